@@ -1,0 +1,131 @@
+"""Records of the reference data, and registries of named things that cite."""
+
+import dataclasses
+import functools
+import tomllib
+from importlib import resources as importlib_resources
+
+from miricigale.utils.exceptions import unknown_name
+
+__all__ = ["Registry", "Resource", "citations", "resource", "resources"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Resource:
+    """
+    One record of ``resources.toml``.
+
+    Parameters
+    ----------
+    name : str
+        Such as ``"ssp.bc03"``.
+    kind : str
+        ``"bundled"`` (a file of this package), ``"package"`` (made from an installed
+        package such as astro-sedpy) or ``"user"`` (brought by the user).
+    title : str
+        One line that says what it is.
+    licence : str
+        Terms of whoever made the numbers and of the package they came in.
+    citation : str
+        What to cite.
+    source : str
+        Where the numbers come from.
+    file : str, optional
+        Path below ``refdata/files`` for bundled resources; below the data folder else.
+    sha256 : str, optional
+        Checksum of the file.
+    script : str, optional
+        The script in ``tools/`` that made it.
+    retrieved : str, optional
+        ISO date.
+    notes : str, optional
+        Accuracy, caveats.
+    """
+
+    name: str
+    kind: str
+    title: str
+    licence: str
+    citation: str
+    source: str
+    file: str = ""
+    sha256: str = ""
+    script: str = ""
+    retrieved: str = ""
+    notes: str = ""
+
+
+@functools.cache
+def resources():
+    """
+    All records of ``resources.toml``.
+
+    Returns
+    -------
+    records : dict of str to `Resource`
+    """
+    text = (importlib_resources.files("miricigale.refdata") / "resources.toml").read_text()
+    return {name: Resource(name=name, **entry) for name, entry in tomllib.loads(text).items()}
+
+
+def resource(name):
+    """
+    The record of one resource.
+
+    Raises
+    ------
+    KeyError
+        If there is no such resource; the message lists the known ones.
+    """
+    try:
+        return resources()[name]
+    except KeyError:
+        raise unknown_name("resource", name, resources()) from None
+
+
+def citations(*names):
+    """What to cite for the named resources, as a sorted list without repeats."""
+    return sorted({resource(name).citation for name in names})
+
+
+class Registry:
+    """
+    Named things made on first use.
+
+    Parameters
+    ----------
+    kind : str
+        What is registered, for messages ("filter").
+    """
+
+    def __init__(self, kind):
+        self.kind = kind
+        self._loaders = {}
+
+    def register(self, name, loader, **metadata):
+        """Register ``loader(name)``; a second registration of a name is an error."""
+        if name in self._loaders:
+            msg = f"{self.kind} {name!r} is registered already"
+            raise ValueError(msg)
+        self._loaders[name] = (loader, metadata)
+
+    def names(self):
+        """All names, sorted."""
+        return sorted(self._loaders)
+
+    def metadata(self, name):
+        """The metadata given at registration; nothing is loaded."""
+        return dict(self._entry(name)[1])
+
+    def get(self, name):
+        """Make the named thing (no cache: values are the loader's business)."""
+        return self._entry(name)[0](name)
+
+    def _entry(self, name):
+        try:
+            return self._loaders[name]
+        except KeyError:
+            raise unknown_name(self.kind, name, self._loaders) from None
+
+    def __contains__(self, name):
+        return name in self._loaders

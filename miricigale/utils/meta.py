@@ -1,0 +1,34 @@
+"""What a result says of where it came from."""
+
+import datetime
+import importlib.metadata
+
+__all__ = ["provenance"]
+
+
+def provenance(*, citations=(), **values):
+    """
+    Make the meta dictionary that results carry.
+
+    Parameters
+    ----------
+    citations : iterable of str, optional
+        What to cite for the data that went in.
+    **values
+        Anything else that fits in a FITS or ECSV header (numbers, text, short lists).
+
+    Returns
+    -------
+    meta : dict
+        Package name and version, UTC date, citations (sorted, unique) and the values.
+    """
+    try:
+        version = importlib.metadata.version("miricigale")
+    except importlib.metadata.PackageNotFoundError:
+        version = "unknown"
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    meta = {"package": "miricigale", "version": version, "created": now}
+    if citations:
+        meta["citations"] = sorted(set(citations))
+    meta.update({key: value for key, value in values.items() if value is not None})
+    return meta

@@ -1,0 +1,78 @@
+"""Random streams with one owner and a key, so that order and workers change nothing."""
+
+import hashlib
+
+import numpy as np
+
+from miricigale.utils.exceptions import argument_error
+
+__all__ = ["as_generator", "check_seed", "stream", "text_key"]
+
+
+def text_key(text):
+    """
+    Turn a text (a filter's name, a source's id) into 64 bits that never change.
+
+    Parameters
+    ----------
+    text : object
+        Anything with a stable `str`.
+
+    Returns
+    -------
+    key : int
+        The first 64 bits of the sha256 of the text.
+    """
+    return int.from_bytes(hashlib.sha256(str(text).encode()).digest()[:8], "big")
+
+
+def check_seed(seed, name="seed"):
+    """
+    Return ``seed`` as an int, drawing a fresh one for None.
+
+    Raises
+    ------
+    ValueError
+        If ``seed`` is neither None, a non-negative integer nor a Generator.
+    """
+    if seed is None:
+        return int(np.random.SeedSequence().entropy)
+    if isinstance(seed, np.random.Generator):
+        return int(seed.integers(2**63))
+    if isinstance(seed, (bool, float)) or not hasattr(seed, "__index__") or int(seed) < 0:
+        raise argument_error(name, "a non-negative integer, a Generator or None", repr(seed))
+    return int(seed)
+
+
+def stream(seed, *key):
+    """
+    Make the random generator of one piece of work.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the whole run (see `check_seed`).
+    *key : int or str
+        What the stream is for: stage, filter, dither, source id. Text is hashed with
+        `text_key`. The same seed and key give the same stream anywhere.
+
+    Returns
+    -------
+    generator : `~numpy.random.Generator`
+    """
+    words = []
+    for part in key:
+        number = part if isinstance(part, (int, np.integer)) else text_key(part)
+        number = int(number)
+        if number < 0:
+            number += 2**64
+        # spawn keys are sequences of 32-bit words: two for each part, whatever its size
+        words += [(number >> 32) & 0xFFFFFFFF, number & 0xFFFFFFFF]
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=tuple(words)))
+
+
+def as_generator(seed):
+    """Return a Generator for an int, a Generator (itself) or None."""
+    if isinstance(seed, np.random.Generator):
+        return seed
+    return np.random.default_rng(check_seed(seed))

@@ -1,0 +1,204 @@
+"""
+The thin door to sep: native byte order, contiguous memory, and honest defaults.
+
+sep wants C-contiguous arrays in native byte order and knows no NaN; and its ``extract``
+filters with ``filter_type='matched'`` unless told otherwise, which reads the threshold as
+a filtered signal-to-noise and is not what Source Extractor's ``DETECT_THRESH`` means. The
+functions here take any array, put NaN into the mask, and use ``filter_type='conv'``.
+"""
+
+import numpy as np
+import sep
+
+from miricigale.utils.exceptions import argument_error
+
+__all__ = ["background", "extract", "native"]
+
+
+def native(array, dtype=None):
+    """
+    Return an array as sep wants it: C-contiguous, native byte order, not masked.
+
+    Parameters
+    ----------
+    array : array_like
+        Any array (FITS images are big-endian).
+    dtype : dtype, optional
+        Type wanted; by default float32 stays float32, bool and int32 stay, all else
+        becomes float64.
+
+    Returns
+    -------
+    array : `~numpy.ndarray`
+        The input itself where it already complies, else a copy.
+    """
+    array = np.asarray(array)
+    if dtype is None:
+        kind, size = array.dtype.kind, array.dtype.itemsize
+        if kind == "b":
+            dtype = np.bool_
+        elif kind == "f" and size == 4:
+            dtype = np.float32
+        elif kind in "iu" and size <= 4:
+            dtype = np.int32
+        else:
+            dtype = np.float64
+    return np.ascontiguousarray(array, dtype=np.dtype(dtype).newbyteorder("="))
+
+
+def _image(data, mask, name="data"):
+    """Return native data with non-finite pixels zeroed and added to the mask."""
+    data = native(data)
+    if data.ndim != 2:
+        raise argument_error(name, "a two-dimensional image", f"shape {data.shape}")
+    if data.dtype.kind != "f":
+        data = data.astype(np.float64)
+    if mask is not None:
+        mask = native(np.asarray(mask) != 0)
+        if mask.shape != data.shape:
+            raise argument_error("mask", f"of the image's shape {data.shape}", str(mask.shape))
+    bad = ~np.isfinite(data)
+    if bad.any():
+        mask = bad if mask is None else mask | bad
+        data = np.where(bad, data.dtype.type(0), data)
+    return data, mask
+
+
+def background(data, mask=None, box=64, filter_size=3):
+    """
+    Estimate the smooth background of an image and its local rms.
+
+    Parameters
+    ----------
+    data : array_like, shape (ny, nx)
+        The image; NaN counts as masked.
+    mask : array_like of bool, shape (ny, nx), optional
+        True where a pixel does not take part.
+    box : int or (int, int), optional
+        Box size in pixels, (y, x) if two.
+    filter_size : int or (int, int), optional
+        Size of the median filter in boxes, (y, x) if two.
+
+    Returns
+    -------
+    back, rms : `~numpy.ndarray`, shape (ny, nx)
+        Background and its rms in the unit and float type of ``data``.
+
+    Raises
+    ------
+    ValueError
+        If the image is not two-dimensional, sizes are not positive, or nothing is left
+        unmasked.
+
+    References
+    ----------
+    Bertin & Arnouts 1996, A&AS 117, 393, sec. 4; Barbary 2016, JOSS 1, 58.
+    """
+    data, mask = _image(data, mask)
+    if mask is not None and mask.all():
+        raise argument_error("mask", "a mask that leaves some pixels", "all pixels masked")
+    bh, bw = np.broadcast_to(box, 2)
+    fh, fw = np.broadcast_to(filter_size, 2)
+    for name, size in (("box", (bh, bw)), ("filter_size", (fh, fw))):
+        if min(size) < 1:
+            raise argument_error(name, "at least 1", f"{tuple(map(int, size))}")
+    result = sep.Background(data, mask=mask, bw=int(bw), bh=int(bh), fw=int(fw), fh=int(fh))
+    return result.back(dtype=data.dtype), result.rms(dtype=data.dtype)
+
+
+def extract(
+    data,
+    threshold,
+    *,
+    err=None,
+    mask=None,
+    min_area=5,
+    filter_kernel="default",
+    filter_type="conv",
+    deblend_n_thresholds=32,
+    deblend_contrast=0.005,
+    clean=True,
+    clean_param=1.0,
+    segmentation=True,
+    pixel_stack=None,
+):
+    """
+    Detect sources as Source Extractor does.
+
+    Parameters
+    ----------
+    data : array_like, shape (ny, nx)
+        Background-subtracted image; NaN counts as masked.
+    threshold : float
+        In units of ``err`` if that is given, else in the unit of ``data``.
+    err : float or array_like, shape (ny, nx), optional
+        Noise of a pixel. Values that are not finite or not positive count as masked.
+    mask : array_like of bool, shape (ny, nx), optional
+        True where there is no data.
+    min_area : int, optional
+        Least number of connected pixels above the threshold.
+    filter_kernel : array_like, None or "default", optional
+        Detection filter; None for none, "default" for sep's 3 x 3 pyramid.
+    filter_type : {"conv", "matched"}, optional
+        "conv" is Source Extractor's meaning of the threshold. With "matched" the threshold
+        applies to the signal-to-noise of the filtered image.
+    deblend_n_thresholds, deblend_contrast : optional
+        Source Extractor's DEBLEND_NTHRESH and DEBLEND_MINCONT (1 turns deblending off).
+    clean, clean_param : optional
+        Source Extractor's CLEAN and CLEAN_PARAM.
+    segmentation : bool, optional
+        Whether the segmentation map is returned.
+    pixel_stack : int, optional
+        Size of sep's buffer of detected pixels; by default the number of pixels of the
+        image or sep's present value, whichever is larger (it never overflows).
+
+    Returns
+    -------
+    objects : `~numpy.ndarray`
+        sep's structured array.
+    segmentation : `~numpy.ndarray` of int32, shape (ny, nx)
+        Label i + 1 for object i; only if asked for.
+
+    Raises
+    ------
+    ValueError
+        If arguments disagree in shape or are out of range.
+    """
+    if filter_type not in ("conv", "matched"):
+        raise argument_error("filter_type", "'conv' or 'matched'", repr(filter_type))
+    if min_area < 1:
+        raise argument_error("min_area", "at least 1", min_area)
+    data, mask = _image(data, mask)
+    if err is not None:
+        if np.ndim(err) == 0:
+            if not (np.isfinite(err) and err > 0):
+                raise argument_error("err", "positive", err)
+            err = float(err)
+        else:
+            err = native(err, data.dtype)
+            if err.shape != data.shape:
+                raise argument_error("err", f"of the image's shape {data.shape}", str(err.shape))
+            bad = ~(np.isfinite(err) & (err > 0))
+            if bad.any():
+                mask = bad if mask is None else mask | bad
+                err = np.where(bad, err.dtype.type(1), err)
+    options = {}
+    if not (isinstance(filter_kernel, str) and filter_kernel == "default"):
+        options["filter_kernel"] = None if filter_kernel is None else native(filter_kernel)
+    wanted = max(data.size, sep.get_extract_pixstack()) if pixel_stack is None else pixel_stack
+    if sep.get_extract_pixstack() != int(wanted):
+        sep.set_extract_pixstack(int(wanted))
+    return sep.extract(
+        data,
+        float(threshold),
+        err=err,
+        mask=mask,
+        minarea=int(min_area),
+        filter_type=filter_type,
+        deblend_nthresh=int(deblend_n_thresholds),
+        deblend_cont=float(deblend_contrast),
+        clean=bool(clean),
+        clean_param=float(clean_param),
+        segmentation_map=bool(segmentation),
+        **options,
+    )

@@ -1,0 +1,113 @@
+"""Checks and joins of tables, and integer flags that explain themselves."""
+
+import enum
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import match_coordinates_sky
+
+from miricigale.utils.exceptions import argument_error
+
+__all__ = ["Flags", "error_column", "match_sky", "require_columns", "unique_ids"]
+
+
+class Flags(enum.IntFlag):
+    """Base of the flag sets: an IntFlag whose members' docs are told by `describe`."""
+
+    @classmethod
+    def describe(cls):
+        """One line of text that gives each bit its name, for a column's description."""
+        bits = ", ".join(f"{m.value} {m.name.lower().replace('_', ' ')}" for m in cls if m.value)
+        return f"bit flags (sum): {bits}; 0 good"
+
+    @classmethod
+    def names(cls, value):
+        """Names of the bits set in ``value``, lower case."""
+        return [m.name.lower() for m in cls if m.value and int(value) & m.value]
+
+
+def error_column(name):
+    """Name of the error column of a flux column."""
+    return f"{name}_err"
+
+
+def require_columns(table, names, argument, *, units=None):
+    """
+    Check that a table has columns, and that they convert to given units.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        The table to check.
+    names : iterable of str
+        Columns that must be there.
+    argument : str
+        The argument's name, for the message.
+    units : dict, optional
+        Column name to the unit that it must convert to.
+
+    Raises
+    ------
+    ValueError
+        If a column is missing; the message lists what is there.
+    `~astropy.units.UnitsError`
+        If a column has no unit or a wrong one.
+    """
+    missing = [name for name in names if name not in table.colnames]
+    if missing:
+        raise argument_error(
+            argument, f"a table with the columns {missing}", f"columns {table.colnames}"
+        )
+    for name, unit in (units or {}).items():
+        if name not in table.colnames:
+            continue
+        have = getattr(table[name], "unit", None)
+        if have is None or not u.Unit(have).is_equivalent(unit):
+            msg = f"'{argument}' column {name!r} must be convertible to {unit}, got {have}"
+            raise u.UnitsError(msg)
+
+
+def unique_ids(ids, argument):
+    """Return ids as an array after checking that none is there twice."""
+    ids = np.asarray(ids)
+    values, counts = np.unique(ids, return_counts=True)
+    if np.any(counts > 1):
+        twice = values[counts > 1][:5].tolist()
+        raise argument_error(
+            argument, "a table whose ids are unique", f"duplicates such as {twice}"
+        )
+    return ids
+
+
+def match_sky(coords, reference, *, radius):
+    """
+    Match each reference position to its nearest partner, one to one.
+
+    Parameters
+    ----------
+    coords, reference : `~astropy.coordinates.SkyCoord`
+        Measured and reference positions.
+    radius : `~astropy.units.Quantity`
+        Largest separation of a match.
+
+    Returns
+    -------
+    index : `~numpy.ndarray` of int, shape (n_reference,)
+        Row of ``coords`` that belongs to each reference, -1 where there is none. A row
+        claimed by several references goes to the nearest.
+    separation : `~astropy.units.Quantity`, shape (n_reference,)
+        Separation in arcsec, NaN where there is no match.
+    """
+    n = len(reference)
+    index = np.full(n, -1)
+    separation = np.full(n, np.nan)
+    if n and len(coords):
+        nearest, sep, _ = match_coordinates_sky(reference, coords)
+        sep = sep.to_value(u.arcsec)
+        taken = set()
+        for row in np.argsort(sep, kind="stable"):
+            if sep[row] <= radius.to_value(u.arcsec) and nearest[row] not in taken:
+                taken.add(nearest[row])
+                index[row] = nearest[row]
+                separation[row] = sep[row]
+    return index, separation * u.arcsec

@@ -1,0 +1,103 @@
+"""The units that arrays have inside the package, and the doors that convert to them."""
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.utils.exceptions import argument_error
+
+__all__ = [
+    "ANGLE",
+    "DN",
+    "FNU",
+    "LUMINOSITY",
+    "LUMINOSITY_NU",
+    "MASS",
+    "RATE",
+    "SURFACE_BRIGHTNESS",
+    "TIME",
+    "WAVE",
+    "frozen_array",
+    "frozen_quantity",
+    "to_array",
+]
+
+#: Units declared once; every array inside the package is in one of these.
+WAVE = u.um
+FNU = u.uJy
+LUMINOSITY = u.W
+LUMINOSITY_NU = u.W / u.Hz
+MASS = u.Msun
+SURFACE_BRIGHTNESS = u.MJy / u.sr
+DN = u.adu
+TIME = u.s
+RATE = u.adu / u.s
+ANGLE = u.arcsec
+
+
+def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
+    """
+    Convert a quantity to a plain float64 array in ``unit``.
+
+    Parameters
+    ----------
+    value : `~astropy.units.Quantity`
+        Anything `~astropy.units.Quantity` accepts; a bare number is refused unless
+        ``unit`` is dimensionless.
+    unit : `~astropy.units.Unit`
+        The unit wanted.
+    name : str
+        The argument's name, for the error message.
+    ndim : int, optional
+        Required number of dimensions.
+    finite : bool, optional
+        Whether NaN and infinity are refused.
+    equivalencies : list, optional
+        Passed to `~astropy.units.Quantity.to_value`.
+
+    Returns
+    -------
+    array : `~numpy.ndarray`
+        Float64 values in ``unit``; a new array or a view of the input.
+
+    Raises
+    ------
+    `~astropy.units.UnitsError`
+        If the unit cannot be converted or is missing.
+    ValueError
+        If the number of dimensions is wrong or a value is not finite.
+    """
+    unit = u.Unit(unit)
+    if not hasattr(value, "unit"):
+        value = u.Quantity(value)
+        if value.unit == u.dimensionless_unscaled and unit != u.dimensionless_unscaled:
+            msg = f"'{name}' must be a quantity convertible to {unit}, got a bare number"
+            raise u.UnitsError(msg)
+    try:
+        quantity = u.Quantity(value)
+        array = np.asarray(quantity.to_value(unit, equivalencies or []), dtype=float)
+    except u.UnitConversionError:
+        msg = f"'{name}' must be convertible to {unit}, got {getattr(value, 'unit', None)}"
+        raise u.UnitsError(msg) from None
+    if ndim is not None and array.ndim != ndim:
+        raise argument_error(name, f"an array of {ndim} dimension(s)", f"shape {array.shape}")
+    if finite and not np.all(np.isfinite(array)):
+        n_bad = int(np.count_nonzero(~np.isfinite(array)))
+        raise argument_error(name, "finite values", f"{n_bad} that are NaN or infinite")
+    return array
+
+
+def frozen_array(value, dtype=float):
+    """Copy ``value`` to a C-contiguous array of ``dtype`` that cannot be written to."""
+    array = np.array(value, dtype=dtype, order="C", copy=True)
+    array.flags.writeable = False
+    return array
+
+
+def frozen_quantity(value, unit, name, *, ndim=None, finite=False):
+    """
+    Copy a quantity to ``unit`` and mark it read-only.
+
+    Parameters are those of `to_array`; the result is a `~astropy.units.Quantity`.
+    """
+    array = frozen_array(to_array(value, unit, name, ndim=ndim, finite=finite))
+    return u.Quantity(array, unit, copy=False)
