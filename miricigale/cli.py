@@ -1,0 +1,201 @@
+"""The command line: a thin layer over the workflow and the classes."""
+
+import argparse
+import logging
+import sys
+import time
+from pathlib import Path
+
+__all__ = ["main"]
+
+
+def _parser():
+    parser = argparse.ArgumentParser(
+        prog="miricigale", description="Plan and analyse JWST/MIRI deep imaging."
+    )
+    parser.add_argument("--version", action="store_true", help="print the version and stop")
+    parser.add_argument("-v", "--verbose", action="store_true", help="say what is done")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+
+    run = commands.add_parser("run", help="run a study: a preset (goodss) or a TOML file")
+    run.add_argument("config", help="preset name or path of a TOML file")
+    run.add_argument("--quick", action="store_true", help="fewer groups, dithers and sources")
+    run.add_argument("-o", "--output", type=Path, help="folder (default: the name of the run)")
+    run.add_argument("--keep-level1b", action="store_true", help="keep the level-1b files")
+    run.add_argument("--threads", type=int, help="threads (default: all cores)")
+    run.add_argument("--seed", type=int, help="seed of every random draw")
+    run.add_argument("--print-config", action="store_true", help="print the configuration and stop")
+    run.add_argument("--no-progress", action="store_true", help="no progress bars")
+
+    fit = commands.add_parser("fit", help="fit redshift and AGN fraction of a photometry table")
+    fit.add_argument(
+        "photometry", type=Path, help="ECSV or FITS: id, <filter>, <filter>_err in uJy"
+    )
+    fit.add_argument("-o", "--output", type=Path, default=Path("fits.fits"), help="results (FITS)")
+    fit.add_argument("--axes", choices=("fit", "quick"), default="fit", help="model grid")
+    fit.add_argument("--redshift", metavar="COLUMN", help="column of known redshifts")
+    fit.add_argument("--model-error", type=float, default=0.1, help="relative model error")
+    fit.add_argument("--threads", type=int, default=1, help="threads")
+
+    phot = commands.add_parser("photometry", help="forced photometry on a high-resolution prior")
+    phot.add_argument("image", type=Path, help="MIRI mosaic (FITS with SCI and ERR, MJy/sr)")
+    phot.add_argument("highres", type=Path, help="high-resolution image (likewise)")
+    phot.add_argument("--filter", required=True, help="filter of the mosaic, such as miri.f770w")
+    phot.add_argument(
+        "--pa-aper", type=float, required=True, help="PA of the detector's y axis (deg)"
+    )
+    phot.add_argument("-o", "--output", type=Path, default=Path("photometry.ecsv"), help="table")
+
+    plan = commands.add_parser("plan", help="saturation and depth of the CEERS exposures")
+    plan.add_argument("--quick", action="store_true", help="of the quick exposures instead")
+
+    filters = commands.add_parser("filters", help="list the filters")
+    filters.add_argument("pattern", nargs="?", default="", help="part of the name")
+
+    data = commands.add_parser("data", help="reference data: list, check or add")
+    actions = data.add_subparsers(dest="action", metavar="ACTION", required=True)
+    actions.add_parser("list", help="what there is, its licence and what to cite")
+    actions.add_parser("check", help="whether each file is there and whole")
+    add = actions.add_parser("add", help="copy a file into the data folder")
+    add.add_argument("name", help="resource name")
+    add.add_argument("path", type=Path, help="file or folder")
+    return parser
+
+
+def _run(args):
+    from miricigale.workflow import disk_use, load_config, run_study
+
+    overrides = {"run": {}}
+    if args.keep_level1b:
+        overrides["run"]["keep_level1b"] = True
+    if args.threads is not None:
+        overrides["run"]["threads"] = args.threads
+    if args.seed is not None:
+        overrides["run"]["seed"] = args.seed
+    config = load_config(args.config, quick=args.quick, overrides=overrides)
+    if args.print_config:
+        print(config.to_toml(), end="")
+        return 0
+    folder = args.output or Path(config.run.name)
+    print(
+        f"{config.run.name}: needs about {disk_use(config) / 1e9:.2f} GB in {folder}/", flush=True
+    )
+    begin = time.monotonic()
+    try:
+        report = run_study(config, folder, progress_bar=not args.no_progress)
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on from here", file=sys.stderr)
+        return 130
+    print(f"done in {(time.monotonic() - begin) / 60:.1f} min; report: {report}")
+    return 0
+
+
+def _fit(args):
+    from concurrent.futures import ThreadPoolExecutor
+
+    from miricigale.workflow.commands import fit_table
+
+    with ThreadPoolExecutor(max(1, args.threads)) as executor:
+        results = fit_table(
+            args.photometry,
+            axes=args.axes,
+            redshift=args.redshift,
+            model_error=args.model_error,
+            executor=executor if args.threads > 1 else None,
+            progress_bar=True,
+        )
+    results.write(args.output, overwrite=True)
+    table = args.output.with_suffix(".ecsv")
+    results.to_table().write(table, overwrite=True)
+    print(f"{args.output} and {table}")
+    return 0
+
+
+def _photometry(args):
+    from miricigale.workflow.commands import measure_files
+
+    table = measure_files(args.image, args.highres, filter=args.filter, pa_aper=args.pa_aper)
+    table.write(args.output, overwrite=True)
+    print(f"{len(table)} sources in {args.output}")
+    return 0
+
+
+def _plan(args):
+    from miricigale.workflow.commands import plan_table
+
+    plan_table(quick=args.quick).pprint_all()
+    return 0
+
+
+def _filters(args):
+    from miricigale.workflow.commands import filter_table
+
+    table = filter_table(args.pattern)
+    if len(table) == 0:
+        print(f"no filter has {args.pattern!r} in its name", file=sys.stderr)
+        return 1
+    table.pprint_all()
+    return 0
+
+
+def _data(args):
+    from miricigale.refdata import add_resource, check_resources, resources
+
+    if args.action == "add":
+        print(add_resource(args.name, args.path))
+        return 0
+    if args.action == "check":
+        rows = check_resources()
+        for name, state, where in rows:
+            print(f"{name:22s} {state:16s} {where}")
+        return int(any(state == "wrong checksum" for _, state, _ in rows))
+    for name, record in resources().items():
+        print(f"{name} ({record.kind}): {record.title}")
+        print(f"    licence: {record.licence}\n    cite: {record.citation}")
+    return 0
+
+
+def main(argv=None):
+    """
+    Entry point of the ``miricigale`` command.
+
+    Parameters
+    ----------
+    argv : list of str, optional
+        Arguments; those of the process if not given.
+
+    Returns
+    -------
+    status : int
+        0 if all went well, 2 for input that cannot be used, 130 if interrupted.
+    """
+    parser = _parser()
+    args = parser.parse_args(argv)
+    logging.basicConfig(
+        level=logging.INFO if args.verbose else logging.WARNING, format="%(message)s"
+    )
+    if args.version:
+        from miricigale import __version__
+
+        print(__version__)
+        return 0
+    if args.command is None:
+        parser.print_help()
+        return 2
+    commands = {
+        "run": _run,
+        "fit": _fit,
+        "photometry": _photometry,
+        "plan": _plan,
+        "filters": _filters,
+        "data": _data,
+    }
+    try:
+        return commands[args.command](args)
+    except (ValueError, KeyError, OSError, ImportError) as err:
+        # one clear sentence; the traceback is for --verbose
+        if args.verbose:
+            raise
+        message = err.args[0] if isinstance(err, KeyError) and err.args else err
+        print(f"miricigale: {message}", file=sys.stderr)
+        return 2

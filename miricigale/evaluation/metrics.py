@@ -1,0 +1,226 @@
+"""Numbers that say how well truth was recovered."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+from astropy.stats import binom_conf_interval
+
+from miricigale.utils.exceptions import argument_error
+
+__all__ = [
+    "PhotozMetrics",
+    "RecoveryMetrics",
+    "fraction_interval",
+    "photoz_metrics",
+    "recovery_metrics",
+    "running_median",
+    "sigma_mad",
+]
+
+
+def _pair(first, second, names):
+    first, second = np.asarray(first, float), np.asarray(second, float)
+    if first.shape != second.shape or first.ndim != 1:
+        raise argument_error(
+            names[1],
+            f"a 1-D array as long as '{names[0]}'",
+            f"shapes {first.shape} and {second.shape}",
+        )
+    return first, second
+
+
+def sigma_mad(values):
+    """
+    Robust scatter: 1.48 times the median absolute deviation from the median.
+
+    Parameters
+    ----------
+    values : array-like
+        Values; those that are not finite are an error of the caller and give NaN.
+
+    Returns
+    -------
+    sigma : float
+        NaN for an empty input.
+
+    References
+    ----------
+    Yang et al. 2021, ApJ 908, 144, section 5 (sigma_MAD).
+    """
+    values = np.asarray(values, float)
+    if values.size == 0:
+        return np.nan
+    return float(1.48 * np.median(np.abs(values - np.median(values))))
+
+
+def fraction_interval(n_success, n_total):
+    """
+    A fraction with its 68 % interval (Wilson).
+
+    Parameters
+    ----------
+    n_success, n_total : int
+        Counts.
+
+    Returns
+    -------
+    fraction, low, high : float
+        NaN where ``n_total`` is zero.
+    """
+    if n_total == 0:
+        return np.nan, np.nan, np.nan
+    low, high = binom_conf_interval(n_success, n_total, interval="wilson")
+    return n_success / n_total, float(low), float(high)
+
+
+@dataclasses.dataclass(frozen=True)
+class PhotozMetrics:
+    """
+    Quality of photometric redshifts.
+
+    Parameters
+    ----------
+    n : int
+        Sources compared.
+    n_unusable : int
+        Sources left out because one of the two redshifts is not finite.
+    bias : float
+        Median of dz = (z_fit - z_true) / (1 + z_true).
+    sigma_mad : float
+        1.48 x median |dz - median dz|.
+    outlier_fraction, outlier_low, outlier_high : float
+        Share with abs(dz) above the limit and its 68 % interval.
+    n_outliers : int
+        Their number.
+    """
+
+    n: int
+    n_unusable: int
+    bias: float
+    sigma_mad: float
+    outlier_fraction: float
+    outlier_low: float
+    outlier_high: float
+    n_outliers: int
+
+
+def photoz_metrics(z_true, z_fit, *, outlier=0.15):
+    """
+    Compare photometric with true redshifts.
+
+    Parameters
+    ----------
+    z_true, z_fit : array-like, shape (n,)
+        Redshifts; pairs with a NaN are counted apart.
+    outlier : float, optional
+        A source with abs(dz) above this is an outlier.
+
+    Returns
+    -------
+    metrics : `PhotozMetrics`
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ.
+    """
+    z_true, z_fit = _pair(z_true, z_fit, ("z_true", "z_fit"))
+    good = np.isfinite(z_true) & np.isfinite(z_fit)
+    delta = (z_fit[good] - z_true[good]) / (1 + z_true[good])
+    n_out = int(np.count_nonzero(np.abs(delta) > outlier))
+    fraction, low, high = fraction_interval(n_out, delta.size)
+    return PhotozMetrics(
+        n=int(delta.size),
+        n_unusable=int(np.count_nonzero(~good)),
+        bias=float(np.median(delta)) if delta.size else np.nan,
+        sigma_mad=sigma_mad(delta),
+        outlier_fraction=fraction,
+        outlier_low=low,
+        outlier_high=high,
+        n_outliers=n_out,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class RecoveryMetrics:
+    """
+    Quality of a measured quantity.
+
+    Parameters
+    ----------
+    n, n_unusable : int
+        Pairs compared, and pairs left out because a value is not finite.
+    median, median_err : float
+        Median of measured minus true, and its standard error (1.253 sigma / sqrt n).
+    sigma_mad : float
+        Robust scatter of the difference.
+    """
+
+    n: int
+    n_unusable: int
+    median: float
+    median_err: float
+    sigma_mad: float
+
+
+def recovery_metrics(true, measured, *, relative=False):
+    """
+    Compare measured with true values.
+
+    Parameters
+    ----------
+    true, measured : array-like, shape (n,)
+        Values in the same unit.
+    relative : bool, optional
+        Whether differences are divided by the true value.
+
+    Returns
+    -------
+    metrics : `RecoveryMetrics`
+    """
+    true, measured = _pair(true, measured, ("true", "measured"))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        delta = (measured - true) / true if relative else measured - true
+    good = np.isfinite(delta)
+    delta = delta[good]
+    sigma = sigma_mad(delta)
+    return RecoveryMetrics(
+        n=int(delta.size),
+        n_unusable=int(np.count_nonzero(~good)),
+        median=float(np.median(delta)) if delta.size else np.nan,
+        median_err=1.2533 * sigma / np.sqrt(delta.size) if delta.size else np.nan,
+        sigma_mad=sigma,
+    )
+
+
+def running_median(x, y, *, size=20):
+    """
+    Median of ``y`` and ``x`` in consecutive bins of ``size`` points sorted by ``x``.
+
+    Parameters
+    ----------
+    x, y : array-like, shape (n,)
+        Points; those with a NaN are left out.
+    size : int, optional
+        Points per bin; what remains after the last full bin joins it.
+
+    Returns
+    -------
+    x_mid, y_mid, y_sigma : `~numpy.ndarray`, shape (n_bins,)
+        Medians and `sigma_mad` in each bin.
+    """
+    x, y = _pair(x, y, ("x", "y"))
+    if size < 1:
+        raise argument_error("size", "at least 1", size)
+    good = np.isfinite(x) & np.isfinite(y)
+    order = np.argsort(x[good], kind="stable")
+    x, y = x[good][order], y[good][order]
+    n_bins = max(1, x.size // size) if x.size else 0
+    edges = [k * size for k in range(n_bins)] + [x.size]
+    bins = [slice(a, b) for a, b in itertools.pairwise(edges)]
+    return (
+        np.array([np.median(x[b]) for b in bins]),
+        np.array([np.median(y[b]) for b in bins]),
+        np.array([sigma_mad(y[b]) for b in bins]),
+    )

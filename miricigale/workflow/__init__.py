@@ -1,0 +1,1 @@
+"""The whole study: configuration, stages, and a runner that resumes."""

@@ -1,0 +1,418 @@
+"""Typed run configuration: frozen dataclasses from TOML, strict about every key."""
+
+import dataclasses
+import json
+import tomllib
+import typing
+from importlib import resources
+from pathlib import Path
+
+from miricigale.utils.exceptions import ConfigError, unknown_name
+
+__all__ = ["StudyConfig", "load_config", "preset_names"]
+
+CEERS_FILTERS = (
+    "miri.f770w",
+    "miri.f1000w",
+    "miri.f1280w",
+    "miri.f1500w",
+    "miri.f1800w",
+    "miri.f2100w",
+)
+EXISTING_BANDS = (
+    *(f"megacam.{b}" for b in "ugriz"),
+    "acs.f606w",
+    "acs.f814w",
+    "wfc3.f125w",
+    "wfc3.f140w",
+    "wfc3.f160w",
+    *(f"irac.ch{k}" for k in range(1, 5)),
+    "mips.24",
+)
+# 5-sigma AB depths of the existing bands (PHYSICS: after Stefanon 2017 and FIDEL)
+EXISTING_DEPTHS = (
+    27.1, 27.3, 27.2, 27.0, 26.1, 28.8, 28.2, 27.6, 26.8, 27.6, 23.9, 24.2, 22.5, 22.8, 19.3,
+)  # fmt: skip
+
+
+def _option(default, doc, *, low=None, high=None, choices=None):
+    """A field with its documentation and limits in the metadata."""
+    limits = {"doc": doc, "low": low, "high": high, "choices": choices}
+    return dataclasses.field(default=default, metadata=limits)
+
+
+@dataclasses.dataclass(frozen=True)
+class RunSection:
+    """What the run is called and how it goes."""
+
+    name: str = _option("study", "Name of the run; its folder unless --output is given.")
+    seed: int = _option(20210211, "Seed of every random draw.", low=0)
+    threads: int = _option(0, "Threads; 0 for as many as there are cores.", low=0)
+    keep_level1b: bool = _option(False, "Whether the level-1b (uncal) files are kept.")
+
+
+@dataclasses.dataclass(frozen=True)
+class CatalogSection:
+    """The real sources that are simulated."""
+
+    source: str = _option("catalog.goodss", "Resource name or path of the catalogue.")
+    mag_limit: float = _option(26.6, "Faint limit in the magnitude column.", low=10.0, high=40.0)
+    mag_column: str = _option("mag_f160w", "Column that the limit applies to.")
+
+
+@dataclasses.dataclass(frozen=True)
+class PointingSection:
+    """Where the telescope looks."""
+
+    ra: float = _option(
+        53.13440, "Right ascension of the field centre in degrees.", low=0, high=360
+    )
+    dec: float = _option(-27.83444, "Declination of the field centre in degrees.", low=-90, high=90)
+    roll: float = _option(0.0, "Position angle of V3 in degrees.", low=-360, high=360)
+
+
+@dataclasses.dataclass(frozen=True)
+class SedSection:
+    """How the input SEDs are fitted and what AGN is added."""
+
+    axes: str = _option("galaxy", "Grid of the input fit.", choices=("galaxy", "quick"))
+    catalog_error: float = _option(
+        0.05, "Relative error given to the catalogue's fluxes.", low=1e-4, high=1.0
+    )
+    frac_agn: float = _option(0.0, "fracAGN of the injected sources.", low=0.0, high=0.99)
+
+
+@dataclasses.dataclass(frozen=True)
+class ExposureSection:
+    """What is exposed, and for how long."""
+
+    filters: tuple[str, ...] = _option(CEERS_FILTERS, "MIRI filters.")
+    plan: str = _option("ceers", "Exposure plan.", choices=("ceers", "quick"))
+    n_groups: tuple[int, ...] = _option((), "Groups of each filter instead of the plan's.")
+    n_integrations: tuple[int, ...] = _option((), "Integrations of each filter, likewise.")
+    n_dithers: tuple[int, ...] = _option((), "Dithers of each filter, likewise.")
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneSection:
+    """The sky behind the sources."""
+
+    background_gradient: float = _option(0.05, "Relative gradient per arcmin.", low=0.0, high=1.0)
+    gradient_angle: float = _option(45.0, "Position angle of the gradient in degrees.")
+    background_scale: float = _option(
+        1.0, "Factor on the low-zodi background.", low=0.0, high=100.0
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class HighresSection:
+    """The high-resolution image that is the prior."""
+
+    filter: str = _option("wfc3.f160w", "Its filter.")
+    pixel_scale: float = _option(0.06, "Pixel scale in arcsec.", low=0.01, high=0.2)
+    depth: float = _option(27.6, "5-sigma AB depth of a point source.", low=20.0, high=35.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class DetectorSection:
+    """What the detector does to the light."""
+
+    cosmic_rays: bool = _option(True, "Whether cosmic rays hit.")
+
+
+@dataclasses.dataclass(frozen=True)
+class ReductionSection:
+    """How ramps become mosaics."""
+
+    jump_threshold: float = _option(5.0, "Jump detection threshold in sigma.", low=2.0, high=50.0)
+    background_box: int = _option(32, "Box of the background mesh in pixels.", low=8, high=512)
+    background_filter: int = _option(3, "Median filter of the mesh in cells.", low=1, high=15)
+    pixel_scale: float = _option(0.11, "Pixel scale of the mosaics in arcsec.", low=0.02, high=0.5)
+    pixfrac: float = _option(1.0, "Drop size of the drizzling.", low=0.1, high=1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class PhotometrySection:
+    """How sources are found and measured."""
+
+    threshold: float = _option(
+        0.25, "Detection threshold in sigma of a pixel.", low=0.01, high=100.0
+    )
+    min_area: int = _option(60, "Smallest area of a detection in pixels.", low=1, high=10000)
+    regularization: str = _option(
+        "auto", "Regularisation of the matching kernels: auto, yang2021 (0.03) or a number."
+    )
+    match_radius: float = _option(
+        0.5, "Radius of the match to the truth in arcsec.", low=0.05, high=3.0
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class ErrorSection:
+    """How the error function is made."""
+
+    statistic: str = _option("mad", "Scatter statistic.", choices=("mad", "median_abs"))
+    bin_size: int = _option(30, "Sources per bin.", low=5, high=1000)
+
+
+@dataclasses.dataclass(frozen=True)
+class FitSection:
+    """The final fit, with and without MIRI."""
+
+    bands: tuple[str, ...] = _option(EXISTING_BANDS, "Existing bands.")
+    depths: tuple[float, ...] = _option(EXISTING_DEPTHS, "Their 5-sigma AB depths.")
+    axes: str = _option("fit", "Grid of the fit.", choices=("fit", "quick"))
+    model_error: float = _option(0.1, "Relative model error.", low=0.0, high=1.0)
+    min_detected: int = _option(2, "MIRI bands a source must be detected in.", low=0, high=9)
+
+
+@dataclasses.dataclass(frozen=True)
+class PointSourceSection:
+    """The check with bright point sources on a grid."""
+
+    enabled: bool = _option(True, "Whether the check is made.")
+    spacing: float = _option(15.0, "Spacing of the grid in arcsec.", low=6.0, high=60.0)
+    signal_to_noise: float = _option(1000.0, "Approximate S/N of each.", low=20.0, high=1e5)
+
+
+@dataclasses.dataclass(frozen=True)
+class ReportSection:
+    """The page at the end."""
+
+    dpi: int = _option(110, "Resolution of the figures.", low=40, high=400)
+
+
+@dataclasses.dataclass(frozen=True)
+class StudyConfig:
+    """
+    Everything that a run depends on.
+
+    Each attribute is a section of the TOML file; every key has a default, a type,
+    limits and a line of documentation (see `to_toml`).
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.ConfigError`
+        If lists that belong together have different lengths.
+    """
+
+    run: RunSection = dataclasses.field(default_factory=RunSection)
+    catalog: CatalogSection = dataclasses.field(default_factory=CatalogSection)
+    pointing: PointingSection = dataclasses.field(default_factory=PointingSection)
+    sed: SedSection = dataclasses.field(default_factory=SedSection)
+    exposures: ExposureSection = dataclasses.field(default_factory=ExposureSection)
+    scene: SceneSection = dataclasses.field(default_factory=SceneSection)
+    highres: HighresSection = dataclasses.field(default_factory=HighresSection)
+    detector: DetectorSection = dataclasses.field(default_factory=DetectorSection)
+    reduction: ReductionSection = dataclasses.field(default_factory=ReductionSection)
+    photometry: PhotometrySection = dataclasses.field(default_factory=PhotometrySection)
+    errors: ErrorSection = dataclasses.field(default_factory=ErrorSection)
+    fit: FitSection = dataclasses.field(default_factory=FitSection)
+    point_sources: PointSourceSection = dataclasses.field(default_factory=PointSourceSection)
+    report: ReportSection = dataclasses.field(default_factory=ReportSection)
+
+    def __post_init__(self):
+        for key in ("n_groups", "n_integrations", "n_dithers"):
+            values = getattr(self.exposures, key)
+            if values and len(values) != len(self.exposures.filters):
+                msg = (
+                    f"[exposures] {key} must have one number per filter "
+                    f"({len(self.exposures.filters)}), got {len(values)}"
+                )
+                raise ConfigError(msg)
+            if any(value < 1 for value in values):
+                msg = f"[exposures] {key} must be at least 1, got {min(values)}"
+                raise ConfigError(msg)
+        if not self.exposures.filters:
+            msg = "[exposures] filters must name at least one filter, got none"
+            raise ConfigError(msg)
+        if len(set(self.exposures.filters)) != len(self.exposures.filters):
+            msg = f"[exposures] filters must not repeat, got {list(self.exposures.filters)}"
+            raise ConfigError(msg)
+        if len(self.fit.bands) != len(self.fit.depths):
+            msg = (
+                f"[fit] depths must have one number per band ({len(self.fit.bands)}), "
+                f"got {len(self.fit.depths)}"
+            )
+            raise ConfigError(msg)
+        if self.photometry.regularization not in ("auto", "yang2021"):
+            try:
+                positive = float(self.photometry.regularization) > 0
+            except ValueError:
+                positive = False
+            if not positive:
+                msg = (
+                    "[photometry] regularization must be 'auto', 'yang2021' or a positive "
+                    f"number as text, got {self.photometry.regularization!r}"
+                )
+                raise ConfigError(msg)
+
+    @classmethod
+    def from_dict(cls, values, *, base=None):
+        """
+        Make a configuration from nested dictionaries.
+
+        Parameters
+        ----------
+        values : dict of dict
+            Sections and their keys; what is absent keeps the value of ``base``.
+        base : `StudyConfig`, optional
+            Where absent keys come from; the defaults if not given.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.ConfigError`
+            For an unknown section or key (the message lists the known ones), a wrong
+            type, or a value outside its limits.
+        """
+        base = base or cls()
+        sections = {field.name: getattr(base, field.name) for field in dataclasses.fields(cls)}
+        unknown = sorted(set(values) - set(sections))
+        if unknown:
+            msg = f"unknown section {unknown}; known: {sorted(sections)}"
+            raise ConfigError(msg)
+        for name, entries in values.items():
+            if not isinstance(entries, dict):
+                msg = f"[{name}] must be a section, got {entries!r}"
+                raise ConfigError(msg)
+            sections[name] = _replace_section(name, sections[name], entries)
+        return cls(**sections)
+
+    def section_dict(self, *names):
+        """Plain values of the named sections, for hashing."""
+        return {name: dataclasses.asdict(getattr(self, name)) for name in names}
+
+    def to_toml(self):
+        """
+        The whole configuration as TOML, each key with its documentation.
+
+        Returns
+        -------
+        text : str
+            Gives the same configuration back through `load_config`.
+        """
+        lines = ["# miricigale run configuration; 'miricigale run FILE' takes it back"]
+        for field in dataclasses.fields(self):
+            section = getattr(self, field.name)
+            lines += ["", f"[{field.name}]  # {type(section).__doc__.strip()}"]
+            for entry in dataclasses.fields(section):
+                lines.append(f"# {entry.metadata['doc']}{_limits_text(entry.metadata)}")
+                lines.append(f"{entry.name} = {_toml_value(getattr(section, entry.name))}")
+        return "\n".join(lines) + "\n"
+
+
+def _limits_text(limits):
+    if limits["choices"]:
+        return f" One of {', '.join(limits['choices'])}."
+    if limits["low"] is not None and limits["high"] is not None:
+        return f" ({limits['low']} to {limits['high']})"
+    if limits["low"] is not None:
+        return f" (at least {limits['low']})"
+    return ""
+
+
+def _toml_value(value):
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
+    # JSON's booleans, numbers and strings are valid TOML
+    return json.dumps(value)
+
+
+def _replace_section(name, section, entries):
+    fields = {field.name: field for field in dataclasses.fields(section)}
+    unknown = sorted(set(entries) - set(fields))
+    if unknown:
+        msg = f"[{name}] does not know {unknown}; known: {sorted(fields)}"
+        raise ConfigError(msg)
+    hints = typing.get_type_hints(type(section))
+    changes = {
+        key: _checked(f"[{name}] {key}", value, hints[key], fields[key].metadata)
+        for key, value in entries.items()
+    }
+    return dataclasses.replace(section, **changes)
+
+
+def _checked(label, value, hint, limits):
+    if typing.get_origin(hint) is tuple:
+        if not isinstance(value, (list, tuple)):
+            msg = f"{label} must be a list, got {value!r}"
+            raise ConfigError(msg)
+        item = typing.get_args(hint)[0]
+        return tuple(_checked(label, entry, item, limits) for entry in value)
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if type(value) is not hint:
+        msg = f"{label} must be of type {hint.__name__}, got {value!r}"
+        raise ConfigError(msg)
+    low, high, choices = limits["low"], limits["high"], limits["choices"]
+    if choices and value not in choices:
+        msg = f"{label} must be one of {list(choices)}, got {value!r}"
+        raise ConfigError(msg)
+    # the negated comparison also refuses NaN
+    if (low is not None and not value >= low) or (high is not None and not value <= high):
+        msg = f"{label} must be between {low} and {high}, got {value!r}"
+        if high is None:
+            msg = f"{label} must be at least {low}, got {value!r}"
+        raise ConfigError(msg)
+    return value
+
+
+def preset_names():
+    """Names of the configurations that come with the package."""
+    folder = resources.files("miricigale.workflow") / "presets"
+    names = (Path(entry.name) for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    return sorted(path.stem for path in names if "." not in path.stem)
+
+
+def load_config(source, *, quick=False, overrides=None):
+    """
+    Read a run configuration.
+
+    Parameters
+    ----------
+    source : str or path-like
+        Name of a preset (``"goodss"``) or path of a TOML file.
+    quick : bool, optional
+        For presets: use the quick variant. Not allowed with a file, which already says
+        everything.
+    overrides : dict of dict, optional
+        Sections and keys that replace those of the source.
+
+    Returns
+    -------
+    config : `StudyConfig`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.ConfigError`
+        If the file is missing, not TOML, or holds an unknown or wrong key.
+    KeyError
+        If there is no such preset.
+    """
+    source = str(source)
+    if source.endswith(".toml"):
+        if quick:
+            msg = "--quick belongs to presets; a configuration file already says how long to expose"
+            raise ConfigError(msg)
+        path = Path(source).expanduser()
+        if not path.is_file():
+            msg = f"no configuration file {path}"
+            raise ConfigError(msg)
+        texts = [(str(path), path.read_text(encoding="utf-8"))]
+    else:
+        if source not in preset_names():
+            raise unknown_name("preset", source, preset_names())
+        folder = resources.files("miricigale.workflow") / "presets"
+        names = [f"{source}.toml", *([f"{source}.quick.toml"] if quick else [])]
+        texts = [(name, (folder / name).read_text(encoding="utf-8")) for name in names]
+    config = StudyConfig()
+    for label, text in texts:
+        try:
+            config = StudyConfig.from_dict(tomllib.loads(text), base=config)
+        except tomllib.TOMLDecodeError as err:
+            msg = f"{label} is not valid TOML: {err}"
+            raise ConfigError(msg) from None
+        except ConfigError as err:
+            msg = f"{label}: {err}"
+            raise ConfigError(msg) from None
+    return StudyConfig.from_dict(overrides, base=config) if overrides else config

@@ -1,0 +1,29 @@
+import astropy.units as u
+import numpy as np
+import pytest
+
+from miricigale.evaluation import main_sequence_sfr, number_counts, sfr_to_infrared_luminosity
+
+
+def test_speagle_main_sequence_at_published_values():
+    # Speagle et al. 2014, equation 28, evaluated by hand at t = 5 Gyr and M = 10^10.5
+    expected = 10 ** ((0.84 - 0.13) * 10.5 - (6.51 - 0.55))
+    sfr = main_sequence_sfr(10**10.5 * u.Msun, 5 * u.Gyr)
+    assert sfr.to_value(u.Msun / u.yr) == pytest.approx(expected)
+
+
+def test_kennicutt_relation_in_solar_units():
+    # Kennicutt 1998: 1 Msun/yr is 5.8e9 Lsun
+    assert sfr_to_infrared_luminosity(1 * u.Msun / u.yr).to_value(u.Lsun) == pytest.approx(
+        5.8e9, rel=0.01
+    )
+
+
+def test_counts_conserve_sources():
+    flux = ([23.2, 23.7, 25.1] * u.ABmag).to(u.uJy)
+    flux = np.append(flux, -1 * u.uJy)
+    counts, error = number_counts(flux, 2 * u.deg**2, [23, 24, 24.5, 26])
+    assert counts.to_value(u.deg**-2) * [1, 0.5, 1.5] * 2 == pytest.approx([2, 0, 1])
+    assert (error[0] / counts[0]).value == pytest.approx(1 / np.sqrt(2))
+    with pytest.raises(ValueError, match="'edges' must be ascending magnitudes"):
+        number_counts(flux, 1 * u.deg**2, [24, 23])

@@ -1,0 +1,68 @@
+import pytest
+
+from miricigale.utils.exceptions import ConfigError
+from miricigale.workflow.config import StudyConfig, load_config, preset_names
+
+
+@pytest.mark.parametrize("quick", [False, True])
+def test_a_printed_configuration_comes_back_the_same(tmp_path, quick):
+    config = load_config("goodss", quick=quick)
+    path = tmp_path / "my.toml"
+    path.write_text(config.to_toml())
+    assert load_config(path) == config
+
+
+def test_presets_are_listed_without_their_variants():
+    assert preset_names() == ["goodss"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[detektor]\n", "unknown section .*detektor.*known: .*detector"),
+        ("[run]\nsead = 1\n", r"\[run\] does not know \['sead'\]; known: .*'seed'"),
+        ("[run]\nseed = 1.5\n", r"\[run\] seed must be of type int, got 1.5"),
+        ("[run]\nseed = true\n", r"\[run\] seed must be of type int, got True"),
+        ("[run]\nseed = -1\n", r"\[run\] seed must be at least 0, got -1"),
+        ("[pointing]\ndec = 95.0\n", r"\[pointing\] dec must be between -90 and 90, got 95.0"),
+        ("[pointing]\ndec = nan\n", r"\[pointing\] dec must be between"),
+        ("[fit]\naxes = 'huge'\n", r"\[fit\] axes must be one of \['fit', 'quick'\], got 'huge'"),
+        ("[fit]\nbands = ['acs.f606w']\n", r"\[fit\] depths must have one number per band \(1\)"),
+        ("[exposures]\nfilters = []\n", "at least one filter"),
+        ("[exposures]\nfilters = ['miri.f770w', 'miri.f770w']\n", "must not repeat"),
+        (
+            "[exposures]\nn_groups = [10]\n",
+            r"n_groups must have one number per filter \(6\), got 1",
+        ),
+        ("[photometry]\nregularization = '-1'\n", "regularization must be 'auto', 'yang2021'"),
+        ("run = 3\n", r"\[run\] must be a section, got 3"),
+        ("[run\n", "is not valid TOML"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_one_sentence(tmp_path, text, message):
+    path = tmp_path / "bad.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message) as info:
+        load_config(path)
+    assert "\n" not in str(info.value).split("TOML:")[0]
+
+
+def test_missing_files_and_presets_are_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"no configuration file .*absent\.toml"):
+        load_config(tmp_path / "absent.toml")
+    with pytest.raises(KeyError, match="no preset 'cosmos'; known: goodss"):
+        load_config("cosmos")
+    with pytest.raises(ConfigError, match="--quick belongs to presets"):
+        load_config(tmp_path / "absent.toml", quick=True)
+
+
+def test_overrides_win():
+    config = load_config("goodss", overrides={"run": {"seed": 5}, "sed": {"frac_agn": 0}})
+    assert config.run.seed == 5
+    assert config.sed.frac_agn == 0.0
+
+
+def test_defaults_describe_ceers():
+    config = StudyConfig()
+    assert len(config.exposures.filters) == 6
+    assert len(config.fit.bands) == 15
