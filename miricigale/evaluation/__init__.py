@@ -2,6 +2,8 @@
 
 from miricigale.evaluation.classes import CLASS_NAMES, class_fractions, classify
 from miricigale.evaluation.counts import (
+    PUBLISHED_LIGHT,
+    integrated_light,
     main_sequence_sfr,
     number_counts,
     sfr_to_infrared_luminosity,
@@ -20,12 +22,14 @@ from miricigale.evaluation.report import Report
 
 __all__ = [
     "CLASS_NAMES",
+    "PUBLISHED_LIGHT",
     "PhotozMetrics",
     "RecoveryMetrics",
     "Report",
     "class_fractions",
     "classify",
     "fraction_interval",
+    "integrated_light",
     "main_sequence_sfr",
     "match_truth",
     "number_counts",

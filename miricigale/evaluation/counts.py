@@ -5,7 +5,23 @@ import numpy as np
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["main_sequence_sfr", "number_counts", "sfr_to_infrared_luminosity"]
+__all__ = [
+    "PUBLISHED_LIGHT",
+    "integrated_light",
+    "main_sequence_sfr",
+    "number_counts",
+    "sfr_to_infrared_luminosity",
+]
+
+#: Integrated light of resolved galaxies, nW / m2 / sr: band, wavelength (um), value,
+#: errors down and up, reference.
+PUBLISHED_LIGHT = (
+    ("miri.f770w", 7.0, 0.49, 0.20, 0.20, "Metcalfe et al. 2003, A&A 407, 791 (ISO)"),
+    ("miri.f1500w", 15.0, 2.4, 0.5, 0.5, "Elbaz et al. 2002, A&A 384, 848 (ISO)"),
+    ("miri.f1500w", 15.0, 2.70, 0.62, 0.62, "Metcalfe et al. 2003, A&A 407, 791 (ISO)"),
+    ("miri.f2100w", 24.0, 1.9, 0.6, 0.6, "Papovich et al. 2004, ApJS 154, 70 (> 60 uJy)"),
+    ("miri.f2100w", 24.0, 2.7, 0.7, 1.1, "Papovich et al. 2004, ApJS 154, 70 (extrapolated)"),
+)
 
 
 def main_sequence_sfr(stellar_mass, age_of_universe):
@@ -80,3 +96,34 @@ def number_counts(flux, area, edges):
     n, _ = np.histogram(mag, edges)
     unit = 1 / (np.diff(edges) * area.to_value(u.deg**2)) / u.deg**2
     return n * unit, np.sqrt(n) * unit
+
+
+def integrated_light(flux, area, wavelength):
+    """
+    Surface brightness of all sources together.
+
+    Parameters
+    ----------
+    flux : `~astropy.units.Quantity`, shape (n,)
+        Fluxes; NaN is an error.
+    area : `~astropy.units.Quantity`
+        Solid angle that they fill.
+    wavelength : `~astropy.units.Quantity`
+        Wavelength (pivot) of the band.
+
+    Returns
+    -------
+    light, light_err : `~astropy.units.Quantity`
+        nu I_nu in nW / m2 / sr, and the Poisson error of the sources' number, weighted by
+        flux (cosmic variance is not in it).
+    """
+    if not np.all(np.isfinite(flux)):
+        raise argument_error(
+            "flux", "finite", f"{np.count_nonzero(~np.isfinite(flux))} that are not"
+        )
+    nu = wavelength.to(u.Hz, u.spectral())
+    unit = u.nW / u.m**2 / u.sr
+    return (
+        (nu * flux.sum() / area).to(unit),
+        (nu * np.sqrt((flux**2).sum()) / area).to(unit),
+    )

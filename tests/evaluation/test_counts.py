@@ -2,7 +2,12 @@ import astropy.units as u
 import numpy as np
 import pytest
 
-from miricigale.evaluation import main_sequence_sfr, number_counts, sfr_to_infrared_luminosity
+from miricigale.evaluation import (
+    integrated_light,
+    main_sequence_sfr,
+    number_counts,
+    sfr_to_infrared_luminosity,
+)
 
 
 def test_speagle_main_sequence_at_published_values():
@@ -27,3 +32,12 @@ def test_counts_conserve_sources():
     assert (error[0] / counts[0]).value == pytest.approx(1 / np.sqrt(2))
     with pytest.raises(ValueError, match="'edges' must be ascending magnitudes"):
         number_counts(flux, 1 * u.deg**2, [24, 23])
+
+
+def test_integrated_light_in_closed_form():
+    # 1 MJy/sr at 15 um is 1e-20 W/m2/Hz/sr times 1.9986e13 Hz, or 199.86 nW/m2/sr
+    light, error = integrated_light([4.0, 4.0] * u.Jy, 8e-6 * u.sr, 15 * u.um)
+    assert light.to_value(u.nW / u.m**2 / u.sr) == pytest.approx(199.86, rel=1e-4)
+    assert (error / light).to_value(u.one) == pytest.approx(1 / np.sqrt(2))
+    with pytest.raises(ValueError, match="'flux' must be finite, got 1 that are not"):
+        integrated_light([np.nan, 1] * u.Jy, 1 * u.sr, 15 * u.um)
