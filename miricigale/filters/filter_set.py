@@ -1,0 +1,155 @@
+"""Several filters at once."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.filters.filter import UNCOVERED, Filter, check_wave
+from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.units import FNU, WAVE, to_array
+
+__all__ = ["FilterSet"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class FilterSet:
+    """
+    An ordered set of filters.
+
+    Parameters
+    ----------
+    filters : iterable of `Filter` or str
+        Filters, or names of the library.
+
+    Raises
+    ------
+    ValueError
+        If a name is there twice, or there is no filter.
+
+    Examples
+    --------
+    >>> from miricigale.filters import FilterSet
+    >>> filters = FilterSet.from_names(["miri.f770w", "miri.f1000w"])
+    >>> filters.names
+    ('miri.f770w', 'miri.f1000w')
+    >>> import numpy as np
+    >>> filters.weights(np.linspace(5, 15, 50)).sum(axis=1)
+    array([1., 1.])
+    """
+
+    filters: tuple
+
+    def __post_init__(self):
+        items = [self.filters] if isinstance(self.filters, (str, Filter)) else self.filters
+        filters = tuple(f if isinstance(f, Filter) else Filter.from_name(f) for f in items)
+        names = [f.name for f in filters]
+        if not names or len(set(names)) < len(names):
+            raise argument_error("filters", "one or more filters of different names", names)
+        object.__setattr__(self, "filters", filters)
+
+    @classmethod
+    def from_names(cls, names):
+        """Make a set of filters of the library; see `Filter.from_name`."""
+        return cls(names)
+
+    @property
+    def names(self):
+        """Names, in order, as a tuple."""
+        return tuple(f.name for f in self.filters)
+
+    @property
+    def pivots(self):
+        """Pivot wavelengths, um, shape (n_filters,)."""
+        return u.Quantity([f.pivot for f in self.filters]).to(WAVE)
+
+    def __len__(self):
+        return len(self.filters)
+
+    def __iter__(self):
+        return iter(self.filters)
+
+    def __contains__(self, name):
+        return getattr(name, "name", name) in self.names
+
+    def __getitem__(self, key):
+        """The filter of a name or number; for a slice or a list of names, a set."""
+        if isinstance(key, slice):
+            return FilterSet(self.filters[key])
+        if isinstance(key, (list, tuple)):
+            return FilterSet([self[name] for name in key])
+        if isinstance(key, str):
+            if key not in self.names:
+                raise unknown_name("filter in this set", key, self.names)
+            return self.filters[self.names.index(key)]
+        return self.filters[key]
+
+    def __repr__(self):
+        return f"<FilterSet {', '.join(self.names)}>"
+
+    def weights(self, wave, *, tolerance=UNCOVERED):
+        """
+        Weights of the values of a spectrum in each band.
+
+        Parameters
+        ----------
+        wave : `~astropy.units.Quantity` or `~numpy.ndarray`, shape (n_wave,)
+            Strictly ascending observed wavelengths; an array without unit is in um.
+        tolerance : float, optional
+            Share of a band that may lie outside ``wave``; 1 gives a row of zeros for a
+            band that lies wholly outside.
+
+        Returns
+        -------
+        weights : `~numpy.ndarray`, shape (n_filters, n_wave)
+            Rows of sum 1: ``weights @ fnu`` are the photon-counting means, exact for
+            F_nu linear in wavelength between the points.
+
+        Raises
+        ------
+        ValueError
+            If ``wave`` does not ascend or leaves more of a band uncovered.
+        """
+        wave = check_wave(wave)
+        weights = np.zeros((len(self.filters), wave.size))
+        for row, band in zip(weights, self.filters, strict=True):
+            first, part = band._weights(wave, tolerance)
+            row[first : first + part.size] = part
+        return weights
+
+    def synthetic_fluxes(self, sed):
+        """
+        Mean flux densities of a spectrum; see `Filter.synthetic_flux`.
+
+        Parameters
+        ----------
+        sed : object
+            With ``wave`` and ``fnu``, quantities of one dimension.
+
+        Returns
+        -------
+        fluxes : `~astropy.units.Quantity`, shape (n_filters,)
+            In uJy.
+        """
+        fnu = to_array(sed.fnu, FNU, "sed.fnu", ndim=1)
+        return self.weights(sed.wave) @ fnu * FNU
+
+    def plot(self, ax=None, **kwargs):
+        """
+        Draw the throughputs, each to its peak.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to; the current axes if not given.
+        **kwargs
+            Passed to `~matplotlib.axes.Axes.plot`.
+
+        Returns
+        -------
+        ax : `~matplotlib.axes.Axes`
+        """
+        from miricigale.plotting.filters import plot_filters
+
+        curves = [(f.wave.value, f.throughput / f.throughput.max(), f.name) for f in self.filters]
+        return plot_filters(curves, ax=ax, **kwargs)

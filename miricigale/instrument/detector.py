@@ -1,0 +1,308 @@
+"""What the detector is: figures, non-linearity, flat field, bad and reference pixels."""
+
+import dataclasses
+import functools
+
+import numpy as np
+from numpy.polynomial import polynomial as poly
+from scipy.interpolate import RectBivariateSpline
+
+from miricigale.instrument.figures import filter_row, table
+from miricigale.instrument.siaf import aperture, imager_columns, shape_aperture
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.random import stream
+from miricigale.utils.units import frozen_array
+
+__all__ = [
+    "DetectorProperties",
+    "bad_pixel_mask",
+    "field_mask",
+    "flat_field",
+    "miri_detector",
+    "reference_pixel_mask",
+]
+
+# Our own detector is one and the same everywhere: its pixels are drawn with this seed
+_SEED = 56075
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DetectorProperties:
+    """
+    Figures of a detector.
+
+    Parameters
+    ----------
+    gain : float
+        Electrons per DN; one value for noise and photometric conversion.
+    read_noise : float
+        Of one frame, DN.
+    dark_current : float
+        Electrons per second.
+    full_well : float
+        Electrons.
+    bias : float
+        Level of an empty pixel, DN.
+    nonlinearity : tuple of float
+        Coefficients, lowest power first, of the polynomial that turns measured DN above
+        the bias into linear DN. The first must be 0 and the second 1.
+    ipc : tuple of float
+        Share of a pixel's signal seen by each horizontal, vertical and diagonal neighbour.
+    reference_columns : int
+        Columns without light on each side of the full frame.
+    pixel_pitch : float
+        In um.
+    cosmic_ray_flux : float
+        Hits per um2 per second.
+    adc_bits : int
+        Bits of the converter.
+
+    Raises
+    ------
+    ValueError
+        If a figure is not positive, or the non-linearity polynomial does not rise up to the
+        full well.
+    """
+
+    gain: float = 4.0
+    read_noise: float = 6.0
+    dark_current: float = 0.2
+    full_well: float = 210e3
+    bias: float = 11000.0
+    nonlinearity: tuple = (0.0, 1.0)
+    ipc: tuple = (0.0, 0.0, 0.0)
+    reference_columns: int = 4
+    pixel_pitch: float = 25.0
+    cosmic_ray_flux: float = 0.0
+    adc_bits: int = 16
+
+    def __post_init__(self):
+        for name in ("gain", "full_well", "pixel_pitch", "adc_bits"):
+            if not getattr(self, name) > 0:
+                raise argument_error(name, "positive", getattr(self, name))
+        for name in ("read_noise", "dark_current", "bias", "cosmic_ray_flux", "reference_columns"):
+            if not getattr(self, name) >= 0:
+                raise argument_error(name, "at least 0", getattr(self, name))
+        coefficients = tuple(float(c) for c in self.nonlinearity)
+        object.__setattr__(self, "nonlinearity", coefficients)
+        object.__setattr__(self, "ipc", tuple(float(c) for c in self.ipc))
+        if len(self.ipc) != 3:
+            raise argument_error("ipc", "three shares", self.ipc)
+        if len(coefficients) < 2 or coefficients[:2] != (0.0, 1.0):
+            raise argument_error(
+                "nonlinearity", "coefficients that begin with 0, 1", self.nonlinearity
+            )
+        slope = poly.polyval(
+            np.linspace(0, self.full_well / self.gain, 200), poly.polyder(coefficients)
+        )
+        if np.any(slope < 0.2):
+            raise argument_error("nonlinearity", "rising up to the full well", self.nonlinearity)
+
+    replace = dataclasses.replace
+
+    @property
+    def saturation_dn(self):
+        """Measured (non-linear) DN above the bias of a full well."""
+        return float(self.delinearize(self.full_well / self.gain))
+
+    @property
+    def cosmic_ray_rate(self):
+        """Hits per pixel per second."""
+        return self.cosmic_ray_flux * self.pixel_pitch**2
+
+    @property
+    def ipc_kernel(self):
+        """Interpixel capacitance, shape (3, 3), sum 1."""
+        horizontal, vertical, diagonal = self.ipc
+        centre = 1 - 2 * horizontal - 2 * vertical - 4 * diagonal
+        return np.array(
+            [
+                [diagonal, vertical, diagonal],
+                [horizontal, centre, horizontal],
+                [diagonal, vertical, diagonal],
+            ]
+        )
+
+    def linearize(self, dn):
+        """
+        Turn measured into linear signal.
+
+        Parameters
+        ----------
+        dn : array_like
+            Measured DN above the bias.
+
+        Returns
+        -------
+        linear : `~numpy.ndarray`
+            Linear DN above the bias, float64. Negative signals are left as they are.
+        """
+        dn = np.asarray(dn, dtype=float)
+        return np.where(dn > 0, poly.polyval(dn, self.nonlinearity), dn)
+
+    def delinearize(self, dn):
+        """
+        Turn linear into measured signal: the inverse of `linearize` (Newton's method).
+
+        Parameters
+        ----------
+        dn : array_like
+            Linear DN above the bias; beyond twice the full well, where the polynomial
+            means nothing, the measured signal rises in proportion.
+
+        Returns
+        -------
+        measured : `~numpy.ndarray`
+            Measured DN above the bias, float64; `linearize` gives ``dn`` back to 1e-6 DN
+            below twice the full well.
+        """
+        linear = np.asarray(dn, dtype=float)
+        top = 2 * self.full_well / self.gain
+        target = np.clip(linear, 0, top)
+        measured = target.copy()
+        derivative = poly.polyder(self.nonlinearity)
+        for _ in range(30):
+            step = (poly.polyval(measured, self.nonlinearity) - target) / poly.polyval(
+                measured, derivative
+            )
+            measured -= step
+            if np.all(np.abs(step) < 1e-9 * (1 + target)):
+                break
+        with np.errstate(divide="ignore", invalid="ignore"):
+            beyond = np.where(linear > top, measured * linear / top, measured)
+        return np.where(linear > 0, beyond, linear)
+
+
+@functools.cache
+def miri_detector():
+    """
+    The imager's detector.
+
+    Returns
+    -------
+    detector : `DetectorProperties`
+        In-flight figures of the user documentation; the non-linearity has the measured
+        size and a smooth form of our own.
+    """
+    return DetectorProperties(**table()["detector"])
+
+
+def _cut(full, shape, subarray):
+    """Cut a full-frame map to a sub-array, or its first rows and columns for another shape."""
+    part = shape_aperture(shape, subarray)
+    if part is not None:
+        return full[part.slices]
+    ny, nx = (int(n) for n in shape)
+    if not (0 < ny <= full.shape[0] and 0 < nx <= full.shape[1]):
+        raise argument_error("shape", f"at most {full.shape}", shape)
+    return full[:ny, :nx]
+
+
+@functools.cache
+def _flat_pixels():
+    return stream(_SEED, "flat", "pixels").standard_normal(aperture("FULL").shape, np.float32)
+
+
+@functools.cache
+def _full_flat(filter):
+    # pixels are the detector's own; what is smooth belongs to the filter as well
+    pixels = _flat_pixels()
+    n = miri_detector().reference_columns
+    x, y = (np.linspace(-1, 1, size) for size in pixels.shape[::-1])
+    # a spline through random values 150 pixels apart
+    knots = np.linspace(-1, 1, 8)
+    values = stream(_SEED, "flat", filter).standard_normal((8, 8))
+    smooth = RectBivariateSpline(knots, knots, values)(y, x)
+    smooth /= smooth.std()
+    flat = 1 + 0.01 * pixels + 0.004 * smooth - 0.01 * (x**2 + y[:, None] ** 2 - 2 / 3)
+    flat[:, n:-n] /= flat[:, n:-n].mean()
+    flat[:, :n] = flat[:, -n:] = 1
+    return frozen_array(flat, np.float32)
+
+
+def flat_field(filter, shape=None, *, subarray=None):
+    """
+    Relative response of the pixels: the same for the simulated detector and the reduction.
+
+    Parameters
+    ----------
+    filter : str
+        One of `~miricigale.instrument.imager_filters`.
+    shape : tuple of int, optional
+        ``(ny, nx)`` of a sub-array; any other shape means the first rows and columns of
+        the full frame, which is the default.
+    subarray : str, optional
+        Name of the sub-array.
+
+    Returns
+    -------
+    flat : `~numpy.ndarray` of float32, shape (ny, nx)
+        Mean 1 over the full frame; 1 % from pixel to pixel, as much across the field;
+        1 in the reference columns. Read-only, and always the same: it is our own,
+        drawn once, and no measurement.
+    """
+    filter_row(filter)
+    return _cut(_full_flat(str(filter)), shape, subarray)
+
+
+@functools.cache
+def _full_bad_pixels():
+    shape = aperture("FULL").shape
+    rng = stream(_SEED, "bad pixels")
+    mask = rng.random(shape) < 7e-4
+    # and some clusters of a few neighbours
+    rows, columns = (rng.integers(1, n - 2, size=60) for n in shape)
+    for row, column in zip(rows, columns, strict=True):
+        mask[row : row + 2, column : column + 3] |= rng.random((2, 3)) < 0.8
+    n = miri_detector().reference_columns
+    mask[:, :n] = mask[:, -n:] = False
+    return frozen_array(mask, bool)
+
+
+def bad_pixel_mask(shape=None, *, subarray=None):
+    """
+    Pixels that never work, about 0.1 %.
+
+    Parameters are those of `flat_field` without the filter.
+
+    Returns
+    -------
+    mask : `~numpy.ndarray` of bool, shape (ny, nx)
+        True where bad. Read-only, and always the same; reference pixels are not bad.
+    """
+    return _cut(_full_bad_pixels(), shape, subarray)
+
+
+def reference_pixel_mask(shape=None, *, subarray=None):
+    """
+    Pixels that see no light: four columns on each side of the full frame.
+
+    Parameters are those of `flat_field` without the filter.
+
+    Returns
+    -------
+    mask : `~numpy.ndarray` of bool, shape (ny, nx)
+    """
+    mask = np.zeros(aperture("FULL").shape, dtype=bool)
+    n = miri_detector().reference_columns
+    mask[:, :n] = mask[:, -n:] = True
+    return _cut(mask, shape, subarray)
+
+
+def field_mask(shape=None, *, subarray=None):
+    """
+    Pixels that see the sky through the imaging filters.
+
+    The others lie behind the masks of the coronagraphs (or are reference pixels). This
+    is the rectangle of the aperture MIRIM_ILLUM.
+
+    Parameters are those of `flat_field` without the filter.
+
+    Returns
+    -------
+    mask : `~numpy.ndarray` of bool, shape (ny, nx)
+        True where the sky is seen.
+    """
+    mask = np.zeros(aperture("FULL").shape, dtype=bool)
+    mask[:, slice(*imager_columns())] = True
+    return _cut(mask, shape, subarray)

@@ -1,0 +1,28 @@
+"""The table of published figures that the modules of this room read."""
+
+import functools
+import tomllib
+
+from miricigale.refdata import locate
+from miricigale.utils.exceptions import unknown_name
+
+__all__ = ["imager_filters"]
+
+
+@functools.cache
+def table():
+    """The whole of ``imager.toml`` as a dict."""
+    return tomllib.loads(locate("instrument.imager").read_text())
+
+
+def imager_filters():
+    """Names of the nine imaging filters, blue to red."""
+    return tuple(f"miri.{name}" for name in table()["filters"])
+
+
+def filter_row(name):
+    """The figures of one filter; `KeyError` with the known names for any other."""
+    try:
+        return table()["filters"][str(name).removeprefix("miri.")]
+    except KeyError:
+        raise unknown_name("imaging filter", name, imager_filters()) from None

@@ -1,0 +1,245 @@
+"""
+Where the pixels of the MIRI imager look.
+
+The chain is that of the Science Instrument Aperture File: pixel -> ideal plane (a
+polynomial of degree 4) -> telescope frame V2, V3 -> sky (rotations of the sphere). Pixels
+are 0-based here, with integers at their centres.
+"""
+
+import dataclasses
+import functools
+import tomllib
+
+import numpy as np
+
+from miricigale.refdata import locate
+from miricigale.utils.exceptions import argument_error, unknown_name
+
+__all__ = [
+    "Aperture",
+    "aperture",
+    "attitude_matrix",
+    "imager_columns",
+    "pixel_to_v2v3",
+    "subarrays",
+    "v2v3_to_sky",
+]
+
+_ARCSEC = np.pi / 180 / 3600
+
+
+@functools.cache
+def _table():
+    return tomllib.loads(locate("instrument.siaf").read_text())
+
+
+@dataclasses.dataclass(frozen=True)
+class Aperture:
+    """
+    A sub-array of the imager.
+
+    Parameters
+    ----------
+    name : str
+        ``"FULL"``, ``"BRIGHTSKY"``, ``"SUB256"``, ``"SUB128"`` or ``"SUB64"``.
+    origin : tuple of int
+        Column and row of its first pixel in the full frame, 0-based.
+    shape : tuple of int
+        Rows and columns, ``(ny, nx)``.
+    reference : tuple of float
+        Reference pixel ``(x, y)`` in the sub-array, 0-based.
+    v2, v3 : float
+        Telescope coordinates of the reference pixel, arcsec.
+    v3_ideal_y_angle : float
+        Angle of the ideal +y axis from +V3 towards +V2, deg.
+    parity : int
+        -1 when ideal +x points to -V2.
+    """
+
+    name: str
+    origin: tuple
+    shape: tuple
+    reference: tuple
+    v2: float
+    v3: float
+    v3_ideal_y_angle: float
+    parity: int
+
+    @property
+    def slices(self):
+        """Slices ``[y, x]`` that cut the sub-array out of a full frame."""
+        (x, y), (ny, nx) = self.origin, self.shape
+        return slice(y, y + ny), slice(x, x + nx)
+
+
+def subarrays():
+    """Names of the sub-arrays, ``"FULL"`` first."""
+    return tuple(_table()["subarrays"])
+
+
+def imager_columns():
+    """First and last (excluded) column of the full frame that sees the sky through the filters."""
+    return tuple(_table()["imager_columns"])
+
+
+@functools.cache
+def aperture(name="FULL"):
+    """
+    Look up a sub-array.
+
+    Parameters
+    ----------
+    name : str, optional
+        One of `subarrays`.
+
+    Returns
+    -------
+    aperture : `Aperture`
+
+    Raises
+    ------
+    KeyError
+        If there is no such sub-array; the message lists the known ones.
+    """
+    table = _table()
+    try:
+        row = table["subarrays"][name]
+    except KeyError:
+        raise unknown_name("sub-array", name, table["subarrays"]) from None
+    nx, ny = row["size"]
+    return Aperture(
+        name=name,
+        origin=tuple(row["origin"]),
+        shape=(ny, nx),
+        reference=(row["reference"][0] - 1, row["reference"][1] - 1),
+        v2=row["v2"],
+        v3=row["v3"],
+        v3_ideal_y_angle=table["v3_ideal_y_angle"],
+        parity=table["parity"],
+    )
+
+
+def _ideal(x, y):
+    """Ideal coordinates (arcsec) of pixel offsets to the reference of the full frame."""
+    # row i: the coefficients of x^(i-j) y^j
+    sums = []
+    for axis in ("x_ideal", "y_ideal"):
+        total = np.zeros(np.broadcast(x, y).shape)
+        for i, row in enumerate(_table()[axis]):
+            for j, coefficient in enumerate(row):
+                total = total + coefficient * x ** (i - j) * y**j
+        sums.append(total)
+    return sums
+
+
+def pixel_to_v2v3(x, y, *, subarray="FULL"):
+    """
+    Telescope coordinates of pixels.
+
+    Parameters
+    ----------
+    x, y : array_like
+        Pixel positions in the sub-array, 0-based.
+    subarray : str, optional
+        One of `subarrays`. All use the polynomial of the full frame, to which the
+        sub-arrays' own expansions in the SIAF agree to 0.001 mas.
+
+    Returns
+    -------
+    v2, v3 : `~numpy.ndarray`
+        In arcsec.
+    """
+    full, part = aperture("FULL"), aperture(subarray)
+    x = np.asarray(x, dtype=float) + part.origin[0] - full.reference[0]
+    y = np.asarray(y, dtype=float) + part.origin[1] - full.reference[1]
+    x_ideal, y_ideal = _ideal(x, y)
+    angle = np.radians(full.v3_ideal_y_angle)
+    cos, sin = np.cos(angle), np.sin(angle)
+    v2 = full.v2 + full.parity * x_ideal * cos + y_ideal * sin
+    v3 = full.v3 - full.parity * x_ideal * sin + y_ideal * cos
+    return v2, v3
+
+
+def _rotation(axis, angle):
+    """Right-handed rotation of vectors by ``angle`` (rad) about a coordinate axis."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    matrix = np.eye(3)
+    a, b = {0: (1, 2), 1: (2, 0), 2: (0, 1)}[axis]
+    matrix[a, a] = matrix[b, b] = cos
+    matrix[a, b], matrix[b, a] = -sin, sin
+    return matrix
+
+
+def attitude_matrix(ra, dec, roll, *, v2, v3):
+    """
+    Rotation from the telescope frame to the sky.
+
+    Parameters
+    ----------
+    ra, dec : float
+        Where the point (v2, v3) looks, deg.
+    roll : float
+        Position angle of +V3 there, east of north, deg.
+    v2, v3 : float
+        Telescope coordinates of the point, arcsec.
+
+    Returns
+    -------
+    matrix : `~numpy.ndarray`, shape (3, 3)
+        Multiplies unit vectors of the telescope frame.
+
+    References
+    ----------
+    JWST-STScI-001550, "Description and use of the JWST Science Instrument Aperture File".
+    """
+    return (
+        _rotation(2, np.radians(ra))
+        @ _rotation(1, -np.radians(dec))
+        @ _rotation(0, -np.radians(roll))
+        @ _rotation(1, v3 * _ARCSEC)
+        @ _rotation(2, -v2 * _ARCSEC)
+    )
+
+
+def unit_vector(longitude, latitude):
+    """Unit vectors of angles in radians, the three components first."""
+    cos = np.cos(latitude)
+    return np.stack([cos * np.cos(longitude), cos * np.sin(longitude), np.sin(latitude)])
+
+
+def v2v3_to_sky(v2, v3, matrix):
+    """
+    Sky positions of telescope coordinates.
+
+    Parameters
+    ----------
+    v2, v3 : array_like
+        In arcsec.
+    matrix : `~numpy.ndarray`, shape (3, 3)
+        From `attitude_matrix`.
+
+    Returns
+    -------
+    ra, dec : `~numpy.ndarray`
+        In deg, ra in 0-360.
+    """
+    vector = unit_vector(np.asarray(v2) * _ARCSEC, np.asarray(v3) * _ARCSEC)
+    vector = np.tensordot(matrix, vector, axes=1)
+    ra = np.degrees(np.arctan2(vector[1], vector[0])) % 360
+    dec = np.degrees(np.arctan2(vector[2], np.hypot(vector[0], vector[1])))
+    return ra, dec
+
+
+def shape_aperture(shape, subarray):
+    """The aperture named, or the one that ``shape`` stands for, or None for a shape of none."""
+    if subarray is not None:
+        found = aperture(subarray)
+        if shape is not None and tuple(shape) != found.shape:
+            raise argument_error("shape", f"{found.shape} for {subarray!r}", tuple(shape))
+        return found
+    if shape is None:
+        return aperture("FULL")
+    for name in subarrays():
+        if aperture(name).shape == tuple(shape):
+            return aperture(name)
+    return None

@@ -1,0 +1,329 @@
+"""World coordinates of the imager and of mosaics, as `astropy.wcs.WCS`."""
+
+import functools
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.wcs import WCS, Sip
+from scipy.interpolate import RectBivariateSpline
+
+from miricigale.instrument.siaf import (
+    aperture,
+    attitude_matrix,
+    pixel_to_v2v3,
+    unit_vector,
+    v2v3_to_sky,
+)
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import to_array
+
+__all__ = [
+    "imager_wcs",
+    "mosaic_wcs",
+    "north_up_wcs",
+    "pixel_area_map",
+    "pixel_to_sky",
+    "tangent_offset",
+]
+
+_SIP_ORDER = 5
+_SIP_INVERSE_ORDER = 8
+
+
+def scalar_position(position, name):
+    """Check that ``position`` is one SkyCoord and return its ICRS ra, dec in deg."""
+    if not isinstance(position, SkyCoord) or not position.isscalar:
+        raise argument_error(name, "one SkyCoord", repr(position))
+    position = position.icrs
+    return float(position.ra.deg), float(position.dec.deg)
+
+
+def pixel_to_sky(x, y, pointing, roll, *, subarray="FULL"):
+    """
+    Sky positions of pixels by the full spherical transformation, without a fit.
+
+    Parameters
+    ----------
+    x, y : array_like
+        Pixel positions, 0-based.
+    pointing : `~astropy.coordinates.SkyCoord`
+        Where the reference pixel of the sub-array looks.
+    roll : `~astropy.units.Quantity`
+        Position angle of +V3 at the reference pixel, east of north.
+    subarray : str, optional
+        One of `~miricigale.instrument.subarrays`.
+
+    Returns
+    -------
+    sky : `~astropy.coordinates.SkyCoord`
+    """
+    ra, dec = scalar_position(pointing, "pointing")
+    roll = float(to_array(roll, u.deg, "roll", ndim=0))
+    part = aperture(subarray)
+    # the reference through the polynomial, so that it looks exactly at the pointing
+    v2, v3 = pixel_to_v2v3(*part.reference, subarray=subarray)
+    matrix = attitude_matrix(ra, dec, roll, v2=float(v2), v3=float(v3))
+    return SkyCoord(*v2v3_to_sky(*pixel_to_v2v3(x, y, subarray=subarray), matrix), unit="deg")
+
+
+def tangent_plane(ra, dec):
+    """Gnomonic coordinates (deg) about (0, 0) of positions in deg near it."""
+    vector = unit_vector(np.radians(ra), np.radians(dec))
+    return np.degrees(vector[1] / vector[0]), np.degrees(vector[2] / vector[0])
+
+
+def _powers(order, *, lowest):
+    return [(i, n - i) for n in range(lowest, order + 1) for i in range(n, -1, -1)]
+
+
+def _scaled_fit(x, y, values, order, *, lowest=1):
+    """Least-squares polynomial without the terms below ``lowest``, as a (order+1)^2 table."""
+    sx, sy = np.abs(x).max(), np.abs(y).max()
+    powers = _powers(order, lowest=lowest)
+    design = np.stack([(x / sx) ** i * (y / sy) ** j for i, j in powers], axis=1)
+    solution = np.linalg.lstsq(design, values, rcond=None)[0]
+    tables = np.zeros((values.shape[1], order + 1, order + 1))
+    for (i, j), row in zip(powers, solution, strict=True):
+        tables[:, i, j] = row / (sx**i * sy**j)
+    return tables
+
+
+@functools.cache
+def _sip(subarray):
+    """
+    CD matrix at roll 0 (deg / pixel) and SIP tables of a sub-array.
+
+    In the tangent plane at the reference pixel the sky is a rotation of the telescope
+    frame, so one fit serves every pointing and roll.
+    """
+    part = aperture(subarray)
+    ny, nx = part.shape
+    # Chebyshev nodes: the fit is as good at the edge as inside
+    nodes = np.cos(np.pi * (np.arange(40) + 0.5) / 40)
+    gx, gy = np.meshgrid((nx / 2) * (1 + nodes) - 0.5, (ny / 2) * (1 + nodes) - 0.5)
+    v2_ref, v3_ref = pixel_to_v2v3(*part.reference, subarray=subarray)
+    matrix = attitude_matrix(0.0, 0.0, 0.0, v2=float(v2_ref), v3=float(v3_ref))
+    ra, dec = v2v3_to_sky(*pixel_to_v2v3(gx, gy, subarray=subarray), matrix)
+    xi, eta = tangent_plane(ra, dec)
+    dx, dy = (gx - part.reference[0]).ravel(), (gy - part.reference[1]).ravel()
+    forward = _scaled_fit(dx, dy, np.stack([xi.ravel(), eta.ravel()], axis=1), _SIP_ORDER)
+    cd = np.array([[t[1, 0], t[0, 1]] for t in forward])
+    forward[:, 1, 0] = forward[:, 0, 1] = 0
+    a, b = np.tensordot(np.linalg.inv(cd), forward, axes=1)
+    # the inverse: pixel offsets as corrections of the linear ones
+    plane = np.linalg.inv(cd) @ np.stack([xi.ravel(), eta.ravel()])
+    shift = np.stack([dx - plane[0], dy - plane[1]], axis=1)
+    ap, bp = _scaled_fit(plane[0], plane[1], shift, _SIP_INVERSE_ORDER)
+    return cd, a, b, ap, bp
+
+
+def _rotate(angle):
+    """Tangent plane (east, north) coordinates when its axes turn by ``angle`` (deg) east of north."""
+    cos, sin = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    return np.array([[cos, sin], [-sin, cos]])
+
+
+def imager_wcs(pointing, roll, *, subarray="FULL"):
+    """
+    World coordinates of an exposure, as TAN-SIP.
+
+    Parameters
+    ----------
+    pointing : `~astropy.coordinates.SkyCoord`
+        Where the reference pixel of the sub-array looks.
+    roll : `~astropy.units.Quantity`
+        Position angle of +V3 at the reference pixel, east of north.
+    subarray : str, optional
+        One of `~miricigale.instrument.subarrays`.
+
+    Returns
+    -------
+    wcs : `~astropy.wcs.WCS`
+        With ``pixel_shape`` (nx, ny). It equals the full transformation (`pixel_to_sky`)
+        to 1e-5 mas in every pixel; the reference pixel is exact.
+
+    Raises
+    ------
+    ValueError
+        If ``pointing`` is not one position.
+    KeyError
+        If there is no such sub-array.
+
+    References
+    ----------
+    Shupe et al. 2005, ASP Conf. 347, 491 (SIP).
+    """
+    ra, dec = scalar_position(pointing, "pointing")
+    roll = float(to_array(roll, u.deg, "roll", ndim=0, finite=True))
+    part = aperture(subarray)
+    cd, a, b, ap, bp = _sip(subarray)
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = ["RA---TAN-SIP", "DEC--TAN-SIP"]
+    wcs.wcs.cunit = ["deg", "deg"]
+    wcs.wcs.crval = [ra, dec]
+    wcs.wcs.crpix = [part.reference[0] + 1, part.reference[1] + 1]
+    wcs.wcs.cd = _rotate(roll) @ cd
+    wcs.wcs.radesys = "ICRS"
+    wcs.sip = Sip(a, b, ap, bp, wcs.wcs.crpix)
+    wcs.pixel_shape = part.shape[::-1]
+    wcs.wcs.set()
+    return wcs
+
+
+def tangent_offset(pointing, x_offset, y_offset, pa):
+    """
+    Move along axes turned on the sky.
+
+    Parameters
+    ----------
+    pointing : `~astropy.coordinates.SkyCoord`
+        Where the movement starts.
+    x_offset, y_offset : `~astropy.units.Quantity`
+        Offsets in the tangent plane; +x lies 90 deg west of +y, as in the ideal frame of
+        the imager.
+    pa : `~astropy.units.Quantity`
+        Position angle of +y, east of north.
+
+    Returns
+    -------
+    position : `~astropy.coordinates.SkyCoord`
+    """
+    ra, dec = (np.radians(angle) for angle in scalar_position(pointing, "pointing"))
+    x = to_array(x_offset, u.rad, "x_offset")
+    y = to_array(y_offset, u.rad, "y_offset")
+    pa = float(to_array(pa, u.rad, "pa", ndim=0))
+    east = -x * np.cos(pa) + y * np.sin(pa)
+    north = x * np.sin(pa) + y * np.cos(pa)
+    radial = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    to_east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    to_north = np.cross(radial, to_east)
+    vector = radial + np.multiply.outer(east, to_east) + np.multiply.outer(north, to_north)
+    return SkyCoord(
+        np.arctan2(vector[..., 1], vector[..., 0]),
+        np.arctan2(vector[..., 2], np.hypot(vector[..., 0], vector[..., 1])),
+        unit="rad",
+    )
+
+
+def pixel_area_map(wcs, shape):
+    """
+    Solid angle of each pixel.
+
+    Parameters
+    ----------
+    wcs : `~astropy.wcs.WCS`
+        Two celestial axes, distorted or not.
+    shape : tuple of int
+        ``(ny, nx)``.
+
+    Returns
+    -------
+    area : `~numpy.ndarray`, shape (ny, nx)
+        In sr. The Jacobian of the WCS on a coarse grid, joined by bicubic splines.
+    """
+    ny, nx = shape
+    nodes = [np.linspace(0, n - 1, min(max(n, 6), 33)) for n in (ny, nx)]
+    x, y = np.meshgrid(nodes[1], nodes[0])
+
+    def direction(dx, dy):
+        ra, dec = wcs.all_pix2world((x + dx).ravel(), (y + dy).ravel(), 0)
+        return unit_vector(np.radians(ra), np.radians(dec))
+
+    step = 0.5
+    along_x = (direction(step, 0) - direction(-step, 0)) / (2 * step)
+    along_y = (direction(0, step) - direction(0, -step)) / (2 * step)
+    area = np.linalg.norm(np.cross(along_x, along_y, axis=0), axis=0).reshape(x.shape)
+    return RectBivariateSpline(nodes[0], nodes[1], area)(np.arange(ny), np.arange(nx))
+
+
+def north_up_wcs(center, pixel_scale, shape):
+    """
+    Undistorted gnomonic coordinates with north up and east left.
+
+    Parameters
+    ----------
+    center : `~astropy.coordinates.SkyCoord`
+        Position of the centre of the image.
+    pixel_scale : `~astropy.units.Quantity`
+        Side of a pixel.
+    shape : tuple of int
+        ``(ny, nx)``.
+
+    Returns
+    -------
+    wcs : `~astropy.wcs.WCS`
+        With ``pixel_shape`` (nx, ny).
+    """
+    ra, dec = scalar_position(center, "center")
+    scale = float(to_array(pixel_scale, u.deg, "pixel_scale", ndim=0))
+    if not scale > 0:
+        raise argument_error("pixel_scale", "positive", pixel_scale)
+    ny, nx = (int(n) for n in shape)
+    if ny < 1 or nx < 1:
+        raise argument_error("shape", "two positive integers", shape)
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    wcs.wcs.cunit = ["deg", "deg"]
+    wcs.wcs.crval = [ra, dec]
+    wcs.wcs.crpix = [(nx + 1) / 2, (ny + 1) / 2]
+    wcs.wcs.cdelt = [-scale, scale]
+    wcs.wcs.radesys = "ICRS"
+    wcs.pixel_shape = (nx, ny)
+    wcs.wcs.set()
+    return wcs
+
+
+def mosaic_wcs(exposures, pixel_scale, *, margin=0 * u.arcsec):
+    """
+    The smallest north-up grid that holds every pixel of the exposures.
+
+    Parameters
+    ----------
+    exposures : iterable of `~miricigale.instrument.Exposure` or `~astropy.wcs.WCS`
+        What is to be covered; a WCS must have its ``pixel_shape``.
+    pixel_scale : `~astropy.units.Quantity`
+        Side of a pixel of the mosaic.
+    margin : `~astropy.units.Quantity`, optional
+        Rim added on each side.
+
+    Returns
+    -------
+    wcs : `~astropy.wcs.WCS`
+        With ``pixel_shape`` (nx, ny).
+
+    Raises
+    ------
+    ValueError
+        If there are no exposures, or a WCS has no shape.
+    """
+    wcss = [getattr(item, "wcs", item) if not isinstance(item, WCS) else item for item in exposures]
+    if not wcss:
+        raise argument_error("exposures", "at least one exposure", "none")
+    ra, dec = [], []
+    for wcs in wcss:
+        if wcs.pixel_shape is None:
+            raise argument_error("exposures", "WCSs with a pixel_shape", "one without")
+        nx, ny = wcs.pixel_shape
+        # distorted edges bulge between the corners
+        tx, ty = np.linspace(-0.5, nx - 0.5, 17), np.linspace(-0.5, ny - 0.5, 17)
+        x = np.concatenate([tx, tx, np.full(17, -0.5), np.full(17, nx - 0.5)])
+        y = np.concatenate([np.full(17, -0.5), np.full(17, ny - 0.5), ty, ty])
+        world = wcs.all_pix2world(x, y, 0)
+        ra.append(world[0])
+        dec.append(world[1])
+    ra, dec = np.concatenate(ra), np.concatenate(dec)
+    mean = unit_vector(np.radians(ra), np.radians(dec)).mean(axis=1)
+    start = SkyCoord(
+        np.arctan2(mean[1], mean[0]), np.arctan2(mean[2], np.hypot(mean[0], mean[1])), unit="rad"
+    )
+    rim = float(to_array(margin, u.arcsec, "margin", ndim=0))
+    scale = float(to_array(pixel_scale, u.arcsec, "pixel_scale", ndim=0))
+    # twice: the second time about the middle of the box that the first found
+    for _ in range(2):
+        grid = north_up_wcs(start, pixel_scale, (1, 1))
+        x, y = grid.all_world2pix(ra, dec, 0)
+        middle = (x.min() + x.max()) / 2, (y.min() + y.max()) / 2
+        start = SkyCoord(*grid.all_pix2world(*middle, 0), unit="deg")
+    shape = [int(np.ceil(np.ptp(t) + 2 * rim / scale)) for t in (y, x)]
+    return north_up_wcs(start, pixel_scale, shape)

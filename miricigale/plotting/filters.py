@@ -1,0 +1,30 @@
+"""Filter curves."""
+
+from miricigale.plotting.axes import resolve_axes
+
+__all__ = ["plot_filters"]
+
+
+def plot_filters(curves, ax=None, **kwargs):
+    """
+    Draw filter curves.
+
+    Parameters
+    ----------
+    curves : iterable of tuple
+        Wavelength (um), throughput and name of each.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to; the current axes if not given.
+    **kwargs
+        Passed to `~matplotlib.axes.Axes.plot`.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    ax = resolve_axes(ax)
+    for wave, throughput, name in curves:
+        ax.plot(wave, throughput, **{"label": name, **kwargs})
+    ax.set_xlabel("wavelength (µm)")
+    ax.set_ylabel("throughput")
+    return ax

@@ -1,0 +1,216 @@
+"""Passbands against closed forms, published pivots and synphot."""
+
+from types import SimpleNamespace
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.modeling.physical_models import BlackBody
+from astropy.tests.helper import assert_quantity_allclose
+from numpy.testing import assert_allclose
+
+from miricigale.filters import Filter
+from miricigale.utils.exceptions import DataError
+
+PIVOTS = {  # SVO and STScI, um
+    "miri.f560w": 5.635,
+    "miri.f770w": 7.639,
+    "miri.f1000w": 9.953,
+    "miri.f1130w": 11.308,
+    "miri.f1280w": 12.810,
+    "miri.f1500w": 15.064,
+    "miri.f1800w": 17.984,
+    "miri.f2100w": 20.795,
+    "miri.f2550w": 25.364,
+    "wfc3.f125w": 1.2486,
+    "wfc3.f160w": 1.5369,
+    "acs.f606w": 0.5921,
+    "acs.f814w": 0.8057,
+    "nircam.f444w": 4.4037,
+}
+
+
+def box(low=8.0, high=12.0, name="box"):
+    return Filter([low, high] * u.um, [1, 1], name=name)
+
+
+def spectrum(wave, fnu):
+    return SimpleNamespace(wave=wave * u.um, fnu=fnu * u.uJy)
+
+
+@pytest.mark.parametrize("name", PIVOTS)
+def test_pivots_are_the_published_ones(name):
+    assert_quantity_allclose(Filter.from_name(name).pivot, PIVOTS[name] * u.um, rtol=6e-4)
+    if name.startswith("miri"):
+        assert abs(Filter.from_name(name).pivot.value - PIVOTS[name]) < 0.005
+
+
+def test_box_has_the_closed_form_wavelengths():
+    band = box()
+    # int lam dlam / int dlam / lam, and int dlam / int dlam / lam
+    assert_quantity_allclose(band.pivot, np.sqrt(40 / np.log(1.5)) * u.um, rtol=1e-6)
+    assert_quantity_allclose(band.effective_wavelength, 4 / np.log(1.5) * u.um, rtol=1e-6)
+    assert_quantity_allclose(band.width, 4 * u.um, rtol=1e-5)
+
+
+def test_flux_through_a_box_has_the_closed_form():
+    # F_nu = lam through a box: int dlam / int dlam / lam, from two points only
+    sed = spectrum(np.array([1.0, 100.0]), np.array([1.0, 100.0]))
+    assert_quantity_allclose(box().synthetic_flux(sed), 4 / np.log(1.5) * u.uJy, rtol=1e-6)
+
+
+def test_flat_spectrum_has_its_flux_in_every_band():
+    sed = spectrum(np.geomspace(0.05, 400, 37), np.full(37, 3.0))
+    for name in Filter.names():
+        assert_quantity_allclose(Filter.from_name(name).synthetic_flux(sed), 3 * u.uJy, rtol=1e-12)
+
+
+def test_weights_equal_dense_integration():
+    rng = np.random.default_rng(1)
+    wave = np.sort(rng.uniform(6, 24, 60))
+    fnu = rng.uniform(0, 10, 60)
+    band = Filter(np.sort(rng.uniform(8, 20, 25)) * u.um, rng.uniform(0, 1, 25), name="random")
+    edges = band.wave.value
+    lam = np.linspace(edges[0], edges[-1], 2_000_001)
+    photons = np.interp(lam, edges, band.throughput) / lam
+    dense = np.trapezoid(photons * np.interp(lam, wave, fnu), lam) / np.trapezoid(photons, lam)
+    assert_allclose(band.weights(wave) @ fnu, dense, rtol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["miri.f770w", "wfc3.f160w", "irac.ch2", "megacam.u"])
+def test_flux_equals_that_of_synphot(name):
+    from synphot import Observation, SourceSpectrum
+    from synphot.models import Empirical1D
+
+    band = Filter.from_name(name)
+    wave = np.geomspace(band.wave.value[0] * 0.9, band.wave.value[-1] * 1.1, 20_000)
+    fnu = (1 + wave**1.5) * (1 + 0.3 * np.sin(40 * np.log(wave)))
+    source = SourceSpectrum(Empirical1D, points=wave * u.um, lookup_table=fnu * u.uJy)
+    expected = Observation(source, band.to_synphot(), force="none").effstim(u.uJy)
+    assert_quantity_allclose(band.synthetic_flux(spectrum(wave, fnu)), expected, rtol=1e-4)
+
+
+def test_there_and_back_through_synphot():
+    band = Filter.from_name("miri.f1000w")
+    back = Filter.from_synphot(band.to_synphot(), name="miri.f1000w")
+    assert_quantity_allclose(back.pivot, band.pivot, rtol=1e-9)
+    assert_allclose(back.throughput, band.throughput, atol=1e-12)
+
+
+def test_curves_end_in_zero_and_carry_no_more_zeros():
+    for name in Filter.names():
+        throughput = Filter.from_name(name).throughput
+        assert throughput[0] == 0 == throughput[-1]
+        assert throughput[1] > 0
+        assert throughput[-2] > 0
+
+
+def test_edge_of_a_cut_curve_is_a_step():
+    # F2550W stops at 3 % of its peak at 29.99 um: padding must not add light beyond
+    band = Filter.from_name("miri.f2550w")
+    assert_allclose(band.throughput[-2] / band.throughput.max(), 0.03, atol=0.005)
+    assert band.wave.value[-1] < 29.9941
+
+
+def test_values_never_change():
+    band = Filter.from_name("miri.f770w")
+    with pytest.raises(ValueError, match="read-only"):
+        band.throughput[0] = 1
+    with pytest.raises(ValueError, match="read-only"):
+        band.wave.value[0] = 1
+    with pytest.raises(AttributeError):
+        band.name = "other"
+
+
+def test_a_filter_cites_its_source():
+    meta = Filter.from_name("miri.f770w").meta
+    assert "astro-sedpy" in meta["source"]
+    assert any("sedpy" in text for text in meta["citations"])
+
+
+def test_catalogue_convention_gives_the_true_flux_of_its_reference_spectrum():
+    for name in ("irac.ch1", "irac.ch4", "mips.24"):
+        band = Filter.from_name(name)
+        nominal = band.meta["reference_wavelength"]
+        wave = np.geomspace(band.wave.value[0] / 1.01, band.wave.value[-1] * 1.01, 5000)
+
+        def reference(lam, name=name):
+            if name.startswith("irac"):  # nu F_nu constant
+                return lam
+            return BlackBody(1e4 * u.K)(lam * u.um).value * 1e6
+
+        flux = band.synthetic_flux(spectrum(wave, reference(wave))) * band.catalogue_factor
+        assert_quantity_allclose(flux, reference(np.array(nominal)) * u.uJy, rtol=5e-5)
+    assert Filter.from_name("miri.f770w").catalogue_factor == 1
+
+
+def test_spectrum_that_does_not_cover_the_band_is_refused():
+    with pytest.raises(ValueError, match=r"leaves .*% of filter 'box'"):
+        box().synthetic_flux(spectrum(np.array([5.0, 11.0]), np.ones(2)))
+    with pytest.raises(ValueError, match=r"leaves 100.00% of filter 'box'"):
+        box().synthetic_flux(spectrum(np.array([50.0, 110.0]), np.ones(2)))
+    # less than 1e-4 of the weight is missing
+    sed = spectrum(np.array([8.0001, 20.0]), np.full(2, 7.0))
+    assert_quantity_allclose(box().synthetic_flux(sed), 7 * u.uJy)
+
+
+@pytest.mark.parametrize(
+    ("wave", "throughput", "message"),
+    [
+        ([2, 1] * u.um, [1, 1], "'wave' must be positive and strictly ascending"),
+        ([1, 2] * u.um, [1, -1], "'throughput' must be not negative"),
+        ([1, 2] * u.um, [0, 0], "'throughput' must be not negative, and somewhere positive"),
+        ([1, 2, 3] * u.um, [1, 1], "'throughput' must be as many values as 'wave'"),
+        ([1, 2] * u.um, [1, np.nan], "'throughput' must be finite"),
+    ],
+)
+def test_rejects_what_is_no_curve(wave, throughput, message):
+    with pytest.raises(ValueError, match=message):
+        Filter(wave, throughput, name="bad")
+
+
+def test_rejects_wrong_units():
+    with pytest.raises(u.UnitsError, match="'wave' must be"):
+        Filter([1, 2] * u.K, [1, 1], name="bad")
+    with pytest.raises(u.UnitsError, match="'wave' must be a quantity"):
+        Filter([1, 2], [1, 1], name="bad")
+
+
+def test_unknown_name_lists_the_known():
+    with pytest.raises(KeyError, match=r"no filter 'miri.f707w'; known: .*miri.f770w"):
+        Filter.from_name("miri.f707w")
+    with pytest.raises(KeyError, match=r"no curve 'nonsense' in astro-sedpy"):
+        Filter.from_name("sedpy.nonsense")
+
+
+def test_any_curve_of_sedpy_by_its_name():
+    assert_quantity_allclose(Filter.from_name("sedpy.sdss_r0").pivot, 0.6176 * u.um, rtol=2e-3)
+
+
+def test_reads_the_files_of_cigale(tmp_path):
+    path = tmp_path / "some.dat"
+    path.write_text("# my.band\n# energy\n# a box that counts energy\n80000 8\n120000 12\n")
+    band = Filter.read(path)
+    assert band.name == "my.band"
+    # an energy response in proportion to lam is a flat photon response
+    assert_quantity_allclose(band.pivot, box().pivot, rtol=1e-9)
+    path.write_text("80000 1\n120000 1\n")
+    assert Filter.read(path).name == "some"
+    assert_quantity_allclose(Filter.read(path, name="a").pivot, box().pivot, rtol=1e-9)
+
+
+def test_unreadable_files_are_named(tmp_path):
+    path = tmp_path / "some.dat"
+    with pytest.raises(DataError, match=r"some.dat cannot be read"):
+        Filter.read(path)
+    path.write_text("one two\n")
+    with pytest.raises(DataError, match=r"some.dat has not two columns of numbers"):
+        Filter.read(path)
+
+
+def test_plot_returns_the_axes():
+    from matplotlib.figure import Figure
+
+    ax = Figure().add_subplot()
+    assert Filter.from_name("miri.f770w").plot(ax=ax) is ax
+    assert len(ax.lines) == 1

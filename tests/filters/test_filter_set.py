@@ -1,0 +1,109 @@
+"""Sets of filters."""
+
+import pickle
+from types import SimpleNamespace
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.tests.helper import assert_quantity_allclose
+from numpy.testing import assert_allclose
+
+from miricigale.filters import Filter, FilterSet
+
+NAMES = ["megacam.u", "wfc3.f160w", "irac.ch4", "miri.f770w", "miri.f2100w"]
+
+
+@pytest.fixture(scope="module")
+def filters():
+    return FilterSet.from_names(NAMES)
+
+
+def test_is_an_ordered_collection(filters):
+    assert filters.names == tuple(NAMES)
+    assert len(filters) == 5
+    assert [f.name for f in filters] == NAMES
+    assert filters["irac.ch4"].name == filters[2].name == "irac.ch4"
+    assert filters[["miri.f770w", "megacam.u"]].names == ("miri.f770w", "megacam.u")
+    assert filters[3:].names == tuple(NAMES[3:])
+    assert "irac.ch4" in filters
+    assert "irac.ch1" not in filters
+
+
+def test_pivots_in_um(filters):
+    assert filters.pivots.unit == u.um
+    assert_allclose(filters.pivots.value, [0.3828, 1.5369, 7.884, 7.639, 20.795], rtol=1e-3)
+
+
+def test_weights_are_those_of_the_single_filters(filters):
+    wave = np.geomspace(0.1, 100, 700)
+    weights = filters.weights(wave)
+    assert weights.shape == (5, 700)
+    assert_allclose(weights.sum(axis=1), 1, rtol=1e-12)
+    for row, band in zip(weights, filters, strict=True):
+        assert_allclose(row, band.weights(wave * u.um), rtol=1e-12)
+
+
+def test_finer_sampling_of_the_same_line_changes_nothing(filters):
+    # exact for piecewise-linear F_nu: nodes added on a straight piece carry no news
+    coarse = np.geomspace(0.1, 100, 60)
+    values = np.random.default_rng(2).uniform(1, 2, 60)
+    fine = np.unique(np.concatenate([coarse, np.linspace(0.1, 100, 9000)]))
+    assert_allclose(
+        filters.weights(fine) @ np.interp(fine, coarse, values),
+        filters.weights(coarse) @ values,
+        rtol=1e-10,
+    )
+
+
+def test_redshift_of_a_power_law(filters):
+    # F_nu in proportion to lam^2: the mean is the square of the pivot wavelength
+    # (int T lam dlam / int T dlam / lam), in whatever place the nodes stand
+    for shift in (1.0, 1.037, 3.3):
+        wave = np.geomspace(0.05, 60, 20_000) * shift
+        means = filters.weights(wave) @ wave**2
+        assert_allclose(means, filters.pivots.value**2, rtol=1e-6)
+
+
+def test_synthetic_fluxes(filters):
+    sed = SimpleNamespace(wave=np.array([1e3, 1e7]) * u.AA, fnu=np.full(2, 2.0) * u.mJy)
+    assert_quantity_allclose(filters.synthetic_fluxes(sed), np.full(5, 2000.0) * u.uJy)
+
+
+def test_uncovered_band_is_an_error_or_zero_on_request(filters):
+    wave = np.geomspace(1, 100, 100)
+    with pytest.raises(ValueError, match=r"leaves 100.00% of filter 'megacam.u'"):
+        filters.weights(wave)
+    weights = filters.weights(wave, tolerance=1)
+    assert np.all(weights[0] == 0)
+    assert_allclose(weights[1:].sum(axis=1), 1)
+
+
+def test_rejects_bad_sets(filters):
+    with pytest.raises(ValueError, match="different names"):
+        FilterSet.from_names(["miri.f770w", "miri.f770w"])
+    with pytest.raises(ValueError, match="one or more"):
+        FilterSet([])
+    with pytest.raises(KeyError, match=r"no filter in this set 'nope'; known: irac.ch4"):
+        filters["nope"]
+    with pytest.raises(ValueError, match="strictly ascending"):
+        filters.weights([3.0, 2.0])
+
+
+def test_pickles(filters):
+    again = pickle.loads(pickle.dumps(filters))
+    assert again.names == filters.names
+    assert_quantity_allclose(again.pivots, filters.pivots)
+
+
+def test_own_filters_stand_beside_those_of_the_library():
+    own = Filter([1, 2] * u.um, [1, 1], name="own")
+    assert FilterSet([own, "miri.f770w"]).names == ("own", "miri.f770w")
+
+
+def test_plot_returns_the_axes(filters):
+    from matplotlib.figure import Figure
+
+    ax = Figure().add_subplot()
+    assert filters.plot(ax=ax) is ax
+    assert len(ax.lines) == 5

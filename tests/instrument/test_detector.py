@@ -1,0 +1,128 @@
+"""What the detector is."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from miricigale.instrument import (
+    DetectorProperties,
+    aperture,
+    bad_pixel_mask,
+    field_mask,
+    flat_field,
+    imager_filters,
+    miri_detector,
+    reference_pixel_mask,
+)
+
+
+def test_published_figures():
+    detector = miri_detector()
+    assert (detector.gain, detector.read_noise, detector.dark_current) == (4.0, 6.0, 0.2)
+    assert detector.full_well == 210e3
+    assert detector.reference_columns == 4
+    # 4.9e-8 /um2/s at solar minimum times about 1.7, on 25 um pixels
+    assert_allclose(detector.cosmic_ray_rate, 4.9e-8 * 1.7 * 625, rtol=0.01)
+
+
+def test_full_well_fits_the_converter():
+    detector = miri_detector()
+    assert detector.bias + detector.saturation_dn < 2**detector.adc_bits - 1
+
+
+def test_linearity_there_and_back():
+    detector = miri_detector()
+    dn = np.linspace(-100, 1.9 * detector.full_well / detector.gain, 4001)
+    assert_allclose(detector.linearize(detector.delinearize(dn)), dn, atol=1e-6)
+    assert_allclose(detector.linearize(detector.saturation_dn) * detector.gain, 210e3, rtol=1e-9)
+    measured = detector.delinearize(dn)
+    assert np.all(np.diff(measured) > 0)
+    # a few per cent at the full well, nothing for an empty one
+    assert 0.02 < 1 - detector.saturation_dn * detector.gain / 210e3 < 0.08
+    assert_allclose(detector.delinearize(10.0), 10, rtol=1e-4)
+
+
+def test_linearity_against_a_square_root():
+    # dn + c dn^2 has a closed inverse
+    detector = DetectorProperties(nonlinearity=(0, 1, 1e-6))
+    dn = np.linspace(0, 60_000, 50)
+    assert_allclose(detector.delinearize(dn), (np.sqrt(1 + 4e-6 * dn) - 1) / 2e-6, atol=1e-6)
+
+
+def test_interpixel_capacitance_moves_and_loses_nothing():
+    kernel = miri_detector().ipc_kernel
+    assert_allclose(kernel.sum(), 1)
+    assert_allclose(kernel[1], [0.033, 1 - 2 * 0.033 - 2 * 0.024 - 4 * 0.013, 0.033])
+    assert_array_equal(kernel, kernel[::-1, ::-1])
+
+
+def test_flat_field():
+    flat = flat_field("miri.f770w")
+    assert flat.dtype == np.float32
+    assert flat.shape == (1024, 1032)
+    assert not flat.flags.writeable
+    light = ~reference_pixel_mask()
+    assert_allclose(flat[light].mean(), 1, rtol=1e-5)
+    assert np.all(flat[~light] == 1)
+    # differences of neighbours hold the pixels, without what is smooth
+    pixels = np.diff(flat[:, 4:-4].astype(float), axis=1).std() / np.sqrt(2)
+    assert_allclose(pixels, 0.01, rtol=0.02)
+    assert flat[light].std() < 0.015
+
+
+def test_flats_are_the_same_each_time_and_differ_smoothly_by_filter():
+    flats = [flat_field(name).astype(float) for name in imager_filters()[:2]]
+    assert_array_equal(flat_field(imager_filters()[0]), flats[0])
+    ratio = flats[1] / flats[0]
+    assert ratio.std() > 0.002
+    assert np.diff(ratio[:, 4:-4], axis=1).std() < 2e-4
+
+
+def test_bad_pixels_are_about_one_in_a_thousand():
+    mask = bad_pixel_mask()
+    assert mask.dtype == bool
+    assert 0.0007 < mask.mean() < 0.0013
+    assert not np.any(mask & reference_pixel_mask())
+    # some stand together
+    assert np.any(mask[:, 1:] & mask[:, :-1])
+
+
+def test_reference_and_field_masks():
+    assert reference_pixel_mask().sum() == 8 * 1024
+    field = field_mask()
+    # 74" x 113"
+    assert_allclose(field.any(axis=0).sum() * 0.1105, 74, atol=0.5)
+    assert not np.any(field & reference_pixel_mask())
+    assert field_mask(subarray="BRIGHTSKY").all()
+
+
+def test_subarrays_are_cut_from_the_same_detector():
+    for name in ("BRIGHTSKY", "SUB256", "SUB64"):
+        part = aperture(name)
+        cut = flat_field("miri.f770w")[part.slices]
+        assert_array_equal(flat_field("miri.f770w", subarray=name), cut)
+        assert_array_equal(flat_field("miri.f770w", part.shape), cut)
+    assert reference_pixel_mask(subarray="SUB64").sum() == 4 * 64
+    assert not reference_pixel_mask(subarray="SUB256").any()
+    assert_array_equal(bad_pixel_mask((50, 40)), bad_pixel_mask()[:50, :40])
+    with pytest.raises(ValueError, match=r"'shape' must be \(256, 256\) for 'SUB256'"):
+        flat_field("miri.f770w", (3, 3), subarray="SUB256")
+    with pytest.raises(ValueError, match="'shape' must be at most"):
+        bad_pixel_mask((2000, 3))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"gain": 0}, "'gain' must be positive, got 0"),
+        ({"read_noise": -1}, "'read_noise' must be at least 0"),
+        ({"nonlinearity": (0, 2)}, "'nonlinearity' must be coefficients that begin with 0, 1"),
+        ({"nonlinearity": (0, 1, -1e-4)}, "'nonlinearity' must be rising"),
+        ({"ipc": (1, 2)}, "'ipc' must be three shares"),
+    ],
+)
+def test_rejects_impossible_detectors(options, message):
+    with pytest.raises(ValueError, match=message):
+        DetectorProperties(**options)
+    with pytest.raises(KeyError, match=r"no imaging filter 'miri.f1w'"):
+        flat_field("miri.f1w")

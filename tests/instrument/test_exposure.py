@@ -1,0 +1,162 @@
+"""Exposures, dithers and their times against the survey's published plan."""
+
+import pickle
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.tests.helper import assert_quantity_allclose
+from numpy.testing import assert_allclose
+
+from miricigale.instrument import (
+    CEERS_FILTERS,
+    Exposure,
+    ceers_exposures,
+    dither_offsets,
+    dither_patterns,
+    frame_time,
+    saturation_forecast,
+)
+
+FIELD = SkyCoord(214.9533, 52.95101, unit="deg")
+ROLL = 120 * u.deg
+
+
+def exposure(**options):
+    options = {"n_groups": 10, "pointing": FIELD, "roll": ROLL, **options}
+    return Exposure("miri.f770w", **options)
+
+
+def test_times_follow_from_the_frames():
+    one = exposure(n_groups=100, n_integrations=2)
+    assert_quantity_allclose(one.frame_time, 2.775 * u.s)
+    assert_quantity_allclose(one.integration_time, 277.5 * u.s)
+    assert_quantity_allclose(one.exposure_time, 555 * u.s)
+    # one reset frame between two integrations
+    assert_quantity_allclose(one.duration, 557.775 * u.s)
+    assert_quantity_allclose(frame_time("SLOWR1"), 23.89 * u.s)
+    assert frame_time(subarray="SUB64") < frame_time(subarray="SUB256") < frame_time()
+
+
+def test_the_survey_lasts_as_long_as_published():
+    exposures = ceers_exposures(FIELD, ROLL)
+    assert len(exposures) == 5 * 3 + 6
+    for name in CEERS_FILTERS:
+        mine = [e for e in exposures if e.filter == name]
+        expected = 4662 if name == "miri.f2100w" else 1665
+        assert_allclose(sum(e.exposure_time.value for e in mine), expected, rtol=1e-12)
+        assert [e.dither for e in mine] == list(range(len(mine)))
+
+
+def test_the_trial_keeps_every_band():
+    exposures = ceers_exposures(FIELD, ROLL, quick=True)
+    assert {e.filter for e in exposures} == set(CEERS_FILTERS)
+    assert len(exposures) == 12
+    full = sum(e.exposure_time for e in ceers_exposures(FIELD, ROLL))
+    assert sum(e.exposure_time for e in exposures) < 0.3 * full
+    assert {e.filter for e in ceers_exposures(FIELD, ROLL, filters=["miri.f770w"])} == {
+        "miri.f770w"
+    }
+    with pytest.raises(KeyError, match=r"no band of the survey 'miri.f560w'"):
+        ceers_exposures(FIELD, ROLL, filters=["miri.f560w"])
+
+
+def test_no_integration_of_the_survey_saturates_on_the_sky():
+    for one in ceers_exposures(FIELD, ROLL):
+        assert saturation_forecast(one) < 0.9
+
+
+def test_exposure_of_a_given_time_keeps_the_wells_open():
+    for name, time in (("miri.f770w", 555), ("miri.f2100w", 777), ("miri.f2550w", 300)):
+        one = Exposure.from_time(name, time * u.s, pointing=FIELD, roll=ROLL)
+        assert_allclose(one.exposure_time.value, time, rtol=0.05)
+        assert saturation_forecast(one) < 0.63
+    slow = Exposure.from_time("miri.f560w", 500 * u.s, readout="SLOWR1", pointing=FIELD, roll=ROLL)
+    assert (slow.n_groups, slow.n_integrations) == (21, 1)
+
+
+def test_dithers_move_a_source_the_other_way():
+    base = exposure()
+    offsets = dither_offsets("ceers", 6).value
+    for one, (dx, dy) in zip(base.dithered("ceers", 6), offsets, strict=True):
+        x, y = one.wcs.world_to_pixel(FIELD)
+        assert_allclose(x - 692.5, -dx / 0.1105, atol=0.25)
+        assert_allclose(y - 511.5, -dy / 0.1113, atol=0.25)
+
+
+def test_dithers_sample_the_pixel_evenly():
+    pixels = dither_offsets("ceers", 6).value / [0.110497, 0.111336]
+    for axis in pixels.T:
+        assert_allclose(np.sort(np.round(axis % 1, 6) % 1), np.arange(6) / 6, atol=1e-5)
+        assert_allclose(np.sort(np.round(axis[:3] % 1, 6) % 1), np.arange(3) / 3, atol=1e-5)
+    four = dither_offsets("4-point", 4).value / [0.110497, 0.111336]
+    assert len({tuple(np.round(point % 1, 6) % 1) for point in four}) == 4
+    assert_allclose(four.mean(axis=0), 0, atol=1e-9)
+
+
+def test_patterns_go_on_and_tables_are_taken():
+    for name in dither_patterns():
+        offsets = dither_offsets(name, 13)
+        assert offsets.shape == (13, 2)
+        assert len(np.unique(offsets.value.round(6), axis=0)) == 13
+    table = [[0, 0], [1, -2]] * u.arcsec
+    assert_quantity_allclose(dither_offsets(table, 2), table)
+    with pytest.raises(ValueError, match=r"'pattern' must be offsets of shape \(3, 2\)"):
+        dither_offsets(table, 3)
+    with pytest.raises(KeyError, match="no dither pattern 'spiral'; known: 4-point"):
+        dither_offsets("spiral", 3)
+
+
+def test_keywords_of_the_pointing():
+    words = exposure(subarray="SUB256").pointing_keywords()
+    assert (words["SUBSTRT1"], words["SUBSTRT2"]) == (413, 51)
+    assert_allclose([words["RA_REF"], words["DEC_REF"]], [FIELD.ra.deg, FIELD.dec.deg])
+    assert_allclose(words["PA_APER"], 120 + 4.83544897)
+    # V1 lies at the distance of the aperture, and +V3 turns by the convergence of meridians
+    boresight = SkyCoord(words["RA_V1"], words["DEC_V1"], unit="deg")
+    assert_allclose(boresight.separation(FIELD).arcsec, np.hypot(439.64, 411.948), rtol=1e-5)
+    turn = (words["RA_V1"] - words["RA_REF"]) * np.sin(FIELD.dec.rad)
+    assert_allclose(words["PA_V3"] - 120, turn, atol=2e-3)
+
+
+def test_normalises_and_freezes():
+    one = Exposure("f770w", n_groups=10, pointing=FIELD.galactic, roll=-10 * u.deg)
+    assert one.filter == "miri.f770w"
+    assert one.pointing.separation(FIELD) < 1e-6 * u.arcsec
+    assert_quantity_allclose(one.roll, 350 * u.deg)
+    assert one.shape == (1024, 1032)
+    with pytest.raises(AttributeError):
+        one.n_groups = 3
+    assert one.replace(n_groups=3).n_groups == 3
+    again = pickle.loads(pickle.dumps(one))
+    assert_allclose(again.wcs.all_pix2world(3, 4, 0), one.wcs.all_pix2world(3, 4, 0))
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"n_groups": 1}, ValueError, "'n_groups' must be an integer of at least 2, got 1"),
+        ({"n_groups": 2.5}, ValueError, "'n_groups' must be an integer"),
+        ({"n_integrations": 0}, ValueError, "'n_integrations' must be an integer of at least 1"),
+        ({"readout": "FAST"}, KeyError, "no readout pattern 'FAST'; known: FASTR1, SLOWR1"),
+        ({"subarray": "SUB1"}, KeyError, "no sub-array 'SUB1'"),
+        (
+            {"subarray": "SUB256", "readout": "SLOWR1"},
+            KeyError,
+            "no sub-array of SLOWR1 'SUB256'; known: FULL",
+        ),
+        ({"roll": 3 * u.s}, u.UnitsError, "'roll' must be convertible to deg"),
+        ({"pointing": 3}, ValueError, "'pointing' must be one SkyCoord"),
+    ],
+)
+def test_rejects_what_cannot_be_exposed(options, error, message):
+    with pytest.raises(error, match=message):
+        exposure(**options)
+
+
+def test_rejects_foreign_filters():
+    with pytest.raises(KeyError, match=r"no imaging filter 'wfc3.f160w'; known: miri.f1000w"):
+        Exposure("wfc3.f160w", n_groups=10, pointing=FIELD, roll=ROLL)
+    with pytest.raises(ValueError, match="'time' must be at least two frames"):
+        Exposure.from_time("miri.f770w", 3 * u.s, pointing=FIELD, roll=ROLL)

@@ -1,0 +1,126 @@
+"""Sensitivity figures against published ones and against the throughput curves."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.tests.helper import assert_quantity_allclose
+from numpy.testing import assert_allclose
+
+from miricigale.filters import Filter
+from miricigale.instrument import (
+    CEERS_FILTERS,
+    DetectorProperties,
+    Exposure,
+    background_level,
+    background_spectrum,
+    etc_limit,
+    imager_filters,
+    photmjsr,
+    proposal_limit,
+    psf_fwhm,
+    saturation_forecast,
+    saturation_time,
+    scaled_limit,
+)
+
+# low background at the nominal wavelengths 5.6, 7.7, 10, 11.3, 12.8, 15, 18, 21, 25.5 um
+BACKGROUND = [1.0, 5.1, 11.7, 16, 22, 38, 95, 254, 980]
+NOMINAL = [5.6, 7.7, 10.0, 11.3, 12.8, 15.0, 18.0, 21.0, 25.5]
+
+
+def test_nine_filters_blue_to_red():
+    assert len(imager_filters()) == 9
+    pivots = [Filter.from_name(name).pivot.value for name in imager_filters()]
+    assert np.all(np.diff(pivots) > 0)
+
+
+@pytest.mark.parametrize("name", imager_filters())
+def test_conversion_follows_from_the_throughput(name):
+    # electrons per second per MJy/sr: 1e-20 A Omega int T dlam / lam / h
+    band = Filter.from_name(name)
+    wave = band.wave.value
+    integral = np.trapezoid(band.throughput / wave, wave)
+    omega = (0.110498 * u.arcsec * 0.111336 * u.arcsec).to_value(u.sr)
+    rate = 1e-20 * 25.4 * omega * integral / 6.62607015e-34
+    assert_allclose(photmjsr(name, gain=3.1), 3.1 / rate, rtol=0.004)
+
+
+def test_conversion_is_in_proportion_to_the_gain():
+    assert_allclose(photmjsr("miri.f770w", gain=3.1), 0.272)
+    assert_allclose(photmjsr("miri.f770w"), 0.272 * 4.0 / 3.1)
+    with pytest.raises(ValueError, match="'gain' must be positive"):
+        photmjsr("miri.f770w", gain=0)
+
+
+def test_background_levels_are_the_published_ones():
+    levels = [background_level(name).value for name in imager_filters()]
+    assert_allclose(levels, BACKGROUND, rtol=0.10)
+    assert_allclose(background_spectrum(NOMINAL * u.um).value, BACKGROUND, rtol=0.05)
+
+
+@pytest.mark.parametrize("name", imager_filters())
+def test_background_levels_are_band_means_of_the_spectrum(name):
+    band = Filter.from_name(name)
+    wave = np.linspace(band.wave.value[0], band.wave.value[-1], 4000)
+    mean = band.weights(wave) @ background_spectrum(wave * u.um)
+    assert_quantity_allclose(background_level(name), mean, rtol=0.003)
+    thermal = band.weights(wave) @ background_spectrum(wave * u.um, zodi="none")
+    assert_quantity_allclose(background_level(name, zodi="none"), thermal, rtol=0.004)
+    assert_quantity_allclose(background_level(name, zodi=2), 2 * mean - thermal, rtol=0.003)
+
+
+def test_background_beyond_the_curve_is_refused():
+    with pytest.raises(ValueError, match="'wave' must be between 2 and 31 um"):
+        background_spectrum([5, 40] * u.um)
+    with pytest.raises(KeyError, match="no zodiacal background 'bright'; known: low, none"):
+        background_level("miri.f770w", zodi="bright")
+
+
+def test_scaled_limits_of_the_survey():
+    # exposure time calculator 4.0 scaled to the survey's exposures, AB at 5 sigma
+    times = [1665] * 5 + [4662]
+    expected = [25.20, 24.50, 23.87, 23.49, 22.72, 22.56]
+    for name, time, magnitude in zip(CEERS_FILTERS, times, expected, strict=True):
+        limit = scaled_limit(name, time * u.s).to_value(u.ABmag)
+        assert_allclose(limit, magnitude, atol=0.012)
+        assert abs(proposal_limit(name).value - limit) < 0.45
+    assert_quantity_allclose(
+        scaled_limit("miri.f770w", 1e4 * u.s, n_sigma=10), etc_limit("miri.f770w")
+    )
+
+
+def test_versions_of_the_calculator():
+    for name in imager_filters():
+        assert_quantity_allclose(etc_limit(name, "2.0"), etc_limit(name), rtol=0.25)
+    assert_quantity_allclose(etc_limit("miri.f2100w", "2.0"), 3.99 * u.uJy)
+    with pytest.raises(KeyError, match=r"version of the exposure time calculator '3.0'"):
+        etc_limit("miri.f770w", "3.0")
+    with pytest.raises(KeyError, match=r"no band of the survey 'miri.f560w'"):
+        proposal_limit("miri.f560w")
+
+
+def test_widths_grow_as_the_diffraction_limit():
+    for name in imager_filters():
+        diffraction = (Filter.from_name(name).pivot / (6.5 * u.m)).to(
+            u.arcsec, u.dimensionless_angles()
+        )
+        # a little wider than lam / D, more so where the pixels are coarse
+        assert 0.95 < psf_fwhm(name) / diffraction < 1.2
+
+
+def test_sky_fills_the_wells_in_the_known_times():
+    for name, time in (("miri.f2100w", 107), ("miri.f1800w", 347), ("miri.f1500w", 693)):
+        assert_quantity_allclose(saturation_time(name), time * u.s, rtol=0.07)
+
+
+def test_forecast_counts_photons():
+    # without dark: level / photmjsr DN/s times gain, over the well
+    detector = DetectorProperties(gain=4.0, dark_current=0.0, full_well=1e5)
+    exposure = Exposure(
+        "miri.f770w", n_groups=100, pointing=SkyCoord(1, 2, unit="deg"), roll=0 * u.deg
+    )
+    forecast = saturation_forecast(exposure, background=10 * u.MJy / u.sr, detector=detector)
+    assert_allclose(forecast, 10 / (0.272 / 3.1) * 277.5 / 1e5)
+    image = np.full((3, 4), 10.0) * u.MJy / u.sr
+    assert saturation_forecast(exposure, background=image, detector=detector).shape == (3, 4)

@@ -1,0 +1,131 @@
+"""Finding, adding and checking reference data."""
+
+import hashlib
+import sys
+
+import pytest
+
+from miricigale.refdata import Resource, add_resource, check_resources, conf, locate, registry
+from miricigale.refdata.locate import data_folder, file_sha256
+from miricigale.utils.exceptions import DataError
+
+TEXT = b"some numbers\n"
+
+
+@pytest.fixture
+def folders(tmp_path, monkeypatch):
+    """An empty data folder, no environment, and records of three user resources."""
+    monkeypatch.delenv("MIRICIGALE_DATA", raising=False)
+    common = {"kind": "user", "title": "T", "licence": "L", "citation": "C", "source": "a page"}
+    records = {
+        "test.file": Resource(
+            name="test.file",
+            file="sub/file.dat",
+            sha256=hashlib.sha256(TEXT).hexdigest(),
+            **common,
+        ),
+        "test.folder": Resource(name="test.folder", file="folder", **common),
+        "test.package": Resource(name="test.package", **(common | {"kind": "package"})),
+    }
+    bundled = registry.resources()
+    everything = {"instrument.siaf": bundled["instrument.siaf"], **records}
+    # the package exports a function of the name of the module
+    for module in (registry, sys.modules["miricigale.refdata.locate"]):
+        monkeypatch.setattr(module, "resources", lambda: everything)
+    with conf.set_temp("data_folder", str(tmp_path / "data")):
+        yield tmp_path
+
+
+def source(folder):
+    path = folder / "mine.dat"
+    path.write_bytes(TEXT)
+    return path
+
+
+def test_bundled_files_are_there_and_whole():
+    bundled = {name for name, record in registry.resources().items() if record.kind == "bundled"}
+    states = {name: state for name, state, _ in check_resources()}
+    assert {states[name] for name in bundled} == {"ok"}
+    assert bundled
+
+
+def test_data_folder_is_set_by_the_user(folders):
+    assert data_folder() == folders / "data"
+    with conf.set_temp("data_folder", ""):
+        assert data_folder().name == "miricigale"
+
+
+def test_absent_resource_says_where_to_get_it(folders):
+    with pytest.raises(
+        DataError, match=r"'test.file' \(T\) is in none of the data folder .*a page"
+    ):
+        locate("test.file")
+    with pytest.raises(KeyError, match="no resource 'nope'"):
+        locate("nope")
+    with pytest.raises(ValueError, match="'name' must be a resource that is a file"):
+        locate("test.package")
+
+
+def test_added_file_is_found(folders):
+    target = add_resource("test.file", source(folders))
+    assert target == folders / "data" / "sub" / "file.dat"
+    assert locate("test.file", check=True) == target
+    assert target.read_bytes() == TEXT
+    assert not list(target.parent.glob("*.partial"))
+
+
+def test_added_folder_replaces_the_old(folders):
+    old, new = folders / "old", folders / "new"
+    for folder in (old, new):
+        folder.mkdir()
+        (folder / folder.name).write_text("x")
+    add_resource("test.folder", old)
+    path = add_resource("test.folder", new)
+    assert [p.name for p in path.iterdir()] == ["new"]
+    assert locate("test.folder") == path
+
+
+def test_wrong_file_is_refused(folders):
+    path = source(folders)
+    path.write_bytes(b"other numbers\n")
+    with pytest.raises(DataError, match=r"mine.dat is not the file .* 'test.file' describes"):
+        add_resource("test.file", path)
+    with pytest.raises(DataError, match="no file or folder"):
+        add_resource("test.file", folders / "absent")
+    with pytest.raises(ValueError, match="'name' must be a resource that is a file"):
+        add_resource("test.package", path)
+
+
+def test_file_that_changed_is_noticed(folders):
+    path = add_resource("test.file", source(folders))
+    path.write_bytes(b"broken\n")
+    assert locate("test.file") == path
+    with pytest.raises(DataError, match="sha256 differs"):
+        locate("test.file", check=True)
+
+
+def test_environment_wins_over_the_folder_over_the_package(folders, monkeypatch):
+    bundled = locate("instrument.siaf")
+    assert "miricigale" in bundled.parts
+    for folder in (folders / "data", folders / "env"):
+        (folder / "instrument").mkdir(parents=True)
+        (folder / "instrument" / bundled.name).write_text("mine")
+    assert locate("instrument.siaf").is_relative_to(folders / "data")
+    monkeypatch.setenv("MIRICIGALE_DATA", str(folders / "env"))
+    assert locate("instrument.siaf").is_relative_to(folders / "env")
+
+
+def test_check_tells_the_state_of_each(folders):
+    add_resource("test.file", source(folders)).write_bytes(b"broken\n")
+    states = {name: state for name, state, _ in check_resources()}
+    assert states == {
+        "instrument.siaf": "ok",
+        "test.file": "wrong checksum",
+        "test.folder": "absent",
+        "test.package": "from package",
+    }
+
+
+def test_checksum(tmp_path):
+    path = source(tmp_path)
+    assert file_sha256(path) == hashlib.sha256(TEXT).hexdigest()

@@ -1,0 +1,69 @@
+"""Errors, provenance, optional packages, parallel maps and progress bars."""
+
+import datetime
+import math
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+import miricigale
+from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.meta import provenance
+from miricigale.utils.optional import require
+from miricigale.utils.parallel import chunks, parallel_map
+from miricigale.utils.progress import progress
+
+
+def test_errors_name_the_argument():
+    error = argument_error("n", "positive", -1)
+    assert isinstance(error, ValueError)
+    assert str(error) == "'n' must be positive, got -1"
+    assert "no filter 'a'; known: b, c" in str(unknown_name("filter", "a", {"c": 1, "b": 2}))
+
+
+def test_provenance():
+    meta = provenance(citations=["b", "a", "b"], seed=3, nothing=None)
+    assert meta["package"] == "miricigale"
+    assert meta["citations"] == ["a", "b"]
+    assert meta["seed"] == 3
+    assert "nothing" not in meta
+    made = datetime.datetime.fromisoformat(meta["created"])
+    assert abs(datetime.datetime.now(datetime.UTC) - made) < datetime.timedelta(minutes=1)
+
+
+def test_optional_packages():
+    assert require("math", extra="none") is math
+    with pytest.raises(ImportError, match=r"pip install 'miricigale\[samplers\]'"):
+        require("no_such_package", extra="samplers")
+
+
+def test_parallel_map_gives_the_same_answer_in_order():
+    serial = parallel_map(math.sqrt, range(20))
+    with ThreadPoolExecutor(3) as executor:
+        assert parallel_map(math.sqrt, range(20), executor=executor) == serial
+    assert serial == [math.sqrt(i) for i in range(20)]
+
+
+def test_parallel_map_passes_errors_on():
+    with ThreadPoolExecutor(2) as executor, pytest.raises(ValueError, match=r"math domain|nonneg"):
+        parallel_map(math.sqrt, [1, -1, 2], executor=executor)
+
+
+def test_chunks_cover_everything_once():
+    pieces = [i for part in chunks(10, 4) for i in range(10)[part]]
+    assert pieces == list(range(10))
+    assert list(chunks(0, 4)) == []
+
+
+def test_progress_is_silent_unless_asked(capsys):
+    assert list(progress(range(3))) == [0, 1, 2]
+    assert capsys.readouterr().err == ""
+    assert list(progress(range(3), show=True, desc="work")) == [0, 1, 2]
+    assert "work" in capsys.readouterr().err
+
+
+def test_package_lists_its_classes_without_loading_them():
+    assert {"Filter", "SEDModel", "Detector", "BayesFitter"} <= set(dir(miricigale))
+    assert miricigale.Filter.__name__ == "Filter"
+    with pytest.raises(AttributeError, match="has no attribute 'Nonsense'"):
+        miricigale.Nonsense  # noqa: B018

@@ -1,0 +1,76 @@
+"""Checks and joins of tables."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
+
+from miricigale.utils.tables import Flags, error_column, match_sky, require_columns, unique_ids
+
+
+class Sample(Flags):
+    """Flags of a sample."""
+
+    GOOD = 0
+    EDGE = 1
+    NEAR_STAR = 4
+
+
+def test_flags_explain_themselves():
+    assert Sample.describe() == "bit flags (sum): 1 edge, 4 near star; 0 good"
+    assert Sample.names(5) == ["edge", "near_star"]
+    assert Sample.names(np.int64(0)) == []
+
+
+def test_error_column():
+    assert error_column("miri.f770w") == "miri.f770w_err"
+
+
+def test_require_columns():
+    table = QTable({"id": [1, 2], "flux": [1, 2] * u.mJy})
+    require_columns(table, ["id", "flux"], "photometry", units={"flux": u.uJy, "absent": u.m})
+    with pytest.raises(ValueError, match=r"'photometry' must be a table with the columns \['z'\]"):
+        require_columns(table, ["id", "z"], "photometry")
+    with pytest.raises(u.UnitsError, match="'photometry' column 'flux' must be convertible to m"):
+        require_columns(table, [], "photometry", units={"flux": u.m})
+    with pytest.raises(u.UnitsError, match="'photometry' column 'id' must be convertible to uJy"):
+        require_columns(table, [], "photometry", units={"id": u.uJy})
+
+
+def test_unique_ids():
+    assert_array_equal(unique_ids([3, 1, 2], "catalog"), [3, 1, 2])
+    with pytest.raises(ValueError, match=r"'catalog' must be .* duplicates such as \[1\]"):
+        unique_ids([1, 1, 2], "catalog")
+
+
+def sky(x, y):
+    return SkyCoord(np.array(x) / 3600, np.array(y) / 3600, unit="deg")
+
+
+def test_match_is_one_to_one():
+    # two references claim row 0: the nearer has it
+    coords = sky([0.0, 10.0, 50.0], [0, 0, 0])
+    reference = sky([0.3, 0.1, 10.2, 30.0], [0, 0, 0, 0])
+    index, separation = match_sky(coords, reference, radius=1 * u.arcsec)
+    assert_array_equal(index, [-1, 0, 1, -1])
+    assert separation.unit == u.arcsec
+    assert_allclose(separation.value, [np.nan, 0.1, 0.2, np.nan], atol=1e-9)
+
+
+def test_match_recovers_a_permutation():
+    rng = np.random.default_rng(4)
+    x, y = rng.uniform(0, 3000, (2, 100))
+    order = rng.permutation(100)
+    index, _ = match_sky(sky(x, y), sky(x[order] + 0.05, y[order]), radius=0.2 * u.arcsec)
+    assert_array_equal(index, order)
+
+
+@pytest.mark.parametrize(("n", "m"), [(0, 3), (3, 0)])
+def test_match_with_nothing(n, m):
+    index, separation = match_sky(
+        sky(np.zeros(n), np.zeros(n)), sky(np.zeros(m), np.zeros(m)), radius=1 * u.arcsec
+    )
+    assert_array_equal(index, np.full(m, -1))
+    assert np.all(np.isnan(separation))
