@@ -1,0 +1,123 @@
+"""The door to stpsf, STScI's own PSF simulator (optional)."""
+
+import os
+
+import numpy as np
+from astropy.io import fits
+
+from miricigale.psf.library import MIRI_PIXEL_SCALE
+from miricigale.psf.model import from_photutils
+from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.optional import require
+from miricigale.utils.units import ANGLE, to_array
+
+__all__ = ["stpsf_grid", "stpsf_psf"]
+
+
+def _instrument(filter_name, opd):
+    if "STPSF_PATH" not in os.environ:
+        msg = "stpsf needs its data files: set the environment variable STPSF_PATH to their folder"
+        raise DataError(msg)
+    stpsf = require("stpsf", extra="stpsf")
+    instrument = stpsf.MIRI()
+    instrument.filter = str(filter_name).removeprefix("miri.").upper()
+    if isinstance(opd, str) and opd == "perfect":
+        instrument.pupilopd = None
+        instrument.include_si_wfe = False
+        instrument.include_ote_field_dependence = False
+    elif isinstance(opd, (str, os.PathLike)):
+        instrument.pupilopd = os.fspath(opd)
+    elif isinstance(opd, fits.HDUList):
+        instrument.pupilopd = opd
+    elif opd is not None:
+        raise argument_error("opd", "None, 'perfect', a path or an HDUList", type(opd).__name__)
+    return instrument
+
+
+def stpsf_grid(
+    filter,
+    *,
+    n_psfs=1,
+    oversampling=4,
+    fov=10.0 * ANGLE,
+    opd=None,
+    n_wavelengths=9,
+):
+    """
+    PSFs of the MIRI imager over the field, from stpsf.
+
+    Parameters
+    ----------
+    filter : str
+        Such as ``"miri.f770w"``.
+    n_psfs : int, optional
+        A square number of positions; 1 for the middle of the detector.
+    oversampling : int, optional
+        Cells per pixel.
+    fov : `~astropy.units.Quantity`, optional
+        Width of the grids.
+    opd : str, path-like or `~astropy.io.fits.HDUList`, optional
+        Wavefront error as stpsf takes it; ``"perfect"`` for none, and stpsf's default if
+        not given.
+    n_wavelengths : int, optional
+        Wavelengths per band.
+
+    Returns
+    -------
+    grid : `~photutils.psf.GriddedPSFModel`
+
+    Raises
+    ------
+    ImportError
+        If stpsf is not installed; the message says how to.
+    `~miricigale.utils.exceptions.DataError`
+        If ``STPSF_PATH`` is not set.
+
+    References
+    ----------
+    Perrin et al. 2014, Proc. SPIE 9143, 91433X.
+    """
+    if round(n_psfs**0.5) ** 2 != n_psfs:
+        raise argument_error("n_psfs", "a square number", n_psfs)
+    instrument = _instrument(filter, opd)
+    pixels = to_array(fov, ANGLE, "fov") / MIRI_PIXEL_SCALE.value
+    return instrument.psf_grid(
+        num_psfs=int(n_psfs),
+        all_detectors=False,
+        oversample=int(oversampling),
+        fov_pixels=2 * int(np.ceil(pixels / 2)) + 1,
+        nlambda=int(n_wavelengths),
+        verbose=False,
+    )
+
+
+def stpsf_psf(filter, *, x=515.0, y=511.0, **options):
+    """
+    PSF of the MIRI imager at one position of the detector, from stpsf.
+
+    Parameters
+    ----------
+    filter : str
+        Such as ``"miri.f770w"``.
+    x, y : float, optional
+        Position on the detector.
+    **options
+        Those of `stpsf_grid`.
+
+    Returns
+    -------
+    psf : `~photutils.psf.ImagePSF`
+        In the detector frame, with jitter, cruciform, pixel and interpixel capacitance.
+        stpsf keeps the light that the cruciform scatters out of its grid inside of it.
+    """
+    grid = stpsf_grid(filter, **options)
+    psf = from_photutils(
+        grid,
+        pixel_scale=MIRI_PIXEL_SCALE,
+        frame="detector",
+        includes=("jitter", "cruciform", "pixel", "ipc"),
+        x=x,
+        y=y,
+    )
+    psf.meta.update(filter=str(filter), instrument="MIRI", source="stpsf")
+    return psf

@@ -1,0 +1,150 @@
+"""What a detector does to the image of a point source: pixels, capacitance, cruciform, blur."""
+
+import math
+
+import numpy as np
+from scipy.fft import irfft2, next_fast_len, rfft2
+
+from miricigale.psf import _core
+from miricigale.psf.optics import jwst_constants
+from miricigale.utils.exceptions import argument_error
+
+__all__ = ["EFFECTS", "blur", "cruciform", "cruciform_fraction", "detector_response"]
+
+#: Effects that a PSF may include, in the order in which they act.
+EFFECTS = ("jitter", "cruciform", "pixel", "ipc")
+
+#: Length over which the cruciform falls by e, in pixels.
+_FOLDING = 25.0
+
+#: Factors on the amplitudes that in-flight images ask for.
+_IN_FLIGHT = {"miri.f560w": 2.0}
+
+
+def _amplitude(filter_name, calibration):
+    """Light scattered along each axis per pixel of distance, beyond the inner radius."""
+    if calibration not in ("flight", "stpsf"):
+        raise argument_error("calibration", "'flight' or 'stpsf'", repr(calibration))
+    # the tabulated kernel holds at an oversampling of 4: one pixel is 4 cells of A / 4^2
+    amplitude = jwst_constants()["cruciform"].get(filter_name, 0.0) / 4
+    return amplitude * (_IN_FLIGHT.get(filter_name, 1.0) if calibration == "flight" else 1.0)
+
+
+def _profile(distance, filter_name, calibration):
+    inner = jwst_constants()["cruciform_inner_radius"]
+    profile = _amplitude(filter_name, calibration) * np.exp(-distance / _FOLDING)
+    # the mean of both sides on the step itself, so that sampled sums equal the integral
+    return profile * (0.75 + 0.25 * np.sign(distance - inner))
+
+
+def cruciform_fraction(filter_name, *, calibration="flight"):
+    """
+    Light that the cruciform takes out of the image's core.
+
+    Parameters
+    ----------
+    filter_name : str
+        Such as ``"miri.f560w"``; zero for filters without a cruciform.
+    calibration : {"flight", "stpsf"}, optional
+        See `cruciform`.
+
+    Returns
+    -------
+    fraction : float
+        Scattered over scattered plus direct light.
+    """
+    inner = jwst_constants()["cruciform_inner_radius"]
+    outside = math.exp(-inner / _FOLDING)
+    integral = 2 * _FOLDING * (0.5 * (1 - outside) + outside)
+    both = 2 * _amplitude(filter_name, calibration) * integral
+    return both / (1 + both)
+
+
+def cruciform(image, filter_name, *, oversampling, calibration="flight"):
+    """
+    Scatter light along rows and columns, as the detector does at short wavelengths.
+
+    An exponential cross of folding length 25 pixels, half as strong within 12 pixels;
+    the sum over the infinite plane is conserved.
+
+    Parameters
+    ----------
+    image : `~numpy.ndarray`, shape (n, n)
+        Oversampled image of a point source, detector axes.
+    filter_name : str
+        Such as ``"miri.f770w"``.
+    oversampling : int
+        Cells per pixel.
+    calibration : {"flight", "stpsf"}, optional
+        stpsf's amplitudes, or those with the factor 2 that in-flight F560W images want.
+
+    Returns
+    -------
+    image : `~numpy.ndarray`, shape (n, n)
+
+    References
+    ----------
+    Gaspar et al. 2021, PASP 133, 014504; stpsf (STScI), ``detectors.py``.
+    """
+    fraction = cruciform_fraction(filter_name, calibration=calibration)
+    if fraction == 0:
+        return image
+    distance = np.arange(max(image.shape)) / oversampling
+    kernel = _profile(distance, filter_name, calibration) / oversampling
+    scattered = _core.line_scatter(image, kernel, 0) + _core.line_scatter(image, kernel, 1)
+    return (image + scattered) * (1 - fraction)
+
+
+def _apply_transfer(image, transfer, margin):
+    """Multiply the spectrum by ``transfer(fx, fy)`` (cycles per cell), padding by zeros."""
+    shape = [next_fast_len(size + 2 * margin, real=True) for size in image.shape]
+    fy, fx = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])
+    spectrum = rfft2(image, shape)
+    spectrum *= transfer(fx, fy)
+    return irfft2(spectrum, shape)[: image.shape[0], : image.shape[1]]
+
+
+def detector_response(image, *, oversampling, pixel=True, ipc=None, jitter=0.0, boxes=()):
+    """
+    Convolve with jitter, the pixel and the interpixel capacitance in one transform.
+
+    Parameters
+    ----------
+    image : `~numpy.ndarray`, shape (n, n)
+        Oversampled image of a point source.
+    oversampling : int
+        Cells per pixel.
+    pixel : bool, optional
+        Whether the square pixel's response enters.
+    ipc : tuple of float, optional
+        Couplings along x, along y, diagonal.
+    jitter : float, optional
+        Standard deviation per axis in pixels.
+    boxes : iterable of float, optional
+        Widths in pixels of further square boxes (drops, output pixels).
+
+    Returns
+    -------
+    image : `~numpy.ndarray`, shape (n, n)
+        Same grid: the effective PSF.
+    """
+    widths = [*boxes, 1.0] if pixel else list(boxes)
+
+    def transfer(fx, fy):
+        px, py = fx * oversampling, fy * oversampling
+        total = np.ones((py.size, px.size))
+        for width in widths:
+            total *= _core.box_transfer(px, width) * _core.box_transfer(py, width)
+        if ipc is not None:
+            total *= _core.ipc_transfer(px, py, *ipc)
+        if jitter > 0:
+            total *= _core.gaussian_transfer(px**2 + py**2, jitter)
+        return total
+
+    extent = sum(widths) + 5 * jitter + (1 if ipc is not None else 0)
+    return _apply_transfer(image, transfer, math.ceil(extent * oversampling) + 1)
+
+
+def blur(image, sigma):
+    """Convolve with a round Gaussian of ``sigma`` cells."""
+    return detector_response(image, oversampling=1, pixel=False, jitter=sigma)

@@ -1,0 +1,161 @@
+"""Numbers that describe a PSF: encircled energy and its radii, width, tables of them."""
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+from scipy.optimize import least_squares
+
+from miricigale.psf import _core
+from miricigale.psf.model import half_maximum_width, psf_info
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import ANGLE, to_array
+
+__all__ = ["encircled_energy", "fwhm", "psf_table", "radius_of_encircled_energy"]
+
+
+def encircled_energy(psf, radius):
+    """
+    Fraction of a point source's light inside circles around the centre.
+
+    Parameters
+    ----------
+    psf : `~photutils.psf.ImagePSF`
+        A PSF with the meta of `~miricigale.psf.make_psf`.
+    radius : `~astropy.units.Quantity`
+        Scalar or array of radii.
+
+    Returns
+    -------
+    fraction : float or `~numpy.ndarray`
+        Of all light, also of that beyond the PSF's grid.
+
+    Raises
+    ------
+    ValueError
+        If a radius is negative or its circle leaves the grid.
+    """
+    info = psf_info(psf)
+    radii = to_array(radius, ANGLE, "radius", finite=True)
+    if np.any(radii < 0) or np.any(radii > info.half_width):
+        wanted = f"between 0 and the half width of the PSF, {info.half_width:.4g} arcsec"
+        raise argument_error("radius", wanted, radius)
+    flat = np.ascontiguousarray(radii.ravel() / info.cell)
+    sums = _core.radial_sums(info.data, *info.origin, flat) / info.oversampling**2
+    return float(sums[0]) if radii.ndim == 0 else sums.reshape(radii.shape)
+
+
+def radius_of_encircled_energy(psf, fraction, *, relative_to="total"):
+    """
+    Radius of the circle that holds a fraction of the light.
+
+    Parameters
+    ----------
+    psf : `~photutils.psf.ImagePSF`
+        A PSF with the meta of `~miricigale.psf.make_psf`.
+    fraction : float
+        Between 0 and 1.
+    relative_to : {"total", "grid"}, optional
+        Whether of all light or of that in the largest circle on the grid.
+
+    Returns
+    -------
+    radius : `~astropy.units.Quantity`
+        In arcsec.
+
+    Raises
+    ------
+    ValueError
+        If the grid does not hold the fraction.
+    """
+    info = psf_info(psf)
+    if relative_to not in ("total", "grid"):
+        raise argument_error("relative_to", "'total' or 'grid'", repr(relative_to))
+    cells = np.arange(0.0, info.half_width / info.cell, 0.25)
+    sums = _core.radial_sums(info.data, *info.origin, cells) / info.oversampling**2
+    level = fraction * (sums[-1] if relative_to == "grid" else 1.0)
+    if not 0 < fraction <= 1 or level > sums[-1]:
+        wanted = f"positive and at most the {sums[-1]:.4f} that the PSF's grid holds"
+        raise argument_error("fraction", wanted, fraction)
+    k = int(np.argmax(sums >= level))
+    if k == 0:
+        return 0.0 * ANGLE
+    part = (level - sums[k - 1]) / (sums[k] - sums[k - 1])
+    return (cells[k - 1] + part * 0.25) * info.cell * ANGLE
+
+
+def fwhm(psf, *, method="half_maximum"):
+    """
+    Full width at half maximum.
+
+    Parameters
+    ----------
+    psf : `~photutils.psf.ImagePSF`
+        A PSF with the meta of `~miricigale.psf.make_psf`.
+    method : {"half_maximum", "gaussian"}, optional
+        Where the azimuthal mean falls to a half (what the meta holds), or that of a round
+        Gaussian fitted out to 0.75 FWHM, the usual way to measure stars. The core of a
+        diffraction pattern falls more steeply than a Gaussian: the fit is 1-3 % narrower.
+
+    Returns
+    -------
+    fwhm : `~astropy.units.Quantity`
+        In arcsec.
+
+    Raises
+    ------
+    ValueError
+        If the method is unknown.
+    """
+    info = psf_info(psf)
+    width = half_maximum_width(info.data, *info.origin)
+    if method == "gaussian":
+        width = _gaussian_width(info.data, *info.origin, width)
+    elif method != "half_maximum":
+        raise argument_error("method", "'half_maximum' or 'gaussian'", repr(method))
+    return width * info.cell * ANGLE
+
+
+def _gaussian_width(data, x, y, start):
+    yy, xx = np.indices(data.shape)
+    r = np.hypot(xx - x, yy - y)
+    inside = r < 0.75 * start
+    r2, values = r[inside] ** 2, data[inside]
+
+    def residual(p):
+        return p[0] * np.exp(-4 * np.log(2) * r2 / p[1] ** 2) - values / values.max()
+
+    return float(least_squares(residual, [1.0, start]).x[1])
+
+
+def psf_table(psfs, *, radii=(0.5, 1.0, 1.5, 2.5, 5.0) * u.arcsec):
+    """
+    Tabulate PSFs: width, radius of 80 %, encircled energies.
+
+    Parameters
+    ----------
+    psfs : iterable of `~photutils.psf.ImagePSF`
+        PSFs with the meta of `~miricigale.psf.make_psf`.
+    radii : `~astropy.units.Quantity`, optional
+        Radii of the encircled energies.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        Columns ``filter``, ``fwhm``, ``fwhm_gaussian``, ``r80``, ``enclosed`` and ``eef_<radius>``.
+    """
+    psfs = list(psfs)
+    table = QTable()
+    table["filter"] = [str(psf.meta.get("filter", "")) for psf in psfs]
+    table["fwhm"] = u.Quantity([fwhm(psf) for psf in psfs])
+    table["fwhm_gaussian"] = u.Quantity([fwhm(psf, method="gaussian") for psf in psfs])
+    table["r80"] = u.Quantity([radius_of_encircled_energy(psf, 0.8) for psf in psfs])
+    table["enclosed"] = [psf_info(psf).enclosed for psf in psfs]
+    for radius in radii:
+        name = f"eef_{radius.to_value(ANGLE):g}"
+        table[name] = [encircled_energy(psf, radius) for psf in psfs]
+        table[name].info.description = f"fraction of all light within {radius}"
+    table["fwhm"].info.description = "full width at half maximum of the azimuthal mean"
+    table["fwhm_gaussian"].info.description = "that of a Gaussian fitted out to 0.75 FWHM"
+    table["r80"].info.description = "radius that holds 80 % of all light"
+    table["enclosed"].info.description = "fraction of all light on the PSF's grid"
+    return table

@@ -1,0 +1,432 @@
+"""Kernels that bring an image to the resolution of another."""
+
+import dataclasses
+import functools
+import json
+
+import astropy.units as u
+import numpy as np
+from astropy.io import fits
+from photutils.psf import ImagePSF
+from photutils.psf_matching import make_wiener_kernel
+from scipy.signal import fftconvolve, oaconvolve
+
+from miricigale.psf import _core
+from miricigale.psf.model import make_psf, psf_info
+from miricigale.psf.resample import average_psf, psf_image, psf_mosaic, rotate_psf
+from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.units import ANGLE, frozen_array, to_array
+
+__all__ = ["REGULARIZATIONS", "MatchingKernel"]
+
+#: Regularisation parameters that have a name; they belong to pixels of 0.06 arcsec.
+REGULARIZATIONS = {"yang2021": 0.03}
+
+# from smooth to sharp: two steps per decade
+_SEQUENCE = tuple(10.0 ** (-0.5 * k) for k in range(2, 17))
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class MatchingKernel:
+    """
+    A convolution kernel from a sharp PSF to a wide one.
+
+    The sharp PSF is taken as the image of unit flux, so that a template of unit sum
+    turns into what the wide image shows of a source of unit flux: the kernel's sum is
+    the fraction of light that the wide PSF's grid holds, a little below 1 (exactly 1 with
+    ``normalize=True`` in `from_psfs`).
+
+    Parameters
+    ----------
+    array : `~numpy.ndarray`, shape (n, n), n odd
+        The kernel.
+    pixel_scale : `~astropy.units.Quantity`
+        Pixel of the images that it is for.
+    source, target : `~numpy.ndarray`, optional
+        The two PSFs on the same pixels.
+    regularization : float, optional
+        Wiener parameter with which it was made; NaN if unknown.
+    meta : dict, optional
+        What else is known of it.
+
+    Raises
+    ------
+    ValueError
+        If an array is not square, odd and finite.
+    """
+
+    array: np.ndarray
+    pixel_scale: u.Quantity
+    source: np.ndarray | None = None
+    target: np.ndarray | None = None
+    regularization: float = float("nan")
+    meta: dict = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        for name in ("array", "source", "target"):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, frozen_array(_odd_square(value, name)))
+        scale = float(to_array(self.pixel_scale, ANGLE, "pixel_scale"))
+        if not scale > 0:
+            raise argument_error("pixel_scale", "positive", self.pixel_scale)
+        object.__setattr__(self, "pixel_scale", scale * ANGLE)
+        object.__setattr__(self, "meta", dict(self.meta))
+
+    def __repr__(self):
+        n = self.array.shape[0]
+        return (
+            f"<MatchingKernel {n} x {n} px of {self.pixel_scale}, sum {self.array.sum():.4f}, "
+            f"regularization {self.regularization:.3g}>"
+        )
+
+    @classmethod
+    def from_psfs(
+        cls,
+        hi,
+        lo,
+        *,
+        pixel_scale,
+        regularization="auto",
+        penalty="laplacian",
+        hi_angle=None,
+        lo_angle=None,
+        grid_angle=0.0 * u.deg,
+        resampling=None,
+        extent=None,
+        normalize=False,
+        tolerance=1e-3,
+    ):
+        """
+        Make the kernel by a Wiener filter that penalises roughness.
+
+        Parameters
+        ----------
+        hi, lo : `~photutils.psf.ImagePSF` or `~numpy.ndarray`
+            The sharp and the wide PSF. An array is taken as sampled on the image's grid
+            (pixel and orientation), centred, its sum the fraction of light it holds.
+        pixel_scale : `~astropy.units.Quantity`
+            Pixel of the image that is to be convolved.
+        regularization : float, str, optional
+            The Wiener parameter mu; ``"yang2021"`` for 0.03. It belongs to the pixel
+            scale: the penalty of a given structure grows as the pixel's fourth power.
+            ``"auto"`` goes through 0.1, 0.03, ... 1e-8, takes the largest error of the
+            encircled energy at any radius for each, and chooses the largest mu (the
+            smoothest kernel) whose error is at most ``tolerance`` above the smallest.
+        penalty : str, optional
+            As for `photutils.psf_matching.make_wiener_kernel`.
+        hi_angle, lo_angle : `~astropy.units.Quantity`, optional
+            Position angle of the +y axis of a PSF in the detector frame; needed for those,
+            refused for PSFs on the sky. An array of angles (rolls, dithers) gives the average.
+        grid_angle : `~astropy.units.Quantity`, optional
+            Position angle of the image's +y axis.
+        resampling : {"drizzle", None}, optional
+            With ``"drizzle"`` the wide PSF is that of a drizzled mosaic on these pixels
+            (see `psf_mosaic`); None for the PSF of single exposures.
+        extent : `~astropy.units.Quantity`, optional
+            Width of the kernel; that of the wide PSF if not given.
+        normalize : bool, optional
+            Whether both PSFs are scaled to unit sum first, as the paper does.
+        tolerance : float, optional
+            See ``regularization``.
+
+        Returns
+        -------
+        kernel : `MatchingKernel`
+
+        Raises
+        ------
+        ValueError
+            If an angle is missing or one too many, shapes do not fit, or an array's sum is
+            not that of a PSF.
+
+        References
+        ----------
+        Boucaud et al. 2016, A&A 596, A63, eq. 15 (the filter); Yang et al. 2021, ApJ 908,
+        144, section 3.3.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from miricigale.psf import MatchingKernel, gaussian_psf
+        >>> kind = {"pixel_scale": 0.06 * u.arcsec, "fov": 6 * u.arcsec}
+        >>> hi, lo = (gaussian_psf(w * u.arcsec, **kind) for w in (0.2, 0.5))
+        >>> kernel = MatchingKernel.from_psfs(hi, lo, pixel_scale=0.06 * u.arcsec)
+        >>> round(float(kernel.array.sum()), 4)
+        1.0
+        """
+        scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
+        if resampling not in ("drizzle", None):
+            raise argument_error("resampling", "'drizzle' or None", repr(resampling))
+        n = _size(hi, lo, scale, extent)
+        source = _on_grid(hi, "hi", hi_angle, grid_angle, scale, n, None)
+        target = _on_grid(lo, "lo", lo_angle, grid_angle, scale, n, resampling)
+        energy = 1.0 if normalize else float(target.sum())
+        source = source / source.sum()
+        target = target * (energy / target.sum())
+        make = functools.partial(_wiener, source, target, penalty)
+        mu, errors = _choose(regularization, make, source, target, tolerance)
+        return cls(
+            make(mu),
+            pixel_scale=scale * ANGLE,
+            source=source,
+            target=target,
+            regularization=mu,
+            meta={
+                "penalty": penalty,
+                "energy": energy,
+                "lost": 0.0,
+                "grid_angle": float(grid_angle.to_value(u.deg)),
+                "resampling": resampling or "none",
+                **errors,
+            },
+        )
+
+    @property
+    def noise_gain(self):
+        """Factor by which the kernel multiplies the rms of uncorrelated noise."""
+        return float(np.sqrt(np.sum(self.array**2)))
+
+    @functools.cached_property
+    def matched(self):
+        """
+        The sharp PSF after convolution, to be compared with ``target``.
+
+        Raises
+        ------
+        ValueError
+            If the kernel was made without PSFs.
+        """
+        self._need_psfs()
+        return fftconvolve(self.source, self.array, mode="same")
+
+    def apply(self, image):
+        """
+        Convolve an image, taking zero outside of it.
+
+        Parameters
+        ----------
+        image : `~numpy.ndarray`, shape (ny, nx)
+            Image on pixels of ``pixel_scale``.
+
+        Returns
+        -------
+        image : `~numpy.ndarray`, shape (ny, nx)
+
+        Raises
+        ------
+        ValueError
+            If the image is not 2D or not finite (a pixel without data must be given a
+            value before it is spread over the kernel).
+        """
+        image = np.asarray(image, dtype=float)
+        if image.ndim != 2:
+            raise argument_error("image", "2D", f"shape {image.shape}")
+        bad = int(np.count_nonzero(~np.isfinite(image)))
+        if bad:
+            raise argument_error("image", "finite", f"{bad} pixels that are NaN or infinite")
+        convolve = oaconvolve if min(image.shape) > 2 * self.array.shape[0] else fftconvolve
+        full = convolve(image, self.array, mode="full")
+        h = self.array.shape[0] // 2
+        return full[h : h + image.shape[0], h : h + image.shape[1]]
+
+    def encircled_energy_error(self, radii=None):
+        """
+        Encircled energy of the convolved sharp PSF minus that of the wide one.
+
+        Parameters
+        ----------
+        radii : `~astropy.units.Quantity`, optional
+            By default every pixel from 1 to the edge.
+
+        Returns
+        -------
+        error : `~numpy.ndarray`
+            Fraction of all light, signed.
+
+        Raises
+        ------
+        ValueError
+            If the kernel was made without PSFs.
+        """
+        self._need_psfs()
+        pixels = _radii(self.target)
+        if radii is not None:
+            pixels = np.atleast_1d(to_array(radii, ANGLE, "radii")) / self.pixel_scale.value
+        return _energy_error(self.matched, self.target, np.ascontiguousarray(pixels))
+
+    def cropped(self, extent):
+        """
+        Cut the kernel to a smaller square; what is lost stands in ``meta['lost']``.
+
+        Parameters
+        ----------
+        extent : `~astropy.units.Quantity`
+            New width.
+
+        Returns
+        -------
+        kernel : `MatchingKernel`
+            Not renormalised: its sum is smaller by ``meta['lost']``. ``source`` and
+            ``target`` stay as they are.
+        """
+        width = float(to_array(extent, ANGLE, "extent")) / self.pixel_scale.value
+        half, old = int(width // 2), self.array.shape[0] // 2
+        if not 0 <= half <= old:
+            wanted = f"at most {self.array.shape[0] * self.pixel_scale.value:.4g} arcsec"
+            raise argument_error("extent", wanted, extent)
+        array = self.array[old - half : old + half + 1, old - half : old + half + 1]
+        lost = self.meta.get("lost", 0.0) + float(self.array.sum() - array.sum())
+        return dataclasses.replace(self, array=array, meta={**self.meta, "lost": lost})
+
+    def write(self, path, *, overwrite=False):
+        """
+        Write the kernel and its PSFs as FITS.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        overwrite : bool, optional
+            Whether an existing file is replaced.
+        """
+        hdus = [fits.PrimaryHDU(), fits.ImageHDU(self.array, name="KERNEL")]
+        header = hdus[1].header
+        header["PIXSCALE"] = (self.pixel_scale.value, "arcsec")
+        if np.isfinite(self.regularization):
+            header["REGULAR"] = (self.regularization, "Wiener parameter")
+        header["META"] = json.dumps(self.meta, default=str)
+        for name in ("source", "target"):
+            if getattr(self, name) is not None:
+                hdus.append(fits.ImageHDU(getattr(self, name), name=name.upper()))
+        fits.HDUList(hdus).writeto(path, overwrite=overwrite, checksum=True)
+
+    @classmethod
+    def read(cls, path):
+        """
+        Read what `write` wrote.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If the file is not a kernel.
+        """
+        with fits.open(path) as hdus:
+            if "KERNEL" not in hdus:
+                msg = f"{path} has no KERNEL extension, only {[hdu.name for hdu in hdus]}"
+                raise DataError(msg)
+            header = hdus["KERNEL"].header
+            arrays = {
+                name: np.array(hdus[name.upper()].data, dtype=float)
+                for name in ("source", "target")
+                if name.upper() in hdus
+            }
+            return cls(
+                np.array(hdus["KERNEL"].data, dtype=float),
+                header["PIXSCALE"] * ANGLE,
+                regularization=header.get("REGULAR", float("nan")),
+                meta=json.loads(header.get("META", "{}")),
+                **arrays,
+            )
+
+    def _need_psfs(self):
+        if self.source is None or self.target is None:
+            raise argument_error("source, target", "the kernel's PSFs", "a kernel without them")
+
+
+def _odd_square(value, name):
+    value = np.asarray(value, dtype=float)
+    if value.ndim != 2 or value.shape[0] != value.shape[1] or value.shape[0] % 2 == 0:
+        raise argument_error(name, "square with an odd number of pixels", f"shape {value.shape}")
+    if not np.all(np.isfinite(value)):
+        raise argument_error(name, "finite", "NaN or infinite pixels")
+    return value
+
+
+def _size(hi, lo, scale, extent):
+    """Odd number of pixels on which both PSFs are sampled."""
+    arrays = {
+        name: _odd_square(psf, name).shape[0]
+        for name, psf in (("hi", hi), ("lo", lo))
+        if not isinstance(psf, ImagePSF)
+    }
+    if len(set(arrays.values())) > 1:
+        raise argument_error("hi, lo", "arrays of the same shape", arrays)
+    if arrays:
+        n = next(iter(arrays.values()))
+    else:
+        n = 2 * int(psf_info(lo, "lo").half_width / scale) + 1
+    if extent is not None:
+        wanted = 2 * int(float(to_array(extent, ANGLE, "extent")) / scale / 2) + 1
+        if wanted > n or wanted < 5:
+            text = f"from 5 pixels to the {n * scale:.4g} arcsec of the PSFs"
+            raise argument_error("extent", text, extent)
+        n = wanted
+    return n
+
+
+def _on_grid(psf, name, angle, grid_angle, scale, n, resampling):
+    """One PSF on n x n pixels of the image, its sum the enclosed fraction."""
+    if not isinstance(psf, ImagePSF):
+        data = np.asarray(psf, dtype=float)
+        total = data.sum()
+        if not 0 < total < 1.02:
+            wanted = "a PSF whose sum is the fraction of light it holds (at most 1)"
+            raise argument_error(name, wanted, f"a sum of {total:.6g}")
+        cut = (data.shape[0] - n) // 2
+        if angle is None and resampling is None:
+            return data[cut : cut + n, cut : cut + n]
+        frame = "sky" if angle is None else "detector"
+        psf = make_psf(data, pixel_scale=scale * ANGLE, frame=frame)
+    info = psf_info(psf, name)
+    if info.frame == "detector" and angle is None:
+        wanted = "the position angle of the detector's +y (the PSF is in the detector frame)"
+        argument = name + "_angle"
+        raise argument_error(argument, wanted, "None")
+    if resampling:
+        psf = psf_mosaic(psf, scale * ANGLE, angle, grid_angle=grid_angle)
+    else:
+        angles = [None] if angle is None else list(np.atleast_1d(angle))
+        try:
+            turned = [rotate_psf(psf, one, grid_angle=grid_angle) for one in angles]
+        except ValueError as err:
+            raise ValueError(str(err).replace("'angle'", f"'{name}_angle'")) from None
+        psf = average_psf(turned) if len(turned) > 1 else turned[0]
+    return psf_image(psf, pixel_scale=scale * ANGLE, shape=n)
+
+
+def _wiener(source, target, penalty, mu):
+    kernel = make_wiener_kernel(source, target, regularization=mu, penalty=penalty)
+    return kernel * (target.sum() / kernel.sum())
+
+
+def _radii(image):
+    return np.arange(1.0, image.shape[0] // 2 + 0.25, 0.5)
+
+
+def _energy_error(image, target, radii):
+    c = target.shape[0] // 2
+    return _core.radial_sums(image - target, c, c, radii)
+
+
+def _choose(regularization, make, source, target, tolerance):
+    """The Wiener parameter, and what was measured on the way."""
+
+    def error(mu):
+        matched = fftconvolve(source, make(mu), mode="same")
+        return float(np.abs(_energy_error(matched, target, _radii(target))).max())
+
+    if isinstance(regularization, str):
+        if regularization in REGULARIZATIONS:
+            regularization = REGULARIZATIONS[regularization]
+        elif regularization != "auto":
+            known = ["auto", *REGULARIZATIONS]
+            raise argument_error("regularization", f"positive or one of {known}", regularization)
+    if regularization != "auto":
+        if not regularization > 0:
+            raise argument_error("regularization", "positive", regularization)
+        return float(regularization), {"max_error": error(regularization)}
+    errors = [error(mu) for mu in _SEQUENCE]
+    allowed = min(errors) + tolerance
+    best = next(k for k, value in enumerate(errors) if value <= allowed)
+    return _SEQUENCE[best], {"max_error": errors[best], "smallest_error": min(errors)}

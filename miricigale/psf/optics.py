@@ -1,0 +1,314 @@
+"""Pupils, wavefronts and the light of a point source in the focal plane."""
+
+import dataclasses
+import functools
+import math
+import tomllib
+
+import numpy as np
+
+from miricigale.psf import _core
+from miricigale.refdata import locate
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.random import stream
+from miricigale.utils.units import frozen_array
+
+__all__ = ["Pupil", "hst_pupil", "jwst_constants", "jwst_pupil", "polychromatic_psf"]
+
+#: One arcsecond in rad.
+ARCSEC = math.pi / 180 / 3600
+
+#: Lines per pupil cell along y at which outlines are sampled.
+_ROWS = 8
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Pupil:
+    """
+    A pupil on a square grid, seen so that its axes are those of the image.
+
+    Parameters
+    ----------
+    amplitude : `~numpy.ndarray`, shape (n, n)
+        Transmission of each cell, 0 to 1, edges anti-aliased.
+    segments : `~numpy.ndarray` of int, shape (n, n)
+        Number of the mirror segment from 1; 0 outside.
+    diameter : float
+        Side of the grid in m.
+    angle : float
+        Angle of the telescope's own y axis from the image's y axis, clockwise, in deg.
+    """
+
+    amplitude: np.ndarray
+    segments: np.ndarray
+    diameter: float
+    angle: float = 0.0
+
+    def __post_init__(self):
+        object.__setattr__(self, "amplitude", frozen_array(self.amplitude))
+        object.__setattr__(self, "segments", frozen_array(self.segments, dtype=np.int16))
+
+    @property
+    def n(self):
+        """Cells per side."""
+        return self.amplitude.shape[0]
+
+    @property
+    def step(self):
+        """Side of a cell in m."""
+        return self.diameter / self.n
+
+    @property
+    def clear_area(self):
+        """Collecting area in m^2."""
+        return float(self.amplitude.sum()) * self.step**2
+
+    def wavefront_error(self, rms, *, seed=1, segment_fraction=0.6):
+        """
+        Draw a wavefront error for the pupil.
+
+        Piston, tip, tilt and focus of every segment, and defocus, astigmatism, coma,
+        trefoil and spherical aberration of the whole; overall piston and tilt removed.
+        The draw does not depend on the grid or on the image's orientation beyond the
+        fineness of the grid.
+
+        Parameters
+        ----------
+        rms : float
+            In nm, over the pupil.
+        seed : int, optional
+            The same seed gives the same telescope at every wavelength.
+        segment_fraction : float, optional
+            Share of the variance in the segment terms.
+
+        Returns
+        -------
+        opd : `~numpy.ndarray`, shape (n, n)
+            Optical path difference in nm.
+
+        Raises
+        ------
+        ValueError
+            If ``rms`` is negative or ``segment_fraction`` is outside 0 to 1.
+        """
+        if not rms >= 0:
+            raise argument_error("rms", "zero or positive", rms)
+        if not 0 <= segment_fraction <= 1:
+            raise argument_error("segment_fraction", "between 0 and 1", segment_fraction)
+        if rms == 0:
+            return np.zeros_like(self.amplitude)
+        axis = (np.arange(self.n) - 0.5 * (self.n - 1)) * 2 / self.n
+        v, u = np.meshgrid(axis, axis, indexing="ij")
+        # back to the telescope's frame, so that the error turns with the telescope
+        a = math.radians(self.angle)
+        x, y = -u * math.cos(a) + v * math.sin(a), u * math.sin(a) + v * math.cos(a)
+        rng = stream(seed, "psf", "wavefront")
+        return _core.wavefront(self.amplitude, self.segments, x, y, rms, segment_fraction, rng)
+
+
+@functools.cache
+def jwst_constants():
+    """
+    The telescope's outlines and MIRI's couplings, from ``psf.jwst_pupil``.
+
+    Returns
+    -------
+    constants : dict
+        The content of the file; see its comments for units.
+    """
+    return tomllib.loads(locate("psf.jwst_pupil").read_text())
+
+
+def _to_image(vertices, angle):
+    """
+    Turn (V2, V3) outlines to the image's axes.
+
+    An image of the sky has V2 to the left where V3 is up (parity -1); V3 lies ``angle``
+    deg clockwise of the image's +y.
+    """
+    a = math.radians(angle)
+    v2, v3 = np.asarray(vertices, dtype=float).T
+    return np.ascontiguousarray(
+        np.stack([-v2 * math.cos(a) + v3 * math.sin(a), v2 * math.sin(a) + v3 * math.cos(a)], 1)
+    )
+
+
+@functools.lru_cache(maxsize=8)
+def jwst_pupil(n=384, *, angle=4.83544897, struts=True):
+    """
+    The entrance pupil of JWST as an image-plane axis sees it.
+
+    Parameters
+    ----------
+    n : int, optional
+        Cells per side.
+    angle : float, optional
+        V3IdlYAngle in deg: V3 lies that far clockwise of the detector's +y axis. The
+        default is MIRI's (SIAF, MIRIM_FULL).
+    struts : bool, optional
+        Whether the secondary mirror's struts obscure.
+
+    Returns
+    -------
+    pupil : `Pupil`
+
+    Raises
+    ------
+    ValueError
+        If ``n`` is too small to resolve the struts.
+    """
+    if n < 64:
+        raise argument_error("n", "at least 64", n)
+    constants = jwst_constants()
+    # corners of the B segments reach the circle in the telescope's frame only
+    diameter = constants["diameter"] * 1.002
+    step = diameter / n
+    amplitude = np.zeros((n, n))
+    segments = np.zeros((n, n), dtype=np.int16)
+    best = np.zeros((n, n))
+    for index, vertices in enumerate(constants["segments"].values(), start=1):
+        covered = _core.polygon_coverage(_to_image(vertices, angle), n, step, _ROWS)
+        amplitude += covered
+        mine = covered > best
+        segments[mine], best[mine] = index, covered[mine]
+    if struts:
+        blocked = np.zeros((n, n))
+        for vertices in constants["struts"].values():
+            covered = _core.polygon_coverage(_to_image(vertices, angle), n, step, _ROWS)
+            blocked = np.maximum(blocked, covered)
+        amplitude *= 1 - blocked
+    return Pupil(np.minimum(amplitude, 1.0), segments, diameter, angle)
+
+
+def _circle(radius, x=0.0, y=0.0, corners=720):
+    # a polygon of the circle's own area
+    t = 2 * np.pi * np.arange(corners) / corners
+    r = radius * math.sqrt(2 * np.pi / corners / math.sin(2 * np.pi / corners))
+    return np.stack([x + r * np.cos(t), y + r * np.sin(t)], axis=1)
+
+
+@functools.lru_cache(maxsize=8)
+def hst_pupil(n=256, *, angle=45.0, obscuration=0.40):
+    """
+    The pupil of HST with its central obscuration, four vanes and three pads.
+
+    Parameters
+    ----------
+    n : int, optional
+        Cells per side.
+    angle : float, optional
+        Angle of a vane from the image's +y axis in deg.
+    obscuration : float, optional
+        Radius of the central obscuration over that of the pupil. That of the telescope is
+        0.33; 0.40 is the value with which the light in the first ring agrees with STScI's
+        empirical PSFs of WFC3/IR at F160W, whose cold mask is larger.
+
+    Returns
+    -------
+    pupil : `Pupil`
+
+    Notes
+    -----
+    2.4 m, vanes 0.022 and pads 0.065 of the radius, the geometry of the Optical Telescope
+    Assembly.
+
+    References
+    ----------
+    Krist, Hook & Stoehr 2011, SPIE 8127, 81270J (Tiny Tim).
+    """
+    diameter = 2.4
+    radius, step = 0.5 * diameter, diameter / n
+    amplitude = _core.polygon_coverage(_circle(radius), n, step, _ROWS)
+    segments = (amplitude > 0).astype(np.int16)
+    amplitude *= 1 - _core.polygon_coverage(_circle(obscuration * radius), n, step, _ROWS)
+    half = 0.011 * radius
+    blocked = np.zeros((n, n))
+    for k in range(2):
+        a = math.radians(angle + 90 * k)
+        along, across = np.array([-math.sin(a), math.cos(a)]), np.array([math.cos(a), math.sin(a)])
+        corners = np.array(
+            [
+                s * radius * along + t * half * across
+                for s, t in ((-1, -1), (-1, 1), (1, 1), (1, -1))
+            ]
+        )
+        blocked = np.maximum(blocked, _core.polygon_coverage(corners, n, step, _ROWS))
+    turn = math.radians(angle - 45.0)
+    for px, py in ((0.8921, 0.0), (-0.4615, 0.7555), (-0.4564, -0.7606)):
+        x = radius * (px * math.cos(turn) - py * math.sin(turn))
+        y = radius * (px * math.sin(turn) + py * math.cos(turn))
+        pad = _core.polygon_coverage(_circle(0.065 * radius, x, y, 90), n, step, _ROWS)
+        blocked = np.maximum(blocked, pad)
+    return Pupil(amplitude * (1 - blocked), segments, diameter, 0.0)
+
+
+def _centre(pupil, opd, wavelength):
+    """Offset of the image's core from the axis in rad (Gaussian-weighted centroid)."""
+    scale = wavelength / pupil.diameter
+    grid = np.linspace(-4, 4, 65) * scale
+    function = pupil.amplitude * np.exp(2j * np.pi * opd / wavelength)
+    image = _core.matrix_dft_intensity(function, pupil.step, wavelength, grid, grid)
+    x, y = 0.0, 0.0
+    for _ in range(20):
+        wx = np.exp(-0.5 * ((grid - x) / (0.6 * scale)) ** 2)
+        wy = np.exp(-0.5 * ((grid - y) / (0.6 * scale)) ** 2)
+        weighted = image * wy[:, None] * wx
+        total = weighted.sum()
+        # twice the step: for a core as wide as the window this converges at once
+        dx = 2 * (np.sum(weighted.sum(0) * grid) / total - x)
+        dy = 2 * (np.sum(weighted.sum(1) * grid) / total - y)
+        x, y = x + dx, y + dy
+        if math.hypot(dx, dy) < 1e-5 * scale:
+            break
+    return x, y
+
+
+def polychromatic_psf(pupil, opd, wavelengths, *, weights=None, step, n):
+    """
+    Light of a point source summed over a band, before any detector.
+
+    Parameters
+    ----------
+    pupil : `Pupil`
+        The pupil in the axes of the image.
+    opd : `~numpy.ndarray`, shape (n_pupil, n_pupil)
+        Optical path difference in nm.
+    wavelengths : `~numpy.ndarray`, shape (m,)
+        In um.
+    weights : `~numpy.ndarray`, shape (m,), optional
+        Weights of the wavelengths; equal if not given.
+    step : float
+        Side of an image cell in arcsec.
+    n : int
+        Cells per side, odd; the core's centroid stands on the middle one.
+
+    Returns
+    -------
+    image : `~numpy.ndarray`, shape (n, n)
+        Fraction of the light in each cell.
+
+    Raises
+    ------
+    ValueError
+        If ``n`` is even or the grid is wider than the transform's period.
+    """
+    if n % 2 == 0:
+        raise argument_error("n", "odd", n)
+    wavelengths = np.asarray(wavelengths, dtype=float) * 1e-6
+    period = wavelengths.min() / pupil.step / ARCSEC
+    if n * step > period:
+        wanted = f"an image below {period:.1f} arcsec (a finer pupil allows more)"
+        raise argument_error("n", wanted, f"{n} x {step:.4g} arcsec = {n * step:.1f} arcsec")
+    if weights is None:
+        weights = np.full(wavelengths.size, 1.0 / wavelengths.size)
+    opd = np.asarray(opd, dtype=float) * 1e-9
+    shift = _centre(pupil, opd, float(np.average(wavelengths, weights=weights)))
+    axis = (np.arange(n) - (n - 1) // 2) * step * ARCSEC
+    image = np.zeros((n, n))
+    power = float(pupil.amplitude.sum())
+    for wavelength, weight in zip(wavelengths, weights, strict=True):
+        function = pupil.amplitude * np.exp(2j * np.pi * opd / wavelength)
+        image += weight * _core.matrix_dft_intensity(
+            function, pupil.step, wavelength, axis + shift[0], axis + shift[1], power=power
+        )
+    return image

@@ -1,0 +1,283 @@
+"""PSFs on other grids: turned to the sky, averaged, sampled, drizzled."""
+
+import math
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import Angle
+from photutils.psf import ImagePSF
+
+from miricigale.psf.effects import detector_response
+from miricigale.psf.model import interpolate, make_psf, psf_info
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import ANGLE, to_array
+
+__all__ = ["average_psf", "psf_image", "psf_mosaic", "rotate_psf"]
+
+# entries of the meta that make_psf works out itself
+_MADE = ("pixel_scale", "oversampling", "frame", "angle", "includes", "fwhm", "enclosed")
+_MADE += ("eef_radius", "eef")
+
+
+def _carried(meta, **changes):
+    kept = {key: value for key, value in meta.items() if key not in _MADE}
+    return {**kept, **changes}
+
+
+def _degrees(angle, argument):
+    if angle is None:
+        wanted = "the position angle of the detector's +y axis, east of north"
+        raise argument_error(argument, wanted, "None: it is unknown where the PSF points")
+    if not isinstance(angle, (u.Quantity, Angle)):
+        msg = f"'{argument}' must be a quantity convertible to deg, got a bare number"
+        raise u.UnitsError(msg)
+    return float(to_array(angle, u.deg, argument, finite=True))
+
+
+def _turn_by(info, angle, grid_angle, argument):
+    """Counter-clockwise turn in deg that brings the PSF to the grid."""
+    if info.frame == "sky":
+        if angle is not None:
+            wanted = "left out for a PSF that stands on the sky already"
+            raise argument_error(argument, wanted, angle)
+        start = info.angle
+    else:
+        start = _degrees(angle, argument)
+    return start - grid_angle
+
+
+def _sample(info, x, y, turn):
+    """Values per cell at offsets x, y in arcsec (broadcast), after a turn in deg."""
+    a = math.radians(turn)
+    if turn % 360 == 0:
+        u_, v_ = x, y
+    else:
+        u_ = x * math.cos(a) + y * math.sin(a)
+        v_ = -x * math.sin(a) + y * math.cos(a)
+    return interpolate(info.data, u_ / info.cell + info.origin[0], v_ / info.cell + info.origin[1])
+
+
+def rotate_psf(psf, angle=None, *, grid_angle=0.0 * u.deg):
+    """
+    Turn a PSF from the detector's axes to those of an image of the sky.
+
+    Parameters
+    ----------
+    psf : `~photutils.psf.ImagePSF`
+        In the detector frame, or in the sky frame at another angle.
+    angle : `~astropy.units.Quantity`
+        Position angle of the detector's +y axis, east of north (PA_APER). Needed for a
+        PSF in the detector frame, refused for one that stands on the sky.
+    grid_angle : `~astropy.units.Quantity`, optional
+        Position angle of the image's +y axis; 0 for a mosaic with north up. Its +x is
+        west of that, as on any image of the sky.
+
+    Returns
+    -------
+    psf : `~photutils.psf.ImagePSF`
+        Same grid, frame ``"sky"``; cells that come from beyond the old grid are 0.
+
+    Raises
+    ------
+    ValueError
+        If the angle of a PSF in the detector frame is not given.
+
+    Notes
+    -----
+    With north up and east left a position angle grows counter-clockwise, and so does the
+    turn.
+    """
+    info = psf_info(psf)
+    grid = _degrees(grid_angle, "grid_angle")
+    turn = _turn_by(info, angle, grid, "angle")
+    ny, nx = info.data.shape
+    if turn % 90 == 0 and nx == ny and info.origin == ((nx - 1) / 2, (ny - 1) / 2):
+        # counter-clockwise with y up
+        data = np.rot90(info.data, -round(turn / 90))
+    else:
+        x = (np.arange(nx) - info.origin[0]) * info.cell
+        y = ((np.arange(ny) - info.origin[1]) * info.cell)[:, None]
+        data = _sample(info, x, y, turn)
+    return make_psf(
+        data,
+        pixel_scale=info.pixel_scale * ANGLE,
+        oversampling=info.oversampling,
+        frame="sky",
+        angle=grid * u.deg,
+        includes=info.includes,
+        origin=info.origin,
+        **_carried(info.meta, telescope_angle=turn + grid),
+    )
+
+
+def average_psf(psfs, weights=None):
+    """
+    Average PSFs, for instance over dithers or rolls.
+
+    Parameters
+    ----------
+    psfs : sequence of `~photutils.psf.ImagePSF`
+        All of the same grid, frame, angle and effects.
+    weights : array_like, optional
+        Non-negative weights, such as exposure times; equal if not given.
+
+    Returns
+    -------
+    psf : `~photutils.psf.ImagePSF`
+
+    Raises
+    ------
+    ValueError
+        If the list is empty, the PSFs differ, or the weights do not fit.
+    """
+    psfs = list(psfs)
+    if not psfs:
+        raise argument_error("psfs", "at least one PSF", "none")
+    infos = [psf_info(psf, f"psfs[{i}]") for i, psf in enumerate(psfs)]
+    first = infos[0]
+    for i, info in enumerate(infos[1:], start=1):
+        for name in ("pixel_scale", "oversampling", "frame", "angle", "includes", "origin"):
+            mine, theirs = getattr(info, name), getattr(first, name)
+            same = (
+                np.allclose(mine, theirs, rtol=1e-6) if isinstance(mine, float) else mine == theirs
+            )
+            if not same:
+                raise argument_error("psfs", f"alike in {name}", f"{theirs} and {mine} (psfs[{i}])")
+        if info.data.shape != first.data.shape:
+            raise argument_error(
+                "psfs", "alike in shape", f"{first.data.shape} and {info.data.shape} (psfs[{i}])"
+            )
+    w = np.ones(len(psfs)) if weights is None else np.asarray(weights, dtype=float)
+    if w.shape != (len(psfs),) or np.any(w < 0) or not w.sum() > 0:
+        raise argument_error("weights", f"{len(psfs)} non-negative numbers", weights)
+    data = np.tensordot(w / w.sum(), np.stack([info.data for info in infos]), axes=1)
+    return make_psf(
+        data,
+        pixel_scale=first.pixel_scale * ANGLE,
+        oversampling=first.oversampling,
+        frame=first.frame,
+        angle=first.angle * u.deg,
+        includes=first.includes,
+        origin=first.origin,
+        **_carried(first.meta, n_averaged=len(psfs)),
+    )
+
+
+def psf_image(psf, *, pixel_scale, shape, offset=(0.0, 0.0)):
+    """
+    Sample a PSF on another pixel grid of the same orientation.
+
+    The PSF is evaluated at the pixels' centres and scaled by the ratio of the areas;
+    no further pixel response is applied (see `psf_mosaic` for that).
+
+    Parameters
+    ----------
+    psf : `~photutils.psf.ImagePSF`
+        A PSF with the meta of `~miricigale.psf.make_psf`.
+    pixel_scale : `~astropy.units.Quantity`
+        Side of a pixel of the image.
+    shape : int or tuple of int
+        Rows and columns; the PSF's centre is the middle of the image.
+    offset : tuple of float, optional
+        Shift of the centre in x, y, in pixels of the image.
+
+    Returns
+    -------
+    image : `~numpy.ndarray`, shape ``shape``
+        Fraction of the light in each pixel; the sum is the encircled fraction.
+    """
+    info = psf_info(psf)
+    scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
+    ny, nx = (shape, shape) if np.isscalar(shape) else shape
+    x = (np.arange(nx) - (nx - 1) / 2 - offset[0]) * scale
+    y = ((np.arange(ny) - (ny - 1) / 2 - offset[1]) * scale)[:, None]
+    return _sample(info, x, y, 0.0) * (scale / info.pixel_scale) ** 2
+
+
+def psf_mosaic(
+    psf,
+    pixel_scale,
+    pa=None,
+    fov=None,
+    *,
+    grid_angle=0.0 * u.deg,
+    resampling="drizzle",
+    pixfrac=1.0,
+    oversampling=None,
+):
+    """
+    The PSF of a mosaic made from many dithered exposures.
+
+    Parameters
+    ----------
+    psf : `~photutils.psf.ImagePSF`
+        PSF of the exposures, detector frame (or sky frame, then without ``pa``).
+    pixel_scale : `~astropy.units.Quantity`
+        Pixel of the mosaic.
+    pa : `~astropy.units.Quantity`, optional
+        Position angle of the detector's +y; several (an array) are averaged.
+    fov : `~astropy.units.Quantity`, optional
+        Width of the grid; that of ``psf`` if not given.
+    grid_angle : `~astropy.units.Quantity`, optional
+        Position angle of the mosaic's +y.
+    resampling : {"drizzle", None}, optional
+        ``"drizzle"`` adds what the resampling does to the image, averaged over all
+        sub-pixel positions: the drop (the detector's pixel times ``pixfrac``) and the
+        mosaic's own pixel. None changes the grid only.
+    pixfrac : float, optional
+        Size of the drop.
+    oversampling : int, optional
+        Cells per mosaic pixel; by default as fine as ``psf``.
+
+    Returns
+    -------
+    psf : `~photutils.psf.ImagePSF`
+        Frame ``"sky"``, ``pixel_scale`` that of the mosaic, ``"drizzle"`` added to
+        ``includes``.
+
+    Raises
+    ------
+    ValueError
+        If ``pa`` is missing for a PSF in the detector frame.
+
+    References
+    ----------
+    Fruchter & Hook 2002, PASP 114, 144.
+    """
+    info = psf_info(psf)
+    if resampling not in ("drizzle", None):
+        raise argument_error("resampling", "'drizzle' or None", repr(resampling))
+    if not 0 < pixfrac <= 1:
+        raise argument_error("pixfrac", "above 0 and at most 1", pixfrac)
+    scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
+    grid = _degrees(grid_angle, "grid_angle")
+    angles = [None] if pa is None else list(np.atleast_1d(pa))
+    turns = [_turn_by(info, angle, grid, "pa") for angle in angles]
+    if oversampling is None:
+        oversampling = max(1, math.ceil(scale / info.cell - 1e-6))
+    cell = scale / oversampling
+    width = 2 * info.half_width if fov is None else float(to_array(fov, ANGLE, "fov"))
+    n = 2 * round(0.5 * width / cell - 0.5) + 1
+    if resampling == "drizzle":
+        data = detector_response(
+            info.data, oversampling=info.oversampling, pixel=False, boxes=(pixfrac,)
+        )
+        blurred = ImagePSF(data, oversampling=info.oversampling, origin=info.origin)
+        blurred.meta.update(info.meta)
+        info = psf_info(blurred)
+    axis = (np.arange(n) - n // 2) * cell
+    data = np.mean([_sample(info, axis, axis[:, None], turn) for turn in turns], axis=0)
+    data *= (scale / info.pixel_scale) ** 2
+    includes = list(info.includes)
+    if resampling == "drizzle":
+        data = detector_response(data, oversampling=oversampling, pixel=True)
+        includes.append("drizzle")
+    return make_psf(
+        data,
+        pixel_scale=scale * ANGLE,
+        oversampling=oversampling,
+        frame="sky",
+        angle=grid * u.deg,
+        includes=includes,
+        **_carried(info.meta, telescope_angle=turns[0] + grid),
+    )

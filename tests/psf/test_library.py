@@ -1,0 +1,258 @@
+import os
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+from photutils.psf import ImagePSF
+
+from miricigale.filters import Filter
+from miricigale.psf import (
+    encircled_energy,
+    fwhm,
+    gaussian_psf,
+    hst_psf,
+    library,
+    make_psf,
+    miri_psf,
+    moffat_psf,
+    psf_info,
+    psf_table,
+    radius_of_encircled_energy,
+)
+
+# jwst-docs, MIRI Point Spread Functions, table 1 (commissioning, PID 1028)
+IN_FLIGHT = {
+    "miri.f560w": 0.207,
+    "miri.f770w": 0.269,
+    "miri.f1000w": 0.328,
+    "miri.f1130w": 0.375,
+    "miri.f1280w": 0.420,
+    "miri.f1500w": 0.488,
+    "miri.f1800w": 0.591,
+    "miri.f2100w": 0.674,
+    "miri.f2550w": 0.803,
+}
+
+# stpsf 2.2.0: MIRI().psf_grid(num_psfs=1, oversample=4, fov_pixels=91, nlambda=9) with no
+# wavefront error (pupilopd=None, no instrument error) and no pupil shift
+STPSF_RADII = [0.2, 0.3, 0.5, 1.0, 1.5, 2.5] * u.arcsec
+STPSF = {
+    "miri.f560w": (0.2082, [0.5940, 0.6753, 0.7761, 0.8332, 0.8619, 0.9082]),
+    "miri.f770w": (0.2680, [0.5436, 0.6500, 0.7643, 0.8373, 0.8706, 0.9131]),
+    "miri.f1000w": (0.3457, [0.4563, 0.6415, 0.7207, 0.8510, 0.8913, 0.9233]),
+    "miri.f2100w": (0.6954, [0.1602, 0.3154, 0.5874, 0.7209, 0.8418, 0.8764]),
+}
+
+DATA = os.environ.get("MIRICIGALE_DATA")
+needs_data = pytest.mark.skipif(
+    DATA is None or not (Path(DATA) / "psf").exists(),
+    reason="needs the psf folder of MIRICIGALE_DATA",
+)
+
+
+@pytest.mark.parametrize("name", IN_FLIGHT)
+def test_width_agrees_with_the_telescope_in_flight(name):
+    psf = miri_psf(name, fov=9 * u.arcsec)
+    assert fwhm(psf, method="gaussian").to_value(u.arcsec) == pytest.approx(
+        IN_FLIGHT[name], rel=0.04
+    )
+    assert fwhm(psf).to_value(u.arcsec) == pytest.approx(IN_FLIGHT[name], rel=0.07)
+
+
+@pytest.mark.parametrize("name", STPSF)
+def test_agrees_with_stpsf(name):
+    width, energies = STPSF[name]
+    psf = miri_psf(name, wavefront_error=0 * u.nm, calibration="stpsf", fov=9 * u.arcsec)
+    assert fwhm(psf).to_value(u.arcsec) == pytest.approx(width, rel=0.01)
+    np.testing.assert_allclose(encircled_energy(psf, STPSF_RADII), energies, atol=0.017)
+
+
+def test_model_is_a_photutils_psf_of_unit_flux_per_pixel():
+    psf = miri_psf("miri.f770w")
+    assert isinstance(psf, ImagePSF)
+    n = psf.data.shape[0]
+    assert psf.data.shape == (n, n)
+    assert n % 2 == 1
+    assert np.unravel_index(psf.data.argmax(), psf.data.shape) == (n // 2, n // 2)
+    # evaluated at the pixels of a detector, at any sub-pixel position: the enclosed light
+    y, x = np.mgrid[:201, :201]
+    for position in ((100.0, 100.0), (100.37, 99.81)):
+        image = psf.evaluate(x, y, 1.0, *position)
+        assert image.sum() == pytest.approx(psf.meta["enclosed"], abs=1e-3)
+
+
+def test_meta_says_what_the_psf_is():
+    psf = miri_psf("miri.f1000w", fov=8 * u.arcsec, includes=("ipc", "pixel"), seed=4)
+    meta = psf.meta
+    assert meta["filter"] == "miri.f1000w"
+    assert meta["includes"] == ["pixel", "ipc"]
+    assert meta["frame"] == "detector"
+    assert meta["angle"] == 0
+    assert meta["pixel_scale"] == pytest.approx((0.110498 * 0.111336) ** 0.5)
+    assert (meta["oversampling"], meta["seed"], meta["wavefront_error"]) == (4, 4, 75.0)
+    assert meta["fwhm"] == pytest.approx(fwhm(psf).to_value(u.arcsec))
+    assert meta["eef_radius"] == [0.25, 0.5, 1.0, 1.5, 2.5]
+    np.testing.assert_allclose(meta["eef"], encircled_energy(psf, meta["eef_radius"] * u.arcsec))
+    assert meta["enclosed"] == pytest.approx(psf.data.sum() / 16)
+    assert any("Perrin" in text for text in meta["citations"])
+
+
+def test_effects_are_applied_once_and_only_if_asked():
+    kind = {"fov": 4 * u.arcsec}
+    bare = fwhm(miri_psf("miri.f770w", includes=(), **kind))
+    pixel = fwhm(miri_psf("miri.f770w", includes=("pixel",), **kind))
+    both = fwhm(miri_psf("miri.f770w", includes=("pixel", "ipc"), **kind))
+    assert bare < pixel < both
+    a = miri_psf("miri.f770w", includes=("ipc", "pixel", "cruciform", "jitter"), **kind)
+    np.testing.assert_array_equal(a.data, miri_psf("miri.f770w", **kind).data)
+
+
+def test_seed_makes_the_telescope():
+    kind = {"fov": 5 * u.arcsec}
+    one, two = (miri_psf("miri.f560w", seed=s, **kind).data for s in (1, 2))
+    library._miri_data.cache_clear()
+    np.testing.assert_array_equal(miri_psf("miri.f560w", seed=1, **kind).data, one)
+    assert np.abs(one - two).max() > 1e-3 * one.max()
+
+
+def test_cached_data_cannot_be_spoiled():
+    kind = {"fov": 5 * u.arcsec}
+    psf = miri_psf("miri.f1500w", **kind)
+    before = psf.data.copy()
+    psf.data[:] = 0
+    np.testing.assert_array_equal(miri_psf("miri.f1500w", **kind).data, before)
+
+
+def test_result_does_not_depend_on_the_sampling():
+    radii = [0.3, 0.6, 1.0, 2.0] * u.arcsec
+    kind = {"fov": 5 * u.arcsec}
+    reference = encircled_energy(miri_psf("miri.f770w", **kind), radii)
+    for other in ({"oversampling": 3}, {"n_pupil": 512}, {"n_wavelengths": 15}):
+        psf = miri_psf("miri.f770w", **kind, **other)
+        np.testing.assert_allclose(encircled_energy(psf, radii), reference, atol=1e-3)
+
+
+def test_field_of_view_only_cuts():
+    small, large = (miri_psf("miri.f1000w", fov=w * u.arcsec) for w in (6, 10))
+    n, m = small.data.shape[0] // 2, large.data.shape[0] // 2
+    inner = large.data[m - n : m + n + 1, m - n : m + n + 1]
+    # but for light that the cruciform scatters from outside
+    np.testing.assert_allclose(small.data, inner, atol=1e-5 * inner.max())
+    assert small.meta["enclosed"] < large.meta["enclosed"] < 1
+
+
+def test_encircled_energy_rises_to_the_enclosed_light():
+    psf = miri_psf("miri.f2100w")
+    energy = encircled_energy(psf, np.linspace(0, 10.4, 60) * u.arcsec)
+    assert energy[0] == 0
+    assert np.all(np.diff(energy) > 0)
+    assert 0.95 < energy[-1] < psf.meta["enclosed"] < 1
+    r80 = radius_of_encircled_energy(psf, 0.8)
+    assert encircled_energy(psf, r80) == pytest.approx(0.8, abs=1e-4)
+
+
+def test_table_of_all_filters():
+    radii = [1, 2.5] * u.arcsec
+    table = psf_table([miri_psf(name, fov=9 * u.arcsec) for name in IN_FLIGHT], radii=radii)
+    assert np.all(np.diff(table["fwhm"]) > 0)
+    assert table["r80"].unit == u.arcsec
+    assert np.all(table["eef_2.5"] > table["eef_1"])
+
+
+@pytest.mark.parametrize("index", [0.0, 2.0])
+def test_band_quantiles_have_the_mean_wavelength_of_the_photons(index):
+    band = Filter.from_name("miri.f1500w")
+    wave, rate = band.wave.value, band.throughput * band.wave.value ** (-1.0 - index)
+    mean = np.trapezoid(rate * wave, wave) / np.trapezoid(rate, wave)
+    quantiles = library.band_quantiles("miri.f1500w", 51, index)
+    assert np.all(np.diff(quantiles) > 0)
+    assert quantiles.mean() == pytest.approx(mean, rel=1e-3)
+
+
+def test_hst_has_the_width_of_the_mosaics():
+    psf = hst_psf()
+    assert fwhm(psf).to_value(u.arcsec) == pytest.approx(0.20, abs=5e-4)
+    assert psf.meta["frame"] == "sky"
+    assert psf.meta["pixel_scale"] == 0.06
+    assert fwhm(hst_psf(fwhm=0.22 * u.arcsec)).to_value(u.arcsec) == pytest.approx(0.22, abs=5e-4)
+    assert fwhm(hst_psf("wfc3.f105w")) < fwhm(psf)
+
+
+def test_hst_spikes_turn_with_the_telescope():
+    psf = hst_psf(angle=25 * u.deg)
+    info = psf_info(psf)
+    c, r = info.origin[0], 3.0 / info.cell
+    angles = np.radians(np.arange(0, 180, 0.5))
+    # position angle t: counter-clockwise from +y
+    ring = psf.evaluate(-r * np.sin(angles) / 4, r * np.cos(angles) / 4, 1.0, 0.0, 0.0)
+    assert c == (psf.data.shape[0] - 1) / 2
+    peak = np.degrees(angles[np.argmax(ring)])
+    assert min(abs(peak - 70), abs(peak - 160)) < 2
+
+
+@needs_data
+@pytest.mark.filterwarnings("ignore::astropy.io.fits.verify.VerifyWarning")
+def test_hst_agrees_with_empirical_psfs():
+    from miricigale.psf import read_psf
+
+    radii = [0.1, 0.2, 0.3, 0.5, 1.0, 1.5] * u.arcsec
+    # STScI's ePSF: no drizzle, so only beyond the core
+    empirical = read_psf(
+        Path(DATA) / "psf" / "PSFSTD_WFC3IR_F160W.fits",
+        plane=4,
+        pixel_scale=0.128 * u.arcsec,
+        oversampling=4,
+        frame="detector",
+        enclosed=1.0,
+    )
+    a, b = encircled_energy(empirical, radii), encircled_energy(hst_psf(), radii)
+    np.testing.assert_allclose((b / b[-1])[2:], (a / a[-1])[2:], atol=0.025)
+    # CEERS mosaics, 0.04 arcsec pixels as the header says
+    ceers = read_psf(
+        Path(DATA) / "psf" / "psf-ceers-f160w.fits",
+        pixel_scale=0.04 * u.arcsec,
+        frame="sky",
+        enclosed=1.0,
+    )
+    ours = hst_psf(pixel_scale=0.04 * u.arcsec, fwhm=fwhm(ceers))
+    a, b = encircled_energy(ceers, radii), encircled_energy(ours, radii)
+    np.testing.assert_allclose(b / b[-1], a / a[-1], atol=0.05)
+
+
+def test_gaussian_and_moffat_have_their_width_and_energy():
+    kind = {"pixel_scale": 0.1 * u.arcsec, "fov": 12 * u.arcsec}
+    g = gaussian_psf(0.8 * u.arcsec, **kind)
+    m = moffat_psf(0.8 * u.arcsec, beta=2.5, **kind)
+    assert fwhm(g).to_value(u.arcsec) == pytest.approx(0.8, rel=1e-3)
+    assert fwhm(g, method="gaussian").to_value(u.arcsec) == pytest.approx(0.8, rel=1e-3)
+    assert fwhm(m).to_value(u.arcsec) == pytest.approx(0.8, rel=1e-3)
+    assert g.meta["enclosed"] == pytest.approx(1)
+    core = 0.4 / np.sqrt(2 ** (1 / 2.5) - 1)
+    expected = 1 - (1 + (3.0 / core) ** 2) ** (1 - 2.5)
+    assert encircled_energy(m, 3 * u.arcsec) == pytest.approx(expected, rel=1e-3)
+
+
+def test_wrong_arguments_are_named():
+    with pytest.raises(KeyError, match=r"no PSF for the filter 'miri.f999w'; known: miri.f1000w"):
+        miri_psf("miri.f999w")
+    with pytest.raises(ValueError, match="'includes' must be out of"):
+        miri_psf("miri.f770w", includes=("pixel", "smile"))
+    with pytest.raises(u.UnitsError, match="'fov' must be a quantity"):
+        miri_psf("miri.f770w", fov=10)
+    with pytest.raises(u.UnitsError, match="'wavefront_error' must be convertible"):
+        miri_psf("miri.f770w", wavefront_error=1 * u.s)
+    with pytest.raises(ValueError, match="'oversampling' must be a positive integer"):
+        miri_psf("miri.f770w", oversampling=0)
+    with pytest.raises(ValueError, match="'fwhm' must be at least"):
+        hst_psf(fwhm=0.1 * u.arcsec)
+    psf = gaussian_psf(0.5 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=4 * u.arcsec)
+    with pytest.raises(ValueError, match="'radius' must be between 0 and the half width"):
+        encircled_energy(psf, 3 * u.arcsec)
+    with pytest.raises(ValueError, match="'fraction' must be positive and at most"):
+        radius_of_encircled_energy(psf, 1.5)
+    with pytest.raises(ValueError, match="'data' must be normalised to 4"):
+        make_psf(np.ones((9, 9)), pixel_scale=1 * u.arcsec, oversampling=2, frame="sky")
+    bare = ImagePSF(np.ones((9, 9)) / 81)
+    with pytest.raises(ValueError, match="from_photutils"):
+        fwhm(bare)

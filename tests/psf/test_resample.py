@@ -1,0 +1,236 @@
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.nddata import NDData
+from astropy.wcs import WCS
+from photutils.psf import GriddedPSFModel, ImagePSF
+
+from miricigale.psf import (
+    average_psf,
+    encircled_energy,
+    from_photutils,
+    gaussian_psf,
+    make_psf,
+    miri_psf,
+    psf_image,
+    psf_info,
+    psf_mosaic,
+    read_psf,
+    rotate_psf,
+)
+
+
+def blob(x, y, *, frame="detector", n=121, oversampling=4, scale=0.11):
+    """A core and a fainter blob at an offset x, y in pixels."""
+    axis = (np.arange(n) - n // 2) / oversampling
+    xx, yy = np.meshgrid(axis, axis)
+    data = np.exp(-0.5 * (xx**2 + yy**2)) + 0.5 * np.exp(-2 * ((xx - x) ** 2 + (yy - y) ** 2))
+    data *= oversampling**2 / data.sum()
+    return make_psf(data, pixel_scale=scale * u.arcsec, oversampling=oversampling, frame=frame)
+
+
+def detector_wcs(pa):
+    """+y at position angle ``pa``, +x west of it."""
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    wcs.wcs.crval = [53.1, -27.8]
+    wcs.wcs.crpix = [1, 1]
+    a, s = np.radians(pa), 0.11 / 3600
+    # east of north: +y is (sin pa, cos pa) in (east, north), +x is (-cos pa, sin pa)
+    wcs.wcs.cd = s * np.array([[-np.cos(a), np.sin(a)], [np.sin(a), np.cos(a)]])
+    return wcs
+
+
+@pytest.mark.parametrize("pa", [0.0, 35.0, 110.0, -75.0, 250.0])
+@pytest.mark.parametrize(("x", "y"), [(0.0, 9.0), (8.0, 0.0), (-6.0, 5.0)])
+def test_feature_lands_at_its_place_on_the_sky(pa, x, y):
+    """The blob's sky position through the detector's WCS, found again in a north-up mosaic."""
+    psf = rotate_psf(blob(x, y), pa * u.deg)
+    north_up = detector_wcs(0.0)
+    sky = detector_wcs(pa).pixel_to_world(x, y)
+    mx, my = north_up.world_to_pixel(sky)
+    around = psf.evaluate(
+        *np.meshgrid(mx + np.linspace(-1, 1, 41), my + np.linspace(-1, 1, 41)), 1.0, 0.0, 0.0
+    )
+    j, i = np.unravel_index(around.argmax(), around.shape)
+    assert abs(i - 20) * 0.05 < 0.15
+    assert abs(j - 20) * 0.05 < 0.15
+    assert psf.meta["frame"] == "sky"
+    assert psf.meta["telescope_angle"] == pa
+
+
+def test_north_up_and_east_left():
+    """At PA 90 the detector's +y points east, which is to the left."""
+    psf = rotate_psf(blob(0.0, 9.0), 90 * u.deg)
+    east, west = psf.evaluate(np.array([-9.0, 9.0]), np.zeros(2), 1.0, 0.0, 0.0)
+    assert east > 10 * abs(west)
+
+
+@pytest.mark.parametrize("quarter", [1, 2, 3])
+def test_quarter_turns_move_pixels_and_agree_with_interpolation(quarter):
+    psf = blob(3.0, 7.0)
+    exact = rotate_psf(psf, 90.0 * quarter * u.deg)
+    near = rotate_psf(psf, (90.0 * quarter + 1e-7) * u.deg)
+    np.testing.assert_allclose(np.sort(exact.data, axis=None), np.sort(psf.data, axis=None))
+    np.testing.assert_allclose(near.data, exact.data, atol=1e-6)
+
+
+def test_turning_conserves_light_and_encircled_energy():
+    psf = miri_psf("miri.f770w", fov=12 * u.arcsec)
+    radii = [0.2, 0.5, 1.0, 3.0, 5.5] * u.arcsec
+    turned = rotate_psf(psf, 33 * u.deg)
+    np.testing.assert_allclose(
+        encircled_energy(turned, radii), encircled_energy(psf, radii), atol=1e-3
+    )
+    assert turned.meta["enclosed"] == pytest.approx(psf.meta["enclosed"], abs=5e-3)
+    assert turned.meta["fwhm"] == pytest.approx(psf.meta["fwhm"], rel=1e-3)
+    assert turned.meta["includes"] == psf.meta["includes"]
+
+
+def test_there_and_back():
+    psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=6 * u.arcsec)
+    other = rotate_psf(psf, grid_angle=-40 * u.deg)
+    assert other.meta["angle"] == -40
+    back = rotate_psf(other)
+    np.testing.assert_allclose(back.data, psf.data, atol=1e-4 * psf.data.max())
+    # a grid whose +y is at the detector's angle needs no turn
+    psf = blob(2.0, 4.0)
+    same = rotate_psf(psf, 55 * u.deg, grid_angle=55 * u.deg)
+    np.testing.assert_array_equal(same.data, psf.data)
+
+
+def test_unknown_and_superfluous_angles_are_errors():
+    with pytest.raises(ValueError, match="'angle' must be the position angle of the detector"):
+        rotate_psf(blob(1.0, 1.0))
+    with pytest.raises(u.UnitsError, match="'angle' must be a quantity"):
+        rotate_psf(blob(1.0, 1.0), 30.0)
+    on_sky = rotate_psf(blob(1.0, 1.0), 30 * u.deg)
+    with pytest.raises(ValueError, match="left out for a PSF that stands on the sky"):
+        rotate_psf(on_sky, 30 * u.deg)
+
+
+def test_average_over_rolls_is_weighted():
+    a, b = rotate_psf(blob(5.0, 0.0), 0 * u.deg), rotate_psf(blob(5.0, 0.0), 90 * u.deg)
+    mean = average_psf([a, b], weights=[3.0, 1.0])
+    np.testing.assert_allclose(mean.data, 0.75 * a.data + 0.25 * b.data)
+    assert mean.meta["n_averaged"] == 2
+    assert mean.meta["frame"] == "sky"
+
+
+def test_average_refuses_what_differs():
+    a = blob(1.0, 0.0)
+    with pytest.raises(ValueError, match="'psfs' must be alike in frame"):
+        average_psf([a, rotate_psf(a, 10 * u.deg)])
+    with pytest.raises(ValueError, match="'psfs' must be alike in pixel_scale"):
+        average_psf([a, blob(1.0, 0.0, scale=0.06)])
+    with pytest.raises(ValueError, match=r"'psfs' must be alike in (shape|origin)"):
+        average_psf([a, blob(1.0, 0.0, n=101)])
+    with pytest.raises(ValueError, match="'psfs' must be at least one"):
+        average_psf([])
+    with pytest.raises(ValueError, match="'weights' must be 2 non-negative"):
+        average_psf([a, a], weights=[1.0, -1.0])
+
+
+@pytest.mark.parametrize("scale", [0.03, 0.06, 0.11])
+def test_image_on_another_grid_holds_the_same_light(scale):
+    psf = miri_psf("miri.f1000w")
+    n = 2 * int(10.4 / scale) + 1
+    image = psf_image(psf, pixel_scale=scale * u.arcsec, shape=n)
+    assert image.shape == (n, n)
+    assert image.argmax() == image.size // 2
+    assert image.sum() == pytest.approx(psf.meta["enclosed"], abs=1e-3)
+
+
+def test_image_is_the_model_evaluated():
+    psf = miri_psf("miri.f770w", fov=8 * u.arcsec)
+    scale = psf.meta["pixel_scale"]
+    image = psf_image(psf, pixel_scale=0.06 * u.arcsec, shape=(41, 51), offset=(0.3, -0.2))
+    y, x = np.indices(image.shape)
+    x, y = (x - 25 - 0.3) * 0.06 / scale, (y - 20 + 0.2) * 0.06 / scale
+    expected = psf.evaluate(x, y, 1.0, 0.0, 0.0) * (0.06 / scale) ** 2
+    np.testing.assert_allclose(image, expected, atol=1e-5 * image.max())
+
+
+def test_drizzle_adds_the_drop_and_the_pixel():
+    """Variances of boxes add: (native^2 + mosaic^2) / 12 per axis, at any angle."""
+    psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=6 * u.arcsec)
+    detector = make_psf(
+        psf.data, pixel_scale=0.11 * u.arcsec, oversampling=4, frame="detector", includes=["pixel"]
+    )
+    for pixfrac in (1.0, 0.6):
+        mosaic = psf_mosaic(detector, 0.06 * u.arcsec, 30 * u.deg, pixfrac=pixfrac)
+        info = psf_info(mosaic)
+        axis = (np.arange(info.data.shape[0]) - info.origin[0]) * info.cell
+        variance = info.data.sum(0) @ axis**2 / info.data.sum()
+        expected = 0.4**2 / (8 * np.log(2)) + ((0.11 * pixfrac) ** 2 + 0.06**2) / 12
+        assert variance == pytest.approx(expected, rel=1e-3)
+        assert info.enclosed == pytest.approx(1, abs=1e-3)
+        assert info.includes == ("pixel", "drizzle")
+        assert info.pixel_scale == pytest.approx(0.06)
+
+
+def test_mosaic_psf_is_what_dithered_pixels_average_to():
+    """Spread the pixels of many dithers of a point source over a mosaic, by hand."""
+    psf = gaussian_psf(0.35 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=5 * u.arcsec)
+    fine = 11  # cells of 0.01 arcsec: 11 a native pixel, 6 a mosaic pixel
+    total = np.zeros((330, 330))
+    y, x = np.mgrid[:30, :30]
+    for dy in range(fine):
+        for dx in range(fine):
+            # source in the middle of the field, the detector's grid shifted under it
+            image = psf.evaluate(x, y, 1.0, 15 - 0.5 + (dx - 5) / fine, 15 - 0.5 + (dy - 5) / fine)
+            spread = np.kron(image, np.ones((fine, fine))) / fine**2
+            total += np.roll(spread, (5 - dy, 5 - dx), axis=(0, 1)) / fine**2
+    # total is the mosaic before its own pixel; the source stands between cells 164 and 165
+    mosaic = psf_mosaic(psf, 0.06 * u.arcsec)
+    binned = total[3:327, 3:327].reshape(54, 6, 54, 6).sum((1, 3))
+    expected = psf_image(mosaic, pixel_scale=0.06 * u.arcsec, shape=54)
+    np.testing.assert_allclose(binned, expected, atol=2e-3 * expected.max())
+
+
+def test_mosaic_of_several_rolls_is_the_mean():
+    psf = miri_psf("miri.f1500w", fov=5 * u.arcsec, oversampling=2)
+    kind = {"pixel_scale": 0.11 * u.arcsec, "resampling": None}
+    both = psf_mosaic(psf, pa=[10, 70] * u.deg, **kind)
+    parts = [psf_mosaic(psf, pa=a * u.deg, **kind).data for a in (10, 70)]
+    np.testing.assert_allclose(both.data, np.mean(parts, axis=0), atol=1e-12)
+    with pytest.raises(ValueError, match="'pa' must be the position angle"):
+        psf_mosaic(psf, 0.06 * u.arcsec)
+    with pytest.raises(ValueError, match="'resampling' must be 'drizzle' or None"):
+        psf_mosaic(psf, 0.06 * u.arcsec, 0 * u.deg, resampling="lanczos")
+
+
+def test_takes_over_photutils_models():
+    psf = blob(2.0, 3.0)
+    bare = ImagePSF(psf.data, oversampling=4)
+    kind = {"pixel_scale": 0.11 * u.arcsec, "frame": "detector", "includes": ("pixel",)}
+    again = from_photutils(bare, **kind)
+    np.testing.assert_array_equal(again.data, psf.data)
+    assert again.meta["includes"] == ["pixel"]
+    positions = [(0, 0), (0, 100), (100, 0), (100, 100)]
+    stack = np.stack([psf.data * f for f in (0.8, 0.9, 0.9, 1.0)])
+    grid = GriddedPSFModel(NDData(stack, meta={"grid_xypos": positions, "oversampling": 4}))
+    there = from_photutils(grid, x=50, y=50, **kind)
+    np.testing.assert_allclose(there.data, 0.9 * psf.data, rtol=1e-6, atol=1e-9)
+    with pytest.raises(ValueError, match="given for a GriddedPSFModel"):
+        from_photutils(grid, **kind)
+    with pytest.raises(TypeError, match="'model' must be an ImagePSF or a GriddedPSFModel"):
+        from_photutils(psf.data, **kind)
+
+
+def test_reads_any_fits_image(tmp_path):
+    from astropy.io import fits
+
+    psf = blob(2.0, 3.0)
+    path = tmp_path / "psf.fits"
+    fits.HDUList(
+        [fits.PrimaryHDU(), fits.ImageHDU(np.stack([psf.data, 7 * psf.data]).astype(">f4"))]
+    ).writeto(path)
+    kind = {"pixel_scale": 0.11 * u.arcsec, "oversampling": 4, "frame": "detector"}
+    one = read_psf(path, ext=1, plane=1, enclosed=0.9, **kind)
+    np.testing.assert_allclose(one.data, 0.9 * psf.data, rtol=1e-5, atol=1e-7)
+    assert one.meta["enclosed"] == pytest.approx(0.9)
+    with pytest.raises(ValueError, match="a file with a 2D image in extension 0"):
+        read_psf(path, **kind)
+    with pytest.raises(ValueError, match="'data' must be normalised to 16"):
+        read_psf(path, ext=1, plane=1, **kind)

@@ -1,0 +1,48 @@
+import os
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from miricigale.psf import encircled_energy, miri_psf, stpsf_grid, stpsf_psf
+from miricigale.utils.exceptions import DataError
+
+
+def test_says_what_is_missing(monkeypatch):
+    monkeypatch.delenv("STPSF_PATH", raising=False)
+    with pytest.raises(DataError, match="STPSF_PATH"):
+        stpsf_psf("miri.f770w")
+    with pytest.raises(ValueError, match="'n_psfs' must be a square number, got 3"):
+        stpsf_grid("miri.f770w", n_psfs=3)
+
+
+def test_names_the_package_that_is_missing(monkeypatch):
+    import sys
+
+    monkeypatch.setenv("STPSF_PATH", "/nowhere")
+    monkeypatch.setitem(sys.modules, "stpsf", None)
+    with pytest.raises(ImportError, match=r"miricigale\[stpsf\]"):
+        stpsf_psf("miri.f770w")
+
+
+@pytest.mark.skipif("STPSF_PATH" not in os.environ, reason="needs STPSF_PATH and stpsf")
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", ["miri.f1000w", "miri.f2100w"])
+def test_ours_is_like_stpsf(name):
+    pytest.importorskip("stpsf")
+    theirs = stpsf_psf(name, opd="perfect", fov=9 * u.arcsec)
+    ours = miri_psf(name, wavefront_error=0 * u.nm, fov=9 * u.arcsec, calibration="stpsf")
+    assert theirs.meta["fwhm"] == pytest.approx(ours.meta["fwhm"], rel=0.01)
+    radii = [0.2, 0.5, 1.0, 2.5] * u.arcsec
+    np.testing.assert_allclose(
+        encircled_energy(ours, radii), encircled_energy(theirs, radii), atol=0.017
+    )
+    # orientation: the mirror image is much less alike in the wings
+    r = 2.0 / 0.1109
+    t = np.radians(np.arange(0, 360, 2.0))
+    a, b, mirrored = (
+        p.evaluate(s * r * np.cos(t), r * np.sin(t), 1.0, 0.0, 0.0)
+        for p, s in ((theirs, 1), (ours, 1), (ours, -1))
+    )
+    assert np.corrcoef(a, b)[0, 1] > 0.95
+    assert np.corrcoef(a, mirrored)[0, 1] < 0.9
