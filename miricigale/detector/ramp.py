@@ -1,0 +1,178 @@
+"""The ramp: counts of one exposure, group by group, and its file."""
+
+import numpy as np
+from astropy.nddata import NDData
+
+from miricigale.detector import level1b
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import DN
+
+__all__ = ["Ramp"]
+
+
+def _read_only(array):
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+class Ramp(NDData):
+    """
+    Counts of one exposure: every group of every integration.
+
+    A ramp never changes. Its arrays are large, so that they are not copied but marked
+    read-only.
+
+    Parameters
+    ----------
+    data : `~numpy.ndarray` of uint16 or float32, shape (n_int, n_group, ny, nx)
+        Counts in DN.
+    exposure : `~miricigale.instrument.Exposure`
+        What was exposed.
+    pixel_dq : `~numpy.ndarray` of uint32, shape (ny, nx), optional
+        Flags of pixels, bits as in `DQ`; zero if not given.
+    group_dq : `~numpy.ndarray` of uint8, shape like ``data``, optional
+        Flags of groups (the lower eight bits of `DQ`); None where they are not known, as
+        in a file of level 1b.
+    meta : dict, optional
+        Where it came from.
+
+    Raises
+    ------
+    ValueError
+        If a shape is not that of the exposure or a dtype is another.
+    """
+
+    def __init__(self, data, exposure, *, pixel_dq=None, group_dq=None, meta=None):
+        data = np.asarray(data)
+        shape = (exposure.n_integrations, exposure.n_groups, *exposure.shape)
+        if data.shape != shape:
+            raise argument_error("data", f"of the exposure's shape {shape}", data.shape)
+        if data.dtype not in (np.uint16, np.float32):
+            raise argument_error("data", "of dtype uint16 or float32", data.dtype)
+        if pixel_dq is None:
+            pixel_dq = np.zeros(shape[2:], np.uint32)
+        pixel_dq = np.asarray(pixel_dq)
+        if pixel_dq.shape != shape[2:] or pixel_dq.dtype != np.uint32:
+            got = f"shape {pixel_dq.shape}, dtype {pixel_dq.dtype}"
+            raise argument_error("pixel_dq", f"of shape {shape[2:]}, dtype uint32", got)
+        if group_dq is not None:
+            group_dq = np.asarray(group_dq)
+            if group_dq.shape != shape or group_dq.dtype != np.uint8:
+                got = f"shape {group_dq.shape}, dtype {group_dq.dtype}"
+                raise argument_error("group_dq", f"of shape {shape}, dtype uint8", got)
+            group_dq = _read_only(group_dq)
+        super().__init__(_read_only(data), unit=DN, meta=dict(meta or {}))
+        self._exposure = exposure
+        self._pixel_dq = _read_only(pixel_dq)
+        self._group_dq = group_dq
+        self._frozen = True
+
+    def __setattr__(self, name, value):
+        if getattr(self, "_frozen", False):
+            msg = f"a ramp does not change: {name!r} cannot be set"
+            raise AttributeError(msg)
+        super().__setattr__(name, value)
+
+    @property
+    def exposure(self):
+        """The `~miricigale.instrument.Exposure`."""
+        return self._exposure
+
+    @property
+    def pixel_dq(self):
+        """Flags of pixels, uint32 (ny, nx)."""
+        return self._pixel_dq
+
+    @property
+    def group_dq(self):
+        """Flags of groups, uint8 like the data, or None."""
+        return self._group_dq
+
+    @property
+    def wcs(self):
+        """The exposure's `~astropy.wcs.WCS` (of the two pixel axes)."""
+        return self._exposure.wcs
+
+    @wcs.setter
+    def wcs(self, value):
+        if value is not None:
+            msg = "a ramp's WCS is that of its exposure"
+            raise AttributeError(msg)
+
+    @property
+    def shape(self):
+        """(n_int, n_group, ny, nx)."""
+        return self.data.shape
+
+    def __repr__(self):
+        n_int, n_group, ny, nx = self.shape
+        return (
+            f"<Ramp {self.exposure.filter}: {n_int} integration(s) x {n_group} groups, "
+            f"{ny} x {nx} pixels, {self.data.dtype}>"
+        )
+
+    __str__ = __repr__
+
+    def write(self, path, *, start=None, overwrite=False):
+        """
+        Write a JWST level-1b file (``*_uncal.fits``).
+
+        Parameters
+        ----------
+        path : path-like
+            The file; it appears under its name only when it is complete.
+        start : `~astropy.time.Time`, optional
+            When the exposure began; 2022-06-21 plus an hour for each dither if not given.
+        overwrite : bool, optional
+            Whether an existing file is replaced.
+
+        Returns
+        -------
+        path : `pathlib.Path`
+
+        Raises
+        ------
+        OSError
+            If the file exists and ``overwrite`` is False.
+        ValueError
+            If the data are not counts (uint16).
+
+        Notes
+        -----
+        Level 1b holds no flags. Those of pixels and the meta dictionary stand in two
+        extensions of our own (``SIM_PIXELDQ``, ``SIM_META``) that the official pipeline
+        passes over; those of groups are not written.
+        """
+        return level1b.write(
+            path,
+            self.data,
+            self.exposure,
+            pixel_dq=self.pixel_dq,
+            meta=dict(self.meta),
+            start=start,
+            overwrite=overwrite,
+        )
+
+    @classmethod
+    def read(cls, path):
+        """
+        Read a level-1b file, our own or one of JWST.
+
+        Parameters
+        ----------
+        path : path-like
+            An ``*_uncal.fits`` of the MIRI imager.
+
+        Returns
+        -------
+        ramp : `Ramp`
+            In a file that is not ours reference columns are the only flags.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If the file is missing, truncated or not of that kind.
+        """
+        data, exposure, pixel_dq, meta = level1b.read(path)
+        return cls(data, exposure, pixel_dq=pixel_dq, meta=meta)

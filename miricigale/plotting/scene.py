@@ -1,0 +1,49 @@
+"""Images of scenes."""
+
+import numpy as np
+
+from miricigale.plotting.axes import resolve_axes
+
+__all__ = ["plot_scene"]
+
+
+def plot_scene(image, *, ax=None, marks=None, label="", **kwargs):
+    """
+    Draw an image with an asinh stretch set by its own scatter.
+
+    Parameters
+    ----------
+    image : `~numpy.ndarray`, shape (ny, nx)
+        The image.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where; the current axes by default.
+    marks : tuple of `~numpy.ndarray`, optional
+        Pixel positions x and y to be marked.
+    label : str, optional
+        Label of the colour bar.
+    **kwargs
+        Passed to `~matplotlib.axes.Axes.imshow`.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    from matplotlib.colors import AsinhNorm
+
+    ax = resolve_axes(ax)
+    low, middle, high = np.nanpercentile(image, [2, 50, 99.9])
+    width = max(middle - low, 1e-3 * (high - low), np.finfo(float).tiny)
+    options = {"origin": "lower", "cmap": "gray", "interpolation": "nearest"}
+    if "norm" not in kwargs and not {"vmin", "vmax"} & set(kwargs):
+        # about the median: a bright background does not hide the sources
+        image, label = image - middle, f"{label} - {middle:.4g}" if label else label
+        options["norm"] = AsinhNorm(
+            linear_width=width, vmin=low - middle, vmax=max(high - middle, width)
+        )
+    drawn = ax.imshow(image, **{**options, **kwargs})
+    ax.set_xlabel("x [pixel]")
+    ax.set_ylabel("y [pixel]")
+    ax.figure.colorbar(drawn, ax=ax, label=label, shrink=0.8)
+    if marks is not None:
+        ax.plot(*marks, "o", mfc="none", mec="tab:orange", ms=5, mew=0.6)
+    return ax

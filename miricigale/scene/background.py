@@ -1,0 +1,120 @@
+"""The background of a scene: a level and a gradient that stands on the sky."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+from scipy.interpolate import RectBivariateSpline
+
+from miricigale.instrument import background_level
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
+
+__all__ = ["Background"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Background:
+    """
+    A background with a linear gradient on the sky.
+
+    Parameters
+    ----------
+    level : `~astropy.units.Quantity`
+        Surface brightness at the centre.
+    gradient : `~astropy.units.Quantity`, optional
+        Relative change per angle (such as ``0.05 / u.arcmin``).
+    position_angle : `~astropy.units.Quantity`, optional
+        Direction in which it grows, east of north.
+    center : `~astropy.coordinates.SkyCoord`, optional
+        Where the level holds; the centre of each image if not given. Dithers of one field
+        share a background only with one common centre.
+
+    Raises
+    ------
+    ValueError
+        If the level is negative or not finite.
+    """
+
+    level: u.Quantity
+    gradient: u.Quantity = 0 / u.arcmin
+    position_angle: u.Quantity = 45 * u.deg
+    center: SkyCoord | None = None
+
+    def __post_init__(self):
+        level = float(to_array(self.level, SURFACE_BRIGHTNESS, "level", ndim=0))
+        if not (np.isfinite(level) and level >= 0):
+            raise argument_error("level", "finite and not negative", self.level)
+        gradient = to_array(self.gradient, 1 / u.arcmin, "gradient", ndim=0, finite=True)
+        angle = to_array(self.position_angle, u.deg, "position_angle", ndim=0, finite=True)
+        object.__setattr__(self, "level", level * SURFACE_BRIGHTNESS)
+        object.__setattr__(self, "gradient", float(gradient) / u.arcmin)
+        object.__setattr__(self, "position_angle", float(angle) * u.deg)
+
+    @classmethod
+    def low_zodi(cls, filter, *, gradient=0.05 / u.arcmin, position_angle=45 * u.deg, center=None):
+        """
+        The background of a MIRI filter at low zodiacal light.
+
+        Parameters
+        ----------
+        filter : str
+            One of `~miricigale.instrument.imager_filters`.
+        gradient, position_angle, center
+            As of the class; by default 5 % per arcmin at 45 deg.
+
+        Examples
+        --------
+        >>> from miricigale.scene import Background
+        >>> Background.low_zodi("miri.f770w").gradient
+        <Quantity 0.05 1 / arcmin>
+        """
+        level = background_level(filter)
+        return cls(level, gradient=gradient, position_angle=position_angle, center=center)
+
+    def image(self, wcs, shape):
+        """
+        The background in each pixel.
+
+        Parameters
+        ----------
+        wcs : `~astropy.wcs.WCS`
+            World coordinates of the image.
+        shape : tuple of int
+            ``(ny, nx)``.
+
+        Returns
+        -------
+        image : `~numpy.ndarray`, shape (ny, nx)
+            MJy/sr.
+
+        Raises
+        ------
+        ValueError
+            If the gradient makes the background negative somewhere.
+        """
+        ny, nx = shape
+        level, gradient = self.level.value, self.gradient.value
+        if gradient == 0:
+            return np.full(shape, level)
+        center = self.center
+        if center is None:
+            center = SkyCoord(*wcs.all_pix2world((nx - 1) / 2, (ny - 1) / 2, 0), unit="deg")
+        # smooth, so a coarse grid is enough
+        nodes = [np.linspace(-0.5, n - 0.5, 12) for n in (ny, nx)]
+        x, y = np.meshgrid(nodes[1], nodes[0])
+        ra, dec = np.radians(wcs.all_pix2world(x.ravel(), y.ravel(), 0)).reshape(2, *x.shape)
+        ra0, dec0 = center.icrs.ra.rad, center.icrs.dec.rad
+        cos = np.sin(dec0) * np.sin(dec) + np.cos(dec0) * np.cos(dec) * np.cos(ra - ra0)
+        east = np.cos(dec) * np.sin(ra - ra0) / cos
+        north = (np.cos(dec0) * np.sin(dec) - np.sin(dec0) * np.cos(dec) * np.cos(ra - ra0)) / cos
+        angle = self.position_angle.to_value(u.rad)
+        along = np.degrees(east * np.sin(angle) + north * np.cos(angle)) * 60.0
+        image = level * (
+            1 + gradient * RectBivariateSpline(*nodes, along)(np.arange(ny), np.arange(nx))
+        )
+        if image.min() < 0:
+            msg = f"the background's gradient of {self.gradient} makes it negative within the image"
+            raise ValueError(msg)
+        return image

@@ -1,0 +1,202 @@
+"""The catalogue of sources: its columns, how it is read and what is refused."""
+
+import warnings
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.io.registry import IORegistryError
+from astropy.table import QTable, Table
+from astropy.units import UnitsWarning
+
+from miricigale.profiles import SERSIC_INDEX_RANGE
+from miricigale.refdata import locate, resources
+from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.tables import Flags, require_columns, unique_ids
+from miricigale.utils.units import FNU
+
+__all__ = ["CATALOG_COLUMNS", "CatalogFlags", "check_catalog", "read_catalog"]
+
+#: Columns that every catalogue has, with their unit (None: dimensionless or not a number).
+CATALOG_COLUMNS = {
+    "id": None,
+    "sky": None,
+    "redshift": None,
+    "profile": None,
+    "half_light_radius": u.arcsec,
+    "sersic_index": None,
+    "axis_ratio": None,
+    "position_angle": u.deg,
+}
+
+PROFILES = ("sersic", "point")
+
+
+class CatalogFlags(Flags):
+    """What is wrong with a row of a catalogue; the row is kept."""
+
+    BAD_RADIUS = 1  # a Sersic profile without a positive radius: drawn as a point
+    BAD_INDEX = 2  # index outside the range that profiles are made for: drawn as a point
+    BAD_AXIS_RATIO = 4  # not in (0, 1]: drawn as a point
+    BAD_ANGLE = 8  # not finite: drawn as a point unless it is round
+    NO_REDSHIFT = 16  # not finite or not positive (stars)
+
+    @classmethod
+    def unusable_profile(cls):
+        """The bits that make a Sersic profile be drawn as a point."""
+        return cls.BAD_RADIUS | cls.BAD_INDEX | cls.BAD_AXIS_RATIO | cls.BAD_ANGLE
+
+
+def _plain(table, name, unit, argument):
+    column = table[name]
+    if hasattr(column, "mask"):
+        filled = column.filled(np.nan) if np.any(column.mask) else column.filled()
+        column = getattr(filled, "unmasked", filled)
+    try:
+        if unit is not None:
+            return u.Quantity(column, unit, dtype=float)
+        values = column.to_value(u.one) if hasattr(column, "to_value") else np.asarray(column)
+        return np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise argument_error(argument, f"a table with numbers in {name!r}", column.dtype) from None
+
+
+def check_catalog(table, *, filters=(), argument="catalog"):
+    """
+    Check a catalogue and bring it into the package's units.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        With the columns of `CATALOG_COLUMNS`; ``ra`` and ``dec`` (with units) may stand for
+        ``sky``. Columns of fluxes are called by their filter (``"miri.f770w"``).
+    filters : iterable of str, optional
+        Flux columns that must be there.
+    argument : str, optional
+        What the table is called in messages.
+
+    Returns
+    -------
+    catalog : `~astropy.table.QTable`
+        A copy with ``sky`` in ICRS, radii in arcsec, angles in deg, fluxes in uJy and a
+        column ``flags`` (`CatalogFlags`). Other columns are kept.
+
+    Raises
+    ------
+    ValueError
+        If a column is missing, an id is there twice, a position is not finite, a profile
+        has an unknown name or there are no rows.
+    `~astropy.units.UnitsError`
+        If a column has no unit or a wrong one.
+    """
+    if not isinstance(table, Table):
+        raise argument_error(argument, "a table", type(table).__name__)
+    catalog = QTable(table, copy=True)
+    if "sky" not in catalog.colnames and {"ra", "dec"} <= set(catalog.colnames):
+        require_columns(catalog, ["ra", "dec"], argument, units={"ra": u.deg, "dec": u.deg})
+        sky = [_plain(catalog, name, u.deg, argument) for name in ("ra", "dec")]
+        bad = ~np.isfinite(sky[0]) | ~np.isfinite(sky[1])
+        _refuse_positions(bad, argument)
+        catalog["sky"] = SkyCoord(*sky)
+    units = {name: unit for name, unit in CATALOG_COLUMNS.items() if unit is not None}
+    require_columns(catalog, CATALOG_COLUMNS, argument, units=units)
+    require_columns(catalog, filters, argument, units=dict.fromkeys(filters, FNU))
+    if len(catalog) == 0:
+        raise argument_error(argument, "a table with rows", "none")
+    if not isinstance(catalog["sky"], SkyCoord):
+        raise argument_error(
+            argument, "a table with SkyCoord in 'sky'", type(catalog["sky"]).__name__
+        )
+    if not np.issubdtype(np.asarray(catalog["id"]).dtype, np.integer):
+        raise argument_error(argument, "a table with integers in 'id'", catalog["id"].dtype)
+    unique_ids(catalog["id"], argument)
+    sky = catalog["sky"].icrs
+    _refuse_positions(~(np.isfinite(sky.ra.deg) & np.isfinite(sky.dec.deg)), argument)
+    catalog["sky"] = SkyCoord(sky.ra, sky.dec)
+    profile = np.asarray(catalog["profile"]).astype(str)
+    unknown = sorted(set(profile.tolist()) - set(PROFILES))
+    if unknown:
+        raise argument_error(argument, f"a table with 'profile' among {PROFILES}", unknown)
+    catalog["profile"] = profile
+    for name, unit in CATALOG_COLUMNS.items():
+        if name not in ("id", "sky", "profile"):
+            catalog[name] = _plain(catalog, name, unit, argument)
+    for name in catalog.colnames:
+        unit = getattr(catalog[name], "unit", None)
+        if "." in name and unit is not None and unit.is_equivalent(FNU):
+            catalog[name] = _plain(catalog, name, FNU, argument)
+    catalog["flags"] = _flags(catalog)
+    catalog["flags"].info.description = CatalogFlags.describe()
+    return catalog
+
+
+def _refuse_positions(bad, argument):
+    if np.any(bad):
+        rows = np.flatnonzero(bad)
+        wanted = "a table of finite positions"
+        raise argument_error(argument, wanted, f"{rows.size} that are not, first in row {rows[0]}")
+
+
+def _flags(catalog):
+    flags = np.zeros(len(catalog), dtype=int)
+    sersic = catalog["profile"] == "sersic"
+    radius = catalog["half_light_radius"].value
+    ratio, angle = catalog["axis_ratio"], catalog["position_angle"].value
+    low, high = SERSIC_INDEX_RANGE
+    index = catalog["sersic_index"]
+    flags[sersic & ~(np.isfinite(radius) & (radius > 0))] |= CatalogFlags.BAD_RADIUS
+    flags[sersic & ~((index >= low) & (index <= high))] |= CatalogFlags.BAD_INDEX
+    flags[sersic & ~((ratio > 0) & (ratio <= 1))] |= CatalogFlags.BAD_AXIS_RATIO
+    flags[sersic & ~np.isfinite(angle) & (ratio != 1)] |= CatalogFlags.BAD_ANGLE
+    flags[~(catalog["redshift"] > 0)] |= CatalogFlags.NO_REDSHIFT
+    return flags
+
+
+def read_catalog(path):
+    """
+    Read a catalogue of sources.
+
+    Parameters
+    ----------
+    path : str or path-like
+        Name of a resource (``"catalog.goodss"``) or an ECSV, FITS or other file that
+        `~astropy.table.QTable` reads and that carries units.
+
+    Returns
+    -------
+    catalog : `~astropy.table.QTable`
+        As made by `check_catalog`.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If there is no such file, or it is no table.
+    ValueError, `~astropy.units.UnitsError`
+        If the table is refused by `check_catalog`.
+
+    Examples
+    --------
+    >>> from miricigale.scene import read_catalog
+    >>> catalog = read_catalog("catalog.goodss")
+    >>> len(catalog)
+    1308
+    """
+    name = str(path)
+    if not isinstance(path, Path) and name in resources():
+        path = locate(name)
+    path = Path(path).expanduser()
+    if not path.is_file():
+        known = ", ".join(key for key in sorted(resources()) if key.startswith("catalog."))
+        msg = f"no catalogue {name!r}: neither a file nor one of {known}"
+        raise DataError(msg)
+    plain = path.name.removesuffix(".gz")
+    form = {".ecsv": "ascii.ecsv", ".fits": "fits", ".fit": "fits"}.get(Path(plain).suffix.lower())
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UnitsWarning)
+            table = QTable.read(path, format=form)
+    except (IORegistryError, OSError, ValueError, TypeError, UnitsWarning) as err:
+        msg = f"{path} cannot be read as a table: {str(err).splitlines()[0]}"
+        raise DataError(msg) from err
+    return check_catalog(table, argument=path.name)

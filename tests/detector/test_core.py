@@ -1,0 +1,119 @@
+from math import lgamma
+
+import numpy as np
+import pytest
+from scipy import ndimage, stats
+
+from miricigale.detector import _core
+
+KEY = np.array([11, 22, 33, 44], np.uint64)
+
+
+def normals(shape, first_row=0, key=KEY):
+    out = np.empty(shape)
+    _core.standard_normals(key, first_row, out)
+    return out
+
+
+def test_normals_are_normal():
+    sample = normals((200, 2000)).ravel()
+    assert stats.kstest(sample, "norm").pvalue > 1e-3
+    n = sample.size
+    assert abs(sample.mean()) < 4 / np.sqrt(n)
+    assert abs(sample.var() - 1) < 4 * np.sqrt(2 / n)
+    assert abs(stats.skew(sample)) < 4 * np.sqrt(6 / n)
+    assert abs(stats.kurtosis(sample)) < 4 * np.sqrt(24 / n)
+
+
+def test_normal_tail_has_its_share():
+    # beyond 3.6541 the ziggurat hands over to its tail
+    sample = normals((400, 5000)).ravel()
+    for limit in (3.0, 3.6541528853610088, 4.0):
+        expected = sample.size * 2 * stats.norm.sf(limit)
+        found = np.count_nonzero(np.abs(sample) > limit)
+        assert abs(found - expected) < 4 * np.sqrt(expected)
+
+
+def test_streams_of_rows_and_keys_are_apart():
+    rows = normals((64, 4000))
+    other = normals((64, 4000), key=KEY + np.uint64(1))
+    correlation = np.corrcoef(np.vstack([rows, other]))
+    np.fill_diagonal(correlation, 0)
+    assert np.abs(correlation).max() < 5 / np.sqrt(4000)
+
+
+def test_a_row_does_not_know_its_block():
+    whole = normals((20, 50), first_row=100)
+    np.testing.assert_array_equal(whole[7:12], normals((5, 50), first_row=107))
+
+
+@pytest.mark.parametrize("mean", [0.05, 0.555, 3.0, 9.99, 10.0, 31.0, 161.0, 5000.0])
+def test_poisson_numbers_are_poisson(mean):
+    ramp = np.zeros((2, 100, 10, 100), np.float32)
+    _core.add_poisson(ramp, np.full((10, 100), mean), KEY, 0)
+    counts = np.diff(ramp, axis=1, prepend=0).ravel().astype(int)
+    low, high = stats.poisson.ppf([1e-3, 1 - 1e-3], mean).astype(int)
+    # about 40 bins, each with many expected counts
+    edges = np.unique(np.linspace(low, high, 40).astype(int))
+    cdf = np.concatenate([[0], stats.poisson.cdf(edges, mean), [1]])
+    expected = counts.size * np.diff(cdf)
+    found = np.bincount(np.searchsorted(edges, counts), minlength=expected.size)
+    keep = expected > 5
+    chi2 = np.sum((found - expected)[keep] ** 2 / expected[keep])
+    assert stats.chi2.sf(chi2, keep.sum() - 1) > 1e-3
+
+
+def test_poisson_of_no_light_is_nothing():
+    ramp = np.zeros((1, 5, 2, 8), np.float32)
+    _core.add_poisson(ramp, np.zeros((2, 8)), KEY, 0)
+    assert not ramp.any()
+
+
+def test_enormous_means_stay_finite():
+    ramp = np.zeros((1, 3, 1, 4), np.float32)
+    _core.add_poisson(ramp, np.full((1, 4), 1e15), KEY, 0)
+    np.testing.assert_allclose(ramp[0, -1], 3e9, rtol=1e-3)
+
+
+def test_log_factorial():
+    k = np.arange(0, 400)
+    got = [_core._log_factorial(float(n)) for n in k]
+    np.testing.assert_allclose(got, [lgamma(n + 1) for n in k], atol=1e-9)
+
+
+def test_coupling_is_a_convolution():
+    rng = np.random.default_rng(0)
+    ramp = rng.uniform(0, 1000, (1, 2, 9, 11)).astype(np.float32)
+    kernel = np.array([[1, 2, 1], [3, 10, 4], [1, 5, 1]], np.float32) / 28
+    expected = [ndimage.correlate(plane, kernel, mode="nearest") for plane in ramp[0]]
+    _core.couple_neighbours(ramp, kernel)
+    np.testing.assert_allclose(ramp[0], expected, rtol=1e-5)
+
+
+def test_rounding_and_limits_of_the_converter():
+    values = np.array([-3.0, -0.4, 0.49, 0.51, 1234.6, 65535.4, 65535.6, 1e6], np.float32)
+    ramp = values.reshape(1, 1, 1, -1)
+    counts = np.empty(ramp.shape, np.uint16)
+    flags = np.zeros(ramp.shape, np.uint8)
+    _core.digitize(ramp, counts, flags, np.uint8(64), np.uint8(2))
+    assert counts.ravel().tolist() == [0, 0, 0, 1, 1235, 65535, 65535, 65535]
+    assert flags.ravel().tolist() == [64, 0, 0, 0, 0, 0, 2, 2]
+
+
+def test_pink_noise_has_its_variance_and_falls_with_frequency():
+    n_rows, n_group = 64, 128
+    ramp = np.zeros((1, n_group, n_rows, 8), np.float32)
+    _core.add_pink_noise(ramp, 2.0, 10, 4, KEY, 0, n_rows)
+    # columns share four outputs in turn
+    np.testing.assert_array_equal(ramp[..., :4], ramp[..., 4:])
+    series = ramp[0].reshape(-1, 8)[:, :4].astype(float)
+    assert series.std() == pytest.approx(2.0, rel=0.25)
+    power = np.mean(np.abs(np.fft.rfft(series - series.mean(axis=0), axis=0)) ** 2, axis=1)
+    frequency = np.arange(power.size)
+    low, high = (frequency >= 16) & (frequency < 64), (frequency >= 512) & (frequency < 2048)
+    slope = np.log(power[high].mean() / power[low].mean()) / np.log(32)
+    assert slope == pytest.approx(-1, abs=0.3)
+    # and rows are what they are in any block
+    part = np.zeros((1, n_group, 5, 8), np.float32)
+    _core.add_pink_noise(part, 2.0, 10, 4, KEY, 20, n_rows)
+    np.testing.assert_array_equal(part, ramp[:, :, 20:25])

@@ -1,0 +1,291 @@
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.nddata import CCDData
+
+import miricigale.detector.detector as module
+from miricigale.detector import (
+    DQ,
+    ADConversion,
+    Bias,
+    CosmicRays,
+    Dark,
+    Detector,
+    InterpixelCapacitance,
+    Nonlinearity,
+    Photons,
+    Ramp,
+    ReadNoise,
+)
+from miricigale.instrument import flat_field, miri_detector, photmjsr
+from miricigale.utils.exceptions import MiricigaleWarning
+
+PLAIN = (Photons(flat=False), Nonlinearity(linear=True), Bias(), ReadNoise(), ADConversion())
+
+
+@pytest.fixture(scope="module")
+def detector():
+    return Detector.miri_imager()
+
+
+def test_mean_variance_and_covariance_of_a_ramp(make_exposure, make_sky):
+    exposure = make_exposure(n_groups=8, subarray="SUB256")
+    level, gain, noise = 200.0, miri_detector().gain, miri_detector().read_noise
+    ramp = Detector(PLAIN).expose(make_sky(exposure, level), exposure, seed=3)
+    counts = ramp.data[0].reshape(8, -1).astype(float) - miri_detector().bias
+    n = counts.shape[1]
+    step = level / photmjsr("miri.f770w") * exposure.group_time.to_value("s")
+    order = np.arange(1, 9)
+    # signal in DN grows evenly; groups share the photons of the earlier one
+    expected = np.minimum.outer(order, order) * step / gain
+    expected += np.eye(8) * (noise**2 + 1 / 12)
+    np.testing.assert_allclose(
+        counts.mean(axis=1), order * step, atol=5 * np.sqrt(expected.max() / n)
+    )
+    scale = np.sqrt(np.outer(expected.diagonal(), expected.diagonal()))
+    np.testing.assert_allclose((np.cov(counts) - expected) / scale, 0, atol=5 * np.sqrt(2 / n))
+    differences = np.diff(counts, axis=0)
+    variance = step / gain + 2 * (noise**2 + 1 / 12)
+    assert differences.var() == pytest.approx(variance, rel=5 * np.sqrt(3 / differences.size))
+
+
+def test_full_chain_returns_the_sky_after_linearization(make_exposure, make_sky, detector):
+    exposure = make_exposure(n_groups=30, subarray="SUB256")
+    level = 2000.0
+    ramp = detector.expose(make_sky(exposure, level), exposure, seed=0)
+    good = (ramp.pixel_dq == 0)[None] & (ramp.group_dq[0] == 0)
+    linear = miri_detector().linearize(ramp.data[0].astype(float) - miri_detector().bias)
+    slope = np.where(good.all(axis=0), linear[-1] - linear[0], np.nan) / 29
+    dark = miri_detector().dark_current / miri_detector().gain
+    expected = (level / photmjsr("miri.f770w") + dark) * exposure.group_time.to_value("s")
+    # the flat field of a sub-array has a mean of its own
+    flat = np.median(flat_field("miri.f770w", subarray="SUB256"))
+    assert np.nanmedian(slope) == pytest.approx(expected * flat, rel=1e-3)
+
+
+def test_same_seed_same_counts_on_any_threads_and_blocks(
+    make_exposure, make_sky, detector, monkeypatch
+):
+    exposure = make_exposure(n_groups=5, n_integrations=2, subarray="SUB128")
+    detector = Detector.miri_imager(showers=0.2, residual=0.01, pink_noise=2.0)
+    # without 'ipc' in the image, neighbours across blocks are coupled
+    sky = make_sky(exposure, 30.0, includes=())
+    one = detector.expose(sky, exposure, seed=5, n_threads=1)
+    for samples in (1, 136 * 10 * 7, 10**9):
+        monkeypatch.setattr(module, "_BLOCK_SAMPLES", samples)
+        other = detector.expose(sky, exposure, seed=5, n_threads=3)
+        np.testing.assert_array_equal(other.data, one.data)
+        np.testing.assert_array_equal(other.pixel_dq, one.pixel_dq)
+        np.testing.assert_array_equal(other.group_dq, one.group_dq)
+
+
+def test_seeds_filters_and_dithers_differ(make_exposure, make_sky):
+    exposure = make_exposure(n_groups=2)
+    sky = make_sky(exposure, 100.0)
+    noise = Detector((Photons(), Nonlinearity(), Bias(), ReadNoise(), ADConversion()))
+    first = noise.expose(sky, exposure, seed=1).data
+    np.testing.assert_array_equal(noise.expose(sky, exposure, seed=1).data, first)
+    assert np.mean(noise.expose(sky, exposure, seed=2).data != first) > 0.8
+    assert np.mean(noise.expose(sky, exposure.replace(dither=1), seed=1).data != first) > 0.8
+    red = make_exposure("miri.f1000w", n_groups=2)
+    assert np.mean(noise.expose(sky, red, seed=1).data != first) > 0.8
+
+
+def test_an_effect_keeps_its_numbers_when_another_goes(make_exposure, make_sky):
+    exposure = make_exposure(n_groups=3)
+    sky = make_sky(exposure, 0.0)
+    tail = (Nonlinearity(linear=True), Bias(), ReadNoise(), ADConversion())
+    rays = CosmicRays(flux=1e-4)
+    quiet = Detector((Photons(), *tail)).expose(sky, exposure, seed=4).data.astype(int)
+    hit = Detector((Photons(), rays, *tail)).expose(sky, exposure, seed=4).data.astype(int)
+    assert np.all(hit >= quiet)
+    assert 0.1 < np.mean(hit == quiet) < 0.999
+
+
+def test_two_effects_of_a_kind_draw_apart(make_exposure, make_sky):
+    exposure = make_exposure(n_groups=20, subarray="SUB256")
+    end = (Nonlinearity(linear=True), ADConversion())
+    two = (Photons(), Dark(current=400.0), Dark(current=400.0), *end)
+    counts = Detector(two).expose(make_sky(exposure, 0.0), exposure, seed=0).data[0, -1]
+    variance = 2 * 400 * 20 * 0.3 / 16 + 1 / 12
+    assert counts.var() == pytest.approx(variance, rel=5 * np.sqrt(2 / counts.size))
+
+
+def test_what_the_psf_holds_is_left_out(make_exposure, make_sky, detector):
+    exposure = make_exposure(n_groups=2)
+    image = make_sky(exposure, 0.0, includes=())
+    image.data[30, 40] = 5e4
+    chain = (
+        Photons(flat=False),
+        InterpixelCapacitance(),
+        Nonlinearity(linear=True),
+        ADConversion(),
+    )
+    spread = Detector(chain).expose(image, exposure, seed=0).data[0, -1].astype(float)
+    assert spread[30, 41] / spread.sum() == pytest.approx(0.033, rel=0.05)
+    image.meta["psf_includes"] = ["pixel", "ipc"]
+    ramp = Detector(chain).expose(image, exposure, seed=0)
+    assert ramp.data[0, -1, 30, 41] == 0
+    assert not any("Interpixel" in text for text in ramp.meta["effects"])
+    assert InterpixelCapacitance() in detector.effects
+
+
+def test_shape_and_reset_of_integrations(make_exposure, make_sky, detector):
+    exposure = make_exposure(n_groups=7, n_integrations=3)
+    ramp = detector.expose(make_sky(exposure, 3000.0), exposure, seed=0)
+    assert ramp.shape == (3, 7, 64, 72)
+    medians = np.median(ramp.data, axis=(2, 3))
+    assert np.ptp(medians[:, 0]) < 20
+    assert np.all(np.diff(medians, axis=1) > 50)
+
+
+def test_reference_pixels_see_no_light(make_exposure, make_sky, detector):
+    exposure = make_exposure(n_groups=4)
+    ramp = detector.expose(make_sky(exposure, 1e4), exposure, seed=0)
+    reference = ramp.pixel_dq & DQ.REFERENCE_PIXEL != 0
+    counts = ramp.data[:, :, reference]
+    assert counts.mean() == pytest.approx(11000, abs=5 * 6 / np.sqrt(counts.size))
+    assert np.median(ramp.data[0, -1, :, 10:]) > 12000
+
+
+def test_bright_light_saturates_and_is_flagged(make_exposure, make_sky, detector):
+    exposure = make_exposure(n_groups=3)
+    image = make_sky(exposure, 1.0)
+    image.data[20, 30] = 1e9
+    ramp = detector.expose(image, exposure, seed=0)
+    assert np.all(ramp.group_dq[0, :, 20, 30] & DQ.SATURATED)
+    top = miri_detector().bias + miri_detector().saturation_dn
+    assert ramp.data[0, -1, 20, 30] == pytest.approx(top, abs=40)
+    assert np.count_nonzero(ramp.group_dq) == 3
+
+
+def test_out_of_range_counts_are_flagged(make_exposure, make_sky):
+    exposure = make_exposure(n_groups=2)
+    low = (Photons(), Nonlinearity(), Bias(level=-100), ADConversion())
+    ramp = Detector(low).expose(make_sky(exposure, 0), exposure, seed=0)
+    assert ramp.data.max() == 0
+    assert np.all(ramp.group_dq == DQ.AD_FLOOR)
+    high = (Photons(), Nonlinearity(), Bias(level=70000), ADConversion())
+    ramp = Detector(high).expose(make_sky(exposure, 0), exposure, seed=0)
+    assert ramp.data.min() == 65535
+    assert np.all(ramp.group_dq == DQ.SATURATED)
+
+
+def test_warns_of_a_saturating_sky(make_exposure, make_sky, detector, caplog):
+    exposure = make_exposure(n_groups=10)
+    well = 210e3 / 10 / exposure.group_time.to_value("s") / 4 * photmjsr("miri.f770w")
+    with pytest.warns(MiricigaleWarning, match="fills 120 % of the full well"):
+        detector.expose(make_sky(exposure, 1.2 * well), exposure, seed=0)
+    ramp = detector.expose(make_sky(exposure, 0.7 * well), exposure, seed=0)
+    assert "fills 70 % of the full well" in caplog.text
+    assert ramp.meta["sky_well_fraction"] == pytest.approx(0.7, abs=0.01)
+
+
+def test_refuses_wrong_images(make_exposure, make_sky, detector):
+    exposure = make_exposure()
+    with pytest.raises(TypeError, match="'image' must be a CCDData"):
+        detector.expose(np.zeros(exposure.shape), exposure)
+    with pytest.raises(u.UnitsError, match="'image' must be convertible to MJy / sr"):
+        detector.expose(CCDData(np.zeros(exposure.shape), unit="adu"), exposure)
+    with pytest.raises(ValueError, match="'image' must be of the exposure's shape"):
+        detector.expose(CCDData(np.zeros((3, 4)), unit="MJy/sr"), exposure)
+    image = make_sky(exposure, 1.0)
+    image.data[3, 4] = np.nan
+    with pytest.raises(ValueError, match="'image' must be finite values, got 1 that"):
+        detector.expose(image, exposure)
+    image.data[3, 4] = -0.5
+    with pytest.raises(ValueError, match="'image' must be surface brightness that is nowhere"):
+        detector.expose(image, exposure)
+    with pytest.raises(ValueError, match="'n_threads' must be at least 1"):
+        detector.expose(make_sky(exposure, 1.0), exposure, n_threads=0)
+    with pytest.raises(ValueError, match="'seed' must be"):
+        detector.expose(make_sky(exposure, 1.0), exposure, seed=-1)
+
+
+def test_other_units_of_surface_brightness(make_exposure, make_sky):
+    exposure = make_exposure(n_groups=2)
+    sky = make_sky(exposure, 100.0)
+    other = CCDData(sky.data * 1e6, unit="Jy/sr", meta=sky.meta)
+    detector = Detector(PLAIN)
+    np.testing.assert_array_equal(
+        detector.expose(other, exposure, seed=1).data, detector.expose(sky, exposure, seed=1).data
+    )
+
+
+def test_refuses_wrong_effects(make_exposure, make_sky):
+    exposure = make_exposure()
+    sky = make_sky(exposure, 1.0)
+    with pytest.raises(ValueError, match="'effects' must be made of detector effects"):
+        Detector((Photons(), "noise"))
+    with pytest.raises(ValueError, match="'properties' must be"):
+        Detector(PLAIN, properties={"gain": 4})
+    with pytest.raises(ValueError, match="'effects' must hold Photons before it"):
+        Detector((Dark(), Photons(), ADConversion())).expose(sky, exposure)
+    with pytest.raises(ValueError, match="ending with ADConversion, got"):
+        Detector((Photons(), Dark())).expose(sky, exposure)
+    with pytest.raises(ValueError, match="'effects' must be a tuple with one Photons"):
+        Detector((Photons(), Photons(), ADConversion())).expose(sky, exposure)
+    with pytest.raises(ValueError, match="'residual' must be"):
+        Detector.miri_imager(residual=True)
+
+
+def test_gain_cancels_in_the_rate(make_exposure, make_sky):
+    # one gain for noise and calibration: electrons per MJy/sr do not depend on it
+    exposure = make_exposure(n_groups=3, subarray="SUB256")
+    sky = make_sky(exposure, 3000.0)
+    chain = (Photons(flat=False), Nonlinearity(linear=True), ADConversion())
+    low = Detector(chain, properties=miri_detector().replace(gain=2.0))
+    high = Detector(chain, properties=miri_detector().replace(gain=4.0))
+    ratio = low.expose(sky, exposure, seed=0).data[0, -1].astype(float).mean()
+    ratio /= high.expose(sky, exposure, seed=0).data[0, -1].astype(float).mean()
+    assert ratio == pytest.approx(2, rel=1e-3)
+
+
+def test_detector_says_what_it_does(detector):
+    names = [type(effect).__name__ for effect in detector.effects]
+    assert names == [
+        "Photons",
+        "Dark",
+        "InterpixelCapacitance",
+        "CosmicRays",
+        "BadPixels",
+        "ReferencePixels",
+        "Saturation",
+        "Nonlinearity",
+        "Bias",
+        "ReadNoise",
+        "ADConversion",
+    ]
+    assert "CosmicRays(flux=None" in repr(detector)
+    bare = Detector.miri_imager(cosmic_rays=False, bad_pixels=False, residual=0.01, showers=True)
+    assert type(bare.effects[0]).__name__ == "Residual"
+    assert len(bare.effects) == 10
+
+
+def test_ramp_does_not_change(make_exposure, make_sky, detector):
+    exposure = make_exposure(n_groups=2)
+    ramp = detector.expose(make_sky(exposure, 1.0), exposure, seed=0)
+    assert ramp.unit == u.adu
+    assert ramp.wcs is exposure.wcs
+    assert ramp.meta["seed"] == 0
+    assert "1 integration(s) x 2 groups" in repr(ramp)
+    for name in ("mask", "uncertainty", "wcs", "exposure"):
+        with pytest.raises(AttributeError):
+            setattr(ramp, name, None)
+    for array in (ramp.data, ramp.pixel_dq, ramp.group_dq):
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0
+
+
+def test_ramp_checks_its_arrays(make_exposure):
+    exposure = make_exposure(n_groups=2)
+    good = np.zeros((1, 2, 64, 72), np.uint16)
+    assert Ramp(good, exposure).group_dq is None
+    with pytest.raises(ValueError, match="'data' must be of the exposure's shape"):
+        Ramp(good[0], exposure)
+    with pytest.raises(ValueError, match="'data' must be of dtype"):
+        Ramp(good.astype(float), exposure)
+    with pytest.raises(ValueError, match="'pixel_dq' must be"):
+        Ramp(good, exposure, pixel_dq=np.zeros((64, 72)))
+    with pytest.raises(ValueError, match="'group_dq' must be"):
+        Ramp(good, exposure, group_dq=np.zeros((64, 72), np.uint8))

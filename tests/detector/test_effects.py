@@ -1,0 +1,267 @@
+import numpy as np
+import pytest
+from scipy import stats
+
+from miricigale.detector import (
+    DQ,
+    BadPixels,
+    Bias,
+    Block,
+    CosmicRays,
+    Dark,
+    InterpixelCapacitance,
+    Nonlinearity,
+    Photons,
+    ReadNoise,
+    ReferencePixels,
+    Residual,
+    Saturation,
+)
+from miricigale.detector.effects import stream_key
+from miricigale.instrument import bad_pixel_mask, flat_field, miri_detector, photmjsr
+
+
+@pytest.fixture
+def make_block(make_exposure):
+    def make(band="miri.f770w", *, seed=1, properties=None, **options):
+        exposure = make_exposure(band, **options)
+        shape = (exposure.n_integrations, exposure.n_groups, *exposure.shape)
+        return Block(
+            exposure,
+            properties or miri_detector(),
+            slice(0, exposure.shape[0]),
+            np.zeros(exposure.shape, np.uint32),
+            np.zeros(shape, np.uint8),
+            stream_key(seed, exposure, "test"),
+        )
+
+    return make
+
+
+def empty(block):
+    return np.zeros(block.ramp_shape, np.float32)
+
+
+def test_photons_come_at_the_calibrated_rate(make_block):
+    block = make_block("miri.f1000w", n_groups=40, subarray="SUB256")
+    exposure = block.exposure
+    ramp = Photons(flat=False).apply(np.full(exposure.shape, 11.7), block)
+    gain = miri_detector().gain
+    expected = 11.7 / photmjsr("miri.f1000w") * gain * exposure.integration_time.to_value("s")
+    assert ramp[0, -1].mean() == pytest.approx(
+        expected, abs=5 * np.sqrt(expected / ramp[0, -1].size)
+    )
+    # dispersion test of the Poisson distribution
+    n = ramp[0, -1].size
+    assert ramp[0, -1].var() / expected == pytest.approx(1, abs=5 * np.sqrt(2 / n))
+
+
+def test_photons_see_the_flat_field(make_block):
+    block = make_block(n_groups=2, subarray="SUB256")
+    ramp = Photons().apply(np.full(block.exposure.shape, 1e6), block)
+    flat = flat_field("miri.f770w", subarray="SUB256")
+    ratio = ramp[0, -1] / ramp[0, -1].mean() / (flat / flat.mean())
+    np.testing.assert_allclose(ratio, 1, atol=0.005)
+
+
+def test_dark_charge(make_block):
+    block = make_block(n_groups=50, subarray="SUB256")
+    ramp = Dark().apply(empty(block), block)
+    n = ramp[0, 0].size
+    mean = 0.2 * 50 * 0.3
+    assert ramp[0, -1].mean() == pytest.approx(mean, abs=5 * np.sqrt(mean / n))
+    assert Dark(current=0).apply(empty(block), block).max() == 0
+
+
+def test_integrations_are_independent(make_block):
+    block = make_block(n_groups=4, n_integrations=3, subarray="SUB256")
+    last = Dark(current=100).apply(empty(block), block)[:, -1].reshape(3, -1)
+    correlation = np.corrcoef(last) - np.eye(3)
+    assert np.abs(correlation).max() < 5 / np.sqrt(last.shape[1])
+
+
+def test_number_of_cosmic_rays(make_block):
+    # hits without track, scatter or leakage leave the same charge each
+    effect = CosmicRays(track_max=0, yield_dex=0, leakage=0, thickness=35, yield_median=10)
+    block = make_block(n_groups=200, n_integrations=2, subarray="FULL")
+    block = Block(
+        block.exposure,
+        block.properties,
+        slice(100, 164),
+        block.pixel_dq[100:164],
+        block.group_dq[:, :, 100:164],
+        block.key,
+    )
+    ramp = effect.apply(empty(block), block)
+    hits = ramp[:, -1].sum(dtype=float) / 350
+    assert hits == pytest.approx(round(hits), abs=1e-3)
+    # 4.9e-8 hits / um2 / s at solar minimum, times 1.7
+    expected = 4.9e-8 * 1.7 * (25**2 * 64 * 1032) * (2 * 200 * 2.775)
+    assert abs(hits - expected) < 4 * np.sqrt(expected) + 0.01 * expected
+    # they come at any time
+    when = np.nonzero(np.diff(ramp, axis=1, prepend=0).sum(axis=(2, 3)).ravel())[0]
+    assert stats.kstest(when / 400, "uniform").pvalue > 1e-3
+
+
+def test_cosmic_rays_leak_to_their_neighbours(make_block):
+    effect = CosmicRays(flux=3e-5, track_max=0, yield_dex=0, leakage=0.03)
+    block = make_block(n_groups=2)
+    image = effect.apply(empty(block), block)[0, -1]
+    charge = 35 * 100
+    # an isolated hit: no other one near
+    isolated = [
+        (y, x)
+        for y in range(2, 62)
+        for x in range(2, 70)
+        if image[y, x] == pytest.approx(0.88 * charge, rel=1e-5)
+        and image[y - 2 : y + 3, x - 2 : x + 3].sum() == pytest.approx(charge, rel=1e-5)
+    ]
+    assert isolated
+    for y, x in isolated:
+        for side in (image[y - 1, x], image[y + 1, x], image[y, x - 1], image[y, x + 1]):
+            assert side == pytest.approx(0.03 * charge, rel=1e-5)
+        assert image[y - 1, x - 1] == 0
+
+
+def test_tracks_keep_the_charge_and_their_lengths(make_block):
+    block = make_block(n_groups=60, subarray="SUB256")
+    options = {"flux": 2e-5, "yield_dex": 0, "yield_median": 10, "leakage": 0}
+    ramp = CosmicRays(track_max=16, **options).apply(empty(block), block)
+    hits = 2e-5 * 25**2 * 256**2 * 60 * 0.3
+    # the mean of thickness / cos is 2 thickness for p(cos) = 2 cos, less where tracks are cut
+    cut = np.hypot(1, 16 * 25 / 35)
+    mean_path = 35 * (2 - 1 / cut)
+    assert ramp[0, -1].sum(dtype=float) == pytest.approx(hits * mean_path * 10, rel=0.05)
+
+
+def test_showers_are_faint_and_wide(make_block):
+    block = make_block(n_groups=10, subarray="SUB256")
+    options = {"flux": 3e-7, "yield_median": 0.0}
+    effect = CosmicRays(shower_fraction=1.0, shower_charge=1e5, yield_dex=0, **options)
+    dull = CosmicRays(**options)
+    image = effect.apply(empty(block), block)[0, -1]
+    assert dull.apply(empty(block), block).max() == 0
+    assert np.count_nonzero(image) > 1000
+    # a Gaussian of 10^5 electrons, 15 pixels wide
+    assert 0 < image.max() < 20 * 1e5 / (2 * np.pi * 15**2)
+
+
+def test_blocks_of_cosmic_rays_fit_together(make_block):
+    block = make_block(n_groups=20, subarray="SUB256")
+    effect = CosmicRays(flux=1e-6, shower_fraction=0.05)
+    whole = effect.apply(empty(block), block)
+    part = Block(
+        block.exposure,
+        block.properties,
+        slice(97, 104),
+        block.pixel_dq[97:104],
+        block.group_dq[:, :, 97:104],
+        block.key,
+    )
+    np.testing.assert_array_equal(effect.apply(empty(part), part), whole[:, :, 97:104])
+
+
+def test_bad_and_reference_pixels(make_block):
+    block = make_block(n_groups=5, subarray="FULL")
+    ramp = np.full(block.ramp_shape, 100, np.float32)
+    ramp = ReferencePixels().apply(BadPixels(hot_current=1e4).apply(ramp, block), block)
+    bad = bad_pixel_mask()
+    np.testing.assert_array_equal(block.pixel_dq & DQ.DO_NOT_USE != 0, bad)
+    assert np.all(ramp[:, :, block.pixel_dq & DQ.DEAD != 0] == 0)
+    assert np.all(ramp[:, -1][:, block.pixel_dq & DQ.HOT != 0] > 1e5)
+    reference = block.pixel_dq & DQ.REFERENCE_PIXEL != 0
+    assert np.flatnonzero(reference.any(axis=0)).tolist() == [0, 1, 2, 3, 1028, 1029, 1030, 1031]
+    assert ramp[:, :, reference].max() == 0
+    assert np.all(ramp[:, :, block.pixel_dq == 0] == 100)
+
+
+def test_saturation_stops_and_flags(make_block):
+    block = make_block(n_groups=4)
+    ramp = empty(block)
+    ramp[0, :, 5, 6] = [1e5, 2e5, 2.1e5, 3e5]
+    ramp = Saturation().apply(ramp, block)
+    assert ramp[0, :, 5, 6].tolist() == [1e5, 2e5, 2.1e5, 2.1e5]
+    assert block.group_dq[0, :, 5, 6].tolist() == [0, 0, DQ.SATURATED, DQ.SATURATED]
+    assert np.count_nonzero(block.group_dq) == 2
+
+
+def test_linearize_undoes_the_nonlinearity(make_block):
+    block = make_block(n_groups=2)
+    electrons = np.linspace(0, 210e3, 2 * 64 * 72)
+    ramp = Nonlinearity().apply(electrons.astype(np.float32).reshape(block.ramp_shape), block)
+    assert np.all(ramp.ravel()[1:] <= electrons[1:] / 4)
+    linear = miri_detector().linearize(ramp).ravel()
+    np.testing.assert_allclose(linear, electrons / 4, atol=0.02)
+    ramp = Nonlinearity(linear=True).apply(
+        electrons.astype(np.float32).reshape(block.ramp_shape), block
+    )
+    np.testing.assert_allclose(ramp.ravel(), electrons / 4, atol=0.01)
+
+
+def test_bias_and_reset_noise(make_block):
+    block = make_block(n_groups=3, n_integrations=2, subarray="SUB256")
+    assert np.all(Bias(level=500).apply(empty(block), block) == 500)
+    ramp = Bias(reset_noise=5).apply(empty(block), block)
+    n = ramp[0, 0].size
+    assert np.all(ramp[:, 0] == ramp[:, 2])
+    assert ramp.mean() == pytest.approx(11000, abs=5 * 5 / np.sqrt(2 * n))
+    assert ramp[0, 0].std() == pytest.approx(5, rel=5 / np.sqrt(2 * n))
+    assert abs(np.corrcoef(ramp[0, 0].ravel(), ramp[1, 0].ravel())[0, 1]) < 5 / np.sqrt(n)
+
+
+def test_read_noise(make_block):
+    block = make_block(n_groups=3, subarray="SUB256")
+    ramp = ReadNoise().apply(empty(block), block)
+    assert ramp.std() == pytest.approx(6, rel=5 / np.sqrt(2 * ramp.size))
+    pink = ReadNoise(sigma=0, pink=3.0).apply(empty(block), block)
+    assert pink.std() > 0
+    np.testing.assert_array_equal(pink[..., 0], pink[..., 4])
+
+
+def test_coupling_keeps_a_flat_field_and_spreads_a_point(make_block):
+    block = make_block(n_groups=2)
+    flat = InterpixelCapacitance().apply(np.full(block.ramp_shape, 1000, np.float32), block)
+    np.testing.assert_allclose(flat, 1000, rtol=1e-6)
+    ramp = empty(block)
+    ramp[:, :, 30, 40] = 1000
+    ramp = InterpixelCapacitance().apply(ramp, block)
+    np.testing.assert_allclose(
+        ramp[0, 0, 29:32, 39:42] / 1000, miri_detector().ipc_kernel, rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("correlation", [0.0, 1.0, 3.0])
+def test_residual_is_fixed_on_the_detector(make_block, correlation):
+    effect = Residual(0.01, correlation=correlation)
+    one, two = make_block(seed=1, subarray="SUB256"), make_block(seed=2, subarray="SUB256")
+    light = np.full(one.exposure.shape, 100.0)
+    pattern = effect.apply(light, one)
+    np.testing.assert_array_equal(pattern, effect.apply(light, two))
+    n_independent = light.size / max(1, 4 * np.pi * correlation**2)
+    assert pattern.std() == pytest.approx(1, rel=5 / np.sqrt(2 * n_independent))
+    other = make_block("miri.f1000w", subarray="SUB256")
+    assert np.abs(effect.apply(light, other) - pattern).max() > 1
+    # and it does not know blocks
+    part = Block(one.exposure, one.properties, slice(50, 60), None, None, one.key)
+    np.testing.assert_allclose(effect.apply(light[50:60], part), pattern[50:60], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("effect", "name"),
+    [
+        (lambda: Residual(0.5), "amplitude"),
+        (lambda: Residual(0.01, correlation=-1), "correlation"),
+        (lambda: CosmicRays(leakage=0.3), "leakage"),
+        (lambda: CosmicRays(shower_fraction=2), "shower_fraction"),
+        (lambda: CosmicRays(track_max=1000), "track_max"),
+    ],
+)
+def test_errors_name_the_argument(effect, name):
+    with pytest.raises(ValueError, match=f"'{name}' must be"):
+        effect()
+
+
+def test_effects_on_ramps_want_a_ramp(make_block):
+    block = make_block()
+    with pytest.raises(ValueError, match="Dark acts on a ramp"):
+        Dark().apply(np.zeros(block.exposure.shape), block)

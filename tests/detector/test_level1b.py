@@ -1,0 +1,144 @@
+import warnings
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.time import Time
+from astropy.wcs import WCS
+
+from miricigale.detector import DQ, Detector, Ramp
+from miricigale.utils.exceptions import DataError
+
+
+@pytest.fixture
+def ramp(make_exposure, make_sky):
+    exposure = make_exposure("miri.f1500w", n_groups=3, n_integrations=2, dither=2)
+    return Detector.miri_imager().expose(make_sky(exposure, 40.0), exposure, seed=9)
+
+
+def test_round_trip(ramp, tmp_path):
+    path = ramp.write(tmp_path / "a_uncal.fits")
+    back = Ramp.read(path)
+    assert back.data.dtype == np.uint16
+    np.testing.assert_array_equal(back.data, ramp.data)
+    np.testing.assert_array_equal(back.pixel_dq, ramp.pixel_dq)
+    assert back.group_dq is None
+    assert back.meta == ramp.meta
+    for name in ("filter", "readout", "n_groups", "n_integrations", "subarray", "dither"):
+        assert getattr(back.exposure, name) == getattr(ramp.exposure, name)
+    assert back.exposure.pointing.separation(ramp.exposure.pointing) < 1e-6 * u.arcsec
+    assert abs(back.exposure.roll - ramp.exposure.roll) < 1e-9 * u.deg
+    corner = back.wcs.pixel_to_world(0, 63)
+    assert corner.separation(ramp.wcs.pixel_to_world(0, 63)) < 1e-5 * u.arcsec
+
+
+def test_header_is_what_the_pipeline_asks_for(ramp, tmp_path):
+    path = ramp.write(tmp_path / "a_uncal.fits", start=Time("2023-01-02T03:04:05"))
+    with warnings.catch_warnings(), fits.open(path) as hdus:
+        warnings.simplefilter("error")
+        hdus.verify("exception")
+        primary, science = hdus[0].header, hdus["SCI"].header
+        assert hdus["SCI"].data.dtype == np.uint16
+        np.testing.assert_array_equal(hdus["SCI"].data, ramp.data)
+        assert hdus["ASDF"].data["ASDF_METADATA"][0].tobytes().startswith(b"#ASDF 1.0.0\n")
+        assert hdus["SIM_PIXELDQ"].data.dtype == np.uint32
+    # what Detector1 and Image2 fail without (measured by removing keywords)
+    for key in ("DATE-OBS", "TIME-OBS", "TFRAME", "NFRAMES", "SUBARRAY", "SUBSTRT1", "SUBSTRT2"):
+        assert key in primary
+    for key in ("SUBSIZE1", "SUBSIZE2", "DATAMODL", "EXP_TYPE", "INSTRUME", "DETECTOR", "FILTER"):
+        assert key in primary
+    for key in ("RA_REF", "DEC_REF", "ROLL_REF", "V2_REF", "V3_REF", "VPARITY", "V3I_YANG"):
+        assert key in science
+    assert primary["DATE-OBS"] == "2023-01-02"
+    assert primary["TIME-OBS"].startswith("03:04:05")
+    assert (primary["NINTS"], primary["NGROUPS"], primary["FILTER"]) == (2, 3, "F1500W")
+    assert primary["EXPEND"] - primary["EXPSTART"] == pytest.approx(
+        ramp.exposure.duration.to_value("d"), abs=1e-10
+    )
+    # the linear WCS of the header finds the reference pixel and its neighbours
+    linear = WCS(science, naxis=2)
+    x, y = ramp.exposure.aperture.reference
+    for dx in (0, 5):
+        offset = linear.pixel_to_world(x + dx, y).separation(ramp.wcs.pixel_to_world(x + dx, y))
+        assert offset < 0.01 * u.arcsec
+
+
+def test_existing_files_are_kept(ramp, tmp_path):
+    path = ramp.write(tmp_path / "a_uncal.fits")
+    with pytest.raises(OSError, match="exists; give overwrite=True"):
+        ramp.write(path)
+    ramp.write(path, overwrite=True)
+    assert [p.name for p in tmp_path.iterdir()] == ["a_uncal.fits"]
+
+
+def test_only_counts_are_written(make_exposure, tmp_path):
+    exposure = make_exposure(n_groups=2)
+    floats = Ramp(np.zeros((1, 2, 64, 72), np.float32), exposure)
+    with pytest.raises(ValueError, match="'data' must be counts"):
+        floats.write(tmp_path / "a_uncal.fits")
+    assert not list(tmp_path.iterdir())
+
+
+def foreign(path, *, drop=(), primary=None, data=None):
+    """A level-1b file as another program would write it, with standard keywords only."""
+    head = {
+        "INSTRUME": "MIRI",
+        "EXP_TYPE": "MIR_IMAGE",
+        "FILTER": "F770W",
+        "READPATT": "FASTR1",
+        "SUBARRAY": "SUB64",
+        "NINTS": 1,
+        "NGROUPS": 4,
+    }
+    head.update(primary or {})
+    science = {"RA_REF": 214.9, "DEC_REF": 52.9, "ROLL_REF": 120.0}
+    data = np.arange(4 * 64 * 72, dtype=np.uint16).reshape(1, 4, 64, 72) if data is None else data
+    hdus = fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(data, name="SCI")])
+    hdus[0].header.update({k: v for k, v in head.items() if k not in drop})
+    hdus[1].header.update({k: v for k, v in science.items() if k not in drop})
+    hdus.writeto(path)
+    return path
+
+
+def test_reads_files_of_others(tmp_path):
+    ramp = Ramp.read(foreign(tmp_path / "b_uncal.fits"))
+    np.testing.assert_array_equal(ramp.data.ravel(), np.arange(4 * 64 * 72))
+    assert ramp.exposure.filter == "miri.f770w"
+    assert ramp.exposure.dither == 0
+    assert ramp.exposure.roll == 120 * u.deg
+    assert np.count_nonzero(ramp.pixel_dq & DQ.REFERENCE_PIXEL) == 64 * 4
+    sky = ramp.wcs.pixel_to_world(*ramp.exposure.aperture.reference)
+    assert sky.separation(ramp.exposure.pointing) < 1e-3 * u.arcsec
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"drop": ["RA_REF"]}, "has no keyword RA_REF"),
+        ({"primary": {"EXP_TYPE": "MIR_MRS"}}, "must be a MIRI MIR_IMAGE exposure"),
+        ({"primary": {"SUBARRAY": "SUB256"}}, "must have"),
+        ({"primary": {"FILTER": "F777W"}}, "cannot be read as a level-1b file"),
+        ({"data": np.zeros((4, 64, 72), np.float32)}, "must hold unsigned 16-bit counts"),
+    ],
+)
+def test_refuses_other_files(tmp_path, options, message):
+    with pytest.raises(DataError, match=message):
+        Ramp.read(foreign(tmp_path / "c_uncal.fits", **options))
+
+
+def test_refuses_what_is_no_file(ramp, tmp_path):
+    with pytest.raises(DataError, match="cannot be read"):
+        Ramp.read(tmp_path / "none.fits")
+    path = tmp_path / "text.fits"
+    path.write_text("not a FITS file")
+    with pytest.raises(DataError, match="cannot be read"):
+        Ramp.read(path)
+    fits.PrimaryHDU().writeto(tmp_path / "empty.fits")
+    with pytest.raises(DataError, match="no SCI extension"):
+        Ramp.read(tmp_path / "empty.fits")
+    whole = ramp.write(tmp_path / "a_uncal.fits")
+    cut = tmp_path / "cut_uncal.fits"
+    cut.write_bytes(whole.read_bytes()[:30000])
+    with pytest.raises(DataError):
+        Ramp.read(cut)

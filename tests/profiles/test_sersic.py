@@ -1,0 +1,122 @@
+import numpy as np
+import pytest
+from astropy.modeling.models import Sersic2D
+from scipy.special import erf
+
+from miricigale.profiles import (
+    sersic_bn,
+    sersic_enclosed_fraction,
+    sersic_image,
+    sersic_radius,
+    sersic_stamp,
+)
+
+INDICES = (0.3, 0.5, 1.0, 2.5, 4.0, 8.0)
+
+
+def pixel_gaussian(n, center, sigma):
+    at = np.arange(n) - center
+    return 0.5 * (erf((at + 0.5) / sigma / 2**0.5) - erf((at - 0.5) / sigma / 2**0.5))
+
+
+def test_bn_is_what_ciotti_and_bertin_give():
+    n = np.array([1.0, 2.0, 4.0, 8.0])
+    series = 2 * n - 1 / 3 + 4 / (405 * n) + 46 / (25515 * n**2) + 131 / (1148175 * n**3)
+    np.testing.assert_allclose(sersic_bn(n), series, rtol=1e-4)
+
+
+def test_light_beyond_ten_radii():
+    # 3.9 % at n = 4 and 11.5 % at n = 8
+    np.testing.assert_allclose(
+        1 - sersic_enclosed_fraction(10.0, [4, 8]), [0.039, 0.115], atol=5e-4
+    )
+
+
+@pytest.mark.parametrize("n", INDICES)
+def test_radius_inverts_the_enclosed_fraction(n):
+    assert sersic_enclosed_fraction(1.0, n) == pytest.approx(0.5, abs=1e-12)
+    assert sersic_enclosed_fraction(sersic_radius(0.93, n), n) == pytest.approx(0.93, rel=1e-10)
+
+
+@pytest.mark.parametrize("ratio", [0.1, 0.5, 1.0])
+@pytest.mark.parametrize("r_eff", [0.2, 1.0, 4.0])
+def test_index_one_half_is_a_gaussian(r_eff, ratio):
+    sigma = r_eff / np.sqrt(2 * np.log(2))
+    x, y = 30.37, 29.81
+    image = sersic_image((60, 60), x=x, y=y, r_eff=r_eff, n=0.5, axis_ratio=ratio)
+    truth = np.outer(pixel_gaussian(60, y, ratio * sigma), pixel_gaussian(60, x, sigma))
+    np.testing.assert_allclose(image, truth, atol=3e-4 * truth.max())
+    assert image.sum() == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("ratio", [0.1, 0.6, 1.0])
+@pytest.mark.parametrize("r_eff", [0.2, 2.0])
+@pytest.mark.parametrize("n", INDICES)
+def test_total_light_and_division_of_pixels(n, r_eff, ratio):
+    rng = np.random.default_rng([int(10 * n), int(10 * r_eff), int(10 * ratio)])
+    x, y = rng.uniform(99.5, 100.5, 2)
+    theta = rng.uniform(0, np.pi)
+    shape = {"n": n, "axis_ratio": ratio, "theta": theta, "total_flux": 7.0}
+    image = sersic_image((201, 201), x=x, y=y, r_eff=r_eff, **shape)
+    # everything within 100 pixels, up to what lies beyond
+    beyond = 1 - sersic_enclosed_fraction(100 / r_eff, n)
+    assert 7 * (1 - beyond) * (1 - 1e-4) <= image.sum() <= 7 * (1 + 1e-4)
+    # pixels are sums of smaller pixels, the central one included
+    fine = sersic_image((35, 35), x=5 * (x - 97) + 2, y=5 * (y - 97) + 2, r_eff=5 * r_eff, **shape)
+    coarse = image[97:104, 97:104]
+    np.testing.assert_allclose(
+        fine.reshape(7, 5, 7, 5).sum(axis=(1, 3)), coarse, rtol=1e-3, atol=3e-4 * coarse.max()
+    )
+
+
+def test_central_pixel_by_the_enclosed_light_of_circles():
+    # the flux of a square is bracketed by its inscribed and circumscribed circles, and the
+    # cusp of a small n = 4 galaxy leaves no room between them
+    image = sersic_image((3, 3), x=1, y=1, r_eff=0.002, n=4)
+    inner, outer = sersic_enclosed_fraction(np.array([0.5, 0.5**0.5]) / 0.002, 4.0)
+    assert inner <= image[1, 1] <= outer
+    assert outer - inner < 2e-3
+
+
+def test_agrees_with_the_model_of_astropy_away_from_the_cusp():
+    image = sersic_image((81, 81), x=40, y=40, r_eff=12, n=2, axis_ratio=0.6, theta=0.4)
+    y, x = np.mgrid[:81, :81]
+    model = Sersic2D(amplitude=1, r_eff=12, n=2, x_0=40, y_0=40, ellip=0.4, theta=0.4)
+    ratio = (image / model(x, y))[np.hypot(x - 40, y - 40) > 10]
+    np.testing.assert_allclose(ratio, ratio.mean(), rtol=2e-3)
+    bn = sersic_bn(2)
+    norm = 2 * np.pi * 2 * 0.6 * 144 * np.exp(bn) * bn**-4 * 6  # Gamma(4) = 6
+    assert ratio.mean() == pytest.approx(1 / norm, rel=1e-3)
+
+
+def test_position_angle_runs_from_x_to_y():
+    image = sersic_image((61, 61), x=30, y=30, r_eff=6, n=1, axis_ratio=0.3, theta=np.radians(30))
+    y, x = np.mgrid[:61, :61] - 30
+    theta = 0.5 * np.arctan2(2 * np.sum(image * x * y), np.sum(image * (x**2 - y**2)))
+    assert np.degrees(theta) == pytest.approx(30, abs=0.2)
+
+
+def test_stamp_is_a_cut_of_the_image():
+    kwargs = {"r_eff": 2.5, "n": 2, "axis_ratio": 0.5, "theta": 1.0, "total_flux": 3.0}
+    stamp, (y0, x0) = sersic_stamp(x=70.2, y=60.9, enclosed=0.99, **kwargs)
+    image = sersic_image((140, 140), x=70.2, y=60.9, **kwargs)
+    ny, nx = stamp.shape
+    np.testing.assert_allclose(stamp, image[y0 : y0 + ny, x0 : x0 + nx], rtol=1e-9)
+    assert 3 * 0.99 < stamp.sum() < 3
+    small, _ = sersic_stamp(x=70.2, y=60.9, enclosed=0.99, max_radius=4, **kwargs)
+    assert max(small.shape) <= 9
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "match"),
+    [
+        ("n", 0.1, "'n' must be within 0.2 and 10.0, got 0.1"),
+        ("r_eff", 0.0, "'r_eff' must be positive, got 0.0"),
+        ("axis_ratio", 1.5, "'axis_ratio' must be above 0 and at most 1"),
+        ("total_flux", np.nan, "'total_flux' must be finite"),
+    ],
+)
+def test_refuses(name, value, match):
+    kwargs = {"x": 5, "y": 5, "r_eff": 2.0, "n": 1.0, name: value}
+    with pytest.raises(ValueError, match=match):
+        sersic_image((11, 11), **kwargs)

@@ -1,0 +1,158 @@
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+
+from miricigale.scene import CatalogFlags, check_catalog, read_catalog
+from miricigale.utils.exceptions import DataError
+
+
+@pytest.fixture
+def table():
+    return QTable(
+        {
+            "id": [3, 7],
+            "sky": SkyCoord([53.1, 53.2], [-27.8, -27.7], unit="deg"),
+            "redshift": [0.5, 2.0],
+            "profile": ["sersic", "point"],
+            "half_light_radius": [0.3, 0.0] * u.arcsec,
+            "sersic_index": [1.0, np.nan],
+            "axis_ratio": [0.5, 1.0],
+            "position_angle": [20.0, 0.0] * u.deg,
+            "miri.f770w": [1.0, 2.0] * u.mJy,
+        }
+    )
+
+
+def test_units_are_converted_and_the_input_is_left_alone(table):
+    table["half_light_radius"] = table["half_light_radius"].to(u.deg)
+    catalog = check_catalog(table, filters=["miri.f770w"])
+    assert catalog["miri.f770w"].unit == u.uJy
+    assert catalog["miri.f770w"][1].value == 2000
+    assert catalog["half_light_radius"][0].value == pytest.approx(0.3)
+    assert catalog["flags"].tolist() == [0, 0]
+    assert table["miri.f770w"].unit == u.mJy
+    assert "flags" not in table.colnames
+
+
+@pytest.mark.parametrize("suffix", ["ecsv", "fits", "ecsv.gz"])
+def test_round_trip(table, tmp_path, suffix):
+    path = tmp_path / f"catalog.{suffix}"
+    if suffix.endswith("gz"):
+        import gzip
+
+        table.write(tmp_path / "plain.ecsv")
+        path.write_bytes(gzip.compress((tmp_path / "plain.ecsv").read_bytes()))
+    else:
+        table.write(path)
+    catalog = read_catalog(path)
+    assert catalog["id"].tolist() == [3, 7]
+    assert catalog["sky"].separation(table["sky"]).max() < 1 * u.mas
+    assert catalog["profile"].tolist() == ["sersic", "point"]
+
+
+def test_ra_and_dec_stand_for_sky(table):
+    table["ra"], table["dec"] = table["sky"].ra.to(u.rad), table["sky"].dec
+    expected = table["sky"]
+    table.remove_column("sky")
+    assert check_catalog(table)["sky"].separation(expected).max() < 1e-6 * u.arcsec
+
+
+def test_unusable_rows_are_flagged(table):
+    table = QTable([*[table[0]] * 5])
+    table["id"] = range(5)
+    table["half_light_radius"][0] = -1 * u.arcsec
+    table["sersic_index"][1] = 12
+    table["axis_ratio"][2] = 0
+    table["position_angle"][3] = np.nan
+    table["redshift"][4] = np.nan
+    flags = check_catalog(table)["flags"]
+    f = CatalogFlags
+    wanted = [f.BAD_RADIUS, f.BAD_INDEX, f.BAD_AXIS_RATIO, f.BAD_ANGLE, f.NO_REDSHIFT]
+    assert flags.tolist() == wanted
+
+
+def test_refuses(table):
+    def broken(**columns):
+        copy = table.copy()
+        for name, value in columns.items():
+            copy[name] = value
+        return copy
+
+    with pytest.raises(ValueError, match=r"columns \['redshift'\], got columns"):
+        check_catalog(
+            table[
+                "id",
+                "sky",
+                "profile",
+                "half_light_radius",
+                "sersic_index",
+                "axis_ratio",
+                "position_angle",
+            ]
+        )
+    with pytest.raises(ValueError, match=r"columns \['miri.f560w'\]"):
+        check_catalog(table, filters=["miri.f560w"])
+    with pytest.raises(
+        u.UnitsError, match="'half_light_radius' must be convertible to arcsec, got None"
+    ):
+        check_catalog(broken(half_light_radius=[0.1, 0.2]))
+    with pytest.raises(u.UnitsError, match=r"'miri\.f770w' must be convertible to uJy, got s"):
+        check_catalog(broken(**{"miri.f770w": [1, 2] * u.s}), filters=["miri.f770w"])
+    with pytest.raises(ValueError, match=r"ids are unique, got duplicates such as \[3\]"):
+        check_catalog(broken(id=[3, 3]))
+    with pytest.raises(ValueError, match="integers in 'id'"):
+        check_catalog(broken(id=["a", "b"]))
+    with pytest.raises(ValueError, match="finite positions, got 1 that are not, first in row 1"):
+        check_catalog(broken(sky=SkyCoord([53, np.nan], [-27, -27], unit="deg")))
+    with pytest.raises(ValueError, match=r"'profile' among .*, got \['disk'\]"):
+        check_catalog(broken(profile=["disk", "point"]))
+    with pytest.raises(ValueError, match="numbers in 'axis_ratio'"):
+        check_catalog(broken(axis_ratio=["x", "y"]))
+    with pytest.raises(ValueError, match="a table with rows, got none"):
+        check_catalog(table[:0])
+    with pytest.raises(ValueError, match="'catalog' must be a table, got dict"):
+        check_catalog({})
+
+
+def test_unreadable_files(tmp_path):
+    with pytest.raises(
+        DataError, match=r"no catalogue 'catalog.cosmos': neither a file nor one of catalog.goodss"
+    ):
+        read_catalog("catalog.cosmos")
+    path = tmp_path / "broken.ecsv"
+    path.write_text("# %ECSV 1.0\n# ---\nnonsense")
+    with pytest.raises(DataError, match=r"broken\.ecsv cannot be read as a table"):
+        read_catalog(path)
+
+
+def test_bundled_catalogue():
+    catalog = read_catalog("catalog.goodss")
+    center = SkyCoord(53.13440, -27.83444, unit="deg")
+    separation = catalog["sky"].separation(center)
+    assert separation.max() < 95 * u.arcsec
+    # the counts of the 3D-HST catalogue in the bare field of view, 74 by 113 arcsec
+    east = (catalog["sky"].ra - center.ra) * np.cos(center.dec)
+    north = catalog["sky"].dec - center.dec
+    field = (abs(east) < 37 * u.arcsec) & (abs(north) < 56.5 * u.arcsec)
+    # one source lies within 2 mas of the edge
+    assert field.sum() == pytest.approx(451, abs=1)
+    flags = [int(np.sum(catalog["galfit_flag"][field] == k)) for k in range(4)]
+    np.testing.assert_allclose(flags, [273, 67, 108, 3], atol=1)
+    assert catalog["star"][field].sum() == 2
+    galaxies = ~catalog["star"]
+    assert np.all(catalog["redshift"][galaxies] > 0)
+    assert np.all(catalog["flags"][galaxies] == 0)
+    assert catalog["wfc3.f160w"].min() > 0.08 * u.uJy  # 26.6 AB
+    fluxes = [name for name in catalog.colnames if name.startswith("nircam.")]
+    assert len(fluxes) == 22
+    for name in fluxes:
+        colour = -2.5 * np.log10(catalog[name] / catalog["wfc3.f160w"]).value
+        good = np.isfinite(colour)
+        assert np.all(np.abs(colour[good]) < 5)
+        assert np.all((catalog["quality"][~good] & 3) != 0)
+    sersic = catalog["profile"] == "sersic"
+    assert np.all(catalog["mag_f160w"][sersic].value <= 24.5)
+    assert np.all(catalog["galfit_flag"][sersic] <= 1)
+    assert catalog["half_light_radius"][sersic].max() <= 3 * u.arcsec

@@ -1,0 +1,79 @@
+import importlib.util
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from miricigale.scene import Scene, depth_to_rms, highres_image
+
+_spec = importlib.util.spec_from_file_location("scene_tools", Path(__file__).parent / "conftest.py")
+tools = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(tools)
+
+FILTER = "miri.f770w"
+SHAPE = (240, 250)
+
+
+@pytest.fixture
+def fine():
+    return tools.tan_wcs(SHAPE, 0.06)
+
+
+@pytest.fixture
+def catalog(fine):
+    return tools.make_catalog(fine, [100.0, 180.0], [60.0, 120.0], flux=[1.0, 2.0])
+
+
+def test_noise_belongs_to_the_depth(fine, psf, catalog):
+    image = highres_image(catalog, filter=FILTER, wcs=fine, psf=psf, depth=27 * u.ABmag, seed=4)
+    truth = Scene(catalog, filter=FILTER, wcs=fine, psf=psf).render()
+    noise = (image.data - truth.data) * (0.06 * u.arcsec).to_value(u.rad) ** 2 * 1e12
+    # blank apertures of the radius of the depth: a fifth of 27 AB = 0.0575 uJy
+    y, x = np.mgrid[-3.5:4, -3.5:4]
+    mask = np.hypot(x, y) <= 0.2 / 0.06
+    blocks = noise[:240, :248].reshape(30, 8, 31, 8).swapaxes(1, 2)
+    fluxes = (blocks * mask).sum(axis=(2, 3)) / np.sqrt(mask.sum() / (np.pi * (0.2 / 0.06) ** 2))
+    assert fluxes.std() == pytest.approx(0.0575 / 5, rel=0.08)
+    assert np.std(noise) == pytest.approx(
+        np.mean(image.uncertainty.array) * (0.06 * u.arcsec).to_value(u.rad) ** 2 * 1e12, rel=0.02
+    )
+    assert image.unit == u.MJy / u.sr
+    assert image.meta["seed"] == 4
+
+
+def test_noise_does_not_know_the_sources(fine, psf, catalog):
+    both = highres_image(catalog, filter=FILTER, wcs=fine, psf=psf, seed=9)
+    one = highres_image(catalog[:1], filter=FILTER, wcs=fine, psf=psf, seed=9)
+    far = np.s_[150:, :100]
+    np.testing.assert_allclose(both.data[far], one.data[far], rtol=1e-6, atol=1e-12)
+    again = highres_image(catalog, filter=FILTER, wcs=fine, psf=psf, seed=9)
+    np.testing.assert_array_equal(both.data, again.data)
+    other = highres_image(catalog, filter=FILTER, wcs=fine, psf=psf, seed=10)
+    assert not np.any(both.data == other.data)
+
+
+def test_map_of_the_noise(fine, psf, catalog):
+    rms = np.full(SHAPE, 0.01)
+    rms[:, 125:] = 0
+    image = highres_image(catalog, filter=FILTER, wcs=fine, psf=psf, rms=rms * u.MJy / u.sr, seed=1)
+    truth = Scene(catalog, filter=FILTER, wcs=fine, psf=psf).render()
+    np.testing.assert_array_equal(image.data[:, 125:], truth.data[:, 125:])
+    assert np.std((image.data - truth.data)[:, :125]) == pytest.approx(0.01, rel=0.02)
+    np.testing.assert_array_equal(image.uncertainty.array, rms)
+
+
+def test_depth_to_rms_scales_with_the_aperture():
+    kwargs = {"pixel_area": 1e-13}
+    wide = depth_to_rms(1 * u.uJy, aperture_radius=0.4 * u.arcsec, **kwargs)
+    narrow = depth_to_rms(1 * u.uJy, aperture_radius=0.2 * u.arcsec, **kwargs)
+    assert narrow == pytest.approx(2 * wide)
+    assert depth_to_rms(23.9 * u.ABmag, **kwargs) == pytest.approx(narrow, rel=1e-6)
+
+
+def test_refuses(fine, psf, catalog):
+    kwargs = {"filter": FILTER, "wcs": fine, "psf": psf, "seed": 1}
+    with pytest.raises(ValueError, match=r"'rms' must be one value or a map of shape \(240, 250\)"):
+        highres_image(catalog, rms=np.ones((3, 3)) * u.MJy / u.sr, **kwargs)
+    with pytest.raises(u.UnitsError, match="'depth' must be a quantity convertible to uJy"):
+        highres_image(catalog, depth=27.0, **kwargs)
