@@ -38,3 +38,11 @@ def round_mantissa(array, bits):
     drop = 23 - bits
     rounded = (word + np.uint32(1 << (drop - 1))) & np.uint32(0xFFFFFFFF << drop & 0xFFFFFFFF)
     return rounded.view("<f4")
+
+
+def write_fits(hdus, path):
+    """Write a FITS file whose bytes do not depend on the hour (gzip keeps the time)."""
+    from unittest import mock
+
+    with mock.patch("gzip.time.time", return_value=0.0):
+        hdus.writeto(path, overwrite=True)

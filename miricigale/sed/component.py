@@ -1,0 +1,99 @@
+"""The base of all components of a model, and their registry."""
+
+import functools
+
+from miricigale.refdata import Registry, locate
+from miricigale.sed.parameter import Parameter
+
+__all__ = ["COMPONENTS", "ROLES", "Component", "register"]
+
+#: What a component does, in the order in which light meets it.
+ROLES = ("sfh", "stellar", "nebular", "attenuation", "dust", "agn", "igm")
+
+#: Components by name, for configurations.
+COMPONENTS = Registry("component")
+
+
+def register(cls):
+    """Class decorator: make a component known by its ``name``."""
+    COMPONENTS.register(cls.name, lambda _: cls, role=cls.role, reference=cls.reference)
+    return cls
+
+
+class Component:
+    """
+    One link in the chain of a model.
+
+    A subclass gives ``name``, ``role`` (one of `ROLES`), ``reference`` (what to cite) and
+    declares its parameters as `~miricigale.sed.Parameter` in the class body. Numbers go in
+    and arrays come out; units are the model's business.
+
+    Parameters
+    ----------
+    **defaults
+        New defaults of parameters, as quantities or bare numbers in the declared unit.
+
+    Raises
+    ------
+    TypeError
+        If a name is not one of the parameters.
+    """
+
+    name = ""
+    role = ""
+    reference = ""
+    resource = None
+
+    def __init__(self, **defaults):
+        known = type(self).declared()
+        for name, value in defaults.items():
+            if name not in known:
+                msg = f"{type(self).__name__} has no parameter {name!r}; known: {', '.join(known)}"
+                raise TypeError(msg)
+            self.__dict__[name] = known[name].check(value)
+
+    @classmethod
+    def declared(cls):
+        """Parameters as declared in the class bodies, base classes first."""
+        out = {}
+        for base in reversed(cls.__mro__):
+            out.update({k: v for k, v in vars(base).items() if isinstance(v, Parameter)})
+        return out
+
+    @property
+    def parameters(self):
+        """Parameters with the defaults of this instance: dict of name to Parameter."""
+        return {
+            name: par.replace(self.__dict__[name]) if name in self.__dict__ else par
+            for name, par in type(self).declared().items()
+        }
+
+    def nodes(self):
+        """Wavelengths in um between which the component's spectra are straight lines."""
+        return ()
+
+    def inert(self, values):
+        """Names of parameters that make no difference, given the values of all."""
+        return ()
+
+    def invalid(self, values):
+        """
+        Say why values inside their bounds cannot be evaluated, or None.
+
+        Used where parameters are restricted together or to a list.
+        """
+        return
+
+    @functools.cached_property
+    def path(self):
+        """Path of the file of `resource`, found on first use."""
+        return str(locate(self.resource))
+
+    @property
+    def library(self):
+        """Name of the resource that the component reads, or of itself if it reads none."""
+        return self.resource or self.name
+
+    def __repr__(self):
+        values = ", ".join(f"{n}={p.default:g}" for n, p in self.parameters.items())
+        return f"{type(self).__name__}({values})"

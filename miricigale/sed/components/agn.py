@@ -1,0 +1,302 @@
+"""Active nuclei: accretion disk, dusty torus and polar dust."""
+
+import functools
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from miricigale.sed import _core
+from miricigale.sed.component import Component, register
+from miricigale.sed.parameter import Parameter
+from miricigale.utils.exceptions import DataError
+
+__all__ = ["AGN", "AGNTemplates", "ParametricTorus", "TorusSpectra"]
+
+#: Mean over the sphere of cos i (1 + 2 cos i) / 3: a disk's light over its face-on value.
+DISK_MEAN = 7.0 / 18.0
+
+
+@dataclass(frozen=True, eq=False)
+class TorusSpectra:
+    """
+    What a torus library says for one set of parameters, in W/um on a common scale.
+
+    Parameters
+    ----------
+    face_on : `~numpy.ndarray`
+        The disk without obscuration, seen from above.
+    disk : `~numpy.ndarray`
+        Disk light seen at the inclination, direct and scattered.
+    dust : `~numpy.ndarray`
+        Dust emission seen at the inclination.
+    """
+
+    face_on: np.ndarray
+    disk: np.ndarray
+    dust: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class AGNTemplates:
+    """
+    Spectra for one watt of AGN dust emission (torus + polar), in W/um.
+
+    Parameters
+    ----------
+    disk, torus, polar : `~numpy.ndarray`
+        The parts as seen; torus + polar integrate to 1 W.
+    accretion_power : float
+        Luminosity of the disk over all directions, in W for each W of dust emission.
+    """
+
+    disk: np.ndarray
+    torus: np.ndarray
+    polar: np.ndarray
+    accretion_power: float
+
+    @property
+    def total(self):
+        """Sum of the parts."""
+        return self.disk + self.torus + self.polar
+
+
+class AGN(Component):
+    """
+    Base of nuclei with a torus and polar dust; a subclass gives `torus_spectra`.
+
+    Polar dust with an SMC law, k = 1.39 (lambda / um)^-1.2, dims the disk where the line of sight
+    misses the torus (i <= 90 deg - opening angle). What it takes from the disk over its cone,
+    (7/18 - sin^2 oa / 6 - 2 sin^3 oa / 9) int disk (1 - 10^(-0.4 k E)), it sends out evenly as
+    a modified blackbody; torus and polar emission together are then scaled to 1 W.
+    """
+
+    role = "agn"
+    frac_agn = Parameter(
+        default=0.0, bounds=(0.0, 0.999), doc="AGN fraction, in the model's definition."
+    )
+    inclination = Parameter(
+        default=70.0, bounds=(0.0, 90.0), unit="deg", doc="Angle between axis and line of sight."
+    )
+    opening_angle = Parameter(
+        default=40.0, bounds=(10.0, 80.0), unit="deg",
+        doc="Angle between the equator and the edge of the torus.",
+    )  # fmt: skip
+    ebv_polar = Parameter(
+        default=0.1, bounds=(0.0, 3.0), unit="mag", doc="Colour excess of the polar dust."
+    )
+    temperature_polar = Parameter(
+        default=100.0, bounds=(20.0, 1500.0), unit="K", doc="Temperature of the polar dust."
+    )
+    emissivity_polar = Parameter(
+        default=1.6, bounds=(0.5, 3.0), doc="Emissivity index of the polar dust."
+    )
+
+    def torus_spectra(self, wave, values):
+        """
+        Disk and torus of the library.
+
+        Parameters
+        ----------
+        wave : `~numpy.ndarray`
+            Rest wavelengths in um.
+        values : dict
+            Values of all parameters of the component.
+
+        Returns
+        -------
+        spectra : `TorusSpectra`
+        """
+        raise NotImplementedError
+
+    def templates(self, wave, values):
+        """
+        Spectra for one watt of dust emission.
+
+        Returns
+        -------
+        templates : `AGNTemplates`
+        """
+        base = self.torus_spectra(wave, values)
+        disk, polar = base.disk, np.zeros(wave.size)
+        if values["ebv_polar"] > 0.0:
+            law = 1.39 * wave**-1.2
+            transmission = 10.0 ** (-0.4 * law * values["ebv_polar"])
+            if values["inclination"] <= 90.0 - values["opening_angle"]:
+                disk = disk * transmission
+            s = np.sin(np.radians(values["opening_angle"]))
+            share = DISK_MEAN - s**2 / 6.0 - 2.0 * s**3 / 9.0
+            absorbed = share * np.trapezoid(base.face_on * (1.0 - transmission), wave)
+            polar = _core.modified_blackbody(
+                wave, values["temperature_polar"], values["emissivity_polar"]
+            )
+            polar *= absorbed / np.trapezoid(polar, wave)
+        norm = 1.0 / np.trapezoid(base.dust + polar, wave)
+        power = norm * DISK_MEAN * np.trapezoid(base.face_on, wave)
+        return AGNTemplates(disk * norm, base.dust * norm, polar * norm, float(power))
+
+    def inert(self, values):
+        polar = values["ebv_polar"] == 0.0
+        return ("temperature_polar", "emissivity_polar") if polar else ()
+
+
+@register
+class ParametricTorus(AGN):
+    """
+    Our own torus: a sum of blackbodies behind a screen, after SKIRTOR in form and scale.
+
+    Dust at radii rho = 1 ... R has T = 1500 K rho^-b and weight rho^c, shines through a layer
+    and is dimmed by the torus in front of it. Fifteen constants (``torus.parametric``) were
+    fitted to the 50 SKIRTOR SEDs with p = 1, q = 0, opening angle 40 deg and R = 20: 0.057 dex
+    rms in 2-40 um over shape, worst 0.14 (tau 11, seen edge on).
+
+    The disk has the SKIRTOR form of 2020 and shines as cos i (1 + 2 cos i). The energy that the
+    torus takes from it, over all directions, is what the dust sends out; its dependence
+    on inclination and tau is that of the library.
+
+    The rest is **not fitted**: ``p`` moves the weight by dm/dlnr ~ r^(3 - p), so c falls by p - 1;
+    ``q`` thins the torus towards the poles, ``tau exp(-q |cos theta|)``; ``opening_angle`` moves the edge;
+    ``radius_ratio`` is the outer end of the integral.
+    """
+
+    name = "parametric_torus"
+    reference = "form after Stalevski et al. 2012, 2016, MNRAS 420, 2756; 458, 2288"
+    resource = "torus.parametric"
+    tau97 = Parameter(
+        default=7.0, bounds=(1.0, 15.0), doc="Optical depth at 9.7 um along the equator."
+    )
+    p = Parameter(default=1.0, bounds=(0.0, 2.0), doc="Slope of density with radius.")
+    q = Parameter(default=1.0, bounds=(0.0, 2.0), doc="Slope of density with angle.")
+    radius_ratio = Parameter(
+        default=20.0, bounds=(5.0, 40.0), doc="Outer over inner radius of the torus."
+    )
+
+    def nodes(self):
+        low = 0.008 * (30.0 / 0.008) ** (np.arange(241) / 240)
+        return np.concatenate([low, 30.0 * (1000.0 / 30.0) ** (np.arange(1, 53) / 52)])
+
+    def torus_spectra(self, wave, values):
+        names = ("tau97", "inclination", "opening_angle", "p", "q", "radius_ratio")
+        path = self.path
+        return _torus(path, wave.tobytes(), *(float(values[n]) for n in names))
+
+
+@functools.lru_cache(maxsize=2)
+def _constants(path):
+    try:
+        return tomllib.loads(Path(path).read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as err:
+        msg = f"{path} does not hold the constants of a torus: {err}"
+        raise DataError(msg) from err
+
+
+@functools.lru_cache(maxsize=512)
+def _torus(path, wave_bytes, tau, inclination, opening, p, q, ratio):
+    const = _constants(path)
+    wave = np.frombuffer(wave_bytes)
+    mu = np.cos(np.radians(inclination))
+    face_on = _core.disk_spectrum(wave)
+    face_on /= DISK_MEAN * np.trapezoid(face_on, wave)
+    disk = face_on * _seen_fraction(const, wave, tau, inclination, opening, q)
+    dust = _dust_shape(
+        path, wave_bytes, tau * np.exp(-q * mu), tau, opening, inclination, p, q, ratio
+    )
+    power = _absorbed(path, tau, opening, q) * _anisotropy(const, tau, inclination, opening)
+    dust *= power / np.trapezoid(dust, wave)
+    for array in (face_on, disk, dust):
+        array.flags.writeable = False
+    return TorusSpectra(face_on, disk, dust)
+
+
+def _seen_fraction(const, wave, tau, inclination, opening, q):
+    """Disk light seen, direct and scattered, over the face-on disk."""
+    mu = np.cos(np.radians(inclination))
+    direct = mu * (1.0 + 2.0 * mu) / 3.0
+    x, depth = np.log10(wave), np.log(tau / 7.0)
+    scatter = const["scattering"]
+    if inclination < 90.0 - opening - const["extinction"]["edge"]:
+        a, b, cut, power = scatter["clear"]
+        scattered = 10.0 ** (a + b * x) / (1.0 + (wave / cut) ** power)
+        return direct + scattered
+    ext = const["extinction"]
+    curve = ext["amplitude"] * wave ** -ext["power"]
+    curve += ext["silicate97"] * _core.drude(wave, 9.7, ext["width97"])
+    curve += ext["silicate18"] * _core.drude(wave, 18.0, ext["width18"])
+    transmission = np.exp(-np.minimum(tau * np.exp(-q * mu) * curve, 600.0))
+    h = scatter["hidden"]
+    log = h[0] + h[1] * x + h[2] * x**2 + (h[3] + h[4] * x) * depth
+    log += h[5] * (inclination - 110.0 + opening) / 20.0
+    return direct * transmission + 10.0**log / (1.0 + (wave / scatter["cutoff"]) ** 6)
+
+
+def _anisotropy(const, tau, inclination, opening):
+    """Dust light seen at an inclination over its mean over the sphere."""
+    ani = const["anisotropy"]
+    a, b, c, d = ani["constants"]
+    depth = np.log(tau / 7.0)
+
+    def relative(angle):
+        edge = 1.0 / (1.0 + np.exp(-(angle - ani["centre"] + opening - 40.0) / ani["width"]))
+        return 10.0 ** (a + b * depth + (c + d * depth) * edge)
+
+    mu, weight = _gauss(64)
+    return relative(inclination) / (weight @ relative(np.degrees(np.arccos(mu))))
+
+
+@functools.lru_cache(maxsize=256)
+def _absorbed(path, tau, opening, q):
+    """Share of the disk's light, over all directions, that neither passes nor is scattered."""
+    const = _constants(path)
+    wave = np.geomspace(_core.DISK_BREAKS[0], 100.0, 400)
+    spectrum = _core.disk_spectrum(wave)
+    spectrum /= np.trapezoid(spectrum, wave)
+    mu_edge = np.cos(np.radians(90.0 - opening - const["extinction"]["edge"]))
+    nodes, weights = _gauss(24)
+    escaped = 0.0
+    for low, high in ((0.0, mu_edge), (mu_edge, 1.0)):
+        for node, weight in zip(nodes, weights, strict=True):
+            angle = float(np.degrees(np.arccos(low + (high - low) * node)))
+            seen = _seen_fraction(const, wave, tau, angle, opening, q)
+            escaped += (high - low) * weight * np.trapezoid(spectrum * seen, wave)
+    return 1.0 - escaped / DISK_MEAN
+
+
+def _dust_shape(path, wave_bytes, tau_sight, tau, opening, inclination, p, q, ratio):
+    """Dust emission at an inclination, arbitrary scale."""
+    e = _constants(path)["emission"]
+    wave = np.frombuffer(wave_bytes)
+    opacity = e["c0"] * (wave / 9.7) ** -e["s1"] + _core.drude(wave, 9.7, e["w97"])
+    opacity += e["g18"] * _core.drude(wave, 18.0, e["w18"])
+    rho, planck = _planck_by_radius(wave_bytes, e["temperature"], e["b"], ratio)
+    weight = rho ** (e["c"] - (p - 1.0))
+    emission = planck @ (weight * _steps(np.log(rho)))
+    # mean over the torus of exp(-q |cos theta|), the layer that shines
+    s = np.sin(np.radians(opening))
+    mean = -np.expm1(-q * s) / (q * s) if q > 0.0 else 1.0
+    layer = e["te"] * (tau * mean / 7.0) ** e["te_power"]
+    shift = opening - 40.0
+    sight = e["tl"] * (tau_sight / 7.0) ** e["tl_power"]
+    sight *= max(0.0, 1.0 + e["gi"] * (inclination - 60.0 + shift) / 30.0)
+    sight /= 1.0 + np.exp(-(inclination - e["i0"] + shift) / e["width"])
+    return emission * -np.expm1(-layer * opacity) * np.exp(-sight * opacity)
+
+
+@functools.lru_cache(maxsize=16)
+def _planck_by_radius(wave_bytes, temperature, b, ratio):
+    wave = np.frombuffer(wave_bytes)
+    rho = np.geomspace(1.0, ratio, 60)
+    return rho, _core.planck_lambda(wave[:, None], temperature * rho**-b)
+
+
+def _steps(x):
+    out = np.zeros(x.size)
+    out[:-1] += 0.5 * np.diff(x)
+    out[1:] += 0.5 * np.diff(x)
+    return out
+
+
+@functools.cache
+def _gauss(n):
+    x, w = np.polynomial.legendre.leggauss(n)
+    return 0.5 * (x + 1.0), 0.5 * w

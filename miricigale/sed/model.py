@@ -1,0 +1,377 @@
+"""Models: components in a chain, from parameters to spectra and band fluxes."""
+
+import functools
+
+import astropy.units as u
+from astropy.table import QTable
+
+from miricigale.filters import FilterSet
+from miricigale.refdata import citations
+from miricigale.sed import presets, tables
+from miricigale.sed.chain import Chain
+from miricigale.sed.component import COMPONENTS, ROLES, Component
+from miricigale.sed.parameter import Parameter
+from miricigale.sed.spectrum import COSMOLOGY, SED, distance
+from miricigale.utils.exceptions import ConfigError, argument_error, unknown_name
+from miricigale.utils.meta import provenance
+from miricigale.utils.units import FNU, WAVE
+
+__all__ = ["DEFINITIONS", "ModelSpectra", "SEDModel"]
+
+#: What the AGN fraction is a fraction of.
+DEFINITIONS = ("dust", "3-1000um")
+
+_MODEL_PARAMETERS = {
+    "redshift": Parameter(default=1.0, bounds=(0.0, 20.0), doc="Redshift."),
+    "mass": Parameter(
+        default=1e10, bounds=(0.0, 1e16), unit="Msun", doc="Stellar mass formed, living or not."
+    ),
+}
+for _name, _parameter in _MODEL_PARAMETERS.items():
+    _parameter.name = _name
+
+
+class ModelSpectra:
+    """
+    Spectra of one model, part by part.
+
+    Attributes
+    ----------
+    total : `SED`
+        The whole, as observed.
+    components : dict of str to `SED`
+        ``stellar`` (attenuated), ``dust`` and, with an AGN, ``agn_disk``, ``agn_torus`` and
+        ``agn_polar``: they sum to ``total``. ``stellar_intrinsic`` is the starlight before dust.
+    derived : dict of str to `~astropy.units.Quantity`
+        See `SEDModel.derived_columns`.
+    parameters : dict of str to `~astropy.units.Quantity`
+        All parameters.
+    """
+
+    def __init__(self, total, components, derived, parameters):
+        self.total = total
+        self.components = components
+        self.derived = derived
+        self.parameters = parameters
+
+
+class SEDModel:
+    """
+    A model of spectra: a chain of components.
+
+    Parameters
+    ----------
+    components : iterable of `~miricigale.sed.Component`
+        One of each role at most; a history (``sfh``) and populations (``stellar``) are
+        needed, ``attenuation``, ``dust``, ``agn`` and ``igm`` may be left out. They act in the order
+        of their roles, whatever the order here.
+    cosmology : `~astropy.cosmology.Cosmology`, optional
+        For distances and the age of the universe.
+    frac_agn_definition : {"dust", "3-1000um"}, optional
+        What ``frac_agn`` f means: AGN dust emission over the sum with the galaxy's dust
+        luminosity (CIGALE's default), or the AGN's share of all 3-1000 um light.
+
+    Raises
+    ------
+    ValueError
+        If a role is missing or there twice, or two components share a parameter name.
+
+    Examples
+    --------
+    >>> from miricigale.sed import SEDModel
+    >>> model = SEDModel.yang2021()
+    >>> sed = model.evaluate(age=3.0, ebv=0.2, redshift=1.0, mass=1e10)
+    >>> sed.redshift
+    1.0
+    """
+
+    def __init__(self, components, *, cosmology=COSMOLOGY, frac_agn_definition="dust"):
+        self.components = tuple(sorted(components, key=_role_order))
+        if frac_agn_definition not in DEFINITIONS:
+            raise argument_error(
+                "frac_agn_definition", f"one of {DEFINITIONS}", repr(frac_agn_definition)
+            )
+        self.cosmology = cosmology
+        self.frac_agn_definition = frac_agn_definition
+        roles = [c.role for c in self.components]
+        for role in ("sfh", "stellar"):
+            if role not in roles:
+                raise argument_error("components", f"with a component of role {role!r}", roles)
+        if len(set(roles)) < len(roles):
+            raise argument_error("components", "at most one of each role", roles)
+        if "dust" in roles and "attenuation" not in roles:
+            raise argument_error("components", "with 'attenuation' if there is 'dust'", roles)
+        if "nebular" in roles:
+            raise argument_error("components", "without 'nebular', which is not built yet", roles)
+        merged = {}
+        for component in self.components:
+            twice = set(component.parameters) & (set(merged) | set(_MODEL_PARAMETERS))
+            if twice:
+                raise argument_error("components", "without shared parameter names", sorted(twice))
+            merged.update(component.parameters)
+        self._parameters = merged | _MODEL_PARAMETERS
+
+    # ------------------------------------------------------------------ making
+
+    @classmethod
+    def from_dict(cls, config):
+        """
+        Make a model from plain values, such as a section of a TOML file.
+
+        Parameters
+        ----------
+        config : dict
+            ``components``: list of dicts with ``name`` (see ``COMPONENTS.names()``) and new
+            defaults of parameters; ``frac_agn_definition``: see the class.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.ConfigError`
+            If a key, component or parameter is unknown.
+        """
+        unknown = set(config) - {"components", "frac_agn_definition"}
+        if unknown:
+            msg = f"[sed] does not know {sorted(unknown)}; known: components, frac_agn_definition"
+            raise ConfigError(msg)
+        parts = []
+        for entry in config.get("components", ()):
+            defaults = dict(entry)
+            try:
+                parts.append(COMPONENTS.get(defaults.pop("name", "(none)"))(**defaults))
+            except (KeyError, TypeError, ValueError) as err:
+                msg = f"[sed] component {entry}: {err.args[0]}"
+                raise ConfigError(msg) from err
+        try:
+            definition = config.get("frac_agn_definition", "dust")
+            return cls(parts, frac_agn_definition=definition)
+        except ValueError as err:
+            msg = f"[sed] {err}"
+            raise ConfigError(msg) from err
+
+    @classmethod
+    def yang2021(
+        cls, *, agn=True, igm="meiksin2006", frac_agn_definition="dust", cosmology=COSMOLOGY
+    ):
+        """
+        The chain of Yang et al. 2021, from the libraries at hand; ``meta`` names them.
+
+        Delayed history, BC03 at solar metallicity (Kroupa IMF; the paper has Chabrier),
+        Calzetti-Leitherer attenuation, dust in a sequence of alpha, torus with SMC polar dust
+        (oa 40 deg, i 70 deg, p 1, q 1, R 20, emissivity 1.6), intergalactic absorption.
+
+        Parameters
+        ----------
+        agn : bool, optional
+            Whether the chain has an AGN.
+        igm : str, optional
+            Name of the intergalactic component.
+        frac_agn_definition, cosmology : optional
+            As for the class.
+        """
+        parts = presets.yang2021_components(agn=agn, igm=igm)
+        return cls(parts, frac_agn_definition=frac_agn_definition, cosmology=cosmology)
+
+    @staticmethod
+    def yang2021_axes(kind="fit"):
+        """Axes of the grids of Yang et al. 2021; see `miricigale.sed.yang2021_axes`."""
+        return presets.yang2021_axes(kind)
+
+    # -------------------------------------------------------------- description
+
+    @property
+    def parameters(self):
+        """All parameters, in the order of the chain: dict of name to `Parameter`."""
+        return dict(self._parameters)
+
+    @property
+    def has_agn(self):
+        """Whether the chain has an AGN."""
+        return any(c.role == "agn" for c in self.components)
+
+    @property
+    def meta(self):
+        """Libraries, citations and definitions: a dict that fits into any header."""
+        resources = [c.resource for c in self.components if c.resource]
+        cite = [*citations(*resources), *(c.reference for c in self.components if c.reference)]
+        return provenance(
+            citations=cite,
+            components=[f"{c.role}: {c.name} ({c.library})" for c in self.components],
+            imf="Kroupa (inferred); Yang et al. 2021 use Chabrier",
+            frac_agn_definition=self.frac_agn_definition if self.has_agn else None,
+            cosmology=f"H0={self.cosmology.H0.value:g}, Om0={self.cosmology.Om0:g}",
+        )
+
+    @functools.cached_property
+    def chain(self):
+        """The components on their common grid of wavelengths (made on first use)."""
+        return Chain({c.role: c for c in self.components})
+
+    @property
+    def wave(self):
+        """Rest wavelengths at which the spectra are evaluated."""
+        return self.chain.wave * WAVE
+
+    def derived_columns(self):
+        """Names, units and descriptions of the derived quantities: dict of name to pair."""
+        return {n: v for n, v in tables.DERIVED.items() if self.has_agn or n not in tables.OF_AGN}
+
+    def __getstate__(self):
+        state = self.__dict__.copy()
+        state.pop("chain", None)
+        return state
+
+    def __repr__(self):
+        return f"<SEDModel {' -> '.join(c.name for c in self.components)}>"
+
+    # --------------------------------------------------------------- evaluation
+
+    def values(self, parameters):
+        """
+        Check parameters and fill in the defaults.
+
+        Parameters
+        ----------
+        parameters : dict
+            Quantities, or numbers in the declared units.
+
+        Returns
+        -------
+        values : dict of str to float
+
+        Raises
+        ------
+        KeyError
+            If a name is not known.
+        ValueError
+            If a value is outside its bounds, or the galaxy older than the universe.
+        """
+        for name in parameters:
+            if name not in self._parameters:
+                raise unknown_name("parameter", name, self._parameters)
+        out = {
+            name: par.check(parameters[name]) if name in parameters else par.default
+            for name, par in self._parameters.items()
+        }
+        for component in self.components:
+            why = component.invalid(out)
+            if why:
+                raise ValueError(why)
+        limit = self._universe(out["redshift"])
+        if out["age"] > limit:
+            raise argument_error(
+                "age", f"at most the age of the universe, {limit:.3f} Gyr", out["age"]
+            )
+        return out
+
+    def _universe(self, redshift):
+        return float(self.cosmology.age(redshift).to_value(u.Gyr))
+
+    def evaluate(self, **parameters):
+        """
+        The spectrum of one model.
+
+        Parameters
+        ----------
+        **parameters
+            Any of `parameters`, as quantities or numbers in their units.
+
+        Returns
+        -------
+        sed : `SED`
+            As observed; ``meta["derived"]`` holds the derived quantities.
+
+        Raises
+        ------
+        KeyError, ValueError
+            See `values`.
+        """
+        return self.decompose(**parameters).total
+
+    def decompose(self, **parameters):
+        """
+        Spectra of one model, part by part, with derived quantities.
+
+        Returns
+        -------
+        spectra : `ModelSpectra`
+        """
+        values = self.values(parameters)
+        chain, z = self.chain, values["redshift"]
+        state = tables.row_state(self, values)
+        scale = values["mass"] * float(tables.dilution(z, distance(z, self.cosmology)))
+        factor = chain.transmission(z) * scale
+        wave = chain.wave * (1.0 + z) * WAVE
+        quantities = {
+            name: u.Quantity(values[name], par.unit) for name, par in self._parameters.items()
+        }
+        derived = {
+            name: u.Quantity(state.derived[name] * (values["mass"] if extensive else 1.0), unit)
+            for name, (unit, extensive, _) in self.derived_columns().items()
+        }
+
+        def sed(spectrum, **meta):
+            return SED(wave, chain.lnu(spectrum) * factor * FNU, redshift=z, meta=meta)
+
+        galaxy = state.galaxy
+        parts = {
+            "stellar_intrinsic": sed(galaxy.starlight.intrinsic),
+            "stellar": sed(galaxy.starlight.light),
+            "dust": sed(galaxy.dust),
+        }
+        if state.agn is not None:
+            for name in ("disk", "torus", "polar"):
+                parts[f"agn_{name}"] = sed(state.power * getattr(state.agn, name))
+        total = sed(state.spectrum, **self.meta, parameters=quantities, derived=derived)
+        return ModelSpectra(total, parts, derived, quantities)
+
+    def derived(self, **parameters):
+        """Derived quantities of one model: dict of name to `~astropy.units.Quantity`."""
+        return self.decompose(**parameters).derived
+
+    def fluxes(self, table, filters):
+        """
+        Band fluxes of any list of models, at their own redshifts.
+
+        Parameters
+        ----------
+        table : `~astropy.table.Table`
+            A row for each model; columns by parameter name, the defaults where there is
+            none; ``redshift`` is needed. Other columns than parameters are left alone.
+        filters : `~miricigale.filters.FilterSet` or list of str
+            The bands.
+
+        Returns
+        -------
+        fluxes : `~astropy.table.QTable`
+            ``id`` if the input has it, a column in uJy for each band, derived quantities and
+            ``flags`` (`~miricigale.sed.ModelFlags`); a row that cannot be evaluated is flagged and
+            holds NaN.
+        """
+        filters = filters if isinstance(filters, FilterSet) else FilterSet(filters)
+        return tables.flux_table(self, QTable(table, copy=False), filters)
+
+    def grid(self, axes, filters):
+        """
+        Factorised band fluxes of a grid of models.
+
+        Parameters
+        ----------
+        axes : dict of str to array
+            Parameter name to its values; ``redshift`` is needed, ``mass`` has no place here.
+            Other parameters have their defaults. Without ``frac_agn``, or with 0 alone, the grid
+            has no AGN.
+        filters : `~miricigale.filters.FilterSet` or list of str
+            The bands.
+
+        Returns
+        -------
+        grid : `~miricigale.sed.ModelGrid`
+        """
+        filters = filters if isinstance(filters, FilterSet) else FilterSet(filters)
+        return tables.model_grid(self, axes, filters)
+
+
+def _role_order(component):
+    if not isinstance(component, Component):
+        raise argument_error("components", "Component instances", repr(component))
+    return ROLES.index(component.role)

@@ -1,0 +1,107 @@
+"""Parameters as components declare them."""
+
+import math
+
+import astropy.units as u
+
+from miricigale.utils.exceptions import argument_error
+
+__all__ = ["Parameter"]
+
+
+class Parameter:
+    """
+    One parameter of a component: unit, default, bounds and doc, declared in a class body.
+
+    The fitter, the configuration and the docs read the same declaration. On a class the
+    attribute is the `Parameter`, on an instance its default value (a float in the unit),
+    which the constructor of the component may change.
+
+    Parameters
+    ----------
+    default : float
+        In ``unit``.
+    unit : `~astropy.units.Unit` or str, optional
+        Unit; dimensionless if not given.
+    bounds : tuple of float
+        Smallest and largest value allowed, in ``unit``, both included.
+    doc : str
+        One sentence that says what it is.
+
+    Raises
+    ------
+    ValueError
+        If the default is outside the bounds.
+    """
+
+    def __init__(self, *, default, bounds, doc, unit=""):
+        self.unit = u.Unit(unit)
+        self.default = float(default)
+        self.bounds = (float(bounds[0]), float(bounds[1]))
+        self.doc = str(doc)
+        self.name = ""
+        self.check(self.default)
+
+    def __set_name__(self, owner, name):
+        self.name = name
+
+    def __get__(self, instance, owner=None):
+        if instance is None:
+            return self
+        return instance.__dict__.get(self.name, self.default)
+
+    def __set__(self, instance, value):
+        msg = f"parameter {self.name!r} is set when the component is made"
+        raise AttributeError(msg)
+
+    def replace(self, default):
+        """Copy with another default."""
+        new = Parameter(default=default, bounds=self.bounds, doc=self.doc, unit=self.unit)
+        new.name = self.name
+        return new
+
+    def contains(self, value):
+        """Whether a value in the unit is finite and inside the bounds."""
+        return math.isfinite(value) and self.bounds[0] <= value <= self.bounds[1]
+
+    def check(self, value):
+        """
+        Convert a value to a float in the unit and check the bounds.
+
+        Parameters
+        ----------
+        value : float or `~astropy.units.Quantity`
+            A bare number is taken in the declared unit.
+
+        Raises
+        ------
+        `~astropy.units.UnitsError`
+            If the unit cannot be converted.
+        ValueError
+            If it is not one finite number inside the bounds.
+        """
+        number = self.convert(value)
+        try:
+            number = float(number)
+        except TypeError:
+            raise argument_error(self.name, "one number", f"shape {number.shape}") from None
+        if not self.contains(number):
+            low, high = self.bounds
+            raise argument_error(self.name, f"from {low} to {high} {self.unit}".rstrip(), number)
+        return number
+
+    def convert(self, value):
+        """Convert a number, array or quantity to plain numbers in the unit."""
+        if not hasattr(value, "unit") or value.unit is None:
+            return value
+        try:
+            return u.Quantity(value).to_value(self.unit)
+        except u.UnitConversionError:
+            msg = (
+                f"'{self.name}' must be convertible to {self.unit or 'a number'}, got {value.unit}"
+            )
+            raise u.UnitsError(msg) from None
+
+    def __repr__(self):
+        unit = f" {self.unit}" if self.unit != u.dimensionless_unscaled else ""
+        return f"<Parameter {self.name!r} {self.default}{unit}, {self.bounds}: {self.doc}>"

@@ -1,0 +1,183 @@
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from miricigale.sed import _core
+
+
+def test_delayed_history_forms_one_solar_mass_and_has_the_delayed_shape():
+    rate = _core.delayed_history(3000, 500.0)
+    assert rate.sum() * 1e6 == pytest.approx(1.0, rel=1e-12)
+    t = np.arange(3000)
+    np.testing.assert_allclose(rate / rate[500], t / 500 * np.exp(1 - t / 500), rtol=1e-12)
+    # the continuous integral of t exp(-t/tau) / tau^2 from 0 to T is 1 - (1 + T/tau) exp(-T/tau)
+    whole = 1 - (1 + 3000 / 500) * np.exp(-3000 / 500)
+    assert rate[500] * 1e6 == pytest.approx(500 * np.exp(-1) / 500**2 / whole, rel=1e-3)
+
+
+def test_delayed_history_peaks_at_tau():
+    assert np.argmax(_core.delayed_history(5000, 700.0)) == 700
+
+
+def test_burst_forms_its_fraction():
+    old = _core.delayed_history(2000, 300.0)
+    new = _core.delayed_history(2000, 300.0, 0.2, 50, 30.0)
+    assert new.sum() == pytest.approx(1e-6)
+    burst = new[-50:].sum() - 0.8 * old[-50:].sum()
+    assert burst == pytest.approx(0.2e-6, rel=1e-10)
+
+
+def test_time_weights_are_means_of_ten_interpolations():
+    age = np.array([0.0, 0.5, 3.0, 10.0])
+    weights = _core.time_weights(age, 10).toarray()
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
+    table = np.array([5.0, 1.0, 2.0, 9.0])
+    for k in (0, 2, 7):
+        want = np.mean([np.interp(k + i / 10, age, table) for i in range(1, 11)])
+        assert weights[k] @ table == pytest.approx(want)
+
+
+@pytest.mark.parametrize(
+    ("wave", "k"),
+    [
+        # Calzetti et al. 2000, eq. 4, worked out by hand; k(V) is R_V = 4.05
+        (0.55, 2.659 * (-2.156 + 1.509 / 0.55 - 0.198 / 0.55**2 + 0.011 / 0.55**3) + 4.05),
+        (0.30, 2.659 * (-2.156 + 5.03 - 2.2 + 0.4074074) + 4.05),
+        (0.15, 2.659 * (-2.156 + 10.06 - 8.8 + 3.2592593) + 4.05),
+        (1.0, 2.659 * (-1.857 + 1.040) + 4.05),
+        (2.0, 2.659 * (-1.857 + 0.520) + 4.05),
+        # Leitherer et al. 2002, eq. 14, in um: 5.472 + 0.671/l - 9.218e-3/l^2 + 2.620e-5/l^3... at 0.12
+        (0.12, 5.472 + 0.671 / 0.12 - 9.218e-3 / 0.12**2 + 2.620e-3 / 0.12**3),
+        (0.09, 0.0),
+        (5.0, 0.0),
+    ],
+)
+def test_starburst_curve_at_points(wave, k):
+    assert _core.leitherer_calzetti(np.array([wave]))[0] == pytest.approx(k, rel=1e-6)
+
+
+def test_starburst_curve_has_r_v_and_colour_excess():
+    b, v = _core.leitherer_calzetti(np.array([0.44, 0.55]))
+    assert v == pytest.approx(4.05, abs=0.01)
+    assert b - v == pytest.approx(1.0, abs=0.05)
+
+
+def test_leitherer_joins_calzetti():
+    low, high = _core.leitherer_calzetti(np.array([0.1499999, 0.1500001]))
+    assert low == pytest.approx(high, rel=0.04)
+
+
+@pytest.mark.parametrize(("slope", "bump"), [(0.0, 3.0), (-0.5, 0.0), (0.3, 1.5)])
+def test_modified_curve_keeps_the_colour_excess(slope, bump):
+    band = np.array([0.44, 0.55])
+    want = np.diff(_core.leitherer_calzetti(band))
+    np.testing.assert_allclose(np.diff(_core.attenuation_curve(band, slope, bump)), want)
+
+
+def test_bump_stands_at_2175():
+    wave = np.linspace(0.18, 0.26, 801)
+    extra = _core.attenuation_curve(wave, 0.0, 3.0) - _core.attenuation_curve(wave)
+    assert wave[np.argmax(extra)] == pytest.approx(0.2175, abs=0.003)
+
+
+def test_disk_integrates_to_one_and_has_its_slopes():
+    total = sum(
+        quad(lambda w: float(_core.disk_spectrum(np.array([w]))[0]), a, b)[0]
+        for a, b in zip(_core.DISK_BREAKS[:-1], _core.DISK_BREAKS[1:], strict=True)
+    )
+    assert total == pytest.approx(1.0, rel=1e-6)
+    for a, b, slope in ((0.0082, 0.0098, 0.2), (0.011, 0.09, -1), (0.2, 4, -1.5), (6, 900, -4)):
+        low, high = _core.disk_spectrum(np.array([a, b]))
+        assert np.log(high / low) / np.log(b / a) == pytest.approx(slope)
+    low, high = _core.disk_spectrum(np.array([0.2, 4.0]), delta=0.5)
+    assert np.log(high / low) / np.log(20) == pytest.approx(-1.0)
+
+
+def test_modified_blackbody_obeys_wien_and_rayleigh_jeans():
+    wave = np.geomspace(1, 3000, 5000)
+    # optically thick and beta 0 is a blackbody: Wien's law 2897.77 um K
+    black = _core.planck_lambda(wave, 150.0)
+    assert wave[np.argmax(black)] == pytest.approx(2897.77 / 150.0, rel=2e-3)
+    thin = _core.modified_blackbody(np.array([2e5, 4e5]), 300.0, 1.6)
+    assert np.log(thin[1] / thin[0]) / np.log(2) == pytest.approx(-4 - 1.6, abs=0.01)
+
+
+def test_band_means_of_a_straight_line_by_numerical_integration():
+    wave = np.array([1.0, 2.0, 4.0, 8.0])
+    fnu = np.array([1.0, 5.0, 2.0, 7.0])
+    band = np.array([1.5, 2.5, 3.0, 5.0])
+    curve = np.array([0.0, 1.0, 0.4, 0.0])
+    start = np.array([0, 4])
+    moments = _core.band_moments(start, band, curve)
+    t = lambda x: np.interp(x, band, curve)  # noqa: E731
+    points = {"points": [2.0, 2.5, 3.0, 4.0], "epsabs": 1e-13}
+    top = quad(lambda x: np.interp(x, wave, fnu) * t(x) / x, 1.5, 5.0, **points)[0]
+    bottom = quad(lambda x: t(x) / x, 1.5, 5.0, **points)[0]
+    got = _core.band_means(wave, fnu, start, band, curve, moments)
+    assert got[0] == pytest.approx(top / bottom, rel=1e-10)
+
+
+# ------------------------------------------------------------------------------ IGM
+
+
+def test_meiksin_is_clear_redward_of_lyman_alpha():
+    z = 3.0
+    wave = np.linspace(0.12160001 * (1 + z), 5.0, 1000)
+    np.testing.assert_array_equal(_core.meiksin_transmission(wave, z), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("z", "law"), [(2.0, (0.00211, 3.7)), (3.9, (0.00211, 3.7)), (5.0, (0.00058, 4.5))]
+)
+def test_meiksin_lyman_alpha_is_the_published_power_law(z, law):
+    """Between Lyman beta and alpha only tau_alpha acts (Meiksin 2006, eq. 2 and 3)."""
+    rest = 0.1150
+    absorber = rest * (1 + z) / (0.0912 / 0.75)
+    got = _core.meiksin_transmission(np.array([rest * (1 + z)]), z)[0]
+    assert got == pytest.approx(np.exp(-law[0] * absorber ** law[1]), rel=1e-12)
+
+
+def test_meiksin_forest_agrees_with_the_observed_decrement():
+    """D_A = 0.27 +- 0.05 at z = 3 (Bechtold 1994; Kim et al. 2002 give tau_eff 0.36 +- 0.05)."""
+    tau = -np.log(_core.meiksin_transmission(np.array([0.1215 * 4.0]), 3.0)[0])
+    assert tau == pytest.approx(0.36, abs=0.05)
+
+
+def test_meiksin_lyman_limit_systems_by_direct_integration():
+    """Eq. 7: N0 Gamma-weighted systems; series against numerical integration."""
+    z, wave = 3.0, 0.0912 * 3.2
+    limit = wave / 0.0912
+
+    # tau = int dz' int_1^inf dtau_L N0 (beta - 1) / ... tau_L^-1.5 (1 - exp(-tau_L (l/l_L)^3)),
+    # Meiksin 2006: N0 = 0.25, beta = 1.5, gamma = 1.5
+    def inner(zz):
+        ratio = (limit / (1 + zz)) ** 3
+        # int_1^inf x^-1.5 (1 - exp(-x r)) dx by substitution x = 1 / s^2
+        value = quad(lambda s: 2 * -np.expm1(-ratio / s**2), 0, 1)[0]
+        return 0.25 * 0.5 * (1 + zz) ** 1.5 * value
+
+    direct = quad(inner, limit - 1, z)[0]
+    first, series = _core._lls_terms()
+    lls = first * ((1 + z) * limit**1.5 - limit**2.5)
+    for n, term in enumerate(series, start=1):
+        lls -= term * ((1 + z) ** (2.5 - 3 * n) * limit ** (3 * n) - limit**2.5)
+    assert 0.25 * lls == pytest.approx(direct, rel=0.02)
+
+
+@pytest.mark.parametrize("function", [_core.meiksin_transmission, _core.madau_transmission])
+def test_transmission_falls_with_redshift_and_stays_between_0_and_1(function):
+    rest = np.linspace(0.08, 0.121, 300)
+    previous = 1.0
+    for z in (0.5, 1.0, 2.0, 3.0, 4.0):
+        got = function(rest * (1 + z), z)
+        assert np.all((got >= 0) & (got <= 1))
+        mean = got.mean()
+        assert mean < previous
+        previous = mean
+
+
+def test_madau_line_at_published_coefficients():
+    # Madau 1995: 0.0036 (l / 0.1216 um)^3.46 between the first two lines
+    got = _core.madau_transmission(np.array([0.11 * 4.0]), 3.0)[0]
+    line = 0.0912 / 0.75
+    assert got == pytest.approx(np.exp(-0.0036 * (0.44 / line) ** 3.46), rel=1e-12)

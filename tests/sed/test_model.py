@@ -1,0 +1,367 @@
+import pickle
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.cosmology import FlatLambdaCDM
+from astropy.table import QTable
+from astropy.tests.helper import assert_quantity_allclose
+
+from miricigale.sed import COSMOLOGY, ModelFlags, ModelGrid, SEDModel, yang2021_axes
+from miricigale.sed.components import BC03, CalzettiLeitherer, DelayedSFH, DraineLi2007
+from miricigale.utils.exceptions import ConfigError
+
+AXES = {
+    "tau": [0.1, 1.0],
+    "age": [0.5, 5.0],
+    "ebv": [0.1, 0.7],
+    "alpha": [1.0, 2.0],
+    "tau97": [3.0, 7.0],
+    "ebv_polar": [0.0, 0.2],
+    "temperature_polar": [100.0, 300.0],
+    "frac_agn": [0.0, 0.4, 0.9],
+    "redshift": [0.01, 0.5, 2.0, 4.0],
+}
+
+
+@pytest.fixture(scope="module")
+def grid(model, filters):
+    return model.grid(AXES, filters)
+
+
+# ------------------------------------------------------------------------ one model
+
+
+@pytest.mark.parametrize("ebv", [0.0, 0.1, 0.9])
+def test_energy_balance(model, ebv):
+    """Starlight in = starlight out + dust light, to 1e-6 of the absorbed power."""
+    values = model.values({"ebv": ebv, "age": 3.0, "slope": -0.3})
+    galaxy = model.chain.galaxy(values)
+    wave = model.chain.wave
+    starlight = galaxy.starlight
+    lost = np.trapezoid(starlight.intrinsic, wave) - np.trapezoid(starlight.light, wave)
+    emitted = np.trapezoid(galaxy.dust, wave)
+    assert emitted == pytest.approx(lost, rel=1e-6, abs=1e-12 * np.trapezoid(starlight.light, wave))
+
+
+def test_dust_luminosity_of_the_observed_spectrum(model):
+    """Integrate the dust SED over frequency and scale by 4 pi d^2: L_dust comes back."""
+    parts = model.decompose(age=3.0, ebv=0.4, redshift=0.7, mass=3e10 * u.Msun)
+    dust = parts.components["dust"]
+    flux = -np.trapezoid(dust.fnu, dust.wave.to(u.Hz, u.spectral()))
+    far = COSMOLOGY.luminosity_distance(0.7)
+    power = (flux * 4 * np.pi * far**2).to(u.W)
+    # trapezoids in frequency and wavelength differ by the curvature between nodes
+    assert_quantity_allclose(power, parts.derived["dust_luminosity"], rtol=2e-4)
+
+
+def test_parts_sum_to_the_whole(model):
+    parts = model.decompose(age=2.0, frac_agn=0.5, redshift=2.5)
+    total = sum(s.fnu for name, s in parts.components.items() if name != "stellar_intrinsic")
+    assert_quantity_allclose(total, parts.total.fnu, rtol=1e-10, atol=1e-30 * u.uJy)
+
+
+def test_flux_scales_with_mass_and_inverse_square_of_distance(filters):
+    cosmology = FlatLambdaCDM(H0=35.2, Om0=0.272)  # twice as far
+    near, far = SEDModel.yang2021(), SEDModel.yang2021(cosmology=cosmology)
+    one = near.evaluate(redshift=1.0, age=1.0, mass=1e10)
+    two = near.evaluate(redshift=1.0, age=1.0, mass=2e10)
+    away = far.evaluate(redshift=1.0, age=1.0, mass=1e10)
+    assert_quantity_allclose(two.fnu, 2 * one.fnu)
+    assert_quantity_allclose(away.fnu * 4, one.fnu)
+
+
+@pytest.mark.parametrize("fraction", [0.1, 0.6, 0.99])
+def test_agn_fraction_means_what_its_definition_says(fraction):
+    for definition, name in (("dust", "frac_agn_dust"), ("3-1000um", "frac_agn_ir")):
+        model = SEDModel.yang2021(frac_agn_definition=definition)
+        parts = model.decompose(frac_agn=fraction, age=3.0, redshift=0.5)
+        assert parts.derived[name].value == pytest.approx(fraction, rel=1e-10)
+        # the same from the spectra
+        rest = parts.total.wave.value / 1.5
+        inside = (rest >= 3 * (1 - 1e-9)) & (rest <= 1000 * (1 + 1e-9))
+        power = {
+            key: -np.trapezoid(sed.fnu.value[inside], 1 / rest[inside])
+            for key, sed in parts.components.items()
+        }
+        agn = sum(power[f"agn_{part}"] for part in ("disk", "torus", "polar"))
+        share = agn / (agn + power["stellar"] + power["dust"])
+        # trapezoids in frequency here, in wavelength there
+        assert parts.derived["frac_agn_ir"].value == pytest.approx(share, abs=1e-3)
+
+
+def test_definitions_differ_by_at_most_ten_per_cent_or_so():
+    got = [
+        SEDModel.yang2021(frac_agn_definition=d).derived(frac_agn=0.5, age=3.0)["agn_power"]
+        for d in ("dust", "3-1000um")
+    ]
+    assert abs(np.log(got[1] / got[0])) < 0.15
+
+
+def test_six_micron_luminosity_from_the_spectrum(model):
+    parts = model.decompose(frac_agn=0.7, age=3.0, redshift=1.0)
+    agn = sum(parts.components[f"agn_{n}"].fnu_at(12 * u.um) for n in ("disk", "torus", "polar"))
+    far = COSMOLOGY.luminosity_distance(1.0)
+    nu = (12 * u.um).to(u.Hz, u.spectral())
+    want = (nu * agn * 4 * np.pi * far**2).to(u.W)
+    assert_quantity_allclose(parts.derived["l_6um"], want, rtol=1e-6)
+
+
+def test_star_formation_rates_of_a_nearly_constant_history(model):
+    """tau = 100 Gyr: SFR grows linearly, the mean over the last 100 Myr is that of 50 Myr ago."""
+    got = model.derived(tau=100.0, age=1.0, mass=1e9, redshift=0.1)
+    assert_quantity_allclose(got["stellar_mass_formed"], 1e9 * u.Msun)
+    assert_quantity_allclose(got["sfr"], 2.0 * u.Msun / u.yr, rtol=0.01)
+    assert_quantity_allclose(got["sfr_100myr"], 1.9 * u.Msun / u.yr, rtol=0.01)
+
+
+def test_infrared_luminosity_follows_the_star_formation_rate():
+    """Kennicutt 1998: SFR = 4.5e-44 L_IR (Salpeter, 8-1000 um); a Kroupa IMF has 0.67 of it."""
+    model = SEDModel.yang2021(agn=False)
+    got = model.derived(tau=100.0, age=0.1, ebv=0.9, redshift=0.1)
+    rate = 4.5e-44 * 0.67 * got["ir_luminosity"].to_value("erg / s")
+    assert got["sfr_100myr"].value == pytest.approx(rate, rel=0.35)
+
+
+def test_model_without_agn_has_no_agn_numbers():
+    model = SEDModel.yang2021(agn=False)
+    assert "accretion_power" not in model.derived(age=1.0)
+    assert "frac_agn" not in model.parameters
+    with pytest.raises(KeyError, match=r"no parameter 'frac_agn'; known: .*ebv"):
+        model.evaluate(frac_agn=0.2)
+
+
+def test_absorption_by_the_intergalactic_medium_is_in_the_spectrum(model):
+    sed = model.evaluate(age=1.0, redshift=4.0)
+    rest = sed.wave.value / 5.0
+    assert np.all(sed.fnu.value[rest > 0.0912] > 0)
+    clear = SEDModel(model.components[:-1]).evaluate(age=1.0, redshift=4.0)
+    below = (rest > 0.1) & (rest < 0.12)
+    ratio = sed.fnu[below] / clear.fnu_at(sed.wave[below])
+    assert np.all(ratio < 0.7)
+    above = rest > 0.1217
+    assert_quantity_allclose(sed.fnu[above], clear.fnu_at(sed.wave[above]), rtol=2e-4)
+
+
+def test_meta_says_which_libraries(model):
+    meta = model.evaluate(age=1.0).meta
+    assert any("ssp.bc03" in part for part in meta["components"])
+    assert any("dust.dl07" in part for part in meta["components"])
+    assert "Kroupa" in meta["imf"]
+    assert any("Meiksin" in c for c in meta["citations"])
+    assert any("Bruzual" in c for c in meta["citations"])
+
+
+@pytest.mark.parametrize(
+    ("parameters", "error", "match"),
+    [
+        ({"taus": 1.0}, KeyError, "no parameter 'taus'; known: .*tau97"),
+        ({"tau": -1.0}, ValueError, "'tau' must be from 0.001 to 100.0 Gyr, got -1.0"),
+        ({"age": 7.0, "redshift": 2.0}, ValueError, "'age' must be at most the age of the"),
+        ({"redshift": 1 * u.um}, u.UnitsError, "'redshift' must be convertible"),
+    ],
+)
+def test_bad_parameters_are_refused(model, parameters, error, match):
+    with pytest.raises(error, match=match):
+        model.evaluate(**parameters)
+
+
+@pytest.mark.parametrize(
+    ("components", "match"),
+    [
+        ([DelayedSFH()], "with a component of role 'stellar'"),
+        ([DelayedSFH(), DelayedSFH(), BC03()], "at most one of each role"),
+        ([DelayedSFH(), BC03(), DraineLi2007()], "with 'attenuation' if there is 'dust'"),
+        ([DelayedSFH(), "bc03"], "Component instances"),
+    ],
+)
+def test_bad_chains_are_refused(components, match):
+    with pytest.raises(ValueError, match=match):
+        SEDModel(components)
+
+
+def test_order_of_the_list_does_not_matter():
+    parts = [CalzettiLeitherer(), BC03(), DraineLi2007(), DelayedSFH()]
+    assert [c.role for c in SEDModel(parts).components] == ["sfh", "stellar", "attenuation", "dust"]
+
+
+def test_from_dict():
+    model = SEDModel.from_dict(
+        {
+            "components": [
+                {"name": "delayed", "tau": 0.3},
+                {"name": "bc03"},
+                {"name": "calzetti", "slope": -0.2},
+                {"name": "dl07", "q_pah": 1.12},
+            ]
+        }
+    )
+    assert model.parameters["tau"].default == 0.3
+    assert model.parameters["q_pah"].default == 1.12
+    with pytest.raises(ConfigError, match=r"\[sed\] component .* no parameter 'taus'"):
+        SEDModel.from_dict({"components": [{"name": "delayed", "taus": 0.3}]})
+    with pytest.raises(ConfigError, match=r"\[sed\] component .* no component 'old'"):
+        SEDModel.from_dict({"components": [{"name": "old"}]})
+    with pytest.raises(ConfigError, match=r"\[sed\] does not know \['part'\]"):
+        SEDModel.from_dict({"part": 1})
+
+
+def test_model_survives_pickling(model):
+    copy = pickle.loads(pickle.dumps(model))
+    assert_quantity_allclose(copy.evaluate(age=1.0).fnu, model.evaluate(age=1.0).fnu)
+
+
+# --------------------------------------------------------------------- many models
+
+
+def test_three_ways_to_a_flux_agree(model, filters, grid):
+    """grid() == fluxes() == evaluate() + FilterSet."""
+    rng = np.random.default_rng(3)
+    rows, want = [], []
+    while len(rows) < 12:
+        z, g = rng.integers(len(grid.redshift)), rng.integers(grid.n_galaxies)
+        a, f = rng.integers(grid.n_agn), rng.integers(len(grid.frac_agn))
+        if not grid.allowed[z, g]:
+            continue
+        row = {n: grid.galaxy_parameters[n][g] for n in grid.galaxy_parameters.colnames}
+        row |= {n: grid.agn_parameters[n][a] for n in grid.agn_parameters.colnames}
+        row |= {"redshift": grid.redshift[z], "frac_agn": grid.frac_agn[f], "mass": 1e10 * u.Msun}
+        rows.append(row)
+        want.append(1e10 * grid.flux(z, g, a, f))
+    table = QTable(rows)
+    got = model.fluxes(table, filters)
+    for i, row in enumerate(rows):
+        direct = filters.synthetic_fluxes(model.evaluate(**row)).value
+        listed = np.array([got[name][i].value for name in filters.names])
+        np.testing.assert_allclose(listed, want[i], rtol=1e-6)
+        np.testing.assert_allclose(direct, want[i], rtol=1e-6)
+        g = np.flatnonzero(
+            np.all(
+                [grid.galaxy_parameters[n] == row[n] for n in grid.galaxy_parameters.colnames],
+                axis=0,
+            )
+        )[0]
+        assert_quantity_allclose(
+            got["dust_luminosity"][i], 1e10 * grid.dust_luminosity[g] * u.W, rtol=1e-10
+        )
+    assert np.all(got["flags"] == 0)
+
+
+def test_both_definitions_obey_the_factorisation(filters):
+    model = SEDModel.yang2021(frac_agn_definition="3-1000um")
+    grid = model.grid(AXES | {"redshift": [0.5]}, filters)
+    assert grid.meta["frac_agn_definition"] == "3-1000um"
+    row = {n: grid.galaxy_parameters[n][5] for n in grid.galaxy_parameters.colnames}
+    row |= {n: grid.agn_parameters[n][3] for n in grid.agn_parameters.colnames}
+    sed = model.evaluate(**row, redshift=0.5, frac_agn=0.4, mass=1.0)
+    got = filters.synthetic_fluxes(sed).value
+    np.testing.assert_allclose(got, grid.flux(0, 5, 3, 1), rtol=1e-6)
+    power = sed.meta["derived"]["accretion_power"].value
+    reference = 0.4 / 0.6 * grid.dust_luminosity[5]
+    assert power == pytest.approx(reference * grid.agn_properties["accretion_power"][3].value)
+
+
+def test_grid_counts_identical_models(grid):
+    assert grid.n_agn == 6  # (3, 7) x [no polar dust, two temperatures]
+    assert grid.agn_multiplicity.tolist() == [2, 2, 1, 1, 1, 1] or sorted(
+        grid.agn_multiplicity
+    ) == [1, 1, 1, 1, 2, 2]
+    assert grid.agn_multiplicity.sum() == 8
+    assert grid.n_models == 4 * 16 * 3 * 8
+    none = np.asarray(grid.agn_parameters["ebv_polar"].value == 0)
+    assert_quantity_allclose(grid.agn_parameters["temperature_polar"][none], 200 * u.K)
+
+
+def test_grid_marks_galaxies_older_than_the_universe(grid):
+    age = grid.galaxy_parameters["age"]
+    universe = COSMOLOGY.age(grid.redshift)
+    np.testing.assert_array_equal(grid.allowed, age[None, :] <= universe[:, None])
+    assert not grid.allowed.all()
+
+
+def test_grid_without_agn(model, filters):
+    grid = model.grid({"age": [1.0], "redshift": [0.5]}, filters)
+    assert grid.n_agn == 0
+    assert grid.n_models == 1
+    assert grid.frac_agn.tolist() == [0.0]
+
+
+def test_grid_survives_writing(grid, tmp_path):
+    grid.write(tmp_path / "grid.fits")
+    back = ModelGrid.read(tmp_path / "grid.fits")
+    for name in ("redshift", "galaxy", "agn", "dust_luminosity", "frac_agn", "allowed"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(grid, name))
+    assert back.filters == grid.filters
+    assert back.meta["axes"] == grid.meta["axes"]
+    for name in grid.galaxy_properties.colnames:
+        assert_quantity_allclose(back.galaxy_properties[name], grid.galaxy_properties[name])
+    assert back.n_models == grid.n_models
+
+
+def test_rows_that_cannot_be_evaluated_are_flagged(model, filters):
+    table = QTable(
+        {
+            "id": [11, 12, 13, 14, 15],
+            "age": [1.0, 7.0, 1.0, 1.0, 1.0] * u.Gyr,
+            "redshift": [1.0, 2.0, np.nan, 1.0, 1.0],
+            "ebv": [0.1, 0.1, 0.1, 9.0, 0.1] * u.mag,
+            "metallicity": [0.02, 0.02, 0.02, 0.02, 0.03],
+        }
+    )
+    got = model.fluxes(table, filters)
+    assert got["id"].tolist() == [11, 12, 13, 14, 15]
+    assert [ModelFlags.names(f) for f in got["flags"]] == [
+        [],
+        ["older_than_universe"],
+        ["not_finite"],
+        ["out_of_bounds"],
+        ["not_in_library"],
+    ]
+    assert np.isfinite(got["irac.ch1"][0])
+    assert np.all(np.isnan(got["irac.ch1"][1:]))
+    assert np.all(np.isnan(got["sfr"][1:]))
+    assert "older than universe" in got["flags"].info.description
+
+
+def test_order_of_the_rows_does_not_matter(model, filters):
+    rng = np.random.default_rng(0)
+    table = QTable(
+        {"redshift": rng.uniform(0, 3, 8), "ebv": rng.uniform(0, 0.5, 8), "age": [1] * 8}
+    )
+    one = model.fluxes(table, filters)
+    two = model.fluxes(table[::-1], filters)[::-1]
+    np.testing.assert_array_equal(one["irac.ch1"], two["irac.ch1"])
+
+
+def test_redshift_is_needed(model, filters):
+    with pytest.raises(ValueError, match="'table' must be a table with a column 'redshift'"):
+        model.fluxes(QTable({"age": [1.0]}), filters)
+    with pytest.raises(ValueError, match="'axes' must be with 'redshift'"):
+        model.grid({"age": [1.0]}, filters)
+
+
+@pytest.mark.parametrize(
+    ("axes", "error", "match"),
+    [
+        ({"taus": [1.0], "redshift": [1.0]}, KeyError, "no axis 'taus'"),
+        ({"mass": [1.0], "redshift": [1.0]}, KeyError, "no axis 'mass'"),
+        ({"tau": [1.0, 0.5], "redshift": [1.0]}, ValueError, "'tau' must be ascending values"),
+        ({"tau": [1e4], "redshift": [1.0]}, ValueError, "'tau' must be from"),
+    ],
+)
+def test_bad_axes_are_refused(model, filters, axes, error, match):
+    with pytest.raises(error, match=match):
+        model.grid(axes, filters)
+
+
+def test_axes_of_the_paper_make_24_million_models():
+    axes = yang2021_axes("fit")
+    sizes = {name: len(values) for name, values in axes.items()}
+    assert np.prod(list(sizes.values())) == 24_024_000
+    step = np.diff(np.log(1 + axes["redshift"]))
+    np.testing.assert_allclose(step, 0.03)
+    assert axes["redshift"][0] == pytest.approx(0.01)
+    assert axes["redshift"][-1] < 6.0
+    assert "frac_agn" not in yang2021_axes("galaxy")
+    with pytest.raises(ValueError, match="'kind' must be 'fit'"):
+        yang2021_axes("small")

@@ -1,0 +1,67 @@
+import astropy.units as u
+import pytest
+
+from miricigale.sed import COMPONENTS, Component, Parameter, SEDModel
+from miricigale.sed.components import DelayedSFH
+
+
+class Example(Component):
+    name = "example"
+    role = "agn"
+    length = Parameter(default=2.0, bounds=(1.0, 10.0), unit="m", doc="A length.")
+
+
+def test_parameter_is_itself_on_the_class_and_a_number_on_an_instance():
+    assert isinstance(Example.length, Parameter)
+    assert Example().length == 2.0
+    assert Example(length=300 * u.cm).length == 3.0
+    assert Example(length=3.0).parameters["length"].default == 3.0
+    assert Example().parameters["length"].default == 2.0
+
+
+def test_parameter_converts_units_and_refuses_others():
+    par = Example.length
+    assert par.check(0.005 * u.km) == pytest.approx(5.0)
+    with pytest.raises(u.UnitsError, match="'length' must be convertible to m"):
+        par.check(3 * u.s)
+
+
+@pytest.mark.parametrize("value", [0.5, 11.0, float("nan"), float("inf")])
+def test_parameter_refuses_values_outside_its_bounds(value):
+    with pytest.raises(ValueError, match="'length' must be from 1"):
+        Example.length.check(value)
+
+
+def test_component_is_frozen_and_knows_its_parameters():
+    with pytest.raises(AttributeError, match="when the component is made"):
+        Example().length = 4.0
+    with pytest.raises(TypeError, match="no parameter 'width'; known: length"):
+        Example(width=1.0)
+
+
+@pytest.mark.parametrize("name", COMPONENTS.names())
+def test_every_component_declares_unit_bounds_doc_and_reference(name):
+    cls = COMPONENTS.get(name)
+    component = cls()
+    assert component.reference or component.role == "igm"
+    assert component.reference
+    for parameter in component.parameters.values():
+        assert isinstance(parameter.unit, u.UnitBase)
+        assert parameter.bounds[0] < parameter.bounds[1]
+        assert parameter.bounds[0] <= parameter.default <= parameter.bounds[1]
+        assert parameter.doc.endswith(".")
+
+
+def test_model_has_the_names_that_other_rooms_use():
+    names = set(SEDModel.yang2021().parameters)
+    assert names >= {
+        *("tau", "age", "metallicity", "ebv", "ebv_factor", "uv_bump", "slope", "alpha"),
+        *("frac_agn", "tau97", "inclination", "opening_angle", "p", "q", "radius_ratio"),
+        *("ebv_polar", "temperature_polar", "emissivity_polar", "redshift", "mass"),
+    }
+
+
+def test_registry_lists_the_right_names():
+    assert COMPONENTS.get("delayed") is DelayedSFH
+    with pytest.raises(KeyError, match=r"no component 'delay'; known: .*delayed"):
+        COMPONENTS.get("delay")
