@@ -1,1 +1,22 @@
 """The whole study: configuration, stages, and a runner that resumes."""
+
+from miricigale.workflow.config import StudyConfig, load_config, preset_names
+from miricigale.workflow.products import ProductStore, read_image, write_image
+from miricigale.workflow.runner import Context, Stage, StudyRunner
+from miricigale.workflow.stages import study_stages
+from miricigale.workflow.study import disk_use, run_study
+
+__all__ = [
+    "Context",
+    "ProductStore",
+    "Stage",
+    "StudyConfig",
+    "StudyRunner",
+    "disk_use",
+    "load_config",
+    "preset_names",
+    "read_image",
+    "run_study",
+    "study_stages",
+    "write_image",
+]

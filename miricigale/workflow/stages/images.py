@@ -1,0 +1,217 @@
+"""Stages 4 to 10: scenes, ramps, rates, calibrated images, mosaics, prior, kernels."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+
+from miricigale.detector import Detector
+from miricigale.instrument import Exposure, background_level, ceers_exposures, mosaic_wcs
+from miricigale.photometry import detect_sources
+from miricigale.psf import MatchingKernel, hst_psf, miri_psf, psf_mosaic
+from miricigale.reduction import Reducer
+from miricigale.scene import Background, Scene, highres_image
+
+__all__ = [
+    "band_exposures",
+    "expose_and_reduce",
+    "exposure_units",
+    "grid_of",
+    "kernel_of",
+    "make_exposure",
+    "make_highres",
+    "make_kernel",
+    "make_mosaic",
+    "reducer_of",
+    "study_exposures",
+]
+
+
+def study_exposures(config):
+    """
+    All exposures of a configuration.
+
+    Returns
+    -------
+    exposures : dict of str to `~miricigale.instrument.Exposure`
+        By unit name, ``<filter>-<dither>``.
+    """
+    options = config.exposures
+    pointing = SkyCoord(config.pointing.ra * u.deg, config.pointing.dec * u.deg)
+    roll = config.pointing.roll * u.deg
+    quick = options.plan == "quick"
+    units = {}
+    for k, name in enumerate(options.filters):
+        own = {
+            key: getattr(options, key)[k]
+            for key in ("n_groups", "n_integrations")
+            if getattr(options, key)
+        }
+        n_dithers = options.n_dithers[k] if options.n_dithers else None
+        if "n_groups" in own and n_dithers:
+            exposure = Exposure(name, pointing=pointing, roll=roll, **own)
+            exposures = exposure.dithered("ceers", n_dithers)
+        else:
+            exposures = ceers_exposures(pointing, roll, filters=[name], quick=quick)
+            if n_dithers:
+                exposures = exposures[0].replace(pointing=pointing).dithered("ceers", n_dithers)
+            exposures = [dataclasses.replace(exposure, **own) for exposure in exposures]
+        for exposure in exposures:
+            units[f"{name}-{exposure.dither}"] = exposure
+    return units
+
+
+def exposure_units(config):
+    """Names of the exposures, ``<filter>-<dither>``."""
+    return tuple(study_exposures(config))
+
+
+def band_exposures(config, name):
+    """The exposures of one band, in order."""
+    return [e for e in study_exposures(config).values() if e.filter == name]
+
+
+def reducer_of(config):
+    """The reducer that a configuration describes."""
+    options = config.reduction
+    return Reducer(
+        jump_threshold=options.jump_threshold,
+        box=options.background_box,
+        filter_size=options.background_filter,
+        pixfrac=options.pixfrac,
+    )
+
+
+def expose_and_reduce(config, exposure, catalog, *, seed, keep=None):
+    """
+    Take one exposure of a catalogue from the scene to the calibrated image.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.config.StudyConfig`
+        The configuration.
+    exposure : `~miricigale.instrument.Exposure`
+        What is exposed.
+    catalog : `~astropy.table.QTable`
+        Sources with fluxes in the exposure's filter.
+    seed : int
+        Seed of the detector.
+    keep : callable, optional
+        Called with the `~miricigale.detector.Ramp`, to write it.
+
+    Returns
+    -------
+    rate, cal : `~astropy.nddata.CCDData`
+        In DN/s and, background subtracted, in MJy/sr.
+    """
+    options = config.scene
+    background = Background(
+        background_level(exposure.filter) * options.background_scale,
+        gradient=options.background_gradient / u.arcmin,
+        position_angle=options.gradient_angle * u.deg,
+        center=SkyCoord(config.pointing.ra * u.deg, config.pointing.dec * u.deg),
+    )
+    scene = Scene(
+        catalog,
+        filter=exposure.filter,
+        wcs=exposure.wcs,
+        psf=miri_psf(exposure.filter),
+        background=background,
+    )
+    detector = Detector.miri_imager(cosmic_rays=config.detector.cosmic_rays)
+    ramp = detector.expose(scene.render(), exposure, seed=seed)
+    if keep is not None:
+        keep(ramp)
+    reducer = reducer_of(config)
+    rate = reducer.fit_ramp(ramp)
+    del ramp
+    cal, _ = reducer.subtract_background(reducer.calibrate(rate))
+    return rate, cal
+
+
+def make_exposure(context, unit):
+    """Stages 4 to 7 of one exposure: scene, ramp, rate, calibrated image."""
+    config = context.config
+    exposure = study_exposures(config)[unit]
+    truth = QTable.read(context.path("truth.ecsv"))
+
+    def keep(ramp):
+        context.save(f"level1b/{unit}_uncal.fits", ramp.write)
+
+    rate, cal = expose_and_reduce(
+        config,
+        exposure,
+        truth,
+        seed=context.seed,
+        keep=keep if config.run.keep_level1b else None,
+    )
+    context.save_image(f"exposures/{unit}_rate.fits", rate)
+    context.save_image(f"exposures/{unit}_cal.fits", cal)
+
+
+def grid_of(config, pixel_scale):
+    """North-up WCS that covers every exposure of the study."""
+    return mosaic_wcs(list(study_exposures(config).values()), pixel_scale * u.arcsec)
+
+
+def make_mosaic(context, name):
+    """Stage 8: drizzle the dithers of one band, on its own grid and on the prior's."""
+    config = context.config
+    reducer = reducer_of(config)
+    units = [unit for unit, e in study_exposures(config).items() if e.filter == name]
+    images = [context.image(f"exposures/{unit}_cal.fits") for unit in units]
+    for label, scale in (("", config.reduction.pixel_scale), ("_fine", config.highres.pixel_scale)):
+        mosaic = reducer.mosaic(images, grid_of(config, scale))
+        # the second pass: what the dithers' own meshes left
+        mosaic, _ = reducer.subtract_background(mosaic)
+        context.save_image(f"mosaic_{name}{label}.fits", mosaic)
+
+
+def make_highres(context, _):
+    """Stage 9: the high-resolution image, its segmentation and the detected sources."""
+    config = context.config
+    truth = QTable.read(context.path("truth.ecsv"))
+    options = config.highres
+    image = highres_image(
+        truth,
+        filter=options.filter,
+        wcs=grid_of(config, options.pixel_scale),
+        psf=hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec),
+        depth=options.depth * u.ABmag,
+        seed=context.seed,
+    )
+    segmentation, detected = detect_sources(
+        image,
+        threshold=config.photometry.threshold,
+        min_area=config.photometry.min_area,
+    )
+    context.save_image("f160w.fits", image)
+    context.save_image("segm.fits", image, segmentation=np.asarray(segmentation.data, np.int32))
+    context.save_table("detections.ecsv", detected)
+
+
+def kernel_of(config, name):
+    """Kernel from the high-resolution image to the mosaic of one band."""
+    options = config.highres
+    value = config.photometry.regularization
+    exposures = band_exposures(config, name)
+    target = psf_mosaic(
+        miri_psf(name),
+        config.reduction.pixel_scale * u.arcsec,
+        u.Quantity([e.pa_aper for e in exposures]),
+        pixfrac=config.reduction.pixfrac,
+    )
+    return MatchingKernel.from_psfs(
+        hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec),
+        target,
+        pixel_scale=options.pixel_scale * u.arcsec,
+        regularization=value if value in ("auto", "yang2021") else float(value),
+    )
+
+
+def make_kernel(context, name):
+    """Stage 10: the kernel of one band."""
+    kernel = kernel_of(context.config, name)
+    context.save(f"kernel_{name}.fits", lambda path: kernel.write(path, overwrite=True))

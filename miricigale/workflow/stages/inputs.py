@@ -1,0 +1,143 @@
+"""Stages 1 to 3: catalogue, input SEDs, model fluxes."""
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable, hstack
+
+from miricigale.fitting import BayesFitter, FitResults
+from miricigale.scene import read_catalog
+from miricigale.sed import SEDModel
+from miricigale.utils.exceptions import ConfigError, argument_error
+from miricigale.utils.random import stream
+from miricigale.utils.tables import error_column
+from miricigale.workflow.stages.stars import star_fluxes
+
+__all__ = ["add_agn", "catalog_bands", "fit_inputs", "make_catalog", "make_truth"]
+
+#: Redshifts closer than this share a node of the grid of the input fit.
+REDSHIFT_STEP = 0.01
+GALAXY_PARAMETERS = ("tau", "age", "ebv", "alpha", "metallicity")
+
+
+def catalog_bands(catalog):
+    """Names of the flux columns of a catalogue: those with a dot in the name."""
+    return [name for name in catalog.colnames if "." in name and not name.endswith("_err")]
+
+
+def make_catalog(context, _):
+    """Stage 1: read the catalogue and cut it at the faint limit."""
+    options = context.config.catalog
+    catalog = read_catalog(options.source)
+    if options.mag_column not in catalog.colnames:
+        raise argument_error("mag_column", f"one of {catalog.colnames}", repr(options.mag_column))
+    magnitude = u.Quantity(catalog[options.mag_column]).value
+    chosen = catalog[magnitude <= options.mag_limit]
+    if len(chosen) == 0:
+        msg = (
+            f"[catalog] mag_limit = {options.mag_limit} leaves none of the {len(catalog)} sources, "
+            f"whose {options.mag_column} begins at {np.nanmin(magnitude):.2f}"
+        )
+        raise ConfigError(msg)
+    context.save_table("catalog.ecsv", chosen)
+
+
+def fit_inputs(context, _):
+    """Stage 2: fit a galaxy grid to the catalogue's fluxes at the known redshifts."""
+    options = context.config.sed
+    catalog = QTable.read(context.path("catalog.ecsv"))
+    bands = catalog_bands(catalog)
+    photometry = QTable({"id": catalog["id"]})
+    photometry["redshift"] = np.asarray(catalog["redshift"], float)
+    for name in bands:
+        photometry[name] = catalog[name]
+        photometry[error_column(name)] = np.abs(catalog[name]) * options.catalog_error
+    nodes = np.unique(np.round(photometry["redshift"] / REDSHIFT_STEP) * REDSHIFT_STEP)
+    model = SEDModel.yang2021()
+    axes = SEDModel.yang2021_axes("galaxy" if options.axes == "galaxy" else "quick")
+    axes = {name: values for name, values in axes.items() if name in GALAXY_PARAMETERS}
+    axes["redshift"] = nodes[nodes > 0]
+    axes["frac_agn"] = [0.0]
+    fitter = BayesFitter(
+        model,
+        bands,
+        axes=axes,
+        model_error=context.config.fit.model_error,
+        redshift_tolerance=REDSHIFT_STEP,
+    )
+    results = fitter.fit(photometry, redshift="redshift", progress_bar=context.progress_bar)
+    context.save("input_seds.fits", lambda path: results.write(path, overwrite=True))
+
+
+def add_agn(table, frac_agn, seed):
+    """
+    Give each source an AGN drawn from the paper's ranges.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+        Parameters of the galaxies, with ``id``; the AGN's columns are added.
+    frac_agn : float
+        fracAGN of every source.
+    seed : int
+        Each source has its own stream, keyed by its id.
+
+    References
+    ----------
+    Yang et al. 2021, ApJ 908, 144, table 3.
+    """
+    drawn = {
+        name: np.empty(len(table))
+        for name in (
+            "tau97", "p", "q", "inclination", "ebv_polar", "temperature_polar", "emissivity_polar"
+        )
+    }  # fmt: skip
+    for row, key in enumerate(table["id"]):
+        rng = stream(seed, "truth", str(key))
+        drawn["tau97"][row] = rng.choice([3.0, 5.0, 7.0, 9.0, 11.0])
+        drawn["p"][row] = rng.choice([0.0, 0.5, 1.0, 1.5])
+        drawn["q"][row] = rng.choice([0.0, 0.5, 1.0, 1.5])
+        drawn["inclination"][row] = rng.choice([60.0, 70.0, 80.0, 90.0])
+        drawn["ebv_polar"][row] = rng.uniform(0, 0.3)
+        drawn["temperature_polar"][row] = rng.uniform(100, 300)
+        drawn["emissivity_polar"][row] = rng.uniform(1, 2)
+    table["frac_agn"] = np.full(len(table), frac_agn)
+    for name, values in drawn.items():
+        table[name] = values
+
+
+def make_truth(context, _):
+    """Stage 3: the best-fit SED (and its AGN) of each source through every band."""
+    config = context.config
+    catalog = QTable.read(context.path("catalog.ecsv"))
+    best = FitResults.read(context.path("input_seds.fits")).best_parameters()
+    parameters = QTable({"id": catalog["id"]})
+    parameters["redshift"] = np.asarray(catalog["redshift"], float)
+    for name in best.colnames:
+        if name in (*GALAXY_PARAMETERS, "mass"):
+            parameters[name] = best[name]
+    model = SEDModel.yang2021(agn=config.sed.frac_agn > 0)
+    if config.sed.frac_agn > 0:
+        add_agn(parameters, config.sed.frac_agn, context.seed)
+    bands = list(
+        dict.fromkeys([*config.fit.bands, *config.exposures.filters, config.highres.filter])
+    )
+    light = model.fluxes(parameters, bands)
+    light.rename_column("flags", "sed_flags")
+    star = np.asarray(catalog["star"], bool)
+    if np.any(star):
+        stars = star_fluxes(catalog[star], catalog_bands(catalog), bands)
+        for name in bands:
+            light[name][star] = stars[name]
+    own = {*light.colnames, *parameters.colnames}
+    truth = hstack(
+        [
+            parameters,
+            catalog[[c for c in catalog.colnames if c not in own and "." not in c]],
+            light[[c for c in light.colnames if c not in parameters.colnames]],
+        ],
+        metadata_conflicts="silent",
+    )
+    if "frac_agn" not in truth.colnames:
+        truth["frac_agn"] = np.zeros(len(truth))
+    truth.meta.clear()
+    context.save_table("truth.ecsv", truth)

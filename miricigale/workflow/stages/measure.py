@@ -1,0 +1,140 @@
+"""Stages 11 to 13: forced photometry, error function, fits."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+from photutils.segmentation import SegmentationImage
+
+from miricigale.evaluation import match_truth
+from miricigale.fitting import BayesFitter
+from miricigale.photometry import ErrorModel, ForcedPhotometer
+from miricigale.psf import MatchingKernel
+from miricigale.sed import SEDModel
+from miricigale.utils.tables import error_column
+from miricigale.workflow.products import read_image
+from miricigale.workflow.stages.sample import add_selection, in_field
+
+__all__ = [
+    "band_photometry",
+    "fit_photometry",
+    "make_errors",
+    "measure_photometry",
+    "mock_photometry",
+    "read_segmentation",
+]
+
+
+def read_segmentation(path):
+    """The segmentation that stage 9 wrote."""
+    _, labels = read_image(path, planes=["segmentation"])
+    return SegmentationImage(labels.astype(np.int32))
+
+
+def measure_photometry(context, name):
+    """Stage 11: forced photometry of one band on its own grid."""
+    kernel = MatchingKernel.read(context.path(f"kernel_{name}.fits"))
+    result = ForcedPhotometer(kernel).measure(
+        context.image(f"mosaic_{name}.fits"),
+        context.image("f160w.fits"),
+        read_segmentation(context.path("segm.fits")),
+        QTable.read(context.path("detections.ecsv")),
+    )
+    table = result.to_table()
+    context.save_table(f"photometry/{name}.ecsv", table)
+    context.save_image(f"photometry/{name}_model.fits", result.model_image)
+    context.save_image(f"photometry/{name}_residual.fits", result.residual_image)
+
+
+def band_photometry(context):
+    """The photometry of all bands in one table, a row for each detection."""
+    bands = context.config.exposures.filters
+    joined = None
+    for name in bands:
+        table = QTable.read(context.path(f"photometry/{name}.ecsv"))
+        if joined is None:
+            joined = table["id", "sky"]
+        joined[name] = table["flux"]
+        joined[error_column(name)] = table["flux_err"]
+        joined[f"{name}_flags"] = table["flags"]
+    joined.meta.clear()
+    return joined
+
+
+def make_errors(context, _):
+    """Stage 12: match to the truth, error function of every band, sample of the fit."""
+    config = context.config
+    bands = config.exposures.filters
+    photometry = band_photometry(context)
+    truth = QTable.read(context.path("truth.ecsv"))
+    matched = match_truth(
+        truth, photometry, bands, radius=config.photometry.match_radius * u.arcsec
+    )
+    inside = in_field(truth["sky"], [context.image(f"mosaic_{name}.fits") for name in bands])
+    # the error function is for galaxies of the field: what was matched there
+    errors = ErrorModel.from_tables(
+        QTable({"id": matched["id"], **{name: matched[f"{name}_true"] for name in bands}})[inside],
+        matched[inside],
+        filters=bands,
+        statistic=config.errors.statistic,
+        bin_size=config.errors.bin_size,
+    )
+    for name in bands:
+        matched[f"{name}_formal_err"] = matched[error_column(name)]
+        matched[f"{name}_extrapolated"] = errors.extrapolated(matched[name], name)
+    matched = errors.assign(matched, filters=bands)
+    add_selection(matched, truth, bands, inside=inside, min_detected=config.fit.min_detected)
+    context.save_table("photometry.ecsv", photometry)
+    context.save_table("matched.ecsv", matched)
+    context.save("errors.ecsv", errors.write)
+
+
+def mock_photometry(config, truth, matched, *, seed):
+    """
+    Photometry of the fitted sample: mock existing bands, measured MIRI bands.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.config.StudyConfig`
+        Bands and depths.
+    truth, matched : `~astropy.table.QTable`, n rows
+        Of stages 3 and 12.
+    seed : int
+        Noise of a source in a band depends on its id and the band only.
+
+    Returns
+    -------
+    photometry : `~astropy.table.QTable`
+        A row for each source of the sample (``selection`` 0).
+    """
+    bands = config.fit.bands
+    errors = ErrorModel.from_depths(
+        dict(zip(bands, config.fit.depths, strict=True)),
+        fractional={name: 0.10 if name.startswith(("irac", "mips")) else 0.03 for name in bands},
+    )
+    sample = np.asarray(matched["selection"]) == 0
+    photometry = errors.perturb(truth[["id", *bands]][sample], seed=seed)
+    for name in config.exposures.filters:
+        for column in (name, error_column(name)):
+            photometry[column] = matched[column][sample]
+    return photometry
+
+
+def fit_photometry(context, unit):
+    """Stage 13: fit the detected sources with or without MIRI."""
+    config = context.config
+    truth = QTable.read(context.path("truth.ecsv"))
+    matched = QTable.read(context.path("matched.ecsv"))
+    photometry = mock_photometry(config, truth, matched, seed=context.seed)
+    miri = config.exposures.filters if unit == "with_miri" else ()
+    fitter = BayesFitter(
+        SEDModel.yang2021(),
+        [*config.fit.bands, *miri],
+        axes=SEDModel.yang2021_axes(config.fit.axes),
+        model_error=config.fit.model_error,
+    )
+    with ThreadPoolExecutor(context.n_threads) as executor:
+        results = fitter.fit(photometry, executor=executor, progress_bar=context.progress_bar)
+    context.save(f"fits_{unit}.fits", lambda path: results.write(path, overwrite=True))
+    context.save_table(f"fits_{unit}.ecsv", results.to_table())

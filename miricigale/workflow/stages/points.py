@@ -1,0 +1,110 @@
+"""The check of the whole chain with bright point sources on a grid."""
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+
+from miricigale.instrument import mosaic_wcs, scaled_limit, tangent_offset
+from miricigale.photometry import ForcedPhotometer, detect_sources
+from miricigale.psf import hst_psf
+from miricigale.scene import highres_image
+from miricigale.utils.random import text_key
+from miricigale.utils.tables import error_column, match_sky
+from miricigale.workflow.stages.images import (
+    expose_and_reduce,
+    kernel_of,
+    reducer_of,
+    study_exposures,
+)
+from miricigale.workflow.stages.sample import in_field
+
+__all__ = ["measure_point_sources", "point_catalog"]
+
+#: Flux of the point sources on the high-resolution image: bright, so that noise is no matter.
+PRIOR_FLUX = 30 * u.uJy
+
+
+def point_catalog(exposure, band_flux, prior, *, spacing, seed):
+    """
+    Point sources on a grid over the field of an exposure.
+
+    Parameters
+    ----------
+    exposure : `~miricigale.instrument.Exposure`
+        Whose field is filled.
+    band_flux : `~astropy.units.Quantity`
+        Flux in its filter.
+    prior : str
+        Filter of the high-resolution image.
+    spacing : float
+        Spacing in arcsec; each source is moved by a random part of a pixel.
+    seed : int
+        Seed of those shifts.
+
+    Returns
+    -------
+    catalog : `~astropy.table.QTable`
+        As `~miricigale.scene.Scene` takes it.
+    """
+    rng = np.random.default_rng(seed)
+    steps = np.arange(-70, 70.1, spacing)
+    x, y = (v.ravel() + rng.uniform(-0.1, 0.1, v.size) for v in np.meshgrid(steps, steps))
+    positions = [
+        tangent_offset(exposure.pointing, dx * u.arcsec, dy * u.arcsec, exposure.pa_aper)
+        for dx, dy in zip(x, y, strict=True)
+    ]
+    n = len(positions)
+    catalog = QTable(
+        {
+            "id": np.arange(1, n + 1),
+            "sky": SkyCoord(positions),
+            "redshift": np.full(n, np.nan),
+            "profile": np.full(n, "point"),
+            "half_light_radius": np.zeros(n) * u.arcsec,
+            "sersic_index": np.ones(n),
+            "axis_ratio": np.ones(n),
+            "position_angle": np.zeros(n) * u.deg,
+        }
+    )
+    catalog[exposure.filter] = np.full(n, band_flux.to_value(u.uJy)) * u.uJy
+    catalog[prior] = np.full(n, PRIOR_FLUX.value) * u.uJy
+    return catalog
+
+
+def measure_point_sources(context, name):
+    """Simulate, reduce and measure bright point sources in one band, as the study does."""
+    config = context.config
+    options, prior = config.point_sources, config.highres.filter
+    exposure = next(e for e in study_exposures(config).values() if e.filter == name)
+    flux = options.signal_to_noise * scaled_limit(name, exposure.exposure_time, n_sigma=1.0)
+    # own streams: these exposures are not those of the study
+    seed = (context.seed + text_key(f"points/{name}")) % 2**63
+    catalog = point_catalog(exposure, flux, prior, spacing=options.spacing, seed=seed)
+    _, cal = expose_and_reduce(config, exposure, catalog, seed=seed)
+    reducer = reducer_of(config)
+    mosaic = reducer.mosaic([cal], mosaic_wcs([exposure], config.reduction.pixel_scale * u.arcsec))
+    mosaic, _ = reducer.subtract_background(mosaic)
+    highres = highres_image(
+        catalog,
+        filter=prior,
+        wcs=mosaic_wcs([exposure], config.highres.pixel_scale * u.arcsec),
+        psf=hst_psf(prior, pixel_scale=config.highres.pixel_scale * u.arcsec),
+        depth=config.highres.depth * u.ABmag,
+        seed=seed,
+    )
+    segmentation, detected = detect_sources(
+        highres, threshold=config.photometry.threshold, min_area=config.photometry.min_area
+    )
+    result = ForcedPhotometer(kernel_of(config, name)).measure(
+        mosaic, highres, segmentation, detected
+    )
+    table = catalog["id", "sky"]
+    table["flux_true"] = catalog[name]
+    index, _ = match_sky(detected["sky"], catalog["sky"], radius=0.3 * u.arcsec)
+    measured = result.to_table()
+    for column in ("flux", error_column("flux")):
+        table[column] = np.where(index >= 0, measured[column][index].value, np.nan) * u.uJy
+    table["flags"] = np.where(index >= 0, np.asarray(measured["flags"])[index], 0)
+    table["in_field"] = in_field(table["sky"], [mosaic])
+    context.save_table(f"points/{name}.ecsv", table)

@@ -1,0 +1,455 @@
+"""Stage 14: truth and results to numbers, figures and one page."""
+
+import json
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.evaluation import (
+    PUBLISHED_LIGHT,
+    Report,
+    fraction_interval,
+    integrated_light,
+    photoz_metrics,
+    recovery_metrics,
+)
+from miricigale.fitting import FitResults
+from miricigale.instrument import proposal_limit, scaled_limit
+from miricigale.photometry import ErrorModel
+from miricigale.workflow.stages import figures
+from miricigale.workflow.stages.images import band_exposures
+from miricigale.workflow.stages.sample import SampleFlags, magnitude
+
+__all__ = ["make_report", "study_metrics"]
+
+FITS = ("with_miri", "without_miri")
+#: Shares of sources detected in two or more bands, by H-band limit: Yang et al. 2021.
+PAPER_DETECTED = ((26.0, 0.53), (25.0, 0.75))
+
+
+def _point_metrics(table):
+    good = np.asarray(table["in_field"], bool)
+    return recovery_metrics(
+        table["flux_true"][good].value, table["flux"][good].value, relative=True
+    )
+
+
+def _band_metrics(matched, truth, name):
+    """Recovery of the isolated sources above 20 sigma, and pulls, in one band."""
+    selection = np.asarray(matched["selection"])
+    usable = (selection & (SampleFlags.OUTSIDE_FIELD | SampleFlags.NOT_MATCHED)) == 0
+    flux, true = matched[name].value, matched[f"{name}_true"].value
+    formal = matched[f"{name}_formal_err"].value
+    with np.errstate(invalid="ignore"):
+        bright = usable & (true > 20 * formal) & ~_crowded(truth, name)
+    pulls = (flux - true) / formal
+    pulls = pulls[usable & np.isfinite(pulls)]
+    return {
+        "bright_isolated": recovery_metrics(true[bright], flux[bright], relative=True),
+        "n_measured": int(np.count_nonzero(usable & np.isfinite(flux))),
+        "pull_median": float(np.median(pulls)) if pulls.size else np.nan,
+    }
+
+
+def _crowded(truth, name, radius=2 * u.arcsec):
+    """Whether a neighbour within 2 arcsec is brighter than the source's magnitude plus one."""
+    sky, mag = truth["sky"], magnitude(truth[name])
+    here, there, _, _ = sky.search_around_sky(sky, radius)
+    other = here != there
+    with np.errstate(invalid="ignore"):
+        near = other & (mag[there] < mag[here] + 1)
+    crowded = np.zeros(len(truth), bool)
+    crowded[here[near]] = True
+    return crowded
+
+
+def study_metrics(context):
+    """
+    All numbers of the report.
+
+    Parameters
+    ----------
+    context : `~miricigale.workflow.runner.Context`
+        Of a run whose other stages are done.
+
+    Returns
+    -------
+    metrics : dict
+        Plain values, as written to ``report/metrics.json``.
+    """
+    config = context.config
+    bands = config.exposures.filters
+    truth = QTable.read(context.path("truth.ecsv"))
+    matched = QTable.read(context.path("matched.ecsv"))
+    errors = ErrorModel.read(context.path("errors.ecsv"))
+    selection = np.asarray(matched["selection"])
+    field = (selection & (SampleFlags.OUTSIDE_FIELD | SampleFlags.STAR | SampleFlags.NO_MODEL)) == 0
+    metrics = {
+        "n_catalog": len(truth),
+        "n_field": int(field.sum()),
+        "n_matched": int((field & (np.asarray(matched["matched"]))).sum()),
+        "n_sample": int((selection == 0).sum()),
+        "bands": {},
+        "detected": [],
+        "fits": {},
+    }
+    prior = magnitude(truth[config.highres.filter])
+    for limit, paper in PAPER_DETECTED:
+        chosen = field & (prior < limit)
+        n = int(np.count_nonzero(chosen & (matched["n_detected"] >= 2)))
+        fraction, low, high = fraction_interval(n, int(chosen.sum()))
+        metrics["detected"].append(
+            {"limit": limit, "fraction": fraction, "low": low, "high": high, "paper": paper}
+        )
+    for name in bands:
+        time = sum(e.exposure_time for e in band_exposures(config, name))
+        entry = _band_metrics(matched, truth, name)
+        bright = entry.pop("bright_isolated")
+        entry |= {
+            "limit": float(errors.limiting_magnitude(name).value),
+            "etc_limit": float(scaled_limit(name, time).to_value(u.ABmag)),
+            "bright_n": bright.n,
+            "bright_median": bright.median,
+            "bright_median_err": bright.median_err,
+        }
+        if config.point_sources.enabled:
+            points = _point_metrics(QTable.read(context.path(f"points/{name}.ecsv")))
+            entry |= {
+                "points_n": points.n,
+                "points_median": points.median,
+                "points_scatter": points.sigma_mad,
+            }
+        metrics["bands"][name] = entry
+    sample = truth[selection == 0]
+    for unit in FITS:
+        table = QTable.read(context.path(f"fits_{unit}.ecsv"))
+        photoz = photoz_metrics(sample["redshift"], table["redshift_mean"])
+        fraction = recovery_metrics(sample["frac_agn"], table["frac_agn_mean"])
+        metrics["fits"][unit] = {
+            "n": photoz.n,
+            "photoz_bias": photoz.bias,
+            "photoz_sigma_mad": photoz.sigma_mad,
+            "photoz_n_outliers": photoz.n_outliers,
+            "photoz_outliers": photoz.outlier_fraction,
+            "photoz_outliers_low": photoz.outlier_low,
+            "photoz_outliers_high": photoz.outlier_high,
+            "frac_agn_bias": fraction.median,
+            "frac_agn_sigma_mad": fraction.sigma_mad,
+            "frac_agn_width": float(np.nanmedian(table["frac_agn_std"])),
+        }
+    return metrics
+
+
+def make_report(context, _):
+    """Stage 14: the page, its figures as PNG, and the numbers as JSON."""
+    config = context.config
+    metrics = study_metrics(context)
+    context.save("report/metrics.json", lambda path: path.write_text(json.dumps(metrics, indent=1)))
+    report = Report(
+        f"miricigale: {config.run.name}",
+        subtitle=(
+            f"{metrics['n_field']} galaxies in a MIRI field at RA {config.pointing.ra:.5f}, "
+            f"Dec {config.pointing.dec:.5f}, injected fracAGN {config.sed.frac_agn:g}, "
+            f"seed {config.run.seed}"
+        ),
+        dpi=config.report.dpi,
+    )
+    writer = _Writer(context, report, metrics)
+    writer.summary()
+    writer.images()
+    writer.photometry()
+    writer.errors()
+    writer.fits()
+    writer.inputs()
+    writer.configuration()
+    context.save("report/index.html", lambda path: report.write(path))
+
+
+class _Writer:
+    """The sections of the page; each reads the products that it shows."""
+
+    def __init__(self, context, report, metrics):
+        self.context, self.report, self.metrics = context, report, metrics
+        self.config = context.config
+        self.bands = context.config.exposures.filters
+        self.truth = QTable.read(context.path("truth.ecsv"))
+        self.matched = QTable.read(context.path("matched.ecsv"))
+        self.errors_model = ErrorModel.read(context.path("errors.ecsv"))
+        self.fit_tables = {unit: QTable.read(context.path(f"fits_{unit}.ecsv")) for unit in FITS}
+        self.sample = np.asarray(self.matched["selection"]) == 0
+
+    def summary(self):
+        """Headline numbers."""
+        m, fits = self.metrics, self.metrics["fits"]
+        self.report.section(
+            "At a glance",
+            "Real galaxies with known redshifts were given the mid-infrared light of their fitted "
+            "SEDs, exposed, reduced and measured; then redshift and AGN fraction were fitted "
+            "together, with and without the MIRI bands, and held against the truth.",
+        )
+        self.report.items(
+            [
+                ("galaxies in the field", m["n_field"]),
+                ("found on the high-resolution image", m["n_matched"]),
+                (f"in the fit: {self.config.fit.min_detected}+ MIRI bands", m["n_sample"]),
+                ("photo-z outliers with MIRI", _percent(fits["with_miri"]["photoz_outliers"])),
+                ("photo-z outliers without", _percent(fits["without_miri"]["photoz_outliers"])),
+                ("fracAGN scatter with MIRI", f"{fits['with_miri']['frac_agn_sigma_mad']:.3f}"),
+                ("fracAGN scatter without", f"{fits['without_miri']['frac_agn_sigma_mad']:.3f}"),
+            ]
+        )
+        self.report.table(
+            [
+                (
+                    f"H < {row['limit']:g}",
+                    _percent(row["fraction"]),
+                    f"{_percent(row['low'])} to {_percent(row['high'])}",
+                    _percent(row["paper"]),
+                )
+                for row in m["detected"]
+                if self.config.catalog.mag_limit >= row["limit"]
+            ],
+            header=("sample", "detected in 2+ bands", "68 % interval", "Yang et al. 2021"),
+            caption="Galaxies of the field detected (5 sigma by the error function) in two or more bands",
+        )
+
+    def images(self):
+        """Colour image; mosaic, model and residual."""
+        self.report.section("Images")
+        by_wave = list(self.bands)
+        chosen = [by_wave[round(k * (len(by_wave) - 1) / 2)] for k in range(3)]
+        images = [self.context.image(f"mosaic_{name}_fine.fits") for name in chosen]
+        prior = self.context.image("f160w.fits")
+        self.report.figure(
+            figures.colour_figure(*images, prior, [*chosen, self.config.highres.filter]),
+            "The field: high-resolution prior, and three MIRI bands drizzled to its grid.",
+        )
+        triples = [
+            (
+                self.context.image(f"mosaic_{name}.fits"),
+                self.context.image(f"photometry/{name}_model.fits"),
+                self.context.image(f"photometry/{name}_residual.fits"),
+            )
+            for name in chosen
+        ]
+        self.report.figure(
+            figures.triptych_figure(triples, chosen),
+            "Mosaic, fitted model and residual of the brightest part (-3 to +12 sigma).",
+        )
+
+    def photometry(self):
+        """Measured against true fluxes, and the point sources."""
+        self.report.section(
+            "Forced photometry",
+            "Every detection of the high-resolution image is fitted in each MIRI mosaic; matched "
+            "sources inside the field are shown.",
+        )
+        inside = (np.asarray(self.matched["selection"]) & SampleFlags.OUTSIDE_FIELD) == 0
+        table = self.matched[inside & np.asarray(self.matched["matched"])]
+        self.report.figure(
+            figures.magnitude_figure(table, self.bands), "Measured against true magnitudes."
+        )
+        self.report.figure(
+            figures.offset_figure(table, self.bands),
+            "Measured minus true magnitude with the running median of 20 sources and its scatter; "
+            "triangles lie beyond the axis.",
+        )
+        rows = [
+            (
+                name,
+                entry["bright_n"],
+                _signed(entry["bright_median"]),
+                f"{100 * entry['bright_median_err']:.1f} %",
+                *(
+                    (
+                        entry["points_n"],
+                        _signed(entry["points_median"]),
+                        _percent(entry["points_scatter"]),
+                    )
+                    if "points_n" in entry
+                    else ("", "", "")
+                ),
+            )
+            for name, entry in self.metrics["bands"].items()
+        ]
+        self.report.table(
+            rows,
+            header=(
+                "band",
+                "isolated > 20 sigma",
+                "median offset",
+                "its error",
+                "point sources",
+                "median offset",
+                "scatter",
+            ),
+            caption="Measured over true flux minus one",
+        )
+        if self.config.point_sources.enabled:
+            points = {
+                name: QTable.read(self.context.path(f"points/{name}.ecsv")) for name in self.bands
+            }
+            points = {name: table[np.asarray(table["in_field"])] for name, table in points.items()}
+            self.report.figure(
+                figures.point_figure(points, self.bands),
+                "Bright point sources on a grid, one exposure a band through the whole chain; "
+                "blue: median, grey: 3 %.",
+            )
+
+    def errors(self):
+        """The error function and the limits."""
+        self.report.section(
+            "Error function and limits",
+            "Scatter of measured about true fluxes in bins of true flux; it is used as the error of "
+            "the measured fluxes in the fit.",
+        )
+        limits = {
+            name: self.errors_model.limiting_flux(name).to_value(u.uJy) for name in self.bands
+        }
+        self.report.figure(
+            figures.error_figure(self.errors_model, self.bands, limits),
+            "Error function of each band; dots mark the 5-sigma limits.",
+        )
+        self.report.table(
+            [
+                (
+                    name,
+                    f"{entry['limit']:.2f}",
+                    f"{entry['etc_limit']:.2f}",
+                    _proposal(name),
+                )
+                for name, entry in self.metrics["bands"].items()
+            ],
+            header=("band", "5 sigma here", "calculator 4.0, scaled", "CEERS proposal"),
+            caption="5-sigma limits, AB magnitudes",
+        )
+
+    def fits(self):
+        """Redshifts, AGN fractions, and one source in detail."""
+        self.report.section(
+            "Redshift and AGN fraction",
+            "Posterior means of the same sources, fitted with the existing bands alone and with MIRI.",
+        )
+        sample = self.truth[self.sample]
+        self.report.figure(
+            figures.redshift_figure(sample, self.fit_tables),
+            "Fitted against true redshift; dashed: the limits beyond which a source is an outlier.",
+        )
+        self.report.figure(
+            figures.fraction_figure(self.fit_tables, self.config.sed.frac_agn),
+            "Posterior means and widths of the AGN fraction.",
+        )
+        self.report.table(
+            [
+                (
+                    unit.replace("_", " "),
+                    entry["n"],
+                    f"{entry['photoz_bias']:+.4f}",
+                    f"{entry['photoz_sigma_mad']:.4f}",
+                    f"{entry['photoz_n_outliers']} ({_percent(entry['photoz_outliers'])})",
+                    f"{entry['frac_agn_bias']:+.3f}",
+                    f"{entry['frac_agn_sigma_mad']:.3f}",
+                    f"{entry['frac_agn_width']:.3f}",
+                )
+                for unit, entry in self.metrics["fits"].items()
+            ],
+            header=(
+                "fit",
+                "sources",
+                "dz/(1+z) median",
+                "sigma_MAD",
+                "outliers",
+                "fracAGN offset",
+                "scatter",
+                "width",
+            ),
+            caption="Redshift and AGN fraction against truth",
+        )
+        results = {unit: FitResults.read(self.context.path(f"fits_{unit}.fits")) for unit in FITS}
+        key = self._example()
+        if key is not None:
+            self.report.figure(
+                figures.example_figure(results, self.truth, key, self.config),
+                f"Source {key}: photometry and best fit with MIRI, and the posteriors of redshift "
+                "and AGN fraction with (red) and without (blue) MIRI.",
+            )
+
+    def _example(self):
+        """A typical source: median magnitude among those near redshift one."""
+        sample = self.truth[self.sample]
+        if len(sample) == 0:
+            return None
+        near = np.abs(np.asarray(sample["redshift"]) - 1.2)
+        chosen = sample[np.argsort(near, kind="stable")[: max(1, len(sample) // 5)]]
+        flux = chosen[self.bands[-1]].value
+        return chosen["id"][np.argsort(flux)[int(0.7 * (len(chosen) - 1))]]
+
+    def inputs(self):
+        """The inputs beside published relations."""
+        self.report.section(
+            "The inputs beside published relations",
+            "What was injected follows from fits to real galaxies; these are checks that it is sane.",
+        )
+        known = np.isfinite(self.truth["stellar_mass"].value)
+        galaxies = self.truth[known & ~np.asarray(self.truth["star"], bool)]
+        self.report.figure(
+            figures.input_figure(galaxies),
+            "Left: infrared luminosity against redshift; right: star-formation rate (100 Myr) against "
+            "stellar mass with the main sequence of Speagle et al. 2014 at z = 0.5, 1 and 2.",
+        )
+        area = figures.catalog_area(self.truth)
+        self.report.figure(
+            figures.counts_figure(galaxies, self.bands, area),
+            "Number counts of the injected fluxes of all galaxies of the catalogue "
+            f"({area.to_value(u.arcmin**2):.1f} square arcmin, H < {self.config.catalog.mag_limit:g}).",
+        )
+        rows = []
+        for name, wave, value, down, up, reference in PUBLISHED_LIGHT:
+            if name in self.bands:
+                light, error = integrated_light(galaxies[name], area, wave * u.um)
+                rows.append(
+                    (
+                        name,
+                        f"{light.value:.2f} +- {error.value:.2f}",
+                        f"{value:.2f} -{down:.2f} +{up:.2f}",
+                        f"{wave:g} um, {reference}",
+                    )
+                )
+        if rows:
+            self.report.table(
+                rows,
+                header=("band", "this catalogue", "published", "reference"),
+                caption="Light of all galaxies together, nW / m2 / sr, at the published wavelength",
+            )
+
+    def configuration(self):
+        """Configuration and times."""
+        self.report.section("How it was made")
+        rows = {}
+        for key, record in self.context.store.records.items():
+            rows.setdefault(key.split(":")[0], []).append(record["seconds"])
+        self.report.table(
+            [(name, len(times), f"{sum(times):.1f}") for name, times in rows.items()],
+            header=("stage", "pieces", "seconds"),
+            caption="Time of each stage",
+        )
+        self.report.text(
+            "The configuration stands in config.toml beside this report; 'miricigale run config.toml' "
+            "repeats it. What to cite for the data: 'miricigale data list'."
+        )
+
+
+def _percent(value):
+    return f"{100 * value:.1f} %" if np.isfinite(value) else "none"
+
+
+def _signed(value):
+    return f"{100 * value:+.2f} %" if np.isfinite(value) else "none"
+
+
+def _proposal(name):
+    try:
+        return f"{proposal_limit(name).value:.1f}"
+    except KeyError:
+        return ""

@@ -1,0 +1,91 @@
+"""Which sources are compared and fitted, and why the others are not."""
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.utils.tables import Flags, error_column
+
+__all__ = ["SampleFlags", "add_selection", "detected_bands", "in_field", "magnitude"]
+
+
+class SampleFlags(Flags):
+    """Why a source of the catalogue is not in the fitted sample."""
+
+    #: Outside the pixels that all bands share.
+    OUTSIDE_FIELD = 1
+    #: A star.
+    STAR = 2
+    #: No model SED (and so no flux) could be made.
+    NO_MODEL = 4
+    #: Not found on the high-resolution image, or another source is nearer.
+    NOT_MATCHED = 8
+    #: Detected in too few MIRI bands.
+    FEW_BANDS = 16
+
+
+def magnitude(flux):
+    """AB magnitudes of fluxes; NaN where not positive."""
+    value = u.Quantity(flux).to_value(u.uJy)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(value > 0, 23.9 - 2.5 * np.log10(value), np.nan)
+
+
+def in_field(sky, images):
+    """
+    Whether positions fall on a usable pixel of every image.
+
+    Parameters
+    ----------
+    sky : `~astropy.coordinates.SkyCoord`, shape (n,)
+        Positions.
+    images : iterable of `~astropy.nddata.CCDData`
+        With WCS and mask.
+
+    Returns
+    -------
+    inside : `~numpy.ndarray` of bool, shape (n,)
+    """
+    inside = np.ones(len(sky), bool)
+    for image in images:
+        x, y = (np.round(v).astype(int) for v in image.wcs.world_to_pixel(sky))
+        ny, nx = image.shape
+        on = (x >= 0) & (x < nx) & (y >= 0) & (y < ny)
+        usable = ~np.asarray(image.mask, bool)
+        inside &= on
+        inside[on] &= usable[y[on], x[on]]
+    return inside
+
+
+def detected_bands(table, bands):
+    """Number of bands in which each source is above five times its error."""
+    with np.errstate(invalid="ignore"):
+        return sum((table[name] > 5 * table[error_column(name)]).astype(int) for name in bands)
+
+
+def add_selection(matched, truth, bands, *, inside, min_detected):
+    """
+    Add ``n_detected`` and ``selection`` (`SampleFlags`, 0 in the sample) to a matched table.
+
+    Parameters
+    ----------
+    matched : `~astropy.table.QTable`
+        From `~miricigale.evaluation.match_truth`, with errors from the error function.
+    truth : `~astropy.table.QTable`
+        Row by row the same sources, with ``star``.
+    bands : iterable of str
+        MIRI bands.
+    inside : array of bool
+        See `in_field`.
+    min_detected : int
+        Bands in which a source of the sample is detected.
+    """
+    flags = np.zeros(len(matched), int)
+    matched["n_detected"] = detected_bands(matched, bands)
+    known = np.all([np.isfinite(matched[f"{name}_true"].value) for name in bands], axis=0)
+    flags[~np.asarray(inside)] |= SampleFlags.OUTSIDE_FIELD
+    flags[np.asarray(truth["star"], bool)] |= SampleFlags.STAR
+    flags[~known] |= SampleFlags.NO_MODEL
+    flags[~matched["matched"]] |= SampleFlags.NOT_MATCHED
+    flags[matched["n_detected"] < min_detected] |= SampleFlags.FEW_BANDS
+    matched["selection"] = flags
+    matched["selection"].info.description = SampleFlags.describe()

@@ -1,0 +1,59 @@
+"""Stars among the sources: black bodies through every band."""
+
+import astropy.units as u
+import numpy as np
+from astropy.modeling.models import BlackBody
+from astropy.table import QTable
+
+from miricigale.filters import FilterSet
+from miricigale.sed import SED
+
+__all__ = ["star_fluxes"]
+
+TEMPERATURES = np.geomspace(2000, 30000, 120) * u.K
+WAVELENGTHS = np.geomspace(0.2, 40, 1500) * u.um
+
+
+def star_fluxes(catalog, known, wanted):
+    """
+    Fluxes of stars in any band, from the black body that fits their known ones best.
+
+    Parameters
+    ----------
+    catalog : `~astropy.table.QTable`, n rows
+        Stars with fluxes in the ``known`` bands; NaN is left out.
+    known, wanted : iterable of str
+        Filter names.
+
+    Returns
+    -------
+    fluxes : `~astropy.table.QTable`, n rows
+        ``temperature`` and a column in uJy for each wanted band. Beyond a few um any
+        photosphere without dust is close to the Rayleigh-Jeans law.
+    """
+    known, wanted = list(known), list(wanted)
+    filters = FilterSet.from_names([*known, *wanted])
+    models = np.array(
+        [
+            filters.synthetic_fluxes(
+                SED(WAVELENGTHS, (BlackBody(temperature)(WAVELENGTHS) * u.sr).to(u.uJy))
+            ).value
+            for temperature in TEMPERATURES
+        ]
+    )
+    data = np.array([catalog[name].to_value(u.uJy) for name in known]).T
+    good = np.isfinite(data) & (data > 0)
+    # least squares in the logarithm: equal relative errors, the scale is the mean ratio
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(good[:, None], np.log(data[:, None] / models[None, :, : len(known)]), 0.0)
+    count = np.maximum(good.sum(axis=1), 1)[:, None]
+    scale = ratio.sum(axis=2) / count
+    scatter = np.where(good[:, None], (ratio - scale[..., None]) ** 2, 0.0).sum(axis=2)
+    best = np.argmin(scatter, axis=1)
+    rows = np.arange(len(catalog))
+    fluxes = np.exp(scale[rows, best])[:, None] * models[best, len(known) :]
+    fluxes[~good.any(axis=1)] = np.nan
+    table = QTable({"temperature": TEMPERATURES[best]})
+    for k, name in enumerate(wanted):
+        table[name] = fluxes[:, k] * u.uJy
+    return table

@@ -1,0 +1,91 @@
+import subprocess
+import sys
+
+import pytest
+
+from miricigale.cli import main
+from miricigale.workflow import load_config
+
+
+def test_the_configuration_can_be_printed_and_given_back(capsys, tmp_path):
+    assert main(["run", "goodss", "--quick", "--seed", "4", "--print-config"]) == 0
+    path = tmp_path / "my.toml"
+    path.write_text(capsys.readouterr().out)
+    config = load_config(path)
+    assert config.run.seed == 4
+    assert config.exposures.plan == "quick"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["run", "cosmos"], "no preset 'cosmos'; known: goodss"),
+        (["run", "absent.toml"], "no configuration file absent.toml"),
+        (["fit", "absent.ecsv"], "no table absent.ecsv"),
+        (["data", "add", "nothing", "x"], "no resource 'nothing'; known:"),
+        (["photometry", "a.fits", "b.fits", "--filter", "miri.f770w", "--pa-aper", "0"], "no image"),
+    ],
+)
+def test_what_cannot_be_used_is_one_sentence_on_stderr(
+    capsys, tmp_path, monkeypatch, arguments, message
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith(f"miricigale: {message}")
+    assert captured.err.count("\n") == 1
+    assert "Traceback" not in captured.err
+
+
+def test_a_catalogue_that_is_none_is_refused(capsys, tmp_path):
+    (tmp_path / "cat.ecsv").write_text("not a table")
+    config = tmp_path / "my.toml"
+    config.write_text(f"[catalog]\nsource = '{tmp_path / 'cat.ecsv'}'\n")
+    assert main(["run", str(config), "-o", str(tmp_path / "run"), "--no-progress"]) == 2
+    assert "cat.ecsv" in capsys.readouterr().err
+
+
+def test_an_empty_sample_is_refused(capsys, tmp_path):
+    config = tmp_path / "my.toml"
+    config.write_text("[catalog]\nmag_limit = 12.0\n")
+    assert main(["run", str(config), "-o", str(tmp_path / "run"), "--no-progress"]) == 2
+    assert "mag_limit = 12.0 leaves none of the 1308 sources" in capsys.readouterr().err
+
+
+def test_data_names_licences_and_checks_sums(capsys, monkeypatch, tmp_path):
+    monkeypatch.delenv("MIRICIGALE_DATA", raising=False)
+    assert main(["data", "list"]) == 0
+    text = capsys.readouterr().out
+    assert "ssp.bc03 (bundled)" in text
+    assert text.count("licence:") == text.count("cite:") > 5
+    assert main(["data", "check"]) == 0
+    assert "wrong checksum" not in capsys.readouterr().out
+
+
+def test_filters_are_listed_with_published_pivots(capsys):
+    assert main(["filters", "miri.f1500w"]) == 0
+    assert "15.06" in capsys.readouterr().out
+    assert main(["filters", "nonsense"]) == 1
+
+
+def test_the_plan_states_the_exposures(capsys):
+    assert main(["plan"]) == 0
+    text = capsys.readouterr().out
+    assert "miri.f2100w" in text
+    assert "1665.0" in text
+    assert "4662.0" in text
+
+
+def test_help_and_version(capsys):
+    assert main([]) == 2
+    assert "run a study" in capsys.readouterr().out
+    assert main(["--version"]) == 0
+
+
+def test_importing_the_package_opens_nothing_heavy():
+    code = (
+        "import sys, miricigale; "
+        "print([m for m in ('numba', 'scipy', 'photutils', 'matplotlib', 'synphot') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
