@@ -39,7 +39,11 @@ def main():
     parser.add_argument("--quick", action="store_true", help="40 groups only")
     parser.add_argument("--threads", type=int, default=None)
     args = parser.parse_args()
-    cases = [("miri.f1000w", 40, 1)] if args.quick else [("miri.f1000w", 200, 1), ("miri.f2100w", 10, 28)]
+    cases = (
+        [("miri.f1000w", 40, 1)]
+        if args.quick
+        else [("miri.f1000w", 200, 1), ("miri.f2100w", 10, 28)]
+    )
     detector, reducer = Detector.miri_imager(), Reducer(n_threads=args.threads)
     print(f"{'':44s} {'wall s':>8s} {'cpu s':>8s} {'+peak MB':>10s}")
     for filt, n_groups, n_integrations in cases:

@@ -1,0 +1,199 @@
+"""Smooth background of an image, with the sources masked."""
+
+import dataclasses
+
+import numpy as np
+from scipy.ndimage import binary_dilation, gaussian_filter, label
+
+from miricigale.reduction.flags import PixelFlags
+from miricigale.reduction.images import flag_pixels, plain_mask, sigma, with_data
+from miricigale.utils import sep_tools
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.parallel import chunks
+
+__all__ = ["Background", "estimate_background", "subtract_background"]
+
+# detection of what is masked: standard deviations of the smoothing in pixels (cores, and
+# the wings of bright sources), and the least number of connected pixels
+_WIDTHS = (0.85, 2.5)
+_MIN_AREA = 5
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Background:
+    """
+    Smooth background of an image.
+
+    Parameters
+    ----------
+    level, rms : `~numpy.ndarray` of float32, shape (ny, nx)
+        Background, and the noise of a pixel about it, in the unit of the image.
+    source_mask : `~numpy.ndarray` of bool, shape (ny, nx)
+        Pixels that were taken for sources.
+    box, filter_size : int
+        Size of the boxes in pixels, and of the median filter in boxes.
+    """
+
+    level: np.ndarray
+    rms: np.ndarray
+    source_mask: np.ndarray
+    box: int
+    filter_size: int
+
+    def __repr__(self):
+        return (
+            f"<Background median {np.median(self.level):.4g}, rms {np.median(self.rms):.4g}, "
+            f"{100 * self.source_mask.mean():.1f} % masked as sources>"
+        )
+
+
+def estimate_background(image, *, box=32, filter_size=3, threshold=3.0, grow=3, iterations=3):
+    """
+    Estimate the background of an image, masking what stands above it.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        Any unit.
+    box, filter_size : int, optional
+        Size of the boxes in pixels, and of the median filter in boxes.
+    threshold : float, optional
+        Sources are at least five connected pixels that rise by this many sigma above the
+        background after a Gaussian smoothing, once of 0.85 pixels and once, for the wings
+        of bright sources, of 2.5; sigma is that of the smoothed image, as measured.
+    grow : int, optional
+        The mask is dilated by this many pixels.
+    iterations : int, optional
+        How often sources are detected and masked.
+
+    Returns
+    -------
+    background : `Background`
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range or every pixel is masked.
+
+    Notes
+    -----
+    A plane, fitted to the medians of the boxes, is taken off first and given back: the
+    median filter of boxes would flatten a gradient at the edges of the image.
+
+    Boxes that sources fill are filled from their neighbours. What is fainter than the
+    threshold stays in the background: its mean is the mean of the unmasked pixels,
+    clipped as Source Extractor does it (mode estimate).
+    """
+    for name, value, least in (
+        ("box", box, 4), ("filter_size", filter_size, 1), ("grow", grow, 0), ("iterations", iterations, 0)
+    ):  # fmt: skip
+        if value < least:
+            raise argument_error(name, f"at least {least}", value)
+    if not threshold > 0:
+        raise argument_error("threshold", "positive", threshold)
+    mask = plain_mask(image)
+    data = sep_tools.native(image.data)
+    data = np.where(mask, 0, data if data.dtype.kind == "f" else data.astype(float))
+    sources = np.zeros(data.shape, bool)
+    for step in range(iterations + 1):
+        plane = _plane(data, mask | sources, box)
+        level, rms = sep_tools.background(data - plane, mask | sources, box, filter_size)
+        level += plane
+        if step == iterations:
+            break
+        found = _detect(data - level, rms, mask, sources, threshold)
+        if grow:
+            found = binary_dilation(found, iterations=grow)
+        if np.array_equal(found, sources):
+            break
+        # never mask everything: where nothing would be left the last mask stays
+        if (found | mask).all():
+            break
+        sources = found
+    return Background(
+        level.astype(np.float32, copy=False),
+        rms.astype(np.float32, copy=False),
+        sources,
+        int(box),
+        int(filter_size),
+    )
+
+
+def _plane(data, mask, box):
+    """Plane through the medians of boxes, clipped."""
+    ny, nx = data.shape
+    points = []
+    for rows in chunks(ny, box):
+        for columns in chunks(nx, box):
+            good = ~mask[rows, columns]
+            # boxes that are mostly masked say little
+            if good.mean() >= 0.3:
+                y, x = (0.5 * (s.start + s.stop - 1) for s in (rows, columns))
+                points.append((1.0, x / nx, y / ny, np.median(data[rows, columns][good])))
+    if len(points) < 6:
+        return np.zeros_like(data)
+    points = np.array(points)
+    keep = np.ones(len(points), bool)
+    for _ in range(5):
+        coef, *_ = np.linalg.lstsq(points[keep, :3], points[keep, 3], rcond=None)
+        residual = points[:, 3] - points[:, :3] @ coef
+        spread = 1.4826 * np.median(np.abs(residual[keep] - np.median(residual[keep])))
+        new = np.abs(residual) <= 3 * spread
+        if new.sum() < 6 or np.array_equal(new, keep):
+            break
+        keep = new
+    y, x = np.ogrid[:ny, :nx]
+    return (coef[0] + coef[1] * (x / nx) + coef[2] * (y / ny)).astype(data.dtype)
+
+
+def _detect(residual, rms, mask, sources, threshold):
+    """Pixels that rise above the noise of the image, smoothed little and much."""
+    good = ~mask & (rms > 0)
+    scaled = np.where(good, residual / np.where(good, rms, 1), 0).astype(np.float32)
+    found = np.zeros(mask.shape, bool)
+    for width in _WIDTHS:
+        smooth = gaussian_filter(scaled, width, mode="nearest")
+        # correlated noise is smoothed less: its width is measured
+        values = smooth[good & ~sources]
+        noise = 1.4826 * np.median(np.abs(values - np.median(values)))
+        high = good & (smooth > threshold * noise)
+        labels, _ = label(high, np.ones((3, 3), bool))
+        large = np.bincount(labels.ravel()) >= _MIN_AREA
+        large[0] = False
+        found |= large[labels]
+    return found
+
+
+def subtract_background(image, *, negative_threshold=10.0, **options):
+    """
+    Subtract the background and mask what lies far below it.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        Any unit.
+    negative_threshold : float or None, optional
+        Pixels below the background by more than this many sigma are masked with
+        `PixelFlags.NEGATIVE`; None for none.
+    **options
+        Passed to `estimate_background`.
+
+    Returns
+    -------
+    image : `~astropy.nddata.CCDData`
+        Without background; ``meta["background"]`` is the median that was taken off.
+    background : `Background`
+    """
+    background = estimate_background(image, **options)
+    out = with_data(
+        image,
+        np.asarray(image.data, np.float32) - background.level,
+        background=float(np.median(background.level[~plain_mask(image)])),
+    )
+    if negative_threshold is not None:
+        if not negative_threshold > 0:
+            raise argument_error("negative_threshold", "positive or None", negative_threshold)
+        noise = np.fmax(background.rms, sigma(image))
+        low = ~plain_mask(out) & (out.data < -negative_threshold * noise)
+        out = flag_pixels(out, low, PixelFlags.NEGATIVE)
+    return out, background

@@ -1,0 +1,179 @@
+"""Slopes to surface brightness: dark, flat, conversion, residual cosmic rays."""
+
+import astroscrappy
+import numpy as np
+from scipy.ndimage import binary_dilation, convolve, maximum_filter
+
+from miricigale.instrument import field_mask, flat_field, photmjsr, psf_fwhm
+from miricigale.reduction.flags import PixelFlags
+from miricigale.reduction.images import flag_pixels, plain_flags, plain_mask, sigma, with_data
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
+
+__all__ = ["calibrate", "find_cosmic_rays"]
+
+# mean scale of the imager's pixels, to turn a FWHM into pixels; the detection kernel
+# needs no more accuracy
+_PIXEL_SCALE = 0.1109
+
+
+def find_cosmic_rays(
+    image,
+    *,
+    fwhm,
+    sigma_clip=5.0,
+    sigma_fraction=0.3,
+    object_limit=3.0,
+    iterations=3,
+    sharpness=2.0,
+):
+    """
+    Find what is sharper than a point source.
+
+    L.A.Cosmic proposes hits; of these only pixels stay that rise more steeply above
+    their neighbours than a point source does, with the hits that touch them.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        With uncertainty.
+    fwhm : float
+        Of the point-spread function, in pixels.
+    sigma_clip : float, optional
+        Laplacian over noise from which a pixel counts.
+    sigma_fraction : float, optional
+        Fraction of that for the neighbours of a hit.
+    object_limit : float, optional
+        Least contrast between the Laplacian and the fine structure (differences of
+        median filters): higher values protect point sources better.
+    iterations : int, optional
+        Passes.
+    sharpness : float, optional
+        How many times steeper than a Gaussian of ``fwhm``, centred on a pixel, a hit must be:
+        the peak less the mean of its four neighbours, over the highest of the eight
+        neighbours.
+
+    Returns
+    -------
+    mask : `~numpy.ndarray` of bool, shape (ny, nx)
+        True where there is a hit.
+
+    Notes
+    -----
+    Without the last condition L.A.Cosmic eats the cores and diffraction patterns of bright
+    point sources, for any choice of its parameters. The price are hits spread evenly
+    over several pixels, which only the other dithers show (`reject_outliers`).
+
+    References
+    ----------
+    van Dokkum 2001, PASP 113, 1420; McCully et al. 2018, astroscrappy.
+    """
+    if not fwhm > 0:
+        raise argument_error("fwhm", "positive", fwhm)
+    mask = plain_mask(image)
+    error = sigma(image)
+    good = ~mask & np.isfinite(error) & (error > 0)
+    if not good.any():
+        return np.zeros(mask.shape, bool)
+    level = np.median(image.data[good])
+    # in units of the typical noise, so that float32 is enough whatever the unit
+    unit = np.median(error[good])
+    data = np.where(good, (image.data - level) / unit, 0.0).astype(np.float32)
+    variance = np.where(good, np.square(error / unit), 1.0).astype(np.float32)
+    hits, _ = astroscrappy.detect_cosmics(
+        np.ascontiguousarray(data),
+        inmask=np.ascontiguousarray(~good),
+        invar=np.ascontiguousarray(variance),
+        sigclip=float(sigma_clip),
+        sigfrac=float(sigma_fraction),
+        objlim=float(object_limit),
+        gain=1.0,
+        readnoise=0.0,
+        satlevel=np.inf,
+        niter=int(iterations),
+    )
+    hits &= good
+    if not hits.any():
+        return hits
+    # a Gaussian's pixel over its neighbour: exp(1 / (2 sigma^2))
+    ratio = np.exp(0.5 * (2 * np.sqrt(2 * np.log(2)) / fwhm) ** 2)
+    steep = max(sharpness * (ratio - 1), 1.0)
+    mean = convolve(data, np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], np.float32) / 4)
+    ring = np.ones((3, 3), bool)
+    highest = maximum_filter(data, footprint=ring & (np.arange(9).reshape(3, 3) != 4))
+    noise = np.sqrt(variance)
+    rise = data - mean
+    sharp = hits & (rise > steep * highest) & (rise > sigma_clip * noise)
+    return hits & binary_dilation(sharp, ring)
+
+
+def calibrate(
+    rate,
+    *,
+    filter,
+    subarray,
+    dark,
+    gain,
+    ipc_kernel=None,
+    field_only=True,
+    cosmic_rays=None,
+):
+    """
+    Turn an image of slopes into surface brightness.
+
+    Parameters
+    ----------
+    rate : `~astropy.nddata.CCDData`
+        DN/s, with uncertainty.
+    filter, subarray : str
+        Whose flat field and conversion.
+    dark : float
+        Dark rate, DN/s.
+    gain : float
+        Electrons per DN.
+    ipc_kernel : `~numpy.ndarray`, shape (3, 3), optional
+        Coupling of neighbours that blurs the flat field as it blurs the image: a uniform
+        sky comes out uniform.
+    field_only : bool, optional
+        Whether pixels behind the coronagraph masks are masked; sub-arrays that lie wholly
+        outside the imager's field are left alone.
+    cosmic_rays : dict or None, optional
+        Options of `find_cosmic_rays`; None leaves that step out.
+
+    Returns
+    -------
+    cal : `~astropy.nddata.CCDData`
+        MJy/sr; ``meta["photmjsr"]`` is the conversion.
+
+    Raises
+    ------
+    ValueError
+        If the image is not in DN/s.
+    """
+    if rate.unit is None or not rate.unit.is_equivalent(RATE):
+        raise argument_error("rate", f"in {RATE}", f"unit {rate.unit}")
+    flat = flat_field(filter, rate.shape, subarray=subarray)
+    if ipc_kernel is not None:
+        flat = convolve(flat, np.asarray(ipc_kernel, np.float32), mode="nearest")
+    conversion = photmjsr(filter, gain=gain)
+    scale = np.float32(rate.unit.to(RATE) * conversion) / flat
+    dark = np.float32(dark / rate.unit.to(RATE))
+    out = with_data(
+        rate,
+        (np.asarray(rate.data, np.float32) - dark) * scale,
+        factor=scale,
+        unit=SURFACE_BRIGHTNESS,
+        photmjsr=float(conversion),
+    )
+    if field_only:
+        inside = field_mask(rate.shape, subarray=subarray)
+        outside = ~inside if inside.any() else np.zeros_like(inside)
+        outside &= (plain_flags(rate) & np.uint32(PixelFlags.REFERENCE)) == 0
+        out = flag_pixels(out, outside, PixelFlags.OUTSIDE_FIELD)
+    if cosmic_rays is not None:
+        fwhm = psf_fwhm(filter)
+        fwhm = float(getattr(fwhm, "value", fwhm)) / _PIXEL_SCALE
+        hits = find_cosmic_rays(out, fwhm=fwhm, **cosmic_rays)
+        out = flag_pixels(out, hits, PixelFlags.COSMIC_RAY)
+        out.meta["n_cosmic_rays"] = int(np.count_nonzero(hits))
+    return out

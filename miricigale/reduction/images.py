@@ -1,0 +1,101 @@
+"""Small helpers for `~astropy.nddata.CCDData` with flags."""
+
+import numpy as np
+from astropy.nddata import CCDData, StdDevUncertainty
+
+from miricigale.reduction.flags import MASKED
+from miricigale.utils.exceptions import argument_error
+
+__all__ = ["flag_pixels", "image", "plain_flags", "plain_mask", "sigma", "with_data"]
+
+
+def image(data, unit, *, error, flags, wcs, meta):
+    """Make an image whose mask says which flags forbid a pixel, or where it is not finite."""
+    data = np.asarray(data, np.float32)
+    error = np.asarray(error, np.float32)
+    flags = np.asarray(flags, np.uint32)
+    mask = (flags & np.uint32(MASKED)) != 0
+    return CCDData(
+        data,
+        unit=unit,
+        uncertainty=StdDevUncertainty(error),
+        mask=mask | ~np.isfinite(data) | ~np.isfinite(error),
+        flags=flags,
+        wcs=wcs,
+        meta=dict(meta),
+    )
+
+
+def plain_mask(image):
+    """Mask of an image as a bool array, with pixels that are not finite."""
+    bad = ~np.isfinite(image.data)
+    return bad if image.mask is None else bad | np.asarray(image.mask, bool)
+
+
+def plain_flags(image):
+    """Flags of an image as a new uint32 array; zeros where it has none."""
+    if image.flags is None:
+        return np.zeros(image.data.shape, np.uint32)
+    return np.array(image.flags, np.uint32)
+
+
+def sigma(image, name="image"):
+    """
+    Standard deviation of each pixel as an array.
+
+    Raises
+    ------
+    ValueError
+        If the image has no uncertainty.
+    """
+    if image.uncertainty is None:
+        raise argument_error(name, "an image with an uncertainty", "one without")
+    uncertainty = image.uncertainty
+    if uncertainty.uncertainty_type == "std":
+        return np.asarray(uncertainty.array)
+    return np.asarray(uncertainty.represent_as(StdDevUncertainty).array)
+
+
+def with_data(source, data, *, factor=None, unit=None, **meta):
+    """
+    Copy an image with other data.
+
+    Parameters
+    ----------
+    source : `~astropy.nddata.CCDData`
+        Gives everything else.
+    data : `~numpy.ndarray`
+        The new data.
+    factor : float or `~numpy.ndarray`, optional
+        Multiplies the uncertainty.
+    unit : `~astropy.units.Unit`, optional
+        The new unit.
+    **meta
+        Added to the meta dictionary.
+
+    Returns
+    -------
+    image : `~astropy.nddata.CCDData`
+    """
+    uncertainty = None
+    if source.uncertainty is not None:
+        error = sigma(source)
+        uncertainty = StdDevUncertainty(np.array(error if factor is None else error * factor))
+    return CCDData(
+        data,
+        unit=source.unit if unit is None else unit,
+        uncertainty=uncertainty,
+        mask=plain_mask(source),
+        flags=plain_flags(source),
+        wcs=source.wcs,
+        meta={**source.meta, **meta},
+    )
+
+
+def flag_pixels(source, where, flag):
+    """Copy an image with ``flag`` set, and masked if the flag says so, where ``where``."""
+    out = with_data(source, source.data)
+    out.flags[where] |= np.uint32(flag)
+    if int(flag) & int(MASKED):
+        out.mask |= where
+    return out

@@ -1,0 +1,374 @@
+"""Dithers to one image: outlier rejection and drizzle."""
+
+import dataclasses
+
+import numpy as np
+from astropy.nddata import CCDData
+from astropy.wcs.utils import proj_plane_pixel_area
+from drizzle.resample import Drizzle
+from scipy.interpolate import RectBivariateSpline
+from scipy.ndimage import map_coordinates
+
+from miricigale.reduction.flags import PixelFlags
+from miricigale.reduction.images import flag_pixels, image, plain_mask, sigma
+from miricigale.utils import sep_tools
+from miricigale.utils.exceptions import argument_error
+
+__all__ = [
+    "Mosaic",
+    "drizzle_images",
+    "noise_correction",
+    "pixel_map",
+    "reject_outliers",
+    "weight_map",
+]
+
+# nodes of the grid on which a distorted WCS is evaluated; between them bicubic splines
+_NODES = 49
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Mosaic:
+    """
+    A drizzled image.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        Surface brightness in the unit of the inputs, with uncertainty, mask and WCS.
+    weight : `~numpy.ndarray` of float32, shape (ny, nx)
+        Sum of the inverse variances that went into each pixel (area-weighted).
+    n_images : `~numpy.ndarray` of uint8, shape (ny, nx)
+        Number of inputs that touch each pixel.
+    """
+
+    image: CCDData
+    weight: np.ndarray
+    n_images: np.ndarray
+
+    def __repr__(self):
+        ny, nx = self.weight.shape
+        return f"<Mosaic {ny} x {nx} pixels of {int(self.n_images.max())} images>"
+
+
+def pixel_map(wcs_in, wcs_out, shape):
+    """
+    Where the pixels of one image lie in another.
+
+    Parameters
+    ----------
+    wcs_in, wcs_out : `~astropy.wcs.WCS`
+        Distorted or not.
+    shape : tuple of int
+        ``(ny, nx)`` of the first image.
+
+    Returns
+    -------
+    x, y : `~numpy.ndarray`, shape (ny, nx)
+        Coordinates in the second image. Polynomial distortion is evaluated on a grid of 49
+        x 49 nodes and interpolated by bicubic splines (1e-5 pixels or better); tables of
+        distortion are followed pixel by pixel.
+    """
+    ny, nx = shape
+    smooth = not any(
+        getattr(w, name, None) is not None
+        for w in (wcs_in, wcs_out)
+        for name in ("cpdis1", "cpdis2", "det2im1", "det2im2")
+    )
+    if smooth and min(ny, nx) > _NODES:
+        nodes_y, nodes_x = (np.linspace(0, n - 1, _NODES) for n in (ny, nx))
+    else:
+        nodes_y, nodes_x = np.arange(ny, dtype=float), np.arange(nx, dtype=float)
+    grid_x, grid_y = np.meshgrid(nodes_x, nodes_y)
+    world = wcs_in.all_pix2world(grid_x.ravel(), grid_y.ravel(), 0)
+    found = wcs_out.all_world2pix(*world, 0)
+    x, y = (np.reshape(values, grid_x.shape) for values in found)
+    if x.shape == (ny, nx):
+        return x, y
+    rows, columns = np.arange(ny, dtype=float), np.arange(nx, dtype=float)
+    return tuple(RectBivariateSpline(nodes_y, nodes_x, values)(rows, columns) for values in (x, y))
+
+
+def weight_map(source, *, box=32, filter_size=3):
+    """
+    Inverse variance of an image that does not follow the data of single pixels.
+
+    Parameters
+    ----------
+    source : `~astropy.nddata.CCDData`
+        With uncertainty.
+    box, filter_size : int, optional
+        Over which the variance is smoothed (clipped mode of the boxes, median of boxes).
+
+    Returns
+    -------
+    weight : `~numpy.ndarray` of float32, shape (ny, nx)
+        Zero where the image is masked.
+
+    Notes
+    -----
+    The variance of a pixel is estimated from its own counts: weights by it would favour
+    pixels that fluctuated low, and lower the mosaic by about sigma^2 / rate.
+    """
+    mask = plain_mask(source)
+    variance = np.square(np.asarray(sigma(source), float))
+    bad = mask | ~np.isfinite(variance) | (variance <= 0)
+    if bad.all():
+        return np.zeros(mask.shape, np.float32)
+    typical = np.median(variance[~bad])
+    smooth, _ = sep_tools.background(variance / typical, bad, box, filter_size)
+    # the spline between boxes may overshoot: weights stay within a factor of ten
+    smooth = np.clip(smooth, 0.1, 10.0) * typical
+    return np.where(bad, 0.0, 1.0 / smooth).astype(np.float32)
+
+
+def noise_correction(pixfrac, ratio):
+    """
+    Noise of large areas of a drizzled image over what its pixels' noise says.
+
+    Parameters
+    ----------
+    pixfrac : float
+        Side of the drops in input pixels.
+    ratio : float
+        Side of an output pixel over that of an input pixel.
+
+    Returns
+    -------
+    factor : float
+        At least 1: drizzling correlates neighbours, so that the sum over N pixels is this
+        factor noisier than the pixels' errors in quadrature.
+
+    References
+    ----------
+    Fruchter & Hook 2002, PASP 114, 144, eqs. 9 and 10.
+    """
+    r = pixfrac / ratio
+    return r / (1 - 1 / (3 * r)) if r >= 1 else 1 / (1 - r / 3)
+
+
+def drizzle_images(images, wcs, *, shape=None, pixfrac=1.0, weights=None, pixel_maps=None):
+    """
+    Drizzle images onto one grid.
+
+    Parameters
+    ----------
+    images : list of `~astropy.nddata.CCDData`
+        Surface brightness in one unit, with uncertainty and WCS; masked pixels get no
+        weight.
+    wcs : `~astropy.wcs.WCS`
+        Of the output.
+    shape : tuple of int, optional
+        ``(ny, nx)`` of the output; by default ``wcs.pixel_shape``.
+    pixfrac : float, optional
+        Side of the drops in input pixels, 0-1.
+    weights : list of `~numpy.ndarray`, optional
+        Weight of each pixel; by default `weight_map`.
+    pixel_maps : list of (x, y), optional
+        Results of `pixel_map`, if they are there already.
+
+    Returns
+    -------
+    mosaic : `Mosaic`
+        The brightness is the area- and weight-weighted mean (square kernel), so that the
+        sum of brightness times pixel area is conserved. Variances go through with squared
+        weights. ``image.meta["noise_correction"]`` says by how much sums over many
+        pixels are noisier than these variances tell (`noise_correction`).
+
+    Raises
+    ------
+    ValueError
+        If there are no images, units differ or the output has no shape.
+    """
+    images = list(images)
+    _check(images)
+    if not 0 < pixfrac <= 1:
+        raise argument_error("pixfrac", "above 0 and at most 1", pixfrac)
+    if shape is None:
+        if wcs.pixel_shape is None:
+            raise argument_error("wcs", "a WCS with a pixel_shape, or 'shape' given", "neither")
+        shape = wcs.pixel_shape[::-1]
+    shape = tuple(int(n) for n in shape)
+    weights = [weight_map(im) for im in images] if weights is None else list(weights)
+    if pixel_maps is None:
+        pixel_maps = [None] * len(images)
+    # drizzle works in float32: weights near one
+    positive = [w[w > 0] for w in weights]
+    positive = [w for w in positive if w.size]
+    unit_weight = float(np.median([np.median(w) for w in positive])) if positive else 1.0
+
+    sink = Drizzle(
+        kernel="square", fillval="NAN", fillval2="NAN", out_shape=shape, disable_ctx=True
+    )
+    n_images = np.zeros(shape, np.uint8)
+    before = np.zeros(shape, np.float32)
+    for im, weight, where in zip(images, weights, pixel_maps, strict=True):
+        x, y = pixel_map(im.wcs, wcs, im.shape) if where is None else where
+        mask = plain_mask(im)
+        weight = np.where(mask, 0.0, np.asarray(weight) / unit_weight).astype(np.float32)
+        if not weight.any():
+            continue
+        good = weight > 0
+        variance = np.square(np.asarray(sigma(im), float))
+        sink.add_image(
+            np.where(good, im.data, 0.0).astype(np.float32),
+            exptime=1.0,
+            pixmap=np.dstack([x, y]),
+            data2=np.where(good, variance, 0.0).astype(np.float32),
+            weight_map=weight,
+            pixfrac=float(pixfrac),
+            pixel_scale_ratio=_scale(wcs) / _scale(im.wcs),
+            in_units="cps",
+        )
+        n_images += sink.out_wht > before
+        before = sink.out_wht.copy()
+
+    if n_images.any():
+        data, variance = sink.out_img, sink.out_img2
+        variance = variance[0] if isinstance(variance, (list, tuple)) else variance
+        weight = sink.out_wht
+    else:
+        data = np.full(shape, np.nan, np.float32)
+        variance, weight = data, np.zeros(shape, np.float32)
+    covered = (weight > 0) & np.isfinite(data)
+    flags = np.where(covered, 0, int(PixelFlags.NO_DATA)).astype(np.uint32)
+    scales = [_scale(im.wcs) for im in images]
+    ratio = _scale(wcs) / float(np.mean(scales))
+    meta = _meta(images)
+    meta.update(
+        pixfrac=float(pixfrac),
+        pixel_scale=_scale(wcs) * 3600,
+        noise_correction=noise_correction(pixfrac, ratio)
+        * float(np.mean([im.meta.get("noise_correction", 1.0) for im in images])),
+    )
+    out = image(
+        np.where(covered, data, np.nan),
+        images[0].unit,
+        error=np.sqrt(np.where(covered, variance, np.nan)),
+        flags=flags,
+        wcs=wcs,
+        meta=meta,
+    )
+    return Mosaic(out, (weight * np.float32(unit_weight)).astype(np.float32), n_images)
+
+
+def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None, pixel_maps=None):
+    """
+    Mask pixels that disagree with the other dithers.
+
+    Parameters
+    ----------
+    images : list of `~astropy.nddata.CCDData`
+        Background-subtracted images; fewer than three are returned as they are.
+    wcs : `~astropy.wcs.WCS`
+        Grid on which they are compared; best with pixels of about the detector's size.
+    threshold : float, optional
+        In sigma of the pixel (with the noise of the median).
+    derivative : float, optional
+        A pixel may differ, beyond the noise, by this times the steepest difference to its
+        four neighbours in the median image: point sources are sampled differently in
+        each dither.
+    weights, pixel_maps : list, optional
+        As in `drizzle_images`.
+
+    Returns
+    -------
+    images : list of `~astropy.nddata.CCDData`
+        With `PixelFlags.OUTLIER` set and masked; ``meta["n_outliers"]`` counts them. Only
+        pixels that at least three images cover are judged.
+
+    Notes
+    -----
+    Each image is drizzled alone, the median of these is interpolated back to the pixels of
+    each image (linearly), and compared there.
+
+    References
+    ----------
+    Fruchter & Hook 2002, PASP 114, 144, sec. 5 (without the second pass on neighbours).
+    """
+    images = list(images)
+    _check(images)
+    if not threshold > 0:
+        raise argument_error("threshold", "positive", threshold)
+    if not derivative >= 0:
+        raise argument_error("derivative", "at least 0", derivative)
+    if len(images) < 3:
+        return images
+    weights = [weight_map(im) for im in images] if weights is None else weights
+    if pixel_maps is None:
+        pixel_maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
+    stack = np.stack(
+        [
+            drizzle_images([im], wcs, weights=[w], pixel_maps=[p]).image.data
+            for im, w, p in zip(images, weights, pixel_maps, strict=True)
+        ]
+    )
+    count = np.isfinite(stack).sum(axis=0)
+    median = _nan_median(stack, count)
+    del stack
+    # where too few images overlap there is nothing to compare with
+    judged = count >= 3
+    steep = np.zeros_like(median)
+    for axis in (0, 1):
+        step = np.abs(np.diff(median, axis=axis))
+        low, high = [slice(None)] * 2, [slice(None)] * 2
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        steep[tuple(low)] = np.fmax(steep[tuple(low)], step)
+        steep[tuple(high)] = np.fmax(steep[tuple(high)], step)
+    median = np.where(judged, median, 0.0)
+    judged = judged.astype(np.float32)
+    out = []
+    for im, (x, y) in zip(images, pixel_maps, strict=True):
+        coords = np.array([y, x])
+        options = {"order": 1, "mode": "constant", "cval": 0.0}
+        expected = map_coordinates(median, coords, **options)
+        slope = map_coordinates(np.nan_to_num(steep), coords, **options)
+        known = map_coordinates(judged, coords, **options) > 0.999
+        noise = sigma(im) * np.sqrt(1 + 1.5 / len(images))
+        with np.errstate(invalid="ignore"):
+            far = np.abs(im.data - expected) > threshold * noise + derivative * slope
+        outlier = far & known & ~plain_mask(im)
+        flagged = flag_pixels(im, outlier, PixelFlags.OUTLIER)
+        flagged.meta["n_outliers"] = int(np.count_nonzero(outlier))
+        out.append(flagged)
+    return out
+
+
+def _nan_median(stack, count):
+    """Median along the first axis without NaN: sorting puts NaN last."""
+    ordered = np.sort(stack, axis=0)
+    low = np.maximum(count - 1, 0) // 2
+    high = np.minimum(count // 2, stack.shape[0] - 1)
+    pick = lambda i: np.take_along_axis(ordered, i[None], axis=0)[0]  # noqa: E731
+    return 0.5 * (pick(low) + pick(high))
+
+
+def _scale(wcs):
+    """Side of a pixel at the reference position, deg."""
+    return float(np.sqrt(proj_plane_pixel_area(wcs)))
+
+
+def _check(images):
+    if not images:
+        raise argument_error("images", "at least one image", "none")
+    for im in images:
+        if not isinstance(im, CCDData) or im.wcs is None or im.uncertainty is None:
+            raise argument_error("images", "CCDData with uncertainty and WCS", repr(type(im)))
+        if im.unit != images[0].unit:
+            raise argument_error("images", f"in one unit ({images[0].unit})", str(im.unit))
+
+
+def _meta(images):
+    """What the inputs say of themselves, put together."""
+    metas = [im.meta for im in images]
+    meta = {"n_exposures": len(images)}
+    for key in ("exposure_time", "n_cosmic_rays", "n_outliers"):
+        if all(key in m for m in metas):
+            meta[key] = sum(m[key] for m in metas)
+    for key in ("pa_aper", "dither", "background"):
+        if all(key in m for m in metas):
+            meta[key] = [m[key] for m in metas]
+    for key in metas[0]:
+        if key not in meta and all(m.get(key) == metas[0][key] for m in metas):
+            meta[key] = metas[0][key]
+    return meta

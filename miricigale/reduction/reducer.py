@@ -1,0 +1,488 @@
+"""The `Reducer`: ramps in, calibrated images and mosaics out."""
+
+import dataclasses
+
+import numpy as np
+from astropy.nddata import CCDData
+
+from miricigale.detector import DQ
+from miricigale.instrument import DetectorProperties, miri_detector, mosaic_wcs
+from miricigale.reduction.background import Background, estimate_background, subtract_background
+from miricigale.reduction.calibration import calibrate
+from miricigale.reduction.flags import PixelFlags
+from miricigale.reduction.images import image
+from miricigale.reduction.mosaic import (
+    drizzle_images,
+    pixel_map,
+    reject_outliers,
+    weight_map,
+)
+from miricigale.reduction.rampfit import fit_groups, reference_drift
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.meta import provenance
+from miricigale.utils.progress import progress
+from miricigale.utils.units import ANGLE, RATE, to_array
+
+__all__ = ["BACKENDS", "Reducer", "ReductionResult"]
+
+#: Known backends.
+BACKENDS = ("native",)
+
+# flags of a ramp's pixels that forbid a slope
+_UNUSABLE = DQ.DO_NOT_USE | DQ.NON_SCIENCE | DQ.REFERENCE_PIXEL | DQ.DEAD
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class ReductionResult:
+    """
+    What the reduction of one filter's dithers gave.
+
+    Parameters
+    ----------
+    rates : tuple of `~astropy.nddata.CCDData`
+        Slopes, DN/s.
+    images : tuple of `~astropy.nddata.CCDData`
+        Calibrated, background subtracted, outliers masked; MJy/sr.
+    backgrounds : tuple of `Background`
+        What was subtracted from each.
+    mosaic : `~astropy.nddata.CCDData`
+        MJy/sr.
+    weight : `~numpy.ndarray`, shape (ny, nx)
+        Weight (inverse variance) of the mosaic.
+    n_images : `~numpy.ndarray`, shape (ny, nx)
+        Number of dithers at each pixel of the mosaic.
+    mosaic_background : `Background`
+        What was subtracted from the mosaic in the second pass.
+    """
+
+    rates: tuple
+    images: tuple
+    backgrounds: tuple
+    mosaic: CCDData
+    weight: np.ndarray
+    n_images: np.ndarray
+    mosaic_background: Background
+
+    @property
+    def filter(self):
+        """Name of the filter."""
+        return self.mosaic.meta.get("filter")
+
+    def __repr__(self):
+        ny, nx = self.mosaic.shape
+        return f"<ReductionResult {self.filter}: {len(self.images)} dithers, mosaic {ny} x {nx}>"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Reducer:
+    """
+    Settings of the reduction; every method leaves them as they are.
+
+    Parameters
+    ----------
+    backend : {"native"}, optional
+        Who does the work.
+    jump_threshold : float or None, optional
+        Sigma above which a jump is cut out of a ramp; None for no jump detection.
+    neighbour_threshold : float or None, optional
+        Sigma above which a jump is cut in the four neighbours too.
+    skip_first, skip_last : int, optional
+        Groups left out at the start and end of each integration.
+    saturation : float, optional
+        Fraction of the detector's saturation from which groups are left out.
+    reference_correction : bool, optional
+        Whether the mean of the reference columns is taken off, group by group.
+    ipc : bool or None, optional
+        Whether neighbours share their charge, which lowers the photon noise of a pixel
+        (and correlates it) and blurs the flat field. None: as the ramp says, True where
+        it does not.
+    field_only : bool, optional
+        Whether pixels behind the coronagraph masks are masked.
+    cosmic_rays : bool, optional
+        Whether residual cosmic rays are searched on the slope image.
+    cosmic_ray_sigma, cosmic_ray_contrast : float, optional
+        ``sigma_clip`` and ``object_limit`` of `find_cosmic_rays`.
+    box, filter_size : int, optional
+        Of the background: boxes in pixels, median filter in boxes.
+    negative_threshold : float or None, optional
+        Pixels so many sigma below the background are masked.
+    outlier_threshold : float or None, optional
+        Sigma for the comparison of three or more dithers; None for none.
+    pixfrac : float, optional
+        Side of the drizzle's drops in input pixels.
+    properties : `~miricigale.instrument.DetectorProperties`, optional
+        The detector; `~miricigale.instrument.miri_detector` if not given.
+    n_threads : int, optional
+        Threads of the ramp fit; as many as there are processors if not given. It changes
+        nothing in the result.
+
+    Raises
+    ------
+    ValueError
+        If the backend is not known or an option is out of range.
+
+    Examples
+    --------
+    >>> from miricigale.reduction import Reducer
+    >>> Reducer(jump_threshold=4.5).jump_threshold
+    4.5
+    """
+
+    backend: str = "native"
+    jump_threshold: float | None = 5.0
+    neighbour_threshold: float | None = 10.0
+    skip_first: int = 0
+    skip_last: int = 0
+    saturation: float = 0.98
+    reference_correction: bool = True
+    ipc: bool | None = None
+    field_only: bool = True
+    cosmic_rays: bool = True
+    cosmic_ray_sigma: float = 5.0
+    cosmic_ray_contrast: float = 3.0
+    box: int = 32
+    filter_size: int = 3
+    negative_threshold: float | None = 10.0
+    outlier_threshold: float | None = 5.0
+    pixfrac: float = 1.0
+    properties: DetectorProperties | None = None
+    n_threads: int | None = None
+
+    def __post_init__(self):
+        if self.backend not in BACKENDS:
+            known = " or ".join(repr(name) for name in BACKENDS)
+            raise argument_error("backend", known, repr(self.backend))
+        for name in (
+            "jump_threshold", "neighbour_threshold", "negative_threshold", "outlier_threshold"
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise argument_error(name, "positive or None", value)
+        for name in ("cosmic_ray_sigma", "cosmic_ray_contrast", "filter_size"):
+            if not getattr(self, name) > 0:
+                raise argument_error(name, "positive", getattr(self, name))
+        for name in ("skip_first", "skip_last"):
+            value = getattr(self, name)
+            if value < 0 or int(value) != value:
+                raise argument_error(name, "an integer of at least 0", value)
+        if self.box < 4:
+            raise argument_error("box", "at least 4", self.box)
+        for name in ("saturation", "pixfrac"):
+            if not 0 < getattr(self, name) <= 1:
+                raise argument_error(name, "above 0 and at most 1", getattr(self, name))
+        if self.n_threads is not None and self.n_threads < 1:
+            raise argument_error("n_threads", "at least 1 or None", self.n_threads)
+        if self.properties is not None and not isinstance(self.properties, DetectorProperties):
+            raise argument_error("properties", "a DetectorProperties", repr(self.properties))
+
+    replace = dataclasses.replace
+
+    @property
+    def _detector(self):
+        return miri_detector() if self.properties is None else self.properties
+
+    def fit_groups(self, ramp, *, progress_bar=False):
+        """
+        Fit the ramps of an exposure, with every plane of the result.
+
+        Parameters
+        ----------
+        ramp : `~miricigale.detector.Ramp`
+            Counts in DN.
+        progress_bar : bool, optional
+            Whether a progress bar is shown.
+
+        Returns
+        -------
+        fit : `RampFit`
+            Slope, Poisson and read variance, groups used, jumps, flags.
+
+        Raises
+        ------
+        ValueError
+            If fewer than two groups are left.
+        """
+        exposure, detector = ramp.exposure, self._detector
+        dq = np.asarray(ramp.pixel_dq)
+        reference = (dq & np.uint32(DQ.REFERENCE_PIXEL)) != 0
+        usable = (dq & np.uint32(_UNUSABLE)) == 0
+        n_group = ramp.data.shape[1]
+        if self.skip_first + self.skip_last > n_group - 2:
+            msg = f"at most {n_group - 2} groups together for {n_group} groups"
+            raise argument_error(
+                "skip_first, skip_last", msg, f"{self.skip_first}, {self.skip_last}"
+            )
+        drift = reference_drift(ramp.data, reference) if self.reference_correction else 0.0
+        factor = float(np.sum(detector.ipc_kernel**2)) if self._shares_charge(ramp) else 1.0
+        fit = fit_groups(
+            ramp.data,
+            group_time=float(exposure.group_time.to_value("s")),
+            gain=detector.gain,
+            read_noise=detector.read_noise,
+            bias=detector.bias + drift,
+            linearity=detector.nonlinearity,
+            saturation=detector.bias + self.saturation * detector.saturation_dn,
+            usable=usable,
+            first_group=self.skip_first,
+            last_group=n_group - self.skip_last,
+            jump_threshold=self.jump_threshold,
+            neighbour_threshold=self.neighbour_threshold,
+            poisson_factor=factor,
+            n_threads=self.n_threads,
+            progress_bar=progress_bar,
+        )
+        fit.flags[reference] |= np.uint32(PixelFlags.REFERENCE)
+        fit.flags[~usable & ~reference] |= np.uint32(PixelFlags.BAD_PIXEL)
+        return fit
+
+    def fit_ramp(self, ramp, *, progress_bar=False):
+        """
+        Fit the ramps of an exposure.
+
+        Parameters
+        ----------
+        ramp : `~miricigale.detector.Ramp`
+            Counts in DN.
+        progress_bar : bool, optional
+            Whether a progress bar is shown.
+
+        Returns
+        -------
+        rate : `~astropy.nddata.CCDData`
+            Slope in DN/s with standard deviation, mask, ``flags`` (`PixelFlags`) and WCS;
+            masked pixels without a slope are NaN. The meta dictionary has the exposure in
+            plain values, and ``noise_correction``: by how much the sum over many pixels is
+            noisier than their errors in quadrature, because neighbours share charge.
+        """
+        fit = self.fit_groups(ramp, progress_bar=progress_bar)
+        ipc = self._shares_charge(ramp)
+        meta = provenance(
+            **_plain(ramp.exposure),
+            n_jumps=len(fit.jumps),
+            ipc=ipc,
+            noise_correction=self._noise_correction(fit) if ipc else 1.0,
+            gain=self._detector.gain,
+        )
+        return image(
+            fit.rate, RATE, error=fit.error, flags=fit.flags, wcs=ramp.exposure.wcs, meta=meta
+        )
+
+    def calibrate(self, rate):
+        """
+        Turn slopes into surface brightness.
+
+        Dark subtraction, flat field, photometric conversion, mask of the field and of
+        residual cosmic rays. The background stays.
+
+        Parameters
+        ----------
+        rate : `~astropy.nddata.CCDData`
+            DN/s, from `fit_ramp` (its meta dictionary names filter and sub-array).
+
+        Returns
+        -------
+        cal : `~astropy.nddata.CCDData`
+            MJy/sr.
+        """
+        for key in ("filter", "subarray"):
+            if key not in rate.meta:
+                raise argument_error("rate", f"an image whose meta has {key!r}", "none")
+        detector = self._detector
+        options = {
+            "sigma_clip": self.cosmic_ray_sigma,
+            "object_limit": self.cosmic_ray_contrast,
+        }
+        return calibrate(
+            rate,
+            filter=rate.meta["filter"],
+            subarray=rate.meta["subarray"],
+            dark=detector.dark_current / detector.gain,
+            gain=detector.gain,
+            ipc_kernel=detector.ipc_kernel if rate.meta.get("ipc") else None,
+            field_only=self.field_only,
+            cosmic_rays=options if self.cosmic_rays else None,
+        )
+
+    def estimate_background(self, image):
+        """Estimate the background of an image: a `Background`."""
+        return estimate_background(
+            image,
+            box=self.box,
+            filter_size=self.filter_size,
+        )
+
+    def subtract_background(self, image):
+        """
+        Subtract the background and mask pixels far below it.
+
+        Parameters
+        ----------
+        image : `~astropy.nddata.CCDData`
+            A calibrated image or a mosaic.
+
+        Returns
+        -------
+        image : `~astropy.nddata.CCDData`
+        background : `Background`
+        """
+        return subtract_background(
+            image,
+            box=self.box,
+            filter_size=self.filter_size,
+            negative_threshold=self.negative_threshold,
+        )
+
+    def mosaic(self, images, wcs, *, pixfrac=None):
+        """
+        Drizzle images onto one grid.
+
+        Parameters
+        ----------
+        images : iterable of `~astropy.nddata.CCDData`
+            Calibrated, background-subtracted images. Outliers are masked first, if there
+            are three or more images and that was not done before.
+        wcs : `~astropy.wcs.WCS`
+            Of the output, with ``pixel_shape``.
+        pixfrac : float, optional
+            That of the settings if not given.
+
+        Returns
+        -------
+        mosaic : `~astropy.nddata.CCDData`
+            Surface brightness with standard deviation, WCS and a mask where there is no
+            data (and NaN there). The meta dictionary has ``n_exposures``,
+            ``exposure_time`` (s, sum), ``pa_aper`` (deg, list) and ``noise_correction``,
+            that of the inputs times that of the drizzle (`noise_correction`).
+        """
+        return self.drizzle(images, wcs, pixfrac=pixfrac)[0].image
+
+    def drizzle(self, images, wcs, *, pixfrac=None):
+        """
+        Drizzle images onto one grid, with every plane of the result.
+
+        Parameters are those of `mosaic`.
+
+        Returns
+        -------
+        mosaic : `Mosaic`
+        images : list of `~astropy.nddata.CCDData`
+            The inputs with outliers masked.
+        """
+        images = list(images)
+        for im in images:
+            if not isinstance(im, CCDData):
+                raise argument_error("images", "made of CCDData", type(im).__name__)
+        pixfrac = self.pixfrac if pixfrac is None else pixfrac
+        weights = [weight_map(im) for im in images]
+        maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
+        judged = all("n_outliers" in im.meta for im in images)
+        if self.outlier_threshold is not None and len(images) >= 3 and not judged:
+            images = reject_outliers(
+                images, wcs, threshold=self.outlier_threshold, weights=weights, pixel_maps=maps
+            )
+        result = drizzle_images(images, wcs, pixfrac=pixfrac, weights=weights, pixel_maps=maps)
+        return result, images
+
+    def run(self, ramps, *, wcs=None, pixel_scale=0.11 * ANGLE, progress_bar=False):
+        """
+        Reduce the dithers of one filter.
+
+        Parameters
+        ----------
+        ramps : iterable of `~miricigale.detector.Ramp`
+            One at a time is held if this is a generator.
+        wcs : `~astropy.wcs.WCS`, optional
+            Of the mosaic; by default the smallest north-up grid that holds
+            every unmasked pixel of the dithers.
+        pixel_scale : `~astropy.units.Quantity`, optional
+            Of that grid, if ``wcs`` is not given.
+        progress_bar : bool, optional
+            Whether a progress bar is shown.
+
+        Returns
+        -------
+        result : `ReductionResult`
+
+        Raises
+        ------
+        ValueError
+            If there are no ramps, or of more than one filter.
+        """
+        to_array(pixel_scale, ANGLE, "pixel_scale", ndim=0, finite=True)
+        rates, images, backgrounds = [], [], []
+        for ramp in progress(ramps, show=progress_bar, desc="reduce"):
+            if rates and ramp.exposure.filter != rates[0].meta["filter"]:
+                wanted = f"of one filter ({rates[0].meta['filter']})"
+                raise argument_error("ramps", wanted, ramp.exposure.filter)
+            rates.append(self.fit_ramp(ramp))
+            del ramp
+            subtracted, background = self.subtract_background(self.calibrate(rates[-1]))
+            images.append(subtracted)
+            backgrounds.append(background)
+        if not rates:
+            raise argument_error("ramps", "at least one ramp", "none")
+        if wcs is None:
+            wcs = mosaic_wcs([_seen(im) for im in images], pixel_scale)
+        drizzled, images = self.drizzle(images, wcs)
+        mosaic, mosaic_background = self.subtract_background(drizzled.image)
+        # the mosaic's own level would hide those of the dithers
+        mosaic.meta["mosaic_background"] = mosaic.meta.pop("background")
+        if "background" in drizzled.image.meta:
+            mosaic.meta["background"] = drizzled.image.meta["background"]
+        return ReductionResult(
+            tuple(rates),
+            tuple(images),
+            tuple(backgrounds),
+            mosaic,
+            drizzled.weight,
+            drizzled.n_images,
+            mosaic_background,
+        )
+
+    def _noise_correction(self, fit):
+        """Noise of large areas over that of pixels that share their charge."""
+        good = np.isfinite(fit.rate)
+        if not good.any():
+            return 1.0
+        photon, read = (float(np.median(v[good])) for v in (fit.var_poisson, fit.var_read))
+        shared = float(np.sum(self._detector.ipc_kernel**2))
+        return float(np.sqrt((photon / shared + read) / (photon + read)))
+
+    def _shares_charge(self, ramp):
+        """Whether the charge of this ramp was coupled between neighbours."""
+        if self.ipc is not None:
+            return bool(self.ipc)
+        effects = ramp.meta.get("effects")
+        if effects is None:
+            return True
+        return any(str(effect).startswith("InterpixelCapacitance") for effect in effects)
+
+
+def _plain(exposure):
+    """Fields of an exposure in values that fit a header."""
+    return {
+        "filter": exposure.filter,
+        "readout": exposure.readout,
+        "subarray": exposure.subarray,
+        "n_groups": exposure.n_groups,
+        "n_integrations": exposure.n_integrations,
+        "dither": exposure.dither,
+        "ra": float(exposure.pointing.ra.deg),
+        "dec": float(exposure.pointing.dec.deg),
+        "roll": float(exposure.roll.to_value("deg")),
+        "pa_aper": float(exposure.pa_aper.to_value("deg")),
+        "group_time": float(exposure.group_time.to_value("s")),
+        "exposure_time": float(exposure.exposure_time.to_value("s")),
+    }
+
+
+def _seen(im):
+    """WCS of the part of an image that holds its unmasked pixels, with its shape."""
+    good = ~np.asarray(im.mask)
+    rows, columns = (np.flatnonzero(good.any(axis=axis)) for axis in (1, 0))
+    if rows.size == 0:
+        rows, columns = (np.arange(n) for n in im.shape)
+    part = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+    wcs = im.wcs.slice(part)
+    wcs.pixel_shape = tuple(int(np.ptp(index)) + 1 for index in (columns, rows))
+    return wcs

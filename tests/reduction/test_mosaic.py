@@ -1,0 +1,254 @@
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData, StdDevUncertainty
+from reproject import reproject_exact
+
+from miricigale.instrument import imager_wcs, mosaic_wcs, north_up_wcs, pixel_area_map
+from miricigale.reduction import (
+    PixelFlags,
+    drizzle_images,
+    noise_correction,
+    pixel_map,
+    reject_outliers,
+    weight_map,
+)
+
+CENTER = SkyCoord(53.1344, -27.8344, unit="deg")
+FULL = (1024, 1032)
+
+
+def make(data, wcs, error=1.0, mask=None, **meta):
+    error = np.broadcast_to(np.float32(error), data.shape).copy()
+    return CCDData(
+        data, unit="MJy/sr", uncertainty=StdDevUncertainty(error), mask=mask, wcs=wcs, meta=meta
+    )
+
+
+def small_wcs(dx=0.0, dy=0.0, angle=30.0, shape=(150, 160)):
+    """A cut of the distorted imager, moved by pixels."""
+    wcs = imager_wcs(CENTER, angle * u.deg)
+    x0, y0 = 600, 420
+    cut = wcs.deepcopy()
+    cut.wcs.crpix = wcs.wcs.crpix - [x0, y0]
+    cut.sip = type(wcs.sip)(wcs.sip.a, wcs.sip.b, wcs.sip.ap, wcs.sip.bp, cut.wcs.crpix)
+    sky = wcs.pixel_to_world(wcs.wcs.crpix[0] - 1 + dx, wcs.wcs.crpix[1] - 1 + dy)
+    cut.wcs.crval = [sky.ra.deg, sky.dec.deg]
+    cut.pixel_shape = shape[::-1]
+    cut.wcs.set()
+    return cut
+
+
+def test_pixel_map_is_the_wcs():
+    inside, outside = (
+        imager_wcs(CENTER, 77 * u.deg),
+        north_up_wcs(CENTER, 0.06 * u.arcsec, (2700, 2700)),
+    )
+    x, y = pixel_map(inside, outside, FULL)
+    rng = np.random.default_rng(0)
+    ys, xs = rng.integers(0, 1024, 3000), rng.integers(0, 1032, 3000)
+    expected = outside.all_world2pix(*inside.all_pix2world(xs, ys, 0), 0)
+    np.testing.assert_allclose(x[ys, xs], expected[0], atol=1e-5)
+    np.testing.assert_allclose(y[ys, xs], expected[1], atol=1e-5)
+
+
+@pytest.mark.parametrize("scale", [0.06, 0.11])
+def test_agrees_with_reproject_exact(scale):
+    wcs = small_wcs()
+    data = np.random.default_rng(1).normal(size=(150, 160)) + 10
+    out = mosaic_wcs([wcs], scale * u.arcsec)
+    shape = out.pixel_shape[::-1]
+    mosaic = drizzle_images([make(data, wcs)], out)
+    expected, footprint = reproject_exact((data, wcs), out, shape_out=shape)
+    inner = footprint > 0.9999
+    assert inner.mean() > 0.4
+    np.testing.assert_allclose(mosaic.image.data[inner], expected[inner], atol=2e-3)
+    np.testing.assert_array_equal(mosaic.image.mask, np.isnan(mosaic.image.data))
+    assert np.all(mosaic.image.flags[mosaic.image.mask] == PixelFlags.NO_DATA)
+
+
+@pytest.mark.parametrize("scale", [0.06, 0.11])
+def test_flux_of_point_sources_is_conserved_through_the_distortion(scale):
+    rng = np.random.default_rng(5)
+    images, truth = [], None
+    sky = None
+    for step in range(3):
+        wcs = imager_wcs(SkyCoord(CENTER.ra + step * 1.1 * u.arcsec, CENTER.dec), 30 * u.deg)
+        if sky is None:
+            grid = np.mgrid[100:920:160, 100:920:160].reshape(2, -1)
+            sky = wcs.pixel_to_world(*(grid + rng.uniform(-5, 5, grid.shape)))
+            truth = rng.uniform(10, 100, grid.shape[1])
+        area = pixel_area_map(wcs, FULL)
+        data = np.zeros(FULL)
+        for x, y, flux in zip(*wcs.world_to_pixel(sky), truth, strict=True):
+            x0, y0 = round(float(x)), round(float(y))
+            part = np.s_[y0 - 12 : y0 + 13, x0 - 12 : x0 + 13]
+            yy, xx = np.mgrid[part]
+            stamp = np.exp(-0.5 * ((xx - x) ** 2 + (yy - y) ** 2) / 2.0**2)
+            # flux over solid angle: sum(brightness * area) is the flux
+            data[part] += flux * stamp / stamp.sum() / area[part]
+        images.append(make(data, wcs, error=1e3))
+    out = mosaic_wcs(images_wcs(images), scale * u.arcsec)
+    mosaic = drizzle_images(images, out)
+    light = np.nan_to_num(mosaic.image.data) * pixel_area_map(out, out.pixel_shape[::-1])
+    yy, xx = np.mgrid[: light.shape[0], : light.shape[1]]
+    for x, y, flux in zip(*out.world_to_pixel(sky), truth, strict=True):
+        half = round(2.2 / scale)
+        x0, y0 = round(float(x)), round(float(y))
+        part = np.s_[y0 - half : y0 + half + 1, x0 - half : x0 + half + 1]
+        assert light[part].sum() == pytest.approx(flux, rel=1e-3)
+        centre = np.average(xx[part], weights=light[part])
+        assert centre == pytest.approx(float(x), abs=0.02)
+
+
+def images_wcs(images):
+    """WCS of each image, with its shape."""
+    for im in images:
+        im.wcs.pixel_shape = im.shape[::-1]
+    return [im.wcs for im in images]
+
+
+def test_variances_are_those_of_many_draws():
+    rng = np.random.default_rng(6)
+    wcss = [small_wcs(dx, dy) for dx, dy in ((0, 0), (8.4, 3.3), (-5.7, 6.1))]
+    out = mosaic_wcs(wcss, 0.08 * u.arcsec)
+    errors = [rng.uniform(0.5, 2.0) * rng.uniform(0.8, 1.2, (150, 160)) for _ in wcss]
+    maps = [pixel_map(w, out, (150, 160)) for w in wcss]
+    total, total2, n = 0.0, 0.0, 60
+    for _ in range(n):
+        images = [
+            make(rng.normal(size=e.shape) * e, w, error=e)
+            for e, w in zip(errors, wcss, strict=True)
+        ]
+        mosaic = drizzle_images(images, out, pixel_maps=maps)
+        total = total + mosaic.image.data
+        total2 = total2 + mosaic.image.data.astype(float) ** 2
+    good = ~mosaic.image.mask
+    scatter2 = (total2 / n)[good]
+    predicted = mosaic.image.uncertainty.array[good] ** 2
+    assert np.mean(scatter2 / predicted) == pytest.approx(1, abs=0.02)
+    # weights are inverse variances
+    assert mosaic.n_images.max() == 3
+    single = drizzle_images(images[:1], out, pixel_maps=maps[:1])
+    assert np.median(mosaic.weight[mosaic.n_images == 3]) > np.median(
+        single.weight[single.weight > 0]
+    )
+
+
+def test_noise_correction_is_that_of_large_boxes():
+    rng = np.random.default_rng(7)
+    for scale in (0.06, 0.11):
+        wcs = small_wcs()
+        out = mosaic_wcs([wcs], scale * u.arcsec)
+        ratios = []
+        for _ in range(12):
+            image = drizzle_images([make(rng.normal(size=(150, 160)), wcs)], out).image
+            n = 24
+            ny, nx = (k // n * n for k in image.shape)
+            boxes = image.data[:ny, :nx].reshape(ny // n, n, nx // n, n).mean(axis=(1, 3))
+            errors = image.uncertainty.array[:ny, :nx].reshape(ny // n, n, nx // n, n)
+            errors = np.sqrt((errors**2).sum(axis=(1, 3))) / n**2
+            good = np.isfinite(boxes)
+            ratios += list(boxes[good] / errors[good])
+        assert np.std(ratios) == pytest.approx(image.meta["noise_correction"], rel=0.08)
+    assert noise_correction(1.0, 1.0) == pytest.approx(1.5)
+    assert noise_correction(1.0, 0.5) == pytest.approx(2.4)
+
+
+def test_masked_pixels_and_nan_have_no_weight():
+    wcs = small_wcs()
+    data = np.full((150, 160), 5.0)
+    mask = np.zeros(data.shape, bool)
+    data[70:75, 80:85], mask[70:75, 80:85] = 1e6, True
+    data[20, 20] = np.nan
+    mosaic = drizzle_images([make(data, wcs, mask=mask)], mosaic_wcs([wcs], 0.06 * u.arcsec))
+    good = ~mosaic.image.mask
+    np.testing.assert_allclose(mosaic.image.data[good], 5.0, rtol=1e-5)
+    x, y = mosaic.image.wcs.world_to_pixel(wcs.pixel_to_world(82, 72))
+    assert mosaic.image.mask[round(float(y)), round(float(x))]
+    assert np.all(mosaic.weight[~good] == 0)
+
+
+def test_weights_do_not_follow_the_data():
+    rng = np.random.default_rng(8)
+    wcs = small_wcs()
+    data = np.full((150, 160), 50.0)
+    data[60:70, 60:70] += 1000
+    images = []
+    for _ in range(4):
+        counts = rng.poisson(data).astype(float)
+        # errors as an observer has them, from the counts themselves
+        images.append(make(counts, wcs, error=np.sqrt(np.maximum(counts, 1))))
+    assert np.ptp(weight_map(images[0])) / weight_map(images[0]).mean() < 0.2
+    mosaic = drizzle_images(images, mosaic_wcs([wcs], 0.11 * u.arcsec)).image
+    sky = np.concatenate([mosaic.data[60:85, 60:120].ravel(), mosaic.data[110:120, 60:120].ravel()])
+    # 1/counts weights would lower the sky by 1
+    assert abs(sky.mean() - 50) < 0.3
+
+
+def test_outliers_are_masked_and_stars_are_not():
+    rng = np.random.default_rng(9)
+    shifts = ((0, 0), (8.4, 3.3), (-5.7, 6.1), (3.2, -7.6))
+    reference = small_wcs()
+    sky = reference.pixel_to_world(*rng.uniform(25, 125, (2, 25)))
+    peaks = 10 ** rng.uniform(1, 3.5, 25)
+    images, where = [], []
+    for shift in shifts:
+        wcs = small_wcs(*shift)
+        yy, xx = np.mgrid[:150, :160]
+        data = np.zeros((150, 160))
+        for x, y, peak in zip(*wcs.world_to_pixel(sky), peaks, strict=True):
+            data += peak * np.exp(-0.5 * ((xx - x) ** 2 + (yy - y) ** 2) / 0.95**2)
+        stars = data > 1
+        error = np.sqrt(1 + data / 50)
+        data = data + rng.normal(size=data.shape) * error
+        ys, xs = rng.integers(30, 120, (2, 20))
+        free = ~stars[ys, xs]
+        data[ys[free], xs[free]] += 20
+        where.append((ys[free], xs[free], stars))
+        images.append(make(data, wcs, error=error))
+    out = reject_outliers(images, mosaic_wcs([im.wcs for im in images], 0.11 * u.arcsec))
+    for im, (ys, xs, stars) in zip(out, where, strict=True):
+        flagged = (im.flags & np.uint32(PixelFlags.OUTLIER)) != 0
+        assert flagged[ys, xs].mean() > 0.9
+        np.testing.assert_array_equal(flagged, im.mask)
+        flagged[ys, xs] = False
+        assert flagged[stars].mean() < 0.002
+        assert flagged.sum() < 5
+        assert im.meta["n_outliers"] >= 0.9 * len(ys)
+    assert not any(im.mask is not None and np.any(im.mask) for im in images)
+    assert reject_outliers(images[:2], images[0].wcs) == images[:2]
+
+
+def test_meta_tells_of_the_inputs():
+    wcs = small_wcs()
+    images = [
+        make(np.zeros((150, 160)), wcs, exposure_time=100.0, pa_aper=34.8 + k, filter="miri.f770w")
+        for k in range(2)
+    ]
+    meta = drizzle_images(images, mosaic_wcs([wcs], 0.11 * u.arcsec)).image.meta
+    assert meta["n_exposures"] == 2
+    assert meta["exposure_time"] == 200.0
+    assert meta["pa_aper"] == [34.8, 35.8]
+    assert meta["filter"] == "miri.f770w"
+    assert meta["pixel_scale"] == pytest.approx(0.11)
+
+
+def test_refuses_what_cannot_be_put_together():
+    wcs = small_wcs()
+    good = make(np.zeros((150, 160)), wcs)
+    grid = mosaic_wcs([wcs], 0.11 * u.arcsec)
+    with pytest.raises(ValueError, match="'images' must be at least one image"):
+        drizzle_images([], grid)
+    other = CCDData(good.data, unit="Jy", wcs=wcs, uncertainty=StdDevUncertainty(good.data))
+    with pytest.raises(ValueError, match="'images' must be in one unit"):
+        drizzle_images([good, other], grid)
+    with pytest.raises(ValueError, match="'images' must be CCDData with uncertainty and WCS"):
+        drizzle_images([CCDData(good.data, unit="Jy")], grid)
+    with pytest.raises(ValueError, match="'pixfrac' must be above 0"):
+        drizzle_images([good], grid, pixfrac=0)
+    bare = grid.deepcopy()
+    bare.pixel_shape = None
+    with pytest.raises(ValueError, match="'wcs' must be a WCS with a pixel_shape"):
+        drizzle_images([good], bare)

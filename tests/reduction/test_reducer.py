@@ -1,0 +1,260 @@
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData, StdDevUncertainty
+from scipy.ndimage import convolve
+
+from miricigale.detector import Detector
+from miricigale.instrument import (
+    DetectorProperties,
+    Exposure,
+    background_level,
+    field_mask,
+    flat_field,
+    miri_detector,
+    mosaic_wcs,
+    photmjsr,
+    pixel_area_map,
+)
+from miricigale.reduction import PixelFlags, Reducer, ReductionResult
+
+FILTER = "miri.f1000w"
+SKY = background_level(FILTER).value
+
+
+def exposure(dither=0, *, filt=FILTER, subarray="SUB256", **options):
+    x, y = [(0, 0), (2.13, 1.27), (-1.71, 2.42), (1.1, -2.2)][dither]
+    pointing = SkyCoord(53.1344 + x / 3600, -27.8344 + y / 3600, unit="deg")
+    options = {"n_groups": 40, "n_integrations": 1, **options}
+    return Exposure(
+        filt, subarray=subarray, pointing=pointing, roll=30 * u.deg, dither=dither, **options
+    )
+
+
+def expose(light, exp, *, seed=1, **options):
+    image = CCDData(np.broadcast_to(light, exp.shape).copy(), unit="MJy/sr")
+    return Detector.miri_imager(**options).expose(image, exp, seed=seed, n_threads=1)
+
+
+def expected_rate(exp, sky, *, ipc=True):
+    flat = flat_field(exp.filter, subarray=exp.subarray)
+    if ipc:
+        flat = convolve(flat, miri_detector().ipc_kernel, mode="nearest")
+    detector = miri_detector()
+    return sky / photmjsr(exp.filter) * flat + detector.dark_current / detector.gain
+
+
+@pytest.mark.parametrize(
+    ("filt", "n_groups", "n_integrations", "sky"),
+    [
+        (FILTER, 40, 1, SKY),
+        ("miri.f560w", 2, 1, 1.0),
+        ("miri.f560w", 40, 1, 0.01),
+        ("miri.f2100w", 10, 4, 257.0),
+    ],
+)
+def test_pulls_of_simulated_exposures(filt, n_groups, n_integrations, sky):
+    exp = exposure(filt=filt, n_groups=n_groups, n_integrations=n_integrations)
+    rate = Reducer().fit_ramp(expose(sky, exp))
+    # where light is coupled in from outside the frame there is no truth
+    good = ~rate.mask
+    good[[0, -1]] = good[:, [0, -1]] = False
+    truth = expected_rate(exp, sky)
+    pull = ((rate.data - truth) / rate.uncertainty.array)[good]
+    assert 0.95 < pull.std() < 1.05
+    mean_error = rate.uncertainty.array[good].mean() / np.sqrt(good.sum())
+    bias = (rate.data - truth)[good].mean()
+    assert abs(bias) < max(1e-3 * truth.mean(), 5 * mean_error)
+
+
+def test_flags_tell_why(tmp_path):
+    exp = exposure(subarray="FULL", n_groups=3)
+    ramp = expose(SKY, exp)
+    reducer = Reducer(cosmic_rays=False)
+    rate = reducer.fit_ramp(ramp)
+    cal = reducer.calibrate(rate)
+    for image in (rate, cal):
+        why = image.flags
+        assert np.all(why[:, :4] & np.uint32(PixelFlags.REFERENCE))
+        bad = (why & np.uint32(PixelFlags.BAD_PIXEL)) != 0
+        assert 5e-4 < bad.mean() < 2e-3
+        assert np.all(np.isnan(rate.data[bad]))
+        # nothing is masked without a reason
+        assert np.all(why[image.mask] != 0)
+    assert np.all(cal.mask[~field_mask()])
+    assert rate.unit == "adu / s"
+    assert cal.unit == "MJy / sr"
+    assert rate.wcs is not None
+    assert rate.meta["filter"] == FILTER
+    assert rate.meta["pa_aper"] == pytest.approx(exp.pa_aper.value)
+    assert rate.meta["exposure_time"] == pytest.approx(exp.exposure_time.value)
+    good = ~cal.mask
+    assert np.median(cal.data[good]) == pytest.approx(SKY, rel=5e-3)
+
+
+def stars(exp, positions, fluxes, *, width=1.2):
+    """Gaussian stars, uJy, in MJy/sr."""
+    ny, nx = exp.shape
+    light = np.zeros(exp.shape)
+    area = pixel_area_map(exp.wcs, exp.shape)
+    yy, xx = np.mgrid[:ny, :nx]
+    for x, y, flux in zip(*exp.wcs.world_to_pixel(positions), fluxes, strict=True):
+        stamp = np.exp(-0.5 * ((xx - x) ** 2 + (yy - y) ** 2) / width**2)
+        light += flux * 1e-12 * stamp / stamp.sum() / area
+    return light
+
+
+@pytest.fixture(scope="module")
+def field():
+    exps = [exposure(d) for d in range(4)]
+    grid = np.mgrid[60:200:44, 60:200:44].reshape(2, -1).astype(float)
+    grid += np.random.default_rng(2).uniform(-4, 4, grid.shape)
+    positions = exps[0].wcs.pixel_to_world(*grid)
+    fluxes = np.full(grid.shape[1], 30.0)
+    ramps = [expose(SKY + stars(e, positions, fluxes), e) for e in exps]
+    return exps, positions, fluxes, ramps
+
+
+def test_the_whole_way_keeps_fluxes_and_errors(field):
+    exps, positions, fluxes, ramps = field
+    result = Reducer().run(iter(ramps))
+    assert isinstance(result, ReductionResult)
+    assert result.filter == FILTER
+    mosaic = result.mosaic
+    assert mosaic.unit == "MJy / sr"
+    assert mosaic.meta["n_exposures"] == 4
+    assert mosaic.meta["exposure_time"] == pytest.approx(sum(e.exposure_time.value for e in exps))
+    assert mosaic.meta["pa_aper"] == [e.pa_aper.value for e in exps]
+    np.testing.assert_array_equal(mosaic.mask, (result.weight == 0) | np.isnan(mosaic.data))
+    for background in result.backgrounds:
+        assert np.median(background.level) == pytest.approx(SKY, rel=2e-3)
+
+    area = pixel_area_map(mosaic.wcs, mosaic.shape)
+    yy, xx = np.mgrid[: mosaic.shape[0], : mosaic.shape[1]]
+    measured, error = [], []
+    for x, y in zip(*mosaic.wcs.world_to_pixel(positions), strict=True):
+        inside = np.hypot(xx - x, yy - y) < 8
+        assert not mosaic.mask[inside].any()
+        measured.append((mosaic.data * area)[inside].sum() * 1e12)
+        sigma = np.sqrt(((mosaic.uncertainty.array * area)[inside] ** 2).sum()) * 1e12
+        error.append(sigma * mosaic.meta["noise_correction"])
+    pull = (np.array(measured) - fluxes) / error
+    # also no star has lost its core to the search for cosmic rays
+    assert np.abs(pull).max() < 4
+    assert np.mean(measured) == pytest.approx(30.0, abs=4 * np.mean(error) / np.sqrt(len(error)))
+    assert np.mean(error) < 0.03 * 30
+
+    blank = (result.n_images == 4) & ~mosaic.mask & ~result.mosaic_background.source_mask
+    for x, y in zip(*mosaic.wcs.world_to_pixel(positions), strict=True):
+        blank &= np.hypot(xx - x, yy - y) > 10
+    pull = (mosaic.data / mosaic.uncertainty.array)[blank]
+    # neighbours share charge, and drizzle puts them together
+    assert 0.97 < pull.std() < 1.1
+
+
+def test_the_fine_mosaic_has_the_same_light(field):
+    exps, positions, _, ramps = field
+    reducer = Reducer(outlier_threshold=None)
+    result = reducer.run(ramps[:2], pixel_scale=0.11 * u.arcsec)
+    fine = reducer.mosaic(result.images, mosaic_wcs(exps[:2], 0.06 * u.arcsec))
+    sums = []
+    for mosaic in (result.mosaic, fine):
+        area = pixel_area_map(mosaic.wcs, mosaic.shape)
+        x, y = (float(v) for v in mosaic.wcs.world_to_pixel(positions[5]))
+        yy, xx = np.mgrid[: mosaic.shape[0], : mosaic.shape[1]]
+        inside = np.hypot(xx - x, yy - y) * mosaic.meta["pixel_scale"] < 0.9
+        sums.append((mosaic.data * area)[inside].sum() * 1e12)
+    assert sums[1] == pytest.approx(sums[0], rel=0.01)
+
+
+def test_settings_do_not_change_and_results_do_not_depend_on_threads(field):
+    ramps = field[3]
+    one = Reducer(n_threads=1)
+    with pytest.raises(AttributeError):
+        one.jump_threshold = 3.0
+    a, b = one.fit_ramp(ramps[0]), one.replace(n_threads=4).fit_ramp(ramps[0])
+    np.testing.assert_array_equal(a.data, b.data)
+    np.testing.assert_array_equal(a.uncertainty.array, b.uncertainty.array)
+    np.testing.assert_array_equal(a.flags, b.flags)
+
+
+def test_subarrays_beside_the_field_are_not_masked_away():
+    exp = exposure(subarray="SUB64", n_groups=5)
+    reducer = Reducer()
+    cal = reducer.calibrate(reducer.fit_ramp(expose(SKY, exp)))
+    assert cal.mask.mean() < 0.2
+    assert np.median(cal.data[~cal.mask]) == pytest.approx(SKY, rel=0.1)
+
+
+def test_charge_sharing_is_as_the_ramp_says():
+    exp = exposure()
+    image = CCDData(np.full(exp.shape, SKY), unit="MJy/sr", meta={"psf_includes": ["ipc"]})
+    ramp = Detector.miri_imager().expose(image, exp, seed=1, n_threads=1)
+    rate = Reducer().fit_ramp(ramp)
+    assert rate.meta["ipc"] is False
+    assert rate.meta["noise_correction"] == 1.0
+    good = ~rate.mask
+    pull = ((rate.data - expected_rate(exp, SKY, ipc=False)) / rate.uncertainty.array)[good]
+    assert 0.97 < pull.std() < 1.03
+    assert Reducer(ipc=True).fit_ramp(ramp).meta["ipc"] is True
+
+
+def test_saturated_stars_are_used_or_masked_with_the_reason():
+    exp = exposure(n_groups=20)
+    light = np.full(exp.shape, SKY)
+    light[100, 100] = 1e4
+    light[150, 150] = 1e5
+    rate = Reducer().fit_ramp(expose(light, exp, cosmic_rays=False, bad_pixels=False))
+    assert rate.flags[100, 100] & np.uint32(PixelFlags.SATURATED)
+    assert not rate.mask[100, 100]
+    assert rate.flags[150, 150] & np.uint32(PixelFlags.FULLY_SATURATED)
+    assert rate.mask[150, 150]
+    kernel = miri_detector().ipc_kernel
+    spread = convolve(light * flat_field(FILTER, subarray="SUB256"), kernel, mode="nearest")
+    truth = spread / photmjsr(FILTER) + 0.05
+    error = rate.uncertainty.array[100, 100]
+    # a core has the full photon noise of its own light, less what its neighbours share
+    assert abs(rate.data[100, 100] - truth[100, 100]) < 5 * error
+
+
+def test_groups_can_be_left_out():
+    exp = exposure(n_groups=8)
+    ramp = expose(SKY, exp, cosmic_rays=False)
+    fit = Reducer(skip_first=2, skip_last=1).fit_groups(ramp)
+    assert fit.n_used.max() == 4
+    with pytest.raises(ValueError, match="'skip_first, skip_last' must be at most 6 groups"):
+        Reducer(skip_first=4, skip_last=3).fit_groups(ramp)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"backend": "magic"}, "'backend' must be 'native', got 'magic'"),
+        ({"jump_threshold": 0}, "'jump_threshold' must be positive or None"),
+        ({"saturation": 1.5}, "'saturation' must be above 0 and at most 1"),
+        ({"box": 1}, "'box' must be at least 4"),
+        ({"skip_first": -1}, "'skip_first' must be an integer of at least 0"),
+        ({"cosmic_ray_sigma": 0}, "'cosmic_ray_sigma' must be positive"),
+        ({"n_threads": 0}, "'n_threads' must be at least 1 or None"),
+        ({"properties": 3}, "'properties' must be a DetectorProperties"),
+    ],
+)
+def test_bad_settings_are_named(options, match):
+    with pytest.raises(ValueError, match=match):
+        Reducer(**options)
+
+
+def test_refuses_what_does_not_belong_together():
+    reducer = Reducer(properties=DetectorProperties())
+    with pytest.raises(ValueError, match="'ramps' must be at least one ramp"):
+        reducer.run([])
+    ramps = [
+        expose(5.0, exposure(n_groups=2, filt=f), cosmic_rays=False)
+        for f in ("miri.f770w", "miri.f1000w")
+    ]
+    with pytest.raises(ValueError, match=r"'ramps' must be of one filter \(miri.f770w\)"):
+        reducer.run(ramps)
+    bare = CCDData(np.ones((4, 4)), unit="adu / s", uncertainty=StdDevUncertainty(np.ones((4, 4))))
+    with pytest.raises(ValueError, match="'rate' must be an image whose meta has 'filter'"):
+        reducer.calibrate(bare)
