@@ -229,6 +229,12 @@ class StudyConfig:
         if len(set(self.exposures.filters)) != len(self.exposures.filters):
             msg = f"[exposures] filters must not repeat, got {list(self.exposures.filters)}"
             raise ConfigError(msg)
+        if self.fit.min_detected > len(self.exposures.filters):
+            msg = (
+                f"[fit] min_detected must be at most the number of MIRI filters "
+                f"({len(self.exposures.filters)}), got {self.fit.min_detected}"
+            )
+            raise ConfigError(msg)
         if len(self.fit.bands) != len(self.fit.depths):
             msg = (
                 f"[fit] depths must have one number per band ({len(self.fit.bands)}), "

@@ -26,8 +26,8 @@ def disk_use(config):
     total = 20_000_000  # tables, fits, report
     for exposure in exposures.values():
         pixels = math.prod(exposure.shape)
-        # rate and cal: data, error (float32) and mask
-        total += 2 * 9 * pixels
+        # rate and cal: data, error, flags (32 bits each) and mask
+        total += 2 * 13 * pixels
         if config.run.keep_level1b:
             # counts, and the planes that only a simulation knows
             total += 2 * pixels * exposure.n_groups * exposure.n_integrations + 8 * pixels

@@ -23,7 +23,10 @@ def test_the_configuration_can_be_printed_and_given_back(capsys, tmp_path):
         (["run", "absent.toml"], "no configuration file absent.toml"),
         (["fit", "absent.ecsv"], "no table absent.ecsv"),
         (["data", "add", "nothing", "x"], "no resource 'nothing'; known:"),
-        (["photometry", "a.fits", "b.fits", "--filter", "miri.f770w", "--pa-aper", "0"], "no image"),
+        (
+            ["photometry", "a.fits", "b.fits", "--filter", "miri.f770w", "--pa-aper", "0"],
+            "no image",
+        ),
     ],
 )
 def test_what_cannot_be_used_is_one_sentence_on_stderr(

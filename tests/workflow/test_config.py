@@ -29,6 +29,10 @@ def test_presets_are_listed_without_their_variants():
         ("[fit]\naxes = 'huge'\n", r"\[fit\] axes must be one of \['fit', 'quick'\], got 'huge'"),
         ("[fit]\nbands = ['acs.f606w']\n", r"\[fit\] depths must have one number per band \(1\)"),
         ("[exposures]\nfilters = []\n", "at least one filter"),
+        (
+            "[fit]\nmin_detected = 7\n",
+            r"min_detected must be at most the number of MIRI filters \(6\)",
+        ),
         ("[exposures]\nfilters = ['miri.f770w', 'miri.f770w']\n", "must not repeat"),
         (
             "[exposures]\nn_groups = [10]\n",

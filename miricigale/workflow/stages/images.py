@@ -147,8 +147,8 @@ def make_exposure(context, unit):
         seed=context.seed,
         keep=keep if config.run.keep_level1b else None,
     )
-    context.save_image(f"exposures/{unit}_rate.fits", rate)
-    context.save_image(f"exposures/{unit}_cal.fits", cal)
+    for label, image in (("rate", rate), ("cal", cal)):
+        context.save_image(f"exposures/{unit}_{label}.fits", image, dq=image.flags)
 
 
 def grid_of(config, pixel_scale):
@@ -163,9 +163,10 @@ def make_mosaic(context, name):
     units = [unit for unit, e in study_exposures(config).items() if e.filter == name]
     images = [context.image(f"exposures/{unit}_cal.fits") for unit in units]
     for label, scale in (("", config.reduction.pixel_scale), ("_fine", config.highres.pixel_scale)):
-        mosaic = reducer.mosaic(images, grid_of(config, scale))
+        # outliers are found once: the images come back with them masked
+        drizzled, images = reducer.drizzle(images, grid_of(config, scale))
         # the second pass: what the dithers' own meshes left
-        mosaic, _ = reducer.subtract_background(mosaic)
+        mosaic, _ = reducer.subtract_background(drizzled.image)
         context.save_image(f"mosaic_{name}{label}.fits", mosaic)
 
 

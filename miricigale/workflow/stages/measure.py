@@ -35,7 +35,8 @@ def read_segmentation(path):
 def measure_photometry(context, name):
     """Stage 11: forced photometry of one band on its own grid."""
     kernel = MatchingKernel.read(context.path(f"kernel_{name}.fits"))
-    result = ForcedPhotometer(kernel).measure(
+    # a constant takes up what faint sources and wings left in the background
+    result = ForcedPhotometer(kernel, fit_background=True).measure(
         context.image(f"mosaic_{name}.fits"),
         context.image("f160w.fits"),
         read_segmentation(context.path("segm.fits")),

@@ -96,7 +96,7 @@ def measure_point_sources(context, name):
     segmentation, detected = detect_sources(
         highres, threshold=config.photometry.threshold, min_area=config.photometry.min_area
     )
-    result = ForcedPhotometer(kernel_of(config, name)).measure(
+    result = ForcedPhotometer(kernel_of(config, name), fit_background=True).measure(
         mosaic, highres, segmentation, detected
     )
     table = catalog["id", "sky"]

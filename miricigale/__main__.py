@@ -1,0 +1,7 @@
+"""``python -m miricigale``."""
+
+import sys
+
+from miricigale.cli import main
+
+sys.exit(main())

@@ -1,0 +1,204 @@
+"""Aperture photometry in the manner of Source Extractor, to compare forced photometry with."""
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+from photutils.aperture import CircularAperture
+from photutils.background import LocalBackground
+from photutils.segmentation import SourceCatalog
+
+from miricigale.photometry.arrays import image_arrays, pixel_scale
+from miricigale.photometry.detection import detect_sources
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.meta import provenance
+from miricigale.utils.sep_tools import background as sep_background
+from miricigale.utils.units import ANGLE, FNU, to_array
+
+__all__ = ["aperture_photometry", "source_extractor_photometry"]
+
+
+def aperture_photometry(image, sky, diameter, *, local_background=None):
+    """
+    Sum light in circles.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        In units of surface brightness, with WCS.
+    sky : `~astropy.coordinates.SkyCoord`, shape (n,)
+        Positions.
+    diameter : `~astropy.units.Quantity`
+        Of the aperture.
+    local_background : `~astropy.units.Quantity`, optional
+        Width of an annulus just outside the aperture whose sigma-clipped median is
+        subtracted.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        ``flux`` and ``flux_err`` (uJy; for noise that is not correlated) and ``coverage``, the
+        fraction of the aperture on usable pixels. NaN where that is zero.
+
+    Raises
+    ------
+    ValueError
+        If the diameter is not positive.
+    """
+    arrays = image_arrays(image, "image")
+    size = float(to_array(diameter, ANGLE, "diameter"))
+    if not size > 0:
+        raise argument_error("diameter", "positive", diameter)
+    scale = pixel_scale(image.wcs)
+    radius = size / 2 / scale
+    xy = np.stack(arrays.wcs.world_to_pixel(sky), axis=-1).reshape(-1, 2)
+    flux, flux_err, coverage = _circle_sums(arrays, xy, radius)
+    if local_background is not None:
+        width = float(to_array(local_background, ANGLE, "local_background")) / scale
+        level = _annulus_levels(arrays, xy, radius, width)
+        flux = flux - level * np.pi * radius**2 * coverage
+    table = QTable({"flux": flux * FNU, "flux_err": flux_err * FNU, "coverage": coverage})
+    table["flux"].info.description = f"Light in a circle of {size:.4g} arcsec diameter"
+    table["flux_err"].info.description = "Its error for noise that is not correlated"
+    table["coverage"].info.description = "Fraction of the aperture on usable pixels"
+    return table
+
+
+def _circle_sums(arrays, xy, radius):
+    """Flux, error and usable fraction in circles, exact in the pixels that they cut."""
+    n = len(xy)
+    if n == 0:
+        return np.empty(0), np.empty(0), np.empty(0)
+    aperture = CircularAperture(np.nan_to_num(xy, nan=-1e6), radius)
+    variance = np.where(arrays.usable, arrays.sigma, 0.0) ** 2
+    sums = [
+        np.atleast_1d(aperture.do_photometry(image)[0])
+        for image in (arrays.flux, variance, arrays.usable.astype(float))
+    ]
+    coverage = np.nan_to_num(sums[2]) / aperture.area
+    empty = coverage <= 0
+    flux, noise = (np.where(empty, np.nan, values) for values in sums[:2])
+    return flux, np.sqrt(noise), coverage
+
+
+def _annulus_levels(arrays, xy, radius, width):
+    """Median flux per pixel in rings from ``radius`` to ``radius + width`` pixels."""
+    estimate = LocalBackground(radius, radius + width)
+    levels = np.zeros(len(xy))
+    ny, nx = arrays.flux.shape
+    reach = radius + width
+    for k, (x, y) in enumerate(xy):
+        if -reach < x < nx + reach and -reach < y < ny + reach:
+            level = float(np.squeeze(estimate(arrays.flux, x, y, mask=~arrays.usable)))
+            levels[k] = level if np.isfinite(level) else 0.0
+    return levels
+
+
+def source_extractor_photometry(
+    image,
+    *,
+    preset="yang2021_miri",
+    threshold=None,
+    min_area=None,
+    diameter=1.86 * u.arcsec,
+    kron=(2.5, 3.5),
+    aperture_fraction=0.8,
+    auto_fraction=0.94,
+    background_box=64,
+    background_filter=6,
+    local_background=40,
+):
+    """
+    Detect and measure on one image, blind, as Source Extractor does.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        In units of surface brightness, with WCS.
+    preset, threshold, min_area : optional
+        See `~miricigale.photometry.detect_sources`.
+    diameter : `~astropy.units.Quantity`, optional
+        Of the circular aperture; 31 pixels of 0.06 arcsec by default.
+    kron : (float, float), optional
+        Source Extractor's PHOT_AUTOPARAMS: factor on the Kron radius, and least scaled radius.
+    aperture_fraction, auto_fraction : float, optional
+        Light of a point source in the circle and in the AUTO ellipse.
+    background_box, background_filter : int, optional
+        BACK_SIZE in pixels and BACK_FILTERSIZE in boxes.
+    local_background : int, optional
+        Width of the ring for the local background in pixels, 0 for none.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        The detections, with ``flux_auto``, ``flux_auto_err``, ``flux_aper``, ``flux_aper_err`` as
+        measured, and ``flux_best``, ``flux_best_err``: the brighter of the two after each is
+        divided by its fraction.
+
+    References
+    ----------
+    Yang et al. 2021, ApJ 908, 144, appendix (the settings); Bertin & Arnouts 1996.
+    """
+    for name, value in (
+        ("aperture_fraction", aperture_fraction),
+        ("auto_fraction", auto_fraction),
+    ):
+        if not 0 < value <= 1:
+            raise argument_error(name, "above 0 and at most 1", value)
+    segmentation, catalog = detect_sources(
+        image,
+        preset=preset,
+        threshold=threshold,
+        min_area=min_area,
+        subtract_background=True,
+        box=background_box,
+        filter_size=background_filter,
+    )
+    arrays = image_arrays(image, "image")
+    level, _ = sep_background(arrays.flux, ~arrays.usable, background_box, background_filter)
+    flux = arrays.flux - np.where(arrays.usable, level, 0.0)
+    names = ("flux_auto", "flux_auto_err", "flux_aper", "flux_aper_err")
+    if len(catalog) == 0:
+        values = [np.empty(0)] * 4
+    else:
+        values = _measure(
+            arrays, flux, segmentation, catalog, diameter, kron, local_background, image.wcs
+        )
+    for name, value in zip(names, values, strict=True):
+        catalog[name] = value * FNU
+    auto, auto_err, aper, aper_err = values
+    brighter = np.nan_to_num(auto, nan=-np.inf) / auto_fraction > aper / aperture_fraction
+    catalog["flux_best"] = np.where(brighter, auto / auto_fraction, aper / aperture_fraction) * FNU
+    catalog["flux_best_err"] = (
+        np.where(brighter, auto_err / auto_fraction, aper_err / aperture_fraction) * FNU
+    )
+    descriptions = {
+        "flux_auto": "Light in the Kron ellipse",
+        "flux_aper": "Light in the circle",
+        "flux_best": "Brighter of the two after correction to total",
+    }
+    for name, text in descriptions.items():
+        catalog[name].info.description = text
+        catalog[f"{name}_err"].info.description = "Error for noise that is not correlated"
+    catalog.meta.update(provenance(preset=preset))
+    return catalog
+
+
+def _measure(arrays, flux, segmentation, catalog, diameter, kron, local_background, wcs):
+    sigma = np.where(arrays.usable, arrays.sigma, 0.0)
+    sources = SourceCatalog(
+        flux,
+        segmentation,
+        error=sigma,
+        mask=~arrays.usable,
+        local_bkg_width=int(local_background),
+        kron_params=(kron[0], kron[1] / kron[0], 0.0),
+    )
+    auto, auto_err = (np.atleast_1d(v) for v in (sources.kron_flux, sources.kron_flux_err))
+    radius = float(to_array(diameter, ANGLE, "diameter")) / 2 / pixel_scale(wcs)
+    xy = np.stack([catalog["x"], catalog["y"]], axis=-1)
+    shifted = type(arrays)(flux, sigma, arrays.usable, arrays.area, wcs, arrays.measured_noise)
+    aper, aper_err, coverage = _circle_sums(shifted, xy, radius)
+    if local_background:
+        ring = _annulus_levels(shifted, xy, radius, int(local_background))
+        aper = aper - ring * np.pi * radius**2 * coverage
+    return auto, auto_err, aper, aper_err

@@ -1,0 +1,191 @@
+"""From images with units and coordinates to the plain arrays that photometry works on."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+from astropy.nddata import CCDData, StdDevUncertainty
+from astropy.stats import mad_std
+from astropy.wcs.utils import pixel_to_pixel, proj_plane_pixel_scales
+
+from miricigale.instrument import north_up_wcs, pixel_area_map
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
+
+__all__ = ["ImageArrays", "fine_wcs", "image_arrays", "local_maps", "pixel_scale", "sky_pixels"]
+
+#: uJy per MJy.
+_MICRO = 1e12
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ImageArrays:
+    """
+    An image as arrays of flux per pixel.
+
+    Attributes
+    ----------
+    flux, sigma : `~numpy.ndarray`, shape (ny, nx)
+        Data and noise in uJy per pixel; zero and infinite where not usable.
+    usable : bool `~numpy.ndarray`, shape (ny, nx)
+        False where masked, not finite or without noise.
+    area : `~numpy.ndarray`, shape (ny, nx)
+        uJy per MJy/sr: the solid angle of each pixel.
+    wcs : `~astropy.wcs.WCS`
+        The image's coordinates.
+    measured_noise : bool
+        Whether sigma was measured on the image for want of an uncertainty.
+    """
+
+    flux: np.ndarray
+    sigma: np.ndarray
+    usable: np.ndarray
+    area: np.ndarray
+    wcs: object
+    measured_noise: bool
+
+    @property
+    def inverse_sigma(self):
+        """1 / sigma, zero where not usable."""
+        return np.where(self.usable, 1.0 / self.sigma, 0.0)
+
+
+def image_arrays(image, name):
+    """
+    Take a `~astropy.nddata.CCDData` apart.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        Two-dimensional, in units of surface brightness, with a celestial WCS. Without an
+        uncertainty the noise is 1.4826 times the median absolute deviation of the image.
+    name : str
+        The argument's name, for messages.
+
+    Returns
+    -------
+    arrays : `ImageArrays`
+
+    Raises
+    ------
+    TypeError
+        If it is no CCDData.
+    ValueError
+        If it is not two-dimensional or has no celestial WCS or no usable pixel.
+    `~astropy.units.UnitsError`
+        If the unit is not one of surface brightness.
+    """
+    if not isinstance(image, CCDData):
+        msg = f"'{name}' must be a CCDData, got {type(image).__name__}"
+        raise TypeError(msg)
+    if image.data.ndim != 2:
+        raise argument_error(name, "a two-dimensional image", f"shape {image.data.shape}")
+    if image.wcs is None or not image.wcs.has_celestial:
+        raise argument_error(name, "an image with a celestial WCS", "one without")
+    data = to_array(image.data * image.unit, SURFACE_BRIGHTNESS, name)
+    factor = (1 * image.unit).to_value(SURFACE_BRIGHTNESS)
+    usable = np.isfinite(data)
+    if image.mask is not None:
+        usable &= ~np.asarray(image.mask, bool)
+    if image.uncertainty is None:
+        noise = mad_std(data[usable]) if usable.any() else 0.0
+        noise = np.full(data.shape, noise)
+    else:
+        noise = image.uncertainty.represent_as(StdDevUncertainty)
+        scale = factor if noise.unit is None else (1 * noise.unit).to_value(SURFACE_BRIGHTNESS)
+        noise = np.asarray(noise.array, float) * scale
+    usable &= np.isfinite(noise) & (noise > 0)
+    if not usable.any():
+        raise argument_error(name, "an image with usable pixels", "none (masked, NaN or no noise)")
+    area = pixel_area_map(image.wcs, data.shape) * _MICRO
+    return ImageArrays(
+        flux=np.where(usable, data, 0.0) * area,
+        sigma=np.where(usable, noise * area, np.inf),
+        usable=usable,
+        area=area,
+        wcs=image.wcs,
+        measured_noise=image.uncertainty is None,
+    )
+
+
+def pixel_scale(wcs):
+    """Mean pixel scale of a WCS at its reference, in arcsec."""
+    return float(np.sqrt(np.prod(proj_plane_pixel_scales(wcs.celestial))) * 3600.0)
+
+
+def fine_wcs(image_wcs, shape, scale):
+    """North-up grid of pixels of ``scale`` arcsec about the middle of an image."""
+    middle = image_wcs.pixel_to_world((shape[1] - 1) / 2, (shape[0] - 1) / 2).icrs
+    return north_up_wcs(middle, scale * u.arcsec, (1, 1))
+
+
+def sky_pixels(sky, wcs, shape, margin):
+    """
+    Pixel positions of those coordinates that are on or near an image.
+
+    Parameters
+    ----------
+    sky : `~astropy.coordinates.SkyCoord`, shape (n,)
+        Positions.
+    wcs : `~astropy.wcs.WCS`
+        The image's coordinates.
+    shape : (int, int)
+        The image's shape.
+    margin : float
+        Rim in pixels.
+
+    Returns
+    -------
+    xy : `~numpy.ndarray`, shape (n, 2)
+        NaN for positions outside of the image and its rim.
+    """
+    xy = np.full((len(sky), 2), np.nan)
+    ny, nx = shape
+    middle = wcs.pixel_to_world((nx - 1) / 2, (ny - 1) / 2)
+    radius = 1.05 * (np.hypot(nx, ny) / 2 + margin) * pixel_scale(wcs)
+    near = sky.separation(middle).arcsec < radius
+    if near.any():
+        xy[near] = np.stack(wcs.world_to_pixel(sky[near]), axis=-1)
+    low = -0.5 - margin
+    x, y = xy.T
+    # a NaN fails every comparison
+    inside = (x > low) & (x < nx - 1 - low) & (y > low) & (y < ny - 1 - low)
+    xy[~inside] = np.nan
+    return xy
+
+
+def local_maps(xy, half, image_wcs, grid_wcs):
+    """
+    Quadratic maps from pixel offsets on an image to positions on a finer grid.
+
+    Parameters
+    ----------
+    xy : `~numpy.ndarray`, shape (n, 2)
+        Image positions about which the maps expand.
+    half : `~numpy.ndarray`, shape (n,)
+        Offset in pixels at which the map is exact.
+    image_wcs, grid_wcs : `~astropy.wcs.WCS`
+        The two grids.
+
+    Returns
+    -------
+    poly : `~numpy.ndarray`, shape (n, 2, 6)
+        Coefficients of 1, u, v, u^2, u v, v^2 for x and y on the grid.
+    """
+    step = np.maximum(np.asarray(half, float), 2.0)
+    u3, v3 = np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0])
+    x = xy[:, 0, None, None] + step[:, None, None] * u3
+    y = xy[:, 1, None, None] + step[:, None, None] * v3
+    if len(xy) == 0:
+        return np.empty((0, 2, 6))
+    fine = pixel_to_pixel(image_wcs, grid_wcs, x.ravel(), y.ravel())
+    poly = np.empty((len(xy), 2, 6))
+    for axis, values in enumerate(fine):
+        f = np.asarray(values).reshape(-1, 3, 3)  # [source, v, u]
+        poly[:, axis, 0] = f[:, 1, 1]
+        poly[:, axis, 1] = (f[:, 1, 2] - f[:, 1, 0]) / (2 * step)
+        poly[:, axis, 2] = (f[:, 2, 1] - f[:, 0, 1]) / (2 * step)
+        poly[:, axis, 3] = (f[:, 1, 2] - 2 * f[:, 1, 1] + f[:, 1, 0]) / (2 * step**2)
+        poly[:, axis, 4] = (f[:, 2, 2] - f[:, 2, 0] - f[:, 0, 2] + f[:, 0, 0]) / (4 * step**2)
+        poly[:, axis, 5] = (f[:, 2, 1] - 2 * f[:, 1, 1] + f[:, 0, 1]) / (2 * step**2)
+    return poly

@@ -1,0 +1,116 @@
+"""Corrections that bright point sources tell: encircled energy, scale, apertures."""
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.photometry.aperture import _circle_sums
+from miricigale.photometry.arrays import image_arrays, pixel_scale
+from miricigale.psf import encircled_energy, radius_of_encircled_energy
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import ANGLE, FNU, to_array
+
+__all__ = ["aperture_correction", "encircled_flux", "flux_scaling"]
+
+
+def encircled_flux(image, sky, flux, radii):
+    """
+    Light of point sources within radii, over what they should have.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        In units of surface brightness, background subtracted, with WCS.
+    sky : `~astropy.coordinates.SkyCoord`, shape (n,)
+        Positions of isolated point sources.
+    flux : `~astropy.units.Quantity`, shape (n,)
+        Their true fluxes.
+    radii : `~astropy.units.Quantity`, shape (m,)
+        Radii.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        A row for each radius: ``radius``, ``median``, ``scatter`` (1.4826 times the median
+        absolute deviation) and ``values``, shape (m, n), NaN for apertures that touch
+        pixels without data.
+
+    References
+    ----------
+    Yang et al. 2021, ApJ 908, 144, section 3.2 (EEF_PT).
+    """
+    arrays = image_arrays(image, "image")
+    true = to_array(flux, FNU, "flux", ndim=1)
+    if len(true) != len(sky):
+        raise argument_error("flux", f"{len(sky)} fluxes, one for each position", len(true))
+    if len(true) == 0 or not np.all(true > 0):
+        raise argument_error("flux", "positive fluxes", "none" if len(true) == 0 else true.min())
+    radius = np.atleast_1d(to_array(radii, ANGLE, "radii"))
+    scale = pixel_scale(image.wcs)
+    xy = np.stack(arrays.wcs.world_to_pixel(sky), axis=-1).reshape(-1, 2)
+    values = np.empty((len(radius), len(true)))
+    for k, r in enumerate(radius):
+        inside, _, coverage = _circle_sums(arrays, xy, r / scale)
+        values[k] = np.where(coverage > 0.999, inside / true, np.nan)
+    if not np.isfinite(values).any(axis=1).all():
+        raise argument_error("sky", "positions whose apertures are on the image", "none")
+    median = np.nanmedian(values, axis=1)
+    scatter = 1.4826 * np.nanmedian(np.abs(values - median[:, None]), axis=1)
+    return QTable(
+        {"radius": radius * ANGLE, "median": median, "scatter": scatter, "values": values}
+    )
+
+
+def flux_scaling(image, sky, flux, psf, *, fraction=0.8):
+    """
+    The factor by which an image is to be multiplied to have the true flux scale.
+
+    Parameters
+    ----------
+    image, sky, flux
+        As in `encircled_flux`.
+    psf : `~photutils.psf.ImagePSF`
+        PSF of the image, which must include all that its pixels do.
+    fraction : float, optional
+        Encircled energy at whose radius the two are compared.
+
+    Returns
+    -------
+    factor, error : float
+        ``fraction`` over the median measured one, and the error of that from the scatter
+        of the sources.
+
+    References
+    ----------
+    Yang et al. 2021, ApJ 908, 144, section 3.2 (f_scaling).
+    """
+    radius = radius_of_encircled_energy(psf, fraction)
+    table = encircled_flux(image, sky, flux, u.Quantity([radius]))
+    n = int(np.isfinite(table["values"][0]).sum())
+    factor = fraction / float(table["median"][0])
+    # the error of a median is 1.2533 times that of a mean
+    error = factor * 1.2533 * float(table["scatter"][0] / table["median"][0]) / np.sqrt(n)
+    return factor, error
+
+
+def aperture_correction(psf, radius):
+    """
+    The factor from light in a circle to total light, for a point source.
+
+    Parameters
+    ----------
+    psf : `~photutils.psf.ImagePSF`
+        PSF of the image.
+    radius : `~astropy.units.Quantity`
+        Of the circle.
+
+    Returns
+    -------
+    factor : float or `~numpy.ndarray`
+        1 / (encircled energy).
+    """
+    energy = np.asarray(encircled_energy(psf, radius), float)
+    if np.any(energy <= 0):
+        raise argument_error("radius", "positive", radius)
+    factor = 1.0 / energy
+    return float(factor) if factor.ndim == 0 else factor

@@ -1,0 +1,314 @@
+"""Normal equations of forced photometry, and errors that are true for correlated noise."""
+
+import dataclasses
+
+import numpy as np
+import scipy.sparse
+
+from miricigale.photometry import _core
+
+__all__ = ["LinearFit", "noise_correlation", "normal_matrix", "project", "sandwich_matrix"]
+
+
+def noise_correlation(residual, usable, *, max_lag=8, clip=5.0, significance=3.0):
+    """
+    Measure the covariance of pixels' noise on a whitened residual image.
+
+    Parameters
+    ----------
+    residual : `~numpy.ndarray`, shape (ny, nx)
+        Data minus model, over sigma.
+    usable : bool `~numpy.ndarray`, shape (ny, nx)
+        Source-free pixels with data.
+    max_lag : int, optional
+        Largest separation that is looked at, in pixels.
+    clip : float, optional
+        Pixels further from the median than this many robust standard deviations do not
+        take part.
+    significance : float, optional
+        Rings of separations in which the mean is less significant than this are cut off.
+
+    Returns
+    -------
+    correlation : `~numpy.ndarray`, shape (2 m + 1, 2 m + 1), m <= max_lag
+        Mean product at each separation, in units of sigma^2: the middle is 1 for true
+        sigmas, and the whole a single number for noise that is not correlated (0 for a
+        residual that is the same everywhere).
+
+    Raises
+    ------
+    ValueError
+        If fewer than 100 pixels are usable.
+    """
+    usable = np.asarray(usable, bool)
+    if np.count_nonzero(usable) < 100:
+        msg = f"'usable' must leave at least 100 pixels, got {np.count_nonzero(usable)}"
+        raise ValueError(msg)
+    values = residual[usable]
+    middle = np.median(values)
+    spread = 1.4826 * np.median(np.abs(values - middle))
+    usable = usable & (np.abs(residual - middle) <= clip * spread)
+    lag = min(max_lag, (min(residual.shape) - 1) // 2)
+    level = residual[usable].mean()
+    covariance, error = _core.autocorrelation(residual - level, usable, lag)
+    if not covariance[lag, lag] > 0:
+        return np.zeros((1, 1))
+    index = np.arange(-lag, lag + 1)
+    ring = np.maximum(np.abs(index)[:, None], np.abs(index)[None])
+    for outer in range(lag, 0, -1):
+        member = ring == outer
+        # each value stands twice in a ring
+        mean = covariance[member].mean()
+        mean_error = error[member].mean() * np.sqrt(2.0 / np.count_nonzero(member))
+        peak = np.max(np.abs(covariance[member]) / error[member])
+        if abs(mean) > significance * mean_error or peak > significance + 1.5:
+            break
+        lag = outer - 1
+    keep = slice(len(index) // 2 - lag, len(index) // 2 + lag + 1)
+    return covariance[keep, keep].copy()
+
+
+def _whitened(block, inverse_sigma):
+    values = np.empty_like(block.values)
+    _core.scale_stamps(block.values, block.box, block.start, inverse_sigma, values)
+    return values
+
+
+def _gather(n, diagonal, pairs, products):
+    i, j = pairs.T.astype(np.int64)
+    rows = np.concatenate([np.arange(n), i, j])
+    columns = np.concatenate([np.arange(n), j, i])
+    data = np.concatenate([diagonal, products, products])
+    return scipy.sparse.coo_array((data, (rows, columns)), shape=(n, n)).tocsr()
+
+
+def _walk(bank, inverse_sigma, pairs, left, right, out):
+    """
+    Products of all pairs, with at most those blocks in memory that can still overlap.
+
+    ``left`` and ``right`` turn a block's whitened values into (box, start, values).
+    """
+    live = []
+    for block in bank.blocks():
+        white = _whitened(block, inverse_sigma)
+        mine = right(block, white)
+        live = [one for one in live if one[1] > block.box[0, 0]]
+        live.append((block, _reach(block, mine), left(block, white)))
+        for other, _, theirs in live:
+            low, high = np.searchsorted(pairs[:, 0], [other.first, other.last])
+            rows = low + np.flatnonzero(
+                (pairs[low:high, 1] >= block.first) & (pairs[low:high, 1] < block.last)
+            )
+            if len(rows):
+                local = pairs[rows] - np.array([other.first, block.first], pairs.dtype)
+                products = np.empty(len(rows))
+                _core.pair_products(*_order(theirs), *_order(mine), local, products)
+                out[rows] = products
+        yield block, white, mine
+
+
+def _reach(block, grown):
+    box = grown[0]
+    rim = block.box[0, 0] - box[0, 0] if len(box) else 0
+    return int((box[:, 0] + box[:, 2]).max() + 2 * rim)
+
+
+def _order(stamps):
+    box, start, values = stamps
+    return values, box, start
+
+
+def normal_matrix(bank, inverse_sigma, images=()):
+    """
+    Build the whitened normal equations.
+
+    Parameters
+    ----------
+    bank : `~miricigale.photometry.templates.TemplateBank`
+        Templates.
+    inverse_sigma : `~numpy.ndarray`, shape (ny, nx)
+        1 / sigma, zero where masked.
+    images : list of `~numpy.ndarray`, shape (ny, nx)
+        Whitened images onto which the whitened templates are projected.
+
+    Returns
+    -------
+    matrix : `~scipy.sparse.csr_array`, shape (n, n)
+        Products of the whitened templates.
+    projection : `~numpy.ndarray`, shape (n, len(images))
+    power : `~numpy.ndarray`, shape (n,)
+        Sums of squares of the templates without weights.
+    light : `~numpy.ndarray`, shape (n, 2)
+        Sums of the templates inside the image, and on usable pixels.
+    """
+    n = len(bank.order)
+    pairs = _core.find_pairs(bank.box)
+    products = np.zeros(len(pairs))
+    diagonal, power, light = np.empty(n), np.empty(n), np.empty((n, 2))
+    usable = inverse_sigma > 0
+    projection = np.empty((n, len(images)))
+
+    def plain(block, white):
+        return block.box, block.start, white
+
+    for block, white, _ in _walk(bank, inverse_sigma, pairs, plain, plain, products):
+        rows = slice(block.first, block.last)
+        own = np.repeat(np.arange(len(block.box)), 2).reshape(-1, 2)
+        for values, out in ((white, diagonal), (block.values, power)):
+            same = np.empty(len(own))
+            stamps = (values, block.box, block.start)
+            _core.pair_products(*stamps, *stamps, own, same)
+            out[rows] = same
+        _core.stamp_sums(block.values, block.box, block.start, usable, light[rows])
+        for column, image in enumerate(images):
+            one = np.empty(len(block.box))
+            _core.projections(white, block.box, block.start, image, one)
+            projection[rows, column] = one
+    return _gather(n, diagonal, pairs, products), projection, power, light
+
+
+def project(bank, inverse_sigma, images):
+    """Project whitened images onto the whitened templates, shape (n, len(images))."""
+    projection = np.empty((len(bank.order), len(images)))
+    for block in bank.blocks():
+        white = _whitened(block, inverse_sigma)
+        for column, image in enumerate(images):
+            one = np.empty(len(block.box))
+            _core.projections(white, block.box, block.start, image, one)
+            projection[block.first : block.last, column] = one
+    return projection
+
+
+def sandwich_matrix(bank, inverse_sigma, correlation):
+    """
+    Build A^T W C W A, what the correlated noise does to the right-hand side.
+
+    Parameters
+    ----------
+    bank, inverse_sigma
+        As in `normal_matrix`.
+    correlation : `~numpy.ndarray`, shape (2 m + 1, 2 m + 1)
+        Covariance of the whitened noise by separation.
+
+    Returns
+    -------
+    matrix : `~scipy.sparse.csr_array`, shape (n, n)
+    """
+    n = len(bank.order)
+    lag = correlation.shape[0] // 2
+    pairs = _core.find_pairs(bank.box, grow=lag)
+    products = np.zeros(len(pairs))
+    diagonal = np.empty(n)
+    kernel = np.ascontiguousarray(correlation)
+
+    def plain(block, white):
+        return block.box, block.start, white
+
+    def spread(block, white):
+        if lag == 0:
+            return block.box, block.start, white * np.float32(kernel[0, 0])
+        box = block.box + np.array([-lag, -lag, 2 * lag, 2 * lag])
+        start = np.concatenate([[0], np.cumsum(box[:, 2] * box[:, 3])])
+        values = np.empty(int(start[-1]), np.float32)
+        _core.convolve_stamps(white, block.box, block.start, kernel, box, start, values)
+        return box, start, values
+
+    for block, white, mine in _walk(bank, inverse_sigma, pairs, plain, spread, products):
+        own = np.repeat(np.arange(len(block.box)), 2).reshape(-1, 2)
+        same = np.empty(len(own))
+        _core.pair_products(white, block.box, block.start, *_order(mine), own, same)
+        diagonal[block.first : block.last] = same
+    return _gather(n, diagonal, pairs, products)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LinearFit:
+    """
+    Least squares for sparse sources plus a few parameters of the whole image.
+
+    Attributes
+    ----------
+    matrix : sparse array, shape (n, n)
+        Normal matrix of the sources.
+    rhs : `~numpy.ndarray`, shape (n,)
+    border : `~numpy.ndarray`, shape (n, g)
+        Products of sources and common parameters.
+    corner, corner_rhs : `~numpy.ndarray`, shape (g, g) and (g,)
+        The common parameters' own part.
+
+    Notes
+    -----
+    The common parameters are eliminated by their Schur complement, so that the sparse
+    factor is that of the sources alone.
+    """
+
+    matrix: object
+    rhs: np.ndarray
+    border: np.ndarray
+    corner: np.ndarray
+    corner_rhs: np.ndarray
+
+    def __post_init__(self):
+        solve = _core.factorize(self.matrix)
+        z = solve(self.border) if self.border.shape[1] else self.border
+        q = np.linalg.inv(self.corner - self.border.T @ z)
+        common = q @ (self.corner_rhs - z.T @ self.rhs)
+        for name, value in (
+            ("solve", solve),
+            ("_z", z),
+            ("_q", q),
+            ("common", common),
+            ("flux", solve(self.rhs) - z @ common),
+        ):
+            object.__setattr__(self, name, value)
+
+    def covariance(self, xy, *, core, halo, noise=None, pattern=None):
+        """
+        Covariances of sources that overlap, and of the common parameters.
+
+        Parameters
+        ----------
+        xy : `~numpy.ndarray`, shape (n, 2)
+            Positions in pixels.
+        core, halo : float
+            See `~miricigale.photometry._core.block_covariance`.
+        noise : tuple, optional
+            The sandwich's filling: its sparse matrix, border and corner. Without it
+            the noise is white with the given sigmas.
+        pattern : sparse array, optional
+            Elements wanted.
+
+        Returns
+        -------
+        covariance : `~scipy.sparse.csr_array`, shape (n, n)
+        common : `~numpy.ndarray`, shape (g, g)
+        blending : `~numpy.ndarray`, shape (n,)
+            Formal error over that of the source alone.
+        """
+        z, q = self._z, self._q
+        options = {"core": core, "halo": halo, "pattern": pattern}
+        middle, border, corner = (None, None, None) if noise is None else noise
+        local, inverse = _core.block_covariance(
+            self.matrix, xy[:, 1], xy[:, 0], middle=middle, **options
+        )
+        inverse = inverse + np.einsum("kg,kg->k", z @ q, z)
+        blending = np.sqrt(inverse * self.matrix.diagonal())
+        if not len(q):
+            return local, q, blending
+        if noise is None:
+            return _add_low_rank(local, [(z @ q, z)]), q, blending
+        # theta = Q (b_g - Z^T b_s), x = S^-1 b_s - Z theta
+        cross = (border - middle @ z) @ q
+        common = corner - border.T @ z - z.T @ border + z.T @ (middle @ z)
+        common = q @ common @ q
+        e = self.solve(cross)
+        return _add_low_rank(local, [(z @ common, z), (-e, z), (-z, e)]), common, blending
+
+
+def _add_low_rank(matrix, terms):
+    """Add sums of outer products to the non-zeros of a sparse matrix."""
+    coo = matrix.tocoo()
+    data = coo.data.copy()
+    for left, right in terms:
+        data += np.einsum("kg,kg->k", left[coo.row], right[coo.col])
+    return scipy.sparse.coo_array((data, (coo.row, coo.col)), shape=matrix.shape).tocsr()

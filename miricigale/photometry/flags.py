@@ -1,0 +1,30 @@
+"""What can be wrong with a measured flux."""
+
+from miricigale.utils.tables import Flags
+
+__all__ = ["ForcedFlags"]
+
+
+class ForcedFlags(Flags):
+    """
+    Flags of forced photometry, added up bit by bit.
+
+    A flux is NaN where ``NO_DATA`` or ``DEGENERATE`` is set, and usable otherwise.
+    """
+
+    #: More than a tenth of the template's light falls off the image.
+    EDGE = 1
+    #: More than a tenth of the template's light falls on masked pixels.
+    MASKED = 2
+    #: Too little of the template's light falls on usable pixels: not measured.
+    NO_DATA = 4
+    #: Blending makes the error more than twice that of the source alone.
+    BLENDED = 8
+    #: The template is the same as another one's: not measured, the other has the light.
+    DEGENERATE = 16
+    #: The template is a point source because the catalogue position has no segment.
+    NO_SEGMENT = 32
+    #: The template is a point source because the segment is too noisy.
+    NOISY_SEGMENT = 64
+    #: The template is a point source because another source owns the segment.
+    SHARED_SEGMENT = 128

@@ -1,0 +1,197 @@
+"""What forced photometry returns."""
+
+import dataclasses
+import functools
+
+import astropy.units as u
+import numpy as np
+import scipy.sparse
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData
+from astropy.table import QTable
+
+from miricigale.photometry.flags import ForcedFlags
+from miricigale.utils.tables import error_column
+
+__all__ = ["ForcedPhotometryResult", "crowded"]
+
+
+def crowded(sky, flux, *, radius=2 * u.arcsec, delta_mag=1.0):
+    """
+    Find sources that have a neighbour which is bright enough to matter.
+
+    Parameters
+    ----------
+    sky : `~astropy.coordinates.SkyCoord`, shape (n,)
+        Positions.
+    flux : array_like or `~astropy.units.Quantity`, shape (n,)
+        Fluxes.
+    radius : `~astropy.units.Quantity`, optional
+        How near a neighbour is.
+    delta_mag : float, optional
+        A neighbour counts if it is brighter than the source's magnitude plus this.
+
+    Returns
+    -------
+    crowded : bool `~numpy.ndarray`, shape (n,)
+        A source whose flux is not positive is crowded by any positive neighbour.
+
+    References
+    ----------
+    Yang et al. 2021, ApJ 908, 144, section 4.1.
+    """
+    found = np.zeros(len(sky), bool)
+    if len(sky) > 1:
+        flux = np.asarray(getattr(flux, "value", flux), float)
+        i, j, _, _ = sky.search_around_sky(sky, radius)
+        limit = np.maximum(flux[i], 0.0) * 10 ** (-0.4 * delta_mag)
+        found[i[(i != j) & (flux[j] > limit)]] = True
+    return found
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class ForcedPhotometryResult:
+    """
+    Fluxes of all sources of a catalogue on one image.
+
+    Attributes
+    ----------
+    id : `~numpy.ndarray`, shape (n,)
+        The catalogue's ids, in its order.
+    sky : `~astropy.coordinates.SkyCoord`, shape (n,)
+        The catalogue's positions.
+    flux, flux_err : `~astropy.units.Quantity`, shape (n,)
+        Total fluxes and errors in uJy; NaN where not measured.
+    covariance : `~scipy.sparse.csr_array`, shape (n, n)
+        In uJy^2, for pairs whose templates overlap; rows of sources that were not
+        measured are empty.
+    flags : int `~numpy.ndarray`, shape (n,)
+        See `ForcedFlags`.
+    coverage : `~numpy.ndarray`, shape (n,)
+        Fraction of the template's light on usable pixels.
+    chi2 : `~numpy.ndarray`, shape (n,)
+        Template-weighted mean of (residual / sigma)^2, about 1 for a good fit.
+    residual_fraction : `~numpy.ndarray`, shape (n,)
+        Light left below the template's core over what the fit took there.
+    template_snr : `~numpy.ndarray`, shape (n,)
+        Signal-to-noise of the segment of the high-resolution image; NaN without one.
+    crowded : bool `~numpy.ndarray`, shape (n,)
+        Whether a neighbour within 2 arcsec is brighter than the source's magnitude + 1.
+    x, y : `~numpy.ndarray`, shape (n,)
+        Positions on the image; NaN far outside.
+    model_image, residual_image : `~astropy.nddata.CCDData`
+        MJy/sr, on the image's grid.
+    noise_correlation : `~numpy.ndarray`, shape (2 m + 1, 2 m + 1), or None
+        Measured covariance of the noise in units of sigma^2 by separation; None where
+        the noise was taken as white.
+    background, background_err : `~astropy.units.Quantity` or None
+        Constant that was fitted, MJy/sr.
+    shift, shift_err : `~astropy.units.Quantity`, shape (2,), or None
+        Shift (x, y) of the image against the catalogue, in arcsec along its axes.
+    meta : dict
+        Settings and provenance.
+    """
+
+    id: np.ndarray
+    sky: SkyCoord
+    flux: u.Quantity
+    flux_err: u.Quantity
+    covariance: scipy.sparse.csr_array
+    flags: np.ndarray
+    coverage: np.ndarray
+    chi2: np.ndarray
+    residual_fraction: np.ndarray
+    template_snr: np.ndarray
+    crowded: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    model_image: CCDData
+    residual_image: CCDData
+    noise_correlation: np.ndarray | None = None
+    background: u.Quantity | None = None
+    background_err: u.Quantity | None = None
+    shift: u.Quantity | None = None
+    shift_err: u.Quantity | None = None
+    meta: dict = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+
+    def __len__(self):
+        return len(self.id)
+
+    def __repr__(self):
+        n = int(np.count_nonzero(np.isfinite(self.flux.value)))
+        return f"<ForcedPhotometryResult {len(self)} sources, {n} measured>"
+
+    @functools.cached_property
+    def snr(self):
+        """Flux over its error, shape (n,)."""
+        return np.asarray((self.flux / self.flux_err).value)
+
+    def to_table(self, name=None):
+        """
+        Make a table of the fluxes.
+
+        Parameters
+        ----------
+        name : str, optional
+            Name of the filter: columns are then called ``<name>``, ``<name>_err``,
+            ``<name>_flags`` and so on, so that tables of several bands can be joined by
+            ``id``. Without it they are ``flux``, ``flux_err``, ``flags``...
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            With units, descriptions, and provenance in ``meta``.
+        """
+        flux, prefix = ("flux", "") if name is None else (name, f"{name}_")
+        columns = {
+            flux: (self.flux, "Total flux"),
+            error_column(flux): (self.flux_err, "1-sigma error of the flux"),
+            f"{prefix}flags": (self.flags, ForcedFlags.describe()),
+            f"{prefix}snr": (self.snr, "Flux over error"),
+            f"{prefix}crowded": (
+                self.crowded,
+                "Neighbour within 2 arcsec brighter than the magnitude + 1",
+            ),
+            f"{prefix}coverage": (self.coverage, "Fraction of the light on usable pixels"),
+            f"{prefix}chi2": (self.chi2, "Template-weighted mean of (residual / sigma)^2"),
+            f"{prefix}residual_fraction": (
+                self.residual_fraction,
+                "Residual over fitted light in the core",
+            ),
+        }
+        table = QTable({"id": self.id, "sky": self.sky}, meta=dict(self.meta), copy=True)
+        table["id"].info.description = "Id of the catalogue"
+        table["sky"].info.description = "Position of the catalogue"
+        for key, (values, description) in columns.items():
+            table[key] = values
+            table[key].info.description = description
+        return table
+
+    def plot(self, ax=None, **kwargs):
+        """
+        Draw image, model and residual side by side.
+
+        Parameters
+        ----------
+        ax : sequence of three `~matplotlib.axes.Axes`, optional
+            Where to draw.
+        **kwargs
+            Passed to `~miricigale.plotting.images.plot_model_residual`.
+
+        Returns
+        -------
+        ax : `~numpy.ndarray` of three `~matplotlib.axes.Axes`
+        """
+        from miricigale.plotting.images import plot_model_residual
+
+        model = self.model_image.data
+        scale = float(self.meta.get("pixel_scale", 1.0))
+        return plot_model_residual(
+            self.residual_image.data + model, model, ax=ax, pixel_scale=scale, **kwargs
+        )

@@ -1,0 +1,299 @@
+"""Images: stretched, in colour, with segments, and image beside model and residual."""
+
+import numpy as np
+
+from miricigale.plotting.axes import new_figure, resolve_axes
+
+__all__ = [
+    "color_image",
+    "plot_color",
+    "plot_image",
+    "plot_model_residual",
+    "plot_segmentation",
+]
+
+
+def _robust(image):
+    """Median and robust standard deviation of the finite pixels, (0, 1) without any."""
+    values = image[np.isfinite(image)]
+    if values.size == 0:
+        return 0.0, 1.0
+    middle = float(np.median(values))
+    # the darker half knows little of sources
+    low = values[values <= middle]
+    sigma = 1.4826 * float(np.median(middle - low)) if low.size else 0.0
+    return middle, sigma if sigma > 0 else float(values.std()) or 1.0
+
+
+def _extent(shape, pixel_scale, center):
+    """Edges in arcsec, zero in the middle of the image or at a pixel."""
+    ny, nx = shape
+    x, y = ((nx - 1) / 2, (ny - 1) / 2) if center is None else center
+    left, right = -0.5 - x, nx - 0.5 - x
+    bottom, top = -0.5 - y, ny - 0.5 - y
+    return [edge * pixel_scale for edge in (left, right, bottom, top)]
+
+
+def _label(ax, title):
+    ax.set(xlabel="x (arcsec)", ylabel="y (arcsec)", title=title)
+    return ax
+
+
+def plot_image(
+    image,
+    *,
+    ax=None,
+    pixel_scale=1.0,
+    stretch="asinh",
+    softening=None,
+    limits=None,
+    cmap="gray_r",
+    title=None,
+    colorbar=None,
+    center=None,
+):
+    """
+    Draw an image on axes in arcsec.
+
+    Parameters
+    ----------
+    image : array_like, shape (ny, nx)
+        NaN is left white.
+    ax : `~matplotlib.axes.Axes`, optional
+        Axes to draw on.
+    pixel_scale : float, optional
+        Arcsec per pixel.
+    stretch : {"asinh", "linear"}, optional
+        How values become colours.
+    softening : float, optional
+        Value at which ``"asinh"`` turns over; twice the image's own noise by default.
+    limits : (float, float), optional
+        Values of the two ends of the colours; by default two sigma below the median, and
+        the 99.7th percentile or eight sigma above it, whichever is higher.
+    cmap : str, optional
+        Colours.
+    title : str, optional
+        Title.
+    colorbar : str, optional
+        If given, a colour bar with this label.
+    center : (float, float), optional
+        Pixel (x, y) of the origin of the axes; the middle by default.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    from matplotlib.colors import AsinhNorm, Normalize
+
+    if stretch not in ("asinh", "linear"):
+        msg = f"'stretch' must be 'asinh' or 'linear', got {stretch!r}"
+        raise ValueError(msg)
+    ax = resolve_axes(ax)
+    image = np.asarray(image, float)
+    middle, sigma = _robust(image)
+    if limits is None:
+        finite = image[np.isfinite(image)]
+        high = np.percentile(finite, 99.7) if finite.size else 1.0
+        limits = middle - 2 * sigma, max(high, middle + 8 * sigma)
+    if stretch == "asinh":
+        norm = AsinhNorm(softening or 2 * sigma, vmin=limits[0], vmax=limits[1])
+    else:
+        norm = Normalize(*limits)
+    drawn = ax.imshow(
+        image,
+        origin="lower",
+        interpolation="nearest",
+        norm=norm,
+        cmap=cmap,
+        extent=_extent(image.shape, pixel_scale, center),
+    )
+    if colorbar is not None:
+        # the ticks of an asinh scale crowd about zero
+        ticks = None if stretch == "linear" else [0.0, *(limits[1] * np.array([0.03, 0.2, 1.0]))]
+        bar = ax.figure.colorbar(drawn, ax=ax, label=colorbar, shrink=0.85, ticks=ticks)
+        if ticks is not None:
+            bar.set_ticks(ticks, labels=[f"{tick:.2g}" for tick in ticks])
+            bar.minorticks_off()
+    return _label(ax, title)
+
+
+def plot_model_residual(
+    image,
+    model,
+    *,
+    ax=None,
+    pixel_scale=1.0,
+    limits=None,
+    titles=("image", "model", "residual"),
+    unit=None,
+    center=None,
+):
+    """
+    Draw image, model and residual side by side with the same stretch.
+
+    Parameters
+    ----------
+    image, model : array_like, shape (ny, nx)
+        The residual is their difference.
+    ax : sequence of three `~matplotlib.axes.Axes`, optional
+        Axes to draw on; a new figure (``ax[0].figure``) by default.
+    pixel_scale : float, optional
+        Arcsec per pixel.
+    limits : (float, float), optional
+        As in `plot_image`, those of the image by default. The residual is drawn from -5 to
+        5 sigma of its own noise.
+    titles : tuple of str, optional
+        Titles.
+    unit : str, optional
+        Label of the colour bars; none are drawn without it.
+    center : (float, float), optional
+        As in `plot_image`.
+
+    Returns
+    -------
+    ax : `~numpy.ndarray` of three `~matplotlib.axes.Axes`
+    """
+    if ax is None:
+        _, ax = new_figure(1, 3, size=(4.2, 3.9))
+    ax = np.ravel(np.asarray(ax, dtype=object))
+    if len(ax) != 3:
+        msg = f"'ax' must be three axes, got {len(ax)}"
+        raise ValueError(msg)
+    image, model = np.asarray(image, float), np.asarray(model, float)
+    middle, sigma = _robust(image)
+    if limits is None:
+        finite = image[np.isfinite(image)]
+        high = np.percentile(finite, 99.7) if finite.size else 1.0
+        limits = middle - 2 * sigma, max(high, middle + 8 * sigma)
+    options = {"pixel_scale": pixel_scale, "colorbar": unit, "center": center}
+    residual = image - model
+    # one turnover for both, or a noiseless model would be stretched beyond comparison
+    for axes, data, title in zip(ax[:2], (image, model), titles[:2], strict=True):
+        plot_image(data, ax=axes, title=title, limits=limits, softening=2 * sigma, **options)
+    _, noise = _robust(residual)
+    span = (-5 * noise, 5 * noise)
+    plot_image(
+        residual,
+        ax=ax[2],
+        stretch="linear",
+        limits=span,
+        cmap="RdBu_r",
+        title=titles[2],
+        **options,
+    )
+    for axes in ax[1:]:
+        axes.set_ylabel("")
+    return ax
+
+
+def color_image(red, green, blue, *, scale=None, softening=8.0, stretch=6.0):
+    """
+    Make a colour image whose hues do not depend on brightness.
+
+    Parameters
+    ----------
+    red, green, blue : array_like, shape (ny, nx)
+        Images on the same pixels. NaN is black.
+    scale : (float, float, float), optional
+        Factors for the three; by default each is divided by its own noise, so that the
+        sky is grey.
+    softening, stretch : float, optional
+        Q and linear stretch of Lupton et al., in units of the noise.
+
+    Returns
+    -------
+    image : `~numpy.ndarray` of uint8, shape (ny, nx, 3)
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ.
+
+    References
+    ----------
+    Lupton et al. 2004, PASP 116, 133.
+    """
+    from astropy.visualization import make_lupton_rgb
+
+    planes = [np.asarray(plane, float) for plane in (red, green, blue)]
+    if len({plane.shape for plane in planes}) != 1:
+        msg = f"'red', 'green', 'blue' must be of one shape, got {[p.shape for p in planes]}"
+        raise ValueError(msg)
+    scaled = []
+    for k, plane in enumerate(planes):
+        middle, sigma = _robust(plane)
+        factor = 1 / sigma if scale is None else scale[k]
+        scaled.append(np.nan_to_num((plane - middle) * factor, nan=0.0))
+    return make_lupton_rgb(*scaled, minimum=-1.0, stretch=stretch, Q=softening)
+
+
+def plot_color(red, green, blue, *, ax=None, pixel_scale=1.0, title=None, center=None, **kwargs):
+    """
+    Draw a colour image on axes in arcsec.
+
+    Parameters
+    ----------
+    red, green, blue
+        As in `color_image`.
+    ax, pixel_scale, title, center : optional
+        As in `plot_image`.
+    **kwargs
+        Passed to `color_image`.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    ax = resolve_axes(ax)
+    image = color_image(red, green, blue, **kwargs)
+    ax.imshow(
+        image,
+        origin="lower",
+        interpolation="nearest",
+        extent=_extent(image.shape[:2], pixel_scale, center),
+    )
+    return _label(ax, title)
+
+
+def plot_segmentation(
+    image, labels, *, ax=None, pixel_scale=1.0, color="#c2410c", title=None, center=None, **kwargs
+):
+    """
+    Draw the outlines of segments over an image.
+
+    Parameters
+    ----------
+    image : array_like, shape (ny, nx)
+        The image.
+    labels : int array_like, shape (ny, nx)
+        Label of each pixel, 0 for none.
+    ax, pixel_scale, title, center : optional
+        As in `plot_image`.
+    color : str, optional
+        Of the outlines.
+    **kwargs
+        Passed to `plot_image`.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    from matplotlib.collections import LineCollection
+
+    image, labels = np.asarray(image), np.asarray(labels)
+    if image.shape != labels.shape:
+        msg = f"'labels' must be of the image's shape {image.shape}, got {labels.shape}"
+        raise ValueError(msg)
+    ax = plot_image(image, ax=ax, pixel_scale=pixel_scale, title=title, center=center, **kwargs)
+    left, _, bottom, _ = _extent(image.shape, pixel_scale, center)
+    lines = np.concatenate([_edges(labels), _edges(labels.T)[:, :, ::-1]])
+    lines = lines * pixel_scale + np.array([left, bottom])
+    ax.add_collection(LineCollection(lines, colors=color, linewidths=0.7))
+    return ax
+
+
+def _edges(labels):
+    """Vertical edges between pixels of different labels, shape (n, 2, 2), in pixel corners."""
+    padded = np.pad(labels, ((0, 0), (1, 1)))
+    y, x = np.nonzero(padded[:, 1:] != padded[:, :-1])
+    return np.stack([np.stack([x, y], -1), np.stack([x, y + 1], -1)], axis=1).astype(float)

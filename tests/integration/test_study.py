@@ -1,0 +1,169 @@
+"""The whole study at a small size: every stage, resume after a stop, the command line."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from miricigale.workflow import StudyRunner, load_config, read_image, study_stages
+
+SMALL = """
+[run]
+name = "small"
+seed = 3
+
+[catalog]
+mag_limit = 22.5
+
+[exposures]
+filters = ["miri.f770w", "miri.f1500w"]
+n_groups = [12, 12]
+n_integrations = [1, 1]
+n_dithers = [2, 1]
+
+[sed]
+axes = "quick"
+
+[photometry]
+threshold = 1.0
+min_area = 20
+
+[errors]
+bin_size = 10
+
+[fit]
+axes = "quick"
+"""
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    """Folder of a small study that was stopped in the middle and finished."""
+    folder = tmp_path_factory.mktemp("study")
+    (folder / "small.toml").write_text(SMALL)
+    command = [sys.executable, "-m", "miricigale", "run", "small.toml", "--no-progress"]
+    first = subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True)
+    product = folder / "small" / "exposures" / "miri.f770w-0_cal.fits"
+    deadline = time.monotonic() + 300
+    while not product.exists() and first.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.2)
+    # let the manifest be written, then stop as Ctrl-C does
+    time.sleep(1.0)
+    first.send_signal(signal.SIGINT)
+    _, message = first.communicate(timeout=120)
+    before = product.stat().st_mtime_ns
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    return {
+        "folder": folder / "small",
+        "stopped": (first.returncode, message),
+        "before": before,
+        "after": product.stat().st_mtime_ns,
+        "done": done,
+    }
+
+
+def test_a_stopped_run_says_so_and_goes_on(study):
+    status, message = study["stopped"]
+    assert status == 130
+    assert "goes on from here" in message
+    assert study["done"].returncode == 0, study["done"].stderr
+    assert study["done"].stdout.strip().endswith("report/index.html")
+    assert study["before"] == study["after"]
+    assert not list(study["folder"].rglob(".partial-*"))
+
+
+def test_every_product_stands_in_the_manifest_and_nothing_else(study):
+    manifest = json.loads((study["folder"] / "manifest.json").read_text())
+    recorded = {name for record in manifest["stages"].values() for name in record["products"]}
+    found = {str(p.relative_to(study["folder"])) for p in study["folder"].rglob("*") if p.is_file()}
+    assert found - recorded == {"manifest.json", "config.toml"}
+    assert recorded - found == set()
+
+
+def test_no_source_is_lost_between_catalogue_and_result(study):
+    catalog = QTable.read(study["folder"] / "catalog.ecsv")
+    truth = QTable.read(study["folder"] / "truth.ecsv")
+    matched = QTable.read(study["folder"] / "matched.ecsv")
+    assert truth["id"].tolist() == catalog["id"].tolist() == matched["id"].tolist()
+    fitted = QTable.read(study["folder"] / "fits_with_miri.ecsv")
+    sample = matched["id"][np.asarray(matched["selection"]) == 0]
+    assert fitted["id"].tolist() == sample.tolist()
+
+
+def test_point_sources_come_back_as_they_went_in(study):
+    for name in ("miri.f770w", "miri.f1500w"):
+        table = QTable.read(study["folder"] / "points" / f"{name}.ecsv")
+        table = table[np.asarray(table["in_field"])]
+        ratio = (table["flux"] / table["flux_true"]).to_value(u.one)
+        assert len(ratio) > 20
+        assert np.isfinite(ratio).all()
+        # the promise of the study: 3 % in the median
+        assert abs(np.median(ratio) - 1) < 0.03
+
+
+def test_the_mosaic_shows_the_truth(study):
+    """Light of a bright star in an aperture, against the injected flux."""
+    truth = QTable.read(study["folder"] / "truth.ecsv")
+    matched = QTable.read(study["folder"] / "matched.ecsv")
+    stars = np.flatnonzero(
+        np.asarray(truth["star"], bool)
+        & np.asarray(matched["matched"])
+        & (truth["miri.f770w"] > 10 * u.uJy)
+    )
+    ratio = (matched["miri.f770w"][stars] / truth["miri.f770w"][stars]).to_value(u.one)
+    assert len(ratio) >= 2
+    assert abs(np.median(ratio) - 1) < 0.05
+
+
+def test_images_are_what_they_say(study):
+    rate = read_image(study["folder"] / "exposures" / "miri.f770w-0_rate.fits")
+    assert rate.unit == u.adu / u.s
+    assert rate.shape == (1024, 1032)
+    mosaic = read_image(study["folder"] / "mosaic_miri.f770w.fits")
+    assert mosaic.unit == u.MJy / u.sr
+    sigma = mosaic.uncertainty.array[~mosaic.mask]
+    assert np.all(sigma > 0)
+    # empty sky is empty
+    sky = mosaic.data[~mosaic.mask]
+    assert abs(np.median(sky)) < 0.2 * np.median(sigma)
+
+
+def test_the_report_has_its_sections_and_numbers(study):
+    page = (study["folder"] / "report" / "index.html").read_text()
+    for title in ("Images", "Forced photometry", "Error function", "Redshift and AGN fraction"):
+        assert title in page
+    metrics = json.loads((study["folder"] / "report" / "metrics.json").read_text())
+    assert metrics["n_sample"] > 10
+    assert metrics["fits"]["with_miri"]["n"] == metrics["n_sample"]
+
+
+def test_the_same_seed_gives_the_same_numbers_on_one_thread(study, tmp_path):
+    config = load_config(study["folder"] / "config.toml", overrides={"run": {"threads": 1}})
+    wanted = {
+        "catalog",
+        "seds",
+        "truth",
+        "exposures",
+        "mosaics",
+        "highres",
+        "kernels",
+        "photometry",
+    }
+    stages = [stage for stage in study_stages() if stage.name in wanted]
+    StudyRunner(config, tmp_path / "again", stages).run()
+    for name in ("exposures/miri.f770w-1_cal.fits", "mosaic_miri.f1500w.fits"):
+        first, second = (
+            read_image(folder / name) for folder in (study["folder"], tmp_path / "again")
+        )
+        np.testing.assert_array_equal(first.data, second.data)
+    first, second = (
+        QTable.read(folder / "photometry" / "miri.f770w.ecsv")
+        for folder in (study["folder"], tmp_path / "again")
+    )
+    np.testing.assert_array_equal(first["flux"].value, second["flux"].value)

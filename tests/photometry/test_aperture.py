@@ -1,0 +1,79 @@
+import astropy.units as u
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from miricigale.instrument import north_up_wcs
+from miricigale.photometry import (
+    aperture_correction,
+    aperture_photometry,
+    encircled_flux,
+    flux_scaling,
+    source_extractor_photometry,
+)
+from miricigale.psf import gaussian_psf
+
+
+@pytest.fixture(scope="module")
+def stars(tools):
+    rng = np.random.default_rng(3)
+    shape = (400, 400)
+    wcs = north_up_wcs(tools.CENTER, 0.06 * u.arcsec, shape)
+    grid = np.linspace(-9, 9, 5) + 0.013
+    dx, dy = (a.ravel() for a in np.meshgrid(grid, grid))
+    sky = tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
+    flux = np.geomspace(50, 500, 25)
+    sigma = 0.02 / (tools.FINE**2 * tools.SR * 1e12)
+    clean = tools.render(sky, flux, tools.LO, wcs, shape)
+    return sky, flux, tools.as_ccd(clean + rng.normal(0, sigma, shape), wcs, sigma)
+
+
+def test_circles_hold_the_light_of_a_gaussian(tools, stars):
+    sky, flux, image = stars
+    table = aperture_photometry(image, sky, 1.2 * u.arcsec)
+    inside = 1 - np.exp(-0.5 * (0.6 / tools.LO) ** 2)
+    pull = (table["flux"].value - inside * flux) / table["flux_err"].value
+    assert np.abs(pull).max() < 4
+    assert_allclose(table["flux_err"].value, 0.02 * np.sqrt(np.pi) * 0.6 / 0.06, rtol=1e-6)
+    assert_allclose(table["coverage"], 1.0)
+    image = image.add(3.0 * u.MJy / u.sr, handle_meta="first_found")
+    local = aperture_photometry(image, sky, 1.2 * u.arcsec, local_background=0.8 * u.arcsec)
+    assert_allclose(local["flux"].value, table["flux"].value, rtol=0.05)
+    away = tools.CENTER.spherical_offsets_by([1] * u.deg, [0] * u.deg)
+    off = aperture_photometry(image, away, 1 * u.arcsec)
+    assert np.isnan(off["flux"][0])
+    assert off["coverage"][0] == 0
+
+
+def test_source_extractor_like_fluxes(stars):
+    sky, flux, image = stars
+    table = source_extractor_photometry(
+        image, diameter=1.0 * u.arcsec, aperture_fraction=0.8647, auto_fraction=1.0
+    )
+    index, separation, _ = sky.match_to_catalog_sky(table["sky"])
+    assert separation.arcsec.max() < 0.05
+    ratio = table["flux_best"].value[index] / flux
+    assert abs(np.median(ratio) - 1) < 0.02
+    # Kron's ellipse at 2.5 radii holds most of the light
+    assert np.all(table["flux_auto"].value[index] > 0.9 * flux)
+    assert_allclose(table["flux_aper"].value[index] / flux, 0.8647, rtol=0.05)
+    with pytest.raises(ValueError, match="'auto_fraction' must be above 0"):
+        source_extractor_photometry(image, auto_fraction=0)
+
+
+def test_encircled_energy_and_scale_of_point_sources(tools, stars):
+    sky, flux, image = stars
+    radii = [0.2, 0.5, 1.0] * u.arcsec
+    table = encircled_flux(image, sky, flux * u.uJy, radii)
+    assert_allclose(table["median"], 1 - np.exp(-0.5 * (radii.value / tools.LO) ** 2), atol=0.003)
+    psf = gaussian_psf(
+        tools.LO * np.sqrt(8 * np.log(2)) * u.arcsec, pixel_scale=0.06 * u.arcsec, fov=5 * u.arcsec
+    )
+    factor, error = flux_scaling(image, sky, flux * u.uJy, psf)
+    assert abs(factor - 1) < 4 * error < 0.02
+    factor, _ = flux_scaling(image, sky, flux / 0.9 * u.uJy, psf)
+    assert_allclose(factor, 1 / 0.9, rtol=0.01)
+    expected = 1 / (1 - np.exp(-0.5 * (0.5 / tools.LO) ** 2))
+    assert_allclose(aperture_correction(psf, 0.5 * u.arcsec), expected, rtol=2e-3)
+    with pytest.raises(ValueError, match="'flux' must be positive"):
+        encircled_flux(image, sky, -flux * u.uJy, radii)

@@ -1,0 +1,157 @@
+import pickle
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+from numpy.testing import assert_allclose
+
+from miricigale.instrument import background_level
+from miricigale.photometry import YANG2021_DEPTHS, ErrorModel
+from miricigale.psf import gaussian_psf
+
+BAND = "miri.f770w"
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    """Gaussian errors of 0.1 uJy and 5 % of the flux."""
+    rng = np.random.default_rng(1)
+    n = 30000
+    true = 10 ** rng.uniform(-1, 2, n)
+    sigma = np.hypot(0.1, 0.05 * true)
+    truth = QTable({"id": np.arange(n), BAND: true * u.uJy})
+    measured = QTable({"id": np.arange(n), BAND: (true + rng.normal(0, sigma)) * u.uJy})
+    return truth, measured
+
+
+def test_statistics_of_gaussian_errors(simulated):
+    flux = np.array([0.3, 2.0, 30.0])
+    expected = np.hypot(0.1, 0.05 * flux)
+    robust = ErrorModel.from_tables(*simulated, bin_size=600)
+    assert_allclose(robust.sigma(flux * u.uJy, BAND).value, expected, rtol=0.08)
+    paper = ErrorModel.from_tables(*simulated, bin_size=600, statistic="median_abs")
+    # the median of |x| is 0.6745 sigma
+    ratio = paper.sigma(flux * u.uJy, BAND) / robust.sigma(flux * u.uJy, BAND)
+    assert_allclose(ratio, 0.67449, rtol=1e-4)
+
+
+def test_limit_is_where_the_signal_to_noise_is_reached(simulated):
+    model = ErrorModel.from_tables(*simulated, bin_size=600)
+    # f = 5 sqrt(0.1^2 + (0.05 f)^2)
+    exact = 5 * 0.1 / np.sqrt(1 - 25 * 0.05**2)
+    assert_allclose(model.limiting_flux(BAND).value, exact, rtol=0.06)
+    assert model.limiting_magnitude(BAND).unit == u.ABmag
+    by_error = model.limiting_magnitude(BAND, magnitude_error=0.217)
+    assert_allclose(by_error.value, model.limiting_magnitude(BAND, 5.003).value, atol=1e-3)
+    # a magnitude error below the floor is never reached
+    assert np.isnan(model.limiting_magnitude(BAND, 100).value)
+
+
+def test_outside_of_the_bins_errors_are_constant_and_flagged(simulated):
+    model = ErrorModel.from_tables(*simulated)
+    flux = [-5.0, 0.0, 0.01, 1.0, 500.0, np.nan] * u.uJy
+    sigma = model.sigma(flux, BAND)
+    assert sigma[0] == sigma[1] == sigma[2] > 0
+    assert sigma[4] == model.sigma(1e4 * u.uJy, BAND)
+    assert np.isnan(sigma[5])
+    assert model.extrapolated(flux, BAND)[:5].tolist() == [True, True, True, False, True]
+
+
+def test_rows_are_matched_by_id_and_nan_does_not_count(simulated):
+    truth, measured = simulated
+    shuffled = measured[np.random.default_rng(0).permutation(len(measured))][:20000]
+    shuffled[BAND][::7] = np.nan
+    model = ErrorModel.from_tables(truth, shuffled, filters=[BAND], bin_size=600)
+    assert_allclose(model.sigma(30 * u.uJy, BAND).value, 1.5, rtol=0.1)
+    with pytest.raises(ValueError, match="'measured' must be a table of 30000 rows"):
+        ErrorModel.from_tables(truth[[BAND]], shuffled[[BAND]])
+    with pytest.raises(ValueError, match="at least three measured sources in"):
+        ErrorModel.from_tables(truth[:2], measured[:2])
+    with pytest.raises(ValueError, match="'statistic' must be one of"):
+        ErrorModel.from_tables(truth, measured, statistic="rms")
+
+
+def test_few_sources_make_one_bin():
+    rng = np.random.default_rng(0)
+    truth = QTable({BAND: np.linspace(1, 2, 12) * u.uJy})
+    measured = QTable({BAND: (truth[BAND].value + rng.normal(0, 0.1, 12)) * u.uJy})
+    model = ErrorModel.from_tables(truth, measured)
+    assert len(model.to_table()) == 1
+    assert 0.03 < model.sigma(1.5 * u.uJy, BAND).value < 0.3
+
+
+def test_depths():
+    model = ErrorModel.yang2021()
+    assert set(model.filters) == set(YANG2021_DEPTHS)
+    assert len(model.filters) == 15
+    # AB 27.6 is 3631 Jy 10^(-0.4 27.6) = 0.03311 uJy
+    assert_allclose(model.sigma(0 * u.uJy, "wfc3.f160w").value, 0.03311 / 5, rtol=1e-3)
+    assert_allclose(model.sigma(1e3 * u.uJy, "wfc3.f160w").value, 30, rtol=1e-3)
+    assert_allclose(model.sigma(1e6 * u.uJy, "irac.ch1").value, 1e5, rtol=1e-3)
+    same = ErrorModel.from_depths({"a": 23.9 * u.ABmag, "b": 1 * u.uJy})
+    assert_allclose(same.sigma(0 * u.uJy, "a").value, 0.2, rtol=1e-3)
+    assert_allclose(same.sigma(0 * u.uJy, "b").value, 0.2, rtol=1e-12)
+    assert_allclose(same.limiting_magnitude("a").value, 23.9, atol=1e-9)
+    assert (model | same).filters == (*model.filters, "a", "b")
+
+
+def test_exposure_scales_as_photon_noise_does():
+    psf = gaussian_psf(0.4 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=10 * u.arcsec)
+    options = {"psf": psf, "n_integrations": 1}
+    base = ErrorModel.from_exposure("miri.f1500w", 2000 * u.s, **options)
+    longer = ErrorModel.from_exposure("miri.f1500w", 8000 * u.s, **options)
+    zero = 0 * u.uJy
+    assert_allclose(
+        base.sigma(zero, "miri.f1500w") / longer.sigma(zero, "miri.f1500w"), 2, rtol=0.01
+    )
+    sky = background_level("miri.f1500w")
+    brighter = ErrorModel.from_exposure("miri.f1500w", 2000 * u.s, background=4 * sky, **options)
+    assert_allclose(
+        brighter.sigma(zero, "miri.f1500w") / base.sigma(zero, "miri.f1500w"), 2, rtol=0.01
+    )
+    # extended sources: noise grows as the width, sqrt(4 pi sigma^2)
+    wide = ErrorModel.from_exposure("miri.f1500w", 2000 * u.s, size=0.8 * u.arcsec, **options)
+    ratio = wide.sigma(zero, "miri.f1500w") / base.sigma(zero, "miri.f1500w")
+    assert_allclose(ratio, np.hypot(0.4, 0.8) / 0.4, rtol=0.02)
+    # far above the sky the source's own photons count: error grows as the root
+    bright = base.sigma([1e7, 4e7] * u.uJy, "miri.f1500w")
+    assert_allclose(bright[1] / bright[0], 2, rtol=0.01)
+    with pytest.raises(ValueError, match="at least two frames"):
+        ErrorModel.from_exposure("miri.f1500w", 3 * u.s, **options)
+
+
+def test_perturbed_fluxes_have_the_stated_scatter():
+    model = ErrorModel.from_depths({BAND: 1 * u.uJy}, fractional=0.1)
+    table = QTable({"id": np.arange(3000), BAND: np.full(3000, 4.0) * u.uJy, "z": np.ones(3000)})
+    one = model.perturb(table, seed=3)
+    sigma = np.hypot(0.2, 0.4)
+    assert_allclose(one[f"{BAND}_err"].value, sigma)
+    assert abs(np.std(one[BAND].value - 4) / sigma - 1) < 0.05
+    assert abs(np.mean(one[BAND].value - 4)) < 4 * sigma / np.sqrt(3000)
+    assert np.all(table[BAND].value == 4)
+    # a cut in the table does not change the draws
+    part = model.perturb(table[100:200][::-1], seed=3)
+    assert np.array_equal(part[BAND][::-1], one[BAND][100:200])
+    assert not np.array_equal(model.perturb(table, seed=4)[BAND], one[BAND])
+    assert_allclose(model.assign(table)[f"{BAND}_err"].value, sigma)
+
+
+def test_tables_come_back(tmp_path, simulated):
+    model = ErrorModel.from_tables(*simulated) | ErrorModel.yang2021()
+    path = tmp_path / "errors.ecsv"
+    model.write(path)
+    again = ErrorModel.read(path)
+    flux = np.geomspace(0.01, 100, 20) * u.uJy
+    for other in (again, pickle.loads(pickle.dumps(model))):
+        assert other.filters == model.filters
+        for name in model.filters:
+            assert_allclose(other.sigma(flux, name), model.sigma(flux, name), rtol=1e-12)
+    assert again.extrapolated(1e4 * u.uJy, BAND)
+    with pytest.raises(KeyError, match="no band of this error model"):
+        model.sigma(flux, "miri.f560w")
+    axes = model.plot(filters=[BAND])
+    assert axes.get_xlabel()
+    import matplotlib.pyplot as plt
+
+    plt.close("all")

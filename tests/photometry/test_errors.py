@@ -1,0 +1,150 @@
+import astropy.units as u
+import numpy as np
+import pytest
+import scipy.ndimage
+from astropy.table import QTable
+from numpy.testing import assert_allclose
+
+from miricigale.instrument import north_up_wcs, pixel_area_map
+from miricigale.photometry import ForcedPhotometer
+from miricigale.photometry.errors import LinearFit, noise_correlation
+
+
+def noise_images(kind, shape, rng):
+    """White noise of unit rms, or the bilinear interpolation of coarser noise."""
+    while True:
+        if kind == "white":
+            yield rng.normal(size=shape)
+        else:
+            native = rng.normal(size=(shape[0] // 2 + 40, shape[1] // 2 + 40))
+            y, x = (
+                np.mgrid[: shape[0], : shape[1]] * (0.06 / 0.11)
+                + rng.uniform(3, 4, 2)[:, None, None]
+            )
+            yield scipy.ndimage.map_coordinates(native, [y, x], order=1)
+
+
+@pytest.mark.parametrize("kind", ["white", "resampled"])
+def test_pulls_are_unity(tools, kind):
+    rng = np.random.default_rng(11)
+    scale, shape = (0.11, (200, 200)) if kind == "white" else (0.06, (360, 360))
+    wcs = north_up_wcs(tools.CENTER, scale * u.arcsec, shape)
+    n = 60
+    sky = tools.positions(rng, n, 9.5)
+    flux = 10 ** rng.uniform(-0.5, 1, n)
+    truth = tools.render(sky, flux, tools.LO, wcs, shape)
+    level = 0.5 * 1e-12 / tools.SR
+    catalog = QTable({"sky": sky})
+    photometer = ForcedPhotometer(tools.kernel, template="psf", fit_background=True)
+    naive = ForcedPhotometer(tools.kernel, template="psf", correlated_noise=False)
+    pulls, plain, chi2 = [], [], []
+    noises = noise_images(kind, shape, rng)
+    for k in range(12):
+        noise = next(noises)
+        image = tools.as_ccd(truth + level * noise, wcs, level * noise.std())
+        result = photometer.measure(image, catalog=catalog)
+        pulls.append((result.flux.value - flux) / result.flux_err.value)
+        chi2.append(result.chi2)
+        if k < 4:
+            result = naive.measure(image, catalog=catalog)
+            plain.append((result.flux.value - flux) / result.flux_err.value)
+    assert 0.95 < np.std(pulls) < 1.1
+    assert abs(np.mean(pulls)) < 0.12
+    assert 0.85 < np.median(chi2) < 1.05
+    if kind == "resampled":
+        assert np.std(plain) > 2.0
+    else:
+        assert 0.9 < np.std(plain) < 1.1
+
+
+def test_wrong_sigmas_do_not_matter(tools):
+    rng = np.random.default_rng(1)
+    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (150, 150))
+    catalog = QTable({"sky": tools.positions(rng, 20, 7.0)})
+    noise = rng.normal(size=(150, 150))
+    errors = [
+        ForcedPhotometer(tools.kernel)
+        .measure(tools.as_ccd(noise, wcs, stated), catalog=catalog)
+        .flux_err.value
+        for stated in (1.0, 0.2)
+    ]
+    assert_allclose(errors[0], errors[1], rtol=1e-3)
+    # and without any the noise of the image is taken
+    image = tools.as_ccd(noise, wcs, 1.0)
+    image.uncertainty = None
+    result = ForcedPhotometer(tools.kernel).measure(image, catalog=catalog)
+    assert result.meta["measured_noise"]
+    assert_allclose(result.flux_err.value, errors[0], rtol=0.01)
+
+
+def test_error_of_an_isolated_source_is_the_closed_form(tools):
+    # white noise: sigma_flux = sigma / sqrt(sum(P^2)), sum(P^2) = pixel / (4 pi width^2)
+    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (120, 120))
+    rng = np.random.default_rng(0)
+    image = tools.as_ccd(rng.normal(size=(120, 120)), wcs, 1.0)
+    catalog = QTable({"sky": tools.positions(rng, 1, 0.1)})
+    result = ForcedPhotometer(tools.kernel, correlated_noise=False).measure(image, catalog=catalog)
+    per_pixel = pixel_area_map(wcs, (120, 120))[60, 60] * 1e12
+    expected = per_pixel * np.sqrt(4 * np.pi) * tools.LO / 0.11
+    assert_allclose(result.flux_err.value, expected, rtol=1e-3)
+
+
+def test_blended_covariance_is_the_dense_inverse(tools):
+    rng = np.random.default_rng(8)
+    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (70, 70))
+    sky = tools.positions(rng, 12, 1.2)
+    sigma = rng.uniform(0.5, 2, (70, 70))
+    image = tools.as_ccd(rng.normal(size=(70, 70)), wcs, 1.0)
+    image.uncertainty.array[:] = sigma
+    result = ForcedPhotometer(tools.kernel, template="psf", correlated_noise=False).measure(
+        image, catalog=QTable({"sky": sky})
+    )
+    area = pixel_area_map(wcs, (70, 70)) * 1e12
+    design = np.stack(
+        [
+            (tools.render(sky[k : k + 1], [1.0], tools.LO, wcs, (70, 70)) / sigma).ravel()
+            for k in range(12)
+        ]
+    )
+    assert area.std() / area.mean() < 1e-6
+    covariance = np.linalg.inv(design @ design.T)
+    scale = np.sqrt(np.diag(covariance))
+    got = result.covariance.toarray() / scale[:, None] / scale
+    assert_allclose(got, covariance / scale[:, None] / scale, atol=2e-3)
+    assert_allclose(result.flux_err.value, scale, rtol=2e-3)
+
+
+def test_common_parameters_like_dense_least_squares():
+    import scipy.sparse
+
+    rng = np.random.default_rng(2)
+    design = rng.normal(size=(400, 8))
+    data = rng.normal(size=400)
+    noise = scipy.linalg.toeplitz(0.6 ** np.arange(400))
+    a, g = design[:, :6], design[:, 6:]
+    fit = LinearFit(scipy.sparse.csr_array(a.T @ a), a.T @ data, a.T @ g, g.T @ g, g.T @ data)
+    inverse = np.linalg.inv(design.T @ design)
+    solution = inverse @ design.T @ data
+    assert_allclose(np.concatenate([fit.flux, fit.common]), solution, rtol=1e-10)
+    full = scipy.sparse.csr_array(np.ones((6, 6)))
+    options = {"core": 10.0, "halo": 10.0, "pattern": full}
+    xy = rng.random((6, 2))
+    covariance, common, _ = fit.covariance(xy, **options)
+    assert_allclose(covariance.toarray(), inverse[:6, :6], atol=1e-12)
+    assert_allclose(common, inverse[6:, 6:], atol=1e-12)
+    filling = (scipy.sparse.csr_array(a.T @ noise @ a), a.T @ noise @ g, g.T @ noise @ g)
+    covariance, common, blending = fit.covariance(xy, noise=filling, **options)
+    expected = inverse @ design.T @ noise @ design @ inverse
+    assert_allclose(covariance.toarray(), expected[:6, :6], atol=1e-12)
+    assert_allclose(common, expected[6:, 6:], atol=1e-12)
+    assert_allclose(blending, np.sqrt(np.diag(inverse)[:6] * np.diag(a.T @ a)), rtol=1e-10)
+
+
+def test_white_noise_has_no_correlation():
+    rng = np.random.default_rng(0)
+    image = 1.3 * rng.normal(size=(300, 300))
+    found = noise_correlation(image, np.ones(image.shape, bool))
+    assert found.shape == (1, 1)
+    assert_allclose(found, 1.3**2, rtol=0.02)
+    with pytest.raises(ValueError, match="'usable' must leave at least 100 pixels"):
+        noise_correlation(image, np.zeros(image.shape, bool))

@@ -1,0 +1,342 @@
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData
+from astropy.table import QTable
+from numpy.testing import assert_allclose
+
+from miricigale.instrument import imager_wcs, north_up_wcs, pixel_area_map
+from miricigale.photometry import ForcedFlags, ForcedPhotometer, detect_sources
+from miricigale.psf import MatchingKernel
+from miricigale.utils.exceptions import MiricigaleWarning
+
+
+def flagged(result, flag):
+    return (result.flags & int(flag)) != 0
+
+
+def test_noiseless_point_sources_come_back_exactly(tools, field):
+    result = ForcedPhotometer(tools.kernel, template="psf").measure(
+        field.image, catalog=field.catalog
+    )
+    assert_allclose(result.flux.to_value(u.uJy), field.flux, rtol=1e-6, atol=1e-6)
+    assert np.abs(result.residual_image.data).max() < 1e-6 * field.image.data.max()
+    assert list(result.id) == list(field.catalog["id"])
+    assert not result.flags.any()
+
+
+@pytest.mark.parametrize("grid", ["fine", "turned", "distorted"])
+def test_flux_does_not_depend_on_the_grid(tools, field, grid):
+    if grid == "fine":
+        shape = (480, 480)
+        wcs = north_up_wcs(tools.CENTER, 0.06 * u.arcsec, shape)
+    elif grid == "turned":
+        shape = (340, 340)
+        wcs = north_up_wcs(tools.CENTER, 0.13 * u.arcsec, shape)
+        c, s = np.cos(0.6), np.sin(0.6)
+        wcs.wcs.pc = [[c, -s], [s, c]]
+        wcs.wcs.set()
+    else:
+        shape = (1024, 1032)
+        wcs = imager_wcs(tools.CENTER, 71 * u.deg)
+    data = tools.render(field.sky, field.flux, tools.LO, wcs, shape)
+    # the scene itself conserves flux on this grid
+    assert_allclose((data * pixel_area_map(wcs, shape)).sum() * 1e12, field.flux.sum(), rtol=1e-6)
+    image = tools.as_ccd(data, wcs, 0.01)
+    result = ForcedPhotometer(tools.kernel).measure(image, catalog=field.catalog)
+    assert_allclose(result.flux.value, field.flux, rtol=1e-4, atol=1e-4)
+    model = (result.model_image.data * pixel_area_map(wcs, shape)).sum() * 1e12
+    assert_allclose(model, field.flux.sum(), rtol=1e-4)
+
+
+def galaxies(tools, noise=0.002, n=30, seed=7, spacing=3.2):
+    """Isolated Gaussian galaxies, as the two images show them."""
+    rng = np.random.default_rng(seed)
+    side = int(np.ceil(np.sqrt(n)))
+    grid = (np.arange(side) - (side - 1) / 2) * spacing
+    dx, dy = (a.ravel()[:n] + rng.uniform(-0.2, 0.2, n) for a in np.meshgrid(grid, grid))
+    sky = tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
+    size = rng.uniform(0.05, 0.25, n)
+    bright = np.full(n, 20.0)
+    flux = 10 ** rng.uniform(0.5, 2, n)
+    half = int((side + 1.5) * spacing / 2 / tools.FINE)
+    fine = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, (2 * half, 2 * half))
+    high = tools.render(sky, bright, np.hypot(size, tools.HI), fine, (2 * half, 2 * half))
+    per_pixel = tools.FINE**2 * tools.SR * 1e12
+    sigma = noise / per_pixel
+    high = tools.as_ccd(high + rng.normal(0, sigma, high.shape), fine, sigma)
+    n_low = int(2 * half * tools.FINE / 0.11)
+    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (n_low, n_low))
+    low = tools.render(sky, flux, np.hypot(size, tools.LO), wcs, (n_low, n_low))
+    return sky, flux, high, tools.as_ccd(low, wcs, 0.01)
+
+
+def test_extended_sources_through_kernel_and_cutouts(tools):
+    sky, flux, high, low = galaxies(tools)
+    segmentation, detected = detect_sources(high, threshold=1.0, min_area=10)
+    assert len(detected) == len(sky)
+    result = ForcedPhotometer(tools.kernel).measure(low, high, segmentation, QTable({"sky": sky}))
+    assert not result.flags.any()
+    ratio = result.flux.value / flux
+    assert abs(np.median(ratio) - 1) < 0.005
+    assert_allclose(ratio, 1, atol=0.02)
+    # a point-source template does not know that they are extended
+    point = ForcedPhotometer(tools.kernel, template="psf").measure(
+        low, catalog=QTable({"sky": sky})
+    )
+    assert np.median(point.flux.value / flux) < 0.9
+
+
+def test_segments_as_they_are_lose_light(tools):
+    sky, flux, high, low = galaxies(tools, noise=0.02)
+    segmentation, _ = detect_sources(high, threshold=1.5, min_area=10)
+    catalog = QTable({"sky": sky})
+    plain = ForcedPhotometer(tools.kernel, wings=False).measure(low, high, segmentation, catalog)
+    full = ForcedPhotometer(tools.kernel).measure(low, high, segmentation, catalog)
+    assert np.median(plain.flux.value / flux) < 0.985
+    assert abs(np.median(full.flux.value / flux) - 1) < 0.035
+
+
+@pytest.mark.parametrize(("noise", "snr", "bias"), [(0.05, 40, 0.06), (0.16, 20, 0.1)])
+def test_noisy_templates(tools, noise, snr, bias):
+    ratios, as_they_are = [], []
+    for seed in range(3):
+        sky, flux, high, low = galaxies(tools, noise=noise, n=49, seed=seed)
+        segmentation, _ = detect_sources(high, threshold=1.0, min_area=10)
+        catalog = QTable({"sky": sky})
+        result = ForcedPhotometer(tools.kernel).measure(low, high, segmentation, catalog)
+        good = result.flags == 0
+        assert np.nanmedian(result.template_snr) < snr
+        ratios.append((result.flux.value / flux)[good])
+        # the segments as they are, without regard to their noise
+        quiet = tools.as_ccd(high.data, high.wcs, high.uncertainty.array[0, 0] * 1e-3)
+        plain = ForcedPhotometer(tools.kernel, wings=False)
+        result = plain.measure(low, quiet, segmentation, catalog)
+        as_they_are.append((result.flux.value / flux)[good])
+    assert abs(np.median(np.concatenate(ratios)) - 1) < bias
+    assert np.median(np.concatenate(as_they_are)) < 1 - bias / 2
+
+
+def test_noise_in_the_template_is_taken_off_the_diagonal(tools):
+    # noise of known variance in the cutout: expectation of the corrected power is that of the truth
+    from miricigale.photometry.templates import Cutout, FineTemplates, TemplateBank
+
+    rng = np.random.default_rng(2)
+    fine = FineTemplates(tools.kernel.array, tools.kernel.target)
+    y, x = np.mgrid[-9:10, -9:10]
+    light = np.exp(-0.5 * (x**2 + y**2) / 2.0**2)
+    light /= light.sum()
+    sigma = 0.02
+    n = 200
+    noisy = [light + rng.normal(0, sigma, light.shape) for _ in range(n)]
+    parts = [Cutout(a, (20, 20), noise=sigma**2 * light.size) for a in [light, *noisy]]
+    poly = np.zeros((n + 1, 2, 6))
+    poly[:, 0, 1] = poly[:, 1, 2] = 11 / 6
+    poly[:, :, 0] = 29.0
+    at = np.full((n + 1, 2), 29.0)
+    bank = TemplateBank(fine, parts, at, np.full((n + 1, 2), 40.0), poly, (81, 81))
+    from miricigale.photometry.errors import normal_matrix
+
+    matrix, _, power, _ = normal_matrix(bank, np.ones((81, 81)))
+    assert_allclose(matrix.diagonal(), power, rtol=1e-6)
+    power = power[np.argsort(bank.order)]
+    terms = bank.noise_terms()[np.argsort(bank.order)]
+    assert np.mean(power[1:]) > 1.1 * power[0]
+    assert_allclose(np.mean(power[1:] - terms[1:]), power[0], rtol=0.02)
+
+
+def test_blank_positions_and_shared_segments_are_point_sources(tools):
+    sky, _, high, low = galaxies(tools, n=9)
+    segmentation, detected = detect_sources(high, threshold=1.0, min_area=10)
+    blank = tools.CENTER.spherical_offsets_by(1.6 * u.arcsec, 1.6 * u.arcsec)
+    double = sky[0].spherical_offsets_by(0.15 * u.arcsec, 0 * u.arcsec)
+    ra, dec = (
+        np.concatenate(
+            [getattr(sky, name).deg, [getattr(one, name).deg for one in (blank, double)]]
+        )
+        for name in ("ra", "dec")
+    )
+    catalog = QTable({"sky": SkyCoord(ra, dec, unit="deg")})
+    result = ForcedPhotometer(tools.kernel).measure(low, high, segmentation, catalog)
+    assert flagged(result, ForcedFlags.NO_SEGMENT).tolist() == [False] * 9 + [True, False]
+    assert flagged(result, ForcedFlags.SHARED_SEGMENT).sum() == 1
+    assert np.isfinite(result.flux.value).all()
+    # a detection's own table gives its labels
+    result = ForcedPhotometer(tools.kernel).measure(low, high, segmentation, detected)
+    assert not result.flags.any()
+
+
+def test_sersic_templates(tools):
+    from miricigale.profiles import sersic_image
+
+    rng = np.random.default_rng(0)
+    n, shape = 6, (300, 300)
+    wcs = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, shape)
+    sky = tools.positions(rng, n, 6.0)
+    x, y = wcs.world_to_pixel(sky)
+    rows = {"r": rng.uniform(0.2, 0.5, n), "n": rng.uniform(0.8, 2, n)}
+    rows |= {"q": rng.uniform(0.4, 1, n), "pa": rng.uniform(0, 180, n)}
+    flux = 10 ** rng.uniform(1, 2, n)
+    scene = sum(
+        sersic_image(shape, x=x[k], y=y[k], total_flux=flux[k], r_eff=rows["r"][k] / tools.FINE,
+                     n=rows["n"][k], axis_ratio=rows["q"][k], theta=np.radians(90 + rows["pa"][k]))
+        for k in range(n)
+    )  # fmt: skip
+    from scipy.ndimage import gaussian_filter
+
+    scene = gaussian_filter(scene, tools.LO / tools.FINE, truncate=8, mode="constant")
+    image = tools.as_ccd(scene / (pixel_area_map(wcs, shape) * 1e12), wcs, 0.01)
+    catalog = QTable(
+        {"sky": sky, "profile": ["sersic"] * n, "half_light_radius": rows["r"] * u.arcsec,
+         "sersic_index": rows["n"], "axis_ratio": rows["q"], "position_angle": rows["pa"] * u.deg}
+    )  # fmt: skip
+    result = ForcedPhotometer(tools.kernel, template="sersic").measure(image, catalog=catalog)
+    assert_allclose(result.flux.value / flux, 1, atol=0.02)
+
+
+def test_background_and_shift_are_found(tools, field):
+    moved = field.sky.spherical_offsets_by(0.06 * u.arcsec, -0.03 * u.arcsec)
+    image = tools.render(moved, field.flux, tools.LO, field.wcs, field.image.shape) + 0.7
+    image = tools.as_ccd(image, field.wcs, 0.01)
+    settings = {"fit_background": True, "max_shift": 0.3 * u.arcsec}
+    result = ForcedPhotometer(tools.kernel, **settings).measure(image, catalog=field.catalog)
+    # +x is west
+    assert_allclose(result.shift.to_value(u.arcsec), [-0.06, -0.03], atol=2e-4)
+    assert_allclose(result.background.to_value("MJy/sr"), 0.7, atol=1e-4)
+    assert_allclose(result.flux.value, field.flux, rtol=2e-3, atol=2e-3)
+    with pytest.warns(MiricigaleWarning, match="beyond 'max_shift'"):
+        result = ForcedPhotometer(
+            tools.kernel, fit_background=True, max_shift=0.02 * u.arcsec
+        ).measure(image, catalog=field.catalog)
+    assert result.shift is None
+
+
+def test_masked_pixels_do_not_count(tools, field):
+    rng = np.random.default_rng(0)
+    mask = rng.random(field.image.shape) < 0.2
+    data = field.image.data.copy()
+    data[mask] = np.where(rng.random(mask.sum()) < 0.5, 1e6, np.nan)
+    image = tools.as_ccd(data, field.wcs, 0.01, mask=mask)
+    result = ForcedPhotometer(tools.kernel, template="psf").measure(image, catalog=field.catalog)
+    assert_allclose(result.flux.value, field.flux, rtol=1e-5, atol=1e-5)
+    assert flagged(result, ForcedFlags.MASKED).mean() > 0.9
+    assert np.isnan(result.residual_image.data[mask]).all()
+    assert_allclose(result.coverage, 0.8, atol=0.15)
+
+
+def test_edges_and_absent_data(tools):
+    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (120, 120))
+    west = [0.0, 6.55, 7.2, 9.0, 600.0]
+    north = [0.0, -3.0, 0.0, 3.0, 0.0]
+    sky = tools.CENTER.spherical_offsets_by(-np.array(west) * u.arcsec, north * u.arcsec)
+    flux = np.full(5, 50.0)
+    image = tools.as_ccd(tools.render(sky, flux, tools.LO, wcs, (120, 120)), wcs, 0.01)
+    result = ForcedPhotometer(tools.kernel, template="psf").measure(
+        image, catalog=QTable({"sky": sky})
+    )
+    assert flagged(result, ForcedFlags.EDGE).tolist() == [False, True, True, True, True]
+    assert flagged(result, ForcedFlags.NO_DATA).tolist() == [False, False, True, True, True]
+    assert_allclose(result.flux.value[:2], 50.0, rtol=1e-3)
+    assert np.isnan(result.flux.value[2:]).all()
+    assert np.isnan(result.flux_err.value[2:]).all()
+    table = result.to_table("miri.f770w")
+    assert table["miri.f770w"].unit == u.uJy
+    assert "edge" in table["miri.f770w_flags"].info.description
+
+
+def test_blends_are_flagged_and_twins_not_counted_twice(tools):
+    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (120, 120))
+    offset = np.array([0.0, 0.15, 3.0, 3.0])
+    sky = tools.CENTER.spherical_offsets_by(offset * u.arcsec, np.zeros(4) * u.arcsec)
+    flux = np.array([10.0, 20.0, 30.0, 0.0])
+    image = tools.as_ccd(tools.render(sky, flux, tools.LO, wcs, (120, 120)), wcs, 0.01)
+    result = ForcedPhotometer(tools.kernel, template="psf").measure(
+        image, catalog=QTable({"sky": sky})
+    )
+    assert flagged(result, ForcedFlags.BLENDED).tolist() == [True, True, False, False]
+    assert flagged(result, ForcedFlags.DEGENERATE).tolist() == [False, False, False, True]
+    assert_allclose(result.flux.value[:3], flux[:3], rtol=1e-4)
+    assert result.covariance[0, 1] < 0
+    # a source without light of its own is crowded by any neighbour
+    assert result.crowded.tolist() == [True, True, False, True]
+
+
+def test_radius_cuts_templates_without_changing_fluxes(tools, field):
+    short = ForcedPhotometer(tools.kernel, template="psf", radius=1.2 * u.arcsec)
+    result = short.measure(field.image, catalog=field.catalog)
+    assert_allclose(result.flux.value, field.flux, rtol=2e-3, atol=2e-3)
+    assert not flagged(result, ForcedFlags.EDGE).any()
+
+
+def test_templates_made_anew_give_the_same(tools, field):
+    kept = ForcedPhotometer(tools.kernel).measure(field.image, catalog=field.catalog)
+    anew = ForcedPhotometer(tools.kernel, max_bytes=1e4).measure(field.image, catalog=field.catalog)
+    assert_allclose(anew.flux.value, kept.flux.value, rtol=1e-12)
+    assert_allclose(anew.flux_err.value, kept.flux_err.value, rtol=1e-12)
+
+
+def test_integration_over_pixels(tools):
+    # a target without the pixel's response: pixels of the image are averages of the scene
+    from scipy.special import erf
+
+    n, scale = 90, 0.2
+    wcs = north_up_wcs(tools.CENTER, scale * u.arcsec, (n, n))
+    sky = tools.CENTER.spherical_offsets_by(0.03 * u.arcsec, 0.05 * u.arcsec)
+    x, y = wcs.world_to_pixel(sky)
+    edges = np.arange(n + 1) - 0.5
+    gx, gy = (np.diff(0.5 * erf((edges - p) * scale / tools.LO / np.sqrt(2))) for p in (x, y))
+    image = tools.as_ccd(100.0 * gy[:, None] * gx / (pixel_area_map(wcs, (n, n)) * 1e12), wcs, 0.1)
+    catalog = QTable({"sky": sky.reshape(1)})
+    flux = [
+        ForcedPhotometer(tools.kernel, integrate=flag).measure(image, catalog=catalog).flux.value[0]
+        for flag in (True, False)
+    ]
+    assert_allclose(flux[0], 100.0, rtol=1e-5)
+    assert flux[1] < 97.5
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "text"),
+    [
+        ({"template": "galaxy"}, ValueError, "'template' must be 'auto'"),
+        ({"max_shift": -1 * u.arcsec}, ValueError, "'max_shift' must be positive"),
+        ({"max_shift": 0.3}, u.UnitsError, "'max_shift' must be a quantity"),
+        ({"min_coverage": 2}, ValueError, "'min_coverage' must be between 0 and 1"),
+    ],
+)
+def test_bad_settings_are_refused(tools, change, error, text):
+    with pytest.raises(error, match=text):
+        ForcedPhotometer(tools.kernel, **change)
+
+
+def test_bad_inputs_are_refused(tools, field):
+    photometer = ForcedPhotometer(tools.kernel)
+    with pytest.raises(TypeError, match="'image' must be a CCDData"):
+        photometer.measure(field.image.data, catalog=field.catalog)
+    with pytest.raises(ValueError, match="'catalog' must be a table with the columns"):
+        photometer.measure(field.image, catalog=QTable({"ra": [1]}))
+    with pytest.raises(ValueError, match="'highres' must be on the kernel's pixels"):
+        photometer.measure(field.image, field.image, catalog=field.catalog)
+    wrong = CCDData(field.image.data, unit="adu", wcs=field.wcs)
+    with pytest.raises(u.UnitsError, match="'image' must be convertible to MJy / sr"):
+        photometer.measure(wrong, catalog=field.catalog)
+    bare = MatchingKernel(tools.kernel.array, pixel_scale=0.06 * u.arcsec)
+    with pytest.raises(ValueError, match="'kernel' must be a MatchingKernel with its source"):
+        ForcedPhotometer(bare)
+
+
+def test_empty_catalogue(tools, field):
+    result = ForcedPhotometer(tools.kernel).measure(field.image, catalog=field.catalog[:0])
+    assert len(result) == 0
+    assert len(result.to_table()) == 0
+
+
+def test_result_is_frozen_and_plots(tools, field):
+    result = ForcedPhotometer(tools.kernel).measure(field.image, catalog=field.catalog)
+    with pytest.raises(ValueError, match="read-only"):
+        result.flux[0] = 1 * u.uJy
+    with pytest.raises(AttributeError):
+        result.flux = None
+    axes = result.plot()
+    assert [ax.get_title() for ax in axes] == ["image", "model", "residual"]
