@@ -12,9 +12,10 @@ from miricigale.evaluation import (
     running_median,
     sfr_to_infrared_luminosity,
 )
-from miricigale.filters import FilterSet
 from miricigale.plotting.axes import new_figure
 from miricigale.plotting.comparison import (
+    MEASURED,
+    SECOND,
     plot_counts,
     plot_error_function,
     plot_histogram,
@@ -23,7 +24,7 @@ from miricigale.plotting.comparison import (
     plot_redshifts,
     plot_relation,
 )
-from miricigale.sed import COSMOLOGY
+from miricigale.sed import COSMOLOGY, SEDModel
 from miricigale.workflow.stages.sample import magnitude
 
 __all__ = [
@@ -265,4 +266,48 @@ def counts_figure(galaxies, bands, area):
         plot_counts(edges, counts.to_value(u.deg**-2), error.to_value(u.deg**-2), ax=ax, title=name)
     for ax in list(axes.flat)[len(bands) :]:
         ax.set_visible(False)
+    return figure
+
+
+def example_figure(results, truth, key):
+    """
+    One source: photometry with the best fit, and posteriors of redshift and AGN fraction.
+
+    Parameters
+    ----------
+    results : dict of str to `~miricigale.fitting.FitResults`
+        ``with_miri`` and ``without_miri``.
+    truth : `~astropy.table.QTable`
+        With ``id``, ``redshift`` and ``frac_agn``.
+    key : object
+        Id of the source.
+    """
+    from matplotlib.figure import Figure
+
+    row = truth[np.asarray(truth["id"]) == key][0]
+    figure = Figure(figsize=(12, 4.8), layout="constrained")
+    grid = figure.add_gridspec(2, 3, height_ratios=(3, 1), width_ratios=(1.7, 1, 1))
+    upper = figure.add_subplot(grid[0, 0])
+    lower = figure.add_subplot(grid[1, 0], sharex=upper)
+    results["with_miri"][key].plot_sed(ax=(upper, lower), model=SEDModel.yang2021())
+    upper.tick_params(labelbottom=False)
+    for column, (name, label) in enumerate(
+        (("redshift", "redshift"), ("frac_agn", "AGN fraction")), start=1
+    ):
+        ax = figure.add_subplot(grid[:, column])
+        for unit, color in (("with_miri", MEASURED), ("without_miri", SECOND)):
+            edges, weights = results[unit][key].pdf(name)
+            density = weights / np.diff(edges.value)
+            ax.stairs(
+                density / density.max(),
+                edges.value,
+                color=color,
+                lw=1.6,
+                label=unit.replace("_", " "),
+            )
+        ax.axvline(row[name], color="0.35", ls="--", lw=1, label="truth")
+        ax.set(xlabel=label, ylabel="posterior density (peak 1)", ylim=(0, 1.08))
+        if name == "redshift":
+            ax.set_xlim(max(0, row[name] - 1.2), row[name] + 1.2)
+        ax.legend(fontsize=8, frameon=False)
     return figure

@@ -30,7 +30,8 @@ def make_catalog(context, _):
     catalog = read_catalog(options.source)
     if options.mag_column not in catalog.colnames:
         raise argument_error("mag_column", f"one of {catalog.colnames}", repr(options.mag_column))
-    magnitude = u.Quantity(catalog[options.mag_column]).value
+    column = catalog[options.mag_column]
+    magnitude = np.asarray(getattr(column, "value", column), float)
     chosen = catalog[magnitude <= options.mag_limit]
     if len(chosen) == 0:
         msg = (
@@ -109,12 +110,12 @@ def make_truth(context, _):
     """Stage 3: the best-fit SED (and its AGN) of each source through every band."""
     config = context.config
     catalog = QTable.read(context.path("catalog.ecsv"))
-    best = FitResults.read(context.path("input_seds.fits")).best_parameters()
+    best = FitResults.read(context.path("input_seds.fits")).to_table()
     parameters = QTable({"id": catalog["id"]})
     parameters["redshift"] = np.asarray(catalog["redshift"], float)
-    for name in best.colnames:
-        if name in (*GALAXY_PARAMETERS, "mass"):
-            parameters[name] = best[name]
+    for name in (*GALAXY_PARAMETERS, "mass"):
+        if f"{name}_best" in best.colnames:
+            parameters[name] = best[f"{name}_best"]
     model = SEDModel.yang2021(agn=config.sed.frac_agn > 0)
     if config.sed.frac_agn > 0:
         add_agn(parameters, config.sed.frac_agn, context.seed)

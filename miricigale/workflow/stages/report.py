@@ -370,7 +370,7 @@ class _Writer:
         key = self._example()
         if key is not None:
             self.report.figure(
-                figures.example_figure(results, self.truth, key, self.config),
+                figures.example_figure(results, self.truth, key),
                 f"Source {key}: photometry and best fit with MIRI, and the posteriors of redshift "
                 "and AGN fraction with (red) and without (blue) MIRI.",
             )

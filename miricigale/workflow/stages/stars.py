@@ -32,7 +32,8 @@ def star_fluxes(catalog, known, wanted):
         photosphere without dust is close to the Rayleigh-Jeans law.
     """
     known, wanted = list(known), list(wanted)
-    filters = FilterSet.from_names([*known, *wanted])
+    filters = FilterSet.from_names(list(dict.fromkeys([*known, *wanted])))
+    first, last = ([filters.names.index(name) for name in names] for names in (known, wanted))
     models = np.array(
         [
             filters.synthetic_fluxes(
@@ -45,13 +46,13 @@ def star_fluxes(catalog, known, wanted):
     good = np.isfinite(data) & (data > 0)
     # least squares in the logarithm: equal relative errors, the scale is the mean ratio
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(good[:, None], np.log(data[:, None] / models[None, :, : len(known)]), 0.0)
+        ratio = np.where(good[:, None], np.log(data[:, None] / models[None][:, :, first]), 0.0)
     count = np.maximum(good.sum(axis=1), 1)[:, None]
     scale = ratio.sum(axis=2) / count
     scatter = np.where(good[:, None], (ratio - scale[..., None]) ** 2, 0.0).sum(axis=2)
     best = np.argmin(scatter, axis=1)
     rows = np.arange(len(catalog))
-    fluxes = np.exp(scale[rows, best])[:, None] * models[best, len(known) :]
+    fluxes = np.exp(scale[rows, best])[:, None] * models[np.ix_(best, last)]
     fluxes[~good.any(axis=1)] = np.nan
     table = QTable({"temperature": TEMPERATURES[best]})
     for k, name in enumerate(wanted):

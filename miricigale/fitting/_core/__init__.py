@@ -1,0 +1,18 @@
+"""Kernels of the grid fit: arrays in, arrays out."""
+
+from miricigale.fitting._core.driver import fit_many, make_scratch, make_sums
+from miricigale.fitting._core.histogram import N_BINS, PER_DEX
+from miricigale.fitting._core.structs import Output, Request, Scratch, Sums, Tables
+
+__all__ = [
+    "N_BINS",
+    "PER_DEX",
+    "Output",
+    "Request",
+    "Scratch",
+    "Sums",
+    "Tables",
+    "fit_many",
+    "make_scratch",
+    "make_sums",
+]

@@ -1,0 +1,1 @@
+"""Ways to find a posterior; the grid engine is the one that every installation has."""

@@ -1,0 +1,139 @@
+"""Results of fits as FITS files."""
+
+import json
+from dataclasses import fields
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.io import fits
+
+from miricigale.fitting.priors import GridAxis
+from miricigale.utils.exceptions import DataError
+
+__all__ = ["read_results", "write_results"]
+
+_FORMAT = "miricigale-fitresults-1"
+_DICTS = ("pdf", "best")
+_TEXT = ("filters", "quantities", "descriptions", "meta")
+
+
+def write_results(results, path, *, overwrite=False):
+    """
+    Write results: a table extension of all arrays, and a text extension of all else.
+
+    Parameters
+    ----------
+    results : `~miricigale.fitting.FitResults`
+        The results.
+    path : path-like
+        The file.
+    overwrite : bool, optional
+        Whether a file that is there is replaced.
+    """
+    from astropy.table import Table
+
+    table = Table()
+    for item in fields(results):
+        value = getattr(results, item.name)
+        if isinstance(value, np.ndarray):
+            table[item.name] = value
+    for name in _DICTS:
+        for key, value in getattr(results, name).items():
+            table[f"{name}:{key}"] = value
+    text = {name: getattr(results, name) for name in _TEXT}
+    text["units"] = [u.Unit(unit).to_string() for unit in results.units]
+    text["shapes"] = {name: table[name].shape[1:] for name in table.colnames}
+    text["axes"] = {
+        name: {
+            "values": axis.values.tolist(),
+            "unit": u.Unit(axis.unit).to_string(),
+            "kind": axis.kind,
+            "weights": axis.weights.tolist(),
+            "bounds": list(axis.bounds),
+        }
+        for name, axis in results.axes.items()
+    }
+    empty = [name for name in table.colnames if table[name].size == 0 and len(table)]
+    table.remove_columns(empty)
+    hdus = [fits.PrimaryHDU(header=fits.Header({"FORMAT": _FORMAT}))]
+    data = np.frombuffer(json.dumps(text, default=_plain).encode(), dtype=np.uint8)
+    hdus.append(fits.ImageHDU(data, name="TEXT"))
+    hdu = fits.table_to_hdu(table)
+    hdu.name = "RESULTS"
+    hdus.append(hdu)
+    fits.HDUList(hdus).writeto(Path(path), overwrite=overwrite, output_verify="exception")
+
+
+def read_results(cls, path):
+    """
+    Read results.
+
+    Parameters
+    ----------
+    cls : type
+        `~miricigale.fitting.FitResults`.
+    path : path-like
+        The file.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file is something else or incomplete.
+    """
+    from astropy.table import Table
+
+    try:
+        with fits.open(Path(path), memmap=False) as hdus:
+            if hdus[0].header.get("FORMAT") != _FORMAT:
+                msg = f"{path} holds no fit results (no FORMAT = {_FORMAT!r} in its header)"
+                raise DataError(msg)
+            text = json.loads(bytes(np.asarray(hdus["TEXT"].data)).decode())
+            table = Table.read(hdus["RESULTS"], character_as_bytes=False)
+        n = len(table)
+        columns = {
+            name: np.asarray(table[name]).reshape(n, *shape)
+            if name in table.colnames
+            else np.zeros((n, *shape))
+            for name, shape in text["shapes"].items()
+        }
+        values = {name: tuple(text[name]) for name in ("filters", "quantities", "descriptions")}
+        values |= {"meta": text["meta"], "units": tuple(u.Unit(x) for x in text["units"])}
+        values["axes"] = {
+            name: GridAxis(
+                name,
+                np.array(axis["values"]),
+                u.Unit(axis["unit"]),
+                axis["kind"],
+                np.array(axis["weights"]),
+                None,
+                tuple(axis["bounds"]),
+            )
+            for name, axis in text["axes"].items()
+        }
+        for name in _DICTS:
+            start = f"{name}:"
+            values[name] = {
+                key.removeprefix(start): _native(array)
+                for key, array in columns.items()
+                if key.startswith(start)
+            }
+        values |= {name: _native(array) for name, array in columns.items() if ":" not in name}
+        return cls(**values)
+    except (KeyError, ValueError, TypeError) as err:
+        msg = f"{path} is not a complete file of fit results: {err}"
+        raise DataError(msg) from err
+
+
+def _native(array):
+    """Bring an array to the byte order of the machine."""
+    return array.astype(array.dtype.newbyteorder("=")) if array.dtype.kind in "fiu" else array
+
+
+def _plain(value):
+    """Turn numpy numbers and arrays into what JSON knows."""
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return str(value)

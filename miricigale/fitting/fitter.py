@@ -1,0 +1,465 @@
+"""BayesFitter: posteriors of galaxy and AGN parameters from broad-band photometry."""
+
+import logging
+from dataclasses import dataclass, field, replace
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.fitting.engines.grid import GridEngine
+from miricigale.fitting.flags import FitFlags
+from miricigale.fitting.likelihood import per_band, read_photometry
+from miricigale.fitting.posterior import cell_edges
+from miricigale.fitting.priors import GridPriors, grid_priors
+from miricigale.fitting.quantities import DERIVED_LEVELS, Quantities
+from miricigale.fitting.results import FitResults
+from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.meta import provenance
+from miricigale.utils.parallel import chunks, parallel_map
+
+__all__ = ["BayesFitter"]
+
+logger = logging.getLogger(__name__)
+
+
+class BayesFitter:
+    """
+    Fit photometry with every model of a grid and sum up the posterior.
+
+    The model flux of redshift z, galaxy g, torus k and AGN fraction f is
+    s (G[z, g] + c L_dust[g] A[z, k]) with c = f / (1 - f). The scale s (the stellar mass
+    formed) that minimises chi2 is known in closed form, and weights are
+    prior * exp(-chi2 / 2) there, as in CIGALE [1]_; the prior on s that this amounts to is flat
+    in the signal-to-noise ratio of the model, which is that of a prior flat in log s to within
+    the relative variance of s. Pairs (galaxy, torus) that no AGN fraction can make good enough
+    are found by a bound and left out; the rest is evaluated in double precision.
+
+    Parameters
+    ----------
+    model : `~miricigale.sed.ModelGrid` or `~miricigale.sed.SEDModel`
+        A grid, or a model of which a grid is made with ``axes``.
+    filters : list of str or `~miricigale.filters.FilterSet`, optional
+        Bands to fit. By default those of the grid that the photometry has; of a model, these
+        are the bands of the grid and must be given.
+    axes : dict, optional
+        Parameter name to values, for a model (see `~miricigale.sed.SEDModel.grid`).
+    priors : dict, optional
+        Parameter name to prior: a function of the value, an array of weights of the nodes or
+        ``"log"``. Others are flat in the nodes of the grid.
+    prior_f : {"grid", "uniform"}, optional
+        Prior of the AGN fractions: equal for all values of the grid (so that f = 0, which is
+        evaluated once for each galaxy, carries the summed weight of all tori), or by the width
+        of their cells.
+    engine : {"grid"}, optional
+        How the posterior is found.
+    model_error : float or dict of str to float, optional
+        Part of the flux that is added to its error in quadrature, for all or by filter.
+    error_floor : float or dict of str to float, optional
+        Least relative error of a flux, for all or by filter.
+    n_bands_min : int, optional
+        Objects with fewer usable bands are flagged and not fitted.
+    redshift_tolerance : float, optional
+        How far, in |dz| / (1 + z), a fixed redshift may lie from its node of the grid; half the
+        distance of the nodes by default.
+    max_reduced_chi2 : float, optional
+        Above this reduced chi2 of the best model an object is flagged.
+    scale_error : bool, optional
+        Whether the uncertainty of each model's own scale is part of the posterior of masses,
+        luminosities and fluxes (CIGALE leaves it out).
+    rtol : float, optional
+        Largest part of the posterior that pruning may miss; 0 evaluates every model.
+
+    Examples
+    --------
+    >>> from miricigale.fitting import BayesFitter
+    >>> fitter = BayesFitter(grid)  # doctest: +SKIP
+    >>> results = fitter.fit(photometry)  # doctest: +SKIP
+    >>> results.to_table()["id", "redshift_mean", "frac_agn_mean"]  # doctest: +SKIP
+
+    References
+    ----------
+    .. [1] Boquien et al. 2019, A&A 622, A103, section 4.3
+    """
+
+    def __init__(
+        self,
+        model,
+        filters=None,
+        *,
+        axes=None,
+        priors=None,
+        prior_f="grid",
+        engine="grid",
+        model_error=0.1,
+        error_floor=0.0,
+        n_bands_min=2,
+        redshift_tolerance=None,
+        max_reduced_chi2=100.0,
+        scale_error=True,
+        rtol=1e-6,
+    ):
+        if engine != "grid":
+            raise argument_error("engine", "'grid'", repr(engine))
+        names = None if filters is None else tuple(getattr(filters, "names", filters))
+        if isinstance(names, tuple) and isinstance(filters, str):
+            raise argument_error("filters", "a list of names or a FilterSet", repr(filters))
+        self.model = None
+        if hasattr(model, "grid"):
+            if axes is None or names is None:
+                msg = "'axes' and 'filters' must be given when 'model' is an SEDModel"
+                raise ValueError(msg)
+            self.model = model
+            model = model.grid(axes, filters)
+        elif axes is not None:
+            raise argument_error("axes", "None when 'model' is a ModelGrid", "a value")
+        if not hasattr(model, "galaxy_properties"):
+            raise argument_error("model", "a ModelGrid or an SEDModel", type(model).__name__)
+        self.grid = model
+        for name in names or ():
+            if name not in model.filters:
+                raise unknown_name("filter of the grid", name, model.filters)
+        self.filters = names
+        if not (isinstance(n_bands_min, (int, np.integer)) and n_bands_min >= 1):
+            raise argument_error("n_bands_min", "an integer >= 1", repr(n_bands_min))
+        if not 0 <= rtol < 0.1:
+            raise argument_error("rtol", "in [0, 0.1)", f"{rtol}")
+        if not max_reduced_chi2 > 0:
+            raise argument_error("max_reduced_chi2", "positive", f"{max_reduced_chi2}")
+        if redshift_tolerance is not None and not redshift_tolerance >= 0:
+            raise argument_error("redshift_tolerance", ">= 0", f"{redshift_tolerance}")
+        self.engine = engine
+        self.model_error = per_band(model_error, model.filters, "model_error")
+        self.error_floor = per_band(error_floor, model.filters, "error_floor")
+        self.n_bands_min = int(n_bands_min)
+        self.redshift_tolerance = redshift_tolerance
+        self.max_reduced_chi2 = float(max_reduced_chi2)
+        self.prior_f = prior_f
+        self.priors = grid_priors(model, priors, prior_f=prior_f)
+        self.quantities = Quantities.of_grid(model)
+        self._engine = self._make_engine(bool(scale_error), float(rtol))
+
+    def __repr__(self):
+        bands = "bands of the photometry" if self.filters is None else f"{len(self.filters)} bands"
+        return f"<BayesFitter of {self.grid!r}, {bands}>"
+
+    def _make_engine(self, scale_error, rtol):
+        grid, priors, quantities = self.grid, self.priors, self.quantities
+        return GridEngine(
+            galaxy=np.asarray(grid.galaxy, dtype=float),
+            agn=np.asarray(grid.agn, dtype=float),
+            dust=np.asarray(grid.dust_luminosity, dtype=float),
+            frac=np.asarray(grid.frac_agn, dtype=float),
+            usable=np.asarray(grid.allowed, dtype=bool) & (priors.galaxy > 0),
+            prior_galaxy=priors.galaxy,
+            prior_agn=priors.agn,
+            prior_frac=priors.frac,
+            galaxy_scale=quantities.galaxy_scale,
+            agn_scale=quantities.agn_scale,
+            mixed_galaxy=quantities.mixed_galaxy,
+            mixed_agn=quantities.mixed_agn,
+            levels=DERIVED_LEVELS,
+            rtol=rtol,
+            scale_error=scale_error,
+        )
+
+    def fit(
+        self,
+        photometry,
+        *,
+        redshift=None,
+        seed=None,
+        executor=None,
+        progress_bar=False,
+        chunk_size=64,
+    ):
+        """
+        Fit a catalogue.
+
+        Parameters
+        ----------
+        photometry : `~astropy.table.QTable`
+            One row for each object: ``id``, a flux column for each filter, called by the
+            filter's name, and its error ``<name>_err``. NaN is a missing band.
+        redshift : str or array_like, optional
+            Column of ``photometry``, or values, of known redshifts; each is taken to the nearest
+            redshift of the grid. Without it the redshift is free.
+        seed : optional
+            Not used by this engine; other engines draw from it.
+        executor : `concurrent.futures.Executor`, optional
+            Fits pieces of the catalogue at the same time; the answer is the same. Threads work
+            well: the kernels hold no lock.
+        progress_bar : bool, optional
+            Whether to show one.
+        chunk_size : int, optional
+            Objects in a piece.
+
+        Returns
+        -------
+        results : `FitResults`
+            One row for each object, in the order of the catalogue; those that could not be
+            fitted are flagged.
+
+        Raises
+        ------
+        ValueError
+            If a column is missing or ``redshift`` has the wrong shape.
+        `~astropy.units.UnitsError`
+            If a flux column has no unit of flux density.
+        """
+        del seed
+        grid = self.grid
+        filters = self._bands(photometry)
+        columns = [grid.filters.index(name) for name in filters]
+        data = read_photometry(
+            photometry,
+            filters,
+            model_error=self.model_error[columns],
+            error_floor=self.error_floor[columns],
+            n_bands_min=self.n_bands_min,
+            grid_filters=grid.filters,
+        )
+        if isinstance(chunk_size, bool) or not int(chunk_size) >= 1:
+            raise argument_error("chunk_size", "an integer >= 1", repr(chunk_size))
+        flags = data.flags.copy()
+        log_prior = self._redshift_prior(photometry, redshift, flags)
+        log_prior[(flags & int(FitFlags.UNFITTED)) != 0] = -np.inf
+        n = len(data.ids)
+        task = _Chunk(self._engine, self.priors)
+        pieces = [
+            (np.nan_to_num(data.flux[s]), data.sigma[s], log_prior[s])
+            for s in chunks(n, int(chunk_size))
+        ]
+        parts = parallel_map(task, pieces, executor=executor, progress_bar=progress_bar, desc="fit")
+        logger.debug("fitted %d objects", n)
+        return self._results(data, flags, log_prior, parts, redshift is not None, filters)
+
+    def _bands(self, photometry):
+        """Filters to fit: those asked for, or those of the grid that the table has."""
+        if self.filters is not None:
+            return self.filters
+        have = getattr(photometry, "colnames", ())
+        filters = tuple(name for name in self.grid.filters if name in have)
+        if not filters:
+            wanted = f"a table with at least one of the columns {list(self.grid.filters)}"
+            raise argument_error("photometry", wanted, f"columns {list(have)}")
+        return filters
+
+    def _redshift_prior(self, photometry, redshift, flags):
+        """ln(prior) of the grid's redshifts for every object, shape (n, nz)."""
+        n, z = len(photometry), self.grid.redshift
+        with np.errstate(divide="ignore"):
+            log_prior = np.log(self.priors.redshift)
+        usable = self._engine.usable.any(axis=1)
+        log_prior = np.where(usable, log_prior, -np.inf)
+        out = np.tile(log_prior, (n, 1))
+        if redshift is None:
+            flags[~np.isfinite(out).any(axis=1)] |= int(FitFlags.NO_MODEL)
+            return out
+        if isinstance(redshift, str):
+            if redshift not in photometry.colnames:
+                raise argument_error(
+                    "redshift", f"a column among {photometry.colnames}", repr(redshift)
+                )
+            redshift = photometry[redshift]
+        mask = getattr(redshift, "mask", None)
+        values = getattr(redshift, "unmasked", redshift)
+        values = u.Quantity(values).to_value(u.dimensionless_unscaled)
+        values = (
+            np.array(np.broadcast_to(values, (n,)), dtype=float) if values.ndim == 0 else values
+        )
+        if values.shape != (n,):
+            raise argument_error("redshift", f"{n} values", f"shape {values.shape}")
+        values = np.where(mask, np.nan, values) if mask is not None else values
+        missing = ~(np.isfinite(values) & (values > 0))
+        safe = np.where(missing, z[0], values)
+        node = np.argmin(np.abs(np.log1p(safe)[:, None] - np.log1p(z)), axis=1)
+        apart = np.abs(safe - z[node]) / (1.0 + safe)
+        if self.redshift_tolerance is not None:
+            limit = np.full(n, self.redshift_tolerance)
+        else:
+            edges = np.log1p(cell_edges(z, (0.0, np.inf)))
+            limit = 1.001 * (edges[node + 1] - edges[node]) / 2.0 + 1e-6
+            limit = np.maximum(limit, 1e-3 if z.size == 1 else 0.0)
+        outside = ~missing & (apart > limit)
+        flags[missing] |= int(FitFlags.NO_REDSHIFT)
+        flags[outside] |= int(FitFlags.REDSHIFT_OUTSIDE)
+        fixed = np.full((n, z.size), -np.inf)
+        fixed[np.arange(n), node] = np.where(np.isfinite(log_prior[node]), 0.0, -np.inf)
+        fixed[missing | outside] = -np.inf
+        none = ~missing & ~outside & ~np.isfinite(fixed).any(axis=1)
+        flags[none] |= int(FitFlags.NO_MODEL)
+        return fixed
+
+    def _results(self, data, flags, log_prior, parts, fixed, filters):
+        grid, priors = self.grid, self.priors
+        n = len(data.ids)
+        merged = _Part.merge(parts, self._engine, priors, n)
+        used = data.used
+        n_bands = used.sum(axis=1)
+        fitted = np.isfinite(merged.chi2)
+        reduced = np.where(n_bands > 1, merged.chi2 / np.maximum(n_bands - 1, 1), np.nan)
+        with np.errstate(invalid="ignore"):
+            flags[fitted & (reduced > self.max_reduced_chi2)] |= int(FitFlags.HIGH_CHI2)
+            flags[fitted & ~(merged.scale > 0)] |= int(FitFlags.NO_SIGNAL)
+            unfitted = ~fitted & ((flags & int(FitFlags.UNFITTED)) == 0)
+            flags[unfitted] |= int(FitFlags.NO_SIGNAL)
+            if not fixed and grid.redshift.size > 2:
+                pdf = merged.pdf["redshift"]
+                edge = np.maximum(pdf[:, 0], pdf[:, -1]) > 0.01
+                flags[fitted & edge] |= int(FitFlags.REDSHIFT_EDGE)
+        log_sigma = np.where(used, np.log(np.where(used, data.sigma, 1.0)), 0.0).sum(axis=1)
+        log_sigma += 0.5 * n_bands * np.log(2.0 * np.pi)
+        index, scale = merged.index, merged.scale
+        best_flux = np.full(data.flux.shape, np.nan)
+        ok = fitted
+        if np.any(ok):
+            z, g, k, f = index[ok].T
+            flux = grid.galaxy[z, g]
+            if grid.agn_multiplicity.size:
+                ratio = grid.frac_agn[f] / (1.0 - grid.frac_agn[f])
+                power = ratio * grid.dust_luminosity[g]
+                flux = flux + power[:, None] * grid.agn[z, k]
+            best_flux[ok] = scale[ok, None] * flux
+        meta = provenance(
+            citations=grid.meta.get("citations", ()),
+            fit=self.settings(filters, fixed),
+            grid={k: v for k, v in grid.meta.items() if k not in ("citations", "axes")},
+        )
+        return FitResults(
+            ids=data.ids,
+            flags=flags,
+            n_bands=n_bands,
+            chi2=merged.chi2,
+            log_evidence=merged.log_sum - log_sigma,
+            filters=grid.filters,
+            flux=data.flux,
+            flux_err=data.flux_err,
+            sigma=data.sigma,
+            axes={name: replace(axis, share=None) for name, axis in priors.axes.items()},
+            pdf=merged.pdf,
+            pdf_2d=merged.pdf_2d,
+            best_index=index,
+            best_scale=scale,
+            best=self._best(index, scale, ok),
+            quantities=self.quantities.names,
+            units=self.quantities.units,
+            descriptions=self.quantities.descriptions,
+            moments=merged.moments,
+            quantiles=merged.quantiles,
+            model_flux=merged.band[:, 0],
+            model_flux_std=merged.band[:, 1],
+            best_flux=best_flux,
+            meta=meta,
+            model=self.model,
+        )
+
+    def settings(self, filters=None, fixed=False):
+        """Return what the fit was told, for the meta of results: a dict of plain values."""
+        names = self.grid.filters
+        return {
+            "engine": self.engine,
+            "filters": list(filters or self.filters or names),
+            "redshift": "fixed" if fixed else "free",
+            "prior_f": self.prior_f,
+            "model_error": dict(zip(names, self.model_error.tolist(), strict=True)),
+            "error_floor": dict(zip(names, self.error_floor.tolist(), strict=True)),
+            "n_bands_min": self.n_bands_min,
+            "rtol": self._engine.rtol,
+            "scale_error": self._engine.scale_error,
+            "n_models": int(self._engine.n_models),
+            "constants": self._constants(),
+        }
+
+    def _constants(self):
+        """Parameters of the grid that have one value, which have no posterior."""
+        out = {}
+        for table in (self.grid.galaxy_parameters, self.grid.agn_parameters):
+            for name in table.colnames:
+                if name not in self.priors.axes and len(table):
+                    column = table[name]
+                    out[name] = float(getattr(column, "value", column)[0])
+        return out
+
+    def _best(self, index, scale, ok):
+        """Parameters and derived quantities of the best models: name to array."""
+        n = len(scale)
+        z, g, k, f = np.where(ok[:, None], index, 0).T
+        out = {}
+        grid = self.grid
+        frac = grid.frac_agn[f]
+        for name, axis in self.priors.axes.items():
+            if name == "redshift":
+                values = grid.redshift[z]
+            elif name == "frac_agn":
+                values = frac
+            elif axis.kind == "galaxy":
+                values = _plain(grid.galaxy_parameters[name])[g]
+            else:
+                # without AGN there is no torus to speak of
+                values = np.where(frac > 0, _plain(grid.agn_parameters[name])[k], np.nan)
+            out[name] = np.where(ok, values, np.nan)
+        derived = self.quantities.best(grid, g, k, frac, np.where(ok, scale, np.nan))
+        for i, name in enumerate(self.quantities.names):
+            out[name] = np.broadcast_to(derived[i], (n,))
+        return out
+
+
+def _plain(column):
+    return np.asarray(getattr(column, "value", column), dtype=float)
+
+
+@dataclass(frozen=True, eq=False)
+class _Chunk:
+    """Fit a piece of a catalogue; picklable."""
+
+    engine: GridEngine
+    priors: GridPriors
+
+    def __call__(self, piece):
+        out = self.engine.fit(*piece)
+        pdf = {"redshift": out.zf.sum(axis=2)}
+        for name, axis in self.priors.axes.items():
+            if axis.kind == "frac_agn":
+                pdf[name] = out.zf.sum(axis=1)
+            elif axis.kind == "galaxy":
+                pdf[name] = out.galaxy @ axis.share.T
+            elif axis.kind == "agn":
+                pdf[name] = out.agn @ axis.share.T
+        return _Part(
+            chi2=np.maximum(out.norm - out.best_r, 0.0),
+            log_sum=out.log_sum,
+            scale=out.best_scale,
+            index=out.index,
+            pdf=pdf,
+            pdf_2d=out.zf,
+            band=out.band,
+            moments=out.moments,
+            quantiles=out.quantiles,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Results of a piece of a catalogue."""
+
+    chi2: np.ndarray
+    log_sum: np.ndarray
+    scale: np.ndarray
+    index: np.ndarray
+    pdf: dict = field(default_factory=dict)
+    pdf_2d: np.ndarray = None
+    band: np.ndarray = None
+    moments: np.ndarray = None
+    quantiles: np.ndarray = None
+
+    @classmethod
+    def merge(cls, parts, engine, priors, n):
+        """Join the pieces; a catalogue without rows gets arrays without rows."""
+        if not parts:
+            n_z, _, n_b = engine.galaxy.shape
+            empty = (np.zeros((n, n_b)), np.zeros((n, n_b)), np.zeros((n, n_z)))
+            parts = [_Chunk(engine, priors)(empty)]
+        names = [name for name in cls.__dataclass_fields__ if name != "pdf"]
+        merged = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
+        pdf = {name: np.concatenate([p.pdf[name] for p in parts]) for name in parts[0].pdf}
+        return cls(pdf=pdf, **merged)

@@ -1,0 +1,45 @@
+"""Why an object was not fitted, or what to know of its fit."""
+
+from miricigale.utils.tables import Flags
+
+__all__ = ["FitFlags"]
+
+
+class FitFlags(Flags):
+    """Flags of a fitted catalogue; `FitFlags.UNFITTED` is the sum of those that prevent a fit."""
+
+    NO_BAND = 1
+    """No usable band."""
+    FEW_BANDS = 2
+    """Fewer usable bands than asked for."""
+    BAD_ERROR = 4
+    """A measured flux whose error is zero, negative or not finite; the band is left out."""
+    NO_REDSHIFT = 8
+    """A fixed redshift was asked for and is missing, not finite or not positive."""
+    REDSHIFT_OUTSIDE = 16
+    """The fixed redshift has no redshift of the grid within the tolerance."""
+    DUPLICATE_ID = 32
+    """The id occurred before; only its first row is fitted."""
+    HIGH_CHI2 = 64
+    """No model fits: the reduced chi2 of the best is above the limit."""
+    NO_SIGNAL = 128
+    """No model has a positive scale: the fluxes are all zero or negative, or nearly so."""
+    REDSHIFT_EDGE = 256
+    """More than one per cent of the posterior lies on the first or last redshift."""
+    NO_MODEL = 512
+    """No model is left by the age of the universe and the priors."""
+
+    UNFITTED = 1 | 2 | 8 | 16 | 32 | 512
+    """Bits with which a row has no result."""
+
+    @classmethod
+    def describe(cls):
+        """One line of text that gives each bit its name, for a column's description."""
+        single = (m for m in cls if m.value and m is not cls.UNFITTED)
+        bits = ", ".join(f"{m.value} {m.name.lower().replace('_', ' ')}" for m in single)
+        return f"bit flags (sum): {bits}; 0 good"
+
+    @classmethod
+    def names(cls, value):
+        """Names of the bits set in ``value``, lower case."""
+        return [m.name.lower() for m in cls if m is not cls.UNFITTED and m.value & int(value)]

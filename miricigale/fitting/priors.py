@@ -1,0 +1,197 @@
+"""Priors on grid parameters: a product over parameters, in weights of the nodes."""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from miricigale.fitting.posterior import cell_edges
+from miricigale.utils.exceptions import argument_error, unknown_name
+
+__all__ = ["GridAxis", "GridPriors", "grid_priors"]
+
+
+@dataclass(frozen=True, eq=False)
+class GridAxis:
+    """
+    One parameter of a grid.
+
+    Parameters
+    ----------
+    name : str
+        Name of the parameter.
+    values : `~numpy.ndarray`, shape (n,)
+        Its values, ascending.
+    unit : `~astropy.units.Unit`
+        Their unit.
+    kind : {"redshift", "frac_agn", "galaxy", "agn"}
+        What the parameter belongs to.
+    weights : `~numpy.ndarray`, shape (n,)
+        Prior of the values; sums to 1.
+    share : `~numpy.ndarray` or None, shape (n, n_models)
+        Part of every galaxy or AGN model that belongs to each value: one of a kind, or, where
+        the parameter has no effect, as the prior has it.
+    bounds : tuple of float
+        Limits that the outermost cells do not pass.
+    """
+
+    name: str
+    values: np.ndarray
+    unit: object
+    kind: str
+    weights: np.ndarray
+    share: np.ndarray | None = None
+    bounds: tuple = (-np.inf, np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class GridPriors:
+    """Axes with priors, and the prior weights of galaxies, tori, fractions and redshifts."""
+
+    axes: dict
+    galaxy: np.ndarray
+    agn: np.ndarray
+    frac: np.ndarray
+    redshift: np.ndarray
+
+
+def grid_priors(grid, priors=None, *, prior_f="grid"):
+    """
+    Work out the prior weights of a model grid.
+
+    Parameters
+    ----------
+    grid : `~miricigale.sed.ModelGrid`
+        The grid.
+    priors : dict, optional
+        Parameter name to its prior: a function of the value (a density, taken at the nodes),
+        an array of weights of the nodes, or ``"log"`` (1 / value). Others are flat in the
+        nodes.
+    prior_f : {"grid", "uniform"}, optional
+        Weights of the AGN fractions if ``priors`` does not name them: equal for all values of
+        the grid (as CIGALE counts), or by the width of their cells.
+
+    Returns
+    -------
+    priors : `GridPriors`
+
+    Raises
+    ------
+    KeyError
+        If a name is not a parameter of the grid that has several values.
+    ValueError
+        If weights are negative, not finite or all zero.
+    """
+    priors = dict(priors or {})
+    if prior_f not in ("grid", "uniform"):
+        raise argument_error("prior_f", "'grid' or 'uniform'", repr(prior_f))
+    axes = {}
+    z, f = grid.redshift, grid.frac_agn
+    axes["redshift"] = _axis("redshift", z, 1, "redshift", priors, bounds=(0.0, np.inf))
+    if grid.agn_multiplicity.size:
+        if prior_f == "uniform" and "frac_agn" not in priors:
+            priors["frac_agn"] = np.diff(cell_edges(f, (0.0, 1.0)))
+        axes["frac_agn"] = _axis("frac_agn", f, 1, "frac_agn", priors, bounds=(0.0, 1.0))
+    galaxy = np.ones(grid.dust_luminosity.size)
+    for name in grid.galaxy_parameters.colnames:
+        galaxy *= _add_axis(axes, name, grid.galaxy_parameters[name], "galaxy", priors)
+    agn = np.ones(grid.agn_multiplicity.size)
+    if agn.size:
+        left = grid.agn_multiplicity.astype(float)
+        inert = _inert(grid)
+        for name in grid.agn_parameters.colnames:
+            rows, nodes = inert.get(name, (None, None))
+            agn *= _add_axis(axes, name, grid.agn_parameters[name], "agn", priors, rows, nodes)
+            if rows is not None:
+                left[rows] /= len(nodes)
+        agn *= left
+    unknown = sorted(set(priors) - set(axes))
+    if unknown:
+        raise unknown_name("grid parameter", unknown[0], axes)
+    if not galaxy.sum() > 0 or (agn.size and not agn.sum() > 0):
+        raise argument_error("priors", "positive for at least one model", "0 for all")
+    frac = axes["frac_agn"].weights if agn.size else np.ones(1)
+    return GridPriors(axes, galaxy, agn, frac, axes["redshift"].weights)
+
+
+def _add_axis(axes, name, column, kind, priors, rows=None, nodes=None):
+    """Add the axis of a table's column; return the prior factor of each model."""
+    unit = getattr(column, "unit", None) or 1
+    column = np.asarray(getattr(column, "value", column), dtype=float)
+    values = np.unique(column if nodes is None else np.concatenate([nodes]))
+    if values.size == 1 and name not in priors:
+        return np.ones(column.size)
+    axis = _axis(name, values, unit, kind, priors)
+    share = (column[None, :] == values[:, None]).astype(float)
+    factor = axis.weights @ share * values.size
+    if rows is not None:
+        share[:, rows] = axis.weights[:, None]
+        factor[rows] = values.size
+    axes[name] = GridAxis(name, values, unit, kind, axis.weights, share, axis.bounds)
+    return factor
+
+
+def _axis(name, values, unit, kind, priors, bounds=(-np.inf, np.inf)):
+    prior = priors.get(name)
+    argument = f"priors[{name!r}]"
+    if prior is None:
+        weights = np.ones(values.size)
+    elif isinstance(prior, str):
+        if prior != "log" or not np.all(values > 0):
+            wanted = "a function, an array or 'log' (with values above 0)"
+            raise argument_error(argument, wanted, repr(prior))
+        weights = 1.0 / values
+    elif callable(prior):
+        weights = np.asarray(prior(values), dtype=float)
+    else:
+        weights = np.asarray(prior, dtype=float)
+    if weights.shape != values.shape:
+        wanted = f"{values.size} weights, for {name} = {values}"
+        raise argument_error(argument, wanted, f"shape {weights.shape}")
+    if not np.all(np.isfinite(weights) & (weights >= 0)) or not weights.sum() > 0:
+        raise argument_error(argument, "finite, >= 0 and not all 0", f"{weights}")
+    return GridAxis(name, values, unit, kind, weights / weights.sum(), None, bounds)
+
+
+def _inert(grid):
+    """
+    Find the parameters without effect in rows that stand for several models.
+
+    The grid keeps the mean of the values that were merged. Returned is, by name, the rows and
+    the values of the whole axis.
+    """
+    found = {}
+    nodes = {
+        name: np.unique(grid.meta.get("axes", {}).get(name, []))
+        for name in grid.agn_parameters.colnames
+    }
+    many = [name for name in nodes if nodes[name].size > 1]
+    table = {
+        name: np.asarray(getattr(grid.agn_parameters[name], "value", grid.agn_parameters[name]))
+        for name in many
+    }
+    for row in np.flatnonzero(grid.agn_multiplicity > 1):
+        merged = [n for n in many if np.isclose(table[n][row], nodes[n].mean())]
+        # another row that differs in this parameter alone shows that it has an effect
+        for name in list(merged):
+            same = np.ones(len(grid.agn_parameters), bool)
+            for other in many:
+                if other != name:
+                    same &= table[other] == table[other][row]
+            if np.count_nonzero(same) > 1:
+                merged.remove(name)
+        count = grid.agn_multiplicity[row]
+        for size in range(1, len(merged) + 1):
+            names = next(
+                (
+                    c
+                    for c in itertools.combinations(merged, size)
+                    if np.prod([nodes[n].size for n in c]) == count
+                ),
+                None,
+            )
+            if names:
+                for name in names:
+                    found.setdefault(name, ([], nodes[name]))[0].append(row)
+                break
+    return found

@@ -1,0 +1,546 @@
+"""What a fit returns: FitResults for a catalogue, FitResult for one object of it."""
+
+from dataclasses import dataclass, field, fields
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.fitting.flags import FitFlags
+from miricigale.fitting.posterior import cell_edges, cell_percentiles, moments
+from miricigale.fitting.quantities import DERIVED_LEVELS
+from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.tables import error_column
+from miricigale.utils.units import FNU, frozen_array
+
+__all__ = ["FitResult", "FitResults"]
+
+_LEVELS = (0.16, 0.5, 0.84)
+_SUFFIXES = ("p16", "p50", "p84")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FitResults:
+    """
+    Posteriors of the objects of a catalogue, in its order.
+
+    Made by `BayesFitter.fit`; every array is read-only, and NaN for objects that could not be
+    fitted.
+
+    Parameters
+    ----------
+    ids : `~numpy.ndarray`, shape (n,)
+        Ids of the objects.
+    flags : `~numpy.ndarray` of int, shape (n,)
+        `FitFlags`.
+    n_bands : `~numpy.ndarray` of int, shape (n,)
+        Number of bands used.
+    chi2 : `~numpy.ndarray`, shape (n,)
+        Chi2 of the best model, model error included.
+    log_evidence : `~numpy.ndarray`, shape (n,)
+        ln of the sum of prior * likelihood (fluxes in uJy), each model at its best scale.
+    filters : tuple of str
+        Bands of the grid, nb of them.
+    flux, flux_err, sigma : `~numpy.ndarray`, shape (n, nb)
+        Measured fluxes, their errors, and the errors used (with model error; infinite in bands
+        that were not used), in uJy.
+    axes : dict of str to `~miricigale.fitting.priors.GridAxis`
+        Parameters that have several values.
+    pdf : dict of str to `~numpy.ndarray`, shape (n, n_values)
+        Posterior weights of their values.
+    pdf_2d : `~numpy.ndarray`, shape (n, nz, nf)
+        Joint posterior of redshift and AGN fraction.
+    best_index : `~numpy.ndarray` of int, shape (n, 4)
+        Redshift, galaxy, torus and fraction of the best model in the grid.
+    best_scale : `~numpy.ndarray`, shape (n,)
+        Its scale, in solar masses formed.
+    best : dict of str to `~numpy.ndarray`, shape (n,)
+        Parameters and derived quantities of the best model.
+    quantities, units, descriptions : tuple
+        Names, units and meanings of the n_q derived quantities.
+    moments : `~numpy.ndarray`, shape (n, n_q, 3)
+        Mean, standard deviation and mean of log10 (over models where it is not zero).
+    quantiles : `~numpy.ndarray`, shape (n, n_q, n_levels)
+        Quantiles at `miricigale.fitting.quantities.DERIVED_LEVELS`.
+    model_flux, model_flux_std, best_flux : `~numpy.ndarray`, shape (n, nb)
+        Mean and standard deviation of the model fluxes over the posterior, and the fluxes of
+        the best model, in uJy, in all bands of the grid.
+    meta : dict
+        Provenance and the settings of the fit.
+    model : `~miricigale.sed.SEDModel`, optional
+        The model the grid was made from; not written to files.
+    """
+
+    ids: np.ndarray
+    flags: np.ndarray
+    n_bands: np.ndarray
+    chi2: np.ndarray
+    log_evidence: np.ndarray
+    filters: tuple
+    flux: np.ndarray
+    flux_err: np.ndarray
+    sigma: np.ndarray
+    axes: dict
+    pdf: dict
+    pdf_2d: np.ndarray
+    best_index: np.ndarray
+    best_scale: np.ndarray
+    best: dict
+    quantities: tuple
+    units: tuple
+    descriptions: tuple
+    moments: np.ndarray
+    quantiles: np.ndarray
+    model_flux: np.ndarray
+    model_flux_std: np.ndarray
+    best_flux: np.ndarray
+    meta: dict = field(default_factory=dict)
+    model: object = None
+
+    def __post_init__(self):
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, item.name, frozen_array(value, value.dtype))
+        for name in ("pdf", "best"):
+            frozen = {k: frozen_array(v) for k, v in getattr(self, name).items()}
+            object.__setattr__(self, name, frozen)
+        rows = {}
+        for row, key in enumerate(self.ids.tolist()):
+            rows.setdefault(key, row)
+        object.__setattr__(self, "_rows", rows)
+
+    def __len__(self):
+        return len(self.ids)
+
+    def __iter__(self):
+        return (FitResult(self, row) for row in range(len(self)))
+
+    def __getitem__(self, key):
+        """Return the result of the object with this id."""
+        return FitResult(self, self.row(key))
+
+    def __repr__(self):
+        good = int(np.count_nonzero(self.fitted))
+        return f"<FitResults of {len(self)} objects, {good} fitted, {len(self.filters)} bands>"
+
+    def row(self, key):
+        """
+        Row of an id (the first, if it occurs twice).
+
+        Raises
+        ------
+        KeyError
+            If there is none.
+        """
+        key = key.item() if isinstance(key, np.generic) else key
+        if key not in self._rows:
+            some = ", ".join(map(repr, list(self._rows)[:5]))
+            msg = f"no object with the id {key!r} among {len(self)}; the first are {some}"
+            raise KeyError(msg)
+        return self._rows[key]
+
+    @property
+    def fitted(self):
+        """Which objects have a result."""
+        return np.isfinite(self.chi2)
+
+    @property
+    def reduced_chi2(self):
+        """Chi2 over the number of bands less one; NaN with a single band."""
+        free = np.maximum(self.n_bands - 1, 0)
+        return np.divide(self.chi2, free, out=np.full(len(self), np.nan), where=free > 0)
+
+    @property
+    def parameters(self):
+        """Names of all that has a posterior: parameters, then derived quantities."""
+        return (*self.axes, *self.quantities)
+
+    def unit(self, name):
+        """Unit of a parameter or derived quantity."""
+        if name in self.axes:
+            return u.Unit(self.axes[name].unit)
+        return self.units[self._quantity(name)]
+
+    def _quantity(self, name):
+        if name not in self.quantities:
+            raise unknown_name("parameter", name, self.parameters)
+        return self.quantities.index(name)
+
+    def mean(self, name):
+        """Posterior means of a parameter or derived quantity: Quantity, shape (n,)."""
+        return self._moments(name)[0] * self.unit(name)
+
+    def std(self, name):
+        """Posterior standard deviations: Quantity, shape (n,)."""
+        return self._moments(name)[1] * self.unit(name)
+
+    def _moments(self, name):
+        if name in self.axes:
+            return moments(self.axes[name].values, self.pdf[name])
+        i = self._quantity(name)
+        return self.moments[:, i, 0], self.moments[:, i, 1]
+
+    def percentile(self, name, levels):
+        """
+        Posterior percentiles.
+
+        Parameters
+        ----------
+        name : str
+            A parameter or derived quantity.
+        levels : array_like
+            Levels in (0, 1). Of derived quantities the distribution is kept between 0.001 and
+            0.999.
+
+        Returns
+        -------
+        percentiles : `~astropy.units.Quantity`, shape (n, n_levels)
+            For parameters of the grid from the distribution that is linear within each cell.
+        """
+        levels = np.atleast_1d(np.asarray(levels, dtype=float))
+        if not np.all((levels > 0) & (levels < 1)):
+            raise argument_error("levels", "between 0 and 1", f"{levels}")
+        if name in self.axes:
+            axis = self.axes[name]
+            out = cell_percentiles(axis.values, self.pdf[name], levels, axis.bounds)
+        else:
+            kept = self.quantiles[:, self._quantity(name)]
+            out = np.array([np.interp(levels, DERIVED_LEVELS, row) for row in kept])
+            out = out.reshape(len(self), levels.size)
+        return out * self.unit(name)
+
+    def to_table(self):
+        """
+        Results as a table.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            One row for each object: ``id``, ``flags``, ``n_bands``, ``chi2_best``,
+            ``reduced_chi2``, ``log_evidence``, and for each parameter and derived quantity
+            ``<name>_mean``, ``_std``, ``_p16``, ``_p50``, ``_p84`` and ``_best``; derived
+            quantities also have ``_logmean``, the mean of log10 (dex, in their unit).
+        """
+        out = QTable(meta=dict(self.meta))
+        columns = {
+            "id": (np.array(self.ids), "identifier"),
+            "flags": (np.array(self.flags), FitFlags.describe()),
+            "n_bands": (np.array(self.n_bands), "bands used"),
+            "chi2_best": (np.array(self.chi2), "chi2 of the best model"),
+            "reduced_chi2": (self.reduced_chi2, "chi2_best over the number of bands less one"),
+            "log_evidence": (np.array(self.log_evidence), "ln of the evidence, fluxes in uJy"),
+        }
+        for name, (values, text) in columns.items():
+            out[name] = values
+            out[name].info.description = text
+        for name in self.parameters:
+            unit = self.unit(name)
+            meaning = self._meaning(name)
+            percentiles = self.percentile(name, _LEVELS)
+            parts = {"mean": self.mean(name), "std": self.std(name)}
+            parts |= {s: percentiles[:, i] for i, s in enumerate(_SUFFIXES)}
+            parts["best"] = u.Quantity(self.best[name], unit)
+            for suffix, value in parts.items():
+                column = f"{name}_{suffix}"
+                out[column] = value
+                out[column].info.description = f"{_PARTS[suffix]} of {meaning}"
+            if name in self.quantities:
+                column = f"{name}_logmean"
+                out[column] = self.moments[:, self._quantity(name), 2] * u.dex
+                out[column].info.description = (
+                    f"posterior mean of log10 of {meaning}, in {unit.to_string()}"
+                )
+        return out
+
+    def _meaning(self, name):
+        if name in self.quantities:
+            return self.descriptions[self._quantity(name)]
+        return name
+
+    def predict(self, filters=None):
+        """
+        Fluxes of the models over the posterior.
+
+        Parameters
+        ----------
+        filters : list of str, optional
+            Bands of the grid, fitted or not; all by default.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            ``id`` and, for each filter, posterior mean (by its name), standard deviation
+            (``<name>_err``) and flux of the best model (``<name>_best``) in uJy.
+        """
+        names = self.filters if filters is None else tuple(getattr(filters, "names", filters))
+        out = QTable({"id": np.array(self.ids)}, meta=dict(self.meta))
+        for name in names:
+            i = self._band(name)
+            out[name] = self.model_flux[:, i] * FNU
+            out[name].info.description = "posterior mean of the model flux"
+            out[error_column(name)] = self.model_flux_std[:, i] * FNU
+            out[error_column(name)].info.description = "its posterior standard deviation"
+            out[f"{name}_best"] = self.best_flux[:, i] * FNU
+            out[f"{name}_best"].info.description = "flux of the best model"
+        return out
+
+    def _band(self, name):
+        if name not in self.filters:
+            raise unknown_name("filter of the grid", name, self.filters)
+        return self.filters.index(name)
+
+    def with_model(self, model):
+        """Return a copy that knows the `~miricigale.sed.SEDModel`, for spectra of the best fits."""
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        return type(self)(**{**values, "model": model})
+
+    def plot_sed(self, key, ax=None, **kwargs):
+        """Draw photometry and best model of an object; see `FitResult.plot_sed`."""
+        return self[key].plot_sed(ax=ax, **kwargs)
+
+    def plot_pdf(self, key, name, ax=None, **kwargs):
+        """Draw the posterior of a parameter of an object; see `FitResult.plot_pdf`."""
+        return self[key].plot_pdf(name, ax=ax, **kwargs)
+
+    def plot_pdf2d(self, key, ax=None, **kwargs):
+        """Draw the joint posterior of redshift and AGN fraction; see `FitResult.plot_pdf2d`."""
+        return self[key].plot_pdf2d(ax=ax, **kwargs)
+
+    def write(self, path, *, overwrite=False):
+        """
+        Write everything but the model to a FITS file.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        overwrite : bool, optional
+            Whether a file that is there is replaced.
+        """
+        from miricigale.fitting.files import write_results
+
+        write_results(self, path, overwrite=overwrite)
+
+    @classmethod
+    def read(cls, path):
+        """
+        Read results that `write` made.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If the file is something else or incomplete.
+        """
+        from miricigale.fitting.files import read_results
+
+        return read_results(cls, path)
+
+
+_PARTS = {
+    "mean": "posterior mean",
+    "std": "posterior standard deviation",
+    "p16": "16th percentile",
+    "p50": "median",
+    "p84": "84th percentile",
+    "best": "best model's value",
+}
+
+
+class FitResult:
+    """
+    Posterior of one object: a view of a row of `FitResults`.
+
+    Parameters
+    ----------
+    results : `FitResults`
+        The catalogue.
+    row : int
+        The row.
+    """
+
+    def __init__(self, results, row):
+        self._all = results
+        self._row = row
+
+    def __repr__(self):
+        return f"<FitResult of {self.id!r}, chi2 {self.chi2:.4g} in {self.n_bands} bands>"
+
+    @property
+    def id(self):
+        """Identifier of the object."""
+        return self._all.ids[self._row]
+
+    @property
+    def flags(self):
+        """`FitFlags` of the object."""
+        return FitFlags(int(self._all.flags[self._row]))
+
+    @property
+    def n_bands(self):
+        """Number of bands used."""
+        return int(self._all.n_bands[self._row])
+
+    @property
+    def chi2(self):
+        """Chi2 of the best model."""
+        return float(self._all.chi2[self._row])
+
+    @property
+    def log_evidence(self):
+        """Natural logarithm of the evidence, fluxes in uJy."""
+        return float(self._all.log_evidence[self._row])
+
+    @property
+    def parameters(self):
+        """Names of all that has a posterior."""
+        return self._all.parameters
+
+    @property
+    def best(self):
+        """Parameters and derived quantities of the best model: dict of name to Quantity."""
+        return {n: self._all.best[n][self._row] * self._all.unit(n) for n in self.parameters}
+
+    def mean(self, name):
+        """Posterior mean."""
+        return self._all.mean(name)[self._row]
+
+    def std(self, name):
+        """Posterior standard deviation."""
+        return self._all.std(name)[self._row]
+
+    def percentile(self, name, levels):
+        """Posterior percentiles; see `FitResults.percentile`."""
+        return self._all.percentile(name, levels)[self._row]
+
+    def pdf(self, name):
+        """
+        Posterior of a parameter or derived quantity.
+
+        Returns
+        -------
+        edges : `~astropy.units.Quantity`, shape (n + 1,)
+            Edges of the cells: those around the nodes of the grid, or, for a derived quantity,
+            its quantiles.
+        weights : `~numpy.ndarray`, shape (n,)
+            Weight of each cell.
+        """
+        results = self._all
+        if name in results.axes:
+            axis = results.axes[name]
+            edges = cell_edges(axis.values, axis.bounds)
+            return edges * results.unit(name), results.pdf[name][self._row]
+        edges = results.quantiles[self._row, results._quantity(name)]
+        return edges * results.unit(name), np.diff(DERIVED_LEVELS)
+
+    @property
+    def pdf_2d(self):
+        """Joint posterior of redshift and AGN fraction, shape (nz, nf)."""
+        return self._all.pdf_2d[self._row]
+
+    def best_sed(self, model=None, **changes):
+        """
+        Spectrum of the best model.
+
+        Parameters
+        ----------
+        model : `~miricigale.sed.SEDModel`, optional
+            If the results do not know it (those read from a file do not).
+        **changes
+            Parameters to change.
+
+        Returns
+        -------
+        sed : `~miricigale.sed.SED`
+
+        Raises
+        ------
+        ValueError
+            If no model is known or the object was not fitted.
+        """
+        model = self._all.model if model is None else model
+        if model is None:
+            raise argument_error("model", "an SEDModel (these results know none)", "None")
+        if not np.isfinite(self.chi2):
+            names = ", ".join(FitFlags.names(self.flags))
+            raise argument_error("id", "an object that was fitted", f"{self.id!r} ({names})")
+        known = dict(self._all.meta.get("fit", {}).get("constants", {}))
+        best = self.best
+        known |= {name: best[name] for name in self._all.axes if np.isfinite(best[name].value)}
+        known = {name: value for name, value in known.items() if name in model.parameters}
+        values = {
+            name: u.Quantity(getattr(value, "value", value), model.parameters[name].unit)
+            for name, value in known.items()
+        }
+        values["mass"] = best["mass"]
+        return model.evaluate(**{**values, **changes})
+
+    def plot_sed(self, ax=None, *, model=None, filters=None, **kwargs):
+        """
+        Draw photometry, best model and residuals.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes` or pair of them, optional
+            Where to draw; a pair also gets the residuals.
+        model : `~miricigale.sed.SEDModel`, optional
+            See `best_sed`; without one only the fluxes of the best model are drawn.
+        filters : `~miricigale.filters.FilterSet`, optional
+            Where the wavelengths of the bands are taken from.
+        **kwargs
+            Passed to `miricigale.plotting.posteriors.plot_sed_fit`.
+
+        Returns
+        -------
+        axes : `~matplotlib.axes.Axes` or pair of them
+        """
+        from miricigale.plotting.posteriors import plot_sed_fit
+
+        results, row = self._all, self._row
+        if filters is None:
+            from miricigale.filters import FilterSet
+
+            filters = FilterSet.from_names(results.filters)
+        order = [filters.names.index(name) for name in results.filters]
+        wave = u.Quantity(filters.pivots)[order]
+        if model is not None or results.model is not None:
+            sed = self.best_sed(model)
+            kwargs.setdefault("spectrum", (sed.wave, sed.fnu))
+        used = np.isfinite(results.sigma[row])
+        text = f"{self.id}: z = {self.best['redshift'].value:.3f}"
+        kwargs.setdefault("title", f"{text}, chi2 = {self.chi2:.1f} in {self.n_bands} bands")
+        return plot_sed_fit(
+            wave,
+            results.flux[row] * FNU,
+            np.where(used, results.sigma[row], results.flux_err[row]) * FNU,
+            results.best_flux[row] * FNU,
+            used=used,
+            ax=ax,
+            **kwargs,
+        )
+
+    def plot_pdf(self, name, ax=None, **kwargs):
+        """Draw the posterior of a parameter or derived quantity; returns the axes."""
+        from miricigale.plotting.posteriors import plot_pdf
+
+        edges, weights = self.pdf(name)
+        kwargs.setdefault("label", name)
+        if name in self._all.quantities:
+            kwargs.setdefault("log", bool(edges.value[0] > 0))
+        return plot_pdf(edges, weights, ax=ax, **kwargs)
+
+    def plot_pdf2d(self, ax=None, **kwargs):
+        """Draw the joint posterior of redshift and AGN fraction; returns the axes."""
+        from miricigale.plotting.posteriors import plot_pdf_2d
+
+        if "frac_agn" not in self._all.axes:
+            raise argument_error("frac_agn", "an axis of the grid", "a grid without AGN")
+        x, y = self._all.axes["redshift"], self._all.axes["frac_agn"]
+        kwargs.setdefault("labels", ("redshift", "frac_agn"))
+        return plot_pdf_2d(
+            cell_edges(x.values, x.bounds),
+            cell_edges(y.values, y.bounds),
+            self.pdf_2d,
+            ax=ax,
+            **kwargs,
+        )

@@ -1,0 +1,223 @@
+"""Posteriors of one object: one and two parameters, and its photometry with the best model."""
+
+import astropy.units as u
+import numpy as np
+
+__all__ = ["plot_pdf", "plot_pdf_2d", "plot_sed_fit"]
+
+
+def _value(quantity, unit=None):
+    quantity = u.Quantity(quantity)
+    return quantity.value if unit is None else quantity.to_value(unit)
+
+
+def plot_pdf(edges, weights, *, ax=None, label=None, truth=None, log=False, **kwargs):
+    """
+    Draw a one-dimensional posterior as density over its cells.
+
+    Parameters
+    ----------
+    edges : array_like or `~astropy.units.Quantity`, shape (n + 1,)
+        Edges of the cells.
+    weights : array_like, shape (n,)
+        Weight of each cell.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; the current axes by default.
+    label : str, optional
+        Name of the parameter.
+    truth : float, optional
+        A value to mark.
+    log : bool, optional
+        Whether the axis is logarithmic and the density one in dex.
+    **kwargs
+        Passed to `~matplotlib.axes.Axes.stairs`.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    import matplotlib.pyplot as plt
+
+    ax = plt.gca() if ax is None else ax
+    unit = getattr(edges, "unit", u.dimensionless_unscaled)
+    edges = np.asarray(_value(edges), dtype=float)
+    weights = np.asarray(weights, dtype=float)
+    place = np.log10(np.maximum(edges, 1e-300)) if log else edges
+    width = np.diff(place)
+    keep = width > 0
+    density = np.divide(weights, width, out=np.zeros(weights.size), where=keep)
+    kwargs.setdefault("fill", True)
+    kwargs.setdefault("alpha", 0.5)
+    ax.stairs(density, edges, **kwargs)
+    if log:
+        ax.set_xscale("log")
+    if truth is not None:
+        ax.axvline(truth, color="black", linestyle="--", linewidth=1)
+    if label is not None:
+        text = "" if unit == u.dimensionless_unscaled else f" ({unit.to_string()})"
+        ax.set_xlabel(f"{label}{text}")
+    ax.set_ylabel("probability density" + (" per dex" if log else ""))
+    ax.set_ylim(bottom=0)
+    return ax
+
+
+def plot_pdf_2d(
+    x_edges, y_edges, weights, *, ax=None, labels=None, truth=None, levels=(0.68, 0.95), **kwargs
+):
+    """
+    Draw a two-dimensional posterior with the cells of highest density outlined.
+
+    Parameters
+    ----------
+    x_edges, y_edges : array_like, shapes (nx + 1,) and (ny + 1,)
+        Edges of the cells.
+    weights : array_like, shape (nx, ny)
+        Weight of each cell.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; the current axes by default.
+    labels : pair of str, optional
+        Names of the parameters.
+    truth : pair of float, optional
+        A point to mark.
+    levels : tuple of float, optional
+        Parts of the posterior to outline.
+    **kwargs
+        Passed to `~matplotlib.axes.Axes.pcolormesh`.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    import matplotlib.pyplot as plt
+
+    ax = plt.gca() if ax is None else ax
+    x, y = np.asarray(x_edges, dtype=float), np.asarray(y_edges, dtype=float)
+    weights = np.asarray(weights, dtype=float)
+    area = np.diff(x)[:, None] * np.diff(y)
+    density = np.divide(weights, area, out=np.zeros(weights.shape), where=area > 0)
+    kwargs.setdefault("cmap", "Blues")
+    ax.pcolormesh(x, y, density.T, **kwargs)
+    order = np.argsort(density, axis=None)[::-1]
+    inside = np.empty(weights.size)
+    total = np.cumsum(weights.ravel()[order])
+    # the cell that passes a level belongs to it
+    inside[order] = np.concatenate([[0.0], total[:-1]]) / max(total[-1], 1e-300)
+    inside = inside.reshape(weights.shape)
+    for level, width in zip(levels, (1.5, 0.8, 0.5, 0.5), strict=False):
+        _outline(ax, x, y, inside < level, linewidth=width)
+    seen = np.flatnonzero(weights.sum(axis=1) > 1e-4 * weights.sum())
+    if seen.size:
+        low, high = max(seen[0] - 2, 0), min(seen[-1] + 3, x.size - 1)
+        ax.set_xlim(x[low], x[high])
+    if truth is not None:
+        ax.plot(*truth, marker="x", color="tab:red", markersize=9, markeredgewidth=2)
+    if labels is not None:
+        ax.set_xlabel(labels[0])
+        ax.set_ylabel(labels[1])
+    return ax
+
+
+def _outline(ax, x, y, mask, **kwargs):
+    """Draw the border between cells inside and outside of a mask."""
+    from matplotlib.collections import LineCollection
+
+    padded = np.pad(mask, 1)
+    lines = []
+    for i, j in zip(*np.nonzero(padded[1:, 1:-1] != padded[:-1, 1:-1]), strict=True):
+        lines.append([(x[i], y[j]), (x[i], y[j + 1])])
+    for i, j in zip(*np.nonzero(padded[1:-1, 1:] != padded[1:-1, :-1]), strict=True):
+        lines.append([(x[i], y[j]), (x[i + 1], y[j])])
+    ax.add_collection(LineCollection(lines, colors="black", **kwargs))
+
+
+def plot_sed_fit(
+    wave,
+    flux,
+    flux_err,
+    model_flux,
+    *,
+    used=None,
+    spectrum=None,
+    ax=None,
+    title=None,
+):
+    """
+    Draw photometry with the best model, and the residuals in units of the errors.
+
+    Parameters
+    ----------
+    wave : `~astropy.units.Quantity`, shape (n,)
+        Wavelengths of the bands.
+    flux, flux_err : `~astropy.units.Quantity`, shape (n,)
+        Measured fluxes and errors; NaN where there is none.
+    model_flux : `~astropy.units.Quantity`, shape (n,)
+        Fluxes of the best model.
+    used : array_like of bool, shape (n,), optional
+        Bands that were fitted; others are drawn open.
+    spectrum : pair of `~astropy.units.Quantity`, optional
+        Wavelength and flux density of the best model.
+    ax : `~matplotlib.axes.Axes` or pair of them, optional
+        Where to draw. One gets no residuals; without, a new figure is made.
+    title : str, optional
+        Title.
+
+    Returns
+    -------
+    axes : pair of `~matplotlib.axes.Axes`, or one if one was given
+    """
+    import matplotlib.pyplot as plt
+
+    residual_ax = None
+    if ax is None:
+        _, (ax, residual_ax) = plt.subplots(
+            2, 1, sharex=True, figsize=(7, 5), height_ratios=(3, 1), layout="constrained"
+        )
+    elif isinstance(ax, (tuple, list, np.ndarray)):
+        ax, residual_ax = ax
+    wave, flux = _value(wave, u.um), _value(flux, u.uJy)
+    err, model = _value(flux_err, u.uJy), _value(model_flux, u.uJy)
+    used = np.ones(wave.size, bool) if used is None else np.asarray(used, bool)
+    have = np.isfinite(flux) & np.isfinite(err)
+    limits = np.concatenate([flux[have & (flux > 0)], model[np.isfinite(model) & (model > 0)]])
+    low, high = (limits.min() / 4, limits.max() * 4) if limits.size else (0.1, 10.0)
+    if spectrum is not None:
+        x, y = _value(spectrum[0], u.um), _value(spectrum[1], u.uJy)
+        shown = (x > 0.5 * wave.min()) & (x < 2.0 * wave.max())
+        ax.plot(x[shown], y[shown], color="0.6", linewidth=0.8, zorder=1, label="best model")
+    ax.plot(wave, model, "s", color="tab:orange", markersize=7, fillstyle="none", zorder=3)
+    above = have & (flux > 0)
+    below = have & ~(flux > 0)
+    for keep, fill in ((above & used, "full"), (above & ~used, "none")):
+        ax.errorbar(
+            wave[keep],
+            flux[keep],
+            yerr=err[keep],
+            fmt="o",
+            color="tab:blue",
+            fillstyle=fill,
+            markersize=5,
+            zorder=4,
+        )
+    top = np.maximum(flux, 0.0) + 2.0 * err
+    if np.any(below):
+        # two sigma above a flux that is not positive
+        ax.plot(wave[below], np.maximum(top[below], low), "v", color="tab:blue", zorder=4)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlim(0.7 * wave.min(), 1.4 * wave.max())
+    ax.set_ylim(low, high)
+    ax.set_ylabel("flux density (uJy)")
+    if title is not None:
+        ax.set_title(title, fontsize="medium")
+    if residual_ax is None:
+        ax.set_xlabel("observed wavelength (um)")
+        return ax
+    pull = np.where(have, (flux - model) / np.where(have, err, 1.0), np.nan)
+    residual_ax.axhline(0.0, color="0.6", linewidth=0.8)
+    residual_ax.plot(wave[used], pull[used], "o", color="tab:blue", markersize=5)
+    residual_ax.plot(wave[~used], pull[~used], "o", color="tab:blue", fillstyle="none")
+    size = np.nanmax(np.abs(pull[have]), initial=2.5) * 1.15
+    residual_ax.set_ylim(-size, size)
+    residual_ax.set_ylabel("residual (sigma)")
+    residual_ax.set_xlabel("observed wavelength (um)")
+    return ax, residual_ax
