@@ -592,6 +592,20 @@ def _bins(name, true, seen, size, statistic):
     edges = np.arange(0, max(len(true) // size, 1) * size + 1, size)
     edges[-1] = len(true)
     parts = [order[a:b] for a, b in itertools.pairwise(edges)][::-1]
-    flux = np.array([np.median(true[part]) for part in parts])
-    error = np.array([np.median(np.abs(seen[part] - true[part])) for part in parts])
+    flux, error = np.transpose([_scatter(true[part], seen[part]) for part in parts])
     return _Binned(flux, error * _STATISTICS[statistic], float(true.min()), float(true.max()))
+
+
+def _scatter(true, seen):
+    """
+    Median true flux of a bin and median absolute deviation there.
+
+    Bright sources scatter in proportion to their flux (templates, blends), faint ones by the
+    noise of the sky. Where the signal-to-noise is above 5 the deviations are taken relative to
+    each flux, or the brightest of a wide bin would set the error of the faintest.
+    """
+    flux = np.median(true)
+    absolute = np.median(np.abs(seen - true))
+    if flux > 5 * absolute and np.all(true > 0):
+        return flux, flux * np.median(np.abs(seen / true - 1.0))
+    return flux, absolute

@@ -60,7 +60,7 @@ def _filled(image, floor=0.0):
 
 def colour_figure(blue, green, red, prior, names):
     """The three-colour MIRI image beside the high-resolution image of the same field."""
-    figure, axes = new_figure(1, 2, size=(6, 6))
+    figure, axes = new_figure(1, 2, size=(4.8, 6.8))
     channels = []
     for image in (red, green, blue):
         data = _filled(image)

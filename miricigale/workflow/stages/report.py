@@ -420,7 +420,9 @@ class _Writer:
             self.report.table(
                 rows,
                 header=("band", "this catalogue", "published", "reference"),
-                caption="Light of all galaxies together, nW / m2 / sr, at the published wavelength",
+                caption="Light of all galaxies together, nW / m2 / sr, at the published wavelength; the "
+                "published values hold the sources that those surveys resolved, fewer faint ones "
+                "and more bright ones than this small field",
             )
 
     def configuration(self):
@@ -435,8 +437,8 @@ class _Writer:
             caption="Time of each stage",
         )
         self.report.text(
-            "The configuration stands in config.toml beside this report; 'miricigale run config.toml' "
-            "repeats it. What to cite for the data: 'miricigale data list'."
+            "The configuration is config.toml in the folder of the run; 'miricigale run' takes it. What "
+            "to cite for the data: 'miricigale data list'."
         )
 
 
