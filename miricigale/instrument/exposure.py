@@ -27,9 +27,11 @@ CEERS_FILTERS = (
     "miri.f2100w",
 )
 
-#: Groups, integrations and dithers of each band: 1665 s, and 4662 s at F2100W.
+#: Groups, integrations and dithers of each band: 1665 s, and 4662 s at F2100W. Integrations are
+#: short enough for the low sky to fill less than 60 % of the well.
 _CEERS = dict.fromkeys(CEERS_FILTERS, (200, 1, 3))
-_CEERS["miri.f1800w"] = (100, 2, 3)
+_CEERS["miri.f1500w"] = (100, 2, 3)
+_CEERS["miri.f1800w"] = (50, 4, 3)
 _CEERS["miri.f2100w"] = (10, 28, 6)
 
 #: The same for a trial: about a third of the frames, two dithers.
