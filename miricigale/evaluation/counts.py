@@ -13,14 +13,12 @@ __all__ = [
     "sfr_to_infrared_luminosity",
 ]
 
-#: Integrated light of resolved galaxies, nW / m2 / sr: band, wavelength (um), value,
+#: Light of galaxies together in nW / m2 / sr: band, wavelength (um), least flux (uJy), value,
 #: errors down and up, reference.
 PUBLISHED_LIGHT = (
-    ("miri.f770w", 7.0, 0.49, 0.20, 0.20, "Metcalfe et al. 2003, A&A 407, 791 (ISO)"),
-    ("miri.f1500w", 15.0, 2.4, 0.5, 0.5, "Elbaz et al. 2002, A&A 384, 848 (ISO)"),
-    ("miri.f1500w", 15.0, 2.70, 0.62, 0.62, "Metcalfe et al. 2003, A&A 407, 791 (ISO)"),
-    ("miri.f2100w", 24.0, 1.9, 0.6, 0.6, "Papovich et al. 2004, ApJS 154, 70 (> 60 uJy)"),
-    ("miri.f2100w", 24.0, 2.7, 0.7, 1.1, "Papovich et al. 2004, ApJS 154, 70 (extrapolated)"),
+    ("miri.f1500w", 15.0, 50.0, 2.4, 0.5, 0.5, "Elbaz et al. 2002, A&A 384, 848"),
+    ("miri.f2100w", 24.0, 60.0, 1.9, 0.6, 0.6, "Papovich et al. 2004, ApJS 154, 70"),
+    ("miri.f2100w", 24.0, 0.0, 2.7, 0.7, 1.1, "Papovich et al. 2004, extrapolated"),
 )
 
 

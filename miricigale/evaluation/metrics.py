@@ -88,7 +88,7 @@ class PhotozMetrics:
     bias : float
         Median of dz = (z_fit - z_true) / (1 + z_true).
     sigma_mad : float
-        1.48 x median |dz - median dz|.
+        1.48 x median abs(dz - median dz).
     outlier_fraction, outlier_low, outlier_high : float
         Share with abs(dz) above the limit and its 68 % interval.
     n_outliers : int

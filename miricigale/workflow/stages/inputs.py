@@ -1,6 +1,5 @@
 """Stages 1 to 3: catalogue, input SEDs, model fluxes."""
 
-import astropy.units as u
 import numpy as np
 from astropy.table import QTable, hstack
 

@@ -405,24 +405,30 @@ class _Writer:
             f"({area.to_value(u.arcmin**2):.1f} square arcmin, H < {self.config.catalog.mag_limit:g}).",
         )
         rows = []
-        for name, wave, value, down, up, reference in PUBLISHED_LIGHT:
+        for name, wave, least, value, down, up, reference in PUBLISHED_LIGHT:
             if name in self.bands:
-                light, error = integrated_light(galaxies[name], area, wave * u.um)
+                flux = galaxies[name][galaxies[name] >= least * u.uJy]
+                light, error = integrated_light(flux, area, wave * u.um)
                 rows.append(
                     (
-                        name,
-                        f"{light.value:.2f} +- {error.value:.2f}",
+                        f"{name}, {wave:g} um",
+                        f"{least:g} uJy" if least else "none",
+                        f"{light.value:.2f} +- {error.value:.2f} ({len(flux)})",
                         f"{value:.2f} -{down:.2f} +{up:.2f}",
-                        f"{wave:g} um, {reference}",
+                        reference,
                     )
                 )
         if rows:
             self.report.table(
                 rows,
-                header=("band", "this catalogue", "published", "reference"),
-                caption="Light of all galaxies together, nW / m2 / sr, at the published wavelength; the "
-                "published values hold the sources that those surveys resolved, fewer faint ones "
-                "and more bright ones than this small field",
+                header=(
+                    "band",
+                    "faint limit",
+                    "this catalogue (sources)",
+                    "published",
+                    "reference",
+                ),
+                caption="Light of all galaxies above a flux, nu I_nu in nW / m2 / sr; Poisson errors",
             )
 
     def configuration(self):
