@@ -45,6 +45,10 @@ class Stage:
     units : callable, optional
         Called with the configuration; names of the pieces that are done and resumed one
         by one.
+    plan : callable, optional
+        Called with the configuration and the unit; plain values that the stage takes from the
+        package (the exposures of a named plan, the axes of a named grid), so that a change
+        of those is seen.
     """
 
     name: str
@@ -55,6 +59,7 @@ class Stage:
     resources: tuple = ()
     version: int = 1
     units: Callable | None = None
+    plan: Callable | None = None
 
     def unit_names(self, config):
         """Names of the pieces; a single empty one for a stage that has none."""
@@ -159,6 +164,8 @@ class StudyRunner:
             "inputs": {name: store.checksums(name) for name in stage.needs},
             "data": {name: resource(name).sha256 for name in stage.resources},
         }
+        if stage.plan is not None:
+            values["plan"] = stage.plan(self.config, unit)
         if "catalog" in stage.sections and Path(self.config.catalog.source).is_file():
             # a user's own file may change under the same name
             values["catalog"] = hashlib.sha256(

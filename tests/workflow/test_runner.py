@@ -75,6 +75,19 @@ def test_only_what_depends_on_a_change_is_done_again(tmp_path):
     assert recorder.run(tmp_path / "run", other, version=2) == ["first:a", "first:b"]
 
 
+def test_a_change_of_the_packages_own_plan_is_seen(tmp_path):
+    ran = []
+
+    def function(context, _):
+        ran.append(1)
+        context.save("x.txt", lambda path: path.write_text("x"))
+
+    for groups in (200, 200, 100):
+        stage = Stage("one", function, "one", plan=lambda _, __, n=groups: {"n_groups": n})
+        StudyRunner(StudyConfig(), tmp_path / "run", [stage]).run()
+    assert len(ran) == 2
+
+
 def test_a_damaged_product_is_made_again(tmp_path):
     recorder = Recorder()
     recorder.run(tmp_path / "run")

@@ -1,13 +1,14 @@
 """The stages of the study, in order."""
 
 from miricigale.workflow.stages.images import (
+    exposure_plan,
     exposure_units,
     make_exposure,
     make_highres,
     make_kernel,
     make_mosaic,
 )
-from miricigale.workflow.stages.inputs import fit_inputs, make_catalog, make_truth
+from miricigale.workflow.stages.inputs import axes_plan, fit_inputs, make_catalog, make_truth
 from miricigale.workflow.stages.measure import fit_photometry, make_errors, measure_photometry
 from miricigale.workflow.stages.points import measure_point_sources
 from miricigale.workflow.stages.report import make_report
@@ -38,8 +39,9 @@ def study_stages():
             fit_inputs,
             "input SEDs",
             needs=("catalog",),
-            sections=("sed",),
+            sections=("sed", "fit"),
             resources=sed_data,
+            plan=lambda config, _: axes_plan(config.sed.axes),
         ),
         Stage(
             "truth",
@@ -54,8 +56,12 @@ def study_stages():
             make_exposure,
             "exposure",
             needs=("truth",),
-            sections=(*images, "run"),
+            sections=images,
             units=exposure_units,
+            plan=lambda config, unit: {
+                "exposures": exposure_plan(config, unit),
+                "keep_level1b": config.run.keep_level1b,
+            },
         ),
         Stage(
             "mosaics",
@@ -64,6 +70,7 @@ def study_stages():
             needs=("exposures",),
             sections=("exposures", "pointing", "reduction", "highres"),
             units=_filters,
+            plan=exposure_plan,
         ),
         Stage(
             "highres",
@@ -71,6 +78,7 @@ def study_stages():
             "high-resolution image",
             needs=("truth",),
             sections=("highres", "photometry", "pointing", "exposures", "reduction"),
+            plan=lambda config, _: exposure_plan(config),
         ),
         Stage(
             "kernels",
@@ -78,6 +86,7 @@ def study_stages():
             "matching kernel",
             sections=("highres", "photometry", "pointing", "exposures", "reduction"),
             units=_filters,
+            plan=exposure_plan,
         ),
         Stage(
             "photometry",
@@ -93,6 +102,7 @@ def study_stages():
             "point sources",
             needs=("kernels",),
             sections=(*images, "highres", "point_sources", "photometry"),
+            plan=exposure_plan,
             units=lambda config: _filters(config) if config.point_sources.enabled else (),
         ),
         Stage(
@@ -109,6 +119,7 @@ def study_stages():
             needs=("truth", "errors"),
             sections=("fit", "exposures"),
             resources=sed_data,
+            plan=lambda config, _: axes_plan(config.fit.axes),
             units=lambda _: ("with_miri", "without_miri"),
         ),
         Stage(

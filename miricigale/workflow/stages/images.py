@@ -17,6 +17,7 @@ from miricigale.scene import Background, Scene, highres_image
 __all__ = [
     "band_exposures",
     "expose_and_reduce",
+    "exposure_plan",
     "exposure_units",
     "grid_of",
     "kernel_of",
@@ -66,6 +67,23 @@ def study_exposures(config):
 def exposure_units(config):
     """Names of the exposures, ``<filter>-<dither>``."""
     return tuple(study_exposures(config))
+
+
+def exposure_plan(config, unit=None):
+    """Plain values of the exposures of a unit, a filter, or the whole study, for hashing."""
+    return {
+        name: [
+            e.readout,
+            e.n_groups,
+            e.n_integrations,
+            e.subarray,
+            e.pointing.ra.deg,
+            e.pointing.dec.deg,
+            e.roll.value,
+        ]
+        for name, e in study_exposures(config).items()
+        if not unit or unit in (name, e.filter)
+    }
 
 
 def band_exposures(config, name):

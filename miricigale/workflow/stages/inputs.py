@@ -11,11 +11,16 @@ from miricigale.utils.random import stream
 from miricigale.utils.tables import error_column
 from miricigale.workflow.stages.stars import star_fluxes
 
-__all__ = ["add_agn", "catalog_bands", "fit_inputs", "make_catalog", "make_truth"]
+__all__ = ["add_agn", "axes_plan", "catalog_bands", "fit_inputs", "make_catalog", "make_truth"]
 
 #: Redshifts closer than this share a node of the grid of the input fit.
 REDSHIFT_STEP = 0.01
 GALAXY_PARAMETERS = ("tau", "age", "ebv", "alpha", "metallicity")
+
+
+def axes_plan(kind):
+    """Plain values of a named grid's axes, for hashing."""
+    return {name: list(values) for name, values in SEDModel.yang2021_axes(kind).items()}
 
 
 def catalog_bands(catalog):
