@@ -1,22 +1,28 @@
 """Errors as a function of flux: from simulations, from an exposure, from survey depths."""
 
 import dataclasses
-import itertools
 import types
 
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
-from scipy.ndimage import gaussian_filter
-from scipy.optimize import brentq
 
-from miricigale.instrument import background_level, miri_detector, photmjsr
-from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
+from miricigale.photometry.error_curves import (
+    STATISTICS,
+    Analytic,
+    common_bands,
+    curves_from_table,
+    curves_to_table,
+    exposure_curve,
+    limiting_flux,
+    measured_curve,
+    same_rows,
+)
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.meta import provenance
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import error_column, require_columns
-from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.units import FNU, to_array
 
 __all__ = ["YANG2021_DEPTHS", "ErrorModel"]
 
@@ -40,56 +46,6 @@ YANG2021_DEPTHS = types.MappingProxyType(
         "mips.24": 19.3,
     }
 )
-
-#: What turns the median of absolute values into a standard deviation.
-_STATISTICS = {"mad": 1.482602218505602, "median_abs": 1.0}
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Binned:
-    """Errors at nodes in flux, joined by straight lines in asinh(flux)."""
-
-    flux: np.ndarray
-    error: np.ndarray
-    low: float
-    high: float
-    kind = "binned"
-
-    def sigma(self, flux):
-        scale = self.error[0] if self.error[0] > 0 else 1.0
-        return np.interp(np.arcsinh(flux / scale), np.arcsinh(self.flux / scale), self.error)
-
-    def outside(self, flux):
-        return (flux < self.low) | (flux > self.high)
-
-    def rows(self):
-        nan = np.full(len(self.flux), np.nan)
-        ends = [np.full(len(self.flux), v) for v in (self.low, self.high)]
-        return [self.flux, self.error, *ends, nan, nan]
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Analytic:
-    """sigma^2 = sky^2 + fraction^2 flux^2 + photon max(flux, 0)."""
-
-    sky: float
-    fraction: float = 0.0
-    photon: float = 0.0
-    kind = "analytic"
-    high = np.inf
-
-    def sigma(self, flux):
-        return np.sqrt(
-            self.sky**2 + (self.fraction * flux) ** 2 + self.photon * np.maximum(flux, 0)
-        )
-
-    def outside(self, flux):
-        return np.zeros(np.shape(flux), bool)
-
-    def rows(self):
-        return [
-            np.array([v]) for v in (np.nan, self.sky, np.nan, np.nan, self.fraction, self.photon)
-        ]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -177,30 +133,22 @@ class ErrorModel:
         ----------
         Yang et al. 2021, ApJ 908, 144, section 4.2.
         """
-        if statistic not in _STATISTICS:
-            raise argument_error("statistic", f"one of {sorted(_STATISTICS)}", repr(statistic))
+        if statistic not in STATISTICS:
+            raise argument_error("statistic", f"one of {sorted(STATISTICS)}", repr(statistic))
         if int(bin_size) < 3:
             raise argument_error("bin_size", "at least 3", bin_size)
         if filters is None:
-            errors = {error_column(name) for name in truth.colnames}
-            filters = [
-                name
-                for name in truth.colnames
-                if name in measured.colnames
-                and name not in errors
-                and getattr(truth[name], "unit", None) is not None
-                and u.Unit(truth[name].unit).is_equivalent(FNU)
-            ]
+            filters = common_bands(truth, measured)
         filters = list(filters)
         for table, argument in ((truth, "truth"), (measured, "measured")):
             require_columns(table, filters, argument, units=dict.fromkeys(filters, FNU))
-        rows_true, rows_measured = _same_rows(truth, measured)
+        rows_true, rows_measured = same_rows(truth, measured)
         curves = {}
         for name in filters:
             true = to_array(truth[name], FNU, name)[rows_true]
             seen = to_array(measured[name], FNU, name)[rows_measured]
             good = np.isfinite(true) & np.isfinite(seen)
-            curves[name] = _bins(name, true[good], seen[good], int(bin_size), statistic)
+            curves[name] = measured_curve(name, true[good], seen[good], int(bin_size), statistic)
         return cls(curves, provenance(source="tables", statistic=statistic, bin_size=bin_size))
 
     @classmethod
@@ -228,7 +176,7 @@ class ErrorModel:
                 raise argument_error("depths", "finite depths", f"{depth} for {name!r}")
             if not part >= 0:
                 raise argument_error("fractional", "at least 0", f"{part} for {name!r}")
-            curves[name] = _Analytic(limit / 5, float(part))
+            curves[name] = Analytic(limit / 5, float(part))
         return cls(curves, provenance(source="depths"))
 
     @classmethod
@@ -293,43 +241,17 @@ class ErrorModel:
         residual or crowding is in it: it is a lower limit, by a factor of about two
         below the exposure time calculator's (see the guide).
         """
-        seconds = float(to_array(time, u.s, "time"))
-        if not seconds > 0:
-            raise argument_error("time", "positive", time)
-        if int(n_integrations) < 1:
-            raise argument_error("n_integrations", "at least 1", n_integrations)
-        step = float(to_array(frame_time, u.s, "frame_time"))
-        level = background_level(filter) if background is None else background
-        level = float(to_array(level, SURFACE_BRIGHTNESS, "background"))
-        detector = miri_detector()
-        conversion = photmjsr(filter)
-        n_frames = seconds / n_integrations / step
-        if n_frames < 2:
-            raise argument_error(
-                "time", f"at least two frames of {step} s in each integration", time
-            )
-        electrons = level / conversion * detector.gain + detector.dark_current
-        variance = electrons / seconds
-        read = detector.read_noise * detector.gain
-        variance += 12 * read**2 / (n_frames * (n_frames**2 - 1) * step**2) / n_integrations
-        pixel_noise = np.sqrt(variance) / detector.gain * conversion
-        pixel = u.Quantity(MIRI_PIXEL_SCALE, ANGLE).value
-        per_pixel = (pixel * u.arcsec).to_value(u.rad) ** 2 * 1e12  # uJy per MJy/sr
-        share = psf_image(
-            miri_psf(filter) if psf is None else psf, pixel_scale=pixel * ANGLE, shape=91
+        curve = exposure_curve(
+            filter,
+            time,
+            background=background,
+            size=size,
+            psf=psf,
+            n_integrations=n_integrations,
+            frame_time=frame_time,
+            fractional=fractional,
         )
-        width = float(to_array(size, ANGLE, "size"))
-        if not width >= 0:
-            raise argument_error("size", "at least 0", size)
-        if width > 0:
-            share = gaussian_filter(share, width / np.sqrt(8 * np.log(2)) / pixel)
-        power = np.sum(share**2)
-        sky = pixel_noise * per_pixel / np.sqrt(power)
-        photon = np.sum(share**3) / power**2 * per_pixel * conversion / detector.gain / seconds
-        return cls(
-            {str(filter): _Analytic(float(sky), float(fractional), float(photon))},
-            provenance(source="exposure"),
-        )
+        return cls({str(filter): curve}, provenance(source="exposure"))
 
     def sigma(self, flux, filter):
         """
@@ -381,20 +303,7 @@ class ErrorModel:
         """
         if not n_sigma > 0:
             raise argument_error("n_sigma", "positive", n_sigma)
-        curve = self._curve(filter)
-
-        def excess(flux):
-            return flux - n_sigma * float(curve.sigma(flux))
-
-        grid = np.geomspace(1e-9, 1e9, 3601)
-        below = np.flatnonzero(grid < n_sigma * curve.sigma(grid))
-        if len(below) == 0:
-            return grid[0] * FNU
-        last = below[-1]
-        if last == len(grid) - 1:
-            return np.nan * FNU
-        limit = brentq(excess, grid[last], grid[last + 1], rtol=1e-12)
-        return (np.nan if limit > curve.high else limit) * FNU
+        return limiting_flux(self._curve(filter), n_sigma) * FNU
 
     def limiting_magnitude(self, filter, n_sigma=5.0, *, magnitude_error=None):
         """
@@ -493,46 +402,12 @@ class ErrorModel:
         table : `~astropy.table.QTable`
             A row for each node (binned) or filter (analytic).
         """
-        names, kinds, rows = [], [], []
-        for name, curve in self.curves.items():
-            values = np.stack(curve.rows())
-            rows.append(values)
-            names += [name] * values.shape[1]
-            kinds += [curve.kind] * values.shape[1]
-        values = np.concatenate(rows, axis=1) if rows else np.empty((6, 0))
-        table = QTable({"filter": names, "kind": kinds}, meta=dict(self.meta))
-        columns = (
-            ("flux", FNU, "Median true flux of the bin"),
-            ("sigma", FNU, "1-sigma error there, or that of the sky"),
-            ("low", FNU, "Least true flux of all bins"),
-            ("high", FNU, "Greatest true flux of all bins"),
-            ("fraction", u.dimensionless_unscaled, "Part of the flux added in quadrature"),
-            ("photon", FNU, "Variance per flux of the source's own photons"),
-        )
-        for (name, unit, text), value in zip(columns, values, strict=True):
-            table[name] = value * unit
-            table[name].info.description = text
-        return table
+        return curves_to_table(self.curves, self.meta)
 
     @classmethod
     def from_table(cls, table):
         """Make the model of a table that `to_table` made."""
-        wanted = ["filter", "kind", "flux", "sigma", "low", "high", "fraction", "photon"]
-        require_columns(table, wanted, "table")
-        curves = {}
-        filters = np.asarray(table["filter"]).astype(str)
-        for name in dict.fromkeys(filters):
-            part = table[filters == name]
-            flux, sigma, low, high, photon = (
-                u.Quantity(part[c]).to_value(FNU)
-                for c in ("flux", "sigma", "low", "high", "photon")
-            )
-            if part["kind"][0] == "binned":
-                curves[name] = _Binned(flux, sigma, float(low[0]), float(high[0]))
-            else:
-                fraction = float(u.Quantity(part["fraction"][0]).value)
-                curves[name] = _Analytic(float(sigma[0]), fraction, float(photon[0]))
-        return cls(curves, dict(table.meta))
+        return cls(curves_from_table(table), dict(table.meta))
 
     def write(self, path, *, overwrite=False):
         """Write the curves as an ECSV table."""
@@ -567,45 +442,3 @@ class ErrorModel:
             fluxes[name] = middle * np.geomspace(0.03, 300, 200)
             sigmas[name] = self._curve(name).sigma(fluxes[name])
         return plot_error_function(fluxes, sigmas, limits=limits, ax=ax)
-
-
-def _same_rows(truth, measured):
-    if "id" in truth.colnames and "id" in measured.colnames:
-        _, rows, others = np.intersect1d(
-            np.asarray(truth["id"]), np.asarray(measured["id"]), return_indices=True
-        )
-        return rows, others
-    if len(truth) != len(measured):
-        raise argument_error(
-            "measured", f"a table of {len(truth)} rows as 'truth', or ids in both", len(measured)
-        )
-    rows = np.arange(len(truth))
-    return rows, rows
-
-
-def _bins(name, true, seen, size, statistic):
-    if len(true) < 3:
-        raise argument_error(
-            "measured", f"at least three measured sources in {name!r}", f"{len(true)}"
-        )
-    order = np.argsort(-true, kind="stable")
-    edges = np.arange(0, max(len(true) // size, 1) * size + 1, size)
-    edges[-1] = len(true)
-    parts = [order[a:b] for a, b in itertools.pairwise(edges)][::-1]
-    flux, error = np.transpose([_scatter(true[part], seen[part]) for part in parts])
-    return _Binned(flux, error * _STATISTICS[statistic], float(true.min()), float(true.max()))
-
-
-def _scatter(true, seen):
-    """
-    Median true flux of a bin and median absolute deviation there.
-
-    Bright sources scatter in proportion to their flux (templates, blends), faint ones by the
-    noise of the sky. Where the signal-to-noise is above 5 the deviations are taken relative to
-    each flux, or the brightest of a wide bin would set the error of the faintest.
-    """
-    flux = np.median(true)
-    absolute = np.median(np.abs(seen - true))
-    if flux > 5 * absolute and np.all(true > 0):
-        return flux, flux * np.median(np.abs(seen / true - 1.0))
-    return flux, absolute

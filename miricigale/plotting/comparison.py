@@ -169,8 +169,9 @@ def plot_redshifts(z_true, z_fit, *, z_err=None, ax=None, outlier=0.15, title=No
         ax.errorbar(z_true, z_fit, yerr=z_err, fmt="none", ecolor="0.8", elinewidth=0.6, zorder=0)
     ax.plot(z_true[~bad], z_fit[~bad], ".", ms=4, color=SECOND, alpha=0.7)
     ax.plot(z_true[bad], z_fit[bad], "x", ms=4, color=MEASURED, label="outliers")
-    ax.set_xscale("function", functions=(lambda v: np.log1p(np.maximum(v, -0.9)), np.expm1))
-    ax.set_yscale("function", functions=(lambda v: np.log1p(np.maximum(v, -0.9)), np.expm1))
+    functions = (lambda v: np.log1p(np.maximum(v, -0.9)), np.expm1)
+    ax.set_xscale("function", functions=functions)
+    ax.set_yscale("function", functions=functions)
     ticks = [0, 0.5, 1, 2, 3, 4, 6]
     ax.set_xticks([t for t in ticks if t < top])
     ax.set_yticks([t for t in ticks if t < top])

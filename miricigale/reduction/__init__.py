@@ -12,7 +12,8 @@ from miricigale.reduction.mosaic import (
     weight_map,
 )
 from miricigale.reduction.rampfit import RampFit, fit_groups, reference_drift
-from miricigale.reduction.reducer import BACKENDS, Reducer, ReductionResult
+from miricigale.reduction.reducer import BACKENDS, Reducer
+from miricigale.reduction.results import ReductionResult
 
 __all__ = [
     "BACKENDS",

@@ -137,13 +137,18 @@ def _plane(data, mask, box):
     for _ in range(5):
         coef, *_ = np.linalg.lstsq(points[keep, :3], points[keep, 3], rcond=None)
         residual = points[:, 3] - points[:, :3] @ coef
-        spread = 1.4826 * np.median(np.abs(residual[keep] - np.median(residual[keep])))
+        spread = _spread(residual[keep])
         new = np.abs(residual) <= 3 * spread
         if new.sum() < 6 or np.array_equal(new, keep):
             break
         keep = new
     y, x = np.ogrid[:ny, :nx]
     return (coef[0] + coef[1] * (x / nx) + coef[2] * (y / ny)).astype(data.dtype)
+
+
+def _spread(values):
+    """Standard deviation from the median of absolute deviations."""
+    return 1.4826 * np.median(np.abs(values - np.median(values)))
 
 
 def _detect(residual, rms, mask, sources, threshold):
@@ -155,7 +160,7 @@ def _detect(residual, rms, mask, sources, threshold):
         smooth = gaussian_filter(scaled, width, mode="nearest")
         # correlated noise is smoothed less: its width is measured
         values = smooth[good & ~sources]
-        noise = 1.4826 * np.median(np.abs(values - np.median(values)))
+        noise = _spread(values)
         high = good & (smooth > threshold * noise)
         labels, _ = label(high, np.ones((3, 3), bool))
         large = np.bincount(labels.ravel()) >= _MIN_AREA

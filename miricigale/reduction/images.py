@@ -6,7 +6,16 @@ from astropy.nddata import CCDData, StdDevUncertainty
 from miricigale.reduction.flags import MASKED
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["flag_pixels", "image", "plain_flags", "plain_mask", "sigma", "with_data"]
+__all__ = [
+    "exposure_values",
+    "flag_pixels",
+    "image",
+    "plain_flags",
+    "plain_mask",
+    "seen_wcs",
+    "sigma",
+    "with_data",
+]
 
 
 def image(data, unit, *, error, flags, wcs, meta):
@@ -99,3 +108,33 @@ def flag_pixels(source, where, flag):
     if int(flag) & int(MASKED):
         out.mask |= where
     return out
+
+
+def exposure_values(exposure):
+    """Fields of an exposure in values that fit a header."""
+    return {
+        "filter": exposure.filter,
+        "readout": exposure.readout,
+        "subarray": exposure.subarray,
+        "n_groups": exposure.n_groups,
+        "n_integrations": exposure.n_integrations,
+        "dither": exposure.dither,
+        "ra": float(exposure.pointing.ra.deg),
+        "dec": float(exposure.pointing.dec.deg),
+        "roll": float(exposure.roll.to_value("deg")),
+        "pa_aper": float(exposure.pa_aper.to_value("deg")),
+        "group_time": float(exposure.group_time.to_value("s")),
+        "exposure_time": float(exposure.exposure_time.to_value("s")),
+    }
+
+
+def seen_wcs(im):
+    """WCS of the part of an image that holds its unmasked pixels, with its shape."""
+    good = ~np.asarray(im.mask)
+    rows, columns = (np.flatnonzero(good.any(axis=axis)) for axis in (1, 0))
+    if rows.size == 0:
+        rows, columns = (np.arange(n) for n in im.shape)
+    part = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+    wcs = im.wcs.slice(part)
+    wcs.pixel_shape = tuple(int(np.ptp(index)) + 1 for index in (columns, rows))
+    return wcs

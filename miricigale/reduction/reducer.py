@@ -7,10 +7,10 @@ from astropy.nddata import CCDData
 
 from miricigale.detector import DQ
 from miricigale.instrument import DetectorProperties, miri_detector, mosaic_wcs
-from miricigale.reduction.background import Background, estimate_background, subtract_background
+from miricigale.reduction.background import estimate_background, subtract_background
 from miricigale.reduction.calibration import calibrate
 from miricigale.reduction.flags import PixelFlags
-from miricigale.reduction.images import image
+from miricigale.reduction.images import exposure_values, image, seen_wcs
 from miricigale.reduction.mosaic import (
     drizzle_images,
     pixel_map,
@@ -18,59 +18,19 @@ from miricigale.reduction.mosaic import (
     weight_map,
 )
 from miricigale.reduction.rampfit import fit_groups, reference_drift
+from miricigale.reduction.results import ReductionResult
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.progress import progress
 from miricigale.utils.units import ANGLE, RATE, to_array
 
-__all__ = ["BACKENDS", "Reducer", "ReductionResult"]
+__all__ = ["BACKENDS", "Reducer"]
 
 #: Known backends.
 BACKENDS = ("native",)
 
 # flags of a ramp's pixels that forbid a slope
 _UNUSABLE = DQ.DO_NOT_USE | DQ.NON_SCIENCE | DQ.REFERENCE_PIXEL | DQ.DEAD
-
-
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class ReductionResult:
-    """
-    What the reduction of one filter's dithers gave.
-
-    Parameters
-    ----------
-    rates : tuple of `~astropy.nddata.CCDData`
-        Slopes, DN/s.
-    images : tuple of `~astropy.nddata.CCDData`
-        Calibrated, background subtracted, outliers masked; MJy/sr.
-    backgrounds : tuple of `Background`
-        What was subtracted from each.
-    mosaic : `~astropy.nddata.CCDData`
-        MJy/sr.
-    weight : `~numpy.ndarray`, shape (ny, nx)
-        Weight (inverse variance) of the mosaic.
-    n_images : `~numpy.ndarray`, shape (ny, nx)
-        Number of dithers at each pixel of the mosaic.
-    mosaic_background : `Background`
-        What was subtracted from the mosaic in the second pass.
-    """
-
-    rates: tuple
-    images: tuple
-    backgrounds: tuple
-    mosaic: CCDData
-    weight: np.ndarray
-    n_images: np.ndarray
-    mosaic_background: Background
-
-    @property
-    def filter(self):
-        """Name of the filter."""
-        return self.mosaic.meta.get("filter")
-
-    def __repr__(self):
-        ny, nx = self.mosaic.shape
-        return f"<ReductionResult {self.filter}: {len(self.images)} dithers, mosaic {ny} x {nx}>"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -257,7 +217,7 @@ class Reducer:
         fit = self.fit_groups(ramp, progress_bar=progress_bar)
         ipc = self._shares_charge(ramp)
         meta = provenance(
-            **_plain(ramp.exposure),
+            **exposure_values(ramp.exposure),
             n_jumps=len(fit.jumps),
             ipc=ipc,
             noise_correction=self._noise_correction(fit) if ipc else 1.0,
@@ -422,7 +382,7 @@ class Reducer:
         if not rates:
             raise argument_error("ramps", "at least one ramp", "none")
         if wcs is None:
-            wcs = mosaic_wcs([_seen(im) for im in images], pixel_scale)
+            wcs = mosaic_wcs([seen_wcs(im) for im in images], pixel_scale)
         drizzled, images = self.drizzle(images, wcs)
         mosaic, mosaic_background = self.subtract_background(drizzled.image)
         # the mosaic's own level would hide those of the dithers
@@ -456,33 +416,3 @@ class Reducer:
         if effects is None:
             return True
         return any(str(effect).startswith("InterpixelCapacitance") for effect in effects)
-
-
-def _plain(exposure):
-    """Fields of an exposure in values that fit a header."""
-    return {
-        "filter": exposure.filter,
-        "readout": exposure.readout,
-        "subarray": exposure.subarray,
-        "n_groups": exposure.n_groups,
-        "n_integrations": exposure.n_integrations,
-        "dither": exposure.dither,
-        "ra": float(exposure.pointing.ra.deg),
-        "dec": float(exposure.pointing.dec.deg),
-        "roll": float(exposure.roll.to_value("deg")),
-        "pa_aper": float(exposure.pa_aper.to_value("deg")),
-        "group_time": float(exposure.group_time.to_value("s")),
-        "exposure_time": float(exposure.exposure_time.to_value("s")),
-    }
-
-
-def _seen(im):
-    """WCS of the part of an image that holds its unmasked pixels, with its shape."""
-    good = ~np.asarray(im.mask)
-    rows, columns = (np.flatnonzero(good.any(axis=axis)) for axis in (1, 0))
-    if rows.size == 0:
-        rows, columns = (np.arange(n) for n in im.shape)
-    part = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
-    wcs = im.wcs.slice(part)
-    wcs.pixel_shape = tuple(int(np.ptp(index)) + 1 for index in (columns, rows))
-    return wcs

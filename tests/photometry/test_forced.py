@@ -120,7 +120,8 @@ def test_noisy_templates(tools, noise, snr, bias):
 
 def test_noise_in_the_template_is_taken_off_the_diagonal(tools):
     # noise of known variance in the cutout: expectation of the corrected power is that of the truth
-    from miricigale.photometry.templates import Cutout, FineTemplates, TemplateBank
+    from miricigale.photometry.cutouts import Cutout
+    from miricigale.photometry.templates import FineTemplates, TemplateBank
 
     rng = np.random.default_rng(2)
     fine = FineTemplates(tools.kernel.array, tools.kernel.target)

@@ -1,0 +1,245 @@
+"""What light, dark current and particles do to the charge of a ramp."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from miricigale.detector._core.random import (
+    PTRS_FROM,
+    advance,
+    fill_normals,
+    poisson,
+    poisson_inversion,
+    ptrs_constants,
+    ptrs_rest,
+    seed_stream,
+    uniform,
+    unit,
+)
+
+__all__ = ["add_cosmic_rays", "add_poisson", "couple_neighbours"]
+
+#: Greatest mean for which a draw is done; beyond it a pixel is saturated a thousandfold.
+_MEAN_MAX = 1e9
+
+
+@njit(cache=True, nogil=True)
+def add_poisson(ramp, mean, key, first_row):
+    """
+    Add charge that arrives at random, accumulating over the groups of an integration.
+
+    Parameters
+    ----------
+    ramp : `~numpy.ndarray` of float32, shape (n_int, n_group, n_row, n_col)
+        Accumulated charge (electrons); added to in place.
+    mean : `~numpy.ndarray` of float64, shape (n_row, n_col)
+        Expected electrons per group; at most 1e9 is drawn.
+    key : `~numpy.ndarray` of uint64, shape (4,)
+        Key words of the streams.
+    first_row : int
+        Detector row of the first row.
+    """
+    n_int, n_group, n_row, n_col = ramp.shape
+    state = np.empty(4, np.uint64)
+    mu = np.empty(n_col)
+    a = np.empty(n_col)
+    b = np.empty(n_col)
+    c = np.empty(n_col)
+    total = np.empty(n_col)
+    for r in range(n_row):
+        for x in range(n_col):
+            mu[x] = min(mean[r, x], _MEAN_MAX)
+            if mu[x] < PTRS_FROM:
+                c[x] = math.exp(-mu[x])
+            else:
+                a[x], b[x], c[x] = ptrs_constants(mu[x])
+        for i in range(n_int):
+            seed_stream(state, key, i, first_row + r)
+            s0, s1, s2, s3 = state[0], state[1], state[2], state[3]
+            total[:] = 0.0
+            for g in range(n_group):
+                for x in range(n_col):
+                    if mu[x] <= 0.0:
+                        k = 0.0
+                    elif mu[x] < PTRS_FROM:
+                        s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
+                        k = poisson_inversion(unit(bits), mu[x], c[x])
+                    else:
+                        k = -1.0
+                        while k < 0.0:
+                            s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
+                            u = unit(bits) - 0.5
+                            s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
+                            v = unit(bits)
+                            us = 0.5 - abs(u)
+                            k = math.floor((2.0 * a[x] / us + b[x]) * u + mu[x] + 0.43)
+                            if us < 0.07 or v > c[x]:
+                                k = ptrs_rest(mu[x], a[x], b[x], v, k, us)
+                    total[x] += k
+                    ramp[i, g, r, x] += np.float32(total[x])
+
+
+@njit(cache=True, nogil=True)
+def _push(deposits, n, slot, head, row, col, charge):
+    """Append one deposit to the list of its group; returns the (grown) list and its length."""
+    if n == deposits.shape[0]:
+        grown = np.empty((2 * n, 4))
+        grown[:n] = deposits
+        deposits = grown
+    deposits[n, 0] = head[slot]
+    deposits[n, 1] = row
+    deposits[n, 2] = col
+    deposits[n, 3] = charge
+    head[slot] = n
+    return deposits, n + 1
+
+
+@njit(cache=True, nogil=True)
+def add_cosmic_rays(
+    ramp,
+    key,
+    first_row,
+    n_detector_rows,
+    hits_per_row,
+    thickness,
+    yield_median,
+    yield_sigma,
+    track_max,
+    leakage,
+    shower_fraction,
+    shower_charge,
+    shower_sigma,
+):
+    """
+    Add the charge of cosmic-ray hits.
+
+    Parameters
+    ----------
+    ramp : `~numpy.ndarray` of float32, shape (n_int, n_group, n_row, n_col)
+        Accumulated charge (electrons); added to in place.
+    key : `~numpy.ndarray` of uint64, shape (4,)
+        Key words of the streams.
+    first_row, n_detector_rows : int
+        Detector row of the first row, and how many there are.
+    hits_per_row : float
+        Expected hits in one row during all integrations.
+    thickness : float
+        Thickness of the layer in pixels.
+    yield_median : float
+        Median electrons set free per pixel length of path.
+    yield_sigma : float
+        Standard deviation of the natural logarithm of that yield.
+    track_max : float
+        Longest track in pixels.
+    leakage : float
+        Share of a pixel's deposit that goes to each of its four neighbours.
+    shower_fraction, shower_charge, shower_sigma : float
+        Share of hits that make a shower, its charge (electrons) and Gaussian width
+        (pixels).
+    """
+    n_int, n_group, n_row, n_col = ramp.shape
+    reach = math.ceil(track_max) + 2
+    if shower_fraction > 0.0:
+        reach = max(reach, math.ceil(3.0 * shower_sigma) + 1)
+    deposits = np.empty((1024, 4))
+    head = np.full(n_int * n_group, -1, np.int64)
+    n = 0
+    state = np.empty(4, np.uint64)
+    normal = np.empty(1)
+    last_row = first_row + n_row
+    for row in range(max(0, first_row - reach), min(n_detector_rows, last_row + reach)):
+        seed_stream(state, key, 0, row)
+        for _hit in range(int(poisson(state, hits_per_row))):
+            # every hit uses the same draws up to here, shower or not
+            slot = min(int(uniform(state) * (n_int * n_group)), n_int * n_group - 1)
+            x = uniform(state) * n_col
+            y = row + uniform(state)
+            # isotropic flux through a plane: p(cos) = 2 cos
+            cos2 = uniform(state)
+            azimuth = 2.0 * math.pi * uniform(state)
+            fill_normals(state, normal)
+            strength = math.exp(yield_sigma * normal[0])
+            shower = uniform(state) < shower_fraction
+            length = min(thickness * math.sqrt((1.0 - cos2) / cos2), track_max)
+            dx = length * math.cos(azimuth)
+            dy = length * math.sin(azimuth)
+            charge = yield_median * strength * math.sqrt(thickness**2 + length**2)
+            # walk through the pixels that the track crosses (Amanatides & Woo 1987)
+            px, py = math.floor(x), math.floor(y)
+            step_x = 1 if dx > 0.0 else -1
+            step_y = 1 if dy > 0.0 else -1
+            next_x = ((px + (step_x > 0)) - x) / dx if dx != 0.0 else math.inf
+            next_y = ((py + (step_y > 0)) - y) / dy if dy != 0.0 else math.inf
+            done = 0.0
+            while done < 1.0:
+                to = min(next_x, next_y, 1.0)
+                q = charge * (to - done)
+                done = to
+                if abs(py - first_row) <= n_row + 1 and q > 0.0:
+                    for k in range(5):
+                        cx = px + (k == 1) - (k == 2)
+                        cy = py + (k == 3) - (k == 4)
+                        share = 1.0 - 4.0 * leakage if k == 0 else leakage
+                        if 0 <= cx < n_col and first_row <= cy < last_row and share > 0.0:
+                            deposits, n = _push(
+                                deposits, n, slot, head, cy - first_row, cx, q * share
+                            )
+                if next_x <= next_y:
+                    px += step_x
+                    next_x += abs(1.0 / dx) if dx != 0.0 else math.inf
+                else:
+                    py += step_y
+                    next_y += abs(1.0 / dy) if dy != 0.0 else math.inf
+            if shower:
+                peak = shower_charge * strength / (2.0 * math.pi * shower_sigma**2)
+                r = math.ceil(3.0 * shower_sigma)
+                iy, ix = math.floor(y), math.floor(x)
+                for cy in range(max(iy - r, first_row), min(iy + r + 1, last_row)):
+                    for cx in range(max(ix - r, 0), min(ix + r + 1, n_col)):
+                        d2 = (cy + 0.5 - y) ** 2 + (cx + 0.5 - x) ** 2
+                        q = peak * math.exp(-0.5 * d2 / shower_sigma**2)
+                        deposits, n = _push(deposits, n, slot, head, cy - first_row, cx, q)
+    plane = np.zeros((n_row, n_col), np.float32)
+    for i in range(n_int):
+        plane[:] = 0.0
+        for g in range(n_group):
+            k = head[i * n_group + g]
+            while k >= 0:
+                plane[int(deposits[k, 1]), int(deposits[k, 2])] += np.float32(deposits[k, 3])
+                k = int(deposits[k, 0])
+            for r in range(n_row):
+                for x in range(n_col):
+                    ramp[i, g, r, x] += plane[r, x]
+
+
+@njit(cache=True, nogil=True)
+def couple_neighbours(ramp, kernel):
+    """
+    Replace each pixel by the sum of its 3 x 3 neighbours, weighted by a kernel.
+
+    At an edge the missing neighbour is the pixel nearest to it, so that a symmetric
+    kernel of sum 1 keeps a uniform field.
+
+    Parameters
+    ----------
+    ramp : `~numpy.ndarray` of float32, shape (n_int, n_group, n_row, n_col)
+        Changed in place.
+    kernel : `~numpy.ndarray` of float32, shape (3, 3)
+    """
+    n_int, n_group, n_row, n_col = ramp.shape
+    padded = np.empty((n_row + 2, n_col + 2), np.float32)
+    for i in range(n_int):
+        for g in range(n_group):
+            padded[1:-1, 1:-1] = ramp[i, g]
+            padded[0, 1:-1] = ramp[i, g, 0]
+            padded[-1, 1:-1] = ramp[i, g, -1]
+            padded[:, 0] = padded[:, 1]
+            padded[:, -1] = padded[:, -2]
+            for r in range(n_row):
+                for x in range(n_col):
+                    total = np.float32(0.0)
+                    for dy in range(3):
+                        for dx in range(3):
+                            total += kernel[dy, dx] * padded[r + dy, x + dx]
+                    ramp[i, g, r, x] = total

@@ -1,0 +1,106 @@
+"""What all effects share: the block they act on, their streams, their base."""
+
+import dataclasses
+
+import numpy as np
+
+from miricigale.instrument import DetectorProperties, Exposure
+from miricigale.utils.random import stream
+
+__all__ = ["Block", "Effect", "check_ramp", "key_words", "stream_key"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Block:
+    """
+    Where and when an effect acts: some full rows of one exposure.
+
+    Parameters
+    ----------
+    exposure : `~miricigale.instrument.Exposure`
+        What is exposed.
+    properties : `~miricigale.instrument.DetectorProperties`
+        Gain, noise, full well and the rest.
+    rows : slice
+        Detector rows, start and stop given.
+    pixel_dq : `~numpy.ndarray` of uint32, shape (n_row, n_col)
+        Flags that effects may set (`DQ`).
+    group_dq : `~numpy.ndarray` of uint8, shape (n_int, n_group, n_row, n_col)
+        Flags that effects may set.
+    key : `~numpy.ndarray` of uint64, shape (4,)
+        Key words of the random streams of this effect in this exposure.
+    """
+
+    exposure: Exposure
+    properties: DetectorProperties
+    rows: slice
+    pixel_dq: np.ndarray
+    group_dq: np.ndarray
+    key: np.ndarray
+
+    @property
+    def group_time(self):
+        """Time between the groups in s."""
+        return self.exposure.group_time.to_value("s")
+
+    @property
+    def total_time(self):
+        """Time during which charge is collected in all integrations in s."""
+        return self.exposure.n_integrations * self.exposure.n_groups * self.group_time
+
+    @property
+    def ramp_shape(self):
+        """Shape of a ramp of this block."""
+        return self.group_dq.shape
+
+
+def key_words(*key):
+    """Draw the key words of the kernels' streams from the stream of a key, uint64 (4,)."""
+    return stream(*key).integers(0, 2**64 - 1, size=4, dtype=np.uint64, endpoint=True)
+
+
+def stream_key(seed, exposure, name):
+    """Key words of the streams of the effect ``name`` in an exposure, uint64 (4,)."""
+    return key_words(seed, "detector", exposure.filter, exposure.dither, name)
+
+
+def check_ramp(array, block, effect):
+    """Check that an effect on ramps was given one."""
+    if array.shape != block.ramp_shape:
+        msg = (
+            f"{type(effect).__name__} acts on a ramp of shape {block.ramp_shape} but was given "
+            f"shape {array.shape}: 'effects' must hold Photons before it"
+        )
+        raise ValueError(msg)
+    return array
+
+
+@dataclasses.dataclass(frozen=True)
+class Effect:
+    """
+    Base of the effects.
+
+    ``halo`` is how many rows beside a row an effect reads; ``included_as`` is the name
+    under which an image's ``psf_includes`` may say that the effect is in it already.
+    """
+
+    halo = 0
+    included_as = None
+
+    def apply(self, array, block):
+        """
+        Return the array as it is after the effect.
+
+        Parameters
+        ----------
+        array : `~numpy.ndarray`
+            Surface brightness (n_row, n_col) or ramp (n_int, n_group, n_row, n_col); may
+            be changed in place.
+        block : `Block`
+            Where and when.
+
+        Returns
+        -------
+        array : `~numpy.ndarray`
+        """
+        raise NotImplementedError

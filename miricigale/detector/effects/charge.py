@@ -1,0 +1,209 @@
+"""Effects on the accumulated charge, in electrons."""
+
+import dataclasses
+
+import numpy as np
+
+from miricigale.detector import _core
+from miricigale.detector.dq import DQ
+from miricigale.detector.effects.base import Effect, check_ramp
+from miricigale.instrument import bad_pixel_mask, reference_pixel_mask
+from miricigale.utils.exceptions import argument_error
+
+__all__ = [
+    "BadPixels",
+    "CosmicRays",
+    "Dark",
+    "InterpixelCapacitance",
+    "ReferencePixels",
+    "Saturation",
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class Dark(Effect):
+    """
+    Dark current, with its Poisson noise.
+
+    Parameters
+    ----------
+    current : float, optional
+        Electrons per second; that of the detector's properties if not given.
+    """
+
+    current: float | None = None
+
+    def apply(self, array, block):
+        """Add the dark charge."""
+        ramp = check_ramp(array, block, self)
+        current = block.properties.dark_current if self.current is None else self.current
+        mean = np.full(ramp.shape[2:], current * block.group_time)
+        _core.add_poisson(ramp, mean, block.key, block.rows.start)
+        return ramp
+
+
+@dataclasses.dataclass(frozen=True)
+class InterpixelCapacitance(Effect):
+    """
+    Coupling of a pixel's voltage to its eight neighbours.
+
+    Left out where the image's ``psf_includes`` holds ``"ipc"``.
+    """
+
+    halo = 1
+    included_as = "ipc"
+
+    def apply(self, array, block):
+        """Couple the accumulated charge of neighbours."""
+        ramp = check_ramp(array, block, self)
+        kernel = np.asarray(block.properties.ipc_kernel, np.float32)
+        _core.couple_neighbours(ramp, kernel)
+        return ramp
+
+
+@dataclasses.dataclass(frozen=True)
+class CosmicRays(Effect):
+    """
+    Hits by cosmic rays: straight tracks through a layer, leakage, showers if asked for.
+
+    Particles arrive isotropically, so that the cosine of the angle of incidence is
+    distributed as 2 cos; a track crosses thickness x tan(angle) of the detector plane and
+    sets charge free in proportion to its length in the layer. The charge per length is
+    log-normal. With the defaults half of the hits leave more than 5000 electrons, 1 % more
+    than 10^5. Of each pixel's charge the share ``leakage`` goes to each of its four
+    neighbours (this stands in for `InterpixelCapacitance`, which acts before).
+
+    Parameters
+    ----------
+    flux : float, optional
+        Hits per um^2 and s; that of the detector's properties if not given (4.9e-8 at
+        solar minimum times 1.7).
+    thickness : float, optional
+        Thickness of the sensitive layer in um.
+    yield_median : float, optional
+        Median electrons per um of path.
+    yield_dex : float, optional
+        Scatter of that yield in dex.
+    track_max : float, optional
+        Longest track in pixels; longer ones are cut there.
+    leakage : float, optional
+        Share of the charge that goes to each of the four neighbours.
+    shower_fraction : float, optional
+        Share of hits that come with a shower, a faint Gaussian cloud; 0 for none.
+    shower_charge : float, optional
+        Median charge of a shower in electrons.
+    shower_sigma : float, optional
+        Its Gaussian width in pixels; painted to three times that.
+    """
+
+    flux: float | None = None
+    thickness: float = 35.0
+    yield_median: float = 100.0
+    yield_dex: float = 0.5
+    track_max: float = 16.0
+    leakage: float = 0.03
+    shower_fraction: float = 0.0
+    shower_charge: float = 3e5
+    shower_sigma: float = 15.0
+
+    def __post_init__(self):
+        if not 0 <= self.leakage <= 0.2:
+            raise argument_error("leakage", "from 0 to 0.2", self.leakage)
+        if not 0 <= self.shower_fraction <= 1:
+            raise argument_error("shower_fraction", "from 0 to 1", self.shower_fraction)
+        if not 0 <= self.track_max <= 200:
+            raise argument_error("track_max", "from 0 to 200 pixels", self.track_max)
+
+    def apply(self, array, block):
+        """Add the charge of the hits."""
+        ramp = check_ramp(array, block, self)
+        properties = block.properties
+        flux = properties.cosmic_ray_flux if self.flux is None else self.flux
+        pitch = properties.pixel_pitch
+        hits_per_row = flux * pitch**2 * ramp.shape[3] * block.total_time
+        _core.add_cosmic_rays(
+            ramp,
+            block.key,
+            block.rows.start,
+            block.exposure.shape[0],
+            float(hits_per_row),
+            float(self.thickness / pitch),
+            float(self.yield_median * pitch),
+            float(self.yield_dex * np.log(10.0)),
+            float(self.track_max),
+            float(self.leakage),
+            float(self.shower_fraction),
+            float(self.shower_charge),
+            float(self.shower_sigma),
+        )
+        return ramp
+
+
+@dataclasses.dataclass(frozen=True)
+class BadPixels(Effect):
+    """
+    Pixels that do not work, as the instrument's mask has them.
+
+    Every second bad pixel (by row plus column) is dead: it collects nothing. The others are hot:
+    they collect more dark current. Both are flagged DO_NOT_USE.
+
+    Parameters
+    ----------
+    hot_current : float, optional
+        Additional dark current of hot pixels in electrons per second.
+    """
+
+    hot_current: float = 300.0
+
+    def apply(self, array, block):
+        """Empty the dead pixels and heat the hot ones."""
+        ramp = check_ramp(array, block, self)
+        bad = bad_pixel_mask(subarray=block.exposure.subarray)[block.rows]
+        y, x = np.indices(bad.shape)
+        dead = bad & ((y + block.rows.start + x) % 2 == 0)
+        hot = bad & ~dead
+        ramp[:, :, dead] = 0.0
+        mean = np.where(hot, self.hot_current * block.group_time, 0.0)
+        _core.add_poisson(ramp, mean, block.key, block.rows.start)
+        block.pixel_dq[dead] |= np.uint32(DQ.DEAD | DQ.DO_NOT_USE)
+        block.pixel_dq[hot] |= np.uint32(DQ.HOT | DQ.DO_NOT_USE)
+        return ramp
+
+
+@dataclasses.dataclass(frozen=True)
+class ReferencePixels(Effect):
+    """
+    Columns at both sides of the full frame that see no light and collect no charge.
+
+    They share bias, drift and read noise with the others, and are flagged
+    REFERENCE_PIXEL and NON_SCIENCE.
+    """
+
+    def apply(self, array, block):
+        """Empty the reference columns."""
+        ramp = check_ramp(array, block, self)
+        mask = reference_pixel_mask(subarray=block.exposure.subarray)[block.rows]
+        ramp[:, :, mask] = 0.0
+        block.pixel_dq[mask] |= np.uint32(DQ.REFERENCE_PIXEL | DQ.NON_SCIENCE)
+        return ramp
+
+
+@dataclasses.dataclass(frozen=True)
+class Saturation(Effect):
+    """
+    Charge stops at the full well; the groups from there on are flagged SATURATED.
+
+    Parameters
+    ----------
+    full_well : float, optional
+        In electrons; that of the detector's properties if not given.
+    """
+
+    full_well: float | None = None
+
+    def apply(self, array, block):
+        """Clip the charge and flag it."""
+        ramp = check_ramp(array, block, self)
+        well = block.properties.full_well if self.full_well is None else self.full_well
+        _core.clip_well(ramp, float(well), block.group_dq, np.uint8(DQ.SATURATED))
+        return ramp

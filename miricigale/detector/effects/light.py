@@ -1,0 +1,87 @@
+"""Effects on light: what the flat field leaves behind, and the photons it turns into."""
+
+import dataclasses
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from miricigale.detector import _core
+from miricigale.detector.effects.base import Effect, key_words
+from miricigale.instrument import flat_field, photmjsr
+from miricigale.utils.exceptions import argument_error
+
+__all__ = ["Photons", "Residual"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Residual(Effect):
+    """
+    What flat field and sky subtraction leave behind, fixed on the detector.
+
+    Multiplies the light by 1 plus a random pattern that is the same in every exposure
+    through one filter.
+
+    Parameters
+    ----------
+    amplitude : float
+        Standard deviation of the pattern, as a fraction of the light.
+    correlation : float, optional
+        Gaussian width of the pattern's correlation in pixels; 0 for white.
+    pattern : int, optional
+        Which random pattern: a property of the detector, apart from the exposure's seed.
+    """
+
+    amplitude: float
+    correlation: float = 1.0
+    pattern: int = 0
+
+    def __post_init__(self):
+        if not 0 <= self.amplitude < 0.2:
+            raise argument_error("amplitude", "a fraction from 0 to 0.2", self.amplitude)
+        if not 0 <= self.correlation <= 30:
+            raise argument_error("correlation", "from 0 to 30 pixels", self.correlation)
+
+    def apply(self, array, block):
+        """Multiply surface brightness by the pattern."""
+        reach = int(np.ceil(4 * self.correlation))
+        n_row, n_col = array.shape
+        key = key_words(self.pattern, "detector", "residual", block.exposure.filter)
+        white = np.empty((n_row + 2 * reach, n_col + 2 * reach))
+        # rows beyond the detector have streams of their own
+        _core.standard_normals(key, block.rows.start - reach + 10_000, white)
+        if reach:
+            delta = np.zeros(2 * reach + 1)
+            delta[reach] = 1.0
+            shape = gaussian_filter1d(delta, self.correlation, truncate=4.0)
+            for axis in (0, 1):
+                white = gaussian_filter1d(white, self.correlation, axis=axis, truncate=4.0)
+            # unit variance: each axis has multiplied it by the sum of the squared weights
+            white = white[reach:-reach, reach:-reach] / np.sum(shape**2)
+        return array * (1.0 + self.amplitude * white)
+
+
+@dataclasses.dataclass(frozen=True)
+class Photons(Effect):
+    """
+    Surface brightness to electrons: calibration, flat field, Poisson noise.
+
+    Parameters
+    ----------
+    flat : bool, optional
+        Whether the flat field of the instrument multiplies the light.
+    """
+
+    flat: bool = True
+
+    def apply(self, array, block):
+        """Turn surface brightness (MJy/sr) into a ramp (electrons)."""
+        if array.ndim != 2:
+            raise argument_error("effects", "a tuple with one Photons in it", "two")
+        exposure = block.exposure
+        gain = block.properties.gain
+        mean = array * (gain / photmjsr(exposure.filter, gain=gain) * block.group_time)
+        if self.flat:
+            mean = mean * flat_field(exposure.filter, subarray=exposure.subarray)[block.rows]
+        ramp = np.zeros(block.ramp_shape, np.float32)
+        _core.add_poisson(ramp, np.ascontiguousarray(mean, float), block.key, block.rows.start)
+        return ramp

@@ -1,0 +1,120 @@
+"""Effects of the read-out: response, bias, noise and rounding, in DN."""
+
+import dataclasses
+
+import numpy as np
+
+from miricigale.detector import _core
+from miricigale.detector.dq import DQ
+from miricigale.detector.effects.base import Effect, check_ramp
+
+__all__ = ["ADConversion", "Bias", "Nonlinearity", "ReadNoise"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Nonlinearity(Effect):
+    """
+    Electrons to DN: gain, and the response that falls as the pixel fills.
+
+    The response is the detector's ``delinearize``, tabulated every 8 DN up to the full well
+    and interpolated (to better than 1e-3 DN for curvatures up to 1e-4 per DN).
+
+    Parameters
+    ----------
+    linear : bool, optional
+        Whether the response is taken as linear: the gain alone.
+    """
+
+    linear: bool = False
+
+    def apply(self, array, block):
+        """Turn electrons into DN above the bias."""
+        ramp = check_ramp(array, block, self)
+        properties = block.properties
+        step = 8.0
+        nodes = step * np.arange(
+            int(np.ceil(1.05 * properties.full_well / properties.gain / step)) + 2
+        )
+        response = nodes if self.linear else properties.delinearize(nodes)
+        response = np.ascontiguousarray(response, np.float32)
+        _core.interpolate_response(ramp, float(properties.gain), response, step)
+        return ramp
+
+
+@dataclasses.dataclass(frozen=True)
+class Bias(Effect):
+    """
+    The level from which a pixel starts after its reset.
+
+    Parameters
+    ----------
+    level : float, optional
+        In DN; that of the detector's properties if not given.
+    reset_noise : float, optional
+        Standard deviation of the level from reset to reset (kTC noise), in DN. It is the
+        same for all groups of an integration.
+    """
+
+    level: float | None = None
+    reset_noise: float = 0.0
+
+    def apply(self, array, block):
+        """Add the level."""
+        ramp = check_ramp(array, block, self)
+        level = block.properties.bias if self.level is None else self.level
+        ramp += np.float32(level)
+        if self.reset_noise:
+            offset = np.empty(ramp.shape[2:])
+            for i in range(ramp.shape[0]):
+                # integrations are told apart by the row that the stream is for
+                first = block.rows.start + (i + 1) * 2**20
+                _core.standard_normals(block.key, first, offset)
+                ramp[i] += np.asarray(self.reset_noise * offset, np.float32)
+        return ramp
+
+
+@dataclasses.dataclass(frozen=True)
+class ReadNoise(Effect):
+    """
+    Gaussian noise of every read, and 1/f noise if asked for.
+
+    Parameters
+    ----------
+    sigma : float, optional
+        Standard deviation of one read in DN; that of the detector's properties if not
+        given.
+    pink : float, optional
+        Standard deviation of the 1/f part in DN, common to the pixels of one row and
+        output (four outputs, to which columns belong in turn).
+    octaves : int, optional
+        Over how many octaves of time, from one row upwards, the 1/f part reaches.
+    """
+
+    sigma: float | None = None
+    pink: float = 0.0
+    octaves: int = 16
+
+    def apply(self, array, block):
+        """Add the noise."""
+        ramp = check_ramp(array, block, self)
+        sigma = block.properties.read_noise if self.sigma is None else self.sigma
+        first = block.rows.start
+        _core.add_noise(ramp, float(sigma), block.key, first)
+        if self.pink:
+            # streams apart from those of the white noise
+            key = block.key[::-1].copy()
+            n_rows = block.exposure.shape[0]
+            _core.add_pink_noise(ramp, float(self.pink), int(self.octaves), 4, key, first, n_rows)
+        return ramp
+
+
+@dataclasses.dataclass(frozen=True)
+class ADConversion(Effect):
+    """Rounding to unsigned 16-bit numbers; out of range flagged AD_FLOOR or SATURATED."""
+
+    def apply(self, array, block):
+        """Turn DN into counts."""
+        ramp = check_ramp(array, block, self)
+        counts = np.empty(ramp.shape, np.uint16)
+        _core.digitize(ramp, counts, block.group_dq, np.uint8(DQ.AD_FLOOR), np.uint8(DQ.SATURATED))
+        return counts

@@ -1,0 +1,44 @@
+"""
+Arrays-only kernels of forced photometry: sampling of templates, normal equations, covariances.
+
+Stamps of all shapes lie one after the other in a flat array; ``start[k]`` is where stamp ``k``
+begins and ``box[k] = (y0, x0, ny, nx)`` where it lies on the target image. Sums run in float64
+in a fixed order, so that answers do not depend on the machine's number of cores.
+"""
+
+from miricigale.photometry._core.noise import autocorrelation
+from miricigale.photometry._core.sampling import (
+    box_response,
+    convolve_batch,
+    sample_stamps,
+    spline_response,
+)
+from miricigale.photometry._core.solve import block_covariance, factorize
+from miricigale.photometry._core.stamps import (
+    add_model,
+    convolve_stamps,
+    find_pairs,
+    pair_products,
+    projections,
+    residual_statistics,
+    scale_stamps,
+    stamp_sums,
+)
+
+__all__ = [
+    "add_model",
+    "autocorrelation",
+    "block_covariance",
+    "box_response",
+    "convolve_batch",
+    "convolve_stamps",
+    "factorize",
+    "find_pairs",
+    "pair_products",
+    "projections",
+    "residual_statistics",
+    "sample_stamps",
+    "scale_stamps",
+    "spline_response",
+    "stamp_sums",
+]

@@ -1,0 +1,56 @@
+"""Statistics of the noise of an image."""
+
+import numpy as np
+import scipy.fft
+
+__all__ = ["autocorrelation"]
+
+
+def autocorrelation(residual, usable, lag):
+    """
+    Mean product of pixel pairs by separation, over usable pixels.
+
+    Parameters
+    ----------
+    residual : `~numpy.ndarray`, shape (ny, nx)
+        Whitened residual (data minus model, over sigma).
+    usable : bool array, shape (ny, nx)
+        Pixels that count.
+    lag : int
+        Largest separation in pixels along each axis.
+
+    Returns
+    -------
+    covariance : float array, shape (2 lag + 1, 2 lag + 1)
+        Mean product, lag (0, 0) in the middle; symmetric through the centre.
+    error : float array of the same shape
+        Its statistical error, from the number of pairs.
+    """
+    good = np.asarray(usable, bool)
+    ny, nx = good.shape
+    size = 1024
+    shape = (
+        scipy.fft.next_fast_len(min(ny, size) + 2 * lag, True),
+        scipy.fft.next_fast_len(nx + lag, True),
+    )
+    sums = np.zeros((2, lag + 1, 2 * lag + 1))
+    for y0 in range(0, ny, size):
+        # products of the rows of a strip with those up to lag below
+        mine = good[y0 : y0 + size]
+        more = good[y0 : y0 + size + lag]
+        z = np.where(more, residual[y0 : y0 + size + lag], 0.0)
+        for k, (a, b) in enumerate(((z[: len(mine)], z), (mine, more))):
+            first = scipy.fft.rfft2(np.asarray(a, float), s=shape)
+            second = scipy.fft.rfft2(np.asarray(b, float), s=shape)
+            product = scipy.fft.irfft2(first.conj() * second, s=shape)
+            sums[k] += product[np.ix_(np.arange(lag + 1), np.arange(-lag, lag + 1))]
+    # the half plane of negative separations is the mirror of the other
+    full = np.concatenate([sums[:, :0:-1, ::-1], sums], axis=1)
+    pairs = np.maximum(np.rint(full[1]), 1.0)
+    covariance = full[0] / pairs
+    covariance = 0.5 * (covariance + covariance[::-1, ::-1])
+    variance = covariance[lag, lag]
+    # sum of squared correlations: what correlated noise does to the error of a lag
+    rho = covariance / variance if variance > 0 else covariance
+    spread = np.sqrt(max(1.0, float(np.sum(np.where(np.abs(rho) > 0.02, rho, 0.0) ** 2))))
+    return covariance, variance * spread / np.sqrt(pairs)

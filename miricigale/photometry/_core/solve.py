@@ -1,0 +1,131 @@
+"""Sparse normal equations: their solution, and elements of their inverse."""
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+from scipy.sparse.linalg import splu
+
+__all__ = ["block_covariance", "factorize"]
+
+
+def factorize(matrix):
+    """
+    Factorise a symmetric positive sparse matrix after scaling it to a unit diagonal.
+
+    Parameters
+    ----------
+    matrix : sparse array, shape (n, n)
+        Normal matrix; every diagonal element must be positive.
+
+    Returns
+    -------
+    solve : callable
+        Solves for a vector or a matrix of right-hand sides.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the matrix is singular.
+    """
+    scale = np.sqrt(matrix.diagonal())
+    if not np.all(scale > 0):
+        msg = "the normal matrix has a diagonal element that is not positive"
+        raise np.linalg.LinAlgError(msg)
+    unit = scipy.sparse.diags_array(1.0 / scale)
+    try:
+        lu = splu(
+            (unit @ matrix @ unit).tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+    except RuntimeError as err:
+        msg = f"the normal equations are singular ({err})"
+        raise np.linalg.LinAlgError(msg) from None
+
+    def solve(rhs):
+        rhs = np.asarray(rhs, float)
+        s = scale if rhs.ndim == 1 else scale[:, None]
+        return lu.solve(rhs / s) / s
+
+    return solve
+
+
+def block_covariance(matrix, y, x, *, core, halo, middle=None, pattern=None, exact=1500):
+    """
+    Elements of the inverse of a normal matrix, by dense inversion of blocks on the sky.
+
+    Parameters
+    ----------
+    matrix : sparse array, shape (n, n)
+        Normal matrix H^-1.
+    y, x : float arrays, shape (n,)
+        Positions in pixels.
+    core, halo : float
+        Size of the blocks and of the margin around each, in pixels. The inverse decays
+        exponentially away from a source, so that a margin of several PSF widths suffices.
+    middle : sparse array, shape (n, n), optional
+        If given, elements of H middle H are returned instead of H.
+    pattern : sparse array, shape (n, n), optional
+        Which elements are wanted (its non-zeros); those of ``matrix`` by default.
+    exact : int, optional
+        Up to this many sources are done in one block, without approximation.
+
+    Returns
+    -------
+    covariance : `~scipy.sparse.csr_array`, shape (n, n)
+        Symmetric, with the elements of ``pattern``.
+    inverse_diagonal : `~numpy.ndarray`, shape (n,)
+        Diagonal of H.
+    """
+    n = matrix.shape[0]
+    scale = 1.0 / np.sqrt(matrix.diagonal())
+    unit = scipy.sparse.diags_array(scale)
+    matrix = (unit @ matrix @ unit).tocsr()
+    if middle is not None:
+        # H M H = D (S^-1 (D M D) S^-1) D with S = D H^-1 D
+        middle = (unit @ middle @ unit).tocsr()
+    pattern = (matrix if pattern is None else pattern).tocsr()
+    rows, columns, values = [], [], []
+    inverse_diagonal = np.empty(n)
+    for near, inner in _blocks(n, y, x, core, halo, exact):
+        inverse = _dense_inverse(matrix[near][:, near].toarray())
+        inverse_diagonal[near[inner]] = np.diag(inverse)[inner]
+        if middle is not None:
+            inverse = inverse @ middle[near][:, near].toarray() @ inverse
+        wanted = pattern[near[inner]][:, near].tocoo()
+        i = np.flatnonzero(inner)[wanted.row]
+        rows.append(near[i])
+        columns.append(near[wanted.col])
+        values.append(inverse[i, wanted.col])
+    rows, columns = np.concatenate(rows), np.concatenate(columns)
+    values = np.concatenate(values) * scale[rows] * scale[columns]
+    found = scipy.sparse.coo_array((values, (rows, columns)), shape=(n, n)).tocsr()
+    return ((found + found.T) * 0.5).tocsr(), inverse_diagonal * scale**2
+
+
+def _blocks(n, y, x, core, halo, exact):
+    """Yield the members of each block with its halo, and which of them are its own."""
+    if n <= exact:
+        yield np.arange(n), np.ones(n, bool)
+        return
+    iy, ix = np.floor(y / core).astype(int), np.floor(x / core).astype(int)
+    order = np.argsort(y, kind="stable")
+    ys = y[order]
+    for row in np.unique(iy):
+        low, high = np.searchsorted(ys, [row * core - halo, (row + 1) * core + halo])
+        strip = order[low:high]
+        for column in np.unique(ix[iy == row]):
+            near = strip[
+                (x[strip] >= column * core - halo) & (x[strip] < (column + 1) * core + halo)
+            ]
+            yield near, (iy[near] == row) & (ix[near] == column)
+
+
+def _dense_inverse(block):
+    factor, info = scipy.linalg.lapack.dpotrf(block, lower=1)
+    if info == 0:
+        inverse, info = scipy.linalg.lapack.dpotri(factor, lower=1)
+        if info == 0:
+            return np.tril(inverse) + np.tril(inverse, -1).T
+    return scipy.linalg.pinvh(block)

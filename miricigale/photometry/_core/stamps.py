@@ -1,0 +1,210 @@
+"""Sums over stamps: overlaps, products, projections, models and what is left of them."""
+
+import numpy as np
+from numba import njit
+
+__all__ = [
+    "add_model",
+    "convolve_stamps",
+    "find_pairs",
+    "pair_products",
+    "projections",
+    "residual_statistics",
+    "scale_stamps",
+    "stamp_sums",
+]
+
+
+@njit(cache=True)
+def _sweep(box, grow, pairs):
+    # boxes sorted by y0: candidates of i end where y0[j] passes i's last row
+    n = box.shape[0]
+    count = 0
+    for i in range(n):
+        y1 = box[i, 0] + box[i, 2] + grow
+        x0 = box[i, 1] - grow
+        x1 = box[i, 1] + box[i, 3] + grow
+        for j in range(i + 1, n):
+            if box[j, 0] >= y1:
+                break
+            if box[j, 1] < x1 and box[j, 1] + box[j, 3] > x0 and box[j, 2] > 0 and box[i, 2] > 0:
+                if pairs.shape[0] > 0:
+                    pairs[count, 0] = i
+                    pairs[count, 1] = j
+                count += 1
+    return count
+
+
+def find_pairs(box, grow=0):
+    """
+    List the pairs i < j whose boxes overlap after one of them is grown.
+
+    Parameters
+    ----------
+    box : int array, shape (n, 4)
+        Boxes (y0, x0, ny, nx) sorted by y0.
+    grow : int, optional
+        Pixels by which a box is grown on each side.
+
+    Returns
+    -------
+    pairs : int array, shape (n_pairs, 2)
+    """
+    n = _sweep(box, grow, np.empty((0, 2), np.int32))
+    pairs = np.empty((n, 2), np.int32)
+    if n:
+        _sweep(box, grow, pairs)
+    return pairs
+
+
+@njit(cache=True)
+def pair_products(a, a_box, a_start, b, b_box, b_start, pairs, out):
+    """
+    Sum products of two sets of stamps over the pixels they share.
+
+    Parameters
+    ----------
+    a, b : `~numpy.ndarray`
+        Flat stamps with their boxes and starts.
+    pairs : int array, shape (n, 2)
+        Rows of ``a`` and ``b``.
+    out : float array, shape (n,)
+        Filled with the sums.
+    """
+    for k in range(pairs.shape[0]):
+        i, j = pairs[k, 0], pairs[k, 1]
+        y0 = max(a_box[i, 0], b_box[j, 0])
+        y1 = min(a_box[i, 0] + a_box[i, 2], b_box[j, 0] + b_box[j, 2])
+        x0 = max(a_box[i, 1], b_box[j, 1])
+        x1 = min(a_box[i, 1] + a_box[i, 3], b_box[j, 1] + b_box[j, 3])
+        total = 0.0
+        for y in range(y0, y1):
+            na = a_start[i] + (y - a_box[i, 0]) * a_box[i, 3] - a_box[i, 1]
+            nb = b_start[j] + (y - b_box[j, 0]) * b_box[j, 3] - b_box[j, 1]
+            part = 0.0
+            for x in range(x0, x1):
+                part += a[na + x] * b[nb + x]
+            total += part
+        out[k] = total
+
+
+@njit(cache=True)
+def projections(values, box, start, image, out):
+    """Sum each stamp times the image below it: ``out[k] = sum(stamp_k * image)``."""
+    for k in range(box.shape[0]):
+        n = start[k]
+        total = 0.0
+        for y in range(box[k, 0], box[k, 0] + box[k, 2]):
+            for x in range(box[k, 1], box[k, 1] + box[k, 3]):
+                total += values[n] * image[y, x]
+                n += 1
+        out[k] = total
+
+
+@njit(cache=True)
+def scale_stamps(values, box, start, image, out):
+    """Multiply each stamp by the image below it into ``out``."""
+    for k in range(box.shape[0]):
+        n = start[k]
+        for y in range(box[k, 0], box[k, 0] + box[k, 2]):
+            for x in range(box[k, 1], box[k, 1] + box[k, 3]):
+                out[n] = values[n] * image[y, x]
+                n += 1
+
+
+@njit(cache=True)
+def add_model(image, values, box, start, flux):
+    """Add stamps times their fluxes to an image, in the order of the stamps."""
+    for k in range(box.shape[0]):
+        f = flux[k]
+        if f == 0.0:
+            continue
+        n = start[k]
+        for y in range(box[k, 0], box[k, 0] + box[k, 2]):
+            for x in range(box[k, 1], box[k, 1] + box[k, 3]):
+                image[y, x] += f * values[n]
+                n += 1
+
+
+@njit(cache=True)
+def stamp_sums(values, box, start, usable, out):
+    """
+    Sum each stamp's light: all of it inside the image, and that on usable pixels.
+
+    ``out`` has the shape (n, 2).
+    """
+    for k in range(box.shape[0]):
+        n = start[k]
+        inside = 0.0
+        good = 0.0
+        for y in range(box[k, 0], box[k, 0] + box[k, 2]):
+            for x in range(box[k, 1], box[k, 1] + box[k, 3]):
+                inside += values[n]
+                if usable[y, x]:
+                    good += values[n]
+                n += 1
+        out[k, 0] = inside
+        out[k, 1] = good
+
+
+@njit(cache=True)
+def residual_statistics(values, box, start, residual, inverse_sigma, out):
+    """
+    Template-weighted mean of (residual / sigma)^2, and the residual below the core.
+
+    ``out`` has the shape (n, 3): mean square, sum of residuals over pixels where the
+    template exceeds a tenth of its peak, and the template's own sum there.
+    """
+    for k in range(box.shape[0]):
+        peak = 0.0
+        for n in range(start[k], start[k + 1]):
+            peak = max(peak, values[n])
+        n = start[k]
+        square = 0.0
+        weight = 0.0
+        left = 0.0
+        core = 0.0
+        for y in range(box[k, 0], box[k, 0] + box[k, 2]):
+            for x in range(box[k, 1], box[k, 1] + box[k, 3]):
+                t = values[n]
+                if t > 0.0 and inverse_sigma[y, x] > 0.0:
+                    r = residual[y, x]
+                    z = r * inverse_sigma[y, x]
+                    square += t * z * z
+                    weight += t
+                    if t > 0.1 * peak:
+                        left += r
+                        core += t
+                n += 1
+        out[k, 0] = square / weight if weight > 0.0 else np.nan
+        out[k, 1] = left
+        out[k, 2] = core
+
+
+@njit(cache=True)
+def convolve_stamps(values, box, start, kernel, out_box, out_start, out):
+    """
+    Convolve stamps with a small symmetric kernel; the results are larger by its half-width.
+
+    Parameters
+    ----------
+    kernel : float array, shape (2 m + 1, 2 m + 1)
+        Symmetric under reflection through its centre.
+    out_box, out_start, out
+        Boxes grown by m on each side, their starts, and the flat result (zeroed here).
+    """
+    size = kernel.shape[0]
+    out[:] = 0.0
+    for k in range(box.shape[0]):
+        ny, nx = box[k, 2], box[k, 3]
+        width = out_box[k, 3]
+        for a in range(size):
+            for b in range(size):
+                c = kernel[a, b]
+                if c == 0.0:
+                    continue
+                for y in range(ny):
+                    n = start[k] + y * nx
+                    m = out_start[k] + (y + a) * width + b
+                    for x in range(nx):
+                        out[m + x] += c * values[n + x]

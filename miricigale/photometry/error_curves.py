@@ -1,0 +1,230 @@
+"""Curves of one band: the error as a function of flux, from bins or from a formula."""
+
+import dataclasses
+import itertools
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+from scipy.ndimage import gaussian_filter
+from scipy.optimize import brentq
+
+from miricigale.instrument import background_level, miri_detector, photmjsr
+from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.tables import error_column, require_columns
+from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, to_array
+
+__all__ = [
+    "STATISTICS",
+    "Analytic",
+    "Binned",
+    "common_bands",
+    "curves_from_table",
+    "curves_to_table",
+    "exposure_curve",
+    "limiting_flux",
+    "measured_curve",
+    "same_rows",
+]
+
+#: What turns the median of absolute values into a standard deviation.
+STATISTICS = {"mad": 1.482602218505602, "median_abs": 1.0}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Binned:
+    """Errors at nodes in flux, joined by straight lines in asinh(flux)."""
+
+    flux: np.ndarray
+    error: np.ndarray
+    low: float
+    high: float
+    kind = "binned"
+
+    def sigma(self, flux):
+        scale = self.error[0] if self.error[0] > 0 else 1.0
+        return np.interp(np.arcsinh(flux / scale), np.arcsinh(self.flux / scale), self.error)
+
+    def outside(self, flux):
+        return (flux < self.low) | (flux > self.high)
+
+    def rows(self):
+        nan = np.full(len(self.flux), np.nan)
+        ends = [np.full(len(self.flux), v) for v in (self.low, self.high)]
+        return [self.flux, self.error, *ends, nan, nan]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Analytic:
+    """sigma^2 = sky^2 + fraction^2 flux^2 + photon max(flux, 0)."""
+
+    sky: float
+    fraction: float = 0.0
+    photon: float = 0.0
+    kind = "analytic"
+    high = np.inf
+
+    def sigma(self, flux):
+        return np.sqrt(
+            self.sky**2 + (self.fraction * flux) ** 2 + self.photon * np.maximum(flux, 0)
+        )
+
+    def outside(self, flux):
+        return np.zeros(np.shape(flux), bool)
+
+    def rows(self):
+        return [
+            np.array([v]) for v in (np.nan, self.sky, np.nan, np.nan, self.fraction, self.photon)
+        ]
+
+
+def exposure_curve(filter, time, *, background, size, psf, n_integrations, frame_time, fractional):
+    """Photon and read noise of an exposure; parameters are those of `ErrorModel.from_exposure`."""
+    seconds = float(to_array(time, u.s, "time"))
+    if not seconds > 0:
+        raise argument_error("time", "positive", time)
+    if int(n_integrations) < 1:
+        raise argument_error("n_integrations", "at least 1", n_integrations)
+    step = float(to_array(frame_time, u.s, "frame_time"))
+    level = background_level(filter) if background is None else background
+    level = float(to_array(level, SURFACE_BRIGHTNESS, "background"))
+    detector = miri_detector()
+    conversion = photmjsr(filter)
+    n_frames = seconds / n_integrations / step
+    if n_frames < 2:
+        raise argument_error("time", f"at least two frames of {step} s in each integration", time)
+    electrons = level / conversion * detector.gain + detector.dark_current
+    variance = electrons / seconds
+    read = detector.read_noise * detector.gain
+    variance += 12 * read**2 / (n_frames * (n_frames**2 - 1) * step**2) / n_integrations
+    pixel_noise = np.sqrt(variance) / detector.gain * conversion
+    pixel = u.Quantity(MIRI_PIXEL_SCALE, ANGLE).value
+    per_pixel = (pixel * u.arcsec).to_value(u.rad) ** 2 * 1e12  # uJy per MJy/sr
+    share = psf_image(miri_psf(filter) if psf is None else psf, pixel_scale=pixel * ANGLE, shape=91)
+    width = float(to_array(size, ANGLE, "size"))
+    if not width >= 0:
+        raise argument_error("size", "at least 0", size)
+    if width > 0:
+        share = gaussian_filter(share, width / np.sqrt(8 * np.log(2)) / pixel)
+    power = np.sum(share**2)
+    sky = pixel_noise * per_pixel / np.sqrt(power)
+    photon = np.sum(share**3) / power**2 * per_pixel * conversion / detector.gain / seconds
+    return Analytic(float(sky), float(fractional), float(photon))
+
+
+def measured_curve(name, true, seen, size, statistic):
+    """Errors of one band in bins of true flux, from arrays in uJy."""
+    if len(true) < 3:
+        raise argument_error(
+            "measured", f"at least three measured sources in {name!r}", f"{len(true)}"
+        )
+    order = np.argsort(-true, kind="stable")
+    edges = np.arange(0, max(len(true) // size, 1) * size + 1, size)
+    edges[-1] = len(true)
+    parts = [order[a:b] for a, b in itertools.pairwise(edges)][::-1]
+    flux, error = np.transpose([_scatter(true[part], seen[part]) for part in parts])
+    return Binned(flux, error * STATISTICS[statistic], float(true.min()), float(true.max()))
+
+
+def _scatter(true, seen):
+    """
+    Median true flux of a bin and median absolute deviation there.
+
+    Bright sources scatter in proportion to their flux (templates, blends), faint ones by the
+    noise of the sky. Where the signal-to-noise is above 5 the deviations are taken relative to
+    each flux, or the brightest of a wide bin would set the error of the faintest.
+    """
+    flux = np.median(true)
+    absolute = np.median(np.abs(seen - true))
+    if flux > 5 * absolute and np.all(true > 0):
+        return flux, flux * np.median(np.abs(seen / true - 1.0))
+    return flux, absolute
+
+
+def limiting_flux(curve, n_sigma):
+    """Flux (uJy) above which the signal-to-noise exceeds ``n_sigma``; NaN if none reaches it."""
+
+    def excess(flux):
+        return flux - n_sigma * float(curve.sigma(flux))
+
+    grid = np.geomspace(1e-9, 1e9, 3601)
+    below = np.flatnonzero(grid < n_sigma * curve.sigma(grid))
+    if len(below) == 0:
+        return grid[0]
+    last = below[-1]
+    if last == len(grid) - 1:
+        return np.nan
+    limit = brentq(excess, grid[last], grid[last + 1], rtol=1e-12)
+    return np.nan if limit > curve.high else limit
+
+
+def common_bands(truth, measured):
+    """Names of the flux columns that two tables both have."""
+    errors = {error_column(name) for name in truth.colnames}
+    return [
+        name
+        for name in truth.colnames
+        if name in measured.colnames
+        and name not in errors
+        and getattr(truth[name], "unit", None) is not None
+        and u.Unit(truth[name].unit).is_equivalent(FNU)
+    ]
+
+
+def same_rows(truth, measured):
+    """Rows of two tables that belong to the same source, by ``id`` or by place."""
+    if "id" in truth.colnames and "id" in measured.colnames:
+        _, rows, others = np.intersect1d(
+            np.asarray(truth["id"]), np.asarray(measured["id"]), return_indices=True
+        )
+        return rows, others
+    if len(truth) != len(measured):
+        raise argument_error(
+            "measured", f"a table of {len(truth)} rows as 'truth', or ids in both", len(measured)
+        )
+    rows = np.arange(len(truth))
+    return rows, rows
+
+
+def curves_to_table(curves, meta):
+    """Make the table of curves by filter name."""
+    names, kinds, rows = [], [], []
+    for name, curve in curves.items():
+        values = np.stack(curve.rows())
+        rows.append(values)
+        names += [name] * values.shape[1]
+        kinds += [curve.kind] * values.shape[1]
+    values = np.concatenate(rows, axis=1) if rows else np.empty((6, 0))
+    table = QTable({"filter": names, "kind": kinds}, meta=dict(meta))
+    columns = (
+        ("flux", FNU, "Median true flux of the bin"),
+        ("sigma", FNU, "1-sigma error there, or that of the sky"),
+        ("low", FNU, "Least true flux of all bins"),
+        ("high", FNU, "Greatest true flux of all bins"),
+        ("fraction", u.dimensionless_unscaled, "Part of the flux added in quadrature"),
+        ("photon", FNU, "Variance per flux of the source's own photons"),
+    )
+    for (name, unit, text), value in zip(columns, values, strict=True):
+        table[name] = value * unit
+        table[name].info.description = text
+    return table
+
+
+def curves_from_table(table):
+    """Make the curves by filter name of what `curves_to_table` made."""
+    wanted = ["filter", "kind", "flux", "sigma", "low", "high", "fraction", "photon"]
+    require_columns(table, wanted, "table")
+    curves = {}
+    filters = np.asarray(table["filter"]).astype(str)
+    for name in dict.fromkeys(filters):
+        part = table[filters == name]
+        flux, sigma, low, high, photon = (
+            u.Quantity(part[c]).to_value(FNU) for c in ("flux", "sigma", "low", "high", "photon")
+        )
+        if part["kind"][0] == "binned":
+            curves[name] = Binned(flux, sigma, float(low[0]), float(high[0]))
+        else:
+            fraction = float(u.Quantity(part["fraction"][0]).value)
+            curves[name] = Analytic(float(sigma[0]), fraction, float(photon[0]))
+    return curves

@@ -1,0 +1,236 @@
+"""Whole rows of pixels without saturation or jumps, many at once; the others one by one."""
+
+import numpy as np
+from numba import njit
+
+from miricigale.reduction._core.pixel import X_MIN, fit_pixel, gather, linear, store
+
+__all__ = ["BLOCK", "fit_rows"]
+
+#: Pixels that are worked on together (inner, vectorised loop).
+BLOCK = 64
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def fit_rows(
+    data,
+    offset,
+    coef,
+    saturation,
+    usable,
+    y0,
+    y1,
+    g0,
+    g1,
+    s,
+    inv_gain,
+    scale,
+    threshold,
+    rate,
+    var_poisson,
+    var_read,
+    n_used,
+    n_jump,
+    dq,
+):
+    """
+    Fit the ramps of rows ``y0`` to ``y1`` and find their jumps.
+
+    Parameters
+    ----------
+    data : `~numpy.ndarray`, shape (n_int, n_group, ny, nx)
+        Groups in DN, as read.
+    offset : `~numpy.ndarray` of float64, shape (n_int, n_group)
+        Subtracted before linearisation (bias and common drift).
+    coef : `~numpy.ndarray` of float64
+        Linearity polynomial, ascending.
+    saturation : float
+        Raw DN from which a group, and all after it, is dropped.
+    usable : `~numpy.ndarray` of bool, shape (ny, nx)
+        Pixels to fit; the others get NaN.
+    y0, y1, g0, g1 : int
+        Range of rows, and of groups that take part.
+    s : float
+        Variance of one read in DN^2.
+    inv_gain : float
+        DN per electron: Poisson variance of a difference is slope times this.
+    scale : float
+        Inverse group time: DN per group to DN/s.
+    threshold : float
+        Jumps are cut above this many sigma; infinity for none.
+    rate, var_poisson, var_read, n_used, n_jump, dq : `~numpy.ndarray`, shape (ny, nx)
+        Filled in place.
+
+    Returns
+    -------
+    events : `~numpy.ndarray` of float64, shape (n_event, 5)
+        y, x, integration, difference (counted from ``g0``) and signed significance.
+    """
+    n_int, _, _, nx = data.shape
+    n_diff = g1 - g0 - 1
+    n_all = n_int * n_diff
+    thr2 = threshold * threshold
+
+    d = np.empty((n_all, BLOCK))
+    mean = np.empty((n_diff, BLOCK))
+    f = np.empty((n_diff + 2, BLOCK))
+    h = np.empty((n_diff + 2, BLOCK))
+    tmp = np.empty((n_diff + 1, BLOCK))
+    before = np.empty(BLOCK)
+    top = np.empty(BLOCK)
+    slope = np.empty(BLOCK)
+    v = np.empty(BLOCK)
+    lam = np.empty(BLOCK)
+    eps = np.empty(BLOCK)
+    sw = np.empty(BLOCK)
+    sw2 = np.empty(BLOCK)
+    swd = np.empty(BLOCK)
+    norm = np.empty(BLOCK)
+    inv_d = np.empty(BLOCK)
+    wf = np.empty(BLOCK)
+    acc = np.empty(BLOCK)
+    crit = np.empty(BLOCK)
+    # scratch of the general path
+    d1 = np.empty(n_all)
+    cut = np.empty(n_all, np.bool_)
+    found = np.empty(n_all)
+    valid = np.empty(n_int, np.int64)
+    f1 = np.empty(n_diff + 2)
+    tmp1 = np.empty(n_diff + 1)
+    first = np.empty(n_all + 1, np.int64)
+    last = np.empty(n_all + 1, np.int64)
+    events = np.empty((256, 5))
+    n_event = 0
+
+    for y in range(y0, y1):
+        for x0 in range(0, nx, BLOCK):
+            nb = min(BLOCK, nx - x0)
+            top[:] = 0.0
+            mean[:, :] = 0.0
+            for k in range(n_int):
+                for g in range(g0, g1):
+                    off = offset[k, g]
+                    row = data[k, g, y]
+                    if g == g0:
+                        for b in range(nb):
+                            raw = float(row[x0 + b])
+                            top[b] = raw if raw > top[b] else top[b]
+                            before[b] = linear(raw - off, coef)
+                    else:
+                        i = k * n_diff + g - g0 - 1
+                        for b in range(nb):
+                            raw = float(row[x0 + b])
+                            top[b] = raw if raw > top[b] else top[b]
+                            value = linear(raw - off, coef)
+                            d[i, b] = value - before[b]
+                            mean[i - k * n_diff, b] += value - before[b]
+                            before[b] = value
+            for b in range(nb, BLOCK):
+                d[:, b] = 0.0
+            # start with the plain mean, then twice the weights of the last slope
+            sw[:] = 0.0
+            for i in range(n_diff):
+                for b in range(BLOCK):
+                    sw[b] += mean[i, b]
+            for b in range(BLOCK):
+                slope[b] = sw[b] / n_all
+            for _ in range(2):
+                for b in range(BLOCK):
+                    vv = slope[b] * inv_gain
+                    low = X_MIN * s
+                    vv = vv if vv > low else low
+                    v[b] = vv
+                    xx = vv / s
+                    q = 0.5 * xx + np.sqrt(xx + 0.25 * xx * xx)
+                    lam[b] = 1.0 / (1.0 + q)
+                    eps[b] = q / (1.0 + q)
+                    inv_d[b] = (1.0 + q) / (s * q * (2.0 + q))
+                    f[0, b] = 0.0
+                    sw[b] = 0.0
+                    sw2[b] = 0.0
+                    swd[b] = 0.0
+                for i in range(n_diff + 1):
+                    for b in range(BLOCK):
+                        f[i + 1, b] = f[i, b] + (1.0 - f[i, b]) * eps[b]
+                for i in range(1, n_diff + 1):
+                    for b in range(BLOCK):
+                        w = f[i, b] * f[n_diff + 1 - i, b]
+                        sw[b] += w
+                        sw2[b] += w * w
+                        swd[b] += w * mean[i - 1, b]
+                for b in range(BLOCK):
+                    slope[b] = swd[b] / (sw[b] * n_int)
+                    norm[b] = 1.0 / (v[b] * (2.0 - f[n_diff + 1, b]))
+            # jump statistic of every difference
+            crit[:] = -1.0
+            if n_all > 1 and np.isfinite(threshold):
+                for i in range(n_diff + 2):
+                    for b in range(BLOCK):
+                        h[i, b] = f[i, b] * (2.0 - f[i, b])
+                for b in range(BLOCK):
+                    inv_d[b] = inv_d[b] / h[n_diff + 1, b]
+                    # w_j^2 / W with w_j = f f norm and W = n_int sw norm
+                    wf[b] = norm[b] / (sw[b] * n_int)
+                for k in range(n_int):
+                    base = k * n_diff - 1
+                    acc[:] = 0.0
+                    for j in range(1, n_diff + 1):
+                        for b in range(BLOCK):
+                            acc[b] = lam[b] * acc[b] + h[j, b] * (d[base + j, b] - slope[b])
+                            tmp[j, b] = acc[b]
+                    acc[:] = 0.0
+                    for j in range(n_diff, 0, -1):
+                        m = n_diff + 1 - j
+                        for b in range(BLOCK):
+                            z = (h[m, b] * tmp[j, b] + h[j, b] * acc[b]) * inv_d[b]
+                            c = h[j, b] * h[m, b] * inv_d[b]
+                            w = f[j, b] * f[m, b]
+                            p = c - w * w * wf[b]
+                            p = p if p > 1e-9 * c else 1e-9 * c
+                            q = z * z - thr2 * p
+                            crit[b] = q if q > crit[b] else crit[b]
+                            acc[b] = lam[b] * (acc[b] + h[m, b] * (d[base + j, b] - slope[b]))
+            for b in range(nb):
+                x = x0 + b
+                if not usable[y, x]:
+                    rate[y, x] = np.nan
+                    var_poisson[y, x] = np.nan
+                    var_read[y, x] = np.nan
+                    continue
+                if top[b] < saturation and crit[b] <= 0.0:
+                    var = 1.0 / (sw[b] * norm[b] * n_int)
+                    vp = v[b] * sw2[b] * norm[b] * norm[b] * n_int * var * var
+                    rate[y, x] = slope[b] * scale
+                    var_poisson[y, x] = vp * scale * scale
+                    var_read[y, x] = max(var - vp, 0.0) * scale * scale
+                    n_used[y, x] = n_all
+                    continue
+                if top[b] < saturation:
+                    saturated = False
+                    valid[:] = n_diff
+                    for i in range(n_all):
+                        d1[i] = d[i, b]
+                else:
+                    saturated = gather(data, offset, coef, saturation, y, x, g0, g1, d1, valid)
+                cut[:] = False
+                result = fit_pixel(
+                    d1, cut, valid, n_diff, s, inv_gain, threshold, f1, tmp1, first, last, found
+                )
+                store(
+                    y, x, scale, result, saturated, False,
+                    rate, var_poisson, var_read, n_used, n_jump, dq,
+                )  # fmt: skip
+                if result[4] > 0:
+                    for i in range(n_all):
+                        if cut[i]:
+                            if n_event == events.shape[0]:
+                                grown = np.empty((2 * n_event, 5))
+                                grown[:n_event] = events
+                                events = grown
+                            events[n_event, 0] = y
+                            events[n_event, 1] = x
+                            events[n_event, 2] = i // n_diff
+                            events[n_event, 3] = i % n_diff
+                            events[n_event, 4] = found[i]
+                            n_event += 1
+    return events[:n_event].copy()
