@@ -1,7 +1,10 @@
 """Sphinx configuration."""
 
+import doctest
 import importlib.metadata
 import os
+import re
+from pathlib import Path
 
 from sphinx_astropy.conf.v2 import *  # noqa: F403
 from sphinx_astropy.conf.v2 import exclude_patterns, extensions
@@ -58,8 +61,38 @@ html_sidebars = {
 html_theme_options = {
     "header_links_before_dropdown": 8,
     "icon_links": [],
+    "navbar_persistent": ["search-button"],
     "navigation_with_keys": False,
     "navigation_depth": 3,
     "show_nav_level": 1,
     "show_toc_level": 2,
 }
+
+
+def draw_figures(app):
+    """Run the tutorial, saving the current figure wherever the page has an image of it."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    import matplotlib.pyplot as plt
+
+    page = Path(app.srcdir) / "tutorials" / "by_hand.rst"
+    folder = Path(app.srcdir) / "_build" / "figures"
+    folder.mkdir(parents=True, exist_ok=True)
+    image = r"^\.\. image:: /_build/figures/(\S+)$"
+    pieces = re.split(image, page.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    codes, names = pieces[0::2], pieces[1::2]
+    paths = [folder / name for name in names]
+    if all(path.exists() and path.stat().st_mtime > page.stat().st_mtime for path in paths):
+        return
+    namespace = {}
+    for code, path in zip(codes, paths, strict=False):
+        for example in doctest.DocTestParser().get_examples(code):
+            exec(compile(example.source, page.name, "exec"), namespace)
+        plt.gcf().savefig(path, dpi=110, bbox_inches="tight")
+        plt.close("all")
+
+
+def setup(app):
+    """Add what these pages need to Sphinx."""
+    app.connect("builder-inited", draw_figures)
