@@ -63,7 +63,7 @@ def _parser():
 
 
 def _run(args):
-    from miricigale.workflow import disk_use, load_config, run_study
+    from miricigale.workflow import check_study, disk_use, load_config, run_study
 
     overrides = {"run": {}}
     if args.keep_level1b:
@@ -76,6 +76,7 @@ def _run(args):
     if args.print_config:
         print(config.to_toml(), end="")
         return 0
+    check_study(config)
     folder = args.output or Path(config.run.name)
     print(
         f"{config.run.name}: needs about {disk_use(config) / 1e9:.2f} GB in {folder}/", flush=True
@@ -197,5 +198,12 @@ def main(argv=None):
         if args.verbose:
             raise
         message = err.args[0] if isinstance(err, KeyError) and err.args else err
-        print(f"miricigale: {message}", file=sys.stderr)
+        # a bare key says nothing to a reader
+        kind = (
+            f"{type(err).__name__} "
+            if isinstance(err, KeyError) and " " not in str(message)
+            else ""
+        )
+        where = "".join(f" ({note})" for note in getattr(err, "__notes__", ()))
+        print(f"miricigale: {kind}{' '.join(str(message).split())}{where}", file=sys.stderr)
         return 2

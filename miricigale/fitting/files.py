@@ -10,6 +10,7 @@ from astropy.io import fits
 
 from miricigale.fitting.priors import GridAxis
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import open_fits
 
 __all__ = ["read_results", "write_results"]
 
@@ -79,12 +80,12 @@ def read_results(cls, path):
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
-        If the file is something else or incomplete.
+        If the file is missing, something else or incomplete.
     """
     from astropy.table import Table
 
     try:
-        with fits.open(Path(path), memmap=False) as hdus:
+        with open_fits(path, wanted="fit results", memmap=False) as hdus:
             if hdus[0].header.get("FORMAT") != _FORMAT:
                 msg = f"{path} holds no fit results (no FORMAT = {_FORMAT!r} in its header)"
                 raise DataError(msg)

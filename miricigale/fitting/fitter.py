@@ -16,6 +16,8 @@ from miricigale.fitting.results import FitResults
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import chunks, parallel_map
+from miricigale.utils.tables import require_columns
+from miricigale.utils.units import to_array
 
 __all__ = ["BayesFitter"]
 
@@ -59,7 +61,7 @@ class BayesFitter:
     n_bands_min : int, optional
         Objects with fewer usable bands are flagged and not fitted.
     redshift_tolerance : float, optional
-        How far, in |dz| / (1 + z), a fixed redshift may lie from its node of the grid; half the
+        How far, in abs(dz) / (1 + z), a fixed redshift may lie from its node of the grid; half the
         distance of the nodes by default.
     max_reduced_chi2 : float, optional
         Above this reduced chi2 of the best model an object is flagged.
@@ -207,6 +209,7 @@ class BayesFitter:
             If a flux column has no unit of flux density.
         """
         del seed
+        require_columns(photometry, [], "photometry")
         grid = self.grid
         filters = self._bands(photometry)
         columns = [grid.filters.index(name) for name in filters]
@@ -263,7 +266,7 @@ class BayesFitter:
             redshift = photometry[redshift]
         mask = getattr(redshift, "mask", None)
         values = getattr(redshift, "unmasked", redshift)
-        values = u.Quantity(values).to_value(u.dimensionless_unscaled)
+        values = to_array(values, u.dimensionless_unscaled, "redshift")
         values = (
             np.array(np.broadcast_to(values, (n,)), dtype=float) if values.ndim == 0 else values
         )

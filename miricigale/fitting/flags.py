@@ -29,6 +29,9 @@ class FitFlags(Flags):
     NO_MODEL = 512
     """No model is left by the age of the universe and the priors."""
 
+    BAD_FLUX = 1024
+    """A flux that is infinite; the band is left out."""
+
     UNFITTED = 1 | 2 | 8 | 16 | 32 | 512
     """Bits with which a row has no result."""
 

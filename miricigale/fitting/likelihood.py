@@ -83,8 +83,9 @@ def read_photometry(table, filters, *, model_error, error_floor, n_bands_min, gr
         i = grid_filters.index(name)
         f = _column(table, name)
         e = _column(table, error_column(name))
-        bad = np.isfinite(f) & ~(e > 0)
-        # a flux without error is a missing band; zero or negative errors are worth a word
+        flags[np.isinf(f)] |= int(FitFlags.BAD_FLUX)
+        bad = np.isfinite(f) & ~((e > 0) & np.isfinite(e))
+        # a flux without error is a missing band; errors of no use are worth a word
         flags[bad & ~np.isnan(e)] |= int(FitFlags.BAD_ERROR)
         good = np.isfinite(f) & np.isfinite(e) & (e > 0)
         flux[:, i], err[:, i] = f, e

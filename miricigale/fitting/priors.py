@@ -118,7 +118,12 @@ def _add_axis(axes, name, column, kind, priors, rows=None, nodes=None):
     """Add the axis of a table's column; return the prior factor of each model."""
     unit = getattr(column, "unit", None) or 1
     column = np.asarray(getattr(column, "value", column), dtype=float)
-    values = np.unique(column if nodes is None else np.concatenate([nodes]))
+    if nodes is None:
+        # means of equal values may differ in the last digit
+        values, rows_of = np.unique(np.float64(np.char.mod("%.12g", column)), return_inverse=True)
+        column = values[rows_of]
+    else:
+        values = np.unique(nodes)
     if values.size == 1 and name not in priors:
         return np.ones(column.size)
     axis = _axis(name, values, unit, kind, priors)

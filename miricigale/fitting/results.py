@@ -248,9 +248,9 @@ class FitResults:
             if name in self.quantities:
                 column = f"{name}_logmean"
                 out[column] = self.moments[:, self._quantity(name), 2] * u.dex
-                out[column].info.description = (
-                    f"posterior mean of log10 of {meaning}, in {unit.to_string()}"
-                )
+                out[
+                    column
+                ].info.description = f"posterior mean of log10 of {meaning}, in {unit.to_string()}"
         return out
 
     def _meaning(self, name):

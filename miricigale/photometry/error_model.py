@@ -18,7 +18,8 @@ from miricigale.photometry.error_curves import (
     measured_curve,
     same_rows,
 )
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import DataError, argument_error, unknown_name
+from miricigale.utils.files import read_ecsv
 from miricigale.utils.meta import provenance
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import error_column, require_columns
@@ -122,7 +123,8 @@ class ErrorModel:
         -------
         model : `ErrorModel`
             Errors at the median true flux of each bin, joined in asinh(flux), constant
-            beyond the first and last.
+            beyond the first and last. Bins are pooled until both the error and the
+            signal-to-noise rise with flux (isotonic regression).
 
         Raises
         ------
@@ -345,6 +347,11 @@ class ErrorModel:
         -------
         table : `~astropy.table.QTable`
             A copy with error columns.
+
+        Raises
+        ------
+        ValueError
+            If the table has no band that the model knows, or lacks one of ``filters``.
         """
         table, filters = self._prepare(photometry, filters)
         for name in filters:
@@ -370,6 +377,11 @@ class ErrorModel:
         table : `~astropy.table.QTable`
             A copy with Gaussian noise of the error at the true flux added to the fluxes, and
             that error in the error columns.
+
+        Raises
+        ------
+        ValueError
+            As `assign`.
         """
         table, filters = self._prepare(photometry, filters)
         seed = check_seed(seed)
@@ -382,9 +394,13 @@ class ErrorModel:
         return table
 
     def _prepare(self, photometry, filters):
+        require_columns(photometry, [], "photometry")
         if filters is None:
             filters = [name for name in self.filters if name in photometry.colnames]
         filters = list(filters)
+        if not filters:
+            wanted = f"a table with at least one of the columns {list(self.filters)}"
+            raise argument_error("photometry", wanted, f"columns {photometry.colnames}")
         require_columns(photometry, filters, "photometry", units=dict.fromkeys(filters, FNU))
         for name in filters:
             self._curve(name)
@@ -415,8 +431,20 @@ class ErrorModel:
 
     @classmethod
     def read(cls, path):
-        """Read what `write` wrote."""
-        return cls.from_table(QTable.read(path, format="ascii.ecsv"))
+        """
+        Read what `write` wrote.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If the file is missing or something else.
+        """
+        table = read_ecsv(path, wanted="an error model")
+        try:
+            return cls.from_table(table)
+        except (TypeError, ValueError) as err:
+            msg = f"{path} is no error model: {err}"
+            raise DataError(msg) from err
 
     def plot(self, ax=None, *, filters=None):
         """

@@ -1,8 +1,11 @@
 """Finding reference data: environment, the user's folder, bundled files."""
 
+import functools
 import hashlib
+import importlib.metadata
 import os
 import shutil
+import warnings
 from importlib import resources as importlib_resources
 from pathlib import Path
 
@@ -10,9 +13,17 @@ from astropy import config as _config
 from astropy.config import ConfigItem, ConfigNamespace
 
 from miricigale.refdata.registry import resource, resources
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
 
-__all__ = ["add_resource", "check_resources", "conf", "data_folder", "file_sha256", "locate"]
+__all__ = [
+    "add_resource",
+    "check_resources",
+    "conf",
+    "data_folder",
+    "file_sha256",
+    "fingerprint",
+    "locate",
+]
 
 
 class Conf(ConfigNamespace):
@@ -55,6 +66,15 @@ def _places(record):
         yield "the package", Path(str(importlib_resources.files("miricigale.refdata"))) / "files"
 
 
+def _warn_of_override(record, label, path):
+    """Say so if a bundled file gives way to another one of different content."""
+    if label == "the package" or record.kind != "bundled" or not path.is_file():
+        return
+    if _sha256_of(path, path.stat().st_mtime_ns) != record.sha256:
+        msg = f"resource {record.name!r} is taken from {path}, which differs from the bundled file"
+        warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+
+
 def locate(name, *, check=False):
     """
     Find the file or folder of a resource.
@@ -92,6 +112,7 @@ def locate(name, *, check=False):
                     f"{path} is not the file that the record of {name!r} describes (sha256 differs)"
                 )
                 raise DataError(msg)
+            _warn_of_override(record, label, path)
             return path
         tried.append(f"{label} ({folder})")
     msg = (
@@ -99,6 +120,41 @@ def locate(name, *, check=False):
         f"get it from {record.source} and run 'miricigale data add {name} PATH'"
     )
     raise DataError(msg)
+
+
+def fingerprint(name):
+    """
+    What identifies the data that a resource stands for now.
+
+    Parameters
+    ----------
+    name : str
+        The resource.
+
+    Returns
+    -------
+    text : str
+        sha256 of the file that `locate` finds (over names and contents for a folder), or the
+        version of the package that it comes from.
+    """
+    record = resource(name)
+    if not record.file:
+        package = record.source.split(",")[0]
+        return f"{package} {importlib.metadata.version(package)}"
+    path = locate(name)
+    if path.is_file():
+        return _sha256_of(path, path.stat().st_mtime_ns)
+    parts = [
+        f"{p.relative_to(path)} {file_sha256(p)}" for p in sorted(path.rglob("*")) if p.is_file()
+    ]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+@functools.lru_cache(maxsize=256)
+def _sha256_of(path, modified):
+    """Checksum of a file, kept as long as it does not change."""
+    del modified
+    return file_sha256(path)
 
 
 def add_resource(name, path):

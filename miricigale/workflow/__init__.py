@@ -4,7 +4,7 @@ from miricigale.workflow.config import StudyConfig, load_config, preset_names
 from miricigale.workflow.products import ProductStore, read_image, write_image
 from miricigale.workflow.runner import Context, Stage, StudyRunner
 from miricigale.workflow.stages import study_stages
-from miricigale.workflow.study import disk_use, run_study
+from miricigale.workflow.study import check_study, disk_use, run_study
 
 __all__ = [
     "Context",
@@ -12,6 +12,7 @@ __all__ = [
     "Stage",
     "StudyConfig",
     "StudyRunner",
+    "check_study",
     "disk_use",
     "load_config",
     "preset_names",

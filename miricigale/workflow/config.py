@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import tomllib
 import typing
 from importlib import resources
@@ -79,6 +80,15 @@ class SedSection:
     catalog_error: float = _option(
         0.05, "Relative error given to the catalogue's fluxes.", low=1e-4, high=1.0
     )
+    max_wavelength: float = _option(
+        3.0,
+        "Longest pivot wavelength (um) of the catalogue's bands that are fitted.",
+        low=0.3,
+        high=30.0,
+    )
+    alpha: tuple[float, ...] = _option(
+        (1.5, 2.5), "Range from which the dust's alpha is drawn, since these bands do not show it."
+    )
     frac_agn: float = _option(0.0, "fracAGN of the injected sources.", low=0.0, high=0.99)
 
 
@@ -118,6 +128,9 @@ class DetectorSection:
     """What the detector does to the light."""
 
     cosmic_rays: bool = _option(True, "Whether cosmic rays hit.")
+    residual: float = _option(
+        0.0, "Fraction of the light that stays as a fixed pattern (flat, sky).", low=0.0, high=0.1
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -229,6 +242,9 @@ class StudyConfig:
         if len(set(self.exposures.filters)) != len(self.exposures.filters):
             msg = f"[exposures] filters must not repeat, got {list(self.exposures.filters)}"
             raise ConfigError(msg)
+        if len(self.sed.alpha) != 2 or not 0 < self.sed.alpha[0] <= self.sed.alpha[1] <= 4:
+            msg = f"[sed] alpha must be two numbers in order, above 0 to 4, got {list(self.sed.alpha)}"
+            raise ConfigError(msg)
         if self.fit.min_detected > len(self.exposures.filters):
             msg = (
                 f"[fit] min_detected must be at most the number of MIRI filters "
@@ -284,9 +300,14 @@ class StudyConfig:
             sections[name] = _replace_section(name, sections[name], entries)
         return cls(**sections)
 
-    def section_dict(self, *names):
-        """Plain values of the named sections, for hashing."""
-        return {name: dataclasses.asdict(getattr(self, name)) for name in names}
+    def values(self, *names):
+        """Plain values of sections (``"scene"``) and keys (``"run.name"``), for hashing."""
+        found = {}
+        for name in names:
+            section, _, key = name.partition(".")
+            values = getattr(self, section)
+            found[name] = getattr(values, key) if key else dataclasses.asdict(values)
+        return found
 
     def to_toml(self):
         """
@@ -350,6 +371,9 @@ def _checked(label, value, hint, limits):
     if type(value) is not hint:
         msg = f"{label} must be of type {hint.__name__}, got {value!r}"
         raise ConfigError(msg)
+    if hint is float and not math.isfinite(value):
+        msg = f"{label} must be a finite number, got {value!r}"
+        raise ConfigError(msg)
     low, high, choices = limits["low"], limits["high"], limits["choices"]
     if choices and value not in choices:
         msg = f"{label} must be one of {list(choices)}, got {value!r}"
@@ -404,7 +428,11 @@ def load_config(source, *, quick=False, overrides=None):
         if not path.is_file():
             msg = f"no configuration file {path}"
             raise ConfigError(msg)
-        texts = [(str(path), path.read_text(encoding="utf-8"))]
+        try:
+            texts = [(str(path), path.read_text(encoding="utf-8"))]
+        except UnicodeDecodeError as err:
+            msg = f"{path} is not a text file in UTF-8: {err.reason} at byte {err.start}"
+            raise ConfigError(msg) from None
     else:
         if source not in preset_names():
             raise unknown_name("preset", source, preset_names())

@@ -45,7 +45,8 @@ def write_image(image, path, *, planes=None):
     """
     header = image.wcs.to_header(relax=True) if image.wcs is not None else fits.Header()
     header["BUNIT"] = image.unit.to_string("fits")
-    header["META"] = json.dumps(dict(image.meta), default=_plain, allow_nan=True)
+    meta = {key: value for key, value in image.meta.items() if key != "created"}
+    header["META"] = json.dumps(meta, default=_plain, allow_nan=True)
     hdus = [
         fits.PrimaryHDU(),
         fits.ImageHDU(np.asarray(image.data, np.float32), header, name="SCI"),
@@ -83,7 +84,12 @@ def read_image(path, *, planes=()):
     if not Path(path).is_file():
         msg = f"no image file {path}"
         raise DataError(msg)
-    with fits.open(path) as hdus:
+    try:
+        hdus = fits.open(path)
+    except OSError as err:
+        msg = f"{path} is not a FITS image: {err}"
+        raise DataError(msg) from None
+    with hdus:
         if "SCI" not in hdus:
             msg = f"{path} has no SCI extension, only {[hdu.name for hdu in hdus]}"
             raise DataError(msg)
@@ -122,17 +128,20 @@ class ProductStore:
     def __init__(self, folder):
         self.folder = Path(folder)
         path = self.folder / MANIFEST
+        self.records = {}
         if path.is_file():
-            try:
-                self.records = json.loads(path.read_text(encoding="utf-8"))["stages"]
-            except (json.JSONDecodeError, KeyError) as err:
-                msg = f"{path} is not a manifest of a run: {err}"
-                raise DataError(msg) from None
-        else:
-            if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
-                msg = f"{self.folder} exists, is not empty and is no run's folder; choose another with --output"
+            self.records = _read_manifest(path)
+        elif self.folder.exists():
+            # a run that was killed at its first moment leaves these
+            known = ("run.lock", ".partial-")
+            if not self.folder.is_dir() or any(
+                not entry.name.startswith(known) for entry in self.folder.iterdir()
+            ):
+                msg = (
+                    f"{self.folder} exists, is not empty and is no run's folder; choose another "
+                    "with --output"
+                )
                 raise DataError(msg)
-            self.records = {}
         self.folder.mkdir(parents=True, exist_ok=True)
         self._lock = self.folder / "run.lock"
 
@@ -210,6 +219,11 @@ class ProductStore:
         self.records[key] = {"hash": digest, "seconds": round(seconds, 2), "products": products}
         self._write_manifest()
 
+    def drop(self, key):
+        """Forget a stage's record and remove the products that it names."""
+        for name in self.records.pop(key, {}).get("products", {}):
+            self.path(name).unlink(missing_ok=True)
+
     def checksums(self, stage):
         """Checksums of all products of a stage, over its units."""
         return {
@@ -226,6 +240,20 @@ class ProductStore:
                 json.dumps({"stages": self.records}, indent=1), encoding="utf-8"
             ),
         )
+
+
+def _read_manifest(path):
+    """The records of a manifest, checked."""
+    try:
+        records = json.loads(path.read_text(encoding="utf-8"))["stages"]
+        for record in records.values():
+            record["hash"], record["seconds"]
+            for product in record["products"].values():
+                product["sha256"], product["bytes"]
+    except (ValueError, KeyError, TypeError, AttributeError) as err:
+        msg = f"{path} is not the manifest of a run ({type(err).__name__}: {err})"
+        raise DataError(msg) from None
+    return records
 
 
 def _alive(pid):

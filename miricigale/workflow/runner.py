@@ -6,12 +6,13 @@ import json
 import logging
 import shutil
 import time
+import types
 from collections.abc import Callable
 from pathlib import Path
 
 import numba
 
-from miricigale.refdata import resource
+from miricigale.refdata.locate import file_sha256, fingerprint
 from miricigale.utils.exceptions import ConfigError, DataError
 from miricigale.utils.progress import progress
 from miricigale.workflow.products import ProductStore, read_image, write_image
@@ -37,7 +38,8 @@ class Stage:
     needs : tuple of str
         Stages whose products it reads.
     sections : tuple of str
-        Sections of the configuration that it depends on.
+        Sections (``"scene"``) or keys (``"run.keep_level1b"``) of the configuration that it
+        reads; reading another one is an error.
     resources : tuple of str
         Reference data that it depends on.
     version : int
@@ -66,6 +68,34 @@ class Stage:
         return tuple(self.units(config)) if self.units else ("",)
 
 
+class ConfigView:
+    """
+    What a stage has declared of a configuration; reading anything else is an error.
+
+    A stage that reads what is not in its hash would be taken for current when it is not.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.config.StudyConfig`
+        The configuration.
+    stage : `Stage`
+        Whose declaration counts.
+    """
+
+    def __init__(self, config, stage):
+        self._config, self._stage = config, stage
+
+    def __getattr__(self, section):
+        if section in self._stage.sections:
+            return getattr(self._config, section)
+        keys = [k.split(".")[1] for k in self._stage.sections if k.startswith(f"{section}.")]
+        if not keys:
+            msg = f"stage {self._stage.name!r} reads [{section}] without declaring it"
+            raise RuntimeError(msg)
+        values = getattr(self._config, section)
+        return types.SimpleNamespace(**{key: getattr(values, key) for key in keys})
+
+
 class Context:
     """
     What a stage sees of the run.
@@ -80,21 +110,14 @@ class Context:
         Whether progress bars are shown.
     """
 
-    def __init__(self, config, store, *, progress_bar=False):
-        self.config = config
+    def __init__(self, config, store, *, stage=None, progress_bar=False):
+        self.config = config if stage is None else ConfigView(config, stage)
         self.store = store
         self.progress_bar = progress_bar
         self.saved = []
-
-    @property
-    def seed(self):
-        """Seed of the run."""
-        return self.config.run.seed
-
-    @property
-    def n_threads(self):
-        """Threads to use."""
-        return self.config.run.threads or numba.config.NUMBA_NUM_THREADS
+        # neither changes a product by itself: the seed is in every hash, threads in none
+        self.seed = config.run.seed
+        self.n_threads = config.run.threads or numba.config.NUMBA_NUM_THREADS
 
     def path(self, name):
         """Path of a product."""
@@ -108,6 +131,9 @@ class Context:
 
     def save_table(self, name, table):
         """Write a table as ECSV or FITS by the suffix of ``name``."""
+        table = table.copy(copy_data=False)
+        # the manifest says when; the same run gives the same bytes
+        table.meta.pop("created", None)
         return self.save(name, lambda path: table.write(path, overwrite=True))
 
     def save_image(self, name, image, **planes):
@@ -160,17 +186,16 @@ class StudyRunner:
             "unit": unit,
             "version": stage.version,
             "seed": self.config.run.seed,
-            "config": self.config.section_dict(*stage.sections),
+            "config": self.config.values(*stage.sections),
             "inputs": {name: store.checksums(name) for name in stage.needs},
-            "data": {name: resource(name).sha256 for name in stage.resources},
+            "data": {name: fingerprint(name) for name in stage.resources},
         }
         if stage.plan is not None:
             values["plan"] = stage.plan(self.config, unit)
-        if "catalog" in stage.sections and Path(self.config.catalog.source).is_file():
+        source = Path(self.config.catalog.source).expanduser()
+        if "catalog" in stage.sections and source.is_file():
             # a user's own file may change under the same name
-            values["catalog"] = hashlib.sha256(
-                Path(self.config.catalog.source).read_bytes()
-            ).hexdigest()
+            values["catalog"] = file_sha256(source)
         text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -208,20 +233,24 @@ class StudyRunner:
 
     @staticmethod
     def _drop_stale(store, jobs):
-        """Forget records of units that the configuration no longer has."""
+        """Forget units that the configuration no longer has, and remove their products."""
         keys = {_key(stage.name, unit) for stage, unit in jobs}
         for key in [key for key in store.records if key not in keys]:
-            del store.records[key]
+            store.drop(key)
 
     def _run_one(self, stage, unit, store):
         key, digest = _key(stage.name, unit), self.digest(stage, unit, store)
         if store.is_current(key, digest):
             log.info("%s stands already", key)
             return
-        store.records.pop(key, None)
-        context = Context(self.config, store, progress_bar=self.progress_bar)
+        store.drop(key)
+        context = Context(self.config, store, stage=stage, progress_bar=self.progress_bar)
         begin = time.perf_counter()
-        stage.function(context, unit)
+        try:
+            stage.function(context, unit)
+        except (ValueError, KeyError, OSError) as err:
+            err.add_note(f"in stage {key}")
+            raise
         seconds = time.perf_counter() - begin
         store.finish(key, digest, context.saved, seconds=seconds)
         log.info("%s took %.1f s", key, seconds)

@@ -2,11 +2,22 @@
 
 import math
 
+import astropy.units as u
+import numpy as np
+
+from miricigale.filters import Filter
+from miricigale.instrument import background_level, imager_filters, saturation_forecast
+from miricigale.psf import hst_psf
+from miricigale.scene import read_catalog
+from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.runner import check_disk, run_stages
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.images import grid_of, study_exposures
 
-__all__ = ["disk_use", "run_study"]
+__all__ = ["MIN_SOURCES", "check_study", "disk_use", "run_study"]
+
+#: Sources that a field must have for an error function to be measured.
+MIN_SOURCES = 3
 
 
 def disk_use(config):
@@ -38,6 +49,61 @@ def disk_use(config):
     return total + 9 * fine + 13 * fine
 
 
+def check_study(config):
+    """
+    Refuse what would fail only after hours of work.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.StudyConfig`
+        The configuration.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.ConfigError`
+        If a filter is unknown, the high-resolution image has no PSF, the sky fills the well, or
+        fewer than `MIN_SOURCES` sources of the catalogue fall in the field.
+    """
+    known = set(Filter.names())
+    unknown = [name for name in config.fit.bands if name not in known]
+    if unknown:
+        msg = f"[fit] bands has unknown filters {unknown}; 'miricigale filters' lists them"
+        raise ConfigError(msg)
+    unknown = [name for name in config.exposures.filters if name not in imager_filters()]
+    if unknown:
+        msg = f"[exposures] filters has {unknown}; known: {list(imager_filters())}"
+        raise ConfigError(msg)
+    try:
+        exposures = study_exposures(config)
+    except (KeyError, ValueError) as err:
+        msg = f"[exposures] {err.args[0]}"
+        raise ConfigError(msg) from err
+    try:
+        hst_psf(config.highres.filter, pixel_scale=config.highres.pixel_scale * u.arcsec)
+    except (KeyError, ValueError) as err:
+        msg = f"[highres] filter: {err.args[0]}"
+        raise ConfigError(msg) from err
+    for exposure in exposures.values():
+        level = background_level(exposure.filter) * config.scene.background_scale
+        fill = float(saturation_forecast(exposure, background=level))
+        if fill >= 1:
+            msg = (
+                f"[exposures] {exposure.filter}: the sky fills {100 * fill:.0f} % of the well in "
+                f"{exposure.n_groups} groups; take fewer groups and more integrations"
+            )
+            raise ConfigError(msg)
+    catalog = read_catalog(config.catalog.source)
+    wcs = grid_of(config, config.reduction.pixel_scale)
+    n_inside = int(np.count_nonzero(wcs.footprint_contains(catalog["sky"])))
+    if n_inside < MIN_SOURCES:
+        msg = (
+            f"[pointing] at RA {config.pointing.ra}, Dec {config.pointing.dec} has {n_inside} of the "
+            f"{len(catalog)} sources of {config.catalog.source!r} in its field; at least "
+            f"{MIN_SOURCES} are needed"
+        )
+        raise ConfigError(msg)
+
+
 def run_study(config, folder, *, progress_bar=False):
     """
     Run all stages of a study in a folder; what stands there and is current is kept.
@@ -63,6 +129,7 @@ def run_study(config, folder, *, progress_bar=False):
     `~miricigale.utils.exceptions.ConfigError`, KeyError, ValueError
         If the configuration names what does not exist or leaves nothing to do.
     """
+    check_study(config)
     check_disk(folder, disk_use(config))
     store = run_stages(config, folder, study_stages(), progress_bar=progress_bar)
     return store.path("report/index.html")

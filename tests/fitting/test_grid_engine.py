@@ -143,8 +143,12 @@ def test_percentiles_of_derived_quantities(make_grid, draw_photometry, brute_for
             total = np.cumsum(weights[order])
             got = results.percentile(name, levels)[i].value
             # where the distribution jumps, either side will do
-            low = values[order][np.minimum(np.searchsorted(total, np.subtract(levels, 4e-3)), order.size - 1)]
-            high = values[order][np.minimum(np.searchsorted(total, np.add(levels, 4e-3)), order.size - 1)]
+            low = values[order][
+                np.minimum(np.searchsorted(total, np.subtract(levels, 4e-3)), order.size - 1)
+            ]
+            high = values[order][
+                np.minimum(np.searchsorted(total, np.add(levels, 4e-3)), order.size - 1)
+            ]
             assert np.all(got >= low * 10**-0.011 - 1e-300), (name, i)
             assert np.all(got <= high * 10**0.011), (name, i)
 
@@ -184,3 +188,18 @@ def test_galaxies_alone_weigh_one_over_the_number_of_fractions(make_grid, draw_p
     uniform = BayesFitter(dark, prior_f="uniform").fit(table)
     width = np.diff([0.0, 0.1, 0.35, 0.7, 1.0])
     np.testing.assert_allclose(uniform.pdf["frac_agn"][0], width, rtol=1e-6)
+
+
+def test_a_short_list_of_pairs_changes_nothing(make_grid, draw_photometry, monkeypatch):
+    """When the list is full it is worked off, and the search goes on."""
+    from miricigale.fitting.engines import grid as module
+
+    grid = make_grid(8, n_tau=20, n_age=16)
+    table, _ = draw_photometry(grid, 6, noise=1.0)
+    fitter = BayesFitter(grid)
+    want = fitter.fit(table)
+    monkeypatch.setattr(module, "_CAPACITY", 1)
+    got = BayesFitter(grid).fit(table)
+    np.testing.assert_allclose(got.pdf_2d, want.pdf_2d, atol=1e-6)
+    np.testing.assert_allclose(got.moments[:, :, 0], want.moments[:, :, 0], rtol=1e-5)
+    np.testing.assert_allclose(got.log_evidence, want.log_evidence, atol=1e-6)

@@ -55,6 +55,24 @@ def test_an_empty_sample_is_refused(capsys, tmp_path):
     assert "mag_limit = 12.0 leaves none of the 1308 sources" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[highres]\nfilter = 'nircam.f200w'\n", "[highres] filter: "),
+        ("[pointing]\nra = 10.0\n", "[pointing] at RA 10.0"),
+        ("[scene]\nbackground_scale = 50.0\n", "the sky fills"),
+        ("[exposures]\nfilters = ['miri.f560x', 'miri.f770w']\n", "[exposures] filters has"),
+        ("[fit]\nbands = ['megacam.x']\ndepths = [25.0]\n", "[fit] bands has unknown filters"),
+    ],
+)
+def test_what_would_fail_late_is_refused_at_once(capsys, tmp_path, text, message):
+    config = tmp_path / "my.toml"
+    config.write_text(text)
+    assert main(["run", str(config), "-o", str(tmp_path / "run"), "--no-progress"]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 def test_data_names_licences_and_checks_sums(capsys, monkeypatch, tmp_path):
     monkeypatch.delenv("MIRICIGALE_DATA", raising=False)
     assert main(["data", "list"]) == 0

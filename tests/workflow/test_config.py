@@ -25,7 +25,9 @@ def test_presets_are_listed_without_their_variants():
         ("[run]\nseed = true\n", r"\[run\] seed must be of type int, got True"),
         ("[run]\nseed = -1\n", r"\[run\] seed must be at least 0, got -1"),
         ("[pointing]\ndec = 95.0\n", r"\[pointing\] dec must be between -90 and 90, got 95.0"),
-        ("[pointing]\ndec = nan\n", r"\[pointing\] dec must be between"),
+        ("[pointing]\ndec = nan\n", r"\[pointing\] dec must be a finite number, got nan"),
+        ("[scene]\ngradient_angle = inf\n", r"gradient_angle must be a finite number, got inf"),
+        ("[sed]\nalpha = [2.5, 1.5]\n", r"alpha must be two numbers in order"),
         ("[fit]\naxes = 'huge'\n", r"\[fit\] axes must be one of \['fit', 'quick'\], got 'huge'"),
         ("[fit]\nbands = ['acs.f606w']\n", r"\[fit\] depths must have one number per band \(1\)"),
         ("[exposures]\nfilters = []\n", "at least one filter"),
@@ -58,6 +60,13 @@ def test_missing_files_and_presets_are_named(tmp_path):
         load_config("cosmos")
     with pytest.raises(ConfigError, match="--quick belongs to presets"):
         load_config(tmp_path / "absent.toml", quick=True)
+
+
+def test_a_file_that_is_no_text_is_named(tmp_path):
+    path = tmp_path / "binary.toml"
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(ConfigError, match=r"binary\.toml is not a text file in UTF-8"):
+        load_config(path)
 
 
 def test_overrides_win():

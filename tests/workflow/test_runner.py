@@ -102,6 +102,42 @@ def test_a_foreign_folder_is_refused(tmp_path):
         ProductStore(tmp_path)
 
 
+def test_a_run_that_was_killed_at_once_can_begin_again(tmp_path):
+    (tmp_path / "run.lock").write_text("999999999")
+    (tmp_path / ".partial-manifest.json").write_text("{")
+    with ProductStore(tmp_path) as store:
+        assert store.records == {}
+
+
+@pytest.mark.parametrize("text", ["[]", "{", '{"stages": {"catalog": {}}}', '{"stages": [1]}'])
+def test_a_damaged_manifest_is_named(tmp_path, text):
+    (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(DataError, match=r"manifest\.json is not the manifest of a run"):
+        ProductStore(tmp_path)
+
+
+def test_products_that_no_longer_belong_are_removed(tmp_path):
+    def function(context, unit):
+        context.save(f"{unit}.txt", lambda path: path.write_text(unit))
+
+    for units in ("ab", "a"):
+        stage = Stage("one", function, "one", units=lambda _, u=units: u)
+        StudyRunner(StudyConfig(), tmp_path / "run", [stage]).run()
+    assert (tmp_path / "run" / "a.txt").exists()
+    assert not (tmp_path / "run" / "b.txt").exists()
+
+
+def test_a_stage_that_reads_what_it_has_not_declared_is_an_error(tmp_path):
+    stage = Stage("one", lambda context, _: context.config.scene, "one", sections=("run.name",))
+    with pytest.raises(RuntimeError, match=r"stage 'one' reads \[scene\] without declaring it"):
+        StudyRunner(StudyConfig(), tmp_path / "run", [stage]).run()
+    stage = Stage(
+        "one", lambda context, _: context.config.run.keep_level1b, "one", sections=("run.name",)
+    )
+    with pytest.raises(AttributeError, match="keep_level1b"):
+        StudyRunner(StudyConfig(), tmp_path / "run", [stage]).run()
+
+
 def test_a_folder_in_use_is_refused_and_a_stale_lock_is_not(tmp_path):
     import os
 

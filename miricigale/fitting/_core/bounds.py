@@ -180,9 +180,9 @@ def pair_block(unit_galaxy, p, threshold, unit_agn, a, a2, start, base, found, b
     unit_galaxy : `~numpy.ndarray` of float32, shape (n_used, BLOCK)
         Unit vectors of the galaxies.
     p : `~numpy.ndarray` of float32, shape (BLOCK,)
-        Their projections.
+        Their projections; -1000 for a galaxy that may not be used.
     threshold : `~numpy.ndarray` of float32, shape (BLOCK,)
-        Least bound R / |d|^2 to keep, above 4 where the galaxy is not allowed.
+        Least bound R / |d|^2 to keep, 1e30 for a galaxy that may not be used.
     unit_agn, a, a2
         From `torus_projections`.
     start : int

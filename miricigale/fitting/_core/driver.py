@@ -29,6 +29,8 @@ __all__ = ["fit_many", "make_scratch", "make_sums"]
 _OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
 _NEVER = np.float32(1e30)
+_NOWHERE = np.float32(-1e3)
+_LOG10_E = 0.43429448190325183
 # Pairs whose bound is within this of the best are evaluated first.
 _FIRST = 10.0
 _GALAXY_MASK = (1 << (ROW_BITS - AGN_BITS)) - 1
@@ -70,9 +72,9 @@ def make_scratch(n_z, n_galaxy, n_padded, n_agn, n_frac, n_bands, capacity):
         np.zeros((2, LANES), np.int64),
         np.zeros(n_frac * LANES),
         np.zeros(n_frac * LANES),
-        np.zeros(n_frac * LANES),
-        np.zeros(n_frac * LANES),
-        np.zeros(n_frac * LANES, np.int64),
+        np.zeros(2 * n_frac),
+        np.zeros(2 * n_frac),
+        np.zeros(2 * n_frac, np.int64),
         np.zeros(1, np.int64),
     )
 
@@ -223,7 +225,7 @@ def _fit_one(tables, request, data, weight, log_prior, sums, scratch):
         value += log_prior[z] + tables.log_galaxy[g]
         if value > reference:
             reference = value
-            sums.origin[0] = math.log10(s) if s > 0.0 else 0.0
+            sums.origin[0] = _LOG10_E * math.log(s) if s > 0.0 else 0.0
     if reference < -1e299:
         return norm
     top_dust = 1e-300
@@ -231,8 +233,8 @@ def _fit_one(tables, request, data, weight, log_prior, sums, scratch):
     for g in range(n_galaxy):
         top_dust = max(top_dust, tables.dust[g])
         top_mixed = max(top_mixed, tables.mixed_galaxy[g])
-    sums.origin[1] = sums.origin[0] + math.log10(top_dust)
-    sums.origin[2] = sums.origin[0] + math.log10(top_mixed)
+    sums.origin[1] = sums.origin[0] + _LOG10_E * math.log(top_dust)
+    sums.origin[2] = sums.origin[0] + _LOG10_E * math.log(top_mixed)
     n_found = np.int64(0)
     if n_agn > 0 and tables.ratio.size > 0:
         log_pair = log_top + 2.0 * math.log(max(top_agn, 1e-300))
@@ -247,6 +249,7 @@ def _fit_one(tables, request, data, weight, log_prior, sums, scratch):
         bound = scratch.bound
         log_galaxy = tables.log_galaxy
         threshold = np.empty(BLOCK, np.float32)
+        p_block = np.empty(BLOCK, np.float32)
         for i in range(n_z):
             z = order[i]
             if promise[z] < -1e29:
@@ -257,12 +260,15 @@ def _fit_one(tables, request, data, weight, log_prior, sums, scratch):
                 n_here = 0
                 for m in range(BLOCK):
                     g = start + m
+                    # what may not be used is parallel to nothing and reaches nothing
                     threshold[m] = _NEVER
+                    p_block[m] = _NOWHERE
                     if g < n_galaxy and tables.usable[z, g]:
                         n_here += 1
                         t = reference - request.delta - log_prior[z] - log_pair
                         t -= tables.log_galaxy[g]
                         threshold[m] = max(min(t / norm, 1.0), -1.0) - 1e-6
+                        p_block[m] = scratch.p32[z, g]
                 if n_here == 0:
                     continue
                 for j in range(n_used):
@@ -273,7 +279,7 @@ def _fit_one(tables, request, data, weight, log_prior, sums, scratch):
                         unit_galaxy[j, m] = row[start + m] * s32 * inverse[start + m]
                 end = pair_block(
                     unit_galaxy,
-                    scratch.p32[z, start : start + BLOCK],
+                    p_block,
                     threshold,
                     unit_agn,
                     a32,

@@ -19,9 +19,12 @@ from miricigale.fitting._core.histogram import HALF_BINS, N_BINS, PER_DEX, fill_
 __all__ = ["LANES", "evaluate_pairs", "evaluate_singles", "row_best"]
 
 #: Pairs evaluated side by side.
-LANES = 64
+LANES = 128
 
 _OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
+# Written into the caller: a call counts the references of every array of its bundles, which
+# for small pieces of work takes longer than the work.
+_INLINE = {**_OPTIONS, "inline": "always"}
 
 # Offsets of the vectors in Scratch.buffer.
 _P, _Q, _X2, _A, _B, _DUST, _PRIOR, _R, _S2, _E = (i * LANES for i in range(10))
@@ -30,9 +33,10 @@ _END = 20 * LANES
 _AGN_MASK = (1 << AGN_BITS) - 1
 _GALAXY_MASK = (1 << (ROW_BITS - AGN_BITS)) - 1
 #: Pairs of a list that go into the histograms unthinned.
-_SAMPLE = 20_000
+_SAMPLE = 50_000
 
 _LOG2E = 1.4426950408889634
+_LOG10_E = 0.43429448190325183
 _LN2_HIGH = 0.6931471803691238
 _LN2_LOW = 1.9082149292705877e-10
 
@@ -259,13 +263,13 @@ def _find_best(tables, sums, scratch, z, n):
             _note_best(sums, num * s, s, z, g, k, j + tables.zero_frac)
 
 
-@njit(**_OPTIONS)
+@njit(**_INLINE)
 def _fill_histograms(tables, sums, scratch, n, n_listed, share):
     """
     Add the pairs in the lanes to the histograms.
 
-    Of long lists only every so many-th of the pairs that carry less than their share of the
-    weight is taken, with so many times its weight.
+    Of long lists only every so many-th of the pairs that carry less than 5 times their share
+    of the weight is taken, with so many times its weight.
     """
     n_ratio = tables.ratio.size
     buffer = scratch.buffer
@@ -273,19 +277,27 @@ def _fill_histograms(tables, sums, scratch, n, n_listed, share):
     while stride > 1 and (stride % 2 == 0 or stride % 3 == 0 or stride % 5 == 0 or stride % 7 == 0):
         stride += 1
     least = 1e-4 * share * sums.total[0]
-    heavy = share * sums.total[0] if stride > 1 else 0.0
+    heavy = 5.0 * share * sums.total[0] if stride > 1 else 0.0
     index = scratch.lane_index
     scale = scratch.scale
     weight = scratch.weight
-    log_scale = scratch.log_scale
-    mixed = scratch.mixed
+    values = scratch.values
+    logs = scratch.logs
+    power = scratch.log_power
+    ratio = tables.ratio
     log_ratio = tables.log_ratio
+    log_dust = tables.log_dust
+    mixed_galaxy = tables.mixed_galaxy
+    mixed_agn = tables.mixed_agn
     galaxy_hist, agn_hist, mixed_hist = sums.hist_galaxy, sums.hist_agn, sums.hist_mixed
     galaxy_range, agn_range, mixed_range = sums.range_galaxy, sums.range_agn, sums.range_mixed
-    middle = HALF_BINS - PER_DEX * sums.origin[0]
+    galaxy_middle = HALF_BINS - PER_DEX * sums.origin[0]
+    agn_middle = HALF_BINS - PER_DEX * sums.origin[1]
+    mixed_middle = HALF_BINS - PER_DEX * sums.origin[2]
     seen = scratch.counter[0]
     scratch.counter[0] += n
-    done = False
+    mixed_first = mixed_range[0, 0]
+    mixed_last = mixed_range[0, 1]
     for i in range(n):
         w = buffer[_W0 + i]
         if w <= least:
@@ -295,48 +307,39 @@ def _fill_histograms(tables, sums, scratch, n, n_listed, share):
             if (seen + i) % stride != 0:
                 continue
             factor = np.float64(stride)
-        if not done:
-            done = True
-            for j in range(n_ratio):
-                c = tables.ratio[j]
-                for m in range(n):
-                    part = c * buffer[_DUST + m] * tables.mixed_agn[index[1, m]]
-                    part += tables.mixed_galaxy[index[0, m]]
-                    mixed[j * LANES + m] = scale[j * LANES + m] * part
-            fill_log10(scale, scratch.log_power, log_scale, n_ratio * LANES)
-            fill_log10(mixed, scratch.log_power, mixed, n_ratio * LANES)
         g, k = index[0, i], index[1, i]
-        dust = buffer[_DUST + i] > 0.0
-        first = N_BINS
-        last = -1
-        agn_first = N_BINS
-        agn_last = -1
-        shift = (tables.log_dust[g] - sums.origin[1] + sums.origin[0]) * PER_DEX
+        dust = buffer[_DUST + i]
         for j in range(n_ratio):
-            o = j * LANES + i
-            if scale[o] == 0.0:
+            s = scale[j * LANES + i]
+            values[j] = s
+            values[n_ratio + j] = s * (mixed_galaxy[g] + ratio[j] * dust * mixed_agn[k])
+        fill_log10(values, power, logs, 2 * n_ratio)
+        shift = PER_DEX * log_dust[g] + agn_middle
+        first, last = galaxy_range[g, 0], galaxy_range[g, 1]
+        agn_first, agn_last = agn_range[k, 0], agn_range[k, 1]
+        for j in range(n_ratio):
+            if values[j] == 0.0:
                 continue
-            t = weight[o] * factor
-            y = log_scale[o] * PER_DEX + middle
-            column = min(max(np.int64(y), 0), N_BINS - 1)
+            t = weight[j * LANES + i] * factor
+            y = logs[j] * PER_DEX
+            column = min(max(np.int64(y + galaxy_middle), 0), N_BINS - 1)
             galaxy_hist[g, column] += t
             first = min(first, column)
             last = max(last, column)
-            if dust:
-                y += shift
-                column = min(max(np.int64(y + log_ratio[j]), 0), N_BINS - 1)
+            if dust > 0.0:
+                column = min(max(np.int64(y + log_ratio[j] + shift), 0), N_BINS - 1)
                 agn_hist[k, column] += t
                 agn_first = min(agn_first, column)
                 agn_last = max(agn_last, column)
-            column = np.int64((mixed[o] - sums.origin[2]) * PER_DEX + HALF_BINS)
-            if column > 0:
-                mixed_hist[0, min(column, N_BINS - 1)] += t
-        _widen(galaxy_range, g, first, last)
-        if dust:
-            _widen(agn_range, k, agn_first, agn_last)
-    if done:
-        # any bin of the one row may be in use
-        _widen(mixed_range, 0, 0, N_BINS - 1)
+            if values[n_ratio + j] > 0.0:
+                y = logs[n_ratio + j] * PER_DEX + mixed_middle
+                column = min(max(np.int64(y), 0), N_BINS - 1)
+                mixed_hist[0, column] += t
+                mixed_first = min(mixed_first, column)
+                mixed_last = max(mixed_last, column)
+        galaxy_range[g, 0], galaxy_range[g, 1] = first, last
+        agn_range[k, 0], agn_range[k, 1] = agn_first, agn_last
+    mixed_range[0, 0], mixed_range[0, 1] = mixed_first, mixed_last
 
 
 @njit(**_OPTIONS)
@@ -346,7 +349,7 @@ def _widen(bins, row, first, last):
     bins[row, 1] = max(bins[row, 1], last)
 
 
-@njit(**_OPTIONS)
+@njit(**_INLINE)
 def _evaluate_lanes(tables, request, sums, scratch, z, n, n_listed):
     """
     Evaluate the first n pairs in the lanes, all at redshift z, and add them to the sums.
@@ -481,22 +484,28 @@ def evaluate_pairs(tables, request, data, weight, log_prior, sums, scratch, n, f
     index = scratch.lane_index
     c_low = tables.ratio[0]
     c_high = tables.ratio[n_ratio - 1]
-    known[:] = 0
+    n_listed = np.int64(1)
     for i in range(n):
-        pair = found[i]
-        if bound[i] < floor or pair < 0:
+        n_listed += bound[i] >= floor and found[i] >= 0
+    known[:] = 0
+    for i in range(n + 1):
+        # the round after the last one only empties the lanes
+        pair = found[i] if i < n else np.int64(-1)
+        if i < n and (bound[i] < floor or pair < 0):
             continue
+        z = pair >> ROW_BITS
+        if filled > 0 and (filled == LANES or z != z_now):
+            _evaluate_lanes(tables, request, sums, scratch, z_now, filled, n_listed)
+            filled = np.int64(0)
+        if i == n:
+            break
         k = pair & _AGN_MASK
         g = (pair >> AGN_BITS) & _GALAXY_MASK
-        z = pair >> ROW_BITS
         pair_prior = log_prior[z] + log_galaxy[g] + log_agn[k]
         pair_floor = sure - pair_prior - log_frac
         if z != z_now:
-            if filled > 0:
-                _evaluate_lanes(tables, request, sums, scratch, z_now, filled, n)
-                filled = np.int64(0)
             z_now = z
-            agn_products(tables.agn[z], data, weight, agn_pq)
+            agn_products(agn[z], data, weight, agn_pq)
         if known[g] != z + 1:
             known[g] = z + 1
             p = 0.0
@@ -545,11 +554,6 @@ def evaluate_pairs(tables, request, data, weight, log_prior, sums, scratch, n, f
         index[0, filled] = g
         index[1, filled] = k
         filled += 1
-        if filled == LANES:
-            _evaluate_lanes(tables, request, sums, scratch, z, filled, n)
-            filled = np.int64(0)
-    if filled > 0:
-        _evaluate_lanes(tables, request, sums, scratch, z_now, filled, n)
 
 
 @njit(**_OPTIONS)
@@ -622,7 +626,7 @@ def evaluate_singles(tables, request, data, weight, log_prior, sums, scratch, fl
                 sums.hist_galaxy[g, column] += t
                 _widen(sums.range_galaxy, g, column, column)
                 if tables.mixed_galaxy[g] > 0.0:
-                    y += math.log10(tables.mixed_galaxy[g]) - sums.origin[2]
+                    y += _LOG10_E * math.log(tables.mixed_galaxy[g]) - sums.origin[2]
                     column = np.int64(y * PER_DEX + HALF_BINS)
                     column = min(max(column, 0), N_BINS - 1)
                     sums.hist_mixed[0, column] += t

@@ -26,6 +26,8 @@ N_BINS = 2 * HALF_BINS
 
 _OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
+_LN_10 = 2.3025850929940457
+_LOG10_E = 0.43429448190325183
 _LOG10_2 = 0.30102999566398120
 _LOG10_E2 = 0.86858896380650366  # 2 log10(e)
 _MANTISSA = np.int64(0x000FFFFFFFFFFFFF)
@@ -104,7 +106,7 @@ def add_scaled(hist, bins, scale, weight, least, out):
     for i in range(hist.shape[0]):
         if scale[i] > 0.0 and weight[i] > top:
             top = weight[i]
-            shift = math.log10(scale[i])
+            shift = _LOG10_E * math.log(scale[i])
     for i in range(hist.shape[0]):
         if weight[i] <= least or bins[i, 1] < 0:
             continue
@@ -112,7 +114,7 @@ def add_scaled(hist, bins, scale, weight, least, out):
             for j in range(bins[i, 0], bins[i, 1] + 1):
                 zero += hist[i, j]
             continue
-        offset = (math.log10(scale[i]) - shift) * PER_DEX
+        offset = (_LOG10_E * math.log(scale[i]) - shift) * PER_DEX
         step = math.floor(offset)
         part = offset - step
         for j in range(bins[i, 0], bins[i, 1] + 1):
@@ -198,7 +200,7 @@ def log_summary(hist, middle, zero, sigma, levels, quantiles):
             j += 1
         part = (target - below) / hist[j] if hist[j] > 0.0 else 0.5
         part = min(max(part, 0.0), 1.0)
-        quantiles[i] = 10.0 ** (middle + (j - HALF_BINS + part) / PER_DEX)
+        quantiles[i] = math.exp(_LN_10 * (middle + (j - HALF_BINS + part) / PER_DEX))
     if last < 0:
         return np.nan
     return middle + (moment / total - HALF_BINS) / PER_DEX

@@ -81,9 +81,9 @@ class Scratch(NamedTuple):
     lane_index: np.ndarray  # int64 (2, LANES): galaxies and tori of the pairs
     scale: np.ndarray  # float64 (nf * LANES,)
     weight: np.ndarray  # float64 (nf * LANES,)
-    log_scale: np.ndarray  # float64 (nf * LANES,)
-    mixed: np.ndarray  # float64 (nf * LANES,)
-    log_power: np.ndarray  # int64 (nf * LANES,)
+    values: np.ndarray  # float64 (2 * nf,): one pair's scales and mixed quantity
+    logs: np.ndarray  # float64 (2 * nf,)
+    log_power: np.ndarray  # int64 (2 * nf,)
     counter: np.ndarray  # int64 (1,): pairs seen, for the thinning of histograms
 
 

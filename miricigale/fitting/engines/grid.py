@@ -12,6 +12,8 @@ __all__ = ["GridEngine"]
 
 #: Pairs listed at once by one worker (12 bytes each).
 _CAPACITY = 1 << 22
+#: Part of ``rtol`` that the weight of what is left out may have.
+_SAFETY = 1e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -40,7 +42,8 @@ class GridEngine:
     levels : `~numpy.ndarray`
         Ascending levels of the quantiles of derived quantities.
     rtol : float
-        Largest relative error of posterior weights that pruning may cause.
+        Relative error that pruning may cause; posterior weights are bounded to a thousandth of
+        it, so that moments of quantities with a long tail hold it too.
     scale_error : bool
         Whether the variance of each model's own scale is part of the posterior.
     """
@@ -75,10 +78,10 @@ class GridEngine:
 
     @property
     def delta(self):
-        """How far 2 ln(posterior) of a model may lie below the best: 2 ln(3 n_models / rtol)."""
+        """How far 2 ln(posterior) of a model may lie below the best: 2 ln(1000 n_models / rtol)."""
         if self.rtol == 0:
             return 1e9
-        return 2.0 * np.log(3.0 * max(self.n_models, 1) / self.rtol)
+        return 2.0 * np.log(max(self.n_models, 1) / (_SAFETY * self.rtol))
 
     @cached_property
     def _tables(self):
@@ -92,30 +95,39 @@ class GridEngine:
         prior_galaxy = self.prior_galaxy / self.prior_galaxy.sum()
         prior_frac = self.prior_frac / self.prior_frac.sum()
         prior_agn = self.prior_agn / max(self.prior_agn.sum(), 1e-300)
+        # all writable, for the kernels are compiled once more for arrays that are not
         return _core.Tables(
-            np.ascontiguousarray(self.galaxy),
-            np.ascontiguousarray(self.agn),
+            _writable(self.galaxy),
+            _writable(self.agn),
             galaxy32,
             np.ascontiguousarray(_in_own_unit(self.agn)),
-            self.dust.copy(),
+            _writable(self.dust),
             log_dust,
             ratio,
             np.log10(ratio) * _core.PER_DEX,
             int(self.frac[0] == 0.0),
-            np.ascontiguousarray(self.usable),
+            _writable(self.usable),
             prior_galaxy,
             prior_agn,
             prior_frac,
             _two_log(prior_galaxy),
             _two_log(prior_agn),
             _two_log(prior_frac),
-            np.ascontiguousarray(self.galaxy_scale),
-            np.ascontiguousarray(self.agn_scale),
-            np.ascontiguousarray(self.mixed_galaxy),
-            np.ascontiguousarray(self.mixed_agn),
+            _writable(self.galaxy_scale),
+            _writable(self.agn_scale),
+            _writable(self.mixed_galaxy),
+            _writable(self.mixed_agn),
         )
 
-    def fit(self, flux, sigma, log_prior):
+    def workspace(self):
+        """Make the accumulators and work space of one worker (some tens of MB)."""
+        n_z, n_galaxy, n_bands = self.galaxy.shape
+        n_agn, n_frac = self.agn.shape[1], self.frac.size
+        sums = _core.make_sums(n_z, n_galaxy, n_agn, n_frac, n_bands)
+        n_padded = self._tables.galaxy32.shape[2]
+        return sums, _core.make_scratch(n_z, n_galaxy, n_padded, n_agn, n_frac, n_bands, _CAPACITY)
+
+    def fit(self, flux, sigma, log_prior, *, workspace=None):
         """
         Fit objects.
 
@@ -125,6 +137,8 @@ class GridEngine:
             Fluxes and errors in uJy; bands with infinite sigma are not used.
         log_prior : `~numpy.ndarray`, shape (n, nz)
             ln(prior) of the redshifts, -inf where it is 0; rows of -inf are not fitted.
+        workspace : tuple, optional
+            What `workspace` returned, for use by one thread at a time; made if not given.
 
         Returns
         -------
@@ -153,12 +167,9 @@ class GridEngine:
             np.full((n, self.n_quantities, self.levels.size), np.nan),
         )
         request = _core.Request(
-            float(self.delta), self.rtol / 3.0, float(self.scale_error), self.levels.copy()
+            float(self.delta), _SAFETY * self.rtol, float(self.scale_error), self.levels.copy()
         )
-        sums = _core.make_sums(n_z, n_galaxy, n_agn, n_frac, n_bands)
-        scratch = _core.make_scratch(
-            n_z, n_galaxy, tables.galaxy32.shape[2], n_agn, n_frac, n_bands, _CAPACITY
-        )
+        sums, scratch = self.workspace() if workspace is None else workspace
         _core.fit_many(tables, request, data, weight, log_prior, sums, scratch, out)
         return out
 
@@ -171,6 +182,11 @@ def _in_own_unit(table):
     """Divide the fluxes of every model by the largest, in single precision."""
     top = table.max(axis=-1, keepdims=True, initial=0.0)
     return (table / np.where(top > 0, top, 1.0)).astype(np.float32)
+
+
+def _writable(array):
+    """Copy an array to a contiguous one that may be written to."""
+    return np.array(array, order="C", copy=True)
 
 
 def _two_log(prior):

@@ -1,5 +1,8 @@
 """The stages of the study, in order."""
 
+from miricigale.refdata import resources
+from miricigale.refdata.locate import fingerprint
+from miricigale.sed import SEDModel
 from miricigale.workflow.stages.images import (
     exposure_plan,
     exposure_units,
@@ -8,7 +11,13 @@ from miricigale.workflow.stages.images import (
     make_kernel,
     make_mosaic,
 )
-from miricigale.workflow.stages.inputs import axes_plan, fit_inputs, make_catalog, make_truth
+from miricigale.workflow.stages.inputs import (
+    fit_inputs,
+    input_axes,
+    make_catalog,
+    make_truth,
+    plain_axes,
+)
 from miricigale.workflow.stages.measure import fit_photometry, make_errors, measure_photometry
 from miricigale.workflow.stages.points import measure_point_sources
 from miricigale.workflow.stages.report import make_report
@@ -31,24 +40,47 @@ def study_stages():
     from miricigale.workflow.runner import Stage
 
     images = ("pointing", "exposures", "scene", "detector", "reduction")
-    sed_data = ("ssp.bc03", "dust.dl07")
+    grid = ("pointing", "exposures")
+    kernel = ("highres", "photometry.regularization", "reduction")
+    sed_data = ("ssp.bc03", "dust.dl07", "torus.parametric", "filters.sedpy")
+    image_data = (
+        "instrument.siaf",
+        "instrument.imager",
+        "instrument.thermal",
+        "psf.jwst_pupil",
+        "filters.sedpy",
+    )
     return (
-        Stage("catalog", make_catalog, "catalogue", sections=("catalog", "highres")),
+        Stage(
+            "catalog",
+            make_catalog,
+            "catalogue",
+            sections=("catalog",),
+            plan=lambda config, _: (
+                fingerprint(config.catalog.source) if config.catalog.source in resources() else ""
+            ),
+        ),
         Stage(
             "seds",
             fit_inputs,
             "input SEDs",
             needs=("catalog",),
-            sections=("sed", "fit"),
+            sections=("sed.axes", "sed.catalog_error", "sed.max_wavelength", "fit.model_error"),
             resources=sed_data,
-            plan=lambda config, _: axes_plan(config.sed.axes),
+            plan=lambda config, _: plain_axes(input_axes(config.sed.axes)),
         ),
         Stage(
             "truth",
             make_truth,
             "model fluxes",
             needs=("catalog", "seds"),
-            sections=("sed", "exposures", "fit", "highres"),
+            sections=(
+                "sed.frac_agn",
+                "sed.alpha",
+                "exposures.filters",
+                "fit.bands",
+                "highres.filter",
+            ),
             resources=sed_data,
         ),
         Stage(
@@ -56,19 +88,17 @@ def study_stages():
             make_exposure,
             "exposure",
             needs=("truth",),
-            sections=images,
+            sections=(*images, "run.keep_level1b"),
+            resources=image_data,
             units=exposure_units,
-            plan=lambda config, unit: {
-                "exposures": exposure_plan(config, unit),
-                "keep_level1b": config.run.keep_level1b,
-            },
+            plan=exposure_plan,
         ),
         Stage(
             "mosaics",
             make_mosaic,
             "mosaic",
             needs=("exposures",),
-            sections=("exposures", "pointing", "reduction", "highres"),
+            sections=(*grid, "reduction", "highres.pixel_scale"),
             units=_filters,
             plan=exposure_plan,
         ),
@@ -77,14 +107,16 @@ def study_stages():
             make_highres,
             "high-resolution image",
             needs=("truth",),
-            sections=("highres", "photometry", "pointing", "exposures", "reduction"),
+            sections=(*grid, "highres", "photometry.threshold", "photometry.min_area"),
+            resources=("filters.sedpy",),
             plan=lambda config, _: exposure_plan(config),
         ),
         Stage(
             "kernels",
             make_kernel,
             "matching kernel",
-            sections=("highres", "photometry", "pointing", "exposures", "reduction"),
+            sections=(*grid, *kernel),
+            resources=image_data,
             units=_filters,
             plan=exposure_plan,
         ),
@@ -93,15 +125,20 @@ def study_stages():
             measure_photometry,
             "forced photometry",
             needs=("mosaics", "highres", "kernels"),
-            sections=("photometry", "exposures"),
             units=_filters,
         ),
         Stage(
             "points",
             measure_point_sources,
             "point sources",
-            needs=("kernels",),
-            sections=(*images, "highres", "point_sources", "photometry"),
+            sections=(
+                *images,
+                *kernel[:2],
+                "photometry.threshold",
+                "photometry.min_area",
+                "point_sources",
+            ),
+            resources=image_data,
             plan=exposure_plan,
             units=lambda config: _filters(config) if config.point_sources.enabled else (),
         ),
@@ -109,17 +146,24 @@ def study_stages():
             "errors",
             make_errors,
             "error function",
-            needs=("truth", "photometry"),
-            sections=("errors", "photometry", "exposures"),
+            needs=("truth", "mosaics", "photometry"),
+            sections=(
+                "errors",
+                "exposures.filters",
+                "photometry.match_radius",
+                "fit.min_detected",
+                "fit.axes",
+            ),
+            plan=lambda config, _: plain_axes(SEDModel.yang2021_axes(config.fit.axes)),
         ),
         Stage(
             "fits",
             fit_photometry,
             "fit",
             needs=("truth", "errors"),
-            sections=("fit", "exposures"),
+            sections=("fit", "exposures.filters"),
             resources=sed_data,
-            plan=lambda config, _: axes_plan(config.fit.axes),
+            plan=lambda config, _: plain_axes(SEDModel.yang2021_axes(config.fit.axes)),
             units=lambda _: ("with_miri", "without_miri"),
         ),
         Stage(
@@ -129,6 +173,7 @@ def study_stages():
             needs=(
                 "catalog",
                 "truth",
+                "exposures",
                 "mosaics",
                 "highres",
                 "photometry",
@@ -136,6 +181,16 @@ def study_stages():
                 "errors",
                 "fits",
             ),
-            sections=("report", "exposures", "fit", "errors", "pointing", "sed"),
+            sections=(
+                *grid,
+                "run.name",
+                "catalog.mag_limit",
+                "sed",
+                "highres.filter",
+                "fit",
+                "errors",
+                "point_sources",
+                "report",
+            ),
         ),
     )

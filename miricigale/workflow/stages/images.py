@@ -91,7 +91,7 @@ def band_exposures(config, name):
     return [e for e in study_exposures(config).values() if e.filter == name]
 
 
-def reducer_of(config):
+def reducer_of(config, n_threads=None):
     """The reducer that a configuration describes."""
     options = config.reduction
     return Reducer(
@@ -99,10 +99,11 @@ def reducer_of(config):
         box=options.background_box,
         filter_size=options.background_filter,
         pixfrac=options.pixfrac,
+        n_threads=n_threads,
     )
 
 
-def expose_and_reduce(config, exposure, catalog, *, seed, keep=None):
+def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, keep=None):
     """
     Take one exposure of a catalogue from the scene to the calibrated image.
 
@@ -116,6 +117,8 @@ def expose_and_reduce(config, exposure, catalog, *, seed, keep=None):
         Sources with fluxes in the exposure's filter.
     seed : int
         Seed of the detector.
+    n_threads : int, optional
+        Threads; it changes nothing in the result.
     keep : callable, optional
         Called with the `~miricigale.detector.Ramp`, to write it.
 
@@ -137,12 +140,15 @@ def expose_and_reduce(config, exposure, catalog, *, seed, keep=None):
         wcs=exposure.wcs,
         psf=miri_psf(exposure.filter),
         background=background,
+        workers=n_threads,
     )
-    detector = Detector.miri_imager(cosmic_rays=config.detector.cosmic_rays)
-    ramp = detector.expose(scene.render(), exposure, seed=seed)
+    detector = Detector.miri_imager(
+        cosmic_rays=config.detector.cosmic_rays, residual=config.detector.residual or False
+    )
+    ramp = detector.expose(scene.render(), exposure, seed=seed, n_threads=n_threads)
     if keep is not None:
         keep(ramp)
-    reducer = reducer_of(config)
+    reducer = reducer_of(config, n_threads)
     rate = reducer.fit_ramp(ramp)
     del ramp
     cal, _ = reducer.subtract_background(reducer.calibrate(rate))
@@ -163,6 +169,7 @@ def make_exposure(context, unit):
         exposure,
         truth,
         seed=context.seed,
+        n_threads=context.n_threads,
         keep=keep if config.run.keep_level1b else None,
     )
     for label, image in (("rate", rate), ("cal", cal)):

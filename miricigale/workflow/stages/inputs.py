@@ -3,6 +3,7 @@
 import numpy as np
 from astropy.table import QTable, hstack
 
+from miricigale.filters import Filter
 from miricigale.fitting import BayesFitter, FitResults
 from miricigale.scene import read_catalog
 from miricigale.sed import SEDModel
@@ -11,16 +12,51 @@ from miricigale.utils.random import stream
 from miricigale.utils.tables import error_column
 from miricigale.workflow.stages.stars import star_fluxes
 
-__all__ = ["add_agn", "axes_plan", "catalog_bands", "fit_inputs", "make_catalog", "make_truth"]
+__all__ = [
+    "add_agn",
+    "catalog_bands",
+    "fit_inputs",
+    "input_axes",
+    "make_catalog",
+    "make_truth",
+    "plain_axes",
+]
 
 #: Redshifts closer than this share a node of the grid of the input fit.
 REDSHIFT_STEP = 0.01
 GALAXY_PARAMETERS = ("tau", "age", "ebv", "alpha", "metallicity")
 
 
-def axes_plan(kind):
-    """Plain values of a named grid's axes, for hashing."""
-    return {name: list(values) for name, values in SEDModel.yang2021_axes(kind).items()}
+def input_axes(kind):
+    """
+    Axes of the fit of the input SEDs.
+
+    The grid of the paper begins at E(B-V) 0.1 and 0.5 Gyr, which real galaxies of the catalogue
+    fall below; the inputs go down to 0 and 0.1 Gyr. The dust's alpha has one value: bands
+    shorter than a few um say nothing of it (see `make_truth`).
+
+    Parameters
+    ----------
+    kind : {"galaxy", "quick"}
+        The paper's galaxy grid or the thinner one.
+
+    Returns
+    -------
+    axes : dict of str to `~numpy.ndarray`
+        Without redshift.
+    """
+    axes = SEDModel.yang2021_axes(kind)
+    return {
+        "tau": axes["tau"],
+        "age": np.union1d([0.1, 0.3], axes["age"]),
+        "ebv": np.union1d([0.0, 0.05], axes["ebv"]),
+        "alpha": np.array([2.0]),
+    }
+
+
+def plain_axes(axes):
+    """Plain values of a grid's axes, for hashing."""
+    return {name: list(values) for name, values in axes.items()}
 
 
 def catalog_bands(catalog):
@@ -50,18 +86,24 @@ def fit_inputs(context, _):
     """Stage 2: fit a galaxy grid to the catalogue's fluxes at the known redshifts."""
     options = context.config.sed
     catalog = QTable.read(context.path("catalog.ecsv"))
-    bands = catalog_bands(catalog)
+    bands = [
+        name
+        for name in catalog_bands(catalog)
+        if Filter.from_name(name).pivot.value <= options.max_wavelength
+    ]
+    if not bands:
+        msg = (
+            f"[sed] max_wavelength = {options.max_wavelength} leaves none of the catalogue's bands"
+        )
+        raise ConfigError(msg)
     photometry = QTable({"id": catalog["id"]})
     photometry["redshift"] = np.asarray(catalog["redshift"], float)
     for name in bands:
         photometry[name] = catalog[name]
         photometry[error_column(name)] = np.abs(catalog[name]) * options.catalog_error
     nodes = np.unique(np.round(photometry["redshift"] / REDSHIFT_STEP) * REDSHIFT_STEP)
-    model = SEDModel.yang2021()
-    axes = SEDModel.yang2021_axes("galaxy" if options.axes == "galaxy" else "quick")
-    axes = {name: values for name, values in axes.items() if name in GALAXY_PARAMETERS}
-    axes["redshift"] = nodes[nodes > 0]
-    axes["frac_agn"] = [0.0]
+    model = SEDModel.yang2021(agn=False)
+    axes = input_axes(options.axes) | {"redshift": nodes[nodes > 0]}
     fitter = BayesFitter(
         model,
         bands,
@@ -70,6 +112,7 @@ def fit_inputs(context, _):
         redshift_tolerance=REDSHIFT_STEP,
     )
     results = fitter.fit(photometry, redshift="redshift", progress_bar=context.progress_bar)
+    results.meta.pop("created", None)
     context.save("input_seds.fits", lambda path: results.write(path, overwrite=True))
 
 
@@ -120,12 +163,25 @@ def make_truth(context, _):
     for name in (*GALAXY_PARAMETERS, "mass"):
         if f"{name}_best" in best.colnames:
             parameters[name] = best[f"{name}_best"]
+    low, high = config.sed.alpha
+    parameters["alpha"] = [
+        stream(context.seed, "truth", "alpha", str(key)).uniform(low, high)
+        for key in parameters["id"]
+    ]
     model = SEDModel.yang2021(agn=config.sed.frac_agn > 0)
     if config.sed.frac_agn > 0:
         add_agn(parameters, config.sed.frac_agn, context.seed)
     bands = list(
         dict.fromkeys([*config.fit.bands, *config.exposures.filters, config.highres.filter])
     )
+    prior = config.highres.filter
+    if prior in catalog.colnames:
+        # the prior image shows what was measured: each SED is scaled to it
+        fitted, measured = model.fluxes(parameters, [prior])[prior], catalog[prior]
+        usable = np.isfinite(fitted) & (fitted > 0) & np.isfinite(measured) & (measured > 0)
+        ratio = np.where(usable, (measured / np.where(usable, fitted, 1 * fitted.unit)).value, 1.0)
+        parameters["mass"] = parameters["mass"] * ratio
+        parameters["prior_ratio"] = np.where(usable, ratio, np.nan)
     light = model.fluxes(parameters, bands)
     light.rename_column("flags", "sed_flags")
     star = np.asarray(catalog["star"], bool)

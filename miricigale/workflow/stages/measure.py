@@ -48,9 +48,8 @@ def measure_photometry(context, name):
     context.save_image(f"photometry/{name}_residual.fits", result.residual_image)
 
 
-def band_photometry(context):
+def band_photometry(context, bands):
     """The photometry of all bands in one table, a row for each detection."""
-    bands = context.config.exposures.filters
     joined = None
     for name in bands:
         table = QTable.read(context.path(f"photometry/{name}.ecsv"))
@@ -67,7 +66,7 @@ def make_errors(context, _):
     """Stage 12: match to the truth, error function of every band, sample of the fit."""
     config = context.config
     bands = config.exposures.filters
-    photometry = band_photometry(context)
+    photometry = band_photometry(context, bands)
     truth = QTable.read(context.path("truth.ecsv"))
     matched = match_truth(
         truth, photometry, bands, radius=config.photometry.match_radius * u.arcsec
@@ -85,9 +84,18 @@ def make_errors(context, _):
         matched[f"{name}_formal_err"] = matched[error_column(name)]
         matched[f"{name}_extrapolated"] = errors.extrapolated(matched[name], name)
     matched = errors.assign(matched, filters=bands)
-    add_selection(matched, truth, bands, inside=inside, min_detected=config.fit.min_detected)
+    nodes = SEDModel.yang2021_axes(config.fit.axes)["redshift"]
+    add_selection(
+        matched,
+        truth,
+        bands,
+        inside=inside,
+        min_detected=config.fit.min_detected,
+        redshifts=(nodes[0], nodes[-1]),
+    )
     context.save_table("photometry.ecsv", photometry)
     context.save_table("matched.ecsv", matched)
+    errors.meta.pop("created", None)
     context.save("errors.ecsv", errors.write)
 
 
@@ -137,5 +145,6 @@ def fit_photometry(context, unit):
     )
     with ThreadPoolExecutor(context.n_threads) as executor:
         results = fitter.fit(photometry, executor=executor, progress_bar=context.progress_bar)
+    results.meta.pop("created", None)
     context.save(f"fits_{unit}.fits", lambda path: results.write(path, overwrite=True))
     context.save_table(f"fits_{unit}.ecsv", results.to_table())

@@ -81,7 +81,7 @@ def measure_point_sources(context, name):
     # own streams: these exposures are not those of the study
     seed = (context.seed + text_key(f"points/{name}")) % 2**63
     catalog = point_catalog(exposure, flux, prior, spacing=options.spacing, seed=seed)
-    _, cal = expose_and_reduce(config, exposure, catalog, seed=seed)
+    _, cal = expose_and_reduce(config, exposure, catalog, seed=seed, n_threads=context.n_threads)
     reducer = reducer_of(config)
     mosaic = reducer.mosaic([cal], mosaic_wcs([exposure], config.reduction.pixel_scale * u.arcsec))
     mosaic, _ = reducer.subtract_background(mosaic)

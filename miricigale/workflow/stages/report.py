@@ -1,6 +1,7 @@
 """Stage 14: truth and results to numbers, figures and one page."""
 
 import json
+import logging
 
 import astropy.units as u
 import numpy as np
@@ -13,15 +14,18 @@ from miricigale.evaluation import (
     integrated_light,
     photoz_metrics,
     recovery_metrics,
+    sigma_mad,
 )
 from miricigale.fitting import FitResults
 from miricigale.instrument import proposal_limit, scaled_limit
-from miricigale.photometry import ErrorModel
+from miricigale.photometry import ErrorModel, ForcedFlags
 from miricigale.workflow.stages import figures
 from miricigale.workflow.stages.images import band_exposures
 from miricigale.workflow.stages.sample import SampleFlags, magnitude
 
 __all__ = ["make_report", "study_metrics"]
+
+log = logging.getLogger(__name__)
 
 FITS = ("with_miri", "without_miri")
 #: Shares of sources detected in two or more bands, by H-band limit: Yang et al. 2021.
@@ -41,15 +45,32 @@ def _band_metrics(matched, truth, name):
     usable = (selection & (SampleFlags.OUTSIDE_FIELD | SampleFlags.NOT_MATCHED)) == 0
     flux, true = matched[name].value, matched[f"{name}_true"].value
     formal = matched[f"{name}_formal_err"].value
+    whole = (np.asarray(matched[f"{name}_flags"]) & (ForcedFlags.EDGE | ForcedFlags.MASKED)) == 0
     with np.errstate(invalid="ignore"):
-        bright = usable & (true > 20 * formal) & ~_crowded(truth, name)
-    pulls = (flux - true) / formal
-    pulls = pulls[usable & np.isfinite(pulls)]
+        bright = usable & whole & (true > 20 * formal) & ~_crowded(truth, name)
+        faint = usable & whole & (true < 20 * formal) & np.isfinite(flux)
+    pulls = (flux[faint] - true[faint]) / formal[faint]
     return {
         "bright_isolated": recovery_metrics(true[bright], flux[bright], relative=True),
         "n_measured": int(np.count_nonzero(usable & np.isfinite(flux))),
+        "formal_limit": _magnitude_of(5 * np.nanmedian(formal[usable])) if usable.any() else np.nan,
+        "pull_n": int(pulls.size),
         "pull_median": float(np.median(pulls)) if pulls.size else np.nan,
+        "pull_scatter": sigma_mad(pulls),
     }
+
+
+def _magnitude_of(flux):
+    """AB magnitude of a flux in uJy."""
+    return float(23.9 - 2.5 * np.log10(flux))
+
+
+def _coverage(truth, table, name):
+    """Share of the sources whose true value lies between the 16th and 84th percentile."""
+    low, high = table[f"{name}_p16"], table[f"{name}_p84"]
+    good = np.isfinite(low) & np.isfinite(high)
+    inside = good & (truth >= low) & (truth <= high)
+    return fraction_interval(int(np.count_nonzero(inside)), int(np.count_nonzero(good)))[0]
 
 
 def _crowded(truth, name, radius=2 * u.arcsec):
@@ -90,6 +111,9 @@ def study_metrics(context):
         "n_field": int(field.sum()),
         "n_matched": int((field & (np.asarray(matched["matched"]))).sum()),
         "n_sample": int((selection == 0).sum()),
+        "n_left_out": {
+            flag.name.lower(): int(np.count_nonzero(selection & flag)) for flag in SampleFlags
+        },
         "bands": {},
         "detected": [],
         "fits": {},
@@ -136,7 +160,8 @@ def study_metrics(context):
             "photoz_outliers_high": photoz.outlier_high,
             "frac_agn_bias": fraction.median,
             "frac_agn_sigma_mad": fraction.sigma_mad,
-            "frac_agn_width": float(np.nanmedian(table["frac_agn_std"])),
+            "frac_agn_width": float(np.nanmedian(table["frac_agn_std"])) if len(table) else np.nan,
+            "redshift_coverage": _coverage(sample["redshift"], table, "redshift"),
         }
     return metrics
 
@@ -145,13 +170,15 @@ def make_report(context, _):
     """Stage 14: the page, its figures as PNG, and the numbers as JSON."""
     config = context.config
     metrics = study_metrics(context)
+    if metrics["n_sample"] == 0:
+        log.warning("no source is left to fit: %s", metrics["n_left_out"])
     context.save("report/metrics.json", lambda path: path.write_text(json.dumps(metrics, indent=1)))
     report = Report(
         f"miricigale: {config.run.name}",
         subtitle=(
             f"{metrics['n_field']} galaxies in a MIRI field at RA {config.pointing.ra:.5f}, "
             f"Dec {config.pointing.dec:.5f}, injected fracAGN {config.sed.frac_agn:g}, "
-            f"seed {config.run.seed}"
+            f"seed {context.seed}"
         ),
         dpi=config.report.dpi,
     )
@@ -164,6 +191,15 @@ def make_report(context, _):
     writer.inputs()
     writer.configuration()
     context.save("report/index.html", lambda path: report.write(path))
+
+
+def _without_nan(values):
+    """The same values with None for NaN, which JSON does not know."""
+    if isinstance(values, dict):
+        return {key: _without_nan(value) for key, value in values.items()}
+    if isinstance(values, list):
+        return [_without_nan(value) for value in values]
+    return None if isinstance(values, float) and not np.isfinite(values) else values
 
 
 class _Writer:
@@ -195,8 +231,8 @@ class _Writer:
                 (f"in the fit: {self.config.fit.min_detected}+ MIRI bands", m["n_sample"]),
                 ("photo-z outliers with MIRI", _percent(fits["with_miri"]["photoz_outliers"])),
                 ("photo-z outliers without", _percent(fits["without_miri"]["photoz_outliers"])),
-                ("fracAGN scatter with MIRI", f"{fits['with_miri']['frac_agn_sigma_mad']:.3f}"),
-                ("fracAGN scatter without", f"{fits['without_miri']['frac_agn_sigma_mad']:.3f}"),
+                ("fracAGN with MIRI", _plus_minus(fits["with_miri"])),
+                ("fracAGN without", _plus_minus(fits["without_miri"])),
             ]
         )
         self.report.table(
@@ -316,13 +352,27 @@ class _Writer:
                 (
                     name,
                     f"{entry['limit']:.2f}",
+                    f"{entry['formal_limit']:.2f}",
                     f"{entry['etc_limit']:.2f}",
                     _proposal(name),
+                    f"{entry['pull_median']:+.2f}",
+                    f"{entry['pull_scatter']:.2f}",
                 )
                 for name, entry in self.metrics["bands"].items()
             ],
-            header=("band", "5 sigma here", "calculator 4.0, scaled", "CEERS proposal"),
-            caption="5-sigma limits, AB magnitudes",
+            header=(
+                "band",
+                "5 sigma, error function",
+                "formal",
+                "calculator 4.0, scaled",
+                "CEERS proposal",
+                "pull median",
+                "pull scatter",
+            ),
+            caption=(
+                "5-sigma limits (AB magnitudes), and (measured - true) / formal error of the sources "
+                "below 20 sigma, blends and template errors included"
+            ),
         )
 
     def fits(self):
@@ -351,6 +401,7 @@ class _Writer:
                     f"{entry['frac_agn_bias']:+.3f}",
                     f"{entry['frac_agn_sigma_mad']:.3f}",
                     f"{entry['frac_agn_width']:.3f}",
+                    _percent(entry["redshift_coverage"]),
                 )
                 for unit, entry in self.metrics["fits"].items()
             ],
@@ -363,8 +414,10 @@ class _Writer:
                 "fracAGN offset",
                 "scatter",
                 "width",
+                "z in 16-84 %",
             ),
-            caption="Redshift and AGN fraction against truth",
+            caption="Redshift and AGN fraction against truth; truths lie within the models of the fit, "
+            "whose 10 % model error they do not have, so posteriors are wide",
         )
         results = {unit: FitResults.read(self.context.path(f"fits_{unit}.fits")) for unit in FITS}
         key = self._example()
@@ -446,6 +499,10 @@ class _Writer:
             "The configuration is config.toml in the folder of the run; 'miricigale run' takes it. What "
             "to cite for the data: 'miricigale data list'."
         )
+
+
+def _plus_minus(fit):
+    return f"{fit['frac_agn_bias']:+.2f} ± {fit['frac_agn_sigma_mad']:.2f}"
 
 
 def _percent(value):

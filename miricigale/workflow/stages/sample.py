@@ -21,6 +21,8 @@ class SampleFlags(Flags):
     NOT_MATCHED = 8
     #: Detected in too few MIRI bands.
     FEW_BANDS = 16
+    #: Its redshift is outside of the grid of the fit.
+    OUTSIDE_GRID = 32
 
 
 def magnitude(flux):
@@ -62,7 +64,7 @@ def detected_bands(table, bands):
         return sum((table[name] > 5 * table[error_column(name)]).astype(int) for name in bands)
 
 
-def add_selection(matched, truth, bands, *, inside, min_detected):
+def add_selection(matched, truth, bands, *, inside, min_detected, redshifts):
     """
     Add ``n_detected`` and ``selection`` (`SampleFlags`, 0 in the sample) to a matched table.
 
@@ -78,6 +80,8 @@ def add_selection(matched, truth, bands, *, inside, min_detected):
         See `in_field`.
     min_detected : int
         Bands in which a source of the sample is detected.
+    redshifts : tuple of float
+        Range of the grid of the fit.
     """
     flags = np.zeros(len(matched), int)
     matched["n_detected"] = detected_bands(matched, bands)
@@ -87,5 +91,7 @@ def add_selection(matched, truth, bands, *, inside, min_detected):
     flags[~known] |= SampleFlags.NO_MODEL
     flags[~matched["matched"]] |= SampleFlags.NOT_MATCHED
     flags[matched["n_detected"] < min_detected] |= SampleFlags.FEW_BANDS
+    redshift = np.asarray(truth["redshift"], float)
+    flags[~((redshift >= redshifts[0]) & (redshift <= redshifts[1]))] |= SampleFlags.OUTSIDE_GRID
     matched["selection"] = flags
     matched["selection"].info.description = SampleFlags.describe()

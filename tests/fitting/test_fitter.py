@@ -1,0 +1,209 @@
+import pickle
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from miricigale.fitting import BayesFitter, FitFlags
+from miricigale.sed import SEDModel
+
+ARRAYS = ("chi2", "log_evidence", "pdf_2d", "moments", "quantiles", "model_flux", "best_flux")
+
+
+def _same(a, b):
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_threads_and_pieces_change_nothing(grid, photometry):
+    fitter = BayesFitter(grid)
+    serial = fitter.fit(photometry)
+    _same(serial, fitter.fit(photometry, chunk_size=5))
+    with ThreadPoolExecutor(3) as pool:
+        _same(serial, fitter.fit(photometry, executor=pool, chunk_size=2))
+
+
+@pytest.mark.slow
+def test_processes_change_nothing(grid, photometry):
+    import multiprocessing
+
+    fitter = BayesFitter(grid)
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        _same(fitter.fit(photometry), fitter.fit(photometry, executor=pool))
+
+
+def test_the_engine_is_picklable(grid, photometry):
+    fitter = BayesFitter(grid)
+    again = pickle.loads(pickle.dumps(fitter._engine))
+    flux = np.array([[photometry[name][0].value for name in grid.filters]])
+    sigma = np.full(flux.shape, 1.0)
+    prior = np.zeros((1, grid.redshift.size))
+    one, two = fitter._engine.fit(flux, sigma, prior), again.fit(flux, sigma, prior)
+    np.testing.assert_array_equal(one.zf, two.zf)
+
+
+def test_noiseless_models_are_found(grid, draw_photometry):
+    table, truth = draw_photometry(grid, 20, noise=1e-4)
+    results = BayesFitter(grid, model_error=0.0).fit(table)
+    for i, (z, g, _k, f, s) in enumerate(truth):
+        assert results.best["redshift"][i] == grid.redshift[z]
+        if grid.dust_luminosity[g] > 0:
+            assert results.best["frac_agn"][i] == grid.frac_agn[f]
+        assert results.best["tau"][i] == grid.galaxy_parameters["tau"][g].value
+        assert results.best_scale[i] == pytest.approx(s, rel=1e-3)
+
+
+def test_units_of_the_photometry_do_not_matter(grid, photometry):
+    other = photometry.copy()
+    for name in other.colnames:
+        if name.startswith("band"):
+            other[name] = other[name].to(u.mJy)
+    one, two = BayesFitter(grid).fit(photometry), BayesFitter(grid).fit(other)
+    np.testing.assert_allclose(one.pdf_2d, two.pdf_2d, atol=1e-9)
+    np.testing.assert_allclose(one.moments[:, :, 0], two.moments[:, :, 0], rtol=1e-6)
+
+
+def test_fixed_redshift_by_column_and_by_value(grid, photometry, brute_force):
+    fitter = BayesFitter(grid)
+    by_column = fitter.fit(photometry, redshift="redshift")
+    assert np.all(by_column.best["redshift"] == photometry["redshift"])
+    np.testing.assert_allclose(by_column.std("redshift").value, 0.0, atol=1e-12)
+    _same(by_column, fitter.fit(photometry, redshift=photometry["redshift"]))
+    z = int(np.flatnonzero(grid.redshift == photometry["redshift"][0])[0])
+    log_prior = np.where(np.arange(grid.redshift.size) == z, 0.0, -np.inf)
+    want = brute_force(fitter, by_column.flux[0], by_column.sigma[0], log_prior)
+    np.testing.assert_allclose(by_column.pdf_2d[0], want["zf"], atol=1e-6)
+
+
+def test_fixed_redshift_goes_to_the_nearest_node_or_is_flagged(grid, photometry):
+    z = np.array(photometry["redshift"], dtype=float)
+    z[:5] = [0.23, np.nan, -1.0, 0.0, 9.0]
+    results = BayesFitter(grid).fit(photometry, redshift=z)
+    assert results.best["redshift"][0] == grid.redshift[0]
+    assert [FitFlags.names(f) for f in results.flags[1:5]] == [
+        ["no_redshift"],
+        ["no_redshift"],
+        ["no_redshift"],
+        ["redshift_outside"],
+    ]
+    assert not results.fitted[1:5].any()
+    assert results.fitted[5:].all()
+    strict = BayesFitter(grid, redshift_tolerance=0.001).fit(photometry, redshift=z)
+    assert FitFlags.names(strict.flags[0]) == ["redshift_outside"]
+
+
+def test_rows_that_cannot_be_fitted_stay_in_place(grid, draw_photometry):
+    table, _ = draw_photometry(grid, 7, noise=0.05)
+    for name in grid.filters:
+        table[name][0] = np.nan * u.uJy
+    for name in grid.filters[1:]:
+        table[f"{name}_err"][1] = np.nan * u.uJy
+    table["band2_err"][2] = 0.0 * u.uJy
+    table["band3_err"][2] = -1.0 * u.uJy
+    table["id"][4] = table["id"][3]
+    for name in grid.filters:
+        table[name][5] = -table[name][5]
+    table["band0"][6] *= 1e4
+    table["band0_err"][6] = 1e-3 * table["band0"][6]
+    results = BayesFitter(grid, model_error=0.0).fit(table)
+    names = [FitFlags.names(f) for f in results.flags]
+    assert names[0] == ["no_band"]
+    assert names[1] == ["few_bands"]
+    assert "bad_error" in names[2]
+    assert results.n_bands[2] == 4
+    assert names[4] == ["duplicate_id"]
+    assert "no_signal" in names[5]
+    assert "high_chi2" in names[6]
+    assert list(results.ids) == list(table["id"])
+    np.testing.assert_array_equal(results.fitted, [0, 0, 1, 1, 0, 1, 1])
+    out = results.to_table()
+    assert "32 duplicate id" in out["flags"].info.description
+    assert np.isnan(out["mass_mean"][0])
+
+
+def test_masked_fluxes_are_missing_bands(grid, photometry):
+    from astropy.utils.masked import Masked
+
+    table = photometry.copy()
+    mask = np.zeros(len(table), bool)
+    mask[2] = True
+    table["band1"] = Masked(table["band1"], mask)
+    results = BayesFitter(grid).fit(table)
+    assert np.isinf(results.sigma[2, 1])
+
+
+def test_a_band_that_is_not_fitted_is_predicted(grid, draw_photometry):
+    table, truth = draw_photometry(grid, 10, noise=1e-3)
+    table.remove_columns(["band3", "band3_err"])
+    results = BayesFitter(grid, model_error=0.0).fit(table)
+    assert "band3" not in results.meta["fit"]["filters"]
+    want = [s * grid.flux(z, g, k, f)[3] for z, g, k, f, s in truth]
+    np.testing.assert_allclose(results.predict(["band3"])["band3"].value, want, rtol=0.05)
+
+
+def test_model_error_is_added_in_quadrature(grid, photometry):
+    results = BayesFitter(grid, model_error={"band1": 0.2}, error_floor=0.05).fit(photometry)
+    used = np.isfinite(results.sigma)
+    err = np.maximum(results.flux_err, 0.05 * np.abs(results.flux))
+    extra = np.where(np.arange(6) == 1, 0.2, 0.0) * results.flux
+    np.testing.assert_allclose(results.sigma[used], np.hypot(err, extra)[used])
+
+
+def test_an_empty_catalogue_gives_empty_results(grid, photometry):
+    results = BayesFitter(grid).fit(photometry[:0])
+    assert len(results) == 0
+    assert len(results.to_table()) == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "text"),
+    [
+        ({"filters": ["band9"]}, KeyError, "no filter of the grid 'band9'; known: band0"),
+        ({"filters": "band1"}, ValueError, "'filters' must be a list of names"),
+        ({"engine": "tarot"}, ValueError, "'engine' must be 'grid', got 'tarot'"),
+        ({"model_error": -1}, ValueError, "'model_error' must be finite and not negative"),
+        ({"model_error": {"x": 1}}, ValueError, r"'model_error' must be a dict with keys among"),
+        ({"priors": {"mood": "log"}}, KeyError, "no grid parameter 'mood'; known: age"),
+        ({"priors": {"tau": [1, 2]}}, ValueError, r"must be 5 weights, for tau"),
+        ({"priors": {"frac_agn": "log"}}, ValueError, "with values above 0"),
+        ({"priors": {"tau": lambda x: -x}}, ValueError, "finite, >= 0 and not all 0"),
+        ({"prior_f": "no"}, ValueError, "'prior_f' must be 'grid' or 'uniform'"),
+        ({"rtol": 1}, ValueError, r"'rtol' must be in \[0, 0.1\)"),
+        ({"n_bands_min": 0}, ValueError, "'n_bands_min' must be an integer >= 1"),
+        ({"axes": {"a": [1]}}, ValueError, "'axes' must be None when"),
+    ],
+)
+def test_bad_options_are_named(grid, options, error, text):
+    with pytest.raises(error, match=text):
+        BayesFitter(grid, **options)
+
+
+def test_bad_photometry_is_named(grid, photometry):
+    fitter = BayesFitter(grid)
+    with pytest.raises(ValueError, match="'photometry' must be a table with at least one of"):
+        fitter.fit(QTable({"id": [1]}))
+    with pytest.raises(
+        ValueError, match=r"'photometry' must be a table with the columns \['band0_err'\]"
+    ):
+        fitter.fit(photometry[[n for n in photometry.colnames if n != "band0_err"]])
+    bare = photometry.copy()
+    bare["band0"] = bare["band0"].value
+    with pytest.raises(u.UnitsError, match="'photometry' column 'band0' must be convertible"):
+        fitter.fit(bare)
+    with pytest.raises(ValueError, match="'redshift' must be a column among"):
+        fitter.fit(photometry, redshift="z_best")
+    with pytest.raises(ValueError, match="'redshift' must be 12 values"):
+        fitter.fit(photometry, redshift=[1.0, 2.0])
+    with pytest.raises(ValueError, match="'axes' and 'filters' must be given"):
+        BayesFitter(SEDModel.yang2021())
+
+
+def test_a_prior_that_leaves_nothing_is_flagged(grid, photometry):
+    from dataclasses import replace
+
+    none = replace(grid, allowed=np.zeros_like(grid.allowed))
+    results = BayesFitter(none).fit(photometry)
+    assert all(FitFlags.names(f) == ["no_model"] for f in results.flags)

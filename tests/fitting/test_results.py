@@ -1,0 +1,138 @@
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from miricigale.fitting import BayesFitter, FitResults
+from miricigale.fitting.posterior import cell_edges, cell_percentiles, moments
+from miricigale.utils.exceptions import DataError
+
+
+@pytest.fixture(scope="module")
+def results(grid, photometry):
+    return BayesFitter(grid).fit(photometry)
+
+
+def test_table_has_units_descriptions_and_provenance(results, tmp_path):
+    table = results.to_table()
+    assert table["mass_mean"].unit == u.Msun
+    assert table["sfr_p50"].unit == u.Msun / u.yr
+    assert table["accretion_power_std"].unit == u.W
+    assert table["age_p84"].unit == u.Gyr
+    assert all(table[name].info.description for name in table.colnames)
+    assert table.meta["fit"]["prior_f"] == "grid"
+    assert "nobody" in table.meta["citations"]
+    np.testing.assert_array_equal(table["id"], results.ids)
+    path = tmp_path / "results.ecsv"
+    table.write(path)
+    again = QTable.read(path)
+    np.testing.assert_allclose(again["mass_mean"], table["mass_mean"])
+
+
+def test_sum_of_parts(results):
+    """The mean of a sum is the sum of the means."""
+    total = results.mean("ir_luminosity")
+    parts = results.mean("ir_luminosity_galaxy") + results.mean("ir_luminosity_agn")
+    np.testing.assert_allclose(total.value, parts.value, rtol=1e-9)
+
+
+def test_percentiles_are_ordered_and_bracket_the_mean(results):
+    for name in results.parameters:
+        p = results.percentile(name, [0.05, 0.16, 0.5, 0.84, 0.95]).value
+        assert np.all(np.diff(p, axis=1) >= 0), name
+    for name in ("redshift", "frac_agn", "mass", "stellar_mass"):
+        mean = results.mean(name).value
+        low, high = results.percentile(name, [0.001, 0.999]).value.T
+        assert np.all((mean >= low) & (mean <= high)), name
+
+
+def test_views_agree_with_the_catalogue(results):
+    view = results[3]
+    assert view.id == 3
+    assert view.chi2 == results.chi2[3]
+    assert view.mean("mass") == results.mean("mass")[3]
+    edges, weights = view.pdf("frac_agn")
+    np.testing.assert_allclose(edges, [0.0, 0.1, 0.35, 0.7, 1.0])
+    assert weights.sum() == pytest.approx(1.0)
+    np.testing.assert_allclose(view.pdf_2d.sum(axis=0), weights, atol=1e-12)
+    edges, weights = view.pdf("mass")
+    assert edges.unit == u.Msun
+    assert len(edges) == len(weights) + 1
+    assert len(list(results)) == len(results)
+    with pytest.raises(KeyError, match="no object with the id 99 among 12; the first are 0, 1"):
+        results[99]
+    with pytest.raises(KeyError, match="no parameter 'mood'; known: accretion_power"):
+        results.mean("mood")
+    with pytest.raises(ValueError, match="'levels' must be between 0 and 1"):
+        results.percentile("mass", [16])
+
+
+def test_prediction_of_the_best_model(results, grid):
+    table = results.predict()
+    z, g, k, f = results.best_index[0]
+    want = results.best_scale[0] * grid.flux(z, g, k, f)
+    got = [table[f"{name}_best"][0].value for name in grid.filters]
+    np.testing.assert_allclose(got, want, rtol=1e-12)
+    with pytest.raises(KeyError, match="no filter of the grid 'band9'"):
+        results.predict(["band9"])
+
+
+def test_write_and_read(results, tmp_path):
+    path = tmp_path / "fits.fits"
+    results.write(path)
+    again = FitResults.read(path)
+    one, two = results.to_table(), again.to_table()
+    assert one.colnames == two.colnames
+    for name in one.colnames:
+        assert one[name].info.description == two[name].info.description
+        assert getattr(one[name], "unit", None) == getattr(two[name], "unit", None)
+        np.testing.assert_array_equal(one[name], two[name])
+    np.testing.assert_array_equal(results.pdf_2d, again.pdf_2d)
+    assert again.meta["fit"] == results.meta["fit"]
+    assert again[5].best["mass"] == results[5].best["mass"]
+    with pytest.raises(OSError, match="already exists"):
+        results.write(path)
+    results.write(path, overwrite=True)
+
+
+def test_ids_may_be_text_and_the_grid_without_agn(make_grid, draw_photometry, tmp_path):
+    grid = make_grid(frac=[0.0])
+    table, _ = draw_photometry(grid, 3)
+    table["id"] = ["a", "b", "c1"]
+    results = BayesFitter(grid).fit(table)
+    assert "frac_agn" not in results.parameters
+    results.write(tmp_path / "r.fits")
+    assert FitResults.read(tmp_path / "r.fits")["c1"].chi2 == results["c1"].chi2
+
+
+def test_foreign_files_are_refused(grid, tmp_path):
+    path = tmp_path / "grid.fits"
+    grid.write(path)
+    with pytest.raises(DataError, match="holds no fit results"):
+        FitResults.read(path)
+
+
+def test_results_cannot_be_changed(results):
+    with pytest.raises(ValueError, match="read-only"):
+        results.chi2[0] = 0
+    with pytest.raises(AttributeError):
+        results.chi2 = 0
+
+
+def test_cells():
+    np.testing.assert_allclose(cell_edges([0, 1, 3]), [-0.5, 0.5, 2, 4])
+    np.testing.assert_allclose(cell_edges([0, 1, 3], (0, 3.5)), [0, 0.5, 2, 3.5])
+    np.testing.assert_allclose(cell_edges([2.0]), [2, 2])
+
+
+def test_percentiles_of_a_uniform_distribution():
+    """Equal weights on equal cells: the percentiles are linear in the level."""
+    values = np.arange(10) + 0.5
+    pdf = np.full((2, 10), 0.1)
+    pdf[1] = np.nan
+    got = cell_percentiles(values, pdf, [0.05, 0.5, 0.999])
+    np.testing.assert_allclose(got[0], [0.5, 5.0, 9.99])
+    assert np.isnan(got[1]).all()
+    mean, std = moments(values, pdf[:1])
+    assert mean[0] == pytest.approx(5.0)
+    assert std[0] == pytest.approx(np.sqrt(99 / 12))

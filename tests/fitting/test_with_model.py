@@ -1,0 +1,64 @@
+"""The fitter with real spectra and filters."""
+
+import numpy as np
+import pytest
+
+from miricigale.fitting import BayesFitter, FitResults
+from miricigale.sed import SEDModel
+
+NAMES = ["acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1", "irac.ch2"]
+NAMES += ["miri.f770w", "miri.f1000w", "miri.f1500w", "miri.f2100w"]
+AXES = {
+    "redshift": np.array([0.5, 1.0, 1.5, 2.0]),
+    "tau": np.array([0.5, 3.0]),
+    "age": np.array([1.0, 3.0]),
+    "ebv": np.array([0.1, 0.4]),
+    "frac_agn": np.array([0.0, 0.3, 0.8]),
+    "ebv_polar": np.array([0.0, 0.2]),
+    "temperature_polar": np.array([100.0, 200.0]),
+}
+
+
+@pytest.fixture(scope="module")
+def fitter():
+    return BayesFitter(SEDModel.yang2021(), NAMES, axes=AXES)
+
+
+def test_the_best_spectrum_has_the_best_fluxes(fitter, draw_photometry, tmp_path):
+    from miricigale.filters import FilterSet
+
+    table, _ = draw_photometry(fitter.grid, 4, noise=0.02)
+    results = fitter.fit(table)
+    filters = FilterSet.from_names(NAMES)
+    for result in results:
+        sed = result.best_sed()
+        got = filters.synthetic_fluxes(sed).to_value("uJy")
+        np.testing.assert_allclose(got, results.best_flux[results.row(result.id)], rtol=1e-3)
+    results.write(tmp_path / "r.fits")
+    again = FitResults.read(tmp_path / "r.fits")
+    with pytest.raises(ValueError, match="'model' must be an SEDModel"):
+        again[0].best_sed()
+    sed = again.with_model(fitter.model)[0].best_sed()
+    np.testing.assert_allclose(sed.fnu.value, results[0].best_sed().fnu.value)
+
+
+def test_polar_temperature_keeps_its_prior_where_there_is_no_polar_dust(fitter, draw_photometry):
+    assert list(fitter.grid.agn_multiplicity) == [2, 1, 1]
+    assert list(fitter.priors.axes["temperature_polar"].values) == [100.0, 200.0]
+    np.testing.assert_allclose(fitter.priors.axes["temperature_polar"].share[:, 0], 0.5)
+    np.testing.assert_allclose(fitter.priors.agn, [2, 1, 1])
+    weighted = BayesFitter(fitter.grid, priors={"temperature_polar": [1.0, 3.0]})
+    np.testing.assert_allclose(weighted.priors.agn, [2.0, 0.5, 1.5])
+
+
+def test_plot_sed(fitter, draw_photometry):
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    table, _ = draw_photometry(fitter.grid, 1, noise=0.05)
+    top, bottom = fitter.fit(table).plot_sed(0)
+    assert len(top.lines) > 1
+    assert bottom.get_xlabel() == "observed wavelength (um)"
+    plt.close("all")
