@@ -31,9 +31,8 @@ def input_axes(kind):
     """
     Axes of the fit of the input SEDs.
 
-    The grid of the paper begins at E(B-V) 0.1 and 0.5 Gyr, which real galaxies of the catalogue
-    fall below; the inputs go down to 0 and 0.1 Gyr. The dust's alpha has one value: bands
-    shorter than a few um say nothing of it (see `make_truth`).
+    Those of the paper, but one value of the dust's alpha: bands shorter than a few um say
+    nothing of it, and a fit of it would run to the edge of the grid (see `make_truth`).
 
     Parameters
     ----------
@@ -48,8 +47,8 @@ def input_axes(kind):
     axes = SEDModel.yang2021_axes(kind)
     return {
         "tau": axes["tau"],
-        "age": np.union1d([0.1, 0.3], axes["age"]),
-        "ebv": np.union1d([0.0, 0.05], axes["ebv"]),
+        "age": axes["age"],
+        "ebv": axes["ebv"],
         "alpha": np.array([2.0]),
     }
 
