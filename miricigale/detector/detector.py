@@ -26,7 +26,7 @@ from miricigale.detector.effects import (
     stream_key,
 )
 from miricigale.detector.ramp import Ramp
-from miricigale.instrument import DetectorProperties, miri_detector, saturation_forecast
+from miricigale.instrument import DetectorProperties, Exposure, miri_detector, saturation_forecast
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import parallel_map
@@ -245,6 +245,8 @@ class Detector:
 
     def _light(self, image, exposure):
         """Surface brightness as an array, checked."""
+        if not isinstance(exposure, Exposure):
+            raise argument_error("exposure", "an Exposure", type(exposure).__name__)
         if getattr(image, "unit", None) is None:
             msg = f"'image' must be a CCDData in {SURFACE_BRIGHTNESS}, got {type(image).__name__}"
             raise TypeError(msg)

@@ -4,6 +4,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import FNU, to_array
 
 __all__ = [
     "PUBLISHED_LIGHT",
@@ -42,8 +43,8 @@ def main_sequence_sfr(stellar_mass, age_of_universe):
     ----------
     Speagle et al. 2014, ApJS 214, 15, equation 28.
     """
-    log_mass = np.log10(stellar_mass.to_value(u.Msun))
-    age = age_of_universe.to_value(u.Gyr)
+    log_mass = np.log10(to_array(stellar_mass, u.Msun, "stellar_mass"))
+    age = to_array(age_of_universe, u.Gyr, "age_of_universe")
     return 10 ** ((0.84 - 0.026 * age) * log_mass - (6.51 - 0.11 * age)) * u.Msun / u.yr
 
 
@@ -65,7 +66,7 @@ def sfr_to_infrared_luminosity(sfr):
     ----------
     Kennicutt 1998, ARA&A 36, 189, equation 4: SFR = 4.5e-44 L_IR [erg/s].
     """
-    return (sfr.to_value(u.Msun / u.yr) / 4.5e-44 * u.erg / u.s).to(u.Lsun)
+    return (to_array(sfr, u.Msun / u.yr, "sfr") / 4.5e-44 * u.erg / u.s).to(u.Lsun)
 
 
 def number_counts(flux, area, edges):
@@ -89,10 +90,10 @@ def number_counts(flux, area, edges):
     edges = np.asarray(edges, float)
     if edges.ndim != 1 or np.any(np.diff(edges) <= 0):
         raise argument_error("edges", "ascending magnitudes", edges)
-    flux = flux.to_value(u.uJy)
+    flux = to_array(flux, FNU, "flux", ndim=1)
     mag = 23.9 - 2.5 * np.log10(flux[flux > 0])
     n, _ = np.histogram(mag, edges)
-    unit = 1 / (np.diff(edges) * area.to_value(u.deg**2)) / u.deg**2
+    unit = 1 / (np.diff(edges) * _solid_angle(area)) / u.deg**2
     return n * unit, np.sqrt(n) * unit
 
 
@@ -115,13 +116,19 @@ def integrated_light(flux, area, wavelength):
         nu I_nu in nW / m2 / sr, and the Poisson error of the sources' number, weighted by
         flux (cosmic variance is not in it).
     """
-    if not np.all(np.isfinite(flux)):
-        raise argument_error(
-            "flux", "finite", f"{np.count_nonzero(~np.isfinite(flux))} that are not"
-        )
-    nu = wavelength.to(u.Hz, u.spectral())
+    flux = to_array(flux, FNU, "flux", ndim=1, finite=True) * FNU
+    area = _solid_angle(area) * u.deg**2
+    nu = to_array(wavelength, u.Hz, "wavelength", ndim=0, equivalencies=u.spectral()) * u.Hz
     unit = u.nW / u.m**2 / u.sr
     return (
         (nu * flux.sum() / area).to(unit),
         (nu * np.sqrt((flux**2).sum()) / area).to(unit),
     )
+
+
+def _solid_angle(area):
+    """Check an area: a positive number of square degrees."""
+    value = float(to_array(area, u.deg**2, "area", ndim=0))
+    if not (np.isfinite(value) and value > 0):
+        raise argument_error("area", "finite and positive", area)
+    return value

@@ -4,7 +4,9 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column, match_sky, require_columns
+from miricigale.utils.units import FNU
 
 __all__ = ["match_truth"]
 
@@ -31,10 +33,20 @@ def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):
         (-1 where nothing matched), ``separation``, ``matched`` and, for each band,
         ``<band>_true``, ``<band>`` and ``<band>_err`` (NaN where nothing matched), and
         the flag columns of ``measured`` (``<band>_flags`` or ``flags``).
+
+    Raises
+    ------
+    ValueError
+        If a column is missing or ``bands`` is one name.
+    `~astropy.units.UnitsError`
+        If a flux column or ``radius`` has a wrong unit or none.
     """
+    if isinstance(bands, str):
+        raise argument_error("bands", "a list of filter names", repr(bands))
     bands = list(bands)
-    require_columns(truth, ["id", "sky", *bands], "truth")
-    require_columns(measured, ["id", "sky"], "measured")
+    units = dict.fromkeys([c for band in bands for c in (band, error_column(band))], FNU)
+    require_columns(truth, ["id", "sky", *bands], "truth", units=dict.fromkeys(bands, FNU))
+    require_columns(measured, ["id", "sky"], "measured", units=units)
     index, separation = match_sky(measured["sky"], truth["sky"], radius=radius)
     found = index >= 0
     table = QTable({"id": truth["id"], "sky": truth["sky"]})

@@ -317,14 +317,14 @@ class Filter:
         Raises
         ------
         ValueError
-            If the spectrum leaves more than 1e-4 of the band uncovered.
+            If it is no spectrum, or leaves more than 1e-4 of the band uncovered.
 
         References
         ----------
         Bessell & Murphy 2012, PASP, 124, 140, equation A15.
         """
-        fnu = to_array(sed.fnu, FNU, "sed.fnu", ndim=1)
-        first, part = self._weights(check_wave(sed.wave), UNCOVERED)
+        wave, fnu = spectrum_arrays(sed)
+        first, part = self._weights(wave, UNCOVERED)
         return float(part @ fnu[first : first + part.size]) * FNU
 
     def plot(self, ax=None, **kwargs):
@@ -355,6 +355,17 @@ def check_wave(wave):
     if wave.ndim != 1 or wave.size < 2 or not np.all(np.diff(wave) > 0):
         raise argument_error("wave", "two or more strictly ascending wavelengths", wave)
     return wave
+
+
+def spectrum_arrays(sed):
+    """Wavelengths (um) and F_nu (uJy) of anything with ``wave`` and ``fnu``."""
+    if not (hasattr(sed, "wave") and hasattr(sed, "fnu")):
+        raise argument_error("sed", "an object with wave and fnu", type(sed).__name__)
+    wave, fnu = check_wave(sed.wave), to_array(sed.fnu, FNU, "sed.fnu", ndim=1)
+    if wave.shape != fnu.shape:
+        got = f"{fnu.size} for {wave.size} wavelengths"
+        raise argument_error("sed.fnu", "as many values as sed.wave", got)
+    return wave, fnu
 
 
 @functools.lru_cache(maxsize=512)

@@ -5,9 +5,9 @@ import dataclasses
 import astropy.units as u
 import numpy as np
 
-from miricigale.filters.filter import UNCOVERED, Filter, check_wave
+from miricigale.filters.filter import UNCOVERED, Filter, check_wave, spectrum_arrays
 from miricigale.utils.exceptions import argument_error, unknown_name
-from miricigale.utils.units import FNU, WAVE, to_array
+from miricigale.utils.units import FNU, WAVE
 
 __all__ = ["FilterSet"]
 
@@ -131,8 +131,8 @@ class FilterSet:
         fluxes : `~astropy.units.Quantity`, shape (n_filters,)
             In uJy.
         """
-        fnu = to_array(sed.fnu, FNU, "sed.fnu", ndim=1)
-        return self.weights(sed.wave) @ fnu * FNU
+        wave, fnu = spectrum_arrays(sed)
+        return self.weights(wave) @ fnu * FNU
 
     def plot(self, ax=None, **kwargs):
         """

@@ -15,6 +15,7 @@ from miricigale.psf import _core
 from miricigale.psf.model import make_psf, psf_info
 from miricigale.psf.resample import average_psf, psf_image, psf_mosaic, rotate_psf
 from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.files import open_fits
 from miricigale.utils.units import ANGLE, frozen_array, to_array
 
 __all__ = ["REGULARIZATIONS", "MatchingKernel"]
@@ -309,25 +310,29 @@ class MatchingKernel:
         Raises
         ------
         `~miricigale.utils.exceptions.DataError`
-            If the file is not a kernel.
+            If the file is missing or not a kernel.
         """
-        with fits.open(path) as hdus:
+        with open_fits(path, wanted="a matching kernel") as hdus:
             if "KERNEL" not in hdus:
                 msg = f"{path} has no KERNEL extension, only {[hdu.name for hdu in hdus]}"
                 raise DataError(msg)
             header = hdus["KERNEL"].header
-            arrays = {
-                name: np.array(hdus[name.upper()].data, dtype=float)
-                for name in ("source", "target")
-                if name.upper() in hdus
-            }
-            return cls(
-                np.array(hdus["KERNEL"].data, dtype=float),
-                header["PIXSCALE"] * ANGLE,
-                regularization=header.get("REGULAR", float("nan")),
-                meta=json.loads(header.get("META", "{}")),
-                **arrays,
-            )
+            try:
+                arrays = {
+                    name: np.array(hdus[name.upper()].data, dtype=float)
+                    for name in ("source", "target")
+                    if name.upper() in hdus
+                }
+                return cls(
+                    np.array(hdus["KERNEL"].data, dtype=float),
+                    header["PIXSCALE"] * ANGLE,
+                    regularization=header.get("REGULAR", float("nan")),
+                    meta=json.loads(header.get("META", "{}")),
+                    **arrays,
+                )
+            except (KeyError, TypeError, ValueError) as err:
+                msg = f"{path} is not a complete matching kernel: {err}"
+                raise DataError(msg) from err
 
     def _need_psfs(self):
         if self.source is None or self.target is None:

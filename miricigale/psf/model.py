@@ -4,11 +4,11 @@ import dataclasses
 
 import astropy.units as u
 import numpy as np
-from astropy.io import fits
 from photutils.psf import GriddedPSFModel, ImagePSF
 
 from miricigale.psf import _core
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.files import open_fits
 from miricigale.utils.units import ANGLE, to_array
 
 __all__ = ["FRAMES", "PSFInfo", "from_photutils", "make_psf", "psf_info", "read_psf"]
@@ -340,10 +340,12 @@ def read_psf(
 
     Raises
     ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file is missing or no FITS.
     ValueError
         If there is no 2D image there.
     """
-    with fits.open(path, output_verify="silentfix") as hdus:
+    with open_fits(path, wanted="a PSF", output_verify="silentfix") as hdus:
         data = hdus[ext].data
         if data is not None and plane is not None:
             data = data[plane]

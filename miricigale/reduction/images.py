@@ -2,14 +2,19 @@
 
 import numpy as np
 from astropy.nddata import CCDData, StdDevUncertainty
+from astropy.wcs import WCS
 
 from miricigale.reduction.flags import MASKED
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import SURFACE_BRIGHTNESS
 
 __all__ = [
+    "check_images",
+    "check_overlap",
     "exposure_values",
     "flag_pixels",
     "image",
+    "overlaps",
     "plain_flags",
     "plain_mask",
     "seen_wcs",
@@ -138,3 +143,37 @@ def seen_wcs(im):
     wcs = im.wcs.slice(part)
     wcs.pixel_shape = tuple(int(np.ptp(index)) + 1 for index in (columns, rows))
     return wcs
+
+
+def check_images(images, wcs, *, shape=None):
+    """Refuse images that cannot be put together, and what is no grid for them."""
+    if not isinstance(wcs, WCS):
+        raise argument_error("wcs", "an astropy WCS", type(wcs).__name__)
+    if shape is None and wcs.pixel_shape is None:
+        raise argument_error("wcs", "a WCS with a pixel_shape, or 'shape' given", "neither")
+    if not images:
+        raise argument_error("images", "at least one image", "none")
+    for im in images:
+        if not isinstance(im, CCDData) or im.wcs is None or im.uncertainty is None:
+            raise argument_error("images", "CCDData with uncertainty and WCS", repr(type(im)))
+        if im.unit != images[0].unit:
+            raise argument_error("images", f"in one unit ({images[0].unit})", str(im.unit))
+    if not images[0].unit.is_equivalent(SURFACE_BRIGHTNESS):
+        wanted = f"surface brightness (convertible to {SURFACE_BRIGHTNESS}; see calibrate)"
+        raise argument_error("images", wanted, f"unit {images[0].unit}")
+    filters = sorted({str(im.meta["filter"]) for im in images if "filter" in im.meta})
+    if len(filters) > 1:
+        raise argument_error("images", "of one filter", ", ".join(filters))
+
+
+def check_overlap(pixel_maps, shape):
+    """Refuse a grid that no image touches."""
+    if not any(overlaps(where, shape) for where in pixel_maps):
+        got = "one elsewhere on the sky: no image touches it"
+        raise argument_error("wcs", "a grid that overlaps the images", got)
+
+
+def overlaps(where, shape):
+    """Whether an image's pixels come within half a pixel of a grid (NaN does not)."""
+    (x, y), (ny, nx) = where, shape
+    return bool(np.any((x > -1) & (x < nx) & (y > -1) & (y < ny)))

@@ -4,13 +4,22 @@ import dataclasses
 
 import numpy as np
 from astropy.nddata import CCDData
+from astropy.wcs import NoConvergence
 from astropy.wcs.utils import proj_plane_pixel_area
 from drizzle.resample import Drizzle
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import map_coordinates
 
 from miricigale.reduction.flags import PixelFlags
-from miricigale.reduction.images import flag_pixels, image, plain_mask, sigma
+from miricigale.reduction.images import (
+    check_images,
+    check_overlap,
+    flag_pixels,
+    image,
+    overlaps,
+    plain_mask,
+    sigma,
+)
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import argument_error
 
@@ -67,7 +76,12 @@ def pixel_map(wcs_in, wcs_out, shape):
     x, y : `~numpy.ndarray`, shape (ny, nx)
         Coordinates in the second image. Polynomial distortion is evaluated on a grid of 49
         x 49 nodes and interpolated by bicubic splines (1e-5 pixels or better); tables of
-        distortion are followed pixel by pixel.
+        distortion are followed pixel by pixel. NaN on the other side of the sky.
+
+    Raises
+    ------
+    ValueError
+        If the distortion of ``wcs_out`` cannot be inverted there.
     """
     ny, nx = shape
     smooth = not any(
@@ -81,10 +95,19 @@ def pixel_map(wcs_in, wcs_out, shape):
         nodes_y, nodes_x = np.arange(ny, dtype=float), np.arange(nx, dtype=float)
     grid_x, grid_y = np.meshgrid(nodes_x, nodes_y)
     world = wcs_in.all_pix2world(grid_x.ravel(), grid_y.ravel(), 0)
-    found = wcs_out.all_world2pix(*world, 0)
+    try:
+        found = wcs_out.all_world2pix(*world, 0)
+    except NoConvergence:
+        wanted = "a WCS whose distortion can be inverted where the image lies"
+        raise argument_error(
+            "wcs_out (the grid's wcs)", wanted, "one that diverges there"
+        ) from None
     x, y = (np.reshape(values, grid_x.shape) for values in found)
     if x.shape == (ny, nx):
         return x, y
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        # splines know no NaN; images on the other side of the sky come here
+        return np.full((2, ny, nx), np.nan)
     rows, columns = np.arange(ny, dtype=float), np.arange(nx, dtype=float)
     return tuple(RectBivariateSpline(nodes_y, nodes_x, values)(rows, columns) for values in (x, y))
 
@@ -178,20 +201,24 @@ def drizzle_images(images, wcs, *, shape=None, pixfrac=1.0, weights=None, pixel_
     Raises
     ------
     ValueError
-        If there are no images, units differ or the output has no shape.
+        If there are no images, they are not surface brightness of one unit and filter, or
+        the output has no shape or lies elsewhere on the sky.
     """
     images = list(images)
-    _check(images)
+    check_images(images, wcs, shape=shape)
     if not 0 < pixfrac <= 1:
         raise argument_error("pixfrac", "above 0 and at most 1", pixfrac)
-    if shape is None:
-        if wcs.pixel_shape is None:
-            raise argument_error("wcs", "a WCS with a pixel_shape, or 'shape' given", "neither")
-        shape = wcs.pixel_shape[::-1]
+    shape = wcs.pixel_shape[::-1] if shape is None else shape
     shape = tuple(int(n) for n in shape)
-    weights = [weight_map(im) for im in images] if weights is None else list(weights)
     if pixel_maps is None:
-        pixel_maps = [None] * len(images)
+        pixel_maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
+    check_overlap(pixel_maps, shape)
+    weights = [weight_map(im) for im in images] if weights is None else list(weights)
+    return _drizzle(images, wcs, shape, pixfrac, weights, pixel_maps)
+
+
+def _drizzle(images, wcs, shape, pixfrac, weights, pixel_maps):
+    """As `drizzle_images`, of what was checked; images may lie beside the grid."""
     # drizzle works in float32: weights near one
     positive = [w[w > 0] for w in weights]
     positive = [w for w in positive if w.size]
@@ -202,8 +229,9 @@ def drizzle_images(images, wcs, *, shape=None, pixfrac=1.0, weights=None, pixel_
     )
     n_images = np.zeros(shape, np.uint8)
     before = np.zeros(shape, np.float32)
-    for im, weight, where in zip(images, weights, pixel_maps, strict=True):
-        x, y = pixel_map(im.wcs, wcs, im.shape) if where is None else where
+    for im, weight, (x, y) in zip(images, weights, pixel_maps, strict=True):
+        if not overlaps((x, y), shape):
+            continue
         mask = plain_mask(im)
         weight = np.where(mask, 0.0, np.asarray(weight) / unit_weight).astype(np.float32)
         if not weight.any():
@@ -287,7 +315,7 @@ def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None,
     Fruchter & Hook 2002, PASP 114, 144, sec. 5 (without the second pass on neighbours).
     """
     images = list(images)
-    _check(images)
+    check_images(images, wcs)
     if not threshold > 0:
         raise argument_error("threshold", "positive", threshold)
     if not derivative >= 0:
@@ -299,7 +327,7 @@ def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None,
         pixel_maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
     stack = np.stack(
         [
-            drizzle_images([im], wcs, weights=[w], pixel_maps=[p]).image.data
+            _drizzle([im], wcs, wcs.pixel_shape[::-1], 1.0, [w], [p]).image.data
             for im, w, p in zip(images, weights, pixel_maps, strict=True)
         ]
     )
@@ -346,16 +374,6 @@ def _nan_median(stack, count):
 def _scale(wcs):
     """Side of a pixel at the reference position, deg."""
     return float(np.sqrt(proj_plane_pixel_area(wcs)))
-
-
-def _check(images):
-    if not images:
-        raise argument_error("images", "at least one image", "none")
-    for im in images:
-        if not isinstance(im, CCDData) or im.wcs is None or im.uncertainty is None:
-            raise argument_error("images", "CCDData with uncertainty and WCS", repr(type(im)))
-        if im.unit != images[0].unit:
-            raise argument_error("images", f"in one unit ({images[0].unit})", str(im.unit))
 
 
 def _meta(images):

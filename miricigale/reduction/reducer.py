@@ -3,14 +3,19 @@
 import dataclasses
 
 import numpy as np
-from astropy.nddata import CCDData
 
-from miricigale.detector import DQ
+from miricigale.detector import DQ, Ramp
 from miricigale.instrument import DetectorProperties, miri_detector, mosaic_wcs
 from miricigale.reduction.background import estimate_background, subtract_background
 from miricigale.reduction.calibration import calibrate
 from miricigale.reduction.flags import PixelFlags
-from miricigale.reduction.images import exposure_values, image, seen_wcs
+from miricigale.reduction.images import (
+    check_images,
+    check_overlap,
+    exposure_values,
+    image,
+    seen_wcs,
+)
 from miricigale.reduction.mosaic import (
     drizzle_images,
     pixel_map,
@@ -160,8 +165,10 @@ class Reducer:
         Raises
         ------
         ValueError
-            If fewer than two groups are left.
+            If it is no ramp, or fewer than two groups are left.
         """
+        if not isinstance(ramp, Ramp):
+            raise argument_error("ramp", "a Ramp", type(ramp).__name__)
         exposure, detector = ramp.exposure, self._detector
         dq = np.asarray(ramp.pixel_dq)
         reference = (dq & np.uint32(DQ.REFERENCE_PIXEL)) != 0
@@ -313,6 +320,12 @@ class Reducer:
             data (and NaN there). The meta dictionary has ``n_exposures``,
             ``exposure_time`` (s, sum), ``pa_aper`` (deg, list) and ``noise_correction``,
             that of the inputs times that of the drizzle (`noise_correction`).
+
+        Raises
+        ------
+        ValueError
+            If the images are not surface brightness of one filter, or the grid has no shape
+            or lies elsewhere on the sky.
         """
         return self.drizzle(images, wcs, pixfrac=pixfrac)[0].image
 
@@ -329,12 +342,11 @@ class Reducer:
             The inputs with outliers masked.
         """
         images = list(images)
-        for im in images:
-            if not isinstance(im, CCDData):
-                raise argument_error("images", "made of CCDData", type(im).__name__)
+        check_images(images, wcs)
         pixfrac = self.pixfrac if pixfrac is None else pixfrac
         weights = [weight_map(im) for im in images]
         maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
+        check_overlap(maps, wcs.pixel_shape[::-1])
         judged = all("n_outliers" in im.meta for im in images)
         if self.outlier_threshold is not None and len(images) >= 3 and not judged:
             images = reject_outliers(

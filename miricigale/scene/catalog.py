@@ -10,10 +10,11 @@ from astropy.io.registry import IORegistryError
 from astropy.table import QTable, Table
 from astropy.units import UnitsWarning
 
+from miricigale.filters import Filter
 from miricigale.profiles import SERSIC_INDEX_RANGE
 from miricigale.refdata import locate, resources
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.tables import Flags, require_columns, unique_ids
+from miricigale.utils.tables import Flags, error_column, require_columns, unique_ids
 from miricigale.utils.units import FNU
 
 __all__ = ["CATALOG_COLUMNS", "CatalogFlags", "check_catalog", "read_catalog"]
@@ -70,7 +71,8 @@ def check_catalog(table, *, filters=(), argument="catalog"):
     ----------
     table : `~astropy.table.Table`
         With the columns of `CATALOG_COLUMNS`; ``ra`` and ``dec`` (with units) may stand for
-        ``sky``. Columns of fluxes are called by their filter (``"miri.f770w"``).
+        ``sky``. Columns of fluxes are called by their filter (``"miri.f770w"``), those of
+        errors end on ``_err``. ``star`` (bool) says which sources are stars.
     filters : iterable of str, optional
         Flux columns that must be there.
     argument : str, optional
@@ -80,15 +82,16 @@ def check_catalog(table, *, filters=(), argument="catalog"):
     -------
     catalog : `~astropy.table.QTable`
         A copy with ``sky`` in ICRS, radii in arcsec, angles in deg, fluxes in uJy and a
-        column ``flags`` (`CatalogFlags`). Other columns are kept.
+        column ``flags`` (`CatalogFlags`); ``star`` is False throughout where there was none.
+        Other columns are kept.
 
     Raises
     ------
     ValueError
-        If a column is missing, an id is there twice, a position is not finite, a profile
+        If a column is missing, ``star`` is not bool, an id is there twice, a position is not finite, a profile
         has an unknown name or there are no rows.
     `~astropy.units.UnitsError`
-        If a column has no unit or a wrong one.
+        If a column has no unit or a wrong one; a column called by a filter must be a flux.
     """
     if not isinstance(table, Table):
         raise argument_error(argument, "a table", type(table).__name__)
@@ -101,7 +104,8 @@ def check_catalog(table, *, filters=(), argument="catalog"):
         catalog["sky"] = SkyCoord(*sky)
     units = {name: unit for name, unit in CATALOG_COLUMNS.items() if unit is not None}
     require_columns(catalog, CATALOG_COLUMNS, argument, units=units)
-    require_columns(catalog, filters, argument, units=dict.fromkeys(filters, FNU))
+    fluxes = [*filters, *(name for name in catalog.colnames if _is_flux(name))]
+    require_columns(catalog, filters, argument, units=dict.fromkeys(fluxes, FNU))
     if len(catalog) == 0:
         raise argument_error(argument, "a table with rows", "none")
     if not isinstance(catalog["sky"], SkyCoord):
@@ -124,11 +128,24 @@ def check_catalog(table, *, filters=(), argument="catalog"):
             catalog[name] = _plain(catalog, name, unit, argument)
     for name in catalog.colnames:
         unit = getattr(catalog[name], "unit", None)
-        if "." in name and unit is not None and unit.is_equivalent(FNU):
+        linear = isinstance(unit, u.UnitBase)  # a magnitude is none
+        if "." in name and linear and unit.is_equivalent(FNU):
             catalog[name] = _plain(catalog, name, FNU, argument)
+    if "star" not in catalog.colnames:
+        catalog["star"] = np.zeros(len(catalog), dtype=bool)
+    star = catalog["star"]
+    if star.dtype != bool or np.any(getattr(star, "mask", False)):
+        got = "missing values" if star.dtype == bool else star.dtype
+        raise argument_error(argument, "a table with True or False in 'star'", got)
     catalog["flags"] = _flags(catalog)
     catalog["flags"].info.description = CatalogFlags.describe()
     return catalog
+
+
+def _is_flux(name):
+    """Whether a column is called by a filter of the library, or is the error of one."""
+    band = name.removesuffix(error_column(""))
+    return band in Filter.names() or band.startswith("sedpy.")
 
 
 def _refuse_positions(bad, argument):

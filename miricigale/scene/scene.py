@@ -108,7 +108,7 @@ class Scene:
     psf : `~photutils.psf.ImagePSF`
         PSF on the image's pixels with the pixel response in it. If its meta gives a
         ``pixel_scale`` (arcsec) or, in the frame of the sky, an ``angle`` (deg), they are
-        compared with the WCS.
+        compared with the WCS; a ``filter`` in it must be ``filter``.
     background : `~miricigale.scene.Background` or `~astropy.units.Quantity`, optional
         Background, or its constant level; none by default.
     enclosed : float, optional
@@ -121,7 +121,7 @@ class Scene:
     Raises
     ------
     ValueError
-        If the WCS has no shape, or the PSF belongs to other pixels.
+        If the WCS has no shape, or the PSF belongs to other pixels or another filter.
 
     Notes
     -----
@@ -220,6 +220,12 @@ class Scene:
             if abs(turn) > 1:
                 got = f"turned by {turn:.1f} deg (see miricigale.psf.rotate_psf)"
                 raise argument_error("psf", "in the orientation of the WCS", got)
+        have = meta.get("filter")
+        if isinstance(have, str):
+            # other packages write F770W where we write miri.f770w
+            wanted, have = self._filter.lower(), have.lower()
+            if have not in (wanted, wanted.rpartition(".")[2]):
+                raise argument_error("psf", f"one of the filter {self._filter}", f"one of {have}")
 
     @functools.cached_property
     def _painted(self):

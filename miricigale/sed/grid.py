@@ -10,6 +10,7 @@ from astropy.io import fits
 from astropy.table import QTable
 
 from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.files import open_fits
 from miricigale.utils.units import frozen_array
 
 __all__ = ["ModelGrid"]
@@ -221,10 +222,10 @@ class ModelGrid:
         Raises
         ------
         `~miricigale.utils.exceptions.DataError`
-            If the file is something else or truncated.
+            If the file is missing, something else or truncated.
         """
         try:
-            with fits.open(Path(path), memmap=False) as hdus:
+            with open_fits(path, wanted="a model grid", memmap=False) as hdus:
                 if hdus[0].header.get("FORMAT") != _FORMAT:
                     msg = f"{path} is not a model grid (no FORMAT = {_FORMAT!r} in its header)"
                     raise DataError(msg)

@@ -1,9 +1,11 @@
 """Models: components in a chain, from parameters to spectra and band fluxes."""
 
+import difflib
 import functools
+import warnings
 
 import astropy.units as u
-from astropy.table import QTable
+from astropy.table import QTable, Table
 
 from miricigale.filters import FilterSet
 from miricigale.refdata import citations
@@ -12,7 +14,7 @@ from miricigale.sed.chain import Chain
 from miricigale.sed.component import COMPONENTS, ROLES, Component
 from miricigale.sed.parameter import Parameter
 from miricigale.sed.spectrum import COSMOLOGY, SED, distance
-from miricigale.utils.exceptions import ConfigError, argument_error, unknown_name
+from miricigale.utils.exceptions import ConfigError, MiricigaleWarning, argument_error, unknown_name
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import FNU, WAVE
 
@@ -346,9 +348,35 @@ class SEDModel:
             ``id`` if the input has it, a column in uJy for each band, derived quantities and
             ``flags`` (`~miricigale.sed.ModelFlags`); a row that cannot be evaluated is flagged and
             holds NaN.
+
+        Raises
+        ------
+        ValueError
+            If it is no table or has no redshift.
+        `~astropy.units.UnitsError`
+            If a column has a wrong unit.
+
+        Warns
+        -----
+        `~miricigale.utils.exceptions.MiricigaleWarning`
+            If a column's name is within a letter or two of a parameter's.
         """
+        if not isinstance(table, (Table, dict)):
+            raise argument_error("table", "a table", type(table).__name__)
         filters = filters if isinstance(filters, FilterSet) else FilterSet(filters)
-        return tables.flux_table(self, QTable(table, copy=False), filters)
+        table = QTable(table, copy=False)
+        self._warn_of_slips(table.colnames)
+        return tables.flux_table(self, table, filters)
+
+    def _warn_of_slips(self, names):
+        """Warn of columns that are left alone and look like a parameter misspelt."""
+        names = [name for name in names if name not in self._parameters]
+        lower = {name.lower(): name for name in self._parameters}
+        for name in sorted(set(names) - set(tables.DERIVED)):
+            close = difflib.get_close_matches(name.lower(), lower, n=1, cutoff=0.85)
+            if close:
+                msg = f"column {name!r} is no parameter and left alone: is it {lower[close[0]]!r}?"
+                warnings.warn(msg, MiricigaleWarning, stacklevel=3)
 
     def grid(self, axes, filters):
         """

@@ -30,7 +30,7 @@ def native(array, dtype=None):
     Returns
     -------
     array : `~numpy.ndarray`
-        The input itself where it already complies, else a copy.
+        A view of the input's own memory where it already complies, else a copy.
     """
     array = np.asarray(array)
     if dtype is None:

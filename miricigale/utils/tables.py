@@ -5,8 +5,10 @@ import enum
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import match_coordinates_sky
+from astropy.table import Table
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import ANGLE, to_array
 
 __all__ = ["Flags", "error_column", "match_sky", "require_columns", "unique_ids"]
 
@@ -49,10 +51,12 @@ def require_columns(table, names, argument, *, units=None):
     Raises
     ------
     ValueError
-        If a column is missing; the message lists what is there.
+        If it is no table, or a column is missing; the message lists what is there.
     `~astropy.units.UnitsError`
-        If a column has no unit or a wrong one.
+        If a column has no unit or a wrong one (magnitudes are no fluxes).
     """
+    if not isinstance(table, Table):
+        raise argument_error(argument, "a table", type(table).__name__)
     missing = [name for name in names if name not in table.colnames]
     if missing:
         raise argument_error(
@@ -62,7 +66,12 @@ def require_columns(table, names, argument, *, units=None):
         if name not in table.colnames:
             continue
         have = getattr(table[name], "unit", None)
-        if have is None or not u.Unit(have).is_equivalent(unit):
+        have = None if have is None else u.Unit(have)
+        if isinstance(have, u.function.FunctionUnitBase) or have is None:
+            good = False
+        else:
+            good = have.is_equivalent(unit)
+        if not good:
             msg = f"'{argument}' column {name!r} must be convertible to {unit}, got {have}"
             raise u.UnitsError(msg)
 
@@ -97,7 +106,15 @@ def match_sky(coords, reference, *, radius):
         claimed by several references goes to the nearest.
     separation : `~astropy.units.Quantity`, shape (n_reference,)
         Separation in arcsec, NaN where there is no match.
+
+    Raises
+    ------
+    `~astropy.units.UnitsError`, ValueError
+        If ``radius`` is no angle, or not one of at least 0.
     """
+    limit = float(to_array(radius, ANGLE, "radius", ndim=0))
+    if not limit >= 0:
+        raise argument_error("radius", "at least 0", radius)
     n = len(reference)
     index = np.full(n, -1)
     separation = np.full(n, np.nan)
@@ -106,7 +123,7 @@ def match_sky(coords, reference, *, radius):
         sep = sep.to_value(u.arcsec)
         taken = set()
         for row in np.argsort(sep, kind="stable"):
-            if sep[row] <= radius.to_value(u.arcsec) and nearest[row] not in taken:
+            if sep[row] <= limit and nearest[row] not in taken:
                 taken.add(nearest[row])
                 index[row] = nearest[row]
                 separation[row] = sep[row]

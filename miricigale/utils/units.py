@@ -64,16 +64,24 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
     `~astropy.units.UnitsError`
         If the unit cannot be converted or is missing.
     ValueError
-        If the number of dimensions is wrong or a value is not finite.
+        If it is no number, the number of dimensions is wrong or a value is not finite.
     """
     unit = u.Unit(unit)
-    if not hasattr(value, "unit"):
-        value = u.Quantity(value)
-        if value.unit == u.dimensionless_unscaled and unit != u.dimensionless_unscaled:
-            msg = f"'{name}' must be a quantity convertible to {unit}, got a bare number"
-            raise u.UnitsError(msg)
     try:
         quantity = u.Quantity(value)
+    except u.UnitTypeError:
+        # magnitudes and other logarithms
+        msg = f"'{name}' must be convertible to {unit}, got {value.unit}"
+        raise u.UnitsError(msg) from None
+    except (TypeError, ValueError):
+        wanted = "numbers" if unit == u.dimensionless_unscaled else f"convertible to {unit}"
+        got = repr(value) if isinstance(value, (str, list)) else type(value).__name__
+        raise argument_error(name, wanted, got) from None
+    bare = not hasattr(value, "unit") and quantity.unit == u.dimensionless_unscaled
+    if bare and unit != u.dimensionless_unscaled:
+        msg = f"'{name}' must be a quantity convertible to {unit}, got a bare number"
+        raise u.UnitsError(msg)
+    try:
         array = np.asarray(quantity.to_value(unit, equivalencies or []), dtype=float)
     except u.UnitConversionError:
         msg = f"'{name}' must be convertible to {unit}, got {getattr(value, 'unit', None)}"

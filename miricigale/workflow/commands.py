@@ -94,7 +94,11 @@ def _read_table(path):
     if not path.is_file():
         msg = f"no table {path}"
         raise DataError(msg)
-    return QTable.read(path)
+    try:
+        return QTable.read(path)
+    except (OSError, ValueError, TypeError) as err:
+        msg = f"{path} cannot be read as a table (ECSV or FITS): {str(err).splitlines()[0]}"
+        raise DataError(msg) from err
 
 
 def fit_table(

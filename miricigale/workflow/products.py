@@ -12,6 +12,7 @@ from astropy.wcs import WCS
 
 from miricigale.refdata.locate import file_sha256
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import open_fits
 
 __all__ = ["ProductStore", "read_image", "write_image"]
 
@@ -81,14 +82,7 @@ def read_image(path, *, planes=()):
     `~miricigale.utils.exceptions.DataError`
         If the file is missing or has no SCI extension.
     """
-    if not Path(path).is_file():
-        msg = f"no image file {path}"
-        raise DataError(msg)
-    try:
-        hdus = fits.open(path)
-    except OSError as err:
-        msg = f"{path} is not a FITS image: {err}"
-        raise DataError(msg) from None
+    hdus = open_fits(path, wanted="an image (FITS with SCI)")
     with hdus:
         if "SCI" not in hdus:
             msg = f"{path} has no SCI extension, only {[hdu.name for hdu in hdus]}"

@@ -289,3 +289,8 @@ def test_ramp_checks_its_arrays(make_exposure):
         Ramp(good, exposure, pixel_dq=np.zeros((64, 72)))
     with pytest.raises(ValueError, match="'group_dq' must be"):
         Ramp(good, exposure, group_dq=np.zeros((64, 72), np.uint8))
+
+
+def test_what_is_no_exposure_is_named(make_exposure, make_sky, detector):
+    with pytest.raises(ValueError, match="'exposure' must be an Exposure, got NoneType"):
+        detector.expose(make_sky(make_exposure(), 1.0), None)

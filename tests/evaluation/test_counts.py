@@ -39,5 +39,19 @@ def test_integrated_light_in_closed_form():
     light, error = integrated_light([4.0, 4.0] * u.Jy, 8e-6 * u.sr, 15 * u.um)
     assert light.to_value(u.nW / u.m**2 / u.sr) == pytest.approx(199.86, rel=1e-4)
     assert (error / light).to_value(u.one) == pytest.approx(1 / np.sqrt(2))
-    with pytest.raises(ValueError, match="'flux' must be finite, got 1 that are not"):
+    with pytest.raises(ValueError, match="'flux' must be finite values, got 1 that are NaN"):
         integrated_light([np.nan, 1] * u.Jy, 1 * u.sr, 15 * u.um)
+
+
+def test_bare_numbers_are_refused_by_name():
+    flux, area = [1.0, 2.0] * u.uJy, 1 * u.deg**2
+    with pytest.raises(u.UnitsError, match=r"'area' must be a quantity convertible to deg2"):
+        number_counts(flux, 1, [23, 24])
+    with pytest.raises(ValueError, match="'area' must be finite and positive, got 0"):
+        number_counts(flux, 0 * u.sr, [23, 24])
+    with pytest.raises(ValueError, match="'area' must be convertible to deg2, got NoneType"):
+        integrated_light(flux, None, 15 * u.um)
+    with pytest.raises(u.UnitsError, match=r"'flux' must be convertible to uJy, got mag\(AB\)"):
+        number_counts([23.0] * u.ABmag, area, [23, 24])
+    with pytest.raises(u.UnitsError, match="'wavelength' must be a quantity convertible to Hz"):
+        integrated_light(flux, area, 15)

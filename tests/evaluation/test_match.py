@@ -50,3 +50,20 @@ def test_missing_columns_are_named(truth):
         ValueError, match=r"'truth' must be a table with the columns \['miri.f560w'\]"
     ):
         match_truth(truth, truth, ["miri.f560w"])
+
+
+def test_wrong_units_are_named(truth):
+    measured = truth.copy()
+    measured["miri.f770w_err"] = 0.1 * u.uJy
+    with pytest.raises(u.UnitsError, match="'radius' must be a quantity convertible to arcsec"):
+        match_truth(truth, measured, ["miri.f770w"], radius=1)
+    with pytest.raises(ValueError, match="'radius' must be at least 0, got -1"):
+        match_truth(truth, measured, ["miri.f770w"], radius=-1 * u.arcsec)
+    measured["miri.f770w"] = measured["miri.f770w"].to(u.ABmag)
+    message = r"'measured' column 'miri\.f770w' must be convertible to uJy, got mag\(AB\)"
+    with pytest.raises(u.UnitsError, match=message):
+        match_truth(truth, measured, ["miri.f770w"])
+    with pytest.raises(ValueError, match="'truth' must be a table, got NoneType"):
+        match_truth(None, measured, ["miri.f770w"])
+    with pytest.raises(ValueError, match="'bands' must be a list of filter names"):
+        match_truth(truth, measured, "miri.f770w")

@@ -214,3 +214,11 @@ def test_plot_returns_the_axes():
     ax = Figure().add_subplot()
     assert Filter.from_name("miri.f770w").plot(ax=ax) is ax
     assert len(ax.lines) == 1
+
+
+def test_what_is_no_spectrum_is_named():
+    band = box()
+    with pytest.raises(ValueError, match="'sed' must be an object with wave and fnu, got NoneType"):
+        band.synthetic_flux(None)
+    with pytest.raises(ValueError, match=r"'sed\.fnu' must be as many values as sed\.wave, got 2"):
+        band.synthetic_flux(spectrum([7, 9, 13], [1, 1]))

@@ -207,3 +207,29 @@ def test_a_prior_that_leaves_nothing_is_flagged(grid, photometry):
     none = replace(grid, allowed=np.zeros_like(grid.allowed))
     results = BayesFitter(none).fit(photometry)
     assert all(FitFlags.names(f) == ["no_model"] for f in results.flags)
+
+
+@pytest.mark.parametrize("filters", [None, ["band0", "band1"]])
+def test_what_is_no_table_is_named(grid, photometry, filters):
+    fitter = BayesFitter(grid, filters)
+    for bad in (None, {"id": [1]}):
+        with pytest.raises(ValueError, match="'photometry' must be a table, got"):
+            fitter.fit(bad)
+    with pytest.raises(ValueError, match=r"'redshift' must be numbers, got \['a', 'b'\]"):
+        fitter.fit(photometry[:2], redshift=["a", "b"])
+    table = photometry.copy()
+    table["band0"] = np.full(len(table), 22.0) * u.ABmag
+    with pytest.raises(u.UnitsError, match=r"column 'band0' must be convertible to uJy, got mag"):
+        fitter.fit(table)
+
+
+def test_infinite_fluxes_are_flagged(grid, photometry):
+    table = photometry.copy()
+    table["band0"][0], table["band1"][1] = np.inf * u.uJy, -np.inf * u.uJy
+    table["band2_err"][2] = np.inf * u.uJy
+    whole, results = (BayesFitter(grid).fit(t) for t in (photometry, table))
+    flags = np.asarray(results.flags)[:4]
+    assert [bool(f & FitFlags.BAD_FLUX) for f in flags] == [True, True, False, False]
+    assert [bool(f & FitFlags.BAD_ERROR) for f in flags] == [False, False, True, False]
+    assert np.isfinite(results.chi2[:4]).all()
+    assert (whole.n_bands - results.n_bands)[:4].tolist() == [1, 1, 1, 0]

@@ -110,6 +110,10 @@ def test_foreign_files_are_refused(grid, tmp_path):
     grid.write(path)
     with pytest.raises(DataError, match="holds no fit results"):
         FitResults.read(path)
+    path.write_text("text")
+    for name in ("grid.fits", "none.fits"):
+        with pytest.raises(DataError, match=f"{name} cannot be read as fit results: "):
+            FitResults.read(tmp_path / name)
 
 
 def test_results_cannot_be_changed(results):

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 from miricigale.instrument import background_level
 from miricigale.photometry import YANG2021_DEPTHS, ErrorModel
 from miricigale.psf import gaussian_psf
+from miricigale.utils.exceptions import DataError
 
 BAND = "miri.f770w"
 
@@ -155,3 +156,31 @@ def test_tables_come_back(tmp_path, simulated):
     import matplotlib.pyplot as plt
 
     plt.close("all")
+
+
+def test_tables_without_fluxes_are_named(simulated):
+    model = ErrorModel.from_depths({BAND: 25.0})
+    table = QTable({"id": [1], "wfc3.f160w": [1.0] * u.uJy})
+    for method, options in ((model.assign, {}), (model.perturb, {"seed": 1})):
+        message = r"'photometry' must be a table with at least one of the columns \['miri\.f770w'\]"
+        with pytest.raises(ValueError, match=message):
+            method(table, **options)
+        with pytest.raises(ValueError, match="'photometry' must be a table, got dict"):
+            method({}, **options)
+        magnitudes = QTable({BAND: [22.0] * u.ABmag})
+        with pytest.raises(u.UnitsError, match=r"column 'miri\.f770w' must be convertible to uJy"):
+            method(magnitudes, **options)
+    with pytest.raises(u.UnitsError, match=r"'flux' must be convertible to uJy, got mag\(AB\)"):
+        model.sigma(22 * u.ABmag, BAND)
+    truth, measured = simulated
+    measured = QTable({BAND: measured[BAND].to(u.uJy).value * u.ABmag})
+    with pytest.raises(u.UnitsError, match=r"'measured' column 'miri\.f770w' must be"):
+        ErrorModel.from_tables(truth, measured, filters=[BAND])
+
+
+def test_foreign_files_are_named(tmp_path):
+    with pytest.raises(DataError, match=r"none\.ecsv cannot be read as an error model: no such"):
+        ErrorModel.read(tmp_path / "none.ecsv")
+    QTable({"a": [1]}).write(tmp_path / "other.ecsv")
+    with pytest.raises(DataError, match=r"other\.ecsv is no error model: .* the columns"):
+        ErrorModel.read(tmp_path / "other.ecsv")

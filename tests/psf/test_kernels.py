@@ -1,6 +1,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.io import fits
 from scipy.signal import fftconvolve
 
 from miricigale.psf import (
@@ -11,6 +12,7 @@ from miricigale.psf import (
     psf_image,
     rotate_psf,
 )
+from miricigale.utils.exceptions import DataError
 
 SCALE = 0.06 * u.arcsec
 
@@ -200,3 +202,18 @@ def test_values_are_frozen_and_checked():
             gaussian(31, 1), gaussian(31, 2), pixel_scale=SCALE, regularization="best"
         )
     assert "5 x 5 px of 0.06 arcsec" in repr(kernel)
+
+
+def test_foreign_files_are_named(tmp_path):
+    path = tmp_path / "kernel.fits"
+    with pytest.raises(
+        DataError, match=r"kernel\.fits cannot be read as a matching kernel: no such"
+    ):
+        MatchingKernel.read(path)
+    path.write_text("text")
+    with pytest.raises(DataError, match=r"kernel\.fits cannot be read as a matching kernel: "):
+        MatchingKernel.read(path)
+    hdus = [fits.PrimaryHDU(), fits.ImageHDU(gaussian(5, 1.0), name="KERNEL")]
+    fits.HDUList(hdus).writeto(path, overwrite=True)
+    with pytest.raises(DataError, match=r"kernel\.fits is not a complete .*PIXSCALE"):
+        MatchingKernel.read(path)

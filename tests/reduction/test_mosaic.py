@@ -252,3 +252,30 @@ def test_refuses_what_cannot_be_put_together():
     bare.pixel_shape = None
     with pytest.raises(ValueError, match="'wcs' must be a WCS with a pixel_shape"):
         drizzle_images([good], bare)
+    with pytest.raises(ValueError, match="'wcs' must be an astropy WCS, got NoneType"):
+        drizzle_images([good], None)
+    rate = CCDData(good.data, unit="adu/s", wcs=wcs, uncertainty=StdDevUncertainty(good.data))
+    with pytest.raises(ValueError, match=r"'images' must be surface brightness .*, got unit adu"):
+        drizzle_images([rate], grid)
+    bands = [make(good.data, wcs, filter=name) for name in ("miri.f770w", "miri.f1000w")]
+    with pytest.raises(ValueError, match=r"of one filter, got miri\.f1000w, miri\.f770w"):
+        drizzle_images(bands, grid)
+
+
+@pytest.mark.parametrize(("ra", "dec"), [(53.2, -27.8344), (233.1, 27.8)])
+def test_a_grid_elsewhere_on_the_sky_is_refused(ra, dec):
+    wcs = small_wcs()
+    good = make(np.zeros((150, 160)), wcs)
+    elsewhere = north_up_wcs(SkyCoord(ra, dec, unit="deg"), 0.11 * u.arcsec, (150, 150))
+    with pytest.raises(ValueError, match="'wcs' must be a grid that overlaps the images"):
+        drizzle_images([good], elsewhere)
+    if dec < 0:
+        distorted = imager_wcs(SkyCoord(ra, dec, unit="deg"), 30 * u.deg)
+        with pytest.raises(ValueError, match="whose distortion can be inverted"):
+            drizzle_images([good], distorted)
+    # one that lies beside the grid adds nothing and disturbs nothing
+    beside = make(np.ones((150, 160)), small_wcs(dx=2000.0))
+    grid = mosaic_wcs([wcs], 0.11 * u.arcsec)
+    mosaic = drizzle_images([good, beside], grid)
+    assert mosaic.n_images.max() == 1
+    assert np.nanmax(mosaic.image.data) == 0

@@ -258,3 +258,20 @@ def test_refuses_what_does_not_belong_together():
     bare = CCDData(np.ones((4, 4)), unit="adu / s", uncertainty=StdDevUncertainty(np.ones((4, 4))))
     with pytest.raises(ValueError, match="'rate' must be an image whose meta has 'filter'"):
         reducer.calibrate(bare)
+
+
+def test_what_is_no_ramp_or_grid_is_named():
+    image = CCDData(np.zeros((8, 8)), unit="MJy/sr", uncertainty=StdDevUncertainty(np.ones((8, 8))))
+    with pytest.raises(ValueError, match="'ramp' must be a Ramp, got ndarray"):
+        Reducer().fit_ramp(np.zeros((1, 5, 8, 8)))
+    with pytest.raises(ValueError, match="'wcs' must be an astropy WCS, got NoneType"):
+        Reducer().mosaic([image], None)
+    rate = Reducer().fit_ramp(expose(SKY, exposure()))
+    grid = mosaic_wcs([exposure()], 0.11 * u.arcsec)
+    with pytest.raises(ValueError, match="'images' must be surface brightness"):
+        Reducer().mosaic([rate], grid)
+    cal = Reducer().calibrate(rate)
+    far = mosaic_wcs([exposure()], 0.11 * u.arcsec)
+    far.wcs.crval = [150.1, 2.2]
+    with pytest.raises(ValueError, match="'wcs' must be a grid that overlaps the images"):
+        Reducer().mosaic([cal], far)

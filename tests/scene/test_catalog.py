@@ -60,7 +60,7 @@ def test_ra_and_dec_stand_for_sky(table):
 
 
 def test_unusable_rows_are_flagged(table):
-    table = QTable([*[table[0]] * 5])
+    table = table[[0] * 5]
     table["id"] = range(5)
     table["half_light_radius"][0] = -1 * u.arcsec
     table["sersic_index"][1] = 12
@@ -156,3 +156,29 @@ def test_bundled_catalogue():
     assert np.all(catalog["mag_f160w"][sersic].value <= 24.5)
     assert np.all(catalog["galfit_flag"][sersic] <= 1)
     assert catalog["half_light_radius"][sersic].max() <= 3 * u.arcsec
+
+
+@pytest.mark.parametrize("name", ["miri.f770w", "wfc3.f160w", "wfc3.f160w_err", "sepy"])
+def test_columns_called_by_a_filter_must_be_fluxes(table, tmp_path, name):
+    name = name.replace("sepy", "sedpy.jwst_f770w")
+    table[name] = [1.0, 2.0]
+    table.write(tmp_path / "c.ecsv")
+    with pytest.raises(
+        u.UnitsError, match=rf"column '{name}' must be convertible to uJy, got None"
+    ):
+        read_catalog(tmp_path / "c.ecsv")
+    table[name] = [20.0, 21.0] * u.ABmag
+    with pytest.raises(u.UnitsError, match=rf"column '{name}' must be .* got mag\(AB\)"):
+        check_catalog(table)
+    table.remove_column(name)
+    table["other.mag"], table["class.prob"] = [20.0, 21.0] * u.ABmag, [0.1, 0.9]
+    assert {"other.mag", "class.prob"} <= set(check_catalog(table).colnames)
+
+
+def test_stars_are_told_or_there_are_none(table):
+    assert check_catalog(table)["star"].tolist() == [False, False]
+    table["star"] = [False, True]
+    assert check_catalog(table)["star"].tolist() == [False, True]
+    table["star"] = [0, 1]
+    with pytest.raises(ValueError, match="True or False in 'star', got int64"):
+        check_catalog(table)

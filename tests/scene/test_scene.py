@@ -242,6 +242,15 @@ def test_refuses(wcs, psf):
     bare.pixel_shape = None
     with pytest.raises(ValueError, match="'wcs' must be a WCS with its pixel_shape"):
         Scene(catalog, filter=FILTER, wcs=bare, psf=psf)
+    other = tools.gaussian_psf(filter="miri.f2100w")
+    with pytest.raises(ValueError, match=r"'psf' must be one of the filter miri\.f770w, got one"):
+        Scene(catalog, filter=FILTER, wcs=wcs, psf=other)
+    for name in (FILTER, "F770W"):
+        Scene(catalog, filter=FILTER, wcs=wcs, psf=tools.gaussian_psf(filter=name))
+    catalog[FILTER] = [20.0] * u.ABmag
+    with pytest.raises(u.UnitsError, match=r"'miri\.f770w' must be convertible to uJy, got mag"):
+        Scene(catalog, filter=FILTER, wcs=wcs, psf=psf)
+    catalog = tools.make_catalog(wcs, 50, 45)
     even = ImagePSF(np.ones((8, 8)), oversampling=4)
     with pytest.raises(ValueError, match="'psf' must be centred on a node"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=even)

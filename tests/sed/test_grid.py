@@ -55,6 +55,12 @@ def test_arrays_are_read_only():
 
 def test_foreign_and_truncated_files_are_refused(tmp_path):
     fits.PrimaryHDU(np.zeros(3)).writeto(tmp_path / "other.fits")
+    (tmp_path / "text.fits").write_text("text")
+    for name, text in (("text", ""), ("none", "no such file")):
+        with pytest.raises(
+            DataError, match=rf"{name}\.fits cannot be read as a model grid: {text}"
+        ):
+            ModelGrid.read(tmp_path / f"{name}.fits")
     with pytest.raises(DataError, match="is not a model grid"):
         ModelGrid.read(tmp_path / "other.fits")
     make().write(tmp_path / "grid.fits")

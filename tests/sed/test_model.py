@@ -9,7 +9,7 @@ from astropy.tests.helper import assert_quantity_allclose
 
 from miricigale.sed import COSMOLOGY, ModelFlags, ModelGrid, SEDModel, yang2021_axes
 from miricigale.sed.components import BC03, CalzettiLeitherer, DelayedSFH, DraineLi2007
-from miricigale.utils.exceptions import ConfigError
+from miricigale.utils.exceptions import ConfigError, MiricigaleWarning
 
 AXES = {
     "tau": [0.1, 1.0],
@@ -365,3 +365,12 @@ def test_axes_of_the_paper_make_24_million_models():
     assert "frac_agn" not in yang2021_axes("galaxy")
     with pytest.raises(ValueError, match="'kind' must be 'fit'"):
         yang2021_axes("small")
+
+
+def test_tables_of_parameters_are_checked(model, filters):
+    with pytest.raises(ValueError, match="'table' must be a table, got list"):
+        model.fluxes([1], filters)
+    table = QTable({"redshift": [0.5], "ebvv": [0.3], "stellar_mass": [1.0], "seen": [True]})
+    with pytest.warns(MiricigaleWarning, match="'ebvv' is no parameter .* is it 'ebv'") as caught:
+        model.fluxes(table, filters)
+    assert len(caught) == 1

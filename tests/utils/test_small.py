@@ -33,8 +33,8 @@ def test_provenance():
 
 def test_optional_packages():
     assert require("math", extra="none") is math
-    with pytest.raises(ImportError, match=r"pip install 'miricigale\[samplers\]'"):
-        require("no_such_package", extra="samplers")
+    with pytest.raises(ImportError, match=r"pip install 'miricigale\[stpsf\]'"):
+        require("no_such_package", extra="stpsf")
 
 
 def test_parallel_map_gives_the_same_answer_in_order():

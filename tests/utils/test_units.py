@@ -59,3 +59,16 @@ def test_frozen_quantity_in_the_same_unit_is_a_copy():
     quantity = frozen_quantity(values, u.m, "x")
     values[0] = 7 * u.m
     assert quantity[0] == 0 * u.m
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "message"),
+    [
+        (23 * u.ABmag, u.UnitsError, r"'x' must be convertible to uJy, got mag\(AB\)"),
+        (None, ValueError, "'x' must be convertible to uJy, got NoneType"),
+        (["a", "b"], ValueError, r"'x' must be convertible to uJy, got \['a', 'b'\]"),
+    ],
+)
+def test_refuses_what_is_no_linear_quantity(value, error, message):
+    with pytest.raises(error, match=message):
+        to_array(value, u.uJy, "x")

@@ -25,7 +25,7 @@ def test_the_configuration_can_be_printed_and_given_back(capsys, tmp_path):
         (["data", "add", "nothing", "x"], "no resource 'nothing'; known:"),
         (
             ["photometry", "a.fits", "b.fits", "--filter", "miri.f770w", "--pa-aper", "0"],
-            "no image",
+            "a.fits cannot be read as an image",
         ),
     ],
 )

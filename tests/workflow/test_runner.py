@@ -187,8 +187,11 @@ def test_images_survive_the_file(tmp_path):
 
 
 def test_missing_and_foreign_images_are_named(tmp_path):
-    with pytest.raises(DataError, match="no image file"):
+    with pytest.raises(DataError, match=r"absent\.fits cannot be read as an image"):
         read_image(tmp_path / "absent.fits")
+    (tmp_path / "text.fits").write_text("no image")
+    with pytest.raises(DataError, match=r"text\.fits cannot be read as an image"):
+        read_image(tmp_path / "text.fits")
 
 
 def test_a_full_disk_is_told_before_the_run(tmp_path):

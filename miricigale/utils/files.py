@@ -1,0 +1,80 @@
+"""Files that others give us: opened, or refused in one sentence that names the file."""
+
+import warnings
+from pathlib import Path
+
+from astropy.io import fits
+from astropy.table import QTable
+from astropy.utils.exceptions import AstropyUserWarning
+
+from miricigale.utils.exceptions import DataError
+
+__all__ = ["open_fits", "read_ecsv"]
+
+
+def open_fits(path, *, wanted, **options):
+    """
+    Open a FITS file, or say which file could not be read as what.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    wanted : str
+        What the file should be, for the message, such as ``"a matching kernel"``.
+    **options
+        Passed to `astropy.io.fits.open`.
+
+    Returns
+    -------
+    hdus : `~astropy.io.fits.HDUList`
+        To be closed (or used in a ``with`` statement).
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file is missing, no FITS or truncated.
+    """
+    hdus = None
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", ".*truncated", AstropyUserWarning)
+            hdus = fits.open(path, **options)
+            # headers are read late: a truncated file shows only now
+            len(hdus)
+    except (OSError, TypeError, ValueError, AstropyUserWarning) as err:
+        if hdus is not None:
+            hdus.close()
+        raise _unreadable(path, wanted, err) from err
+    return hdus
+
+
+def read_ecsv(path, *, wanted):
+    """
+    Read an ECSV table, or say which file could not be read as what.
+
+    Parameters are those of `open_fits`.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file is missing or no ECSV table.
+    """
+    # astropy would take text for the table itself
+    if not Path(path).is_file():
+        raise _unreadable(path, wanted, "no such file")
+    try:
+        return QTable.read(path, format="ascii.ecsv")
+    except (OSError, TypeError, ValueError) as err:
+        raise _unreadable(path, wanted, err) from err
+
+
+def _unreadable(path, wanted, err):
+    if isinstance(err, FileNotFoundError):
+        err = "no such file"
+    lines = str(err).splitlines() or [type(err).__name__]
+    return DataError(f"{path} cannot be read as {wanted}: {lines[0]}")

@@ -1,0 +1,33 @@
+"""Files that cannot be read are named."""
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import open_fits, read_ecsv
+
+
+def test_a_good_file_is_open(tmp_path):
+    fits.PrimaryHDU(np.arange(6)).writeto(tmp_path / "a.fits")
+    with open_fits(tmp_path / "a.fits", wanted="an image", memmap=False) as hdus:
+        assert hdus[0].data.tolist() == list(range(6))
+
+
+@pytest.mark.parametrize("reader", [open_fits, read_ecsv])
+def test_missing_and_foreign_files_are_named(tmp_path, reader):
+    with pytest.raises(DataError, match=r"none\.x cannot be read as a kernel: no such file"):
+        reader(tmp_path / "none.x", wanted="a kernel")
+    for text in ("", "not a file of that kind"):
+        (tmp_path / "text.x").write_text(text)
+        with pytest.raises(DataError, match=r"text\.x cannot be read as a kernel: \w"):
+            reader(tmp_path / "text.x", wanted="a kernel")
+
+
+def test_truncated_files_are_named(tmp_path):
+    hdus = [fits.PrimaryHDU(), fits.ImageHDU(np.zeros((100, 100)), name="SCI")]
+    fits.HDUList(hdus).writeto(tmp_path / "whole.fits")
+    part = (tmp_path / "whole.fits").read_bytes()[:20000]
+    (tmp_path / "part.fits").write_bytes(part)
+    with pytest.raises(DataError, match=r"part\.fits cannot be read as an image: .*truncated"):
+        open_fits(tmp_path / "part.fits", wanted="an image")
