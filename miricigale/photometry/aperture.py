@@ -3,7 +3,7 @@
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
-from photutils.aperture import CircularAperture
+from photutils.aperture import ApertureStats, CircularAperture
 from photutils.background import LocalBackground
 from photutils.segmentation import SourceCatalog
 
@@ -71,7 +71,7 @@ def _circle_sums(arrays, xy, radius):
     aperture = CircularAperture(np.nan_to_num(xy, nan=-1e6), radius)
     variance = np.where(arrays.usable, arrays.sigma, 0.0) ** 2
     sums = [
-        np.atleast_1d(aperture.do_photometry(image)[0])
+        np.atleast_1d(ApertureStats(image, aperture).sum)
         for image in (arrays.flux, variance, arrays.usable.astype(float))
     ]
     coverage = np.nan_to_num(sums[2]) / aperture.area
