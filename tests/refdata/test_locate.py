@@ -6,8 +6,8 @@ import sys
 import pytest
 
 from miricigale.refdata import Resource, add_resource, check_resources, conf, locate, registry
-from miricigale.refdata.locate import data_folder, file_sha256
-from miricigale.utils.exceptions import DataError
+from miricigale.refdata.locate import data_folder, file_sha256, fingerprint
+from miricigale.utils.exceptions import DataError, MiricigaleWarning
 
 TEXT = b"some numbers\n"
 
@@ -110,9 +110,24 @@ def test_environment_wins_over_the_folder_over_the_package(folders, monkeypatch)
     for folder in (folders / "data", folders / "env"):
         (folder / "instrument").mkdir(parents=True)
         (folder / "instrument" / bundled.name).write_text("mine")
-    assert locate("instrument.siaf").is_relative_to(folders / "data")
+    # another file than the bundled one is taken, and said
+    message = "'instrument.siaf' is taken from .* which differs from the bundled file"
+    with pytest.warns(MiricigaleWarning, match=message):
+        assert locate("instrument.siaf").is_relative_to(folders / "data")
     monkeypatch.setenv("MIRICIGALE_DATA", str(folders / "env"))
-    assert locate("instrument.siaf").is_relative_to(folders / "env")
+    with pytest.warns(MiricigaleWarning, match=message):
+        assert locate("instrument.siaf").is_relative_to(folders / "env")
+
+
+def test_the_fingerprint_is_that_of_the_file_found(folders, monkeypatch):
+    path = locate("instrument.siaf")
+    assert fingerprint("instrument.siaf") == hashlib.sha256(path.read_bytes()).hexdigest()
+    other = folders / "env" / "instrument" / path.name
+    other.parent.mkdir(parents=True)
+    other.write_text("mine")
+    monkeypatch.setenv("MIRICIGALE_DATA", str(folders / "env"))
+    with pytest.warns(MiricigaleWarning, match="differs from the bundled file"):
+        assert fingerprint("instrument.siaf") == hashlib.sha256(b"mine").hexdigest()
 
 
 def test_check_tells_the_state_of_each(folders):
