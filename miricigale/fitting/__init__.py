@@ -7,6 +7,7 @@ posteriors of all parameters and derived quantities.
 
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.flags import FitFlags
-from miricigale.fitting.results import FitResult, FitResults
+from miricigale.fitting.result import FitResult
+from miricigale.fitting.results import FitResults
 
 __all__ = ["BayesFitter", "FitFlags", "FitResult", "FitResults"]
