@@ -42,40 +42,58 @@ axes = "quick"
 """
 
 
+def stopped(command, folder, product, how):
+    """Start a run, stop it by a signal once a product stands; exit status and messages."""
+    process = subprocess.Popen(
+        command,
+        cwd=folder,
+        stderr=subprocess.PIPE,
+        text=True,
+        # whoever runs the tests in the background hands down an ignored SIGINT
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    deadline = time.monotonic() + 300
+    while not product.exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.1)
+    # let the manifest be written
+    time.sleep(1.0)
+    process.send_signal(how)
+    _, message = process.communicate(timeout=120)
+    return process.returncode, message
+
+
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
-    """Folder of a small study that was stopped in the middle and finished."""
+    """Folder of a small study that was killed, then stopped, then finished."""
     folder = tmp_path_factory.mktemp("study")
     (folder / "small.toml").write_text(SMALL)
     command = [sys.executable, "-m", "miricigale", "run", "small.toml", "--no-progress"]
-    first = subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True)
     product = folder / "small" / "exposures" / "miri.f770w-0_cal.fits"
-    deadline = time.monotonic() + 300
-    while not product.exists() and first.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.2)
-    # let the manifest be written, then stop as Ctrl-C does
-    time.sleep(1.0)
-    first.send_signal(signal.SIGINT)
-    _, message = first.communicate(timeout=120)
+    killed = stopped(command, folder, product, signal.SIGKILL)
     before = product.stat().st_mtime_ns
+    later = folder / "small" / "exposures" / "miri.f1500w-0_cal.fits"
+    interrupted = stopped(command, folder, later, signal.SIGINT)
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     return {
         "folder": folder / "small",
-        "stopped": (first.returncode, message),
+        "killed": killed,
+        "interrupted": interrupted,
         "before": before,
         "after": product.stat().st_mtime_ns,
         "done": done,
     }
 
 
-def test_a_stopped_run_says_so_and_goes_on(study):
-    status, message = study["stopped"]
+def test_a_killed_and_a_stopped_run_go_on(study):
+    assert study["killed"][0] == -signal.SIGKILL
+    status, message = study["interrupted"]
     assert status == 130
     assert "goes on from here" in message
     assert study["done"].returncode == 0, study["done"].stderr
     assert study["done"].stdout.strip().endswith("report/index.html")
     assert study["before"] == study["after"]
     assert not list(study["folder"].rglob(".partial-*"))
+    assert not (study["folder"] / "run.lock").exists()
 
 
 def test_every_product_stands_in_the_manifest_and_nothing_else(study):
@@ -108,7 +126,7 @@ def test_point_sources_come_back_as_they_went_in(study):
 
 
 def test_the_mosaic_shows_the_truth(study):
-    """Light of a bright star in an aperture, against the injected flux."""
+    """Measured light of bright stars against the injected flux."""
     truth = QTable.read(study["folder"] / "truth.ecsv")
     matched = QTable.read(study["folder"] / "matched.ecsv")
     stars = np.flatnonzero(
