@@ -49,6 +49,27 @@ YANG2021_DEPTHS = types.MappingProxyType(
 )
 
 
+def fractional_error(name):
+    """
+    Part of the flux that the paper adds to the error of an existing band, in quadrature.
+
+    Parameters
+    ----------
+    name : str
+        Filter.
+
+    Returns
+    -------
+    fraction : float
+        0.10 for IRAC and MIPS, 0.03 otherwise.
+
+    References
+    ----------
+    Yang et al. 2021, ApJ 908, 144.
+    """
+    return 0.10 if name.startswith(("irac", "mips")) else 0.03
+
+
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ErrorModel:
     """
@@ -191,9 +212,7 @@ class ErrorModel:
         model : `ErrorModel`
             A fifth of `YANG2021_DEPTHS`, and 3 % of the flux (10 % for IRAC and MIPS).
         """
-        fractional = {
-            name: 0.10 if name.startswith(("irac", "mips")) else 0.03 for name in YANG2021_DEPTHS
-        }
+        fractional = {name: fractional_error(name) for name in YANG2021_DEPTHS}
         return cls.from_depths(YANG2021_DEPTHS, fractional=fractional)
 
     @classmethod

@@ -6,7 +6,7 @@ import numpy as np
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["as_generator", "check_seed", "stream", "text_key"]
+__all__ = ["check_seed", "stream", "text_key"]
 
 
 def text_key(text):
@@ -69,10 +69,3 @@ def stream(seed, *key):
         # spawn keys are sequences of 32-bit words: two for each part, whatever its size
         words += [(number >> 32) & 0xFFFFFFFF, number & 0xFFFFFFFF]
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=tuple(words)))
-
-
-def as_generator(seed):
-    """Return a Generator for an int, a Generator (itself) or None."""
-    if isinstance(seed, np.random.Generator):
-        return seed
-    return np.random.default_rng(check_seed(seed))

@@ -10,7 +10,6 @@ __all__ = [
     "DN",
     "FNU",
     "LUMINOSITY",
-    "LUMINOSITY_NU",
     "MASS",
     "RATE",
     "SURFACE_BRIGHTNESS",
@@ -25,7 +24,6 @@ __all__ = [
 WAVE = u.um
 FNU = u.uJy
 LUMINOSITY = u.W
-LUMINOSITY_NU = u.W / u.Hz
 MASS = u.Msun
 SURFACE_BRIGHTNESS = u.MJy / u.sr
 DN = u.adu

@@ -8,32 +8,11 @@ import typing
 from importlib import resources
 from pathlib import Path
 
+from miricigale.instrument import CEERS_FILTERS
+from miricigale.photometry import YANG2021_DEPTHS
 from miricigale.utils.exceptions import ConfigError, unknown_name
 
 __all__ = ["StudyConfig", "load_config", "preset_names"]
-
-CEERS_FILTERS = (
-    "miri.f770w",
-    "miri.f1000w",
-    "miri.f1280w",
-    "miri.f1500w",
-    "miri.f1800w",
-    "miri.f2100w",
-)
-EXISTING_BANDS = (
-    *(f"megacam.{b}" for b in "ugriz"),
-    "acs.f606w",
-    "acs.f814w",
-    "wfc3.f125w",
-    "wfc3.f140w",
-    "wfc3.f160w",
-    *(f"irac.ch{k}" for k in range(1, 5)),
-    "mips.24",
-)
-# 5-sigma AB depths of the existing bands (PHYSICS: after Stefanon 2017 and FIDEL)
-EXISTING_DEPTHS = (
-    27.1, 27.3, 27.2, 27.0, 26.1, 28.8, 28.2, 27.6, 26.8, 27.6, 23.9, 24.2, 22.5, 22.8, 19.3,
-)  # fmt: skip
 
 
 def _option(default, doc, *, low=None, high=None, choices=None):
@@ -172,8 +151,8 @@ class ErrorSection:
 class FitSection:
     """The final fit, with and without MIRI."""
 
-    bands: tuple[str, ...] = _option(EXISTING_BANDS, "Existing bands.")
-    depths: tuple[float, ...] = _option(EXISTING_DEPTHS, "Their 5-sigma AB depths.")
+    bands: tuple[str, ...] = _option(tuple(YANG2021_DEPTHS), "Existing bands.")
+    depths: tuple[float, ...] = _option(tuple(YANG2021_DEPTHS.values()), "Their 5-sigma AB depths.")
     axes: str = _option("fit", "Grid of the fit.", choices=("fit", "quick"))
     model_error: float = _option(0.1, "Relative model error.", low=0.0, high=1.0)
     min_detected: int = _option(2, "MIRI bands a source must be detected in.", low=0, high=9)

@@ -8,6 +8,7 @@ from miricigale.fitting import BayesFitter, FitResults
 from miricigale.scene import read_catalog
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError, argument_error
+from miricigale.utils.meta import provenance
 from miricigale.utils.random import stream
 from miricigale.utils.tables import error_column
 from miricigale.workflow.stages.stars import star_fluxes
@@ -199,5 +200,7 @@ def make_truth(context, _):
     )
     if "frac_agn" not in truth.colnames:
         truth["frac_agn"] = np.zeros(len(truth))
+    citations = [*catalog.meta.get("citations", ()), *model.meta["citations"]]
     truth.meta.clear()
+    truth.meta.update(provenance(citations=citations, stage="truth"))
     context.save_table("truth.ecsv", truth)

@@ -10,8 +10,10 @@ from photutils.segmentation import SegmentationImage
 from miricigale.evaluation import match_truth
 from miricigale.fitting import BayesFitter
 from miricigale.photometry import ErrorModel, ForcedPhotometer
+from miricigale.photometry.error_model import fractional_error
 from miricigale.psf import MatchingKernel
 from miricigale.sed import SEDModel
+from miricigale.utils.meta import provenance
 from miricigale.utils.tables import error_column
 from miricigale.workflow.products import read_image
 from miricigale.workflow.stages.sample import add_selection, in_field
@@ -59,6 +61,7 @@ def band_photometry(context, bands):
         joined[error_column(name)] = table["flux_err"]
         joined[f"{name}_flags"] = table["flags"]
     joined.meta.clear()
+    joined.meta.update(provenance(stage="photometry"))
     return joined
 
 
@@ -120,7 +123,7 @@ def mock_photometry(config, truth, matched, *, seed):
     bands = config.fit.bands
     errors = ErrorModel.from_depths(
         dict(zip(bands, config.fit.depths, strict=True)),
-        fractional={name: 0.10 if name.startswith(("irac", "mips")) else 0.03 for name in bands},
+        fractional={name: fractional_error(name) for name in bands},
     )
     sample = np.asarray(matched["selection"]) == 0
     photometry = errors.perturb(truth[["id", *bands]][sample], seed=seed)
