@@ -4,11 +4,22 @@ import functools
 
 from miricigale.refdata import Registry, locate
 from miricigale.sed.parameter import Parameter
+from miricigale.utils.exceptions import argument_error
 
 __all__ = ["COMPONENTS", "ROLES", "Component", "register"]
 
 #: What a component does, in the order in which light meets it.
-ROLES = ("sfh", "stellar", "nebular", "attenuation", "dust", "agn", "igm")
+ROLES = (
+    "sfh",
+    "stellar",
+    "nebular",
+    "attenuation",
+    "dust",
+    "agn",
+    "xray",
+    "igm",
+    "foreground",
+)
 
 #: Components by name, for configurations.
 COMPONENTS = Registry("component")
@@ -26,17 +37,21 @@ class Component:
 
     A subclass gives ``name``, ``role`` (one of `ROLES`), ``reference`` (what to cite) and
     declares its parameters as `~miricigale.sed.Parameter` in the class body. Numbers go in
-    and arrays come out; units are the model's business.
+    and arrays come out; units are the model's business. Choices that are names and not
+    numbers, such as a law, are `options`: fixed when the component is made.
 
     Parameters
     ----------
     **defaults
-        New defaults of parameters, as quantities or bare numbers in the declared unit.
+        New defaults of parameters, as quantities or bare numbers in the declared unit, and
+        values of options.
 
     Raises
     ------
     TypeError
-        If a name is not one of the parameters.
+        If a name is neither a parameter nor an option.
+    ValueError
+        If a value is outside its bounds or not one of the option's.
     """
 
     name = ""
@@ -44,11 +59,22 @@ class Component:
     reference = ""
     resource = None
 
+    #: Options of this class: name to the values allowed, the first being the default.
+    options = {}
+
     def __init__(self, **defaults):
-        known = type(self).declared()
+        known, options = type(self).declared(), type(self).all_options()
+        for name, values in options.items():
+            self.__dict__[name] = values[0]
         for name, value in defaults.items():
+            if name in options:
+                if value not in options[name]:
+                    raise argument_error(name, f"one of {', '.join(options[name])}", repr(value))
+                self.__dict__[name] = value
+                continue
             if name not in known:
-                msg = f"{type(self).__name__} has no parameter {name!r}; known: {', '.join(known)}"
+                names = ", ".join([*known, *options])
+                msg = f"{type(self).__name__} has no parameter {name!r}; known: {names}"
                 raise TypeError(msg)
             self.__dict__[name] = known[name].check(value)
 
@@ -59,6 +85,19 @@ class Component:
         for base in reversed(cls.__mro__):
             out.update({k: v for k, v in vars(base).items() if isinstance(v, Parameter)})
         return out
+
+    @classmethod
+    def all_options(cls):
+        """Options as declared in the class bodies: dict of name to the values allowed."""
+        out = {}
+        for base in reversed(cls.__mro__):
+            out.update(vars(base).get("options", {}))
+        return out
+
+    @property
+    def settings(self):
+        """Options as chosen, and whatever else than parameters shapes the spectra: dict."""
+        return {name: self.__dict__[name] for name in type(self).all_options()}
 
     @property
     def parameters(self):
@@ -95,5 +134,6 @@ class Component:
         return self.resource or self.name
 
     def __repr__(self):
-        values = ", ".join(f"{n}={p.default:g}" for n, p in self.parameters.items())
-        return f"{type(self).__name__}({values})"
+        values = [f"{n}={p.default:g}" for n, p in self.parameters.items()]
+        values += [f"{n}={v!r}" for n, v in self.settings.items()]
+        return f"{type(self).__name__}({', '.join(values)})"

@@ -3,7 +3,7 @@ import pytest
 from astropy.io import fits
 
 from miricigale.refdata import locate, resource
-from miricigale.sed.components.dust import load_dl07
+from miricigale.sed.components.dust.dl07 import load_dl07
 from miricigale.sed.components.stellar import load_ssp
 
 

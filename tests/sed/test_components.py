@@ -14,7 +14,7 @@ from miricigale.sed.components import (
     ParametricTorus,
     TorusSpectra,
 )
-from miricigale.sed.components.agn import _absorbed, _seen_fraction
+from miricigale.sed.components.agn.parametric import _absorbed, _seen_fraction
 from miricigale.utils.exceptions import DataError
 
 
@@ -286,7 +286,7 @@ def test_steeper_density_makes_a_hotter_torus(torus, wave):
 
 
 def test_hidden_disk_is_weak_in_the_visible(torus):
-    from miricigale.sed.components.agn import _constants
+    from miricigale.sed.components.agn.parametric import _constants
 
     seen = _seen_fraction(_constants(torus.path), np.array([0.5]), 7.0, 70.0, 40.0, 1.0)
     assert 1e-5 < seen[0] < 1e-3
@@ -321,7 +321,7 @@ def test_torus_against_skirtor(data_file, torus, wave):
 
 
 def test_foreign_files_are_refused(tmp_path):
-    from miricigale.sed.components.dust import load_dl07
+    from miricigale.sed.components.dust.dl07 import load_dl07
     from miricigale.sed.components.stellar import load_ssp
 
     path = tmp_path / "other.fits"

@@ -3,6 +3,7 @@ import pytest
 from scipy.integrate import quad
 
 from miricigale.sed import _core
+from miricigale.sed._core import igm
 
 
 def test_delayed_history_forms_one_solar_mass_and_has_the_delayed_shape():
@@ -157,7 +158,7 @@ def test_meiksin_lyman_limit_systems_by_direct_integration():
         return 0.25 * 0.5 * (1 + zz) ** 1.5 * value
 
     direct = quad(inner, limit - 1, z)[0]
-    first, series = _core._lls_terms()
+    first, series = igm._lls_terms()
     lls = first * ((1 + z) * limit**1.5 - limit**2.5)
     for n, term in enumerate(series, start=1):
         lls -= term * ((1 + z) ** (2.5 - 3 * n) * limit ** (3 * n) - limit**2.5)

@@ -1,4 +1,4 @@
-"""Emission of dust in galaxies; the energy is what attenuation took."""
+"""Draine & Li 2007, with its own parameters and as a sequence in alpha."""
 
 import functools
 
@@ -6,41 +6,12 @@ import numpy as np
 from astropy.io import fits
 
 from miricigale.sed import _core
-from miricigale.sed.component import Component, register
+from miricigale.sed.component import register
+from miricigale.sed.components.dust.base import DustEmission
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import DataError
 
-__all__ = ["DraineLi2007", "DraineLi2007Alpha", "DustEmission", "load_dl07"]
-
-
-class DustEmission(Component):
-    """Base: `template` gives a spectrum that integrates to 1."""
-
-    role = "dust"
-
-    def spectrum(self, values):
-        """Spectrum at `nodes`, arbitrary scale."""
-        raise NotImplementedError
-
-    def template(self, wave, **values):
-        """
-        Spectrum for one watt.
-
-        Parameters
-        ----------
-        wave : `~numpy.ndarray`
-            Rest wavelengths in um.
-        **values
-            Values of the parameters; defaults where not given.
-
-        Returns
-        -------
-        spectrum : `~numpy.ndarray`
-            L_lambda in W/um; the integral over `nodes`, by trapezoids, is 1 W.
-        """
-        full = {name: par.default for name, par in self.parameters.items()} | values
-        nodes, spectrum = self.nodes(), self.spectrum(full)
-        return np.interp(wave, nodes, spectrum / np.trapezoid(spectrum, nodes), left=0, right=0)
+__all__ = ["DraineLi2007", "DraineLi2007Alpha", "load_dl07"]
 
 
 @functools.lru_cache(maxsize=2)

@@ -1,0 +1,24 @@
+"""Thermal and resonance shapes; wavelengths in um."""
+
+import numpy as np
+
+__all__ = ["PLANCK_K", "drude", "modified_blackbody", "planck_lambda"]
+
+PLANCK_K = 14387.768775  # h c / k in um K
+
+
+def planck_lambda(wave, temperature):
+    """B_lambda in arbitrary units, safe for large exponents."""
+    x = np.minimum(PLANCK_K / (wave * temperature), 600.0)
+    return wave**-5.0 / np.expm1(x)
+
+
+def modified_blackbody(wave, temperature, beta, wave_thick=200.0):
+    """(1 - exp(-(wave_thick / wave)^beta)) B_lambda(T), arbitrary units."""
+    return -np.expm1(-((wave_thick / wave) ** beta)) * planck_lambda(wave, temperature)
+
+
+def drude(wave, centre, width):
+    """Drude profile, 1 at the centre."""
+    w = (width / centre) ** 2
+    return w / ((wave / centre - centre / wave) ** 2 + w)
