@@ -4,6 +4,7 @@ import doctest
 import importlib.metadata
 import os
 import re
+import sys
 from pathlib import Path
 
 from sphinx_astropy.conf.v2 import *  # noqa: F403
@@ -14,6 +15,9 @@ author = "The miricigale developers"
 copyright = f"2026, {author}"
 release = importlib.metadata.version("miricigale")
 version = ".".join(release.split(".")[:2])
+
+# the directive of the pages about components
+sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 
 # what these pages do not use
 extensions = [
@@ -28,6 +32,7 @@ extensions = [
         "sphinx_astropy.ext.generate_config",
     )
 ]
+extensions.append("sed_component")
 exclude_patterns = [*exclude_patterns, "changes/*"]
 
 # links to other packages are made where the pages are published; elsewhere no network is needed

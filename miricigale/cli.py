@@ -2,7 +2,9 @@
 
 import argparse
 import logging
+import shutil
 import sys
+import textwrap
 import time
 from pathlib import Path
 
@@ -54,11 +56,12 @@ def _parser():
 
     data = commands.add_parser("data", help="reference data: list, check or add")
     actions = data.add_subparsers(dest="action", metavar="ACTION", required=True)
-    actions.add_parser("list", help="what there is, its licence and what to cite")
+    listing = actions.add_parser("list", help="what there is, where, its licence, what to cite")
+    listing.add_argument("pattern", nargs="?", default="", help="part of the name")
     actions.add_parser("check", help="whether each file is there and whole")
-    add = actions.add_parser("add", help="copy a file into the data folder")
-    add.add_argument("name", help="resource name")
-    add.add_argument("path", type=Path, help="file or folder")
+    add = actions.add_parser("add", help="bring a file into the data folder; convert a library")
+    add.add_argument("name", help="resource name, as 'miricigale data list' has it")
+    add.add_argument("path", type=Path, help="file, folder or archive as distributed")
     return parser
 
 
@@ -140,19 +143,64 @@ def _filters(args):
 
 
 def _data(args):
-    from miricigale.refdata import add_resource, check_resources, resources
+    return {"list": _data_list, "check": _data_check, "add": _data_add}[args.action](args)
 
-    if args.action == "add":
-        print(add_resource(args.name, args.path))
-        return 0
-    if args.action == "check":
-        rows = check_resources()
-        for name, state, where in rows:
-            print(f"{name:22s} {state:16s} {where}")
-        return int(any(state == "wrong checksum" for _, state, _ in rows))
-    for name, record in resources().items():
-        print(f"{name} ({record.kind}): {record.title}")
-        print(f"    licence: {record.licence}\n    cite: {record.citation}")
+
+def _data_list(args):
+    from miricigale.refdata import find_resource, resources
+
+    records = {name: record for name, record in resources().items() if args.pattern in name}
+    if not records:
+        print(f"no resource has {args.pattern!r} in its name", file=sys.stderr)
+        return 1
+    width = min(shutil.get_terminal_size((100, 24)).columns, 120)
+    for name, record in records.items():
+        path = find_resource(name) if record.file else None
+        if path is not None:
+            state = str(path)
+        elif not record.file:
+            state = f"read from {record.source}"
+        else:
+            state = f"absent; miricigale data add {name} PATH"
+        print(f"{name} ({record.kind}): {state}")
+        lines = [record.title, f"licence: {record.licence}", f"cite: {record.citation}"]
+        if record.file and path is None:
+            lines.append(f"source: {record.source}")
+        for line in lines:
+            # addresses stay whole, to be copied
+            wrapped = textwrap.wrap(line, width - 4, break_long_words=False, break_on_hyphens=False)
+            print(textwrap.indent("\n  ".join(wrapped), "    "))
+    return 0
+
+
+def _data_check(args):
+    from miricigale.refdata import check_resources
+    from miricigale.sed.libraries import openers
+
+    rows = check_resources(openers())
+    length = max(len(row.name) for row in rows)
+    for row in rows:
+        print(f"{row.name:{length}s}  {row.state:14s}  {row.where}")
+        if row.message:
+            print(f"{'':{length}s}  {row.message}")
+    bad = [row.name for row in rows if row.bad]
+    if bad:
+        print(f"miricigale: not as they should be: {', '.join(bad)}", file=sys.stderr)
+    return int(bool(bad))
+
+
+def _data_add(args):
+    from miricigale.refdata import add_resource
+    from miricigale.sed.libraries import READERS, add_library
+
+    try:
+        if args.name in READERS:
+            print(add_library(args.name, args.path, progress_bar=sys.stderr.isatty()))
+        else:
+            print(add_resource(args.name, args.path))
+    except KeyboardInterrupt:
+        print("stopped; nothing was changed", file=sys.stderr)
+        return 130
     return 0
 
 

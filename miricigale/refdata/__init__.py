@@ -1,15 +1,20 @@
 """Reference data: one record per resource, one function that finds it."""
 
-from miricigale.refdata.locate import add_resource, check_resources, conf, locate
+from miricigale.refdata.check import ResourceState, check_resources
+from miricigale.refdata.locate import cache_folder, conf, find_resource, locate
 from miricigale.refdata.registry import Registry, Resource, citations, resource, resources
+from miricigale.refdata.store import add_resource
 
 __all__ = [
     "Registry",
     "Resource",
+    "ResourceState",
     "add_resource",
+    "cache_folder",
     "check_resources",
     "citations",
     "conf",
+    "find_resource",
     "locate",
     "resource",
     "resources",

@@ -3,8 +3,8 @@
 import functools
 import hashlib
 import importlib.metadata
+import json
 import os
-import shutil
 import warnings
 from importlib import resources as importlib_resources
 from pathlib import Path
@@ -12,17 +12,20 @@ from pathlib import Path
 from astropy import config as _config
 from astropy.config import ConfigItem, ConfigNamespace
 
-from miricigale.refdata.registry import resource, resources
+from miricigale.refdata.registry import resource
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
 
 __all__ = [
-    "add_resource",
-    "check_resources",
+    "cache_folder",
     "conf",
     "data_folder",
     "file_sha256",
+    "find_resource",
     "fingerprint",
+    "fingerprint_of",
     "locate",
+    "record_path",
+    "stored_record",
 ]
 
 
@@ -31,6 +34,12 @@ class Conf(ConfigNamespace):
 
     data_folder = ConfigItem(
         "", "Folder for reference data that the user brings; empty: astropy's cache folder."
+    )
+    cache_folder = ConfigItem(
+        "", "Folder for what can be made again; empty: astropy's cache folder."
+    )
+    grid_cache_size = ConfigItem(
+        1000, "Size in MB to which the cache of model grids may grow; 0: none.", "integer(min=0)"
     )
 
 
@@ -52,27 +61,134 @@ def data_folder():
     return Path(_config.get_cache_dir()) / "miricigale"
 
 
+def cache_folder():
+    """
+    The user's folder for what the package can make again, such as model grids.
+
+    Returns
+    -------
+    folder : `pathlib.Path`
+        ``conf.cache_folder``, or ``miricigale/cache`` in astropy's cache folder; it need not
+        exist, and may be deleted at any time.
+    """
+    if conf.cache_folder:
+        return Path(conf.cache_folder).expanduser()
+    return Path(_config.get_cache_dir()) / "miricigale" / "cache"
+
+
 def file_sha256(path):
     """The sha256 of a file as hexadecimal text."""
     with open(path, "rb") as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
+def record_path(path):
+    """Path of the record that is kept beside a file that was added: ``<file>.json``."""
+    return path.with_name(path.name + ".json")
+
+
+def stored_record(path):
+    """
+    The record that was written when a file was added.
+
+    Parameters
+    ----------
+    path : `pathlib.Path`
+        The file.
+
+    Returns
+    -------
+    record : dict or None
+        Checksum, size, source and what was found; None if there is none.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If it is there and cannot be read.
+    """
+    beside = record_path(path)
+    try:
+        status = beside.stat()
+        record = _json(beside, status.st_ino, status.st_size, status.st_mtime_ns)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (OSError, ValueError) as err:
+        msg = f"{beside} cannot be read as the record of {path.name}: {err}"
+        raise DataError(msg) from err
+    if not isinstance(record, dict) or not isinstance(record.get("sha256"), str):
+        msg = f"{beside} cannot be read as the record of {path.name}: it has no 'sha256'"
+        raise DataError(msg)
+    return dict(record)
+
+
+@functools.lru_cache(maxsize=16)
+def _json(path, inode, size, modified):
+    """Content of a JSON file, kept as long as it does not change: thousands of checksums."""
+    del inode, size, modified
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
 def _places(record):
-    if "MIRICIGALE_DATA" in os.environ:
+    if os.environ.get("MIRICIGALE_DATA"):
         yield "MIRICIGALE_DATA", Path(os.environ["MIRICIGALE_DATA"]).expanduser()
     yield "the data folder", data_folder()
     if record.kind == "bundled":
         yield "the package", Path(str(importlib_resources.files("miricigale.refdata"))) / "files"
 
 
+def find_place(record):
+    """
+    Where the file of a record is found first.
+
+    Returns
+    -------
+    label : str
+        ``"MIRICIGALE_DATA"``, ``"the data folder"``, ``"the package"`` or ``""``.
+    path : `pathlib.Path` or None
+    """
+    for label, folder in _places(record):
+        path = folder / record.file
+        if path.exists():
+            return label, path
+    return "", None
+
+
 def _warn_of_override(record, label, path):
     """Say so if a bundled file gives way to another one of different content."""
     if label == "the package" or record.kind != "bundled" or not path.is_file():
         return
-    if _sha256_of(path, path.stat().st_mtime_ns) != record.sha256:
+    if fingerprint_of(path) != record.sha256:
         msg = f"resource {record.name!r} is taken from {path}, which differs from the bundled file"
         warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+
+
+def _file_record(name):
+    record = resource(name)
+    if not record.file:
+        raise argument_error("name", "a resource that is a file", f"{name!r} ({record.source})")
+    return record
+
+
+def find_resource(name):
+    """
+    Find the file or folder of a resource, if it is anywhere.
+
+    Parameters
+    ----------
+    name : str
+        Such as ``"torus.skirtor2016"``; see `resources`.
+
+    Returns
+    -------
+    path : `pathlib.Path` or None
+        As `locate` finds it; None where that would raise for want of a file.
+
+    Raises
+    ------
+    KeyError
+        If there is no such resource.
+    """
+    return find_place(_file_record(name))[1]
 
 
 def locate(name, *, check=False):
@@ -87,7 +203,8 @@ def locate(name, *, check=False):
     name : str
         Such as ``"ssp.bc03"``; see `resources`.
     check : bool, optional
-        Whether the checksum is compared with the record.
+        Whether the checksum is compared with the record, or with the one that was written
+        beside the file when it was added.
 
     Returns
     -------
@@ -100,26 +217,22 @@ def locate(name, *, check=False):
     `~miricigale.utils.exceptions.DataError`
         If it is in none of the places, or its checksum differs.
     """
-    record = resource(name)
-    if not record.file:
-        raise argument_error("name", "a resource that is a file", f"{name!r} ({record.source})")
-    tried = []
-    for label, folder in _places(record):
-        path = folder / record.file
-        if path.exists():
-            if check and record.sha256 and path.is_file() and file_sha256(path) != record.sha256:
-                msg = (
-                    f"{path} is not the file that the record of {name!r} describes (sha256 differs)"
-                )
-                raise DataError(msg)
-            _warn_of_override(record, label, path)
-            return path
-        tried.append(f"{label} ({folder})")
-    msg = (
-        f"resource {name!r} ({record.title}) is in none of {', '.join(tried)}; "
-        f"get it from {record.source} and run 'miricigale data add {name} PATH'"
-    )
-    raise DataError(msg)
+    record = _file_record(name)
+    label, path = find_place(record)
+    if path is None:
+        tried = ", ".join(f"{label} ({folder})" for label, folder in _places(record))
+        msg = (
+            f"resource {name!r} ({record.title}) is in none of {tried}; "
+            f"get it from {record.source} and run 'miricigale data add {name} PATH'"
+        )
+        raise DataError(msg)
+    if check and path.is_file():
+        wanted = record.sha256 or (stored_record(path) or {}).get("sha256", "")
+        if wanted and file_sha256(path) != wanted:
+            msg = f"{path} is not the file that the record of {name!r} describes (sha256 differs)"
+            raise DataError(msg)
+    _warn_of_override(record, label, path)
+    return path
 
 
 def fingerprint(name):
@@ -141,88 +254,48 @@ def fingerprint(name):
     if not record.file:
         package = record.source.split(",")[0]
         return f"{package} {importlib.metadata.version(package)}"
-    path = locate(name)
-    if path.is_file():
-        return _sha256_of(path, path.stat().st_mtime_ns)
-    parts = [
-        f"{p.relative_to(path)} {file_sha256(p)}" for p in sorted(path.rglob("*")) if p.is_file()
-    ]
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+    return fingerprint_of(locate(name))
 
 
-@functools.lru_cache(maxsize=256)
-def _sha256_of(path, modified):
-    """Checksum of a file, kept as long as it does not change."""
-    del modified
-    return file_sha256(path)
-
-
-def add_resource(name, path):
+def fingerprint_of(path, *, trust=True):
     """
-    Copy a file or folder that the user brings into the data folder.
+    The sha256 of a file, or over names and contents of a folder.
 
     Parameters
     ----------
-    name : str
-        The resource that it is.
-    path : path-like
-        The file or folder.
-
-    Returns
-    -------
     path : `pathlib.Path`
-        Where it stands now.
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If there is no such path, or its checksum is not the record's.
-    """
-    record, path = resource(name), Path(path).expanduser()
-    if not record.file:
-        raise argument_error("name", "a resource that is a file", f"{name!r} ({record.source})")
-    if not path.exists():
-        msg = f"no file or folder {path}"
-        raise DataError(msg)
-    if record.sha256 and (not path.is_file() or file_sha256(path) != record.sha256):
-        msg = f"{path} is not the file that the record of {name!r} describes (sha256 differs)"
-        raise DataError(msg)
-    target = data_folder() / record.file
-    target.parent.mkdir(parents=True, exist_ok=True)
-    # a copy that is interrupted must not be found later
-    partial = target.with_name(target.name + ".partial")
-    if path.is_dir():
-        shutil.rmtree(partial, ignore_errors=True)
-        shutil.copytree(path, partial)
-        shutil.rmtree(target, ignore_errors=True)
-    else:
-        shutil.copyfile(path, partial)
-    os.replace(partial, target)
-    return target
-
-
-def check_resources():
-    """
-    State of every resource.
+        The file or folder.
+    trust : bool, optional
+        Whether the file is not read where its size and time are those of the record beside
+        it, or of an earlier call.
 
     Returns
     -------
-    rows : list of tuple
-        Name, state (``"ok"``, ``"absent"``, ``"wrong checksum"``, ``"unchecked"``,
-        ``"from package"``) and path or source, one for each record.
+    text : str
     """
-    rows = []
-    for name, record in resources().items():
-        if not record.file:
-            rows.append((name, "from package", record.source))
-            continue
-        try:
-            path = locate(name, check=True)
-        except DataError as err:
-            state = "wrong checksum" if "sha256" in str(err) else "absent"
-            rows.append((name, state, record.source))
-        else:
-            rows.append(
-                (name, "ok" if record.sha256 and path.is_file() else "unchecked", str(path))
-            )
-    return rows
+    if path.is_dir():
+        parts = [
+            f"{p.relative_to(path)} {file_sha256(p)}"
+            for p in sorted(path.rglob("*"))
+            if p.is_file()
+        ]
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+    if not trust:
+        return file_sha256(path)
+    status = path.stat()
+    size, modified = status.st_size, status.st_mtime_ns
+    try:
+        record = stored_record(path) or {}
+    except DataError:
+        # 'miricigale data check' tells; the file itself is what counts
+        record = {}
+    if (record.get("size"), record.get("mtime_ns")) == (size, modified):
+        return record["sha256"]
+    return _sha256_of(path, status.st_ino, size, modified)
+
+
+@functools.lru_cache(maxsize=256)
+def _sha256_of(path, inode, size, modified):
+    """Checksum of a file, kept as long as it does not change."""
+    del inode, size, modified
+    return file_sha256(path)

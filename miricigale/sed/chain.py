@@ -5,25 +5,61 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from miricigale.filters import FilterSet
 from miricigale.sed import _core
 from miricigale.sed.component import ROLES
 
-__all__ = ["Attenuated", "Chain", "Galaxy", "Stars"]
+__all__ = ["COLOURS", "Attenuated", "Chain", "Galaxy", "Stars"]
 
 INFRARED = (3.0, 1000.0)  # um
 SIX = 6.0  # um
+VISUAL = 0.55  # um, where A_V and the light-weighted age are taken
+#: The ten windows of Calzetti, Kinney & Storchi-Bergmann 1994, table 2 (um).
+UV_WINDOWS = (
+    (0.1268, 0.1284),
+    (0.1309, 0.1316),
+    (0.1342, 0.1371),
+    (0.1407, 0.1515),
+    (0.1562, 0.1583),
+    (0.1677, 0.1740),
+    (0.1760, 0.1833),
+    (0.1866, 0.1890),
+    (0.1930, 0.1950),
+    (0.2400, 0.2580),
+)
+#: Bands of the rest-frame colours.
+COLOUR_BANDS = {
+    "nuv": "sedpy.galex_NUV",
+    "u": "sedpy.bessell_U",
+    "v": "sedpy.bessell_V",
+    "r": "sedpy.sdss_r0",
+    "j": "sedpy.twomass_J",
+}
+#: Rest-frame colours: name to the two bands.
+COLOURS = {"nuv_r": ("nuv", "r"), "u_v": ("u", "v"), "v_j": ("v", "j")}
 
 
 @dataclass(frozen=True, eq=False)
 class Stars:
-    """Stellar light for one solar mass formed: L_lambda in W/um, masses and rates."""
+    """
+    Light of stars and of the gas they ionise, for one solar mass formed.
+
+    Spectra are L_lambda in W/um; ``nebular_young`` and ``nebular_old`` are the gas's part
+    of ``young`` and ``old``; ``dust_power`` in W is what dust takes of the ionising light;
+    ages are in Gyr, rates in Msun/yr, masses in Msun.
+    """
 
     young: np.ndarray
     old: np.ndarray
+    nebular_young: np.ndarray | None
+    nebular_old: np.ndarray | None
+    dust_power: float
     stellar_mass: float
     sfr: float
     sfr_10myr: float
     sfr_100myr: float
+    age_mass: float
+    age_light: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +68,7 @@ class Attenuated:
 
     light: np.ndarray
     intrinsic: np.ndarray
+    nebular: np.ndarray | None
     absorbed: float
 
 
@@ -50,6 +87,14 @@ class Galaxy:
         return self.starlight.light + self.dust
 
 
+def trapezoid_weights(wave):
+    """Weights of the trapezoid rule: ``weights @ spectrum`` is its integral."""
+    weights = np.zeros(wave.size)
+    weights[:-1] += 0.5 * np.diff(wave)
+    weights[1:] += 0.5 * np.diff(wave)
+    return weights
+
+
 class Chain:
     """
     Components in order, on the union of their nodes.
@@ -63,82 +108,188 @@ class Chain:
     ----------
     wave : `~numpy.ndarray`, shape (n_wave,)
         Rest wavelengths in um.
+    weights : `~numpy.ndarray`, shape (n_wave,)
+        Weights of the trapezoid rule on them.
     """
 
     def __init__(self, components):
         self.by_role = {role: components.get(role) for role in ROLES}
         parts = [c.nodes() for c in components.values() if len(c.nodes())]
-        wave = _core.merge_nodes([*parts, [SIX, *INFRARED]])
+        limit = _core.LYMAN_LIMIT * np.array([1 - 1e-5, 1 + 1e-5])
+        windows = np.ravel(UV_WINDOWS)
+        wave = _core.merge_nodes([*parts, [SIX, VISUAL, *INFRARED], limit, windows])
         wave.flags.writeable = False
         self.wave = wave
-        self._to_lnu = wave**2 / _core.LIGHT
-        low, high = np.searchsorted(wave, np.array(INFRARED) * (1 - 1e-9))
-        self._infrared = slice(int(low), int(high) + 1)
-        self._six = int(np.searchsorted(wave, SIX * (1 - 1e-9)))
-        self._stellar_hat = _core.hat_matrix(np.asarray(components["stellar"].nodes()), wave)
+        self.log_wave = np.log(wave)
+        self.weights = trapezoid_weights(wave)
+        self.to_lnu = wave**2 / _core.LIGHT
+        self._ionising = wave < _core.LYMAN_LIMIT
+        self._at = {x: int(np.searchsorted(wave, x * (1 - 1e-9))) for x in (SIX, VISUAL, *INFRARED)}
+        self._functionals()
         self._keys = {
             role: tuple(part.parameters) if part else () for role, part in self.by_role.items()
         }
-        self._factors = functools.lru_cache(maxsize=64)(self._make_factors)
+        self._caches()
+
+    def _caches(self):
+        self._table = functools.lru_cache(maxsize=8)(self._make_table)
+        self._factors = functools.lru_cache(maxsize=256)(self._make_factors)
         self._stars = functools.lru_cache(maxsize=64)(self._make_stars)
         self._starlight = functools.lru_cache(maxsize=256)(self._make_starlight)
         self._dust = functools.lru_cache(maxsize=256)(self._make_dust)
         self._agn = functools.lru_cache(maxsize=256)(self._make_agn)
+        self._sky = functools.lru_cache(maxsize=64)(self._make_sky)
+
+    def _functionals(self):
+        """Everything derived from a galaxy's light by a sum over wavelengths, in one matrix."""
+        wave, n = self.wave, self.wave.size
+        infrared = np.zeros(n)
+        part = slice(self._at[INFRARED[0]], self._at[INFRARED[1]] + 1)
+        infrared[part] = trapezoid_weights(wave[part])
+        windows = np.zeros((len(UV_WINDOWS), n))
+        for row, (low, high) in zip(windows, UV_WINDOWS, strict=True):
+            first, last = np.searchsorted(wave, [low * (1 - 1e-9), high * (1 + 1e-9)])
+            row[first:last] = trapezoid_weights(wave[first:last]) / (high - low)
+        bands = FilterSet.from_names(list(COLOUR_BANDS.values())).weights(wave) * self.to_lnu
+        visual = np.zeros((1, n))
+        visual[0, self._at[VISUAL]] = 1.0
+        self.functionals = np.concatenate([infrared[None], visual, windows, bands])
 
     # values of the parameters of some roles, as a key for the caches
+    def names(self, *roles):
+        """Names of the parameters of these roles."""
+        return tuple(name for role in roles for name in self._keys[role])
+
     def key(self, values, *roles):
         """Values of all parameters of these roles, as a tuple."""
-        return tuple(values[name] for role in roles for name in self._keys[role])
+        return tuple(values[name] for name in self.names(*roles))
 
     def _dict(self, key, *roles):
-        names = [name for role in roles for name in self._keys[role]]
-        return dict(zip(names, key, strict=True))
+        return dict(zip(self.names(*roles), key, strict=True))
+
+    # ------------------------------------------------------------------ stars
+
+    def _make_table(self, metallicity):
+        """Ages, spectra on our grid, living mass and ionising photons of one metallicity."""
+        stellar = self.by_role["stellar"]
+        age, spectra, living = stellar.table(metallicity)
+        matrix = _core.hat_matrix(np.asarray(stellar.nodes()), self.wave)
+        spectra = np.ascontiguousarray((matrix @ np.asarray(spectra, dtype=float).T).T)
+        ionising = stellar.ionizing(metallicity) if self.by_role["nebular"] else None
+        return age, spectra, living, ionising
+
+    @functools.cached_property
+    def _nebular_hat(self):
+        return _core.hat_matrix(np.asarray(self.by_role["nebular"].nodes()), self.wave)
 
     def _make_stars(self, key):
-        values = self._dict(key, "sfh", "stellar")
-        history = self.by_role["sfh"].history(values)
-        stellar = self.by_role["stellar"]
-        _, spectra, living = stellar.table(values["metallicity"])
-        young, old = stellar.age_weights(history, values["metallicity"])
-        return Stars(
-            young=self._stellar_hat @ (young @ spectra),
-            old=self._stellar_hat @ (old @ spectra),
-            stellar_mass=float((young + old) @ living),
-            sfr=float(history[-1]),
-            sfr_10myr=float(history[-10:].mean()),
-            sfr_100myr=float(history[-100:].mean()),
-        )
+        return self.stars_of([key])[0]
+
+    def stars_of(self, keys):
+        """
+        `Stars` of several histories at once.
+
+        Parameters
+        ----------
+        keys : list of tuple
+            As `key` gives them for ``sfh``, ``stellar`` and ``nebular``.
+        """
+        values = [self._dict(key, "sfh", "stellar", "nebular") for key in keys]
+        out = [None] * len(keys)
+        for metallicity in {v["metallicity"] for v in values}:
+            rows = [i for i, v in enumerate(values) if v["metallicity"] == metallicity]
+            for i, stars in zip(
+                rows, self._stars_of_metal(metallicity, [values[i] for i in rows]), strict=True
+            ):
+                out[i] = stars
+        return out
+
+    def _stars_of_metal(self, metallicity, values):
+        age, spectra, living, ionising = self._table(metallicity)
+        sfh, stellar, nebular = (self.by_role[r] for r in ("sfh", "stellar", "nebular"))
+        histories = [sfh.history(v) for v in values]
+        pairs = [stellar.age_weights(h, v) for h, v in zip(histories, values, strict=True)]
+        young, old = (np.array([pair[i] for pair in pairs]) for i in (0, 1))
+        young_light, old_light = young @ spectra, old @ spectra
+        both = young + old
+        visual = spectra[:, self._at[VISUAL]]
+        light = both @ visual
+        age_light = (both * visual) @ age / np.where(light > 0, light, np.nan) * 1e-3
+        age_mass = both @ age / both.sum(axis=1) * 1e-3
+        mass = both @ living
+        for i, (v, h) in enumerate(zip(values, histories, strict=True)):
+            parts = [young_light[i], old_light[i]]
+            gas, dusty = [None, None], 0.0
+            if nebular is not None:
+                hard = sum(self.weights @ (part * self._ionising) for part in parts)
+                dusty = v["f_dust"] * float(hard)
+                passed = np.where(self._ionising, v["f_esc"], 1.0)
+                gas = [
+                    self._nebular_hat @ nebular.spectra(age, w, ionising, v)
+                    for w in (young[i], old[i])
+                ]
+                parts = [part * passed + glow for part, glow in zip(parts, gas, strict=True)]
+            yield Stars(
+                young=parts[0],
+                old=parts[1],
+                nebular_young=gas[0],
+                nebular_old=gas[1],
+                dust_power=dusty,
+                stellar_mass=float(mass[i]),
+                sfr=float(h[-1]),
+                sfr_10myr=float(h[-10:].mean()),
+                sfr_100myr=float(h[-100:].mean()),
+                age_mass=float(age_mass[i]),
+                age_light=float(age_light[i]),
+            )
 
     def stars(self, values):
         """`Stars` for a dict of values."""
-        return self._stars(self.key(values, "sfh", "stellar"))
+        return self._stars(self.key(values, "sfh", "stellar", "nebular"))
+
+    # ------------------------------------------------------- attenuation and dust
 
     def _make_factors(self, key):
-        return self.by_role["attenuation"].factors(self.wave, self._dict(key, "attenuation"))
+        attenuation = self.by_role["attenuation"]
+        if attenuation is None:
+            ones = np.ones(self.wave.size)
+            return ones, ones
+        return attenuation.factors(self.wave, self._dict(key, "attenuation"))
+
+    def factors(self, key):
+        """Transmissions for young and old stars, by the key of ``attenuation``."""
+        return self._factors(key)
 
     def _make_starlight(self, star_key, key):
         stars = self._stars(star_key)
-        intrinsic = stars.young + stars.old
-        if self.by_role["attenuation"] is None:
-            return Attenuated(intrinsic, intrinsic, 0.0)
         young, old = self._factors(key)
+        intrinsic = stars.young + stars.old
         light = stars.young * young + stars.old * old
-        return Attenuated(light, intrinsic, float(np.trapezoid(intrinsic - light, self.wave)))
+        nebular = None
+        if stars.nebular_young is not None:
+            nebular = stars.nebular_young * young + stars.nebular_old * old
+        absorbed = float(self.weights @ (intrinsic - light)) + stars.dust_power
+        return Attenuated(light, intrinsic, nebular, absorbed)
 
     def starlight(self, values):
         """`Attenuated` starlight for a dict of values."""
-        return self._starlight(self.key(values, "sfh", "stellar"), self.key(values, "attenuation"))
+        stars = self.key(values, "sfh", "stellar", "nebular")
+        return self._starlight(stars, self.key(values, "attenuation"))
 
     def _make_dust(self, key):
+        if self.by_role["dust"] is None:
+            return np.zeros(self.wave.size)
         template = self.by_role["dust"].template(self.wave, **self._dict(key, "dust"))
         # one watt on this grid too, where the step at the first node is a slope
-        return template / np.trapezoid(template, self.wave)
+        return template / (self.weights @ template)
 
     def dust(self, values):
         """Dust spectrum in W/um for one watt; zeros without a dust component."""
-        if self.by_role["dust"] is None:
-            return np.zeros(self.wave.size)
         return self._dust(self.key(values, "dust"))
+
+    def dust_of(self, key):
+        """The same by the key of ``dust``."""
+        return self._dust(key)
 
     def galaxy(self, values):
         """`Galaxy` for a dict of values."""
@@ -146,33 +297,57 @@ class Chain:
         dust = starlight.absorbed * self.dust(values)
         return Galaxy(self.stars(values), starlight, dust, starlight.absorbed)
 
+    # ------------------------------------------------------------- AGN and the sky
+
     def _make_agn(self, key):
         return self.by_role["agn"].templates(self.wave, self._dict(key, "agn"))
 
-    def agn(self, values):
-        """`~miricigale.sed.components.AGNTemplates` for a dict of values, whatever its fraction."""
+    def agn_key(self, values):
+        """Values of the AGN's parameters, those without effect at their defaults."""
         agn = self.by_role["agn"]
         changed = values | {"frac_agn": 0.0}
-        for name in agn.inert(values):
+        for name in agn.inert(changed):
             changed[name] = agn.parameters[name].default
-        return self._agn(self.key(changed, "agn"))
+        return self.key(changed, "agn")
 
-    def transmission(self, redshift):
-        """Transmission of the intergalactic medium at every rest wavelength."""
-        igm = self.by_role["igm"]
-        if igm is None:
-            return np.ones(self.wave.size)
-        return igm.transmission(self.wave * (1.0 + redshift), redshift)
+    def agn_of(self, key):
+        """`~miricigale.sed.components.AGNTemplates` by a key of `agn_key`."""
+        return self._agn(key)
+
+    def agn(self, values):
+        """`~miricigale.sed.components.AGNTemplates` for a dict of values, whatever its fraction."""
+        return self._agn(self.agn_key(values))
+
+    def _make_sky(self, redshift, key):
+        observed = self.wave * (1.0 + redshift)
+        igm, foreground = self.by_role["igm"], self.by_role["foreground"]
+        out = np.ones(self.wave.size) if igm is None else igm.transmission(observed, redshift)
+        if foreground is not None:
+            out = out * foreground.transmission(observed, self._dict(key, "foreground"))
+        return out
+
+    def sky(self, values):
+        """Transmission between the source and us at every rest wavelength."""
+        return self._sky(values["redshift"], self.key(values, "foreground"))
+
+    def sky_of(self, redshift, key):
+        """The same by redshift and the key of ``foreground``."""
+        return self._sky(redshift, key)
+
+    # --------------------------------------------------------------- derived values
 
     def infrared(self, spectrum):
         """Integral over 3-1000 um of L_lambda, along the last axis."""
-        part = self._infrared
-        return np.trapezoid(spectrum[..., part], self.wave[part], axis=-1)
+        return spectrum @ self.functionals[0]
 
     def six_micron(self, spectrum):
         """Power nu L_nu at 6 um."""
-        return spectrum[..., self._six] * SIX
+        return spectrum[..., self._at[SIX]] * SIX
+
+    def visual(self, spectrum):
+        """L_lambda at 0.55 um."""
+        return spectrum[..., self._at[VISUAL]]
 
     def lnu(self, spectrum):
         """L_nu in W/Hz from L_lambda in W/um."""
-        return spectrum * self._to_lnu
+        return spectrum * self.to_lnu

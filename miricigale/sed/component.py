@@ -59,6 +59,9 @@ class Component:
     reference = ""
     resource = None
 
+    #: Parameters of other components that this one looks at.
+    others = ()
+
     #: Options of this class: name to the values allowed, the first being the default.
     options = {}
 
@@ -122,6 +125,11 @@ class Component:
         Used where parameters are restricted together or to a list.
         """
         return
+
+    @property
+    def refuses(self):
+        """Whether `invalid` can refuse anything."""
+        return type(self).invalid is not Component.invalid
 
     @functools.cached_property
     def path(self):

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
+import astropy.units as u
 import numpy as np
 from astropy.io import fits
 from astropy.table import QTable
@@ -15,8 +16,14 @@ from miricigale.utils.units import frozen_array
 
 __all__ = ["ModelGrid"]
 
-_FORMAT = "miricigale-modelgrid-1"
-_TABLES = ("galaxy_parameters", "agn_parameters", "galaxy_properties", "agn_properties")
+_FORMAT = "miricigale-modelgrid-2"
+_TABLES = (
+    "galaxy_parameters",
+    "agn_parameters",
+    "galaxy_properties",
+    "galaxy_shape",
+    "agn_properties",
+)
 _ARRAYS = {
     "redshift": ("", float),
     "galaxy": ("uJy / solMass", float),
@@ -67,6 +74,9 @@ class ModelGrid:
     agn_properties : `~astropy.table.QTable`, nA rows
         Derived quantities for each watt of AGN power (``accretion_power``, ``l_6um``,
         ...).
+    galaxy_shape : `~astropy.table.QTable`, nG rows, optional
+        Derived quantities of the galaxy that do not scale with mass (``a_v``, ``beta``,
+        ``age_light``, colours, ...).
     agn_multiplicity : `~numpy.ndarray` of int, shape (nA,)
         How many identical models of the grid each row stands for: without polar dust
         the temperatures of that dust make no difference, and are evaluated once.
@@ -92,10 +102,13 @@ class ModelGrid:
     agn_properties: QTable
     agn_multiplicity: np.ndarray
     meta: dict = field(default_factory=dict)
+    galaxy_shape: QTable | None = None
 
     def __post_init__(self):
         object.__setattr__(self, "filters", tuple(str(name) for name in self.filters))
         object.__setattr__(self, "meta", dict(self.meta))
+        if self.galaxy_shape is None:
+            object.__setattr__(self, "galaxy_shape", QTable())
         for name, (_, dtype) in _ARRAYS.items():
             object.__setattr__(self, name, frozen_array(getattr(self, name), dtype))
         n_z, n_b = self.redshift.size, len(self.filters)
@@ -114,10 +127,9 @@ class ModelGrid:
                 raise argument_error(name, f"of shape {shape}", f"{getattr(self, name).shape}")
         for name in _TABLES:
             rows = n_g if name.startswith("galaxy") else n_a
-            if len(getattr(self, name)) != rows:
-                raise argument_error(
-                    name, f"a table of {rows} rows", f"{len(getattr(self, name))} rows"
-                )
+            table = getattr(self, name)
+            if len(table) != rows and not (name == "galaxy_shape" and not table.colnames):
+                raise argument_error(name, f"a table of {rows} rows", f"{len(table)} rows")
         if len(set(self.filters)) != n_b or n_b == 0:
             raise argument_error("filters", "one or more different names", f"{self.filters}")
         if n_z == 0 or n_g == 0:
@@ -198,7 +210,13 @@ class ModelGrid:
         """
         header = fits.Header({"FORMAT": _FORMAT})
         hdus = [fits.PrimaryHDU(header=header)]
-        text = {"filters": list(self.filters), "meta": self.meta}
+        described = {
+            table: {
+                c: getattr(self, table)[c].info.description for c in getattr(self, table).colnames
+            }
+            for table in _TABLES
+        }
+        text = {"filters": list(self.filters), "meta": self.meta, "descriptions": described}
         hdus.append(_text_hdu(json.dumps(text, default=str)))
         for name, (unit, dtype) in _ARRAYS.items():
             array = getattr(self, name)
@@ -231,7 +249,10 @@ class ModelGrid:
                     raise DataError(msg)
                 text = json.loads(bytes(np.asarray(hdus["TEXT"].data)).decode())
                 values = {name: hdus[name].data for name in _ARRAYS if name in hdus}
-                tables = {name: QTable.read(hdus[name]) for name in _TABLES}
+                tables = {
+                    name: _restore(QTable.read(hdus[name]), text["descriptions"][name])
+                    for name in _TABLES
+                }
         except (KeyError, ValueError, TypeError) as err:
             msg = f"{path} is not a complete model grid: {err}"
             raise DataError(msg) from err
@@ -257,6 +278,16 @@ class ModelGrid:
 def _text_hdu(text):
     data = np.frombuffer(text.encode(), dtype=np.uint8)
     return fits.ImageHDU(data, name="TEXT")
+
+
+def _restore(table, descriptions):
+    """Columns are quantities again, pure numbers too, and say what they are."""
+    for name, description in descriptions.items():
+        column = table[name]
+        if not hasattr(column, "to_value"):
+            table[name] = u.Quantity(np.asarray(column, dtype=float))
+        table[name].info.description = description
+    return table
 
 
 def _plain(table):

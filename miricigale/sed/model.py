@@ -5,13 +5,22 @@ import functools
 import warnings
 
 import astropy.units as u
+import numpy as np
 from astropy.table import QTable, Table
 
 from miricigale.filters import FilterSet
 from miricigale.refdata import citations
-from miricigale.sed import presets, tables
+from miricigale.sed import gridding, presets, tables
 from miricigale.sed.chain import Chain
 from miricigale.sed.component import COMPONENTS, ROLES, Component
+from miricigale.sed.derived import (
+    DERIVED,
+    agn_quantities,
+    columns,
+    galaxy_quantities,
+    scaled_quantities,
+)
+from miricigale.sed.grid_cache import cached_grid
 from miricigale.sed.parameter import Parameter
 from miricigale.sed.spectrum import COSMOLOGY, SED, distance
 from miricigale.utils.exceptions import ConfigError, MiricigaleWarning, argument_error, unknown_name
@@ -42,8 +51,9 @@ class ModelSpectra:
     total : `SED`
         The whole, as observed.
     components : dict of str to `SED`
-        ``stellar`` (attenuated), ``dust`` and, with an AGN, ``agn_disk``, ``agn_torus`` and
-        ``agn_polar``: they sum to ``total``. ``stellar_intrinsic`` is the starlight before dust.
+        ``stellar`` (attenuated), ``dust``, with gas ``nebular`` (attenuated) and with an AGN
+        ``agn_disk``, ``agn_torus`` and ``agn_polar``: they sum to ``total``.
+        ``stellar_intrinsic`` is the light of stars and gas before dust.
     derived : dict of str to `~astropy.units.Quantity`
         See `SEDModel.derived_columns`.
     parameters : dict of str to `~astropy.units.Quantity`
@@ -103,8 +113,8 @@ class SEDModel:
             raise argument_error("components", "at most one of each role", roles)
         if "dust" in roles and "attenuation" not in roles:
             raise argument_error("components", "with 'attenuation' if there is 'dust'", roles)
-        if "nebular" in roles:
-            raise argument_error("components", "without 'nebular', which is not built yet", roles)
+        if "xray" in roles and "agn" not in roles:
+            raise argument_error("components", "with 'agn' if there is 'xray'", roles)
         merged = {}
         for component in self.components:
             twice = set(component.parameters) & (set(merged) | set(_MODEL_PARAMETERS))
@@ -112,6 +122,7 @@ class SEDModel:
                 raise argument_error("components", "without shared parameter names", sorted(twice))
             merged.update(component.parameters)
         self._parameters = merged | _MODEL_PARAMETERS
+        self._notes = ()
 
     # ------------------------------------------------------------------ making
 
@@ -140,7 +151,7 @@ class SEDModel:
             defaults = dict(entry)
             try:
                 parts.append(COMPONENTS.get(defaults.pop("name", "(none)"))(**defaults))
-            except (KeyError, TypeError, ValueError) as err:
+            except (KeyError, TypeError, ValueError, u.UnitsError) as err:
                 msg = f"[sed] component {entry}: {err.args[0]}"
                 raise ConfigError(msg) from err
         try:
@@ -152,26 +163,44 @@ class SEDModel:
 
     @classmethod
     def yang2021(
-        cls, *, agn=True, igm="meiksin2006", frac_agn_definition="dust", cosmology=COSMOLOGY
+        cls,
+        *,
+        agn=True,
+        xray=False,
+        igm="meiksin2006",
+        libraries="best",
+        frac_agn_definition="dust",
+        cosmology=COSMOLOGY,
     ):
         """
-        The chain of Yang et al. 2021, from the libraries at hand; ``meta`` names them.
+        The chain of Yang et al. 2021, from the best libraries at hand; ``meta`` names them.
 
-        Delayed history, BC03 at solar metallicity (Kroupa IMF; the paper has Chabrier),
-        Calzetti-Leitherer attenuation, dust in a sequence of alpha, torus with SMC polar dust
-        (oa 40 deg, i 70 deg, p 1, q 1, R 20, emissivity 1.6), intergalactic absorption.
+        Delayed history, BC03 at solar metallicity, Calzetti-Leitherer attenuation, dust in a
+        sequence of alpha, torus with SMC polar dust (oa 40 deg, i 70 deg, p 1, q 1, R 20,
+        emissivity 1.6), intergalactic absorption. BC03 files (the paper: Chabrier IMF), Dale et
+        al. 2014 and SKIRTOR are used where they are registered (``miricigale data add``) and
+        hold the paper's values; bundled tables stand in for what is not: BC03 with a Kroupa IMF,
+        a Draine & Li sequence, a parametric torus.
 
         Parameters
         ----------
         agn : bool, optional
             Whether the chain has an AGN.
+        xray : bool, optional
+            Whether X-rays of the AGN are derived, as in the paper: Stern 2015, photon index 1.8,
+            half of the 0.5-7 keV flux.
         igm : str, optional
             Name of the intergalactic component.
+        libraries : {"best", "bundled"}, optional
+            Whether registered libraries are used, or the bundled tables alone;
+            ``meta["libraries"]`` says which and why.
         frac_agn_definition, cosmology : optional
             As for the class.
         """
-        parts = presets.yang2021_components(agn=agn, igm=igm)
-        return cls(parts, frac_agn_definition=frac_agn_definition, cosmology=cosmology)
+        parts, notes = presets.yang2021_components(agn=agn, xray=xray, igm=igm, libraries=libraries)
+        model = cls(parts, frac_agn_definition=frac_agn_definition, cosmology=cosmology)
+        model._notes = tuple(notes)
+        return model
 
     @staticmethod
     def yang2021_axes(kind="fit"):
@@ -185,10 +214,19 @@ class SEDModel:
         """All parameters, in the order of the chain: dict of name to `Parameter`."""
         return dict(self._parameters)
 
+    def component(self, role):
+        """The component of a role (one of `~miricigale.sed.ROLES`), or None."""
+        return next((c for c in self.components if c.role == role), None)
+
     @property
     def has_agn(self):
         """Whether the chain has an AGN."""
-        return any(c.role == "agn" for c in self.components)
+        return self.component("agn") is not None
+
+    @property
+    def resources(self):
+        """Names of the reference data that the components read."""
+        return tuple(c.resource for c in self.components if c.resource)
 
     @property
     def meta(self):
@@ -198,10 +236,15 @@ class SEDModel:
         return provenance(
             citations=cite,
             components=[f"{c.role}: {c.name} ({c.library})" for c in self.components],
-            imf="Kroupa (inferred); Yang et al. 2021 use Chabrier",
+            libraries=list(self._notes) or None,
+            options=self._options() or None,
+            imf=self.component("stellar").imf,
             frac_agn_definition=self.frac_agn_definition if self.has_agn else None,
             cosmology=f"H0={self.cosmology.H0.value:g}, Om0={self.cosmology.Om0:g}",
         )
+
+    def _options(self):
+        return [f"{c.name}: {n} = {v}" for c in self.components for n, v in c.settings.items()]
 
     @functools.cached_property
     def chain(self):
@@ -214,8 +257,15 @@ class SEDModel:
         return self.chain.wave * WAVE
 
     def derived_columns(self):
-        """Names, units and descriptions of the derived quantities: dict of name to pair."""
-        return {n: v for n, v in tables.DERIVED.items() if self.has_agn or n not in tables.OF_AGN}
+        """
+        Derived quantities that come with every evaluation.
+
+        Returns
+        -------
+        columns : dict of str to `~miricigale.sed.Derived`
+            Unit and description by name.
+        """
+        return columns(self)
 
     def __getstate__(self):
         state = self.__dict__.copy()
@@ -299,31 +349,45 @@ class SEDModel:
         """
         values = self.values(parameters)
         chain, z = self.chain, values["redshift"]
-        state = tables.row_state(self, values)
-        scale = values["mass"] * float(tables.dilution(z, distance(z, self.cosmology)))
-        factor = chain.transmission(z) * scale
+        galaxy, agn = chain.galaxy(values), None
+        got = galaxy_quantities(
+            [galaxy.stars],
+            np.array([galaxy.dust_luminosity]),
+            galaxy.light[None] @ chain.functionals.T,
+            chain.visual(galaxy.starlight.intrinsic[None]),
+        )
+        spectrum = galaxy.light
+        if self.has_agn:
+            agn, fraction = chain.agn(values), values["frac_agn"]
+            ratio = np.array([fraction / (1.0 - fraction)])
+            seen = tables.seen_agn(chain, [agn])
+            got |= agn_quantities(self.frac_agn_definition, ratio, got, seen)
+            spectrum = spectrum + got["agn_power"] * agn.total
+        far = distance(z, self.cosmology)
+        scaled = scaled_quantities(self, got, np.array([values["mass"]]), z, far, values)
+        factor = chain.sky(values) * (values["mass"] * float(tables.dilution(z, far)))
         wave = chain.wave * (1.0 + z) * WAVE
         quantities = {
             name: u.Quantity(values[name], par.unit) for name, par in self._parameters.items()
         }
         derived = {
-            name: u.Quantity(state.derived[name] * (values["mass"] if extensive else 1.0), unit)
-            for name, (unit, extensive, _) in self.derived_columns().items()
+            name: u.Quantity(scaled[name][0], entry.unit)
+            for name, entry in self.derived_columns().items()
         }
 
         def sed(spectrum, **meta):
             return SED(wave, chain.lnu(spectrum) * factor * FNU, redshift=z, meta=meta)
 
-        galaxy = state.galaxy
-        parts = {
-            "stellar_intrinsic": sed(galaxy.starlight.intrinsic),
-            "stellar": sed(galaxy.starlight.light),
-            "dust": sed(galaxy.dust),
-        }
-        if state.agn is not None:
+        starlight = galaxy.starlight
+        parts = {"stellar_intrinsic": sed(starlight.intrinsic), "stellar": sed(starlight.light)}
+        if starlight.nebular is not None:
+            parts["stellar"] = sed(starlight.light - starlight.nebular)
+            parts["nebular"] = sed(starlight.nebular)
+        parts["dust"] = sed(galaxy.dust)
+        if agn is not None:
             for name in ("disk", "torus", "polar"):
-                parts[f"agn_{name}"] = sed(state.power * getattr(state.agn, name))
-        total = sed(state.spectrum, **self.meta, parameters=quantities, derived=derived)
+                parts[f"agn_{name}"] = sed(got["agn_power"] * getattr(agn, name))
+        total = sed(spectrum, **self.meta, parameters=quantities, derived=derived)
         return ModelSpectra(total, parts, derived, quantities)
 
     def derived(self, **parameters):
@@ -363,7 +427,7 @@ class SEDModel:
         """
         if not isinstance(table, (Table, dict)):
             raise argument_error("table", "a table", type(table).__name__)
-        filters = filters if isinstance(filters, FilterSet) else FilterSet(filters)
+        filters = self._bands(filters)
         table = QTable(table, copy=False)
         self._warn_of_slips(table.colnames)
         return tables.flux_table(self, table, filters)
@@ -372,31 +436,51 @@ class SEDModel:
         """Warn of columns that are left alone and look like a parameter misspelt."""
         names = [name for name in names if name not in self._parameters]
         lower = {name.lower(): name for name in self._parameters}
-        for name in sorted(set(names) - set(tables.DERIVED)):
+        for name in sorted(set(names) - set(DERIVED)):
             close = difflib.get_close_matches(name.lower(), lower, n=1, cutoff=0.85)
             if close:
                 msg = f"column {name!r} is no parameter and left alone: is it {lower[close[0]]!r}?"
                 warnings.warn(msg, MiricigaleWarning, stacklevel=3)
 
-    def grid(self, axes, filters):
+    def grid(self, axes, filters, *, cache=True):
         """
         Factorised band fluxes of a grid of models.
 
         Parameters
         ----------
         axes : dict of str to array
-            Parameter name to its values; ``redshift`` is needed, ``mass`` has no place here.
-            Other parameters have their defaults. Without ``frac_agn``, or with 0 alone, the grid
-            has no AGN.
+            Parameter name to its values; ``redshift`` is needed, ``mass`` has no place here, nor
+            have parameters of X-rays and the foreground. Other parameters have their
+            defaults. Without ``frac_agn``, or with 0 alone, the grid has no AGN.
         filters : `~miricigale.filters.FilterSet` or list of str
             The bands.
+        cache : bool, optional
+            Whether a grid of the same content (axes, bands, components, data, cosmology, code)
+            is taken from the cache folder, and a new one kept there.
 
         Returns
         -------
         grid : `~miricigale.sed.ModelGrid`
+
+        Raises
+        ------
+        KeyError
+            If an axis is not a parameter.
+        ValueError
+            If values do not ascend, are outside their bounds or not in the library.
         """
+        filters = self._bands(filters)
+        axes = gridding.check_axes(self, axes)
+        if not cache:
+            return gridding.model_grid(self, axes, filters)
+        return cached_grid(self, axes, filters, gridding.model_grid)
+
+    def _bands(self, filters):
         filters = filters if isinstance(filters, FilterSet) else FilterSet(filters)
-        return tables.model_grid(self, axes, filters)
+        foreground = self.component("foreground")
+        if foreground is not None:
+            foreground.check_bands(filters)
+        return filters
 
 
 def _role_order(component):

@@ -2,25 +2,81 @@
 
 import numpy as np
 
+from miricigale.refdata import find_resource
 from miricigale.sed import components as c
 from miricigale.sed.component import COMPONENTS
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["yang2021_axes", "yang2021_components"]
+__all__ = ["LIBRARIES", "yang2021_axes", "yang2021_components"]
+
+#: Where a preset takes its libraries from.
+LIBRARIES = ("best", "bundled")
+
+#: Torus of the fits of Yang et al. 2021 (table 1; q is inferred).
+TORUS = {"p": 1.0, "q": 1.0, "opening_angle": 40.0, "radius_ratio": 20.0}
 
 
-def yang2021_components(*, agn=True, igm="meiksin2006"):
-    """Components of the chain of Yang et al. 2021, from the bundled libraries."""
+def yang2021_components(*, agn=True, xray=False, igm="meiksin2006", libraries="best"):
+    """
+    Components of the chain of Yang et al. 2021.
+
+    Parameters
+    ----------
+    agn : bool, optional
+        Whether there is an AGN.
+    xray : bool, optional
+        Whether its X-rays are derived.
+    igm : str, optional
+        Name of the intergalactic component.
+    libraries : {"best", "bundled"}, optional
+        ``"best"``: what the user has registered where it holds the paper's values, the bundled
+        tables for the rest; ``"bundled"``: the bundled tables alone.
+
+    Returns
+    -------
+    components : list of `~miricigale.sed.Component`
+    notes : list of str
+        Which library each part comes from, and why not a better one.
+    """
+    if libraries not in LIBRARIES:
+        raise argument_error("libraries", f"one of {LIBRARIES}", repr(libraries))
+    notes = []
+
+    def choose(what, better, plain, covers):
+        if libraries == "bundled":
+            notes.append(f"{what}: {plain.resource}, as asked")
+            return plain
+        if find_resource(better.resource) is None:
+            notes.append(f"{what}: {plain.resource}; {better.resource} is not registered")
+            return plain
+        lacks = covers(better)
+        if lacks:
+            notes.append(f"{what}: {plain.resource}; {better.resource} {lacks}")
+            return plain
+        notes.append(f"{what}: {better.resource}")
+        return better
+
+    def solar(library):
+        return library.invalid({"metallicity": 0.02})
+
+    def torus(library):
+        axes = yang2021_axes("fit")
+        points = [TORUS | {"tau97": t, "inclination": 70.0} for t in axes["tau97"]]
+        why = next(filter(None, map(library.invalid, points)), None)
+        return why and f"lacks the paper's torus: {why}"
+
     parts = [
         c.DelayedSFH(),
-        c.BC03(),
+        choose("stars", c.BC03Library(), c.BC03(), solar),
         c.CalzettiLeitherer(),
-        c.DraineLi2007Alpha(),
+        choose("dust", c.Dale2014(), c.DraineLi2007Alpha(), lambda _: None),
         COMPONENTS.get(igm)(),
     ]
     if agn:
-        parts.append(c.ParametricTorus())
-    return parts
+        parts.append(choose("torus", c.Skirtor2016(**TORUS), c.ParametricTorus(**TORUS), torus))
+    if xray:
+        parts.append(c.XRay(xray_transmission=0.5))
+    return parts, notes
 
 
 def yang2021_axes(kind="fit"):

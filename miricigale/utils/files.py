@@ -37,6 +37,7 @@ def open_fits(path, *, wanted, **options):
     """
     hdus = None
     try:
+        _refuse_stump(Path(path))
         with warnings.catch_warnings():
             warnings.filterwarnings("error", ".*truncated", AstropyUserWarning)
             hdus = fits.open(path, **options)
@@ -47,6 +48,15 @@ def open_fits(path, *, wanted, **options):
             hdus.close()
         raise _unreadable(path, wanted, err) from err
     return hdus
+
+
+def _refuse_stump(path):
+    """Refuse what is shorter than one block of FITS; astropy would leave the file open."""
+    if path.is_file() and path.stat().st_size < 2880:
+        with open(path, "rb") as handle:
+            if handle.read(2) != b"\x1f\x8b":  # compressed files may be that short
+                msg = "it is no FITS file, or truncated"
+                raise OSError(msg)
 
 
 def read_ecsv(path, *, wanted):

@@ -1,12 +1,23 @@
 """Finding, adding and checking reference data."""
 
 import hashlib
+import json
 import sys
 
 import pytest
 
-from miricigale.refdata import Resource, add_resource, check_resources, conf, locate, registry
-from miricigale.refdata.locate import data_folder, file_sha256, fingerprint
+from miricigale.refdata import (
+    Resource,
+    add_resource,
+    cache_folder,
+    check_resources,
+    conf,
+    find_resource,
+    locate,
+    registry,
+    store,
+)
+from miricigale.refdata.locate import data_folder, file_sha256, fingerprint, record_path
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 
 TEXT = b"some numbers\n"
@@ -29,8 +40,7 @@ def folders(tmp_path, monkeypatch):
     }
     bundled = registry.resources()
     everything = {"instrument.siaf": bundled["instrument.siaf"], **records}
-    # the package exports a function of the name of the module
-    for module in (registry, sys.modules["miricigale.refdata.locate"]):
+    for module in (registry, sys.modules["miricigale.refdata.check"]):
         monkeypatch.setattr(module, "resources", lambda: everything)
     with conf.set_temp("data_folder", str(tmp_path / "data")):
         yield tmp_path
@@ -44,7 +54,7 @@ def source(folder):
 
 def test_bundled_files_are_there_and_whole():
     bundled = {name for name, record in registry.resources().items() if record.kind == "bundled"}
-    states = {name: state for name, state, _ in check_resources()}
+    states = {row.name: row.state for row in check_resources()}
     assert {states[name] for name in bundled} == {"ok"}
     assert bundled
 
@@ -53,6 +63,16 @@ def test_data_folder_is_set_by_the_user(folders):
     assert data_folder() == folders / "data"
     with conf.set_temp("data_folder", ""):
         assert data_folder().name == "miricigale"
+
+
+def test_cache_folder_is_set_by_the_user(folders):
+    with conf.set_temp("cache_folder", ""):
+        assert cache_folder().parts[-2:] == ("miricigale", "cache")
+    with conf.set_temp("cache_folder", str(folders / "c")):
+        assert cache_folder() == folders / "c"
+    assert conf.grid_cache_size == 1000
+    with pytest.raises(TypeError, match="too small"):
+        conf.grid_cache_size = -1
 
 
 def test_absent_resource_says_where_to_get_it(folders):
@@ -66,12 +86,29 @@ def test_absent_resource_says_where_to_get_it(folders):
         locate("test.package")
 
 
+def test_absent_resource_can_be_asked_for(folders):
+    assert find_resource("test.file") is None
+    path = add_resource("test.file", source(folders))
+    assert find_resource("test.file") == path
+    with pytest.raises(KeyError, match="no resource 'nope'"):
+        find_resource("nope")
+
+
+def test_an_empty_environment_is_no_folder(folders, monkeypatch):
+    """The working folder must not be taken for the data folder."""
+    monkeypatch.setenv("MIRICIGALE_DATA", "")
+    monkeypatch.chdir(folders)
+    (folders / "sub").mkdir()
+    (folders / "sub" / "file.dat").write_bytes(TEXT)
+    assert find_resource("test.file") is None
+
+
 def test_added_file_is_found(folders):
     target = add_resource("test.file", source(folders))
     assert target == folders / "data" / "sub" / "file.dat"
     assert locate("test.file", check=True) == target
     assert target.read_bytes() == TEXT
-    assert not list(target.parent.glob("*.partial"))
+    assert not list(target.parent.glob(".*.partial"))
 
 
 def test_added_folder_replaces_the_old(folders):
@@ -83,6 +120,39 @@ def test_added_folder_replaces_the_old(folders):
     path = add_resource("test.folder", new)
     assert [p.name for p in path.iterdir()] == ["new"]
     assert locate("test.folder") == path
+    assert [p.name for p in path.parent.iterdir() if p.suffix != ".lock"] == ["folder"]
+
+
+@pytest.mark.parametrize("name", ["test.file", "test.folder"])
+def test_an_interrupted_copy_leaves_the_old_one(folders, monkeypatch, name):
+    path = source(folders)
+    (folders / "old").mkdir()
+    mine = path if name == "test.file" else folders / "old"
+    target = add_resource(name, mine)
+    before = fingerprint(name)
+    (folders / "old" / "new.dat").write_text("x")
+
+    def interrupt(*args):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "install", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            add_resource(name, mine)
+    assert fingerprint(name) == before
+    assert not list(target.parent.glob(".*.partial"))
+
+
+def test_the_record_beside_a_file_answers_only_while_it_is_fresh(folders):
+    path = add_resource("test.file", source(folders))
+    status = path.stat()
+    record = {"sha256": "kept", "size": status.st_size, "mtime_ns": status.st_mtime_ns}
+    record_path(path).write_text(json.dumps(record))
+    assert fingerprint("test.file") == "kept"
+    path.write_bytes(TEXT + b"more")
+    assert fingerprint("test.file") == hashlib.sha256(TEXT + b"more").hexdigest()
+    record_path(path).write_text("[]")
+    assert fingerprint("test.file") == hashlib.sha256(TEXT + b"more").hexdigest()
 
 
 def test_wrong_file_is_refused(folders):
@@ -132,7 +202,7 @@ def test_the_fingerprint_is_that_of_the_file_found(folders, monkeypatch):
 
 def test_check_tells_the_state_of_each(folders):
     add_resource("test.file", source(folders)).write_bytes(b"broken\n")
-    states = {name: state for name, state, _ in check_resources()}
+    states = {row.name: row.state for row in check_resources()}
     assert states == {
         "instrument.siaf": "ok",
         "test.file": "wrong checksum",

@@ -2,7 +2,30 @@
 
 import numpy as np
 
-__all__ = ["attenuation_curve", "leitherer_calzetti"]
+from miricigale.sed._core.thermal import drude
+
+__all__ = [
+    "attenuation_curve",
+    "leitherer_calzetti",
+    "pei_smc",
+    "power_law_attenuation",
+    "smc_power_law",
+]
+
+_BREAK = 0.0912  # nothing is attenuated at this wavelength and below
+_B, _V = 0.44, 0.55
+
+# Pei 1992, table 4, SMC: amplitude, wavelength in um, b, n. Background, far-ultraviolet rise,
+# 2175 A, silicates at 9.7 and 18 um, far infrared
+_PEI_SMC = (
+    (185.0, 0.042, 90.0, 2.0),
+    (27.0, 0.08, 5.5, 4.0),
+    (0.005, 0.22, -1.95, 2.0),
+    (0.010, 9.7, -1.95, 2.0),
+    (0.012, 18.0, -1.80, 2.0),
+    (0.030, 25.0, 0.0, 2.0),
+)
+_PEI_SMC_RV = 2.93
 
 
 def leitherer_calzetti(wave):
@@ -13,24 +36,50 @@ def leitherer_calzetti(wave):
         k = 2.659 * np.where(nm < 630.0, short, -1.857 + 1.040e3 / nm) + 4.05
         ultraviolet = 5.472 + 0.671e3 / nm - 9.218e3 / nm**2 + 2.62e6 / nm**3
         k = np.where(nm < 150.0, ultraviolet, k)
-    return np.where(nm <= 91.2, 0.0, np.maximum(k, 0.0))
+    return np.where(nm <= _BREAK * 1e3, 0.0, np.maximum(k, 0.0))
 
 
-def _bump(wave, amplitude):
-    nm = np.asarray(wave, dtype=float) * 1e3
-    width = (nm * 35.0) ** 2
-    return amplitude * width / ((nm**2 - 217.5**2) ** 2 + width)
-
-
-def attenuation_curve(wave, slope=0.0, bump=0.0):
+def attenuation_curve(wave, slope=0.0, bump=0.0, centre=0.2175, width=0.035, scaling="exact"):
     """
-    Starburst curve times (lambda / 0.55 um)^slope plus a bump at 0.2175 um.
+    Starburst curve times (lambda / 0.55 um)^slope, plus a Drude bump, scaled in E(B-V).
 
-    Scaled to keep E(B-V), taken between 0.44 and 0.55 um, that of the starburst curve.
+    ``scaling="exact"`` keeps k(0.44 um) - k(0.55 um) of the starburst curve; ``"cigale"`` that of
+    the starburst curve with the bump, so that a bump alone scales nothing (Boquien et al. 2019,
+    equation 8 and their code).
     """
     wave = np.asarray(wave, dtype=float)
-    band = np.array([0.44, 0.55])
+    band = np.array([_B, _V])
     old = leitherer_calzetti(band)
-    new = old * (band / 0.55) ** slope + _bump(band, bump)
-    curve = leitherer_calzetti(wave) * (wave / 0.55) ** slope + _bump(wave, bump)
+    new = old * (band / _V) ** slope
+    curve = leitherer_calzetti(wave)
+    if slope:
+        curve = curve * (wave / _V) ** slope
+    if bump:
+        extra = bump * drude(band, centre, width)
+        new = new + extra
+        if scaling == "cigale":
+            old = old + extra
+        curve = curve + bump * drude(wave, centre, width)
     return curve * ((old[0] - old[1]) / (new[0] - new[1]))
+
+
+def power_law_attenuation(wave, slope):
+    """A(lambda) / A_V = (lambda / 0.55 um)^slope; 0 at 0.0912 um and below."""
+    wave = np.asarray(wave, dtype=float)
+    return np.where(wave <= _BREAK, 0.0, (wave / _V) ** slope)
+
+
+def smc_power_law(wave):
+    """k(lambda) = 1.39 (lambda / um)^-1.2 of the SMC; 0 at 0.0912 um and below."""
+    wave = np.asarray(wave, dtype=float)
+    return np.where(wave <= _BREAK, 0.0, 1.39 * wave**-1.2)
+
+
+def pei_smc(wave):
+    """k(lambda) = (1 + R_V) xi(lambda) of the SMC, Pei 1992; 0 at 0.0912 um and below."""
+    wave = np.asarray(wave, dtype=float)
+    xi = np.zeros_like(wave)
+    for amplitude, centre, b, n in _PEI_SMC:
+        ratio = (wave / centre) ** n
+        xi += amplitude / (ratio + 1.0 / ratio + b)
+    return np.where(wave <= _BREAK, 0.0, (1.0 + _PEI_SMC_RV) * xi)

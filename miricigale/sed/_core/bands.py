@@ -5,13 +5,15 @@ import math
 import numpy as np
 from numba import njit
 
-__all__ = ["band_means", "band_moments"]
+__all__ = ["band_means", "band_tables"]
+
+BUCKETS = 2048  # of equal width in each band, to find a point of its curve without a search
 
 
 @njit(cache=True)
-def band_moments(start, band_wave, throughput):
+def band_tables(start, band_wave, throughput):
     """
-    Running integrals of passbands, linear between their points, in closed form.
+    What `band_means` needs to know of passbands that are linear between their points.
 
     Parameters
     ----------
@@ -22,65 +24,78 @@ def band_moments(start, band_wave, throughput):
 
     Returns
     -------
-    moments : `~numpy.ndarray`, shape (2, n)
-        Integrals of T / lambda and of T from the first point of the band to each point.
+    moments : `~numpy.ndarray`, shape (5, n)
+        Integrals of T / lambda and of T from the first point of the band to each point, the
+        logarithm of the wavelength, and offset and slope of the curve beyond each point.
+    bucket : `~numpy.ndarray` of int, shape (n_band, BUCKETS)
+        The last point at or before the lower edge of each bucket.
     """
-    out = np.zeros((2, band_wave.size))
+    out = np.zeros((5, band_wave.size))
+    bucket = np.zeros((start.size - 1, BUCKETS), dtype=np.int32)
     for band in range(start.size - 1):
-        for i in range(start[band], start[band + 1] - 1):
-            zero, one = _piece(band_wave, throughput, i, band_wave[i + 1])
+        first, last = start[band], start[band + 1] - 1
+        for i in range(first, last + 1):
+            out[2, i] = math.log(band_wave[i])
+        for i in range(first, last):
+            rise = (throughput[i + 1] - throughput[i]) / (band_wave[i + 1] - band_wave[i])
+            out[3, i], out[4, i] = throughput[i] - rise * band_wave[i], rise
+            step = band_wave[i + 1] - band_wave[i]
+            one = step * (throughput[i] + 0.5 * rise * step)
+            zero = out[3, i] * math.log1p(step / band_wave[i]) + rise * step
             out[0, i + 1] = out[0, i] + zero
             out[1, i + 1] = out[1, i] + one
-    return out
+        width = (band_wave[last] - band_wave[first]) / BUCKETS
+        i = first
+        for k in range(BUCKETS):
+            edge = band_wave[first] + k * width
+            while i < last - 1 and band_wave[i + 1] <= edge:
+                i += 1
+            bucket[band, k] = i
+    return out, bucket
 
 
 @njit(cache=True)
-def _piece(wave, throughput, i, x):
-    """Integrals of T / lambda and T from the point i to x on the piece that follows it."""
-    step = x - wave[i]
-    rise = (throughput[i + 1] - throughput[i]) / (wave[i + 1] - wave[i])
-    one = step * (throughput[i] + 0.5 * rise * step)
-    zero = (throughput[i] - rise * wave[i]) * math.log1p(step / wave[i]) + rise * step
-    return zero, one
-
-
-@njit(cache=True)
-def band_means(wave, fnu, start, band_wave, throughput, moments):
+def band_means(wave, log_wave, fnu, start, band_wave, moments, bucket, out):
     """
     Photon-counting means of F_nu in bands, without making a matrix of weights.
 
     Parameters
     ----------
-    wave, fnu : `~numpy.ndarray`, shape (n_wave,)
-        Observed wavelengths and a spectrum linear between them; it covers the bands.
-    start, band_wave, throughput : `~numpy.ndarray`
-        Passbands as for `band_moments`.
-    moments : `~numpy.ndarray`, shape (2, n)
-        Their `band_moments`.
-
-    Returns
-    -------
-    means : `~numpy.ndarray`, shape (n_band,)
-        ``int F T / lambda dlambda / int T / lambda dlambda``, exact.
+    wave, log_wave, fnu : `~numpy.ndarray`, shape (n_wave,)
+        Observed wavelengths, their logarithms, and a spectrum linear between them; it covers
+        the bands.
+    start, band_wave : `~numpy.ndarray`
+        Passbands as for `band_tables`.
+    moments, bucket : `~numpy.ndarray`
+        From `band_tables`.
+    out : `~numpy.ndarray`, shape (n_band,)
+        Filled with ``int F T / lambda dlambda / int T / lambda dlambda``, exact.
     """
-    out = np.empty(start.size - 1)
     for band in range(start.size - 1):
         first, last = start[band], start[band + 1] - 1
         low, high = band_wave[first], band_wave[last]
+        scale = BUCKETS / (high - low)
         j = np.searchsorted(wave, low, side="right") - 1
         j = min(max(j, 0), wave.size - 2)
-        i, zero, one, total = first, 0.0, 0.0, 0.0
+        zero, one, total = 0.0, 0.0, 0.0
         while True:
-            right = min(high, wave[j + 1])
-            i += np.searchsorted(band_wave[i:last], right, side="right") - 1
-            new_zero, new_one = _piece(band_wave, throughput, i, right)
-            new_zero += moments[0, i]
-            new_one += moments[1, i]
+            if wave[j + 1] < high:
+                right, log_right = wave[j + 1], log_wave[j + 1]
+                # one bucket back: the division may round up over an edge
+                i = bucket[band, max(min(int((right - low) * scale), BUCKETS) - 1, 0)]
+                while i < last - 1 and band_wave[i + 1] <= right:
+                    i += 1
+                step = right - band_wave[i]
+                rise = moments[4, i]
+                new_zero = moments[0, i] + moments[3, i] * (log_right - moments[2, i]) + rise * step
+                at = moments[3, i] + rise * band_wave[i]
+                new_one = moments[1, i] + step * (at + 0.5 * rise * step)
+            else:
+                new_zero, new_one = moments[0, last], moments[1, last]
             slope = (fnu[j + 1] - fnu[j]) / (wave[j + 1] - wave[j])
             total += (fnu[j] - slope * wave[j]) * (new_zero - zero) + slope * (new_one - one)
             zero, one = new_zero, new_one
-            if right >= high or j == wave.size - 2:
+            if wave[j + 1] >= high or j == wave.size - 2:
                 break
             j += 1
         out[band] = total / moments[0, last]
-    return out

@@ -1,11 +1,61 @@
 """Star-formation histories in steps of 1 Myr, and their weights on tabulated ages."""
 
+import math
+
 import numpy as np
+from numba import njit
 from scipy.sparse import csr_matrix
 
-__all__ = ["YOUNG", "delayed_history", "time_weights"]
+__all__ = [
+    "YOUNG",
+    "age_steps",
+    "constant_history",
+    "delayed_history",
+    "double_exponential_history",
+    "split_by_age",
+    "table_history",
+    "time_weights",
+]
 
 YOUNG = 10  # Myr
+
+_BLOCK = 64
+
+
+@njit(cache=True, fastmath={"reassoc", "contract"})
+def _exponential(n, tau, delayed):
+    """Compute ``exp(-t / tau)``, or ``t exp(-t / tau)``, for t = 0 ... n - 1, up to a factor."""
+    # a rising exponential is counted from its last step, so that nothing overflows
+    zero = n - 1 if tau < 0.0 else 0
+    fine, out = np.empty(_BLOCK), np.empty(n)
+    for i in range(_BLOCK):
+        fine[i] = math.exp(-i / tau)
+    for start in range(0, n, _BLOCK):
+        coarse = math.exp(-(start - zero) / tau)
+        for i in range(min(_BLOCK, n - start)):
+            out[start + i] = coarse * fine[i]
+    if delayed:
+        for t in range(n):
+            out[t] *= t
+    return out
+
+
+@njit(cache=True, fastmath={"reassoc", "contract"})
+def _finish(rate, f_burst, age_burst, tau_burst):
+    """Add an exponential burst in the last steps that makes a fraction of all stars; sum 1e-6."""
+    n = rate.size
+    total = rate.sum()
+    if f_burst > 0.0:
+        last = min(age_burst, n)
+        burst = _exponential(last, tau_burst, False)
+        scale = f_burst / (1.0 - f_burst) * total / burst.sum()
+        for i in range(last):
+            rate[n - last + i] += scale * burst[i]
+        total = rate.sum()
+    factor = 1e-6 / total
+    for i in range(n):
+        rate[i] *= factor
+    return rate
 
 
 def delayed_history(age, tau, f_burst=0.0, age_burst=20.0, tau_burst=50.0):
@@ -16,15 +66,49 @@ def delayed_history(age, tau, f_burst=0.0, age_burst=20.0, tau_burst=50.0):
     ``age_burst`` steps that makes the fraction ``f_burst`` of all stars. The sum is 1e-6,
     so that one solar mass is formed by rates in Msun/yr. ``age`` is a whole number.
     """
-    t = np.arange(int(age), dtype=float)
-    rate = t * np.exp(-t / tau) / tau**2
-    if t.size == 1:
-        rate[:] = 1.0
-    if f_burst > 0.0:
-        n = min(int(age_burst), t.size)
-        burst = np.exp(-np.arange(n) / tau_burst)
-        rate[-n:] += burst * (f_burst / (1.0 - f_burst) * rate.sum() / burst.sum())
-    return rate * (1e-6 / rate.sum())
+    # a single step is at t = 0, where the rate is 0
+    rate = _exponential(int(age), float(tau), int(age) > 1)
+    return _finish(rate, float(f_burst), int(age_burst), float(tau_burst))
+
+
+def double_exponential_history(age, tau, f_burst=0.0, age_burst=20.0, tau_burst=50.0):
+    """
+    Star-formation rate in steps of 1 Myr.
+
+    ``exp(-t / tau)`` for t = 0 ... age - 1 (rising if ``tau`` is negative) and a burst as in
+    `delayed_history`. The sum is 1e-6.
+    """
+    rate = _exponential(int(age), float(tau), False)
+    return _finish(rate, float(f_burst), int(age_burst), float(tau_burst))
+
+
+def constant_history(age):
+    """Star-formation rate in ``age`` steps of 1 Myr, all the same; the sum is 1e-6."""
+    return np.full(int(age), 1e-6 / int(age))
+
+
+def table_history(time, rate):
+    """
+    Put a history in bins of any width on steps of 1 Myr.
+
+    Parameters
+    ----------
+    time : `~numpy.ndarray`, shape (n_bin + 1,)
+        Edges of the bins in Myr, ascending.
+    rate : `~numpy.ndarray`, shape (n_bin,)
+        Rate in each bin.
+
+    Returns
+    -------
+    rate : `~numpy.ndarray`, shape (n_steps,)
+        Mean rates in steps of 1 Myr from the first edge, the last of which holds what is left:
+        the integral is that of the table.
+    """
+    formed = np.concatenate([[0.0], np.cumsum(rate * np.diff(time))])
+    n = int(np.ceil(np.round(time[-1] - time[0], 6)))
+    edges = np.arange(n + 1, dtype=float)
+    # the last edge lies at or beyond the end of the table, where all is formed
+    return np.diff(np.interp(edges, time - time[0], formed))
 
 
 def time_weights(age, n_steps):
@@ -51,3 +135,93 @@ def time_weights(age, n_steps):
     data = np.concatenate([1 - t, t]) / 10.0
     index = (np.concatenate([step, step]), np.concatenate([cell, cell + 1]))
     return csr_matrix((data, index), shape=(n_steps, age.size))
+
+
+def age_steps(age, n_steps):
+    """
+    The matrix of `time_weights`, arranged for `split_by_age`.
+
+    Parameters
+    ----------
+    age : `~numpy.ndarray`, shape (n_age,)
+        Ages of the table in Myr, from 0.
+    n_steps : int
+        Number of steps.
+
+    Returns
+    -------
+    runs : `~numpy.ndarray` of int, shape (3, n_run)
+        Steps that lie between two neighbouring ages: first, last + 1, number of the younger age.
+        A step k of them counts as mass at k + 0.55 Myr, the mean of its ten times.
+    mixed : `~numpy.ndarray` of int, shape (n_mixed,)
+        The other steps.
+    indptr, indices, data : `~numpy.ndarray`
+        Their rows of the matrix.
+    """
+    k = np.arange(n_steps)
+    cell = np.clip(np.searchsorted(age, k + 0.1, side="right") - 1, 0, age.size - 2)
+    inside = (k + 0.1 >= age[cell]) & (k + 1.0 <= age[cell + 1])
+    runs = []
+    for j in np.unique(cell[inside]):
+        steps = k[inside & (cell == j)]
+        runs.append((steps[0], steps[-1] + 1, j))
+    mixed = k[~inside]
+    rows = time_weights(age, n_steps)[mixed]
+    runs = np.array(runs, dtype=np.int64).reshape(-1, 3).T.copy()
+    return runs, mixed, rows.indptr, rows.indices, rows.data
+
+
+@njit(cache=True, fastmath={"reassoc", "contract"})
+def _moments(history, first, last):
+    """Sums of mass and of mass times (step - first), for steps counted back from the end."""
+    n, zero, one = history.size, 0.0, 0.0
+    for i in range(last - first):
+        rate = history[n - 1 - first - i]
+        zero += rate
+        one += rate * i
+    return 1e6 * zero, 1e6 * one
+
+
+@njit(cache=True)
+def split_by_age(history, n_young, age, runs, mixed, indptr, indices, data):
+    """
+    Masses at tabulated ages, of young and of old stars, without making a sparse product.
+
+    Parameters
+    ----------
+    history : `~numpy.ndarray`, shape (n_steps,)
+        Rates in Msun/yr in steps of 1 Myr, oldest first.
+    n_young : int
+        Number of steps, counted from the last, that are young.
+    age : `~numpy.ndarray`, shape (n_age,)
+        Ages of the table in Myr.
+    runs, mixed, indptr, indices, data : `~numpy.ndarray`
+        `age_steps` of ``age``, for as many steps as the history has or more.
+
+    Returns
+    -------
+    mass : `~numpy.ndarray`, shape (2, n_age)
+        Msun of young and of old stars.
+    """
+    mass = np.zeros((2, age.size))
+    n = history.size
+    for r in range(runs.shape[1]):
+        cell = runs[2, r]
+        for part in range(2):
+            first = max(runs[0, r], n_young if part else 0)
+            last = min(runs[1, r], n if part else min(n, n_young))
+            if last > first:
+                zero, one = _moments(history, first, last)
+                old = (one + zero * (first + 0.55 - age[cell])) / (age[cell + 1] - age[cell])
+                mass[part, cell] += zero - old
+                mass[part, cell + 1] += old
+        if runs[1, r] >= n:
+            break
+    for i in range(mixed.size):
+        k = mixed[i]
+        if k >= n:
+            break
+        formed = 1e6 * history[n - 1 - k]
+        for j in range(indptr[i], indptr[i + 1]):
+            mass[0 if k < n_young else 1, indices[j]] += data[j] * formed
+    return mass

@@ -1,4 +1,11 @@
-"""Mean transmission of the intergalactic medium; observed wavelengths in um."""
+"""
+Mean transmission of the intergalactic medium; observed wavelengths in um.
+
+Absorbers stand between redshift 0 and the source: nothing absorbs at a source redshift of 0, a
+line takes nothing below its rest wavelength, and the continuum seen below the Lyman limit
+is integrated from redshift 0. Where the published formulae are silent (observed wavelengths below
+0.0912 um) this is what their own integrands give.
+"""
 
 import functools
 import math
@@ -6,16 +13,38 @@ import math
 import numpy as np
 from numba import njit
 
-__all__ = ["LYMAN_LIMIT", "lyman_lines", "madau_transmission", "meiksin_transmission"]
+__all__ = [
+    "INOUE_LIMIT",
+    "LYMAN_LIMIT",
+    "inoue_lines",
+    "inoue_transmission",
+    "lyman_lines",
+    "madau_transmission",
+    "meiksin_transmission",
+]
 
-LYMAN_LIMIT = 0.0912  # um, the rounded value that the conventions use
+LYMAN_LIMIT = 0.0912  # um, the rounded value that Madau, Meiksin and CIGALE use
+INOUE_LIMIT = 0.09118  # um, Inoue et al. 2014, section 4
+
+# Meiksin 2006, table 1: depth of the line n over that of Lyman alpha, n = 3 ... 9
 _FACTORS = np.array([0.0, 0.0, 1.0, 0.348, 0.179, 0.109, 0.0722, 0.0508, 0.0373, 0.0283])
+_N_MAX = 31  # lines n = 2 ... 30
+
+# Madau 1995, eq. 12 and 15: amplitudes of Lyman alpha to delta
+_MADAU = np.array([0.0036, 1.7e-3, 1.2e-3, 9.3e-4])
+
+# Inoue et al. 2014, eq. 21 and 22: powers of 1 + z of the forest and of damped systems
+_LAF_POWERS = np.array([1.2, 3.7, 5.5])
+_DLA_POWERS = np.array([2.0, 3.0])
 
 
-def lyman_lines(n_max=31):
+def lyman_lines(n_max=_N_MAX):
     """Wavelengths in um of the lines n -> 1, n = 2 ... n_max - 1."""
     n = np.arange(2, n_max)
     return LYMAN_LIMIT / (1.0 - 1.0 / n**2)
+
+
+# ------------------------------------------------------------------------- Meiksin
 
 
 @functools.cache
@@ -27,62 +56,93 @@ def _lls_terms():
     return first, np.array(series)
 
 
+@functools.cache
+def _meiksin_lines():
+    """Wavelengths of the lines n = 2 ... 30, and depths over Lyman alpha at 1 + z = 4."""
+    n = np.arange(2, _N_MAX, dtype=float)
+    depth = np.zeros(n.size)
+    depth[1:8] = _FACTORS[3:10]
+    # eq. 4: above n = 9 in proportion to the depth of n = 9 at the same observed wavelength,
+    # that is, at another redshift
+    depth[8:] = _FACTORS[9] * 720.0 / (n[8:] * (n[8:] ** 2 - 1.0))
+    return lyman_lines(), depth
+
+
 def meiksin_transmission(wave, redshift):
     """
     Mean transmission of the intergalactic medium, Meiksin 2006, as CIGALE has it.
 
     Parameters
     ----------
-    wave : `~numpy.ndarray`
-        Observed wavelength in um.
+    wave : `~numpy.ndarray`, shape (n,)
+        Observed wavelengths in um, in any order.
     redshift : float
-        Redshift of the source.
+        Redshift of the source, >= 0.
+
+    Returns
+    -------
+    transmission : `~numpy.ndarray`, shape (n,)
 
     Notes
     -----
     The optical depths of the higher lines are those of Table 1 times the Lyman-alpha depth
     at the source's redshift (CIGALE's reading; it absorbs a little more than the depth at
-    the absorber's would). Below 0.07 (1 + z) um the transmission falls as wavelength squared.
+    the absorber's would). Below 0.07 (1 + z) um the transmission falls as wavelength squared, for
+    any z > 0.
     """
-    first, series = _lls_terms()
-    return _meiksin(np.asarray(wave, dtype=float), float(redshift), first, series, _FACTORS)
+    wave = np.ascontiguousarray(wave, dtype=float)
+    return _meiksin(wave, float(redshift), *_lls_terms(), *_meiksin_lines())
 
 
 @njit(cache=True)
-def _meiksin(wave, redshift, first, series, factors):
+def _meiksin(wave, redshift, first, series, lines, depth):
     out = np.ones(wave.size)
+    if redshift <= 0.0:
+        return out
     z1 = 1.0 + redshift
     if redshift <= 4.0:
         amplitude, power = 0.00211, 3.7
     else:
         amplitude, power = 0.00058, 4.5
     tau_alpha = amplitude * z1**power
+    # powers of 1 + z = w / line, split into one of w and one of the line
+    third = (0.25 / lines) ** (1.0 / 3.0)
+    sixth = np.sqrt(third)
+    highest = lines[0] * z1
     for i in range(wave.size):
         w = wave[i]
-        if w >= z1 * 0.0912 / 0.75:
+        if w >= highest:
             continue
         tau = 0.0
-        nine = factors[9] * tau_alpha * (0.25 * w / 0.0912 * (1.0 - 1.0 / 81.0)) ** (1.0 / 3.0)
-        for n in range(2, 31):
-            x = w / 0.0912 * (1.0 - 1.0 / (n * n))  # 1 + z of the absorber
-            if x >= z1:
+        if w > lines[0]:
+            tau += amplitude * (w / lines[0]) ** power
+        cube = w ** (1.0 / 3.0)
+        root = math.sqrt(cube)
+        rest = 0.0
+        for j in range(1, lines.size):
+            if w >= lines[j] * z1:
+                break
+            if w <= lines[j]:
                 continue
-            if n == 2:
-                tau += amplitude * x**power
-            elif n <= 5:
-                exponent = 1.0 / 3.0 if x < 4.0 else 1.0 / 6.0
-                tau += tau_alpha * factors[n] * (0.25 * x) ** exponent
-            elif n <= 9:
-                tau += tau_alpha * factors[n] * (0.25 * x) ** (1.0 / 3.0)
+            if j <= 3:  # n = 3, 4, 5
+                below = w < 4.0 * lines[j]
+                rest += depth[j] * (third[j] * cube if below else sixth[j] * root)
+            elif j <= 7:
+                rest += depth[j] * third[j] * cube
             else:
-                tau += nine * 720.0 / (n * (n * n - 1.0))
-        limit = w / 0.0912
-        if limit < z1:
-            tau += 0.805 * limit**3 * (1.0 / limit - 1.0 / z1)
-            lls = first * (z1 * limit**1.5 - limit**2.5)
+                rest += depth[j] * third[7] * cube
+        tau += tau_alpha * rest
+        x = w / LYMAN_LIMIT
+        if x < z1:
+            low = max(x, 1.0)  # 1 + z of the nearest absorber
+            tau += 0.805 * x**3 * (1.0 / low - 1.0 / z1)
+            lls = first * x**1.5 * (z1 - low)
+            far, near = (x / z1) ** 3, (x / low) ** 3
+            a, b = z1**2.5, low**2.5
             for k in range(series.size):
-                n = k + 1
-                lls -= series[k] * (z1 ** (2.5 - 3 * n) * limit ** (3 * n) - limit**2.5)
+                a *= far
+                b *= near
+                lls -= series[k] * (a - b)
             tau += 0.25 * lls
         out[i] = math.exp(-tau)
         if w < 0.07 * z1:
@@ -90,22 +150,180 @@ def _meiksin(wave, redshift, first, series, factors):
     return out
 
 
+# --------------------------------------------------------------------------- Madau
+
+
 def madau_transmission(wave, redshift):
-    """Mean transmission after Madau 1995: four lines and the continuum (footnote 3)."""
-    wave = np.asarray(wave, dtype=float)
-    z1 = 1.0 + redshift
-    tau = np.zeros(wave.shape)
-    lines = ((2, 0.0036), (3, 1.7e-3), (4, 1.2e-3), (5, 9.3e-4))
-    for n, amplitude in lines:
-        line = LYMAN_LIMIT / (1.0 - 1.0 / n**2)
-        tau += np.where(wave < line * z1, amplitude * (wave / line) ** 3.46, 0.0)
-    x = wave / LYMAN_LIMIT
-    inside = x < z1
-    x = np.where(inside, np.maximum(x, 1e-6), z1)
-    continuum = (
-        0.25 * x**3 * (z1**0.46 - x**0.46)
-        + 9.4 * x**1.5 * (z1**0.18 - x**0.18)
-        - 0.7 * x**3 * (x**-1.32 - z1**-1.32)
-        - 0.023 * (z1**1.68 - x**1.68)
-    )
-    return np.exp(-tau - np.where(inside, np.maximum(continuum, 0.0), 0.0))
+    """
+    Mean transmission after Madau 1995: four lines and the continuum (footnote 3).
+
+    Parameters
+    ----------
+    wave : `~numpy.ndarray`, shape (n,)
+        Observed wavelengths in um, in any order.
+    redshift : float
+        Redshift of the source, >= 0.
+
+    Returns
+    -------
+    transmission : `~numpy.ndarray`, shape (n,)
+    """
+    wave = np.ascontiguousarray(wave, dtype=float)
+    return _madau(wave, 1.0 + float(redshift), lyman_lines(6), _MADAU)
+
+
+@njit(cache=True)
+def _madau(wave, z1, lines, amplitudes):
+    out = np.ones(wave.size)
+    scaled = amplitudes * lines**-3.46
+    highest = lines[0] * z1
+    for i in range(wave.size):
+        w = wave[i]
+        if w >= highest:
+            continue
+        total = 0.0
+        for j in range(lines.size):
+            if w < lines[j] * z1 and w > lines[j]:
+                total += scaled[j]
+        tau = total * w**3.46 if total > 0.0 else 0.0
+        x = w / LYMAN_LIMIT
+        if x < z1:
+            low = max(x, 1.0)
+            continuum = (
+                0.25 * x**3 * (z1**0.46 - low**0.46)
+                + 9.4 * x**1.5 * (z1**0.18 - low**0.18)
+                - 0.7 * x**3 * (low**-1.32 - z1**-1.32)
+                - 0.023 * (z1**1.68 - low**1.68)
+            )
+            # the last term is a fit that turns the sum negative far in the ultraviolet
+            tau += max(continuum, 0.0)
+        out[i] = math.exp(-tau)
+    return out
+
+
+# --------------------------------------------------------------------------- Inoue
+
+
+def inoue_lines(table):
+    """
+    Prepare the Lyman series of Inoue et al. 2014 for `inoue_transmission`.
+
+    Parameters
+    ----------
+    table : `~numpy.ndarray`, shape (n_line, 6)
+        Their table 2, longest wavelength first: wavelength in um, A_LAF,1 to 3, A_DLA,1 and 2.
+
+    Returns
+    -------
+    lines : tuple of `~numpy.ndarray`
+        Wavelengths, and amplitudes of forest and damped systems over the wavelength to the
+        power that goes with them: shapes (n_line,), (n_line, 3), (n_line, 2).
+    """
+    table = np.asarray(table, dtype=float)
+    wave = np.ascontiguousarray(table[:, 0])
+    forest = table[:, 1:4] * wave[:, None] ** -_LAF_POWERS
+    damped = table[:, 4:6] * wave[:, None] ** -_DLA_POWERS
+    return wave, forest, damped
+
+
+def inoue_transmission(wave, redshift, lines):
+    """
+    Mean transmission of the intergalactic medium, Inoue et al. 2014, section 4.
+
+    Parameters
+    ----------
+    wave : `~numpy.ndarray`, shape (n,)
+        Observed wavelengths in um, in any order.
+    redshift : float
+        Redshift of the source, >= 0.
+    lines : tuple of `~numpy.ndarray`
+        From `inoue_lines`.
+
+    Returns
+    -------
+    transmission : `~numpy.ndarray`, shape (n,)
+
+    Notes
+    -----
+    Lyman series: eq. 20 to 22 with table 2; Lyman continuum: eq. 25 to 29.
+    """
+    wave = np.ascontiguousarray(wave, dtype=float)
+    return _inoue(wave, 1.0 + float(redshift), *lines)
+
+
+@njit(cache=True)
+def _inoue(wave, z1, lines, forest, damped):
+    out = np.ones(wave.size)
+    highest = lines[0] * z1
+    for i in range(wave.size):
+        w = wave[i]
+        if w >= highest:
+            continue
+        log = math.log(w)
+        w12, w37, w55 = math.exp(1.2 * log), math.exp(3.7 * log), math.exp(5.5 * log)
+        w2, w3 = w * w, w * w * w
+        tau = 0.0
+        for j in range(lines.size):
+            line = lines[j]
+            if w >= line * z1:
+                break
+            if w <= line:
+                continue
+            if w < 2.2 * line:
+                tau += forest[j, 0] * w12
+            elif w < 5.7 * line:
+                tau += forest[j, 1] * w37
+            else:
+                tau += forest[j, 2] * w55
+            tau += damped[j, 0] * w2 if w < 3.0 * line else damped[j, 1] * w3
+        x = w / INOUE_LIMIT
+        if x < z1:
+            if x >= 1.0:
+                tau += _inoue_forest(x, z1) + _inoue_damped(x, z1)
+            else:
+                # lower limit of the integrals at redshift 0 instead of x - 1
+                tau += x**2.1 * _inoue_forest(1.0, z1) + _inoue_damped_near(x, z1)
+        out[i] = math.exp(-tau)
+    return out
+
+
+@njit(cache=True)
+def _inoue_forest(x, z1):
+    """Lyman continuum of the forest, eq. 25 to 27; x = wavelength / limit."""
+    x21 = x**2.1
+    if z1 < 2.2:
+        return 0.325 * (x**1.2 - z1**-0.9 * x21)
+    if z1 < 5.7:
+        if x < 2.2:
+            return 2.55e-2 * z1**1.6 * x21 + 0.325 * x**1.2 - 0.250 * x21
+        return 2.55e-2 * (z1**1.6 * x21 - x**3.7)
+    if x < 2.2:
+        return 5.22e-4 * z1**3.4 * x21 + 0.325 * x**1.2 - 3.14e-2 * x21
+    if x < 5.7:
+        return 5.22e-4 * z1**3.4 * x21 + 0.218 * x21 - 2.55e-2 * x**3.7
+    return 5.22e-4 * (z1**3.4 * x21 - x**5.5)
+
+
+@njit(cache=True)
+def _inoue_damped(x, z1):
+    """Lyman continuum of damped systems, eq. 28 and 29."""
+    near = x**-0.3
+    if z1 < 3.0:
+        return 0.2113 * z1**2 - 0.07661 * z1**2.3 * near - 0.1347 * x**2
+    far = 0.04696 * z1**3 - 0.01779 * z1**3.3 * near
+    if x < 3.0:
+        return 0.6340 + far - 0.1347 * x**2 - 0.2905 * near
+    return far - 0.02916 * x**3
+
+
+@njit(cache=True)
+def _inoue_damped_near(x, z1):
+    """The same for x < 1: eq. 28 and 29 with their lower limit at redshift 0."""
+    near = x**-0.3
+    if z1 < 3.0:
+        tau = 0.2113 * (z1**2 - 1.0) - 0.07661 * (z1**2.3 - 1.0) * near
+    else:
+        far = 0.04696 * z1**3 - 0.01779 * z1**3.3 * near
+        tau = 0.6340 - 0.2113 + far - (0.2905 - 0.07661) * near
+    # the form holds where damped systems are opaque: not in the far ultraviolet
+    return max(tau, 0.0)

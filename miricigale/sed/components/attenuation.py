@@ -1,10 +1,54 @@
 """Attenuation of starlight by dust."""
 
+import functools
+
+import numpy as np
+
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
 
-__all__ = ["Attenuation", "CalzettiLeitherer"]
+__all__ = ["SMC", "Attenuation", "CalzettiLeitherer", "CharlotFall"]
+
+_CURVES = {
+    "calzetti": _core.attenuation_curve,
+    "power_law": _core.power_law_attenuation,
+    "smc": _core.smc_power_law,
+    "pei1992": _core.pei_smc,
+}
+_MAG = -0.4 * np.log(10.0)
+
+
+@functools.lru_cache(maxsize=64)
+def _exponents(wave, law, *shape):
+    """
+    First and last wavelength that a law dims, and ln of what one magnitude leaves there.
+
+    A grid is asked for with thousands of amounts of dust: it is known by its bytes, which are
+    hashed in 2 us.
+    """
+    exponent = _MAG * _CURVES[law](np.frombuffer(wave), *shape)
+    inside = np.flatnonzero(exponent)
+    first, last = (int(inside[0]), int(inside[-1]) + 1) if inside.size else (0, 0)
+    part = exponent[first:last].copy()
+    part.flags.writeable = False
+    return first, last, part
+
+
+def _key(wave):
+    """Bytes of a grid of wavelengths."""
+    return np.ascontiguousarray(wave, dtype=float).tobytes()
+
+
+def _transmission(shape, found, amount):
+    """10^(-0.4 k amount), as a new array that cannot be written to."""
+    first, last, part = found
+    out = np.ones(shape)
+    flat = out.reshape(-1)[first:last]
+    np.multiply(part, amount, out=flat)
+    np.exp(flat, out=flat)
+    out.flags.writeable = False
+    return out
 
 
 class Attenuation(Component):
@@ -14,41 +58,170 @@ class Attenuation(Component):
 
     def factors(self, wave, values):
         """
-        Transmission at rest wavelengths in um.
+        Transmission at rest wavelengths.
+
+        Parameters
+        ----------
+        wave : `~numpy.ndarray`
+            Rest wavelengths in um.
+        values : dict
+            Values of the parameters.
 
         Returns
         -------
         young, old : `~numpy.ndarray`, shape of ``wave``
-            Between 0 and 1.
+            From 0 to 1 for stars below and above 10 Myr. Not to be written to; one array twice
+            where they are the same.
         """
         raise NotImplementedError
 
 
-@register
-class CalzettiLeitherer(Attenuation):
-    """
-    Starburst attenuation with a free slope and an ultraviolet bump.
+class _Screen(Attenuation):
+    """A curve k(lambda) times a colour excess, which old stars have a share of."""
 
-    Calzetti et al. 2000, continued by Leitherer et al. 2002 from 0.15 down to 0.0912 um (0
-    below), times (lambda / 0.55 um)^slope, plus a Drude bump at 0.2175 um (width 0.035 um),
-    scaled to keep E(B-V).
-    """
-
-    name = "calzetti"
-    reference = "Calzetti et al. 2000, ApJ 533, 682; Leitherer et al. 2002, ApJS 140, 303"
     ebv = Parameter(
         default=0.3, bounds=(0.0, 3.0), unit="mag", doc="Colour excess of stars below 10 Myr."
     )
     ebv_factor = Parameter(
         default=1.0, bounds=(0.0, 1.0), doc="Colour excess of older stars over that of young ones."
     )
-    uv_bump = Parameter(default=0.0, bounds=(0.0, 10.0), doc="Amplitude of the 0.2175 um bump.")
-    slope = Parameter(default=0.0, bounds=(-1.2, 0.6), doc="Change of the curve's power-law slope.")
+
+    def _law(self, values):
+        raise NotImplementedError
 
     def factors(self, wave, values):
-        curve = _core.attenuation_curve(wave, values["slope"], values["uv_bump"])
-        young = 10.0 ** (-0.4 * values["ebv"] * curve)
-        return young, young ** values["ebv_factor"]
+        """See `Attenuation.factors`."""
+        found = _exponents(_key(wave), *self._law(values))
+        ebv, factor, shape = values["ebv"], values["ebv_factor"], np.shape(wave)
+        young = _transmission(shape, found, ebv)
+        return young, young if factor == 1.0 else _transmission(shape, found, ebv * factor)
 
     def inert(self, values):
-        return ("ebv_factor", "uv_bump", "slope") if values["ebv"] == 0.0 else ()
+        """Every other parameter, where there is no dust."""
+        return tuple(n for n in self.parameters if n != "ebv") if values["ebv"] == 0.0 else ()
+
+
+@register
+class CalzettiLeitherer(_Screen):
+    """
+    Starburst attenuation with a free slope and an ultraviolet bump.
+
+    Calzetti et al. 2000, continued by Leitherer et al. 2002 from 0.15 down to 0.0912 um (0
+    below), times (lambda / 0.55 um)^slope, plus a Drude bump, scaled in E(B-V) as Noll et al.
+    2009 and CIGALE do. The formula of Calzetti et al. for 0.63-2.2 um is continued to 3.115 um,
+    where it reaches 0; beyond, only the wing of a bump is left.
+
+    Parameters
+    ----------
+    ebv_scaling : {"exact", "cigale"}
+        What the scaling keeps. ``"exact"``: k(0.44 um) - k(0.55 um) is that of the starburst curve,
+        1.012, whatever the slope and the bump. ``"cigale"``: that of the starburst curve plus the
+        bump, as in the code of CIGALE; the whole curve is then higher by 0.5 % for each unit of
+        ``uv_bump``. Without a bump they are the same.
+    **defaults
+        New defaults of parameters.
+    """
+
+    name = "calzetti"
+    reference = (
+        "Calzetti et al. 2000, ApJ 533, 682; Leitherer et al. 2002, ApJS 140, 303; "
+        "Noll et al. 2009, A&A 507, 1793"
+    )
+    options = {"ebv_scaling": ("exact", "cigale")}
+    uv_bump = Parameter(
+        default=0.0,
+        bounds=(0.0, 10.0),
+        doc="Amplitude of the ultraviolet bump in k (Milky Way: 3).",
+    )
+    slope = Parameter(default=0.0, bounds=(-1.2, 0.6), doc="Change of the curve's power-law slope.")
+    uv_bump_wavelength = Parameter(
+        default=0.2175, bounds=(0.18, 0.26), unit="um", doc="Centre of the bump."
+    )
+    uv_bump_width = Parameter(
+        default=0.035, bounds=(0.005, 0.1), unit="um", doc="Full width at half maximum of the bump."
+    )
+
+    def _law(self, values):
+        bump = values["uv_bump"]
+        if bump == 0.0:
+            return "calzetti", values["slope"]
+        centre, width = values["uv_bump_wavelength"], values["uv_bump_width"]
+        return "calzetti", values["slope"], bump, centre, width, self.ebv_scaling
+
+    def inert(self, values):
+        """The bump's place and width where there is no bump; all but ``ebv`` without dust."""
+        if values["ebv"] > 0.0 and values["uv_bump"] == 0.0:
+            return ("uv_bump_wavelength", "uv_bump_width")
+        return super().inert(values)
+
+
+@register
+class SMC(_Screen):
+    """
+    Extinction of the Small Magellanic Cloud as a screen before the stars.
+
+    Nothing is dimmed at 0.0912 um and below.
+
+    Parameters
+    ----------
+    law : {"smc", "pei1992"}
+        ``"smc"``: k = 1.39 (lambda / um)^-1.2, the law of the polar dust of AGN (a fit to Prevot et
+        al. 1984 in the ultraviolet; k(0.55 um) = 2.85 and k(0.44 um) - k(0.55 um) = 0.87, so
+        that ``ebv`` is the colour excess but for 13 %). ``"pei1992"``: the six terms of Pei 1992,
+        with silicates and R_V = 2.93.
+    **defaults
+        New defaults of parameters.
+    """
+
+    name = "smc"
+    reference = "Prevot et al. 1984, A&A 132, 389; Pei 1992, ApJ 395, 130"
+    options = {"law": ("smc", "pei1992")}
+
+    def _law(self, values):
+        return (self.law,)
+
+
+@register
+class CharlotFall(Attenuation):
+    """
+    Birth clouds and interstellar medium: two power laws, two populations.
+
+    Charlot & Fall 2000 with free slopes: stars below 10 Myr are behind both, older ones behind
+    the interstellar medium, A(lambda) = A_V (lambda / 0.55 um)^slope. Nothing is dimmed at 0.0912
+    um and below. Defaults are CIGALE's.
+    """
+
+    name = "charlot_fall"
+    reference = "Charlot & Fall 2000, ApJ 539, 718; Boquien et al. 2019, A&A 622, A103"
+    av_ism = Parameter(
+        default=1.0, bounds=(0.0, 10.0), unit="mag", doc="A_V of the interstellar medium."
+    )
+    mu = Parameter(
+        default=0.44,
+        bounds=(1e-4, 1.0),
+        doc="A_V of the interstellar medium over that of it and the birth clouds.",
+    )
+    slope_ism = Parameter(
+        default=-0.7, bounds=(-3.0, 0.0), doc="Slope of attenuation in the interstellar medium."
+    )
+    slope_bc = Parameter(
+        default=-1.3, bounds=(-3.0, 0.0), doc="Slope of attenuation in the birth clouds."
+    )
+
+    def factors(self, wave, values):
+        """See `Attenuation.factors`."""
+        key, shape = _key(wave), np.shape(wave)
+        av, mu = values["av_ism"], values["mu"]
+        old = _transmission(shape, _exponents(key, "power_law", values["slope_ism"]), av)
+        if mu == 1.0:
+            return old, old
+        clouds = _exponents(key, "power_law", values["slope_bc"])
+        young = old * _transmission(shape, clouds, av * (1.0 - mu) / mu)
+        young.flags.writeable = False
+        return young, old
+
+    def inert(self, values):
+        """All but ``av_ism`` without dust; the slope of clouds that are not there."""
+        if values["av_ism"] == 0.0:
+            return ("mu", "slope_ism", "slope_bc")
+        return ("slope_bc",) if values["mu"] == 1.0 else ()

@@ -1,15 +1,32 @@
 """Absorption by the intergalactic medium."""
 
+import functools
+import tomllib
+from pathlib import Path
+
 import numpy as np
 
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
+from miricigale.utils.exceptions import DataError
 
-__all__ = ["IGM", "Madau1995", "Meiksin2006"]
+__all__ = ["IGM", "Inoue2014", "Madau1995", "Meiksin2006"]
+
+# n = 2 ... 10: of the lines beyond, each is at most 1.6 % of Lyman alpha in optical depth
+_N_LINES = 9
+
+# below the limit light fades within a few per cent in wavelength from z = 4 on, faster than
+# the grids of stars resolve: without these bands there are per cents too bright
+_BELOW_LIMIT = 1.0 - np.array([0.002, 0.005, 0.01, 0.015, 0.025, 0.035, 0.05, 0.07, 0.09, 0.11])
 
 
 class IGM(Component):
-    """Base: `transmission` at observed wavelengths."""
+    """
+    Base: `transmission` at observed wavelengths.
+
+    Lines absorb from their rest wavelength to (1 + z) times it, so nothing is absorbed at z = 0 or
+    longward of Lyman alpha.
+    """
 
     role = "igm"
 
@@ -19,17 +36,27 @@ class IGM(Component):
 
         Parameters
         ----------
-        wave : `~numpy.ndarray`
+        wave : `~numpy.ndarray`, shape (n,)
             Observed wavelengths in um.
         redshift : float
             Redshift of the source.
+
+        Returns
+        -------
+        transmission : `~numpy.ndarray`, shape (n,)
+            From 0 to 1.
         """
         raise NotImplementedError
 
+    def edges(self):
+        """Rest wavelengths in um of the Lyman lines that jump most, and of the limit."""
+        return np.append(_core.lyman_lines(_N_LINES + 2), _core.LYMAN_LIMIT)
+
     def nodes(self):
-        """Both sides of the Lyman lines and limit, where the transmission jumps."""
-        edges = np.append(_core.lyman_lines(11), _core.LYMAN_LIMIT)
-        return np.sort(np.concatenate([edges * (1 - 1e-5), edges * (1 + 1e-5)]))
+        """Both sides of the Lyman lines and limit, where it jumps, and some below the limit."""
+        edges = self.edges()
+        below = edges[-1] * _BELOW_LIMIT
+        return np.sort(np.concatenate([edges * (1 - 1e-5), edges * (1 + 1e-5), below]))
 
 
 @register
@@ -50,5 +77,70 @@ class Madau1995(IGM):
     name = "madau1995"
     reference = "Madau 1995, ApJ 441, 18"
 
+    def edges(self):
+        """Rest wavelengths in um of the four lines, and of the limit."""
+        return np.append(_core.lyman_lines(6), _core.LYMAN_LIMIT)
+
     def transmission(self, wave, redshift):
         return _core.madau_transmission(wave, redshift)
+
+
+@register
+class Inoue2014(IGM):
+    """
+    Inoue et al. 2014: 39 Lyman lines and the continuum, of the forest and of damped systems.
+
+    Table 2 with equations 20 to 22 for the lines, equations 25 to 29 for the continuum.
+    """
+
+    name = "inoue2014"
+    reference = "Inoue et al. 2014, MNRAS 442, 1805"
+    resource = "igm.inoue2014"
+
+    def edges(self):
+        """Rest wavelengths in um of the first lines of table 2, and of the limit."""
+        return np.append(load_lines(self.path)[0][:_N_LINES], _core.INOUE_LIMIT)
+
+    def transmission(self, wave, redshift):
+        return _core.inoue_transmission(wave, redshift, load_lines(self.path))
+
+
+_COLUMNS = ("wavelength", "laf1", "laf2", "laf3", "dla1", "dla2")
+
+
+@functools.lru_cache(maxsize=2)
+def load_lines(path):
+    """
+    Read the Lyman series of Inoue et al. 2014, table 2.
+
+    Parameters
+    ----------
+    path : str
+        A TOML file with the arrays ``wavelength`` (um), ``laf1`` to ``laf3``, ``dla1``, ``dla2``.
+
+    Returns
+    -------
+    lines : tuple of `~numpy.ndarray`
+        See `miricigale.sed._core.inoue_lines`; read-only.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If it is another file, or columns are short, not positive or not in order.
+    """
+    try:
+        columns = tomllib.loads(Path(path).read_text())
+        table = np.array([columns[name] for name in _COLUMNS], dtype=float).T
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as err:
+        msg = f"{path} is not table 2 of Inoue et al. 2014: {err}"
+        raise DataError(msg) from err
+    if table.ndim != 2 or len(table) != 39 or not np.all(np.isfinite(table) & (table > 0)):
+        msg = f"{path} must hold six columns of 39 positive numbers, got shape {table.shape}"
+        raise DataError(msg)
+    if np.any(np.diff(table[:, 0]) >= 0):
+        msg = f"{path} must hold 'wavelength' from the longest to the shortest"
+        raise DataError(msg)
+    lines = _core.inoue_lines(table)
+    for array in lines:
+        array.flags.writeable = False
+    return lines

@@ -1,10 +1,26 @@
 """Star-formation histories, in steps of 1 Myr."""
 
+import hashlib
+import os
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable, Table
+
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
+from miricigale.utils.exceptions import DataError, argument_error
 
-__all__ = ["DelayedSFH", "StarFormationHistory"]
+__all__ = [
+    "ConstantSFH",
+    "DelayedSFH",
+    "DoubleExponentialSFH",
+    "StarFormationHistory",
+    "TableSFH",
+]
+
+_RATE = u.Msun / u.yr
 
 
 class StarFormationHistory(Component):
@@ -34,17 +50,9 @@ class StarFormationHistory(Component):
         raise NotImplementedError
 
 
-@register
-class DelayedSFH(StarFormationHistory):
-    """
-    Delayed exponential history, with an optional recent burst.
+class BurstHistory(StarFormationHistory):
+    """Base: histories that may end in an exponential burst."""
 
-    ``SFR_t = t exp(-t / tau) / tau^2`` for t = 0, 1, ... age - 1 Myr, and an exponential burst
-    in the last ``age_burst`` that makes the fraction ``f_burst`` of all stars.
-    """
-
-    name = "delayed"
-    reference = "Boquien et al. 2019, A&A 622, A103, eq. 3"
     tau = Parameter(default=1.0, bounds=(0.001, 100.0), unit="Gyr", doc="E-folding time.")
     f_burst = Parameter(default=0.0, bounds=(0.0, 0.99), doc="Mass fraction made in the burst.")
     age_burst = Parameter(
@@ -54,8 +62,9 @@ class DelayedSFH(StarFormationHistory):
         default=0.05, bounds=(0.001, 100.0), unit="Gyr", doc="E-folding time of the burst."
     )
 
-    def history(self, values):
-        return _core.delayed_history(
+    def _numbers(self, values):
+        """Arguments of the functions in `_core`, times in Myr."""
+        return (
             self.steps(values),
             values["tau"] * 1e3,
             values["f_burst"],
@@ -68,5 +77,195 @@ class DelayedSFH(StarFormationHistory):
 
     def invalid(self, values):
         if values["f_burst"] > 0.0 and values["age_burst"] > values["age"]:
-            return "'age_burst' must not exceed 'age'"
+            return f"'age_burst' must not exceed 'age', got {values['age_burst']:g} Gyr"
         return None
+
+
+@register
+class DelayedSFH(BurstHistory):
+    """
+    Delayed exponential history, with an optional recent burst.
+
+    ``SFR_t = t exp(-t / tau) / tau^2`` for t = 0, 1, ... age - 1 Myr, and an exponential burst
+    in the last ``age_burst`` that makes the fraction ``f_burst`` of all stars.
+    """
+
+    name = "delayed"
+    reference = "Boquien et al. 2019, A&A 622, A103, eq. 3"
+
+    def history(self, values):
+        return _core.delayed_history(*self._numbers(values))
+
+
+@register
+class DoubleExponentialSFH(BurstHistory):
+    """
+    Two exponentials: the main history and a recent burst (``sfh2exp`` of CIGALE).
+
+    ``SFR_t = exp(-t / tau)`` for t = 0, 1, ... age - 1 Myr, rising where ``tau`` is negative,
+    and an exponential burst in the last ``age_burst`` that makes the fraction ``f_burst`` of
+    all stars.
+    """
+
+    name = "double_exponential"
+    reference = "Boquien et al. 2019, A&A 622, A103, sect. 3.1.1"
+    tau = Parameter(
+        default=6.0,
+        bounds=(-100.0, 100.0),
+        unit="Gyr",
+        doc="E-folding time of the main history; negative: the rate rises; not within 1 Myr of 0.",
+    )
+    f_burst = Parameter(default=0.01, bounds=(0.0, 0.99), doc="Mass fraction made in the burst.")
+
+    def history(self, values):
+        return _core.double_exponential_history(*self._numbers(values))
+
+    def invalid(self, values):
+        if abs(values["tau"]) < 0.001:
+            return f"'tau' must be 0.001 Gyr or more, or -0.001 or less, got {values['tau']:g}"
+        return super().invalid(values)
+
+
+@register
+class ConstantSFH(StarFormationHistory):
+    """Constant star-formation rate."""
+
+    name = "constant"
+    reference = "Kennicutt 1998, ARA&A 36, 189"
+
+    def history(self, values):
+        return _core.constant_history(self.steps(values))
+
+
+@register
+class TableSFH(StarFormationHistory):
+    """
+    Any history, from a table.
+
+    Each row begins a bin of time in which the rate is constant: it lasts until the next row,
+    the last one as long as the one before it. With rows of 1 Myr these are the steps; other
+    bins are integrated onto steps of 1 Myr, so that the mass is conserved. Rates are taken
+    relative to one another: the stars formed until ``age`` are one solar mass.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table` or path-like
+        Column ``time`` and one or more columns of rates, with units; or a file of it that
+        `astropy.table.Table.read` understands.
+    path : path-like, optional
+        The file, where there is no ``table`` (for configurations).
+    **defaults
+        As for `~miricigale.sed.Component`; ``age`` is the table's length if it is not given.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file cannot be read.
+    ValueError
+        If times do not ascend, or a value is negative, masked or not finite.
+    `~astropy.units.UnitsError`
+        If a column has no unit or a wrong one.
+    """
+
+    name = "sfh_table"
+    reference = "Boquien et al. 2019, A&A 622, A103, sect. 3.1.1"
+    sfh_index = Parameter(default=0, bounds=(0, 9999), doc="Which column of rates, counted from 0.")
+    age = Parameter(
+        default=1.0,
+        bounds=(0.001, 13.7),
+        unit="Gyr",
+        doc="Time of observation since the first row; rounded to 1 Myr; default: the table's end.",
+    )
+
+    def __init__(self, table=None, *, path=None, **defaults):
+        if (table is None) == (path is None):
+            raise argument_error("table", "a table or a path, one of them", "both or none")
+        table = _read(path if table is None else table)
+        edges, rates = _bins(table)
+        self._columns = tuple(name for name in table.colnames if name != "time")
+        self._sha256 = hashlib.sha256(edges.tobytes() + rates.tobytes()).hexdigest()
+        self._rates = np.array([_core.table_history(edges, rate) for rate in rates])
+        self._rates.flags.writeable = False
+        length = self._rates.shape[1] / 1e3
+        if "age" not in defaults and length > type(self).age.bounds[1]:
+            limit = type(self).age.bounds[1]
+            raise argument_error(
+                "table", f"{limit} Gyr long at most where 'age' is not given", f"{length:g} Gyr"
+            )
+        super().__init__(**{"age": length} | defaults)
+        why = self.invalid({name: par.default for name, par in self.parameters.items()})
+        if why:
+            raise ValueError(why)
+
+    @property
+    def settings(self):
+        return {"columns": self._columns, "sha256": self._sha256}
+
+    def history(self, values):
+        rate = self._rates[int(values["sfh_index"]), : self.steps(values)]
+        return rate * (1e-6 / rate.sum())
+
+    def invalid(self, values):
+        index, n = values["sfh_index"], len(self._rates)
+        if index != int(index) or index >= n:
+            return f"'sfh_index' must be a whole number below {n}, got {index:g}"
+        steps = self.steps(values)
+        if steps > self._rates.shape[1]:
+            end = self._rates.shape[1] / 1e3
+            return f"'age' must not exceed the end of the table, {end:g} Gyr, got {values['age']:g}"
+        if not np.any(self._rates[int(index), :steps]):
+            return f"'age' must be after the first stars of the table, got {values['age']:g} Gyr"
+        return None
+
+
+def _read(table):
+    if isinstance(table, Table):
+        return QTable(table, copy=False)
+    if not isinstance(table, (str, os.PathLike)):
+        raise argument_error("table", "an astropy table or a path", type(table).__name__)
+    if not os.path.isfile(table):
+        msg = f"{table} cannot be read as a star-formation history: no such file"
+        raise DataError(msg)
+    try:
+        return QTable.read(table)
+    except Exception as err:  # readers of all formats raise as they like
+        lines = str(err).strip().splitlines() or [type(err).__name__]
+        msg = f"{table} cannot be read as a star-formation history: {lines[0]}"
+        raise DataError(msg) from err
+
+
+def _bins(table):
+    """Edges of the bins in Myr and rates in Msun/yr, shape (n_column, n_bin), checked."""
+    names = [name for name in table.colnames if name != "time"]
+    if "time" not in table.colnames or not names:
+        wanted = "with a column 'time' and one or more columns of rates"
+        raise argument_error("table", wanted, table.colnames)
+    if len(table) < 2:
+        raise argument_error("table", "of two rows or more", len(table))
+    time = _column(table, "time", u.Myr)
+    if not np.all(np.diff(time) > 0):
+        raise argument_error("time", "ascending", "times that stand still or fall")
+    rates = np.array([_column(table, name, _RATE) for name in names])
+    for name, rate in zip(names, rates, strict=True):
+        if np.any(rate < 0):
+            raise argument_error(name, "rates of 0 or more", f"{rate.min():g}")
+        if not np.any(rate > 0):
+            raise argument_error(name, "a history that forms stars", "zeros")
+    return np.append(time, 2 * time[-1] - time[-2]), rates
+
+
+def _column(table, name, unit):
+    column = table[name]
+    if np.any(getattr(column, "mask", False)):
+        raise argument_error(name, "without masked values", f"{np.sum(column.mask)} masked")
+    if getattr(column, "unit", None) is None:
+        msg = f"'{name}' must have a unit convertible to {unit}, got none"
+        raise u.UnitsError(msg)
+    try:
+        array = np.asarray(u.Quantity(column).to_value(unit), dtype=float)
+    except u.UnitConversionError:
+        msg = f"'{name}' must be convertible to {unit}, got {column.unit}"
+        raise u.UnitsError(msg) from None
+    if array.ndim != 1 or not np.all(np.isfinite(array)):
+        raise argument_error(name, "finite numbers, one in a row", "others")
+    return array

@@ -1,23 +1,28 @@
-"""The one format in which libraries are kept: a FITS table with a row for each spectrum."""
+"""The one format in which libraries are kept: FITS, an image for each kind of spectrum."""
 
+import bisect
 import functools
 import json
 import os
+import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 from astropy.io import fits
-from astropy.table import QTable
 
+from miricigale.refdata.store import partial_path
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits
-from miricigale.utils.units import WAVE, to_array
+from miricigale.utils.units import WAVE, frozen_array, to_array
 
-__all__ = ["LibraryTable", "open_library", "write_library"]
+__all__ = ["LibraryTable", "open_library", "verify_library", "write_library"]
 
 _FORMAT = "miricigale-library-1"
+
+#: Values of an axis that differ by less than this, relatively, are the same.
+_SAME = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,19 +35,27 @@ class LibraryTable:
     name : str
         The resource, such as ``"torus.skirtor2016"``.
     wave : `~numpy.ndarray`, shape (n_wave,)
-        Rest wavelengths in um, ascending.
+        Rest wavelengths in um (or a quantity), positive and ascending.
     axes : dict of str to `~numpy.ndarray`, shape (n_rows,)
-        What distinguishes the spectra, in the units of the component's parameters.
+        What distinguishes the spectra, in the units of the component's parameters. No two
+        rows have the same values (to 1e-6, relatively) of all axes.
     spectra : dict of str to `~numpy.ndarray`, shape (n_rows, n_wave)
-        The spectra, in ``units``.
+        The spectra, in ``units``, as float32 or float64. Those of `open_library` stay on
+        disk, read-only and in the byte order of FITS; `spectrum` gives native float64.
     units : dict of str to str
         Units of axes, spectra and values that have one.
     values : dict of str to `~numpy.ndarray`, shape (n_rows,), optional
         Other numbers of each row.
     meta : dict, optional
-        Plain values: what was read, checksums of the files, notes.
+        Plain values: what was read, checksums of the files (``"files"``), notes.
     summary : tuple of str, optional
         What was found, in sentences for whoever registers it.
+
+    Raises
+    ------
+    ValueError
+        If shapes, names or units do not fit together, wavelengths or axes are not finite or
+        not in order, or two rows have the same values of all axes.
     """
 
     name: str
@@ -55,22 +68,55 @@ class LibraryTable:
     summary: tuple = ()
 
     def __post_init__(self):
-        wave = (
-            to_array(self.wave, WAVE, "wave", ndim=1, finite=True)
-            if hasattr(self.wave, "unit")
-            else np.asarray(self.wave, dtype=float)
-        )
+        wave = to_array(self.wave, WAVE, "wave") if hasattr(self.wave, "unit") else self.wave
+        wave = frozen_array(wave)
         object.__setattr__(self, "wave", wave)
-        if wave.size < 2 or not np.all(np.diff(wave) > 0):
-            raise argument_error("wave", "two or more ascending wavelengths", f"{wave.size}")
+        good = wave.ndim == 1 and wave.size > 1 and np.all(np.isfinite(wave)) and wave[0] > 0
+        if not good or not np.all(np.diff(wave) > 0):
+            got = f"{wave.size} of shape {wave.shape}"
+            raise argument_error("wave", "two or more positive, ascending wavelengths", got)
+        self._check_names()
         n = self.n_rows
         for kind in ("axes", "values"):
             for name, column in getattr(self, kind).items():
-                if np.shape(column) != (n,):
-                    raise argument_error(name, f"of shape ({n},)", np.shape(column))
+                if hasattr(column, "unit"):
+                    raise argument_error(name, "plain numbers (units stand apart)", "a quantity")
+            columns = {k: frozen_array(v) for k, v in getattr(self, kind).items()}
+            object.__setattr__(self, kind, columns)
+            for name, column in columns.items():
+                if column.shape != (n,):
+                    raise argument_error(name, f"of shape ({n},)", column.shape)
         for name, column in self.spectra.items():
             if np.shape(column) != (n, wave.size):
                 raise argument_error(name, f"of shape {(n, wave.size)}", np.shape(column))
+        for name, column in self.axes.items():
+            if not np.all(np.isfinite(column)):
+                raise argument_error(name, "finite in every row", "NaN or infinity")
+        summary = (self.summary,) if isinstance(self.summary, str) else tuple(self.summary)
+        object.__setattr__(self, "summary", summary)
+        object.__setattr__(self, "_index", self._make_index())
+
+    def _check_names(self):
+        if not self.axes or not self.spectra:
+            got = f"axes {list(self.axes)} and spectra {list(self.spectra)}"
+            raise argument_error("axes", "one axis and one kind of spectra at least", got)
+        names = [*self.axes, *self.values, *self.spectra]
+        # columns of a FITS table have names without case
+        if len({name.lower() for name in names}) < len(names):
+            raise argument_error("axes", "of other names than values and spectra", names)
+        for name in names:
+            if not (name.isascii() and name.isidentifier()):
+                raise argument_error("axes", "named by plain identifiers", repr(name))
+        for name, unit in self.units.items():
+            if name not in (*names, "wave"):
+                known = f"of a column ({', '.join(names)})"
+                raise argument_error("units", known, repr(name))
+            try:
+                u.Unit(unit)
+            except (TypeError, ValueError):
+                raise argument_error("units", f"a unit for {name!r}", repr(unit)) from None
+        if u.Unit(self.units.get("wave", WAVE)) != WAVE:
+            raise argument_error("units", f"{WAVE} for 'wave'", repr(self.units["wave"]))
 
     @property
     def n_rows(self):
@@ -78,13 +124,72 @@ class LibraryTable:
         return len(next(iter(self.spectra.values())))
 
     def values_of(self, axis):
-        """Different values of an axis, ascending."""
-        return np.unique(np.asarray(self.axes[axis], dtype=float))
+        """
+        Different values of an axis, ascending.
+
+        Raises
+        ------
+        KeyError
+            If there is no such axis.
+        """
+        if axis not in self.axes:
+            msg = f"library {self.name!r} has no axis {axis!r}; axes: {', '.join(self.axes)}"
+            raise KeyError(msg)
+        return self._levels[axis].copy()
 
     @functools.cached_property
-    def _index(self):
-        rows = np.column_stack([np.asarray(a, dtype=float) for a in self.axes.values()])
-        return {tuple(np.round(row, 9)): i for i, row in enumerate(rows)}
+    def _levels(self):
+        levels = {}
+        for name, column in self.axes.items():
+            found = np.unique(column)
+            gap = _SAME * np.maximum(np.abs(found[1:]), np.abs(found[:-1]))
+            levels[name] = found[np.append(True, np.diff(found) > gap)]
+        return levels
+
+    @functools.cached_property
+    def _ladders(self):
+        """Levels of each axis as floats, and how near to each a value must be."""
+        ladders = {}
+        for name, levels in self._levels.items():
+            # zero has no relative neighbourhood: there the extent of the axis is the measure
+            near = _SAME * np.maximum(np.abs(levels), 1e-3 * (levels[-1] - levels[0]))
+            ladders[name] = (levels.tolist(), near.tolist())
+        return ladders
+
+    def _code(self, axis, value):
+        """Number of the level that is the same as a value, or -1."""
+        levels, near = self._ladders[axis]
+        right = bisect.bisect_left(levels, value)
+        for k in (right, right - 1):
+            if 0 <= k < len(levels) and abs(value - levels[k]) <= near[k]:
+                return k
+        return -1
+
+    def _make_index(self):
+        keys = np.empty((self.n_rows, len(self.axes)), dtype=np.int32)
+        for k, (name, column) in enumerate(self.axes.items()):
+            found, which = np.unique(column, return_inverse=True)
+            codes = np.array([self._code(name, value) for value in found.tolist()])
+            if np.any(codes < 0):
+                wanted = f"of values that differ by more than {_SAME:g}, relatively"
+                raise argument_error(name, wanted, "some that creep")
+            keys[:, k] = codes[which]
+        # bytes, unlike thousands of tuples, set off no collection of garbage
+        text, size = keys.tobytes(), keys.itemsize * keys.shape[1]
+        index = {}
+        for i in range(self.n_rows):
+            row = text[i * size : (i + 1) * size]
+            if row in index:
+                where = ", ".join(f"{name} = {column[i]:g}" for name, column in self.axes.items())
+                got = f"{where} in rows {index[row]} and {i}"
+                raise argument_error("axes", "different in every row", got)
+            index[row] = i
+        return index
+
+    @property
+    def complete(self):
+        """Whether every combination of the values of the axes has a row."""
+        return self.n_rows == np.prod([levels.size for levels in self._levels.values()])
 
     def row(self, **values):
         """
@@ -93,14 +198,45 @@ class LibraryTable:
         Parameters
         ----------
         **values : float
-            In the units of the axes.
+            In the units of the axes; the same to 1e-6, relatively. Others than the axes
+            are not looked at.
+
+        Raises
+        ------
+        ValueError
+            If an axis has no value.
         """
-        return self._index.get(tuple(round(float(values[name]), 9) for name in self.axes))
+        missing = [name for name in self.axes if name not in values]
+        if missing:
+            got = f"only {', '.join(values) or 'none'}"
+            raise argument_error(", ".join(missing), f"given to find a row of {self.name!r}", got)
+        codes = [self._code(name, float(values[name])) for name in self.axes]
+        return self._index.get(np.array(codes, dtype=np.int32).tobytes())
+
+    def spectrum(self, kind, row):
+        """
+        Read spectra, as native float64.
+
+        Parameters
+        ----------
+        kind : str
+            Name of the kind of spectra.
+        row : int or sequence of int
+            Number(s) of rows.
+
+        Returns
+        -------
+        spectrum : `~numpy.ndarray`, shape (n_wave,) or (n, n_wave)
+            A copy.
+        """
+        return np.array(self.spectra[kind][row], dtype=float)
 
 
 def write_library(library, path):
     """
     Write a library where `open_library` finds it, all or nothing.
+
+    The same library gives the same bytes.
 
     Parameters
     ----------
@@ -108,32 +244,78 @@ def write_library(library, path):
         The library.
     path : path-like
         The file; one that is there is replaced.
+
+    Raises
+    ------
+    ValueError
+        If ``meta`` does not consist of plain values.
     """
     path = Path(path)
-    table = QTable()
-    for kind in ("axes", "values", "spectra"):
-        for name, column in getattr(library, kind).items():
-            table[name] = np.asarray(column) * u.Unit(library.units.get(name, ""))
-    hdu = fits.table_to_hdu(table)
-    hdu.name = "SPECTRA"
     text = {
         "name": library.name,
         "axes": list(library.axes),
         "values": list(library.values),
         "spectra": list(library.spectra),
-        "units": library.units,
+        "units": {name: str(unit) for name, unit in library.units.items()},
         "meta": library.meta,
         "summary": list(library.summary),
     }
-    data = np.frombuffer(json.dumps(text).encode(), dtype=np.uint8)
+    try:
+        data = np.frombuffer(json.dumps(text, default=_plain).encode(), dtype=np.uint8)
+    except (TypeError, ValueError) as err:
+        raise argument_error("meta", "plain values (text, numbers, lists, dicts)", err) from None
     wave = fits.ImageHDU(library.wave, name="WAVE")
     wave.header["BUNIT"] = "um"
-    primary = fits.PrimaryHDU(header=fits.Header({"FORMAT": _FORMAT}))
-    partial = path.with_name(path.name + ".partial")
+    columns = [
+        fits.Column(name, "D", unit=_fits_unit(library, name), array=column)
+        for name, column in (library.axes | library.values).items()
+    ]
+    hdus = [
+        fits.PrimaryHDU(header=fits.Header({"FORMAT": _FORMAT})),
+        wave,
+        fits.BinTableHDU.from_columns(columns, name="ROWS"),
+        fits.ImageHDU(data, name="TEXT"),
+    ]
+    for k, (name, spectra) in enumerate(library.spectra.items()):
+        array = np.asarray(spectra)
+        if array.dtype.kind != "f" or array.dtype.itemsize not in (4, 8):
+            array = array.astype(float)
+        hdu = fits.ImageHDU(array, name="SPECTRA", ver=k + 1)
+        hdu.header["KIND"] = name
+        hdu.header["BUNIT"] = _fits_unit(library, name) or ""
+        hdus.append(hdu)
+    hdus = fits.HDUList(hdus)
+    hdus.update_extend()
+    for hdu in hdus:
+        # no date in the comment: it would change the checksum of the file
+        hdu.add_checksum(when="sum of this HDU")
     path.parent.mkdir(parents=True, exist_ok=True)
-    hdus = fits.HDUList([primary, wave, hdu, fits.ImageHDU(data, name="TEXT")])
-    hdus.writeto(partial, overwrite=True, checksum=True)
-    os.replace(partial, path)
+    partial = partial_path(path)
+    try:
+        with open(partial, "wb") as handle:
+            hdus.writeto(handle)
+            handle.flush()
+            os.fsync(handle.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _plain(value):
+    """Make plain values of numpy's for JSON."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        return value.tolist()
+    msg = f"{type(value).__name__} {value!r}"
+    raise TypeError(msg)
+
+
+def _fits_unit(library, name):
+    """The unit in FITS's words for other readers; ours is in the text."""
+    unit = u.Unit(library.units.get(name, ""))
+    try:
+        return unit.to_string("fits") or None
+    except ValueError:
+        return str(unit)
 
 
 def open_library(path, name):
@@ -150,6 +332,7 @@ def open_library(path, name):
     Returns
     -------
     library : `LibraryTable`
+        The same object as long as the file does not change.
 
     Raises
     ------
@@ -158,37 +341,89 @@ def open_library(path, name):
     """
     path = Path(path)
     try:
-        return _open(str(path), path.stat().st_mtime_ns, name)
+        status = path.stat()
     except OSError as err:
-        if isinstance(err, DataError):
-            raise
-        msg = f"{path} cannot be read as the library {name!r}: {err}"
+        reason = "no such file" if isinstance(err, FileNotFoundError) else err.strerror
+        msg = f"{path} cannot be read as the library {name!r}: {reason}"
         raise DataError(msg) from err
+    with _lock:
+        key = (status.st_ino, status.st_size, status.st_mtime_ns)
+        return _open(str(path.absolute()), key, name)
+
+
+#: Threads that ask for the same library wait for one to open it.
+_lock = threading.Lock()
 
 
 @functools.lru_cache(maxsize=8)
-def _open(path, modified, name):
-    del modified
+def _open(path, key, name):
+    del key
     try:
+        # the mapping lives as long as the arrays that use it
         with open_fits(path, wanted=f"the library {name!r}", memmap=True) as hdus:
             if hdus[0].header.get("FORMAT") != _FORMAT:
-                msg = f"{path} is not a library in this package's format; see 'miricigale data add'"
+                msg = (
+                    f"{path} is not a library in this package's format; "
+                    "distributed files are converted by 'miricigale data add NAME PATH'"
+                )
                 raise DataError(msg)
             text = json.loads(bytes(np.asarray(hdus["TEXT"].data)).decode())
             if text["name"] != name:
                 msg = f"{path} holds {text['name']!r}, not {name!r}"
                 raise DataError(msg)
-            data = hdus["SPECTRA"].data
+            rows = hdus["ROWS"].data
             return LibraryTable(
                 name=name,
-                wave=np.array(hdus["WAVE"].data, dtype=float),
-                axes={n: np.array(data[n], dtype=float) for n in text["axes"]},
-                values={n: np.array(data[n], dtype=float) for n in text["values"]},
-                spectra={n: data[n] for n in text["spectra"]},
+                wave=hdus["WAVE"].data,
+                axes={n: rows[n] for n in text["axes"]},
+                values={n: rows[n] for n in text["values"]},
+                spectra={n: _mapped(hdus, k + 1, n) for k, n in enumerate(text["spectra"])},
                 units=text["units"],
                 meta=text["meta"],
                 summary=tuple(text["summary"]),
             )
     except (KeyError, ValueError, TypeError) as err:
-        msg = f"{path} is not a whole library: {err}"
+        reason = err.args[0] if err.args else err
+        msg = f"{path} is not a whole library: {reason}"
         raise DataError(msg) from err
+
+
+def _mapped(hdus, version, kind):
+    hdu = hdus["SPECTRA", version]
+    if hdu.header.get("KIND") != kind:
+        msg = f"spectra {version} are {hdu.header.get('KIND')!r}, not {kind!r}"
+        raise ValueError(msg)
+    data = hdu.data
+    data.flags.writeable = False
+    return data
+
+
+def verify_library(path, name):
+    """
+    Read all of a library and compare the checksums in it.
+
+    Parameters and errors are those of `open_library`.
+
+    Returns
+    -------
+    library : `LibraryTable`
+        Opened anew.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If it is not whole, or a checksum or a number is not as it should be.
+    """
+    library = _open.__wrapped__(str(path), None, name)
+    with open_fits(path, wanted=f"the library {name!r}") as hdus:
+        for number, hdu in enumerate(hdus):
+            # 1 is success, 2 no checksum
+            if (hdu.verify_datasum(), hdu.verify_checksum()) != (1, 1):
+                msg = f"{path} is damaged: wrong checksum in HDU {number} ({hdu.name})"
+                raise DataError(msg)
+    for kind, spectra in library.spectra.items():
+        for first in range(0, library.n_rows, 1000):
+            if not np.all(np.isfinite(spectra[first : first + 1000])):
+                msg = f"{path} has {kind!r} spectra with NaN or infinity"
+                raise DataError(msg)
+    return library

@@ -42,7 +42,8 @@ def study_stages():
     images = ("pointing", "exposures", "scene", "detector", "reduction")
     grid = ("pointing", "exposures")
     kernel = ("highres", "photometry.regularization", "reduction")
-    sed_data = ("ssp.bc03", "dust.dl07", "torus.parametric", "filters.sedpy")
+    # the preset takes the best libraries that there are: a new one makes a new result
+    sed_data = (*SEDModel.yang2021().resources, "filters.sedpy")
     image_data = (
         "instrument.siaf",
         "instrument.imager",

@@ -6,8 +6,8 @@ from astropy.table import QTable, hstack
 from miricigale.filters import Filter
 from miricigale.fitting import BayesFitter, FitResults
 from miricigale.scene import read_catalog
-from miricigale.sed import SEDModel
-from miricigale.utils.exceptions import ConfigError, argument_error
+from miricigale.sed import ModelFlags, SEDModel
+from miricigale.utils.exceptions import ConfigError, DataError, argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.random import stream
 from miricigale.utils.tables import error_column
@@ -183,6 +183,14 @@ def make_truth(context, _):
         parameters["mass"] = parameters["mass"] * ratio
         parameters["prior_ratio"] = np.where(usable, ratio, np.nan)
     light = model.fluxes(parameters, bands)
+    lacking = (light["flags"] & int(ModelFlags.NOT_IN_LIBRARY)) > 0
+    if np.any(lacking):
+        msg = (
+            f"{np.count_nonzero(lacking)} of {len(light)} sources have parameters that the "
+            f"registered libraries lack ({'; '.join(model.meta['libraries'])}): register whole "
+            "libraries with 'miricigale data add', or remove these"
+        )
+        raise DataError(msg)
     light.rename_column("flags", "sed_flags")
     star = np.asarray(catalog["star"], bool)
     if np.any(star):

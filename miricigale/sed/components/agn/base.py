@@ -1,17 +1,17 @@
 """What every nucleus has: disk, torus and polar dust."""
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 
 from miricigale.sed import _core
+from miricigale.sed._core import DISK_MEAN
 from miricigale.sed.component import Component
 from miricigale.sed.parameter import Parameter
+from miricigale.utils.exceptions import argument_error
 
 __all__ = ["AGN", "DISK_MEAN", "AGNTemplates", "TorusSpectra"]
-
-#: Mean over the sphere of cos i (1 + 2 cos i) / 3: a disk's light over its face-on value.
-DISK_MEAN = 7.0 / 18.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +62,18 @@ class AGN(Component):
     """
     Base of nuclei with a torus and polar dust; a subclass gives `torus_spectra`.
 
-    Polar dust with an SMC law, k = 1.39 (lambda / um)^-1.2, dims the disk where the line of sight
-    misses the torus (i <= 90 deg - opening angle). What it takes from the disk over its cone,
-    (7/18 - sin^2 oa / 6 - 2 sin^3 oa / 9) int disk (1 - 10^(-0.4 k E)), it sends out evenly as
-    a modified blackbody; torus and polar emission together are then scaled to 1 W.
+    Polar dust (option ``polar_law``: ``smc``, ``calzetti`` or ``gaskell``) dims the disk where the
+    line of sight misses the torus (i <= 90 deg - opening angle). What it takes from the disk
+    over its cone, (7/18 - sin^2 oa / 6 - 2 sin^3 oa / 9) int disk (1 - 10^(-0.4 k E)), it sends
+    out evenly as a modified blackbody, (1 - exp(-(200 um / lambda)^beta)) B_lambda(T); torus
+    and polar emission together are then scaled to 1 W (Yang et al. 2020, MNRAS 491, 740).
+
+    The disk (option ``disk``) is a power law between breaks; ``disk_slope`` changes its slope
+    in the optical and keeps its power. The torus's emission does not follow such changes.
     """
 
     role = "agn"
+    options = {"polar_law": _core.POLAR_LAWS, "disk": tuple(_core.DISKS)}
     frac_agn = Parameter(
         default=0.0, bounds=(0.0, 0.999), doc="AGN fraction, in the model's definition."
     )
@@ -78,6 +83,10 @@ class AGN(Component):
     opening_angle = Parameter(
         default=40.0, bounds=(10.0, 80.0), unit="deg",
         doc="Angle between the equator and the edge of the torus.",
+    )  # fmt: skip
+    disk_slope = Parameter(
+        default=0.0, bounds=(-1.0, 1.0),
+        doc="Added to the disk's optical slope, L_lambda ~ lambda^(-1.5 + disk_slope).",
     )  # fmt: skip
     ebv_polar = Parameter(
         default=0.1, bounds=(0.0, 3.0), unit="mag", doc="Colour excess of the polar dust."
@@ -110,28 +119,43 @@ class AGN(Component):
         """
         Spectra for one watt of dust emission.
 
+        Parameters
+        ----------
+        wave : `~numpy.ndarray`
+            Rest wavelengths in um, ascending, from the disk's beginning to where dust is dark.
+        values : dict
+            Values of all parameters of the component.
+
         Returns
         -------
         templates : `AGNTemplates`
+
+        Raises
+        ------
+        ValueError
+            If the wavelengths hold no dust emission.
         """
         base = self.torus_spectra(wave, values)
-        disk, polar = base.disk, np.zeros(wave.size)
-        if values["ebv_polar"] > 0.0:
-            law = 1.39 * wave**-1.2
-            transmission = 10.0 ** (-0.4 * law * values["ebv_polar"])
-            if values["inclination"] <= 90.0 - values["opening_angle"]:
-                disk = disk * transmission
-            s = np.sin(np.radians(values["opening_angle"]))
-            share = DISK_MEAN - s**2 / 6.0 - 2.0 * s**3 / 9.0
-            absorbed = share * np.trapezoid(base.face_on * (1.0 - transmission), wave)
-            polar = _core.modified_blackbody(
-                wave, values["temperature_polar"], values["emissivity_polar"]
-            )
-            polar *= absorbed / np.trapezoid(polar, wave)
-        norm = 1.0 / np.trapezoid(base.dust + polar, wave)
-        power = norm * DISK_MEAN * np.trapezoid(base.face_on, wave)
-        return AGNTemplates(disk * norm, base.dust * norm, polar * norm, float(power))
+        opening = values["opening_angle"]
+        parts, power, total = _core.add_polar(
+            _polar_grid(wave.tobytes(), self.polar_law), base.face_on, base.disk, base.dust,
+            float(values["ebv_polar"]), float(values["temperature_polar"]),
+            float(values["emissivity_polar"]), _core.polar_share(opening),
+            values["inclination"] <= 90.0 - opening,
+        )  # fmt: skip
+        if not total > 0.0:
+            raise argument_error("wave", "a grid that holds the dust emission", _span(wave))
+        return AGNTemplates(parts[0], parts[1], parts[2], power)
 
     def inert(self, values):
         polar = values["ebv_polar"] == 0.0
         return ("temperature_polar", "emissivity_polar") if polar else ()
+
+
+@functools.lru_cache(maxsize=16)
+def _polar_grid(wave_bytes, law):
+    return _core.polar_grid(np.frombuffer(wave_bytes), law)
+
+
+def _span(wave):
+    return f"{wave.size} points from {wave[0]:g} to {wave[-1]:g} um"

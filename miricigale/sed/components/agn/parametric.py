@@ -27,7 +27,8 @@ class ParametricTorus(AGN):
 
     The disk has the SKIRTOR form of 2020 and shines as cos i (1 + 2 cos i). The energy that the
     torus takes from it, over all directions, is what the dust sends out; its dependence
-    on inclination and tau is that of the library.
+    on inclination and tau is that of the library. With another disk or slope, of the same
+    power, the dust emission stays what it is.
 
     The rest is **not fitted**: ``p`` moves the weight by dm/dlnr ~ r^(3 - p), so c falls by p - 1;
     ``q`` thins the torus towards the poles, ``tau exp(-q |cos theta|)``; ``opening_angle`` moves the edge;
@@ -47,13 +48,13 @@ class ParametricTorus(AGN):
     )
 
     def nodes(self):
-        low = 0.008 * (30.0 / 0.008) ** (np.arange(241) / 240)
-        return np.concatenate([low, 30.0 * (1000.0 / 30.0) ** (np.arange(1, 53) / 52)])
+        high = 30.0 * (1000.0 / 30.0) ** (np.arange(1, 53) / 52)
+        return np.concatenate([_core.disk_nodes(self.disk), high])
 
     def torus_spectra(self, wave, values):
         names = ("tau97", "inclination", "opening_angle", "p", "q", "radius_ratio")
-        path = self.path
-        return _torus(path, wave.tobytes(), *(float(values[n]) for n in names))
+        disk = (self.disk, float(values["disk_slope"]))
+        return _torus(self.path, wave.tobytes(), disk, *(float(values[n]) for n in names))
 
 
 @functools.lru_cache(maxsize=2)
@@ -66,21 +67,22 @@ def _constants(path):
 
 
 @functools.lru_cache(maxsize=512)
-def _torus(path, wave_bytes, tau, inclination, opening, p, q, ratio):
+def _torus(path, wave_bytes, disk, tau, inclination, opening, p, q, ratio):
     const = _constants(path)
     wave = np.frombuffer(wave_bytes)
     mu = np.cos(np.radians(inclination))
-    face_on = _core.disk_spectrum(wave)
+    form, slope = disk
+    face_on = _core.disk_spectrum(wave, slope, form)
     face_on /= DISK_MEAN * np.trapezoid(face_on, wave)
-    disk = face_on * _seen_fraction(const, wave, tau, inclination, opening, q)
+    seen = face_on * _seen_fraction(const, wave, tau, inclination, opening, q)
     dust = _dust_shape(
         path, wave_bytes, tau * np.exp(-q * mu), tau, opening, inclination, p, q, ratio
     )
     power = _absorbed(path, tau, opening, q) * _anisotropy(const, tau, inclination, opening)
     dust *= power / np.trapezoid(dust, wave)
-    for array in (face_on, disk, dust):
+    for array in (face_on, seen, dust):
         array.flags.writeable = False
-    return TorusSpectra(face_on, disk, dust)
+    return TorusSpectra(face_on, seen, dust)
 
 
 def _seen_fraction(const, wave, tau, inclination, opening, q):

@@ -13,7 +13,19 @@ class DustEmission(Component):
     role = "dust"
 
     def spectrum(self, values):
-        """Spectrum at `nodes`, arbitrary scale."""
+        """
+        Spectrum at `nodes`.
+
+        Parameters
+        ----------
+        values : dict of str to float
+            Values of all parameters.
+
+        Returns
+        -------
+        spectrum : `~numpy.ndarray`
+            L_lambda, not negative, arbitrary scale.
+        """
         raise NotImplementedError
 
     def template(self, wave, **values):

@@ -13,6 +13,8 @@ from miricigale.utils.exceptions import DataError
 
 __all__ = ["DraineLi2007", "DraineLi2007Alpha", "load_dl07"]
 
+U_MAX = 1e6  # of the power law dM/dU ~ U^-2
+
 
 @functools.lru_cache(maxsize=2)
 def load_dl07(path):
@@ -63,6 +65,28 @@ class DraineLi2007(_DraineLi):
     u_min = Parameter(default=1.0, bounds=(0.1, 25.0), doc="Least intensity of starlight.")
     gamma = Parameter(default=0.02, bounds=(0.0, 1.0), doc="Mass fraction heated by more.")
     q_pah = Parameter(default=2.5, bounds=(0.47, 4.58), doc="Mass fraction in PAHs, per cent.")
+
+    @staticmethod
+    def mean_intensity(values):
+        """
+        Mean intensity <U> over the dust mass, Draine & Li 2007, equation 33.
+
+        The power per dust mass is P0 <U>, P0 being that at U = 1 (135 to 139 L_sun / M_sun in
+        the table's source, by q_PAH).
+
+        Parameters
+        ----------
+        values : dict of str to float
+            Values of all parameters.
+
+        Returns
+        -------
+        mean : float
+            In units of the starlight near the Sun.
+        """
+        least, gamma = values["u_min"], values["gamma"]
+        lump = least * np.log(U_MAX / least) / (1.0 - least / U_MAX)
+        return float((1.0 - gamma) * least + gamma * lump)
 
     def spectrum(self, values):
         table = self._table()
@@ -128,8 +152,8 @@ def _cell(axis, value):
 def _alpha_tables(path):
     """Spectra per dust mass on an even grid in log U, PAH-rich and PAH-poor."""
     table = load_dl07(path)
-    intensity = np.geomspace(0.1, 1e6, 141)
-    matrix = _core.hat_matrix(np.log(table["u"]), np.clip(np.log(intensity), None, np.log(1e6)))
+    intensity = np.geomspace(0.1, U_MAX, 141)
+    matrix = _core.hat_matrix(np.log(table["u"]), np.clip(np.log(intensity), None, np.log(U_MAX)))
     out = [intensity]
     for q in (-1, 0):
         mass = table["single"][q] * table["single_power"][q][:, None]

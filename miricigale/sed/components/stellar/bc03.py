@@ -1,61 +1,17 @@
-"""Light of stars from simple stellar populations."""
+"""The bundled simple stellar populations."""
 
 import functools
 
-import numpy as np
 from astropy.io import fits
 
-from miricigale.sed import _core
-from miricigale.sed.component import Component, register
+from miricigale.sed.component import register
+from miricigale.sed.components.stellar.base import StellarPopulations
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import DataError
 
-__all__ = ["BC03", "StellarPopulations", "load_ssp"]
+__all__ = ["BC03", "load_ssp"]
 
 SOLAR_LUMINOSITY = 3.828e26  # W, IAU 2015
-
-
-class StellarPopulations(Component):
-    """Base: a table of SSPs by metallicity, age and wavelength."""
-
-    role = "stellar"
-
-    def table(self, metallicity):
-        """
-        One metallicity.
-
-        Returns
-        -------
-        age : `~numpy.ndarray`, shape (n_age,)
-            Ages in Myr, from 0.
-        spectra : `~numpy.ndarray`, shape (n_age, n_wave)
-            L_lambda in W/um for one solar mass formed.
-        living : `~numpy.ndarray`, shape (n_age,)
-            Mass in stars still alive for one solar mass formed.
-        """
-        raise NotImplementedError
-
-    def age_weights(self, history, metallicity):
-        """
-        Weights of the tabulated ages for a history.
-
-        Returns
-        -------
-        young, old : `~numpy.ndarray`, shape (n_age,)
-            Solar masses formed less and more than 10 Myr ago, spread over the table.
-        """
-        age = self.table(metallicity)[0]
-        matrix = _step_weights(age.tobytes(), len(age))
-        mass = 1e6 * history[::-1]
-        n = mass.size
-        young = matrix[: min(n, _core.YOUNG)].T @ mass[: _core.YOUNG]
-        old = matrix[_core.YOUNG : n].T @ mass[_core.YOUNG :]
-        return young, np.asarray(old)
-
-
-@functools.lru_cache(maxsize=4)
-def _step_weights(age_bytes, n_age):
-    return _core.time_weights(np.frombuffer(age_bytes, dtype=float, count=n_age), 14000)
 
 
 @functools.lru_cache(maxsize=2)
@@ -106,6 +62,7 @@ class BC03(StellarPopulations):
     name = "bc03"
     reference = "Bruzual & Charlot 2003, MNRAS 344, 1000"
     resource = "ssp.bc03"
+    imf = "Kroupa (inferred)"
     metallicity = Parameter(
         default=0.02,
         bounds=(0.0001, 0.1),
@@ -115,18 +72,10 @@ class BC03(StellarPopulations):
     def nodes(self):
         return load_ssp(self.path)[0]
 
+    def metallicities(self):
+        return tuple(load_ssp(self.path)[2])
+
     def table(self, metallicity):
         _, age, spectra, living = load_ssp(self.path)
-        key = self._nearest(metallicity)
+        key = self.nearest(metallicity)
         return age, spectra[key], living[key]
-
-    def _nearest(self, metallicity):
-        spectra = load_ssp(self.path)[2]
-        return min(spectra, key=lambda z: abs(np.log(z / metallicity)))
-
-    def invalid(self, values):
-        wanted = values["metallicity"]
-        if abs(self._nearest(wanted) / wanted - 1.0) > 1e-3:
-            known = ", ".join(f"{z:g}" for z in load_ssp(self.path)[2])
-            return f"'metallicity' must be one of {known}, got {wanted:g}"
-        return None

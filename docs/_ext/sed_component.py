@@ -1,0 +1,147 @@
+"""
+Directives that show what the code declares, so that no page repeats it by hand.
+
+``.. sed-component:: NAME`` shows a component of a model: class, role, reference, the data that
+it reads, options and parameters; a name that is not registered is an error of the build.
+``.. sed-derived::`` shows the table of derived quantities.
+"""
+
+import re
+
+from docutils.statemachine import StringList
+from sphinx.util.docutils import SphinxDirective
+
+from miricigale.refdata import resource
+from miricigale.sed import COMPONENTS, DERIVED, components
+
+__all__ = ["SEDComponent", "SEDDerived", "component_lines", "derived_lines", "setup"]
+
+_KINDS = {
+    "bundled": "comes with the package",
+    "package": "read from an installed package",
+    "user": "to be brought by you",
+}
+
+
+def escape(text):
+    """Text that reStructuredText shows as it is, markup characters included."""
+    return re.sub(r"([\\*`|_])", r"\\\1", " ".join(str(text).split()))
+
+
+def component_lines(name):
+    """
+    What a component declares, as lines of reStructuredText.
+
+    Parameters
+    ----------
+    name : str
+        The component's ``name``.
+
+    Returns
+    -------
+    lines : list of str
+
+    Raises
+    ------
+    KeyError
+        If no such component is registered.
+    """
+    cls = COMPONENTS.get(name)
+    where = components.__name__ if hasattr(components, cls.__name__) else cls.__module__
+    fields = [
+        ("Component", f"``{name}``, :class:`~{where}.{cls.__name__}`"),
+        ("Role", f"``{cls.role}``"),
+        ("Reference", escape(cls.reference) or "–"),
+    ]
+    if cls.resource:
+        fields += _data_fields(resource(cls.resource))
+    else:
+        fields.append(("Data", "none"))
+    lines = [f":{key}: {text}" for key, text in fields]
+    options = cls.all_options()
+    if options:
+        rows = [
+            (f"``{option}``", f"``{values[0]}``", ", ".join(f"``{v}``" for v in values[1:]) or "–")
+            for option, values in options.items()
+        ]
+        lines += _table("Options", ("option", "default", "others"), rows)
+    rows = [
+        (
+            f"``{par.name}``",
+            escape(par.unit.to_string()) or "–",
+            f"{par.default:g}",
+            f"{par.bounds[0]:g} to {par.bounds[1]:g}",
+            escape(par.doc),
+        )
+        for par in cls.declared().values()
+    ]
+    if rows:
+        head = ("parameter", "unit", "default", "bounds", "meaning")
+        lines += _table("Parameters", head, rows)
+    else:
+        lines += ["", "It has no parameters."]
+    return [*lines, ""]
+
+
+def derived_lines():
+    """Derived quantities, as lines of reStructuredText."""
+    rows = [
+        (f"``{name}``", escape(entry.unit.to_string()) or "–", escape(entry.text))
+        for name, entry in DERIVED.items()
+    ]
+    return [*_table("Derived quantities", ("name", "unit", "meaning"), rows), ""]
+
+
+def _data_fields(record):
+    kind = _KINDS[record.kind]
+    fields = [("Data", f"``{record.name}``, {kind}: {escape(record.title)}")]
+    if record.kind == "user":
+        source = escape(record.source)
+        fields += [
+            ("Source", source),
+            ("Registration", f"``miricigale data add {record.name} PATH``; see :doc:`/guide/data`"),
+        ]
+    fields += [("Licence", escape(record.licence)), ("To cite", escape(record.citation))]
+    return fields
+
+
+def _table(title, head, rows):
+    """Lines of a list-table."""
+    lines = ["", f".. list-table:: {title}", "   :header-rows: 1", ""]
+    for row in (head, *rows):
+        marks = ["   * - ", *["     - "] * (len(row) - 1)]
+        lines += [mark + cell for mark, cell in zip(marks, row, strict=True)]
+    return lines
+
+
+class SEDComponent(SphinxDirective):
+    """Show what a component declares."""
+
+    required_arguments = 1
+    has_content = False
+
+    def run(self):
+        """Nodes of the fields and tables."""
+        try:
+            lines = component_lines(self.arguments[0])
+        except KeyError as err:
+            raise self.error(str(err.args[0])) from err
+        source = f"sed-component {self.arguments[0]}"
+        return self.parse_text_to_nodes(StringList(lines, source))
+
+
+class SEDDerived(SphinxDirective):
+    """Show the derived quantities."""
+
+    has_content = False
+
+    def run(self):
+        """Nodes of the table."""
+        return self.parse_text_to_nodes(StringList(derived_lines(), "sed-derived"))
+
+
+def setup(app):
+    """Add the directives to Sphinx."""
+    app.add_directive("sed-component", SEDComponent)
+    app.add_directive("sed-derived", SEDDerived)
+    return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,83 @@
+"""The state of every resource: there, whole, and what its record says."""
+
+from typing import NamedTuple
+
+from miricigale.refdata.locate import find_place, fingerprint_of, stored_record
+from miricigale.refdata.registry import resources
+from miricigale.utils.exceptions import DataError
+
+__all__ = ["ResourceState", "check_resources"]
+
+
+class ResourceState(NamedTuple):
+    """
+    State of one resource.
+
+    Parameters
+    ----------
+    name : str
+        The resource.
+    state : str
+        ``"ok"``; ``"absent"``; ``"wrong checksum"`` (another file than its record describes);
+        ``"damaged"`` (cannot be opened as what it should be); ``"unchecked"`` (there, but
+        nothing says what it should be); ``"from package"``.
+    where : str
+        Path, or source if absent.
+    message : str
+        What is wrong, or empty.
+    """
+
+    name: str
+    state: str
+    where: str
+    message: str = ""
+
+    @property
+    def bad(self):
+        """Whether results that use the resource cannot be trusted."""
+        return self.state in ("wrong checksum", "damaged")
+
+
+def check_resources(openers=None):
+    """
+    State of every resource, from its whole content.
+
+    Files are compared with the checksum of the record in ``resources.toml``, or with that of
+    the record that was written beside them when they were added.
+
+    Parameters
+    ----------
+    openers : dict of str to callable, optional
+        By resource: called with the path, raises
+        `~miricigale.utils.exceptions.DataError` if the file is not whole (those of
+        libraries: `miricigale.sed.libraries.openers`).
+
+    Returns
+    -------
+    rows : list of `ResourceState`
+        One for each record.
+    """
+    return [_state(record, (openers or {}).get(record.name)) for record in resources().values()]
+
+
+def _state(record, opener):
+    name = record.name
+    if not record.file:
+        return ResourceState(name, "from package", record.source)
+    path = find_place(record)[1]
+    if path is None:
+        return ResourceState(name, "absent", record.source)
+    where = str(path)
+    try:
+        beside = stored_record(path)
+        if opener is not None:
+            opener(path)
+        wanted = record.sha256 or (beside or {}).get("sha256", "")
+        if not wanted or not path.is_file():
+            return ResourceState(name, "unchecked", where, "no record of its checksum")
+        if fingerprint_of(path, trust=False) != wanted:
+            return ResourceState(name, "wrong checksum", where, "sha256 differs from its record")
+    except OSError as err:
+        message = str(err) if isinstance(err, DataError) else f"{path} cannot be read: {err}"
+        return ResourceState(name, "damaged", where, message)
+    return ResourceState(name, "ok", where)

@@ -1,0 +1,108 @@
+"""Many models at once: starlight behind dust with its re-emission, and fluxes in bands."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from miricigale.sed._core.bands import band_means
+
+__all__ = ["block_fluxes", "mix_light"]
+
+
+@njit(cache=True)
+def mix_light(weight, young, old, star, dim_young, dim_old, dim, extra, dust, dusty, out, taken):
+    """
+    Galaxies of one solar mass: attenuated starlight plus the dust that it heats.
+
+    Parameters
+    ----------
+    weight : `~numpy.ndarray`, shape (n_wave,)
+        Weights of the trapezoid rule on the grid of wavelengths.
+    young, old : `~numpy.ndarray`, shape (n_star, n_wave)
+        Light of young and old stars in W/um.
+    star, dim, dusty : `~numpy.ndarray` of int, shape (n,)
+        Which stars, attenuation and dust spectrum each galaxy has.
+    dim_young, dim_old : `~numpy.ndarray`, shape (n_dim, n_wave)
+        Transmissions for young and old stars.
+    extra : `~numpy.ndarray`, shape (n_star,)
+        Power in W that dust takes besides.
+    dust : `~numpy.ndarray`, shape (n_dust, n_wave)
+        Dust spectra in W/um with integral 1.
+    out, taken : `~numpy.ndarray`, shape (n, n_wave) and (n,)
+        Filled with the light in W/um and the power in W that dust took.
+    """
+    for i in range(star.size):
+        s, a, d = star[i], dim[i], dusty[i]
+        lost = 0.0
+        for j in range(weight.size):
+            light = young[s, j] * dim_young[a, j] + old[s, j] * dim_old[a, j]
+            lost += weight[j] * (young[s, j] + old[s, j] - light)
+            out[i, j] = light
+        lost += extra[s]
+        taken[i] = lost
+        for j in range(weight.size):
+            out[i, j] += lost * dust[d, j]
+
+
+@njit(cache=True)
+def block_fluxes(
+    wave,
+    log_wave,
+    to_lnu,
+    light,
+    agn,
+    which,
+    power,
+    dim,
+    sky,
+    z,
+    scale,
+    start,
+    band,
+    moments,
+    bucket,
+    out,
+):
+    """
+    Band fluxes of a block of models, each at its own redshift.
+
+    Parameters
+    ----------
+    wave, log_wave, to_lnu : `~numpy.ndarray`, shape (n_wave,)
+        Rest wavelengths in um, their logarithms, and the factor from L_lambda to L_nu.
+    light : `~numpy.ndarray`, shape (n, n_wave)
+        L_lambda of the galaxies.
+    agn : `~numpy.ndarray`, shape (n_agn, n_wave)
+        L_lambda of AGN for one watt.
+    which : `~numpy.ndarray` of int, shape (n,)
+        Which of the AGN each model has.
+    power : `~numpy.ndarray`, shape (n,)
+        Power of the AGN in W.
+    dim : `~numpy.ndarray`, shape (n_dim, n_wave)
+        Transmissions between the source and us.
+    sky : `~numpy.ndarray` of int, shape (n,)
+        Which of them each model has.
+    z, scale : `~numpy.ndarray`, shape (n,)
+        Redshift, and factor from L_nu to flux.
+    start, band, moments, bucket : `~numpy.ndarray`
+        Passbands as for `band_means`.
+    out : `~numpy.ndarray`, shape (n, n_band)
+        Filled with the fluxes.
+    """
+    observed, log_observed = np.empty(wave.size), np.empty(wave.size)
+    fnu = np.empty(wave.size)
+    for i in range(z.size):
+        k, p, s = which[i], power[i], sky[i]
+        stretch = 1.0 + z[i]
+        log_stretch = math.log(stretch)
+        for j in range(wave.size):
+            observed[j] = wave[j] * stretch
+            log_observed[j] = log_wave[j] + log_stretch
+            total = light[i, j]
+            if p > 0.0:
+                total += p * agn[k, j]
+            fnu[j] = total * to_lnu[j] * dim[s, j]
+        band_means(observed, log_observed, fnu, start, band, moments, bucket, out[i])
+        for b in range(out.shape[1]):
+            out[i, b] *= scale[i]

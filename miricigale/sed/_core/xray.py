@@ -1,0 +1,64 @@
+"""X-rays of AGN as power laws; luminosities in W, energies in keV."""
+
+import numpy as np
+from scipy.special import exprel
+
+__all__ = ["power_law_energy", "stern2015", "xray_flux"]
+
+_STERN = (40.981, 1.024, -0.047)
+_ERG = 1e-7  # W s
+_UNIT_6UM = 1e41 * _ERG  # W
+_BAND = (2.0, 10.0)  # keV
+
+
+def stern2015(l_6um):
+    """
+    Intrinsic rest-frame 2-10 keV luminosity from that at 6 um, Stern 2015, equation 2.
+
+    Parameters
+    ----------
+    l_6um : `~numpy.ndarray`
+        nu L_nu of the AGN at rest 6 um in W, >= 0.
+
+    Returns
+    -------
+    l_2_10kev : `~numpy.ndarray`
+        W; 0 where there is no light at 6 um.
+    """
+    l_6um = np.asarray(l_6um, dtype=float)
+    none = l_6um == 0.0
+    x = np.log10(np.where(none, _UNIT_6UM, l_6um) / _UNIT_6UM)
+    return np.where(none, 0.0, 10.0 ** np.polyval(_STERN[::-1], x) * _ERG)
+
+
+def power_law_energy(low, high, photon_index):
+    """Integral of E^(1 - Gamma) over energies from ``low`` to ``high``; ln(high/low) at Gamma = 2."""
+    slope, width = 2.0 - np.asarray(photon_index, dtype=float), np.log(np.divide(high, low))
+    return np.asarray(low, dtype=float) ** slope * width * exprel(slope * width)
+
+
+def xray_flux(l_2_10kev, redshift, far, *, low, high, photon_index, transmission=1.0):
+    """
+    Observed flux of a power law in a band fixed in the observer's frame.
+
+    Parameters
+    ----------
+    l_2_10kev : `~numpy.ndarray`
+        Rest-frame 2-10 keV luminosity, W.
+    redshift, far : `~numpy.ndarray`
+        Redshift and luminosity distance in m.
+    low, high : float or `~numpy.ndarray`
+        Ends of the band, keV.
+    photon_index : float or `~numpy.ndarray`
+        Gamma of N(E) ~ E^-Gamma.
+    transmission : float or `~numpy.ndarray`, optional
+        What absorption leaves of the flux.
+
+    Returns
+    -------
+    flux : `~numpy.ndarray`
+        W/m2: L (rest, low to high) (1 + z)^(2 - Gamma) / (4 pi far^2) times the transmission.
+    """
+    ratio = power_law_energy(low, high, photon_index) / power_law_energy(*_BAND, photon_index)
+    stretch = (1.0 + np.asarray(redshift, dtype=float)) ** (2.0 - np.asarray(photon_index))
+    return l_2_10kev * ratio * stretch * transmission / (4.0 * np.pi * np.square(far))

@@ -1,0 +1,299 @@
+"""Lines and continuum of the gas that young stars ionise."""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from miricigale.sed import _core
+from miricigale.sed.component import Component, register
+from miricigale.sed.parameter import Parameter
+from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.files import open_fits
+
+__all__ = ["Nebular", "NebularTable", "load_nebular"]
+
+_KM_S = 1e-9 * _core.LIGHT  # speed of light
+_WIDTH = Parameter(
+    default=300.0,
+    bounds=(1.0, 3000.0),
+    unit="km / s",
+    doc="Full width of the lines at half maximum.",
+)
+_WIDTH.name = "line_width"
+
+
+@dataclass(frozen=True, eq=False)
+class NebularTable:
+    """
+    Emission of HII regions for each ionising photon per second.
+
+    Attributes
+    ----------
+    metallicity, log_u : `~numpy.ndarray`, shape (n_model,)
+        Of the gas; log U is that at its inner edge.
+    age : `~numpy.ndarray`, shape (n_age,)
+        Ages in Myr of the stars that ionise.
+    wave : `~numpy.ndarray`, shape (n_wave,)
+        Wavelengths of the continuum in um.
+    continuum : `~numpy.ndarray`, shape (n_model, n_age, n_wave)
+        W/um.
+    names : tuple of str
+        Names of the lines.
+    line_wave : `~numpy.ndarray`, shape (n_line,)
+        Their wavelengths in vacuum in um.
+    lines : `~numpy.ndarray`, shape (n_model, n_age, n_line)
+        W.
+    """
+
+    metallicity: np.ndarray
+    log_u: np.ndarray
+    age: np.ndarray
+    wave: np.ndarray
+    continuum: np.ndarray
+    names: tuple
+    line_wave: np.ndarray
+    lines: np.ndarray
+
+    @functools.cached_property
+    def metallicities(self):
+        """Different metallicities, ascending."""
+        return np.unique(self.metallicity)
+
+    def models(self, metallicity):
+        """Numbers of the models of a metallicity, ascending in log U; empty if it is not there."""
+        return np.flatnonzero(np.abs(self.metallicity / metallicity - 1.0) <= 1e-3)
+
+    @functools.lru_cache(maxsize=64)  # noqa: B019 -- tables live as long as the process
+    def emission(self, metallicity, log_u):
+        """
+        Continuum and lines one after the other, linear in log U between logarithms.
+
+        Returns
+        -------
+        emission : `~numpy.ndarray`, shape (n_age, n_wave + n_line)
+
+        Raises
+        ------
+        ValueError
+            If the table has no such metallicity, or not this log U for it.
+        """
+        models = self.models(metallicity)
+        if not models.size:
+            known = ", ".join(f"{z:g}" for z in self.metallicities)
+            raise argument_error("metallicity", f"one of {known}", f"{metallicity:g}")
+        nodes = self.log_u[models]
+        if not nodes[0] <= log_u <= nodes[-1]:
+            raise argument_error("log_u", f"from {nodes[0]:g} to {nodes[-1]:g}", f"{log_u:g}")
+        cell = int(np.clip(np.searchsorted(nodes, log_u, side="right") - 1, 0, nodes.size - 2))
+        t = (log_u - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
+        low, high = (
+            np.concatenate([self.continuum[m], self.lines[m]], axis=1)
+            for m in models[cell : cell + 2]
+        )
+        # powers, not exp(log): exact at the nodes, and 0 where both are
+        out = low ** (1.0 - t) * high**t
+        out.flags.writeable = False
+        return out
+
+
+@functools.lru_cache(maxsize=2)
+def load_nebular(path):
+    """
+    Read a table that ``tools/make_nebular.py`` made.
+
+    Parameters
+    ----------
+    path : str
+        The file.
+
+    Returns
+    -------
+    table : `NebularTable`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file is something else.
+    """
+    with open_fits(path, wanted="a table of nebular emission") as hdus:
+        try:
+            arrays = {
+                name: np.array(hdus[name.upper().replace("_", "")].data, dtype=float)
+                for name in ("metallicity", "log_u", "age", "wave", "continuum", "lines")
+            }
+            names = tuple(str(name).strip() for name in hdus["LINE_LIST"].data["NAME"])
+            arrays["line_wave"] = np.array(hdus["LINE_LIST"].data["WAVE"], dtype=float)
+        except KeyError as err:
+            msg = f"{path} is not a table of nebular emission: {err.args[0]}"
+            raise DataError(msg) from err
+    shape = (arrays["metallicity"].size, arrays["age"].size)
+    wanted = {
+        "continuum": (*shape, arrays["wave"].size),
+        "lines": (*shape, len(names)),
+        "log_u": shape[:1],
+    }
+    for name, size in wanted.items():
+        if arrays[name].shape != size:
+            msg = f"{path}: '{name}' must have shape {size}, got {arrays[name].shape}"
+            raise DataError(msg)
+    for array in arrays.values():
+        array.flags.writeable = False
+    return NebularTable(names=names, **arrays)
+
+
+@register
+class Nebular(Component):
+    """
+    HII regions computed with Cloudy, for each ionising photon.
+
+    Every population lights its gas in proportion to its hydrogen-ionising photons, with the
+    spectrum that its age gives; lines are Gaussians. Grains are not in the gas: its light
+    meets dust in the chain, as starlight does.
+
+    Parameters
+    ----------
+    line_width : float or `~astropy.units.Quantity`, optional
+        Full width of the lines at half maximum, in km/s. It decides where the nodes are, so
+        it is fixed when the component is made.
+    gas : {"stellar", "free"}, optional
+        Whether the gas has the metallicity of the stars or its own, ``metallicity_gas``.
+    **defaults
+        New defaults of parameters.
+
+    Raises
+    ------
+    ValueError
+        If a value is outside its bounds or not one of the option's.
+    """
+
+    name = "nebular"
+    role = "nebular"
+    reference = (
+        "Ferland et al. 2017, RMxAA 53, 385 (Cloudy); Inoue 2011, MNRAS 415, 2920 (escape and dust)"
+    )
+    resource = "nebular.cloudy"
+    options = {"gas": ("stellar", "free")}
+    others = ("metallicity",)
+    log_u = Parameter(
+        default=-2.0,
+        bounds=(-4.0, 0.0),
+        doc="Ionisation parameter U at the inner edge of the gas, in log; to -3 at Z = 0.05.",
+    )
+    metallicity_gas = Parameter(
+        default=0.02,
+        bounds=(0.0001, 0.05),
+        doc="Metallicity of the gas if gas='free': 0.0001, 0.0004, 0.004, 0.008, 0.02 or 0.05.",
+    )
+    f_esc = Parameter(
+        default=0.0, bounds=(0.0, 1.0), doc="Share of ionising photons that leave the galaxy."
+    )
+    f_dust = Parameter(
+        default=0.0, bounds=(0.0, 1.0), doc="Share of ionising photons that dust absorbs."
+    )
+
+    def __init__(self, *, line_width=_WIDTH.default, **defaults):
+        super().__init__(**defaults)
+        self.line_width = _WIDTH.check(line_width)
+
+    @property
+    def settings(self):
+        return super().settings | {"line_width": self.line_width}
+
+    @property
+    def table(self):
+        """The `NebularTable`."""
+        return load_nebular(self.path)
+
+    @property
+    def line_names(self):
+        """Names of the lines, as `lines` has them: angstrom in air, um in vacuum."""
+        return self.table.names
+
+    @property
+    def line_wave(self):
+        """Vacuum wavelengths of the lines in um: `~numpy.ndarray`, shape (n_line,)."""
+        return self.table.line_wave
+
+    @functools.cached_property
+    def _drawn(self):
+        table = self.table
+        nodes, operator = _core.line_operator(table.wave, table.line_wave, self.line_width / _KM_S)
+        nodes.flags.writeable = False
+        return nodes, operator
+
+    def nodes(self):
+        return self._drawn[0]
+
+    def inert(self, values):
+        if _core.absorbed_share(values["f_esc"], values["f_dust"]) == 0.0:
+            return ("log_u", "metallicity_gas")
+        return () if self.gas == "free" else ("metallicity_gas",)
+
+    def _metallicity(self, values):
+        return values["metallicity" if self.gas == "stellar" else "metallicity_gas"]
+
+    def invalid(self, values):
+        f_esc, f_dust = values["f_esc"], values["f_dust"]
+        if f_esc + f_dust > 1.0 + 1e-12:
+            return f"'f_esc' and 'f_dust' must not exceed 1 together, got {f_esc:g} and {f_dust:g}"
+        table, wanted = self.table, self._metallicity(values)
+        models = table.models(wanted)
+        if not models.size:
+            known = ", ".join(f"{z:g}" for z in table.metallicities)
+            if self.gas == "free":
+                return f"'metallicity_gas' must be one of {known}, got {wanted:g}"
+            return (
+                f"'metallicity' must be one of {known} for the gas to have it, got {wanted:g};"
+                " give the gas its own with gas='free'"
+            )
+        low, high = table.log_u[models[[0, -1]]]
+        if not low <= values["log_u"] <= high:
+            return (
+                f"'log_u' must be from {low:g} to {high:g} where the gas has metallicity"
+                f" {wanted:g}, got {values['log_u']:g}"
+            )
+        return None
+
+    def _emission(self, age, weights, ionizing, values):
+        """Continuum in W/um and lines in W, one after the other."""
+        table = self.table
+        share = _core.absorbed_share(values["f_esc"], values["f_dust"])
+        photons = _core.photons_by_age(age, share * weights * ionizing, table.age)
+        return photons @ table.emission(self._metallicity(values), values["log_u"])
+
+    def spectra(self, age, weights, ionizing, values):
+        """
+        Light of the gas around some stars.
+
+        Parameters
+        ----------
+        age : `~numpy.ndarray`, shape (n_age,)
+            Ages of the stellar table in Myr.
+        weights : `~numpy.ndarray`, shape (n_age,)
+            Solar masses formed of each.
+        ionizing : `~numpy.ndarray`, shape (n_age,)
+            Hydrogen-ionising photons per second for each solar mass formed.
+        values : dict
+            Values of all parameters, those of the stars among them.
+
+        Returns
+        -------
+        spectrum : `~numpy.ndarray`, shape (n_node,)
+            L_lambda in W/um at `nodes`.
+        """
+        return self._drawn[1] @ self._emission(age, weights, ionizing, values)
+
+    def lines(self, age, weights, ionizing, values):
+        """
+        Luminosities of the lines before any dust.
+
+        Parameters are those of `spectra`.
+
+        Returns
+        -------
+        lines : dict of str to float
+            W, by `line_names`.
+        """
+        emission = self._emission(age, weights, ionizing, values)[self.table.wave.size :]
+        return dict(zip(self.line_names, emission.tolist(), strict=True))

@@ -1,0 +1,191 @@
+"""Quantities derived from models: what there is, and how it follows from sums over spectra."""
+
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.sed.chain import COLOUR_BANDS, COLOURS, UV_WINDOWS
+from miricigale.utils.units import LUMINOSITY, MASS
+
+__all__ = [
+    "DERIVED",
+    "Derived",
+    "agn_quantities",
+    "columns",
+    "galaxy_quantities",
+    "scaled_quantities",
+]
+
+
+@dataclass(frozen=True)
+class Derived:
+    """One derived quantity: unit, description, whether it scales with mass, and of what."""
+
+    unit: u.UnitBase
+    text: str
+    extensive: bool = True
+    of: str = "galaxy"
+
+
+_RATE = u.Msun / u.yr
+_NONE = u.dimensionless_unscaled
+
+#: All derived quantities, in the order of the output.
+DERIVED = {
+    "stellar_mass": Derived(MASS, "mass of living stars, without remnants"),
+    "stellar_mass_formed": Derived(MASS, "mass of all stars ever formed"),
+    "sfr": Derived(_RATE, "star-formation rate of the last 1 Myr"),
+    "sfr_10myr": Derived(_RATE, "mean star-formation rate of the last 10 Myr"),
+    "sfr_100myr": Derived(_RATE, "mean star-formation rate of the last 100 Myr"),
+    "dust_luminosity": Derived(LUMINOSITY, "power that dust takes from starlight and emits"),
+    "ir_luminosity": Derived(LUMINOSITY, "all light in 3-1000 um, AGN included", of="both"),
+    "age_mass": Derived(u.Gyr, "mean age of stars by mass formed", extensive=False),
+    "age_light": Derived(
+        u.Gyr, "mean age of stars by their light at 0.55 um before dust", extensive=False
+    ),
+    "a_v": Derived(u.mag, "attenuation of the galaxy's light at 0.55 um", extensive=False),
+    "beta": Derived(
+        _NONE,
+        "slope of L_lambda in the ten windows of Calzetti et al. 1994, 0.127-0.258 um, galaxy",
+        extensive=False,
+    ),
+    "nuv_r": Derived(u.mag, "rest-frame colour NUV - r of the galaxy, AB", extensive=False),
+    "u_v": Derived(u.mag, "rest-frame colour U - V of the galaxy, AB", extensive=False),
+    "v_j": Derived(u.mag, "rest-frame colour V - J of the galaxy, AB", extensive=False),
+    "agn_power": Derived(LUMINOSITY, "emission of torus and polar dust as seen", of="agn"),
+    "agn_luminosity": Derived(LUMINOSITY, "all light of the AGN as seen", of="agn"),
+    "accretion_power": Derived(
+        LUMINOSITY, "luminosity of the accretion disk, over all directions", of="agn"
+    ),
+    "l_6um": Derived(LUMINOSITY, "nu L_nu of the AGN at 6 um, as seen", of="agn"),
+    "frac_agn_dust": Derived(_NONE, "AGN fraction, definition 'dust'", False, "agn"),
+    "frac_agn_ir": Derived(_NONE, "AGN share of 3-1000 um light", False, "agn"),
+}
+
+_LOG_UV = np.log10(np.mean(UV_WINDOWS, axis=1))
+_BAND = {name: i for i, name in enumerate(COLOUR_BANDS)}
+
+
+def columns(model):
+    """Derived quantities of a model: dict of name to `Derived`."""
+    out = {n: d for n, d in DERIVED.items() if model.has_agn or d.of != "agn"}
+    xray = model.component("xray")
+    if xray is not None:
+        # the relation is not linear: it is worked out after scaling
+        out |= {n: Derived(unit, text, False, "xray") for n, (unit, text) in xray.columns.items()}
+    return out
+
+
+def galaxy_quantities(stars, absorbed, sums, intrinsic_visual):
+    """
+    Derived quantities of galaxies, for one solar mass formed.
+
+    Parameters
+    ----------
+    stars : list of `~miricigale.sed.chain.Stars`
+        The n galaxies' stars.
+    absorbed : `~numpy.ndarray`, shape (n,)
+        Power that dust took, in W.
+    sums : `~numpy.ndarray`, shape (n, n_functional)
+        The galaxies' light times ``Chain.functionals``.
+    intrinsic_visual : `~numpy.ndarray`, shape (n,)
+        L_lambda at 0.55 um before dust.
+
+    Returns
+    -------
+    values : dict of str to `~numpy.ndarray`, shape (n,)
+        In the units of `DERIVED`.
+    """
+    n = len(_LOG_UV)
+    visual, windows, bands = sums[:, 1], sums[:, 2 : 2 + n], sums[:, 2 + n :]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs = np.log10(windows)
+        magnitude = -2.5 * np.log10(bands)
+        a_v = 2.5 * np.log10(intrinsic_visual / visual)
+    step = _LOG_UV - _LOG_UV.mean()
+    out = {
+        name: np.array([getattr(s, name) for s in stars])
+        for name in ("stellar_mass", "sfr", "sfr_10myr", "sfr_100myr", "age_mass", "age_light")
+    }
+    out |= {
+        "stellar_mass_formed": np.ones(len(stars)),
+        "dust_luminosity": absorbed,
+        "ir_luminosity": sums[:, 0],
+        "a_v": a_v,
+        "beta": logs @ step / (step @ step),
+    }
+    for name, (blue, red) in COLOURS.items():
+        out[name] = magnitude[:, _BAND[blue]] - magnitude[:, _BAND[red]]
+    return out
+
+
+def agn_quantities(definition, ratio, galaxy, seen):
+    """
+    Derived quantities of nuclei, and the power that the fraction asks for.
+
+    Parameters
+    ----------
+    definition : {"dust", "3-1000um"}
+        What the fraction f refers to.
+    ratio : `~numpy.ndarray`, shape (n,)
+        f / (1 - f).
+    galaxy : dict of str to `~numpy.ndarray`, shape (n,)
+        From `galaxy_quantities`.
+    seen : dict of str to `~numpy.ndarray`, shape (n,)
+        For one watt of torus and polar emission: ``infrared``, ``luminosity``, ``six`` and
+        ``accretion``.
+
+    Returns
+    -------
+    values : dict of str to `~numpy.ndarray`, shape (n,)
+        Those of the AGN, and ``ir_luminosity`` of both.
+    """
+    dust, infrared = galaxy["dust_luminosity"], galaxy["ir_luminosity"]
+    power = ratio * (dust if definition == "dust" else infrared / seen["infrared"])
+    agn_infrared = power * seen["infrared"]
+    total = infrared + agn_infrared
+    return {
+        "ir_luminosity": total,
+        "agn_power": power,
+        "agn_luminosity": power * seen["luminosity"],
+        "accretion_power": power * seen["accretion"],
+        "l_6um": power * seen["six"],
+        "frac_agn_dust": _fraction(power, power + dust),
+        "frac_agn_ir": _fraction(agn_infrared, total),
+    }
+
+
+def _fraction(part, whole):
+    return np.divide(part, whole, out=np.zeros_like(part), where=part > 0.0)
+
+
+def scaled_quantities(model, values, mass, redshift, far, parameters):
+    """
+    Derived quantities of galaxies of given masses.
+
+    Parameters
+    ----------
+    model : `~miricigale.sed.SEDModel`
+        The model.
+    values : dict of str to `~numpy.ndarray`, shape (n,)
+        For one solar mass formed.
+    mass, redshift, far : `~numpy.ndarray` or float
+        Mass formed in Msun, redshift, luminosity distance in m.
+    parameters : dict of str to `~numpy.ndarray` or float
+        Values of the parameters.
+
+    Returns
+    -------
+    values : dict of str to `~numpy.ndarray`, shape (n,)
+    """
+    out = {
+        name: values[name] * mass if entry.extensive else values[name]
+        for name, entry in columns(model).items()
+        if entry.of != "xray"
+    }
+    xray = model.component("xray")
+    if xray is not None:
+        own = {name: parameters[name] for name in xray.parameters}
+        out |= xray.derived(out["l_6um"], redshift, far, own)
+    return out

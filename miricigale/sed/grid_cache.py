@@ -1,0 +1,141 @@
+"""Grids kept between sessions, under a name made of everything that shapes them."""
+
+import functools
+import hashlib
+import json
+import logging
+import os
+from pathlib import Path
+
+import numpy as np
+
+from miricigale.refdata.locate import cache_folder, conf, fingerprint
+from miricigale.sed.grid import ModelGrid
+from miricigale.utils.exceptions import DataError
+from miricigale.utils.units import WAVE
+
+__all__ = ["cached_grid", "grid_key"]
+
+_log = logging.getLogger(__name__)
+
+
+@functools.cache
+def _code():
+    """Checksum of the code that makes grids: one of another version is not taken."""
+    package = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for room in ("filters", "sed"):
+        for path in sorted((package / room).rglob("*.py")):
+            digest.update(path.relative_to(package).as_posix().encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def grid_key(model, axes, filters):
+    """
+    Checksum of everything that a grid depends on.
+
+    Parameters
+    ----------
+    model : `~miricigale.sed.SEDModel`
+        The model: components, their options and defaults, cosmology, definition.
+    axes : dict of str to `~numpy.ndarray`
+        The axes.
+    filters : `~miricigale.filters.FilterSet`
+        The bands, by their curves.
+
+    Returns
+    -------
+    key : str
+        Hexadecimal sha256.
+    """
+    parts = [
+        {
+            "name": c.name,
+            "class": f"{type(c).__module__}.{type(c).__qualname__}",
+            "settings": c.settings,
+            "defaults": {n: p.default for n, p in c.parameters.items()},
+            "data": fingerprint(c.resource) if c.resource else None,
+        }
+        for c in model.components
+    ]
+    bands = [[f.name, _digest(f.wave.to_value(WAVE)), _digest(f.throughput)] for f in filters]
+    content = {
+        "code": _code(),
+        "components": parts,
+        "cosmology": repr(model.cosmology),
+        "definition": model.frac_agn_definition,
+        "axes": {name: [v.hex() for v in values.tolist()] for name, values in axes.items()},
+        "bands": bands,
+    }
+    text = json.dumps(content, sort_keys=True, default=repr)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _digest(values):
+    return hashlib.sha256(np.ascontiguousarray(values, dtype="<f8").tobytes()).hexdigest()
+
+
+def cached_grid(model, axes, filters, make):
+    """
+    A grid from the cache folder, or a new one that is then kept there.
+
+    Parameters
+    ----------
+    model, axes, filters
+        As for `grid_key`.
+    make : callable
+        ``make(model, axes, filters)`` makes the grid.
+
+    Returns
+    -------
+    grid : `~miricigale.sed.ModelGrid`
+
+    Notes
+    -----
+    The least recently used grids go when all together are larger than
+    ``miricigale.refdata.conf.grid_cache_size`` (MB; 0: nothing is kept). A cache that cannot be
+    read or written is logged and done without: the grid is the same.
+    """
+    limit = conf.grid_cache_size * 1e6
+    if limit <= 0:
+        return make(model, axes, filters)
+    path = cache_folder() / "grids" / f"{grid_key(model, axes, filters)}.fits"
+    if path.exists():
+        try:
+            grid = ModelGrid.read(path)
+            os.utime(path)
+        except (DataError, OSError) as err:
+            _log.warning("cached grid not used: %s", err)
+        else:
+            return grid
+    grid = make(model, axes, filters)
+    if grid.galaxy.nbytes + grid.agn.nbytes > limit:
+        return grid
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # another process may be at the same grid
+        partial = path.with_name(f"{path.stem}.{os.getpid()}.partial")
+        grid.write(partial, overwrite=True)
+        os.replace(partial, path)
+        _make_room(path.parent, limit, keep=path)
+    except OSError as err:
+        _log.warning("grid not kept in the cache: %s", err)
+    return grid
+
+
+def _make_room(folder, limit, keep):
+    files = []
+    for path in folder.glob("*.fits"):
+        try:
+            stat = path.stat()
+        except FileNotFoundError:
+            continue
+        files.append((stat.st_mtime_ns, stat.st_size, path))
+    total = sum(size for _, size, _ in files)
+    for _, size, path in sorted(files):
+        if total <= limit:
+            break
+        if path != keep:
+            path.unlink(missing_ok=True)
+            total -= size

@@ -1,0 +1,233 @@
+"""Factorised grids of models: galaxies and AGN at every redshift, each worked out once."""
+
+import itertools
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.sed.derived import DERIVED, galaxy_quantities
+from miricigale.sed.grid import ModelGrid
+from miricigale.sed.spectrum import distance
+from miricigale.sed.tables import dilution, seen_agn
+from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.meta import provenance
+
+__all__ = ["check_axes", "model_grid"]
+
+#: Roles whose parameters shape the galaxy.
+GALAXY_ROLES = ("sfh", "stellar", "nebular", "attenuation", "dust")
+
+
+def check_axes(model, axes):
+    """Check the axes: dict of name to values in the declared units."""
+    out = {}
+    skipped = {"mass", *_names(model, ("xray", "foreground"))}
+    for name, values in axes.items():
+        if name not in model.parameters or name in skipped:
+            raise unknown_name("axis", name, [n for n in model.parameters if n not in skipped])
+        parameter = model.parameters[name]
+        array = np.atleast_1d(np.asarray(parameter.convert(values), dtype=float))
+        if array.ndim != 1 or array.size == 0 or np.any(np.diff(array) <= 0):
+            raise argument_error(name, "ascending values", array)
+        for value in array:
+            parameter.check(value)
+        out[name] = array
+    if "redshift" not in out:
+        raise argument_error("axes", "with 'redshift'", sorted(axes))
+    return out
+
+
+def _names(model, roles):
+    return [n for c in model.components if c.role in roles for n in c.parameters]
+
+
+def _products(parameters, axes):
+    """All combinations of parameters, the last one fastest: list of dicts."""
+    values = [axes.get(name, [parameter.default]) for name, parameter in parameters.items()]
+    return [
+        dict(zip(parameters, map(float, row), strict=True)) for row in itertools.product(*values)
+    ]
+
+
+def _distinct_agn(component, rows):
+    """Merge rows that differ in parameters without effect: rows, counts."""
+    groups = {}
+    for row in rows:
+        inert = component.inert(row)
+        key = tuple((name, value) for name, value in row.items() if name not in inert)
+        groups.setdefault(key, []).append(row)
+    out = []
+    for group in groups.values():
+        merged = dict(group[0])
+        for name in component.inert(merged):
+            merged[name] = float(np.mean([row[name] for row in group]))
+        out.append(merged)
+    return out, np.array([len(group) for group in groups.values()], dtype=np.int64)
+
+
+def _parameter_table(parameters, rows):
+    out = QTable()
+    for name, parameter in parameters.items():
+        column = np.array([row[name] for row in rows], dtype=float)
+        out[name] = u.Quantity(column, parameter.unit)
+        out[name].info.description = parameter.doc
+    return out
+
+
+class _Distinct:
+    """Different items of a long list, by key."""
+
+    def __init__(self, keys):
+        self._seen = {}
+        self.rows = np.array(
+            [self._seen.setdefault(key, len(self._seen)) for key in keys], dtype=np.int64
+        )
+        self.keys = list(self._seen)
+
+
+class _Galaxies:
+    """Galaxies of a grid: their different stars, attenuated starlight and dust."""
+
+    def __init__(self, model, rows):
+        chain = self.chain = model.chain
+        self.parameters = rows
+        star_keys = [chain.key(row, "sfh", "stellar", "nebular") for row in rows]
+        light_keys = [
+            (star, chain.key(row, "attenuation")) for star, row in zip(star_keys, rows, strict=True)
+        ]
+        stars, light = _Distinct(star_keys), _Distinct(light_keys)
+        dust = _Distinct([chain.key(row, "dust") for row in rows])
+        self.light_rows, self.dust_rows = light.rows, dust.rows
+        made = dict(zip(stars.keys, chain.stars_of(stars.keys), strict=True))
+        self._stars = [made[key] for key in star_keys]
+        absorbed, visual, spectra = [], [], []
+        for star, dim in light.keys:
+            source, (young, old) = made[star], chain.factors(dim)
+            intrinsic = source.young + source.old
+            spectra.append(source.young * young + source.old * old)
+            absorbed.append(chain.weights @ (intrinsic - spectra[-1]) + source.dust_power)
+            visual.append(chain.visual(intrinsic))
+        self.starlight = np.array(spectra)
+        self.dust = np.array([chain.dust_of(key) for key in dust.keys])
+        self.absorbed = np.array(absorbed)[light.rows]
+        self._visual = np.array(visual)[light.rows]
+
+    def quantities(self):
+        """Derived quantities: dict of arrays, one value for each galaxy."""
+        functionals = self.chain.functionals.T
+        sums = (self.starlight @ functionals)[self.light_rows]
+        sums = sums + self.absorbed[:, None] * (self.dust @ functionals)[self.dust_rows]
+        return galaxy_quantities(self._stars, self.absorbed, sums, self._visual)
+
+    def fluxes(self, weights):
+        """Band values of every galaxy for weights of shape (n_wave, n_band)."""
+        out = (self.starlight @ weights)[self.light_rows]
+        out += self.absorbed[:, None] * (self.dust @ weights)[self.dust_rows]
+        return out
+
+
+def _galaxy_tables(quantities):
+    """What scales with mass, and what does not."""
+    scaling, shape = QTable(), QTable()
+    for name, values in quantities.items():
+        if name == "stellar_mass_formed":
+            continue
+        entry = DERIVED[name]
+        if entry.extensive:
+            scaling[name] = values * (entry.unit / u.Msun)
+            scaling[name].info.description = f"{entry.text}, for one solar mass formed"
+        else:
+            shape[name] = values * entry.unit
+            shape[name].info.description = entry.text
+    text = "3-1000 um light of stars and dust, without AGN, for one solar mass formed"
+    scaling["ir_luminosity"].info.description = text
+    return scaling, shape
+
+
+def _agn_table(model, parts):
+    """Properties of AGN for one watt of what the fraction refers to, and the scale to it."""
+    seen = seen_agn(model.chain, parts)
+    scale = np.ones(len(parts))
+    if model.frac_agn_definition != "dust":
+        scale = 1.0 / seen["infrared"]
+    values = {
+        "agn_power": np.ones(len(parts)),
+        "agn_luminosity": seen["luminosity"],
+        "accretion_power": seen["accretion"],
+        "l_6um": seen["six"],
+        "ir_luminosity": seen["infrared"],
+    }
+    out = QTable()
+    for name, column in values.items():
+        out[name] = column * scale * u.dimensionless_unscaled
+        out[name].info.description = f"{DERIVED[name].text}, W for each W of AGN power"
+    out["ir_luminosity"].info.description = "3-1000 um light of the AGN, W for each W of AGN power"
+    return scale, out
+
+
+def model_grid(model, axes, filters):
+    """The factorised grid of `SEDModel.grid`, for axes that `check_axes` gave."""
+    chain, redshift = model.chain, axes["redshift"]
+    agn_component = model.component("agn")
+    of_agn = agn_component.parameters if agn_component else {}
+    frac_agn = axes.get("frac_agn", np.zeros(1))
+    with_agn = bool(of_agn) and np.any(frac_agn > 0.0)
+    of_galaxy = {n: model.parameters[n] for n in _names(model, GALAXY_ROLES)}
+    rows = _products(of_galaxy, axes)
+    _refuse_invalid(model, rows, GALAXY_ROLES)
+    galaxies = _Galaxies(model, rows)
+    properties, shape = _galaxy_tables(galaxies.quantities())
+
+    agn_rows, count, inert = [], np.zeros(0, int), []
+    agn_spectra, agn_properties = np.zeros((0, chain.wave.size)), QTable()
+    agn_parameters = {n: p for n, p in of_agn.items() if n != "frac_agn"}
+    if with_agn:
+        every = [r | {"frac_agn": 0.0} for r in _products(agn_parameters, axes)]
+        _refuse_invalid(model, every, ("agn",))
+        agn_rows, count = _distinct_agn(agn_component, every)
+        inert = [sorted(agn_component.inert(row)) for row in agn_rows]
+        parts = [chain.agn(row) for row in agn_rows]
+        scale, agn_properties = _agn_table(model, parts)
+        agn_spectra = chain.lnu(np.array([t.total for t in parts])) * scale[:, None]
+    reference = galaxies.absorbed
+    if model.frac_agn_definition != "dust":
+        reference = properties["ir_luminosity"].value
+
+    galaxy = np.empty((redshift.size, len(rows), len(filters)))
+    agn = np.empty((redshift.size, len(agn_rows), len(filters)))
+    far = distance(redshift, model.cosmology)
+    defaults = {name: parameter.default for name, parameter in model.parameters.items()}
+    for i, z in enumerate(redshift):
+        sky = chain.sky(defaults | {"redshift": float(z)})
+        weights = (filters.weights(chain.wave * (1.0 + z)) * sky).T * dilution(z, far[i])
+        galaxy[i] = galaxies.fluxes(weights * chain.to_lnu[:, None])
+        agn[i] = agn_spectra @ weights
+    age = np.array([row["age"] for row in rows])
+    universe = model.cosmology.age(redshift).to_value(u.Gyr)
+    meta = provenance(**model.meta)
+    meta |= {"axes": {name: values.tolist() for name, values in axes.items()}, "inert": inert}
+    return ModelGrid(
+        filters=filters.names,
+        redshift=redshift,
+        galaxy=galaxy,
+        agn=agn,
+        dust_luminosity=reference,
+        frac_agn=frac_agn if with_agn else np.zeros(1),
+        allowed=age[None, :] <= universe[:, None],
+        galaxy_parameters=_parameter_table(of_galaxy, rows),
+        agn_parameters=_parameter_table(agn_parameters, agn_rows) if with_agn else QTable(),
+        galaxy_properties=properties,
+        galaxy_shape=shape,
+        agn_properties=agn_properties,
+        agn_multiplicity=count,
+        meta=meta,
+    )
+
+
+def _refuse_invalid(model, rows, roles):
+    for component in model.components:
+        if component.role in roles and component.refuses:
+            why = next((w for w in map(component.invalid, rows) if w), None)
+            if why:
+                raise ValueError(why)

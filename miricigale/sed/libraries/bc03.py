@@ -1,0 +1,248 @@
+"""Reading of the simple stellar populations of Bruzual & Charlot as they distribute them."""
+
+import hashlib
+import re
+from pathlib import Path
+
+import numpy as np
+
+from miricigale.sed.libraries.ised import Ised, parse_ised, read_bytes, read_ised
+from miricigale.sed.libraries.table import LibraryTable
+from miricigale.utils.exceptions import DataError, argument_error
+
+__all__ = ["Ised", "read_bc03", "read_ised"]
+
+#: Of GALAXEV, in W: its files are in this unit (3.826e33 erg/s).
+SOLAR_LUMINOSITY = 3.826e26
+#: Metallicities by their code in file names: tracks of Padova 1994, and of Padova 2000.
+PADOVA_1994 = {22: 0.0001, 32: 0.0004, 42: 0.004, 52: 0.008, 62: 0.02, 72: 0.05, 82: 0.1}
+PADOVA_2000 = {122: 0.0004, 132: 0.001, 142: 0.004, 152: 0.008, 162: 0.019, 172: 0.03}
+IMFS = {"chab": "Chabrier", "salp": "Salpeter", "kroup": "Kroupa"}
+#: Second age in yr: tells the version of 2003 from that of 2016.
+SECOND_AGE = {2003: 125893.0, 2016: 1.0e5}
+
+LONGEST = 160.0  # um
+DENSE_FROM = 10.0  # um
+DENSITY = 30.0  # wavelengths for each e-fold
+
+
+def read_bc03(path):
+    """
+    Read SSPs of Bruzual & Charlot (2003, 2016), any IMF, any number of metallicities.
+
+    Metallicities come from the text in the files, or their names (``m62``) where there is
+    none; the IMF from the names (``chab``, ``salp``, ``kroup``) or the head. Beyond 10 um, where
+    the files sample coarsely, wavelengths are inserted by interpolation in the logarithms, and
+    files that end before 160 um go on to there with their last slope.
+
+    The living mass leaves out remnants. Files of 2003 give the mass in stars with remnants,
+    of which their mass of remnants is taken away; those of 2016 give living stars. Which it
+    is, the mass of gas says where the file has it, else the second age. At age 0 all live.
+
+    Parameters
+    ----------
+    path : path-like or iterable of path-like
+        A file ``.ised`` or ``.ised_ASCII`` (also ``.gz``), a folder of one set of them, a
+        pattern of names such as ``folder/bc2003_lr_*_ssp.ised``, or several files.
+
+    Returns
+    -------
+    library : `~miricigale.sed.libraries.LibraryTable`
+        Axes ``metallicity`` and ``age`` (Myr); spectra ``luminosity`` in W/um for one solar
+        mass formed; values ``living`` and ``remnants`` (Msun for one solar mass formed).
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If a file is foreign, truncated or no single burst, states another metallicity or IMF
+        than its name, or the files are not one set (IMF, wavelengths, ages, limits of mass).
+    """
+    paths = _files(path)
+    parts, files = [], {}
+    for file in paths:
+        raw = file.read_bytes()
+        files[file.name] = hashlib.sha256(raw).hexdigest()
+        part = parse_ised(read_bytes(file), file)
+        if not part.is_ssp:
+            msg = f"{file} holds a composite population ({part.history}), wanted a single burst"
+            raise DataError(msg)
+        parts.append((file, part, _metallicity(part, file), _imf(part, file)))
+    _check_set(parts)
+    parts.sort(key=lambda item: item[2])
+    first, imf = parts[0][1], parts[0][3]
+    wave, _ = _refine(first.wave / 1e4, first.spectra[:1])
+    n_age = first.age.size
+    spectra = np.empty((len(parts) * n_age, wave.size), dtype=np.float32)
+    living, remnants, basis = np.empty(len(spectra)), np.empty(len(spectra)), set()
+    for i, (file, part, _, _) in enumerate(parts):
+        rows = slice(i * n_age, (i + 1) * n_age)
+        spectra[rows] = _refine(part.wave / 1e4, part.spectra)[1] * (SOLAR_LUMINOSITY * 1e4)
+        living[rows], how = _living(part, file)
+        remnants[rows] = part.quantities["remnants"]
+        basis.add(how)
+    metal, name, (low, high) = [p[2] for p in parts], _set_name(paths[0].name), first.mass_limits
+    extended = first.wave[-1] / 1e4 < LONGEST * (1 - 1e-6)
+    versions = [v for v, age in SECOND_AGE.items() if np.isclose(first.age[1], age, rtol=1e-3)]
+    return LibraryTable(
+        name="ssp.bc03_user",
+        wave=wave,
+        axes={"metallicity": np.repeat(metal, n_age), "age": np.tile(first.age / 1e6, len(parts))},
+        spectra={"luminosity": spectra},
+        units={"age": "Myr", "luminosity": "W / um"},
+        values={"living": living, "remnants": remnants},
+        meta={
+            "files": files,
+            "imf": imf,
+            "mass_limits": list(first.mass_limits),
+            "version": versions[0] if versions else None,
+            "models": name,
+            "living": sorted(basis),
+        },
+        summary=(
+            f"{name}: {imf} IMF, {low:g} to {high:g} Msun, Z = {', '.join(f'{z:g}' for z in metal)}",
+            f"{n_age} ages to {first.age[-1] / 1e9:g} Gyr, {first.wave.size} wavelengths",
+            f"{wave.size - first.wave.size} wavelengths inserted beyond {DENSE_FROM:g} um",
+            f"living mass: {', '.join(sorted(basis))}",
+            f"continued from {first.wave[-1] / 1e4:g} to {LONGEST:g} um"
+            if extended
+            else f"the files reach {first.wave[-1] / 1e4:g} um",
+        ),
+    )
+
+
+def _files(path):
+    if isinstance(path, (list, tuple, set)):
+        if not path:
+            raise argument_error("path", "a file, a folder or several files", "nothing")
+        return sorted((Path(p) for p in path), key=str)
+    path = Path(path).expanduser()
+    if path.is_dir():
+        found = sorted(p for p in path.iterdir() if _is_ised(p.name))
+    elif path.exists():
+        found = [path]
+    else:
+        found = sorted(p for p in path.parent.glob(path.name) if _is_ised(p.name))
+    if not found:
+        wanted = "wanted files *.ised or *.ised_ASCII (also .gz)"
+        msg = f"{path} cannot be read as populations of BC03: {wanted}, got none"
+        raise DataError(msg)
+    return found
+
+
+def _is_ised(name):
+    return re.search(r"\.ised(_ascii)?(\.gz)?$", name, re.IGNORECASE) is not None
+
+
+def _set_name(name):
+    """Name of a file without endings and code of metallicity, which its set shares."""
+    stem = re.sub(r"\.ised(_ascii)?(\.gz)?$", "", name, flags=re.IGNORECASE)
+    return re.sub(r"_m\d{2,3}(?=_|$)", "", stem)
+
+
+def _metallicity(part, file):
+    match = re.search(r"_m(\d{2,3})(?=[_.])", file.name)
+    named = (PADOVA_1994 | PADOVA_2000).get(int(match[1])) if match else None
+    stated = part.metallicity
+    if named is None and stated is None:
+        msg = f"{file} states no metallicity: wanted 'Z=...' in its head or a name like _m62_"
+        raise DataError(msg)
+    if named is not None and stated is not None and not np.isclose(named, stated, rtol=0.01):
+        msg = f"{file} states Z = {stated:g}, but its name (m{match[1]}) means Z = {named:g}"
+        raise DataError(msg)
+    return named if stated is None else stated
+
+
+def _imf(part, file):
+    named = {imf for token, imf in IMFS.items() if f"_{token}" in file.name.lower()}
+    # Chabrier's is the only one that is no power law
+    stated = "Chabrier" if not part.slopes else None
+    if len(part.slopes) == 1 and np.isclose(part.slopes[0], 1.35, atol=0.01):
+        stated = "Salpeter"
+    if len(named) != 1 and stated is None:
+        msg = f"{file} names no IMF: wanted one of {', '.join(IMFS)} in its name"
+        raise DataError(msg)
+    if len(named) == 1 and stated is not None and stated not in named:
+        msg = f"{file} holds a {stated} IMF, but its name means {named.pop()}"
+        raise DataError(msg)
+    return stated if stated is not None else named.pop()
+
+
+def _check_set(parts):
+    """Refuse files that are not one set, and say which two do not fit."""
+    file, first, _, imf = parts[0]
+    seen = {}
+    for other, part, metallicity, other_imf in parts:
+        why = None
+        if part.wave.shape != first.wave.shape or not np.array_equal(part.wave, first.wave):
+            why = f"{part.wave.size} wavelengths and the other {first.wave.size}, or others"
+        elif other_imf != imf:
+            why = f"a {other_imf} IMF and the other a {imf} IMF"
+        elif part.mass_limits != first.mass_limits:
+            why = f"masses of {part.mass_limits} Msun and the other of {first.mass_limits}"
+        elif part.age.shape != first.age.shape or not np.allclose(part.age, first.age, rtol=1e-4):
+            why = f"{part.age.size} ages and the other {first.age.size}, or others"
+        elif metallicity in seen:
+            why = f"the same metallicity as {seen[metallicity].name}, {metallicity:g}"
+        if why:
+            msg = f"{other} and {file.name} are not one set: the one has {why}"
+            raise DataError(msg)
+        seen[metallicity] = other
+
+
+def _living(part, file):
+    """Mass of living stars without remnants, and how it was found."""
+    mass, remnants = part.quantities["mass"], part.quantities["remnants"]
+    gas = part.quantities.get("gas")
+    old = part.age > 1e8
+    if gas is not None and np.any(gas[old] > 0):
+        with_remnants = np.abs(mass + gas - 1.0)[old].max()
+        without = np.abs(mass + remnants + gas - 1.0)[old].max()
+        if min(with_remnants, without) > 0.01:
+            msg = f"{file} has masses of stars, remnants and gas that do not sum to 1 Msun"
+            raise DataError(msg)
+        take = with_remnants < without
+    elif np.isclose(part.age[1], SECOND_AGE[2003], rtol=1e-3):
+        take = True
+    elif np.isclose(part.age[1], SECOND_AGE[2016], rtol=1e-3):
+        take = False
+    else:
+        msg = (
+            f"{file} does not tell whether its mass of stars includes remnants: wanted a mass of "
+            f"gas, or a second age of {SECOND_AGE[2003]:g} yr (2003) or {SECOND_AGE[2016]:g} yr "
+            f"(2016), got {part.age[1]:g} yr"
+        )
+        raise DataError(msg)
+    living = mass - remnants if take else mass.copy()
+    living[part.age == 0] = 1.0
+    if living.min() < 0 or living.max() > 1.05:
+        msg = f"{file} must have living masses of 0 to 1 Msun, got up to {living.max():g}"
+        raise DataError(msg)
+    return living, "mass in stars less remnants" if take else "mass in stars, as in the file"
+
+
+def _refine(wave, spectra):
+    """Insert wavelengths beyond 10 um, log-log between neighbours, and go on to 160 um."""
+    ends = wave[-1] < LONGEST * (1 - 1e-6)
+    target = max(LONGEST, wave[-1])
+    points = np.append(wave, LONGEST) if ends else wave
+    pieces = [points[points <= DENSE_FROM]]
+    far = points[points > DENSE_FROM]
+    start = pieces[0][-1:] if pieces[0].size else far[:1]
+    for low, high in zip(np.append(start, far[:-1]), far, strict=True):
+        n = max(1, int(np.ceil(np.log(high / low) * DENSITY)))
+        pieces.append(np.append(np.geomspace(low, high, n + 1)[1:-1], high))
+    fine = np.concatenate(pieces)
+    out = np.empty((len(spectra), fine.size))
+    known = np.isin(fine, wave)
+    new = ~known
+    logs = np.log(wave)
+    at = np.log(np.minimum(fine[new], target))
+    for row, spectrum in zip(out, spectra, strict=True):
+        row[known] = spectrum
+        # a spectrum that is 0 stays 0, whatever the slope
+        level = np.log(np.maximum(spectrum.astype(float), 1e-300))
+        slope = (level[-1] - level[-2]) / (logs[-1] - logs[-2])
+        inside = np.interp(at, logs, level)
+        beyond = level[-1] + slope * (at - logs[-1])
+        row[new] = np.exp(np.where(at > logs[-1], beyond, inside))
+    return fine, np.where(out < 1e-200, 0.0, out)

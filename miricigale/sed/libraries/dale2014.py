@@ -1,0 +1,221 @@
+"""Reading of the templates of Dale et al. 2014 as CIGALE distributes them."""
+
+import hashlib
+import tarfile
+import zipfile
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from miricigale.sed import _core
+from miricigale.sed.components.stellar import BC03
+from miricigale.sed.libraries.table import LibraryTable
+from miricigale.utils.exceptions import DataError
+
+__all__ = ["read_dale2014"]
+
+SPECTRA = "spectra.0.00AGN.dat"
+CALIBRATION = "dhcal.dat"
+STARS = "stellar_SED_age13Gyr_tau10Gyr.spec"
+ALPHA = np.arange(1, 65) / 16.0
+N_WAVE = 1018
+SHORTEST = 2.0  # um, where CIGALE lets the templates begin
+SCALED_AT = 7  # row of the spectra (1.028 um) at which CIGALE scales the starlight
+LONGEST = 1e4  # um; beyond, rows are 7 to 25 % apart and the last says -99.9999
+
+#: Files that this reader was tested on.
+KNOWN = {
+    CALIBRATION: "bb0b15806b03f8f45d340c236222cad787607d00c0f1354393622629c9cb22db",
+    SPECTRA: "eb716792d6426ab839b2764d6a8ad6e1558d3b1d44a9bbe911af75a36514b4b3",
+}
+
+
+def read_dale2014(path):
+    """
+    Read the templates of Dale et al. 2014 without AGN.
+
+    Wanted are ``spectra.0.00AGN.dat`` (wavelength in um and 64 columns of log10 nuF_nu) and
+    ``dhcal.dat`` (alpha in the second column), and, where it is there, CIGALE's
+    ``stellar_SED_age13Gyr_tau10Gyr.spec`` (A, W/A). Made of them, by the rules of CIGALE's
+    database builder: the columns are divided by wavelength; starlight of 13 Gyr (exponential,
+    tau 10 Gyr) that equals the template at 1.028 um is subtracted, negative rests being 0; what
+    is below 2 um goes; the integral becomes 1 W. Rows beyond 1 cm, coarse and without radio
+    emission, go too. Without the stellar file the starlight is that of the bundled
+    ``ssp.bc03`` (solar). The templates before the subtraction are kept beside.
+
+    Parameters
+    ----------
+    path : path-like
+        Folder with the files, a CIGALE source tree, or a zip or tar archive of either.
+
+    Returns
+    -------
+    library : `~miricigale.sed.libraries.LibraryTable`
+        64 rows; axis ``alpha``; spectra ``removed`` and ``kept`` (with and without the
+        subtraction of starlight) in W/um for 1 W; value ``log_f60_f100`` of ``dhcal.dat``.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If a file is missing, foreign or truncated.
+    """
+    path = Path(path)
+    contents, places = _find(path)
+    alpha, colour = _read_calibration(contents[CALIBRATION], places[CALIBRATION])
+    wave, log_power = _read_spectra(contents[SPECTRA], places[SPECTRA])
+    _check_order(wave, log_power, colour, places)
+    if STARS in contents:
+        stars = np.interp(wave, *_read_stars(contents[STARS], places[STARS]), right=0)
+        source = STARS
+    else:
+        stars = _bundled_starlight(wave)
+        source = "ssp.bc03 (Z = 0.02, exponential history, tau 10 Gyr, age 13 Gyr)"
+
+    emission = 10.0**log_power / wave[:, None]
+    starlight = stars[:, None] * (emission[SCALED_AT] / stars[SCALED_AT])
+    used = (wave >= SHORTEST) & (wave <= LONGEST)
+    nodes, emission, starlight = wave[used], emission[used].T, starlight[used].T
+    removed = emission - starlight
+    negative = int(np.sum(removed < 0))
+    share = np.max(starlight[:, 0] / emission[:, 0])
+    spectra = {
+        name: part / np.trapezoid(part, nodes, axis=1)[:, None]
+        for name, part in (("removed", np.maximum(removed, 0.0)), ("kept", emission))
+    }
+    files = {name: hashlib.sha256(data).hexdigest() for name, data in sorted(contents.items())}
+    changed = [name for name, sha in KNOWN.items() if files[name] != sha]
+    return LibraryTable(
+        name="dust.dale2014",
+        wave=nodes,
+        axes={"alpha": alpha},
+        spectra=spectra,
+        units={"removed": "W / um", "kept": "W / um"},
+        values={"log_f60_f100": colour},
+        meta={"files": files, "starlight": source, "negative": negative},
+        summary=(
+            f"{alpha.size} templates in alpha, {nodes[0]:g} to {nodes[-1]:g} um",
+            f"starlight subtracted: {source}; {100 * share:.0f} % of the emission at 2 um",
+            f"{negative} values beyond 2 um were negative after that and became 0",
+            f"not the copy that this reader was tested on: {', '.join(changed)}"
+            if changed
+            else "spectra and alphas are those of CIGALE 0.9",
+        ),
+    )
+
+
+def _find(path):
+    """Contents of the files by name, and where each was found."""
+    if path.is_dir():
+        found = {p.as_posix(): p for p in path.rglob("*.dat") if p.is_file()}
+        found |= {p.as_posix(): p for p in path.rglob(STARS) if p.is_file()}
+        return _pick(path, found, lambda p: p.read_bytes())
+    if not path.is_file():
+        msg = f"{path} cannot be read as templates of Dale et al. 2014: no such file or folder"
+        raise DataError(msg)
+    try:
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                return _pick(path, {n: n for n in archive.namelist()}, archive.read)
+        if tarfile.is_tarfile(path):
+            with tarfile.open(path) as archive:
+                members = {m.name: m for m in archive if m.isfile()}
+                return _pick(path, members, lambda m: archive.extractfile(m).read())
+    except (zipfile.BadZipFile, tarfile.TarError, EOFError) as err:
+        msg = f"{path} is not a whole archive: {err}"
+        raise DataError(msg) from err
+    msg = (
+        f"{path} cannot be read as templates of Dale et al. 2014: wanted a folder or an archive "
+        f"that holds {SPECTRA} and {CALIBRATION}, got another file"
+    )
+    raise DataError(msg)
+
+
+def _pick(path, found, read):
+    """Choose the one folder with the spectra among the names found, and read its files."""
+    folders = [PurePosixPath(n).parent for n in found if PurePosixPath(n).name == SPECTRA]
+    if len(folders) > 1:
+        folders = [f for f in folders if f.parts[-2:] == ("database_builder", "dale2014")]
+    if len(folders) != 1:
+        msg = f"{path} must hold one {SPECTRA}, got {len(folders) or 'none'}"
+        raise DataError(msg)
+    here = {PurePosixPath(n).name: n for n in found if PurePosixPath(n).parent == folders[0]}
+    if CALIBRATION not in here:
+        msg = f"{path} has {SPECTRA} without {CALIBRATION}, which lists the alphas of its columns"
+        raise DataError(msg)
+    wanted = [name for name in (SPECTRA, CALIBRATION, STARS) if name in here]
+    contents = {name: read(found[here[name]]) for name in wanted}
+    inside = {name: here[name] if path.is_dir() else f"{path}:{here[name]}" for name in wanted}
+    return contents, inside
+
+
+def _numbers(data, place, n_columns, wanted):
+    """Rows of numbers of a text file, comments left out: array (n_rows, n_columns)."""
+    try:
+        lines = [line.split() for line in data.decode("ascii").splitlines()]
+        rows = [words for words in lines if words and not words[0].startswith("#")]
+        odd = [i for i, words in enumerate(rows, 1) if len(words) != n_columns]
+        if odd:
+            msg = f"row {odd[0]} of {len(rows)} has {len(rows[odd[0] - 1])} columns"
+            raise ValueError(msg)
+        table = np.array(rows, dtype=float).reshape(len(rows), n_columns)
+    except ValueError as err:
+        msg = f"{place} is not {wanted} in {n_columns} columns: {err}"
+        raise DataError(msg) from err
+    if not np.all(np.isfinite(table)):
+        msg = f"{place} must hold finite numbers, got {np.sum(~np.isfinite(table))} others"
+        raise DataError(msg)
+    return table
+
+
+def _read_calibration(data, place):
+    table = _numbers(data, place, 5, "the list of alphas")
+    if table.shape[0] != ALPHA.size or not np.allclose(table[:, 1], ALPHA, rtol=0, atol=1e-6):
+        msg = (
+            f"{place} must list alpha = {ALPHA[0]:g} to {ALPHA[-1]:g} in {ALPHA.size} steps in its "
+            f"second column, got {table.shape[0]} rows"
+        )
+        raise DataError(msg)
+    return table[:, 1], table[:, 2]
+
+
+def _read_spectra(data, place):
+    table = _numbers(data, place, 1 + ALPHA.size, "wavelength and log10 nuF_nu")
+    wave = table[:, 0]
+    if wave.size != N_WAVE:
+        msg = f"{place} must have {N_WAVE} rows, got {wave.size}: truncated or another version"
+        raise DataError(msg)
+    if not np.all(np.diff(wave) > 0) or wave[0] > 1.0 or wave[-1] < 1e3:
+        msg = f"{place} must have ascending wavelengths in um, from 1 or less to 1000 or more"
+        raise DataError(msg)
+    return wave, table[:, 1:]
+
+
+def _read_stars(data, place):
+    table = _numbers(data, place, 4, "wavelength in A and starlight in W/A")
+    wave, light = table[:, 0] / 1e4, table[:, 1]
+    if not np.all(np.diff(wave) > 0) or wave[0] > 1.0 or wave[-1] < 5.0 or np.any(light < 0):
+        msg = f"{place} must hold starlight, not negative, at ascending wavelengths from 1 to 5 um"
+        raise DataError(msg)
+    return wave, light
+
+
+def _check_order(wave, log_power, colour, places):
+    """Columns belong to the alphas if their colours do (dhcal.dat has those of IRAS bands)."""
+    log_fnu = (log_power + np.log10(wave)[:, None]).T
+    at = np.log([60.0, 100.0])
+    seen = np.array([np.subtract(*np.interp(at, np.log(wave), row)) for row in log_fnu])
+    if np.abs(seen - colour).max() > 0.06:
+        msg = (
+            f"{places[SPECTRA]} does not fit {places[CALIBRATION]}: log f60/f100 differs by "
+            f"{np.abs(seen - colour).max():.2f}, wanted less than 0.06"
+        )
+        raise DataError(msg)
+
+
+def _bundled_starlight(wave):
+    """L_lambda at 13 Gyr of a history exp(-t / 10 Gyr), from the bundled SSPs; arbitrary scale."""
+    stars = BC03()
+    age, spectra, _ = stars.table(0.02)
+    born = np.arange(13000) + 0.5  # Myr ago
+    weights = _core.hat_matrix(age, born).T @ np.exp(born / 1e4)
+    return np.interp(wave, stars.nodes(), weights @ spectra, right=0)

@@ -1,0 +1,325 @@
+"""Reader of the SKIRTOR library as its authors, CIGALE and lightningpy distribute it."""
+
+import hashlib
+import itertools
+import re
+import tarfile
+import zipfile
+import zlib
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from miricigale.sed.libraries.table import LibraryTable
+from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import open_fits
+
+__all__ = ["SKIRTOR_AXES", "read_skirtor"]
+
+#: Values of the whole library: 19,200 spectra.
+SKIRTOR_AXES = {
+    "tau97": (3.0, 5.0, 7.0, 9.0, 11.0),
+    "p": (0.0, 0.5, 1.0, 1.5),
+    "q": (0.0, 0.5, 1.0, 1.5),
+    "opening_angle": (10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0),
+    "radius_ratio": (10.0, 20.0, 30.0),
+    "inclination": tuple(10.0 * k for k in range(10)),
+}
+_WHOLE = 19200
+_WANTED = (
+    "the SKIRTOR library (t*_p*_q*_oa*_R*_Mcl0.97_i*_sed.dat, or lightningpy's SKIRTOR.fits.gz)"
+)
+_NUMBER = r"(\d+(?:\.\d+)?)"
+_NAME = re.compile(
+    rf"t{_NUMBER}_p{_NUMBER}_q{_NUMBER}_oa{_NUMBER}_R{_NUMBER}_Mcl0\.97_i{_NUMBER}_sed\.dat"
+)
+_ROWS, _COLUMNS = 132, 7
+
+# the files are for 1e11 Lsun of 3.839e26 W at 10 Mpc
+_SUN = 1e11
+_FLUX = _SUN * 3.839e26 / (4.0 * np.pi * (1e7 * 3.0856775814913673e16) ** 2)  # W/m2
+
+# lightningpy's FITS file has one torus only
+_FITS_FIXED = {"p": 1.0, "q": 0.0, "opening_angle": 40.0, "radius_ratio": 20.0}
+_FITS_UNITS = {
+    "TAU": ("",),
+    "INCLINATION": ("deg",),
+    "WAVE_REST": ("um", "micron"),
+    "NU_REST": ("Hz",),
+    "LNU_TOTAL": ("Hz-1 solLum", "solLum Hz-1"),
+    "LNU_DISK_DIRECT": ("Hz-1 solLum", "solLum Hz-1"),
+    "LNU_DISK_SCATTERED": ("Hz-1 solLum", "solLum Hz-1"),
+    "LNU_DUST_TOTAL": ("Hz-1 solLum", "solLum Hz-1"),
+    "LNU_TRANSPARENT": ("Hz-1 solLum", "solLum Hz-1"),
+}
+
+
+def read_skirtor(path):
+    """
+    Read SKIRTOR (Stalevski et al. 2012, MNRAS 420, 2756; 2016, MNRAS 458, 2288).
+
+    Parameters
+    ----------
+    path : `~pathlib.Path`
+        A folder with the authors' ``*_sed.dat`` anywhere below (CIGALE's source tree is one), a
+        zip or tar archive of them, a folder of such archives, or the FITS file of lightningpy.
+
+    Returns
+    -------
+    library : `~miricigale.sed.libraries.LibraryTable`
+        ``torus.skirtor2016``: ``disk`` (direct and scattered) and ``dust``, L_lambda in 1/um for
+        one watt of accretion power, 32 bit. The whole library has 19,200 rows; a part is
+        taken where it is a full product of values and has inclination 0, which is
+        the disk seen from above.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If a file is truncated, foreign or in other units, models differ under one name,
+        or the product of values has holes.
+    """
+    path = Path(path)
+    if not path.exists():
+        msg = f"{path} does not exist; wanted {_WANTED}"
+        raise DataError(msg)
+    if path.is_file() and not _is_archive(path) and not _NAME.fullmatch(path.name):
+        wave, axes, spectra, files = _read_fits(path)
+    else:
+        wave, axes, spectra, files = _read_texts(path)
+    order = np.lexsort([axes[name] for name in reversed(SKIRTOR_AXES)])
+    axes = {name: np.asarray(axes[name])[order] for name in SKIRTOR_AXES}
+    _check_product(path, axes)
+    n = len(order)
+    part = "the whole library" if n == _WHOLE else f"a part of the library, {n:,} of {_WHOLE:,}"
+    span = f"{wave.size} wavelengths, {wave[0]:g}-{wave[-1]:g} um"
+    summary = (f"SKIRTOR 2016: {n:,} spectra ({part}) at {span}",)
+    return LibraryTable(
+        name="torus.skirtor2016",
+        wave=wave,
+        axes=axes,
+        spectra={name: array[order] for name, array in spectra.items()},
+        units={"opening_angle": "deg", "inclination": "deg", "disk": "um-1", "dust": "um-1"},
+        meta={
+            "files": files,
+            "scale": "L_lambda for one watt of accretion power",
+            "complete": n == _WHOLE,
+        },
+        summary=summary,
+    )
+
+
+def _check_product(path, axes):
+    """Refuse holes and values that are not the library's."""
+    values = {name: np.unique(column) for name, column in axes.items()}
+    for name, here in values.items():
+        strange = sorted(set(here.tolist()) - set(SKIRTOR_AXES[name]))
+        if strange:
+            known = " ".join(f"{v:g}" for v in SKIRTOR_AXES[name])
+            msg = f"{path}: {name} {strange[0]:g} is not of SKIRTOR 2016, which has {known}"
+            raise DataError(msg)
+    there = set(zip(*(column.tolist() for column in axes.values()), strict=True))
+    wanted = int(np.prod([v.size for v in values.values()]))
+    if len(there) < wanted:
+        product = itertools.product(*(v.tolist() for v in values.values()))
+        holes = itertools.islice((key for key in product if key not in there), 3)
+        msg = (
+            f"{path}: {len(there):,} spectra, but the values found make {wanted:,}; missing, "
+            f"among others: {', '.join(map(_file_name, holes))}"
+        )
+        raise DataError(msg)
+    if values["inclination"][0] != 0.0:
+        msg = f"{path}: no spectrum at inclination 0, which is the disk seen from above"
+        raise DataError(msg)
+
+
+def _file_name(key):
+    t, p, q, oa, ratio, i = (f"{v:g}" for v in key)
+    return f"t{t}_p{p}_q{q}_oa{oa}_R{ratio}_Mcl0.97_i{i}_sed.dat"
+
+
+# ------------------------------------------------------------------ the authors' files
+
+
+def _is_archive(path):
+    return zipfile.is_zipfile(path) or tarfile.is_tarfile(path)
+
+
+def _members(path):
+    """Name and bytes of each spectrum below a folder or in an archive, and of its source."""
+    if path.is_dir():
+        texts = [p for p in sorted(path.rglob("*_sed.dat")) if _NAME.fullmatch(p.name)]
+        if texts:
+            for text in texts:
+                yield text.name, text.read_bytes(), str(text)
+            return
+        for archive in sorted(path.rglob("*")):
+            if archive.name.endswith((".zip", ".tar", ".tar.gz", ".tgz")):
+                yield from _members(archive)
+    elif _NAME.fullmatch(path.name):
+        yield path.name, path.read_bytes(), str(path)
+    elif zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            for name in sorted(archive.namelist()):
+                if _NAME.fullmatch(PurePosixPath(name).name):
+                    yield PurePosixPath(name).name, archive.read(name), f"{path}:{name}"
+    else:
+        with tarfile.open(path) as archive:
+            for member in archive:
+                name = PurePosixPath(member.name).name
+                if member.isfile() and _NAME.fullmatch(name):
+                    yield name, archive.extractfile(member).read(), f"{path}:{member.name}"
+
+
+def _read_texts(path):
+    """Wavelengths, axes, spectra and checksums from the authors' text files."""
+    wave, keys, disk, dust, files, known = None, [], [], [], {}, {}
+    try:
+        for name, data, source in _members(path):
+            key = tuple(map(float, _NAME.fullmatch(name).groups()))
+            digest = hashlib.sha256(data).hexdigest()
+            if key in known:
+                if known[key][0] != digest:
+                    msg = f"{source} and {known[key][1]} are the same model with different numbers"
+                    raise DataError(msg)
+                continue
+            known[key] = (digest, source)
+            table = _parse(data, source)
+            if wave is None:
+                wave = table[0]
+                _check_wave(wave, source)
+            elif not np.allclose(table[0], wave, rtol=1e-4, atol=0.0):
+                msg = f"{source} has other wavelengths than the files before it"
+                raise DataError(msg)
+            seen = table[2] + table[3]
+            _check_columns(wave, table[1:], seen, key[-1], _FLUX, source)
+            keys.append(key)
+            disk.append((seen / (wave * _FLUX)).astype(np.float32))
+            dust.append((table[4] / (wave * _FLUX)).astype(np.float32))
+            files[_short(source, path)] = digest
+    except (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error) as err:
+        msg = f"{path} is a truncated or damaged archive: {err}"
+        raise DataError(msg) from err
+    if not keys:
+        msg = f"{path} holds no spectrum; wanted {_WANTED}"
+        raise DataError(msg)
+    axes = dict(zip(SKIRTOR_AXES, np.array(keys).T, strict=True))
+    return wave, axes, {"disk": np.array(disk), "dust": np.array(dust)}, files
+
+
+def _short(source, path):
+    """Name of a source relative to the folder that was given."""
+    return source.removeprefix(f"{path}/") if path.is_dir() else source.removeprefix(f"{path}:")
+
+
+def _parse(data, source):
+    """The seven columns of one file, shape (7, 132): wavelength in um, then lambda F_lambda."""
+    start = 0
+    while data[start : start + 1] == b"#":
+        start = data.find(b"\n", start) + 1
+        if start == 0:
+            start = len(data)
+    tokens = data[start:].split()
+    if len(tokens) != _ROWS * _COLUMNS:
+        msg = (
+            f"{source}: wanted {_ROWS} rows of {_COLUMNS} numbers below '#' lines, got "
+            f"{len(tokens)} words: truncated, or not a spectrum of SKIRTOR"
+        )
+        raise DataError(msg)
+    try:
+        table = np.array([float(x) for x in tokens]).reshape(_ROWS, _COLUMNS)
+    except ValueError as err:
+        msg = f"{source}: not a number in a spectrum of SKIRTOR: {err}"
+        raise DataError(msg) from err
+    if not (np.isfinite(table).all() and table.min() >= 0.0):
+        msg = f"{source}: negative, infinite or missing numbers"
+        raise DataError(msg)
+    return table.T
+
+
+def _check_wave(wave, source):
+    """SKIRTOR has 132 wavelengths from 0.001 to 1000 um."""
+    ascending = np.all(np.diff(wave) > 0.0)
+    if not (ascending and np.isclose(wave[0], 1e-3, 1e-3) and np.isclose(wave[-1], 1e3, 1e-3)):
+        msg = f"{source}: wanted wavelengths from 0.001 to 1000 um, got {wave[0]:g} to {wave[-1]:g}"
+        raise DataError(msg)
+
+
+def _check_columns(wave, table, seen, inclination, unit, source):
+    """
+    The columns are what they should be, by two laws that all spectra obey.
+
+    The parts add up to the total, and the disk without dust shines as cos i (1 + 2 cos i)
+    with 1e11 Lsun over all directions: a foreign unit or column breaks one of them.
+    """
+    total, dust, transparent = table[0], table[3], table[-1]
+    if np.abs(total - seen - dust).max() > 1e-3 * total.max():
+        msg = f"{source}: direct + scattered + dust is not the total: columns in another order?"
+        raise DataError(msg)
+    mu = np.cos(np.radians(inclination))
+    power = np.trapezoid(transparent / wave, wave) / unit
+    law = mu * (1.0 + 2.0 * mu) / 3.0 * 18.0 / 7.0
+    if abs(power - law) > 0.02:
+        msg = (
+            f"{source}: the transparent disk has {power:.4g} of 1e11 Lsun at 10 Mpc, wanted "
+            f"{law:.4g} at inclination {inclination:g}: another unit than W/m2 (lambda F_lambda)?"
+        )
+        raise DataError(msg)
+
+
+# ------------------------------------------------------------------ lightningpy's file
+
+
+def _read_fits(path):
+    """Wavelengths, axes, spectra and checksum from the FITS grid of lightningpy."""
+    with open_fits(path, wanted=_WANTED) as hdus:
+        rows = hdus[1].data if len(hdus) > 1 else None
+        columns = {} if getattr(rows, "columns", None) is None else rows.columns
+        units = {c.name: (c.unit or "").strip() for c in columns}
+        lacking = [name for name in _FITS_UNITS if name not in units]
+        if lacking:
+            msg = f"{path} is not {_WANTED}: a first table without column {lacking[0]}"
+            raise DataError(msg)
+        for name, known in _FITS_UNITS.items():
+            if units[name] not in known:
+                msg = f"{path}: column {name} must be in {known[0]!r}, got {units[name]!r}"
+                raise DataError(msg)
+        try:
+            table = {name: np.array(rows[name], dtype=float) for name in _FITS_UNITS}
+        except (OSError, ValueError, TypeError) as err:
+            msg = f"{path} is truncated or damaged: {err}"
+            raise DataError(msg) from err
+    order = np.argsort(table["WAVE_REST"][0])
+    wave = table["WAVE_REST"][0][order]
+    if wave.shape != (_ROWS,) or not np.all(table["WAVE_REST"] == table["WAVE_REST"][0]):
+        msg = f"{path}: wanted the same {_ROWS} wavelengths in all rows"
+        raise DataError(msg)
+    _check_wave(wave, path)
+    nu = table["NU_REST"][:, order]
+    if not np.allclose(nu * wave, 2.99792458e14, rtol=1e-4):
+        msg = f"{path}: frequencies and wavelengths do not belong together"
+        raise DataError(msg)
+    power = {
+        name: table[f"LNU_{name}"][:, order] * nu
+        for name in ("TOTAL", "DISK_DIRECT", "DISK_SCATTERED", "DUST_TOTAL", "TRANSPARENT")
+    }
+    for name, array in power.items():
+        if not (np.isfinite(array).all() and array.min() >= 0.0):
+            msg = f"{path}: negative, infinite or missing numbers in LNU_{name}"
+            raise DataError(msg)
+    seen = power["DISK_DIRECT"] + power["DISK_SCATTERED"]
+    for k, angle in enumerate(table["INCLINATION"]):
+        part = [power["TOTAL"][k], None, None, power["DUST_TOTAL"][k], power["TRANSPARENT"][k]]
+        _check_columns(wave, part, seen[k], angle, _SUN, f"{path} row {k + 1}")
+    n = len(seen)
+    axes = {"tau97": table["TAU"], "inclination": table["INCLINATION"]}
+    axes |= {name: np.full(n, value) for name, value in _FITS_FIXED.items()}
+    if len(set(zip(axes["tau97"], axes["inclination"], strict=True))) < n:
+        msg = f"{path}: two rows of the same TAU and INCLINATION"
+        raise DataError(msg)
+    spectra = {
+        "disk": (seen / (wave * _SUN)).astype(np.float32),
+        "dust": (power["DUST_TOTAL"] / (wave * _SUN)).astype(np.float32),
+    }
+    with path.open("rb") as stream:
+        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    return wave, axes, spectra, {path.name: digest}

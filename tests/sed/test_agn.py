@@ -1,0 +1,717 @@
+import io
+import tarfile
+import zipfile
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from scipy.integrate import quad
+
+from miricigale.sed import _core
+from miricigale.sed.components import ParametricTorus, Skirtor2016, TorusSpectra
+from miricigale.sed.components.agn.parametric import _absorbed, _constants, _seen_fraction
+from miricigale.sed.libraries import open_library, write_library
+from miricigale.sed.libraries.skirtor import read_skirtor
+from miricigale.utils.exceptions import DataError
+
+LAWS = ("smc", "calzetti", "gaskell")
+
+
+def values_of(component, **changes):
+    return {name: par.default for name, par in component.parameters.items()} | changes
+
+
+@pytest.fixture(scope="module")
+def torus():
+    return ParametricTorus()
+
+
+@pytest.fixture(scope="module")
+def wave(torus):
+    return np.unique(np.concatenate([torus.nodes(), np.geomspace(0.008, 1e4, 1500)]))
+
+
+class Bare(ParametricTorus):
+    """A torus that sends out one watt whatever happens, and hides nothing."""
+
+    name = "bare"
+
+    def torus_spectra(self, wave, values):
+        face_on = _core.disk_spectrum(wave, values["disk_slope"], self.disk)
+        dust = _core.planck_lambda(wave, 300.0)
+        return TorusSpectra(face_on, face_on, dust / np.trapezoid(dust, wave))
+
+
+# ------------------------------------------------------------------------------- disk
+
+
+@pytest.mark.parametrize("disk", sorted(_core.DISKS))
+@pytest.mark.parametrize("delta", [-0.5, 0.0, 0.5])
+def test_disk_has_unit_power_and_no_steps(disk, delta):
+    breaks = _core.DISKS[disk][0]
+    total = sum(
+        quad(lambda x: np.exp(x) * float(_core.disk_spectrum(np.exp([x]), delta, disk)[0]), a, b)[0]
+        for a, b in zip(np.log(breaks[:-1]), np.log(breaks[1:]), strict=True)
+    )
+    assert total == pytest.approx(1.0, rel=1e-6)
+    for edge in breaks[1:-1]:
+        low, high = _core.disk_spectrum(edge * np.array([1 - 1e-9, 1 + 1e-9]), delta, disk)
+        assert low == pytest.approx(high, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("disk", "inside"), [("skirtor", (0.2, 4.0)), ("schartmann2005", (0.2, 9.0))]
+)
+def test_slope_of_the_disk_in_the_optical(disk, inside):
+    inside = np.array(inside)
+    for delta in (-0.36, 0.0, 0.7):
+        light = _core.disk_spectrum(inside, delta, disk)
+        slope = np.diff(np.log(light)) / np.diff(np.log(inside))
+        assert slope[0] == pytest.approx(-1.5 + delta, rel=1e-9)
+
+
+def test_unknown_disk_is_refused():
+    with pytest.raises(ValueError, match=r"'disk' must be one of skirtor, .* got 'shakura'"):
+        ParametricTorus(disk="shakura")
+
+
+@pytest.mark.parametrize("disk", sorted(_core.DISKS))
+def test_other_disks_have_the_same_power_and_leave_the_dust_alone(torus, disk):
+    other = ParametricTorus(disk=disk)
+    wave = np.unique(np.concatenate([torus.nodes(), other.nodes()]))
+    values = values_of(torus, inclination=30.0)
+    plain = torus.torus_spectra(wave, values)
+    for delta in (-0.8, 0.4):
+        changed = other.torus_spectra(wave, values | {"disk_slope": delta})
+        power = [np.trapezoid(s.face_on, wave) for s in (plain, changed)]
+        assert power[1] == pytest.approx(power[0], rel=1e-12)
+        np.testing.assert_array_equal(changed.dust, plain.dust)
+        # what the torus lets through is a property of the torus
+        both = (plain.face_on > 0) & (changed.face_on > 0)
+        through = [s.disk[both] / s.face_on[both] for s in (plain, changed)]
+        np.testing.assert_allclose(through[1], through[0], rtol=1e-12)
+
+
+def test_shallower_disk_is_redder(torus, wave):
+    def colour(delta):
+        disk = torus.torus_spectra(wave, values_of(torus, inclination=0.0, disk_slope=delta)).disk
+        return np.divide(*np.interp([2.0, 0.3], wave, disk))
+
+    assert colour(0.5) / colour(0.0) == pytest.approx((2.0 / 0.3) ** 0.5, rel=0.01)
+
+
+# ------------------------------------------------------------------------- polar dust
+
+
+def test_smc_law_is_the_published_power_law():
+    np.testing.assert_allclose(
+        _core.polar_curve(np.array([1.0, 0.55, 0.15]), "smc"), [1.39, 2.848, 13.54], rtol=1e-3
+    )
+
+
+def test_calzetti_law_has_its_ratio_of_total_to_selective_extinction():
+    blue, visual = _core.polar_curve(np.array([0.44, 0.55]), "calzetti")
+    assert visual == pytest.approx(4.05, abs=0.02)
+    assert blue - visual == pytest.approx(1.0, abs=0.06)
+    # as for starbursts down to the Lyman limit, on and not off below it
+    wave = np.geomspace(0.0913, 5.0, 500)
+    np.testing.assert_allclose(
+        _core.polar_curve(wave, "calzetti"), _core.leitherer_calzetti(wave), rtol=1e-12
+    )
+    below = _core.polar_curve(np.array([0.0911, 0.05, 0.02]), "calzetti")
+    assert below[0] == pytest.approx(_core.polar_curve(np.array([0.0913]), "calzetti")[0], rel=0.01)
+    assert np.all(np.diff(below) > 0)
+
+
+def test_gaskell_law_joins_smoothly_and_is_flat_in_the_ultraviolet():
+    """Table 3 of Gaskell et al. 2004: A(B)/A(V) = 1.182; the two pieces meet at 3.69 um^-1."""
+    k = lambda x: _core.polar_curve(1.0 / np.asarray(x, dtype=float), "gaskell") * 0.182  # noqa: E731
+    blue, visual = k([1 / 0.44, 1 / 0.55])
+    assert visual == pytest.approx(1.0, abs=0.01)
+    assert blue == pytest.approx(1.182, abs=0.002)
+    low, high = k([3.69 - 1e-9, 3.69 + 1e-9])
+    assert low == pytest.approx(high, abs=2e-4)
+    slopes = [np.diff(k(x))[0] / 0.01 for x in ([3.68, 3.69], [3.69, 3.70])]
+    assert slopes[0] == pytest.approx(slopes[1], abs=2e-3)
+    assert k([8.0])[0] / k([3.69])[0] < 1.03
+    infrared = k(np.linspace(0.01, 1.6, 400))
+    assert infrared[0] == 0.0
+    assert np.all(np.diff(infrared) >= 0.0)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_no_law_makes_the_disk_brighter(law):
+    assert np.all(_core.polar_curve(np.geomspace(1e-4, 1e4, 2000), law) >= 0.0)
+
+
+def test_unknown_law_is_refused():
+    with pytest.raises(ValueError, match="'polar_law' must be one of smc, calzetti, gaskell, got"):
+        ParametricTorus(polar_law="mrn")
+    with pytest.raises(ValueError, match="'law' must be one of smc, calzetti, gaskell, got 'mrn'"):
+        _core.polar_curve(np.array([1.0]), "mrn")
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(("opening", "slope"), [(20.0, 0.0), (40.0, -0.4), (60.0, 0.4)])
+def test_polar_dust_energy_by_integration_over_solid_angle(wave, law, opening, slope):
+    """Along every line of sight that misses the torus, what is lost of cos i (1 + 2 cos i)."""
+    bare = Bare(polar_law=law)
+    values = values_of(bare, ebv_polar=0.25, opening_angle=opening, inclination=85.0)
+    parts = bare.templates(wave, values | {"disk_slope": slope})
+    got = np.trapezoid(parts.polar, wave) / np.trapezoid(parts.torus, wave)
+    face_on = _core.disk_spectrum(wave, slope)
+    through = 10 ** (-0.4 * 0.25 * _core.polar_curve(wave, law))
+    angle = np.linspace(0.0, np.radians(90 - opening), 4001)
+    pattern = np.cos(angle) * (1 + 2 * np.cos(angle)) / 3
+    # both hemispheres, of 4 pi: int dOmega / 4 pi = int sin i di
+    per_angle = pattern * np.trapezoid(face_on * (1 - through), wave) * np.sin(angle)
+    assert got == pytest.approx(np.trapezoid(per_angle, angle), rel=1e-6)
+
+
+def test_polar_dust_is_a_modified_blackbody(wave):
+    bare = Bare()
+    values = values_of(bare, ebv_polar=0.2, temperature_polar=130.0, emissivity_polar=1.3)
+    polar = bare.templates(wave, values).polar
+    shape = (1 - np.exp(-((200.0 / wave) ** 1.3))) * wave**-5.0
+    shape /= np.expm1(np.minimum(14387.769 / (wave * 130.0), 600.0))
+    bright = polar > 1e-12 * polar.max()
+    ratio = polar[bright] / shape[bright]
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_polar_dust_dims_the_disk_only_where_the_line_of_sight_misses_the_torus(wave, law):
+    torus = ParametricTorus(polar_law=law)
+    for angle, dimmed in ((30.0, True), (50.0, True), (50.1, False), (70.0, False)):
+        bare, dusty = (
+            torus.templates(wave, values_of(torus, inclination=angle, ebv_polar=e))
+            for e in (0.0, 0.3)
+        )
+        visible = (wave > 0.1) & (wave < 1.0)
+        seen = [p.disk[visible] / p.accretion_power for p in (bare, dusty)]
+        curve = 10 ** (-0.4 * 0.3 * _core.polar_curve(wave[visible], law))
+        np.testing.assert_allclose(seen[1] / seen[0], curve if dimmed else 1.0, rtol=1e-10)
+
+
+def test_without_polar_dust_its_parameters_make_no_difference(torus, wave):
+    values = values_of(torus, ebv_polar=0.0)
+    assert set(torus.inert(values)) == {"temperature_polar", "emissivity_polar"}
+    first = torus.templates(wave, values)
+    second = torus.templates(wave, values | {"temperature_polar": 500.0, "emissivity_polar": 1.0})
+    np.testing.assert_array_equal(first.total, second.total)
+    assert not first.polar.any()
+
+
+def test_wavelengths_without_dust_emission_are_refused(torus):
+    wave = np.geomspace(0.05, 0.2, 50)
+    with pytest.raises(ValueError, match=r"'wave' must be a grid .* got 50 points from 0\.05"):
+        torus.templates(wave, values_of(torus, ebv_polar=0.1))
+
+
+# ------------------------------------------------------------------------------ power
+
+
+def test_torus_and_polar_dust_are_normalised_to_one_watt(torus, wave):
+    parts = torus.templates(wave, values_of(torus, ebv_polar=0.2))
+    assert np.trapezoid(parts.torus + parts.polar, wave) == pytest.approx(1.0, rel=1e-12)
+    assert np.all(parts.polar >= 0)
+
+
+def test_disk_mean_over_the_sphere_is_seven_eighteenths():
+    assert quad(lambda mu: mu * (1 + 2 * mu) / 3, 0, 1)[0] == pytest.approx(7 / 18)
+    assert pytest.approx(7 / 18) == _core.DISK_MEAN
+
+
+@pytest.mark.parametrize("slope", [-0.5, 0.0, 0.5])
+def test_accretion_power_is_the_disk_over_all_directions(wave, slope):
+    """Disk light without any dust, summed over the sphere, for each watt of dust emission."""
+    bare = Bare()
+    values = values_of(bare, ebv_polar=0.2, disk_slope=slope, inclination=10.0)
+    parts = bare.templates(wave, values)
+    mu = np.linspace(0.0, 1.0, 2001)
+    disk = np.trapezoid(_core.disk_spectrum(wave, slope), wave)
+    over_angles = np.trapezoid(disk * mu * (1 + 2 * mu) / 3, mu)
+    # the torus of Bare has one watt: its share of the template is the scale of the template
+    scale = np.trapezoid(parts.torus, wave)
+    assert parts.accretion_power == pytest.approx(over_angles * scale, rel=1e-6)
+
+
+def test_face_on_disk_without_dust_is_hardly_dimmed(torus, wave):
+    base = torus.torus_spectra(wave, values_of(torus, inclination=0.0, ebv_polar=0.0))
+    seen = np.trapezoid(base.disk, wave) / np.trapezoid(base.face_on, wave)
+    assert seen == pytest.approx(1.0, abs=0.06)
+
+
+# ------------------------------------------------------------------- parametric torus
+
+
+@pytest.mark.parametrize(("tau", "q"), [(5.0, 1.0), (9.0, 0.0)])
+def test_torus_emits_what_the_disk_loses(torus, wave, tau, q):
+    """Energy over all directions: disk = what is seen of the disk + dust emission."""
+    values = values_of(torus, ebv_polar=0.0, tau97=tau, q=q)
+    edge = np.cos(np.radians(47.0))
+    x, w = np.polynomial.legendre.leggauss(40)
+    total = 0.0
+    for low, high in ((0.0, edge), (edge, 1.0)):
+        for node, weight in zip(0.5 * (x + 1), 0.5 * w, strict=True):
+            angle = float(np.degrees(np.arccos(low + (high - low) * node)))
+            parts = torus.torus_spectra(wave, values | {"inclination": angle})
+            total += (high - low) * weight * np.trapezoid(parts.disk + parts.dust, wave)
+    emitted = 7 / 18 * np.trapezoid(torus.torus_spectra(wave, values).face_on, wave)
+    assert total == pytest.approx(emitted, rel=2e-3)
+
+
+def test_absorbed_share_is_near_that_of_the_geometry(torus):
+    """Everything below the edge is lost: (s^2/6 + 2 s^3/9) / (7/18), less what is scattered."""
+    s = np.cos(np.radians(47.0))
+    geometric = (s**2 / 6 + 2 * s**3 / 9) / (7 / 18)
+    assert _absorbed(torus.path, 11.0, 40.0, 0.0) == pytest.approx(geometric, abs=0.03)
+
+
+def test_silicate_feature_turns_from_emission_to_absorption(torus, wave):
+    def strength(angle):
+        dust = torus.torus_spectra(wave, values_of(torus, inclination=angle, q=0.0, tau97=9.0)).dust
+        low, mid, high = np.interp([7.5, 9.7, 13.5], wave, dust * wave)
+        return np.log(mid / np.sqrt(low * high))
+
+    assert strength(10.0) > 0.1
+    assert strength(90.0) < -0.3
+
+
+def test_steeper_density_makes_a_hotter_torus(torus, wave):
+    def colour(p):
+        dust = torus.torus_spectra(wave, values_of(torus, p=p)).dust
+        return np.divide(*np.interp([4.0, 20.0], wave, dust))
+
+    assert colour(0.0) < colour(1.0) < colour(1.5)
+
+
+def test_hidden_disk_is_weak_in_the_visible(torus):
+    seen = _seen_fraction(_constants(torus.path), np.array([0.5]), 7.0, 70.0, 40.0, 1.0)
+    assert 1e-5 < seen[0] < 1e-3
+
+
+def test_torus_against_skirtor(data_file, torus, wave):
+    """Shape in 2-40 um and the scale of dust light over disk light; tau 5, i 80 left out."""
+    library = read_skirtor(data_file("skirtor2016/SKIRTOR.fits.gz"))
+    grid = np.geomspace(2, 40, 61)
+    shape, scale = [], []
+    for k in range(library.n_rows):
+        tau, angle = (float(library.axes[a][k]) for a in ("tau97", "inclination"))
+        if tau == 5 and angle == 80:
+            continue
+        theirs = library.spectra["dust"][k] * library.wave
+        values = values_of(torus, q=0.0, tau97=tau, inclination=angle)
+        ours = torus.torus_spectra(wave, values).dust
+        ratio = np.log10(np.interp(grid, wave, ours * wave))
+        log = np.log10(np.maximum(theirs, 1e-30))
+        ratio -= np.interp(np.log(grid), np.log(library.wave), log)
+        shape.append(ratio - ratio.mean())
+        power = np.trapezoid(theirs / library.wave, library.wave)
+        scale.append(np.log10(np.trapezoid(ours, wave) / power))
+    assert np.sqrt(np.mean(np.square(shape))) < 0.058
+    assert np.sqrt(np.mean(np.square(shape), axis=1)).max() < 0.15
+    assert abs(np.mean(scale)) < 0.01
+    assert np.std(scale) < 0.05
+
+
+# ---------------------------------------------------------------------------- SKIRTOR
+
+FLUX = 1e11 * 3.839e26 / (4 * np.pi * (1e7 * 3.0856775814913673e16) ** 2)  # W/m2
+SHORT = 10 ** (np.arange(66) * 0.06 - 3)  # the library's steps: 0.06, 0.0144 and 0.06 dex
+LONG = 10 ** (3 - np.arange(26) * 0.06)[::-1]
+WAVE = np.concatenate([SHORT, np.geomspace(SHORT[-1], LONG[0], 42)[1:-1], LONG])
+
+
+def spectrum(tau, p, q, opening, ratio, angle):
+    """Columns of a made-up torus with SKIRTOR's disk: 132 rows, lambda F_lambda in W/m2."""
+    mu = np.cos(np.radians(angle))
+    disk = _core.disk_spectrum(WAVE, 0.0, "stalevski2016") * WAVE
+    transparent = disk * 18 / 7 * mu * (1 + 2 * mu) / 3
+    hidden = np.exp(-tau / WAVE) if angle > 90 - opening else np.ones(WAVE.size)
+    direct, scattered = transparent * hidden, 0.02 * disk / (1 + WAVE**2)
+    body = _core.planck_lambda(WAVE, 300.0 + 40 * p - 30 * q + ratio)
+    dust = WAVE * body / np.trapezoid(body, WAVE) * (0.6 - 0.002 * angle)
+    columns = [direct + scattered + dust, direct, scattered, dust, 0.03 * dust, transparent]
+    return np.column_stack([WAVE, *(FLUX * c for c in columns)])
+
+
+def text(table):
+    names = ("lambda (micron)", "total flux; lambda*F_lambda (W/m2)", "direct stellar flux",
+             "scattered stellar flux", "total dust emission flux", "dust emission scattered flux",
+             "transparent flux")  # fmt: skip
+    head = "".join(f"# column {k + 1}: {name}\n" for k, name in enumerate(names))
+    return head + "".join(" ".join(f"{x:.8e}" for x in row) + "\n" for row in table)
+
+
+def file_name(tau, p, q, opening, ratio, angle):
+    return f"t{tau:g}_p{p:g}_q{q:g}_oa{opening:g}_R{ratio:g}_Mcl0.97_i{angle:g}_sed.dat"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A complete part of 2 x 1 x 2 x 1 x 1 x 3 spectra, in folders as in a source tree."""
+    root = tmp_path / "cigale"
+    for tau in (3, 7):
+        below = root / "database_builder" / "skirtor2016" / f"t{tau}"
+        below.mkdir(parents=True)
+        for q in (0, 1.5):
+            for angle in (0, 40, 70):
+                key = (tau, 0.5, q, 40, 20, angle)
+                (below / file_name(*key)).write_text(text(spectrum(*key)))
+    (root / "README.dat").write_text("nothing of ours")
+    return root
+
+
+def a_file(folder, pattern="t7_p0.5_q0_*_i40_sed.dat"):
+    return next(folder.rglob(pattern))
+
+
+def test_folder_is_read_as_written(folder):
+    library = read_skirtor(folder)
+    assert library.n_rows == 12
+    assert "12 of 19,200" in library.summary[0]
+    assert {name: library.values_of(name).tolist() for name in ("tau97", "q", "inclination")} == {
+        "tau97": [3, 7],
+        "q": [0, 1.5],
+        "inclination": [0, 40, 70],
+    }
+    assert len(library.meta["files"]) == 12
+    np.testing.assert_allclose(library.wave, WAVE, rtol=1e-7)
+    key = (7, 0.5, 1.5, 40, 20, 70)
+    table = spectrum(*key)
+    row = library.row(**dict(zip(library.axes, key, strict=True)))
+    # per watt of accretion: 4 pi d^2 F_lambda / L
+    np.testing.assert_allclose(
+        library.spectra["dust"][row], table[:, 4] / FLUX / WAVE, rtol=2e-7, atol=1e-37
+    )
+    np.testing.assert_allclose(
+        library.spectra["disk"][row],
+        (table[:, 2] + table[:, 3]) / FLUX / WAVE,
+        rtol=2e-7,
+        atol=1e-37,
+    )
+    assert library.spectra["dust"].dtype == np.float32
+
+
+@pytest.mark.parametrize("kind", ["zip", "tar.gz"])
+def test_archives_and_folders_of_archives_are_the_same(folder, tmp_path, kind):
+    (tmp_path / "store").mkdir()
+    archive = tmp_path / "store" / f"skirtor.{kind}"
+    files = sorted(folder.rglob("*"))
+    if kind == "zip":
+        with zipfile.ZipFile(archive, "w") as out:
+            for file in files:
+                out.write(file, f"nested/{file.relative_to(folder)}")
+            out.writestr("__MACOSX/._t7_p0.5_q0_oa40_R20_Mcl0.97_i40_sed.dat", "junk")
+    else:
+        with tarfile.open(archive, "w:gz") as out:
+            out.add(folder, "nested")
+    wanted = read_skirtor(folder)
+    for path in (archive, archive.parent):
+        library = read_skirtor(path)
+        np.testing.assert_array_equal(library.spectra["disk"], wanted.spectra["disk"])
+        np.testing.assert_array_equal(library.axes["q"], wanted.axes["q"])
+
+
+def test_library_comes_back_from_disk(folder, tmp_path):
+    library = read_skirtor(folder)
+    write_library(library, tmp_path / "skirtor2016.fits")
+    again = open_library(tmp_path / "skirtor2016.fits", "torus.skirtor2016")
+    np.testing.assert_array_equal(again.spectra["dust"], library.spectra["dust"])
+    assert again.meta == library.meta
+
+
+def test_truncated_and_foreign_spectra_are_refused(folder):
+    path = a_file(folder)
+    whole = path.read_text()
+    path.write_text(whole[: len(whole) // 2])
+    with pytest.raises(DataError, match=r"t7_p0\.5_q0_.*i40_sed\.dat: wanted 132 rows of 7 num"):
+        read_skirtor(folder)
+    path.write_text(whole.replace("e-", "x-", 1))
+    with pytest.raises(DataError, match=r"i40_sed\.dat: not a number"):
+        read_skirtor(folder)
+    path.write_text("# nothing")
+    with pytest.raises(DataError, match="got 0 words"):
+        read_skirtor(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda t: t * np.array([1, *6 * [1e3]]), r"of 1e11 Lsun at 10 Mpc.*another unit"),
+        (lambda t: t[:, [0, 1, 2, 3, 5, 4, 6]], "not the total: columns in another order"),
+        (lambda t: t * np.array([1.1, *6 * [1]]), "wavelengths"),
+        (lambda t: np.where(t == t[50, 4], -t, t), "negative, infinite or missing"),
+    ],
+)
+def test_wrong_numbers_are_refused_by_name(folder, change, says):
+    path = a_file(folder)
+    path.write_text(text(change(np.loadtxt(path))))
+    with pytest.raises(DataError, match=rf"t7_p0\.5_q0_.*i40_sed\.dat.*{says}"):
+        read_skirtor(folder)
+
+
+def test_holes_are_refused_by_name(folder):
+    a_file(folder).unlink()
+    with pytest.raises(DataError, match=r"11 spectra, but .* make 12; .* t7_p0\.5_q0_oa40_R20_Mc"):
+        read_skirtor(folder)
+
+
+def test_face_on_spectra_are_wanted(folder):
+    for path in folder.rglob("*_i0_sed.dat"):
+        path.unlink()
+    with pytest.raises(DataError, match="no spectrum at inclination 0"):
+        read_skirtor(folder)
+
+
+def test_values_that_skirtor_has_not_are_refused(folder):
+    key = (4, 0.5, 0, 40, 20, 0)
+    (folder / file_name(*key)).write_text(text(spectrum(*key)))
+    with pytest.raises(DataError, match="tau97 4 is not of SKIRTOR 2016, which has 3 5 7 9 11"):
+        read_skirtor(folder)
+
+
+def test_one_model_twice_is_taken_once_if_it_is_the_same(folder):
+    path = a_file(folder)
+    copy = folder / "copy" / path.name
+    copy.parent.mkdir()
+    copy.write_bytes(path.read_bytes())
+    assert read_skirtor(folder).n_rows == 12
+    copy.write_text(text(np.loadtxt(path) * np.array([1, *6 * [1.001]])))
+    with pytest.raises(DataError, match="the same model with different numbers"):
+        read_skirtor(folder)
+
+
+def test_other_things_are_refused(tmp_path, folder):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match=r"empty holds no spectrum; wanted the SKIRTOR library"):
+        read_skirtor(tmp_path / "empty")
+    with pytest.raises(DataError, match=r"nowhere does not exist"):
+        read_skirtor(tmp_path / "nowhere")
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(DataError, match=r"notes\.txt"):
+        read_skirtor(tmp_path / "notes.txt")
+    fits.PrimaryHDU(np.zeros((2, 2))).writeto(tmp_path / "image.fits")
+    with pytest.raises(DataError, match=r"image\.fits is not the SKIRTOR library"):
+        read_skirtor(tmp_path / "image.fits")
+    data = io.BytesIO()
+    with tarfile.open(fileobj=data, mode="w:gz") as out:
+        out.add(folder, "nested")
+    (tmp_path / "half.tar.gz").write_bytes(data.getvalue()[: len(data.getvalue()) // 2])
+    with pytest.raises(DataError, match=r"half\.tar\.gz is a truncated or damaged archive"):
+        read_skirtor(tmp_path / "half.tar.gz")
+
+
+def write_fits(path, change=lambda name, column: column):
+    """A file in lightningpy's layout, wavelengths descending: two optical depths."""
+    rows = [(tau, angle) for angle in (0, 40, 70) for tau in (3, 7)]
+    tables = [spectrum(tau, 1, 0, 40, 20, angle)[::-1] for tau, angle in rows]
+    nu = 2.99792458e14 / WAVE[::-1]
+    columns = {"INCLINATION": [float(a) for _, a in rows], "TAU": [float(t) for t, _ in rows]}
+    columns |= {"WAVE_REST": [WAVE[::-1]] * 6, "NU_REST": [nu] * 6}
+    names = ("TOTAL", "DISK_DIRECT", "DISK_SCATTERED", "DUST_TOTAL", "DUST_SCATTERED")
+    for k, name in enumerate((*names, "TRANSPARENT"), 1):
+        columns[f"LNU_{name}"] = [t[:, k] / FLUX * 1e11 / nu for t in tables]
+    units = {"INCLINATION": "deg", "WAVE_REST": "um", "NU_REST": "Hz"}
+    out = []
+    for name, values in columns.items():
+        column = change(name, np.array(values))
+        shape = "132D" if column.ndim == 2 else "D"
+        unit = units.get(name, "Hz-1 solLum" if name.startswith("LNU") else None)
+        out.append(fits.Column(name, shape, unit=unit, array=column))
+    fits.BinTableHDU.from_columns(out).writeto(path)
+
+
+def test_fits_grid_is_the_same_as_text(tmp_path):
+    write_fits(tmp_path / "grid.fits")
+    library = read_skirtor(tmp_path / "grid.fits")
+    for tau in (3, 7):
+        for angle in (0, 40, 70):
+            key = (tau, 1, 0, 40, 20, angle)
+            (tmp_path / file_name(*key)).write_text(text(spectrum(*key)))
+    texts = read_skirtor(tmp_path)
+    for name in library.spectra:
+        np.testing.assert_allclose(
+            library.spectra[name], texts.spectra[name], rtol=1e-6, atol=1e-37
+        )
+    for name in library.axes:
+        np.testing.assert_array_equal(library.axes[name], texts.axes[name])
+
+
+@pytest.mark.parametrize(
+    ("column", "factor", "says"),
+    [
+        ("LNU_TRANSPARENT", 1.5, "another unit"),
+        ("NU_REST", 1.1, "do not belong together"),
+        ("LNU_DUST_TOTAL", -1.0, "negative, infinite or missing numbers in LNU_DUST_TOTAL"),
+        ("WAVE_REST", 10.0, "wanted wavelengths from 0.001 to 1000 um"),
+    ],
+)
+def test_wrong_fits_grids_are_refused(tmp_path, column, factor, says):
+    path = tmp_path / "grid.fits"
+    write_fits(path, lambda name, array: array * (factor if name == column else 1.0))
+    with pytest.raises(DataError, match=rf"grid\.fits.*{says}"):
+        read_skirtor(path)
+
+
+@pytest.fixture
+def skirtor(folder, tmp_path):
+    write_library(read_skirtor(folder), tmp_path / "skirtor2016.fits")
+    part = Skirtor2016(p=0.5, q=1.5, disk="stalevski2016")
+    part.path = str(tmp_path / "skirtor2016.fits")
+    return part
+
+
+def full_grid(part):
+    return np.unique(np.concatenate([part.nodes(), np.geomspace(0.001, 1000, 3000)]))
+
+
+@pytest.mark.parametrize("angle", [0.0, 40.0, 70.0])
+def test_skirtor_gives_the_library_where_nothing_is_changed(skirtor, angle):
+    wave = full_grid(skirtor)
+    base = skirtor.torus_spectra(wave, values_of(skirtor, inclination=angle))
+    table = spectrum(7, 0.5, 1.5, 40, 20, angle)
+    dust = np.trapezoid(table[:, 4] / WAVE, WAVE)
+    assert np.trapezoid(base.dust, wave) == pytest.approx(1.0, rel=1e-6)
+    at = np.searchsorted(wave, WAVE * (1 - 1e-6))[:-1]
+    np.testing.assert_allclose(
+        base.dust[at], (table[:, 4] / WAVE / dust)[:-1], rtol=1e-5, atol=1e-25
+    )
+    # power laws instead of straight lines between 132 points: 0.3 %; scattered light, 2 % of the
+    # disk at inclination 0, takes the disk's colour there
+    np.testing.assert_allclose(
+        base.disk[at], ((table[:, 2] + table[:, 3]) / WAVE / dust)[:-1], rtol=0.015, atol=1e-12
+    )
+    assert np.interp([1e-4, 2e3], wave, base.dust, left=0, right=0).tolist() == [0, 0]
+
+
+def test_skirtor_accretion_power_is_that_of_the_files(skirtor):
+    """1e11 Lsun, and the little that dust scatters upwards."""
+    wave = full_grid(skirtor)
+    parts = skirtor.templates(wave, values_of(skirtor, inclination=70.0, ebv_polar=0.0))
+    table = spectrum(7, 0.5, 1.5, 40, 20, 70)
+    dust = np.trapezoid(table[:, 4] / WAVE, WAVE) / FLUX
+    assert parts.accretion_power * dust == pytest.approx(1.0, abs=0.02)
+    assert np.trapezoid(parts.torus, wave) == pytest.approx(1.0, rel=1e-12)
+
+
+def test_skirtor_keeps_its_power_with_another_disk(skirtor):
+    other = Skirtor2016(p=0.5, q=1.5, disk="schartmann2005")
+    other.path = skirtor.path
+    wave = np.unique(np.concatenate([full_grid(skirtor), other.nodes()]))
+    first, second = (
+        part.torus_spectra(wave, values_of(part, inclination=40.0, disk_slope=slope))
+        for part, slope in ((skirtor, 0.0), (other, -0.36))
+    )
+    power = [np.trapezoid(s.face_on, wave) for s in (first, second)]
+    assert power[1] == pytest.approx(power[0], rel=1e-12)
+    np.testing.assert_array_equal(first.dust, second.dust)
+    inside = (wave > 0.2) & (wave < 4)
+    slope = np.gradient(np.log(second.face_on[inside]), np.log(wave[inside]))
+    np.testing.assert_allclose(slope, -1.86, rtol=1e-6)
+
+
+def test_skirtor_says_what_it_has(skirtor):
+    values = values_of(skirtor)
+    assert skirtor.invalid(values) is None
+    assert skirtor.covers(tau97=3.0, q=[0.0, 1.5], age=5.0)
+    assert skirtor.missing(q=[0.0, 1.0], tau97=3.0) == {"q": (0.0, 1.5)}
+    says = skirtor.invalid(values | {"tau97": 5.0, "inclination": 45.0})
+    assert "'tau97' must be one of 3, 7, got 5" in says
+    assert "'inclination' must be one of 0, 40, 70, got 45" in says
+    with pytest.raises(ValueError, match=r"'q' must be one of 0, 1\.5, got 1 "):
+        skirtor.torus_spectra(full_grid(skirtor), values | {"q": 1.0})
+
+
+def test_library_registered_anew_is_read_anew(skirtor):
+    wave, values = full_grid(skirtor), values_of(skirtor)
+    before = skirtor.torus_spectra(wave, values).dust
+    library = open_library(skirtor.path, "torus.skirtor2016")
+    dust = np.array(library.spectra["dust"]) * (library.wave > 5)
+    spectra = {"disk": np.array(library.spectra["disk"]), "dust": dust}
+    axes = library.axes
+    write_library(
+        type(library)(library.name, library.wave, axes, spectra, library.units), skirtor.path
+    )
+    after = skirtor.torus_spectra(wave, values).dust
+    assert np.interp(4.0, wave, before) > 0
+    assert np.interp(4.0, wave, after) == 0.0
+
+
+# ------------------------------------------------------------------ the real SKIRTOR
+
+
+@pytest.fixture(scope="module")
+def real(data_file):
+    return read_skirtor(data_file("skirtor2016/SKIRTOR.fits.gz"))
+
+
+def test_real_grid_has_what_its_authors_say(real):
+    assert real.n_rows == 50
+    np.testing.assert_array_equal(real.values_of("tau97"), [3, 5, 7, 9, 11])
+    np.testing.assert_array_equal(real.values_of("inclination"), np.arange(10) * 10.0)
+    assert real.wave[[0, -1]] == pytest.approx([1e-3, 1e3], rel=1e-6)
+
+
+def test_real_spectra_conserve_energy(real):
+    """Over the sphere, disk and dust send out what the disk makes, to 5 %."""
+    for tau in real.values_of("tau97"):
+        rows = [real.row(tau97=tau, p=1, q=0, opening_angle=40, radius_ratio=20, inclination=i)
+                for i in range(90, -10, -10)]  # fmt: skip
+        light = real.spectra["disk"][rows] + real.spectra["dust"][rows]
+        mu = np.cos(np.radians(np.arange(90, -10, -10)))
+        total = np.trapezoid(np.trapezoid(light, real.wave, axis=1), mu)
+        assert total == pytest.approx(1.0, abs=0.05)
+
+
+def test_real_grid_survives_the_authors_layout(real, tmp_path):
+    """Written as lambda F_lambda at 10 Mpc in the documented columns, and read back."""
+    for k in range(real.n_rows):
+        key = [float(real.axes[a][k]) for a in real.axes]
+        mu = np.cos(np.radians(key[-1]))
+        disk, dust = (real.spectra[n][k].astype(float) * real.wave * FLUX for n in ("disk", "dust"))
+        shape = _core.disk_spectrum(real.wave, 0.0, "stalevski2016") * real.wave * FLUX
+        clear = shape * mu * (1 + 2 * mu) * 6 / 7
+        columns = [real.wave, disk + dust, disk, 0 * disk, dust, 0 * dust, clear]
+        (tmp_path / file_name(*key)).write_text(text(np.column_stack(columns)))
+    again = read_skirtor(tmp_path)
+    for name in real.spectra:
+        np.testing.assert_allclose(again.spectra[name], real.spectra[name], rtol=2e-7, atol=1e-30)
+    for name in real.axes:
+        np.testing.assert_array_equal(again.axes[name], real.axes[name])
+
+
+def test_disk_of_the_real_library_is_the_form_of_2016(real):
+    """Where nothing is in the way the library's disk is its power law, but for scattered light."""
+    top = real.row(tau97=3, p=1, q=0, opening_angle=40, radius_ratio=20, inclination=0)
+    shape = _core.disk_spectrum(real.wave, 0.0, "stalevski2016") * 18 / 7
+    inside = real.wave < 30
+    np.testing.assert_allclose(real.spectra["disk"][top][inside] / shape[inside], 1.0, atol=0.1)
+
+
+def test_real_spectrum_that_looks_wrong(real):
+    """tau 5, inclination 80: far above its neighbours in tau at 2.3 um."""
+    at = np.argmin(np.abs(real.wave - 2.3))
+    light = [
+        real.spectra["dust"][
+            real.row(tau97=t, p=1, q=0, opening_angle=40, radius_ratio=20, inclination=80)
+        ][at]
+        for t in (3, 5, 7)
+    ]
+    assert np.log10(light[1] / np.sqrt(light[0] * light[2])) > 0.3
+
+
+def test_real_templates(real, tmp_path):
+    """The model of Yang et al. 2021 that this grid has: one watt, and 1e11 Lsun behind it."""
+    write_library(real, tmp_path / "skirtor2016.fits")
+    part = Skirtor2016(q=0.0, disk="stalevski2016")
+    part.path = str(tmp_path / "skirtor2016.fits")
+    wave = full_grid(part)
+    parts = part.templates(wave, values_of(part, ebv_polar=0.0))
+    row = real.row(tau97=7, p=1, q=0, opening_angle=40, radius_ratio=20, inclination=70)
+    dust = np.trapezoid(real.spectra["dust"][row], real.wave)
+    assert parts.accretion_power * dust == pytest.approx(1.0, abs=0.02)
+    dusty = part.templates(wave, values_of(part, ebv_polar=0.3))
+    assert np.trapezoid(dusty.torus + dusty.polar, wave) == pytest.approx(1.0, rel=1e-12)
+    assert dusty.accretion_power < parts.accretion_power

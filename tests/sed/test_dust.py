@@ -1,0 +1,522 @@
+import shutil
+import tarfile
+import zipfile
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.io import fits
+from astropy.modeling.models import BlackBody
+from scipy.optimize import brentq
+
+from miricigale.filters import FilterSet
+from miricigale.sed import SEDModel, _core
+from miricigale.sed.components import BC03, CalzettiLeitherer, DelayedSFH, Meiksin2006
+from miricigale.sed.components.dust import (
+    Casey2012,
+    Dale2014,
+    DraineLi2007,
+    DraineLi2007Alpha,
+)
+from miricigale.sed.components.dust.dl07 import load_dl07
+from miricigale.sed.libraries import write_library
+from miricigale.sed.libraries.dale2014 import read_dale2014
+from miricigale.utils.exceptions import DataError
+
+EVERY = [Casey2012, Dale2014, DraineLi2007, DraineLi2007Alpha]
+ALPHA = np.arange(1, 65) / 16.0
+
+
+def values_of(component, **changes):
+    return {name: par.default for name, par in component.parameters.items()} | changes
+
+
+# ------------------------------------------------------- files like Dale et al.'s
+
+
+def synthetic_wave():
+    start = [0.36, 0.45, 0.58, 0.75, 1.0, 1.009, 1.019, 1.028]
+    return np.append(start, np.geomspace(1.038, 224591.141, 1010))
+
+
+def synthetic_stars(wave):
+    return _core.planck_lambda(wave, 4000.0) / _core.planck_lambda(1.0, 4000.0)
+
+
+def synthetic_dust(wave, alpha):
+    """Blackbodies of 90 to 30 K as alpha grows, of 40 times the power of the stars."""
+    dust = _core.modified_blackbody(wave, 90.0 - 15.0 * alpha, 1.5)
+    stars = synthetic_stars(wave)
+    return 40.0 * dust / np.trapezoid(dust, wave) * np.trapezoid(stars, wave)
+
+
+@pytest.fixture(scope="module")
+def dale_folder(tmp_path_factory):
+    """A folder with files of the distributed format, made of known starlight and dust."""
+    folder = tmp_path_factory.mktemp("dale2014")
+    wave = synthetic_wave()
+    stars, columns, colours = synthetic_stars(wave), [wave], []
+    for alpha in ALPHA:
+        dust = synthetic_dust(wave, alpha)
+        columns.append(np.log10((stars + dust) * wave))
+        at60, at100 = np.interp([60.0, 100.0], wave, synthetic_dust(wave, alpha))
+        colours.append(np.log10(at60 * 60.0**2 / (at100 * 100.0**2)))
+    formats = ["%10.3f"] + ["%9.5f"] * ALPHA.size
+    np.savetxt(folder / "spectra.0.00AGN.dat", np.column_stack(columns), fmt=formats)
+    lines = ["# Ndhmod", "# 64", "# Ndh alpha lgfnu60_fnu100 lgLIR_M[Lsol] lgLIR_C[Lsol]"]
+    lines += [
+        f"{i:02d} {a:.4f} {c:7.4f} 12.0 11.9"
+        for i, (a, c) in enumerate(zip(ALPHA, colours, strict=True), 1)
+    ]
+    (folder / "dhcal.dat").write_text("\n".join(lines) + "\n")
+    grid = np.geomspace(0.1, 160.0, 4000)
+    light = synthetic_stars(grid)
+    table = np.column_stack([grid * 1e4, light, 0 * light, light])
+    np.savetxt(folder / "stellar_SED_age13Gyr_tau10Gyr.spec", table, header="made for a test")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def dale_data(dale_folder, tmp_path_factory):
+    """A data folder in which these files are registered."""
+    folder = tmp_path_factory.mktemp("data")
+    write_library(read_dale2014(dale_folder), folder / "sed/dale2014.fits")
+    return folder
+
+
+@pytest.fixture
+def dale(dale_data, monkeypatch):
+    monkeypatch.setenv("MIRICIGALE_DATA", str(dale_data))
+
+
+@pytest.fixture(scope="module")
+def real(data_file, tmp_path_factory):
+    """The distributed files, registered."""
+    folder = tmp_path_factory.mktemp("real")
+    library = read_dale2014(data_file("dale2014"))
+    write_library(library, folder / "sed/dale2014.fits")
+    return library, folder
+
+
+@pytest.fixture
+def real_dale(real, monkeypatch):
+    monkeypatch.setenv("MIRICIGALE_DATA", str(real[1]))
+    return real[0]
+
+
+# ---------------------------------------------------------------- every component
+
+
+@pytest.mark.parametrize("cls", EVERY)
+def test_spectra_are_not_negative_and_templates_send_out_one_watt(cls, dale):
+    part, rng = cls(), np.random.default_rng(1)
+    nodes = part.nodes()
+    for _ in range(20):
+        values = {n: rng.uniform(*p.bounds) for n, p in part.parameters.items()}
+        spectrum = part.spectrum(values)
+        assert np.all(np.isfinite(spectrum))
+        assert spectrum.min() >= 0.0
+        total = np.trapezoid(part.template(nodes, **values), nodes)
+        assert total == pytest.approx(1.0, rel=1e-12)
+
+
+@pytest.mark.parametrize("cls", EVERY)
+def test_there_is_nothing_outside_the_nodes(cls, dale):
+    nodes = cls().nodes()
+    outside = np.array([0.5 * nodes[0], 2.0 * nodes[-1]])
+    np.testing.assert_array_equal(cls().template(outside), 0.0)
+
+
+# ------------------------------------------------------------- Dale et al. 2014
+
+
+def test_subtraction_of_starlight_leaves_the_dust(dale_folder):
+    """The files hold stars and blackbodies: what is left is the blackbodies."""
+    library = read_dale2014(dale_folder)
+    np.testing.assert_array_equal(library.axes["alpha"], ALPHA)
+    seen = library.wave > 2.5
+    for i in (0, 31, 63):
+        truth = synthetic_dust(library.wave, ALPHA[i])
+        truth /= np.trapezoid(truth, library.wave)
+        removed, kept = (library.spectra[name][i] for name in ("removed", "kept"))
+        # what is left of the stars is the rounding of the file
+        assert np.all(np.abs(removed - truth)[seen] < 1e-3 * kept[seen])
+    assert library.meta["starlight"] == "stellar_SED_age13Gyr_tau10Gyr.spec"
+    # where it is kept, the starlight between 2 um and 1 cm is part of the one watt
+    wave = synthetic_wave()
+    both = synthetic_stars(wave) + synthetic_dust(wave, 2.0)
+    used = (wave >= 2.0) & (wave <= 1e4)
+    truth = both[used] / np.trapezoid(both[used], wave[used])
+    np.testing.assert_allclose(library.spectra["kept"][31], truth, rtol=1e-3)
+
+
+def test_starlight_is_scaled_at_the_wavelength_of_cigale(dale_folder, tmp_path):
+    """
+    Starlight bluer by l^-1/2 than the file's leaves 1 - (l / 1.028)^-1/2 of it.
+
+    CIGALE scales at the eighth row of the templates, 1.028 um.
+    """
+    folder = tmp_path / "dale"
+    shutil.copytree(dale_folder, folder)
+    grid = np.geomspace(0.1, 160.0, 4000)
+    light = synthetic_stars(grid) * grid**-0.5
+    table = np.column_stack([grid * 1e4, light, 0 * light, light])
+    np.savetxt(folder / "stellar_SED_age13Gyr_tau10Gyr.spec", table)
+    library = read_dale2014(folder)
+    # dust of 30 K is nothing in the near infrared; the ratio of two wavelengths has no scale
+    removed, kept = (library.spectra[name][63] for name in ("removed", "kept"))
+    near = (library.wave > 2.0) & (library.wave < 5.0)
+    closed = 1.0 - (library.wave[near] / 1.028) ** -0.5
+    ratio = removed[near] / kept[near]
+    np.testing.assert_allclose(ratio / ratio[-1], closed / closed[-1], rtol=5e-3)
+
+
+def test_without_the_stellar_file_bundled_populations_are_subtracted(dale_folder, tmp_path):
+    for name in ("spectra.0.00AGN.dat", "dhcal.dat"):
+        shutil.copy(dale_folder / name, tmp_path)
+    library = read_dale2014(tmp_path)
+    assert "ssp.bc03" in library.meta["starlight"]
+    assert any("ssp.bc03" in line for line in library.summary)
+    assert sorted(library.meta["files"]) == ["dhcal.dat", "spectra.0.00AGN.dat"]
+    # whatever the starlight is, dust beyond 20 um does not feel it
+    far = library.wave > 20.0
+    truth = synthetic_dust(library.wave, 2.0)
+    got = library.spectra["removed"][31]
+    ratio = got[far] / truth[far]
+    assert np.ptp(ratio) / ratio.mean() < 1e-3
+
+
+def test_source_trees_and_archives_are_read_alike(dale_folder, tmp_path):
+    wanted = read_dale2014(dale_folder)
+    tree = tmp_path / "cigale/database_builder/dale2014"
+    shutil.copytree(dale_folder, tree)
+    with zipfile.ZipFile(tmp_path / "cigale.zip", "w") as archive:
+        for path in sorted(tree.iterdir()):
+            archive.write(path, path.relative_to(tmp_path))
+    with tarfile.open(tmp_path / "cigale.tar.gz", "w:gz") as archive:
+        archive.add(tmp_path / "cigale", "cigale")
+    for source in ("cigale", "cigale.zip", "cigale.tar.gz"):
+        got = read_dale2014(tmp_path / source)
+        assert got.meta["files"] == wanted.meta["files"]
+        np.testing.assert_array_equal(got.spectra["removed"], wanted.spectra["removed"])
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("spectra.0.00AGN.dat", lambda t: t[: len(t) // 2], "row .* columns|1018 rows, got"),
+        ("spectra.0.00AGN.dat", lambda t: t[: t.rindex("\n", 0, -9) + 1], "1018 rows, got 1017"),
+        ("spectra.0.00AGN.dat", lambda t: "hello\n" + t, "columns"),
+        ("spectra.0.00AGN.dat", lambda t: t.replace("  0.450 ", "  nan "), "finite"),
+        ("spectra.0.00AGN.dat", lambda t: t.replace("  0.450 ", "  0.650 "), "ascending"),
+        ("dhcal.dat", lambda t: t.replace("02 0.1250", "02 0.1300"), "64 steps"),
+        ("dhcal.dat", lambda t: t[: t.index("40 2.5")], "64 steps .* got 39 rows"),
+        ("stellar_SED_age13Gyr_tau10Gyr.spec", lambda t: t[: len(t) // 3], "columns|starlight"),
+    ],
+)
+def test_damaged_files_are_refused_by_name(dale_folder, tmp_path, name, change, message):
+    folder = tmp_path / "dale"
+    shutil.copytree(dale_folder, folder)
+    text = (folder / name).read_text()
+    assert change(text) != text
+    (folder / name).write_text(change(text))
+    with pytest.raises(DataError, match=message) as caught:
+        read_dale2014(folder)
+    assert name in str(caught.value)
+
+
+def test_columns_in_another_order_are_refused(dale_folder, tmp_path):
+    folder = tmp_path / "dale"
+    shutil.copytree(dale_folder, folder)
+    table = np.loadtxt(folder / "spectra.0.00AGN.dat")
+    table[:, 1:] = table[:, :0:-1]
+    np.savetxt(folder / "spectra.0.00AGN.dat", table, fmt="%.5f")
+    with pytest.raises(DataError, match=r"does not fit .*dhcal\.dat: log f60/f100 differs by"):
+        read_dale2014(folder)
+
+
+def test_other_places_are_refused_by_name(dale_folder, tmp_path):
+    with pytest.raises(DataError, match=r"nowhere .* no such file or folder"):
+        read_dale2014(tmp_path / "nowhere")
+    with pytest.raises(DataError, match=r"must hold one spectra\.0\.00AGN\.dat, got none"):
+        read_dale2014(tmp_path)
+    path = tmp_path / "other.fits"
+    fits.PrimaryHDU(np.zeros((2, 2))).writeto(path)
+    with pytest.raises(DataError, match=r"other\.fits cannot be read as templates"):
+        read_dale2014(path)
+    half = tmp_path / "half"
+    half.mkdir()
+    shutil.copy(dale_folder / "spectra.0.00AGN.dat", half)
+    with pytest.raises(DataError, match=r"half has spectra.* without dhcal\.dat"):
+        read_dale2014(half)
+    for name in ("a", "b"):
+        shutil.copytree(dale_folder, tmp_path / "two" / name)
+    with pytest.raises(DataError, match="must hold one"):
+        read_dale2014(tmp_path / "two")
+    with zipfile.ZipFile(tmp_path / "cut.zip", "w") as archive:
+        archive.write(dale_folder / "dhcal.dat", "dhcal.dat")
+    data = (tmp_path / "cut.zip").read_bytes()
+    (tmp_path / "cut.zip").write_bytes(data[: len(data) // 2])
+    with pytest.raises(DataError, match=r"cut\.zip"):
+        read_dale2014(tmp_path / "cut.zip")
+
+
+def test_unregistered_templates_are_named_with_the_command(monkeypatch, tmp_path):
+    from miricigale.refdata import conf
+
+    monkeypatch.delenv("MIRICIGALE_DATA", raising=False)
+    wanted = r"miricigale data add dust\.dale2014 PATH"
+    with conf.set_temp("data_folder", str(tmp_path)), pytest.raises(DataError, match=wanted):
+        Dale2014().nodes()
+
+
+def test_templates_are_exact_at_their_alphas_and_linear_between(dale, dale_folder):
+    library, part = read_dale2014(dale_folder), Dale2014()
+    nodes = part.nodes()
+    for i in (0, 17, 63):
+        got = part.template(nodes, alpha=ALPHA[i])
+        np.testing.assert_allclose(got, library.spectra["removed"][i], rtol=1e-12)
+    low, high = library.spectra["removed"][30:32]
+    got = part.template(nodes, alpha=0.25 * ALPHA[30] + 0.75 * ALPHA[31])
+    np.testing.assert_allclose(got, 0.25 * low + 0.75 * high, rtol=1e-12)
+
+
+def test_starlight_is_an_option(dale, dale_folder):
+    library = read_dale2014(dale_folder)
+    part = Dale2014(starlight="kept")
+    got = part.template(part.nodes(), alpha=2.0)
+    np.testing.assert_allclose(got, library.spectra["kept"][31], rtol=1e-12)
+    with pytest.raises(ValueError, match="'starlight' must be one of removed, kept, got 'both'"):
+        Dale2014(starlight="both")
+
+
+def test_distributed_templates_have_the_colours_that_are_listed(real_dale):
+    """dhcal.dat lists log f_nu(60)/f_nu(100) of IRAS bands; ours are monochromatic."""
+    wave = real_dale.wave
+    for row, colour in zip(
+        real_dale.spectra["removed"], real_dale.values["log_f60_f100"], strict=True
+    ):
+        at60, at100 = np.interp([60.0, 100.0], wave, row * wave**2)
+        assert np.log10(at60 / at100) == pytest.approx(colour, abs=0.04)
+    assert real_dale.meta["negative"] == 0
+    assert any("CIGALE 0.9" in line for line in real_dale.summary)
+
+
+def test_total_infrared_luminosity_from_three_bands(real_dale):
+    """L(3-1100 um) = 1.559 nuL(24) + 0.7686 nuL(70) + 1.347 nuL(160): Dale & Helou 2002."""
+    wave = real_dale.wave
+    part = (wave >= 3.0) & (wave <= 1100.0)
+    for row in real_dale.spectra["removed"]:
+        bands = np.interp([24.0, 70.0, 160.0], wave, row * wave)
+        total = np.trapezoid(row[part], wave[part])
+        assert bands @ [1.559, 0.7686, 1.347] == pytest.approx(total, rel=0.03)
+
+
+def test_starlight_matters_only_below_three_micron(real_dale):
+    """What docs/guide/sed/dale2014.rst states: 22 % at 2 um, 0.4 % at most beyond 5 um."""
+    wave = real_dale.wave
+    removed, kept = (real_dale.spectra[name] for name in ("removed", "kept"))
+    assert np.all(np.abs(kept[:, 0] / removed[:, 0] - 1.28) < 0.02)
+    far = wave > 5.0
+    np.testing.assert_allclose(kept[:, far] / removed[:, far], 1.0, atol=0.005)
+
+
+def test_starlight_hardly_matters_in_a_galaxy_with_stars(real_dale):
+    """Stated in docs/guide/sed/dale2014.rst: below 1 % in any band, 0.8 % in F770W at z = 2."""
+    bands = FilterSet.from_names(
+        ["irac.ch1", "irac.ch2", "miri.f560w", "miri.f770w", "miri.f1000w", "miri.f1500w"]
+    )
+    for redshift in (0.5, 1.0, 2.0):
+        fluxes = []
+        for starlight in ("removed", "kept"):
+            dust = Dale2014(starlight=starlight)
+            model = SEDModel([DelayedSFH(), BC03(), CalzettiLeitherer(), dust, Meiksin2006()])
+            sed = model.evaluate(redshift=redshift, tau=1.0, age=1.0, ebv=0.9, alpha=2.0)
+            fluxes.append(bands.synthetic_fluxes(sed).value)
+        np.testing.assert_allclose(fluxes[1], fluxes[0], rtol=0.01)
+        if redshift == 2.0:
+            assert fluxes[1][3] / fluxes[0][3] == pytest.approx(1.0075, abs=0.001)
+
+
+def test_alpha_sequence_against_dale_2014(real_dale):
+    """What is stated of the mapping: 0.10 dex in 5-25 um, 0.06 beyond."""
+    ours, theirs = DraineLi2007Alpha(), Dale2014()
+    grid, rows = np.geomspace(5.0, 1000.0, 500), []
+    for alpha in (1.0, 1.5, 2.0, 2.5, 3.0, 3.5):
+        pair = [part.template(grid, alpha=alpha) for part in (ours, theirs)]
+        ratio = np.log10(pair[0] / pair[1])
+        rows.append(ratio - np.log10(np.divide(*(np.trapezoid(y, grid) for y in pair))))
+    rows = np.array(rows)
+    assert np.sqrt(np.mean(rows[:, grid <= 25] ** 2)) == pytest.approx(0.10, abs=0.01)
+    assert np.sqrt(np.mean(rows[:, grid > 25] ** 2)) == pytest.approx(0.06, abs=0.01)
+
+
+# -------------------------------------------------------------------- Casey 2012
+
+
+def test_blackbody_is_planck_times_one_minus_exp_of_minus_tau():
+    part = Casey2012()
+    wave = part.nodes()
+    got = part.parts(values_of(part, temperature_dust=50.0, emissivity_dust=1.8))[0]
+    planck = BlackBody(temperature=50 * u.K)(wave * u.um).value / wave**2
+    truth = planck * (1.0 - np.exp(-((200.0 / wave) ** 1.8)))
+    # hot enough to stay clear of underflow
+    seen = wave > 5.0
+    ratio = got[seen] / truth[seen]
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("beta", [1.0, 1.6, 2.0])
+def test_rayleigh_jeans_tail(beta):
+    """dlnL/dlnl = -5 + x/(1-exp(-x)) - beta tau/(exp(tau)-1); -(4 + beta) in the limit."""
+    part = Casey2012()
+    wave = part.nodes()
+    spectrum = part.spectrum(values_of(part, temperature_dust=100.0, emissivity_dust=beta))
+    slope = np.gradient(np.log(spectrum), np.log(wave))
+    at = np.searchsorted(wave, [500.0, 1000.0, 2500.0])
+    x, tau = 14387.77 / wave[at] / 100.0, (200.0 / wave[at]) ** beta
+    closed = -5.0 + x / (1.0 - np.exp(-x)) - beta * tau / np.expm1(tau)
+    np.testing.assert_allclose(slope[at], closed, atol=2e-3)
+    assert slope[at[-1]] == pytest.approx(-(4.0 + beta), abs=0.08)
+
+
+@pytest.mark.parametrize("alpha", [1.5, 2.0, 3.0])
+def test_power_law_has_its_slope_in_the_mid_infrared(alpha):
+    """S_nu ~ l^alpha where l << l_c, the blackbody of 35 K being nothing there."""
+    part = Casey2012()
+    wave = part.nodes()
+    mid = (wave > 3.0) & (wave < 8.0)
+    spectrum = part.spectrum(values_of(part, alpha_mir=alpha))[mid]
+    turn = part.turnover(alpha, 35.0)
+    snu = spectrum * wave[mid] ** 2 * np.exp((wave[mid] / turn) ** 2)
+    slope = np.polyfit(np.log(wave[mid]), np.log(snu), 1)[0]
+    assert slope == pytest.approx(alpha, abs=1e-3)
+
+
+@pytest.mark.parametrize("temperature", [35.0, 50.0, 80.0, 100.0])
+@pytest.mark.parametrize("alpha", [1.0, 1.5, 2.0, 3.0])
+def test_turnover_is_where_the_slope_of_the_blackbody_is_alpha(temperature, alpha):
+    """L(alpha, T) is a fit to the root of that equation; l_c is three quarters of it."""
+
+    def excess(wave):
+        x, tau = 14387.77 / wave / temperature, (200.0 / wave) ** 1.5
+        return -3.0 + x / (1.0 - np.exp(-x)) - 1.5 * tau / np.expm1(tau) - alpha
+
+    root = brentq(excess, 8.0, 400.0)
+    assert Casey2012.turnover(alpha, temperature) / 0.75 == pytest.approx(root, rel=0.015)
+
+
+def test_power_law_meets_the_blackbody_at_the_turnover():
+    part = Casey2012()
+    values = values_of(part, temperature_dust=45.0)
+    turn = part.turnover(values["alpha_mir"], 45.0)
+    blackbody, power_law = (np.interp(turn, part.nodes(), y) for y in part.parts(values))
+    # its cut-off has it at 1/e there
+    assert power_law / blackbody == pytest.approx(np.exp(-1.0), rel=1e-4)
+
+
+def test_warmer_dust_peaks_at_shorter_wavelengths():
+    part = Casey2012()
+    wave = part.nodes()
+    peaks = [
+        wave[np.argmax(part.template(wave, temperature_dust=t) * wave)] for t in (20.0, 35.0, 60.0)
+    ]
+    assert peaks == sorted(peaks, reverse=True)
+
+
+def test_straight_lines_between_the_nodes_are_good_enough(monkeypatch):
+    """Ten times as many nodes change means over 20 % in wavelength by less than 1.3e-4."""
+    from miricigale.sed.components.dust import casey2012
+
+    part = Casey2012()
+    wave = part.nodes()
+    steps = np.diff(wave)[:, None] * np.arange(10) / 10
+    fine = np.append((wave[:-1, None] + steps).ravel(), wave[-1])
+    for values in (
+        values_of(part),
+        values_of(part, temperature_dust=20.0, alpha_mir=5.0),
+        values_of(part, temperature_dust=140.0, emissivity_dust=3.0, alpha_mir=4.0),
+    ):
+        coarse = part.spectrum(values)
+        with monkeypatch.context() as patch:
+            patch.setattr(casey2012, "NODES", fine)
+            truth = part.spectrum(values)
+        coarse = coarse / np.trapezoid(coarse, wave)
+        truth = truth / np.trapezoid(truth, fine)
+        for centre in np.geomspace(1.3, 2600.0, 30):
+            x = np.geomspace(0.9 * centre, 1.1 * centre, 4001)
+            means = [
+                np.trapezoid(np.interp(x, w, y), x) for w, y in ((wave, coarse), (fine, truth))
+            ]
+            assert means[0] == pytest.approx(means[1], rel=1.3e-4)
+
+
+# -------------------------------------------------------------- Draine & Li 2007
+
+
+@pytest.mark.parametrize(("u_min", "q_pah"), [(1.0, 2.5), (0.8, 4.58), (25.0, 0.47)])
+def test_dust_at_a_node_is_the_table(u_min, q_pah):
+    part = DraineLi2007()
+    table = load_dl07(part.path)
+    i = np.argmin(np.abs(table["qpah"] - q_pah))
+    j = np.argmin(np.abs(table["umin"] - u_min))
+    nodes = part.nodes()
+    got = part.template(nodes, u_min=u_min, q_pah=q_pah, gamma=0.0)
+    np.testing.assert_allclose(got, table["single"][i, j], rtol=1e-4)
+    got = part.template(nodes, u_min=u_min, q_pah=q_pah, gamma=1.0)
+    np.testing.assert_allclose(got, table["powerlaw"][i, j], rtol=1e-4)
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.02, 0.3, 1.0])
+def test_power_per_dust_mass_is_the_mean_intensity(gamma):
+    """Draine & Li 2007, equation 33: (1 - g) Umin + g Umin ln(Umax/Umin) / (1 - Umin/Umax)."""
+    part = DraineLi2007()
+    table = load_dl07(part.path)
+    for j, umin in enumerate(table["umin"]):
+        mean = part.mean_intensity(values_of(part, u_min=umin, gamma=gamma))
+        i = int(np.argmin(np.abs(table["u"] - umin)))
+        power = (1 - gamma) * table["single_power"][:, i] + gamma * table["powerlaw_power"][:, j]
+        np.testing.assert_allclose(power / mean, 1.0, atol=0.01)
+
+
+def test_mean_intensity_is_an_average_over_the_mass():
+    from scipy.integrate import quad
+
+    part = DraineLi2007()
+    mass = quad(lambda v: np.exp(-v), np.log(0.5), np.log(1e6))[0]
+    power = quad(lambda v: 1.0, np.log(0.5), np.log(1e6))[0]
+    got = part.mean_intensity(values_of(part, u_min=0.5, gamma=0.1))
+    assert got == pytest.approx(0.9 * 0.5 + 0.1 * power / mass, rel=1e-9)
+
+
+def test_gamma_changes_spectra_as_mass_fractions_do():
+    """Per dust mass the spectrum is linear in gamma: the template is that over <U>."""
+    part = DraineLi2007()
+    nodes = part.nodes()
+    none, all_, some = (part.template(nodes, gamma=g) for g in (0.0, 1.0, 0.2))
+    weights = [part.mean_intensity(values_of(part, gamma=g)) for g in (0.0, 1.0)]
+    mixed = 0.8 * weights[0] * none + 0.2 * weights[1] * all_
+    np.testing.assert_allclose(some, mixed / np.trapezoid(mixed, nodes), rtol=0.01)
+
+
+def test_pah_features_stand_out():
+    part = DraineLi2007()
+    wave = np.array([7.0, 7.7, 10.0, 11.3])
+    rich = part.template(wave, q_pah=4.58, u_min=1.0, gamma=0.0) * wave
+    poor = part.template(wave, q_pah=0.47, u_min=1.0, gamma=0.0) * wave
+    assert rich[1] > 3 * rich[2]
+    assert np.all(rich[[1, 3]] > 3 * poor[[1, 3]])
+
+
+def test_more_intensity_makes_warmer_dust():
+    part = DraineLi2007Alpha()
+    wave = part.nodes()
+    peaks = [wave[np.argmax(part.template(wave, alpha=a) * wave)] for a in (1.0, 2.0, 3.0)]
+    assert peaks == sorted(peaks)
+
+
+def test_a_foreign_table_is_refused(tmp_path):
+    path = tmp_path / "other.fits"
+    fits.PrimaryHDU(np.zeros((2, 2))).writeto(path)
+    with pytest.raises(DataError, match="not a Draine & Li table"):
+        load_dl07(str(path))

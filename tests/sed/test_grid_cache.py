@@ -1,0 +1,129 @@
+import logging
+import os
+
+import numpy as np
+import pytest
+from astropy.cosmology import Planck18
+
+from miricigale.filters import Filter, FilterSet
+from miricigale.refdata import conf
+from miricigale.sed import SEDModel, gridding
+from miricigale.sed.components import BC03, CalzettiLeitherer, DelayedSFH, DraineLi2007
+from miricigale.sed.grid_cache import grid_key
+
+AXES = {"age": [0.5, 2.0], "ebv": [0.1, 0.4], "redshift": [0.3, 1.0]}
+BANDS = FilterSet.from_names(["wfc3.f160w", "miri.f770w"])
+
+
+@pytest.fixture
+def folder(tmp_path):
+    with conf.set_temp("cache_folder", str(tmp_path)):
+        yield tmp_path / "grids"
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """How many grids were really made."""
+    calls = []
+    real = gridding.model_grid
+
+    def count(*args):
+        calls.append(args)
+        return real(*args)
+
+    monkeypatch.setattr(gridding, "model_grid", count)
+    return calls
+
+
+def model(**options):
+    return SEDModel([DelayedSFH(), BC03(), CalzettiLeitherer(), DraineLi2007()], **options)
+
+
+def same(a, b):
+    for name in ("galaxy", "agn", "redshift", "dust_luminosity", "allowed"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    assert {**a.meta, "created": 0} == {**b.meta, "created": 0}
+    for name in ("galaxy_properties", "galaxy_shape", "galaxy_parameters"):
+        one, two = getattr(a, name), getattr(b, name)
+        assert one.colnames == two.colnames
+        for column in one.colnames:
+            assert one[column].unit == two[column].unit
+            assert one[column].info.description == two[column].info.description
+            np.testing.assert_array_equal(one[column].value, two[column].value)
+
+
+def test_a_grid_is_made_once_and_read_back_bit_for_bit(folder, made):
+    first = model().grid(AXES, BANDS)
+    again = model().grid(AXES, BANDS)
+    assert len(made) == 1
+    same(first, again)
+    same(first, model().grid(AXES, BANDS, cache=False))
+    assert len(made) == 2
+
+
+def test_everything_that_shapes_a_grid_is_in_its_name(folder):
+    axes = gridding.check_axes(model(), AXES)
+    changed = gridding.check_axes(model(), AXES | {"ebv": [0.1, 0.4 + 1e-15]})
+    curve = Filter(BANDS[0].wave, BANDS[0].throughput * np.linspace(1, 0.99, BANDS[0].wave.size),
+                   name=BANDS[0].name)  # fmt: skip
+    parts = model().components
+    keys = [
+        grid_key(model(), axes, BANDS),
+        grid_key(model(), changed, BANDS),
+        grid_key(model(), axes, BANDS[:1]),
+        grid_key(model(), axes, FilterSet([curve, BANDS[1]])),
+        grid_key(model(cosmology=Planck18), axes, BANDS),
+        grid_key(model(frac_agn_definition="3-1000um"), axes, BANDS),
+        grid_key(SEDModel([*parts[:2], CalzettiLeitherer(slope=0.1), parts[3]]), axes, BANDS),
+    ]
+    assert len(set(keys)) == len(keys)
+    assert grid_key(model(), axes, BANDS) == keys[0]
+
+
+def test_other_data_make_another_grid(folder, monkeypatch):
+    axes = gridding.check_axes(model(), AXES)
+    before = grid_key(model(), axes, BANDS)
+    monkeypatch.setattr("miricigale.sed.grid_cache.fingerprint", lambda name: f"new {name}")
+    assert grid_key(model(), axes, BANDS) != before
+
+
+def test_a_damaged_file_is_made_again_and_said(folder, made, caplog):
+    first = model().grid(AXES, BANDS)
+    (path,) = folder.glob("*.fits")
+    path.write_bytes(path.read_bytes()[:2000])
+    with caplog.at_level(logging.WARNING):
+        again = model().grid(AXES, BANDS)
+    assert "cached grid not used" in caplog.text
+    assert len(made) == 2
+    same(first, again)
+    model().grid(AXES, BANDS)
+    assert len(made) == 2
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a file in the way of a folder")
+def test_a_folder_that_cannot_be_written_is_done_without(tmp_path, made, caplog):
+    (tmp_path / "grids").write_text("in the way")
+    with conf.set_temp("cache_folder", str(tmp_path)), caplog.at_level(logging.WARNING):
+        grid = model().grid(AXES, BANDS)
+    assert grid.n_galaxies == 4
+    assert "not kept in the cache" in caplog.text
+
+
+def test_the_cache_keeps_to_its_size(folder, made):
+    model().grid(AXES, BANDS)
+    (old,) = folder.glob("*.fits")
+    os.utime(old, (1, 1))
+    # room for one and a half of them, in MB
+    with conf.set_temp("grid_cache_size", 1):
+        limit = conf.grid_cache_size * 1e6
+        filler = folder / "filler.fits"
+        filler.write_bytes(b"0" * int(limit - 1.5 * old.stat().st_size))
+        os.utime(filler, (2, 2))
+        model().grid(AXES | {"ebv": [0.2]}, BANDS)
+    names = {path.name for path in folder.glob("*.fits")}
+    assert old.name not in names
+    assert "filler.fits" in names
+    assert len(names) == 2
+    with conf.set_temp("grid_cache_size", 0):
+        model().grid(AXES | {"ebv": [0.3]}, BANDS)
+    assert len(list(folder.glob("*.fits"))) == 2

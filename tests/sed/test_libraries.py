@@ -1,0 +1,550 @@
+"""Libraries of spectra: the format they are kept in, and their registration."""
+
+import hashlib
+import json
+import mmap
+import subprocess
+import sys
+import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from miricigale import refdata
+from miricigale.refdata import Resource, check_resources, conf, find_resource, locate, registry
+from miricigale.refdata.locate import file_sha256, fingerprint, record_path, stored_record
+from miricigale.sed.libraries import (
+    READERS,
+    LibraryTable,
+    add_library,
+    open_library,
+    openers,
+    register,
+    table,
+    verify_library,
+    write_library,
+)
+from miricigale.utils.exceptions import DataError
+
+NAME = "test.library"
+AXES = {"tau": [3.0, 3.0, 7.0, 7.0], "q": [0.0, 0.97, 0.0, 0.97]}
+
+
+def make(name=NAME, n_wave=5, factor=1.0, **changes):
+    """Four spectra on two axes; row k is factor * (10 k + wavelength)."""
+    wave = np.geomspace(0.1, 1000.0, n_wave)
+    spectra = factor * (10.0 * np.arange(4)[:, None] + wave).astype(np.float32)
+    options = {
+        "axes": {k: np.array(v) for k, v in AXES.items()},
+        "spectra": {"dust": spectra, "disk": 2 * spectra.astype(float)},
+        "units": {"tau": "", "q": "", "dust": "W / um", "disk": "solLum / Angstrom"},
+        "values": {"mass": np.array([0.1, 0.2, 0.3, 0.4])},
+        "meta": {"files": {"a.dat": "0" * 64}, "note": "Calzetti, Größe µ"},
+        "summary": ("4 Spektren für λ > 0.1 µm",),
+    } | changes
+    if "axes" in changes and "units" not in changes:
+        options["units"] = {"dust": "W / um"}
+    return LibraryTable(name=name, wave=wave, **options)
+
+
+# ----------------------------------------------------------------------------- the table
+
+
+def test_what_is_written_comes_back(tmp_path):
+    library = make()
+    path = tmp_path / "sub" / "x.fits"
+    write_library(library, path)
+    found = open_library(path, NAME)
+    np.testing.assert_array_equal(found.wave, library.wave)
+    for kind in ("axes", "values", "spectra"):
+        for name, column in getattr(library, kind).items():
+            np.testing.assert_array_equal(getattr(found, kind)[name], column)
+    assert found.spectra["dust"].dtype.itemsize == 4
+    assert found.spectra["disk"].dtype.itemsize == 8
+    assert {k: u.Unit(v) for k, v in found.units.items()} == {
+        k: u.Unit(v) for k, v in library.units.items()
+    }
+    assert found.meta == library.meta
+    assert found.summary == library.summary
+    assert found.spectrum("dust", 2).tolist() == pytest.approx((20 + library.wave).tolist())
+    assert found.spectrum("dust", [0, 3]).shape == (2, 5)
+    assert [p.name for p in path.parent.iterdir()] == ["x.fits"]
+
+
+def test_other_programs_read_it(tmp_path):
+    """A FITS reader finds images with units, a table of axes, and checksums that hold."""
+    path = tmp_path / "x.fits"
+    write_library(make(), path)
+    with fits.open(path, checksum=True) as hdus:
+        hdus.verify("exception")
+        assert hdus["SPECTRA", 1].data[3, 0] == pytest.approx(30.1)
+        assert u.Unit(hdus["SPECTRA", 2].header["BUNIT"]) == u.L_sun / u.AA
+        assert hdus["WAVE"].header["BUNIT"] == "um"
+        assert hdus["ROWS"].columns.names == ["tau", "q", "mass"]
+
+
+def test_the_same_library_gives_the_same_bytes(tmp_path):
+    for name in ("a", "b"):
+        write_library(make(), tmp_path / name)
+    assert file_sha256(tmp_path / "a") == file_sha256(tmp_path / "b")
+
+
+def test_a_large_library_stays_on_disk(tmp_path):
+    n, wave = 15000, np.geomspace(1e-3, 1e3, 500)
+    spectra = np.ones((n, wave.size), dtype=np.float32)
+    big = LibraryTable(NAME, wave, {"k": np.arange(n)}, {"a": spectra, "b": spectra})
+    path = tmp_path / "big.fits"
+    write_library(big, path)
+    assert path.stat().st_size > 60e6
+    tracemalloc.start()
+    try:
+        library = open_library(path, NAME)
+        row = library.spectrum("b", 14000)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert np.all(row == 1)
+    assert peak < 10e6
+    base = library.spectra["b"]
+    while isinstance(base, np.ndarray) and base.base is not None:
+        base = base.base
+    assert isinstance(base, mmap.mmap)
+    with pytest.raises(ValueError, match="read-only"):
+        library.spectra["b"][0, 0] = 2.0
+
+
+def test_rows_are_found_by_the_values_of_their_axes():
+    library = make(axes={"tau": np.array([3, 3, 7, 7]), "q": [0.0, np.float32(0.97)] * 2})
+    assert library.row(tau=7, q=0.97) == 3
+    assert library.row(tau=7.0, q=0.0) == 2
+    assert library.row(tau=0.1 + 0.2 + 2.7, q=0.97, other=1.0) == 1
+    assert library.row(tau=5.0, q=0.97) is None
+    assert library.row(tau=7.001, q=0.97) is None
+    assert library.row(tau=7.0, q=1e-4) is None
+    np.testing.assert_allclose(library.values_of("q"), [0.0, 0.97], rtol=1e-7)
+    with pytest.raises(ValueError, match=r"'q' must be given to find a row of 'test.library'"):
+        library.row(tau=3.0)
+    with pytest.raises(KeyError, match=r"no axis 'p'; axes: tau, q"):
+        library.values_of("p")
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e-4, 1.0, 1e9])
+def test_small_and_large_values_of_an_axis_are_told_apart(scale):
+    """Whatever the unit, values one part in a thousand apart are different rows."""
+    values = scale * np.array([0.0, 1.0, 1.001, 97.0])
+    library = make(axes={"k": values})
+    assert [library.row(k=v) for v in values] == [0, 1, 2, 3]
+    assert [library.row(k=v * (1 + 1e-9)) for v in values] == [0, 1, 2, 3]
+    assert library.row(k=scale * 1.0005) is None
+
+
+def test_whether_the_grid_is_complete_is_known():
+    assert make().complete
+    assert not make(axes={"tau": [1.0, 1.0, 2.0, 3.0], "q": [0.0, 1.0, 0.0, 0.0]}).complete
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"axes": {"tau": [1, 1, 2, 2], "q": [0, 0, 0, 1]}}, "tau = 1, q = 0 in rows 0 and 1"),
+        ({"axes": {"tau": [1.0, 2.0, 3.0]}}, r"'tau' must be of shape \(4,\)"),
+        ({"axes": {"tau": [1.0, 2.0, 3.0, np.nan]}}, "'tau' must be finite in every row"),
+        ({"axes": {"tau": [1, 2, 3, 4] * u.um}}, "'tau' must be plain numbers"),
+        ({"axes": {"tau": 1 + 8e-7 * np.arange(4)}}, "'tau' must be of values that differ by more"),
+        ({"axes": {}}, "one axis and one kind of spectra at least"),
+        ({"axes": {"MASS": [1, 2, 3, 4]}, "units": {}}, "of other names"),
+        ({"axes": {"a b": [1, 2, 3, 4]}, "units": {}}, "plain identifiers, got 'a b'"),
+        ({"units": {"dust": "furlong"}}, "a unit for 'dust', got 'furlong'"),
+        ({"units": {"wave": "Angstrom"}}, "um for 'wave', got 'Angstrom'"),
+        ({"units": {"dost": "W"}}, "of a column .*, got 'dost'"),
+        ({"spectra": {"dust": np.zeros((4, 4))}, "units": {}}, r"'dust' must be of shape \(4, 5\)"),
+    ],
+)
+def test_what_is_no_library_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        make(**changes)
+
+
+@pytest.mark.parametrize("wave", [[1.0], [2.0, 1.0], [0.0, 1.0], [1.0, np.inf], [1.0, 1.0]])
+def test_wavelengths_ascend(wave):
+    with pytest.raises(ValueError, match="'wave' must be two or more positive, ascending"):
+        LibraryTable(NAME, np.array(wave), {"a": [1.0]}, {"b": np.ones((1, len(wave)))})
+
+
+def test_wavelengths_may_be_a_quantity():
+    library = LibraryTable(NAME, [1000, 2000] * u.nm, {"a": [1.0]}, {"b": np.ones((1, 2))})
+    np.testing.assert_allclose(library.wave, [1.0, 2.0])
+
+
+def test_meta_is_plain(tmp_path):
+    numbers = {"n": np.int64(3), "x": np.float32(0.5), "v": np.arange(3)}
+    write_library(make(meta=numbers), tmp_path / "x.fits")
+    assert open_library(tmp_path / "x.fits", NAME).meta == {"n": 3, "x": 0.5, "v": [0, 1, 2]}
+    with pytest.raises(ValueError, match=r"'meta' must be plain values .*, got .*Path"):
+        write_library(make(meta={"path": Path("a")}), tmp_path / "y.fits")
+    assert not (tmp_path / "y.fits").exists()
+
+
+def test_foreign_and_other_files_are_refused_by_name(tmp_path):
+    path = tmp_path / "x.fits"
+    with pytest.raises(DataError, match=r"x.fits cannot be read as .*'test.library'.*no such file"):
+        open_library(path, NAME)
+    path.write_text("not FITS at all")
+    with pytest.raises(DataError, match=r"x.fits cannot be read as the library"):
+        open_library(path, NAME)
+    fits.PrimaryHDU(np.zeros(3)).writeto(path, overwrite=True)
+    with pytest.raises(DataError, match=r"x.fits is not a library .*miricigale data add"):
+        open_library(path, NAME)
+    write_library(make("other"), path)
+    with pytest.raises(DataError, match=r"x.fits holds 'other', not 'test.library'"):
+        open_library(path, NAME)
+    with pytest.raises(DataError, match=r"cannot be read as the library"):
+        open_library(tmp_path, NAME)
+
+
+@pytest.mark.parametrize("kept", [0.02, 0.3, 0.5, 0.7, 0.9, 0.999])
+def test_a_truncated_file_is_refused(tmp_path, kept):
+    path = tmp_path / "x.fits"
+    write_library(make(n_wave=3000), path)
+    whole = path.read_bytes()
+    for size in {int(kept * len(whole)), 2880 * int(kept * len(whole) / 2880)}:
+        path.write_bytes(whole[:size])
+        with pytest.raises(DataError, match=r"x.fits (cannot be read as|is not a whole)"):
+            open_library(path, NAME)
+
+
+def test_one_changed_bit_is_found(tmp_path):
+    path = tmp_path / "x.fits"
+    write_library(make(n_wave=3000), path)
+    verify_library(path, NAME)
+    whole = path.read_bytes()
+    for place in (0.1, 0.5, 0.9):
+        data = bytearray(whole)
+        data[int(place * len(data))] ^= 1
+        path.write_bytes(bytes(data))
+        with pytest.raises(DataError, match=r"x.fits"):
+            verify_library(path, NAME)
+
+
+def test_spectra_with_nan_are_not_whole(tmp_path):
+    spectra = np.ones((4, 5))
+    spectra[2, 3] = np.nan
+    write_library(make(spectra={"dust": spectra}, units={}), tmp_path / "x.fits")
+    with pytest.raises(DataError, match=r"x.fits has 'dust' spectra with NaN or infinity"):
+        verify_library(tmp_path / "x.fits", NAME)
+
+
+def test_a_file_that_changes_is_opened_anew(tmp_path):
+    path = tmp_path / "x.fits"
+    write_library(make(), path)
+    old = open_library(path, NAME)
+    assert open_library(path, NAME) is old
+    write_library(make(factor=2.0), path)
+    new = open_library(path, NAME)
+    np.testing.assert_allclose(new.spectra["dust"], 2.0 * old.spectra["dust"])
+
+
+def test_threads_share_one_library(tmp_path):
+    path = tmp_path / "x.fits"
+    write_library(make(n_wave=2000), path)
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda _: open_library(path, NAME), range(32)))
+    assert all(library is found[0] for library in found)
+
+
+# ----------------------------------------------------------------------------- registration
+
+
+def read_fake(path):
+    """A line for each spectrum: tau, q and a number; the last line says 'end'."""
+    lines = path.read_text().splitlines()
+    if not lines or lines[-1] != "end":
+        msg = f"{path} is truncated: the last line must be 'end'"
+        raise DataError(msg)
+    rows = np.array([[float(x) for x in line.split()] for line in lines[:-1]])
+    return LibraryTable(
+        name=NAME,
+        wave=np.geomspace(1.0, 100.0, 7),
+        axes={"tau": rows[:, 0], "angle": rows[:, 1]},
+        spectra={"dust": rows[:, 2:] * np.ones(7, dtype=np.float32)},
+        units={"angle": "deg", "dust": "W / um"},
+        meta={"files": {path.name: file_sha256(path)}},
+        summary=(f"{len(rows)} spectra of nothing",),
+    )
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """An empty data folder, and a library with a reader."""
+    monkeypatch.delenv("MIRICIGALE_DATA", raising=False)
+    record = Resource(NAME, "user", "A test", "L", "C", "a page", file="sed/test.fits")
+    monkeypatch.setattr(registry, "resources", lambda: {NAME: record})
+    monkeypatch.setattr(sys.modules["miricigale.refdata.check"], "resources", registry.resources)
+    monkeypatch.setitem(READERS, NAME, read_fake)
+    with conf.set_temp("data_folder", str(tmp_path / "data")):
+        yield tmp_path
+
+
+def source(folder, text="3 0 1.5\n3 90 2.5\n7 0 3.5\n7 90 4.5\nend\n"):
+    path = folder / "fake.dat"
+    path.write_text(text)
+    return path
+
+
+def state():
+    (row,) = check_resources(openers())
+    return row
+
+
+def names(folder):
+    """Files that are left in the data folder, without the lock."""
+    found = (folder / "data").rglob("*")
+    return sorted(p.name for p in found if p.is_file() and p.suffix != ".lock")
+
+
+def test_a_library_is_registered_and_found(folder):
+    assert find_resource(NAME) is None
+    assert state().state == "absent"
+    path = source(folder)
+    report = add_library(NAME, path)
+    assert report.path == locate(NAME, check=True) == folder / "data" / "sed" / "test.fits"
+    assert names(folder) == ["test.fits", "test.fits.json"]
+    library = open_library(report.path, NAME)
+    assert library.spectrum("dust", library.row(tau=7, angle=90)) == pytest.approx(4.5)
+    assert (report.n_spectra, report.complete, report.n_wave) == (4, True, 7)
+    assert report.axes["angle"].tolist() == [0.0, 90.0]
+    assert report.units["angle"] == "deg"
+    assert report.sha256 == hashlib.sha256(report.path.read_bytes()).hexdigest()
+    assert report.files == {"fake.dat": hashlib.sha256(path.read_bytes()).hexdigest()}
+    assert report.replaced == ""
+    assert state().state == "ok"
+
+
+def test_the_report_says_what_was_found(folder):
+    text = str(add_library(NAME, source(folder)))
+    for part in (
+        "fake.dat (1 file read)",
+        "4 of each kind: dust (W / um); 7 wavelengths, 1 to 100 um",
+        "2: 0 90 deg",
+        "2 x 2: complete",
+        "4 spectra of nothing",
+        file_sha256(folder / "fake.dat"),
+        file_sha256(folder / "data" / "sed" / "test.fits"),
+    ):
+        assert part in text
+    holes = add_library(NAME, source(folder, "3 0 1\n3 90 1\n7 90 2\nend\n"))
+    assert "2 x 2: 1 of 4 not there" in str(holes)
+
+
+def test_the_record_says_what_it_was_made_from(folder):
+    report = add_library(NAME, source(folder))
+    record = json.loads(record_path(report.path).read_text())
+    assert record == stored_record(report.path)
+    assert record["source"] == str((folder / "fake.dat").resolve())
+    assert record["files"] == report.files
+    assert record["sha256"] == report.sha256
+    assert record["size"] == report.path.stat().st_size
+    assert record["axes"] == {"tau": [3.0, 7.0], "angle": [0.0, 90.0]}
+    assert record["summary"] == ["4 spectra of nothing"]
+    assert {"date", "version"} <= set(record)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("3 0 1.5\n", "fake.dat is truncated"),
+        ("3 0 x\nend\n", "fake.dat cannot be read as 'test.library': could not convert"),
+        ("3 0 1\n3 0 2\nend\n", "fake.dat cannot be read .* different in every row"),
+        ("end\n", "fake.dat cannot be read as 'test.library'"),
+        ("3 0 nan\nend\n", "NaN or infinity"),
+        ("3 0 1\n3 90\nend\n", "fake.dat cannot be read as 'test.library'"),
+    ],
+)
+def test_a_refused_library_leaves_the_old_one(folder, text, message):
+    before = add_library(NAME, source(folder))
+    path = source(folder, text)
+    with pytest.raises(DataError, match=message):
+        add_library(NAME, path)
+    assert names(folder) == ["test.fits", "test.fits.json"]
+    assert file_sha256(before.path) == before.sha256
+    assert state().state == "ok"
+
+
+def test_a_better_library_replaces_the_old_one(folder):
+    old = add_library(NAME, source(folder))
+    opened = open_library(old.path, NAME)
+    mark = fingerprint(NAME)
+    assert mark == old.sha256
+    new = add_library(NAME, source(folder, "3 0 9.5\nend\n"))
+    assert old.sha256 in new.replaced
+    assert "replaces" in str(new)
+    assert fingerprint(NAME) == new.sha256 != mark
+    # whoever works with the old one goes on with it
+    assert opened.spectrum("dust", 3) == pytest.approx(4.5)
+    assert open_library(new.path, NAME).n_rows == 1
+
+
+def test_the_same_files_give_the_same_fingerprint(folder):
+    path = source(folder)
+    assert add_library(NAME, path).sha256 == add_library(NAME, path).sha256
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError("No space left on device")])
+@pytest.mark.parametrize("place", ["written", "checked", "recorded"])
+def test_an_interrupted_conversion_changes_nothing(folder, monkeypatch, error, place):
+    before = add_library(NAME, source(folder))
+    path = source(folder, "3 0 9.5\nend\n")
+
+    def interrupt(*args, **kwargs):
+        raise error
+
+    where = {
+        "written": (table.os, "fsync"),
+        "checked": (register, "verify_library"),
+        "recorded": (register, "install"),
+    }[place]
+    with monkeypatch.context() as patch:
+        patch.setattr(*where, interrupt)
+        with pytest.raises((KeyboardInterrupt, OSError)):
+            add_library(NAME, path)
+    assert names(folder) == ["test.fits", "test.fits.json"]
+    assert file_sha256(before.path) == before.sha256
+    assert state().state == "ok"
+
+
+def test_what_a_killed_process_left_is_ignored_and_swept(folder):
+    report = add_library(NAME, source(folder))
+    left = report.path.with_name(f".{report.path.name}.1-abc.partial")
+    left.write_bytes(b"half")
+    assert locate(NAME) == report.path
+    assert state().state == "ok"
+    add_library(NAME, source(folder))
+    assert names(folder) == ["test.fits", "test.fits.json"]
+
+
+def test_a_process_that_dies_between_file_and_record_leaves_a_library_that_works(
+    folder, monkeypatch
+):
+    add_library(NAME, source(folder))
+    replace = sys.modules["miricigale.refdata.store"].os.replace
+
+    def die(old, new):
+        if str(new).endswith(".json"):
+            raise KeyboardInterrupt
+        replace(old, new)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("miricigale.refdata.store.os.replace", die)
+        with pytest.raises(KeyboardInterrupt):
+            add_library(NAME, source(folder, "3 0 9.5\nend\n"))
+    assert open_library(locate(NAME), NAME).spectrum("dust", 0) == pytest.approx(9.5)
+    assert state().state == "unchecked"
+    assert fingerprint(NAME) == file_sha256(locate(NAME))
+
+
+ADD = """
+import sys
+import numpy as np
+from miricigale.refdata import Resource, conf, registry
+from miricigale.sed.libraries import READERS, LibraryTable, add_library
+
+value, folder = float(sys.argv[1]), sys.argv[2]
+record = Resource("t", "user", "T", "L", "C", "S", file="sed/t.fits")
+registry.resources = lambda: {"t": record}
+READERS["t"] = lambda path: LibraryTable(
+    "t", np.linspace(1, 2, 1000), {"k": np.arange(200.0)},
+    {"dust": np.full((200, 1000), value)}, meta={"files": {"f": sys.argv[1]}},
+)
+with conf.set_temp("data_folder", folder):
+    print("ready", flush=True)
+    sys.stdin.readline()
+    for _ in range(15):
+        add_library("t", folder)
+"""
+
+
+def test_two_processes_may_add_at_once(tmp_path):
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", ADD, value, str(tmp_path)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for value in ("1", "2")
+    ]
+    for process in processes:
+        assert process.stdout.readline() == "ready\n"
+    for process in processes:
+        process.stdin.write("\n")
+        process.stdin.flush()
+    for process in processes:
+        _, errors = process.communicate(timeout=120)
+        assert process.returncode == 0, errors
+    path = tmp_path / "sed" / "t.fits"
+    library = verify_library(path, "t")
+    record = stored_record(path)
+    # one of the two won, and the record is of that one
+    assert record["sha256"] == file_sha256(path)
+    assert float(record["files"]["f"]) == library.spectra["dust"][0, 0]
+    assert not list(path.parent.glob(".*.partial"))
+
+
+def test_damage_is_told(folder):
+    report = add_library(NAME, source(folder))
+    whole = report.path.read_bytes()
+    report.path.write_bytes(whole[:5000])
+    row = state()
+    assert (row.state, row.bad) == ("damaged", True)
+    assert "test.fits" in row.message
+    other = bytearray(whole)
+    other[-2000] ^= 1
+    report.path.write_bytes(bytes(other))
+    assert state().state == "damaged"
+    # a whole library, but not the one of the record
+    write_library(read_fake(source(folder, "1 2 3\nend\n")), report.path)
+    assert (state().state, state().bad) == ("wrong checksum", True)
+    with pytest.raises(DataError, match="sha256 differs"):
+        locate(NAME, check=True)
+    record_path(report.path).write_text("{")
+    row = state()
+    assert (row.state, row.bad) == ("damaged", True)
+    assert "test.fits.json cannot be read" in row.message
+    record_path(report.path).unlink()
+    assert (state().state, state().bad) == ("unchecked", False)
+    report.path.write_text("something else")
+    assert state().state == "damaged"
+
+
+def test_the_fingerprint_is_that_of_the_content(folder):
+    report = add_library(NAME, source(folder))
+    write_library(read_fake(source(folder, "1 2 3\nend\n")), report.path)
+    assert fingerprint(NAME) == file_sha256(report.path) != report.sha256
+
+
+def test_names_and_readers_are_checked(folder, monkeypatch):
+    path = source(folder)
+    with pytest.raises(KeyError, match=r"no library 'ssp.bc03'; known: .*test.library"):
+        add_library("ssp.bc03", path)
+    with pytest.raises(DataError, match=r"no file or folder .*absent.dat"):
+        add_library(NAME, folder / "absent.dat")
+    monkeypatch.setitem(READERS, NAME, lambda path: make("other"))
+    with pytest.raises(ValueError, match="'reader' must be one that gives the library"):
+        add_library(NAME, path)
+    monkeypatch.setitem(READERS, NAME, lambda path: make(meta={}))
+    with pytest.raises(ValueError, match=r"'reader' must be .*checksums"):
+        add_library(NAME, path)
+    assert names(folder) == []
+
+
+def test_every_reader_has_a_record_of_a_user_library():
+    for name in READERS:
+        record = refdata.resource(name)
+        assert record.kind == "user"
+        assert record.file.endswith(".fits")
+        assert callable(register._reader(name))

@@ -1,0 +1,399 @@
+import gzip
+
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from miricigale.refdata.locate import conf
+from miricigale.sed import SEDModel
+from miricigale.sed.components import BC03Library, ConstantSFH
+from miricigale.sed.libraries import add_library
+from miricigale.sed.libraries.bc03 import read_bc03, read_ised
+from miricigale.utils.exceptions import DataError
+
+AGE = np.array([0.0, 125893.0, 1e6, 1e7, 1e8, 1e9, 1e10, 2e10])
+WAVE = np.concatenate([np.geomspace(91, 1e5, 200), [1.3e5, 2.6e5, 8e5, 1.6e6]])
+TEXT = "Padova (1994) + S. Charlot (1997). X=0.70, Y=0.28, Z={:g}"
+NAME = "bc2003_lr_m62_chab_ssp"
+
+
+def content(*, metallicity=0.02, law=0, slopes=(), age=AGE, wave=WAVE, text=TEXT):
+    """Numbers of a file of GALAXEV: light falls with age, beyond 1 um as a power of wavelength."""
+    level = 1e-3 * metallicity**-0.1 / (1 + age / 1e6)
+    spectra = (level[:, None] * np.minimum(wave / 1e4, (wave / 1e4) ** -3.5)).astype("f4")
+    n = age.size
+    mass = (1 - 0.045 * np.log10(1 + age / 1e4)).astype("f4")
+    remnants = (0.02 * np.log10(1 + age / 1e7)).astype("f4")
+    others = [np.full(n, i + 0.5, dtype="f4") for i in range(12)]
+    others[1], others[9] = mass, remnants
+    line = text.format(metallicity)
+    out = {"age": age.astype("f4"), "wave": wave.astype("f4"), "spectra": spectra}
+    return out | {"law": law, "slopes": slopes, "text": line, "vectors": others}
+
+
+def binary(parts, order="<", n_vectors=12):
+    """Fortran's unformatted records, as GALAXEV writes them."""
+
+    def record(*items):
+        data = b"".join(
+            x
+            if isinstance(x, bytes)
+            else np.asarray(x).astype(order + np.asarray(x).dtype.str[1:]).tobytes()
+            for x in items
+        )
+        size = np.array(len(data), dtype=order + "i4").tobytes()
+        return size + data + size
+
+    def integer(x):
+        return np.array(x, dtype="i4")
+
+    text = parts["text"].ljust(80).encode()
+    segments = [np.array([x, 0.1, 100, 0, 1, 1], dtype="f4") for x in parts["slopes"]]
+    one = np.ones(4, dtype="f4")
+    n = parts["age"].size
+    out = record(
+        *(integer(n), parts["age"], np.array([0.1, 100], dtype="f4")),
+        *(integer(len(segments)), *segments, np.array([1, 1.5, 0.67], dtype="f4")),
+        *(integer(parts["law"]), np.array(1e9, dtype="f4"), text, one, text, text),
+        *(integer(-2), integer(0)),
+    )
+    out += record(integer(parts["wave"].size), parts["wave"])
+    index = np.linspace(0, 1, 52).astype("f4")
+    for row in parts["spectra"]:
+        out += record(integer(row.size), row, integer(52), index)
+    for vector in parts["vectors"][:n_vectors]:
+        out += record(integer(n), vector)
+    return out
+
+
+def ascii_text(parts, n_vectors=12):
+    """Fortran's list-directed output: a new line for each record, wrapped at 80 columns or so."""
+
+    def record(*items):
+        words = []
+        for item in items:
+            item = np.atleast_1d(item)
+            form = "{:d}" if item.dtype.kind == "i" else "{:.8E}"
+            words += [form.format(x) for x in item.tolist()]
+        rows = [words[i : i + 5] for i in range(0, len(words), 5)]
+        return "".join("  " + "   ".join(row) + "\n" for row in rows)
+
+    n = parts["age"].size
+    out = record(n, parts["age"])
+    segments = [x for s in parts["slopes"] for x in (s, 0.1, 100.0, 0.0, 1.0, 1.0)]
+    out += record(0.1, 100.0, len(parts["slopes"]), *segments)
+    out += record(1.0, 1.5, 0.67, parts["law"], 1e9)
+    out += " 4*1.000000 -2 F\n" + 3 * (parts["text"] + "\n")
+    out += record(parts["wave"].size, parts["wave"])
+    for row in parts["spectra"]:
+        out += record(row.size, row, 52, np.linspace(0, 1, 52))
+    for vector in parts["vectors"][:n_vectors]:
+        out += record(n, vector)
+    return out.encode()
+
+
+FORMS = {
+    "little": (".ised", binary),
+    "big": (".ised", lambda parts: binary(parts, ">")),
+    "ascii": (".ised_ASCII", ascii_text),
+}
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(name=NAME, *, form="little", zipped=False, **changes):
+        ending, writer = FORMS[form]
+        data = writer(content(**changes))
+        path = tmp_path / f"{name}{ending}{'.gz' if zipped else ''}"
+        path.write_bytes(gzip.compress(data) if zipped else data)
+        return path
+
+    return write
+
+
+# ------------------------------------------------------------------------- one file
+
+
+@pytest.mark.parametrize("zipped", [False, True])
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(("name", "slopes"), [(NAME, ()), ("bc2003_lr_m62_salp_ssp", (1.35,))])
+def test_every_form_of_a_file_gives_what_was_written(write, form, zipped, name, slopes):
+    path = write(name, form=form, zipped=zipped, slopes=slopes)
+    got, want = read_ised(path), content(slopes=slopes)
+    np.testing.assert_array_equal(got.age, want["age"])
+    np.testing.assert_array_equal(got.wave, want["wave"])
+    np.testing.assert_allclose(got.spectra, want["spectra"], rtol=1e-7)
+    np.testing.assert_allclose(got.quantities["mass"], want["vectors"][1], rtol=1e-7)
+    np.testing.assert_allclose(got.quantities["sfr"], 2.5)
+    np.testing.assert_allclose(got.quantities["remnants"], want["vectors"][9], rtol=1e-7)
+    assert got.is_ssp
+    assert got.metallicity == 0.02
+    assert got.slopes == slopes
+    assert got.mass_limits == pytest.approx((0.1, 100))
+    assert got.texts == (TEXT.format(0.02),) * 3
+
+
+@pytest.mark.parametrize("form", ["little", "big"])
+def test_a_binary_file_cut_anywhere_is_refused(tmp_path, form):
+    data = FORMS[form][1](content())
+    rng = np.random.default_rng(11)
+    record = 4 * AGE.size + 12
+    needed = len(data) - 2 * record  # the last two vectors need not be there
+    for cut in [0, 3, 4, 50, *rng.integers(60, needed, 40), needed - record, needed - 1]:
+        path = tmp_path / f"cut_{cut}.ised"
+        path.write_bytes(data[:cut])
+        with pytest.raises(
+            DataError, match=rf"cut_{cut}\.ised cannot be read as a file of GALAXEV"
+        ):
+            read_ised(path)
+
+
+def test_a_text_file_cut_anywhere_is_refused(tmp_path):
+    data = ascii_text(content())
+    rng = np.random.default_rng(12)
+    for cut in [0, 1, *rng.integers(2, int(0.98 * len(data)), 40)]:
+        path = tmp_path / f"cut_{cut}.ised_ASCII"
+        path.write_bytes(data[:cut])
+        with pytest.raises(DataError, match=rf"cut_{cut}\.ised_ASCII cannot be read"):
+            read_ised(path)
+
+
+def test_a_compressed_file_cut_anywhere_is_refused(tmp_path):
+    data = gzip.compress(binary(content()))
+    for cut in (10, len(data) // 2, len(data) - 1):
+        path = tmp_path / "cut.ised.gz"
+        path.write_bytes(data[:cut])
+        with pytest.raises(DataError, match=r"cut\.ised\.gz cannot be read"):
+            read_ised(path)
+
+
+@pytest.mark.parametrize("data", [b"nothing of the kind\n" * 100, bytes(5000), b"12 of them\n"])
+def test_foreign_files_are_refused(tmp_path, data):
+    path = tmp_path / "foreign.ised"
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=r"foreign\.ised cannot be read as a file of GALAXEV"):
+        read_ised(path)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -1e-9])
+def test_impossible_spectra_are_refused(tmp_path, bad):
+    parts = content()
+    parts["spectra"][3, 50] = bad
+    path = tmp_path / "bad.ised"
+    path.write_bytes(binary(parts))
+    with pytest.raises(DataError, match=r"bad\.ised .* spectra must be (finite|0 or more)"):
+        read_ised(path)
+
+
+def test_a_record_of_another_length_is_refused(tmp_path):
+    parts = content()
+    parts["spectra"] = [row if i != 4 else row[:-1] for i, row in enumerate(parts["spectra"])]
+    path = tmp_path / "odd.ised"
+    path.write_bytes(binary(parts))
+    with pytest.raises(DataError, match=rf"record 7 must hold {WAVE.size} numbers, got"):
+        read_ised(path)
+
+
+def test_composites_of_the_authors(data_file):
+    """Exponential rates normalised to 1 Msun in infinite time, of a Chabrier IMF, solar."""
+    part = read_ised(data_file("bc03/bc2003_lr_m62_chab_tau3_dust00.ised.gz"))
+    assert part.spectra.shape == (221, 1221)
+    assert (part.law, part.tau, part.metallicity) == (4, 3e9, 0.02)
+    assert "exponential, tau 3 Gyr" in part.history
+    np.testing.assert_allclose(
+        part.quantities["sfr"][1:], np.exp(-part.age[1:] / 3e9) / 3e9, rtol=1e-6
+    )
+    # the bolometric flux is the integral of the spectrum
+    rows = part.age > 0
+    total = np.trapezoid(part.spectra[rows].astype(float), part.wave, axis=1)
+    np.testing.assert_allclose(total, part.quantities["bolometric"][rows], rtol=0.01)
+    delayed = read_ised(data_file("bc03/bc2003_lr_m62_chab_delayed1_dust00.ised.gz"))
+    assert "delayed, tau 1 Gyr" in delayed.history
+    with pytest.raises(DataError, match=r"tau3_dust00.* composite population .*exponential"):
+        read_bc03(data_file("bc03/bc2003_lr_m62_chab_tau3_dust00.ised.gz"))
+
+
+# ---------------------------------------------------------------------- a library
+
+
+@pytest.fixture
+def folder(write, tmp_path):
+    write("bc2003_lr_m42_chab_ssp", metallicity=0.004, form="big")
+    write("bc2003_lr_m72_chab_ssp", metallicity=0.05, form="ascii", zipped=True)
+    write(NAME)
+    (tmp_path / "bc2003_lr_m62_chab_ssp.1color").write_text("not a spectrum\n")
+    return tmp_path
+
+
+def test_a_folder_is_one_library(folder):
+    library = read_bc03(folder)
+    np.testing.assert_array_equal(library.values_of("metallicity"), [0.004, 0.02, 0.05])
+    assert library.meta["imf"] == "Chabrier"
+    assert library.meta["version"] == 2003
+    assert len(library.meta["files"]) == 3
+    for z in (0.004, 0.02, 0.05):
+        want = content(metallicity=z)
+        for i, age in enumerate(AGE.astype("f4").astype(float) / 1e6):
+            got = library.spectra["luminosity"][library.row(metallicity=z, age=age)]
+            known = np.isin(library.wave, want["wave"].astype(float) / 1e4)
+            assert known.sum() == WAVE.size
+            # Lsun/A in W/um, with the solar luminosity of GALAXEV
+            np.testing.assert_allclose(got[known], want["spectra"][i] * 3.826e30, rtol=1e-6)
+
+
+def test_living_mass_is_without_remnants(write):
+    library, parts = read_bc03(write()), content()
+    living = library.values["living"]
+    assert living[0] == 1.0
+    np.testing.assert_allclose(living[1:], (parts["vectors"][1] - parts["vectors"][9])[1:])
+    np.testing.assert_allclose(library.values["remnants"], parts["vectors"][9])
+    # the files of 2016 have living stars
+    age = np.where(AGE == 125893.0, 1e5, AGE)
+    library = read_bc03(write("bc2003_lr_xmiless_m62_chab_ssp", age=age))
+    np.testing.assert_allclose(library.values["living"][1:], content(age=age)["vectors"][1][1:])
+    assert library.meta["version"] == 2016
+    with pytest.raises(DataError, match="whether its mass of stars includes remnants"):
+        read_bc03(write(age=np.where(AGE == 125893.0, 3e5, AGE)))
+
+
+@pytest.mark.parametrize("remnants_counted", [True, False])
+def test_mass_of_gas_tells_what_the_mass_of_stars_is(tmp_path, remnants_counted):
+    parts = content(age=np.where(AGE == 125893.0, 3e5, AGE))
+    mass, remnants = parts["vectors"][1], parts["vectors"][9]
+    gas = 1 - mass - (0 if remnants_counted else remnants)
+    parts["vectors"] += [gas, np.ones_like(gas)]
+    path = tmp_path / f"{NAME}.ised"
+    path.write_bytes(binary(parts, n_vectors=14))
+    want = mass - remnants if remnants_counted else mass
+    np.testing.assert_allclose(read_bc03(path).values["living"][1:], want[1:])
+    parts["vectors"][12] = 2 * gas
+    path.write_bytes(binary(parts, n_vectors=14))
+    with pytest.raises(DataError, match="do not sum to 1 Msun"):
+        read_bc03(path)
+
+
+def test_far_infrared_is_dense_and_goes_on(write):
+    """Between sparse points and beyond the last a power law stays one."""
+    short = WAVE[WAVE < 3e5]
+    library = read_bc03(write(wave=short))
+    assert library.wave[-1] == pytest.approx(160.0)
+    far = library.wave > 10
+    assert np.diff(np.log(library.wave[far])).max() < 1 / 30 + 1e-9
+    row = library.spectra["luminosity"][3].astype(float)
+    slope = np.diff(np.log(row[far])) / np.diff(np.log(library.wave[far]))
+    np.testing.assert_allclose(slope, -3.5, atol=2e-4)
+    assert "continued from 26 to 160 um" in library.summary
+
+
+def test_names_of_2016_and_a_metallicity_from_the_name(write):
+    path = write("bc2003_hr_stelib_m52_chab_ssp", text="no metallicity here")
+    assert read_bc03(path).values_of("metallicity") == [0.008]
+    path = write("bc2003_hr_xmiless_m162_kroup_ssp", metallicity=0.019, slopes=(0.3, 1.3))
+    library = read_bc03(path)
+    assert (library.meta["imf"], library.values_of("metallicity")[0]) == ("Kroupa", 0.019)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "match"),
+    [
+        (NAME, {"metallicity": 0.008}, "states Z = 0.008, but its name .m62. means Z = 0.02"),
+        ("mine_chab", {"text": "nothing"}, "states no metallicity"),
+        ("bc2003_lr_m62_salp_ssp", {}, "holds a Chabrier IMF, but its name means Salpeter"),
+        (NAME, {"slopes": (1.35,)}, "holds a Salpeter IMF, but its name means Chabrier"),
+        ("bc2003_lr_m62_ssp", {"slopes": (0.3, 1.3)}, "names no IMF"),
+        (NAME, {"law": 6}, "composite population .delayed, tau 1 Gyr.*wanted a single burst"),
+    ],
+)
+def test_files_that_contradict_themselves_are_refused(write, name, changes, match):
+    with pytest.raises(DataError, match=match):
+        read_bc03(write(name, **changes))
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "match"),
+    [
+        ("bc2003_hr_m72_chab_ssp", {"wave": WAVE[::2]}, "are not one set: .* wavelengths"),
+        ("bc2003_lr_m72_salp_ssp", {"slopes": (1.35,)}, "are not one set: .* IMF"),
+        ("bc2003_lr_m72_chab_ssp", {"age": np.append(AGE, 3e10)}, "are not one set: .* ages"),
+        ("copy_m72_chab", {"metallicity": 0.02, "text": "Z=0.02"}, "but its name"),
+    ],
+)
+def test_mixtures_are_refused(write, tmp_path, name, changes, match):
+    write()
+    write(name, **({"metallicity": 0.05} | changes))
+    with pytest.raises(DataError, match=match):
+        read_bc03(tmp_path)
+
+
+def test_the_same_metallicity_twice_is_refused_but_a_pattern_picks_one(write, tmp_path):
+    write()
+    write(form="ascii")
+    with pytest.raises(DataError, match=r"the same metallicity as bc2003_lr_m62_chab_ssp\.ised,"):
+        read_bc03(tmp_path)
+    assert len(read_bc03(tmp_path / "*_ssp.ised").meta["files"]) == 1
+    assert len(read_bc03([tmp_path / f"{NAME}.ised"]).meta["files"]) == 1
+    with pytest.raises(DataError, match=r"wanted files .*got none"):
+        read_bc03(tmp_path / "*.none")
+
+
+# ------------------------------------------------------------------ the component
+
+
+@pytest.fixture
+def registered(folder, tmp_path):
+    with conf.set_temp("data_folder", str(tmp_path / "data")):
+        add_library("ssp.bc03_user", folder)
+        yield BC03Library()
+
+
+def test_component_gives_the_table_of_each_metallicity(registered):
+    want = content(metallicity=0.004)
+    age, spectra, living = registered.table(0.004)
+    np.testing.assert_allclose(age, AGE / 1e6, rtol=1e-6)
+    visual = np.searchsorted(registered.nodes(), 0.55)
+    wave = registered.nodes()[visual]
+    level = np.interp(wave, want["wave"] / 1e4, want["spectra"][4]) * 3.826e30
+    assert spectra[4, visual] == pytest.approx(level, rel=1e-3)
+    np.testing.assert_allclose(living, read_bc03_living(want), rtol=1e-6)
+    values = {n: p.default for n, p in registered.parameters.items()}
+    assert registered.metallicities() == (0.004, 0.02, 0.05)
+    assert registered.invalid(values) is None
+    assert "must be one of 0.004, 0.02, 0.05, got 0.008" in registered.invalid(
+        values | {"metallicity": 0.008}
+    )
+    assert registered.settings["imf"] == registered.imf == "Chabrier"
+    assert "Chabrier" in registered.library
+
+
+def read_bc03_living(parts):
+    out = parts["vectors"][1] - parts["vectors"][9]
+    out[0] = 1.0
+    return out
+
+
+def test_ionising_photons_of_a_ramp(registered):
+    """L = c lambda below 1 um: photons c (l^3 - l0^3) / (3 h c) below the Lyman limit."""
+    got = registered.ionizing(0.02)
+    level = 1e-3 * 0.02**-0.1 / (1 + AGE / 1e6) * 3.826e30
+    hc = 6.62607015e-34 * 2.99792458e14
+    want = level * (0.0912**3 - 0.0091**3) / 3 / hc
+    np.testing.assert_allclose(got, want, rtol=1e-5)
+
+
+def test_whole_models_use_the_library(registered):
+    model = SEDModel([ConstantSFH(age=0.1), registered])
+    table = QTable({"redshift": [0.5, 0.5, 0.5], "metallicity": [0.02, 0.004, 0.01]})
+    fluxes = model.fluxes(table, ["megacam.r", "irac.ch1"])
+    flux = fluxes["megacam.r"].value
+    # the made-up light goes as metallicity^-0.1
+    assert flux[1] / flux[0] == pytest.approx(5**0.1, rel=1e-5)
+    assert np.isnan(flux[2])
+    assert fluxes["flags"][2] > 0
+
+
+def test_without_the_files_the_error_says_what_to_do(tmp_path):
+    with conf.set_temp("data_folder", str(tmp_path)):
+        part = BC03Library()
+        assert "BC03Library" in repr(part)
+        with pytest.raises(DataError, match=r"miricigale data add ssp\.bc03_user PATH"):
+            part.nodes()

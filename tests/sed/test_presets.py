@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+
+from miricigale.refdata import conf, resource
+from miricigale.sed import SEDModel
+from miricigale.sed.libraries import LibraryTable, add_library, write_library
+from miricigale.utils.exceptions import DataError
+
+
+@pytest.fixture
+def folder(tmp_path):
+    with conf.set_temp("data_folder", str(tmp_path)):
+        yield tmp_path
+
+
+def names(model):
+    return {c.role: c.name for c in model.components}
+
+
+def test_bundled_tables_where_nothing_is_registered(folder):
+    model = SEDModel.yang2021()
+    assert names(model)["stellar"] == "bc03"
+    assert names(model)["dust"] == "dl07_alpha"
+    assert names(model)["agn"] == "parametric_torus"
+    assert all("is not registered" in note for note in model.meta["libraries"])
+    assert set(model.resources) == {"ssp.bc03", "dust.dl07", "torus.parametric"}
+
+
+def test_registered_dust_is_taken_and_said(folder, data_file):
+    add_library("dust.dale2014", data_file("dale2014"))
+    model = SEDModel.yang2021()
+    assert names(model)["dust"] == "dale2014"
+    assert "dust: dust.dale2014" in model.meta["libraries"]
+    assert any("Dale" in text for text in model.meta["citations"])
+    assert "dust.dale2014" in model.resources
+    assert names(SEDModel.yang2021(libraries="bundled"))["dust"] == "dl07_alpha"
+    # the paper's grid can be made with it
+    axes = SEDModel.yang2021_axes("galaxy") | {"redshift": [1.0]}
+    assert model.grid(axes, ["miri.f770w"]).n_galaxies == 560
+
+
+def test_a_library_without_the_papers_values_is_not_taken_and_why(folder, data_file):
+    add_library("torus.skirtor2016", data_file("skirtor2016/SKIRTOR.fits.gz"))
+    model = SEDModel.yang2021()
+    assert names(model)["agn"] == "parametric_torus"
+    (note,) = (text for text in model.meta["libraries"] if text.startswith("torus"))
+    assert "torus.skirtor2016 lacks the paper's torus" in note
+    assert "q" in note
+
+
+def test_a_torus_library_with_the_papers_values_is_taken(folder):
+    """A complete little library, of a made-up spectrum."""
+    wave = np.geomspace(1e-3, 1e3, 132)
+    axes = {"tau97": [3.0, 5.0, 7.0, 9.0, 11.0], "p": [1.0], "q": [1.0], "opening_angle": [40.0]}
+    axes |= {"radius_ratio": [20.0], "inclination": [0.0, 70.0]}
+    rows = np.array(np.meshgrid(*axes.values(), indexing="ij")).reshape(len(axes), -1)
+    spectra = {n: np.tile(np.exp(-np.log(wave / x) ** 2) / wave, (rows.shape[1], 1))
+               for n, x in (("disk", 0.2), ("dust", 20.0))}  # fmt: skip
+    table = LibraryTable(
+        name="torus.skirtor2016",
+        wave=wave,
+        axes=dict(zip(axes, rows, strict=True)),
+        spectra=spectra,
+    )
+    write_library(table, folder / resource("torus.skirtor2016").file)
+    model = SEDModel.yang2021()
+    assert names(model)["agn"] == "skirtor2016"
+    got = model.derived(frac_agn=0.5, age=1.0)
+    assert got["frac_agn_dust"].value == pytest.approx(0.5)
+    with pytest.raises(ValueError, match=r"'tau97' must be one of 3, 5, 7, 9, 11"):
+        model.evaluate(frac_agn=0.5, tau97=4.0)
+
+
+def test_unknown_choice_and_absent_library_are_refused(folder):
+    with pytest.raises(ValueError, match="'libraries' must be one of"):
+        SEDModel.yang2021(libraries="mine")
+    model = SEDModel.from_dict(
+        {"components": [{"name": n} for n in ("delayed", "bc03", "calzetti", "dale2014")]}
+    )
+    with pytest.raises(DataError, match=r"data add dust\.dale2014"):
+        model.evaluate(age=1.0)
+
+
+def test_xrays_of_the_paper():
+    """L(2-10 keV) = 10^42.5 erg/s at z = 2 is about 1e-16 erg/s/cm2 in the paper's band, halved."""
+    model = SEDModel.yang2021(xray=True)
+    got = model.derived(frac_agn=0.5, age=1.0, redshift=2.0, mass=1e10)
+    scale = 10**42.5 / got["l_2_10kev"].to_value("erg/s")
+    assert 0.7e-16 < scale * got["xray_flux"].to_value("erg / (s cm2)") < 1.4e-16

@@ -1,0 +1,226 @@
+"""X-rays against closed forms and published numbers."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.cosmology import FlatLambdaCDM
+from astropy.tests.helper import assert_quantity_allclose
+from scipy.integrate import quad
+
+from miricigale.sed import COSMOLOGY
+from miricigale.sed.component import COMPONENTS
+from miricigale.sed.components import XRay
+from miricigale.sed.xray import band_luminosity, stern2015, xray_flux
+
+ERG = u.erg / u.s
+CGS = u.erg / u.s / u.cm**2
+FULL, HARD = [0.5, 7] * u.keV, [2, 10] * u.keV
+
+
+def values_of(component, **changes):
+    return {name: par.default for name, par in component.parameters.items()} | changes
+
+
+# ----------------------------------------------------------------------------- Stern 2015
+
+
+@pytest.mark.parametrize(
+    ("log_six", "log_x"),
+    # 40.981 + 1.024 x - 0.047 x^2 by hand
+    [(41, 40.981), (42, 41.958), (44, 43.630), (46, 44.926), (47, 45.433)],
+)
+def test_stern_by_hand(log_six, log_x):
+    got = stern2015(10.0**log_six * ERG).to_value(ERG)
+    assert np.log10(got) == pytest.approx(log_x, abs=1e-9)
+
+
+def test_stern_agrees_with_the_relation_of_fiore_2009_at_seyferts():
+    """log L_X = log L(5.8 um) - 0.3 below 43.04."""
+    got = np.log10(stern2015([1e42, 1e43] * ERG).to_value(ERG))
+    np.testing.assert_allclose(got, [41.7, 42.7], atol=0.3)
+
+
+def test_stern_agrees_with_the_bilinear_relation_of_quasars():
+    """Chen et al. 2017: log L_X = 0.84 (log L_6um - 45) + 44.60 below 44.79, 0.40 and 44.51 above."""
+    for log_six in (44.0, 44.5, 45.0, 45.5, 46.0):
+        if log_six < 44.79:
+            want = 0.84 * (log_six - 45) + 44.60
+        else:
+            want = 0.40 * (log_six - 45) + 44.51
+        got = np.log10(stern2015(10**log_six * ERG).to_value(ERG))
+        assert got == pytest.approx(want, abs=0.3)
+
+
+def test_stern_takes_any_shape_and_no_light_is_no_x_ray():
+    got = stern2015([[0.0, 1e44], [1e45, 0.0]] * ERG)
+    assert got.shape == (2, 2)
+    assert got[0, 0] == 0 == got[1, 1]
+    assert np.all(np.isfinite(got))
+
+
+def test_stern_refuses():
+    with pytest.raises(ValueError, match=r"'l_6um' must be >= 0, got -1"):
+        stern2015([1.0, -1.0] * u.W)
+    with pytest.raises(u.UnitsError, match="'l_6um' must be"):
+        stern2015(1e44)
+    with pytest.raises(u.UnitsError, match="'l_6um' must be convertible"):
+        stern2015(1 * u.Jy)
+
+
+# ---------------------------------------------------------------------------------- bands
+
+
+def test_bands_of_equal_power_per_decade():
+    """Gamma = 2: in proportion to the logarithm of the band's ends."""
+    got = band_luminosity(1 * u.W, from_band=HARD, to_band=FULL, photon_index=2.0)
+    assert_quantity_allclose(got, np.log(7 / 0.5) / np.log(10 / 2) * u.W, rtol=1e-14)
+
+
+@pytest.mark.parametrize("index", [0.5, 1.4, 1.8, 1.999999, 2.000001, 2.5, 3.0])
+def test_bands_by_integration(index):
+    ends = [quad(lambda e: e ** (1 - index), *band)[0] for band in ((0.5, 7), (2, 10))]
+    got = band_luminosity(1 * u.W, from_band=HARD, to_band=FULL, photon_index=index)
+    assert_quantity_allclose(got, ends[0] / ends[1] * u.W, rtol=1e-10)
+
+
+def test_bands_there_and_back_and_in_parts():
+    there = band_luminosity(3 * ERG, from_band=HARD, to_band=FULL)
+    assert_quantity_allclose(band_luminosity(there, from_band=FULL, to_band=HARD), 3 * ERG)
+    parts = [[0.5, 2] * u.keV, [2000, 7000] * u.eV]
+    total = sum(band_luminosity(3 * ERG, from_band=HARD, to_band=part) for part in parts)
+    assert_quantity_allclose(total, there)
+
+
+def test_soft_over_hard_by_hand():
+    """(2^0.2 - 0.5^0.2) / (10^0.2 - 2^0.2) = 0.64 at Gamma 1.8."""
+    got = band_luminosity(1 * CGS, from_band=HARD, to_band=[0.5, 2] * u.keV)
+    want = (2**0.2 - 0.5**0.2) / (10**0.2 - 2**0.2)
+    assert_quantity_allclose(got, want * CGS)
+    assert want == pytest.approx(0.64, abs=0.01)
+
+
+@pytest.mark.parametrize("band", [[7, 0.5] * u.keV, [0, 2] * u.keV, [1, 2, 3] * u.keV])
+def test_bands_are_checked(band):
+    with pytest.raises(ValueError, match="'to_band' must be"):
+        band_luminosity(1 * u.W, from_band=HARD, to_band=band)
+    with pytest.raises(ValueError, match="'band' must be"):
+        xray_flux(1 * u.W, 1.0, band=band)
+
+
+# ----------------------------------------------------------------------------------- flux
+
+
+def test_no_k_correction_for_equal_power_per_decade():
+    far = COSMOLOGY.luminosity_distance(2.0)
+    got = xray_flux(1e44 * ERG, 2.0, band=HARD, photon_index=2.0)
+    assert_quantity_allclose(got, 1e44 * ERG / (4 * np.pi * far**2), rtol=1e-12)
+    assert got.unit == CGS
+
+
+@pytest.mark.parametrize("index", [1.4, 1.8, 2.3])
+@pytest.mark.parametrize("z", [0.1, 1.0, 4.0])
+def test_flux_is_the_power_of_the_rest_frame_band(index, z):
+    """What is seen in 0.5-7 keV left in 0.5 (1 + z) to 7 (1 + z) keV."""
+    rest = band_luminosity(1e43 * ERG, from_band=HARD, to_band=(1 + z) * FULL, photon_index=index)
+    far = COSMOLOGY.luminosity_distance(z)
+    got = xray_flux(1e43 * ERG, z, photon_index=index)
+    assert_quantity_allclose(got, rest / (4 * np.pi * far**2), rtol=1e-10)
+
+
+def test_flux_limit_of_yang_2021():
+    """
+    MIRI is 50 % complete near 1e-16 erg/s/cm2, L_X 10^42.5 at z = 2 (Gamma 1.8, flux halved).
+
+    0.90e-16 by the closed form: 10^42.5 / (4 pi d^2) x 1.387 x 3^0.2 / 2.
+    """
+    flux = xray_flux(10**42.5 * ERG, 2.0, transmission=0.5)
+    assert np.log10(flux.to_value(CGS)) == pytest.approx(-16.0, abs=0.1)
+
+
+def test_flux_at_redshift_zero_is_at_ten_parsec():
+    got = xray_flux(1 * u.W, 0.0, band=HARD)
+    assert_quantity_allclose(got, 1 * u.W / (4 * np.pi * (10 * u.pc) ** 2))
+
+
+def test_flux_takes_arrays_cosmology_and_transmission():
+    other = FlatLambdaCDM(H0=50, Om0=1.0)
+    z, power = np.array([0.5, 1.0, 3.0]), [1e42, 1e43, 1e44] * ERG
+    got = xray_flux(power, z, cosmology=other, transmission=0.3)
+    each = [xray_flux(p, float(s), cosmology=other) for p, s in zip(power, z, strict=True)]
+    assert_quantity_allclose(got, 0.3 * u.Quantity(each))
+    # Einstein-de Sitter: d_L = (2 c / H0) (1 + z) (1 - 1 / sqrt(1 + z))
+    far = 2 * 299792.458 / 50 * (1 + z) * (1 - 1 / np.sqrt(1 + z)) * u.Mpc
+    want = band_luminosity(power, from_band=HARD, to_band=FULL) * (1 + z) ** 0.2
+    assert_quantity_allclose(got, 0.3 * want / (4 * np.pi * far**2), rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"redshift": -0.1}, "'redshift' must be >= 0"),
+        ({"transmission": 1.5}, "'transmission' must be from 0 to 1"),
+        ({"photon_index": np.nan}, "'photon_index' must be finite"),
+    ],
+)
+def test_flux_refuses(changes, match):
+    arguments = {"redshift": 1.0} | changes
+    with pytest.raises(ValueError, match=match):
+        xray_flux(1 * u.W, **arguments)
+
+
+# ------------------------------------------------------------------------------ component
+
+
+def test_component_is_known_by_name():
+    part = COMPONENTS.get("xray")()
+    assert isinstance(part, XRay)
+    assert part.settings == {"law": "stern2015"}
+    assert len(part.nodes()) == 0
+
+
+def test_component_equals_the_functions_for_any_array():
+    part = XRay(xray_transmission=0.5)
+    z = np.array([0.3, 1.0, 2.0, 5.0])
+    six = np.array([0.0, 1e36, 3e37, 1e39])
+    far = COSMOLOGY.luminosity_distance(z).to_value(u.m)
+    got = part.derived(six, z, far, values_of(part))
+    power = stern2015(six * u.W)
+    assert_quantity_allclose(got["l_2_10kev"] * part.columns["l_2_10kev"][0], power)
+    flux = xray_flux(power, z, transmission=0.5)
+    assert_quantity_allclose(got["xray_flux"] * part.columns["xray_flux"][0], flux)
+    assert got["xray_flux"][0] == 0.0
+    assert set(got) == set(part.columns)
+    one = part.derived(six[2], z[2], far[2], values_of(part))
+    assert one["xray_flux"] == pytest.approx(got["xray_flux"][2])
+
+
+def test_component_takes_values_that_change_along_the_rows():
+    part = XRay()
+    index, high = np.array([1.4, 2.0]), np.array([2.0, 10.0])
+    got = part.derived(
+        np.full(2, 1e37), 1.0, 1e26, values_of(part, photon_index=index, xray_high=high)
+    )
+    for i in range(2):
+        one = part.derived(
+            1e37, 1.0, 1e26, values_of(part, photon_index=index[i], xray_high=high[i])
+        )
+        assert got["xray_flux"][i] == pytest.approx(one["xray_flux"])
+
+
+def test_relation_is_not_linear_in_luminosity():
+    """Ten times the light at 1e44 erg/s: 10^(1.024 - 0.047 (16 - 9)) = 4.95 times the X-rays."""
+    part = XRay()
+    got = part.derived(np.array([1e37, 1e38]), 1.0, 1e26, values_of(part))["l_2_10kev"]
+    assert got[1] / got[0] == pytest.approx(10 ** (1.024 - 0.047 * 7), rel=1e-10)
+
+
+def test_empty_band_is_invalid():
+    part = XRay()
+    assert part.invalid(values_of(part)) is None
+    why = part.invalid(values_of(part, xray_low=8.0))
+    assert why == "'xray_high' must be above 'xray_low', got 8 to 7 keV"
+
+
+def test_component_refuses_unknown_laws():
+    with pytest.raises(ValueError, match="'law' must be one of stern2015, got 'mateos2015'"):
+        XRay(law="mateos2015")

@@ -1,0 +1,121 @@
+"""The data command: list, check and add, their output and exit statuses."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from miricigale.cli import main
+from miricigale.refdata import Resource, conf, locate, registry
+from miricigale.refdata.locate import file_sha256
+from miricigale.sed.libraries import READERS, LibraryTable
+
+NAME = "test.library"
+
+
+def read(path):
+    spectra = np.loadtxt(path, ndmin=2)
+    return LibraryTable(
+        name=NAME,
+        wave=np.arange(1.0, 1.0 + spectra.shape[1]),
+        axes={"k": np.arange(float(len(spectra)))},
+        spectra={"dust": spectra},
+        meta={"files": {path.name: file_sha256(path)}},
+        summary=("numbers of nobody",),
+    )
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.delenv("MIRICIGALE_DATA", raising=False)
+    record = Resource(NAME, "user", "A test", "Free", "Nobody 2030", "a page", file="sed/x.fits")
+    known = registry.resources()
+    everything = {name: known[name] for name in ("ssp.bc03", "filters.sedpy")} | {NAME: record}
+    for module in (
+        registry,
+        sys.modules["miricigale.refdata.check"],
+        sys.modules["miricigale.refdata"],
+    ):
+        monkeypatch.setattr(module, "resources", lambda: everything)
+    monkeypatch.setitem(READERS, NAME, read)
+    (tmp_path / "good.txt").write_text("1 2 3\n4 5 6\n")
+    (tmp_path / "bad.txt").write_text("1 2 3\nnumbers?\n")
+    with conf.set_temp("data_folder", str(tmp_path / "data")):
+        yield tmp_path
+
+
+def test_a_library_is_added_listed_and_checked(folder, capsys):
+    assert main(["data", "list", NAME]) == 0
+    text = capsys.readouterr().out
+    assert "test.library (user): absent; miricigale data add test.library PATH" in text
+    assert "source: a page" in text
+    assert main(["data", "add", NAME, str(folder / "good.txt")]) == 0
+    captured = capsys.readouterr()
+    assert "numbers of nobody" in captured.out
+    assert "2 of each kind: dust" in captured.out
+    assert file_sha256(folder / "good.txt") in captured.out
+    # no terminal, no bar
+    assert captured.err == ""
+    path = locate(NAME)
+    assert main(["data", "list", NAME]) == 0
+    text = capsys.readouterr().out
+    for part in (f"test.library (user): {path}", "A test", "licence: Free", "cite: Nobody 2030"):
+        assert part in text
+    assert main(["data", "check"]) == 0
+    assert f"ok              {path}" in capsys.readouterr().out
+    assert main(["data", "add", NAME, str(folder / "good.txt")]) == 0
+    assert "replaces" in capsys.readouterr().out
+
+
+def test_damage_is_an_exit_status(folder, capsys):
+    main(["data", "add", NAME, str(folder / "good.txt")])
+    path = locate(NAME)
+    path.write_bytes(path.read_bytes()[:-2880])
+    capsys.readouterr()
+    assert main(["data", "check"]) == 1
+    captured = capsys.readouterr()
+    assert f"damaged         {path}" in captured.out
+    assert captured.err == f"miricigale: not as they should be: {NAME}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([NAME, "bad.txt"], "bad.txt cannot be read as 'test.library': "),
+        ([NAME, "absent.txt"], "no file or folder "),
+        (["nothing", "good.txt"], "no resource 'nothing'; known: "),
+        (["filters.sedpy", "good.txt"], "'name' must be a resource that is a file"),
+        (["ssp.bc03", "good.txt"], "good.txt is not the file that the record of 'ssp.bc03'"),
+    ],
+)
+def test_refusals_are_one_sentence_on_stderr(folder, capsys, arguments, message):
+    name, path = arguments
+    assert main(["data", "add", name, str(folder / path)]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("miricigale: ")
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+    assert not (folder / "data" / "sed" / "x.fits").exists()
+
+
+def test_a_stop_changes_nothing(folder, capsys, monkeypatch):
+    def stop(path):
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(READERS, NAME, stop)
+    assert main(["data", "add", NAME, str(folder / "good.txt")]) == 130
+    assert "nothing was changed" in capsys.readouterr().err
+
+
+def test_steps_are_shown_on_a_terminal(folder, capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert main(["data", "add", NAME, str(folder / "good.txt")]) == 0
+    text = capsys.readouterr().err
+    assert "test.library: reading" in text
+    assert "test.library: checking" in text
+
+
+def test_an_unknown_name_is_told(folder, capsys):
+    assert main(["data", "list", "nonsense"]) == 1
+    assert "no resource has 'nonsense' in its name" in capsys.readouterr().err

