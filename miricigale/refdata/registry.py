@@ -102,9 +102,9 @@ class Registry:
         self.kind = kind
         self._loaders = {}
 
-    def register(self, name, loader, **metadata):
-        """Register ``loader(name)``; a second registration of a name is an error."""
-        if name in self._loaders:
+    def register(self, name, loader, *, replace=False, **metadata):
+        """Register ``loader(name)``; a name that is there is an error unless ``replace``."""
+        if name in self._loaders and not replace:
             msg = f"{self.kind} {name!r} is registered already"
             raise ValueError(msg)
         self._loaders[name] = (loader, metadata)

@@ -134,6 +134,7 @@ class Chain:
     def _caches(self):
         self._table = functools.lru_cache(maxsize=8)(self._make_table)
         self._factors = functools.lru_cache(maxsize=256)(self._make_factors)
+        self._gas_factors = functools.lru_cache(maxsize=256)(self._make_gas_factor)
         self._stars = functools.lru_cache(maxsize=64)(self._make_stars)
         self._starlight = functools.lru_cache(maxsize=256)(self._make_starlight)
         self._dust = functools.lru_cache(maxsize=256)(self._make_dust)
@@ -229,6 +230,8 @@ class Chain:
                     for w in (young[i], old[i])
                 ]
                 parts = [part * passed + glow for part, glow in zip(parts, gas, strict=True)]
+            for part in (*parts, *(glow for glow in gas if glow is not None)):
+                part.flags.writeable = False
             yield Stars(
                 young=parts[0],
                 old=parts[1],
@@ -260,14 +263,31 @@ class Chain:
         """Transmissions for young and old stars, by the key of ``attenuation``."""
         return self._factors(key)
 
+    def gas_factor(self, key):
+        """Transmission for gas by the key of ``attenuation``; None if that of the stars."""
+        return self._gas_factors(key)
+
+    def _make_gas_factor(self, key):
+        attenuation = self.by_role["attenuation"]
+        if attenuation is None or self.by_role["nebular"] is None:
+            return None
+        return attenuation.gas_factor(self.wave, self._dict(key, "attenuation"))
+
     def _make_starlight(self, star_key, key):
-        stars = self._stars(star_key)
+        return self.attenuate(self._stars(star_key), key)
+
+    def attenuate(self, stars, key):
+        """`Attenuated` light of `Stars` behind the dust of a key of ``attenuation``."""
         young, old = self._factors(key)
         intrinsic = stars.young + stars.old
         light = stars.young * young + stars.old * old
         nebular = None
         if stars.nebular_young is not None:
-            nebular = stars.nebular_young * young + stars.nebular_old * old
+            gas = self.gas_factor(key)
+            nebular = stars.nebular_young * (young if gas is None else gas)
+            nebular += stars.nebular_old * (old if gas is None else gas)
+            if gas is not None:
+                light = light - stars.nebular_young * young - stars.nebular_old * old + nebular
         absorbed = float(self.weights @ (intrinsic - light)) + stars.dust_power
         return Attenuated(light, intrinsic, nebular, absorbed)
 
@@ -281,7 +301,9 @@ class Chain:
             return np.zeros(self.wave.size)
         template = self.by_role["dust"].template(self.wave, **self._dict(key, "dust"))
         # one watt on this grid too, where the step at the first node is a slope
-        return template / (self.weights @ template)
+        template = template / (self.weights @ template)
+        template.flags.writeable = False
+        return template
 
     def dust(self, values):
         """Dust spectrum in W/um for one watt; zeros without a dust component."""
@@ -321,17 +343,21 @@ class Chain:
     def _make_sky(self, redshift, key):
         observed = self.wave * (1.0 + redshift)
         igm, foreground = self.by_role["igm"], self.by_role["foreground"]
-        out = np.ones(self.wave.size) if igm is None else igm.transmission(observed, redshift)
+        values = self._dict(key, "igm", "foreground")
+        out = np.ones(self.wave.size)
+        if igm is not None:
+            own = {name: values[name] for name in igm.parameters}
+            out = igm.transmission(observed, redshift, **own)
         if foreground is not None:
-            out = out * foreground.transmission(observed, self._dict(key, "foreground"))
+            out = out * foreground.transmission(observed, values)
         return out
 
     def sky(self, values):
         """Transmission between the source and us at every rest wavelength."""
-        return self._sky(values["redshift"], self.key(values, "foreground"))
+        return self._sky(values["redshift"], self.key(values, "igm", "foreground"))
 
     def sky_of(self, redshift, key):
-        """The same by redshift and the key of ``foreground``."""
+        """The same by redshift and the key of ``igm`` and ``foreground``."""
         return self._sky(redshift, key)
 
     # --------------------------------------------------------------- derived values

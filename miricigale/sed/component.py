@@ -3,6 +3,7 @@
 import functools
 
 from miricigale.refdata import Registry, locate
+from miricigale.refdata.locate import fingerprint_of
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import argument_error
 
@@ -26,8 +27,30 @@ COMPONENTS = Registry("component")
 
 
 def register(cls):
-    """Class decorator: make a component known by its ``name``."""
-    COMPONENTS.register(cls.name, lambda _: cls, role=cls.role, reference=cls.reference)
+    """
+    Class decorator: make a component known by its ``name``.
+
+    A class of the same module and name takes the place of the former: a notebook's cell may be
+    run again.
+
+    Raises
+    ------
+    ValueError
+        If it has no name, no known role, or the name of another component.
+    """
+    if not cls.name:
+        raise argument_error("name", "a name", f"{cls.name!r} of {cls.__name__}")
+    if cls.role not in ROLES:
+        raise argument_error(
+            "role", f"one of {', '.join(ROLES)}", f"{cls.role!r} of {cls.__name__}"
+        )
+    same = False
+    if cls.name in COMPONENTS:
+        old = COMPONENTS.get(cls.name)
+        same = (old.__module__, old.__qualname__) == (cls.__module__, cls.__qualname__)
+    COMPONENTS.register(
+        cls.name, lambda _: cls, replace=same, role=cls.role, reference=cls.reference
+    )
     return cls
 
 
@@ -80,6 +103,12 @@ class Component:
                 msg = f"{type(self).__name__} has no parameter {name!r}; known: {names}"
                 raise TypeError(msg)
             self.__dict__[name] = known[name].check(value)
+
+    def __setattr__(self, name, value):
+        if name in type(self).all_options():
+            msg = f"option {name!r} is set when the component is made"
+            raise AttributeError(msg)
+        super().__setattr__(name, value)
 
     @classmethod
     def declared(cls):
@@ -134,7 +163,18 @@ class Component:
     @functools.cached_property
     def path(self):
         """Path of the file of `resource`, found on first use."""
-        return str(locate(self.resource))
+        path = locate(self.resource)
+        # what is read from now on: another file may take its place later
+        self.__dict__["fingerprint"] = fingerprint_of(path)
+        return str(path)
+
+    @functools.cached_property
+    def fingerprint(self):
+        """Checksum of the data that the component reads, "" if it reads none."""
+        if not self.resource:
+            return ""
+        _ = self.path
+        return self.__dict__["fingerprint"]
 
     @property
     def library(self):

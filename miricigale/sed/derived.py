@@ -36,8 +36,12 @@ DERIVED = {
     "stellar_mass": Derived(MASS, "mass of living stars, without remnants"),
     "stellar_mass_formed": Derived(MASS, "mass of all stars ever formed"),
     "sfr": Derived(_RATE, "star-formation rate of the last 1 Myr"),
-    "sfr_10myr": Derived(_RATE, "mean star-formation rate of the last 10 Myr"),
-    "sfr_100myr": Derived(_RATE, "mean star-formation rate of the last 100 Myr"),
+    "sfr_10myr": Derived(
+        _RATE, "mean star-formation rate of the last 10 Myr, or since the first stars"
+    ),
+    "sfr_100myr": Derived(
+        _RATE, "mean star-formation rate of the last 100 Myr, or since the first stars"
+    ),
     "dust_luminosity": Derived(LUMINOSITY, "power that dust takes from starlight and emits"),
     "ir_luminosity": Derived(LUMINOSITY, "all light in 3-1000 um, AGN included", of="both"),
     "age_mass": Derived(u.Gyr, "mean age of stars by mass formed", extensive=False),

@@ -265,7 +265,11 @@ class ModelGrid:
         n_z, n_b = len(values["redshift"]), len(text["filters"])
         values.setdefault("agn", np.zeros((n_z, 0, n_b)))
         values.setdefault("agn_multiplicity", np.zeros(0, int))
-        return cls(tuple(text["filters"]), **values, **tables, meta=text["meta"])
+        try:
+            return cls(tuple(text["filters"]), **values, **tables, meta=text["meta"])
+        except ValueError as err:
+            msg = f"{path} is not a sound model grid: {err}"
+            raise DataError(msg) from err
 
     def __repr__(self):
         return (

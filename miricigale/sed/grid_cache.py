@@ -2,19 +2,26 @@
 
 import functools
 import hashlib
+import importlib.metadata
 import json
 import logging
 import os
+import time
+import uuid
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from miricigale.refdata.locate import cache_folder, conf, fingerprint
+from miricigale.refdata.locate import cache_folder, conf, fingerprint_of
 from miricigale.sed.grid import ModelGrid
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.meta import provenance
 from miricigale.utils.units import WAVE
 
 __all__ = ["cached_grid", "grid_key"]
+
+ABANDONED = 86400.0  # seconds after which an unfinished file is nobody's any more
 
 _log = logging.getLogger(__name__)
 
@@ -55,7 +62,8 @@ def grid_key(model, axes, filters):
             "class": f"{type(c).__module__}.{type(c).__qualname__}",
             "settings": c.settings,
             "defaults": {n: p.default for n, p in c.parameters.items()},
-            "data": fingerprint(c.resource) if c.resource else None,
+            "data": c.fingerprint,
+            "extinction": c.role == "foreground" and _version("dust_extinction"),
         }
         for c in model.components
     ]
@@ -63,13 +71,36 @@ def grid_key(model, axes, filters):
     content = {
         "code": _code(),
         "components": parts,
-        "cosmology": repr(model.cosmology),
+        "cosmology": [repr(model.cosmology), *_exact(model.cosmology)],
         "definition": model.frac_agn_definition,
         "axes": {name: [v.hex() for v in values.tolist()] for name, values in axes.items()},
         "bands": bands,
     }
     text = json.dumps(content, sort_keys=True, default=repr)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+@functools.cache
+def _version(package):
+    return importlib.metadata.version(package)
+
+
+def _exact(cosmology):
+    """Parameters of a cosmology to the last digit."""
+    for name, value in sorted(cosmology.parameters.items()):
+        plain = getattr(value, "value", value)
+        yield name, np.asarray(plain).tolist() if plain is not None else None
+
+
+def _own(component):
+    return type(component).__module__.split(".")[0] == __name__.split(".")[0]
+
+
+def _unchanged(model):
+    """Whether the files that were read are those that are there now."""
+    return all(
+        c.fingerprint == fingerprint_of(Path(c.path)) for c in model.components if c.resource
+    )
 
 
 def _digest(values):
@@ -95,10 +126,11 @@ def cached_grid(model, axes, filters, make):
     -----
     The least recently used grids go when all together are larger than
     ``miricigale.refdata.conf.grid_cache_size`` (MB; 0: nothing is kept). A cache that cannot be
-    read or written is logged and done without: the grid is the same.
+    read or written is logged and done without: the grid is the same. Models with components from
+    outside this package are not cached, since their code may change under the same name.
     """
     limit = conf.grid_cache_size * 1e6
-    if limit <= 0:
+    if limit <= 0 or not all(map(_own, model.components)):
         return make(model, axes, filters)
     path = cache_folder() / "grids" / f"{grid_key(model, axes, filters)}.fits"
     if path.exists():
@@ -108,16 +140,21 @@ def cached_grid(model, axes, filters, make):
         except (DataError, OSError) as err:
             _log.warning("cached grid not used: %s", err)
         else:
-            return grid
+            # the numbers are the same, whoever asks; the words are those of this model
+            kept = {name: grid.meta[name] for name in ("axes", "inert")}
+            return replace(grid, meta=provenance(**model.meta) | kept)
     grid = make(model, axes, filters)
-    if grid.galaxy.nbytes + grid.agn.nbytes > limit:
+    if grid.galaxy.nbytes + grid.agn.nbytes > limit or not _unchanged(model):
         return grid
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # another process may be at the same grid
-        partial = path.with_name(f"{path.stem}.{os.getpid()}.partial")
-        grid.write(partial, overwrite=True)
-        os.replace(partial, path)
+        # another thread, process or machine may be at the same grid
+        partial = path.with_name(f"{path.stem}.{uuid.uuid4().hex}.partial")
+        try:
+            grid.write(partial)
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
         _make_room(path.parent, limit, keep=path)
     except OSError as err:
         _log.warning("grid not kept in the cache: %s", err)
@@ -126,10 +163,14 @@ def cached_grid(model, axes, filters, make):
 
 def _make_room(folder, limit, keep):
     files = []
-    for path in folder.glob("*.fits"):
+    for path in folder.iterdir():
         try:
             stat = path.stat()
         except FileNotFoundError:
+            continue
+        if path.suffix == ".partial" and time.time() - stat.st_mtime > ABANDONED:
+            path.unlink(missing_ok=True)
+        if path.suffix != ".fits":
             continue
         files.append((stat.st_mtime_ns, stat.st_size, path))
     total = sum(size for _, size, _ in files)

@@ -1,6 +1,7 @@
 """Factorised grids of models: galaxies and AGN at every redshift, each worked out once."""
 
 import itertools
+from collections.abc import Mapping
 
 import astropy.units as u
 import numpy as np
@@ -21,14 +22,18 @@ GALAXY_ROLES = ("sfh", "stellar", "nebular", "attenuation", "dust")
 
 def check_axes(model, axes):
     """Check the axes: dict of name to values in the declared units."""
+    if not isinstance(axes, Mapping):
+        raise argument_error("axes", "a dict of parameter name to values", type(axes).__name__)
     out = {}
-    skipped = {"mass", *_names(model, ("xray", "foreground"))}
+    skipped = {"mass", *_names(model, ("xray", "igm", "foreground"))}
     for name, values in axes.items():
         if name not in model.parameters or name in skipped:
             raise unknown_name("axis", name, [n for n in model.parameters if n not in skipped])
         parameter = model.parameters[name]
-        array = np.atleast_1d(np.asarray(parameter.convert(values), dtype=float))
-        if array.ndim != 1 or array.size == 0 or np.any(np.diff(array) <= 0):
+        if np.any(getattr(values, "mask", False)):
+            raise argument_error(name, "values without a mask", values)
+        array = parameter.array(values)
+        if array.size == 0 or not np.all(np.diff(array) > 0):
             raise argument_error(name, "ascending values", array)
         for value in array:
             parameter.check(value)
@@ -101,17 +106,15 @@ class _Galaxies:
         self.light_rows, self.dust_rows = light.rows, dust.rows
         made = dict(zip(stars.keys, chain.stars_of(stars.keys), strict=True))
         self._stars = [made[key] for key in star_keys]
-        absorbed, visual, spectra = [], [], []
-        for star, dim in light.keys:
-            source, (young, old) = made[star], chain.factors(dim)
-            intrinsic = source.young + source.old
-            spectra.append(source.young * young + source.old * old)
-            absorbed.append(chain.weights @ (intrinsic - spectra[-1]) + source.dust_power)
-            visual.append(chain.visual(intrinsic))
-        self.starlight = np.array(spectra)
+        # many galaxies: their spectra are in memory once
+        self.starlight = np.empty((len(light.keys), chain.wave.size))
+        absorbed, visual = np.empty((2, len(light.keys)))
+        for i, (star, dim) in enumerate(light.keys):
+            behind = chain.attenuate(made[star], dim)
+            self.starlight[i] = behind.light
+            absorbed[i], visual[i] = behind.absorbed, chain.visual(behind.intrinsic)
         self.dust = np.array([chain.dust_of(key) for key in dust.keys])
-        self.absorbed = np.array(absorbed)[light.rows]
-        self._visual = np.array(visual)[light.rows]
+        self.absorbed, self._visual = absorbed[light.rows], visual[light.rows]
 
     def quantities(self):
         """Derived quantities: dict of arrays, one value for each galaxy."""
@@ -171,11 +174,14 @@ def model_grid(model, axes, filters):
     chain, redshift = model.chain, axes["redshift"]
     agn_component = model.component("agn")
     of_agn = agn_component.parameters if agn_component else {}
-    frac_agn = axes.get("frac_agn", np.zeros(1))
-    with_agn = bool(of_agn) and np.any(frac_agn > 0.0)
+    frac_agn = np.zeros(1)
+    if of_agn:
+        frac_agn = axes.get("frac_agn", np.array([of_agn["frac_agn"].default]))
+    with_agn = bool(np.any(frac_agn > 0.0))
     of_galaxy = {n: model.parameters[n] for n in _names(model, GALAXY_ROLES)}
     rows = _products(of_galaxy, axes)
-    _refuse_invalid(model, rows, GALAXY_ROLES)
+    defaults = {name: parameter.default for name, parameter in model.parameters.items()}
+    _refuse_invalid(model, [defaults | row for row in rows], GALAXY_ROLES)
     galaxies = _Galaxies(model, rows)
     properties, shape = _galaxy_tables(galaxies.quantities())
 
@@ -184,7 +190,7 @@ def model_grid(model, axes, filters):
     agn_parameters = {n: p for n, p in of_agn.items() if n != "frac_agn"}
     if with_agn:
         every = [r | {"frac_agn": 0.0} for r in _products(agn_parameters, axes)]
-        _refuse_invalid(model, every, ("agn",))
+        _refuse_invalid(model, [defaults | row for row in every], ("agn",))
         agn_rows, count = _distinct_agn(agn_component, every)
         inert = [sorted(agn_component.inert(row)) for row in agn_rows]
         parts = [chain.agn(row) for row in agn_rows]
@@ -197,7 +203,6 @@ def model_grid(model, axes, filters):
     galaxy = np.empty((redshift.size, len(rows), len(filters)))
     agn = np.empty((redshift.size, len(agn_rows), len(filters)))
     far = distance(redshift, model.cosmology)
-    defaults = {name: parameter.default for name, parameter in model.parameters.items()}
     for i, z in enumerate(redshift):
         sky = chain.sky(defaults | {"redshift": float(z)})
         weights = (filters.weights(chain.wave * (1.0 + z)) * sky).T * dilution(z, far[i])

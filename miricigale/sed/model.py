@@ -3,6 +3,7 @@
 import difflib
 import functools
 import warnings
+from collections.abc import Mapping
 
 import astropy.units as u
 import numpy as np
@@ -106,6 +107,9 @@ class SEDModel:
         self.cosmology = cosmology
         self.frac_agn_definition = frac_agn_definition
         roles = [c.role for c in self.components]
+        if "agn" in roles and "attenuation" not in roles and frac_agn_definition == "dust":
+            wanted = "'3-1000um' where nothing attenuates: there is no dust luminosity to refer to"
+            raise argument_error("frac_agn_definition", wanted, "'dust'")
         for role in ("sfh", "stellar"):
             if role not in roles:
                 raise argument_error("components", f"with a component of role {role!r}", roles)
@@ -115,6 +119,12 @@ class SEDModel:
             raise argument_error("components", "with 'attenuation' if there is 'dust'", roles)
         if "xray" in roles and "agn" not in roles:
             raise argument_error("components", "with 'agn' if there is 'xray'", roles)
+        for role, name in (("sfh", "age"), ("stellar", "metallicity")):
+            if name not in self.component(role).parameters:
+                raise argument_error(
+                    "components", f"with a parameter {name!r} in the {role!r} component",
+                    self.component(role),
+                )  # fmt: skip
         merged = {}
         for component in self.components:
             twice = set(component.parameters) & (set(merged) | set(_MODEL_PARAMETERS))
@@ -142,12 +152,19 @@ class SEDModel:
         `~miricigale.utils.exceptions.ConfigError`
             If a key, component or parameter is unknown.
         """
+        if not isinstance(config, Mapping):
+            msg = f"[sed] must be a table of keys, got {type(config).__name__}"
+            raise ConfigError(msg)
         unknown = set(config) - {"components", "frac_agn_definition"}
         if unknown:
             msg = f"[sed] does not know {sorted(unknown)}; known: components, frac_agn_definition"
             raise ConfigError(msg)
         parts = []
-        for entry in config.get("components", ()):
+        entries = config.get("components", ())
+        if isinstance(entries, (str, Mapping)) or not all(isinstance(e, Mapping) for e in entries):
+            msg = "[sed] components must be a list of tables with 'name', got " + repr(entries)
+            raise ConfigError(msg)
+        for entry in entries:
             defaults = dict(entry)
             try:
                 parts.append(COMPONENTS.get(defaults.pop("name", "(none)"))(**defaults))
@@ -363,6 +380,9 @@ class SEDModel:
             seen = tables.seen_agn(chain, [agn])
             got |= agn_quantities(self.frac_agn_definition, ratio, got, seen)
             spectrum = spectrum + got["agn_power"] * agn.total
+        if values.get("frac_agn", 0.0) > 0.0 and got["agn_power"][0] == 0.0:
+            msg = "frac_agn has no effect: the galaxy has no dust luminosity that it could refer to"
+            warnings.warn(msg, MiricigaleWarning, stacklevel=3)
         far = distance(z, self.cosmology)
         scaled = scaled_quantities(self, got, np.array([values["mass"]]), z, far, values)
         factor = chain.sky(values) * (values["mass"] * float(tables.dilution(z, far)))
@@ -411,7 +431,7 @@ class SEDModel:
         fluxes : `~astropy.table.QTable`
             ``id`` if the input has it, a column in uJy for each band, derived quantities and
             ``flags`` (`~miricigale.sed.ModelFlags`); a row that cannot be evaluated is flagged and
-            holds NaN.
+            holds NaN, a band that the spectrum does not cover is NaN and its row flagged.
 
         Raises
         ------
@@ -427,6 +447,8 @@ class SEDModel:
         """
         if not isinstance(table, (Table, dict)):
             raise argument_error("table", "a table", type(table).__name__)
+        if isinstance(table, dict) and any(np.ndim(column) != 1 for column in table.values()):
+            raise argument_error("table", "columns of one dimension", "a dict of other things")
         filters = self._bands(filters)
         table = QTable(table, copy=False)
         self._warn_of_slips(table.colnames)
@@ -451,7 +473,7 @@ class SEDModel:
         axes : dict of str to array
             Parameter name to its values; ``redshift`` is needed, ``mass`` has no place here, nor
             have parameters of X-rays and the foreground. Other parameters have their
-            defaults. Without ``frac_agn``, or with 0 alone, the grid has no AGN.
+            defaults. With no ``frac_agn`` but 0 the grid has no AGN.
         filters : `~miricigale.filters.FilterSet` or list of str
             The bands.
         cache : bool, optional

@@ -3,6 +3,7 @@
 import math
 
 import astropy.units as u
+import numpy as np
 
 from miricigale.utils.exceptions import argument_error
 
@@ -81,25 +82,63 @@ class Parameter:
             If it is not one finite number inside the bounds.
         """
         number = self.convert(value)
-        try:
-            number = float(number)
-        except TypeError:
-            raise argument_error(self.name, "one number", f"shape {number.shape}") from None
+        if np.ndim(number) != 0:
+            raise argument_error(self.name, "one number", f"shape {np.shape(number)}")
+        if number is np.ma.masked or np.asarray(number).dtype.kind not in "iuf":
+            raise argument_error(self.name, "one number", repr(value))
+        number = float(number)
         if not self.contains(number):
             low, high = self.bounds
             raise argument_error(self.name, f"from {low} to {high} {self.unit}".rstrip(), number)
         return number
 
+    def array(self, values):
+        """
+        Convert several values to an array in the unit; masked ones are NaN.
+
+        Parameters
+        ----------
+        values : array_like, `~astropy.table.Column` or `~astropy.units.Quantity`, shape (n,)
+            Bare numbers are taken in the declared unit.
+
+        Returns
+        -------
+        array : `~numpy.ndarray` of float, shape (n,)
+
+        Raises
+        ------
+        `~astropy.units.UnitsError`
+            If the unit cannot be converted.
+        ValueError
+            If they are not real numbers, or have more than one dimension.
+        """
+        if isinstance(values, (list, tuple)) and any(hasattr(v, "unit") for v in values):
+            values = self._quantity(values, "a mixture")
+        mask = getattr(values, "mask", None)
+        plain = self.convert(getattr(values, "unmasked", values))
+        plain = np.ma.getdata(plain)
+        array = np.atleast_1d(np.asarray(plain))
+        if array.ndim != 1:
+            raise argument_error(self.name, "of one dimension", f"shape {array.shape}")
+        if array.dtype.kind not in "iuf":
+            raise argument_error(self.name, "numbers", f"values of type {array.dtype}")
+        out = array.astype(float)
+        if mask is not None and np.any(mask):
+            out[np.broadcast_to(mask, out.shape)] = np.nan
+        return out
+
     def convert(self, value):
         """Convert a number, array or quantity to plain numbers in the unit."""
         if not hasattr(value, "unit") or value.unit is None:
             return value
+        return self._quantity(value, value.unit).to_value(self.unit)
+
+    def _quantity(self, value, unit):
         try:
-            return u.Quantity(value).to_value(self.unit)
-        except u.UnitConversionError:
-            msg = (
-                f"'{self.name}' must be convertible to {self.unit or 'a number'}, got {value.unit}"
-            )
+            return u.Quantity(value).to(self.unit)
+        except (u.UnitConversionError, TypeError, ValueError):
+            wanted = self.unit if self.unit != u.dimensionless_unscaled else "a number"
+            msg = f"'{self.name}' must be convertible to {wanted}, got {unit}"
             raise u.UnitsError(msg) from None
 
     def __repr__(self):

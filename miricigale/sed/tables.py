@@ -1,9 +1,12 @@
 """Tables of models: rows of parameters to band fluxes and derived quantities."""
 
+import functools
+
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from miricigale.filters.filter import UNCOVERED
 from miricigale.sed import _core
 from miricigale.sed.derived import agn_quantities, columns, galaxy_quantities, scaled_quantities
 from miricigale.sed.spectrum import distance
@@ -23,6 +26,10 @@ class ModelFlags(Flags):
     OUT_OF_BOUNDS = 2
     OLDER_THAN_UNIVERSE = 4
     NOT_IN_LIBRARY = 8
+    NOT_COVERED = 16
+    """A band reaches beyond the spectrum; it alone is NaN."""
+    NO_AGN_POWER = 32
+    """An AGN fraction was asked for, and there is no dust luminosity that it could refer to."""
 
 
 def dilution(redshift, far):
@@ -47,9 +54,7 @@ def _columns(model, table):
     out = {}
     for name, parameter in model.parameters.items():
         if name in table.colnames:
-            values = parameter.convert(table[name])
-            values = np.ma.filled(np.ma.asarray(values).astype(float), np.nan)
-            out[name] = np.asarray(values, dtype=float)
+            out[name] = parameter.array(table[name])
         elif name == "redshift":
             raise argument_error("table", "a table with a column 'redshift'", table.colnames)
         else:
@@ -89,6 +94,7 @@ def _row_flags(model, values, n):
     return flags
 
 
+@functools.lru_cache(maxsize=16)
 def _stack(filters):
     """All passbands one after the other, as `_core.band_means` takes them."""
     waves = [band.wave.to_value(WAVE) for band in filters]
@@ -101,11 +107,10 @@ def _stack(filters):
 class _Blocks:
     """Works out blocks of rows of one model; a model's spectra are never all in memory."""
 
-    def __init__(self, model, values, filters, far):
+    def __init__(self, model, values, bands, far):
         self.model, self.values, self.far = model, values, far
         self.chain = model.chain
-        self.bands = _stack(filters)
-        self.n_band = len(filters)
+        self.bands = bands
         self._light = np.empty((BLOCK, self.chain.wave.size))
         self._last = {}
 
@@ -130,16 +135,15 @@ class _Blocks:
         chain, n = self.chain, len(rows)
         stars, star = self._stars(rows)
         factors, dim = self._of("attenuation", rows, chain.factors)
+        gas, _ = self._of("attenuation", rows, chain.gas_factor)
         dust, dusty = self._of("dust", rows, chain.dust_of)
         light, taken = self._light[:n], np.empty(n)
-        young, old = np.array([s.young for s in stars]), np.array([s.old for s in stars])
+        parts, dims = self._screens(stars, factors, gas)
         _core.mix_light(
             chain.weights,
-            young,
-            old,
+            *parts,
             star,
-            np.array([f[0] for f in factors]),
-            np.array([f[1] for f in factors]),
+            *dims,
             dim,
             np.array([s.dust_power for s in stars]),
             np.array(dust),
@@ -147,20 +151,40 @@ class _Blocks:
             light,
             taken,
         )
-        visual = chain.visual(young + old)[star]
+        visual = np.sum([chain.visual(p) for p in parts if p.size], axis=0)[star]
         sums = light @ chain.functionals.T
         return light, galaxy_quantities([stars[i] for i in star], taken, sums, visual)
 
+    def _screens(self, stars, factors, gas):
+        """Light of young stars, old stars and gas on its own, and the transmission of each."""
+        none = np.zeros((0, self.chain.wave.size))
+        young, old = np.array([s.young for s in stars]), np.array([s.old for s in stars])
+        parts = [young, old, none]
+        dims = [np.array([f[0] for f in factors]), np.array([f[1] for f in factors]), none]
+        if stars[0].nebular_young is not None and gas[0] is not None:
+            glow = [
+                np.array([getattr(s, f"nebular_{age}") for s in stars]) for age in ("young", "old")
+            ]
+            parts = [young - glow[0], old - glow[1], glow[0] + glow[1]]
+            dims[2] = np.array(gas)
+        return parts, dims
+
     def agn(self, rows):
         """Spectra of AGN for one watt, which of them each row has, and their sums."""
-        chain = self.chain
+        chain, n = self.chain, len(rows)
+        which = np.zeros(n, dtype=np.int64)
+        active = np.flatnonzero(self.values["frac_agn"][rows] > 0)
+        if active.size == 0:
+            blank = dict.fromkeys(("infrared", "luminosity", "six", "accretion"), np.ones(n))
+            return np.zeros((1, chain.wave.size)), which, blank
         names = chain.names("agn")
-        different, index = _distinct(self.values, names, rows)
+        different, index = _distinct(self.values, names, rows[active])
         keys = [chain.agn_key(dict(zip(names, map(float, row), strict=True))) for row in different]
         unique = list(dict.fromkeys(keys))
         place = np.array([unique.index(key) for key in keys], dtype=np.int64)
         parts = [chain.agn_of(key) for key in unique]
-        which = place[index]
+        # the others have the first one, at no power
+        which[active] = place[index]
         seen = {name: array[which] for name, array in seen_agn(chain, parts).items()}
         return np.array([t.total for t in parts]), which, seen
 
@@ -177,14 +201,14 @@ class _Blocks:
             definition = self.model.frac_agn_definition
             derived |= agn_quantities(definition, fraction / (1 - fraction), derived, seen)
             power = derived["agn_power"]
-        names = ("redshift", *chain.names("foreground"))
+        names = ("redshift", *chain.names("igm", "foreground"))
         different, sky = _distinct(values, names, rows)
         dim = np.array([chain.sky_of(float(r[0]), tuple(map(float, r[1:]))) for r in different])
-        flux = np.empty((n, self.n_band))
+        flux = np.empty((n, self.bands[0].size - 1))
         scale = mass * dilution(z, self.far[rows])
         _core.block_fluxes(
             chain.wave, chain.log_wave, chain.to_lnu, light, spectra, which, power, dim, sky, z, scale,
-            *self.bands, flux,
+            *self.bands, UNCOVERED, flux,
         )  # fmt: skip
         own = {name: column[rows] for name, column in values.items()}
         return flux, scaled_quantities(self.model, derived, mass, z, self.far[rows], own)
@@ -193,6 +217,12 @@ class _Blocks:
 def flux_table(model, table, filters):
     """Fluxes and derived quantities of rows of parameters; see `SEDModel.fluxes`."""
     n = len(table)
+    taken = {"id", "flags", *columns(model)}
+    for name in filters.names:
+        if name in taken:
+            raise argument_error(
+                "filters", f"without names of other columns ({name!r} is one)", name
+            )
     values = _columns(model, table)
     flags = _row_flags(model, values, n)
     names = columns(model)
@@ -203,12 +233,16 @@ def flux_table(model, table, filters):
     far[good] = distance(values["redshift"][good], model.cosmology)
     # neighbours share stars, then dust, then nuclei
     order = np.lexsort([values[name][good] for name in reversed(model.parameters)])
-    blocks = _Blocks(model, values, filters, far)
+    blocks = _Blocks(model, values, _stack(filters), far)
     for first in range(0, good.size, BLOCK):
         rows = good[order[first : first + BLOCK]]
         flux[rows], got = blocks.run(rows)
         for name in names:
             derived[name][rows] = got[name]
+        flags[rows[np.any(np.isnan(flux[rows]), axis=1)]] |= int(ModelFlags.NOT_COVERED)
+        if model.has_agn:
+            without = (values["frac_agn"][rows] > 0) & (got["agn_power"] == 0)
+            flags[rows[without]] |= int(ModelFlags.NO_AGN_POWER)
     out = QTable()
     if "id" in table.colnames:
         out["id"] = table["id"]

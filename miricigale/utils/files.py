@@ -1,5 +1,7 @@
 """Files that others give us: opened, or refused in one sentence that names the file."""
 
+import functools
+import os
 import warnings
 from pathlib import Path
 
@@ -9,7 +11,42 @@ from astropy.utils.exceptions import AstropyUserWarning
 
 from miricigale.utils.exceptions import DataError
 
-__all__ = ["open_fits", "read_ecsv"]
+__all__ = ["cached_by_file", "open_fits", "read_ecsv"]
+
+
+def cached_by_file(maxsize):
+    """
+    Decorator: keep what a function of a file makes, as long as the file stays the same one.
+
+    Parameters
+    ----------
+    maxsize : int
+        How many results are kept; the least recently used go.
+
+    Returns
+    -------
+    decorator : callable
+        For functions whose first argument is a path and whose arguments are all hashable.
+    """
+
+    def decorate(function):
+        @functools.lru_cache(maxsize=maxsize)
+        def kept(path, state, *args):
+            del state
+            return function(path, *args)
+
+        @functools.wraps(function)
+        def call(path, *args):
+            try:
+                status = os.stat(path)
+            except OSError:
+                return function(path, *args)  # which says what is wrong
+            state = (status.st_ino, status.st_size, status.st_mtime_ns)
+            return kept(str(path), state, *args)
+
+        return call
+
+    return decorate
 
 
 def open_fits(path, *, wanted, **options):

@@ -1,9 +1,18 @@
 """What a result says of where it came from."""
 
 import datetime
+import functools
 import importlib.metadata
 
 __all__ = ["provenance"]
+
+
+@functools.cache
+def _version():
+    try:
+        return importlib.metadata.version("miricigale")
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"
 
 
 def provenance(*, citations=(), **values):
@@ -22,12 +31,8 @@ def provenance(*, citations=(), **values):
     meta : dict
         Package name and version, UTC date, citations (sorted, unique) and the values.
     """
-    try:
-        version = importlib.metadata.version("miricigale")
-    except importlib.metadata.PackageNotFoundError:
-        version = "unknown"
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    meta = {"package": "miricigale", "version": version, "created": now}
+    meta = {"package": "miricigale", "version": _version(), "created": now}
     if citations:
         meta["citations"] = sorted(set(citations))
     meta.update({key: value for key, value in values.items() if value is not None})

@@ -261,6 +261,22 @@ def test_torus_emits_what_the_disk_loses(torus, wave, tau, q):
     assert total == pytest.approx(emitted, rel=2e-3)
 
 
+@pytest.mark.parametrize("opening", [20.0, 30.0, 40.0, 50.0, 60.0])
+@pytest.mark.parametrize("q", [0.0, 1.0, 2.0])
+@pytest.mark.parametrize("tau", [1.0, 7.0, 15.0])
+def test_no_torus_takes_more_than_shines_on_it_nor_less_than_nothing(torus, tau, q, opening):
+    """The disk's light between equator and edge, int mu (1 + 2 mu) dmu, in closed form."""
+    s = np.sin(np.radians(opening + _constants(torus.path)["extinction"]["edge"]))
+    belt = (s**2 / 2 + 2 * s**3 / 3) / (7 / 6)
+    assert 0.5 * belt < _absorbed(torus.path, tau, opening, q) < belt
+
+
+def test_opening_angles_beyond_the_fit_are_refused():
+    for angle in (10.0, 70.0):
+        with pytest.raises(ValueError, match="'opening_angle' must be from 20"):
+            ParametricTorus(opening_angle=angle)
+
+
 def test_absorbed_share_is_near_that_of_the_geometry(torus):
     """Everything below the edge is lost: (s^2/6 + 2 s^3/9) / (7/18), less what is scattered."""
     s = np.cos(np.radians(47.0))

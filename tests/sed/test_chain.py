@@ -215,13 +215,13 @@ def test_gas_takes_ionising_light_and_lets_the_rest_pass():
     )
 
 
-def test_gas_and_stars_lacking_a_common_metallicity_are_flagged():
+def test_gas_that_the_table_lacks_is_flagged():
     model = make("constant", "bc03", "nebular")
-    table = QTable({"redshift": [0.1, 0.1], "metallicity": [0.02, 0.1], "age": [0.1, 0.1]})
+    table = QTable({"redshift": [0.1, 0.1], "metallicity": [0.02, 0.05], "age": [0.1, 0.1]})
     got = model.fluxes(table, ["wfc3.f160w"])
     assert [ModelFlags.names(f) for f in got["flags"]] == [[], ["not_in_library"]]
-    with pytest.raises(ValueError, match="for the gas to have it"):
-        model.evaluate(metallicity=0.1)
+    with pytest.raises(ValueError, match="'log_u' must be from -4 to -3 where the gas"):
+        model.evaluate(metallicity=0.05)
 
 
 def test_xrays_follow_the_mass_by_their_own_relation(full):

@@ -115,8 +115,32 @@ def test_band_means_of_a_straight_line_by_numerical_integration():
     top = quad(lambda x: np.interp(x, wave, fnu) * t(x) / x, 1.5, 5.0, **points)[0]
     bottom = quad(lambda x: t(x) / x, 1.5, 5.0, **points)[0]
     got = np.empty(start.size - 1)
-    _core.band_means(wave, np.log(wave), fnu, start, band, *tables, got)
+    _core.band_means(wave, np.log(wave), fnu, start, band, *tables, 1e-4, got)
     assert got[0] == pytest.approx(top / bottom, rel=1e-10)
+
+
+@pytest.mark.parametrize("ends", [(1.8, 8.0), (1.0, 4.2), (1.8, 4.2)])
+def test_band_means_over_the_part_that_a_spectrum_covers(ends):
+    """Within the tolerance the mean is that of the part covered, beyond it there is none."""
+    wave = np.array([ends[0], 2.0, 4.0, ends[1]])
+    fnu = np.array([1.0, 5.0, 2.0, 7.0])
+    band, start = np.array([1.5, 2.5, 3.0, 5.0]), np.array([0, 4])
+    curve = np.array([0.0, 1.0, 0.4, 0.0])
+    tables = _core.band_tables(start, band, curve)
+    low, high = max(1.5, ends[0]), min(5.0, ends[1])
+    t = lambda x: np.interp(x, band, curve)  # noqa: E731
+    points = {"points": [2.0, 2.5, 3.0, 4.0], "epsabs": 1e-13}
+    top = quad(lambda x: np.interp(x, wave, fnu) * t(x) / x, low, high, **points)[0]
+    bottom = quad(lambda x: t(x) / x, low, high, **points)[0]
+    whole = quad(lambda x: t(x) / x, 1.5, 5.0, **points)[0]
+    got = np.empty(1)
+    _core.band_means(wave, np.log(wave), fnu, start, band, *tables, 1.01 - bottom / whole, got)
+    assert got[0] == pytest.approx(top / bottom, rel=1e-10)
+    _core.band_means(wave, np.log(wave), fnu, start, band, *tables, 0.99 - bottom / whole, got)
+    assert np.isnan(got[0])
+    far = wave + 10.0
+    _core.band_means(far, np.log(far), fnu, start, band, *tables, 1.0, got)
+    assert np.isnan(got[0])
 
 
 # ------------------------------------------------------------------------------ IGM

@@ -1,14 +1,24 @@
 import logging
 import os
+import re
+import time
+from concurrent.futures import ThreadPoolExecutor
+from importlib import resources
 
 import numpy as np
 import pytest
 from astropy.cosmology import Planck18
 
 from miricigale.filters import Filter, FilterSet
-from miricigale.refdata import conf
+from miricigale.refdata import conf, resource
 from miricigale.sed import SEDModel, gridding
-from miricigale.sed.components import BC03, CalzettiLeitherer, DelayedSFH, DraineLi2007
+from miricigale.sed.components import (
+    BC03,
+    CalzettiLeitherer,
+    DelayedSFH,
+    DraineLi2007,
+    ParametricTorus,
+)
 from miricigale.sed.grid_cache import grid_key
 
 AXES = {"age": [0.5, 2.0], "ebv": [0.1, 0.4], "redshift": [0.3, 1.0]}
@@ -75,16 +85,96 @@ def test_everything_that_shapes_a_grid_is_in_its_name(folder):
         grid_key(model(cosmology=Planck18), axes, BANDS),
         grid_key(model(frac_agn_definition="3-1000um"), axes, BANDS),
         grid_key(SEDModel([*parts[:2], CalzettiLeitherer(slope=0.1), parts[3]]), axes, BANDS),
+        grid_key(
+            SEDModel([*parts[:2], CalzettiLeitherer(ebv_scaling="cigale"), parts[3]]), axes, BANDS
+        ),
     ]
     assert len(set(keys)) == len(keys)
     assert grid_key(model(), axes, BANDS) == keys[0]
 
 
-def test_other_data_make_another_grid(folder, monkeypatch):
-    axes = gridding.check_axes(model(), AXES)
-    before = grid_key(model(), axes, BANDS)
-    monkeypatch.setattr("miricigale.sed.grid_cache.fingerprint", lambda name: f"new {name}")
-    assert grid_key(model(), axes, BANDS) != before
+def change_torus(folder, width):
+    """A torus of other constants in the data folder, which goes before the bundled one."""
+    target = folder / resource("torus.parametric").file
+    target.parent.mkdir(parents=True, exist_ok=True)
+    bundled = resources.files("miricigale.refdata") / "files" / resource("torus.parametric").file
+    text, n = re.subn(r"(?m)^b = .*$", f"b = {width}", bundled.read_text())
+    assert n == 1
+    target.write_text(text)
+
+
+AGN_AXES = {"age": [1.0], "frac_agn": [0.0, 0.5], "redshift": [0.3]}
+
+
+def with_agn():
+    return SEDModel([*model().components, ParametricTorus()])
+
+
+@pytest.mark.filterwarnings("ignore:resource 'torus.parametric' is taken from")
+def test_other_data_make_another_grid(folder, made, tmp_path):
+    with conf.set_temp("data_folder", str(tmp_path / "data")):
+        before = with_agn().grid(AGN_AXES, BANDS)
+        change_torus(tmp_path / "data", 1.3)
+        after = with_agn().grid(AGN_AXES, BANDS)
+        assert len(made) == 2
+        assert not np.allclose(before.agn / after.agn, 1.0, rtol=1e-3)
+        same(after, with_agn().grid(AGN_AXES, BANDS, cache=False))
+
+
+@pytest.mark.filterwarnings("ignore:resource 'torus.parametric' is taken from")
+def test_a_model_that_read_older_data_leaves_the_cache_alone(folder, made, tmp_path):
+    """A model goes on with what it has read; nobody else gets its grid for the new data's."""
+    with conf.set_temp("data_folder", str(tmp_path / "data")):
+        change_torus(tmp_path / "data", 1.2)
+        old = with_agn()
+        old.grid(AGN_AXES, BANDS)
+        change_torus(tmp_path / "data", 1.3)
+        old.grid(AGN_AXES | {"redshift": [0.4]}, BANDS)
+        new = with_agn().grid(AGN_AXES | {"redshift": [0.4]}, BANDS)
+        same(new, with_agn().grid(AGN_AXES | {"redshift": [0.4]}, BANDS, cache=False))
+
+
+def test_components_from_elsewhere_are_not_cached(folder, made):
+    """Their code may change under the same name, as in a notebook."""
+
+    class Grey(CalzettiLeitherer):
+        def factors(self, wave, values):
+            dim = np.full(wave.size, 0.5)
+            return dim, dim
+
+    own = SEDModel([DelayedSFH(), BC03(), Grey(), DraineLi2007()])
+    for _ in range(2):
+        own.grid(AXES, BANDS)
+    assert len(made) == 2
+    assert not folder.exists()
+
+
+def test_the_words_are_those_of_whoever_asks(folder, made):
+    axes = {"age": [1.0], "redshift": [0.3]}
+    SEDModel.yang2021(agn=False, libraries="bundled").grid(axes, BANDS)
+    grid = SEDModel.yang2021(agn=False).grid(axes, BANDS)
+    assert len(made) == 1
+    assert all("not registered" in note for note in grid.meta["libraries"])
+    assert grid.meta["axes"] == {"age": [1.0], "redshift": [0.3]}
+
+
+def test_threads_at_the_same_grid_get_the_same_numbers(folder):
+    with ThreadPoolExecutor(4) as pool:
+        grids = list(pool.map(lambda _: model().grid(AXES, BANDS), range(8)))
+    for grid in grids[1:]:
+        same(grids[0], grid)
+    assert len(list(folder.iterdir())) == 1
+
+
+def test_leftovers_of_a_killed_run_go(folder):
+    folder.mkdir()
+    old, new = folder / "a.partial", folder / "b.partial"
+    for path, age in ((old, 1e6), (new, 0.0)):
+        path.write_text("")
+        os.utime(path, (time.time() - age,) * 2)
+    model().grid(AXES, BANDS)
+    assert not old.exists()
+    assert new.exists()
 
 
 def test_a_damaged_file_is_made_again_and_said(folder, made, caplog):

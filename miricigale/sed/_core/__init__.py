@@ -2,8 +2,9 @@
 
 from miricigale.sed._core.attenuation import (
     attenuation_curve,
+    cardelli_odonnell,
     leitherer_calzetti,
-    pei_smc,
+    pei_extinction,
     power_law_attenuation,
     smc_power_law,
 )
@@ -69,6 +70,7 @@ __all__ = [
     "band_means",
     "band_tables",
     "block_fluxes",
+    "cardelli_odonnell",
     "constant_history",
     "delayed_history",
     "disk_nodes",
@@ -86,7 +88,7 @@ __all__ = [
     "merge_nodes",
     "mix_light",
     "modified_blackbody",
-    "pei_smc",
+    "pei_extinction",
     "photon_weights",
     "photons_by_age",
     "planck_lambda",

@@ -6,8 +6,9 @@ from miricigale.sed._core.thermal import drude
 
 __all__ = [
     "attenuation_curve",
+    "cardelli_odonnell",
     "leitherer_calzetti",
-    "pei_smc",
+    "pei_extinction",
     "power_law_attenuation",
     "smc_power_law",
 ]
@@ -15,17 +16,44 @@ __all__ = [
 _BREAK = 0.0912  # nothing is attenuated at this wavelength and below
 _B, _V = 0.44, 0.55
 
-# Pei 1992, table 4, SMC: amplitude, wavelength in um, b, n. Background, far-ultraviolet rise,
-# 2175 A, silicates at 9.7 and 18 um, far infrared
-_PEI_SMC = (
-    (185.0, 0.042, 90.0, 2.0),
-    (27.0, 0.08, 5.5, 4.0),
-    (0.005, 0.22, -1.95, 2.0),
-    (0.010, 9.7, -1.95, 2.0),
-    (0.012, 18.0, -1.80, 2.0),
-    (0.030, 25.0, 0.0, 2.0),
+# Pei 1992, table 4: amplitude, wavelength in um, b, n. Background, far-ultraviolet rise, 2175 A,
+# silicates at 9.7 and 18 um, far infrared
+_PEI = {
+    "mw": (
+        (165.0, 0.047, 90.0, 2.0),
+        (14.0, 0.08, 4.0, 6.5),
+        (0.045, 0.22, -1.95, 2.0),
+        (0.002, 9.7, -1.95, 2.0),
+        (0.002, 18.0, -1.80, 2.0),
+        (0.012, 25.0, 0.0, 2.0),
+    ),
+    "lmc": (
+        (175.0, 0.046, 90.0, 2.0),
+        (19.0, 0.08, 5.5, 4.5),
+        (0.023, 0.22, -1.95, 2.0),
+        (0.005, 9.7, -1.95, 2.0),
+        (0.006, 18.0, -1.80, 2.0),
+        (0.020, 25.0, 0.0, 2.0),
+    ),
+    "smc": (
+        (185.0, 0.042, 90.0, 2.0),
+        (27.0, 0.08, 5.5, 4.0),
+        (0.005, 0.22, -1.95, 2.0),
+        (0.010, 9.7, -1.95, 2.0),
+        (0.012, 18.0, -1.80, 2.0),
+        (0.030, 25.0, 0.0, 2.0),
+    ),
+}
+_PEI_RV = {"mw": 3.08, "lmc": 3.16, "smc": 2.93}
+
+# a and b of A(lambda) / A(V) = a(x) + b(x) / R_V, x = 1 um / lambda: highest power first
+_INFRARED, _INFRARED_POWER = (0.574, -0.527), 1.61  # Cardelli et al. 1989, equation 2
+_OPTICAL = (  # O'Donnell 1994, in x - 1.82
+    (-0.505, 1.647, -0.827, -1.718, 1.137, 0.701, -0.609, 0.104, 1.0),
+    (3.347, -10.805, 5.491, 11.102, -7.985, -3.989, 2.908, 1.952, 0.0),
 )
-_PEI_SMC_RV = 2.93
+_RISE = ((-0.009779, -0.04473, 0.0, 0.0), (0.1207, 0.2130, 0.0, 0.0))  # equation 4, in x - 5.9
+_FAR = ((-0.070, 0.137, -0.628, -1.073), (0.374, -0.420, 4.257, 13.670))  # equation 5, in x - 8
 
 
 def leitherer_calzetti(wave):
@@ -75,11 +103,43 @@ def smc_power_law(wave):
     return np.where(wave <= _BREAK, 0.0, 1.39 * wave**-1.2)
 
 
-def pei_smc(wave):
-    """k(lambda) = (1 + R_V) xi(lambda) of the SMC, Pei 1992; 0 at 0.0912 um and below."""
+def pei_extinction(wave, galaxy):
+    """k(lambda) = (1 + R_V) xi(lambda), Pei 1992, of mw, lmc or smc; 0 at 0.0912 um and below."""
     wave = np.asarray(wave, dtype=float)
     xi = np.zeros_like(wave)
-    for amplitude, centre, b, n in _PEI_SMC:
+    for amplitude, centre, b, n in _PEI[galaxy]:
         ratio = (wave / centre) ** n
         xi += amplitude / (ratio + 1.0 / ratio + b)
-    return np.where(wave <= _BREAK, 0.0, (1.0 + _PEI_SMC_RV) * xi)
+    return np.where(wave <= _BREAK, 0.0, (1.0 + _PEI_RV[galaxy]) * xi)
+
+
+def cardelli_odonnell(wave, r_v):
+    """
+    k(lambda) of the Milky Way: Cardelli et al. 1989, the optical part of O'Donnell 1994.
+
+    Given for 0.1-3.3 um; the cubic of the far ultraviolet goes on to 0.0912 um, with 0 from there
+    down, and the power law of the infrared has no end.
+    """
+    wave = np.asarray(wave, dtype=float)
+    # no powers of what lies far outside
+    x = 1.0 / np.maximum(wave, _BREAK)
+    infrared = x**_INFRARED_POWER
+    ultraviolet = (
+        1.752 - 0.316 * x - 0.104 / ((x - 4.67) ** 2 + 0.341),
+        -3.090 + 1.825 * x + 1.206 / ((x - 4.62) ** 2 + 0.263),
+    )
+    pieces = [x < 1.1, x < 3.3, x < 5.9, x < 8.0]
+    parts = [
+        np.select(
+            pieces,
+            [
+                _INFRARED[i] * infrared,
+                np.polyval(_OPTICAL[i], x - 1.82),
+                ultraviolet[i],
+                ultraviolet[i] + np.polyval(_RISE[i], x - 5.9),
+            ],
+            np.polyval(_FAR[i], x - 8.0),
+        )
+        for i in (0, 1)
+    ]
+    return np.where(wave <= _BREAK, 0.0, r_v * parts[0] + parts[1])

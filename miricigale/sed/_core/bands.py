@@ -55,38 +55,62 @@ def band_tables(start, band_wave, throughput):
 
 
 @njit(cache=True)
-def band_means(wave, log_wave, fnu, start, band_wave, moments, bucket, out):
+def _moments_at(x, log_x, band, first, last, band_wave, moments, bucket):
+    """Integrals of T / lambda and of T from the first point of a band to a wavelength in it."""
+    scale = BUCKETS / (band_wave[last] - band_wave[first])
+    # one bucket back: the division may round up over an edge
+    i = bucket[band, max(min(int((x - band_wave[first]) * scale), BUCKETS) - 1, 0)]
+    while i < last - 1 and band_wave[i + 1] <= x:
+        i += 1
+    step, rise = x - band_wave[i], moments[4, i]
+    zero = moments[0, i] + moments[3, i] * (log_x - moments[2, i]) + rise * step
+    one = moments[1, i] + step * (moments[3, i] + rise * (band_wave[i] + 0.5 * step))
+    return zero, one
+
+
+@njit(cache=True)
+def band_means(wave, log_wave, fnu, start, band_wave, moments, bucket, tolerance, out):
     """
     Photon-counting means of F_nu in bands, without making a matrix of weights.
 
     Parameters
     ----------
     wave, log_wave, fnu : `~numpy.ndarray`, shape (n_wave,)
-        Observed wavelengths, their logarithms, and a spectrum linear between them; it covers
-        the bands.
+        Observed wavelengths, their logarithms, and a spectrum linear between them.
     start, band_wave : `~numpy.ndarray`
         Passbands as for `band_tables`.
     moments, bucket : `~numpy.ndarray`
         From `band_tables`.
+    tolerance : float
+        Share of a band that may lie outside the spectrum; the mean is that of the rest.
     out : `~numpy.ndarray`, shape (n_band,)
-        Filled with ``int F T / lambda dlambda / int T / lambda dlambda``, exact.
+        Filled with ``int F T / lambda dlambda / int T / lambda dlambda``, exact; NaN where more
+        of a band is not covered.
     """
+    n = wave.size
     for band in range(start.size - 1):
         first, last = start[band], start[band + 1] - 1
         low, high = band_wave[first], band_wave[last]
+        if wave[0] >= high or wave[n - 1] <= low:
+            out[band] = np.nan
+            continue
         scale = BUCKETS / (high - low)
+        begin, one, total = 0.0, 0.0, 0.0
         j = np.searchsorted(wave, low, side="right") - 1
-        j = min(max(j, 0), wave.size - 2)
-        zero, one, total = 0.0, 0.0, 0.0
+        if j < 0:
+            j = 0
+            begin, one = _moments_at(
+                wave[0], log_wave[0], band, first, last, band_wave, moments, bucket
+            )
+        zero = begin
         while True:
             if wave[j + 1] < high:
+                # `_moments_at`, whose call for each step would cost more than the step
                 right, log_right = wave[j + 1], log_wave[j + 1]
-                # one bucket back: the division may round up over an edge
                 i = bucket[band, max(min(int((right - low) * scale), BUCKETS) - 1, 0)]
                 while i < last - 1 and band_wave[i + 1] <= right:
                     i += 1
-                step = right - band_wave[i]
-                rise = moments[4, i]
+                step, rise = right - band_wave[i], moments[4, i]
                 new_zero = moments[0, i] + moments[3, i] * (log_right - moments[2, i]) + rise * step
                 at = moments[3, i] + rise * band_wave[i]
                 new_one = moments[1, i] + step * (at + 0.5 * rise * step)
@@ -95,7 +119,9 @@ def band_means(wave, log_wave, fnu, start, band_wave, moments, bucket, out):
             slope = (fnu[j + 1] - fnu[j]) / (wave[j + 1] - wave[j])
             total += (fnu[j] - slope * wave[j]) * (new_zero - zero) + slope * (new_one - one)
             zero, one = new_zero, new_one
-            if wave[j + 1] >= high or j == wave.size - 2:
+            if wave[j + 1] >= high or j == n - 2:
                 break
             j += 1
-        out[band] = total / moments[0, last]
+        covered = zero - begin
+        enough = covered >= (1.0 - tolerance) * moments[0, last]
+        out[band] = total / covered if enough else np.nan

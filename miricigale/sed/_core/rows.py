@@ -11,7 +11,9 @@ __all__ = ["block_fluxes", "mix_light"]
 
 
 @njit(cache=True)
-def mix_light(weight, young, old, star, dim_young, dim_old, dim, extra, dust, dusty, out, taken):
+def mix_light(
+    weight, young, old, gas, star, dim_young, dim_old, dim_gas, dim, extra, dust, dusty, out, taken
+):
     """
     Galaxies of one solar mass: attenuated starlight plus the dust that it heats.
 
@@ -20,11 +22,13 @@ def mix_light(weight, young, old, star, dim_young, dim_old, dim, extra, dust, du
     weight : `~numpy.ndarray`, shape (n_wave,)
         Weights of the trapezoid rule on the grid of wavelengths.
     young, old : `~numpy.ndarray`, shape (n_star, n_wave)
-        Light of young and old stars in W/um.
+        Light of young and old stars in W/um, with that of their gas if it is dimmed as they are.
+    gas : `~numpy.ndarray`, shape (n_star, n_wave) or (0, n_wave)
+        Light of gas that has a transmission of its own.
     star, dim, dusty : `~numpy.ndarray` of int, shape (n,)
         Which stars, attenuation and dust spectrum each galaxy has.
-    dim_young, dim_old : `~numpy.ndarray`, shape (n_dim, n_wave)
-        Transmissions for young and old stars.
+    dim_young, dim_old, dim_gas : `~numpy.ndarray`, shape (n_dim, n_wave)
+        Transmissions for young and old stars and for ``gas``.
     extra : `~numpy.ndarray`, shape (n_star,)
         Power in W that dust takes besides.
     dust : `~numpy.ndarray`, shape (n_dust, n_wave)
@@ -32,12 +36,17 @@ def mix_light(weight, young, old, star, dim_young, dim_old, dim, extra, dust, du
     out, taken : `~numpy.ndarray`, shape (n, n_wave) and (n,)
         Filled with the light in W/um and the power in W that dust took.
     """
+    own_gas = gas.shape[0] > 0
     for i in range(star.size):
         s, a, d = star[i], dim[i], dusty[i]
         lost = 0.0
         for j in range(weight.size):
             light = young[s, j] * dim_young[a, j] + old[s, j] * dim_old[a, j]
-            lost += weight[j] * (young[s, j] + old[s, j] - light)
+            before = young[s, j] + old[s, j]
+            if own_gas:
+                light += gas[s, j] * dim_gas[a, j]
+                before += gas[s, j]
+            lost += weight[j] * (before - light)
             out[i, j] = light
         lost += extra[s]
         taken[i] = lost
@@ -62,6 +71,7 @@ def block_fluxes(
     band,
     moments,
     bucket,
+    tolerance,
     out,
 ):
     """
@@ -87,8 +97,10 @@ def block_fluxes(
         Redshift, and factor from L_nu to flux.
     start, band, moments, bucket : `~numpy.ndarray`
         Passbands as for `band_means`.
+    tolerance : float
+        Share of a band that may lie outside the spectra.
     out : `~numpy.ndarray`, shape (n, n_band)
-        Filled with the fluxes.
+        Filled with the fluxes; NaN in bands that the spectrum does not cover.
     """
     observed, log_observed = np.empty(wave.size), np.empty(wave.size)
     fnu = np.empty(wave.size)
@@ -103,6 +115,6 @@ def block_fluxes(
             if p > 0.0:
                 total += p * agn[k, j]
             fnu[j] = total * to_lnu[j] * dim[s, j]
-        band_means(observed, log_observed, fnu, start, band, moments, bucket, out[i])
+        band_means(observed, log_observed, fnu, start, band, moments, bucket, tolerance, out[i])
         for b in range(out.shape[1]):
             out[i, b] *= scale[i]

@@ -12,6 +12,7 @@ from miricigale.sed.components.attenuation import (
     Attenuation,
     CalzettiLeitherer,
     CharlotFall,
+    ModifiedStarburst,
 )
 from miricigale.sed.components.dust import (
     Casey2012,
@@ -56,6 +57,7 @@ __all__ = [
     "Inoue2014",
     "Madau1995",
     "Meiksin2006",
+    "ModifiedStarburst",
     "Nebular",
     "ParametricTorus",
     "Skirtor2016",

@@ -8,13 +8,14 @@ from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
 
-__all__ = ["SMC", "Attenuation", "CalzettiLeitherer", "CharlotFall"]
+__all__ = ["SMC", "Attenuation", "CalzettiLeitherer", "CharlotFall", "ModifiedStarburst"]
 
 _CURVES = {
     "calzetti": _core.attenuation_curve,
+    "cardelli_odonnell": _core.cardelli_odonnell,
     "power_law": _core.power_law_attenuation,
     "smc": _core.smc_power_law,
-    "pei1992": _core.pei_smc,
+    "pei1992": _core.pei_extinction,
 }
 _MAG = -0.4 * np.log(10.0)
 
@@ -52,7 +53,7 @@ def _transmission(shape, found, amount):
 
 
 class Attenuation(Component):
-    """Base: `factors` gives transmissions for young and old stars."""
+    """Base: `factors` gives transmissions for young and old stars, `gas_factor` that for gas."""
 
     role = "attenuation"
 
@@ -74,6 +75,25 @@ class Attenuation(Component):
             where they are the same.
         """
         raise NotImplementedError
+
+    def gas_factor(self, wave, values):
+        """
+        Transmission for lines and continuum of the gas, where it is not that of the stars.
+
+        Parameters
+        ----------
+        wave : `~numpy.ndarray`
+            Rest wavelengths in um.
+        values : dict
+            Values of the parameters.
+
+        Returns
+        -------
+        gas : `~numpy.ndarray`, shape of ``wave``, or None
+            From 0 to 1, not to be written to, for the gas around stars of any age. None: gas is
+            dimmed as the stars that it surrounds, by `factors`.
+        """
+        return None
 
 
 class _Screen(Attenuation):
@@ -101,8 +121,33 @@ class _Screen(Attenuation):
         return tuple(n for n in self.parameters if n != "ebv") if values["ebv"] == 0.0 else ()
 
 
+class _Starburst(Attenuation):
+    """The starburst curve with a free slope and an ultraviolet bump."""
+
+    options = {"ebv_scaling": ("exact", "cigale")}
+    uv_bump = Parameter(
+        default=0.0,
+        bounds=(0.0, 10.0),
+        doc="Amplitude of the ultraviolet bump in k (Milky Way: 3).",
+    )
+    slope = Parameter(default=0.0, bounds=(-1.2, 0.6), doc="Change of the curve's power-law slope.")
+    uv_bump_wavelength = Parameter(
+        default=0.2175, bounds=(0.18, 0.26), unit="um", doc="Centre of the bump."
+    )
+    uv_bump_width = Parameter(
+        default=0.035, bounds=(0.005, 0.1), unit="um", doc="Full width at half maximum of the bump."
+    )
+
+    def _law(self, values):
+        bump = values["uv_bump"]
+        if bump == 0.0:
+            return "calzetti", values["slope"]
+        centre, width = values["uv_bump_wavelength"], values["uv_bump_width"]
+        return "calzetti", values["slope"], bump, centre, width, self.ebv_scaling
+
+
 @register
-class CalzettiLeitherer(_Screen):
+class CalzettiLeitherer(_Starburst, _Screen):
     """
     Starburst attenuation with a free slope and an ultraviolet bump.
 
@@ -127,32 +172,82 @@ class CalzettiLeitherer(_Screen):
         "Calzetti et al. 2000, ApJ 533, 682; Leitherer et al. 2002, ApJS 140, 303; "
         "Noll et al. 2009, A&A 507, 1793"
     )
-    options = {"ebv_scaling": ("exact", "cigale")}
-    uv_bump = Parameter(
-        default=0.0,
-        bounds=(0.0, 10.0),
-        doc="Amplitude of the ultraviolet bump in k (Milky Way: 3).",
-    )
-    slope = Parameter(default=0.0, bounds=(-1.2, 0.6), doc="Change of the curve's power-law slope.")
-    uv_bump_wavelength = Parameter(
-        default=0.2175, bounds=(0.18, 0.26), unit="um", doc="Centre of the bump."
-    )
-    uv_bump_width = Parameter(
-        default=0.035, bounds=(0.005, 0.1), unit="um", doc="Full width at half maximum of the bump."
-    )
-
-    def _law(self, values):
-        bump = values["uv_bump"]
-        if bump == 0.0:
-            return "calzetti", values["slope"]
-        centre, width = values["uv_bump_wavelength"], values["uv_bump_width"]
-        return "calzetti", values["slope"], bump, centre, width, self.ebv_scaling
 
     def inert(self, values):
         """The bump's place and width where there is no bump; all but ``ebv`` without dust."""
         if values["ebv"] > 0.0 and values["uv_bump"] == 0.0:
             return ("uv_bump_wavelength", "uv_bump_width")
         return super().inert(values)
+
+
+@register
+class ModifiedStarburst(_Starburst):
+    """
+    Gas behind more dust than the stars: an extinction law for the one, the starburst curve for
+    the other.
+
+    Lines and continuum of the gas have the colour excess ``ebv_lines`` and one of four laws of
+    extinction; stars of every age have ``ebv_factor_stars`` of it (0.44: Calzetti et al. 1994,
+    2000) and the curve of `CalzettiLeitherer`. What both lose heats the dust. Without gas in the
+    chain only the stars' part is left.
+
+    Parameters
+    ----------
+    ebv_scaling : {"exact", "cigale"}
+        What the scaling of the stars' curve keeps, as in `CalzettiLeitherer`.
+    gas_law : {"mw", "lmc", "smc", "mw_pei1992"}
+        The gas's law. ``"mw"``: Cardelli, Clayton & Mathis 1989 with the optical part of O'Donnell
+        1994, given for 0.1-3.3 um and continued by its own formulae, as CIGALE does: no
+        silicates. The others: six terms of Pei 1992 each, far ultraviolet to far infrared,
+        silicates included, R_V = 3.16 (LMC), 2.93 (SMC), 3.08 (Milky Way). Nothing is dimmed at
+        0.0912 um and below.
+    **defaults
+        New defaults of parameters.
+    """
+
+    name = "modified_starburst"
+    reference = (
+        "Calzetti et al. 1994, ApJ 429, 582; Calzetti et al. 2000, ApJ 533, 682; "
+        "Cardelli et al. 1989, ApJ 345, 245; O'Donnell 1994, ApJ 422, 158; Pei 1992, ApJ 395, 130"
+    )
+    options = {"gas_law": ("mw", "lmc", "smc", "mw_pei1992")}
+    ebv_lines = Parameter(
+        default=0.3, bounds=(0.0, 5.0), unit="mag", doc="Colour excess of the gas."
+    )
+    ebv_factor_stars = Parameter(
+        default=0.44, bounds=(0.0, 1.0), doc="Colour excess of the stars over that of the gas."
+    )
+    r_v_gas = Parameter(
+        default=3.1,
+        bounds=(2.0, 6.0),
+        doc="A(V) / E(B-V) of the gas's dust, for gas_law='mw' only.",
+    )
+
+    def factors(self, wave, values):
+        """See `Attenuation.factors`; the same for young and old stars."""
+        found = _exponents(_key(wave), *self._law(values))
+        ebv = values["ebv_lines"] * values["ebv_factor_stars"]
+        stars = _transmission(np.shape(wave), found, ebv)
+        return stars, stars
+
+    def gas_factor(self, wave, values):
+        """See `Attenuation.gas_factor`."""
+        if self.gas_law == "mw":
+            law = ("cardelli_odonnell", values["r_v_gas"])
+        else:
+            law = ("pei1992", self.gas_law.removesuffix("_pei1992"))
+        return _transmission(np.shape(wave), _exponents(_key(wave), *law), values["ebv_lines"])
+
+    def inert(self, values):
+        """R_V of a law that has its own, the curve of stars or a bump that is not there."""
+        if values["ebv_lines"] == 0.0:
+            return tuple(n for n in self.parameters if n != "ebv_lines")
+        out = () if self.gas_law == "mw" else ("r_v_gas",)
+        if values["ebv_factor_stars"] == 0.0:
+            return (*out, *_Starburst.declared())
+        if values["uv_bump"] == 0.0:
+            return (*out, "uv_bump_wavelength", "uv_bump_width")
+        return out
 
 
 @register
@@ -178,7 +273,7 @@ class SMC(_Screen):
     options = {"law": ("smc", "pei1992")}
 
     def _law(self, values):
-        return (self.law,)
+        return ("pei1992", "smc") if self.law == "pei1992" else ("smc",)
 
 
 @register

@@ -1,6 +1,5 @@
 """Absorption by the intergalactic medium."""
 
-import functools
 import tomllib
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import numpy as np
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import cached_by_file
 
 __all__ = ["IGM", "Inoue2014", "Madau1995", "Meiksin2006"]
 
@@ -108,7 +108,7 @@ class Inoue2014(IGM):
 _COLUMNS = ("wavelength", "laf1", "laf2", "laf3", "dla1", "dla2")
 
 
-@functools.lru_cache(maxsize=2)
+@cached_by_file(maxsize=2)
 def load_lines(path):
     """
     Read the Lyman series of Inoue et al. 2014, table 2.

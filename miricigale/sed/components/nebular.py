@@ -9,7 +9,7 @@ from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import open_fits
+from miricigale.utils.files import cached_by_file, open_fits
 
 __all__ = ["Nebular", "NebularTable", "load_nebular"]
 
@@ -97,7 +97,7 @@ class NebularTable:
         return out
 
 
-@functools.lru_cache(maxsize=2)
+@cached_by_file(maxsize=2)
 def load_nebular(path):
     """
     Read a table that ``tools/make_nebular.py`` made.

@@ -11,6 +11,7 @@ from miricigale.sed.component import register
 from miricigale.sed.components.agn.base import AGN, DISK_MEAN, TorusSpectra
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import cached_by_file
 
 __all__ = ["ParametricTorus"]
 
@@ -32,7 +33,9 @@ class ParametricTorus(AGN):
 
     The rest is **not fitted**: ``p`` moves the weight by dm/dlnr ~ r^(3 - p), so c falls by p - 1;
     ``q`` thins the torus towards the poles, ``tau exp(-q |cos theta|)``; ``opening_angle`` moves the edge;
-    ``radius_ratio`` is the outer end of the integral.
+    ``radius_ratio`` is the outer end of the integral. Angles outside 20-60 deg are refused: the
+    form, fitted at 40 deg, would send out more light face on than any surface can, or take
+    less than nothing from the disk.
     """
 
     name = "parametric_torus"
@@ -43,6 +46,10 @@ class ParametricTorus(AGN):
     )
     p = Parameter(default=1.0, bounds=(0.0, 2.0), doc="Slope of density with radius.")
     q = Parameter(default=1.0, bounds=(0.0, 2.0), doc="Slope of density with angle.")
+    opening_angle = Parameter(
+        default=40.0, bounds=(20.0, 60.0), unit="deg",
+        doc="Angle between the equator and the edge of the torus; fitted at 40 deg only.",
+    )  # fmt: skip
     radius_ratio = Parameter(
         default=20.0, bounds=(5.0, 40.0), doc="Outer over inner radius of the torus."
     )
@@ -57,7 +64,7 @@ class ParametricTorus(AGN):
         return _torus(self.path, wave.tobytes(), disk, *(float(values[n]) for n in names))
 
 
-@functools.lru_cache(maxsize=2)
+@cached_by_file(maxsize=2)
 def _constants(path):
     try:
         return tomllib.loads(Path(path).read_text())
@@ -66,7 +73,7 @@ def _constants(path):
         raise DataError(msg) from err
 
 
-@functools.lru_cache(maxsize=512)
+@cached_by_file(maxsize=512)
 def _torus(path, wave_bytes, disk, tau, inclination, opening, p, q, ratio):
     const = _constants(path)
     wave = np.frombuffer(wave_bytes)
@@ -86,12 +93,17 @@ def _torus(path, wave_bytes, disk, tau, inclination, opening, p, q, ratio):
 
 
 def _seen_fraction(const, wave, tau, inclination, opening, q):
-    """Disk light seen, direct and scattered, over the face-on disk."""
-    mu = np.cos(np.radians(inclination))
+    """
+    Disk light seen, direct and scattered, over the face-on disk.
+
+    Inclinations may be an array of shape (n, 1), all on one side of the edge of the torus.
+    """
+    angle = np.asarray(inclination, dtype=float)
+    mu = np.cos(np.radians(angle))
     direct = mu * (1.0 + 2.0 * mu) / 3.0
     x, depth = np.log10(wave), np.log(tau / 7.0)
     scatter = const["scattering"]
-    if inclination < 90.0 - opening - const["extinction"]["edge"]:
+    if np.all(angle < 90.0 - opening - const["extinction"]["edge"]):
         a, b, cut, power = scatter["clear"]
         scattered = 10.0 ** (a + b * x) / (1.0 + (wave / cut) ** power)
         return direct + scattered
@@ -102,8 +114,8 @@ def _seen_fraction(const, wave, tau, inclination, opening, q):
     transmission = np.exp(-np.minimum(tau * np.exp(-q * mu) * curve, 600.0))
     h = scatter["hidden"]
     log = h[0] + h[1] * x + h[2] * x**2 + (h[3] + h[4] * x) * depth
-    log += h[5] * (inclination - 110.0 + opening) / 20.0
-    return direct * transmission + 10.0**log / (1.0 + (wave / scatter["cutoff"]) ** 6)
+    hidden = 10.0**log / (1.0 + (wave / scatter["cutoff"]) ** 6)
+    return direct * transmission + hidden * 10.0 ** (h[5] * (angle - 110.0 + opening) / 20.0)
 
 
 def _anisotropy(const, tau, inclination, opening):
@@ -120,7 +132,7 @@ def _anisotropy(const, tau, inclination, opening):
     return relative(inclination) / (weight @ relative(np.degrees(np.arccos(mu))))
 
 
-@functools.lru_cache(maxsize=256)
+@cached_by_file(maxsize=256)
 def _absorbed(path, tau, opening, q):
     """Share of the disk's light, over all directions, that neither passes nor is scattered."""
     const = _constants(path)
@@ -131,11 +143,10 @@ def _absorbed(path, tau, opening, q):
     nodes, weights = _gauss(24)
     escaped = 0.0
     for low, high in ((0.0, mu_edge), (mu_edge, 1.0)):
-        for node, weight in zip(nodes, weights, strict=True):
-            angle = float(np.degrees(np.arccos(low + (high - low) * node)))
-            seen = _seen_fraction(const, wave, tau, angle, opening, q)
-            escaped += (high - low) * weight * np.trapezoid(spectrum * seen, wave)
-    return 1.0 - escaped / DISK_MEAN
+        angle = np.degrees(np.arccos(low + (high - low) * nodes))[:, None]
+        seen = _seen_fraction(const, wave, tau, angle, opening, q)
+        escaped += (high - low) * (weights @ np.trapezoid(spectrum * seen, wave, axis=1))
+    return float(1.0 - escaped / DISK_MEAN)
 
 
 def _dust_shape(path, wave_bytes, tau_sight, tau, opening, inclination, p, q, ratio):

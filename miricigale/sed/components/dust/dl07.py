@@ -1,7 +1,5 @@
 """Draine & Li 2007, with its own parameters and as a sequence in alpha."""
 
-import functools
-
 import numpy as np
 from astropy.io import fits
 
@@ -10,13 +8,14 @@ from miricigale.sed.component import register
 from miricigale.sed.components.dust.base import DustEmission
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import cached_by_file
 
 __all__ = ["DraineLi2007", "DraineLi2007Alpha", "load_dl07"]
 
 U_MAX = 1e6  # of the power law dM/dU ~ U^-2
 
 
-@functools.lru_cache(maxsize=2)
+@cached_by_file(maxsize=2)
 def load_dl07(path):
     """
     Read the bundled Draine & Li 2007 table.
@@ -148,7 +147,7 @@ def _cell(axis, value):
     return low, float(np.clip(part, 0.0, 1.0))
 
 
-@functools.lru_cache(maxsize=2)
+@cached_by_file(maxsize=2)
 def _alpha_tables(path):
     """Spectra per dust mass on an even grid in log U, PAH-rich and PAH-poor."""
     table = load_dl07(path)
