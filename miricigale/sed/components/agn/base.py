@@ -75,7 +75,7 @@ class AGN(Component):
     role = "agn"
     options = {"polar_law": _core.POLAR_LAWS, "disk": tuple(_core.DISKS)}
     frac_agn = Parameter(
-        default=0.0, bounds=(0.0, 0.999), doc="AGN fraction, in the model's definition."
+        default=0.0, bounds=(0.0, 0.999999), doc="AGN fraction, in the model's definition."
     )
     inclination = Parameter(
         default=70.0, bounds=(0.0, 90.0), unit="deg", doc="Angle between axis and line of sight."
