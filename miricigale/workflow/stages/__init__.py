@@ -65,6 +65,7 @@ def study_stages():
             "seds",
             fit_inputs,
             "input SEDs",
+            version=2,
             needs=("catalog",),
             sections=("sed.axes", "sed.catalog_error", "sed.max_wavelength", "fit.model_error"),
             resources=sed_data,
@@ -74,6 +75,7 @@ def study_stages():
             "truth",
             make_truth,
             "model fluxes",
+            version=2,
             needs=("catalog", "seds"),
             sections=(
                 "sed.frac_agn",
@@ -161,6 +163,7 @@ def study_stages():
             "fits",
             fit_photometry,
             "fit",
+            version=2,
             needs=("truth", "errors"),
             sections=("fit", "exposures.filters"),
             resources=sed_data,
