@@ -31,13 +31,28 @@ def _parser():
 
     fit = commands.add_parser("fit", help="fit redshift and AGN fraction of a photometry table")
     fit.add_argument(
-        "photometry", type=Path, help="ECSV or FITS: id, <filter>, <filter>_err in uJy"
+        "photometry",
+        type=Path,
+        metavar="CATALOGUE",
+        help="FITS or ECSV with id, <filter> and <filter>_err; CSV with --flux-unit",
     )
-    fit.add_argument("-o", "--output", type=Path, default=Path("fits.fits"), help="results (FITS)")
+    fit.add_argument(
+        "-o", "--output", type=Path, default=Path("fits"), help="folder of the results"
+    )
     fit.add_argument("--axes", choices=("fit", "quick"), default="fit", help="model grid")
     fit.add_argument("--redshift", metavar="COLUMN", help="column of known redshifts")
     fit.add_argument("--model-error", type=float, default=0.1, help="relative model error")
+    fit.add_argument("--flux-unit", metavar="UNIT", help="unit of fluxes that have none (CSV)")
+    fit.add_argument("--hdu", help="extension of a FITS file, if it has several tables")
+    fit.add_argument("--chunk-rows", type=int, default=10000, help="rows in memory at a time")
+    fit.add_argument(
+        "--resume",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="go on with what is in the folder, or replace it",
+    )
     fit.add_argument("--threads", type=int, default=1, help="threads")
+    fit.add_argument("--no-progress", action="store_true", help="no progress bar")
 
     phot = commands.add_parser("photometry", help="forced photometry on a high-resolution prior")
     phot.add_argument("image", type=Path, help="MIRI mosaic (FITS with SCI and ERR, MJy/sr)")
@@ -97,21 +112,32 @@ def _run(args):
 def _fit(args):
     from concurrent.futures import ThreadPoolExecutor
 
-    from miricigale.workflow.commands import fit_table
+    from miricigale.workflow.commands import fit_catalogue
 
-    with ThreadPoolExecutor(max(1, args.threads)) as executor:
-        results = fit_table(
-            args.photometry,
-            axes=args.axes,
-            redshift=args.redshift,
-            model_error=args.model_error,
-            executor=executor if args.threads > 1 else None,
-            progress_bar=True,
-        )
-    results.write(args.output, overwrite=True)
-    table = args.output.with_suffix(".ecsv")
-    results.to_table().write(table, overwrite=True)
-    print(f"{args.output} and {table}")
+    try:
+        with ThreadPoolExecutor(max(1, args.threads)) as executor:
+            results = fit_catalogue(
+                args.photometry,
+                args.output,
+                axes=args.axes,
+                redshift=args.redshift,
+                model_error=args.model_error,
+                flux_unit=args.flux_unit,
+                hdu=int(args.hdu) if (args.hdu or "").isdigit() else args.hdu,
+                chunk_rows=args.chunk_rows,
+                resume=args.resume,
+                executor=executor if args.threads > 1 else None,
+                progress_bar=not args.no_progress,
+            )
+        table = args.output / "table.fits"
+        results.write_table(table, overwrite=True)
+    except KeyboardInterrupt:
+        n_parts = len(list(args.output.glob("part-*.fits")))
+        kept = f"{n_parts} finished parts are in {args.output}/"
+        how = "the same command, without --no-resume," if not args.resume else "the same command"
+        print(f"stopped; {kept}; {how} goes on from here", file=sys.stderr)
+        return 130
+    print(f"{results!r}; all in {table}")
     return 0
 
 
@@ -204,6 +230,13 @@ def _data_add(args):
     return 0
 
 
+def _input_errors():
+    """Errors that tell of input that cannot be used."""
+    from astropy.units import UnitsError
+
+    return (ValueError, KeyError, OSError, ImportError, UnitsError)
+
+
 def main(argv=None):
     """
     Entry point of the ``miricigale`` command.
@@ -241,9 +274,9 @@ def main(argv=None):
     }
     try:
         return commands[args.command](args)
-    except (ValueError, KeyError, OSError, ImportError) as err:
+    except Exception as err:
         # one clear sentence; the traceback is for --verbose
-        if args.verbose:
+        if args.verbose or not isinstance(err, _input_errors()):
             raise
         message = err.args[0] if isinstance(err, KeyError) and err.args else err
         # a bare key says nothing to a reader

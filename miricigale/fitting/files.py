@@ -14,9 +14,9 @@ from miricigale.utils.files import open_fits
 
 __all__ = ["read_results", "write_results"]
 
-_FORMAT = "miricigale-fitresults-1"
+_FORMAT = "miricigale-fitresults-2"
 _DICTS = ("pdf", "best")
-_TEXT = ("filters", "quantities", "descriptions", "meta")
+_TUPLES = ("filters", "quantities", "descriptions", "intensive")
 
 
 def write_results(results, path, *, overwrite=False):
@@ -42,7 +42,7 @@ def write_results(results, path, *, overwrite=False):
     for name in _DICTS:
         for key, value in getattr(results, name).items():
             table[f"{name}:{key}"] = value
-    text = {name: getattr(results, name) for name in _TEXT}
+    text = {name: getattr(results, name) for name in (*_TUPLES, "meta")}
     text["units"] = [u.Unit(unit).to_string() for unit in results.units]
     text["shapes"] = {name: table[name].shape[1:] for name in table.colnames}
     text["axes"] = {
@@ -98,7 +98,7 @@ def read_results(cls, path):
             else np.zeros((n, *shape))
             for name, shape in text["shapes"].items()
         }
-        values = {name: tuple(text[name]) for name in ("filters", "quantities", "descriptions")}
+        values = {name: tuple(text[name]) for name in _TUPLES}
         values |= {"meta": text["meta"], "units": tuple(u.Unit(x) for x in text["units"])}
         values["axes"] = {
             name: GridAxis(
@@ -120,6 +120,10 @@ def read_results(cls, path):
                 if key.startswith(start)
             }
         values |= {name: _native(array) for name, array in columns.items() if ":" not in name}
+        if "axis_moments" in columns:
+            from miricigale.fitting.continuous_results import ContinuousResults
+
+            cls = ContinuousResults
         return cls(**values)
     except (KeyError, ValueError, TypeError) as err:
         msg = f"{path} is not a complete file of fit results: {err}"

@@ -3,21 +3,22 @@
 import logging
 from dataclasses import dataclass, field, replace
 
-import astropy.units as u
 import numpy as np
 
+from miricigale.fitting.engines.draws import draw_models
 from miricigale.fitting.engines.grid import GridEngine
 from miricigale.fitting.flags import FitFlags
 from miricigale.fitting.likelihood import per_band, read_photometry
-from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.priors import GridPriors, grid_priors
 from miricigale.fitting.quantities import DERIVED_LEVELS, Quantities
+from miricigale.fitting.redshifts import density_log_prior, fixed_log_prior, known_redshifts
 from miricigale.fitting.results import FitResults
+from miricigale.fitting.samples import Samples
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import chunks, parallel_map
+from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import require_columns
-from miricigale.utils.units import to_array
 
 __all__ = ["BayesFitter"]
 
@@ -52,8 +53,9 @@ class BayesFitter:
         Prior of the AGN fractions: equal for all values of the grid (so that f = 0, which is
         evaluated once for each galaxy, carries the summed weight of all tori), or by the width
         of their cells.
-    engine : {"grid"}, optional
-        How the posterior is found.
+    engine : {"grid", "nautilus", "dynesty"}, optional
+        How the posterior is found. The samplers are for continuous parameters: with one of them
+        this gives a `~miricigale.fitting.ContinuousFitter`, whose arguments it then takes.
     model_error : float or dict of str to float, optional
         Part of the flux that is added to its error in quadrature, for all or by filter.
     error_floor : float or dict of str to float, optional
@@ -83,6 +85,19 @@ class BayesFitter:
     .. [1] Boquien et al. 2019, A&A 622, A103, section 4.3
     """
 
+    def __new__(cls, *args, engine="grid", **options):
+        """Another engine than the grid samples continuous parameters: a `ContinuousFitter`."""
+        if engine == "grid":
+            return super().__new__(cls)
+        from miricigale.fitting.continuous import ContinuousFitter
+        from miricigale.fitting.engines.base import get_sampler
+
+        get_sampler(engine)
+        return ContinuousFitter(*args, engine=engine, **options)
+
+    def __getnewargs_ex__(self):
+        return (), {}
+
     def __init__(
         self,
         model,
@@ -100,8 +115,6 @@ class BayesFitter:
         scale_error=True,
         rtol=1e-6,
     ):
-        if engine != "grid":
-            raise argument_error("engine", "'grid'", repr(engine))
         names = None if filters is None else tuple(getattr(filters, "names", filters))
         if isinstance(names, tuple) and isinstance(filters, str):
             raise argument_error("filters", "a list of names or a FilterSet", repr(filters))
@@ -169,6 +182,7 @@ class BayesFitter:
         photometry,
         *,
         redshift=None,
+        redshift_prior=None,
         seed=None,
         executor=None,
         progress_bar=False,
@@ -181,10 +195,16 @@ class BayesFitter:
         ----------
         photometry : `~astropy.table.QTable`
             One row for each object: ``id``, a flux column for each filter, called by the
-            filter's name, and its error ``<name>_err``. NaN is a missing band.
+            filter's name, and its error ``<name>_err``. NaN is a missing band. Where a boolean
+            column ``<name>_limit`` is true the flux is an upper limit: this engine leaves the band
+            out and flags the object (``LIMIT_LEFT_OUT``); samplers take limits into account.
         redshift : str or array_like, optional
             Column of ``photometry``, or values, of known redshifts; each is taken to the nearest
             redshift of the grid. Without it the redshift is free.
+        redshift_prior : tuple, optional
+            Redshifts, shape (n_z,), and densities in redshift, shape (n_z,) or (n, n_z), joined by
+            straight lines: a p(z) for all or each object, which is integrated over the cells of
+            the grid's redshifts and takes the place of their prior.
         seed : optional
             Not used by this engine; other engines draw from it.
         executor : `concurrent.futures.Executor`, optional
@@ -204,11 +224,28 @@ class BayesFitter:
         Raises
         ------
         ValueError
-            If a column is missing or ``redshift`` has the wrong shape.
+            If a column is missing, ``redshift`` or ``redshift_prior`` has the wrong shape, or both
+            are given.
         `~astropy.units.UnitsError`
             If a flux column has no unit of flux density.
         """
         del seed
+        if isinstance(chunk_size, bool) or not int(chunk_size) >= 1:
+            raise argument_error("chunk_size", "an integer >= 1", repr(chunk_size))
+        ready = self._prepare(photometry, redshift, redshift_prior)
+        data, flags, log_prior, filters = ready
+        n = len(data.ids)
+        task = _Chunk(self._engine, self.priors, self.quantities)
+        pieces = [
+            (np.nan_to_num(data.flux[s]), data.sigma[s], log_prior[s])
+            for s in chunks(n, int(chunk_size))
+        ]
+        parts = parallel_map(task, pieces, executor=executor, progress_bar=progress_bar, desc="fit")
+        logger.debug("fitted %d objects", n)
+        return self._results(data, flags, log_prior, parts, redshift is not None, filters)
+
+    def _prepare(self, photometry, redshift, redshift_prior):
+        """Fluxes, flags, ln(prior) of the redshifts of every object, and the bands."""
         require_columns(photometry, [], "photometry")
         grid = self.grid
         filters = self._bands(photometry)
@@ -221,20 +258,83 @@ class BayesFitter:
             n_bands_min=self.n_bands_min,
             grid_filters=grid.filters,
         )
-        if isinstance(chunk_size, bool) or not int(chunk_size) >= 1:
-            raise argument_error("chunk_size", "an integer >= 1", repr(chunk_size))
+        data = self._leave_limits_out(data, photometry, filters)
         flags = data.flags.copy()
-        log_prior = self._redshift_prior(photometry, redshift, flags)
+        log_prior = self._redshift_prior(photometry, redshift, redshift_prior, flags)
+        free = sum(axis.values.size > 1 for axis in self.priors.axes.values())
+        free += 1 - (redshift is not None and self.grid.redshift.size > 1)  # and the mass
+        some = data.used.sum(axis=1)
+        few = (some < free) & ((flags & int(FitFlags.UNFITTED)) == 0)
+        flags[few] |= int(FitFlags.FEW_FOR_PARAMETERS)
         log_prior[(flags & int(FitFlags.UNFITTED)) != 0] = -np.inf
-        n = len(data.ids)
-        task = _Chunk(self._engine, self.priors)
+        return data, flags, log_prior, filters
+
+    def sample(
+        self,
+        photometry,
+        n_draws,
+        *,
+        seed,
+        redshift=None,
+        redshift_prior=None,
+        executor=None,
+        progress_bar=False,
+    ):
+        """
+        Draw models from the posterior of every object.
+
+        Parameters
+        ----------
+        photometry, redshift, redshift_prior, executor, progress_bar : optional
+            As for `fit`.
+        n_draws : int
+            Draws for each object, independent and of equal weight.
+        seed : int
+            Every object has its own stream, keyed by its id: neither order nor the number of
+            workers changes a draw.
+
+        Returns
+        -------
+        samples : `~miricigale.fitting.Samples`
+            Parameters, derived quantities, fluxes and spectra of the draws; NaN for objects that
+            could not be fitted, which are flagged as by `fit`.
+
+        Raises
+        ------
+        ValueError
+            See `fit`; or if ``n_draws`` is not positive.
+        """
+        if isinstance(n_draws, bool) or not isinstance(n_draws, (int, np.integer)) or n_draws < 1:
+            raise argument_error("n_draws", "an integer >= 1", repr(n_draws))
+        seed = check_seed(seed)
+        ready = self._prepare(photometry, redshift, redshift_prior)
+        data, flags, log_prior, filters = ready
+        task = _Draws(self._engine, int(n_draws), seed)
         pieces = [
-            (np.nan_to_num(data.flux[s]), data.sigma[s], log_prior[s])
-            for s in chunks(n, int(chunk_size))
+            (np.nan_to_num(data.flux[s]), data.sigma[s], log_prior[s], data.ids[s])
+            for s in chunks(len(data.ids), 16)
         ]
-        parts = parallel_map(task, pieces, executor=executor, progress_bar=progress_bar, desc="fit")
-        logger.debug("fitted %d objects", n)
-        return self._results(data, flags, log_prior, parts, redshift is not None, filters)
+        parts = parallel_map(
+            task, pieces, executor=executor, progress_bar=progress_bar, desc="draws"
+        )
+        index, scale = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+        unfitted = ~np.isfinite(scale).all(axis=1) & ((flags & int(FitFlags.UNFITTED)) == 0)
+        flags[unfitted] |= int(FitFlags.NO_SIGNAL)
+        meta = provenance(
+            citations=self.grid.meta.get("citations", ()),
+            fit=self.settings(filters, redshift is not None),
+            seed=seed,
+        )
+        return Samples(
+            grid=self.grid,
+            ids=data.ids,
+            flags=flags,
+            index=index,
+            scale=scale,
+            model=self.model,
+            meta=meta,
+            axes=self.priors.axes,
+        )
 
     def _bands(self, photometry):
         """Filters to fit: those asked for, or those of the grid that the table has."""
@@ -247,56 +347,42 @@ class BayesFitter:
             raise argument_error("photometry", wanted, f"columns {list(have)}")
         return filters
 
-    def _redshift_prior(self, photometry, redshift, flags):
+    def _redshift_prior(self, photometry, redshift, redshift_prior, flags):
         """ln(prior) of the grid's redshifts for every object, shape (n, nz)."""
-        n, z = len(photometry), self.grid.redshift
-        with np.errstate(divide="ignore"):
-            log_prior = np.log(self.priors.redshift)
-        usable = self._engine.usable.any(axis=1)
-        log_prior = np.where(usable, log_prior, -np.inf)
-        out = np.tile(log_prior, (n, 1))
-        if redshift is None:
-            flags[~np.isfinite(out).any(axis=1)] |= int(FitFlags.NO_MODEL)
-            return out
-        if isinstance(redshift, str):
-            if redshift not in photometry.colnames:
-                raise argument_error(
-                    "redshift", f"a column among {photometry.colnames}", repr(redshift)
-                )
-            redshift = photometry[redshift]
-        mask = getattr(redshift, "mask", None)
-        values = getattr(redshift, "unmasked", redshift)
-        values = to_array(values, u.dimensionless_unscaled, "redshift")
-        values = (
-            np.array(np.broadcast_to(values, (n,)), dtype=float) if values.ndim == 0 else values
-        )
-        if values.shape != (n,):
-            raise argument_error("redshift", f"{n} values", f"shape {values.shape}")
-        values = np.where(mask, np.nan, values) if mask is not None else values
-        missing = ~(np.isfinite(values) & (values > 0))
-        safe = np.where(missing, z[0], values)
-        node = np.argmin(np.abs(np.log1p(safe)[:, None] - np.log1p(z)), axis=1)
-        apart = np.abs(safe - z[node]) / (1.0 + safe)
-        if self.redshift_tolerance is not None:
-            limit = np.full(n, self.redshift_tolerance)
-        else:
-            edges = np.log1p(cell_edges(z, (0.0, np.inf)))
-            limit = 1.001 * (edges[node + 1] - edges[node]) / 2.0 + 1e-6
-            limit = np.maximum(limit, 1e-3 if z.size == 1 else 0.0)
-        outside = ~missing & (apart > limit)
-        flags[missing] |= int(FitFlags.NO_REDSHIFT)
-        flags[outside] |= int(FitFlags.REDSHIFT_OUTSIDE)
-        fixed = np.full((n, z.size), -np.inf)
-        fixed[np.arange(n), node] = np.where(np.isfinite(log_prior[node]), 0.0, -np.inf)
-        fixed[missing | outside] = -np.inf
-        none = ~missing & ~outside & ~np.isfinite(fixed).any(axis=1)
-        flags[none] |= int(FitFlags.NO_MODEL)
-        return fixed
+        if redshift is not None and redshift_prior is not None:
+            msg = "'redshift' and 'redshift_prior' must not be given both"
+            raise ValueError(msg)
+        z, prior = self.grid.redshift, self.priors.redshift
+        allowed = self._engine.usable.any(axis=1) & (prior > 0)
+        if redshift_prior is not None:
+            return density_log_prior(redshift_prior, z, allowed, flags)
+        if redshift is not None:
+            values = known_redshifts(photometry, redshift)
+            return fixed_log_prior(values, z, allowed, self.redshift_tolerance, flags)
+        log_prior = np.log(prior, where=allowed, out=np.full(z.size, -np.inf))
+        if not allowed.any():
+            flags |= int(FitFlags.NO_MODEL)
+        return np.tile(log_prior, (len(photometry), 1))
+
+    def _leave_limits_out(self, data, photometry, filters):
+        """Take upper limits, which this engine cannot weigh yet, out of the fluxes, and flag."""
+        sigma, flags = data.sigma.copy(), data.flags.copy()
+        for name in filters:
+            column = f"{name}_limit"
+            if column in photometry.colnames:
+                limit = np.asarray(np.ma.filled(np.ma.asarray(photometry[column]), False), bool)
+                band = self.grid.filters.index(name)
+                flags[limit & np.isfinite(sigma[:, band])] |= int(FitFlags.LIMIT_LEFT_OUT)
+                sigma[limit, band] = np.inf
+        n_bands = np.isfinite(sigma).sum(axis=1)
+        flags[n_bands == 0] |= int(FitFlags.NO_BAND)
+        flags[(n_bands > 0) & (n_bands < self.n_bands_min)] |= int(FitFlags.FEW_BANDS)
+        return replace(data, sigma=sigma, flags=flags)
 
     def _results(self, data, flags, log_prior, parts, fixed, filters):
         grid, priors = self.grid, self.priors
         n = len(data.ids)
-        merged = _Part.merge(parts, self._engine, priors, n)
+        merged = _Part.merge(parts, self._engine, priors, self.quantities, n)
         used = data.used
         n_bands = used.sum(axis=1)
         fitted = np.isfinite(merged.chi2)
@@ -354,6 +440,7 @@ class BayesFitter:
             best_flux=best_flux,
             meta=meta,
             model=self.model,
+            intensive=self.quantities.shape.names,
         )
 
     def settings(self, filters=None, fixed=False):
@@ -417,6 +504,7 @@ class _Chunk:
 
     engine: GridEngine
     priors: GridPriors
+    quantities: Quantities
 
     def __call__(self, piece):
         out = self.engine.fit(*piece)
@@ -425,9 +513,11 @@ class _Chunk:
             if axis.kind == "frac_agn":
                 pdf[name] = out.zf.sum(axis=1)
             elif axis.kind == "galaxy":
-                pdf[name] = out.galaxy @ axis.share.T
+                # not a matrix product, whose last digits depend on how many rows there are
+                pdf[name] = np.einsum("ng,vg->nv", out.galaxy, axis.share)
             elif axis.kind == "agn":
-                pdf[name] = out.agn @ axis.share.T
+                pdf[name] = np.einsum("ng,vg->nv", out.agn, axis.share)
+        moments, quantiles = self.quantities.summarise(out)
         return _Part(
             chi2=np.maximum(out.norm - out.best_r, 0.0),
             log_sum=out.log_sum,
@@ -436,9 +526,30 @@ class _Chunk:
             pdf=pdf,
             pdf_2d=out.zf,
             band=out.band,
-            moments=out.moments,
-            quantiles=out.quantiles,
+            moments=moments,
+            quantiles=quantiles,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Draws:
+    """Draw models for a piece of a catalogue; picklable."""
+
+    engine: GridEngine
+    n_draws: int
+    seed: int
+
+    def __call__(self, piece):
+        flux, sigma, log_prior, ids = piece
+        out = self.engine.fit(flux, sigma, log_prior)
+        index = np.full((len(ids), self.n_draws, 4), -1)
+        scale = np.full((len(ids), self.n_draws), np.nan)
+        for i in np.flatnonzero(np.isfinite(out.norm)):
+            rng = stream(self.seed, "fit", "draws", str(ids[i]))
+            index[i], scale[i] = draw_models(
+                self.engine, flux[i], sigma[i], out.zf[i], self.n_draws, rng
+            )
+        return index, scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -456,12 +567,12 @@ class _Part:
     quantiles: np.ndarray = None
 
     @classmethod
-    def merge(cls, parts, engine, priors, n):
+    def merge(cls, parts, engine, priors, quantities, n):
         """Join the pieces; a catalogue without rows gets arrays without rows."""
         if not parts:
             n_z, _, n_b = engine.galaxy.shape
             empty = (np.zeros((n, n_b)), np.zeros((n, n_b)), np.zeros((n, n_z)))
-            parts = [_Chunk(engine, priors)(empty)]
+            parts = [_Chunk(engine, priors, quantities)(empty)]
         names = [name for name in cls.__dataclass_fields__ if name != "pdf"]
         merged = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
         pdf = {name: np.concatenate([p.pdf[name] for p in parts]) for name in parts[0].pdf}

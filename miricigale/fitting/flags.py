@@ -32,6 +32,11 @@ class FitFlags(Flags):
     BAD_FLUX = 1024
     """A flux that is infinite; the band is left out."""
 
+    FEW_FOR_PARAMETERS = 2048
+    """Fewer usable bands than free parameters, the mass among them: the prior decides much."""
+    LIMIT_LEFT_OUT = 4096
+    """An upper limit that the engine cannot weigh; the band is left out."""
+
     UNFITTED = 1 | 2 | 8 | 16 | 32 | 512
     """Bits with which a row has no result."""
 

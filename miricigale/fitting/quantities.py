@@ -1,13 +1,15 @@
-"""Derived quantities of a grid: masses, rates and luminosities that grow with the scale."""
+"""Derived quantities of a grid: what grows with the scale, and the shape of the galaxy."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import astropy.units as u
 import numpy as np
 
+from miricigale.fitting.posterior import cell_percentiles
 from miricigale.utils.units import LUMINOSITY, MASS
 
-__all__ = ["DERIVED_LEVELS", "Quantities"]
+__all__ = ["DERIVED_LEVELS", "Quantities", "ShapeQuantities"]
 
 #: Levels at which the distributions of derived quantities are kept.
 DERIVED_LEVELS = np.array(
@@ -15,15 +17,19 @@ DERIVED_LEVELS = np.array(
     + [0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.84, 0.9, 0.95, 0.975, 0.99, 0.995, 0.999]
 )
 DERIVED_LEVELS.flags.writeable = False
+#: Values of a shape quantity closer than this part of their range are one.
+_SAME = 1e-9
+#: Shape quantities whose outermost cells end at 0.
+_NOT_NEGATIVE = ("a_v", "age_mass", "age_light")
 
 
 @dataclass(frozen=True, eq=False)
-class Quantities:
+class ShapeQuantities:
     """
-    What is derived from the models of a grid, and how.
+    What is derived from a galaxy model and does not scale with its mass.
 
-    The order is: the galaxy's quantities (for each solar mass formed), the AGN's (for each W of
-    AGN power), then the one that both have a part in.
+    Attenuation, ages, colours: one value for each galaxy model, so that their posterior
+    follows from the marginal weights of the galaxy models.
 
     Parameters
     ----------
@@ -33,10 +39,113 @@ class Quantities:
         Units of the quantities.
     descriptions : tuple of str
         One line each.
+    values : `~numpy.ndarray`, shape (n_quantities, nG)
+        Values of the galaxy models; those that are not finite are left out of the posterior.
+    """
+
+    names: tuple
+    units: tuple
+    descriptions: tuple
+    values: np.ndarray
+
+    @classmethod
+    def of_grid(cls, grid):
+        """Take all columns of ``grid.galaxy_shape`` (`~miricigale.sed.ModelGrid`)."""
+        table = getattr(grid, "galaxy_shape", None)
+        names = () if table is None else tuple(table.colnames)
+        units, texts, values = [], [], []
+        for name in names:
+            column = table[name]
+            units.append(getattr(column, "unit", None) or u.dimensionless_unscaled)
+            texts.append(_text(column, ""))
+            values.append(np.asarray(getattr(column, "value", column), float))
+        shape = (len(names), grid.dust_luminosity.size)
+        return cls(names, tuple(units), tuple(texts), np.array(values, float).reshape(shape))
+
+    @cached_property
+    def _nodes(self):
+        """For each quantity: galaxies by ascending value, starts of equal values, the values."""
+        out = []
+        for row in self.values:
+            finite = np.flatnonzero(np.isfinite(row))
+            order = finite[np.argsort(row[finite], kind="stable")]
+            value = row[order]
+            if value.size == 0:
+                out.append((order, np.zeros(0, int), value))
+                continue
+            step = np.diff(value) > _SAME * (value[-1] - value[0])
+            start = np.concatenate([[0], np.flatnonzero(step) + 1])
+            out.append((order, start, value[start]))
+        return out
+
+    def nodes(self, name):
+        """Different values of a quantity in the grid, ascending: array, shape (n_nodes,)."""
+        return self._nodes[self.names.index(name)][2]
+
+    def bounds(self, name):
+        """Limits that the outermost cells do not pass."""
+        return (0.0 if name in _NOT_NEGATIVE else -np.inf, np.inf)
+
+    def summarise(self, weights, levels):
+        """
+        Reduce posterior weights of galaxy models to moments and quantiles.
+
+        Parameters
+        ----------
+        weights : `~numpy.ndarray`, shape (n, nG)
+            Weights of the galaxy models for n objects; rows of NaN give NaN.
+        levels : `~numpy.ndarray`, shape (n_levels,)
+            Levels of the quantiles, in (0, 1).
+
+        Returns
+        -------
+        moments : `~numpy.ndarray`, shape (n, n_quantities, 3)
+            Mean, standard deviation, and NaN (a mean of log10 has no meaning here).
+        quantiles : `~numpy.ndarray`, shape (n, n_quantities, n_levels)
+            From the distribution over the different values, linear within each cell.
+        """
+        n = len(weights)
+        out = np.full((n, len(self.names), 3), np.nan)
+        quantiles = np.full((n, len(self.names), len(levels)), np.nan)
+        for i, (order, start, nodes) in enumerate(self._nodes):
+            if nodes.size == 0:
+                continue
+            # sums along rows in memory, so that pieces of a catalogue give the same digits
+            part = np.take(weights, order, axis=1)
+            total = part.sum(axis=1, keepdims=True)
+            # an object may have all its weight on models without a value
+            part = np.divide(part, total, out=np.full(part.shape, np.nan), where=total > 0)
+            value = self.values[i, order]
+            mean = np.sum(part * value, axis=1)
+            out[:, i, 0] = mean
+            out[:, i, 1] = np.sqrt(np.sum(part * (value - mean[:, None]) ** 2, axis=1))
+            pdf = np.add.reduceat(part, start, axis=1)
+            quantiles[:, i] = cell_percentiles(nodes, pdf, levels, self.bounds(self.names[i]))
+        return out, quantiles
+
+
+@dataclass(frozen=True, eq=False)
+class Quantities:
+    """
+    What is derived from the models of a grid, and how.
+
+    The order is: the galaxy's quantities (for each solar mass formed), the AGN's (for each W of
+    AGN power), the one that both have a part in, then those that do not scale with mass.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Names, those of ``shape`` at the end.
+    units : tuple of `~astropy.units.UnitBase`
+        Units of the quantities.
+    descriptions : tuple of str
+        One line each.
     galaxy_scale, agn_scale : `~numpy.ndarray`, shapes (n_qg, nG) and (n_qa, nA)
         Values for each solar mass formed and for each W.
     mixed_galaxy, mixed_agn : `~numpy.ndarray`, shapes (nG,) and (nA,)
-        The two parts of the last quantity.
+        The two parts of the quantity of both.
+    shape : `ShapeQuantities`
+        What does not scale with mass.
     """
 
     names: tuple
@@ -46,6 +155,7 @@ class Quantities:
     agn_scale: np.ndarray
     mixed_galaxy: np.ndarray
     mixed_agn: np.ndarray
+    shape: ShapeQuantities
 
     @classmethod
     def of_grid(cls, grid):
@@ -88,40 +198,76 @@ class Quantities:
             names.append("total_luminosity")
             texts.append("dust luminosity and AGN power")
         units.append(LUMINOSITY)
+        shape = ShapeQuantities.of_grid(grid)
         return cls(
-            tuple(names),
-            tuple(units),
-            tuple(texts),
+            (*names, *shape.names),
+            (*units, *shape.units),
+            (*texts, *shape.descriptions),
             np.array(galaxy_scale),
             np.array(agn_scale, float).reshape(len(agn_scale), n_agn),
             np.array(mixed_galaxy, float),
             np.array(mixed_agn, float),
+            shape,
         )
 
-    def best(self, grid, g, k, frac, scale):
+    def summarise(self, out):
         """
-        Values for single models.
+        Join the quantities that scale with those that do not.
 
         Parameters
         ----------
-        grid : `~miricigale.sed.ModelGrid`
-            The grid.
-        g, k : `~numpy.ndarray` of int, shape (n,)
-            Galaxies and tori.
-        frac, scale : `~numpy.ndarray`, shape (n,)
-            AGN fractions and solar masses formed.
+        out : `~miricigale.fitting._core.Output`
+            What the grid engine returns for n objects: ``moments`` and ``quantiles`` of what
+            scales, ``galaxy``, the weights of the galaxy models.
 
         Returns
         -------
-        values : `~numpy.ndarray`, shape (n_quantities, n)
+        moments : `~numpy.ndarray`, shape (n, n_quantities, 3)
+        quantiles : `~numpy.ndarray`, shape (n, n_quantities, n_levels)
         """
+        moments, quantiles = self.shape.summarise(out.galaxy, DERIVED_LEVELS)
+        return (
+            np.concatenate([out.moments, moments], axis=1),
+            np.concatenate([out.quantiles, quantiles], axis=1),
+        )
+
+    def evaluate(self, name, grid, g, k, frac, scale):
+        """
+        Values of one quantity for single models.
+
+        Parameters
+        ----------
+        name : str
+            The quantity.
+        grid : `~miricigale.sed.ModelGrid`
+            The grid.
+        g, k : `~numpy.ndarray` of int, shape (...)
+            Galaxies and tori.
+        frac, scale : `~numpy.ndarray`, shape (...)
+            AGN fractions and solar masses formed; NaN gives NaN.
+
+        Returns
+        -------
+        values : `~numpy.ndarray`, shape (...)
+        """
+        i = self.names.index(name)
+        n_galaxy, n_agn = len(self.galaxy_scale), len(self.agn_scale)
+        if i < n_galaxy:
+            return scale * self.galaxy_scale[i][g]
+        if i > n_galaxy + n_agn:
+            # no value where there is no model
+            return np.where(
+                np.isfinite(scale), self.shape.values[i - n_galaxy - n_agn - 1][g], np.nan
+            )
         power = scale * frac / (1.0 - frac) * grid.dust_luminosity[g]
-        rows = [scale * row[g] for row in self.galaxy_scale]
-        rows += [power * row[k] for row in self.agn_scale]
+        if i < n_galaxy + n_agn:
+            return power * self.agn_scale[i - n_galaxy][k]
         mixed = scale * self.mixed_galaxy[g]
-        if self.mixed_agn.size:
-            mixed = mixed + power * self.mixed_agn[k]
-        return np.array([*rows, mixed])
+        return mixed + power * self.mixed_agn[k] if self.mixed_agn.size else mixed
+
+    def best(self, grid, g, k, frac, scale):
+        """Values of all quantities for single models (see `evaluate`): shape (n_quantities, ...)."""
+        return np.array([self.evaluate(n, grid, g, k, frac, scale) for n in self.names])
 
 
 def _text(column, ending):

@@ -98,6 +98,21 @@ class FitResult:
         edges = results.quantiles[self._row, results._quantity(name)]
         return edges * results.unit(name), np.diff(DERIVED_LEVELS)
 
+    def cdf(self, name):
+        """
+        Cumulative distribution of a parameter or derived quantity, linear between its points.
+
+        Returns
+        -------
+        values : `~astropy.units.Quantity`, shape (n,)
+            Edges of the cells of the grid, or, for a derived quantity, its quantiles.
+        levels : `~numpy.ndarray`, shape (n,)
+            Part of the posterior below each; from 0.001 to 0.999 for a derived quantity.
+        """
+        edges, weights = self.pdf(name)
+        first = 0.0 if name in self._all.axes else DERIVED_LEVELS[0]
+        return edges, first + np.concatenate([[0.0], np.cumsum(weights)])
+
     @property
     def pdf_2d(self):
         """Joint posterior of redshift and AGN fraction, shape (nz, nf)."""
@@ -190,7 +205,7 @@ class FitResult:
 
         edges, weights = self.pdf(name)
         kwargs.setdefault("label", name)
-        if name in self._all.quantities:
+        if name in self._all.quantities and name not in self._all.intensive:
             kwargs.setdefault("log", bool(edges.value[0] > 0))
         return plot_pdf(edges, weights, ax=ax, **kwargs)
 

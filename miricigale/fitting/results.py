@@ -70,6 +70,9 @@ class FitResults:
         Provenance and the settings of the fit.
     model : `~miricigale.sed.SEDModel`, optional
         The model the grid was made from; not written to files.
+    intensive : tuple of str, optional
+        Those of ``quantities`` that do not scale with mass: attenuation, ages, colours. They
+        have no mean of log10.
     """
 
     ids: np.ndarray
@@ -97,6 +100,7 @@ class FitResults:
     best_flux: np.ndarray
     meta: dict = field(default_factory=dict)
     model: object = None
+    intensive: tuple = ()
 
     def __post_init__(self):
         for item in fields(self):
@@ -221,7 +225,8 @@ class FitResults:
             One row for each object: ``id``, ``flags``, ``n_bands``, ``chi2_best``,
             ``reduced_chi2``, ``log_evidence``, and for each parameter and derived quantity
             ``<name>_mean``, ``_std``, ``_p16``, ``_p50``, ``_p84`` and ``_best``; derived
-            quantities also have ``_logmean``, the mean of log10 (dex, in their unit).
+            quantities that scale with mass also have ``_logmean``, the mean of log10 (dex, in
+            their unit).
         """
         out = QTable(meta=dict(self.meta))
         columns = {
@@ -246,7 +251,7 @@ class FitResults:
                 column = f"{name}_{suffix}"
                 out[column] = value
                 out[column].info.description = f"{_PARTS[suffix]} of {meaning}"
-            if name in self.quantities:
+            if name in self.quantities and name not in self.intensive:
                 column = f"{name}_logmean"
                 out[column] = self.moments[:, self._quantity(name), 2] * u.dex
                 out[
@@ -261,7 +266,9 @@ class FitResults:
 
     def predict(self, filters=None):
         """
-        Fluxes of the models over the posterior.
+        Fluxes of the models over the posterior, summed over all models.
+
+        In bands that the grid does not have, `Samples.predict` has them from draws.
 
         Parameters
         ----------

@@ -3,7 +3,16 @@
 import astropy.units as u
 import numpy as np
 
-__all__ = ["plot_pdf", "plot_pdf_2d", "plot_sed_fit"]
+from miricigale.plotting.axes import resolve_axes
+
+__all__ = [
+    "plot_pdf",
+    "plot_pdf_2d",
+    "plot_pulls",
+    "plot_recovery",
+    "plot_sed_band",
+    "plot_sed_fit",
+]
 
 
 def _value(quantity, unit=None):
@@ -221,3 +230,128 @@ def plot_sed_fit(
     residual_ax.set_ylabel("residual (sigma)")
     residual_ax.set_xlabel("observed wavelength (um)")
     return ax, residual_ax
+
+
+def plot_sed_band(wave, bands, *, ax=None, rest=True, color="tab:blue", label=None, **kwargs):
+    """
+    Draw percentiles of a spectrum: pairs of levels as bands, a middle one as a line.
+
+    Parameters
+    ----------
+    wave : `~astropy.units.Quantity`, shape (n,)
+        Wavelengths.
+    bands : list of `~astropy.units.Quantity`, shape (n,)
+        Percentiles in ascending order: L_nu, or F_nu as observed.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; the current axes by default.
+    rest : bool, optional
+        Whether these are rest-frame luminosities, drawn as nu L_nu.
+    color : str, optional
+        Colour.
+    label : str, optional
+        Label of the line or the outermost band.
+    **kwargs
+        Passed to `~matplotlib.axes.Axes.fill_between`.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    ax = resolve_axes(ax)
+    x = _value(wave, u.um)
+    if rest:
+        nu = u.Quantity(wave).to(u.Hz, u.spectral())
+        rows = [(nu * band).to_value(u.W) for band in bands]
+    else:
+        rows = [_value(band, u.uJy) for band in bands]
+    kwargs.setdefault("alpha", 0.3)
+    n = len(rows)
+    for i in range(n // 2):
+        text = label if i == 0 and n % 2 == 0 else None
+        ax.fill_between(x, rows[i], rows[n - 1 - i], color=color, linewidth=0, label=text, **kwargs)
+    if n % 2:
+        ax.plot(x, rows[n // 2], color=color, linewidth=1, label=label)
+    top = max(float(np.max(row)) for row in rows)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    if top > 0:
+        ax.set_ylim(1e-5 * top, 3.0 * top)
+    ax.set_xlabel(f"{'rest' if rest else 'observed'} wavelength (um)")
+    ax.set_ylabel("nu L_nu (W)" if rest else "flux density (uJy)")
+    return ax
+
+
+def plot_recovery(true, mean, std, *, ax=None, name=None, unit="", log=False, **kwargs):
+    """
+    Draw recovered against true values with their errors and the line of equality.
+
+    Parameters
+    ----------
+    true, mean, std : array_like, shape (n,)
+        True values, posterior means and standard deviations; NaN is not drawn.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; the current axes by default.
+    name, unit : str, optional
+        For the labels.
+    log : bool, optional
+        Whether the axes are logarithmic; values that are not positive are not drawn.
+    **kwargs
+        Passed to `~matplotlib.axes.Axes.errorbar`.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    ax = resolve_axes(ax)
+    true, mean, std = (np.asarray(x, dtype=float) for x in (true, mean, std))
+    good = np.isfinite(true) & np.isfinite(mean)
+    if log:
+        good &= (true > 0) & (mean > 0)
+    options = {"fmt": ".", "color": "tab:blue", "alpha": 0.6, "elinewidth": 0.6} | kwargs
+    ax.errorbar(true[good], mean[good], yerr=std[good], **options)
+    if np.any(good):
+        ends = np.array([true[good].min(), true[good].max()])
+        ax.plot(ends, ends, color="0.4", linewidth=1)
+    if log:
+        ax.set_xscale("log")
+        ax.set_yscale("log")
+    text = f" ({unit})" if unit else ""
+    ax.set_xlabel(f"true {name or ''}{text}")
+    ax.set_ylabel(f"recovered {name or ''}{text}")
+    return ax
+
+
+def plot_pulls(pull, *, ax=None, label=None, limit=5.0, **kwargs):
+    """
+    Draw the distribution of pulls with the Gaussian that it should be.
+
+    Parameters
+    ----------
+    pull : array_like, shape (n,)
+        Differences in units of their errors; NaN is not drawn.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; the current axes by default.
+    label : str, optional
+        Label of the histogram.
+    limit : float, optional
+        Half width of the axis; pulls beyond are counted in the last bins.
+    **kwargs
+        Passed to `~matplotlib.axes.Axes.hist`.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    ax = resolve_axes(ax)
+    pull = np.asarray(pull, dtype=float)
+    pull = np.clip(pull[np.isfinite(pull)], -limit, limit)
+    x = np.linspace(-limit, limit, 201)
+    ax.plot(x, np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi), color="0.4", linewidth=1)
+    if pull.size:
+        edges = np.linspace(-limit, limit, 21)
+        options = {"histtype": "step", "density": True} | kwargs
+        ax.hist(pull, bins=edges, label=label, **options)
+    ax.set_xlim(-limit, limit)
+    ax.set_xlabel("(measured - predicted) / error")
+    ax.set_ylabel("probability density")
+    return ax

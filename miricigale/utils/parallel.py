@@ -1,8 +1,20 @@
 """Maps over pieces of work by whatever executor the caller brings."""
 
+import contextlib
+import functools
+import os
+import pickle
+import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
 from miricigale.utils.progress import progress
 
 __all__ = ["chunks", "parallel_map"]
+
+#: Functions whose pickle is longer (bytes) go to other processes once, not with every piece.
+_HEAVY = 100_000
 
 
 def parallel_map(function, items, *, executor=None, progress_bar=False, desc=None):
@@ -12,7 +24,9 @@ def parallel_map(function, items, *, executor=None, progress_bar=False, desc=Non
     Parameters
     ----------
     function : callable
-        Called with one item; must be picklable for process executors.
+        Called with one item; must be picklable for process executors. One that carries much
+        data (a model grid) is not sent with every item: a process pool reads it from a
+        temporary file once for each process, dask gets it by ``client.scatter``.
     items : iterable
         The pieces of work.
     executor : `concurrent.futures.Executor`, optional
@@ -31,13 +45,65 @@ def parallel_map(function, items, *, executor=None, progress_bar=False, desc=Non
     items = list(items)
     if executor is None:
         return [function(item) for item in progress(items, show=progress_bar, desc=desc)]
-    futures = [executor.submit(function, item) for item in items]
+    with _sent_once(function, executor) as call:
+        futures = [executor.submit(*call, item) for item in items]
+        try:
+            return [f.result() for f in progress(futures, show=progress_bar, desc=desc)]
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            raise
+
+
+@contextlib.contextmanager
+def _sent_once(function, executor):
+    """What to submit before the item, so that a heavy function travels once."""
+    # dask's executor has no public way to its client
+    client = getattr(executor, "_client", None)
+    scatter = getattr(client, "scatter", None)
+    if scatter is None and not isinstance(executor, ProcessPoolExecutor):
+        yield (function,)
+        return
     try:
-        return [f.result() for f in progress(futures, show=progress_bar, desc=desc)]
-    except BaseException:
-        for future in futures:
-            future.cancel()
-        raise
+        data = pickle.dumps(function, protocol=pickle.HIGHEST_PROTOCOL)
+    except (pickle.PicklingError, AttributeError, TypeError):
+        # the executor may have better means, or says what is wrong
+        yield (function,)
+        return
+    if len(data) <= _HEAVY:
+        yield (function,)
+    elif scatter is not None:
+        yield (_call, scatter(function))
+    else:
+        handle, name = tempfile.mkstemp(prefix="miricigale-", suffix=".pickle")
+        try:
+            with os.fdopen(handle, "wb") as stream:
+                stream.write(data)
+            del data
+            yield (_FromFile(name),)
+        finally:
+            Path(name).unlink(missing_ok=True)
+
+
+def _call(function, item):
+    return function(item)
+
+
+@dataclass(frozen=True)
+class _FromFile:
+    """A function that every process reads from a file when it needs it first."""
+
+    path: str
+
+    def __call__(self, item):
+        return _unpickled(self.path)(item)
+
+
+@functools.lru_cache(maxsize=1)
+def _unpickled(path):
+    # written by this program a moment ago, in a file that only its user can write
+    with open(path, "rb") as stream:
+        return pickle.load(stream)
 
 
 def chunks(n, size):

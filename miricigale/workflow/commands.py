@@ -1,14 +1,12 @@
 """What the smaller commands of the command line do, for use in code too."""
 
-from pathlib import Path
-
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
 from miricigale.filters import Filter
-from miricigale.fitting import BayesFitter
+from miricigale.fitting import BayesFitter, fit_file
 from miricigale.instrument import (
     ceers_exposures,
     proposal_limit,
@@ -19,11 +17,12 @@ from miricigale.instrument import (
 from miricigale.photometry import ForcedPhotometer, detect_sources
 from miricigale.psf import MatchingKernel, hst_psf, miri_psf, psf_mosaic
 from miricigale.sed import SEDModel
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column
 from miricigale.workflow.products import read_image
 
-__all__ = ["filter_table", "fit_table", "measure_files", "plan_table"]
+__all__ = ["filter_table", "fit_catalogue", "measure_files", "plan_table"]
 
 
 def filter_table(pattern=""):
@@ -89,67 +88,77 @@ def plan_table(*, quick=False):
     return QTable(rows=rows, names=columns)
 
 
-def _read_table(path):
-    path = Path(path)
-    if not path.is_file():
-        msg = f"no table {path}"
-        raise DataError(msg)
-    try:
-        return QTable.read(path)
-    except (OSError, ValueError, TypeError) as err:
-        msg = f"{path} cannot be read as a table (ECSV or FITS): {str(err).splitlines()[0]}"
-        raise DataError(msg) from err
-
-
-def fit_table(
-    path, *, axes="fit", redshift=None, model_error=0.1, executor=None, progress_bar=False
+def fit_catalogue(
+    path,
+    output,
+    *,
+    axes="fit",
+    redshift=None,
+    model_error=0.1,
+    flux_unit=None,
+    hdu=None,
+    chunk_rows=10000,
+    resume=True,
+    executor=None,
+    progress_bar=False,
 ):
     """
-    Fit a table of photometry with the chain of Yang et al. 2021.
+    Fit a catalogue of photometry of any length with the chain of Yang et al. 2021.
 
     Parameters
     ----------
     path : path-like
-        ECSV or FITS with ``id`` and, for each band, ``<filter>`` and ``<filter>_err``.
+        FITS, ECSV or CSV with ``id`` and, for each band, ``<filter>`` and ``<filter>_err``.
+    output : path-like
+        Folder of the results.
     axes : {"fit", "quick"}, optional
         Model grid; see `miricigale.sed.yang2021_axes`.
     redshift : str, optional
         Column of known redshifts; fitted if not given.
     model_error : float, optional
         Relative model error.
-    executor : `concurrent.futures.Executor`, optional
-        Workers.
-    progress_bar : bool, optional
-        Whether progress is shown.
+    flux_unit, hdu, chunk_rows, resume, executor, progress_bar : optional
+        As for `miricigale.fitting.fit_file`.
 
     Returns
     -------
-    results : `~miricigale.fitting.FitResults`
+    results : `~miricigale.fitting.FitResultsFiles`
 
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
-        If there is no such file.
+        If there is no such file, or it cannot be read by rows.
     ValueError
         If no column is a flux in a known filter with an error beside it.
     """
-    table = _read_table(path)
+    names = open_rows(path, chunk_rows, hdu=hdu).colnames
     known = set(Filter.names())
     bands = [
         name
-        for name in table.colnames
-        if (name in known or name.startswith("sedpy.")) and error_column(name) in table.colnames
+        for name in names
+        if (name in known or name.startswith("sedpy.")) and error_column(name) in names
     ]
     if not bands:
         raise argument_error(
             "photometry",
             "a table with columns <filter> and <filter>_err ('miricigale filters' lists the names)",
-            f"columns {table.colnames}",
+            f"columns {list(names)}",
         )
     fitter = BayesFitter(
         SEDModel.yang2021(), bands, axes=SEDModel.yang2021_axes(axes), model_error=model_error
     )
-    return fitter.fit(table, redshift=redshift, executor=executor, progress_bar=progress_bar)
+    return fit_file(
+        fitter,
+        path,
+        output,
+        redshift=redshift,
+        flux_unit=flux_unit,
+        hdu=hdu,
+        chunk_rows=chunk_rows,
+        resume=resume,
+        executor=executor,
+        progress_bar=progress_bar,
+    )
 
 
 def measure_files(image, highres, *, filter, pa_aper):

@@ -141,17 +141,17 @@ def brute_force(fitter, flux, sigma, log_prior=None):
     }
 
 
-@pytest.fixture(name="make_grid")
+@pytest.fixture(name="make_grid", scope="session")
 def _make_grid():
     return make_grid
 
 
-@pytest.fixture(name="draw_photometry")
+@pytest.fixture(name="draw_photometry", scope="session")
 def _draw_photometry():
     return draw_photometry
 
 
-@pytest.fixture(name="brute_force")
+@pytest.fixture(name="brute_force", scope="session")
 def _brute_force():
     return brute_force
 

@@ -1,10 +1,18 @@
 """Objects drawn from the prior: posteriors must be right on average."""
 
+import dataclasses
+
 import astropy.units as u
 import numpy as np
+import pytest
 from astropy.table import QTable
+from scipy import stats
 
 from miricigale.fitting import BayesFitter
+from miricigale.fitting.posterior import cell_edges, randomised_ranks
+from miricigale.fitting.quantities import DERIVED_LEVELS
+
+N = 3000
 
 
 def _draw(grid, n, rng):
@@ -27,25 +35,63 @@ def _draw(grid, n, rng):
     return table, z, g, k, f, s
 
 
-def test_ranks_are_uniform_and_intervals_cover(make_grid):
-    n = 3000
+@pytest.fixture(scope="module")
+def fitted(make_grid):
     grid = make_grid(11, n_z=8, n_tau=6, n_age=4, frac=np.append(np.arange(5) * 0.2, 0.95))
     rng = np.random.default_rng(4)
-    table, z, _g, _k, f, s = _draw(grid, n, rng)
-    results = BayesFitter(grid, model_error=0.0).fit(table)
+    # six values that several galaxies have, and as many as there are galaxies
+    grid = dataclasses.replace(
+        grid,
+        galaxy_shape=QTable(
+            {
+                "a_v": np.sqrt(grid.galaxy_parameters["tau"].value) * u.mag,
+                "u_v": rng.normal(0.5, 0.7, grid.n_galaxies) * u.mag,
+            }
+        ),
+    )
+    drawn = _draw(grid, N, rng)
+    results = BayesFitter(grid, model_error=0.0).fit(drawn[0])
     assert results.fitted.all()
+    return grid, results, drawn[1:], rng
+
+
+def _check(rank, name):
+    # the largest distance from the diagonal of 3000 ranks, at a probability of 0.001
+    assert stats.kstest(rank, "uniform").pvalue > 1e-3, name
+    cover = np.mean((rank > 0.16) & (rank < 0.84))
+    assert abs(cover - 0.68) < 0.03, (name, cover)
+
+
+def test_randomised_ranks_of_nodes(fitted):
+    _grid, results, (z, _g, _k, f, _s), rng = fitted
     for name, node in (("redshift", z), ("frac_agn", f)):
-        pdf = results.pdf[name]
-        total = np.cumsum(pdf, axis=1)
-        at = np.take_along_axis(total, node[:, None], axis=1)[:, 0]
-        own = np.take_along_axis(pdf, node[:, None], axis=1)[:, 0]
-        rank = at - own * rng.random(n)
-        counts = np.histogram(rank, bins=10, range=(0, 1))[0]
-        chi2 = np.sum((counts - n / 10) ** 2 / (n / 10))
-        # 9 degrees of freedom: 27.9 has a probability of 0.001
-        assert chi2 < 27.9, (name, counts)
-        cover = np.mean((rank > 0.16) & (rank < 0.84))
-        assert abs(cover - 0.68) < 0.03, name
+        _check(randomised_ranks(results.pdf[name], node, rng.random(N)), name)
+
+
+@pytest.mark.parametrize("name", ["redshift", "frac_agn", "a_v", "u_v"])
+def test_percentiles_of_the_distribution_linear_in_cells(fitted, name):
+    """A truth anywhere in the cell of its node is below a percentile as often as it says."""
+    grid, results, (z, g, _k, f, _s), rng = fitted
+    if name in results.axes:
+        axis = results.axes[name]
+        node, edges = {"redshift": z, "frac_agn": f}[name], cell_edges(axis.values, axis.bounds)
+    else:
+        values, node = np.unique(grid.galaxy_shape[name].value, return_inverse=True)
+        node, edges = node[g], cell_edges(values, (0, np.inf) if name == "a_v" else (-9, 9))
+    truth = edges[node] + rng.random(N) * (edges[node + 1] - edges[node])
+    percentiles = results.percentile(name, DERIVED_LEVELS).value
+    below = np.mean(truth[:, None] < percentiles, axis=0)
+    # five standard deviations of a binomial count
+    error = np.sqrt(DERIVED_LEVELS * (1 - DERIVED_LEVELS) / N)
+    np.testing.assert_array_less(np.abs(below - DERIVED_LEVELS), 5 * error)
+    low, high = results.percentile(name, [0.16, 0.84]).value.T
+    assert abs(np.mean((truth > low) & (truth < high)) - 0.68) < 0.03
+
+
+def test_mass(fitted):
+    _grid, results, (*_, s), _rng = fitted
+    kept = results.quantiles[:, results.quantities.index("mass")]
+    rank = np.array([np.interp(x, row, DERIVED_LEVELS) for x, row in zip(s, kept, strict=True)])
+    _check(rank, "mass")
     low, high = results.percentile("mass", [0.16, 0.84]).value.T
-    cover = np.mean((s > low) & (s < high))
-    assert abs(cover - 0.68) < 0.03
+    assert abs(np.mean((s > low) & (s < high)) - 0.68) < 0.03

@@ -1,3 +1,4 @@
+import itertools
 import pickle
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 
@@ -5,8 +6,10 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from scipy.integrate import quad
 
 from miricigale.fitting import BayesFitter, FitFlags
+from miricigale.fitting.posterior import cell_edges
 from miricigale.sed import SEDModel
 
 ARRAYS = ("chi2", "log_evidence", "pdf_2d", "moments", "quantiles", "model_flux", "best_flux")
@@ -163,7 +166,7 @@ def test_an_empty_catalogue_gives_empty_results(grid, photometry):
     [
         ({"filters": ["band9"]}, KeyError, "no filter of the grid 'band9'; known: band0"),
         ({"filters": "band1"}, ValueError, "'filters' must be a list of names"),
-        ({"engine": "tarot"}, ValueError, "'engine' must be 'grid', got 'tarot'"),
+        ({"engine": "tarot"}, KeyError, "no engine 'tarot'; known: dynesty, nautilus"),
         ({"model_error": -1}, ValueError, "'model_error' must be finite and not negative"),
         ({"model_error": {"x": 1}}, ValueError, r"'model_error' must be a dict with keys among"),
         ({"priors": {"mood": "log"}}, KeyError, "no grid parameter 'mood'; known: age"),
@@ -233,3 +236,93 @@ def test_infinite_fluxes_are_flagged(grid, photometry):
     assert [bool(f & FitFlags.BAD_ERROR) for f in flags] == [False, False, True, False]
     assert np.isfinite(results.chi2[:4]).all()
     assert (whole.n_bands - results.n_bands)[:4].tolist() == [1, 1, 1, 0]
+
+
+# ------------------------------------------------------------- densities of redshift, limits
+
+
+def test_a_density_weighs_the_redshifts_by_its_integral_over_their_cells(
+    make_grid, draw_photometry
+):
+    """Posterior with p(z) = posterior with a flat prior times the integrals, by quadrature."""
+    grid = make_grid(3, n_z=6)
+    fitter = BayesFitter(grid, rtol=0)
+    table, _ = draw_photometry(grid, 5, seed=2)
+    nodes = np.array([0.0, 0.4, 0.9, 2.0, 9.0])
+    density = np.array([0.1, 2.0, 0.3, 0.5, 0.0])
+    z = grid.redshift
+    edges = cell_edges(z, (0.0, np.inf))
+    weights = [
+        quad(lambda x: np.interp(x, nodes, density, right=0.0), a, b, points=nodes[1:-1])[0]
+        for a, b in itertools.pairwise(edges)
+    ]
+    flat = fitter.fit(table).pdf["redshift"]
+    want = flat * weights
+    got = fitter.fit(table, redshift_prior=(nodes, density)).pdf["redshift"]
+    np.testing.assert_allclose(got, want / want.sum(axis=1, keepdims=True), rtol=1e-7, atol=1e-13)
+    # one for each object is the same, row by row
+    each = fitter.fit(table, redshift_prior=(nodes, np.tile(density, (5, 1)))).pdf["redshift"]
+    np.testing.assert_array_equal(each, got)
+
+
+def test_a_narrow_density_is_a_known_redshift(make_grid, draw_photometry):
+    grid = make_grid(3, n_z=6)
+    fitter = BayesFitter(grid)
+    table, _ = draw_photometry(grid, 4, seed=2)
+    z = grid.redshift[2]
+    known = fitter.fit(table, redshift=np.full(4, z))
+    nodes = np.array([z - 1e-4, z, z + 1e-4])
+    dense = fitter.fit(table, redshift_prior=(nodes, np.array([0.0, 1.0, 0.0])))
+    np.testing.assert_allclose(dense.log_evidence, known.log_evidence, rtol=1e-12)
+    np.testing.assert_array_equal(dense.best_index, known.best_index)
+
+
+def test_densities_that_cannot_be_used_are_flagged_or_refused(make_grid, draw_photometry):
+    grid = make_grid(3, n_z=6)
+    fitter = BayesFitter(grid)
+    table, _ = draw_photometry(grid, 4, seed=2)
+    nodes = np.array([0.0, 50.0, 51.0])
+    density = np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0], [np.nan, 1.0, 1.0], [0.0, 0.0, 0.0]])
+    got = fitter.fit(table, redshift_prior=(nodes, density))
+    names = [set(FitFlags.names(flag)) for flag in got.flags]
+    assert "no_model" in names[1]
+    assert "no_redshift" in names[2]
+    assert "no_redshift" in names[3]
+    assert got.fitted.tolist() == [True, False, False, False]
+    for prior, match in (
+        ((nodes, density[:2]), "'redshift_prior' must be"),
+        ((nodes[::-1], density), "ascending"),
+        ((nodes, -density[:1].repeat(4, axis=0)), "not negative"),
+        ("p_z", "'redshift_prior' must be"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            fitter.fit(table, redshift_prior=prior)
+    with pytest.raises(ValueError, match="must not be given both"):
+        fitter.fit(table, redshift=1.0, redshift_prior=(nodes, density))
+
+
+def test_an_upper_limit_is_no_flux(make_grid, draw_photometry):
+    """The engine does not weigh limits yet: the band counts as missing, and the row says so."""
+    grid = make_grid(3)
+    fitter = BayesFitter(grid)
+    table, _ = draw_photometry(grid, 4, seed=4)
+    name = grid.filters[1]
+    table[f"{name}_limit"] = [True, False, False, True]
+    blank = table.copy()
+    blank[name][[0, 3]] = np.nan
+    got, want = fitter.fit(table), fitter.fit(blank)
+    np.testing.assert_array_equal(got.chi2, want.chi2)
+    np.testing.assert_array_equal(got.pdf_2d, want.pdf_2d)
+    names = [FitFlags.names(flag) for flag in got.flags]
+    assert ["limit_left_out" in n for n in names] == [True, False, False, True]
+
+
+def test_fewer_bands_than_parameters_are_flagged(make_grid, draw_photometry):
+    grid = make_grid(3)
+    table, _ = draw_photometry(grid, 2, seed=4)
+    for name in grid.filters[2:]:
+        table[name][0] = np.nan
+    got = BayesFitter(grid).fit(table)
+    assert got.fitted.all()
+    names = [FitFlags.names(flag) for flag in got.flags]
+    assert "few_for_parameters" in names[0]

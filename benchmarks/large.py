@@ -1,0 +1,123 @@
+"""
+Memory and time of a fit from file to file: a long catalogue and a small grid.
+
+    python benchmarks/large.py [--n 200000] [--chunk-rows 10000] [--threads 1]
+
+The catalogue is written a piece at a time. Peak memory is that of a process of its own, for this
+catalogue and for one a tenth as long: the difference is what a longer catalogue costs.
+"""
+
+import argparse
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.fitting import BayesFitter, fit_file, open_results
+from miricigale.fitting.part_files import _write_rows
+from miricigale.sed import SEDModel
+
+BANDS = ["megacam.u", "acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1", "irac.ch2"]
+BANDS += ["miri.f770w", "miri.f1000w", "miri.f1500w", "miri.f2100w"]
+
+
+def make_grid():
+    axes = SEDModel.yang2021_axes("quick")
+    axes = {name: axes[name] for name in ("tau", "age", "ebv", "alpha")}
+    axes["redshift"] = np.expm1(np.linspace(np.log(1.1), np.log(5.0), 30))
+    return SEDModel.yang2021(agn=False).grid(axes, BANDS)
+
+
+def catalogue(grid, n, step=20000):
+    """Models of the grid with errors of 10 %, ``step`` rows at a time."""
+    rng = np.random.default_rng(1)
+    for start in range(0, n, step):
+        size = min(step, n - start)
+        z = rng.integers(grid.redshift.size, size=size)
+        g = np.array([rng.choice(np.flatnonzero(grid.allowed[i])) for i in z])
+        flux = 1e10 * grid.flux(z, g)
+        table = QTable({"id": start + np.arange(size)})
+        for i, name in enumerate(grid.filters):
+            error = 0.1 * flux[:, i]
+            table[name] = (flux[:, i] + error * rng.normal(size=size)) * u.uJy
+            table[f"{name}_err"] = error * u.uJy
+        yield table
+
+
+def write_catalogue(path, grid, n):
+    with open(path, "wb") as stream:
+        stream.write(bytes(-_write_rows(stream, catalogue(grid, n), n, 0) % 2880))
+
+
+def one(folder, n, chunk_rows, threads):
+    """Fit a catalogue and print seconds and peak memory."""
+    grid = make_grid()
+    fitter = BayesFitter(grid)
+    warm = QTable({"id": [0], **{c: [1.0] * u.uJy for b in BANDS for c in (b, f"{b}_err")}})
+    fitter.fit(warm)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    start = time.time()
+    with ThreadPoolExecutor(threads) as executor:
+        results = fit_file(
+            fitter,
+            folder / f"{n}.fits",
+            folder / f"out{n}",
+            chunk_rows=chunk_rows,
+            executor=executor if threads > 1 else None,
+        )
+    fitted = time.time() - start
+    start = time.time()
+    results.write_table(folder / f"table{n}.fits")
+    joined = time.time() - start
+    start = time.time()
+    fit_file(fitter, folder / f"{n}.fits", folder / f"out{n}", chunk_rows=chunk_rows)
+    again = time.time() - start
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(fitted, joined, again, before, peak)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--n", type=int, default=200_000, help="objects")
+    parser.add_argument("--chunk-rows", type=int, default=10_000)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.one:
+        one(options.one, options.n, options.chunk_rows, options.threads)
+        return
+    grid = make_grid()
+    print(f"{grid!r}; {options.chunk_rows} rows a part, {options.threads} threads")
+    print(
+        f"{'objects':>8s} {'input':>8s} {'results':>8s} {'fit':>8s} {'rate':>8s} {'join':>7s}",
+        end="",
+    )
+    print(f" {'resume':>7s} {'before':>8s} {'peak':>8s}")
+    with tempfile.TemporaryDirectory() as folder:
+        folder = Path(folder)
+        for n in (options.n // 10, options.n):
+            write_catalogue(folder / f"{n}.fits", grid, n)
+            run = [sys.executable, __file__, "--one", str(folder), "--n", str(n)]
+            run += ["--chunk-rows", str(options.chunk_rows), "--threads", str(options.threads)]
+            env = {**os.environ, "OMP_NUM_THREADS": "1"}
+            text = subprocess.check_output(run, text=True, env=env).split()
+            fitted, joined, again, before, peak = map(float, text[-5:])
+            size = (folder / f"{n}.fits").stat().st_size / 1e6
+            results = open_results(folder / f"out{n}")
+            out = sum(path.stat().st_size for path in results.paths) / 1e6
+            print(
+                f"{n:8d} {size:5.0f} MB {out:5.0f} MB {fitted:6.0f} s {n / fitted:4.0f} /s "
+                f"{joined:5.0f} s {again:5.1f} s {before:5.0f} MB {peak:5.0f} MB"
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,260 @@
+"""Catalogues of photometry as CIGALE reads them."""
+
+import warnings
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable, Table
+
+from miricigale.fitting.cigale.bands import filter_of_band, is_line
+from miricigale.utils.exceptions import DataError, MiricigaleWarning
+from miricigale.utils.tables import error_column
+from miricigale.utils.units import FNU
+
+__all__ = ["read_cigale_catalog", "read_table"]
+
+#: Values that stand for nothing, besides NaN and all below `THRESHOLD`.
+SENTINELS = (-99.0, -999.0)
+THRESHOLD = -9990.0
+#: Relative error of fluxes without a column of errors.
+DEFAULT_ERROR = 0.1
+
+_OWN = ("id", "redshift", "distance")
+
+
+def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=False):
+    """
+    Read a catalogue of photometry in CIGALE's format.
+
+    Parameters
+    ----------
+    path : path-like
+        A text table (with a header line, after ``#`` or not), FITS or VOTable file. Columns:
+        ``id``, ``redshift``, optionally ``distance`` (Mpc), and for each band its flux by the
+        band's name and its error ``<band>_err``; without a unit they are in mJy.
+    bands : iterable of str, optional
+        Which bands to read; all by default. A band named without its error
+        (``["IRAC1", "IRAC1_err", "MIPS1"]``) gets 10 % of its flux, as in CIGALE; so does a
+        band that has no column of errors.
+    limits : bool, optional
+        Whether negative errors mark upper limits; if not, such a band is missing.
+    names : dict of str to str, optional
+        Filters of bands that are not known, or otherwise known: CIGALE's name to ours (see
+        `~miricigale.filters.Filter.from_name`).
+    strict : bool, optional
+        Whether a band without a filter is an error, not a warning.
+
+    Returns
+    -------
+    photometry : `~astropy.table.QTable`
+        ``id``; ``redshift``, NaN where it is missing or negative; ``distance`` if it is there;
+        for each band, by our name, flux and error in uJy, and ``<filter>_limit`` if an object
+        has an upper limit there: then the flux is the limit and the error its 1 sigma.
+        ``meta["cigale"]`` has ``bands`` (our names to CIGALE's), ``default_error`` (bands
+        with an error of 10 %) and ``left_out``.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file cannot be read, a column is missing, two bands are the same filter, or,
+        with ``strict``, columns would be left out.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        Of bands and columns that are left out, all in one message.
+
+    Notes
+    -----
+    Missing is a flux or error that is NaN, masked, -99, -999 or below -9990, and an error of 0.
+    """
+    path = Path(path)
+    table = read_table(path, "a catalogue of CIGALE")
+    for name in ("id", "redshift"):
+        if name not in table.colnames:
+            msg = f"{path} has no column {name!r}, only {', '.join(table.colnames)}"
+            raise DataError(msg)
+    chosen, with_error = _choose(path, table, bands)
+    filters, left_out = _filters(path, table, chosen, names or {})
+    other = [] if bands is not None else _others(table, chosen)
+    out = QTable()
+    out["id"] = np.array(table["id"])
+    redshift = _numbers(path, table, "redshift")
+    out["redshift"] = np.where(redshift >= 0, redshift, np.nan)
+    if "distance" in table.colnames:
+        out["distance"] = _with_unit(path, table, "distance", u.Mpc)
+    no_error = []
+    for band, name in filters.items():
+        flux = _missing(_with_unit(path, table, band, u.mJy).to_value(FNU), 1e3)
+        column = error_column(band)
+        if band in with_error:
+            error = _missing(_with_unit(path, table, column, u.mJy).to_value(FNU), 1e3)
+        else:
+            error = DEFAULT_ERROR * np.abs(flux)
+            no_error.append(band)
+        _add_band(out, name, flux, error, limits)
+        out[name].info.description = band
+    out.meta["cigale"] = {
+        "file": path.name,
+        "bands": {name: band for band, name in filters.items()},
+        "default_error": no_error,
+        "left_out": left_out + other,
+    }
+    _tell(path, left_out, other, no_error, strict)
+    return out
+
+
+def _tell(path, left_out, other, no_error, strict):
+    parts = []
+    if left_out:
+        parts.append(f"left out, no filter here: {', '.join(left_out)}")
+    if other:
+        parts.append(f"left out, no bands: {', '.join(other)}")
+    if strict and left_out:
+        msg = f"{path}: {'; '.join(parts)}"
+        raise DataError(msg)
+    if no_error:
+        parts.append(f"10 % of the flux taken for the error: {', '.join(no_error)}")
+    if parts:
+        msg = f"{path}: {'; '.join(parts)}"
+        warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+
+
+def _choose(path, table, bands):
+    """Bands to read, and those of them that have errors."""
+    have = set(table.colnames)
+    if bands is None:
+        chosen = [
+            name
+            for name in table.colnames
+            if name not in _OWN
+            and not name.endswith("_err")
+            and (error_column(name) in have or filter_of_band(name) or is_line(name))
+        ]
+        return chosen, {name for name in chosen if error_column(name) in have}
+    bands = list(bands)
+    lost = [name for name in bands if name not in have]
+    if lost:
+        msg = f"{path} has no column {', '.join(lost)}; it has {', '.join(table.colnames)}"
+        raise DataError(msg)
+    chosen = [name for name in dict.fromkeys(bands) if not name.endswith("_err")]
+    return chosen, {name for name in chosen if error_column(name) in bands}
+
+
+def _others(table, chosen):
+    """Columns that are neither bands nor their errors."""
+    known = {*_OWN, *chosen, *map(error_column, chosen)}
+    return [name for name in table.colnames if name not in known]
+
+
+def _filters(path, table, chosen, names):
+    filters, left_out = {}, []
+    for band in chosen:
+        unit = table[band].unit
+        line = is_line(band) or (unit is not None and unit.is_equivalent(u.W / u.m**2))
+        name = None if line else names.get(band, filter_of_band(band))
+        if name is None:
+            left_out.append(f"{band} (line)" if line else band)
+            continue
+        twin = next((b for b, n in filters.items() if n == name), None)
+        if twin is not None:
+            msg = f"{path}: the bands {twin} and {band} are both the filter {name}"
+            raise DataError(msg)
+        filters[band] = name
+    if not filters:
+        msg = f"{path} has no band that is known here, of {', '.join(chosen) or 'none'}"
+        raise DataError(msg)
+    return filters, left_out
+
+
+def _missing(values, factor):
+    """Set values that stand for nothing to NaN; ``factor`` has brought them from mJy to uJy."""
+    bad = values < THRESHOLD * factor
+    for sentinel in SENTINELS:
+        # the file's own number times a unit: equal but for rounding
+        bad |= np.abs(values - sentinel * factor) <= 1e-9 * factor
+    return np.where(bad, np.nan, values)
+
+
+def _add_band(out, name, flux, error, limits):
+    limit = error < 0
+    gone = ~np.isfinite(flux) | ~np.isfinite(error) | (error == 0)
+    if not limits:
+        gone |= limit
+    limit &= ~gone
+    out[name] = np.where(gone, np.nan, flux) * FNU
+    out[error_column(name)] = np.where(gone, np.nan, np.abs(error)) * FNU
+    if np.any(limit):
+        out[f"{name}_limit"] = limit
+        out[f"{name}_limit"].info.description = "whether the flux is an upper limit"
+
+
+def _numbers(path, table, name):
+    """Column as floats, NaN where masked."""
+    column = table[name]
+    try:
+        values = np.array(np.ma.getdata(column), dtype=float)
+    except (TypeError, ValueError):
+        msg = f"{path}: the column {name!r} holds something else than numbers"
+        raise DataError(msg) from None
+    values[np.broadcast_to(np.ma.getmaskarray(column), values.shape)] = np.nan
+    return values
+
+
+def _with_unit(path, table, name, default):
+    unit = table[name].unit or default
+    try:
+        return (_numbers(path, table, name) * u.Unit(unit)).to(default)
+    except (u.UnitConversionError, TypeError, ValueError):
+        msg = f"{path}: the column {name!r} must be convertible to {default}, got {unit}"
+        raise DataError(msg) from None
+
+
+def read_table(path, wanted):
+    """
+    Read a table in any of CIGALE's formats.
+
+    Parameters
+    ----------
+    path : path-like
+        Text, FITS or VOTable.
+    wanted : str
+        What it should be, for the message.
+
+    Returns
+    -------
+    table : `~astropy.table.Table`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If it cannot be read.
+    """
+    path = Path(path)
+    if not path.is_file():
+        msg = f"{path} cannot be read as {wanted}: no such file"
+        raise DataError(msg)
+    try:
+        table = Table.read(path, **_format(path))
+    except Exception as err:  # readers of all formats raise as they like
+        lines = str(err).strip().splitlines() or [type(err).__name__]
+        msg = f"{path} cannot be read as {wanted}: {lines[0]}"
+        raise DataError(msg) from err
+    table.convert_bytestring_to_unicode()
+    return table
+
+
+def _format(path):
+    suffixes = [s.lower() for s in path.suffixes]
+    if {".fits", ".fit"} & set(suffixes[-2:]):
+        return {"format": "fits"}
+    if suffixes and suffixes[-1] in (".xml", ".vot", ".votable"):
+        return {"format": "votable"}
+    with open(path, encoding="utf-8") as handle:
+        first = next((line for line in handle if line.strip()), "")
+    if first.startswith("# %ECSV"):
+        return {"format": "ascii.ecsv"}
+    if first.startswith("#") and "id" in first.strip("# \n").split():
+        return {"format": "ascii.commented_header"}
+    return {"format": "ascii"}

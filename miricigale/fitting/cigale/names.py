@@ -1,0 +1,107 @@
+"""Names of physical quantities: CIGALE's, with its units, for ours."""
+
+import astropy.units as u
+
+__all__ = ["cigale_names", "known_property", "unit_of"]
+
+# our name, CIGALE's, CIGALE's unit
+_PARAMETERS = (
+    ("redshift", "universe.redshift", ""),
+    ("frac_agn", "agn.fracAGN", ""),
+    ("tau97", "agn.t", ""),
+    ("p", "agn.pl", ""),
+    ("q", "agn.q", ""),
+    ("opening_angle", "agn.oa", "deg"),
+    ("radius_ratio", "agn.R", ""),
+    ("inclination", "agn.i", "deg"),
+    ("disk_slope", "agn.delta", ""),
+    ("ebv_polar", "agn.EBV", "mag"),
+    ("temperature_polar", "agn.temperature", "K"),
+    ("emissivity_polar", "agn.emissivity", ""),
+    ("alpha", "dust.alpha", ""),
+    ("temperature_dust", "dust.temperature", "K"),
+    ("emissivity_dust", "dust.beta", ""),
+    ("alpha_mir", "dust.alpha", ""),
+    ("u_min", "dust.umin", ""),
+    ("q_pah", "dust.qpah", ""),
+    ("gamma", "dust.gamma", ""),
+    ("tau", "sfh.tau_main", "Myr"),
+    ("age", "sfh.age_main", "Myr"),
+    ("f_burst", "sfh.f_burst", ""),
+    ("age_burst", "sfh.age_burst", "Myr"),
+    ("tau_burst", "sfh.tau_burst", "Myr"),
+    ("metallicity", "stellar.metallicity", ""),
+    ("separation_age", "stellar.old_young_separation_age", "Myr"),
+    ("log_u", "nebular.logU", ""),
+    ("metallicity_gas", "nebular.zgas", ""),
+    ("f_esc", "nebular.f_esc", ""),
+    ("f_dust", "nebular.f_dust", ""),
+    ("ebv", "attenuation.E_BVs.stellar.young", "mag"),
+    ("ebv_lines", "attenuation.E_BV_lines", "mag"),
+    ("ebv_factor_stars", "attenuation.E_BV_factor", ""),
+    ("ebv_factor", "attenuation.ebvs_old_factor", ""),
+    ("slope", "attenuation.powerlaw_slope", ""),
+    ("uv_bump", "attenuation.uv_bump_amplitude", ""),
+    ("uv_bump_wavelength", "attenuation.uv_bump_wavelength", "nm"),
+    ("uv_bump_width", "attenuation.uv_bump_width", "nm"),
+    ("av_ism", "attenuation.Av_ISM", "mag"),
+    ("mu", "attenuation.mu", ""),
+    ("slope_ism", "attenuation.slope_ISM", ""),
+    ("slope_bc", "attenuation.slope_BC", ""),
+    ("stellar_mass", "stellar.m_star", "solMass"),
+    ("mass", "sfh.integrated", "solMass"),
+    ("sfr", "sfh.sfr", "solMass / yr"),
+    ("sfr_10myr", "sfh.sfr10Myrs", "solMass / yr"),
+    ("sfr_100myr", "sfh.sfr100Myrs", "solMass / yr"),
+    ("dust_luminosity", "dust.luminosity", "W"),
+    ("agn_power", "agn.total_dust_luminosity", "W"),
+    ("agn_luminosity", "agn.luminosity", "W"),
+    ("accretion_power", "agn.accretion_power", "W"),
+)
+#: Our units where they are not CIGALE's.
+_OURS = {
+    **dict.fromkeys(("tau", "age", "age_burst", "tau_burst"), u.Gyr),
+    **dict.fromkeys(("uv_bump_wavelength", "uv_bump_width"), u.um),
+}
+#: Names that depend on the module.
+_OF_MODULE = {
+    "sfh2exp": {"age": "sfh.age", "age_burst": "sfh.burst_age"},
+    "sfhfromfile": {"age": "sfh.age"},
+}
+
+
+def cigale_names(modules=None):
+    """
+    CIGALE's names of what we have.
+
+    Parameters
+    ----------
+    modules : dict of str to str, optional
+        Role of a component to CIGALE's module, on which some names depend.
+
+    Returns
+    -------
+    names : dict of str to tuple
+        Our name to CIGALE's name, its unit, and the factor to it from ours.
+    """
+    names = {}
+    for ours, theirs, unit in _PARAMETERS:
+        unit = u.Unit(unit)
+        names[ours] = (theirs, unit, _OURS.get(ours, unit).to(unit))
+    for module in (modules or {}).values():
+        for ours, theirs in _OF_MODULE.get(module, {}).items():
+            names[ours] = (theirs, *names[ours][1:])
+    return names
+
+
+def known_property(name, modules=None):
+    """Whether we have a quantity of CIGALE's name."""
+    return any(theirs == name for theirs, *_ in cigale_names(modules).values())
+
+
+def unit_of(name):
+    """Unit of a quantity of CIGALE's name; None if it is not known."""
+    units = {theirs: u.Unit(unit) for _, theirs, unit in _PARAMETERS}
+    for module, renamed in _OF_MODULE.items():
+        units |= {new: cigale_names({"": module})[ours][1] for ours, new in renamed.items()}
+    return units.get(name)

@@ -1,0 +1,156 @@
+"""Results in CIGALE's columns."""
+
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable, Table
+
+from miricigale.fitting.cigale.bands import cigale_band, filter_of_band
+from miricigale.fitting.cigale.catalog import read_table
+from miricigale.fitting.cigale.names import cigale_names, unit_of
+from miricigale.utils.exceptions import DataError, argument_error, unknown_name
+
+__all__ = ["read_cigale_results", "write_cigale_results"]
+
+_CHI2 = ("best.chi_square", "best.reduced_chi_square")
+
+
+def write_cigale_results(
+    results, path, *, variables=None, bands=None, modules=None, overwrite=False
+):
+    """
+    Write results as CIGALE does, in ``results.fits`` or ``results.txt``.
+
+    Parameters
+    ----------
+    results : `~miricigale.fitting.FitResults`
+        Results of a fit.
+    path : path-like
+        The file; a text table if it ends in ``.txt``, else FITS.
+    variables : iterable of str, optional
+        For which of CIGALE's quantities there are columns ``bayes.X`` and ``bayes.X_err``; all
+        that we have by default.
+    bands : dict of str to str, optional
+        Our filters to CIGALE's bands; by default those of ``results.meta["cigale"]``, or CIGALE's
+        present names, and ours where there is none.
+    modules : dict of str to str, optional
+        Role of a component to CIGALE's module, on which some names depend; by default those of
+        ``results.meta["cigale"]``.
+    overwrite : bool, optional
+        Whether a file that is there is replaced.
+
+    Raises
+    ------
+    KeyError
+        If a variable is not known.
+    OSError
+        If the file is there and ``overwrite`` is not given.
+
+    Notes
+    -----
+    The columns are ``id``; ``bayes.X`` and ``bayes.X_err``, posterior means and standard
+    deviations; those of the bands' fluxes; ``best.chi_square`` and ``best.reduced_chi_square``
+    (by the number of bands less one); ``best.X``, quantities of the best model, also of
+    parameters that have one value; ``best.<band>``. Units are CIGALE's: Myr, Msun, Msun/yr, W,
+    mag, nm, deg, mJy.
+    """
+    path = Path(path)
+    if path.exists() and not overwrite:
+        msg = f"{path} is there; overwrite=True replaces it"
+        raise OSError(msg)
+    note = results.meta.get("cigale", {})
+    modules = note.get("modules", {}) if modules is None else modules
+    bands = {**note.get("bands", {}), **(bands or {})}
+    columns = _columns(results, cigale_names(modules), variables)
+    table = Table()
+    table["id"] = np.array(results.ids)
+    for name, (mean, std, _, unit) in columns.items():
+        if mean is not None:
+            table[f"bayes.{name}"] = u.Quantity(mean, unit)
+            table[f"bayes.{name}_err"] = u.Quantity(std, unit)
+    written = {name: bands.get(name, cigale_band(name)) for name in results.filters}
+    if len(set(written.values())) < len(written):
+        raise argument_error("bands", "a different name for each filter", f"{written}")
+    for i, band in enumerate(written.values()):
+        table[f"bayes.{band}"] = (results.model_flux[:, i] * u.uJy).to(u.mJy)
+        table[f"bayes.{band}_err"] = (results.model_flux_std[:, i] * u.uJy).to(u.mJy)
+    table[_CHI2[0]] = np.array(results.chi2)
+    table[_CHI2[1]] = np.array(results.reduced_chi2)
+    for name, (_, _, best, unit) in columns.items():
+        table[f"best.{name}"] = u.Quantity(best, unit)
+    for i, band in enumerate(written.values()):
+        table[f"best.{band}"] = (results.best_flux[:, i] * u.uJy).to(u.mJy)
+    if path.suffix.lower() == ".txt":
+        table.write(path, format="ascii.fixed_width", delimiter=None, overwrite=overwrite)
+    else:
+        table.write(path, format="fits", overwrite=overwrite)
+
+
+def _columns(results, names, variables):
+    """CIGALE's name to mean, standard deviation (None if not wanted), best value and unit."""
+    constants = results.meta.get("fit", {}).get("constants", {})
+    options = results.meta.get("grid", {}).get("options") or ()
+    if "nebular: gas = stellar" in options:
+        constants = {name: x for name, x in constants.items() if name != "metallicity_gas"}
+    columns = {}
+    for ours, (theirs, unit, factor) in names.items():
+        if ours in results.parameters:
+            mean, std = (x.value * factor for x in (results.mean(ours), results.std(ours)))
+            columns[theirs] = (mean, std, np.asarray(results.best[ours]) * factor, unit)
+        elif ours in constants:
+            value = np.where(results.fitted, constants[ours] * factor, np.nan)
+            columns[theirs] = (value, np.where(results.fitted, 0.0, np.nan), value, unit)
+    known = set(columns)
+    if variables is not None:
+        for name in variables:
+            if name not in known:
+                raise unknown_name("quantity of the results", name, known)
+        wanted = set(variables)
+        columns = {
+            name: (mean, std, best, unit) if name in wanted else (None, None, best, unit)
+            for name, (mean, std, best, unit) in columns.items()
+        }
+    return dict(sorted(columns.items()))
+
+
+def read_cigale_results(path):
+    """
+    Read ``results.fits`` or ``results.txt``, CIGALE's own or those of `write_cigale_results`.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        CIGALE's columns, with units where the file has them or the name is known.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file is missing or something else.
+    """
+    table = read_table(path, "results of CIGALE")
+    missing = [name for name in ("id", *_CHI2) if name not in table.colnames]
+    if missing:
+        msg = f"{path} is no table of CIGALE's results: no column {', '.join(missing)}"
+        raise DataError(msg)
+    for name in table.colnames:
+        column = table[name]
+        if column.unit is None and name.startswith(("bayes.", "best.")) and name not in _CHI2:
+            column.unit = _unit(name)
+    return QTable(table)
+
+
+def _unit(column):
+    name = column.partition(".")[2]
+    for text in (name, name.removesuffix("_err")):
+        unit = unit_of(text)
+        if unit is not None:
+            return unit
+        if filter_of_band(text) is not None:
+            return u.mJy
+    return None

@@ -1,0 +1,278 @@
+"""A run of CIGALE as a model, a grid and a fit here."""
+
+import dataclasses
+import inspect
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from miricigale.fitting.cigale.catalog import read_cigale_catalog
+from miricigale.fitting.cigale.results import write_cigale_results
+from miricigale.fitting.fitter import BayesFitter
+from miricigale.sed import SEDModel
+from miricigale.utils.exceptions import ConfigError, argument_error
+from miricigale.utils.tables import require_columns
+
+__all__ = ["CigaleSetup"]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CigaleSetup:
+    """
+    A run of CIGALE in our terms; made by `~miricigale.fitting.read_pcigale_ini`.
+
+    Parameters
+    ----------
+    path : `~pathlib.Path`
+        The configuration.
+    data_file : `~pathlib.Path` or None
+        The catalogue.
+    components : tuple of `~miricigale.sed.Component`
+        The chain.
+    parameters : dict of str to `~numpy.ndarray`
+        Axes of the grid but redshift.
+    redshift : `~numpy.ndarray` or None
+        Redshifts that the configuration lists.
+    modules : dict of str to str
+        Role of a component to the module that it came from.
+    frac_agn_definition : str
+        See `~miricigale.sed.SEDModel`.
+    bands : dict of str to str
+        Bands to fit: our names to CIGALE's.
+    predicted : dict of str to str
+        Bands to predict besides.
+    columns : tuple of str
+        Bands to fit, with ``_err`` where their errors are used, by CIGALE's names.
+    variables : tuple of str
+        Quantities to estimate, by CIGALE's names; empty: all.
+    additional_error : float
+        Part of the flux added to errors in quadrature.
+    limits : bool
+        Whether upper limits take part in the fit.
+    redshift_decimals : int
+        To how many decimals known redshifts are rounded; negative: not at all.
+    mock : bool
+        Whether an analysis of mock objects was asked for.
+    cores : int
+        Number of cores asked for.
+    left_out, replaced, differs : tuple of str
+        What there is no counterpart of, what something else stands in for, and conventions
+        that differ.
+    names : dict of str to str
+        Filters that the user gave for bands, by CIGALE's names.
+    """
+
+    path: Path
+    data_file: Path | None
+    components: tuple
+    parameters: dict
+    redshift: np.ndarray | None
+    modules: dict
+    frac_agn_definition: str
+    bands: dict
+    predicted: dict
+    columns: tuple
+    variables: tuple
+    additional_error: float = 0.1
+    limits: bool = False
+    redshift_decimals: int = 2
+    mock: bool = False
+    cores: int = 1
+    left_out: tuple = ()
+    replaced: tuple = ()
+    differs: tuple = ()
+    names: dict = field(default_factory=dict)
+
+    def __repr__(self):
+        parts = " -> ".join(component.name for component in self.components)
+        return f"<CigaleSetup {self.path.name}: {parts}, {len(self.bands)} bands>"
+
+    def describe(self):
+        """Say what is left out, replaced and different, a line each; "" if nothing is."""
+        lists = {"left out": self.left_out, "replaced": self.replaced, "differs": self.differs}
+        return "\n".join(f"{name}: {'; '.join(items)}" for name, items in lists.items() if items)
+
+    def model(self):
+        """Make the `~miricigale.sed.SEDModel`."""
+        return SEDModel(self.components, frac_agn_definition=self.frac_agn_definition)
+
+    def axes(self, redshifts=None):
+        """
+        Axes of the grid.
+
+        Parameters
+        ----------
+        redshifts : array_like, optional
+            Redshifts of objects; not needed where the configuration lists redshifts.
+
+        Returns
+        -------
+        axes : dict of str to `~numpy.ndarray`
+            For `~miricigale.sed.SEDModel.grid`. The redshifts are those of the configuration,
+            or each different one of the objects' after `rounded`.
+
+        Raises
+        ------
+        ValueError
+            If there is no redshift.
+        """
+        nodes = self.redshift
+        if nodes is None:
+            if redshifts is None:
+                wanted = "given where the configuration lists no redshifts"
+                raise argument_error("redshifts", wanted, "None")
+            nodes = self.rounded(redshifts)
+            nodes = np.unique(nodes[np.isfinite(nodes)])
+            if not nodes.size:
+                raise argument_error("redshifts", "with a redshift >= 0", "none")
+        return self.parameters | {"redshift": nodes}
+
+    def rounded(self, redshifts):
+        """
+        Redshifts to ``redshift_decimals``.
+
+        Those that would become 0, which stands for 10 pc, stay as they are; negative ones are
+        missing (NaN).
+        """
+        z = np.ma.filled(np.ma.masked_invalid(np.ma.asarray(redshifts, dtype=float)), np.nan)
+        z = np.where(z >= 0, z, np.nan)
+        if self.redshift_decimals < 0:
+            return z
+        near = np.round(z, self.redshift_decimals)
+        return np.where((near == 0) & (z > 0), z, near)
+
+    def catalog(self, path=None, *, strict=False):
+        """
+        Read the photometry, as `read_cigale_catalog` does.
+
+        Parameters
+        ----------
+        path : path-like, optional
+            Another catalogue than that of the configuration.
+        strict : bool, optional
+            Whether a band without a filter is an error.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.ConfigError`
+            If the configuration names no catalogue.
+        """
+        path = self.data_file if path is None else path
+        if path is None:
+            msg = f"{self.path} names no data_file"
+            raise ConfigError(msg)
+        return read_cigale_catalog(
+            path, bands=self.columns, limits=self.limits, names=self.names, strict=strict
+        )
+
+    def fitter(self, photometry, *, compat="cigale", **options):
+        """
+        Make the fitter, and the grid with the redshifts of the objects.
+
+        Parameters
+        ----------
+        photometry : `~astropy.table.QTable`
+            Photometry, such as `catalog` gives.
+        compat : {"cigale", None}, optional
+            Whether the fit keeps CIGALE's conventions, see `~miricigale.fitting.BayesFitter`.
+        **options
+            Passed to `~miricigale.fitting.BayesFitter`.
+
+        Returns
+        -------
+        fitter : `~miricigale.fitting.BayesFitter`
+        """
+        require_columns(photometry, ["id"], "photometry")
+        have = [name for name in self.bands if name in photometry.colnames]
+        if not have:
+            wanted = f"a table with at least one of the columns {list(self.bands)}"
+            raise argument_error("photometry", wanted, f"columns {photometry.colnames}")
+        redshifts = photometry["redshift"] if "redshift" in photometry.colnames else None
+        grid = self.model().grid(self.axes(redshifts), [*have, *self.predicted])
+        options = {"model_error": self.additional_error} | options
+        if compat is not None and "compat" in inspect.signature(BayesFitter).parameters:
+            options["compat"] = compat
+        elif compat is not None:
+            options.setdefault("scale_error", False)
+        return BayesFitter(grid, have, **options)
+
+    def fit(self, photometry, *, compat="cigale", executor=None, progress_bar=False, **options):
+        """
+        Fit photometry.
+
+        Objects with a redshift are fitted at the node next to it, after rounding where the nodes
+        are the objects' own; others over all redshifts that the configuration lists.
+
+        Parameters
+        ----------
+        photometry, compat, **options
+            See `fitter`.
+        executor, progress_bar : optional
+            See `~miricigale.fitting.BayesFitter.fit`.
+
+        Returns
+        -------
+        results : `~miricigale.fitting.FitResults`
+            In the order of the table; ``meta["cigale"]`` says what was left out.
+        """
+        if self.redshift is not None:
+            # the node next to the redshift is taken, however far
+            options = {"redshift_tolerance": np.inf} | options
+        fitter = self.fitter(photometry, compat=compat, **options)
+        known = {"executor": executor, "progress_bar": progress_bar}
+        if "redshift" in photometry.colnames:
+            z = self.rounded(photometry["redshift"])
+        else:
+            z = np.full(len(photometry), np.nan)
+        if self.redshift is None:
+            results = fitter.fit(photometry, redshift=z, **known)
+        else:
+            results = _by_redshift(fitter, photometry, z, known)
+        note = {
+            "configuration": self.path.name,
+            "bands": self.bands | self.predicted,
+            "modules": self.modules,
+            "left_out": list(self.left_out),
+            "replaced": list(self.replaced),
+            "differs": list(self.differs),
+        }
+        changed = dataclasses.replace(results, meta=dict(results.meta) | {"cigale": note})
+        return changed.with_model(self.model())
+
+    def write_results(self, results, path, *, overwrite=False):
+        """Write results as `write_cigale_results` does, with the names of this configuration."""
+        write_cigale_results(
+            results,
+            path,
+            variables=self.variables or None,
+            bands=self.bands | self.predicted,
+            modules=self.modules,
+            overwrite=overwrite,
+        )
+
+
+def _by_redshift(fitter, photometry, z, known):
+    """Fit objects of known redshift there and the others everywhere; join in order."""
+    fixed = np.isfinite(z)
+    if np.all(fixed):
+        return fitter.fit(photometry, redshift=z, **known)
+    free = fitter.fit(photometry, **known)
+    if not np.any(fixed):
+        return free
+    # all objects go through both, so that ids that are there twice are found as such
+    at = fitter.fit(photometry, redshift=np.where(fixed, z, fitter.grid.redshift[0]), **known)
+    values = {}
+    for item in dataclasses.fields(free):
+        one, two = getattr(at, item.name), getattr(free, item.name)
+        values[item.name] = _join(one, two, fixed) if item.name != "meta" else two
+    return type(free)(**values)
+
+
+def _join(one, two, fixed):
+    if isinstance(one, np.ndarray) and one.ndim and len(one) == len(fixed):
+        return np.where(fixed.reshape(-1, *[1] * (one.ndim - 1)), one, two)
+    if isinstance(one, Mapping) and one and all(isinstance(x, np.ndarray) for x in one.values()):
+        return {name: _join(one[name], two[name], fixed) for name in one}
+    return two

@@ -1,0 +1,137 @@
+"""What a sampler is given and what it returns; the samplers by name."""
+
+import contextlib
+import importlib
+import importlib.util
+from dataclasses import dataclass
+
+import numpy as np
+
+from miricigale.utils.exceptions import unknown_name
+
+__all__ = [
+    "CITATIONS",
+    "SAMPLERS",
+    "Draws",
+    "Request",
+    "effective_size",
+    "get_sampler",
+    "single_threaded",
+]
+
+#: Module of each sampler in this folder: its ``load`` imports the package.
+SAMPLERS = {
+    "nautilus": "miricigale.fitting.engines.nautilus",
+    "dynesty": "miricigale.fitting.engines.dynesty",
+}
+
+#: What to cite for them.
+CITATIONS = {
+    "nautilus": ("Lange 2023, MNRAS 525, 3181 (nautilus)",),
+    "dynesty": ("Speagle 2020, MNRAS 493, 3132 (dynesty)",),
+}
+
+
+@dataclass(frozen=True)
+class Request:
+    """
+    Settings of a sampler.
+
+    Parameters
+    ----------
+    n_live : int
+        Number of live points.
+    n_effective : int
+        Effective size that the sample shall have, if the sampler can go on until it has.
+    max_calls : int
+        Number of evaluated models after which the sampler stops, finished or not.
+    options : dict
+        Passed on to the sampler.
+    """
+
+    n_live: int
+    n_effective: int
+    max_calls: int
+    options: dict
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """
+    Weighted draws from a posterior.
+
+    Parameters
+    ----------
+    call : `~numpy.ndarray` of int, shape (n,)
+        Which evaluation of the likelihood each draw is, counted from 0 in the order of the calls.
+    log_weight : `~numpy.ndarray`, shape (n,)
+        Natural logarithm of the weights, whatever their sum.
+    log_evidence, log_evidence_err : float
+        ln of the evidence and its 1-sigma error as the sampler sees it.
+    converged : bool
+        Whether the sampler finished before ``max_calls``.
+    """
+
+    call: np.ndarray
+    log_weight: np.ndarray
+    log_evidence: float
+    log_evidence_err: float
+    converged: bool
+
+    @property
+    def weight(self):
+        """Weights that sum to 1."""
+        weight = np.exp(self.log_weight - self.log_weight.max())
+        return weight / weight.sum()
+
+
+def effective_size(weight):
+    """Kish's effective size of a weighted sample, (sum w)^2 / sum w^2."""
+    return float(np.sum(weight) ** 2 / np.sum(np.square(weight)))
+
+
+def get_sampler(engine):
+    """
+    Find a sampler by its name.
+
+    Parameters
+    ----------
+    engine : str or callable
+        One of `SAMPLERS`, or a function that does what those do: called as
+        ``sample(log_like, n_dim, rng, request)`` with
+
+        - ``log_like(points)``: ln(likelihood), shape (m,), of points of the unit cube, shape
+          (m, n_dim), in which the prior is flat, and the numbers of these calls, shape (m,);
+        - ``rng``: the `~numpy.random.Generator` that everything random is drawn from;
+        - ``request``: a `Request`,
+
+        it returns `Draws`.
+
+    Returns
+    -------
+    sample : callable
+
+    Raises
+    ------
+    KeyError
+        If there is none of this name.
+    ImportError
+        If its package is not installed; the message holds the pip command.
+    """
+    if callable(engine):
+        return engine
+    if engine not in SAMPLERS:
+        raise unknown_name("engine", engine, SAMPLERS)
+    return importlib.import_module(SAMPLERS[engine]).load()
+
+
+def single_threaded():
+    """
+    Context in which linear algebra runs on one core, if threadpoolctl is installed.
+
+    Sums that are cut into other pieces differ in the last digit, and samplers would then go
+    other ways.
+    """
+    if importlib.util.find_spec("threadpoolctl") is None:
+        return contextlib.nullcontext()
+    return importlib.import_module("threadpoolctl").threadpool_limits(1)

@@ -1,0 +1,292 @@
+"""One object, fitted with continuous parameters by a sampler."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.fitting.engines.base import (
+    Request,
+    effective_size,
+    get_sampler,
+    single_threaded,
+)
+from miricigale.fitting.engines.scale import best_scale, chi2_at
+from miricigale.fitting.engines.space import Space
+from miricigale.utils.random import stream
+
+__all__ = ["ContinuousEngine", "Posterior", "Target"]
+
+#: Draws from the prior of which at least one has to be possible.
+_TRIALS = 2048
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """
+    What is known of one object.
+
+    Parameters
+    ----------
+    key : str
+        Text of its id, from which its random stream comes.
+    flux, sigma : `~numpy.ndarray`, shape (n_bands,)
+        Fluxes and errors in uJy; infinite errors in bands that are not used.
+    limit : `~numpy.ndarray` of bool, shape (n_bands,)
+        Which of the bands are upper limits.
+    space : `Space`
+        Parameters and priors.
+    """
+
+    key: str
+    flux: np.ndarray
+    sigma: np.ndarray
+    limit: np.ndarray
+    space: Space
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """
+    Weighted sample of a posterior.
+
+    Parameters
+    ----------
+    weight : `~numpy.ndarray`, shape (n,)
+        Weights; they sum to 1.
+    parameters, derived : dict of str to `~numpy.ndarray`, shape (n,)
+        Free parameters without mass, and derived quantities, mass among them.
+    flux : `~numpy.ndarray`, shape (n, n_bands)
+        Fluxes in uJy.
+    best : dict of str to float
+        Free parameters, mass and derived quantities of the model that fits best, at the scale
+        that does.
+    best_flux : `~numpy.ndarray`, shape (n_bands,)
+        Its fluxes.
+    chi2 : float
+        Its chi2.
+    log_evidence, log_evidence_err : float
+        ln(evidence) and its error; fluxes in uJy.
+    n_calls : int
+        Models evaluated.
+    n_effective : float
+        Effective size of the sample.
+    converged : bool
+        Whether the sampler finished.
+    """
+
+    weight: np.ndarray
+    parameters: dict
+    derived: dict
+    flux: np.ndarray
+    best: dict
+    best_flux: np.ndarray
+    chi2: float
+    log_evidence: float
+    log_evidence_err: float
+    n_calls: int
+    n_effective: float
+    converged: bool
+
+
+class _Calls:
+    """All evaluations of one object's likelihood, in order."""
+
+    def __init__(self, engine, target):
+        self._engine, self._target = engine, target
+        self._parts, self.n = [], 0
+        used = np.isfinite(target.sigma)
+        measured = used & ~target.limit
+        self._used = used
+        self._norm = np.log(target.sigma[measured]).sum()
+        self._norm += 0.5 * np.count_nonzero(measured) * np.log(2.0 * np.pi)
+
+    def __call__(self, points):
+        values = self._target.space.values(np.asarray(points))
+        mass = values.pop("mass")
+        flux, derived = self._engine.models(values)
+        used, target = self._used, self._target
+        seen, data = flux[:, used], (target.flux[used], target.sigma[used], target.limit[used])
+        good = np.isfinite(flux).all(axis=1)
+        seen = np.where(good[:, None], seen, 1.0)
+        if self._engine.profile:
+            scale, variance = best_scale(seen, *data)
+        else:
+            scale, variance = mass, np.zeros(len(mass))
+        chi2 = chi2_at(scale, seen, *data)
+        chi2[~good] = np.inf
+        part = {name: values[name] for name in target.space.free if name != "mass"}
+        part = {"parameters": part, "derived": derived, "flux": flux}
+        self._parts.append(part | {"scale": scale, "variance": variance, "chi2": chi2})
+        number = self.n + np.arange(len(chi2))
+        self.n += len(chi2)
+        return -0.5 * chi2 - self._norm, number
+
+    def of(self, name, calls):
+        """Arrays of some of the calls; a dict of them where there are several by name."""
+        if isinstance(self._parts[0][name], dict):
+            return {
+                key: np.concatenate([part[name][key] for part in self._parts])[calls]
+                for key in self._parts[0][name]
+            }
+        return np.concatenate([part[name] for part in self._parts])[calls]
+
+
+@dataclass(frozen=True, eq=False)
+class ContinuousEngine:
+    """
+    Posteriors of continuous parameters by a sampler.
+
+    Parameters
+    ----------
+    model : `~miricigale.sed.SEDModel`
+        The model.
+    filters : `~miricigale.filters.FilterSet` or tuple of str
+        Bands that are evaluated.
+    names : tuple of str
+        Their names.
+    sampler : str or callable
+        See `~miricigale.fitting.engines.base.get_sampler`.
+    request : `~miricigale.fitting.engines.base.Request`
+        Settings of the sampler.
+    profile : bool
+        Whether the mass of each model is the one that fits best (with its Gaussian error if
+        ``scale_error``) and not a parameter.
+    scale_error : bool
+        See ``profile``.
+    """
+
+    model: object
+    filters: object
+    names: tuple
+    sampler: object
+    request: Request
+    profile: bool = True
+    scale_error: bool = True
+
+    @property
+    def columns(self):
+        """Derived quantities: `~miricigale.sed.Derived` by name."""
+        columns = dict(self.model.derived_columns())
+        # the parameter mass, by another name
+        columns.pop("stellar_mass_formed", None)
+        return columns
+
+    def models(self, values, mass=None):
+        """
+        Fluxes and derived quantities of models.
+
+        Parameters
+        ----------
+        values : dict of str to `~numpy.ndarray`, shape (m,)
+            Values of all parameters but mass.
+        mass : `~numpy.ndarray`, shape (m,), optional
+            Solar masses formed; 1 by default.
+
+        Returns
+        -------
+        flux : `~numpy.ndarray`, shape (m, n_bands)
+            In uJy; NaN where a model is not possible.
+        derived : dict of str to `~numpy.ndarray`, shape (m,)
+            Derived quantities in the units of the model.
+        """
+        n = len(next(iter(values.values())))
+        table = QTable(values | {"mass": np.ones(n) if mass is None else mass}, copy=False)
+        got = self.model.fluxes(table, self.filters)
+        flux = np.column_stack([got[name].value for name in self.names])
+        derived = {
+            name: np.asarray(getattr(got[name], "value", got[name]), dtype=float)
+            for name in self.columns
+        }
+        return flux, derived
+
+    def possible(self, target, rng):
+        """Whether the prior leaves any model."""
+        calls = _Calls(self, target)
+        for _ in range(0, _TRIALS, 256):
+            log_like, _ = calls(rng.random((256, target.space.n_dim)))
+            if np.isfinite(log_like).any():
+                return True
+        return False
+
+    def fit(self, target, seed):
+        """
+        Sample the posterior of one object.
+
+        Parameters
+        ----------
+        target : `Target`
+            The object; one band at least is measured.
+        seed : int
+            Seed of the whole catalogue.
+
+        Returns
+        -------
+        posterior : `Posterior` or None
+            None if the prior leaves no model.
+        """
+        with single_threaded():
+            if not self.possible(target, stream(seed, "fit", "prior", target.key)):
+                return None
+            return self._fit(target, seed)
+
+    def _fit(self, target, seed):
+        calls = _Calls(self, target)
+        rng = stream(seed, "fit", target.key)
+        draws = get_sampler(self.sampler)(calls, target.space.n_dim, rng, self.request)
+        weight = draws.weight
+        keep = weight > 0
+        weight, call = weight[keep], np.asarray(draws.call)[keep]
+        parameters, derived = calls.of("parameters", call), calls.of("derived", call)
+        flux = calls.of("flux", call)
+        top, variance = calls.of("scale", call), calls.of("variance", call)
+        scale = top
+        if self.profile and self.scale_error:
+            scale = _positive_normal(top, np.sqrt(variance), stream(seed, "scale", target.key))
+        # the best of all models that were met, whether or not they are part of the sample
+        best = [int(np.argmin(calls.of("chi2", slice(None))))]
+        best_parameters, best_scale = calls.of("parameters", best), calls.of("scale", best)
+        fixed = target.space.fixed
+        best_derived = self._scaled(calls.of("derived", best), best_parameters, best_scale, fixed)
+        best_parameters |= best_derived
+        return Posterior(
+            weight=weight / weight.sum(),
+            parameters=parameters,
+            derived=self._scaled(derived, parameters, scale, fixed),
+            flux=flux * scale[:, None],
+            best={name: float(array[0]) for name, array in best_parameters.items()},
+            best_flux=calls.of("flux", best)[0] * best_scale[0],
+            chi2=float(calls.of("chi2", best)[0]),
+            log_evidence=draws.log_evidence,
+            log_evidence_err=draws.log_evidence_err,
+            n_calls=calls.n,
+            n_effective=effective_size(weight),
+            converged=draws.converged,
+        )
+
+    def _scaled(self, derived, parameters, scale, fixed):
+        """Derived quantities of models of given masses, from those for one solar mass."""
+        columns = self.columns
+        out = {"mass": scale}
+        out |= {
+            name: array * scale if columns[name].extensive else array
+            for name, array in derived.items()
+        }
+        other = [name for name, column in columns.items() if column.of == "xray"]
+        if other:
+            # these are not proportional to mass
+            rest = {n: np.full(scale.size, v) for n, v in fixed.items() if n != "mass"}
+            got = self.models(rest | parameters, scale)[1]
+            out |= {name: got[name] for name in other}
+        return out
+
+
+def _positive_normal(mean, std, rng):
+    """Draws from normal distributions, those below 0 drawn again."""
+    out = mean + std * rng.standard_normal(mean.size)
+    for _ in range(1000):
+        below = np.flatnonzero(out < 0)
+        if not below.size:
+            break
+        out[below] = mean[below] + std[below] * rng.standard_normal(below.size)
+    return out

@@ -1,0 +1,350 @@
+"""Priors of continuous parameters: from the unit cube to values."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from miricigale.fitting.posterior import cell_edges
+from miricigale.utils.exceptions import argument_error, unknown_name
+
+__all__ = ["Choice", "Continuous", "Flat", "Log", "Space", "Table", "make_prior", "prior_cells"]
+
+#: Part of a prior without limits that may lie outside the cells of its axis.
+_TAIL = 1e-3
+
+
+@dataclass(frozen=True)
+class Flat:
+    """Flat from ``low`` to ``high``."""
+
+    low: float
+    high: float
+
+    def transform(self, unit):
+        """Values at which the cumulative prior is ``unit``."""
+        return self.low + unit * (self.high - self.low)
+
+    def cdf(self, value):
+        """Cumulative prior."""
+        return np.clip((value - self.low) / (self.high - self.low), 0.0, 1.0)
+
+    def nodes(self, n):
+        """Middles of n cells."""
+        return self.transform((np.arange(n) + 0.5) / n)
+
+    @property
+    def bounds(self):
+        """Limits of the outermost cells."""
+        return (self.low, self.high)
+
+    def __str__(self):
+        return f"flat from {self.low:g} to {self.high:g}"
+
+
+class Log(Flat):
+    """Flat in the logarithm from ``low`` to ``high``."""
+
+    def transform(self, unit):
+        """Values at which the cumulative prior is ``unit``."""
+        return self.low * (self.high / self.low) ** np.asarray(unit)
+
+    def cdf(self, value):
+        """Cumulative prior."""
+        value = np.clip(value, self.low, self.high)
+        return np.log(value / self.low) / np.log(self.high / self.low)
+
+    def __str__(self):
+        return f"flat in log from {self.low:g} to {self.high:g}"
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """These values only, ascending, with weights that sum to 1."""
+
+    values: np.ndarray
+    weights: np.ndarray
+
+    def transform(self, unit):
+        """Values at which the cumulative prior reaches ``unit``."""
+        place = np.searchsorted(np.cumsum(self.weights), unit, side="right")
+        return self.values[np.minimum(place, self.values.size - 1)]
+
+    def __str__(self):
+        return f"one of {', '.join(f'{v:g}' for v in self.values)}"
+
+
+@dataclass(frozen=True, eq=False)
+class Continuous:
+    """A distribution of `scipy.stats`, cut to ``low`` and ``high``."""
+
+    law: object
+    low: float
+    high: float
+
+    @property
+    def _ends(self):
+        return self.law.cdf(self.low), self.law.cdf(self.high)
+
+    def transform(self, unit):
+        """Values at which the cumulative prior is ``unit``."""
+        first, last = self._ends
+        return np.clip(self.law.ppf(first + unit * (last - first)), self.low, self.high)
+
+    def cdf(self, value):
+        """Cumulative prior."""
+        first, last = self._ends
+        return np.clip((self.law.cdf(value) - first) / (last - first), 0.0, 1.0)
+
+    def nodes(self, n):
+        """Middles of n cells: even, or even in the logarithm if they span more than a factor 30."""
+        low, high = self.transform(np.array([_TAIL, 1.0 - _TAIL]))
+        return (Log if 0 < 30 * low < high else Flat)(low, high).nodes(n)
+
+    @property
+    def bounds(self):
+        """Limits of the outermost cells."""
+        return (self.low, self.high)
+
+    def __str__(self):
+        law = getattr(getattr(self.law, "dist", None), "name", type(self.law).__name__)
+        return f"{law} of mean {self.law.mean():g}, std {self.law.std():g}"
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A density given at nodes and linear between them, such as p(z)."""
+
+    value: np.ndarray
+    density: np.ndarray
+    _total: np.ndarray = field(init=False, repr=False)
+
+    def __post_init__(self):
+        area = 0.5 * np.diff(self.value) * (self.density[1:] + self.density[:-1])
+        object.__setattr__(self, "_total", np.concatenate([[0.0], np.cumsum(area)]))
+
+    @property
+    def area(self):
+        """Integral of the density."""
+        return float(self._total[-1])
+
+    def cut(self, low, high):
+        """Leave out what lies outside ``low`` and ``high``; None if nothing is left."""
+        low, high = max(low, self.value[0]), min(high, self.value[-1])
+        if not low < high:
+            return None
+        inside = self.value[(self.value > low) & (self.value < high)]
+        value = np.concatenate([[low], inside, [high]])
+        new = Table(value, np.interp(value, self.value, self.density))
+        return new if new.area > 0 else None
+
+    def transform(self, unit):
+        """Values at which the cumulative prior is ``unit``."""
+        target = np.asarray(unit) * self.area
+        i = np.clip(np.searchsorted(self._total, target, side="right") - 1, 0, self.value.size - 2)
+        first, last = self.density[i], self.density[i + 1]
+        width = self.value[i + 1] - self.value[i]
+        rest = target - self._total[i]
+        # the root of first t + (last - first) t^2 / (2 width) = rest that stays finite
+        root = np.sqrt(np.maximum(first**2 + 2.0 * rest * (last - first) / width, 0.0))
+        below = first + root
+        step = np.divide(2.0 * rest, below, out=np.zeros_like(rest), where=below > 0)
+        return self.value[i] + np.clip(step, 0.0, width)
+
+    def cdf(self, value):
+        """Cumulative prior."""
+        value = np.clip(value, self.value[0], self.value[-1])
+        i = np.clip(np.searchsorted(self.value, value, side="right") - 1, 0, self.value.size - 2)
+        step = value - self.value[i]
+        slope = (self.density[i + 1] - self.density[i]) / (self.value[i + 1] - self.value[i])
+        part = self._total[i] + step * (self.density[i] + 0.5 * slope * step)
+        return part / self.area
+
+
+def make_prior(name, prior, parameter):
+    """
+    Work out the prior of one parameter.
+
+    Parameters
+    ----------
+    name : str
+        Name of the parameter, for messages.
+    prior : object
+        - ``(low, high)``: flat; ``(low, high, "log")``: flat in the logarithm;
+        - ``"flat"`` or ``"log"``: the same over the bounds of the parameter;
+        - a list or array: these values only, of equal weight; ``(values, weights)``: of these;
+        - a frozen distribution of `scipy.stats`, cut to the bounds of the parameter;
+        - one number: a fixed value.
+
+        Numbers may be quantities.
+    parameter : `~miricigale.sed.Parameter`
+        Its declaration.
+
+    Returns
+    -------
+    prior : object or float
+        One of the priors of this module, or the fixed value.
+
+    Raises
+    ------
+    ValueError
+        If it is something else or outside the bounds of the parameter.
+    """
+    argument = f"priors[{name!r}]"
+    wanted = "(low, high), (low, high, 'log'), 'flat', 'log', values, a distribution or a number"
+    if isinstance(prior, str):
+        if prior not in ("flat", "log"):
+            raise argument_error(argument, wanted, repr(prior))
+        return _interval(argument, *parameter.bounds, prior)
+    if hasattr(prior, "ppf") and hasattr(prior, "cdf"):
+        law = Continuous(prior, *parameter.bounds)
+        first, last = law._ends
+        if not last - first > 0:
+            text = f"with weight from {law.low} to {law.high}"
+            raise argument_error(argument, text, str(law))
+        return law
+    if isinstance(prior, tuple):
+        if len(prior) == 3 and prior[2] in ("log", "flat"):
+            return _interval(argument, *_ends(argument, prior[:2], parameter), prior[2])
+        if len(prior) != 2:
+            raise argument_error(argument, wanted, repr(prior))
+        if np.ndim(prior[0]) == 1 and np.ndim(prior[1]) == 1:
+            return _choice(argument, *prior, parameter)
+        return _interval(argument, *_ends(argument, prior, parameter), "flat")
+    if np.ndim(prior) == 1:
+        return _choice(argument, prior, np.ones(len(prior)), parameter)
+    try:
+        return parameter.check(prior)
+    except TypeError:
+        raise argument_error(argument, wanted, repr(prior)) from None
+
+
+def _ends(argument, pair, parameter):
+    try:
+        return [parameter.check(value) for value in pair]
+    except TypeError:
+        raise argument_error(argument, "a pair of numbers", repr(pair)) from None
+
+
+def _interval(argument, low, high, kind):
+    if not (np.isfinite(low) and np.isfinite(high) and low < high):
+        raise argument_error(argument, "(low, high), finite and ascending", f"({low}, {high})")
+    if kind == "log":
+        if not low > 0:
+            raise argument_error(argument, "above 0 if it is flat in the logarithm", f"{low}")
+        return Log(low, high)
+    return Flat(low, high)
+
+
+def _choice(argument, values, weights, parameter):
+    values = [parameter.check(value) for value in values]
+    weights = np.asarray(weights, dtype=float)
+    if weights.shape != (len(values),):
+        text = f"a weight for each of {len(values)} values"
+        raise argument_error(argument, text, f"shape {weights.shape}")
+    if not (np.all(np.isfinite(weights) & (weights >= 0)) and weights.sum() > 0):
+        raise argument_error(argument, "weights that are finite, >= 0 and not all 0", f"{weights}")
+    order = np.argsort(values)
+    values, weights = np.array(values)[order], weights[order]
+    if np.any(np.diff(values) == 0):
+        raise argument_error(argument, "different values", f"{values}")
+    if values.size == 1:
+        return float(values[0])
+    return Choice(values, weights / weights.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """
+    The parameters of a fit: some free, with priors, the others fixed.
+
+    Parameters
+    ----------
+    free : dict of str to prior
+        Priors of this module by name.
+    fixed : dict of str to float
+        Values of the others.
+    """
+
+    free: dict
+    fixed: dict
+
+    @classmethod
+    def of_model(cls, model, priors):
+        """Take the priors of the parameters of a model; parameters without are at their defaults."""
+        declared = model.parameters
+        for name in priors:
+            if name not in declared:
+                raise unknown_name("parameter", name, declared)
+        made = {name: make_prior(name, priors[name], declared[name]) for name in priors}
+        free = {name: made[name] for name in declared if not _number(made.get(name, 0.0))}
+        fixed = {
+            name: made.get(name, parameter.default)
+            for name, parameter in declared.items()
+            if name not in free
+        }
+        return cls(free, fixed)
+
+    def with_prior(self, name, prior):
+        """Copy in which a parameter has another prior, or a value."""
+        free = {key: value for key, value in self.free.items() if key != name}
+        fixed = {key: value for key, value in self.fixed.items() if key != name}
+        (fixed if _number(prior) else free)[name] = prior
+        return replace(self, free=free, fixed=fixed)
+
+    @property
+    def n_dim(self):
+        """Number of free parameters."""
+        return len(self.free)
+
+    def values(self, points):
+        """
+        Parameters of points of the unit cube.
+
+        Parameters
+        ----------
+        points : `~numpy.ndarray`, shape (m, n_dim)
+            Points, in the order of ``free``.
+
+        Returns
+        -------
+        values : dict of str to `~numpy.ndarray`, shape (m,)
+            Of all parameters, fixed ones included.
+        """
+        out = {name: np.full(len(points), value) for name, value in self.fixed.items()}
+        for i, (name, prior) in enumerate(self.free.items()):
+            out[name] = prior.transform(points[:, i])
+        return out
+
+
+def prior_cells(prior, n):
+    """
+    Cells of an axis for a prior.
+
+    Parameters
+    ----------
+    prior : object
+        A prior of this module.
+    n : int
+        Number of cells, unless the prior has values of its own.
+
+    Returns
+    -------
+    nodes, weights : `~numpy.ndarray`, shape (n,)
+        Nodes of the cells and their prior.
+    bounds : tuple of float
+        Limits of the outermost cells.
+    """
+    if isinstance(prior, Choice):
+        return prior.values, prior.weights, (-np.inf, np.inf)
+    if isinstance(prior, Table):
+        flat = Flat(prior.value[0], prior.value[-1])
+        nodes, bounds = flat.nodes(n), flat.bounds
+    else:
+        nodes, bounds = prior.nodes(n), prior.bounds
+    edges = cell_edges(nodes, bounds)
+    total = prior.cdf(edges[1:-1])
+    return nodes, np.diff(np.concatenate([[0.0], total, [1.0]])), bounds
+
+
+def _number(prior):
+    return isinstance(prior, (int, float))

@@ -1,0 +1,121 @@
+"""What the models of a grid are: parameters and derived quantities by index and scale."""
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.fitting.quantities import Quantities
+from miricigale.utils.exceptions import unknown_name
+from miricigale.utils.random import stream
+
+__all__ = ["ModelValues"]
+
+#: AGN fractions in both definitions: the AGN's part and the galaxy's.
+_FRACTIONS = {
+    "frac_agn_dust": ("agn_power", "dust_luminosity"),
+    "frac_agn_ir": ("ir_luminosity_agn", "ir_luminosity_galaxy"),
+}
+_FRACTION_TEXT = {
+    "frac_agn_dust": "AGN power over the sum with the dust luminosity",
+    "frac_agn_ir": "AGN share of 3-1000 um light",
+}
+
+
+class ModelValues:
+    """
+    Values of parameters and derived quantities of models of a grid.
+
+    Parameters
+    ----------
+    grid : `~miricigale.sed.ModelGrid`
+        The grid.
+    axes : dict of str to `~miricigale.fitting.priors.GridAxis`
+        Parameters that have several values, with ``share``.
+    seed : int
+        Chooses values of parameters without effect.
+    """
+
+    def __init__(self, grid, axes, seed):
+        self.grid, self.axes, self.seed = grid, axes, seed
+        self.quantities = Quantities.of_grid(grid)
+        have = set(self.quantities.names)
+        self.fractions = tuple(n for n, parts in _FRACTIONS.items() if set(parts) <= have)
+
+    @property
+    def names(self):
+        """Names of parameters, derived quantities and AGN fractions."""
+        return (*self.axes, *self.quantities.names, *self.fractions)
+
+    def unit(self, name):
+        """Unit of a parameter or quantity."""
+        if name in self.axes:
+            return u.Unit(self.axes[name].unit)
+        if name in self.fractions:
+            return u.dimensionless_unscaled
+        if name not in self.quantities.names:
+            raise unknown_name("parameter", name, self.names)
+        return self.quantities.units[self.quantities.names.index(name)]
+
+    def description(self, name):
+        """One line on a parameter or quantity."""
+        if name in self.quantities.names:
+            return self.quantities.descriptions[self.quantities.names.index(name)]
+        if name in self.fractions:
+            return _FRACTION_TEXT[name]
+        for table in (self.grid.galaxy_parameters, self.grid.agn_parameters):
+            if name in table.colnames and table[name].info.description:
+                return table[name].info.description
+        return name
+
+    def extensive(self, name):
+        """Whether a quantity scales with mass."""
+        return name in self.quantities.names and name not in self.quantities.shape.names
+
+    def values(self, name, ids, index, scale):
+        """
+        Values in models drawn for n objects.
+
+        Parameters
+        ----------
+        name : str
+            A parameter or quantity.
+        ids : `~numpy.ndarray`, shape (n,)
+            Ids of the objects, which key the streams of parameters without effect.
+        index : `~numpy.ndarray` of int, shape (n, n_draws, 4)
+            Redshift, galaxy, torus (-1: none) and AGN fraction.
+        scale : `~numpy.ndarray`, shape (n, n_draws)
+            Solar masses formed.
+
+        Returns
+        -------
+        values : `~numpy.ndarray`, shape (n, n_draws)
+            NaN for parameters of a torus that is not there.
+        """
+        z, g, k, f = np.moveaxis(index, -1, 0)
+        grid = self.grid
+        if name == "redshift":
+            return grid.redshift[z]
+        if name in self.axes:
+            axis = self.axes[name]
+            if axis.kind == "frac_agn":
+                return grid.frac_agn[f]
+            return self._of_axis(axis, g if axis.kind == "galaxy" else k, ids)
+        if name in self.fractions:
+            agn, galaxy = (self.values(part, ids, index, scale) for part in _FRACTIONS[name])
+            whole = agn + galaxy
+            return np.divide(agn, whole, out=np.zeros_like(whole), where=whole != 0)
+        frac = grid.frac_agn[f]
+        return self.quantities.evaluate(name, grid, g, np.maximum(k, 0), frac, scale)
+
+    def _of_axis(self, axis, model, ids):
+        """Values of a parameter; where a model stands for several, drawn as its prior has it."""
+        share = axis.share
+        out = axis.values[np.argmax(share, axis=0)][model]
+        several = np.count_nonzero(share > 0, axis=0) > 1
+        many = several[model] & (model >= 0)
+        total = np.cumsum(share, axis=0)
+        for i in np.flatnonzero(many.any(axis=1)):
+            rng = stream(self.seed, "samples", axis.name, str(ids[i]))
+            draw = rng.random(model.shape[1])[many[i]]
+            cdf = total[:, model[i][many[i]]]
+            out[i, many[i]] = axis.values[np.sum(draw * cdf[-1] >= cdf, axis=0)]
+        return np.where(model >= 0, out, np.nan)

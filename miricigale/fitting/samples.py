@@ -1,0 +1,510 @@
+"""Models drawn from posteriors: joint distributions, fluxes in any band, spectra."""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.fitting import spectra
+from miricigale.fitting.flags import FitFlags
+from miricigale.fitting.model_values import ModelValues
+from miricigale.fitting.posterior import bin_cells, node_cells
+from miricigale.fitting.priors import grid_priors
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.tables import error_column
+from miricigale.utils.units import FNU, WAVE, frozen_array
+
+__all__ = ["Samples"]
+
+_LEVELS = (0.16, 0.5, 0.84)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Samples:
+    """
+    Models drawn from the posteriors of the objects of a catalogue.
+
+    All draws of an object have the same weight. What a model is comes from the grid, so that
+    only four indices and a scale are kept for each.
+
+    Parameters
+    ----------
+    grid : `~miricigale.sed.ModelGrid`
+        The grid that was fitted.
+    ids : array_like, shape (n,)
+        Ids of the objects.
+    flags : array_like of int, shape (n,)
+        `FitFlags`.
+    index : array_like of int, shape (n, n_draws, 4)
+        Redshift, galaxy, torus and AGN fraction of every draw, as indices of the grid; -1 for
+        objects that could not be fitted. Where the fraction is 0 the torus may be -1: none.
+    scale : array_like, shape (n, n_draws)
+        Solar masses formed.
+    model : `~miricigale.sed.SEDModel`, optional
+        The model the grid was made from, for other bands and for spectra.
+    meta : dict, optional
+        Provenance. ``meta["seed"]``, 0 by default, chooses values of parameters without effect.
+    axes : dict of str to `~miricigale.fitting.priors.GridAxis`, optional
+        Parameters that have several values, with the prior of the fit (``fitter.priors.axes``);
+        flat in the nodes by default. It matters only for parameters without effect: their
+        posterior is their prior.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not agree or an index is not one of the grid.
+    """
+
+    grid: object
+    ids: np.ndarray
+    flags: np.ndarray
+    index: np.ndarray
+    scale: np.ndarray
+    model: object = None
+    meta: dict = field(default_factory=dict)
+    axes: dict | None = None
+
+    def __post_init__(self):
+        ids = np.asarray(self.ids)
+        n = ids.size
+        shape = np.shape(self.scale)
+        if len(shape) != 2 or shape[0] != n or shape[1] < 1:
+            raise argument_error("scale", f"of shape ({n}, n_draws)", f"{shape}")
+        if np.shape(self.index) != (*shape, 4):
+            raise argument_error("index", f"of shape {(*shape, 4)}", f"{np.shape(self.index)}")
+        if np.shape(self.flags) != (n,):
+            raise argument_error("flags", f"of shape ({n},)", f"{np.shape(self.flags)}")
+        for name, dtype in (
+            ("ids", ids.dtype),
+            ("flags", np.int64),
+            ("index", np.int32),
+            ("scale", float),
+        ):
+            object.__setattr__(self, name, frozen_array(getattr(self, name), dtype))
+        grid = self.grid
+        sizes = (grid.redshift.size, grid.n_galaxies, max(grid.n_agn, 1), grid.frac_agn.size)
+        drawn = self.index[self.fitted].reshape(-1, 4)
+        lowest = np.array([0, 0, -1, 0])
+        if np.any(drawn < lowest) or np.any(drawn >= np.array(sizes)):
+            raise argument_error("index", f"within the grid's {sizes}", "others")
+        if np.any((drawn[:, 2] < 0) & (grid.frac_agn[drawn[:, 3]] > 0)):
+            raise argument_error("index", "with a torus where the AGN fraction is above 0", "none")
+        object.__setattr__(self, "meta", dict(self.meta))
+        if self.axes is None:
+            object.__setattr__(self, "axes", grid_priors(grid).axes)
+        rows = {}
+        for row, key in enumerate(self.ids.tolist()):
+            rows.setdefault(key, row)
+        object.__setattr__(self, "_rows", rows)
+
+    def __len__(self):
+        return len(self.ids)
+
+    def __repr__(self):
+        return f"<Samples of {len(self)} objects, {self.n_draws} draws each>"
+
+    def __getitem__(self, key):
+        """Return the samples of the object with this id."""
+        rows = slice(self.row(key), self.row(key) + 1)
+        arrays = {name: getattr(self, name)[rows] for name in ("ids", "flags", "index", "scale")}
+        return replace(self, **arrays)
+
+    def row(self, key):
+        """
+        Row of an id (the first, if it occurs twice).
+
+        Raises
+        ------
+        KeyError
+            If there is none.
+        """
+        key = key.item() if isinstance(key, np.generic) else key
+        if key not in self._rows:
+            some = ", ".join(map(repr, list(self._rows)[:5]))
+            msg = f"no object with the id {key!r} among {len(self)}; the first are {some}"
+            raise KeyError(msg)
+        return self._rows[key]
+
+    @property
+    def n_draws(self):
+        """Number of draws of each object."""
+        return self.scale.shape[1]
+
+    @property
+    def fitted(self):
+        """Which objects have draws."""
+        return (self.index[:, :, 0] >= 0).all(axis=1)
+
+    def with_model(self, model):
+        """Return a copy that knows the `~miricigale.sed.SEDModel`."""
+        return replace(self, model=model)
+
+    # ------------------------------------------------------------------- values
+
+    @cached_property
+    def _models(self):
+        return ModelValues(self.grid, self.axes, int(self.meta.get("seed", 0)))
+
+    @property
+    def parameters(self):
+        """
+        Names of all that can be asked for.
+
+        Parameters with several values in the grid, derived quantities and, where the grid has
+        AGN, the AGN fraction in both definitions.
+        """
+        return self._models.names
+
+    def unit(self, name):
+        """Unit of a parameter or derived quantity."""
+        return self._models.unit(name)
+
+    def description(self, name):
+        """One line on a parameter or derived quantity."""
+        return self._models.description(name)
+
+    def values(self, name):
+        """
+        Values of a parameter or derived quantity in every draw.
+
+        Returns
+        -------
+        values : `~astropy.units.Quantity`, shape (n, n_draws)
+            NaN for objects that could not be fitted, and for parameters of the AGN where a
+            draw has none.
+        """
+        unit = self.unit(name)
+        fitted = self.fitted
+        out = np.full(self.scale.shape, np.nan)
+        out[fitted] = self._models.values(
+            name, self.ids[fitted], self.index[fitted], self.scale[fitted]
+        )
+        return out * unit
+
+    def to_table(self, names=None):
+        """
+        All draws as a long table.
+
+        Parameters
+        ----------
+        names : list of str, optional
+            Parameters and derived quantities; all by default.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            ``id``, ``draw`` (from 0), ``flags``, and a column for each parameter and derived
+            quantity; the draws of an object follow one another. Objects that could not be
+            fitted stay in place with NaN.
+        """
+        n, draws = self.scale.shape
+        out = QTable(meta=dict(self.meta))
+        columns = {
+            "id": (np.repeat(self.ids, draws), "identifier"),
+            "draw": (np.tile(np.arange(draws), n), "number of the draw"),
+            "flags": (np.repeat(self.flags, draws), FitFlags.describe()),
+        }
+        for name, (values, text) in columns.items():
+            out[name] = values
+            out[name].info.description = text
+        for name in self.parameters if names is None else names:
+            out[name] = self.values(name).ravel()
+            out[name].info.description = self.description(name)
+        return out
+
+    def mean(self, name):
+        """Means of the draws: Quantity, shape (n,)."""
+        return self.values(name).mean(axis=1)
+
+    def std(self, name):
+        """Standard deviations of the draws: Quantity, shape (n,)."""
+        return self.values(name).std(axis=1)
+
+    def percentile(self, name, levels):
+        """
+        Percentiles of the draws.
+
+        Parameters
+        ----------
+        name : str
+            A parameter or derived quantity.
+        levels : array_like
+            Levels in (0, 1).
+
+        Returns
+        -------
+        percentiles : `~astropy.units.Quantity`, shape (n, n_levels)
+        """
+        values = self.values(name)
+        return np.quantile(values.value, _check_levels(levels), axis=1).T * values.unit
+
+    # -------------------------------------------------------------- distributions
+
+    def pdf(self, name, key, *, bins=30):
+        """
+        Distribution of a parameter or derived quantity of one object.
+
+        Parameters
+        ----------
+        name : str
+            A parameter or derived quantity.
+        key : object
+            Id of the object.
+        bins : int or array_like, optional
+            Number or edges of the bins of derived quantities. Those of parameters of the grid
+            are the cells around its nodes.
+
+        Returns
+        -------
+        edges : `~astropy.units.Quantity`, shape (n_bins + 1,)
+            Bins of equal width, in the logarithm where a quantity scales with mass.
+        weights : `~numpy.ndarray`, shape (n_bins,)
+            Part of the draws in each.
+        """
+        edges, place = self._binned(name, key, bins)
+        weights = np.bincount(place[place >= 0], minlength=edges.size - 1) / place.size
+        return edges, weights
+
+    def pdf_2d(self, a, b, key, *, bins=30):
+        """
+        Joint distribution of two parameters or derived quantities of one object.
+
+        Parameters
+        ----------
+        a, b : str
+            Parameters or derived quantities.
+        key : object
+            Id of the object.
+        bins : int or array_like, optional
+            See `pdf`.
+
+        Returns
+        -------
+        a_edges, b_edges : `~astropy.units.Quantity`, shapes (n_a + 1,) and (n_b + 1,)
+            Edges of the cells.
+        weights : `~numpy.ndarray`, shape (n_a, n_b)
+            Part of the draws in each; the draws without a value (parameters of an AGN that is
+            not there) are in none.
+        """
+        a_edges, i = self._binned(a, key, bins)
+        b_edges, j = self._binned(b, key, bins)
+        weights = np.zeros((a_edges.size - 1, b_edges.size - 1))
+        both = (i >= 0) & (j >= 0)
+        np.add.at(weights, (i[both], j[both]), 1.0 / self.n_draws)
+        return a_edges, b_edges, weights
+
+    def _binned(self, name, key, bins):
+        """Edges of the cells, and the cell of every draw (-1: none)."""
+        unit = self.unit(name)
+        values = self._one(key).values(name).value[0]
+        if name in self.axes:
+            axis = self.axes[name]
+            edges, place = node_cells(values, axis.values, axis.bounds)
+        else:
+            bins = bins.to_value(unit) if hasattr(bins, "unit") else bins
+            if not np.ndim(bins) and not np.isfinite(values).any():
+                raise argument_error("name", "one with values in the draws", repr(name))
+            edges, place = bin_cells(values, bins, log=self._models.extensive(name))
+        return edges * unit, place
+
+    def _one(self, key):
+        """Return the samples of one object that was fitted."""
+        one = self[key]
+        if not one.fitted[0]:
+            names = ", ".join(FitFlags.names(one.flags[0])) or "no draws"
+            raise argument_error("key", "the id of an object that was fitted", f"{key!r} ({names})")
+        return one
+
+    # ---------------------------------------------------------- fluxes and spectra
+
+    def fluxes(self, filters=None):
+        """
+        Model fluxes of every draw.
+
+        Parameters
+        ----------
+        filters : list of str or `~miricigale.filters.FilterSet`, optional
+            Any bands. Those of the grid (all of them by default) are read from it; for others
+            the model is evaluated, every different model of the draws once.
+
+        Returns
+        -------
+        fluxes : `~astropy.units.Quantity`, shape (n, n_draws, n_filters)
+            In uJy; NaN for objects that could not be fitted.
+
+        Raises
+        ------
+        ValueError
+            If a band is not one of the grid and no model is known, or the model is another.
+        """
+        names, extra = self._bands(filters)
+        out = np.full((*self.scale.shape, len(names)), np.nan)
+        fitted = np.flatnonzero(self.fitted)
+        own = [i for i, name in enumerate(names) if name in self.grid.filters]
+        columns = [self.grid.filters.index(names[i]) for i in own]
+        for row in fitted if own else ():
+            z, g, k, f = spectra.plain_index(self.grid, self.index[row]).T
+            flux = self.grid.flux(z, g, k, f)[:, columns]
+            out[row][:, own] = self.scale[row][:, None] * flux
+        if extra and fitted.size:
+            other = [names.index(band) for band in extra]
+            flux = spectra.model_fluxes(
+                self._model(), self.grid, self.index[fitted], extra.values()
+            )
+            out[np.ix_(fitted, np.arange(self.n_draws), other)] = (
+                flux * self.scale[fitted][:, :, None]
+            )
+        return out * FNU
+
+    def _bands(self, filters):
+        """Names of the bands asked for, and those that the grid has not: name to filter."""
+        if filters is None:
+            return list(self.grid.filters), {}
+        if isinstance(filters, str):
+            raise argument_error("filters", "a list of names or a FilterSet", repr(filters))
+        from miricigale.filters import FilterSet
+
+        names = list(getattr(filters, "names", filters))
+        other = [name for name in names if name not in self.grid.filters]
+        if other:
+            self._model()
+        given = dict(zip(names, filters, strict=True)) if hasattr(filters, "names") else {}
+        missing = [name for name in other if name not in given]
+        if missing:
+            given |= dict(zip(missing, FilterSet.from_names(missing), strict=True))
+        return names, {name: given[name] for name in other}
+
+    def _model(self):
+        if self.model is None:
+            raise argument_error("model", "an SEDModel (these samples know none)", "None")
+        spectra.check_model(self.model, self.grid)
+        return self.model
+
+    def predict(self, filters=None, *, levels=_LEVELS):
+        """
+        Posterior of the fluxes in any bands.
+
+        Parameters
+        ----------
+        filters : list of str or `~miricigale.filters.FilterSet`, optional
+            See `fluxes`.
+        levels : tuple of float, optional
+            Levels of percentiles.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            ``id``, ``flags`` and, for each filter, mean (by its name), standard deviation
+            (``<name>_err``) and percentiles (``<name>_p16``, ...) in uJy.
+        """
+        levels = _check_levels(levels)
+        names, _ = self._bands(filters)
+        fluxes = self.fluxes(filters).value
+        out = QTable(
+            {"id": np.array(self.ids), "flags": np.array(self.flags)}, meta=dict(self.meta)
+        )
+        out["flags"].info.description = FitFlags.describe()
+        for i, name in enumerate(names):
+            columns = {
+                name: (fluxes[:, :, i].mean(axis=1), "posterior mean of the model flux"),
+                error_column(name): (fluxes[:, :, i].std(axis=1), "its standard deviation"),
+            }
+            for level, values in zip(
+                levels, np.quantile(fluxes[:, :, i], levels, axis=1), strict=True
+            ):
+                text = f"quantile {level:g} of the model flux"
+                columns[f"{name}_{_suffix(level)}"] = (values, text)
+            for column, (values, text) in columns.items():
+                out[column] = values * FNU
+                out[column].info.description = text
+        return out
+
+    def spectra(self, key, *, rest=True):
+        """
+        Spectra of the draws of one object; different galaxies and tori are evaluated once.
+
+        Parameters
+        ----------
+        key : object
+            Id of the object.
+        rest : bool, optional
+            Whether in the rest frame (L_nu as it leaves the galaxy, without absorption between
+            the galaxies and in the Milky Way) or as observed (F_nu, with both).
+
+        Returns
+        -------
+        wave : `~astropy.units.Quantity`, shape (n_wave,)
+            Wavelengths in um; of the observed spectra those that all draws cover, in the steps
+            of the median redshift.
+        spectra : `~astropy.units.Quantity`, shape (n_draws, n_wave)
+            In W / Hz or uJy.
+        """
+        one = self._one(key)
+        function = spectra.rest_spectra if rest else spectra.observed_spectra
+        wave, values = function(self._model(), self.grid, one.index[0], one.scale[0])
+        return wave * WAVE, values * (u.W / u.Hz if rest else FNU)
+
+    def sed_band(self, key, levels=_LEVELS, *, rest=True):
+        """
+        Percentiles of the spectrum of one object.
+
+        Parameters
+        ----------
+        key : object
+            Id of the object.
+        levels : tuple of float, optional
+            Levels of the percentiles, in (0, 1).
+        rest : bool, optional
+            Whether in the rest frame; see `spectra`.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            ``wave`` and a column for each level (``p16``, ``p50``, ``p84``), taken at every
+            wavelength by itself: L_nu in W / Hz, or F_nu in uJy as observed.
+        """
+        levels = _check_levels(levels)
+        wave, values = self.spectra(key, rest=rest)
+        out = QTable({"wave": wave}, meta=dict(self.meta) | {"id": str(key), "rest": bool(rest)})
+        out["wave"].info.description = f"{'rest' if rest else 'observed'} wavelength"
+        for level, row in zip(levels, np.quantile(values.value, levels, axis=0), strict=True):
+            out[_suffix(level)] = row * values.unit
+            out[
+                _suffix(level)
+            ].info.description = f"quantile {level:g} of {'L_nu' if rest else 'F_nu'}"
+        return out
+
+    # -------------------------------------------------------------------- drawing
+
+    def plot_sed_band(self, key, ax=None, *, levels=_LEVELS, rest=True, **kwargs):
+        """Draw `sed_band`; returns the axes."""
+        from miricigale.plotting.posteriors import plot_sed_band
+
+        table = self.sed_band(key, levels, rest=rest)
+        bands = [table[name] for name in table.colnames[1:]]
+        return plot_sed_band(table["wave"], bands, ax=ax, rest=rest, **kwargs)
+
+    def plot_pdf2d(self, key, a="redshift", b="frac_agn", ax=None, *, bins=30, **kwargs):
+        """Draw the joint distribution of two parameters of an object; returns the axes."""
+        from miricigale.plotting.posteriors import plot_pdf_2d
+
+        a_edges, b_edges, weights = self.pdf_2d(a, b, key, bins=bins)
+        kwargs.setdefault("labels", tuple(self._label(name) for name in (a, b)))
+        return plot_pdf_2d(a_edges.value, b_edges.value, weights, ax=ax, **kwargs)
+
+    def _label(self, name):
+        unit = self.unit(name).to_string()
+        return f"{name} ({unit})" if unit else name
+
+
+def _check_levels(levels):
+    levels = np.atleast_1d(np.asarray(levels, dtype=float))
+    if levels.ndim != 1 or not np.all((levels > 0) & (levels < 1)):
+        raise argument_error("levels", "between 0 and 1", f"{levels}")
+    return levels
+
+
+def _suffix(level):
+    return f"p{100 * level:g}"

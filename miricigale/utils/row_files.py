@@ -1,0 +1,295 @@
+"""Tables on disk, read by pieces of rows: FITS binary tables, ECSV and CSV."""
+
+import abc
+import csv
+import hashlib
+import io
+import json
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+from astropy.table import QTable
+
+from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.files import open_fits
+
+__all__ = ["RowFile", "open_rows"]
+
+
+def open_rows(path, chunk_rows, *, hdu=None, units=None):
+    """
+    Open a table that is to be read in pieces.
+
+    Parameters
+    ----------
+    path : path-like
+        FITS with a binary table, ECSV, or CSV with a line of column names (``.csv``).
+    chunk_rows : int
+        Rows in a piece.
+    hdu : int or str, optional
+        Extension of a FITS file; the only table by default.
+    units : callable, optional
+        Called with the name of a column of a CSV file, which knows no units; returns the text of
+        its unit, or None.
+
+    Returns
+    -------
+    rows : `RowFile`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file is missing, of another kind, or cannot be read by rows.
+    """
+    if isinstance(chunk_rows, bool) or not (
+        isinstance(chunk_rows, (int, np.integer)) and chunk_rows >= 1
+    ):
+        raise argument_error("chunk_rows", "an integer >= 1", repr(chunk_rows))
+    path = Path(path)
+    if not path.is_file():
+        msg = f"no table {path}"
+        raise DataError(msg)
+    with open(path, "rb") as stream:
+        start = stream.read(9)
+    if start.startswith(b"SIMPLE"):
+        return _FitsRows(path, int(chunk_rows), hdu)
+    if hdu is not None:
+        raise argument_error("hdu", f"None, for {path} is no FITS file", repr(hdu))
+    if start.startswith(b"# %ECSV"):
+        return _ECSVRows(path, int(chunk_rows))
+    if path.suffix.lower() == ".csv":
+        return _CSVRows(path, int(chunk_rows), units or (lambda name: None))
+    packed = start.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ"))
+    why = "unpack it first" if packed else "write it as FITS (a binary table) or ECSV"
+    msg = f"{path} cannot be read as a table in pieces of rows: {why}"
+    raise DataError(msg)
+
+
+class RowFile(abc.ABC):
+    """A table on disk of which one piece at a time is in memory."""
+
+    def __init__(self, path, chunk_rows):
+        self.path = path
+        self.chunk_rows = chunk_rows
+
+    @property
+    @abc.abstractmethod
+    def colnames(self):
+        """Names of the columns."""
+
+    @property
+    @abc.abstractmethod
+    def n_rows(self):
+        """Number of rows."""
+
+    @cached_property
+    def sha256(self):
+        """Checksum of the file."""
+        with open(self.path, "rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+
+    @property
+    def n_chunks(self):
+        """Number of pieces; a table without rows is one."""
+        return max(1, -(-self.n_rows // self.chunk_rows))
+
+    def span(self, i):
+        """First row of piece ``i`` and the row after its last."""
+        start = i * self.chunk_rows
+        return start, min(self.n_rows, start + self.chunk_rows)
+
+    def chunk(self, i):
+        """
+        Read piece ``i``.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            As `QTable.read` gives these rows of the whole file; text is text, not bytes.
+        """
+        start, stop = self.span(i)
+        try:
+            table = self._read(start, stop)
+        except (OSError, ValueError, TypeError) as err:
+            first = (str(err).splitlines() or [type(err).__name__])[0]
+            msg = f"{self.path} rows {start} to {stop} cannot be read: {first}"
+            raise DataError(msg) from err
+        if len(table) != stop - start:
+            msg = f"{self.path} has {len(table)} rows where {stop - start} were counted"
+            raise DataError(msg)
+        return table
+
+    @abc.abstractmethod
+    def _read(self, start, stop):
+        """Read rows; ``start`` is the first of a piece."""
+
+
+class _FitsRows(RowFile):
+    def __init__(self, path, chunk_rows, hdu):
+        super().__init__(path, chunk_rows)
+        with open_fits(path, wanted="a catalogue") as hdus:
+            table = self._choose(hdus, hdu)
+            self._header = table.header.copy()
+            self._start = table.fileinfo()["datLoc"]
+            self._colnames = tuple(table.columns.names)
+            formats = dict(zip(table.columns.names, table.columns.formats, strict=True))
+        self._width = self._header["NAXIS1"]
+        ragged = [name for name, text in formats.items() if "P" in text or "Q" in text]
+        if ragged:
+            msg = (
+                f"{path} has columns of variable length, {ragged}, "
+                "which cannot be read in pieces of rows"
+            )
+            raise DataError(msg)
+        wanted = self._start + self._width * self.n_rows
+        if path.stat().st_size < wanted:
+            msg = f"{path} is truncated: {path.stat().st_size} bytes, wanted at least {wanted}"
+            raise DataError(msg)
+        # what belongs to the whole table
+        for key in ("CHECKSUM", "DATASUM", "THEAP"):
+            self._header.remove(key, ignore_missing=True)
+        self._header["PCOUNT"] = 0
+
+    def _choose(self, hdus, hdu):
+        tables = [i for i, item in enumerate(hdus) if isinstance(item, fits.BinTableHDU)]
+        if hdu is None:
+            if len(tables) != 1:
+                msg = f"{self.path} has {len(tables)} binary tables; 'hdu' says which is meant"
+                raise DataError(msg)
+            return hdus[tables[0]]
+        try:
+            chosen = hdus[hdu]
+        except (KeyError, IndexError) as err:
+            msg = f"{self.path} has no extension {hdu!r}"
+            raise DataError(msg) from err
+        if not isinstance(chosen, fits.BinTableHDU):
+            msg = f"{self.path} extension {hdu!r} is no binary table"
+            raise DataError(msg)
+        return chosen
+
+    @property
+    def colnames(self):
+        return self._colnames
+
+    @property
+    def n_rows(self):
+        return self._header["NAXIS2"]
+
+    def _read(self, start, stop):
+        # a small file of its own, so that units, masks and text are what astropy makes of them
+        header = self._header.copy()
+        header["NAXIS2"] = stop - start
+        with open(self.path, "rb") as stream:
+            stream.seek(self._start + start * self._width)
+            data = stream.read((stop - start) * self._width)
+        first = fits.PrimaryHDU().header.tostring() + header.tostring()
+        file = io.BytesIO(first.encode("ascii") + data + bytes(-len(data) % 2880))
+        return QTable.read(file, format="fits", hdu=1, character_as_bytes=False)
+
+
+class _TextRows(RowFile):
+    """Rows of text; a row may go over several lines within quotes."""
+
+    @cached_property
+    def _index(self):
+        """Header as lines, where each piece starts (bytes), number of rows."""
+        header, starts, n_rows, here = [], [], 0, 0
+        n_open, names_read = 0, False
+        with open(self.path, "rb") as stream:
+            for line in stream:
+                begin, here = here, here + len(line)
+                if n_open == 0 and (not line.strip() or line.startswith(b"#")):
+                    if not names_read:
+                        header.append(line.decode())
+                    continue
+                if not names_read:
+                    header.append(line.decode())
+                    names_read = True
+                    continue
+                if n_open == 0:
+                    if n_rows % self.chunk_rows == 0:
+                        starts.append(begin)
+                    n_rows += 1
+                n_open = (n_open + line.count(b'"')) % 2
+        if not names_read:
+            msg = f"{self.path} has no line of column names"
+            raise DataError(msg)
+        starts.append(here)
+        return header, starts, n_rows
+
+    @property
+    def n_rows(self):
+        return self._index[2]
+
+    def _text(self, start):
+        starts = self._index[1]
+        i = start // self.chunk_rows
+        if i + 1 >= len(starts):
+            return ""
+        with open(self.path, "rb") as stream:
+            stream.seek(starts[i])
+            return stream.read(starts[i + 1] - starts[i]).decode()
+
+    @property
+    def _header(self):
+        return "".join(self._index[0])
+
+    @cached_property
+    def colnames(self):
+        *header, names = [line for line in self._index[0] if line.strip()]
+        comma = self.path.suffix.lower() == ".csv" or "# delimiter: ','\n" in header
+        row = next(csv.reader([names], delimiter="," if comma else " "))
+        return tuple(name.strip() for name in row)
+
+    def _read(self, start, stop):
+        return QTable.read(self._header + self._text(start), format="ascii.ecsv")
+
+
+class _ECSVRows(_TextRows):
+    """ECSV, whose header says what the columns are."""
+
+
+class _CSVRows(_TextRows):
+    """CSV, whose columns are what all of their rows can be read as."""
+
+    def __init__(self, path, chunk_rows, units):
+        super().__init__(path, chunk_rows)
+        self._units = units
+
+    @cached_property
+    def _header(self):
+        kinds = ["bool"] * len(self.colnames)
+        for i in range(self.n_chunks):
+            rows = list(csv.reader(io.StringIO(self._text(self.span(i)[0]))))
+            for j, column in enumerate(zip(*rows, strict=False)):
+                kinds[j] = _kind(kinds[j], [value for value in column if value.strip()])
+        lines = ["# %ECSV 1.0", "# ---", "# delimiter: ','", "# datatype:"]
+        for name, kind in zip(self.colnames, kinds, strict=True):
+            unit = self._units(name)
+            about = {"name": name, "datatype": kind} | ({} if unit is None else {"unit": unit})
+            lines.append(f"# - {json.dumps(about)}")
+        names = io.StringIO()
+        csv.writer(names, lineterminator="\n").writerow(self.colnames)
+        return "\n".join([*lines, names.getvalue()])
+
+
+_KINDS = ("bool", "int64", "float64", "string")
+
+
+def _kind(kind, values):
+    """Return the first kind, from ``kind`` on, that all of these texts can be read as."""
+    for name in _KINDS[_KINDS.index(kind) :]:
+        if name == "string":
+            break
+        if name == "bool":
+            if set(values) <= {"True", "False"}:
+                return name
+            continue
+        try:
+            np.array(values, dtype=str).astype(name)
+        except (ValueError, OverflowError):
+            continue
+        return name
+    return "string"

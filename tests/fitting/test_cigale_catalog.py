@@ -1,0 +1,215 @@
+import warnings
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable, Table
+
+from miricigale.filters import Filter
+from miricigale.fitting import read_cigale_catalog
+from miricigale.fitting.cigale import cigale_band, filter_of_band
+from miricigale.utils.exceptions import DataError, MiricigaleWarning
+
+TEXT = """\
+# id redshift IRAC1 IRAC1_err jwst.miri.F770W jwst.miri.F770W_err MIPS1 MIPS1_err
+one 1.324 2.0e-3 1e-4 3e-3 2e-4 0.1 -0.02
+two -1 nan 1e-4 -99 2e-4 0.2 0.03
+three 0.5 -9999 -9999 3e-3 0 -0.01 0.02
+four 0.25 2e-3 nan 3e-3 -9999 0.3 0.04
+"""
+
+
+@pytest.fixture
+def text_file(tmp_path):
+    path = tmp_path / "galaxies.txt"
+    path.write_text(TEXT)
+    return path
+
+
+def test_millijansky_become_microjansky(text_file):
+    table = read_cigale_catalog(text_file)
+    assert table["irac.ch1"].unit == u.uJy
+    np.testing.assert_allclose(table["irac.ch1"][0].value, 2.0, rtol=1e-14)
+    np.testing.assert_allclose(table["irac.ch1_err"][0].value, 0.1, rtol=1e-14)
+    np.testing.assert_allclose(table["miri.f770w"][0].value, 3.0, rtol=1e-14)
+    assert table["id"].tolist() == ["one", "two", "three", "four"]
+    assert table.meta["cigale"]["bands"]["miri.f770w"] == "jwst.miri.F770W"
+
+
+def test_missing_values(text_file):
+    table = read_cigale_catalog(text_file)
+    # NaN, -9999 in flux, NaN in the error
+    assert np.isnan(table["irac.ch1"].value).tolist() == [False, True, True, True]
+    # -99, an error of 0, an error of -9999
+    assert np.isnan(table["miri.f770w"].value).tolist() == [False, True, True, True]
+    assert np.isnan(table["redshift"]).tolist() == [False, True, False, False]
+    # a negative flux is a measurement
+    np.testing.assert_allclose(table["mips.24"][2].value, -10.0)
+    np.testing.assert_array_equal(
+        np.isnan(table["irac.ch1"].value), np.isnan(table["irac.ch1_err"].value)
+    )
+
+
+def test_negative_errors_are_upper_limits(text_file):
+    table = read_cigale_catalog(text_file)
+    assert table["mips.24_limit"].tolist() == [True, False, False, False]
+    np.testing.assert_allclose(table["mips.24"][0].value, 100.0)
+    np.testing.assert_allclose(table["mips.24_err"][0].value, 20.0)
+    assert "irac.ch1_limit" not in table.colnames
+
+    without = read_cigale_catalog(text_file, limits=False)
+    assert "mips.24_limit" not in without.colnames
+    assert np.isnan(without["mips.24"][0].value)
+    assert np.isnan(without["mips.24_err"][0].value)
+
+
+@pytest.mark.parametrize("name", ["cat.fits", "cat.xml", "cat.ecsv", "cat.csv", "cat.txt"])
+def test_all_formats_say_the_same(text_file, tmp_path, name):
+    truth = read_cigale_catalog(text_file)
+    plain = Table.read(text_file, format="ascii.commented_header")
+    path = tmp_path / name
+    kind = {"xml": "votable", "txt": "ascii", "csv": "csv"}.get(name[4:])
+    plain.write(path, **({"format": kind} if kind else {}))
+    table = read_cigale_catalog(path)
+    assert table.colnames == truth.colnames
+    for column in truth.colnames:
+        if column == "id":
+            assert table["id"].tolist() == truth["id"].tolist()
+        else:
+            np.testing.assert_allclose(
+                np.asarray(table[column]), np.asarray(truth[column]), rtol=1e-12
+            )
+
+
+def test_units_of_the_file_are_kept(tmp_path):
+    table = QTable({"id": [1, 2], "redshift": [0.1, 0.2]})
+    table["FUV"] = [1.0, 2.0] * u.Jy
+    table["FUV_err"] = [0.1, 0.2] * u.Jy
+    table["distance"] = [3.0, np.nan] * u.kpc
+    table.write(tmp_path / "c.fits")
+    got = read_cigale_catalog(tmp_path / "c.fits")
+    np.testing.assert_allclose(got["sedpy.galex_FUV"].value, [1e6, 2e6])
+    np.testing.assert_allclose(got["sedpy.galex_FUV_err"].value, [1e5, 2e5])
+    np.testing.assert_allclose(got["distance"][0].to_value(u.Mpc), 3e-3)
+
+    table["FUV"] = [1.0, 2.0] * u.m
+    table.write(tmp_path / "d.fits")
+    with pytest.raises(DataError, match="'FUV' must be convertible to mJy"):
+        read_cigale_catalog(tmp_path / "d.fits")
+
+
+def test_ten_per_cent_where_there_is_no_error(tmp_path):
+    path = tmp_path / "c.txt"
+    path.write_text("id redshift IRAC1 IRAC2 IRAC2_err\n1 1.0 -5e-3 1e-3 1e-4\n")
+    with pytest.warns(MiricigaleWarning, match=r"10 % of the flux .*: IRAC1$"):
+        table = read_cigale_catalog(path)
+    np.testing.assert_allclose(table["irac.ch1_err"].value, [0.5])
+    np.testing.assert_allclose(table["irac.ch2_err"].value, [0.1])
+    # an error that is not among the bands is not used
+    with pytest.warns(MiricigaleWarning, match="IRAC1, IRAC2"):
+        table = read_cigale_catalog(path, bands=["IRAC1", "IRAC2"])
+    np.testing.assert_allclose(table["irac.ch2_err"].value, [0.1])
+
+
+def test_what_is_left_out_is_named_once(tmp_path):
+    path = tmp_path / "c.txt"
+    path.write_text(
+        "id redshift ra IRAC1 IRAC1_err xray_soft xray_soft_err line.H-alpha line.H-alpha_err\n"
+        "1 1.0 150 5e-3 1e-3 1 1 2e-19 1e-19\n"
+    )
+    with pytest.warns(MiricigaleWarning) as record:
+        table = read_cigale_catalog(path)
+    assert len(record) == 1
+    text = str(record[0].message)
+    for name in ("xray_soft", "line.H-alpha (line)", "ra"):
+        assert name in text
+    assert table.colnames == ["id", "redshift", "irac.ch1", "irac.ch1_err"]
+    assert table.meta["cigale"]["left_out"] == ["xray_soft", "line.H-alpha (line)", "ra"]
+    with pytest.raises(DataError, match="xray_soft"):
+        read_cigale_catalog(path, strict=True)
+    # a filter may be given for it
+    with pytest.warns(MiricigaleWarning) as record:
+        table = read_cigale_catalog(path, names={"xray_soft": "sedpy.uvot_m2"})
+    assert "xray_soft" not in str(record[0].message)
+    assert "sedpy.uvot_m2" in table.colnames
+
+
+def test_only_the_bands_asked_for(text_file):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        table = read_cigale_catalog(text_file, bands=["MIPS1", "MIPS1_err"])
+    assert table.colnames == ["id", "redshift", "mips.24", "mips.24_err", "mips.24_limit"]
+    with pytest.raises(DataError, match="no column IRAC3"):
+        read_cigale_catalog(text_file, bands=["IRAC3"])
+
+
+@pytest.mark.parametrize(
+    ("content", "wanted"),
+    [
+        ("id IRAC1 IRAC1_err\n1 1 1\n", "no column 'redshift'"),
+        ("id redshift IRAC1 IRAC1_err spitzer.irac.ch1\n1 1 1 1 1\n", "IRAC1 and spitzer.irac.ch1"),
+        ("id redshift xray\n1 1 1\n", "no band that is known"),
+        ("id redshift IRAC1 IRAC1_err\n1 1 faint 1\n", "'IRAC1' holds something else"),
+    ],
+)
+def test_refused(tmp_path, content, wanted):
+    path = tmp_path / "c.txt"
+    path.write_text(content)
+    with pytest.raises(DataError, match=wanted):
+        read_cigale_catalog(path)
+    with pytest.raises(DataError, match="no such file"):
+        read_cigale_catalog(tmp_path / "none.txt")
+
+
+@pytest.mark.parametrize(
+    ("band", "name", "pivot"),
+    [
+        # pivot wavelengths of the instruments' documentation, um
+        ("FUV", "sedpy.galex_FUV", 0.153),
+        ("galex.NUV", "sedpy.galex_NUV", 0.230),
+        ("u_prime", "sedpy.sdss_u0", 0.356),
+        ("sdss.up", "sedpy.sdss_u0", 0.356),
+        ("sdss.zp", "sedpy.sdss_z0", 0.893),
+        ("megacam_u", "megacam.u", 0.38),
+        ("cfht.megacam.u", "megacam.u", 0.38),
+        ("hst.wfc.F814W", "acs.f814w", 0.805),
+        ("ACS_F606W", "acs.f606w", 0.592),
+        ("hst.wfc3.F160W", "wfc3.f160w", 1.537),
+        ("hst.wfc3.F275W", "sedpy.wfc3_uvis_f275w", 0.271),
+        ("F336W_UVIS_CHIP2", "sedpy.wfc3_uvis_f336w", 0.335),
+        ("J_2mass", "sedpy.twomass_J", 1.24),
+        ("2mass.Ks", "sedpy.twomass_Ks", 2.16),
+        ("vista.vircam.Ks", "sedpy.vista_vircam_Ks", 2.15),
+        ("ukirt.wfcam.K", "sedpy.ukirt_wfcam_K", 2.2),
+        ("WISE3", "sedpy.wise_w3", 12.08),
+        ("IRAC4", "irac.ch4", 7.87),
+        ("spitzer.irac.ch1", "irac.ch1", 3.55),
+        ("MIPS1", "mips.24", 23.68),
+        ("spitzer.mips.70", "mips.70", 71.4),
+        ("F770W", "miri.f770w", 7.64),
+        ("jwst.miri.F2100W", "miri.f2100w", 20.8),
+        ("F444W", "nircam.f444w", 4.42),
+        ("jwst.nircam.F150W", "nircam.f150w", 1.50),
+        ("PACS_green", "sedpy.herschel_pacs_100", 100.0),
+        ("herschel.pacs.160", "sedpy.herschel_pacs_160", 160.0),
+        ("PLW", "sedpy.herschel_spire_500", 500.0),
+        ("subaru.suprime.IB427", "sedpy.subaru_suprimecam_ia427", 0.426),
+        ("subaru.hsc.y", "sedpy.hsc_y", 0.98),
+        ("V_B90", "sedpy.bessell_V", 0.55),
+    ],
+)
+def test_bands(band, name, pivot):
+    assert filter_of_band(band) == name
+    np.testing.assert_allclose(Filter.from_name(name).pivot.value, pivot, rtol=0.03)
+
+
+def test_bands_without_a_curve():
+    for band in ("xray_boxcar_2to12keV", "VLA_L", "scuba.850", "jwst.miri.F999W", "F814W"):
+        assert filter_of_band(band) is None
+
+
+def test_filters_find_their_way_back():
+    for name in (*Filter.names(), "sedpy.sdss_r0", "sedpy.galex_NUV", "sedpy.wise_w4"):
+        assert filter_of_band(cigale_band(name)) == name
+    assert cigale_band("miri.f770w") == "jwst.miri.F770W"
+    assert cigale_band("acs.f850lp") == "hst.wfc.F850LP"

@@ -1,0 +1,591 @@
+import os
+import warnings
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from miricigale.fitting import CigaleSetup, FitFlags, fit_cigale, read_cigale_results
+from miricigale.fitting import read_pcigale_ini as read
+from miricigale.fitting.cigale.ini import parse_ini, parse_values
+from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarning
+
+INI = """\
+# A comment, with an = sign
+data_file = galaxies.txt
+parameters_file =
+sed_modules = sfhdelayed, bc03, nebular, dustatt_modified_starburst, dl2007, skirtor2016, redshifting
+analysis_method = pdf_analysis
+cores = 2
+bands = hst.wfc3.F160W, hst.wfc3.F160W_err, IRAC1, IRAC1_err, F770W, F770W_err, MIPS1, MIPS1_err
+properties =
+additionalerror = 0.05
+
+[sed_modules_params]
+  [[sfhdelayed]]
+    tau_main = 500, 5e3   # Myr
+    age_main = 5000, 1000
+    tau_burst = 50.0
+    age_burst = 20
+    f_burst = 0.0
+    sfr_A = 1.0
+    normalise = True
+  [[bc03]]
+    imf = 1
+    metallicity = 0.02
+    separation_age = 10
+  [[nebular]]
+    logU = -3.0
+    zgas = 0.02
+    ne = 100
+    f_esc = 0.0
+    f_dust = 0.0
+    lines_width = 400.0
+    emission = True
+  [[dustatt_modified_starburst]]
+    E_BV_lines = "range 0.5 1.0 0.5"
+    E_BV_factor = 0.44
+    uv_bump_wavelength = 217.5
+    uv_bump_width = 35.0
+    uv_bump_amplitude = 0.0
+    powerlaw_slope = -0.2
+    Ext_law_emission_lines = 2
+    Rv = 3.1
+    filters = B_B90 & V_B90 & FUV
+  [[dl2007]]
+    qpah = 2.5
+    umin = 1.0
+    umax = 1000000.0
+    gamma = 0.1
+  [[skirtor2016]]
+    t = 3, 7
+    pl = 1.0
+    q = 0.5
+    oa = 40
+    R = 20
+    Mcl = 0.97
+    i = 30, 70
+    disk_type = 1
+    delta = -0.36
+    fracAGN = 0.0, 0.5, 0.9
+    lambda_fracAGN = 0/0
+    law = 2
+    EBV = 0.03
+    temperature = 100.0
+    emissivity = 1.6
+  [[redshifting]]
+    redshift =
+
+[analysis_params]
+  variables = agn.fracAGN, stellar.m_star, sfh.sfr10Myrs, sfh.age_main, dust.luminosity
+  bands = jwst.miri.F2100W
+  save_best_sed = False
+  lim_flag = noscaling
+  mock_flag = True
+  redshift_decimals = 1
+  blocks = 1
+"""
+
+
+def write(folder, *changes, name="pcigale.ini"):
+    """Write the configuration with replacements, which must have a place."""
+    text = INI
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def quiet(path, **options):
+    """Read without the warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MiricigaleWarning)
+        return read(path, libraries="bundled", **options)
+
+
+# ----------------------------------------------------------------------- the dialect
+
+
+def test_the_dialect_is_that_of_configobj(tmp_path):
+    reference = pytest.importorskip("astropy.extern.configobj.configobj").ConfigObj
+    lines = ["[a]", "  list = 1, 'b, c' , \"d # e\" # f", "  one = 2,", "  none = ", "[[b]]"]
+    lines += ['x = "eval np.linspace(0, 1, 3)"', "[[c]]", "y = B_B90 & V_B90", "[d]", "z=3=4"]
+    path = tmp_path / "a.ini"
+    path.write_text("\n".join(lines))
+    assert parse_ini(path) == reference(str(path)).dict()
+    assert parse_ini(write(tmp_path)) == reference(str(write(tmp_path))).dict()
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("2.5", [2.5]),
+        (["3", "1e2", "-0.5"], [-0.5, 3.0, 100.0]),
+        ("range 0.1 1.0 0.1", np.arange(1, 11) / 10),
+        ("range 10 40 10", [10, 20, 30, 40]),
+        ("eval np.linspace(0.01, 6., 5)", np.linspace(0.01, 6, 5)),
+        ("eval np.logspace(-1, 1, num=3)", [0.1, 1, 10]),
+        ("eval list(np.arange(3) * 0.5) ", [0, 0.5, 1]),
+        ("eval np.append(np.linspace(0, 0.8, 3), 0.99)", [0, 0.4, 0.8, 0.99]),
+        ("eval 10**np.linspace(1, 3, 3)", [10, 100, 1000]),
+        ("eval np.round(np.geomspace(1, 10, 3), 2)", [1, 3.16, 10]),
+        ("eval [1, 2**3, -(1 + 1) / 4]", [-0.5, 1, 8]),
+        ("eval 7", [7]),
+    ],
+)
+def test_values(text, wanted):
+    np.testing.assert_allclose(parse_values(text, "x"), wanted, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "eval __import__('os').remove('x')",
+        "eval open('x')",
+        "eval np.load('x')",
+        "eval np.lib.format.open_memmap('x')",
+        "eval (1).__class__",
+        "eval [x for x in (1, 2)]",
+        "eval lambda: 1",
+        "eval np.linspace(0, 1, 10**9)",
+        "eval np.linspace(0, 1, 3, dtype=1)",
+        "eval np.arange(0, 1e12, 1)",
+        "eval 9**9**9**9",
+        "eval 1/0",
+        "eval 'text'",
+        "eval " + "(" * 5000,
+        "eval",
+        "range 1 2",
+        "range 0 1 0",
+        "three",
+        ["1", "1.0"],
+        [],
+        "nan",
+    ],
+)
+def test_nothing_else_is_evaluated(text):
+    with pytest.raises(ValueError, match=r"^fracAGN "):
+        parse_values(text, "fracAGN")
+
+
+@pytest.mark.parametrize(
+    ("content", "wanted"),
+    [
+        ("a = 1\nb\n", "line 2: neither"),
+        ("a = 1\na = 2\n", "line 2: 'a' is there twice"),
+        ("[[b]]\n", "line 1: section 'b' is nested too deep"),
+        ("[b]\n[b]\n", "line 2: section 'b' is there twice"),
+        ("[b\n", "line 1: .* is no section"),
+        ('a = "b\n', "line 1: the quote"),
+        ('a = """b\n', "triple quotes"),
+        ("a = 1\n", "no sed_modules"),
+    ],
+)
+def test_foreign_files_are_refused(tmp_path, content, wanted):
+    path = tmp_path / "pcigale.ini"
+    path.write_text(content)
+    with pytest.raises(DataError, match=wanted):
+        read(path)
+    with pytest.raises(DataError, match="no such file"):
+        read(tmp_path / "none.ini")
+
+
+# --------------------------------------------------------------------------- modules
+
+
+def test_axes_in_our_units(tmp_path):
+    axes = quiet(write(tmp_path)).axes([0.52, 0.48, 1.26, np.nan, -1])
+    wanted = {
+        "tau": [0.5, 5.0],
+        "age": [1.0, 5.0],
+        "ebv_lines": [0.5, 1.0],
+        "tau97": [3.0, 7.0],
+        "inclination": [30.0, 70.0],
+        "frac_agn": [0.0, 0.5, 0.9],
+        "redshift": [0.5, 1.3],
+    }
+    assert set(axes) == set(wanted)
+    for name, values in wanted.items():
+        np.testing.assert_allclose(axes[name], values, rtol=1e-12)
+
+
+def test_parameters_and_options_of_the_chain(tmp_path):
+    setup = quiet(write(tmp_path))
+    model = setup.model()
+    assert [c.name for c in model.components] == [
+        *(
+            "delayed",
+            "bc03",
+            "nebular",
+            "modified_starburst",
+            "dl07",
+            "parametric_torus",
+            "meiksin2006",
+        )
+    ]
+    defaults = {name: p.default for name, p in model.parameters.items()}
+    wanted = {"f_burst": 0, "age_burst": 0.02, "tau_burst": 0.05, "separation_age": 10}
+    wanted |= {
+        "log_u": -3,
+        "slope": -0.2,
+        "ebv_factor_stars": 0.44,
+        "r_v_gas": 3.1,
+        "uv_bump_wavelength": 0.2175,
+    }
+    wanted |= {"uv_bump_width": 0.035, "q_pah": 2.5, "u_min": 1, "gamma": 0.1, "q": 0.5}
+    wanted |= {"disk_slope": -0.36, "ebv_polar": 0.03, "emissivity_polar": 1.6}
+    for name, value in wanted.items():
+        assert defaults[name] == pytest.approx(value, rel=1e-12), name
+    agn, gas = model.component("agn"), model.component("nebular")
+    assert (agn.polar_law, agn.disk) == ("gaskell", "schartmann2005")
+    # as the stars have it
+    assert (gas.gas, gas.line_width) == ("stellar", 400.0)
+    dust = model.component("attenuation")
+    assert (dust.gas_law, dust.ebv_scaling) == ("lmc", "cigale")
+    assert setup.additional_error == 0.05
+    assert (setup.limits, setup.mock, setup.cores, setup.redshift_decimals) == (True, True, 2, 1)
+    assert list(setup.bands.items())[2] == ("miri.f770w", "F770W")
+    assert setup.predicted == {"miri.f2100w": "jwst.miri.F2100W"}
+
+
+@pytest.mark.parametrize(
+    ("text", "definition", "replaced"),
+    [
+        ("0/0", "dust", False),
+        ("3/1000", "3-1000um", False),
+        ("3.0 / 1000.", "3-1000um", False),
+        ("5/20", "dust", True),
+    ],
+)
+def test_definition_of_the_fraction(tmp_path, text, definition, replaced):
+    setup = quiet(write(tmp_path, ("lambda_fracAGN = 0/0", f"lambda_fracAGN = {text}")))
+    assert setup.model().frac_agn_definition == definition
+    assert any("lambda_fracAGN = 5/20" in x for x in setup.replaced) is replaced
+
+
+@pytest.mark.parametrize(
+    ("flag", "wanted"), [("True", True), ("full", True), ("False", False), ("none", False)]
+)
+def test_flag_of_limits(tmp_path, flag, wanted):
+    setup = quiet(write(tmp_path, ("lim_flag = noscaling", f"lim_flag = {flag}")))
+    assert setup.limits is wanted
+
+
+def test_other_modules(tmp_path):
+    sections = """\
+  [[sfh2exp]]
+    tau_main = 6000
+    tau_burst = 50
+    f_burst = 0.01, 0.1
+    age = 3000
+    burst_age = 20, 40
+    sfr_0 = 1.0
+    normalise = True
+  [[dustatt_modified_CF00]]
+    Av_ISM = 0.5, 1
+    mu = 0.44
+    slope_ISM = -0.7
+    slope_BC = -1.3
+    filters = V_B90
+  [[casey2012]]
+    temperature = 35
+    beta = 1.6
+    alpha = 2.0, 2.5
+[analysis_params]
+"""
+    modules = "sed_modules = sfh2exp, bc03, dustatt_modified_CF00, casey2012, redshifting"
+    old = next(line for line in INI.splitlines() if line.startswith("sed_modules"))
+    path = write(
+        tmp_path,
+        (old, modules),
+        ("[analysis_params]\n", sections),
+        ("redshift =\n", 'redshift = "eval np.linspace(0.5, 1, 3)"\n'),
+        ("agn.fracAGN, ", ""),
+        ("sfh.age_main", "sfh.age"),
+    )
+    # nothing is left out or replaced
+    with pytest.warns(MiricigaleWarning, match="differs: Chabrier IMF: Kroupa"):
+        setup = read(path, strict=True)
+    names = [c.name for c in setup.components]
+    assert names == ["double_exponential", "bc03", "charlot_fall", "casey2012", "meiksin2006"]
+    axes = setup.axes()
+    np.testing.assert_allclose(axes["age_burst"], [0.02, 0.04])
+    np.testing.assert_allclose(axes["f_burst"], [0.01, 0.1])
+    np.testing.assert_allclose(axes["av_ism"], [0.5, 1.0])
+    np.testing.assert_allclose(axes["alpha_mir"], [2.0, 2.5])
+    np.testing.assert_allclose(axes["redshift"], [0.5, 0.75, 1.0])
+    assert not setup.model().has_agn
+    assert setup.variables == (*("stellar.m_star", "sfh.sfr10Myrs", "sfh.age", "dust.luminosity"),)
+
+
+def test_history_from_a_file(tmp_path):
+    rows = "\n".join(f"{t} {2.0 if t < 50 else 0.0} 1.0" for t in range(100))
+    (tmp_path / "history.txt").write_text(f"# time burst steady\n{rows}\n")
+    section = """\
+  [[sfhfromfile]]
+    filename = history.txt
+    sfr_column = 1, 2
+    age = 100
+    normalise = True
+[analysis_params]
+"""
+    path = write(
+        tmp_path,
+        ("[analysis_params]\n", section),
+        ("sed_modules = sfhdelayed", "sed_modules = sfhfromfile"),
+    )
+    setup = quiet(path)
+    np.testing.assert_array_equal(setup.parameters["sfh_index"], [0, 1])
+    sfh = setup.components[0]
+    rate = sfh.history({"age": 0.1, "sfh_index": 0})
+    # one solar mass in the first 50 Myr
+    np.testing.assert_allclose(rate[:50], 1 / 50e6)
+    np.testing.assert_allclose(rate[50:], 0.0)
+
+
+def test_one_message_names_all_that_is_left_out(tmp_path):
+    path = write(
+        tmp_path,
+        ("skirtor2016, redshifting", "skirtor2016, radio, restframe_parameters, redshifting"),
+        ("IRAC1, IRAC1_err", "IRAC1, IRAC1_err, VLA_L, VLA_L_err, line.OII, line.OII_err"),
+        ("variables = ", "variables = radio.qir, "),
+        ("fracAGN = 0.0, 0.5, 0.9", "fracAGN = 0.5, 1.0"),
+        ("law = 2", "law = 0, 2"),
+        ("zgas = 0.02", "zgas = 0.014"),
+    )
+    with pytest.warns(MiricigaleWarning) as record:
+        setup = read(path, libraries="bundled")
+    assert len(record) == 1
+    left, replaced, differs = str(record[0].message).splitlines()[1:]
+    names = ("module radio", "module restframe_parameters", "band VLA_L", "band line.OII")
+    for text in (*names, "variable radio.qir", "skirtor2016.fracAGN = 1 (not", "law = 2"):
+        assert text in left
+    assert "nebular.zgas = 0.014 by 0.02" in replaced
+    assert "skirtor2016 by parametric_torus" in replaced
+    assert "Chabrier IMF: Kroupa" in differs
+    # and the rest is there
+    assert setup.model().has_agn
+    assert list(setup.bands.values()) == ["hst.wfc3.F160W", "IRAC1", "F770W", "MIPS1"]
+    assert "agn.fracAGN" in setup.variables
+    with pytest.raises(ConfigError, match=r"(?s)module radio.*parametric_torus"):
+        read(path, libraries="bundled", strict=True)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "wanted"),
+    [
+        ("sfhdelayed, bc03", "sfhperiodic, m2005", "sfh, stellar .*sfhperiodic, m2005"),
+        ("tau_main = 500, 5e3", "tau_main = 500, fast", r"sfhdelayed.tau_main = 500, fast"),
+        ("t = 3, 7", "t = 3, 3", "skirtor2016.t has a value twice"),
+        ("metallicity = 0.02", "metallicity = -1 , -2", None),
+        ("parameters_file =", "parameters_file = models.txt", "parameters_file"),
+        ("IRAC1, IRAC1_err, F770W, F770W_err", "F770W, jwst.miri.F770W", "both the filter miri"),
+        ("IRAC1, IRAC1_err", "IRAC1_err", "IRAC1 is not"),
+        ("lambda_fracAGN = 0/0", "lambda_fracAGN = all", "two wavelengths"),
+        ("lim_flag = noscaling", "lim_flag = perhaps", "lim_flag"),
+        ("additionalerror = 0.05", "additionalerror = -1", "additionalerror"),
+        ("redshift_decimals = 1", "redshift_decimals = x", "redshift_decimals"),
+    ],
+)
+def test_refused(tmp_path, old, new, wanted):
+    path = write(tmp_path, (old, new))
+    if wanted is None:
+        # the nearest bound is taken, and named
+        assert any("metallicity" in x for x in quiet(path).replaced)
+        return
+    with pytest.raises(ConfigError, match=wanted) as error:
+        quiet(path)
+    assert str(path) in str(error.value)
+
+
+def test_rounding_of_redshifts(tmp_path):
+    setup = quiet(write(tmp_path))
+    z = setup.rounded([0.04, 0.06, 1.25, 1.251, 0.0, -1.0, np.nan])
+    np.testing.assert_allclose(z, [0.04, 0.1, 1.2, 1.3, 0.0, np.nan, np.nan])
+    exact = quiet(write(tmp_path, ("redshift_decimals = 1", "redshift_decimals = -1")))
+    np.testing.assert_array_equal(exact.rounded([0.1234, 2.5]), [0.1234, 2.5])
+    with pytest.raises(ValueError, match="redshifts"):
+        setup.axes()
+    with pytest.raises(ValueError, match="redshifts"):
+        setup.axes([np.nan])
+
+
+# ------------------------------------------------------------------------- whole runs
+
+
+def models(setup, rows):
+    """Photometry in mJy of models on nodes of the grid, by CIGALE's names."""
+    table = QTable(rows)
+    every = setup.bands | setup.predicted
+    fluxes = setup.model().fluxes(table, list(every))
+    return {band: fluxes[name].to_value(u.mJy) for name, band in every.items()}, fluxes
+
+
+def write_catalog(path, redshift, fluxes, bands, error=0.01):
+    names = [x for band in bands for x in (band, f"{band}_err")]
+    lines = [" ".join(["# id redshift", *names])]
+    for i, z in enumerate(redshift):
+        values = [x for b in bands for x in (fluxes[b][i], error * fluxes[b][i])]
+        lines.append(" ".join([f"g{i}", f"{z}", *(f"{v:.15g}" for v in values)]))
+    path.write_text("\n".join(lines) + "\n")
+
+
+ROWS = {
+    "redshift": [0.5, 1.3, 0.5],
+    "mass": [1e10, 3e10, 1e11],
+    "tau": [0.5, 5.0, 0.5],
+    "age": [5.0, 1.0, 1.0],
+    "ebv_lines": [0.5, 1.0, 0.5],
+    "tau97": [7.0, 3.0, 7.0],
+    "inclination": [30.0, 70.0, 70.0],
+    "frac_agn": [0.5, 0.0, 0.9],
+}
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Three models, written as CIGALE's files."""
+    path = write(tmp_path)
+    setup = quiet(path)
+    fluxes, truth = models(setup, ROWS)
+    # redshifts that round to the models'
+    write_catalog(tmp_path / "galaxies.txt", [0.52, 1.26, 0.5], fluxes, setup.bands.values())
+    return path, fluxes, truth
+
+
+def test_a_run_gives_the_models_back(run, tmp_path):
+    path, fluxes, truth = run
+    out = tmp_path / "results.fits"
+    setup = quiet(path)
+    results = fit_cigale(setup, output=out)
+    assert isinstance(setup, CigaleSetup)
+    assert results.meta["cigale"]["modules"]["agn"] == "skirtor2016"
+    np.testing.assert_allclose(results.chi2, 0.0, atol=1e-6)
+    table = read_cigale_results(out)
+    assert table["id"].tolist() == ["g0", "g1", "g2"]
+    best = {
+        "sfh.tau_main": ([500, 5000, 500], "Myr"),
+        "sfh.age_main": ([5000, 1000, 1000], "Myr"),
+        "sfh.integrated": ([1e10, 3e10, 1e11], "Msun"),
+        "sfh.age_burst": ([20] * 3, "Myr"),
+        "stellar.old_young_separation_age": ([10] * 3, "Myr"),
+        "attenuation.E_BV_lines": ([0.5, 1.0, 0.5], "mag"),
+        "attenuation.uv_bump_wavelength": ([217.5] * 3, "nm"),
+        "universe.redshift": ([0.5, 1.3, 0.5], ""),
+        "agn.fracAGN": ([0.5, 0.0, 0.9], ""),
+        "agn.t": ([7, np.nan, 7], ""),
+        "agn.i": ([30, np.nan, 70], "deg"),
+        "dust.umin": ([1] * 3, ""),
+    }
+    for name, unit in (
+        ("stellar_mass", "Msun"),
+        ("dust_luminosity", "W"),
+        ("sfr_10myr", "Msun/yr"),
+        ("accretion_power", "W"),
+    ):
+        theirs = {
+            "stellar_mass": "stellar.m_star",
+            "dust_luminosity": "dust.luminosity",
+            "sfr_10myr": "sfh.sfr10Myrs",
+            "accretion_power": "agn.accretion_power",
+        }[name]
+        best[theirs] = (truth[name].to_value(unit), unit)
+    for name, (values, unit) in best.items():
+        got = u.Quantity(table[f"best.{name}"])
+        assert got.unit == u.Unit(unit), name
+        np.testing.assert_allclose(got.value, values, rtol=1e-5, err_msg=name)
+    for band, values in fluxes.items():
+        assert table[f"best.{band}"].unit == u.mJy
+        np.testing.assert_allclose(table[f"best.{band}"].value, values, rtol=1e-5)
+    # the quantities asked for have means and errors, others have not
+    wanted = {"agn.fracAGN", "stellar.m_star", "sfh.sfr10Myrs", "sfh.age_main", "dust.luminosity"}
+    have = {c[6:] for c in table.colnames if c.startswith("bayes.") and not c.endswith("_err")}
+    assert have - set(fluxes) == wanted
+    for name in wanted:
+        assert np.all(u.Quantity(table[f"bayes.{name}_err"]).value >= 0)
+    np.testing.assert_allclose(
+        table["best.reduced_chi_square"], table["best.chi_square"] / 3, atol=1e-12
+    )
+
+
+def test_text_and_fits_say_the_same(run, tmp_path):
+    setup = quiet(run[0])
+    results = fit_cigale(setup)
+    for name in ("results.fits", "results.txt"):
+        setup.write_results(results, tmp_path / name)
+        with pytest.raises(OSError, match="overwrite"):
+            setup.write_results(results, tmp_path / name)
+    one, two = (read_cigale_results(tmp_path / f"results.{x}") for x in ("fits", "txt"))
+    assert one.colnames == two.colnames
+    for name in one.colnames:
+        if name != "id":
+            assert u.Quantity(one[name]).unit == u.Quantity(two[name]).unit, name
+            np.testing.assert_allclose(
+                u.Quantity(one[name]).value, u.Quantity(two[name]).value, rtol=1e-12
+            )
+    (tmp_path / "x.txt").write_text("id b\n1 2\n")
+    with pytest.raises(DataError, match=r"no column best.chi_square"):
+        read_cigale_results(tmp_path / "x.txt")
+
+
+def test_known_and_unknown_redshifts(run, tmp_path):
+    path, fluxes, _ = run
+    path = write(
+        tmp_path,
+        ("redshift =\n", "redshift = 0.5, 0.9, 1.3\n"),
+        ("redshift_decimals = 1", "redshift_decimals = 2"),
+    )
+    setup = quiet(path)
+    # the first is known, to the nearest node; the second is not; the third is at a wrong one
+    catalog = tmp_path / "galaxies.txt"
+    write_catalog(catalog, [0.61, -1, 2.0], fluxes, setup.bands.values())
+    results = fit_cigale(setup)
+    np.testing.assert_allclose(results.best["redshift"], [0.5, 1.3, 1.3])
+    np.testing.assert_allclose(results.chi2[:2], 0.0, atol=1e-6)
+    assert results.chi2[2] > 1e-3
+    np.testing.assert_allclose(results.pdf["redshift"][0], [1, 0, 0])
+    assert np.all(results.flags & int(FitFlags.NO_REDSHIFT) == 0)
+
+
+def test_limits_take_part_only_if_asked(run, tmp_path):
+    path = run[0]
+    lines = (tmp_path / "galaxies.txt").read_text().splitlines()
+    words = lines[1].split()
+    # the last band of the first object is a limit
+    words[-1] = f"-{words[-1]}"
+    (tmp_path / "galaxies.txt").write_text("\n".join([lines[0], " ".join(words), *lines[2:]]))
+    with_limits = quiet(path).catalog()
+    assert with_limits["mips.24_limit"].tolist() == [True, False, False]
+    without = quiet(write(tmp_path, ("lim_flag = noscaling", "lim_flag = none")))
+    assert "mips.24_limit" not in without.catalog().colnames
+    assert fit_cigale(without).n_bands.tolist() == [3, 4, 4]
+
+
+def test_the_example_of_cigale():
+    folder = os.environ.get("MIRICIGALE_DATA")
+    path = Path(folder or "") / "cigale/sdss_qso/pcigale.ini"
+    if not folder or not path.exists():
+        pytest.skip("needs cigale/sdss_qso/pcigale.ini in $MIRICIGALE_DATA")
+    with pytest.warns(MiricigaleWarning) as record:
+        setup = read(path, libraries="bundled")
+    assert len(record) == 1
+    text = str(record[0].message)
+    for name in ("band xray_boxcar_2to12keV", "xray.alpha_ox", "dale2014 by", "skirtor2016 by"):
+        assert name in text
+    np.testing.assert_allclose(setup.parameters["age"], [0.1, 3.0, 5.0])
+    np.testing.assert_allclose(setup.parameters["ebv_polar"], [0, 0.05, 0.1, 0.15, 0.2, 0.3])
+    catalog = setup.catalog()
+    assert len(catalog) == 1986
+    # the first row of the file: 1.673e-02 mJy
+    np.testing.assert_allclose(catalog["sedpy.sdss_u0"][0].value, 16.73)
+    results = setup.fit(catalog[:300])
+    assert np.all(results.fitted)
+    # quasars: red ones are behind dust, and the models describe the most of them
+    assert np.median(results.reduced_chi2) < 2
+    colour = np.log10(catalog["sedpy.sdss_i0"] / catalog["sedpy.sdss_g0"])[:300].value
+    dust = results.mean("ebv_polar").value
+    assert np.corrcoef(colour, dust)[0, 1] > 0.7

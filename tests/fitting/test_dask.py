@@ -1,0 +1,111 @@
+"""Workers in other processes: the same numbers, and the grid travels once."""
+
+import operator
+import pickle
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from dataclasses import fields
+from functools import partial
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+
+from miricigale.fitting import BayesFitter, FitResults, fit_file
+from miricigale.utils.parallel import parallel_map
+
+
+def assert_same(results, whole):
+    """Two results are one, bit for bit."""
+    for item in fields(FitResults):
+        a, b = getattr(results, item.name), getattr(whole, item.name)
+        if isinstance(b, np.ndarray):
+            np.testing.assert_array_equal(a, b, err_msg=item.name, strict=True)
+        elif item.name in ("pdf", "best"):
+            for name, array in b.items():
+                np.testing.assert_array_equal(a[name], array, err_msg=name, strict=True)
+
+
+class Weighing(ProcessPoolExecutor):
+    """Processes, and what the tasks that were sent to them weigh."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.n_bytes = []
+
+    def submit(self, function, *args):
+        self.n_bytes.append(len(pickle.dumps((function, args))))
+        return super().submit(function, *args)
+
+
+@pytest.fixture
+def grid(make_grid):
+    # half a megabyte, as pickled
+    return make_grid(n_z=20, n_tau=12, n_age=12, n_b=20)
+
+
+@pytest.fixture
+def photometry(grid, draw_photometry):
+    return draw_photometry(grid, 90, missing=0.1)[0]
+
+
+@pytest.mark.parametrize("processes", [True, False])
+def test_two_dask_workers_give_the_numbers_of_one_process(grid, photometry, tmp_path, processes):
+    distributed = pytest.importorskip("distributed")
+    fitter = BayesFitter(grid)
+    whole = fitter.fit(photometry)
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=processes, dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        assert len(client.scheduler_info()["workers"]) == 2
+        executor = client.get_executor()
+        assert_same(fitter.fit(photometry, executor=executor, chunk_size=8), whole)
+        # both workers had their part
+        n_done = client.run(lambda dask_worker: dask_worker.state.executed_count)
+        assert len(n_done) == 2
+        assert min(n_done.values()) > 0
+        photometry.write(tmp_path / "catalogue.fits")
+        results = fit_file(
+            fitter, tmp_path / "catalogue.fits", tmp_path / "out", chunk_rows=50, executor=executor
+        )
+        table = results.to_table()
+    for name, column in whole.to_table().items():
+        np.testing.assert_array_equal(np.asarray(table[name]), np.asarray(column), err_msg=name)
+
+
+def test_processes_get_the_grid_once(grid, photometry):
+    fitter = BayesFitter(grid)
+    whole = fitter.fit(photometry)
+    engine = len(pickle.dumps(fitter._engine))
+    assert engine > 400_000
+    with Weighing(2, mp_context=get_context("spawn")) as executor:
+        assert_same(fitter.fit(photometry, executor=executor, chunk_size=8), whole)
+    assert len(executor.n_bytes) == 12
+    # 8 objects, 20 bands and redshifts
+    assert max(executor.n_bytes) < 5000
+
+
+class Plain(Executor):
+    """An executor of nobody's making."""
+
+    def submit(self, function, *args):
+        future = Future()
+        future.set_result(pickle.loads(pickle.dumps(function))(*args))
+        return future
+
+
+def test_any_executor_will_do(grid, photometry):
+    fitter = BayesFitter(grid)
+    assert_same(fitter.fit(photometry, executor=Plain()), fitter.fit(photometry))
+
+
+def test_a_fault_in_a_worker_is_told_and_leaves_no_file(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    heavy = partial(operator.getitem, list(range(100_000)))
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor:
+        with pytest.raises(IndexError, match="out of range"):
+            parallel_map(heavy, [1, 2, 100_000, 4], executor=executor)
+        assert parallel_map(heavy, [4, 5], executor=executor) == [4, 5]
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,163 @@
+"""Mock catalogues refitted, and bands left out."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from miricigale.fitting import BayesFitter, leave_out, mock_analysis
+from miricigale.plotting.axes import new_figure
+
+
+@pytest.fixture(scope="module")
+def catalogue(grid, draw_photometry):
+    return draw_photometry(grid, 400, seed=8, noise=0.15, missing=0.1)[0]
+
+
+@pytest.fixture(scope="module")
+def fitter(grid):
+    return BayesFitter(grid, model_error=0.0)
+
+
+@pytest.fixture(scope="module")
+def results(fitter, catalogue):
+    return fitter.fit(catalogue)
+
+
+@pytest.fixture(scope="module")
+def mock(fitter, results, catalogue):
+    return mock_analysis(fitter, results, catalogue, seed=5)
+
+
+def test_the_mock_is_the_best_model_with_the_errors_of_the_object(mock, results, catalogue):
+    pulls = []
+    for i, name in enumerate(results.filters):
+        flux = mock.photometry[name].to_value(u.uJy)
+        measured = np.isfinite(catalogue[name].value)
+        np.testing.assert_array_equal(np.isfinite(flux), measured)
+        error = catalogue[f"{name}_err"].to_value(u.uJy)
+        np.testing.assert_array_equal(mock.photometry[f"{name}_err"].to_value(u.uJy), error)
+        pulls.append(((flux - results.best_flux[:, i]) / error)[measured])
+    pull = np.concatenate(pulls)
+    n = pull.size
+    assert abs(pull.mean()) < 4 / np.sqrt(n)
+    assert abs(pull.std() - 1) < 4 / np.sqrt(2 * n)
+
+
+def test_recovery_is_calibrated(mock):
+    """
+    Best models have the noise of the catalogue in them and are not drawn from the prior.
+
+    The intervals need not hold 68 % of them, but not far from it.
+    """
+    table = mock.metrics()
+    assert list(table["parameter"]) == list(mock.parameters)
+    row = {name: table[table["parameter"] == name][0] for name in mock.parameters}
+    for name in ("redshift", "frac_agn", "mass", "ir_luminosity"):
+        assert abs(row[name]["coverage"] - 0.68) < 0.1, name
+        assert abs(row[name]["offset"]) < max(row[name]["scatter"], 0.03), name
+        assert row[name]["n"] == 400
+    assert row["mass"]["unit"] == "dex"
+    assert row["age"]["unit"] == "Gyr"
+    # a torus that is not there has no true parameters
+    with_agn = np.count_nonzero(mock.truth.best["frac_agn"] > 0)
+    assert row["tau97"]["n"] == with_agn < 400
+
+
+def test_without_noise_the_truth_comes_back(grid, draw_photometry):
+    table, truth = draw_photometry(grid, 30, seed=2, noise=1e-4)
+    fitter = BayesFitter(grid, model_error=0.0)
+    results = fitter.fit(table)
+    mock = mock_analysis(fitter, results, table, seed=1)
+    out = mock.to_table()
+    np.testing.assert_allclose(out["redshift_mean"], out["redshift_true"])
+    np.testing.assert_allclose(out["mass_mean"], out["mass_true"], rtol=0.01)
+    # where there is no dust the AGN fraction is of nothing, and any mass is right
+    lit = np.array([grid.dust_luminosity[t[1]] > 0 for t in truth])
+    np.testing.assert_allclose(
+        out["mass_true"].value[lit], np.array([t[4] for t in truth])[lit], rtol=0.01
+    )
+    assert np.all(np.abs(mock.metrics(["mass"])["offset"]) < 0.01)
+
+
+def test_a_cut_changes_nothing(fitter, results, catalogue, mock):
+    some = [7, 300, 12]
+    part = mock_analysis(fitter, fitter.fit(catalogue[some]), catalogue[some], seed=5)
+    for name in results.filters:
+        np.testing.assert_array_equal(part.photometry[name], mock.photometry[name][some])
+    other = mock_analysis(fitter, results, catalogue, seed=6)
+    assert np.any(other.photometry["band0"] != mock.photometry["band0"])
+
+
+def test_objects_without_fit_and_upper_limits_stay(fitter, catalogue):
+    table = catalogue[:4].copy()
+    for name in fitter.grid.filters:
+        table[name][1] = np.nan
+    table["band2_limit"] = [True, False, False, False]
+    table["band2"][0] = 5 * u.uJy
+    results = fitter.fit(table)
+    mock = mock_analysis(fitter, results, table, seed=0, model_error=True)
+    assert mock.recovered.flags[1] == results.flags[1] == 1
+    assert mock.photometry["band2"][0] == 5 * u.uJy
+    assert mock.photometry["band2"][2] != table["band2"][2]
+    assert mock.metrics(["redshift"])["n"][0] == 3
+
+
+def test_known_redshifts_have_to_be_given_again(fitter, catalogue):
+    table = catalogue[:5]
+    results = fitter.fit(table, redshift="redshift")
+    with pytest.raises(ValueError, match="'redshift' must be given again"):
+        mock_analysis(fitter, results, table, seed=0)
+    mock = mock_analysis(fitter, results, table, seed=0, redshift="redshift")
+    np.testing.assert_array_equal(mock.recovered.best["redshift"], results.best["redshift"])
+    with pytest.raises(ValueError, match="'photometry' must be of the objects"):
+        mock_analysis(fitter, results, table[::-1], seed=0, redshift="redshift")
+
+
+def test_bands_left_out(fitter, catalogue, results):
+    out = leave_out(fitter, catalogue, ["band1", "band4"])
+    assert out.results["band1"] is out.results["band4"]
+    n_used = np.isfinite(results.sigma[:, [0, 2, 3, 5]]).sum(axis=1)
+    np.testing.assert_array_equal(out.results["band1"].n_bands, n_used)
+    good = n_used >= 2
+    want = (out.flux - out.predicted) / np.sqrt(out.flux_err**2 + out.predicted_std**2)
+    np.testing.assert_allclose(out.pull[good], want[good], rtol=1e-12)
+    table = out.to_table()
+    np.testing.assert_array_equal(table["band4"], catalogue["band4"].to(u.uJy))
+    assert table["band4_predicted"].unit == u.uJy
+    assert all(table[name].info.description for name in table.colnames)
+    metrics = out.metrics()
+    # models and errors are right here: pulls are centred and about a third beyond 1
+    assert np.all(np.abs(metrics["pull"]) < 0.3)
+    assert np.all(np.abs(metrics["within"] - 0.68) < 0.12)
+    each = leave_out(fitter, catalogue[:20], ["band1", "band4"], separately=True)
+    assert each.results["band1"] is not each.results["band4"]
+    assert np.all(each.results["band1"].n_bands >= out.results["band1"].n_bands[:20])
+
+
+def test_a_wrong_zero_point_is_found(fitter, catalogue):
+    table = catalogue.copy()
+    table["band3"] = table["band3"] * 3.0
+    out = leave_out(fitter, table, ["band3"])
+    assert out.metrics()["offset"][0] == pytest.approx(2.0, abs=0.5)
+
+
+def test_bands_that_are_not_there(fitter, catalogue):
+    with pytest.raises(KeyError, match="no filter of the grid 'band9'"):
+        leave_out(fitter, catalogue, ["band9"])
+    with pytest.raises(ValueError, match="'bands' must be a list"):
+        leave_out(fitter, catalogue, "band1")
+    with pytest.raises(ValueError, match=r"'photometry' must be a table with the columns \['band1"):
+        leave_out(fitter, catalogue["id", "band2", "band2_err"], ["band1"])
+
+
+def test_drawing(mock, fitter, catalogue):
+    ax = new_figure()[1][0, 0]
+    assert mock.plot("mass", ax=ax) is ax
+    assert ax.get_xscale() == "log"
+    ax = new_figure()[1][0, 0]
+    assert "Gyr" in mock.plot("age", ax=ax).get_xlabel()
+    out = leave_out(fitter, catalogue[:50], ["band1"])
+    ax = new_figure()[1][0, 0]
+    assert out.plot("band1", ax=ax).get_xlim() == (-5, 5)
+    with pytest.raises(KeyError, match="no band that was left out 'band2'"):
+        out.plot("band2")

@@ -1,0 +1,276 @@
+"""Models drawn from posteriors, with draws made by hand."""
+
+import dataclasses
+from concurrent.futures import ThreadPoolExecutor
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+from scipy.stats import chi2
+
+from miricigale.filters import FilterSet
+from miricigale.fitting import BayesFitter, Samples
+from miricigale.sed import SED, SEDModel
+
+BANDS = ["acs.f606w", "wfc3.f160w", "miri.f770w", "miri.f2100w"]
+AXES = {
+    "redshift": np.array([0.5, 1.0, 1.5]),
+    "age": np.array([1.0, 3.0]),
+    "ebv": np.array([0.1, 0.4]),
+    "frac_agn": np.array([0.0, 0.3, 0.8]),
+    "ebv_polar": np.array([0.0, 0.2]),
+    "temperature_polar": np.array([100.0, 200.0]),
+}
+
+
+def draw_models(grid, n=3, draws=40, seed=0):
+    rng = np.random.default_rng(seed)
+    sizes = (grid.redshift.size, grid.n_galaxies, max(grid.n_agn, 1), grid.frac_agn.size)
+    index = np.stack([rng.integers(size, size=(n, draws)) for size in sizes], axis=-1)
+    scale = 1e10 * rng.lognormal(0.0, 0.3, (n, draws))
+    index[-1], scale[-1] = -1, np.nan
+    return index, scale
+
+
+@pytest.fixture(scope="module")
+def model():
+    return SEDModel.yang2021(libraries="bundled")
+
+
+@pytest.fixture(scope="module")
+def real(model):
+    grid = model.grid(AXES, BANDS, cache=False)
+    index, scale = draw_models(grid)
+    return Samples(grid, ["a", "b", "c"], [0, 0, 1], index, scale, model, {"seed": 3})
+
+
+@pytest.fixture(scope="module")
+def samples(grid):
+    index, scale = draw_models(grid, n=4)
+    return Samples(grid, np.arange(4), np.zeros(4, int), index, scale)
+
+
+def test_values_are_those_of_the_models(samples):
+    grid = samples.grid
+    z, g, k, f = samples.index[1, 7]
+    table = samples.to_table()
+    assert len(table) == 4 * 40
+    row = table[(table["id"] == 1) & (table["draw"] == 7)][0]
+    assert row["redshift"] == grid.redshift[z]
+    assert row["frac_agn"] == grid.frac_agn[f]
+    assert u.isclose(row["age"], grid.galaxy_parameters["age"][g])
+    assert row["mass"] == samples.scale[1, 7] * u.Msun
+    sfr = samples.scale[1, 7] * u.Msun * grid.galaxy_properties["sfr"][g]
+    assert u.isclose(row["sfr"], sfr)
+    power = samples.scale[1, 7] * grid.dust_luminosity[g]
+    power *= grid.frac_agn[f] / (1 - grid.frac_agn[f])
+    accretion = power * grid.agn_properties["accretion_power"][k] * u.W
+    assert u.isclose(row["accretion_power"], accretion)
+    assert all(table[name].info.description for name in table.colnames)
+    assert np.isnan(table["mass"][table["id"] == 3]).all()
+    assert table.colnames[:3] == ["id", "draw", "flags"]
+
+
+def test_moments_and_percentiles_are_those_of_the_draws(samples):
+    mass = samples.scale[0]
+    assert samples.mean("mass")[0].value == pytest.approx(mass.mean())
+    assert samples.std("mass")[0].value == pytest.approx(mass.std())
+    got = samples.percentile("mass", [0.16, 0.5])
+    np.testing.assert_allclose(got[0].value, np.percentile(mass, [16, 50]))
+    assert np.isnan(got[3]).all()
+    edges, weights = samples.pdf("age", 0)
+    age = samples.values("age").value[0]
+    np.testing.assert_allclose(weights, [np.mean(age == x) for x in samples.axes["age"].values])
+    assert edges.unit == u.Gyr
+    a, b, joint = samples.pdf_2d("age", "mass", 0, bins=5)
+    assert joint.shape == (a.size - 1, b.size - 1) == (4, 5)
+    np.testing.assert_allclose(joint.sum(axis=1), weights)
+    edges, weights = samples.pdf("mass", 0, bins=[0.5, 1.0, 2.0] * (1e10 * u.Msun))
+    assert weights[0] == pytest.approx(np.mean((mass >= 0.5e10) & (mass < 1e10)))
+
+
+def test_parameters_without_effect_have_their_prior(real):
+    """Without polar dust its temperature is anything; the draws share it as the prior has it."""
+    n = 4000
+    grid = real.grid
+    no_dust = int(np.flatnonzero(grid.agn_parameters["ebv_polar"].value == 0)[0])
+    index = np.zeros((1, n, 4), int)
+    index[..., 2], index[..., 3] = no_dust, 1
+    axes = BayesFitter(grid, priors={"temperature_polar": [1.0, 3.0]}).priors.axes
+    one = Samples(grid, ["x"], [0], index, np.ones((1, n)), axes=axes)
+    part = np.mean(one.values("temperature_polar").value == 200.0)
+    assert abs(part - 0.75) < 5 * np.sqrt(0.75 * 0.25 / n)
+    # the same in any company
+    two = Samples(grid, ["y", "x"], [0, 0], np.repeat(index, 2, axis=0), np.ones((2, n)), axes=axes)
+    np.testing.assert_array_equal(
+        two["x"].values("temperature_polar"), one.values("temperature_polar")
+    )
+    index[..., 2:] = -1, 0
+    none = Samples(grid, ["x"], [0], index, np.ones((1, n)))
+    assert np.isnan(none.values("temperature_polar")).all()
+    assert none.values("accretion_power").max() == 0
+
+
+def test_fractions_in_both_definitions(real, model):
+    ir, dust = real.values("frac_agn_ir").value, real.values("frac_agn_dust").value
+    for i, j in ((0, 3), (1, 11)):
+        z, g, k, f = real.index[i, j]
+        grid = real.grid
+        values = {"redshift": grid.redshift[z], "frac_agn": grid.frac_agn[f]}
+        for table, row in ((grid.galaxy_parameters, g), (grid.agn_parameters, k)):
+            values |= {name: table[name][row] for name in table.colnames}
+        derived = model.derived(**values)
+        assert ir[i, j] == pytest.approx(derived["frac_agn_ir"].value, rel=1e-9)
+        assert dust[i, j] == pytest.approx(derived["frac_agn_dust"].value, rel=1e-9)
+        assert real.values("a_v")[i, j].value == pytest.approx(derived["a_v"].value, rel=1e-9)
+
+
+def test_fluxes_in_bands_of_the_grid_and_others(real, model):
+    got = real.fluxes(BANDS[1:3]).value
+    z, g, k, f = real.index[0, 5]
+    want = real.scale[0, 5] * real.grid.flux(z, g, k, f)[1:3]
+    np.testing.assert_allclose(got[0, 5], want, rtol=1e-12)
+    # a grid made with the band has the same fluxes
+    other = model.grid(AXES, ["miri.f1500w"], cache=False)
+    want = Samples(other, real.ids, real.flags, real.index, real.scale).fluxes()
+    table = real.predict(["miri.f1500w", "wfc3.f160w"])
+    np.testing.assert_allclose(real.fluxes(["miri.f1500w"]), want, rtol=1e-9)
+    mean = want[:, :, 0].mean(axis=1)
+    np.testing.assert_allclose(table["miri.f1500w"], mean, rtol=1e-9)
+    np.testing.assert_allclose(table["miri.f1500w_err"], want[:, :, 0].std(axis=1), rtol=1e-9)
+    p84 = np.percentile(want.value, 84, axis=1)[:, 0]
+    np.testing.assert_allclose(table["miri.f1500w_p84"].value, p84, rtol=1e-9)
+    assert np.isnan(table["wfc3.f160w"][2])
+    # filters that no library knows come in a set
+    curve = FilterSet.from_names(["miri.f1500w"])[0]
+    mine = FilterSet([dataclasses.replace(curve, name="mine")])
+    np.testing.assert_allclose(real.fluxes(mine), want, rtol=1e-9)
+
+
+def test_spectra_against_single_models(real, model):
+    i, j = 1, 4
+    z, g, k, f = real.index[i, j]
+    grid = real.grid
+    values = {"redshift": grid.redshift[z], "frac_agn": grid.frac_agn[f]}
+    for table, row in ((grid.galaxy_parameters, g), (grid.agn_parameters, k)):
+        values |= {name: table[name][row] for name in table.colnames}
+    sed = model.evaluate(**values, mass=real.scale[i, j])
+    wave, observed = real.spectra("b", rest=False)
+    inside = (wave > 0.2 * u.um) & (wave < 500 * u.um)
+    want = sed.fnu_at(wave[inside]).value
+    np.testing.assert_allclose(observed[j, inside].value, want, rtol=1e-9)
+    # in the rest frame the flux at 10 pc is L_nu / (4 pi d^2)
+    wave, rest = real.spectra("b")
+    near = sed.redshifted(0.0, cosmology=model.cosmology)
+    red = wave > 0.13 * u.um  # where nothing is absorbed on the way
+    area = 4 * np.pi * (10 * u.pc) ** 2
+    got = (rest[j, red] / area).to_value(u.uJy)
+    np.testing.assert_allclose(got, near.fnu_at(wave[red]).value, rtol=1e-6)
+
+
+def test_band_of_the_spectrum(real):
+    table = real.sed_band("a", (0.16, 0.5, 0.84))
+    _, spectra = real.spectra("a")
+    assert table["p50"].unit == u.W / u.Hz
+    np.testing.assert_allclose(table["p50"].value, np.median(spectra.value, axis=0))
+    assert np.all(table["p16"] <= table["p84"])
+    # equal draws have a band of no width, and it is the spectrum
+    index = np.tile(real.index[:1, :1], (1, 10, 1))
+    same = Samples(real.grid, ["s"], [0], index, np.full((1, 10), 1e10), real.model)
+    band = same.sed_band("s", rest=False)
+    np.testing.assert_allclose(band["p16"].value, band["p84"].value, rtol=1e-12)
+    flux = SED(band["wave"], band["p50"], redshift=0.0)
+    want = 1e10 * real.grid.flux(*index[0, 0])
+    got = FilterSet.from_names(BANDS).synthetic_fluxes(flux).to_value(u.uJy)
+    np.testing.assert_allclose(got, want, rtol=1e-3)
+
+
+def test_drawing(real):
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from miricigale.plotting.axes import new_figure
+
+    for rest, label in ((True, "rest wavelength (um)"), (False, "observed wavelength (um)")):
+        ax = new_figure()[1][0, 0]
+        assert real.plot_sed_band("a", ax=ax, rest=rest) is ax
+        assert ax.get_xlabel() == label
+        assert ax.get_yscale() == "log"
+    ax = new_figure()[1][0, 0]
+    assert real.plot_pdf2d("a", "mass", "a_v", ax=ax).get_ylabel() == "a_v (mag)"
+
+
+def test_what_is_refused(real, model, samples):
+    args = (real.grid, real.ids, real.flags)
+    with pytest.raises(ValueError, match="'index' must be of shape"):
+        Samples(*args, real.index[:, :5], real.scale)
+    with pytest.raises(ValueError, match="'index' must be within the grid's"):
+        Samples(*args, real.index + 10, real.scale)
+    with pytest.raises(KeyError, match="no object with the id 'd' among 3"):
+        real["d"]
+    with pytest.raises(KeyError, match="no parameter 'mood'"):
+        real.values("mood")
+    with pytest.raises(ValueError, match="'model' must be an SEDModel"):
+        Samples(*args, real.index, real.scale).predict(["miri.f1500w"])
+    with pytest.raises(ValueError, match="'model' must be the one of the grid \\(components"):
+        real.with_model(SEDModel.yang2021(agn=False)).sed_band("a")
+    with pytest.raises(ValueError, match=r"'key' must be .* got 'c' \(no_band\)"):
+        real.sed_band("c")
+    with pytest.raises(ValueError, match="'filters' must be a list"):
+        real.predict("miri.f770w")
+    with pytest.raises(ValueError, match="'levels' must be between 0 and 1"):
+        real.sed_band("a", (16, 84))
+    with pytest.raises(ValueError, match="read-only"):
+        samples.scale[0, 0] = 1
+    assert isinstance(samples.to_table(["mass"]), QTable)
+
+
+def test_draws_of_the_fitter_have_its_posterior(grid, photometry):
+    fitter = BayesFitter(grid)
+    results = fitter.fit(photometry)
+    n = 2000
+    samples = fitter.sample(photometry, n, seed=4)
+    assert isinstance(samples, Samples)
+    np.testing.assert_array_equal(samples.ids, results.ids)
+    for name in ("redshift", "frac_agn", "tau", "tau97", "mass", "sfr", "ir_luminosity"):
+        error = results.std(name).value / np.sqrt(n)
+        apart = np.abs(samples.mean(name).value - results.mean(name).value)
+        np.testing.assert_array_less(apart, 5 * error + 1e-9 * results.mean(name).value)
+
+
+def test_draws_are_those_of_the_object_whatever_its_company(grid, photometry):
+    fitter = BayesFitter(grid)
+    whole = fitter.sample(photometry, 50, seed=4)
+    turned = fitter.sample(photometry[::-1], 50, seed=4)
+    np.testing.assert_array_equal(whole.index, turned.index[::-1])
+    np.testing.assert_array_equal(whole.scale, turned.scale[::-1])
+    with ThreadPoolExecutor(2) as pool:
+        spread = fitter.sample(photometry, 50, seed=4, executor=pool)
+    np.testing.assert_array_equal(whole.scale, spread.scale)
+    other = fitter.sample(photometry, 50, seed=5)
+    assert np.any(whole.index != other.index)
+    for bad in (0, 1.5, True):
+        with pytest.raises(ValueError, match="'n_draws' must be an integer >= 1"):
+            fitter.sample(photometry, bad, seed=1)
+
+
+def test_draws_have_the_joint_posterior_of_all_models(make_grid, draw_photometry, brute_force):
+    """Frequencies of (galaxy, torus, fraction) against the weights of all models, by chi2."""
+    grid = make_grid(3)
+    table, _ = draw_photometry(grid, 3, seed=5)
+    fitter = BayesFitter(grid, rtol=0)
+    results = fitter.fit(table)
+    n = 20_000
+    samples = fitter.sample(table, n, seed=9)
+    for i in range(3):
+        want = brute_force(fitter, results.flux[i], results.sigma[i])["weights"]
+        got = np.zeros(want.shape)
+        np.add.at(got, tuple(samples.index[i].T), 1)
+        # one cell for all that is rare
+        common = n * want > 10
+        expected = np.append(n * want[common], n * want[~common].sum())
+        seen = np.append(got[common], got[~common].sum())
+        keep = expected > 0
+        statistic = np.sum((seen - expected)[keep] ** 2 / expected[keep])
+        assert chi2.sf(statistic, keep.sum() - 1) > 1e-4

@@ -1,0 +1,152 @@
+"""Quantities that do not scale with mass: from the weights of the galaxy models."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from miricigale.fitting import BayesFitter, FitResults
+from miricigale.fitting.posterior import cell_percentiles
+from miricigale.fitting.quantities import DERIVED_LEVELS, ShapeQuantities
+
+
+def with_shape(grid):
+    """Ages, a colour that some galaxies lack, and the tau of each model as an attenuation."""
+    rng = np.random.default_rng(5)
+    tau = grid.galaxy_parameters["tau"].value
+    colour = rng.normal(0, 1, tau.size)
+    colour[::4] = -np.inf
+    table = QTable(
+        {
+            "a_v": tau * u.mag,
+            "u_v": colour * u.mag,
+            "beta": np.full(tau.size, -2.0) * u.dimensionless_unscaled,
+            "age_mass": grid.galaxy_parameters["age"] * 0.7,
+        }
+    )
+    table["a_v"].info.description = "attenuation"
+    return dataclasses.replace(grid, galaxy_shape=table)
+
+
+@pytest.fixture(scope="module")
+def fitter(grid):
+    return BayesFitter(with_shape(grid), rtol=0)
+
+
+@pytest.fixture(scope="module")
+def results(fitter, photometry):
+    return fitter.fit(photometry)
+
+
+def test_mean_and_scatter_against_every_model(fitter, results, brute_force):
+    table = fitter.grid.galaxy_shape
+    for row in range(3):
+        want = brute_force(fitter, results.flux[row], results.sigma[row])["galaxy"]
+        for name in table.colnames:
+            value = table[name].value
+            w = np.where(np.isfinite(value), want, 0.0) / want[np.isfinite(value)].sum()
+            value = np.where(np.isfinite(value), value, 0.0)
+            mean = w @ value
+            assert results.mean(name)[row].value == pytest.approx(mean, rel=1e-9)
+            std = np.sqrt(w @ (value - mean) ** 2)
+            assert results.std(name)[row].value == pytest.approx(std, rel=1e-6, abs=1e-9)
+        _z, g, _k, _f = results.best_index[row]
+        assert results[row].best["a_v"] == table["a_v"][g]
+
+
+def test_a_quantity_that_equals_a_parameter_has_its_posterior(results):
+    """A_V is tau here: the two differ in the distance of the kept levels only."""
+    for part in ("mean", "std"):
+        got, want = getattr(results, part)("a_v").value, getattr(results, part)("tau").value
+        np.testing.assert_allclose(got, want, rtol=1e-9)
+    levels = [0.16, 0.5, 0.84]
+    got = results.percentile("a_v", levels).value
+    np.testing.assert_allclose(got, results.percentile("tau", levels).value, rtol=1e-9)
+
+
+def test_a_single_value_has_no_scatter(results):
+    np.testing.assert_allclose(results.mean("beta").value, -2.0, rtol=1e-12)
+    np.testing.assert_array_equal(results.percentile("beta", 0.3).value, -2.0)
+    np.testing.assert_allclose(results.std("beta").value, 0.0, atol=1e-12)
+
+
+def test_uniform_weights_give_straight_quantiles():
+    """Equal cells of equal weight: the quantiles are linear, whatever the order of the models."""
+    order = np.random.default_rng(0).permutation(20)
+    values = (np.arange(20) + 0.5)[order]
+    # each value twice, to the last digit or nearly
+    shape = ShapeQuantities(("v",), (u.mag,), ("",), np.concatenate([values, values + 1e-12])[None])
+    weights = np.full((300, 40), 1 / 40)
+    weights[7] = np.nan
+    moments, quantiles = shape.summarise(weights, DERIVED_LEVELS)
+    np.testing.assert_allclose(quantiles[0, 0], 20 * DERIVED_LEVELS, atol=1e-9)
+    np.testing.assert_allclose(quantiles[299, 0], quantiles[0, 0], rtol=1e-12)
+    assert moments[0, 0, 0] == pytest.approx(10)
+    assert moments[0, 0, 1] == pytest.approx(np.sqrt((20**2 - 1) / 12))
+    assert np.isnan(moments[7]).all()
+    assert np.isnan(quantiles[7]).all()
+
+
+def test_the_place_in_a_catalogue_makes_no_difference():
+    """Rows are worked out together; each has the digits that it has alone, ties included."""
+    rng = np.random.default_rng(1)
+    weights = np.round(rng.dirichlet(np.full(30, 0.1), 300), 2)
+    weights[::3] = 1 / 30
+    levels = np.append(np.arange(1, 30) / 30, DERIVED_LEVELS)
+    whole = cell_percentiles(np.arange(30.0), weights, levels)
+    for row in (0, 17, 255, 256, 298):
+        alone = cell_percentiles(np.arange(30.0), weights[row : row + 1], levels)
+        np.testing.assert_array_equal(whole[row], alone[0])
+
+
+def test_objects_without_a_value():
+    """All weight on models without a colour: no value, and no warning."""
+    shape = ShapeQuantities(("c", "d"), (u.mag,) * 2, ("",) * 2, np.array([[np.nan, 1.0]] * 2))
+    moments, quantiles = shape.summarise(np.array([[1.0, 0.0], [0.5, 0.5]]), np.array([0.5]))
+    assert np.isnan(moments[0]).all()
+    np.testing.assert_array_equal(moments[1, :, 0], 1.0)
+    np.testing.assert_array_equal(quantiles[:, 0, 0], [np.nan, 1.0])
+
+
+def test_tables_files_and_views(results, tmp_path):
+    table = results.to_table()
+    assert table["a_v_p50"].unit == u.mag
+    assert table["a_v_mean"].info.description == "posterior mean of attenuation"
+    assert "a_v_logmean" not in table.colnames
+    assert "mass_logmean" in table.colnames
+    edges, weights = results[0].pdf("u_v")
+    assert np.all(np.diff(edges.value) >= 0)
+    assert weights.sum() == pytest.approx(0.998)
+    for name in ("u_v", "mass", "redshift"):
+        values, levels = results[0].cdf(name)
+        middle = np.interp(0.5, levels, values.value)
+        assert results[0].percentile(name, 0.5)[0].value == pytest.approx(middle, rel=1e-9)
+    results.write(tmp_path / "r.fits")
+    again = FitResults.read(tmp_path / "r.fits")
+    assert again.intensive == ("a_v", "u_v", "beta", "age_mass")
+    for field in dataclasses.fields(results):
+        one, two = getattr(results, field.name), getattr(again, field.name)
+        if isinstance(one, np.ndarray):
+            assert one.dtype == two.dtype
+            np.testing.assert_array_equal(one, two)
+        elif field.name in ("pdf", "best"):
+            assert one.keys() == two.keys()
+            for name in one:
+                np.testing.assert_array_equal(one[name], two[name])
+        elif field.name == "axes":
+            assert one.keys() == two.keys()
+            for name in one:
+                np.testing.assert_array_equal(one[name].values, two[name].values)
+        elif field.name not in ("meta", "model"):
+            assert one == two, field.name
+
+
+def test_pieces_and_an_empty_catalogue(fitter, photometry, results):
+    pieces = fitter.fit(photometry, chunk_size=5)
+    np.testing.assert_array_equal(pieces.moments, results.moments)
+    np.testing.assert_array_equal(pieces.quantiles, results.quantiles)
+    empty = fitter.fit(photometry[:0])
+    assert len(empty.to_table()) == 0
+    assert "a_v_mean" in empty.to_table().colnames

@@ -1,0 +1,320 @@
+"""Fits from file to file: the numbers of one call, in pieces that a later call goes on from."""
+
+import csv
+import gzip
+from dataclasses import fields, replace
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import QTable
+
+from miricigale.fitting import BayesFitter, FitFlags, FitResults, fit_file, open_results
+from miricigale.utils.exceptions import DataError
+
+
+def assert_same(results, whole):
+    """Parts joined are the whole, bit for bit."""
+    parts = list(results.parts())
+    assert sum(map(len, parts)) == len(whole)
+    for item in fields(FitResults):
+        value = getattr(whole, item.name)
+        if isinstance(value, np.ndarray):
+            joined = np.concatenate([getattr(part, item.name) for part in parts])
+            np.testing.assert_array_equal(joined, value, err_msg=item.name, strict=True)
+        elif item.name in ("pdf", "best"):
+            for name, array in value.items():
+                joined = np.concatenate([getattr(part, item.name)[name] for part in parts])
+                np.testing.assert_array_equal(joined, array, err_msg=name, strict=True)
+
+
+class Stopped(Exception):
+    pass
+
+
+def count_fits(monkeypatch, *, stop=None):
+    """Count the calls of fit, and stop one of them."""
+    calls = []
+    fit = BayesFitter.fit
+
+    def counted(self, table, **options):
+        calls.append(len(table))
+        if len(calls) == stop:
+            raise Stopped
+        return fit(self, table, **options)
+
+    monkeypatch.setattr(BayesFitter, "fit", counted)
+    return calls
+
+
+@pytest.fixture
+def grid(grid):
+    n = grid.n_galaxies
+    shape = QTable({"a_v": np.repeat(np.linspace(0, 2, n // 4), 4) * u.mag, "beta": np.arange(n)})
+    return replace(grid, galaxy_shape=shape)
+
+
+@pytest.fixture
+def fitter(grid):
+    return BayesFitter(grid, max_reduced_chi2=30.0)
+
+
+@pytest.fixture
+def catalogue(grid, draw_photometry):
+    """Photometry with gaps, useless rows and ids that occur again, near and far."""
+    table = draw_photometry(grid, 150, missing=0.15)[0]
+    ids = [f"{'n' * (1 + i % 5)}{i}" for i in range(150)]
+    ids[5] = ids[140] = ids[3]
+    ids[120] = ids[70]
+    table["id"] = ids
+    table["band2"][9] = np.inf * u.uJy
+    for name in grid.filters:
+        table[name][11] = np.nan
+        table[name][12] = -table[name][12]
+    return table
+
+
+@pytest.mark.parametrize("chunk_rows", [1, 7, 64, 100, 1000])
+def test_the_pieces_are_one_fit_bit_for_bit(fitter, catalogue, tmp_path, chunk_rows):
+    catalogue = catalogue[: 25 * chunk_rows]
+    catalogue.write(tmp_path / "catalogue.fits")
+    whole = fitter.fit(catalogue)
+    results = fit_file(fitter, tmp_path / "catalogue.fits", tmp_path / "out", chunk_rows=chunk_rows)
+    assert len(results.paths) == -(-len(catalogue) // chunk_rows)
+    assert_same(results, whole)
+    twice = (whole.flags & FitFlags.DUPLICATE_ID) > 0
+    assert np.flatnonzero(twice).tolist() == [i for i in (5, 120, 140) if i < len(catalogue)]
+
+
+@pytest.mark.parametrize("how", ["column", "values", "prior", "priors", "prior column"])
+def test_redshifts_go_with_their_rows(fitter, catalogue, tmp_path, how):
+    rng = np.random.default_rng(3)
+    nodes = np.linspace(0.0, 3.0, 7)
+    density = rng.uniform(0.1, 1.0, (len(catalogue), 7))
+    options, options_file = {}, None
+    if how == "column":
+        options = {"redshift": "redshift"}
+    elif how == "values":
+        options = {"redshift": np.array(catalogue["redshift"])}
+    elif how == "prior":
+        options = {"redshift_prior": (nodes, density[0])}
+    else:
+        options = {"redshift_prior": (nodes, density)}
+        if how == "prior column":
+            catalogue["p_z"] = density
+            options_file = {"redshift_prior": (nodes, "p_z")}
+    catalogue.write(tmp_path / "catalogue.fits")
+    whole = fitter.fit(catalogue, **options)
+    results = fit_file(
+        fitter,
+        tmp_path / "catalogue.fits",
+        tmp_path / "out",
+        chunk_rows=40,
+        **(options_file or options),
+    )
+    assert_same(results, whole)
+
+
+def test_text_tables_are_read_by_rows(fitter, catalogue, tmp_path):
+    catalogue["note"] = [f'a "note"\nof {i} lines' for i in range(len(catalogue))]
+    whole = fitter.fit(catalogue)
+    for delimiter in (" ", ","):
+        catalogue.write(tmp_path / "catalogue.ecsv", delimiter=delimiter, overwrite=True)
+        results = fit_file(
+            fitter, tmp_path / "catalogue.ecsv", tmp_path / "out", chunk_rows=40, resume=False
+        )
+        assert_same(results, whole)
+
+
+def test_csv_has_the_unit_that_it_is_told(fitter, catalogue, tmp_path):
+    whole = fitter.fit(catalogue)
+    path = tmp_path / "catalogue.csv"
+    with open(path, "w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(catalogue.colnames)
+        for row in catalogue:
+            flux = [repr(float(row[c].to_value(u.nJy))) for c in catalogue.colnames[1:-1]]
+            writer.writerow([row["id"], *flux, row["redshift"]])
+    results = fit_file(fitter, path, tmp_path / "out", chunk_rows=40, flux_unit=u.nJy)
+    assert len(list(results.parts())) == 4
+    table, wanted = results.to_table(), whole.to_table()
+    np.testing.assert_array_equal(table["flags"], wanted["flags"])
+    for name in ("redshift_mean", "mass_mean"):
+        np.testing.assert_allclose(table[name].value, wanted[name].value, rtol=1e-9)
+    with pytest.raises(u.UnitsError, match="must be convertible to uJy"):
+        fit_file(fitter, path, tmp_path / "no unit", chunk_rows=40)
+    with pytest.raises(u.UnitsError, match="'flux_unit' must be convertible to uJy, got mag"):
+        fit_file(fitter, path, tmp_path / "no unit", flux_unit="mag")
+
+
+def test_a_stopped_fit_goes_on(fitter, catalogue, tmp_path, monkeypatch):
+    catalogue.write(tmp_path / "catalogue.fits")
+    arguments = (fitter, tmp_path / "catalogue.fits", tmp_path / "out")
+    whole = fitter.fit(catalogue)
+    with monkeypatch.context() as patch:
+        calls = count_fits(patch, stop=3)
+        with pytest.raises(Stopped):
+            fit_file(*arguments, chunk_rows=40)
+        with pytest.raises(DataError, match=r"holds 2 of 4 parts: fit_file .* goes on"):
+            open_results(tmp_path / "out")
+        there = open_results(tmp_path / "out", partial=True)
+        assert (len(there), there.complete) == (80, False)
+        assert len(there.to_table()) == 80
+    with monkeypatch.context() as patch:
+        calls = count_fits(patch)
+        results = fit_file(*arguments, chunk_rows=40)
+        assert len(calls) == 2
+        assert_same(results, whole)
+        # nothing is left to do
+        fit_file(*arguments, chunk_rows=40)
+        assert len(calls) == 2
+
+
+def test_a_damaged_part_is_made_again(fitter, catalogue, tmp_path, monkeypatch):
+    catalogue.write(tmp_path / "catalogue.fits")
+    arguments = (fitter, tmp_path / "catalogue.fits", tmp_path / "out")
+    fit_file(*arguments, chunk_rows=40)
+    whole = fitter.fit(catalogue)
+    one, two = (tmp_path / "out" / f"part-0000{i}.fits" for i in (1, 2))
+    one.write_bytes(one.read_bytes()[:-2880])
+    data = bytearray(two.read_bytes())
+    data[-4000] ^= 1
+    two.write_bytes(data)
+    (tmp_path / "out" / "part-00003.fits.tmp").write_bytes(b"half a part")
+    calls = count_fits(monkeypatch)
+    assert_same(fit_file(*arguments, chunk_rows=40), whole)
+    assert len(calls) == 2
+
+
+def test_parts_of_another_fit_are_refused(fitter, grid, catalogue, tmp_path):
+    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
+    catalogue.write(path)
+    fit_file(fitter, path, out, chunk_rows=80, redshift="redshift")
+    same = {"chunk_rows": 80, "redshift": "redshift"}
+
+    def refused(match, fitter=fitter, **changes):
+        with pytest.raises(ValueError, match=rf"holds results of another fit: .*{match}"):
+            fit_file(fitter, path, out, **(same | changes))
+
+    # the same grid, made again, is the same
+    fit_file(
+        BayesFitter(replace(grid, meta=dict(grid.meta)), max_reduced_chi2=30.0), path, out, **same
+    )
+    refused("chunk_rows", chunk_rows=79)
+    refused("redshift", redshift=None)
+    refused("redshift", redshift=np.array(catalogue["redshift"]))
+    refused("model_error", BayesFitter(grid, max_reduced_chi2=30.0, model_error=0.2))
+    refused("max_reduced_chi2", BayesFitter(grid))
+    refused("priors", BayesFitter(grid, max_reduced_chi2=30.0, priors={"tau": "log"}))
+    other = replace(grid, galaxy=grid.galaxy * (1 + 1e-15 * np.arange(6)))
+    refused("grid", BayesFitter(other, max_reduced_chi2=30.0))
+    catalogue["band0"][0] *= 1.01
+    catalogue.write(path, overwrite=True)
+    refused(r"catalogue\.sha256")
+    results = fit_file(fitter, path, out, chunk_rows=150, resume=False)
+    assert [item.name for item in sorted(out.iterdir())] == ["manifest.json", "part-00000.fits"]
+    assert_same(results, fitter.fit(catalogue))
+
+
+def test_results_are_read_as_if_they_were_one(fitter, catalogue, tmp_path):
+    catalogue.write(tmp_path / "catalogue.fits")
+    whole = fitter.fit(catalogue)
+    fit_file(fitter, tmp_path / "catalogue.fits", tmp_path / "out", chunk_rows=40)
+    results = open_results(tmp_path / "out")
+    assert (len(results), results.complete) == (150, True)
+    assert repr(results).startswith("<FitResultsFiles of 150 objects, ")
+    assert [item.id for item in results] == catalogue["id"].tolist()
+    key = catalogue["id"][90]
+    assert results[key].best["mass"] == whole[key].best["mass"]
+    with pytest.raises(KeyError, match="no object with the id 'nobody' among 150"):
+        results["nobody"]
+    wanted = whole.to_table()
+    results.write_table(tmp_path / "table.fits")
+    with pytest.raises(OSError, match="overwrite=True replaces it"):
+        results.write_table(tmp_path / "table.fits")
+    written = QTable.read(tmp_path / "table.fits", character_as_bytes=False, mask_invalid=False)
+    for table in (results.to_table(), written):
+        assert table.colnames == wanted.colnames
+        for name in wanted.colnames:
+            assert table[name].unit == wanted[name].unit
+            assert table[name].info.description == wanted[name].info.description
+            np.testing.assert_array_equal(np.asarray(table[name]), np.asarray(wanted[name]))
+    assert "nobody" in written.meta["CITE"]
+    few = results.to_table(["id", "mass_p50"])
+    assert few.colnames == ["id", "mass_p50"]
+    np.testing.assert_array_equal(few["mass_p50"], wanted["mass_p50"])
+    with pytest.raises(KeyError, match="no column 'weight'; known: "):
+        results.to_table(["weight"])
+
+
+def test_a_catalogue_without_rows_has_results_without_rows(fitter, catalogue, tmp_path):
+    for suffix in ("fits", "ecsv"):
+        catalogue[:0].write(tmp_path / f"empty.{suffix}")
+        results = fit_file(fitter, tmp_path / f"empty.{suffix}", tmp_path / suffix)
+        assert len(results) == len(results.to_table()) == 0
+        results.write_table(tmp_path / "table.fits", overwrite=True)
+        assert len(QTable.read(tmp_path / "table.fits")) == 0
+
+
+def test_numbers_as_ids(fitter, catalogue, tmp_path):
+    for kind in (np.uint64, np.int32, float):
+        ids = np.arange(150).astype(kind)
+        ids[100] = ids[2]
+        catalogue["id"] = ids
+        catalogue.write(tmp_path / "catalogue.fits", overwrite=True)
+        results = fit_file(
+            fitter, tmp_path / "catalogue.fits", tmp_path / "out", chunk_rows=40, resume=False
+        )
+        assert_same(results, fitter.fit(catalogue))
+
+
+def test_what_cannot_be_read_by_rows_is_refused(fitter, catalogue, tmp_path):
+    def refused(name, match, error=DataError, **options):
+        with pytest.raises(error, match=match):
+            fit_file(fitter, tmp_path / name, tmp_path / "out", **options)
+
+    good = tmp_path / "good.fits"
+    catalogue.write(good)
+    refused("absent.fits", "no table .*absent.fits")
+    (tmp_path / "text.dat").write_text("id flux\n1 2\n")
+    refused("text.dat", "write it as FITS .* or ECSV")
+    with gzip.open(tmp_path / "packed.fits.gz", "wb") as stream:
+        stream.write(good.read_bytes())
+    refused("packed.fits.gz", "unpack it first")
+    (tmp_path / "short.fits").write_bytes(good.read_bytes()[:-2880])
+    refused("short.fits", "truncated|cannot be read")
+    (tmp_path / "nothing.csv").write_text("")
+    refused("nothing.csv", "has no line of column names")
+    fits.PrimaryHDU(np.zeros((3, 3))).writeto(tmp_path / "image.fits")
+    refused("image.fits", "has 0 binary tables")
+    with fits.open(good) as hdus:
+        fits.HDUList([hdus[0], hdus[1], hdus[1].copy()]).writeto(tmp_path / "two.fits")
+    refused("two.fits", "has 2 binary tables; 'hdu' says which")
+    refused("two.fits", "no extension 'PHOTOMETRY'", hdu="PHOTOMETRY")
+    refused("two.fits", "extension 0 is no binary table", hdu=0)
+    assert len(fit_file(fitter, tmp_path / "two.fits", tmp_path / "second", hdu=2)) == 150
+    ragged = fits.Column("p", "PD()", array=np.array([[1.0], [1.0, 2.0]], dtype=object))
+    fits.BinTableHDU.from_columns([ragged]).writeto(tmp_path / "ragged.fits")
+    refused("ragged.fits", r"columns of variable length, \['p'\]")
+    refused("good.fits", "'chunk_rows' must be an integer >= 1, got 0", ValueError, chunk_rows=0)
+    refused("good.fits", "'redshift' must be 150 values", ValueError, redshift=[1.0, 2.0])
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(ValueError, match="'fitter' must be a BayesFitter, got str"):
+        fit_file("fitter", good, tmp_path / "out")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("mine")
+    for resume in (True, False):
+        with pytest.raises(DataError, match="is not empty and holds no manifest"):
+            fit_file(fitter, good, tmp_path / "full", resume=resume)
+    assert (tmp_path / "full" / "thesis.tex").read_text() == "mine"
+    with pytest.raises(DataError, match="is a file; results of fit_file go to a folder"):
+        fit_file(fitter, good, good)
+
+
+def test_a_folder_of_something_else_is_no_results(tmp_path):
+    with pytest.raises(DataError, match="holds no results of fit_file"):
+        open_results(tmp_path)
+    (tmp_path / "manifest.json").write_text('{"format": "photos"}')
+    with pytest.raises(DataError, match=r"manifest.json is no manifest of fit_file: its format"):
+        open_results(tmp_path)

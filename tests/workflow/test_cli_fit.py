@@ -1,0 +1,104 @@
+"""``miricigale fit``: the folder it fills, and how it goes on."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from miricigale.cli import main
+from miricigale.fitting import BayesFitter, open_results
+from miricigale.sed import SEDModel
+
+BANDS = ("wfc3.f125w", "wfc3.f160w", "irac.ch1", "irac.ch2", "miri.f770w", "miri.f1500w")
+
+
+@pytest.fixture(scope="module")
+def catalogue():
+    """Five galaxies of the model, with 5 % errors."""
+    axes = SEDModel.yang2021_axes("quick")
+    z = axes["redshift"]
+    z = z[np.linspace(z.size // 4, z.size // 2, 5).astype(int)]
+    truth = QTable({"id": np.arange(5) + 1, "redshift": z, "mass": np.full(5, 1e10) * u.Msun})
+    for name in ("tau", "age", "ebv", "alpha"):
+        truth[name] = np.full(5, axes[name][0])
+    table = SEDModel.yang2021(agn=False).fluxes(truth, list(BANDS))
+    out = QTable({"id": truth["id"], "z_spec": z})
+    for name in BANDS:
+        out[name] = table[name]
+        out[f"{name}_err"] = 0.05 * table[name]
+    return out
+
+
+def test_a_catalogue_becomes_a_folder_of_results(catalogue, tmp_path, capsys):
+    catalogue.write(tmp_path / "cat.fits")
+    out = tmp_path / "out"
+    command = ["fit", str(tmp_path / "cat.fits"), "-o", str(out), "--axes", "quick"]
+    command += ["--chunk-rows", "2", "--redshift", "z_spec", "--threads", "2", "--no-progress"]
+    assert main(command) == 0
+    assert "5 objects, 5 fitted, 3 parts" in capsys.readouterr().out
+    assert len(open_results(out)) == 5
+    table = QTable.read(out / "table.fits")
+    # the mass formed that went in
+    np.testing.assert_allclose(table["mass_best"].to_value(u.Msun), 1e10, rtol=0.02)
+    assert main([*command, "--chunk-rows", "3"]) == 2
+    assert "holds results of another fit: chunk_rows differ" in capsys.readouterr().err
+    assert main([*command, "--chunk-rows", "3", "--no-resume"]) == 0
+    assert open_results(out).n_parts == 2
+
+
+def test_ctrl_c_keeps_what_is_finished(catalogue, tmp_path, capsys, monkeypatch):
+    catalogue.write(tmp_path / "cat.ecsv")
+    out = tmp_path / "out"
+    command = ["fit", str(tmp_path / "cat.ecsv"), "-o", str(out), "--axes", "quick"]
+    command += ["--chunk-rows", "2", "--no-progress"]
+    fit, calls = BayesFitter.fit, []
+
+    def stopped(self, *args, **kwargs):
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return fit(self, *args, **kwargs)
+
+    monkeypatch.setattr(BayesFitter, "fit", stopped)
+    assert main(command) == 130
+    err = capsys.readouterr().err
+    assert f"stopped; 2 finished parts are in {out}/; the same command goes on from here" in err
+    assert main(command) == 0
+    assert len(calls) == 4
+    assert len(QTable.read(out / "table.fits")) == 5
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--redshift", "z_phot"], "'redshift' must be a column among"),
+        (["--hdu", "SECOND"], "has no extension 'SECOND'"),
+        (["--chunk-rows", "0"], "'chunk_rows' must be an integer >= 1, got 0"),
+        (["--flux-unit", "mag"], "'flux_unit' must be convertible to uJy, got mag"),
+    ],
+)
+def test_options_that_cannot_be_used_are_one_sentence(
+    catalogue, tmp_path, capsys, options, message
+):
+    catalogue.write(tmp_path / "cat.fits")
+    command = ["fit", str(tmp_path / "cat.fits"), "-o", str(tmp_path / "out"), "--axes", "quick"]
+    assert main([*command, *options]) == 2
+    assert message in capsys.readouterr().err
+    assert list((tmp_path / "out").glob("part-*")) == []
+
+
+def test_a_table_without_photometry_is_told_what_is_wanted(tmp_path, capsys):
+    QTable({"id": [1], "flux": [1.0] * u.uJy}).write(tmp_path / "cat.fits")
+    assert main(["fit", str(tmp_path / "cat.fits"), "-o", str(tmp_path / "out")]) == 2
+    assert "a table with columns <filter> and <filter>_err" in capsys.readouterr().err
+
+
+def test_magnitudes_are_no_fluxes(tmp_path, capsys):
+    table = QTable({"id": [1], "irac.ch1": [20.0] * u.ABmag, "irac.ch1_err": [0.1] * u.mag})
+    table.write(tmp_path / "cat.ecsv")
+    assert (
+        main(["fit", str(tmp_path / "cat.ecsv"), "--axes", "quick", "-o", str(tmp_path / "o")]) == 2
+    )
+    err = capsys.readouterr().err
+    assert "column 'irac.ch1' must be convertible to uJy, got mag(AB)" in err
+    assert "Traceback" not in err
