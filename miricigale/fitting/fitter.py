@@ -24,6 +24,9 @@ __all__ = ["BayesFitter"]
 
 logger = logging.getLogger(__name__)
 
+#: Best chi2 above which exp(-chi2 / 2) is below the smallest normal number for every model.
+VANISHING_CHI2 = 1417.0
+
 
 class BayesFitter:
     """
@@ -69,7 +72,11 @@ class BayesFitter:
         Above this reduced chi2 of the best model an object is flagged.
     scale_error : bool, optional
         Whether the uncertainty of each model's own scale is part of the posterior of masses,
-        luminosities and fluxes (CIGALE leaves it out).
+        luminosities and fluxes: so by default, but CIGALE leaves it out.
+    compat : {"cigale"}, optional
+        Reproduce choices of CIGALE that are not ours: no ``scale_error``, no result where the best
+        chi2 is above 1417 (its weights, from which the best chi2 is not subtracted, all vanish;
+        flagged ``NO_LIKELIHOOD``), and no standard deviation below 5 % of the mean.
     rtol : float, optional
         Largest part of the posterior that pruning may miss; 0 evaluates every model.
 
@@ -112,7 +119,8 @@ class BayesFitter:
         n_bands_min=2,
         redshift_tolerance=None,
         max_reduced_chi2=100.0,
-        scale_error=True,
+        scale_error=None,
+        compat=None,
         rtol=1e-6,
     ):
         names = None if filters is None else tuple(getattr(filters, "names", filters))
@@ -142,6 +150,12 @@ class BayesFitter:
             raise argument_error("max_reduced_chi2", "positive", f"{max_reduced_chi2}")
         if redshift_tolerance is not None and not redshift_tolerance >= 0:
             raise argument_error("redshift_tolerance", ">= 0", f"{redshift_tolerance}")
+        if compat not in (None, "cigale"):
+            raise argument_error("compat", "None or 'cigale'", repr(compat))
+        if compat and scale_error:
+            raise argument_error("scale_error", "False with compat='cigale'", repr(scale_error))
+        scale_error = compat is None if scale_error is None else scale_error
+        self.compat = compat
         self.engine = engine
         self.model_error = per_band(model_error, model.filters, "model_error")
         self.error_floor = per_band(error_floor, model.filters, "error_floor")
@@ -385,6 +399,10 @@ class BayesFitter:
         merged = _Part.merge(parts, self._engine, priors, self.quantities, n)
         used = data.used
         n_bands = used.sum(axis=1)
+        if self.compat == "cigale":
+            vanished = merged.chi2 > VANISHING_CHI2
+            flags[vanished] |= int(FitFlags.NO_LIKELIHOOD)
+            merged.forget(vanished)
         fitted = np.isfinite(merged.chi2)
         reduced = np.where(n_bands > 1, merged.chi2 / np.maximum(n_bands - 1, 1), np.nan)
         with np.errstate(invalid="ignore"):
@@ -456,6 +474,7 @@ class BayesFitter:
             "n_bands_min": self.n_bands_min,
             "rtol": self._engine.rtol,
             "scale_error": self._engine.scale_error,
+            "compat": self.compat,
             "n_models": int(self._engine.n_models),
             "constants": self._constants(),
         }
@@ -565,6 +584,14 @@ class _Part:
     band: np.ndarray = None
     moments: np.ndarray = None
     quantiles: np.ndarray = None
+
+    def forget(self, rows):
+        """Leave nothing of these objects."""
+        for array in (self.chi2, self.log_sum, self.scale, *self.pdf.values()):
+            array[rows] = np.nan
+        for array in (self.pdf_2d, self.band, self.moments, self.quantiles):
+            array[rows] = np.nan
+        self.index[rows] = -1
 
     @classmethod
     def merge(cls, parts, engine, priors, quantities, n):

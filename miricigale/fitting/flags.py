@@ -37,7 +37,10 @@ class FitFlags(Flags):
     LIMIT_LEFT_OUT = 4096
     """An upper limit that the engine cannot weigh; the band is left out."""
 
-    UNFITTED = 1 | 2 | 8 | 16 | 32 | 512
+    NO_LIKELIHOOD = 8192
+    """With ``compat="cigale"``: the best chi2 is so high that every likelihood vanishes."""
+
+    UNFITTED = 1 | 2 | 8 | 16 | 32 | 512 | 8192
     """Bits with which a row has no result."""
 
     @classmethod

@@ -17,6 +17,8 @@ from miricigale.utils.units import FNU, frozen_array
 __all__ = ["FitResults"]
 
 _LEVELS = (0.16, 0.5, 0.84)
+#: Part of the mean below which CIGALE gives no standard deviation.
+CIGALE_LEAST_ERROR = 0.05
 _SUFFIXES = ("p16", "p50", "p84")
 
 
@@ -182,9 +184,13 @@ class FitResults:
 
     def _moments(self, name):
         if name in self.axes:
-            return moments(self.axes[name].values, self.pdf[name])
-        i = self._quantity(name)
-        return self.moments[:, i, 0], self.moments[:, i, 1]
+            mean, std = moments(self.axes[name].values, self.pdf[name])
+        else:
+            i = self._quantity(name)
+            mean, std = self.moments[:, i, 0], self.moments[:, i, 1]
+        if self.meta.get("fit", {}).get("compat") == "cigale":
+            std = np.maximum(std, CIGALE_LEAST_ERROR * np.abs(mean))
+        return mean, std
 
     def percentile(self, name, levels):
         """

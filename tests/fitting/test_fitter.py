@@ -326,3 +326,30 @@ def test_fewer_bands_than_parameters_are_flagged(make_grid, draw_photometry):
     assert got.fitted.all()
     names = [FitFlags.names(flag) for flag in got.flags]
     assert "few_for_parameters" in names[0]
+
+
+def test_choices_of_cigale(make_grid, draw_photometry):
+    """No result where exp(-chi2 / 2) vanishes, no error below 5 %, no scatter of the scale."""
+    grid = make_grid(3)
+    table, _ = draw_photometry(grid, 4, seed=4)
+    name = grid.filters[0]
+    table[name][2] *= 1e4
+    table[f"{name}_err"][2] *= 0.01
+    ours = BayesFitter(grid, model_error=0.0, scale_error=False).fit(table)
+    theirs = BayesFitter(grid, model_error=0.0, compat="cigale").fit(table)
+    assert (ours.chi2 > 1417).tolist() == [False, False, True, False]
+    assert theirs.fitted.tolist() == [True, True, False, True]
+    assert "no_likelihood" in FitFlags.names(theirs.flags[2])
+    assert np.isnan(theirs.mean("mass")[2])
+    good = theirs.fitted
+    for quantity in ("redshift", "frac_agn", "mass", "sfr"):
+        mean, std = theirs.mean(quantity)[good], ours.std(quantity)[good]
+        np.testing.assert_array_equal(mean, ours.mean(quantity)[good])
+        want = np.maximum(std, 0.05 * np.abs(mean))
+        np.testing.assert_allclose(theirs.std(quantity)[good].value, want.value, rtol=1e-12)
+    for options, match in (
+        ({"compat": "prospector"}, "'compat' must be None or 'cigale'"),
+        ({"compat": "cigale", "scale_error": True}, "'scale_error' must be False"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            BayesFitter(grid, **options)

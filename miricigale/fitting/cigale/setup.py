@@ -1,7 +1,6 @@
 """A run of CIGALE as a model, a grid and a fit here."""
 
 import dataclasses
-import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -192,10 +191,8 @@ class CigaleSetup:
         redshifts = photometry["redshift"] if "redshift" in photometry.colnames else None
         grid = self.model().grid(self.axes(redshifts), [*have, *self.predicted])
         options = {"model_error": self.additional_error} | options
-        if compat is not None and "compat" in inspect.signature(BayesFitter).parameters:
+        if compat is not None:
             options["compat"] = compat
-        elif compat is not None:
-            options.setdefault("scale_error", False)
         return BayesFitter(grid, have, **options)
 
     def fit(self, photometry, *, compat="cigale", executor=None, progress_bar=False, **options):
