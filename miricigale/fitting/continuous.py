@@ -198,7 +198,8 @@ class ContinuousFitter:
         ----------
         photometry : `~astropy.table.QTable`
             As for `BayesFitter.fit`: ``id``, a flux column for each filter, its error
-            ``<name>_err`` and, if there are upper limits, a boolean ``<name>_limit``.
+            ``<name>_err`` and, if there are upper limits, a boolean ``<name>_limit``. Objects
+            with limits only are flagged, not fitted.
         redshift : str or array_like, optional
             Column of ``photometry``, or values, of known redshifts.
         redshift_prior : tuple, optional
@@ -237,15 +238,13 @@ class ContinuousFitter:
             grid_filters=self.names,
         )
         flags = data.flags.copy()
-        limit = _limits(data, photometry, self.names)
-        measured = (data.used & ~limit).sum(axis=1)
-        flags[(measured == 0) & data.used.any(axis=1)] |= int(FitFlags.NO_BAND)
         spaces, kind = self._spaces(photometry, redshift, redshift_prior, flags)
         unfitted = (flags & int(FitFlags.UNFITTED)) != 0
         axes = self._axes(spaces)
         rows = np.flatnonzero(~unfitted)
         targets = [
-            Target(str(data.ids[i]), data.flux[i], data.sigma[i], limit[i], spaces[i]) for i in rows
+            Target(str(data.ids[i]), data.flux[i], data.sigma[i], data.limit[i], spaces[i])
+            for i in rows
         ]
         task = FitOne(self._engine, axes, seed, self.n_draws)
         # here too, for threads of one process share this setting
@@ -409,6 +408,7 @@ class ContinuousFitter:
             flux=data.flux,
             flux_err=data.flux_err,
             sigma=data.sigma,
+            limit=data.limit,
             axes=axes,
             pdf=pdf,
             best_index=np.full((n, 4), -1),
@@ -422,16 +422,6 @@ class ContinuousFitter:
             model=self.model,
             **out,
         )
-
-
-def _limits(data, photometry, names):
-    """Which bands of which objects are upper limits, shape (n, n_bands)."""
-    out = np.zeros(data.flux.shape, dtype=bool)
-    for i, name in enumerate(names):
-        column = f"{name}_limit"
-        if column in photometry.colnames:
-            out[:, i] = np.ma.filled(np.ma.asarray(photometry[column]), False)
-    return out & data.used
 
 
 def _names(filters, argument):

@@ -14,7 +14,9 @@ from miricigale.utils.files import open_fits
 
 __all__ = ["read_results", "write_results"]
 
-_FORMAT = "miricigale-fitresults-2"
+_FORMAT = "miricigale-fitresults-3"
+#: Files of the format before have no joint posteriors of pairs.
+_READABLE = (_FORMAT, "miricigale-fitresults-2")
 _DICTS = ("pdf", "best")
 _TUPLES = ("filters", "quantities", "descriptions", "intensive")
 
@@ -42,7 +44,10 @@ def write_results(results, path, *, overwrite=False):
     for name in _DICTS:
         for key, value in getattr(results, name).items():
             table[f"{name}:{key}"] = value
+    for i, weights in enumerate(results.pairs.values()):
+        table[f"pair:{i}"] = weights
     text = {name: getattr(results, name) for name in (*_TUPLES, "meta")}
+    text["pairs"] = [list(names) for names in results.pairs]
     text["units"] = [u.Unit(unit).to_string() for unit in results.units]
     text["shapes"] = {name: table[name].shape[1:] for name in table.colnames}
     text["axes"] = {
@@ -86,7 +91,7 @@ def read_results(cls, path):
 
     try:
         with open_fits(path, wanted="fit results", memmap=False) as hdus:
-            if hdus[0].header.get("FORMAT") != _FORMAT:
+            if hdus[0].header.get("FORMAT") not in _READABLE:
                 msg = f"{path} holds no fit results (no FORMAT = {_FORMAT!r} in its header)"
                 raise DataError(msg)
             text = json.loads(bytes(np.asarray(hdus["TEXT"].data)).decode())
@@ -119,6 +124,10 @@ def read_results(cls, path):
                 for key, array in columns.items()
                 if key.startswith(start)
             }
+        values["pairs"] = {
+            tuple(names): _native(columns[f"pair:{i}"])
+            for i, names in enumerate(text.get("pairs", ()))
+        }
         values |= {name: _native(array) for name, array in columns.items() if ":" not in name}
         if "axis_moments" in columns:
             from miricigale.fitting.continuous_results import ContinuousResults

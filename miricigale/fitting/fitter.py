@@ -1,31 +1,29 @@
 """BayesFitter: posteriors of galaxy and AGN parameters from broad-band photometry."""
 
 import logging
-from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from miricigale.fitting.engines.draws import draw_models
+from miricigale.fitting.assembly import constants, fit_results
 from miricigale.fitting.engines.grid import GridEngine
 from miricigale.fitting.flags import FitFlags
+from miricigale.fitting.fractions import OtherFraction
 from miricigale.fitting.likelihood import per_band, read_photometry
-from miricigale.fitting.priors import GridPriors, grid_priors
+from miricigale.fitting.pairs import check_pairs
+from miricigale.fitting.pieces import DrawPiece, FitPiece, Part, cut
+from miricigale.fitting.priors import grid_priors
 from miricigale.fitting.quantities import DERIVED_LEVELS, Quantities
 from miricigale.fitting.redshifts import density_log_prior, fixed_log_prior, known_redshifts
-from miricigale.fitting.results import FitResults
 from miricigale.fitting.samples import Samples
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.meta import provenance
-from miricigale.utils.parallel import chunks, parallel_map
+from miricigale.utils.parallel import parallel_map
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import require_columns
 
 __all__ = ["BayesFitter"]
 
 logger = logging.getLogger(__name__)
-
-#: Best chi2 above which exp(-chi2 / 2) is below the smallest normal number for every model.
-VANISHING_CHI2 = 1417.0
 
 
 class BayesFitter:
@@ -64,7 +62,8 @@ class BayesFitter:
     error_floor : float or dict of str to float, optional
         Least relative error of a flux, for all or by filter.
     n_bands_min : int, optional
-        Objects with fewer usable bands are flagged and not fitted.
+        Objects with fewer usable bands, upper limits among them, are flagged and not fitted. One
+        band at least must be no limit.
     redshift_tolerance : float, optional
         How far, in abs(dz) / (1 + z), a fixed redshift may lie from its node of the grid; half the
         distance of the nodes by default.
@@ -78,7 +77,8 @@ class BayesFitter:
         chi2 is above 1417 (its weights, from which the best chi2 is not subtracted, all vanish;
         flagged ``NO_LIKELIHOOD``), and no standard deviation below 5 % of the mean.
     rtol : float, optional
-        Largest part of the posterior that pruning may miss; 0 evaluates every model.
+        Largest relative error of posterior weights, means and standard deviations that leaving
+        out hopeless models may cause; 0 evaluates every model.
 
     Examples
     --------
@@ -165,6 +165,7 @@ class BayesFitter:
         self.prior_f = prior_f
         self.priors = grid_priors(model, priors, prior_f=prior_f)
         self.quantities = Quantities.of_grid(model)
+        self.fraction = OtherFraction.of_grid(model)
         self._engine = self._make_engine(bool(scale_error), float(rtol))
 
     def __repr__(self):
@@ -187,6 +188,8 @@ class BayesFitter:
             mixed_galaxy=quantities.mixed_galaxy,
             mixed_agn=quantities.mixed_agn,
             levels=DERIVED_LEVELS,
+            share_galaxy=None if self.fraction is None else self.fraction.galaxy,
+            share_agn=None if self.fraction is None else self.fraction.agn,
             rtol=rtol,
             scale_error=scale_error,
         )
@@ -197,6 +200,7 @@ class BayesFitter:
         *,
         redshift=None,
         redshift_prior=None,
+        pairs=None,
         seed=None,
         executor=None,
         progress_bar=False,
@@ -210,8 +214,10 @@ class BayesFitter:
         photometry : `~astropy.table.QTable`
             One row for each object: ``id``, a flux column for each filter, called by the
             filter's name, and its error ``<name>_err``. NaN is a missing band. Where a boolean
-            column ``<name>_limit`` is true the flux is an upper limit: this engine leaves the band
-            out and flags the object (``LIMIT_LEFT_OUT``); samplers take limits into account.
+            column ``<name>_limit`` is true the flux is an upper limit and the error its 1 sigma
+            (without model error and floor); its term of chi2 is -2 ln of the probability that a
+            measurement of the model lies below the limit [1]_ [2]_. Objects with limits only are
+            flagged, not fitted.
         redshift : str or array_like, optional
             Column of ``photometry``, or values, of known redshifts; each is taken to the nearest
             redshift of the grid. Without it the redshift is free.
@@ -219,6 +225,10 @@ class BayesFitter:
             Redshifts, shape (n_z,), and densities in redshift, shape (n_z,) or (n, n_z), joined by
             straight lines: a p(z) for all or each object, which is integrated over the cells of
             the grid's redshifts and takes the place of their prior.
+        pairs : list of tuple of str, optional
+            Pairs of parameters with several values (``results.axes``), of which the joint
+            posteriors are summed exactly as well: ``[("age", "tau"), ("redshift", "age")]``.
+            That of redshift and AGN fraction is always there.
         seed : optional
             Not used by this engine; other engines draw from it.
         executor : `concurrent.futures.Executor`, optional
@@ -237,26 +247,32 @@ class BayesFitter:
 
         Raises
         ------
+        KeyError
+            If a name in ``pairs`` is unknown.
         ValueError
-            If a column is missing, ``redshift`` or ``redshift_prior`` has the wrong shape, or both
-            are given.
+            If a column is missing, one of limits is not boolean, there are limits in a band in
+            which a model has negative flux, ``redshift`` or ``redshift_prior`` has the wrong
+            shape, or both are given, or ``pairs`` has a parameter twice or one with a single value.
         `~astropy.units.UnitsError`
             If a flux column has no unit of flux density.
+
+        References
+        ----------
+        .. [1] Sawicki 2012, PASP 124, 1208, appendix
+        .. [2] Boquien et al. 2019, A&A 622, A103, section 4.3
         """
         del seed
         if isinstance(chunk_size, bool) or not int(chunk_size) >= 1:
             raise argument_error("chunk_size", "an integer >= 1", repr(chunk_size))
-        ready = self._prepare(photometry, redshift, redshift_prior)
-        data, flags, log_prior, filters = ready
-        n = len(data.ids)
-        task = _Chunk(self._engine, self.priors, self.quantities)
-        pieces = [
-            (np.nan_to_num(data.flux[s]), data.sigma[s], log_prior[s])
-            for s in chunks(n, int(chunk_size))
-        ]
+        pairs = check_pairs(pairs, self)
+        data, flags, log_prior, filters = self._prepare(photometry, redshift, redshift_prior)
+        task = FitPiece(self._engine, self.priors, self.quantities, pairs)
+        pieces = cut(data, log_prior, int(chunk_size))
         parts = parallel_map(task, pieces, executor=executor, progress_bar=progress_bar, desc="fit")
-        logger.debug("fitted %d objects", n)
-        return self._results(data, flags, log_prior, parts, redshift is not None, filters)
+        logger.debug("fitted %d objects", len(data.ids))
+        return fit_results(
+            self, data, flags, Part.merge(parts), self.settings(filters, redshift is not None)
+        )
 
     def _prepare(self, photometry, redshift, redshift_prior):
         """Fluxes, flags, ln(prior) of the redshifts of every object, and the bands."""
@@ -272,13 +288,15 @@ class BayesFitter:
             n_bands_min=self.n_bands_min,
             grid_filters=grid.filters,
         )
-        data = self._leave_limits_out(data, photometry, filters)
+        bound = data.limit.any(axis=0)
+        for i in np.flatnonzero(bound & self._engine._negative) if bound.any() else ():
+            wanted = "without limits in bands in which a model has negative flux"
+            raise argument_error("photometry", wanted, f"some in {grid.filters[i]}")
         flags = data.flags.copy()
         log_prior = self._redshift_prior(photometry, redshift, redshift_prior, flags)
         free = sum(axis.values.size > 1 for axis in self.priors.axes.values())
         free += 1 - (redshift is not None and self.grid.redshift.size > 1)  # and the mass
-        some = data.used.sum(axis=1)
-        few = (some < free) & ((flags & int(FitFlags.UNFITTED)) == 0)
+        few = (data.measured.sum(axis=1) < free) & ((flags & int(FitFlags.UNFITTED)) == 0)
         flags[few] |= int(FitFlags.FEW_FOR_PARAMETERS)
         log_prior[(flags & int(FitFlags.UNFITTED)) != 0] = -np.inf
         return data, flags, log_prior, filters
@@ -321,15 +339,14 @@ class BayesFitter:
         if isinstance(n_draws, bool) or not isinstance(n_draws, (int, np.integer)) or n_draws < 1:
             raise argument_error("n_draws", "an integer >= 1", repr(n_draws))
         seed = check_seed(seed)
-        ready = self._prepare(photometry, redshift, redshift_prior)
-        data, flags, log_prior, filters = ready
-        task = _Draws(self._engine, int(n_draws), seed)
-        pieces = [
-            (np.nan_to_num(data.flux[s]), data.sigma[s], log_prior[s], data.ids[s])
-            for s in chunks(len(data.ids), 16)
-        ]
+        data, flags, log_prior, filters = self._prepare(photometry, redshift, redshift_prior)
+        keys = [stream(seed, "fit", "draws", str(key)).integers(2**63) for key in data.ids]
         parts = parallel_map(
-            task, pieces, executor=executor, progress_bar=progress_bar, desc="draws"
+            DrawPiece(self._engine, int(n_draws)),
+            cut(data, log_prior, 16, seeds=np.array(keys, dtype=np.int64)),
+            executor=executor,
+            progress_bar=progress_bar,
+            desc="draws",
         )
         index, scale = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
         unfitted = ~np.isfinite(scale).all(axis=1) & ((flags & int(FitFlags.UNFITTED)) == 0)
@@ -378,89 +395,6 @@ class BayesFitter:
             flags |= int(FitFlags.NO_MODEL)
         return np.tile(log_prior, (len(photometry), 1))
 
-    def _leave_limits_out(self, data, photometry, filters):
-        """Take upper limits, which this engine cannot weigh yet, out of the fluxes, and flag."""
-        sigma, flags = data.sigma.copy(), data.flags.copy()
-        for name in filters:
-            column = f"{name}_limit"
-            if column in photometry.colnames:
-                limit = np.asarray(np.ma.filled(np.ma.asarray(photometry[column]), False), bool)
-                band = self.grid.filters.index(name)
-                flags[limit & np.isfinite(sigma[:, band])] |= int(FitFlags.LIMIT_LEFT_OUT)
-                sigma[limit, band] = np.inf
-        n_bands = np.isfinite(sigma).sum(axis=1)
-        flags[n_bands == 0] |= int(FitFlags.NO_BAND)
-        flags[(n_bands > 0) & (n_bands < self.n_bands_min)] |= int(FitFlags.FEW_BANDS)
-        return replace(data, sigma=sigma, flags=flags)
-
-    def _results(self, data, flags, log_prior, parts, fixed, filters):
-        grid, priors = self.grid, self.priors
-        n = len(data.ids)
-        merged = _Part.merge(parts, self._engine, priors, self.quantities, n)
-        used = data.used
-        n_bands = used.sum(axis=1)
-        if self.compat == "cigale":
-            vanished = merged.chi2 > VANISHING_CHI2
-            flags[vanished] |= int(FitFlags.NO_LIKELIHOOD)
-            merged.forget(vanished)
-        fitted = np.isfinite(merged.chi2)
-        reduced = np.where(n_bands > 1, merged.chi2 / np.maximum(n_bands - 1, 1), np.nan)
-        with np.errstate(invalid="ignore"):
-            flags[fitted & (reduced > self.max_reduced_chi2)] |= int(FitFlags.HIGH_CHI2)
-            flags[fitted & ~(merged.scale > 0)] |= int(FitFlags.NO_SIGNAL)
-            unfitted = ~fitted & ((flags & int(FitFlags.UNFITTED)) == 0)
-            flags[unfitted] |= int(FitFlags.NO_SIGNAL)
-            if not fixed and grid.redshift.size > 2:
-                pdf = merged.pdf["redshift"]
-                edge = np.maximum(pdf[:, 0], pdf[:, -1]) > 0.01
-                flags[fitted & edge] |= int(FitFlags.REDSHIFT_EDGE)
-        log_sigma = np.where(used, np.log(np.where(used, data.sigma, 1.0)), 0.0).sum(axis=1)
-        log_sigma += 0.5 * n_bands * np.log(2.0 * np.pi)
-        index, scale = merged.index, merged.scale
-        best_flux = np.full(data.flux.shape, np.nan)
-        ok = fitted
-        if np.any(ok):
-            z, g, k, f = index[ok].T
-            flux = grid.galaxy[z, g]
-            if grid.agn_multiplicity.size:
-                ratio = grid.frac_agn[f] / (1.0 - grid.frac_agn[f])
-                power = ratio * grid.dust_luminosity[g]
-                flux = flux + power[:, None] * grid.agn[z, k]
-            best_flux[ok] = scale[ok, None] * flux
-        meta = provenance(
-            citations=grid.meta.get("citations", ()),
-            fit=self.settings(filters, fixed),
-            grid={k: v for k, v in grid.meta.items() if k not in ("citations", "axes")},
-        )
-        return FitResults(
-            ids=data.ids,
-            flags=flags,
-            n_bands=n_bands,
-            chi2=merged.chi2,
-            log_evidence=merged.log_sum - log_sigma,
-            filters=grid.filters,
-            flux=data.flux,
-            flux_err=data.flux_err,
-            sigma=data.sigma,
-            axes={name: replace(axis, share=None) for name, axis in priors.axes.items()},
-            pdf=merged.pdf,
-            pdf_2d=merged.pdf_2d,
-            best_index=index,
-            best_scale=scale,
-            best=self._best(index, scale, ok),
-            quantities=self.quantities.names,
-            units=self.quantities.units,
-            descriptions=self.quantities.descriptions,
-            moments=merged.moments,
-            quantiles=merged.quantiles,
-            model_flux=merged.band[:, 0],
-            model_flux_std=merged.band[:, 1],
-            best_flux=best_flux,
-            meta=meta,
-            model=self.model,
-            intensive=self.quantities.shape.names,
-        )
-
     def settings(self, filters=None, fixed=False):
         """Return what the fit was told, for the meta of results: a dict of plain values."""
         names = self.grid.filters
@@ -476,131 +410,5 @@ class BayesFitter:
             "scale_error": self._engine.scale_error,
             "compat": self.compat,
             "n_models": int(self._engine.n_models),
-            "constants": self._constants(),
+            "constants": constants(self.grid, self.priors.axes),
         }
-
-    def _constants(self):
-        """Parameters of the grid that have one value, which have no posterior."""
-        out = {}
-        for table in (self.grid.galaxy_parameters, self.grid.agn_parameters):
-            for name in table.colnames:
-                if name not in self.priors.axes and len(table):
-                    column = table[name]
-                    out[name] = float(getattr(column, "value", column)[0])
-        return out
-
-    def _best(self, index, scale, ok):
-        """Parameters and derived quantities of the best models: name to array."""
-        n = len(scale)
-        z, g, k, f = np.where(ok[:, None], index, 0).T
-        out = {}
-        grid = self.grid
-        frac = grid.frac_agn[f]
-        for name, axis in self.priors.axes.items():
-            if name == "redshift":
-                values = grid.redshift[z]
-            elif name == "frac_agn":
-                values = frac
-            elif axis.kind == "galaxy":
-                values = _plain(grid.galaxy_parameters[name])[g]
-            else:
-                # without AGN there is no torus to speak of
-                values = np.where(frac > 0, _plain(grid.agn_parameters[name])[k], np.nan)
-            out[name] = np.where(ok, values, np.nan)
-        derived = self.quantities.best(grid, g, k, frac, np.where(ok, scale, np.nan))
-        for i, name in enumerate(self.quantities.names):
-            out[name] = np.broadcast_to(derived[i], (n,))
-        return out
-
-
-def _plain(column):
-    return np.asarray(getattr(column, "value", column), dtype=float)
-
-
-@dataclass(frozen=True, eq=False)
-class _Chunk:
-    """Fit a piece of a catalogue; picklable."""
-
-    engine: GridEngine
-    priors: GridPriors
-    quantities: Quantities
-
-    def __call__(self, piece):
-        out = self.engine.fit(*piece)
-        pdf = {"redshift": out.zf.sum(axis=2)}
-        for name, axis in self.priors.axes.items():
-            if axis.kind == "frac_agn":
-                pdf[name] = out.zf.sum(axis=1)
-            elif axis.kind == "galaxy":
-                # not a matrix product, whose last digits depend on how many rows there are
-                pdf[name] = np.einsum("ng,vg->nv", out.galaxy, axis.share)
-            elif axis.kind == "agn":
-                pdf[name] = np.einsum("ng,vg->nv", out.agn, axis.share)
-        moments, quantiles = self.quantities.summarise(out)
-        return _Part(
-            chi2=np.maximum(out.norm - out.best_r, 0.0),
-            log_sum=out.log_sum,
-            scale=out.best_scale,
-            index=out.index,
-            pdf=pdf,
-            pdf_2d=out.zf,
-            band=out.band,
-            moments=moments,
-            quantiles=quantiles,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class _Draws:
-    """Draw models for a piece of a catalogue; picklable."""
-
-    engine: GridEngine
-    n_draws: int
-    seed: int
-
-    def __call__(self, piece):
-        flux, sigma, log_prior, ids = piece
-        out = self.engine.fit(flux, sigma, log_prior)
-        index = np.full((len(ids), self.n_draws, 4), -1)
-        scale = np.full((len(ids), self.n_draws), np.nan)
-        for i in np.flatnonzero(np.isfinite(out.norm)):
-            rng = stream(self.seed, "fit", "draws", str(ids[i]))
-            index[i], scale[i] = draw_models(
-                self.engine, flux[i], sigma[i], out.zf[i], self.n_draws, rng
-            )
-        return index, scale
-
-
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """Results of a piece of a catalogue."""
-
-    chi2: np.ndarray
-    log_sum: np.ndarray
-    scale: np.ndarray
-    index: np.ndarray
-    pdf: dict = field(default_factory=dict)
-    pdf_2d: np.ndarray = None
-    band: np.ndarray = None
-    moments: np.ndarray = None
-    quantiles: np.ndarray = None
-
-    def forget(self, rows):
-        """Leave nothing of these objects."""
-        for array in (self.chi2, self.log_sum, self.scale, *self.pdf.values()):
-            array[rows] = np.nan
-        for array in (self.pdf_2d, self.band, self.moments, self.quantiles):
-            array[rows] = np.nan
-        self.index[rows] = -1
-
-    @classmethod
-    def merge(cls, parts, engine, priors, quantities, n):
-        """Join the pieces; a catalogue without rows gets arrays without rows."""
-        if not parts:
-            n_z, _, n_b = engine.galaxy.shape
-            empty = (np.zeros((n, n_b)), np.zeros((n, n_b)), np.zeros((n, n_z)))
-            parts = [_Chunk(engine, priors, quantities)(empty)]
-        names = [name for name in cls.__dataclass_fields__ if name != "pdf"]
-        merged = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
-        pdf = {name: np.concatenate([p.pdf[name] for p in parts]) for name in parts[0].pdf}
-        return cls(pdf=pdf, **merged)

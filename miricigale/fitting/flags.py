@@ -11,7 +11,7 @@ class FitFlags(Flags):
     NO_BAND = 1
     """No usable band."""
     FEW_BANDS = 2
-    """Fewer usable bands than asked for."""
+    """Fewer usable bands, upper limits among them, than asked for."""
     BAD_ERROR = 4
     """A measured flux whose error is zero, negative or not finite; the band is left out."""
     NO_REDSHIFT = 8
@@ -33,14 +33,14 @@ class FitFlags(Flags):
     """A flux that is infinite; the band is left out."""
 
     FEW_FOR_PARAMETERS = 2048
-    """Fewer usable bands than free parameters, the mass among them: the prior decides much."""
-    LIMIT_LEFT_OUT = 4096
-    """An upper limit that the engine cannot weigh; the band is left out."""
+    """Fewer fluxes than free parameters, the mass among them; limits are not counted."""
+    ALL_LIMITS = 4096
+    """Upper limits and no flux: any model that is faint enough fits."""
 
     NO_LIKELIHOOD = 8192
     """With ``compat="cigale"``: the best chi2 is so high that every likelihood vanishes."""
 
-    UNFITTED = 1 | 2 | 8 | 16 | 32 | 512 | 8192
+    UNFITTED = 1 | 2 | 8 | 16 | 32 | 512 | 4096 | 8192
     """Bits with which a row has no result."""
 
     @classmethod

@@ -7,19 +7,12 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.fitting.flags import FitFlags
+from miricigale.fitting.likelihood import limits
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU, frozen_array, to_array
 
-__all__ = ["LeaveOutResult", "leave_out", "limits", "plain_column"]
-
-
-def limits(table, name):
-    """Rows whose flux in a band is an upper limit (``<name>_limit``): array of bool."""
-    column = f"{name}_limit"
-    if column not in table.colnames:
-        return np.zeros(len(table), dtype=bool)
-    return np.asarray(np.ma.filled(np.ma.asarray(table[column]), False), dtype=bool)
+__all__ = ["LeaveOutResult", "leave_out", "plain_column"]
 
 
 def plain_column(table, name):
@@ -35,6 +28,9 @@ def plain_column(table, name):
 def leave_out(fitter, photometry, bands, *, separately=False, **options):
     """
     Fit without some bands, and compare what is measured there with what the rest predicts.
+
+    Upper limits in other bands take part in the fit; where a band left out is an upper limit there
+    is a prediction, but nothing to compare it with.
 
     Parameters
     ----------

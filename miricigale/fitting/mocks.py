@@ -6,7 +6,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.fitting.flags import FitFlags
-from miricigale.fitting.left_out import limits, plain_column
+from miricigale.fitting.left_out import plain_column
 from miricigale.fitting.posterior import randomised_ranks
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import check_seed, stream
@@ -24,7 +24,8 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
 
     The best model of every object takes the object's place; its fluxes in the bands that were
     used are perturbed by the measured errors of that object and fitted as the object was
-    (Boquien et al. 2019, A&A 622, A103, section 4.3). Upper limits stay as they are.
+    (Boquien et al. 2019, A&A 622, A103, section 4.3). Upper limits stay as they are, for what
+    would have been measured there is not known.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
     mock = QTable(photometry, copy=True)
     for name in filters:
         i = results.filters.index(name)
-        change = used[:, i] & ~limits(photometry, name)
+        change = used[:, i] & ~results.limit[:, i]
         flux = plain_column(photometry, name)
         flux[change] = (results.best_flux[:, i] + noise[:, i] * error[:, i])[change]
         mock[name] = flux * FNU

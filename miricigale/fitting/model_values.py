@@ -3,6 +3,7 @@
 import astropy.units as u
 import numpy as np
 
+from miricigale.fitting.fractions import FRACTIONS
 from miricigale.fitting.quantities import Quantities
 from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.random import stream
@@ -13,10 +14,6 @@ __all__ = ["ModelValues"]
 _FRACTIONS = {
     "frac_agn_dust": ("agn_power", "dust_luminosity"),
     "frac_agn_ir": ("ir_luminosity_agn", "ir_luminosity_galaxy"),
-}
-_FRACTION_TEXT = {
-    "frac_agn_dust": "AGN power over the sum with the dust luminosity",
-    "frac_agn_ir": "AGN share of 3-1000 um light",
 }
 
 
@@ -60,7 +57,7 @@ class ModelValues:
         if name in self.quantities.names:
             return self.quantities.descriptions[self.quantities.names.index(name)]
         if name in self.fractions:
-            return _FRACTION_TEXT[name]
+            return FRACTIONS[name]
         for table in (self.grid.galaxy_parameters, self.grid.agn_parameters):
             if name in table.colnames and table[name].info.description:
                 return table[name].info.description

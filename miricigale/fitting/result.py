@@ -43,8 +43,13 @@ class FitResult:
 
     @property
     def n_bands(self):
-        """Number of bands used."""
+        """Number of bands used, upper limits among them."""
         return int(self._all.n_bands[self._row])
+
+    @property
+    def n_limits(self):
+        """How many of them are upper limits."""
+        return int(self._all.n_limits[self._row])
 
     @property
     def chi2(self):
@@ -118,6 +123,15 @@ class FitResult:
         """Joint posterior of redshift and AGN fraction, shape (nz, nf)."""
         return self._all.pdf_2d[self._row]
 
+    @property
+    def pairs(self):
+        """Joint posteriors of other pairs of parameters: (x, y) to array of shape (nx, ny)."""
+        return {names: table[self._row] for names, table in self._all.pairs.items()}
+
+    def joint_pdf(self, x, y):
+        """Joint posterior of two parameters, shape (nx, ny); see `FitResults.joint_pdf`."""
+        return self._all.joint_pdf(x, y)[self._row]
+
     def best_sed(self, model=None, **changes):
         """
         Spectrum of the best model.
@@ -157,7 +171,7 @@ class FitResult:
 
     def plot_sed(self, ax=None, *, model=None, filters=None, **kwargs):
         """
-        Draw photometry, best model and residuals.
+        Draw photometry, upper limits (as arrows), best model and residuals.
 
         Parameters
         ----------
@@ -195,6 +209,7 @@ class FitResult:
             np.where(used, results.sigma[row], results.flux_err[row]) * FNU,
             results.best_flux[row] * FNU,
             used=used,
+            limit=results.limit[row],
             ax=ax,
             **kwargs,
         )
@@ -209,18 +224,33 @@ class FitResult:
             kwargs.setdefault("log", bool(edges.value[0] > 0))
         return plot_pdf(edges, weights, ax=ax, **kwargs)
 
-    def plot_pdf2d(self, ax=None, **kwargs):
-        """Draw the joint posterior of redshift and AGN fraction; returns the axes."""
+    def plot_pdf2d(self, x="redshift", y="frac_agn", ax=None, **kwargs):
+        """
+        Draw the joint posterior of two parameters.
+
+        Parameters
+        ----------
+        x, y : str, optional
+            Parameters of which the results have it; see `FitResults.joint_pdf`.
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw; the current axes by default.
+        **kwargs
+            Passed to `miricigale.plotting.posteriors.plot_pdf_2d`.
+
+        Returns
+        -------
+        ax : `~matplotlib.axes.Axes`
+        """
         from miricigale.plotting.posteriors import plot_pdf_2d
 
-        if "frac_agn" not in self._all.axes:
+        axes = self._all.axes
+        if "frac_agn" in (x, y) and "frac_agn" not in axes:
             raise argument_error("frac_agn", "an axis of the grid", "a grid without AGN")
-        x, y = self._all.axes["redshift"], self._all.axes["frac_agn"]
-        kwargs.setdefault("labels", ("redshift", "frac_agn"))
-        return plot_pdf_2d(
-            cell_edges(x.values, x.bounds),
-            cell_edges(y.values, y.bounds),
-            self.pdf_2d,
-            ax=ax,
-            **kwargs,
-        )
+        weights = self.joint_pdf(x, y)
+        edges = [cell_edges(axes[name].values, axes[name].bounds) for name in (x, y)]
+        kwargs.setdefault("labels", tuple(self._label(name) for name in (x, y)))
+        return plot_pdf_2d(*edges, weights, ax=ax, **kwargs)
+
+    def _label(self, name):
+        unit = self._all.unit(name).to_string()
+        return f"{name} ({unit})" if unit else name

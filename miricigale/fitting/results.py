@@ -37,16 +37,16 @@ class FitResults:
     flags : `~numpy.ndarray` of int, shape (n,)
         `FitFlags`.
     n_bands : `~numpy.ndarray` of int, shape (n,)
-        Number of bands used.
+        Number of bands used, upper limits among them.
     chi2 : `~numpy.ndarray`, shape (n,)
-        Chi2 of the best model, model error included.
+        Chi2 of the best model, model error and the terms of upper limits included.
     log_evidence : `~numpy.ndarray`, shape (n,)
         ln of the sum of prior * likelihood (fluxes in uJy), each model at its best scale.
     filters : tuple of str
         Bands of the grid, nb of them.
     flux, flux_err, sigma : `~numpy.ndarray`, shape (n, nb)
-        Measured fluxes, their errors, and the errors used (with model error; infinite in bands
-        that were not used), in uJy.
+        Measured fluxes or upper limits, their errors, and the errors used (of fluxes with model
+        error; infinite in bands that were not used), in uJy.
     axes : dict of str to `~miricigale.fitting.priors.GridAxis`
         Parameters that have several values.
     pdf : dict of str to `~numpy.ndarray`, shape (n, n_values)
@@ -73,8 +73,13 @@ class FitResults:
     model : `~miricigale.sed.SEDModel`, optional
         The model the grid was made from; not written to files.
     intensive : tuple of str, optional
-        Those of ``quantities`` that do not scale with mass: attenuation, ages, colours. They
-        have no mean of log10.
+        Those of ``quantities`` that do not scale with mass: attenuation, ages, colours, the AGN
+        fraction in its other definition. They have no mean of log10.
+    limit : `~numpy.ndarray` of bool, shape (n, nb), optional
+        Which of the bands used are upper limits; none by default.
+    pairs : dict of tuple of str to `~numpy.ndarray`, shape (n, nx, ny), optional
+        Joint posteriors of other pairs of parameters, those that the fit was asked for; see
+        `joint_pdf`.
     """
 
     ids: np.ndarray
@@ -103,13 +108,17 @@ class FitResults:
     meta: dict = field(default_factory=dict)
     model: object = None
     intensive: tuple = ()
+    limit: np.ndarray | None = None
+    pairs: dict = field(default_factory=dict)
 
     def __post_init__(self):
+        if self.limit is None:
+            object.__setattr__(self, "limit", np.zeros(np.shape(self.sigma), dtype=bool))
         for item in fields(self):
             value = getattr(self, item.name)
             if isinstance(value, np.ndarray):
                 object.__setattr__(self, item.name, frozen_array(value, value.dtype))
-        for name in ("pdf", "best"):
+        for name in ("pdf", "best", "pairs"):
             frozen = {k: frozen_array(v) for k, v in getattr(self, name).items()}
             object.__setattr__(self, name, frozen)
         rows = {}
@@ -153,8 +162,13 @@ class FitResults:
         return np.isfinite(self.chi2)
 
     @property
+    def n_limits(self):
+        """How many of the bands used are upper limits: array of int, shape (n,)."""
+        return np.count_nonzero(self.limit, axis=1)
+
+    @property
     def reduced_chi2(self):
-        """Chi2 over the number of bands less one; NaN with a single band."""
+        """Chi2 over the number of bands (limits among them) less one; NaN with a single band."""
         free = np.maximum(self.n_bands - 1, 0)
         return np.divide(self.chi2, free, out=np.full(len(self), np.nan), where=free > 0)
 
@@ -221,6 +235,40 @@ class FitResults:
             out = out.reshape(len(self), levels.size)
         return out * self.unit(name)
 
+    def joint_pdf(self, x, y):
+        """
+        Joint posteriors of two parameters, summed over all models.
+
+        Parameters
+        ----------
+        x, y : str
+            Redshift and AGN fraction, or two that were a pair of ``pairs`` in `BayesFitter.fit`,
+            in any order. `Samples.pdf_2d` has those of any two, from draws.
+
+        Returns
+        -------
+        weights : `~numpy.ndarray`, shape (n, nx, ny)
+            Weights of the values ``axes[x].values`` and ``axes[y].values``; they sum to 1.
+
+        Raises
+        ------
+        KeyError
+            If the results do not have it.
+        """
+        known = dict(self.pairs)
+        if "frac_agn" in self.axes:
+            known["redshift", "frac_agn"] = self.pdf_2d
+        if (x, y) in known:
+            return known[x, y]
+        if (y, x) in known:
+            return known[y, x].swapaxes(1, 2)
+        for name in (x, y):
+            if name not in self.parameters:
+                raise unknown_name("parameter", name, self.parameters)
+        have = ", ".join(f"{a} and {b}" for a, b in known) or "none"
+        msg = f"no joint posterior of {x} and {y}; known: {have} ('pairs' of BayesFitter.fit)"
+        raise KeyError(msg)
+
     def to_table(self):
         """
         Results as a table.
@@ -228,17 +276,18 @@ class FitResults:
         Returns
         -------
         table : `~astropy.table.QTable`
-            One row for each object: ``id``, ``flags``, ``n_bands``, ``chi2_best``,
-            ``reduced_chi2``, ``log_evidence``, and for each parameter and derived quantity
-            ``<name>_mean``, ``_std``, ``_p16``, ``_p50``, ``_p84`` and ``_best``; derived
-            quantities that scale with mass also have ``_logmean``, the mean of log10 (dex, in
-            their unit).
+            One row for each object: ``id``, ``flags``, ``n_bands``, ``n_limits``,
+            ``chi2_best``, ``reduced_chi2``, ``log_evidence``, and for each parameter and derived
+            quantity ``<name>_mean``, ``_std``, ``_p16``, ``_p50``, ``_p84`` and ``_best``;
+            derived quantities that scale with mass also have ``_logmean``, the mean of log10
+            (dex, in their unit).
         """
         out = QTable(meta=dict(self.meta))
         columns = {
             "id": (np.array(self.ids), "identifier"),
             "flags": (np.array(self.flags), FitFlags.describe()),
-            "n_bands": (np.array(self.n_bands), "bands used"),
+            "n_bands": (np.array(self.n_bands), "bands used, upper limits among them"),
+            "n_limits": (self.n_limits, "bands used that are upper limits"),
             "chi2_best": (np.array(self.chi2), "chi2 of the best model"),
             "reduced_chi2": (self.reduced_chi2, "chi2_best over the number of bands less one"),
             "log_evidence": (np.array(self.log_evidence), "ln of the evidence, fluxes in uJy"),
@@ -317,9 +366,9 @@ class FitResults:
         """Draw the posterior of a parameter of an object; see `FitResult.plot_pdf`."""
         return self[key].plot_pdf(name, ax=ax, **kwargs)
 
-    def plot_pdf2d(self, key, ax=None, **kwargs):
-        """Draw the joint posterior of redshift and AGN fraction; see `FitResult.plot_pdf2d`."""
-        return self[key].plot_pdf2d(ax=ax, **kwargs)
+    def plot_pdf2d(self, key, x="redshift", y="frac_agn", ax=None, **kwargs):
+        """Draw the joint posterior of two parameters of an object; see `FitResult.plot_pdf2d`."""
+        return self[key].plot_pdf2d(x, y, ax=ax, **kwargs)
 
     def write(self, path, *, overwrite=False):
         """

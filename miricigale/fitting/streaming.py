@@ -10,6 +10,7 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 
+from miricigale.fitting.pairs import check_pairs
 from miricigale.fitting.part_files import (
     MANIFEST,
     PARTS_FORMAT,
@@ -42,6 +43,7 @@ def fit_file(
     chunk_rows=10000,
     redshift=None,
     redshift_prior=None,
+    pairs=None,
     flux_unit=None,
     hdu=None,
     executor=None,
@@ -73,6 +75,8 @@ def fit_file(
     redshift_prior : tuple, optional
         As for `BayesFitter.fit`: redshifts and densities, of which there may be one row for each
         row of the catalogue, or the name of a column that holds them.
+    pairs : list of tuple of str, optional
+        As for `BayesFitter.fit`: pairs of parameters of which joint posteriors are kept too.
     flux_unit : unit-like, optional
         Unit of flux columns and their errors where the file gives none, as CSV does.
     hdu : int or str, optional
@@ -108,9 +112,10 @@ def fit_file(
     rows = open_rows(
         path_in, chunk_rows, hdu=hdu, units=lambda name: unit_text if name in fluxes else None
     )
-    inputs = _Inputs(rows, redshift, redshift_prior, unit, fluxes)
+    pairs = check_pairs(pairs, fitter)
+    inputs = _Inputs(rows, redshift, redshift_prior, unit, fluxes, pairs)
     folder = Path(path_out)
-    job = _job(fitter, rows, redshift, redshift_prior, unit_text, hdu)
+    job = _job(fitter, rows, redshift, redshift_prior, unit_text, hdu, pairs)
     manifest = _open_folder(folder, job, resume)
     seen = _SeenIds()
     n_old = 0
@@ -135,7 +140,8 @@ def fit_file(
 class _Inputs:
     """The pieces of a catalogue, and of what was given beside it."""
 
-    def __init__(self, rows, redshift, redshift_prior, unit, fluxes):
+    def __init__(self, rows, redshift, redshift_prior, unit, fluxes, pairs):
+        self.pairs = pairs
         self.rows, self.unit, self.fluxes = rows, unit, fluxes
         self.redshift, self.prior = redshift, redshift_prior
         n = rows.n_rows
@@ -161,7 +167,7 @@ class _Inputs:
                 if table[name].unit is None:
                     table[name] = table[name] * self.unit
         piece = slice(*self.rows.span(i))
-        options = {}
+        options = {"pairs": self.pairs} if self.pairs else {}
         if self.redshift is not None:
             options["redshift"] = self.redshift[piece] if self.by_row else self.redshift
         if self.prior is not None:
@@ -243,7 +249,7 @@ class _SeenIds:
             self._runs.append(run)
 
 
-def _job(fitter, rows, redshift, redshift_prior, flux_unit, hdu):
+def _job(fitter, rows, redshift, redshift_prior, flux_unit, hdu, pairs):
     """What makes a fit another one, in plain values."""
     values = vars(fitter)
     content = {
@@ -252,7 +258,7 @@ def _job(fitter, rows, redshift, redshift_prior, flux_unit, hdu):
         # the spectra are in the grid
         if name != "model"
     }
-    return {
+    job = {
         "catalogue": {
             "sha256": rows.sha256,
             "bytes": rows.path.stat().st_size,
@@ -266,6 +272,7 @@ def _job(fitter, rows, redshift, redshift_prior, flux_unit, hdu):
         "fitter": content,
         "settings": fitter.settings(),
     }
+    return job | ({"pairs": [list(names) for names in pairs]} if pairs else {})
 
 
 def _open_folder(folder, job, resume):

@@ -14,6 +14,9 @@ __all__ = [
     "plot_sed_fit",
 ]
 
+#: Upper limits: a bar, and an arrow down from it.
+_ARROW = {"fmt": "_", "uplims": True, "color": "tab:blue", "markersize": 10, "zorder": 4}
+
 
 def _value(quantity, unit=None):
     quantity = u.Quantity(quantity)
@@ -76,6 +79,8 @@ def plot_pdf_2d(
     """
     Draw a two-dimensional posterior with the cells of highest density outlined.
 
+    The axes reach two cells beyond those that hold more than 1e-4 of the posterior.
+
     Parameters
     ----------
     x_edges, y_edges : array_like, shapes (nx + 1,) and (ny + 1,)
@@ -114,10 +119,11 @@ def plot_pdf_2d(
     inside = inside.reshape(weights.shape)
     for level, width in zip(levels, (1.5, 0.8, 0.5, 0.5), strict=False):
         _outline(ax, x, y, inside < level, linewidth=width)
-    seen = np.flatnonzero(weights.sum(axis=1) > 1e-4 * weights.sum())
-    if seen.size:
-        low, high = max(seen[0] - 2, 0), min(seen[-1] + 3, x.size - 1)
-        ax.set_xlim(x[low], x[high])
+    for edges, sums, limits in ((x, weights.sum(axis=1), "xlim"), (y, weights.sum(axis=0), "ylim")):
+        seen = np.flatnonzero(sums > 1e-4 * sums.sum())
+        if seen.size:
+            low, high = max(seen[0] - 2, 0), min(seen[-1] + 3, edges.size - 1)
+            ax.set(**{limits: (edges[low], edges[high])})
     if truth is not None:
         ax.plot(*truth, marker="x", color="tab:red", markersize=9, markeredgewidth=2)
     if labels is not None:
@@ -146,6 +152,7 @@ def plot_sed_fit(
     model_flux,
     *,
     used=None,
+    limit=None,
     spectrum=None,
     ax=None,
     title=None,
@@ -163,6 +170,8 @@ def plot_sed_fit(
         Fluxes of the best model.
     used : array_like of bool, shape (n,), optional
         Bands that were fitted; others are drawn open.
+    limit : array_like of bool, shape (n,), optional
+        Bands whose flux is an upper limit: a bar with an arrow down.
     spectrum : pair of `~astropy.units.Quantity`, optional
         Wavelength and flux density of the best model.
     ax : `~matplotlib.axes.Axes` or pair of them, optional
@@ -186,6 +195,7 @@ def plot_sed_fit(
     wave, flux = _value(wave, u.um), _value(flux, u.uJy)
     err, model = _value(flux_err, u.uJy), _value(model_flux, u.uJy)
     used = np.ones(wave.size, bool) if used is None else np.asarray(used, bool)
+    limit = np.zeros(wave.size, bool) if limit is None else np.asarray(limit, bool)
     have = np.isfinite(flux) & np.isfinite(err)
     limits = np.concatenate([flux[have & (flux > 0)], model[np.isfinite(model) & (model > 0)]])
     low, high = (limits.min() / 4, limits.max() * 4) if limits.size else (0.1, 10.0)
@@ -194,8 +204,8 @@ def plot_sed_fit(
         shown = (x > 0.5 * wave.min()) & (x < 2.0 * wave.max())
         ax.plot(x[shown], y[shown], color="0.6", linewidth=0.8, zorder=1, label="best model")
     ax.plot(wave, model, "s", color="tab:orange", markersize=7, fillstyle="none", zorder=3)
-    above = have & (flux > 0)
-    below = have & ~(flux > 0)
+    above = have & (flux > 0) & ~limit
+    below = have & ~(flux > 0) & ~limit
     for keep, fill in ((above & used, "full"), (above & ~used, "none")):
         ax.errorbar(
             wave[keep],
@@ -211,6 +221,10 @@ def plot_sed_fit(
     if np.any(below):
         # two sigma above a flux that is not positive
         ax.plot(wave[below], np.maximum(top[below], low), "v", color="tab:blue", zorder=4)
+    bound = have & limit
+    if np.any(bound):
+        top = np.maximum(flux[bound], 3.0 * low)
+        ax.errorbar(wave[bound], top, yerr=0.5 * top, **_ARROW)
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.set_xlim(0.7 * wave.min(), 1.4 * wave.max())
@@ -223,9 +237,15 @@ def plot_sed_fit(
         return ax
     pull = np.where(have, (flux - model) / np.where(have, err, 1.0), np.nan)
     residual_ax.axhline(0.0, color="0.6", linewidth=0.8)
-    residual_ax.plot(wave[used], pull[used], "o", color="tab:blue", markersize=5)
-    residual_ax.plot(wave[~used], pull[~used], "o", color="tab:blue", fillstyle="none")
-    size = np.nanmax(np.abs(pull[have]), initial=2.5) * 1.15
+    for keep, fill in ((used & ~limit, "full"), (~used & ~limit, "none")):
+        residual_ax.plot(
+            wave[keep], pull[keep], "o", color="tab:blue", fillstyle=fill, markersize=5
+        )
+    # of limits only those that the model passes have to be seen
+    seen = have & ~(limit & (pull > 0))
+    size = np.nanmax(np.abs(pull[seen]), initial=2.5) * 1.15
+    if np.any(bound):
+        residual_ax.errorbar(wave[bound], pull[bound], yerr=0.25 * size, **_ARROW)
     residual_ax.set_ylim(-size, size)
     residual_ax.set_ylabel("residual (sigma)")
     residual_ax.set_xlabel("observed wavelength (um)")

@@ -4,6 +4,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from scipy.stats import norm
 
 from miricigale.sed import ModelGrid
 
@@ -86,12 +87,41 @@ def draw_photometry(grid, n, seed=1, *, noise=0.1, missing=0.0, mass=(9.5, 11.0)
     return table, truth
 
 
-def brute_force(fitter, flux, sigma, log_prior=None):
-    """Posterior of one object by arrays over all models, with nothing left out."""
+def _limited(p, q, unit, level):
+    """
+    Scales that minimise chi2 with upper limits, by bisection; their variance and the terms.
+
+    ``unit`` is the model flux over the limits' sigma, shape (..., n), ``level`` the limit over it.
+    """
+
+    def slope(s):
+        u = s[..., None] * unit - level
+        return q * s - p + (np.exp(norm.logpdf(u) - norm.logsf(u)) * unit).sum(-1)
+
+    low, high = np.zeros(p.shape), np.maximum(p, 0.0) / q
+    for _ in range(120):
+        middle = 0.5 * (low + high)
+        above = slope(middle) > 0
+        low, high = np.where(above, low, middle), np.where(above, middle, high)
+    s = np.where(slope(np.zeros(p.shape)) >= 0, 0.0, high)
+    u = s[..., None] * unit - level
+    hazard = np.exp(norm.logpdf(u) - norm.logsf(u))
+    variance = 1.0 / (q + (hazard * (hazard - u) * unit**2).sum(-1))
+    return s, variance, -2.0 * norm.logsf(u).sum(-1)
+
+
+def brute_force(fitter, flux, sigma, log_prior=None, limit=None):
+    """
+    Posterior of one object by arrays over all models, with nothing left out.
+
+    ``limit`` says which bands are upper limits; ``flux`` and ``sigma`` hold them.
+    """
     grid, priors = fitter.grid, fitter.priors
     quantities = fitter.quantities
-    use = np.isfinite(sigma)
+    limit = np.zeros(flux.size, bool) if limit is None else np.asarray(limit)
+    use = np.isfinite(sigma) & ~limit
     w = np.where(use, 1.0 / np.square(sigma), 0.0)
+    level = flux[limit] / sigma[limit]
     flux = np.where(use, flux, 0.0)
     f = grid.frac_agn
     x = (f / (1.0 - f))[None, :] * grid.dust_luminosity[:, None]
@@ -100,8 +130,8 @@ def brute_force(fitter, flux, sigma, log_prior=None):
         agn, prior_agn = np.zeros((grid.redshift.size, 1, flux.size)), np.ones(1)
     model = grid.galaxy[:, :, None, None, :] + x[None, :, None, :, None] * agn[:, None, :, None, :]
     p, q = (model * w * flux).sum(-1), (model * model * w).sum(-1)
-    s = np.maximum(p, 0.0) / q
-    chi2 = (w * (flux - s[..., None] * model) ** 2).sum(-1)
+    s, variance, terms = _limited(p, q, model[..., limit] / sigma[limit], level)
+    chi2 = (w * (flux - s[..., None] * model) ** 2).sum(-1) + terms
     prior = (
         (priors.redshift if log_prior is None else np.exp(log_prior))[:, None, None, None]
         * (priors.galaxy / priors.galaxy.sum())[None, :, None, None]
@@ -120,11 +150,21 @@ def brute_force(fitter, flux, sigma, log_prior=None):
     if grid.n_agn:
         mixed = mixed + power * quantities.mixed_agn[None, None, :, None]
     unit = [np.broadcast_to(row, s.shape) for row in [*rows, mixed]]
-    square_s = s * s + fitter._engine.scale_error / q
+    more = fitter._engine.scale_error * variance
     mean = np.array([(like * s * row).sum() for row in unit])
-    square = np.array([(like * square_s * row**2).sum() for row in unit])
+    # about the means, so that narrow posteriors keep their digits
+    std = [
+        np.sqrt((like * ((s * row - m) ** 2 + more * row**2)).sum())
+        for row, m in zip(unit, mean, strict=True)
+    ]
     band = ((like * s)[..., None] * model).sum((0, 1, 2, 3))
-    band_square = ((like * square_s)[..., None] * model**2).sum((0, 1, 2, 3))
+    apart = (s[..., None] * model - band) ** 2 + more[..., None] * model**2
+    values = [s * row for row in unit]
+    if fitter.fraction is not None:
+        y = (f / (1.0 - f)) * fitter.fraction.galaxy[:, None, None] * fitter.fraction.agn[:, None]
+        values.append(np.broadcast_to(y / (1.0 + y), s.shape))
+        mean = np.append(mean, (like * values[-1]).sum())
+        std.append(np.sqrt((like * (values[-1] - mean[-1]) ** 2).sum()))
     return {
         "chi2": chi2[prior > 0].min(),
         "index": np.unravel_index(np.where(prior > 0, chi2, np.inf).argmin(), chi2.shape),
@@ -133,10 +173,11 @@ def brute_force(fitter, flux, sigma, log_prior=None):
         "galaxy": like.sum((0, 2, 3)),
         "agn": like.sum((0, 1, 3)),
         "mean": mean,
-        "std": np.sqrt(np.maximum(square - mean**2, 0.0)),
+        "std": np.array(std),
         "band": band,
-        "band_std": np.sqrt(np.maximum(band_square - band**2, 0.0)),
-        "values": [s * row for row in unit],
+        "band_std": np.sqrt((like[..., None] * apart).sum((0, 1, 2, 3))),
+        "scale": s,
+        "values": values,
         "weights": like,
     }
 

@@ -558,8 +558,17 @@ def test_limits_take_part_only_if_asked(run, tmp_path):
     # the last band of the first object is a limit
     words[-1] = f"-{words[-1]}"
     (tmp_path / "galaxies.txt").write_text("\n".join([lines[0], " ".join(words), *lines[2:]]))
-    with_limits = quiet(path).catalog()
-    assert with_limits["mips.24_limit"].tolist() == [True, False, False]
+    with pytest.warns(MiricigaleWarning, match="lim_flag noscaling: upper limits act on the scale"):
+        setup = read(path, libraries="bundled")
+    assert setup.catalog()["mips.24_limit"].tolist() == [True, False, False]
+    results = fit_cigale(setup)
+    assert results.n_bands.tolist() == [4, 4, 4]
+    assert results.n_limits.tolist() == [1, 0, 0]
+    # models of the true scale reach the limit, which is 2 ln 2; fainter ones are somewhat better
+    assert 0.0 < results.chi2[0] < 2.0 * np.log(2.0)
+    full = quiet(write(tmp_path, ("lim_flag = noscaling", "lim_flag = full")))
+    assert "lim_flag" not in full.describe()
+    np.testing.assert_array_equal(fit_cigale(full).chi2, results.chi2)
     without = quiet(write(tmp_path, ("lim_flag = noscaling", "lim_flag = none")))
     assert "mips.24_limit" not in without.catalog().colnames
     assert fit_cigale(without).n_bands.tolist() == [3, 4, 4]

@@ -301,22 +301,6 @@ def test_densities_that_cannot_be_used_are_flagged_or_refused(make_grid, draw_ph
         fitter.fit(table, redshift=1.0, redshift_prior=(nodes, density))
 
 
-def test_an_upper_limit_is_no_flux(make_grid, draw_photometry):
-    """The engine does not weigh limits yet: the band counts as missing, and the row says so."""
-    grid = make_grid(3)
-    fitter = BayesFitter(grid)
-    table, _ = draw_photometry(grid, 4, seed=4)
-    name = grid.filters[1]
-    table[f"{name}_limit"] = [True, False, False, True]
-    blank = table.copy()
-    blank[name][[0, 3]] = np.nan
-    got, want = fitter.fit(table), fitter.fit(blank)
-    np.testing.assert_array_equal(got.chi2, want.chi2)
-    np.testing.assert_array_equal(got.pdf_2d, want.pdf_2d)
-    names = [FitFlags.names(flag) for flag in got.flags]
-    assert ["limit_left_out" in n for n in names] == [True, False, False, True]
-
-
 def test_fewer_bands_than_parameters_are_flagged(make_grid, draw_photometry):
     grid = make_grid(3)
     table, _ = draw_photometry(grid, 2, seed=4)

@@ -153,7 +153,8 @@ def test_upper_limits_give_the_posterior_of_the_integral(engine):
 
 
 @pytest.mark.parametrize("engine", NAUTILUS)
-def test_real_model_agrees_with_the_grid_engine(engine):
+@pytest.mark.parametrize("limits", [(), ("wfc3.f160w", "miri.f1500w")])
+def test_real_model_agrees_with_the_grid_engine(engine, limits):
     model = SEDModel.yang2021(libraries="bundled")
     ebv, frac = 0.6 * (np.arange(48) + 0.5) / 48, 0.9 * (np.arange(48) + 0.5) / 48
     axes = {"redshift": [1.0], "ebv": ebv, "frac_agn": frac, "tau": [1.0], "age": [2.0]}
@@ -161,11 +162,13 @@ def test_real_model_agrees_with_the_grid_engine(engine):
     fluxes = model.fluxes(QTable(truth | {"mass": [2e10]}), REAL)
     flux = np.array([[fluxes[name][0].value for name in REAL]])
     table = photometry(flux * [1.1, 0.93, 1.04, 1.1, 0.9, 1.05], 0.08 * flux, names=REAL)
+    for name in limits:
+        table[f"{name}_limit"] = [True]
     grid = BayesFitter(model, REAL, axes=axes).fit(table)
     priors = {"ebv": (0.0, 0.6), "frac_agn": (0.0, 0.9), "tau": 1.0, "age": 2.0}
     fitter = ContinuousFitter(model, REAL, priors=priors, engine=engine, n_live=250)
     results = fitter.fit(table, redshift=[1.0], seed=3)
-    for name in ("ebv", "frac_agn", "mass", "accretion_power", "dust_luminosity"):
+    for name in ("ebv", "frac_agn", "frac_agn_ir", "mass", "accretion_power", "dust_luminosity"):
         mean, std = grid.mean(name)[0], grid.std(name)[0]
         # 2000 draws leave an error of 0.022 std
         assert abs(results.mean(name)[0] - mean) < 0.1 * std, name
@@ -173,6 +176,7 @@ def test_real_model_agrees_with_the_grid_engine(engine):
     assert_allclose(results.log_evidence[0], grid.log_evidence[0], atol=0.1)
     assert_allclose(results.model_flux, grid.model_flux, rtol=0.01)
     assert results.chi2[0] <= grid.chi2[0] + 0.1
+    assert results.n_limits[0] == grid.n_limits[0] == len(limits)
     assert_allclose(results.mean("redshift")[0], 1.0, rtol=1e-12)
     sed = results[0].best_sed()
     for name in ("accretion_power", "stellar_mass", "a_v", "frac_agn_ir"):
@@ -243,7 +247,9 @@ def test_what_cannot_be_fitted_stays_in_place_and_files_keep_everything(engine, 
     fitter = linear_fitter({"a": (-5.0, 5.0)}, engine, n_live=60, n_effective=99, n_draws=40)
     results = fitter.fit(table, redshift=[1.0, 1.0, 1.0, np.nan, 25.0, 1.0], seed=1)
     assert list(results.fitted) == [True] + [False] * 5
-    assert [FitFlags.NO_BAND & f for f in results.flags] == [0, 1, 0, 0, 0, 1]
+    assert [FitFlags.NO_BAND & f for f in results.flags] == [0, 1, 0, 0, 0, 0]
+    assert results.flags[5] == FitFlags.ALL_LIMITS
+    assert results.n_limits.tolist() == [0, 0, 0, 0, 0, 4]
     assert results.flags[2] == FitFlags.DUPLICATE_ID
     assert results.flags[3] == FitFlags.NO_REDSHIFT
     assert results.flags[4] == FitFlags.REDSHIFT_OUTSIDE
@@ -255,6 +261,7 @@ def test_what_cannot_be_fitted_stays_in_place_and_files_keep_everything(engine, 
     results.write(tmp_path / "r.fits")
     again = ContinuousResults.read(tmp_path / "r.fits")
     np.testing.assert_array_equal(again.draws, results.draws)
+    np.testing.assert_array_equal(again.limit, results.limit)
     np.testing.assert_array_equal(again.mean("a"), results.mean("a"))
     np.testing.assert_array_equal(again.percentile("a", 0.3), results.percentile("a", 0.3))
     assert again.samples("a").colnames == ["redshift", "a", "mass"]

@@ -125,7 +125,7 @@ def test_tables_files_and_views(results, tmp_path):
         assert results[0].percentile(name, 0.5)[0].value == pytest.approx(middle, rel=1e-9)
     results.write(tmp_path / "r.fits")
     again = FitResults.read(tmp_path / "r.fits")
-    assert again.intensive == ("a_v", "u_v", "beta", "age_mass")
+    assert again.intensive == ("a_v", "u_v", "beta", "age_mass", "frac_agn_ir")
     for field in dataclasses.fields(results):
         one, two = getattr(results, field.name), getattr(again, field.name)
         if isinstance(one, np.ndarray):

@@ -51,6 +51,40 @@ def test_polar_temperature_keeps_its_prior_where_there_is_no_polar_dust(fitter, 
     np.testing.assert_allclose(weighted.priors.agn, [2.0, 0.5, 1.5])
 
 
+@pytest.mark.filterwarnings("ignore:frac_agn has no effect")
+@pytest.mark.parametrize(
+    ("definition", "name"), [("dust", "frac_agn_ir"), ("3-1000um", "frac_agn_dust")]
+)
+def test_agn_fraction_in_the_other_definition(definition, name, draw_photometry):
+    """That of the spectrum of the best model, and of draws, also without dust in the galaxy."""
+    model = SEDModel.yang2021(libraries="bundled", frac_agn_definition=definition)
+    axes = AXES | {"ebv": np.array([0.0, 0.4]), "frac_agn": np.array([0.0, 0.1, 0.6])}
+    fitter = BayesFitter(model, NAMES, axes=axes)
+    table, _ = draw_photometry(fitter.grid, 12, noise=0.1)
+    results, samples = fitter.fit(table), fitter.sample(table, 3000, seed=2)
+    assert results.parameters[-1] == name
+    for result in results:
+        sed = result.best_sed()
+        derived = sed.meta["derived"]
+        assert result.best[name].value == pytest.approx(derived[name].value, abs=1e-9)
+        if result.best["frac_agn"] > 0 and derived["dust_luminosity"].value > 0:
+            assert result.best[name] != result.best["frac_agn"]
+    mean, std = results.mean(name).value, results.std(name).value
+    assert np.all(np.abs(samples.mean(name).value - mean) < 4.5 * std / np.sqrt(3000) + 1e-6)
+    np.testing.assert_allclose(samples.std(name).value, std, rtol=0.1, atol=1e-3)
+    g, k, f = np.moveaxis(samples.index, -1, 0)[1:]
+    each = fitter.fraction.evaluate(g, np.maximum(k, 0), fitter.grid.frac_agn[f])
+    np.testing.assert_allclose(samples.values(name).value, each, rtol=1e-12, atol=1e-12)
+    clear = np.flatnonzero(fitter.grid.galaxy_properties["dust_luminosity"].value == 0)
+    # without dust there is no power of the AGN, or nothing else than it
+    alone = fitter.fraction.evaluate(clear, 0, 0.6)
+    assert clear.size == 4
+    np.testing.assert_array_equal(alone, 0.0 if definition == "dust" else 1.0)
+    column = results.to_table()[f"{name}_mean"]
+    np.testing.assert_array_equal(column.value, mean)
+    assert samples.description(name) in column.info.description
+
+
 def test_plot_sed(fitter, draw_photometry):
     import matplotlib as mpl
 

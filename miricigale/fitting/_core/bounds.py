@@ -17,10 +17,10 @@ import numpy as np
 from numba import njit
 
 __all__ = [
-    "AGN_BITS",
     "BLOCK",
+    "DONE",
     "GROUP",
-    "ROW_BITS",
+    "KEY_BITS",
     "galaxy_projections",
     "pair_block",
     "torus_projections",
@@ -30,9 +30,11 @@ __all__ = [
 BLOCK = 64
 #: Tori handled side by side; arrays of unit vectors are padded with zeros to a multiple.
 GROUP = 4
-#: How redshift, galaxy and torus are packed into the index of a pair.
-AGN_BITS = 20
-ROW_BITS = 44
+#: A run is a torus with a block of galaxies at one redshift; its key has so many bits for the
+#: torus, as many for the block, and the redshift above.
+KEY_BITS = 20
+#: Bound of a pair that is not listed, or is no more.
+DONE = np.float32(-3e38)
 
 _OPTIONS = {
     "cache": True,
@@ -108,13 +110,14 @@ def torus_projections(agn, bands, root_weight, data, unit, a, a2):
     """
     zero = np.float32(0)
     for k in range(a.size):
+        for j in range(bands.size):
+            unit[k, j] = agn[k, bands[j]] * root_weight[j]
+        # sums apart from stores: see `agn_products`
         norm = zero
         s = zero
         for j in range(bands.size):
-            t = agn[k, bands[j]] * root_weight[j]
-            unit[k, j] = t
-            norm += t * t
-            s += t * data[j]
+            norm += unit[k, j] * unit[k, j]
+            s += unit[k, j] * data[j]
         if norm < _TINY:
             a[k] = zero
             a2[k] = _ALWAYS if norm > zero else zero
@@ -171,7 +174,9 @@ def _products(unit_galaxy, unit_agn, x):
 
 
 @njit(**_OPTIONS)
-def pair_block(unit_galaxy, p, threshold, unit_agn, a, a2, start, base, found, bound):
+def pair_block(
+    unit_galaxy, p, threshold, base, norm, unit_agn, a, a2, key, start, run_key, bound, top
+):
     """
     Find the pairs of one block of galaxies whose bound reaches a threshold.
 
@@ -183,35 +188,44 @@ def pair_block(unit_galaxy, p, threshold, unit_agn, a, a2, start, base, found, b
         Their projections; -1000 for a galaxy that may not be used.
     threshold : `~numpy.ndarray` of float32, shape (BLOCK,)
         Least bound R / |d|^2 to keep, 1e30 for a galaxy that may not be used.
+    base : `~numpy.ndarray` of float32, shape (BLOCK,)
+        2 ln(prior) of the galaxies, with that of their best partner.
+    norm : float32
+        |d|^2.
     unit_agn, a, a2
         From `torus_projections`.
+    key : int
+        Key of the block with torus 0.
     start : int
-        Where to write in ``found``, which must have room for BLOCK * n_agn more.
-    base : int
-        Packed index of the first galaxy with torus 0: redshift << ROW_BITS | galaxy <<
-        AGN_BITS | torus.
-    found : `~numpy.ndarray` of int64
-        Filled with pair indices.
-    bound : `~numpy.ndarray` of float32
-        Filled with their bounds in units of |d|^2.
+        Where to write in the list, which must have room for as many runs as there are tori.
+    run_key : `~numpy.ndarray` of int64
+        Filled with the keys of tori of which some pair is kept.
+    bound : `~numpy.ndarray` of float32, shape (n, BLOCK)
+        Filled with bounds of R + 2 ln(prior), `DONE` for pairs that are not kept.
+    top : `~numpy.ndarray` of float32, shape (BLOCK,)
+        Filled with the galaxies' largest bounds.
 
     Returns
     -------
     end : int
-        One past the last pair written.
+        One past the last run written.
     """
     one = np.float32(1)
     zero = np.float32(0)
+    slack = np.float32(1e-6)
     x = np.empty((GROUP, BLOCK), np.float32)
     rest = np.empty(BLOCK, np.float32)
     least = np.empty(BLOCK, np.float32)
     score = np.empty(BLOCK, np.float32)
+    alone = np.empty(BLOCK, np.float32)
     for i in range(BLOCK):
         p2 = max(p[i], zero) + _ETA
         p2 = p2 * p2
+        alone[i] = p2
         rest[i] = threshold[i] - p2
         # a galaxy that passes alone passes with every torus
         least[i] = -one if p2 >= threshold[i] else threshold[i]
+        top[i] = DONE
     end = start
     for k0 in range(0, unit_agn.shape[0], GROUP):
         _products(unit_galaxy, unit_agn[k0 : k0 + GROUP], x)
@@ -224,21 +238,24 @@ def pair_block(unit_galaxy, p, threshold, unit_agn, a, a2, start, base, found, b
                 n2 = p[i] - ak * xm[i] + _ETA
                 r = n1 * n1 - rest[i] * (one - xm[i] * xm[i] - _EPS)
                 score[i] = max(min(r, min(n1, n2)), a2k - least[i])
-            n_kept = 0
+            most = score[0]
             for i in range(BLOCK):
-                n_kept += score[i] >= zero
-            if n_kept == 0:
+                most = max(most, score[i])
+            if most < zero:
                 continue
+            run_key[end] = key + k0 + m
+            row = bound[end]
             for i in range(BLOCK):
-                if score[i] >= zero:
-                    p2 = max(p[i], zero) + _ETA
-                    p2 = p2 * p2
-                    n1 = ak - p[i] * xm[i] + _ETA
-                    n2 = p[i] - ak * xm[i] + _ETA
-                    r = max(p2, a2k)
-                    if min(n1, n2) >= zero:
-                        r = max(r, p2 + n1 * n1 / max(one - xm[i] * xm[i] - _EPS, _EPS))
-                    found[end] = base + (i << AGN_BITS) + k0 + m
-                    bound[end] = min(r, _ALWAYS)
-                    end += 1
+                n1 = ak - p[i] * xm[i] + _ETA
+                n2 = p[i] - ak * xm[i] + _ETA
+                both = alone[i] + n1 * n1 / max(one - xm[i] * xm[i] - _EPS, _EPS)
+                r = max(alone[i], a2k)
+                r = max(r, both) if min(n1, n2) >= zero else r
+                r = min(r, one) * norm
+                # rounding of single precision is added
+                value = r + base[i] + slack * (r + abs(base[i]))
+                value = value if score[i] >= zero else DONE
+                row[i] = value
+                top[i] = max(top[i], value)
+            end += 1
     return end

@@ -1,8 +1,9 @@
 """
-Logarithmic histograms, from which the percentiles of derived quantities are read.
+Histograms, from which the percentiles of derived quantities are read.
 
 Bins are 0.01 dex wide and span 10.24 dex on either side of the quantity at the best model;
-what lies beyond is counted in the outermost bins.
+what lies beyond is counted in the outermost bins. A fraction has linear bins, in which each
+model is spread evenly over its cell.
 """
 
 import math
@@ -13,20 +14,30 @@ from numba import njit
 __all__ = [
     "HALF_BINS",
     "N_BINS",
+    "N_SHARE",
     "PER_DEX",
+    "POINTS",
     "add_scaled",
+    "add_share",
     "clear_rows",
     "fill_log10",
     "log_summary",
+    "share_quantiles",
 ]
 
 PER_DEX = 100
 HALF_BINS = 1024
 N_BINS = 2 * HALF_BINS
+#: Bins of a fraction.
+N_SHARE = 4096
+#: Models that are put into the histograms at a time.
+POINTS = 256
 
 _OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
 _LN_10 = 2.3025850929940457
+# Variance in bins: 1/12 of a bin, and 1/6 of the sharing between neighbours.
+_BINNED = 0.25
 _LOG10_E = 0.43429448190325183
 _LOG10_2 = 0.30102999566398120
 _LOG10_E2 = 0.86858896380650366  # 2 log10(e)
@@ -117,14 +128,83 @@ def add_scaled(hist, bins, scale, weight, least, out):
         offset = (_LOG10_E * math.log(scale[i]) - shift) * PER_DEX
         step = math.floor(offset)
         part = offset - step
-        for j in range(bins[i, 0], bins[i, 1] + 1):
-            m = hist[i, j]
-            if m > 0.0:
-                low = min(max(j + step, 0), N_BINS - 1)
-                high = min(max(j + step + 1, 0), N_BINS - 1)
-                out[low] += (1.0 - part) * m
-                out[high] += part * m
+        first, last = bins[i, 0], bins[i, 1]
+        step = min(max(np.int64(step), -2 * N_BINS), 2 * N_BINS)
+        # what leaves the histogram is counted in its outermost bins
+        low = max(first, -step)
+        high = min(last, N_BINS - 2 - step)
+        for j in range(first, min(low, last + 1)):
+            out[0] += hist[i, j]
+        for j in range(max(high + 1, first), last + 1):
+            out[N_BINS - 1] += hist[i, j]
+        if high < low:
+            continue
+        row = hist[i, low : high + 1]
+        left = out[low + step : high + step + 1]
+        for j in range(row.size):
+            left[j] += (1.0 - part) * row[j]
+        right = out[low + step + 1 : high + step + 2]
+        for j in range(row.size):
+            right[j] += part * row[j]
     return shift, zero
+
+
+@njit(**_OPTIONS)
+def add_share(change, low, high, weight):
+    """
+    Add a weight that is spread evenly from ``low`` to ``high`` (within 0 and 1).
+
+    Parameters
+    ----------
+    change : `~numpy.ndarray`, shape (N_SHARE + 2,)
+        Changes of slope of the cumulative distribution at the edges of the bins.
+    """
+    # what is narrower than a bin is as wide as one
+    high = max(high, low + 1.0 / N_SHARE)
+    v = weight / (N_SHARE * (high - low))
+    x = low * N_SHARE
+    i = min(np.int64(x), N_SHARE)
+    part = x - i
+    change[i] += (1.0 - part) * v
+    change[i + 1] += part * v
+    x = min(high * N_SHARE, N_SHARE + 1.0)
+    i = min(np.int64(x), N_SHARE)
+    part = x - i
+    change[i] -= (1.0 - part) * v
+    change[i + 1] -= part * v
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def share_quantiles(change, levels, quantiles):
+    """
+    Quantiles of a fraction.
+
+    Parameters
+    ----------
+    change : `~numpy.ndarray`, shape (N_SHARE + 2,)
+        From `add_share`.
+    levels, quantiles : `~numpy.ndarray`, shape (n,)
+        Levels, ascending, in (0, 1); quantiles, filled: NaN if there is no weight.
+    """
+    total = 0.0
+    slope = 0.0
+    for j in range(N_SHARE):
+        slope += change[j]
+        total += slope
+    if not total > 0.0:
+        quantiles[:] = np.nan
+        return
+    below = 0.0
+    slope = change[0]
+    j = 0
+    for i in range(levels.size):
+        target = levels[i] * total
+        while j < N_SHARE - 1 and below + slope < target:
+            below += slope
+            j += 1
+            slope += change[j]
+        part = min(max((target - below) / slope, 0.0), 1.0) if slope > 0.0 else 0.0
+        quantiles[i] = (j + part) / N_SHARE
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -169,6 +249,8 @@ def log_summary(hist, middle, zero, sigma, levels, quantiles):
             quantiles[i] = np.nan
         return np.nan
     width = min(sigma * 0.43429448190325182 * PER_DEX, 200.0)
+    # what bins of equal density, and sharing between two of them, have added is left out
+    width = math.sqrt(max(width * width - _BINNED, 0.0))
     if width > 0.15 and last >= 0:
         reach = math.ceil(4.0 * width)
         kernel = np.empty(2 * reach + 1)

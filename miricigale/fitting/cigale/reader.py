@@ -89,6 +89,9 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         *(f"property {x}" for x in _list(config.get("properties", [])) if not x.endswith("_err")),
     ]
     data_file = config.get("data_file") or None
+    differs = []
+    if settings["limits"] and _limit_flag(analysis) == "noscaling":
+        differs.append("lim_flag noscaling: upper limits act on the scale too, as with full")
     setup = CigaleSetup(
         path=path,
         data_file=None if data_file is None else path.parent / data_file,
@@ -103,7 +106,7 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         variables=tuple(name for name in variables if name not in without),
         left_out=tuple(left_out),
         replaced=tuple(chain.replaced),
-        differs=tuple(chain.differs),
+        differs=(*chain.differs, *differs),
         names=names,
         **settings,
     )
@@ -159,17 +162,22 @@ def _number(section, key, default, kind):
         raise ConfigError(msg) from None
 
 
-def _settings(config, analysis):
+def _limit_flag(analysis):
+    """What the fit does with upper limits: full, noscaling or none."""
     limits = str(analysis.get("lim_flag", "none")).strip().lower()
     if limits not in ("full", "noscaling", "none"):
         limits = "full" if _flag(limits, "lim_flag") else "none"
+    return limits
+
+
+def _settings(config, analysis):
     error = _number(config, "additionalerror", 0.1, float)
     if not error >= 0:
         msg = f"additionalerror must be >= 0, got {error:g}"
         raise ConfigError(msg)
     return {
         "additional_error": error,
-        "limits": limits != "none",
+        "limits": _limit_flag(analysis) != "none",
         "redshift_decimals": _number(analysis, "redshift_decimals", 2, int),
         "mock": _flag(analysis.get("mock_flag", ""), "mock_flag"),
         "cores": _number(config, "cores", 1, int),

@@ -1,19 +1,81 @@
 """The grid engine: every model of a `~miricigale.sed.ModelGrid`, by factors."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from scipy.special import log_ndtr, ndtr, ndtri
 
 from miricigale.fitting import _core
 from miricigale.fitting._core.bounds import BLOCK
+from miricigale.fitting.posterior import cell_edges
+from miricigale.utils.exceptions import argument_error
 
 __all__ = ["GridEngine"]
 
-#: Pairs listed at once by one worker (12 bytes each).
-_CAPACITY = 1 << 22
+#: Runs of up to 64 pairs listed at once by one worker (260 bytes each).
+_CAPACITY = 1 << 16
 #: Part of ``rtol`` that the weight of what is left out may have.
-_SAFETY = 1e-3
+_SAFETY = 0.1
+#: How much more than its weight a model may add to second moments without being looked at twice.
+_TAIL = 10.0
+#: Part of ``rtol`` times its share below which a pair adds nothing to the scatter of fluxes.
+_THIN = 1e-4
+#: Least ``rtol`` with which pairs of little weight are evaluated in single precision.
+_SINGLE = 5e-7
+
+
+@dataclass(frozen=True, eq=False)
+class GridOutput:
+    """
+    What a fit of n objects returns; not a number, or -1, in rows that were not fitted.
+
+    Parameters
+    ----------
+    chi2 : `~numpy.ndarray`, shape (n,)
+        Chi2 of the best model.
+    log_sum : `~numpy.ndarray`, shape (n,)
+        ln of the sum of prior exp(-chi2 / 2).
+    n_models : `~numpy.ndarray`, shape (n,)
+        How many models were evaluated.
+    best_scale : `~numpy.ndarray`, shape (n,)
+        Solar masses formed of the best model.
+    index : `~numpy.ndarray` of int, shape (n, 4)
+        Redshift, galaxy, torus and AGN fraction of the best model.
+    zf : `~numpy.ndarray`, shape (n, nz, nf)
+        Joint posterior of redshift and AGN fraction.
+    galaxy, agn : `~numpy.ndarray`, shapes (n, nG) and (n, nA)
+        Posteriors of galaxy models and tori.
+    band : `~numpy.ndarray`, shape (n, 2, nb)
+        Posterior mean and standard deviation of model fluxes.
+    moments : `~numpy.ndarray`, shape (n, n_quantities, 3)
+        Mean, standard deviation and mean log10 of derived quantities.
+    quantiles : `~numpy.ndarray`, shape (n, n_quantities, n_levels)
+        Quantiles of derived quantities.
+    share, share_quantiles : `~numpy.ndarray`, shapes (n, 2) and (n, n_levels)
+        Mean and standard deviation, and quantiles of the other AGN fraction.
+    draw_index, draw_scale : `~numpy.ndarray`, shapes (n, n_draws, 4) and (n, n_draws, 2)
+        Models drawn from the posterior; their scales and the variances of these.
+    joint : dict of str to `~numpy.ndarray`, shape (n, ...)
+        Joint posteriors that were asked for, by two letters of z, g, k and f.
+    """
+
+    chi2: np.ndarray
+    log_sum: np.ndarray
+    n_models: np.ndarray
+    best_scale: np.ndarray
+    index: np.ndarray
+    zf: np.ndarray
+    galaxy: np.ndarray
+    agn: np.ndarray
+    band: np.ndarray
+    moments: np.ndarray
+    quantiles: np.ndarray
+    share: np.ndarray
+    share_quantiles: np.ndarray
+    draw_index: np.ndarray
+    draw_scale: np.ndarray
+    joint: dict = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -41,9 +103,16 @@ class GridEngine:
         Parts of galaxy and torus in one quantity that is the sum of both.
     levels : `~numpy.ndarray`
         Ascending levels of the quantiles of derived quantities.
+    share_galaxy, share_agn : `~numpy.ndarray`, shapes (nG,) and (nA,), optional
+        The AGN fraction in another definition is y / (1 + y), y the product of f / (1 - f) and
+        both.
     rtol : float
-        Relative error that pruning may cause; posterior weights are bounded to a thousandth of
-        it, so that moments of quantities with a long tail hold it too.
+        Relative error that pruning may cause. The weight of what is left out is bounded to a
+        tenth of it, and what it could add to the variance of any derived quantity to
+        ``rtol``, so that those with a long tail hold it too. (The standard deviation of an AGN's
+        quantity below a thousandth of the mean total luminosity is held to a part of the latter.)
+        From 5e-7 on, pairs of little weight are evaluated in single precision, in which a weight
+        is good to some 1e-7.
     scale_error : bool
         Whether the variance of each model's own scale is part of the posterior.
     """
@@ -61,6 +130,8 @@ class GridEngine:
     mixed_galaxy: np.ndarray
     mixed_agn: np.ndarray
     levels: np.ndarray
+    share_galaxy: np.ndarray | None = None
+    share_agn: np.ndarray | None = None
     rtol: float = 1e-6
     scale_error: bool = True
 
@@ -78,56 +149,97 @@ class GridEngine:
 
     @property
     def delta(self):
-        """How far 2 ln(posterior) of a model may lie below the best: 2 ln(1000 n_models / rtol)."""
+        """How far 2 ln(posterior) of a model may lie below the best: 2 ln(100 n_models / rtol)."""
         if self.rtol == 0:
             return 1e9
-        return 2.0 * np.log(max(self.n_models, 1) / (_SAFETY * self.rtol))
+        return 2.0 * np.log(max(self.n_models, 1) * _TAIL / (_SAFETY * self.rtol))
 
     @cached_property
     def _tables(self):
         n_z, n_galaxy, n_bands = self.galaxy.shape
         n_padded = -(-n_galaxy // BLOCK) * BLOCK
         galaxy32 = np.ones((n_z, n_bands, n_padded), np.float32)
-        galaxy32[:, :, :n_galaxy] = _in_own_unit(self.galaxy).transpose(0, 2, 1)
-        frac = self.frac[self.frac > 0]
-        ratio = frac / (1.0 - frac)
+        tiles = np.ones((n_z, n_padded // BLOCK, n_bands, BLOCK))
+        unit = _unit(self.galaxy)
+        galaxy32[:, :, :n_galaxy] = (self.galaxy / unit).transpose(0, 2, 1)
+        for start in range(0, n_galaxy, BLOCK):
+            part = self.galaxy[:, start : start + BLOCK].transpose(0, 2, 1)
+            tiles[:, start // BLOCK, :, : part.shape[2]] = part
+        above = self.frac > 0
+        ratio = _ratio(self.frac[above])
+        edge = _ratio(cell_edges(self.frac, (0.0, 1.0)))
         log_dust = np.log10(self.dust, where=self.dust > 0, out=np.full(n_galaxy, -400.0))
         prior_galaxy = self.prior_galaxy / self.prior_galaxy.sum()
         prior_frac = self.prior_frac / self.prior_frac.sum()
         prior_agn = self.prior_agn / max(self.prior_agn.sum(), 1e-300)
+        share_galaxy, share_agn = self.share_galaxy, self.share_agn
+        if share_galaxy is None or share_agn is None:
+            share_galaxy, share_agn = np.zeros(n_galaxy), np.zeros(self.agn.shape[1])
+        rows = (self.dust, _two_log(prior_galaxy), share_galaxy, self.mixed_galaxy)
+        blocks = np.zeros((4, n_padded))
+        blocks[:, :n_galaxy] = rows
+        blocks = blocks.reshape(4, n_padded // BLOCK, BLOCK)
+        log_usable = np.full((n_z, n_padded), -1e300)
+        log_usable[:, :n_galaxy] = np.where(self.usable, _two_log(prior_galaxy), -1e300)
         # all writable, for the kernels are compiled once more for arrays that are not
         return _core.Tables(
-            _writable(self.galaxy),
-            _writable(self.agn),
-            galaxy32,
-            np.ascontiguousarray(_in_own_unit(self.agn)),
-            _writable(self.dust),
-            log_dust,
-            ratio,
-            np.log10(ratio) * _core.PER_DEX,
-            int(self.frac[0] == 0.0),
-            _writable(self.usable),
-            prior_galaxy,
-            prior_agn,
-            prior_frac,
-            _two_log(prior_galaxy),
-            _two_log(prior_agn),
-            _two_log(prior_frac),
-            _writable(self.galaxy_scale),
-            _writable(self.agn_scale),
-            _writable(self.mixed_galaxy),
-            _writable(self.mixed_agn),
+            galaxy=_writable(self.galaxy),
+            agn=_writable(self.agn),
+            tiles=tiles,
+            blocks=blocks,
+            galaxy32=galaxy32,
+            agn32=np.ascontiguousarray((self.agn / _unit(self.agn)).astype(np.float32)),
+            galaxy_unit=_writable(unit[:, :, 0]),
+            dust=_writable(self.dust),
+            ratio=ratio,
+            zero_frac=int(self.frac[0] == 0.0),
+            usable=_writable(self.usable),
+            log_usable=log_usable,
+            prior_agn=prior_agn,
+            prior_frac=prior_frac,
+            log_galaxy=_two_log(prior_galaxy),
+            log_agn=_two_log(prior_agn),
+            log_frac=_two_log(prior_frac),
+            galaxy_scale=_writable(self.galaxy_scale),
+            agn_scale=_writable(self.agn_scale),
+            mixed_galaxy=_writable(self.mixed_galaxy),
+            mixed_agn=_writable(self.mixed_agn),
+            points=_core.PointTables(
+                ratio=ratio,
+                log_ratio=np.log10(ratio) * _core.PER_DEX,
+                edge=_writable(np.column_stack([edge[:-1], edge[1:]])[above]),
+                edge_zero=float(edge[1]),
+                dust=_writable(self.dust),
+                log_dust=log_dust,
+                mixed_galaxy=_writable(self.mixed_galaxy),
+                mixed_agn=_writable(self.mixed_agn),
+                share_galaxy=_writable(share_galaxy),
+                share_agn=_writable(share_agn),
+                share_mean=float(prior_agn @ share_agn),
+            ),
         )
 
-    def workspace(self):
+    def workspace(self, n_draws=0, joint=()):
         """Make the accumulators and work space of one worker (some tens of MB)."""
         n_z, n_galaxy, n_bands = self.galaxy.shape
-        n_agn, n_frac = self.agn.shape[1], self.frac.size
-        sums = _core.make_sums(n_z, n_galaxy, n_agn, n_frac, n_bands)
-        n_padded = self._tables.galaxy32.shape[2]
-        return sums, _core.make_scratch(n_z, n_galaxy, n_padded, n_agn, n_frac, n_bands, _CAPACITY)
+        size = (n_z, n_galaxy, self.agn.shape[1], self.frac.size, n_bands)
+        return _core.make_sums(*size, n_draws, joint), _core.make_scratch(
+            *size, int(self.frac[0] == 0.0), _CAPACITY
+        )
 
-    def fit(self, flux, sigma, log_prior, *, workspace=None):
+    def fit(
+        self,
+        flux,
+        sigma,
+        log_prior,
+        *,
+        limit=None,
+        limit_sigma=None,
+        n_draws=0,
+        seeds=None,
+        joint=(),
+        workspace=None,
+    ):
         """
         Fit objects.
 
@@ -137,56 +249,266 @@ class GridEngine:
             Fluxes and errors in uJy; bands with infinite sigma are not used.
         log_prior : `~numpy.ndarray`, shape (n, nz)
             ln(prior) of the redshifts, -inf where it is 0; rows of -inf are not fitted.
+        limit, limit_sigma : `~numpy.ndarray`, shape (n, nb), optional
+            Upper limits and their errors in uJy; bands with infinite error have none. A band has
+            a flux or a limit, not both.
+        n_draws : int, optional
+            Number of models to draw from each posterior; see `draw`.
+        seeds : `~numpy.ndarray` of int, shape (n,), optional
+            Seeds of the draws.
+        joint : tuple of str, optional
+            Joint posteriors to return as well: ``"zg"``, ``"zk"``, ``"gk"``, ``"fg"``, ``"fk"``
+            with z redshift, g galaxy, k torus, f AGN fraction.
         workspace : tuple, optional
-            What `workspace` returned, for use by one thread at a time; made if not given.
+            What `workspace` returned for this ``n_draws`` and ``joint``, for use by one thread at
+            a time; made if not given.
 
         Returns
         -------
-        out : `~miricigale.fitting._core.Output`
-            Not a number where an object was not fitted.
+        out : `GridOutput`
+
+        Raises
+        ------
+        ValueError
+            If there are limits in a band in which a model has negative flux.
         """
-        tables = self._tables
         n_z, n_galaxy, n_bands = self.galaxy.shape
         n_agn, n_frac = self.agn.shape[1], self.frac.size
         n = flux.shape[0]
         weight = 1.0 / np.square(sigma)
         data = np.where(weight > 0, flux, 0.0)
+        inverse = np.zeros((n, n_bands)) if limit_sigma is None else 1.0 / limit_sigma
+        limit = np.where(inverse > 0, 0.0 if limit is None else limit, 0.0)
+        negative = np.flatnonzero((inverse > 0).any(axis=0) & self._negative)
+        if negative.size:
+            wanted = "in bands in which no model has negative flux"
+            raise argument_error("limit", wanted, f"limits in band {int(negative[0])}")
         log_prior = np.where(np.isfinite(log_prior), 2.0 * log_prior, -1e300)
-        out = _core.Output(
-            np.full(n, np.nan),
-            np.full(n, np.nan),
-            np.zeros(n),
-            np.full(n, np.nan),
-            np.full(n, np.nan),
-            np.full((n, 4), -1),
-            np.full((n, n_z, n_frac), np.nan),
-            np.full((n, n_galaxy), np.nan),
-            np.full((n, n_agn), np.nan),
-            np.full((n, 2, n_bands), np.nan),
-            np.full((n, self.n_quantities, 3), np.nan),
-            np.full((n, self.n_quantities, self.levels.size), np.nan),
+        seeds = np.zeros(n, np.uint64) if seeds is None else np.array(seeds, np.uint64)
+        n_quantities, n_levels = self.n_quantities, self.levels.size
+        size = {"z": n_z, "g": n_galaxy, "k": n_agn, "f": n_frac}
+        out = GridOutput(
+            chi2=np.full(n, np.nan),
+            log_sum=np.full(n, np.nan),
+            n_models=np.zeros(n),
+            best_scale=np.full(n, np.nan),
+            index=np.full((n, 4), -1),
+            zf=np.full((n, n_z, n_frac), np.nan),
+            galaxy=np.full((n, n_galaxy), np.nan),
+            agn=np.full((n, n_agn), np.nan),
+            band=np.full((n, 2, n_bands), np.nan),
+            moments=np.full((n, n_quantities, 3), np.nan),
+            quantiles=np.full((n, n_quantities, n_levels), np.nan),
+            share=np.full((n, 2), np.nan),
+            share_quantiles=np.full((n, n_levels), np.nan),
+            draw_index=np.full((n, n_draws, 4), -1),
+            draw_scale=np.full((n, n_draws, 2), np.nan),
+            joint={name: np.full((n, size[name[0]], size[name[1]]), np.nan) for name in joint},
         )
-        request = _core.Request(
-            float(self.delta), _SAFETY * self.rtol, float(self.scale_error), self.levels.copy()
-        )
-        sums, scratch = self.workspace() if workspace is None else workspace
-        _core.fit_many(tables, request, data, weight, log_prior, sums, scratch, out)
+        sums, scratch = self.workspace(n_draws, joint) if workspace is None else workspace
+        for i in np.flatnonzero(log_prior.max(axis=1, initial=-1e300) > -1e200):
+            target = _target(data[i], weight[i], log_prior[i], limit[i], inverse[i])
+            sums.draws.state[0] = seeds[i]
+            if self._sum_up(target, sums, scratch):
+                self._summarise(target, sums, out, i)
         return out
+
+    def _sum_up(self, target, sums, scratch):
+        """Sum up the posterior of one object; returns whether there is any."""
+        tables, request = self._tables, self._request
+        _core.clear(sums.flat, sums.best, sums.index, sums.hist, sums.draws)
+        if not target.norm > 0.0:
+            return False
+        if not _core.begin(tables, target, scratch, sums.hist.origin):
+            return False
+        sums.best[2] = scratch.reference[0]
+        _core.evaluate_singles(tables, request, target, sums, scratch)
+        n_z, n_blocks = tables.tiles.shape[:2]
+        with_pairs = self.agn.shape[1] > 0 and tables.ratio.size > 0
+        position, end, share = 0, n_z * n_blocks, 1.0
+        single = self.rtol >= _SINGLE
+        while with_pairs and position < end:
+            n, position = _core.list_runs(tables, request, target, scratch, position)
+            share *= 0.5
+            # the best model met so far gets weight 1
+            reference = scratch.reference[0]
+            if reference > sums.best[2]:
+                if sums.total[0] > 0.0:
+                    _core.rescale(sums, np.exp(0.5 * (sums.best[2] - reference)))
+                sums.best[2] = reference
+            # bounds are raised for second moments only after a first look
+            scratch.tail_galaxy.fill(0.0)
+            scratch.tail_agn.fill(0.0)
+            floor = _core.first_floor(scratch.bound, scratch.count, reference, n)
+            _core.evaluate_runs(tables, request, target, sums, scratch, n, floor, floor, False)
+            room = share * request.rtol * sums.total[0]
+            if room > 0.0:
+                _core.raise_bounds(
+                    tables.agn,
+                    tables.galaxy_unit,
+                    target.weight,
+                    (target.norm + 1.0) / request.tail,
+                    *_core.variances(tables, sums),
+                    scratch.inverse_norm,
+                    scratch.run_key,
+                    scratch.bound,
+                    n,
+                    scratch.tail_galaxy,
+                    scratch.tail_agn,
+                )
+            # a bound holds the largest prior of a fraction, of which all together have 1
+            unit = np.exp(min(0.5 * (reference - sums.best[2]), 600.0)) / tables.prior_frac.max()
+            floor, sure = _core.second_floor(
+                scratch.bound, scratch.count, reference, n, room, unit, request.delta
+            )
+            _core.evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single)
+        return sums.total[0] > 0.0
+
+    def _summarise(self, target, sums, out, i):
+        """Fill row i of the output."""
+        total, tables = sums.total[0], self._tables
+        z, g, k, f = out.index[i] = sums.index
+        scale = out.best_scale[i] = sums.best[1]
+        model = scale * self.galaxy[z, g]
+        if self.frac[f] > 0:
+            power = scale * self.dust[g] * self.frac[f] / (1.0 - self.frac[f])
+            model = model + power * self.agn[z, k]
+        # from the residuals: |F|^2_w - R would lose digits
+        chi2 = np.sum(target.weight * (target.flux - model) ** 2)
+        faint = target.level - model[target.limits] * target.inverse
+        out.chi2[i] = chi2 - 2.0 * log_ndtr(faint).sum()
+        norm = target.norm + target.dark
+        out.log_sum[i] = np.log(total) + 0.5 * (sums.best[2] - norm)
+        out.n_models[i] = sums.best[3]
+        # sums in single precision differ by some 1e-8
+        out.zf[i] = sums.zf / sums.zf.sum()
+        out.galaxy[i] = sums.galaxy[:, 0] / sums.galaxy[:, 0].sum()
+        # without AGN the data say nothing on the torus: its prior
+        prior = tables.prior_agn
+        if prior.size:
+            agn = sums.agn[:, 0] + sums.alone.sum() * prior
+            out.agn[i] = agn / agn.sum()
+        mean, square = sums.band / total
+        out.band[i] = mean, np.sqrt(np.maximum(square - mean * mean, 0.0))
+        _core.summarise(
+            tables,
+            self._request,
+            sums,
+            out.moments[i],
+            out.quantiles[i],
+            out.share[i],
+            out.share_quantiles[i],
+        )
+        out.draw_index[i] = sums.draws.index
+        out.draw_scale[i] = sums.draws.scale
+        for name, table in out.joint.items():
+            table[i] = getattr(sums, name)
+            if name == "zk" and tables.zero_frac:
+                table[i] += sums.zf[:, :1] * prior
+            elif name == "gk":
+                table[i] += sums.alone[:, None] * prior
+            elif name == "fk" and tables.zero_frac:
+                table[i, 0] += sums.alone.sum() * prior
+            table[i] /= table[i].sum()
+
+    def draw(self, flux, sigma, log_prior, n_draws, seeds, *, limit=None, limit_sigma=None):
+        """
+        Draw models from the posteriors, exactly and independently.
+
+        Parameters
+        ----------
+        flux, sigma, log_prior, limit, limit_sigma : `~numpy.ndarray`
+            As in `fit`.
+        n_draws : int
+            Number of draws for each object.
+        seeds : `~numpy.ndarray` of int, shape (n,)
+            Each object's seed: its draws depend on nothing else but its data.
+
+        Returns
+        -------
+        index : `~numpy.ndarray` of int, shape (n, n_draws, 4)
+            Redshift, galaxy, torus and AGN fraction; -1 for objects that could not be fitted.
+            Where the fraction is 0 the torus is one drawn from the prior.
+        scale : `~numpy.ndarray`, shape (n, n_draws)
+            Solar masses formed: with ``scale_error`` drawn from the Gaussian about the model's
+            best scale, as far as it is positive.
+        """
+        out = self.fit(
+            flux,
+            sigma,
+            log_prior,
+            limit=limit,
+            limit_sigma=limit_sigma,
+            n_draws=n_draws,
+            seeds=seeds,
+        )
+        index, scale = out.draw_index, out.draw_scale[:, :, 0]
+        prior = self.prior_agn / self.prior_agn.sum() if self.agn.shape[1] else np.ones(1)
+        for i in np.flatnonzero(np.isfinite(out.chi2)):
+            rng = np.random.default_rng(int(seeds[i]))
+            torus = rng.choice(prior.size, size=n_draws, p=prior)
+            index[i, :, 2] = np.where(index[i, :, 2] < 0, torus, index[i, :, 2])
+            if self.scale_error:
+                error = np.sqrt(out.draw_scale[i, :, 1])
+                low = ndtr(-scale[i] / error)
+                uniform = 1.0 - rng.random(n_draws)
+                scale[i] += error * ndtri(low + (1.0 - low) * uniform)
+        return index, scale
+
+    @cached_property
+    def _request(self):
+        return _core.Request(
+            delta=float(self.delta),
+            rtol=_SAFETY * self.rtol,
+            tail=_TAIL,
+            thin=_THIN * self.rtol,
+            scale_error=float(self.scale_error),
+            levels=self.levels.copy(),
+        )
+
+    @cached_property
+    def _negative(self):
+        """Bands in which a model has negative flux."""
+        negative = np.any(self.galaxy < 0, axis=(0, 1))
+        return negative | np.any(self.agn < 0, axis=(0, 1))
 
     def __getstate__(self):
         # the prepared tables are made again by whoever unpickles
-        return {name: value for name, value in self.__dict__.items() if name != "_tables"}
+        hidden = ("_tables", "_request", "_negative")
+        return {name: value for name, value in self.__dict__.items() if name not in hidden}
 
 
-def _in_own_unit(table):
-    """Divide the fluxes of every model by the largest, in single precision."""
+def _target(flux, weight, log_prior, limit, inverse):
+    """Bundle the data of one object."""
+    limits = np.flatnonzero(inverse > 0)
+    level = limit[limits] * inverse[limits]
+    return _core.Target(
+        flux=flux,
+        weight=weight,
+        log_prior=log_prior,
+        bands=np.flatnonzero(weight > 0),
+        limits=limits,
+        level=level,
+        inverse=inverse[limits],
+        dark=float(-2.0 * log_ndtr(level).sum()),
+        norm=float(np.sum(weight * flux * flux)),
+    )
+
+
+def _unit(table):
+    """Largest flux of every model, shape (nz, n, 1); 1 where there is none."""
     top = table.max(axis=-1, keepdims=True, initial=0.0)
-    return (table / np.where(top > 0, top, 1.0)).astype(np.float32)
+    return np.where(top > 0, top, 1.0)
+
+
+def _ratio(frac):
+    """Odds f / (1 - f), of 1 a large number."""
+    return frac / np.maximum(1.0 - frac, 1e-12)
 
 
 def _writable(array):
     """Copy an array to a contiguous one that may be written to."""
-    return np.array(array, order="C", copy=True)
+    return np.array(array, dtype=np.asarray(array).dtype, order="C", copy=True)
 
 
 def _two_log(prior):

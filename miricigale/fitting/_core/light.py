@@ -1,0 +1,249 @@
+"""
+Pairs side by side in single precision, for those that have little weight each.
+
+With x* the best x of a pair between the smallest and largest, R* = R(x*), s* the scale and
+D* = <m, wm> there, R* D(x) - N(x)^2 is a quadratic in x that is 0 at x*, so that ::
+
+    R* - R(x) = (x - x*) (K (x - x*) + M) / D(x),    K = R* b - a^2,
+
+with M = 0 unless x* is an end of the range. What is worked out in double precision is x - x*, and
+R*, which single precision could not tell from that of other pairs; the rest is of order 1, and
+rounding changes a weight by some 1e-7.
+"""
+
+import numpy as np
+from numba import njit
+
+from miricigale.fitting._core.lanes import (
+    F1,
+    F2,
+    LANES,
+    PRIOR,
+    SHARE,
+    TOP,
+    U2,
+    V1,
+    V2,
+    W0,
+    W1,
+    W2,
+    WR,
+    WZ,
+    X2,
+    A,
+    B,
+    P,
+    Q,
+    exponential,
+)
+
+__all__ = ["light_likelihoods", "light_size", "pair_weight"]
+
+_OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
+
+# Offsets of the vectors in Lanes.light: N, D, K, M, the scale's variance, the share, x*, the
+# other fraction there, ...
+_P, _A, _Q, _X, _B, _K, _M, _VAR, _SHARE, _BEST, _OTHER = (i * LANES for i in range(11))
+# ... sums over the fractions ...
+_S0, _S1, _S2, _Y1, _SY, _Y2, _F1, _F2, _SZ = (i * LANES for i in range(11, 20))
+# ... and work space.
+_D, _I, _PHI = (i * LANES for i in range(20, 23))
+# ... and weights at every fraction, over those at x*.
+_T = 23 * LANES
+
+_LOG2E = np.float32(1.4426950408889634)
+_LN2_HIGH = np.float32(0.693359375)
+_LN2_LOW = np.float32(-2.12194440e-4)
+
+
+def light_size(n_ratio):
+    """Length of Lanes.light."""
+    return _T + n_ratio * LANES
+
+
+@njit(**_OPTIONS)
+def pair_weight(lanes, single, j, i):
+    """Prior * likelihood of the pair in lane i at a fraction."""
+    if single:
+        return lanes.buffer[TOP + i] * lanes.light[_T + j * LANES + i]
+    return lanes.weight[j * LANES + i]
+
+
+@njit(**_OPTIONS)
+def _prepare(buffer, light, power, low, high, reference, scale_error):
+    """
+    Fill the vectors of ``light`` that say what the pairs are.
+
+    Weights at x* go to buffer[W0], units of the scales to buffer[W1], R* to buffer[W2], x* to
+    buffer[WR], which are not needed before the sums. Returned is the largest R*.
+    """
+    two = power.view(np.float64)
+    for i in range(LANES):
+        p, a = buffer[P + i], buffer[A + i]
+        q, x2, b = buffer[Q + i], buffer[X2 + i], buffer[B + i]
+        t = 0.5 * x2
+        rise = a * q - p * t
+        fall = p * b - a * t
+        inner = rise / fall if fall > 0.0 else 1e300
+        best = min(max(inner, low), high) if rise > 0.0 else low
+        num = max(p + best * a, 0.0)
+        one = 1.0 / max(q + best * (x2 + best * b), 1e-300)
+        each = num * one
+        r = num * each
+        k = -0.5 * one * (r * b - a * a)
+        m = -one * ((r * b - a * a) * best + r * t - p * a)
+        unit = max(each, np.sqrt(one))
+        each = one / unit
+        e = 0.5 * (r + buffer[PRIOR + i] - reference)
+        buffer[W0 + i], power[i] = exponential(min(max(e, -700.0), 700.0))
+        buffer[W1 + i] = unit
+        buffer[W2 + i] = r
+        buffer[WR + i] = best
+        light[_P + i] = max(p * each, -1e30)
+        light[_A + i] = a * each
+        light[_Q + i] = q * one
+        light[_X + i] = x2 * one
+        light[_B + i] = b * one
+        light[_K + i] = k if num > 0.0 else 0.0
+        light[_M + i] = m if num > 0.0 and best != inner else 0.0
+        light[_VAR + i] = scale_error * each / unit
+        light[_SHARE + i] = buffer[SHARE + i]
+        light[_BEST + i] = best
+        y = best * buffer[SHARE + i]
+        light[_OTHER + i] = y / (1.0 + y)
+    for i in range(LANES):
+        buffer[W0 + i] *= two[i] if buffer[PRIOR + i] > -1e200 else 0.0
+    top = 0.0
+    for i in range(LANES):
+        top = max(top, buffer[W2 + i])
+    return top
+
+
+@njit(**_OPTIONS)
+def light_likelihoods(
+    buffer, light, power, power32, ratio, frac_prior, first, reference, scale_error, out
+):
+    """
+    Do what `lanes.likelihoods` does, in single precision.
+
+    Parameters
+    ----------
+    light : `~numpy.ndarray` of float32, shape (light_size(n_ratio),) or more
+        Vectors of LANES pairs.
+    power32 : `~numpy.ndarray` of int32, shape (LANES,)
+        Scratch.
+    buffer, power, ratio, frac_prior, first, reference, scale_error, out
+        As there.
+
+    Returns
+    -------
+    top : float
+        Largest R*, which no R exceeds.
+    """
+    zero = np.float32(0)
+    one = np.float32(1)
+    half = np.float32(0.5)
+    # products of what is less than this would be too small for fast numbers
+    lowest = np.float32(-50.0)
+    two = power32.view(np.float32)
+    c_0, c_1 = ratio[0], ratio[-1]
+    top = _prepare(buffer, light, power, c_0, c_1, reference, scale_error)
+    for i in range(_S0, _SZ + LANES):
+        light[i] = zero
+    least = 1e300
+    for i in range(LANES):
+        p, a = buffer[P + i], buffer[A + i]
+        least = min(least, min(p + c_0 * a, p + c_1 * a) if p > -1e29 else 1e300)
+    # where a fraction has R = 0 the difference to R* is not that of the formula
+    some_dark = least <= 0.0
+    for j in range(ratio.size):
+        at = _T + j * LANES
+        c = np.float32(ratio[j])
+        f = np.float32(frac_prior[j + first])
+        for i in range(LANES):
+            d = np.float32(ratio[j] - buffer[WR + i])
+            y = c * light[_SHARE + i]
+            den = light[_Q + i] + c * (light[_X + i] + c * light[_B + i])
+            # one division for both 1 / D and y / (1 + y)
+            both = one / (den * (one + y))
+            inverse = both * (one + y)
+            light[_PHI + i] = y * both * den
+            light[_I + i] = inverse
+            light[_D + i] = d * (light[_K + i] * d + light[_M + i]) * inverse
+        if some_dark:
+            for i in range(LANES):
+                # R* - R is R* there
+                num = buffer[P + i] + ratio[j] * buffer[A + i]
+                light[_D + i] = light[_D + i] if num > 0.0 else -0.5 * buffer[W2 + i]
+        for i in range(LANES):
+            e = max(light[_D + i], lowest)
+            m = np.floor(e * _LOG2E + half)
+            r = e - m * _LN2_HIGH
+            r = r - m * _LN2_LOW
+            v = np.float32(1.9875691500e-4)
+            v = v * r + np.float32(1.3981999507e-3)
+            v = v * r + np.float32(8.3334519073e-3)
+            v = v * r + np.float32(4.1665795894e-2)
+            v = v * r + np.float32(1.6666665459e-1)
+            v = v * r + np.float32(5.0000001201e-1)
+            v = v * (r * r) + r + one
+            power32[i] = (np.int32(m) + np.int32(127)) << np.int32(23)
+            light[at + i] = v * f
+        for i in range(LANES):
+            t = light[at + i] * two[i]
+            light[at + i] = t
+            s = max(light[_P + i] + c * light[_A + i], zero) * light[_I + i]
+            # about the values at x*, so that means and squares keep their digits
+            ds = s - one
+            dy = c * s - light[_BEST + i]
+            phi = light[_PHI + i] - light[_OTHER + i]
+            # what the scale's own variance adds
+            spread = t * light[_VAR + i] * light[_I + i]
+            t_ds = t * ds
+            t_dy = t * dy
+            t_phi = t * phi
+            light[_S0 + i] += t
+            light[_S1 + i] += t_ds
+            light[_S2 + i] += t_ds * ds + spread
+            light[_Y1 + i] += t_dy
+            light[_SY + i] += t_ds * dy + spread * c
+            light[_Y2 + i] += t_dy * dy + spread * (c * c)
+            light[_F1 + i] += t_phi
+            light[_F2 + i] += t_phi * phi
+        if some_dark:
+            for i in range(LANES):
+                dark = light[_P + i] + c * light[_A + i] <= zero
+                light[_SZ + i] += light[at + i] if dark else zero
+    for j in range(ratio.size):
+        at = _T + j * LANES
+        total = 0.0
+        for i in range(LANES):
+            total += buffer[W0 + i] * light[at + i]
+        out[j] = total
+    for i in range(LANES):
+        w0 = buffer[W0 + i]
+        unit = buffer[W1 + i]
+        first = w0 * unit
+        second = first * unit
+        s0 = np.float64(light[_S0 + i])
+        s1 = np.float64(light[_S1 + i])
+        y1 = np.float64(light[_Y1 + i])
+        best = np.float64(light[_BEST + i])
+        w1 = first * (s0 + s1)
+        v1 = first * (best * s0 + y1)
+        buffer[W0 + i] = w0 * s0
+        buffer[TOP + i] = w0
+        buffer[W1 + i] = w1
+        buffer[W2 + i] = second * (s0 + 2.0 * s1 + light[_S2 + i])
+        buffer[V1 + i] = v1
+        buffer[U2 + i] = second * (best * (s0 + s1) + y1 + light[_SY + i])
+        buffer[V2 + i] = second * (best * (best * s0 + 2.0 * y1) + light[_Y2 + i])
+        f1 = np.float64(light[_F1 + i])
+        other = np.float64(light[_OTHER + i])
+        buffer[F1 + i] = w0 * (other * s0 + f1)
+        buffer[F2 + i] = w0 * (other * (other * s0 + 2.0 * f1) + light[_F2 + i])
+        buffer[WZ + i] = w0 * light[_SZ + i]
+        # sum of l R, with R = (p + c a) s; lanes without weight have no p either
+        p = buffer[P + i]
+        buffer[WR + i] = (p if p > -1e200 else 0.0) * w1 + buffer[A + i] * v1
+    return top

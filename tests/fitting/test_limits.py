@@ -1,0 +1,540 @@
+"""Upper limits: everything against a plain evaluation, and what they mean at their extremes."""
+
+import itertools
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import MaskedColumn, QTable
+from scipy.integrate import quad
+from scipy.special import log_ndtr
+from scipy.stats import norm
+
+from miricigale.fitting import BayesFitter, FitFlags, FitResults, fit_file, leave_out, mock_analysis
+from miricigale.fitting.engines.scale import best_scale, chi2_at
+from miricigale.fitting.posterior import cell_edges
+
+ERROR = {"band0": 0.1, "band1": 0.05, "band3": 0.2}
+FLOOR = {"band2": 0.15, "band3": 0.02}
+PRIORS = {
+    "redshift": lambda z: z * np.exp(-z),
+    "frac_agn": [4.0, 2.0, 1.0, 3.0],
+    "tau": [1.0, 0.0, 2.0, 3.0, 0.5],
+    "age": "log",
+    "tau97": [0.3, 0.7],
+    "ebv_polar": lambda x: np.exp(-3 * x),
+    "temperature_polar": [1.0, 3.0],
+}
+EVERYTHING = {"model_error": ERROR, "error_floor": FLOOR, "priors": PRIORS, "rtol": 0}
+
+
+def add_limits(table, grid, part=0.3, seed=0):
+    """Make upper limits of some measured bands: near the flux, on both sides of it."""
+    rng = np.random.default_rng(seed)
+    for name in grid.filters:
+        limit = (rng.random(len(table)) < part) & np.isfinite(table[name])
+        factor = np.where(limit, rng.uniform(0.3, 2.0, len(table)), 1.0)
+        table[name] = table[name] * factor
+        table[f"{name}_limit"] = limit
+    return table
+
+
+def by_hand(table, grid, error=ERROR, floor=FLOOR):
+    """Fluxes, errors as the fit should take them, and limits: arrays (n, nb)."""
+    flux = np.array([table[name].to_value(u.uJy) for name in grid.filters]).T
+    err = np.array([table[f"{name}_err"].to_value(u.uJy) for name in grid.filters]).T
+    limit = np.array([table[f"{name}_limit"] for name in grid.filters]).T
+    extra = np.array([error.get(name, 0.0) for name in grid.filters])
+    least = np.array([floor.get(name, 0.0) for name in grid.filters])
+    total = np.hypot(np.maximum(err, least * abs(flux)), extra * abs(flux))
+    sigma = np.where(limit, err, total)
+    return flux, np.where(np.isfinite(flux), sigma, np.inf), limit & np.isfinite(flux)
+
+
+def prior_by_hand(fitter):
+    """Weights of galaxies and tori as products over their parameters."""
+    grid = fitter.grid
+    galaxy, agn = np.ones(grid.n_galaxies), np.ones(grid.n_agn)
+    for weights, table in ((galaxy, grid.galaxy_parameters), (agn, grid.agn_parameters)):
+        for name in table.colnames:
+            column = np.asarray(getattr(table[name], "value", table[name]))
+            values = np.unique(grid.meta["axes"].get(name, column))
+            prior = PRIORS[name]
+            if isinstance(prior, str):
+                prior = 1.0 / values
+            elif callable(prior):
+                prior = prior(values)
+            prior = np.asarray(prior) / np.sum(prior)
+            # a torus without polar dust stands for all its temperatures
+            hit = column[:, None] == values
+            weights *= np.where(hit.any(axis=1), hit @ prior, 1.0)
+    return galaxy / galaxy.sum(), agn / agn.sum()
+
+
+def other_fraction(grid):
+    """AGN share of the infrared light, shape (nG, nA, nf)."""
+    f = grid.frac_agn
+    power = (f / (1 - f)) * grid.dust_luminosity[:, None, None]
+    agn = power * grid.agn_properties["ir_luminosity"].value[:, None]
+    whole = agn + grid.galaxy_properties["ir_luminosity"].value[:, None, None]
+    return np.divide(agn, whole, out=np.zeros(agn.shape), where=whole > 0)
+
+
+def compare(results, fitter, i, want, sigma, limit, *, rtol=1e-9):
+    """Every sum of one object."""
+    assert results.chi2[i] == pytest.approx(want["chi2"], rel=rtol, abs=rtol)
+    measured = np.isfinite(sigma) & ~limit
+    constant = np.log(sigma[measured]).sum() + 0.5 * measured.sum() * np.log(2 * np.pi)
+    assert results.log_evidence[i] == pytest.approx(want["log_sum"] - constant, abs=1e-8)
+    np.testing.assert_allclose(results.pdf_2d[i], want["zf"], rtol=rtol, atol=1e-13)
+    for name, axis in fitter.priors.axes.items():
+        if axis.kind in ("galaxy", "agn"):
+            expected = axis.share @ want[axis.kind]
+            np.testing.assert_allclose(results.pdf[name][i], expected, rtol=rtol, atol=1e-13)
+    np.testing.assert_allclose(results.moments[i, :, 0], want["mean"], rtol=rtol)
+    np.testing.assert_allclose(results.model_flux[i], want["band"], rtol=rtol)
+    # variances are the difference of two sums: to rtol and rounding
+    for got, mean, std in (
+        (results.moments[i, :, 1], want["mean"], want["std"]),
+        (results.model_flux_std[i], want["band"], want["band_std"]),
+    ):
+        assert np.all(np.abs(got**2 - std**2) <= 2 * rtol * std**2 + 1e-14 * mean**2)
+    z, g, k, f = results.best_index[i]
+    best = want["scale"][z, g, max(k, 0), f] * fitter.grid.flux(z, g, max(k, 0), f)
+    np.testing.assert_allclose(results.best_flux[i], best, rtol=rtol)
+
+
+CASES = {
+    "all": ({}, {}),
+    "no scale error": ({}, {"scale_error": False}),
+    "no galaxy-only models": ({"frac": [0.1, 0.5, 0.8, 0.95]}, {}),
+    "more galaxies than a block": ({"n_tau": 5, "n_age": 13}, {}),
+    "faint": ({}, {"noise": 3.0}),
+    "bright": ({}, {"noise": 0.01}),
+}
+
+
+@pytest.mark.parametrize(
+    ("case", "redshift"),
+    [
+        ("all", "free"),
+        ("all", "density"),
+        ("all", "known"),
+        ("no scale error", "density"),
+        ("no galaxy-only models", "known"),
+        ("more galaxies than a block", "density"),
+        ("faint", "free"),
+        ("faint", "density"),
+        ("bright", "free"),
+        ("bright", "known"),
+    ],
+)
+def test_all_options_at_once_equal_the_plain_sums(
+    case, redshift, make_grid, draw_photometry, brute_force
+):
+    of_grid, options = CASES[case]
+    grid = make_grid(3, **of_grid)
+    fitter = BayesFitter(grid, **EVERYTHING, scale_error=options.get("scale_error", True))
+    noise = options.get("noise", 0.15)
+    table = draw_photometry(grid, 8, seed=5, noise=noise, missing=0.15)[0]
+    table = add_limits(table, grid)
+    flux, sigma, limit = by_hand(table, grid)
+    assert limit.any(axis=1).sum() > 4
+    known, log_prior = {}, [None] * 8
+    z = grid.redshift
+    if redshift == "known":
+        known = {"redshift": "redshift"}
+        node = np.array(table["redshift"])[:, None] == z
+        log_prior = np.log(node, where=node, out=np.full(node.shape, -np.inf))
+    elif redshift == "density":
+        nodes = np.array([0.0, 0.3, 1.1, 2.0, 4.0])
+        density = np.random.default_rng(4).uniform(0.1, 2.0, (8, 5))
+        known = {"redshift_prior": (nodes, density)}
+        edges = cell_edges(z, (0.0, np.inf))
+        whole = np.trapezoid(density, nodes, axis=1)
+        log_prior = [
+            np.log(
+                [
+                    quad(np.interp, a, b, args=(nodes, row), points=nodes[1:-1])[0]
+                    for a, b in itertools.pairwise(edges)
+                ]
+            )
+            - np.log(total)
+            for row, total in zip(density, whole, strict=True)
+        ]
+    results = fitter.fit(table, **known)
+    np.testing.assert_allclose(results.sigma, sigma, rtol=1e-15)
+    np.testing.assert_array_equal(results.limit, limit)
+    galaxy, agn = prior_by_hand(fitter)
+    np.testing.assert_allclose(fitter.priors.galaxy / fitter.priors.galaxy.sum(), galaxy)
+    np.testing.assert_allclose(fitter.priors.agn / fitter.priors.agn.sum(), agn)
+    for i in np.flatnonzero(results.fitted):
+        want = brute_force(fitter, flux[i], sigma[i], log_prior[i], limit[i])
+        compare(results, fitter, i, want, sigma[i], limit[i])
+        # the fraction in its second definition, from luminosities
+        share = other_fraction(grid)
+        weights = want["weights"].sum(axis=0)
+        mean = np.sum(weights * share)
+        assert results.mean("frac_agn_ir")[i].value == pytest.approx(mean, rel=1e-9)
+        std = np.sqrt(np.sum(weights * (share - mean) ** 2))
+        assert results.std("frac_agn_ir")[i].value == pytest.approx(std, rel=1e-9, abs=1e-7)
+        g, k, f = results.best_index[i, 1:]
+        assert results.best["frac_agn_ir"][i] == pytest.approx(share[g, max(k, 0), f], rel=1e-12)
+    unfitted = ~(np.isfinite(sigma) & ~limit).any(axis=1)
+    np.testing.assert_array_equal(results.fitted, ~unfitted)
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.1, 0.5, 5.0])
+def test_pruning_loses_no_more_than_asked(noise, make_grid, draw_photometry):
+    grid = make_grid(7, n_tau=12, n_age=9)
+    table = draw_photometry(grid, 10, seed=3, noise=noise, missing=0.1)[0]
+    table = add_limits(table, grid, part=0.4)
+    whole, pruned = (BayesFitter(grid, rtol=rtol).fit(table) for rtol in (0, 1e-6))
+    np.testing.assert_allclose(pruned.pdf_2d, whole.pdf_2d, atol=1e-6)
+    np.testing.assert_allclose(pruned.log_evidence, whole.log_evidence, atol=1e-6)
+    np.testing.assert_allclose(pruned.chi2, whole.chi2, rtol=1e-12)
+    np.testing.assert_allclose(pruned.moments[..., 0], whole.moments[..., 0], rtol=1e-6)
+    np.testing.assert_allclose(pruned.moments[..., 1], whole.moments[..., 1], rtol=2e-6)
+
+
+def test_one_model_has_the_posterior_of_the_text_book(make_grid):
+    """Detection 10 +- 1, limit 8 +- 0.5 on twice as bright a band: the minimum by scipy."""
+    from scipy.optimize import minimize_scalar
+
+    grid = make_grid(n_z=1, n_tau=1, n_age=1, frac=[0.0], n_b=2)
+    one, two = grid.galaxy[0, 0]
+    table = QTable({"id": ["only"]})
+    mass = 1e10
+    for name, flux, err in (("band0", one, 0.1 * one), ("band1", 0.8 * two, 0.05 * two)):
+        table[name], table[f"{name}_err"] = [flux * mass] * u.uJy, [err * mass] * u.uJy
+    table["band1_limit"] = [True]
+
+    def chi2(s):
+        terms = log_ndtr((0.8 - s) / 0.05)
+        return ((1.0 - s) / 0.1) ** 2 - 2 * terms
+
+    best = minimize_scalar(chi2, bounds=(0.5, 1.0), method="bounded", options={"xatol": 1e-10})
+    results = BayesFitter(grid, model_error=0.0).fit(table)
+    assert results.chi2[0] == pytest.approx(best.fun, rel=1e-9)
+    assert results.best_scale[0] == pytest.approx(best.x * mass, rel=1e-6)
+    step = 1e-4
+    second = (chi2(best.x + step) - 2 * best.fun + chi2(best.x - step)) / step**2
+    assert results.std("mass")[0].value == pytest.approx(mass * np.sqrt(2 / second), rel=1e-5)
+    norm_of_flux = norm(one * mass, 0.1 * one * mass).logpdf(one * mass)
+    assert results.log_evidence[0] == pytest.approx(norm_of_flux - 0.5 * best.fun, rel=1e-9)
+    assert (results.n_bands[0], results.n_limits[0]) == (2, 1)
+    assert results.reduced_chi2[0] == results.chi2[0]
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.5, 10.0])
+def test_samplers_and_grid_define_limits_alike(noise, make_grid, draw_photometry):
+    """Chi2, scale and its variance of single models, by the function that samplers call."""
+    grid = make_grid(n_z=1, n_tau=1, n_age=1, frac=[0.0])
+    table = add_limits(draw_photometry(grid, 40, seed=6, noise=noise)[0], grid, part=0.5)
+    results = BayesFitter(grid, model_error=0.05).fit(table)
+    ok = np.flatnonzero(results.fitted)
+    model = grid.galaxy[0]
+    for i in ok:
+        data = results.flux[i], results.sigma[i], results.limit[i]
+        scale, variance = best_scale(model, *data)
+        assert results.chi2[i] == pytest.approx(chi2_at(scale, model, *data)[0], rel=1e-9)
+        assert results.best_scale[i] == pytest.approx(scale[0], rel=1e-8)
+        assert results.std("mass")[i].value == pytest.approx(np.sqrt(variance[0]), rel=1e-6)
+
+
+def test_percentiles_of_the_other_fraction(make_grid, draw_photometry, brute_force):
+    """The weight of every model is spread over its cell of the fraction."""
+    grid = make_grid(3, n_tau=8, n_age=6)
+    fitter = BayesFitter(grid, rtol=0)
+    table = add_limits(draw_photometry(grid, 8, seed=7, noise=0.4)[0], grid, part=0.2)
+    results = fitter.fit(table)
+    edges = cell_edges(grid.frac_agn, (0.0, 1.0))
+    ends = np.minimum(edges, 1 - 1e-12)
+    galaxy = grid.galaxy_properties["ir_luminosity"].value
+    torus = grid.agn_properties["ir_luminosity"].value
+    # where there is no AGN its torus is a mean one
+    mean = np.average(torus, weights=fitter.priors.agn)
+    y = np.divide(grid.dust_luminosity, galaxy, out=np.zeros(galaxy.size), where=galaxy > 0)
+    y = (ends / (1 - ends)) * y[:, None, None] * torus[:, None]
+    share = y / (1 + y)
+    low, high = share[..., :-1].copy(), share[..., 1:].copy()
+    alone = y[:, :, 1] / torus * mean
+    high[..., 0] = alone / (1 + alone)
+    levels = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
+    for i in np.flatnonzero(results.fitted):
+        weights = brute_force(fitter, results.flux[i], results.sigma[i], limit=results.limit[i])[
+            "weights"
+        ].sum(axis=0)
+        got = results.percentile("frac_agn_ir", levels)[i].value
+
+        def below(x, weights=weights):
+            width = np.maximum(high - low, 1e-12)
+            return np.sum(weights * np.clip((x - low) / width, 0.0, 1.0))
+
+        # bins of the distribution, 0.002 wide at most
+        assert all(below(x - 2e-3) <= p + 1e-4 for x, p in zip(got, levels, strict=True))
+        assert all(below(x + 2e-3) >= p - 1e-4 for x, p in zip(got, levels, strict=True))
+
+
+# ------------------------------------------------------------------------- what limits mean
+
+
+def test_a_limit_far_above_all_models_changes_nothing(make_grid, draw_photometry):
+    grid = make_grid(3)
+    fitter = BayesFitter(grid, rtol=0)
+    table = draw_photometry(grid, 10, seed=2)[0]
+    without = table.copy()
+    without["band4"] = np.nan * u.uJy
+    table["band4"] = 1e6 * table["band4"]
+    table["band4_limit"] = True
+    want, got = fitter.fit(without), fitter.fit(table)
+    np.testing.assert_allclose(got.pdf_2d, want.pdf_2d, rtol=1e-10, atol=1e-14)
+    np.testing.assert_allclose(got.moments[..., :2], want.moments[..., :2], rtol=1e-10)
+    np.testing.assert_allclose(got.log_evidence, want.log_evidence, rtol=1e-12)
+    np.testing.assert_allclose(got.chi2, want.chi2, rtol=1e-10)
+    np.testing.assert_allclose(got.quantiles, want.quantiles, rtol=1e-3)
+    np.testing.assert_array_equal(got.n_bands, want.n_bands + 1)
+
+
+def test_a_limit_without_error_is_a_wall(make_grid, draw_photometry):
+    """As sigma goes to 0 the best scale of every model is that of the detections or the wall's."""
+    grid = make_grid(3)
+    table = draw_photometry(grid, 8, seed=2)[0]
+    wall = 0.5 * table["band4"].value
+    table["band4"] = wall * u.uJy
+    table["band4_err"] = 1e-9 * wall * u.uJy
+    table["band4_limit"] = True
+    fitter = BayesFitter(grid, model_error=0.0, rtol=0)
+    results = fitter.fit(table)
+    assert np.all(results.best_flux[:, 4] <= wall * (1 + 1e-8))
+    assert np.all(results.model_flux[:, 4] <= wall * (1 + 1e-8))
+    index = np.ogrid[tuple(slice(n) for n in (4, 20, grid.n_agn, 4))]
+    model = grid.flux(*index)
+    used = np.arange(6) != 4
+    for i in range(8):
+        flux = results.flux[i, used]
+        weight = results.sigma[i, used] ** -2
+        p, q = (model[..., used] * flux * weight).sum(-1), (model[..., used] ** 2 * weight).sum(-1)
+        scale = np.minimum(np.maximum(p, 0) / q, wall[i] / model[..., 4])
+        chi2 = (weight * (flux - scale[..., None] * model[..., used]) ** 2).sum(-1)
+        chi2[~np.broadcast_to(grid.allowed[:, :, None, None], chi2.shape)] = np.inf
+        assert results.chi2[i] == pytest.approx(chi2.min(), rel=1e-4, abs=1e-4)
+
+
+def test_a_lower_limit_on_flux_moves_the_mass_down(make_grid, draw_photometry):
+    grid = make_grid(3)
+    table = draw_photometry(grid, 10, seed=2)[0]
+    fitter = BayesFitter(grid)
+    means = []
+    for factor in (10.0, 1.0, 0.3, 0.1):
+        other = table.copy()
+        for name in ("band0", "band3"):
+            other[name] = factor * abs(table[name])
+            other[f"{name}_limit"] = True
+        means.append(np.log(fitter.fit(other).model_flux[:, [0, 3]]).sum(axis=1))
+    assert np.all(np.diff(means, axis=0) < 0)
+
+
+def test_fluxes_that_are_limits_need_the_column(make_grid, draw_photometry):
+    """False everywhere is the same as no column; where it is true the numbers differ."""
+    grid = make_grid(3)
+    table = draw_photometry(grid, 6, seed=2)[0]
+    fitter = BayesFitter(grid)
+    plain = fitter.fit(table)
+    assert not plain.limit.any()
+    table["band1_limit"] = False
+    np.testing.assert_array_equal(fitter.fit(table).pdf_2d, plain.pdf_2d)
+    table["band1_limit"][3] = True
+    some = fitter.fit(table)
+    rows = np.arange(6) != 3
+    # a limit of one object leaves the others as they are, bit for bit
+    np.testing.assert_array_equal(some.pdf_2d[rows], plain.pdf_2d[rows])
+    np.testing.assert_array_equal(some.moments[rows], plain.moments[rows])
+    assert np.any(some.pdf_2d[3] != plain.pdf_2d[3])
+
+
+@pytest.mark.parametrize(
+    "column",
+    [
+        [True, False, True],
+        [1, 0, 1],
+        [1.0, 0.0, 1.0],
+        ["True", "false", "T"],
+        ["1", "", "true"],
+        MaskedColumn([True, True, True], mask=[False, True, False]),
+    ],
+)
+def test_how_limits_may_be_written(make_grid, draw_photometry, column):
+    grid = make_grid(3)
+    table = draw_photometry(grid, 3, seed=2)[0]
+    table["band1_limit"] = column
+    assert BayesFitter(grid).fit(table).limit[:, 1].tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize(
+    "column", [[0.5, 0.0, 1.0], ["yes", "no", "no"], [1, 0, 1] * u.uJy, [np.nan, 1.0, 0.0]]
+)
+def test_what_is_not_boolean_is_refused(make_grid, draw_photometry, column):
+    grid = make_grid(3)
+    table = draw_photometry(grid, 3, seed=2)[0]
+    table["band1_limit"] = column
+    with pytest.raises(ValueError, match="whose column 'band1_limit' is boolean, got"):
+        BayesFitter(grid).fit(table)
+
+
+def test_flags_and_counts(make_grid, draw_photometry):
+    grid = make_grid(3)
+    table = draw_photometry(grid, 6, seed=4)[0]
+    limit = np.zeros((6, 6), bool)
+    limit[0] = True
+    limit[1, 1:] = True
+    limit[2, :2] = True
+    for j, name in enumerate(grid.filters):
+        table[f"{name}_limit"] = limit[:, j]
+    # a limit that is missing is none, and one without error is no band
+    table["band0"][2] = np.nan
+    table["band1_err"][2] = 0.0 * u.uJy
+    for name in grid.filters[1:]:
+        table[name][3] = np.nan
+    table["band0_limit"][3] = True
+    results = BayesFitter(grid).fit(table)
+    names = [FitFlags.names(flag) for flag in results.flags]
+    assert names[0] == ["all_limits"]
+    assert "few_for_parameters" in names[1]
+    assert "bad_error" in names[2]
+    assert {"all_limits", "few_bands"} <= set(names[3])
+    assert results.fitted.tolist() == [False, True, True, False, True, True]
+    assert results.n_bands.tolist() == [6, 6, 4, 1, 6, 6]
+    assert results.n_limits.tolist() == [6, 5, 0, 1, 0, 0]
+    out = results.to_table()
+    assert out["n_limits"].tolist() == results.n_limits.tolist()
+    assert out["n_limits"].info.description
+    assert results[1].n_limits == 5
+
+
+def test_negative_models_have_no_limits(make_grid, draw_photometry):
+    from dataclasses import replace
+
+    grid = make_grid(3)
+    galaxy = grid.galaxy.copy()
+    galaxy[0, 0, 2] *= -1
+    fitter = BayesFitter(replace(grid, galaxy=galaxy))
+    table = draw_photometry(grid, 3, seed=4)[0]
+    table["band1_limit"] = True
+    assert fitter.fit(table).fitted.all()
+    table["band2_limit"] = True
+    with pytest.raises(ValueError, match="a model has negative flux, got some in band2"):
+        fitter.fit(table)
+
+
+# --------------------------------------------------------------------- all that fits go through
+
+
+@pytest.fixture(scope="module")
+def catalogue(grid, draw_photometry):
+    table = draw_photometry(grid, 60, seed=8, noise=0.15, missing=0.1)[0]
+    return add_limits(table, grid, part=0.25)
+
+
+def test_results_keep_limits_in_files(grid, catalogue, tmp_path):
+    fitter = BayesFitter(grid)
+    results = fitter.fit(catalogue)
+    results.write(tmp_path / "r.fits")
+    again = FitResults.read(tmp_path / "r.fits")
+    assert again.limit.dtype == bool
+    np.testing.assert_array_equal(again.limit, results.limit)
+    assert again.to_table()["n_limits"].tolist() == results.n_limits.tolist()
+    with pytest.raises(ValueError, match="read-only"):
+        again.limit[0] = True
+
+
+@pytest.mark.parametrize("kind", ["fits", "ecsv", "csv"])
+def test_catalogues_on_disk(grid, catalogue, tmp_path, kind):
+    fitter = BayesFitter(grid)
+    catalogue = catalogue.copy()
+    catalogue["id"][40] = catalogue["id"][3]
+    path = tmp_path / f"catalogue.{kind}"
+    unit = None
+    if kind == "csv":
+        plain = catalogue.copy()
+        for name in plain.colnames:
+            plain[name] = getattr(plain[name], "value", plain[name])
+            if name.endswith("_limit"):
+                plain[name] = plain[name].astype(int if name < "band2" else bool)
+        plain.write(path, format="csv")
+        unit = u.uJy
+    else:
+        catalogue.write(path)
+    parts = list(fit_file(fitter, path, tmp_path / "out", chunk_rows=25, flux_unit=unit).parts())
+    whole = fitter.fit(catalogue)
+    for name in ("limit", "chi2", "pdf_2d", "moments", "quantiles", "n_bands", "flags"):
+        joined = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_array_equal(joined, getattr(whole, name), err_msg=name)
+
+
+def test_samples_follow_the_posterior(grid, catalogue):
+    fitter = BayesFitter(grid)
+    results = fitter.fit(catalogue)
+    n = 4000
+    samples = fitter.sample(catalogue, n, seed=1)
+    np.testing.assert_array_equal(samples.fitted, results.fitted)
+    np.testing.assert_array_equal(samples.flags & 4096, results.flags & 4096)
+    ok = results.fitted
+    for name in ("redshift", "frac_agn", "frac_agn_ir"):
+        mean, std = results.mean(name).value[ok], results.std(name).value[ok]
+        pull = (samples.mean(name).value[ok] - mean) / np.maximum(std, 1e-6) * np.sqrt(n)
+        assert np.abs(pull).max() < 4.5, name
+    # what scales is drawn with its error, cut at 0
+    mean, std = (x.value[ok] for x in (results.mean("mass"), results.std("mass")))
+    near = std < 0.3 * mean
+    pull = (samples.mean("mass").value[ok] - mean) / std * np.sqrt(n)
+    assert np.abs(pull[near]).max() < 4.5
+
+
+def test_mocks_perturb_fluxes_and_keep_limits(grid, catalogue):
+    fitter = BayesFitter(grid, model_error=0.0)
+    results = fitter.fit(catalogue)
+    mock = mock_analysis(fitter, results, catalogue, seed=5)
+    pulls = []
+    for j, name in enumerate(grid.filters):
+        limit = results.limit[:, j]
+        new, old = mock.photometry[name].value, catalogue[name].value
+        np.testing.assert_array_equal(new[limit], old[limit])
+        changed = results.fitted & np.isfinite(old) & ~limit
+        pulls.append(((new - results.best_flux[:, j]) / catalogue[f"{name}_err"].value)[changed])
+    np.testing.assert_array_equal(mock.recovered.limit, results.limit)
+    np.testing.assert_array_equal(mock.recovered.fitted, results.fitted)
+    pull = np.concatenate(pulls)
+    assert abs(pull.std() - 1) < 4 / np.sqrt(2 * pull.size)
+    metrics = mock.metrics(["frac_agn_ir"])
+    assert metrics["unit"][0] == ""
+    assert metrics["n"][0] == results.fitted.sum()
+
+
+def test_bands_left_out_have_predictions_but_no_pull_for_limits(grid, catalogue):
+    fitter = BayesFitter(grid)
+    out = leave_out(fitter, catalogue, ["band2"])
+    limit = np.array(catalogue["band2_limit"])
+    found = out.results["band2"]
+    assert np.isnan(out.pull[limit]).all()
+    assert np.isfinite(out.predicted[limit & found.fitted]).all()
+    assert not found.limit[:, 2].any()
+    assert found.limit[:, 3].any()
+    assert np.isfinite(out.pull[~limit & found.fitted & np.isfinite(catalogue["band2"])]).all()
+
+
+def test_plots_show_arrows():
+    from matplotlib.lines import CARETDOWNBASE
+
+    from miricigale.plotting.axes import new_figure
+    from miricigale.plotting.posteriors import plot_sed_fit
+
+    wave = np.array([1.0, 3.0, 9.0]) * u.um
+    flux, err = np.array([3.0, 5.0, -1.0]) * u.uJy, np.array([0.3, 0.5, 0.2]) * u.uJy
+    _, axes = new_figure(2)
+    top, bottom = axes.ravel()[:2]
+    plot_sed_fit(wave, flux, err, flux, limit=[False, True, True], ax=(top, bottom))
+    for ax in (top, bottom):
+        caps = [line for bar in ax.containers for line in bar.lines[1]]
+        arrows = [line for line in caps if line.get_marker() == CARETDOWNBASE]
+        assert [len(line.get_xdata()) for line in arrows] == [2]

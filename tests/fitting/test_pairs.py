@@ -1,0 +1,363 @@
+"""Joint posteriors of two parameters, against plain sums over models."""
+
+import pickle
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import fields, replace
+from itertools import combinations
+from multiprocessing import get_context
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import QTable
+
+from miricigale.fitting import BayesFitter, FitResults, fit_file, open_results
+
+PRIORS = {
+    "redshift": lambda z: z * np.exp(-z),
+    "age": "log",
+    "ebv_polar": [0.5, 1.0, 2.0],
+    "temperature_polar": [1.0, 3.0],
+}
+CASES = {
+    "default": ({}, {}),
+    "priors": ({}, {"priors": PRIORS}),
+    "prior_f by width": ({}, {"prior_f": "uniform"}),
+    "no galaxy-only models": ({"frac": [0.1, 0.5, 0.95]}, {}),
+    "no AGN": ({"frac": [0.0]}, {}),
+    "one redshift": ({"n_z": 1}, {}),
+    "no scale error": ({}, {"scale_error": False}),
+    "CIGALE": ({}, {"compat": "cigale"}),
+}
+
+
+def free_pairs(fitter):
+    """All pairs of parameters that have several values."""
+    free = [name for name, axis in fitter.priors.axes.items() if axis.values.size > 1]
+    # in both orders
+    return [pair if i % 2 else pair[::-1] for i, pair in enumerate(combinations(free, 2))]
+
+
+def members(grid, name, values, weights):
+    """Part of the models of its table that have each value of a parameter: kind and array."""
+    if name in ("redshift", "frac_agn"):
+        return name, np.eye(len(values))
+    kind = "galaxy" if name in grid.galaxy_parameters.colnames else "agn"
+    column = u.Quantity(getattr(grid, f"{kind}_parameters")[name]).value
+    part = np.array([np.isclose(column, value) for value in values], dtype=float)
+    if name == "temperature_polar":
+        # tori without polar dust are of all temperatures
+        part[:, grid.agn_parameters["ebv_polar"].value == 0] = np.reshape(weights, (-1, 1))
+    return kind, part
+
+
+def plain(fitter, weights, x, y):
+    """Joint posterior from the weights of all models (z, g, k, f)."""
+    letter = {"redshift": "z", "galaxy": "g", "agn": "k", "frac_agn": "f"}
+    terms, parts = "zgkf", []
+    for name, value in ((x, "x"), (y, "y")):
+        axis = fitter.priors.axes[name]
+        kind, part = members(fitter.grid, name, axis.values, axis.weights)
+        terms += f",{value}{letter[kind]}"
+        parts.append(part)
+    return np.einsum(f"{terms}->xy", weights, *parts)
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(("rtol", "atol"), [(0.0, 1e-9), (1e-6, 1e-6)])
+def test_every_pair_is_the_sum_over_all_models(
+    case, rtol, atol, make_grid, draw_photometry, brute_force
+):
+    of_grid, of_fitter = CASES[case]
+    grid = make_grid(3, **of_grid)
+    fitter = BayesFitter(grid, rtol=rtol, **of_fitter)
+    table, _ = draw_photometry(grid, 4, seed=5, missing=0.2, noise=0.3)
+    pairs = free_pairs(fitter)
+    results = fitter.fit(table, pairs=pairs)
+    assert results.fitted.all()
+    for i in range(len(table)):
+        weights = brute_force(fitter, results.flux[i], results.sigma[i])["weights"]
+        for x, y in pairs:
+            want = plain(fitter, weights, x, y)
+            np.testing.assert_allclose(
+                results.joint_pdf(x, y)[i], want, rtol=0, atol=atol, err_msg=f"{x}, {y}"
+            )
+
+
+def test_with_upper_limits_and_known_redshifts(make_grid, draw_photometry, brute_force):
+    grid = make_grid(6)
+    fitter = BayesFitter(grid, rtol=0, n_bands_min=2)
+    table, truth = draw_photometry(grid, 4, seed=8, noise=0.3)
+    table["band1_limit"] = [True, True, False, True]
+    table["band4_limit"] = [False, True, True, False]
+    pairs = free_pairs(fitter)
+    free = fitter.fit(table, pairs=pairs)
+    fixed = fitter.fit(table, pairs=pairs, redshift="redshift")
+    for i in range(len(table)):
+        known = np.where(np.arange(grid.redshift.size) == truth[i][0], 0.0, -np.inf)
+        for results, log_prior in ((free, None), (fixed, known)):
+            weights = brute_force(
+                fitter, results.flux[i], results.sigma[i], log_prior, results.limit[i]
+            )["weights"]
+            for x, y in pairs:
+                want = plain(fitter, weights, x, y)
+                np.testing.assert_allclose(results.joint_pdf(x, y)[i], want, rtol=0, atol=1e-9)
+
+
+def test_merged_models_are_as_all_of_them_apart(make_grid, draw_photometry):
+    """A torus that stands for two temperatures times two laws, against the four one by one."""
+    rng = np.random.default_rng(4)
+    some = make_grid(4)
+    rows = [(e, t, law) for e in (0.0, 0.3) for t in (100.0, 200.0) for law in (1.0, 2.0)]
+    ebv, temperature, law = np.array(rows).T
+    agn = 1e-36 * np.exp(rng.normal(0, 0.8, (some.redshift.size, 8, len(some.filters))))
+    agn[:, :4] = agn[:, :1]
+    power = rng.uniform(1.0, 3.0, 8)
+    power[:4] = power[0]
+    names = {"ebv_polar": [0.0, 0.3], "temperature_polar": [100.0, 200.0], "law": [1.0, 2.0]}
+    apart = replace(
+        some,
+        agn=agn,
+        agn_parameters=QTable({"ebv_polar": ebv, "temperature_polar": temperature, "law": law}),
+        agn_properties=QTable({"accretion_power": power, "ir_luminosity": power}),
+        agn_multiplicity=np.ones(8, int),
+        meta={"axes": names},
+    )
+    keep = np.array([0, 4, 5, 6, 7])
+    parameters = apart.agn_parameters[keep]
+    parameters["temperature_polar"][0], parameters["law"][0] = 150.0, 1.5
+    merged = replace(
+        apart,
+        agn=agn[:, keep],
+        agn_parameters=parameters,
+        agn_properties=apart.agn_properties[keep],
+        agn_multiplicity=np.array([4, 1, 1, 1, 1]),
+    )
+    table, _ = draw_photometry(apart, 5, noise=0.3)
+    priors = {"temperature_polar": [1.0, 3.0], "law": [2.0, 1.0]}
+    one, two = (BayesFitter(grid, rtol=0, priors=priors) for grid in (merged, apart))
+    pairs = free_pairs(two)
+    one, two = one.fit(table, pairs=pairs), two.fit(table, pairs=pairs)
+    assert {"ebv_polar", "temperature_polar", "law"} < set(one.axes)
+    for x, y in pairs:
+        np.testing.assert_allclose(one.joint_pdf(x, y), two.joint_pdf(x, y), rtol=0, atol=1e-10)
+
+
+@pytest.fixture(scope="module")
+def fitter(grid):
+    return BayesFitter(grid)
+
+
+@pytest.fixture(scope="module")
+def results(fitter, photometry):
+    table = QTable(photometry, copy=True)
+    for name in fitter.grid.filters:
+        # nothing to fit
+        table[name][3] = np.nan
+    return fitter.fit(table, pairs=free_pairs(fitter))
+
+
+def assert_same(one, two):
+    """Two results are one, bit for bit."""
+    for item in fields(FitResults):
+        a, b = getattr(one, item.name), getattr(two, item.name)
+        if isinstance(b, np.ndarray):
+            np.testing.assert_array_equal(a, b, err_msg=item.name, strict=True)
+        elif item.name in ("pdf", "best", "pairs"):
+            assert list(a) == list(b)
+            for name, array in b.items():
+                np.testing.assert_array_equal(a[name], array, err_msg=str(name), strict=True)
+
+
+def test_marginals_are_the_posteriors_of_each(results):
+    assert len(results.pairs) == 20  # of 7 parameters 21, one of which is always there
+    for x, y in results.pairs:
+        table = results.pairs[x, y]
+        assert table.shape == (
+            len(results),
+            results.axes[x].values.size,
+            results.axes[y].values.size,
+        )
+        np.testing.assert_allclose(table.sum(axis=2), results.pdf[x], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(table.sum(axis=1), results.pdf[y], rtol=0, atol=1e-6)
+        assert np.isnan(table[3]).all()
+        assert not results.fitted[3]
+
+
+def test_either_order_and_the_view_of_one_object(results):
+    for x, y in [*results.pairs, ("redshift", "frac_agn")]:
+        table = results.joint_pdf(x, y)
+        np.testing.assert_array_equal(results.joint_pdf(y, x), table.swapaxes(1, 2))
+        np.testing.assert_array_equal(results[5].joint_pdf(x, y), table[5])
+        np.testing.assert_array_equal(results[5].joint_pdf(y, x), table[5].T)
+        with pytest.raises(ValueError, match="read-only"):
+            table[0] = 0.0
+    np.testing.assert_array_equal(results.joint_pdf("redshift", "frac_agn"), results.pdf_2d)
+    assert list(results[5].pairs) == list(results.pairs)
+
+
+def test_draws_agree_within_their_error(fitter, results, photometry):
+    n = 6000
+    samples = fitter.sample(photometry[:1], n, seed=2)
+    key = photometry["id"][0]
+    for x, y in results.pairs:
+        want = results[key].joint_pdf(x, y)
+        got = samples.pdf_2d(x, y, key)[2]
+        # a binomial number in each cell
+        error = np.sqrt(want * (1 - want) / n)
+        np.testing.assert_array_less(np.abs(got - want), 5 * error + 3 / n, err_msg=f"{x}, {y}")
+
+
+def test_nothing_else_changes_nor_does_the_cut(fitter, results, photometry, monkeypatch):
+    pairs = list(results.pairs)
+    whole = fitter.fit(photometry, pairs=pairs)
+    without = fitter.fit(photometry)
+    assert without.pairs == {}
+    assert_same(replace(whole, pairs={}), without)
+    assert_same(fitter.fit(photometry, pairs=pairs, chunk_size=5), whole)
+    with ThreadPoolExecutor(2) as executor:
+        assert_same(fitter.fit(photometry, pairs=pairs, chunk_size=3, executor=executor), whole)
+    # one object at a time, as on large grids
+    monkeypatch.setattr("miricigale.fitting.pieces._JOINT_SIZE", 1)
+    assert_same(fitter.fit(photometry, pairs=pairs), whole)
+    empty = fitter.fit(photometry[:0], pairs=pairs)
+    assert empty.joint_pdf("age", "tau").shape == (0, 4, 5)
+
+
+def test_only_what_is_needed_is_asked_of_the_engine(fitter, photometry, monkeypatch):
+    asked = []
+    fit = type(fitter._engine).fit
+
+    def listening(self, *args, joint=(), **kwargs):
+        asked.append(set(joint))
+        return fit(self, *args, joint=joint, **kwargs)
+
+    monkeypatch.setattr(type(fitter._engine), "fit", listening)
+    for pairs, want in (
+        (None, set()),
+        ([("age", "tau"), ("tau97", "ebv_polar"), ("frac_agn", "redshift")], set()),
+        ([("age", "redshift"), ("redshift", "tau")], {"zg"}),
+        ([("tau97", "frac_agn"), ("tau97", "age")], {"fk", "gk"}),
+    ):
+        fitter.fit(photometry[:2], pairs=pairs)
+        assert asked.pop() == want
+
+
+def test_another_process_has_them_too(fitter, photometry):
+    pairs = [("redshift", "age"), ("tau", "ebv_polar"), ("age", "tau")]
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor:
+        there = fitter.fit(photometry, pairs=pairs, executor=executor, chunk_size=7)
+    here = fitter.fit(photometry, pairs=pairs)
+    for names in pairs:
+        np.testing.assert_allclose(there.pairs[names], here.pairs[names], rtol=0, atol=1e-12)
+    assert_same(pickle.loads(pickle.dumps(here)), here)
+
+
+def test_files_keep_them(results, tmp_path):
+    results.write(tmp_path / "new.fits")
+    assert_same(FitResults.read(tmp_path / "new.fits"), results)
+    assert_same(results.with_model(None), results)
+    # what the version before wrote has none
+    replace(results, pairs={}).write(tmp_path / "old.fits")
+    fits.setval(tmp_path / "old.fits", "FORMAT", value="miricigale-fitresults-2")
+    old = FitResults.read(tmp_path / "old.fits")
+    assert old.pairs == {}
+    np.testing.assert_array_equal(old.joint_pdf("redshift", "frac_agn"), results.pdf_2d)
+
+
+def test_from_file_to_file(fitter, photometry, tmp_path):
+    table = QTable(photometry, copy=True)
+    table["id"][9] = table["id"][1]
+    table.write(tmp_path / "catalogue.fits")
+    pairs = [("age", "redshift"), ("tau", "temperature_polar")]
+    source, folder = tmp_path / "catalogue.fits", tmp_path / "out"
+    files = fit_file(fitter, source, folder, chunk_rows=5, pairs=pairs)
+    whole = fitter.fit(table, pairs=pairs)
+    parts = list(files.parts())
+    for names in pairs:
+        joined = np.concatenate([part.pairs[names] for part in parts])
+        np.testing.assert_array_equal(joined, whole.pairs[names])
+    key = table["id"][7]
+    got = open_results(folder)[key].joint_pdf("redshift", "age")
+    np.testing.assert_array_equal(got, whole[key].joint_pdf("redshift", "age"))
+    # the same in other words goes on, others do not
+    fit_file(fitter, source, folder, chunk_rows=5, pairs=[*pairs, ("redshift", "frac_agn")])
+    for other in (None, pairs[:1]):
+        with pytest.raises(ValueError, match="results of another fit: pairs differ"):
+            fit_file(fitter, source, folder, chunk_rows=5, pairs=other)
+    with pytest.raises(KeyError, match="'mood'"):
+        fit_file(fitter, source, tmp_path / "new", pairs=[("mood", "age")])
+    assert not (tmp_path / "new").exists()
+
+
+def test_cigale_forgets_them_where_its_weights_vanish(grid, photometry):
+    table = QTable(photometry[:2], copy=True)
+    for name in grid.filters:
+        table[f"{name}_err"][0] = 1e-9 * table[name][0]
+    fitter = BayesFitter(grid, compat="cigale", model_error=0.0)
+    results = fitter.fit(table, pairs=[("age", "redshift")])
+    assert np.isnan(results.joint_pdf("age", "redshift")[0]).all()
+    assert results.joint_pdf("age", "redshift")[1].sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "error", "message"),
+    [
+        ([("mood", "age")], KeyError, "no parameter for 'pairs' 'mood'; known: age, ebv_polar"),
+        ([("age", "age")], ValueError, "'pairs' must be of two different parameters"),
+        ([("age", "mass")], ValueError, "'pairs' must be of parameters of the grid .*'mass'"),
+        ([("frac_agn_ir", "age")], ValueError, "of the grid .*'frac_agn_ir'"),
+        (("age", "tau"), ValueError, "'pairs' must be a list of pairs .*'age' in it"),
+        ([("age", "tau", "tau97")], ValueError, "'pairs' must be a list of pairs"),
+        (["ab"], ValueError, "'pairs' must be a list of pairs"),
+        ("age", ValueError, "'pairs' must be a list of pairs"),
+        ([3], ValueError, "'pairs' must be a list of pairs .*3 in it"),
+        (3, ValueError, "'pairs' must be a list of pairs"),
+    ],
+)
+def test_errors_name_the_argument(fitter, photometry, pairs, error, message):
+    with pytest.raises(error, match=message):
+        fitter.fit(photometry, pairs=pairs)
+
+
+def test_one_value_has_no_joint_posterior(make_grid, draw_photometry):
+    grid = make_grid(n_z=1, n_tau=1)
+    fitter = BayesFitter(grid, priors={"tau": [1.0]})
+    table, _ = draw_photometry(grid, 1)
+    for name in ("redshift", "tau"):
+        with pytest.raises(ValueError, match=f"several values, got '{name}', which has one"):
+            fitter.fit(table, pairs=[(name, "age")])
+    with pytest.raises(ValueError, match="several values, got 'tau', which has one"):
+        BayesFitter(grid).fit(table, pairs=[("age", "tau")])
+
+
+def test_the_same_pair_is_kept_once(fitter, photometry):
+    pairs = [("age", "tau"), ("tau", "age"), ("frac_agn", "redshift"), ("age", "tau")]
+    assert list(fitter.fit(photometry[:1], pairs=pairs).pairs) == [("age", "tau")]
+    assert fitter.fit(photometry[:1], pairs=[]).pairs == {}
+
+
+def test_what_was_not_asked_for_is_named(fitter, photometry):
+    results = fitter.fit(photometry[:1], pairs=[("age", "tau")])
+    with pytest.raises(KeyError, match="no joint posterior of tau97 and tau; known: age and tau, "):
+        results.joint_pdf("tau97", "tau")
+    with pytest.raises(KeyError, match="no parameter 'mood'"):
+        results[0].joint_pdf("mood", "tau")
+
+
+def test_any_pair_is_drawn(results):
+    mpl = pytest.importorskip("matplotlib")
+    mpl.use("Agg")
+    from miricigale.plotting.axes import new_figure
+
+    for x, y in [("age", "tau"), ("tau", "age"), ("redshift", "frac_agn"), ("tau97", "redshift")]:
+        ax = new_figure()[1][0, 0]
+        assert results.plot_pdf2d(2, x, y, ax=ax) is ax
+        assert ax.get_xlabel().split()[0] == x
+        assert ax.get_ylabel().split()[0] == y
+        drawn = ax.collections[0].get_array()
+        assert drawn.size == results.joint_pdf(x, y)[2].size
+    assert ax.get_xlabel() == "tau97"
+    ax = new_figure()[1][0, 0]
+    assert results[2].plot_pdf2d("age", "tau", ax=ax).get_xlabel() == "age (Gyr)"

@@ -1,0 +1,260 @@
+"""What holds for any photometry: missing bands, limits, any S/N, any unit, negative fluxes."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+from scipy.special import log_ndtr
+
+from miricigale.fitting import BayesFitter, FitFlags
+from miricigale.fitting.quantities import DERIVED_LEVELS
+
+N = 200
+SETTINGS = {
+    "default": {},
+    "no model error": {"model_error": 0.0},
+    "exact": {"rtol": 0, "model_error": 0.02},
+    "cigale": {"compat": "cigale"},
+    "no scale error": {"scale_error": False, "error_floor": 0.05},
+}
+ARRAYS = (
+    "flags",
+    "n_bands",
+    "limit",
+    "chi2",
+    "log_evidence",
+    "pdf_2d",
+    "moments",
+    "quantiles",
+    "model_flux",
+    "model_flux_std",
+    "best_flux",
+    "best_index",
+    "best_scale",
+)
+
+
+def wild_photometry(grid, n=N, seed=0, *, units=True):
+    """Models at S/N of 1e-3 to 1e5 in units of 1e-12 to 1e12, some bands missing or limits."""
+    rng = np.random.default_rng(seed)
+    n_b = len(grid.filters)
+    z, g = rng.integers(grid.redshift.size, size=n), rng.integers(grid.n_galaxies, size=n)
+    k, f = rng.integers(grid.n_agn, size=n), rng.integers(grid.frac_agn.size, size=n)
+    flux = 1e9 * grid.flux(z, g, k, f)
+    if units:
+        flux *= 10.0 ** rng.uniform(-12, 12, (n, 1))
+    # one S/N for each object, and another for each band
+    noise = 10.0 ** (-rng.uniform(-3, 5, (n, 1)) + rng.normal(0.0, 0.5, (n, n_b)))
+    err = np.abs(flux) * noise
+    flux = flux + err * rng.normal(size=flux.shape)
+    flux = np.where(rng.random(flux.shape) < 0.02, -flux, flux)
+    flux[rng.random(flux.shape) < rng.choice([0.0, 0.1, 0.6], (n, 1))] = np.nan
+    err[rng.random(err.shape) < 0.01] = np.nan
+    limit = rng.random(flux.shape) < rng.choice([0.0, 0.2, 0.7], (n, 1))
+    flux = np.where(limit, np.abs(flux) + 10.0 ** rng.uniform(-1, 1, flux.shape) * err, flux)
+    table = QTable({"id": [f"object {i}" for i in range(n)]})
+    for j, name in enumerate(grid.filters):
+        table[name] = flux[:, j] * u.uJy
+        table[f"{name}_err"] = err[:, j] * u.uJy
+        table[f"{name}_limit"] = limit[:, j]
+    return table
+
+
+def scaled(table, grid, factor):
+    """Multiply all fluxes and errors."""
+    out = table.copy()
+    for name in grid.filters:
+        out[name] = out[name] * factor
+        out[f"{name}_err"] = out[f"{name}_err"] * factor
+    return out
+
+
+def assert_same_moments(got, want, rtol):
+    """
+    Means to rtol, and variances, which are the difference of two sums, to that and rounding.
+
+    Shape (n, n_quantities, 2 or 3).
+    """
+    np.testing.assert_allclose(got[..., 0], want[..., 0], rtol=rtol, atol=0)
+    error = np.abs(got[..., 1] ** 2 - want[..., 1] ** 2)
+    allowed = 3.0 * rtol * want[..., 1] ** 2 + 1e-14 * want[..., 0] ** 2
+    assert np.all(error <= allowed)
+
+
+@pytest.fixture(scope="module", params=[1, 2, 3])
+def wild(request, make_grid):
+    grid = make_grid(request.param)
+    return grid, wild_photometry(grid, seed=request.param)
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+def test_posteriors_are_posteriors(wild, settings):
+    grid, table = wild
+    results = BayesFitter(grid, **SETTINGS[settings]).fit(table)
+    assert list(results.ids) == list(table["id"])
+    ok = results.fitted
+    assert ok.mean() > 0.5
+    assert np.all(((results.flags & int(FitFlags.UNFITTED)) != 0) == ~ok)
+    for name, axis in results.axes.items():
+        pdf = results.pdf[name]
+        assert np.all(np.isnan(pdf[~ok]))
+        assert np.all(np.isfinite(pdf[ok]))
+        assert np.all(pdf[ok] >= 0)
+        np.testing.assert_allclose(pdf[ok].sum(axis=1), 1.0, rtol=1e-12, err_msg=name)
+        mean, slack = results.mean(name).value[ok], 1e-12 * np.abs(axis.values).max()
+        assert np.all(mean >= axis.values[0] - slack)
+        assert np.all(mean <= axis.values[-1] + slack)
+    np.testing.assert_allclose(results.pdf_2d[ok].sum(axis=(1, 2)), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(results.pdf_2d[ok].sum(axis=2), results.pdf["redshift"][ok])
+    levels = [0.002, 0.025, 0.16, 0.5, 0.84, 0.975, 0.998]
+    for name in results.parameters:
+        mean, std = results.mean(name).value, results.std(name).value
+        assert np.all(np.isnan(mean[~ok])), name
+        assert np.all(np.isfinite(mean[ok])), name
+        assert np.all(std[ok] >= 0), name
+        percentiles = results.percentile(name, levels).value[ok]
+        # interpolated between kept levels: equal but for rounding where they are
+        steps = np.diff(percentiles, axis=1)
+        assert np.all(steps >= -1e-12 * np.abs(percentiles[:, 1:])), name
+    assert np.all(np.diff(results.quantiles[ok], axis=2) >= 0)
+    assert results.quantiles.shape[2] == DERIVED_LEVELS.size
+    assert np.all(results.mean("frac_agn_ir")[ok] >= 0)
+    assert np.all(results.mean("frac_agn_ir")[ok] <= 1)
+    assert np.all(results.mean("mass")[ok] >= 0)
+    assert np.all(np.isfinite(results.log_evidence[ok]))
+    assert np.all(results.model_flux[ok] >= 0)
+    assert np.all(results.model_flux_std[ok] >= 0)
+
+
+@pytest.mark.parametrize("settings", ["default", "no model error"])
+def test_chi2_is_that_of_the_best_model(wild, settings):
+    """Terms of detections and limits at the best parameters, one by one."""
+    grid, table = wild
+    results = BayesFitter(grid, **SETTINGS[settings]).fit(table)
+    ok = np.flatnonzero(results.fitted)
+    z, g, k, f = results.best_index[ok].T
+    model = results.best_scale[ok, None] * grid.flux(z, g, np.maximum(k, 0), f)
+    np.testing.assert_allclose(results.best_flux[ok], model, rtol=1e-12)
+    assert np.all(results.chi2[ok] >= 0)
+    sigma, limit = results.sigma[ok], results.limit[ok]
+    used = np.isfinite(sigma)
+    apart = np.where(used, (results.flux[ok] - model) / sigma, 0.0)
+    terms = np.where(used, np.where(limit, -2.0 * log_ndtr(apart), apart**2), 0.0)
+    # chi2 is what is left of sum F^2 / sigma^2: it has the digits of that
+    whole = np.where(used & ~limit, np.square(results.flux[ok] / sigma), 0.0).sum(axis=1)
+    error = np.abs(results.chi2[ok] - terms.sum(axis=1))
+    assert np.all(error <= 1e-9 * results.chi2[ok] + 1e-14 * whole + 1e-9)
+    assert np.all(results.best["redshift"][ok] == grid.redshift[z])
+    assert np.all(grid.allowed[z, g])
+
+
+def test_order_pieces_and_executors_change_nothing(wild):
+    grid, table = wild
+    fitter = BayesFitter(grid)
+    whole = fitter.fit(table)
+    order = np.random.default_rng(0).permutation(N)[: N // 2]
+    some = fitter.fit(table[order])
+    with ThreadPoolExecutor(2) as pool:
+        threads = fitter.fit(table, executor=pool, chunk_size=23)
+    one = fitter.fit(table[:20], chunk_size=1)
+    for name in ARRAYS:
+        want = getattr(whole, name)
+        np.testing.assert_array_equal(getattr(some, name), want[order], err_msg=name)
+        np.testing.assert_array_equal(getattr(threads, name), want, err_msg=name)
+        np.testing.assert_array_equal(getattr(one, name), want[:20], err_msg=name)
+
+
+@pytest.mark.parametrize("factor", [1e-9, 0.37, 1e6])
+def test_brighter_and_heavier_is_the_same(make_grid, factor):
+    """All fluxes and errors times a factor: masses times it, everything else as it was."""
+    grid = make_grid(5)
+    table = wild_photometry(grid, 100, seed=4, units=False)
+    fitter = BayesFitter(grid, rtol=0, model_error=0.05)
+    one, two = fitter.fit(table), fitter.fit(scaled(table, grid, factor))
+    ok = one.fitted
+    np.testing.assert_array_equal(two.fitted, ok)
+    np.testing.assert_array_equal(two.flags, one.flags)
+    np.testing.assert_allclose(two.pdf_2d[ok], one.pdf_2d[ok], rtol=1e-7, atol=1e-10)
+    np.testing.assert_allclose(two.chi2[ok], one.chi2[ok], rtol=1e-8, atol=1e-8)
+    n = one.n_bands - one.n_limits
+    np.testing.assert_allclose(
+        two.log_evidence[ok], (one.log_evidence - n * np.log(factor))[ok], rtol=1e-9, atol=1e-8
+    )
+    extensive = [name not in one.intensive for name in one.quantities]
+    moments = one.moments[ok][..., :2] * np.where(extensive, factor, 1.0)[:, None]
+    assert_same_moments(two.moments[ok], moments, 1e-6)
+    for name in one.axes:
+        np.testing.assert_allclose(two.pdf[name][ok], one.pdf[name][ok], rtol=1e-7, atol=1e-10)
+    np.testing.assert_allclose(two.model_flux[ok], factor * one.model_flux[ok], rtol=1e-7)
+    mass = one.percentile("mass", [0.16, 0.5, 0.84]).value[ok] * factor
+    # bins of 0.01 dex
+    np.testing.assert_allclose(
+        two.percentile("mass", [0.16, 0.5, 0.84]).value[ok], mass, rtol=0.024
+    )
+
+
+def test_a_band_of_enormous_error_changes_nothing(wild):
+    grid, table = wild
+    fitter = BayesFitter(grid, rtol=0, model_error=0.05)
+    name = grid.filters[3]
+    without = table.copy()
+    without[name] = np.nan * u.uJy
+    without[f"{name}_limit"] = False
+    other = without.copy()
+    # a flux within the error, of which the model error is a small part
+    fluxes = [np.abs(without[n].value) for n in grid.filters if n != name]
+    size = np.nan_to_num(fluxes).max(axis=0)
+    size = np.where(size > 0, size, 1.0)
+    other[name], other[f"{name}_err"] = size * u.uJy, 1e12 * size * u.uJy
+    want, got = fitter.fit(without), fitter.fit(other)
+    # one band more may make a fit of what was none
+    ok = want.fitted
+    assert got.fitted[ok].all()
+    np.testing.assert_array_equal(got.n_bands, want.n_bands + 1)
+    np.testing.assert_allclose(got.pdf_2d[ok], want.pdf_2d[ok], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(got.chi2[ok], want.chi2[ok], rtol=1e-8, atol=1e-8)
+    assert_same_moments(got.moments[ok], want.moments[ok], 1e-6)
+    constant = np.log(1e12 * size) + 0.5 * np.log(2 * np.pi)
+    np.testing.assert_allclose(
+        got.log_evidence[ok], (want.log_evidence - constant)[ok], rtol=1e-9, atol=1e-7
+    )
+
+
+def test_more_data_never_fit_better(wild):
+    """The best chi2 can only grow with another band, as can that of a lower limit."""
+    grid, table = wild
+    fitter = BayesFitter(grid, model_error=0.0)
+    fewer = table.copy()
+    fewer[grid.filters[0]] = np.nan * u.uJy
+    lower = table.copy()
+    for name in grid.filters:
+        limit = table[f"{name}_limit"]
+        shift = np.where(limit, table[f"{name}_err"].value, 0.0)
+        lower[name] = (table[name].value - shift) * u.uJy
+    every, few, low = fitter.fit(table), fitter.fit(fewer), fitter.fit(lower)
+    both = every.fitted & few.fitted
+    used = np.isfinite(every.sigma) & ~every.limit
+    whole = np.where(used, np.square(every.flux / every.sigma), 0.0).sum(axis=1)
+    slack = 1e-9 * (1.0 + every.chi2) + 1e-13 * whole
+    assert np.all((few.chi2 <= every.chi2 + slack)[both])
+    assert np.all((low.chi2 >= every.chi2 - slack)[every.fitted])
+
+
+def test_draws_are_models_of_the_grid(wild):
+    grid, table = wild
+    fitter = BayesFitter(grid)
+    results, samples = fitter.fit(table[:60]), fitter.sample(table[:60], 30, seed=4)
+    ok = results.fitted
+    np.testing.assert_array_equal(samples.fitted, ok)
+    np.testing.assert_array_equal(samples.flags[~ok], results.flags[~ok])
+    z, g = np.moveaxis(samples.index[ok][..., :2], -1, 0)
+    assert grid.allowed[z, g].all()
+    assert np.all(samples.scale[ok] >= 0)
+    assert np.isfinite(samples.scale[ok]).all()
+    # no draw of a redshift that the posterior has not
+    assert np.all(np.take_along_axis(results.pdf["redshift"][ok], z, axis=1) > 0)
+    again = fitter.sample(table[:60][::-1], 30, seed=4)
+    np.testing.assert_array_equal(again.index[::-1], samples.index)
+    np.testing.assert_array_equal(again.scale[::-1], samples.scale)
