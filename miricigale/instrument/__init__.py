@@ -8,7 +8,7 @@ from miricigale.instrument.detector import (
     miri_detector,
     reference_pixel_mask,
 )
-from miricigale.instrument.dithers import dither_offsets, dither_patterns
+from miricigale.instrument.dithers import dither_offsets, dither_patterns, read_dithers
 from miricigale.instrument.exposure import (
     CEERS_FILTERS,
     Exposure,
@@ -75,6 +75,7 @@ __all__ = [
     "pixel_to_v2v3",
     "proposal_limit",
     "psf_fwhm",
+    "read_dithers",
     "readout_patterns",
     "reference_pixel_mask",
     "saturation_forecast",

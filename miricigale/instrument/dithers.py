@@ -1,12 +1,20 @@
 """Dither patterns: offsets of the pointing along the axes of the imager."""
 
+import functools
+import os
+import re
+from pathlib import Path
+
 import astropy.units as u
 import numpy as np
+from astropy.io.registry import IORegistryError
+from astropy.table import QTable, Table
 
-from miricigale.utils.exceptions import argument_error, unknown_name
-from miricigale.utils.units import to_array
+from miricigale.utils.exceptions import DataError, argument_error, unknown_name
+from miricigale.utils.tables import require_columns
+from miricigale.utils.units import ANGLE, to_array
 
-__all__ = ["dither_offsets", "dither_patterns"]
+__all__ = ["dither_offsets", "dither_patterns", "read_dithers"]
 
 # sides of the pixel at the reference, arcsec (SIAF)
 _PIXEL = (0.110497, 0.111336)
@@ -36,22 +44,68 @@ _PATTERNS = {
 }
 
 
+#: Cycling patterns: standard deviation and largest radius in pixels. Gaussian as IRAC's, from
+#: which the observatory's are taken, the small one without its middle.
+_CYCLING = {
+    "cycling-small": (8.0, 11.0),
+    "cycling-medium": (26.0, 64.0),
+    "cycling-large": (52.0, 128.0),
+}
+_N_CYCLING = 311
+#: Half pixels in turn.
+_PHASES = ((0.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
+
+
+def _radical_inverse(n, base):
+    """The first n numbers of a Halton sequence: evenly spread over 0 to 1 from any start."""
+    result, index, weight = np.zeros(n), np.arange(1, n + 1), 1.0 / base
+    while np.any(index):
+        result += weight * (index % base)
+        index, weight = index // base, weight / base
+    return result
+
+
+@functools.cache
+def _cycling(name):
+    sigma, limit = _CYCLING[name]
+    share = _radical_inverse(_N_CYCLING, 2)
+    inner = (0.4 * limit if name == "cycling-small" else 0.0) ** 2 / (2 * sigma**2)
+    a, b = np.exp(-inner), np.exp(-((limit - 1) ** 2) / (2 * sigma**2))
+    radius = sigma * np.sqrt(-2 * np.log(a - share * (a - b)))
+    angle = 2 * np.pi * _radical_inverse(_N_CYCLING, 3)
+    points = np.round(np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1))
+    points += np.array(_PHASES)[np.arange(_N_CYCLING) % 4]
+    points.flags.writeable = False
+    return points
+
+
+def _points(pattern):
+    return _cycling(pattern) if pattern in _CYCLING else np.array(_PATTERNS[pattern])
+
+
 def dither_patterns():
     """Names of the patterns."""
-    return tuple(_PATTERNS)
+    return (*_PATTERNS, *_CYCLING)
 
 
-def dither_offsets(pattern, n):
+def dither_offsets(pattern, n=None, *, start=0):
     """
     Offsets of the pointing.
 
     Parameters
     ----------
-    pattern : str or `~astropy.units.Quantity`
-        ``"ceers"`` (3 points within 2.6" of the centre, or 6 within 5"), ``"4-point"`` (a box of 2" by 3" with
-        half-pixel phases), ``"none"``, or a table of offsets of shape (m, 2).
-    n : int
-        How many; patterns start again, shifted by a quarter pixel, when they are used up.
+    pattern : str, path-like, `~astropy.units.Quantity` or `~astropy.table.Table`
+        ``"ceers"`` (3 points within 2.6" of the centre, or 6 within 5"), ``"4-point"`` (a box
+        of 2" by 3" with half-pixel phases), ``"cycling-small"``, ``"cycling-medium"`` or
+        ``"cycling-large"`` (311 points within 1.2", 7" or 14", Gaussian, half-pixel phases in
+        turn of four), ``"none"``; or offsets: of shape (m, 2), a table with ``x_offset`` and
+        ``y_offset``, or the `~pathlib.Path` of a file for `read_dithers`.
+    n : int, optional
+        How many; all of the pattern's by default. Named patterns start again, shifted by a
+        quarter pixel, when they are used up.
+    start : int, optional
+        Which of the pattern's points comes first, from 0, as cycling patterns go on from tile to
+        tile.
 
     Returns
     -------
@@ -63,17 +117,100 @@ def dither_offsets(pattern, n):
     KeyError
         If there is no such pattern.
     ValueError
-        If ``n`` is smaller than 1, or larger than a table of offsets.
+        If ``n`` is smaller than 1, or with ``start`` larger than a table of offsets.
     """
-    if n < 1 or int(n) != n:
+    if n is not None and (n < 1 or int(n) != n):
         raise argument_error("n", "a positive integer", n)
-    if not isinstance(pattern, str):
-        offsets = to_array(pattern, u.arcsec, "pattern", ndim=2, finite=True)
-        if offsets.shape[1] != 2 or offsets.shape[0] < n:
-            raise argument_error("pattern", f"offsets of shape ({n}, 2)", f"shape {offsets.shape}")
-        return offsets[:n] * u.arcsec
-    if pattern not in _PATTERNS:
-        raise unknown_name("dither pattern", pattern, _PATTERNS)
-    points = np.array(_PATTERNS[pattern])
-    turns, step = np.divmod(np.arange(int(n)), len(points))
-    return (points[step] + 0.25 * turns[:, None]) * np.array(_PIXEL) * u.arcsec
+    if start < 0 or int(start) != start:
+        raise argument_error("start", "0 or a positive integer", start)
+    if isinstance(pattern, str):
+        if pattern not in dither_patterns():
+            raise unknown_name("dither pattern", pattern, dither_patterns())
+        points = _points(pattern)
+        number = int(start) + np.arange(len(points) if n is None else int(n))
+        turns, step = np.divmod(number, len(points))
+        return (points[step] + 0.25 * turns[:, None]) * np.array(_PIXEL) * ANGLE
+    if isinstance(pattern, os.PathLike):
+        pattern = read_dithers(pattern)
+    elif isinstance(pattern, Table):
+        pattern = _table_offsets(pattern, "pattern")
+    offsets = to_array(pattern, ANGLE, "pattern", ndim=2, finite=True)
+    last = len(offsets) if n is None else int(start) + int(n)
+    if offsets.shape[1] != 2 or len(offsets) < last or last <= start:
+        wanted = f"offsets of shape ({last}, 2)"
+        raise argument_error("pattern", wanted, f"shape {offsets.shape}")
+    return offsets[int(start) : last] * ANGLE
+
+
+def _table_offsets(table, argument):
+    names = ("x_offset", "y_offset")
+    require_columns(table, names, argument, units=dict.fromkeys(names, ANGLE))
+    columns = [to_array(u.Quantity(table[name]), ANGLE, name, finite=True) for name in names]
+    return np.stack(columns, axis=1) * ANGLE
+
+
+def read_dithers(path, *, observation=None):
+    """
+    Read offsets from a table or from APT's list of pointings.
+
+    Parameters
+    ----------
+    path : path-like
+        A table with the columns ``x_offset`` and ``y_offset`` and their units (ECSV, FITS), or
+        the list that APT exports as ``.pointing``: of this the rows of MIRI imager apertures
+        (``MIRIM_...``) that are exposures of science or in parallel are taken, one for each
+        dither, and their ``DithX`` and ``DithY``.
+    observation : int, optional
+        Number of the observation, for a list of several.
+
+    Returns
+    -------
+    offsets : `~astropy.units.Quantity`, shape (n, 2)
+        Along the ideal +x and +y axes, arcsec.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If there is no such file, or no offsets in it.
+    ValueError
+        If a list has several observations with such rows and none, or another, is asked for.
+    """
+    path = Path(path).expanduser()
+    if not path.is_file():
+        msg = f"no file of dithers {str(path)!r}"
+        raise DataError(msg)
+    if path.suffix.lower() == ".pointing":
+        return _read_pointings(path, observation)
+    try:
+        table = QTable.read(path, format={".ecsv": "ascii.ecsv"}.get(path.suffix.lower()))
+    except (IORegistryError, OSError, ValueError, TypeError) as err:
+        msg = f"{path} cannot be read as a table: {str(err).splitlines()[0]}"
+        raise DataError(msg) from err
+    return _table_offsets(table, path.name)
+
+
+def _read_pointings(path, observation):
+    """Rows by observation; the columns are those of APT's header line."""
+    found, apertures, current = {}, set(), 0
+    for line in path.read_text(errors="replace").splitlines():
+        words = line.split()
+        if line.startswith("* "):
+            number = re.search(r"\(Obs (\d+)\)", line) or re.search(r"Observation (\d+)", line)
+            current = int(number.group(1)) if number else current + 1
+        if len(words) < 19 or not all(word.isdigit() for word in words[:4]):
+            continue
+        apertures.add(words[4])
+        if not words[4].startswith("MIRIM") or words[18] not in ("SCIENCE", "PARALLEL"):
+            continue
+        # target and tile, dither: several exposures of one place stand in rows of their own
+        key = (words[0], words[1], words[3])
+        rows = found.setdefault(current, {})
+        rows.setdefault(key, (float(words[11]), float(words[12])))
+    if not found:
+        msg = f"{path} has no exposures of MIRIM apertures; it has {sorted(apertures)}"
+        raise DataError(msg)
+    if observation is None and len(found) == 1:
+        observation = next(iter(found))
+    if observation not in found:
+        raise argument_error("observation", f"one of {sorted(found)}", observation)
+    return np.array(list(found[observation].values())) * ANGLE

@@ -245,18 +245,20 @@ class Exposure:
             "SUBSIZE2": part.shape[0],
         }
 
-    def dithered(self, pattern, n, *, first=0):
+    def dithered(self, pattern, n=None, *, first=0, start=0):
         """
         This exposure at ``n`` positions of a dither pattern.
 
         Parameters
         ----------
-        pattern : str or `~astropy.units.Quantity`
+        pattern : str, path-like, `~astropy.units.Quantity` or `~astropy.table.Table`
             See `dither_offsets`.
-        n : int
-            Number of positions.
+        n : int, optional
+            Number of positions; all of the pattern's by default.
         first : int, optional
-            Number of the first dither.
+            Number of the first dither, a label.
+        start : int, optional
+            Which point of the pattern is the first.
 
         Returns
         -------
@@ -265,7 +267,7 @@ class Exposure:
         pa = self.pa_aper
         return [
             self.replace(pointing=tangent_offset(self.pointing, dx, dy, pa), dither=first + number)
-            for number, (dx, dy) in enumerate(dither_offsets(pattern, n))
+            for number, (dx, dy) in enumerate(dither_offsets(pattern, n, start=start))
         ]
 
 

@@ -31,6 +31,10 @@ TABLE_START = math.log(1e-8)
 TABLE_STEP = 0.05
 TABLE_SIZE = 600
 
+#: Largest relative change of the brightness within a cell (exponent) for which one value with
+#: the Laplacian does, and for which 3 x 3 points do.
+_LAPLACIAN, _GAUSS3 = 0.12, 1.0
+
 _NODES8, _WEIGHTS8 = np.polynomial.legendre.leggauss(8)
 _NODES3, _WEIGHTS3 = np.polynomial.legendre.leggauss(3)
 _NODES6, _WEIGHTS6 = np.polynomial.legendre.leggauss(6)
@@ -38,7 +42,7 @@ _NODES6, _WEIGHTS6 = np.polynomial.legendre.leggauss(6)
 
 @njit(cache=True)
 def _lookup(log_r, table):
-    """Enclosed fraction and first radial moment at ln(R / R_e), by cubic Hermite pieces."""
+    """Enclosed fraction and first radial moment at ln(R / R_e), by quintic and cubic pieces."""
     t = (log_r - TABLE_START) / TABLE_STEP
     if t <= 0.0:
         r = math.exp(log_r - TABLE_START)
@@ -51,7 +55,14 @@ def _lookup(log_r, table):
     h10 = t * (1.0 - t) * (1.0 - t) * TABLE_STEP
     h01 = t * t * (3.0 - 2.0 * t)
     h11 = t * t * (t - 1.0) * TABLE_STEP
-    f = h00 * table[0, i] + h10 * table[1, i] + h01 * table[0, i + 1] + h11 * table[1, i + 1]
+    t3 = t * t * t
+    end = t3 * (10.0 - 15.0 * t + 6.0 * t * t)
+    slope0 = (t - t3 * (6.0 - 8.0 * t + 3.0 * t * t)) * TABLE_STEP
+    slope1 = -t3 * (4.0 - 7.0 * t + 3.0 * t * t) * TABLE_STEP
+    bend0 = 0.5 * t * t * (1.0 - t) * (1.0 - t) * (1.0 - t) * TABLE_STEP * TABLE_STEP
+    bend1 = 0.5 * t3 * (1.0 - t) * (1.0 - t) * TABLE_STEP * TABLE_STEP
+    f = (1.0 - end) * table[0, i] + slope0 * table[1, i] + bend0 * table[4, i]
+    f += end * table[0, i + 1] + slope1 * table[1, i + 1] + bend1 * table[4, i + 1]
     m = h00 * table[2, i] + h10 * table[3, i] + h01 * table[2, i + 1] + h11 * table[3, i + 1]
     return f, m
 
@@ -131,7 +142,7 @@ def cell(dx, dy, size, par, table, out):
         Side of the cell.
     par : array, shape (13,)
         The source's parameters.
-    table : array, shape (4, TABLE_SIZE)
+    table : array, shape (5, TABLE_SIZE)
         Its enclosed light (`miricigale.profiles.sersic.light_table`).
     out : array, shape (3,)
         Filled with the light and the offset of its centroid from the cell's centre.
@@ -151,7 +162,7 @@ def cell(dx, dy, size, par, table, out):
     if z > 80.0 + slope * change:
         out[0] = 0.0
         return
-    if slope * change < 0.35:
+    if slope * change < _LAPLACIAN:
         f = par[3] * math.exp(-z) * size * size
         # f'' / f = (slope^2 - slope (power - 1) / w) (grad w)^2 - slope laplacian w
         grad2 = 4.0 * (gx * gx + gy * gy)
@@ -161,7 +172,7 @@ def cell(dx, dy, size, par, table, out):
         out[2] = -2.0 * slope * gy * size * size / 12.0
         return
     light, mx, my = 0.0, 0.0, 0.0
-    if slope * change < 1.0:
+    if slope * change < _GAUSS3:
         for i in range(3):
             oy = 0.5 * size * _NODES3[i]
             for j in range(3):

@@ -96,9 +96,9 @@ def light_table(n):
 
     Returns
     -------
-    table : `~numpy.ndarray`, shape (N, 4, TABLE_SIZE)
-        Enclosed fraction and its derivative, first radial moment and its derivative, at
-        even steps of ln(R / R_e).
+    table : `~numpy.ndarray`, shape (N, 5, TABLE_SIZE)
+        Enclosed fraction and its derivative, first radial moment and its derivative, second
+        derivative of the enclosed fraction, at even steps of ln(R / R_e).
     """
     n = np.atleast_1d(np.asarray(n, dtype=float))[:, None]
     bn = sersic_bn(n)
@@ -107,7 +107,8 @@ def light_table(n):
     density = np.exp(2 * n * np.log(bn) - gammaln(2 * n) + 2 * log_r - z) / n  # dF / d ln R
     fraction = gammainc(2 * n, z)
     moment = np.exp(gammaln(3 * n) - gammaln(2 * n) - n * np.log(bn)) * gammainc(3 * n, z)
-    return np.stack([fraction, density, moment, density * np.exp(log_r)], axis=1)
+    bend = density * (2 - z / n)
+    return np.stack([fraction, density, moment, density * np.exp(log_r), bend], axis=1)
 
 
 def parameter_rows(*, x, y, total_flux, r_eff, n, axis_ratio, theta):

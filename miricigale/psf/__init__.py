@@ -12,17 +12,14 @@ from miricigale.psf.energy import (
     psf_table,
     radius_of_encircled_energy,
 )
+from miricigale.psf.field import grid_weights, miri_psf_grid, psf_at, psf_grid
 from miricigale.psf.kernels import REGULARIZATIONS, MatchingKernel
-from miricigale.psf.library import (
-    MIRI_PIXEL_SCALE,
-    gaussian_psf,
-    hst_psf,
-    miri_psf,
-    moffat_psf,
-)
+from miricigale.psf.library import MIRI_PIXEL_SCALE, hst_psf, miri_psf
 from miricigale.psf.model import PSFInfo, from_photutils, make_psf, psf_info, read_psf
 from miricigale.psf.optics import Pupil, hst_pupil, jwst_pupil
 from miricigale.psf.resample import average_psf, psf_image, psf_mosaic, rotate_psf
+from miricigale.psf.shapes import gaussian_psf, moffat_psf
+from miricigale.psf.stars import psf_from_stars
 
 __all__ = [
     "EFFECTS",
@@ -37,12 +34,17 @@ __all__ = [
     "from_photutils",
     "fwhm",
     "gaussian_psf",
+    "grid_weights",
     "hst_psf",
     "hst_pupil",
     "jwst_pupil",
     "make_psf",
     "miri_psf",
+    "miri_psf_grid",
     "moffat_psf",
+    "psf_at",
+    "psf_from_stars",
+    "psf_grid",
     "psf_image",
     "psf_info",
     "psf_mosaic",

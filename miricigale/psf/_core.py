@@ -4,6 +4,7 @@ import math
 
 import numba
 import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
 
 __all__ = [
     "box_transfer",
@@ -153,6 +154,16 @@ def wavefront(amplitude, segments, x, y, rms, segment_fraction, rng):
     return rms * _standardise(total, weights)
 
 
+def _phases(angles, frequencies, dtype):
+    """exp(-2 pi i times the outer product); whole turns go before the precision does."""
+    turns = np.outer(angles, frequencies)
+    turns -= np.rint(turns)
+    result = np.empty(turns.shape, dtype=dtype)
+    turns = (2 * np.pi * turns).astype(result.real.dtype)
+    result.real, result.imag = np.cos(turns), -np.sin(turns)
+    return result
+
+
 def matrix_dft_intensity(
     pupil, step, wavelength, theta_x, theta_y, *, power=None, dtype=np.complex64
 ):
@@ -190,9 +201,10 @@ def matrix_dft_intensity(
     """
     n = pupil.shape[0]
     position = (np.arange(n) - 0.5 * (n - 1)) * step
-    left = np.exp(-2j * np.pi / wavelength * np.outer(theta_y, position)).astype(dtype)
-    right = np.exp(-2j * np.pi / wavelength * np.outer(position, theta_x)).astype(dtype)
-    field = left @ pupil.astype(dtype) @ right
+    left = _phases(theta_y, position / wavelength, dtype)
+    same = theta_x is theta_y
+    right = left if same else _phases(theta_x, position / wavelength, dtype)
+    field = left @ pupil.astype(dtype) @ right.T
     cell = (theta_x[1] - theta_x[0]) * (theta_y[1] - theta_y[0]) * (step / wavelength) ** 2
     scale = cell / (np.sum(np.abs(pupil) ** 2) if power is None else power)
     return (field.real.astype(float) ** 2 + field.imag.astype(float) ** 2) * scale
@@ -237,17 +249,15 @@ def line_scatter(image, kernel, axis):
     scattered : `~numpy.ndarray`, shape (n, n)
     """
     n = image.shape[axis]
-    size = 2 * n
+    size = next_fast_len(2 * n, real=True)
     circular = np.zeros(size)
     circular[:n] = kernel[:n]
     circular[size - n + 1 :] = kernel[1:n][::-1]
-    transfer = np.fft.rfft(circular).real
-    shape = [1, 1]
-    shape[axis] = transfer.size
-    result = np.fft.irfft(
-        np.fft.rfft(image, size, axis=axis) * transfer.reshape(shape), size, axis=axis
-    )
-    return np.take(result, np.arange(n), axis=axis)
+    transfer = rfft(circular).real
+    # the lines side by side in memory
+    lines = np.ascontiguousarray(np.moveaxis(image, axis, -1))
+    result = irfft(rfft(lines, size) * transfer, size)[:, :n]
+    return np.ascontiguousarray(np.moveaxis(result, -1, axis))
 
 
 @numba.njit(cache=True)

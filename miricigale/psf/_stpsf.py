@@ -5,6 +5,7 @@ import os
 import numpy as np
 from astropy.io import fits
 
+from miricigale.psf.effects import EFFECTS
 from miricigale.psf.library import MIRI_PIXEL_SCALE
 from miricigale.psf.model import from_photutils
 from miricigale.utils.exceptions import DataError, argument_error
@@ -65,6 +66,9 @@ def stpsf_grid(
     Returns
     -------
     grid : `~photutils.psf.GriddedPSFModel`
+        With the entries of the meta that `~miricigale.psf.psf_grid` gives, so that
+        `~miricigale.psf.psf_at` and `~miricigale.scene.Scene` take it. The pixel is the same all
+        over the field.
 
     Raises
     ------
@@ -81,7 +85,7 @@ def stpsf_grid(
         raise argument_error("n_psfs", "a square number", n_psfs)
     instrument = _instrument(filter, opd)
     pixels = to_array(fov, ANGLE, "fov") / MIRI_PIXEL_SCALE.value
-    return instrument.psf_grid(
+    grid = instrument.psf_grid(
         num_psfs=int(n_psfs),
         all_detectors=False,
         oversample=int(oversampling),
@@ -89,6 +93,16 @@ def stpsf_grid(
         nlambda=int(n_wavelengths),
         verbose=False,
     )
+    scale = float(MIRI_PIXEL_SCALE.value)
+    grid.meta.update(
+        filter=f"miri.{str(filter).removeprefix('miri.').lower()}",
+        pixel_scale=scale,
+        pixel_scales=[scale] * len(grid.data),
+        frame="detector",
+        includes=list(EFFECTS),
+        source="stpsf",
+    )
+    return grid
 
 
 def stpsf_psf(filter, *, x=515.0, y=511.0, **options):
@@ -115,7 +129,7 @@ def stpsf_psf(filter, *, x=515.0, y=511.0, **options):
         grid,
         pixel_scale=MIRI_PIXEL_SCALE,
         frame="detector",
-        includes=("jitter", "cruciform", "pixel", "ipc"),
+        includes=EFFECTS,
         x=x,
         y=y,
     )

@@ -9,13 +9,25 @@ from miricigale.psf import _core
 from miricigale.psf.optics import jwst_constants
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["EFFECTS", "blur", "cruciform", "cruciform_fraction", "detector_response"]
+__all__ = [
+    "EFFECTS",
+    "blur",
+    "cruciform",
+    "cruciform_fraction",
+    "cruciform_shift",
+    "detector_response",
+]
 
 #: Effects that a PSF may include, in the order in which they act.
 EFFECTS = ("jitter", "cruciform", "pixel", "ipc")
 
 #: Length over which the cruciform falls by e, in pixels.
 _FOLDING = 25.0
+
+#: Where the cross stands beside the source, pixels, against the column or row in the full
+#: frame: broken lines through stpsf's nodes, which were read off stars in flight.
+_SHIFT_X = ((0.0, 357.0, 1031.0), (1.5, 0.5, -0.9))
+_SHIFT_Y = ((0.0, 511.0, 1031.0), (1.6, 0.0, -1.6))
 
 #: Factors on the amplitudes that in-flight images ask for.
 _IN_FLIGHT = {"miri.f560w": 2.0}
@@ -60,7 +72,45 @@ def cruciform_fraction(filter_name, *, calibration="flight"):
     return both / (1 + both)
 
 
-def cruciform(image, filter_name, *, oversampling, calibration="flight"):
+def cruciform_shift(x, y):
+    """
+    Offset of the cruciform's centre from the source, which leads to the array's middle.
+
+    Parameters
+    ----------
+    x, y : float
+        Position in the full frame, 0-based pixels.
+
+    Returns
+    -------
+    shift : tuple of float
+        Offset of the arm along the columns in x and of that along the rows in y, pixels;
+        nothing at about (598, 511).
+
+    References
+    ----------
+    stpsf (STScI), ``detectors.py``, from effective PSFs at F560W.
+    """
+    return float(np.interp(x, *_SHIFT_X)), float(np.interp(y, *_SHIFT_Y))
+
+
+def _shifted(image, shift, axis):
+    """Shift by a fraction of cells, linearly: sum and centroid are kept but for the edge."""
+    whole = math.floor(shift)
+    part = shift - whole
+    result = np.zeros_like(image)
+    for step, weight in ((whole, 1 - part), (whole + 1, part)):
+        n = image.shape[axis] - abs(step)
+        if weight == 0 or n <= 0:
+            continue
+        source, target = [slice(None)] * 2, [slice(None)] * 2
+        source[axis] = slice(max(0, -step), max(0, -step) + n)
+        target[axis] = slice(max(0, step), max(0, step) + n)
+        result[tuple(target)] += weight * image[tuple(source)]
+    return result
+
+
+def cruciform(image, filter_name, *, oversampling, calibration="flight", shift=(0.0, 0.0)):
     """
     Scatter light along rows and columns, as the detector does at short wavelengths.
 
@@ -77,6 +127,8 @@ def cruciform(image, filter_name, *, oversampling, calibration="flight"):
         Cells per pixel.
     calibration : {"flight", "stpsf"}, optional
         stpsf's amplitudes, or those with the factor 2 that in-flight F560W images want.
+    shift : tuple of float, optional
+        Offset of the cross in x, y in pixels (see `cruciform_shift`).
 
     Returns
     -------
@@ -91,7 +143,11 @@ def cruciform(image, filter_name, *, oversampling, calibration="flight"):
         return image
     distance = np.arange(max(image.shape)) / oversampling
     kernel = _profile(distance, filter_name, calibration) / oversampling
-    scattered = _core.line_scatter(image, kernel, 0) + _core.line_scatter(image, kernel, 1)
+    columns, rows = (_core.line_scatter(image, kernel, axis) for axis in (0, 1))
+    if any(shift):
+        columns = _shifted(columns, shift[0] * oversampling, 1)
+        rows = _shifted(rows, shift[1] * oversampling, 0)
+    scattered = columns + rows
     return (image + scattered) * (1 - fraction)
 
 

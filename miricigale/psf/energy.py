@@ -5,6 +5,7 @@ import numpy as np
 from astropy.table import QTable
 from scipy.optimize import least_squares
 
+from miricigale.instrument import imager_filters, psf_fwhm
 from miricigale.psf import _core
 from miricigale.psf.model import half_maximum_width, psf_info
 from miricigale.utils.exceptions import argument_error
@@ -127,6 +128,13 @@ def _gaussian_width(data, x, y, start):
     return float(least_squares(residual, [1.0, start]).x[1])
 
 
+def _r80(psf):
+    try:
+        return radius_of_encircled_energy(psf, 0.8).value
+    except ValueError:
+        return np.nan
+
+
 def psf_table(psfs, *, radii=(0.5, 1.0, 1.5, 2.5, 5.0) * u.arcsec):
     """
     Tabulate PSFs: width, radius of 80 %, encircled energies.
@@ -141,19 +149,31 @@ def psf_table(psfs, *, radii=(0.5, 1.0, 1.5, 2.5, 5.0) * u.arcsec):
     Returns
     -------
     table : `~astropy.table.QTable`
-        Columns ``filter``, ``fwhm``, ``fwhm_gaussian``, ``r80``, ``enclosed`` and ``eef_<radius>``.
+        Columns ``filter``, ``frame``, ``angle`` (NaN on the detector), ``includes``, ``fwhm``,
+        ``fwhm_gaussian``, ``fwhm_flight`` (NaN but for MIRI's filters), ``r80`` (NaN if the
+        grid holds less), ``enclosed`` and ``eef_<radius>``, with units and descriptions.
     """
     psfs = list(psfs)
+    infos = [psf_info(psf, f"psfs[{i}]") for i, psf in enumerate(psfs)]
     table = QTable()
     table["filter"] = [str(psf.meta.get("filter", "")) for psf in psfs]
+    table["frame"] = [info.frame for info in infos]
+    table["angle"] = [info.angle if info.frame == "sky" else np.nan for info in infos] * u.deg
+    table["includes"] = [" ".join(info.includes) for info in infos]
     table["fwhm"] = u.Quantity([fwhm(psf) for psf in psfs])
     table["fwhm_gaussian"] = u.Quantity([fwhm(psf, method="gaussian") for psf in psfs])
-    table["r80"] = u.Quantity([radius_of_encircled_energy(psf, 0.8) for psf in psfs])
-    table["enclosed"] = [psf_info(psf).enclosed for psf in psfs]
+    flight = [psf_fwhm(n).value if n in imager_filters() else np.nan for n in table["filter"]]
+    table["fwhm_flight"] = flight * ANGLE
+    table["r80"] = [_r80(psf) for psf in psfs] * ANGLE
+    table["enclosed"] = [info.enclosed for info in infos]
     for radius in radii:
         name = f"eef_{radius.to_value(ANGLE):g}"
         table[name] = [encircled_energy(psf, radius) for psf in psfs]
         table[name].info.description = f"fraction of all light within {radius}"
+    table["frame"].info.description = "axes of the detector, or turned to the sky"
+    table["angle"].info.description = "position angle of +y, east of north"
+    table["includes"].info.description = "what the PSF holds besides the optics"
+    table["fwhm_flight"].info.description = "of stars in flight (JWST programme 1028)"
     table["fwhm"].info.description = "full width at half maximum of the azimuthal mean"
     table["fwhm_gaussian"].info.description = "that of a Gaussian fitted out to 0.75 FWHM"
     table["r80"].info.description = "radius that holds 80 % of all light"

@@ -1,4 +1,4 @@
-"""PSFs by name: the nine MIRI imaging filters, WFC3/IR mosaics, simple shapes."""
+"""PSFs by name: the nine MIRI imaging filters, WFC3/IR mosaics."""
 
 import functools
 import math
@@ -8,14 +8,21 @@ import numpy as np
 from scipy.optimize import brentq
 
 from miricigale.filters import Filter
-from miricigale.psf.effects import EFFECTS, cruciform, cruciform_fraction, detector_response
-from miricigale.psf.model import half_maximum_width, make_psf
+from miricigale.instrument import aperture, pixel_to_v2v3
+from miricigale.psf.effects import (
+    EFFECTS,
+    cruciform,
+    cruciform_fraction,
+    cruciform_shift,
+    detector_response,
+)
+from miricigale.psf.model import half_maximum_width, interpolate, make_psf
 from miricigale.psf.optics import hst_pupil, jwst_constants, jwst_pupil, polychromatic_psf
 from miricigale.refdata import citations
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.units import ANGLE, WAVE, to_array
 
-__all__ = ["MIRI_PIXEL_SCALE", "gaussian_psf", "hst_psf", "miri_psf", "moffat_psf"]
+__all__ = ["MIRI_PIXEL_SCALE", "hst_psf", "local_pixel", "miri_psf", "odd_cells"]
 
 #: Geometric mean of the imager's pixel, 0.110498 x 0.111336 arcsec (SIAF, MIRIM_FULL).
 MIRI_PIXEL_SCALE = math.sqrt(0.110498 * 0.111336) * u.arcsec
@@ -69,7 +76,7 @@ def band_quantiles(name, n, spectral_index=0.0):
     return result
 
 
-def _odd(width, cell):
+def odd_cells(width, cell):
     """Odd number of cells that covers a width, nearest to it."""
     return 2 * round(0.5 * width / cell - 0.5) + 1
 
@@ -83,26 +90,104 @@ def _checked(oversampling, fov, default):
     return int(oversampling), width
 
 
+@functools.lru_cache(maxsize=4)
+def _miri_optics(name, cell, n, rms, seed, n_wavelengths, index, n_pupil):
+    pupil = jwst_pupil(n_pupil)
+    opd = pupil.wavefront_error(rms, seed=seed)
+    waves = band_quantiles(name, n_wavelengths, index)
+    data = polychromatic_psf(pupil, opd, waves, step=cell, n=n)
+    data.flags.writeable = False
+    return data
+
+
+def local_pixel(x, y, *, subarray="FULL"):
+    """
+    The pixel at a position of the imager, as the distortion has it.
+
+    Parameters
+    ----------
+    x, y : float
+        0-based position in the sub-array.
+    subarray : str, optional
+        One of `~miricigale.instrument.subarrays`.
+
+    Returns
+    -------
+    jacobian : `~numpy.ndarray`, shape (2, 2)
+        Arcsec along the axes of the ideal plane (parity of an image of the sky, +y at
+        V3IdlYAngle from V3) per pixel: its columns are the sides of the pixel.
+
+    Raises
+    ------
+    ValueError
+        If the position is not on the sub-array.
+    """
+    part = aperture(subarray)
+    ny, nx = part.shape
+    if not (-0.5 <= x <= nx - 0.5 and -0.5 <= y <= ny - 0.5):
+        raise argument_error("position", f"on the {nx} x {ny} pixels of {subarray}", (x, y))
+    half = 0.5 * np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
+    v2, v3 = pixel_to_v2v3(x + half[0], y + half[1], subarray=subarray)
+    a = math.radians(part.v3_ideal_y_angle)
+    ideal_x = part.parity * (math.cos(a) * v2 - math.sin(a) * v3)
+    ideal_y = math.sin(a) * v2 + math.cos(a) * v3
+    return np.array([[i[0] - i[1], i[2] - i[3]] for i in (ideal_x, ideal_y)])
+
+
+def _distorted_optics(map_, oversampling, n, cell, *optics):
+    """The optics' image on cells that are parallelograms: ``map_`` of the nominal cell."""
+    # fine enough for splines between the samples at the shortest wavelength
+    finer = math.ceil(4 / oversampling)
+    # in coarse steps, so that places share one image of the optics
+    widening = math.ceil(np.abs(map_).sum(axis=1).max() * 50) / 50
+    reach = max(widening, 1.02) * (n // 2) * finer
+    n_fine = 2 * (math.ceil(reach) + 12) + 1
+    fine = _miri_optics(optics[0], cell / finer, n_fine, *optics[1:])
+    axis = (np.arange(n) - n // 2) * float(finer)
+    x = map_[0, 0] * axis + map_[0, 1] * axis[:, None] + n_fine // 2
+    y = map_[1, 0] * axis + map_[1, 1] * axis[:, None] + n_fine // 2
+    return interpolate(fine, x, y) * abs(np.linalg.det(map_)) * finer**2
+
+
 @functools.lru_cache(maxsize=24)
 def _miri_data(
-    name, oversampling, fov, rms, seed, includes, calibration, n_wavelengths, index, n_pupil
+    name,
+    oversampling,
+    fov,
+    rms,
+    seed,
+    includes,
+    calibration,
+    n_wavelengths,
+    index,
+    n_pupil,
+    position=None,
 ):
     scale = MIRI_PIXEL_SCALE.value
     cell = scale / oversampling
     # light scattered in from just beyond the edge: two pixels more than asked for
     margin = 2 * oversampling
-    n = _odd(fov, cell) + 2 * margin
-    pupil = jwst_pupil(n_pupil)
-    opd = pupil.wavefront_error(rms, seed=seed)
-    waves = band_quantiles(name, n_wavelengths, index)
-    data = polychromatic_psf(pupil, opd, waves, step=cell, n=n)
+    n = odd_cells(fov, cell) + 2 * margin
+    optics = (rms, seed, n_wavelengths, index, n_pupil)
+    shift = (0.0, 0.0)
+    if position is None:
+        data = _miri_optics(name, cell, n, *optics)
+    else:
+        x, y, subarray = position
+        map_ = local_pixel(x, y, subarray=subarray) / scale
+        data = _distorted_optics(map_, oversampling, n, cell, name, *optics)
+        scale *= math.sqrt(abs(np.linalg.det(map_)))
+        corner = aperture(subarray).origin
+        shift = cruciform_shift(x + corner[0], y + corner[1])
     constants = jwst_constants()
     jitter = 0.0
     if "jitter" in includes:
         extra = _IN_FLIGHT_BLUR.get(name, 0.0) if calibration == "flight" else 0.0
         jitter = math.hypot(constants["jitter"], extra) / scale
     if "cruciform" in includes:
-        data = cruciform(data, name, oversampling=oversampling, calibration=calibration)
+        data = cruciform(
+            data, name, oversampling=oversampling, calibration=calibration, shift=shift
+        )
     data = detector_response(
         data,
         oversampling=oversampling,
@@ -112,7 +197,7 @@ def _miri_data(
     )
     data = data[margin:-margin, margin:-margin] * oversampling**2
     data.flags.writeable = False
-    return data
+    return data, scale
 
 
 def miri_psf(
@@ -127,6 +212,8 @@ def miri_psf(
     n_wavelengths=9,
     spectral_index=0.0,
     n_pupil=384,
+    position=None,
+    subarray="FULL",
 ):
     """
     PSF of the MIRI imager, from the telescope's pupil.
@@ -159,16 +246,25 @@ def miri_psf(
         The source's spectrum is ``F_nu ~ nu**spectral_index``.
     n_pupil : int, optional
         Cells across the pupil.
+    position : tuple of float, optional
+        Where on the array, 0-based pixels x, y: the image is then sampled by the pixel
+        that the distortion makes there (its sides, turn and shear) and the cruciform's
+        centre shifted as stars in flight have it. Without a position the pixel is square
+        and the cruciform centred, as at about (598, 511) of the full frame.
+    subarray : str, optional
+        Whose pixels ``position`` counts, one of `~miricigale.instrument.subarrays`.
 
     Returns
     -------
     psf : `~photutils.psf.ImagePSF`
         In the detector frame (+x, +y along the columns and rows; V3 lies 4.84 deg
         clockwise of +y), pixel 0.11092 arcsec: the geometric mean of the true
-        0.1105 x 0.1113. The sum of the data is ``oversampling**2`` times the fraction of
-        light on the grid. The core's centroid is the middle cell. The meta has the
-        entries of `~miricigale.psf.make_psf` and ``filter``, ``wavefront_error`` (nm),
-        ``seed``, ``calibration``, ``cruciform_fraction``, ``citations``.
+        0.1105 x 0.1113, or that of the pixel at ``position``. The sum of the data is
+        ``oversampling**2`` times the fraction of light on the grid. The core's centroid is
+        the middle cell. The meta has the entries of `~miricigale.psf.make_psf` and
+        ``filter``, ``wavefront_error`` (nm), ``seed``, ``calibration``,
+        ``cruciform_fraction``, ``citations``; with a position also ``position`` and
+        ``subarray``.
 
     Raises
     ------
@@ -200,7 +296,10 @@ def miri_psf(
     rms = float(to_array(wavefront_error, u.nm, "wavefront_error"))
     # written order, whatever the caller's
     effects = tuple(effect for effect in EFFECTS if effect in includes)
-    data = _miri_data(
+    place = {}
+    if position is not None:
+        place = {"position": tuple(float(v) for v in position), "subarray": subarray}
+    data, scale = _miri_data(
         name,
         oversampling,
         width,
@@ -211,11 +310,12 @@ def miri_psf(
         int(n_wavelengths),
         float(spectral_index),
         int(n_pupil),
+        (*place["position"], subarray) if place else None,
     )
     scattered = cruciform_fraction(name, calibration=calibration) if "cruciform" in effects else 0.0
     return make_psf(
         data,
-        pixel_scale=MIRI_PIXEL_SCALE,
+        pixel_scale=scale * ANGLE,
         oversampling=oversampling,
         frame="detector",
         includes=effects,
@@ -226,6 +326,7 @@ def miri_psf(
         calibration=calibration,
         cruciform_fraction=scattered,
         citations=citations("psf.jwst_pupil"),
+        **place,
     )
 
 
@@ -248,7 +349,7 @@ def _hst_blur(name, fwhm, scale, n_wavelengths):
     """Gaussian sigma in arcsec with which the mosaic's PSF has the width asked for."""
     oversampling = max(1, math.ceil(scale / 0.015))
     cell = scale / oversampling
-    middle = _odd(2.4, cell) // 2
+    middle = odd_cells(2.4, cell) // 2
     data = _hst_optics(name, cell, 2 * middle + 1, n_wavelengths, 45.0)
 
     def excess(sigma):
@@ -325,7 +426,7 @@ def hst_psf(
     cell = scale / oversampling
     # vanes at 45 deg to +y; on the sky an angle east of north is counter-clockwise
     vane = (45.0 + float(to_array(angle, u.deg, "angle"))) % 360.0
-    data = _hst_optics(name, cell, _odd(width, cell), n_wavelengths, vane)
+    data = _hst_optics(name, cell, odd_cells(width, cell), n_wavelengths, vane)
     data = _hst_blurred(data, oversampling, scale, sigma) * oversampling**2
     return make_psf(
         data,
@@ -338,75 +439,3 @@ def hst_psf(
         blur=sigma,
         telescope_angle=float(to_array(angle, u.deg, "angle")),
     )
-
-
-def _round_psf(profile, pixel_scale, oversampling, fov):
-    scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
-    width = float(to_array(fov, ANGLE, "fov"))
-    cell = scale / oversampling
-    n = _odd(width, cell)
-    axis = (np.arange(n) - n // 2) * cell
-    return profile(np.hypot(axis, axis[:, None])) * scale**2
-
-
-def gaussian_psf(fwhm, *, pixel_scale, oversampling=4, fov):
-    """
-    A round Gaussian.
-
-    Parameters
-    ----------
-    fwhm, pixel_scale, fov : `~astropy.units.Quantity`
-        Width, pixel and width of the grid.
-    oversampling : int, optional
-        Cells per pixel.
-
-    Returns
-    -------
-    psf : `~photutils.psf.ImagePSF`
-        Of the surface brightness (no pixel response); sky frame, where it has no angle.
-    """
-    sigma = float(to_array(fwhm, ANGLE, "fwhm")) / math.sqrt(8 * math.log(2))
-
-    def profile(r):
-        return np.exp(-0.5 * (r / sigma) ** 2) / (2 * math.pi * sigma**2)
-
-    data = _round_psf(profile, pixel_scale, oversampling, fov)
-    return make_psf(data, pixel_scale=pixel_scale, oversampling=oversampling, frame="sky")
-
-
-def moffat_psf(fwhm, *, beta=3.0, pixel_scale, oversampling=4, fov):
-    """
-    A round Moffat profile, for ground-based images.
-
-    Parameters
-    ----------
-    fwhm, pixel_scale, fov : `~astropy.units.Quantity`
-        Width, pixel and width of the grid.
-    beta : float, optional
-        Exponent of the wings, above 1.
-    oversampling : int, optional
-        Cells per pixel.
-
-    Returns
-    -------
-    psf : `~photutils.psf.ImagePSF`
-        As `gaussian_psf`.
-
-    Raises
-    ------
-    ValueError
-        If ``beta`` is not above 1 (the light would be infinite).
-
-    References
-    ----------
-    Moffat 1969, A&A 3, 455.
-    """
-    if not beta > 1:
-        raise argument_error("beta", "above 1", beta)
-    core = float(to_array(fwhm, ANGLE, "fwhm")) / (2 * math.sqrt(2 ** (1 / beta) - 1))
-
-    def profile(r):
-        return (beta - 1) / (math.pi * core**2) * (1 + (r / core) ** 2) ** -beta
-
-    data = _round_psf(profile, pixel_scale, oversampling, fov)
-    return make_psf(data, pixel_scale=pixel_scale, oversampling=oversampling, frame="sky")

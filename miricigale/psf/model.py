@@ -232,7 +232,8 @@ def make_psf(
     if not scale > 0:
         raise argument_error("pixel_scale", "positive", pixel_scale)
     enclosed = float(data.sum()) / oversampling**2
-    if enclosed > 1.02:
+    # stpsf's sums reach 1.03 at the corners of the array, where its distortion adds light
+    if enclosed > 1.04:
         wanted = f"normalised to {oversampling**2} over the infinite plane"
         raise argument_error("data", wanted, f"a sum of {data.sum():.6g}")
     psf = ImagePSF(data, oversampling=int(oversampling), origin=origin)

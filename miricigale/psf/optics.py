@@ -306,9 +306,12 @@ def polychromatic_psf(pupil, opd, wavelengths, *, weights=None, step, n):
     axis = (np.arange(n) - (n - 1) // 2) * step * ARCSEC
     image = np.zeros((n, n))
     power = float(pupil.amplitude.sum())
+    # the core goes to the middle by a tilt: one matrix then serves both axes
+    across = (np.arange(pupil.n) - 0.5 * (pupil.n - 1)) * pupil.step
+    path = opd - shift[0] * across - shift[1] * across[:, None]
     for wavelength, weight in zip(wavelengths, weights, strict=True):
-        function = pupil.amplitude * np.exp(2j * np.pi * opd / wavelength)
+        function = pupil.amplitude * np.exp(2j * np.pi * path / wavelength)
         image += weight * _core.matrix_dft_intensity(
-            function, pupil.step, wavelength, axis + shift[0], axis + shift[1], power=power
+            function, pupil.step, wavelength, axis, axis, power=power
         )
     return image

@@ -2,14 +2,17 @@
 
 from miricigale.scene.background import Background
 from miricigale.scene.catalog import CATALOG_COLUMNS, CatalogFlags, check_catalog, read_catalog
+from miricigale.scene.cutouts import Cutout
 from miricigale.scene.highres import depth_to_rms, highres_image
-from miricigale.scene.render import Painter
+from miricigale.scene.render import FieldPainter, Painter
 from miricigale.scene.scene import Scene, SceneFlags
 
 __all__ = [
     "CATALOG_COLUMNS",
     "Background",
     "CatalogFlags",
+    "Cutout",
+    "FieldPainter",
     "Painter",
     "Scene",
     "SceneFlags",

@@ -98,6 +98,43 @@ def deposit_points(grid, x, y, flux, sums, low_y, high_y, low_x, high_x, oversam
 
 
 @njit(cache=True)
+def deposit_pieces(part, x, y, light):
+    """
+    Put the pieces of one source on a grid of its own.
+
+    Parameters
+    ----------
+    part : array, shape (ny, nx)
+        Light on the nodes, changed in place; what falls beside it is lost.
+    x, y, light : array, shape (N,)
+        Positions in nodes and light.
+    """
+    wy, wx = np.empty(4), np.empty(4)
+    ny, nx = part.shape
+    for k in range(x.size):
+        iy, ix = math.floor(y[k]), math.floor(x[k])
+        if iy < -2 or ix < -2 or iy > ny or ix > nx:
+            continue
+        _spline_weights(y[k] - iy, wy)
+        _spline_weights(x[k] - ix, wx)
+        for a in range(max(0, 1 - iy), min(4, ny - iy + 1)):
+            for b in range(max(0, 1 - ix), min(4, nx - ix + 1)):
+                part[iy - 1 + a, ix - 1 + b] += light[k] * wy[a] * wx[b]
+
+
+@njit(cache=True)
+def landed_light(part, sums, low_y, high_y, low_x, high_x, oversampling):
+    """Light of a grid that lands on the image; arguments as in `deposit_points`."""
+    total = 0.0
+    for i in range(part.shape[0]):
+        for j in range(part.shape[1]):
+            if part[i, j] != 0.0:
+                share = _share(sums, low_y, high_y, low_x, high_x, oversampling, i, j)
+                total += part[i, j] * share
+    return total
+
+
+@njit(cache=True)
 def _row_span(par, dy, limit, n):
     """First and last column whose node lies within the ellipse w <= limit in a row."""
     a, b, c = par[8], par[9], par[10]
@@ -121,7 +158,7 @@ def deposit_cusps(grid, rows, tables, w_zone, sums, low_y, high_y, low_x, high_x
         As in `deposit_points`.
     rows : array, shape (N, 13)
         Parameters of the profiles in nodes.
-    tables : array, shape (N, 4, TABLE_SIZE)
+    tables : array, shape (N, 5, TABLE_SIZE)
         Their enclosed light.
     w_zone : array, shape (N,)
         Squared elliptical radius (in half-light radii) that is done here.

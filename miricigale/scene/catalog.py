@@ -31,7 +31,7 @@ CATALOG_COLUMNS = {
     "position_angle": u.deg,
 }
 
-PROFILES = ("sersic", "point")
+PROFILES = ("sersic", "point", "cutout")
 
 
 class CatalogFlags(Flags):

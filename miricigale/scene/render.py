@@ -1,20 +1,21 @@
-"""Painting point and Sersic sources through a PSF: one grid, one convolution."""
+"""Painting points, Sersic profiles and images through a PSF: one grid, one convolution."""
 
 import dataclasses
 import math
 import os
 
 import numpy as np
-from photutils.psf import ImagePSF
+from photutils.psf import GriddedPSFModel, ImagePSF
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import spline_filter
 
 from miricigale.profiles import sersic_enclosed_fraction, sersic_radius
 from miricigale.profiles.sersic import light_table, parameter_rows
+from miricigale.psf import grid_weights
 from miricigale.scene import _core
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["Painter"]
+__all__ = ["FieldPainter", "Painter"]
 
 #: Sersic sources with a half-light radius below this many nodes are points.
 _UNRESOLVED = 0.05
@@ -110,7 +111,7 @@ class Painter:
         high = np.clip(margin + n - 1 - k, -half - 1, half) + half + 1
         return low, high
 
-    def paint(self, *, x, y, flux, is_sersic, r_eff, n, axis_ratio, theta):
+    def paint(self, *, x, y, flux, is_sersic, r_eff, n, axis_ratio, theta, images=None):
         """
         Paint the sources.
 
@@ -123,7 +124,10 @@ class Painter:
         is_sersic : `~numpy.ndarray` of bool, shape (N,)
             Whether the row is a Sersic profile; a point otherwise.
         r_eff, n, axis_ratio, theta : `~numpy.ndarray`, shape (N,)
-            As in `~miricigale.profiles.sersic_image`; not looked at for points.
+            As in `~miricigale.profiles.sersic_image`; not looked at for others.
+        images : dict, optional
+            For rows that are images: offsets ``dx``, ``dy`` in pixels and the share of the
+            light of many small pieces, which add up to 1.
 
         Returns
         -------
@@ -165,10 +169,34 @@ class Painter:
             in_image[extended] = landed
             kept[extended] = sersic_enclosed_fraction(cut / radius, index)
         points = ~extended
+        for row, (dx, dy, share) in (images or {}).items():
+            points[row] = False
+            in_image[row] = self._add_image(
+                grid, node_x[row] + dx * os_, node_y[row] + dy * os_, flux[row] * share, ranges
+            )
         in_image[points] = _core.deposit_points(
             grid, node_x[points], node_y[points], np.asarray(flux, float)[points], *ranges
         )
         return self._convolve(grid), in_image, kept
+
+    @staticmethod
+    def _add_image(grid, x, y, light, ranges):
+        """Put many pieces of one source on the grid; return how much lands on the image."""
+        (x0, x1), (y0, y1) = (
+            (max(0, math.floor(v.min()) - 2), min(n, math.floor(v.max()) + 4))
+            for v, n in ((x, grid.shape[1]), (y, grid.shape[0]))
+        )
+        if x1 <= x0 or y1 <= y0:
+            return 0.0
+        sums, low_y, high_y, low_x, high_x, os_ = ranges
+        # the tables go by the node's phase: begin on a whole pixel
+        x0, y0 = x0 - x0 % os_, y0 - y0 % os_
+        # in double precision: single would lose the light of many pieces on a node
+        part = np.zeros((y1 - y0, x1 - x0))
+        cuts = (low_y[y0:y1], high_y[y0:y1], low_x[x0:x1], high_x[x0:x1])
+        _core.deposit_pieces(part, x - x0, y - y0, light)
+        grid[y0:y1, x0:x1] += part
+        return _core.landed_light(part, sums, *cuts, os_)
 
     def _convolve(self, grid):
         """Convolve with the coefficients and keep one node for each pixel of the image."""
@@ -190,3 +218,74 @@ class Painter:
             return np.zeros(self.shape)
         image = irfft2(total, size, workers=workers)
         return image[margin : margin + ny, margin : margin + nx].copy()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FieldPainter:
+    """
+    Paints sources through a PSF that varies over the field.
+
+    The PSF of a source is bilinear between those of the grid, as in photutils: each PSF of
+    the grid paints the sources near to it with their weights. An extended source has the PSF
+    of its centre.
+
+    Parameters
+    ----------
+    shape, enclosed, max_radius, workers
+        As of `Painter`.
+    psf : `~photutils.psf.GriddedPSFModel`
+        PSFs with the pixel response in them, at positions on the image.
+    """
+
+    shape: tuple
+    psf: GriddedPSFModel
+    enclosed: float = 0.995
+    max_radius: float = math.inf
+    workers: int | None = None
+
+    def __post_init__(self):
+        if not isinstance(self.psf, GriddedPSFModel):
+            raise argument_error("psf", "a photutils GriddedPSFModel", type(self.psf).__name__)
+
+    def _painter(self, k):
+        psf = ImagePSF(self.psf.data[k], oversampling=self.psf.oversampling)
+        return Painter(
+            self.shape,
+            psf,
+            enclosed=self.enclosed,
+            max_radius=self.max_radius,
+            workers=self.workers,
+        )
+
+    @property
+    def enclosed_by_psf(self):
+        """Least fraction of a point's light within the array of a PSF."""
+        sums = np.asarray(self.psf.data).sum(axis=(1, 2))
+        return float(sums.min() / np.prod(self.psf.oversampling))
+
+    def paint(self, *, x, y, flux, images=None, **profile):
+        """
+        Paint the sources; see `Painter.paint`.
+
+        Returns
+        -------
+        image, in_image, kept : `~numpy.ndarray`
+        """
+        weights = grid_weights(self.psf, x, y)
+        total, in_image, kept = np.zeros(self.shape), np.zeros(len(x)), np.ones(len(x))
+        for k in range(weights.shape[1]):
+            use = weights[:, k] > 0
+            if not np.any(use):
+                continue
+            row = np.cumsum(use) - 1
+            mine = {row[i]: value for i, value in (images or {}).items() if use[i]}
+            part, landed, kept[use] = self._painter(k).paint(
+                x=x[use],
+                y=y[use],
+                flux=(flux * weights[:, k])[use],
+                images=mine,
+                **{name: value[use] for name, value in profile.items()},
+            )
+            total += part
+            in_image[use] += landed
+        return total, in_image, kept

@@ -7,12 +7,15 @@ import numpy as np
 from astropy.nddata import CCDData
 from astropy.table import QTable
 from astropy.wcs import WCS
+from photutils.psf import GriddedPSFModel
 
-from miricigale.instrument import pixel_area_map
+from miricigale.instrument import aperture, pixel_area_map
 from miricigale.profiles import ellipse_to_pixels
 from miricigale.scene.background import Background
 from miricigale.scene.catalog import CatalogFlags, check_catalog, read_catalog
-from miricigale.scene.render import Painter
+from miricigale.scene.cutouts import Cutout
+from miricigale.scene.render import FieldPainter, Painter
+from miricigale.scene.sky import local_jacobian, pixel_positions
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.tables import Flags
@@ -34,64 +37,6 @@ class SceneFlags(Flags):
     DRAWN_AS_POINT = 16  # a Sersic profile whose parameters cannot be used
 
 
-def local_jacobian(wcs, x, y):
-    """
-    Local linear map from the sky to the pixels.
-
-    Parameters
-    ----------
-    wcs : `~astropy.wcs.WCS`
-        World coordinates, distorted or not.
-    x, y : `~numpy.ndarray`, shape (N,)
-        Pixel positions.
-
-    Returns
-    -------
-    jacobian : `~numpy.ndarray`, shape (N, 2, 2)
-        Pixels per arcsec: ``[dx, dy] = jacobian @ [east, north]``.
-    """
-
-    def world(dx, dy):
-        return np.asarray(wcs.all_pix2world(x + dx, y + dy, 0))
-
-    _, dec = world(0, 0)
-    columns = []
-    for step in ((0.5, 0.0), (0.0, 0.5)):
-        d_ra, d_dec = world(*step) - world(-step[0], -step[1])
-        d_ra = (d_ra + 180.0) % 360.0 - 180.0
-        columns.append(3600.0 * np.stack([d_ra * np.cos(np.radians(dec)), d_dec], axis=-1))
-    return np.linalg.inv(np.stack(columns, axis=-1))
-
-
-def pixel_positions(wcs, sky, shape):
-    """
-    Pixel positions, by the distortion where it is defined and linear far from the image.
-
-    Parameters
-    ----------
-    wcs : `~astropy.wcs.WCS`
-        World coordinates.
-    sky : `~astropy.coordinates.SkyCoord`, shape (N,)
-        Positions.
-    shape : tuple of int
-        ``(ny, nx)`` of the image.
-
-    Returns
-    -------
-    x, y : `~numpy.ndarray`, shape (N,)
-        Pixels; NaN on the other side of the sky.
-    near : `~numpy.ndarray` of bool, shape (N,)
-        Within half an image of the image.
-    """
-    ny, nx = shape
-    ra, dec = sky.icrs.ra.deg, sky.icrs.dec.deg
-    x, y = np.asarray(wcs.wcs_world2pix(ra, dec, 0), dtype=float)
-    near = (x > -0.5 * nx) & (x < 1.5 * nx) & (y > -0.5 * ny) & (y < 1.5 * ny)
-    if np.any(near):
-        x[near], y[near] = wcs.all_world2pix(ra[near], dec[near], 0, quiet=True)
-    return x, y, near
-
-
 class Scene:
     """
     A catalogue of sources as an instrument would see it without noise.
@@ -105,10 +50,12 @@ class Scene:
         The flux column, such as ``"miri.f770w"``.
     wcs : `~astropy.wcs.WCS`
         World coordinates of the image with their ``pixel_shape``, distorted or not.
-    psf : `~photutils.psf.ImagePSF`
-        PSF on the image's pixels with the pixel response in it. If its meta gives a
+    psf : `~photutils.psf.ImagePSF` or `~photutils.psf.GriddedPSFModel`
+        PSF on the image's pixels with the pixel response in it, or PSFs over the field (see
+        `~miricigale.psf.miri_psf_grid`). If its meta gives a
         ``pixel_scale`` (arcsec) or, in the frame of the sky, an ``angle`` (deg), they are
-        compared with the WCS; a ``filter`` in it must be ``filter``.
+        compared with the WCS; a ``filter`` in it must be ``filter``, and a grid's
+        ``subarray`` have the image's shape.
     background : `~miricigale.scene.Background` or `~astropy.units.Quantity`, optional
         Background, or its constant level; none by default.
     enclosed : float, optional
@@ -117,11 +64,18 @@ class Scene:
         Largest semi-major axis of that isophote.
     workers : int, optional
         Threads of the Fourier transforms; the image does not depend on it.
+    cutouts : dict, optional
+        For each id whose profile is ``"cutout"`` its `~miricigale.scene.Cutout`.
+    agn : str, optional
+        Column of the catalogue that gives a source a point source at its centre besides its
+        profile: a flux comes on top of the column ``filter``; a number without unit, 0 to 1,
+        is the share of the column ``filter`` that is in the point. NaN means none.
 
     Raises
     ------
     ValueError
-        If the WCS has no shape, or the PSF belongs to other pixels or another filter.
+        If the WCS has no shape, the PSF belongs to other pixels or another filter, a cutout
+        is missing or has no source, or a value of ``agn`` is out of its range.
 
     Notes
     -----
@@ -142,6 +96,8 @@ class Scene:
         enclosed=0.9995,
         max_radius=12 * u.arcsec,
         workers=None,
+        cutouts=None,
+        agn=None,
     ):
         if not isinstance(catalog, QTable):
             catalog = read_catalog(catalog) if not hasattr(catalog, "colnames") else catalog
@@ -157,9 +113,12 @@ class Scene:
         scale = self._pixel_scale()
         self._check_psf(psf, scale)
         radius = float(to_array(max_radius, ANGLE, "max_radius", ndim=0))
-        self._painter = Painter(
+        painter = FieldPainter if isinstance(psf, GriddedPSFModel) else Painter
+        self._painter = painter(
             self._shape, psf, enclosed=enclosed, max_radius=radius / scale, workers=workers
         )
+        self._cutouts = self._check_cutouts(cutouts)
+        self._galaxy_flux, self._agn_flux = self._split_flux(agn)
 
     def __repr__(self):
         ny, nx = self._shape
@@ -189,6 +148,45 @@ class Scene:
     def background(self):
         """The background, or None."""
         return self._background
+
+    def _check_cutouts(self, cutouts):
+        """Cutouts by row of the catalogue."""
+        cutouts = dict(cutouts or {})
+        for key, value in cutouts.items():
+            if not isinstance(value, Cutout):
+                raise argument_error("cutouts", f"a Cutout for {key!r}", type(value).__name__)
+        rows = np.flatnonzero(self._catalog["profile"] == "cutout")
+        ids = {int(self._catalog["id"][row]): int(row) for row in rows}
+        lacking, foreign = sorted(set(ids) - set(cutouts)), sorted(set(cutouts) - set(ids))
+        if lacking:
+            raise argument_error("cutouts", "one for each profile 'cutout'", f"none for {lacking}")
+        if foreign:
+            wanted = "for ids whose profile is 'cutout'"
+            raise argument_error("cutouts", wanted, f"some for {foreign}")
+        return {ids[key]: value for key, value in cutouts.items()}
+
+    def _split_flux(self, agn):
+        """Light of the profiles and of the points at their centres, uJy."""
+        flux = self._catalog[self._filter].to_value(FNU)
+        if agn is None:
+            return flux, np.zeros(len(flux))
+        if agn not in self._catalog.colnames:
+            raise argument_error("agn", f"a column of {self._catalog.colnames}", repr(agn))
+        column = self._catalog[agn]
+        column = column.filled(np.nan) if hasattr(column, "filled") else column
+        unit = getattr(column, "unit", None)
+        if unit is None or unit == u.one:
+            share = np.nan_to_num(np.asarray(column, dtype=float), nan=0.0, posinf=2.0)
+            if np.any((share < 0) | (share > 1)):
+                row = int(np.argmax((share < 0) | (share > 1)))
+                raise argument_error("agn", "shares between 0 and 1", f"{column[row]} in row {row}")
+            return flux * (1 - share), flux * share
+        light = np.nan_to_num(to_array(column, FNU, "agn"), nan=0.0)
+        if np.any((light < 0) | ~np.isfinite(light)):
+            row = int(np.argmax((light < 0) | ~np.isfinite(light)))
+            wanted = "fluxes that are finite and not negative"
+            raise argument_error("agn", wanted, f"{column[row]} in row {row}")
+        return flux, light
 
     @staticmethod
     def _check_background(background):
@@ -220,6 +218,11 @@ class Scene:
             if abs(turn) > 1:
                 got = f"turned by {turn:.1f} deg (see miricigale.psf.rotate_psf)"
                 raise argument_error("psf", "in the orientation of the WCS", got)
+        if isinstance(psf, GriddedPSFModel) and "subarray" in meta:
+            own = aperture(meta["subarray"]).shape
+            if own != self._shape:
+                got = f"those of {meta['subarray']}, {own[1]} x {own[0]} pixels"
+                raise argument_error("psf", "a grid of places on this image", got)
         have = meta.get("filter")
         if isinstance(have, str):
             # other packages write F770W where we write miri.f770w
@@ -232,7 +235,8 @@ class Scene:
         """The light in each pixel (uJy), and the table of truth."""
         catalog, shape = self._catalog, self._shape
         ny, nx = shape
-        flux = catalog[self._filter].to_value(FNU)
+        galaxy, agn = self._galaxy_flux, self._agn_flux
+        flux = galaxy + agn
         x, y, near = pixel_positions(self._wcs, catalog["sky"], shape)
         flags = np.zeros(len(catalog), dtype=int)
         inside = near & (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
@@ -244,43 +248,64 @@ class Scene:
         flags[sersic & spoilt] |= SceneFlags.DRAWN_AS_POINT
         sersic &= ~spoilt
 
-        use = near & valid
-        in_image, kept = np.zeros(len(catalog)), np.ones(len(catalog))
-        radius, ratio, theta = np.zeros((3, len(catalog)))
-        if np.any(use):
-            radius[use], ratio[use], theta[use] = ellipse_to_pixels(
-                local_jacobian(self._wcs, x[use], y[use]),
-                radius=np.where(sersic, catalog["half_light_radius"].to_value(ANGLE), 0)[use],
-                axis_ratio=np.where(sersic, catalog["axis_ratio"], 1.0)[use],
-                position_angle=np.nan_to_num(catalog["position_angle"].to_value(u.rad))[use],
-            )
-        image, in_image[use], kept[use] = self._painter.paint(
-            x=x[use],
-            y=y[use],
-            flux=flux[use],
-            is_sersic=sersic[use],
-            r_eff=radius[use],
-            n=catalog["sersic_index"][use],
-            axis_ratio=ratio[use],
-            theta=theta[use],
+        # rows of the profiles, then those of the points at their centres
+        rows = np.flatnonzero(near & valid)
+        n_profiles = rows.size
+        rows = np.append(rows, rows[agn[rows] > 0])
+        profile = np.arange(rows.size) < n_profiles
+        jacobian = local_jacobian(self._wcs, x[rows], y[rows])
+        is_sersic = sersic[rows] & profile
+        radius, ratio, theta = ellipse_to_pixels(
+            jacobian,
+            radius=np.where(is_sersic, catalog["half_light_radius"].to_value(ANGLE)[rows], 0),
+            axis_ratio=np.where(is_sersic, catalog["axis_ratio"][rows], 1.0),
+            position_angle=np.nan_to_num(catalog["position_angle"].to_value(u.rad))[rows],
         )
-        flags[use & (kept < 0.99)] |= SceneFlags.CUT_PROFILE
+        images = {
+            k: self._cutouts[row].pieces(jacobian[k])
+            for k, row in enumerate(rows[:n_profiles])
+            if row in self._cutouts
+        }
+        image, landed, whole = self._painter.paint(
+            x=x[rows],
+            y=y[rows],
+            flux=np.where(profile, galaxy[rows], agn[rows]),
+            is_sersic=is_sersic,
+            r_eff=radius,
+            n=catalog["sersic_index"][rows],
+            axis_ratio=ratio,
+            theta=theta,
+            images=images,
+        )
+        in_image = np.bincount(rows, weights=landed, minlength=len(catalog))
+        # of all light, the points' included
+        lost = np.zeros(len(catalog))
+        own = rows[:n_profiles]
+        total = np.where(flux[own] > 0, flux[own], 1.0)
+        lost[own] = (1 - whole[:n_profiles]) * galaxy[own] / total
+        flags[lost > 0.01] |= SceneFlags.CUT_PROFILE
         enclosed = self._painter.enclosed_by_psf
-        flags[inside & valid & (in_image < 0.95 * flux * kept * enclosed)] |= SceneFlags.NEAR_EDGE
+        flags[inside & valid & (in_image < 0.95 * flux * (1 - lost) * enclosed)] |= (
+            SceneFlags.NEAR_EDGE
+        )
+        painted_as = np.where(sersic, "sersic", "point").astype("U6")
+        painted_as[list(self._cutouts)] = "cutout"
         truth = QTable(
             {
                 "id": catalog["id"],
                 "sky": catalog["sky"],
                 "x": x,
                 "y": y,
-                "profile": np.where(sersic, "sersic", "point"),
+                "profile": painted_as,
                 "flux_total": flux * FNU,
+                "flux_agn": agn * FNU,
                 "flux_in_image": in_image * FNU,
                 "flags": flags,
             },
             meta=provenance(filter=self._filter),
         )
-        truth["flux_total"].info.description = "light to infinity"
+        truth["flux_total"].info.description = "light to infinity, the AGN's included"
+        truth["flux_agn"].info.description = "light of the point at the centre"
         truth[
             "flux_in_image"
         ].info.description = "light that the image holds, through PSF and edges"
@@ -293,7 +318,7 @@ class Scene:
         What is in the image, one row for each row of the catalogue.
 
         A `~astropy.table.QTable` with ``id``, ``sky``, ``x``, ``y`` (pixels), ``profile`` as
-        painted, ``flux_total``, ``flux_in_image`` and ``flags`` (`SceneFlags`).
+        painted, ``flux_total``, ``flux_agn`` (of it), ``flux_in_image`` and ``flags`` (`SceneFlags`).
         """
         return self._painted[1].copy()
 

@@ -158,6 +158,20 @@ def test_table_of_all_filters():
     assert np.all(np.diff(table["fwhm"]) > 0)
     assert table["r80"].unit == u.arcsec
     assert np.all(table["eef_2.5"] > table["eef_1"])
+    np.testing.assert_allclose(table["fwhm_flight"].value, list(IN_FLIGHT.values()))
+    np.testing.assert_allclose((table["fwhm_gaussian"] / table["fwhm_flight"]).value, 1, atol=0.04)
+    assert set(table["frame"]) == {"detector"}
+    assert np.all(np.isnan(table["angle"]))
+    assert set(table["includes"]) == {"jitter cruciform pixel ipc"}
+    assert all(table[name].info.description for name in table.colnames if name != "filter")
+
+
+def test_table_of_a_mosaic_and_of_a_grid_that_holds_little():
+    kind = {"fov": 0.45 * u.arcsec}
+    table = psf_table([hst_psf(angle=20 * u.deg), hst_psf(**kind)], radii=[0.2] * u.arcsec)
+    assert table["angle"].value.tolist() == [0, 0]
+    assert np.isfinite(table["r80"].value).tolist() == [True, False]
+    assert np.all(np.isnan(table["fwhm_flight"]))
 
 
 @pytest.mark.parametrize("index", [0.0, 2.0])

@@ -99,6 +99,55 @@ def test_there_and_back():
     np.testing.assert_array_equal(same.data, psf.data)
 
 
+def long_gaussian(angle, major=2.2, minor=1.1, *, n=161, oversampling=4):
+    """Gaussian on the detector, long axis ``angle`` deg counter-clockwise of +x; in pixels."""
+    axis = (np.arange(n) - n // 2) / oversampling
+    x, y = np.meshgrid(axis, axis)
+    a = np.radians(angle)
+    p, q = x * np.cos(a) + y * np.sin(a), y * np.cos(a) - x * np.sin(a)
+    data = np.exp(-0.5 * ((p / major) ** 2 + (q / minor) ** 2))
+    data *= oversampling**2 / data.sum()
+    return make_psf(data, pixel_scale=0.11 * u.arcsec, oversampling=oversampling, frame="detector")
+
+
+def sky_moments(psf):
+    """Second moments in arcsec^2 along +x (west) and +y (north) of an image of the sky."""
+    info = psf_info(psf)
+    axis = (np.arange(info.data.shape[0]) - info.origin[0]) * info.cell
+    x, y = np.meshgrid(axis, axis)
+    return np.array([[np.sum(info.data * p * q) / info.data.sum() for p in (x, y)] for q in (x, y)])
+
+
+def turned(covariance, angle):
+    cos, sin = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    rotation = np.array([[cos, -sin], [sin, cos]])
+    return rotation @ covariance @ rotation.T
+
+
+@pytest.mark.parametrize("pa", [0.0, 30.0, 107.0, -50.0])
+def test_second_moments_turn_with_the_angle(pa):
+    """Position angles grow counter-clockwise where north is up and east left."""
+    own = 0.11**2 * turned(np.diag([2.2**2, 1.1**2]), 20.0)
+    psf = rotate_psf(long_gaussian(20.0), pa * u.deg)
+    np.testing.assert_allclose(sky_moments(psf), turned(own, pa), atol=1e-4 * own.max())
+
+
+def test_second_moments_of_a_mosaic_of_dithers():
+    """Mean over rolls and exposure times, and the boxes of the drop and of the pixel."""
+    own = 0.11**2 * turned(np.diag([2.2**2, 1.1**2]), 20.0)
+    rolls, times = [10.0, 70.0, 110.0], [1.0, 2.0, 0.5]
+    psf = long_gaussian(20.0)
+    mean = average_psf([psf_mosaic(psf, 0.06 * u.arcsec, r * u.deg) for r in rolls], times)
+    truth = np.average([turned(own, r) for r in rolls], axis=0, weights=times)
+    # a square has the same second moments in every direction
+    truth = truth + np.eye(2) * (0.11**2 + 0.06**2) / 12
+    np.testing.assert_allclose(sky_moments(mean), truth, atol=5e-4 * truth.max())
+    alike = psf_mosaic(psf, 0.06 * u.arcsec, rolls * u.deg)
+    unweighted = np.mean([turned(own, r) for r in rolls], axis=0)
+    unweighted += np.eye(2) * (0.11**2 + 0.06**2) / 12
+    np.testing.assert_allclose(sky_moments(alike), unweighted, atol=5e-4 * truth.max())
+
+
 def test_unknown_and_superfluous_angles_are_errors():
     with pytest.raises(ValueError, match="'angle' must be the position angle of the detector"):
         rotate_psf(blob(1.0, 1.0))

@@ -1,0 +1,211 @@
+"""PSFs over the field, as photutils' gridded models."""
+
+import astropy.units as u
+import numpy as np
+from astropy.nddata import NDData
+from photutils.psf import GriddedPSFModel
+
+from miricigale.instrument import aperture, imager_columns
+from miricigale.psf.library import miri_psf
+from miricigale.psf.model import make_psf, psf_info
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import ANGLE
+
+__all__ = ["grid_weights", "miri_psf_grid", "psf_at", "psf_grid"]
+
+# entries of the meta that belong to one PSF, or that photutils adds
+_OWN = ("fwhm", "enclosed", "eef_radius", "eef", "position", "pixel_scale", "oversampling")
+_OWN += ("grid_xypos", "grid_shape", "pixel_scales")
+
+
+def psf_grid(psfs, positions):
+    """
+    Put PSFs of different places in one `~photutils.psf.GriddedPSFModel`.
+
+    Parameters
+    ----------
+    psfs : sequence of `~photutils.psf.ImagePSF`
+        PSFs with the meta of `~miricigale.psf.make_psf`, centred on their middle cell,
+        alike in shape, oversampling, frame, angle and effects.
+    positions : array_like, shape (n, 2)
+        Where on the image they hold, 0-based pixels x, y; all points of a rectangular grid
+        of at least 2 x 2.
+
+    Returns
+    -------
+    grid : `~photutils.psf.GriddedPSFModel`
+        Bilinear between the positions, constant beyond them. Its meta is that of the first
+        PSF with ``pixel_scale`` (arcsec) the mean and ``pixel_scales`` that of each PSF in
+        the grid's order, and without what differs from place to place (``fwhm``,
+        ``enclosed``, ``eef``): `psf_at` gives a PSF with its own.
+
+    Raises
+    ------
+    ValueError
+        If the PSFs differ, or the positions are no rectangular grid.
+    """
+    psfs = list(psfs)
+    positions = np.asarray(positions, dtype=float)
+    if positions.ndim != 2 or positions.shape != (len(psfs), 2):
+        raise argument_error("positions", f"of shape ({len(psfs)}, 2)", positions.shape)
+    columns, rows = (np.unique(positions[:, k]) for k in (0, 1))
+    points = np.unique(positions, axis=0)
+    if min(columns.size, rows.size) < 2 or len(points) != columns.size * rows.size:
+        raise argument_error("positions", "all points of a rectangular grid", positions.tolist())
+    if len(points) != len(psfs):
+        raise argument_error("positions", "different places", positions.tolist())
+    infos = [psf_info(psf, f"psfs[{i}]") for i, psf in enumerate(psfs)]
+    first = infos[0]
+    middle = ((first.data.shape[1] - 1) / 2, (first.data.shape[0] - 1) / 2)
+    for i, info in enumerate(infos):
+        for name in ("oversampling", "frame", "angle", "includes"):
+            mine, theirs = getattr(info, name), getattr(first, name)
+            if mine != theirs:
+                raise argument_error("psfs", f"alike in {name}", f"{theirs} and {mine} (psfs[{i}])")
+        if info.data.shape != first.data.shape:
+            shapes = f"{first.data.shape} and {info.data.shape} (psfs[{i}])"
+            raise argument_error("psfs", "alike in shape", shapes)
+        if not np.allclose(info.origin, middle):
+            raise argument_error("psfs", "centred on the middle", f"{info.origin} (psfs[{i}])")
+    # photutils' own order: by y, then by x
+    order = np.lexsort(positions.T)
+    scales = [infos[i].pixel_scale for i in order]
+    meta = {key: value for key, value in first.meta.items() if key not in _OWN}
+    meta.update(
+        grid_xypos=[tuple(float(v) for v in positions[i]) for i in order],
+        oversampling=first.oversampling,
+        pixel_scale=float(np.mean(scales)),
+        pixel_scales=scales,
+    )
+    return GriddedPSFModel(NDData(np.stack([infos[i].data for i in order]), meta=meta))
+
+
+def miri_psf_grid(filter, *, n_psfs=9, subarray="FULL", positions=None, **options):
+    """
+    PSFs of the MIRI imager over the field.
+
+    What varies from place to place: the pixel, by the distortion of the SIAF (its sides,
+    0.107 to 0.1114 arcsec, its turn by -0.7 to 0.5 deg, its shear), and the centre of the
+    cruciform, which shifts by up to 1.6 pixels towards the middle of the array. The wavefront
+    does not vary.
+
+    Parameters
+    ----------
+    filter : str or `~miricigale.filters.Filter`
+        One of the nine imaging filters.
+    n_psfs : int, optional
+        How many, a square number of at least 4; they stand on an even grid that reaches the
+        edges of the sub-array (of the imager's part of it, see
+        `~miricigale.instrument.imager_columns`).
+    subarray : str, optional
+        One of `~miricigale.instrument.subarrays`, in whose pixels the positions are.
+    positions : array_like, shape (n, 2), optional
+        Positions x, y instead of the even grid.
+    **options
+        Those of `~miricigale.psf.miri_psf`.
+
+    Returns
+    -------
+    grid : `~photutils.psf.GriddedPSFModel`
+        As made by `psf_grid`; `~miricigale.scene.Scene` takes it for its PSF.
+
+    Raises
+    ------
+    ValueError
+        If ``n_psfs`` is no square number of at least 4, or a position is off the array.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import miri_psf_grid
+    >>> grid = miri_psf_grid("miri.f1500w", n_psfs=4, fov=3 * u.arcsec, oversampling=2)
+    >>> grid.data.shape
+    (4, 55, 55)
+    """
+    if positions is None:
+        side = round(n_psfs**0.5) if n_psfs >= 4 else 0
+        if side**2 != n_psfs:
+            raise argument_error("n_psfs", "a square number of at least 4", n_psfs)
+        part = aperture(subarray)
+        ny, nx = part.shape
+        first, last = (int(np.clip(c - part.origin[0], 0, nx)) for c in imager_columns())
+        if last - first < 2:
+            first, last = 0, nx  # SUB64 and SUB128 stand beside the imager's own field
+        columns = np.linspace(first, last - 1, side)
+        rows = np.linspace(0, ny - 1, side)
+        positions = [(x, y) for y in rows for x in columns]
+    psfs = [miri_psf(filter, position=tuple(p), subarray=subarray, **options) for p in positions]
+    return psf_grid(psfs, positions)
+
+
+def grid_weights(grid, x, y):
+    """
+    Weights with which the PSFs of a grid make up the PSF at positions.
+
+    Parameters
+    ----------
+    grid : `~photutils.psf.GriddedPSFModel`
+        PSFs over the field.
+    x, y : array_like, shape (N,)
+        Positions in pixels; beyond the grid the nearest point of it counts.
+
+    Returns
+    -------
+    weights : `~numpy.ndarray`, shape (N, n_psfs)
+        Bilinear, at most four of a row not zero; each row has the sum 1. The columns are in
+        the order of ``grid.data``.
+    """
+    x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.asarray(y, float))
+    where = np.asarray(grid.grid_xypos, dtype=float)
+    if len(where) == 1:
+        return np.ones((x.size, 1))
+    hats = []
+    for values, own in ((x, where[:, 0]), (y, where[:, 1])):
+        nodes = np.unique(own)
+        hats.append([np.interp(values, nodes, (nodes == node).astype(float)) for node in own])
+    return (np.array(hats[0]) * np.array(hats[1])).T
+
+
+def psf_at(grid, x, y):
+    """
+    The PSF of a grid at a position.
+
+    Parameters
+    ----------
+    grid : `~photutils.psf.GriddedPSFModel`
+        As made by `psf_grid`. Other gridded models know neither pixel nor frame: see
+        `~miricigale.psf.from_photutils`.
+    x, y : float
+        Position in pixels.
+
+    Returns
+    -------
+    psf : `~photutils.psf.ImagePSF`
+        With its own ``fwhm``, ``eef``, ``pixel_scale`` and ``position``.
+
+    Raises
+    ------
+    TypeError
+        If it is no gridded model.
+    ValueError
+        If its meta lacks ``pixel_scales`` or ``frame``.
+    """
+    if not isinstance(grid, GriddedPSFModel):
+        msg = f"'grid' must be a photutils GriddedPSFModel, got {type(grid).__name__}"
+        raise TypeError(msg)
+    missing = [key for key in ("pixel_scales", "frame") if key not in grid.meta]
+    if missing:
+        wanted = f"a grid whose meta has {missing} (see miricigale.psf.from_photutils)"
+        raise argument_error("grid", wanted, f"meta with {sorted(grid.meta)}")
+    weights = grid_weights(grid, float(x), float(y))[0]
+    meta = {k: v for k, v in grid.meta.items() if k not in (*_OWN, "frame", "angle", "includes")}
+    return make_psf(
+        np.tensordot(weights, np.asarray(grid.data), axes=1),
+        pixel_scale=float(weights @ np.asarray(grid.meta["pixel_scales"])) * ANGLE,
+        oversampling=int(np.atleast_1d(grid.oversampling)[0]),
+        frame=grid.meta["frame"],
+        angle=grid.meta.get("angle", 0.0) * u.deg,
+        includes=grid.meta.get("includes", ()),
+        position=(float(x), float(y)),
+        **meta,
+    )

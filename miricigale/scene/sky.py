@@ -1,0 +1,63 @@
+"""From the sky to the pixels of an image: positions and the local linear map."""
+
+import numpy as np
+
+__all__ = ["local_jacobian", "pixel_positions"]
+
+
+def local_jacobian(wcs, x, y):
+    """
+    Local linear map from the sky to the pixels.
+
+    Parameters
+    ----------
+    wcs : `~astropy.wcs.WCS`
+        World coordinates, distorted or not.
+    x, y : `~numpy.ndarray`, shape (N,)
+        Pixel positions.
+
+    Returns
+    -------
+    jacobian : `~numpy.ndarray`, shape (N, 2, 2)
+        Pixels per arcsec: ``[dx, dy] = jacobian @ [east, north]``.
+    """
+
+    def world(dx, dy):
+        return np.asarray(wcs.all_pix2world(x + dx, y + dy, 0))
+
+    _, dec = world(0, 0)
+    columns = []
+    for step in ((0.5, 0.0), (0.0, 0.5)):
+        d_ra, d_dec = world(*step) - world(-step[0], -step[1])
+        d_ra = (d_ra + 180.0) % 360.0 - 180.0
+        columns.append(3600.0 * np.stack([d_ra * np.cos(np.radians(dec)), d_dec], axis=-1))
+    return np.linalg.inv(np.stack(columns, axis=-1))
+
+
+def pixel_positions(wcs, sky, shape):
+    """
+    Pixel positions, by the distortion where it is defined and linear far from the image.
+
+    Parameters
+    ----------
+    wcs : `~astropy.wcs.WCS`
+        World coordinates.
+    sky : `~astropy.coordinates.SkyCoord`, shape (N,)
+        Positions.
+    shape : tuple of int
+        ``(ny, nx)`` of the image.
+
+    Returns
+    -------
+    x, y : `~numpy.ndarray`, shape (N,)
+        Pixels; NaN on the other side of the sky.
+    near : `~numpy.ndarray` of bool, shape (N,)
+        Within half an image of the image.
+    """
+    ny, nx = shape
+    ra, dec = sky.icrs.ra.deg, sky.icrs.dec.deg
+    x, y = np.asarray(wcs.wcs_world2pix(ra, dec, 0), dtype=float)
+    near = (x > -0.5 * nx) & (x < 1.5 * nx) & (y > -0.5 * ny) & (y < 1.5 * ny)
+    if np.any(near):
+        x[near], y[near] = wcs.all_world2pix(ra[near], dec[near], 0, quiet=True)
+    return x, y, near

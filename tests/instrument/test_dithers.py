@@ -1,0 +1,133 @@
+"""Dither patterns by name, from tables and from APT's list of pointings."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+from numpy.testing import assert_allclose
+
+from miricigale.instrument import Exposure, dither_offsets, read_dithers
+from miricigale.utils.exceptions import DataError
+
+PIXEL = np.array([0.110497, 0.111336])
+HEADER = (
+    "Tar Tile Exp Dith Aperture Name             Target       RA         Dec        BaseX    BaseY"
+    "    DithX    DithY    V2       V3       IdlX     IdlY   Level      Type      ExPar  DkPar   dDist"
+)
+ROW = (
+    "  1    1   {exp}    {dith} {aperture}              1 {name}  +80.48750  -69.49750   +0.000   +0.000"
+    "   {x:+.3f}   {y:+.3f}  -453.559 -373.814   {x:+.3f}   {y:+.3f} DITHER  {kind}        0      0  0.215"
+)
+
+
+def pointing_list(path, rows_by_observation):
+    lines = ["# APT Output Product", "=" * 40]
+    for number, rows in rows_by_observation.items():
+        lines += [f"* Deep field (Obs {number})", f"** Visit {number}:1", HEADER]
+        lines += [ROW.format(**row) for row in rows] + [""]
+    path.write_text("\n".join(lines))
+    return path
+
+
+def row(dith, x, y, *, exp=1, aperture="MIRIM_FULL", kind="SCIENCE"):
+    options = {"dith": dith, "x": x, "y": y, "exp": exp, "aperture": aperture, "kind": kind}
+    return {**options, "name": "FIELD"}
+
+
+@pytest.mark.parametrize(
+    ("name", "limit"), [("cycling-small", 11), ("cycling-medium", 64), ("cycling-large", 128)]
+)
+def test_cycling_spreads_over_its_circle_and_the_pixel(name, limit):
+    points = dither_offsets(name).value / PIXEL
+    assert points.shape == (311, 2)
+    assert len(np.unique(points.round(3), axis=0)) > 0.8 * 311
+    radius = np.hypot(*points.T)
+    assert 0.8 * limit < radius.max() <= limit
+    assert_allclose(points.mean(axis=0), 0, atol=0.06 * limit)
+    # four in a row sample the pixel by halves
+    for k in (0, 40, 200):
+        phases = np.round(points[k : k + 4] % 1, 3) % 1
+        assert {tuple(p) for p in phases} == {(0, 0), (0.5, 0), (0.5, 0.5), (0, 0.5)}
+    # any stretch goes round: all four quadrants within sixteen points
+    for k in range(0, 290, 37):
+        quadrants = {(a > 0, b > 0) for a, b in points[k : k + 16]}
+        assert len(quadrants) == 4
+    if name == "cycling-small":
+        assert radius.min() > 3
+
+
+def test_cycling_goes_on_from_tile_to_tile():
+    every = dither_offsets("cycling-medium", 20)
+    first, then = (
+        dither_offsets("cycling-medium", 12),
+        dither_offsets("cycling-medium", 8, start=12),
+    )
+    assert_allclose(np.vstack([first, then]).value, every.value)
+    field = SkyCoord(53.1, -27.8, unit="deg")
+    base = Exposure("miri.f2100w", n_groups=10, pointing=field, roll=20 * u.deg)
+    tile = base.dithered("cycling-medium", 3, first=12, start=12)
+    assert [one.dither for one in tile] == [12, 13, 14]
+    for one, (dx, dy) in zip(tile, then[:3].value, strict=True):
+        x, y = one.wcs.world_to_pixel(field)
+        assert_allclose([x - 692.5, y - 511.5], [-dx / 0.1105, -dy / 0.1113], atol=0.7)
+
+
+def test_all_of_a_pattern_if_not_told_how_many():
+    assert dither_offsets("4-point").shape == (4, 2)
+    assert dither_offsets([[0, 0], [1, 2], [3, 4]] * u.arcsec, start=1).value.tolist() == [
+        [1, 2],
+        [3, 4],
+    ]
+
+
+@pytest.mark.parametrize("suffix", ["ecsv", "fits"])
+def test_a_table_and_its_file(tmp_path, suffix):
+    table = QTable({"x_offset": [0, 1, -2.5] * u.arcsec, "y_offset": [0, 0.02, 0.03] * u.arcmin})
+    truth = [[0, 0], [1, 1.2], [-2.5, 1.8]]
+    assert_allclose(dither_offsets(table).value, truth)
+    path = tmp_path / f"dithers.{suffix}"
+    table.write(path)
+    assert_allclose(read_dithers(path).value, truth)
+    assert_allclose(dither_offsets(path, 2).value, truth[:2])
+
+
+def test_a_list_of_pointings(tmp_path):
+    rows = [
+        row(1, 0.0, 0.0, kind="T_ACQ"),
+        row(1, 1.101, -0.25),
+        row(1, 1.101, -0.25, exp=2),
+        row(2, -1.2, 3.5),
+        row(2, 9.0, 9.0, aperture="NRCALL_FULL"),
+        row(3, 0.5, -2.75, kind="PARALLEL"),
+    ]
+    path = pointing_list(tmp_path / "plan.pointing", {4: rows})
+    truth = [[1.101, -0.25], [-1.2, 3.5], [0.5, -2.75]]
+    assert_allclose(read_dithers(path).value, truth)
+    assert_allclose(dither_offsets(path).value, truth)
+    several = pointing_list(tmp_path / "two.pointing", {4: rows, 7: rows[:3]})
+    assert_allclose(read_dithers(several, observation=7).value, truth[:1])
+    with pytest.raises(ValueError, match=r"'observation' must be one of \[4, 7\], got None"):
+        read_dithers(several)
+    other = pointing_list(tmp_path / "nircam.pointing", {1: rows[4:5]})
+    with pytest.raises(
+        DataError, match=r"no exposures of MIRIM apertures; it has \['NRCALL_FULL'\]"
+    ):
+        read_dithers(other)
+
+
+def test_refuses(tmp_path):
+    with pytest.raises(DataError, match="no file of dithers"):
+        read_dithers(tmp_path / "nothing.ecsv")
+    path = tmp_path / "text.ecsv"
+    path.write_text("nonsense")
+    with pytest.raises(DataError, match=r"text\.ecsv cannot be read as a table"):
+        read_dithers(path)
+    with pytest.raises(ValueError, match=r"'pattern' must be .*'y_offset'"):
+        dither_offsets(QTable({"x_offset": [1] * u.arcsec}))
+    with pytest.raises(u.UnitsError, match="'x_offset' must be convertible to arcsec"):
+        dither_offsets(QTable({"x_offset": [1.0], "y_offset": [1.0]}))
+    with pytest.raises(ValueError, match="'start' must be 0 or a positive integer"):
+        dither_offsets("ceers", 3, start=-1)
+    with pytest.raises(ValueError, match=r"'pattern' must be offsets of shape \(3, 2\)"):
+        dither_offsets([[0, 0], [1, 2]] * u.arcsec, 2, start=1)

@@ -1,0 +1,211 @@
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.nddata import NDData
+from photutils.psf import GriddedPSFModel, ImagePSF
+
+from miricigale.instrument import aperture, pixel_to_sky
+from miricigale.psf import (
+    MIRI_PIXEL_SCALE,
+    _core,
+    average_psf,
+    effects,
+    encircled_energy,
+    gaussian_psf,
+    grid_weights,
+    hst_psf,
+    miri_psf,
+    miri_psf_grid,
+    psf_at,
+    psf_grid,
+    psf_mosaic,
+)
+from miricigale.psf.library import band_quantiles, local_pixel
+from miricigale.psf.optics import _to_image, jwst_constants
+
+CORNERS = [(359.0, 0.0), (1026.0, 0.0), (1026.0, 1023.0), (700.0, 300.0)]
+SMALL = {"fov": 4 * u.arcsec, "oversampling": 3}
+
+
+@pytest.mark.parametrize(("x", "y"), CORNERS)
+def test_pixel_is_that_of_the_distortion(x, y):
+    """Sides and angles of the pixel by the full spherical transformation to the sky."""
+    field, roll = SkyCoord(53.1, -27.8, unit="deg"), 30 * u.deg
+    here = pixel_to_sky(x, y, field, roll)
+    along_x, along_y = pixel_to_sky(x + 1, y, field, roll), pixel_to_sky(x, y + 1, field, roll)
+    jacobian = local_pixel(x, y)
+    sides = np.hypot(*jacobian)
+    assert here.separation(along_x).arcsec == pytest.approx(sides[0], rel=3e-4)
+    assert here.separation(along_y).arcsec == pytest.approx(sides[1], rel=3e-4)
+    # position angles: the ideal +y stands at roll + V3IdlYAngle, its +x 90 deg less
+    ideal = 30 + aperture().v3_ideal_y_angle
+    pa_x = ideal - 90 + np.degrees(np.arctan2(jacobian[1, 0], jacobian[0, 0]))
+    pa_y = ideal + np.degrees(np.arctan2(-jacobian[0, 1], jacobian[1, 1]))
+    for there, angle in ((along_x, pa_x), (along_y, pa_y)):
+        turn = (here.position_angle(there).deg - angle + 180) % 360 - 180
+        assert turn == pytest.approx(0, abs=0.05)
+
+
+@pytest.mark.parametrize("oversampling", [2, 4])
+@pytest.mark.parametrize("name", ["miri.f560w", "miri.f1500w"])
+def test_optics_at_a_position_are_those_of_the_warped_pupil(name, oversampling):
+    """|F(P)|^2 sampled at J p is |F(P(J^-T w))|^2 at p: no interpolation, no small angles."""
+    x, y = 359.0, 0.0
+    got = miri_psf(
+        name,
+        position=(x, y),
+        includes=(),
+        wavefront_error=0 * u.nm,
+        fov=6 * u.arcsec,
+        oversampling=oversampling,
+    )
+    map_ = local_pixel(x, y) / MIRI_PIXEL_SCALE.value
+    n, constants = 384, jwst_constants()
+    step = 1.03 * constants["diameter"] / n
+    amplitude, blocked = np.zeros((n, n)), np.zeros((n, n))
+    for vertices in constants["segments"].values():
+        amplitude += _core.polygon_coverage(_to_image(vertices, 4.83544897) @ map_, n, step, 8)
+    for vertices in constants["struts"].values():
+        part = _core.polygon_coverage(_to_image(vertices, 4.83544897) @ map_, n, step, 8)
+        blocked = np.maximum(blocked, part)
+    amplitude = np.minimum(amplitude, 1) * (1 - blocked)
+    cells = got.data.shape[0]
+    axis = (np.arange(cells) - cells // 2) * MIRI_PIXEL_SCALE.to_value(u.rad) / oversampling
+    truth = np.mean(
+        [
+            _core.matrix_dft_intensity(
+                amplitude + 0j, step, wave * 1e-6, axis, axis, power=amplitude.sum()
+            )
+            for wave in band_quantiles(name, 9)
+        ],
+        axis=0,
+    )
+    truth *= oversampling**2
+    np.testing.assert_allclose(got.data, truth, atol=2e-3 * truth.max())
+    assert got.meta["enclosed"] == pytest.approx(truth.sum() / oversampling**2, abs=1e-3)
+    # the square pixel's image is no such thing
+    square = miri_psf(
+        name,
+        includes=(),
+        wavefront_error=0 * u.nm,
+        fov=6 * u.arcsec,
+        oversampling=oversampling,
+    )
+    assert np.abs(square.data - truth).max() > 5 * np.abs(got.data - truth).max()
+
+
+def test_widths_on_the_sky_are_the_same_all_over_the_field():
+    radii = [0.2, 0.5, 1.0, 1.8] * u.arcsec
+    kind = {**SMALL, "includes": ()}
+    reference = encircled_energy(miri_psf("miri.f1000w", **kind), radii)
+    for position in CORNERS:
+        psf = miri_psf("miri.f1000w", position=position, **kind)
+        assert psf.meta["pixel_scale"] == pytest.approx(
+            np.sqrt(abs(np.linalg.det(local_pixel(*position))))
+        )
+        np.testing.assert_allclose(encircled_energy(psf, radii), reference, atol=2e-3)
+
+
+def test_cross_leans_to_the_middle_of_the_array():
+    image = np.zeros((401, 401))
+    image[200, 200] = 1.0
+    for x, y in ((100.0, 100.0), (1000.0, 900.0)):
+        shift = effects.cruciform_shift(x, y)
+        assert np.sign(shift).tolist() == [np.sign(598 - x), np.sign(511 - y)]
+        out = effects.cruciform(image, "miri.f560w", oversampling=4, shift=shift)
+        cells = np.arange(401) - 200
+        # arms beyond the core, where the other arm is not
+        up, right = out[300:].sum(0), out[:, 300:].sum(1)
+        assert (up @ cells) / up.sum() == pytest.approx(4 * shift[0], abs=1e-9)
+        assert (right @ cells) / right.sum() == pytest.approx(4 * shift[1], abs=1e-9)
+        straight = effects.cruciform(image, "miri.f560w", oversampling=4)
+        assert out.sum() == pytest.approx(straight.sum(), rel=1e-12)
+    assert effects.cruciform_shift(597.7, 511.0) == pytest.approx((0, 0), abs=1e-3)
+
+
+@pytest.fixture(scope="module")
+def grid():
+    return miri_psf_grid("miri.f770w", n_psfs=4, **SMALL)
+
+
+def test_grid_is_photutils_model_and_says_what_it_is(grid):
+    assert isinstance(grid, GriddedPSFModel)
+    assert grid.meta["frame"] == "detector"
+    assert grid.meta["includes"] == ["jitter", "cruciform", "pixel", "ipc"]
+    assert grid.meta["filter"] == "miri.f770w"
+    assert "fwhm" not in grid.meta
+    for k, (x, y) in enumerate(grid.grid_xypos):
+        alone = miri_psf("miri.f770w", position=(x, y), **SMALL)
+        np.testing.assert_array_equal(grid.data[k], alone.data)
+        here = psf_at(grid, x, y)
+        np.testing.assert_allclose(here.data, alone.data, rtol=1e-12)
+        assert here.meta["pixel_scale"] == pytest.approx(alone.meta["pixel_scale"])
+        assert here.meta["fwhm"] == pytest.approx(alone.meta["fwhm"])
+        assert here.meta["position"] == (x, y)
+
+
+@pytest.mark.parametrize(("x", "y"), [(600.0, 200.0), (359.0, 900.0), (100.0, 1500.0)])
+def test_between_the_places_it_is_what_photutils_evaluates(grid, x, y):
+    yy, xx = np.mgrid[-8:9, -8:9]
+    expected = grid.evaluate(xx + x, yy + y, 1.0, x, y)
+    here = psf_at(grid, x, y)
+    np.testing.assert_allclose(
+        here.evaluate(xx, yy, 1.0, 0.0, 0.0), expected, atol=1e-5 * expected.max()
+    )
+    assert grid_weights(grid, x, y).sum() == pytest.approx(1)
+
+
+def test_grid_of_a_subarray_counts_its_pixels():
+    corner = aperture("BRIGHTSKY").origin
+    one = miri_psf("miri.f1000w", position=(20, 30), subarray="BRIGHTSKY", **SMALL)
+    full = miri_psf("miri.f1000w", position=(20 + corner[0], 30 + corner[1]), **SMALL)
+    np.testing.assert_allclose(one.data, full.data, atol=1e-9)
+    part = miri_psf_grid("miri.f1000w", n_psfs=4, subarray="BRIGHTSKY", **SMALL)
+    assert np.ptp(part.grid_xypos, axis=0).tolist() == [511, 511]
+
+
+def test_dithers_of_a_source_average_on_the_mosaic(grid):
+    """Each dither's own place on the array, then its turn: the mean of the parts."""
+    places = [(500.0, 400.0), (540.0, 370.0), (600.0, 700.0)]
+    parts = [
+        psf_mosaic(psf_at(grid, *p), 0.06 * u.arcsec, 40 * u.deg, 3 * u.arcsec) for p in places
+    ]
+    mean = average_psf(parts)
+    np.testing.assert_allclose(mean.data, np.mean([p.data for p in parts], axis=0), rtol=1e-12)
+    assert mean.meta["frame"] == "sky"
+
+
+def test_f160w_over_a_mosaic_of_two_rolls():
+    kind = {"fov": 3 * u.arcsec}
+    a, b = hst_psf(angle=0 * u.deg, **kind), hst_psf(angle=30 * u.deg, **kind)
+    grid = psf_grid([a, b, a, b], [(0, 0), (900, 0), (0, 900), (900, 900)])
+    assert grid.meta["pixel_scale"] == pytest.approx(0.06)
+    middle = psf_at(grid, 450, 10)
+    np.testing.assert_allclose(middle.data, 0.5 * (a.data + b.data), rtol=1e-12)
+
+
+def test_refuses():
+    psf = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=2 * u.arcsec)
+    square = [(0, 0), (9, 0), (0, 9), (9, 9)]
+    with pytest.raises(ValueError, match=r"'positions' must be of shape \(4, 2\)"):
+        psf_grid([psf] * 4, square[:3])
+    with pytest.raises(ValueError, match="'positions' must be all points of a rectangular grid"):
+        psf_grid([psf] * 4, [(0, 0), (9, 0), (0, 9), (8, 9)])
+    with pytest.raises(ValueError, match="'positions' must be different places"):
+        psf_grid([psf] * 5, [*square, (9, 9)])
+    wide = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.1 * u.arcsec, fov=3 * u.arcsec)
+    with pytest.raises(ValueError, match="'psfs' must be alike in shape"):
+        psf_grid([psf, psf, psf, wide], square)
+    with pytest.raises(ValueError, match="'psfs' must be alike in oversampling, got 4 and 3"):
+        psf_grid([psf, psf, psf, miri_psf("miri.f770w", **SMALL)], square)
+    with pytest.raises(ValueError, match="'n_psfs' must be a square number of at least 4, got 6"):
+        miri_psf_grid("miri.f770w", n_psfs=6)
+    with pytest.raises(ValueError, match="'position' must be on the 1032 x 1024 pixels of FULL"):
+        miri_psf("miri.f770w", position=(1032, 0), **SMALL)
+    with pytest.raises(TypeError, match="'grid' must be a photutils GriddedPSFModel, got ImagePSF"):
+        psf_at(ImagePSF(np.ones((5, 5))), 0, 0)
+    meta = {"grid_xypos": square, "oversampling": 1}
+    bare = GriddedPSFModel(NDData(np.ones((4, 5, 5)), meta=meta))
+    with pytest.raises(ValueError, match="from_photutils"):
+        psf_at(bare, 0, 0)

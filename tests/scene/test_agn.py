@@ -1,0 +1,86 @@
+"""A point source at the centre of a galaxy, as a share of its light or on top of it."""
+
+import importlib.util
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from miricigale.instrument import pixel_area_map
+from miricigale.scene import Scene, SceneFlags
+
+_spec = importlib.util.spec_from_file_location("scene_tools", Path(__file__).parent / "conftest.py")
+tools = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(tools)
+
+FILTER = "miri.f770w"
+GALAXY = {"profile": "sersic", "radius": 0.5, "index": 2.0, "ratio": 0.4, "angle": 40.0}
+
+
+def light(catalog, wcs, psf, **options):
+    scene = Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, **options)
+    return scene.render().data * pixel_area_map(wcs, (90, 100)) * 1e12, scene.truth
+
+
+def test_a_share_of_the_light_is_in_the_point(wcs, psf):
+    galaxy = tools.make_catalog(wcs, 50.3, 44.6, **GALAXY)
+    point = tools.make_catalog(wcs, 50.3, 44.6)
+    host, _ = light(galaxy, wcs, psf)
+    nucleus, _ = light(point, wcs, psf)
+    galaxy["frac_agn"] = [0.3]
+    image, truth = light(galaxy, wcs, psf, agn="frac_agn")
+    np.testing.assert_allclose(image, 0.7 * host + 0.3 * nucleus, atol=1e-6 * image.max())
+    assert truth["flux_total"].value.tolist() == [10.0]
+    assert truth["flux_agn"].value.tolist() == [3.0]
+    assert truth["flux_in_image"].value[0] == pytest.approx(image.sum(), rel=1e-6)
+    assert truth["profile"].tolist() == ["sersic"]
+
+
+def test_a_flux_comes_on_top(wcs, psf):
+    galaxy = tools.make_catalog(wcs, [30.0, 70.0, 60.0], [40.0, 50.0, 20.0], **GALAXY)
+    host, alone = light(galaxy, wcs, psf)
+    assert alone["flux_agn"].value.tolist() == [0, 0, 0]
+    galaxy["agn"] = [0.004, np.nan, 0.0] * u.mJy
+    image, truth = light(galaxy, wcs, psf, agn="agn")
+    nucleus, _ = light(tools.make_catalog(wcs, 30.0, 40.0, flux=4.0), wcs, psf)
+    np.testing.assert_allclose(image, host + nucleus, atol=1e-6 * image.max())
+    np.testing.assert_allclose(truth["flux_total"].value, [14, 10, 10])
+    np.testing.assert_allclose(truth["flux_agn"].value, [4, 0, 0])
+
+
+def test_what_is_cut_is_of_all_light(wcs, psf):
+    """A profile of index 8 cut at 4 arcsec loses a few per cent, a bright point in it less."""
+    steep = {**GALAXY, "index": 8.0, "radius": 1.0}
+    galaxy = tools.make_catalog(wcs, 50.0, 45.0, **steep)
+    cut = int(SceneFlags.CUT_PROFILE)
+    galaxy["frac_agn"] = [0.99]
+    kind = {"max_radius": 4 * u.arcsec}
+    assert light(galaxy, wcs, psf, **kind)[1]["flags"][0] & cut
+    assert not light(galaxy, wcs, psf, agn="frac_agn", **kind)[1]["flags"][0] & cut
+
+
+def test_refuses(wcs, psf):
+    galaxy = tools.make_catalog(wcs, [50.0, 30.0], 45.0, **GALAXY)
+    with pytest.raises(ValueError, match=r"'agn' must be a column of .* got 'nucleus'"):
+        light(galaxy, wcs, psf, agn="nucleus")
+    galaxy["share"] = [0.2, 1.3]
+    with pytest.raises(
+        ValueError, match=r"'agn' must be shares between 0 and 1, got 1\.3 in row 1"
+    ):
+        light(galaxy, wcs, psf, agn="share")
+    galaxy["extra"] = [1.0, -2.0] * u.uJy
+    with pytest.raises(ValueError, match="'agn' must be fluxes that are finite and not negative"):
+        light(galaxy, wcs, psf, agn="extra")
+    galaxy["other"] = [1.0, 2.0] * u.s
+    with pytest.raises(u.UnitsError, match="'agn' must be convertible to uJy"):
+        light(galaxy, wcs, psf, agn="other")
+
+
+def test_nothing_near_is_an_empty_image(wcs, psf):
+    galaxy = tools.make_catalog(wcs, 50.0, 45.0, **GALAXY)
+    galaxy["sky"] = galaxy["sky"].directional_offset_by(0 * u.deg, 5 * u.arcmin)
+    galaxy["share"] = [0.5]
+    image, truth = light(galaxy, wcs, psf, agn="share")
+    assert not np.any(image)
+    assert truth["flags"].tolist() == [SceneFlags.OUTSIDE_IMAGE]

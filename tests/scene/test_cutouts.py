@@ -1,0 +1,202 @@
+"""Images of galaxies as sources: light, place, orientation and shape."""
+
+import importlib.util
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.nddata import CCDData
+from astropy.wcs import Sip
+from photutils.psf import ImagePSF
+
+from miricigale.instrument import pixel_area_map
+from miricigale.profiles import sersic_image
+from miricigale.scene import Cutout, Scene
+
+_spec = importlib.util.spec_from_file_location("scene_tools", Path(__file__).parent / "conftest.py")
+tools = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(tools)
+
+FILTER = "miri.f770w"
+
+
+def light(scene):
+    return scene.render().data * pixel_area_map(scene.wcs, (90, 100)) * 1e12
+
+
+def moments(image):
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
+    total = image.sum()
+    x0, y0 = np.sum(image * x) / total, np.sum(image * y) / total
+    x, y = x - x0, y - y0
+    return x0, y0, np.array([[np.sum(image * p * q) / total for p in (x, y)] for q in (x, y)])
+
+
+def one(wcs, x, y, **columns):
+    return tools.make_catalog(wcs, x, y, profile="cutout", **columns)
+
+
+def gaussian_stamp(sigma_x, sigma_y, scale, n=81, **options):
+    """A Gaussian integrated over the pixels of a stamp; widths in arcsec."""
+    data = np.outer(
+        tools.pixel_gaussian(n, (n - 1) / 2, sigma_y / scale),
+        tools.pixel_gaussian(n, (n - 1) / 2, sigma_x / scale),
+    )
+    return Cutout(data, pixel_scale=scale * u.arcsec, **options)
+
+
+@pytest.mark.parametrize("scale", [0.03, 0.06, 0.2])
+@pytest.mark.parametrize(("x", "y"), [(50.0, 45.0), (50.37, 44.81), (49.5, 45.24)])
+def test_light_is_kept_to_1e6_and_the_place_to_a_hundredth_of_a_pixel(psf, scale, x, y):
+    wcs = tools.tan_wcs(pa=25.0)
+    stamp = gaussian_stamp(0.35, 0.35, scale, n=4 * round(1.5 / scale) + 1)
+    # the catalogue's flux, whatever the stamp's own unit
+    stamp = Cutout(17.0 * stamp.data, pixel_scale=stamp.pixel_scale)
+    scene = Scene(one(wcs, x, y), filter=FILTER, wcs=wcs, psf=psf, cutouts={1: stamp})
+    image = light(scene)
+    assert image.sum() == pytest.approx(10.0, rel=1e-6)
+    assert scene.truth["flux_in_image"].value[0] == pytest.approx(image.sum(), rel=1e-6)
+    x0, y0, _ = moments(image)
+    assert (x0, y0) == (pytest.approx(x, abs=1e-3), pytest.approx(y, abs=1e-3))
+
+
+@pytest.mark.parametrize("parity", [-1, 1])
+@pytest.mark.parametrize(("pa", "angle"), [(0.0, 0.0), (35.0, 0.0), (20.0, 80.0), (200.0, -30.0)])
+def test_second_moments_through_angle_and_parity(psf, pa, angle, parity):
+    """Widths add in squares: profile, stamp pixel (twice: drawn and spread), PSF, pixel."""
+    wcs = tools.tan_wcs(pa=pa, parity=parity)
+    scale = 0.05
+    stamp = gaussian_stamp(0.2, 0.5, scale, angle=angle * u.deg)
+    scene = Scene(one(wcs, 50, 45), filter=FILTER, wcs=wcs, psf=psf, cutouts={1: stamp})
+    x0, y0, got = moments(light(scene))
+    assert (x0, y0) == (pytest.approx(50, abs=1e-3), pytest.approx(45, abs=1e-3))
+    # the stamp's +y at the position angle, +x west of it; east is to the left for parity -1
+    t = np.radians(angle)
+    sky = np.array([[-np.cos(t), np.sin(t)], [np.sin(t), np.cos(t)]])
+    p = np.radians(pa)
+    pixels = np.array([[parity * np.cos(p), -parity * np.sin(p)], [np.sin(p), np.cos(p)]]) / 0.11
+    own = np.diag([0.2**2, 0.5**2]) + np.eye(2) * scale**2 / 6
+    truth = (pixels @ sky) @ own @ (pixels @ sky).T + np.eye(2) * (0.85**2 + 1 / 12)
+    np.testing.assert_allclose(got, truth, rtol=2e-3, atol=5e-3)
+
+
+def test_a_very_small_stamp_is_a_point(wcs, psf):
+    stamp = Cutout(np.ones((1, 1)), pixel_scale=1e-4 * u.arcsec)
+    scene = Scene(one(wcs, 40.37, 30.81), filter=FILTER, wcs=wcs, psf=psf, cutouts={1: stamp})
+    y, x = np.mgrid[:90, :100]
+    expected = ImagePSF(psf.data, oversampling=4, x_0=40.37, y_0=30.81, flux=10)(x, y)
+    np.testing.assert_allclose(light(scene), expected, atol=2e-6 * expected.max())
+
+
+def test_a_drawn_galaxy_is_the_galaxy(wcs, psf):
+    """A finely drawn Sersic stamp and the profile itself."""
+    kwargs = {"radius": 0.4, "index": 1.5, "ratio": 0.5, "angle": 30.0}
+    galaxy = tools.make_catalog(wcs, 50.3, 44.8, profile="sersic", **kwargs)
+    # position angle 30 deg on a north-up stamp: 120 deg from +x
+    data = sersic_image(
+        (601, 601), x=300, y=300, r_eff=40, n=1.5, axis_ratio=0.5, theta=np.radians(120)
+    )
+    stamp = Cutout(data, pixel_scale=0.01 * u.arcsec)
+    kind = {"filter": FILTER, "wcs": wcs, "psf": psf}
+    image = light(Scene(one(wcs, 50.3, 44.8), cutouts={1: stamp}, **kind))
+    truth = light(Scene(galaxy, max_radius=2.9 * u.arcsec, **kind))
+    np.testing.assert_allclose(
+        image / image.sum(), truth / truth.sum(), atol=4e-3 * truth.max() / truth.sum()
+    )
+
+
+@pytest.mark.parametrize("parity", [-1, 1])
+def test_stamp_of_an_image_stands_as_the_image_does(psf, parity):
+    """A companion lands where the WCS of its own image says."""
+    own = tools.tan_wcs((61, 71), scale=0.05, pa=130.0, parity=parity)
+    y, x = np.mgrid[:61, :71]
+    data = np.exp(-0.5 * ((x - 35) ** 2 + (y - 30) ** 2) / 2.0)
+    data += 0.8 * np.exp(-0.5 * ((x - 60) ** 2 + (y - 45) ** 2) / 2.0)
+    data[0, 0] = np.nan
+    image = CCDData(data, unit="adu", wcs=own, mask=(x == 2) & (y == 2))
+    sky = own.pixel_to_world(35, 30)
+    stamp = Cutout.from_image(image, sky)
+    assert stamp.pixel_scale.to_value(u.arcsec) == pytest.approx(0.05, rel=1e-6)
+    wcs = tools.tan_wcs(pa=20.0)
+    catalog = one(wcs, 50, 45)
+    catalog["sky"] = sky.reshape((1,))
+    scene = Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, cutouts={1: stamp})
+    cx, cy = (float(v) for v in wcs.world_to_pixel(own.pixel_to_world(60, 45)))
+    drawn = light(scene)
+    part = np.s_[round(cy) - 4 : round(cy) + 5, round(cx) - 4 : round(cx) + 5]
+    yy, xx = np.mgrid[part]
+    blob = drawn[part]
+    # in a window of its own: the principal source is 11 pixels away
+    assert np.sum(blob * xx) / blob.sum() == pytest.approx(cx, abs=0.05)
+    assert np.sum(blob * yy) / blob.sum() == pytest.approx(cy, abs=0.05)
+
+
+def test_distortion_stretches_the_stamp(psf):
+    wcs = tools.tan_wcs(pa=20.0)
+    a, b = np.zeros((3, 3)), np.zeros((3, 3))
+    a[2, 0], b[1, 1] = 1.5e-3, -8e-4
+    wcs.wcs.ctype = ["RA---TAN-SIP", "DEC--TAN-SIP"]
+    wcs.sip = Sip(a, b, None, None, wcs.wcs.crpix)
+    wcs.wcs.set()
+    catalog = one(wcs, 20.0, 25.0)
+    stamp = gaussian_stamp(0.25, 0.25, 0.05)
+    scene = Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, cutouts={1: stamp})
+    x0, y0, got = moments(light(scene))
+    assert (x0, y0) == (pytest.approx(20, abs=0.01), pytest.approx(25, abs=0.01))
+    t = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    width = np.sqrt(0.25**2 + 0.05**2 / 6)
+    px, py = wcs.world_to_pixel(
+        catalog["sky"][0].directional_offset_by(t * u.rad, width * u.arcsec)
+    )
+    variance = 2 * np.array([np.mean((px - 20) ** 2), np.mean((py - 25) ** 2)])
+    np.testing.assert_allclose(np.diag(got), variance + 0.85**2 + 1 / 12, rtol=5e-3)
+
+
+def test_light_beyond_the_edge_is_in_no_pixel(wcs, psf):
+    stamp = gaussian_stamp(0.6, 0.6, 0.06)
+    for x in (-3.0, 1.0, 98.6):
+        scene = Scene(one(wcs, x, 45.0), filter=FILTER, wcs=wcs, psf=psf, cutouts={1: stamp})
+        total = light(scene).sum()
+        assert scene.truth["flux_in_image"].value[0] == pytest.approx(total, rel=1e-5)
+        assert 0.1 < total < 9
+
+
+def test_beside_other_sources(wcs, psf):
+    table = tools.make_catalog(
+        wcs, [30.0, 60.0, 70.0], [40.0, 50.0, 20.0], profile=["sersic", "cutout", "point"]
+    )
+    stamp = gaussian_stamp(0.2, 0.2, 0.06)
+    kind = {"filter": FILTER, "wcs": wcs, "psf": psf}
+    scene = Scene(table, cutouts={2: stamp}, **kind)
+    parts = [light(Scene(table[k : k + 1], **kind)) for k in (0, 2)]
+    parts.append(light(Scene(table[1:2], cutouts={2: stamp}, **kind)))
+    np.testing.assert_allclose(light(scene), sum(parts), atol=1e-6)
+    assert scene.truth["profile"].tolist() == ["sersic", "cutout", "point"]
+    assert scene.truth["flags"].tolist() == [0, 0, 0]
+
+
+def test_refuses(wcs, psf):
+    stamp = gaussian_stamp(0.2, 0.2, 0.06)
+    kind = {"filter": FILTER, "wcs": wcs, "psf": psf}
+    with pytest.raises(ValueError, match=r"'cutouts' must be one for each .* got none for \[1\]"):
+        Scene(one(wcs, 50, 45), **kind)
+    with pytest.raises(ValueError, match=r"'cutouts' must be for ids .* got some for \[7\]"):
+        Scene(one(wcs, 50, 45), cutouts={1: stamp, 7: stamp}, **kind)
+    with pytest.raises(ValueError, match="'cutouts' must be a Cutout for 1, got ndarray"):
+        Scene(one(wcs, 50, 45), cutouts={1: np.ones((5, 5))}, **kind)
+    with pytest.raises(ValueError, match="'data' must be a finite 2D array with a positive sum"):
+        Cutout(np.zeros((5, 5)), pixel_scale=0.1 * u.arcsec)
+    with pytest.raises(ValueError, match="'pixel_scale' must be positive"):
+        Cutout(np.ones((5, 5)), pixel_scale=0 * u.arcsec)
+    with pytest.raises(u.UnitsError, match="'pixel_scale' must be a quantity"):
+        Cutout(np.ones((5, 5)), pixel_scale=0.1)
+    with pytest.raises(ValueError, match="'image' must be NDData with a WCS"):
+        Cutout.from_image(CCDData(np.ones((5, 5)), unit="adu"))
+    long = tools.tan_wcs((5, 5))
+    long.wcs.cd = long.wcs.cd * np.array([1.0, 1.2])
+    with pytest.raises(ValueError, match="'image' must be with square pixels"):
+        Cutout.from_image(CCDData(np.ones((5, 5)), unit="adu", wcs=long))
+    with pytest.raises(ValueError, match="read-only"):
+        stamp.data[0, 0] = 1
+    assert repr(stamp) == "<Cutout 81 x 81 pixels of 0.06 arcsec, angle 0 deg>"
