@@ -41,7 +41,12 @@ def _parser():
     )
     fit.add_argument("--axes", choices=("fit", "quick"), default="fit", help="model grid")
     fit.add_argument("--redshift", metavar="COLUMN", help="column of known redshifts")
-    fit.add_argument("--model-error", type=float, default=0.1, help="relative model error")
+    fit.add_argument(
+        "--model-error",
+        type=float,
+        default=0.1,
+        help="model error as a part of the flux (0.1 is 10 %%)",
+    )
     fit.add_argument("--flux-unit", metavar="UNIT", help="unit of fluxes that have none (CSV)")
     fit.add_argument("--hdu", help="extension of a FITS file, if it has several tables")
     fit.add_argument("--chunk-rows", type=int, default=10000, help="rows in memory at a time")

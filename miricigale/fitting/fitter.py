@@ -36,7 +36,8 @@ class BayesFitter:
     prior * exp(-chi2 / 2) there, as in CIGALE [1]_; the prior on s that this amounts to is flat
     in the signal-to-noise ratio of the model, which is that of a prior flat in log s to within
     the relative variance of s. Pairs (galaxy, torus) that no AGN fraction can make good enough
-    are found by a bound and left out; the rest is evaluated in double precision.
+    are found by a bound and left out; of the rest those with most of the weight are evaluated in
+    double precision, the others in single precision unless ``rtol`` is below 5e-7.
 
     Parameters
     ----------

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from miricigale.fitting.posterior import cell_edges
+from miricigale.sed.component import COMPONENTS
 from miricigale.utils.exceptions import argument_error, unknown_name
 
 __all__ = ["GridAxis", "GridPriors", "grid_priors"]
@@ -92,16 +93,18 @@ def grid_priors(grid, priors=None, *, prior_f="grid"):
         if prior_f == "uniform" and "frac_agn" not in priors:
             priors["frac_agn"] = np.diff(cell_edges(f, (0.0, 1.0)))
         axes["frac_agn"] = _axis("frac_agn", f, 1, "frac_agn", priors, bounds=(0.0, 1.0))
+    bounds = _bounds(grid)
     galaxy = np.ones(grid.dust_luminosity.size)
     for name in grid.galaxy_parameters.colnames:
-        galaxy *= _add_axis(axes, name, grid.galaxy_parameters[name], "galaxy", priors)
+        galaxy *= _add_axis(axes, name, grid.galaxy_parameters[name], "galaxy", priors, bounds)
     agn = np.ones(grid.agn_multiplicity.size)
     if agn.size:
         left = grid.agn_multiplicity.astype(float)
         inert = _inert(grid)
         for name in grid.agn_parameters.colnames:
             rows, nodes = inert.get(name, (None, None))
-            agn *= _add_axis(axes, name, grid.agn_parameters[name], "agn", priors, rows, nodes)
+            column = grid.agn_parameters[name]
+            agn *= _add_axis(axes, name, column, "agn", priors, bounds, rows, nodes)
             if rows is not None:
                 left[rows] /= len(nodes)
         agn *= left
@@ -114,7 +117,18 @@ def grid_priors(grid, priors=None, *, prior_f="grid"):
     return GridPriors(axes, galaxy, agn, frac, axes["redshift"].weights)
 
 
-def _add_axis(axes, name, column, kind, priors, rows=None, nodes=None):
+def _bounds(grid):
+    """Limits of the parameters of the components that the grid was made of: name to (low, high)."""
+    out = {}
+    for text in grid.meta.get("components", ()):
+        name = text.partition(": ")[2].partition(" (")[0]
+        if name in COMPONENTS:
+            declared = COMPONENTS.get(name).declared()
+            out.update({key: parameter.bounds for key, parameter in declared.items()})
+    return out
+
+
+def _add_axis(axes, name, column, kind, priors, bounds, rows=None, nodes=None):
     """Add the axis of a table's column; return the prior factor of each model."""
     unit = getattr(column, "unit", None) or 1
     column = np.asarray(getattr(column, "value", column), dtype=float)
@@ -126,7 +140,10 @@ def _add_axis(axes, name, column, kind, priors, rows=None, nodes=None):
         values = np.unique(nodes)
     if values.size == 1 and name not in priors:
         return np.ones(column.size)
-    axis = _axis(name, values, unit, kind, priors)
+    low, high = bounds.get(name, (-np.inf, np.inf))
+    # a node on the limit, but for its last digit, is inside
+    inside = (min(low, values[0]), max(high, values[-1]))
+    axis = _axis(name, values, unit, kind, priors, inside)
     share = (column[None, :] == values[:, None]).astype(float)
     factor = axis.weights @ share * values.size
     if rows is not None:

@@ -7,6 +7,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.fitting.flags import FitFlags
+from miricigale.fitting.keyed import find_row, rows_by_id
 from miricigale.fitting.posterior import cell_percentiles, moments
 from miricigale.fitting.quantities import DERIVED_LEVELS
 from miricigale.fitting.result import FitResult
@@ -121,10 +122,7 @@ class FitResults:
         for name in ("pdf", "best", "pairs"):
             frozen = {k: frozen_array(v) for k, v in getattr(self, name).items()}
             object.__setattr__(self, name, frozen)
-        rows = {}
-        for row, key in enumerate(self.ids.tolist()):
-            rows.setdefault(key, row)
-        object.__setattr__(self, "_rows", rows)
+        object.__setattr__(self, "_rows", rows_by_id(self.ids))
 
     def __len__(self):
         return len(self.ids)
@@ -149,12 +147,7 @@ class FitResults:
         KeyError
             If there is none.
         """
-        key = key.item() if isinstance(key, np.generic) else key
-        if key not in self._rows:
-            some = ", ".join(map(repr, list(self._rows)[:5]))
-            msg = f"no object with the id {key!r} among {len(self)}; the first are {some}"
-            raise KeyError(msg)
-        return self._rows[key]
+        return find_row(self._rows, key, len(self))
 
     @property
     def fitted(self):

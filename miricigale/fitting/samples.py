@@ -7,13 +7,13 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.fitting import spectra
+from miricigale.fitting import predictions, spectra
 from miricigale.fitting.flags import FitFlags
+from miricigale.fitting.keyed import find_row, rows_by_id
 from miricigale.fitting.model_values import ModelValues
 from miricigale.fitting.posterior import bin_cells, node_cells
 from miricigale.fitting.priors import grid_priors
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, WAVE, frozen_array
 
 __all__ = ["Samples"]
@@ -94,10 +94,7 @@ class Samples:
         object.__setattr__(self, "meta", dict(self.meta))
         if self.axes is None:
             object.__setattr__(self, "axes", grid_priors(grid).axes)
-        rows = {}
-        for row, key in enumerate(self.ids.tolist()):
-            rows.setdefault(key, row)
-        object.__setattr__(self, "_rows", rows)
+        object.__setattr__(self, "_rows", rows_by_id(self.ids))
 
     def __len__(self):
         return len(self.ids)
@@ -120,12 +117,7 @@ class Samples:
         KeyError
             If there is none.
         """
-        key = key.item() if isinstance(key, np.generic) else key
-        if key not in self._rows:
-            some = ", ".join(map(repr, list(self._rows)[:5]))
-            msg = f"no object with the id {key!r} among {len(self)}; the first are {some}"
-            raise KeyError(msg)
-        return self._rows[key]
+        return find_row(self._rows, key, len(self))
 
     @property
     def n_draws(self):
@@ -238,7 +230,7 @@ class Samples:
         percentiles : `~astropy.units.Quantity`, shape (n, n_levels)
         """
         values = self.values(name)
-        return np.quantile(values.value, _check_levels(levels), axis=1).T * values.unit
+        return np.quantile(values.value, predictions.check_levels(levels), axis=1).T * values.unit
 
     # -------------------------------------------------------------- distributions
 
@@ -341,40 +333,19 @@ class Samples:
         """
         names, extra = self._bands(filters)
         out = np.full((*self.scale.shape, len(names)), np.nan)
-        fitted = np.flatnonzero(self.fitted)
-        own = [i for i, name in enumerate(names) if name in self.grid.filters]
-        columns = [self.grid.filters.index(names[i]) for i in own]
-        for row in fitted if own else ():
-            z, g, k, f = spectra.plain_index(self.grid, self.index[row]).T
-            flux = self.grid.flux(z, g, k, f)[:, columns]
-            out[row][:, own] = self.scale[row][:, None] * flux
-        if extra and fitted.size:
-            other = [names.index(band) for band in extra]
-            flux = spectra.model_fluxes(
-                self._model(), self.grid, self.index[fitted], extra.values()
-            )
-            out[np.ix_(fitted, np.arange(self.n_draws), other)] = (
-                flux * self.scale[fitted][:, :, None]
-            )
+        fitted = self.fitted
+        model = self._model() if extra else None
+        out[fitted] = predictions.draw_fluxes(
+            self.grid, self.index[fitted], self.scale[fitted], names, extra, model
+        )
         return out * FNU
 
     def _bands(self, filters):
-        """Names of the bands asked for, and those that the grid has not: name to filter."""
-        if filters is None:
-            return list(self.grid.filters), {}
-        if isinstance(filters, str):
-            raise argument_error("filters", "a list of names or a FilterSet", repr(filters))
-        from miricigale.filters import FilterSet
-
-        names = list(getattr(filters, "names", filters))
-        other = [name for name in names if name not in self.grid.filters]
-        if other:
+        """Names of the bands asked for, and those that only a model has."""
+        names, extra = predictions.band_names(self.grid, filters)
+        if extra:
             self._model()
-        given = dict(zip(names, filters, strict=True)) if hasattr(filters, "names") else {}
-        missing = [name for name in other if name not in given]
-        if missing:
-            given |= dict(zip(missing, FilterSet.from_names(missing), strict=True))
-        return names, {name: given[name] for name in other}
+        return names, extra
 
     def _model(self):
         if self.model is None:
@@ -399,27 +370,9 @@ class Samples:
             ``id``, ``flags`` and, for each filter, mean (by its name), standard deviation
             (``<name>_err``) and percentiles (``<name>_p16``, ...) in uJy.
         """
-        levels = _check_levels(levels)
+        levels = predictions.check_levels(levels)
         names, _ = self._bands(filters)
-        fluxes = self.fluxes(filters).value
-        out = QTable(
-            {"id": np.array(self.ids), "flags": np.array(self.flags)}, meta=dict(self.meta)
-        )
-        out["flags"].info.description = FitFlags.describe()
-        for i, name in enumerate(names):
-            columns = {
-                name: (fluxes[:, :, i].mean(axis=1), "posterior mean of the model flux"),
-                error_column(name): (fluxes[:, :, i].std(axis=1), "its standard deviation"),
-            }
-            for level, values in zip(
-                levels, np.quantile(fluxes[:, :, i], levels, axis=1), strict=True
-            ):
-                text = f"quantile {level:g} of the model flux"
-                columns[f"{name}_{_suffix(level)}"] = (values, text)
-            for column, (values, text) in columns.items():
-                out[column] = values * FNU
-                out[column].info.description = text
-        return out
+        return predictions.flux_table(self, names, self.fluxes(filters).value, levels)
 
     def spectra(self, key, *, rest=True):
         """
@@ -465,16 +418,10 @@ class Samples:
             ``wave`` and a column for each level (``p16``, ``p50``, ``p84``), taken at every
             wavelength by itself: L_nu in W / Hz, or F_nu in uJy as observed.
         """
-        levels = _check_levels(levels)
+        levels = predictions.check_levels(levels)
         wave, values = self.spectra(key, rest=rest)
-        out = QTable({"wave": wave}, meta=dict(self.meta) | {"id": str(key), "rest": bool(rest)})
-        out["wave"].info.description = f"{'rest' if rest else 'observed'} wavelength"
-        for level, row in zip(levels, np.quantile(values.value, levels, axis=0), strict=True):
-            out[_suffix(level)] = row * values.unit
-            out[
-                _suffix(level)
-            ].info.description = f"quantile {level:g} of {'L_nu' if rest else 'F_nu'}"
-        return out
+        meta = dict(self.meta) | {"id": str(key), "rest": bool(rest)}
+        return predictions.spectrum_table(wave, values, levels, rest=rest, meta=meta)
 
     # -------------------------------------------------------------------- drawing
 
@@ -497,14 +444,3 @@ class Samples:
     def _label(self, name):
         unit = self.unit(name).to_string()
         return f"{name} ({unit})" if unit else name
-
-
-def _check_levels(levels):
-    levels = np.atleast_1d(np.asarray(levels, dtype=float))
-    if levels.ndim != 1 or not np.all((levels > 0) & (levels < 1)):
-        raise argument_error("levels", "between 0 and 1", f"{levels}")
-    return levels
-
-
-def _suffix(level):
-    return f"p{100 * level:g}"

@@ -146,6 +146,9 @@ class _Inputs:
         self.redshift, self.prior = redshift, redshift_prior
         n = rows.n_rows
         self.by_row = redshift is not None and not isinstance(redshift, str) and np.ndim(redshift)
+        if isinstance(redshift, (list, tuple)):
+            # rows are taken from it by number
+            self.redshift = np.array(redshift)
         if self.by_row and np.shape(redshift) != (n,):
             raise argument_error("redshift", f"{n} values", f"shape {np.shape(redshift)}")
         self.prior_by_row = False
@@ -158,6 +161,8 @@ class _Inputs:
             self.prior_by_row = not isinstance(density, str) and np.ndim(density) == 2
             if self.prior_by_row and len(density) != n:
                 raise argument_error("redshift_prior", f"{n} rows", f"{len(density)}")
+            if isinstance(density, (list, tuple)):
+                self.prior = (redshift_prior[0], np.array(density))
 
     def take(self, i):
         """Piece ``i``: table, and the arguments of `fit` that go with it."""
@@ -283,7 +288,8 @@ def _open_folder(folder, job, resume):
         raise DataError(msg)
     if (folder / MANIFEST).is_file():
         manifest = read_manifest(folder)
-        if resume:
+        # a call that failed before its first part leaves nothing to keep
+        if resume and manifest["parts"]:
             other = _differences(manifest["job"], job)
             if other:
                 msg = (

@@ -5,6 +5,7 @@ from astropy.table import QTable
 
 from miricigale.fitting import BayesFitter, FitResults
 from miricigale.fitting.posterior import cell_edges, cell_percentiles, moments
+from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import DataError
 
 
@@ -44,6 +45,38 @@ def test_percentiles_are_ordered_and_bracket_the_mean(results):
         mean = results.mean(name).value
         low, high = results.percentile(name, [0.001, 0.999]).value.T
         assert np.all((mean >= low) & (mean <= high)), name
+
+
+def test_no_parameter_leaves_its_limits():
+    """Reddening and time are not negative; a cell about the lowest node would reach below 0."""
+    model = SEDModel.yang2021(libraries="bundled")
+    bands = ["acs.f606w", "wfc3.f160w", "miri.f770w", "miri.f2100w"]
+    axes = {
+        "redshift": [1.0],
+        "tau": [0.1, 1.0] * u.Gyr,
+        "age": [0.1, 1.0] * u.Gyr,
+        "ebv": [0.0, 0.4] * u.mag,
+        "slope": [-0.4, 0.0],
+        "ebv_polar": [0.0, 0.3] * u.mag,
+        "temperature_polar": [100.0, 300.0] * u.K,
+        "frac_agn": [0.0, 0.5],
+    }
+    grid = model.grid(axes, bands, cache=False)
+    flux = 1e10 * grid.flux(0, np.arange(grid.n_galaxies)) * u.uJy
+    photometry = QTable({"id": np.arange(len(flux))})
+    for i, name in enumerate(bands):
+        photometry[name], photometry[f"{name}_err"] = flux[:, i], 0.05 * flux[:, i]
+    results = BayesFitter(grid).fit(photometry)
+    assert set(axes) - {"redshift"} <= set(results.axes)
+    for name in results.axes:
+        low, high = model.parameters[name].bounds
+        values = results.percentile(name, [0.001, 0.999]).value
+        assert np.all((values >= low) & (values <= high)), name
+        edges, _ = results[0].pdf(name)
+        assert edges[0].value >= low
+        assert edges[-1].value <= high
+    # what may be negative is not cut at 0
+    assert results[0].pdf("slope")[0][-1].value == pytest.approx(0.2)
 
 
 def test_views_agree_with_the_catalogue(results):

@@ -217,6 +217,16 @@ def test_parts_of_another_fit_are_refused(fitter, grid, catalogue, tmp_path):
     assert_same(results, fitter.fit(catalogue))
 
 
+def test_a_call_that_failed_at_once_binds_no_other(fitter, catalogue, tmp_path):
+    path, out = tmp_path / "catalogue.csv", tmp_path / "out"
+    catalogue.write(path)
+    with pytest.raises(u.UnitsError, match="convertible to uJy"):
+        fit_file(fitter, path, out)
+    # the remedy is another setting, in the folder that the first call made
+    results = fit_file(fitter, path, out, flux_unit="uJy")
+    assert len(results) == len(catalogue)
+
+
 def test_results_are_read_as_if_they_were_one(fitter, catalogue, tmp_path):
     catalogue.write(tmp_path / "catalogue.fits")
     whole = fitter.fit(catalogue)

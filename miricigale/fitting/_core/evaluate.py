@@ -6,6 +6,8 @@ that everything stands side by side in memory; those of short runs are gathered.
 redshift are kept apart, and model fluxes are summed up when a redshift is finished.
 """
 
+import math
+
 import numpy as np
 from numba import njit
 
@@ -30,9 +32,9 @@ from miricigale.fitting._core.lanes import (
     fill_dead,
     gather,
     likelihoods,
-    limited_likelihoods,
 )
 from miricigale.fitting._core.light import light_likelihoods, pair_weight
+from miricigale.fitting._core.limited import limited_likelihoods
 from miricigale.fitting._core.products import (
     agn_products,
     best_mixtures,
@@ -40,6 +42,7 @@ from miricigale.fitting._core.products import (
     few_products,
     galaxy_products,
 )
+from miricigale.fitting._core.workspace import rescale
 
 __all__ = ["evaluate_runs", "finish_redshift"]
 
@@ -413,10 +416,19 @@ def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single
                 continue
         top = -1.0
         if n_limits > 0:
-            top = limited_likelihoods(
-                lanes, weight, tables.ratio, tables.prior_frac, first, best[2],
-                request.scale_error, frac_sum, target, request.delta,
-            )  # fmt: skip
+            while True:
+                top, over = limited_likelihoods(
+                    buffer, lanes.limited, lanes.power, lanes.limit, weight, tables.ratio,
+                    tables.prior_frac, first, best[2], request.scale_error, frac_sum,
+                    target.level, target.dark, request.delta,
+                )  # fmt: skip
+                if over < 200.0:
+                    break
+                # far better than the reference, which is found without regard to most limits
+                add_points(tables.points, sums.hist, waiting)
+                waiting = np.int64(0)
+                best[2] += 2.0 * over
+                rescale(sums, galaxy_z, agn_z, math.exp(-min(over, 700.0)))
         elif light:
             top = light_likelihoods(
                 buffer, lanes.light, lanes.power, lanes.power32, tables.ratio,

@@ -159,7 +159,8 @@ def add_share(change, low, high, weight):
     change : `~numpy.ndarray`, shape (N_SHARE + 2,)
         Changes of slope of the cumulative distribution at the edges of the bins.
     """
-    # what is narrower than a bin is as wide as one
+    # what is narrower than a bin is as wide as one, and lies within the last bin if all is there
+    low = min(low, 1.0 - 1.0 / N_SHARE)
     high = max(high, low + 1.0 / N_SHARE)
     v = weight / (N_SHARE * (high - low))
     x = low * N_SHARE

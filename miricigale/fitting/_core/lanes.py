@@ -7,12 +7,11 @@ s = (p + x a) / (q + 2 x X + x^2 b) and |F|^2_w - chi2 = R = (p + x a) s. Where 
 negative the best scale that is not negative is 0 and R = 0.
 """
 
-import math
-
 import numpy as np
 from numba import njit
 
 from miricigale.fitting._core.limits import limited_scale
+from miricigale.fitting._core.structs import NO_LIGHT
 
 __all__ = [
     "LANES",
@@ -24,7 +23,6 @@ __all__ = [
     "gather",
     "lane_model",
     "likelihoods",
-    "limited_likelihoods",
 ]
 
 #: Pairs evaluated side by side: a block of galaxies with one torus, or single pairs.
@@ -119,7 +117,8 @@ def lane_model(lanes, target, c, i, floor):
     buffer, slope = lanes.buffer, lanes.slope
     p = buffer[P + i] + c * buffer[A + i]
     q = buffer[Q + i] + c * (buffer[X2 + i] + c * buffer[B + i])
-    inverse = 1.0 / max(q, 1e-300)
+    q = q if q > NO_LIGHT else 1.0 / NO_LIGHT
+    inverse = 1.0 / q
     s = max(p, 0.0) * inverse
     r = max(p, 0.0) * s
     n = target.limits.size
@@ -127,50 +126,7 @@ def lane_model(lanes, target, c, i, floor):
         return s, r, inverse
     for m in range(n):
         slope[m] = lanes.limit[m, i] + c * lanes.limit[n + m, i]
-    return limited_scale(p, max(q, 1e-300), slope, target.level, target.dark)
-
-
-@njit(**_OPTIONS)
-def limited_likelihoods(
-    lanes, weight, ratio, frac_prior, first, reference, scale_error, out, target, delta
-):
-    """Do what `likelihoods` does, for objects with upper limits."""
-    buffer = lanes.buffer
-    for i in range(W0, SIZE):
-        buffer[i] = 0.0
-    top = 0.0
-    for j in range(ratio.size):
-        c = ratio[j]
-        out[j] = 0.0
-        for i in range(LANES):
-            prior = buffer[PRIOR + i]
-            weight[j * LANES + i] = 0.0
-            if prior < -1e200:
-                continue
-            # what is hopeless without the limits is so with them
-            floor = reference - delta - prior
-            s, r, inverse = lane_model(lanes, target, c, i, floor)
-            if r < floor:
-                continue
-            e = 0.5 * (r + prior - reference)
-            top = max(top, r)
-            t = math.exp(min(max(e, _LOWEST), 700.0)) * frac_prior[j + first]
-            y = c * buffer[SHARE + i]
-            phi = y / (1.0 + y)
-            s2 = s * s + scale_error * inverse
-            weight[j * LANES + i] = t
-            out[j] += t
-            buffer[W0 + i] += t
-            buffer[W1 + i] += t * s
-            buffer[V1 + i] += t * s * c
-            buffer[W2 + i] += t * s2
-            buffer[U2 + i] += t * s2 * c
-            buffer[V2 + i] += t * s2 * c * c
-            buffer[F1 + i] += t * phi
-            buffer[F2 + i] += t * phi * phi
-            buffer[WR + i] += t * s * s / inverse
-            buffer[WZ + i] += t if s == 0.0 else 0.0
-    return top
+    return limited_scale(p, q, slope, target.level, target.dark)
 
 
 @njit(**_OPTIONS)
@@ -247,7 +203,8 @@ def likelihoods(
         for i in range(LANES):
             p = max(buffer[P + i] + c * buffer[A + i], 0.0)
             q = buffer[Q + i] + c * (buffer[X2 + i] + c * buffer[B + i])
-            q = max(q, 1e-300)
+            # without light in the used bands there is no scale to speak of
+            q = q if q > NO_LIGHT else 1.0 / NO_LIGHT
             # one division for both 1 / q and y / (1 + y)
             y = c * buffer[SHARE + i]
             both = 1.0 / (q * (1.0 + y))

@@ -36,6 +36,7 @@ from miricigale.fitting._core.lanes import (
     Q,
     exponential,
 )
+from miricigale.fitting._core.structs import NO_LIGHT
 
 __all__ = ["light_likelihoods", "light_size", "pair_weight"]
 
@@ -51,6 +52,8 @@ _D, _I, _PHI = (i * LANES for i in range(20, 23))
 # ... and weights at every fraction, over those at x*.
 _T = 23 * LANES
 
+# Above this a share times any odds is as good as infinite, and would not fit with others.
+_MOST = 1e11
 _LOG2E = np.float32(1.4426950408889634)
 _LN2_HIGH = np.float32(0.693359375)
 _LN2_LOW = np.float32(-2.12194440e-4)
@@ -87,7 +90,9 @@ def _prepare(buffer, light, power, low, high, reference, scale_error):
         inner = rise / fall if fall > 0.0 else 1e300
         best = min(max(inner, low), high) if rise > 0.0 else low
         num = max(p + best * a, 0.0)
-        one = 1.0 / max(q + best * (x2 + best * b), 1e-300)
+        norm = q + best * (x2 + best * b)
+        dark = norm <= NO_LIGHT
+        one = 1.0 / norm if not dark else NO_LIGHT
         each = num * one
         r = num * each
         k = -0.5 * one * (r * b - a * a)
@@ -101,13 +106,13 @@ def _prepare(buffer, light, power, low, high, reference, scale_error):
         buffer[WR + i] = best
         light[_P + i] = max(p * each, -1e30)
         light[_A + i] = a * each
-        light[_Q + i] = q * one
+        light[_Q + i] = q * one if not dark else 1.0
         light[_X + i] = x2 * one
         light[_B + i] = b * one
         light[_K + i] = k if num > 0.0 else 0.0
         light[_M + i] = m if num > 0.0 and best != inner else 0.0
         light[_VAR + i] = scale_error * each / unit
-        light[_SHARE + i] = buffer[SHARE + i]
+        light[_SHARE + i] = min(buffer[SHARE + i], _MOST)
         light[_BEST + i] = best
         y = best * buffer[SHARE + i]
         light[_OTHER + i] = y / (1.0 + y)

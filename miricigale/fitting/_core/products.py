@@ -23,7 +23,7 @@ def row_best(
     galaxy, agn, dust, ratio, prior_agn, log_agn, log_frac, zero_frac, target, agn_pq, slope
 ):
     """
-    Best model of one galaxy at one redshift.
+    Best model of one galaxy at one redshift; with limits, a good one.
 
     Parameters
     ----------
@@ -55,6 +55,7 @@ def row_best(
         q += t * galaxy[b]
     best_value = -1e300
     best_s = 0.0
+    without = -1e300
     if zero_frac == 1 and q > 0.0 and log_frac[0] > -1e200:
         for m in range(n_limits):
             slope[m] = galaxy[target.limits[m]] * target.inverse[m]
@@ -77,7 +78,11 @@ def row_best(
             s = num / den
             log_prior = log_agn[k] + log_frac[j + zero_frac]
             value = num * s + log_prior
-            if value > best_value and n_limits > 0:
+            # with limits, only at what would be better without them than all before
+            if n_limits > 0:
+                if value <= without:
+                    continue
+                without = value
                 for m in range(n_limits):
                     band = target.limits[m]
                     slope[m] = (galaxy[band] + x * agn[k, band]) * target.inverse[m]

@@ -48,6 +48,15 @@ def _single_precision(target, root_weight, unit_data):
 
 
 @njit(**_OPTIONS)
+def _one_sigma(galaxy, target):
+    """Error of a galaxy's scale; 1 if it has no light in the used bands."""
+    q = 0.0
+    for b in target.bands:
+        q += galaxy[b] * galaxy[b] * target.weight[b]
+    return 1.0 / math.sqrt(q) if q > 1e-290 else 1.0
+
+
+@njit(**_OPTIONS)
 def begin(tables, target, scratch, origin):
     """
     Start on an object: look at galaxies without AGN, order the redshifts.
@@ -71,7 +80,7 @@ def begin(tables, target, scratch, origin):
     unit_data = np.empty(bands.size, np.float32)
     _single_precision(target, root_weight, unit_data)
     promise, order = scratch.promise, scratch.order
-    row_of = np.zeros(n_z, np.int64)
+    row_of = np.full(n_z, -1)
     for z in range(n_z):
         promise[z] = -1e30
         if log_prior[z] < -1e200:
@@ -80,19 +89,24 @@ def begin(tables, target, scratch, origin):
         galaxy_projections(
             tables.galaxy32[z], bands, root_weight, unit_data, p32, scratch.inverse_norm[z]
         )
-        top = np.float32(-1)
+        top = np.float32(-2)
+        row_top = np.float32(-2)
         for g in range(n_galaxy):
-            if tables.usable[z, g] and p32[g] > top:
-                top = p32[g]
+            if not tables.usable[z, g]:
+                continue
+            top = max(top, p32[g])
+            # one too faint for single precision has 4, and may have no light at all
+            if row_of[z] < 0 or (p32[g] < 2.0 and p32[g] > row_top):
                 row_of[z] = g
-        if top > -1.0:
+                row_top = p32[g] if p32[g] < 2.0 else row_top
+        if row_of[z] >= 0:
             value = np.float64(max(top, zero))
             promise[z] = value * value * target.norm + log_prior[z]
     _sort_descending(promise, order)
     reference = -1e300
-    for i in range(min(3, n_z)):
+    for i in range(n_z):
         z = order[i]
-        if promise[z] < -1e29:
+        if promise[z] < -1e29 or (i >= 3 and reference > -1e299):
             break
         agn_products(tables.agn[z], target, scratch.agn_pq, scratch.agn_weighted)
         g = row_of[z]
@@ -104,7 +118,9 @@ def begin(tables, target, scratch, origin):
         value += log_prior[z] + tables.log_galaxy[g]
         if value > reference:
             reference = value
-            origin[0] = _LOG10_E * math.log(s) if s > 0.0 else 0.0
+            # where the best has no light others have about what one sigma allows
+            s = s if s > 0.0 else _one_sigma(tables.galaxy[z, g], target)
+            origin[0] = _LOG10_E * math.log(s)
     if reference < -1e299:
         return False
     scratch.reference[0] = reference
@@ -172,9 +188,10 @@ def list_runs(tables, request, target, scratch, position):
     while position < n_z * n_blocks and n + n_agn <= run_key.size:
         z = scratch.order[position // n_blocks]
         block = position % n_blocks
-        position += 1
         if scratch.promise[z] < -1e29:
-            return n, np.int64(n_z * n_blocks)
+            position = np.int64(n_z * n_blocks)
+            break
+        position += 1
         if z != z_now:
             z_now = z
             agn_known = False

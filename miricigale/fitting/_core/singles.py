@@ -10,6 +10,7 @@ from miricigale.fitting._core.collect import PARTS, deposit_single, note_best, t
 from miricigale.fitting._core.evaluate import finish_redshift
 from miricigale.fitting._core.limits import limited_scale
 from miricigale.fitting._core.products import galaxy_products
+from miricigale.fitting._core.structs import NO_LIGHT
 
 __all__ = ["evaluate_singles"]
 
@@ -19,7 +20,8 @@ _OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "nump
 @njit(**_OPTIONS)
 def _model(galaxy, target, p, q, slope):
     """Scale, R and variance of the scale of a galaxy with p = <G, wF> and q = <G, wG>."""
-    q = max(q, 1e-300)
+    # without light the scale is 0, and nothing is known of its error
+    q = q if q > NO_LIGHT else 1.0 / NO_LIGHT
     s = max(p, 0.0) / q
     if target.limits.size == 0:
         return s, max(p, 0.0) * s, 1.0 / q

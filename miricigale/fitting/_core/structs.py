@@ -16,6 +16,9 @@ __all__ = [
     "Target",
 ]
 
+#: A model with <m, wm> below this has no light in the used bands.
+NO_LIGHT = 1e-290
+
 
 class PointTables(NamedTuple):
     """What the histograms need to know of the models; a part of `Tables`."""
@@ -148,6 +151,7 @@ class Lanes(NamedTuple):
 
     buffer: np.ndarray  # float64 (SIZE,): vectors of the pairs being evaluated
     light: np.ndarray  # float32 (light_size(nf),): the same in single precision
+    limited: np.ndarray  # float64 (LIMITED_SIZE,): work space for limits
     pending: np.ndarray  # float64 (N_INPUT * LANES,): the first of them, of gathered pairs
     power: np.ndarray  # int64 (LANES,)
     power32: np.ndarray  # int32 (LANES,)

@@ -10,6 +10,7 @@ from miricigale.fitting._core.floors import N_LEVELS
 from miricigale.fitting._core.histogram import N_BINS, N_SHARE, POINTS, clear_rows
 from miricigale.fitting._core.lanes import LANES, N_INPUT, SIZE
 from miricigale.fitting._core.light import light_size
+from miricigale.fitting._core.limited import LIMITED_SIZE
 from miricigale.fitting._core.structs import Draws, Histograms, Lanes, Scratch, Sums
 
 __all__ = ["JOINT", "clear", "make_scratch", "make_sums", "rescale"]
@@ -109,6 +110,7 @@ def make_scratch(n_z, n_galaxy, n_agn, n_frac, n_bands, zero_frac, capacity):
         lanes=Lanes(
             buffer=np.zeros(SIZE),
             light=np.zeros(light_size(n_frac), np.float32),
+            limited=np.zeros(LIMITED_SIZE),
             pending=np.zeros(N_INPUT * LANES),
             power=np.zeros(LANES, np.int64),
             power32=np.zeros(LANES, np.int32),
@@ -146,11 +148,16 @@ def clear(flat, best, index, hist, draws):
 
 
 @njit(cache=True, nogil=True)
-def rescale(sums, factor):
+def _multiply(x, factor):
+    for i in range(x.size):
+        x[i] *= factor
+
+
+@njit(cache=True, nogil=True)
+def rescale(sums, galaxy_z, agn_z, factor):
     """Multiply all weights, when a better model becomes the reference."""
-    for i in range(sums.flat.size):
-        sums.flat[i] *= factor
-    for i in range(sums.hist.flat.size):
-        sums.hist.flat[i] *= factor
-    for i in range(sums.draws.next.size):
-        sums.draws.next[i] *= factor
+    _multiply(sums.flat, factor)
+    _multiply(sums.hist.flat, factor)
+    _multiply(sums.draws.next, factor)
+    _multiply(galaxy_z.reshape(galaxy_z.size), factor)
+    _multiply(agn_z.reshape(agn_z.size), factor)

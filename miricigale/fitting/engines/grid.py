@@ -324,7 +324,7 @@ class GridEngine:
         sums.best[2] = scratch.reference[0]
         _core.evaluate_singles(tables, request, target, sums, scratch)
         n_z, n_blocks = tables.tiles.shape[:2]
-        with_pairs = self.agn.shape[1] > 0 and tables.ratio.size > 0
+        with_pairs = self.agn.shape[1] > 0 and tables.prior_frac[tables.zero_frac :].any()
         position, end, share = 0, n_z * n_blocks, 1.0
         single = self.rtol >= _SINGLE
         while with_pairs and position < end:
@@ -334,7 +334,8 @@ class GridEngine:
             reference = scratch.reference[0]
             if reference > sums.best[2]:
                 if sums.total[0] > 0.0:
-                    _core.rescale(sums, np.exp(0.5 * (sums.best[2] - reference)))
+                    factor = np.exp(0.5 * (sums.best[2] - reference))
+                    _core.rescale(sums, scratch.galaxy_z, scratch.agn_z, factor)
                 sums.best[2] = reference
             # bounds are raised for second moments only after a first look
             scratch.tail_galaxy.fill(0.0)
@@ -356,8 +357,10 @@ class GridEngine:
                     scratch.tail_galaxy,
                     scratch.tail_agn,
                 )
-            # a bound holds the largest prior of a fraction, of which all together have 1
-            unit = np.exp(min(0.5 * (reference - sums.best[2]), 600.0)) / tables.prior_frac.max()
+            # a bound holds the largest prior of the fractions above 0, a weight those of all
+            prior = tables.prior_frac[tables.zero_frac :]
+            unit = np.exp(min(0.5 * (reference - sums.best[2]), 600.0))
+            unit *= prior.sum() / max(prior.max(), 1e-300)
             floor, sure = _core.second_floor(
                 scratch.bound, scratch.count, reference, n, room, unit, request.delta
             )

@@ -1,0 +1,326 @@
+"""The grid engine where grids, priors and data are at their limits."""
+
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from miricigale.fitting import BayesFitter, FitFlags, fit_file
+from miricigale.fitting.engines import grid as engine_module
+
+
+def _table(grid, flux, err, **columns):
+    table = QTable({"id": np.arange(len(flux))})
+    for j, name in enumerate(grid.filters):
+        table[name] = flux[:, j] * u.uJy
+        table[f"{name}_err"] = err[:, j] * u.uJy
+    for name, values in columns.items():
+        table[name] = values
+    return table
+
+
+def _assert_equal_plain(fitter, table, brute_force, *, rtol=1e-6, std_rtol=1e-4, **options):
+    results = fitter.fit(table, **options)
+    assert results.fitted.all()
+    z = fitter.grid.redshift
+    for i in range(len(table)):
+        log_prior = None
+        if "redshift" in options:
+            log_prior = np.where(z == np.asarray(options["redshift"])[i], 0.0, -np.inf)
+        want = brute_force(fitter, results.flux[i], results.sigma[i], log_prior)
+        assert results.chi2[i] == pytest.approx(want["chi2"], rel=1e-6, abs=1e-6)
+        np.testing.assert_allclose(results.pdf_2d[i], want["zf"], rtol=rtol, atol=rtol)
+        scale = 1e-9 * np.abs(want["mean"]).max()
+        n = want["mean"].size
+        np.testing.assert_allclose(results.moments[i, :n, 0], want["mean"], rtol=rtol, atol=scale)
+        np.testing.assert_allclose(
+            results.moments[i, :n, 1], want["std"], rtol=std_rtol, atol=1e2 * scale
+        )
+    return results
+
+
+@pytest.mark.parametrize("n_galaxies", [(1, 1), (8, 8), (13, 5), (16, 8)])
+@pytest.mark.parametrize("rtol", [0.0, 1e-6])
+def test_numbers_of_galaxies_about_those_of_a_block(
+    n_galaxies, rtol, make_grid, draw_photometry, brute_force
+):
+    """1, 64, 65 and 128 galaxies: one, one whole, two and two whole blocks."""
+    grid = make_grid(6, n_z=2, n_tau=n_galaxies[0], n_age=n_galaxies[1])
+    grid = replace(grid, allowed=np.ones_like(grid.allowed), dust_luminosity=grid.dust_luminosity)
+    table, _ = draw_photometry(grid, 3, seed=3, noise=0.2)
+    _assert_equal_plain(BayesFitter(grid, rtol=rtol), table, brute_force)
+
+
+def test_known_redshifts_of_bright_objects(make_grid, draw_photometry, brute_force):
+    """
+    At S/N 1000 the best model of a galaxy lies tens of thousands in chi2 below that of others.
+
+    Weights are taken over that of a model met early; were it a poor one they would overflow.
+    """
+    grid = make_grid(9, n_tau=12, n_age=9)
+    table, truth = draw_photometry(grid, 12, seed=8, noise=1e-3)
+    fitter = BayesFitter(grid, model_error=0.0)
+    redshift = [grid.redshift[t[0]] for t in truth]
+    results = _assert_equal_plain(fitter, table, brute_force, redshift=redshift, rtol=1e-5)
+    assert np.all(np.isfinite(results.model_flux_std))
+
+
+def test_priors_that_leave_little(make_grid, draw_photometry, brute_force):
+    """Zeros in the priors of every parameter, f = 0 and the best galaxies among them."""
+    grid = make_grid(3)
+    priors = {
+        "redshift": [0.0, 1.0, 0.0, 2.0],
+        "tau": [0.0, 1.0, 0.0, 1.0, 3.0],
+        "tau97": [0.0, 1.0],
+        "ebv_polar": [1.0, 0.0, 1.0],
+        "frac_agn": [0.0, 1.0, 0.0, 1.0],
+    }
+    table, _ = draw_photometry(grid, 4, seed=2, noise=0.3)
+    for rtol in (0.0, 1e-6):
+        results = _assert_equal_plain(
+            BayesFitter(grid, priors=priors, rtol=rtol), table, brute_force
+        )
+        for name in priors:
+            assert np.all(results.pdf[name][:, np.equal(priors[name], 0)] == 0), name
+    only_galaxies = BayesFitter(grid, priors={"frac_agn": [1.0, 0.0, 0.0, 0.0]})
+    _assert_equal_plain(only_galaxies, table, brute_force)
+
+
+def test_a_heavy_prior_of_no_agn(make_grid, draw_photometry, brute_force):
+    """What all fractions above 0 weigh together counts in what may be left out."""
+    grid = make_grid(5, n_tau=12, n_age=9, frac=np.append(0.0, np.linspace(0.05, 0.95, 19)))
+    priors = {"frac_agn": np.append(1.0, np.full(19, 1e-4))}
+    table, _ = draw_photometry(grid, 4, seed=2, noise=0.3)
+    _assert_equal_plain(BayesFitter(grid, priors=priors), table, brute_force)
+
+
+def test_several_lists_equal_one(make_grid, draw_photometry, monkeypatch):
+    """With every model evaluated, cutting the list changes the order of sums and nothing else."""
+    grid = make_grid(8, n_tau=20, n_age=16)
+    table, _ = draw_photometry(grid, 4, noise=0.5)
+    pairs = [("age", "tau97"), ("tau", "frac_agn"), ("redshift", "age"), ("redshift", "tau97")]
+    pairs += [("frac_agn", "tau97")]
+    for rtol, tolerance in ((0.0, 1e-11), (1e-6, 1e-6)):
+        fitter = BayesFitter(grid, rtol=rtol)
+        want, drawn = fitter.fit(table, pairs=pairs), fitter.sample(table, 400, seed=1)
+        with monkeypatch.context() as patch:
+            patch.setattr(engine_module, "_CAPACITY", 1)
+            short = BayesFitter(grid, rtol=rtol)
+            got, others = short.fit(table, pairs=pairs), short.sample(table, 400, seed=1)
+        np.testing.assert_allclose(got.pdf_2d, want.pdf_2d, rtol=tolerance, atol=tolerance)
+        np.testing.assert_allclose(
+            got.moments[:, :, :2], want.moments[:, :, :2], rtol=1e3 * tolerance
+        )
+        for pair in pairs:
+            np.testing.assert_allclose(got.pairs[pair], want.pairs[pair], atol=tolerance)
+        # draws of either are draws from the same posterior: z within 5 of their scatter
+        for samples in (drawn, others):
+            mean, std = want.mean("redshift").value, want.std("redshift").value
+            pull = (samples.mean("redshift").value - mean) / (std / 20.0 + 1e-12)
+            assert np.all(np.abs(pull) < 5.0)
+
+
+@pytest.mark.parametrize("rtol", [0.0, 1e-6])
+def test_models_without_light_in_the_used_bands(rtol, make_grid, draw_photometry):
+    """
+    They weigh exp(-|F|^2 / 2), as their scale of 0 says, and nothing becomes infinite.
+
+    So it is in the far ultraviolet of high redshifts.
+    """
+    grid = make_grid(4)
+    galaxy, agn = grid.galaxy.copy(), grid.agn.copy()
+    galaxy[3, :, :3] = 0.0
+    galaxy[1, 5, :3] = 0.0
+    agn[:, :, :3] = 0.0
+    dark = replace(grid, galaxy=galaxy, agn=agn)
+    table, _ = draw_photometry(grid, 4, seed=4, noise=0.5)
+    for name in grid.filters[3:]:
+        del table[name], table[f"{name}_err"]
+    fitter = BayesFitter(dark, rtol=rtol, model_error=0.0)
+    results = fitter.fit(table)
+    assert results.fitted.all()
+    n_fractions = grid.frac_agn.size
+    for i in range(4):
+        flux, sigma = results.flux[i, :3], results.sigma[i, :3]
+        model = galaxy[:, :, :3] / sigma
+        q = np.sum(model**2, axis=2)
+        p = model @ (flux / sigma)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            gain = np.where(q > 0, np.maximum(p, 0.0) ** 2 / q, 0.0)
+            s = np.where(q > 0, np.maximum(p, 0.0) / q, 0.0)
+            variance = np.where(q > 0, 1.0 / q, 0.0)
+        weight = np.exp(0.5 * (gain - gain.max())) * dark.allowed
+        weight /= weight.sum()
+        np.testing.assert_allclose(results.pdf["redshift"][i], weight.sum(axis=1), rtol=1e-5)
+        np.testing.assert_allclose(results.pdf["frac_agn"][i], 1 / n_fractions, rtol=1e-5)
+        mean = np.sum(weight * s)
+        std = np.sqrt(np.sum(weight * (s**2 + variance)) - mean**2)
+        assert results.mean("mass")[i].value == pytest.approx(mean, rel=1e-5)
+        assert results.std("mass")[i].value == pytest.approx(std, rel=1e-4)
+    samples = fitter.sample(table, 20, seed=3)
+    assert np.all(np.isfinite(samples.scale))
+    assert np.all(samples.scale <= results.mean("mass")[:, None].value * 1e3)
+
+
+def test_a_lightless_redshift_of_high_prior_hides_no_other(make_grid, draw_photometry):
+    grid = make_grid(4, n_z=6)
+    galaxy, agn = grid.galaxy.copy(), grid.agn.copy()
+    galaxy[2:, :, :2] = 0.0
+    agn[:, :, :2] = 0.0
+    dark = replace(grid, galaxy=galaxy, agn=agn)
+    table, _ = draw_photometry(replace(grid, agn=agn), 3, seed=1, noise=0.1)
+    table = table["id", "band0", "band0_err", "band1", "band1_err"]
+    results = BayesFitter(dark).fit(table)
+    assert results.fitted.all()
+    assert np.all(results.pdf["redshift"][:, :2].sum(axis=1) > 0.9)
+
+
+def test_negative_fluxes_only(make_grid, draw_photometry):
+    """Every model does best with a scale of 0, so that the posterior is the prior."""
+    grid = make_grid(4)
+    table, _ = draw_photometry(grid, 2, noise=0.1)
+    for name in grid.filters:
+        table[name] = -np.abs(table[name])
+    for n_bands in (1, 6):
+        for name in grid.filters[n_bands:]:
+            table[name] = np.nan * table[name]
+        results = BayesFitter(grid, n_bands_min=1).fit(table)
+        assert np.all(results.flags & int(FitFlags.NO_SIGNAL))
+        assert results.fitted.all()
+        count = grid.allowed.sum(axis=1)
+        np.testing.assert_allclose(results.pdf["redshift"][0], count / count.sum(), rtol=1e-6)
+        np.testing.assert_allclose(results.mean("mass").value, 0.0)
+        np.testing.assert_allclose(results.percentile("mass", [0.5, 0.9]).value, 0.0)
+
+
+def test_percentiles_where_the_most_likely_model_has_no_light(make_grid):
+    """
+    The mass of half the posterior is about one sigma, whatever the unit of the fluxes.
+
+    One galaxy is negative in all it could match, and has most of the prior.
+    """
+    grid = make_grid(4, n_z=2, n_tau=2, n_age=1, frac=[0.0])
+    galaxy = np.full_like(grid.galaxy, 1e-9)
+    galaxy[0, :, 3:] = 1e-3 * 1e-9
+    galaxy[1, :, :3] = 1e-3 * 1e-9
+    grid = replace(grid, galaxy=galaxy, allowed=np.ones_like(grid.allowed))
+    unit = 1e8
+    flux = unit * np.array([[-0.5, -0.5, -0.5, 0.1, 0.1, 0.1]])
+    table = _table(grid, flux, np.full_like(flux, unit))
+    fitter = BayesFitter(grid, priors={"redshift": [0.6, 0.4]}, model_error=0.0, scale_error=False)
+    results = fitter.fit(table)
+    model = galaxy[1, 0]
+    scale = np.sum(model * flux) / np.sum(model**2)
+    high = results.percentile("mass", [0.95])[0, 0].value
+    assert np.log10(high) == pytest.approx(np.log10(scale), abs=0.011)
+    assert results.percentile("mass", [0.3])[0, 0].value == 0.0
+
+
+@pytest.mark.parametrize("frac", [[0.0, 0.2, 0.5, 0.999999], [0.1, 0.9, 0.99, 0.999999]])
+@pytest.mark.parametrize("rtol", [0.0, 1e-6])
+def test_galaxies_without_dust_where_fractions_refer_to_all_infrared_light(
+    frac, rtol, make_grid, draw_photometry, brute_force
+):
+    """All dust luminosity is then the AGN's, which holds in both precisions and in percentiles."""
+    grid = make_grid(3, frac=frac)
+    dust = grid.dust_luminosity * (np.arange(grid.n_galaxies) % 2)
+    galaxy = QTable(grid.galaxy_properties)
+    galaxy["ir_luminosity"] = np.where(dust > 0, dust, 1e26) * 1.1 * u.W / u.Msun
+    galaxy["dust_luminosity"] = dust * u.W / u.Msun
+    agn = QTable(grid.agn_properties)
+    agn["agn_power"] = np.linspace(0.8, 1.2, grid.n_agn)
+    grid = replace(
+        grid,
+        dust_luminosity=galaxy["ir_luminosity"].value,
+        galaxy_properties=galaxy,
+        agn_properties=agn,
+        meta=dict(grid.meta) | {"frac_agn_definition": "3-1000um"},
+    )
+    # tori so bright that no AGN at all fits best
+    grid = replace(grid, agn=grid.agn * 1e3)
+    table, _ = draw_photometry(grid, 6, seed=5, noise=0.1)
+    fitter = BayesFitter(grid, rtol=rtol)
+    results = fitter.fit(table)
+    for i in range(len(table)):
+        want = brute_force(fitter, results.flux[i], results.sigma[i])
+        np.testing.assert_allclose(results.pdf_2d[i], want["zf"], rtol=1e-5, atol=1e-6)
+        assert results.moments[i, -1, 0] == pytest.approx(want["mean"][-1], rel=1e-5, abs=1e-6)
+        values, weights = want["values"][-1].ravel(), want["weights"].ravel()
+        all_agn = weights[values > 1 - 1e-6].sum()
+        if all_agn > 0.2:
+            # the upper part of the distribution is at 1
+            level = 1.0 - 0.25 * all_agn
+            got = results.percentile("frac_agn_dust", [level])[i, 0]
+            assert float(got) == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("noise", [1e-6, 1e6])
+def test_signal_to_noise_of_a_million_and_its_inverse(noise, make_grid, draw_photometry):
+    grid = make_grid(7, n_tau=12, n_age=9)
+    table, truth = draw_photometry(grid, 6, seed=3, noise=noise)
+    # measurements are never all negative by chance
+    table["band0"] = np.abs(table["band0"])
+    results = BayesFitter(grid, model_error=0.0).fit(table)
+    assert results.fitted.all()
+    assert np.all(np.isfinite(results.moments[:, :, :2]))
+    np.testing.assert_allclose(results.pdf_2d.sum(axis=(1, 2)), 1.0, rtol=1e-12)
+    if noise < 1:
+        z, g, k, f, scale = (np.array(x) for x in zip(*truth, strict=True))
+        power = np.where(grid.frac_agn[f] * grid.dust_luminosity[g] > 0)[0]
+        np.testing.assert_array_equal(results.best_index[:, :2], np.stack([z, g], axis=1))
+        np.testing.assert_array_equal(results.best_index[power, 2:].T, [k[power], f[power]])
+        np.testing.assert_allclose(results.mean("mass").value, scale, rtol=1e-4)
+    else:
+        # nothing is known but the sign: no model is preferred by more than the few sigma of noise
+        prior = grid.allowed.sum(axis=1) / grid.allowed.sum()
+        assert np.all(np.abs(np.log(results.pdf["redshift"] / prior)) < 5.0)
+
+
+def test_pieces_threads_and_pickles_change_no_digit(make_grid, draw_photometry):
+    grid = make_grid(2, n_tau=13, n_age=5)
+    table, _ = draw_photometry(grid, 23, noise=0.5, missing=0.2)
+    pairs = [("age", "tau97"), ("tau", "frac_agn")]
+    fitter = BayesFitter(grid)
+    want = fitter.fit(table, pairs=pairs)
+    copied = pickle.loads(pickle.dumps(fitter))
+    with ThreadPoolExecutor(4) as threads:
+        others = [
+            copied.fit(table, pairs=pairs, chunk_size=1),
+            fitter.fit(table, pairs=pairs, chunk_size=5, executor=threads),
+            BayesFitter(grid).fit(table, pairs=pairs, chunk_size=3, executor=threads),
+        ]
+    for got in others:
+        for name in ("chi2", "log_evidence", "pdf_2d", "moments", "quantiles", "model_flux_std"):
+            np.testing.assert_array_equal(getattr(got, name), getattr(want, name), err_msg=name)
+        for pair in pairs:
+            np.testing.assert_array_equal(got.pairs[pair], want.pairs[pair])
+
+
+def test_lists_of_redshifts_go_with_rows_of_files(make_grid, draw_photometry, tmp_path):
+    """An id of an earlier piece is a duplicate; redshifts and p(z) stay with their rows."""
+    grid = make_grid(1)
+    table, truth = draw_photometry(grid, 6, noise=0.3)
+    table["id"] = [0, 1, 2, 0, 4, 5]
+    table.write(tmp_path / "catalogue.fits")
+    fitter = BayesFitter(grid)
+    redshift = [float(grid.redshift[t[0]]) for t in truth]
+    nodes = [0.0, 1.0, 3.0]
+    density = [[1.0, 2.0 + i, 0.5] for i in range(6)]
+    for name, options in (
+        ("known", {"redshift": redshift}),
+        ("density", {"redshift_prior": (nodes, density)}),
+    ):
+        files = fit_file(
+            fitter, tmp_path / "catalogue.fits", tmp_path / name, chunk_rows=3, **options
+        )
+        whole = fitter.fit(table, **options)
+        parts = list(files.parts())
+        got = np.concatenate([part.flags for part in parts])
+        np.testing.assert_array_equal(got, whole.flags)
+        assert got[3] & int(FitFlags.DUPLICATE_ID)
+        got = np.concatenate([part.pdf_2d for part in parts])
+        np.testing.assert_array_equal(got, whole.pdf_2d)
