@@ -13,6 +13,8 @@ __all__ = ["VANISHING_CHI2", "constants", "fit_results"]
 
 #: Best chi2 above which exp(-chi2 / 2) is below the smallest normal number for every model.
 VANISHING_CHI2 = 1417.0
+#: S/N of the best model in all bands together below which an object is flagged.
+LOW_SIGNAL = 3.0
 
 
 def fit_results(fitter, data, flags, merged, settings):
@@ -42,7 +44,10 @@ def fit_results(fitter, data, flags, merged, settings):
         flags[vanished] |= int(FitFlags.NO_LIKELIHOOD)
         merged.forget(vanished)
     n_bands = data.used.sum(axis=1)
-    _flag(fitter, flags, merged, n_bands, settings["redshift"] == "fixed")
+    best_flux = _best_flux(grid, merged)
+    signal = np.where(data.measured, best_flux / data.sigma, 0.0)
+    signal = np.sqrt(np.sum(signal * signal, axis=1))
+    _flag(fitter, flags, merged, n_bands, settings["redshift"] == "fixed", signal)
     # limits are probabilities, which have no unit
     log_sigma = np.log(np.where(data.measured, data.sigma, 1.0)).sum(axis=1)
     log_sigma += 0.5 * data.measured.sum(axis=1) * np.log(2.0 * np.pi)
@@ -77,7 +82,7 @@ def fit_results(fitter, data, flags, merged, settings):
         quantiles=merged.quantiles,
         model_flux=merged.band[:, 0],
         model_flux_std=merged.band[:, 1],
-        best_flux=_best_flux(grid, merged),
+        best_flux=best_flux,
         meta=meta,
         model=fitter.model,
         intensive=(*fitter.quantities.shape.names, *names[len(fitter.quantities.names) :]),
@@ -94,13 +99,14 @@ def constants(grid, axes):
     return out
 
 
-def _flag(fitter, flags, merged, n_bands, fixed):
+def _flag(fitter, flags, merged, n_bands, fixed, signal):
     """Flag, in place, what the fits of a catalogue show."""
     fitted = np.isfinite(merged.chi2)
     reduced = np.where(n_bands > 1, merged.chi2 / np.maximum(n_bands - 1, 1), np.nan)
     with np.errstate(invalid="ignore"):
         flags[fitted & (reduced > fitter.max_reduced_chi2)] |= int(FitFlags.HIGH_CHI2)
         flags[fitted & ~(merged.scale > 0)] |= int(FitFlags.NO_SIGNAL)
+        flags[fitted & (signal < LOW_SIGNAL)] |= int(FitFlags.LOW_SIGNAL)
         unfitted = ~fitted & ((flags & int(FitFlags.UNFITTED)) == 0)
         flags[unfitted] |= int(FitFlags.NO_SIGNAL)
         if not fixed and fitter.grid.redshift.size > 2:

@@ -40,6 +40,9 @@ class FitFlags(Flags):
     NO_LIKELIHOOD = 8192
     """With ``compat="cigale"``: the best chi2 is so high that every likelihood vanishes."""
 
+    LOW_SIGNAL = 16384
+    """The best model has S/N below 3 over all bands: take masses and luminosities from samples."""
+
     UNFITTED = 1 | 2 | 8 | 16 | 32 | 512 | 4096 | 8192
     """Bits with which a row has no result."""
 

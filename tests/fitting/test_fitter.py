@@ -337,3 +337,19 @@ def test_choices_of_cigale(make_grid, draw_photometry):
     ):
         with pytest.raises(ValueError, match=match):
             BayesFitter(grid, **options)
+
+
+@pytest.mark.parametrize("signal", [1.0, 2.9, 3.1, 30.0])
+def test_signal_to_noise_below_three_is_flagged(make_grid, signal):
+    """Photometry that is a model of the grid has the S/N of its fluxes in quadrature."""
+    grid = make_grid(2)
+    galaxy = np.flatnonzero(grid.allowed[1])[-1]
+    model = grid.flux(1, galaxy, 0, 2)
+    sigma = np.linalg.norm(model) / signal
+    table = QTable({"id": [1]})
+    for name, flux in zip(grid.filters, model, strict=True):
+        table[name] = [flux] * u.uJy
+        table[f"{name}_err"] = [sigma] * u.uJy
+    results = BayesFitter(grid, model_error=0.0).fit(table)
+    assert results.chi2[0] == pytest.approx(0.0, abs=1e-9)
+    assert bool(results.flags[0] & int(FitFlags.LOW_SIGNAL)) == (signal < 3.0)
