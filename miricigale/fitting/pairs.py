@@ -89,7 +89,7 @@ def joint_tables(out, pairs, axes):
 
     Parameters
     ----------
-    out : `~miricigale.fitting.engines.grid.GridOutput`
+    out : `~miricigale.fitting.engines.output.GridOutput`
         What the engine found for n objects, with the sums that `joint_names` names.
     pairs : tuple of tuple of str
         See `check_pairs`.

@@ -216,7 +216,7 @@ class Quantities:
 
         Parameters
         ----------
-        out : `~miricigale.fitting.engines.grid.GridOutput`
+        out : `~miricigale.fitting.engines.output.GridOutput`
             What the grid engine returns for n objects: ``moments`` and ``quantiles`` of what
             scales, ``galaxy``, the weights of the galaxy models.
 

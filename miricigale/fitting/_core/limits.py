@@ -3,7 +3,7 @@ Upper limits: the scale of a model that minimises chi2 with error-function terms
 
 A limit F with error sigma adds T(u) = -2 ln(erfc(u / sqrt(2)) / 2), u = (s m - F) / sigma,
 the probability that a measurement of the model flux s m lies below F (Sawicki 2012, PASP 124,
-1208; Boquien et al. 2019, A&A 622, A103, eq. 15). T is convex and grows with u, so that what
+1208; Boquien et al. 2019, A&A 622, A103, section 4.3). T is convex and grows with u, so that what
 detections alone allow is an upper bound, and Newton's method on the derivative, begun at the
 scale that detections alone would have, comes down to the minimum from one side.
 """

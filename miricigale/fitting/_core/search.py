@@ -57,6 +57,17 @@ def _one_sigma(galaxy, target):
 
 
 @njit(**_OPTIONS)
+def _row_best(tables, target, scratch, z, g):
+    """Do what `row_best` does, with R + 2 ln(prior) of the galaxy and the redshift too."""
+    value, s = row_best(
+        tables.galaxy[z, g], tables.agn[z], tables.dust[g], tables.ratio, tables.prior_agn,
+        tables.log_agn, tables.log_frac, tables.zero_frac, target, scratch.agn_pq,
+        scratch.lanes.slope,
+    )  # fmt: skip
+    return value + target.log_prior[z] + tables.log_galaxy[g], s
+
+
+@njit(**_OPTIONS)
 def begin(tables, target, scratch, origin):
     """
     Start on an object: look at galaxies without AGN, order the redshifts.
@@ -110,12 +121,7 @@ def begin(tables, target, scratch, origin):
             break
         agn_products(tables.agn[z], target, scratch.agn_pq, scratch.agn_weighted)
         g = row_of[z]
-        value, s = row_best(
-                        tables.galaxy[z, g], tables.agn[z], tables.dust[g], tables.ratio,
-                        tables.prior_agn, tables.log_agn, tables.log_frac, tables.zero_frac, target,
-                        scratch.agn_pq, scratch.lanes.slope,
-                    )  # fmt: skip
-        value += log_prior[z] + tables.log_galaxy[g]
+        value, s = _row_best(tables, target, scratch, z, g)
         if value > reference:
             reference = value
             # where the best has no light others have about what one sigma allows
@@ -229,12 +235,7 @@ def list_runs(tables, request, target, scratch, position):
                     agn_known = True
                     agn_products(tables.agn[z], target, scratch.agn_pq, scratch.agn_weighted)
                 g = start + m
-                value, _ = row_best(
-                        tables.galaxy[z, g], tables.agn[z], tables.dust[g], tables.ratio,
-                        tables.prior_agn, tables.log_agn, tables.log_frac, tables.zero_frac, target,
-                        scratch.agn_pq, scratch.lanes.slope,
-                    )  # fmt: skip
-                value += log_prior[z] + tables.log_galaxy[g]
+                value, _ = _row_best(tables, target, scratch, z, g)
                 if value > reference:
                     reference = value
                     margin = 2.0

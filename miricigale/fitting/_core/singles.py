@@ -7,10 +7,10 @@ from numba import njit
 
 from miricigale.fitting._core.bounds import BLOCK
 from miricigale.fitting._core.collect import PARTS, deposit_single, note_best, take_draw
-from miricigale.fitting._core.evaluate import finish_redshift
 from miricigale.fitting._core.limits import limited_scale
 from miricigale.fitting._core.products import galaxy_products
 from miricigale.fitting._core.structs import NO_LIGHT
+from miricigale.fitting._core.totals import finish_redshift
 
 __all__ = ["evaluate_singles"]
 

@@ -1,14 +1,14 @@
 """The grid engine: every model of a `~miricigale.sed.ModelGrid`, by factors."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from scipy.special import log_ndtr, ndtr, ndtri
 
 from miricigale.fitting import _core
-from miricigale.fitting._core.bounds import BLOCK
-from miricigale.fitting.posterior import cell_edges
+from miricigale.fitting.engines.layout import make_tables
+from miricigale.fitting.engines.output import GridOutput
 from miricigale.utils.exceptions import argument_error
 
 __all__ = ["GridEngine"]
@@ -23,59 +23,6 @@ _TAIL = 10.0
 _THIN = 1e-4
 #: Least ``rtol`` with which pairs of little weight are evaluated in single precision.
 _SINGLE = 5e-7
-
-
-@dataclass(frozen=True, eq=False)
-class GridOutput:
-    """
-    What a fit of n objects returns; not a number, or -1, in rows that were not fitted.
-
-    Parameters
-    ----------
-    chi2 : `~numpy.ndarray`, shape (n,)
-        Chi2 of the best model.
-    log_sum : `~numpy.ndarray`, shape (n,)
-        ln of the sum of prior exp(-chi2 / 2).
-    n_models : `~numpy.ndarray`, shape (n,)
-        How many models were evaluated.
-    best_scale : `~numpy.ndarray`, shape (n,)
-        Solar masses formed of the best model.
-    index : `~numpy.ndarray` of int, shape (n, 4)
-        Redshift, galaxy, torus and AGN fraction of the best model.
-    zf : `~numpy.ndarray`, shape (n, nz, nf)
-        Joint posterior of redshift and AGN fraction.
-    galaxy, agn : `~numpy.ndarray`, shapes (n, nG) and (n, nA)
-        Posteriors of galaxy models and tori.
-    band : `~numpy.ndarray`, shape (n, 2, nb)
-        Posterior mean and standard deviation of model fluxes.
-    moments : `~numpy.ndarray`, shape (n, n_quantities, 3)
-        Mean, standard deviation and mean log10 of derived quantities.
-    quantiles : `~numpy.ndarray`, shape (n, n_quantities, n_levels)
-        Quantiles of derived quantities.
-    share, share_quantiles : `~numpy.ndarray`, shapes (n, 2) and (n, n_levels)
-        Mean and standard deviation, and quantiles of the other AGN fraction.
-    draw_index, draw_scale : `~numpy.ndarray`, shapes (n, n_draws, 4) and (n, n_draws, 2)
-        Models drawn from the posterior; their scales and the variances of these.
-    joint : dict of str to `~numpy.ndarray`, shape (n, ...)
-        Joint posteriors that were asked for, by two letters of z, g, k and f.
-    """
-
-    chi2: np.ndarray
-    log_sum: np.ndarray
-    n_models: np.ndarray
-    best_scale: np.ndarray
-    index: np.ndarray
-    zf: np.ndarray
-    galaxy: np.ndarray
-    agn: np.ndarray
-    band: np.ndarray
-    moments: np.ndarray
-    quantiles: np.ndarray
-    share: np.ndarray
-    share_quantiles: np.ndarray
-    draw_index: np.ndarray
-    draw_scale: np.ndarray
-    joint: dict = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -156,68 +103,7 @@ class GridEngine:
 
     @cached_property
     def _tables(self):
-        n_z, n_galaxy, n_bands = self.galaxy.shape
-        n_padded = -(-n_galaxy // BLOCK) * BLOCK
-        galaxy32 = np.ones((n_z, n_bands, n_padded), np.float32)
-        tiles = np.ones((n_z, n_padded // BLOCK, n_bands, BLOCK))
-        unit = _unit(self.galaxy)
-        galaxy32[:, :, :n_galaxy] = (self.galaxy / unit).transpose(0, 2, 1)
-        for start in range(0, n_galaxy, BLOCK):
-            part = self.galaxy[:, start : start + BLOCK].transpose(0, 2, 1)
-            tiles[:, start // BLOCK, :, : part.shape[2]] = part
-        above = self.frac > 0
-        ratio = _ratio(self.frac[above])
-        edge = _ratio(cell_edges(self.frac, (0.0, 1.0)))
-        log_dust = np.log10(self.dust, where=self.dust > 0, out=np.full(n_galaxy, -400.0))
-        prior_galaxy = self.prior_galaxy / self.prior_galaxy.sum()
-        prior_frac = self.prior_frac / self.prior_frac.sum()
-        prior_agn = self.prior_agn / max(self.prior_agn.sum(), 1e-300)
-        share_galaxy, share_agn = self.share_galaxy, self.share_agn
-        if share_galaxy is None or share_agn is None:
-            share_galaxy, share_agn = np.zeros(n_galaxy), np.zeros(self.agn.shape[1])
-        rows = (self.dust, _two_log(prior_galaxy), share_galaxy, self.mixed_galaxy)
-        blocks = np.zeros((4, n_padded))
-        blocks[:, :n_galaxy] = rows
-        blocks = blocks.reshape(4, n_padded // BLOCK, BLOCK)
-        log_usable = np.full((n_z, n_padded), -1e300)
-        log_usable[:, :n_galaxy] = np.where(self.usable, _two_log(prior_galaxy), -1e300)
-        # all writable, for the kernels are compiled once more for arrays that are not
-        return _core.Tables(
-            galaxy=_writable(self.galaxy),
-            agn=_writable(self.agn),
-            tiles=tiles,
-            blocks=blocks,
-            galaxy32=galaxy32,
-            agn32=np.ascontiguousarray((self.agn / _unit(self.agn)).astype(np.float32)),
-            galaxy_unit=_writable(unit[:, :, 0]),
-            dust=_writable(self.dust),
-            ratio=ratio,
-            zero_frac=int(self.frac[0] == 0.0),
-            usable=_writable(self.usable),
-            log_usable=log_usable,
-            prior_agn=prior_agn,
-            prior_frac=prior_frac,
-            log_galaxy=_two_log(prior_galaxy),
-            log_agn=_two_log(prior_agn),
-            log_frac=_two_log(prior_frac),
-            galaxy_scale=_writable(self.galaxy_scale),
-            agn_scale=_writable(self.agn_scale),
-            mixed_galaxy=_writable(self.mixed_galaxy),
-            mixed_agn=_writable(self.mixed_agn),
-            points=_core.PointTables(
-                ratio=ratio,
-                log_ratio=np.log10(ratio) * _core.PER_DEX,
-                edge=_writable(np.column_stack([edge[:-1], edge[1:]])[above]),
-                edge_zero=float(edge[1]),
-                dust=_writable(self.dust),
-                log_dust=log_dust,
-                mixed_galaxy=_writable(self.mixed_galaxy),
-                mixed_agn=_writable(self.mixed_agn),
-                share_galaxy=_writable(share_galaxy),
-                share_agn=_writable(share_agn),
-                share_mean=float(prior_agn @ share_agn),
-            ),
-        )
+        return make_tables(self)
 
     def workspace(self, n_draws=0, joint=()):
         """Make the accumulators and work space of one worker (some tens of MB)."""
@@ -496,24 +382,3 @@ def _target(flux, weight, log_prior, limit, inverse):
         dark=float(-2.0 * log_ndtr(level).sum()),
         norm=float(np.sum(weight * flux * flux)),
     )
-
-
-def _unit(table):
-    """Largest flux of every model, shape (nz, n, 1); 1 where there is none."""
-    top = table.max(axis=-1, keepdims=True, initial=0.0)
-    return np.where(top > 0, top, 1.0)
-
-
-def _ratio(frac):
-    """Odds f / (1 - f), of 1 a large number."""
-    return frac / np.maximum(1.0 - frac, 1e-12)
-
-
-def _writable(array):
-    """Copy an array to a contiguous one that may be written to."""
-    return np.array(array, dtype=np.asarray(array).dtype, order="C", copy=True)
-
-
-def _two_log(prior):
-    """Return 2 ln(prior), -1e300 where it is zero."""
-    return 2.0 * np.log(prior, where=prior > 0, out=np.full(prior.shape, -5e299))

@@ -41,7 +41,7 @@ def chi2_at(scale, model, flux, sigma, limit):
     -------
     chi2 : `~numpy.ndarray`, shape (m,)
         Sum of ((F - s m) / sigma)^2 and, of limits, of -2 ln(1/2 (1 + erf((F - s m) / (sqrt2
-        sigma)))) (Sawicki 2012, PASP 124, 1208, eq. A10; Boquien et al. 2019, eq. 14).
+        sigma)))) (Sawicki 2012, PASP 124, 1208, eq. A10; Boquien et al. 2019, section 4.3).
     """
     apart = (flux - scale[:, None] * model) / sigma
     return np.sum(np.where(limit, -2.0 * log_ndtr(apart), np.square(apart)), axis=1)
