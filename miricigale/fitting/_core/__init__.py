@@ -4,7 +4,7 @@ Kernels of the grid fit: arrays in, arrays out.
 For one object `begin` starts, `evaluate_singles` adds the models without AGN, `list_runs`
 (`bounds`) lists the pairs that can matter, `first_floor`, `raise_bounds` and `second_floor` say
 how many of them do, `evaluate_runs` sums them up (`lanes`: side by side, `light`: in single
-precision, `limits`: with upper limits, `collect`: into histograms and draws), and `summarise`
+precision, `limited`: with upper limits, `collect`: into histograms and draws), and `summarise`
 turns the sums into moments and quantiles. numba's cache of a function holds the compiled code of
 those it calls, and does not see when they change: who edits one empties ``__pycache__``.
 """

@@ -112,7 +112,7 @@ def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single
         Of these, pairs whose exact bound turns out lower than this get that bound in the list
         and are not evaluated.
     single : bool
-        Whether single precision will do (not for limits).
+        Whether single precision will do.
     """
     run, cross, pq, known = scratch.run, scratch.cross, scratch.pq, scratch.known
     bound, blocks, tiles = scratch.bound, tables.blocks, tables.tiles
@@ -127,6 +127,8 @@ def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single
     for j in range(tables.zero_frac, tables.log_frac.size):
         top_frac = max(top_frac, tables.log_frac[j])
     low, high = tables.ratio[0], tables.ratio[-1]
+    for i in range(lanes.left.size):
+        lanes.left[i] = 1.0
     other = np.empty(BLOCK)
     n_listed = 1.0
     for r in range(n):
@@ -237,9 +239,10 @@ def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single
         if n_limits > 0:
             while True:
                 top, over = limited_likelihoods(
-                    buffer, lanes.limited, lanes.power, lanes.limit, weight, tables.ratio,
-                    tables.prior_frac, first, best[2], request.scale_error, frac_sum,
-                    target.level, target.dark, request.delta,
+                    buffer, lanes.limited, lanes.left, lanes.light, lanes.power, lanes.power32,
+                    lanes.limit, lanes.limit_light, weight, tables.ratio, tables.prior_frac, first,
+                    best[2], request.scale_error, frac_sum, target.level, target.dark,
+                    request.delta, single,
                 )  # fmt: skip
                 if over < 200.0:
                     break

@@ -18,6 +18,7 @@ _PER_UNIT = 4.0
 _FIRST = 10.0
 #: ... but not many more than so many of them.
 _MOST = 8192
+_FEW = 4
 # Below every bound, above `DONE`.
 _ALL = -1e37
 _BLOCK_MASK = (1 << KEY_BITS) - 1
@@ -39,7 +40,7 @@ def _count(bound, n, reference, count):
 @njit(**_OPTIONS)
 def first_floor(bound, count, reference, n):
     """
-    Least bound to evaluate first, and in double precision.
+    Least bound to evaluate first, and whether in double precision.
 
     Parameters
     ----------
@@ -47,14 +48,21 @@ def first_floor(bound, count, reference, n):
         See `miricigale.fitting._core.structs.Scratch`; ``n`` runs are listed.
     reference : float
         The best bound that some model reaches.
+
+    Returns
+    -------
+    floor : float
+    few : bool
+        Whether these are few enough for double precision; where many pairs could be as good as
+        the best, none has much weight.
     """
     _count(bound, n, reference, count)
     total = 0.0
     for j in range(int(_FIRST * _PER_UNIT)):
         total += count[j]
         if total > _MOST:
-            return reference - (j + 1) / _PER_UNIT
-    return reference - _FIRST
+            return reference - (j + 1) / _PER_UNIT, total < _FEW * _MOST
+    return reference - _FIRST, True
 
 
 @njit(**_OPTIONS)

@@ -22,6 +22,7 @@ __all__ = [
     "fill_dead",
     "gather",
     "lane_model",
+    "light_exponential",
     "likelihoods",
 ]
 
@@ -46,6 +47,9 @@ _LOG2E = 1.4426950408889634
 _LN2_HIGH = 0.6931471803691238
 _LN2_LOW = 1.9082149292705877e-10
 _LOWEST = -700.0
+_LOG2E_32 = np.float32(1.4426950408889634)
+_LN2_HIGH_32 = np.float32(0.693359375)
+_LN2_LOW_32 = np.float32(-2.12194440e-4)
 
 
 @njit(**_OPTIONS)
@@ -150,6 +154,22 @@ def exponential(e):
     v = v * r + 1.0
     v = v * r + 1.0
     return v, np.int64(np.int32(m) + 1023) << np.int64(52)
+
+
+@njit(**_OPTIONS)
+def light_exponential(e):
+    """Do what `exponential` does for e from -80 to 80, in single precision."""
+    m = np.floor(e * _LOG2E_32 + np.float32(0.5))
+    r = e - m * _LN2_HIGH_32
+    r = r - m * _LN2_LOW_32
+    v = np.float32(1.9875691500e-4)
+    v = v * r + np.float32(1.3981999507e-3)
+    v = v * r + np.float32(8.3334519073e-3)
+    v = v * r + np.float32(4.1665795894e-2)
+    v = v * r + np.float32(1.6666665459e-1)
+    v = v * r + np.float32(5.0000001201e-1)
+    v = v * (r * r) + r + np.float32(1)
+    return v, (np.int32(m) + np.int32(127)) << np.int32(23)
 
 
 @njit(**_OPTIONS)

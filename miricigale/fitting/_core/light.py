@@ -35,6 +35,7 @@ from miricigale.fitting._core.lanes import (
     P,
     Q,
     exponential,
+    light_exponential,
 )
 from miricigale.fitting._core.structs import NO_LIGHT
 
@@ -54,9 +55,6 @@ _T = 23 * LANES
 
 # Above this a share times any odds is as good as infinite, and would not fit with others.
 _MOST = 1e11
-_LOG2E = np.float32(1.4426950408889634)
-_LN2_HIGH = np.float32(0.693359375)
-_LN2_LOW = np.float32(-2.12194440e-4)
 
 
 def light_size(n_ratio):
@@ -147,7 +145,6 @@ def light_likelihoods(
     """
     zero = np.float32(0)
     one = np.float32(1)
-    half = np.float32(0.5)
     # products of what is less than this would be too small for fast numbers
     lowest = np.float32(-50.0)
     two = power32.view(np.float32)
@@ -182,17 +179,7 @@ def light_likelihoods(
                 light[_D + i] = light[_D + i] if num > 0.0 else -0.5 * buffer[W2 + i]
         for i in range(LANES):
             e = max(light[_D + i], lowest)
-            m = np.floor(e * _LOG2E + half)
-            r = e - m * _LN2_HIGH
-            r = r - m * _LN2_LOW
-            v = np.float32(1.9875691500e-4)
-            v = v * r + np.float32(1.3981999507e-3)
-            v = v * r + np.float32(8.3334519073e-3)
-            v = v * r + np.float32(4.1665795894e-2)
-            v = v * r + np.float32(1.6666665459e-1)
-            v = v * r + np.float32(5.0000001201e-1)
-            v = v * (r * r) + r + one
-            power32[i] = (np.int32(m) + np.int32(127)) << np.int32(23)
+            v, power32[i] = light_exponential(e)
             light[at + i] = v * f
         for i in range(LANES):
             t = light[at + i] * two[i]

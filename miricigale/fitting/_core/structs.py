@@ -151,12 +151,14 @@ class Lanes(NamedTuple):
 
     buffer: np.ndarray  # float64 (SIZE,): vectors of the pairs being evaluated
     light: np.ndarray  # float32 (light_size(nf),): the same in single precision
-    limited: np.ndarray  # float64 (LIMITED_SIZE,): work space for limits
+    limited: np.ndarray  # float64 (LIMITED_SIZE,): vectors of scales with limits
+    left: np.ndarray  # float64 (nf * LANES,): what limits left of the scales of earlier pairs
     pending: np.ndarray  # float64 (N_INPUT * LANES,): the first of them, of gathered pairs
     power: np.ndarray  # int64 (LANES,)
     power32: np.ndarray  # int32 (LANES,)
     index: np.ndarray  # int64 (4, LANES): galaxies and tori of the pairs; of gathered ones
     limit: np.ndarray  # float64 (2 nb, LANES): their fluxes in bands with limits
+    limit_light: np.ndarray  # float32 (2 nb, LANES): the same over the unit of the scale
     pending_limit: np.ndarray  # float64 (2 nb, LANES): those of gathered ones
     weight: np.ndarray  # float64 (nf * LANES,): prior * likelihood
     frac_sum: np.ndarray  # float64 (nf > 0,)

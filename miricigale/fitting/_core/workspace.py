@@ -10,7 +10,7 @@ from miricigale.fitting._core.floors import N_LEVELS
 from miricigale.fitting._core.histogram import N_BINS, N_SHARE, POINTS, clear_rows
 from miricigale.fitting._core.lanes import LANES, N_INPUT, SIZE
 from miricigale.fitting._core.light import light_size
-from miricigale.fitting._core.limited import LIMITED_SIZE
+from miricigale.fitting._core.limited_scales import LIMITED_SIZE
 from miricigale.fitting._core.structs import Draws, Histograms, Lanes, Scratch, Sums
 
 __all__ = ["JOINT", "clear", "make_scratch", "make_sums", "rescale"]
@@ -111,11 +111,13 @@ def make_scratch(n_z, n_galaxy, n_agn, n_frac, n_bands, zero_frac, capacity):
             buffer=np.zeros(SIZE),
             light=np.zeros(light_size(n_frac), np.float32),
             limited=np.zeros(LIMITED_SIZE),
+            left=np.ones(n_frac * LANES),
             pending=np.zeros(N_INPUT * LANES),
             power=np.zeros(LANES, np.int64),
             power32=np.zeros(LANES, np.int32),
             index=np.zeros((4, LANES), np.int64),
             limit=np.zeros((2 * n_bands, LANES)),
+            limit_light=np.zeros((2 * n_bands, LANES), np.float32),
             pending_limit=np.zeros((2 * n_bands, LANES)),
             weight=np.zeros(n_frac * LANES),
             frac_sum=np.zeros(max(n_frac - zero_frac, 1)),

@@ -23,6 +23,8 @@ _TAIL = 10.0
 _THIN = 1e-4
 #: Least ``rtol`` with which pairs of little weight are evaluated in single precision.
 _SINGLE = 5e-7
+#: Largest chi2 of a good model, and square of a limit over its error, for that with limits.
+_MODEST = 1000.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -226,8 +228,13 @@ class GridEngine:
             # bounds are raised for second moments only after a first look
             scratch.tail_galaxy.fill(0.0)
             scratch.tail_agn.fill(0.0)
-            floor = _core.first_floor(scratch.bound, scratch.count, reference, n)
-            _core.evaluate_runs(tables, request, target, sums, scratch, n, floor, floor, False)
+            if target.limits.size:
+                # a probability many sigma out is not one for single precision
+                worst = max(target.norm + target.dark - reference, target.level.max() ** 2)
+                single = single and worst < _MODEST
+            floor, few = _core.first_floor(scratch.bound, scratch.count, reference, n)
+            light = single and not few
+            _core.evaluate_runs(tables, request, target, sums, scratch, n, floor, floor, light)
             room = share * request.rtol * sums.total[0]
             if room > 0.0:
                 _core.raise_bounds(
