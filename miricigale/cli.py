@@ -47,6 +47,14 @@ def _parser():
         default=0.1,
         help="model error as a part of the flux (0.1 is 10 %%)",
     )
+    fit.add_argument(
+        "--pairs",
+        nargs="+",
+        action="extend",
+        type=_pair,
+        metavar="NAME:NAME",
+        help="parameters whose joint posteriors are kept too, such as age:tau redshift:ebv",
+    )
     fit.add_argument("--flux-unit", metavar="UNIT", help="unit of fluxes that have none (CSV)")
     fit.add_argument("--hdu", help="extension of a FITS file, if it has several tables")
     fit.add_argument("--chunk-rows", type=int, default=10000, help="rows in memory at a time")
@@ -85,6 +93,15 @@ def _parser():
     return parser
 
 
+def _pair(text):
+    """Two names with a colon between them."""
+    names = tuple(text.split(":"))
+    if len(names) != 2 or not all(names):
+        msg = f"{text!r} is no pair NAME:NAME"
+        raise argparse.ArgumentTypeError(msg)
+    return names
+
+
 def _run(args):
     from miricigale.workflow import check_study, disk_use, load_config, run_study
 
@@ -117,6 +134,7 @@ def _run(args):
 def _fit(args):
     from concurrent.futures import ThreadPoolExecutor
 
+    from miricigale.fitting import OtherFitError
     from miricigale.workflow.commands import fit_catalogue
 
     try:
@@ -127,6 +145,7 @@ def _fit(args):
                 axes=args.axes,
                 redshift=args.redshift,
                 model_error=args.model_error,
+                pairs=args.pairs,
                 flux_unit=args.flux_unit,
                 hdu=int(args.hdu) if (args.hdu or "").isdigit() else args.hdu,
                 chunk_rows=args.chunk_rows,
@@ -136,6 +155,10 @@ def _fit(args):
             )
         table = args.output / "table.fits"
         results.write_table(table, overwrite=True)
+    except OtherFitError as err:
+        # in the words of this command
+        remedy = "--no-resume to replace them"
+        raise OtherFitError(err.folder, err.differences, remedy) from err
     except KeyboardInterrupt:
         n_parts = len(list(args.output.glob("part-*.fits")))
         kept = f"{n_parts} finished parts are in {args.output}/"

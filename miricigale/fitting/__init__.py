@@ -24,7 +24,7 @@ from miricigale.fitting.part_files import FitResultsFiles, open_results
 from miricigale.fitting.result import FitResult
 from miricigale.fitting.results import FitResults
 from miricigale.fitting.samples import Samples
-from miricigale.fitting.streaming import fit_file
+from miricigale.fitting.streaming import OtherFitError, fit_file
 
 __all__ = [
     "BayesFitter",
@@ -37,6 +37,7 @@ __all__ = [
     "FitResultsFiles",
     "LeaveOutResult",
     "MockResult",
+    "OtherFitError",
     "Samples",
     "fit_cigale",
     "fit_file",

@@ -10,7 +10,8 @@ from miricigale.fitting.engines.redshifts import fixed_redshifts, given_redshift
 from miricigale.fitting.engines.reduce import FitOne
 from miricigale.fitting.engines.space import Choice, Flat, Space, Table, prior_cells
 from miricigale.fitting.flags import FitFlags
-from miricigale.fitting.likelihood import per_band, read_photometry
+from miricigale.fitting.likelihood import per_band, read_photometry, unused_bands
+from miricigale.fitting.pairs import named_pairs
 from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.priors import GridAxis
 from miricigale.fitting.quantities import DERIVED_LEVELS
@@ -187,6 +188,7 @@ class ContinuousFitter:
         *,
         redshift=None,
         redshift_prior=None,
+        pairs=None,
         seed=None,
         executor=None,
         progress_bar=False,
@@ -206,6 +208,10 @@ class ContinuousFitter:
             Redshifts, ascending, shape (n_z,), and the density of the prior there, shape (n_z,)
             or (n, n_z); linear between them. It takes the place of the prior of redshift,
             within its limits.
+        pairs : list of tuple of str, optional
+            Pairs of free parameters (``results.axes``), the mass not among them, of which joint
+            posteriors are kept too: the weight of the sample in each cell of both axes. Draws of
+            any two, and of derived quantities, are in ``results.samples``.
         seed : int or `~numpy.random.Generator`, optional
             Every object has its own stream, from the seed and its id.
         executor : `concurrent.futures.Executor`, optional
@@ -222,9 +228,12 @@ class ContinuousFitter:
 
         Raises
         ------
+        KeyError
+            If a name in ``pairs`` is unknown.
         ValueError
-            If a column is missing, ``redshift`` or ``redshift_prior`` has the wrong shape, or
-            nothing is free.
+            If a column is missing, an id is masked, ``redshift`` or ``redshift_prior`` has the
+            wrong shape, nothing is free, or ``pairs`` has a parameter twice, one with a single
+            value, or a derived quantity.
         `~astropy.units.UnitsError`
             If a flux column has no unit of flux density.
         """
@@ -237,6 +246,7 @@ class ContinuousFitter:
             n_bands_min=self.n_bands_min,
             grid_filters=self.names,
         )
+        unused = unused_bands(photometry, self.filters)
         flags = data.flags.copy()
         spaces, kind = self._spaces(photometry, redshift, redshift_prior, flags)
         unfitted = (flags & int(FitFlags.UNFITTED)) != 0
@@ -246,7 +256,11 @@ class ContinuousFitter:
             Target(str(data.ids[i]), data.flux[i], data.sigma[i], data.limit[i], spaces[i])
             for i in rows
         ]
-        task = FitOne(self._engine, axes, seed, self.n_draws)
+        constant = [name for name in self.model.parameters if name not in axes and name != "mass"]
+        derived = ("mass", *self._engine.columns)
+        wanted = "of free parameters but mass ('samples' of the results has draws of all)"
+        pairs = named_pairs(pairs, axes, constant, derived, wanted)
+        task = FitOne(self._engine, axes, seed, self.n_draws, pairs)
         # here too, for threads of one process share this setting
         with single_threaded():
             parts = parallel_map(
@@ -258,10 +272,10 @@ class ContinuousFitter:
         done = {int(row): part for row, part in zip(rows, parts, strict=True) if part is not None}
         meta = provenance(
             citations=[*self.model.meta.get("citations", ()), *CITATIONS.get(self.engine, ())],
-            fit=self.settings(kind) | {"seed": seed},
+            fit=self.settings(kind) | {"unused_bands": unused, "seed": seed},
             model={k: v for k, v in self.model.meta.items() if k != "citations"},
         )
-        return self._results(data, flags, axes, done, meta)
+        return self._results(data, flags, axes, done, meta, pairs)
 
     def settings(self, redshift="free"):
         """Return what the fit was told, for the meta of results: a dict of plain values."""
@@ -360,7 +374,7 @@ class ContinuousFitter:
             weights = np.diff(cdf) / (cdf[-1] - cdf[0])
         return GridAxis("redshift", nodes, 1, "redshift", weights, None, bounds)
 
-    def _results(self, data, flags, axes, done, meta):
+    def _results(self, data, flags, axes, done, meta, pairs):
         n = len(data.ids)
         derived = self._engine.columns
         quantities = ("mass", *derived)
@@ -382,12 +396,16 @@ class ContinuousFitter:
         }
         out = {name: np.full((n, *shape), np.nan) for name, shape in shapes.items()}
         pdf = {name: np.full((n, axis.values.size), np.nan) for name, axis in axes.items()}
+        size = {name: axis.values.size for name, axis in axes.items()}
+        joint = {(x, y): np.full((n, size[x], size[y]), np.nan) for x, y in pairs}
         best = {name: np.full(n, np.nan) for name in (*axes, *quantities)}
         for row, part in done.items():
             for name in shapes:
                 out[name][row] = part[name]
             for name in axes:
                 pdf[name][row] = part["pdf"][name]
+            for names in joint:
+                joint[names][row] = part["pairs"][names]
             for name in best:
                 best[name][row] = part["best"][name]
         n_bands = data.used.sum(axis=1)
@@ -411,6 +429,7 @@ class ContinuousFitter:
             limit=data.limit,
             axes=axes,
             pdf=pdf,
+            pairs=joint,
             best_index=np.full((n, 4), -1),
             best_scale=best["mass"],
             best=best,

@@ -7,7 +7,8 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.fitting.flags import FitFlags
-from miricigale.fitting.quantities import DERIVED_LEVELS
+from miricigale.fitting.posterior import check_levels
+from miricigale.fitting.quantities import kept_percentiles
 from miricigale.fitting.results import FitResults
 from miricigale.utils.exceptions import argument_error
 
@@ -66,20 +67,23 @@ class ContinuousResults(FitResults):
         name : str
             A parameter or derived quantity.
         levels : array_like
-            Levels in (0, 1); of 0.001 to 0.999 the distribution is kept.
+            Levels from 0.001 to 0.999, between which the distributions are kept.
 
         Returns
         -------
         percentiles : `~astropy.units.Quantity`, shape (n, n_levels)
+
+        Raises
+        ------
+        KeyError
+            If there is no such parameter.
+        ValueError
+            If a level is outside.
         """
         if name not in self.axes:
             return super().percentile(name, levels)
-        levels = np.atleast_1d(np.asarray(levels, dtype=float))
-        if not np.all((levels > 0) & (levels < 1)):
-            raise argument_error("levels", "between 0 and 1", f"{levels}")
         kept = self.axis_quantiles[:, self._axis(name)]
-        out = np.array([np.interp(levels, DERIVED_LEVELS, row) for row in kept])
-        return out.reshape(len(self), levels.size) * self.unit(name)
+        return kept_percentiles(name, check_levels(levels), kept) * self.unit(name)
 
     def samples(self, key):
         """

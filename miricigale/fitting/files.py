@@ -9,10 +9,19 @@ import numpy as np
 from astropy.io import fits
 
 from miricigale.fitting.priors import GridAxis
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits
 
-__all__ = ["read_results", "write_results"]
+__all__ = [
+    "axes_from_plain",
+    "axes_to_plain",
+    "check_text_ids",
+    "native",
+    "read_results",
+    "read_text",
+    "text_hdu",
+    "write_results",
+]
 
 _FORMAT = "miricigale-fitresults-3"
 #: Files of the format before have no joint posteriors of pairs.
@@ -33,9 +42,15 @@ def write_results(results, path, *, overwrite=False):
         The file.
     overwrite : bool, optional
         Whether a file that is there is replaced.
+
+    Raises
+    ------
+    ValueError
+        If an id is text that is not ASCII.
     """
     from astropy.table import Table
 
+    check_text_ids(results.ids)
     table = Table()
     for item in fields(results):
         value = getattr(results, item.name)
@@ -50,21 +65,11 @@ def write_results(results, path, *, overwrite=False):
     text["pairs"] = [list(names) for names in results.pairs]
     text["units"] = [u.Unit(unit).to_string() for unit in results.units]
     text["shapes"] = {name: table[name].shape[1:] for name in table.colnames}
-    text["axes"] = {
-        name: {
-            "values": axis.values.tolist(),
-            "unit": u.Unit(axis.unit).to_string(),
-            "kind": axis.kind,
-            "weights": axis.weights.tolist(),
-            "bounds": list(axis.bounds),
-        }
-        for name, axis in results.axes.items()
-    }
+    text["axes"] = axes_to_plain(results.axes)
     empty = [name for name in table.colnames if table[name].size == 0 and len(table)]
     table.remove_columns(empty)
     hdus = [fits.PrimaryHDU(header=fits.Header({"FORMAT": _FORMAT}))]
-    data = np.frombuffer(json.dumps(text, default=_plain).encode(), dtype=np.uint8)
-    hdus.append(fits.ImageHDU(data, name="TEXT"))
+    hdus.append(text_hdu(text))
     hdu = fits.table_to_hdu(table)
     hdu.name = "RESULTS"
     hdus.append(hdu)
@@ -94,7 +99,7 @@ def read_results(cls, path):
             if hdus[0].header.get("FORMAT") not in _READABLE:
                 msg = f"{path} holds no fit results (no FORMAT = {_FORMAT!r} in its header)"
                 raise DataError(msg)
-            text = json.loads(bytes(np.asarray(hdus["TEXT"].data)).decode())
+            text = read_text(hdus)
             table = Table.read(hdus["RESULTS"], character_as_bytes=False)
         n = len(table)
         columns = {
@@ -105,30 +110,19 @@ def read_results(cls, path):
         }
         values = {name: tuple(text[name]) for name in _TUPLES}
         values |= {"meta": text["meta"], "units": tuple(u.Unit(x) for x in text["units"])}
-        values["axes"] = {
-            name: GridAxis(
-                name,
-                np.array(axis["values"]),
-                u.Unit(axis["unit"]),
-                axis["kind"],
-                np.array(axis["weights"]),
-                None,
-                tuple(axis["bounds"]),
-            )
-            for name, axis in text["axes"].items()
-        }
+        values["axes"] = axes_from_plain(text["axes"])
         for name in _DICTS:
             start = f"{name}:"
             values[name] = {
-                key.removeprefix(start): _native(array)
+                key.removeprefix(start): native(array)
                 for key, array in columns.items()
                 if key.startswith(start)
             }
         values["pairs"] = {
-            tuple(names): _native(columns[f"pair:{i}"])
+            tuple(names): native(columns[f"pair:{i}"])
             for i, names in enumerate(text.get("pairs", ()))
         }
-        values |= {name: _native(array) for name, array in columns.items() if ":" not in name}
+        values |= {name: native(array) for name, array in columns.items() if ":" not in name}
         if "axis_moments" in columns:
             from miricigale.fitting.continuous_results import ContinuousResults
 
@@ -139,7 +133,56 @@ def read_results(cls, path):
         raise DataError(msg) from err
 
 
-def _native(array):
+def check_text_ids(ids):
+    """Refuse ids that FITS, whose text is ASCII, cannot hold."""
+    if ids.dtype.kind == "U":
+        foreign = [key for key in ids.tolist() if not key.isascii()]
+        if foreign:
+            raise argument_error("ids", "ASCII where they go to a FITS file", f"{foreign[0]!r}")
+
+
+def axes_to_plain(axes):
+    """Turn axes without their shares into what JSON knows."""
+    return {
+        name: {
+            "values": axis.values.tolist(),
+            "unit": u.Unit(axis.unit).to_string(),
+            "kind": axis.kind,
+            "weights": axis.weights.tolist(),
+            "bounds": list(axis.bounds),
+        }
+        for name, axis in axes.items()
+    }
+
+
+def axes_from_plain(text, shares=None):
+    """Make axes of what `axes_to_plain` returned; ``shares`` by name are part of them."""
+    return {
+        name: GridAxis(
+            name,
+            np.array(axis["values"]),
+            u.Unit(axis["unit"]),
+            axis["kind"],
+            np.array(axis["weights"]),
+            (shares or {}).get(name),
+            tuple(axis["bounds"]),
+        )
+        for name, axis in text.items()
+    }
+
+
+def text_hdu(text):
+    """Put a dict into an extension ``TEXT``, as JSON: header cards are too short for it."""
+    data = np.frombuffer(json.dumps(text, default=_plain).encode(), dtype=np.uint8)
+    return fits.ImageHDU(data, name="TEXT")
+
+
+def read_text(hdus):
+    """Read the dict that `text_hdu` wrote."""
+    return json.loads(bytes(np.asarray(hdus["TEXT"].data)).decode())
+
+
+def native(array):
     """Bring an array to the byte order of the machine."""
     return array.astype(array.dtype.newbyteorder("=")) if array.dtype.kind in "fiu" else array
 

@@ -1,6 +1,7 @@
 """BayesFitter: posteriors of galaxy and AGN parameters from broad-band photometry."""
 
 import logging
+import warnings
 
 import numpy as np
 
@@ -8,14 +9,14 @@ from miricigale.fitting.assembly import constants, fit_results
 from miricigale.fitting.engines.grid import GridEngine
 from miricigale.fitting.flags import FitFlags
 from miricigale.fitting.fractions import OtherFraction
-from miricigale.fitting.likelihood import per_band, read_photometry
+from miricigale.fitting.likelihood import per_band, read_photometry, unused_bands
 from miricigale.fitting.pairs import check_pairs
 from miricigale.fitting.pieces import DrawPiece, FitPiece, Part, cut
 from miricigale.fitting.priors import grid_priors
 from miricigale.fitting.quantities import DERIVED_LEVELS, Quantities
 from miricigale.fitting.redshifts import density_log_prior, fixed_log_prior, known_redshifts
 from miricigale.fitting.samples import Samples
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error, unknown_name
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import parallel_map
 from miricigale.utils.random import check_seed, stream
@@ -246,13 +247,20 @@ class BayesFitter:
             One row for each object, in the order of the catalogue; those that could not be
             fitted are flagged.
 
+        Warns
+        -----
+        `~miricigale.utils.exceptions.MiricigaleWarning`
+            If ``filters`` was not given and the photometry has bands (names of filters, or columns
+            in a unit of flux density with an error beside them) that the grid lacks. Bands that
+            are not fitted are also in ``meta["fit"]["unused_bands"]`` of the results.
+
         Raises
         ------
         KeyError
             If a name in ``pairs`` is unknown.
         ValueError
-            If a column is missing, one of limits is not boolean, there are limits in a band in
-            which a model has negative flux, ``redshift`` or ``redshift_prior`` has the wrong
+            If a column is missing, an id is masked, one of limits is not boolean, there are limits
+            in a band in which a model has negative flux, ``redshift`` or ``redshift_prior`` has the wrong
             shape, or both are given, or ``pairs`` has a parameter twice or one with a single value.
         `~astropy.units.UnitsError`
             If a flux column has no unit of flux density.
@@ -266,20 +274,26 @@ class BayesFitter:
         if isinstance(chunk_size, bool) or not int(chunk_size) >= 1:
             raise argument_error("chunk_size", "an integer >= 1", repr(chunk_size))
         pairs = check_pairs(pairs, self)
-        data, flags, log_prior, filters = self._prepare(photometry, redshift, redshift_prior)
+        data, flags, log_prior, settings = self._prepare(photometry, redshift, redshift_prior)
         task = FitPiece(self._engine, self.priors, self.quantities, pairs)
         pieces = cut(data, log_prior, int(chunk_size))
         parts = parallel_map(task, pieces, executor=executor, progress_bar=progress_bar, desc="fit")
         logger.debug("fitted %d objects", len(data.ids))
-        return fit_results(
-            self, data, flags, Part.merge(parts), self.settings(filters, redshift is not None)
-        )
+        return fit_results(self, data, flags, Part.merge(parts), settings)
 
     def _prepare(self, photometry, redshift, redshift_prior):
-        """Fluxes, flags, ln(prior) of the redshifts of every object, and the bands."""
+        """Fluxes, flags, ln(prior) of the redshifts of every object, and the settings."""
         require_columns(photometry, [], "photometry")
         grid = self.grid
         filters = self._bands(photometry)
+        unused = unused_bands(photometry, filters)
+        if unused and self.filters is None:
+            # who names the bands knows that others are left out
+            warnings.warn(
+                f"bands of the photometry that the grid lacks are not fitted: {', '.join(unused)}",
+                MiricigaleWarning,
+                stacklevel=3,
+            )
         columns = [grid.filters.index(name) for name in filters]
         data = read_photometry(
             photometry,
@@ -300,7 +314,8 @@ class BayesFitter:
         few = (data.measured.sum(axis=1) < free) & ((flags & int(FitFlags.UNFITTED)) == 0)
         flags[few] |= int(FitFlags.FEW_FOR_PARAMETERS)
         log_prior[(flags & int(FitFlags.UNFITTED)) != 0] = -np.inf
-        return data, flags, log_prior, filters
+        settings = self.settings(filters, redshift is not None) | {"unused_bands": unused}
+        return data, flags, log_prior, settings
 
     def sample(
         self,
@@ -340,7 +355,7 @@ class BayesFitter:
         if isinstance(n_draws, bool) or not isinstance(n_draws, (int, np.integer)) or n_draws < 1:
             raise argument_error("n_draws", "an integer >= 1", repr(n_draws))
         seed = check_seed(seed)
-        data, flags, log_prior, filters = self._prepare(photometry, redshift, redshift_prior)
+        data, flags, log_prior, settings = self._prepare(photometry, redshift, redshift_prior)
         keys = [stream(seed, "fit", "draws", str(key)).integers(2**63) for key in data.ids]
         parts = parallel_map(
             DrawPiece(self._engine, int(n_draws)),
@@ -354,7 +369,7 @@ class BayesFitter:
         flags[unfitted] |= int(FitFlags.NO_SIGNAL)
         meta = provenance(
             citations=self.grid.meta.get("citations", ()),
-            fit=self.settings(filters, redshift is not None),
+            fit=settings,
             seed=seed,
         )
         return Samples(

@@ -23,7 +23,7 @@ class FitFlags(Flags):
     HIGH_CHI2 = 64
     """No model fits: the reduced chi2 of the best is above the limit."""
     NO_SIGNAL = 128
-    """No model has a positive scale: the fluxes are all zero or negative, or nearly so."""
+    """No model has a positive scale, the fluxes being zero or negative: the posterior is the prior."""
     REDSHIFT_EDGE = 256
     """More than one per cent of the posterior lies on the first or last redshift."""
     NO_MODEL = 512

@@ -32,7 +32,12 @@ def find_row(rows, key, n):
         If there is none.
     """
     key = key.item() if isinstance(key, np.generic) else key
-    if key not in rows:
+    try:
+        known = key in rows
+    except TypeError:
+        # slices and lists are no ids
+        known = False
+    if not known:
         some = ", ".join(map(repr, list(rows)[:5]))
         msg = f"no object with the id {key!r} among {n}; the first are {some}"
         raise KeyError(msg)

@@ -54,8 +54,11 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     KeyError
         If a band is not one of the grid.
     ValueError
-        If the photometry does not have it.
+        If the photometry does not have it, no object is measured in it, or too few bands are left
+        to fit (``n_bands_min`` of the fitter).
     """
+    if not hasattr(fitter, "grid"):
+        raise argument_error("fitter", "a BayesFitter", type(fitter).__name__)
     if isinstance(bands, str) or not len(bands):
         raise argument_error("bands", "a list of one or more names", repr(bands))
     bands = tuple(bands)
@@ -65,6 +68,20 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     columns = [c for name in bands for c in (name, error_column(name))]
     require_columns(photometry, ["id", *columns], "photometry", units=dict.fromkeys(columns, FNU))
     groups = [(name,) for name in bands] if separately else [bands]
+    fitted = [f for f in fitter.filters or fitter.grid.filters if f in photometry.colnames]
+    for group in groups:
+        left = [name for name in fitted if name not in group]
+        if len(left) < fitter.n_bands_min:
+            wanted = f"such that n_bands_min = {fitter.n_bands_min} or more of {fitted} are left"
+            raise argument_error("bands", wanted, f"{list(group)}")
+    flux = np.array([plain_column(photometry, name) for name in bands]).T
+    err = np.array([plain_column(photometry, error_column(name)) for name in bands]).T
+    limit = np.array([limits(photometry, name) for name in bands]).T
+    good = np.isfinite(flux) & np.isfinite(err) & (err > 0)
+    empty = [name for name, any_good in zip(bands, good.any(axis=0), strict=True) if not any_good]
+    if empty and len(photometry):
+        raise argument_error("bands", "measured for one object at least", f"{empty}")
+    good &= ~limit
     results, predicted, scatter = {}, [], []
     for group in groups:
         blank = QTable(photometry, copy=True)
@@ -78,10 +95,6 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
             results[name] = found
             predicted.append(found.model_flux[:, i])
             scatter.append(found.model_flux_std[:, i])
-    flux = np.array([plain_column(photometry, name) for name in bands]).T
-    err = np.array([plain_column(photometry, error_column(name)) for name in bands]).T
-    limit = np.array([limits(photometry, name) for name in bands]).T
-    good = np.isfinite(flux) & np.isfinite(err) & (err > 0) & ~limit
     return LeaveOutResult(
         bands=bands,
         flux=np.where(good, flux, np.nan),

@@ -2,14 +2,16 @@
 
 from dataclasses import dataclass
 
+import astropy.units as u
 import numpy as np
 
+from miricigale.filters import Filter
 from miricigale.fitting.flags import FitFlags
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU, to_array
 
-__all__ = ["FitData", "limits", "per_band", "read_photometry"]
+__all__ = ["FitData", "limits", "per_band", "read_ids", "read_photometry", "unused_bands"]
 
 _TRUE = ("true", "t", "1")
 _FALSE = ("false", "f", "0", "")
@@ -82,7 +84,8 @@ def read_photometry(table, filters, *, model_error, error_floor, n_bands_min, gr
     Raises
     ------
     ValueError
-        If a column is missing, or one of limits holds something else than true and false.
+        If a column is missing, one of limits holds something else than true and false, or an id
+        is masked.
     `~astropy.units.UnitsError`
         If a flux has no unit of flux density.
     """
@@ -112,11 +115,97 @@ def read_photometry(table, filters, *, model_error, error_floor, n_bands_min, gr
     flags[(n_bands > 0) & (n_bands == limit.sum(axis=1))] |= int(FitFlags.ALL_LIMITS)
     flags[n_bands == 0] |= int(FitFlags.NO_BAND)
     flags[(n_bands > 0) & (n_bands < n_bands_min)] |= int(FitFlags.FEW_BANDS)
-    ids = np.asarray(table["id"])
+    ids = read_ids(table)
     first = np.zeros(n, dtype=bool)
     first[np.unique(ids, return_index=True)[1]] = True
     flags[~first] |= int(FitFlags.DUPLICATE_ID)
     return FitData(ids, flux, err, sigma, limit, flags)
+
+
+def read_ids(table):
+    """
+    Ids of a catalogue.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        The catalogue of n objects, with the column ``id``.
+
+    Returns
+    -------
+    ids : `~numpy.ndarray`, shape (n,)
+        Numbers, or text whether it came as such or as bytes.
+
+    Raises
+    ------
+    ValueError
+        If one is masked or empty text, for nothing would tell its object from
+        others; if some are numbers and some text, or several are in a row.
+    """
+    require_columns(table, ["id"], "photometry")
+    column = table["id"]
+    ids = np.asarray(getattr(column, "unmasked", column))
+    if ids.ndim != 1:
+        raise argument_error("photometry", "a table with one id in a row", f"{ids.shape}")
+    missing = np.broadcast_to(np.asarray(getattr(column, "mask", False)), ids.shape)
+    if ids.dtype.kind == "O":
+        missing = missing | np.array([value is None for value in ids], dtype=bool)
+    elif ids.dtype.kind in "US":
+        missing = missing | (ids == ids.dtype.type())
+    if missing.any():
+        rows = np.flatnonzero(missing)
+        got = f"{rows.size} masked or empty, the first in row {rows[0]} (from 0)"
+        raise argument_error("photometry", "a table with an id in every row", got)
+    if ids.dtype.kind == "S":
+        # as astropy reads text of FITS files
+        return np.char.decode(ids, "utf-8")
+    if ids.dtype.kind == "O":
+        kinds = {type(value) for value in ids.tolist()}
+        if len(kinds) > 1:
+            names = sorted(kind.__name__ for kind in kinds)
+            raise argument_error("photometry", "a table with ids of one kind", f"{names}")
+        return np.array(ids.tolist()) if ids.size else ids.astype(str)
+    return ids
+
+
+def unused_bands(table, filters):
+    """
+    Bands of a catalogue that are not fitted.
+
+    A column is a band if it has an error ``<name>_err`` beside it and both are in a unit of flux
+    density, or if its name is that of a filter.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        Photometry.
+    filters : iterable of str
+        The bands that are fitted.
+
+    Returns
+    -------
+    names : list of str
+        In the order of the columns.
+    """
+    known, columns = set(Filter.names()), set(table.colnames)
+    out = []
+    for name in table.colnames:
+        if name in filters:
+            continue
+        pair = (name, error_column(name))
+        measured = pair[1] in columns and all(_is_flux(table[c]) for c in pair)
+        if measured or name in known or name.startswith("sedpy."):
+            out.append(name)
+    return out
+
+
+def _is_flux(column):
+    """Whether a column has a unit of flux density."""
+    unit = getattr(column, "unit", None)
+    try:
+        return unit is not None and u.Unit(unit).is_equivalent(FNU)
+    except (TypeError, ValueError):
+        return False
 
 
 def limits(table, name):
@@ -172,7 +261,13 @@ def per_band(value, filters, name):
         if unknown:
             raise argument_error(name, f"a dict with keys among {list(filters)}", f"{unknown}")
         value = [value.get(f, 0.0) for f in filters]
-    array = np.broadcast_to(np.asarray(value, dtype=float), (len(filters),)).copy()
+    if isinstance(value, (list, tuple)):
+        value = [float(to_array(v, u.dimensionless_unscaled, name, ndim=0)) for v in value]
+    # 10 % is 0.1
+    value = to_array(value, u.dimensionless_unscaled, name)
+    if value.shape not in ((), (len(filters),)):
+        raise argument_error(name, f"a number or {len(filters)} of them", f"shape {value.shape}")
+    array = np.broadcast_to(value, (len(filters),)).copy()
     if not np.all(np.isfinite(array) & (array >= 0)):
         raise argument_error(name, "finite and not negative", f"{value}")
     return array

@@ -7,6 +7,7 @@ from astropy.table import QTable
 
 from miricigale.fitting.flags import FitFlags
 from miricigale.fitting.left_out import plain_column
+from miricigale.fitting.likelihood import read_ids
 from miricigale.fitting.posterior import randomised_ranks
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import check_seed, stream
@@ -57,7 +58,7 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
     filters = results.meta.get("fit", {}).get("filters", results.filters)
     columns = [c for name in filters for c in (name, error_column(name))]
     require_columns(photometry, ["id", *columns], "photometry", units=dict.fromkeys(columns, FNU))
-    if not np.array_equal(np.asarray(photometry["id"]), results.ids):
+    if not np.array_equal(read_ids(photometry), results.ids):
         raise argument_error("photometry", "of the objects of 'results', in order", "others")
     if results.meta.get("fit", {}).get("redshift") == "fixed" and options.get("redshift") is None:
         raise argument_error("redshift", "given again: it was fixed in 'results'", "None")

@@ -5,16 +5,43 @@ import numpy as np
 
 from miricigale.fitting.fractions import FRACTIONS
 from miricigale.fitting.quantities import Quantities
-from miricigale.utils.exceptions import unknown_name
+from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.random import stream
 
-__all__ = ["ModelValues"]
+__all__ = ["ModelValues", "check_draws"]
 
 #: AGN fractions in both definitions: the AGN's part and the galaxy's.
 _FRACTIONS = {
     "frac_agn_dust": ("agn_power", "dust_luminosity"),
     "frac_agn_ir": ("ir_luminosity_agn", "ir_luminosity_galaxy"),
 }
+
+
+def check_draws(grid, ids, flags, index, scale):
+    """
+    Check models drawn from a grid; see `~miricigale.fitting.Samples` for the arguments.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not agree, an index is not one of the grid, or there is no torus where the
+        AGN fraction is above 0.
+    """
+    n, shape = ids.size, np.shape(scale)
+    if len(shape) != 2 or shape[0] != n or shape[1] < 1:
+        raise argument_error("scale", f"of shape ({n}, n_draws)", f"{shape}")
+    if np.shape(index) != (*shape, 4):
+        raise argument_error("index", f"of shape {(*shape, 4)}", f"{np.shape(index)}")
+    if np.shape(flags) != (n,):
+        raise argument_error("flags", f"of shape ({n},)", f"{np.shape(flags)}")
+    sizes = (grid.redshift.size, grid.n_galaxies, max(grid.n_agn, 1), grid.frac_agn.size)
+    index = np.asarray(index, dtype=np.int64)
+    drawn = index[(index[:, :, 0] >= 0).all(axis=1)].reshape(-1, 4)
+    lowest = np.array([0, 0, -1, 0])
+    if np.any(drawn < lowest) or np.any(drawn >= np.array(sizes)):
+        raise argument_error("index", f"within the grid's {sizes}", "others")
+    if np.any((drawn[:, 2] < 0) & (grid.frac_agn[drawn[:, 3]] > 0)):
+        raise argument_error("index", "with a torus where the AGN fraction is above 0", "none")
 
 
 class ModelValues:

@@ -5,7 +5,7 @@ import numpy as np
 from miricigale.fitting.assembly import constants
 from miricigale.utils.exceptions import argument_error, unknown_name
 
-__all__ = ["check_pairs", "joint_names", "joint_tables"]
+__all__ = ["check_pairs", "joint_names", "joint_tables", "named_pairs"]
 
 #: Letters of the engine's joint sums: redshift and fraction before galaxy, galaxy before torus.
 _LETTERS = {"redshift": "z", "frac_agn": "f", "galaxy": "g", "agn": "k"}
@@ -37,11 +37,35 @@ def check_pairs(pairs, fitter):
         If these are no pairs, both are one parameter, or one has a single value or is a derived
         quantity.
     """
+    axes = fitter.priors.axes
+    derived = (*fitter.quantities.names, getattr(fitter.fraction, "name", None))
+    constant = constants(fitter.grid, axes)
+    wanted = "of parameters of the grid ('sample' draws derived quantities jointly)"
+    return named_pairs(pairs, axes, constant, derived, wanted)
+
+
+def named_pairs(pairs, axes, constant, derived, wanted):
+    """
+    Check pairs of parameters.
+
+    Parameters
+    ----------
+    pairs : list of tuple of str or None
+        Pairs of parameters.
+    axes : dict of str to `~miricigale.fitting.priors.GridAxis`
+        Parameters that have a posterior.
+    constant, derived : iterable of str
+        Names of parameters with one value, and of derived quantities.
+    wanted : str
+        What is asked for in place of derived quantities, for the message.
+
+    Returns
+    -------
+    pairs : tuple of tuple of str
+        As of `check_pairs`, which tells the errors too.
+    """
     if isinstance(pairs, (str, dict)) or not np.iterable(() if pairs is None else pairs):
         raise argument_error("pairs", "a list of pairs of parameter names", repr(pairs))
-    axes = fitter.priors.axes
-    constant = constants(fitter.grid, axes)
-    derived = (*fitter.quantities.names, getattr(fitter.fraction, "name", None))
     out = {}
     for pair in () if pairs is None else pairs:
         names = () if isinstance(pair, (str, dict)) or not np.iterable(pair) else tuple(pair)
@@ -49,11 +73,10 @@ def check_pairs(pairs, fitter):
             raise argument_error("pairs", "a list of pairs of parameter names", f"{pair!r} in it")
         for name in names:
             if name in derived:
-                wanted = "of parameters of the grid ('sample' draws derived quantities jointly)"
                 raise argument_error("pairs", wanted, repr(name))
             if name in constant or (name in axes and axes[name].values.size == 1):
-                wanted = "of parameters with several values"
-                raise argument_error("pairs", wanted, f"{name!r}, which has one")
+                several = "of parameters with several values"
+                raise argument_error("pairs", several, f"{name!r}, which has one")
             if name not in axes:
                 raise unknown_name("parameter for 'pairs'", name, axes)
         names = tuple(map(str, names))

@@ -14,6 +14,8 @@ __all__ = ["DrawPiece", "FitPiece", "Part", "cut"]
 
 #: Numbers of joint sums that a piece may have at once (32 MB).
 _JOINT_SIZE = 1 << 22
+#: Fluxes that are all 0 become negative by this part of their error; see `cut`.
+_DARK = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +146,12 @@ def cut(data, log_prior, size, **more):
     out = []
     for s in list(chunks(len(data.ids), size)) or [slice(0, 0)]:
         flux, sigma, limit = np.nan_to_num(data.flux[s]), data.sigma[s], data.limit[s]
+        measured = data.measured[s]
+        signal = np.divide(flux, sigma, out=np.zeros(flux.shape), where=measured)
+        # the engine compares directions, of which zeros have none. Just below zero the best scale of
+        # every model is 0 as well, and chi2 is larger by 1e-16 a band
+        dark = measured & (np.sum(signal * signal, axis=1) == 0.0)[:, None]
+        flux = np.where(dark, -_DARK * sigma, flux)
         piece = {"flux": flux, "sigma": np.where(limit, np.inf, sigma), "log_prior": log_prior[s]}
         if with_limits:
             piece |= {"limit": flux, "limit_sigma": np.where(limit, sigma, np.inf)}

@@ -2,10 +2,13 @@
 
 import numpy as np
 
+from miricigale.utils.exceptions import argument_error
+
 __all__ = [
     "bin_cells",
     "cell_edges",
     "cell_percentiles",
+    "check_levels",
     "moments",
     "node_cells",
     "randomised_ranks",
@@ -60,6 +63,23 @@ def moments(values, pdf):
     # about the mean, so that narrow posteriors do not lose digits
     deviation = values - mean[..., None]
     return mean, np.sqrt(np.sum(pdf * deviation * deviation, axis=-1))
+
+
+def check_levels(levels):
+    """
+    Levels of percentiles as an array.
+
+    Raises
+    ------
+    ValueError
+        If one is not between 0 and 1, or these are several lists.
+    """
+    levels = np.atleast_1d(np.asarray(levels, dtype=float))
+    if levels.ndim != 1:
+        raise argument_error("levels", "a number or a list of numbers", f"shape {levels.shape}")
+    if not np.all((levels > 0) & (levels < 1)):
+        raise argument_error("levels", "between 0 and 1", f"{levels}")
+    return levels
 
 
 def cell_percentiles(values, pdf, levels, bounds=(-np.inf, np.inf)):

@@ -9,22 +9,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
 
-__all__ = ["band_names", "check_levels", "draw_fluxes", "flux_table", "spectrum_table"]
-
-
-def check_levels(levels):
-    """
-    Levels of percentiles as an array.
-
-    Raises
-    ------
-    ValueError
-        If one is not between 0 and 1.
-    """
-    levels = np.atleast_1d(np.asarray(levels, dtype=float))
-    if levels.ndim != 1 or not np.all((levels > 0) & (levels < 1)):
-        raise argument_error("levels", "between 0 and 1", f"{levels}")
-    return levels
+__all__ = ["band_names", "draw_fluxes", "flux_table", "spectrum_table"]
 
 
 def band_names(grid, filters):
@@ -107,7 +92,7 @@ def flux_table(samples, names, fluxes, levels):
     fluxes : `~numpy.ndarray`, shape (n, n_draws, n_filters)
         Fluxes of the draws in uJy.
     levels : `~numpy.ndarray`
-        From `check_levels`.
+        From `~miricigale.fitting.posterior.check_levels`.
     """
     out = QTable(
         {"id": np.array(samples.ids), "flags": np.array(samples.flags)}, meta=dict(samples.meta)
@@ -139,7 +124,7 @@ def spectrum_table(wave, values, levels, *, rest, meta):
     values : `~astropy.units.Quantity`, shape (n_draws, n_wave)
         Spectra.
     levels : `~numpy.ndarray`
-        From `check_levels`.
+        From `~miricigale.fitting.posterior.check_levels`.
     rest : bool
         Whether these are rest-frame spectra.
     meta : dict

@@ -7,9 +7,10 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.fitting.posterior import cell_percentiles
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import LUMINOSITY, MASS
 
-__all__ = ["DERIVED_LEVELS", "Quantities", "ShapeQuantities"]
+__all__ = ["DERIVED_LEVELS", "Quantities", "ShapeQuantities", "kept_percentiles"]
 
 #: Levels at which the distributions of derived quantities are kept.
 DERIVED_LEVELS = np.array(
@@ -21,6 +22,36 @@ DERIVED_LEVELS.flags.writeable = False
 _SAME = 1e-9
 #: Shape quantities whose outermost cells end at 0.
 _NOT_NEGATIVE = ("a_v", "age_mass", "age_light")
+
+
+def kept_percentiles(name, levels, kept):
+    """
+    Percentiles of a quantity from its kept quantiles, linear between them.
+
+    Parameters
+    ----------
+    name : str
+        The quantity, for the message.
+    levels : `~numpy.ndarray`, shape (n_levels,)
+        Levels.
+    kept : `~numpy.ndarray`, shape (n, n_kept)
+        Quantiles at `DERIVED_LEVELS` of n objects.
+
+    Returns
+    -------
+    percentiles : `~numpy.ndarray`, shape (n, n_levels)
+
+    Raises
+    ------
+    ValueError
+        If a level is beyond the kept ones: nothing is known of the tails.
+    """
+    low, high = DERIVED_LEVELS[[0, -1]]
+    if np.any((levels < low) | (levels > high)):
+        wanted = f"from {low:g} to {high:g} for {name!r}, whose distribution is kept there"
+        raise argument_error("levels", wanted, f"{levels.tolist()}")
+    out = np.array([np.interp(levels, DERIVED_LEVELS, row) for row in kept])
+    return out.reshape(len(kept), levels.size)
 
 
 @dataclass(frozen=True, eq=False)

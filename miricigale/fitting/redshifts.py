@@ -25,7 +25,7 @@ def known_redshifts(photometry, redshift):
     Returns
     -------
     values : `~numpy.ndarray`, shape (n,)
-        NaN where one is missing, not finite or not positive.
+        NaN where one is missing, masked, not finite or not positive.
 
     Raises
     ------
@@ -38,15 +38,13 @@ def known_redshifts(photometry, redshift):
             wanted = f"a column among {photometry.colnames}"
             raise argument_error("redshift", wanted, repr(redshift))
         redshift = photometry[redshift]
-    mask = getattr(redshift, "mask", False)
-    values = getattr(redshift, "unmasked", redshift)
-    values = to_array(values, u.dimensionless_unscaled, "redshift")
+    values = _unmasked(redshift, "redshift")
     if values.ndim == 0:
         values = np.full(n, float(values))
     if values.shape != (n,):
         raise argument_error("redshift", f"{n} values", f"shape {values.shape}")
     with np.errstate(invalid="ignore"):
-        good = np.isfinite(values) & (values > 0) & ~np.asarray(mask)
+        good = np.isfinite(values) & (values > 0)
     return np.where(good, values, np.nan)
 
 
@@ -65,18 +63,19 @@ def read_density(redshift_prior, n):
     Returns
     -------
     nodes, density : `~numpy.ndarray`
-        As given.
+        As given; densities that are masked are NaN.
 
     Raises
     ------
     ValueError
-        If shapes do not agree, redshifts do not ascend or a density is negative or infinite.
+        If shapes do not agree, redshifts do not ascend or are masked, or a density is negative or
+        infinite.
     """
     wanted = "(redshifts of shape (n_z,), densities of shape (n_z,) or (n, n_z))"
     if not (isinstance(redshift_prior, tuple) and len(redshift_prior) == 2):
         raise argument_error("redshift_prior", wanted, type(redshift_prior).__name__)
-    nodes = to_array(redshift_prior[0], u.dimensionless_unscaled, "redshift_prior[0]")
-    density = to_array(redshift_prior[1], u.dimensionless_unscaled, "redshift_prior[1]")
+    nodes = _unmasked(redshift_prior[0], "redshift_prior[0]")
+    density = _unmasked(redshift_prior[1], "redshift_prior[1]")
     shapes = f"shapes {nodes.shape} and {density.shape}"
     if nodes.ndim != 1 or nodes.size < 2 or density.shape not in (nodes.shape, (n, nodes.size)):
         raise argument_error("redshift_prior", wanted, shapes)
@@ -85,6 +84,13 @@ def read_density(redshift_prior, n):
     if np.any(density < 0) or np.any(np.isinf(density)):
         raise argument_error("redshift_prior[1]", "finite and not negative", "others")
     return nodes, density
+
+
+def _unmasked(value, name):
+    """Numbers as an array, NaN where they are masked."""
+    mask = np.asarray(getattr(value, "mask", False))
+    array = to_array(getattr(value, "unmasked", value), u.dimensionless_unscaled, name)
+    return np.where(mask, np.nan, array)
 
 
 def density_log_prior(redshift_prior, grid_redshift, allowed, flags):
@@ -103,7 +109,7 @@ def density_log_prior(redshift_prior, grid_redshift, allowed, flags):
     allowed : `~numpy.ndarray` of bool, shape (nz,)
         Whether there are models at that redshift.
     flags : `~numpy.ndarray` of int, shape (n,)
-        Densities that hold NaN or sum to 0 are flagged here as ``NO_REDSHIFT``, those that leave
+        Densities that are masked, hold NaN or sum to 0 are flagged here as ``NO_REDSHIFT``, those that leave
         nothing of the grid as ``NO_MODEL``.
 
     Returns

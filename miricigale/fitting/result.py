@@ -29,7 +29,8 @@ class FitResult:
         self._row = row
 
     def __repr__(self):
-        return f"<FitResult of {self.id!r}, chi2 {self.chi2:.4g} in {self.n_bands} bands>"
+        key = np.asarray(self.id).item()
+        return f"<FitResult of {key!r}, chi2 {self.chi2:.4g} in {self.n_bands} bands>"
 
     @property
     def id(self):

@@ -8,10 +8,10 @@ from astropy.table import QTable
 
 from miricigale.fitting.flags import FitFlags
 from miricigale.fitting.keyed import find_row, rows_by_id
-from miricigale.fitting.posterior import cell_percentiles, moments
-from miricigale.fitting.quantities import DERIVED_LEVELS
+from miricigale.fitting.posterior import cell_percentiles, check_levels, moments
+from miricigale.fitting.quantities import kept_percentiles
 from miricigale.fitting.result import FitResult
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, frozen_array
 
@@ -208,24 +208,27 @@ class FitResults:
         name : str
             A parameter or derived quantity.
         levels : array_like
-            Levels in (0, 1). Of derived quantities the distribution is kept between 0.001 and
-            0.999.
+            Levels in (0, 1); of derived quantities from 0.001 to 0.999, between which their
+            distribution is kept.
 
         Returns
         -------
         percentiles : `~astropy.units.Quantity`, shape (n, n_levels)
             For parameters of the grid from the distribution that is linear within each cell.
+
+        Raises
+        ------
+        KeyError
+            If there is no such parameter.
+        ValueError
+            If a level is outside.
         """
-        levels = np.atleast_1d(np.asarray(levels, dtype=float))
-        if not np.all((levels > 0) & (levels < 1)):
-            raise argument_error("levels", "between 0 and 1", f"{levels}")
+        levels = check_levels(levels)
         if name in self.axes:
             axis = self.axes[name]
             out = cell_percentiles(axis.values, self.pdf[name], levels, axis.bounds)
         else:
-            kept = self.quantiles[:, self._quantity(name)]
-            out = np.array([np.interp(levels, DERIVED_LEVELS, row) for row in kept])
-            out = out.reshape(len(self), levels.size)
+            out = kept_percentiles(name, levels, self.quantiles[:, self._quantity(name)])
         return out * self.unit(name)
 
     def joint_pdf(self, x, y):

@@ -10,9 +10,10 @@ from astropy.table import QTable
 from miricigale.fitting import predictions, spectra
 from miricigale.fitting.flags import FitFlags
 from miricigale.fitting.keyed import find_row, rows_by_id
-from miricigale.fitting.model_values import ModelValues
-from miricigale.fitting.posterior import bin_cells, node_cells
+from miricigale.fitting.model_values import ModelValues, check_draws
+from miricigale.fitting.posterior import bin_cells, check_levels, node_cells
 from miricigale.fitting.priors import grid_priors
+from miricigale.fitting.sample_files import read_samples, write_samples
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import FNU, WAVE, frozen_array
 
@@ -68,32 +69,13 @@ class Samples:
 
     def __post_init__(self):
         ids = np.asarray(self.ids)
-        n = ids.size
-        shape = np.shape(self.scale)
-        if len(shape) != 2 or shape[0] != n or shape[1] < 1:
-            raise argument_error("scale", f"of shape ({n}, n_draws)", f"{shape}")
-        if np.shape(self.index) != (*shape, 4):
-            raise argument_error("index", f"of shape {(*shape, 4)}", f"{np.shape(self.index)}")
-        if np.shape(self.flags) != (n,):
-            raise argument_error("flags", f"of shape ({n},)", f"{np.shape(self.flags)}")
-        for name, dtype in (
-            ("ids", ids.dtype),
-            ("flags", np.int64),
-            ("index", np.int32),
-            ("scale", float),
-        ):
+        dtypes = {"ids": ids.dtype, "flags": np.int64, "index": np.int32, "scale": float}
+        check_draws(self.grid, ids, self.flags, self.index, self.scale)
+        for name, dtype in dtypes.items():
             object.__setattr__(self, name, frozen_array(getattr(self, name), dtype))
-        grid = self.grid
-        sizes = (grid.redshift.size, grid.n_galaxies, max(grid.n_agn, 1), grid.frac_agn.size)
-        drawn = self.index[self.fitted].reshape(-1, 4)
-        lowest = np.array([0, 0, -1, 0])
-        if np.any(drawn < lowest) or np.any(drawn >= np.array(sizes)):
-            raise argument_error("index", f"within the grid's {sizes}", "others")
-        if np.any((drawn[:, 2] < 0) & (grid.frac_agn[drawn[:, 3]] > 0)):
-            raise argument_error("index", "with a torus where the AGN fraction is above 0", "none")
         object.__setattr__(self, "meta", dict(self.meta))
         if self.axes is None:
-            object.__setattr__(self, "axes", grid_priors(grid).axes)
+            object.__setattr__(self, "axes", grid_priors(self.grid).axes)
         object.__setattr__(self, "_rows", rows_by_id(self.ids))
 
     def __len__(self):
@@ -132,6 +114,46 @@ class Samples:
     def with_model(self, model):
         """Return a copy that knows the `~miricigale.sed.SEDModel`."""
         return replace(self, model=model)
+
+    # -------------------------------------------------------------------- files
+
+    def write(self, path, *, overwrite=False):
+        """
+        Write the draws to a FITS file, without the grid and the model.
+
+        For other programs ``to_table().write`` has the values.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        overwrite : bool, optional
+            Whether a file that is there is replaced.
+        """
+        write_samples(self, path, overwrite=overwrite)
+
+    @classmethod
+    def read(cls, path, grid, *, model=None):
+        """
+        Read samples that `write` made.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        grid : `~miricigale.sed.ModelGrid`
+            The grid that was fitted (``fitter.grid``): draws are indices of it.
+        model : `~miricigale.sed.SEDModel`, optional
+            The model that it was made from, for other bands and for spectra.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If the file is missing, something else or incomplete.
+        ValueError
+            If the grid is another.
+        """
+        return read_samples(cls, path, grid, model=model)
 
     # ------------------------------------------------------------------- values
 
@@ -230,7 +252,7 @@ class Samples:
         percentiles : `~astropy.units.Quantity`, shape (n, n_levels)
         """
         values = self.values(name)
-        return np.quantile(values.value, predictions.check_levels(levels), axis=1).T * values.unit
+        return np.quantile(values.value, check_levels(levels), axis=1).T * values.unit
 
     # -------------------------------------------------------------- distributions
 
@@ -370,7 +392,7 @@ class Samples:
             ``id``, ``flags`` and, for each filter, mean (by its name), standard deviation
             (``<name>_err``) and percentiles (``<name>_p16``, ...) in uJy.
         """
-        levels = predictions.check_levels(levels)
+        levels = check_levels(levels)
         names, _ = self._bands(filters)
         return predictions.flux_table(self, names, self.fluxes(filters).value, levels)
 
@@ -418,7 +440,7 @@ class Samples:
             ``wave`` and a column for each level (``p16``, ``p50``, ``p84``), taken at every
             wavelength by itself: L_nu in W / Hz, or F_nu in uJy as observed.
         """
-        levels = predictions.check_levels(levels)
+        levels = check_levels(levels)
         wave, values = self.spectra(key, rest=rest)
         meta = dict(self.meta) | {"id": str(key), "rest": bool(rest)}
         return predictions.spectrum_table(wave, values, levels, rest=rest, meta=meta)

@@ -4,12 +4,14 @@ import importlib.metadata
 import json
 import logging
 import os
+import warnings
 from dataclasses import fields, replace
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 
+from miricigale.fitting.likelihood import read_ids
 from miricigale.fitting.pairs import check_pairs
 from miricigale.fitting.part_files import (
     MANIFEST,
@@ -22,17 +24,40 @@ from miricigale.fitting.part_files import (
 )
 from miricigale.refdata.locate import file_sha256
 from miricigale.utils.content import content_sha256
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
 from miricigale.utils.progress import progress
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU
 
-__all__ = ["fit_file"]
+__all__ = ["OtherFitError", "fit_file"]
 
 logger = logging.getLogger(__name__)
 
 _PACKAGES = ("miricigale", "numpy", "numba", "astropy")
+
+
+class OtherFitError(ValueError):
+    """
+    A folder holds results of another fit.
+
+    Parameters
+    ----------
+    folder : path-like
+        The folder.
+    differences : list of str
+        What differs.
+    remedy : str, optional
+        What the caller can do.
+    """
+
+    def __init__(self, folder, differences, remedy="resume=False to replace them"):
+        self.folder, self.differences = folder, differences
+        names = ", ".join(differences)
+        super().__init__(
+            f"{folder} holds results of another fit: {names} differ; "
+            f"give another folder, or {remedy}"
+        )
 
 
 def fit_file(
@@ -94,15 +119,24 @@ def fit_file(
     results : `FitResultsFiles`
         All parts.
 
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        What `BayesFitter.fit` warns of, once.
+
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
         If the catalogue cannot be read by rows, or the folder holds something else.
+    `OtherFitError`
+        If the folder holds parts of another fit.
     ValueError
-        If the folder holds parts of another fit, and what `BayesFitter.fit` raises.
+        What `BayesFitter.fit` raises; a note tells the rows.
     """
-    if not (hasattr(fitter, "fit") and hasattr(fitter, "settings")):
+    if not all(hasattr(fitter, name) for name in ("fit", "settings", "grid")):
         raise argument_error("fitter", "a BayesFitter", type(fitter).__name__)
+    if not isinstance(path_in, (str, os.PathLike)):
+        raise argument_error("path_in", "the path of a catalogue", type(path_in).__name__)
     unit = None if flux_unit is None else u.Unit(flux_unit)
     if unit is not None and not unit.is_equivalent(FNU):
         msg = f"'flux_unit' must be convertible to {FNU}, got {unit}"
@@ -118,7 +152,7 @@ def fit_file(
     job = _job(fitter, rows, redshift, redshift_prior, unit_text, hdu, pairs)
     manifest = _open_folder(folder, job, resume)
     seen = _SeenIds()
-    n_old = 0
+    n_old, n_new = 0, 0
     with progress(show=progress_bar, total=rows.n_rows, desc="fit", unit="obj") as bar:
         for i in range(rows.n_chunks):
             start, stop = rows.span(i)
@@ -128,7 +162,17 @@ def fit_file(
                 n_old += 1
             else:
                 table, options = inputs.take(i)
-                results = _fit(fitter, table, options, seen, executor)
+                with warnings.catch_warnings():
+                    if n_new:
+                        # what is true of all pieces was said of the first
+                        text = "bands of the photometry"
+                        warnings.filterwarnings("ignore", text, MiricigaleWarning)
+                    try:
+                        results = _fit(fitter, table, options, seen, executor)
+                    except (ValueError, u.UnitsError) as err:
+                        err.add_note(f"in rows {start} to {stop - 1} of {rows.path}")
+                        raise
+                n_new += 1
                 manifest["parts"][path.name] = _write_part(results, path)
                 write_manifest(folder, manifest)
                 seen.add(results.ids)
@@ -188,9 +232,8 @@ class _Inputs:
 
 def _fit(fitter, table, options, seen, executor):
     """Fit a piece as a part of the whole: ids of earlier pieces are duplicates."""
-    require_columns(table, ["id"], "photometry")
     n = len(table)
-    again = np.flatnonzero(seen.find(np.asarray(table["id"])))
+    again = np.flatnonzero(seen.find(read_ids(table)))
     if again.size == 0:
         return fitter.fit(table, executor=executor, **options)
     # rows with these ids come first, so that the fit itself sees that they occur twice
@@ -292,11 +335,7 @@ def _open_folder(folder, job, resume):
         if resume and manifest["parts"]:
             other = _differences(manifest["job"], job)
             if other:
-                msg = (
-                    f"{folder} holds results of another fit: {', '.join(other)} differ; "
-                    "give another folder, or resume=False to replace them"
-                )
-                raise ValueError(msg)
+                raise OtherFitError(folder, other)
             return manifest
         for name in manifest["parts"]:
             (folder / name).unlink(missing_ok=True)

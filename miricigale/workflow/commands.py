@@ -1,5 +1,7 @@
 """What the smaller commands of the command line do, for use in code too."""
 
+import warnings
+
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
@@ -7,6 +9,7 @@ from astropy.table import QTable
 
 from miricigale.filters import Filter
 from miricigale.fitting import BayesFitter, fit_file
+from miricigale.fitting.likelihood import unused_bands
 from miricigale.instrument import (
     ceers_exposures,
     proposal_limit,
@@ -17,7 +20,7 @@ from miricigale.instrument import (
 from miricigale.photometry import ForcedPhotometer, detect_sources
 from miricigale.psf import MatchingKernel, hst_psf, miri_psf, psf_mosaic
 from miricigale.sed import SEDModel
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column
 from miricigale.workflow.products import read_image
@@ -95,6 +98,7 @@ def fit_catalogue(
     axes="fit",
     redshift=None,
     model_error=0.1,
+    pairs=None,
     flux_unit=None,
     hdu=None,
     chunk_rows=10000,
@@ -117,12 +121,17 @@ def fit_catalogue(
         Column of known redshifts; fitted if not given.
     model_error : float, optional
         Relative model error.
-    flux_unit, hdu, chunk_rows, resume, executor, progress_bar : optional
+    pairs, flux_unit, hdu, chunk_rows, resume, executor, progress_bar : optional
         As for `miricigale.fitting.fit_file`.
 
     Returns
     -------
     results : `~miricigale.fitting.FitResultsFiles`
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        If the catalogue has bands under names that no filter has, or without errors.
 
     Raises
     ------
@@ -131,7 +140,8 @@ def fit_catalogue(
     ValueError
         If no column is a flux in a known filter with an error beside it.
     """
-    names = open_rows(path, chunk_rows, hdu=hdu).colnames
+    rows = open_rows(path, chunk_rows, hdu=hdu)
+    names = rows.colnames
     known = set(Filter.names())
     bands = [
         name
@@ -144,6 +154,13 @@ def fit_catalogue(
             "a table with columns <filter> and <filter>_err ('miricigale filters' lists the names)",
             f"columns {list(names)}",
         )
+    unused = unused_bands(rows.chunk(0), bands)
+    if unused:
+        msg = (
+            f"bands of the photometry are not fitted, as their names ('miricigale filters') or "
+            f"errors are missing: {', '.join(unused)}"
+        )
+        warnings.warn(msg, MiricigaleWarning, stacklevel=2)
     fitter = BayesFitter(
         SEDModel.yang2021(), bands, axes=SEDModel.yang2021_axes(axes), model_error=model_error
     )
@@ -152,6 +169,7 @@ def fit_catalogue(
         path,
         output,
         redshift=redshift,
+        pairs=pairs,
         flux_unit=flux_unit,
         hdu=hdu,
         chunk_rows=chunk_rows,

@@ -150,6 +150,26 @@ def test_bands_that_are_not_there(fitter, catalogue):
         leave_out(fitter, catalogue["id", "band2", "band2_err"], ["band1"])
 
 
+def test_nothing_left_to_fit_or_to_compare_is_refused(fitter, catalogue):
+    every = [f"band{i}" for i in range(6)]
+    with pytest.raises(ValueError, match=r"n_bands_min = 2 or more of .* are left, got .*'band5'"):
+        leave_out(fitter, catalogue, every)
+    with pytest.raises(ValueError, match="'bands' must be such that n_bands_min = 2"):
+        leave_out(fitter, catalogue, every[1:])
+    leave_out(fitter, catalogue[:3], every[2:])
+    table = catalogue[:20].copy()
+    table["band3"] = np.nan * u.uJy
+    table["band4_err"] = 0.0 * u.uJy
+    with pytest.raises(ValueError, match=r"'bands' must be measured .*got \['band3', 'band4'\]"):
+        leave_out(fitter, table, ["band2", "band3", "band4"], separately=True)
+    # a limit is a prediction's due
+    table["band5_limit"] = True
+    assert np.isfinite(leave_out(fitter, table, ["band5"]).predicted).any()
+    assert len(leave_out(fitter, catalogue[:0], ["band1"])) == 0
+    with pytest.raises(ValueError, match="'fitter' must be a BayesFitter, got dict"):
+        leave_out({}, catalogue, ["band1"])
+
+
 def test_drawing(mock, fitter, catalogue):
     ax = new_figure()[1][0, 0]
     assert mock.plot("mass", ax=ax) is ax

@@ -110,6 +110,24 @@ def test_prediction_of_the_best_model(results, grid):
         results.predict(["band9"])
 
 
+def test_tails_that_are_not_kept_have_no_percentiles(results):
+    wanted = "'levels' must be from 0.001 to 0.999 for 'mass', whose distribution is kept there"
+    for level in (1e-5, 0.9995):
+        with pytest.raises(ValueError, match=f"{wanted}, got .*{level:g}"):
+            results.percentile("mass", [0.5, level])
+        with pytest.raises(ValueError, match="for 'frac_agn_ir'"):
+            results[0].percentile("frac_agn_ir", level)
+    ends = results.percentile("mass", [0.001, 0.999])
+    np.testing.assert_array_equal(ends, results.quantiles[:, 0][:, [0, -1]] * u.Msun)
+    # the distribution of a parameter is known in full: its first cell is uniform
+    low, half = results.percentile("redshift", [1e-5, 2e-5])[0].value
+    axis = results.axes["redshift"]
+    first = cell_edges(axis.values, axis.bounds)[:2]
+    weight = results.pdf["redshift"][0, 0]
+    if weight > 2e-5:
+        assert half - low == pytest.approx(1e-5 / weight * (first[1] - first[0]), rel=1e-6)
+
+
 def test_write_and_read(results, tmp_path):
     path = tmp_path / "fits.fits"
     results.write(path)

@@ -8,7 +8,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy import integrate, optimize, special, stats
 
 from miricigale.fitting import BayesFitter, ContinuousFitter, ContinuousResults, FitFlags
@@ -105,6 +105,38 @@ def test_linear_model_has_the_posterior_and_evidence_of_the_closed_form(engine):
     both = np.cov(drawn["a"].value, drawn["b"].value)
     # 1000 draws of two variables that are correlated by 0.43
     assert_allclose(both, covariance, atol=0.15 * np.sqrt(np.prod(np.diag(covariance))))
+
+
+@pytest.mark.parametrize("engine", NAUTILUS)
+def test_joint_posteriors_are_those_of_the_closed_form(engine, tmp_path):
+    # two correlated Gaussians; see the test above
+    sigma = np.array([0.1, 0.2, 0.1, 0.1])
+    flux = np.array([[2.4, 2.2, 1.9, 1.7], [np.nan] * 4])
+    priors = {"a": (-1.0, 2.0), "b": (-1.0, 1.0), "mass": 1.0}
+    fitter = linear_fitter(priors, engine, n_cells=25, n_live=100, n_effective=600)
+    results = fitter.fit(photometry(flux, sigma), redshift=1.0, seed=4, pairs=[("b", "a")])
+    weights = results.joint_pdf("a", "b")
+    assert weights.shape == (2, 25, 25)
+    assert np.isnan(weights[1]).all()
+    assert_allclose(weights[0].sum(axis=1), results.pdf["a"][0], atol=1e-12)
+    assert_allclose(weights[0].sum(axis=0), results.pdf["b"][0], atol=1e-12)
+    covariance = np.linalg.inv((SLOPES / sigma) @ (SLOPES / sigma).T)
+    a, b = (results.axes[name].values - results.mean(name)[0].value for name in "ab")
+    got = a @ weights[0] @ b
+    # 0.43 sigma_a sigma_b, within the error of the sample; cells cost no covariance
+    error = np.sqrt(np.prod(np.diag(covariance)) / results.n_effective[0])
+    assert_allclose(got, covariance[0, 1], atol=5.0 * error)
+    results.write(tmp_path / "r.fits")
+    again = ContinuousResults.read(tmp_path / "r.fits")
+    assert_array_equal(again.joint_pdf("a", "b"), weights)
+    for pair, message in (
+        (("a", "mass"), "'pairs' must be of free parameters but mass .*'mass'"),
+        (("a", "redshift"), "of parameters with several values, got 'redshift'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            fitter.fit(photometry(flux, sigma), redshift=1.0, seed=4, pairs=[pair])
+    with pytest.raises(ValueError, match=r"'levels' must be from 0.001 to 0.999 for 'a'"):
+        results.percentile("a", 1e-5)
 
 
 @pytest.mark.parametrize("engine", NAUTILUS)

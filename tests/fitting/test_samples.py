@@ -6,12 +6,14 @@ from concurrent.futures import ThreadPoolExecutor
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.io import fits
 from astropy.table import QTable
 from scipy.stats import chi2
 
 from miricigale.filters import FilterSet
 from miricigale.fitting import BayesFitter, Samples
 from miricigale.sed import SED, SEDModel
+from miricigale.utils.exceptions import DataError
 
 BANDS = ["acs.f606w", "wfc3.f160w", "miri.f770w", "miri.f2100w"]
 AXES = {
@@ -224,6 +226,62 @@ def test_what_is_refused(real, model, samples):
     with pytest.raises(ValueError, match="read-only"):
         samples.scale[0, 0] = 1
     assert isinstance(samples.to_table(["mass"]), QTable)
+
+
+def test_write_and_read(real, model, tmp_path):
+    path = tmp_path / "samples.fits"
+    real.write(path)
+    again = Samples.read(path, real.grid, model=model)
+    one, two = real.to_table(), again.to_table()
+    # parameters without effect too, which are drawn from their prior
+    assert one.colnames == two.colnames
+    for name in one.colnames:
+        assert one[name].info.description == two[name].info.description
+        assert getattr(one[name], "unit", None) == getattr(two[name], "unit", None)
+        np.testing.assert_array_equal(one[name], two[name])
+    assert again.meta == one.meta == two.meta
+    np.testing.assert_array_equal(again.fluxes(), real.fluxes())
+    np.testing.assert_array_equal(again.spectra("a")[1], real.spectra("a")[1])
+    # the grid may have been on disk too
+    real.grid.write(tmp_path / "grid.fits")
+    grid = type(real.grid).read(tmp_path / "grid.fits")
+    np.testing.assert_array_equal(Samples.read(path, grid).values("mass"), real.values("mass"))
+    with pytest.raises(OSError, match="already exists"):
+        real.write(path)
+    real["b"].write(path, overwrite=True)
+    assert list(Samples.read(path, real.grid).ids) == ["b"]
+
+
+def test_files_that_are_no_samples_are_refused(real, grid, samples, tmp_path):
+    path = tmp_path / "samples.fits"
+    samples.write(path)
+    with fits.open(path) as hdus:
+        assert hdus[0].header["FORMAT"] == "miricigale-samples-1"
+    with pytest.raises(ValueError, match="'grid' must be the one of the samples, <ModelGrid 4 red"):
+        Samples.read(path, real.grid)
+    with pytest.raises(ValueError, match="'grid' must be the ModelGrid that was fitted, got str"):
+        Samples.read(path, "grid.fits")
+    with fits.open(path) as hdus:
+        fits.HDUList([hdus[0], hdus["TEXT"]]).writeto(tmp_path / "half.fits")
+    with pytest.raises(DataError, match=r"half\.fits is not a complete file of samples"):
+        Samples.read(tmp_path / "half.fits", grid)
+    grid.write(path, overwrite=True)
+    with pytest.raises(DataError, match="holds no samples"):
+        Samples.read(path, grid)
+    with pytest.raises(DataError, match=r"absent\.fits"):
+        Samples.read(tmp_path / "absent.fits", grid)
+
+
+def test_draws_with_a_prior_keep_it_in_files(make_grid, draw_photometry, tmp_path):
+    grid = make_grid()
+    fitter = BayesFitter(grid, priors={"temperature_polar": [1.0, 3.0]})
+    drawn = fitter.sample(draw_photometry(grid, 2)[0], 500, seed=4)
+    drawn.write(tmp_path / "s.fits")
+    again = Samples.read(tmp_path / "s.fits", grid)
+    np.testing.assert_array_equal(
+        again.values("temperature_polar"), drawn.values("temperature_polar")
+    )
+    assert again.meta == drawn.meta
 
 
 def test_draws_of_the_fitter_have_its_posterior(grid, photometry):

@@ -8,6 +8,7 @@ from astropy.table import QTable
 from miricigale.cli import main
 from miricigale.fitting import BayesFitter, open_results
 from miricigale.sed import SEDModel
+from miricigale.utils.exceptions import MiricigaleWarning
 
 BANDS = ("wfc3.f125w", "wfc3.f160w", "irac.ch1", "irac.ch2", "miri.f770w", "miri.f1500w")
 
@@ -34,14 +35,22 @@ def test_a_catalogue_becomes_a_folder_of_results(catalogue, tmp_path, capsys):
     out = tmp_path / "out"
     command = ["fit", str(tmp_path / "cat.fits"), "-o", str(out), "--axes", "quick"]
     command += ["--chunk-rows", "2", "--redshift", "z_spec", "--threads", "2", "--no-progress"]
+    command += ["--pairs", "age:tau", "--pairs", "ebv:age", "frac_agn:redshift"]
     assert main(command) == 0
     assert "5 objects, 5 fitted, 3 parts" in capsys.readouterr().out
     assert len(open_results(out)) == 5
+    for galaxy in open_results(out):
+        joint = galaxy.joint_pdf("tau", "age")
+        np.testing.assert_allclose(joint.sum(axis=0), galaxy.pdf("age")[1], atol=1e-9)
+        assert list(galaxy.pairs) == [("age", "tau"), ("ebv", "age")]
     table = QTable.read(out / "table.fits")
     # the mass formed that went in
     np.testing.assert_allclose(table["mass_best"].to_value(u.Msun), 1e10, rtol=0.02)
     assert main([*command, "--chunk-rows", "3"]) == 2
-    assert "holds results of another fit: chunk_rows differ" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "holds results of another fit: chunk_rows differ" in err
+    assert "give another folder, or --no-resume to replace them" in err
+    assert "resume=" not in err
     assert main([*command, "--chunk-rows", "3", "--no-resume"]) == 0
     assert open_results(out).n_parts == 2
 
@@ -74,6 +83,7 @@ def test_ctrl_c_keeps_what_is_finished(catalogue, tmp_path, capsys, monkeypatch)
         (["--redshift", "z_phot"], "'redshift' must be a column among"),
         (["--hdu", "SECOND"], "has no extension 'SECOND'"),
         (["--chunk-rows", "0"], "'chunk_rows' must be an integer >= 1, got 0"),
+        (["--pairs", "age:mood"], "no parameter for 'pairs' 'mood'; known: age"),
         (["--flux-unit", "mag"], "'flux_unit' must be convertible to uJy, got mag"),
     ],
 )
@@ -91,6 +101,23 @@ def test_a_table_without_photometry_is_told_what_is_wanted(tmp_path, capsys):
     QTable({"id": [1], "flux": [1.0] * u.uJy}).write(tmp_path / "cat.fits")
     assert main(["fit", str(tmp_path / "cat.fits"), "-o", str(tmp_path / "out")]) == 2
     assert "a table with columns <filter> and <filter>_err" in capsys.readouterr().err
+
+
+def test_pairs_are_two_names(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["fit", "--pairs", "age:tau", "cat.fits"])
+    assert "'cat.fits' is no pair NAME:NAME" in capsys.readouterr().err
+
+
+def test_bands_of_no_filter_are_told(catalogue, tmp_path):
+    table = catalogue.copy()
+    table["hst.f606w"], table["hst.f606w_err"] = table["irac.ch1"], table["irac.ch1_err"]
+    table.write(tmp_path / "cat.fits")
+    command = ["fit", str(tmp_path / "cat.fits"), "-o", str(tmp_path / "out"), "--axes", "quick"]
+    with pytest.warns(MiricigaleWarning, match=r"errors are missing: hst\.f606w$"):
+        assert main([*command, "--redshift", "z_spec", "--no-progress"]) == 0
+    results = open_results(tmp_path / "out")
+    assert [part.meta["fit"]["unused_bands"] for part in results.parts()] == [["hst.f606w"]]
 
 
 def test_magnitudes_are_no_fluxes(tmp_path, capsys):

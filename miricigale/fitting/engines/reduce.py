@@ -27,12 +27,15 @@ class FitOne:
         Seed of the whole catalogue.
     n_draws : int
         Draws of equal weight that are kept.
+    pairs : tuple of tuple of str, optional
+        Axes whose joint posteriors are returned too.
     """
 
     engine: ContinuousEngine
     axes: dict
     seed: int
     n_draws: int
+    pairs: tuple = ()
 
     def __call__(self, target):
         found = self.engine.fit(target, self.seed)
@@ -50,9 +53,13 @@ class FitOne:
             name: np.bincount(cells[name], weight, minlength=axis.values.size)
             for name, axis in self.axes.items()
         }
-        n_f = self.axes["frac_agn"].values.size if "frac_agn" in self.axes else 1
-        both = cells["redshift"] * n_f + (cells["frac_agn"] if n_f > 1 else 0)
-        n_z = self.axes["redshift"].values.size
+        size = {name: axis.values.size for name, axis in self.axes.items()}
+        # one cell of the AGN fraction where it is no axis
+        n_f, fraction = size.get("frac_agn", 1), cells.get("frac_agn", 0)
+
+        def joint(i, j, n_x, n_y):
+            return np.bincount(i * n_y + j, weight, minlength=n_x * n_y).reshape(n_x, n_y)
+
         axis_parts = [_summary(values[name], weight) for name in self.axes]
         parts = [_summary(array, weight) for array in found.derived.values()]
         drawn = _draw(weight, self.n_draws, stream(self.seed, "draws", target.key))
@@ -60,7 +67,8 @@ class FitOne:
         mean = weight @ found.flux
         return {
             "pdf": pdf,
-            "pdf_2d": np.bincount(both, weight, minlength=n_z * n_f).reshape(n_z, n_f),
+            "pdf_2d": joint(cells["redshift"], fraction, size["redshift"], n_f),
+            "pairs": {(x, y): joint(cells[x], cells[y], size[x], size[y]) for x, y in self.pairs},
             "axis_moments": [part[0][:2] for part in axis_parts],
             "axis_quantiles": [part[1] for part in axis_parts],
             "moments": [part[0] for part in parts],

@@ -1,0 +1,237 @@
+"""What catalogues may hold that a fit cannot use: it is told, flagged or refused, never guessed."""
+
+import warnings
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import MaskedColumn, QTable, Table
+from numpy.testing import assert_allclose, assert_array_equal
+
+from miricigale.fitting import BayesFitter, FitFlags, FitResults, fit_file
+from miricigale.utils.exceptions import MiricigaleWarning
+
+
+@pytest.fixture
+def catalogue(grid, draw_photometry):
+    return draw_photometry(grid, 6, noise=0.1)[0]
+
+
+@pytest.fixture
+def wider(catalogue):
+    """Bands that the grid lacks, by unit and by name, and columns that are none."""
+    table = catalogue.copy()
+    table["hst.f606w"], table["hst.f606w_err"] = table["band0"], table["band0_err"]
+    table["miri.f560w"] = np.ones(6)
+    table["mass"], table["mass_err"] = 1e10 * u.Msun, 1e9 * u.Msun
+    table["sky"] = 1.0 * u.uJy
+    return table
+
+
+# ------------------------------------------------------------------------------- bands
+
+
+def test_bands_that_the_grid_lacks_are_named(grid, catalogue, wider):
+    fitter = BayesFitter(grid)
+    with pytest.warns(MiricigaleWarning, match=r"are not fitted: hst\.f606w, miri\.f560w$") as told:
+        results = fitter.fit(wider)
+    assert len(told) == 1
+    # the line that called
+    assert told[0].filename == __file__
+    assert results.meta["fit"]["unused_bands"] == ["hst.f606w", "miri.f560w"]
+    with pytest.warns(MiricigaleWarning, match="hst.f606w"):
+        samples = fitter.sample(wider, 2, seed=1)
+    assert samples.meta["fit"]["unused_bands"] == ["hst.f606w", "miri.f560w"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        alone = fitter.fit(catalogue)
+        # who names the bands knows
+        chosen = BayesFitter(grid, ["band0", "band1", "band2"]).fit(wider)
+    assert alone.meta["fit"]["unused_bands"] == []
+    assert_array_equal(alone.chi2, results.chi2)
+    unused = ["band3", "band4", "band5", "hst.f606w", "miri.f560w"]
+    assert chosen.meta["fit"]["unused_bands"] == unused
+
+
+def test_a_catalogue_on_disk_is_warned_of_once(grid, wider, tmp_path):
+    wider.write(tmp_path / "cat.fits")
+    with pytest.warns(MiricigaleWarning, match="hst.f606w") as told:
+        results = fit_file(BayesFitter(grid), tmp_path / "cat.fits", tmp_path / "o", chunk_rows=2)
+    assert len([w for w in told if w.category is MiricigaleWarning]) == 1
+    for part in results.parts():
+        assert part.meta["fit"]["unused_bands"] == ["hst.f606w", "miri.f560w"]
+
+
+# -------------------------------------------------------------------------------- rows
+
+
+@pytest.mark.parametrize("kind", [int, str])
+def test_masked_ids_are_refused(grid, catalogue, tmp_path, kind):
+    table = Table(catalogue)
+    table["id"] = MaskedColumn(np.arange(6).astype(kind), mask=[0, 0, 0, 0, 1, 0])
+    match = "'photometry' must be a table with an id in every row, got 1 masked or empty"
+    with pytest.raises(ValueError, match=rf"{match}, the first in row 4 \(from 0\)"):
+        BayesFitter(grid).fit(table)
+    if kind is str:
+        # as some files have them
+        table["id"] = [*"abcd", "", "f"]
+        with pytest.raises(ValueError, match=match):
+            BayesFitter(grid).fit(table)
+        table.write(tmp_path / "cat.ecsv")
+        with pytest.raises(ValueError, match=match) as error:
+            fit_file(BayesFitter(grid), tmp_path / "cat.ecsv", tmp_path / "o", chunk_rows=3)
+        assert "in rows 3 to 5 of" in error.value.__notes__[0]
+
+
+def test_text_ids_are_text_wherever_they_come_from(grid, catalogue, tmp_path):
+    catalogue["id"] = [f"g{i}" for i in range(6)]
+    fitter = BayesFitter(grid)
+    want, drawn = fitter.fit(catalogue), fitter.sample(catalogue, 5, seed=1)
+    catalogue.write(tmp_path / "cat.fits")
+    read = Table.read(tmp_path / "cat.fits", character_as_bytes=True)
+    assert read["id"].dtype.kind == "S"
+    of_objects = Table(catalogue)
+    of_objects["id"] = np.array(catalogue["id"].tolist(), dtype=object)
+    for table in (read, of_objects):
+        got = fitter.fit(table)
+        assert got["g3"].chi2 == want["g3"].chi2
+        assert repr(got["g3"]).startswith("<FitResult of 'g3', chi2 ")
+        with pytest.raises(KeyError, match=r"no object with the id slice\(0, 2, None\) among 6"):
+            got[0:2]
+        # and so are the random streams
+        assert_array_equal(fitter.sample(table, 5, seed=1).scale, drawn.scale)
+        got.write(tmp_path / "r.fits", overwrite=True)
+        assert FitResults.read(tmp_path / "r.fits")["g5"].chi2 == want["g5"].chi2
+    for bad, message in (
+        (["a", 1, "b", 2, "c", 3], r"ids of one kind, got \['int', 'str'\]"),
+        (["a", None, "b", "c", "d", "e"], "1 masked or empty, the first in row 1"),
+    ):
+        of_objects["id"] = np.array(bad, dtype=object)
+        with pytest.raises(ValueError, match=message):
+            fitter.fit(of_objects)
+
+
+def test_ids_that_fits_files_cannot_hold_are_named(grid, catalogue, tmp_path):
+    catalogue["id"] = ["a", "b", "Kümmel 3", "c", "d", "e"]
+    fitter = BayesFitter(grid)
+    results, samples = fitter.fit(catalogue), fitter.sample(catalogue, 2, seed=1)
+    for item in (results, samples):
+        assert item["Kümmel 3"] is not None
+        with pytest.raises(ValueError, match=r"'ids' must be ASCII .* got 'Kümmel 3'"):
+            item.write(tmp_path / "r.fits")
+
+
+def test_masked_redshifts_are_missing(grid, catalogue):
+    fitter = BayesFitter(grid)
+    z = np.array(catalogue["redshift"], dtype=float)
+    mask = np.arange(6) == 2
+    want = fitter.fit(catalogue, redshift=np.where(mask, np.nan, z))
+    assert FitFlags.NO_REDSHIFT & want.flags[2]
+    table = Table(catalogue)
+    table["z"] = MaskedColumn(z, mask=mask)
+    for given in ("z", table["z"], np.ma.array(z, mask=mask), table["z"].tolist()):
+        got = fitter.fit(table, redshift=given)
+        assert_array_equal(got.flags, want.flags)
+        assert_array_equal(got.chi2, want.chi2)
+
+
+def test_masked_densities_are_missing(grid, catalogue):
+    fitter = BayesFitter(grid)
+    nodes = np.linspace(0.0, 3.0, 31)
+    density = np.ma.array(np.ones((6, 31)), mask=np.zeros((6, 31), dtype=bool))
+    density[3, 7:9] = np.ma.masked
+    got = fitter.fit(catalogue, redshift_prior=(nodes, density))
+    assert_array_equal(got.flags & int(FitFlags.NO_REDSHIFT) > 0, np.arange(6) == 3)
+    assert_array_equal(got.fitted, np.arange(6) != 3)
+    with pytest.raises(ValueError, match=r"'redshift_prior\[0\]' must be >= 0 and ascending"):
+        fitter.fit(catalogue, redshift_prior=(np.ma.masked_less(nodes, 1.0), np.ones(31)))
+
+
+def test_errors_may_be_per_cent(grid, catalogue):
+    want = BayesFitter(grid, model_error=0.2, error_floor={"band1": 0.3}).fit(catalogue)
+    floor = {"band1": 30 * u.percent}
+    got = BayesFitter(grid, model_error=20 * u.percent, error_floor=floor).fit(catalogue)
+    assert_allclose(got.sigma, want.sigma, rtol=1e-12)
+    with pytest.raises(u.UnitsError, match="'model_error' must be convertible to"):
+        BayesFitter(grid, model_error=0.1 * u.uJy)
+    with pytest.raises(ValueError, match="'model_error' must be a number or 6 of them"):
+        BayesFitter(grid, model_error=np.ones(5))
+
+
+@pytest.mark.parametrize("limited", [False, True])
+@pytest.mark.parametrize("flux", [0.0, -0.3, 1e-250])
+def test_without_signal_the_posterior_is_the_prior(make_grid, draw_photometry, flux, limited):
+    """No model has light, all have the same chi2: sum (F / sigma)^2."""
+    grid = make_grid(3)
+    table, _ = draw_photometry(grid, 3)
+    weights = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
+    for name in grid.filters:
+        table[name][1] = flux * table[f"{name}_err"][1]
+    if limited:
+        table["band5"][1] = 1.0 * table["band5_err"][1]
+        table["band5_limit"] = [False, True, False]
+    fitter = BayesFitter(grid, priors={"tau": weights}, model_error=0.0)
+    results = fitter.fit(table)
+    assert list(results.ids) == [0, 1, 2]
+    assert results.fitted.all()
+    assert FitFlags.NO_SIGNAL & results.flags[1]
+    assert not FitFlags.NO_SIGNAL & (results.flags[0] | results.flags[2])
+    assert results.best_scale[1] == 0.0
+    assert results.mean("mass")[1] == 0.0
+    assert_allclose(results.pdf["tau"][1], weights / 15.0, rtol=1e-6)
+    assert_allclose(results.pdf["frac_agn"][1], 0.25, rtol=1e-6)
+    # impossible ages leave the rest of the prior
+    allowed = (grid.allowed * np.repeat(weights / 15.0, 4)).reshape(4, 5, 4).sum((1, 2)) / 16.0
+    assert_allclose(results.pdf["redshift"][1], allowed / allowed.sum(), rtol=1e-6)
+    n = 5 if limited else 6
+    sigma = results.sigma[1, :n]
+    evidence = -0.5 * n * flux**2 - np.log(np.sqrt(2.0 * np.pi) * sigma).sum()
+    # a measurement of nothing lies below a limit of one sigma in 84 % of cases
+    evidence += np.log(0.8413447460685429) if limited else 0.0
+    assert_allclose(results.log_evidence[1], evidence + np.log(allowed.sum()), rtol=1e-6)
+    drawn = fitter.sample(table, 50, seed=2)
+    assert drawn.fitted.all()
+
+
+def test_the_best_model_has_the_lowest_chi2_of_those_that_matter(
+    make_grid, draw_photometry, brute_force
+):
+    """Whatever its prior with ``rtol=0``; else none is left out that has weight."""
+    grid = make_grid(5, n_tau=8)
+    table, truth = draw_photometry(grid, 8, noise=0.3)
+    n_better = 0
+    for i, (_, g, *_) in enumerate(truth):
+        weights = np.ones(8)
+        weights[g // 4] = 1e-30
+        for rtol in (0.0, 1e-6):
+            fitter = BayesFitter(grid, priors={"tau": weights}, rtol=rtol)
+            results = fitter.fit(table[i : i + 1])
+            want = brute_force(fitter, results.flux[0], results.sigma[0])
+            if rtol == 0.0:
+                assert_allclose(results.chi2[0], want["chi2"], rtol=1e-9)
+                assert (
+                    results.best["tau"][0] == grid.galaxy_parameters["tau"][want["index"][1]].value
+                )
+                continue
+            assert results.chi2[0] >= want["chi2"] * (1.0 - 1e-9)
+            if results.chi2[0] > want["chi2"] * (1.0 + 1e-9):
+                n_better += 1
+                assert want["weights"][want["index"]] < 1e-7
+    # the case that the documentation speaks of does occur
+    assert n_better > 0
+
+
+def test_tables_of_any_kind_are_the_same_fit(grid, catalogue, tmp_path):
+    """Plain columns with units, other units, files, NaN that files mask."""
+    catalogue["band1"][2] = np.nan
+    want = BayesFitter(grid).fit(catalogue)
+    plain = Table(catalogue)
+    catalogue.write(tmp_path / "cat.fits")
+    catalogue.write(tmp_path / "cat.ecsv")
+    tables = [plain, Table(plain, masked=True)]
+    tables += [cls.read(tmp_path / f"cat.{x}") for cls in (Table, QTable) for x in ("fits", "ecsv")]
+    for table in tables:
+        got = BayesFitter(grid).fit(table)
+        assert_allclose(got.chi2, want.chi2, rtol=1e-12)
+        assert_array_equal(got.flags, want.flags)
+        assert_array_equal(got.n_bands, want.n_bands)
