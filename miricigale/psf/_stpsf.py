@@ -20,7 +20,12 @@ def _instrument(filter_name, opd):
         msg = "stpsf needs its data files: set the environment variable STPSF_PATH to their folder"
         raise DataError(msg)
     stpsf = require("stpsf", extra="stpsf")
-    instrument = stpsf.MIRI()
+    try:
+        instrument = stpsf.MIRI()
+    except (OSError, RuntimeError) as err:
+        # no folder, no version.txt, or data of another version than stpsf asks for
+        msg = f"stpsf cannot use the data of STPSF_PATH: {str(err).splitlines()[0]}"
+        raise DataError(msg) from err
     instrument.filter = str(filter_name).removeprefix("miri.").upper()
     if isinstance(opd, str) and opd == "perfect":
         instrument.pupilopd = None

@@ -247,7 +247,7 @@ def make_psf(
         pixel_scale=scale,
         oversampling=int(oversampling),
         frame=frame,
-        angle=float(to_array(angle, u.deg, "angle")) if frame == "sky" else 0.0,
+        angle=float(to_array(angle, u.deg, "angle", finite=True)) if frame == "sky" else 0.0,
         includes=list(includes),
         fwhm=half_maximum_width(data, x, y) * cell,
         enclosed=enclosed,

@@ -34,6 +34,14 @@ def _degrees(angle, argument):
     return float(to_array(angle, u.deg, argument, finite=True))
 
 
+def _positive(value, argument):
+    """An angle in arcsec that is finite and above 0."""
+    size = float(to_array(value, ANGLE, argument, ndim=0, finite=True))
+    if not size > 0:
+        raise argument_error(argument, "positive", value)
+    return size
+
+
 def _turn_by(info, angle, grid_angle, argument):
     """Counter-clockwise turn in deg that brings the PSF to the grid."""
     if info.frame == "sky":
@@ -185,10 +193,17 @@ def psf_image(psf, *, pixel_scale, shape, offset=(0.0, 0.0)):
     -------
     image : `~numpy.ndarray`, shape ``shape``
         Fraction of the light in each pixel; the sum is the encircled fraction.
+
+    Raises
+    ------
+    ValueError
+        If the pixel or the shape is not positive.
     """
     info = psf_info(psf)
-    scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
+    scale = _positive(pixel_scale, "pixel_scale")
     ny, nx = (shape, shape) if np.isscalar(shape) else shape
+    if min(ny, nx) < 1:
+        raise argument_error("shape", "at least one row and column", shape)
     x = (np.arange(nx) - (nx - 1) / 2 - offset[0]) * scale
     y = ((np.arange(ny) - (ny - 1) / 2 - offset[1]) * scale)[:, None]
     return _sample(info, x, y, 0.0) * (scale / info.pixel_scale) ** 2
@@ -238,7 +253,7 @@ def psf_mosaic(
     Raises
     ------
     ValueError
-        If ``pa`` is missing for a PSF in the detector frame.
+        If ``pa`` is missing for a PSF in the detector frame, or a size is not positive.
 
     References
     ----------
@@ -249,14 +264,16 @@ def psf_mosaic(
         raise argument_error("resampling", "'drizzle' or None", repr(resampling))
     if not 0 < pixfrac <= 1:
         raise argument_error("pixfrac", "above 0 and at most 1", pixfrac)
-    scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
+    scale = _positive(pixel_scale, "pixel_scale")
     grid = _degrees(grid_angle, "grid_angle")
     angles = [None] if pa is None else list(np.atleast_1d(pa))
     turns = [_turn_by(info, angle, grid, "pa") for angle in angles]
     if oversampling is None:
         oversampling = max(1, math.ceil(scale / info.cell - 1e-6))
+    if int(oversampling) != oversampling or oversampling < 1:
+        raise argument_error("oversampling", "a positive integer", oversampling)
     cell = scale / oversampling
-    width = 2 * info.half_width if fov is None else float(to_array(fov, ANGLE, "fov"))
+    width = 2 * info.half_width if fov is None else _positive(fov, "fov")
     n = 2 * round(0.5 * width / cell - 0.5) + 1
     if resampling == "drizzle":
         data = detector_response(

@@ -49,11 +49,28 @@ class CatalogFlags(Flags):
         return cls.BAD_RADIUS | cls.BAD_INDEX | cls.BAD_AXIS_RATIO | cls.BAD_ANGLE
 
 
+def unmasked(column):
+    """A column of numbers with NaN where it is masked, in either of astropy's two ways."""
+    if not hasattr(column, "mask"):
+        return column
+    if np.any(column.mask):
+        return (column if column.dtype.kind == "f" else column.astype(float)).filled(np.nan)
+    return column.unmasked if hasattr(column, "unmasked") else column.filled()
+
+
+def _refuse_missing(catalog, argument):
+    """No value of a column that says what a source is may be missing."""
+    for name in ("id", "profile"):
+        missing = np.asarray(getattr(catalog[name], "mask", False))
+        if np.any(missing):
+            row = int(np.argmax(missing))
+            wanted = f"a table without missing values in {name!r}"
+            raise argument_error(argument, wanted, f"{int(missing.sum())}, first in row {row}")
+        catalog[name] = unmasked(catalog[name])
+
+
 def _plain(table, name, unit, argument):
-    column = table[name]
-    if hasattr(column, "mask"):
-        filled = column.filled(np.nan) if np.any(column.mask) else column.filled()
-        column = getattr(filled, "unmasked", filled)
+    column = unmasked(table[name])
     try:
         if unit is not None:
             return u.Quantity(column, unit, dtype=float)
@@ -112,6 +129,7 @@ def check_catalog(table, *, filters=(), argument="catalog"):
         raise argument_error(
             argument, "a table with SkyCoord in 'sky'", type(catalog["sky"]).__name__
         )
+    _refuse_missing(catalog, argument)
     if not np.issubdtype(np.asarray(catalog["id"]).dtype, np.integer):
         raise argument_error(argument, "a table with integers in 'id'", catalog["id"].dtype)
     unique_ids(catalog["id"], argument)

@@ -14,6 +14,9 @@ from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, to_array
 
 __all__ = ["depth_to_rms", "highres_image"]
 
+#: Of the CANDELS wide fields in F160W.
+_DEPTH = 27.6 * u.ABmag
+
 
 def depth_to_rms(depth, *, pixel_area, aperture_radius=0.2 * u.arcsec, n_sigma=5):
     """
@@ -36,6 +39,11 @@ def depth_to_rms(depth, *, pixel_area, aperture_radius=0.2 * u.arcsec, n_sigma=5
     rms : `~numpy.ndarray` or float
         Standard deviation in MJy/sr of noise without correlation between pixels.
 
+    Raises
+    ------
+    ValueError
+        If the depth, the aperture or ``n_sigma`` is not positive.
+
     Examples
     --------
     >>> import astropy.units as u
@@ -46,9 +54,13 @@ def depth_to_rms(depth, *, pixel_area, aperture_radius=0.2 * u.arcsec, n_sigma=5
     """
     flux = depth.to(u.uJy) if getattr(depth, "unit", None) == u.ABmag else depth
     limit = float(to_array(flux, u.uJy, "depth", ndim=0, finite=True))
-    radius = float(to_array(aperture_radius, u.rad, "aperture_radius", ndim=0))
+    if not limit > 0:
+        raise argument_error("depth", "positive", depth)
+    radius = float(to_array(aperture_radius, u.rad, "aperture_radius", ndim=0, finite=True))
     if not radius > 0:
         raise argument_error("aperture_radius", "positive", aperture_radius)
+    if not (np.isfinite(n_sigma) and n_sigma > 0):
+        raise argument_error("n_sigma", "positive", n_sigma)
     pixel_area = np.asarray(pixel_area, dtype=float)
     n_pixels = math.pi * radius**2 / pixel_area
     return (1e-12 * limit / n_sigma / np.sqrt(n_pixels) / pixel_area)[()]
@@ -60,7 +72,7 @@ def highres_image(
     filter="wfc3.f160w",
     wcs,
     psf,
-    depth=27.6 * u.ABmag,
+    depth=None,
     aperture_radius=0.2 * u.arcsec,
     rms=None,
     seed=None,
@@ -74,8 +86,8 @@ def highres_image(
     catalog, filter, wcs, psf
         As of `~miricigale.scene.Scene`; the WCS is meant to be north-up with 0.06" pixels.
     depth : `~astropy.units.Quantity`, optional
-        5-sigma depth of a point-like aperture (see `depth_to_rms`). The default, 27.6 AB
-        in F160W, is that of the CANDELS wide fields.
+        5-sigma depth of a point-like aperture (see `depth_to_rms`). Without it and ``rms``
+        it is 27.6 AB, that of the CANDELS wide fields in F160W.
     aperture_radius : `~astropy.units.Quantity`, optional
         Aperture that the depth is for.
     rms : `~astropy.units.Quantity`, optional
@@ -93,12 +105,17 @@ def highres_image(
     Raises
     ------
     ValueError
-        If the map of the noise has another shape or a negative value.
+        If the map of the noise has another shape or a negative value, or a depth is given
+        besides it.
 
     References
     ----------
     Stefanon et al. 2017, ApJS 229, 32 (depth of the CANDELS/EGS F160W image).
     """
+    if rms is None:
+        depth = _DEPTH if depth is None else depth
+    elif depth is not None:
+        raise argument_error("rms", "left out where there is a depth", "both")
     scene = Scene(catalog, filter=filter, wcs=wcs, psf=psf, **options)
     image = scene.render()
     if rms is None:

@@ -2,23 +2,37 @@
 
 import dataclasses
 import math
-import os
 
 import numpy as np
 from photutils.psf import GriddedPSFModel, ImagePSF
-from scipy.fft import irfft2, next_fast_len, rfft2
-from scipy.ndimage import spline_filter
 
 from miricigale.profiles import sersic_enclosed_fraction, sersic_radius
 from miricigale.profiles.sersic import light_table, parameter_rows
-from miricigale.psf import grid_weights
 from miricigale.scene import _core
+from miricigale.scene.convolve import Places, convolve, phases
 from miricigale.utils.exceptions import argument_error
 
 __all__ = ["FieldPainter", "Painter"]
 
 #: Sersic sources with a half-light radius below this many nodes are points.
 _UNRESOLVED = 0.05
+
+
+def _check(painter, origin):
+    """Refuse a painter's settings; return its oversampling and the node of its centre."""
+    oversampling = np.broadcast_to(painter.psf.oversampling, 2)
+    if oversampling[0] != oversampling[1]:
+        raise argument_error("psf", "oversampled alike in x and y", oversampling.tolist())
+    origin = np.asarray(origin, dtype=float)
+    if np.any(np.abs(origin - np.round(origin)) > 1e-6):
+        raise argument_error("psf", "centred on a node (odd shape)", f"origin {origin.tolist()}")
+    if not 0 < painter.enclosed < 1:
+        raise argument_error("enclosed", "between 0 and 1", painter.enclosed)
+    if not painter.max_radius > 0:
+        raise argument_error("max_radius", "positive", painter.max_radius)
+    if painter.workers is not None and painter.workers < 1:
+        raise argument_error("workers", "at least 1", painter.workers)
+    return int(oversampling[0]), tuple(round(float(v)) for v in origin)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -52,39 +66,25 @@ class Painter:
     def __post_init__(self):
         if not isinstance(self.psf, ImagePSF):
             raise argument_error("psf", "a photutils ImagePSF", type(self.psf).__name__)
-        oversampling = np.broadcast_to(self.psf.oversampling, 2)
-        if oversampling[0] != oversampling[1]:
-            raise argument_error("psf", "oversampled alike in x and y", oversampling.tolist())
-        origin = np.asarray(self.psf.origin, dtype=float)
-        if np.any(np.abs(origin - np.round(origin)) > 1e-6):
-            raise argument_error(
-                "psf", "centred on a node (odd shape)", f"origin {origin.tolist()}"
-            )
-        if not 0 < self.enclosed < 1:
-            raise argument_error("enclosed", "between 0 and 1", self.enclosed)
-        if not self.max_radius > 0:
-            raise argument_error("max_radius", "positive", self.max_radius)
-        object.__setattr__(self, "_oversampling", int(oversampling[0]))
-        object.__setattr__(self, "_phases", self._make_phases())
+        self._prepare(np.asarray(self.psf.data)[None], self.psf.origin, [(0.0, 0.0)])
 
-    def _make_phases(self):
-        """Spline coefficients by sub-pixel phase, shape (os, os, 2 L + 1, 2 L + 1)."""
-        os_ = self._oversampling
-        data = np.asarray(self.psf.data, dtype=float)
-        cx, cy = (round(float(v)) for v in self.psf.origin)
-        # room for the splines to die out
-        reach = max(cx, cy, data.shape[1] - 1 - cx, data.shape[0] - 1 - cy) + 8
-        half = math.ceil((reach + os_) / os_)
-        size = half * os_ + os_ - 1
-        padded = np.zeros((2 * size + 1, 2 * size + 1))
-        padded[size - cy : size - cy + data.shape[0], size - cx : size - cx + data.shape[1]] = data
-        coefficients = spline_filter(padded, order=3, mode="mirror")
-        phases = np.empty((os_, os_, 2 * half + 1, 2 * half + 1))
-        steps = size + os_ * np.arange(-half, half + 1)
-        for a in range(os_):
-            for b in range(os_):
-                phases[a, b] = coefficients[np.ix_(steps - a, steps - b)]
-        return phases
+    def _prepare(self, data, origin, where):
+        """Keep the PSFs, their coefficients and their places x, y."""
+        oversampling, origin = _check(self, origin)
+        (x, k_x), (y, k_y) = (np.unique(v, return_inverse=True) for v in np.transpose(where))
+        order = np.zeros((y.size, x.size), dtype=np.int64)
+        order[k_y, k_x] = np.arange(len(where))
+        data = np.asarray(data, dtype=float)
+        own = {
+            "_oversampling": oversampling,
+            "_origin": origin,
+            "_data": data,
+            "_phases": np.stack([phases(one, origin, oversampling) for one in data]),
+            "_order": order,
+            "_places": (y, x),
+        }
+        for name, value in own.items():
+            object.__setattr__(self, name, value)
 
     @property
     def margin(self):
@@ -96,12 +96,34 @@ class Painter:
         """Fraction of a point's light within the PSF's array."""
         return float(np.sum(self.psf.data)) / self._oversampling**2
 
+    def _axes(self):
+        """Places of the PSFs along y and along x."""
+        return tuple(
+            Places(at, n_pixels=n, margin=self.margin, oversampling=self._oversampling)
+            for at, n in zip(self._places, self.shape, strict=True)
+        )
+
     def _landing(self):
-        """Cumulative sums of the coefficients, with a leading zero."""
-        phases = self._phases
-        sums = np.zeros((*phases.shape[:2], phases.shape[2] + 1, phases.shape[3] + 1))
-        sums[:, :, 1:, 1:] = phases.cumsum(axis=2).cumsum(axis=3)
-        return sums
+        """Which part of the light on each node lands on the image."""
+        shape = self._phases.shape
+        sums = np.zeros((*shape[:3], shape[3] + 1, shape[4] + 1))
+        sums[..., 1:, 1:] = self._phases.cumsum(axis=3).cumsum(axis=4)
+        (k_y, t_y), (k_x, t_x) = (axis.weights() for axis in self._axes())
+        low_y, high_y = self._ranges(self.shape[0])
+        low_x, high_x = self._ranges(self.shape[1])
+        return _core.Landing(
+            sums=sums,
+            low_y=low_y,
+            high_y=high_y,
+            low_x=low_x,
+            high_x=high_x,
+            oversampling=self._oversampling,
+            order=self._order,
+            k_y=k_y,
+            k_x=k_x,
+            t_y=t_y,
+            t_x=t_x,
+        )
 
     def _ranges(self, n):
         """For each node along an axis the range of the phase tables that lies on the image."""
@@ -141,9 +163,7 @@ class Painter:
         os_, margin = self._oversampling, self.margin
         ny, nx = self.shape
         grid = np.zeros(((ny + 2 * margin) * os_, (nx + 2 * margin) * os_), dtype=np.float32)
-        low_y, high_y = self._ranges(ny)
-        low_x, high_x = self._ranges(nx)
-        ranges = (self._landing(), low_y, high_y, low_x, high_x, os_)
+        land = self._landing()
         node_x, node_y = (np.asarray(x) + margin) * os_, (np.asarray(y) + margin) * os_
         in_image, kept = np.zeros(len(node_x)), np.ones(len(node_x))
         extended = np.asarray(is_sersic) & (np.asarray(r_eff) * os_ >= _UNRESOLVED)
@@ -164,23 +184,34 @@ class Painter:
             cut = np.minimum(radius * sersic_radius(self.enclosed, index), self.max_radius * os_)
             cut = np.maximum(cut, zone)
             w_zone, w_cut = (zone / radius) ** 2, (cut / radius) ** 2
-            landed = _core.deposit_outskirts(grid, rows, tables, w_zone, w_cut, *ranges)
-            landed += _core.deposit_cusps(grid, rows, tables, w_zone, *ranges)
+            w_smooth = _core.smooth_from(rows, w_zone, w_cut)
+            landed = _core.deposit_outskirts(grid, rows, tables, w_zone, w_smooth, w_cut, land)
+            landed += _core.deposit_cusps(grid, rows, tables, w_zone, land)
             in_image[extended] = landed
             kept[extended] = sersic_enclosed_fraction(cut / radius, index)
         points = ~extended
         for row, (dx, dy, share) in (images or {}).items():
             points[row] = False
             in_image[row] = self._add_image(
-                grid, node_x[row] + dx * os_, node_y[row] + dy * os_, flux[row] * share, ranges
+                grid, node_x[row] + dx * os_, node_y[row] + dy * os_, flux[row] * share, land
             )
         in_image[points] = _core.deposit_points(
-            grid, node_x[points], node_y[points], np.asarray(flux, float)[points], *ranges
+            grid, node_x[points], node_y[points], np.asarray(flux, float)[points], land
         )
-        return self._convolve(grid), in_image, kept
+        image = convolve(
+            grid,
+            self._data,
+            self._order,
+            *self._axes(),
+            origin=self._origin,
+            margin=margin,
+            oversampling=os_,
+            workers=self.workers,
+        )
+        return image, in_image, kept
 
     @staticmethod
-    def _add_image(grid, x, y, light, ranges):
+    def _add_image(grid, x, y, light, land):
         """Put many pieces of one source on the grid; return how much lands on the image."""
         (x0, x1), (y0, y1) = (
             (max(0, math.floor(v.min()) - 2), min(n, math.floor(v.max()) + 4))
@@ -188,46 +219,20 @@ class Painter:
         )
         if x1 <= x0 or y1 <= y0:
             return 0.0
-        sums, low_y, high_y, low_x, high_x, os_ = ranges
-        # the tables go by the node's phase: begin on a whole pixel
-        x0, y0 = x0 - x0 % os_, y0 - y0 % os_
         # in double precision: single would lose the light of many pieces on a node
         part = np.zeros((y1 - y0, x1 - x0))
-        cuts = (low_y[y0:y1], high_y[y0:y1], low_x[x0:x1], high_x[x0:x1])
         _core.deposit_pieces(part, x - x0, y - y0, light)
-        grid[y0:y1, x0:x1] += part
-        return _core.landed_light(part, sums, *cuts, os_)
-
-    def _convolve(self, grid):
-        """Convolve with the coefficients and keep one node for each pixel of the image."""
-        os_, margin = self._oversampling, self.margin
-        ny, nx = self.shape
-        size = tuple(next_fast_len(n + 2 * margin, real=True) for n in (ny, nx))
-        workers = self.workers or os.cpu_count() or 1
-        taps = np.arange(-margin, margin + 1)
-        total = 0.0
-        for a in range(os_):
-            for b in range(os_):
-                part = grid[a::os_, b::os_].astype(float)
-                if not part.any():
-                    continue
-                kernel = np.zeros(size)
-                kernel[np.ix_(taps % size[0], taps % size[1])] = self._phases[a, b]
-                total = total + rfft2(part, size, workers=workers) * rfft2(kernel, workers=workers)
-        if np.isscalar(total):
-            return np.zeros(self.shape)
-        image = irfft2(total, size, workers=workers)
-        return image[margin : margin + ny, margin : margin + nx].copy()
+        return _core.add_part(grid, part, y0, x0, land)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class FieldPainter:
+class FieldPainter(Painter):
     """
     Paints sources through a PSF that varies over the field.
 
-    The PSF of a source is bilinear between those of the grid, as in photutils: each PSF of
-    the grid paints the sources near to it with their weights. An extended source has the PSF
-    of its centre.
+    Light has the PSF of its own place, bilinear between those of the grid as in photutils and
+    constant beyond it; an extended source is blurred by another PSF on its one side than on the
+    other. All sources are painted and convolved once, whatever the number of PSFs.
 
     Parameters
     ----------
@@ -237,55 +242,17 @@ class FieldPainter:
         PSFs with the pixel response in them, at positions on the image.
     """
 
-    shape: tuple
     psf: GriddedPSFModel
-    enclosed: float = 0.995
-    max_radius: float = math.inf
-    workers: int | None = None
 
     def __post_init__(self):
         if not isinstance(self.psf, GriddedPSFModel):
             raise argument_error("psf", "a photutils GriddedPSFModel", type(self.psf).__name__)
-
-    def _painter(self, k):
-        psf = ImagePSF(self.psf.data[k], oversampling=self.psf.oversampling)
-        return Painter(
-            self.shape,
-            psf,
-            enclosed=self.enclosed,
-            max_radius=self.max_radius,
-            workers=self.workers,
-        )
+        data = np.asarray(self.psf.data)
+        origin = ((data.shape[2] - 1) / 2, (data.shape[1] - 1) / 2)
+        self._prepare(data, origin, np.asarray(self.psf.grid_xypos, dtype=float))
 
     @property
     def enclosed_by_psf(self):
         """Least fraction of a point's light within the array of a PSF."""
         sums = np.asarray(self.psf.data).sum(axis=(1, 2))
-        return float(sums.min() / np.prod(self.psf.oversampling))
-
-    def paint(self, *, x, y, flux, images=None, **profile):
-        """
-        Paint the sources; see `Painter.paint`.
-
-        Returns
-        -------
-        image, in_image, kept : `~numpy.ndarray`
-        """
-        weights = grid_weights(self.psf, x, y)
-        total, in_image, kept = np.zeros(self.shape), np.zeros(len(x)), np.ones(len(x))
-        for k in range(weights.shape[1]):
-            use = weights[:, k] > 0
-            if not np.any(use):
-                continue
-            row = np.cumsum(use) - 1
-            mine = {row[i]: value for i, value in (images or {}).items() if use[i]}
-            part, landed, kept[use] = self._painter(k).paint(
-                x=x[use],
-                y=y[use],
-                flux=(flux * weights[:, k])[use],
-                images=mine,
-                **{name: value[use] for name, value in profile.items()},
-            )
-            total += part
-            in_image[use] += landed
-        return total, in_image, kept
+        return float(sums.min()) / self._oversampling**2

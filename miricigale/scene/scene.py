@@ -12,7 +12,7 @@ from photutils.psf import GriddedPSFModel
 from miricigale.instrument import aperture, pixel_area_map
 from miricigale.profiles import ellipse_to_pixels
 from miricigale.scene.background import Background
-from miricigale.scene.catalog import CatalogFlags, check_catalog, read_catalog
+from miricigale.scene.catalog import CatalogFlags, check_catalog, read_catalog, unmasked
 from miricigale.scene.cutouts import Cutout
 from miricigale.scene.render import FieldPainter, Painter
 from miricigale.scene.sky import local_jacobian, pixel_positions
@@ -113,6 +113,8 @@ class Scene:
         scale = self._pixel_scale()
         self._check_psf(psf, scale)
         radius = float(to_array(max_radius, ANGLE, "max_radius", ndim=0))
+        if not radius > 0:
+            raise argument_error("max_radius", "positive", max_radius)
         painter = FieldPainter if isinstance(psf, GriddedPSFModel) else Painter
         self._painter = painter(
             self._shape, psf, enclosed=enclosed, max_radius=radius / scale, workers=workers
@@ -172,8 +174,7 @@ class Scene:
             return flux, np.zeros(len(flux))
         if agn not in self._catalog.colnames:
             raise argument_error("agn", f"a column of {self._catalog.colnames}", repr(agn))
-        column = self._catalog[agn]
-        column = column.filled(np.nan) if hasattr(column, "filled") else column
+        column = unmasked(self._catalog[agn])
         unit = getattr(column, "unit", None)
         if unit is None or unit == u.one:
             share = np.nan_to_num(np.asarray(column, dtype=float), nan=0.0, posinf=2.0)
@@ -304,6 +305,13 @@ class Scene:
             },
             meta=provenance(filter=self._filter),
         )
+        filled = {
+            int(catalog["id"][row]): stamp.n_filled
+            for row, stamp in self._cutouts.items()
+            if stamp.n_filled
+        }
+        if filled:
+            truth.meta["cutout_pixels_filled"] = filled
         truth["flux_total"].info.description = "light to infinity, the AGN's included"
         truth["flux_agn"].info.description = "light of the point at the centre"
         truth[
@@ -319,6 +327,7 @@ class Scene:
 
         A `~astropy.table.QTable` with ``id``, ``sky``, ``x``, ``y`` (pixels), ``profile`` as
         painted, ``flux_total``, ``flux_agn`` (of it), ``flux_in_image`` and ``flags`` (`SceneFlags`).
+        Its meta has ``cutout_pixels_filled``, by id, where stamps have pixels that were filled in.
         """
         return self._painted[1].copy()
 

@@ -283,3 +283,20 @@ def test_reads_any_fits_image(tmp_path):
         read_psf(path, **kind)
     with pytest.raises(ValueError, match="'data' must be normalised to 16"):
         read_psf(path, ext=1, plane=1, **kind)
+
+
+def test_sizes_that_make_no_grid_are_named():
+    psf = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=3 * u.arcsec)
+    with pytest.raises(ValueError, match=r"'pixel_scale' must be positive, got -0\.06 arcsec"):
+        psf_image(psf, pixel_scale=-0.06 * u.arcsec, shape=11)
+    with pytest.raises(ValueError, match="'shape' must be at least one row and column, got 0"):
+        psf_image(psf, pixel_scale=0.06 * u.arcsec, shape=0)
+    kind = {"pa": 3 * u.deg} if psf.meta["frame"] == "detector" else {}
+    with pytest.raises(ValueError, match="'pixel_scale' must be positive"):
+        psf_mosaic(psf, 0 * u.arcsec, **kind)
+    with pytest.raises(ValueError, match="'oversampling' must be a positive integer, got 0"):
+        psf_mosaic(psf, 0.06 * u.arcsec, oversampling=0, **kind)
+    with pytest.raises(ValueError, match="'fov' must be positive"):
+        psf_mosaic(psf, 0.06 * u.arcsec, fov=-2 * u.arcsec, **kind)
+    with pytest.raises(ValueError, match="'angle' must be finite"):
+        make_psf(np.ones((5, 5)) / 25, pixel_scale=1 * u.arcsec, frame="sky", angle=np.nan * u.deg)

@@ -1,4 +1,5 @@
 import os
+from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -6,6 +7,27 @@ import pytest
 
 from miricigale.psf import encircled_energy, miri_psf, psf_at, stpsf_grid, stpsf_psf
 from miricigale.utils.exceptions import DataError
+
+
+@pytest.fixture
+def data(tmp_path, monkeypatch):
+    """
+    The data of STPSF_PATH.
+
+    Those of an older version without wavefronts do for perfect optics: stpsf asks for a
+    version and for the name of a wavefront, and reads none.
+    """
+    source = Path(os.environ["STPSF_PATH"])
+    if any((source / "MIRI" / "OPD").glob("OPD*.fits*")):
+        return
+    (tmp_path / "MIRI" / "OPD").mkdir(parents=True)
+    for folder in (source, source / "MIRI", source / "MIRI" / "OPD"):
+        for item in folder.iterdir():
+            if item.name not in ("MIRI", "OPD", "version.txt"):
+                (tmp_path / item.relative_to(source)).symlink_to(item)
+    (tmp_path / "version.txt").write_text("2.1.0\n")
+    (tmp_path / "MIRI" / "OPD" / "OPD_RevW_ote_for_MIRI_predicted.fits.gz").touch()
+    monkeypatch.setenv("STPSF_PATH", str(tmp_path))
 
 
 def test_says_what_is_missing(monkeypatch):
@@ -25,8 +47,25 @@ def test_names_the_package_that_is_missing(monkeypatch):
         stpsf_psf("miri.f770w")
 
 
+def test_says_why_the_data_do_not_do(monkeypatch):
+    import sys
+    import types
+
+    def refuse():
+        msg = "STPSF data package has version 1.5.0, but 2.1.0 is needed.\nSee ..."
+        raise OSError(msg)
+
+    monkeypatch.setenv("STPSF_PATH", "/nowhere")
+    monkeypatch.setitem(sys.modules, "stpsf", types.SimpleNamespace(MIRI=refuse))
+    with pytest.raises(
+        DataError, match=r"cannot use the data of STPSF_PATH: .* 2\.1\.0 is needed\.$"
+    ):
+        stpsf_psf("miri.f770w")
+
+
 @pytest.mark.skipif("STPSF_PATH" not in os.environ, reason="needs STPSF_PATH and stpsf")
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.usefixtures("data")
 @pytest.mark.parametrize("name", ["miri.f1000w", "miri.f2100w"])
 def test_ours_is_like_stpsf(name):
     pytest.importorskip("stpsf")
@@ -51,6 +90,7 @@ def test_ours_is_like_stpsf(name):
 @pytest.mark.slow
 @pytest.mark.skipif("STPSF_PATH" not in os.environ, reason="needs STPSF_PATH and stpsf")
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.usefixtures("data")
 def test_corners_of_the_array_are_like_stpsf():
     """Distortion and the lean of the cruciform: far nearer to stpsf than one PSF for all."""
     pytest.importorskip("stpsf")

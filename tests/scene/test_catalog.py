@@ -2,7 +2,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
-from astropy.table import QTable
+from astropy.table import MaskedColumn, QTable, Table
 
 from miricigale.scene import CatalogFlags, check_catalog, read_catalog
 from miricigale.utils.exceptions import DataError
@@ -181,4 +181,20 @@ def test_stars_are_told_or_there_are_none(table):
     assert check_catalog(table)["star"].tolist() == [False, True]
     table["star"] = [0, 1]
     with pytest.raises(ValueError, match="True or False in 'star', got int64"):
+        check_catalog(table)
+
+
+@pytest.mark.parametrize("kind", [Table, QTable])
+def test_masked_values_are_missing_in_either_of_astropys_ways(table, kind):
+    table["profile"] = ["sersic", "sersic"]
+    table["half_light_radius"], table["sersic_index"] = [0.3, 0.2] * u.arcsec, [1.0, 4.0]
+    table = kind(table, masked=True)
+    table["sersic_index"].mask = table["miri.f770w"].mask = [True, False]
+    catalog = check_catalog(table, filters=["miri.f770w"])
+    assert catalog["flags"].tolist() == [CatalogFlags.BAD_INDEX, 0]
+    assert np.isnan(catalog["miri.f770w"].value).tolist() == [True, False]
+    assert catalog["sersic_index"][1] == 4
+    assert not any(hasattr(catalog[name], "mask") for name in ("id", "profile", "axis_ratio"))
+    table["id"] = MaskedColumn([1, 2], mask=[False, True])
+    with pytest.raises(ValueError, match="without missing values in 'id', got 1, first in row 1"):
         check_catalog(table)

@@ -116,7 +116,8 @@ def test_stamp_of_an_image_stands_as_the_image_does(psf, parity):
     data[0, 0] = np.nan
     image = CCDData(data, unit="adu", wcs=own, mask=(x == 2) & (y == 2))
     sky = own.pixel_to_world(35, 30)
-    stamp = Cutout.from_image(image, sky)
+    stamp = Cutout.from_image(image, sky, fill=0)
+    assert stamp.n_filled == 2
     assert stamp.pixel_scale.to_value(u.arcsec) == pytest.approx(0.05, rel=1e-6)
     wcs = tools.tan_wcs(pa=20.0)
     catalog = one(wcs, 50, 45)
@@ -130,6 +131,27 @@ def test_stamp_of_an_image_stands_as_the_image_does(psf, parity):
     # in a window of its own: the principal source is 11 pixels away
     assert np.sum(blob * xx) / blob.sum() == pytest.approx(cx, abs=0.05)
     assert np.sum(blob * yy) / blob.sum() == pytest.approx(cy, abs=0.05)
+
+
+def test_pixels_without_a_measurement_are_an_error_or_counted(wcs, psf):
+    own = tools.tan_wcs((7, 9), scale=0.1)
+    data, mask = np.ones((7, 9)), np.zeros((7, 9), dtype=bool)
+    data[2, 3], data[4, 4] = np.nan, -np.inf
+    mask[2, 3] = mask[6, 0] = True
+    image = CCDData(data, unit="MJy / sr", wcs=own, mask=mask)
+    with pytest.raises(ValueError, match=r"'image' must be without masked .* got 3 of 63 pixels"):
+        Cutout.from_image(image)
+    with pytest.raises(ValueError, match="'fill' must be finite, got nan"):
+        Cutout.from_image(image, fill=np.nan)
+    with pytest.raises(u.UnitsError, match="'fill' must be convertible to MJy"):
+        Cutout.from_image(image, fill=1 * u.s)
+    stamp = Cutout.from_image(image, fill=2000 * u.kJy / u.sr)
+    assert stamp.data.sum() == pytest.approx(60 + 3 * 2)
+    assert "3 pixels filled" in repr(stamp)
+    scene = Scene(one(wcs, 50, 45), filter=FILTER, wcs=wcs, psf=psf, cutouts={1: stamp})
+    assert scene.truth.meta["cutout_pixels_filled"] == {1: 3}
+    whole = CCDData(np.ones((7, 9)), unit="adu", wcs=own)
+    assert Cutout.from_image(whole, fill=0).n_filled == 0
 
 
 def test_distortion_stretches_the_stamp(psf):

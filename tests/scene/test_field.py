@@ -12,7 +12,7 @@ from photutils.psf import GriddedPSFModel
 
 from miricigale.instrument import aperture, imager_wcs, pixel_area_map
 from miricigale.psf import miri_psf_grid
-from miricigale.scene import Scene
+from miricigale.scene import Cutout, Scene
 
 _spec = importlib.util.spec_from_file_location("scene_tools", Path(__file__).parent / "conftest.py")
 tools = importlib.util.module_from_spec(_spec)
@@ -62,6 +62,66 @@ def test_galaxies_widen_by_the_local_psf(wcs, grid):
     own = (0.4 / 0.11) ** 2 / (2 * np.log(2))
     mixture = np.dot(weights, np.square([0.8, 1.0, 1.2, 1.6]))
     np.testing.assert_allclose(variance, own + mixture + 1 / 12, rtol=3e-3)
+
+
+def test_many_places_and_the_lines_between_them(wcs):
+    """On both sides of an inner row and column of PSFs, on them, and beyond the last ones."""
+    places = [(x, y) for y in (10, 41.3, 80) for x in (15.2, 49.5, 70, 95)]
+    data = np.stack([tools.gaussian_psf(0.9 + 0.05 * (k % 5)).data for k in range(12)])
+    grid = GriddedPSFModel(NDData(data, meta={"grid_xypos": places, "oversampling": 4}))
+    x = [49.3, 49.5, 49.9, 30.0, 97.0, 5.0, 82.1]
+    y = [41.1, 60.0, 41.3, 41.5, 5.0, 70.2, 84.9]
+    flux = np.arange(10.0, 80.0, 10.0)
+    scene = Scene(tools.make_catalog(wcs, x, y, flux=flux), filter=FILTER, wcs=wcs, psf=grid)
+    yy, xx = np.mgrid[:90, :100]
+    expected = sum(grid.evaluate(xx, yy, f, a, b) for f, a, b in zip(flux, x, y, strict=True))
+    image = light(scene)
+    # on a line the splines' width of a node rounds off the bend of the weights
+    np.testing.assert_allclose(image, expected, atol=6e-4 * expected.max())
+    off = np.hypot(xx - 49.9, yy - 41.3) > 12
+    off &= np.hypot(xx - 49.5, yy - 60.0) > 12
+    np.testing.assert_allclose(image[off], expected[off], atol=5e-5 * expected.max())
+    assert scene.truth["flux_in_image"].value.sum() == pytest.approx(image.sum(), rel=1e-6)
+
+
+def test_alike_psfs_are_one_psf(wcs, psf):
+    """Points, galaxies and stamps of images, some over the edge."""
+    grid = GriddedPSFModel(
+        NDData(np.stack([psf.data] * 4), meta={"grid_xypos": CORNERS, "oversampling": 4})
+    )
+    catalog = tools.make_catalog(
+        wcs,
+        [20.3, 99.2, 50.0, 3.0],
+        [15.2, 44.5, 70.9, 88.0],
+        profile=["point", "sersic", "cutout", "sersic"],
+        radius=[0, 0.8, 0, 0.2],
+        index=4.0,
+    )
+    stamps = {3: Cutout(np.ones((7, 9)), pixel_scale=0.08 * u.arcsec)}
+    kind = {"filter": FILTER, "wcs": wcs, "cutouts": stamps}
+    one, many = Scene(catalog, psf=psf, **kind), Scene(catalog, psf=grid, **kind)
+    np.testing.assert_allclose(light(many), light(one), atol=1e-9 * light(one).max())
+    np.testing.assert_allclose(
+        many.truth["flux_in_image"].value, one.truth["flux_in_image"].value, rtol=1e-9
+    )
+
+
+def test_each_part_of_a_galaxy_has_the_psf_of_its_own_place(wcs, grid):
+    """A stamp with three lit pixels, far apart, is three points."""
+    stamp = np.zeros((301, 601))
+    lit, shares = [(150, 20), (40, 300), (260, 590)], [0.5, 0.3, 0.2]
+    for place, share in zip(lit, shares, strict=True):
+        stamp[place] = share
+    kind = {"filter": FILTER, "wcs": wcs, "psf": grid}
+    catalog = tools.make_catalog(wcs, 50.0, 45.0, profile="cutout")
+    stamps = {1: Cutout(stamp, pixel_scale=0.01 * u.arcsec)}
+    image = light(Scene(catalog, cutouts=stamps, **kind))
+    yy, xx = np.mgrid[:90, :100]
+    expected = 0
+    for (row, column), share in zip(lit, shares, strict=True):
+        place = 50 + (column - 300) / 11, 45 + (row - 150) / 11
+        expected = expected + grid.evaluate(xx, yy, 10 * share, *place)
+    np.testing.assert_allclose(image, expected, atol=1e-3 * expected.max())
 
 
 def test_the_imagers_psfs_belong_to_their_subarray():

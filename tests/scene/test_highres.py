@@ -5,6 +5,8 @@ import astropy.units as u
 import numpy as np
 import pytest
 
+from miricigale.instrument import north_up_wcs
+from miricigale.psf import encircled_energy, hst_psf
 from miricigale.scene import Scene, depth_to_rms, highres_image
 
 _spec = importlib.util.spec_from_file_location("scene_tools", Path(__file__).parent / "conftest.py")
@@ -77,3 +79,34 @@ def test_refuses(fine, psf, catalog):
         highres_image(catalog, rms=np.ones((3, 3)) * u.MJy / u.sr, **kwargs)
     with pytest.raises(u.UnitsError, match="'depth' must be a quantity convertible to uJy"):
         highres_image(catalog, depth=27.0, **kwargs)
+    with pytest.raises(ValueError, match="'rms' must be left out where there is a depth, got both"):
+        highres_image(catalog, depth=27 * u.ABmag, rms=0.01 * u.MJy / u.sr, **kwargs)
+    with pytest.raises(ValueError, match="'depth' must be positive"):
+        highres_image(catalog, depth=-1 * u.uJy, **kwargs)
+    with pytest.raises(ValueError, match="'n_sigma' must be positive, got 0"):
+        depth_to_rms(1 * u.uJy, pixel_area=1e-13, n_sigma=0)
+
+
+def test_f160w_mosaic_through_its_psf_with_a_map_of_the_noise():
+    """The bundled F160W PSF on a north-up grid of 0.06 arcsec: a star's light, width and noise."""
+    wcs = north_up_wcs(tools.CENTER, 0.06 * u.arcsec, (201, 221))
+    catalog = tools.make_catalog(wcs, [110.0], [100.0], flux=[100.0])
+    catalog.rename_column(FILTER, "wfc3.f160w")
+    y, x = np.mgrid[:201, :221]
+    rms = np.where(x < 110, 0.002, 0.004) * u.MJy / u.sr
+    psf = hst_psf()
+    image = highres_image(catalog, wcs=wcs, psf=psf, rms=rms, seed=3)
+    area = (0.06 * u.arcsec).to_value(u.rad) ** 2 * 1e12
+    r = np.hypot(x - 110, y - 100) * 0.06
+    radii = [0.3, 0.6, 1.2]
+    light = [np.sum(image.data[r < limit]) * area / 100 for limit in radii]
+    # whole pixels in the place of circles
+    energy = encircled_energy(
+        psf, [np.sqrt(np.sum(r < limit) / np.pi) * 0.06 for limit in radii] * u.arcsec
+    )
+    np.testing.assert_allclose(light, energy, atol=0.01)
+    far = r > 5
+    assert np.std(image.data[far & (x < 110)]) == pytest.approx(0.002, rel=0.03)
+    assert np.std(image.data[far & (x > 110)]) == pytest.approx(0.004, rel=0.03)
+    np.testing.assert_array_equal(image.uncertainty.array, rms.value)
+    assert image.meta["psf_includes"] == psf.meta["includes"]

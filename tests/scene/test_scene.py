@@ -251,6 +251,10 @@ def test_refuses(wcs, psf):
     with pytest.raises(u.UnitsError, match=r"'miri\.f770w' must be convertible to uJy, got mag"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=psf)
     catalog = tools.make_catalog(wcs, 50, 45)
+    with pytest.raises(ValueError, match="'workers' must be at least 1, got 0"):
+        Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, workers=0)
+    with pytest.raises(ValueError, match=r"'max_radius' must be positive, got -1\.0 arcsec"):
+        Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, max_radius=-1 * u.arcsec)
     even = ImagePSF(np.ones((8, 8)), oversampling=4)
     with pytest.raises(ValueError, match="'psf' must be centred on a node"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=even)

@@ -1,0 +1,233 @@
+"""
+The convolution of a grid of light with the PSFs of a field, tile by tile.
+
+Between four PSFs of a rectangular grid the PSF of a place is bilinear, a polynomial in the place
+of the light. Written in the place of the pixel and the offset between the two, it is a sum of
+four images, each the same light convolved with a kernel and multiplied by 1, x, y or xy of the
+pixel: one forward transform of the light serves all four.
+"""
+
+import itertools
+import math
+import os
+
+import numpy as np
+from scipy.fft import fft, irfft2, next_fast_len, rfft
+from scipy.ndimage import spline_filter
+
+__all__ = ["Places", "convolve", "phases"]
+
+
+class Places:
+    """
+    Places of PSFs along one axis of the image: linear between them, constant beyond.
+
+    Parameters
+    ----------
+    at : array_like, shape (n,)
+        Sorted places in pixels.
+    n_pixels, margin : int
+        Pixels of the image, and those painted beyond each edge.
+    oversampling : int
+        Nodes per pixel.
+    """
+
+    def __init__(self, at, *, n_pixels, margin, oversampling):
+        self._at = np.asarray(at, dtype=float)
+        self._margin, self._oversampling = margin, oversampling
+        self.n_pixels = n_pixels
+        self._n_nodes = (n_pixels + 2 * margin) * oversampling
+
+    def weights(self):
+        """For each node the place below it, and the weight of the next one."""
+        if self._at.size == 1:
+            return np.zeros(self._n_nodes, dtype=np.int64), np.zeros(self._n_nodes)
+        node = np.arange(self._n_nodes) / self._oversampling - self._margin
+        below = np.clip(np.searchsorted(self._at, node, "right") - 1, 0, self._at.size - 2)
+        part = (node - self._at[below]) / np.diff(self._at)[below]
+        return below.astype(np.int64), np.clip(part, 0.0, 1.0)
+
+    def tiles(self):
+        """
+        Stretches of nodes over which the weights are linear.
+
+        Yields
+        ------
+        first, stop : int
+            Nodes.
+        below : int
+            The place below.
+        origin, length : float
+            Its pixel and the distance of the next place; the length is infinite where the
+            weights are constant.
+        """
+        edges = np.ceil((self._at + self._margin) * self._oversampling - 1e-9)
+        edges = np.clip(np.append(np.append(0, edges), self._n_nodes), 0, self._n_nodes).astype(int)
+        if self._at.size == 1:
+            edges = [0, self._n_nodes]
+        for k, (first, stop) in enumerate(itertools.pairwise(edges)):
+            if stop <= first:
+                continue
+            if k in (0, self._at.size):
+                yield first, stop, max(k - 1, 0), 0.0, np.inf
+            else:
+                yield first, stop, k - 1, self._at[k - 1], self._at[k] - self._at[k - 1]
+
+
+def _window(first, stop, n_pixels, margin, oversampling):
+    """Pixels of a tile and of the image that it reaches, and the length of the transform."""
+    start, end = first // oversampling, -(-stop // oversampling)
+    low, high = max(start - margin, margin), min(end + margin, margin + n_pixels)
+    # what wraps round stays off the wanted pixels
+    size = max(high - start + margin, end - low + margin, end - start)
+    return start, end, low, high, next_fast_len(size, real=True)
+
+
+def _spectrum(part, size, workers):
+    """Half of the transform of an image padded with zeros, without work on empty rows."""
+    rows = rfft(part, size[1], axis=1, workers=workers)
+    return fft(rows, size[0], axis=0, workers=workers, overwrite_x=True)
+
+
+def _kernel_spectrum(kernel, size, workers):
+    """The same for a kernel whose middle is the origin."""
+    half = kernel.shape[0] // 2
+    taps = np.arange(-half, half + 1)
+    wrapped = np.zeros((kernel.shape[0], size[1]))
+    wrapped[:, taps % size[1]] = kernel
+    rows = np.zeros((size[0], size[1] // 2 + 1), dtype=complex)
+    rows[taps % size[0]] = rfft(wrapped, axis=1, workers=workers)
+    return fft(rows, axis=0, workers=workers, overwrite_x=True)
+
+
+def phases(data, origin, oversampling):
+    """
+    Cubic spline coefficients of a PSF by sub-pixel phase.
+
+    Parameters
+    ----------
+    data : `~numpy.ndarray`, shape (ny, nx)
+        Values on the nodes.
+    origin : tuple of int
+        The node x, y that is its centre.
+    oversampling : int
+        Nodes per pixel.
+
+    Returns
+    -------
+    phases : `~numpy.ndarray`, shape (oversampling, oversampling, 2 L + 1, 2 L + 1)
+        Coefficients at the offsets of whole pixels less ``a`` and ``b`` nodes in y and x.
+    """
+    os_, (cx, cy) = oversampling, origin
+    # room for the splines to die out
+    reach = max(cx, cy, data.shape[1] - 1 - cx, data.shape[0] - 1 - cy) + 8
+    half = math.ceil((reach + os_) / os_)
+    size = half * os_ + os_ - 1
+    padded = np.zeros((2 * size + 1, 2 * size + 1))
+    padded[size - cy : size - cy + data.shape[0], size - cx : size - cx + data.shape[1]] = data
+    coefficients = spline_filter(padded, order=3, mode="mirror")
+    result = np.empty((os_, os_, 2 * half + 1, 2 * half + 1))
+    steps = size + os_ * np.arange(-half, half + 1)
+    for a in range(os_):
+        for b in range(os_):
+            result[a, b] = coefficients[np.ix_(steps - a, steps - b)]
+    return result
+
+
+def _kernels(data, origin, oversampling, order, y, x):
+    """Phases of the kernels of 1, x, y and xy of the pixel, as far as they are not zero."""
+    (k_y, length_y), (k_x, length_x) = y, x
+    one = data[order[k_y, k_x]]
+    # the splines' coefficients are those of the PSF times the offset: not the offset times them
+    u = (np.arange(one.shape[1]) - origin[0]) / oversampling / length_x
+    v = ((np.arange(one.shape[0]) - origin[1]) / oversampling / length_y)[:, None]
+    kernels = {(0, 0): one}
+    if np.isfinite(length_x):
+        kernels[0, 1] = data[order[k_y, k_x + 1]] - one
+        kernels[0, 0] = one - u * kernels[0, 1]
+    if np.isfinite(length_y):
+        kernels[1, 0] = data[order[k_y + 1, k_x]] - one
+        kernels[0, 0] = kernels[0, 0] - v * kernels[1, 0]
+    if len(kernels) == 3:
+        both = data[order[k_y + 1, k_x + 1]] - one - kernels[0, 1] - kernels[1, 0]
+        kernels[1, 1] = both
+        kernels[0, 0] = kernels[0, 0] + u * v * both
+        kernels[0, 1] = kernels[0, 1] - v * both
+        kernels[1, 0] = kernels[1, 0] - u * both
+    return {power: phases(kernel, origin, oversampling) for power, kernel in kernels.items()}
+
+
+def convolve(grid, data, order, rows, columns, *, origin, margin, oversampling, workers=None):
+    """
+    Convolve the light on the nodes with the local coefficients; keep one node for each pixel.
+
+    Parameters
+    ----------
+    grid : `~numpy.ndarray`, shape ((ny + 2 margin) os, (nx + 2 margin) os)
+        Light on the nodes.
+    data : `~numpy.ndarray`, shape (n_psfs, n, m)
+        The PSFs on their nodes; their phases reach at most ``margin`` pixels.
+    order : `~numpy.ndarray` of int, shape (n_y, n_x)
+        The PSFs on their rectangular grid.
+    rows, columns : `Places`
+        Where the grid's rows and columns stand.
+    origin : tuple of int
+        The node x, y of each PSF that is its centre.
+    margin : int
+        Pixels beyond each edge.
+    oversampling : int
+        Nodes per pixel.
+    workers : int, optional
+        Threads of the Fourier transforms; all processors if not given.
+
+    Returns
+    -------
+    image : `~numpy.ndarray`, shape (ny, nx)
+        Light in each pixel.
+    """
+    os_ = oversampling
+    workers = workers or os.cpu_count() or 1
+    image = np.zeros((rows.n_pixels, columns.n_pixels))
+    for y_first, y_stop, k_y, y_0, length_y in rows.tiles():
+        y0, y1, low_y, high_y, size_y = _window(y_first, y_stop, rows.n_pixels, margin, os_)
+        for x_first, x_stop, k_x, x_0, length_x in columns.tiles():
+            x0, x1, low_x, high_x, size_x = _window(x_first, x_stop, columns.n_pixels, margin, os_)
+            if high_y <= low_y or high_x <= low_x:
+                continue
+            light = own = grid[y_first:y_stop, x_first:x_stop]
+            if not own.any():
+                continue
+            full = (y1 - y0) * os_, (x1 - x0) * os_
+            if own.shape != full:
+                # the tile begins or ends within a pixel
+                light = np.zeros(full, dtype=grid.dtype)
+                i, j = y_first - y0 * os_, x_first - x0 * os_
+                light[i : i + own.shape[0], j : j + own.shape[1]] = own
+            kernels = _kernels(data, origin, os_, order, (k_y, length_y), (k_x, length_x))
+            size = (size_y, size_x)
+            totals = {}
+            for a in range(os_):
+                for b in range(os_):
+                    part = light[a::os_, b::os_]
+                    if not part.any():
+                        continue
+                    spectrum = _spectrum(part.astype(float), size, workers)
+                    for power, kernel in kernels.items():
+                        product = _kernel_spectrum(kernel[a, b], size, workers)
+                        product *= spectrum
+                        if power in totals:
+                            totals[power] += product
+                        else:
+                            totals[power] = product
+            y = np.arange(low_y - margin, high_y - margin)
+            x = np.arange(low_x - margin, high_x - margin)
+            taken = np.ix_((y + margin - y0) % size_y, (x + margin - x0) % size_x)
+            target = image[y[0] : y[-1] + 1, x[0] : x[-1] + 1]
+            for (in_y, in_x), total in totals.items():
+                piece = irfft2(total, size, workers=workers)[taken]
+                if in_y:
+                    piece *= ((y - y_0) / length_y)[:, None]
+                if in_x:
+                    piece *= (x - x_0) / length_x
+                target += piece
+    return image
