@@ -1,6 +1,8 @@
 """
 Time and memory of one simulated exposure, 1024 x 1032 x 200 groups.
 
+Peaks are those of the process so far: the exposure that is streamed comes first.
+
     python benchmarks/detector.py [n_groups] [n_threads]
 """
 
@@ -59,6 +61,13 @@ def main():
     )
     image, exposure = make("miri.f770w")
     options = {"seed": 0, "n_threads": N_THREADS}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "bench_uncal.fits"
+        timed(
+            f"F770W x {N_GROUPS}, streamed to disk",
+            lambda: detector.expose_to(path, image, exposure, **options),
+        )
+    timed("forecast", lambda: detector.forecast(image, exposure))
     ramp = timed(f"F770W x {N_GROUPS}", lambda: detector.expose(image, exposure, **options))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "bench_uncal.fits"
@@ -72,7 +81,14 @@ def main():
     ):
         image, exposure = make(band, **extra)
         timed(label, lambda i=image, e=exposure: detector.expose(i, e, **options))
-    everything = Detector.miri_imager(showers=True, residual=0.001, pink_noise=2.0)
+    everything = Detector.miri_imager(
+        showers=True,
+        residual=0.001,
+        pink_noise=2.0,
+        reset_anomaly=True,
+        first_frame=True,
+        last_frame=True,
+    )
     image, exposure = make("miri.f770w", includes=())
     timed("F770W with every option on", lambda: everything.expose(image, exposure, **options))
 

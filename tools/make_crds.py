@@ -11,9 +11,9 @@ pipeline runs as it is and needs no network::
     . crds/environment.sh
     strun calwebb_detector1 simulated_uncal.fits
 
-What our detector does not do (reset anomaly, first groups, electromagnetic interference,
-persistence), and what its PSF holds (interpixel capacitance), is ``N/A`` in the cache:
-the pipeline skips these steps.
+What our detector does not do (electromagnetic interference; reset anomaly and first groups
+unless asked for with ``--reset-anomaly`` and ``--skip-first``), and what its PSF holds
+(interpixel capacitance), is ``N/A`` in the cache: the pipeline skips these steps.
 """
 
 import argparse
@@ -27,6 +27,7 @@ from astropy.coordinates import SkyCoord
 from astropy.modeling.models import Mapping, Polynomial2D, Shift
 from numpy.polynomial import Polynomial
 
+from miricigale.detector import ResetAnomaly
 from miricigale.instrument import (
     aperture,
     bad_pixel_mask,
@@ -309,6 +310,33 @@ def add_ramp_references(cache, detector, *, n_groups, readout="FASTR1", subarray
     cache.add(model, "dark", frame=subarray)
 
 
+def add_reset_references(
+    cache, *, anomaly, skip_first, n_groups, readout="FASTR1", subarray="FULL"
+):
+    """Add what the steps reset and rscd ask for; either is left out where there is nothing."""
+    from stdatamodels.jwst import datamodels
+
+    if anomaly is not None:
+        offsets = anomaly.offsets(len(anomaly.amplitudes), n_groups)
+        # up to the last group in which more than a thousandth of a DN is left
+        count = max(1, int(np.count_nonzero(np.abs(offsets).max(axis=0) > 1e-3)))
+        offsets = offsets[:, :count].astype(np.float32)
+        # like the dark, this one is not cut by the pipeline
+        sees = ~reference_pixel_mask(subarray=subarray)
+        model = datamodels.ResetModel(data=offsets[:, :, None, None] * sees.astype(np.float32))
+        model.dq = np.zeros(sees.shape, np.uint32)
+        exposure = model.meta.exposure
+        exposure.readpatt, exposure.nframes, exposure.groupgap = readout, 1, 0
+        exposure.nints, exposure.ngroups = offsets.shape
+        cache.add(model, "reset", frame=subarray)
+    if skip_first:
+        row = (subarray.encode(), readout.encode(), skip_first, skip_first)
+        columns = [("subarray", "S17"), ("readpatt", "S12")]
+        columns += [(name, "<i4") for name in ("group_skip1", "group_skip")]
+        model = datamodels.RSCDModel(rscd_group_skip_table=np.array([row], dtype=columns))
+        cache.add(model, "rscd")
+
+
 def add_image_references(cache, detector, filters):
     """Add what calwebb_image2 asks for."""
     from stdatamodels.jwst import datamodels
@@ -389,7 +417,17 @@ def _short(name):
     return name.rsplit(".", 1)[-1].upper()
 
 
-def build(folder, *, n_groups, filters=None, readout="FASTR1", subarray="FULL", detector=None):
+def build(
+    folder,
+    *,
+    n_groups,
+    filters=None,
+    readout="FASTR1",
+    subarray="FULL",
+    detector=None,
+    reset_anomaly=None,
+    skip_first=0,
+):
     """
     Make the cache.
 
@@ -405,6 +443,11 @@ def build(folder, *, n_groups, filters=None, readout="FASTR1", subarray="FULL", 
         Of the exposures.
     detector : `~miricigale.instrument.DetectorProperties`, optional
         The detector that made them; `~miricigale.instrument.miri_detector` if not given.
+    reset_anomaly : `~miricigale.detector.ResetAnomaly`, optional
+        That of the detector, if it has one: the step reset takes it off.
+    skip_first : int, optional
+        Groups that the step rscd flags at the start of each integration: 1 for a detector
+        with `~miricigale.detector.FirstFrame`. (The pipeline always leaves out the last.)
 
     Returns
     -------
@@ -418,6 +461,14 @@ def build(folder, *, n_groups, filters=None, readout="FASTR1", subarray="FULL", 
         # the data models speak of optional keywords that no step reads
         warnings.simplefilter("ignore")
         add_ramp_references(cache, detector, n_groups=n_groups, readout=readout, subarray=subarray)
+        add_reset_references(
+            cache,
+            anomaly=reset_anomaly,
+            skip_first=skip_first,
+            n_groups=n_groups,
+            readout=readout,
+            subarray=subarray,
+        )
         add_image_references(cache, detector, filters)
         add_catalog_references(cache, filters)
         cache.close()
@@ -431,6 +482,16 @@ def main():
     parser.add_argument("--filters", nargs="+", metavar="NAME", help="all nine if not given")
     parser.add_argument("--readout", default="FASTR1")
     parser.add_argument("--subarray", default="FULL")
+    parser.add_argument(
+        "--reset-anomaly", action="store_true", help="the detector has ResetAnomaly()"
+    )
+    parser.add_argument(
+        "--skip-first",
+        type=int,
+        default=0,
+        metavar="N",
+        help="leave out the first N groups: 1 if the detector has FirstFrame()",
+    )
     options = parser.parse_args()
     build(
         options.folder,
@@ -438,6 +499,8 @@ def main():
         filters=options.filters,
         readout=options.readout,
         subarray=options.subarray,
+        reset_anomaly=ResetAnomaly() if options.reset_anomaly else None,
+        skip_first=options.skip_first,
     )
     print(f"made {options.folder}; now:  . {options.folder}/environment.sh")
 

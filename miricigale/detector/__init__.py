@@ -10,14 +10,20 @@ from miricigale.detector.effects import (
     CosmicRays,
     Dark,
     Effect,
+    FirstFrame,
     InterpixelCapacitance,
+    LastFrame,
+    Latent,
     Nonlinearity,
+    Persistence,
     Photons,
     ReadNoise,
     ReferencePixels,
+    ResetAnomaly,
     Residual,
     Saturation,
 )
+from miricigale.detector.forecast import SaturationForecast, forecast_table
 from miricigale.detector.ramp import Ramp
 
 __all__ = [
@@ -30,12 +36,19 @@ __all__ = [
     "Dark",
     "Detector",
     "Effect",
+    "FirstFrame",
     "InterpixelCapacitance",
+    "LastFrame",
+    "Latent",
     "Nonlinearity",
+    "Persistence",
     "Photons",
     "Ramp",
     "ReadNoise",
     "ReferencePixels",
+    "ResetAnomaly",
     "Residual",
     "Saturation",
+    "SaturationForecast",
+    "forecast_table",
 ]

@@ -1,13 +1,15 @@
 """The detector: a tuple of effects, applied block by block."""
 
 import concurrent.futures
-import functools
+import dataclasses
 import logging
 import warnings
+from pathlib import Path
 
 import numba
 import numpy as np
 
+from miricigale.detector import level1b
 from miricigale.detector.effects import (
     ADConversion,
     BadPixels,
@@ -16,15 +18,21 @@ from miricigale.detector.effects import (
     CosmicRays,
     Dark,
     Effect,
+    FirstFrame,
     InterpixelCapacitance,
+    LastFrame,
+    Latent,
     Nonlinearity,
+    Persistence,
     Photons,
     ReadNoise,
     ReferencePixels,
+    ResetAnomaly,
     Residual,
     Saturation,
     stream_key,
 )
+from miricigale.detector.forecast import SKY_FRACTION, forecast
 from miricigale.detector.ramp import Ramp
 from miricigale.instrument import DetectorProperties, Exposure, miri_detector, saturation_forecast
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
@@ -39,9 +47,6 @@ logger = logging.getLogger(__name__)
 
 # samples (float32) that one thread has in hand: a few MB, so that they stay in the cache
 _BLOCK_SAMPLES = 2**21
-
-# share of the full well from which the sky is spoken of
-_SKY_FRACTION = 0.6
 
 
 class Detector:
@@ -82,6 +87,10 @@ class Detector:
         cosmic_rays=True,
         bad_pixels=True,
         pink_noise=0.0,
+        persistence=False,
+        reset_anomaly=False,
+        first_frame=False,
+        last_frame=False,
         properties=None,
     ):
         """
@@ -89,15 +98,22 @@ class Detector:
 
         Parameters
         ----------
-        residual : float or False, optional
-            Fraction of the light that stays as a fixed pattern (`Residual`); False for
-            none.
+        residual : float, str or False, optional
+            Fraction of the light that stays as a fixed pattern (`Residual`), or ``"etc"`` for
+            that of each filter with which the exposure time calculator's limits come out;
+            False for none.
         showers : bool or float, optional
             Share of the cosmic rays that make showers; True for 0.001.
         cosmic_rays, bad_pixels : bool, optional
             Whether there are any.
         pink_noise : float, optional
             Standard deviation of the 1/f noise in DN.
+        persistence : bool, optional
+            Whether exposures before (``previous`` of `expose`) leave latent images
+            (`Persistence`).
+        reset_anomaly, first_frame, last_frame : bool, optional
+            Whether resets leave their marks on the first and last groups
+            (`ResetAnomaly`, `FirstFrame`, `LastFrame`, at their defaults).
         properties : `~miricigale.instrument.DetectorProperties`, optional
             `~miricigale.instrument.miri_detector` if not given.
 
@@ -109,21 +125,24 @@ class Detector:
             raise argument_error("residual", "False or a fraction of the light", residual)
         effects = []
         if residual:
-            effects.append(Residual(float(residual)))
+            effects.append(Residual(residual if isinstance(residual, str) else float(residual)))
         effects += [Photons(), Dark(), InterpixelCapacitance()]
         if cosmic_rays:
             fraction = 0.001 if showers is True else float(showers)
             effects.append(CosmicRays(shower_fraction=fraction))
+        if persistence:
+            effects.append(Persistence())
         if bad_pixels:
             effects.append(BadPixels())
-        effects += [
-            ReferencePixels(),
-            Saturation(),
-            Nonlinearity(),
-            Bias(),
-            ReadNoise(pink=float(pink_noise)),
-            ADConversion(),
-        ]
+        effects += [ReferencePixels(), Saturation(), Nonlinearity()]
+        for wanted, kind in (
+            (reset_anomaly, ResetAnomaly),
+            (first_frame, FirstFrame),
+            (last_frame, LastFrame),
+        ):
+            if wanted:
+                effects.append(kind())
+        effects += [Bias(), ReadNoise(pink=float(pink_noise)), ADConversion()]
         return cls(effects, properties=properties)
 
     @property
@@ -140,7 +159,9 @@ class Detector:
         lines = ",\n    ".join(map(repr, self._effects))
         return f"Detector((\n    {lines},\n))"
 
-    def expose(self, image, exposure, *, seed=None, n_threads=None, progress_bar=False):
+    def expose(
+        self, image, exposure, *, seed=None, previous=None, n_threads=None, progress_bar=False
+    ):
         """
         Expose the detector to a scene.
 
@@ -155,6 +176,8 @@ class Detector:
         seed : int, `~numpy.random.Generator` or None, optional
             Seed of the run. Every effect has its own stream in each exposure (told apart
             by filter and dither) and detector row.
+        previous : `Latent` or iterable of `Latent`, optional
+            Exposures before, for a detector with `Persistence`.
         n_threads : int, optional
             Number of threads; as many as there are processors if not given
             (``NUMBA_NUM_THREADS``). It changes nothing in the result.
@@ -171,77 +194,203 @@ class Detector:
         `~astropy.units.UnitsError`
             If the image has no unit of surface brightness.
         ValueError
-            If the image has another shape, values that are not finite or that are negative.
+            If the image has another shape, values that are not finite or that are negative, or
+            ``previous`` belongs to another sub-array or is of no use to this detector.
 
         Warns
         -----
         `~miricigale.utils.exceptions.MiricigaleWarning`
             If the sky alone fills the well before the last group.
         """
+        task = self._task(image, exposure, seed, previous)
+        shape = task.shape
+        data = np.empty(shape, np.uint16)
+        pixel_dq = np.zeros(shape[2:], np.uint32)
+        # only flagged rows are ever written, so that the rest takes no memory
+        group_dq = np.zeros(shape, np.uint8)
+
+        def store(rows, counts, pixel_flags, group_flags):
+            data[:, :, rows] = counts
+            pixel_dq[rows] = pixel_flags
+            for i, g, r in np.argwhere(group_flags.any(axis=3)):
+                group_dq[i, g, rows.start + r] = group_flags[i, g, r]
+
+        self._run(task, store, n_threads, progress_bar)
+        return Ramp(data, exposure, pixel_dq=pixel_dq, group_dq=group_dq, meta=task.meta)
+
+    def expose_to(
+        self,
+        path,
+        image,
+        exposure,
+        *,
+        seed=None,
+        previous=None,
+        start=None,
+        overwrite=False,
+        n_threads=None,
+        progress_bar=False,
+    ):
+        """
+        Expose the detector to a scene and write the level-1b file block by block.
+
+        The file is the one that ``expose(...).write(path)`` makes, byte for byte but for the
+        dates, and no more than the blocks in hand are ever in memory.
+
+        Parameters
+        ----------
+        path : path-like
+            The file; it appears under its name only when it is complete.
+        image, exposure, seed, previous, n_threads, progress_bar : optional
+            As for `expose`.
+        start, overwrite : optional
+            As for `Ramp.write`.
+
+        Returns
+        -------
+        path : `pathlib.Path`
+
+        Raises
+        ------
+        OSError
+            If the file exists and ``overwrite`` is False.
+        ValueError
+            As `expose`.
+        """
+        path = Path(path)
+        task = self._task(image, exposure, seed, previous)
+        pixel_dq = np.zeros(task.shape[2:], np.uint32)
+        with level1b.row_writer(path, exposure, start=start, overwrite=overwrite) as parts:
+            writer, finish = parts
+
+            def store(rows, counts, pixel_flags, group_flags):
+                # level 1b holds no flags of groups
+                writer.write(rows, counts)
+                pixel_dq[rows] = pixel_flags
+
+            self._run(task, store, n_threads, progress_bar)
+            finish(pixel_dq, task.meta)
+        return path
+
+    def forecast(self, image, exposure, *, sources=None):
+        """
+        Say what an exposure will saturate, without simulating it.
+
+        The mean rate of charge of every pixel is what the effects make of the light (flat
+        field, dark current, interpixel capacitance where it acts); noise and cosmic rays are
+        left out. It is constant, so that a pixel is full in group ceil(well / (rate x group
+        time)). The well is that of `Saturation`, or the charge at which the converter ends.
+
+        Parameters
+        ----------
+        image, exposure
+            As for `expose`.
+        sources : `~astropy.table.Table`, optional
+            Sources with ``id`` and pixel positions ``x``, ``y``, such as the ``truth`` of a
+            scene; those off the image are passed over. The brightest of the 3 x 3 pixels
+            around a source counts as its peak.
+
+        Returns
+        -------
+        forecast : `SaturationForecast`
+
+        Raises
+        ------
+        `~astropy.units.UnitsError`, ValueError
+            As `expose`; or if a column is missing.
+
+        Warns
+        -----
+        `~miricigale.utils.exceptions.MiricigaleWarning`
+            If the sky fills more than 60 % of the well by the last group.
+        """
+        light = self._light(image, exposure)
+        effects, _ = self._acting(image)
+        told = forecast(light, exposure, effects, self._properties, sources=sources)
+        if told.sky_too_bright:
+            warnings.warn(
+                _sky_message(exposure, told.sky_fraction), MiricigaleWarning, stacklevel=2
+            )
+        return told
+
+    def _acting(self, image):
+        """Return the effects that the image does not hold already, and what it holds."""
+        included = set(getattr(image, "meta", {}).get("psf_includes", ()))
+        return tuple(e for e in self._effects if e.included_as not in included), sorted(included)
+
+    def _task(self, image, exposure, seed, previous):
+        """Check what is exposed and gather what all its blocks share."""
         light = self._light(image, exposure)
         seed = check_seed(seed)
+        effects, included = self._acting(image)
+        previous = self._previous(previous, exposure)
+        fraction = self._check_sky(light, exposure)
+        meta = provenance(
+            seed=seed,
+            effects=[repr(effect) for effect in effects],
+            psf_includes=included,
+            sky_well_fraction=round(fraction, 4),
+            previous=[repr(latent) for latent in previous] or None,
+        )
+        return _Task(light, exposure, _keyed(effects, seed, exposure), previous, meta)
+
+    def _run(self, task, store, n_threads, progress_bar):
+        """Expose all rows, block by block, and hand each block to ``store``."""
         if n_threads is None:
             n_threads = numba.config.NUMBA_NUM_THREADS
         if n_threads < 1:
             raise argument_error("n_threads", "at least 1", n_threads)
-        included = set(getattr(image, "meta", {}).get("psf_includes", ()))
-        effects = tuple(e for e in self._effects if e.included_as not in included)
-        fraction = self._check_sky(light, exposure)
+        n_int, n_group, ny, nx = task.shape
+        height = max(1, _BLOCK_SAMPLES // (n_int * n_group * nx))
+        blocks = [slice(start, min(start + height, ny)) for start in range(0, ny, height)]
 
-        ny, nx = exposure.shape
-        shape = (exposure.n_integrations, exposure.n_groups, ny, nx)
-        data = np.empty(shape, np.uint16)
-        pixel_dq = np.zeros((ny, nx), np.uint32)
-        # only flagged rows are ever written, so that the rest takes no memory
-        group_dq = np.zeros(shape, np.uint8)
-        height = max(1, _BLOCK_SAMPLES // (shape[0] * shape[1] * nx))
-        work = functools.partial(
-            self._expose_rows,
-            _keyed(effects, seed, exposure),
-            light,
-            exposure,
-            (data, pixel_dq, group_dq),
-        )
-        starts = range(0, ny, height)
-        blocks = [slice(start, min(start + height, ny)) for start in starts]
-        desc = f"ramp {exposure.filter}"
+        def work(rows):
+            store(rows, *self._expose_rows(task, rows))
+
+        desc = f"ramp {task.exposure.filter}"
         if n_threads == 1:
             parallel_map(work, blocks, progress_bar=progress_bar, desc=desc)
         else:
             with concurrent.futures.ThreadPoolExecutor(n_threads) as pool:
                 parallel_map(work, blocks, executor=pool, progress_bar=progress_bar, desc=desc)
-        meta = provenance(
-            seed=seed,
-            effects=[repr(effect) for effect in effects],
-            psf_includes=sorted(included),
-            sky_well_fraction=round(fraction, 4),
-        )
-        return Ramp(data, exposure, pixel_dq=pixel_dq, group_dq=group_dq, meta=meta)
 
-    def _expose_rows(self, keyed, light, exposure, out, rows):
-        """Apply the effects to some rows and put the counts where they belong."""
-        data, pixel_dq, group_dq = out
-        halo = sum(effect.halo for effect, _ in keyed)
-        wide = slice(max(rows.start - halo, 0), min(rows.stop + halo, light.shape[0]))
-        shape = (*data.shape[:2], wide.stop - wide.start, data.shape[3])
-        block_pixel_dq = np.zeros(shape[2:], np.uint32)
-        block_group_dq = np.zeros(shape, np.uint8)
-        array = light[wide]
-        for effect, key in keyed:
-            block = Block(exposure, self._properties, wide, block_pixel_dq, block_group_dq, key)
+    def _expose_rows(self, task, rows):
+        """Apply the effects to some rows: counts, flags of pixels, flags of groups."""
+        halo = sum(effect.halo for effect, _ in task.keyed)
+        wide = slice(max(rows.start - halo, 0), min(rows.stop + halo, task.light.shape[0]))
+        shape = (*task.shape[:2], wide.stop - wide.start, task.shape[3])
+        pixel_dq = np.zeros(shape[2:], np.uint32)
+        group_dq = np.zeros(shape, np.uint8)
+        array = task.light[wide]
+        for effect, key in task.keyed:
+            block = Block(
+                task.exposure, self._properties, wide, pixel_dq, group_dq, key, task.previous
+            )
             array = effect.apply(array, block)
         if array.shape != shape or array.dtype != np.uint16:
             msg = (
                 "'effects' must turn light into counts, beginning with Photons and ending with "
-                f"ADConversion, got {[type(effect).__name__ for effect, _ in keyed]}"
+                f"ADConversion, got {[type(effect).__name__ for effect, _ in task.keyed]}"
             )
             raise ValueError(msg)
         inner = slice(rows.start - wide.start, rows.stop - wide.start)
-        data[:, :, rows] = array[:, :, inner]
-        pixel_dq[rows] = block_pixel_dq[inner]
-        flags = block_group_dq[:, :, inner]
-        for i, g, r in np.argwhere(flags.any(axis=3)):
-            group_dq[i, g, rows.start + r] = flags[i, g, r]
+        return array[:, :, inner], pixel_dq[inner], group_dq[:, :, inner]
+
+    def _previous(self, previous, exposure):
+        """Previous exposures as a tuple, checked."""
+        if previous is None:
+            return ()
+        previous = (previous,) if isinstance(previous, Latent) else tuple(previous)
+        for latent in previous:
+            if not isinstance(latent, Latent):
+                raise argument_error("previous", "a Latent or several", repr(latent))
+            if latent.subarray != exposure.subarray or latent.rate.shape != exposure.shape:
+                wanted = f"of {exposure.subarray}, {exposure.shape} pixels"
+                raise argument_error("previous", wanted, repr(latent))
+        if previous and not any(isinstance(e, Persistence) for e in self._effects):
+            wanted = "given to a detector whose effects hold Persistence"
+            raise argument_error("previous", wanted, "one without it")
+        return previous
 
     def _light(self, image, exposure):
         """Surface brightness as an array, checked."""
@@ -267,15 +416,35 @@ class Detector:
         fraction = saturation_forecast(
             exposure, background=np.median(light) * SURFACE_BRIGHTNESS, detector=self._properties
         )
-        message = (
-            f"the sky in {exposure.filter} fills {100 * fraction:.0f} % of the full well by the "
-            f"last of {exposure.n_groups} groups: take fewer groups and more integrations"
-        )
+        message = _sky_message(exposure, fraction)
         if fraction >= 1:
-            warnings.warn(message, MiricigaleWarning, stacklevel=3)
-        elif fraction > _SKY_FRACTION:
+            warnings.warn(message, MiricigaleWarning, stacklevel=4)
+        elif fraction > SKY_FRACTION:
             logger.warning(message)
         return fraction
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class _Task:
+    """What all blocks of one exposure share."""
+
+    light: np.ndarray
+    exposure: Exposure
+    keyed: tuple
+    previous: tuple
+    meta: dict
+
+    @property
+    def shape(self):
+        e = self.exposure
+        return (e.n_integrations, e.n_groups, *e.shape)
+
+
+def _sky_message(exposure, fraction):
+    return (
+        f"the sky in {exposure.filter} fills {100 * fraction:.0f} % of the full well by the "
+        f"last of {exposure.n_groups} groups: take fewer groups and more integrations"
+    )
 
 
 def _keyed(effects, seed, exposure):

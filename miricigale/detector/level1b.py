@@ -6,8 +6,11 @@ of a hundred bytes is what the official pipeline needs to recognise the file. Ke
 follow the JWST keyword dictionary; those that the pipeline asks for are all there.
 """
 
+import contextlib
+import functools
 import json
 import os
+import threading
 import warnings
 from pathlib import Path
 
@@ -22,7 +25,7 @@ from miricigale.detector.dq import DQ
 from miricigale.instrument import Exposure, reference_pixel_mask
 from miricigale.utils.exceptions import DataError, argument_error
 
-__all__ = ["header", "read", "write"]
+__all__ = ["RowWriter", "header", "read", "row_writer", "write"]
 
 _ASDF = (
     b"#ASDF 1.0.0\n#ASDF_STANDARD 1.6.0\n%YAML 1.1\n%TAG ! tag:stsci.edu:asdf/\n"
@@ -197,28 +200,122 @@ def write(path, data, exposure, *, pixel_dq=None, meta=None, start=None, overwri
     path = Path(path)
     if data.dtype != np.uint16:
         raise argument_error("data", "counts (uint16) to be written", data.dtype)
-    if path.exists() and not overwrite:
-        msg = f"{path} exists; give overwrite=True to replace it"
-        raise OSError(msg)
-    primary, science = header(exposure, filename=path.name, start=start)
-    shape = [("NAXIS", data.ndim)] + [(f"NAXIS{i + 1}", n) for i, n in enumerate(data.shape[::-1])]
-    structure = [("XTENSION", "IMAGE"), ("BITPIX", 16), *shape, ("PCOUNT", 0), ("GCOUNT", 1)]
-    scaling = [("EXTNAME", "SCI"), ("BZERO", 32768), ("BSCALE", 1)]
-    science = fits.Header(structure + scaling) + science
-    partial = path.with_name(path.name + ".partial")
-    try:
-        fits.PrimaryHDU(header=primary).writeto(partial, overwrite=True)
+    with _partial(path, exposure, data.shape, start, overwrite) as (partial, science):
         with fits.StreamingHDU(str(partial), science) as stream:
             for part in _chunks(data.reshape(-1)):
                 # BZERO 32768: the top bit is turned
                 stream.write((part ^ np.uint16(0x8000)).view(np.int16))
-        with fits.open(partial, mode="append") as hdus:
-            for hdu in _extensions(pixel_dq, meta):
-                hdus.append(hdu)
+        _append(partial, pixel_dq, meta)
+    return path
+
+
+@contextlib.contextmanager
+def _partial(path, exposure, shape, start, overwrite):
+    """Give a file with its primary header, and the header of SCI; rename it when all is well."""
+    if path.exists() and not overwrite:
+        msg = f"{path} exists; give overwrite=True to replace it"
+        raise OSError(msg)
+    primary, science = header(exposure, filename=path.name, start=start)
+    axes = [("NAXIS", len(shape))] + [(f"NAXIS{i + 1}", n) for i, n in enumerate(shape[::-1])]
+    structure = [("XTENSION", "IMAGE"), ("BITPIX", 16), *axes, ("PCOUNT", 0), ("GCOUNT", 1)]
+    scaling = [("EXTNAME", "SCI"), ("BZERO", 32768), ("BSCALE", 1)]
+    partial = path.with_name(path.name + ".partial")
+    try:
+        fits.PrimaryHDU(header=primary).writeto(partial, overwrite=True)
+        yield partial, fits.Header(structure + scaling) + science
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
-    return path
+
+
+def _append(partial, pixel_dq, meta):
+    with fits.open(partial, mode="append") as hdus:
+        for hdu in _extensions(pixel_dq, meta):
+            hdus.append(hdu)
+
+
+class RowWriter:
+    """
+    Counts of a level-1b file, taken in blocks of rows and in any order.
+
+    Made by `row_writer`. Threads may share one.
+
+    Parameters
+    ----------
+    handle : file
+        Opened for writing without a buffer.
+    start : int
+        Where the counts begin.
+    shape : tuple of int
+        (n_int, n_group, ny, nx).
+    """
+
+    def __init__(self, handle, start, shape):
+        self._handle, self._start, self._shape = handle, start, shape
+        self._lock = threading.Lock()
+
+    def write(self, rows, counts):
+        """
+        Write the counts of some rows.
+
+        Parameters
+        ----------
+        rows : slice
+            Detector rows, start and stop given.
+        counts : `~numpy.ndarray` of uint16, shape (n_int, n_group, n_row, nx)
+            All groups of them.
+        """
+        n_int, n_group, ny, nx = self._shape
+        # BZERO 32768: the top bit is turned
+        stored = (counts ^ np.uint16(0x8000)).view(np.int16).astype(">i2")
+        with self._lock:
+            for i, g in np.ndindex(n_int, n_group):
+                row = (i * n_group + g) * ny + rows.start
+                self._handle.seek(self._start + 2 * nx * row)
+                if self._handle.write(stored[i, g].data) != stored[i, g].nbytes:
+                    msg = f"{self._handle.name} could not be written: is the disk full?"
+                    raise OSError(msg)
+
+
+@contextlib.contextmanager
+def row_writer(path, exposure, *, start=None, overwrite=False):
+    """
+    Write a level-1b file block by block.
+
+    Parameters
+    ----------
+    path : path-like
+        The file; it appears under its name only when the context ends without an error.
+    exposure : `~miricigale.instrument.Exposure`
+        What is exposed.
+    start : `~astropy.time.Time`, optional
+        See `header`.
+    overwrite : bool, optional
+        Whether an existing file is replaced.
+
+    Yields
+    ------
+    writer : `RowWriter`
+    finish : callable
+        To be called last, with ``pixel_dq`` and ``meta`` as in `write`.
+
+    Raises
+    ------
+    OSError
+        If the file exists and ``overwrite`` is False.
+    """
+    path = Path(path)
+    shape = (exposure.n_integrations, exposure.n_groups, *exposure.shape)
+    with (
+        _partial(path, exposure, shape, start, overwrite) as (partial, science),
+        open(partial, "r+b", buffering=0) as handle,
+    ):
+        handle.seek(0, os.SEEK_END)
+        handle.write(science.tostring().encode("ascii"))
+        begin = handle.tell()
+        # FITS files are made of blocks of 2880 bytes
+        handle.truncate(begin + -(-2 * int(np.prod(shape)) // 2880) * 2880)
+        yield RowWriter(handle, begin, shape), functools.partial(_append, partial)
 
 
 def _chunks(flat):

@@ -9,6 +9,12 @@ from miricigale.instrument.detector import (
     reference_pixel_mask,
 )
 from miricigale.instrument.dithers import dither_offsets, dither_patterns, read_dithers
+from miricigale.instrument.etc import (
+    EtcSetup,
+    etc_setup,
+    residual_amplitude,
+    residual_presets,
+)
 from miricigale.instrument.exposure import (
     CEERS_FILTERS,
     Exposure,
@@ -50,6 +56,7 @@ __all__ = [
     "CEERS_FILTERS",
     "Aperture",
     "DetectorProperties",
+    "EtcSetup",
     "Exposure",
     "aperture",
     "attitude_matrix",
@@ -60,6 +67,7 @@ __all__ = [
     "dither_offsets",
     "dither_patterns",
     "etc_limit",
+    "etc_setup",
     "field_mask",
     "flat_field",
     "frame_time",
@@ -78,6 +86,8 @@ __all__ = [
     "read_dithers",
     "readout_patterns",
     "reference_pixel_mask",
+    "residual_amplitude",
+    "residual_presets",
     "saturation_forecast",
     "saturation_time",
     "scaled_limit",

@@ -11,6 +11,7 @@ from miricigale.photometry.detection import (
 from miricigale.photometry.error_model import YANG2021_DEPTHS, ErrorModel
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.forced import ForcedPhotometer
+from miricigale.photometry.limits import sensitivity, sensitivity_table
 from miricigale.photometry.results import ForcedPhotometryResult, crowded
 
 __all__ = [
@@ -28,5 +29,7 @@ __all__ = [
     "detect_sources",
     "encircled_flux",
     "flux_scaling",
+    "sensitivity",
+    "sensitivity_table",
     "source_extractor_photometry",
 ]

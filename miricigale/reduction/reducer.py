@@ -1,10 +1,11 @@
 """The `Reducer`: ramps in, calibrated images and mosaics out."""
 
 import dataclasses
+import warnings
 
 import numpy as np
 
-from miricigale.detector import DQ, Ramp
+from miricigale.detector import DQ, Ramp, ResetAnomaly
 from miricigale.instrument import DetectorProperties, miri_detector, mosaic_wcs
 from miricigale.reduction.background import estimate_background, subtract_background
 from miricigale.reduction.calibration import calibrate
@@ -24,7 +25,7 @@ from miricigale.reduction.mosaic import (
 )
 from miricigale.reduction.rampfit import fit_groups, reference_drift
 from miricigale.reduction.results import ReductionResult
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.progress import progress
 from miricigale.utils.units import ANGLE, RATE, to_array
@@ -51,8 +52,13 @@ class Reducer:
         Sigma above which a jump is cut out of a ramp; None for no jump detection.
     neighbour_threshold : float or None, optional
         Sigma above which a jump is cut in the four neighbours too.
-    skip_first, skip_last : int, optional
-        Groups left out at the start and end of each integration.
+    skip_first, skip_last : int or None, optional
+        Groups left out at the start and end of each integration. None: one each where the
+        ramp says that `~miricigale.detector.FirstFrame` or
+        `~miricigale.detector.LastFrame` acted (and more than three or two groups are there,
+        as in the official pipeline), else none. Give 1 and 1 for ramps of the observatory.
+    reset_anomaly : `~miricigale.detector.ResetAnomaly`, optional
+        The settling after a reset, which is taken off the groups; none if not given.
     saturation : float, optional
         Fraction of the detector's saturation from which groups are left out.
     reference_correction : bool, optional
@@ -96,8 +102,9 @@ class Reducer:
     backend: str = "native"
     jump_threshold: float | None = 5.0
     neighbour_threshold: float | None = 10.0
-    skip_first: int = 0
-    skip_last: int = 0
+    skip_first: int | None = None
+    skip_last: int | None = None
+    reset_anomaly: ResetAnomaly | None = None
     saturation: float = 0.98
     reference_correction: bool = True
     ipc: bool | None = None
@@ -128,8 +135,10 @@ class Reducer:
                 raise argument_error(name, "positive", getattr(self, name))
         for name in ("skip_first", "skip_last"):
             value = getattr(self, name)
-            if value < 0 or int(value) != value:
+            if value is not None and (value < 0 or int(value) != value):
                 raise argument_error(name, "an integer of at least 0", value)
+        if self.reset_anomaly is not None and not isinstance(self.reset_anomaly, ResetAnomaly):
+            raise argument_error("reset_anomaly", "a ResetAnomaly", repr(self.reset_anomaly))
         if self.box < 4:
             raise argument_error("box", "at least 4", self.box)
         for name in ("saturation", "pixfrac"):
@@ -174,11 +183,10 @@ class Reducer:
         reference = (dq & np.uint32(DQ.REFERENCE_PIXEL)) != 0
         usable = (dq & np.uint32(_UNUSABLE)) == 0
         n_group = ramp.data.shape[1]
-        if self.skip_first + self.skip_last > n_group - 2:
+        skip_first, skip_last = self._skipped(ramp)
+        if skip_first + skip_last > n_group - 2:
             msg = f"at most {n_group - 2} groups together for {n_group} groups"
-            raise argument_error(
-                "skip_first, skip_last", msg, f"{self.skip_first}, {self.skip_last}"
-            )
+            raise argument_error("skip_first, skip_last", msg, f"{skip_first}, {skip_last}")
         drift = reference_drift(ramp.data, reference) if self.reference_correction else 0.0
         factor = float(np.sum(detector.ipc_kernel**2)) if self._shares_charge(ramp) else 1.0
         fit = fit_groups(
@@ -186,12 +194,12 @@ class Reducer:
             group_time=float(exposure.group_time.to_value("s")),
             gain=detector.gain,
             read_noise=detector.read_noise,
-            bias=detector.bias + drift,
+            bias=detector.bias + drift + self._anomaly(ramp),
             linearity=detector.nonlinearity,
             saturation=detector.bias + self.saturation * detector.saturation_dn,
             usable=usable,
-            first_group=self.skip_first,
-            last_group=n_group - self.skip_last,
+            first_group=skip_first,
+            last_group=n_group - skip_last,
             jump_threshold=self.jump_threshold,
             neighbour_threshold=self.neighbour_threshold,
             poisson_factor=factor,
@@ -424,7 +432,32 @@ class Reducer:
         """Whether the charge of this ramp was coupled between neighbours."""
         if self.ipc is not None:
             return bool(self.ipc)
-        effects = ramp.meta.get("effects")
-        if effects is None:
-            return True
-        return any(str(effect).startswith("InterpixelCapacitance") for effect in effects)
+        return ramp.meta.get("effects") is None or _acted(ramp, "InterpixelCapacitance")
+
+    def _skipped(self, ramp):
+        """Groups left out at the start and the end of the integrations of a ramp."""
+        n_group = ramp.data.shape[1]
+        first, last = self.skip_first, self.skip_last
+        if first is None:
+            first = int(_acted(ramp, "FirstFrame") and n_group > 3)
+        if last is None:
+            last = int(_acted(ramp, "LastFrame") and n_group > 2)
+        return first, last
+
+    def _anomaly(self, ramp):
+        """Offset of each group after a reset, DN."""
+        if self.reset_anomaly is not None:
+            return self.reset_anomaly.offsets(*ramp.data.shape[:2])
+        if self.skip_first is None and _acted(ramp, "ResetAnomaly"):
+            msg = (
+                "the ramp shows a reset anomaly that this Reducer leaves in: give it "
+                "'reset_anomaly', or 'skip_first' groups to be left out"
+            )
+            warnings.warn(msg, MiricigaleWarning, stacklevel=4)
+        return 0.0
+
+
+def _acted(ramp, name):
+    """Whether a simulated ramp says that an effect of this name acted."""
+    effects = ramp.meta.get("effects") or ()
+    return any(str(effect).startswith(f"{name}(") for effect in effects)

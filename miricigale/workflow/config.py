@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import tomllib
+import types
 import typing
 from importlib import resources
 from pathlib import Path
@@ -107,8 +108,13 @@ class DetectorSection:
     """What the detector does to the light."""
 
     cosmic_rays: bool = _option(True, "Whether cosmic rays hit.")
-    residual: float = _option(
-        0.0, "Fraction of the light that stays as a fixed pattern (flat, sky).", low=0.0, high=0.1
+    residual: float | str = _option(
+        0.0,
+        "Fraction of the light that stays as a fixed pattern (flat, sky), or that of the exposure "
+        "time calculator.",
+        low=0.0,
+        high=0.1,
+        choices=("etc",),
     )
 
 
@@ -308,6 +314,8 @@ class StudyConfig:
 
 
 def _limits_text(limits):
+    if limits["choices"] and limits["low"] is not None:
+        return f" ({limits['low']} to {limits['high']} or {', '.join(limits['choices'])})"
     if limits["choices"]:
         return f" One of {', '.join(limits['choices'])}."
     if limits["low"] is not None and limits["high"] is not None:
@@ -345,6 +353,11 @@ def _checked(label, value, hint, limits):
             raise ConfigError(msg)
         item = typing.get_args(hint)[0]
         return tuple(_checked(label, entry, item, limits) for entry in value)
+    if isinstance(hint, types.UnionType):
+        # a number within the limits, or one of the names
+        named = isinstance(value, str)
+        hint = str if named else float
+        limits = {**limits, **({"low": None, "high": None} if named else {"choices": None})}
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if type(value) is not hint:

@@ -9,6 +9,7 @@ from miricigale.detector import (
     Block,
     CosmicRays,
     Dark,
+    Detector,
     InterpixelCapacitance,
     Nonlinearity,
     Photons,
@@ -18,7 +19,13 @@ from miricigale.detector import (
     Saturation,
 )
 from miricigale.detector.effects import stream_key
-from miricigale.instrument import bad_pixel_mask, flat_field, miri_detector, photmjsr
+from miricigale.instrument import (
+    bad_pixel_mask,
+    flat_field,
+    miri_detector,
+    photmjsr,
+    residual_amplitude,
+)
 
 
 @pytest.fixture
@@ -244,6 +251,18 @@ def test_residual_is_fixed_on_the_detector(make_block, correlation):
     # and it does not know blocks
     part = Block(one.exposure, one.properties, slice(50, 60), None, None, one.key)
     np.testing.assert_allclose(effect.apply(light[50:60], part), pattern[50:60], rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["miri.f560w", "miri.f2550w"])
+def test_residual_by_name_has_the_amplitude_of_the_filter(make_block, name):
+    block = make_block(name, subarray="SUB256")
+    light = np.full(block.exposure.shape, 100.0)
+    pattern = Residual("etc").apply(light, block)
+    # 65536 pixels, of which the correlation leaves one in 4 pi independent
+    assert pattern.std() / 100 == pytest.approx(residual_amplitude(name), rel=0.05)
+    assert Residual("etc") in Detector.miri_imager(residual="etc").effects
+    with pytest.raises(KeyError, match="no residual preset 'flat'; known: etc"):
+        Residual("flat")
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
+from miricigale.instrument import saturation_forecast
+from miricigale.reduction import PixelFlags
 from miricigale.workflow import StudyRunner, load_config, read_image, study_stages
+from miricigale.workflow.stages.images import study_exposures
 
 SMALL = """
 [run]
@@ -137,6 +140,20 @@ def test_the_mosaic_shows_the_truth(study):
     ratio = (matched["miri.f770w"][stars] / truth["miri.f770w"][stars]).to_value(u.one)
     assert len(ratio) >= 2
     assert abs(np.median(ratio) - 1) < 0.05
+
+
+def test_saturation_is_told_before_each_exposure(study):
+    units = study_exposures(load_config(study["folder"] / "config.toml"))
+    assert len(units) == 3
+    for unit, exposure in units.items():
+        (told,) = QTable.read(study["folder"] / f"exposures/{unit}_forecast.ecsv")
+        assert (told["filter"], told["dither"]) == (exposure.filter, exposure.dither)
+        # the closed form of the low background; gradient and flat field are a few per cent
+        assert told["sky_fraction"] == pytest.approx(saturation_forecast(exposure), rel=0.06)
+        # and the image has no slope where the well was full from the start
+        _, flags = read_image(study["folder"] / f"exposures/{unit}_rate.fits", planes=["dq"])
+        full = np.count_nonzero(flags & np.uint32(PixelFlags.SATURATED))
+        assert abs(full - told["n_pixels"]) <= 3 + 0.3 * told["n_pixels"]
 
 
 def test_images_are_what_they_say(study):

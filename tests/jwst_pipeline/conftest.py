@@ -76,11 +76,11 @@ def star_field(base, x, y, flux):
     return table
 
 
-def observe(exposures, catalog, folder):
+def observe(exposures, catalog, folder, *, detector=None):
     """Scene, detector, file: our own part of the chain, at its defaults."""
     psf = miri_psf(exposures[0].filter)
     background = Background.low_zodi(exposures[0].filter, center=exposures[0].pointing)
-    detector = Detector.miri_imager()
+    detector = Detector.miri_imager() if detector is None else detector
     for exposure in exposures:
         scene = Scene(
             catalog, filter=exposure.filter, wcs=exposure.wcs, psf=psf, background=background

@@ -28,6 +28,9 @@ def test_presets_are_listed_without_their_variants():
         ("[pointing]\ndec = nan\n", r"\[pointing\] dec must be a finite number, got nan"),
         ("[scene]\ngradient_angle = inf\n", r"gradient_angle must be a finite number, got inf"),
         ("[sed]\nalpha = [2.5, 1.5]\n", r"alpha must be two numbers in order"),
+        ("[detector]\nresidual = 0.5\n", r"residual must be between 0.0 and 0.1, got 0.5"),
+        ("[detector]\nresidual = 'flat'\n", r"residual must be one of \['etc'\], got 'flat'"),
+        ("[detector]\nresidual = true\n", r"residual must be of type float, got True"),
         ("[fit]\naxes = 'huge'\n", r"\[fit\] axes must be one of \['fit', 'quick'\], got 'huge'"),
         ("[fit]\nbands = ['acs.f606w']\n", r"\[fit\] depths must have one number per band \(1\)"),
         ("[exposures]\nfilters = []\n", "at least one filter"),
@@ -73,6 +76,15 @@ def test_overrides_win():
     config = load_config("goodss", overrides={"run": {"seed": 5}, "sed": {"frac_agn": 0}})
     assert config.run.seed == 5
     assert config.sed.frac_agn == 0.0
+
+
+@pytest.mark.parametrize("residual", [0.01, 0, "etc"])
+def test_a_residual_is_a_fraction_or_a_name(tmp_path, residual):
+    config = load_config("goodss", overrides={"detector": {"residual": residual}})
+    assert config.detector.residual == residual
+    path = tmp_path / "my.toml"
+    path.write_text(config.to_toml())
+    assert load_config(path) == config
 
 
 def test_defaults_describe_ceers():

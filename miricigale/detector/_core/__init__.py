@@ -10,7 +10,12 @@ All kernels release the interpreter lock. Ramps have shape (n_int, n_group, n_ro
 float32; ``first_row`` is the detector row of the block's first row.
 """
 
-from miricigale.detector._core.charge import add_cosmic_rays, add_poisson, couple_neighbours
+from miricigale.detector._core.charge import (
+    add_cosmic_rays,
+    add_latent,
+    add_poisson,
+    couple_neighbours,
+)
 from miricigale.detector._core.random import standard_normals
 from miricigale.detector._core.readout import (
     add_noise,
@@ -18,10 +23,12 @@ from miricigale.detector._core.readout import (
     clip_well,
     digitize,
     interpolate_response,
+    pull_last_group,
 )
 
 __all__ = [
     "add_cosmic_rays",
+    "add_latent",
     "add_noise",
     "add_pink_noise",
     "add_poisson",
@@ -29,5 +36,6 @@ __all__ = [
     "couple_neighbours",
     "digitize",
     "interpolate_response",
+    "pull_last_group",
     "standard_normals",
 ]

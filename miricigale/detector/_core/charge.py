@@ -18,7 +18,7 @@ from miricigale.detector._core.random import (
     unit,
 )
 
-__all__ = ["add_cosmic_rays", "add_poisson", "couple_neighbours"]
+__all__ = ["add_cosmic_rays", "add_latent", "add_poisson", "couple_neighbours"]
 
 #: Greatest mean for which a draw is done; beyond it a pixel is saturated a thousandfold.
 _MEAN_MAX = 1e9
@@ -78,6 +78,41 @@ def add_poisson(ramp, mean, key, first_row):
                                 k = ptrs_rest(mu[x], a[x], b[x], v, k, us)
                     total[x] += k
                     ramp[i, g, r, x] += np.float32(total[x])
+
+
+@njit(cache=True, nogil=True)
+def add_latent(ramp, rates, released, key, first_row):
+    """
+    Add charge that earlier exposures left, accumulating over the groups of an integration.
+
+    Parameters
+    ----------
+    ramp : `~numpy.ndarray` of float32, shape (n_int, n_group, n_row, n_col)
+        Accumulated charge (electrons); added to in place.
+    rates : `~numpy.ndarray` of float64, shape (n_latent, n_row, n_col)
+        Former rates of charge (electrons per second), one plane for each exposure.
+    released : `~numpy.ndarray` of float64, shape (n_latent, n_int, n_group)
+        Expected electrons in each group for a former rate of one.
+    key : `~numpy.ndarray` of uint64, shape (4,)
+        Key words of the streams.
+    first_row : int
+        Detector row of the first row.
+    """
+    n_int, n_group, n_row, n_col = ramp.shape
+    n_latent = rates.shape[0]
+    state = np.empty(4, np.uint64)
+    for r in range(n_row):
+        for i in range(n_int):
+            seed_stream(state, key, i, first_row + r)
+            for x in range(n_col):
+                total = 0.0
+                for g in range(n_group):
+                    mean = 0.0
+                    for k in range(n_latent):
+                        mean += rates[k, r, x] * released[k, i, g]
+                    if mean > 0.0:
+                        total += poisson(state, min(mean, _MEAN_MAX))
+                    ramp[i, g, r, x] += np.float32(total)
 
 
 @njit(cache=True, nogil=True)

@@ -7,7 +7,14 @@ from numba import njit, uint64
 
 from miricigale.detector._core.random import fill_normals, mix, seed_stream
 
-__all__ = ["add_noise", "add_pink_noise", "clip_well", "digitize", "interpolate_response"]
+__all__ = [
+    "add_noise",
+    "add_pink_noise",
+    "clip_well",
+    "digitize",
+    "interpolate_response",
+    "pull_last_group",
+]
 
 
 @njit(cache=True, nogil=True)
@@ -71,6 +78,38 @@ def interpolate_response(ramp, gain, response, step):
                     k = min(max(np.int32(place), np.int32(0)), np.int32(last))
                     low = response[k]
                     ramp[i, g, r, x] = low + (place - np.float32(k)) * (response[k + 1] - low)
+
+
+@njit(cache=True, nogil=True)
+def pull_last_group(ramp, sees, first_row, offset, coupling):
+    """
+    Offset the last group of each integration by what the reset of the row pair before does.
+
+    Parameters
+    ----------
+    ramp : `~numpy.ndarray` of float32, shape (n_int, n_group, n_row, n_col)
+        DN above the bias; changed in place. Rows whose preceding pair is not in the array
+        are left.
+    sees : `~numpy.ndarray` of bool, shape (n_row, n_col)
+        Pixels that are changed.
+    first_row : int
+        Detector row of the first row.
+    offset : float32
+        DN.
+    coupling : float32
+        Share of the mean signal of the preceding pair that is taken off.
+    """
+    n_int, _, n_row, n_col = ramp.shape
+    for i in range(n_int):
+        # from the end: a pair is used before it is changed
+        for r in range(n_row - 1, -1, -1):
+            before = r - (first_row + r) % 2 - 2
+            if before < 0:
+                continue
+            for x in range(n_col):
+                if sees[r, x]:
+                    pair = ramp[i, -1, before, x] + ramp[i, -1, before + 1, x]
+                    ramp[i, -1, r, x] += offset - coupling * np.float32(0.5) * pair
 
 
 @njit(cache=True, nogil=True)

@@ -23,7 +23,9 @@ from miricigale.detector.effects.charge import (
     Saturation,
 )
 from miricigale.detector.effects.light import Photons, Residual
+from miricigale.detector.effects.persistence import Latent, Persistence
 from miricigale.detector.effects.readout import ADConversion, Bias, Nonlinearity, ReadNoise
+from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly
 
 __all__ = [
     "ADConversion",
@@ -33,11 +35,16 @@ __all__ = [
     "CosmicRays",
     "Dark",
     "Effect",
+    "FirstFrame",
     "InterpixelCapacitance",
+    "LastFrame",
+    "Latent",
     "Nonlinearity",
+    "Persistence",
     "Photons",
     "ReadNoise",
     "ReferencePixels",
+    "ResetAnomaly",
     "Residual",
     "Saturation",
     "stream_key",

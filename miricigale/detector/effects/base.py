@@ -29,6 +29,8 @@ class Block:
         Flags that effects may set.
     key : `~numpy.ndarray` of uint64, shape (4,)
         Key words of the random streams of this effect in this exposure.
+    previous : tuple of `~miricigale.detector.Latent`, optional
+        Exposures taken before, which `Persistence` remembers.
     """
 
     exposure: Exposure
@@ -37,6 +39,7 @@ class Block:
     pixel_dq: np.ndarray
     group_dq: np.ndarray
     key: np.ndarray
+    previous: tuple = ()
 
     @property
     def group_time(self):
@@ -104,3 +107,39 @@ class Effect:
         array : `~numpy.ndarray`
         """
         raise NotImplementedError
+
+    def expected(self, array, block):
+        """
+        Return what the effect makes of the light or of the mean rate of charge.
+
+        A forecast asks for it instead of a ramp; what an effect does not change, or only
+        with mean zero, it leaves as it is.
+
+        Parameters
+        ----------
+        array : `~numpy.ndarray`, shape (n_row, n_col)
+            Surface brightness (MJy/sr) until `Photons`, electrons per second from there on.
+        block : `Block`
+            Where and when; its flags are not used.
+
+        Returns
+        -------
+        array : `~numpy.ndarray`, shape (n_row, n_col)
+        """
+        return array
+
+    def limit(self, properties):
+        """
+        Charge from which the effect flags a group as saturated.
+
+        Parameters
+        ----------
+        properties : `~miricigale.instrument.DetectorProperties`
+            Full well, gain and the rest.
+
+        Returns
+        -------
+        electrons : float
+            Infinite for effects that do not.
+        """
+        return np.inf

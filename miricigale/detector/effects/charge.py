@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+from scipy import ndimage
 
 from miricigale.detector import _core
 from miricigale.detector.dq import DQ
@@ -36,10 +37,16 @@ class Dark(Effect):
     def apply(self, array, block):
         """Add the dark charge."""
         ramp = check_ramp(array, block, self)
-        current = block.properties.dark_current if self.current is None else self.current
-        mean = np.full(ramp.shape[2:], current * block.group_time)
+        mean = np.full(ramp.shape[2:], self._rate(block.properties) * block.group_time)
         _core.add_poisson(ramp, mean, block.key, block.rows.start)
         return ramp
+
+    def expected(self, array, block):
+        """Add the dark current."""
+        return array + self._rate(block.properties)
+
+    def _rate(self, properties):
+        return properties.dark_current if self.current is None else self.current
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,6 +66,11 @@ class InterpixelCapacitance(Effect):
         kernel = np.asarray(block.properties.ipc_kernel, np.float32)
         _core.couple_neighbours(ramp, kernel)
         return ramp
+
+    def expected(self, array, block):
+        """Couple the rates of neighbours."""
+        kernel = np.asarray(block.properties.ipc_kernel)
+        return ndimage.correlate(array, kernel, mode="nearest")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,16 +170,24 @@ class BadPixels(Effect):
     def apply(self, array, block):
         """Empty the dead pixels and heat the hot ones."""
         ramp = check_ramp(array, block, self)
-        bad = bad_pixel_mask(subarray=block.exposure.subarray)[block.rows]
-        y, x = np.indices(bad.shape)
-        dead = bad & ((y + block.rows.start + x) % 2 == 0)
-        hot = bad & ~dead
+        dead, hot = self._pixels(block)
         ramp[:, :, dead] = 0.0
         mean = np.where(hot, self.hot_current * block.group_time, 0.0)
         _core.add_poisson(ramp, mean, block.key, block.rows.start)
         block.pixel_dq[dead] |= np.uint32(DQ.DEAD | DQ.DO_NOT_USE)
         block.pixel_dq[hot] |= np.uint32(DQ.HOT | DQ.DO_NOT_USE)
         return ramp
+
+    def expected(self, array, block):
+        """NaN: whatever they collect is no signal."""
+        dead, hot = self._pixels(block)
+        return np.where(dead | hot, np.nan, array)
+
+    def _pixels(self, block):
+        bad = bad_pixel_mask(subarray=block.exposure.subarray)[block.rows]
+        y, x = np.indices(bad.shape)
+        dead = bad & ((y + block.rows.start + x) % 2 == 0)
+        return dead, bad & ~dead
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,6 +207,11 @@ class ReferencePixels(Effect):
         block.pixel_dq[mask] |= np.uint32(DQ.REFERENCE_PIXEL | DQ.NON_SCIENCE)
         return ramp
 
+    def expected(self, array, block):
+        """NaN: they are no part of the image."""
+        mask = reference_pixel_mask(subarray=block.exposure.subarray)[block.rows]
+        return np.where(mask, np.nan, array)
+
 
 @dataclasses.dataclass(frozen=True)
 class Saturation(Effect):
@@ -204,6 +229,10 @@ class Saturation(Effect):
     def apply(self, array, block):
         """Clip the charge and flag it."""
         ramp = check_ramp(array, block, self)
-        well = block.properties.full_well if self.full_well is None else self.full_well
-        _core.clip_well(ramp, float(well), block.group_dq, np.uint8(DQ.SATURATED))
+        well = self.limit(block.properties)
+        _core.clip_well(ramp, well, block.group_dq, np.uint8(DQ.SATURATED))
         return ramp
+
+    def limit(self, properties):
+        """The full well in electrons."""
+        return float(properties.full_well if self.full_well is None else self.full_well)

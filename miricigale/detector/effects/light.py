@@ -7,8 +7,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from miricigale.detector import _core
 from miricigale.detector.effects.base import Effect, key_words
-from miricigale.instrument import flat_field, photmjsr
-from miricigale.utils.exceptions import argument_error
+from miricigale.instrument import flat_field, photmjsr, residual_amplitude, residual_presets
+from miricigale.utils.exceptions import argument_error, unknown_name
 
 __all__ = ["Photons", "Residual"]
 
@@ -23,20 +23,25 @@ class Residual(Effect):
 
     Parameters
     ----------
-    amplitude : float
-        Standard deviation of the pattern, as a fraction of the light.
+    amplitude : float or str
+        Standard deviation of the pattern, as a fraction of the light; or ``"etc"`` for one per
+        filter, which holds at the default correlation
+        (`~miricigale.instrument.residual_amplitude`).
     correlation : float, optional
         Gaussian width of the pattern's correlation in pixels; 0 for white.
     pattern : int, optional
         Which random pattern: a property of the detector, apart from the exposure's seed.
     """
 
-    amplitude: float
+    amplitude: float | str
     correlation: float = 1.0
     pattern: int = 0
 
     def __post_init__(self):
-        if not 0 <= self.amplitude < 0.2:
+        if isinstance(self.amplitude, str):
+            if self.amplitude not in residual_presets():
+                raise unknown_name("residual preset", self.amplitude, residual_presets())
+        elif not 0 <= self.amplitude < 0.2:
             raise argument_error("amplitude", "a fraction from 0 to 0.2", self.amplitude)
         if not 0 <= self.correlation <= 30:
             raise argument_error("correlation", "from 0 to 30 pixels", self.correlation)
@@ -57,7 +62,12 @@ class Residual(Effect):
                 white = gaussian_filter1d(white, self.correlation, axis=axis, truncate=4.0)
             # unit variance: each axis has multiplied it by the sum of the squared weights
             white = white[reach:-reach, reach:-reach] / np.sum(shape**2)
-        return array * (1.0 + self.amplitude * white)
+        amplitude = self.amplitude
+        if isinstance(amplitude, str):
+            amplitude = residual_amplitude(block.exposure.filter, amplitude)
+        return array * (1.0 + amplitude * white)
+
+    expected = apply
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,11 +87,16 @@ class Photons(Effect):
         """Turn surface brightness (MJy/sr) into a ramp (electrons)."""
         if array.ndim != 2:
             raise argument_error("effects", "a tuple with one Photons in it", "two")
-        exposure = block.exposure
-        gain = block.properties.gain
-        mean = array * (gain / photmjsr(exposure.filter, gain=gain) * block.group_time)
-        if self.flat:
-            mean = mean * flat_field(exposure.filter, subarray=exposure.subarray)[block.rows]
+        mean = self.expected(array, block) * block.group_time
         ramp = np.zeros(block.ramp_shape, np.float32)
         _core.add_poisson(ramp, np.ascontiguousarray(mean, float), block.key, block.rows.start)
         return ramp
+
+    def expected(self, array, block):
+        """Electrons per second of the brightness (MJy/sr)."""
+        exposure = block.exposure
+        gain = block.properties.gain
+        rate = array * (gain / photmjsr(exposure.filter, gain=gain))
+        if self.flat:
+            rate = rate * flat_field(exposure.filter, subarray=exposure.subarray)[block.rows]
+        return rate

@@ -112,6 +112,13 @@ class ReadNoise(Effect):
 class ADConversion(Effect):
     """Rounding to unsigned 16-bit numbers; out of range flagged AD_FLOOR or SATURATED."""
 
+    def limit(self, properties):
+        """Charge that reads the highest number; infinite where the full well reads less."""
+        highest = 65535.5 - properties.bias
+        if highest >= properties.saturation_dn:
+            return np.inf
+        return float(properties.gain * properties.linearize(highest))
+
     def apply(self, array, block):
         """Turn DN into counts."""
         ramp = check_ramp(array, block, self)

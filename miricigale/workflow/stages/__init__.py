@@ -90,7 +90,7 @@ def study_stages():
             "exposures",
             make_exposure,
             "exposure",
-            version=2,
+            version=3,
             needs=("truth",),
             sections=(*images, "run.keep_level1b"),
             resources=image_data,

@@ -1,13 +1,14 @@
 """Stages 4 to 10: scenes, ramps, rates, calibrated images, mosaics, prior, kernels."""
 
 import dataclasses
+import logging
 
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
-from miricigale.detector import Detector
+from miricigale.detector import Detector, forecast_table
 from miricigale.instrument import Exposure, background_level, ceers_exposures, mosaic_wcs
 from miricigale.photometry import detect_sources
 from miricigale.psf import MatchingKernel, hst_psf, miri_psf, psf_mosaic
@@ -28,6 +29,8 @@ __all__ = [
     "reducer_of",
     "study_exposures",
 ]
+
+log = logging.getLogger(__name__)
 
 
 def study_exposures(config):
@@ -103,7 +106,7 @@ def reducer_of(config, n_threads=None):
     )
 
 
-def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, keep=None):
+def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, tell=None, keep=None):
     """
     Take one exposure of a catalogue from the scene to the calibrated image.
 
@@ -119,6 +122,8 @@ def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, keep=N
         Seed of the detector.
     n_threads : int, optional
         Threads; it changes nothing in the result.
+    tell : callable, optional
+        Called with the `~miricigale.detector.SaturationForecast`, before anything is exposed.
     keep : callable, optional
         Called with the `~miricigale.detector.Ramp`, to write it.
 
@@ -145,7 +150,11 @@ def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, keep=N
     detector = Detector.miri_imager(
         cosmic_rays=config.detector.cosmic_rays, residual=config.detector.residual or False
     )
-    ramp = detector.expose(scene.render(), exposure, seed=seed, n_threads=n_threads)
+    image = scene.render()
+    if tell is not None:
+        tell(detector.forecast(image, exposure, sources=scene.truth))
+    ramp = detector.expose(image, exposure, seed=seed, n_threads=n_threads)
+    del image
     if keep is not None:
         keep(ramp)
     reducer = reducer_of(config, n_threads)
@@ -161,6 +170,10 @@ def make_exposure(context, unit):
     exposure = study_exposures(config)[unit]
     truth = QTable.read(context.path("truth.ecsv"))
 
+    def tell(forecast):
+        log.info(forecast.describe())
+        context.save_table(f"exposures/{unit}_forecast.ecsv", forecast_table([forecast]))
+
     def keep(ramp):
         context.save(f"level1b/{unit}_uncal.fits", ramp.write)
 
@@ -170,6 +183,7 @@ def make_exposure(context, unit):
         truth,
         seed=context.seed,
         n_threads=context.n_threads,
+        tell=tell,
         keep=keep if config.run.keep_level1b else None,
     )
     for label, image in (("rate", rate), ("cal", cal)):

@@ -1,0 +1,162 @@
+"""
+What resets do to the ramps of MIRI: the anomaly after one, the first and the last frame.
+
+The effects act on DN above the bias, after `Nonlinearity` and before `Bias`: in the same
+place as the steps of the official pipeline that undo them (reset, rscd, lastframe; all but
+the second before the linearity correction). Reference pixels do not show them: a drift
+that they shared would be gone with the reference-pixel correction.
+
+Published is how the effects run, not one number for how strong they are; every amplitude
+below is of our own, plausible in size, and can be given.
+
+References
+----------
+Morrison et al. 2023, PASP 135, 075004, arXiv:2308.16327 (detector effects in flight and the
+pipeline's algorithms); Ressler et al. 2015, PASP 127, 675; documentation of the JWST pipeline, steps
+``reset``, ``rscd``, ``firstframe`` and ``lastframe``.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from miricigale.detector import _core
+from miricigale.detector.effects.base import Effect, check_ramp
+from miricigale.instrument import reference_pixel_mask
+from miricigale.utils.exceptions import argument_error
+
+__all__ = ["FirstFrame", "LastFrame", "ResetAnomaly"]
+
+
+def _check_finite(**values):
+    for name, value in values.items():
+        if not np.all(np.isfinite(value)):
+            raise argument_error(name, "finite", value)
+
+
+def _light_sensitive(block):
+    """True where a pixel is no reference pixel, (n_row, n_col)."""
+    return ~reference_pixel_mask(subarray=block.exposure.subarray)[block.rows]
+
+
+@dataclasses.dataclass(frozen=True)
+class ResetAnomaly(Effect):
+    """
+    The level right after a reset, which settles exponentially.
+
+    Group g (from 0) is offset by ``amplitude exp(-g / groups)``, whatever the signal and
+    in every pixel alike. The decay belongs to the number of the group rather than to time,
+    and has gone by about group 15; the amplitude changes over the first integrations.
+    (The spatial structure that real first groups show in addition is not simulated.)
+
+    Parameters
+    ----------
+    amplitudes : tuple of float, optional
+        Offset of the first group in DN, for the first integration, the second, and so on;
+        the last holds for all further ones. The published fact is that they differ up to
+        the second integration; these values are of our own.
+    groups : float, optional
+        Number of groups in which the offset falls by a factor e. The default, 4, leaves
+        3 % at the 15th group.
+    """
+
+    amplitudes: tuple = (-30.0, -20.0)
+    groups: float = 4.0
+
+    def __post_init__(self):
+        amplitudes = tuple(float(a) for a in np.atleast_1d(self.amplitudes))
+        object.__setattr__(self, "amplitudes", amplitudes)
+        if not amplitudes:
+            raise argument_error("amplitudes", "at least one amplitude", "none")
+        _check_finite(amplitudes=amplitudes)
+        if not (np.isfinite(self.groups) and self.groups > 0):
+            raise argument_error("groups", "positive", self.groups)
+
+    def offsets(self, n_integrations, n_groups):
+        """
+        Offset of each group.
+
+        Parameters
+        ----------
+        n_integrations, n_groups : int
+            Of the exposure.
+
+        Returns
+        -------
+        offsets : `~numpy.ndarray`, shape (n_integrations, n_groups)
+            In DN.
+        """
+        last = len(self.amplitudes) - 1
+        amplitudes = [self.amplitudes[min(i, last)] for i in range(n_integrations)]
+        return np.outer(amplitudes, np.exp(-np.arange(n_groups) / self.groups))
+
+    def apply(self, array, block):
+        """Add the offsets."""
+        ramp = check_ramp(array, block, self)
+        offsets = self.offsets(*ramp.shape[:2]).astype(np.float32)
+        sees = _light_sensitive(block).astype(np.float32)
+        for i, g in np.ndindex(*offsets.shape):
+            ramp[i, g] += offsets[i, g] * sees
+        return ramp
+
+
+@dataclasses.dataclass(frozen=True)
+class FirstFrame(Effect):
+    """
+    The transient of the first group of an integration, which the reductions leave out.
+
+    Parameters
+    ----------
+    offset : float, optional
+        In DN, of every pixel; of our own.
+    """
+
+    offset: float = -15.0
+
+    def __post_init__(self):
+        _check_finite(offset=self.offset)
+
+    def apply(self, array, block):
+        """Offset the first groups."""
+        ramp = check_ramp(array, block, self)
+        ramp[:, 0] += np.float32(self.offset) * _light_sensitive(block).astype(np.float32)
+        return ramp
+
+
+@dataclasses.dataclass(frozen=True)
+class LastFrame(Effect):
+    """
+    The pull of the reset on the last group of an integration.
+
+    The last group is read while the rows are reset in pairs. What the reset of the pair
+    before it does to a pixel has a part of the bias and one of the collected signal:
+    the group is offset by ``offset`` plus ``-coupling`` times the mean signal of the two
+    pixels of the preceding row pair in the same column. The first pair has none before it.
+
+    Parameters
+    ----------
+    offset : float, optional
+        In DN, of every pixel but those of the first pair; of our own.
+    coupling : float, optional
+        Share of the neighbouring pair's signal that is lost; of our own.
+    """
+
+    offset: float = -10.0
+    coupling: float = 0.005
+
+    # an odd row, its even one, and the pair before
+    halo = 3
+
+    def __post_init__(self):
+        _check_finite(offset=self.offset)
+        if not 0 <= self.coupling < 1:
+            raise argument_error("coupling", "a share from 0 to 1", self.coupling)
+
+    def apply(self, array, block):
+        """Pull the last groups."""
+        ramp = check_ramp(array, block, self)
+        sees = _light_sensitive(block)
+        _core.pull_last_group(
+            ramp, sees, block.rows.start, np.float32(self.offset), np.float32(self.coupling)
+        )
+        return ramp

@@ -1,0 +1,231 @@
+"""What will saturate, told before an exposure is simulated."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.detector.effects import Block
+from miricigale.instrument import Exposure
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.tables import require_columns
+
+__all__ = [
+    "NEVER",
+    "SKY_FRACTION",
+    "SaturationForecast",
+    "forecast",
+    "forecast_table",
+    "saturation_group",
+]
+
+#: Share of the full well from which the sky is spoken of.
+SKY_FRACTION = 0.6
+
+#: Group of what is never full.
+NEVER = 2**31 - 1
+
+#: Pixels around a source's own in which its brightest is looked for.
+_REACH = 1
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class SaturationForecast:
+    """
+    What an exposure fills, made by `Detector.forecast`; it never changes.
+
+    Groups are counted from 1, as in n_groups.
+
+    Parameters
+    ----------
+    exposure : `~miricigale.instrument.Exposure`
+        What is exposed.
+    sky_rate : `~astropy.units.Quantity`
+        Electrons per second of the median pixel, dark current included.
+    sky_fraction : float
+        Of the full well that it fills by the last group of an integration.
+    sky_group : int
+        Group in which it is full, were there so many.
+    n_pixels : int
+        Pixels that are full by the last group; bad and reference pixels do not count.
+    sources : `~astropy.table.QTable`
+        One row for each source on the image: ``id``, ``x``, ``y``; ``peak_rate``
+        (electrons per second of its brightest pixel, everything in it included);
+        ``peak_fraction`` of the well by the last group; ``saturated``, whether it is full
+        by then; ``group``, in which it first is (0 if it is not).
+    """
+
+    exposure: Exposure
+    sky_rate: u.Quantity
+    sky_fraction: float
+    sky_group: int
+    n_pixels: int
+    sources: QTable
+
+    @property
+    def saturated(self):
+        """Rows of ``sources`` that saturate, the brightest first."""
+        rows = self.sources[self.sources["saturated"]]
+        return rows[np.argsort(-rows["peak_rate"].value, kind="stable")]
+
+    @property
+    def sky_too_bright(self):
+        """Whether the sky fills more than 60 % of the well."""
+        return self.sky_fraction > SKY_FRACTION
+
+    def describe(self):
+        """
+        One line of text, for a log.
+
+        Returns
+        -------
+        text : str
+        """
+        e, rows = self.exposure, self.saturated
+        text = (
+            f"{e.filter} dither {e.dither} ({e.readout} {e.subarray}, {e.n_integrations} x "
+            f"{e.n_groups} groups): sky fills {100 * self.sky_fraction:.0f} % of the well; "
+            f"saturated: {self.n_pixels} pixel(s), {len(rows)} source(s)"
+        )
+        if len(rows):
+            text += f", the first in group {rows['group'].min()}"
+        return text
+
+    def __repr__(self):
+        return f"<SaturationForecast {self.describe()}>"
+
+
+def forecast(light, exposure, effects, properties, *, sources=None):
+    """
+    Forecast an exposure; see `Detector.forecast`, which checks the image.
+
+    Parameters
+    ----------
+    light : `~numpy.ndarray`, shape (ny, nx)
+        The image in MJy/sr.
+    exposure : `~miricigale.instrument.Exposure`
+        What is exposed.
+    effects : tuple of `Effect`
+        Those that act on this image.
+    properties : `~miricigale.instrument.DetectorProperties`
+        The detector.
+    sources : `~astropy.table.Table`, optional
+        Sources with ``id``, ``x``, ``y``.
+
+    Returns
+    -------
+    forecast : `SaturationForecast`
+    """
+    rate = light
+    block = Block(exposure, properties, slice(0, light.shape[0]), None, None, None)
+    for effect in effects:
+        rate = effect.expected(rate, block)
+    limit = min((effect.limit(properties) for effect in effects), default=np.inf)
+    step = exposure.group_time.to_value(u.s)
+    group = saturation_group(rate, limit, step)
+    good = rate[np.isfinite(rate)]
+    sky = float(np.median(good)) if good.size else np.nan
+    return SaturationForecast(
+        exposure,
+        sky * u.electron / u.s,
+        sky * step * exposure.n_groups / limit,
+        int(saturation_group(sky, limit, step)),
+        int(np.count_nonzero(group <= exposure.n_groups)),
+        _sources(sources, rate, group, limit, exposure),
+    )
+
+
+def saturation_group(rate, limit, step):
+    """
+    Group, from 1, by which a constant rate fills the well: the ceiling of limit / (rate step).
+
+    Non-linearity plays no part in it: the well is one of charge, before the response.
+
+    Parameters
+    ----------
+    rate : array_like
+        Electrons per second.
+    limit : float
+        The well in electrons.
+    step : float
+        Time of a group in s.
+
+    Returns
+    -------
+    group : `~numpy.ndarray` of int
+        At least 1; `NEVER` where nothing fills it.
+    """
+    rate = np.asarray(rate, float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # a rate that fills it exactly does so in that group, whatever the rounding
+        group = np.ceil(limit / (rate * step) * (1 - 1e-12))
+    usable = np.isfinite(group) & (rate > 0) & (group < NEVER)
+    return np.where(usable, np.maximum(group, 1), NEVER).astype(np.int64)
+
+
+def _sources(sources, rate, group, limit, exposure):
+    """The table of sources on the image."""
+    if sources is None:
+        sources = QTable({"id": np.zeros(0, int), "x": np.zeros(0), "y": np.zeros(0)})
+    require_columns(sources, ("id", "x", "y"), "sources")
+    ny, nx = rate.shape
+    x, y = (np.asarray(sources[name], float) for name in ("x", "y"))
+    with np.errstate(invalid="ignore"):
+        on = (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
+    table = QTable({name: sources[name][on] for name in ("id", "x", "y")})
+    column, row = (np.rint(v[on]).astype(int) for v in (x, y))
+    peak = np.zeros(len(table))
+    first = np.full(len(table), NEVER)
+    for dy in range(-_REACH, _REACH + 1):
+        for dx in range(-_REACH, _REACH + 1):
+            r, c = np.clip(row + dy, 0, ny - 1), np.clip(column + dx, 0, nx - 1)
+            peak = np.fmax(peak, rate[r, c])
+            first = np.minimum(first, group[r, c])
+    filled = peak * exposure.integration_time.to_value(u.s)
+    table["peak_rate"] = peak * u.electron / u.s
+    table["peak_fraction"] = filled / limit
+    table["saturated"] = first <= exposure.n_groups
+    table["group"] = np.where(table["saturated"], first, 0)
+    return table
+
+
+def forecast_table(forecasts):
+    """
+    Forecasts of several exposures side by side.
+
+    Parameters
+    ----------
+    forecasts : iterable of `SaturationForecast`
+        One for each exposure.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        One row each: the exposure (``filter``, ``dither``, ``readout``, ``subarray``,
+        ``n_groups``, ``n_integrations``, ``group_time``), ``sky_fraction`` of the full well
+        by the last group, ``sky_group`` in which it would be full, ``n_pixels`` and
+        ``n_sources`` that saturate, the ``first_group`` in which a source does (0: none) and
+        their ``ids``, the brightest first, separated by blanks.
+
+    Raises
+    ------
+    ValueError
+        If there are none.
+    """
+    forecasts = list(forecasts)
+    if not forecasts:
+        raise argument_error("forecasts", "at least one forecast", "none")
+    columns = {}
+    for name in ("filter", "dither", "readout", "subarray", "n_groups", "n_integrations"):
+        columns[name] = [getattr(f.exposure, name) for f in forecasts]
+    columns["group_time"] = u.Quantity([f.exposure.group_time for f in forecasts])
+    for name in ("sky_fraction", "sky_group", "n_pixels"):
+        columns[name] = [getattr(f, name) for f in forecasts]
+    rows = [f.saturated for f in forecasts]
+    columns["n_sources"] = [len(r) for r in rows]
+    columns["first_group"] = [int(r["group"].min()) if len(r) else 0 for r in rows]
+    columns["ids"] = [" ".join(str(i) for i in r["id"]) for r in rows]
+    table = QTable(columns)
+    table["sky_fraction"].info.description = "of the full well by the last group"
+    return table

@@ -1,0 +1,148 @@
+"""How the exposure time calculator gets its published limits, and the residual they imply."""
+
+import dataclasses
+import functools
+import tomllib
+
+import astropy.units as u
+
+from miricigale.instrument.exposure import frame_time
+from miricigale.instrument.figures import filter_row
+from miricigale.refdata import locate
+from miricigale.utils.exceptions import unknown_name
+
+__all__ = ["EtcSetup", "etc_setup", "residual_amplitude", "residual_presets"]
+
+
+@functools.cache
+def _table():
+    """The whole of ``etc.toml`` as a dict."""
+    return tomllib.loads(locate("instrument.etc").read_text())
+
+
+def _short(filter):
+    """Name of a filter in the table; `KeyError` with the known ones for any other."""
+    filter_row(filter)
+    return str(filter).removeprefix("miri.")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class EtcSetup:
+    """
+    Exposures and extraction behind a published limit (see `etc_setup`).
+
+    Parameters
+    ----------
+    filter : str
+        Such as ``"miri.f770w"``.
+    radius : `~astropy.units.Quantity`
+        Of the circular aperture, arcsec.
+    annulus : `~astropy.units.Quantity`
+        Inner and outer radius of the sky annulus, arcsec: as large as the aperture.
+    subtract_annulus : bool
+        Whether the annulus is measured. The published limits take the sky as known.
+    readout : str
+        Readout pattern; full frame.
+    n_groups, n_integrations, n_exposures : int
+        Groups of an integration, integrations of an exposure, exposures at one position.
+    """
+
+    filter: str
+    radius: u.Quantity
+    annulus: u.Quantity
+    subtract_annulus: bool
+    readout: str
+    n_groups: int
+    n_integrations: int
+    n_exposures: int
+
+    @property
+    def time(self):
+        """Time in which light is gathered, all exposures, s."""
+        n_frames = self.n_groups * self.n_integrations * self.n_exposures
+        return n_frames * frame_time(self.readout)
+
+
+def etc_setup(filter):
+    """
+    Exposures and extraction behind the published limits: 10 sigma in 10 ks.
+
+    Parameters
+    ----------
+    filter : str
+        One of `imager_filters`.
+
+    Returns
+    -------
+    setup : `EtcSetup`
+
+    References
+    ----------
+    The script with which the observatory makes the table,
+    ``tests/miri/miri_sensitivity_imaging.py`` of spacetelescope/pandeia-verification; the
+    limits of `etc_limit` are those of JWST user documentation, MIRI Sensitivity.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import etc_setup
+    >>> setup = etc_setup("miri.f1000w")
+    >>> print(f"{setup.radius:.2f}, {setup.n_groups} groups, {setup.time:.0f}")
+    0.42 arcsec, 106 groups, 10001 s
+    """
+    name = _short(filter)
+    table = _table()
+    common, row = table["setup"], table["filters"][name]
+    radius = common["radius_per_um"] * row["wavelength"] * u.arcsec
+    return EtcSetup(
+        filter=f"miri.{name}",
+        radius=radius,
+        annulus=radius * common["annulus"],
+        subtract_annulus=common["subtract_annulus"],
+        readout=common["readout"],
+        n_groups=row["n_groups"],
+        n_integrations=row["n_integrations"],
+        n_exposures=row["n_exposures"],
+    )
+
+
+def residual_presets():
+    """Names of the sets of residuals that `residual_amplitude` knows."""
+    return tuple(_table()["residual"])
+
+
+def residual_amplitude(filter, preset="etc"):
+    """
+    Size of the fixed pattern that flat field and sky subtraction leave behind.
+
+    Parameters
+    ----------
+    filter : str
+        One of `imager_filters`.
+    preset : str, optional
+        ``"etc"``: with it, the limits of the exposure time calculator 4.0 come out of its own
+        exposures and extraction.
+
+    Returns
+    -------
+    amplitude : float
+        Standard deviation as a fraction of the light, for a pattern with a Gaussian
+        correlation of 1 pixel (`~miricigale.detector.Residual`).
+
+    Notes
+    -----
+    Not a measurement: what photons, read noise and dark current leave of the published
+    limits, all of it taken for a pattern that does not average down in 10 ks at one
+    position. ``tools/make_residual.py`` solves for it. In dithered exposures it averages down
+    with the number of positions.
+
+    Examples
+    --------
+    >>> from miricigale.instrument import residual_amplitude
+    >>> 1e-5 < residual_amplitude("miri.f2550w") < residual_amplitude("miri.f560w") < 1e-2
+    True
+    """
+    name = _short(filter)
+    presets = _table()["residual"]
+    if preset not in presets:
+        raise unknown_name("residual preset", preset, presets)
+    return presets[preset][name]

@@ -1,0 +1,394 @@
+"""How faint a point source an exposure reaches through an aperture: the closed form."""
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+from photutils.aperture import CircularAnnulus, CircularAperture
+from scipy.linalg import solveh_banded
+from scipy.ndimage import gaussian_filter1d
+
+from miricigale.instrument import (
+    background_level,
+    etc_limit,
+    etc_setup,
+    frame_time,
+    imager_filters,
+    miri_detector,
+    photmjsr,
+    residual_amplitude,
+)
+from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image, psf_info
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.meta import provenance
+from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, TIME, to_array
+
+__all__ = ["sensitivity", "sensitivity_table"]
+
+# positions of the source's centre within the pixel, per axis, over which is averaged
+_PHASES = (np.arange(4) + 0.5) / 4 - 0.5
+
+
+def ramp_variance(rate, *, n_groups, group_time, read_noise):
+    """
+    Variance of the optimally weighted slope of one ramp.
+
+    The differences of groups have Poisson variance on the diagonal and share the read
+    noise with their neighbours; the best slope has the variance 1 / (1^T C^-1 1).
+
+    Parameters
+    ----------
+    rate : float
+        Electrons per second.
+    n_groups : int
+        Groups, at least 2.
+    group_time : float
+        In s.
+    read_noise : float
+        Of one group, electrons.
+
+    Returns
+    -------
+    variance : float
+        (Electrons per second) squared.
+    """
+    if rate == 0 and read_noise == 0:
+        return 0.0
+    n = n_groups - 1
+    band = np.zeros((2, n))
+    band[0] = -(read_noise**2)  # above the diagonal; the first is not used
+    band[1] = rate * group_time + 2 * read_noise**2
+    return 1.0 / (np.sum(solveh_banded(band, np.ones(n))) * group_time**2)
+
+
+def extraction_weights(radius, annulus=None, *, offset=(0.0, 0.0)):
+    """
+    Weight of each pixel in the flux: aperture less the sky of the annulus.
+
+    Parameters
+    ----------
+    radius : float
+        Of the aperture, pixels.
+    annulus : tuple of float or None, optional
+        Inner and outer radius in pixels; None if the sky is known.
+    offset : tuple of float, optional
+        Of the centre from that of the middle pixel, x, y.
+
+    Returns
+    -------
+    weights : `~numpy.ndarray`, shape (n, n), n odd
+        Overlap of pixel and circle; in the annulus minus the ratio of the areas.
+    """
+    half = int(np.ceil(max(radius, *(annulus or (0.0,))))) + 2
+    centre = (half + offset[0], half + offset[1])
+    shape = (2 * half + 1, 2 * half + 1)
+    weights = CircularAperture(centre, radius).to_mask(method="exact").to_image(shape)
+    if annulus is not None:
+        sky = CircularAnnulus(centre, *annulus).to_mask(method="exact").to_image(shape)
+        weights = weights - sky * (weights.sum() / sky.sum())
+    return weights
+
+
+def noise_power(weights, correlation=None):
+    """
+    Variance of a weighted sum of pixels of unit variance.
+
+    Parameters
+    ----------
+    weights : `~numpy.ndarray`, shape (ny, nx)
+        Weights.
+    correlation : float or None, optional
+        Gaussian width in pixels with which white noise was smoothed (and brought back to
+        unit variance); None or 0 for white noise.
+
+    Returns
+    -------
+    power : float
+        Sum of w_i w_j rho_ij.
+    """
+    if not correlation:
+        return float(np.sum(weights**2))
+    reach = int(np.ceil(4 * correlation))
+    smooth = np.pad(weights, reach)
+    delta = np.zeros(2 * reach + 1)
+    delta[reach] = 1.0
+    shape = gaussian_filter1d(delta, correlation, truncate=4.0)
+    for axis in (0, 1):
+        smooth = gaussian_filter1d(smooth, correlation, axis=axis, truncate=4.0, mode="constant")
+    return float(np.sum(smooth**2) / np.sum(shape**2) ** 2)
+
+
+def _radii(aperture, annulus, setup):
+    """Radii in arcsec, checked."""
+    radius = setup.radius if aperture is None else aperture
+    radius = float(to_array(radius, ANGLE, "aperture", ndim=0, finite=True))
+    if not 0 < radius < 8:
+        raise argument_error("aperture", "between 0 and 8 arcsec", aperture)
+    if annulus is None:
+        return radius, None
+    edges = to_array(annulus, ANGLE, "annulus", ndim=1, finite=True)
+    if edges.size != 2 or not radius <= edges[0] < edges[1] <= 10:
+        wanted = "an inner and outer radius outside the aperture, up to 10 arcsec"
+        raise argument_error("annulus", wanted, annulus)
+    return radius, (float(edges[0]), float(edges[1]))
+
+
+def _amplitude(residual, filter):
+    """Fraction of the light that stays as a pattern."""
+    if residual is None or residual is False:
+        return 0.0
+    if isinstance(residual, str):
+        return residual_amplitude(filter, residual)
+    value = float(to_array(residual, u.dimensionless_unscaled, "residual", ndim=0))
+    if residual is True or not 0 <= value < 0.2:
+        raise argument_error("residual", "None, a name or a fraction from 0 to 0.2", residual)
+    return value
+
+
+def _extraction(radius, annulus, psf, correlation):
+    """Light in the extraction and noise powers, means over positions within the pixel."""
+    info = psf_info(psf)
+    if "pixel" not in info.includes:
+        raise argument_error("psf", "a PSF that includes the pixel", f"one with {info.includes}")
+    scale = MIRI_PIXEL_SCALE.value
+    edges = None if annulus is None else tuple(edge / scale for edge in annulus)
+    values = []
+    for dy in _PHASES:
+        for dx in _PHASES:
+            weights = extraction_weights(radius / scale, edges, offset=(dx, dy))
+            share = psf_image(
+                psf, pixel_scale=MIRI_PIXEL_SCALE, shape=weights.shape, offset=(dx, dy)
+            )
+            values.append(
+                (
+                    np.sum(weights * share),
+                    noise_power(weights),
+                    np.sum(weights**2 * share),
+                    noise_power(weights, correlation),
+                )
+            )
+    return np.mean(values, axis=0)
+
+
+def sensitivity(
+    filter,
+    time=1e4 * u.s,
+    *,
+    n_sigma=10.0,
+    aperture=None,
+    annulus=None,
+    background=None,
+    residual=None,
+    correlation=1.0,
+    n_dithers=1,
+    n_groups=None,
+    readout="FASTR1",
+    subarray="FULL",
+    psf=None,
+    detector=None,
+):
+    """
+    Flux of the point source that an exposure measures with a given significance.
+
+    Photon noise of sky, dark current and source, read noise of optimally fitted ramps, and,
+    if asked for, a residual pattern, summed in a circular aperture.
+
+    Parameters
+    ----------
+    filter : str
+        One of `~miricigale.instrument.imager_filters`.
+    time : `~astropy.units.Quantity`, optional
+        Total exposure time, all dithers.
+    n_sigma : float, optional
+        Flux over its error.
+    aperture : `~astropy.units.Quantity`, optional
+        Radius; that of the exposure time calculator's own limits by default
+        (`~miricigale.instrument.etc_setup`).
+    annulus : `~astropy.units.Quantity`, shape (2,), optional
+        Inner and outer radius of a sky annulus whose mean is taken off. By default the sky is
+        known, as in those limits.
+    background : `~astropy.units.Quantity`, optional
+        Surface brightness of sky and telescope; the low background by default.
+    residual : str, float or None, optional
+        Fraction of the sky that stays as a fixed pattern
+        (`~miricigale.detector.Residual`), or ``"etc"``
+        (`~miricigale.instrument.residual_amplitude`). It does not average down with time.
+    correlation : float, optional
+        Gaussian width of the pattern's correlation in pixels.
+    n_dithers : int, optional
+        Positions over which the time is divided; the pattern averages down with them.
+    n_groups : int, optional
+        Groups of an integration; those of the calculator's limits by default.
+    readout, subarray : str, optional
+        As in `~miricigale.instrument.Exposure`.
+    psf : `~photutils.psf.ImagePSF`, optional
+        PSF with the pixel in it; `~miricigale.psf.miri_psf` by default.
+    detector : `~miricigale.instrument.DetectorProperties`, optional
+        `~miricigale.instrument.miri_detector` by default.
+
+    Returns
+    -------
+    flux : `~astropy.units.Quantity`
+        Total flux of the source, uJy.
+
+    Raises
+    ------
+    KeyError
+        If a name is not known.
+    ValueError
+        If a number is out of its range, the time is shorter than one integration or the sky
+        fills the well within it.
+
+    Notes
+    -----
+    Means over the positions of a source within a pixel. Time lost to cosmic rays, resets
+    between integrations and bad pixels is not counted. Optimal extraction instead of an
+    aperture: `ErrorModel.from_exposure`.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.photometry import sensitivity
+    >>> print(f"{sensitivity('miri.f1000w'):.2f}, {sensitivity('miri.f1000w', residual='etc'):.2f}")
+    0.32 uJy, 0.47 uJy
+    >>> print(f"{sensitivity('miri.f1000w', 1665 * u.s, n_sigma=5, residual='etc', n_dithers=3):.2f}")
+    0.41 uJy
+    """
+    options = {"annulus": annulus, "background": background, "correlation": correlation}
+    options |= {"n_dithers": n_dithers, "n_groups": n_groups, "readout": readout}
+    options |= {"subarray": subarray, "psf": psf, "detector": detector}
+    row = forecast(filter, time, n_sigma, residual, aperture=aperture, **options)
+    return row["flux"] * u.uJy
+
+
+def forecast(
+    filter,
+    time,
+    n_sigma,
+    residual,
+    *,
+    aperture=None,
+    annulus=None,
+    background=None,
+    correlation=1.0,
+    n_dithers=1,
+    n_groups=None,
+    readout="FASTR1",
+    subarray="FULL",
+    psf=None,
+    detector=None,
+):
+    """Everything `sensitivity` works out, in uJy, arcsec, electrons and s."""
+    setup = etc_setup(filter)
+    detector = miri_detector() if detector is None else detector
+    radius, edges = _radii(aperture, annulus, setup)
+    amplitude = _amplitude(residual, filter)
+    level = background_level(filter) if background is None else background
+    level = float(to_array(level, SURFACE_BRIGHTNESS, "background", ndim=0, finite=True))
+    seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
+    groups = setup.n_groups if n_groups is None else n_groups
+    step = frame_time(readout, subarray).to_value(TIME)
+    for name, value, good in (
+        ("n_sigma", n_sigma, n_sigma > 0),
+        ("background", background, level >= 0),
+        ("correlation", correlation, 0 <= correlation <= 30),
+        ("n_dithers", n_dithers, n_dithers >= 1),
+        ("n_groups", n_groups, groups >= 2 and int(groups) == groups),
+    ):
+        if not good:
+            wanted = {"n_sigma": "positive", "background": "at least 0"}
+            wanted |= {"correlation": "from 0 to 30 pixels", "n_dithers": "at least 1"}
+            raise argument_error(name, wanted.get(name, "an integer of at least 2"), value)
+    if seconds < groups * step * (1 - 1e-9):
+        wanted = f"at least one integration of {groups} groups, {groups * step:.4g} s"
+        raise argument_error("time", wanted, time)
+
+    # electrons per second and pixel of 1 MJy/sr; uJy of 1 MJy/sr in a pixel
+    per_level = detector.gain / photmjsr(filter, gain=detector.gain)
+    area = (MIRI_PIXEL_SCALE.to_value(u.rad) ** 2) * 1e12
+    sky = level * per_level
+    rate = sky + detector.dark_current
+    if rate * groups * step >= detector.full_well:
+        wanted = "so few that the sky does not fill the well"
+        raise argument_error("n_groups", wanted, groups)
+    ramp = {
+        "n_groups": int(groups),
+        "group_time": step,
+        "read_noise": detector.read_noise * detector.gain,
+    }
+    n_ramps = seconds / (groups * step)
+    variance = ramp_variance(rate, **ramp) / n_ramps
+    growth = (ramp_variance(1.01 * rate + 1e-3, **ramp) / n_ramps - variance) / (0.01 * rate + 1e-3)
+
+    psf = miri_psf(filter) if psf is None else psf
+    light, white, shot, pattern = _extraction(radius, edges, psf, correlation)
+    if not light > 0:
+        raise argument_error("annulus", "such that light of the source is left", annulus)
+    electrons = per_level / area  # per second and uJy
+    sky_variance = variance * white + (amplitude * sky) ** 2 * pattern / n_dithers
+    # (light F e)^2 = n^2 (V + growth shot F e), solved for F e
+    b, c = n_sigma**2 * growth * shot / light**2, n_sigma**2 * sky_variance / light**2
+    flux = (b + np.sqrt(b**2 + 4 * c)) / 2 / electrons
+    return {
+        "flux": float(flux),
+        "radius": radius,
+        "light": float(light),
+        "background": level,
+        "white": float(np.sqrt(variance * white) / electrons),
+        "residual": float(amplitude * sky * np.sqrt(pattern / n_dithers) / electrons),
+        # what a calibration of the amplitude needs, per unit amplitude
+        "pattern": float(sky * np.sqrt(pattern / n_dithers) / electrons),
+        "shot": float(growth * shot / electrons),
+    }
+
+
+def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=10.0, **options):
+    """
+    Limits of several filters beside those of the exposure time calculator.
+
+    Parameters
+    ----------
+    filters : iterable of str, optional
+        All nine imaging filters by default.
+    time, n_sigma, residual, **options
+        As for `sensitivity`.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        A row per filter: ``radius``, ``light`` (share in the aperture, less the annulus),
+        ``background``, ``noise`` and ``residual`` (standard deviations within the
+        extraction), ``limit_white`` and ``limit`` without and with the residual, ``etc_40``
+        and ``etc_20`` scaled to the time and significance.
+
+    Examples
+    --------
+    >>> from miricigale.photometry import sensitivity_table
+    >>> table = sensitivity_table(["miri.f770w", "miri.f2100w"])
+    >>> bool((abs(table["limit"] / table["etc_40"] - 1) < 0.02).all())
+    True
+    """
+    names = imager_filters() if filters is None else list(filters)
+    seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
+    rows = []
+    for name in names:
+        row = forecast(name, time, n_sigma, residual, **options)
+        bare = forecast(name, time, n_sigma, None, **options)
+        scale = n_sigma / 10 * np.sqrt(1e4 / seconds)
+        rows.append(
+            (
+                name,
+                row["radius"] * ANGLE,
+                row["light"],
+                row["background"] * SURFACE_BRIGHTNESS,
+                row["white"] * u.uJy,
+                row["residual"] * u.uJy,
+                bare["flux"] * u.uJy,
+                row["flux"] * u.uJy,
+                etc_limit(name, "4.0") * scale,
+                etc_limit(name, "2.0") * scale,
+            )
+        )
+    columns = ("filter", "radius", "light", "background", "noise", "residual")
+    columns += ("limit_white", "limit", "etc_40", "etc_20")
+    meta = provenance(time=seconds, n_sigma=float(n_sigma), residual=str(residual))
+    return QTable(rows=rows, names=columns, meta=meta)

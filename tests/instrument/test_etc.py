@@ -1,0 +1,61 @@
+"""The exposure time calculator's set-up against its public description."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.tests.helper import assert_quantity_allclose
+from numpy.testing import assert_allclose
+
+from miricigale.instrument import (
+    etc_limit,
+    etc_setup,
+    imager_filters,
+    residual_amplitude,
+    residual_presets,
+    saturation_time,
+)
+
+# JWST user documentation, MIRI Sensitivity, 10 sigma in 10 ks (uJy): tables of ETC 2.0 and 4.0,
+# the latter's digits cut off
+PUBLISHED = {
+    "2.0": [0.12, 0.24, 0.48, 1.09, 0.88, 1.21, 2.23, 3.99, 12.2],
+    "4.0": [0.13, 0.24, 0.46, 1.02, 0.83, 1.18, 2.42, 4.70, 15.3],
+}
+
+
+@pytest.mark.parametrize("version", PUBLISHED)
+def test_limits_are_the_published_ones(version):
+    for name, published in zip(imager_filters(), PUBLISHED[version], strict=True):
+        limit = etc_limit(name, version).value
+        step = 0.01 if published < 10 else 0.1
+        assert abs(limit - published) <= 1.01 * step
+
+
+@pytest.mark.parametrize("name", imager_filters())
+def test_setup(name):
+    setup = etc_setup(name)
+    assert setup.filter == name
+    # ten thousand seconds, in integrations that the sky does not fill
+    assert_quantity_allclose(setup.time, 1e4 * u.s, rtol=0.002)
+    assert setup.n_groups * 2.775 * u.s < 0.6 * saturation_time(name)
+    # 1.3 lambda / D: a little within the first dark ring
+    wave = int(name[6:-1]) / 100 * u.um
+    diffraction = (wave / (6.5 * u.m)).to(u.arcsec, u.dimensionless_angles())
+    assert_quantity_allclose(setup.radius, 1.32 * diffraction, rtol=0.01)
+    inner, outer = setup.annulus
+    assert_quantity_allclose(inner, 2 * setup.radius)
+    assert_quantity_allclose(outer**2 - inner**2, setup.radius**2)
+    assert not setup.subtract_annulus
+
+
+def test_residuals_are_small_and_named():
+    values = [residual_amplitude(name) for name in imager_filters()]
+    # of the light: below what any flat field is known to, and above nothing
+    assert np.all(np.array(values) > 1e-5)
+    assert np.all(np.array(values) < 3e-3)
+    assert residual_presets() == ("etc",)
+    assert_allclose(residual_amplitude("f770w"), residual_amplitude("miri.f770w"))
+    with pytest.raises(KeyError, match="no residual preset 'best'; known: etc"):
+        residual_amplitude("miri.f770w", "best")
+    with pytest.raises(KeyError, match="no imaging filter"):
+        etc_setup("miri.f600w")

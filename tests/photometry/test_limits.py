@@ -1,0 +1,271 @@
+"""Closed-form limits against theory, simulated white noise and published numbers."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData
+from astropy.tests.helper import assert_quantity_allclose
+from numpy.testing import assert_allclose
+from photutils.aperture import CircularAnnulus, CircularAperture
+from scipy.ndimage import gaussian_filter
+
+from miricigale.detector import Detector
+from miricigale.instrument import (
+    DetectorProperties,
+    Exposure,
+    background_level,
+    etc_limit,
+    etc_setup,
+    imager_filters,
+    photmjsr,
+    pixel_area_map,
+)
+from miricigale.photometry import sensitivity, sensitivity_table
+from miricigale.photometry.limits import extraction_weights, noise_power, ramp_variance
+from miricigale.psf import MIRI_PIXEL_SCALE, encircled_energy, gaussian_psf, miri_psf
+from miricigale.reduction import Reducer
+
+NAME = "miri.f1000w"
+
+
+@pytest.fixture(scope="module")
+def psf():
+    return miri_psf(NAME)
+
+
+def test_slope_of_photons_alone_counts_them():
+    # no read noise: the first group is lost as the zero, and nothing else
+    variance = ramp_variance(50.0, n_groups=20, group_time=2.0, read_noise=0.0)
+    assert_allclose(variance, 50.0 / (19 * 2.0))
+
+
+def test_slope_of_read_noise_alone_is_the_least_squares_line():
+    n = 20
+    variance = ramp_variance(1e-9, n_groups=n, group_time=2.0, read_noise=30.0)
+    assert_allclose(variance, 12 * 30.0**2 / (n * (n**2 - 1) * 2.0**2), rtol=1e-6)
+
+
+def test_slope_is_the_generalised_least_squares_line():
+    # straight line with free level through groups of covariance rate t_min + read noise
+    rate, n, step, read = 20.0, 12, 3.0, 25.0
+    time = step * np.arange(1, n + 1)
+    inverse = np.linalg.inv(rate * np.minimum.outer(time, time) + read**2 * np.eye(n))
+    design = np.column_stack([np.ones(n), time])
+    expected = np.linalg.inv(design.T @ inverse @ design)[1, 1]
+    variance = ramp_variance(rate, n_groups=n, group_time=step, read_noise=read)
+    assert_allclose(variance, expected, rtol=1e-9)
+
+
+def test_white_noise_of_large_extractions_is_the_area():
+    radius, annulus = 30.0, (60.0, 30.0 * np.sqrt(5))
+    area = np.pi * radius**2
+    assert_allclose(noise_power(extraction_weights(radius)), area, rtol=0.02)
+    # an annulus of the same area doubles the variance, and takes off any constant
+    weights = extraction_weights(radius, annulus, offset=(0.2, -0.4))
+    assert_allclose(noise_power(weights), 2 * area, rtol=0.05)
+    assert_allclose(weights.sum(), 0, atol=1e-9 * area)
+
+
+@pytest.mark.parametrize("correlation", [None, 1.0])
+@pytest.mark.parametrize("annulus", [None, (6.0, 8.0)])
+def test_noise_power_is_the_scatter_of_empty_apertures(annulus, correlation):
+    image = np.random.default_rng(3).normal(size=(900, 900))
+    if correlation:
+        image = gaussian_filter(image, correlation, mode="wrap")
+        image /= np.std(image)
+    at = np.arange(20, 880, 12)
+    xy = np.column_stack([v.ravel() for v in np.meshgrid(at, at)])
+    circle = CircularAperture(xy, 3.3)
+    sums = circle.do_photometry(image)[0]
+    if annulus:
+        ring = CircularAnnulus(xy, *annulus)
+        sums = sums - ring.do_photometry(image)[0] * circle.area / ring.area
+    power = noise_power(extraction_weights(3.3, annulus), correlation)
+    # 5184 apertures: 1 % of the standard deviation, the annuli overlap a little
+    assert_allclose(np.std(sums), np.sqrt(power), rtol=0.05)
+
+
+def test_large_apertures_feel_the_correlation_as_its_area():
+    # sum of the correlation exp(-d^2 / 4 c^2) over the plane
+    weights = extraction_weights(60.0)
+    ratio = noise_power(weights, 1.5) / noise_power(weights)
+    assert_allclose(ratio, 4 * np.pi * 1.5**2, rtol=0.06)
+
+
+def test_limit_of_photons_alone_is_sky_over_light(psf):
+    # Poisson sky in the aperture, no read noise, no dark; small source term left out by n_sigma
+    quiet = DetectorProperties(gain=4.0, read_noise=0.0, dark_current=0.0, full_well=1e9)
+    radius, seconds, level = 1.2 * u.arcsec, 1e4, 20.0
+    flux = sensitivity(
+        NAME,
+        seconds * u.s,
+        n_sigma=1e-3,
+        aperture=radius,
+        background=level * u.MJy / u.sr,
+        n_groups=1000,
+        detector=quiet,
+        psf=psf,
+    )
+    rate = level * 4.0 / photmjsr(NAME, gain=4.0)
+    pixels = np.pi * (radius / MIRI_PIXEL_SCALE).to_value("") ** 2
+    electrons = np.sqrt(rate / seconds * 1000 / 999 * pixels)
+    area = MIRI_PIXEL_SCALE.to_value(u.rad) ** 2 * 1e12
+    per_ujy = 4.0 / photmjsr(NAME, gain=4.0) / area
+    expected = 1e-3 * electrons / per_ujy / encircled_energy(psf, radius)
+    # fractional pixels of the rim: sum w^2 is 4 % below sum w
+    assert_quantity_allclose(flux, expected * u.uJy, rtol=0.04)
+
+
+def test_limits_fall_with_the_root_of_time_and_residuals_do_not(psf):
+    options = {"psf": psf, "n_sigma": 1e-3}
+    short, long = (sensitivity(NAME, t * u.s, **options) for t in (1e4, 1e6))
+    assert_quantity_allclose(long, short / 10, rtol=1e-3)
+    short, long = (sensitivity(NAME, t * u.s, residual=0.01, **options) for t in (1e6, 1e10))
+    floor = sensitivity(NAME, 1e12 * u.s, residual=0.01, **options)
+    assert_quantity_allclose(long, floor, rtol=1e-3)
+    assert short > 0.95 * floor
+    # twice the pattern is twice the floor, and four positions halve it
+    double = sensitivity(NAME, 1e12 * u.s, residual=0.02, **options)
+    assert_quantity_allclose(double, 2 * floor, rtol=1e-4)
+    spread = sensitivity(NAME, 1e12 * u.s, residual=0.01, n_dithers=4, **options)
+    assert_quantity_allclose(spread, floor / 2, rtol=1e-4)
+
+
+def test_faint_limits_are_linear_and_bright_ones_count_their_own_photons(psf):
+    one, three = (sensitivity(NAME, n_sigma=n, psf=psf) for n in (1, 3))
+    assert_quantity_allclose(three, 3 * one, rtol=0.005)
+    # no sky: 10^4 electrons for 100 sigma, in the light of the aperture
+    quiet = DetectorProperties(gain=4.0, read_noise=0.0, dark_current=0.0, full_well=1e12)
+    dark = sensitivity(
+        NAME, n_sigma=100, background=0 * u.MJy / u.sr, n_groups=1000, detector=quiet, psf=psf
+    )
+    radius = etc_setup(NAME).radius
+    area = MIRI_PIXEL_SCALE.to_value(u.rad) ** 2 * 1e12
+    collected = dark.value * 4 / photmjsr(NAME, gain=4.0) / area * 1e4
+    assert_allclose(collected * encircled_energy(psf, radius), 1e4, rtol=0.05)
+
+
+def test_annulus_adds_its_noise_and_takes_off_wings(psf):
+    radius, inner, outer = 1.0, 4.0, np.sqrt(4.0**2 + 1.0**2 / 0.5)
+    known = sensitivity(NAME, n_sigma=1e-3, psf=psf, aperture=radius * u.arcsec)
+    measured = sensitivity(
+        NAME, n_sigma=1e-3, psf=psf, aperture=radius * u.arcsec, annulus=[inner, outer] * u.arcsec
+    )
+    light, wings = (
+        encircled_energy(psf, radius * u.arcsec),
+        np.diff(encircled_energy(psf, [inner, outer] * u.arcsec))[0] / 2,
+    )
+    # half as noisy as the aperture: its area is twice as large
+    assert_allclose(measured / known, np.sqrt(1.5) * light / (light - wings), rtol=0.03)
+
+
+@pytest.mark.parametrize("name", imager_filters())
+def test_residual_gives_the_published_limits(name):
+    # ETC 4.0 (JWST user documentation, MIRI Sensitivity), digits cut off there
+    published = dict(
+        zip(imager_filters(), [0.13, 0.24, 0.46, 1.02, 0.83, 1.18, 2.42, 4.70, 15.3], strict=True)
+    )
+    psf = miri_psf(name, oversampling=2, fov=9 * u.arcsec, n_wavelengths=3, n_pupil=192)
+    limit = sensitivity(name, etc_setup(name).time, residual="etc", psf=psf).value
+    assert_allclose(limit, published[name], rtol=0.10)
+    # photons and read noise alone reach deeper: the calculator has excess noise
+    bare = sensitivity(name, etc_setup(name).time, psf=psf).value
+    assert 0.5 < bare / published[name] < 0.9
+
+
+def test_table_scales_the_calculators_limits(psf):
+    table = sensitivity_table([NAME], 2500 * u.s, n_sigma=5, residual=None)
+    assert_quantity_allclose(table["etc_40"], etc_limit(NAME))
+    assert_quantity_allclose(table["etc_20"], etc_limit(NAME, "2.0"))
+    assert_quantity_allclose(table["limit"], table["limit_white"])
+    assert_quantity_allclose(table["background"], background_level(NAME))
+    assert table["residual"][0] == 0 * u.uJy
+    # n sigma times the noise in the aperture, over the light in it, and a little of the source
+    assert_quantity_allclose(table["limit"], 5 * table["noise"] / table["light"], rtol=0.03)
+
+
+@pytest.mark.parametrize("annulus", [None, [0.6, 0.9] * u.arcsec])
+@pytest.mark.parametrize(("residual", "n_exposures"), [(None, 1), (0.004, 1), (0.004, 8)])
+def test_noise_is_that_of_simulated_and_reduced_exposures(residual, n_exposures, annulus):
+    name, radius, n_groups = "miri.f2100w", 0.25 * u.arcsec, 12
+    exposure = Exposure(
+        name,
+        n_groups=n_groups,
+        subarray="SUB256",
+        pointing=SkyCoord(53.1, -27.8, unit="deg"),
+        roll=0 * u.deg,
+    )
+    detector = Detector.miri_imager(residual=residual or False, cosmic_rays=False, bad_pixels=False)
+    sky = CCDData(
+        np.full(exposure.shape, background_level(name).value),
+        unit="MJy/sr",
+        meta={"psf_includes": ["pixel", "ipc"]},
+    )
+    reducer = Reducer(cosmic_rays=False, jump_threshold=None)
+    # the same pattern in each, other photons
+    mean = np.mean(
+        [
+            reducer.calibrate(reducer.fit_ramp(detector.expose(sky, exposure, seed=k))).data
+            for k in range(n_exposures)
+        ],
+        axis=0,
+    )
+    # the sky off first: its sum varies with the area of the pixels
+    level = background_level(name).value
+    flux = (mean - level) * pixel_area_map(exposure.wcs, exposure.shape) * 1e12
+    rng = np.random.default_rng(5)
+    at = np.meshgrid(np.arange(16, 240, 8.0), np.arange(16, 240, 8.0))
+    xy = np.column_stack([v.ravel() for v in at]) + rng.uniform(-0.5, 0.5, (at[0].size, 2))
+    circle = CircularAperture(xy, (radius / MIRI_PIXEL_SCALE).to_value(""))
+    sums = circle.do_photometry(flux)[0]
+    if annulus is not None:
+        ring = CircularAnnulus(xy, *(annulus / MIRI_PIXEL_SCALE).to_value(""))
+        sums = sums - ring.do_photometry(flux)[0] * circle.area / ring.area
+    table = sensitivity_table(
+        [name],
+        n_exposures * exposure.exposure_time,
+        residual=residual,
+        n_groups=n_groups,
+        subarray="SUB256",
+        aperture=radius,
+        annulus=annulus,
+    )
+    expected = np.hypot(table["noise"], table["residual"])[0].value
+    # 784 places: 2.5 % of the standard deviation
+    assert_allclose(np.std(sums - np.median(sums)), expected, rtol=0.09)
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"aperture": 0 * u.arcsec}, "aperture"),
+        ({"annulus": [0.1, 1] * u.arcsec}, "annulus"),
+        ({"annulus": [1, 2, 3] * u.arcsec}, "annulus"),
+        ({"n_sigma": 0}, "n_sigma"),
+        ({"n_dithers": 0}, "n_dithers"),
+        ({"n_groups": 1}, "n_groups"),
+        ({"n_groups": 3000, "time": 1e5 * u.s}, "n_groups"),
+        ({"time": 10 * u.s}, "time"),
+        ({"residual": 0.5}, "residual"),
+        ({"residual": True}, "residual"),
+        ({"correlation": -1}, "correlation"),
+        ({"background": -1 * u.MJy / u.sr}, "background"),
+        (
+            {"psf": gaussian_psf(0.3 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=6 * u.arcsec)},
+            "psf",
+        ),
+    ],
+)
+def test_errors_name_the_argument(options, name, psf):
+    with pytest.raises(ValueError, match=f"'{name}' must be"):
+        sensitivity(NAME, **{"psf": psf, **options})
+
+
+def test_unknown_names_list_the_known():
+    with pytest.raises(KeyError, match="no residual preset 'sky'; known: etc"):
+        sensitivity(NAME, residual="sky")
+    with pytest.raises(KeyError, match="no imaging filter"):
+        sensitivity("miri.f600w")
+    with pytest.raises(u.UnitsError, match="'time' must be"):
+        sensitivity(NAME, 1e4)
