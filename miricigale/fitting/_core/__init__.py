@@ -13,7 +13,6 @@ from miricigale.fitting._core.bounds import BLOCK
 from miricigale.fitting._core.evaluate import evaluate_runs
 from miricigale.fitting._core.floors import first_floor, raise_bounds, second_floor
 from miricigale.fitting._core.histogram import N_BINS, PER_DEX
-from miricigale.fitting._core.limits import limit_term
 from miricigale.fitting._core.search import begin, list_runs
 from miricigale.fitting._core.singles import evaluate_singles
 from miricigale.fitting._core.structs import PointTables, Request, Scratch, Sums, Tables, Target
@@ -36,7 +35,6 @@ __all__ = [
     "evaluate_runs",
     "evaluate_singles",
     "first_floor",
-    "limit_term",
     "list_runs",
     "make_scratch",
     "make_sums",

@@ -16,6 +16,8 @@ single precision can amount to.
 import numpy as np
 from numba import njit
 
+from miricigale.fitting._core.options import INNER
+
 __all__ = [
     "BLOCK",
     "DONE",
@@ -36,12 +38,6 @@ KEY_BITS = 20
 #: Bound of a pair that is not listed, or is no more.
 DONE = np.float32(-3e38)
 
-_OPTIONS = {
-    "cache": True,
-    "nogil": True,
-    "fastmath": True,
-    "error_model": "numpy",
-}
 
 # Rounding of 64 products of unit vectors in float32, generously.
 _ETA = np.float32(3e-6)
@@ -50,7 +46,7 @@ _TINY = np.float32(1e-28)
 _ALWAYS = np.float32(4.0)
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def galaxy_projections(galaxy, bands, root_weight, data, p, inverse_norm):
     """
     Project the data on every galaxy of one redshift.
@@ -91,7 +87,7 @@ def galaxy_projections(galaxy, bands, root_weight, data, p, inverse_norm):
         p[i] = _ALWAYS if faint else p[i] * r
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def torus_projections(agn, bands, root_weight, data, unit, a, a2):
     """
     Unit vectors of the tori of one redshift and their projections.
@@ -132,7 +128,7 @@ def torus_projections(agn, bands, root_weight, data, unit, a, a2):
                 unit[k, j] *= r
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def _products(unit_galaxy, unit_agn, x):
     """Fill x[m, i] = sum_j unit_agn[m, j] unit_galaxy[j, i] for GROUP tori (register blocking)."""
     zero = np.float32(0)
@@ -173,7 +169,7 @@ def _products(unit_galaxy, unit_agn, x):
         j += 1
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def pair_block(
     unit_galaxy, p, threshold, base, norm, unit_agn, a, a2, key, start, run_key, bound, top
 ):

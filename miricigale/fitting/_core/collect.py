@@ -15,6 +15,7 @@ from miricigale.fitting._core.histogram import (
 )
 from miricigale.fitting._core.lanes import LANES, PRIOR, W0, X2, A, B, P, Q, lane_model
 from miricigale.fitting._core.light import pair_weight
+from miricigale.fitting._core.options import EXACT, INNER
 from miricigale.fitting._core.products import best_mixture
 
 __all__ = [
@@ -28,7 +29,6 @@ __all__ = [
     "take_draw",
 ]
 
-_OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 #: Parts of the weight so far by which light models are sampled for the histograms ...
 PARTS = 10_000.0
 #: ... and how many of them a pair must have to go there with all its fractions.
@@ -36,7 +36,7 @@ _HEAVY = 8.0
 _LOG10_E = 0.43429448190325183
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def note_best(best, index, r, s, z, g, k, f):
     """Keep the best model; of equals the one with the lowest indices."""
     if r < best[0]:
@@ -62,7 +62,7 @@ def note_best(best, index, r, s, z, g, k, f):
     index[3] = f
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def find_best(ratio, frac_prior, zero_frac, target, best, index, lanes, z):
     """Look for the best model among the lanes."""
     buffer = lanes.buffer
@@ -84,7 +84,7 @@ def find_best(ratio, frac_prior, zero_frac, target, best, index, lanes, z):
                 note_best(best, index, r, s, z, g, k, j + zero_frac)
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def _add_bin(hist, bins, row, y, t):
     """Share a weight between the two bins whose middles are nearest to y, in bins."""
     y = min(max(y - 0.5, 0.0), N_BINS - 2.0)
@@ -96,7 +96,7 @@ def _add_bin(hist, bins, row, y, t):
     bins[row, 1] = max(bins[row, 1], column + 1)
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def add_points(tables, hist, n):
     """Add n models, of which ``hist.values`` holds the scale."""
     point, values, logs = hist.point, hist.values, hist.logs
@@ -126,7 +126,7 @@ def add_points(tables, hist, n):
             _add_bin(hist.mixed, hist.range_mixed, 0, y, t)
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def deposit_single(tables, hist, g, s, t):
     """Put a model without AGN into the histograms."""
     # what is spread over the cell of f = 0 need not be as many pieces as there are tori
@@ -141,18 +141,19 @@ def deposit_single(tables, hist, g, s, t):
             _add_bin(hist.mixed, hist.range_mixed, 0, y * PER_DEX + HALF_BINS, t)
 
 
-@njit(**_OPTIONS)
-def deposit_lanes(tables, target, hist, lanes, single, total, added, n):
+@njit(**INNER)
+def deposit_lanes(tables, target, hist, lanes, single, total, expected, added, n):
     """
     Note models in the lanes for the histograms; `add_points` puts them there.
 
     Heavy pairs go there with all their fractions. Of the light ones' weight, summed up from model
     to model, every ``PARTS``-th part of the weight so far goes to the model that it is full with
-    (systematic sampling, proportional to weight). ``added`` is the weight of all lanes;
-    ``n`` models wait already, and returned is how many do now.
+    (systematic sampling, proportional to weight); if ``expected``, about what all will sum up to,
+    is more than that, every ``PARTS``-th part of it. ``added`` is the weight of all lanes; ``n``
+    models wait already, and returned is how many do now.
     """
     buffer, index, ratio = lanes.buffer, lanes.index, tables.ratio
-    part = total / PARTS
+    part = max(total, expected) / PARTS
     carry = hist.carry[0]
     if carry + added < part:
         hist.carry[0] += added
@@ -190,7 +191,7 @@ def deposit_lanes(tables, target, hist, lanes, single, total, added, n):
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**EXACT)
 def _uniform(state):
     """Next of the random numbers in (0, 1] (splitmix64; Steele et al. 2014)."""
     state[0] += np.uint64(0x9E3779B97F4A7C15)
@@ -201,7 +202,7 @@ def _uniform(state):
     return (np.float64(x >> np.uint64(11)) + 1.0) / 9007199254740992.0
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def take_draw(draws, d, total, z, g, k, f, s, variance):
     """
     Replace draw d by a model, ``total`` being the weight of all models so far and this one.
@@ -218,7 +219,7 @@ def take_draw(draws, d, total, z, g, k, f, s, variance):
     draws.next[d] = total / _uniform(draws.state)
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def draw_lanes(ratio, zero_frac, target, draws, lanes, single, z, before, after):
     """Let the models in the lanes replace draws; sums of weight are given before and after."""
     buffer = lanes.buffer

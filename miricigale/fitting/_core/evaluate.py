@@ -23,6 +23,7 @@ from miricigale.fitting._core.lanes import (
 )
 from miricigale.fitting._core.light import light_likelihoods
 from miricigale.fitting._core.limited import limited_likelihoods
+from miricigale.fitting._core.options import ENTRY, INNER
 from miricigale.fitting._core.products import (
     agn_products,
     best_mixtures,
@@ -41,7 +42,6 @@ from miricigale.fitting._core.workspace import rescale
 
 __all__ = ["evaluate_runs"]
 
-_OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
 _KEY_MASK = (1 << KEY_BITS) - 1
 #: Runs with at least so many pairs are evaluated as a block.
@@ -50,7 +50,7 @@ _DENSE = 20
 _FEW = 8
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def _fill_limits(galaxy, agn, dust, target, lane_limit, z, g, k, lane):
     """Fill a lane with the fluxes of galaxy and torus (for c = 1) in bands with limits."""
     n = target.limits.size
@@ -61,7 +61,7 @@ def _fill_limits(galaxy, agn, dust, target, lane_limit, z, g, k, lane):
         lane_limit[n + m, lane] = agn[z, k, band] * t * dust[g]
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def _next_run(row, floor, run):
     """Fill ``run`` with the pairs of a run whose bound reaches the floor; returns their number."""
     n = np.int64(0)
@@ -77,7 +77,7 @@ def _next_run(row, floor, run):
     return n
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def _drop(row, run, n_run, cross, other, sure):
     """Note better bounds of what is not worth evaluating, mark the others as done."""
     n_left = np.int64(0)
@@ -93,8 +93,8 @@ def _drop(row, run, n_run, cross, other, sure):
     return n_left
 
 
-@njit(**_OPTIONS)
-def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single):
+@njit(**ENTRY)
+def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single, expected):
     """
     Add the pairs of the listed runs to the sums.
 
@@ -113,6 +113,8 @@ def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single
         and are not evaluated.
     single : bool
         Whether single precision will do.
+    expected : float
+        About what all weights will sum up to, for the histograms; 0 if not known.
     """
     run, cross, pq, known = scratch.run, scratch.cross, scratch.pq, scratch.known
     bound, blocks, tiles = scratch.bound, tables.blocks, tables.tiles
@@ -285,6 +287,6 @@ def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single
                 tables.ratio, first, target, sums.draws, lanes, light, z_now, before, total[0]
             )
         waiting = deposit_lanes(
-            tables.points, target, sums.hist, lanes, light, total[0], added, waiting
+            tables.points, target, sums.hist, lanes, light, total[0], expected, added, waiting
         )
     add_points(tables.points, sums.hist, waiting)

@@ -6,10 +6,10 @@ import numpy as np
 from numba import njit
 
 from miricigale.fitting._core.bounds import BLOCK, DONE, KEY_BITS
+from miricigale.fitting._core.options import ENTRY, INNER
 
 __all__ = ["N_LEVELS", "first_floor", "raise_bounds", "second_floor"]
 
-_OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
 #: Steps of the histogram of bounds, and how many there are for each unit of chi2.
 N_LEVELS = 8000
@@ -24,7 +24,7 @@ _ALL = -1e37
 _BLOCK_MASK = (1 << KEY_BITS) - 1
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def _count(bound, n, reference, count):
     """Fill the histogram of the bounds of n runs."""
     for j in range(count.size):
@@ -37,7 +37,7 @@ def _count(bound, n, reference, count):
                 count[np.int64(min(max(column, 0.0), N_LEVELS))] += 1.0
 
 
-@njit(**_OPTIONS)
+@njit(**ENTRY)
 def first_floor(bound, count, reference, n):
     """
     Least bound to evaluate first, and whether in double precision.
@@ -55,17 +55,24 @@ def first_floor(bound, count, reference, n):
     few : bool
         Whether these are few enough for double precision; where many pairs could be as good as
         the best, none has much weight.
+    first, rest : float
+        Sums of exp((bound - reference) / 2) of these and of the others.
     """
     _count(bound, n, reference, count)
     total = 0.0
-    for j in range(int(_FIRST * _PER_UNIT)):
-        total += count[j]
-        if total > _MOST:
-            return reference - (j + 1) / _PER_UNIT, total < _FEW * _MOST
-    return reference - _FIRST, True
+    first = 0.0
+    last = np.int64(0)
+    while last < int(_FIRST * _PER_UNIT) and total <= _MOST:
+        total += count[last]
+        first += count[last] * math.exp(-0.5 / _PER_UNIT * last)
+        last += 1
+    rest = 0.0
+    for j in range(last, N_LEVELS):
+        rest += count[j] * math.exp(-0.5 / _PER_UNIT * j)
+    return reference - last / _PER_UNIT, total < _FEW * _MOST, first, rest
 
 
-@njit(**_OPTIONS)
+@njit(**ENTRY)
 def raise_bounds(
     agn, galaxy_unit, weight, room, tail_galaxy, tail_agn, inverse_norm, run_key, bound, n,
     raise_galaxy, raise_agn,
@@ -119,7 +126,7 @@ def raise_bounds(
             bound[r, i] = value if bound[r, i] > DONE else DONE
 
 
-@njit(**_OPTIONS)
+@njit(**ENTRY)
 def second_floor(bound, count, reference, n, room, unit, delta):
     """
     Least bound to evaluate, once the weight of the best pairs is known.

@@ -11,6 +11,8 @@ import math
 import numpy as np
 from numba import njit
 
+from miricigale.fitting._core.options import EXACT, EXACT_ENTRY, INNER
+
 __all__ = [
     "HALF_BINS",
     "N_BINS",
@@ -33,7 +35,6 @@ N_SHARE = 4096
 #: Models that are put into the histograms at a time.
 POINTS = 256
 
-_OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
 _LN_10 = 2.3025850929940457
 # Variance in bins: 1/12 of a bin, and 1/6 of the sharing between neighbours.
@@ -46,7 +47,7 @@ _HALF_ONE = np.int64(0x3FE0000000000000)
 _ROOT_HALF = 0.70710678118654752
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def fill_log10(x, work, out, n):
     """
     Fill out[:n] = log10(x[:n]) to 1e-7 for positive normal numbers (x = 0: about -308).
@@ -74,7 +75,7 @@ def fill_log10(x, work, out, n):
         out[i] = (np.float64(np.int32(work[i])) - 0.5) * _LOG10_2 + _LOG10_E2 * s
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def clear_rows(hist, bins):
     """Set the used bins of every row to zero and mark the rows as empty."""
     for i in range(hist.shape[0]):
@@ -84,7 +85,7 @@ def clear_rows(hist, bins):
         bins[i, 1] = -1
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def add_scaled(hist, bins, scale, weight, least, out):
     """
     Sum rows of histograms of log y to one of log(scale y).
@@ -149,7 +150,7 @@ def add_scaled(hist, bins, scale, weight, least, out):
     return shift, zero
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def add_share(change, low, high, weight):
     """
     Add a weight that is spread evenly from ``low`` to ``high`` (within 0 and 1).
@@ -175,7 +176,7 @@ def add_share(change, low, high, weight):
     change[i + 1] -= part * v
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**EXACT_ENTRY)
 def share_quantiles(change, levels, quantiles):
     """
     Quantiles of a fraction.
@@ -208,7 +209,7 @@ def share_quantiles(change, levels, quantiles):
         quantiles[i] = (j + part) / N_SHARE
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**EXACT)
 def log_summary(hist, middle, zero, sigma, levels, quantiles):
     """
     Quantiles and mean logarithm of a quantity from its logarithmic histogram.

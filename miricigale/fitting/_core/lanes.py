@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from miricigale.fitting._core.limits import limited_scale
+from miricigale.fitting._core.options import INNER
 from miricigale.fitting._core.structs import NO_LIGHT
 
 __all__ = [
@@ -29,7 +30,6 @@ __all__ = [
 #: Pairs evaluated side by side: a block of galaxies with one torus, or single pairs.
 LANES = 64
 
-_OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
 # Offsets of the vectors in Scratch.buffer, with A, X and B for x = c: what the pairs
 # are ...
@@ -52,7 +52,7 @@ _LN2_HIGH_32 = np.float32(0.693359375)
 _LN2_LOW_32 = np.float32(-2.12194440e-4)
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def fill_dead(buffer, index, start):
     """Fill the lanes from ``start`` on with pairs of no weight."""
     for i in range(max(start, 0), LANES):
@@ -68,7 +68,7 @@ def fill_dead(buffer, index, start):
         index[1, i] = 0
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def fill_block(buffer, index, run, n_run, pq, blocks, block, cross, a, b, k, log_torus, share):
     """Fill the lanes with a block of galaxies and one torus; those not in the run are dead."""
     last = run[n_run - 1]
@@ -91,7 +91,7 @@ def fill_block(buffer, index, run, n_run, pq, blocks, block, cross, a, b, k, log
         buffer[PRIOR + i] = log_torus + blocks[1, block, i]
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def gather(pending, index, run, n_run, pq, blocks, block, cross, a, b, k, log_torus, share, filled):
     """Add the pairs of a short run to those gathered; returns how many there are now."""
     for j in range(n_run):
@@ -111,7 +111,7 @@ def gather(pending, index, run, n_run, pq, blocks, block, cross, a, b, k, log_to
     return filled
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def lane_model(lanes, target, c, i, floor):
     """
     Scale, R and variance of the scale of the pair in lane i at one fraction, c = f / (1 - f).
@@ -133,7 +133,7 @@ def lane_model(lanes, target, c, i, floor):
     return limited_scale(p, q, slope, target.level, target.dark)
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def exponential(e):
     """
     exp(e) for e from -700 to 700 to 1e-11, as a number and the bits of a power of two.
@@ -156,7 +156,7 @@ def exponential(e):
     return v, np.int64(np.int32(m) + 1023) << np.int64(52)
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def light_exponential(e):
     """Do what `exponential` does for e from -80 to 80, in single precision."""
     m = np.floor(e * _LOG2E_32 + np.float32(0.5))
@@ -172,7 +172,7 @@ def light_exponential(e):
     return v, (np.int32(m) + np.int32(127)) << np.int32(23)
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def likelihoods(
     buffer, power, weight, ratio, frac_prior, first, reference, scale_error, out
 ):  # fmt: skip

@@ -37,11 +37,11 @@ from miricigale.fitting._core.lanes import (
     exponential,
     light_exponential,
 )
+from miricigale.fitting._core.options import INNER
 from miricigale.fitting._core.structs import NO_LIGHT
 
 __all__ = ["light_likelihoods", "light_size", "pair_weight"]
 
-_OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
 # Offsets of the vectors in Lanes.light: N, D, K, M, the scale's variance, the share, x*, the
 # other fraction there, ...
@@ -62,7 +62,7 @@ def light_size(n_ratio):
     return _T + n_ratio * LANES
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def pair_weight(lanes, single, j, i):
     """Prior * likelihood of the pair in lane i at a fraction."""
     if single:
@@ -70,7 +70,7 @@ def pair_weight(lanes, single, j, i):
     return lanes.weight[j * LANES + i]
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def _prepare(buffer, light, power, low, high, reference, scale_error):
     """
     Fill the vectors of ``light`` that say what the pairs are.
@@ -122,7 +122,7 @@ def _prepare(buffer, light, power, low, high, reference, scale_error):
     return top
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def light_likelihoods(
     buffer, light, power, power32, ratio, frac_prior, first, reference, scale_error, out
 ):

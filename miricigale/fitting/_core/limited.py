@@ -37,11 +37,11 @@ from miricigale.fitting._core.limited_scales import (
     fill_light_limits,
     light_scales,
 )
+from miricigale.fitting._core.options import INNER
 from miricigale.fitting._core.structs import NO_LIGHT
 
 __all__ = ["limited_likelihoods"]
 
-_OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
 # What single precision may miss of the largest R.
 _ROUNDING = 1e-3
@@ -49,7 +49,7 @@ _ROUNDING = 1e-3
 _ALIVE, _CHANGE, _V = (i * LANES for i in range(6, 9))
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def limited_likelihoods(
     buffer, work, left, light, power, power32, limit, limit_light, weight, ratio, frac_prior,
     first, reference, scale_error, out, level, dark, delta, single,

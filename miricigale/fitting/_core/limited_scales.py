@@ -22,6 +22,7 @@ from miricigale.fitting._core.lanes import (
     exponential,
     light_exponential,
 )
+from miricigale.fitting._core.options import INNER
 from miricigale.fitting._core.structs import NO_LIGHT
 
 __all__ = [
@@ -38,7 +39,6 @@ __all__ = [
     "scaled_erfc",
 ]
 
-_OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
 # Offsets of the vectors in Lanes.limited: scale, half of chi2 and of its second derivative, the
 # limits' probability over exp(exponent), the exponent, the scale without limits (0 in lanes that do
@@ -68,7 +68,7 @@ _FACTORS = 8
 _LARGEST = 1e15
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def scaled_erfc(z):
     """
     exp(z^2) erfc(z) for z >= 0, to 2e-12.
@@ -98,7 +98,7 @@ def scaled_erfc(z):
     return v * t
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def _add_limit(work, power, slope_galaxy, slope_agn, c, level):
     """
     Add a limit to half the derivatives of chi2, to the product of probabilities and exponents.
@@ -133,7 +133,7 @@ def _add_limit(work, power, slope_galaxy, slope_agn, c, level):
         work[EXPONENT + i] -= 0.5 * u * u if u > 0.0 else 0.0
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def best_scales(buffer, work, power, limit, c, level):
     """
     Fill the scales that minimise chi2 at one fraction, and what goes with them.
@@ -188,7 +188,7 @@ def best_scales(buffer, work, power, limit, c, level):
             far = max(far, moved if work[DETECTED + i] > 0.0 else 0.0)
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def fill_light_limits(buffer, work, limit, n, limit_light):
     """
     Fill the limits' slopes in single precision.
@@ -213,7 +213,7 @@ def fill_light_limits(buffer, work, limit, n, limit_light):
             limit_light[m, i] = min(limit[m, i] * work[_U + i], _LARGEST)
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def _add_light_limit(light, power, slope_galaxy, slope_agn, c, level):
     """Do what `_add_limit` does, in single precision."""
     zero = np.float32(0)
@@ -262,7 +262,7 @@ def _add_light_limit(light, power, slope_galaxy, slope_agn, c, level):
         light[_EXPONENT32 + i] -= half * u * u if u > zero else zero
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def light_scales(buffer, work, light, power, limit, c, level, reference):
     """
     Do what `best_scales` does, in single precision.

@@ -12,9 +12,10 @@ import math
 
 from numba import njit
 
+from miricigale.fitting._core.options import EXACT
+
 __all__ = ["limit_term", "limited_scale"]
 
-_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 _ROOT_HALF = 0.70710678118654752
 _ROOT_2PI = 2.5066282746310002
@@ -23,14 +24,14 @@ _NOTHING = -9.0
 _SERIES = 20.0
 
 
-@njit(**_OPTIONS)
+@njit(**EXACT)
 def _far(u):
     """1 - u times Mills' ratio of the normal distribution, for u >= 20 (to 1e-15)."""
     t = 1.0 / (u * u)
     return t * (1.0 - t * (3.0 - t * (15.0 - t * (105.0 - t * (945.0 - t * 10395.0)))))
 
 
-@njit(**_OPTIONS)
+@njit(**EXACT)
 def limit_term(u):
     """T(u), the term of chi2 of one limit."""
     if u < _SERIES:
@@ -38,7 +39,7 @@ def limit_term(u):
     return u * u + 2.0 * math.log(u * _ROOT_2PI) - 2.0 * math.log1p(-_far(u))
 
 
-@njit(**_OPTIONS)
+@njit(**EXACT)
 def _slopes(u):
     """Half the first and second derivative of T."""
     if u < _SERIES:
@@ -49,7 +50,7 @@ def _slopes(u):
     return hazard, hazard * hazard * rest
 
 
-@njit(**_OPTIONS)
+@njit(**EXACT)
 def limited_scale(p, q, slope, level, dark):
     """
     Best scale of one model.

@@ -4,6 +4,7 @@ from numba import njit
 
 from miricigale.fitting._core.bounds import BLOCK
 from miricigale.fitting._core.limits import limited_scale
+from miricigale.fitting._core.options import INNER
 
 __all__ = [
     "agn_products",
@@ -15,10 +16,8 @@ __all__ = [
     "row_best",
 ]
 
-_OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
-
-@njit(**_OPTIONS)
+@njit(**INNER)
 def row_best(
     galaxy, agn, dust, ratio, prior_agn, log_agn, log_frac, zero_frac, target, agn_pq, slope
 ):
@@ -94,7 +93,7 @@ def row_best(
     return best_value, best_s
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def agn_products(agn, target, agn_pq, agn_weighted):
     """Fill agn_pq[k] = <A, wF>, <A, wA> and agn_weighted[k] = w A for all tori of one redshift."""
     weight, flux = target.weight, target.flux
@@ -112,7 +111,7 @@ def agn_products(agn, target, agn_pq, agn_weighted):
         agn_pq[k, 1] = q
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def galaxy_products(tiles, z, block, target, pq):
     """Fill pq[:, block] with <G, wF> and <G, wG> of a block of the galaxies of one redshift."""
     for i in range(BLOCK):
@@ -127,7 +126,7 @@ def galaxy_products(tiles, z, block, target, pq):
             pq[1, block, i] += t * t * w
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def cross_products(tiles, z, block, bands, weighted, k, cross):
     """Fill cross[0, i] = <G_i, wA> for a block of galaxies and one torus."""
     for i in range(BLOCK):
@@ -153,7 +152,7 @@ def cross_products(tiles, z, block, bands, weighted, k, cross):
         m += 1
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def best_mixture(p, q, t, a, b, low, high):
     """
     Best R of a galaxy with a torus, x = c L_dust anything from low to high.
@@ -168,7 +167,7 @@ def best_mixture(p, q, t, a, b, low, high):
     return num * num / max(q + x * (2.0 * t + x * b), 1e-300)
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def best_mixtures(pq, blocks, block, a, b, low, high, cross):
     """Fill cross[1, i] with the best R of a block of galaxies with a torus."""
     for i in range(BLOCK):
@@ -178,7 +177,7 @@ def best_mixtures(pq, blocks, block, a, b, low, high, cross):
         )
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def few_products(
     tiles, z, block, bands, weighted, k, pq, blocks, a, b, low, high, run, n_run, cross
 ):

@@ -13,18 +13,18 @@ from miricigale.fitting._core.bounds import (
     pair_block,
     torus_projections,
 )
+from miricigale.fitting._core.options import ENTRY, INNER
 from miricigale.fitting._core.products import agn_products, row_best
 
 __all__ = ["begin", "list_runs"]
 
-_OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
 _NEVER = np.float32(1e30)
 _NOWHERE = np.float32(-1e3)
 _LOG10_E = 0.43429448190325183
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def _sort_descending(x, order):
     """Fill the order of the elements from large to small, by insertion (equal ones stay so)."""
     for i in range(x.size):
@@ -35,7 +35,7 @@ def _sort_descending(x, order):
         order[j] = i
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def _single_precision(target, root_weight, unit_data):
     """Fill root_weight with square roots of the weights over the largest, unit_data with d/|d|."""
     top_weight = 0.0
@@ -47,7 +47,7 @@ def _single_precision(target, root_weight, unit_data):
         unit_data[j] = target.flux[target.bands[j]] * math.sqrt(w / target.norm)
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def _one_sigma(galaxy, target):
     """Error of a galaxy's scale; 1 if it has no light in the used bands."""
     q = 0.0
@@ -56,7 +56,7 @@ def _one_sigma(galaxy, target):
     return 1.0 / math.sqrt(q) if q > 1e-290 else 1.0
 
 
-@njit(**_OPTIONS)
+@njit(**INNER)
 def _row_best(tables, target, scratch, z, g):
     """Do what `row_best` does, with R + 2 ln(prior) of the galaxy and the redshift too."""
     value, s = row_best(
@@ -67,7 +67,7 @@ def _row_best(tables, target, scratch, z, g):
     return value + target.log_prior[z] + tables.log_galaxy[g], s
 
 
-@njit(**_OPTIONS)
+@njit(**ENTRY)
 def begin(tables, target, scratch, origin):
     """
     Start on an object: look at galaxies without AGN, order the redshifts.
@@ -140,7 +140,7 @@ def begin(tables, target, scratch, origin):
     return True
 
 
-@njit(**_OPTIONS)
+@njit(**ENTRY)
 def list_runs(tables, request, target, scratch, position):
     """
     List runs of pairs that can matter, until the list is full or all are seen.

@@ -8,16 +8,15 @@ from numba import njit
 from miricigale.fitting._core.bounds import BLOCK
 from miricigale.fitting._core.collect import PARTS, deposit_single, note_best, take_draw
 from miricigale.fitting._core.limits import limited_scale
+from miricigale.fitting._core.options import ENTRY, INNER
 from miricigale.fitting._core.products import galaxy_products
 from miricigale.fitting._core.structs import NO_LIGHT
 from miricigale.fitting._core.totals import finish_redshift
 
 __all__ = ["evaluate_singles"]
 
-_OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
-
-@njit(**_OPTIONS)
+@njit(**INNER)
 def _model(galaxy, target, p, q, slope):
     """Scale, R and variance of the scale of a galaxy with p = <G, wF> and q = <G, wG>."""
     # without light the scale is 0, and nothing is known of its error
@@ -30,7 +29,7 @@ def _model(galaxy, target, p, q, slope):
     return limited_scale(p, q, slope, target.level, target.dark)
 
 
-@njit(**_OPTIONS)
+@njit(**ENTRY)
 def evaluate_singles(tables, request, target, sums, scratch):
     """
     Add the models without AGN (f = 0), one for each galaxy and redshift, to the sums.

@@ -4,10 +4,10 @@ import numpy as np
 from numba import njit
 
 from miricigale.fitting._core.histogram import N_BINS, add_scaled, log_summary, share_quantiles
+from miricigale.fitting._core.options import ENTRY
 
 __all__ = ["summarise", "variances"]
 
-_OPTIONS = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
 #: Standard deviations of AGN quantities below this part of the mean total luminosity need not
 #: hold their relative accuracy.
@@ -61,7 +61,7 @@ def variances(tables, sums):
     )
 
 
-@njit(**_OPTIONS)
+@njit(**ENTRY)
 def _log_quantiles(
     hist, bins, weight, scale, zero, least, origin, sigma, levels, mean_log, quantiles
 ):

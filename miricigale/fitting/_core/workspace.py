@@ -11,6 +11,7 @@ from miricigale.fitting._core.histogram import N_BINS, N_SHARE, POINTS, clear_ro
 from miricigale.fitting._core.lanes import LANES, N_INPUT, SIZE
 from miricigale.fitting._core.light import light_size
 from miricigale.fitting._core.limited_scales import LIMITED_SIZE
+from miricigale.fitting._core.options import ENTRY, EXACT
 from miricigale.fitting._core.structs import Draws, Histograms, Lanes, Scratch, Sums
 
 __all__ = ["JOINT", "clear", "make_scratch", "make_sums", "rescale"]
@@ -126,13 +127,13 @@ def make_scratch(n_z, n_galaxy, n_agn, n_frac, n_bands, zero_frac, capacity):
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(**EXACT)
 def _zero(x):
     for i in range(x.size):
         x[i] = 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit(**ENTRY)
 def clear(flat, best, index, hist, draws):
     """Empty the accumulators."""
     _zero(flat)
@@ -149,13 +150,13 @@ def clear(flat, best, index, hist, draws):
     clear_rows(hist.mixed, hist.range_mixed)
 
 
-@njit(cache=True, nogil=True)
+@njit(**EXACT)
 def _multiply(x, factor):
     for i in range(x.size):
         x[i] *= factor
 
 
-@njit(cache=True, nogil=True)
+@njit(**ENTRY)
 def rescale(sums, galaxy_z, agn_z, factor):
     """Multiply all weights, when a better model becomes the reference."""
     _multiply(sums.flat, factor)

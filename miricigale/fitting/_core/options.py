@@ -1,0 +1,19 @@
+"""
+How the kernels are compiled.
+
+Those called from Python need a wrapper, which takes time to compile; the others only become part of
+them. Sums may be taken in any order, except where digits would be lost.
+"""
+
+__all__ = ["ENTRY", "EXACT", "EXACT_ENTRY", "INNER"]
+
+_ALL = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_WITHIN = {**_ALL, "no_cpython_wrapper": True}
+#: Kernels called from Python.
+ENTRY = {**_ALL, "fastmath": True}
+#: One in which the order of operations counts.
+EXACT_ENTRY = _ALL
+#: Parts of kernels.
+INNER = {**_WITHIN, "fastmath": True}
+#: Parts of kernels in which the order of operations counts.
+EXACT = _WITHIN
