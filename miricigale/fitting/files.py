@@ -46,7 +46,7 @@ def write_results(results, path, *, overwrite=False):
     Raises
     ------
     ValueError
-        If an id is text that is not ASCII.
+        If an id is text that is not ASCII, or ends in a blank.
     """
     from astropy.table import Table
 
@@ -134,11 +134,12 @@ def read_results(cls, path):
 
 
 def check_text_ids(ids):
-    """Refuse ids that FITS, whose text is ASCII, cannot hold."""
+    """Refuse ids that FITS, whose text is ASCII and loses blanks at its end, cannot hold."""
     if ids.dtype.kind == "U":
-        foreign = [key for key in ids.tolist() if not key.isascii()]
+        foreign = [key for key in ids.tolist() if not key.isascii() or key != key.rstrip(" ")]
         if foreign:
-            raise argument_error("ids", "ASCII where they go to a FITS file", f"{foreign[0]!r}")
+            wanted = "ASCII, with no blank at the end, where they go to a FITS file"
+            raise argument_error("ids", wanted, f"{foreign[0]!r}")
 
 
 def axes_to_plain(axes):

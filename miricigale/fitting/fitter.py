@@ -50,8 +50,9 @@ class BayesFitter:
     axes : dict, optional
         Parameter name to values, for a model (see `~miricigale.sed.SEDModel.grid`).
     priors : dict, optional
-        Parameter name to prior: a function of the value, an array of weights of the nodes or
-        ``"log"``. Others are flat in the nodes of the grid.
+        Parameter name to prior: a function of the value, a frozen distribution of `scipy.stats`
+        (both are taken at the nodes), an array of weights of the nodes or ``"log"``. Others are
+        flat in the nodes of the grid.
     prior_f : {"grid", "uniform"}, optional
         Prior of the AGN fractions: equal for all values of the grid (so that f = 0, which is
         evaluated once for each galaxy, carries the summed weight of all tori), or by the width
@@ -143,17 +144,23 @@ class BayesFitter:
         for name in names or ():
             if name not in model.filters:
                 raise unknown_name("filter of the grid", name, model.filters)
+        if names is not None and not len(set(names)) == len(names) > 0:
+            raise argument_error("filters", "different names, at least one", f"{list(names)}")
         self.filters = names
-        if not (isinstance(n_bands_min, (int, np.integer)) and n_bands_min >= 1):
+        if not (_is_number(n_bands_min, np.integer) and n_bands_min >= 1):
             raise argument_error("n_bands_min", "an integer >= 1", repr(n_bands_min))
-        if not 0 <= rtol < 0.1:
-            raise argument_error("rtol", "in [0, 0.1)", f"{rtol}")
-        if not max_reduced_chi2 > 0:
-            raise argument_error("max_reduced_chi2", "positive", f"{max_reduced_chi2}")
-        if redshift_tolerance is not None and not redshift_tolerance >= 0:
-            raise argument_error("redshift_tolerance", ">= 0", f"{redshift_tolerance}")
+        if not (_is_number(rtol) and 0 <= rtol < 0.1):
+            raise argument_error("rtol", "in [0, 0.1)", repr(rtol))
+        if not (_is_number(max_reduced_chi2) and max_reduced_chi2 > 0):
+            raise argument_error("max_reduced_chi2", "positive", repr(max_reduced_chi2))
+        if redshift_tolerance is not None and not (
+            _is_number(redshift_tolerance) and redshift_tolerance >= 0
+        ):
+            raise argument_error("redshift_tolerance", ">= 0", repr(redshift_tolerance))
         if compat not in (None, "cigale"):
             raise argument_error("compat", "None or 'cigale'", repr(compat))
+        if scale_error not in (None, True, False):
+            raise argument_error("scale_error", "True, False or None", repr(scale_error))
         if compat and scale_error:
             raise argument_error("scale_error", "False with compat='cigale'", repr(scale_error))
         scale_error = compat is None if scale_error is None else scale_error
@@ -259,9 +266,10 @@ class BayesFitter:
         KeyError
             If a name in ``pairs`` is unknown.
         ValueError
-            If a column is missing, an id is masked, one of limits is not boolean, there are limits
-            in a band in which a model has negative flux, ``redshift`` or ``redshift_prior`` has the wrong
-            shape, or both are given, or ``pairs`` has a parameter twice or one with a single value.
+            If a column is missing, a flux is no number, an id is masked, one of limits is not
+            boolean, there are limits in a band in which a model has negative flux, ``redshift`` or
+            ``redshift_prior`` has the wrong shape, or both are given, or ``pairs`` has a parameter
+            twice or one with a single value.
         `~astropy.units.UnitsError`
             If a flux column has no unit of flux density.
 
@@ -271,7 +279,7 @@ class BayesFitter:
         .. [2] Boquien et al. 2019, A&A 622, A103, section 4.3
         """
         del seed
-        if isinstance(chunk_size, bool) or not int(chunk_size) >= 1:
+        if not (_is_number(chunk_size, np.integer) and chunk_size >= 1):
             raise argument_error("chunk_size", "an integer >= 1", repr(chunk_size))
         pairs = check_pairs(pairs, self)
         data, flags, log_prior, settings = self._prepare(photometry, redshift, redshift_prior)
@@ -352,7 +360,7 @@ class BayesFitter:
         ValueError
             See `fit`; or if ``n_draws`` is not positive.
         """
-        if isinstance(n_draws, bool) or not isinstance(n_draws, (int, np.integer)) or n_draws < 1:
+        if not (_is_number(n_draws, np.integer) and n_draws >= 1):
             raise argument_error("n_draws", "an integer >= 1", repr(n_draws))
         seed = check_seed(seed)
         data, flags, log_prior, settings = self._prepare(photometry, redshift, redshift_prior)
@@ -428,3 +436,9 @@ class BayesFitter:
             "n_models": int(self._engine.n_models),
             "constants": constants(self.grid, self.priors.axes),
         }
+
+
+def _is_number(value, kind=np.number):
+    """Whether a value is one number, and of a kind; True and False are none."""
+    array = np.asarray(value)
+    return array.ndim == 0 and np.issubdtype(array.dtype, kind)

@@ -13,7 +13,8 @@ class FitFlags(Flags):
     FEW_BANDS = 2
     """Fewer usable bands, upper limits among them, than asked for."""
     BAD_ERROR = 4
-    """A measured flux whose error is zero, negative or not finite; the band is left out."""
+    """A flux whose error is zero, negative, not finite or beyond 1e-60 to 1e60 uJy; the band is left
+    out."""
     NO_REDSHIFT = 8
     """A fixed redshift was asked for and is missing, not finite or not positive."""
     REDSHIFT_OUTSIDE = 16
@@ -30,7 +31,7 @@ class FitFlags(Flags):
     """No model is left by the age of the universe and the priors."""
 
     BAD_FLUX = 1024
-    """A flux that is infinite; the band is left out."""
+    """A flux that is infinite or beyond 1e60 uJy; the band is left out."""
 
     FEW_FOR_PARAMETERS = 2048
     """Fewer fluxes than free parameters, the mass among them; limits are not counted."""

@@ -7,22 +7,12 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.fitting.flags import FitFlags
-from miricigale.fitting.likelihood import limits
+from miricigale.fitting.likelihood import flux_column, limits
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.tables import error_column, require_columns
-from miricigale.utils.units import FNU, frozen_array, to_array
+from miricigale.utils.units import FNU, frozen_array
 
-__all__ = ["LeaveOutResult", "leave_out", "plain_column"]
-
-
-def plain_column(table, name):
-    """Fluxes of a column in uJy, NaN where masked: a new array."""
-    column = table[name]
-    mask = getattr(column, "mask", None)
-    array = to_array(getattr(column, "unmasked", column), FNU, name, ndim=1).copy()
-    if mask is not None:
-        array[np.asarray(mask)] = np.nan
-    return array
+__all__ = ["LeaveOutResult", "leave_out"]
 
 
 def leave_out(fitter, photometry, bands, *, separately=False, **options):
@@ -62,6 +52,8 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     if isinstance(bands, str) or not len(bands):
         raise argument_error("bands", "a list of one or more names", repr(bands))
     bands = tuple(bands)
+    if len(set(bands)) < len(bands):
+        raise argument_error("bands", "different names", f"{list(bands)}")
     for name in bands:
         if name not in fitter.grid.filters:
             raise unknown_name("filter of the grid", name, fitter.grid.filters)
@@ -74,8 +66,8 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
         if len(left) < fitter.n_bands_min:
             wanted = f"such that n_bands_min = {fitter.n_bands_min} or more of {fitted} are left"
             raise argument_error("bands", wanted, f"{list(group)}")
-    flux = np.array([plain_column(photometry, name) for name in bands]).T
-    err = np.array([plain_column(photometry, error_column(name)) for name in bands]).T
+    flux = np.array([flux_column(photometry, name) for name in bands]).T
+    err = np.array([flux_column(photometry, error_column(name)) for name in bands]).T
     limit = np.array([limits(photometry, name) for name in bands]).T
     good = np.isfinite(flux) & np.isfinite(err) & (err > 0)
     empty = [name for name, any_good in zip(bands, good.any(axis=0), strict=True) if not any_good]

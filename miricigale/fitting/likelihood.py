@@ -11,10 +11,23 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU, to_array
 
-__all__ = ["FitData", "limits", "per_band", "read_ids", "read_photometry", "unused_bands"]
+__all__ = [
+    "FitData",
+    "flux_column",
+    "limits",
+    "per_band",
+    "read_ids",
+    "read_photometry",
+    "unused_bands",
+]
 
+#: Part of a flux below which no error is believed: chi2 in double precision ends there.
+_LEAST_ERROR = 1e-6
+#: Least and largest error, and largest flux, in uJy; beyond, their squares are no numbers.
+_SMALL, _LARGE = 1e-60, 1e60
 _TRUE = ("true", "t", "1")
 _FALSE = ("false", "f", "0", "")
+_KINDS = {"U": "text", "S": "text", "b": "true and false", "c": "complex numbers"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +78,9 @@ def read_photometry(table, filters, *, model_error, error_floor, n_bands_min, gr
         Column ``id``, a flux column for each filter and its error ``<name>_err``. NaN (or a
         masked value) in flux or error is a missing band. Where a boolean column
         ``<name>_limit`` (see `limits`) is true the flux is an upper limit and the error its
-        1 sigma, to which neither model error nor floor are added.
+        1 sigma, to which neither model error nor floor are added. No error, of a limit or with
+        all that is added to it, counts as less than 1e-6 of the flux, and those beyond 1e-60
+        to 1e60 uJy are of no use.
     filters : tuple of str
         Bands to use; columns must be there.
     model_error : `~numpy.ndarray`, shape (n_filters,)
@@ -84,8 +99,8 @@ def read_photometry(table, filters, *, model_error, error_floor, n_bands_min, gr
     Raises
     ------
     ValueError
-        If a column is missing, one of limits holds something else than true and false, or an id
-        is masked.
+        If a column is missing or holds no numbers, one of limits holds something else than true
+        and false, or an id is masked.
     `~astropy.units.UnitsError`
         If a flux has no unit of flux density.
     """
@@ -99,18 +114,20 @@ def read_photometry(table, filters, *, model_error, error_floor, n_bands_min, gr
     flags = np.zeros(n, dtype=int)
     for name, extra, floor in zip(filters, model_error, error_floor, strict=True):
         i = grid_filters.index(name)
-        f = _column(table, name)
-        e = _column(table, error_column(name))
-        flags[np.isinf(f)] |= int(FitFlags.BAD_FLUX)
-        bad = np.isfinite(f) & ~((e > 0) & np.isfinite(e))
+        f, e = flux_column(table, name), flux_column(table, error_column(name))
+        has_flux = np.abs(f) < _LARGE
+        known = (e > _SMALL) & (e < _LARGE)
+        flags[~np.isnan(f) & ~has_flux] |= int(FitFlags.BAD_FLUX)
         # a flux without error is a missing band; errors of no use are worth a word
-        flags[bad & ~np.isnan(e)] |= int(FitFlags.BAD_ERROR)
-        good = np.isfinite(f) & np.isfinite(e) & (e > 0)
+        flags[has_flux & ~known & ~np.isnan(e)] |= int(FitFlags.BAD_ERROR)
+        good = has_flux & known
         flux[:, i], err[:, i] = f, e
         size = np.abs(np.where(good, f, 0.0))
-        total = np.hypot(np.maximum(np.where(good, e, 1.0), floor * size), extra * size)
+        own = np.where(good, e, 1.0)
+        total = np.hypot(np.maximum(own, floor * size), extra * size)
         limit[:, i] = good & limits(table, name)
-        sigma[:, i] = np.where(good, np.where(limit[:, i], e, total), np.inf)
+        total = np.maximum(np.where(limit[:, i], own, total), _LEAST_ERROR * size)
+        sigma[:, i] = np.where(good, total, np.inf)
     n_bands = np.isfinite(sigma).sum(axis=1)
     flags[(n_bands > 0) & (n_bands == limit.sum(axis=1))] |= int(FitFlags.ALL_LIMITS)
     flags[n_bands == 0] |= int(FitFlags.NO_BAND)
@@ -140,7 +157,7 @@ def read_ids(table):
     ------
     ValueError
         If one is masked or empty text, for nothing would tell its object from
-        others; if some are numbers and some text, or several are in a row.
+        others; if some are numbers and some text, several are in a row, or bytes are not UTF-8.
     """
     require_columns(table, ["id"], "photometry")
     column = table["id"]
@@ -158,14 +175,20 @@ def read_ids(table):
         raise argument_error("photometry", "a table with an id in every row", got)
     if ids.dtype.kind == "S":
         # as astropy reads text of FITS files
-        return np.char.decode(ids, "utf-8")
+        try:
+            return np.char.decode(ids, "utf-8")
+        except UnicodeDecodeError as err:
+            wanted = "a table with ids that are text, or bytes of text in UTF-8"
+            raise argument_error("photometry", wanted, f"{err.object!r}") from None
     if ids.dtype.kind == "O":
         kinds = {type(value) for value in ids.tolist()}
         if len(kinds) > 1:
             names = sorted(kind.__name__ for kind in kinds)
             raise argument_error("photometry", "a table with ids of one kind", f"{names}")
         return np.array(ids.tolist()) if ids.size else ids.astype(str)
-    return ids
+    # FITS takes numbers of one byte for true and false
+    dtype = np.dtype(np.int16) if ids.dtype == np.int8 else ids.dtype
+    return ids.astype(dtype.newbyteorder("="))
 
 
 def unused_bands(table, filters):
@@ -273,10 +296,35 @@ def per_band(value, filters, name):
     return array
 
 
-def _column(table, name):
+def flux_column(table, name):
+    """
+    Fluxes of a column.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        The table.
+    name : str
+        Its column, of numbers, with a unit of flux density.
+
+    Returns
+    -------
+    flux : `~numpy.ndarray`, shape (n,)
+        In uJy, NaN where masked: a new array.
+
+    Raises
+    ------
+    ValueError
+        If the column holds no real numbers, or several in a row.
+    `~astropy.units.UnitsError`
+        If its unit is another.
+    """
     column = table[name]
-    mask = getattr(column, "mask", None)
-    array = to_array(getattr(column, "unmasked", column), FNU, name, ndim=1).copy()
-    if mask is not None and np.any(mask):
-        array[np.asarray(mask)] = np.nan
+    column = getattr(column, "unmasked", column)
+    kind = getattr(column, "dtype", np.dtype(float)).kind
+    if kind not in "fiuO":
+        wanted = f"a table with numbers in column {name!r}"
+        raise argument_error("photometry", wanted, _KINDS.get(kind, str(column.dtype)))
+    array = to_array(column, FNU, name, ndim=1).copy()
+    array[np.broadcast_to(np.asarray(getattr(table[name], "mask", False)), array.shape)] = np.nan
     return array

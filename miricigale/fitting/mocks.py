@@ -6,8 +6,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.fitting.flags import FitFlags
-from miricigale.fitting.left_out import plain_column
-from miricigale.fitting.likelihood import read_ids
+from miricigale.fitting.likelihood import flux_column, read_ids
 from miricigale.fitting.posterior import randomised_ranks
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import check_seed, stream
@@ -71,7 +70,7 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
     for name in filters:
         i = results.filters.index(name)
         change = used[:, i] & ~results.limit[:, i]
-        flux = plain_column(photometry, name)
+        flux = flux_column(photometry, name)
         flux[change] = (results.best_flux[:, i] + noise[:, i] * error[:, i])[change]
         mock[name] = flux * FNU
     recovered = fitter.fit(mock, **options)

@@ -16,6 +16,8 @@ __all__ = ["DrawPiece", "FitPiece", "Part", "cut"]
 _JOINT_SIZE = 1 << 22
 #: Fluxes that are all 0 become negative by this part of their error; see `cut`.
 _DARK = 1e-8
+#: Sum of squared S/N that counts as 0: smaller numbers have fewer digits, or none.
+_NO_SIGNAL = 1e-280
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,9 +150,9 @@ def cut(data, log_prior, size, **more):
         flux, sigma, limit = np.nan_to_num(data.flux[s]), data.sigma[s], data.limit[s]
         measured = data.measured[s]
         signal = np.divide(flux, sigma, out=np.zeros(flux.shape), where=measured)
-        # the engine compares directions, of which zeros have none. Just below zero the best scale of
-        # every model is 0 as well, and chi2 is larger by 1e-16 a band
-        dark = measured & (np.sum(signal * signal, axis=1) == 0.0)[:, None]
+        # the engine compares directions, of which zeros have none. Just below zero the best scale
+        # of every model is 0 as well, and chi2 is larger by 1e-16 a band
+        dark = measured & (np.sum(signal * signal, axis=1) < _NO_SIGNAL)[:, None]
         flux = np.where(dark, -_DARK * sigma, flux)
         piece = {"flux": flux, "sigma": np.where(limit, np.inf, sigma), "log_prior": log_prior[s]}
         if with_limits:

@@ -3,11 +3,13 @@
 import itertools
 from dataclasses import dataclass
 
+import astropy.units as u
 import numpy as np
 
 from miricigale.fitting.posterior import cell_edges
 from miricigale.sed.component import COMPONENTS
 from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.units import to_array
 
 __all__ = ["GridAxis", "GridPriors", "grid_priors"]
 
@@ -65,9 +67,9 @@ def grid_priors(grid, priors=None, *, prior_f="grid"):
     grid : `~miricigale.sed.ModelGrid`
         The grid.
     priors : dict, optional
-        Parameter name to its prior: a function of the value (a density, taken at the nodes),
-        an array of weights of the nodes, or ``"log"`` (1 / value). Others are flat in the
-        nodes.
+        Parameter name to its prior: a function of the value or a frozen distribution of
+        `scipy.stats` (a density, taken at the nodes), an array of weights of the nodes, or
+        ``"log"`` (1 / value). Others are flat in the nodes.
     prior_f : {"grid", "uniform"}, optional
         Weights of the AGN fractions if ``priors`` does not name them: equal for all values of
         the grid (as CIGALE counts), or by the width of their cells.
@@ -81,8 +83,10 @@ def grid_priors(grid, priors=None, *, prior_f="grid"):
     KeyError
         If a name is not a parameter of the grid that has several values.
     ValueError
-        If weights are negative, not finite or all zero.
+        If weights are no numbers, or are negative, not finite or all zero.
     """
+    if priors is not None and not isinstance(priors, dict):
+        raise argument_error("priors", "a dict of parameters", type(priors).__name__)
     priors = dict(priors or {})
     if prior_f not in ("grid", "uniform"):
         raise argument_error("prior_f", "'grid' or 'uniform'", repr(prior_f))
@@ -163,16 +167,27 @@ def _axis(name, values, unit, kind, priors, bounds=(-np.inf, np.inf)):
             wanted = "a function, an array or 'log' (with values above 0)"
             raise argument_error(argument, wanted, repr(prior))
         weights = 1.0 / values
-    elif callable(prior):
-        weights = np.asarray(prior(values), dtype=float)
+    elif callable(prior) or hasattr(prior, "pdf"):
+        weights = _density(getattr(prior, "pdf", prior), values, argument)
     else:
-        weights = np.asarray(prior, dtype=float)
+        weights = to_array(prior, u.dimensionless_unscaled, argument)
     if weights.shape != values.shape:
         wanted = f"{values.size} weights, for {name} = {values}"
         raise argument_error(argument, wanted, f"shape {weights.shape}")
     if not np.all(np.isfinite(weights) & (weights >= 0)) or not weights.sum() > 0:
         raise argument_error(argument, "finite, >= 0 and not all 0", f"{weights}")
     return GridAxis(name, values, unit, kind, weights / weights.sum(), None, bounds)
+
+
+def _density(function, values, argument):
+    """Values of a function of an array, or of one value at a time."""
+    try:
+        density = function(values)
+    except (TypeError, ValueError):
+        density = None
+    if np.shape(density) != values.shape:
+        density = [function(value) for value in values.tolist()]
+    return to_array(density, u.dimensionless_unscaled, argument)
 
 
 def _inert(grid):

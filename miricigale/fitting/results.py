@@ -11,7 +11,7 @@ from miricigale.fitting.keyed import find_row, rows_by_id
 from miricigale.fitting.posterior import cell_percentiles, check_levels, moments
 from miricigale.fitting.quantities import kept_percentiles
 from miricigale.fitting.result import FitResult
-from miricigale.utils.exceptions import unknown_name
+from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, frozen_array
 
@@ -332,6 +332,8 @@ class FitResults:
             ``id`` and, for each filter, posterior mean (by its name), standard deviation
             (``<name>_err``) and flux of the best model (``<name>_best``) in uJy.
         """
+        if isinstance(filters, str):
+            raise argument_error("filters", "a list of names or a FilterSet", repr(filters))
         names = self.filters if filters is None else tuple(getattr(filters, "names", filters))
         out = QTable({"id": np.array(self.ids)}, meta=dict(self.meta))
         for name in names:

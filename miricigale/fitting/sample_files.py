@@ -39,7 +39,7 @@ def write_samples(samples, path, *, overwrite=False):
     Raises
     ------
     ValueError
-        If an id is text that is not ASCII.
+        If an id is text that is not ASCII, or ends in a blank.
     """
     from astropy.table import Table
 

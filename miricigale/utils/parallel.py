@@ -9,6 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.progress import progress
 
 __all__ = ["chunks", "parallel_map"]
@@ -41,10 +42,17 @@ def parallel_map(function, items, *, executor=None, progress_bar=False, desc=Non
     -------
     results : list
         In the order of ``items``.
+
+    Raises
+    ------
+    ValueError
+        If ``executor`` has no ``submit``.
     """
     items = list(items)
     if executor is None:
         return [function(item) for item in progress(items, show=progress_bar, desc=desc)]
+    if not hasattr(executor, "submit"):
+        raise argument_error("executor", "a concurrent.futures.Executor", f"{executor!r}")
     with _sent_once(function, executor) as call:
         futures = [executor.submit(*call, item) for item in items]
         try:

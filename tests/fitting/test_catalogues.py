@@ -5,10 +5,10 @@ import warnings
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.table import MaskedColumn, QTable, Table
+from astropy.table import Column, MaskedColumn, QTable, Table
 from numpy.testing import assert_allclose, assert_array_equal
 
-from miricigale.fitting import BayesFitter, FitFlags, FitResults, fit_file
+from miricigale.fitting import BayesFitter, FitFlags, FitResults, Samples, fit_file
 from miricigale.utils.exceptions import MiricigaleWarning
 
 
@@ -111,14 +111,39 @@ def test_text_ids_are_text_wherever_they_come_from(grid, catalogue, tmp_path):
             fitter.fit(of_objects)
 
 
-def test_ids_that_fits_files_cannot_hold_are_named(grid, catalogue, tmp_path):
-    catalogue["id"] = ["a", "b", "Kümmel 3", "c", "d", "e"]
+@pytest.mark.parametrize("name", ["Kümmel 3", "b "])
+def test_ids_that_fits_files_cannot_hold_are_named(grid, catalogue, tmp_path, name):
+    catalogue["id"] = ["a", "b", name, "c", "d", "e"]
     fitter = BayesFitter(grid)
     results, samples = fitter.fit(catalogue), fitter.sample(catalogue, 2, seed=1)
     for item in (results, samples):
-        assert item["Kümmel 3"] is not None
-        with pytest.raises(ValueError, match=r"'ids' must be ASCII .* got 'Kümmel 3'"):
+        assert item[name] is not None
+        with pytest.raises(ValueError, match=rf"'ids' must be ASCII, .* got '{name}'"):
             item.write(tmp_path / "r.fits")
+
+
+@pytest.mark.parametrize("dtype", ["i1", "u1", "i2", "u2", ">i4", ">u4", "i8", "u8", ">f4", "f8"])
+def test_ids_of_any_number_survive_files(grid, catalogue, tmp_path, dtype):
+    known = np.dtype(dtype)
+    top = np.iinfo(known).max if known.kind in "iu" else 2**24
+    ids = np.array([1, 2, 3, 4, top - 1, top], dtype=known)
+    table = Table(catalogue)
+    table["id"] = ids
+    fitter = BayesFitter(grid)
+    results, samples = fitter.fit(table), fitter.sample(table, 2, seed=1)
+    assert not np.any(results.flags & int(FitFlags.DUPLICATE_ID))
+    results.write(tmp_path / "r.fits")
+    samples.write(tmp_path / "s.fits")
+    for item in (FitResults.read(tmp_path / "r.fits"), Samples.read(tmp_path / "s.fits", grid)):
+        assert item.ids.tolist() == ids.tolist()
+        assert item.row(ids[5]) == 5
+
+
+def test_bytes_that_are_no_text_are_refused(grid, catalogue):
+    table = Table(catalogue)
+    table["id"] = np.array([b"a", "ä".encode("latin1"), b"c", b"d", b"e", b"f"])
+    with pytest.raises(ValueError, match=r"bytes of text in UTF-8, got b'\\xe4'"):
+        BayesFitter(grid).fit(table)
 
 
 def test_masked_redshifts_are_missing(grid, catalogue):
@@ -159,7 +184,7 @@ def test_errors_may_be_per_cent(grid, catalogue):
 
 
 @pytest.mark.parametrize("limited", [False, True])
-@pytest.mark.parametrize("flux", [0.0, -0.3, 1e-250])
+@pytest.mark.parametrize("flux", [0.0, -0.3, 1e-158, 1e-250])
 def test_without_signal_the_posterior_is_the_prior(make_grid, draw_photometry, flux, limited):
     """No model has light, all have the same chi2: sum (F / sigma)^2."""
     grid = make_grid(3)
@@ -235,3 +260,49 @@ def test_tables_of_any_kind_are_the_same_fit(grid, catalogue, tmp_path):
         assert_allclose(got.chi2, want.chi2, rtol=1e-12)
         assert_array_equal(got.flags, want.flags)
         assert_array_equal(got.n_bands, want.n_bands)
+
+
+@pytest.mark.parametrize("kind", ["text", "true and false", "complex numbers"])
+def test_fluxes_are_numbers(grid, catalogue, kind):
+    table = Table(catalogue)
+    flux = np.asarray(table["band1"])
+    columns = {"text": flux.astype(str), "true and false": flux > 0, "complex numbers": flux * 1j}
+    table["band1"] = Column(columns[kind], unit="uJy")
+    match = f"'photometry' must be a table with numbers in column 'band1', got {kind}"
+    with pytest.raises(ValueError, match=match):
+        BayesFitter(grid).fit(table)
+
+
+@pytest.mark.parametrize("code", [1e99, -1e99, 1e-99])
+def test_codes_beyond_all_measurements_are_left_out(grid, catalogue, code):
+    """Their squares are no numbers, or leave none of those of others."""
+    column, flag = ("band2_err", FitFlags.BAD_ERROR)
+    if code < 0:
+        column, flag = ("band2", FitFlags.BAD_FLUX)
+    missing = catalogue.copy()
+    missing[column][1] = np.nan
+    catalogue[column][1] = code * u.uJy
+    fitter = BayesFitter(grid)
+    got, want = fitter.fit(catalogue), fitter.fit(missing)
+    assert_array_equal(got.flags, want.flags | np.where(np.arange(6) == 1, int(flag), 0))
+    for name in ("chi2", "log_evidence", "moments", "n_bands"):
+        assert_array_equal(getattr(got, name), getattr(want, name))
+
+
+@pytest.mark.parametrize("noise", [1e-8, 1e-12, 1e-30])
+def test_fluxes_without_noise_give_their_model_back(make_grid, draw_photometry, noise):
+    grid = make_grid(2)
+    table, truth = draw_photometry(grid, 20, noise=1e-300)
+    for name in grid.filters:
+        table[f"{name}_err"] = noise * table[name]
+    fitter = BayesFitter(grid, model_error=0.0)
+    results = fitter.fit(table)
+    mass = np.array([model[-1] for model in truth])
+    assert_allclose(results.mean("mass").value, mass, rtol=1e-6)
+    assert_allclose(fitter.sample(table, 20, seed=1).mean("mass").value, mass, rtol=1e-5)
+    assert_allclose(results.mean("redshift").value, table["redshift"].value, rtol=1e-6)
+    # no error below 1e-6: that of the mass is this over the root of the number of bands
+    assert_allclose(results.std("mass").value / mass, 1e-6 / np.sqrt(6), rtol=0.01)
+    assert_allclose(results.chi2, 0.0, atol=1e-9)
+    assert np.isfinite(results.log_evidence).all()
+    assert np.isfinite(results.model_flux_std).all()

@@ -1,4 +1,5 @@
 import itertools
+import math
 import pickle
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 
@@ -7,8 +8,9 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 from scipy.integrate import quad
+from scipy.stats import norm
 
-from miricigale.fitting import BayesFitter, FitFlags
+from miricigale.fitting import BayesFitter, FitFlags, leave_out
 from miricigale.fitting.posterior import cell_edges
 from miricigale.sed import SEDModel
 
@@ -360,3 +362,56 @@ def test_signal_to_noise_below_three_is_flagged(make_grid, signal):
     results = BayesFitter(grid, model_error=0.0).fit(table)
     assert results.chi2[0] == pytest.approx(0.0, abs=1e-9)
     assert bool(results.flags[0] & int(FitFlags.LOW_SIGNAL)) == (signal < 3.0)
+
+
+def test_priors_may_be_distributions_and_functions_of_one_value(grid, photometry):
+    """scipy's normal density at the nodes, given in four ways."""
+    normal = norm(1.5, 0.7)
+    nodes = BayesFitter(grid).priors.axes["tau"].values
+
+    def density(tau):
+        return np.exp(-0.5 * ((tau - 1.5) / 0.7) ** 2)
+
+    def of_one(tau):
+        return math.exp(-0.5 * ((tau - 1.5) / 0.7) ** 2)
+
+    fits = [
+        BayesFitter(grid, priors={"tau": prior}).fit(photometry)
+        for prior in (normal, normal.pdf, density, of_one, density(nodes))
+    ]
+    for other in fits[1:]:
+        np.testing.assert_allclose(other.pdf["tau"], fits[0].pdf["tau"], rtol=1e-6)
+    # the prior of tau is that of the mean posterior's ratio to one with a flat prior
+    flat = BayesFitter(grid).fit(photometry).pdf["tau"] * normal.pdf(nodes)
+    expected = flat / flat.sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(fits[0].pdf["tau"], expected, rtol=1e-4, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"filters": ["band0", "band0"]}, "'filters' must be different names, at least one"),
+        ({"filters": []}, "'filters' must be different names, at least one"),
+        ({"priors": ["tau"]}, "'priors' must be a dict of parameters, got list"),
+        ({"n_bands_min": True}, "'n_bands_min' must be an integer >= 1, got True"),
+        ({"rtol": "low"}, r"'rtol' must be in \[0, 0.1\), got 'low'"),
+        ({"max_reduced_chi2": "x"}, "'max_reduced_chi2' must be positive, got 'x'"),
+        ({"redshift_tolerance": "x"}, "'redshift_tolerance' must be >= 0, got 'x'"),
+        ({"scale_error": "no"}, "'scale_error' must be True, False or None, got 'no'"),
+    ],
+)
+def test_arguments_that_mean_nothing_are_refused(grid, options, message):
+    with pytest.raises(ValueError, match=message):
+        BayesFitter(grid, **options)
+
+
+def test_weights_and_pieces_have_no_unit_and_no_fraction(grid, photometry):
+    with pytest.raises(u.UnitsError, match=r"'priors\['tau'\]' must be convertible to"):
+        BayesFitter(grid, priors={"tau": np.ones(5) * u.Gyr})
+    for size in (2.5, "a", True):
+        with pytest.raises(ValueError, match="'chunk_size' must be an integer >= 1"):
+            BayesFitter(grid).fit(photometry, chunk_size=size)
+    with pytest.raises(ValueError, match="'filters' must be a list of names or a FilterSet"):
+        BayesFitter(grid).fit(photometry).predict("band0")
+    with pytest.raises(ValueError, match="'bands' must be different names"):
+        leave_out(BayesFitter(grid), photometry, ["band1", "band1"])

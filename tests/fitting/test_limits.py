@@ -292,17 +292,19 @@ def test_a_limit_far_above_all_models_changes_nothing(make_grid, draw_photometry
     np.testing.assert_allclose(got.moments[..., :2], want.moments[..., :2], rtol=1e-10)
     np.testing.assert_allclose(got.log_evidence, want.log_evidence, rtol=1e-12)
     np.testing.assert_allclose(got.chi2, want.chi2, rtol=1e-10)
-    np.testing.assert_allclose(got.quantiles, want.quantiles, rtol=1e-3)
+    # percentiles of derived quantities come from samples of the light models
+    np.testing.assert_allclose(got.quantiles, want.quantiles, rtol=0.03)
     np.testing.assert_array_equal(got.n_bands, want.n_bands + 1)
 
 
-def test_a_limit_without_error_is_a_wall(make_grid, draw_photometry):
+@pytest.mark.parametrize("error", [1e-9, 1e-12, 1e-30])
+def test_a_limit_without_error_is_a_wall(make_grid, draw_photometry, error):
     """As sigma goes to 0 the best scale of every model is that of the detections or the wall's."""
     grid = make_grid(3)
     table = draw_photometry(grid, 8, seed=2)[0]
     wall = 0.5 * table["band4"].value
     table["band4"] = wall * u.uJy
-    table["band4_err"] = 1e-9 * wall * u.uJy
+    table["band4_err"] = error * wall * u.uJy
     table["band4_limit"] = True
     fitter = BayesFitter(grid, model_error=0.0, rtol=0)
     results = fitter.fit(table)

@@ -44,6 +44,11 @@ def test_parallel_map_gives_the_same_answer_in_order():
     assert serial == [math.sqrt(i) for i in range(20)]
 
 
+def test_an_executor_can_be_submitted_to():
+    with pytest.raises(ValueError, match="'executor' must be a concurrent.futures.Executor"):
+        parallel_map(math.sqrt, range(3), executor=2)
+
+
 def test_parallel_map_passes_errors_on():
     with ThreadPoolExecutor(2) as executor, pytest.raises(ValueError, match=r"math domain|nonneg"):
         parallel_map(math.sqrt, [1, -1, 2], executor=executor)
