@@ -33,13 +33,14 @@ from miricigale.detector.effects import (
     stream_key,
 )
 from miricigale.detector.forecast import SKY_FRACTION, forecast
+from miricigale.detector.image import checked_light, included_effects
 from miricigale.detector.ramp import Ramp
 from miricigale.instrument import DetectorProperties, Exposure, miri_detector, saturation_forecast
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import parallel_map
 from miricigale.utils.random import check_seed
-from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.units import SURFACE_BRIGHTNESS
 
 __all__ = ["Detector"]
 
@@ -169,8 +170,8 @@ class Detector:
         ----------
         image : `~astropy.nddata.CCDData`
             Noiseless surface brightness (MJy/sr), shape ``exposure.shape``, sky included.
-            What its ``meta["psf_includes"]`` names (such as ``"ipc"``) is not applied
-            again.
+            What its ``meta["psf_includes"]`` names (a list such as ``["pixel", "ipc"]``, or
+            its text) is not applied again.
         exposure : `~miricigale.instrument.Exposure`
             How it is exposed.
         seed : int, `~numpy.random.Generator` or None, optional
@@ -194,8 +195,10 @@ class Detector:
         `~astropy.units.UnitsError`
             If the image has no unit of surface brightness.
         ValueError
-            If the image has another shape, values that are not finite or that are negative, or
-            ``previous`` belongs to another sub-array or is of no use to this detector.
+            If the image has another shape, another filter or place on the sky (where its
+            ``meta["filter"]`` and WCS tell), masked pixels, values that are not finite or that
+            are negative, or ``previous`` belongs to another sub-array or is of no use to this
+            detector.
 
         Warns
         -----
@@ -277,8 +280,8 @@ class Detector:
         Say what an exposure will saturate, without simulating it.
 
         The mean rate of charge of every pixel is what the effects make of the light (flat
-        field, dark current, interpixel capacitance where it acts); noise and cosmic rays are
-        left out. It is constant, so that a pixel is full in group ceil(well / (rate x group
+        field, dark current, interpixel capacitance where it acts); noise, cosmic rays and
+        latent images are left out. It is constant, so that a pixel is full in group ceil(well / (rate x group
         time)). The well is that of `Saturation`, or the charge at which the converter ends.
 
         Parameters
@@ -304,7 +307,7 @@ class Detector:
         `~miricigale.utils.exceptions.MiricigaleWarning`
             If the sky fills more than 60 % of the well by the last group.
         """
-        light = self._light(image, exposure)
+        light = checked_light(image, exposure)
         effects, _ = self._acting(image)
         told = forecast(light, exposure, effects, self._properties, sources=sources)
         if told.sky_too_bright:
@@ -315,12 +318,12 @@ class Detector:
 
     def _acting(self, image):
         """Return the effects that the image does not hold already, and what it holds."""
-        included = set(getattr(image, "meta", {}).get("psf_includes", ()))
+        included = included_effects(image)
         return tuple(e for e in self._effects if e.included_as not in included), sorted(included)
 
     def _task(self, image, exposure, seed, previous):
         """Check what is exposed and gather what all its blocks share."""
-        light = self._light(image, exposure)
+        light = checked_light(image, exposure)
         seed = check_seed(seed)
         effects, included = self._acting(image)
         previous = self._previous(previous, exposure)
@@ -338,8 +341,8 @@ class Detector:
         """Expose all rows, block by block, and hand each block to ``store``."""
         if n_threads is None:
             n_threads = numba.config.NUMBA_NUM_THREADS
-        if n_threads < 1:
-            raise argument_error("n_threads", "at least 1", n_threads)
+        if n_threads < 1 or int(n_threads) != n_threads:
+            raise argument_error("n_threads", "at least 1 and an integer", n_threads)
         n_int, n_group, ny, nx = task.shape
         height = max(1, _BLOCK_SAMPLES // (n_int * n_group * nx))
         blocks = [slice(start, min(start + height, ny)) for start in range(0, ny, height)]
@@ -351,7 +354,7 @@ class Detector:
         if n_threads == 1:
             parallel_map(work, blocks, progress_bar=progress_bar, desc=desc)
         else:
-            with concurrent.futures.ThreadPoolExecutor(n_threads) as pool:
+            with concurrent.futures.ThreadPoolExecutor(int(n_threads)) as pool:
                 parallel_map(work, blocks, executor=pool, progress_bar=progress_bar, desc=desc)
 
     def _expose_rows(self, task, rows):
@@ -380,7 +383,9 @@ class Detector:
         """Previous exposures as a tuple, checked."""
         if previous is None:
             return ()
-        previous = (previous,) if isinstance(previous, Latent) else tuple(previous)
+        if isinstance(previous, Latent) or not np.iterable(previous):
+            previous = (previous,)
+        previous = tuple(previous)
         for latent in previous:
             if not isinstance(latent, Latent):
                 raise argument_error("previous", "a Latent or several", repr(latent))
@@ -391,25 +396,6 @@ class Detector:
             wanted = "given to a detector whose effects hold Persistence"
             raise argument_error("previous", wanted, "one without it")
         return previous
-
-    def _light(self, image, exposure):
-        """Surface brightness as an array, checked."""
-        if not isinstance(exposure, Exposure):
-            raise argument_error("exposure", "an Exposure", type(exposure).__name__)
-        if getattr(image, "unit", None) is None:
-            msg = f"'image' must be a CCDData in {SURFACE_BRIGHTNESS}, got {type(image).__name__}"
-            raise TypeError(msg)
-        data = getattr(image, "data", None) if not hasattr(image, "to_value") else image.value
-        if np.shape(data) != tuple(exposure.shape):
-            raise argument_error(
-                "image", f"of the exposure's shape {tuple(exposure.shape)}", np.shape(data)
-            )
-        light = to_array(data * image.unit, SURFACE_BRIGHTNESS, "image", ndim=2, finite=True)
-        lowest = light.min()
-        # an FFT leaves noise of this size around bright sources
-        if lowest < -1e-6 * np.abs(light).max():
-            raise argument_error("image", "surface brightness that is nowhere negative", lowest)
-        return np.maximum(light, 0.0)
 
     def _check_sky(self, light, exposure):
         """Share of the full well that the median pixel fills in one integration."""

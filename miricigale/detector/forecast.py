@@ -216,6 +216,9 @@ def forecast_table(forecasts):
     forecasts = list(forecasts)
     if not forecasts:
         raise argument_error("forecasts", "at least one forecast", "none")
+    for told in forecasts:
+        if not isinstance(told, SaturationForecast):
+            raise argument_error("forecasts", "made of SaturationForecast", repr(told))
     columns = {}
     for name in ("filter", "dither", "readout", "subarray", "n_groups", "n_integrations"):
         columns[name] = [getattr(f.exposure, name) for f in forecasts]

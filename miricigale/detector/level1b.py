@@ -59,6 +59,8 @@ def header(exposure, *, filename="", start=None):
     """
     if start is None:
         start = Time(_START, scale="utc") + TimeDelta(exposure.dither * 3600.0, format="sec")
+    elif not isinstance(start, Time) or not start.isscalar:
+        raise argument_error("start", "one astropy Time", repr(start))
     duration = TimeDelta(exposure.duration.to_value("s"), format="sec")
     where = exposure.pointing_keywords()
     frame = exposure.frame_time.to_value("s")

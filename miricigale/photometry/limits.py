@@ -8,6 +8,7 @@ from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
 
 from miricigale.instrument import (
+    DetectorProperties,
     background_level,
     etc_limit,
     etc_setup,
@@ -144,9 +145,13 @@ def _amplitude(residual, filter):
     return value
 
 
-def _extraction(radius, annulus, psf, correlation):
+def _extraction(radius, annulus, psf, correlation, filter):
     """Light in the extraction and noise powers, means over positions within the pixel."""
     info = psf_info(psf)
+    have = psf.meta.get("filter")
+    # other packages write F770W where we write miri.f770w
+    if isinstance(have, str) and have.lower().rpartition(".")[2] != filter.rpartition(".")[2]:
+        raise argument_error("psf", f"one of the filter {filter}", f"one of {have}")
     if "pixel" not in info.includes:
         raise argument_error("psf", "a PSF that includes the pixel", f"one with {info.includes}")
     scale = MIRI_PIXEL_SCALE.value
@@ -279,7 +284,10 @@ def forecast(
 ):
     """Everything `sensitivity` works out, in uJy, arcsec, electrons and s."""
     setup = etc_setup(filter)
+    filter = setup.filter  # with the instrument's name, if that was left out
     detector = miri_detector() if detector is None else detector
+    if not isinstance(detector, DetectorProperties):
+        raise argument_error("detector", "a DetectorProperties", repr(detector))
     radius, edges = _radii(aperture, annulus, setup)
     amplitude = _amplitude(residual, filter)
     level = background_level(filter) if background is None else background
@@ -320,7 +328,7 @@ def forecast(
     growth = (ramp_variance(1.01 * rate + 1e-3, **ramp) / n_ramps - variance) / (0.01 * rate + 1e-3)
 
     psf = miri_psf(filter) if psf is None else psf
-    light, white, shot, pattern = _extraction(radius, edges, psf, correlation)
+    light, white, shot, pattern = _extraction(radius, edges, psf, correlation, filter)
     if not light > 0:
         raise argument_error("annulus", "such that light of the source is left", annulus)
     electrons = per_level / area  # per second and uJy
@@ -367,6 +375,8 @@ def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=1
     >>> bool((abs(table["limit"] / table["etc_40"] - 1) < 0.02).all())
     True
     """
+    if isinstance(filters, str):
+        filters = [filters]
     names = imager_filters() if filters is None else list(filters)
     seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
     rows = []
@@ -376,7 +386,7 @@ def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=1
         scale = n_sigma / 10 * np.sqrt(1e4 / seconds)
         rows.append(
             (
-                name,
+                etc_setup(name).filter,
                 row["radius"] * ANGLE,
                 row["light"],
                 row["background"] * SURFACE_BRIGHTNESS,

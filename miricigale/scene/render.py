@@ -30,8 +30,9 @@ def _check(painter, origin):
         raise argument_error("enclosed", "between 0 and 1", painter.enclosed)
     if not painter.max_radius > 0:
         raise argument_error("max_radius", "positive", painter.max_radius)
-    if painter.workers is not None and painter.workers < 1:
-        raise argument_error("workers", "at least 1", painter.workers)
+    workers = painter.workers
+    if workers is not None and (workers < 1 or int(workers) != workers):
+        raise argument_error("workers", "an integer of at least 1", workers)
     return int(oversampling[0]), tuple(round(float(v)) for v in origin)
 
 

@@ -195,6 +195,9 @@ class Scene:
             return background
         if not hasattr(background, "unit"):
             raise argument_error("background", "a Background or a Quantity", repr(background))
+        level = to_array(background, SURFACE_BRIGHTNESS, "background", ndim=0, finite=True)
+        if level < 0:
+            raise argument_error("background", "at least 0", background)
         return Background(background)
 
     def _center_jacobian(self):

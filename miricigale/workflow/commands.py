@@ -17,7 +17,7 @@ from miricigale.instrument import (
     saturation_forecast,
     scaled_limit,
 )
-from miricigale.photometry import ForcedPhotometer, detect_sources
+from miricigale.photometry import ForcedPhotometer, detect_sources, sensitivity
 from miricigale.psf import MatchingKernel, hst_psf, miri_psf, psf_mosaic
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
@@ -55,7 +55,7 @@ def filter_table(pattern=""):
 
 def plan_table(*, quick=False):
     """
-    The CEERS exposures: time, filling of the well by the sky, limits.
+    The CEERS exposures: time, filling of the well by the sky, limits (5 sigma, AB).
 
     Parameters
     ----------
@@ -65,7 +65,10 @@ def plan_table(*, quick=False):
     Returns
     -------
     table : `~astropy.table.QTable`
-        A row for each band.
+        A row for each band. Three limits of point sources: ``limit_etc``, the exposure time
+        calculator's scaled by the root of the time; ``limit``, of these exposures by
+        `~miricigale.photometry.sensitivity` with the residual pattern
+        (``residual="etc"``); ``limit_proposal``, of the survey's proposal.
     """
     exposures = ceers_exposures(SkyCoord(0 * u.deg, 0 * u.deg), 0 * u.deg, quick=quick)
     names = list(dict.fromkeys(e.filter for e in exposures))
@@ -82,13 +85,29 @@ def plan_table(*, quick=False):
                 np.round(time.to(u.s), 1),
                 round(float(saturation_forecast(mine[0])), 3),
                 np.round(scaled_limit(name, time).to(u.ABmag), 2),
+                np.round(_limit(mine, time).to(u.ABmag), 2),
                 np.round(proposal_limit(name), 2),
                 psf_fwhm(name),
             )
         )
     columns = ("filter", "groups", "integrations", "dithers", "time", "sky_in_well")
-    columns += ("limit_etc", "limit_proposal", "fwhm")
+    columns += ("limit_etc", "limit", "limit_proposal", "fwhm")
     return QTable(rows=rows, names=columns)
+
+
+def _limit(exposures, time):
+    """Our own limit of the dithers of one band."""
+    first = exposures[0]
+    return sensitivity(
+        first.filter,
+        time,
+        n_sigma=5,
+        residual="etc",
+        n_groups=first.n_groups,
+        n_dithers=len(exposures),
+        readout=first.readout,
+        subarray=first.subarray,
+    )
 
 
 def fit_catalogue(

@@ -1,6 +1,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 
 import miricigale.detector.detector as module
@@ -123,10 +124,16 @@ def test_what_the_psf_holds_is_left_out(make_exposure, make_sky, detector):
     )
     spread = Detector(chain).expose(image, exposure, seed=0).data[0, -1].astype(float)
     assert spread[30, 41] / spread.sum() == pytest.approx(0.033, rel=0.05)
-    image.meta["psf_includes"] = ["pixel", "ipc"]
+    # a list, and the text that a header makes of it
+    for includes in (["pixel", "ipc"], "pixel, ipc", "ipc", ("PIXEL", "IPC")):
+        image.meta["psf_includes"] = includes
+        ramp = Detector(chain).expose(image, exposure, seed=0)
+        assert ramp.data[0, -1, 30, 41] == 0
+        assert not any("Interpixel" in text for text in ramp.meta["effects"])
+    # a text without it
+    image.meta["psf_includes"] = "pixel"
     ramp = Detector(chain).expose(image, exposure, seed=0)
-    assert ramp.data[0, -1, 30, 41] == 0
-    assert not any("Interpixel" in text for text in ramp.meta["effects"])
+    assert ramp.data[0, -1, 30, 41] > 0
     assert InterpixelCapacitance() in detector.effects
 
 
@@ -193,13 +200,47 @@ def test_refuses_wrong_images(make_exposure, make_sky, detector):
     image.data[3, 4] = np.nan
     with pytest.raises(ValueError, match="'image' must be finite values, got 1 that"):
         detector.expose(image, exposure)
+    image.data[3, 4] = 5.0
+    image.mask = image.data > 2
+    with pytest.raises(ValueError, match=r"'image' must be without masked pixels.* got 1 of them"):
+        detector.expose(image, exposure)
+    image.mask = None
     image.data[3, 4] = -0.5
     with pytest.raises(ValueError, match="'image' must be surface brightness that is nowhere"):
         detector.expose(image, exposure)
     with pytest.raises(ValueError, match="'n_threads' must be at least 1"):
         detector.expose(make_sky(exposure, 1.0), exposure, n_threads=0)
+    with pytest.raises(ValueError, match="'n_threads' must be at least 1 and an integer"):
+        detector.expose(make_sky(exposure, 1.0), exposure, n_threads=1.5)
     with pytest.raises(ValueError, match="'seed' must be"):
         detector.expose(make_sky(exposure, 1.0), exposure, seed=-1)
+
+
+def test_refuses_images_of_another_place_or_filter(make_exposure, make_sky, detector):
+    exposure = make_exposure(n_groups=2)
+    image = make_sky(exposure, 1.0)
+    image.wcs = exposure.wcs
+    for name in ("miri.f770w", "F770W"):
+        image.meta["filter"] = name
+        detector.expose(image, exposure, seed=0)
+        detector.forecast(image, exposure)
+    # the next dither, another roll, another sub-array's corner, the other side of the sky
+    moved = exposure.dithered("ceers", 3)[1]
+    rolled = exposure.replace(roll=exposure.roll + 1 * u.deg)
+    away = exposure.replace(pointing=SkyCoord(233.1344, 27.83444, unit="deg"))
+    for other in (moved, rolled, away):
+        with pytest.raises(ValueError, match="'image' must be where the exposure points"):
+            detector.expose(image, other)
+    # 1" on the sky is nine pixels of 0.11"
+    image.wcs = exposure.replace(
+        pointing=exposure.pointing.directional_offset_by(40 * u.deg, 1 * u.arcsec)
+    ).wcs
+    with pytest.raises(ValueError, match=r"got one 9\.\d+ pixels off"):
+        detector.forecast(image, exposure)
+    image.wcs = exposure.wcs
+    image.meta["filter"] = "miri.f1000w"
+    with pytest.raises(ValueError, match=r"'image' must be one of the filter miri\.f770w, got one"):
+        detector.expose(image, exposure)
 
 
 def test_other_units_of_surface_brightness(make_exposure, make_sky):

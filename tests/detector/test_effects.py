@@ -20,6 +20,7 @@ from miricigale.detector import (
 )
 from miricigale.detector.effects import stream_key
 from miricigale.instrument import (
+    aperture,
     bad_pixel_mask,
     flat_field,
     miri_detector,
@@ -221,8 +222,20 @@ def test_read_noise(make_block):
     ramp = ReadNoise().apply(empty(block), block)
     assert ramp.std() == pytest.approx(6, rel=5 / np.sqrt(2 * ramp.size))
     pink = ReadNoise(sigma=0, pink=3.0).apply(empty(block), block)
-    assert pink.std() > 0
     np.testing.assert_array_equal(pink[..., 0], pink[..., 4])
+
+
+def test_pink_noise_has_as_much_power_in_every_octave(make_block):
+    # 1/f: the variance between rows that are read 1, 2, 4 ... apart grows by equal amounts
+    block = make_block(n_groups=500, n_integrations=2, subarray="SUB256")
+    ramp = ReadNoise(sigma=0, pink=4.0, octaves=16).apply(empty(block), block)
+    drift = ramp[..., :4].astype(float).reshape(-1, 4)
+    lags = 2 ** np.arange(9)
+    growth = np.diff([np.mean((drift[lag:] - drift[:-lag]) ** 2) for lag in lags])
+    # two rows share what changes more slowly than they are apart: 2 sigma^2 / 16 an octave
+    np.testing.assert_allclose(growth, 2 * 4.0**2 / 16, rtol=0.15)
+    # the slowest octaves, 32768 rows long, are drawn 8 times for each of 4 outputs
+    assert drift.std() == pytest.approx(4.0, rel=0.1)
 
 
 def test_coupling_keeps_a_flat_field_and_spreads_a_point(make_block):
@@ -253,6 +266,18 @@ def test_residual_is_fixed_on_the_detector(make_block, correlation):
     np.testing.assert_allclose(effect.apply(light[50:60], part), pattern[50:60], rtol=1e-12)
 
 
+@pytest.mark.parametrize("correlation", [0.0, 1.3])
+@pytest.mark.parametrize("subarray", ["SUB256", "SUB64", "BRIGHTSKY"])
+def test_sub_arrays_see_their_part_of_the_residual(make_block, subarray, correlation):
+    # the same pixels, whichever of them are read: as for the flat field
+    effect = Residual(0.01, correlation=correlation)
+    rows, columns = aperture(subarray).slices
+    full, part = make_block(subarray="FULL", n_groups=2), make_block(subarray=subarray, n_groups=2)
+    whole = effect.apply(np.ones(full.exposure.shape), full)
+    own = effect.apply(np.ones(part.exposure.shape), part)
+    np.testing.assert_allclose(own - 1, whole[rows, columns] - 1, rtol=1e-9, atol=1e-14)
+
+
 @pytest.mark.parametrize("name", ["miri.f560w", "miri.f2550w"])
 def test_residual_by_name_has_the_amplitude_of_the_filter(make_block, name):
     block = make_block(name, subarray="SUB256")
@@ -273,6 +298,17 @@ def test_residual_by_name_has_the_amplitude_of_the_filter(make_block, name):
         (lambda: CosmicRays(leakage=0.3), "leakage"),
         (lambda: CosmicRays(shower_fraction=2), "shower_fraction"),
         (lambda: CosmicRays(track_max=1000), "track_max"),
+        (lambda: CosmicRays(flux=-1.0), "flux"),
+        (lambda: CosmicRays(yield_dex=np.nan), "yield_dex"),
+        (lambda: CosmicRays(shower_sigma=0), "shower_sigma"),
+        (lambda: Dark(current=-0.2), "current"),
+        (lambda: BadPixels(hot_current=np.inf), "hot_current"),
+        (lambda: Saturation(full_well=0), "full_well"),
+        (lambda: Bias(level=np.nan), "level"),
+        (lambda: Bias(reset_noise=-1), "reset_noise"),
+        (lambda: ReadNoise(sigma=-6), "sigma"),
+        (lambda: ReadNoise(pink=np.nan), "pink"),
+        (lambda: ReadNoise(octaves=0), "octaves"),
     ],
 )
 def test_errors_name_the_argument(effect, name):

@@ -193,3 +193,5 @@ def test_table_of_several_exposures(make_exposure, make_sky, plain):
     assert table["sky_fraction"][1] == pytest.approx(8 * table["sky_fraction"][0])
     with pytest.raises(ValueError, match="'forecasts' must be at least one"):
         forecast_table([])
+    with pytest.raises(ValueError, match="'forecasts' must be made of SaturationForecast"):
+        forecast_table([exposure])

@@ -142,3 +142,13 @@ def test_refuses_what_is_no_file(ramp, tmp_path):
     cut.write_bytes(whole.read_bytes()[:30000])
     with pytest.raises(DataError):
         Ramp.read(cut)
+
+
+@pytest.mark.parametrize("start", ["2023-01-02", Time(["2023-01-02", "2023-01-03"])])
+def test_a_start_that_is_no_time_is_named(make_exposure, make_sky, tmp_path, start):
+    exposure = make_exposure(n_groups=2)
+    with pytest.raises(ValueError, match="'start' must be one astropy Time"):
+        Detector.miri_imager().expose_to(
+            tmp_path / "a_uncal.fits", make_sky(exposure, 1.0), exposure, start=start
+        )
+    assert not list(tmp_path.iterdir())

@@ -161,6 +161,14 @@ def test_refuses_what_cannot_be_remembered(make_exposure, make_sky):
         detector.expose(sky, exposure, previous=Latent(np.ones((3, 4)) * RATE, 1 * u.s))
     with pytest.raises(ValueError, match="'previous' must be a Latent or several"):
         detector.expose(sky, exposure, previous=[3])
+    with pytest.raises(ValueError, match="'previous' must be a Latent or several"):
+        detector.expose(sky, exposure, previous=3)
+    with pytest.raises(KeyError, match="no sub-array 'SUB65'; known: BRIGHTSKY"):
+        Latent(np.ones((2, 2)) * RATE, 1 * u.s, "SUB65")
+    with pytest.raises(ValueError, match="'ramp' must be a Ramp"):
+        Latent.from_ramp(sky, 1 * u.s)
+    with pytest.raises(u.UnitsError, match="'time'"):
+        latent.after(5)
     with pytest.raises(ValueError, match="'rate' must be nowhere negative"):
         Latent(np.array([[-1.0]]) * RATE, 1 * u.s)
     with pytest.raises(ValueError, match="'gap' must be at least 0 s"):
@@ -173,6 +181,7 @@ def test_refuses_what_cannot_be_remembered(make_exposure, make_sky):
     ("options", "name"),
     [
         ({"amplitudes": (0.1, 0.2, 0.3)}, "amplitudes, times"),
+        ({"amplitudes": (), "times": ()}, "amplitudes, times"),
         ({"amplitudes": (-0.1, 0.2)}, "amplitudes"),
         ({"times": (0, 1)}, "times"),
     ],

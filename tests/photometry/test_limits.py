@@ -181,6 +181,10 @@ def test_table_scales_the_calculators_limits(psf):
     assert_quantity_allclose(table["limit"], table["limit_white"])
     assert_quantity_allclose(table["background"], background_level(NAME))
     assert table["residual"][0] == 0 * u.uJy
+    # one name is a list of one, and the instrument's may be left out of it
+    short = sensitivity_table("f1000w", 2500 * u.s, n_sigma=5, residual=None)
+    assert short["filter"].tolist() == [NAME]
+    assert_quantity_allclose(short["limit"], table["limit"])
     # n sigma times the noise in the aperture, over the light in it, and a little of the source
     assert_quantity_allclose(table["limit"], 5 * table["noise"] / table["light"], rtol=0.03)
 
@@ -251,6 +255,7 @@ def test_noise_is_that_of_simulated_and_reduced_exposures(residual, n_exposures,
         ({"residual": True}, "residual"),
         ({"correlation": -1}, "correlation"),
         ({"background": -1 * u.MJy / u.sr}, "background"),
+        ({"detector": 3}, "detector"),
         (
             {"psf": gaussian_psf(0.3 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=6 * u.arcsec)},
             "psf",
@@ -265,6 +270,8 @@ def test_errors_name_the_argument(options, name, psf):
 def test_unknown_names_list_the_known():
     with pytest.raises(KeyError, match="no residual preset 'sky'; known: etc"):
         sensitivity(NAME, residual="sky")
+    with pytest.raises(ValueError, match=r"'psf' must be one of the filter miri\.f770w, got one"):
+        sensitivity("miri.f770w", psf=miri_psf("miri.f560w"))
     with pytest.raises(KeyError, match="no imaging filter"):
         sensitivity("miri.f600w")
     with pytest.raises(u.UnitsError, match="'time' must be"):

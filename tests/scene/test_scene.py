@@ -238,6 +238,8 @@ def test_refuses(wcs, psf):
     Scene(catalog, filter=FILTER, wcs=tools.tan_wcs(pa=40.0), psf=turned)
     with pytest.raises(ValueError, match="'background' must be a Background or a Quantity"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, background=3.0)
+    with pytest.raises(ValueError, match=r"'background' must be at least 0, got -3\.0 MJy"):
+        Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, background=-3 * u.MJy / u.sr)
     bare = tools.tan_wcs()
     bare.pixel_shape = None
     with pytest.raises(ValueError, match="'wcs' must be a WCS with its pixel_shape"):
@@ -251,8 +253,10 @@ def test_refuses(wcs, psf):
     with pytest.raises(u.UnitsError, match=r"'miri\.f770w' must be convertible to uJy, got mag"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=psf)
     catalog = tools.make_catalog(wcs, 50, 45)
-    with pytest.raises(ValueError, match="'workers' must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="'workers' must be an integer of at least 1, got 0"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, workers=0)
+    with pytest.raises(ValueError, match=r"'workers' must be an integer of at least 1, got 1\.5"):
+        Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, workers=1.5)
     with pytest.raises(ValueError, match=r"'max_radius' must be positive, got -1\.0 arcsec"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, max_radius=-1 * u.arcsec)
     even = ImagePSF(np.ones((8, 8)), oversampling=4)

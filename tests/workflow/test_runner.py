@@ -4,10 +4,12 @@ import pytest
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.wcs import WCS
 
-from miricigale.utils.exceptions import ConfigError, DataError
+from miricigale.refdata import locate
+from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarning
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.products import ProductStore, read_image, write_image
 from miricigale.workflow.runner import Stage, StudyRunner, check_disk
+from miricigale.workflow.stages import study_stages
 
 
 class Recorder:
@@ -86,6 +88,34 @@ def test_a_change_of_the_packages_own_plan_is_seen(tmp_path):
         stage = Stage("one", function, "one", plan=lambda _, __, n=groups: {"n_groups": n})
         StudyRunner(StudyConfig(), tmp_path / "run", [stage]).run()
     assert len(ran) == 2
+
+
+def test_other_reference_data_make_other_exposures(tmp_path, monkeypatch):
+    # what residual = "etc" means stands in a file, not in the configuration
+    class Nothing:
+        def checksums(self, name):
+            return {}
+
+    def digests():
+        stages = [s for s in study_stages() if s.name in ("exposures", "points", "kernels")]
+        runner = StudyRunner(StudyConfig(), tmp_path / "run", study_stages())
+        units = [next(iter(stage.units(runner.config))) for stage in stages]
+        return {
+            stage.name: runner.digest(stage, unit, Nothing())
+            for stage, unit in zip(stages, units, strict=True)
+        }
+
+    monkeypatch.delenv("MIRICIGALE_DATA", raising=False)
+    before = digests()
+    text = locate("instrument.etc").read_text()
+    other = tmp_path / "data" / "instrument" / "etc.toml"
+    other.parent.mkdir(parents=True)
+    other.write_text(text.replace("f770w = ", "f770w = 2.0  # "))
+    monkeypatch.setenv("MIRICIGALE_DATA", str(tmp_path / "data"))
+    with pytest.warns(MiricigaleWarning, match="differs from the bundled file"):
+        after = digests()
+    changed = {name for name in before if after[name] != before[name]}
+    assert changed == {"exposures", "points"}
 
 
 def test_a_damaged_product_is_made_again(tmp_path):

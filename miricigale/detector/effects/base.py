@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 
 from miricigale.instrument import DetectorProperties, Exposure
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import stream
 
-__all__ = ["Block", "Effect", "check_ramp", "key_words", "stream_key"]
+__all__ = ["Block", "Effect", "check_amounts", "check_ramp", "key_words", "stream_key"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -76,6 +77,16 @@ def check_ramp(array, block, effect):
         )
         raise ValueError(msg)
     return array
+
+
+def check_amounts(*, above_zero=False, **values):
+    """Check that settings are finite and not negative; None stands for the detector's own."""
+    for name, value in values.items():
+        if value is None:
+            continue
+        if not np.isfinite(value) or value < 0 or (above_zero and value == 0):
+            wanted = "finite and positive" if above_zero else "finite and at least 0"
+            raise argument_error(name, wanted, value)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from miricigale.detector import _core
 from miricigale.detector.dq import DQ
-from miricigale.detector.effects.base import Effect, check_ramp
+from miricigale.detector.effects.base import Effect, check_amounts, check_ramp
 from miricigale.instrument import bad_pixel_mask, reference_pixel_mask
 from miricigale.utils.exceptions import argument_error
 
@@ -33,6 +33,9 @@ class Dark(Effect):
     """
 
     current: float | None = None
+
+    def __post_init__(self):
+        check_amounts(current=self.current)
 
     def apply(self, array, block):
         """Add the dark charge."""
@@ -119,6 +122,13 @@ class CosmicRays(Effect):
     shower_sigma: float = 15.0
 
     def __post_init__(self):
+        check_amounts(
+            flux=self.flux,
+            yield_median=self.yield_median,
+            yield_dex=self.yield_dex,
+            shower_charge=self.shower_charge,
+        )
+        check_amounts(above_zero=True, thickness=self.thickness, shower_sigma=self.shower_sigma)
         if not 0 <= self.leakage <= 0.2:
             raise argument_error("leakage", "from 0 to 0.2", self.leakage)
         if not 0 <= self.shower_fraction <= 1:
@@ -166,6 +176,9 @@ class BadPixels(Effect):
     """
 
     hot_current: float = 300.0
+
+    def __post_init__(self):
+        check_amounts(hot_current=self.hot_current)
 
     def apply(self, array, block):
         """Empty the dead pixels and heat the hot ones."""
@@ -225,6 +238,9 @@ class Saturation(Effect):
     """
 
     full_well: float | None = None
+
+    def __post_init__(self):
+        check_amounts(above_zero=True, full_well=self.full_well)
 
     def apply(self, array, block):
         """Clip the charge and flag it."""

@@ -19,7 +19,7 @@ class Residual(Effect):
     What flat field and sky subtraction leave behind, fixed on the detector.
 
     Multiplies the light by 1 plus a random pattern that is the same in every exposure
-    through one filter.
+    through one filter: sub-arrays see their part of the full frame's.
 
     Parameters
     ----------
@@ -50,10 +50,13 @@ class Residual(Effect):
         """Multiply surface brightness by the pattern."""
         reach = int(np.ceil(4 * self.correlation))
         n_row, n_col = array.shape
+        left, bottom = block.exposure.aperture.origin
         key = key_words(self.pattern, "detector", "residual", block.exposure.filter)
-        white = np.empty((n_row + 2 * reach, n_col + 2 * reach))
+        # a row is drawn from the first column of the detector on, whatever part is read
+        white = np.empty((n_row + 2 * reach, left + n_col + 2 * reach))
         # rows beyond the detector have streams of their own
-        _core.standard_normals(key, block.rows.start - reach + 10_000, white)
+        _core.standard_normals(key, bottom + block.rows.start - reach + 10_000, white)
+        white = white[:, left:]
         if reach:
             delta = np.zeros(2 * reach + 1)
             delta[reach] = 1.0

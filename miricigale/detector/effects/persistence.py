@@ -16,7 +16,8 @@ import numpy as np
 from miricigale.detector import _core
 from miricigale.detector.dq import DQ
 from miricigale.detector.effects.base import Effect, check_ramp
-from miricigale.instrument import miri_detector
+from miricigale.detector.ramp import Ramp
+from miricigale.instrument import aperture, miri_detector
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import TIME, frozen_array, to_array
 
@@ -43,6 +44,8 @@ class Latent:
 
     Raises
     ------
+    KeyError
+        If the sub-array is not known.
     ValueError
         If a rate or the gap is negative.
 
@@ -58,6 +61,7 @@ class Latent:
 
     def __post_init__(self):
         unit = u.electron / TIME
+        aperture(self.subarray)
         rate = to_array(self.rate, unit, "rate", ndim=2, finite=True)
         if np.any(rate < 0):
             raise argument_error("rate", "nowhere negative", rate.min())
@@ -88,6 +92,8 @@ class Latent:
         latent : `Latent`
             A saturated pixel counts as full at the end: its latent is a lower limit.
         """
+        if not isinstance(ramp, Ramp):
+            raise argument_error("ramp", "a Ramp", type(ramp).__name__)
         if not 0 <= threshold <= 1:
             raise argument_error("threshold", "a fraction of the full well", threshold)
         properties = miri_detector() if properties is None else properties
@@ -111,7 +117,8 @@ class Latent:
         -------
         latent : `Latent`
         """
-        return dataclasses.replace(self, gap=self.gap + time)
+        step = float(to_array(time, TIME, "time", ndim=0, finite=True))
+        return dataclasses.replace(self, gap=self.gap + step * TIME)
 
     def __repr__(self):
         ny, nx = self.rate.shape
@@ -147,9 +154,9 @@ class Persistence(Effect):
         for name in ("amplitudes", "times"):
             values = tuple(float(v) for v in np.atleast_1d(getattr(self, name)))
             object.__setattr__(self, name, values)
-        if len(self.amplitudes) != len(self.times):
+        if not self.amplitudes or len(self.amplitudes) != len(self.times):
             got = f"{len(self.amplitudes)} and {len(self.times)}"
-            raise argument_error("amplitudes, times", "of one length", got)
+            raise argument_error("amplitudes, times", "of one length, at least one each", got)
         if not all(0 <= a <= 1 for a in self.amplitudes):
             raise argument_error("amplitudes", "shares from 0 to 1", self.amplitudes)
         if not all(np.isfinite(t) and t > 0 for t in self.times):

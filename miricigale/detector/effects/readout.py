@@ -6,7 +6,8 @@ import numpy as np
 
 from miricigale.detector import _core
 from miricigale.detector.dq import DQ
-from miricigale.detector.effects.base import Effect, check_ramp
+from miricigale.detector.effects.base import Effect, check_amounts, check_ramp
+from miricigale.utils.exceptions import argument_error
 
 __all__ = ["ADConversion", "Bias", "Nonlinearity", "ReadNoise"]
 
@@ -58,6 +59,11 @@ class Bias(Effect):
     level: float | None = None
     reset_noise: float = 0.0
 
+    def __post_init__(self):
+        check_amounts(reset_noise=self.reset_noise)
+        if self.level is not None and not np.isfinite(self.level):
+            raise argument_error("level", "finite", self.level)
+
     def apply(self, array, block):
         """Add the level."""
         ramp = check_ramp(array, block, self)
@@ -93,6 +99,11 @@ class ReadNoise(Effect):
     sigma: float | None = None
     pink: float = 0.0
     octaves: int = 16
+
+    def __post_init__(self):
+        check_amounts(sigma=self.sigma, pink=self.pink)
+        if not 1 <= self.octaves <= 40 or int(self.octaves) != self.octaves:
+            raise argument_error("octaves", "an integer from 1 to 40", self.octaves)
 
     def apply(self, array, block):
         """Add the noise."""

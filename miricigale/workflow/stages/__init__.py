@@ -51,6 +51,8 @@ def study_stages():
         "psf.jwst_pupil",
         "filters.sedpy",
     )
+    # residual = "etc" says whose pattern it is, not how strong
+    exposure_data = (*image_data, "instrument.etc")
     return (
         Stage(
             "catalog",
@@ -93,7 +95,7 @@ def study_stages():
             version=3,
             needs=("truth",),
             sections=(*images, "run.keep_level1b"),
-            resources=image_data,
+            resources=exposure_data,
             units=exposure_units,
             plan=exposure_plan,
         ),
@@ -143,7 +145,7 @@ def study_stages():
                 "photometry.min_area",
                 "point_sources",
             ),
-            resources=image_data,
+            resources=exposure_data,
             plan=exposure_plan,
             units=lambda config: _filters(config) if config.point_sources.enabled else (),
         ),

@@ -1,0 +1,96 @@
+"""The image that is exposed: its light, checked against the exposure, and what it holds."""
+
+import numpy as np
+from astropy.wcs import WCS
+from astropy.wcs.utils import proj_plane_pixel_area
+
+from miricigale.instrument import Exposure
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
+
+__all__ = ["checked_light", "included_effects"]
+
+# pixels by which the image may lie off the exposure
+_PLACE = 0.1
+
+
+def checked_light(image, exposure):
+    """
+    Surface brightness of an image, if the exposure can be one of it.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData` or `~astropy.units.Quantity`
+        As for `Detector.expose`.
+    exposure : `~miricigale.instrument.Exposure`
+        How it is exposed.
+
+    Returns
+    -------
+    light : `~numpy.ndarray`, shape (ny, nx)
+        In MJy/sr, nowhere negative.
+
+    Raises
+    ------
+    TypeError
+        If the image has no unit.
+    `~astropy.units.UnitsError`
+        If that is none of surface brightness.
+    ValueError
+        If the image has another shape, filter or place on the sky, masked pixels, or values
+        that are not finite or that are negative.
+    """
+    if not isinstance(exposure, Exposure):
+        raise argument_error("exposure", "an Exposure", type(exposure).__name__)
+    if getattr(image, "unit", None) is None:
+        msg = f"'image' must be a CCDData in {SURFACE_BRIGHTNESS}, got {type(image).__name__}"
+        raise TypeError(msg)
+    masked = np.count_nonzero(getattr(image, "mask", None))
+    if masked:
+        wanted = "without masked pixels, as each of them collects light"
+        raise argument_error("image", wanted, f"{masked} of them")
+    data = getattr(image, "data", None) if not hasattr(image, "to_value") else image.value
+    if np.shape(data) != tuple(exposure.shape):
+        raise argument_error(
+            "image", f"of the exposure's shape {tuple(exposure.shape)}", np.shape(data)
+        )
+    _check_filter(image, exposure)
+    _check_place(image, exposure)
+    light = to_array(data * image.unit, SURFACE_BRIGHTNESS, "image", ndim=2, finite=True)
+    lowest = light.min()
+    # an FFT leaves noise of this size around bright sources
+    if lowest < -1e-6 * np.abs(light).max():
+        raise argument_error("image", "surface brightness that is nowhere negative", lowest)
+    return np.maximum(light, 0.0)
+
+
+def included_effects(image):
+    """Names, in small letters, of what the image's PSF holds (its ``meta["psf_includes"]``)."""
+    included = getattr(image, "meta", {}).get("psf_includes") or ()
+    if isinstance(included, str):
+        # as a header keeps it
+        included = included.replace(",", " ").split()
+    return {str(name).lower() for name in included}
+
+
+def _check_filter(image, exposure):
+    """An image that names its filter must be one of the exposure's."""
+    have = getattr(image, "meta", {}).get("filter")
+    # headers write F770W where we write miri.f770w
+    if isinstance(have, str) and have.lower().rpartition(".")[2] != exposure.filter[5:]:
+        raise argument_error("image", f"one of the filter {exposure.filter}", f"one of {have}")
+
+
+def _check_place(image, exposure):
+    """An image with a WCS must lie where the exposure points: each dither has its own."""
+    wcs = getattr(image, "wcs", None)
+    if not isinstance(wcs, WCS) or not wcs.has_celestial:
+        return
+    ny, nx = exposure.shape
+    x, y = np.array([0.0, nx - 1.0, (nx - 1) / 2]), np.array([0.0, ny - 1.0, (ny - 1) / 2])
+    wanted, have = (w.pixel_to_world(x, y) for w in (exposure.wcs, wcs))
+    side = np.sqrt(proj_plane_pixel_area(exposure.wcs.celestial))
+    off = float(np.max(wanted.separation(have).deg)) / side
+    if not off <= _PLACE:
+        wanted = "where the exposure points (each dither needs a scene on its own wcs)"
+        raise argument_error("image", wanted, f"one {off:.4g} pixels off")
