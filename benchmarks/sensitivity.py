@@ -25,7 +25,7 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.stats import sigma_clip
 from astropy.table import QTable
-from photutils.aperture import CircularAnnulus, CircularAperture
+from photutils.aperture import ApertureStats, CircularAnnulus, CircularAperture
 
 from miricigale.detector import Block, Detector, Residual
 from miricigale.instrument import (
@@ -71,7 +71,7 @@ class Extraction:
         xy = np.column_stack([x.ravel(), y.ravel()])
         xy = xy + rng.uniform(-0.5, 0.5, xy.shape)
         circle = CircularAperture(xy, self.edges[1])
-        lost = circle.do_photometry(self.mask.astype(float))[0] / circle.area
+        lost = ApertureStats(self.mask.astype(float), circle).sum / circle.area
         return xy[lost < 0.05]
 
     def fluxes(self, image, xy):
@@ -79,7 +79,7 @@ class Extraction:
         # a few masked pixels count as sky; dithers would fill them
         values = np.where(self.mask, 0.0, image) * self.area
         circle, ring = CircularAperture(xy, self.radius), CircularAnnulus(xy, *self.edges)
-        inner, outer = (a.do_photometry(values)[0] for a in (circle, ring))
+        inner, outer = (ApertureStats(values, a).sum for a in (circle, ring))
         return inner, inner - outer * circle.area / ring.area
 
 
