@@ -142,18 +142,17 @@ def deposit_single(tables, hist, g, s, t):
 
 
 @njit(**INNER)
-def deposit_lanes(tables, target, hist, lanes, single, total, expected, added, n):
+def deposit_lanes(tables, target, hist, lanes, single, total, added, n):
     """
     Note models in the lanes for the histograms; `add_points` puts them there.
 
     Heavy pairs go there with all their fractions. Of the light ones' weight, summed up from model
     to model, every ``PARTS``-th part of the weight so far goes to the model that it is full with
-    (systematic sampling, proportional to weight); if ``expected``, about what all will sum up to,
-    is more than that, every ``PARTS``-th part of it. ``added`` is the weight of all lanes; ``n``
-    models wait already, and returned is how many do now.
+    (systematic sampling, proportional to weight). ``added`` is the weight of all lanes;
+    ``n`` models wait already, and returned is how many do now.
     """
     buffer, index, ratio = lanes.buffer, lanes.index, tables.ratio
-    part = max(total, expected) / PARTS
+    part = total / PARTS
     carry = hist.carry[0]
     if carry + added < part:
         hist.carry[0] += added

@@ -94,7 +94,7 @@ def _drop(row, run, n_run, cross, other, sure):
 
 
 @njit(**ENTRY)
-def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single, expected):
+def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single):
     """
     Add the pairs of the listed runs to the sums.
 
@@ -113,8 +113,6 @@ def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single
         and are not evaluated.
     single : bool
         Whether single precision will do.
-    expected : float
-        About what all weights will sum up to, for the histograms; 0 if not known.
     """
     run, cross, pq, known = scratch.run, scratch.cross, scratch.pq, scratch.known
     bound, blocks, tiles = scratch.bound, tables.blocks, tables.tiles
@@ -287,6 +285,6 @@ def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single
                 tables.ratio, first, target, sums.draws, lanes, light, z_now, before, total[0]
             )
         waiting = deposit_lanes(
-            tables.points, target, sums.hist, lanes, light, total[0], expected, added, waiting
+            tables.points, target, sums.hist, lanes, light, total[0], added, waiting
         )
     add_points(tables.points, sums.hist, waiting)

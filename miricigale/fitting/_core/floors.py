@@ -18,6 +18,7 @@ _PER_UNIT = 4.0
 _FIRST = 10.0
 #: ... but not many more than so many of them.
 _MOST = 8192
+#: ... and in double precision if there are fewer than so many times as many.
 _FEW = 4
 # Below every bound, above `DONE`.
 _ALL = -1e37
@@ -55,21 +56,14 @@ def first_floor(bound, count, reference, n):
     few : bool
         Whether these are few enough for double precision; where many pairs could be as good as
         the best, none has much weight.
-    first, rest : float
-        Sums of exp((bound - reference) / 2) of these and of the others.
     """
     _count(bound, n, reference, count)
     total = 0.0
-    first = 0.0
-    last = np.int64(0)
-    while last < int(_FIRST * _PER_UNIT) and total <= _MOST:
-        total += count[last]
-        first += count[last] * math.exp(-0.5 / _PER_UNIT * last)
-        last += 1
-    rest = 0.0
-    for j in range(last, N_LEVELS):
-        rest += count[j] * math.exp(-0.5 / _PER_UNIT * j)
-    return reference - last / _PER_UNIT, total < _FEW * _MOST, first, rest
+    for j in range(int(_FIRST * _PER_UNIT)):
+        total += count[j]
+        if total > _MOST:
+            return reference - (j + 1) / _PER_UNIT, total < _FEW * _MOST
+    return reference - _FIRST, True
 
 
 @njit(**ENTRY)

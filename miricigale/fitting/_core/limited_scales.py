@@ -36,7 +36,6 @@ __all__ = [
     "best_scales",
     "fill_light_limits",
     "light_scales",
-    "scaled_erfc",
 ]
 
 
@@ -56,7 +55,8 @@ _ROOT_HALF = 0.70710678118654752
 _ROOT_TWO_OVER_PI = 0.79788456080286536
 _ROOT_HALF_32 = np.float32(_ROOT_HALF)
 _ROOT_TWO_OVER_PI_32 = np.float32(_ROOT_TWO_OVER_PI)
-# Steps of Newton's method; relative size of the last, which in single precision is one of Halley's.
+# Steps of Newton's method; relative size of the last. In single precision the last steps, those
+# for which it matters by less than a part _BEND, take the third derivative into account.
 _MOST = 60
 _CLOSE = 1e-5
 _CLOSE_32 = 5e-3
@@ -69,7 +69,7 @@ _LARGEST = 1e15
 
 
 @njit(**INNER)
-def scaled_erfc(z):
+def _scaled_erfc(z):
     """
     exp(z^2) erfc(z) for z >= 0, to 2e-12.
 
@@ -111,7 +111,7 @@ def _add_limit(work, power, slope_galaxy, slope_agn, c, level):
         u = work[SCALE + i] * m - level
         work[_U + i] = u
         work[_M + i] = m
-        work[_MILLS + i] = scaled_erfc(abs(u) * _ROOT_HALF)
+        work[_MILLS + i] = _scaled_erfc(abs(u) * _ROOT_HALF)
         v, power[i] = exponential(max(-0.5 * u * u, -700.0))
         work[_V + i] = v
     for i in range(LANES):
@@ -228,7 +228,7 @@ def _add_light_limit(light, power, slope_galaxy, slope_agn, c, level):
         u = light[_S32 + i] * m - level
         t = three / (three + abs(u) * _ROOT_HALF_32)
         x = t + t - one
-        # exp(z^2) erfc(z) as in `scaled_erfc`, of degree 10: to 3e-7
+        # exp(z^2) erfc(z) as in `_scaled_erfc`, of degree 10: to 3e-7
         v = np.float32(2.346841757e-5)
         v = v * x + np.float32(7.026003732e-5)
         v = v * x - np.float32(1.714378741e-4)

@@ -232,13 +232,9 @@ class GridEngine:
                 # a probability many sigma out is not one for single precision
                 worst = max(target.norm + target.dark - reference, target.level.max() ** 2)
                 single = single and worst < _MODEST
-            floor, few, first, rest = _core.first_floor(scratch.bound, scratch.count, reference, n)
-            before = sums.total[0]
+            floor, few = _core.first_floor(scratch.bound, scratch.count, reference, n)
             light = single and not few
-            _core.evaluate_runs(tables, request, target, sums, scratch, n, floor, floor, light, 0.0)
-            # as much of their bounds as those had, or rather less; limits make it uncertain
-            part = 0.0 if target.limits.size else 0.5 * rest / max(first, 1e-300)
-            expected = sums.total[0] + part * max(sums.total[0] - before, 0.0)
+            _core.evaluate_runs(tables, request, target, sums, scratch, n, floor, floor, light)
             room = share * request.rtol * sums.total[0]
             if room > 0.0:
                 _core.raise_bounds(
@@ -261,9 +257,7 @@ class GridEngine:
             floor, sure = _core.second_floor(
                 scratch.bound, scratch.count, reference, n, room, unit, request.delta
             )
-            _core.evaluate_runs(
-                tables, request, target, sums, scratch, n, floor, sure, single, expected
-            )
+            _core.evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single)
         return sums.total[0] > 0.0
 
     def _summarise(self, target, sums, out, i):
