@@ -332,12 +332,17 @@ def forecast(
     if not light > 0:
         raise argument_error("annulus", "such that light of the source is left", annulus)
     electrons = per_level / area  # per second and uJy
-    sky_variance = variance * white + (amplitude * sky) ** 2 * pattern / n_dithers
-    # (light F e)^2 = n^2 (V + growth shot F e), solved for F e
-    b, c = n_sigma**2 * growth * shot / light**2, n_sigma**2 * sky_variance / light**2
-    flux = (b + np.sqrt(b**2 + 4 * c)) / 2 / electrons
+    shot_noise = n_sigma**2 * growth * shot / (light**2 * electrons)
+    white_noise = n_sigma**2 * variance * white / (light * electrons) ** 2
+    residual_noise = (n_sigma * amplitude * sky / (light * electrons)) ** 2 * pattern / n_dithers
+
+    def limit(known):
+        # F^2 = n^2 (V + growth shot F), solved for F
+        return float((shot_noise + np.sqrt(shot_noise**2 + 4 * known)) / 2)
+
     return {
-        "flux": float(flux),
+        "flux": limit(white_noise + residual_noise),
+        "flux_white": limit(white_noise),
         "radius": radius,
         "light": float(light),
         "background": level,
@@ -382,7 +387,6 @@ def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=1
     rows = []
     for name in names:
         row = forecast(name, time, n_sigma, residual, **options)
-        bare = forecast(name, time, n_sigma, None, **options)
         scale = n_sigma / 10 * np.sqrt(1e4 / seconds)
         rows.append(
             (
@@ -392,7 +396,7 @@ def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=1
                 row["background"] * SURFACE_BRIGHTNESS,
                 row["white"] * u.uJy,
                 row["residual"] * u.uJy,
-                bare["flux"] * u.uJy,
+                row["flux_white"] * u.uJy,
                 row["flux"] * u.uJy,
                 etc_limit(name, "4.0") * scale,
                 etc_limit(name, "2.0") * scale,
