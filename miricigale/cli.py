@@ -26,6 +26,11 @@ def _parser():
     run.add_argument("--keep-level1b", action="store_true", help="keep the level-1b files")
     run.add_argument("--threads", type=int, help="threads (default: all cores)")
     run.add_argument("--seed", type=int, help="seed of every random draw")
+    run.add_argument(
+        "--redo",
+        action="store_true",
+        help="do again what another configuration or seed made in the folder",
+    )
     run.add_argument("--print-config", action="store_true", help="print the configuration and stop")
     run.add_argument("--no-progress", action="store_true", help="no progress bars")
 
@@ -103,7 +108,8 @@ def _pair(text):
 
 
 def _run(args):
-    from miricigale.workflow import check_study, disk_use, load_config, run_study
+    from miricigale.utils.parallel import available_cores, process_pool
+    from miricigale.workflow import OtherRunError, load_config, run_study
 
     overrides = {"run": {}}
     if args.keep_level1b:
@@ -116,14 +122,18 @@ def _run(args):
     if args.print_config:
         print(config.to_toml(), end="")
         return 0
-    check_study(config)
     folder = args.output or Path(config.run.name)
-    print(
-        f"{config.run.name}: needs about {disk_use(config) / 1e9:.2f} GB in {folder}/", flush=True
-    )
     begin = time.monotonic()
+    options = {"redo": args.redo, "progress_bar": not args.no_progress}
     try:
-        report = run_study(config, folder, progress_bar=not args.no_progress)
+        if config.run.threads == 1:
+            report = run_study(config, folder, **options)
+        else:
+            with process_pool(config.run.threads or available_cores()) as executor:
+                report = run_study(config, folder, executor=executor, **options)
+    except OtherRunError as err:
+        # in the words of this command
+        raise OtherRunError(err.reason, "--redo to do so") from err
     except KeyboardInterrupt:
         print("stopped; the same command goes on from here", file=sys.stderr)
         return 130

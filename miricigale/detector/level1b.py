@@ -68,7 +68,8 @@ def header(exposure, *, filename="", start=None):
     date, clock = start.utc.isot.split("T")
     name = exposure.filter.rsplit(".", 1)[-1].upper()
     primary = {
-        "DATE": (Time.now().utc.isot, "UTC date of file creation"),
+        # not the time of writing: the same exposure gives the same bytes
+        "DATE": ((start + duration).utc.isot, "UTC date at end of simulated exposure"),
         "ORIGIN": ("miricigale", "simulated data"),
         "TELESCOP": ("JWST", "telescope"),
         "FILENAME": (filename, "name of the file"),

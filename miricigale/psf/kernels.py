@@ -15,7 +15,7 @@ from miricigale.psf import _core
 from miricigale.psf.model import make_psf, psf_info
 from miricigale.psf.resample import average_psf, psf_image, psf_mosaic, rotate_psf
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import open_fits
+from miricigale.utils.files import open_fits, write_fits
 from miricigale.utils.units import ANGLE, frozen_array, to_array
 
 __all__ = ["REGULARIZATIONS", "MatchingKernel"]
@@ -300,7 +300,7 @@ class MatchingKernel:
         for name in ("source", "target"):
             if getattr(self, name) is not None:
                 hdus.append(fits.ImageHDU(getattr(self, name), name=name.upper()))
-        fits.HDUList(hdus).writeto(path, overwrite=overwrite, checksum=True)
+        write_fits(hdus, path, overwrite=overwrite)
 
     @classmethod
     def read(cls, path):

@@ -11,7 +11,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 
 from miricigale.utils.exceptions import DataError
 
-__all__ = ["cached_by_file", "open_fits", "read_ecsv"]
+__all__ = ["cached_by_file", "open_fits", "read_ecsv", "write_fits"]
 
 
 def cached_by_file(maxsize):
@@ -94,6 +94,27 @@ def _refuse_stump(path):
             if handle.read(2) != b"\x1f\x8b":  # compressed files may be that short
                 msg = "it is no FITS file, or truncated"
                 raise OSError(msg)
+
+
+def write_fits(hdus, path, *, overwrite=False):
+    """
+    Write a FITS file whose checksums are not dated: the same content gives the same bytes.
+
+    Parameters
+    ----------
+    hdus : list of HDUs
+        The primary HDU first.
+    path : path-like
+        The file.
+    overwrite : bool, optional
+        Whether an existing file is replaced.
+    """
+    hdus = fits.HDUList(hdus)
+    # writing would change the primary header after its sum
+    hdus.update_extend()
+    for hdu in hdus:
+        hdu.add_checksum(when="of this HDU")
+    hdus.writeto(path, overwrite=overwrite, output_verify="exception")
 
 
 def read_ecsv(path, *, wanted):

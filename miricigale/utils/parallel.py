@@ -2,9 +2,13 @@
 
 import contextlib
 import functools
+import logging
+import multiprocessing
 import os
 import pickle
+import signal
 import tempfile
+import threading
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +16,86 @@ from pathlib import Path
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.progress import progress
 
-__all__ = ["chunks", "parallel_map"]
+__all__ = ["available_cores", "available_memory", "chunks", "parallel_map", "process_pool"]
 
 #: Functions whose pickle is longer (bytes) go to other processes once, not with every piece.
 _HEAVY = 100_000
+
+
+def available_cores():
+    """Processor cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1
+
+
+def available_memory():
+    """
+    Bytes of memory of the machine, or of the container that this process runs in.
+
+    Returns
+    -------
+    n_bytes : int
+        4 GB where the system does not say.
+    """
+    try:
+        total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return 4_000_000_000
+    try:
+        limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
+    except OSError:
+        return total
+    return min(total, int(limit)) if limit.isdigit() else total
+
+
+@contextlib.contextmanager
+def process_pool(n_processes):
+    """
+    Processes that end with this one, whatever ends it.
+
+    Parameters
+    ----------
+    n_processes : int
+        How many.
+
+    Yields
+    ------
+    executor : `concurrent.futures.ProcessPoolExecutor`
+        Its processes are stopped at once when the ``with`` block is left by an exception such
+        as `KeyboardInterrupt`.
+    """
+    level = logging.getLogger().getEffectiveLevel()
+    before = set(multiprocessing.active_children())
+    executor = ProcessPoolExecutor(
+        n_processes,
+        # forks of a process with threads can hang
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_begin_process,
+        initargs=(level,),
+    )
+    try:
+        yield executor
+    except BaseException:
+        executor.shutdown(wait=False, cancel_futures=True)
+        for process in set(multiprocessing.active_children()) - before:
+            process.terminate()
+        raise
+    executor.shutdown()
+
+
+def _begin_process(level):
+    """Leave interrupts to the parent, and end when it does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    logging.basicConfig(level=level, format="%(message)s")
+    parent = multiprocessing.parent_process()
+
+    def end():
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=end, daemon=True).start()
 
 
 def parallel_map(function, items, *, executor=None, progress_bar=False, desc=None):

@@ -1,10 +1,89 @@
-"""Progress bars: off in the API unless asked for, on in the command line."""
+"""Progress: off in the API unless asked for, on in the command line."""
+
+import sys
+import time
 
 from tqdm.auto import tqdm
+from tqdm.std import tqdm as plain_tqdm
 
-__all__ = ["progress"]
+__all__ = ["on_terminal", "print_line", "progress"]
+
+
+def on_terminal():
+    """Whether a bar can be drawn: in a terminal or a notebook, not in a log file."""
+    return tqdm is not plain_tqdm or sys.stderr.isatty()
+
+
+def print_line(text):
+    """Write a line to stderr, beside whatever bar is drawn there."""
+    plain_tqdm.write(text, file=sys.stderr)
+
+
+class _Lines:
+    """What `progress` returns where no bar can be drawn: one line at the end, one a minute."""
+
+    def __init__(self, iterable, total, desc, unit, *, every=60.0):
+        if total is None and hasattr(iterable, "__len__"):
+            total = len(iterable)
+        self.iterable, self.total, self.desc, self.unit = iterable, total, desc, unit
+        self.n = 0
+        self._every = every
+        self._begin = self._last = time.monotonic()
+
+    def update(self, n=1):
+        self.n += n
+        if time.monotonic() - self._last > self._every:
+            self._line()
+
+    def set_description(self, desc):
+        self.desc = desc
+
+    def close(self):
+        if self.n:
+            self._line()
+        self.n = 0
+
+    def _line(self):
+        self._last = time.monotonic()
+        share = f"{self.n}" if self.total is None else f"{self.n} of {self.total}"
+        label = f"{self.desc}: " if self.desc else ""
+        print_line(f"{label}{share} {self.unit}, {self._last - self._begin:.0f} s")
+
+    def __iter__(self):
+        try:
+            for item in self.iterable:
+                yield item
+                self.update()
+        finally:
+            self.close()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        self.close()
 
 
 def progress(iterable=None, *, show=False, total=None, desc=None, unit="it"):
-    """Wrap an iterable in a tqdm bar (`tqdm.auto.tqdm`), silent unless ``show``."""
+    """
+    Show how far a loop is.
+
+    Parameters
+    ----------
+    iterable : iterable, optional
+        What is looped over; without it the caller calls ``update``.
+    show : bool, optional
+        Whether anything is shown.
+    total : int, optional
+        Number of steps.
+    desc, unit : str, optional
+        Label, and what a step is.
+
+    Returns
+    -------
+    bar : `tqdm.auto.tqdm` or an object with the same ``update``, ``set_description`` and ``close``
+        A bar; where stderr is no terminal, lines: one at the end and one a minute.
+    """
+    if show and not on_terminal():
+        return _Lines(iterable, total, desc, unit)
     return tqdm(iterable, total=total, desc=desc, unit=unit, disable=not show, leave=False)

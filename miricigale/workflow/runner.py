@@ -1,148 +1,73 @@
-"""Runs the stages in order; what stands already and is current is not done again."""
+"""Runs the stages, side by side where they can be; what stands already and is current is kept."""
 
 import dataclasses
 import hashlib
 import json
 import logging
+import os
 import shutil
-import time
-import types
-from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from pathlib import Path
-
-import numba
 
 from miricigale.refdata.locate import file_sha256, fingerprint
 from miricigale.utils.exceptions import ConfigError, DataError
-from miricigale.utils.progress import progress
-from miricigale.workflow.products import ProductStore, read_image, write_image
+from miricigale.utils.parallel import available_cores, available_memory
+from miricigale.utils.progress import on_terminal, print_line, progress
+from miricigale.workflow.config import load_config
+from miricigale.workflow.stage import run_unit
+from miricigale.workflow.store import CONFIG, ProductStore
 
-__all__ = ["Context", "Stage", "StudyRunner", "run_stages"]
+__all__ = ["OtherRunError", "StudyRunner", "run_stages"]
 
 log = logging.getLogger(__name__)
 
+#: Bytes that a unit takes whose stage does not say how many.
+_MEMORY = 500_000_000
+
+
+class OtherRunError(ValueError):
+    """
+    A folder holds what another configuration made.
+
+    Parameters
+    ----------
+    reason : str
+        What is other, and what would be done.
+    remedy : str, optional
+        What the caller can do.
+    """
+
+    def __init__(self, reason, remedy="redo=True to do so"):
+        self.reason = reason
+        super().__init__(f"{reason}; give another folder, or {remedy}")
+
+
+class _Inline(Executor):
+    """Calls at once, in this thread."""
+
+    def submit(self, function, *args, **kwargs):
+        future = Future()
+        try:
+            future.set_result(function(*args, **kwargs))
+        except Exception as err:
+            future.set_exception(err)
+        return future
+
 
 @dataclasses.dataclass(frozen=True)
-class Stage:
-    """
-    One step of the study.
+class _Job:
+    """One unit of one stage."""
 
-    Parameters
-    ----------
-    name : str
-        Such as ``"mosaic"``.
-    function : callable
-        Called as ``function(context, unit)``; saves its products through the context.
-    title : str
-        What it does, for the progress line.
-    needs : tuple of str
-        Stages whose products it reads.
-    sections : tuple of str
-        Sections (``"scene"``) or keys (``"run.keep_level1b"``) of the configuration that it
-        reads; reading another one is an error.
-    resources : tuple of str
-        Reference data that it depends on.
-    version : int
-        Raised when the stage's own algorithm changes its products.
-    units : callable, optional
-        Called with the configuration; names of the pieces that are done and resumed one
-        by one.
-    plan : callable, optional
-        Called with the configuration and the unit; plain values that the stage takes from the
-        package (the exposures of a named plan, the axes of a named grid), so that a change
-        of those is seen.
-    """
+    stage: object
+    unit: str
 
-    name: str
-    function: Callable
-    title: str
-    needs: tuple = ()
-    sections: tuple = ()
-    resources: tuple = ()
-    version: int = 1
-    units: Callable | None = None
-    plan: Callable | None = None
+    @property
+    def key(self):
+        return self.stage.key(self.unit)
 
-    def unit_names(self, config):
-        """Names of the pieces; a single empty one for a stage that has none."""
-        return tuple(self.units(config)) if self.units else ("",)
-
-
-class ConfigView:
-    """
-    What a stage has declared of a configuration; reading anything else is an error.
-
-    A stage that reads what is not in its hash would be taken for current when it is not.
-
-    Parameters
-    ----------
-    config : `~miricigale.workflow.config.StudyConfig`
-        The configuration.
-    stage : `Stage`
-        Whose declaration counts.
-    """
-
-    def __init__(self, config, stage):
-        self._config, self._stage = config, stage
-
-    def __getattr__(self, section):
-        if section in self._stage.sections:
-            return getattr(self._config, section)
-        keys = [k.split(".")[1] for k in self._stage.sections if k.startswith(f"{section}.")]
-        if not keys:
-            msg = f"stage {self._stage.name!r} reads [{section}] without declaring it"
-            raise RuntimeError(msg)
-        values = getattr(self._config, section)
-        return types.SimpleNamespace(**{key: getattr(values, key) for key in keys})
-
-
-class Context:
-    """
-    What a stage sees of the run.
-
-    Parameters
-    ----------
-    config : `~miricigale.workflow.config.StudyConfig`
-        The configuration.
-    store : `~miricigale.workflow.products.ProductStore`
-        The products.
-    progress_bar : bool
-        Whether progress bars are shown.
-    """
-
-    def __init__(self, config, store, *, stage=None, progress_bar=False):
-        self.config = config if stage is None else ConfigView(config, stage)
-        self.store = store
-        self.progress_bar = progress_bar
-        self.saved = []
-        # neither changes a product by itself: the seed is in every hash, threads in none
-        self.seed = config.run.seed
-        self.n_threads = config.run.threads or numba.config.NUMBA_NUM_THREADS
-
-    def path(self, name):
-        """Path of a product."""
-        return self.store.path(name)
-
-    def save(self, name, writer):
-        """Write a product whole or not at all, and note it for the manifest."""
-        path = self.store.save(name, writer)
-        self.saved.append(name)
-        return path
-
-    def save_table(self, name, table):
-        """Write a table as ECSV or FITS by the suffix of ``name``."""
-        table = table.copy(copy_data=False)
-        # the manifest says when; the same run gives the same bytes
-        table.meta.pop("created", None)
-        return self.save(name, lambda path: table.write(path, overwrite=True))
-
-    def save_image(self, name, image, **planes):
-        """Write an image and further planes."""
-        return self.save(name, lambda path: write_image(image, path, planes=planes))
-
-    def image(self, name, *planes):
-        """Read an image (and planes) that an earlier stage wrote."""
-        return read_image(self.path(name), planes=planes)
+    @property
+    def title(self):
+        return f"{self.stage.title}{' ' + self.unit if self.unit else ''}"
 
 
 class StudyRunner:
@@ -155,17 +80,41 @@ class StudyRunner:
         The configuration.
     folder : path-like
         Where the products go.
-    stages : tuple of `Stage`
-        In an order in which every stage comes after what it needs.
+    stages : callable or tuple of `~miricigale.workflow.stage.Stage`
+        In an order in which every stage comes after what it needs, or a function that returns
+        them, which executors of processes need.
+    executor : `concurrent.futures.Executor`, optional
+        Does units that do not need each other side by side, as many at once as there are
+        threads and as the memory allows. Without it they are done one by one, each on all
+        threads. The products are the same bytes either way.
+    redo : bool, optional
+        Whether products of another configuration are replaced; otherwise they are refused.
+    disk : int, optional
+        Bytes that all products take.
     progress_bar : bool, optional
-        Whether progress is shown.
+        Whether progress is shown: a bar on a terminal, otherwise a line for each stage.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.ConfigError`
+        If a stage comes before what it needs.
     """
 
-    def __init__(self, config, folder, stages, *, progress_bar=False):
+    def __init__(
+        self, config, folder, stages, *, executor=None, redo=False, disk=0, progress_bar=False
+    ):
         self.config = config
         self.folder = Path(folder)
-        self.stages = tuple(stages)
+        self._source = stages if callable(stages) else tuple(stages)
+        self.stages = tuple(stages() if callable(stages) else stages)
+        self.executor = executor
+        self.redo = redo
+        self.disk = disk
         self.progress_bar = progress_bar
+        self.n_threads = config.run.threads or available_cores()
+        self.jobs = [
+            _Job(stage, unit) for stage in self.stages for unit in stage.unit_names(config)
+        ]
         seen = set()
         for stage in self.stages:
             missing = set(stage.needs) - seen
@@ -199,65 +148,245 @@ class StudyRunner:
         text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
+    def forecast(self, store):
+        """
+        What a run would do.
+
+        Parameters
+        ----------
+        store : `~miricigale.workflow.store.ProductStore`
+            The folder.
+
+        Returns
+        -------
+        states : dict of str to str
+            By key: ``"current"``; ``"new"``; ``"lost"``, if products are missing or damaged;
+            ``"changed"``, if they were made otherwise than this run would make them; or
+            ``"surplus"``, if this run has no such unit.
+        """
+        states = {}
+        moved = set()
+        for job in self.jobs:
+            record = store.records.get(job.key)
+            if record is None:
+                state = "new"
+            elif moved.intersection(job.stage.needs) or record["hash"] != self.digest(
+                job.stage, job.unit, store
+            ):
+                state = "changed"
+            else:
+                # the same bytes come back, so that what depends on them stays
+                state = "current" if store.is_whole(job.key) else "lost"
+            states[job.key] = state
+            if state in ("new", "changed"):
+                moved.add(job.stage.name)
+        return states | {key: "surplus" for key in store.records if key not in states}
+
     def run(self):
         """
         Do what is not done yet.
 
         Returns
         -------
-        store : `~miricigale.workflow.products.ProductStore`
+        store : `~miricigale.workflow.store.ProductStore`
 
         Raises
         ------
+        OtherRunError
+            If products of another configuration would be replaced, or an edited
+            ``config.toml``, and ``redo`` is False.
+        `~miricigale.utils.exceptions.DataError`
+            If the folder is another's, in use, or on a disk that is too full.
         KeyboardInterrupt
             Passed on; everything that was finished stays and is not done again.
         """
-        threads = numba.get_num_threads()
-        if self.config.run.threads:
-            numba.set_num_threads(min(self.config.run.threads, numba.config.NUMBA_NUM_THREADS))
-        jobs = [(stage, unit) for stage in self.stages for unit in stage.unit_names(self.config)]
-        try:
-            with (
-                ProductStore(self.folder) as store,
-                progress(total=len(jobs), show=self.progress_bar, desc="study", unit="step") as bar,
-            ):
-                self._drop_stale(store, jobs)
-                store.save("config.toml", lambda path: path.write_text(self.config.to_toml()))
-                for stage, unit in jobs:
-                    bar.set_description(f"{stage.title}{' ' + unit if unit else ''}")
-                    self._run_one(stage, unit, store)
-                    bar.update()
-        finally:
-            numba.set_num_threads(threads)
+        store = ProductStore(self.folder)
+        states = self.forecast(store)
+        if set(states.values()) <= {"current"} and self._config_stands(store):
+            # nothing is written: a finished run can be called on a full or read-only disk
+            self._tell(f"{self.config.run.name}: all {len(self.jobs)} steps stand")
+            return store
+        with store:
+            states = self.forecast(store)
+            self._refuse_replacing(store, states)
+            n_left = sum(states[job.key] != "current" for job in self.jobs)
+            if n_left:
+                needed = max(0, self.disk - store.standing_bytes())
+                check_disk(self.folder, needed)
+                self._tell(
+                    f"{self.config.run.name}: {n_left} of {len(self.jobs)} steps to do, which take "
+                    f"about {needed / 1e9:.2f} GB in {self.folder}/"
+                )
+            self._write_config(store)
+            for key, state in states.items():
+                if state == "surplus":
+                    store.drop(key)
+            self._execute(store)
         return store
 
-    @staticmethod
-    def _drop_stale(store, jobs):
-        """Forget units that the configuration no longer has, and remove their products."""
-        keys = {_key(stage.name, unit) for stage, unit in jobs}
-        for key in [key for key in store.records if key not in keys]:
-            store.drop(key)
+    def _values(self):
+        return json.loads(json.dumps(dataclasses.asdict(self.config)))
 
-    def _run_one(self, stage, unit, store):
-        key, digest = _key(stage.name, unit), self.digest(stage, unit, store)
-        if store.is_current(key, digest):
-            log.info("%s stands already", key)
-            return
-        store.drop(key)
-        context = Context(self.config, store, stage=stage, progress_bar=self.progress_bar)
-        begin = time.perf_counter()
+    def _config_stands(self, store):
+        """Whether manifest and ``config.toml`` say what this run does."""
+        return store.config == self._values() and self._file_stands(store)
+
+    def _file_stands(self, store):
+        """Whether the ``config.toml`` in the folder says what this run does."""
         try:
-            stage.function(context, unit)
-        except (ValueError, KeyError, OSError) as err:
-            err.add_note(f"in stage {key}")
-            raise
-        seconds = time.perf_counter() - begin
-        store.finish(key, digest, context.saved, seconds=seconds)
-        log.info("%s took %.1f s", key, seconds)
+            return load_config(store.path(CONFIG)) == self.config
+        except (ConfigError, OSError, ValueError):
+            return False
+
+    def _refuse_replacing(self, store, states):
+        if self.redo:
+            return
+        edited = store.edited_config()
+        if edited is not None and not self._file_stands(store):
+            msg = (
+                f"{edited} was edited since the run that made this folder, and this run has another "
+                f"configuration, which would replace it; run {edited} itself to use it"
+            )
+            raise OtherRunError(msg)
+        again = [key for key, state in states.items() if state in ("changed", "surplus")]
+        if again:
+            msg = (
+                f"{self.folder} holds {len(again)} finished steps of another run "
+                f"({self._differences(store)}), which would be done again or removed: "
+                f"{_summary(again)}"
+            )
+            raise OtherRunError(msg)
+
+    def _differences(self, store):
+        """What is other in the configuration, in words."""
+        old, new = store.config or {}, self._values()
+        changes = [
+            f"[{section}] {key}: {_short(old.get(section, {}).get(key))} -> {_short(value)}"
+            for section, values in new.items()
+            for key, value in values.items()
+            if old
+            and old.get(section, {}).get(key) != value
+            and (section, key) != ("run", "threads")
+        ]
+        return "; ".join(changes) or "by another version of the package, its data or the catalog"
+
+    def _write_config(self, store):
+        if self._config_stands(store):
+            return
+        stands, edited = self._file_stands(store), store.edited_config()
+        if edited is not None and not stands:
+            kept = edited.with_name("config.edited.toml")
+            os.replace(edited, kept)
+            log.warning("the edited %s is kept as %s", edited, kept.name)
+        store.begin(self._values(), self.config.to_toml(), write=not stands)
+
+    def _tell(self, text):
+        if self.progress_bar:
+            print_line(text)
+
+    def _execute(self, store):
+        """Do all units, each when what it needs is done."""
+        executor = self.executor or _Inline()
+        inline = self.executor is None
+        lines = self.progress_bar and not on_terminal()
+        waiting, running, error = list(self.jobs), {}, None
+        spent = {}
+        show = self.progress_bar and not lines
+        with progress(total=len(self.jobs), show=show, desc="study", unit="step") as bar:
+
+            def done(job, seconds):
+                bar.update()
+                spent.setdefault(job.stage.name, []).append(seconds)
+                units = spent[job.stage.name]
+                if lines and len(units) == len(job.stage.unit_names(self.config)) and sum(units):
+                    n = f" ({len(units)})" if len(units) > 1 else ""
+                    print_line(f"{job.stage.title}{n}: {sum(units):.1f} s")
+
+            while waiting or running:
+                job = None if error else self._next(waiting, running, inline=inline)
+                if job is not None:
+                    waiting.remove(job)
+                    digest = self.digest(job.stage, job.unit, store)
+                    if store.is_current(job.key, digest):
+                        done(job, 0.0)
+                        continue
+                    if store.records.get(job.key, {}).get("hash") != digest:
+                        store.drop(job.key)
+                    running_titles = [job.title, *(other.title for other, _ in running.values())]
+                    bar.set_description(", ".join(running_titles[::-1]))
+                    future = executor.submit(
+                        run_unit,
+                        self.config,
+                        self.folder,
+                        self._source,
+                        job.stage.name,
+                        job.unit,
+                        n_threads=self._share(waiting, running),
+                        progress_bar=show and inline,
+                    )
+                    running[future] = job, digest
+                elif not running:
+                    break
+                for future in (
+                    wait(running, return_when=FIRST_COMPLETED)[0] if (job is None or inline) else ()
+                ):
+                    job, digest = running.pop(future)
+                    try:
+                        products, seconds = future.result()
+                    except BrokenExecutor as err:
+                        msg = f"a process ended while it did {job.title}; was the memory too small?"
+                        raise DataError(msg) from err
+                    except Exception as err:
+                        # what runs beside it is finished and kept
+                        error = error or err
+                        continue
+                    store.finish(job.key, digest, products, seconds=seconds)
+                    log.debug("%s took %.1f s", job.key, seconds)
+                    done(job, seconds)
+        if error:
+            raise error
+
+    def _ready(self, waiting, running):
+        """Units whose inputs stand."""
+        unfinished = {job.stage.name for job in waiting}
+        unfinished |= {job.stage.name for job, _ in running.values()}
+        return [job for job in waiting if not unfinished.intersection(job.stage.needs)]
+
+    def _next(self, waiting, running, *, inline):
+        """The next unit to begin, if one can."""
+        if len(running) >= (1 if inline else self.n_threads):
+            return None
+        memory = (self.config.run.memory * 1e9 or 0.5 * available_memory()) - sum(
+            self._memory(job) for job, _ in running.values()
+        )
+        for job in self._ready(waiting, running):
+            if not running or self._memory(job) <= memory:
+                return job
+        return None
+
+    def _memory(self, job):
+        return job.stage.memory(self.config, job.unit) if job.stage.memory else _MEMORY
+
+    def _share(self, waiting, running):
+        """Threads of a unit that begins now."""
+        if self.executor is None:
+            return self.n_threads
+        together = len(running) + 1 + len(self._ready(waiting, running))
+        return max(1, self.n_threads // min(self.n_threads, together))
 
 
-def _key(name, unit):
-    return f"{name}:{unit}" if unit else name
+def _summary(keys):
+    """Stages, with the number of units where there are several."""
+    counts = {}
+    for key in keys:
+        name = key.split(":")[0]
+        counts[name] = counts.get(name, 0) + 1
+    return ", ".join(f"{name} ({n})" if n > 1 else name for name, n in counts.items())
+
+
+def _short(value):
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def check_disk(folder, needed):
@@ -269,7 +398,7 @@ def check_disk(folder, needed):
     folder : path-like
         Where they will go.
     needed : int
-        Bytes.
+        Bytes beside what stands there.
 
     Raises
     ------
@@ -285,6 +414,6 @@ def check_disk(folder, needed):
         raise DataError(msg)
 
 
-def run_stages(config, folder, stages, *, progress_bar=False):
+def run_stages(config, folder, stages, **options):
     """Run ``stages`` in ``folder``; see `StudyRunner`."""
-    return StudyRunner(config, folder, stages, progress_bar=progress_bar).run()
+    return StudyRunner(config, folder, stages, **options).run()

@@ -10,7 +10,7 @@ from miricigale.instrument import background_level, imager_filters, saturation_f
 from miricigale.psf import hst_psf
 from miricigale.scene import read_catalog
 from miricigale.utils.exceptions import ConfigError
-from miricigale.workflow.runner import check_disk, run_stages
+from miricigale.workflow.runner import run_stages
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.images import grid_of, study_exposures
 
@@ -104,7 +104,7 @@ def check_study(config):
         raise ConfigError(msg)
 
 
-def run_study(config, folder, *, progress_bar=False):
+def run_study(config, folder, *, executor=None, redo=False, progress_bar=False):
     """
     Run all stages of a study in a folder; what stands there and is current is kept.
 
@@ -114,8 +114,13 @@ def run_study(config, folder, *, progress_bar=False):
         The configuration; see `~miricigale.workflow.load_config`.
     folder : path-like
         Folder of the products: new, empty, or that of an earlier run.
+    executor : `concurrent.futures.Executor`, optional
+        Does exposures, bands and fits side by side; an executor of processes is best
+        (`~miricigale.utils.parallel.process_pool`). The products are the same bytes.
+    redo : bool, optional
+        Whether what another configuration made in this folder is done again.
     progress_bar : bool, optional
-        Whether progress bars are shown.
+        Whether progress is shown.
 
     Returns
     -------
@@ -124,12 +129,21 @@ def run_study(config, folder, *, progress_bar=False):
 
     Raises
     ------
+    `~miricigale.workflow.OtherRunError`
+        If the folder holds what another configuration made, and ``redo`` is False.
     `~miricigale.utils.exceptions.DataError`
         If the folder is another's, in use, or on a disk that is too full.
     `~miricigale.utils.exceptions.ConfigError`, KeyError, ValueError
         If the configuration names what does not exist or leaves nothing to do.
     """
     check_study(config)
-    check_disk(folder, disk_use(config))
-    store = run_stages(config, folder, study_stages(), progress_bar=progress_bar)
+    store = run_stages(
+        config,
+        folder,
+        study_stages,
+        executor=executor,
+        redo=redo,
+        disk=disk_use(config),
+        progress_bar=progress_bar,
+    )
     return store.path("report/index.html")

@@ -1,15 +1,17 @@
-import astropy.units as u
-import numpy as np
+import shutil
+import threading
+import types
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
-from astropy.nddata import CCDData, StdDevUncertainty
-from astropy.wcs import WCS
 
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarning
-from miricigale.workflow.config import StudyConfig
-from miricigale.workflow.products import ProductStore, read_image, write_image
-from miricigale.workflow.runner import Stage, StudyRunner, check_disk
+from miricigale.workflow.config import StudyConfig, load_config
+from miricigale.workflow.runner import OtherRunError, StudyRunner, check_disk
+from miricigale.workflow.stage import Stage
 from miricigale.workflow.stages import study_stages
+from miricigale.workflow.store import ProductStore
 
 
 class Recorder:
@@ -43,9 +45,9 @@ class Recorder:
             Stage("second", self.second, "second", needs=("first",)),
         )
 
-    def run(self, folder, config=None, **kwargs):
+    def run(self, folder, config=None, *, redo=False, **kwargs):
         self.ran.clear()
-        StudyRunner(config or StudyConfig(), folder, self.stages(**kwargs)).run()
+        StudyRunner(config or StudyConfig(), folder, self.stages(**kwargs), redo=redo).run()
         return list(self.ran)
 
 
@@ -71,10 +73,93 @@ def test_only_what_depends_on_a_change_is_done_again(tmp_path):
     assert recorder.run(tmp_path / "run", other) == []
     # the second stage's input did not change although the first was done again
     other = StudyConfig.from_dict({"scene": {"background_scale": 2.0}})
-    assert recorder.run(tmp_path / "run", other) == ["first:a", "first:b"]
+    assert recorder.run(tmp_path / "run", other, redo=True) == ["first:a", "first:b"]
     other = StudyConfig.from_dict({"run": {"seed": 7}})
-    assert recorder.run(tmp_path / "run", other) == ["first:a", "first:b", "second"]
-    assert recorder.run(tmp_path / "run", other, version=2) == ["first:a", "first:b"]
+    assert recorder.run(tmp_path / "run", other, redo=True) == ["first:a", "first:b", "second"]
+    assert recorder.run(tmp_path / "run", other, redo=True, version=2) == ["first:a", "first:b"]
+
+
+@pytest.mark.parametrize(
+    ("values", "version", "reason"),
+    [
+        ({"run": {"seed": 7}}, 1, r"\[run\] seed: 20210211 -> 7"),
+        ({"scene": {"background_scale": 2.0}}, 1, r"\[scene\] background_scale: 1.0 -> 2.0"),
+        ({}, 2, "by another version of the package, its data or the catalog"),
+    ],
+)
+def test_nothing_is_done_again_unasked(tmp_path, values, version, reason):
+    recorder = Recorder()
+    recorder.run(tmp_path / "run")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+    other = StudyConfig.from_dict(values)
+    with pytest.raises(OtherRunError, match=rf"3 finished steps.*{reason}.*first \(2\), second; "):
+        recorder.run(tmp_path / "run", other, version=version)
+    assert recorder.ran == []
+    assert {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
+    assert recorder.run(tmp_path / "run", other, version=version, redo=True)[:2] == [
+        "first:a",
+        "first:b",
+    ]
+
+
+def test_an_edited_configuration_is_not_overwritten(tmp_path):
+    recorder, folder = Recorder(), tmp_path / "run"
+    recorder.run(folder)
+    path = folder / "config.toml"
+    edited = path.read_text().replace("min_detected = 2", "min_detected = 3 # mine")
+    path.write_text(edited)
+    with pytest.raises(OtherRunError, match=r"config\.toml was edited since"):
+        recorder.run(folder)
+    assert path.read_text() == edited
+    # it is used when it is asked for, and stays as it was written
+    assert recorder.run(folder, load_config(path)) == []
+    assert path.read_text() == edited
+    recorder.run(folder, redo=True)
+    assert (folder / "config.edited.toml").read_text() == edited
+    assert load_config(path) == StudyConfig()
+
+
+def test_a_finished_run_writes_nothing(tmp_path, monkeypatch):
+    recorder, folder = Recorder(), tmp_path / "run"
+    recorder.run(folder)
+    before = {p.name: p.stat().st_mtime_ns for p in folder.iterdir()}
+    # not even a lock: the disk may be full, the folder read-only
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: types.SimpleNamespace(free=0))
+    monkeypatch.setattr(ProductStore, "__enter__", None)
+    StudyRunner(StudyConfig(), folder, recorder.stages(), disk=10**12).run()
+    assert {p.name: p.stat().st_mtime_ns for p in folder.iterdir()} == before
+
+
+def test_what_stands_needs_no_disk_again(tmp_path, monkeypatch):
+    recorder, folder = Recorder(), tmp_path / "run"
+    recorder.run(folder)
+    size = sum((folder / name).stat().st_size for name in ("first_a.txt", "first_b.txt"))
+    (folder / "second.txt").unlink()
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: types.SimpleNamespace(free=99))
+    with pytest.raises(DataError, match="the run needs about"):
+        StudyRunner(StudyConfig(), folder, recorder.stages(), disk=size + 100).run()
+    StudyRunner(StudyConfig(), folder, recorder.stages(), disk=size + 99).run()
+    assert recorder.ran[-1] == "second"
+
+
+@pytest.mark.parametrize("name", ["first_a.txt", "first_b.txt", "second.txt"])
+def test_a_deleted_product_makes_only_itself_anew(tmp_path, name):
+    recorder = Recorder()
+    recorder.run(tmp_path / "run")
+    (tmp_path / "run" / name).unlink()
+    made = name.removesuffix(".txt").replace("_", ":")
+    assert recorder.run(tmp_path / "run") == [made]
+
+
+def test_a_redo_of_a_lost_product_that_is_stopped_goes_on(tmp_path):
+    recorder = Recorder()
+    recorder.run(tmp_path / "run")
+    (tmp_path / "run" / "first_b.txt").unlink()
+    recorder.fail_at = "b"
+    with pytest.raises(KeyboardInterrupt):
+        recorder.run(tmp_path / "run")
+    recorder.fail_at = None
+    assert recorder.run(tmp_path / "run") == ["first:b"]
 
 
 def test_a_change_of_the_packages_own_plan_is_seen(tmp_path):
@@ -86,7 +171,7 @@ def test_a_change_of_the_packages_own_plan_is_seen(tmp_path):
 
     for groups in (200, 200, 100):
         stage = Stage("one", function, "one", plan=lambda _, __, n=groups: {"n_groups": n})
-        StudyRunner(StudyConfig(), tmp_path / "run", [stage]).run()
+        StudyRunner(StudyConfig(), tmp_path / "run", [stage], redo=True).run()
     assert len(ran) == 2
 
 
@@ -126,33 +211,16 @@ def test_a_damaged_product_is_made_again(tmp_path):
     assert recorder.run(tmp_path / "run") == ["first:a"]
 
 
-def test_a_foreign_folder_is_refused(tmp_path):
-    (tmp_path / "precious.txt").write_text("mine")
-    with pytest.raises(DataError, match="is no run's folder"):
-        ProductStore(tmp_path)
-
-
-def test_a_run_that_was_killed_at_once_can_begin_again(tmp_path):
-    (tmp_path / "run.lock").write_text("999999999")
-    (tmp_path / ".partial-manifest.json").write_text("{")
-    with ProductStore(tmp_path) as store:
-        assert store.records == {}
-
-
-@pytest.mark.parametrize("text", ["[]", "{", '{"stages": {"catalog": {}}}', '{"stages": [1]}'])
-def test_a_damaged_manifest_is_named(tmp_path, text):
-    (tmp_path / "manifest.json").write_text(text)
-    with pytest.raises(DataError, match=r"manifest\.json is not the manifest of a run"):
-        ProductStore(tmp_path)
-
-
 def test_products_that_no_longer_belong_are_removed(tmp_path):
     def function(context, unit):
         context.save(f"{unit}.txt", lambda path: path.write_text(unit))
 
-    for units in ("ab", "a"):
-        stage = Stage("one", function, "one", units=lambda _, u=units: u)
-        StudyRunner(StudyConfig(), tmp_path / "run", [stage]).run()
+    stages = [[Stage("one", function, "one", units=lambda _, u=units: u)] for units in ("ab", "a")]
+    StudyRunner(StudyConfig(), tmp_path / "run", stages[0]).run()
+    with pytest.raises(OtherRunError, match="1 finished steps of another run"):
+        StudyRunner(StudyConfig(), tmp_path / "run", stages[1]).run()
+    assert (tmp_path / "run" / "b.txt").exists()
+    StudyRunner(StudyConfig(), tmp_path / "run", stages[1], redo=True).run()
     assert (tmp_path / "run" / "a.txt").exists()
     assert not (tmp_path / "run" / "b.txt").exists()
 
@@ -168,63 +236,81 @@ def test_a_stage_that_reads_what_it_has_not_declared_is_an_error(tmp_path):
         StudyRunner(StudyConfig(), tmp_path / "run", [stage]).run()
 
 
-def test_a_folder_in_use_is_refused_and_a_stale_lock_is_not(tmp_path):
-    import os
-
-    with ProductStore(tmp_path / "run"), pytest.raises(DataError, match="is in use by process"):
-        ProductStore(tmp_path / "run").__enter__()
-    (tmp_path / "run" / "run.lock").write_text("999999999")
-    with ProductStore(tmp_path / "run"):
-        assert (tmp_path / "run" / "run.lock").read_text() == str(os.getpid())
-
-
 def test_stages_must_come_after_what_they_need(tmp_path):
     stage = Stage("second", print, "second", needs=("first",))
     with pytest.raises(ConfigError, match="stage 'second' needs"):
         StudyRunner(StudyConfig(), tmp_path, [stage])
 
 
-def test_images_survive_the_file(tmp_path):
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
-    wcs.wcs.crval = [53.1, -27.8]
-    wcs.wcs.crpix = [3, 2]
-    wcs.wcs.cdelt = [-3e-5, 3e-5]
-    data = np.arange(12.0, dtype=np.float32).reshape(3, 4)
-    meta = {
-        "filter": "miri.f770w",
-        "exposure time": 5.5,
-        "a_long_name_of_a_list": [1, 2],
-        "none": None,
-    }
-    image = CCDData(
-        data,
-        unit=u.MJy / u.sr,
-        wcs=wcs,
-        mask=data > 10,
-        uncertainty=StdDevUncertainty(data + 1),
-        meta=meta,
-    )
-    write_image(image, tmp_path / "image.fits", planes={"weight": data * 2})
-    back, weight = read_image(tmp_path / "image.fits", planes=["weight"])
-    assert back.unit == u.MJy / u.sr
-    assert dict(back.meta) == meta
-    np.testing.assert_array_equal(back.data, data)
-    np.testing.assert_array_equal(back.mask, data > 10)
-    np.testing.assert_array_equal(back.uncertainty.array, data + 1)
-    np.testing.assert_array_equal(weight, data * 2)
-    assert back.wcs.pixel_to_world(1, 2).separation(wcs.pixel_to_world(1, 2)) < 1e-6 * u.arcsec
-
-
-def test_missing_and_foreign_images_are_named(tmp_path):
-    with pytest.raises(DataError, match=r"absent\.fits cannot be read as an image"):
-        read_image(tmp_path / "absent.fits")
-    (tmp_path / "text.fits").write_text("no image")
-    with pytest.raises(DataError, match=r"text\.fits cannot be read as an image"):
-        read_image(tmp_path / "text.fits")
-
-
 def test_a_full_disk_is_told_before_the_run(tmp_path):
     with pytest.raises(DataError, match="the run needs about"):
         check_disk(tmp_path / "not" / "yet", 10**18)
     check_disk(tmp_path / "not" / "yet", 1)
+
+
+def units_side_by_side(n_units, **options):
+    """The largest number of units that ran at once, and the order in which stages began."""
+    state = types.SimpleNamespace(now=0, most=0, order=[])
+    lock = threading.Lock()
+
+    def work(context, unit):
+        with lock:
+            state.now += 1
+            state.most = max(state.most, state.now)
+            state.order.append(unit[:1])
+        threading.Event().wait(0.05)
+        context.save(f"{unit}.txt", lambda path: path.write_text(unit))
+        with lock:
+            state.now -= 1
+
+    def names(letter):
+        return lambda _: [f"{letter}{k}" for k in range(n_units)]
+
+    memory = options.pop("memory", None)
+    stages = (
+        Stage("a", work, "a", units=names("a"), memory=memory),
+        Stage("b", work, "b", units=names("b"), needs=("a",), memory=memory),
+        Stage("c", work, "c", units=names("c"), memory=memory),
+    )
+    return state, stages
+
+
+@pytest.mark.parametrize(("threads", "gigabytes", "most"), [(3, 4.0, 3), (3, 2.5, 2), (1, 4.0, 1)])
+def test_units_run_side_by_side_within_threads_and_memory(tmp_path, threads, gigabytes, most):
+    state, stages = units_side_by_side(4, memory=lambda _, __: 1_000_000_000)
+    config = StudyConfig.from_dict({"run": {"threads": threads, "memory": gigabytes}})
+    with ThreadPoolExecutor(4) as executor:
+        store = StudyRunner(config, tmp_path / "run", stages, executor=executor).run()
+    assert state.most == most
+    assert len(store.records) == 12
+    # b waits for all of a; c for nobody
+    assert state.order[:4] == ["a"] * 4
+    assert state.order.index("b") >= 4
+
+
+def test_a_unit_larger_than_the_memory_runs_alone(tmp_path):
+    state, stages = units_side_by_side(3, memory=lambda _, __: 10_000_000_000)
+    config = StudyConfig.from_dict({"run": {"threads": 3, "memory": 1.0}})
+    with ThreadPoolExecutor(3) as executor:
+        StudyRunner(config, tmp_path / "run", stages, executor=executor).run()
+    assert state.most == 1
+
+
+def test_what_runs_beside_a_unit_that_fails_is_kept(tmp_path):
+    begun = threading.Event()
+
+    def work(context, unit):
+        if unit == "bad":
+            begun.wait(5)
+            msg = "no such light"
+            raise ValueError(msg)
+        begun.set()
+        threading.Event().wait(0.1)
+        context.save(f"{unit}.txt", lambda path: path.write_text(unit))
+
+    stage = Stage("one", work, "one", units=lambda _: ("bad", "good", "late"))
+    config = StudyConfig.from_dict({"run": {"threads": 2}})
+    with ThreadPoolExecutor(2) as executor, pytest.raises(ValueError, match="no such light") as err:
+        StudyRunner(config, tmp_path / "run", [stage], executor=executor).run()
+    assert "in stage one:bad" in err.value.__notes__
+    assert set(ProductStore(tmp_path / "run").records) == {"one:good"}

@@ -3,6 +3,7 @@
 from miricigale.refdata import resources
 from miricigale.refdata.locate import fingerprint
 from miricigale.sed import SEDModel
+from miricigale.workflow.stage import Stage
 from miricigale.workflow.stages.images import (
     exposure_plan,
     exposure_units,
@@ -35,10 +36,8 @@ def study_stages():
 
     Returns
     -------
-    stages : tuple of `~miricigale.workflow.runner.Stage`
+    stages : tuple of `~miricigale.workflow.stage.Stage`
     """
-    from miricigale.workflow.runner import Stage
-
     images = ("pointing", "exposures", "scene", "detector", "reduction")
     grid = ("pointing", "exposures")
     kernel = ("highres", "photometry.regularization", "reduction")

@@ -81,7 +81,7 @@ def study_metrics(context):
 
     Parameters
     ----------
-    context : `~miricigale.workflow.runner.Context`
+    context : `~miricigale.workflow.stage.Context`
         Of a run whose other stages are done.
 
     Returns

@@ -1,0 +1,184 @@
+"""A stage of the study, and what it sees of the run."""
+
+import dataclasses
+import time
+import types
+from collections.abc import Callable
+
+from miricigale.workflow.products import read_image, write_image
+from miricigale.workflow.store import ProductFolder
+
+__all__ = ["Context", "Stage", "run_unit"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """
+    One step of the study.
+
+    Parameters
+    ----------
+    name : str
+        Such as ``"mosaic"``.
+    function : callable
+        Called as ``function(context, unit)``; saves its products through the context.
+    title : str
+        What it does, for the progress line.
+    needs : tuple of str
+        Stages whose products it reads.
+    sections : tuple of str
+        Sections (``"scene"``) or keys (``"run.keep_level1b"``) of the configuration that it
+        reads; reading another one is an error.
+    resources : tuple of str
+        Reference data that it depends on.
+    version : int
+        Raised when the stage's own algorithm changes its products.
+    units : callable, optional
+        Called with the configuration; names of the pieces that are done and resumed one
+        by one.
+    plan : callable, optional
+        Called with the configuration and the unit; plain values that the stage takes from the
+        package (the exposures of a named plan, the axes of a named grid), so that a change
+        of those is seen.
+    memory : callable, optional
+        Called with the configuration and the unit; about how many bytes it takes to do it.
+    kernels : tuple of str, optional
+        Groups of compiled kernels (`miricigale.workflow.compilation`) that it calls.
+    """
+
+    name: str
+    function: Callable
+    title: str
+    needs: tuple = ()
+    sections: tuple = ()
+    resources: tuple = ()
+    version: int = 1
+    units: Callable | None = None
+    plan: Callable | None = None
+    memory: Callable | None = None
+    kernels: tuple = ()
+
+    def unit_names(self, config):
+        """Names of the pieces; a single empty one for a stage that has none."""
+        return tuple(self.units(config)) if self.units else ("",)
+
+    def key(self, unit):
+        """Name of a piece in the manifest."""
+        return f"{self.name}:{unit}" if unit else self.name
+
+
+class ConfigView:
+    """
+    What a stage has declared of a configuration; reading anything else is an error.
+
+    A stage that reads what is not in its hash would be taken for current when it is not.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.config.StudyConfig`
+        The configuration.
+    stage : `Stage`
+        Whose declaration counts.
+    """
+
+    def __init__(self, config, stage):
+        self._config, self._stage = config, stage
+
+    def __getattr__(self, section):
+        if section in self._stage.sections:
+            return getattr(self._config, section)
+        keys = [k.split(".")[1] for k in self._stage.sections if k.startswith(f"{section}.")]
+        if not keys:
+            msg = f"stage {self._stage.name!r} reads [{section}] without declaring it"
+            raise RuntimeError(msg)
+        values = getattr(self._config, section)
+        return types.SimpleNamespace(**{key: getattr(values, key) for key in keys})
+
+
+class Context:
+    """
+    What a stage sees of the run.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.config.StudyConfig`
+        The configuration.
+    folder : path-like
+        The folder of the run.
+    stage : `Stage`, optional
+        Whose declaration limits what is seen of the configuration.
+    n_threads : int, optional
+        Threads that the stage may use; they change no product.
+    progress_bar : bool, optional
+        Whether progress bars are shown.
+    """
+
+    def __init__(self, config, folder, *, stage=None, n_threads=1, progress_bar=False):
+        self.config = config if stage is None else ConfigView(config, stage)
+        self.products = ProductFolder(folder)
+        self.progress_bar = progress_bar
+        self.saved = []
+        # neither changes a product by itself: the seed is in every hash, threads in none
+        self.seed = config.run.seed
+        self.n_threads = n_threads
+
+    def path(self, name):
+        """Path of a product."""
+        return self.products.path(name)
+
+    def save(self, name, writer):
+        """Write a product whole or not at all, and note it for the manifest."""
+        path = self.products.save(name, writer)
+        self.saved.append(name)
+        return path
+
+    def save_table(self, name, table):
+        """Write a table as ECSV or FITS by the suffix of ``name``."""
+        table = table.copy(copy_data=False)
+        # the manifest says when; the same run gives the same bytes
+        table.meta.pop("created", None)
+        return self.save(name, lambda path: table.write(path, overwrite=True))
+
+    def save_image(self, name, image, **planes):
+        """Write an image and further planes."""
+        return self.save(name, lambda path: write_image(image, path, planes=planes))
+
+    def image(self, name, *planes):
+        """Read an image (and planes) that an earlier stage wrote."""
+        return read_image(self.path(name), planes=planes)
+
+
+def run_unit(config, folder, stages, name, unit, *, n_threads=1, progress_bar=False):
+    """
+    Do one unit of a stage, in whatever process or thread this is called.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.config.StudyConfig`
+        The configuration.
+    folder : path-like
+        The folder of the run.
+    stages : callable or tuple of `Stage`
+        The stages, or a function that makes them.
+    name, unit : str
+        Which.
+    n_threads, progress_bar
+        As for `Context`.
+
+    Returns
+    -------
+    products : dict of str to dict
+        Checksum and size of what was written, by name.
+    seconds : float
+        Time that it took.
+    """
+    (stage,) = (s for s in (stages() if callable(stages) else stages) if s.name == name)
+    context = Context(config, folder, stage=stage, n_threads=n_threads, progress_bar=progress_bar)
+    begin = time.perf_counter()
+    try:
+        stage.function(context, unit)
+    except (ValueError, KeyError, OSError) as err:
+        err.add_note(f"in stage {stage.key(unit)}")
+        raise
+    products = {product: context.products.describe(product) for product in context.saved}
+    return products, time.perf_counter() - begin

@@ -1,0 +1,316 @@
+"""The folder of a run: products written whole or not at all, and the record of what stands."""
+
+import hashlib
+import json
+import logging
+import os
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from miricigale.refdata.locate import file_sha256
+from miricigale.utils.exceptions import DataError
+from miricigale.utils.lock import FolderLock
+
+__all__ = ["ProductFolder", "ProductStore"]
+
+log = logging.getLogger(__name__)
+
+MANIFEST = "manifest.json"
+#: The same text once more: a run outlives the loss of either file.
+SECOND_MANIFEST = ".manifest.copy.json"
+CONFIG = "config.toml"
+LOCK = "run.lock"
+PARTIAL = ".partial-"
+
+
+class ProductFolder:
+    """
+    Where products lie, and how they are written.
+
+    Parameters
+    ----------
+    folder : path-like
+        The folder of a run.
+    """
+
+    def __init__(self, folder):
+        self.folder = Path(folder)
+
+    def path(self, name):
+        """
+        Path of a product.
+
+        Parameters
+        ----------
+        name : str
+            Its name in the folder, with ``/`` between sub-folders.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If the name leads out of the folder, by itself or by a symbolic link.
+        """
+        parts = PurePosixPath(name).parts
+        windows = PureWindowsPath(name)
+        if (
+            not parts
+            or ".." in windows.parts
+            or windows.drive
+            or windows.root
+            or "/".join(parts) != name
+            or "\0" in name
+        ):
+            msg = f"{name!r} is not the name of a product: products lie in {self.folder}"
+            raise DataError(msg)
+        path = self.folder
+        for part in parts:
+            path = path / part
+            if path.is_symlink():
+                msg = f"{path} is a symbolic link; products must lie in {self.folder} itself"
+                raise DataError(msg)
+        return path
+
+    def save(self, name, writer):
+        """
+        Write a product under a temporary name, then rename it.
+
+        Parameters
+        ----------
+        name : str
+            Name in the folder; sub-folders are made.
+        writer : callable
+            Called with the temporary path, whose suffix is that of ``name``.
+
+        Returns
+        -------
+        path : `pathlib.Path`
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If it cannot be written, for instance on a full disk; what stood there before
+            stays.
+        """
+        path = self.path(name)
+        partial = path.with_name(PARTIAL + path.name)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            writer(partial)
+            os.replace(partial, path)
+        except OSError as err:
+            partial.unlink(missing_ok=True)
+            if isinstance(err, DataError):
+                raise
+            msg = f"{path} cannot be written: {err.strerror or err}"
+            raise DataError(msg) from err
+        return path
+
+    def describe(self, name):
+        """Checksum and size of a product, as the manifest holds them."""
+        path = self.path(name)
+        return {"sha256": file_sha256(path), "bytes": path.stat().st_size}
+
+
+class ProductStore(ProductFolder):
+    """
+    The folder of a run and the manifest of what stands in it.
+
+    Used in a ``with`` statement it is locked for other processes.
+
+    Parameters
+    ----------
+    folder : path-like
+        Made when something is written, if it does not exist.
+
+    Attributes
+    ----------
+    config : dict or None
+        Plain values of the configuration that the products were made with, if known.
+    records : dict of str to dict
+        By stage, or stage and unit: ``hash``, ``seconds`` and ``products``.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the folder holds files but no manifest (it is not a run's folder), or a manifest
+        names a product outside the folder.
+    """
+
+    def __init__(self, folder):
+        super().__init__(folder)
+        self._whole = {}
+        self._lock = FolderLock(self.folder, name=LOCK, purpose="run")
+        self._load()
+
+    def _load(self):
+        self.config, self.config_sha256, self.records = None, None, {}
+        found = [self.folder / name for name in (MANIFEST, SECOND_MANIFEST)]
+        found = [path for path in found if path.is_file()]
+        for path in found:
+            if self._read_manifest(path):
+                break
+        else:
+            self._refuse_foreign(damaged=bool(found))
+
+    def _read_manifest(self, path):
+        """Take over a manifest; False if it is damaged."""
+        try:
+            values = json.loads(path.read_text(encoding="utf-8"))
+            records = values["stages"]
+            for record in records.values():
+                record["hash"], float(record["seconds"])
+                for product in record["products"].values():
+                    product["sha256"], int(product["bytes"])
+        except (ValueError, KeyError, TypeError, AttributeError) as err:
+            log.warning("%s is damaged (%s: %s)", path, type(err).__name__, err)
+            return False
+        for record in records.values():
+            for name in record["products"]:
+                try:
+                    self.path(name)
+                except DataError as err:
+                    msg = f"{path} cannot be used: {err}"
+                    raise DataError(msg) from None
+        self.records = records
+        self.config = values.get("config")
+        self.config_sha256 = values.get("config_sha256")
+        return True
+
+    def _refuse_foreign(self, *, damaged):
+        """Refuse a folder that is not a run's, or whose products cannot be told any more."""
+        if damaged:
+            msg = (
+                f"neither {MANIFEST} nor {SECOND_MANIFEST} in {self.folder} can be read, so that "
+                "none of its products can be used; remove the folder, or choose another with "
+                "--output"
+            )
+            raise DataError(msg)
+        # a run that was killed at its first moment leaves these
+        if self.folder.exists() and (
+            not self.folder.is_dir()
+            or any(not e.name.startswith((LOCK, PARTIAL)) for e in self.folder.iterdir())
+        ):
+            msg = (
+                f"{self.folder} exists, is not empty and is no run's folder; choose another "
+                "with --output"
+            )
+            raise DataError(msg)
+
+    def __enter__(self):
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._lock.__enter__()
+        try:
+            # another run may have changed it since it was looked at
+            self._load()
+            for path in self.folder.rglob(f"{PARTIAL}*"):
+                # left over by a run that was killed
+                path.unlink()
+        except BaseException:
+            self._lock.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(self, *exc):
+        self._lock.__exit__(*exc)
+
+    def begin(self, values, text, *, write):
+        """
+        Note the configuration of the run that begins, and write it as ``config.toml``.
+
+        Parameters
+        ----------
+        values : dict
+            Plain values of all sections.
+        text : str
+            The file.
+        write : bool
+            Whether it is written; otherwise the one that stands says the same.
+        """
+        data = text.encode()
+        if write:
+            self.save(CONFIG, lambda path: path.write_bytes(data))
+        self.config, self.config_sha256 = values, hashlib.sha256(data).hexdigest()
+        self._write_manifest()
+
+    def edited_config(self):
+        """Path of ``config.toml`` if somebody changed it since the last run, otherwise None."""
+        path = self.path(CONFIG)
+        if self.config_sha256 is None or not path.is_file():
+            return None
+        return path if file_sha256(path) != self.config_sha256 else None
+
+    def is_whole(self, key):
+        """Whether all products of a record stand with the right checksums."""
+        return all(
+            self._is_whole(name, product) for name, product in self.records[key]["products"].items()
+        )
+
+    def _is_whole(self, name, product):
+        path = self.path(name)
+        if not path.is_file() or path.stat().st_size != product["bytes"]:
+            return False
+        # a file of many megabytes is read once in a run
+        state = (path.stat().st_mtime_ns, product["sha256"])
+        if self._whole.get(name) != state:
+            if file_sha256(path) != product["sha256"]:
+                return False
+            self._whole[name] = state
+        return True
+
+    def is_current(self, key, digest):
+        """
+        Whether a stage's products stand as its record says.
+
+        Parameters
+        ----------
+        key : str
+            Stage, or stage and unit.
+        digest : str
+            Hash of everything that the products depend on.
+        """
+        record = self.records.get(key)
+        return record is not None and record["hash"] == digest and self.is_whole(key)
+
+    def finish(self, key, digest, products, *, seconds):
+        """
+        Record that a stage is done.
+
+        Parameters
+        ----------
+        key, digest : str
+            As for `is_current`.
+        products : dict of str to dict
+            By name: what `ProductFolder.describe` says of it.
+        seconds : float
+            Time that it took.
+        """
+        self.records[key] = {"hash": digest, "seconds": round(seconds, 2), "products": products}
+        self._write_manifest()
+
+    def drop(self, key):
+        """Forget a stage's record and remove the products that it names."""
+        for name in self.records.pop(key, {}).get("products", {}):
+            self.path(name).unlink(missing_ok=True)
+
+    def standing_bytes(self):
+        """Bytes that recorded products take now."""
+        paths = [self.path(name) for r in self.records.values() for name in r["products"]]
+        return sum(path.stat().st_size for path in paths if path.is_file())
+
+    def checksums(self, stage):
+        """Checksums of all products of a stage, over its units."""
+        return {
+            name: product["sha256"]
+            for key, record in sorted(self.records.items())
+            if key.split(":")[0] == stage
+            for name, product in record["products"].items()
+        }
+
+    def _write_manifest(self):
+        values = {
+            "config": self.config,
+            "config_sha256": self.config_sha256,
+            "stages": dict(sorted(self.records.items())),
+        }
+        text = json.dumps(values, indent=1)
+        for name in (MANIFEST, SECOND_MANIFEST):
+            self.save(name, lambda path: path.write_text(text, encoding="utf-8"))

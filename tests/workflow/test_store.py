@@ -1,0 +1,142 @@
+import json
+import os
+
+import pytest
+
+from miricigale.utils.exceptions import DataError
+from miricigale.workflow.store import ProductStore
+
+
+def saved(store, name, text="whole"):
+    """Write a product and its record."""
+    store.save(name, lambda path: path.write_text(text))
+    store.finish("stage", "hash", {name: store.describe(name)}, seconds=1.0)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A run's folder with one product, beside a file that is not its own."""
+    (tmp_path / "victim").write_text("mine")
+    with ProductStore(tmp_path / "run") as store:
+        saved(store, "part/product.txt")
+    return tmp_path / "run"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../victim",
+        "{victim}",
+        "part/../../victim",
+        "..",
+        ".",
+        "",
+        "part//product.txt",
+        "a\\..\\b",
+        "C:x",
+    ],
+)
+def test_no_product_lies_outside_the_folder(folder, name):
+    victim = folder.parent / "victim"
+    name = name.format(victim=victim)
+    text = (folder / "manifest.json").read_text()
+    (folder / "manifest.json").write_text(text.replace("part/product.txt", json.dumps(name)[1:-1]))
+    with pytest.raises(DataError, match=r"manifest\.json cannot be used: .* is not the name of a"):
+        ProductStore(folder)
+    assert victim.read_text() == "mine"
+
+
+@pytest.mark.parametrize("link", ["part", "part/product.txt"])
+def test_no_link_leads_a_product_out_of_the_folder(folder, link):
+    (folder.parent / "elsewhere").mkdir()
+    moved = folder.parent / "elsewhere" / "product.txt"
+    os.replace(folder / "part" / "product.txt", moved)
+    if link == "part":
+        (folder / "part").rmdir()
+        (folder / "part").symlink_to(moved.parent)
+    else:
+        (folder / "part" / "product.txt").symlink_to(moved)
+    with pytest.raises(DataError, match=f"{link} is a symbolic link; products must lie in"):
+        ProductStore(folder)
+    assert moved.read_text() == "whole"
+
+
+def test_a_product_cannot_be_written_through_a_link(tmp_path):
+    (tmp_path / "outside").mkdir()
+    with ProductStore(tmp_path / "run") as store:
+        (tmp_path / "run" / "inside").symlink_to(tmp_path / "outside")
+        with pytest.raises(DataError, match="inside is a symbolic link"):
+            store.save("inside/x.txt", lambda path: path.write_text("x"))
+    assert not list((tmp_path / "outside").iterdir())
+
+
+@pytest.mark.parametrize("name", ["manifest.json", ".manifest.copy.json"])
+@pytest.mark.parametrize("text", [None, "", "[]", "{", '{"stages": {"x": {}}}', '{"stages": [1]}'])
+def test_a_lost_or_damaged_manifest_is_replaced_by_its_copy(folder, name, text):
+    whole = (folder / "manifest.json").read_text()
+    if text is None:
+        (folder / name).unlink()
+    else:
+        (folder / name).write_text(text)
+    with ProductStore(folder) as store:
+        assert store.is_current("stage", "hash")
+        store.finish("other", "hash", {}, seconds=0.0)
+        store.drop("other")
+        store.finish("stage", "hash", store.records["stage"]["products"], seconds=1.0)
+    assert (folder / name).read_text() == whole
+
+
+def test_without_any_manifest_nothing_is_taken_for_a_product(folder):
+    for name in ("manifest.json", ".manifest.copy.json"):
+        (folder / name).write_text("{")
+    with pytest.raises(DataError, match=r"neither manifest\.json nor \.manifest\.copy\.json in"):
+        ProductStore(folder)
+    for name in ("manifest.json", ".manifest.copy.json"):
+        (folder / name).unlink()
+    with pytest.raises(DataError, match="is no run's folder"):
+        ProductStore(folder)
+    assert (folder / "part" / "product.txt").read_text() == "whole"
+
+
+def test_a_foreign_folder_is_refused(tmp_path):
+    (tmp_path / "precious.txt").write_text("mine")
+    with pytest.raises(DataError, match="is no run's folder"):
+        ProductStore(tmp_path)
+
+
+def test_a_run_that_was_killed_at_once_can_begin_again(tmp_path):
+    (tmp_path / "run.lock").write_text("999999999")
+    (tmp_path / ".partial-manifest.json").write_text("{")
+    with ProductStore(tmp_path) as store:
+        assert store.records == {}
+    assert not list(tmp_path.glob(".partial-*"))
+
+
+def test_a_folder_in_use_is_refused(tmp_path):
+    with (
+        ProductStore(tmp_path / "run"),
+        pytest.raises(DataError, match=r"is in use by a run: process \d+ on .* remove .*run\.lock"),
+    ):
+        ProductStore(tmp_path / "run").__enter__()
+
+
+def test_a_full_disk_names_the_product_and_keeps_the_old_one(folder):
+    def fails(path):
+        path.write_text("half")
+        raise OSError(28, "No space left on device")
+
+    with ProductStore(folder) as store:
+        with pytest.raises(DataError, match=r"product\.txt cannot be written: No space left"):
+            store.save("part/product.txt", fails)
+        assert store.is_current("stage", "hash")
+    assert not list(folder.rglob(".partial-*"))
+
+
+def test_another_byte_or_length_is_seen(folder):
+    path = folder / "part" / "product.txt"
+    for text in ("whale", "wholes"):
+        path.write_text(text)
+        assert not ProductStore(folder).is_current("stage", "hash")
+    path.write_text("whole")
+    assert ProductStore(folder).is_current("stage", "hash")
+    assert not ProductStore(folder).is_current("stage", "another hash")
