@@ -1,0 +1,249 @@
+"""Locks of folders, seen from several processes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import pytest
+
+from miricigale.utils import lock
+from miricigale.utils.exceptions import DataError
+from miricigale.utils.lock import FolderLock
+
+HOLD = """
+    import sys, time
+    from miricigale.utils.lock import FolderLock
+    with FolderLock(sys.argv[1]):
+        print("held", flush=True)
+        sys.stdin.read()
+"""
+
+
+def start(code, *args):
+    return subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(code), *map(str, args)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.fixture
+def holder(tmp_path):
+    process = start(HOLD, tmp_path)
+    assert process.stdout.readline() == "held\n"
+    yield process
+    process.kill()
+    process.communicate()
+
+
+def content(folder):
+    return json.loads((folder / "run.lock").read_text())
+
+
+def leave(folder, **changes):
+    """Make a lock of this process and change what it says; returns the text."""
+    with FolderLock(folder):
+        text = json.dumps(content(folder) | changes)
+    (folder / "run.lock").write_text(text)
+    return text
+
+
+def test_a_lock_is_there_while_it_is_held_and_alone(tmp_path):
+    with FolderLock(tmp_path, name="fit.lock", purpose="fit") as held:
+        assert [item.name for item in tmp_path.iterdir()] == ["fit.lock"]
+        assert json.loads(held.path.read_text())["pid"] == os.getpid()
+        again = FolderLock(tmp_path, name="fit.lock", purpose="fit")
+        for other in (held, again):
+            with pytest.raises(DataError, match=f"in use by a fit: process {os.getpid()} on"):
+                other.__enter__()
+        assert held.path.is_file()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_another_process_keeps_out_until_it_ends(tmp_path, holder):
+    wanted = rf"process {holder.pid} on .*, started 20.* UTC; if .* remove .*run\.lock"
+    with pytest.raises(DataError, match=wanted), FolderLock(tmp_path):
+        pass
+    assert content(tmp_path)["pid"] == holder.pid
+    holder.communicate("")
+    with FolderLock(tmp_path):
+        assert content(tmp_path)["pid"] == os.getpid()
+
+
+def test_a_killed_process_leaves_a_lock_that_is_taken_over(tmp_path, holder):
+    holder.kill()
+    if hasattr(os, "waitid"):
+        # a process that ended and was not waited for still has its number, but holds nothing
+        os.waitid(os.P_PID, holder.pid, os.WEXITED | os.WNOWAIT)
+    else:
+        holder.wait()
+    assert content(tmp_path)["pid"] == holder.pid
+    with FolderLock(tmp_path):
+        assert content(tmp_path)["pid"] == os.getpid()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_children_of_a_killed_process_do_not_hold_its_lock(tmp_path):
+    code = """
+        import os, sys, time
+        from miricigale.utils.lock import FolderLock
+        with FolderLock(sys.argv[1]):
+            child = os.fork()
+            if child:
+                print(child, flush=True)
+            time.sleep(60)
+    """
+    process = start(code, tmp_path)
+    child = int(process.stdout.readline())
+    try:
+        process.kill()
+        process.wait()
+        os.kill(child, 0)
+        with FolderLock(tmp_path):
+            assert content(tmp_path)["pid"] == os.getpid()
+    finally:
+        os.kill(child, signal.SIGKILL)
+        process.communicate()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_child_does_not_free_the_lock_of_its_parent(tmp_path):
+    with FolderLock(tmp_path) as held:
+        child = os.fork()
+        if child == 0:
+            held.__exit__(None, None, None)
+            os._exit(0)
+        os.waitpid(child, 0)
+        assert held.path.is_file()
+        with pytest.raises(DataError, match="in use"), FolderLock(tmp_path):
+            pass
+
+
+def test_a_number_that_the_system_gave_away_again_is_not_the_owner(tmp_path):
+    leave(tmp_path, start="12345")
+    with FolderLock(tmp_path):
+        assert content(tmp_path)["start"] != "12345"
+
+
+def test_a_process_of_before_the_last_boot_is_gone(tmp_path):
+    if not lock._identity()["boot"]:
+        pytest.skip("the system tells no boot")
+    leave(tmp_path, boot="another")
+    with FolderLock(tmp_path):
+        assert content(tmp_path)["boot"] != "another"
+
+
+@pytest.mark.parametrize("changes", [{"host": "node7"}, {"machine": "another", "boot": "b"}])
+def test_a_lock_of_another_host_is_never_taken_for_dead(tmp_path, changes):
+    text = leave(tmp_path, pid=2**22 + 1, start="1", **changes)
+    wanted = r"on another host: process 4194305 on .*if it is gone, remove .*run\.lock"
+    with pytest.raises(DataError, match=wanted), FolderLock(tmp_path):
+        pass
+    assert (tmp_path / "run.lock").read_text() == text
+
+
+def test_the_kernel_knows_of_owners_whose_number_is_not_seen(tmp_path, holder, monkeypatch):
+    # as in another container with this host name: its processes have numbers of their own
+    monkeypatch.setattr(lock, "_process_start", lambda pid: None)
+    monkeypatch.setattr(lock, "_PATIENCE", 0.1)
+    with pytest.raises(DataError, match=f"process {holder.pid} on"), FolderLock(tmp_path):
+        pass
+    assert content(tmp_path)["pid"] == holder.pid
+
+
+def test_locks_of_an_earlier_form_hold_a_number_only(tmp_path, holder):
+    path = tmp_path / "run.lock"
+    path.write_text(str(holder.pid))
+    with pytest.raises(DataError, match=f"process {holder.pid} "), FolderLock(tmp_path):
+        pass
+    for gone in (str(2**22 + 1), f"{os.getpid()}\n"):
+        path.unlink(missing_ok=True)
+        path.write_text(gone)
+        with FolderLock(tmp_path):
+            assert content(tmp_path)["pid"] == os.getpid()
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1]", '{"pid": "x"}', "\x00\xff"])
+def test_what_cannot_be_read_is_taken_over_once_it_is_old(tmp_path, monkeypatch, text):
+    monkeypatch.setattr(lock, "_PATIENCE", 0.1)
+    path = tmp_path / "run.lock"
+    path.write_text(text)
+    with pytest.raises(DataError, match=r"unknown.*remove .*run\.lock"), FolderLock(tmp_path):
+        pass
+    old = time.time() - 60
+    os.utime(path, (old, old))
+    with FolderLock(tmp_path):
+        assert content(tmp_path)["pid"] == os.getpid()
+
+
+def test_a_lock_made_anew_by_hand_is_left_to_its_owner(tmp_path):
+    with FolderLock(tmp_path) as first:
+        first.path.unlink()
+        with FolderLock(tmp_path) as second:
+            first.__exit__(None, None, None)
+            assert second.path.is_file()
+    assert not second.path.exists()
+
+
+def test_file_systems_without_hard_links(tmp_path, monkeypatch):
+    def link(*args):
+        raise OSError(lock.errno.EPERM, "no links here")
+
+    monkeypatch.setattr(os, "link", link)
+    with FolderLock(tmp_path):
+        assert content(tmp_path)["pid"] == os.getpid()
+        with pytest.raises(DataError, match="in use"), FolderLock(tmp_path):
+            pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_file_systems_without_flock_leave_old_locks_to_the_user(tmp_path, monkeypatch):
+    monkeypatch.setattr(lock, "_flock", lambda handle: None)
+    with FolderLock(tmp_path), pytest.raises(DataError, match="in use"), FolderLock(tmp_path):
+        pass
+    leave(tmp_path, start="12345")
+    with pytest.raises(DataError, match=r"has no flock .* remove"), FolderLock(tmp_path):
+        pass
+
+
+def test_of_many_that_find_an_old_lock_one_wins(tmp_path):
+    # each takes over what another left, ten times: never are two inside at once
+    code = """
+        import os, sys
+        from miricigale.utils.lock import FolderLock
+        inside = os.path.join(sys.argv[1], "inside")
+        print("ready", flush=True)
+        sys.stdin.readline()
+        n = 0
+        while n < 10:
+            try:
+                lock = FolderLock(sys.argv[1])
+                lock.__enter__()
+            except OSError as err:
+                assert "in use" in str(err), err
+                continue
+            os.close(os.open(inside, os.O_CREAT | os.O_EXCL))
+            n += 1
+            os.unlink(inside)
+            # as if killed: the file stays and names a process that is gone
+            text = lock.path.read_text().replace(f'"pid": {os.getpid()}', '"pid": 4194305')
+            with open(lock.path, "r+") as stream:
+                stream.write(text)
+                stream.truncate()
+            lock._close()
+    """
+    leave(tmp_path, pid=2**22 + 1)
+    processes = [start(code, tmp_path) for _ in range(5)]
+    assert [process.stdout.readline() for process in processes] == ["ready\n"] * 5
+    for process in processes:
+        process.stdin.write("go\n")
+        process.stdin.flush()
+    for process in processes:
+        process.communicate()
+    assert [process.returncode for process in processes] == [0] * 5
