@@ -3,15 +3,15 @@
 import sys
 import time
 
+from tqdm import tqdm as plain_tqdm
 from tqdm.auto import tqdm
-from tqdm.std import tqdm as plain_tqdm
 
 __all__ = ["on_terminal", "print_line", "progress"]
 
 
 def on_terminal():
     """Whether a bar can be drawn: in a terminal or a notebook, not in a log file."""
-    return tqdm is not plain_tqdm or sys.stderr.isatty()
+    return "ipykernel" in sys.modules or sys.stderr.isatty()
 
 
 def print_line(text):

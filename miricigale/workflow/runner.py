@@ -202,7 +202,7 @@ class StudyRunner:
         """
         store = ProductStore(self.folder)
         states = self.forecast(store)
-        if set(states.values()) <= {"current"} and self._config_stands(store):
+        if store.is_sound and set(states.values()) <= {"current"} and self._config_stands(store):
             # nothing is written: a finished run can be called on a full or read-only disk
             self._tell(f"{self.config.run.name}: all {len(self.jobs)} steps stand")
             return store

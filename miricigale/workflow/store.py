@@ -143,18 +143,20 @@ class ProductStore(ProductFolder):
 
     def _load(self):
         self.config, self.config_sha256, self.records = None, None, {}
-        found = [self.folder / name for name in (MANIFEST, SECOND_MANIFEST)]
-        found = [path for path in found if path.is_file()]
-        for path in found:
-            if self._read_manifest(path):
+        paths = [self.path(name) for name in (MANIFEST, SECOND_MANIFEST)]
+        texts = [path.read_bytes() if path.is_file() else None for path in paths]
+        #: Whether both manifests stand and say the same.
+        self.is_sound = texts[0] is not None and texts[0] == texts[1]
+        for path, text in zip(paths, texts, strict=True):
+            if text is not None and self._read_manifest(path, text):
                 break
         else:
-            self._refuse_foreign(damaged=bool(found))
+            self._refuse_foreign(damaged=texts != [None, None])
 
-    def _read_manifest(self, path):
+    def _read_manifest(self, path, text):
         """Take over a manifest; False if it is damaged."""
         try:
-            values = json.loads(path.read_text(encoding="utf-8"))
+            values = json.loads(text)
             records = values["stages"]
             for record in records.values():
                 record["hash"], float(record["seconds"])
@@ -170,6 +172,10 @@ class ProductStore(ProductFolder):
                 except DataError as err:
                     msg = f"{path} cannot be used: {err}"
                     raise DataError(msg) from None
+        # earlier versions wrote none
+        if values.get("sha256", _checksum(values)) != _checksum(values):
+            log.warning("%s is damaged (its checksum is wrong)", path)
+            return False
         self.records = records
         self.config = values.get("config")
         self.config_sha256 = values.get("config_sha256")
@@ -204,6 +210,9 @@ class ProductStore(ProductFolder):
             for path in self.folder.rglob(f"{PARTIAL}*"):
                 # left over by a run that was killed
                 path.unlink()
+            if not self.is_sound:
+                # also in a new folder: from the first moment on it is a run's
+                self._write_manifest()
         except BaseException:
             self._lock.__exit__(None, None, None)
             raise
@@ -311,6 +320,12 @@ class ProductStore(ProductFolder):
             "config_sha256": self.config_sha256,
             "stages": dict(sorted(self.records.items())),
         }
-        text = json.dumps(values, indent=1)
+        text = json.dumps({"sha256": _checksum(values), **values}, indent=1)
         for name in (MANIFEST, SECOND_MANIFEST):
             self.save(name, lambda path: path.write_text(text, encoding="utf-8"))
+
+
+def _checksum(values):
+    """Checksum of what a manifest says."""
+    said = {key: value for key, value in values.items() if key != "sha256"}
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()

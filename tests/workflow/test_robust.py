@@ -1,0 +1,174 @@
+"""Runs that are killed, damaged or out of disk: nothing is lost, nothing is taken for whole."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from miricigale.utils.exceptions import DataError
+from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.runner import StudyRunner
+from miricigale.workflow.stage import Stage
+
+TOY = Path(__file__).with_name("toy_study.py")
+
+
+def contents(folder):
+    """Bytes of all products by name."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*.txt"))
+        if path.is_file()
+    }
+
+
+def start(folder, **options):
+    return subprocess.Popen(
+        [sys.executable, TOY, str(folder), "2"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # whoever runs the tests in the background hands down an ignored SIGINT
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        **options,
+    )
+
+
+def wait_for(path, process):
+    deadline = time.monotonic() + 60
+    while not path.exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.002)
+
+
+def group_lives(group):
+    """Whether a process group has processes."""
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """Products of a toy study that nobody stopped."""
+    folder = tmp_path_factory.mktemp("undisturbed") / "run"
+    process = start(folder)
+    _, message = process.communicate(timeout=120)
+    assert process.returncode == 0, message
+    return contents(folder)
+
+
+def test_a_run_that_is_killed_thirteen_times_ends_with_the_same_bytes(tmp_path, undisturbed):
+    folder = tmp_path / "run"
+    # from the first file of the folder to the last product, and moments between
+    moments = [
+        "run.lock", "config.toml", "manifest.json", "a/0.txt", "a/1.txt", "a/2.txt", "b/0.txt",
+        "b/2.txt", "c/0.txt", "c/1.txt", "d/0.txt", "d/2.txt", "second.txt",
+    ]  # fmt: skip
+    for name in moments:
+        process = start(folder)
+        wait_for(folder / name, process)
+        process.kill()
+        process.communicate(timeout=60)
+        # whatever carries its name is whole
+        for product, data in contents(folder).items():
+            if ".partial-" not in product:
+                assert data == undisturbed[product]
+    process = start(folder)
+    _, message = process.communicate(timeout=120)
+    assert process.returncode == 0, message
+    assert contents(folder) == undisturbed
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_no_process_outlives_the_run(tmp_path, how):
+    process = start(tmp_path / "run", start_new_session=True)
+    wait_for(tmp_path / "run" / "a" / "0.txt", process)
+    process.send_signal(how)
+    begin = time.monotonic()
+    # ends when every process that holds its pipes has ended
+    _, message = process.communicate(timeout=60)
+    assert time.monotonic() - begin < 30
+    assert process.returncode in (-how, 1, 130)
+    # what Python says of a parent that had no time to tidy up is not ours
+    assert how == signal.SIGKILL or "leaked" not in message
+    deadline = time.monotonic() + 10
+    while group_lives(process.pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not group_lives(process.pid)
+
+
+def toy(folder):
+    def first(context, unit):
+        context.save(f"{unit}.txt", lambda path: path.write_text(f"{context.seed} {unit}"))
+
+    def second(context, _):
+        text = "".join(context.path(f"{unit}.txt").read_text() for unit in "abc")
+        context.save("second.txt", lambda path: path.write_text(text))
+
+    stages = (
+        Stage("first", first, "first", units=lambda _: "abc"),
+        Stage("second", second, "second", needs=("first",)),
+    )
+    StudyRunner(StudyConfig(), folder, stages).run()
+
+
+def refusal(folder):
+    """What a run says if it stops, otherwise None."""
+    try:
+        toy(folder)
+    except DataError as err:
+        return str(err)
+    return None
+
+
+def test_a_flipped_byte_anywhere_is_mended(tmp_path):
+    folder = tmp_path / "run"
+    toy(folder)
+    whole = {path.name: path.read_bytes() for path in folder.iterdir()}
+    for name in ("a.txt", "b.txt", "c.txt", "second.txt", "manifest.json", ".manifest.copy.json"):
+        for place in range(0, len(whole[name]), max(1, len(whole[name]) // 20)):
+            data = bytearray(whole[name])
+            data[place] ^= 0x10
+            (folder / name).write_bytes(data)
+            message = refusal(folder)
+            if message:
+                # the name of a product that leads elsewhere
+                assert "manifest" in name
+                assert "cannot be used" in message
+                (folder / name).write_bytes(whole[name])
+            assert contents(folder) == {k: v for k, v in whole.items() if k.endswith(".txt")}
+            manifests = [folder / "manifest.json", folder / ".manifest.copy.json"]
+            assert manifests[0].read_bytes() == manifests[1].read_bytes()
+
+
+def test_a_disk_that_fills_at_any_write_is_named_and_the_run_goes_on(tmp_path, monkeypatch):
+    toy(tmp_path / "whole")
+    replace, n_failed = os.replace, 0
+    for allowed in range(100):
+        folder = tmp_path / f"full{allowed}"
+        left = [allowed]
+
+        def full(source, target, left=left):
+            left[0] -= 1
+            if left[0] < 0:
+                raise OSError(28, "No space left on device")
+            return replace(source, target)
+
+        monkeypatch.setattr(os, "replace", full)
+        message = refusal(folder)
+        monkeypatch.setattr(os, "replace", replace)
+        if message is None:
+            break
+        n_failed += 1
+        assert f"{folder}{os.sep}" in message
+        assert "cannot be written: No space left on device" in message
+        toy(folder)
+        assert contents(folder) == contents(tmp_path / "whole")
+    # each product and each note of it was refused once
+    assert n_failed >= 8
