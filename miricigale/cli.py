@@ -108,8 +108,9 @@ def _pair(text):
 
 
 def _run(args):
+    from miricigale.utils.exceptions import OtherResultsError
     from miricigale.utils.parallel import available_cores, process_pool
-    from miricigale.workflow import OtherRunError, load_config, run_study
+    from miricigale.workflow import load_config, run_study
 
     overrides = {"run": {}}
     if args.keep_level1b:
@@ -131,9 +132,9 @@ def _run(args):
         else:
             with process_pool(config.run.threads or available_cores()) as executor:
                 report = run_study(config, folder, executor=executor, **options)
-    except OtherRunError as err:
+    except OtherResultsError as err:
         # in the words of this command
-        raise OtherRunError(err.reason, "--redo to do so") from err
+        raise OtherResultsError(err.reason, "--redo to replace it") from err
     except KeyboardInterrupt:
         print("stopped; the same command goes on from here", file=sys.stderr)
         return 130
@@ -144,7 +145,7 @@ def _run(args):
 def _fit(args):
     from concurrent.futures import ThreadPoolExecutor
 
-    from miricigale.fitting import OtherFitError
+    from miricigale.utils.exceptions import OtherResultsError
     from miricigale.workflow.commands import fit_catalogue
 
     try:
@@ -165,10 +166,9 @@ def _fit(args):
             )
         table = args.output / "table.fits"
         results.write_table(table, overwrite=True)
-    except OtherFitError as err:
+    except OtherResultsError as err:
         # in the words of this command
-        remedy = "--no-resume to replace them"
-        raise OtherFitError(err.folder, err.differences, remedy) from err
+        raise OtherResultsError(err.reason, "--no-resume to replace them") from err
     except KeyboardInterrupt:
         n_parts = len(list(args.output.glob("part-*.fits")))
         kept = f"{n_parts} finished parts are in {args.output}/"

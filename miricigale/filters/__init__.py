@@ -1,6 +1,11 @@
 """Passbands: curves, synthetic photometry, and weights for fast band averages."""
 
-from miricigale.filters.filter import Filter
-from miricigale.filters.filter_set import FilterSet
+from miricigale.utils.lazy import lazy_names
 
-__all__ = ["Filter", "FilterSet"]
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "filter": ("Filter",),
+        "filter_set": ("FilterSet",),
+    },
+)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import astropy.units as u
 import numpy as np
-from astropy.modeling.physical_models import BlackBody
 
 from miricigale.filters import _core
 from miricigale.filters.library import FILTERS, load_curve
@@ -254,6 +253,8 @@ class Filter:
         wave, throughput, norm = self._fine
         if convention == "nu F_nu = const":
             return reference / (_core.photon_integral(wave, throughput, 1) / norm)
+        from astropy.modeling.physical_models import BlackBody
+
         body = BlackBody(temperature=self.meta["reference_temperature"] * u.K)
         spectrum = body(wave * WAVE).value / body(reference * WAVE).value
         return float(norm / _core.photon_integral(wave, throughput * spectrum))

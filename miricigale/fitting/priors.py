@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.fitting.posterior import cell_edges
-from miricigale.sed.component import COMPONENTS
+from miricigale.sed import COMPONENTS
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.units import to_array
 

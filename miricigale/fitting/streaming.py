@@ -24,40 +24,22 @@ from miricigale.fitting.part_files import (
 )
 from miricigale.refdata.locate import file_sha256
 from miricigale.utils.content import content_sha256
-from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
+from miricigale.utils.exceptions import (
+    DataError,
+    MiricigaleWarning,
+    OtherResultsError,
+    argument_error,
+)
 from miricigale.utils.progress import progress
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU
 
-__all__ = ["OtherFitError", "fit_file"]
+__all__ = ["fit_file"]
 
 logger = logging.getLogger(__name__)
 
 _PACKAGES = ("miricigale", "numpy", "numba", "astropy")
-
-
-class OtherFitError(ValueError):
-    """
-    A folder holds results of another fit.
-
-    Parameters
-    ----------
-    folder : path-like
-        The folder.
-    differences : list of str
-        What differs.
-    remedy : str, optional
-        What the caller can do.
-    """
-
-    def __init__(self, folder, differences, remedy="resume=False to replace them"):
-        self.folder, self.differences = folder, differences
-        names = ", ".join(differences)
-        super().__init__(
-            f"{folder} holds results of another fit: {names} differ; "
-            f"give another folder, or {remedy}"
-        )
 
 
 def fit_file(
@@ -128,7 +110,7 @@ def fit_file(
     ------
     `~miricigale.utils.exceptions.DataError`
         If the catalogue cannot be read by rows, or the folder holds something else.
-    `OtherFitError`
+    `~miricigale.utils.exceptions.OtherResultsError`
         If the folder holds parts of another fit.
     ValueError
         What `BayesFitter.fit` raises; a note tells the rows.
@@ -335,7 +317,8 @@ def _open_folder(folder, job, resume):
         if resume and manifest["parts"]:
             other = _differences(manifest["job"], job)
             if other:
-                raise OtherFitError(folder, other)
+                msg = f"{folder} holds results of another fit: {', '.join(other)} differ"
+                raise OtherResultsError(msg, "resume=False to replace them")
             return manifest
         for name in manifest["parts"]:
             (folder / name).unlink(missing_ok=True)

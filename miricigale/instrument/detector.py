@@ -5,7 +5,6 @@ import functools
 
 import numpy as np
 from numpy.polynomial import polynomial as poly
-from scipy.interpolate import RectBivariateSpline
 
 from miricigale.instrument.figures import filter_row, table
 from miricigale.instrument.siaf import aperture, imager_columns, shape_aperture
@@ -205,6 +204,8 @@ def _flat_pixels():
 
 @functools.cache
 def _full_flat(filter):
+    from scipy.interpolate import RectBivariateSpline
+
     # pixels are the detector's own; what is smooth belongs to the filter as well
     pixels = _flat_pixels()
     n = miri_detector().reference_columns

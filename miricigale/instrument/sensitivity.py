@@ -4,7 +4,6 @@ import functools
 
 import astropy.units as u
 import numpy as np
-from astropy.modeling.physical_models import BlackBody
 from astropy.table import QTable
 
 from miricigale.instrument.detector import miri_detector
@@ -120,6 +119,8 @@ def background_spectrum(wave, *, zodi="low"):
     ValueError
         If a wavelength lies outside the thermal curve.
     """
+    from astropy.modeling.physical_models import BlackBody
+
     lam = to_array(wave, WAVE, "wave", finite=True)
     log_wave, log_level = _thermal()
     low, high = np.exp(log_wave[[0, -1]])

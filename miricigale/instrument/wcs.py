@@ -5,8 +5,6 @@ import functools
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
-from astropy.wcs import WCS, Sip
-from scipy.interpolate import RectBivariateSpline
 
 from miricigale.instrument.siaf import (
     aperture,
@@ -156,6 +154,8 @@ def imager_wcs(pointing, roll, *, subarray="FULL"):
     """
     ra, dec = scalar_position(pointing, "pointing")
     roll = float(to_array(roll, u.deg, "roll", ndim=0, finite=True))
+    from astropy.wcs import WCS, Sip
+
     part = aperture(subarray)
     cd, a, b, ap, bp = _sip(subarray)
     wcs = WCS(naxis=2)
@@ -222,6 +222,8 @@ def pixel_area_map(wcs, shape):
     area : `~numpy.ndarray`, shape (ny, nx)
         In sr. The Jacobian of the WCS on a coarse grid, joined by bicubic splines.
     """
+    from scipy.interpolate import RectBivariateSpline
+
     ny, nx = shape
     nodes = [np.linspace(0, n - 1, min(max(n, 6), 33)) for n in (ny, nx)]
     x, y = np.meshgrid(nodes[1], nodes[0])
@@ -262,6 +264,8 @@ def north_up_wcs(center, pixel_scale, shape):
     ny, nx = (int(n) for n in shape)
     if ny < 1 or nx < 1:
         raise argument_error("shape", "two positive integers", shape)
+    from astropy.wcs import WCS
+
     wcs = WCS(naxis=2)
     wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
     wcs.wcs.cunit = ["deg", "deg"]
@@ -297,6 +301,8 @@ def mosaic_wcs(exposures, pixel_scale, *, margin=0 * u.arcsec):
     ValueError
         If there are no exposures, or a WCS has no shape.
     """
+    from astropy.wcs import WCS
+
     wcss = [getattr(item, "wcs", item) if not isinstance(item, WCS) else item for item in exposures]
     if not wcss:
         raise argument_error("exposures", "at least one exposure", "none")

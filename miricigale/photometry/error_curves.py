@@ -6,11 +6,8 @@ import itertools
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
-from scipy.ndimage import gaussian_filter
-from scipy.optimize import brentq, isotonic_regression
 
 from miricigale.instrument import background_level, miri_detector, photmjsr
-from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, to_array
@@ -81,6 +78,10 @@ class Analytic:
 
 def exposure_curve(filter, time, *, background, size, psf, n_integrations, frame_time, fractional):
     """Photon and read noise of an exposure; parameters are those of `ErrorModel.from_exposure`."""
+    from scipy.ndimage import gaussian_filter
+
+    from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
+
     seconds = float(to_array(time, u.s, "time"))
     if not seconds > 0:
         raise argument_error("time", "positive", time)
@@ -136,6 +137,8 @@ def _pooled(flux, error):
     are joined (isotonic regression in the logarithm); otherwise the limit, where the
     signal-to-noise crosses a value, would be that of one unlucky bin.
     """
+    from scipy.optimize import isotonic_regression
+
     order = np.argsort(flux, kind="stable")
     flux, error = flux[order], error[order]
     if np.all(error > 0):
@@ -165,6 +168,7 @@ def _scatter(true, seen):
 
 def limiting_flux(curve, n_sigma):
     """Flux (uJy) above which the signal-to-noise exceeds ``n_sigma``; NaN if none reaches it."""
+    from scipy.optimize import brentq
 
     def excess(flux):
         return flux - n_sigma * float(curve.sigma(flux))

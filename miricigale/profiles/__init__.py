@@ -1,22 +1,18 @@
 """Sersic and point-source light on a pixel grid."""
 
-from miricigale.profiles.ellipse import ellipse_through, ellipse_to_pixels
-from miricigale.profiles.sersic import (
-    SERSIC_INDEX_RANGE,
-    sersic_bn,
-    sersic_enclosed_fraction,
-    sersic_image,
-    sersic_radius,
-    sersic_stamp,
-)
+from miricigale.utils.lazy import lazy_names
 
-__all__ = [
-    "SERSIC_INDEX_RANGE",
-    "ellipse_through",
-    "ellipse_to_pixels",
-    "sersic_bn",
-    "sersic_enclosed_fraction",
-    "sersic_image",
-    "sersic_radius",
-    "sersic_stamp",
-]
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "ellipse": ("ellipse_through", "ellipse_to_pixels"),
+        "sersic": (
+            "SERSIC_INDEX_RANGE",
+            "sersic_bn",
+            "sersic_enclosed_fraction",
+            "sersic_image",
+            "sersic_radius",
+            "sersic_stamp",
+        ),
+    },
+)

@@ -1,9 +1,8 @@
 """Sersic profiles: closed forms and pixel-integrated images."""
 
 import numpy as np
-from scipy.special import gammainc, gammaincinv, gammaln
+import scipy
 
-from miricigale.profiles import _core
 from miricigale.utils.exceptions import argument_error
 
 __all__ = [
@@ -45,7 +44,7 @@ def sersic_bn(n):
     >>> float(sersic_bn(4.0))
     7.6692494425008
     """
-    return gammaincinv(2.0 * np.asarray(n, dtype=float), 0.5)[()]
+    return scipy.special.gammaincinv(2.0 * np.asarray(n, dtype=float), 0.5)[()]
 
 
 def sersic_enclosed_fraction(radius, n):
@@ -76,13 +75,15 @@ def sersic_enclosed_fraction(radius, n):
     """
     n = np.asarray(n, dtype=float)
     x = np.asarray(radius, dtype=float)
-    return gammainc(2 * n, sersic_bn(n) * x ** (1 / n))[()]
+    return scipy.special.gammainc(2 * n, sersic_bn(n) * x ** (1 / n))[()]
 
 
 def sersic_radius(fraction, n):
     """Radius (over the half-light radius) that encloses a fraction; inverse of `sersic_enclosed_fraction`."""
     n = np.asarray(n, dtype=float)
-    return ((gammaincinv(2 * n, np.asarray(fraction, dtype=float)) / sersic_bn(n)) ** n)[()]
+    return (
+        (scipy.special.gammaincinv(2 * n, np.asarray(fraction, dtype=float)) / sersic_bn(n)) ** n
+    )[()]
 
 
 def light_table(n):
@@ -100,13 +101,18 @@ def light_table(n):
         Enclosed fraction and its derivative, first radial moment and its derivative, second
         derivative of the enclosed fraction, at even steps of ln(R / R_e).
     """
+    from miricigale.profiles import _core
+
     n = np.atleast_1d(np.asarray(n, dtype=float))[:, None]
     bn = sersic_bn(n)
     log_r = _core.TABLE_START + _core.TABLE_STEP * np.arange(_core.TABLE_SIZE)[None]
     z = bn * np.exp(log_r / n)
-    density = np.exp(2 * n * np.log(bn) - gammaln(2 * n) + 2 * log_r - z) / n  # dF / d ln R
-    fraction = gammainc(2 * n, z)
-    moment = np.exp(gammaln(3 * n) - gammaln(2 * n) - n * np.log(bn)) * gammainc(3 * n, z)
+    # dF / d ln R
+    density = np.exp(2 * n * np.log(bn) - scipy.special.gammaln(2 * n) + 2 * log_r - z) / n
+    fraction = scipy.special.gammainc(2 * n, z)
+    moment = np.exp(
+        scipy.special.gammaln(3 * n) - scipy.special.gammaln(2 * n) - n * np.log(bn)
+    ) * scipy.special.gammainc(3 * n, z)
     bend = density * (2 - z / n)
     return np.stack([fraction, density, moment, density * np.exp(log_r), bend], axis=1)
 
@@ -128,7 +134,7 @@ def parameter_rows(*, x, y, total_flux, r_eff, n, axis_ratio, theta):
     )
     bn = sersic_bn(n)
     minor = axis_ratio * r_eff
-    log_norm = 2 * n * np.log(bn) - gammaln(2 * n)
+    log_norm = 2 * n * np.log(bn) - scipy.special.gammaln(2 * n)
     intensity = total_flux * np.exp(log_norm) / (2 * np.pi * n * r_eff * minor)
     xx, xy = np.cos(theta) / r_eff, np.sin(theta) / r_eff
     yx, yy = -np.sin(theta) / minor, np.cos(theta) / minor
@@ -202,6 +208,8 @@ def sersic_image(shape, *, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta
         x=x, y=y, total_flux=total_flux, r_eff=r_eff, n=n, axis_ratio=axis_ratio, theta=theta
     )
     image = np.zeros(shape)
+    from miricigale.profiles import _core
+
     _core.sersic_cells(image, rows[0], light_table(n)[0])
     return image
 

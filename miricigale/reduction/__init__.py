@@ -1,37 +1,23 @@
 """From ramps to calibrated images and mosaics: the `Reducer` and its steps."""
 
-from miricigale.reduction.background import Background, estimate_background, subtract_background
-from miricigale.reduction.calibration import calibrate, find_cosmic_rays
-from miricigale.reduction.flags import PixelFlags
-from miricigale.reduction.mosaic import (
-    Mosaic,
-    drizzle_images,
-    noise_correction,
-    pixel_map,
-    reject_outliers,
-    weight_map,
-)
-from miricigale.reduction.rampfit import RampFit, fit_groups, reference_drift
-from miricigale.reduction.reducer import BACKENDS, Reducer
-from miricigale.reduction.results import ReductionResult
+from miricigale.utils.lazy import lazy_names
 
-__all__ = [
-    "BACKENDS",
-    "Background",
-    "Mosaic",
-    "PixelFlags",
-    "RampFit",
-    "Reducer",
-    "ReductionResult",
-    "calibrate",
-    "drizzle_images",
-    "estimate_background",
-    "find_cosmic_rays",
-    "fit_groups",
-    "noise_correction",
-    "pixel_map",
-    "reference_drift",
-    "reject_outliers",
-    "subtract_background",
-    "weight_map",
-]
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "background": ("Background", "estimate_background", "subtract_background"),
+        "calibration": ("calibrate", "find_cosmic_rays"),
+        "flags": ("PixelFlags",),
+        "mosaic": (
+            "Mosaic",
+            "drizzle_images",
+            "noise_correction",
+            "pixel_map",
+            "reject_outliers",
+            "weight_map",
+        ),
+        "rampfit": ("RampFit", "fit_groups", "reference_drift"),
+        "reducer": ("BACKENDS", "Reducer"),
+        "results": ("ReductionResult",),
+    },
+)

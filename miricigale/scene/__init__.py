@@ -1,23 +1,15 @@
 """Scenes: catalogues of galaxies painted through the instrument's distortion and PSF."""
 
-from miricigale.scene.background import Background
-from miricigale.scene.catalog import CATALOG_COLUMNS, CatalogFlags, check_catalog, read_catalog
-from miricigale.scene.cutouts import Cutout
-from miricigale.scene.highres import depth_to_rms, highres_image
-from miricigale.scene.render import FieldPainter, Painter
-from miricigale.scene.scene import Scene, SceneFlags
+from miricigale.utils.lazy import lazy_names
 
-__all__ = [
-    "CATALOG_COLUMNS",
-    "Background",
-    "CatalogFlags",
-    "Cutout",
-    "FieldPainter",
-    "Painter",
-    "Scene",
-    "SceneFlags",
-    "check_catalog",
-    "depth_to_rms",
-    "highres_image",
-    "read_catalog",
-]
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "background": ("Background",),
+        "catalog": ("CATALOG_COLUMNS", "CatalogFlags", "check_catalog", "read_catalog"),
+        "cutouts": ("Cutout",),
+        "highres": ("depth_to_rms", "highres_image"),
+        "render": ("FieldPainter", "Painter"),
+        "scene": ("Scene", "SceneFlags"),
+    },
+)

@@ -6,6 +6,7 @@ __all__ = [
     "ConfigError",
     "DataError",
     "MiricigaleWarning",
+    "OtherResultsError",
     "argument_error",
     "unknown_name",
 ]
@@ -17,6 +18,23 @@ class ConfigError(ValueError):
 
 class DataError(OSError):
     """A data file that is missing, foreign, truncated or has the wrong checksum."""
+
+
+class OtherResultsError(ValueError):
+    """
+    A folder holds results of other settings, which are not replaced unasked.
+
+    Parameters
+    ----------
+    reason : str
+        What the folder holds, and what differs.
+    remedy : str
+        What the caller can do to replace them.
+    """
+
+    def __init__(self, reason, remedy):
+        self.reason, self.remedy = reason, remedy
+        super().__init__(f"{reason}; give another folder, or {remedy}")
 
 
 class MiricigaleWarning(AstropyUserWarning):

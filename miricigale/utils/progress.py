@@ -3,8 +3,7 @@
 import sys
 import time
 
-from tqdm import tqdm as plain_tqdm
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 __all__ = ["on_terminal", "print_line", "progress"]
 
@@ -16,7 +15,7 @@ def on_terminal():
 
 def print_line(text):
     """Write a line to stderr, beside whatever bar is drawn there."""
-    plain_tqdm.write(text, file=sys.stderr)
+    tqdm.write(text, file=sys.stderr)
 
 
 class _Lines:
@@ -86,4 +85,7 @@ def progress(iterable=None, *, show=False, total=None, desc=None, unit="it"):
     """
     if show and not on_terminal():
         return _Lines(iterable, total, desc, unit)
+    # the notebook's bar is slow to import
+    from tqdm.auto import tqdm
+
     return tqdm(iterable, total=total, desc=desc, unit=unit, disable=not show, leave=False)

@@ -4,7 +4,6 @@ import enum
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import match_coordinates_sky
 from astropy.table import Table
 
 from miricigale.utils.exceptions import argument_error
@@ -112,6 +111,8 @@ def match_sky(coords, reference, *, radius):
     `~astropy.units.UnitsError`, ValueError
         If ``radius`` is no angle, or not one of at least 0.
     """
+    from astropy.coordinates import match_coordinates_sky
+
     limit = float(to_array(radius, ANGLE, "radius", ndim=0))
     if not limit >= 0:
         raise argument_error("radius", "at least 0", radius)

@@ -1,26 +1,16 @@
 """The whole study: configuration, stages, and a runner that resumes."""
 
-from miricigale.workflow.config import StudyConfig, load_config, preset_names
-from miricigale.workflow.products import read_image, write_image
-from miricigale.workflow.runner import OtherRunError, StudyRunner
-from miricigale.workflow.stage import Context, Stage
-from miricigale.workflow.stages import study_stages
-from miricigale.workflow.store import ProductStore
-from miricigale.workflow.study import check_study, disk_use, run_study
+from miricigale.utils.lazy import lazy_names
 
-__all__ = [
-    "Context",
-    "OtherRunError",
-    "ProductStore",
-    "Stage",
-    "StudyConfig",
-    "StudyRunner",
-    "check_study",
-    "disk_use",
-    "load_config",
-    "preset_names",
-    "read_image",
-    "run_study",
-    "study_stages",
-    "write_image",
-]
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "config": ("StudyConfig", "load_config", "preset_names"),
+        "products": ("read_image", "write_image"),
+        "runner": ("StudyRunner",),
+        "stage": ("Context", "Stage"),
+        "stages": ("study_stages",),
+        "store": ("ProductStore",),
+        "study": ("check_study", "disk_use", "run_study"),
+    },
+)

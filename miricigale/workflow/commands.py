@@ -4,26 +4,12 @@ import warnings
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
 from miricigale.filters import Filter
-from miricigale.fitting import BayesFitter, fit_file
-from miricigale.fitting.likelihood import unused_bands
-from miricigale.instrument import (
-    ceers_exposures,
-    proposal_limit,
-    psf_fwhm,
-    saturation_forecast,
-    scaled_limit,
-)
-from miricigale.photometry import ForcedPhotometer, detect_sources, sensitivity
-from miricigale.psf import MatchingKernel, hst_psf, miri_psf, psf_mosaic
-from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column
-from miricigale.workflow.products import read_image
 
 __all__ = ["filter_table", "fit_catalogue", "measure_files", "plan_table"]
 
@@ -70,6 +56,16 @@ def plan_table(*, quick=False):
         `~miricigale.photometry.sensitivity` with the residual pattern
         (``residual="etc"``); ``limit_proposal``, of the survey's proposal.
     """
+    from astropy.coordinates import SkyCoord
+
+    from miricigale.instrument import (
+        ceers_exposures,
+        proposal_limit,
+        psf_fwhm,
+        saturation_forecast,
+        scaled_limit,
+    )
+
     exposures = ceers_exposures(SkyCoord(0 * u.deg, 0 * u.deg), 0 * u.deg, quick=quick)
     names = list(dict.fromkeys(e.filter for e in exposures))
     rows = []
@@ -97,6 +93,8 @@ def plan_table(*, quick=False):
 
 def _limit(exposures, time):
     """Our own limit of the dithers of one band."""
+    from miricigale.photometry import sensitivity
+
     first = exposures[0]
     return sensitivity(
         first.filter,
@@ -173,6 +171,11 @@ def fit_catalogue(
             "a table with columns <filter> and <filter>_err ('miricigale filters' lists the names)",
             f"columns {list(names)}",
         )
+    # what takes long to import, after what is wrong with the file is known
+    from miricigale.fitting import BayesFitter, fit_file
+    from miricigale.fitting.likelihood import unused_bands
+    from miricigale.sed import SEDModel
+
     unused = unused_bands(rows.chunk(0), bands)
     if unused:
         msg = (
@@ -216,7 +219,13 @@ def measure_files(image, highres, *, filter, pa_aper):
     table : `~astropy.table.QTable`
         ``id``, ``sky``, flux, error and flags of every detection.
     """
+    from miricigale.workflow.products import read_image
+
     mosaic, prior = read_image(image), read_image(highres)
+    # after what is wrong with the files is known
+    from miricigale.photometry import ForcedPhotometer, detect_sources
+    from miricigale.psf import MatchingKernel, hst_psf, miri_psf, psf_mosaic
+
     scales = [
         np.sqrt(abs(np.linalg.det(i.wcs.pixel_scale_matrix))) * 3600 * u.arcsec
         for i in (mosaic, prior)

@@ -5,8 +5,6 @@ import json
 import astropy.units as u
 import numpy as np
 from astropy.io import fits
-from astropy.nddata import CCDData, StdDevUncertainty
-from astropy.wcs import WCS
 
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import open_fits, write_fits
@@ -78,6 +76,9 @@ def read_image(path, *, planes=()):
         If the file is missing or has no SCI extension.
     """
     hdus = open_fits(path, wanted="an image (FITS with SCI)")
+    from astropy.nddata import CCDData, StdDevUncertainty
+    from astropy.wcs import WCS
+
     with hdus:
         if "SCI" not in hdus:
             msg = f"{path} has no SCI extension, only {[hdu.name for hdu in hdus]}"

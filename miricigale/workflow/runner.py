@@ -10,36 +10,20 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future
 from pathlib import Path
 
 from miricigale.refdata.locate import file_sha256, fingerprint
-from miricigale.utils.exceptions import ConfigError, DataError
+from miricigale.utils.exceptions import ConfigError, DataError, OtherResultsError
 from miricigale.utils.parallel import available_cores, available_memory
 from miricigale.utils.progress import on_terminal, print_line, progress
 from miricigale.workflow.config import load_config
 from miricigale.workflow.stage import run_unit
 from miricigale.workflow.store import CONFIG, ProductStore
 
-__all__ = ["OtherRunError", "StudyRunner", "run_stages"]
+__all__ = ["StudyRunner", "run_stages"]
 
 log = logging.getLogger(__name__)
 
 #: Bytes that a unit takes whose stage does not say how many.
 _MEMORY = 500_000_000
-
-
-class OtherRunError(ValueError):
-    """
-    A folder holds what another configuration made.
-
-    Parameters
-    ----------
-    reason : str
-        What is other, and what would be done.
-    remedy : str, optional
-        What the caller can do.
-    """
-
-    def __init__(self, reason, remedy="redo=True to do so"):
-        self.reason = reason
-        super().__init__(f"{reason}; give another folder, or {remedy}")
+_REMEDY = "redo=True to replace it"
 
 
 class _Inline(Executor):
@@ -192,7 +176,7 @@ class StudyRunner:
 
         Raises
         ------
-        OtherRunError
+        `~miricigale.utils.exceptions.OtherResultsError`
             If products of another configuration would be replaced, or an edited
             ``config.toml``, and ``redo`` is False.
         `~miricigale.utils.exceptions.DataError`
@@ -247,7 +231,7 @@ class StudyRunner:
                 f"{edited} was edited since the run that made this folder, and this run has another "
                 f"configuration, which would replace it; run {edited} itself to use it"
             )
-            raise OtherRunError(msg)
+            raise OtherResultsError(msg, _REMEDY)
         again = [key for key, state in states.items() if state in ("changed", "surplus")]
         if again:
             msg = (
@@ -255,7 +239,7 @@ class StudyRunner:
                 f"({self._differences(store)}), which would be done again or removed: "
                 f"{_summary(again)}"
             )
-            raise OtherRunError(msg)
+            raise OtherResultsError(msg, _REMEDY)
 
     def _differences(self, store):
         """What is other in the configuration, in words."""

@@ -7,12 +7,11 @@ import numpy as np
 
 from miricigale.filters import Filter
 from miricigale.instrument import background_level, imager_filters, saturation_forecast
-from miricigale.psf import hst_psf
 from miricigale.scene import read_catalog
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.runner import run_stages
 from miricigale.workflow.stages import study_stages
-from miricigale.workflow.stages.images import grid_of, study_exposures
+from miricigale.workflow.stages.exposures import grid_of, study_exposures
 
 __all__ = ["MIN_SOURCES", "check_study", "disk_use", "run_study"]
 
@@ -78,11 +77,6 @@ def check_study(config):
     except (KeyError, ValueError) as err:
         msg = f"[exposures] {err.args[0]}"
         raise ConfigError(msg) from err
-    try:
-        hst_psf(config.highres.filter, pixel_scale=config.highres.pixel_scale * u.arcsec)
-    except (KeyError, ValueError) as err:
-        msg = f"[highres] filter: {err.args[0]}"
-        raise ConfigError(msg) from err
     for exposure in exposures.values():
         level = background_level(exposure.filter) * config.scene.background_scale
         fill = float(saturation_forecast(exposure, background=level))
@@ -102,6 +96,14 @@ def check_study(config):
             f"{MIN_SOURCES} are needed"
         )
         raise ConfigError(msg)
+    # the one check that takes long to import comes last
+    from miricigale.psf import hst_psf
+
+    try:
+        hst_psf(config.highres.filter, pixel_scale=config.highres.pixel_scale * u.arcsec)
+    except (KeyError, ValueError) as err:
+        msg = f"[highres] filter: {err.args[0]}"
+        raise ConfigError(msg) from err
 
 
 def run_study(config, folder, *, executor=None, redo=False, progress_bar=False):
@@ -129,7 +131,7 @@ def run_study(config, folder, *, executor=None, redo=False, progress_bar=False):
 
     Raises
     ------
-    `~miricigale.workflow.OtherRunError`
+    `~miricigale.utils.exceptions.OtherResultsError`
         If the folder holds what another configuration made, and ``redo`` is False.
     `~miricigale.utils.exceptions.DataError`
         If the folder is another's, in use, or on a disk that is too full.

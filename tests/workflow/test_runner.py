@@ -6,9 +6,9 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from miricigale.refdata import locate
-from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarning
+from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarning, OtherResultsError
 from miricigale.workflow.config import StudyConfig, load_config
-from miricigale.workflow.runner import OtherRunError, StudyRunner, check_disk
+from miricigale.workflow.runner import StudyRunner, check_disk
 from miricigale.workflow.stage import Stage
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.store import ProductStore
@@ -92,7 +92,9 @@ def test_nothing_is_done_again_unasked(tmp_path, values, version, reason):
     recorder.run(tmp_path / "run")
     before = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
     other = StudyConfig.from_dict(values)
-    with pytest.raises(OtherRunError, match=rf"3 finished steps.*{reason}.*first \(2\), second; "):
+    with pytest.raises(
+        OtherResultsError, match=rf"3 finished steps.*{reason}.*first \(2\), second; "
+    ):
         recorder.run(tmp_path / "run", other, version=version)
     assert recorder.ran == []
     assert {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
@@ -108,7 +110,7 @@ def test_an_edited_configuration_is_not_overwritten(tmp_path):
     path = folder / "config.toml"
     edited = path.read_text().replace("min_detected = 2", "min_detected = 3 # mine")
     path.write_text(edited)
-    with pytest.raises(OtherRunError, match=r"config\.toml was edited since"):
+    with pytest.raises(OtherResultsError, match=r"config\.toml was edited since"):
         recorder.run(folder)
     assert path.read_text() == edited
     # it is used when it is asked for, and stays as it was written
@@ -217,7 +219,7 @@ def test_products_that_no_longer_belong_are_removed(tmp_path):
 
     stages = [[Stage("one", function, "one", units=lambda _, u=units: u)] for units in ("ab", "a")]
     StudyRunner(StudyConfig(), tmp_path / "run", stages[0]).run()
-    with pytest.raises(OtherRunError, match="1 finished steps of another run"):
+    with pytest.raises(OtherResultsError, match="1 finished steps of another run"):
         StudyRunner(StudyConfig(), tmp_path / "run", stages[1]).run()
     assert (tmp_path / "run" / "b.txt").exists()
     StudyRunner(StudyConfig(), tmp_path / "run", stages[1], redo=True).run()

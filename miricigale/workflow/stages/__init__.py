@@ -2,26 +2,8 @@
 
 from miricigale.refdata import resources
 from miricigale.refdata.locate import fingerprint
-from miricigale.sed import SEDModel
 from miricigale.workflow.stage import Stage
-from miricigale.workflow.stages.images import (
-    exposure_plan,
-    exposure_units,
-    make_exposure,
-    make_highres,
-    make_kernel,
-    make_mosaic,
-)
-from miricigale.workflow.stages.inputs import (
-    fit_inputs,
-    input_axes,
-    make_catalog,
-    make_truth,
-    plain_axes,
-)
-from miricigale.workflow.stages.measure import fit_photometry, make_errors, measure_photometry
-from miricigale.workflow.stages.points import measure_point_sources
-from miricigale.workflow.stages.report import make_report
+from miricigale.workflow.stages.exposures import exposure_plan, exposure_units
 
 __all__ = ["study_stages"]
 
@@ -38,6 +20,24 @@ def study_stages():
     -------
     stages : tuple of `~miricigale.workflow.stage.Stage`
     """
+    from miricigale.sed import SEDModel
+    from miricigale.workflow.stages.images import (
+        make_exposure,
+        make_highres,
+        make_kernel,
+        make_mosaic,
+    )
+    from miricigale.workflow.stages.inputs import (
+        fit_inputs,
+        input_axes,
+        make_catalog,
+        make_truth,
+        plain_axes,
+    )
+    from miricigale.workflow.stages.measure import fit_photometry, make_errors, measure_photometry
+    from miricigale.workflow.stages.points import measure_point_sources
+    from miricigale.workflow.stages.report import make_report
+
     images = ("pointing", "exposures", "scene", "detector", "reduction")
     grid = ("pointing", "exposures")
     kernel = ("highres", "photometry.regularization", "reduction")

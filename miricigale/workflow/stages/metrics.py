@@ -12,7 +12,7 @@ from miricigale.evaluation import (
 )
 from miricigale.instrument import scaled_limit
 from miricigale.photometry import ErrorModel, ForcedFlags
-from miricigale.workflow.stages.images import band_exposures
+from miricigale.workflow.stages.exposures import band_exposures
 from miricigale.workflow.stages.sample import SampleFlags, magnitude
 
 __all__ = ["FITS", "study_metrics"]

@@ -11,12 +11,8 @@ from miricigale.psf import hst_psf
 from miricigale.scene import highres_image
 from miricigale.utils.random import text_key
 from miricigale.utils.tables import error_column, match_sky
-from miricigale.workflow.stages.images import (
-    expose_and_reduce,
-    kernel_of,
-    reducer_of,
-    study_exposures,
-)
+from miricigale.workflow.stages.exposures import study_exposures
+from miricigale.workflow.stages.images import expose_and_reduce, kernel_of, reducer_of
 from miricigale.workflow.stages.sample import in_field
 
 __all__ = ["measure_point_sources", "point_catalog"]

@@ -1,0 +1,76 @@
+"""What is exposed, and the grids that cover it, from the configuration alone."""
+
+import dataclasses
+
+import astropy.units as u
+from astropy.coordinates import SkyCoord
+
+from miricigale.instrument import Exposure, ceers_exposures, mosaic_wcs
+
+__all__ = ["band_exposures", "exposure_plan", "exposure_units", "grid_of", "study_exposures"]
+
+
+def study_exposures(config):
+    """
+    All exposures of a configuration.
+
+    Returns
+    -------
+    exposures : dict of str to `~miricigale.instrument.Exposure`
+        By unit name, ``<filter>-<dither>``.
+    """
+    options = config.exposures
+    pointing = SkyCoord(config.pointing.ra * u.deg, config.pointing.dec * u.deg)
+    roll = config.pointing.roll * u.deg
+    quick = options.plan == "quick"
+    units = {}
+    for k, name in enumerate(options.filters):
+        own = {
+            key: getattr(options, key)[k]
+            for key in ("n_groups", "n_integrations")
+            if getattr(options, key)
+        }
+        n_dithers = options.n_dithers[k] if options.n_dithers else None
+        if "n_groups" in own and n_dithers:
+            exposure = Exposure(name, pointing=pointing, roll=roll, **own)
+            exposures = exposure.dithered("ceers", n_dithers)
+        else:
+            exposures = ceers_exposures(pointing, roll, filters=[name], quick=quick)
+            if n_dithers:
+                exposures = exposures[0].replace(pointing=pointing).dithered("ceers", n_dithers)
+            exposures = [dataclasses.replace(exposure, **own) for exposure in exposures]
+        for exposure in exposures:
+            units[f"{name}-{exposure.dither}"] = exposure
+    return units
+
+
+def exposure_units(config):
+    """Names of the exposures, ``<filter>-<dither>``."""
+    return tuple(study_exposures(config))
+
+
+def exposure_plan(config, unit=None):
+    """Plain values of the exposures of a unit, a filter, or the whole study, for hashing."""
+    return {
+        name: [
+            e.readout,
+            e.n_groups,
+            e.n_integrations,
+            e.subarray,
+            e.pointing.ra.deg,
+            e.pointing.dec.deg,
+            e.roll.value,
+        ]
+        for name, e in study_exposures(config).items()
+        if not unit or unit in (name, e.filter)
+    }
+
+
+def band_exposures(config, name):
+    """The exposures of one band, in order."""
+    return [e for e in study_exposures(config).values() if e.filter == name]
+
+
+def grid_of(config, pixel_scale):
+    """North-up WCS that covers every exposure of the study."""
+    return mosaic_wcs(list(study_exposures(config).values()), pixel_scale * u.arcsec)

@@ -1,0 +1,73 @@
+"""What the commands import before they begin to work."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+import miricigale
+
+HEAVY = ("numba", "photutils", "matplotlib", "scipy.stats", "scipy.signal", "synphot", "sep")
+CODE = """
+import json, sys
+from miricigale.cli import main
+try:
+    status = main(sys.argv[2:])
+except SystemExit as stop:
+    status = stop.code
+with open(sys.argv[1], "w") as file:
+    json.dump({"status": status, "modules": sorted(sys.modules)}, file)
+"""
+
+
+def start(folder, *arguments):
+    """Run a command in a process of its own; returns its status and what it imported."""
+    out = folder / "out.json"
+    env = {**os.environ, "PYTHONPATH": os.path.dirname(os.path.dirname(miricigale.__file__))}
+    subprocess.run(
+        [sys.executable, "-c", CODE, str(out), *arguments],
+        cwd=folder, env=env, check=True, capture_output=True, timeout=300,
+    )  # fmt: skip
+    found = json.loads(out.read_text())
+    return found["status"], found["modules"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status"),
+    [
+        (["--version"], 0),
+        (["fit", "--help"], 0),
+        (["filters", "miri"], 0),
+        (["data", "list"], 0),
+        (["run", "goodss", "--quick", "--print-config"], 0),
+        (["run", "absent.toml"], 2),
+        (["run", "wrong.toml"], 2),
+        (["run", "source.toml"], 2),
+        (["fit", "absent.fits"], 2),
+        (["fit", "empty.csv"], 2),
+        (["photometry", "a.fits", "b.fits", "--filter", "miri.f770w", "--pa-aper", "0"], 2),
+    ],
+)
+def test_light_commands_and_errors_import_nothing_heavy(tmp_path, arguments, status):
+    (tmp_path / "wrong.toml").write_text("[run]\nsede = 1\n")
+    (tmp_path / "source.toml").write_text('[catalog]\nsource = "absent.fits"\n')
+    (tmp_path / "empty.csv").write_text("id,name\n1,a\n")
+    found, modules = start(tmp_path, *arguments)
+    assert found == status
+    assert [name for name in HEAVY if name in modules] == []
+
+
+@pytest.mark.parametrize("room", ["fitting", "photometry", "psf", "scene", "sed", "workflow"])
+def test_rooms_import_what_is_asked_for(tmp_path, room):
+    """Every public name is there, is listed, and is taken by ``import *``; others are refused."""
+    code = (
+        f"import sys, miricigale.{room} as room\n"
+        f"assert 'numba' not in sys.modules\n"
+        f"from miricigale.{room} import *\n"
+        f"assert set(room.__all__) <= set(dir()) and set(room.__all__) <= set(dir(room))\n"
+        f"assert not hasattr(room, 'nothing')\n"
+    )
+    env = {**os.environ, "PYTHONPATH": os.path.dirname(os.path.dirname(miricigale.__file__))}
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=env, check=True, timeout=300)
