@@ -9,13 +9,13 @@ import numpy as np
 from astropy.io import fits
 
 from miricigale.fitting.priors import GridAxis
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import open_fits
+from miricigale.utils.tables import ascii_ids
 
 __all__ = [
     "axes_from_plain",
     "axes_to_plain",
-    "check_text_ids",
     "native",
     "read_results",
     "read_text",
@@ -50,7 +50,7 @@ def write_results(results, path, *, overwrite=False):
     """
     from astropy.table import Table
 
-    check_text_ids(results.ids)
+    ascii_ids(results.ids, "ids")
     table = Table()
     for item in fields(results):
         value = getattr(results, item.name)
@@ -131,15 +131,6 @@ def read_results(cls, path):
     except (KeyError, ValueError, TypeError) as err:
         msg = f"{path} is not a complete file of fit results: {err}"
         raise DataError(msg) from err
-
-
-def check_text_ids(ids):
-    """Refuse ids that FITS, whose text is ASCII and loses blanks at its end, cannot hold."""
-    if ids.dtype.kind == "U":
-        foreign = [key for key in ids.tolist() if not key.isascii() or key != key.rstrip(" ")]
-        if foreign:
-            wanted = "ASCII, with no blank at the end, where they go to a FITS file"
-            raise argument_error("ids", wanted, f"{foreign[0]!r}")
 
 
 def axes_to_plain(axes):

@@ -17,6 +17,7 @@ from miricigale.utils.files import open_fits
 
 __all__ = ["FitResultsFiles", "open_results"]
 
+LOCK = "fit.lock"
 MANIFEST = "manifest.json"
 PARTS_FORMAT = "miricigale-fitparts-1"
 

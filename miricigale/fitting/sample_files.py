@@ -8,7 +8,6 @@ from astropy.io import fits
 from miricigale.fitting.files import (
     axes_from_plain,
     axes_to_plain,
-    check_text_ids,
     native,
     read_text,
     text_hdu,
@@ -16,6 +15,7 @@ from miricigale.fitting.files import (
 from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits
+from miricigale.utils.tables import ascii_ids
 
 __all__ = ["read_samples", "write_samples"]
 
@@ -43,7 +43,7 @@ def write_samples(samples, path, *, overwrite=False):
     """
     from astropy.table import Table
 
-    check_text_ids(samples.ids)
+    ascii_ids(samples.ids, "ids")
     text = {
         "meta": samples.meta,
         "axes": axes_to_plain(samples.axes),

@@ -14,6 +14,7 @@ import numpy as np
 from miricigale.fitting.likelihood import read_ids
 from miricigale.fitting.pairs import check_pairs
 from miricigale.fitting.part_files import (
+    LOCK,
     MANIFEST,
     PARTS_FORMAT,
     open_results,
@@ -30,9 +31,10 @@ from miricigale.utils.exceptions import (
     OtherResultsError,
     argument_error,
 )
+from miricigale.utils.lock import FolderLock
 from miricigale.utils.progress import progress
 from miricigale.utils.row_files import open_rows
-from miricigale.utils.tables import error_column, require_columns
+from miricigale.utils.tables import ascii_ids, error_column, require_columns
 from miricigale.utils.units import FNU
 
 __all__ = ["fit_file"]
@@ -109,11 +111,13 @@ def fit_file(
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
-        If the catalogue cannot be read by rows, or the folder holds something else.
+        If the catalogue cannot be read by rows, the folder holds something else, or another
+        process fits into it: then the message says which file to remove if that is gone.
     `~miricigale.utils.exceptions.OtherResultsError`
         If the folder holds parts of another fit.
     ValueError
-        What `BayesFitter.fit` raises; a note tells the rows.
+        What `BayesFitter.fit` raises; if an id is no ASCII text, which FITS cannot hold,
+        before anything is fitted. A note tells the rows.
     """
     if not all(hasattr(fitter, name) for name in ("fit", "settings", "grid")):
         raise argument_error("fitter", "a BayesFitter", type(fitter).__name__)
@@ -130,9 +134,33 @@ def fit_file(
     )
     pairs = check_pairs(pairs, fitter)
     inputs = _Inputs(rows, redshift, redshift_prior, unit, fluxes, pairs)
+    _check_ids(rows)
     folder = Path(path_out)
     job = _job(fitter, rows, redshift, redshift_prior, unit_text, hdu, pairs)
-    manifest = _open_folder(folder, job, resume)
+    _check_folder(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    with FolderLock(folder, name=LOCK, purpose="fit"):
+        manifest = _open_folder(folder, job, resume)
+        _fit_parts(fitter, inputs, folder, manifest, executor, progress_bar)
+    return open_results(folder, model=getattr(fitter, "model", None))
+
+
+def _check_ids(rows):
+    """Refuse ids that parts cannot hold before the first is fitted, not when it is written."""
+    if "id" not in rows.colnames:
+        return
+    for i in rows.foreign_chunks("id"):
+        try:
+            ascii_ids(read_ids(rows.chunk(i)), "photometry")
+        except ValueError as err:
+            start, stop = rows.span(i)
+            err.add_note(f"in rows {start} to {stop - 1} of {rows.path}")
+            raise
+
+
+def _fit_parts(fitter, inputs, folder, manifest, executor, progress_bar):
+    """Fit the pieces whose parts are not there, and write them."""
+    rows = inputs.rows
     seen = _SeenIds()
     n_old, n_new = 0, 0
     with progress(show=progress_bar, total=rows.n_rows, desc="fit", unit="obj") as bar:
@@ -160,7 +188,6 @@ def fit_file(
                 seen.add(results.ids)
             bar.update(stop - start)
     logger.info("%s: %d parts, %d of them from before", folder, rows.n_chunks, n_old)
-    return open_results(folder, model=getattr(fitter, "model", None))
 
 
 class _Inputs:
@@ -305,12 +332,23 @@ def _job(fitter, rows, redshift, redshift_prior, flux_unit, hdu, pairs):
     return job | ({"pairs": [list(names) for names in pairs]} if pairs else {})
 
 
-def _open_folder(folder, job, resume):
-    """Manifest of the folder: the one that is there if it is of this fit, or a new one."""
-    job = json.loads(json.dumps(job, default=str))
+def _check_folder(folder):
+    """Refuse a folder of something else, before anything is made in it."""
     if folder.exists() and not folder.is_dir():
         msg = f"{folder} is a file; results of fit_file go to a folder"
         raise DataError(msg)
+    if not folder.is_dir() or (folder / MANIFEST).is_file():
+        return
+    # a fit that was killed at its first moment leaves these
+    ours = (LOCK, MANIFEST)
+    if any(not entry.name.startswith(ours) for entry in folder.iterdir()):
+        msg = f"{folder} is not empty and holds no {MANIFEST}; results need a folder of their own"
+        raise DataError(msg)
+
+
+def _open_folder(folder, job, resume):
+    """Manifest of the folder: the one that is there if it is of this fit, or a new one."""
+    job = json.loads(json.dumps(job, default=str))
     if (folder / MANIFEST).is_file():
         manifest = read_manifest(folder)
         # a call that failed before its first part leaves nothing to keep
@@ -322,10 +360,6 @@ def _open_folder(folder, job, resume):
             return manifest
         for name in manifest["parts"]:
             (folder / name).unlink(missing_ok=True)
-    elif folder.is_dir() and any(folder.iterdir()):
-        msg = f"{folder} is not empty and holds no {MANIFEST}; results need a folder of their own"
-        raise DataError(msg)
-    folder.mkdir(parents=True, exist_ok=True)
     versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
     manifest = {"format": PARTS_FORMAT, "versions": versions, "job": job, "parts": {}}
     write_manifest(folder, manifest)

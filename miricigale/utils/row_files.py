@@ -121,6 +121,28 @@ class RowFile(abc.ABC):
             raise DataError(msg)
         return table
 
+    def foreign_chunks(self, name):
+        """
+        Pieces that may have text that is not ASCII, found without making tables of them.
+
+        Parameters
+        ----------
+        name : str
+            The column that is asked for.
+
+        Yields
+        ------
+        i : int
+            Each piece of which this column is all ASCII or no text is left out.
+        """
+        for i in range(self.n_chunks):
+            if self._is_foreign(name, *self.span(i)):
+                yield i
+
+    @abc.abstractmethod
+    def _is_foreign(self, name, start, stop):
+        """Whether these rows may have text that is not ASCII in a column."""
+
     @abc.abstractmethod
     def _read(self, start, stop):
         """Read rows; ``start`` is the first of a piece."""
@@ -134,6 +156,7 @@ class _FitsRows(RowFile):
             self._header = table.header.copy()
             self._start = table.fileinfo()["datLoc"]
             self._colnames = tuple(table.columns.names)
+            self._dtype = table.columns.dtype
             formats = dict(zip(table.columns.names, table.columns.formats, strict=True))
         self._width = self._header["NAXIS1"]
         ragged = [name for name, text in formats.items() if "P" in text or "Q" in text]
@@ -176,6 +199,18 @@ class _FitsRows(RowFile):
     @property
     def n_rows(self):
         return self._header["NAXIS2"]
+
+    def _is_foreign(self, name, start, stop):
+        if start == stop or self._dtype[name].base.kind != "S":
+            return False
+        rows = np.memmap(
+            self.path,
+            self._dtype,
+            mode="r",
+            offset=self._start + start * self._width,
+            shape=stop - start,
+        )
+        return bool(np.any(np.ascontiguousarray(rows[name]).view(np.uint8) > 127))
 
     def _read(self, start, stop):
         # a small file of its own, so that units, masks and text are what astropy makes of them
@@ -242,6 +277,10 @@ class _TextRows(RowFile):
         comma = self.path.suffix.lower() == ".csv" or "# delimiter: ','\n" in header
         row = next(csv.reader([names], delimiter="," if comma else " "))
         return tuple(name.strip() for name in row)
+
+    def _is_foreign(self, name, start, stop):
+        del name, stop
+        return not self._text(start).isascii()
 
     def _read(self, start, stop):
         return QTable.read(self._header + self._text(start), format="ascii.ecsv")

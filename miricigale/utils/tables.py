@@ -9,7 +9,14 @@ from astropy.table import Table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, to_array
 
-__all__ = ["Flags", "error_column", "match_sky", "require_columns", "unique_ids"]
+__all__ = [
+    "Flags",
+    "ascii_ids",
+    "error_column",
+    "match_sky",
+    "require_columns",
+    "unique_ids",
+]
 
 
 class Flags(enum.IntFlag):
@@ -84,6 +91,34 @@ def unique_ids(ids, argument):
         raise argument_error(
             argument, "a table whose ids are unique", f"duplicates such as {twice}"
         )
+    return ids
+
+
+def ascii_ids(ids, argument):
+    """
+    Return ids as an array after checking that a FITS table can hold them.
+
+    Parameters
+    ----------
+    ids : array_like
+        Numbers, which are always fine, or text.
+    argument : str
+        The argument's name, for the message.
+
+    Raises
+    ------
+    ValueError
+        If an id is text that is not ASCII or ends in a blank, which FITS drops; the message
+        tells the first three.
+    """
+    ids = np.asarray(ids)
+    if ids.dtype.kind in "UO":
+        texts = [key for key in ids.tolist() if isinstance(key, str)]
+        foreign = [key for key in texts if not key.isascii() or key != key.rstrip(" ")]
+        if foreign:
+            more = f" and {len(foreign) - 3} more" if len(foreign) > 3 else ""
+            wanted = "ASCII, with no blank at the end, where they go to a FITS file"
+            raise argument_error(argument, wanted, ", ".join(map(repr, foreign[:3])) + more)
     return ids
 
 

@@ -267,6 +267,71 @@ def test_a_catalogue_without_rows_has_results_without_rows(fitter, catalogue, tm
         assert len(QTable.read(tmp_path / "table.fits")) == 0
 
 
+@pytest.mark.parametrize("suffix", ["ecsv", "csv"])
+def test_ids_that_parts_cannot_hold_are_refused_at_once(
+    fitter, catalogue, tmp_path, monkeypatch, suffix
+):
+    name = "Kümmel 3"
+    ids = np.array(catalogue["id"].astype("U20"))
+    ids[5], ids[120] = 'with "quotes", and a\nline', name
+    catalogue["id"] = ids
+    path = tmp_path / f"catalogue.{suffix}"
+    catalogue.write(path)
+    calls = count_fits(monkeypatch)
+    with pytest.raises(ValueError, match=rf"'photometry' must be ASCII.* got '{name}'") as info:
+        fit_file(fitter, path, tmp_path / "out", chunk_rows=40, flux_unit="uJy")
+    assert info.value.__notes__ == [f"in rows 120 to 149 of {path}"]
+    assert not calls
+    assert not (tmp_path / "out").exists()
+    # in memory they are as good as others
+    assert fitter.fit(catalogue)[name].id == name
+
+
+def test_bytes_in_fits_that_are_no_ascii_are_refused_at_once(
+    fitter, catalogue, tmp_path, monkeypatch
+):
+    path = tmp_path / "catalogue.fits"
+    catalogue.write(path)
+    key = catalogue["id"][149].encode()
+    data = path.read_bytes()
+    assert data.count(key) == 1
+    path.write_bytes(data.replace(key, b"\xe9" + key[1:]))
+    calls = count_fits(monkeypatch)
+    with pytest.raises(DataError, match=r"catalogue\.fits rows 120 to 150 cannot be read: .*ascii"):
+        fit_file(fitter, path, tmp_path / "out", chunk_rows=40)
+    assert not calls
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_takes_one_fit_at_a_time(fitter, catalogue, tmp_path, monkeypatch):
+    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
+    catalogue.write(path)
+    inner = []
+
+    def fit(self, *args, **options):
+        with pytest.raises(DataError, match=r"in use by a fit: .* remove .*fit\.lock") as info:
+            fit_file(fitter, path, out, chunk_rows=80)
+        inner.append(info.value)
+        return BayesFitter.__dict__["_fit"](self, *args, **options)
+
+    monkeypatch.setattr(BayesFitter, "_fit", BayesFitter.fit, raising=False)
+    monkeypatch.setattr(BayesFitter, "fit", fit)
+    results = fit_file(fitter, path, out, chunk_rows=80)
+    assert len(inner) == results.n_parts == 2
+    assert not (out / "fit.lock").exists()
+
+
+def test_a_fit_that_was_killed_at_its_first_moment_goes_on(fitter, catalogue, tmp_path):
+    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
+    catalogue.write(path)
+    out.mkdir()
+    # a number above the largest that Linux gives to a process
+    (out / "fit.lock").write_text("4194305")
+    (out / "manifest.json.tmp").write_text("{")
+    assert len(fit_file(fitter, path, out)) == 150
+    assert not (out / "fit.lock").exists()
+
+
 def test_numbers_as_ids(fitter, catalogue, tmp_path):
     for kind in (np.uint64, np.int32, float):
         ids = np.arange(150).astype(kind)

@@ -7,7 +7,14 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
-from miricigale.utils.tables import Flags, error_column, match_sky, require_columns, unique_ids
+from miricigale.utils.tables import (
+    Flags,
+    ascii_ids,
+    error_column,
+    match_sky,
+    require_columns,
+    unique_ids,
+)
 
 
 class Sample(Flags):
@@ -74,3 +81,18 @@ def test_match_with_nothing(n, m):
     )
     assert_array_equal(index, np.full(m, -1))
     assert np.all(np.isnan(separation))
+
+
+@pytest.mark.parametrize("ids", [[3, 1], ["a", "b c"], ["", "~"], np.array(["x", 1], object)])
+def test_ids_that_fits_holds(tmp_path, ids):
+    assert_array_equal(ascii_ids(ids, "ids"), np.asarray(ids))
+
+
+def test_ids_that_fits_does_not_hold_are_told():
+    ids = ["a", "Kümmel", "b ", "\N{GREEK SMALL LETTER ALPHA}", "c", "😀"]
+    with pytest.raises(
+        ValueError, match=r"'catalog' must be ASCII.* got 'Kümmel', 'b ', 'α' and 1"
+    ):
+        ascii_ids(ids, "catalog")
+    with pytest.raises(ValueError, match=r"got 'b '$"):
+        ascii_ids(["a", "b "], "ids")
