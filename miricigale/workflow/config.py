@@ -331,8 +331,12 @@ def _limits_text(limits):
 def _toml_value(value):
     if isinstance(value, tuple):
         return "[" + ", ".join(_toml_value(v) for v in value) + "]"
-    # JSON's booleans, numbers and strings are valid TOML
-    return json.dumps(value)
+    if isinstance(value, float):
+        # nan, inf and -inf as TOML has them, and a point or an exponent in all others
+        return float.__repr__(value)
+    # JSON's booleans, integers and strings are valid TOML, but for its pairs of escapes beyond
+    # U+FFFF and the delete character, which TOML wants escaped
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _replace_section(name, section, entries):

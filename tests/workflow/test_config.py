@@ -1,7 +1,11 @@
+import math
+import tomllib
+
+import numpy as np
 import pytest
 
 from miricigale.utils.exceptions import ConfigError
-from miricigale.workflow.config import StudyConfig, load_config, preset_names
+from miricigale.workflow.config import StudyConfig, _toml_value, load_config, preset_names
 
 
 @pytest.mark.parametrize("quick", [False, True])
@@ -91,3 +95,37 @@ def test_defaults_describe_ceers():
     config = StudyConfig()
     assert len(config.exposures.filters) == 6
     assert len(config.fit.bands) == 15
+
+
+def test_all_text_comes_back_from_toml():
+    nasty = [chr(i) for i in range(0x100)] + list(
+        "\u0100\u2028\ud7ff\ue000\ufeff\uffff😀\U0010ffff"
+    )
+    rng = np.random.default_rng(1)
+    texts = ["", '"""', "\\", "C:\\new", "\\u007f", *nasty]
+    texts += ["".join(rng.choice(nasty, size=12)) for _ in range(300)]
+    for text in texts:
+        line = f"x = {_toml_value(text)}\n"
+        assert tomllib.loads(line.encode().decode())["x"] == text
+    assert tomllib.loads(f"x = {_toml_value(tuple(texts))}")["x"] == texts
+
+
+def test_all_numbers_come_back_from_toml():
+    floats = [0.0, -0.0, 1e16, 1e-7, 5e-324, 1.7976931348623157e308, 0.1, math.inf, -math.inf]
+    for value in (*floats, *np.array(floats), True, False, 0, -3, 2**60):
+        read = tomllib.loads(f"x = {_toml_value(value)}")["x"]
+        assert isinstance(value, type(read))
+        assert (read, math.copysign(1, read)) == (value, math.copysign(1, value))
+    assert math.isnan(tomllib.loads(f"x = {_toml_value(math.nan)}")["x"])
+
+
+def test_a_name_with_any_character_survives_a_printed_configuration(tmp_path):
+    config = load_config("goodss")
+    path = tmp_path / "my.toml"
+    path.write_text(
+        config.to_toml().replace("catalog.goodss", "été 😀 \x9c.fits"), encoding="utf-8"
+    )
+    config = load_config(path)
+    assert config.catalog.source == "été 😀 \x9c.fits"
+    path.write_text(config.to_toml(), encoding="utf-8")
+    assert load_config(path) == config
