@@ -1,8 +1,11 @@
 """Tests see neither the data nor the caches of whoever runs them."""
 
+import contextlib
 import shutil
 import tempfile
 from pathlib import Path
+
+import pytest
 
 
 def pytest_configure(config):
@@ -15,3 +18,20 @@ def pytest_configure(config):
 
 def pytest_unconfigure(config):
     shutil.rmtree(config.own_folder, ignore_errors=True)
+
+
+@pytest.fixture
+def full_disk():
+    """Context in which no file grows beyond some bytes, as on a disk that is full then."""
+    resource = pytest.importorskip("resource")
+
+    @contextlib.contextmanager
+    def limited(n_bytes):
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    return limited

@@ -180,10 +180,12 @@ def _fit(args):
 
 
 def _photometry(args):
+    from miricigale.utils.files import writing
     from miricigale.workflow.commands import measure_files
 
     table = measure_files(args.image, args.highres, filter=args.filter, pa_aper=args.pa_aper)
-    table.write(args.output, overwrite=True)
+    with writing(args.output):
+        table.write(args.output, overwrite=True)
     print(f"{len(table)} sources in {args.output}")
     return 0
 

@@ -24,6 +24,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 from miricigale.detector.dq import DQ
 from miricigale.instrument import Exposure, reference_pixel_mask
 from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.files import writing
 
 __all__ = ["RowWriter", "header", "read", "row_writer", "write"]
 
@@ -224,8 +225,9 @@ def _partial(path, exposure, shape, start, overwrite):
     scaling = [("EXTNAME", "SCI"), ("BZERO", 32768), ("BSCALE", 1)]
     partial = path.with_name(path.name + ".partial")
     try:
-        fits.PrimaryHDU(header=primary).writeto(partial, overwrite=True)
-        yield partial, fits.Header(structure + scaling) + science
+        with writing(path):
+            fits.PrimaryHDU(header=primary).writeto(partial, overwrite=True)
+            yield partial, fits.Header(structure + scaling) + science
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)

@@ -8,6 +8,8 @@ import string
 from importlib import resources
 from pathlib import Path
 
+from miricigale.utils.files import writing
+
 __all__ = ["Report"]
 
 
@@ -124,6 +126,7 @@ class Report:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = path.with_name(path.name + ".partial")
-        partial.write_text(self.to_html(), encoding="utf-8")
+        with writing(path):
+            partial.write_text(self.to_html(), encoding="utf-8")
         os.replace(partial, path)
         return path

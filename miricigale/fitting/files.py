@@ -10,7 +10,7 @@ from astropy.io import fits
 
 from miricigale.fitting.priors import GridAxis
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import open_fits
+from miricigale.utils.files import open_fits, writing
 from miricigale.utils.tables import ascii_ids
 
 __all__ = [
@@ -73,7 +73,8 @@ def write_results(results, path, *, overwrite=False):
     hdu = fits.table_to_hdu(table)
     hdu.name = "RESULTS"
     hdus.append(hdu)
-    fits.HDUList(hdus).writeto(Path(path), overwrite=overwrite, output_verify="exception")
+    with writing(path):
+        fits.HDUList(hdus).writeto(Path(path), overwrite=overwrite, output_verify="exception")
 
 
 def read_results(cls, path):

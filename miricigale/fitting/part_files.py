@@ -13,7 +13,7 @@ from astropy.table import vstack
 
 from miricigale.fitting.results import FitResults
 from miricigale.utils.exceptions import DataError, unknown_name
-from miricigale.utils.files import open_fits
+from miricigale.utils.files import open_fits, writing
 
 __all__ = ["FitResultsFiles", "open_results"]
 
@@ -50,7 +50,8 @@ def write_manifest(folder, manifest):
     """Write the manifest under another name and rename it."""
     path = Path(folder) / MANIFEST
     temporary = path.with_name(MANIFEST + ".tmp")
-    temporary.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+    with writing(path):
+        temporary.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
     os.replace(temporary, path)
 
 
@@ -222,7 +223,7 @@ class FitResultsFiles:
         width = max((part_ids(item).dtype.itemsize for item in self.paths), default=0)
         temporary = path.with_name(path.name + ".tmp")
         try:
-            with open(temporary, "wb") as stream:
+            with writing(path), open(temporary, "wb") as stream:
                 n_bytes = _write_rows(stream, self._tables(columns), len(self), width)
                 stream.write(bytes(-n_bytes % 2880))
             os.replace(temporary, path)

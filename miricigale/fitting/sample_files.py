@@ -14,7 +14,7 @@ from miricigale.fitting.files import (
 )
 from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import open_fits
+from miricigale.utils.files import open_fits, writing
 from miricigale.utils.tables import ascii_ids
 
 __all__ = ["read_samples", "write_samples"]
@@ -57,7 +57,8 @@ def write_samples(samples, path, *, overwrite=False):
     for i, axis in enumerate(samples.axes.values()):
         if axis.share is not None:
             hdus.append(fits.ImageHDU(np.asarray(axis.share, dtype=float), name=f"SHARE{i}"))
-    fits.HDUList(hdus).writeto(Path(path), overwrite=overwrite, output_verify="exception")
+    with writing(path):
+        fits.HDUList(hdus).writeto(Path(path), overwrite=overwrite, output_verify="exception")
 
 
 def read_samples(cls, path, grid, *, model=None):

@@ -19,7 +19,7 @@ from miricigale.photometry.error_curves import (
     same_rows,
 )
 from miricigale.utils.exceptions import DataError, argument_error, unknown_name
-from miricigale.utils.files import read_ecsv
+from miricigale.utils.files import read_ecsv, writing
 from miricigale.utils.meta import provenance
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import error_column, require_columns
@@ -446,7 +446,8 @@ class ErrorModel:
 
     def write(self, path, *, overwrite=False):
         """Write the curves as an ECSV table."""
-        self.to_table().write(path, format="ascii.ecsv", overwrite=overwrite)
+        with writing(path):
+            self.to_table().write(path, format="ascii.ecsv", overwrite=overwrite)
 
     @classmethod
     def read(cls, path):

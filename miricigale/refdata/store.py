@@ -10,6 +10,7 @@ from pathlib import Path
 from miricigale.refdata.locate import data_folder, file_sha256, record_path
 from miricigale.refdata.registry import resource
 from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.files import writing
 
 try:
     import fcntl
@@ -101,7 +102,8 @@ def install(partial, target, record=None):
                 "size": status.st_size,
                 "mtime_ns": status.st_mtime_ns,
             }
-            new.write_text(json.dumps(known | record, indent=1) + "\n", encoding="utf-8")
+            with writing(beside):
+                new.write_text(json.dumps(known | record, indent=1) + "\n", encoding="utf-8")
         beside.unlink(missing_ok=True)
         if target.is_dir():
             # a folder cannot be replaced in one step

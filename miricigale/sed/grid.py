@@ -11,7 +11,7 @@ from astropy.io import fits
 from astropy.table import QTable
 
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import open_fits
+from miricigale.utils.files import open_fits, writing
 from miricigale.utils.units import frozen_array
 
 __all__ = ["ModelGrid"]
@@ -230,7 +230,8 @@ class ModelGrid:
             hdu = fits.table_to_hdu(_plain(getattr(self, name)))
             hdu.name = name
             hdus.append(hdu)
-        fits.HDUList(hdus).writeto(Path(path), overwrite=overwrite, output_verify="exception")
+        with writing(path):
+            fits.HDUList(hdus).writeto(Path(path), overwrite=overwrite, output_verify="exception")
 
     @classmethod
     def read(cls, path):

@@ -1,5 +1,6 @@
 """Files that others give us: opened, or refused in one sentence that names the file."""
 
+import contextlib
 import functools
 import os
 import warnings
@@ -11,7 +12,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 
 from miricigale.utils.exceptions import DataError
 
-__all__ = ["cached_by_file", "open_fits", "read_ecsv", "write_fits"]
+__all__ = ["cached_by_file", "open_fits", "read_ecsv", "write_fits", "writing"]
 
 
 def cached_by_file(maxsize):
@@ -114,7 +115,8 @@ def write_fits(hdus, path, *, overwrite=False):
     hdus.update_extend()
     for hdu in hdus:
         hdu.add_checksum(when="of this HDU")
-    hdus.writeto(path, overwrite=overwrite, output_verify="exception")
+    with writing(path):
+        hdus.writeto(path, overwrite=overwrite, output_verify="exception")
 
 
 def read_ecsv(path, *, wanted):
@@ -139,6 +141,34 @@ def read_ecsv(path, *, wanted):
         return QTable.read(path, format="ascii.ecsv")
     except (OSError, TypeError, ValueError) as err:
         raise _unreadable(path, wanted, err) from err
+
+
+@contextlib.contextmanager
+def writing(path):
+    """
+    Write a file, with its name in what goes wrong.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, by the name that the user knows.
+
+    Raises
+    ------
+    OSError
+        What was raised within, with the name of the file if it had none: a full disk is found
+        by ``write``, which does not know the name.
+    """
+    try:
+        yield
+    except OSError as err:
+        if isinstance(err, DataError) or err.filename is not None or str(path) in str(err):
+            raise
+        if err.errno is not None:
+            raise OSError(err.errno, err.strerror, str(path)) from err
+        # numpy tells how much it wrote, but not why it was no more
+        msg = f"{path} could not be written (is the disk full?): {err}"
+        raise OSError(msg) from err
 
 
 def _unreadable(path, wanted, err):

@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from miricigale.refdata.locate import file_sha256
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import writing
 from miricigale.utils.lock import FolderLock
 
 __all__ = ["ProductFolder", "ProductStore"]
@@ -86,22 +87,20 @@ class ProductFolder:
 
         Raises
         ------
-        `~miricigale.utils.exceptions.DataError`
-            If it cannot be written, for instance on a full disk; what stood there before
-            stays.
+        OSError
+            If it cannot be written, for instance on a full disk; it names the product, and
+            what stood there before stays.
         """
         path = self.path(name)
         partial = path.with_name(PARTIAL + path.name)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            writer(partial)
-            os.replace(partial, path)
-        except OSError as err:
+            with writing(path):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                writer(partial)
+                os.replace(partial, path)
+        except BaseException:
             partial.unlink(missing_ok=True)
-            if isinstance(err, DataError):
-                raise
-            msg = f"{path} cannot be written: {err.strerror or err}"
-            raise DataError(msg) from err
+            raise
         return path
 
     def describe(self, name):

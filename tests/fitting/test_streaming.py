@@ -187,6 +187,25 @@ def test_a_damaged_part_is_made_again(fitter, catalogue, tmp_path, monkeypatch):
     assert len(calls) == 2
 
 
+def test_a_full_disk_is_told_with_the_file_and_left_behind(fitter, catalogue, tmp_path, full_disk):
+    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
+    catalogue.write(path)
+    whole = fitter.fit(catalogue)
+    with (
+        pytest.raises(OSError, match=r"part-00000\.fits"),
+        full_disk(20000),
+    ):
+        fit_file(fitter, path, out, chunk_rows=80)
+    assert [item.name for item in out.iterdir()] == ["manifest.json"]
+    with pytest.raises(OSError, match=r"fit\.lock"), full_disk(10):
+        fit_file(fitter, path, out, chunk_rows=80)
+    results = fit_file(fitter, path, out, chunk_rows=80)
+    assert_same(results, whole)
+    with pytest.raises(OSError, match=r"table\.fits'?$"), full_disk(20000):
+        results.write_table(tmp_path / "table.fits")
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["catalogue.fits", "out"]
+
+
 def test_parts_of_another_fit_are_refused(fitter, grid, catalogue, tmp_path):
     path, out = tmp_path / "catalogue.fits", tmp_path / "out"
     catalogue.write(path)
@@ -287,18 +306,23 @@ def test_ids_that_parts_cannot_hold_are_refused_at_once(
     assert fitter.fit(catalogue)[name].id == name
 
 
-def test_bytes_in_fits_that_are_no_ascii_are_refused_at_once(
-    fitter, catalogue, tmp_path, monkeypatch
+@pytest.mark.parametrize(
+    ("start", "match"),
+    [("é".encode(), "'photometry' must be ASCII.* got 'é"), (b"\xe9n", "bytes of text in UTF-8")],
+)
+def test_ids_in_fits_that_are_no_ascii_are_refused_at_once(
+    fitter, catalogue, tmp_path, monkeypatch, start, match
 ):
     path = tmp_path / "catalogue.fits"
     catalogue.write(path)
     key = catalogue["id"][149].encode()
     data = path.read_bytes()
     assert data.count(key) == 1
-    path.write_bytes(data.replace(key, b"\xe9" + key[1:]))
+    path.write_bytes(data.replace(key, start + key[2:]))
     calls = count_fits(monkeypatch)
-    with pytest.raises(DataError, match=r"catalogue\.fits rows 120 to 150 cannot be read: .*ascii"):
+    with pytest.raises(ValueError, match=match) as info:
         fit_file(fitter, path, tmp_path / "out", chunk_rows=40)
+    assert info.value.__notes__ == [f"in rows 120 to 149 of {path}"]
     assert not calls
     assert not (tmp_path / "out").exists()
 

@@ -1,11 +1,13 @@
 """Files that cannot be read are named."""
 
+import errno
+
 import numpy as np
 import pytest
 from astropy.io import fits
 
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import open_fits, read_ecsv
+from miricigale.utils.files import open_fits, read_ecsv, writing
 
 
 def test_a_good_file_is_open(tmp_path):
@@ -31,3 +33,24 @@ def test_truncated_files_are_named(tmp_path):
     (tmp_path / "part.fits").write_bytes(part)
     with pytest.raises(DataError, match=r"part\.fits cannot be read as an image: .*truncated"):
         open_fits(tmp_path / "part.fits", wanted="an image")
+
+
+def test_a_file_that_could_not_be_written_is_named(tmp_path, full_disk):
+    path, partial = tmp_path / "a.fits", tmp_path / "a.partial"
+    with full_disk(5000):
+        # Python's files tell the number of the error, numpy's do not
+        with pytest.raises(OSError, match=r"\[Errno \d+\] .*: '.*a\.fits'") as info, writing(path):
+            partial.write_bytes(bytes(9000))
+        assert info.value.errno == errno.EFBIG
+        with (
+            pytest.raises(OSError, match=r"a\.fits could not be written \(is the disk full\?\)"),
+            writing(path),
+        ):
+            fits.PrimaryHDU(np.zeros(9000)).writeto(path)
+
+
+def test_errors_that_say_what_they_are_about_are_left_alone(tmp_path):
+    for wanted in (DataError("no such exposure"), FileNotFoundError(2, "none", "b.fits")):
+        with pytest.raises(OSError) as info, writing(tmp_path / "a.fits"):
+            raise wanted
+        assert info.value is wanted

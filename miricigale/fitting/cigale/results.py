@@ -10,6 +10,7 @@ from miricigale.fitting.cigale.bands import cigale_band, filter_of_band
 from miricigale.fitting.cigale.catalog import read_table
 from miricigale.fitting.cigale.names import cigale_names, unit_of
 from miricigale.utils.exceptions import DataError, argument_error, unknown_name
+from miricigale.utils.files import writing
 
 __all__ = ["read_cigale_results", "write_cigale_results"]
 
@@ -81,10 +82,11 @@ def write_cigale_results(
         table[f"best.{name}"] = u.Quantity(best, unit)
     for i, band in enumerate(written.values()):
         table[f"best.{band}"] = (results.best_flux[:, i] * u.uJy).to(u.mJy)
-    if path.suffix.lower() == ".txt":
-        table.write(path, format="ascii.fixed_width", delimiter=None, overwrite=overwrite)
-    else:
-        table.write(path, format="fits", overwrite=overwrite)
+    with writing(path):
+        if path.suffix.lower() == ".txt":
+            table.write(path, format="ascii.fixed_width", delimiter=None, overwrite=overwrite)
+        else:
+            table.write(path, format="fits", overwrite=overwrite)
 
 
 def _columns(results, names, variables):

@@ -14,7 +14,7 @@ from astropy.io import fits
 
 from miricigale.refdata.store import partial_path
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import open_fits
+from miricigale.utils.files import open_fits, writing
 from miricigale.utils.units import WAVE, frozen_array, to_array
 
 __all__ = ["LibraryTable", "open_library", "verify_library", "write_library"]
@@ -292,7 +292,7 @@ def write_library(library, path):
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = partial_path(path)
     try:
-        with open(partial, "wb") as handle:
+        with writing(path), open(partial, "wb") as handle:
             hdus.writeto(handle)
             handle.flush()
             os.fsync(handle.fileno())
