@@ -13,6 +13,7 @@ import weakref
 from pathlib import Path
 
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import writing
 
 try:
     import fcntl
@@ -102,10 +103,11 @@ class FolderLock:
     def _write(self, spare):
         self._text = json.dumps(_identity()) + "\n"
         self._handle = os.open(spare, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o644)
-        try:
-            os.write(self._handle, self._text.encode())
-        except OSError as err:
-            raise OSError(err.errno, err.strerror, str(self.path)) from err
+        data = self._text.encode()
+        with writing(self.path):
+            while data:
+                # on a disk that is nearly full a part is written first
+                data = data[os.write(self._handle, data) :]
         self._flocks = _flock(self._handle) is True
 
     def _place(self, spare):

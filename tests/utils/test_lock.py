@@ -212,6 +212,12 @@ def test_file_systems_without_flock_leave_old_locks_to_the_user(tmp_path, monkey
         pass
 
 
+def test_a_full_disk_leaves_no_lock(tmp_path, full_disk):
+    with pytest.raises(OSError, match=r"run\.lock"), full_disk(10), FolderLock(tmp_path):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_of_many_that_find_an_old_lock_one_wins(tmp_path):
     # each takes over what another left, ten times: never are two inside at once
     code = """
