@@ -11,7 +11,6 @@ import functools
 import json
 import os
 import threading
-import warnings
 from pathlib import Path
 
 import astropy.units as u
@@ -19,12 +18,11 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.time import Time, TimeDelta
-from astropy.utils.exceptions import AstropyUserWarning
 
 from miricigale.detector.dq import DQ
 from miricigale.instrument import Exposure, reference_pixel_mask
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import writing
+from miricigale.utils.files import open_fits, writing
 
 __all__ = ["RowWriter", "header", "read", "row_writer", "write"]
 
@@ -370,16 +368,14 @@ def read(path):
     `~miricigale.utils.exceptions.DataError`
         If the file is missing, truncated or not of that kind.
     """
-    path = Path(path)
+    path, wanted = Path(path), "a level-1b file of the MIRI imager"
     try:
-        with warnings.catch_warnings(), open(path, "rb") as handle:
-            warnings.filterwarnings("error", "File may have been truncated", AstropyUserWarning)
-            with fits.open(handle, memmap=True, do_not_scale_image_data=True) as hdus:
-                return _read(path, hdus)
-    except (KeyError, TypeError, ValueError, OSError, AstropyUserWarning) as err:
+        with open_fits(path, wanted=wanted, memmap=True, do_not_scale_image_data=True) as hdus:
+            return _read(path, hdus)
+    except (KeyError, TypeError, ValueError, OSError) as err:
         if isinstance(err, DataError):
             raise
-        msg = f"{path} cannot be read as a level-1b file of the MIRI imager: {err}"
+        msg = f"{path} cannot be read as {wanted}: {err}"
         raise DataError(msg) from err
 
 

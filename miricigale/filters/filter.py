@@ -10,6 +10,7 @@ import numpy as np
 from miricigale.filters import _core
 from miricigale.filters.library import FILTERS, load_curve
 from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.files import unpacked_size
 from miricigale.utils.units import FNU, WAVE, frozen_array, frozen_quantity, to_array
 
 __all__ = ["Filter"]
@@ -149,6 +150,7 @@ class Filter:
             If the file is missing or has not two columns of numbers.
         """
         path = Path(path)
+        unpacked_size(path)
         try:
             lines = path.read_text().splitlines()
         except (OSError, UnicodeDecodeError) as err:

@@ -11,6 +11,7 @@ from astropy.io.registry import IORegistryError
 from astropy.table import QTable, Table
 
 from miricigale.utils.exceptions import DataError, argument_error, unknown_name
+from miricigale.utils.files import unpacked_size
 from miricigale.utils.tables import require_columns
 from miricigale.utils.units import ANGLE, to_array
 
@@ -179,6 +180,7 @@ def read_dithers(path, *, observation=None):
     if not path.is_file():
         msg = f"no file of dithers {str(path)!r}"
         raise DataError(msg)
+    unpacked_size(path)
     if path.suffix.lower() == ".pointing":
         return _read_pointings(path, observation)
     try:

@@ -10,7 +10,7 @@ from pathlib import Path
 from miricigale.refdata.locate import data_folder, file_sha256, record_path
 from miricigale.refdata.registry import resource
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import writing
+from miricigale.utils.files import unpacked_size, writing
 
 try:
     import fcntl
@@ -156,6 +156,8 @@ def add_resource(name, path):
     if record.sha256 and (not path.is_file() or file_sha256(path) != record.sha256):
         msg = f"{path} is not the file that the record of {name!r} describes (sha256 differs)"
         raise DataError(msg)
+    # a copy has no holes
+    unpacked_size(path)
     target = data_folder() / record.file
     with locked(target):
         partial = partial_path(target)

@@ -14,6 +14,7 @@ from miricigale.filters import Filter
 from miricigale.profiles import SERSIC_INDEX_RANGE
 from miricigale.refdata import locate, resources
 from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.files import unpacked_size
 from miricigale.utils.tables import Flags, error_column, require_columns, unique_ids
 from miricigale.utils.units import FNU
 
@@ -225,6 +226,7 @@ def read_catalog(path):
         known = ", ".join(key for key in sorted(resources()) if key.startswith("catalog."))
         msg = f"no catalogue {name!r}: neither a file nor one of {known}"
         raise DataError(msg)
+    unpacked_size(path)
     plain = path.name.removesuffix(".gz")
     form = {".ecsv": "ascii.ecsv", ".fits": "fits", ".fit": "fits"}.get(Path(plain).suffix.lower())
     try:

@@ -2,17 +2,53 @@
 
 import contextlib
 import functools
+import importlib
+import math
 import os
 import warnings
+import zipfile
 from pathlib import Path
 
+import astropy.units as u
+from astropy.config import ConfigItem, ConfigNamespace
 from astropy.io import fits
 from astropy.table import QTable
 from astropy.utils.exceptions import AstropyUserWarning
 
 from miricigale.utils.exceptions import DataError
 
-__all__ = ["cached_by_file", "open_fits", "read_ecsv", "write_fits", "writing"]
+__all__ = [
+    "cached_by_file",
+    "check_unpacked",
+    "conf",
+    "image_unit",
+    "open_fits",
+    "read_ecsv",
+    "unpacked_size",
+    "write_fits",
+    "writing",
+]
+
+# how packed files begin, and the module of Python's that opens them
+_PACKED = {b"\x1f\x8b": "gzip", b"BZh": "bz2", b"\xfd7zXZ\x00": "lzma"}
+_ZIP = b"PK\x03\x04"
+_COMPRESS = b"\x1f\x9d"
+_CHUNK = 1 << 20
+# a file may unpack to so many times its size, however large it is
+_EXPANSION = 8
+
+
+class Conf(ConfigNamespace):
+    """Settings of the package for files, kept in astropy's configuration folder."""
+
+    unpacked_size = ConfigItem(
+        4000,
+        "Size in MB to which a packed file may unpack, or eight times its size if that is more.",
+        "integer(min=1)",
+    )
+
+
+conf = Conf()
 
 
 def cached_by_file(maxsize):
@@ -71,8 +107,10 @@ def open_fits(path, *, wanted, **options):
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
-        If the file is missing, no FITS or truncated.
+        If the file is missing, no FITS or truncated, or would unpack to more than the bound of
+        `check_unpacked`.
     """
+    n_bytes = unpacked_size(path)
     hdus = None
     try:
         _refuse_stump(Path(path))
@@ -81,11 +119,174 @@ def open_fits(path, *, wanted, **options):
             hdus = fits.open(path, **options)
             # headers are read late: a truncated file shows only now
             len(hdus)
+        _check_declared(path, hdus, n_bytes)
+    except DataError:
+        hdus.close()
+        raise
     except (OSError, TypeError, ValueError, AstropyUserWarning) as err:
         if hdus is not None:
             hdus.close()
         raise _unreadable(path, wanted, err) from err
     return hdus
+
+
+def _check_declared(path, hdus, n_bytes):
+    """Refuse headers that declare more data than there are, or than tiles may unpack to."""
+    last = hdus[-1].fileinfo()
+    # astropy sees to it in files that are not packed; the last block may lack its filling
+    if last is not None and last["datLoc"] + last["datSpan"] - 2879 > n_bytes:
+        msg = "truncated: its headers declare more data than it holds"
+        raise OSError(msg)
+    tiled = [hdu for hdu in hdus if isinstance(hdu, fits.CompImageHDU)]
+    declared = sum(math.prod(hdu.shape) * abs(hdu.header["BITPIX"]) // 8 for hdu in tiled)
+    check_unpacked(path, declared)
+
+
+def check_unpacked(path, n_bytes):
+    """
+    Refuse to unpack a file to more than the bound.
+
+    The bound is ``miricigale.utils.files.conf.unpacked_size`` (MB, 4000 by default), or eight
+    times the size of the file if that is more.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    n_bytes : int
+        What it unpacks to, as a whole or in part.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If that is more than the bound.
+    """
+    packed, bound = _bound(path)
+    if n_bytes > bound:
+        msg = (
+            f"{path} ({packed / 1e6:.3g} MB on the disk) would unpack to "
+            f"{'more than ' if n_bytes == bound + 1 else ''}{n_bytes / 1e9:.3g} GB, and the bound "
+            f"is {bound / 1e9:.3g} GB; if it is to be trusted, raise "
+            "miricigale.utils.files.conf.unpacked_size (in MB)"
+        )
+        raise DataError(msg)
+
+
+def _bound(path):
+    """Bytes on the disk, and how many a file may unpack to."""
+    packed = min(os.stat(path).st_size, _allocated(path))
+    return packed, max(conf.unpacked_size * 1_000_000, _EXPANSION * packed)
+
+
+def unpacked_size(path):
+    """
+    Size of a file without the packing that astropy opens by itself (gzip, bzip2, xz, zip).
+
+    Content is counted piece by piece and not kept. That takes as long as unpacking does, once for
+    a file in a session. A file with holes counts as packed into what it takes on the disk.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    n_bytes : int
+        0 if there is no such file.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If it would unpack to more than the bound of `check_unpacked`, or the packing is damaged
+        or one that cannot be counted.
+    """
+    if not os.path.isfile(path):
+        return 0
+    try:
+        n_bytes = _count(path, _bound(path)[1])
+    except Exception as err:  # each packing has its own
+        if getattr(err, "errno", None):
+            # whoever opens it says what is wrong
+            return 0
+        raise _unreadable(path, "a packed file", err) from err
+    check_unpacked(path, n_bytes)
+    return n_bytes
+
+
+@cached_by_file(256)
+def _count(path, most):
+    """Bytes after unpacking; one more than the most if there are more."""
+    with open(path, "rb") as stream:
+        start = stream.read(6)
+    if start.startswith(_ZIP):
+        with zipfile.ZipFile(path) as archive:
+            return sum(member.file_size for member in archive.infolist())
+    if start.startswith(_COMPRESS):
+        msg = "it is packed by 'compress'; unpack it first"
+        raise OSError(msg)
+    for begin, module in _PACKED.items():
+        if start.startswith(begin):
+            n_bytes = 0
+            with importlib.import_module(module).open(path) as stream:
+                while n_bytes <= most and (piece := stream.read(_CHUNK)):
+                    n_bytes += len(piece)
+            return min(n_bytes, most + 1)
+    return os.stat(path).st_size
+
+
+def _allocated(path):
+    """Bytes that a file has on the disk; holes, which are read as zeros, have none."""
+    status = os.stat(path)
+    blocks = getattr(status, "st_blocks", 0)
+    # some file systems tell no blocks, others fewer for a while, or compress
+    if not blocks or _EXPANSION * 512 * blocks >= status.st_size or not hasattr(os, "SEEK_DATA"):
+        return status.st_size
+    n_bytes, end = 0, 0
+    with open(path, "rb", buffering=0) as stream, contextlib.suppress(OSError):
+        # an error tells that there are no data after this place
+        while True:
+            start = stream.seek(end, os.SEEK_DATA)
+            end = stream.seek(start, os.SEEK_HOLE)
+            n_bytes += end - start
+    return n_bytes
+
+
+def image_unit(header, path, *, like):
+    """
+    Unit of an image, as its header states it.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header`
+        Of the image.
+    path : path-like
+        The file, for the message.
+    like : unit-like
+        Unit that it must be convertible to, such as ``"MJy/sr"``.
+
+    Returns
+    -------
+    unit : `~astropy.units.Unit`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the keyword ``BUNIT`` is missing, no unit or one of another kind.
+    """
+    text = header.get("BUNIT", "")
+    try:
+        unit = u.Unit(text) if str(text).strip() else None
+        if unit is not None and unit.is_equivalent(like):
+            return unit
+    except (TypeError, ValueError):
+        pass
+    got = f"BUNIT = {text!r}" if text else "none"
+    msg = (
+        f"{path} must state the unit of its pixels in the keyword BUNIT, one that converts to "
+        f"{u.Unit(like)} (for instance '{u.Unit(like).to_string('fits')}'), got {got}"
+    )
+    raise DataError(msg)
 
 
 def _refuse_stump(path):
@@ -137,6 +338,7 @@ def read_ecsv(path, *, wanted):
     # astropy would take text for the table itself
     if not Path(path).is_file():
         raise _unreadable(path, wanted, "no such file")
+    unpacked_size(path)
     try:
         return QTable.read(path, format="ascii.ecsv")
     except (OSError, TypeError, ValueError) as err:

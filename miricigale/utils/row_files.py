@@ -13,7 +13,7 @@ from astropy.io import fits
 from astropy.table import QTable
 
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import open_fits
+from miricigale.utils.files import open_fits, unpacked_size
 
 __all__ = ["RowFile", "open_rows"]
 
@@ -57,11 +57,13 @@ def open_rows(path, chunk_rows, *, hdu=None, units=None):
         return _FitsRows(path, int(chunk_rows), hdu)
     if hdu is not None:
         raise argument_error("hdu", f"None, for {path} is no FITS file", repr(hdu))
+    packed = start.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ"))
+    if not packed:
+        unpacked_size(path)
     if start.startswith(b"# %ECSV"):
         return _ECSVRows(path, int(chunk_rows))
-    if path.suffix.lower() == ".csv":
+    if path.suffix.lower() == ".csv" and not packed:
         return _CSVRows(path, int(chunk_rows), units or (lambda name: None))
-    packed = start.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ"))
     why = "unpack it first" if packed else "write it as FITS (a binary table) or ECSV"
     msg = f"{path} cannot be read as a table in pieces of rows: {why}"
     raise DataError(msg)

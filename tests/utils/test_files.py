@@ -1,13 +1,27 @@
 """Files that cannot be read are named."""
 
 import errno
+import gzip
+import importlib
+import subprocess
+import sys
+import textwrap
+import zipfile
 
+import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
 
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import open_fits, read_ecsv, writing
+from miricigale.utils.files import (
+    conf,
+    image_unit,
+    open_fits,
+    read_ecsv,
+    unpacked_size,
+    writing,
+)
 
 
 def test_a_good_file_is_open(tmp_path):
@@ -54,3 +68,161 @@ def test_errors_that_say_what_they_are_about_are_left_alone(tmp_path):
         with pytest.raises(OSError) as info, writing(tmp_path / "a.fits"):
             raise wanted
         assert info.value is wanted
+
+
+def pack(module, path, n_mb):
+    """Pack zeros."""
+    with importlib.import_module(module).open(path, "wb") as stream:
+        for _ in range(n_mb):
+            stream.write(bytes(1_000_000))
+
+
+@pytest.mark.parametrize("module", ["gzip", "bz2", "lzma"])
+def test_what_unpacks_beyond_the_bound_is_refused_by_name(tmp_path, module):
+    path = tmp_path / "bomb"
+    pack(module, path, 3)
+    assert unpacked_size(path) == 3_000_000
+    with conf.set_temp("unpacked_size", 3):
+        assert unpacked_size(path) == 3_000_000
+    wanted = (
+        r"bomb \(.* MB on the disk\) would unpack to more than 0\.002 GB, .* bound is 0\.002 GB"
+    )
+    with conf.set_temp("unpacked_size", 2):
+        for reader in (open_fits, read_ecsv):
+            with pytest.raises(DataError, match=wanted + ".*raise .*conf.unpacked_size"):
+                reader(path, wanted="an image")
+
+
+def test_a_bomb_takes_no_memory(tmp_path):
+    # a part of its content is not told by the last bytes of a file of several members
+    path = tmp_path / "bomb.fits.gz"
+    pack("gzip", path, 100)
+    path.write_bytes(3 * path.read_bytes())
+    code = """
+        import resource, sys
+        from miricigale.utils.files import open_fits
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        from miricigale.utils.files import conf
+        conf.unpacked_size = 250
+        try:
+            open_fits(sys.argv[1], wanted="an image")
+        except OSError as err:
+            assert "more than 0.25 GB" in str(err), err
+        else:
+            raise SystemExit("opened")
+        print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e3)
+    """
+    pytest.importorskip("resource")
+    command = [sys.executable, "-c", textwrap.dedent(code), str(path)]
+    grown = float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    # kB on Linux, bytes on macOS
+    assert grown < 50 * (1000 if sys.platform == "darwin" else 1)
+
+
+def test_a_large_file_may_unpack_to_eight_times_its_size(tmp_path):
+    path = tmp_path / "noise.gz"
+    noise = np.random.default_rng(1).bytes(500_000)
+    with gzip.open(path, "wb") as stream:
+        stream.write(noise + bytes(3_000_000))
+    with conf.set_temp("unpacked_size", 1):
+        assert unpacked_size(path) == 3_500_000
+    with gzip.open(path, "wb") as stream:
+        stream.write(noise + bytes(4_000_000))
+    with conf.set_temp("unpacked_size", 1), pytest.raises(DataError, match="would unpack"):
+        unpacked_size(path)
+
+
+def test_members_of_zip_files_are_counted_together(tmp_path):
+    path = tmp_path / "two.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("a", "b"):
+            archive.writestr(name, bytes(600_000))
+    with conf.set_temp("unpacked_size", 1), pytest.raises(DataError, match=r"to 0\.0012 GB"):
+        unpacked_size(path)
+    assert unpacked_size(path) == 1_200_000
+
+
+@pytest.mark.parametrize("start", [b"\x1f\x8b\x08\x00", b"BZh91AY", b"\xfd7zXZ\x00", b"PK\x03\x04"])
+def test_damaged_packings_are_named(tmp_path, start):
+    path = tmp_path / "broken.fits.x"
+    path.write_bytes(start + bytes(5000))
+    with pytest.raises(DataError, match=r"broken\.fits\.x cannot be read as a packed file: \w"):
+        open_fits(path, wanted="an image")
+    path.write_bytes(b"\x1f\x9d" + bytes(5000))
+    with pytest.raises(DataError, match="packed by 'compress'; unpack it first"):
+        open_fits(path, wanted="an image")
+
+
+def test_a_packed_header_may_not_declare_more_than_there_is(tmp_path):
+    header = fits.PrimaryHDU(np.zeros((10, 10))).header
+    header["NAXIS2"] = 10_000_000_000
+    path = tmp_path / "image.fits.gz"
+    with gzip.open(path, "wb") as stream:
+        stream.write(header.tostring().encode() + bytes(2880))
+    with pytest.raises(DataError, match=r"image\.fits\.gz cannot be read as an image: truncated"):
+        open_fits(path, wanted="an image")
+    data = np.arange(100.0).reshape(10, 10)
+    fits.PrimaryHDU(data).writeto(path, overwrite=True)
+    with open_fits(path, wanted="an image") as hdus:
+        np.testing.assert_array_equal(hdus[0].data, data)
+
+
+def test_tiles_may_not_unpack_beyond_the_bound(tmp_path):
+    path = tmp_path / "tiles.fits"
+    hdu = fits.CompImageHDU(np.zeros((1000, 500), np.float32), compression_type="GZIP_1")
+    fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(path)
+    with conf.set_temp("unpacked_size", 1), pytest.raises(DataError, match=r"to 0\.002 GB"):
+        open_fits(path, wanted="an image")
+    with conf.set_temp("unpacked_size", 2), open_fits(path, wanted="an image") as hdus:
+        assert hdus[1].data.shape == (1000, 500)
+
+
+def test_holes_count_as_packed(tmp_path):
+    path = tmp_path / "holes.fits"
+    header = fits.PrimaryHDU(np.zeros((10, 10))).header
+    header["NAXIS2"] = 1_000_000_000
+    size = 2880 + 2880 * -(-80_000_000_000 // 2880)
+    with open(path, "wb") as stream:
+        stream.write(header.tostring().encode())
+        try:
+            stream.truncate(size)
+        except OSError:
+            pytest.skip("no files of this size")
+    if path.stat().st_blocks * 512 > 1_000_000:
+        pytest.skip("no files with holes")
+    with pytest.raises(DataError, match=r"holes\.fits .* would unpack to 80 GB, .* is 4 GB"):
+        open_fits(path, wanted="an image")
+    with conf.set_temp("unpacked_size", 100_000), open_fits(path, wanted="an image") as hdus:
+        assert hdus[0].shape == (1_000_000_000, 10)
+
+
+def test_large_files_without_holes_are_not_bound(tmp_path):
+    path = tmp_path / "large.fits"
+    fits.PrimaryHDU(np.random.default_rng(1).normal(size=(500, 500))).writeto(path)
+    with conf.set_temp("unpacked_size", 1), open_fits(path, wanted="an image") as hdus:
+        assert hdus[0].shape == (500, 500)
+
+
+@pytest.mark.parametrize("text", ["MJy/sr", "uJy/arcsec2", "W m-2 Hz-1 sr-1", " MJy / sr "])
+def test_units_of_images(text):
+    unit = image_unit(fits.Header({"BUNIT": text}), "a.fits", like="MJy/sr")
+    assert unit.is_equivalent("Jy/sr")
+    assert unit == u.Unit(text)
+
+
+@pytest.mark.parametrize(
+    ("cards", "got"),
+    [
+        ({}, "none"),
+        ({"BUNIT": "  "}, "BUNIT = ''|none"),
+        ({"BUNIT": "cows"}, "BUNIT = 'cows'"),
+        ({"BUNIT": "DN/s"}, "BUNIT = 'DN/s'"),
+        ({"BUNIT": 3.5}, "BUNIT = 3.5"),
+        ({"BUNIT": "mag"}, "BUNIT = 'mag'"),
+    ],
+)
+def test_images_without_a_unit_are_named_with_what_is_accepted(cards, got):
+    with pytest.raises(
+        DataError, match=rf"a\.fits must state .* BUNIT, .* MJy / sr .*, got ({got})"
+    ):
+        image_unit(fits.Header(cards), "a.fits", like="MJy/sr")

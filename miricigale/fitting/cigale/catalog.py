@@ -9,6 +9,7 @@ from astropy.table import QTable, Table
 
 from miricigale.fitting.cigale.bands import filter_of_band, is_line
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
+from miricigale.utils.files import unpacked_size
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
 
@@ -235,6 +236,7 @@ def read_table(path, wanted):
     if not path.is_file():
         msg = f"{path} cannot be read as {wanted}: no such file"
         raise DataError(msg)
+    unpacked_size(path)
     try:
         table = Table.read(path, **_format(path))
     except Exception as err:  # readers of all formats raise as they like

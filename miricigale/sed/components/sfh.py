@@ -11,6 +11,7 @@ from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.files import unpacked_size
 
 __all__ = [
     "ConstantSFH",
@@ -226,6 +227,7 @@ def _read(table):
     if not os.path.isfile(table):
         msg = f"{table} cannot be read as a star-formation history: no such file"
         raise DataError(msg)
+    unpacked_size(table)
     try:
         return QTable.read(table)
     except Exception as err:  # readers of all formats raise as they like

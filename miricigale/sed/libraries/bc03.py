@@ -1,11 +1,11 @@
 """Reading of the simple stellar populations of Bruzual & Charlot as they distribute them."""
 
-import hashlib
 import re
 from pathlib import Path
 
 import numpy as np
 
+from miricigale.refdata.locate import file_sha256
 from miricigale.sed.libraries.ised import Ised, parse_ised, read_bytes, read_ised
 from miricigale.sed.libraries.table import LibraryTable
 from miricigale.utils.exceptions import DataError, argument_error
@@ -60,9 +60,8 @@ def read_bc03(path):
     paths = _files(path)
     parts, files = [], {}
     for file in paths:
-        raw = file.read_bytes()
-        files[file.name] = hashlib.sha256(raw).hexdigest()
         part = parse_ised(read_bytes(file), file)
+        files[file.name] = file_sha256(file)
         if not part.is_ssp:
             msg = f"{file} holds a composite population ({part.history}), wanted a single burst"
             raise DataError(msg)

@@ -11,6 +11,7 @@ from miricigale.sed import _core
 from miricigale.sed.components.stellar import BC03
 from miricigale.sed.libraries.table import LibraryTable
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import check_unpacked, unpacked_size
 
 __all__ = ["read_dale2014"]
 
@@ -115,11 +116,15 @@ def _find(path):
     try:
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
-                return _pick(path, {n: n for n in archive.namelist()}, archive.read)
+                members = {m.filename: m for m in archive.infolist()}
+                return _pick(path, members, archive.read, lambda m: m.file_size)
         if tarfile.is_tarfile(path):
+            unpacked_size(path)
             with tarfile.open(path) as archive:
                 members = {m.name: m for m in archive if m.isfile()}
-                return _pick(path, members, lambda m: archive.extractfile(m).read())
+                return _pick(
+                    path, members, lambda m: archive.extractfile(m).read(), lambda m: m.size
+                )
     except (zipfile.BadZipFile, tarfile.TarError, EOFError) as err:
         msg = f"{path} is not a whole archive: {err}"
         raise DataError(msg) from err
@@ -130,7 +135,7 @@ def _find(path):
     raise DataError(msg)
 
 
-def _pick(path, found, read):
+def _pick(path, found, read, size=lambda file: 0):
     """Choose the one folder with the spectra among the names found, and read its files."""
     folders = [PurePosixPath(n).parent for n in found if PurePosixPath(n).name == SPECTRA]
     if len(folders) > 1:
@@ -143,6 +148,7 @@ def _pick(path, found, read):
         msg = f"{path} has {SPECTRA} without {CALIBRATION}, which lists the alphas of its columns"
         raise DataError(msg)
     wanted = [name for name in (SPECTRA, CALIBRATION, STARS) if name in here]
+    check_unpacked(path, sum(size(found[here[name]]) for name in wanted))
     contents = {name: read(found[here[name]]) for name in wanted}
     inside = {name: here[name] if path.is_dir() else f"{path}:{here[name]}" for name in wanted}
     return contents, inside

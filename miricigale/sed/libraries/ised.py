@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import unpacked_size
 
 __all__ = ["Ised", "read_ised"]
 
@@ -131,6 +132,7 @@ def read_ised(path):
 
 def read_bytes(path):
     """Content of a file, decompressed if it is compressed by gzip."""
+    unpacked_size(path)
     try:
         data = path.read_bytes()
         return gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data

@@ -12,7 +12,7 @@ import numpy as np
 
 from miricigale.sed.libraries.table import LibraryTable
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import open_fits
+from miricigale.utils.files import check_unpacked, open_fits, unpacked_size
 
 __all__ = ["SKIRTOR_AXES", "read_skirtor"]
 
@@ -146,6 +146,7 @@ def _is_archive(path):
 
 def _members(path):
     """Name and bytes of each spectrum below a folder or in an archive, and of its source."""
+    n_bytes = 0
     if path.is_dir():
         texts = [p for p in sorted(path.rglob("*_sed.dat")) if _NAME.fullmatch(p.name)]
         if texts:
@@ -159,14 +160,20 @@ def _members(path):
         yield path.name, path.read_bytes(), str(path)
     elif zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
-            for name in sorted(archive.namelist()):
-                if _NAME.fullmatch(PurePosixPath(name).name):
-                    yield PurePosixPath(name).name, archive.read(name), f"{path}:{name}"
+            for member in sorted(archive.infolist(), key=lambda member: member.filename):
+                name = PurePosixPath(member.filename).name
+                if _NAME.fullmatch(name):
+                    n_bytes += member.file_size
+                    check_unpacked(path, n_bytes)
+                    yield name, archive.read(member), f"{path}:{member.filename}"
     else:
+        unpacked_size(path)
         with tarfile.open(path) as archive:
             for member in archive:
                 name = PurePosixPath(member.name).name
                 if member.isfile() and _NAME.fullmatch(name):
+                    n_bytes += member.size
+                    check_unpacked(path, n_bytes)
                     yield name, archive.extractfile(member).read(), f"{path}:{member.name}"
 
 

@@ -1,14 +1,13 @@
 """Draine & Li 2007, with its own parameters and as a sequence in alpha."""
 
 import numpy as np
-from astropy.io import fits
 
 from miricigale.sed import _core
 from miricigale.sed.component import register
 from miricigale.sed.components.dust.base import DustEmission
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import cached_by_file
+from miricigale.utils.files import cached_by_file, open_fits
 
 __all__ = ["DraineLi2007", "DraineLi2007Alpha", "load_dl07"]
 
@@ -29,9 +28,9 @@ def load_dl07(path):
     """
     names = ["wave", "qpah", "u", "umin", "single", "powerlaw", "single_power", "powerlaw_power"]
     try:
-        with fits.open(path) as hdus:
+        with open_fits(path, wanted="a Draine & Li table") as hdus:
             table = {name: hdus[name].data.astype(float) for name in names}
-    except (KeyError, OSError) as err:
+    except KeyError as err:
         msg = f"{path} is not a Draine & Li table: {err}"
         raise DataError(msg) from err
     for array in table.values():

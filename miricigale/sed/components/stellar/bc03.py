@@ -1,12 +1,10 @@
 """The bundled simple stellar populations."""
 
-from astropy.io import fits
-
 from miricigale.sed.component import register
 from miricigale.sed.components.stellar.base import StellarPopulations
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import cached_by_file
+from miricigale.utils.files import cached_by_file, open_fits
 
 __all__ = ["BC03", "load_ssp"]
 
@@ -31,7 +29,7 @@ def load_ssp(path):
     """
     spectra, living = {}, {}
     try:
-        with fits.open(path) as hdus:
+        with open_fits(path, wanted="a table of simple stellar populations") as hdus:
             wave = hdus["WAVE"].data.astype(float) / 1e4
             age = hdus["AGE"].data.astype(float) / 1e6
             alive = hdus["LIVING"].data
@@ -40,7 +38,7 @@ def load_ssp(path):
                 value = float(hdu.header["METAL"])
                 spectra[value] = hdu.data.astype(float) * (SOLAR_LUMINOSITY * 1e4)
                 living[value] = alive[k].astype(float)
-    except (KeyError, OSError) as err:
+    except KeyError as err:
         msg = f"{path} is not a table of simple stellar populations: {err}"
         raise DataError(msg) from err
     for array in (wave, age, *spectra.values(), *living.values()):
