@@ -2,6 +2,11 @@
 
 import csv
 import gzip
+import pickle
+import signal
+import subprocess
+import sys
+import textwrap
 from dataclasses import fields, replace
 
 import astropy.units as u
@@ -185,6 +190,39 @@ def test_a_damaged_part_is_made_again(fitter, catalogue, tmp_path, monkeypatch):
     calls = count_fits(monkeypatch)
     assert_same(fit_file(*arguments, chunk_rows=40), whole)
     assert len(calls) == 2
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
+@pytest.mark.parametrize("moment", ["manifest.json", "part-00001.fits"])
+def test_a_killed_fit_goes_on(fitter, catalogue, tmp_path, moment):
+    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
+    catalogue.write(path)
+    (tmp_path / "fitter").write_bytes(pickle.dumps(fitter))
+    code = """
+        import os, pickle, signal, sys
+        from miricigale.fitting import fit_file
+        replace = os.replace
+
+        def killed(old, new):
+            # whole, but not yet under its name
+            if str(new).endswith(sys.argv[4]):
+                os.kill(os.getpid(), signal.SIGKILL)
+            replace(old, new)
+
+        os.replace = killed
+        with open(sys.argv[1], "rb") as stream:
+            fitter = pickle.load(stream)
+        fit_file(fitter, sys.argv[2], sys.argv[3], chunk_rows=80)
+    """
+    arguments = map(str, (tmp_path / "fitter", path, out, moment))
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code), *arguments], check=False)
+    assert done.returncode == -signal.SIGKILL
+    names = {item.name for item in out.iterdir()}
+    assert names >= {"fit.lock", f"{moment}.tmp"}
+    assert moment not in names
+    assert_same(fit_file(fitter, path, out, chunk_rows=80), fitter.fit(catalogue))
+    names = sorted(item.name for item in out.iterdir())
+    assert names == ["manifest.json", "part-00000.fits", "part-00001.fits"]
 
 
 def test_a_full_disk_is_told_with_the_file_and_left_behind(fitter, catalogue, tmp_path, full_disk):

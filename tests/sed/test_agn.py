@@ -13,6 +13,7 @@ from miricigale.sed.components.agn.parametric import _absorbed, _constants, _see
 from miricigale.sed.libraries import open_library, write_library
 from miricigale.sed.libraries.skirtor import read_skirtor
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import conf
 
 LAWS = ("smc", "calzetti", "gaskell")
 
@@ -430,6 +431,29 @@ def test_archives_and_folders_of_archives_are_the_same(folder, tmp_path, kind):
         np.testing.assert_array_equal(library.axes["q"], wanted.axes["q"])
 
 
+@pytest.mark.parametrize("kind", ["zip", "tar", "tar.gz"])
+def test_archives_that_unpack_beyond_the_bound_are_refused(tmp_path, kind):
+    archive = tmp_path / f"skirtor.{kind}"
+    (tmp_path / "zeros").write_bytes(bytes(1_100_000))
+    names = [f"t7_p0.5_q0_oa40_R20_Mcl0.97_i{i}_sed.dat" for i in (40, 50)]
+    if kind == "zip":
+        with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as out:
+            out.write(tmp_path / "zeros", names[0])
+    elif kind == "tar.gz":
+        with tarfile.open(archive, "w:gz") as out:
+            out.add(tmp_path / "zeros", names[0])
+    else:
+        # a member that is all holes: nothing is stored of its 80 GB
+        info = tarfile.TarInfo(names[0])
+        sparse = {"GNU.sparse.major": "0", "GNU.sparse.minor": "1", "GNU.sparse.name": names[0]}
+        sparse |= {"GNU.sparse.size": "80000000000", "GNU.sparse.map": "0,0"}
+        info.pax_headers = sparse
+        with tarfile.open(archive, "w", format=tarfile.PAX_FORMAT) as out:
+            out.addfile(info)
+    with conf.set_temp("unpacked_size", 1), pytest.raises(DataError, match="would unpack to"):
+        read_skirtor(archive)
+
+
 def test_library_comes_back_from_disk(folder, tmp_path):
     library = read_skirtor(folder)
     write_library(library, tmp_path / "skirtor2016.fits")
@@ -515,7 +539,7 @@ def test_other_things_are_refused(tmp_path, folder):
     with tarfile.open(fileobj=data, mode="w:gz") as out:
         out.add(folder, "nested")
     (tmp_path / "half.tar.gz").write_bytes(data.getvalue()[: len(data.getvalue()) // 2])
-    with pytest.raises(DataError, match=r"half\.tar\.gz is a truncated or damaged archive"):
+    with pytest.raises(DataError, match=r"half\.tar\.gz cannot be read as a packed file: .*ended"):
         read_skirtor(tmp_path / "half.tar.gz")
 
 

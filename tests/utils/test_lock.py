@@ -114,15 +114,27 @@ def test_children_of_a_killed_process_do_not_hold_its_lock(tmp_path):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_forked_child_does_not_free_the_lock_of_its_parent(tmp_path):
-    with FolderLock(tmp_path) as held:
-        child = os.fork()
-        if child == 0:
-            held.__exit__(None, None, None)
-            os._exit(0)
-        os.waitpid(child, 0)
-        assert held.path.is_file()
-        with pytest.raises(DataError, match="in use"), FolderLock(tmp_path):
+    code = """
+        import os, sys
+        from miricigale.utils.lock import FolderLock
+        with FolderLock(sys.argv[1]) as held:
+            child = os.fork()
+            if child == 0:
+                held.__exit__(None, None, None)
+                os._exit(0)
+            os.waitpid(child, 0)
+            print("waited", flush=True)
+            sys.stdin.read()
+    """
+    process = start(code, tmp_path)
+    try:
+        assert process.stdout.readline() == "waited\n"
+        with pytest.raises(DataError, match=f"process {process.pid} "), FolderLock(tmp_path):
             pass
+    finally:
+        process.communicate("")
+    assert process.returncode == 0
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_number_that_the_system_gave_away_again_is_not_the_owner(tmp_path):
