@@ -109,7 +109,7 @@ def _pair(text):
 
 def _run(args):
     from miricigale.utils.exceptions import OtherResultsError
-    from miricigale.utils.parallel import available_cores, process_pool
+    from miricigale.utils.parallel import process_pool, thread_count
     from miricigale.workflow import load_config, run_study
 
     overrides = {"run": {}}
@@ -130,7 +130,7 @@ def _run(args):
         if config.run.threads == 1:
             report = run_study(config, folder, **options)
         else:
-            with process_pool(config.run.threads or available_cores()) as executor:
+            with process_pool(thread_count(config.run.threads or None)) as executor:
                 report = run_study(config, folder, executor=executor, **options)
     except OtherResultsError as err:
         # in the words of this command

@@ -8,6 +8,7 @@ import scipy.ndimage
 from miricigale.photometry import _core
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.profiles import ellipse_to_pixels, sersic_stamp
+from miricigale.utils.parallel import parallel_map
 
 __all__ = ["RIM", "Cutout", "convolve_padded", "cutouts", "own_segments", "sersic_cutouts"]
 
@@ -83,7 +84,7 @@ def own_segments(segmentation, labels, xy):
     return label, flags
 
 
-def cutouts(data, variance, segmentation, label, xy, source_psf, *, min_snr, wings):
+def cutouts(data, variance, segmentation, label, xy, source_psf, *, min_snr, wings, executor=None):
     """
     Cut sources from the high-resolution image and carry on where their segments end.
 
@@ -105,6 +106,8 @@ def cutouts(data, variance, segmentation, label, xy, source_psf, *, min_snr, win
     wings : bool
         Whether light outside of the segment is added; otherwise a cutout is the
         segment as it is.
+    executor : `concurrent.futures.Executor`, optional
+        Threads to work with.
 
     Returns
     -------
@@ -131,7 +134,7 @@ def cutouts(data, variance, segmentation, label, xy, source_psf, *, min_snr, win
     coefficients = convolve_padded(source_psf, lambda shape: 1.0 / _core.spline_response(shape))
     usable = np.isfinite(variance)
     slices = scipy.ndimage.find_objects(segmentation)
-    smooth = _smooth_snr(data, variance) if wings else None
+    smooth = _smooth_snr(data, variance, executor) if wings else None
     for k, one in enumerate(label):
         place = slices[one - 1] if 0 < one <= len(slices) else None
         if place is None:
@@ -178,12 +181,18 @@ def cutouts(data, variance, segmentation, label, xy, source_psf, *, min_snr, win
 _WIDTH, _CORE_SNR, _RING, _AROUND = 1.5, 4.0, 2.0, 16
 
 
-def _smooth_snr(data, variance):
+def _smooth_snr(data, variance, executor):
     usable = np.isfinite(variance)
-    noise = np.sqrt(scipy.ndimage.gaussian_filter(np.where(usable, variance, 0.0), 4 * _WIDTH))
+
+    def smooth(what):
+        image, width = what
+        return scipy.ndimage.gaussian_filter(np.where(usable, image, 0.0), width)
+
+    images = [(variance, 4 * _WIDTH), (data, _WIDTH)]
+    noise, light = parallel_map(smooth, images, executor=executor)
+    noise = np.sqrt(noise)
     gain = 1.0 / (2.0 * np.sqrt(np.pi) * _WIDTH)
-    smooth = scipy.ndimage.gaussian_filter(np.where(usable, data, 0.0), _WIDTH)
-    return smooth / np.where(noise > 0, noise * gain, np.inf)
+    return light / np.where(noise > 0, noise * gain, np.inf)
 
 
 def _carry_on(data, variance, smooth, segmentation, one, place):

@@ -1,11 +1,15 @@
 """Normal equations of forced photometry, and errors that are true for correlated noise."""
 
 import dataclasses
+import functools
 
 import numpy as np
+import scipy.fft
 import scipy.sparse
 
 from miricigale.photometry import _core
+from miricigale.photometry.templates import batches
+from miricigale.utils.parallel import chunks
 
 __all__ = ["LinearFit", "noise_correlation", "normal_matrix", "project", "sandwich_matrix"]
 
@@ -68,10 +72,42 @@ def noise_correlation(residual, usable, *, max_lag=8, clip=5.0, significance=3.0
     return covariance[keep, keep].copy()
 
 
-def _whitened(block, inverse_sigma):
+#: Pairs of stamps that a thread works on at a time.
+_PAIRS = 1024
+
+
+def _whitened(bank, block, inverse_sigma):
     values = np.empty_like(block.values)
-    _core.scale_stamps(block.values, block.box, block.start, inverse_sigma, values)
+
+    def scale(part):
+        stamps = (block.values, block.box[part], block.start[part])
+        _core.scale_stamps(*stamps, inverse_sigma, values)
+
+    bank.map(scale, block.parts())
     return values
+
+
+def _projected(bank, block, values, images):
+    """Sums of a block's stamps times images, shape (n, len(images))."""
+    out = np.empty((len(images), len(block.box)))
+
+    def project_part(part):
+        for image, one in zip(images, out, strict=True):
+            _core.projections(values, block.box[part], block.start[part], image, one[part])
+
+    bank.map(project_part, block.parts())
+    return out.T
+
+
+def _products(bank, left, right, pairs):
+    """Sums of the products of pairs of stamps, each side as (values, box, start)."""
+    out = np.empty(len(pairs))
+
+    def multiply(part):
+        _core.pair_products(*left, *right, pairs[part], out[part])
+
+    bank.map(multiply, chunks(len(pairs), _PAIRS))
+    return out
 
 
 def _gather(n, diagonal, pairs, products):
@@ -82,18 +118,19 @@ def _gather(n, diagonal, pairs, products):
     return scipy.sparse.coo_array((data, (rows, columns)), shape=(n, n)).tocsr()
 
 
-def _walk(bank, inverse_sigma, pairs, left, right, out):
+def _walk(bank, inverse_sigma, pairs, out, spread=None):
     """
     Products of all pairs, with at most those blocks in memory that can still overlap.
 
-    ``left`` and ``right`` turn a block's whitened values into (box, start, values).
+    ``spread`` is what is done to the right-hand one of a pair, given its block and whitened
+    stamps; the walk yields each block, its whitened stamps and those after it.
     """
     live = []
     for block in bank.blocks():
-        white = _whitened(block, inverse_sigma)
-        mine = right(block, white)
+        white = (_whitened(bank, block, inverse_sigma), block.box, block.start)
+        mine = white if spread is None else spread(block, white)
         live = [one for one in live if one[1] > block.box[0, 0]]
-        live.append((block, _reach(block, mine), left(block, white)))
+        live.append((block, _reach(block, mine), white))
         for other, _, theirs in live:
             low, high = np.searchsorted(pairs[:, 0], [other.first, other.last])
             rows = low + np.flatnonzero(
@@ -101,21 +138,19 @@ def _walk(bank, inverse_sigma, pairs, left, right, out):
             )
             if len(rows):
                 local = pairs[rows] - np.array([other.first, block.first], pairs.dtype)
-                products = np.empty(len(rows))
-                _core.pair_products(*_order(theirs), *_order(mine), local, products)
-                out[rows] = products
+                out[rows] = _products(bank, theirs, mine, local)
         yield block, white, mine
 
 
+def _own(block):
+    """Pairs of each stamp of a block with itself."""
+    return np.repeat(np.arange(len(block.box), dtype=np.int32), 2).reshape(-1, 2)
+
+
 def _reach(block, grown):
-    box = grown[0]
+    _, box, _ = grown
     rim = block.box[0, 0] - box[0, 0] if len(box) else 0
     return int((box[:, 0] + box[:, 2]).max() + 2 * rim)
-
-
-def _order(stamps):
-    box, start, values = stamps
-    return values, box, start
 
 
 def normal_matrix(bank, inverse_sigma, images=()):
@@ -145,25 +180,14 @@ def normal_matrix(bank, inverse_sigma, images=()):
     pairs = _core.find_pairs(bank.box)
     products = np.zeros(len(pairs))
     diagonal, power, light = np.empty(n), np.empty(n), np.empty((n, 2))
-    usable = inverse_sigma > 0
+    usable = np.array(inverse_sigma > 0, float)
     projection = np.empty((n, len(images)))
-
-    def plain(block, white):
-        return block.box, block.start, white
-
-    for block, white, _ in _walk(bank, inverse_sigma, pairs, plain, plain, products):
+    for block, white, _ in _walk(bank, inverse_sigma, pairs, products):
         rows = slice(block.first, block.last)
-        own = np.repeat(np.arange(len(block.box)), 2).reshape(-1, 2)
-        for values, out in ((white, diagonal), (block.values, power)):
-            same = np.empty(len(own))
-            stamps = (values, block.box, block.start)
-            _core.pair_products(*stamps, *stamps, own, same)
-            out[rows] = same
-        _core.stamp_sums(block.values, block.box, block.start, usable, light[rows])
-        for column, image in enumerate(images):
-            one = np.empty(len(block.box))
-            _core.projections(white, block.box, block.start, image, one)
-            projection[rows, column] = one
+        for stamps, out in ((white, diagonal), (block.stamps, power)):
+            out[rows] = _products(bank, stamps, stamps, _own(block))
+        light[rows] = _projected(bank, block, block.values, [np.ones_like(usable), usable])
+        projection[rows] = _projected(bank, block, white[0], images)
     return _gather(n, diagonal, pairs, products), projection, power, light
 
 
@@ -171,11 +195,8 @@ def project(bank, inverse_sigma, images):
     """Project whitened images onto the whitened templates, shape (n, len(images))."""
     projection = np.empty((len(bank.order), len(images)))
     for block in bank.blocks():
-        white = _whitened(block, inverse_sigma)
-        for column, image in enumerate(images):
-            one = np.empty(len(block.box))
-            _core.projections(white, block.box, block.start, image, one)
-            projection[block.first : block.last, column] = one
+        white = _whitened(bank, block, inverse_sigma)
+        projection[block.first : block.last] = _projected(bank, block, white, images)
     return projection
 
 
@@ -193,31 +214,42 @@ def sandwich_matrix(bank, inverse_sigma, correlation):
     Returns
     -------
     matrix : `~scipy.sparse.csr_array`, shape (n, n)
+
+    Notes
+    -----
+    Stamps are convolved with the correlation by transforms in single precision, that of the
+    correlation made once for each padded shape.
     """
     n = len(bank.order)
     lag = correlation.shape[0] // 2
     pairs = _core.find_pairs(bank.box, grow=lag)
     products = np.zeros(len(pairs))
     diagonal = np.empty(n)
-    kernel = np.ascontiguousarray(correlation)
+    kernel = np.asarray(correlation, np.float32)
 
-    def plain(block, white):
-        return block.box, block.start, white
+    @functools.lru_cache(maxsize=64)
+    def transfer(shape):
+        return scipy.fft.rfft2(kernel, s=shape)
 
     def spread(block, white):
         if lag == 0:
-            return block.box, block.start, white * np.float32(kernel[0, 0])
+            return white[0] * kernel[0, 0], *white[1:]
         box = block.box + np.array([-lag, -lag, 2 * lag, 2 * lag])
         start = np.concatenate([[0], np.cumsum(box[:, 2] * box[:, 3])])
         values = np.empty(int(start[-1]), np.float32)
-        _core.convolve_stamps(white, block.box, block.start, kernel, box, start, values)
-        return box, start, values
 
-    for block, white, mine in _walk(bank, inverse_sigma, pairs, plain, spread, products):
-        own = np.repeat(np.arange(len(block.box)), 2).reshape(-1, 2)
-        same = np.empty(len(own))
-        _core.pair_products(white, block.box, block.start, *_order(mine), own, same)
-        diagonal[block.first : block.last] = same
+        def convolve(batch):
+            shape, rows = batch
+            _core.convolve_stamps(*white, rows, transfer(shape), shape, box, start, values)
+
+        # rounded up so that many stamps share a shape
+        shapes = -(-box[:, 2:] // 8) * 8
+        fast = {n: scipy.fft.next_fast_len(int(n), True) for n in np.unique(shapes)}
+        bank.map(convolve, batches((fast[ny], fast[nx]) for ny, nx in shapes))
+        return values, box, start
+
+    for block, white, mine in _walk(bank, inverse_sigma, pairs, products, spread):
+        diagonal[block.first : block.last] = _products(bank, white, mine, _own(block))
     return _gather(n, diagonal, pairs, products)
 
 

@@ -1,5 +1,7 @@
 """Forced photometry: all sources of a catalogue fitted at once, with templates."""
 
+import concurrent.futures
+
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
@@ -17,6 +19,7 @@ from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.template_fit import TemplateFit
 from miricigale.photometry.templates import FineTemplates, TemplateBank
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.parallel import thread_count
 from miricigale.utils.tables import require_columns, unique_ids
 from miricigale.utils.units import ANGLE, to_array
 
@@ -63,6 +66,9 @@ class ForcedPhotometer:
         Sources with less of their template's light on usable pixels are not measured.
     max_bytes : float, optional
         Memory for templates; beyond it they are made anew for each pass.
+    n_threads : int, optional
+        Number of threads; by default one for each processor. It changes nothing in the
+        result.
 
     Raises
     ------
@@ -98,6 +104,7 @@ class ForcedPhotometer:
         radius=None,
         min_coverage=0.05,
         max_bytes=1.5e9,
+        n_threads=None,
     ):
         if template not in ("auto", "cutout", "psf", "sersic"):
             raise argument_error("template", "'auto', 'cutout', 'psf' or 'sersic'", repr(template))
@@ -122,6 +129,7 @@ class ForcedPhotometer:
         self._radius = None if radius is None else u.Quantity(radius, ANGLE)
         self._min_coverage = float(min_coverage)
         self._max_bytes = float(max_bytes)
+        self._n_threads = thread_count(n_threads)
 
     @property
     def kernel(self):
@@ -160,6 +168,11 @@ class ForcedPhotometer:
         ValueError, TypeError, `~astropy.units.UnitsError`
             If an input does not fit; the message says which.
         """
+        with concurrent.futures.ThreadPoolExecutor(self._n_threads) as pool:
+            executor = pool if self._n_threads > 1 else None
+            return self._measure(image, highres, segmentation, catalog, executor)
+
+    def _measure(self, image, highres, segmentation, catalog, executor):
         arrays = image_arrays(image, "image")
         ids, sky, labels = _sources(catalog)
         scale = pixel_scale(image.wcs)
@@ -175,7 +188,7 @@ class ForcedPhotometer:
         snr = np.full(n, np.nan)
         parts, flags[near], snr[near] = self._parts(
             catalog[near], sky[near], fine_xy, grid_wcs, fine_arrays, segments,
-            None if labels is None else labels[near],
+            None if labels is None else labels[near], executor,
         )  # fmt: skip
         sides = None
         if self._integrate:
@@ -184,8 +197,9 @@ class ForcedPhotometer:
         fine = FineTemplates(self._kernel.array, self._kernel.target, sides)
         radius = np.inf if self._radius is None else self._radius.value / scale
         bank = TemplateBank(
-            fine, parts, fine_xy, xy[near], poly, shape, radius=radius, max_bytes=self._max_bytes
-        )
+            fine, parts, fine_xy, xy[near], poly, shape,
+            radius=radius, max_bytes=self._max_bytes, executor=executor,
+        )  # fmt: skip
         fit = TemplateFit(
             arrays,
             bank,
@@ -231,7 +245,7 @@ class ForcedPhotometer:
             )
         return highres.wcs, fine_arrays, segments
 
-    def _parts(self, catalog, sky, fine_xy, grid_wcs, fine_arrays, segments, labels):
+    def _parts(self, catalog, sky, fine_xy, grid_wcs, fine_arrays, segments, labels, executor):
         """The template of each source: a `Cutout`, or None for a point source."""
         n = len(sky)
         none = [None] * n, np.zeros(n, int), np.full(n, np.nan)
@@ -252,6 +266,7 @@ class ForcedPhotometer:
             self._kernel.source,
             min_snr=self._min_snr if self._template == "auto" else 0.0,
             wings=self._wings,
+            executor=executor,
         )
         return parts, flags | more, snr
 

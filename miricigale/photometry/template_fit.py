@@ -4,9 +4,9 @@ import warnings
 
 import astropy.units as u
 import numpy as np
-import scipy.ndimage
 import scipy.sparse
 from astropy.nddata import CCDData, StdDevUncertainty
+from scipy.signal import oaconvolve
 
 from miricigale.photometry import _core
 from miricigale.photometry.errors import (
@@ -163,10 +163,18 @@ class TemplateFit:
         middle = sandwich_matrix(self.bank, self.inverse_sigma, correlation)
         middle = middle[keep][:, keep]
         white = [column * self.inverse_sigma for column in self.columns]
-        spread = [scipy.ndimage.convolve(w, correlation, mode="constant") for w in white]
+        spread = [oaconvolve(w, correlation, mode="same") for w in white]
         border = project(self.bank, self.inverse_sigma, spread)[keep]
         corner = np.array([[np.sum(a * b) for b in spread] for a in white])
         return correlation, (middle, border, corner.reshape(len(white), len(white)))
+
+    def _statistics(self, block, residual, out):
+        def measure(part):
+            start = block.start[part.start : part.stop + 1]
+            stamps = (block.values, block.box[part], start)
+            _core.residual_statistics(*stamps, residual, self.inverse_sigma, out[part])
+
+        self.bank.map(measure, block.parts())
 
     def result(self, image, sky, xy, flags, snr, catalog):
         """Put everything in the order of the catalogue."""
@@ -203,10 +211,7 @@ class TemplateFit:
             ).tocsr()
             flags[member[blending > 2]] |= int(ForcedFlags.BLENDED)
             for block in self.bank.blocks():
-                _core.residual_statistics(
-                    block.values, block.box, block.start, residual, self.inverse_sigma,
-                    statistics[block.first : block.last],
-                )  # fmt: skip
+                self._statistics(block, residual, statistics[block.first : block.last])
         coverage = np.zeros(n)
         coverage[source] = np.clip(self.light[:, 1], 0.0, 1.0)
         inside = np.zeros(n)

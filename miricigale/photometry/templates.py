@@ -8,8 +8,12 @@ import scipy.fft
 
 from miricigale.photometry import _core
 from miricigale.photometry.cutouts import RIM, convolve_padded
+from miricigale.utils.parallel import parallel_map
 
-__all__ = ["Block", "FineTemplates", "TemplateBank"]
+__all__ = ["Block", "FineTemplates", "TemplateBank", "batches"]
+
+#: Pixels of the stamps that a thread works on at a time.
+_PART = 1_000_000
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -73,7 +77,8 @@ class FineTemplates:
 
     def coefficients(self, group, shape):
         """Convolve cutouts of one shape, returning an array of shape (n, *shape)."""
-        stamps = np.zeros((len(group), *shape))
+        size = np.max([cutout.data.shape for cutout in group], axis=0) + RIM
+        stamps = np.zeros((len(group), *size))
         for stamp, cutout in zip(stamps, group, strict=True):
             h, w = cutout.data.shape
             stamp[RIM : RIM + h, RIM : RIM + w] = cutout.data
@@ -93,6 +98,46 @@ class Block:
     def last(self):
         """Row after the last."""
         return self.first + len(self.box)
+
+    @property
+    def stamps(self):
+        """Values, boxes and starts, as the kernels take them."""
+        return self.values, self.box, self.start
+
+    def parts(self):
+        """Slices of the block's own rows (0 for its first), of a million pixels or so each."""
+        first, n = 0, len(self.box)
+        while first < n:
+            last = int(np.searchsorted(self.start, self.start[first] + _PART, side="right")) - 1
+            last = min(max(last, first + 1), n)
+            yield slice(first, last)
+            first = last
+
+
+def batches(shapes):
+    """
+    Put stamps of one shape together, a million pixels or so at a time.
+
+    Parameters
+    ----------
+    shapes : iterable
+        The shape of each stamp, or a tuple that begins with it; None for those left out.
+
+    Yields
+    ------
+    shape : tuple
+        As it was given.
+    rows : list of int
+        Stamps of this shape.
+    """
+    groups = {}
+    for row, shape in enumerate(shapes):
+        if shape is not None:
+            groups.setdefault(shape, []).append(row)
+    for shape, rows in groups.items():
+        size = max(1, _PART // (shape[0] * shape[1]))
+        for first in range(0, len(rows), size):
+            yield shape, rows[first : first + size]
 
 
 class TemplateBank:
@@ -120,12 +165,26 @@ class TemplateBank:
         Largest half-width of a stamp in image pixels.
     max_bytes : float, optional
         Memory for stamps; if they need more they are made anew whenever needed.
+    executor : `concurrent.futures.Executor`, optional
+        Threads that the bank's `map` works with.
     """
 
-    def __init__(self, fine, cutout, fine_xy, xy, poly, shape, *, radius=np.inf, max_bytes=1.5e9):
+    def __init__(
+        self,
+        fine,
+        cutout,
+        fine_xy,
+        xy,
+        poly,
+        shape,
+        *,
+        radius=np.inf,
+        max_bytes=1.5e9,
+        executor=None,
+    ):
         self._fine, self._cutout = fine, cutout
         self._fine_xy, self._xy, self._poly = fine_xy, xy, poly
-        self._max_bytes = max_bytes
+        self._max_bytes, self._executor = max_bytes, executor
         box = self._boxes(shape, radius)
         self.order = np.argsort(box[:, 0], kind="stable")
         self.box = np.ascontiguousarray(box[self.order])
@@ -178,7 +237,12 @@ class TemplateBank:
             shape,
             radius=radius,
             max_bytes=self._max_bytes,
+            executor=self._executor,
         )
+
+    def map(self, function, parts):
+        """Call a function with each of some independent pieces of work, on the bank's threads."""
+        parallel_map(function, parts, executor=self._executor)
 
     @property
     def xy(self):
@@ -207,7 +271,7 @@ class TemplateBank:
             return
         keep = 4.0 * self.n_values <= self._max_bytes
         kept = []
-        limit = max(4_000_000, int(self._max_bytes / 4 / 16))
+        limit = max(4 * _PART, int(self._max_bytes / 4 / 16))
         first, n = 0, len(self.order)
         while first < n:
             last = int(np.searchsorted(self.start, self.start[first] + limit, side="right")) - 1
@@ -222,37 +286,43 @@ class TemplateBank:
 
     def _make(self, first, last):
         fine = self._fine
-        box = self.box[first:last]
         start = self.start[first : last + 1] - self.start[first]
-        values = np.zeros(int(start[-1]), np.float32)
-        rows = self.order[first:last]
-        groups = {}
-        amplitude = np.zeros(last - first)
-        for local, k in enumerate(rows):
-            cutout = self._cutout[k]
-            amplitude[local] = 1.0 if cutout is None else cutout.wings
-            if cutout is not None and box[local, 2] and box[local, 3]:
-                key = (fine.shape(cutout), cutout.convolved)
-                groups.setdefault(key, []).append(local)
-        middle = (np.array(fine.point.shape[2:0:-1]) - 1) / 2
-        poly = self._poly[rows].copy()
-        poly[:, :, 0] += middle - self._fine_xy[rows]
-        which = np.zeros(last - first, int)
-        center = self._xy[rows]
-        _core.sample_stamps(fine.point, which, amplitude, center, poly, box, start, values)
-        for (shape, _), members in groups.items():
-            size = max(1, int(64e6 / 8 / (shape[0] * shape[1])))
-            for part in (members[i : i + size] for i in range(0, len(members), size)):
-                group = [self._cutout[rows[local]] for local in part]
-                coefficients = fine.coefficients(group, shape)
-                which = np.zeros(last - first, int)
-                amplitude = np.zeros(last - first)
-                poly = self._poly[rows].copy()
-                for index, (local, cutout) in enumerate(zip(part, group, strict=True)):
-                    which[local], amplitude[local] = index, 1.0
-                    corner = fine.corner(cutout)
-                    poly[local, :, 0] -= corner[::-1]
-                _core.sample_stamps(
-                    coefficients, which, amplitude, center, poly, box, start, values
-                )
-        return Block(first, box, start, values)
+        block = Block(first, self.box[first:last], start, np.zeros(int(start[-1]), np.float32))
+        sources = self.order[first:last]
+        cutout = [self._cutout[k] for k in sources]
+        wings = np.array([1.0 if one is None else one.wings for one in cutout])
+        point = fine.point
+        middle = (np.array(point.shape[2:0:-1]) - 1) / 2
+
+        def add(coefficients, which, amplitude, rows, origin):
+            # sums of a piece in double precision, where each stamp begins anew
+            box = block.box[rows]
+            poly = self._poly[sources[rows]]
+            poly[:, :, 0] -= origin
+            begin = np.concatenate([[0], np.cumsum(box[:, 2] * box[:, 3])])
+            sums = np.zeros(int(begin[-1]))
+            center = self._xy[sources[rows]]
+            _core.sample_stamps(coefficients, which, amplitude, center, poly, box, begin, sums)
+            for k, low, high in zip(rows, begin[:-1], begin[1:], strict=True):
+                block.values[start[k] : start[k + 1]] += sums[low:high]
+
+        def add_points(part):
+            rows = np.arange(part.start, part.stop)
+            origin = self._fine_xy[sources[rows]] - middle
+            add(point, np.zeros(len(rows), int), wings[rows], rows, origin)
+
+        def add_cutouts(batch):
+            (*shape, _), rows = batch
+            group = [cutout[k] for k in rows]
+            origin = np.array([fine.corner(one)[::-1] for one in group])
+            n = len(rows)
+            add(fine.coefficients(group, tuple(shape)), np.arange(n), np.ones(n), rows, origin)
+
+        self.map(add_points, block.parts())
+        seen = (block.box[:, 2] > 0) & (block.box[:, 3] > 0)
+        shapes = (
+            (*fine.shape(one), one.convolved) if one is not None and inside else None
+            for one, inside in zip(cutout, seen, strict=True)
+        )
+        self.map(add_cutouts, batches(shapes))
+        return block

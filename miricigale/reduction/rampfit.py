@@ -14,14 +14,13 @@ that there is no bias to first order.
 
 import concurrent.futures
 import dataclasses
-import os
 
 import numpy as np
 
 from miricigale.reduction import _core
 from miricigale.reduction.flags import PixelFlags
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.parallel import chunks, parallel_map
+from miricigale.utils.parallel import chunks, parallel_map, thread_count
 
 __all__ = ["RampFit", "fit_groups", "reference_drift"]
 
@@ -198,7 +197,7 @@ def fit_groups(
         raise argument_error("read_noise", "at least 0", read_noise)
     jump = _threshold(jump_threshold, "jump_threshold")
     neighbour = _threshold(neighbour_threshold, "neighbour_threshold")
-    n_threads = _n_threads(n_threads)
+    n_threads = thread_count(n_threads)
     usable = np.ones((ny, nx), bool) if usable is None else np.ascontiguousarray(usable, bool)
     if usable.shape != (ny, nx):
         raise argument_error("usable", f"of shape {(ny, nx)}", usable.shape)
@@ -259,17 +258,6 @@ def _threshold(value, name):
     if not value > 0:
         raise argument_error(name, "positive or None", value)
     return float(value)
-
-
-def _n_threads(n_threads):
-    """Check a number of threads; None is the number of processors of this process."""
-    if n_threads is None:
-        if hasattr(os, "sched_getaffinity"):
-            return len(os.sched_getaffinity(0))
-        return os.cpu_count() or 1
-    if n_threads < 1:
-        raise argument_error("n_threads", "at least 1", n_threads)
-    return int(n_threads)
 
 
 def _neighbours(events, threshold, usable, n_diff):

@@ -16,18 +16,10 @@ from pathlib import Path
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.progress import progress
 
-__all__ = ["available_cores", "available_memory", "chunks", "parallel_map", "process_pool"]
+__all__ = ["available_memory", "chunks", "parallel_map", "process_pool", "thread_count"]
 
 #: Functions whose pickle is longer (bytes) go to other processes once, not with every piece.
 _HEAVY = 100_000
-
-
-def available_cores():
-    """Processor cores that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:
-        return os.cpu_count() or 1
 
 
 def available_memory():
@@ -192,6 +184,33 @@ def _unpickled(path):
     # written by this program a moment ago, in a file that only its user can write
     with open(path, "rb") as stream:
         return pickle.load(stream)
+
+
+def thread_count(n_threads=None):
+    """
+    Check a number of threads.
+
+    Parameters
+    ----------
+    n_threads : int, optional
+        What was asked for; the number of processors of this process if not given.
+
+    Returns
+    -------
+    n_threads : int
+
+    Raises
+    ------
+    ValueError
+        If it is no integer of at least 1.
+    """
+    if n_threads is None:
+        if hasattr(os, "sched_getaffinity"):
+            return len(os.sched_getaffinity(0))
+        return os.cpu_count() or 1
+    if n_threads < 1 or int(n_threads) != n_threads:
+        raise argument_error("n_threads", "at least 1 and an integer", n_threads)
+    return int(n_threads)
 
 
 def chunks(n, size):

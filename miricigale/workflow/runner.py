@@ -11,7 +11,7 @@ from pathlib import Path
 
 from miricigale.refdata.locate import file_sha256, fingerprint
 from miricigale.utils.exceptions import ConfigError, DataError, OtherResultsError
-from miricigale.utils.parallel import available_cores, available_memory
+from miricigale.utils.parallel import available_memory, thread_count
 from miricigale.utils.progress import on_terminal, print_line, progress
 from miricigale.workflow.config import load_config
 from miricigale.workflow.stage import run_unit
@@ -95,7 +95,7 @@ class StudyRunner:
         self.redo = redo
         self.disk = disk
         self.progress_bar = progress_bar
-        self.n_threads = config.run.threads or available_cores()
+        self.n_threads = thread_count(config.run.threads or None)
         self.jobs = [
             _Job(stage, unit) for stage in self.stages for unit in stage.unit_names(config)
         ]

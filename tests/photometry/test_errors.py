@@ -2,12 +2,13 @@ import astropy.units as u
 import numpy as np
 import pytest
 import scipy.ndimage
+import scipy.sparse
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import ForcedPhotometer
-from miricigale.photometry.errors import LinearFit, noise_correlation
+from miricigale.photometry.errors import LinearFit, noise_correlation, sandwich_matrix
 
 
 def noise_images(kind, shape, rng):
@@ -114,9 +115,53 @@ def test_blended_covariance_is_the_dense_inverse(tools):
     assert_allclose(result.flux_err.value, scale, rtol=2e-3)
 
 
-def test_common_parameters_like_dense_least_squares():
-    import scipy.sparse
+def direct_sandwich(bank, inverse_sigma, correlation):
+    """A^T W C W A by the direct convolution of whole images, in double precision."""
+    images = np.zeros((len(bank.order), *inverse_sigma.shape))
+    for block in bank.blocks():
+        for k, (y, x, h, w) in enumerate(block.box):
+            stamp = block.values[block.start[k] : block.start[k + 1]].reshape(h, w)
+            images[block.first + k, y : y + h, x : x + w] = stamp
+    images *= inverse_sigma
+    spread = [scipy.ndimage.convolve(image, correlation, mode="constant") for image in images]
+    return scipy.sparse.csr_array(np.einsum("iyx,jyx->ij", images, np.stack(spread)))
 
+
+@pytest.mark.parametrize("max_bytes", [1.5e9, 1e4])
+def test_errors_are_those_of_the_direct_convolution(tools, monkeypatch, max_bytes):
+    # blends, an edge, masked pixels, and noise that is correlated over several pixels; with
+    # little memory in several blocks
+    monkeypatch.setattr("miricigale.photometry.templates._PART", 5000)
+    rng = np.random.default_rng(21)
+    shape = (150, 160)
+    wcs = north_up_wcs(tools.CENTER, 0.06 * u.arcsec, shape)
+    sky = tools.positions(rng, 50, 4.6)
+    noise = next(noise_images("resampled", shape, rng))
+    noise = scipy.ndimage.gaussian_filter(noise, 1.0)
+    mask = rng.random(shape) < 0.1
+    image = tools.as_ccd(noise, wcs, noise.std(), mask=mask)
+    options = {"template": "psf", "fit_background": True, "max_bytes": max_bytes}
+    photometer = ForcedPhotometer(tools.kernel, **options)
+    catalog = QTable({"sky": sky})
+    found = photometer.measure(image, catalog=catalog)
+    assert found.noise_correlation.shape[0] >= 7
+    seen = []
+
+    def direct(*args):
+        expected = direct_sandwich(*args)
+        scale = np.sqrt(expected.diagonal())
+        difference = (sandwich_matrix(*args) - expected).toarray()
+        seen.append(np.abs(difference / scale[:, None] / scale).max())
+        return expected
+
+    monkeypatch.setattr("miricigale.photometry.template_fit.sandwich_matrix", direct)
+    truth = photometer.measure(image, catalog=catalog)
+    assert seen[0] < 1e-6
+    assert_allclose(found.flux.value, truth.flux.value, rtol=1e-12)
+    assert_allclose(found.flux_err.value, truth.flux_err.value, rtol=1e-6)
+
+
+def test_common_parameters_like_dense_least_squares():
     rng = np.random.default_rng(2)
     design = rng.normal(size=(400, 8))
     data = rng.normal(size=400)

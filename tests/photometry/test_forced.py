@@ -1,10 +1,11 @@
 import astropy.units as u
 import numpy as np
 import pytest
+import scipy.ndimage
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.table import QTable
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from miricigale.instrument import imager_wcs, north_up_wcs, pixel_area_map
 from miricigale.photometry import ForcedFlags, ForcedPhotometer, detect_sources
@@ -277,6 +278,31 @@ def test_templates_made_anew_give_the_same(tools, field):
     assert_allclose(anew.flux_err.value, kept.flux_err.value, rtol=1e-12)
 
 
+@pytest.mark.parametrize("n_threads", [2, 3])
+def test_threads_do_not_change_a_bit(tools, monkeypatch, n_threads):
+    # pieces so small that there are many for each thread
+    monkeypatch.setattr("miricigale.photometry.templates._PART", 5000)
+    monkeypatch.setattr("miricigale.photometry.errors._PAIRS", 7)
+    sky, _, high, low = galaxies(tools, noise=0.02, n=36, spacing=1.6)
+    noise = np.random.default_rng(3).normal(0, 0.5, low.data.shape)
+    low.data[:] += scipy.ndimage.gaussian_filter(noise, 1.0)
+    segmentation, _ = detect_sources(high, threshold=1.0, min_area=10)
+    alone, shared = (
+        ForcedPhotometer(tools.kernel, fit_background=True, n_threads=n).measure(
+            low, high, segmentation, QTable({"sky": sky})
+        )
+        for n in (1, n_threads)
+    )
+    assert alone.noise_correlation.shape[0] > 1
+    assert np.isfinite(alone.flux.value).all()
+    for name in ("flux", "flux_err", "background", "background_err"):
+        assert_array_equal(getattr(shared, name).value, getattr(alone, name).value)
+    for name in ("chi2", "residual_fraction", "coverage", "flags", "noise_correlation"):
+        assert_array_equal(getattr(shared, name), getattr(alone, name))
+    assert_array_equal(shared.covariance.toarray(), alone.covariance.toarray())
+    assert_array_equal(shared.residual_image.data, alone.residual_image.data)
+
+
 def test_integration_over_pixels(tools):
     # a target without the pixel's response: pixels of the image are averages of the scene
     from scipy.special import erf
@@ -304,6 +330,7 @@ def test_integration_over_pixels(tools):
         ({"max_shift": -1 * u.arcsec}, ValueError, "'max_shift' must be positive"),
         ({"max_shift": 0.3}, u.UnitsError, "'max_shift' must be a quantity"),
         ({"min_coverage": 2}, ValueError, "'min_coverage' must be between 0 and 1"),
+        ({"n_threads": 1.5}, ValueError, "'n_threads' must be at least 1 and an integer"),
     ],
 )
 def test_bad_settings_are_refused(tools, change, error, text):

@@ -3,7 +3,8 @@ Arrays-only kernels of forced photometry: sampling of templates, normal equation
 
 Stamps of all shapes lie one after the other in a flat array; ``start[k]`` is where stamp ``k``
 begins and ``box[k] = (y0, x0, ny, nx)`` where it lies on the target image. Sums run in float64
-in a fixed order, so that answers do not depend on the machine's number of cores.
+in a fixed order, so that answers do not depend on the number of threads; no kernel holds the
+interpreter's lock, and each is called with one set of types, so that it is compiled once.
 """
 
 from miricigale.photometry._core.noise import autocorrelation
@@ -22,7 +23,6 @@ from miricigale.photometry._core.stamps import (
     projections,
     residual_statistics,
     scale_stamps,
-    stamp_sums,
 )
 
 __all__ = [
@@ -40,5 +40,4 @@ __all__ = [
     "sample_stamps",
     "scale_stamps",
     "spline_response",
-    "stamp_sums",
 ]

@@ -3,6 +3,8 @@
 import numpy as np
 from numba import njit
 
+from miricigale.photometry._core.sampling import convolve_batch
+
 __all__ = [
     "add_model",
     "convolve_stamps",
@@ -11,11 +13,10 @@ __all__ = [
     "projections",
     "residual_statistics",
     "scale_stamps",
-    "stamp_sums",
 ]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _sweep(box, grow, pairs):
     # boxes sorted by y0: candidates of i end where y0[j] passes i's last row
     n = box.shape[0]
@@ -57,7 +58,8 @@ def find_pairs(box, grow=0):
     return pairs
 
 
-@njit(cache=True)
+# products of float32 add up in float64 without rounding, in whatever order
+@njit(cache=True, nogil=True, fastmath={"reassoc"})
 def pair_products(a, a_box, a_start, b, b_box, b_start, pairs, out):
     """
     Sum products of two sets of stamps over the pixels they share.
@@ -79,16 +81,17 @@ def pair_products(a, a_box, a_start, b, b_box, b_start, pairs, out):
         x1 = min(a_box[i, 1] + a_box[i, 3], b_box[j, 1] + b_box[j, 3])
         total = 0.0
         for y in range(y0, y1):
-            na = a_start[i] + (y - a_box[i, 0]) * a_box[i, 3] - a_box[i, 1]
-            nb = b_start[j] + (y - b_box[j, 0]) * b_box[j, 3] - b_box[j, 1]
+            na = a_start[i] + (y - a_box[i, 0]) * a_box[i, 3] - a_box[i, 1] + x0
+            nb = b_start[j] + (y - b_box[j, 0]) * b_box[j, 3] - b_box[j, 1] + x0
+            row_a, row_b = a[na : na + x1 - x0], b[nb : nb + x1 - x0]
             part = 0.0
-            for x in range(x0, x1):
-                part += a[na + x] * b[nb + x]
+            for x in range(row_a.size):
+                part += row_a[x] * row_b[x]
             total += part
         out[k] = total
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def projections(values, box, start, image, out):
     """Sum each stamp times the image below it: ``out[k] = sum(stamp_k * image)``."""
     for k in range(box.shape[0]):
@@ -101,7 +104,7 @@ def projections(values, box, start, image, out):
         out[k] = total
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def scale_stamps(values, box, start, image, out):
     """Multiply each stamp by the image below it into ``out``."""
     for k in range(box.shape[0]):
@@ -112,7 +115,7 @@ def scale_stamps(values, box, start, image, out):
                 n += 1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def add_model(image, values, box, start, flux):
     """Add stamps times their fluxes to an image, in the order of the stamps."""
     for k in range(box.shape[0]):
@@ -126,28 +129,7 @@ def add_model(image, values, box, start, flux):
                 n += 1
 
 
-@njit(cache=True)
-def stamp_sums(values, box, start, usable, out):
-    """
-    Sum each stamp's light: all of it inside the image, and that on usable pixels.
-
-    ``out`` has the shape (n, 2).
-    """
-    for k in range(box.shape[0]):
-        n = start[k]
-        inside = 0.0
-        good = 0.0
-        for y in range(box[k, 0], box[k, 0] + box[k, 2]):
-            for x in range(box[k, 1], box[k, 1] + box[k, 3]):
-                inside += values[n]
-                if usable[y, x]:
-                    good += values[n]
-                n += 1
-        out[k, 0] = inside
-        out[k, 1] = good
-
-
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def residual_statistics(values, box, start, residual, inverse_sigma, out):
     """
     Template-weighted mean of (residual / sigma)^2, and the residual below the core.
@@ -158,7 +140,8 @@ def residual_statistics(values, box, start, residual, inverse_sigma, out):
     for k in range(box.shape[0]):
         peak = 0.0
         for n in range(start[k], start[k + 1]):
-            peak = max(peak, values[n])
+            if values[n] > peak:
+                peak = values[n]
         n = start[k]
         square = 0.0
         weight = 0.0
@@ -181,30 +164,28 @@ def residual_statistics(values, box, start, residual, inverse_sigma, out):
         out[k, 2] = core
 
 
-@njit(cache=True)
-def convolve_stamps(values, box, start, kernel, out_box, out_start, out):
+def convolve_stamps(values, box, start, rows, transfer, shape, out_box, out_start, out):
     """
-    Convolve stamps with a small symmetric kernel; the results are larger by its half-width.
+    Convolve some of the stamps with a kernel given by its transform; the results are larger.
 
     Parameters
     ----------
-    kernel : float array, shape (2 m + 1, 2 m + 1)
-        Symmetric under reflection through its centre.
+    values, box, start
+        Flat stamps.
+    rows : int array, shape (n,)
+        Which of them.
+    transfer : `~numpy.ndarray`, shape (shape[0], shape[1] // 2 + 1)
+        Transform of the kernel, its corner on the first pixel.
+    shape : (int, int)
+        Shape of the transform, at least that of the largest result.
     out_box, out_start, out
-        Boxes grown by m on each side, their starts, and the flat result (zeroed here).
+        Boxes of all stamps, grown by the kernel's half-width on each side, their starts, and the
+        flat result.
     """
-    size = kernel.shape[0]
-    out[:] = 0.0
-    for k in range(box.shape[0]):
-        ny, nx = box[k, 2], box[k, 3]
-        width = out_box[k, 3]
-        for a in range(size):
-            for b in range(size):
-                c = kernel[a, b]
-                if c == 0.0:
-                    continue
-                for y in range(ny):
-                    n = start[k] + y * nx
-                    m = out_start[k] + (y + a) * width + b
-                    for x in range(nx):
-                        out[m + x] += c * values[n + x]
+    batch = np.zeros((len(rows), *shape), values.dtype)
+    for padded, k in zip(batch, rows, strict=True):
+        ny, nx = box[k, 2:]
+        padded[:ny, :nx] = values[start[k] : start[k + 1]].reshape(ny, nx)
+    for convolved, k in zip(convolve_batch(batch, transfer, shape), rows, strict=True):
+        ny, nx = out_box[k, 2:]
+        out[out_start[k] : out_start[k + 1]] = convolved[:ny, :nx].ravel()

@@ -38,7 +38,7 @@ def measure_photometry(context, name):
     """Stage 11: forced photometry of one band on its own grid."""
     kernel = MatchingKernel.read(context.path(f"kernel_{name}.fits"))
     # a constant takes up what faint sources and wings left in the background
-    result = ForcedPhotometer(kernel, fit_background=True).measure(
+    result = ForcedPhotometer(kernel, fit_background=True, n_threads=context.n_threads).measure(
         context.image(f"mosaic_{name}.fits"),
         context.image("f160w.fits"),
         read_segmentation(context.path("segm.fits")),

@@ -92,9 +92,10 @@ def measure_point_sources(context, name):
     segmentation, detected = detect_sources(
         highres, threshold=config.photometry.threshold, min_area=config.photometry.min_area
     )
-    result = ForcedPhotometer(kernel_of(config, name), fit_background=True).measure(
-        mosaic, highres, segmentation, detected
+    photometer = ForcedPhotometer(
+        kernel_of(config, name), fit_background=True, n_threads=context.n_threads
     )
+    result = photometer.measure(mosaic, highres, segmentation, detected)
     table = catalog["id", "sky"]
     table["flux_true"] = catalog[name]
     index, _ = match_sky(detected["sky"], catalog["sky"], radius=0.3 * u.arcsec)
