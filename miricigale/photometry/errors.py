@@ -11,7 +11,7 @@ from miricigale.photometry import _core
 from miricigale.photometry.templates import batches
 from miricigale.utils.parallel import chunks
 
-__all__ = ["LinearFit", "noise_correlation", "normal_matrix", "project", "sandwich_matrix"]
+__all__ = ["LinearFit", "noise_correlation", "normal_matrix", "sandwich_matrix"]
 
 
 def noise_correlation(residual, usable, *, max_lag=8, clip=5.0, significance=3.0):
@@ -181,32 +181,24 @@ def normal_matrix(bank, inverse_sigma, images=()):
     products = np.zeros(len(pairs))
     diagonal, power, light = np.empty(n), np.empty(n), np.empty((n, 2))
     usable = np.array(inverse_sigma > 0, float)
+    everywhere = np.ones_like(usable)
     projection = np.empty((n, len(images)))
     for block, white, _ in _walk(bank, inverse_sigma, pairs, products):
         rows = slice(block.first, block.last)
         for stamps, out in ((white, diagonal), (block.stamps, power)):
             out[rows] = _products(bank, stamps, stamps, _own(block))
-        light[rows] = _projected(bank, block, block.values, [np.ones_like(usable), usable])
+        light[rows] = _projected(bank, block, block.values, [everywhere, usable])
         projection[rows] = _projected(bank, block, white[0], images)
     return _gather(n, diagonal, pairs, products), projection, power, light
 
 
-def project(bank, inverse_sigma, images):
-    """Project whitened images onto the whitened templates, shape (n, len(images))."""
-    projection = np.empty((len(bank.order), len(images)))
-    for block in bank.blocks():
-        white = _whitened(bank, block, inverse_sigma)
-        projection[block.first : block.last] = _projected(bank, block, white, images)
-    return projection
-
-
-def sandwich_matrix(bank, inverse_sigma, correlation):
+def sandwich_matrix(bank, inverse_sigma, correlation, images=()):
     """
     Build A^T W C W A, what the correlated noise does to the right-hand side.
 
     Parameters
     ----------
-    bank, inverse_sigma
+    bank, inverse_sigma, images
         As in `normal_matrix`.
     correlation : `~numpy.ndarray`, shape (2 m + 1, 2 m + 1)
         Covariance of the whitened noise by separation.
@@ -214,6 +206,7 @@ def sandwich_matrix(bank, inverse_sigma, correlation):
     Returns
     -------
     matrix : `~scipy.sparse.csr_array`, shape (n, n)
+    projection : `~numpy.ndarray`, shape (n, len(images))
 
     Notes
     -----
@@ -224,7 +217,7 @@ def sandwich_matrix(bank, inverse_sigma, correlation):
     lag = correlation.shape[0] // 2
     pairs = _core.find_pairs(bank.box, grow=lag)
     products = np.zeros(len(pairs))
-    diagonal = np.empty(n)
+    diagonal, projection = np.empty(n), np.empty((n, len(images)))
     kernel = np.asarray(correlation, np.float32)
 
     @functools.lru_cache(maxsize=64)
@@ -249,8 +242,10 @@ def sandwich_matrix(bank, inverse_sigma, correlation):
         return values, box, start
 
     for block, white, mine in _walk(bank, inverse_sigma, pairs, products, spread):
-        diagonal[block.first : block.last] = _products(bank, white, mine, _own(block))
-    return _gather(n, diagonal, pairs, products)
+        rows = slice(block.first, block.last)
+        diagonal[rows] = _products(bank, white, mine, _own(block))
+        projection[rows] = _projected(bank, block, white[0], images)
+    return _gather(n, diagonal, pairs, products), projection
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

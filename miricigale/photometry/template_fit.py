@@ -13,7 +13,6 @@ from miricigale.photometry.errors import (
     LinearFit,
     noise_correlation,
     normal_matrix,
-    project,
     sandwich_matrix,
 )
 from miricigale.photometry.flags import ForcedFlags
@@ -160,11 +159,10 @@ class TemplateFit:
         if not correlation.any():
             return None, None
         keep = self.rows
-        middle = sandwich_matrix(self.bank, self.inverse_sigma, correlation)
-        middle = middle[keep][:, keep]
         white = [column * self.inverse_sigma for column in self.columns]
         spread = [oaconvolve(w, correlation, mode="same") for w in white]
-        border = project(self.bank, self.inverse_sigma, spread)[keep]
+        middle, border = sandwich_matrix(self.bank, self.inverse_sigma, correlation, spread)
+        middle, border = middle[keep][:, keep], border[keep]
         corner = np.array([[np.sum(a * b) for b in spread] for a in white])
         return correlation, (middle, border, corner.reshape(len(white), len(white)))
 

@@ -13,7 +13,7 @@ from miricigale.utils.parallel import parallel_map
 __all__ = ["Block", "FineTemplates", "TemplateBank", "batches"]
 
 #: Pixels of the stamps that a thread works on at a time.
-_PART = 1_000_000
+_PART = 250_000
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -105,7 +105,7 @@ class Block:
         return self.values, self.box, self.start
 
     def parts(self):
-        """Slices of the block's own rows (0 for its first), of a million pixels or so each."""
+        """Slices of the block's own rows (0 for its first), of some hundred thousand pixels each."""
         first, n = 0, len(self.box)
         while first < n:
             last = int(np.searchsorted(self.start, self.start[first] + _PART, side="right")) - 1
@@ -116,7 +116,7 @@ class Block:
 
 def batches(shapes):
     """
-    Put stamps of one shape together, a million pixels or so at a time.
+    Put stamps of one shape together, some hundred thousand pixels at a time.
 
     Parameters
     ----------
@@ -271,7 +271,7 @@ class TemplateBank:
             return
         keep = 4.0 * self.n_values <= self._max_bytes
         kept = []
-        limit = max(4 * _PART, int(self._max_bytes / 4 / 16))
+        limit = 16 * _PART
         first, n = 0, len(self.order)
         while first < n:
             last = int(np.searchsorted(self.start, self.start[first] + limit, side="right")) - 1

@@ -148,11 +148,12 @@ def test_errors_are_those_of_the_direct_convolution(tools, monkeypatch, max_byte
     seen = []
 
     def direct(*args):
-        expected = direct_sandwich(*args)
+        expected = direct_sandwich(*args[:3])
         scale = np.sqrt(expected.diagonal())
-        difference = (sandwich_matrix(*args) - expected).toarray()
+        found, projection = sandwich_matrix(*args)
+        difference = (found - expected).toarray()
         seen.append(np.abs(difference / scale[:, None] / scale).max())
-        return expected
+        return expected, projection
 
     monkeypatch.setattr("miricigale.photometry.template_fit.sandwich_matrix", direct)
     truth = photometer.measure(image, catalog=catalog)
