@@ -16,18 +16,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from miricigale.profiles._core import cell
 
-#: Rows that one task of the parallel loop owns; fixed, so that threads change nothing.
-BLOCK = 64
-
 #: Small cells per node and axis near the cusp.
 SUB = 4
-
-#: Nodes in double precision that the cusps of one batch of sources take.
-CHUNK = 2_000_000
 
 #: In the smooth part one node in so many is worked out, the others by polynomials through six.
 STEP = 4
@@ -45,7 +39,7 @@ SMOOTH_ALONG, SMOOTH_ACROSS = 40.0, 16.0
 SLOPE_ALONG, SLOPE_ACROSS = 0.075, 0.12
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _spline_weights(t, w):
     s = 1.0 - t
     w[0] = s * s * s / 6.0
@@ -86,21 +80,14 @@ class Landing(NamedTuple):
     t_x: np.ndarray
 
 
-@njit(cache=True)
-def _box(sums, k, phase, y0, y1, x0, x1):
+@njit(cache=True, nogil=True)
+def _box(sums, y0, y1, x0, x1):
     """Sum of a table over a range, from its cumulative sums."""
-    if y0 == 0 and x0 == 0:
-        return sums[k, phase, y1, x1]
-    return (
-        sums[k, phase, y1, x1]
-        - sums[k, phase, y0, x1]
-        - sums[k, phase, y1, x0]
-        + sums[k, phase, y0, x0]
-    )
+    return sums[y1, x1] - sums[y0, x1] - sums[y1, x0] + sums[y0, x0]
 
 
-@njit(cache=True)
-def _share_row(land, i, j0, share):
+@njit(cache=True, nogil=True)
+def share_row(land, i, j0, share):
     """Fill in what part of the light deposited on a row's nodes from ``j0`` on lands."""
     os_ = land.oversampling
     y0, y1 = land.low_y[i], land.high_y[i]
@@ -119,13 +106,24 @@ def _share_row(land, i, j0, share):
             if x1 <= x0:
                 continue
             phase, k, t = j % os_, k_x[j], t_x[j]
-            part = _box(sums, order[k], phase, y0, y1, x0, x1)
+            part = _box(sums[order[k], phase], y0, y1, x0, x1)
             if t != 0.0:
-                part += t * (_box(sums, order[k + 1], phase, y0, y1, x0, x1) - part)
+                part += t * (_box(sums[order[k + 1], phase], y0, y1, x0, x1) - part)
             share[n] += w_y * part
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
+def _alike(land, i, k):
+    """Whether the light of two rows of nodes lands alike."""
+    return (
+        land.low_y[i] == land.low_y[k]
+        and land.high_y[i] == land.high_y[k]
+        and land.k_y[i] == land.k_y[k]
+        and land.t_y[i] == land.t_y[k]
+    )
+
+
+@njit(cache=True, nogil=True)
 def deposit_points(grid, x, y, flux, land):
     """
     Put points on the grid.
@@ -156,7 +154,7 @@ def deposit_points(grid, x, y, flux, land):
             i = iy - 1 + a
             if i < 0 or i >= grid.shape[0]:
                 continue
-            _share_row(land, i, j0, share[: j1 - j0])
+            share_row(land, i, j0, share[: j1 - j0])
             for j in range(j0, j1):
                 light = flux[k] * wy[a] * wx[j - ix + 1]
                 grid[i, j] += light
@@ -164,7 +162,7 @@ def deposit_points(grid, x, y, flux, land):
     return landed
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _deposit(part, y, x, light, wy, wx):
     """Put one point's light on the nodes of a part of the grid; beside it, it is lost."""
     ny, nx = part.shape
@@ -178,7 +176,7 @@ def _deposit(part, y, x, light, wy, wx):
             part[iy - 1 + a, ix - 1 + b] += light * wy[a] * wx[b]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def deposit_pieces(part, x, y, light):
     """
     Put the pieces of one source on a grid of its own.
@@ -195,19 +193,19 @@ def deposit_pieces(part, x, y, light):
         _deposit(part, y[k], x[k], light[k], wy, wx)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def add_part(grid, part, i0, j0, land):
     """Add a part to the grid at row ``i0`` and column ``j0``; return what lands on the image."""
     total, share = 0.0, np.empty(part.shape[1])
     for i in range(part.shape[0]):
-        _share_row(land, i0 + i, j0, share)
+        share_row(land, i0 + i, j0, share)
         for j in range(part.shape[1]):
             grid[i0 + i, j0 + j] += part[i, j]
             total += part[i, j] * share[j]
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _row_span(par, dy, limit, n):
     """First and last column whose node lies within the ellipse w <= limit in a row."""
     a, b, c = par[8], par[9], par[10]
@@ -220,68 +218,41 @@ def _row_span(par, dy, limit, n):
     return max(first, 0), min(last, n - 1)
 
 
-@njit(cache=True, parallel=True)
-def _cusps(buffer, start, box, shape, rows, tables, w_zone):
-    """Fill the part of the grid around each cusp, one after the other in ``buffer``."""
-    size = 1.0 / SUB
-    for k in prange(rows.shape[0]):
-        wy, wx, out = np.empty(4), np.empty(4), np.empty(3)
-        i0, i1, j0, j1 = box[k]
-        part = buffer[start[k] : start[k + 1]].reshape(i1 - i0, j1 - j0)
-        par, table = rows[k], tables[k]
-        for i in range(i0, i1):
-            first, last = _row_span(par, i - par[1], w_zone[k], shape[1])
-            for j in range(first, last + 1):
-                for si in range(SUB):
-                    y = i + (si + 0.5) * size - 0.5
-                    for sj in range(SUB):
-                        x = j + (sj + 0.5) * size - 0.5
-                        cell(x - par[0], y - par[1], size, par, table, out)
-                        if out[0] > 0.0:
-                            _deposit(part, y + out[2] - i0, x + out[1] - j0, out[0], wy, wx)
-
-
-def deposit_cusps(grid, rows, tables, w_zone, land):
+@njit(cache=True, nogil=True)
+def fill_cusp(part, i0, j0, n_x, par, table, w_zone):
     """
-    Put the inner parts of Sersic profiles on the grid, in small cells.
+    Put the inner part of a Sersic profile on a grid of its own, in small cells.
 
     Parameters
     ----------
-    grid, land
-        As in `deposit_points`.
-    rows : array, shape (N, 13)
-        Parameters of the profiles in nodes.
-    tables : array, shape (N, 5, TABLE_SIZE)
-        Their enclosed light.
-    w_zone : array, shape (N,)
+    part : array, shape (ny, nx)
+        Light on the nodes, changed in place.
+    i0, j0 : int
+        Row and column of its first node on the whole grid.
+    n_x : int
+        Columns of the whole grid.
+    par : array, shape (13,)
+        Parameters of the profile in nodes.
+    table : array, shape (5, TABLE_SIZE)
+        Its enclosed light.
+    w_zone : float
         Squared elliptical radius (in half-light radii) that is done here.
-
-    Returns
-    -------
-    landed : array, shape (N,)
     """
-    landed = np.zeros(rows.shape[0])
-    a, b, c = rows[:, 8], rows[:, 9], rows[:, 10]
-    half = np.sqrt(w_zone / (a * c - b * b))
-    box = np.empty((rows.shape[0], 4), dtype=np.int64)
-    for m, (center, reach) in enumerate(((rows[:, 1], half * a**0.5), (rows[:, 0], half * c**0.5))):
-        # a spline reaches two nodes beyond its cell
-        box[:, 2 * m] = np.clip(np.floor(center - reach) - 3, 0, grid.shape[m])
-        box[:, 2 * m + 1] = np.clip(np.ceil(center + reach) + 4, 0, grid.shape[m])
-    used = np.flatnonzero((box[:, 1] > box[:, 0]) & (box[:, 3] > box[:, 2]))
-    sizes = (box[:, 1] - box[:, 0]) * (box[:, 3] - box[:, 2])
-    for chunk in np.array_split(used, max(1, math.ceil(sizes[used].sum() / CHUNK))):
-        start = np.append(0, np.cumsum(sizes[chunk]))
-        buffer = np.zeros(start[-1])
-        _cusps(buffer, start, box[chunk], grid.shape, rows[chunk], tables[chunk], w_zone[chunk])
-        for n, k in enumerate(chunk):
-            i0, i1, j0, j1 = box[k]
-            part = buffer[start[n] : start[n + 1]].reshape(i1 - i0, j1 - j0)
-            landed[k] = add_part(grid, part, i0, j0, land)
-    return landed
+    size = 1.0 / SUB
+    wy, wx, out = np.empty(4), np.empty(4), np.empty(3)
+    for i in range(i0, i0 + part.shape[0]):
+        first, last = _row_span(par, i - par[1], w_zone, n_x)
+        for j in range(first, last + 1):
+            for si in range(SUB):
+                y = i + (si + 0.5) * size - 0.5
+                for sj in range(SUB):
+                    x = j + (sj + 0.5) * size - 0.5
+                    cell(x - par[0], y - par[1], size, par, table, out)
+                    if out[0] > 0.0:
+                        _deposit(part, y + out[2] - i0, x + out[1] - j0, out[0], wy, wx)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _fill_row(par, table, dy, first, last, hole_first, hole_last, light, shift_x, shift_y):
     """Light and first moments of the cells of a row, shifted by 2 columns from ``first``."""
     out = np.empty(3)
@@ -300,7 +271,7 @@ def _fill_row(par, table, dy, first, last, hole_first, hole_last, light, shift_x
         j += 1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _add_row(row, share, first, last, low, high, light, shift_x, shift_y, w_light, w_shift):
     """
     Add a row of cells to the nodes ``low`` to ``high`` of a row of the grid with two weights.
@@ -319,7 +290,7 @@ def _add_row(row, share, first, last, low, high, light, shift_x, shift_y, w_ligh
     return landed
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _smooth_deposit(par, dx, dy):
     """Deposit on a node where the profile is smooth: brightness and a sixth of the Laplacian."""
     a, b, c, power = par[8], par[9], par[10], par[11]
@@ -332,7 +303,7 @@ def _smooth_deposit(par, dx, dy):
     return par[3] * math.exp(-z) * (1.0 + second / 6.0)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _add_smooth(row, share, par, dy, first, last):
     """Add the smooth deposits of the nodes ``first`` to ``last``; return what lands."""
     landed = 0.0
@@ -366,7 +337,7 @@ def smooth_from(rows, w_zone, w_cut):
     Parameters
     ----------
     rows, w_zone, w_cut
-        As in `deposit_outskirts`.
+        As in `fill_outskirts`.
 
     Returns
     -------
@@ -389,85 +360,88 @@ def smooth_from(rows, w_zone, w_cut):
     return np.where(w < w_cut, w, np.inf)
 
 
-@njit(cache=True, parallel=True)
-def deposit_outskirts(grid, rows, tables, w_zone, w_smooth, w_cut, land):
+@njit(cache=True, nogil=True)
+def fill_outskirts(grid, start, stop, rows, tables, w_zone, w_smooth, w_cut, land, landed):
     """
-    Add the outer parts of Sersic profiles: one cell for each node, then the smooth part.
+    Add the outer parts of Sersic profiles to some rows: one cell for each node, then the smooth part.
 
     Parameters
     ----------
-    grid, rows, tables, w_zone, land
-        As in `deposit_cusps`.
+    grid : array, shape (ny, nx)
+        Light on the nodes, changed in place in the rows ``start`` to ``stop`` only.
+    start, stop : int
+        Rows that are done here.
+    rows : array, shape (N, 13)
+        Parameters of the profiles in nodes.
+    tables : array, shape (N, 5, TABLE_SIZE)
+        Their enclosed light.
+    w_zone : array, shape (N,)
+        Squared elliptical radius up to which `fill_cusp` does them.
     w_smooth : array, shape (N,)
         Squared elliptical radius from which the profiles are smooth (`smooth_from`).
     w_cut : array, shape (N,)
         Squared elliptical radius at which the profiles end.
-
-    Returns
-    -------
+    land : `Landing`
     landed : array, shape (N,)
+        Light of these rows that lands on the image, overwritten.
     """
     ny, nx = grid.shape
-    n_blocks = (ny + BLOCK - 1) // BLOCK
-    landed = np.zeros((n_blocks, rows.shape[0]))
-    for block in prange(n_blocks):
-        light, shift_x, shift_y = np.empty(nx + 5), np.empty(nx + 5), np.empty(nx + 5)
-        start, stop = block * BLOCK, min(ny, (block + 1) * BLOCK)
-        share = np.empty((stop - start, nx))
-        for i in range(start, stop):
-            _share_row(land, i, 0, share[i - start])
-        for k in range(rows.shape[0]):
-            par, table = rows[k], tables[k]
-            half = math.sqrt(w_cut[k] * par[8] / (par[8] * par[10] - par[9] * par[9]))
-            # cells of the rows just outside reach into this block
-            lowest = max(start - 1, 0, math.ceil(par[1] - half))
-            highest = min(stop, ny - 1, math.floor(par[1] + half))
-            smooth = w_smooth[k] < w_cut[k]
-            total = 0.0
-            for i in range(lowest, highest + 1):
-                dy = i - par[1]
-                first, last = _row_span(par, dy, w_cut[k], nx)
+    light, shift_x, shift_y = np.empty(nx + 5), np.empty(nx + 5), np.empty(nx + 5)
+    share = np.empty((stop - start, nx))
+    os_ = land.oversampling
+    for i in range(start, stop):
+        if i - os_ >= start and _alike(land, i, i - os_):
+            # by hand: numba takes seconds to compile the assignment of a slice
+            for j in range(nx):
+                share[i - start, j] = share[i - os_ - start, j]
+        else:
+            share_row(land, i, 0, share[i - start])
+    for k in range(rows.shape[0]):
+        par, table = rows[k], tables[k]
+        half = math.sqrt(w_cut[k] * par[8] / (par[8] * par[10] - par[9] * par[9]))
+        # cells of the rows just outside reach into this block
+        lowest = max(start - 1, 0, math.ceil(par[1] - half))
+        highest = min(stop, ny - 1, math.floor(par[1] + half))
+        smooth = w_smooth[k] < w_cut[k]
+        total = 0.0
+        for i in range(lowest, highest + 1):
+            dy = i - par[1]
+            first, last = _row_span(par, dy, w_cut[k], nx)
+            if last < first:
+                continue
+            if smooth:
+                inner_first, inner_last = _row_span(par, dy, w_smooth[k], nx)
+                if start <= i < stop:
+                    row, own = grid[i], share[i - start]
+                    if inner_last < inner_first:
+                        total += _add_smooth(row, own, par, dy, first, last)
+                    else:
+                        total += _add_smooth(row, own, par, dy, first, inner_first - 1)
+                        total += _add_smooth(row, own, par, dy, inner_last + 1, last)
+                # the cells that reach inner nodes of this row and its neighbours
+                first, last = nx, -1
+                for step in range(-1, 2):
+                    one, two = _row_span(par, dy + step, w_smooth[k], nx)
+                    if one <= two:
+                        first, last = min(first, one - 1), max(last, two + 1)
+                first, last = max(first, 0), min(last, nx - 1)
                 if last < first:
                     continue
-                if smooth:
-                    inner_first, inner_last = _row_span(par, dy, w_smooth[k], nx)
-                    if start <= i < stop:
-                        row, own = grid[i], share[i - start]
-                        if inner_last < inner_first:
-                            total += _add_smooth(row, own, par, dy, first, last)
-                        else:
-                            total += _add_smooth(row, own, par, dy, first, inner_first - 1)
-                            total += _add_smooth(row, own, par, dy, inner_last + 1, last)
-                    # the cells that reach inner nodes of this row and its neighbours
-                    first, last = nx, -1
-                    for step in range(-1, 2):
-                        one, two = _row_span(par, dy + step, w_smooth[k], nx)
-                        if one <= two:
-                            first, last = min(first, one - 1), max(last, two + 1)
-                    first, last = max(first, 0), min(last, nx - 1)
-                    if last < first:
-                        continue
-                hole_first, hole_last = _row_span(par, dy, w_zone[k], nx)
-                _fill_row(
-                    par, table, dy, first, last, hole_first, hole_last, light, shift_x, shift_y
-                )
-                for step in range(-1, 2):
-                    if start <= i + step < stop:
-                        low, high, w_light = 0, nx - 1, 5 / 24
-                        if smooth:
-                            low, high = _row_span(par, dy + step, w_smooth[k], nx)
-                        if step == 0:
-                            w_light = 14 / 24
-                        total += _add_row(
-                            grid[i + step],
-                            share[i + step - start],
-                            *(first, last, low, high),
-                            *(light, shift_x, shift_y),
-                            w_light,
-                            float(step),
-                        )
-            landed[block, k] = total
-    result = np.zeros(rows.shape[0])
-    for block in range(n_blocks):
-        result += landed[block]
-    return result
+            hole_first, hole_last = _row_span(par, dy, w_zone[k], nx)
+            _fill_row(par, table, dy, first, last, hole_first, hole_last, light, shift_x, shift_y)
+            for step in range(-1, 2):
+                if start <= i + step < stop:
+                    low, high, w_light = 0, nx - 1, 5 / 24
+                    if smooth:
+                        low, high = _row_span(par, dy + step, w_smooth[k], nx)
+                    if step == 0:
+                        w_light = 14 / 24
+                    total += _add_row(
+                        grid[i + step],
+                        share[i + step - start],
+                        *(first, last, low, high),
+                        *(light, shift_x, shift_y),
+                        w_light,
+                        float(step),
+                    )
+        landed[k] = total

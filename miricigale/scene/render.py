@@ -10,6 +10,7 @@ from miricigale.profiles import sersic_enclosed_fraction, sersic_radius
 from miricigale.profiles.sersic import light_table, parameter_rows
 from miricigale.scene import _core
 from miricigale.scene.convolve import Places, convolve, phases
+from miricigale.scene.deposit import deposit_profiles
 from miricigale.utils.exceptions import argument_error
 
 __all__ = ["FieldPainter", "Painter"]
@@ -54,8 +55,7 @@ class Painter:
     max_radius : float, optional
         Largest semi-major axis of that isophote in pixels.
     workers : int, optional
-        Threads of the Fourier transforms; all processors if not given. The image does
-        not depend on it.
+        Threads; all processors if not given. The image does not depend on it.
     """
 
     shape: tuple
@@ -186,9 +186,9 @@ class Painter:
             cut = np.maximum(cut, zone)
             w_zone, w_cut = (zone / radius) ** 2, (cut / radius) ** 2
             w_smooth = _core.smooth_from(rows, w_zone, w_cut)
-            landed = _core.deposit_outskirts(grid, rows, tables, w_zone, w_smooth, w_cut, land)
-            landed += _core.deposit_cusps(grid, rows, tables, w_zone, land)
-            in_image[extended] = landed
+            in_image[extended] = deposit_profiles(
+                grid, rows, tables, w_zone, w_smooth, w_cut, land, workers=self.workers
+            )
             kept[extended] = sersic_enclosed_fraction(cut / radius, index)
         points = ~extended
         for row, (dx, dy, share) in (images or {}).items():
