@@ -19,7 +19,7 @@ __all__ = [
 ]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def polygon_coverage(vertices, n, step, rows):
     """
     Fraction of each cell of a centred square grid that lies inside a polygon.
@@ -58,7 +58,13 @@ def polygon_coverage(vertices, n, step, rows):
                 count += 1
         if count < 2:
             continue
-        crossings[:count].sort()
+        # few, and numba takes seconds to compile a sort
+        for i in range(1, count):
+            x, k = crossings[i], i
+            while k > 0 and crossings[k - 1] > x:
+                crossings[k] = crossings[k - 1]
+                k -= 1
+            crossings[k] = x
         j = line // rows
         for pair in range(count // 2):
             left = min(max(crossings[2 * pair], 0.0), float(n))
@@ -260,7 +266,7 @@ def line_scatter(image, kernel, axis):
     return np.ascontiguousarray(np.moveaxis(result, -1, axis))
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _overlap(dx, dy, radius, parts):
     """Part of the unit square around (dx, dy) inside a circle around 0."""
     if radius >= 12.0:
@@ -276,7 +282,36 @@ def _overlap(dx, dy, radius, parts):
     return area / parts
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
+def _sorted_sums(image, x_center, y_center, radii):
+    """`radial_sums` for radii in ascending order."""
+    m = radii.size
+    full = np.zeros(m + 1)
+    sums = np.zeros(m)
+    for j in range(image.shape[0]):
+        dy = j - y_center
+        for i in range(image.shape[1]):
+            dx = i - x_center
+            r = math.sqrt(dx * dx + dy * dy)
+            # half a diagonal either way: circles below do not see it, those above see all
+            k, stop = 0, m
+            while k < stop:
+                middle = (k + stop) // 2
+                if radii[middle] < r - 0.71:
+                    k = middle + 1
+                else:
+                    stop = middle
+            while k < m and radii[k] < r + 0.71:
+                sums[k] += image[j, i] * _overlap(dx, dy, radii[k], 16)
+                k += 1
+            full[k] += image[j, i]
+    running = 0.0
+    for k in range(m):
+        running += full[k]
+        sums[k] += running
+    return sums
+
+
 def radial_sums(image, x_center, y_center, radii):
     """
     Sums of an image inside circles.
@@ -297,24 +332,8 @@ def radial_sums(image, x_center, y_center, radii):
     -------
     sums : `~numpy.ndarray`, shape (m,)
     """
-    m = radii.size
+    image, radii = np.ascontiguousarray(image, float), np.asarray(radii, float)
     order = np.argsort(radii)
-    sorted_radii = radii[order]
-    full = np.zeros(m + 1)
-    sums = np.zeros(m)
-    for j in range(image.shape[0]):
-        dy = j - y_center
-        for i in range(image.shape[1]):
-            dx = i - x_center
-            r = math.sqrt(dx * dx + dy * dy)
-            # half a diagonal either way: circles below do not see it, those above see all
-            k = np.searchsorted(sorted_radii, r - 0.71)
-            while k < m and sorted_radii[k] < r + 0.71:
-                sums[order[k]] += image[j, i] * _overlap(dx, dy, sorted_radii[k], 16)
-                k += 1
-            full[k] += image[j, i]
-    running = 0.0
-    for k in range(m):
-        running += full[k]
-        sums[order[k]] += running
+    sums = np.empty(radii.size)
+    sums[order] = _sorted_sums(image, float(x_center), float(y_center), radii[order])
     return sums

@@ -9,8 +9,10 @@ from miricigale.detector._core.random import (
     PTRS_FROM,
     advance,
     fill_normals,
+    inversion_table,
     poisson,
     poisson_inversion,
+    poisson_lookup,
     ptrs_constants,
     ptrs_rest,
     seed_stream,
@@ -42,30 +44,55 @@ def add_poisson(ramp, mean, key, first_row):
     """
     n_int, n_group, n_row, n_col = ramp.shape
     state = np.empty(4, np.uint64)
+    columns = np.empty(n_col, np.int64)
     mu = np.empty(n_col)
     a = np.empty(n_col)
     b = np.empty(n_col)
     c = np.empty(n_col)
+    inverse_alpha = np.empty(n_col)
+    log_mu = np.empty(n_col)
     total = np.empty(n_col)
+    steps, guide = np.empty(0, np.int64), np.empty(0, np.int64)
+    tabulated = -1.0
     for r in range(n_row):
+        # pixels without light draw nothing
+        n = 0
+        alike = True
         for x in range(n_col):
-            mu[x] = min(mean[r, x], _MEAN_MAX)
-            if mu[x] < PTRS_FROM:
-                c[x] = math.exp(-mu[x])
-            else:
-                a[x], b[x], c[x] = ptrs_constants(mu[x])
+            if mean[r, x] > 0.0:
+                columns[n] = x
+                mu[n] = min(mean[r, x], _MEAN_MAX)
+                alike = alike and mu[n] == mu[0]
+                n += 1
+        if n == 0:
+            continue
+        # one mean for all, such as the dark current's
+        alike = alike and mu[0] < PTRS_FROM
+        if alike:
+            if mu[0] != tabulated:
+                tabulated = mu[0]
+                steps, guide = inversion_table(tabulated)
+        else:
+            for m in range(n):
+                if mu[m] < PTRS_FROM:
+                    c[m] = math.exp(-mu[m])
+                else:
+                    a[m], b[m], c[m], inverse_alpha[m], log_mu[m] = ptrs_constants(mu[m])
         for i in range(n_int):
             seed_stream(state, key, i, first_row + r)
             s0, s1, s2, s3 = state[0], state[1], state[2], state[3]
             total[:] = 0.0
             for g in range(n_group):
-                for x in range(n_col):
-                    if mu[x] <= 0.0:
-                        k = 0.0
-                    elif mu[x] < PTRS_FROM:
+                if alike:
+                    for m in range(n):
                         s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
-                        k = poisson_inversion(unit(bits), mu[x], c[x])
-                    else:
+                        total[m] += poisson_lookup(bits, steps, guide)
+                else:
+                    for m in range(n):
+                        if mu[m] < PTRS_FROM:
+                            s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
+                            total[m] += poisson_inversion(unit(bits), mu[m], c[m])
+                            continue
                         k = -1.0
                         while k < 0.0:
                             s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
@@ -73,11 +100,15 @@ def add_poisson(ramp, mean, key, first_row):
                             s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
                             v = unit(bits)
                             us = 0.5 - abs(u)
-                            k = math.floor((2.0 * a[x] / us + b[x]) * u + mu[x] + 0.43)
-                            if us < 0.07 or v > c[x]:
-                                k = ptrs_rest(mu[x], a[x], b[x], v, k, us)
-                    total[x] += k
-                    ramp[i, g, r, x] += np.float32(total[x])
+                            k = math.floor((2.0 * a[m] / us + b[m]) * u + mu[m] + 0.43)
+                            if us < 0.07 or v > c[m]:
+                                k = ptrs_rest(
+                                    mu[m], a[m], b[m], inverse_alpha[m], log_mu[m], v, k, us
+                                )
+                        total[m] += k
+                row = ramp[i, g, r]
+                for m in range(n):
+                    row[columns[m]] += np.float32(total[m])
 
 
 @njit(cache=True, nogil=True)
@@ -119,8 +150,11 @@ def add_latent(ramp, rates, released, key, first_row):
 def _push(deposits, n, slot, head, row, col, charge):
     """Append one deposit to the list of its group; returns the (grown) list and its length."""
     if n == deposits.shape[0]:
+        # by hand: an assignment of slices takes seconds to compile
         grown = np.empty((2 * n, 4))
-        grown[:n] = deposits
+        for i in range(n):
+            for j in range(4):
+                grown[i, j] = deposits[i, j]
         deposits = grown
     deposits[n, 0] = head[slot]
     deposits[n, 1] = row

@@ -16,10 +16,12 @@ __all__ = [
     "PTRS_FROM",
     "advance",
     "fill_normals",
+    "inversion_table",
     "log_factorial",
     "mix",
     "poisson",
     "poisson_inversion",
+    "poisson_lookup",
     "ptrs_constants",
     "ptrs_rest",
     "seed_stream",
@@ -46,6 +48,10 @@ _TO_UNIT = 2.0**-53
 #: Means from which PTRS is used (it needs at least 10).
 PTRS_FROM = 10.0
 
+#: Parts of the unit interval in which a table of inversions is entered.
+GUIDE = 1024
+_TO_GUIDE = np.int64(53 - 10)
+
 _ZIGGURAT_R = 3.6541528853610088
 _ZIGGURAT_V = 0.00492867323399
 
@@ -65,8 +71,18 @@ def _ziggurat_tables():
 
 _ZIG_X, _ZIG_F = _ziggurat_tables()
 
-# log(k!) for small k; Stirling's series beyond
-_LOG_FACTORIAL = np.array([math.lgamma(k + 1.0) for k in range(128)])
+def _stirling(k):
+    n = k + 1.0
+    return (
+        (n - 0.5) * math.log(n) - n + 0.9189385332046727 + (1.0 - 1.0 / (30.0 * n * n)) / (12.0 * n)
+    )
+
+
+# log(k!): exact for small k, Stirling's series beyond, tabulated as far as skies reach
+_LOG_FACTORIAL = np.array(
+    [math.lgamma(k + 1.0) if k < 128 else _stirling(float(k)) for k in range(8192)]
+)
+_stirling = njit(cache=True, nogil=True)(_stirling)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -159,12 +175,7 @@ def fill_normals(s, out):
 
 @njit(cache=True, nogil=True, inline="always")
 def log_factorial(k):
-    if k < 128.0:
-        return _LOG_FACTORIAL[int(k)]
-    n = k + 1.0
-    return (
-        (n - 0.5) * math.log(n) - n + 0.9189385332046727 + (1.0 - 1.0 / (30.0 * n * n)) / (12.0 * n)
-    )
+    return _LOG_FACTORIAL[int(k)] if k < 8192.0 else _stirling(k)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -181,21 +192,71 @@ def poisson_inversion(u, mean, p0):
 
 
 @njit(cache=True, nogil=True)
-def ptrs_rest(mean, a, b, v, k, us):
-    """The slow part of PTRS; negative if the pair is rejected."""
-    if k < 0.0 or (us < 0.013 and v > us):
-        return -1.0
-    inverse_alpha = 1.1239 + 1.1328 / (b - 3.4)
-    left = math.log(v * inverse_alpha / (a / (us * us) + b))
-    if left <= k * math.log(mean) - mean - log_factorial(k):
-        return k
-    return -1.0
+def inversion_table(mean):
+    """
+    Where `poisson_inversion` goes from one number to the next, for many draws of one mean.
+
+    Parameters
+    ----------
+    mean : float
+        Below about 10.
+
+    Returns
+    -------
+    steps : `~numpy.ndarray` of int64, shape (n,)
+        The first of the 2^53 draws that gives more than 0, more than 1, ...; the last is 2^53.
+    guide : `~numpy.ndarray` of int64, shape (GUIDE,)
+        The number that the first draw of each of so many equal parts gives.
+    """
+    p0 = math.exp(-mean)
+    steps = np.empty(201, np.int64)
+    low, end = np.int64(0), np.int64(1) << 53
+    n = 0
+    while low < end:
+        # the number never falls as the draw grows: bisection
+        high = end
+        while low < high:
+            middle = (low + high) // 2
+            if poisson_inversion((float(middle) + 0.5) * _TO_UNIT, mean, p0) > n:
+                high = middle
+            else:
+                low = middle + 1
+        steps[n] = low
+        n += 1
+    guide = np.empty(GUIDE, np.int64)
+    k = 0
+    for part in range(GUIDE):
+        while part * (end // GUIDE) >= steps[k]:
+            k += 1
+        guide[part] = k
+    return steps[:n], guide
+
+
+@njit(cache=True, nogil=True, inline="always")
+def poisson_lookup(bits, steps, guide):
+    """The number that `poisson_inversion` gives for a draw, bit for bit, from the tables of its mean."""
+    draw = np.int64(bits >> _U11)
+    k = guide[draw >> _TO_GUIDE]
+    while draw >= steps[k]:
+        k += 1
+    return k
 
 
 @njit(cache=True, nogil=True, inline="always")
 def ptrs_constants(mean):
+    """The constants a, b, v_r, 1 / alpha of PTRS, and the logarithm of the mean."""
     b = 0.931 + 2.53 * math.sqrt(mean)
-    return -0.059 + 0.02483 * b, b, 0.9277 - 3.6224 / (b - 2.0)
+    a = -0.059 + 0.02483 * b
+    return a, b, 0.9277 - 3.6224 / (b - 2.0), 1.1239 + 1.1328 / (b - 3.4), math.log(mean)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def ptrs_rest(mean, a, b, inverse_alpha, log_mean, v, k, us):
+    """The slow part of PTRS; negative if the pair is rejected."""
+    if k < 0.0 or (us < 0.013 and v > us):
+        return -1.0
+    left = math.log(v * inverse_alpha / (a / (us * us) + b))
+    return k if left <= k * log_mean - mean - log_factorial(k) else -1.0
 
 
 @njit(cache=True, nogil=True)
@@ -205,7 +266,7 @@ def poisson(s, mean):
         return 0.0
     if mean < PTRS_FROM:
         return poisson_inversion(uniform(s), mean, math.exp(-mean))
-    a, b, v_r = ptrs_constants(mean)
+    a, b, v_r, inverse_alpha, log_mean = ptrs_constants(mean)
     k = -1.0
     while k < 0.0:
         u = uniform(s) - 0.5
@@ -213,7 +274,7 @@ def poisson(s, mean):
         us = 0.5 - abs(u)
         k = math.floor((2.0 * a / us + b) * u + mean + 0.43)
         if us < 0.07 or v > v_r:
-            k = ptrs_rest(mean, a, b, v, k, us)
+            k = ptrs_rest(mean, a, b, inverse_alpha, log_mean, v, k, us)
     return k
 
 

@@ -224,8 +224,11 @@ def fit_rows(
                     for i in range(n_all):
                         if cut[i]:
                             if n_event == events.shape[0]:
+                                # by hand: an assignment of slices takes seconds to compile
                                 grown = np.empty((2 * n_event, 5))
-                                grown[:n_event] = events
+                                for k in range(n_event):
+                                    for j in range(5):
+                                        grown[k, j] = events[k, j]
                                 events = grown
                             events[n_event, 0] = y
                             events[n_event, 1] = x
