@@ -123,21 +123,22 @@ def _plane(data, mask, box):
     """Plane through the medians of boxes, clipped."""
     ny, nx = data.shape
     points = []
+    columns = np.arange(0, nx, box)
+    x = 0.5 * (columns + np.minimum(columns + box, nx) - 1)
     for rows in chunks(ny, box):
-        for columns in chunks(nx, box):
-            good = ~mask[rows, columns]
-            # boxes that are mostly masked say little
-            if good.mean() >= 0.3:
-                y, x = (0.5 * (s.start + s.stop - 1) for s in (rows, columns))
-                points.append((1.0, x / nx, y / ny, np.median(data[rows, columns][good])))
+        median, share = _box_medians(data[rows], mask[rows], box)
+        # boxes that are mostly masked say little
+        used = share >= 0.3
+        y = np.full(x.size, 0.5 * (rows.start + rows.stop - 1))
+        points.append(np.stack([np.ones(x.size), x / nx, y / ny, median], axis=1)[used])
+    points = np.concatenate(points)
     if len(points) < 6:
         return np.zeros_like(data)
-    points = np.array(points)
     keep = np.ones(len(points), bool)
     for _ in range(5):
         coef, *_ = np.linalg.lstsq(points[keep, :3], points[keep, 3], rcond=None)
         residual = points[:, 3] - points[:, :3] @ coef
-        spread = _spread(residual[keep])
+        spread = float(_spread(residual[keep]))
         new = np.abs(residual) <= 3 * spread
         if new.sum() < 6 or np.array_equal(new, keep):
             break
@@ -146,26 +147,56 @@ def _plane(data, mask, box):
     return (coef[0] + coef[1] * (x / nx) + coef[2] * (y / ny)).astype(data.dtype)
 
 
+def _box_medians(data, mask, box):
+    """Median of the unmasked pixels of the boxes side by side in some rows, and their share."""
+    height, nx = data.shape
+    n = -(-nx // box)
+    # infinity sorts behind the pixels that count
+    values = np.full((height, n * box), np.inf, data.dtype)
+    values[:, :nx] = np.where(mask, np.inf, data)
+    values = np.sort(values.reshape(height, n, box).swapaxes(0, 1).reshape(n, -1), axis=1)
+    count = np.isfinite(values).sum(axis=1)
+    middle = np.stack([np.maximum(count - 1, 0) // 2, count // 2], axis=1)
+    median = np.take_along_axis(values, np.minimum(middle, values.shape[1] - 1), axis=1)
+    size = np.full(n, height * box)
+    size[-1] = height * (nx - (n - 1) * box)
+    return median.mean(axis=1), count / size
+
+
+def _median(values):
+    """Median of finite values; they are put in another order."""
+    half = values.size // 2
+    values.partition(half)
+    if values.size % 2:
+        return values[half]
+    return np.mean([values[:half].max(), values[half]], dtype=values.dtype)
+
+
 def _spread(values):
-    """Standard deviation from the median of absolute deviations."""
-    return 1.4826 * np.median(np.abs(values - np.median(values)))
+    """Standard deviation from the median of absolute deviations; the values are not kept."""
+    values -= _median(values)
+    return 1.4826 * _median(np.abs(values, out=values))
 
 
 def _detect(residual, rms, mask, sources, threshold):
     """Pixels that rise above the noise of the image, smoothed little and much."""
     good = ~mask & (rms > 0)
-    scaled = np.where(good, residual / np.where(good, rms, 1), 0).astype(np.float32)
+    sky = good & ~sources
+    if not sky.any():
+        return np.zeros(mask.shape, bool)
+    scaled = np.zeros(mask.shape, np.float32)
+    np.divide(residual, rms, out=scaled, where=good, casting="same_kind")
     found = np.zeros(mask.shape, bool)
     for width in _WIDTHS:
         smooth = gaussian_filter(scaled, width, mode="nearest")
         # correlated noise is smoothed less: its width is measured
-        values = smooth[good & ~sources]
-        noise = _spread(values)
+        noise = _spread(smooth[sky])
         high = good & (smooth > threshold * noise)
-        labels, _ = label(high, np.ones((3, 3), bool))
-        large = np.bincount(labels.ravel()) >= _MIN_AREA
-        large[0] = False
-        found |= large[labels]
+        labels, n = label(high, np.ones((3, 3), bool))
+        # the sky, label 0, is most of the image: only what is high is looked at
+        labels = labels[high]
+        large = np.bincount(labels, minlength=n + 1) >= _MIN_AREA
+        found[high] |= large[labels]
     return found
 
 

@@ -71,6 +71,7 @@ def _ziggurat_tables():
 
 _ZIG_X, _ZIG_F = _ziggurat_tables()
 
+
 def _stirling(k):
     n = k + 1.0
     return (
