@@ -124,42 +124,55 @@ def _alike(land, i, k):
 
 
 @njit(cache=True, nogil=True)
-def deposit_points(grid, x, y, flux, land):
+def point_nodes(x, y, flux, land):
     """
-    Put points on the grid.
+    The nodes on which the light of points is deposited.
 
     Parameters
     ----------
-    grid : array, shape (ny, nx)
-        Light on the nodes, changed in place.
     x, y, flux : array, shape (N,)
         Positions in nodes and light.
     land : `Landing`
 
     Returns
     -------
+    i, j : array of int, shape (n,)
+        Row and column of each node of the grid that gets light.
+    light : array, shape (n,)
+        The light that it gets.
     landed : array, shape (N,)
-        Light that lands on the image.
+        Light of each point that lands on the image.
     """
-    landed = np.zeros(x.size)
+    ny, nx = land.low_y.size, land.low_x.size
+    rows, columns = np.empty(16 * x.size, np.int64), np.empty(16 * x.size, np.int64)
+    light, landed = np.empty(16 * x.size), np.zeros(x.size)
     wy, wx, share = np.empty(4), np.empty(4), np.empty(4)
+    n = 0
     for k in range(x.size):
         iy, ix = math.floor(y[k]), math.floor(x[k])
-        j0, j1 = max(ix - 1, 0), min(ix + 3, grid.shape[1])
+        j0, j1 = max(ix - 1, 0), min(ix + 3, nx)
         if j1 <= j0:
             continue
         _spline_weights(y[k] - iy, wy)
         _spline_weights(x[k] - ix, wx)
         for a in range(4):
             i = iy - 1 + a
-            if i < 0 or i >= grid.shape[0]:
+            if i < 0 or i >= ny:
                 continue
             share_row(land, i, j0, share[: j1 - j0])
             for j in range(j0, j1):
-                light = flux[k] * wy[a] * wx[j - ix + 1]
-                grid[i, j] += light
-                landed[k] += light * share[j - j0]
-    return landed
+                rows[n], columns[n] = i, j
+                light[n] = flux[k] * wy[a] * wx[j - ix + 1]
+                landed[k] += light[n] * share[j - j0]
+                n += 1
+    return rows[:n], columns[:n], light[:n], landed
+
+
+@njit(cache=True, nogil=True)
+def deposit_nodes(grid, i, j, light):
+    """Add the light of single nodes to the grid, one after the other."""
+    for k in range(i.size):
+        grid[i[k], j[k]] += light[k]
 
 
 @njit(cache=True, nogil=True)

@@ -195,6 +195,27 @@ def test_sources_on_the_other_side_of_the_sky_do_no_harm(wcs, psf):
     assert np.all(np.isfinite(scene.render().data))
 
 
+def test_points_alone_are_those_beside_a_galaxy(wcs, psf):
+    # alone they are added one by one, beside a galaxy convolved with it
+    x, y = [20.3, 47.9, -1.2, 60.0, 61.5], [31.2, 12.6, 40.4, 60.0, 60.5]
+    points = tools.make_catalog(wcs, x, y)
+    galaxy = tools.make_catalog(wcs, [35.0], [38.0], profile="sersic", radius=0.3, index=1.0)
+    both = tools.make_catalog(
+        wcs,
+        [*x, 35.0],
+        [*y, 38.0],
+        profile=["point"] * len(x) + ["sersic"],
+        radius=[0.0] * len(x) + [0.3],
+        index=1.0,
+    )
+    scenes = [Scene(one, filter=FILTER, wcs=wcs, psf=psf) for one in (points, galaxy, both)]
+    alone, extended, together = (scene.render().data for scene in scenes)
+    # the grid of the transforms is in single precision
+    np.testing.assert_allclose(alone + extended, together, rtol=0, atol=3e-7 * alone.max())
+    flux = [scene.truth["flux_in_image"].value for scene in scenes]
+    np.testing.assert_allclose(np.append(flux[0], flux[1]), flux[2], rtol=1e-12)
+
+
 def test_the_same_on_any_number_of_threads(wcs, psf):
     catalog = tools.make_catalog(
         wcs, [30.0, 60.0], [40.0, 50.0], profile="sersic", radius=0.5, index=4.0, ratio=0.4
