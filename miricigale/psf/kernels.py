@@ -8,23 +8,23 @@ import astropy.units as u
 import numpy as np
 from astropy.io import fits
 from photutils.psf import ImagePSF
-from photutils.psf_matching import make_wiener_kernel
 from scipy.signal import fftconvolve, oaconvolve
 
-from miricigale.psf import _core
 from miricigale.psf.model import make_psf, psf_info
 from miricigale.psf.resample import average_psf, psf_image, psf_mosaic, rotate_psf
+from miricigale.psf.wiener import (
+    REGULARIZATIONS,
+    choose,
+    energy_error,
+    energy_radii,
+    odd_square,
+    wiener,
+)
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits, write_fits
 from miricigale.utils.units import ANGLE, frozen_array, to_array
 
 __all__ = ["REGULARIZATIONS", "MatchingKernel"]
-
-#: Regularisation parameters that have a name; they belong to pixels of 0.06 arcsec.
-REGULARIZATIONS = {"yang2021": 0.03}
-
-# from smooth to sharp: two steps per decade
-_SEQUENCE = tuple(10.0 ** (-0.5 * k) for k in range(2, 17))
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -67,7 +67,7 @@ class MatchingKernel:
         for name in ("array", "source", "target"):
             value = getattr(self, name)
             if value is not None:
-                object.__setattr__(self, name, frozen_array(_odd_square(value, name)))
+                object.__setattr__(self, name, frozen_array(odd_square(value, name)))
         scale = float(to_array(self.pixel_scale, ANGLE, "pixel_scale"))
         if not scale > 0:
             raise argument_error("pixel_scale", "positive", self.pixel_scale)
@@ -114,8 +114,8 @@ class MatchingKernel:
             ``"auto"`` goes through 0.1, 0.03, ... 1e-8, takes the largest error of the
             encircled energy at any radius for each, and chooses the largest mu (the
             smoothest kernel) whose error is at most ``tolerance`` above the smallest.
-        penalty : str, optional
-            As for `photutils.psf_matching.make_wiener_kernel`.
+        penalty : {"laplacian", "biharmonic"}, `~numpy.ndarray` or None, optional
+            What is rough, as for `photutils.psf_matching.make_wiener_kernel`.
         hi_angle, lo_angle : `~astropy.units.Quantity`, optional
             Position angle of the +y axis of a PSF in the detector frame; needed for those,
             refused for PSFs on the sky. An array of angles (rolls, dithers) gives the average.
@@ -165,8 +165,8 @@ class MatchingKernel:
         energy = 1.0 if normalize else float(target.sum())
         source = source / source.sum()
         target = target * (energy / target.sum())
-        make = functools.partial(_wiener, source, target, penalty)
-        mu, errors = _choose(regularization, make, source, target, tolerance)
+        make = wiener(source, target, penalty)
+        mu, errors = choose(regularization, make, source, target, tolerance)
         return cls(
             make(mu),
             pixel_scale=scale * ANGLE,
@@ -251,10 +251,10 @@ class MatchingKernel:
             If the kernel was made without PSFs.
         """
         self._need_psfs()
-        pixels = _radii(self.target)
+        pixels = energy_radii(self.target)
         if radii is not None:
             pixels = np.atleast_1d(to_array(radii, ANGLE, "radii")) / self.pixel_scale.value
-        return _energy_error(self.matched, self.target, np.ascontiguousarray(pixels))
+        return energy_error(self.matched, self.target, np.ascontiguousarray(pixels))
 
     def cropped(self, extent):
         """
@@ -339,19 +339,10 @@ class MatchingKernel:
             raise argument_error("source, target", "the kernel's PSFs", "a kernel without them")
 
 
-def _odd_square(value, name):
-    value = np.asarray(value, dtype=float)
-    if value.ndim != 2 or value.shape[0] != value.shape[1] or value.shape[0] % 2 == 0:
-        raise argument_error(name, "square with an odd number of pixels", f"shape {value.shape}")
-    if not np.all(np.isfinite(value)):
-        raise argument_error(name, "finite", "NaN or infinite pixels")
-    return value
-
-
 def _size(hi, lo, scale, extent):
     """Odd number of pixels on which both PSFs are sampled."""
     arrays = {
-        name: _odd_square(psf, name).shape[0]
+        name: odd_square(psf, name).shape[0]
         for name, psf in (("hi", hi), ("lo", lo))
         if not isinstance(psf, ImagePSF)
     }
@@ -398,40 +389,3 @@ def _on_grid(psf, name, angle, grid_angle, scale, n, resampling):
             raise ValueError(str(err).replace("'angle'", f"'{name}_angle'")) from None
         psf = average_psf(turned) if len(turned) > 1 else turned[0]
     return psf_image(psf, pixel_scale=scale * ANGLE, shape=n)
-
-
-def _wiener(source, target, penalty, mu):
-    kernel = make_wiener_kernel(source, target, regularization=mu, penalty=penalty)
-    return kernel * (target.sum() / kernel.sum())
-
-
-def _radii(image):
-    return np.arange(1.0, image.shape[0] // 2 + 0.25, 0.5)
-
-
-def _energy_error(image, target, radii):
-    c = target.shape[0] // 2
-    return _core.radial_sums(image - target, c, c, radii)
-
-
-def _choose(regularization, make, source, target, tolerance):
-    """The Wiener parameter, and what was measured on the way."""
-
-    def error(mu):
-        matched = fftconvolve(source, make(mu), mode="same")
-        return float(np.abs(_energy_error(matched, target, _radii(target))).max())
-
-    if isinstance(regularization, str):
-        if regularization in REGULARIZATIONS:
-            regularization = REGULARIZATIONS[regularization]
-        elif regularization != "auto":
-            known = ["auto", *REGULARIZATIONS]
-            raise argument_error("regularization", f"positive or one of {known}", regularization)
-    if regularization != "auto":
-        if not regularization > 0:
-            raise argument_error("regularization", "positive", regularization)
-        return float(regularization), {"max_error": error(regularization)}
-    errors = [error(mu) for mu in _SEQUENCE]
-    allowed = min(errors) + tolerance
-    best = next(k for k, value in enumerate(errors) if value <= allowed)
-    return _SEQUENCE[best], {"max_error": errors[best], "smallest_error": min(errors)}

@@ -283,7 +283,11 @@ def psf_mosaic(
         blurred.meta.update(info.meta)
         info = psf_info(blurred)
     axis = (np.arange(n) - n // 2) * cell
-    data = np.mean([_sample(info, axis, axis[:, None], turn) for turn in turns], axis=0)
+    # dithers of one roll are alike
+    alike, counts = np.unique(turns, return_counts=True)
+    data = np.average(
+        [_sample(info, axis, axis[:, None], turn) for turn in alike], axis=0, weights=counts
+    )
     data *= (scale / info.pixel_scale) ** 2
     includes = list(info.includes)
     if resampling == "drizzle":

@@ -2,6 +2,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
+from photutils.psf_matching import make_wiener_kernel
 from scipy.signal import fftconvolve
 
 from miricigale.psf import (
@@ -40,6 +41,23 @@ def test_kernel_between_gaussians_is_the_gaussian_of_the_difference():
     np.testing.assert_allclose(kernel.array, expected, atol=2e-3 * expected.max())
     assert kernel.array.sum() == pytest.approx(1, abs=1e-6)
     assert kernel.noise_gain == pytest.approx(1 / np.sqrt(4 * np.pi * 21), rel=1e-3)
+
+
+@pytest.mark.parametrize("penalty", [None, "laplacian", "biharmonic", np.ones((3, 3)) - 9.0])
+def test_kernel_is_photutils_wiener_kernel(penalty):
+    kind = {"pixel_scale": 0.06 * u.arcsec, "fov": 4 * u.arcsec}
+    hi, lo = (gaussian_psf(w * u.arcsec, **kind) for w in (0.2, 0.5))
+    kernel = MatchingKernel.from_psfs(
+        hi, lo, pixel_scale=0.06 * u.arcsec, regularization=0.01, penalty=penalty
+    )
+    expected = make_wiener_kernel(
+        kernel.source, kernel.target, regularization=0.01, penalty=penalty
+    )
+    expected *= kernel.target.sum() / expected.sum()
+    np.testing.assert_allclose(kernel.array, expected, rtol=0, atol=1e-13)
+    # and the error that goes into the choice is that of the linear convolution
+    error = np.abs(kernel.encircled_energy_error(np.arange(1, 33.1, 0.5) * 0.06 * u.arcsec)).max()
+    assert kernel.meta["max_error"] == pytest.approx(error, rel=1e-6)
 
 
 # PHYSICS: 4.95, 2.8, 1.3, 0.1 % at mu 0.03 and 0.6, 0.2, 0.06, < 0.01 % at 1e-3, measured

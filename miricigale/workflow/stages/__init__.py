@@ -137,9 +137,10 @@ def study_stages():
             "points",
             measure_point_sources,
             "point sources",
+            needs=("kernels",),
             sections=(
                 *images,
-                *kernel[:2],
+                "highres",
                 "photometry.threshold",
                 "photometry.min_area",
                 "point_sources",

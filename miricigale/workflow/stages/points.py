@@ -7,12 +7,12 @@ from astropy.table import QTable
 
 from miricigale.instrument import mosaic_wcs, scaled_limit, tangent_offset
 from miricigale.photometry import ForcedPhotometer, detect_sources
-from miricigale.psf import hst_psf
+from miricigale.psf import MatchingKernel, hst_psf
 from miricigale.scene import highres_image
 from miricigale.utils.random import text_key
 from miricigale.utils.tables import error_column, match_sky
 from miricigale.workflow.stages.exposures import study_exposures
-from miricigale.workflow.stages.images import expose_and_reduce, kernel_of, reducer_of
+from miricigale.workflow.stages.images import expose_and_reduce, reducer_of
 from miricigale.workflow.stages.sample import in_field
 
 __all__ = ["measure_point_sources", "point_catalog"]
@@ -93,7 +93,9 @@ def measure_point_sources(context, name):
         highres, threshold=config.photometry.threshold, min_area=config.photometry.min_area
     )
     photometer = ForcedPhotometer(
-        kernel_of(config, name), fit_background=True, n_threads=context.n_threads
+        MatchingKernel.read(context.path(f"kernel_{name}.fits")),
+        fit_background=True,
+        n_threads=context.n_threads,
     )
     result = photometer.measure(mosaic, highres, segmentation, detected)
     table = catalog["id", "sky"]
