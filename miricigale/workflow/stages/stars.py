@@ -6,7 +6,6 @@ from astropy.modeling.models import BlackBody
 from astropy.table import QTable
 
 from miricigale.filters import FilterSet
-from miricigale.sed import SED
 
 __all__ = ["star_fluxes"]
 
@@ -34,14 +33,9 @@ def star_fluxes(catalog, known, wanted):
     known, wanted = list(known), list(wanted)
     filters = FilterSet.from_names(list(dict.fromkeys([*known, *wanted])))
     first, last = ([filters.names.index(name) for name in names] for names in (known, wanted))
-    models = np.array(
-        [
-            filters.synthetic_fluxes(
-                SED(WAVELENGTHS, (BlackBody(temperature)(WAVELENGTHS) * u.sr).to(u.uJy))
-            ).value
-            for temperature in TEMPERATURES
-        ]
-    )
+    spectra = (BlackBody(TEMPERATURES[:, None])(WAVELENGTHS) * u.sr).to_value(u.uJy)
+    weights = filters.weights(WAVELENGTHS)
+    models = np.array([weights @ spectrum for spectrum in spectra])
     data = np.array([catalog[name].to_value(u.uJy) for name in known]).T
     good = np.isfinite(data) & (data > 0)
     # least squares in the logarithm: equal relative errors, the scale is the mean ratio
