@@ -23,6 +23,6 @@ __getattr__, __dir__, __all__ = lazy_names(
             "running_median",
             "sigma_mad",
         ),
-        "report": ("Report",),
+        "report": ("Missing", "Report", "number"),
     },
 )

@@ -1,6 +1,7 @@
 """One self-contained HTML page: text, tables and figures, no outside file."""
 
 import base64
+import dataclasses
 import html
 import io
 import os
@@ -8,9 +9,61 @@ import string
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
+
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import writing
 
-__all__ = ["Report"]
+__all__ = ["Missing", "Report", "number"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Missing:
+    """
+    A value that there is not: a dash on the page, its reason beneath.
+
+    Parameters
+    ----------
+    reason : str
+        Why there is none.
+    """
+
+    reason: str
+
+    def __str__(self):
+        return "\N{EN DASH}"
+
+
+def number(value, spec, reason, *, scale=1):
+    """
+    Text of a number, or `Missing` where there is none.
+
+    Parameters
+    ----------
+    value : float or None
+        The number; None or not finite is missing.
+    spec : str
+        Format, such as ``"+.2f"``, or one with braces and text around them (``"{:.1f} %"``).
+    reason : str
+        Why it is missing.
+    scale : float, optional
+        Factor before it is written.
+
+    Returns
+    -------
+    text : str or `Missing`
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import number
+    >>> number(0.0123, "{:+.1f} %", "no source", scale=100)
+    '+1.2 %'
+    >>> number(float("nan"), ".2f", "no source")
+    Missing(reason='no source')
+    """
+    if value is None or not np.isfinite(value):
+        return Missing(reason)
+    return (spec if "{" in spec else f"{{:{spec}}}").format(scale * value)
 
 
 class Report:
@@ -23,13 +76,16 @@ class Report:
         Title of the page.
     subtitle : str, optional
         A line beneath it.
+    notices : iterable of str, optional
+        What a reader has to know before anything else, above the first section.
     dpi : int, optional
         Resolution of the figures.
     """
 
-    def __init__(self, title, *, subtitle="", dpi=110):
+    def __init__(self, title, *, subtitle="", notices=(), dpi=110):
         self.title = title
         self.subtitle = subtitle
+        self.notices = tuple(notices)
         self.dpi = dpi
         self._sections = []
 
@@ -48,23 +104,77 @@ class Report:
         """Add a paragraph of plain text."""
         self._add(f"<p>{html.escape(text)}</p>")
 
+    def bullets(self, entries):
+        """Add a list of lines of plain text."""
+        self._add(_bullets(entries))
+
     def items(self, pairs):
-        """Add headline numbers: (label, value) pairs of text."""
-        cells = "".join(
-            f"<div class='item'><b>{html.escape(str(value))}</b><span>{html.escape(str(label))}</span></div>"
-            for label, value in pairs
-        )
+        """Add headline numbers: (label, value) pairs of text; a value may be `Missing`."""
+        cells = ""
+        for label, value in pairs:
+            why = f" ({value.reason})" if isinstance(value, Missing) else ""
+            cells += (
+                f"<div class='item'><b>{html.escape(str(value))}</b>"
+                f"<span>{html.escape(label + why)}</span></div>"
+            )
         self._add(f"<div class='items'>{cells}</div>")
 
-    def table(self, rows, *, header, caption=""):
-        """Add a table: rows of text or numbers under a header."""
-        head = "".join(f"<th>{html.escape(str(name))}</th>" for name in header)
-        body = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>"
-            for row in rows
+    def table(self, rows, *, header, caption="", empty="", text=1):
+        """
+        Add a table.
+
+        Parameters
+        ----------
+        rows : iterable of sequence
+            Cells of text or numbers; those that are `Missing` are dashes, and their reasons
+            stand beneath the table.
+        header : sequence of str
+            Names of the columns.
+        caption : str, optional
+            What stands in it.
+        empty : str, optional
+            Sentence that takes the place of a table without rows.
+        text : int, optional
+            Columns of text at the left; the others are numbers.
+
+        Raises
+        ------
+        ValueError
+            If a row has another number of cells than the header, or there are no rows and no
+            ``empty``.
+        """
+        rows = [tuple(row) for row in rows]
+        if any(len(row) != len(header) for row in rows):
+            lengths = sorted({len(row) for row in rows})
+            raise argument_error("rows", f"{len(header)} cells in each row", lengths)
+        if not rows:
+            if not empty:
+                raise argument_error("rows", "at least one, or 'empty' for the sentence", "none")
+            return self.text(empty)
+        reasons = list(
+            dict.fromkeys(cell.reason for row in rows for cell in row if isinstance(cell, Missing))
         )
+        # one reason needs no number
+        marks = {why: str(k) if len(reasons) > 1 else "" for k, why in enumerate(reasons, start=1)}
+
+        def shown(cell):
+            mark = marks[cell.reason] if isinstance(cell, Missing) else ""
+            return f"{html.escape(str(cell))}{f'<sup>{mark}</sup>' if mark else ''}"
+
+        def cells(row, tag):
+            return "".join(
+                f"<{tag}{' class=t' if k < text else ''}>{shown(cell)}</{tag}>"
+                for k, cell in enumerate(row)
+            )
+
+        body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in rows)
         caption = f"<caption>{html.escape(caption)}</caption>" if caption else ""
-        self._add(f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
+        notes = "; ".join(f"{shown(Missing(why))} {html.escape(why)}" for why in reasons)
+        notes = f"<p class='note'>{notes}</p>" if notes else ""
+        return self._add(
+            f"<div class='table'><table>{caption}<thead><tr>{cells(header, 'th')}</tr></thead>"
+            f"<tbody>{body}</tbody></table>{notes}</div>"
+        )
 
     def figure(self, figure, caption="", *, name=None, folder=None):
         """
@@ -82,7 +192,11 @@ class Report:
             Folder for the separate PNG.
         """
         buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=self.dpi, bbox_inches="tight")
+        # a layout engine has found room for all texts already
+        tight = None if figure.get_layout_engine() else "tight"
+        # without the version of matplotlib, which is no part of the picture
+        meta = {"Software": None}
+        figure.savefig(buffer, format="png", dpi=self.dpi, bbox_inches=tight, metadata=meta)
         figure.clear()
         if name and folder:
             Path(folder).mkdir(parents=True, exist_ok=True)
@@ -111,6 +225,7 @@ class Report:
         return template.substitute(
             title=html.escape(self.title),
             subtitle=html.escape(self.subtitle),
+            notices=f"<aside>{_bullets(self.notices)}</aside>" if self.notices else "",
             contents=contents,
             body=body,
         )
@@ -130,3 +245,7 @@ class Report:
             partial.write_text(self.to_html(), encoding="utf-8")
         os.replace(partial, path)
         return path
+
+
+def _bullets(entries):
+    return "<ul>" + "".join(f"<li>{html.escape(str(entry))}</li>" for entry in entries) + "</ul>"

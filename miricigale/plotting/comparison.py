@@ -98,7 +98,9 @@ def plot_offsets(true, offset, *, running=None, ax=None, title=None, limit=1.0, 
     if running is not None and len(running[0]):
         mid, median, sigma = running
         ax.fill_between(mid, median - sigma, median + sigma, color=SECOND, alpha=0.18, lw=0)
-        ax.plot(mid, median, color=SECOND, lw=1.8, label="running median, scatter")
+        # a single bin makes no line
+        mark = "o" if len(mid) == 1 else None
+        ax.plot(mid, median, color=SECOND, lw=1.8, marker=mark, label="running median, scatter")
         ax.legend(loc="lower left", fontsize=8, frameon=False)
     x_label, y_label = labels or ("true magnitude (AB)", "measured - true (mag)")
     ax.set(ylim=(-limit, limit), xlabel=x_label, ylabel=y_label, title=title)
@@ -125,13 +127,13 @@ def plot_error_function(flux, sigma, *, limits=None, ax=None, colors=None):
     ax : `~matplotlib.axes.Axes`
     """
     ax = resolve_axes(ax)
-    for name in flux:
-        (line,) = ax.loglog(
-            flux[name], sigma[name], lw=1.6, label=name, color=(colors or {}).get(name)
-        )
+    for k, name in enumerate(flux):
+        # neighbours differ in more than a shade
+        style = {"color": (colors or {}).get(name), "ls": ("-", "--")[k % 2]}
+        (line,) = ax.loglog(flux[name], sigma[name], lw=1.6, label=name, **style)
         if limits and np.isfinite(limits[name]):
             ax.plot(limits[name], limits[name] / 5, "o", color=line.get_color(), ms=5)
-    ax.set(xlabel=r"flux ($\mu$Jy)", ylabel=r"1$\sigma$ error ($\mu$Jy)")
+    ax.set(xlabel="flux (µJy)", ylabel=r"1$\sigma$ error (µJy)")
     ax.legend(fontsize=8, frameon=False)
     return ax
 

@@ -6,6 +6,7 @@ from miricigale.plotting.axes import new_figure, resolve_axes
 
 __all__ = [
     "color_image",
+    "mark_sky",
     "plot_color",
     "plot_image",
     "plot_model_residual",
@@ -108,8 +109,13 @@ def plot_image(
         extent=_extent(image.shape, pixel_scale, center),
     )
     if colorbar is not None:
-        # the ticks of an asinh scale crowd about zero
-        ticks = None if stretch == "linear" else [0.0, *(limits[1] * np.array([0.03, 0.2, 1.0]))]
+        ticks = None
+        if stretch == "asinh":
+            # from the bright end, as many as there is room for on the bar
+            ticks = []
+            for tick in limits[1] * np.array([1.0, 0.2, 0.03, 0.0]):
+                if not ticks or norm(ticks[-1]) - norm(tick) > 0.08:
+                    ticks.append(tick)
         bar = ax.figure.colorbar(drawn, ax=ax, label=colorbar, shrink=0.85, ticks=ticks)
         if ticks is not None:
             bar.set_ticks(ticks, labels=[f"{tick:.2g}" for tick in ticks])
@@ -193,7 +199,7 @@ def color_image(red, green, blue, *, scale=None, softening=8.0, stretch=6.0):
     Parameters
     ----------
     red, green, blue : array_like, shape (ny, nx)
-        Images on the same pixels. NaN is black.
+        Images on the same pixels. A pixel with NaN in one of them is black.
     scale : (float, float, float), optional
         Factors for the three; by default each is divided by its own noise, so that the
         sky is grey.
@@ -224,7 +230,10 @@ def color_image(red, green, blue, *, scale=None, softening=8.0, stretch=6.0):
         middle, sigma = _robust(plane)
         factor = 1 / sigma if scale is None else scale[k]
         scaled.append(np.nan_to_num((plane - middle) * factor, nan=0.0))
-    return make_lupton_rgb(*scaled, minimum=-1.0, stretch=stretch, Q=softening)
+    image = make_lupton_rgb(*scaled, minimum=-1.0, stretch=stretch, Q=softening)
+    # a colour of two bands would be a wrong one
+    image[np.any(np.isnan(planes), axis=0)] = 0
+    return image
 
 
 def plot_color(red, green, blue, *, ax=None, pixel_scale=1.0, title=None, center=None, **kwargs):
@@ -253,6 +262,49 @@ def plot_color(red, green, blue, *, ax=None, pixel_scale=1.0, title=None, center
         extent=_extent(image.shape[:2], pixel_scale, center),
     )
     return _label(ax, title)
+
+
+def mark_sky(ax, length, *, north=(0, 1), east=(-1, 0), color="black"):
+    """
+    Mark scale and directions on an image with axes in arcsec, instead of ticks.
+
+    Parameters
+    ----------
+    ax : `~matplotlib.axes.Axes`
+        Of `plot_image` or `plot_color`.
+    length : float
+        Length of the bar in arcsec.
+    north, east : (float, float), optional
+        Directions (x, y) of north and east on the image.
+    color : str, optional
+        Of bar, arrows and letters, which have a thin edge of the opposite shade.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    from matplotlib.colors import to_rgb
+    from matplotlib.patheffects import withStroke
+
+    edge = [withStroke(linewidth=2.5, foreground="black" if np.mean(to_rgb(color)) > 0.5 else "w")]
+    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    width, height = right - left, top - bottom
+    x, y = left + 0.05 * width, bottom + 0.045 * height
+    style = {"color": color, "path_effects": edge}
+    ax.plot([x, x + length], [y, y], lw=2, solid_capstyle="butt", **style)
+    text = {"ha": "center", "va": "center", "fontsize": 8, **style}
+    ax.text(x + length / 2, y + 0.03 * height, f'{length:g}"', **text)
+    size = 0.09 * min(width, height)
+    # room for both arrows, wherever they point
+    origin = np.array([right - 0.05 * width - 1.2 * size, bottom + 0.045 * height + 0.3 * size])
+    for direction, letter in ((north, "N"), (east, "E")):
+        step = size * np.asarray(direction, float) / np.hypot(*direction)
+        arrow = {"arrowstyle": "-|>", "color": color, "lw": 1.3, "shrinkA": 0, "shrinkB": 0}
+        note = ax.annotate("", origin + step, origin, arrowprops=arrow)
+        note.arrow_patch.set_path_effects(edge)
+        ax.text(*(origin + 1.35 * step), letter, **text)
+    ax.set(xlim=(left, right), ylim=(bottom, top), xticks=[], yticks=[], xlabel="", ylabel="")
+    return ax
 
 
 def plot_segmentation(

@@ -1,5 +1,7 @@
 """Posteriors of one object: one and two parameters, and its photometry with the best model."""
 
+import itertools
+
 import astropy.units as u
 import numpy as np
 
@@ -16,6 +18,9 @@ __all__ = [
 
 #: Upper limits: a bar, and an arrow down from it.
 _ARROW = {"fmt": "_", "uplims": True, "color": "tab:blue", "markersize": 10, "zorder": 4}
+
+#: Colours and markers of groups of bands, which differ in shade too.
+_GROUPS = (("tab:blue", "o"), ("#9a3412", "D"), ("0.35", "^"))
 
 
 def _value(quantity, unit=None):
@@ -154,6 +159,8 @@ def plot_sed_fit(
     used=None,
     limit=None,
     spectrum=None,
+    parts=None,
+    groups=None,
     ax=None,
     title=None,
 ):
@@ -174,6 +181,11 @@ def plot_sed_fit(
         Bands whose flux is an upper limit: a bar with an arrow down.
     spectrum : pair of `~astropy.units.Quantity`, optional
         Wavelength and flux density of the best model.
+    parts : dict of str to pair of `~astropy.units.Quantity`, optional
+        Further spectra by label, such as the components of the best model.
+    groups : array_like of str, shape (n,), optional
+        Label of each measured band; every label has its own colour and marker. With ``parts`` or
+        ``groups`` there is a legend.
     ax : `~matplotlib.axes.Axes` or pair of them, optional
         Where to draw. One gets no residuals; without, a new figure is made.
     title : str, optional
@@ -200,23 +212,38 @@ def plot_sed_fit(
     limits = np.concatenate([flux[have & (flux > 0)], model[np.isfinite(model) & (model > 0)]])
     low, high = (limits.min() / 4, limits.max() * 4) if limits.size else (0.1, 10.0)
     if spectrum is not None:
-        x, y = _value(spectrum[0], u.um), _value(spectrum[1], u.uJy)
+        parts = {"best model": spectrum, **(parts or {})}
+    styles = [
+        ("0.45", "-", 1.1),
+        *((f"C{k}", ls, 1.0) for k, ls in ((1, "--"), (2, "-."), (4, ":"))),
+    ]
+    for k, (label, (x, y)) in enumerate((parts or {}).items()):
+        x, y = _value(x, u.um), _value(y, u.uJy)
         shown = (x > 0.5 * wave.min()) & (x < 2.0 * wave.max())
-        ax.plot(x[shown], y[shown], color="0.6", linewidth=0.8, zorder=1, label="best model")
-    ax.plot(wave, model, "s", color="tab:orange", markersize=7, fillstyle="none", zorder=3)
+        color, line, width = styles[k % len(styles)]
+        ax.plot(x[shown], y[shown], color=color, ls=line, linewidth=width, zorder=1, label=label)
+    ax.plot(
+        wave, model, "s", color="tab:orange", markersize=7, fillstyle="none", zorder=3,
+        label="best model in the bands",
+    )  # fmt: skip
+    groups = np.full(wave.size, "") if groups is None else np.asarray(groups, str)
+    kinds = dict(zip(dict.fromkeys(groups.tolist()), itertools.cycle(_GROUPS)))
     above = have & (flux > 0) & ~limit
     below = have & ~(flux > 0) & ~limit
-    for keep, fill in ((above & used, "full"), (above & ~used, "none")):
-        ax.errorbar(
-            wave[keep],
-            flux[keep],
-            yerr=err[keep],
-            fmt="o",
-            color="tab:blue",
-            fillstyle=fill,
-            markersize=5,
-            zorder=4,
-        )
+    for group, (color, marker) in kinds.items():
+        for keep, fill in ((used, "full"), (~used, "none")):
+            keep = keep & above & (groups == group)
+            ax.errorbar(
+                wave[keep],
+                flux[keep],
+                yerr=err[keep],
+                fmt=marker,
+                color=color,
+                fillstyle=fill,
+                markersize=5,
+                zorder=4,
+                label=group if group and fill == "full" else None,
+            )
     top = np.maximum(flux, 0.0) + 2.0 * err
     if np.any(below):
         # two sigma above a flux that is not positive
@@ -229,18 +256,22 @@ def plot_sed_fit(
     ax.set_yscale("log")
     ax.set_xlim(0.7 * wave.min(), 1.4 * wave.max())
     ax.set_ylim(low, high)
-    ax.set_ylabel("flux density (uJy)")
+    ax.set_ylabel("flux density (µJy)")
+    if parts or len(kinds) > 1:
+        ax.legend(fontsize=8, frameon=False)
     if title is not None:
         ax.set_title(title, fontsize="medium")
     if residual_ax is None:
-        ax.set_xlabel("observed wavelength (um)")
+        ax.set_xlabel("observed wavelength (µm)")
         return ax
     pull = np.where(have, (flux - model) / np.where(have, err, 1.0), np.nan)
     residual_ax.axhline(0.0, color="0.6", linewidth=0.8)
-    for keep, fill in ((used & ~limit, "full"), (~used & ~limit, "none")):
-        residual_ax.plot(
-            wave[keep], pull[keep], "o", color="tab:blue", fillstyle=fill, markersize=5
-        )
+    for group, (color, marker) in kinds.items():
+        for keep, fill in ((used, "full"), (~used, "none")):
+            keep = keep & ~limit & (groups == group)
+            residual_ax.plot(
+                wave[keep], pull[keep], marker, color=color, fillstyle=fill, markersize=5
+            )
     # of limits only those that the model passes have to be seen
     seen = have & ~(limit & (pull > 0))
     size = np.nanmax(np.abs(pull[seen]), initial=2.5) * 1.15
@@ -248,7 +279,7 @@ def plot_sed_fit(
         residual_ax.errorbar(wave[bound], pull[bound], yerr=0.25 * size, **_ARROW)
     residual_ax.set_ylim(-size, size)
     residual_ax.set_ylabel("residual (sigma)")
-    residual_ax.set_xlabel("observed wavelength (um)")
+    residual_ax.set_xlabel("observed wavelength (µm)")
     return ax, residual_ax
 
 
@@ -296,8 +327,8 @@ def plot_sed_band(wave, bands, *, ax=None, rest=True, color="tab:blue", label=No
     ax.set_yscale("log")
     if top > 0:
         ax.set_ylim(1e-5 * top, 3.0 * top)
-    ax.set_xlabel(f"{'rest' if rest else 'observed'} wavelength (um)")
-    ax.set_ylabel("nu L_nu (W)" if rest else "flux density (uJy)")
+    ax.set_xlabel(f"{'rest' if rest else 'observed'} wavelength (µm)")
+    ax.set_ylabel("nu L_nu (W)" if rest else "flux density (µJy)")
     return ax
 
 

@@ -36,6 +36,7 @@ def study_stages():
     )
     from miricigale.workflow.stages.measure import fit_photometry, make_errors, measure_photometry
     from miricigale.workflow.stages.points import measure_point_sources
+    from miricigale.workflow.stages.provenance import IMAGE_RESOURCES
     from miricigale.workflow.stages.report import make_report
 
     images = ("pointing", "exposures", "scene", "detector", "reduction")
@@ -43,15 +44,8 @@ def study_stages():
     kernel = ("highres", "photometry.regularization", "reduction")
     # the preset takes the best libraries that there are: a new one makes a new result
     sed_data = (*SEDModel.yang2021().resources, "filters.sedpy")
-    image_data = (
-        "instrument.siaf",
-        "instrument.imager",
-        "instrument.thermal",
-        "psf.jwst_pupil",
-        "filters.sedpy",
-    )
     # residual = "etc" says whose pattern it is, not how strong
-    exposure_data = (*image_data, "instrument.etc")
+    exposure_data = (*IMAGE_RESOURCES, "instrument.etc")
     return (
         Stage(
             "catalog",
@@ -122,7 +116,7 @@ def study_stages():
             make_kernel,
             "matching kernel",
             sections=(*grid, *kernel),
-            resources=image_data,
+            resources=IMAGE_RESOURCES,
             units=_filters,
             plan=exposure_plan,
         ),
@@ -178,6 +172,7 @@ def study_stages():
             "report",
             make_report,
             "report",
+            version=2,
             needs=(
                 "catalog",
                 "truth",
@@ -192,13 +187,16 @@ def study_stages():
             sections=(
                 *grid,
                 "run.name",
-                "catalog.mag_limit",
+                "catalog",
                 "sed",
+                "detector",
                 "highres.filter",
                 "fit",
                 "errors",
                 "point_sources",
                 "report",
             ),
+            resources=(*sed_data, *exposure_data),
+            plan=exposure_plan,
         ),
     )

@@ -1,10 +1,7 @@
-"""Figures of the report, from tables and images."""
+"""Figures of the report, from tables."""
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import SkyCoord
-from astropy.visualization import simple_norm
-from scipy.spatial import ConvexHull
 
 from miricigale.evaluation import (
     main_sequence_sfr,
@@ -12,6 +9,7 @@ from miricigale.evaluation import (
     running_median,
     sfr_to_infrared_luminosity,
 )
+from miricigale.filters import Filter
 from miricigale.plotting.axes import new_figure
 from miricigale.plotting.comparison import (
     MEASURED,
@@ -24,252 +22,333 @@ from miricigale.plotting.comparison import (
     plot_redshifts,
     plot_relation,
 )
-from miricigale.sed import COSMOLOGY, SEDModel
+from miricigale.sed import COSMOLOGY
 from miricigale.workflow.stages.sample import magnitude
 
 __all__ = [
-    "catalog_area",
-    "colour_figure",
+    "WIDTH",
+    "band_label",
     "counts_figure",
     "error_figure",
     "example_figure",
     "fraction_figure",
     "input_figure",
+    "limit_figure",
     "magnitude_figure",
     "offset_figure",
     "point_figure",
     "redshift_figure",
-    "triptych_figure",
+    "three_bands",
 ]
 
-
-def _noise(data):
-    """Robust scatter of an image about its median."""
-    values = data[np.isfinite(data)]
-    return 1.4826 * np.median(np.abs(values - np.median(values)))
-
-
-def _filled(image, floor=0.0):
-    data = np.array(image.data, float)
-    bad = ~np.isfinite(data)
-    if image.mask is not None:
-        bad |= np.asarray(image.mask, bool)
-    data[bad] = floor
-    return data
+#: Inches across: all figures of the page are shown at one width, so that letters have one size.
+WIDTH = 10.5
+#: With and without MIRI.
+FIT_COLORS = {"with_miri": MEASURED, "without_miri": SECOND}
 
 
-def colour_figure(blue, green, red, prior, names):
-    """The three-colour MIRI image beside the high-resolution image of the same field."""
-    figure, axes = new_figure(1, 2, size=(4.8, 6.8))
-    channels = []
-    for image in (red, green, blue):
-        data = _filled(image)
-        # one scale for all channels, in units of their own noise
-        channels.append(np.arcsinh(np.clip(data / _noise(data[data != 0]) - 1, 0, None) / 4))
-    rgb = np.stack(channels, axis=-1)
-    rgb = np.clip(rgb / np.percentile(rgb, 99.7), 0, 1)
-    used = np.argwhere(rgb.sum(axis=-1) > 0)
-    (y0, x0), (y1, x1) = used.min(axis=0), used.max(axis=0) + 1
-    data = _filled(prior)[y0:y1, x0:x1]
-    axes[0, 0].imshow(
-        data, origin="lower", cmap="gray", norm=simple_norm(data, "asinh", percent=99.6)
-    )
-    axes[0, 0].set_title(f"prior, {names[3]}")
-    axes[0, 1].imshow(rgb[y0:y1, x0:x1], origin="lower")
-    axes[0, 1].set_title(f"{names[0]} (blue), {names[1]} (green), {names[2]} (red)")
-    for ax in axes.flat:
-        ax.set(xticks=[], yticks=[])
-    return figure
+def band_label(name):
+    """What a band is called on the page: ``F770W`` for ``miri.f770w``."""
+    return name.rpartition(".")[2].upper()
 
 
-def triptych_figure(images, names, *, size=220):
+def three_bands(names):
     """
-    Mosaic, model and residual of several bands, cut to the same crowded part.
+    Bands that a picture shows: the shortest, the middle one and the longest in wavelength.
 
     Parameters
     ----------
-    images : list of tuple of `~astropy.nddata.CCDData`
-        Mosaic, model, residual of each band.
-    names : list of str
-        Their filters.
-    size : int, optional
-        Side of the cutout in pixels.
+    names : iterable of str
+        Names of filters.
+
+    Returns
+    -------
+    chosen : list of str
+        In order of wavelength; all of them where there are fewer than three.
     """
-    figure, axes = new_figure(len(images), 3, size=(3.2, 3.2))
-    model = _filled(images[0][1])
-    # where the model has most light: the part that tests deblending
-    rows, columns = np.arange(0, model.shape[0], 60), np.arange(0, model.shape[1], 60)
-    light = np.sqrt(np.clip(model, 0, None))
-    smooth = np.add.reduceat(np.add.reduceat(light, rows, axis=0), columns, axis=1)
-    iy, ix = np.unravel_index(np.argmax(smooth), smooth.shape)
-    y0 = int(np.clip(iy * 60 - size // 2 + 30, 0, max(0, model.shape[0] - size)))
-    x0 = int(np.clip(ix * 60 - size // 2 + 30, 0, max(0, model.shape[1] - size)))
-    part = (slice(y0, y0 + size), slice(x0, x0 + size))
-    for row, (name, triple) in enumerate(zip(names, images, strict=True)):
-        data = [_filled(image)[part] for image in triple]
-        sigma = _noise(_filled(triple[2])[part])
-        for ax, values, label in zip(axes[row], data, ("mosaic", "model", "residual"), strict=True):
-            ax.imshow(values, origin="lower", cmap="gray", vmin=-3 * sigma, vmax=12 * sigma)
-            ax.set(xticks=[], yticks=[])
-            if row == 0:
-                ax.set_title(label)
-        axes[row, 0].set_ylabel(name)
-    return figure
+    by_wave = sorted(names, key=lambda name: Filter.from_name(name).pivot)
+    if len(by_wave) < 3:
+        return by_wave
+    return [by_wave[0], by_wave[len(by_wave) // 2], by_wave[-1]]
 
 
-def _panels(n):
-    columns = min(3, n)
-    return -(-n // columns), columns
+def _panels(bands, height, **share):
+    """A panel for each band, three in a row, with labels on the outer axes only."""
+    columns = min(3, len(bands))
+    rows = -(-len(bands) // columns)
+    # one or two bands do not fill the page
+    width = WIDTH / max(2, columns)
+    figure, axes = new_figure(rows, columns, size=(width, height), **share)
+    panels = axes.ravel()
+    for ax in panels[len(bands) :]:
+        ax.remove()
+
+    def tidy():
+        for k, ax in enumerate(panels[: len(bands)]):
+            if k + columns < len(bands):
+                ax.set_xlabel("")
+            else:
+                ax.tick_params(labelbottom=True)
+            if k % columns:
+                ax.set_ylabel("")
+
+    return figure, panels[: len(bands)], tidy
 
 
 def magnitude_figure(table, bands):
-    """Measured against true magnitude in every band."""
-    figure, axes = new_figure(*_panels(len(bands)), size=(3.9, 3.7))
-    for ax, name in zip(axes.flat, bands, strict=False):
-        true, measured = magnitude(table[f"{name}_true"]), magnitude(table[name])
-        plot_magnitudes(true, measured, ax=ax, title=name)
-    for ax in list(axes.flat)[len(bands) :]:
-        ax.set_visible(False)
+    """Measured against true magnitude; ticks are sources without positive flux or off the axis."""
+    figure, axes, tidy = _panels(bands, 3.3, sharex=True, sharey=True)
+    true = {name: magnitude(table[f"{name}_true"]) for name in bands}
+    measured = {name: magnitude(table[name]) for name in bands}
+    known = np.concatenate([values[np.isfinite(values)] for values in true.values()])
+    high = known.max(initial=20) + 1.5
+    for ax, name in zip(axes, bands, strict=True):
+        lost = np.isfinite(true[name]) & ~(measured[name] < high)
+        plot_magnitudes(
+            true[name], measured[name], ax=ax, lost=true[name][lost], title=band_label(name)
+        )
+    low = known.min(initial=high)
+    bright = np.nanmin(np.concatenate([*measured.values(), [low]]))
+    axes[0].set(xlim=(low - 0.4, high - 1.1), ylim=(high, min(low, bright) - 0.4))
+    tidy()
     return figure
 
 
-def offset_figure(table, bands):
-    """Relative difference over its error, and magnitude differences with running medians."""
-    figure, axes = new_figure(*_panels(len(bands)), size=(3.9, 3.3))
-    for ax, name in zip(axes.flat, bands, strict=False):
+def offset_figure(table, bands, limits=None):
+    """
+    Magnitude differences with running medians.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+        Matched sources.
+    bands : list of str
+        Bands.
+    limits : dict of str to float, optional
+        5-sigma limits in AB magnitudes, drawn as lines.
+    """
+    figure, axes, tidy = _panels(bands, 2.9, sharex=True, sharey=True)
+    for ax, name in zip(axes, bands, strict=True):
         true, measured = magnitude(table[f"{name}_true"]), magnitude(table[name])
         offset = measured - true
         good = np.isfinite(offset)
         running = running_median(true[good], offset[good], size=20)
-        plot_offsets(true[good], offset[good], running=running, ax=ax, title=name)
-    for ax in list(axes.flat)[len(bands) :]:
-        ax.set_visible(False)
+        plot_offsets(true[good], offset[good], running=running, ax=ax, title=band_label(name))
+        if limits and np.isfinite(limits[name]):
+            ax.axvline(limits[name], color="0.35", ls=":", lw=1.2, label="5-sigma limit")
+        if ax is axes[0] and ax.get_legend_handles_labels()[0]:
+            ax.legend(loc="lower left", fontsize=8, frameon=False)
+        elif ax.get_legend():
+            ax.get_legend().remove()
+    tidy()
     return figure
 
 
+def _wave_colors(bands):
+    """A colour for each band, darker at shorter wavelengths, distinct to colour-blind readers."""
+    from matplotlib import colormaps
+
+    order = sorted(bands, key=lambda name: Filter.from_name(name).pivot)
+    steps = np.linspace(0.0, 0.82, len(order)) if len(order) > 1 else [0.0]
+    return {n: colormaps["viridis"](step) for n, step in zip(order, steps, strict=True)}
+
+
 def error_figure(errors, bands, limits):
-    """The error function of every band, with the 5-sigma limits."""
-    figure, axes = new_figure(size=(6, 4.4))
-    flux = np.geomspace(0.02, 300, 120) * u.uJy
+    """The error function of every band, with the 5-sigma limits in uJy."""
+    figure, axes = new_figure(size=(WIDTH, 4.2))
+    finite = [value for value in limits.values() if np.isfinite(value)]
+    high = max(300, 30 * max(finite, default=1))
+    flux = np.geomspace(0.02, high, 120) * u.uJy
     plot_error_function(
         dict.fromkeys(bands, flux.value),
         {name: errors.sigma(flux, name).to_value(u.uJy) for name in bands},
         limits=limits,
         ax=axes[0, 0],
+        colors=_wave_colors(bands),
     )
+    handles, names = axes[0, 0].get_legend_handles_labels()
+    names = [band_label(name) for name in names]
+    axes[0, 0].legend(handles, names, fontsize=8, frameon=False, ncols=2)
+    return figure
+
+
+def limit_figure(entries):
+    """
+    Limits against wavelength.
+
+    Parameters
+    ----------
+    entries : dict of str to dict
+        Of each band: ``limit``, ``formal_limit``, ``etc_limit``, ``proposal`` (AB or NaN) and
+        ``ceers``, whether the exposures are those of the proposal.
+    """
+    figure, axes = new_figure(size=(WIDTH, 3.4))
+    ax = axes[0, 0]
+    bands = sorted(entries, key=lambda name: Filter.from_name(name).pivot)
+    wave = np.array([Filter.from_name(name).pivot.to_value(u.um) for name in bands])
+    values = {key: np.array([entries[n][key] for n in bands], float) for key in (
+        "limit", "formal_limit", "etc_limit", "proposal")}  # fmt: skip
+    own = np.array([entries[name]["ceers"] for name in bands], bool)
+    ax.plot(wave, values["limit"], "o-", color=MEASURED, lw=1.2, label="error function")
+    ax.plot(wave, values["formal_limit"], "s", color=MEASURED, mfc="none", label="formal error")
+    label = "calculator, scaled to these exposures"
+    ax.plot(wave, values["etc_limit"], "^--", color=SECOND, lw=1.2, label=label)
+    for keep, label in ((own, "CEERS proposal"), (~own, "CEERS proposal, for other exposures")):
+        if np.any(keep & np.isfinite(values["proposal"])):
+            fill = {} if keep is own else {"mfc": "none"}
+            ax.plot(wave[keep], values["proposal"][keep], "D", color="0.35", label=label, **fill)
+    shown = np.concatenate([v[np.isfinite(v)] for v in values.values()])
+    low, high = (shown.min(), shown.max()) if shown.size else (20, 26)
+    for x, name in zip(wave, bands, strict=True):
+        ax.text(x, high + 0.35, band_label(name), ha="center", va="bottom", fontsize=8, rotation=30)
+    ax.set(
+        xlim=(wave.min() - 1.5, wave.max() + 1.5),
+        ylim=(low - 0.6, high + 1.3),
+        xlabel="wavelength (µm)",
+        ylabel="5-sigma limit (AB)",
+    )
+    ax.legend(fontsize=8, frameon=False, loc="lower left")
     return figure
 
 
 def redshift_figure(truth, fits):
     """Fitted against true redshifts, with and without MIRI."""
-    figure, axes = new_figure(1, len(fits), size=(4.8, 4.5))
-    for ax, (label, table) in zip(axes.flat, fits.items(), strict=True):
+    figure, axes = new_figure(1, len(fits), size=(WIDTH / len(fits), 4.7))
+    for ax, (unit, table) in zip(axes.flat, fits.items(), strict=True):
         plot_redshifts(
             truth["redshift"],
             table["redshift_mean"],
             z_err=table["redshift_std"],
             ax=ax,
-            title=label.replace("_", " "),
+            title=_fit_label(unit),
         )
+    axes[0, -1].set_ylabel("")
     return figure
+
+
+def _fit_label(unit):
+    return unit.replace("_", " ").replace("miri", "MIRI")
 
 
 def fraction_figure(fits, frac_true):
     """Posterior means and widths of fracAGN, with and without MIRI."""
-    figure, axes = new_figure(1, 2, size=(5, 3.8))
-    means = {k.replace("_", " "): t["frac_agn_mean"] for k, t in fits.items()}
-    widths = {k.replace("_", " "): t["frac_agn_std"] for k, t in fits.items()}
+    figure, axes = new_figure(1, 2, size=(WIDTH / 2, 3.6))
+    means = {_fit_label(unit): table["frac_agn_mean"] for unit, table in fits.items()}
+    widths = {_fit_label(unit): table["frac_agn_std"] for unit, table in fits.items()}
     plot_histogram(
         means,
-        np.linspace(0, 1, 41),
+        np.linspace(0, 1, 26),
         ax=axes[0, 0],
         xlabel="fracAGN (posterior mean)",
         truth=frac_true,
     )
+    axes[0, 0].set_xlim(-0.03, 1.03)
     plot_histogram(
-        widths, np.linspace(0, 0.5, 41), ax=axes[0, 1], xlabel="width of the posterior (std)"
+        widths, np.linspace(0, 0.5, 26), ax=axes[0, 1], xlabel="width of the posterior (std)"
     )
+    axes[0, 1].set_ylabel("")
     return figure
 
 
 def point_figure(points, bands):
-    """Measured over true flux of the bright point sources of each band."""
-    figure, axes = new_figure(size=(6.4, 3.8))
+    """Measured over true flux of the bright point sources of each band; triangles lie beyond."""
+    figure, axes = new_figure(size=(WIDTH, 3.2))
     ax = axes[0, 0]
-    for k, name in enumerate(bands):
-        table = points[name]
-        ratio = (table["flux"] / table["flux_true"]).to_value(u.one)
+    ratios = [(points[n]["flux"] / points[n]["flux_true"]).to_value(u.one) for n in bands]
+    finite = np.concatenate([r[np.isfinite(r)] for r in ratios])
+    reach = np.clip(1.3 * np.percentile(np.abs(finite - 1), 98, method="higher"), 0.05, 0.5) if (
+        finite.size) else 0.05  # fmt: skip
+    for k, ratio in enumerate(ratios):
         x = k + np.linspace(-0.3, 0.3, len(ratio))
-        ax.plot(x, ratio, ".", ms=4, color="#9a3412", alpha=0.6)
-        ax.plot([k - 0.35, k + 0.35], [np.nanmedian(ratio)] * 2, color="#1d4ed8", lw=2)
+        for keep, marker in (
+            (np.abs(ratio - 1) <= reach, "."),
+            (ratio > 1 + reach, "^"),
+            (ratio < 1 - reach, "v"),
+        ):
+            y = np.clip(ratio[keep], 1 - 0.97 * reach, 1 + 0.97 * reach)
+            ax.plot(x[keep], y, marker, ms=4, color=MEASURED, alpha=0.6)
+        if np.isfinite(ratio).any():
+            ax.plot([k - 0.35, k + 0.35], [np.nanmedian(ratio)] * 2, color=SECOND, lw=2)
     ax.axhline(1, color="0.4", lw=1)
     ax.axhspan(0.97, 1.03, color="0.9", zorder=0)
     ax.set(
         xticks=range(len(bands)),
-        xticklabels=bands,
-        ylim=(0.85, 1.15),
+        xticklabels=[band_label(name) for name in bands],
+        xlim=(-0.6, len(bands) - 0.4),
+        ylim=(1 - reach, 1 + reach),
         ylabel="measured / true flux",
     )
     return figure
 
 
-def catalog_area(catalog):
-    """Solid angle inside the convex hull of the catalogue's positions."""
-    sky = catalog["sky"]
-    center = SkyCoord(np.mean(sky.ra), np.mean(sky.dec))
-    x, y = center.spherical_offsets_to(sky)
-    hull = ConvexHull(np.transpose([x.to_value(u.arcmin), y.to_value(u.arcmin)]))
-    return hull.volume * u.arcmin**2
+#: Least values that the figure of the inputs shows.
+LEAST_LUMINOSITY, LEAST_RATE, LEAST_MASS = 1e7 * u.Lsun, 1e-3 * u.Msun / u.yr, 1e7 * u.Msun
 
 
 def input_figure(galaxies):
-    """Infrared luminosity against redshift, and star-formation rate against mass."""
-    figure, axes = new_figure(1, 2, size=(5.4, 4.2))
+    """
+    Infrared luminosity against redshift, and star-formation rate against mass.
+
+    Parameters
+    ----------
+    galaxies : `~astropy.table.QTable`
+        With ``redshift``, ``ir_luminosity``, ``stellar_mass`` and ``sfr_100myr``.
+
+    Returns
+    -------
+    figure : `~matplotlib.figure.Figure`
+    n_outside : tuple of int
+        Galaxies below the axes, left and right.
+    """
+    figure, axes = new_figure(1, 2, size=(WIDTH / 2, 4.0))
     redshift = np.asarray(galaxies["redshift"])
+    infrared, mass = galaxies["ir_luminosity"], galaxies["stellar_mass"]
+    rate = galaxies["sfr_100myr"]
+    end = max(6.0, 1.03 * redshift.max(initial=0))
     rates = [1, 10, 100] * u.Msun / u.yr
     lines = [
-        ([0, 6], [value.value] * 2, f"{rate.value:g} Msun/yr")
+        ([0, end], [value.value] * 2, rf"{rate.value:g} M$_\odot$/yr")
         for rate, value in zip(rates, sfr_to_infrared_luminosity(rates), strict=True)
     ]
     plot_relation(
         redshift,
-        galaxies["ir_luminosity"].to_value(u.Lsun),
+        infrared.to_value(u.Lsun),
         lines=lines,
         ax=axes[0, 0],
-        labels=("redshift", r"L$_{IR}$(3-1000 um) / L$_\odot$"),
+        labels=("redshift", r"L(3-1000 µm) / L$_\odot$"),
     )
-    axes[0, 0].set_ylim(1e7, None)
-    mass = np.geomspace(1e8, 2e11, 30) * u.Msun
+    axes[0, 0].set(xlim=(0, end), ylim=(LEAST_LUMINOSITY.value, None))
+    line_mass = np.geomspace(1e8, 2e11, 30) * u.Msun
     lines = [
-        (mass.value, main_sequence_sfr(mass, COSMOLOGY.age(z)).value, f"main sequence, z = {z:g}")
+        (line_mass.value, main_sequence_sfr(line_mass, COSMOLOGY.age(z)).value, f"z = {z:g}")
         for z in (0.5, 1, 2)
     ]
     plot_relation(
-        galaxies["stellar_mass"].to_value(u.Msun),
-        galaxies["sfr_100myr"].to_value(u.Msun / u.yr),
+        mass.to_value(u.Msun),
+        rate.to_value(u.Msun / u.yr),
         lines=lines,
         ax=axes[0, 1],
         labels=(r"stellar mass / M$_\odot$", r"SFR (100 Myr) / (M$_\odot$/yr)"),
         color=redshift,
         log=(True, True),
     )
-    axes[0, 1].set(xlim=(1e7, None), ylim=(1e-3, None))
-    return figure
+    axes[0, 1].set(xlim=(LEAST_MASS.value, None), ylim=(LEAST_RATE.value, None))
+    below = (infrared < LEAST_LUMINOSITY, (rate < LEAST_RATE) | (mass < LEAST_MASS))
+    return figure, tuple(int(np.count_nonzero(rows)) for rows in below)
 
 
 def counts_figure(galaxies, bands, area):
     """Number counts of the injected fluxes in every band."""
-    figure, axes = new_figure(*_panels(len(bands)), size=(3.6, 3.0), sharex=True, sharey=True)
-    edges = np.arange(17, 28.1, 0.5)
-    for ax, name in zip(axes.flat, bands, strict=False):
-        counts, error = number_counts(galaxies[name], area, edges)
-        plot_counts(edges, counts.to_value(u.deg**-2), error.to_value(u.deg**-2), ax=ax, title=name)
-    for ax in list(axes.flat)[len(bands) :]:
-        ax.set_visible(False)
+    figure, axes, tidy = _panels(bands, 2.7, sharex=True, sharey=True)
+    edges = np.arange(15, 30.1, 0.5)
+    for ax, name in zip(axes, bands, strict=True):
+        counts, error = (v.to_value(u.deg**-2) for v in number_counts(galaxies[name], area, edges))
+        plot_counts(edges, counts, error, ax=ax, title=band_label(name))
+    tidy()
     return figure
 
 
-def example_figure(results, truth, key):
+def example_figure(results, truth, key, model):
     """
     One source: photometry with the best fit, and posteriors of redshift and AGN fraction.
 
@@ -281,33 +360,66 @@ def example_figure(results, truth, key):
         With ``id``, ``redshift`` and ``frac_agn``.
     key : object
         Id of the source.
+    model : `~miricigale.sed.SEDModel`
+        Of the fits.
     """
     from matplotlib.figure import Figure
 
     row = truth[np.asarray(truth["id"]) == key][0]
-    figure = Figure(figsize=(12, 4.8), layout="constrained")
-    grid = figure.add_gridspec(2, 3, height_ratios=(3, 1), width_ratios=(1.7, 1, 1))
+    figure = Figure(figsize=(WIDTH, 4.8), layout="constrained")
+    grid = figure.add_gridspec(2, 3, height_ratios=(3, 1), width_ratios=(1.9, 1, 1))
     upper = figure.add_subplot(grid[0, 0])
     lower = figure.add_subplot(grid[1, 0], sharex=upper)
-    results["with_miri"][key].plot_sed(ax=(upper, lower), model=SEDModel.yang2021())
+    best = results["with_miri"][key]
+    total = best.best_sed(model)
+    # nothing else changes: what is left is the galaxy
+    galaxy = best.best_sed(model, frac_agn=0.0)
+    parts = {
+        "galaxy": (galaxy.wave, galaxy.fnu),
+        "AGN": (total.wave, total.fnu - galaxy.fnu),
+    }
+    if not np.any(parts["AGN"][1] > 0):
+        # all of it is galaxy
+        parts = {}
+    other = results["without_miri"][key]
+    if np.isfinite(other.chi2):
+        sed = other.best_sed(model)
+        parts["best model without MIRI"] = (sed.wave, sed.fnu)
+    bands = results["with_miri"].filters
+    best.plot_sed(
+        ax=(upper, lower),
+        spectrum=(total.wave, total.fnu),
+        parts=parts,
+        groups=["MIRI" if name.startswith("miri.") else "existing bands" for name in bands],
+        title=f"source {key}: best z = {best.best['redshift'].value:.3f}, chi2 = {best.chi2:.1f}",
+    )
+    upper.set_xlabel("")
     upper.tick_params(labelbottom=False)
+    handles, names = upper.get_legend_handles_labels()
+    names = ["best model with MIRI" if name == "best model" else name for name in names]
+    upper.legend(handles, names, fontsize=7, frameon=False, loc="upper left", ncols=2)
+    low, high = upper.get_ylim()
+    # room for the legend above the spectrum
+    upper.set_ylim(low, high * (high / low) ** 0.35)
     for column, (name, label) in enumerate(
-        (("redshift", "redshift"), ("frac_agn", "AGN fraction")), start=1
+        (("redshift", "redshift"), ("frac_agn", "fracAGN")), start=1
     ):
         ax = figure.add_subplot(grid[:, column])
-        for unit, color in (("with_miri", MEASURED), ("without_miri", SECOND)):
+        for unit, color in FIT_COLORS.items():
             edges, weights = results[unit][key].pdf(name)
             density = weights / np.diff(edges.value)
-            ax.stairs(
-                density / density.max(),
-                edges.value,
-                color=color,
-                lw=1.6,
-                label=unit.replace("_", " "),
-            )
-        ax.axvline(row[name], color="0.35", ls="--", lw=1, label="truth")
-        ax.set(xlabel=label, ylabel="posterior density (peak 1)", ylim=(0, 1.08))
+            if density.max() > 0:
+                density = density / density.max()
+            style = {"color": color, "lw": 1.6, "label": _fit_label(unit)}
+            if unit == "with_miri":
+                ax.stairs(density, edges.value, fill=True, alpha=0.2, color=color)
+            ax.stairs(density, edges.value, ls="-" if unit == "with_miri" else "--", **style)
+        ax.axvline(row[name], color="0.2", ls=":", lw=1.4, label="truth")
+        ax.set(xlabel=label, ylim=(0, 1.25))
         if name == "redshift":
             ax.set_xlim(max(0, row[name] - 1.2), row[name] + 1.2)
-        ax.legend(fontsize=8, frameon=False)
+            ax.set_ylabel("posterior density (peak 1)")
+        else:
+            ax.set_xlim(-0.04, 1.04)
+            ax.legend(fontsize=8, frameon=False)
     return figure

@@ -1,5 +1,7 @@
 """The numbers of the report, from the products of a run."""
 
+import dataclasses
+
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
@@ -10,16 +12,89 @@ from miricigale.evaluation import (
     recovery_metrics,
     sigma_mad,
 )
-from miricigale.instrument import scaled_limit
+from miricigale.instrument import (
+    CEERS_FILTERS,
+    ceers_exposures,
+    proposal_limit,
+    scaled_limit,
+)
 from miricigale.photometry import ErrorModel, ForcedFlags
 from miricigale.workflow.stages.exposures import band_exposures
 from miricigale.workflow.stages.sample import SampleFlags, magnitude
 
-__all__ = ["FITS", "study_metrics"]
+__all__ = ["FITS", "StudyTables", "as_ceers", "as_paper", "study_metrics"]
 
 FITS = ("with_miri", "without_miri")
-#: Shares of sources detected in two or more bands, by H-band limit: Yang et al. 2021.
+#: Shares of sources detected in two or more bands, by F160W limit: Yang et al. 2021.
 PAPER_DETECTED = ((26.0, 0.53), (25.0, 0.75))
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class StudyTables:
+    """
+    The tables of a run, each read once.
+
+    Parameters
+    ----------
+    truth, matched : `~astropy.table.QTable`
+        Of stages 3 and 12, row by row the same sources.
+    errors : `~miricigale.photometry.ErrorModel`
+        The error function.
+    fits : dict of str to `~astropy.table.QTable`
+        Results by `FITS`, a row for each source of the sample.
+    points : dict of str to `~astropy.table.QTable`
+        Bright point sources by band; empty where the check was not made.
+    """
+
+    truth: QTable
+    matched: QTable
+    errors: ErrorModel
+    fits: dict
+    points: dict
+
+    @classmethod
+    def read(cls, context):
+        """Read those that the stage ``report`` sees."""
+        config = context.config
+        names = config.exposures.filters if config.point_sources.enabled else ()
+        return cls(
+            QTable.read(context.path("truth.ecsv")),
+            QTable.read(context.path("matched.ecsv")),
+            ErrorModel.read(context.path("errors.ecsv")),
+            {unit: QTable.read(context.path(f"fits_{unit}.ecsv")) for unit in FITS},
+            {name: QTable.read(context.path(f"points/{name}.ecsv")) for name in names},
+        )
+
+
+def as_ceers(config, name):
+    """Whether a band is exposed as CEERS did: readout, frames in each dither, number of dithers."""
+    if name not in CEERS_FILTERS:
+        return False
+
+    def seen(exposures):
+        return [(e.readout, e.subarray, e.n_groups * e.n_integrations) for e in exposures]
+
+    own = band_exposures(config, name)
+    # the split of the frames into groups and integrations is not the survey's
+    return seen(own) == seen(ceers_exposures(own[0].pointing, own[0].roll, filters=[name]))
+
+
+def _proposal(name, exposure):
+    """The limit that the CEERS proposal quotes for a band, and the time that it is for."""
+    if name not in CEERS_FILTERS:
+        return {"proposal": np.nan, "proposal_time": np.nan}
+    exposures = ceers_exposures(exposure.pointing, exposure.roll, filters=[name])
+    time = sum(e.exposure_time for e in exposures)
+    return {"proposal": float(proposal_limit(name).value), "proposal_time": time.to_value(u.s)}
+
+
+def as_paper(config):
+    """Whether exposures, bands and selection are those of Yang et al. 2021."""
+    return (
+        set(config.exposures.filters) == set(CEERS_FILTERS)
+        and all(as_ceers(config, name) for name in config.exposures.filters)
+        and config.highres.filter == "wfc3.f160w"
+    )
 
 
 def _point_metrics(table):
@@ -75,25 +150,24 @@ def _crowded(truth, name, radius=2 * u.arcsec):
     return crowded
 
 
-def study_metrics(context):
+def study_metrics(config, tables):
     """
     All numbers of the report.
 
     Parameters
     ----------
-    context : `~miricigale.workflow.stage.Context`
+    config : `~miricigale.workflow.config.StudyConfig`
+        The configuration.
+    tables : `StudyTables`
         Of a run whose other stages are done.
 
     Returns
     -------
     metrics : dict
-        Plain values, as written to ``report/metrics.json``.
+        Plain values, as written to ``report/metrics.json``; NaN where there is nothing to count.
     """
-    config = context.config
     bands = config.exposures.filters
-    truth = QTable.read(context.path("truth.ecsv"))
-    matched = QTable.read(context.path("matched.ecsv"))
-    errors = ErrorModel.read(context.path("errors.ecsv"))
+    truth, matched, errors = tables.truth, tables.matched, tables.errors
     selection = np.asarray(matched["selection"])
     field = (selection & (SampleFlags.OUTSIDE_FIELD | SampleFlags.STAR | SampleFlags.NO_MODEL)) == 0
     metrics = {
@@ -104,31 +178,46 @@ def study_metrics(context):
         "n_left_out": {
             flag.name.lower(): int(np.count_nonzero(selection & flag)) for flag in SampleFlags
         },
+        "as_paper": as_paper(config),
+        # of one band there are no two
+        "n_bands_detected": min(2, len(bands)),
         "bands": {},
         "detected": [],
         "fits": {},
     }
     prior = magnitude(truth[config.highres.filter])
     for limit, paper in PAPER_DETECTED:
+        if limit > config.catalog.mag_limit:
+            continue
         chosen = field & (prior < limit)
-        n = int(np.count_nonzero(chosen & (matched["n_detected"] >= 2)))
+        n = int(np.count_nonzero(chosen & (matched["n_detected"] >= metrics["n_bands_detected"])))
         fraction, low, high = fraction_interval(n, int(chosen.sum()))
         metrics["detected"].append(
-            {"limit": limit, "fraction": fraction, "low": low, "high": high, "paper": paper}
+            {
+                "limit": limit,
+                "n": int(chosen.sum()),
+                "fraction": fraction,
+                "low": low,
+                "high": high,
+                "paper": paper,
+            }
         )
     for name in bands:
-        time = sum(e.exposure_time for e in band_exposures(config, name))
+        exposures = band_exposures(config, name)
+        time = sum(e.exposure_time for e in exposures)
         entry = _band_metrics(matched, truth, name)
         bright = entry.pop("bright_isolated")
         entry |= {
             "limit": float(errors.limiting_magnitude(name).value),
             "etc_limit": float(scaled_limit(name, time).to_value(u.ABmag)),
+            **_proposal(name, exposures[0]),
+            "ceers": as_ceers(config, name),
             "bright_n": bright.n,
             "bright_median": bright.median,
             "bright_median_err": bright.median_err,
         }
-        if config.point_sources.enabled:
-            points = _point_metrics(QTable.read(context.path(f"points/{name}.ecsv")))
+        if name in tables.points:
+            points = _point_metrics(tables.points[name])
             entry |= {
                 "points_n": points.n,
                 "points_median": points.median,
@@ -136,8 +225,7 @@ def study_metrics(context):
             }
         metrics["bands"][name] = entry
     sample = truth[selection == 0]
-    for unit in FITS:
-        table = QTable.read(context.path(f"fits_{unit}.ecsv"))
+    for unit, table in tables.fits.items():
         photoz = photoz_metrics(sample["redshift"], table["redshift_mean"])
         fraction = recovery_metrics(sample["frac_agn"], table["frac_agn_mean"])
         metrics["fits"][unit] = {

@@ -9,15 +9,18 @@ from astropy.table import QTable
 
 from miricigale.evaluation import (
     PUBLISHED_LIGHT,
+    Missing,
     Report,
     integrated_light,
+    number,
 )
 from miricigale.fitting import FitResults
-from miricigale.instrument import proposal_limit
-from miricigale.photometry import ErrorModel
-from miricigale.workflow.stages import figures
-from miricigale.workflow.stages.metrics import FITS, study_metrics
-from miricigale.workflow.stages.sample import SampleFlags
+from miricigale.refdata import resources
+from miricigale.sed import SEDModel
+from miricigale.workflow.stages import figures, pictures, provenance
+from miricigale.workflow.stages.figures import band_label
+from miricigale.workflow.stages.metrics import FITS, StudyTables, study_metrics
+from miricigale.workflow.stages.sample import SampleFlags, footprint_area
 
 __all__ = ["make_report"]
 
@@ -25,12 +28,15 @@ log = logging.getLogger(__name__)
 
 
 def make_report(context, _):
-    """Stage 14: the page, its figures as PNG, and the numbers as JSON."""
+    """Stage 14: the page with its figures, and the numbers as JSON."""
     config = context.config
-    metrics = study_metrics(context)
+    tables = StudyTables.read(context)
+    metrics = study_metrics(config, tables)
     if metrics["n_sample"] == 0:
         log.warning("no source is left to fit: %s", metrics["n_left_out"])
-    context.save("report/metrics.json", lambda path: path.write_text(json.dumps(metrics, indent=1)))
+    text = json.dumps(_without_nan(metrics), indent=1, allow_nan=False)
+    context.save("report/metrics.json", lambda path: path.write_text(text))
+    model = SEDModel.yang2021()
     report = Report(
         f"miricigale: {config.run.name}",
         subtitle=(
@@ -38,16 +44,18 @@ def make_report(context, _):
             f"Dec {config.pointing.dec:.5f}, injected fracAGN {config.sed.frac_agn:g}, "
             f"seed {context.seed}"
         ),
+        notices=provenance.stand_ins(config, model),
         dpi=config.report.dpi,
     )
-    writer = _Writer(context, report, metrics)
+    writer = _Writer(context, report, tables, metrics, model)
     writer.summary()
+    writer.exposures()
     writer.images()
     writer.photometry()
     writer.errors()
     writer.fits()
     writer.inputs()
-    writer.configuration()
+    writer.origin()
     context.save("report/index.html", lambda path: report.write(path))
 
 
@@ -60,22 +68,25 @@ def _without_nan(values):
     return None if isinstance(values, float) and not np.isfinite(values) else values
 
 
+#: Why numbers of the fits are missing.
+NO_SAMPLE = "no source in the fit"
+
+
 class _Writer:
     """The sections of the page; each reads the products that it shows."""
 
-    def __init__(self, context, report, metrics):
+    def __init__(self, context, report, tables, metrics, model):
         self.context, self.report, self.metrics = context, report, metrics
-        self.config = context.config
+        self.tables, self.model, self.config = tables, model, context.config
         self.bands = context.config.exposures.filters
-        self.truth = QTable.read(context.path("truth.ecsv"))
-        self.matched = QTable.read(context.path("matched.ecsv"))
-        self.errors_model = ErrorModel.read(context.path("errors.ecsv"))
-        self.fit_tables = {unit: QTable.read(context.path(f"fits_{unit}.ecsv")) for unit in FITS}
-        self.sample = np.asarray(self.matched["selection"]) == 0
+        self.mosaics = {name: context.image(f"mosaic_{name}.fits") for name in self.bands}
+        self.area = footprint_area(self.mosaics.values())
+        self.selection = np.asarray(tables.matched["selection"])
 
     def summary(self):
         """Headline numbers."""
         m, fits = self.metrics, self.metrics["fits"]
+        with_miri, without = (fits[unit] for unit in FITS)
         self.report.section(
             "At a glance",
             "Real galaxies with known redshifts were given the mid-infrared light of their fitted "
@@ -85,51 +96,96 @@ class _Writer:
         self.report.items(
             [
                 ("galaxies in the field", m["n_field"]),
+                (
+                    "imaged in all bands",
+                    f"{self.area.to_value(u.arcmin**2):.2f} arcmin\N{SUPERSCRIPT TWO}",
+                ),
                 ("found on the high-resolution image", m["n_matched"]),
                 (f"in the fit: {self.config.fit.min_detected}+ MIRI bands", m["n_sample"]),
-                ("photo-z outliers with MIRI", _percent(fits["with_miri"]["photoz_outliers"])),
-                ("photo-z outliers without", _percent(fits["without_miri"]["photoz_outliers"])),
-                ("fracAGN with MIRI", _plus_minus(fits["with_miri"])),
-                ("fracAGN without", _plus_minus(fits["without_miri"])),
+                ("photo-z outliers with MIRI", _percent(with_miri["photoz_outliers"], NO_SAMPLE)),
+                ("photo-z outliers without", _percent(without["photoz_outliers"], NO_SAMPLE)),
+                ("fracAGN offset ± scatter with MIRI", _plus_minus(with_miri)),
+                ("fracAGN offset ± scatter without", _plus_minus(without)),
             ]
         )
+        least = m["n_bands_detected"]
+        paper = "Yang et al. 2021"
+        if not m["as_paper"]:
+            paper += ", six bands, other exposures"
+        name, prior = self.config.catalog.mag_column, band_label(self.config.highres.filter)
+        limit = self.config.catalog.mag_limit
         self.report.table(
             [
                 (
-                    f"H < {row['limit']:g}",
-                    _percent(row["fraction"]),
-                    f"{_percent(row['low'])} to {_percent(row['high'])}",
-                    _percent(row["paper"]),
+                    f"{prior} < {row['limit']:g}",
+                    row["n"],
+                    _percent(row["fraction"], "no galaxy"),
+                    f"{_percent(row['low'], 'no galaxy')} to {_percent(row['high'], 'no galaxy')}"
+                    if row["n"]
+                    else Missing("no galaxy"),
+                    _percent(row["paper"], ""),
                 )
                 for row in m["detected"]
-                if self.config.catalog.mag_limit >= row["limit"]
             ],
-            header=("sample", "detected in 2+ bands", "68 % interval", "Yang et al. 2021"),
-            caption="Galaxies of the field detected (5 sigma by the error function) in two or more bands",
+            header=("sample", "galaxies", f"detected in {least}+ bands", "68 % interval", paper),
+            caption="Galaxies of the field detected (5 sigma by the error function) in "
+            f"{'two or more bands' if least == 2 else 'the one band'}; the catalogue ends at "
+            f"{name} = {limit:g}",
+            empty=f"The catalogue ends at {name} = {limit:g}: too bright for the shares of detected "
+            f"galaxies that are published, to {prior} = 25 and 26.",
+        )
+
+    def exposures(self):
+        """What was exposed, and of which sources."""
+        self.report.section("Exposures and catalogue")
+        bands = self.metrics["bands"]
+        self.report.table(
+            provenance.exposure_rows(
+                self.config,
+                provenance.read_forecasts(self.context),
+                {name: entry["ceers"] for name, entry in bands.items()},
+            ),
+            header=provenance.EXPOSURE_HEADER,
+            caption="Exposures; time is that of all dithers, filling (by the last group) and "
+            "saturated pixels are the highest of a dither",
+            text=2,
+        )
+        catalog = QTable.read(self.context.path("catalog.ecsv"))
+        self.report.table(
+            provenance.catalog_facts(self.config, catalog),
+            header=("catalogue", ""),
+            text=2,
         )
 
     def images(self):
-        """Colour image; mosaic, model and residual."""
+        """The field in colour or grey; mosaic, model and residual."""
         self.report.section("Images")
-        by_wave = list(self.bands)
-        chosen = [by_wave[round(k * (len(by_wave) - 1) / 2)] for k in range(3)]
-        images = [self.context.image(f"mosaic_{name}_fine.fits") for name in chosen]
+        chosen = figures.three_bands(self.bands)
+        labels = ", ".join(band_label(name) for name in chosen)
         prior = self.context.image("f160w.fits")
-        self.report.figure(
-            figures.colour_figure(*images, prior, [*chosen, self.config.highres.filter]),
-            "The field: high-resolution prior, and three MIRI bands drizzled to its grid.",
-        )
-        triples = [
-            (
-                self.context.image(f"mosaic_{name}.fits"),
-                self.context.image(f"photometry/{name}_model.fits"),
-                self.context.image(f"photometry/{name}_residual.fits"),
+        if len(chosen) == 3:
+            told = (
+                f"The field: the high-resolution image, and {labels} (the shortest, the middle and "
+                "the longest of the bands by wavelength) in blue, green and red, each in units of its own noise."
             )
+        else:
+            told = f"The field: the high-resolution image and {labels}; too few bands for colours."
+        self.report.figure(
+            pictures.field_figure(
+                [self.mosaics[name] for name in chosen],
+                prior,
+                [*chosen, self.config.highres.filter],
+            ),
+            f"{told} The bar is 20 arcsec long.",
+        )
+        pairs = [
+            (self.mosaics[name], self.context.image(f"photometry/{name}_model.fits"))
             for name in chosen
         ]
         self.report.figure(
-            figures.triptych_figure(triples, chosen),
-            "Mosaic, fitted model and residual of the brightest part (-3 to +12 sigma).",
+            pictures.residual_figure(pairs, chosen),
+            "Mosaic, fitted model and their difference where the model is brightest; differences from "
+            "-5 to +5 sigma of their own noise. The bar is 5 arcsec long.",
         )
 
     def photometry(self):
@@ -139,57 +195,57 @@ class _Writer:
             "Every detection of the high-resolution image is fitted in each MIRI mosaic; matched "
             "sources inside the field are shown.",
         )
-        inside = (np.asarray(self.matched["selection"]) & SampleFlags.OUTSIDE_FIELD) == 0
-        table = self.matched[inside & np.asarray(self.matched["matched"])]
-        self.report.figure(
-            figures.magnitude_figure(table, self.bands), "Measured against true magnitudes."
-        )
-        self.report.figure(
-            figures.offset_figure(table, self.bands),
-            "Measured minus true magnitude with the running median of 20 sources and its scatter; "
-            "triangles lie beyond the axis.",
-        )
+        matched = self.tables.matched
+        inside = (self.selection & SampleFlags.OUTSIDE_FIELD) == 0
+        table = matched[inside & np.asarray(matched["matched"])]
+        if len(table) == 0:
+            self.report.text("No source of the field was found on the high-resolution image.")
+        else:
+            limits = {name: entry["limit"] for name, entry in self.metrics["bands"].items()}
+            self.report.figure(
+                figures.magnitude_figure(table, self.bands),
+                "Measured against true magnitudes; ticks at the bottom: no positive flux measured, or "
+                "fainter than the axis.",
+            )
+            self.report.figure(
+                figures.offset_figure(table, self.bands, limits),
+                "Measured minus true magnitude of sources with positive flux, with the running "
+                "median of 20 sources and its scatter; triangles lie beyond the axis.",
+            )
+        points = self.tables.points
         rows = [
             (
-                name,
+                band_label(name),
                 entry["bright_n"],
-                _signed(entry["bright_median"]),
-                f"{100 * entry['bright_median_err']:.1f} %",
+                _percent(
+                    entry["bright_median"], reason := "no isolated source above 20 sigma", "+.2f"
+                ),
+                _percent(entry["bright_median_err"], reason),
                 *(
                     (
                         entry["points_n"],
-                        _signed(entry["points_median"]),
-                        _percent(entry["points_scatter"]),
+                        _percent(entry["points_median"], "no point source measured", "+.2f"),
+                        _percent(entry["points_scatter"], "no point source measured"),
                     )
-                    if "points_n" in entry
-                    else ("", "", "")
+                    if points
+                    else ()
                 ),
             )
             for name, entry in self.metrics["bands"].items()
         ]
-        self.report.table(
-            rows,
-            header=(
-                "band",
-                "isolated > 20 sigma",
-                "median offset",
-                "its error",
-                "point sources",
-                "median offset",
-                "scatter",
-            ),
-            caption="Measured over true flux minus one",
-        )
-        if self.config.point_sources.enabled:
-            points = {
-                name: QTable.read(self.context.path(f"points/{name}.ecsv")) for name in self.bands
-            }
-            points = {name: table[np.asarray(table["in_field"])] for name, table in points.items()}
+        header = ("band", "isolated > 20 sigma", "median offset", "its error")
+        if points:
+            header += ("point sources", "median offset", "scatter")
+        self.report.table(rows, header=header, caption="Measured over true flux minus one")
+        if points:
+            shown = {name: table[np.asarray(table["in_field"])] for name, table in points.items()}
             self.report.figure(
-                figures.point_figure(points, self.bands),
+                figures.point_figure(shown, self.bands),
                 "Bright point sources on a grid, one exposure a band through the whole chain; "
-                "blue: median, grey: 3 %.",
+                "blue: median, grey: 3 %; triangles lie beyond the axis.",
             )
+        else:
+            self.report.text("The check with bright point sources was not made ([point_sources]).")
 
     def errors(self):
         """The error function and the limits."""
@@ -198,32 +254,47 @@ class _Writer:
             "Scatter of measured about true fluxes in bins of true flux; it is used as the error of "
             "the measured fluxes in the fit.",
         )
-        limits = {
-            name: self.errors_model.limiting_flux(name).to_value(u.uJy) for name in self.bands
-        }
+        errors, bands = self.tables.errors, self.metrics["bands"]
+        limits = {name: errors.limiting_flux(name).to_value(u.uJy) for name in self.bands}
         self.report.figure(
-            figures.error_figure(self.errors_model, self.bands, limits),
+            figures.error_figure(errors, self.bands, limits),
             "Error function of each band; dots mark the 5-sigma limits.",
         )
+        if len(bands) > 1:
+            self.report.figure(
+                figures.limit_figure(bands),
+                "5-sigma limits beside those of the exposure time calculator (4.0), scaled to the "
+                "same time as its root; short exposures, in which read noise counts, fall short of "
+                "that.",
+            )
+        none = "the error function reaches 5 sigma nowhere"
+        few = "no source below 20 sigma"
+        proposal = "CEERS proposal"
+        if not all(entry["ceers"] for entry in bands.values()):
+            proposal += ", for other exposures"
         self.report.table(
             [
                 (
-                    name,
-                    f"{entry['limit']:.2f}",
-                    f"{entry['formal_limit']:.2f}",
+                    band_label(name),
+                    number(entry["limit"], ".2f", none),
+                    number(entry["formal_limit"], ".2f", "no source measured"),
                     f"{entry['etc_limit']:.2f}",
-                    _proposal(name),
-                    f"{entry['pull_median']:+.2f}",
-                    f"{entry['pull_scatter']:.2f}",
+                    number(entry["limit"] - entry["etc_limit"], "+.2f", none),
+                    number(entry["proposal"], ".1f", "no band of CEERS")
+                    if entry["ceers"] or not np.isfinite(entry["proposal"])
+                    else f"{entry['proposal']:.1f} in {entry['proposal_time']:.0f} s",
+                    number(entry["pull_median"], "+.2f", few),
+                    number(entry["pull_scatter"], ".2f", few),
                 )
-                for name, entry in self.metrics["bands"].items()
+                for name, entry in bands.items()
             ],
             header=(
                 "band",
                 "5 sigma, error function",
                 "formal",
-                "calculator 4.0, scaled",
-                "CEERS proposal",
+                "calculator, scaled",
+                "minus calculator",
+                proposal,
                 "pull median",
                 "pull scatter",
             ),
@@ -239,27 +310,41 @@ class _Writer:
             "Redshift and AGN fraction",
             "Posterior means of the same sources, fitted with the existing bands alone and with MIRI.",
         )
-        sample = self.truth[self.sample]
+        sample = self.tables.truth[self.selection == 0]
+        if len(sample) == 0:
+            left = ", ".join(
+                f"{name.replace('_', ' ')} {n}"
+                for name, n in self.metrics["n_left_out"].items()
+                if n
+            )
+            self.report.text(
+                f"No source is left to fit. Why the {self.metrics['n_catalog']} sources of the "
+                f"catalogue were left out, each for one reason or more: {left}."
+            )
+            return
+        fits = self.tables.fits
         self.report.figure(
-            figures.redshift_figure(sample, self.fit_tables),
+            figures.redshift_figure(sample, fits),
             "Fitted against true redshift; dashed: the limits beyond which a source is an outlier.",
         )
         self.report.figure(
-            figures.fraction_figure(self.fit_tables, self.config.sed.frac_agn),
+            figures.fraction_figure(fits, self.config.sed.frac_agn),
             "Posterior means and widths of the AGN fraction.",
         )
+        none = "no source fitted"
         self.report.table(
             [
                 (
-                    unit.replace("_", " "),
+                    unit.replace("_", " ").replace("miri", "MIRI"),
                     entry["n"],
-                    f"{entry['photoz_bias']:+.4f}",
-                    f"{entry['photoz_sigma_mad']:.4f}",
-                    f"{entry['photoz_n_outliers']} ({_percent(entry['photoz_outliers'])})",
-                    f"{entry['frac_agn_bias']:+.3f}",
-                    f"{entry['frac_agn_sigma_mad']:.3f}",
-                    f"{entry['frac_agn_width']:.3f}",
-                    _percent(entry["redshift_coverage"]),
+                    number(entry["photoz_bias"], "+.4f", none),
+                    number(entry["photoz_sigma_mad"], ".4f", none),
+                    entry["photoz_n_outliers"],
+                    _percent(entry["photoz_outliers"], none),
+                    number(entry["frac_agn_bias"], "+.3f", none),
+                    number(entry["frac_agn_sigma_mad"], ".3f", none),
+                    number(entry["frac_agn_width"], ".3f", none),
+                    _percent(entry["redshift_coverage"], none),
                 )
                 for unit, entry in self.metrics["fits"].items()
             ],
@@ -269,32 +354,37 @@ class _Writer:
                 "dz/(1+z) median",
                 "sigma_MAD",
                 "outliers",
+                "share",
                 "fracAGN offset",
                 "scatter",
                 "width",
                 "z in 16-84 %",
             ),
-            caption="Redshift and AGN fraction against truth; truths lie within the models of the fit, "
-            "whose 10 % model error they do not have, so posteriors are wide",
+            caption="Redshift and AGN fraction against truth; truths lie within the models of the "
+            f"fit, whose {100 * self.config.fit.model_error:g} % model error they do not have, so "
+            "posteriors are wide",
         )
         results = {unit: FitResults.read(self.context.path(f"fits_{unit}.fits")) for unit in FITS}
-        key = self._example()
-        if key is not None:
-            self.report.figure(
-                figures.example_figure(results, self.truth, key),
-                f"Source {key}: photometry and best fit with MIRI, and the posteriors of redshift "
-                "and AGN fraction with (red) and without (blue) MIRI.",
-            )
+        key = self._example(sample, results["with_miri"])
+        if key is None:
+            self.report.text("No source of the sample could be fitted.")
+            return
+        self.report.figure(
+            figures.example_figure(results, self.tables.truth, key, self.model),
+            f"Source {key}: photometry and best models, residuals of the fit with MIRI, and the "
+            "posteriors of redshift and AGN fraction with and without MIRI.",
+        )
 
-    def _example(self):
-        """A typical source: median magnitude among those near redshift one."""
-        sample = self.truth[self.sample]
+    def _example(self, sample, results):
+        """A typical source: among the brighter of those near redshift one that were fitted."""
+        fitted = np.array([np.isfinite(results[key].chi2) for key in sample["id"]], bool)
+        sample = sample[fitted]
         if len(sample) == 0:
             return None
         near = np.abs(np.asarray(sample["redshift"]) - 1.2)
         chosen = sample[np.argsort(near, kind="stable")[: max(1, len(sample) // 5)]]
         flux = chosen[self.bands[-1]].value
-        return chosen["id"][np.argsort(flux)[int(0.7 * (len(chosen) - 1))]]
+        return chosen["id"][np.argsort(flux, kind="stable")[int(0.7 * (len(chosen) - 1))]]
 
     def inputs(self):
         """The inputs beside published relations."""
@@ -302,18 +392,36 @@ class _Writer:
             "The inputs beside published relations",
             "What was injected follows from fits to real galaxies; these are checks that it is sane.",
         )
-        known = np.isfinite(self.truth["stellar_mass"].value)
-        galaxies = self.truth[known & ~np.asarray(self.truth["star"], bool)]
+        truth = self.tables.truth
+        known = np.isfinite(truth["stellar_mass"].value) & ~np.asarray(truth["star"], bool)
+        galaxies = truth[known]
+        if len(galaxies) == 0:
+            self.report.text("No galaxy of the catalogue has a model.")
+            return
+        figure, (faint, passive) = figures.input_figure(galaxies)
+        agn = ", AGN included," if self.config.sed.frac_agn > 0 else ""
         self.report.figure(
-            figures.input_figure(galaxies),
-            "Left: infrared luminosity against redshift; right: star-formation rate (100 Myr) against "
-            "stellar mass with the main sequence of Speagle et al. 2014 at z = 0.5, 1 and 2.",
+            figure,
+            f"Galaxies of the catalogue. Left: luminosity of 3-1000 µm{agn} against redshift, with "
+            "the 8-1000 µm luminosities of three star-formation rates after Kennicutt 1998 (Salpeter IMF). Right: "
+            "star-formation rate (100 Myr) against stellar mass, with the main sequence of Speagle et "
+            f"al. 2014 (Kroupa IMF). {faint} and {passive} galaxies lie below the axes.",
         )
-        area = figures.catalog_area(self.truth)
+        inside = (self.selection[known] & SampleFlags.OUTSIDE_FIELD) == 0
+        self._counts(galaxies[inside])
+
+    def _counts(self, galaxies):
+        """Number counts and the light of all galaxies, over the imaged area."""
+        area = self.area
+        options = self.config.catalog
+        if len(galaxies) == 0:
+            self.report.text("No galaxy with a model lies in the imaged area.")
+            return
         self.report.figure(
             figures.counts_figure(galaxies, self.bands, area),
-            "Number counts of the injected fluxes of all galaxies of the catalogue "
-            f"({area.to_value(u.arcmin**2):.1f} square arcmin, H < {self.config.catalog.mag_limit:g}).",
+            f"Number counts of the injected fluxes: {len(galaxies)} galaxies in the "
+            f"{area.to_value(u.arcmin**2):.2f} square arcmin that all bands have imaged, to "
+            f"{options.mag_column} = {options.mag_limit:g}; Poisson errors.",
         )
         rows = []
         for name, wave, least, value, down, up, reference in PUBLISHED_LIGHT:
@@ -322,57 +430,62 @@ class _Writer:
                 light, error = integrated_light(flux, area, wave * u.um)
                 rows.append(
                     (
-                        f"{name}, {wave:g} um",
-                        f"{least:g} uJy" if least else "none",
-                        f"{light.value:.2f} +- {error.value:.2f} ({len(flux)})",
+                        f"{band_label(name)}, {wave:g} µm",
+                        f"{least:g} µJy" if least else "none",
+                        len(flux),
+                        f"{light.value:.2f} ± {error.value:.2f}"
+                        if len(flux)
+                        else Missing("no source above the limit in the imaged area"),
                         f"{value:.2f} -{down:.2f} +{up:.2f}",
                         reference,
                     )
                 )
-        if rows:
-            self.report.table(
-                rows,
-                header=(
-                    "band",
-                    "faint limit",
-                    "this catalogue (sources)",
-                    "published",
-                    "reference",
-                ),
-                caption="Light of all galaxies above a flux, nu I_nu in nW / m2 / sr; Poisson errors",
-            )
-
-    def configuration(self):
-        """Configuration and times."""
-        self.report.section("How it was made")
-        rows = {}
-        for key, record in self.context.store.records.items():
-            rows.setdefault(key.split(":")[0], []).append(record["seconds"])
         self.report.table(
-            [(name, len(times), f"{sum(times):.1f}") for name, times in rows.items()],
-            header=("stage", "pieces", "seconds"),
-            caption="Time of each stage",
+            rows,
+            header=("band", "faint limit", "sources", "here", "published", "reference"),
+            caption="Light of all galaxies above a flux, nu I_nu in nW / m2 / sr; Poisson errors, without "
+            "cosmic variance",
+            empty="The light of all galaxies together is published near 15 and 24 µm; no band of "
+            "this run (F1500W, F2100W) is there.",
+        )
+
+    def origin(self):
+        """Libraries, software and citations."""
+        self.report.section("How it was made")
+        meta = self.model.meta
+        self.report.table(
+            provenance.library_rows(self.model),
+            header=("part", "component", "library", "reference"),
+            caption=f"SED models of the truth and the fits; cosmology {meta['cosmology']}; fracAGN by "
+            f"the definition {meta['frac_agn_definition']!r}",
+            text=4,
+        )
+        self.report.bullets(meta["libraries"])
+        products = [self.tables.truth.meta, self.tables.matched.meta]
+        self.report.table(
+            provenance.versions(*products),
+            header=("software", "version"),
+            text=2,
         )
         self.report.text(
-            "The configuration is config.toml in the folder of the run; 'miricigale run' takes it. What "
-            "to cite for the data: 'miricigale data list'."
+            "The configuration is config.toml in the folder of the run; 'miricigale run' takes it. "
+            "manifest.json says how long each stage took, with the checksum of each product. To be "
+            "cited for the data:"
         )
+        catalog = self.config.catalog.source
+        names = {
+            *provenance.IMAGE_RESOURCES,
+            *self.model.resources,
+            *({catalog} & set(resources())),
+        }
+        self.report.bullets(provenance.sources_to_cite(sorted(names), products))
 
 
 def _plus_minus(fit):
+    if not np.isfinite(fit["frac_agn_bias"]):
+        return Missing(NO_SAMPLE)
     return f"{fit['frac_agn_bias']:+.2f} ± {fit['frac_agn_sigma_mad']:.2f}"
 
 
-def _percent(value):
-    return f"{100 * value:.1f} %" if np.isfinite(value) else "none"
-
-
-def _signed(value):
-    return f"{100 * value:+.2f} %" if np.isfinite(value) else "none"
-
-
-def _proposal(name):
-    try:
-        return f"{proposal_limit(name).value:.1f}"
-    except KeyError:
-        return ""
+def _percent(value, reason, spec=".1f"):
+    return number(value, f"{{:{spec}}} %", reason, scale=100)

@@ -2,10 +2,19 @@
 
 import astropy.units as u
 import numpy as np
+from astropy.wcs.utils import proj_plane_pixel_area
 
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import Flags, error_column
 
-__all__ = ["SampleFlags", "add_selection", "detected_bands", "in_field", "magnitude"]
+__all__ = [
+    "SampleFlags",
+    "add_selection",
+    "detected_bands",
+    "footprint_area",
+    "in_field",
+    "magnitude",
+]
 
 
 class SampleFlags(Flags):
@@ -56,6 +65,32 @@ def in_field(sky, images):
         inside &= on
         inside[on] &= usable[y[on], x[on]]
     return inside
+
+
+def footprint_area(images):
+    """
+    Solid angle of the pixels that are usable in every image: the field of `in_field`.
+
+    Parameters
+    ----------
+    images : iterable of `~astropy.nddata.CCDData`
+        With mask, on one grid with pixels of one size.
+
+    Returns
+    -------
+    area : `~astropy.units.Quantity`
+
+    Raises
+    ------
+    ValueError
+        If the images differ in shape.
+    """
+    images = list(images)
+    if len({image.shape for image in images}) != 1:
+        raise argument_error("images", "on one grid", [image.shape for image in images])
+    usable = ~np.any([image.mask for image in images], axis=0)
+    pixel = proj_plane_pixel_area(images[0].wcs) * u.deg**2
+    return (np.count_nonzero(usable) * pixel).to(u.arcmin**2)
 
 
 def detected_bands(table, bands):

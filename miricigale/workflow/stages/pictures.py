@@ -1,0 +1,133 @@
+"""Pictures of the report, from images: the field, and what the model leaves of it."""
+
+import astropy.units as u
+import numpy as np
+from astropy.wcs.utils import proj_plane_pixel_scales
+
+from miricigale.plotting.axes import new_figure
+from miricigale.plotting.images import mark_sky, plot_color, plot_image, plot_model_residual
+from miricigale.workflow.stages.figures import WIDTH, band_label
+
+__all__ = ["field_figure", "residual_figure"]
+
+
+def _filled(image):
+    """Values of an image with NaN where it is masked."""
+    data = np.array(image.data, float)
+    if image.mask is not None:
+        data[np.asarray(image.mask, bool)] = np.nan
+    return data
+
+
+def _binned(data, factor):
+    """Means of squares of pixels; NaN where one of them is."""
+    ny, nx = (n // factor * factor for n in data.shape)
+    blocks = data[:ny, :nx].reshape(ny // factor, factor, nx // factor, factor)
+    return blocks.mean(axis=(1, 3))
+
+
+def _scale(image):
+    """Size of a pixel in arcsec."""
+    return float(proj_plane_pixel_scales(image.wcs)[0] * 3600)
+
+
+def _directions(image):
+    """Directions (x, y) of north and east at the middle of an image."""
+    ny, nx = image.shape
+    middle = image.wcs.pixel_to_world((nx - 1) / 2, (ny - 1) / 2)
+    found = {}
+    for name, angle in (("north", 0), ("east", 90)):
+        there = image.wcs.world_to_pixel(middle.directional_offset_by(angle * u.deg, 1 * u.arcsec))
+        found[name] = (float(there[0]) - (nx - 1) / 2, float(there[1]) - (ny - 1) / 2)
+    return found
+
+
+def field_figure(images, prior, names):
+    """
+    The field: the high-resolution image beside a colour image of three bands, or each band in grey.
+
+    Parameters
+    ----------
+    images : list of `~astropy.nddata.CCDData`
+        Mosaics on one grid, the shortest wavelength first; other numbers than three are drawn
+        in grey.
+    prior : `~astropy.nddata.CCDData`
+        The high-resolution image.
+    names : list of str
+        Bands of the images, and of the prior.
+    """
+    planes = [_filled(image) for image in images]
+    used = np.argwhere(np.any([np.isfinite(plane) for plane in planes], axis=0))
+    (y0, x0), (y1, x1) = used.min(axis=0), used.max(axis=0) + 1
+    planes = [plane[y0:y1, x0:x1] for plane in planes]
+    # the same part of the sky on the prior's own pixels
+    corners = images[0].wcs.pixel_to_world([x0 - 0.5, x1 - 0.5], [y0 - 0.5, y1 - 0.5])
+    x, y = (np.round(v + 0.5).astype(int).clip(0) for v in prior.wcs.world_to_pixel(corners))
+    factor = max(1, round(_scale(images[0]) / _scale(prior)))
+    field = _binned(_filled(prior)[y[0] : y[1], x[0] : x[1]], factor)
+    labels = [band_label(name) for name in names]
+    colour = len(planes) == 3
+    n = 2 if colour else 1 + len(planes)
+    width = WIDTH / n
+    bar = 0 if colour else 0.8
+    size = (width, (width - bar) * (y1 - y0) / (x1 - x0) + 0.4)
+    figure, axes = new_figure(1, n, size=size)
+    axes = axes.ravel()
+    grey = {"colorbar": None if colour else "MJy/sr"}
+    scale = factor * _scale(prior)
+    plot_image(field, ax=axes[0], pixel_scale=scale, title=f"{labels[-1]} (prior)", **grey)
+    if colour:
+        parts = zip(("blue", "green", "red"), labels, strict=False)
+        title = ", ".join(f"{label} {color}" for color, label in parts)
+        # the noise of single pixels would be a grain of all colours
+        planes = [_binned(plane, 2) for plane in planes]
+        options = {"stretch": 4.0, "softening": 7.0, "title": title}
+        plot_color(*planes[::-1], ax=axes[1], pixel_scale=2 * _scale(images[0]), **options)
+    else:
+        for ax, plane, image, label in zip(axes[1:], planes, images, labels, strict=False):
+            plot_image(plane, ax=ax, pixel_scale=_scale(image), title=label, **grey)
+    for k, ax in enumerate(axes):
+        mark_sky(ax, 20, **_directions(images[0]), color="white" if colour and k else "black")
+    return figure
+
+
+def residual_figure(images, names, *, size=220):
+    """
+    Mosaic, model and residual of several bands, cut to the same crowded part.
+
+    Parameters
+    ----------
+    images : list of tuple of `~astropy.nddata.CCDData`
+        Mosaic and model of each band, on one grid.
+    names : list of str
+        Their filters.
+    size : int, optional
+        Side of the cutout in pixels.
+    """
+    panel = WIDTH / 3
+    figure, axes = new_figure(len(images), 3, size=(panel, 0.8 * panel))
+    # the model goes on where nothing was exposed
+    model = np.where(np.isfinite(_filled(images[0][0])), _filled(images[0][1]), 0.0)
+    # where the model has most light: the part that tests deblending
+    rows, columns = np.arange(0, model.shape[0], 60), np.arange(0, model.shape[1], 60)
+    light = np.sqrt(np.clip(model, 0, None))
+    smooth = np.add.reduceat(np.add.reduceat(light, rows, axis=0), columns, axis=1)
+    iy, ix = np.unravel_index(np.argmax(smooth), smooth.shape)
+    y0 = int(np.clip(iy * 60 - size // 2 + 30, 0, max(0, model.shape[0] - size)))
+    x0 = int(np.clip(ix * 60 - size // 2 + 30, 0, max(0, model.shape[1] - size)))
+    part = (slice(y0, y0 + size), slice(x0, x0 + size))
+    for row, (name, pair) in enumerate(zip(names, images, strict=True)):
+        titles = ("mosaic", "model", "mosaic - model") if row == 0 else (None, None, None)
+        image, model = (_filled(plane)[part] for plane in pair)
+        plot_model_residual(
+            image,
+            model,
+            ax=axes[row],
+            pixel_scale=_scale(pair[0]),
+            titles=titles,
+            unit="MJy/sr",
+        )
+        for ax in axes[row]:
+            mark_sky(ax, 5, **_directions(pair[0]))
+        axes[row, 0].set_ylabel(band_label(name))
+    return figure

@@ -1,0 +1,251 @@
+"""What the report says of where its numbers come from: exposures, libraries, software, citations."""
+
+import importlib.metadata
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.evaluation import number
+from miricigale.filters import Filter
+from miricigale.refdata import citations, resource, resources
+from miricigale.utils.meta import provenance
+from miricigale.workflow.stages.figures import band_label
+from miricigale.workflow.stages.images import study_exposures
+from miricigale.workflow.stages.inputs import catalog_bands
+
+__all__ = [
+    "EXPOSURE_HEADER",
+    "IMAGE_RESOURCES",
+    "catalog_facts",
+    "exposure_rows",
+    "library_rows",
+    "read_forecasts",
+    "sources_to_cite",
+    "stand_ins",
+    "versions",
+]
+
+#: Reference data of the simulated images.
+IMAGE_RESOURCES = (
+    "instrument.siaf",
+    "instrument.imager",
+    "instrument.thermal",
+    "psf.jwst_pupil",
+    "filters.sedpy",
+)
+
+#: What is not the paper's library, and what that changes, by resource.
+STAND_INS = {
+    "ssp.bc03": (
+        "Stars: a thinned table of Bruzual & Charlot's populations (2016 version) with a Kroupa IMF "
+        "(inferred) stands in for their files with a Chabrier IMF, which the paper has "
+        "(ssp.bc03_user)."
+    ),
+    "dust.dl07": (
+        "Dust: Draine & Li 2007 with an approximate mapping of alpha stands in for the templates of "
+        "Dale et al. 2014 (dust.dale2014): fluxes in MIRI bands differ by up to 0.4 mag, by 1 mag "
+        "at the 3.3 µm feature."
+    ),
+    "torus.parametric": (
+        "Torus: a parametric form stands in for SKIRTOR (torus.skirtor2016): fitted to 50 of its "
+        "spectra, all with p = 1, q = 0, to 0.06 dex rms; other values of p and q, such as q = 1 of "
+        "the fits, are an extrapolation."
+    ),
+}
+
+EXPOSURE_HEADER = (
+    "band",
+    "readout",
+    "groups x integrations",
+    "dithers",
+    "time (s)",
+    "sky fills of the well",
+    "saturated pixels",
+    "as CEERS",
+)
+
+
+def exposure_rows(config, forecasts, ceers):
+    """
+    A row for each kind of exposure of a band, in the order of the configuration.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.config.StudyConfig`
+        The configuration.
+    forecasts : dict of str to `~astropy.table.Table`
+        Forecast of each exposure, by unit.
+    ceers : dict of str to bool
+        Whether each band is exposed as CEERS did.
+
+    Returns
+    -------
+    rows : list of tuple
+        Under `EXPOSURE_HEADER`; filling and saturation are the highest of the dithers.
+    """
+    kinds = {}
+    for unit, e in study_exposures(config).items():
+        key = (e.filter, f"{e.readout} {e.subarray}", e.n_groups, e.n_integrations)
+        kinds.setdefault(key, []).append((e, forecasts[unit]))
+    rows = []
+    for (name, readout, n_groups, n_integrations), group in kinds.items():
+        time = sum(e.exposure_time for e, _ in group).to_value(u.s)
+        fill = max(float(table["sky_fraction"][0]) for _, table in group)
+        full = max(int(table["n_pixels"][0]) for _, table in group)
+        rows.append(
+            (
+                band_label(name),
+                readout,
+                f"{n_groups} x {n_integrations}",
+                len(group),
+                f"{time:.0f}",
+                number(fill, "{:.0f} %", "no usable pixel", scale=100),
+                full,
+                "yes" if ceers[name] else "no",
+            )
+        )
+    return rows
+
+
+def read_forecasts(context):
+    """The forecasts of all exposures, by unit."""
+    return {
+        unit: QTable.read(context.path(f"exposures/{unit}_forecast.ecsv"))
+        for unit in study_exposures(context.config)
+    }
+
+
+def stand_ins(config, model):
+    """
+    Sentences on everything that is not what the paper, or the observatory, has.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.config.StudyConfig`
+        The configuration.
+    model : `~miricigale.sed.SEDModel`
+        Of the truth and the fits.
+
+    Returns
+    -------
+    sentences : list of str
+    """
+    found = [STAND_INS[name] for name in model.resources if name in STAND_INS]
+    found.append(
+        "Instrument: PSFs are computed from the outline of the pupil; non-linearity, flat field and "
+        "bad pixels are stand-ins of the right size; the zodiacal light is two black bodies."
+    )
+    rays = ", read-out and cosmic rays" if config.detector.cosmic_rays else " and read-out"
+    noise = f"Noise: photons, dark current{rays}"
+    if config.detector.residual == 0.0:
+        noise += (
+            " only; the correlated residual of flat field and sky that the exposure time calculator "
+            "allows for is off"
+        )
+    else:
+        noise += f"; residual of flat field and sky: {config.detector.residual}"
+    found.append(f"{noise}.")
+    return found
+
+
+def library_rows(model):
+    """Role, component, and reference data of each component of a model."""
+    rows = []
+    for part in model.components:
+        record = resources().get(part.resource) if part.resource else None
+        what = f"{record.title} ({part.resource})" if record else "closed form"
+        if part.role == "stellar":
+            what += f"; IMF {part.imf}"
+        rows.append(
+            (part.role, part.name, what, part.reference or (record.citation if record else ""))
+        )
+    return rows
+
+
+def catalog_facts(config, catalog):
+    """
+    What the catalogue is: pairs of a label and text.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.config.StudyConfig`
+        The configuration.
+    catalog : `~astropy.table.QTable`
+        The sources that were taken.
+
+    Returns
+    -------
+    facts : list of tuple of str
+    """
+    options = config.catalog
+    bundled = options.source in resources()
+    # where a user's file lies is no part of the result
+    source = f"{options.source}: {resource(options.source).title}" if bundled else (
+        f"{Path(options.source).name}, the user's file")  # fmt: skip
+    bands = catalog_bands(catalog)
+    fitted = [
+        name for name in bands if Filter.from_name(name).pivot.value <= config.sed.max_wavelength
+    ]
+    told = dict.fromkeys(
+        text for name in bands if (text := catalog[name].info.description) is not None
+    )
+    fluxes = f"{len(bands)} bands; the description in the file: {'; '.join(told)}" if told else (
+        f"{len(bands)} bands, as the file gives them, without a description")  # fmt: skip
+    prior = config.highres.filter
+    how = (
+        f" (pivot up to {config.sed.max_wavelength:g} µm), "
+        f"{100 * config.sed.catalog_error:g} % error each"
+    )
+    if prior in bands:
+        how += f"; each SED is scaled to the flux in {prior}"
+    facts = [
+        ("source", source),
+        ("cut", f"{options.mag_column} <= {options.mag_limit:g}, {len(catalog)} sources"),
+        ("fluxes", fluxes),
+        ("input SEDs fitted to", f"{', '.join(fitted)}{how}"),
+    ]
+    if "redshift_source" in catalog.colnames:
+        kinds, counts = np.unique(np.asarray(catalog["redshift_source"], str), return_counts=True)
+        text = ", ".join(f"{n} {kind}" for kind, n in zip(kinds, counts, strict=True))
+        facts.append(("redshifts", text))
+    facts.append(("stars", f"{np.count_nonzero(catalog['star'])}"))
+    return facts
+
+
+def versions(*metas):
+    """
+    Software: pairs of package and version.
+
+    Parameters
+    ----------
+    *metas : dict
+        Meta of products, whose version of this package may be another than today's.
+    """
+    here = provenance()["version"]
+    made = sorted({meta["version"] for meta in metas if "version" in meta})
+    own = here if made in ([], [here]) else f"{here} (products: {', '.join(made)})"
+    packages = ("numpy", "astropy", "photutils", "numba", "scipy", "drizzle", "astro-sedpy")
+    return [("miricigale", own), *((name, importlib.metadata.version(name)) for name in packages)]
+
+
+def sources_to_cite(names, metas):
+    """
+    What to cite: of reference data and of products, each once.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Resources.
+    metas : iterable of dict
+        Meta of products, with ``citations``.
+
+    Returns
+    -------
+    entries : list of str
+        Sorted; one that another contains is left out.
+    """
+    entries = {entry for meta in metas for entry in meta.get("citations", ())}
+    entries |= set(citations(*names))
+    return sorted(one for one in entries if not any(one != two and one in two for two in entries))
