@@ -163,7 +163,7 @@ class Report:
 
         def cells(row, tag):
             return "".join(
-                f"<{tag}{' class=t' if k < text else ''}>{shown(cell)}</{tag}>"
+                f"<{tag}{' class=n' if k >= text else ''}>{shown(cell)}</{tag}>"
                 for k, cell in enumerate(row)
             )
 

@@ -47,6 +47,30 @@ def test_photometry_with_and_without_residuals():
     assert plot_sed_fit(wave, flux, err, model, ax=ax) is ax
 
 
+def test_parts_and_groups_stand_in_the_legend():
+    wave = np.array([1.0, 4.0, 15.0]) * u.um
+    flux = np.array([1.0, 2.0, 3.0]) * u.uJy
+    ax = plt.figure().add_subplot()
+    spectrum = (wave, flux)
+    plot_sed_fit(
+        wave,
+        flux,
+        0.1 * flux,
+        flux,
+        spectrum=spectrum,
+        parts={"AGN": spectrum},
+        groups=["old", "old", "MIRI"],
+        ax=ax,
+    )
+    labels = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert labels[:2] == ["best model", "AGN"]
+    assert {"old", "MIRI"} < set(labels)
+    points = {bar.get_label(): bar.lines[0] for bar in ax.containers}
+    assert points["old"].get_xdata().tolist() == [1.0, 4.0]
+    assert points["MIRI"].get_xdata().tolist() == [15.0]
+    assert points["old"].get_color() != points["MIRI"].get_color()
+
+
 def test_results_draw_themselves(grid, photometry):
     results = BayesFitter(grid).fit(photometry)
     ax = plt.figure().add_subplot()

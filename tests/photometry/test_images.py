@@ -4,6 +4,7 @@ from matplotlib.figure import Figure
 
 from miricigale.plotting.images import (
     color_image,
+    mark_sky,
     plot_color,
     plot_image,
     plot_model_residual,
@@ -60,6 +61,33 @@ def test_colour_shows_where_the_light_is_red(image):
     assert axes.images[0].get_array().shape == (40, 60, 3)
     with pytest.raises(ValueError, match="must be of one shape"):
         color_image(image, dark, dark[:5])
+
+
+def test_colour_needs_all_three(image):
+    dark = np.random.default_rng(1).normal(size=image.shape)
+    holed = image.copy()
+    holed[3, 4] = np.nan
+    assert (color_image(dark, holed, dark)[3, 4] == 0).all()
+
+
+def test_residuals_are_stretched_evenly(image):
+    axes = plot_model_residual(image, image + 3.0)
+    norm = axes[2].images[0].norm
+    assert norm.vmin == -norm.vmax
+
+
+def test_marks_have_their_length_and_direction(image, ax):
+    plot_image(image, ax=ax, pixel_scale=0.5)
+    # north along x, east along y: rolled by 90 degrees
+    mark_sky(ax, 10, north=(2, 0), east=(0, 3))
+    x = ax.lines[0].get_xdata()
+    assert x[1] - x[0] == pytest.approx(10)
+    places = {text.get_text(): np.array(text.get_position()) for text in ax.texts}
+    assert places['10"'][0] == pytest.approx(np.mean(x))
+    step = places["N"] - places["E"]
+    assert step[0] > 0
+    assert step[1] < 0
+    assert len(ax.get_xticks()) == 0
 
 
 def test_outlines_enclose_their_segments(image, ax):

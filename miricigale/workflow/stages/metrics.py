@@ -7,7 +7,9 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.evaluation import (
+    PUBLISHED_LIGHT,
     fraction_interval,
+    integrated_light,
     photoz_metrics,
     recovery_metrics,
     sigma_mad,
@@ -64,6 +66,14 @@ class StudyTables:
             {unit: QTable.read(context.path(f"fits_{unit}.ecsv")) for unit in FITS},
             {name: QTable.read(context.path(f"points/{name}.ecsv")) for name in names},
         )
+
+    def galaxies(self, *, field=False):
+        """Rows of the truth that are galaxies with a model, of the imaged field or all."""
+        known = np.isfinite(self.truth["stellar_mass"].value)
+        known &= ~np.asarray(self.truth["star"], bool)
+        if field:
+            known &= (np.asarray(self.matched["selection"]) & SampleFlags.OUTSIDE_FIELD) == 0
+        return self.truth[known]
 
 
 def as_ceers(config, name):
@@ -150,7 +160,22 @@ def _crowded(truth, name, radius=2 * u.arcsec):
     return crowded
 
 
-def study_metrics(config, tables):
+def _light(galaxies, bands, area):
+    """Light of all galaxies together, where it is published."""
+    rows = []
+    for name, wave, least, value, down, up, reference in PUBLISHED_LIGHT:
+        if name in bands:
+            flux = galaxies[name][galaxies[name] >= least * u.uJy]
+            light, error = integrated_light(flux, area, wave * u.um)
+            published = {"published": value, "down": down, "up": up, "reference": reference}
+            here = {"n": len(flux), "light": light.value, "light_err": error.value}
+            # of no source there is no error either
+            here |= {} if len(flux) else {"light": np.nan, "light_err": np.nan}
+            rows.append({"band": name, "wavelength": wave, "least": least, **here, **published})
+    return rows
+
+
+def study_metrics(config, tables, area):
     """
     All numbers of the report.
 
@@ -160,6 +185,8 @@ def study_metrics(config, tables):
         The configuration.
     tables : `StudyTables`
         Of a run whose other stages are done.
+    area : `~astropy.units.Quantity`
+        Solid angle of the imaged field.
 
     Returns
     -------
@@ -178,11 +205,13 @@ def study_metrics(config, tables):
         "n_left_out": {
             flag.name.lower(): int(np.count_nonzero(selection & flag)) for flag in SampleFlags
         },
+        "area": float(area.to_value(u.arcmin**2)),
         "as_paper": as_paper(config),
         # of one band there are no two
         "n_bands_detected": min(2, len(bands)),
         "bands": {},
         "detected": [],
+        "light": _light(tables.galaxies(field=True), bands, area),
         "fits": {},
     }
     prior = magnitude(truth[config.highres.filter])

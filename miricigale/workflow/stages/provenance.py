@@ -16,15 +16,15 @@ from miricigale.workflow.stages.images import study_exposures
 from miricigale.workflow.stages.inputs import catalog_bands
 
 __all__ = [
-    "EXPOSURE_HEADER",
     "IMAGE_RESOURCES",
     "catalog_facts",
     "exposure_rows",
     "library_rows",
-    "read_forecasts",
     "sources_to_cite",
     "stand_ins",
     "versions",
+    "write_exposures",
+    "write_origin",
 ]
 
 #: Reference data of the simulated images.
@@ -107,14 +107,6 @@ def exposure_rows(config, forecasts, ceers):
             )
         )
     return rows
-
-
-def read_forecasts(context):
-    """The forecasts of all exposures, by unit."""
-    return {
-        unit: QTable.read(context.path(f"exposures/{unit}_forecast.ecsv"))
-        for unit in study_exposures(context.config)
-    }
 
 
 def stand_ins(config, model):
@@ -249,3 +241,46 @@ def sources_to_cite(names, metas):
     entries = {entry for meta in metas for entry in meta.get("citations", ())}
     entries |= set(citations(*names))
     return sorted(one for one in entries if not any(one != two and one in two for two in entries))
+
+
+def write_exposures(context, report, metrics):
+    """Add the section on what was exposed, and of which sources."""
+    config = context.config
+    report.section("Exposures and catalogue")
+    forecasts = {
+        unit: QTable.read(context.path(f"exposures/{unit}_forecast.ecsv"))
+        for unit in study_exposures(config)
+    }
+    ceers = {name: entry["ceers"] for name, entry in metrics["bands"].items()}
+    report.table(
+        exposure_rows(config, forecasts, ceers),
+        header=EXPOSURE_HEADER,
+        caption="Exposures; time is that of all dithers, filling (by the last group) and saturated "
+        "pixels are the highest of a dither",
+        text=2,
+    )
+    catalog = QTable.read(context.path("catalog.ecsv"))
+    report.table(catalog_facts(config, catalog), header=("catalogue", ""), text=2)
+
+
+def write_origin(report, config, model, metas):
+    """Add the section on libraries, software and citations; ``metas`` are those of products."""
+    report.section("How it was made")
+    meta = model.meta
+    report.table(
+        library_rows(model),
+        header=("part", "component", "library", "reference"),
+        caption=f"SED models of the truth and the fits; cosmology {meta['cosmology']}; fracAGN by the "
+        f"definition {meta['frac_agn_definition']!r}",
+        text=4,
+    )
+    report.bullets(meta["libraries"])
+    report.table(versions(*metas), header=("software", "version"), text=2)
+    report.text(
+        "The configuration is config.toml in the folder of the run; 'miricigale run' takes it. "
+        "manifest.json says how long each stage took, with the checksum of each product. To be "
+        "cited for the data:"
+    )
+    catalog = {config.catalog.source} & set(resources())
+    names = {*IMAGE_RESOURCES, "instrument.etc", *model.resources, *catalog}
+    report.bullets(sources_to_cite(names, metas))

@@ -5,22 +5,18 @@ import logging
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 
 from miricigale.evaluation import (
-    PUBLISHED_LIGHT,
     Missing,
     Report,
-    integrated_light,
     number,
 )
 from miricigale.fitting import FitResults
-from miricigale.refdata import resources
 from miricigale.sed import SEDModel
 from miricigale.workflow.stages import figures, pictures, provenance
 from miricigale.workflow.stages.figures import band_label
 from miricigale.workflow.stages.metrics import FITS, StudyTables, study_metrics
-from miricigale.workflow.stages.sample import SampleFlags, footprint_area
+from miricigale.workflow.stages.sample import SampleFlags, footprint_area, typical_source
 
 __all__ = ["make_report"]
 
@@ -31,7 +27,9 @@ def make_report(context, _):
     """Stage 14: the page with its figures, and the numbers as JSON."""
     config = context.config
     tables = StudyTables.read(context)
-    metrics = study_metrics(config, tables)
+    mosaics = {name: context.image(f"mosaic_{name}.fits") for name in config.exposures.filters}
+    area = footprint_area(mosaics.values())
+    metrics = study_metrics(config, tables, area)
     if metrics["n_sample"] == 0:
         log.warning("no source is left to fit: %s", metrics["n_left_out"])
     text = json.dumps(_without_nan(metrics), indent=1, allow_nan=False)
@@ -47,15 +45,15 @@ def make_report(context, _):
         notices=provenance.stand_ins(config, model),
         dpi=config.report.dpi,
     )
-    writer = _Writer(context, report, tables, metrics, model)
+    writer = _Writer(context, report, tables, metrics, model, mosaics, area)
     writer.summary()
-    writer.exposures()
+    provenance.write_exposures(context, report, metrics)
     writer.images()
     writer.photometry()
     writer.errors()
     writer.fits()
     writer.inputs()
-    writer.origin()
+    provenance.write_origin(report, config, model, [tables.truth.meta, tables.matched.meta])
     context.save("report/index.html", lambda path: report.write(path))
 
 
@@ -75,12 +73,11 @@ NO_SAMPLE = "no source in the fit"
 class _Writer:
     """The sections of the page; each reads the products that it shows."""
 
-    def __init__(self, context, report, tables, metrics, model):
+    def __init__(self, context, report, tables, metrics, model, mosaics, area):
         self.context, self.report, self.metrics = context, report, metrics
         self.tables, self.model, self.config = tables, model, context.config
         self.bands = context.config.exposures.filters
-        self.mosaics = {name: context.image(f"mosaic_{name}.fits") for name in self.bands}
-        self.area = footprint_area(self.mosaics.values())
+        self.mosaics, self.area = mosaics, area
         self.selection = np.asarray(tables.matched["selection"])
 
     def summary(self):
@@ -98,7 +95,7 @@ class _Writer:
                 ("galaxies in the field", m["n_field"]),
                 (
                     "imaged in all bands",
-                    f"{self.area.to_value(u.arcmin**2):.2f} arcmin\N{SUPERSCRIPT TWO}",
+                    f"{m['area']:.2f} arcmin\N{SUPERSCRIPT TWO}",
                 ),
                 ("found on the high-resolution image", m["n_matched"]),
                 (f"in the fit: {self.config.fit.min_detected}+ MIRI bands", m["n_sample"]),
@@ -133,28 +130,6 @@ class _Writer:
             f"{name} = {limit:g}",
             empty=f"The catalogue ends at {name} = {limit:g}: too bright for the shares of detected "
             f"galaxies that are published, to {prior} = 25 and 26.",
-        )
-
-    def exposures(self):
-        """What was exposed, and of which sources."""
-        self.report.section("Exposures and catalogue")
-        bands = self.metrics["bands"]
-        self.report.table(
-            provenance.exposure_rows(
-                self.config,
-                provenance.read_forecasts(self.context),
-                {name: entry["ceers"] for name, entry in bands.items()},
-            ),
-            header=provenance.EXPOSURE_HEADER,
-            caption="Exposures; time is that of all dithers, filling (by the last group) and "
-            "saturated pixels are the highest of a dither",
-            text=2,
-        )
-        catalog = QTable.read(self.context.path("catalog.ecsv"))
-        self.report.table(
-            provenance.catalog_facts(self.config, catalog),
-            header=("catalogue", ""),
-            text=2,
         )
 
     def images(self):
@@ -365,7 +340,7 @@ class _Writer:
             "posteriors are wide",
         )
         results = {unit: FitResults.read(self.context.path(f"fits_{unit}.fits")) for unit in FITS}
-        key = self._example(sample, results["with_miri"])
+        key = typical_source(sample, results["with_miri"].fitted, self.bands[-1])
         if key is None:
             self.report.text("No source of the sample could be fitted.")
             return
@@ -375,26 +350,13 @@ class _Writer:
             "posteriors of redshift and AGN fraction with and without MIRI.",
         )
 
-    def _example(self, sample, results):
-        """A typical source: among the brighter of those near redshift one that were fitted."""
-        fitted = np.array([np.isfinite(results[key].chi2) for key in sample["id"]], bool)
-        sample = sample[fitted]
-        if len(sample) == 0:
-            return None
-        near = np.abs(np.asarray(sample["redshift"]) - 1.2)
-        chosen = sample[np.argsort(near, kind="stable")[: max(1, len(sample) // 5)]]
-        flux = chosen[self.bands[-1]].value
-        return chosen["id"][np.argsort(flux, kind="stable")[int(0.7 * (len(chosen) - 1))]]
-
     def inputs(self):
         """The inputs beside published relations."""
         self.report.section(
             "The inputs beside published relations",
             "What was injected follows from fits to real galaxies; these are checks that it is sane.",
         )
-        truth = self.tables.truth
-        known = np.isfinite(truth["stellar_mass"].value) & ~np.asarray(truth["star"], bool)
-        galaxies = truth[known]
+        galaxies = self.tables.galaxies()
         if len(galaxies) == 0:
             self.report.text("No galaxy of the catalogue has a model.")
             return
@@ -407,78 +369,39 @@ class _Writer:
             "star-formation rate (100 Myr) against stellar mass, with the main sequence of Speagle et "
             f"al. 2014 (Kroupa IMF). {faint} and {passive} galaxies lie below the axes.",
         )
-        inside = (self.selection[known] & SampleFlags.OUTSIDE_FIELD) == 0
-        self._counts(galaxies[inside])
+        self._counts(self.tables.galaxies(field=True))
 
     def _counts(self, galaxies):
         """Number counts and the light of all galaxies, over the imaged area."""
-        area = self.area
         options = self.config.catalog
         if len(galaxies) == 0:
             self.report.text("No galaxy with a model lies in the imaged area.")
             return
         self.report.figure(
-            figures.counts_figure(galaxies, self.bands, area),
+            figures.counts_figure(galaxies, self.bands, self.area),
             f"Number counts of the injected fluxes: {len(galaxies)} galaxies in the "
-            f"{area.to_value(u.arcmin**2):.2f} square arcmin that all bands have imaged, to "
+            f"{self.metrics['area']:.2f} square arcmin that all bands have imaged, to "
             f"{options.mag_column} = {options.mag_limit:g}; Poisson errors.",
         )
-        rows = []
-        for name, wave, least, value, down, up, reference in PUBLISHED_LIGHT:
-            if name in self.bands:
-                flux = galaxies[name][galaxies[name] >= least * u.uJy]
-                light, error = integrated_light(flux, area, wave * u.um)
-                rows.append(
-                    (
-                        f"{band_label(name)}, {wave:g} µm",
-                        f"{least:g} µJy" if least else "none",
-                        len(flux),
-                        f"{light.value:.2f} ± {error.value:.2f}"
-                        if len(flux)
-                        else Missing("no source above the limit in the imaged area"),
-                        f"{value:.2f} -{down:.2f} +{up:.2f}",
-                        reference,
-                    )
-                )
+        none = "no source above the limit in the imaged area"
         self.report.table(
-            rows,
+            [
+                (
+                    f"{band_label(row['band'])}, {row['wavelength']:g} µm",
+                    f"{row['least']:g} µJy" if row["least"] else "none",
+                    row["n"],
+                    f"{row['light']:.2f} ± {row['light_err']:.2f}" if row["n"] else Missing(none),
+                    f"{row['published']:.2f} -{row['down']:.2f} +{row['up']:.2f}",
+                    row["reference"],
+                )
+                for row in self.metrics["light"]
+            ],
             header=("band", "faint limit", "sources", "here", "published", "reference"),
             caption="Light of all galaxies above a flux, nu I_nu in nW / m2 / sr; Poisson errors, without "
             "cosmic variance",
             empty="The light of all galaxies together is published near 15 and 24 µm; no band of "
             "this run (F1500W, F2100W) is there.",
         )
-
-    def origin(self):
-        """Libraries, software and citations."""
-        self.report.section("How it was made")
-        meta = self.model.meta
-        self.report.table(
-            provenance.library_rows(self.model),
-            header=("part", "component", "library", "reference"),
-            caption=f"SED models of the truth and the fits; cosmology {meta['cosmology']}; fracAGN by "
-            f"the definition {meta['frac_agn_definition']!r}",
-            text=4,
-        )
-        self.report.bullets(meta["libraries"])
-        products = [self.tables.truth.meta, self.tables.matched.meta]
-        self.report.table(
-            provenance.versions(*products),
-            header=("software", "version"),
-            text=2,
-        )
-        self.report.text(
-            "The configuration is config.toml in the folder of the run; 'miricigale run' takes it. "
-            "manifest.json says how long each stage took, with the checksum of each product. To be "
-            "cited for the data:"
-        )
-        catalog = self.config.catalog.source
-        names = {
-            *provenance.IMAGE_RESOURCES,
-            *self.model.resources,
-            *({catalog} & set(resources())),
-        }
-        self.report.bullets(provenance.sources_to_cite(sorted(names), products))
 
 
 def _plus_minus(fit):

@@ -14,6 +14,7 @@ __all__ = [
     "footprint_area",
     "in_field",
     "magnitude",
+    "typical_source",
 ]
 
 
@@ -130,3 +131,30 @@ def add_selection(matched, truth, bands, *, inside, min_detected, redshifts):
     flags[~((redshift >= redshifts[0]) & (redshift <= redshifts[1]))] |= SampleFlags.OUTSIDE_GRID
     matched["selection"] = flags
     matched["selection"].info.description = SampleFlags.describe()
+
+
+def typical_source(sample, fitted, band):
+    """
+    A source to be shown: among the brighter of those nearest to redshift 1.2.
+
+    Parameters
+    ----------
+    sample : `~astropy.table.QTable`
+        Truth of the fitted sources, with ``id``, ``redshift`` and the band.
+    fitted : array of bool
+        Which of them have a fit.
+    band : str
+        In which they are bright.
+
+    Returns
+    -------
+    key : object or None
+        Its id; None if there is none with a fit.
+    """
+    sample = sample[np.asarray(fitted, bool)]
+    if len(sample) == 0:
+        return None
+    near = np.abs(np.asarray(sample["redshift"]) - 1.2)
+    chosen = sample[np.argsort(near, kind="stable")[: max(1, len(sample) // 5)]]
+    order = np.argsort(chosen[band].value, kind="stable")
+    return chosen["id"][order[int(0.7 * (len(chosen) - 1))]]

@@ -1,0 +1,336 @@
+"""The page of a run: any number of bands, with and without a sample, from made-up products."""
+
+import html
+import json
+import re
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData
+from astropy.table import QTable
+from astropy.wcs import WCS
+
+from miricigale.sed import SEDModel
+from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.products import ProductStore
+from miricigale.workflow.runner import Context
+from miricigale.workflow.stages import study_stages
+from miricigale.workflow.stages.figures import three_bands
+from miricigale.workflow.stages.images import study_exposures
+from miricigale.workflow.stages.metrics import as_ceers, as_paper
+from miricigale.workflow.stages.pictures import field_figure, residual_figure
+from miricigale.workflow.stages.provenance import sources_to_cite, stand_ins
+from miricigale.workflow.stages.sample import footprint_area, in_field
+
+STAGES = {stage.name: stage for stage in study_stages()}
+SCALE = 0.11
+#: Pixels of the made-up images, and the rim that is masked.
+SHAPE, RIM = (130, 170), 15
+AREA = 100 * 140 * SCALE**2 / 3600
+
+
+def sky_image(scale, shape, data, *, rim=0):
+    """A north-up image about the pointing of the default configuration."""
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = "RA---TAN", "DEC--TAN"
+    wcs.wcs.crval = 53.13440, -27.83444
+    wcs.wcs.crpix = (shape[1] + 1) / 2, (shape[0] + 1) / 2
+    wcs.wcs.cdelt = -scale / 3600, scale / 3600
+    mask = np.zeros(shape, bool)
+    if rim:
+        mask = np.ones(shape, bool)
+        mask[rim:-rim, rim:-rim] = False
+    return CCDData(data, wcs=wcs, mask=mask, unit="MJy/sr")
+
+
+def noise_image(seed=0, *, rim=RIM, scale=SCALE, shape=SHAPE):
+    rng = np.random.default_rng(seed)
+    y, x = np.indices(shape)
+    light = 20 * np.exp(-((x - shape[1] / 2) ** 2 + (y - shape[0] / 2) ** 2) / 30)
+    return sky_image(scale, shape, light + rng.normal(size=shape), rim=rim), light
+
+
+def small_config(filters, *, points=False):
+    n = len(filters)
+    return StudyConfig.from_dict(
+        {
+            "run": {"name": "made up"},
+            "exposures": {
+                "filters": filters,
+                "n_groups": [7] * n,
+                "n_integrations": [1] * n,
+                "n_dithers": [1] * n,
+            },
+            "sed": {"axes": "quick"},
+            "errors": {"bin_size": 8},
+            "fit": {
+                "bands": ["megacam.r", "wfc3.f160w", "irac.ch1"],
+                "depths": [27.0, 27.0, 24.0],
+                "axes": "quick",
+                "min_detected": 1,
+            },
+            "point_sources": {"enabled": points},
+            "report": {"dpi": 40},
+        }
+    )
+
+
+def do_stage(config, folder, name, unit=""):
+    context = Context(config, ProductStore(folder), stage=STAGES[name], progress_bar=False)
+    STAGES[name].function(context, unit)
+
+
+def make_run(folder, filters, *, mass=3e10, points=False):
+    """Make up what the stage ``report`` reads, and run it."""
+    config = small_config(filters, points=points)
+    with ProductStore(folder) as store:
+        # the manifest makes it the folder of a run
+        made = Context(config, store, stage=STAGES["truth"], progress_bar=False)
+    rng = np.random.default_rng(1)
+    count = 24
+    center = SkyCoord(53.13440 * u.deg, -27.83444 * u.deg)
+    step = rng.uniform([[-7.0], [-5.0]], [[7.0], [5.0]], size=(2, count)) * u.arcsec
+    sky = center.spherical_offsets_by(*step)
+    parameters = QTable({"id": np.arange(1, count + 1), "redshift": np.linspace(0.3, 2.5, count)})
+    parameters["mass"] = np.geomspace(mass, 10 * mass, count) * u.Msun
+    bands = [*config.fit.bands, *filters]
+    truth = SEDModel.yang2021(agn=False).fluxes(parameters, bands)
+    truth["redshift"], truth["sky"] = parameters["redshift"], sky
+    truth["star"], truth["frac_agn"] = np.zeros(count, bool), np.zeros(count)
+    truth.meta.clear()
+    truth.meta.update(version="1.2", citations=["Somebody 2001", "Somebody 2001, with page"])
+    made.save_table("truth.ecsv", truth)
+    catalog = QTable({"id": truth["id"], "sky": sky, "star": truth["star"]})
+    catalog["wfc3.f160w"] = truth["wfc3.f160w"]
+    made.save_table("catalog.ecsv", catalog)
+    for unit in study_exposures(config):
+        table = QTable({"sky_fraction": [0.31], "n_pixels": [4]})
+        made.save_table(f"exposures/{unit}_forecast.ecsv", table)
+    made.save_image("f160w.fits", noise_image(9, rim=0)[0])
+    for k, name in enumerate(filters):
+        image, light = noise_image(k)
+        made.save_image(f"mosaic_{name}.fits", image)
+        made.save_image(f"photometry/{name}_model.fits", sky_image(SCALE, SHAPE, light))
+        table = QTable({"id": truth["id"], "sky": sky})
+        table["flux"] = truth[name] + rng.normal(0, 0.2, count) * u.uJy
+        table["flux_err"] = np.full(count, 0.2) * u.uJy
+        table["flags"] = np.zeros(count, int)
+        made.save_table(f"photometry/{name}.ecsv", table)
+        bright = QTable({"flux_true": np.full(5, 100.0) * u.uJy})
+        bright["flux"] = bright["flux_true"] * np.array([0.98, 0.99, 1.0, 1.01, 5.0])
+        bright["in_field"] = np.ones(5, bool)
+        made.save_table(f"points/{name}.ecsv", bright)
+    do_stage(config, folder, "errors")
+    do_stage(config, folder, "fits", "with_miri")
+    do_stage(config, folder, "fits", "without_miri")
+    do_stage(config, folder, "report")
+    return folder / "report"
+
+
+def page_of(report):
+    """Text of the page without its pictures."""
+    page = re.sub(r"src='data:[^']*'", "", (report / "index.html").read_text())
+    return re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL)
+
+
+def rows_of(page):
+    return re.findall(r"<tr>(.*?)</tr>", page)
+
+
+@pytest.fixture(scope="module")
+def reports(tmp_path_factory):
+    """Reports of four kinds of run."""
+    folder = tmp_path_factory.mktemp("reports")
+    return {
+        "one": make_run(folder / "one", ["miri.f1000w"], mass=1e4),
+        "two": make_run(folder / "two", ["miri.f2100w", "miri.f560w"], points=True),
+        "four": make_run(
+            folder / "four", ["miri.f1800w", "miri.f560w", "miri.f1000w", "miri.f2550w"]
+        ),
+    }
+
+
+@pytest.mark.parametrize("kind", ["one", "two", "four"])
+def test_each_row_stands_once_and_nothing_is_nan(reports, kind):
+    page = page_of(reports[kind])
+    rows = rows_of(page)
+    assert len(rows) == len(set(rows)) > 10
+    assert not re.search(r"\bnan\b", page, flags=re.IGNORECASE)
+    assert "<tbody></tbody>" not in page
+    # one spelling of each unit
+    assert "uJy" not in page
+    assert not re.search(r"\bum\b", page)
+    # JSON has no word for NaN: a strict reader takes it
+    text = (reports[kind] / "metrics.json").read_text()
+    json.loads(text, parse_constant=lambda word: pytest.fail(word))
+
+
+def test_bands_stand_in_every_table_of_bands(reports):
+    for kind, labels in (
+        ("one", ["F1000W"]),
+        ("two", ["F2100W", "F560W"]),
+        ("four", ["F1800W", "F560W", "F1000W", "F2550W"]),
+    ):
+        page = page_of(reports[kind])
+        tables = re.findall(r"<table>.*?</table>", page)
+        of_bands = [
+            table for table in tables if "<th>band</th>" in table and "published" not in table
+        ]
+        # exposures, recovery, limits
+        assert len(of_bands) == 3
+        for table in of_bands:
+            assert re.findall(r"<tr><td>(F\d+W)</td>", table) == labels
+
+
+def test_colours_need_three_bands(reports):
+    assert "too few bands for colours" in page_of(reports["one"])
+    assert "too few bands for colours" in page_of(reports["two"])
+    page = page_of(reports["four"])
+    # in order of wavelength, whatever the order of the configuration
+    assert "F560W, F1800W, F2550W (the shortest, the middle and the longest" in page
+
+
+def test_what_there_is_not_is_said(reports):
+    page = html.unescape(page_of(reports["one"]))
+    assert "No source is left to fit." in page
+    assert "few bands 24" in page
+    assert "fracAGN offset ± scatter with MIRI (no source in the fit)" in page
+    assert "The check with bright point sources was not made" in page
+    assert "point sources</th>" not in page
+    assert "no band of this run" in page
+    page = html.unescape(page_of(reports["two"]))
+    assert "point sources</th>" in page
+    assert "No source is left to fit" not in page
+    assert "no band of CEERS" in page
+
+
+def test_the_page_says_where_it_comes_from(reports):
+    page = html.unescape(page_of(reports["two"]))
+    # the first lines
+    assert page.index("stands in for SKIRTOR") < page.index("At a glance")
+    assert page.index("Dale et al. 2014 (dust.dale2014)") < page.index("At a glance")
+    for text in (
+        "7 x 1",
+        "31 %",
+        "IMF Kroupa (inferred)",
+        "torus: torus.parametric; torus.skirtor2016 is not registered",
+        "(products: 1.2)",
+        "photutils",
+        "numba",
+        "Somebody 2001, with page",
+        "Bruzual & Charlot 2003",
+        "Momcheva et al. 2016",
+        "seed 20210211",
+        "22.8 in 4662 s",
+        "CEERS proposal, for other exposures",
+        f"in the {AREA:.2f} square arcmin that all bands have imaged",
+    ):
+        assert text in page, text
+    assert "<li>Somebody 2001</li>" not in page
+    # when it was made is not on it
+    assert not re.search(r"20\d\d-\d\d-\d\dT", page)
+
+
+def test_the_same_products_give_the_same_bytes(reports):
+    before = {path.name: path.read_bytes() for path in reports["one"].iterdir()}
+    do_stage(small_config(["miri.f1000w"]), reports["one"].parent, "report")
+    assert before == {path.name: path.read_bytes() for path in reports["one"].iterdir()}
+    # nor does a picture say what drew it
+    assert b"Software" not in before["index.html"]
+
+
+def test_bands_of_a_picture():
+    assert three_bands(["miri.f770w"]) == ["miri.f770w"]
+    assert three_bands(["miri.f2100w", "miri.f770w"]) == ["miri.f770w", "miri.f2100w"]
+    names = [f"miri.f{n}w" for n in (2550, 560, 770, 1000, 1130, 1280, 1500, 1800, 2100)]
+    assert three_bands(names) == ["miri.f560w", "miri.f1280w", "miri.f2550w"]
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_fields_of_fewer_than_three_bands_are_grey(n):
+    prior = noise_image(9, rim=0, scale=0.06, shape=(238, 312))[0]
+    names = ["miri.f770w", "miri.f1000w", "miri.f2100w"][:n]
+    figure = field_figure([noise_image(k)[0] for k in range(n)], prior, [*names, "wfc3.f160w"])
+    pictures = [ax.images[0].get_array() for ax in figure.axes if ax.images]
+    assert [picture.ndim for picture in pictures] == ([2, 3] if n == 3 else [2] * (n + 1))
+    # both parts show the same sky: the unmasked 100 x 140 pixels of 0.11 arcsec
+    for ax in figure.axes:
+        if ax.images and ax.get_title():
+            left, right, bottom, top = ax.images[0].get_extent()
+            assert right - left == pytest.approx(140 * SCALE, abs=0.25)
+            assert top - bottom == pytest.approx(100 * SCALE, abs=0.25)
+            # scale bar, and north up, east left
+            bar = ax.lines[0].get_xdata()
+            assert bar[1] - bar[0] == pytest.approx(20)
+            letters = {text.get_text(): text.get_position() for text in ax.texts}
+            assert letters["N"][1] > letters["E"][1]
+            assert letters["E"][0] < letters["N"][0]
+
+
+def test_residuals_are_stretched_evenly_about_zero():
+    image, light = noise_image()
+    model = sky_image(SCALE, SHAPE, 0.5 * light)
+    figure = residual_figure([(image, model)], ["miri.f770w"], size=100)
+    drawn = {ax.get_title(): ax.images[0] for ax in figure.axes if ax.get_title()}
+    norm = drawn["mosaic - model"].norm
+    assert norm.vmin == -norm.vmax
+    # unit noise: five sigma
+    assert norm.vmax == pytest.approx(5, rel=0.1)
+    colors = drawn["mosaic - model"].cmap([0.0, 0.5, 1.0])
+    assert colors[0][2] > colors[0][0]  # negative blue
+    assert colors[2][0] > colors[2][2]  # positive red
+    assert np.allclose(colors[1][:3], colors[1][0], atol=0.01)
+
+
+def test_area_is_that_of_the_rectangle_that_all_images_share():
+    first, second = noise_image(0)[0], noise_image(1)[0]
+    assert footprint_area([first]).to_value(u.arcmin**2) == pytest.approx(AREA, rel=1e-6)
+    mask = second.mask.copy()
+    mask[:, : SHAPE[1] // 2] = True
+    second.mask = mask
+    shared = footprint_area([first, second]).to_value(u.arcmin**2)
+    assert shared == pytest.approx(AREA / 2, rel=1e-6)
+    # the same field as that of the sources: their density times the area is their number
+    rng = np.random.default_rng(0)
+    y, x = rng.uniform(-0.5, [[SHAPE[0] - 0.5], [SHAPE[1] - 0.5]], size=(2, 20000))
+    share = in_field(first.wcs.pixel_to_world(x, y), [first, second]).mean()
+    whole = SHAPE[0] * SHAPE[1] * SCALE**2 / 3600
+    assert share * whole == pytest.approx(shared, rel=0.05)
+    with pytest.raises(ValueError, match="'images' must be on one grid"):
+        footprint_area([first, noise_image(0, shape=(50, 60))[0]])
+
+
+@pytest.mark.parametrize(
+    ("exposures", "ceers", "paper"),
+    [
+        ({}, True, True),
+        # the split into groups is not the survey's
+        ({"n_groups": [100, 200, 100, 50, 50, 14], "n_integrations": [2, 1, 2, 4, 4, 20]}, True, True),
+        ({"plan": "quick"}, False, False),
+        ({"n_dithers": [2, 3, 3, 3, 3, 6]}, False, False),
+        ({"filters": ["miri.f770w"]}, True, False),
+    ],
+)  # fmt: skip
+def test_what_counts_as_ceers(exposures, ceers, paper):
+    config = StudyConfig.from_dict({"exposures": exposures, "fit": {"min_detected": 1}})
+    assert as_ceers(config, "miri.f770w") is ceers
+    assert as_paper(config) is paper
+
+
+def test_other_bands_are_not_of_ceers():
+    config = small_config(["miri.f560w"])
+    assert not as_ceers(config, "miri.f560w")
+
+
+def test_stand_ins_are_those_of_the_model():
+    config = StudyConfig()
+    assert any("SKIRTOR" in text for text in stand_ins(config, SEDModel.yang2021()))
+    assert not any("SKIRTOR" in text for text in stand_ins(config, SEDModel.yang2021(agn=False)))
+
+
+def test_a_source_is_cited_once():
+    metas = [{"citations": ["A 2001, ApJ 1, 2"]}, {"citations": ["A 2001", "B 2002"]}, {}]
+    assert sources_to_cite([], metas) == ["A 2001, ApJ 1, 2", "B 2002"]
+    assert sources_to_cite(["torus.parametric"], [])[0].startswith("Stalevski")
