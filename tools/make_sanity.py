@@ -15,12 +15,14 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.evaluation import PUBLISHED_LIGHT, integrated_light
+from miricigale.evaluation import number
 from miricigale.fitting import FitResults
 from miricigale.photometry import ErrorModel
+from miricigale.sed import SEDModel
 from miricigale.workflow import load_config, read_image
-from miricigale.workflow.stages import figures
-from miricigale.workflow.stages.sample import SampleFlags
+from miricigale.workflow.stages import figures, pictures
+from miricigale.workflow.stages.metrics import FITS, StudyTables
+from miricigale.workflow.stages.sample import SampleFlags, typical_source
 
 
 def rst_table(header, rows):
@@ -30,6 +32,11 @@ def rst_table(header, rows):
     line = "  ".join("=" * width for width in widths)
     text = ["  ".join(c.ljust(w) for c, w in zip(r, widths, strict=True)).rstrip() for r in rows]
     return "\n".join([line, text[0], line, *text[1:], line])
+
+
+def shown(value, spec, **options):
+    """A number, or a dash where the metrics have none."""
+    return str(number(value, spec, "", **options))
 
 
 def main():
@@ -44,52 +51,54 @@ def main():
     config = load_config(run / "config.toml")
     bands = config.exposures.filters
     metrics = json.loads((run / "report" / "metrics.json").read_text())
-    truth = QTable.read(run / "truth.ecsv")
-    matched = QTable.read(run / "matched.ecsv")
-    errors = ErrorModel.read(run / "errors.ecsv")
-    known = np.isfinite(truth["stellar_mass"].value) & ~np.asarray(truth["star"], bool)
-    galaxies = truth[known]
-    area = figures.catalog_area(truth)
+    fits = {unit: QTable.read(run / f"fits_{unit}.ecsv") for unit in FITS}
+    tables = StudyTables(
+        QTable.read(run / "truth.ecsv"),
+        QTable.read(run / "matched.ecsv"),
+        ErrorModel.read(run / "errors.ecsv"),
+        fits,
+        {},
+    )
+    truth, matched, errors = tables.truth, tables.matched, tables.errors
+    galaxies = tables.galaxies(field=True)
+    area = metrics["area"] * u.arcmin**2
     selection = np.asarray(matched["selection"])
     inside = matched[((selection & SampleFlags.OUTSIDE_FIELD) == 0) & matched["matched"]]
-    fits = {unit: QTable.read(run / f"fits_{unit}.ecsv") for unit in ("with_miri", "without_miri")}
-    results = {unit: FitResults.read(run / f"fits_{unit}.fits") for unit in fits}
+    results = {unit: FitResults.read(run / f"fits_{unit}.fits") for unit in FITS}
     limits = {name: errors.limiting_flux(name).to_value(u.uJy) for name in bands}
-    chosen = [bands[0], bands[len(bands) // 2], bands[-1]]
+    magnitudes = {name: errors.limiting_magnitude(name).value for name in bands}
+    chosen = figures.three_bands(bands)
     sample = truth[selection == 0]
-    typical = sample["id"][np.argsort(np.abs(np.asarray(sample["redshift"]) - 1.2))[5]]
-    pictures = {
-        "inputs": figures.input_figure(galaxies),
+    typical = typical_source(sample, results["with_miri"].fitted, bands[-1])
+    drawn = {
+        "inputs": figures.input_figure(tables.galaxies())[0],
         "counts": figures.counts_figure(galaxies, bands, area),
-        "offsets": figures.offset_figure(inside, bands),
+        "offsets": figures.offset_figure(inside, bands, magnitudes),
         "errors": figures.error_figure(errors, bands, limits),
         "redshifts": figures.redshift_figure(sample, fits),
         "fractions": figures.fraction_figure(fits, config.sed.frac_agn),
-        "example": figures.example_figure(results, truth, typical),
-        "colour": figures.colour_figure(
-            *(read_image(run / f"mosaic_{name}_fine.fits") for name in chosen),
+        "example": figures.example_figure(results, truth, typical, SEDModel.yang2021()),
+        "colour": pictures.field_figure(
+            [read_image(run / f"mosaic_{name}.fits") for name in chosen],
             read_image(run / "f160w.fits"),
             [*chosen, config.highres.filter],
         ),
     }
-    for name, figure in pictures.items():
-        figure.savefig(args.images / f"{name}.png", dpi=80)
-    print(f"{area.to_value(u.arcmin**2):.2f} square arcmin, {len(galaxies)} galaxies\n")
-    rows = []
-    for name, wave, least, value, down, up, reference in PUBLISHED_LIGHT:
-        flux = galaxies[name][galaxies[name] >= least * u.uJy]
-        light, error = integrated_light(flux, area, wave * u.um)
-        rows.append(
-            (
-                name,
-                f"{wave:g} um",
-                f"{least:g}" if least else "none",
-                f"{light.value:.2f} ± {error.value:.2f}",
-                f"{value:.2f} -{down:.2f} +{up:.2f}",
-                reference,
-            )
+    for name, figure in drawn.items():
+        figure.savefig(args.images / f"{name}.png", dpi=80, metadata={"Software": None})
+    print(f"{metrics['area']:.2f} square arcmin, {len(galaxies)} galaxies\n")
+    rows = [
+        (
+            row["band"],
+            f"{row['wavelength']:g} µm",
+            f"{row['least']:g}" if row["least"] else "none",
+            f"{shown(row['light'], '.2f')} ± {shown(row['light_err'], '.2f')}",
+            f"{row['published']:.2f} -{row['down']:.2f} +{row['up']:.2f}",
+            row["reference"],
         )
-    print(rst_table(("band", "at", "limit (uJy)", "here", "published", "reference"), rows), "\n")
+        for row in metrics["light"]
+    ]
+    print(rst_table(("band", "at", "limit (µJy)", "here", "published", "reference"), rows), "\n")
     rows = [
         (
             f"H < {row['limit']:g}",
@@ -103,13 +112,16 @@ def main():
     rows = [
         (
             name,
-            f"{m['limit']:.2f}",
+            shown(m["limit"], ".2f"),
             f"{m['etc_limit']:.2f}",
-            f"{100 * m['bright_median']:+.1f} ± {100 * m['bright_median_err']:.1f} %",
+            " ± ".join(
+                shown(m[f"bright_{key}"], spec, scale=100)
+                for key, spec in (("median", "{:+.1f}"), ("median_err", "{:.1f} %"))
+            ),
             m["bright_n"],
-            f"{100 * m['points_median']:+.2f} %",
-            f"{100 * m['points_scatter']:.2f} %",
-            m["points_n"],
+            shown(m.get("points_median"), "{:+.2f} %", scale=100),
+            shown(m.get("points_scatter"), "{:.2f} %", scale=100),
+            m.get("points_n", 0),
         )
         for name, m in metrics["bands"].items()
     ]
@@ -128,12 +140,12 @@ def main():
         (
             unit.replace("_", " "),
             m["n"],
-            f"{m['photoz_bias']:+.4f}",
-            f"{m['photoz_sigma_mad']:.4f}",
-            f"{m['photoz_n_outliers']} ({100 * m['photoz_outliers']:.1f} %)",
-            f"{m['frac_agn_bias']:+.4f}",
-            f"{m['frac_agn_sigma_mad']:.4f}",
-            f"{m['frac_agn_width']:.3f}",
+            shown(m["photoz_bias"], "+.4f"),
+            shown(m["photoz_sigma_mad"], ".4f"),
+            f"{m['photoz_n_outliers']} ({shown(m['photoz_outliers'], '{:.1f} %', scale=100)})",
+            shown(m["frac_agn_bias"], "+.4f"),
+            shown(m["frac_agn_sigma_mad"], ".4f"),
+            shown(m["frac_agn_width"], ".3f"),
         )
         for unit, m in metrics["fits"].items()
     ]

@@ -13,9 +13,9 @@ from astropy.table import QTable
 from astropy.wcs import WCS
 
 from miricigale.sed import SEDModel
+from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.products import ProductStore
-from miricigale.workflow.runner import Context
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.figures import three_bands
 from miricigale.workflow.stages.images import study_exposures
