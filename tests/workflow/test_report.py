@@ -15,7 +15,6 @@ from astropy.wcs import WCS
 from miricigale.sed import SEDModel
 from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
-from miricigale.workflow.products import ProductStore
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.figures import three_bands
 from miricigale.workflow.stages.images import study_exposures
@@ -78,16 +77,13 @@ def small_config(filters, *, points=False):
 
 
 def do_stage(config, folder, name, unit=""):
-    context = Context(config, ProductStore(folder), stage=STAGES[name], progress_bar=False)
-    STAGES[name].function(context, unit)
+    STAGES[name].function(Context(config, folder, stage=STAGES[name]), unit)
 
 
 def make_run(folder, filters, *, mass=3e10, points=False):
     """Make up what the stage ``report`` reads, and run it."""
     config = small_config(filters, points=points)
-    with ProductStore(folder) as store:
-        # the manifest makes it the folder of a run
-        made = Context(config, store, stage=STAGES["truth"], progress_bar=False)
+    made = Context(config, folder, stage=STAGES["truth"])
     rng = np.random.default_rng(1)
     count = 24
     center = SkyCoord(53.13440 * u.deg, -27.83444 * u.deg)
