@@ -27,6 +27,8 @@ _NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.E
 # longer than another process takes to finish a lock file, in seconds
 _SETTLED = 10.0
 _PATIENCE = 2.0
+# handle of a lock that is held by its file alone
+_CLOSED = -1
 
 
 class FolderLock:
@@ -97,7 +99,7 @@ class FolderLock:
 
     def _close(self):
         handle, self._handle = self._handle, None
-        if handle is not None:
+        if handle not in (None, _CLOSED):
             os.close(handle)
 
     def _write(self, spare):
@@ -109,6 +111,10 @@ class FolderLock:
                 # on a disk that is nearly full a part is written first
                 data = data[os.write(self._handle, data) :]
         self._flocks = _flock(self._handle) is True
+        if not self._flocks:
+            # nothing is held by it, and Windows removes no open file
+            os.close(self._handle)
+            self._handle = _CLOSED
 
     def _place(self, spare):
         """Whether the lock could be made, for there was none."""
