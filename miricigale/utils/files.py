@@ -263,8 +263,8 @@ def image_unit(header, path, *, like):
         Of the image.
     path : path-like
         The file, for the message.
-    like : unit-like
-        Unit that it must be convertible to, such as ``"MJy/sr"``.
+    like : unit-like or None
+        Unit that it must be convertible to, such as ``"MJy/sr"``; any if None.
 
     Returns
     -------
@@ -278,15 +278,13 @@ def image_unit(header, path, *, like):
     text = header.get("BUNIT", "")
     try:
         unit = u.Unit(text) if str(text).strip() else None
-        if unit is not None and unit.is_equivalent(like):
+        if unit is not None and (like is None or unit.is_equivalent(like)):
             return unit
     except (TypeError, ValueError):
         pass
     got = f"BUNIT = {text!r}" if text else "none"
-    msg = (
-        f"{path} must state the unit of its pixels in the keyword BUNIT, one that converts to "
-        f"{u.Unit(like)} (for instance '{u.Unit(like).to_string('fits')}'), got {got}"
-    )
+    wanted = "such as MJy/sr" if like is None else f"one that converts to {u.Unit(like)}"
+    msg = f"{path} must state the unit of its pixels in the keyword BUNIT, {wanted}, got {got}"
     raise DataError(msg)
 
 

@@ -221,7 +221,7 @@ def measure_files(image, highres, *, filter, pa_aper):
     """
     from miricigale.workflow.products import read_image
 
-    mosaic, prior = read_image(image), read_image(highres)
+    mosaic, prior = (read_image(path, unit="MJy/sr") for path in (image, highres))
     # after what is wrong with the files is known
     from miricigale.photometry import ForcedPhotometer, detect_sources
     from miricigale.psf import MatchingKernel, hst_psf, miri_psf, psf_mosaic

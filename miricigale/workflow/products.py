@@ -7,7 +7,7 @@ import numpy as np
 from astropy.io import fits
 
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import open_fits, write_fits
+from miricigale.utils.files import image_unit, open_fits, write_fits
 
 __all__ = ["read_image", "write_image"]
 
@@ -54,7 +54,7 @@ def write_image(image, path, *, planes=None):
     write_fits(hdus, path, overwrite=True)
 
 
-def read_image(path, *, planes=()):
+def read_image(path, *, planes=(), unit=None):
     """
     Read what `write_image` wrote.
 
@@ -64,6 +64,8 @@ def read_image(path, *, planes=()):
         The file.
     planes : iterable of str, optional
         Names of further planes wanted.
+    unit : unit-like, optional
+        Unit that the image's own must be convertible to.
 
     Returns
     -------
@@ -73,7 +75,7 @@ def read_image(path, *, planes=()):
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
-        If the file is missing or has no SCI extension.
+        If the file is missing, or has no SCI extension or no unit of an image.
     """
     hdus = open_fits(path, wanted="an image (FITS with SCI)")
     from astropy.nddata import CCDData, StdDevUncertainty
@@ -87,7 +89,7 @@ def read_image(path, *, planes=()):
         wcs = WCS(header)
         image = CCDData(
             np.array(hdus["SCI"].data, np.float32),
-            unit=u.Unit(header["BUNIT"]),
+            unit=image_unit(header, path, like=unit),
             wcs=wcs if wcs.has_celestial else None,
             uncertainty=StdDevUncertainty(np.array(hdus["ERR"].data, np.float32))
             if "ERR" in hdus

@@ -62,3 +62,12 @@ def test_the_same_image_makes_the_same_bytes(tmp_path):
         # astropy warns, and so fails this test, if one is wrong
         assert all({"CHECKSUM", "DATASUM"} <= set(hdu.header) for hdu in hdus)
         np.testing.assert_array_equal(hdus["DQ"].data, 1)
+
+
+@pytest.mark.parametrize("header", [{}, {"BUNIT": "cows"}])
+def test_images_without_a_unit_are_named(tmp_path, header):
+    path = tmp_path / "bare.fits"
+    sci = fits.ImageHDU(np.zeros((3, 4)), fits.Header(header), name="SCI")
+    fits.HDUList([fits.PrimaryHDU(), sci]).writeto(path)
+    with pytest.raises(DataError, match=r"bare\.fits must state the unit of its pixels"):
+        read_image(path)

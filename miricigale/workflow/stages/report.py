@@ -33,7 +33,7 @@ def make_report(context, _):
     if metrics["n_sample"] == 0:
         log.warning("no source is left to fit: %s", metrics["n_left_out"])
     text = json.dumps(_without_nan(metrics), indent=1, allow_nan=False)
-    context.save("report/metrics.json", lambda path: path.write_text(text))
+    context.save("report/metrics.json", lambda path: path.write_text(text, encoding="utf-8"))
     model = SEDModel.yang2021()
     report = Report(
         f"miricigale: {config.run.name}",
