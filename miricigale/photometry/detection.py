@@ -168,10 +168,12 @@ def _positions(flux, labels, objects):
     if n == 0:
         return np.empty(0), np.empty(0)
     smooth = scipy.ndimage.gaussian_filter(flux, 1.5)
-    peak = np.concatenate([[np.inf], scipy.ndimage.maximum(smooth, labels, np.arange(1, n + 1))])
-    core = (labels > 0) & (smooth > 0.3 * peak[labels])
-    y, x = np.nonzero(core)
-    weight, label = smooth[core], labels[core]
+    # the sky is most of the image and has no peak
+    y, x = np.nonzero(labels)
+    weight, label = smooth[y, x], labels[y, x]
+    peak = np.append(np.inf, scipy.ndimage.maximum(weight, label, np.arange(1, n + 1)))
+    core = weight > 0.3 * peak[label]
+    y, x, weight, label = y[core], x[core], weight[core], label[core]
     total = np.bincount(label, weight, n + 1)[1:]
     found = []
     for values, fallback in ((x, objects["x"]), (y, objects["y"])):
