@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage, stats
 
 from miricigale.detector import _core
-from miricigale.detector._core.random import log_factorial
+from miricigale.detector._core.random import inversion_table, log_factorial
 
 KEY = np.array([11, 22, 33, 44], np.uint64)
 
@@ -62,6 +62,35 @@ def test_poisson_numbers_are_poisson(mean):
     keep = expected > 5
     chi2 = np.sum((found - expected)[keep] ** 2 / expected[keep])
     assert stats.chi2.sf(chi2, keep.sum() - 1) > 1e-3
+
+
+@pytest.mark.parametrize("mean", [1e-3, 0.555, 3.0, 9.99])
+def test_table_of_one_mean_is_the_distribution(mean):
+    steps, guide = inversion_table(mean)
+    assert steps[-1] == 2**53
+    assert np.all(np.diff(steps) >= 0)
+    cdf = stats.poisson.cdf(np.arange(steps.size), mean)
+    np.testing.assert_allclose(steps[:-1] / 2.0**53, cdf[:-1], rtol=0, atol=2e-15)
+    entries = np.arange(guide.size) * (2**53 // guide.size)
+    np.testing.assert_array_equal(guide, np.searchsorted(steps, entries, side="right"))
+    # a pixel of another mean beside it: every number is then searched for, from the same draws
+    ramps = np.zeros((2, 1, 300, 4, 101), np.float32)
+    means = np.full((2, 4, 101), mean)
+    means[1, :, -1] *= 1.001
+    for ramp, one in zip(ramps, means, strict=True):
+        _core.add_poisson(ramp, one, KEY, 7)
+    np.testing.assert_array_equal(ramps[0][..., :-1], ramps[1][..., :-1])
+
+
+def test_dark_columns_leave_the_draws_of_others_alone():
+    mean = np.full((3, 40), 25.0)
+    mean[:, ::3] = 0.0
+    ramp, alone = np.zeros((2, 2, 30, 3, 40), np.float32)
+    _core.add_poisson(ramp, mean, KEY, 0)
+    bright = mean[0] > 0
+    assert not ramp[..., ~bright].any()
+    _core.add_poisson(alone[..., : bright.sum()], mean[:, bright], KEY, 0)
+    np.testing.assert_array_equal(ramp[..., bright], alone[..., : bright.sum()])
 
 
 def test_poisson_of_no_light_is_nothing():

@@ -1,11 +1,12 @@
 import astropy.units as u
+import astroscrappy
 import numpy as np
 import pytest
 from astropy.nddata import CCDData, StdDevUncertainty
 
 from miricigale.instrument import field_mask, flat_field, photmjsr, psf_fwhm
 from miricigale.psf import miri_psf
-from miricigale.reduction import PixelFlags, calibrate, find_cosmic_rays
+from miricigale.reduction import PixelFlags, calibrate, calibration, find_cosmic_rays
 from miricigale.reduction.images import image
 
 SHAPE = (1024, 1032)
@@ -83,6 +84,40 @@ def test_cosmic_rays_are_found_and_stars_are_left_alone(filt):
     # of the stars' 10^4 pixels at most one or two
     assert np.count_nonzero(found & ~near & (stars > 3)) <= 2
     assert np.count_nonzero(found & ~near) <= 4
+
+
+@pytest.mark.parametrize("n_hits", [0, 3, 200])
+def test_hits_are_those_of_lacosmic_on_the_whole_frame(n_hits):
+    rng = np.random.default_rng(n_hits)
+    y, x = np.mgrid[:300, :320]
+    data = rng.normal(size=x.shape)
+    for _ in range(40):
+        r2 = (x - rng.uniform(0, 320)) ** 2 + (y - rng.uniform(0, 300)) ** 2
+        data += 10 ** rng.uniform(0.5, 3.5) * np.exp(-0.5 * r2 / rng.uniform(0.8, 3) ** 2)
+    # tracks of up to four pixels, also at the edges
+    rows, columns = rng.integers(0, 300, n_hits), rng.integers(0, 320, n_hits)
+    for step in range(4):
+        some = rng.random(n_hits) < 0.7**step
+        data[rows[some], np.minimum(columns[some] + step, 319)] += 10 ** rng.uniform(1, 3)
+    data = data.astype(np.float32)
+    variance = (1 + np.maximum(data, 0) / 300).astype(np.float32)
+    mask = rng.random(x.shape) < 0.01
+    mask[:, :20] = True
+    options = {"sigfrac": 0.3, "objlim": 3.0}
+    expected, _ = astroscrappy.detect_cosmics(
+        data,
+        inmask=mask,
+        invar=variance,
+        sigclip=5.0,
+        gain=1.0,
+        readnoise=0.0,
+        satlevel=np.inf,
+        niter=3,
+        **options,
+    )
+    found = calibration._lacosmic(data, variance, mask, 5.0, 3, **options)
+    np.testing.assert_array_equal(found & ~mask, expected & ~mask)
+    assert np.count_nonzero(found & ~mask) >= n_hits
 
 
 def test_a_masked_image_has_no_cosmic_rays():
