@@ -4,7 +4,7 @@ import numpy as np
 
 from miricigale.filters import FilterSet
 from miricigale.fitting.continuous_results import ContinuousResults
-from miricigale.fitting.engines.base import CITATIONS, Request, get_sampler, single_threaded
+from miricigale.fitting.engines.base import CITATIONS, Request, get_sampler
 from miricigale.fitting.engines.continuous import ContinuousEngine, Target
 from miricigale.fitting.engines.redshifts import fixed_redshifts, given_redshifts
 from miricigale.fitting.engines.reduce import FitOne
@@ -18,7 +18,7 @@ from miricigale.fitting.quantities import DERIVED_LEVELS
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
-from miricigale.utils.parallel import parallel_map
+from miricigale.utils.parallel import parallel_map, single_threaded
 from miricigale.utils.random import check_seed
 from miricigale.utils.units import MASS
 

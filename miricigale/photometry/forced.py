@@ -19,7 +19,7 @@ from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.template_fit import TemplateFit
 from miricigale.photometry.templates import FineTemplates, TemplateBank
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.parallel import thread_count
+from miricigale.utils.parallel import single_threaded, thread_count
 from miricigale.utils.tables import require_columns, unique_ids
 from miricigale.utils.units import ANGLE, to_array
 
@@ -168,7 +168,7 @@ class ForcedPhotometer:
         ValueError, TypeError, `~astropy.units.UnitsError`
             If an input does not fit; the message says which.
         """
-        with concurrent.futures.ThreadPoolExecutor(self._n_threads) as pool:
+        with concurrent.futures.ThreadPoolExecutor(self._n_threads) as pool, single_threaded():
             executor = pool if self._n_threads > 1 else None
             return self._measure(image, highres, segmentation, catalog, executor)
 

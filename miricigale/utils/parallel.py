@@ -2,6 +2,8 @@
 
 import contextlib
 import functools
+import importlib
+import importlib.util
 import logging
 import multiprocessing
 import os
@@ -16,7 +18,14 @@ from pathlib import Path
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.progress import progress
 
-__all__ = ["available_memory", "chunks", "parallel_map", "process_pool", "thread_count"]
+__all__ = [
+    "available_memory",
+    "chunks",
+    "parallel_map",
+    "process_pool",
+    "single_threaded",
+    "thread_count",
+]
 
 #: Functions whose pickle is longer (bytes) go to other processes once, not with every piece.
 _HEAVY = 100_000
@@ -211,6 +220,19 @@ def thread_count(n_threads=None):
     if n_threads < 1 or int(n_threads) != n_threads:
         raise argument_error("n_threads", "at least 1 and an integer", n_threads)
     return int(n_threads)
+
+
+def single_threaded():
+    """
+    Context in which linear algebra runs on one core, if threadpoolctl is installed.
+
+    Sums that are cut into other pieces differ in the last digit, and samplers would then go
+    other ways. On many small matrices the threads of the linear algebra moreover wait for each
+    other longer than they work.
+    """
+    if importlib.util.find_spec("threadpoolctl") is None:
+        return contextlib.nullcontext()
+    return importlib.import_module("threadpoolctl").threadpool_limits(1)
 
 
 def chunks(n, size):

@@ -1,8 +1,6 @@
 """What a sampler is given and what it returns; the samplers by name."""
 
-import contextlib
 import importlib
-import importlib.util
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +14,6 @@ __all__ = [
     "Request",
     "effective_size",
     "get_sampler",
-    "single_threaded",
 ]
 
 #: Module of each sampler in this folder: its ``load`` imports the package.
@@ -123,15 +120,3 @@ def get_sampler(engine):
     if engine not in SAMPLERS:
         raise unknown_name("engine", engine, SAMPLERS)
     return importlib.import_module(SAMPLERS[engine]).load()
-
-
-def single_threaded():
-    """
-    Context in which linear algebra runs on one core, if threadpoolctl is installed.
-
-    Sums that are cut into other pieces differ in the last digit, and samplers would then go
-    other ways.
-    """
-    if importlib.util.find_spec("threadpoolctl") is None:
-        return contextlib.nullcontext()
-    return importlib.import_module("threadpoolctl").threadpool_limits(1)

@@ -9,10 +9,10 @@ from miricigale.fitting.engines.base import (
     Request,
     effective_size,
     get_sampler,
-    single_threaded,
 )
 from miricigale.fitting.engines.scale import best_scale, chi2_at
 from miricigale.fitting.engines.space import Space
+from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
 
 __all__ = ["ContinuousEngine", "Posterior", "Target"]
