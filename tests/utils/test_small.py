@@ -2,6 +2,7 @@
 
 import datetime
 import math
+import os
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -10,7 +11,7 @@ import miricigale
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.meta import provenance
 from miricigale.utils.optional import require
-from miricigale.utils.parallel import chunks, parallel_map
+from miricigale.utils.parallel import chunks, parallel_map, thread_count
 from miricigale.utils.progress import progress
 
 
@@ -35,6 +36,14 @@ def test_optional_packages():
     assert require("math", extra="none") is math
     with pytest.raises(ImportError, match=r"pip install 'miricigale\[stpsf\]'"):
         require("no_such_package", extra="stpsf")
+
+
+def test_number_of_threads():
+    assert thread_count(3) == 3
+    assert 1 <= thread_count(None) <= os.cpu_count()
+    for wrong in (0, -1, 1.5):
+        with pytest.raises(ValueError, match="'n_threads' must be at least 1 and an integer"):
+            thread_count(wrong)
 
 
 def test_parallel_map_gives_the_same_answer_in_order():
