@@ -51,12 +51,11 @@ def main():
     config = load_config(run / "config.toml")
     bands = config.exposures.filters
     metrics = json.loads((run / "report" / "metrics.json").read_text())
-    fits = {unit: QTable.read(run / f"fits_{unit}.ecsv") for unit in FITS}
     tables = StudyTables(
         QTable.read(run / "truth.ecsv"),
         QTable.read(run / "matched.ecsv"),
         ErrorModel.read(run / "errors.ecsv"),
-        fits,
+        {unit: FitResults.read(run / f"fits_{unit}.fits") for unit in FITS},
         {},
     )
     truth, matched, errors = tables.truth, tables.matched, tables.errors
@@ -64,7 +63,7 @@ def main():
     area = metrics["area"] * u.arcmin**2
     selection = np.asarray(matched["selection"])
     inside = matched[((selection & SampleFlags.OUTSIDE_FIELD) == 0) & matched["matched"]]
-    results = {unit: FitResults.read(run / f"fits_{unit}.fits") for unit in FITS}
+    fits, results = tables.fits, tables.results
     limits = {name: errors.limiting_flux(name).to_value(u.uJy) for name in bands}
     magnitudes = {name: errors.limiting_magnitude(name).value for name in bands}
     chosen = figures.three_bands(bands)

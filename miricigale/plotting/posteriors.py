@@ -215,7 +215,7 @@ def plot_sed_fit(
         parts = {"best model": spectrum, **(parts or {})}
     styles = [
         ("0.45", "-", 1.1),
-        *((f"C{k}", ls, 1.0) for k, ls in ((1, "--"), (2, "-."), (4, ":"))),
+        *((color, ls, 1.0) for color, ls in (("#1d4ed8", ":"), ("C1", "--"), ("C2", "-."))),
     ]
     for k, (label, (x, y)) in enumerate((parts or {}).items()):
         x, y = _value(x, u.um), _value(y, u.uJy)

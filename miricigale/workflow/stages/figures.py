@@ -372,26 +372,25 @@ def example_figure(results, truth, key, model):
     lower = figure.add_subplot(grid[1, 0], sharex=upper)
     best = results["with_miri"][key]
     total = best.best_sed(model)
-    # nothing else changes: what is left is the galaxy
-    galaxy = best.best_sed(model, frac_agn=0.0)
-    parts = {
-        "galaxy": (galaxy.wave, galaxy.fnu),
-        "AGN": (total.wave, total.fnu - galaxy.fnu),
-    }
-    if not np.any(parts["AGN"][1] > 0):
-        # all of it is galaxy
-        parts = {}
+    parts = {}
     other = results["without_miri"][key]
     if np.isfinite(other.chi2):
         sed = other.best_sed(model)
         parts["best model without MIRI"] = (sed.wave, sed.fnu)
+    fraction = best.best["frac_agn"].value
+    if fraction > 0:
+        # nothing else changes: what is left is the galaxy
+        galaxy = best.best_sed(model, frac_agn=0.0)
+        parts["its galaxy"] = (galaxy.wave, galaxy.fnu)
+        parts["its AGN"] = (total.wave, total.fnu - galaxy.fnu)
     bands = results["with_miri"].filters
     best.plot_sed(
         ax=(upper, lower),
         spectrum=(total.wave, total.fnu),
         parts=parts,
         groups=["MIRI" if name.startswith("miri.") else "existing bands" for name in bands],
-        title=f"source {key}: best z = {best.best['redshift'].value:.3f}, chi2 = {best.chi2:.1f}",
+        title=f"source {key}: best z = {best.best['redshift'].value:.3f}, "
+        f"fracAGN = {fraction:g}, chi2 = {best.chi2:.1f}",
     )
     upper.set_xlabel("")
     upper.tick_params(labelbottom=False)

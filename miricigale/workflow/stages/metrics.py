@@ -1,6 +1,7 @@
 """The numbers of the report, from the products of a run."""
 
 import dataclasses
+import functools
 
 import astropy.units as u
 import numpy as np
@@ -14,6 +15,7 @@ from miricigale.evaluation import (
     recovery_metrics,
     sigma_mad,
 )
+from miricigale.fitting import FitResults
 from miricigale.instrument import (
     CEERS_FILTERS,
     ceers_exposures,
@@ -42,7 +44,7 @@ class StudyTables:
         Of stages 3 and 12, row by row the same sources.
     errors : `~miricigale.photometry.ErrorModel`
         The error function.
-    fits : dict of str to `~astropy.table.QTable`
+    results : dict of str to `~miricigale.fitting.FitResults`
         Results by `FITS`, a row for each source of the sample.
     points : dict of str to `~astropy.table.QTable`
         Bright point sources by band; empty where the check was not made.
@@ -51,7 +53,7 @@ class StudyTables:
     truth: QTable
     matched: QTable
     errors: ErrorModel
-    fits: dict
+    results: dict
     points: dict
 
     @classmethod
@@ -63,9 +65,14 @@ class StudyTables:
             QTable.read(context.path("truth.ecsv")),
             QTable.read(context.path("matched.ecsv")),
             ErrorModel.read(context.path("errors.ecsv")),
-            {unit: QTable.read(context.path(f"fits_{unit}.ecsv")) for unit in FITS},
+            {unit: FitResults.read(context.path(f"fits_{unit}.fits")) for unit in FITS},
             {name: QTable.read(context.path(f"points/{name}.ecsv")) for name in names},
         )
+
+    @functools.cached_property
+    def fits(self):
+        """The results as tables: dict of str to `~astropy.table.QTable`."""
+        return {unit: results.to_table() for unit, results in self.results.items()}
 
     def galaxies(self, *, field=False):
         """Rows of the truth that are galaxies with a model, of the imaged field or all."""

@@ -11,7 +11,6 @@ from miricigale.evaluation import (
     Report,
     number,
 )
-from miricigale.fitting import FitResults
 from miricigale.sed import SEDModel
 from miricigale.workflow.stages import figures, pictures, provenance
 from miricigale.workflow.stages.figures import band_label
@@ -339,7 +338,7 @@ class _Writer:
             f"fit, whose {100 * self.config.fit.model_error:g} % model error they do not have, so "
             "posteriors are wide",
         )
-        results = {unit: FitResults.read(self.context.path(f"fits_{unit}.fits")) for unit in FITS}
+        results = self.tables.results
         key = typical_source(sample, results["with_miri"].fitted, self.bands[-1])
         if key is None:
             self.report.text("No source of the sample could be fitted.")
