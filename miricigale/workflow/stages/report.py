@@ -108,6 +108,11 @@ class _Writer:
         paper = "Yang et al. 2021"
         if not m["as_paper"]:
             paper += ", six bands, other exposures"
+        # of Gaussian errors it is 0.67 sigma
+        if self.config.errors.statistic == "mad":
+            note = "; the paper's 5 sigma are of the median absolute difference, 3.4 of these"
+        else:
+            note = ""
         name, prior = self.config.catalog.mag_column, band_label(self.config.highres.filter)
         limit = self.config.catalog.mag_limit
         self.report.table(
@@ -126,7 +131,7 @@ class _Writer:
             header=("sample", "galaxies", f"detected in {least}+ bands", "68 % interval", paper),
             caption="Galaxies of the field detected (5 sigma by the error function) in "
             f"{'two or more bands' if least == 2 else 'the one band'}; the catalogue ends at "
-            f"{name} = {limit:g}",
+            f"{name} = {limit:g}{note}",
             empty=f"The catalogue ends at {name} = {limit:g}: too bright for the shares of detected "
             f"galaxies that are published, to {prior} = 25 and 26.",
         )
