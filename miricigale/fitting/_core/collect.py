@@ -63,7 +63,7 @@ def note_best(best, index, r, s, z, g, k, f):
 
 
 @njit(**INNER)
-def find_best(ratio, frac_prior, zero_frac, target, best, index, lanes, z):
+def find_best(ratio, frac_prior, zero_frac, limits, best, index, lanes, z):
     """Look for the best model among the lanes."""
     buffer = lanes.buffer
     for i in range(LANES):
@@ -78,7 +78,7 @@ def find_best(ratio, frac_prior, zero_frac, target, best, index, lanes, z):
         for j in range(ratio.size):
             if not frac_prior[j + zero_frac] > 0.0:
                 continue
-            s, r, _ = lane_model(lanes, target, ratio[j], i, best[0])
+            s, r, _ = lane_model(lanes, limits, ratio[j], i, best[0])
             if r >= best[0]:
                 g, k = lanes.index[0, i], lanes.index[1, i]
                 note_best(best, index, r, s, z, g, k, j + zero_frac)
@@ -123,7 +123,8 @@ def add_points(tables, hist, n):
             _add_bin(hist.agn, hist.range_agn, k, y, t)
         if values[n + i] > 0.0:
             y = logs[n + i] * PER_DEX + mixed_middle
-            _add_bin(hist.mixed, hist.range_mixed, 0, y, t)
+            # typed, for a literal 0 would have it compiled once more
+            _add_bin(hist.mixed, hist.range_mixed, np.int64(0), y, t)
 
 
 @njit(**INNER)
@@ -138,11 +139,11 @@ def deposit_single(tables, hist, g, s, t):
         _add_bin(hist.galaxy, hist.range_galaxy, g, x, t)
         if tables.mixed_galaxy[g] > 0.0:
             y += _LOG10_E * math.log(tables.mixed_galaxy[g]) - hist.origin[2]
-            _add_bin(hist.mixed, hist.range_mixed, 0, y * PER_DEX + HALF_BINS, t)
+            _add_bin(hist.mixed, hist.range_mixed, np.int64(0), y * PER_DEX + HALF_BINS, t)
 
 
 @njit(**INNER)
-def deposit_lanes(tables, target, hist, lanes, single, total, added, n):
+def deposit_lanes(tables, limits, hist, lanes, single, total, added, n):
     """
     Note models in the lanes for the histograms; `add_points` puts them there.
 
@@ -176,7 +177,7 @@ def deposit_lanes(tables, target, hist, lanes, single, total, added, n):
                 carry -= t
             if not t > 0.0:
                 continue
-            s, _, _ = lane_model(lanes, target, ratio[j], i, 0.0)
+            s, _, _ = lane_model(lanes, limits, ratio[j], i, 0.0)
             hist.point[0, n] = index[0, i]
             hist.point[1, n] = index[1, i]
             hist.point[2, n] = j
@@ -219,7 +220,7 @@ def take_draw(draws, d, total, z, g, k, f, s, variance):
 
 
 @njit(**INNER)
-def draw_lanes(ratio, zero_frac, target, draws, lanes, single, z, before, after):
+def draw_lanes(ratio, zero_frac, limits, draws, lanes, single, z, before, after):
     """Let the models in the lanes replace draws; sums of weight are given before and after."""
     buffer = lanes.buffer
     for d in range(draws.next.size):
@@ -249,5 +250,5 @@ def draw_lanes(ratio, zero_frac, target, draws, lanes, single, z, before, after)
             if f < 0:
                 break
             g, k = lanes.index[0, lane], lanes.index[1, lane]
-            s, _, variance = lane_model(lanes, target, ratio[f], lane, 0.0)
+            s, _, variance = lane_model(lanes, limits, ratio[f], lane, 0.0)
             take_draw(draws, d, max(total, draws.next[d]), z, g, k, f + zero_frac, s, variance)

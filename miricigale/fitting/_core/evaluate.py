@@ -23,7 +23,7 @@ from miricigale.fitting._core.lanes import (
 )
 from miricigale.fitting._core.light import light_likelihoods
 from miricigale.fitting._core.limited import limited_likelihoods
-from miricigale.fitting._core.options import ENTRY, INNER
+from miricigale.fitting._core.options import INNER
 from miricigale.fitting._core.products import (
     agn_products,
     best_mixtures,
@@ -51,12 +51,12 @@ _FEW = 8
 
 
 @njit(**INNER)
-def _fill_limits(galaxy, agn, dust, target, lane_limit, z, g, k, lane):
+def _fill_limits(galaxy, agn, dust, limits, lane_limit, z, g, k, lane):
     """Fill a lane with the fluxes of galaxy and torus (for c = 1) in bands with limits."""
-    n = target.limits.size
+    n = limits.bands.size
     for m in range(n):
-        band = target.limits[m]
-        t = target.inverse[m]
+        band = limits.bands[m]
+        t = limits.inverse[m]
         lane_limit[m, lane] = galaxy[z, g, band] * t
         lane_limit[n + m, lane] = agn[z, k, band] * t * dust[g]
 
@@ -93,14 +93,14 @@ def _drop(row, run, n_run, cross, other, sure):
     return n_left
 
 
-@njit(**ENTRY)
-def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single):
+@njit(**INNER)
+def evaluate_runs(tables, request, target, limits, sums, scratch, n, floor, sure, single):
     """
     Add the pairs of the listed runs to the sums.
 
     Parameters
     ----------
-    tables, request, target, sums, scratch
+    tables, request, target, limits, sums, scratch
         See `miricigale.fitting._core.structs`; ``scratch.run_key`` and ``scratch.bound`` list
         the pairs.
     n : int
@@ -121,8 +121,7 @@ def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single
     buffer, pending, index = lanes.buffer, lanes.pending, lanes.index
     weight, frac_sum, best, total = lanes.weight, lanes.frac_sum, sums.best, sums.total
     first = tables.zero_frac
-    n_limits = target.limits.size
-    light = single and n_limits == 0
+    light = single and limits is None
     top_frac = -1e300
     for j in range(tables.zero_frac, tables.log_frac.size):
         top_frac = max(top_frac, tables.log_frac[j])
@@ -161,9 +160,10 @@ def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single
             for i in range(LANES):
                 index[0, i] = index[2, i]
                 index[1, i] = index[3, i]
-            for m in range(2 * n_limits):
-                for i in range(LANES):
-                    lanes.limit[m, i] = lanes.pending_limit[m, i]
+            if limits is not None:
+                for m in range(2 * limits.bands.size):
+                    for i in range(LANES):
+                        lanes.limit[m, i] = lanes.pending_limit[m, i]
             fill_dead(buffer, index, filled)
             filled = np.int64(0)
             k = np.int64(-1)
@@ -214,34 +214,36 @@ def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single
                     buffer, index, run, n_left, pq, blocks, block, cross, a, b, k, log_torus,
                     tables.points.share_agn[k],
                 )  # fmt: skip
-                for j in range(n_left if n_limits > 0 else 0):
-                    i = run[j]
-                    _fill_limits(
-                        tables.galaxy, tables.agn, tables.dust, target, lanes.limit, z,
-                        block * BLOCK + i, k, i,
-                    )  # fmt: skip
+                if limits is not None:
+                    for j in range(n_left):
+                        i = run[j]
+                        _fill_limits(
+                            tables.galaxy, tables.agn, tables.dust, limits, lanes.limit, z,
+                            block * BLOCK + i, k, i,
+                        )  # fmt: skip
             else:
                 before = filled
                 filled = gather(
                     pending, index, run, n_left, pq, blocks, block, cross, a, b, k, log_torus,
                     tables.points.share_agn[k], filled,
                 )  # fmt: skip
-                for i in range(before, filled if n_limits > 0 else before):
-                    _fill_limits(
-                        tables.galaxy, tables.agn, tables.dust, target, lanes.pending_limit, z,
-                        index[2, i], k, i,
-                    )  # fmt: skip
+                if limits is not None:
+                    for i in range(before, filled):
+                        _fill_limits(
+                            tables.galaxy, tables.agn, tables.dust, limits, lanes.pending_limit, z,
+                            index[2, i], k, i,
+                        )  # fmt: skip
             r += 1
             n_run = np.int64(0)
             if not whole:
                 continue
         top = -1.0
-        if n_limits > 0:
+        if limits is not None:
             while True:
                 top, over = limited_likelihoods(
                     buffer, lanes.limited, lanes.left, lanes.light, lanes.power, lanes.power32,
                     lanes.limit, lanes.limit_light, weight, tables.ratio, tables.prior_frac, first,
-                    best[2], request.scale_error, frac_sum, target.level, target.dark,
+                    best[2], request.scale_error, frac_sum, limits.level, limits.dark,
                     request.delta, single,
                 )  # fmt: skip
                 if over < 200.0:
@@ -250,7 +252,8 @@ def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single
                 add_points(tables.points, sums.hist, waiting)
                 waiting = np.int64(0)
                 best[2] += 2.0 * over
-                rescale(sums, galaxy_z, agn_z, math.exp(-min(over, 700.0)))
+                factor = math.exp(-min(over, 700.0))
+                rescale(sums.flat, sums.hist.flat, sums.draws.next, galaxy_z, agn_z, factor)
         elif light:
             top = light_likelihoods(
                 buffer, lanes.light, lanes.power, lanes.power32, tables.ratio,
@@ -263,7 +266,7 @@ def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single
             )  # fmt: skip
         if top >= best[0]:
             find_best(
-                tables.ratio, tables.prior_frac, first, target, best, sums.index, lanes, z_now
+                tables.ratio, tables.prior_frac, first, limits, best, sums.index, lanes, z_now
             )
         before = total[0]
         added = add_all(buffer, frac_sum, sums.zf, z_now, first, total, best)
@@ -282,9 +285,9 @@ def evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single
             add_joint(sums.gk, sums.fg, sums.fk, lanes, light, first, tables.ratio.size)
         if sums.draws.next.size > 0:
             draw_lanes(
-                tables.ratio, first, target, sums.draws, lanes, light, z_now, before, total[0]
+                tables.ratio, first, limits, sums.draws, lanes, light, z_now, before, total[0]
             )
         waiting = deposit_lanes(
-            tables.points, target, sums.hist, lanes, light, total[0], added, waiting
+            tables.points, limits, sums.hist, lanes, light, total[0], added, waiting
         )
     add_points(tables.points, sums.hist, waiting)

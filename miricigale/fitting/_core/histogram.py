@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit
 
-from miricigale.fitting._core.options import EXACT, EXACT_ENTRY, INNER
+from miricigale.fitting._core.options import ENTRY, EXACT, EXACT_ENTRY, INNER
 
 __all__ = [
     "HALF_BINS",
@@ -75,7 +75,7 @@ def fill_log10(x, work, out, n):
         out[i] = (np.float64(np.int32(work[i])) - 0.5) * _LOG10_2 + _LOG10_E2 * s
 
 
-@njit(**INNER)
+@njit(**ENTRY)
 def clear_rows(hist, bins):
     """Set the used bins of every row to zero and mark the rows as empty."""
     for i in range(hist.shape[0]):

@@ -112,7 +112,7 @@ def gather(pending, index, run, n_run, pq, blocks, block, cross, a, b, k, log_to
 
 
 @njit(**INNER)
-def lane_model(lanes, target, c, i, floor):
+def lane_model(lanes, limits, c, i, floor):
     """
     Scale, R and variance of the scale of the pair in lane i at one fraction, c = f / (1 - f).
 
@@ -125,12 +125,12 @@ def lane_model(lanes, target, c, i, floor):
     inverse = 1.0 / q
     s = max(p, 0.0) * inverse
     r = max(p, 0.0) * s
-    n = target.limits.size
-    if n == 0 or r < floor:
-        return s, r, inverse
-    for m in range(n):
-        slope[m] = lanes.limit[m, i] + c * lanes.limit[n + m, i]
-    return limited_scale(p, q, slope, target.level, target.dark)
+    if limits is not None and r >= floor:
+        n = limits.bands.size
+        for m in range(n):
+            slope[m] = lanes.limit[m, i] + c * lanes.limit[n + m, i]
+        s, r, inverse = limited_scale(p, q, slope, limits.level, limits.dark)
+    return s, r, inverse
 
 
 @njit(**INNER)

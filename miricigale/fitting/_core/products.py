@@ -19,7 +19,18 @@ __all__ = [
 
 @njit(**INNER)
 def row_best(
-    galaxy, agn, dust, ratio, prior_agn, log_agn, log_frac, zero_frac, target, agn_pq, slope
+    galaxy,
+    agn,
+    dust,
+    ratio,
+    prior_agn,
+    log_agn,
+    log_frac,
+    zero_frac,
+    target,
+    limits,
+    agn_pq,
+    slope,
 ):
     """
     Best model of one galaxy at one redshift; with limits, a good one.
@@ -30,7 +41,7 @@ def row_best(
         Fluxes of the galaxy and of all tori.
     dust : float
         Dust luminosity of the galaxy.
-    ratio, prior_agn, log_agn, log_frac, zero_frac, target
+    ratio, prior_agn, log_agn, log_frac, zero_frac, target, limits
         See `miricigale.fitting._core.structs`.
     agn_pq : `~numpy.ndarray`, shape (nA, 2)
         <A, wF> and <A, wA> at this redshift.
@@ -45,7 +56,6 @@ def row_best(
         Scale of the model that has it.
     """
     weight, bands = target.weight, target.bands
-    n_limits = target.limits.size
     p = 0.0
     q = 0.0
     for b in bands:
@@ -56,9 +66,12 @@ def row_best(
     best_s = 0.0
     without = -1e300
     if zero_frac == 1 and q > 0.0 and log_frac[0] > -1e200:
-        for m in range(n_limits):
-            slope[m] = galaxy[target.limits[m]] * target.inverse[m]
-        best_s, r, _ = limited_scale(p, q, slope, target.level, target.dark)
+        best_s = max(p, 0.0) / q
+        r = max(p, 0.0) * best_s
+        if limits is not None:
+            for m in range(limits.bands.size):
+                slope[m] = galaxy[limits.bands[m]] * limits.inverse[m]
+            best_s, r, _ = limited_scale(p, q, slope, limits.level, limits.dark)
         best_value = r + log_frac[0]
     for k in range(agn_pq.shape[0]):
         if not prior_agn[k] > 0.0:
@@ -78,14 +91,14 @@ def row_best(
             log_prior = log_agn[k] + log_frac[j + zero_frac]
             value = num * s + log_prior
             # with limits, only at what would be better without them than all before
-            if n_limits > 0:
+            if limits is not None:
                 if value <= without:
                     continue
                 without = value
-                for m in range(n_limits):
-                    band = target.limits[m]
-                    slope[m] = (galaxy[band] + x * agn[k, band]) * target.inverse[m]
-                s, r, _ = limited_scale(num, den, slope, target.level, target.dark)
+                for m in range(limits.bands.size):
+                    band = limits.bands[m]
+                    slope[m] = (galaxy[band] + x * agn[k, band]) * limits.inverse[m]
+                s, r, _ = limited_scale(num, den, slope, limits.level, limits.dark)
                 value = r + log_prior
             if value > best_value:
                 best_value = value

@@ -13,7 +13,7 @@ from miricigale.fitting._core.bounds import (
     pair_block,
     torus_projections,
 )
-from miricigale.fitting._core.options import ENTRY, INNER
+from miricigale.fitting._core.options import INNER
 from miricigale.fitting._core.products import agn_products, row_best
 
 __all__ = ["begin", "list_runs"]
@@ -57,24 +57,24 @@ def _one_sigma(galaxy, target):
 
 
 @njit(**INNER)
-def _row_best(tables, target, scratch, z, g):
+def _row_best(tables, target, limits, scratch, z, g):
     """Do what `row_best` does, with R + 2 ln(prior) of the galaxy and the redshift too."""
     value, s = row_best(
         tables.galaxy[z, g], tables.agn[z], tables.dust[g], tables.ratio, tables.prior_agn,
-        tables.log_agn, tables.log_frac, tables.zero_frac, target, scratch.agn_pq,
+        tables.log_agn, tables.log_frac, tables.zero_frac, target, limits, scratch.agn_pq,
         scratch.lanes.slope,
     )  # fmt: skip
     return value + target.log_prior[z] + tables.log_galaxy[g], s
 
 
-@njit(**ENTRY)
-def begin(tables, target, scratch, origin):
+@njit(**INNER)
+def begin(tables, target, limits, scratch, origin):
     """
     Start on an object: look at galaxies without AGN, order the redshifts.
 
     Parameters
     ----------
-    tables, target, scratch
+    tables, target, limits, scratch
         See `miricigale.fitting._core.structs`.
     origin : `~numpy.ndarray`, shape (3,)
         Filled with the logarithms that the histograms begin with, see `structs.Histograms`.
@@ -121,7 +121,7 @@ def begin(tables, target, scratch, origin):
             break
         agn_products(tables.agn[z], target, scratch.agn_pq, scratch.agn_weighted)
         g = row_of[z]
-        value, s = _row_best(tables, target, scratch, z, g)
+        value, s = _row_best(tables, target, limits, scratch, z, g)
         if value > reference:
             reference = value
             # where the best has no light others have about what one sigma allows
@@ -140,14 +140,14 @@ def begin(tables, target, scratch, origin):
     return True
 
 
-@njit(**ENTRY)
-def list_runs(tables, request, target, scratch, position):
+@njit(**INNER)
+def list_runs(tables, request, target, limits, scratch, position):
     """
     List runs of pairs that can matter, until the list is full or all are seen.
 
     Parameters
     ----------
-    tables, request, target, scratch
+    tables, request, target, limits, scratch
         See `miricigale.fitting._core.structs`; `begin` was called. ``scratch.run_key`` and
         ``scratch.bound`` are filled, ``scratch.reference`` is raised when a better model is met.
     position : int
@@ -235,7 +235,7 @@ def list_runs(tables, request, target, scratch, position):
                     agn_known = True
                     agn_products(tables.agn[z], target, scratch.agn_pq, scratch.agn_weighted)
                 g = start + m
-                value, _ = _row_best(tables, target, scratch, z, g)
+                value, _ = _row_best(tables, target, limits, scratch, z, g)
                 if value > reference:
                     reference = value
                     margin = 2.0

@@ -8,7 +8,7 @@ from numba import njit
 from miricigale.fitting._core.bounds import BLOCK
 from miricigale.fitting._core.collect import PARTS, deposit_single, note_best, take_draw
 from miricigale.fitting._core.limits import limited_scale
-from miricigale.fitting._core.options import ENTRY, INNER
+from miricigale.fitting._core.options import INNER
 from miricigale.fitting._core.products import galaxy_products
 from miricigale.fitting._core.structs import NO_LIGHT
 from miricigale.fitting._core.totals import finish_redshift
@@ -17,26 +17,28 @@ __all__ = ["evaluate_singles"]
 
 
 @njit(**INNER)
-def _model(galaxy, target, p, q, slope):
+def _model(galaxy, limits, p, q, slope):
     """Scale, R and variance of the scale of a galaxy with p = <G, wF> and q = <G, wG>."""
     # without light the scale is 0, and nothing is known of its error
     q = q if q > NO_LIGHT else 1.0 / NO_LIGHT
     s = max(p, 0.0) / q
-    if target.limits.size == 0:
-        return s, max(p, 0.0) * s, 1.0 / q
-    for m in range(target.limits.size):
-        slope[m] = galaxy[target.limits[m]] * target.inverse[m]
-    return limited_scale(p, q, slope, target.level, target.dark)
+    r = max(p, 0.0) * s
+    inverse = 1.0 / q
+    if limits is not None:
+        for m in range(limits.bands.size):
+            slope[m] = galaxy[limits.bands[m]] * limits.inverse[m]
+        s, r, inverse = limited_scale(p, q, slope, limits.level, limits.dark)
+    return s, r, inverse
 
 
-@njit(**ENTRY)
-def evaluate_singles(tables, request, target, sums, scratch):
+@njit(**INNER)
+def evaluate_singles(tables, request, target, limits, sums, scratch):
     """
     Add the models without AGN (f = 0), one for each galaxy and redshift, to the sums.
 
     Parameters
     ----------
-    tables, request, target, sums, scratch
+    tables, request, target, limits, sums, scratch
         See `miricigale.fitting._core.structs`; `begin` was called, which projected the galaxies.
     """
     n_z, n_galaxy, _ = tables.galaxy.shape
@@ -64,7 +66,7 @@ def evaluate_singles(tables, request, target, sums, scratch):
                     known = True
                     galaxy_products(tables.tiles, z, block, target, pq)
                 _, r, _ = _model(
-                    tables.galaxy[z, start + i], target, pq[0, block, i], pq[1, block, i], slope
+                    tables.galaxy[z, start + i], limits, pq[0, block, i], pq[1, block, i], slope
                 )
                 value = r + more
                 if value > best[2]:
@@ -91,7 +93,7 @@ def evaluate_singles(tables, request, target, sums, scratch):
                     known = True
                     galaxy_products(tables.tiles, z, block, target, pq)
                 s, r, inverse = _model(
-                    tables.galaxy[z, g], target, pq[0, block, i], pq[1, block, i], slope
+                    tables.galaxy[z, g], limits, pq[0, block, i], pq[1, block, i], slope
                 )
                 note_best(best, sums.index, r, s, z, g, np.int64(0), np.int64(0))
                 prior += tables.log_frac[0]

@@ -8,6 +8,7 @@ __all__ = [
     "Draws",
     "Histograms",
     "Lanes",
+    "Limits",
     "PointTables",
     "Request",
     "Scratch",
@@ -86,11 +87,20 @@ class Target(NamedTuple):
     weight: np.ndarray  # float64 (nb,): 1 / sigma^2; 0 there
     log_prior: np.ndarray  # float64 (nz,): 2 ln(prior) of the redshifts, -1e300 where it is 0
     bands: np.ndarray  # int64 (n_used,): the measured bands
-    limits: np.ndarray  # int64 (n_limits,): bands with an upper limit
+    norm: float  # |F|^2_w
+
+
+class Limits(NamedTuple):
+    """
+    The upper limits of one object.
+
+    The kernels take None where there are none: what they do with limits is then not even compiled.
+    """
+
+    bands: np.ndarray  # int64 (n_limits,): bands with an upper limit
     level: np.ndarray  # float64 (n_limits,): limiting flux over its sigma
     inverse: np.ndarray  # float64 (n_limits,): 1 / sigma
     dark: float  # sum of the limits' terms of chi2 for a model without light
-    norm: float  # |F|^2_w
 
 
 class Histograms(NamedTuple):
@@ -186,4 +196,8 @@ class Scratch(NamedTuple):
     run: np.ndarray  # int64 (BLOCK,): galaxies of a block that a run is about
     galaxy_z: np.ndarray  # float64 (3, n_blocks, BLOCK): sums over one redshift
     agn_z: np.ndarray  # float64 (nA, 3)
+    mean: np.ndarray  # float64 (n_quantities,), and
+    variance: np.ndarray  # float64 (n_quantities,) of derived quantities so far
+    widest_galaxy: np.ndarray  # float64 (nG,): squares of quantities over their variances, and
+    widest_agn: np.ndarray  # float64 (nA,): those of tori
     lanes: Lanes

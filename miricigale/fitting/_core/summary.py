@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 
 from miricigale.fitting._core.histogram import N_BINS, add_scaled, log_summary, share_quantiles
-from miricigale.fitting._core.options import ENTRY
+from miricigale.fitting._core.options import ENTRY, EXACT, EXACT_ENTRY
 
 __all__ = ["summarise", "variances"]
 
@@ -14,23 +14,43 @@ __all__ = ["summarise", "variances"]
 _FAINT = 1e-3
 
 
-def _moments(tables, sums):
-    """Means and variances: the galaxy's quantities, the torus's, then the one of both."""
-    scales = np.vstack([tables.galaxy_scale, tables.mixed_galaxy])
-    powers = np.vstack([tables.agn_scale, tables.mixed_agn])
-    # no matrix products, whose last digits depend on the machine's threads
-    galaxy = np.einsum("qg,gm->qm", scales, sums.galaxy[:, 1:2])[:, 0]
-    galaxy_2 = np.einsum("qg,gm->qm", scales * scales, sums.galaxy[:, 2:])[:, 0]
-    rows = sums.agn[: powers.shape[1]]
-    agn = np.einsum("qk,km->qm", powers, rows[:, 1:2])[:, 0]
-    agn_2 = np.einsum("qk,km->qm", powers * powers, rows[:, 2:])[:, 0]
-    first = np.concatenate([galaxy[:-1], agn[:-1], [galaxy[-1] + agn[-1]]]) / sums.total[0]
-    both = galaxy_2[-1] + agn_2[-1] + 2.0 * sums.total[3]
-    second = np.concatenate([galaxy_2[:-1], agn_2[:-1], [both]]) / sums.total[0]
-    return first, second - first * first
+@njit(**EXACT_ENTRY)
+def moments(galaxy_scale, agn_scale, mixed_galaxy, mixed_agn, galaxy, agn, total, mean, variance):
+    """
+    Means and variances of the derived quantities, scales' own variances included.
+
+    Parameters
+    ----------
+    galaxy_scale, agn_scale, mixed_galaxy, mixed_agn
+        See `miricigale.fitting._core.structs.Tables`.
+    galaxy, agn, total
+        See `miricigale.fitting._core.structs.Sums`.
+    mean, variance : `~numpy.ndarray`, shape (n_quantities,)
+        Filled: the galaxy's quantities, the torus's, the one of both.
+    """
+    n = galaxy_scale.shape[0]
+    for m in range(mean.size):
+        first = 0.0
+        second = 0.0
+        if m < n or m == mean.size - 1:
+            scale = galaxy_scale[m] if m < n else mixed_galaxy
+            for g in range(scale.size):
+                first += scale[g] * galaxy[g, 1]
+                second += scale[g] * scale[g] * galaxy[g, 2]
+        if m >= n:
+            power = agn_scale[m - n] if m < mean.size - 1 else mixed_agn
+            for k in range(power.size):
+                first += power[k] * agn[k, 1]
+                second += power[k] * power[k] * agn[k, 2]
+        if m == mean.size - 1:
+            second += 2.0 * total[3]
+        first /= total[0]
+        mean[m] = first
+        variance[m] = second / total[0] - first * first
 
 
-def variances(tables, sums):
+@njit(**EXACT)
+def variances(tables, sums, mean, variance, galaxy, agn):
     """
     Squares of derived quantities over their variance so far, the largest of each model.
 
@@ -38,27 +58,32 @@ def variances(tables, sums):
     ----------
     tables, sums
         See `miricigale.fitting._core.structs`.
-
-    Returns
-    -------
+    mean, variance : `~numpy.ndarray`, shape (n_quantities,)
+        Scratch.
     galaxy, agn : `~numpy.ndarray`, shapes (nG,) and (nA,)
-        For each squared solar mass and W.
+        Filled, for each squared solar mass and W.
     """
-    mean, variance = _moments(tables, sums)
-    n_galaxy = tables.galaxy_scale.shape[0]
-    least = 1e-12 * mean * mean
-    least[n_galaxy:-1] = (_FAINT * mean[-1]) ** 2
-    variance = np.maximum(variance, least)
-    # of what is the same for all models, in numbers too small to square, nothing is asked
-    inverse = np.divide(1.0, variance, out=np.zeros(variance.size), where=variance > 1e-290)
-    galaxy = np.vstack([tables.galaxy_scale, tables.mixed_galaxy])
-    agn = np.vstack([tables.agn_scale, tables.mixed_agn])
-    of_galaxy = np.append(inverse[:n_galaxy], inverse[-1])
-    of_agn = inverse[n_galaxy:]
-    return (
-        (galaxy * galaxy * of_galaxy[:, None]).max(axis=0, initial=0.0),
-        (agn * agn * of_agn[:, None]).max(axis=0, initial=0.0),
-    )
+    moments(
+        tables.galaxy_scale, tables.agn_scale, tables.mixed_galaxy, tables.mixed_agn, sums.galaxy,
+        sums.agn, sums.total, mean, variance,
+    )  # fmt: skip
+    n = tables.galaxy_scale.shape[0]
+    last = mean.size - 1
+    galaxy[:] = 0.0
+    agn[:] = 0.0
+    for m in range(mean.size):
+        part = _FAINT * mean[last] if n <= m < last else 1e-6 * mean[m]
+        value = max(variance[m], part * part)
+        # of what is the same for all models, in numbers too small to square, nothing is asked
+        inverse = 1.0 / value if value > 1e-290 else 0.0
+        if m < n or m == last:
+            scale = tables.galaxy_scale[m] if m < n else tables.mixed_galaxy
+            for g in range(galaxy.size):
+                galaxy[g] = max(galaxy[g], scale[g] * scale[g] * inverse)
+        if m >= n:
+            power = tables.agn_scale[m - n] if m < last else tables.mixed_agn
+            for k in range(agn.size):
+                agn[k] = max(agn[k], power[k] * power[k] * inverse)
 
 
 @njit(**ENTRY)
@@ -89,7 +114,7 @@ def _log_quantiles(
         mean_log[m] = log_summary(joined, origin + shift, zero + more, sigma, levels, quantiles[m])
 
 
-def summarise(tables, request, sums, moments, quantiles, share, share_levels):
+def summarise(tables, request, sums, out, quantiles, share, share_levels):
     """
     Moments and quantiles of all derived quantities of one object.
 
@@ -97,7 +122,7 @@ def summarise(tables, request, sums, moments, quantiles, share, share_levels):
     ----------
     tables, request, sums
         See `miricigale.fitting._core.structs`.
-    moments, quantiles : `~numpy.ndarray`, shapes (n_quantities, 3) and (n_quantities, n_levels)
+    out, quantiles : `~numpy.ndarray`, shapes (n_quantities, 3) and (n_quantities, n_levels)
         Filled: mean, standard deviation and mean of log10; quantiles at ``request.levels``. The
         order is the galaxy's quantities, the torus's, then the one of both.
     share, share_levels : `~numpy.ndarray`, shapes (2,) and (n_levels,)
@@ -105,12 +130,16 @@ def summarise(tables, request, sums, moments, quantiles, share, share_levels):
     """
     total, hist = sums.total[0], sums.hist
     sigma = request.scale_error / np.sqrt(max(sums.total[1] / total, 1.0))
-    mean, variance = _moments(tables, sums)
-    moments[:, 0] = mean
-    moments[:, 1] = np.sqrt(np.maximum(variance, 0.0))
+    mean, variance = np.empty(len(out)), np.empty(len(out))
+    moments(
+        tables.galaxy_scale, tables.agn_scale, tables.mixed_galaxy, tables.mixed_agn, sums.galaxy,
+        sums.agn, sums.total, mean, variance,
+    )  # fmt: skip
+    out[:, 0] = mean
+    out[:, 1] = np.sqrt(np.maximum(variance, 0.0))
     n_galaxy, n_agn = tables.galaxy_scale.shape[0], tables.agn_scale.shape[0]
     least = 1e-6 * total / tables.galaxy_scale.shape[1]
-    mean_log = np.empty(len(moments))
+    mean_log = np.empty(len(out))
     # weight of models without light, without any AGN power, and without either
     dark = sums.total[2]
     no_power = max(total - hist.agn.sum(), 0.0)
@@ -134,7 +163,7 @@ def summarise(tables, request, sums, moments, quantiles, share, share_levels):
             table, bins, weight, scale, zero, floor, origin, sigma, request.levels,
             mean_log[rows], quantiles[rows],
         )  # fmt: skip
-    moments[:, 2] = mean_log
+    out[:, 2] = mean_log
     share[0] = sums.total[4] / total
     share[1] = np.sqrt(max(sums.total[5] / total - share[0] ** 2, 0.0))
     share_quantiles(hist.share, request.levels, share_levels)

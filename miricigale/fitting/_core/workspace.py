@@ -11,7 +11,7 @@ from miricigale.fitting._core.histogram import N_BINS, N_SHARE, POINTS, clear_ro
 from miricigale.fitting._core.lanes import LANES, N_INPUT, SIZE
 from miricigale.fitting._core.light import light_size
 from miricigale.fitting._core.limited_scales import LIMITED_SIZE
-from miricigale.fitting._core.options import ENTRY, EXACT
+from miricigale.fitting._core.options import EXACT
 from miricigale.fitting._core.structs import Draws, Histograms, Lanes, Scratch, Sums
 
 __all__ = ["JOINT", "clear", "make_scratch", "make_sums", "rescale"]
@@ -83,7 +83,7 @@ def _cut(shapes):
     return flat, {name: piece.reshape(shape) for (name, shape), piece in named}
 
 
-def make_scratch(n_z, n_galaxy, n_agn, n_frac, n_bands, zero_frac, capacity):
+def make_scratch(n_z, n_galaxy, n_agn, n_frac, n_bands, n_quantities, zero_frac, capacity):
     """Make the work space for a grid of the given size; ``capacity`` runs are listed at once."""
     n_blocks = -(-n_galaxy // BLOCK)
     n_padded = n_blocks * BLOCK
@@ -108,6 +108,10 @@ def make_scratch(n_z, n_galaxy, n_agn, n_frac, n_bands, zero_frac, capacity):
         run=np.zeros(BLOCK, np.int64),
         galaxy_z=np.zeros((3, n_blocks, BLOCK)),
         agn_z=np.zeros((n_agn, 3)),
+        mean=np.zeros(n_quantities),
+        variance=np.zeros(n_quantities),
+        widest_galaxy=np.zeros(n_galaxy),
+        widest_agn=np.zeros(n_agn),
         lanes=Lanes(
             buffer=np.zeros(SIZE),
             light=np.zeros(light_size(n_frac), np.float32),
@@ -127,24 +131,13 @@ def make_scratch(n_z, n_galaxy, n_agn, n_frac, n_bands, zero_frac, capacity):
     )
 
 
-@njit(**EXACT)
-def _zero(x):
-    for i in range(x.size):
-        x[i] = 0.0
-
-
-@njit(**ENTRY)
-def clear(flat, best, index, hist, draws):
+def clear(sums):
     """Empty the accumulators."""
-    _zero(flat)
-    _zero(best)
-    for i in range(index.size):
-        index[i] = -1
-    _zero(hist.carry)
-    _zero(hist.share)
-    _zero(draws.next)
-    for i in range(draws.next.size):
-        draws.index[i, 0] = -1
+    hist, draws = sums.hist, sums.draws
+    for array in (sums.flat, sums.best, hist.carry, hist.share, draws.next):
+        array.fill(0.0)
+    sums.index.fill(-1)
+    draws.index[:, 0] = -1
     clear_rows(hist.galaxy, hist.range_galaxy)
     clear_rows(hist.agn, hist.range_agn)
     clear_rows(hist.mixed, hist.range_mixed)
@@ -156,11 +149,11 @@ def _multiply(x, factor):
         x[i] *= factor
 
 
-@njit(**ENTRY)
-def rescale(sums, galaxy_z, agn_z, factor):
+@njit(**EXACT)
+def rescale(flat, histograms, draws, galaxy_z, agn_z, factor):
     """Multiply all weights, when a better model becomes the reference."""
-    _multiply(sums.flat, factor)
-    _multiply(sums.hist.flat, factor)
-    _multiply(sums.draws.next, factor)
+    _multiply(flat, factor)
+    _multiply(histograms, factor)
+    _multiply(draws, factor)
     _multiply(galaxy_z.reshape(galaxy_z.size), factor)
     _multiply(agn_z.reshape(agn_z.size), factor)

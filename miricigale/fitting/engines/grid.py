@@ -23,8 +23,6 @@ _TAIL = 10.0
 _THIN = 1e-4
 #: Least ``rtol`` with which pairs of little weight are evaluated in single precision.
 _SINGLE = 5e-7
-#: Largest chi2 of a good model, and square of a limit over its error, for that with limits.
-_MODEST = 1000.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -112,7 +110,7 @@ class GridEngine:
         n_z, n_galaxy, n_bands = self.galaxy.shape
         size = (n_z, n_galaxy, self.agn.shape[1], self.frac.size, n_bands)
         return _core.make_sums(*size, n_draws, joint), _core.make_scratch(
-            *size, int(self.frac[0] == 0.0), _CAPACITY
+            *size, self.n_quantities, int(self.frac[0] == 0.0), _CAPACITY
         )
 
     def fit(
@@ -194,73 +192,19 @@ class GridEngine:
             joint={name: np.full((n, size[name[0]], size[name[1]]), np.nan) for name in joint},
         )
         sums, scratch = self.workspace(n_draws, joint) if workspace is None else workspace
+        tables, request, single = self._tables, self._request, self.rtol >= _SINGLE
         for i in np.flatnonzero(log_prior.max(axis=1, initial=-1e300) > -1e200):
-            target = _target(data[i], weight[i], log_prior[i], limit[i], inverse[i])
+            target = _target(data[i], weight[i], log_prior[i])
+            limits = _limits(limit[i], inverse[i])
             sums.draws.state[0] = seeds[i]
-            if self._sum_up(target, sums, scratch):
-                self._summarise(target, sums, out, i)
+            _core.clear(sums)
+            if target.norm > 0.0 and _core.sum_up(
+                tables, request, target, limits, sums, scratch, single
+            ):
+                self._summarise(target, limits, sums, out, i)
         return out
 
-    def _sum_up(self, target, sums, scratch):
-        """Sum up the posterior of one object; returns whether there is any."""
-        tables, request = self._tables, self._request
-        _core.clear(sums.flat, sums.best, sums.index, sums.hist, sums.draws)
-        if not target.norm > 0.0:
-            return False
-        if not _core.begin(tables, target, scratch, sums.hist.origin):
-            return False
-        sums.best[2] = scratch.reference[0]
-        _core.evaluate_singles(tables, request, target, sums, scratch)
-        n_z, n_blocks = tables.tiles.shape[:2]
-        with_pairs = self.agn.shape[1] > 0 and tables.prior_frac[tables.zero_frac :].any()
-        position, end, share = 0, n_z * n_blocks, 1.0
-        single = self.rtol >= _SINGLE
-        while with_pairs and position < end:
-            n, position = _core.list_runs(tables, request, target, scratch, position)
-            share *= 0.5
-            # the best model met so far gets weight 1
-            reference = scratch.reference[0]
-            if reference > sums.best[2]:
-                if sums.total[0] > 0.0:
-                    factor = np.exp(0.5 * (sums.best[2] - reference))
-                    _core.rescale(sums, scratch.galaxy_z, scratch.agn_z, factor)
-                sums.best[2] = reference
-            # bounds are raised for second moments only after a first look
-            scratch.tail_galaxy.fill(0.0)
-            scratch.tail_agn.fill(0.0)
-            if target.limits.size:
-                # a probability many sigma out is not one for single precision
-                worst = max(target.norm + target.dark - reference, target.level.max() ** 2)
-                single = single and worst < _MODEST
-            floor, few = _core.first_floor(scratch.bound, scratch.count, reference, n)
-            light = single and not few
-            _core.evaluate_runs(tables, request, target, sums, scratch, n, floor, floor, light)
-            room = share * request.rtol * sums.total[0]
-            if room > 0.0:
-                _core.raise_bounds(
-                    tables.agn,
-                    tables.galaxy_unit,
-                    target.weight,
-                    (target.norm + 1.0) / request.tail,
-                    *_core.variances(tables, sums),
-                    scratch.inverse_norm,
-                    scratch.run_key,
-                    scratch.bound,
-                    n,
-                    scratch.tail_galaxy,
-                    scratch.tail_agn,
-                )
-            # a bound holds the largest prior of the fractions above 0, a weight those of all
-            prior = tables.prior_frac[tables.zero_frac :]
-            unit = np.exp(min(0.5 * (reference - sums.best[2]), 600.0))
-            unit *= prior.sum() / max(prior.max(), 1e-300)
-            floor, sure = _core.second_floor(
-                scratch.bound, scratch.count, reference, n, room, unit, request.delta
-            )
-            _core.evaluate_runs(tables, request, target, sums, scratch, n, floor, sure, single)
-        return sums.total[0] > 0.0
-
-    def _summarise(self, target, sums, out, i):
+    def _summarise(self, target, limits, sums, out, i):
         """Fill row i of the output."""
         total, tables = sums.total[0], self._tables
         z, g, k, f = out.index[i] = sums.index
@@ -271,9 +215,12 @@ class GridEngine:
             model = model + power * self.agn[z, k]
         # from the residuals: |F|^2_w - R would lose digits
         chi2 = np.sum(target.weight * (target.flux - model) ** 2)
-        faint = target.level - model[target.limits] * target.inverse
-        out.chi2[i] = chi2 - 2.0 * log_ndtr(faint).sum()
-        norm = target.norm + target.dark
+        norm = target.norm
+        if limits is not None:
+            faint = limits.level - model[limits.bands] * limits.inverse
+            chi2 -= 2.0 * log_ndtr(faint).sum()
+            norm += limits.dark
+        out.chi2[i] = chi2
         out.log_sum[i] = np.log(total) + 0.5 * (sums.best[2] - norm)
         out.n_models[i] = sums.best[3]
         # sums in single precision differ by some 1e-8
@@ -374,18 +321,26 @@ class GridEngine:
         return {name: value for name, value in self.__dict__.items() if name not in hidden}
 
 
-def _target(flux, weight, log_prior, limit, inverse):
+def _target(flux, weight, log_prior):
     """Bundle the data of one object."""
-    limits = np.flatnonzero(inverse > 0)
-    level = limit[limits] * inverse[limits]
     return _core.Target(
         flux=flux,
         weight=weight,
         log_prior=log_prior,
         bands=np.flatnonzero(weight > 0),
-        limits=limits,
-        level=level,
-        inverse=inverse[limits],
-        dark=float(-2.0 * log_ndtr(level).sum()),
         norm=float(np.sum(weight * flux * flux)),
+    )
+
+
+def _limits(limit, inverse):
+    """Bundle the upper limits of one object; None if it has none."""
+    bands = np.flatnonzero(inverse > 0)
+    if bands.size == 0:
+        return None
+    level = limit[bands] * inverse[bands]
+    return _core.Limits(
+        bands=bands,
+        level=level,
+        inverse=inverse[bands],
+        dark=float(-2.0 * log_ndtr(level).sum()),
     )
