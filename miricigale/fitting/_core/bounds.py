@@ -16,7 +16,7 @@ single precision can amount to.
 import numpy as np
 from numba import njit
 
-from miricigale.fitting._core.options import INNER
+from miricigale.fitting._core.options import ONCE
 
 __all__ = [
     "BLOCK",
@@ -46,7 +46,7 @@ _TINY = np.float32(1e-28)
 _ALWAYS = np.float32(4.0)
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def galaxy_projections(galaxy, bands, root_weight, data, p, inverse_norm):
     """
     Project the data on every galaxy of one redshift.
@@ -87,7 +87,7 @@ def galaxy_projections(galaxy, bands, root_weight, data, p, inverse_norm):
         p[i] = _ALWAYS if faint else p[i] * r
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def torus_projections(agn, bands, root_weight, data, unit, a, a2):
     """
     Unit vectors of the tori of one redshift and their projections.
@@ -128,7 +128,7 @@ def torus_projections(agn, bands, root_weight, data, unit, a, a2):
                 unit[k, j] *= r
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def _products(unit_galaxy, unit_agn, x):
     """Fill x[m, i] = sum_j unit_agn[m, j] unit_galaxy[j, i] for GROUP tori (register blocking)."""
     zero = np.float32(0)
@@ -169,7 +169,7 @@ def _products(unit_galaxy, unit_agn, x):
         j += 1
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def pair_block(
     unit_galaxy, p, threshold, base, norm, unit_agn, a, a2, key, start, run_key, bound, top
 ):

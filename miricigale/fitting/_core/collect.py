@@ -15,7 +15,7 @@ from miricigale.fitting._core.histogram import (
 )
 from miricigale.fitting._core.lanes import LANES, PRIOR, W0, X2, A, B, P, Q, lane_model
 from miricigale.fitting._core.light import pair_weight
-from miricigale.fitting._core.options import EXACT, INNER
+from miricigale.fitting._core.options import EXACT, INNER, ONCE
 from miricigale.fitting._core.products import best_mixture
 
 __all__ = [
@@ -62,7 +62,7 @@ def note_best(best, index, r, s, z, g, k, f):
     index[3] = f
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def find_best(ratio, frac_prior, zero_frac, limits, best, index, lanes, z):
     """Look for the best model among the lanes."""
     buffer = lanes.buffer
@@ -142,7 +142,7 @@ def deposit_single(tables, hist, g, s, t):
             _add_bin(hist.mixed, hist.range_mixed, np.int64(0), y * PER_DEX + HALF_BINS, t)
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def deposit_lanes(tables, limits, hist, lanes, single, total, added, n):
     """
     Note models in the lanes for the histograms; `add_points` puts them there.
@@ -219,7 +219,7 @@ def take_draw(draws, d, total, z, g, k, f, s, variance):
     draws.next[d] = total / _uniform(draws.state)
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def draw_lanes(ratio, zero_frac, limits, draws, lanes, single, z, before, after):
     """Let the models in the lanes replace draws; sums of weight are given before and after."""
     buffer = lanes.buffer

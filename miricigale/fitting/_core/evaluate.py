@@ -23,7 +23,7 @@ from miricigale.fitting._core.lanes import (
 )
 from miricigale.fitting._core.light import light_likelihoods
 from miricigale.fitting._core.limited import limited_likelihoods
-from miricigale.fitting._core.options import INNER
+from miricigale.fitting._core.options import INNER, ONCE
 from miricigale.fitting._core.products import (
     agn_products,
     best_mixtures,
@@ -61,7 +61,7 @@ def _fill_limits(galaxy, agn, dust, limits, lane_limit, z, g, k, lane):
         lane_limit[n + m, lane] = agn[z, k, band] * t * dust[g]
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def _next_run(row, floor, run):
     """Fill ``run`` with the pairs of a run whose bound reaches the floor; returns their number."""
     n = np.int64(0)
@@ -77,7 +77,7 @@ def _next_run(row, floor, run):
     return n
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def _drop(row, run, n_run, cross, other, sure):
     """Note better bounds of what is not worth evaluating, mark the others as done."""
     n_left = np.int64(0)

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from miricigale.fitting._core.bounds import BLOCK, DONE, KEY_BITS
-from miricigale.fitting._core.options import INNER
+from miricigale.fitting._core.options import INNER, ONCE
 
 __all__ = ["N_LEVELS", "first_floor", "raise_bounds", "second_floor"]
 
@@ -38,7 +38,7 @@ def _count(bound, n, reference, count):
                 count[np.int64(min(max(column, 0.0), N_LEVELS))] += 1.0
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def first_floor(bound, count, reference, n):
     """
     Least bound to evaluate first, and whether in double precision.
@@ -66,7 +66,7 @@ def first_floor(bound, count, reference, n):
     return reference - _FIRST, True
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def raise_bounds(
     agn, galaxy_unit, weight, room, tail_galaxy, tail_agn, inverse_norm, run_key, bound, n,
     raise_galaxy, raise_agn,
@@ -120,7 +120,7 @@ def raise_bounds(
             bound[r, i] = value if bound[r, i] > DONE else DONE
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def second_floor(bound, count, reference, n, room, unit, delta):
     """
     Least bound to evaluate, once the weight of the best pairs is known.

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from miricigale.fitting._core.limits import limited_scale
-from miricigale.fitting._core.options import INNER
+from miricigale.fitting._core.options import INNER, ONCE
 from miricigale.fitting._core.structs import NO_LIGHT
 
 __all__ = [
@@ -52,7 +52,7 @@ _LN2_HIGH_32 = np.float32(0.693359375)
 _LN2_LOW_32 = np.float32(-2.12194440e-4)
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def fill_dead(buffer, index, start):
     """Fill the lanes from ``start`` on with pairs of no weight."""
     for i in range(max(start, 0), LANES):
@@ -68,7 +68,7 @@ def fill_dead(buffer, index, start):
         index[1, i] = 0
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def fill_block(buffer, index, run, n_run, pq, blocks, block, cross, a, b, k, log_torus, share):
     """Fill the lanes with a block of galaxies and one torus; those not in the run are dead."""
     last = run[n_run - 1]
@@ -91,7 +91,7 @@ def fill_block(buffer, index, run, n_run, pq, blocks, block, cross, a, b, k, log
         buffer[PRIOR + i] = log_torus + blocks[1, block, i]
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def gather(pending, index, run, n_run, pq, blocks, block, cross, a, b, k, log_torus, share, filled):
     """Add the pairs of a short run to those gathered; returns how many there are now."""
     for j in range(n_run):
@@ -172,7 +172,7 @@ def light_exponential(e):
     return v, (np.int32(m) + np.int32(127)) << np.int32(23)
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def likelihoods(
     buffer, power, weight, ratio, frac_prior, first, reference, scale_error, out
 ):  # fmt: skip

@@ -37,7 +37,7 @@ from miricigale.fitting._core.lanes import (
     exponential,
     light_exponential,
 )
-from miricigale.fitting._core.options import INNER
+from miricigale.fitting._core.options import INNER, ONCE
 from miricigale.fitting._core.structs import NO_LIGHT
 
 __all__ = ["light_likelihoods", "light_size", "pair_weight"]
@@ -70,7 +70,7 @@ def pair_weight(lanes, single, j, i):
     return lanes.weight[j * LANES + i]
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def _prepare(buffer, light, power, low, high, reference, scale_error):
     """
     Fill the vectors of ``light`` that say what the pairs are.
@@ -122,7 +122,7 @@ def _prepare(buffer, light, power, low, high, reference, scale_error):
     return top
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def light_likelihoods(
     buffer, light, power, power32, ratio, frac_prior, first, reference, scale_error, out
 ):

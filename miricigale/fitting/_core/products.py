@@ -4,7 +4,7 @@ from numba import njit
 
 from miricigale.fitting._core.bounds import BLOCK
 from miricigale.fitting._core.limits import limited_scale
-from miricigale.fitting._core.options import INNER
+from miricigale.fitting._core.options import INNER, ONCE
 
 __all__ = [
     "agn_products",
@@ -17,7 +17,7 @@ __all__ = [
 ]
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def row_best(
     galaxy,
     agn,
@@ -139,7 +139,7 @@ def galaxy_products(tiles, z, block, target, pq):
             pq[1, block, i] += t * t * w
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def cross_products(tiles, z, block, bands, weighted, k, cross):
     """Fill cross[0, i] = <G_i, wA> for a block of galaxies and one torus."""
     for i in range(BLOCK):
@@ -180,7 +180,7 @@ def best_mixture(p, q, t, a, b, low, high):
     return num * num / max(q + x * (2.0 * t + x * b), 1e-300)
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def best_mixtures(pq, blocks, block, a, b, low, high, cross):
     """Fill cross[1, i] with the best R of a block of galaxies with a torus."""
     for i in range(BLOCK):
@@ -190,7 +190,7 @@ def best_mixtures(pq, blocks, block, a, b, low, high, cross):
         )
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def few_products(
     tiles, z, block, bands, weighted, k, pq, blocks, a, b, low, high, run, n_run, cross
 ):

@@ -19,7 +19,7 @@ from miricigale.fitting._core.lanes import (
     WZ,
 )
 from miricigale.fitting._core.light import pair_weight
-from miricigale.fitting._core.options import INNER
+from miricigale.fitting._core.options import INNER, ONCE
 
 __all__ = ["add_all", "add_block", "add_gathered", "add_joint", "finish_redshift"]
 
@@ -76,7 +76,7 @@ def finish_redshift(tiles, fluxes, galaxy_z, agn_z, galaxy, agn, band, zg, zk, z
             agn_z[k, m] = 0.0
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def add_all(buffer, frac_sum, zf, z, first, total, best):
     """Add what needs no index; returns the weight of all pairs in the lanes."""
     for j in range(frac_sum.size):
@@ -103,7 +103,7 @@ def add_all(buffer, frac_sum, zf, z, first, total, best):
     return weight
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def add_block(buffer, tiles, blocks, agn, mixed_agn, z, block, k, galaxy_z, agn_z, band, total):
     """Add a block of galaxies with one torus."""
     for i in range(LANES):
@@ -150,7 +150,7 @@ def add_block(buffer, tiles, blocks, agn, mixed_agn, z, block, k, galaxy_z, agn_
         m += 1
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def add_gathered(
     buffer, index, galaxy, agn, mixed_galaxy, mixed_agn, z, galaxy_z, agn_z, band, total, least
 ):
@@ -184,7 +184,7 @@ def add_gathered(
     total[3] += total_cross
 
 
-@njit(**INNER)
+@njit(**ONCE)
 def add_joint(gk, fg, fk, lanes, single, first, n_ratio):
     """Add to the joint sums that were asked for."""
     buffer, index = lanes.buffer, lanes.index
