@@ -87,6 +87,8 @@ def _parser():
     filters = commands.add_parser("filters", help="list the filters")
     filters.add_argument("pattern", nargs="?", default="", help="part of the name")
 
+    commands.add_parser("compile", help="compile all kernels now, once for each installation")
+
     data = commands.add_parser("data", help="reference data: list, check or add")
     actions = data.add_subparsers(dest="action", metavar="ACTION", required=True)
     listing = actions.add_parser("list", help="what there is, where, its licence, what to cite")
@@ -197,6 +199,24 @@ def _plan(args):
     return 0
 
 
+def _compile(args):
+    from miricigale.workflow.warmup import JOBS, compile_in_background, is_compiled
+
+    with compile_in_background() as handle:
+        try:
+            for name in JOBS:
+                handle.wait(name, tell=lambda text: print(text, flush=True))
+        except KeyboardInterrupt:
+            print("stopped; the same command goes on from here", file=sys.stderr)
+            return 130
+    failed = [name for name in JOBS if not is_compiled(name)]
+    if failed:
+        print(f"miricigale: not kept on disk: {', '.join(failed)}", file=sys.stderr)
+        return 1
+    print("all kernels are compiled")
+    return 0
+
+
 def _filters(args):
     from miricigale.workflow.commands import filter_table
 
@@ -296,6 +316,8 @@ def main(argv=None):
     logging.basicConfig(
         level=logging.INFO if args.verbose else logging.WARNING, format="%(message)s"
     )
+    # what is compiled, and for how long, is said to everyone
+    logging.getLogger("miricigale.utils.compilation").setLevel(logging.INFO)
     if args.version:
         from miricigale import __version__
 
@@ -309,6 +331,7 @@ def main(argv=None):
         "fit": _fit,
         "photometry": _photometry,
         "plan": _plan,
+        "compile": _compile,
         "filters": _filters,
         "data": _data,
     }

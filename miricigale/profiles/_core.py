@@ -16,7 +16,8 @@ evaluation with the analytic Laplacian, or Gauss-Legendre points, suffice.
 import math
 
 import numpy as np
-from numba import njit
+
+from miricigale.utils.compilation import njit
 
 #: Columns of a parameter row.
 PARAMETERS = (

@@ -2,9 +2,10 @@
 
 import math
 
-import numba
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
+
+from miricigale.utils.compilation import njit
 
 __all__ = [
     "box_transfer",
@@ -19,7 +20,7 @@ __all__ = [
 ]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def polygon_coverage(vertices, n, step, rows):
     """
     Fraction of each cell of a centred square grid that lies inside a polygon.
@@ -266,7 +267,7 @@ def line_scatter(image, kernel, axis):
     return np.ascontiguousarray(np.moveaxis(result, -1, axis))
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _overlap(dx, dy, radius, parts):
     """Part of the unit square around (dx, dy) inside a circle around 0."""
     if radius >= 12.0:
@@ -282,7 +283,7 @@ def _overlap(dx, dy, radius, parts):
     return area / parts
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _sorted_sums(image, x_center, y_center, radii):
     """`radial_sums` for radii in ascending order."""
     m = radii.size

@@ -16,9 +16,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from miricigale.profiles._core import cell
+from miricigale.utils.compilation import njit
 
 #: Small cells per node and axis near the cusp.
 SUB = 4

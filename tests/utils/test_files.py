@@ -222,7 +222,5 @@ def test_units_of_images(text):
     ],
 )
 def test_images_without_a_unit_are_named_with_what_is_accepted(cards, got):
-    with pytest.raises(
-        DataError, match=rf"a\.fits must state .* BUNIT, .* MJy / sr, got ({got})"
-    ):
+    with pytest.raises(DataError, match=rf"a\.fits must state .* BUNIT, .* MJy / sr, got ({got})"):
         image_unit(fits.Header(cards), "a.fits", like="MJy/sr")

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from miricigale.detector._core.random import (
     PTRS_FROM,
@@ -19,6 +18,7 @@ from miricigale.detector._core.random import (
     uniform,
     unit,
 )
+from miricigale.utils.compilation import njit
 
 __all__ = ["add_cosmic_rays", "add_latent", "add_poisson", "couple_neighbours"]
 

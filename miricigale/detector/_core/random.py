@@ -10,7 +10,9 @@ splitmix64 as they advise. Ziggurat: Marsaglia & Tsang 2000, J. Stat. Softw. 5, 
 import math
 
 import numpy as np
-from numba import njit, uint64
+from numba import uint64
+
+from miricigale.utils.compilation import njit
 
 __all__ = [
     "PTRS_FROM",

@@ -3,9 +3,10 @@
 import math
 
 import numpy as np
-from numba import njit, uint64
+from numba import uint64
 
 from miricigale.detector._core.random import fill_normals, mix, seed_stream
+from miricigale.utils.compilation import njit
 
 __all__ = [
     "add_noise",

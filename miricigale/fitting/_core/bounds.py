@@ -14,9 +14,9 @@ single precision can amount to.
 """
 
 import numpy as np
-from numba import njit
 
 from miricigale.fitting._core.options import ONCE
+from miricigale.utils.compilation import njit
 
 __all__ = [
     "BLOCK",

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from miricigale.fitting._core.histogram import (
     HALF_BINS,
@@ -17,6 +16,7 @@ from miricigale.fitting._core.lanes import LANES, PRIOR, W0, X2, A, B, P, Q, lan
 from miricigale.fitting._core.light import pair_weight
 from miricigale.fitting._core.options import EXACT, INNER, ONCE
 from miricigale.fitting._core.products import best_mixture
+from miricigale.utils.compilation import njit
 
 __all__ = [
     "PARTS",

@@ -9,7 +9,6 @@ redshift are kept apart, and model fluxes are summed up when a redshift is finis
 import math
 
 import numpy as np
-from numba import njit
 
 from miricigale.fitting._core.bounds import BLOCK, DONE, KEY_BITS
 from miricigale.fitting._core.collect import add_points, deposit_lanes, draw_lanes, find_best
@@ -39,6 +38,7 @@ from miricigale.fitting._core.totals import (
     finish_redshift,
 )
 from miricigale.fitting._core.workspace import rescale
+from miricigale.utils.compilation import njit
 
 __all__ = ["evaluate_runs"]
 

@@ -3,10 +3,10 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from miricigale.fitting._core.bounds import BLOCK, DONE, KEY_BITS
 from miricigale.fitting._core.options import INNER, ONCE
+from miricigale.utils.compilation import njit
 
 __all__ = ["N_LEVELS", "first_floor", "raise_bounds", "second_floor"]
 

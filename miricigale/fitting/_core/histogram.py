@@ -9,9 +9,9 @@ model is spread evenly over its cell.
 import math
 
 import numpy as np
-from numba import njit
 
 from miricigale.fitting._core.options import ENTRY, EXACT, EXACT_ENTRY, INNER
+from miricigale.utils.compilation import njit
 
 __all__ = [
     "HALF_BINS",

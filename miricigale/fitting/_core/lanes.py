@@ -8,11 +8,11 @@ negative the best scale that is not negative is 0 and R = 0.
 """
 
 import numpy as np
-from numba import njit
 
 from miricigale.fitting._core.limits import limited_scale
 from miricigale.fitting._core.options import INNER, ONCE
 from miricigale.fitting._core.structs import NO_LIGHT
+from miricigale.utils.compilation import njit
 
 __all__ = [
     "LANES",

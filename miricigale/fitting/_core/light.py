@@ -12,7 +12,6 @@ rounding changes a weight by some 1e-7.
 """
 
 import numpy as np
-from numba import njit
 
 from miricigale.fitting._core.lanes import (
     F1,
@@ -39,6 +38,7 @@ from miricigale.fitting._core.lanes import (
 )
 from miricigale.fitting._core.options import INNER, ONCE
 from miricigale.fitting._core.structs import NO_LIGHT
+from miricigale.utils.compilation import njit
 
 __all__ = ["light_likelihoods", "light_size", "pair_weight"]
 

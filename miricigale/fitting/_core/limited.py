@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from miricigale.fitting._core.lanes import (
     F1,
@@ -39,6 +38,7 @@ from miricigale.fitting._core.limited_scales import (
 )
 from miricigale.fitting._core.options import INNER
 from miricigale.fitting._core.structs import NO_LIGHT
+from miricigale.utils.compilation import njit
 
 __all__ = ["limited_likelihoods"]
 

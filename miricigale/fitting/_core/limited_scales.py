@@ -9,7 +9,6 @@ part is of order 1, and rounding changes a weight by some 1e-6.
 """
 
 import numpy as np
-from numba import njit
 
 from miricigale.fitting._core.lanes import (
     LANES,
@@ -24,6 +23,7 @@ from miricigale.fitting._core.lanes import (
 )
 from miricigale.fitting._core.options import INNER
 from miricigale.fitting._core.structs import NO_LIGHT
+from miricigale.utils.compilation import njit
 
 __all__ = [
     "CHI2",

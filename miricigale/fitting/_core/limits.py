@@ -10,9 +10,8 @@ scale that detections alone would have, comes down to the minimum from one side.
 
 import math
 
-from numba import njit
-
 from miricigale.fitting._core.options import EXACT
+from miricigale.utils.compilation import njit
 
 __all__ = ["limit_term", "limited_scale"]
 

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from miricigale.fitting._core.evaluate import evaluate_runs
 from miricigale.fitting._core.floors import first_floor, raise_bounds, second_floor
@@ -12,6 +11,7 @@ from miricigale.fitting._core.search import begin, list_runs
 from miricigale.fitting._core.singles import evaluate_singles
 from miricigale.fitting._core.summary import variances
 from miricigale.fitting._core.workspace import rescale
+from miricigale.utils.compilation import njit
 
 __all__ = ["sum_up"]
 

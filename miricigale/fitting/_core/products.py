@@ -1,10 +1,9 @@
 """Products of models and data, in double precision: <m, wF>, <m, wm> and what follows."""
 
-from numba import njit
-
 from miricigale.fitting._core.bounds import BLOCK
 from miricigale.fitting._core.limits import limited_scale
 from miricigale.fitting._core.options import INNER, ONCE
+from miricigale.utils.compilation import njit
 
 __all__ = [
     "agn_products",

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from miricigale.fitting._core.bounds import (
     BLOCK,
@@ -15,6 +14,7 @@ from miricigale.fitting._core.bounds import (
 )
 from miricigale.fitting._core.options import INNER
 from miricigale.fitting._core.products import agn_products, row_best
+from miricigale.utils.compilation import njit
 
 __all__ = ["begin", "list_runs"]
 

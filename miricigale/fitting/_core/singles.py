@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from miricigale.fitting._core.bounds import BLOCK
 from miricigale.fitting._core.collect import PARTS, deposit_single, note_best, take_draw
@@ -12,6 +11,7 @@ from miricigale.fitting._core.options import INNER
 from miricigale.fitting._core.products import galaxy_products
 from miricigale.fitting._core.structs import NO_LIGHT
 from miricigale.fitting._core.totals import finish_redshift
+from miricigale.utils.compilation import njit
 
 __all__ = ["evaluate_singles"]
 

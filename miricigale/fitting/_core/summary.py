@@ -1,10 +1,10 @@
 """Moments and quantiles of derived quantities, from the sums over all models."""
 
 import numpy as np
-from numba import njit
 
 from miricigale.fitting._core.histogram import N_BINS, add_scaled, log_summary, share_quantiles
 from miricigale.fitting._core.options import ENTRY, EXACT, EXACT_ENTRY
+from miricigale.utils.compilation import njit
 
 __all__ = ["summarise", "variances"]
 

@@ -1,7 +1,5 @@
 """What the pairs in the lanes add to the sums over all models."""
 
-from numba import njit
-
 from miricigale.fitting._core.bounds import BLOCK
 from miricigale.fitting._core.lanes import (
     DUST,
@@ -20,6 +18,7 @@ from miricigale.fitting._core.lanes import (
 )
 from miricigale.fitting._core.light import pair_weight
 from miricigale.fitting._core.options import INNER, ONCE
+from miricigale.utils.compilation import njit
 
 __all__ = ["add_all", "add_block", "add_gathered", "add_joint", "finish_redshift"]
 

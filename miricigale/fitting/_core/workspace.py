@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from miricigale.fitting._core.bounds import BLOCK
 from miricigale.fitting._core.floors import N_LEVELS
@@ -13,6 +12,7 @@ from miricigale.fitting._core.light import light_size
 from miricigale.fitting._core.limited_scales import LIMITED_SIZE
 from miricigale.fitting._core.options import EXACT
 from miricigale.fitting._core.structs import Draws, Histograms, Lanes, Scratch, Sums
+from miricigale.utils.compilation import njit
 
 __all__ = ["JOINT", "clear", "make_scratch", "make_sums", "rescale"]
 

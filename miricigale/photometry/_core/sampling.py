@@ -2,7 +2,8 @@
 
 import numpy as np
 import scipy.fft
-from numba import njit
+
+from miricigale.utils.compilation import njit
 
 __all__ = ["box_response", "convolve_batch", "sample_stamps", "spline_response"]
 

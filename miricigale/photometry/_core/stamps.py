@@ -1,7 +1,8 @@
 """Sums over stamps: overlaps, products, projections, models and what is left of them."""
 
 import numpy as np
-from numba import njit
+
+from miricigale.utils.compilation import njit
 
 from miricigale.photometry._core.sampling import convolve_batch
 

@@ -1,7 +1,8 @@
 """One pixel at a time: segments between jumps, saturation, and pixels fitted again."""
 
 import numpy as np
-from numba import njit
+
+from miricigale.utils.compilation import njit
 
 __all__ = [
     "FULLY_SATURATED",

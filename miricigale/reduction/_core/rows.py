@@ -1,9 +1,9 @@
 """Whole rows of pixels without saturation or jumps, many at once; the others one by one."""
 
 import numpy as np
-from numba import njit
 
 from miricigale.reduction._core.pixel import X_MIN, fit_pixel, gather, linear, store
+from miricigale.utils.compilation import njit
 
 __all__ = ["BLOCK", "fit_rows"]
 

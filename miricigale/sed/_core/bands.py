@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from miricigale.utils.compilation import njit
 
 __all__ = ["band_means", "band_tables"]
 

@@ -3,8 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 from scipy.sparse import csr_matrix
+
+from miricigale.utils.compilation import njit
 
 __all__ = [
     "YOUNG",

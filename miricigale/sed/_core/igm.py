@@ -11,7 +11,8 @@ import functools
 import math
 
 import numpy as np
-from numba import njit
+
+from miricigale.utils.compilation import njit
 
 __all__ = [
     "INOUE_LIMIT",

@@ -3,10 +3,10 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from miricigale.sed._core.attenuation import leitherer_calzetti
 from miricigale.sed._core.thermal import PLANCK_K
+from miricigale.utils.compilation import njit
 
 __all__ = ["DISK_MEAN", "POLAR_LAWS", "add_polar", "polar_curve", "polar_grid", "polar_share"]
 

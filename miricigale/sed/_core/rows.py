@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numba import njit
 
 from miricigale.sed._core.bands import band_means
+from miricigale.utils.compilation import njit
 
 __all__ = ["block_fluxes", "mix_light"]
 

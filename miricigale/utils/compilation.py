@@ -1,0 +1,91 @@
+"""
+How kernels are compiled: with a word to the user, and without a cache where none can be kept.
+
+numba compiles a kernel when it is first called and keeps the code on disk, in the folder
+``NUMBA_CACHE_DIR`` or else beside the source, so that this happens once for each installation.
+"""
+
+import gc
+import logging
+
+import numba
+from numba.core import event
+
+__all__ = ["njit"]
+
+log = logging.getLogger(__name__)
+
+#: What the kernels of a room do, and about how many seconds all of them take to compile.
+_ROOMS = {
+    "detector": ("the detector", 15),
+    "fitting": ("the fit", 30),
+    "photometry": ("photometry", 10),
+    "profiles": ("light profiles", 5),
+    "psf": ("PSFs", 10),
+    "reduction": ("the reduction", 10),
+    "scene": ("scenes", 15),
+    "sed": ("model spectra", 10),
+}
+
+
+class _Listener(event.Listener):
+    """Says what is compiled, once for each room; compiling is faster without garbage collection."""
+
+    def __init__(self):
+        self.told = set()
+        self.depth = 0
+        self.collect = False
+
+    # numba calls both with its compiler lock held
+    def on_start(self, event):
+        room = event.data["dispatcher"].py_func.__module__.split(".")[1:2]
+        if room and room[0] in _ROOMS and room[0] not in self.told:
+            self.told.add(room[0])
+            log.info("compiling %s, once for each installation, about %d s", *_ROOMS[room[0]])
+        if self.depth == 0:
+            self.collect = gc.isenabled()
+            gc.disable()
+        self.depth += 1
+
+    def on_end(self, event):
+        self.depth -= 1
+        if self.depth == 0 and self.collect:
+            gc.enable()
+
+
+event.register("numba:compile", _Listener())
+
+
+def njit(**options):
+    """
+    Compile a function as `numba.njit` does, without a cache where there is no place for it.
+
+    Parameters
+    ----------
+    **options
+        Those of `numba.njit`.
+
+    Returns
+    -------
+    decorator : callable
+    """
+
+    def decorate(function):
+        try:
+            return numba.njit(**options)(function)
+        except RuntimeError as err:
+            if "no locator available" not in str(err):
+                raise
+        if "cache" not in _warned:
+            _warned.add("cache")
+            log.warning(
+                "compiled kernels cannot be kept, as neither the package's folder nor the user's "
+                "cache can be written: they are compiled in every process; set NUMBA_CACHE_DIR to "
+                "a folder that can be written"
+            )
+        return numba.njit(**{**options, "cache": False})(function)
+
+    return decorate
+
+
+_warned = set()

@@ -1,0 +1,161 @@
+"""Compiling ahead: what is compiled, that it is enough, and what happens where it cannot be kept."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import miricigale
+from miricigale.workflow import warmup
+
+ROOT = Path(miricigale.__file__).parent.parent
+
+#: Every kernel of the package that has code, with its number of signatures and cache misses.
+KERNELS = """
+import sys
+from numba.core.dispatcher import Dispatcher
+def kernels(room):
+    found = {}
+    for name, module in list(sys.modules.items()):
+        if name.startswith(f"miricigale.{room}"):
+            for key, value in vars(module).items():
+                if isinstance(value, Dispatcher) and value.py_func.__module__ == name:
+                    misses = sum(value.stats.cache_misses.values())
+                    found[f"{name}.{key}"] = (len(value.signatures), misses)
+    return found
+"""
+FIT = """
+from miricigale.workflow import warmup
+warmup.compile_job("fit")
+"""
+REAL = """
+import astropy.units as u
+from astropy.table import QTable
+from miricigale.fitting import BayesFitter
+from miricigale.sed import SEDModel
+names = ["acs.f606w", "acs.f814w", "wfc3.f160w", "irac.ch2", "miri.f1000w", "mips.24"]
+table = QTable({"id": ["a", "b", "c"]})
+for k, name in enumerate(names):
+    table[name] = [1.0 + k, 2.0, 0.1] * u.uJy
+    table[f"{name}_err"] = [0.1, 0.2, 0.3] * u.uJy
+fitter = BayesFitter(SEDModel.yang2021(), names, axes=SEDModel.yang2021_axes("quick"))
+fitter.fit(table)
+"""
+
+
+def python(code, cache, **env):
+    """Run code in a process of its own with a cache of its own."""
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(cache), **env}
+    done = subprocess.run(
+        [sys.executable, "-W", "error::RuntimeWarning", "-c", KERNELS + code],
+        cwd=cache, env=env, capture_output=True, text=True, timeout=900, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    """A cache in which the job of the fit has run."""
+    folder = tmp_path_factory.mktemp("numba")
+    python(FIT, folder)
+    return folder
+
+
+@pytest.mark.slow
+def test_a_fit_after_its_job_compiles_nothing(cache):
+    """No kernel of the fit is compiled anew, none for two signatures, none of the limits at all."""
+    out = python(REAL + "print(kernels('fitting'))", cache)
+    found = eval(out.splitlines()[-1])
+    assert {name for name, (_, misses) in found.items() if misses} == set()
+    assert {name for name, (n, _) in found.items() if n > 1} == set()
+    assert found["miricigale.fitting._core.posterior.sum_up"][0] == 1
+    of_limits = [name for name in found if "_core.limit" in name]
+    assert len(of_limits) > 5
+    assert [name for name in of_limits if found[name][0]] == []
+
+
+@pytest.mark.slow
+def test_what_is_compiled_is_known(cache, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
+    assert warmup.is_compiled("fit")
+    assert not warmup.is_compiled("photometry")
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("a process was started"))
+    said = []
+    with warmup.compile_in_background(["fit"]) as handle:
+        handle.wait("fit", tell=said.append)
+    assert said == []
+
+
+def test_a_failing_process_breaks_nothing(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    said = []
+    with warmup.compile_in_background(["sed", "fit"], n_processes=1) as handle:
+        handle.wait("fit", tell=said.append)
+        handle.wait("photometry", tell=said.append)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "absent"))
+    with warmup.compile_in_background(["sed"]) as handle:
+        handle.wait("sed")
+    assert not warmup.is_compiled("sed")
+    assert all("once for each installation" in text for text in said)
+
+
+def test_unknown_jobs_are_refused():
+    with pytest.raises(ValueError, match="'jobs' must be"):
+        warmup.compile_in_background(["fits"])
+    with pytest.raises(ValueError, match="'n_processes' must be"):
+        warmup.compile_in_background(n_processes=0)
+
+
+def _alive(pid):
+    try:
+        return "Z" not in Path(f"/proc/{pid}/stat").read_text().split(")")[1].split()[0]
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_children_end_with_their_parent(tmp_path, how):
+    code = (
+        "import sys, time\n"
+        "from miricigale.workflow.warmup import compile_in_background\n"
+        "handle = compile_in_background(['images'])\n"
+        "while not handle._children: time.sleep(0.05)\n"
+        "print(next(iter(handle._children)).pid, flush=True)\n"
+        "time.sleep(600)\n"
+    )
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path)}
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code], env=env, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    )
+    child = int(parent.stdout.readline())
+    parent.send_signal(how)
+    parent.wait(timeout=60)
+    parent.stdout.close()
+    for _ in range(600):
+        if not _alive(child):
+            break
+        time.sleep(0.1)
+    assert not _alive(child)
+
+
+def test_kernels_run_where_nothing_can_be_kept(tmp_path):
+    """With no folder for the cache there is one warning, which names the variable."""
+    code = (
+        "import logging, numba.core.caching as caching\n"
+        "caching.CacheImpl._locator_classes = []\n"
+        "caching.CompileResultCacheImpl._locator_classes = []\n"
+        "logging.basicConfig(stream=sys.stdout)\n"
+        "from miricigale.photometry import _core\n"
+        "from miricigale.psf import _core as psf\n"
+        "import numpy as np\n"
+        "print(psf.polygon_coverage.__name__)\n"
+    )
+    out = python(code, tmp_path)
+    assert out.count("NUMBA_CACHE_DIR") == 1
