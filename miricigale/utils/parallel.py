@@ -2,8 +2,6 @@
 
 import contextlib
 import functools
-import importlib
-import importlib.util
 import logging
 import multiprocessing
 import os
@@ -14,6 +12,8 @@ import threading
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+
+import threadpoolctl
 
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.progress import progress
@@ -224,15 +224,13 @@ def thread_count(n_threads=None):
 
 def single_threaded():
     """
-    Context in which linear algebra runs on one core, if threadpoolctl is installed.
+    Context in which linear algebra runs on one core.
 
     Sums that are cut into other pieces differ in the last digit, and samplers would then go
     other ways. On many small matrices the threads of the linear algebra moreover wait for each
     other longer than they work.
     """
-    if importlib.util.find_spec("threadpoolctl") is None:
-        return contextlib.nullcontext()
-    return importlib.import_module("threadpoolctl").threadpool_limits(1)
+    return threadpoolctl.threadpool_limits(1)
 
 
 def chunks(n, size):

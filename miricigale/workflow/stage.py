@@ -5,6 +5,7 @@ import time
 import types
 from collections.abc import Callable
 
+from miricigale.utils.parallel import single_threaded
 from miricigale.workflow.products import read_image, write_image
 from miricigale.workflow.store import ProductFolder
 
@@ -176,7 +177,9 @@ def run_unit(config, folder, stages, name, unit, *, n_threads=1, progress_bar=Fa
     context = Context(config, folder, stage=stage, n_threads=n_threads, progress_bar=progress_bar)
     begin = time.perf_counter()
     try:
-        stage.function(context, unit)
+        # the same last digits on any number of cores
+        with single_threaded():
+            stage.function(context, unit)
     except (ValueError, KeyError, OSError) as err:
         err.add_note(f"in stage {stage.key(unit)}")
         raise
