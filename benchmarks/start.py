@@ -54,19 +54,9 @@ def main():
     if options.compile:
         with tempfile.TemporaryDirectory() as folder:
             for name in ("sed", "fit", "images", "photometry"):
-                run = ["-m", "miricigale.workflow.warmup", name]
-                first, second = (cpu_of_job(run, folder) for _ in range(2))
+                code = f"from miricigale.workflow.warmup import compile_job; compile_job({name!r})"
+                first, second = (cpu(["-c", code], NUMBA_CACHE_DIR=folder) for _ in range(2))
                 print(f"{first:7.2f}  compile {name}; from the cache {second:.2f}")
-
-
-def cpu_of_job(run, folder):
-    """As `cpu`, with a pipe that stays open: the job ends when it is closed."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    env = {**os.environ, "NUMBA_CACHE_DIR": folder}
-    with subprocess.Popen([sys.executable, *run], stdin=subprocess.PIPE, env=env) as child:
-        child.wait()
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 if __name__ == "__main__":

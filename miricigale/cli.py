@@ -200,18 +200,21 @@ def _plan(args):
 
 
 def _compile(args):
-    from miricigale.workflow.warmup import JOBS, compile_in_background, is_compiled
+    from miricigale.utils.parallel import process_pool, thread_count
+    from miricigale.workflow.warmup import JOBS, compile_job, describe_job, is_compiled
 
-    with compile_in_background() as handle:
-        try:
-            for name in JOBS:
-                handle.wait(name, tell=lambda text: print(text, flush=True))
-        except KeyboardInterrupt:
-            print("stopped; the same command goes on from here", file=sys.stderr)
-            return 130
-    failed = [name for name in JOBS if not is_compiled(name)]
-    if failed:
-        print(f"miricigale: not kept on disk: {', '.join(failed)}", file=sys.stderr)
+    names = [name for name in JOBS if not is_compiled(name)]
+    try:
+        with process_pool(min(thread_count(), max(1, len(names)))) as executor:
+            jobs = [executor.submit(compile_job, name) for name in names]
+            for name in names:
+                print(describe_job(name), flush=True)
+            kept = [job.result() for job in jobs]
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on from here", file=sys.stderr)
+        return 130
+    if not all(kept):
+        print("miricigale: compiled code cannot be kept; set NUMBA_CACHE_DIR", file=sys.stderr)
         return 1
     print("all kernels are compiled")
     return 0

@@ -4,7 +4,7 @@ import datetime
 import functools
 import importlib.metadata
 
-__all__ = ["provenance"]
+__all__ = ["provenance", "undated"]
 
 
 @functools.cache
@@ -37,3 +37,24 @@ def provenance(*, citations=(), **values):
         meta["citations"] = sorted(set(citations))
     meta.update({key: value for key, value in values.items() if value is not None})
     return meta
+
+
+def undated(meta):
+    """
+    Copy of a meta dictionary without dates, at any depth.
+
+    Parameters
+    ----------
+    meta : dict
+        Such as `provenance` makes.
+
+    Returns
+    -------
+    meta : dict
+        For files that are to be the same bytes for the same content.
+    """
+    return {
+        key: undated(value) if isinstance(value, dict) else value
+        for key, value in meta.items()
+        if key != "created"
+    }

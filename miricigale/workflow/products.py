@@ -8,6 +8,7 @@ from astropy.io import fits
 
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import image_unit, open_fits, write_fits
+from miricigale.utils.meta import undated
 
 __all__ = ["read_image", "write_image"]
 
@@ -39,8 +40,7 @@ def write_image(image, path, *, planes=None):
     """
     header = image.wcs.to_header(relax=True) if image.wcs is not None else fits.Header()
     header["BUNIT"] = image.unit.to_string("fits")
-    meta = {key: value for key, value in image.meta.items() if key != "created"}
-    header["META"] = json.dumps(meta, default=_plain, allow_nan=True)
+    header["META"] = json.dumps(undated(image.meta), default=_plain, allow_nan=True)
     hdus = [
         fits.PrimaryHDU(),
         fits.ImageHDU(np.asarray(image.data, np.float32), header, name="SCI"),

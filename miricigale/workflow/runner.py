@@ -6,7 +6,6 @@ import json
 import logging
 import os
 import shutil
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from pathlib import Path
 
 from miricigale.refdata.locate import file_sha256, fingerprint
@@ -14,8 +13,10 @@ from miricigale.utils.exceptions import ConfigError, DataError, OtherResultsErro
 from miricigale.utils.parallel import available_memory, thread_count
 from miricigale.utils.progress import on_terminal, print_line, progress
 from miricigale.workflow.config import load_config
+from miricigale.workflow.schedule import Task, run_tasks
 from miricigale.workflow.stage import run_unit
 from miricigale.workflow.store import CONFIG, ProductStore
+from miricigale.workflow.warmup import JOBS, compile_job, describe_job, is_compiled
 
 __all__ = ["StudyRunner", "run_stages"]
 
@@ -24,18 +25,6 @@ log = logging.getLogger(__name__)
 #: Bytes that a unit takes whose stage does not say how many.
 _MEMORY = 500_000_000
 _REMEDY = "redo=True to replace it"
-
-
-class _Inline(Executor):
-    """Calls at once, in this thread."""
-
-    def submit(self, function, *args, **kwargs):
-        future = Future()
-        try:
-            future.set_result(function(*args, **kwargs))
-        except Exception as err:
-            future.set_exception(err)
-        return future
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,7 +194,7 @@ class StudyRunner:
             for key, state in states.items():
                 if state == "surplus":
                     store.drop(key)
-            self._execute(store)
+            self._execute(store, states)
         return store
 
     def _values(self):
@@ -268,95 +257,107 @@ class StudyRunner:
         if self.progress_bar:
             print_line(text)
 
-    def _execute(self, store):
+    def _execute(self, store, states):
         """Do all units, each when what it needs is done."""
-        executor = self.executor or _Inline()
+        with _Display(self.progress_bar, len(self.jobs)) as display:
+            begun = {job.stage for job in self.jobs if states[job.key] != "current"}
+            kernels = dict.fromkeys(name for stage in begun for name in stage.kernels)
+            if self.executor is None:
+                # numba compiles one kernel at a time in a process: nothing is won
+                kernels = {}
+            run_tasks(
+                [
+                    *(_compilation(name, display) for name in JOBS if name in kernels),
+                    *(self._task(job, store, display) for job in self.jobs),
+                ],
+                executor=self.executor,
+                n_threads=self.n_threads,
+                memory=self.config.run.memory * 1e9 or 0.5 * available_memory(),
+                tell=display.begin,
+            )
+
+    def _task(self, job, store, display):
+        stage = job.stage
         inline = self.executor is None
-        lines = self.progress_bar and not on_terminal()
-        waiting, running, error = list(self.jobs), {}, None
-        spent = {}
-        show = self.progress_bar and not lines
-        with progress(total=len(self.jobs), show=show, desc="study", unit="step") as bar:
+        digest = None
 
-            def done(job, seconds):
-                bar.update()
-                spent.setdefault(job.stage.name, []).append(seconds)
-                units = spent[job.stage.name]
-                if lines and len(units) == len(job.stage.unit_names(self.config)) and sum(units):
-                    n = f" ({len(units)})" if len(units) > 1 else ""
-                    print_line(f"{job.stage.title}{n}: {sum(units):.1f} s")
+        def begin(submit, n_threads):
+            nonlocal digest
+            digest = self.digest(stage, job.unit, store)
+            if store.is_current(job.key, digest):
+                display.finish(stage, self.config, 0.0)
+                return None
+            if store.records.get(job.key, {}).get("hash") != digest:
+                store.drop(job.key)
+            return submit(
+                run_unit,
+                self.config,
+                self.folder,
+                self._source,
+                stage.name,
+                job.unit,
+                n_threads=n_threads,
+                progress_bar=display.is_bar and inline,
+            )
 
-            while waiting or running:
-                job = None if error else self._next(waiting, running, inline=inline)
-                if job is not None:
-                    waiting.remove(job)
-                    digest = self.digest(job.stage, job.unit, store)
-                    if store.is_current(job.key, digest):
-                        done(job, 0.0)
-                        continue
-                    if store.records.get(job.key, {}).get("hash") != digest:
-                        store.drop(job.key)
-                    running_titles = [job.title, *(other.title for other, _ in running.values())]
-                    bar.set_description(", ".join(running_titles[::-1]))
-                    future = executor.submit(
-                        run_unit,
-                        self.config,
-                        self.folder,
-                        self._source,
-                        job.stage.name,
-                        job.unit,
-                        n_threads=self._share(waiting, running),
-                        progress_bar=show and inline,
-                    )
-                    running[future] = job, digest
-                elif not running:
-                    break
-                for future in (
-                    wait(running, return_when=FIRST_COMPLETED)[0] if (job is None or inline) else ()
-                ):
-                    job, digest = running.pop(future)
-                    try:
-                        products, seconds = future.result()
-                    except BrokenExecutor as err:
-                        msg = f"a process ended while it did {job.title}; was the memory too small?"
-                        raise DataError(msg) from err
-                    except Exception as err:
-                        # what runs beside it is finished and kept
-                        error = error or err
-                        continue
-                    store.finish(job.key, digest, products, seconds=seconds)
-                    log.debug("%s took %.1f s", job.key, seconds)
-                    done(job, seconds)
-        if error:
-            raise error
+        def finish(result):
+            products, seconds = result
+            store.finish(job.key, digest, products, seconds=seconds)
+            log.debug("%s took %.1f s", job.key, seconds)
+            display.finish(stage, self.config, seconds)
 
-    def _ready(self, waiting, running):
-        """Units whose inputs stand."""
-        unfinished = {job.stage.name for job in waiting}
-        unfinished |= {job.stage.name for job, _ in running.values()}
-        return [job for job in waiting if not unfinished.intersection(job.stage.needs)]
-
-    def _next(self, waiting, running, *, inline):
-        """The next unit to begin, if one can."""
-        if len(running) >= (1 if inline else self.n_threads):
-            return None
-        memory = (self.config.run.memory * 1e9 or 0.5 * available_memory()) - sum(
-            self._memory(job) for job, _ in running.values()
+        return Task(
+            stage.name,
+            job.title,
+            begin,
+            finish,
+            needs=frozenset((*stage.needs, *(f"compile {name}" for name in stage.kernels))),
+            memory=stage.memory(self.config, job.unit) if stage.memory else _MEMORY,
         )
-        for job in self._ready(waiting, running):
-            if not running or self._memory(job) <= memory:
-                return job
-        return None
 
-    def _memory(self, job):
-        return job.stage.memory(self.config, job.unit) if job.stage.memory else _MEMORY
 
-    def _share(self, waiting, running):
-        """Threads of a unit that begins now."""
-        if self.executor is None:
-            return self.n_threads
-        together = len(running) + 1 + len(self._ready(waiting, running))
-        return max(1, self.n_threads // min(self.n_threads, together))
+def _compilation(name, display):
+    """Compile what is not compiled yet; a failure only means that it is done where it is called."""
+
+    def begin(submit, _):
+        if is_compiled(name):
+            return None
+        display.line(describe_job(name))
+        return submit(compile_job, name)
+
+    return Task(f"compile {name}", "compilation", begin, memory=_MEMORY, is_optional=True)
+
+
+class _Display:
+    """A bar on a terminal, otherwise a line for each stage, or nothing."""
+
+    def __init__(self, show, total):
+        self.is_bar = show and on_terminal()
+        self._lines = show and not self.is_bar
+        self._bar = progress(total=total, show=self.is_bar, desc="study", unit="step")
+        self._spent = {}
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        self._bar.close()
+
+    def line(self, text):
+        if self._lines or self.is_bar:
+            print_line(text)
+
+    def begin(self, titles):
+        self._bar.set_description(", ".join(titles))
+
+    def finish(self, stage, config, seconds):
+        """A unit of a stage is done."""
+        self._bar.update()
+        spent = self._spent.setdefault(stage.name, [])
+        spent.append(seconds)
+        if self._lines and len(spent) == len(stage.unit_names(config)) and any(spent):
+            units = f" ({len(spent)})" if len(spent) > 1 else ""
+            print_line(f"{stage.title}{units}: {sum(spent):.1f} s")
 
 
 def _summary(keys):

@@ -5,6 +5,7 @@ import time
 import types
 from collections.abc import Callable
 
+from miricigale.utils.meta import undated
 from miricigale.utils.parallel import single_threaded
 from miricigale.workflow.products import read_image, write_image
 from miricigale.workflow.store import ProductFolder
@@ -135,10 +136,14 @@ class Context:
 
     def save_table(self, name, table):
         """Write a table as ECSV or FITS by the suffix of ``name``."""
-        table = table.copy(copy_data=False)
-        # the manifest says when; the same run gives the same bytes
-        table.meta.pop("created", None)
-        return self.save(name, lambda path: table.write(path, overwrite=True))
+        return self.save_result(name, table.copy(copy_data=False))
+
+    def save_result(self, name, result):
+        """Write a result by its own method, without dates: the manifest says when."""
+        meta = undated(result.meta)
+        result.meta.clear()
+        result.meta.update(meta)
+        return self.save(name, lambda path: result.write(path, overwrite=True))
 
     def save_image(self, name, image, **planes):
         """Write an image and further planes."""

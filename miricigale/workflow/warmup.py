@@ -1,5 +1,5 @@
 """
-Compile the kernels of a run side by side, in processes of their own, before they are needed.
+Compile the kernels of a run before they are needed, side by side in several processes.
 
 Each job calls the classes that a run calls, on next to nothing, so that numba compiles what the run
 will need and keeps it on disk; the run then only loads it. What is compiled already is known from
@@ -12,16 +12,12 @@ import importlib.metadata
 import logging
 import os
 import platform
-import queue
-import signal
-import subprocess
 import sys
-import threading
 from pathlib import Path
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["JOBS", "CompileHandle", "compile_in_background", "compile_job", "is_compiled"]
+__all__ = ["JOBS", "compile_job", "describe_job", "is_compiled"]
 
 log = logging.getLogger(__name__)
 
@@ -186,12 +182,16 @@ JOBS = {
 }
 
 
-def _check(names):
-    names = tuple(JOBS) if names is None else tuple(names)
-    unknown = [name for name in names if name not in JOBS]
-    if unknown:
-        raise argument_error("jobs", f"of {', '.join(JOBS)}", unknown)
-    return names
+def _check(name):
+    if name not in JOBS:
+        raise argument_error("name", f"one of {', '.join(JOBS)}", repr(name))
+    return name
+
+
+def describe_job(name):
+    """One line that says what is compiled, and for how long."""
+    _, what, seconds = JOBS[_check(name)]
+    return f"compiling {what}, once for each installation, up to {seconds} s"
 
 
 def compile_job(name):
@@ -202,19 +202,31 @@ def compile_job(name):
     ----------
     name : str
         One of `JOBS`.
+
+    Returns
+    -------
+    is_kept : bool
+        Whether that could be noted; if not, kernels are compiled in every process.
+
+    Raises
+    ------
+    ValueError
+        If there is no such job.
     """
-    JOBS[_check([name])[0]][0]()
+    JOBS[_check(name)][0]()
     path = _marker(name)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     except OSError:
         log.debug("%s cannot be written", path)
+        return False
+    return True
 
 
 def is_compiled(name):
     """Whether the kernels of a job were compiled by this installation, on this machine."""
-    return _marker(_check([name])[0]).is_file()
+    return _marker(_check(name)).is_file()
 
 
 def _marker(name):
@@ -250,145 +262,3 @@ def _processor():
         return f"{platform.machine()} {platform.processor()}"
     wanted = ("model name", "flags", "Features", "CPU part")
     return "\n".join(dict.fromkeys(line for line in lines if line.startswith(wanted)))
-
-
-class CompileHandle:
-    """
-    Jobs that compile in the background; made by `compile_in_background`.
-
-    Parameters
-    ----------
-    names : tuple of str
-        The jobs, in the order in which they begin.
-    n_processes : int
-        How many run at a time.
-    """
-
-    def __init__(self, names, n_processes):
-        self._done = {name: threading.Event() for name in names}
-        self._lock = threading.Lock()
-        self._children = set()
-        self._closed = False
-        self._queue = queue.SimpleQueue()
-        for name in names:
-            self._queue.put(name)
-        for _ in range(min(n_processes, len(names))):
-            threading.Thread(target=self._work, daemon=True).start()
-
-    def _work(self):
-        """Run jobs one after the other."""
-        while True:
-            try:
-                name = self._queue.get_nowait()
-            except queue.Empty:
-                return
-            try:
-                self._run(name)
-            except OSError as err:
-                log.debug("%s was not compiled in the background: %s", name, err)
-            finally:
-                self._done[name].set()
-
-    def _run(self, name):
-        with self._lock:
-            if self._closed:
-                return
-            # with a group of its own it does not hear of Ctrl-C; it ends when the pipe is closed
-            child = subprocess.Popen(
-                [sys.executable, "-m", __name__, name],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                start_new_session=True,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-            )
-            self._children.add(child)
-        status = child.wait()
-        with self._lock:
-            self._children.discard(child)
-        child.stdin.close()
-        log.debug("compiling %s in the background ended with status %d", name, status)
-
-    def wait(self, name, tell=None):
-        """
-        Wait until a job has ended; at once where there is nothing to wait for.
-
-        A job that failed is no error: its kernels are compiled when they are called.
-
-        Parameters
-        ----------
-        name : str
-            One of `JOBS`.
-        tell : callable, optional
-            Called with a sentence before waiting.
-        """
-        event = self._done.get(_check([name])[0])
-        if event is None or event.is_set():
-            return
-        if tell is not None:
-            _, what, seconds = JOBS[name]
-            tell(f"compiling {what}, once for each installation, up to {seconds} s")
-        event.wait()
-
-    def close(self):
-        """End what still runs."""
-        with self._lock:
-            self._closed = True
-            for child in self._children:
-                child.kill()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exc):
-        self.close()
-
-
-def compile_in_background(jobs=None, *, n_processes=None):
-    """
-    Begin to compile, in processes beside this one, what is not compiled yet.
-
-    Where all is compiled already no process is started and nothing heavy imported. The processes
-    end with this one, however it ends.
-
-    Parameters
-    ----------
-    jobs : iterable of str, optional
-        Names of `JOBS`, first what is needed first; all if not given.
-    n_processes : int, optional
-        How many run at a time; as many as there are cores if not given.
-
-    Returns
-    -------
-    handle : `CompileHandle`
-        To wait for jobs, and to be closed.
-
-    Raises
-    ------
-    ValueError
-        If there is no such job, or ``n_processes`` is not positive.
-    """
-    names = _check(jobs)
-    if n_processes is None:
-        n_processes = os.cpu_count() or 1
-    if n_processes < 1:
-        raise argument_error("n_processes", "at least 1", n_processes)
-    return CompileHandle(tuple(name for name in names if not is_compiled(name)), n_processes)
-
-
-def _end_with_parent():
-    """End this process when the pipe from the one that started it is closed."""
-    sys.stdin.buffer.read()
-    os._exit(1)
-
-
-def _main():
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    compile_job(sys.argv[1])
-    # not through the end of the interpreter: the other thread holds stdin
-    os._exit(0)
-
-
-if __name__ == "__main__":
-    _main()

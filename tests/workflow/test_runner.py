@@ -7,6 +7,7 @@ import pytest
 
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarning, OtherResultsError
+from miricigale.workflow import runner
 from miricigale.workflow.config import StudyConfig, load_config
 from miricigale.workflow.runner import StudyRunner, check_disk
 from miricigale.workflow.stage import Stage
@@ -316,3 +317,40 @@ def test_what_runs_beside_a_unit_that_fails_is_kept(tmp_path):
         StudyRunner(config, tmp_path / "run", [stage], executor=executor).run()
     assert "in stage one:bad" in err.value.__notes__
     assert set(ProductStore(tmp_path / "run").records) == {"one:good"}
+
+
+def test_kernels_are_compiled_before_what_calls_them(tmp_path, monkeypatch):
+    order = []
+
+    def work(context, _):
+        order.append(context.stage_name)
+        context.save(f"{context.stage_name}.txt", lambda path: path.write_text("x"))
+
+    def compile_job(name):
+        threading.Event().wait(0.05)
+        order.append(f"compiled {name}")
+        if name == "photometry":
+            msg = "numba cannot"
+            raise ValueError(msg)
+
+    monkeypatch.setattr(runner, "compile_job", compile_job)
+    monkeypatch.setattr(runner, "is_compiled", lambda name: name == "images")
+
+    def stage(name, *kernels):
+        def function(context, unit):
+            context.stage_name = name
+            work(context, unit)
+
+        return Stage(name, function, name, kernels=kernels)
+
+    stages = (stage("a", "fit"), stage("b"), stage("c", "photometry"), stage("d", "images"))
+    config = StudyConfig.from_dict({"run": {"threads": 4}})
+    for expected in ({"a", "b", "c", "d", "compiled fit", "compiled photometry"}, set()):
+        with ThreadPoolExecutor(4) as executor:
+            StudyRunner(config, tmp_path / "run", stages, executor=executor).run()
+        assert set(order) == expected
+        if order:
+            assert order.index("compiled fit") < order.index("a")
+            # one that fails is compiled where it is called
+            assert order.index("compiled photometry") < order.index("c")
+        order.clear()

@@ -1,10 +1,8 @@
 """Compiling ahead: what is compiled, that it is enough, and what happens where it cannot be kept."""
 
 import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -84,65 +82,12 @@ def test_what_is_compiled_is_known(cache, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
     assert warmup.is_compiled("fit")
     assert not warmup.is_compiled("photometry")
-    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("a process was started"))
-    said = []
-    with warmup.compile_in_background(["fit"]) as handle:
-        handle.wait("fit", tell=said.append)
-    assert said == []
-
-
-def test_a_failing_process_breaks_nothing(tmp_path, monkeypatch):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(sys, "executable", "/bin/false")
-    said = []
-    with warmup.compile_in_background(["sed", "fit"], n_processes=1) as handle:
-        handle.wait("fit", tell=said.append)
-        handle.wait("photometry", tell=said.append)
-    monkeypatch.setattr(sys, "executable", str(tmp_path / "absent"))
-    with warmup.compile_in_background(["sed"]) as handle:
-        handle.wait("sed")
-    assert not warmup.is_compiled("sed")
-    assert all("once for each installation" in text for text in said)
 
 
 def test_unknown_jobs_are_refused():
-    with pytest.raises(ValueError, match="'jobs' must be"):
-        warmup.compile_in_background(["fits"])
-    with pytest.raises(ValueError, match="'n_processes' must be"):
-        warmup.compile_in_background(n_processes=0)
-
-
-def _alive(pid):
-    try:
-        return "Z" not in Path(f"/proc/{pid}/stat").read_text().split(")")[1].split()[0]
-    except OSError:
-        return False
-
-
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_children_end_with_their_parent(tmp_path, how):
-    code = (
-        "import sys, time\n"
-        "from miricigale.workflow.warmup import compile_in_background\n"
-        "handle = compile_in_background(['images'])\n"
-        "while not handle._children: time.sleep(0.05)\n"
-        "print(next(iter(handle._children)).pid, flush=True)\n"
-        "time.sleep(600)\n"
-    )
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path)}
-    parent = subprocess.Popen(
-        [sys.executable, "-c", code], env=env, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-    )
-    child = int(parent.stdout.readline())
-    parent.send_signal(how)
-    parent.wait(timeout=60)
-    parent.stdout.close()
-    for _ in range(600):
-        if not _alive(child):
-            break
-        time.sleep(0.1)
-    assert not _alive(child)
+    for function in (warmup.is_compiled, warmup.compile_job, warmup.describe_job):
+        with pytest.raises(ValueError, match="'name' must be one of sed, fit"):
+            function("fits")
 
 
 def test_kernels_run_where_nothing_can_be_kept(tmp_path):

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from miricigale.utils.compilation import njit
-
 from miricigale.photometry._core.sampling import convolve_batch
+from miricigale.utils.compilation import njit
 
 __all__ = [
     "add_model",

@@ -65,6 +65,7 @@ def study_stages():
             sections=("sed.axes", "sed.catalog_error", "sed.max_wavelength", "fit.model_error"),
             resources=sed_data,
             plan=lambda config, _: plain_axes(input_axes(config.sed.axes)),
+            kernels=("sed", "fit"),
         ),
         Stage(
             "truth",
@@ -80,6 +81,7 @@ def study_stages():
                 "highres.filter",
             ),
             resources=sed_data,
+            kernels=("sed",),
         ),
         Stage(
             "exposures",
@@ -91,6 +93,7 @@ def study_stages():
             resources=exposure_data,
             units=exposure_units,
             plan=exposure_plan,
+            kernels=("images",),
         ),
         Stage(
             "mosaics",
@@ -100,6 +103,7 @@ def study_stages():
             sections=(*grid, "reduction", "highres.pixel_scale"),
             units=_filters,
             plan=exposure_plan,
+            kernels=("images",),
         ),
         Stage(
             "highres",
@@ -110,6 +114,7 @@ def study_stages():
             sections=(*grid, "highres", "photometry.threshold", "photometry.min_area"),
             resources=("filters.sedpy",),
             plan=lambda config, _: exposure_plan(config),
+            kernels=("images",),
         ),
         Stage(
             "kernels",
@@ -119,6 +124,7 @@ def study_stages():
             resources=IMAGE_RESOURCES,
             units=_filters,
             plan=exposure_plan,
+            kernels=("images",),
         ),
         Stage(
             "photometry",
@@ -126,6 +132,7 @@ def study_stages():
             "forced photometry",
             needs=("mosaics", "highres", "kernels"),
             units=_filters,
+            kernels=("photometry",),
         ),
         Stage(
             "points",
@@ -142,6 +149,7 @@ def study_stages():
             resources=exposure_data,
             plan=exposure_plan,
             units=lambda config: _filters(config) if config.point_sources.enabled else (),
+            kernels=("images", "photometry"),
         ),
         Stage(
             "errors",
@@ -167,6 +175,7 @@ def study_stages():
             resources=sed_data,
             plan=lambda config, _: plain_axes(SEDModel.yang2021_axes(config.fit.axes)),
             units=lambda _: ("with_miri", "without_miri"),
+            kernels=("sed", "fit"),
         ),
         Stage(
             "report",
@@ -198,5 +207,6 @@ def study_stages():
             ),
             resources=(*sed_data, *exposure_data),
             plan=exposure_plan,
+            kernels=("sed", "fit"),
         ),
     )

@@ -183,4 +183,4 @@ def kernel_of(config, name):
 def make_kernel(context, name):
     """Stage 10: the kernel of one band."""
     kernel = kernel_of(context.config, name)
-    context.save(f"kernel_{name}.fits", lambda path: kernel.write(path, overwrite=True))
+    context.save_result(f"kernel_{name}.fits", kernel)

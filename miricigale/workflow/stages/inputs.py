@@ -112,8 +112,7 @@ def fit_inputs(context, _):
         redshift_tolerance=REDSHIFT_STEP,
     )
     results = fitter.fit(photometry, redshift="redshift", progress_bar=context.progress_bar)
-    results.meta.pop("created", None)
-    context.save("input_seds.fits", lambda path: results.write(path, overwrite=True))
+    context.save_result("input_seds.fits", results)
 
 
 def add_agn(table, frac_agn, seed):

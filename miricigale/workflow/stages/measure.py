@@ -98,8 +98,7 @@ def make_errors(context, _):
     )
     context.save_table("photometry.ecsv", photometry)
     context.save_table("matched.ecsv", matched)
-    errors.meta.pop("created", None)
-    context.save("errors.ecsv", errors.write)
+    context.save_result("errors.ecsv", errors)
 
 
 def mock_photometry(config, truth, matched, *, seed):
@@ -148,6 +147,5 @@ def fit_photometry(context, unit):
     )
     with ThreadPoolExecutor(context.n_threads) as executor:
         results = fitter.fit(photometry, executor=executor, progress_bar=context.progress_bar)
-    results.meta.pop("created", None)
-    context.save(f"fits_{unit}.fits", lambda path: results.write(path, overwrite=True))
+    context.save_result(f"fits_{unit}.fits", results)
     context.save_table(f"fits_{unit}.ecsv", results.to_table())
