@@ -48,7 +48,8 @@ def _finish(rate, f_burst, age_burst, tau_burst):
     total = rate.sum()
     if f_burst > 0.0:
         last = min(age_burst, n)
-        burst = _exponential(last, tau_burst, False)
+        # typed, for a literal would have it compiled once more
+        burst = _exponential(last, tau_burst, np.bool_(False))
         scale = f_burst / (1.0 - f_burst) * total / burst.sum()
         for i in range(last):
             rate[n - last + i] += scale * burst[i]
