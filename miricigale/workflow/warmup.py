@@ -55,7 +55,9 @@ def _images():
     from miricigale.workflow.config import load_config
     from miricigale.workflow.stages.images import expose_and_reduce, reducer_of
 
-    config = load_config("goodss", quick=True)
+    # so low a threshold that there are jumps among so few pixels
+    low = {"reduction": {"jump_threshold": 2.0}}
+    config = load_config("goodss", quick=True, overrides=low)
     center = SkyCoord(config.pointing.ra * u.deg, config.pointing.dec * u.deg)
     catalog = _catalog(center)
     exposures = Exposure(
@@ -87,6 +89,7 @@ def _photometry():
     from astropy.nddata import CCDData, StdDevUncertainty
     from astropy.table import QTable
     from photutils.segmentation import SegmentationImage
+    from scipy.ndimage import gaussian_filter
 
     from miricigale.instrument import north_up_wcs
     from miricigale.photometry import ForcedPhotometer
@@ -103,7 +106,8 @@ def _photometry():
 
     def image(wcs, width):
         y, x = np.mgrid[: wcs.pixel_shape[1], : wcs.pixel_shape[0]]
-        light = 0.01 * rng.standard_normal(y.shape)
+        # correlated, as that of a mosaic
+        light = 0.03 * gaussian_filter(rng.standard_normal(y.shape), 1.0)
         for px, py in zip(*wcs.world_to_pixel(sky), strict=True):
             light += np.exp(-0.5 * ((x - px) ** 2 + (y - py) ** 2) / width**2)
         return CCDData(
