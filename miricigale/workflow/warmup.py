@@ -51,18 +51,18 @@ def _images():
     from miricigale.instrument import Exposure, north_up_wcs
     from miricigale.photometry import detect_sources
     from miricigale.psf import hst_psf
+    from miricigale.reduction import Reducer
     from miricigale.scene import highres_image
     from miricigale.workflow.config import load_config
     from miricigale.workflow.stages.images import expose_and_reduce, reducer_of
 
-    # so low a threshold that there are jumps among so few pixels
-    low = {"reduction": {"jump_threshold": 2.0}}
-    config = load_config("goodss", quick=True, overrides=low)
+    config = load_config("goodss", quick=True)
     center = SkyCoord(config.pointing.ra * u.deg, config.pointing.dec * u.deg)
     catalog = _catalog(center)
     exposures = Exposure(
         "miri.f770w", n_groups=12, subarray="SUB64", pointing=center, roll=0 * u.deg
     ).dithered("ceers", 2)
+    ramps = []
     for n_integrations in (1, 2):
         images = [
             expose_and_reduce(
@@ -71,9 +71,12 @@ def _images():
                 catalog,
                 seed=1,
                 n_threads=2,
+                keep=ramps.append,
             )[1]
             for exposure in exposures
         ]
+    # thresholds so low that there are large jumps among so few pixels
+    Reducer(jump_threshold=2.0, neighbour_threshold=2.0).fit_ramp(ramps[0])
     grid = north_up_wcs(center, 0.06 * u.arcsec, (128, 128))
     reducer_of(config).drizzle(images, grid)
     prior = highres_image(
