@@ -10,7 +10,7 @@ from miricigale.profiles import sersic_enclosed_fraction, sersic_radius
 from miricigale.profiles.sersic import light_table, parameter_rows
 from miricigale.scene import _core
 from miricigale.scene.convolve import Places, add_nodes, convolve, phases
-from miricigale.scene.deposit import deposit_profiles
+from miricigale.scene.deposit import deposit_profiles, smooth_from
 from miricigale.utils.exceptions import argument_error
 
 __all__ = ["FieldPainter", "Painter"]
@@ -199,7 +199,7 @@ class Painter:
             cut = np.minimum(radius * sersic_radius(self.enclosed, index), self.max_radius * os_)
             cut = np.maximum(cut, zone)
             w_zone, w_cut = (zone / radius) ** 2, (cut / radius) ** 2
-            w_smooth = _core.smooth_from(rows, w_zone, w_cut)
+            w_smooth = smooth_from(rows, w_zone, w_cut)
             in_image[extended] = deposit_profiles(
                 grid, rows, tables, w_zone, w_smooth, w_cut, land, workers=self.workers
             )
