@@ -129,11 +129,8 @@ def _run(args):
     begin = time.monotonic()
     options = {"redo": args.redo, "progress_bar": not args.no_progress}
     try:
-        if config.run.threads == 1:
-            report = run_study(config, folder, **options)
-        else:
-            with process_pool(thread_count(config.run.threads or None)) as executor:
-                report = run_study(config, folder, executor=executor, **options)
+        with process_pool(thread_count(config.run.threads or None)) as executor:
+            report = run_study(config, folder, executor=executor, **options)
     except OtherResultsError as err:
         # in the words of this command
         raise OtherResultsError(err.reason, "--redo to replace it") from err
@@ -201,12 +198,12 @@ def _plan(args):
 
 def _compile(args):
     from miricigale.utils.parallel import process_pool, thread_count
-    from miricigale.workflow.warmup import JOBS, compile_job, describe_job, is_compiled
+    from miricigale.workflow.warmup import JOBS, compile_apart, describe_job, is_compiled
 
     names = [name for name in JOBS if not is_compiled(name)]
     try:
         with process_pool(min(thread_count(), max(1, len(names)))) as executor:
-            jobs = [executor.submit(compile_job, name) for name in names]
+            jobs = [executor.submit(compile_apart, name) for name in names]
             for name in names:
                 print(describe_job(name), flush=True)
             kept = [job.result() for job in jobs]

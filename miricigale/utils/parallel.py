@@ -21,6 +21,7 @@ from miricigale.utils.progress import progress
 __all__ = [
     "available_memory",
     "chunks",
+    "end_with_parent",
     "parallel_map",
     "process_pool",
     "single_threaded",
@@ -73,7 +74,7 @@ def process_pool(n_processes):
         n_processes,
         # forks of a process with threads can hang
         mp_context=multiprocessing.get_context("spawn"),
-        initializer=_begin_process,
+        initializer=end_with_parent,
         initargs=(level,),
     )
     try:
@@ -86,8 +87,15 @@ def process_pool(n_processes):
         executor.shutdown(cancel_futures=True)
 
 
-def _begin_process(level):
-    """Leave interrupts to the parent, and end when it does."""
+def end_with_parent(level=logging.WARNING):
+    """
+    Begin a process of `multiprocessing`: it leaves interrupts to its parent, and ends with it.
+
+    Parameters
+    ----------
+    level : int, optional
+        Level of the messages that it writes to stderr.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     logging.basicConfig(level=level, format="%(message)s")
     parent = multiprocessing.parent_process()

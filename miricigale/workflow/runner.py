@@ -16,7 +16,7 @@ from miricigale.workflow.config import load_config
 from miricigale.workflow.schedule import Task, run_tasks
 from miricigale.workflow.stage import run_unit
 from miricigale.workflow.store import CONFIG, ProductStore
-from miricigale.workflow.warmup import JOBS, compile_job, describe_job, is_compiled
+from miricigale.workflow.warmup import JOBS, compile_apart, describe_job, is_compiled
 
 __all__ = ["StudyRunner", "run_stages"]
 
@@ -323,7 +323,7 @@ def _compilation(name, display):
         if is_compiled(name):
             return None
         display.line(describe_job(name))
-        return submit(compile_job, name)
+        return submit(compile_apart, name)
 
     return Task(f"compile {name}", "compilation", begin, memory=_MEMORY, is_optional=True)
 

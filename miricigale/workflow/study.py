@@ -9,6 +9,7 @@ from miricigale.filters import Filter
 from miricigale.instrument import background_level, imager_filters, saturation_forecast
 from miricigale.scene import read_catalog
 from miricigale.utils.exceptions import ConfigError
+from miricigale.workflow.config import HighresSection
 from miricigale.workflow.runner import run_stages
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.exposures import grid_of, study_exposures
@@ -96,7 +97,9 @@ def check_study(config):
             f"{MIN_SOURCES} are needed"
         )
         raise ConfigError(msg)
-    # the one check that takes long to import comes last
+    if config.highres == HighresSection():
+        # known to have a PSF; the check below takes seconds where it has to be compiled first
+        return
     from miricigale.psf import hst_psf
 
     try:

@@ -10,14 +10,16 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import logging
+import multiprocessing
 import os
 import platform
 import sys
 from pathlib import Path
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.parallel import end_with_parent
 
-__all__ = ["JOBS", "compile_job", "describe_job", "is_compiled"]
+__all__ = ["JOBS", "compile_apart", "compile_job", "describe_job", "is_compiled"]
 
 log = logging.getLogger(__name__)
 
@@ -210,11 +212,6 @@ def compile_job(name):
     name : str
         One of `JOBS`.
 
-    Returns
-    -------
-    is_kept : bool
-        Whether that could be noted; if not, kernels are compiled in every process.
-
     Raises
     ------
     ValueError
@@ -227,8 +224,34 @@ def compile_job(name):
         path.touch()
     except OSError:
         log.debug("%s cannot be written", path)
-        return False
-    return True
+
+
+def compile_apart(name):
+    """
+    Run one job in a process of its own, which ends with this one.
+
+    Code that a process has compiled itself differs from what it keeps on disk in the last digit
+    of results: a run whose processes all load what is on disk gives the same bytes as the next.
+
+    Parameters
+    ----------
+    name : str
+        One of `JOBS`.
+
+    Returns
+    -------
+    is_kept : bool
+        Whether its kernels are on disk.
+    """
+    child = multiprocessing.get_context("spawn").Process(target=_child, args=(_check(name),))
+    child.start()
+    child.join()
+    return is_compiled(name)
+
+
+def _child(name):
+    end_with_parent()
+    compile_job(name)
 
 
 def is_compiled(name):

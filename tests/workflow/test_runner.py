@@ -326,14 +326,14 @@ def test_kernels_are_compiled_before_what_calls_them(tmp_path, monkeypatch):
         order.append(context.stage_name)
         context.save(f"{context.stage_name}.txt", lambda path: path.write_text("x"))
 
-    def compile_job(name):
+    def compile_apart(name):
         threading.Event().wait(0.05)
         order.append(f"compiled {name}")
         if name == "photometry":
             msg = "numba cannot"
             raise ValueError(msg)
 
-    monkeypatch.setattr(runner, "compile_job", compile_job)
+    monkeypatch.setattr(runner, "compile_apart", compile_apart)
     monkeypatch.setattr(runner, "is_compiled", lambda name: name == "images")
 
     def stage(name, *kernels):
