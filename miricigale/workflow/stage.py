@@ -1,6 +1,7 @@
 """A stage of the study, and what it sees of the run."""
 
 import dataclasses
+import pkgutil
 import time
 import types
 from collections.abc import Callable
@@ -22,8 +23,9 @@ class Stage:
     ----------
     name : str
         Such as ``"mosaic"``.
-    function : callable
-        Called as ``function(context, unit)``; saves its products through the context.
+    function : callable or str
+        Called as ``function(context, unit)``; saves its products through the context. As text,
+        ``"module:name"`` in `miricigale.workflow.stages`, it is imported when it is called.
     title : str
         What it does, for the progress line.
     needs : tuple of str
@@ -49,7 +51,7 @@ class Stage:
     """
 
     name: str
-    function: Callable
+    function: Callable | str
     title: str
     needs: tuple = ()
     sections: tuple = ()
@@ -63,6 +65,13 @@ class Stage:
     def unit_names(self, config):
         """Names of the pieces; a single empty one for a stage that has none."""
         return tuple(self.units(config)) if self.units else ("",)
+
+    def call(self, context, unit):
+        """Do a piece."""
+        function = self.function
+        if isinstance(function, str):
+            function = pkgutil.resolve_name(f"miricigale.workflow.stages.{function}")
+        function(context, unit)
 
     def key(self, unit):
         """Name of a piece in the manifest."""
@@ -184,7 +193,7 @@ def run_unit(config, folder, stages, name, unit, *, n_threads=1, progress_bar=Fa
     try:
         # the same last digits on any number of cores
         with single_threaded():
-            stage.function(context, unit)
+            stage.call(context, unit)
     except (ValueError, KeyError, OSError) as err:
         err.add_note(f"in stage {stage.key(unit)}")
         raise

@@ -14,7 +14,7 @@ from astropy.table import QTable
 from miricigale.instrument import saturation_forecast
 from miricigale.reduction import PixelFlags
 from miricigale.workflow import StudyRunner, load_config, read_image, study_stages
-from miricigale.workflow.stages.images import study_exposures
+from miricigale.workflow.stages.exposures import study_exposures
 
 SMALL = """
 [run]
@@ -103,8 +103,52 @@ def test_every_product_stands_in_the_manifest_and_nothing_else(study):
     manifest = json.loads((study["folder"] / "manifest.json").read_text())
     recorded = {name for record in manifest["stages"].values() for name in record["products"]}
     found = {str(p.relative_to(study["folder"])) for p in study["folder"].rglob("*") if p.is_file()}
-    assert found - recorded == {"manifest.json", "config.toml"}
+    assert found - recorded == {"manifest.json", ".manifest.copy.json", "config.toml"}
     assert recorded - found == set()
+
+
+def test_deleted_products_make_only_themselves_anew_with_the_same_bytes(study):
+    folder = study["folder"]
+
+    def contents():
+        return {
+            str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.read_bytes())
+            for path in folder.rglob("*")
+            if path.is_file() and "manifest" not in path.name
+        }
+
+    before = contents()
+    deleted = {
+        "input_seds.fits",
+        "exposures/miri.f1500w-0_forecast.ecsv",
+        "kernel_miri.f770w.fits",
+        "mosaic_miri.f1500w.fits",
+        "photometry/miri.f770w.ecsv",
+        "fits_without_miri.ecsv",
+        "report/metrics.json",
+    }
+    for name in deleted:
+        (folder / name).unlink()
+    command = [sys.executable, "-m", "miricigale", "run", "small.toml"]
+    done = subprocess.run(
+        command, cwd=folder.parent, capture_output=True, text=True, check=False, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    # a line for each stage, and none that rewrites itself
+    assert "7 of 19 steps to do" in done.stderr
+    assert "mosaic (2): " in done.stderr
+    assert "\r" not in done.stderr
+    assert "\x1b" not in done.stderr
+    after = contents()
+    assert {name: data for name, (_, data) in after.items()} == {
+        name: data for name, (_, data) in before.items()
+    }
+    manifest = json.loads((folder / "manifest.json").read_text())
+    units = [
+        set(r["products"]) for r in manifest["stages"].values() if deleted & set(r["products"])
+    ]
+    changed = {name for name, (time_ns, _) in after.items() if time_ns != before[name][0]}
+    assert changed == set().union(*units)
 
 
 def test_no_source_is_lost_between_catalogue_and_result(study):

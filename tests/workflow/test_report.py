@@ -16,8 +16,8 @@ from miricigale.sed import SEDModel
 from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.stages import study_stages
+from miricigale.workflow.stages.exposures import study_exposures
 from miricigale.workflow.stages.figures import three_bands
-from miricigale.workflow.stages.images import study_exposures
 from miricigale.workflow.stages.metrics import as_ceers, as_paper
 from miricigale.workflow.stages.pictures import field_figure, residual_figure
 from miricigale.workflow.stages.provenance import sources_to_cite, stand_ins
@@ -77,7 +77,7 @@ def small_config(filters, *, points=False):
 
 
 def do_stage(config, folder, name, unit=""):
-    STAGES[name].function(Context(config, folder, stage=STAGES[name]), unit)
+    STAGES[name].call(Context(config, folder, stage=STAGES[name]), unit)
 
 
 def make_run(folder, filters, *, mass=3e10, points=False):

@@ -3,7 +3,7 @@
 from miricigale.refdata import resources
 from miricigale.refdata.locate import fingerprint
 from miricigale.workflow.stage import Stage
-from miricigale.workflow.stages.exposures import exposure_plan, exposure_units
+from miricigale.workflow.stages.exposures import IMAGE_RESOURCES, exposure_plan, exposure_units
 
 __all__ = ["study_stages"]
 
@@ -21,23 +21,9 @@ def study_stages():
     stages : tuple of `~miricigale.workflow.stage.Stage`
     """
     from miricigale.sed import SEDModel
-    from miricigale.workflow.stages.images import (
-        make_exposure,
-        make_highres,
-        make_kernel,
-        make_mosaic,
-    )
-    from miricigale.workflow.stages.inputs import (
-        fit_inputs,
-        input_axes,
-        make_catalog,
-        make_truth,
-        plain_axes,
-    )
-    from miricigale.workflow.stages.measure import fit_photometry, make_errors, measure_photometry
-    from miricigale.workflow.stages.points import measure_point_sources
-    from miricigale.workflow.stages.provenance import IMAGE_RESOURCES
-    from miricigale.workflow.stages.report import make_report
+
+    # what only the processes of the run call is named, and imported there
+    from miricigale.workflow.stages.inputs import input_axes, plain_axes
 
     images = ("pointing", "exposures", "scene", "detector", "reduction")
     grid = ("pointing", "exposures")
@@ -49,7 +35,7 @@ def study_stages():
     return (
         Stage(
             "catalog",
-            make_catalog,
+            "inputs:make_catalog",
             "catalogue",
             sections=("catalog",),
             plan=lambda config, _: (
@@ -58,7 +44,7 @@ def study_stages():
         ),
         Stage(
             "seds",
-            fit_inputs,
+            "inputs:fit_inputs",
             "input SEDs",
             version=2,
             needs=("catalog",),
@@ -69,7 +55,7 @@ def study_stages():
         ),
         Stage(
             "truth",
-            make_truth,
+            "inputs:make_truth",
             "model fluxes",
             version=2,
             needs=("catalog", "seds"),
@@ -85,7 +71,7 @@ def study_stages():
         ),
         Stage(
             "exposures",
-            make_exposure,
+            "images:make_exposure",
             "exposure",
             version=3,
             needs=("truth",),
@@ -97,7 +83,7 @@ def study_stages():
         ),
         Stage(
             "mosaics",
-            make_mosaic,
+            "images:make_mosaic",
             "mosaic",
             needs=("exposures",),
             sections=(*grid, "reduction", "highres.pixel_scale"),
@@ -107,7 +93,7 @@ def study_stages():
         ),
         Stage(
             "highres",
-            make_highres,
+            "images:make_highres",
             "high-resolution image",
             version=2,
             needs=("truth",),
@@ -118,7 +104,7 @@ def study_stages():
         ),
         Stage(
             "kernels",
-            make_kernel,
+            "images:make_kernel",
             "matching kernel",
             sections=(*grid, *kernel),
             resources=IMAGE_RESOURCES,
@@ -128,7 +114,7 @@ def study_stages():
         ),
         Stage(
             "photometry",
-            measure_photometry,
+            "measure:measure_photometry",
             "forced photometry",
             needs=("mosaics", "highres", "kernels"),
             units=_filters,
@@ -136,7 +122,7 @@ def study_stages():
         ),
         Stage(
             "points",
-            measure_point_sources,
+            "points:measure_point_sources",
             "point sources",
             needs=("kernels",),
             sections=(
@@ -153,7 +139,7 @@ def study_stages():
         ),
         Stage(
             "errors",
-            make_errors,
+            "measure:make_errors",
             "error function",
             needs=("truth", "mosaics", "photometry"),
             sections=(
@@ -167,7 +153,7 @@ def study_stages():
         ),
         Stage(
             "fits",
-            fit_photometry,
+            "measure:fit_photometry",
             "fit",
             version=3,
             needs=("truth", "errors"),
@@ -179,7 +165,7 @@ def study_stages():
         ),
         Stage(
             "report",
-            make_report,
+            "report:make_report",
             "report",
             version=2,
             needs=(

@@ -7,7 +7,23 @@ from astropy.coordinates import SkyCoord
 
 from miricigale.instrument import Exposure, ceers_exposures, mosaic_wcs
 
-__all__ = ["band_exposures", "exposure_plan", "exposure_units", "grid_of", "study_exposures"]
+__all__ = [
+    "IMAGE_RESOURCES",
+    "band_exposures",
+    "exposure_plan",
+    "exposure_units",
+    "grid_of",
+    "study_exposures",
+]
+
+#: Reference data of the simulated images.
+IMAGE_RESOURCES = (
+    "instrument.siaf",
+    "instrument.imager",
+    "instrument.thermal",
+    "psf.jwst_pupil",
+    "filters.sedpy",
+)
 
 
 def study_exposures(config):

@@ -11,12 +11,11 @@ from miricigale.evaluation import number
 from miricigale.filters import Filter
 from miricigale.refdata import citations, resource, resources
 from miricigale.utils.meta import provenance
+from miricigale.workflow.stages.exposures import IMAGE_RESOURCES, study_exposures
 from miricigale.workflow.stages.figures import band_label
-from miricigale.workflow.stages.images import study_exposures
 from miricigale.workflow.stages.inputs import catalog_bands
 
 __all__ = [
-    "IMAGE_RESOURCES",
     "catalog_facts",
     "exposure_rows",
     "library_rows",
@@ -27,14 +26,6 @@ __all__ = [
     "write_origin",
 ]
 
-#: Reference data of the simulated images.
-IMAGE_RESOURCES = (
-    "instrument.siaf",
-    "instrument.imager",
-    "instrument.thermal",
-    "psf.jwst_pupil",
-    "filters.sedpy",
-)
 
 #: What is not the paper's library, and what that changes, by resource.
 STAND_INS = {
