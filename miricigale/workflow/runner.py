@@ -22,8 +22,9 @@ __all__ = ["StudyRunner", "run_stages"]
 
 log = logging.getLogger(__name__)
 
-#: Bytes that a unit takes whose stage does not say how many.
-_MEMORY = 500_000_000
+#: Bytes that a process takes for a unit whose stage does not say how many: measured, of a field
+#: of one pointing.
+_MEMORY = 1_200_000_000
 _REMEDY = "redo=True to replace it"
 
 

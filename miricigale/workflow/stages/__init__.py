@@ -3,7 +3,12 @@
 from miricigale.refdata import resources
 from miricigale.refdata.locate import fingerprint
 from miricigale.workflow.stage import Stage
-from miricigale.workflow.stages.exposures import IMAGE_RESOURCES, exposure_plan, exposure_units
+from miricigale.workflow.stages.exposures import (
+    IMAGE_RESOURCES,
+    exposure_memory,
+    exposure_plan,
+    exposure_units,
+)
 
 __all__ = ["study_stages"]
 
@@ -79,6 +84,7 @@ def study_stages():
             resources=exposure_data,
             units=exposure_units,
             plan=exposure_plan,
+            memory=exposure_memory,
             kernels=("images",),
         ),
         Stage(
@@ -135,6 +141,7 @@ def study_stages():
             resources=exposure_data,
             plan=exposure_plan,
             units=lambda config: _filters(config) if config.point_sources.enabled else (),
+            memory=exposure_memory,
             kernels=("images", "photometry"),
         ),
         Stage(

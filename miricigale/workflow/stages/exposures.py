@@ -1,6 +1,7 @@
 """What is exposed, and the grids that cover it, from the configuration alone."""
 
 import dataclasses
+import math
 
 import astropy.units as u
 from astropy.coordinates import SkyCoord
@@ -10,6 +11,7 @@ from miricigale.instrument import Exposure, ceers_exposures, mosaic_wcs
 __all__ = [
     "IMAGE_RESOURCES",
     "band_exposures",
+    "exposure_memory",
     "exposure_plan",
     "exposure_units",
     "grid_of",
@@ -90,3 +92,25 @@ def band_exposures(config, name):
 def grid_of(config, pixel_scale):
     """North-up WCS that covers every exposure of the study."""
     return mosaic_wcs(list(study_exposures(config).values()), pixel_scale * u.arcsec)
+
+
+def exposure_memory(config, unit):
+    """
+    About how many bytes a process takes that simulates and reduces an exposure.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.config.StudyConfig`
+        The configuration.
+    unit : str
+        Of `study_exposures`, or a filter.
+
+    Returns
+    -------
+    n_bytes : int
+        Measured: 0.5 GB, and counts and flags of each group.
+    """
+    exposures = study_exposures(config)
+    chosen = [e for name, e in exposures.items() if unit in (name, e.filter)]
+    groups = max(math.prod(e.shape) * e.n_groups * e.n_integrations for e in chosen)
+    return 500_000_000 + int(3.3 * groups)
