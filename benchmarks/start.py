@@ -53,7 +53,7 @@ def main():
         print(f"{cpu(['-m', 'miricigale', *command]):7.2f}  miricigale {' '.join(command)}")
     if options.compile:
         with tempfile.TemporaryDirectory() as folder:
-            for name in ("sed", "fit", "images", "photometry"):
+            for name in ("fit", "images", "photometry"):
                 code = f"from miricigale.workflow.warmup import compile_job; compile_job({name!r})"
                 first, second = (cpu(["-c", code], NUMBA_CACHE_DIR=folder) for _ in range(2))
                 print(f"{first:7.2f}  compile {name}; from the cache {second:.2f}")

@@ -1,7 +1,6 @@
 """``python -m miricigale``."""
 
-import sys
+from miricigale.cli import command
 
-from miricigale.cli import main
-
-sys.exit(main())
+if __name__ == "__main__":
+    command()

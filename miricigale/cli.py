@@ -2,13 +2,15 @@
 
 import argparse
 import logging
+import os
 import shutil
 import sys
 import textwrap
+import threading
 import time
 from pathlib import Path
 
-__all__ = ["main"]
+__all__ = ["command", "main"]
 
 
 def _parser():
@@ -142,13 +144,12 @@ def _run(args):
 
 
 def _fit(args):
-    from concurrent.futures import ThreadPoolExecutor
-
     from miricigale.utils.exceptions import OtherResultsError
+    from miricigale.utils.parallel import thread_pool
     from miricigale.workflow.commands import fit_catalogue
 
     try:
-        with ThreadPoolExecutor(max(1, args.threads)) as executor:
+        with thread_pool(max(1, args.threads)) as executor:
             results = fit_catalogue(
                 args.photometry,
                 args.output,
@@ -337,6 +338,9 @@ def main(argv=None):
     }
     try:
         return commands[args.command](args)
+    except KeyboardInterrupt:
+        print("miricigale: stopped", file=sys.stderr)
+        return 130
     except Exception as err:
         # one clear sentence; the traceback is for --verbose
         if args.verbose or not isinstance(err, _input_errors()):
@@ -351,3 +355,15 @@ def main(argv=None):
         where = "".join(f" ({note})" for note in getattr(err, "__notes__", ()))
         print(f"miricigale: {kind}{' '.join(str(message).split())}{where}", file=sys.stderr)
         return 2
+
+
+def command():
+    """Run `main` as the whole of a process; see there."""
+    status = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    others = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
+    if status == 130 and not all(thread.daemon for thread in others):
+        # threads in compiled code hear of no interrupt, and the interpreter would wait for them
+        os._exit(status)
+    sys.exit(status)

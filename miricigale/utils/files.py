@@ -13,7 +13,6 @@ import astropy.units as u
 from astropy.config import ConfigItem, ConfigNamespace
 from astropy.io import fits
 from astropy.table import QTable
-from astropy.utils.exceptions import AstropyUserWarning
 
 from miricigale.utils.exceptions import DataError
 
@@ -114,13 +113,14 @@ def open_fits(path, *, wanted, **options):
     hdus = None
     try:
         _refuse_stump(Path(path))
-        with warnings.catch_warnings():
-            # made an error it would leave the file open; it is said below, of packed files too
-            warnings.filterwarnings("ignore", "File may have been trunc", AstropyUserWarning)
+        with warnings.catch_warnings(record=True) as caught:
+            # made errors at once they would leave the file open
+            warnings.simplefilter("always")
             hdus = fits.open(path, **options)
             # headers are read late
             len(hdus)
         _check_declared(path, hdus, n_bytes)
+        _judge(caught)
     except DataError:
         hdus.close()
         raise
@@ -129,6 +129,18 @@ def open_fits(path, *, wanted, **options):
             hdus.close()
         raise _unreadable(path, wanted, err) from err
     return hdus
+
+
+def _judge(caught):
+    """Refuse what astropy only warns of, and pass its other warnings on."""
+    for warning in caught:
+        text = str(warning.message)
+        if text.startswith("Error validating header"):
+            msg = "truncated or damaged: " + " ".join(text.splitlines()[1].split())
+            raise OSError(msg)
+        # that data are missing is said by `_check_declared`, of packed files too
+        if not text.startswith("File may have been trunc"):
+            warnings.warn(warning.message, stacklevel=3)
 
 
 def _check_declared(path, hdus, n_bytes):

@@ -9,7 +9,7 @@ import pickle
 import signal
 import tempfile
 import threading
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +26,7 @@ __all__ = [
     "process_pool",
     "single_threaded",
     "thread_count",
+    "thread_pool",
 ]
 
 #: Functions whose pickle is longer (bytes) go to other processes once, not with every piece.
@@ -85,6 +86,29 @@ def process_pool(n_processes):
         raise
     finally:
         executor.shutdown(cancel_futures=True)
+
+
+@contextlib.contextmanager
+def thread_pool(n_threads):
+    """
+    Threads that are not waited for when the ``with`` block is left by an exception.
+
+    Parameters
+    ----------
+    n_threads : int
+        How many.
+
+    Yields
+    ------
+    executor : `concurrent.futures.ThreadPoolExecutor`
+    """
+    executor = ThreadPoolExecutor(n_threads)
+    try:
+        yield executor
+    except BaseException:
+        executor.shutdown(wait=False, cancel_futures=True)
+        raise
+    executor.shutdown()
 
 
 def end_with_parent(level=logging.WARNING):

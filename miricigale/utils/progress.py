@@ -15,17 +15,22 @@ def on_terminal():
 
 def print_line(text):
     """Write a line to stderr, beside whatever bar is drawn there."""
-    tqdm.write(text, file=sys.stderr)
+    if on_terminal():
+        tqdm.write(text, file=sys.stderr)
+    else:
+        sys.stderr.write(f"{text}\n")
+        sys.stderr.flush()
 
 
 class _Lines:
-    """What `progress` returns where no bar can be drawn: one line at the end, one a minute."""
+    """What `progress` returns where no bar is drawn: one line at the end, one a minute, or none."""
 
-    def __init__(self, iterable, total, desc, unit, *, every=60.0):
+    def __init__(self, iterable, total, desc, unit, *, show=True, every=60.0):
         if total is None and hasattr(iterable, "__len__"):
             total = len(iterable)
         self.iterable, self.total, self.desc, self.unit = iterable, total, desc, unit
         self.n = 0
+        self._show = show
         self._every = every
         self._begin = self._last = time.monotonic()
 
@@ -34,8 +39,11 @@ class _Lines:
         if time.monotonic() - self._last > self._every:
             self._line()
 
-    def set_description(self, desc):
+    def set_description(self, desc, refresh=True):
         self.desc = desc
+
+    def refresh(self):
+        """A line stands as it is."""
 
     def close(self):
         if self.n:
@@ -43,6 +51,8 @@ class _Lines:
         self.n = 0
 
     def _line(self):
+        if not self._show:
+            return
         self._last = time.monotonic()
         share = f"{self.n}" if self.total is None else f"{self.n} of {self.total}"
         label = f"{self.desc}: " if self.desc else ""
@@ -83,9 +93,10 @@ def progress(iterable=None, *, show=False, total=None, desc=None, unit="it"):
     bar : `tqdm.auto.tqdm` or an object with the same ``update``, ``set_description`` and ``close``
         A bar; where stderr is no terminal, lines: one at the end and one a minute.
     """
-    if show and not on_terminal():
-        return _Lines(iterable, total, desc, unit)
+    if not (show and on_terminal()):
+        # without tqdm, whose semaphore outlives a process that is stopped
+        return _Lines(iterable, total, desc, unit, show=show)
     # the notebook's bar is slow to import
     from tqdm.auto import tqdm
 
-    return tqdm(iterable, total=total, desc=desc, unit=unit, disable=not show, leave=False)
+    return tqdm(iterable, total=total, desc=desc, unit=unit, leave=False)

@@ -23,27 +23,23 @@ __all__ = ["JOBS", "compile_apart", "compile_job", "describe_job", "is_compiled"
 
 log = logging.getLogger(__name__)
 
+_PACKAGE = Path(__file__).resolve().parent.parent
+
 
 def _fit():
+    from astropy.table import QTable
+
     from miricigale.fitting import BayesFitter
     from miricigale.sed import SEDModel
 
+    for agn in (False, True):
+        table = QTable({"id": [1], "redshift": [1.0], "mass": [1e10]})
+        SEDModel.yang2021(agn=agn).fluxes(table, _BANDS)
     fitter = BayesFitter(SEDModel.yang2021(), _BANDS, axes=_axes(), model_error=0.1)
     table = _photometry_table()
     fitter.fit(table)
     table["z"] = [1.0]
     fitter.fit(table, redshift="z")
-
-
-def _sed():
-    from astropy.table import QTable
-
-    from miricigale.sed import SEDModel
-
-    SEDModel.yang2021().grid(_axes(), _BANDS)
-    for agn in (False, True):
-        table = QTable({"id": [1], "redshift": [1.0], "mass": [1e10]})
-        SEDModel.yang2021(agn=agn).fluxes(table, _BANDS)
 
 
 def _images():
@@ -184,8 +180,7 @@ def _catalog(center):
 
 #: What is compiled together: what it is, and about how many seconds it takes on a slow machine.
 JOBS = {
-    "sed": (_sed, "model spectra", 15),
-    "fit": (_fit, "the fit", 60),
+    "fit": (_fit, "model spectra and their fit", 60),
     "images": (_images, "scenes, detector and reduction", 50),
     "photometry": (_photometry, "photometry", 20),
 }
@@ -256,7 +251,10 @@ def _child(name):
 
 def is_compiled(name):
     """Whether the kernels of a job were compiled by this installation, on this machine."""
-    return _marker(_check(name)).is_file()
+    marker = _marker(_check(name))
+    # somebody may have emptied the cache around the marker
+    folder = _PACKAGE if marker.parent.name == "__pycache__" else _numba_folder()
+    return marker.is_file() and any(folder.rglob("*.nbi"))
 
 
 def _marker(name):
@@ -265,18 +263,20 @@ def _marker(name):
 
 def _cache_folder():
     """Where numba keeps compiled code, or near it."""
+    if "NUMBA_CACHE_DIR" not in os.environ and os.access(_PACKAGE, os.W_OK):
+        return _PACKAGE / "__pycache__"
+    return _numba_folder()
+
+
+def _numba_folder():
+    """Where numba keeps compiled code that it cannot keep beside the source."""
     named = os.environ.get("NUMBA_CACHE_DIR")
-    if named:
-        return Path(named)
-    package = Path(__file__).resolve().parent.parent
-    if os.access(package, os.W_OK):
-        return package / "__pycache__"
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "miricigale"
+    return Path(named or Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "numba")
 
 
 def _key():
     """What the compiled code depends on: the sources as numba sees them, packages, processor."""
-    package = Path(__file__).resolve().parent.parent
+    package = _PACKAGE
     parts = [str(package), sys.version, _processor(), os.environ.get("NUMBA_CPU_NAME", "")]
     parts += [importlib.metadata.version(name) for name in ("numba", "llvmlite", "numpy")]
     for path in sorted([*package.glob("*/_core.py"), *package.glob("*/_core/*.py")]):

@@ -76,6 +76,19 @@ def test_progress_is_silent_unless_asked(capsys):
     assert "work" in capsys.readouterr().err
 
 
+def test_progress_is_lines_where_no_bar_can_be_drawn(capsys):
+    bar = progress(show=True, total=5, desc="work", unit="step")
+    bar.set_description("more work", refresh=False)
+    bar.update(3)
+    bar.refresh()
+    bar.close()
+    bar.close()
+    text = capsys.readouterr().err
+    assert text.startswith("more work: 3 of 5 step, ")
+    assert text.count("\n") == 1
+    assert not {"\r", "\x1b"} & set(text)
+
+
 def test_package_lists_its_classes_without_loading_them():
     assert {"Filter", "SEDModel", "Detector", "BayesFitter"} <= set(dir(miricigale))
     assert miricigale.Filter.__name__ == "Filter"

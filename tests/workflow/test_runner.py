@@ -287,8 +287,8 @@ def test_units_run_side_by_side_within_threads_and_memory(tmp_path, threads, gig
     assert state.most == most
     assert len(store.records) == 12
     # b waits for all of a; c for nobody
-    assert state.order[:4] == ["a"] * 4
-    assert state.order.index("b") >= 4
+    last_a = max(k for k, letter in enumerate(state.order) if letter == "a")
+    assert state.order.index("b") > last_a
 
 
 def test_a_unit_larger_than_the_memory_runs_alone(tmp_path):

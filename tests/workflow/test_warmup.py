@@ -86,7 +86,7 @@ def test_what_is_compiled_is_known(cache, monkeypatch):
 
 def test_unknown_jobs_are_refused():
     for function in (warmup.is_compiled, warmup.compile_job, warmup.describe_job):
-        with pytest.raises(ValueError, match="'name' must be one of sed, fit"):
+        with pytest.raises(ValueError, match="'name' must be one of fit, images"):
             function("fits")
 
 

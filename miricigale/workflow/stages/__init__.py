@@ -56,7 +56,7 @@ def study_stages():
             sections=("sed.axes", "sed.catalog_error", "sed.max_wavelength", "fit.model_error"),
             resources=sed_data,
             plan=lambda config, _: plain_axes(input_axes(config.sed.axes)),
-            kernels=("sed", "fit"),
+            kernels=("fit",),
         ),
         Stage(
             "truth",
@@ -72,7 +72,7 @@ def study_stages():
                 "highres.filter",
             ),
             resources=sed_data,
-            kernels=("sed",),
+            kernels=("fit",),
         ),
         Stage(
             "exposures",
@@ -116,7 +116,7 @@ def study_stages():
             resources=IMAGE_RESOURCES,
             units=_filters,
             plan=exposure_plan,
-            kernels=("images",),
+            kernels=("images", "photometry"),
         ),
         Stage(
             "photometry",
@@ -168,7 +168,7 @@ def study_stages():
             resources=sed_data,
             plan=lambda config, _: plain_axes(SEDModel.yang2021_axes(config.fit.axes)),
             units=lambda _: ("with_miri", "without_miri"),
-            kernels=("sed", "fit"),
+            kernels=("fit",),
         ),
         Stage(
             "report",
@@ -200,6 +200,6 @@ def study_stages():
             ),
             resources=(*sed_data, *exposure_data),
             plan=exposure_plan,
-            kernels=("sed", "fit"),
+            kernels=("fit",),
         ),
     )
