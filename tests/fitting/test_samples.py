@@ -194,7 +194,7 @@ def test_drawing(real):
     mpl.use("Agg")
     from miricigale.plotting.axes import new_figure
 
-    for rest, label in ((True, "rest wavelength (um)"), (False, "observed wavelength (um)")):
+    for rest, label in ((True, "rest wavelength (µm)"), (False, "observed wavelength (µm)")):
         ax = new_figure()[1][0, 0]
         assert real.plot_sed_band("a", ax=ax, rest=rest) is ax
         assert ax.get_xlabel() == label

@@ -94,5 +94,5 @@ def test_plot_sed(fitter, draw_photometry):
     table, _ = draw_photometry(fitter.grid, 1, noise=0.05)
     top, bottom = fitter.fit(table).plot_sed(0)
     assert len(top.lines) > 1
-    assert bottom.get_xlabel() == "observed wavelength (um)"
+    assert bottom.get_xlabel() == "observed wavelength (µm)"
     plt.close("all")
