@@ -198,12 +198,12 @@ def _plan(args):
 
 
 def _compile(args):
-    from miricigale.utils.parallel import process_pool, thread_count
+    from miricigale.utils.parallel import thread_count, thread_pool
     from miricigale.workflow.warmup import JOBS, compile_apart, describe_job, is_compiled
 
     names = [name for name in JOBS if not is_compiled(name)]
     try:
-        with process_pool(min(thread_count(), max(1, len(names)))) as executor:
+        with thread_pool(thread_count()) as executor:
             jobs = [executor.submit(compile_apart, name) for name in names]
             for name in names:
                 print(describe_job(name), flush=True)

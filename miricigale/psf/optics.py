@@ -10,6 +10,7 @@ import numpy as np
 from miricigale.psf import _core
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
 from miricigale.utils.units import frozen_array
 
@@ -301,7 +302,13 @@ def polychromatic_psf(pupil, opd, wavelengths, *, weights=None, step, n):
         raise argument_error("n", wanted, f"{n} x {step:.4g} arcsec = {n * step:.1f} arcsec")
     if weights is None:
         weights = np.full(wavelengths.size, 1.0 / wavelengths.size)
-    opd = np.asarray(opd, dtype=float) * 1e-9
+    # the same bits on any number of cores
+    with single_threaded():
+        return _image(pupil, np.asarray(opd, dtype=float) * 1e-9, wavelengths, step, n, weights)
+
+
+def _image(pupil, opd, wavelengths, step, n, weights):
+    """Weighted sum of the images at some wavelengths, their core in the middle."""
     shift = _centre(pupil, opd, float(np.average(wavelengths, weights=weights)))
     axis = (np.arange(n) - (n - 1) // 2) * step * ARCSEC
     image = np.zeros((n, n))

@@ -21,7 +21,6 @@ from miricigale.utils.progress import progress
 __all__ = [
     "available_memory",
     "chunks",
-    "end_with_parent",
     "parallel_map",
     "process_pool",
     "single_threaded",
@@ -75,7 +74,7 @@ def process_pool(n_processes):
         n_processes,
         # forks of a process with threads can hang
         mp_context=multiprocessing.get_context("spawn"),
-        initializer=end_with_parent,
+        initializer=_end_with_parent,
         initargs=(level,),
     )
     try:
@@ -111,7 +110,7 @@ def thread_pool(n_threads):
     executor.shutdown()
 
 
-def end_with_parent(level=logging.WARNING):
+def _end_with_parent(level=logging.WARNING):
     """
     Begin a process of `multiprocessing`: it leaves interrupts to its parent, and ends with it.
 

@@ -262,10 +262,7 @@ class StudyRunner:
         """Do all units, each when what it needs is done."""
         with _Display(self.progress_bar, len(self.jobs)) as display:
             begun = {job.stage for job in self.jobs if states[job.key] != "current"}
-            kernels = dict.fromkeys(name for stage in begun for name in stage.kernels)
-            if self.executor is None:
-                # numba compiles one kernel at a time in a process: nothing is won
-                kernels = {}
+            kernels = {name for stage in begun for name in stage.kernels}
             run_tasks(
                 [
                     *(_compilation(name, display) for name in JOBS if name in kernels),

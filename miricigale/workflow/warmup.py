@@ -10,14 +10,14 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import logging
-import multiprocessing
 import os
 import platform
+import subprocess
 import sys
+import threading
 from pathlib import Path
 
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.parallel import end_with_parent
 
 __all__ = ["JOBS", "compile_apart", "compile_job", "describe_job", "is_compiled"]
 
@@ -207,6 +207,11 @@ def compile_job(name):
     name : str
         One of `JOBS`.
 
+    Returns
+    -------
+    is_kept : bool
+        Whether they are.
+
     Raises
     ------
     ValueError
@@ -219,14 +224,16 @@ def compile_job(name):
         path.touch()
     except OSError:
         log.debug("%s cannot be written", path)
+    return is_compiled(name)
 
 
 def compile_apart(name):
     """
     Run one job in a process of its own, which ends with this one.
 
-    Code that a process has compiled itself differs from what it keeps on disk in the last digit
-    of results: a run whose processes all load what is on disk gives the same bytes as the next.
+    A process that has compiled a kernel uses other copies of what that calls than one that loads
+    it from disk, and they may differ in the last digit of a sum: if all processes of a run load
+    their kernels, the first run gives the same bytes as the next.
 
     Parameters
     ----------
@@ -238,15 +245,19 @@ def compile_apart(name):
     is_kept : bool
         Whether its kernels are on disk.
     """
-    child = multiprocessing.get_context("spawn").Process(target=_child, args=(_check(name),))
-    child.start()
-    child.join()
+    path = os.pathsep.join(filter(None, [str(_PACKAGE.parent), os.environ.get("PYTHONPATH")]))
+    with subprocess.Popen(
+        [sys.executable, "-m", __name__, _check(name)],
+        # closed when this process ends, however it ends
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        # the terminal's Ctrl-C is for this process
+        start_new_session=True,
+        env={**os.environ, "PYTHONPATH": path},
+    ) as child:
+        child.wait()
     return is_compiled(name)
-
-
-def _child(name):
-    end_with_parent()
-    compile_job(name)
 
 
 def is_compiled(name):
@@ -292,3 +303,15 @@ def _processor():
         return f"{platform.machine()} {platform.processor()}"
     wanted = ("model name", "flags", "Features", "CPU part")
     return "\n".join(dict.fromkeys(line for line in lines if line.startswith(wanted)))
+
+
+def _end_with_stdin():
+    sys.stdin.buffer.read()
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    threading.Thread(target=_end_with_stdin, daemon=True).start()
+    compile_job(sys.argv[1])
+    # at once: the thread holds the lock of stdin
+    os._exit(0)

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -84,8 +85,30 @@ def test_what_is_compiled_is_known(cache, monkeypatch):
     assert not warmup.is_compiled("photometry")
 
 
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
+def test_compilation_ends_with_the_process_that_asked_for_it(tmp_path):
+    code = "from miricigale.workflow.warmup import compile_apart\ncompile_apart('images')"
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path)}
+    parent = subprocess.Popen([sys.executable, "-c", code], env=env)
+    children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children")
+    deadline = time.monotonic() + 60
+    while not children.read_text().split() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    (child,) = children.read_text().split()
+    parent.kill()
+    parent.wait(timeout=60)
+    while Path(f"/proc/{child}/cmdline").exists() and time.monotonic() < deadline + 60:
+        # a process that ended but was not waited for has no command line
+        if not Path(f"/proc/{child}/cmdline").read_bytes():
+            break
+        time.sleep(0.05)
+    else:
+        assert not Path(f"/proc/{child}").exists()
+    assert not warmup.is_compiled("images")
+
+
 def test_unknown_jobs_are_refused():
-    for function in (warmup.is_compiled, warmup.compile_job, warmup.describe_job):
+    for function in (warmup.is_compiled, warmup.compile_job, warmup.compile_apart):
         with pytest.raises(ValueError, match="'name' must be one of fit, images"):
             function("fits")
 
