@@ -4,6 +4,7 @@ import functools
 import io
 import json
 import os
+import re
 import warnings
 from pathlib import Path
 
@@ -37,10 +38,16 @@ def read_manifest(folder):
             raise ValueError(msg)
         names = {key: manifest[key] for key in ("job", "parts")}
         names["job"]["catalogue"]["rows"], names["job"]["chunk_rows"]
+        for name, record in names["parts"].items():
+            # parts are removed by these names
+            if not re.fullmatch(r"part-[0-9]{5,}\.fits", name):
+                msg = f"it names {name!r}, which is no part"
+                raise ValueError(msg)
+            record["rows"], record["fitted"], record["bytes"], record["sha256"]
     except FileNotFoundError as err:
         msg = f"{folder} holds no results of fit_file (no {MANIFEST})"
         raise DataError(msg) from err
-    except (OSError, ValueError, KeyError, TypeError) as err:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:
         msg = f"{path} is no manifest of fit_file: {err}"
         raise DataError(msg) from err
     return manifest
@@ -50,6 +57,8 @@ def write_manifest(folder, manifest):
     """Write the manifest under another name and rename it."""
     path = Path(folder) / MANIFEST
     temporary = path.with_name(MANIFEST + ".tmp")
+    # somebody may have put a link there, which would be followed
+    temporary.unlink(missing_ok=True)
     with writing(path):
         temporary.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
     os.replace(temporary, path)
@@ -222,6 +231,7 @@ class FitResultsFiles:
             raise OSError(msg)
         width = max((part_ids(item).dtype.itemsize for item in self.paths), default=0)
         temporary = path.with_name(path.name + ".tmp")
+        temporary.unlink(missing_ok=True)
         try:
             with writing(path), open(temporary, "wb") as stream:
                 n_bytes = _write_rows(stream, self._tables(columns), len(self), width)

@@ -383,6 +383,7 @@ def _differences(old, new, prefix=""):
 def _write_part(results, path):
     """Write a part under another name and rename it; returns its record."""
     temporary = path.with_name(path.name + ".tmp")
+    temporary.unlink(missing_ok=True)
     try:
         results.write(temporary, overwrite=True)
         record = {

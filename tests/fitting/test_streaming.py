@@ -2,7 +2,9 @@
 
 import csv
 import gzip
+import json
 import pickle
+import re
 import signal
 import subprocess
 import sys
@@ -392,6 +394,35 @@ def test_a_fit_that_was_killed_at_its_first_moment_goes_on(fitter, catalogue, tm
     (out / "manifest.json.tmp").write_text("{")
     assert len(fit_file(fitter, path, out)) == 150
     assert not (out / "fit.lock").exists()
+
+
+@pytest.mark.parametrize("resume", [True, False])
+@pytest.mark.parametrize("name", ["../victim", "{}/victim", "part-00000.fits/../../victim"])
+def test_a_manifest_that_names_other_files_is_refused(fitter, catalogue, tmp_path, name, resume):
+    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
+    catalogue.write(path)
+    fit_file(fitter, path, out)
+    (tmp_path / "victim").write_text("mine")
+    name = name.format(tmp_path)
+    manifest = json.loads((out / "manifest.json").read_text())
+    manifest["parts"][name] = manifest["parts"]["part-00000.fits"]
+    (out / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(DataError, match=f"names '{re.escape(name)}', which is no part"):
+        fit_file(fitter, path, out, resume=resume)
+    assert (tmp_path / "victim").read_text() == "mine"
+    assert (out / "part-00000.fits").is_file()
+
+
+def test_links_under_temporary_names_are_not_followed(fitter, catalogue, tmp_path):
+    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
+    catalogue.write(path)
+    (tmp_path / "victim").write_text("mine")
+    fit_file(fitter, path, out)
+    for name in ("manifest.json", "part-00000.fits", "table.fits"):
+        (out / f"{name}.tmp").symlink_to(tmp_path / "victim")
+    fit_file(fitter, path, out, resume=False).write_table(out / "table.fits")
+    assert (tmp_path / "victim").read_text() == "mine"
+    assert not any(entry.is_symlink() for entry in out.iterdir())
 
 
 def test_numbers_as_ids(fitter, catalogue, tmp_path):
