@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import secrets
+import stat
 import subprocess
 import time
 import weakref
@@ -135,6 +136,10 @@ class FolderLock:
     def _replace(self, spare, give_up):
         """Whether the lock of a process that is gone was taken over; False to try again."""
         try:
+            # a link that leads nowhere could neither be made nor read, a pipe be waited for
+            if not stat.S_ISREG(os.lstat(self.path).st_mode):
+                msg = f"{self.path} is no plain file, as locks are: remove it"
+                raise DataError(msg)
             handle = os.open(self.path, os.O_RDWR)
         except FileNotFoundError:
             return False
@@ -226,7 +231,7 @@ def _owner(text):
     try:
         owner = json.loads(text)
         return owner if isinstance(owner["pid"], int) and isinstance(owner["host"], str) else None
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         return None
 
 

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import logging
+import operator
 import os
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -160,8 +161,8 @@ class ProductStore(ProductFolder):
             for record in records.values():
                 record["hash"], float(record["seconds"])
                 for product in record["products"].values():
-                    product["sha256"], int(product["bytes"])
-        except (ValueError, KeyError, TypeError, AttributeError) as err:
+                    product["sha256"], operator.index(product["bytes"])
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:
             log.warning("%s is damaged (%s: %s)", path, type(err).__name__, err)
             return False
         for record in records.values():
@@ -194,6 +195,10 @@ class ProductStore(ProductFolder):
             not self.folder.is_dir()
             or any(not e.name.startswith((LOCK, PARTIAL)) for e in self.folder.iterdir())
         ):
+            if self.path(MANIFEST).is_file():
+                # another run began between the two looks
+                self._load()
+                return
             msg = (
                 f"{self.folder} exists, is not empty and is no run's folder; choose another "
                 "with --output"

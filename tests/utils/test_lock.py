@@ -181,7 +181,7 @@ def test_locks_of_an_earlier_form_hold_a_number_only(tmp_path, holder):
             assert content(tmp_path)["pid"] == os.getpid()
 
 
-@pytest.mark.parametrize("text", ["", "{", "[1]", '{"pid": "x"}', "\x00\xff"])
+@pytest.mark.parametrize("text", ["", "{", "[1]", '{"pid": "x"}', "\x00\xff", "[" * 60000])
 def test_what_cannot_be_read_is_taken_over_once_it_is_old(tmp_path, monkeypatch, text):
     monkeypatch.setattr(lock, "_PATIENCE", 0.1)
     path = tmp_path / "run.lock"
@@ -192,6 +192,23 @@ def test_what_cannot_be_read_is_taken_over_once_it_is_old(tmp_path, monkeypatch,
     os.utime(path, (old, old))
     with FolderLock(tmp_path):
         assert content(tmp_path)["pid"] == os.getpid()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda path: path.symlink_to(path.with_name("nowhere")),
+        lambda path: path.symlink_to(path),
+        lambda path: os.mkfifo(path),
+        lambda path: path.mkdir(),
+    ],
+    ids=["dangling link", "endless link", "pipe", "folder"],
+)
+def test_what_is_no_file_is_refused_at_once(tmp_path, make):
+    make(tmp_path / "run.lock")
+    with pytest.raises(DataError, match=r"run\.lock is no plain file"), FolderLock(tmp_path):
+        pass
+    assert [entry.name for entry in tmp_path.iterdir()] == ["run.lock"]
 
 
 def test_a_lock_made_anew_by_hand_is_left_to_its_owner(tmp_path):

@@ -1,5 +1,6 @@
 import json
 import os
+from pathlib import Path
 
 import pytest
 
@@ -71,7 +72,19 @@ def test_a_product_cannot_be_written_through_a_link(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["manifest.json", ".manifest.copy.json"])
-@pytest.mark.parametrize("text", [None, "", "[]", "{", '{"stages": {"x": {}}}', '{"stages": [1]}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        None,
+        "",
+        "[]",
+        "{",
+        "[" * 100_000,
+        '{"stages": {"x": {}}}',
+        '{"stages": [1]}',
+        '{"stages": {"x": {"hash": "", "seconds": 0, "products": {"y": {"sha256": "", "bytes": 1e999}}}}}',
+    ],
+)
 def test_a_lost_or_damaged_manifest_is_replaced_by_its_copy(folder, name, text):
     whole = (folder / "manifest.json").read_text()
     if text is None:
@@ -102,6 +115,21 @@ def test_a_foreign_folder_is_refused(tmp_path):
     (tmp_path / "precious.txt").write_text("mine")
     with pytest.raises(DataError, match="is no run's folder"):
         ProductStore(tmp_path)
+
+
+def test_a_run_that_began_between_two_looks_is_no_foreign_folder(tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    look = Path.iterdir
+
+    def begun(self):
+        monkeypatch.setattr(Path, "iterdir", look)
+        with ProductStore(folder) as other:
+            other.begin({}, "# mine", write=True)
+        return look(self)
+
+    monkeypatch.setattr(Path, "iterdir", begun)
+    assert ProductStore(folder).is_sound
 
 
 def test_a_run_that_was_killed_at_once_can_begin_again(tmp_path):
