@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import logging
 import os
@@ -198,17 +199,14 @@ class StudyRunner:
             self._execute(store, states)
         return store
 
-    def _values(self):
-        return json.loads(json.dumps(dataclasses.asdict(self.config)))
-
     def _config_stands(self, store):
         """Whether manifest and ``config.toml`` say what this run does."""
-        return store.config == self._values() and self._file_stands(store)
+        return store.config == _values(self.config) and self._file_stands(store)
 
     def _file_stands(self, store):
         """Whether the ``config.toml`` in the folder says what this run does."""
         try:
-            return load_config(store.path(CONFIG)) == self.config
+            return _values(load_config(store.path(CONFIG))) == _values(self.config)
         except (ConfigError, OSError, ValueError):
             return False
 
@@ -218,8 +216,9 @@ class StudyRunner:
         edited = store.edited_config()
         if edited is not None and not self._file_stands(store):
             msg = (
-                f"{edited} was edited since the run that made this folder, and this run has another "
-                f"configuration, which would replace it; run {edited} itself to use it"
+                f"{edited} was edited since the run that made this folder (or that run was of an "
+                f"earlier version), and this run has another configuration, which would replace it; "
+                f"run {edited} itself to use it"
             )
             raise OtherResultsError(msg, _REMEDY)
         again = [key for key, state in states.items() if state in ("changed", "surplus")]
@@ -233,16 +232,17 @@ class StudyRunner:
 
     def _differences(self, store):
         """What is other in the configuration, in words."""
-        old, new = store.config or {}, self._values()
+        old, new = store.config or {}, _values(self.config)
         changes = [
             f"[{section}] {key}: {_short(old.get(section, {}).get(key))} -> {_short(value)}"
             for section, values in new.items()
             for key, value in values.items()
-            if old
-            and old.get(section, {}).get(key) != value
-            and (section, key) != ("run", "threads")
+            if old and old.get(section, {}).get(key) != value
         ]
-        return "; ".join(changes) or "by another version of the package, its data or the catalog"
+        return "; ".join(changes) or (
+            "by another version of the package, its data or the catalog, or before a redo that was "
+            "stopped"
+        )
 
     def _write_config(self, store):
         if self._config_stands(store):
@@ -250,9 +250,13 @@ class StudyRunner:
         stands, edited = self._file_stands(store), store.edited_config()
         if edited is not None and not stands:
             kept = edited.with_name("config.edited.toml")
+            for n in itertools.count(2):
+                if not os.path.lexists(kept):
+                    break
+                kept = edited.with_name(f"config.edited{n}.toml")
             os.replace(edited, kept)
             log.warning("the edited %s is kept as %s", edited, kept.name)
-        store.begin(self._values(), self.config.to_toml(), write=not stands)
+        store.begin(_values(self.config), self.config.to_toml(), write=not stands)
 
     def _tell(self, text):
         if self.progress_bar:
@@ -356,6 +360,14 @@ class _Display:
         if self._lines and len(spent) == len(stage.unit_names(config)) and any(spent):
             units = f" ({len(spent)})" if len(spent) > 1 else ""
             print_line(f"{stage.title}{units}: {sum(spent):.1f} s")
+
+
+def _values(config):
+    """Plain values of what products may depend on."""
+    values = json.loads(json.dumps(dataclasses.asdict(config)))
+    # how a run is done changes no product
+    del values["run"]["threads"], values["run"]["memory"]
+    return values
 
 
 def _summary(keys):

@@ -92,14 +92,18 @@ def run_tasks(tasks, *, executor=None, n_threads=1, memory=float("inf"), tell=No
         if task is not None:
             waiting.remove(task)
             together = min(slots, len(running) + len(ready))
-            future = task.begin(submit, n_threads // together)
+            try:
+                future = task.begin(submit, n_threads // together)
+            except BrokenExecutor as err:
+                raise _died(task) from err
             if future is not None:
                 running[future] = task
                 if tell is not None:
                     tell([other.title for other in running.values()])
         elif running:
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                error = _finish(running.pop(future), future) or error
+                failed = _finish(running.pop(future), future)
+                error = error or failed
         elif error is not None:
             raise error
         else:
@@ -111,8 +115,7 @@ def _finish(task, future):
     try:
         result = future.result()
     except BrokenExecutor as err:
-        msg = f"a process ended during {task.title}; was there too little memory?"
-        raise DataError(msg) from err
+        raise _died(task) from err
     except Exception as err:
         if not task.is_optional:
             return err
@@ -121,6 +124,10 @@ def _finish(task, future):
     if task.finish is not None:
         task.finish(result)
     return None
+
+
+def _died(task):
+    return DataError(f"a process ended during {task.title}; was there too little memory?")
 
 
 def _ready(waiting, running):

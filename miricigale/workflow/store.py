@@ -245,11 +245,12 @@ class ProductStore(ProductFolder):
         self._write_manifest()
 
     def edited_config(self):
-        """Path of ``config.toml`` if somebody changed it since the last run, otherwise None."""
+        """Path of ``config.toml`` if it is not what the last run is known to have written, or None."""
         path = self.path(CONFIG)
-        if self.config_sha256 is None or not path.is_file():
-            return None
-        return path if file_sha256(path) != self.config_sha256 else None
+        # earlier versions noted none: it may have been edited
+        if path.is_file() and file_sha256(path) != self.config_sha256:
+            return path
+        return None
 
     def is_whole(self, key):
         """Whether all products of a record stand with the right checksums."""

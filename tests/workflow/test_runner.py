@@ -1,7 +1,8 @@
+import json
 import shutil
 import threading
 import types
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, ThreadPoolExecutor
 
 import pytest
 
@@ -120,16 +121,41 @@ def test_an_edited_configuration_is_not_overwritten(tmp_path):
     recorder.run(folder, redo=True)
     assert (folder / "config.edited.toml").read_text() == edited
     assert load_config(path) == StudyConfig()
+    # nor is what was kept the first time
+    path.write_text(edited.replace("mine", "mine again"))
+    recorder.run(folder, redo=True)
+    assert (folder / "config.edited.toml").read_text() == edited
+    assert "mine again" in (folder / "config.edited2.toml").read_text()
 
 
-def test_a_finished_run_writes_nothing(tmp_path, monkeypatch):
+def test_a_configuration_of_which_no_checksum_is_known_is_kept(tmp_path):
+    recorder, folder = Recorder(), tmp_path / "run"
+    recorder.run(folder)
+    values = json.loads((folder / "manifest.json").read_text())
+    # as an earlier version wrote it
+    (folder / "manifest.json").write_text(json.dumps({"stages": values["stages"]}))
+    (folder / ".manifest.copy.json").unlink()
+    assert recorder.run(folder) == []
+    (folder / "manifest.json").write_text(json.dumps({"stages": values["stages"]}))
+    (folder / ".manifest.copy.json").unlink()
+    before = (folder / "config.toml").read_text()
+    other = StudyConfig.from_dict({"fit": {"model_error": 0.2}})
+    with pytest.raises(OtherResultsError, match=r"edited since .*or that run was of an earlier"):
+        recorder.run(folder, other)
+    assert recorder.run(folder, other, redo=True) == []
+    assert (folder / "config.edited.toml").read_text() == before
+
+
+@pytest.mark.parametrize("values", [{}, {"threads": 1}, {"memory": 0.5}])
+def test_a_finished_run_writes_nothing(tmp_path, monkeypatch, values):
     recorder, folder = Recorder(), tmp_path / "run"
     recorder.run(folder)
     before = {p.name: p.stat().st_mtime_ns for p in folder.iterdir()}
     # not even a lock: the disk may be full, the folder read-only
     monkeypatch.setattr(shutil, "disk_usage", lambda _: types.SimpleNamespace(free=0))
     monkeypatch.setattr(ProductStore, "__enter__", None)
-    StudyRunner(StudyConfig(), folder, recorder.stages(), disk=10**12).run()
+    config = StudyConfig.from_dict({"run": values})
+    StudyRunner(config, folder, recorder.stages(), disk=10**12).run()
     assert {p.name: p.stat().st_mtime_ns for p in folder.iterdir()} == before
 
 
@@ -317,6 +343,40 @@ def test_what_runs_beside_a_unit_that_fails_is_kept(tmp_path):
         StudyRunner(config, tmp_path / "run", [stage], executor=executor).run()
     assert "in stage one:bad" in err.value.__notes__
     assert set(ProductStore(tmp_path / "run").records) == {"one:good"}
+
+
+def test_the_first_of_several_errors_is_raised(tmp_path):
+    both, failed = threading.Barrier(2), threading.Event()
+
+    def work(context, unit):
+        both.wait(5)
+        if unit == "second":
+            failed.wait(5)
+        raise ValueError(unit)
+
+    stage = Stage("one", work, "one", units=lambda _: ("first", "second"))
+
+    class Submits(ThreadPoolExecutor):
+        def submit(self, function, *args, **kwargs):
+            future = super().submit(function, *args, **kwargs)
+            if args[4] == "first":
+                # when its end has been seen
+                future.add_done_callback(lambda _: threading.Timer(0.2, failed.set).start())
+            return future
+
+    config = StudyConfig.from_dict({"run": {"threads": 2}})
+    with Submits(2) as executor, pytest.raises(ValueError, match="first"):
+        StudyRunner(config, tmp_path / "run", [stage], executor=executor).run()
+
+
+def test_a_process_that_died_before_a_unit_began_is_told(tmp_path):
+    class Broken(Executor):
+        def submit(self, *_, **__):
+            raise BrokenExecutor
+
+    stage = Stage("one", None, "one")
+    with pytest.raises(DataError, match="a process ended during one"):
+        StudyRunner(StudyConfig(), tmp_path / "run", [stage], executor=Broken()).run()
 
 
 def test_kernels_are_compiled_before_what_calls_them(tmp_path, monkeypatch):
