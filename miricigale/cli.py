@@ -71,7 +71,7 @@ def _parser():
         default=True,
         help="go on with what is in the folder, or replace it",
     )
-    fit.add_argument("--threads", type=int, default=1, help="threads")
+    fit.add_argument("--threads", type=int, default=1, help="threads (0 for all cores)")
     fit.add_argument("--no-progress", action="store_true", help="no progress bar")
 
     phot = commands.add_parser("photometry", help="forced photometry on a high-resolution prior")
@@ -145,11 +145,12 @@ def _run(args):
 
 def _fit(args):
     from miricigale.utils.exceptions import OtherResultsError
-    from miricigale.utils.parallel import thread_pool
+    from miricigale.utils.parallel import thread_count, thread_pool
     from miricigale.workflow.commands import fit_catalogue
 
+    n_threads = thread_count(args.threads or None)
     try:
-        with thread_pool(max(1, args.threads)) as executor:
+        with thread_pool(n_threads) as executor:
             results = fit_catalogue(
                 args.photometry,
                 args.output,
@@ -161,7 +162,7 @@ def _fit(args):
                 hdu=int(args.hdu) if (args.hdu or "").isdigit() else args.hdu,
                 chunk_rows=args.chunk_rows,
                 resume=args.resume,
-                executor=executor if args.threads > 1 else None,
+                executor=executor if n_threads > 1 else None,
                 progress_bar=not args.no_progress,
             )
         table = args.output / "table.fits"

@@ -29,9 +29,7 @@ class RunSection:
     name: str = _option("study", "Name of the run; its folder unless --output is given.")
     seed: int = _option(20210211, "Seed of every random draw.", low=0)
     threads: int = _option(0, "Threads; 0 for as many as there are cores.", low=0)
-    memory: float = _option(
-        0.0, "Memory (GB) that steps side by side may take; 0 for half of the machine's.", low=0.0
-    )
+    memory: float = _option(0.0, "Memory (GB) of steps side by side; 0 for half of all.", low=0.0)
     keep_level1b: bool = _option(False, "Whether the level-1b (uncal) files are kept.")
 
 

@@ -22,6 +22,8 @@ from miricigale.workflow.warmup import JOBS, compile_apart, describe_job, is_com
 __all__ = ["StudyRunner", "run_stages"]
 
 log = logging.getLogger(__name__)
+# the command line shows what it says to everyone
+_compilation_log = logging.getLogger("miricigale.utils.compilation")
 
 #: Bytes that a process takes for a unit whose stage does not say how many: measured, of a field
 #: of one pointing.
@@ -213,22 +215,23 @@ class StudyRunner:
     def _refuse_replacing(self, store, states):
         if self.redo:
             return
+        reasons = []
         edited = store.edited_config()
         if edited is not None and not self._file_stands(store):
-            msg = (
+            reasons.append(
                 f"{edited} was edited since the run that made this folder (or that run was of an "
-                f"earlier version), and this run has another configuration, which would replace it; "
+                f"earlier version), and this run has another configuration, which would replace it: "
                 f"run {edited} itself to use it"
             )
-            raise OtherResultsError(msg, _REMEDY)
         again = [key for key, state in states.items() if state in ("changed", "surplus")]
         if again:
-            msg = (
+            reasons.append(
                 f"{self.folder} holds {len(again)} finished steps of another run "
                 f"({self._differences(store)}), which would be done again or removed: "
                 f"{_summary(again)}"
             )
-            raise OtherResultsError(msg, _REMEDY)
+        if reasons:
+            raise OtherResultsError("; ".join(reasons), _REMEDY)
 
     def _differences(self, store):
         """What is other in the configuration, in words."""
@@ -324,7 +327,7 @@ def _compilation(name, display):
     def begin(submit, _):
         if is_compiled(name):
             return None
-        display.line(describe_job(name))
+        display.compilation(describe_job(name))
         return submit(compile_apart, name)
 
     return Task(f"compile {name}", "compilation", begin, memory=_MEMORY, is_optional=True)
@@ -345,9 +348,12 @@ class _Display:
     def __exit__(self, *exc):
         self._bar.close()
 
-    def line(self, text):
+    def compilation(self, text):
+        """Say what is compiled, also where no progress is shown."""
         if self._lines or self.is_bar:
             print_line(text)
+        else:
+            _compilation_log.info(text)
 
     def begin(self, titles):
         self._bar.set_description(", ".join(titles))

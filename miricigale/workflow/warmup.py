@@ -32,9 +32,11 @@ def _fit():
     from miricigale.fitting import BayesFitter
     from miricigale.sed import SEDModel
 
-    for agn in (False, True):
-        table = QTable({"id": [1], "redshift": [1.0], "mass": [1e10]})
-        SEDModel.yang2021(agn=agn).fluxes(table, _BANDS)
+    table = QTable({"id": [1], "redshift": [1.0], "mass": [1e10]})
+    SEDModel.yang2021(agn=False).fluxes(table, _BANDS)
+    # without a share of the light an AGN is left out
+    table["frac_agn"] = [0.4]
+    SEDModel.yang2021().fluxes(table, _BANDS)
     fitter = BayesFitter(SEDModel.yang2021(), _BANDS, axes=_axes(), model_error=0.1)
     table = _photometry_table()
     fitter.fit(table)

@@ -55,6 +55,14 @@ def test_a_catalogue_becomes_a_folder_of_results(catalogue, tmp_path, capsys):
     assert open_results(out).n_parts == 2
 
 
+def test_a_number_of_threads_that_cannot_be_is_refused(catalogue, tmp_path, capsys):
+    catalogue.write(tmp_path / "cat.fits")
+    out = tmp_path / "out"
+    assert main(["fit", str(tmp_path / "cat.fits"), "-o", str(out), "--threads", "-1"]) == 2
+    assert "at least 1 and an integer, got -1" in capsys.readouterr().err
+    assert not out.exists()
+
+
 def test_ctrl_c_keeps_what_is_finished(catalogue, tmp_path, capsys, monkeypatch):
     catalogue.write(tmp_path / "cat.ecsv")
     out = tmp_path / "out"

@@ -121,6 +121,10 @@ def test_an_edited_configuration_is_not_overwritten(tmp_path):
     recorder.run(folder, redo=True)
     assert (folder / "config.edited.toml").read_text() == edited
     assert load_config(path) == StudyConfig()
+    # whatever else there is to say
+    path.write_text(edited)
+    with pytest.raises(OtherResultsError, match=r"was edited since.*3 finished steps"):
+        recorder.run(folder, StudyConfig.from_dict({"run": {"seed": 7}}))
     # nor is what was kept the first time
     path.write_text(edited.replace("mine", "mine again"))
     recorder.run(folder, redo=True)
@@ -379,8 +383,9 @@ def test_a_process_that_died_before_a_unit_began_is_told(tmp_path):
         StudyRunner(StudyConfig(), tmp_path / "run", [stage], executor=Broken()).run()
 
 
-def test_kernels_are_compiled_before_what_calls_them(tmp_path, monkeypatch):
+def test_kernels_are_compiled_before_what_calls_them(tmp_path, monkeypatch, caplog):
     order = []
+    caplog.set_level("INFO", logger="miricigale.utils.compilation")
 
     def work(context, _):
         order.append(context.stage_name)
@@ -414,3 +419,6 @@ def test_kernels_are_compiled_before_what_calls_them(tmp_path, monkeypatch):
             # one that fails is compiled where it is called
             assert order.index("compiled photometry") < order.index("c")
         order.clear()
+    # never silent, also where no progress is shown
+    told = [line for line in caplog.messages if line.startswith("compiling")]
+    assert len(told) == 2
