@@ -253,15 +253,39 @@ def thread_count(n_threads=None):
     return int(n_threads)
 
 
+class _SingleThreaded:
+    """Limits all threads of this process: from the first that enters to the last that leaves."""
+
+    def __init__(self):
+        self._lock = threading.Lock()
+        self._users, self._limits = 0, []
+
+    def __enter__(self):
+        with self._lock:
+            self._users += 1
+            # not only the first: libraries may have been loaded since
+            if any(pool["num_threads"] > 1 for pool in threadpoolctl.threadpool_info()):
+                self._limits.append(threadpoolctl.threadpool_limits(1))
+
+    def __exit__(self, *exc):
+        with self._lock:
+            self._users -= 1
+            while self._limits and not self._users:
+                self._limits.pop().restore_original_limits()
+
+
+_single_threaded = _SingleThreaded()
+
+
 def single_threaded():
     """
-    Context in which linear algebra runs on one core.
+    Context in which linear algebra runs on one core, in all threads of this process.
 
     Sums that are cut into other pieces differ in the last digit, and samplers would then go
     other ways. On many small matrices the threads of the linear algebra moreover wait for each
     other longer than they work.
     """
-    return threadpoolctl.threadpool_limits(1)
+    return _single_threaded
 
 
 def chunks(n, size):

@@ -56,7 +56,8 @@ def _images():
     from miricigale.workflow.config import load_config
     from miricigale.workflow.stages.images import expose_and_reduce, reducer_of
 
-    config = load_config("goodss", quick=True)
+    # what is off by default calls more
+    config = load_config("goodss", quick=True, overrides={"detector": {"residual": 0.01}})
     center = SkyCoord(config.pointing.ra * u.deg, config.pointing.dec * u.deg)
     catalog = _catalog(center)
     exposures = Exposure(

@@ -6,12 +6,13 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+import threadpoolctl
 
 import miricigale
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.meta import provenance
 from miricigale.utils.optional import require
-from miricigale.utils.parallel import chunks, parallel_map, thread_count
+from miricigale.utils.parallel import chunks, parallel_map, single_threaded, thread_count
 from miricigale.utils.progress import progress
 
 
@@ -94,3 +95,17 @@ def test_package_lists_its_classes_without_loading_them():
     assert miricigale.Filter.__name__ == "Filter"
     with pytest.raises(AttributeError, match="has no attribute 'Nonsense'"):
         miricigale.Nonsense  # noqa: B018
+
+
+def test_linear_algebra_stays_on_one_core_until_the_last_thread_is_done():
+    def cores():
+        return {pool["num_threads"] for pool in threadpoolctl.threadpool_info()}
+
+    with threadpoolctl.threadpool_limits(2):
+        before = cores()
+        first, second = single_threaded(), single_threaded()
+        first.__enter__()
+        with second:
+            first.__exit__(None, None, None)
+            assert cores() == {1}
+        assert cores() == before
