@@ -74,14 +74,7 @@ def _parser():
     fit.add_argument("--threads", type=int, default=1, help="threads (0 for all cores)")
     fit.add_argument("--no-progress", action="store_true", help="no progress bar")
 
-    phot = commands.add_parser("photometry", help="forced photometry on a high-resolution prior")
-    phot.add_argument("image", type=Path, help="MIRI mosaic (FITS with SCI and ERR, MJy/sr)")
-    phot.add_argument("highres", type=Path, help="high-resolution image (likewise)")
-    phot.add_argument("--filter", required=True, help="filter of the mosaic, such as miri.f770w")
-    phot.add_argument(
-        "--pa-aper", type=float, required=True, help="PA of the detector's y axis (deg)"
-    )
-    phot.add_argument("-o", "--output", type=Path, default=Path("photometry.ecsv"), help="table")
+    _photometry_parser(commands)
 
     plan = commands.add_parser("plan", help="saturation and depth of the CEERS exposures")
     plan.add_argument("--quick", action="store_true", help="of the quick exposures instead")
@@ -100,6 +93,49 @@ def _parser():
     add.add_argument("name", help="resource name, as 'miricigale data list' has it")
     add.add_argument("path", type=Path, help="file, folder or archive as distributed")
     return parser
+
+
+def _photometry_parser(commands):
+    phot = commands.add_parser("photometry", help="forced photometry on a high-resolution prior")
+    add = phot.add_argument
+    add("positional", nargs="*", metavar="IMAGE HIGHRES", help="the two images, without options")
+    add("--image", metavar="FITS", help="image to be measured; FILE[EXTENSION] names an extension")
+    add("--highres", metavar="FITS", help="high-resolution image: the prior")
+    add("--filter", help="filter of the image, such as miri.f770w, if its header does not tell")
+    add("--highres-filter", metavar="FILTER", help="filter of the prior, likewise")
+    add("--segmentation", metavar="FITS", help="segmentation map of the prior (else: detection)")
+    add("--catalog", metavar="TABLE", help="FITS, ECSV, CSV or plain table with id, ra, dec")
+    add("--kernel", metavar="FITS", help="kernel from prior to image; FILE[EXT,PLANE] of a cube")
+    add("--psf", metavar="FITS", help="PSF of the image; FILE[EXT,PLANE] or FILE[EXT,mean]")
+    add("--highres-psf", metavar="FITS", help="PSF of the prior, likewise")
+    add("--psf-scale", type=float, metavar="ARCSEC", help="pixel of the PSF (else: the image's)")
+    add("--highres-psf-scale", type=float, metavar="ARCSEC", help="pixel of the prior's PSF")
+    add("--pa-aper", type=float, metavar="DEG", help="PA of the detector's y axis, for MIRI's PSF")
+    for prefix, what in (("", "image"), ("highres-", "prior")):
+        noise = phot.add_mutually_exclusive_group()
+        for kind in _NOISE:
+            noise.add_argument(
+                f"--{prefix}{kind}", metavar="FITS", help=f"{kind.replace('-', ' ')} map ({what})"
+            )
+        add(f"--{prefix}unit", help=f"unit of the {what}, such as '10 nJy' (else: BUNIT)")
+        add(f"--{prefix}zero-point", type=float, metavar="AB", help=f"of one count of the {what}")
+        add(
+            f"--{prefix}background-box",
+            type=int,
+            metavar="PIXELS",
+            help=f"subtract a background measured in such boxes of the {what}",
+        )
+    add("--no-background", action="store_true", help="fit no constant with the sources")
+    add("--max-shift", type=float, metavar="ARCSEC", help="fit a shift of the image up to this")
+    add("-o", "--output", type=Path, default=Path("photometry.ecsv"), help="table, ECSV or FITS")
+    add("--page", type=Path, help="HTML page (default: beside the table)")
+    add("--overwrite", action="store_true", help="replace table and page")
+    add("--threads", type=int, help="threads (default: all cores)")
+    add("--seed", type=int, default=1, help="seed of the empty positions of the page")
+    add("--no-progress", action="store_true", help="no progress bar")
+
+
+_NOISE = ("error", "variance", "inverse-variance", "weight")
 
 
 def _pair(text):
@@ -181,13 +217,47 @@ def _fit(args):
 
 
 def _photometry(args):
-    from miricigale.utils.files import writing
-    from miricigale.workflow.commands import measure_files
+    import astropy.units as u
 
-    table = measure_files(args.image, args.highres, filter=args.filter, pa_aper=args.pa_aper)
-    with writing(args.output):
-        table.write(args.output, overwrite=True)
-    print(f"{len(table)} sources in {args.output}")
+    from miricigale.photometry import MosaicFile
+    from miricigale.workflow.photometry import measure_files
+
+    paths = [path for path in (args.image, args.highres) if path is not None] + args.positional
+    if len(paths) != 2 or (args.positional and len(args.positional) != 2):
+        msg = "wanted are --image and --highres, or the two files without options"
+        raise ValueError(msg)
+
+    def described(path, prefix, filter_):
+        names = (*(kind.replace("-", "_") for kind in _NOISE), "unit", "zero_point")
+        names += ("background_box",)
+        options = {name: getattr(args, f"{prefix}{name}") for name in names}
+        return MosaicFile(path, filter=filter_, **options)
+
+    def arcsec(value):
+        return None if value is None else value * u.arcsec
+
+    page = args.page or args.output.with_suffix(".html")
+    table = measure_files(
+        described(paths[0], "", args.filter),
+        described(paths[1], "highres_", args.highres_filter),
+        segmentation=args.segmentation,
+        catalog=args.catalog,
+        kernel=args.kernel,
+        psf=args.psf,
+        highres_psf=args.highres_psf,
+        psf_scale=arcsec(args.psf_scale),
+        highres_psf_scale=arcsec(args.highres_psf_scale),
+        pa_aper=None if args.pa_aper is None else args.pa_aper * u.deg,
+        fit_background=not args.no_background,
+        max_shift=arcsec(args.max_shift),
+        output=args.output,
+        page=page,
+        overwrite=args.overwrite,
+        seed=args.seed,
+        n_threads=args.threads,
+        progress_bar=not args.no_progress,
+    )
+    print(f"{len(table)} sources in {args.output}; page: {page}")
     return 0
 
 

@@ -12,6 +12,9 @@ __getattr__, __dir__, __all__ = lazy_names(
         "flags": ("ForcedFlags",),
         "forced": ("ForcedPhotometer",),
         "limits": ("sensitivity", "sensitivity_table"),
+        "mosaics": ("MosaicFile", "read_mosaic"),
+        "priors": ("read_prior",),
+        "sky_noise": ("weight_scale",),
         "results": ("ForcedPhotometryResult", "crowded"),
     },
 )

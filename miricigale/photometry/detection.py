@@ -17,7 +17,13 @@ from miricigale.utils.sep_tools import extract
 from miricigale.utils.tables import Flags
 from miricigale.utils.units import ANGLE, FNU
 
-__all__ = ["DETECTION_PRESETS", "DetectionFlags", "DetectionPreset", "detect_sources"]
+__all__ = [
+    "DETECTION_PRESETS",
+    "DetectionFlags",
+    "DetectionPreset",
+    "bright_centroids",
+    "detect_sources",
+]
 
 
 class DetectionFlags(Flags):
@@ -157,14 +163,28 @@ def detect_sources(
     return SegmentationImage(labels), catalog
 
 
-def _positions(flux, labels, objects):
+def bright_centroids(flux, labels, fallback):
     """
     Centroids of the bright part of each segment.
 
     The centroid of a whole segment found at a low threshold is led astray by its ragged
     rim.
+
+    Parameters
+    ----------
+    flux : `~numpy.ndarray`, shape (ny, nx)
+        Light.
+    labels : int `~numpy.ndarray`, shape (ny, nx)
+        1 to n, 0 for the sky.
+    fallback : tuple of `~numpy.ndarray`, shape (n,)
+        Positions x, y of those without a bright part.
+
+    Returns
+    -------
+    x, y : `~numpy.ndarray`, shape (n,)
+        0-based pixels.
     """
-    n = len(objects)
+    n = len(fallback[0])
     if n == 0:
         return np.empty(0), np.empty(0)
     smooth = scipy.ndimage.gaussian_filter(flux, 1.5)
@@ -176,10 +196,10 @@ def _positions(flux, labels, objects):
     y, x, weight, label = y[core], x[core], weight[core], label[core]
     total = np.bincount(label, weight, n + 1)[1:]
     found = []
-    for values, fallback in ((x, objects["x"]), (y, objects["y"])):
+    for values, otherwise in ((x, fallback[0]), (y, fallback[1])):
         moment = np.bincount(label, weight * values, n + 1)[1:]
         with np.errstate(divide="ignore", invalid="ignore"):
-            found.append(np.where(total > 0, moment / total, fallback))
+            found.append(np.where(total > 0, moment / total, otherwise))
     return found
 
 
@@ -191,7 +211,7 @@ def _catalog(objects, labels, flux, arrays):
     total = np.bincount(flat, flux.ravel(), n + 1)[1:]
     noise = np.sqrt(np.bincount(flat, variance.ravel(), n + 1)[1:])
     scale = pixel_scale(arrays.wcs)
-    x, y = _positions(flux, labels, objects)
+    x, y = bright_centroids(flux, labels, (objects["x"], objects["y"]))
     sky = arrays.wcs.pixel_to_world(x, y) if n else SkyCoord([], [], unit="deg")
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = total / noise

@@ -23,6 +23,7 @@ __all__ = [
     "image_unit",
     "open_fits",
     "read_ecsv",
+    "split_extension",
     "unpacked_size",
     "write_fits",
     "writing",
@@ -129,6 +130,36 @@ def open_fits(path, *, wanted, **options):
             hdus.close()
         raise _unreadable(path, wanted, err) from err
     return hdus
+
+
+def split_extension(path):
+    """
+    Take ``file.fits[EXTENSION]`` apart.
+
+    Parameters
+    ----------
+    path : path-like
+        A file, with the name or number of an extension in brackets or without.
+
+    Returns
+    -------
+    path : str
+        The file.
+    extension : str, int or None
+        None without brackets, or if a file has this very name.
+
+    Examples
+    --------
+    >>> from miricigale.utils.files import split_extension
+    >>> split_extension("a.fits[SCI]"), split_extension("a.fits[1]"), split_extension("a.fits")
+    (('a.fits', 'SCI'), ('a.fits', 1), ('a.fits', None))
+    """
+    path = os.fspath(path)
+    name, bracket, rest = path.rpartition("[")
+    if not (bracket and name and rest.endswith("]")) or os.path.exists(path):
+        return path, None
+    extension = rest[:-1].strip()
+    return name, int(extension) if extension.isdigit() else extension
 
 
 def _judge(caught):

@@ -11,7 +11,7 @@ from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column
 
-__all__ = ["filter_table", "fit_catalogue", "measure_files", "plan_table"]
+__all__ = ["filter_table", "fit_catalogue", "plan_table"]
 
 
 def filter_table(pattern=""):
@@ -199,41 +199,3 @@ def fit_catalogue(
         executor=executor,
         progress_bar=progress_bar,
     )
-
-
-def measure_files(image, highres, *, filter, pa_aper):
-    """
-    Detect on a high-resolution image and measure on a MIRI mosaic.
-
-    Parameters
-    ----------
-    image, highres : path-like
-        FITS files with SCI, ERR (and MASK) in MJy/sr, north up, background subtracted.
-    filter : str
-        Filter of the mosaic.
-    pa_aper : float
-        Position angle of the detector's y axis in degrees.
-
-    Returns
-    -------
-    table : `~astropy.table.QTable`
-        ``id``, ``sky``, flux, error and flags of every detection.
-    """
-    from miricigale.workflow.products import read_image
-
-    mosaic, prior = (read_image(path, unit="MJy/sr") for path in (image, highres))
-    # after what is wrong with the files is known
-    from miricigale.photometry import ForcedPhotometer, detect_sources
-    from miricigale.psf import MatchingKernel, hst_psf, miri_psf, psf_mosaic
-
-    scales = [
-        np.sqrt(abs(np.linalg.det(i.wcs.pixel_scale_matrix))) * 3600 * u.arcsec
-        for i in (mosaic, prior)
-    ]
-    kernel = MatchingKernel.from_psfs(
-        hst_psf(pixel_scale=scales[1]),
-        psf_mosaic(miri_psf(filter), scales[0], pa_aper * u.deg),
-        pixel_scale=scales[1],
-    )
-    segmentation, detected = detect_sources(prior)
-    return ForcedPhotometer(kernel).measure(mosaic, prior, segmentation, detected).to_table()

@@ -1,0 +1,133 @@
+"""What the pixels of an image are in MJy/sr: units in headers, zero points, keywords."""
+
+import contextlib
+import re
+import warnings
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
+
+__all__ = ["calibration", "parsed_unit"]
+
+#: Names of count rates in headers that are no units of astropy.
+_COUNTS = (
+    (r"\bcps\b", "ct/s"),
+    (r"\belectrons?\b|\be-(?=[/ ]|$)|\be(?=/)", "electron"),
+    (r"\bcounts?\b", "ct"),
+    (r"\badu\b", "adu"),
+    (r"\bdn\b", "DN"),
+    (r"\bsec(?:onds?)?\b", "s"),
+)
+
+
+def parsed_unit(text):
+    """
+    The unit that a header's text means.
+
+    Parameters
+    ----------
+    text : str
+        Such as ``MJy/sr``, ``10.0*nanoJansky`` or ``ELECTRONS/S``.
+
+    Returns
+    -------
+    unit : `~astropy.units.Unit` or None
+        None if it means none.
+    """
+    plain = text
+    for pattern, name in _COUNTS:
+        plain = re.sub(pattern, name, plain, flags=re.IGNORECASE)
+    for one in (text, plain) if text else ():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", u.UnitsWarning)
+            with contextlib.suppress(TypeError, ValueError):
+                return u.Unit(one)
+    return None
+
+
+def calibration(path, text, zero_point, keywords):
+    """
+    What one unit of a pixel's value is.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, for messages.
+    text : str
+        Unit of the pixels; may be empty.
+    zero_point : float, `~astropy.units.Quantity` or None
+        AB magnitude of one count.
+    keywords : dict
+        Values of PHOTMJSR, PHOTFLAM and PHOTPLAM, or None.
+
+    Returns
+    -------
+    factor : `~astropy.units.Quantity`
+        In MJy/sr, or in MJy for fluxes in pixels.
+    source : str
+        Where it is from.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If there is no unit, or one that cannot be calibrated.
+    ValueError
+        If a zero point is given for fluxes, or is not finite.
+    """
+    unit = parsed_unit(text)
+    if unit is not None and u.pix in unit.bases:
+        unit = unit * u.pix
+    if unit is not None and not unit.is_equivalent(u.dimensionless_unscaled):
+        for target in (SURFACE_BRIGHTNESS, u.MJy):
+            if unit.is_equivalent(target):
+                if zero_point is not None:
+                    raise argument_error(
+                        "zero_point", f"left out for {path}, whose unit is {unit}", zero_point
+                    )
+                return unit.to(target) * target, f"unit {unit}"
+    if zero_point is not None:
+        zero = zero_point
+        zero = to_array(zero, u.ABmag, "zero_point") if hasattr(zero, "unit") else zero
+        zero = float(zero)
+        if not np.isfinite(zero):
+            raise argument_error("zero_point", "a finite AB magnitude", zero_point)
+        return (zero * u.ABmag).to(u.MJy), f"zero point {zero:g} AB"
+    if unit is None or unit.is_equivalent(u.dimensionless_unscaled):
+        msg = (
+            f"{path} must state the unit of its pixels: 'unit' such as 'MJy/sr' or '10 nJy', or "
+            f"'zero_point'; what it states is {text!r}"
+        )
+        raise DataError(msg)
+    rates = [base / u.s for base in (u.electron, u.ct, u.adu, u.DN, u.ph)]
+    rate = next((one for one in rates if unit.is_equivalent(one)), None)
+    if rate is None:
+        msg = (
+            f"{path} has pixels in {unit}, and wanted is a surface brightness, a flux in each pixel, "
+            "or a rate of counts; counts need 'zero_point'"
+        )
+        raise DataError(msg)
+    scale = unit.to(rate)
+    found = _header_calibrations(keywords)
+    if len(found) != 1:
+        what = "has both PHOTMJSR and PHOTFLAM" if found else "has neither PHOTMJSR nor PHOTFLAM"
+        msg = f"{path} has pixels in {unit} and its header {what}: 'zero_point' must be given"
+        raise DataError(msg)
+    name, factor = found[0]
+    return factor * scale, name
+
+
+def _header_calibrations(keywords):
+    """Brightness or flux of one count a second, by each calibration that a header has."""
+    found = []
+    value = keywords["PHOTMJSR"]
+    if value:
+        found.append((f"PHOTMJSR {value:.6g}", float(value) * SURFACE_BRIGHTNESS))
+    value, pivot = keywords["PHOTFLAM"], keywords["PHOTPLAM"]
+    if value and pivot:
+        flam = float(value) * u.erg / (u.s * u.cm**2 * u.AA)
+        flux = flam.to(u.MJy, u.spectral_density(float(pivot) * u.AA))
+        found.append((f"PHOTFLAM {value:.6g}, PHOTPLAM {pivot:.6g}", flux))
+    return found

@@ -1,0 +1,208 @@
+"""Images in FITS files of any origin: which extension, which filter, which pixels on the sky."""
+
+import contextlib
+import os
+import re
+import warnings
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.files import open_fits, split_extension
+
+__all__ = [
+    "check_same_grid",
+    "filter_name",
+    "find_image",
+    "grid_angle",
+    "open_image",
+    "read_wcs",
+]
+
+
+@contextlib.contextmanager
+def open_image(path, wanted):
+    """
+    Open ``file.fits[EXTENSION]``.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, with an extension in brackets or without.
+    wanted : str
+        What it should be, for messages.
+
+    Yields
+    ------
+    hdus : `~astropy.io.fits.HDUList`
+    extension : str, int or None
+    """
+    name, extension = split_extension(path)
+    with open_fits(name, wanted=wanted) as hdus:
+        yield hdus, extension
+
+
+def find_image(hdus, extension, path, names):
+    """
+    Index of the extension with the image.
+
+    Parameters
+    ----------
+    hdus : `~astropy.io.fits.HDUList`
+        The file.
+    extension : str, int or None
+        What was asked for.
+    path : path-like
+        The file, for messages.
+    names : iterable of str
+        Names of extensions that are preferred to the first image.
+
+    Returns
+    -------
+    index : int
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If there is no image, or more than one of these names.
+    """
+    images = [k for k, hdu in enumerate(hdus) if hdu.is_image and len(hdu.shape) == 2]
+    if extension is not None:
+        try:
+            found = [hdus.index_of(extension)]
+        except (KeyError, IndexError):
+            msg = f"{path}: there is no such extension, only {[hdu.name for hdu in hdus]}"
+            raise DataError(msg) from None
+        if found[0] not in images:
+            msg = f"{path} is no two-dimensional image, but of the shape {hdus[found[0]].shape}"
+            raise DataError(msg)
+        return found[0]
+    named = [k for k in images if hdus[k].name in names]
+    found = named or images[:1]
+    if not found:
+        shapes = [getattr(hdu, "shape", ()) for hdu in hdus]
+        msg = f"{path} has no two-dimensional image, only {shapes}"
+        raise DataError(msg)
+    if len(found) > 1:
+        msg = (
+            f"{path} has {len(found)} extensions {hdus[found[0]].name}; say which as {path}[NUMBER]"
+        )
+        raise DataError(msg)
+    return found[0]
+
+
+def read_wcs(header, hdus):
+    """
+    The celestial coordinates of an image.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header`
+        Of the image.
+    hdus : `~astropy.io.fits.HDUList`
+        The file, for tables of distortion.
+
+    Returns
+    -------
+    wcs : `~astropy.wcs.WCS` or None
+        None without any.
+    """
+    from astropy.wcs import WCS, FITSFixedWarning
+
+    with warnings.catch_warnings():
+        # dates and the like that are written in another way
+        warnings.simplefilter("ignore", FITSFixedWarning)
+        wcs = WCS(header, hdus)
+    return wcs if wcs.has_celestial else None
+
+
+def filter_name(get):
+    """
+    The filter that a header names.
+
+    Parameters
+    ----------
+    get : callable
+        Called with a keyword, returns its value or None.
+
+    Returns
+    -------
+    name : str or None
+        ``instrument.filter`` in lower case; None if the header does not tell.
+    """
+    instrument = str(get("INSTRUME") or "").strip().lower()
+    names = [str(get(key) or "").strip().lower() for key in ("FILTER", "FILTER1", "FILTER2")]
+    names = [name for name in names if name and not name.startswith("clear")]
+    pupil = str(get("PUPIL") or "").strip().lower()
+    # NIRCam's narrow filters stand in the pupil wheel, in front of a wide one
+    if instrument == "nircam" and re.fullmatch(r"f\d{3}[a-z]\d?", pupil):
+        names = [pupil]
+    return f"{instrument}.{names[0]}" if instrument and len(names) == 1 else None
+
+
+def grid_angle(wcs, shape):
+    """
+    Position angle of an image's +y axis at its middle.
+
+    Parameters
+    ----------
+    wcs : `~astropy.wcs.WCS`
+        Celestial coordinates.
+    shape : (int, int)
+        Rows and columns.
+
+    Returns
+    -------
+    angle : `~astropy.units.Quantity`
+        In deg, east of north.
+
+    Raises
+    ------
+    ValueError
+        If the image is mirrored (east to the right where north is up).
+    """
+    x, y = (shape[1] - 1) / 2, (shape[0] - 1) / 2
+    middle = wcs.pixel_to_world(x, y)
+    up, right = wcs.pixel_to_world(x, y + 1), wcs.pixel_to_world(x + 1, y)
+    angle = middle.position_angle(up).to(u.deg)
+    turn = (angle - middle.position_angle(right)).to_value(u.deg) % 360
+    if turn > 180:
+        raise argument_error("wcs", "of an image of the sky (east left of north)", "a mirrored one")
+    return angle
+
+
+def check_same_grid(wcs, reference, shape, path, reference_path, *, tolerance=0.1):
+    """
+    Refuse a map whose pixels are elsewhere on the sky than those of its image.
+
+    Parameters
+    ----------
+    wcs, reference : `~astropy.wcs.WCS`
+        Coordinates of the map and of the image.
+    shape : (int, int)
+        Rows and columns of both.
+    path, reference_path : path-like
+        Their files, for the message.
+    tolerance : float, optional
+        Largest distance in pixels, in the corners and the middle.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If they differ.
+    """
+    from astropy.wcs.utils import pixel_to_pixel
+
+    ny, nx = shape
+    x = np.array([0, nx - 1, 0, nx - 1, (nx - 1) / 2])
+    y = np.array([0, 0, ny - 1, ny - 1, (ny - 1) / 2])
+    there = pixel_to_pixel(reference, wcs, x, y)
+    distance = np.hypot(there[0] - x, there[1] - y)
+    if not np.all(distance <= tolerance):
+        far = np.nanmax(distance) if np.isfinite(distance).any() else np.inf
+        msg = (
+            f"{os.fspath(path)} is not on the pixels of {os.fspath(reference_path)}: by their "
+            f"coordinates they are up to {far:.4g} pixels apart"
+        )
+        raise DataError(msg)

@@ -1,0 +1,348 @@
+"""Images that observers bring, in any unit and with any map of the noise, as images in MJy/sr."""
+
+import dataclasses
+import functools
+import json
+import logging
+import warnings
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.photometry.calibration import calibration
+from miricigale.photometry.grids import (
+    check_same_grid,
+    filter_name,
+    find_image,
+    open_image,
+    read_wcs,
+)
+from miricigale.photometry.sky_noise import sky_noise
+from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
+from miricigale.utils.units import SURFACE_BRIGHTNESS
+
+__all__ = ["MosaicFile", "MosaicHeader", "read_mosaic"]
+
+_log = logging.getLogger(__name__)
+
+#: Maps of the noise, and the extensions that hold them in the image's own file.
+_NOISE = {
+    "error": ("ERR", "RMS"),
+    "variance": ("VAR",),
+    "inverse_variance": ("IVAR",),
+    "weight": ("WHT", "WEIGHT"),
+}
+#: A scale of the noise further from 1 than this factor is warned of.
+_ODD_SCALE = 10.0
+
+
+def read_mosaic(path, **options):
+    """
+    Read an image of any origin.
+
+    Parameters
+    ----------
+    path : path-like
+        FITS, packed or not; ``file.fits[EXTENSION]`` names an extension.
+    **options
+        Fields of `MosaicFile`: ``filter``, ``unit``, ``zero_point``, ``error``, ``variance``,
+        ``inverse_variance``, ``weight`` and ``background_box``.
+
+    Returns
+    -------
+    image : `~astropy.nddata.CCDData`
+        See `MosaicFile.read`.
+
+    Examples
+    --------
+    >>> from miricigale.photometry import read_mosaic
+    >>> image = read_mosaic("f444w_sci.fits.gz", weight="f444w_wht.fits.gz")  # doctest: +SKIP
+    """
+    return MosaicFile(path, **options).read()
+
+
+@dataclasses.dataclass(frozen=True)
+class MosaicFile:
+    """
+    A file with an image, and what is known of it beyond its header.
+
+    Parameters
+    ----------
+    path : path-like
+        FITS, packed or not; ``file.fits[EXTENSION]`` names an extension. By default the
+        image is in SCI, or in the first extension with one.
+    filter : str, optional
+        Name of the filter; that of the header must be the same, if it has one.
+    unit : unit-like, optional
+        Unit of the pixels instead of the header's ``BUNIT``: a surface brightness, a flux in
+        each pixel (``"10 nJy"``), or a rate of counts.
+    zero_point : float or `~astropy.units.Quantity`, optional
+        AB magnitude of one count (or one count a second, if those are the pixels' values).
+        Without it rates of counts are calibrated by the header's PHOTMJSR or by PHOTFLAM and PHOTPLAM.
+    error, variance, inverse_variance, weight : path-like, optional
+        File with a map of the noise, on the pixels of the image; at most one. Errors and variances
+        are in the unit of the image and its square, and are taken as they are, as inverse
+        variances are. The scale of weights is measured on the sky. By default the extensions ERR
+        (an error) or WHT (a weight) of the image's own file.
+    background_box : int, optional
+        If given, a background is measured in boxes of so many pixels and subtracted.
+    """
+
+    path: object
+    filter: str | None = dataclasses.field(default=None, kw_only=True)
+    unit: object = dataclasses.field(default=None, kw_only=True)
+    zero_point: object = dataclasses.field(default=None, kw_only=True)
+    error: object = dataclasses.field(default=None, kw_only=True)
+    variance: object = dataclasses.field(default=None, kw_only=True)
+    inverse_variance: object = dataclasses.field(default=None, kw_only=True)
+    weight: object = dataclasses.field(default=None, kw_only=True)
+    background_box: int | None = dataclasses.field(default=None, kw_only=True)
+
+    def __post_init__(self):
+        given = [name for name in _NOISE if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise argument_error(", ".join(_NOISE), "at most one of them", " and ".join(given))
+        if self.background_box is not None and not self.background_box >= 1:
+            raise argument_error("background_box", "at least 1 pixel", self.background_box)
+
+    @functools.cached_property
+    def header(self):
+        """
+        What the header says, as a `MosaicHeader`, without reading the image.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If the file is missing or damaged, or has no image with celestial coordinates.
+        ValueError
+            If the header names another filter than ``filter``.
+        """
+        with open_image(self.path, "an image") as (hdus, extension):
+            return _header(self, hdus, find_image(hdus, extension, self.path, ("SCI",)))
+
+    def read(self):
+        """
+        Read the image.
+
+        Returns
+        -------
+        image : `~astropy.nddata.CCDData`
+            In MJy/sr, with WCS and mask (True where a pixel is not finite, has no weight or no
+            error, or is marked in an extension MASK or, as not to be used, in DQ), and with a
+            `~astropy.nddata.StdDevUncertainty` unless there is no map of the noise. Fluxes in
+            pixels are divided by the solid angle of each pixel. ``meta`` has ``filter``, ``pa_aper``
+            (deg), ``source`` (the file), ``source_unit``, ``calibration``, ``noise``, ``noise_scale``
+            (rms of the source-free pixels in units of the map's errors), ``weight_scale``
+            (by which errors of a weight map were multiplied), ``sky_over_noise`` (median over rms
+            of those pixels) and ``n_masked``, as far as they are known.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If a file is missing or damaged, has no unit or coordinates, or a map is not on the
+            pixels of the image.
+        ValueError
+            If the header names another filter, or a count rate cannot be calibrated.
+
+        Warns
+        -----
+        `~miricigale.utils.exceptions.MiricigaleWarning`
+            If there is no map of the noise, or its scale departs from 1 by more than 10 times.
+        """
+        from astropy.nddata import CCDData, StdDevUncertainty
+
+        from miricigale.instrument import pixel_area_map
+
+        header = self.header
+        with open_image(self.path, "an image") as (hdus, _):
+            hdu = hdus[header.index]
+            data = _native(hdu.data)
+            factor, calibrated = calibration(
+                self.path, header.unit, self.zero_point, header.keywords
+            )
+            if factor.unit.is_equivalent(u.MJy):
+                area = pixel_area_map(header.wcs, header.shape)
+                factor = (factor.to_value(u.MJy) / area).astype(data.dtype)
+            else:
+                factor = data.dtype.type(factor.to_value(SURFACE_BRIGHTNESS))
+            usable = np.isfinite(data) & _unmarked(hdus, header.shape)
+            kind, values, source = self._noise_map(hdus, header)
+        meta = dict(header.meta)
+        meta.update(source=str(self.path), source_unit=header.unit, calibration=calibrated)
+        sigma = None
+        if kind is None:
+            zeros = float(np.mean(data[usable] == 0)) if usable.any() else 0.0
+            extra = f", and {zeros:.0%} of its pixels are exactly 0" if zeros > 1e-3 else ""
+            msg = f"{self.path} has no map of the noise, which will be measured on the image{extra}"
+            warnings.warn(msg, MiricigaleWarning, stacklevel=2)
+            meta["noise"] = "none"
+        else:
+            sigma = _sigma(kind, values)
+            usable &= np.isfinite(sigma) & (sigma > 0)
+            meta["noise"] = f"{kind} ({source})"
+        if not usable.any():
+            msg = f"{self.path} has no usable pixel: all are masked, not finite or without weight"
+            raise DataError(msg)
+        data *= factor
+        if self.background_box is not None:
+            from miricigale.utils.sep_tools import background
+
+            data -= background(data, ~usable, self.background_box)[0]
+            meta["background_box"] = int(self.background_box)
+        if sigma is not None:
+            sigma *= factor
+            level, scale, _ = sky_noise(
+                np.where(usable, data, 0) / np.where(usable, sigma, 1), usable
+            )
+            _note_scale(self, kind, scale)
+            meta["noise_scale"] = float(f"{scale:.6g}")
+            if kind == "weight":
+                meta["weight_scale"] = meta["noise_scale"]
+                sigma *= sigma.dtype.type(scale)
+        else:
+            level, scale, _ = sky_noise(np.where(usable, data, 0), usable)
+        meta["sky_over_noise"] = float(f"{level / (scale or 1):.4g}")
+        meta["n_masked"] = int(np.count_nonzero(~usable))
+        return CCDData(
+            data,
+            unit=SURFACE_BRIGHTNESS,
+            wcs=header.wcs,
+            mask=~usable,
+            uncertainty=None if sigma is None else StdDevUncertainty(sigma),
+            meta=meta,
+        )
+
+    def _noise_map(self, hdus, header):
+        """Kind, values and place of the map of the noise; the kind is None if there is none."""
+        for kind, names in _NOISE.items():
+            path = getattr(self, kind)
+            if path is None:
+                continue
+            with open_image(path, f"a map of the {kind.replace('_', ' ')}") as (others, extension):
+                hdu = others[find_image(others, extension, path, names)]
+                if hdu.shape != header.shape:
+                    msg = (
+                        f"{path} (the {kind} of {self.path}) has the shape {hdu.shape}, and the "
+                        f"image {header.shape}"
+                    )
+                    raise DataError(msg)
+                wcs = read_wcs(hdu.header, others)
+                if wcs is not None:
+                    check_same_grid(wcs, header.wcs, header.shape, path, self.path)
+                return kind, _native(hdu.data), str(path)
+        for kind, names in _NOISE.items():
+            for name in names:
+                if name in hdus and hdus[name].shape == header.shape:
+                    return kind, _native(hdus[name].data), f"extension {name}"
+        return None, None, None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MosaicHeader:
+    """
+    What the header of an image says.
+
+    Attributes
+    ----------
+    index : int
+        Extension of the image.
+    shape : (int, int)
+        Rows and columns.
+    wcs : `~astropy.wcs.WCS`
+        Celestial coordinates.
+    filter : str or None
+        As ``instrument.filter`` in lower case, or as it was given.
+    pa_aper : `~astropy.units.Quantity` or None
+        Position angle of the detector's +y axis.
+    unit : str
+        Unit of the pixels as the header or the caller has it; may be empty.
+    keywords : dict
+        Those of the photometric calibration.
+    meta : dict
+        What our own files carry, with ``filter`` and ``pa_aper`` (deg).
+    """
+
+    index: int
+    shape: tuple
+    wcs: object
+    filter: str | None
+    pa_aper: object
+    unit: str
+    keywords: dict
+    meta: dict
+
+
+def _header(file, hdus, index):
+    hdu = hdus[index]
+    header, first = hdu.header, hdus[0].header
+
+    def get(key):
+        return header.get(key, first.get(key))
+
+    wcs = read_wcs(header, hdus)
+    if wcs is None:
+        msg = f"{file.path} has no celestial coordinates (WCS) in its header"
+        raise DataError(msg)
+    try:
+        meta = json.loads(header.get("META", "{}"))
+    except json.JSONDecodeError:
+        # not one of ours
+        meta = {}
+    stated = filter_name(get) or meta.get("filter")
+    if stated is not None and file.filter is not None and stated != file.filter:
+        raise argument_error("filter", f"{stated!r}, the filter in {file.path}", repr(file.filter))
+    angle = get("PA_APER")
+    unit = str(header.get("BUNIT", "") or "").strip()
+    name = file.filter or stated
+    extra = {"filter": name, "pa_aper": angle}
+    return MosaicHeader(
+        index=index,
+        shape=hdu.shape,
+        wcs=wcs,
+        filter=name,
+        pa_aper=None if angle is None else float(angle) * u.deg,
+        unit=unit if file.unit is None else str(file.unit),
+        keywords={key: get(key) for key in ("PHOTMJSR", "PHOTFLAM", "PHOTPLAM")},
+        meta={**meta, **{key: value for key, value in extra.items() if value is not None}},
+    )
+
+
+def _native(data):
+    """A copy in native byte order; single precision stays single."""
+    data = np.asarray(data)
+    single = data.dtype.kind == "f" and data.dtype.itemsize <= 4
+    return np.array(data, dtype=np.float32 if single else np.float64)
+
+
+def _unmarked(hdus, shape):
+    """Pixels that neither MASK nor the first bit (DO_NOT_USE) of DQ marks."""
+    good = np.ones(shape, bool)
+    if "MASK" in hdus and hdus["MASK"].shape == shape:
+        good &= np.asarray(hdus["MASK"].data) == 0
+    if "DQ" in hdus and hdus["DQ"].shape == shape:
+        good &= np.asarray(hdus["DQ"].data).astype(np.int64) & 1 == 0
+    if "WHT" in hdus and hdus["WHT"].shape == shape:
+        good &= np.asarray(hdus["WHT"].data) > 0
+    return good
+
+
+def _sigma(kind, values):
+    """1-sigma errors in the unit of the image, infinite where there are none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if kind == "error":
+            return values
+        if kind == "variance":
+            return np.sqrt(np.where(values > 0, values, np.inf))
+        return 1 / np.sqrt(np.where(values > 0, values, 0))
+
+
+def _note_scale(file, kind, scale):
+    """Log the measured scale of the noise, and warn of one that cannot be that of its map."""
+    done = "which are scaled by it" if kind == "weight" else "which are kept"
+    _log.info("%s: noise is %.4g times the errors of the %s map, %s", file.path, scale, kind, done)
+    if not 1 / _ODD_SCALE < scale < _ODD_SCALE:
+        msg = (
+            f"{file.path}: noise on the sky is {scale:.4g} times what the {kind} map says, {done}; "
+            "is it the map of this image, in its unit?"
+        )
+        warnings.warn(msg, MiricigaleWarning, stacklevel=3)

@@ -1,0 +1,242 @@
+"""Segmentation maps and catalogues that others made, as the prior of forced photometry."""
+
+import logging
+import warnings
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.photometry.grids import check_same_grid, find_image, open_image, read_wcs
+from miricigale.utils.exceptions import DataError, MiricigaleWarning
+from miricigale.utils.files import open_fits, unpacked_size
+from miricigale.utils.tables import unique_ids
+
+__all__ = ["read_prior"]
+
+_log = logging.getLogger(__name__)
+
+_SKY = ("sky", "skycoord", "sky_centroid", "coord")
+_RA = ("ra", "alpha_j2000", "raj2000", "ra_j2000", "alphawin_j2000")
+_DEC = ("dec", "delta_j2000", "dej2000", "dec_j2000", "decj2000", "deltawin_j2000")
+_ID = ("id", "number", "id_obj", "objid", "label")
+
+
+def read_prior(highres, *, segmentation=None, catalog=None, path=None):
+    """
+    Read the sources of a prior.
+
+    Parameters
+    ----------
+    highres : `~astropy.nddata.CCDData`
+        The image that the segments belong to.
+    segmentation : path-like, optional
+        Segmentation map: whole numbers, 0 for the sky, any ids; ``file.fits[EXTENSION]`` names
+        an extension.
+    catalog : path-like, optional
+        FITS, ECSV, CSV or a plain table with ``ra`` and ``dec`` (deg, or with a unit), or a
+        `~astropy.coordinates.SkyCoord`, and ``id``. Without it every segment is a source, whose
+        id is that of the segment.
+    path : path-like, optional
+        File of ``highres``, for messages.
+
+    Returns
+    -------
+    segments : int32 `~numpy.ndarray`, shape (ny, nx)
+        Labels 1 to n; None without a segmentation.
+    sources : `~astropy.table.QTable`
+        ``id``, ``sky`` and, with a segmentation, ``label``: the segment of the same id if
+        most of the catalogue's ids are those of the segments at their positions, and the segment
+        at the position otherwise (0 for none).
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If a file is missing or damaged, the segmentation is not on the image's pixels, or
+        columns are missing.
+    ValueError
+        If ids are not unique, or neither file is given.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        If segments belong to no source of the catalogue: their light stays in the image.
+
+    Examples
+    --------
+    >>> from miricigale.photometry import read_prior
+    >>> segments, sources = read_prior(image, segmentation="seg.fits.gz")  # doctest: +SKIP
+    """
+    if segmentation is None and catalog is None:
+        msg = "'segmentation' or 'catalog' must be given, got neither"
+        raise ValueError(msg)
+    segments = ids = None
+    if segmentation is not None:
+        where = path or highres.meta.get("source", "the image")
+        segments, ids = _segments(segmentation, highres.data.shape, highres.wcs, where)
+    if catalog is None:
+        return segments, _from_segments(highres, segments, ids)
+    sources = _read_catalog(catalog)
+    if segments is not None:
+        sources["label"] = _labels(sources, segments, ids, highres.wcs, catalog, segmentation)
+    return segments, sources
+
+
+def _segments(path, shape, wcs, image_path):
+    """Labels 1 to n in the order of the ids, and the ids."""
+    with open_image(path, "a segmentation map") as (hdus, extension):
+        hdu = hdus[find_image(hdus, extension, path, ("SEGMENTATION", "SEGMAP", "SEG", "SCI"))]
+        if hdu.shape != shape:
+            msg = (
+                f"{path} (the segmentation) has the shape {hdu.shape}, and {image_path} has {shape}: "
+                "they are not on the same pixels"
+            )
+            raise DataError(msg)
+        own = read_wcs(hdu.header, hdus)
+        if own is not None:
+            check_same_grid(own, wcs, shape, path, image_path)
+        data = np.asarray(hdu.data)
+    if data.dtype.kind == "f":
+        rounded = np.where(np.isfinite(data), np.rint(data), 0)
+        if not np.array_equal(rounded, np.where(np.isfinite(data), data, 0)):
+            msg = f"{path} is no segmentation map: it has values that are no whole numbers"
+            raise DataError(msg)
+        # single precision holds no larger whole numbers
+        if data.dtype.itemsize <= 4 and rounded.max(initial=0) > 2**24:
+            msg = f"{path} has ids above 2^24 in single precision, where they are not told apart"
+            raise DataError(msg)
+        data = rounded
+    data = data.astype(np.int64)
+    if data.min(initial=0) < 0:
+        msg = f"{path} has negative ids, such as {data.min()}; 0 is the sky"
+        raise DataError(msg)
+    values, labels = np.unique(data, return_inverse=True)
+    labels = labels.reshape(shape).astype(np.int32)
+    # the sky is 0 even where every pixel belongs to a segment
+    if values[0] != 0:
+        return labels + np.int32(1), values
+    if len(values) == 1:
+        msg = f"{path} has no segment: all of its pixels are 0"
+        raise DataError(msg)
+    return labels, values[1:]
+
+
+def _from_segments(highres, segments, ids):
+    """A source for each segment, at the centroid of its bright part."""
+    from astropy.table import QTable
+    from scipy.ndimage import center_of_mass
+
+    from miricigale.photometry.detection import bright_centroids
+
+    index = np.arange(1, len(ids) + 1)
+    middle = np.array(center_of_mass(np.ones(segments.shape), segments, index)).T
+    flux = np.where(np.isfinite(highres.data), highres.data, 0.0)
+    if highres.mask is not None:
+        flux = np.where(highres.mask, 0.0, flux)
+    x, y = bright_centroids(np.asarray(flux, float), segments, (middle[1], middle[0]))
+    sky = highres.wcs.pixel_to_world(x, y).icrs
+    return QTable({"id": ids, "sky": sky, "label": index})
+
+
+def _read_catalog(path):
+    """``id`` and ``sky`` of a table in any of the usual formats."""
+    from astropy.coordinates import SkyCoord
+    from astropy.table import QTable
+
+    table = _read_table(path)
+    names = {name.lower(): name for name in table.colnames}
+
+    def first(choices):
+        return next((names[name] for name in choices if name in names), None)
+
+    sky = next((n for n in table.colnames if isinstance(table[n], SkyCoord)), None)
+    sky = first(_SKY) if sky is None and first(_SKY) in table.colnames else sky
+    if sky is not None and isinstance(table[sky], SkyCoord):
+        position = table[sky].icrs
+    else:
+        columns = [first(_RA), first(_DEC)]
+        if None in columns:
+            msg = (
+                f"{path} has no position: wanted are the columns ra and dec, or a SkyCoord; "
+                f"there are {table.colnames}"
+            )
+            raise DataError(msg)
+        position = SkyCoord(*(_degrees(table[name], name, path) for name in columns))
+    key = first(_ID)
+    ids = np.arange(1, len(table) + 1) if key is None else np.asarray(table[key])
+    if key is None:
+        _log.info("%s has no ids; its rows are counted from 1", path)
+    return QTable({"id": unique_ids(ids, f"catalog {path}"), "sky": position})
+
+
+def _read_table(path):
+    from pathlib import Path
+
+    from astropy.table import QTable
+
+    if not Path(path).is_file():
+        msg = f"no catalogue {path}"
+        raise DataError(msg)
+    with open(path, "rb") as stream:
+        start = stream.read(9)
+    name = str(path).lower()
+    fits = start.startswith(b"SIMPLE") or name.endswith((".fits", ".fits.gz", ".fit"))
+    try:
+        if fits:
+            with open_fits(path, wanted="a catalogue") as hdus:
+                return QTable.read(hdus, format="fits", character_as_bytes=False)
+        unpacked_size(path)
+        if start.startswith(b"# %ECSV"):
+            return QTable.read(path, format="ascii.ecsv")
+        form = "ascii.csv" if name.endswith((".csv", ".csv.gz")) else "ascii"
+        return QTable.read(path, format=form)
+    except DataError:
+        raise
+    except (OSError, TypeError, ValueError) as err:
+        reason = (str(err).strip().splitlines() or [type(err).__name__])[0]
+        msg = f"{path} cannot be read as a catalogue (FITS, ECSV, CSV or a plain table): {reason}"
+        raise DataError(msg) from err
+
+
+def _degrees(column, name, path):
+    """A coordinate as a quantity; NaN where it is missing."""
+    values = np.ma.filled(column, np.nan) if np.ma.isMaskedArray(column) else column
+    unit = getattr(values, "unit", None) or getattr(column, "unit", None) or u.deg
+    try:
+        return u.Quantity(np.asarray(getattr(values, "value", values), float), unit).to(u.deg)
+    except (TypeError, ValueError, u.UnitConversionError) as err:
+        msg = f"{path}: the column {name} must be an angle in numbers, got {unit}, {column[:1]}"
+        raise DataError(msg) from err
+
+
+def _labels(sources, segments, ids, wcs, catalog, segmentation):
+    """The segment of each source: by id if that is what the ids are, by position otherwise."""
+    ny, nx = segments.shape
+    sky = sources["sky"]
+    known = np.isfinite(sky.ra.deg) & np.isfinite(sky.dec.deg)
+    x, y = np.full((2, len(sources)), -1.0)
+    if known.any():
+        x[known], y[known] = wcs.world_to_pixel(sky[known])
+    column, row = (np.rint(np.nan_to_num(v, nan=-1.0)) for v in (x, y))
+    inside = known & (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
+    here = np.zeros(len(sources), np.int64)
+    here[inside] = segments[row[inside].astype(int), column[inside].astype(int)]
+    own = np.zeros(len(sources), np.int64)
+    if np.asarray(sources["id"]).dtype.kind in "iu":
+        place = np.clip(np.searchsorted(ids, sources["id"]), 0, len(ids) - 1)
+        own = np.where(ids[place] == sources["id"], place + 1, 0)
+    both = here > 0
+    by_id = both.any() and np.mean(own[both] == here[both]) > 0.5
+    label = own if by_id else here
+    _log.info("%s: segments of %s by %s", catalog, segmentation, "id" if by_id else "position")
+    n_without = int(np.count_nonzero(label == 0))
+    if n_without:
+        _log.info("%s: %d sources have no segment and are taken as points", catalog, n_without)
+    orphans = np.setdiff1d(np.arange(1, len(ids) + 1), label)
+    if orphans.size:
+        some = ", ".join(map(str, ids[orphans[:5] - 1]))
+        msg = (
+            f"{orphans.size} segments of {segmentation} belong to no source of {catalog} and are not "
+            f"fitted (ids {some}{', ...' if orphans.size > 5 else ''})"
+        )
+        warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+    return label

@@ -1,0 +1,280 @@
+"""The page of forced photometry: images, magnitudes, flags, errors at empty positions."""
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.evaluation import Report, number
+from miricigale.photometry import ForcedFlags
+from miricigale.photometry.arrays import pixel_scale
+from miricigale.plotting.axes import new_figure
+from miricigale.plotting.images import plot_model_residual
+from miricigale.utils.units import FNU
+
+__all__ = ["photometry_page"]
+
+#: Largest number of pixels across a drawing of a whole image, and rows of the table.
+_ACROSS, _ROWS = 1500, 40
+
+
+def photometry_page(result, filter_, image, highres, kernel, pulls=None):
+    """
+    Make the page of one measurement.
+
+    Parameters
+    ----------
+    result : `~miricigale.photometry.ForcedPhotometryResult`
+        The measurement.
+    filter_ : str
+        Filter of the image.
+    image, highres : `~astropy.nddata.CCDData`
+        What was measured and the prior, of `~miricigale.photometry.read_mosaic`.
+    kernel : `~miricigale.psf.MatchingKernel`
+        Between them.
+    pulls : `~numpy.ndarray`, optional
+        Flux over error at empty positions.
+
+    Returns
+    -------
+    report : `~miricigale.evaluation.Report`
+    """
+    good = np.isfinite(result.flux.value)
+    snr = result.snr
+    page = Report(
+        f"Forced photometry: {filter_}",
+        subtitle=f"{image.meta['source']} on the prior {highres.meta['source']}",
+        notices=_notices(image, highres, pulls),
+    )
+    page.section("Summary")
+    errors = result.flux_err[good & (result.flags == 0)]
+    depth = np.nan if not len(errors) else (5 * np.median(errors)).to_value(u.ABmag)
+    none = "no source was measured without a flag"
+    page.items(
+        [
+            ("sources of the prior", len(result)),
+            ("measured", int(np.count_nonzero(good))),
+            ("above 5 sigma", int(np.count_nonzero(good & (snr > 5)))),
+            ("5 sigma of the median source without flags, AB", number(depth, ".2f", none)),
+            ("pulls at empty positions, robust rms", _pull(pulls)),
+            *_fitted(result),
+        ]
+    )
+    page.section(
+        "Image, model and residual",
+        "The residual is drawn from -5 to 5 times its own noise; pixels without data are white.",
+    )
+    page.figure(_whole(result), "The whole image.")
+    if good.any():
+        page.figure(*_zoom(result))
+    page.section("Magnitudes")
+    page.figure(_magnitudes(result, filter_), "Measured sources by magnitude, and their errors.")
+    _flag_table(page, result)
+    _source_table(page, result)
+    if pulls is not None:
+        page.section(
+            "Errors at empty positions",
+            "Point sources were fitted to the residual image where no source is: flux over error "
+            "should scatter by 1 around 0.",
+        )
+        page.figure(_pull_figure(pulls), f"{len(pulls)} positions and a Gaussian of width 1.")
+    _input_table(page, image, highres, kernel)
+    return page
+
+
+def _notices(image, highres, pulls):
+    lines = []
+    for what, one in (("image", image), ("prior", highres)):
+        scale = one.meta.get("noise_scale")
+        if one.meta.get("noise") == "none":
+            lines.append(f"The {what} has no map of the noise; it was measured on the image.")
+        elif scale is not None and not 0.1 < scale < 10:
+            done = "were scaled by it" if "weight_scale" in one.meta else "were kept"
+            lines.append(
+                f"The noise of the {what} is {scale:.4g} times what its map says; the errors {done}."
+            )
+    if abs(highres.meta.get("sky_over_noise", 0.0)) > 1:
+        level = highres.meta["sky_over_noise"]
+        lines.append(f"The prior has a sky of {level:.3g} times its noise, in the templates too.")
+    if pulls is not None and len(pulls) >= 100 and not 0.8 < _rms(pulls) < 1.25:
+        lines.append(f"Pulls at empty positions scatter by {_rms(pulls):.2f} instead of 1.")
+    return lines
+
+
+def _rms(values):
+    values = values[np.isfinite(values)]
+    return 1.4826 * float(np.median(np.abs(values - np.median(values)))) if len(values) else np.nan
+
+
+def _pull(pulls):
+    return number(None if pulls is None else _rms(pulls), ".2f", "no empty positions")
+
+
+def _fitted(result):
+    items = []
+    if result.background is not None:
+        value = f"{result.background.value:.3g} ± {result.background_err.value:.1g}"
+        items.append(("background that was fitted, MJy/sr", value))
+    if result.shift is not None:
+        value = ", ".join(f"{one:.3f}" for one in result.shift.value)
+        items.append(("shift of the image along x, y, arcsec", value))
+    return items
+
+
+def _whole(result):
+    model = result.model_image.data
+    step = max(1, -(-max(model.shape) // _ACROSS))
+    data = result.residual_image.data + model
+    scale = pixel_scale(result.model_image.wcs) * step
+    ny, nx = model.shape
+    _, axes = new_figure(1, 3, size=(3.5, max(1.8, min(5.0, 3.1 * ny / nx))))
+    axes = plot_model_residual(
+        data[::step, ::step], model[::step, ::step], ax=axes[0], pixel_scale=scale, unit="MJy/sr"
+    )
+    return axes[0].figure
+
+
+def _zoom(result, size=12.0):
+    """Image, model and residual about the brightest source without flags."""
+    model = result.model_image.data
+    scale = pixel_scale(result.model_image.wcs)
+    ranked = np.where((result.flags == 0) & np.isfinite(result.snr), result.snr, -np.inf)
+    if not np.isfinite(ranked).any():
+        ranked = np.nan_to_num(result.snr, nan=-np.inf)
+    k = int(np.argmax(ranked))
+    half = max(8, round(size / 2 / scale))
+    x, y = round(float(result.x[k])), round(float(result.y[k]))
+    cut = tuple(
+        slice(max(0, p - half), min(n, p + half + 1))
+        for p, n in zip((y, x), model.shape, strict=True)
+    )
+    data = result.residual_image.data + model
+    _, axes = new_figure(1, 3, size=(3.5, 3.0))
+    axes = plot_model_residual(data[cut], model[cut], ax=axes[0], pixel_scale=scale, unit="MJy/sr")
+    what = f"Around source {result.id[k]}, signal-to-noise {result.snr[k]:.0f}."
+    return axes[0].figure, what
+
+
+def _magnitude(flux):
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(flux.value > 0, 23.9 - 2.5 * np.log10(flux.to_value(FNU)), np.nan)
+
+
+def _magnitudes(result, filter_):
+    figure, axes = new_figure(1, 2, size=(5.2, 3.6))
+    detected = result.snr > 3
+    mag = _magnitude(result.flux)
+    error = 1.0857 / np.where(detected, result.snr, np.nan)
+    clean = detected & (result.flags == 0)
+    ax = axes[0, 0]
+    if detected.any():
+        bins = np.arange(np.floor(np.nanmin(mag[detected])), np.nanmax(mag[detected]) + 0.5, 0.5)
+        bins = bins if len(bins) > 1 else np.array([bins[0], bins[0] + 0.5])
+        ax.hist(mag[detected], bins, color="0.75", label="above 3 sigma")
+        ax.hist(mag[clean], bins, histtype="step", color="#1d4ed8", label="of these, no flag")
+        ax.legend(frameon=False)
+    ax.set(xlabel=f"{filter_} (AB)", ylabel="sources")
+    ax = axes[0, 1]
+    ax.plot(
+        mag[detected & ~clean],
+        error[detected & ~clean],
+        "x",
+        color="#c2410c",
+        ms=4,
+        label="flagged",
+    )
+    ax.plot(mag[clean], error[clean], ".", color="#1d4ed8", ms=5, label="no flag")
+    ax.axhline(1.0857 / 5, color="0.5", lw=0.8, ls="--", label="5 sigma")
+    ax.set(xlabel=f"{filter_} (AB)", ylabel="error (mag)", yscale="log")
+    ax.legend(frameon=False)
+    return figure
+
+
+def _pull_figure(pulls):
+    figure, axes = new_figure(1, 1, size=(5.6, 3.4))
+    ax = axes[0, 0]
+    values = pulls[np.isfinite(pulls)]
+    bins = np.linspace(-6, 6, 49)
+    ax.hist(np.clip(values, -6, 6), bins, color="0.75")
+    middle = 0.5 * (bins[1:] + bins[:-1])
+    gauss = np.exp(-0.5 * middle**2) / np.sqrt(2 * np.pi) * len(values) * (bins[1] - bins[0])
+    ax.plot(middle, gauss, color="#1d4ed8")
+    ax.set(xlabel="flux / error (those beyond 6 in the outermost bins)", ylabel="positions")
+    return figure
+
+
+def _flag_table(page, result):
+    page.section("Flags", "Nothing is dropped: a source may have several flags, or none.")
+    rows = [("none", "usable", int(np.count_nonzero(result.flags == 0)))]
+    for flag in ForcedFlags:
+        count = int(np.count_nonzero(result.flags & int(flag)))
+        lost = flag in (ForcedFlags.NO_DATA, ForcedFlags.DEGENERATE)
+        name = flag.name.lower().replace("_", " ")
+        rows.append((f"{int(flag)} {name}", "not measured" if lost else "usable", count))
+    rows.append(("crowded", "usable", int(np.count_nonzero(result.crowded))))
+    page.table(rows, header=("flag", "flux", "sources"), text=2)
+
+
+def _source_table(page, result):
+    order = np.argsort(np.nan_to_num(-result.flux.value, nan=np.inf), kind="stable")[:_ROWS]
+    page.section("Brightest sources", "All sources are in the table that was written.")
+    mag = _magnitude(result.flux)
+    none = "no positive flux"
+    rows = [
+        (
+            str(result.id[k]),
+            ", ".join(ForcedFlags.names(result.flags[k])).replace("_", " ") or "none",
+            f"{result.sky[k].ra.deg:.6f}",
+            f"{result.sky[k].dec.deg:.6f}",
+            number(result.flux[k].value, ".4g", "not measured"),
+            number(result.flux_err[k].value, ".2g", "not measured"),
+            number(mag[k], ".2f", none),
+            number(result.snr[k], ".1f", "not measured"),
+            number(result.chi2[k], ".2f", "not measured"),
+            number(result.residual_fraction[k], "+.2f", "not measured"),
+        )
+        for k in order
+    ]
+    header = ("id", "flags", "RA", "Dec", "flux (uJy)", "error", "AB", "S/N", "chi2")
+    page.table(
+        rows, header=(*header, "residual / flux"), text=2, empty="The catalogue has no source."
+    )
+
+
+def _input_table(page, image, highres, kernel):
+    page.section("What was read")
+    keys = [
+        ("filter", "filter"),
+        ("source_unit", "unit of the pixels"),
+        ("calibration", "calibration"),
+        ("noise", "noise"),
+        ("noise_scale", "noise on the sky over that of the map"),
+        ("weight_scale", "factor on the errors of the weights"),
+        ("sky_over_noise", "median sky over noise"),
+        ("background_box", "box of the background that was subtracted (pixels)"),
+        ("pa_aper", "PA_APER (deg)"),
+        ("n_masked", "pixels without data"),
+    ]
+    none = "not stated or not done"
+    cells = [
+        (label, *(_text(one.meta.get(key), none) for one in (image, highres)))
+        for key, label in keys
+    ]
+    shapes = (f"{one.data.shape[1]} x {one.data.shape[0]}" for one in (image, highres))
+    scales = (f"{pixel_scale(one.wcs):.4f}" for one in (image, highres))
+    cells += [("pixels", *shapes), ("pixel (arcsec)", *scales)]
+    page.table(cells, header=("", "image", "prior"), text=3)
+    origin = kernel.meta.get("file", "made from two PSFs")
+    page.text(
+        f"Kernel: {kernel.array.shape[0]} x {kernel.array.shape[0]} pixels of "
+        f"{kernel.pixel_scale.value:.4g} arcsec, sum {kernel.array.sum():.4f}, noise gain "
+        f"{kernel.noise_gain:.3f}, {origin}."
+    )
+
+
+def _text(value, reason):
+    return (
+        number(None, "", reason)
+        if value is None
+        else f"{value:.5g}"
+        if isinstance(value, float)
+        else value
+    )
