@@ -8,7 +8,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.units import SURFACE_BRIGHTNESS
 
 __all__ = ["calibration", "parsed_unit"]
 
@@ -19,7 +19,7 @@ _COUNTS = (
     (r"\bcounts?\b", "ct"),
     (r"\badu\b", "adu"),
     (r"\bdn\b", "DN"),
-    (r"\bsec(?:onds?)?\b", "s"),
+    (r"(?<=/)\s*s(?:ec(?:onds?)?)?\b", "s"),
 )
 
 
@@ -40,7 +40,8 @@ def parsed_unit(text):
     plain = text
     for pattern, name in _COUNTS:
         plain = re.sub(pattern, name, plain, flags=re.IGNORECASE)
-    for one in (text, plain) if text else ():
+    # S alone would be siemens
+    for one in (plain, text) if text else ():
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", u.UnitsWarning)
             with contextlib.suppress(TypeError, ValueError):
@@ -90,8 +91,7 @@ def calibration(path, text, zero_point, keywords):
                 return unit.to(target) * target, f"unit {unit}"
     if zero_point is not None:
         zero = zero_point
-        zero = to_array(zero, u.ABmag, "zero_point") if hasattr(zero, "unit") else zero
-        zero = float(zero)
+        zero = float(zero.to_value(u.ABmag) if hasattr(zero, "unit") else zero)
         if not np.isfinite(zero):
             raise argument_error("zero_point", "a finite AB magnitude", zero_point)
         return (zero * u.ABmag).to(u.MJy), f"zero point {zero:g} AB"

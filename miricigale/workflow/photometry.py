@@ -2,6 +2,7 @@
 
 import logging
 import os
+import tempfile
 import warnings
 from pathlib import Path
 
@@ -64,7 +65,7 @@ def measure_files(
         on the prior.
     kernel : path-like, optional
         From the prior's resolution to that of the image, on the prior's pixels; see
-        `~miricigale.workflow.kernel_files.read_kernel`.
+        ``miricigale.workflow.kernel_files.read_kernel``.
     psf, highres_psf : path-like, optional
         PSFs of image and prior with the pixel and the drizzling in them, +y along that of
         their image: ``file.fits``, ``file.fits[EXTENSION]``, or of a cube
@@ -177,10 +178,12 @@ def _check_output(what, path, overwrite, inputs):
     folder = path.parent
     while not folder.exists():
         folder = folder.parent
-    if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
-        raise argument_error(what, "in a folder that can be written to", path)
-    if path.exists() and not os.access(path, os.W_OK):
-        raise argument_error(what, "a file that can be written to", path)
+    try:
+        # permissions alone do not tell, for a superuser or on a read-only disk
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as err:
+        raise argument_error(what, "in a folder that can be written to", path) from err
 
 
 def _check_images(image, highres, filter_):

@@ -1,0 +1,260 @@
+"""Images of known flux in every unit and noise map; what cannot be used is refused by name."""
+
+import gzip
+import os
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.io import fits
+from numpy.testing import assert_allclose
+
+from miricigale.instrument import north_up_wcs, pixel_area_map
+from miricigale.photometry import MosaicFile, read_mosaic, weight_scale
+from miricigale.photometry.grids import grid_angle
+from miricigale.utils.exceptions import DataError, MiricigaleWarning
+
+SHAPE, SCALE, FLUX = (120, 140), 0.06, 20.0
+REAL = os.environ.get("MIRICIGALE_DATA")
+
+
+def micro_jansky():
+    """A Gaussian of 20 uJy, uJy in each pixel."""
+    y, x = np.indices(SHAPE)
+    return FLUX * np.exp(-0.5 * ((x - 70) ** 2 + (y - 60) ** 2) / 9) / (2 * np.pi * 9)
+
+
+@pytest.fixture
+def write(tools, tmp_path):
+    wcs = north_up_wcs(tools.CENTER, SCALE * u.arcsec, SHAPE)
+
+    def written(data, name="image.fits", *, shift=0.0, planes=(), wcs=wcs, ext="SCI", **header):
+        hdu = fits.ImageHDU(np.asarray(data, np.float32), name=ext)
+        if wcs is not None:
+            hdu.header.update(wcs.to_header(relax=True))
+            hdu.header["CRPIX1"] += shift
+        hdu.header.update({key: value for key, value in header.items() if value is not None})
+        more = [fits.ImageHDU(plane, name=key) for key, plane in dict(planes).items()]
+        path = tmp_path / name
+        fits.HDUList([fits.PrimaryHDU(), hdu, *more]).writeto(path)
+        return path
+
+    return written
+
+
+def total(image):
+    """Flux in uJy of an image in MJy/sr: brightness times the pixels' solid angle."""
+    area = pixel_area_map(image.wcs, image.shape)
+    return float(np.sum(np.where(image.mask, 0, image.data) * area)) * 1e12
+
+
+#: Keywords, options and counts of one uJy. The AB zero point of PHOTFLAM and PHOTPLAM is that of the
+#: HST data handbooks; one count a second of PHOTMJSR is a brightness.
+PIXEL_SR = (SCALE * np.pi / 648000) ** 2
+PHOTFLAM, PHOTPLAM = 1.9275e-20, 15369.0
+HST_ZERO = -2.5 * np.log10(PHOTFLAM) - 5 * np.log10(PHOTPLAM) - 2.408
+UNITS = {
+    "MJy/sr": ({"BUNIT": "MJy/sr"}, {}, 1e-12 / PIXEL_SR),
+    "uJy": ({"BUNIT": "uJy"}, {}, 1.0),
+    "nJy a pixel": ({"BUNIT": "nJy/pixel"}, {}, 1e3),
+    "10 nJy": ({"BUNIT": "10.0*nanoJansky"}, {}, 1e2),
+    "10 nJy, given": ({}, {"unit": "10 nJy"}, 1e2),
+    "Jy": ({"BUNIT": "Jy"}, {}, 1e-6),
+    "uJy/arcsec2": ({"BUNIT": "uJy/arcsec2"}, {}, 1 / SCALE**2),
+    "counts": ({"BUNIT": "counts/s"}, {"zero_point": 25.0}, 10 ** (0.4 * (25.0 - 23.9))),
+    "counts, in total": ({}, {"zero_point": 30 * u.ABmag}, 10 ** (0.4 * (30.0 - 23.9))),
+    "HST": (
+        {"BUNIT": "ELECTRONS/S", "PHOTFLAM": PHOTFLAM, "PHOTPLAM": PHOTPLAM},
+        {},
+        10 ** (0.4 * (HST_ZERO - 23.9)),
+    ),
+    "JWST rate": ({"BUNIT": "DN/s", "PHOTMJSR": 0.25}, {}, 1e-12 / PIXEL_SR / 0.25),
+}
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_a_source_has_its_flux_in_every_unit(write, name):
+    header, options, per_micro = UNITS[name]
+    path = write(micro_jansky() * per_micro, **header)
+    error = write(np.full(SHAPE, 1e-3 * per_micro), "error.fits", wcs=None)
+    with pytest.warns(MiricigaleWarning, match="times what the error map says"):
+        image = read_mosaic(path, error=error, **options)
+    assert image.unit == u.MJy / u.sr
+    # the constants of AB magnitudes in the handbooks have three decimals
+    assert total(image) == pytest.approx(FLUX, rel=1e-3)
+    area = pixel_area_map(image.wcs, SHAPE)
+    assert_allclose(image.uncertainty.array * area, 1e-15, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("header", "options", "message"),
+    [
+        ({}, {}, "must state the unit of its pixels"),
+        ({"BUNIT": "furlong x"}, {}, "what it states is 'furlong x'"),
+        ({"BUNIT": "ELECTRONS"}, {}, "counts need 'zero_point'"),
+        ({"BUNIT": "mJy/beam"}, {}, "wanted is a surface brightness"),
+        ({"BUNIT": "counts/s"}, {}, "neither PHOTMJSR nor PHOTFLAM: 'zero_point'"),
+        (
+            {"BUNIT": "DN/s", "PHOTMJSR": 1.0, "PHOTFLAM": 1e-20, "PHOTPLAM": 1e4},
+            {},
+            "both PHOTMJSR and PHOTFLAM",
+        ),
+        ({"BUNIT": "uJy"}, {"zero_point": 23.9}, "'zero_point' must be left out"),
+        ({"BUNIT": "uJy", "INSTRUME": "MIRI", "FILTER": "F770W"}, {"filter": "miri.f1000w"},
+         "'filter' must be 'miri.f770w', the filter in .*image.fits"),
+        ({"BUNIT": "uJy"}, {"background_box": 0}, "'background_box' must be at least 1"),
+        ({"BUNIT": "uJy", "wcs": None}, {}, "no celestial coordinates"),
+        ({"BUNIT": "uJy", "ext": "OTHER"}, {"error": "absent.fits"}, "absent.fits cannot be read"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_calibrated_is_refused_by_name(write, header, options, message):
+    with pytest.raises((DataError, ValueError), match=message):
+        read_mosaic(write(micro_jansky(), **header), **options)
+
+
+def test_maps_must_be_those_of_the_image(write, tmp_path):
+    path = write(micro_jansky(), BUNIT="uJy")
+    moved = write(np.ones(SHAPE), "moved.fits", shift=3.0)
+    with pytest.raises(DataError, match=r"moved.fits is not on the pixels .* up to 3 pixels apart"):
+        read_mosaic(path, weight=moved)
+    small = write(np.ones((5, 5)), "small.fits")
+    with pytest.raises(DataError, match=r"small.fits \(the weight of .*\) has the shape \(5, 5\)"):
+        read_mosaic(path, weight=small)
+    with pytest.raises(ValueError, match="at most one of them, got error and weight"):
+        MosaicFile(path, error=moved, weight=moved)
+    with pytest.raises(DataError, match=r"no such extension, only \['PRIMARY', 'SCI'\]"):
+        read_mosaic(f"{path}[ERR]")
+    with pytest.raises(DataError, match="no usable pixel"):
+        read_mosaic(path, weight=write(np.zeros(SHAPE), "zero.fits"))
+
+
+def noise(rng, kind):
+    if kind == "white":
+        return rng.normal(size=(400, 400))
+    # as in an image whose pixels were replicated
+    return np.kron(rng.normal(size=(200, 200)), np.ones((2, 2)))
+
+
+@pytest.mark.parametrize("kind", ["white", "replicated"])
+@pytest.mark.parametrize("scale", [0.61, 1.0, 229.0])
+def test_the_scale_of_weights_is_measured_between_sources(kind, scale):
+    rng = np.random.default_rng(8)
+    depth = np.geomspace(0.5, 2.0, 400)[None] * np.ones((400, 1))
+    y, x = np.indices((400, 400))
+    sources = np.zeros((400, 400))
+    for _ in range(80):
+        a, b = rng.uniform(0, 400, 2)
+        sources += 10 ** rng.uniform(0, 3) * np.exp(-0.5 * ((x - a) ** 2 + (y - b) ** 2) / 9)
+    data = (noise(rng, kind) * depth + sources) * scale
+    weight = 1 / depth**2
+    weight[:, 300:] *= rng.random((400, 100)) > 0.1
+    data[:20] = np.nan
+    assert weight_scale(data, weight) == pytest.approx(scale, rel=0.02)
+
+
+def test_weights_become_errors_and_other_maps_stay(write):
+    rng = np.random.default_rng(5)
+    sigma = np.where(np.indices(SHAPE)[1] < 70, 0.1, 0.3)
+    data = rng.normal(size=SHAPE) * sigma
+    path = write(data, BUNIT="MJy/sr")
+    maps = {
+        "error": sigma,
+        "variance": sigma**2,
+        "inverse_variance": sigma**-2,
+        "weight": (0.5 / sigma) ** 2,
+    }
+    for kind, values in maps.items():
+        image = read_mosaic(path, **{kind: write(values, f"{kind}.fits")})
+        tolerance = 0.03 if kind == "weight" else 1e-5
+        assert_allclose(image.uncertainty.array, sigma, rtol=tolerance)
+        assert not image.mask.any()
+        assert image.meta["noise_scale"] == pytest.approx(0.5 if kind == "weight" else 1, rel=0.03)
+        assert ("weight_scale" in image.meta) == (kind == "weight")
+    with pytest.warns(MiricigaleWarning, match="noise on the sky is .* times what the weight map"):
+        read_mosaic(path, weight=write(sigma**-2 * 1e4, "other.fits"))
+    with pytest.warns(MiricigaleWarning, match="no map of the noise"):
+        assert read_mosaic(path).uncertainty is None
+
+
+def test_pixels_without_data_are_masked(write):
+    rng = np.random.default_rng(6)
+    data, err, wht = rng.normal(size=SHAPE), np.ones(SHAPE), np.ones(SHAPE)
+    dq = np.zeros(SHAPE, np.uint32)
+    data[3, 4], err[5, 6], err[7, 8], wht[9, 10] = np.nan, np.nan, 0, 0
+    # not to be used; a jump alone is no harm
+    dq[11, 12], dq[13, 14] = 1 + 4, 4
+    planes = {"ERR": err, "WHT": wht, "DQ": dq}
+    path = write(data, BUNIT="MJy/sr", planes=planes, FILTER="F444W", PUPIL="CLEAR",
+                 INSTRUME="NIRCAM", PA_APER=12.5)  # fmt: skip
+    image = read_mosaic(path)
+    bad = {tuple(map(int, one)) for one in np.argwhere(image.mask)}
+    assert bad == {(3, 4), (5, 6), (7, 8), (9, 10), (11, 12)}
+    assert image.meta["n_masked"] == 5
+    header = MosaicFile(path).header
+    assert header.filter == "nircam.f444w"
+    assert header.pa_aper == 12.5 * u.deg
+    # the pupil wheel holds the filter that counts
+    narrow = write(data, "narrow.fits", FILTER="F444W", PUPIL="F470N", INSTRUME="NIRCAM")
+    assert MosaicFile(narrow).header.filter == "nircam.f470n"
+
+
+def test_packed_files_give_the_same_numbers_in_native_order(write, tmp_path):
+    planes = {"ERR": np.full(SHAPE, 1e-3, np.float32)}
+    path = write(micro_jansky() + np.random.default_rng(1).normal(0, 1e-3, SHAPE), BUNIT="uJy",
+                 planes=planes)  # fmt: skip
+    packed = tmp_path / "image.fits.gz"
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    plain, other = read_mosaic(path), read_mosaic(packed)
+    assert plain.data.dtype == other.data.dtype == np.dtype("=f4")
+    np.testing.assert_array_equal(plain.data, other.data)
+    np.testing.assert_array_equal(plain.uncertainty.array, other.uncertainty.array)
+
+
+def test_a_background_is_subtracted_where_asked_for(write):
+    rng = np.random.default_rng(2)
+    y, _ = np.indices(SHAPE)
+    path = write(
+        5 + 0.0005 * y + rng.normal(0, 0.1, SHAPE),
+        BUNIT="MJy/sr",
+        planes={"ERR": np.full(SHAPE, 0.1)},
+    )
+    assert read_mosaic(path).meta["sky_over_noise"] > 40
+    image = read_mosaic(path, background_box=30)
+    assert abs(image.meta["sky_over_noise"]) < 0.3
+    assert abs(image.data.mean()) < 0.02
+
+
+@pytest.mark.parametrize("angle", [0.0, 30.0, 200.0])
+def test_the_angle_of_a_grid_is_that_of_its_columns(tools, angle):
+    wcs = north_up_wcs(tools.CENTER, SCALE * u.arcsec, SHAPE)
+    a = np.radians(angle)
+    wcs.wcs.pc = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
+    # +y at a position angle means that a step in y goes sin(PA) to the east
+    there = tools.CENTER.spherical_offsets_to(wcs.pixel_to_world(69.5, 59.5 + 100))
+    expected = np.degrees(np.arctan2(there[0].value, there[1].value)) % 360
+    found = grid_angle(wcs, SHAPE).value % 360
+    assert abs((found - expected + 180) % 360 - 180) < 0.01
+    wcs.wcs.cdelt = [SCALE / 3600, SCALE / 3600]
+    with pytest.raises(ValueError, match="a mirrored one"):
+        grid_angle(wcs, SHAPE)
+
+
+@pytest.mark.skipif(
+    not REAL or not (Path(REAL) / "real" / "i2d").is_dir(),
+    reason="needs real/i2d in MIRICIGALE_DATA",
+)
+def test_a_real_i2d_file_of_the_jwst_pipeline():
+    path = next((Path(REAL) / "real" / "i2d").glob("*04101*_i2d.fits"))
+    # a nebula has no empty sky
+    with pytest.warns(MiricigaleWarning, match="times what the error map says"):
+        image = read_mosaic(path)
+    assert image.meta["filter"] == "miri.f1130w"
+    assert image.meta["pa_aper"] == pytest.approx(273.2125, abs=1e-3)
+    data = fits.getdata(path, "SCI")
+    good = ~image.mask
+    assert 0.8 < good.mean() < 1
+    np.testing.assert_array_equal(image.data[good], data[good])
+    # the pipeline's nominal area of a pixel, which is constant, and the WCS's
+    area = np.median(pixel_area_map(image.wcs, data.shape))
+    assert area == pytest.approx(fits.getval(path, "PIXAR_SR", "SCI"), rel=0.005)

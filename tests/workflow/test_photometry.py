@@ -1,0 +1,272 @@
+"""The command `miricigale photometry` on files of a small field whose fluxes are known."""
+
+import os
+import types
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.table import QTable, Table
+
+from miricigale.cli import main
+from miricigale.instrument import north_up_wcs, pixel_area_map
+from miricigale.photometry import read_mosaic
+from miricigale.utils.exceptions import DataError
+from miricigale.workflow.kernel_files import read_kernel
+from miricigale.workflow.products import write_image
+
+CENTER = SkyCoord(34.3, -5.1, unit="deg")
+#: Pixels and rms of the PSFs of image and prior, arcsec.
+COARSE, FINE, WIDE, SHARP = 0.11, 0.06, 0.25, 0.09
+REAL = os.environ.get("MIRICIGALE_DATA")
+
+
+def gaussian(sky, flux, width, wcs, shape):
+    """Points of ``flux`` (uJy) as Gaussians, uJy in each pixel."""
+    y, x = np.indices(shape)
+    dx, dy = CENTER.spherical_offsets_to(wcs.pixel_to_world(x, y))
+    image = np.zeros(shape)
+    for one, light in zip(sky, flux, strict=True):
+        a, b = CENTER.spherical_offsets_to(one)
+        r2 = (dx - a).to_value(u.arcsec) ** 2 + (dy - b).to_value(u.arcsec) ** 2
+        image += light * np.exp(-0.5 * r2 / width**2) / (2 * np.pi * width**2)
+    return image * pixel_area_map(wcs, shape) / (1 * u.arcsec**2).to_value(u.sr)
+
+
+def psf(width, scale, n, shift=(0.0, 0.0)):
+    x, y = (np.arange(n) - n // 2 - one for one in shift)
+    s = width / scale
+    return np.exp(-0.5 * (x[None] ** 2 + y[:, None] ** 2) / s**2) / (2 * np.pi * s**2)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """An image in 10 nJy with weights of another scale, a prior in nJy, segments, PSFs."""
+    folder = tmp_path_factory.mktemp("files")
+    rng = np.random.default_rng(12)
+    steps = np.arange(-2, 3) * 4.2
+    grid = np.array(np.meshgrid(steps, steps)).reshape(2, -1) + rng.uniform(-0.7, 0.7, (2, 25))
+    sky = CENTER.spherical_offsets_by(*(grid * u.arcsec))
+    flux = np.geomspace(0.3, 30, 25)
+    rng.shuffle(flux)
+    ids = 150_000 + 37 * np.arange(25)
+
+    def save(name, data, wcs=None, **header):
+        hdu = fits.PrimaryHDU(np.asarray(data, np.float32), wcs and wcs.to_header())
+        hdu.header.update(header)
+        hdu.writeto(folder / name)
+        return str(folder / name)
+
+    low, high = (260, 262), (470, 474)
+    image_wcs = north_up_wcs(CENTER, COARSE * u.arcsec, low)
+    prior_wcs = north_up_wcs(CENTER, FINE * u.arcsec, high)
+    labels = np.zeros(high, np.int32)
+    y, x = np.indices(high)
+    for one, a, b in zip(ids, *prior_wcs.world_to_pixel(sky), strict=True):
+        labels[(x - a) ** 2 + (y - b) ** 2 < 64] = one
+    noise = 0.005
+    data = gaussian(sky, flux, WIDE, image_wcs, low) + rng.normal(0, noise, low)
+    prior = gaussian(sky, 3 * flux, SHARP, prior_wcs, high) + rng.normal(0, 0.002, high)
+    paths = {
+        "image": save("image.fits", data * 100, image_wcs, BUNIT="10*nanoJansky"),
+        # 1 / variance up to a factor of 4
+        "weight": save("wht.fits", np.full(low, 0.25 / (100 * noise) ** 2), image_wcs),
+        "highres": save("prior.fits.gz", prior * 1e3, prior_wcs, BUNIT="nJy", FILTER="F444W",
+                        INSTRUME="NIRCAM"),
+        "highres-error": save("rms.fits", np.full(high, 2.0)),
+        "segmentation": save("seg.fits", labels, prior_wcs),
+        "psf": save("psf.fits", psf(WIDE, COARSE, 41)),
+        # a cube of PSFs that are off their middle
+        "highres-psf": save("hipsf.fits", [psf(SHARP, FINE, 61, s) for s in [(1.3, -0.6), (0, 0.4)]])
+        + "[0,mean]",
+    }  # fmt: skip
+    return types.SimpleNamespace(
+        folder=folder, paths=paths, sky=sky, flux=flux, ids=ids, save=save, wcs=prior_wcs
+    )
+
+
+def arguments(files, output, **changes):
+    options = {**files.paths, "filter": "miri.f770w", "output": output, **changes}
+    given = [[f"--{key}", str(value)] for key, value in options.items() if value is not None]
+    return ["photometry", "--no-progress", *(part for pair in given for part in pair)]
+
+
+@pytest.mark.parametrize("form", ["ecsv", "fits"])
+def test_files_become_a_catalogue_that_can_be_fitted_and_a_page(files, tmp_path, form, capsys):
+    output = tmp_path / "new" / f"fluxes.{form}"
+    assert main(arguments(files, output)) == 0
+    assert f"25 sources in {output}" in capsys.readouterr().out
+    table = QTable.read(output)
+    assert list(table["id"]) == list(files.ids)
+    flux, error = (table[name].to_value(u.uJy) for name in ("miri.f770w", "miri.f770w_err"))
+    assert np.all(table["sky"].separation(files.sky) < 0.05 * u.arcsec)
+    # the error of a point source on white noise, in closed form: sigma sqrt(4 pi) width / pixel
+    expected = 0.005 * np.sqrt(4 * np.pi) * WIDE / COARSE
+    np.testing.assert_allclose(np.median(error), expected, rtol=0.05)
+    # errors are of the image's noise; PSFs and templates are good to a percent
+    pulls = (flux - files.flux) / np.hypot(error, 0.01 * files.flux)
+    assert np.abs(pulls).max() < 4
+    assert 0.6 < pulls.std() < 1.4
+    page = output.with_suffix(".html").read_text()
+    for text in ("Forced photometry: miri.f770w", "Image, model and residual", "Magnitudes",
+                 "pulls at empty positions", "Brightest sources", "10*nanoJansky", "150037"):  # fmt: skip
+        assert text in page
+    assert page.count("<img") == 4
+
+
+def test_catalogue_kernel_and_the_plain_form(files, tmp_path):
+    """A kernel of others alone, a catalogue, and the two files without options, packed."""
+    from miricigale.psf import MatchingKernel
+
+    made = MatchingKernel.from_psfs(
+        psf(SHARP, FINE, 61), psf(WIDE, FINE, 61), pixel_scale=FINE * u.arcsec
+    )
+    kernel = files.save("kernel.fits", made.array)
+    made.write(files.folder / "own.fits")
+    catalog = files.folder / "catalog.csv"
+    order = np.arange(25)[::-1]
+    Table({"ID": files.ids[order], "ra": files.sky.ra.deg[order], "dec": files.sky.dec.deg[order]}
+          ).write(catalog)  # fmt: skip
+    found = []
+    for path, sharp in ((kernel, files.paths["highres-psf"]), (files.folder / "own.fits", None)):
+        output = tmp_path / f"{len(found)}.ecsv"
+        changes = {"kernel": path, "psf": None, "highres-psf": sharp, "catalog": catalog}
+        plain = {**changes, "image": None, "highres": None}
+        command = arguments(files, output, **plain)
+        assert main([*command, files.paths["image"], files.paths["highres"]]) == 0
+        table = QTable.read(output)
+        assert list(table["id"]) == list(files.ids[order])
+        found.append(table["miri.f770w"].to_value(u.uJy))
+        np.testing.assert_allclose(found[-1], files.flux[order], rtol=0.03, atol=0.2)
+    np.testing.assert_allclose(*found, rtol=0.01, atol=0.02)
+
+
+def test_our_own_files_are_read(files, tmp_path):
+    image = read_mosaic(files.paths["image"], weight=files.paths["weight"], filter="miri.f770w")
+    write_image(image, tmp_path / "own.fits")
+    again = read_mosaic(tmp_path / "own.fits")
+    np.testing.assert_array_equal(again.data, image.data)
+    np.testing.assert_array_equal(again.uncertainty.array, image.uncertainty.array)
+    np.testing.assert_array_equal(again.mask, image.mask)
+    assert again.meta["filter"] == "miri.f770w"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"filter": None}, "'filter' must be given, for the header of"),
+        ({"filter": "miri.f771w"}, "'filter' must be a filter that 'miricigale filters' lists"),
+        ({"image": "highres", "highres": "image", "filter": "nircam.f356w", "weight": None},
+         "'filter' must be 'nircam.f444w', the filter in"),
+        ({"image": "highres", "highres": "f770w", "weight": None}, "seem to be swapped"),
+        ({"highres": "f770w", "image": "image", "psf": "highres-psf", "highres-psf": "psf",
+          "psf-scale": 0.06, "highres-psf-scale": 0.11, "segmentation": None}, "must be wider than that of"),
+        ({"highres": "far", "highres-error": None}, "show different fields: the middle of"),
+        ({"highres": "plain", "highres-error": None}, "no celestial coordinates"),
+        ({"segmentation": "moved"}, "is not on the pixels of"),
+        ({"segmentation": "absent.fits"}, "no file absent.fits ('segmentation')"),
+        ({"psf": None}, "'pa_aper' must be given, for the header of"),
+        ({"highres-psf": None}, "there is no model PSF for nircam.f444w"),
+        ({"psf": None, "filter": "nircam.f480m"}, "there is no model PSF for nircam.f480m"),
+        ({"kernel": "psf"}, "'psf' must be left out where a kernel is given"),
+        ({"kernel": "psf", "psf": None, "highres-psf": None}, "holds the kernel alone"),
+        ({"psf": "cube"}, "must be an image with a PSF, got the shape"),
+        ({"output": "out.txt"}, "'output' must be a table (.ecsv, .fits, .fits.gz)"),
+        ({"output": "/proc/none/out.ecsv"}, "'output' must be in a folder that can be written to"),
+        ({"output": "image"}, "another file than those that are read"),
+        ({"output": "there.ecsv"}, "'output' must be a new file (or 'overwrite' given)"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused_before_the_work(
+    files, tmp_path, monkeypatch, capsys, changes, message
+):
+    monkeypatch.chdir(tmp_path)
+    Path("there.ecsv").write_text("")
+    data, header = fits.getdata(files.paths["highres"], header=True)
+    made = {**files.paths, "cube": files.paths["highres-psf"].partition("[")[0]}
+    for name in ("f770w", "far", "plain", "moved"):
+        own = header.copy()
+        if name == "f770w":
+            own["FILTER"], own["INSTRUME"] = "F770W", "MIRI"
+        elif name == "far":
+            own["CRVAL1"] += 1
+        elif name == "moved":
+            own["CRPIX1"] += 2
+        else:
+            del own["CTYPE*"]
+        whole = name == "moved"
+        kept = np.ones(data.shape, np.int32) if whole else data
+        fits.writeto(f"{name}.fits", kept, own)
+        made[name] = f"{name}.fits"
+    if "f770w" in changes.values() and "psf" in changes:
+        fits.setval("f770w.fits", "FILTER", value="F444W")
+        fits.setval("f770w.fits", "INSTRUME", value="NIRCAM")
+    changes = {key: made.get(value, value) for key, value in changes.items()}
+    status = main(arguments(files, **{"output": "out.ecsv", **changes}))
+    said = capsys.readouterr().err
+    assert status == 2, said
+    assert message in said
+    assert not Path("out.ecsv").exists()
+    assert not Path("out.html").exists()
+
+
+def test_an_angle_other_than_the_headers_is_refused(files, tmp_path, capsys):
+    path = tmp_path / "image.fits"
+    path.write_bytes(Path(files.paths["image"]).read_bytes())
+    fits.setval(path, "PA_APER", value=359.5)
+    output = tmp_path / "out.ecsv"
+    command = arguments(files, output, image=path, psf=None)
+    assert main([*command, "--pa-aper", "40"]) == 2
+    assert "'pa_aper' must be PA_APER of" in capsys.readouterr().err
+
+
+def test_kernels_that_are_none_are_refused(files):
+    from miricigale.psf import gaussian_psf
+
+    sharp = gaussian_psf(0.2 * u.arcsec, pixel_scale=FINE * u.arcsec, fov=3 * u.arcsec)
+    options = {"highres_psf": sharp, "pixel_scale": FINE * u.arcsec}
+    for name, data, message in (
+        ("even", np.ones((4, 4)) / 16, "odd, square and finite"),
+        ("sum", np.ones((5, 5)), "whose sum is about 1, got 25"),
+    ):
+        path = files.save(f"{name}.fits", data)
+        with pytest.raises(DataError, match=message):
+            read_kernel(path, **options)
+
+
+@pytest.mark.skipif(
+    not REAL or not (Path(REAL) / "uds").is_dir(), reason="needs uds in MIRICIGALE_DATA"
+)
+def test_a_real_field_agrees_with_another_program(tmp_path, capsys):
+    """PRIMER-UDS, F444W to F770W; the other program's fluxes are no truth."""
+    start = f"{REAL}/uds/uds-test-"
+    psfs = f"{REAL}/uds/psf/uds-test-f444w"
+    output = tmp_path / "uds.ecsv"
+    command = ["photometry", "--no-progress", "--filter", "miri.f770w", "-o", str(output)]
+    for key, path in {
+        "image": f"{start}f770w_sci.fits.gz",
+        "weight": f"{start}f770w_wht.fits.gz",
+        "highres": f"{start}f444w_sci.fits.gz",
+        "highres-weight": f"{start}f444w_wht.fits.gz",
+        "segmentation": f"{start}LW_seg.fits.gz",
+        "kernel": f"{psfs}_kernel_f770w.fits.gz[0,mean]",
+        "highres-psf": f"{psfs}_psf.fits.gz[0,mean]",
+    }.items():
+        command += [f"--{key}", path]
+    # the weights were made for an image of another scale
+    with pytest.warns(UserWarning, match="noise on the sky is 2.. times what the weight map says"):
+        assert main(command) == 0
+    table = QTable.read(output)
+    other = Table.read(f"{REAL}/uds/photometry_ca3cf34.cat", format="ascii")
+    assert list(table["id"]) == list(other["id"])
+    ours = table["miri.f770w"].to_value(u.uJy)
+    error = table["miri.f770w_err"].to_value(u.uJy)
+    theirs = np.asarray(other["flux_1"]) / 4 * 0.01
+    bright = (ours > 10 * error) & np.isfinite(theirs)
+    assert np.count_nonzero(bright) >= 15
+    assert 0.93 < np.median(ours[bright] / theirs[bright]) < 1.1
+    faint = (ours < 10 * error) & np.isfinite(theirs)
+    assert np.abs(np.median(((ours - theirs) / error)[faint])) < 0.5
