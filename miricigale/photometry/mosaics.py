@@ -197,6 +197,11 @@ class MosaicFile:
             _note_scale(self, kind, scale)
             meta["noise_scale"] = float(f"{scale:.6g}")
             if kind == "weight":
+                if not scale > 0:
+                    msg = (
+                        f"{self.path}: the scale of its weights is unknown, for its sky is constant"
+                    )
+                    raise DataError(msg)
                 meta["weight_scale"] = meta["noise_scale"]
                 sigma *= sigma.dtype.type(scale)
         else:

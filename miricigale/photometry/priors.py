@@ -29,7 +29,7 @@ def read_prior(highres, *, segmentation=None, catalog=None, path=None):
     ----------
     highres : `~astropy.nddata.CCDData`
         The image that the segments belong to.
-    segmentation : path-like, optional
+    segmentation : path-like or int `~numpy.ndarray`, optional
         Segmentation map: whole numbers, 0 for the sky, any ids; ``file.fits[EXTENSION]`` names
         an extension.
     catalog : path-like, optional
@@ -72,7 +72,11 @@ def read_prior(highres, *, segmentation=None, catalog=None, path=None):
     segments = ids = None
     if segmentation is not None:
         where = path or highres.meta.get("source", "the image")
-        segments, ids = _segments(segmentation, highres.data.shape, highres.wcs, where)
+        if isinstance(segmentation, np.ndarray):
+            data, segmentation = segmentation, "the segmentation"
+        else:
+            data = _read_segments(segmentation, highres.data.shape, highres.wcs, where)
+        segments, ids = _numbered(data, segmentation)
     if catalog is None:
         return segments, _from_segments(highres, segments, ids)
     sources = _read_catalog(catalog)
@@ -81,8 +85,8 @@ def read_prior(highres, *, segmentation=None, catalog=None, path=None):
     return segments, sources
 
 
-def _segments(path, shape, wcs, image_path):
-    """Labels 1 to n in the order of the ids, and the ids."""
+def _read_segments(path, shape, wcs, image_path):
+    """The map in a file, after checking that it is on the image's pixels."""
     with open_image(path, "a segmentation map") as (hdus, extension):
         hdu = hdus[find_image(hdus, extension, path, ("SEGMENTATION", "SEGMAP", "SEG", "SCI"))]
         if hdu.shape != shape:
@@ -94,7 +98,11 @@ def _segments(path, shape, wcs, image_path):
         own = read_wcs(hdu.header, hdus)
         if own is not None:
             check_same_grid(own, wcs, shape, path, image_path)
-        data = np.asarray(hdu.data)
+        return np.array(hdu.data)
+
+
+def _numbered(data, path):
+    """Labels 1 to n in the order of the ids, and the ids."""
     if data.dtype.kind == "f":
         rounded = np.where(np.isfinite(data), np.rint(data), 0)
         if not np.array_equal(rounded, np.where(np.isfinite(data), data, 0)):
@@ -110,7 +118,7 @@ def _segments(path, shape, wcs, image_path):
         msg = f"{path} has negative ids, such as {data.min()}; 0 is the sky"
         raise DataError(msg)
     values, labels = np.unique(data, return_inverse=True)
-    labels = labels.reshape(shape).astype(np.int32)
+    labels = labels.reshape(data.shape).astype(np.int32)
     # the sky is 0 even where every pixel belongs to a segment
     if values[0] != 0:
         return labels + np.int32(1), values

@@ -68,8 +68,11 @@ def _read_psf(path, scale, angle):
             msg = f"{path} is no PSF: it has no light, or pixels that are not finite"
             raise DataError(msg)
         form = {"pixel_scale": scale * ANGLE, "frame": "sky", "angle": angle}
-        place = _centred(data)
-        psf = make_psf(data, origin=place, **form)
+        try:
+            psf = make_psf(data, origin=_centred(data), **form)
+        except ValueError as err:
+            msg = f"{path} cannot be read as a PSF: {err}"
+            raise DataError(msg) from err
         n = 2 * (min(data.shape) // 2) - 1
         middle = psf_image(psf, pixel_scale=scale * ANGLE, shape=n)
         # the shift loses nothing but what is beyond the edge

@@ -284,7 +284,9 @@ def _sources(prior, segmentation, catalog, path):
         return read_prior(prior, segmentation=segmentation, catalog=catalog, path=path)
     segments, detected = detect_sources(prior)
     _log.info("%d sources detected on %s", len(detected), path)
-    return segments.data, detected if catalog is None else read_prior(prior, catalog=catalog)[1]
+    if catalog is None:
+        return segments.data, detected
+    return read_prior(prior, segmentation=segments.data, catalog=catalog, path=path)
 
 
 def empty_positions(result, n, *, seed, distance=0.3):

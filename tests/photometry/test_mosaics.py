@@ -127,6 +127,12 @@ def test_maps_must_be_those_of_the_image(write, tmp_path):
         read_mosaic(f"{path}[ERR]")
     with pytest.raises(DataError, match="no usable pixel"):
         read_mosaic(path, weight=write(np.zeros(SHAPE), "zero.fits"))
+    flat = write(np.ones(SHAPE), "flat.fits", BUNIT="uJy")
+    with (
+        pytest.warns(MiricigaleWarning, match="noise on the sky is 0 times"),
+        pytest.raises(DataError, match="scale of its weights is unknown, for its sky is constant"),
+    ):
+        read_mosaic(flat, weight=write(np.ones(SHAPE), "one.fits"))
 
 
 def noise(rng, kind):

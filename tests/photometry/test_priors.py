@@ -70,6 +70,8 @@ def test_catalogues_of_all_forms_keep_their_ids(prior, tmp_path, form):
     for row, one in zip(sources, IDS, strict=True):
         np.testing.assert_array_equal(segments == row["label"], labels == one)
     assert read_prior(image, catalog=path)[0] is None
+    again, _ = read_prior(image, segmentation=labels, catalog=path)
+    np.testing.assert_array_equal(again, segments)
 
 
 def write_csv(path, ids, sky):

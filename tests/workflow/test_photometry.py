@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
+from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.table import QTable, Table
 
 from miricigale.cli import main
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import read_mosaic
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import DataError, MiricigaleWarning
 from miricigale.workflow.kernel_files import read_kernel
 from miricigale.workflow.products import write_image
 
@@ -144,6 +145,20 @@ def test_catalogue_kernel_and_the_plain_form(files, tmp_path):
     np.testing.assert_allclose(*found, rtol=0.01, atol=0.02)
 
 
+def test_without_a_segmentation_sources_are_detected(files, tmp_path):
+    catalog = tmp_path / "catalog.fits"
+    Table({"id": files.ids, "ra": files.sky.ra.deg, "dec": files.sky.dec.deg}).write(catalog)
+    output = tmp_path / "out.ecsv"
+    command = arguments(files, output, segmentation=None, catalog=catalog)
+    # noise peaks at the low threshold of the detection are in no catalogue
+    with pytest.warns(MiricigaleWarning, match="segments of the segmentation belong to no source"):
+        assert main(command) == 0
+    table = QTable.read(output)
+    assert list(table["id"]) == list(files.ids)
+    ours = table["miri.f770w"].to_value(u.uJy)
+    np.testing.assert_allclose(ours, files.flux, rtol=0.05, atol=0.2)
+
+
 def test_our_own_files_are_read(files, tmp_path):
     image = read_mosaic(files.paths["image"], weight=files.paths["weight"], filter="miri.f770w")
     write_image(image, tmp_path / "own.fits")
@@ -152,6 +167,45 @@ def test_our_own_files_are_read(files, tmp_path):
     np.testing.assert_array_equal(again.uncertainty.array, image.uncertainty.array)
     np.testing.assert_array_equal(again.mask, image.mask)
     assert again.meta["filter"] == "miri.f770w"
+
+
+@pytest.mark.slow
+def test_model_psfs_are_turned_to_the_angle_of_the_aperture(tmp_path):
+    """Our own files, without options but filter and angle; sources on centres of both grids."""
+    from miricigale.psf import hst_psf, miri_psf, psf_image, psf_mosaic
+
+    places, flux = np.array([[-4.8, -3.6], [3.6, 3.6], [-2.4, 6.0]]), np.array([10.0, 20.0, 5.0])
+    coarse, rng = 0.12, np.random.default_rng(3)
+    wide = psf_mosaic(miri_psf("miri.f770w"), coarse * u.arcsec, 75 * u.deg)
+    for name, scale, n, model, light, noise, filter_ in (
+        ("image.fits", coarse, 241, wide, flux, 0.002, "miri.f770w"),
+        ("prior.fits", FINE, 481, hst_psf(), flux + 5, 0.002, "wfc3.f160w"),
+    ):
+        wcs, data = north_up_wcs(CENTER, scale * u.arcsec, (n, n)), rng.normal(0, noise, (n, n))
+        stamp = psf_image(model, pixel_scale=scale * u.arcsec, shape=n)
+        for (x, y), one in zip(places / scale, light, strict=True):
+            # no light comes back from the other side
+            moved = np.roll(stamp, (round(y), round(x)), axis=(0, 1))
+            data += one * moved
+        area = pixel_area_map(wcs, (n, n)) * 1e12
+        error = StdDevUncertainty(noise / area)
+        meta = {"filter": filter_}
+        write_image(CCDData(data / area, unit="MJy/sr", wcs=wcs, uncertainty=error, meta=meta),
+                    tmp_path / name)  # fmt: skip
+    sky = CENTER.spherical_offsets_by(*(places.T * [[-1], [1]] * u.arcsec))
+    files = [str(tmp_path / name) for name in ("image.fits", "prior.fits")]
+    output = tmp_path / "out.ecsv"
+    command = ["photometry", "--filter", "miri.f770w", "--no-progress", "-o", str(output), *files]
+    found = {}
+    for angle in (75, 30):
+        assert main([*command, "--pa-aper", str(angle), "--overwrite"]) == 0
+        table = QTable.read(output)
+        index, separation, _ = sky.match_to_catalog_sky(table["sky"])
+        assert separation.max() < 0.05 * u.arcsec
+        found[angle] = table[index]
+    np.testing.assert_allclose(found[75]["miri.f770w"].to_value(u.uJy), flux, rtol=0.01)
+    # the six spikes stand elsewhere at another angle
+    assert np.all(found[30]["miri.f770w_chi2"] > 2 * found[75]["miri.f770w_chi2"])
 
 
 @pytest.mark.parametrize(
@@ -173,6 +227,7 @@ def test_our_own_files_are_read(files, tmp_path):
         ({"psf": None, "filter": "nircam.f480m"}, "there is no model PSF for nircam.f480m"),
         ({"kernel": "psf"}, "'psf' must be left out where a kernel is given"),
         ({"kernel": "psf", "psf": None, "highres-psf": None}, "holds the kernel alone"),
+        ({"psf": "segmentation"}, "seg.fits cannot be read as a PSF"),
         ({"psf": "cube"}, "must be an image with a PSF, got the shape"),
         ({"output": "out.txt"}, "'output' must be a table (.ecsv, .fits, .fits.gz)"),
         ({"output": "/proc/none/out.ecsv"}, "'output' must be in a folder that can be written to"),
