@@ -15,7 +15,28 @@ _log = logging.getLogger(__name__)
 
 
 def file_place(path):
-    """File, extension and plane of ``file.fits[EXTENSION,PLANE]``."""
+    """
+    Take ``file.fits[EXTENSION,PLANE]`` apart.
+
+    Parameters
+    ----------
+    path : path-like
+        A file, with an extension and the plane of a cube in brackets or without.
+
+    Returns
+    -------
+    path : str
+        The file.
+    extension : str or int
+        The first without brackets.
+    plane : int, "mean" or None
+        None for an image.
+
+    Raises
+    ------
+    ValueError
+        If the plane is neither a number nor ``mean``.
+    """
     name, extension = split_extension(path)
     if not isinstance(extension, str) or "," not in extension:
         return name, 0 if extension is None else extension, None
@@ -81,6 +102,18 @@ def _read_psf(path, scale, angle):
 
 
 def is_own_kernel(path):
+    """
+    Whether a file is a kernel with its PSFs, as `~miricigale.psf.MatchingKernel.write` makes it.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    own : bool
+    """
     with open_fits(file_place(path)[0], wanted="a matching kernel") as hdus:
         return "KERNEL" in hdus and "SOURCE" in hdus and "TARGET" in hdus
 
@@ -140,7 +173,31 @@ def read_kernel(path, *, highres_psf=None, pixel_scale=None):
 def matching_kernel(
     image, highres, filter_, pa_aper, *, kernel, psf, highres_psf, psf_scale, highres_psf_scale
 ):
-    """The kernel from the prior to the image."""
+    """
+    The kernel from the prior to the image.
+
+    Parameters
+    ----------
+    image, highres : `~miricigale.photometry.MosaicFile`
+        Their files.
+    filter_ : str
+        Filter of the image, for the model PSF.
+    pa_aper : `~astropy.units.Quantity` or None
+        Position angle of the detector's +y axis, for the model PSF.
+    kernel, psf, highres_psf, psf_scale, highres_psf_scale
+        As for `~miricigale.workflow.photometry.measure_files`, any of them None.
+
+    Returns
+    -------
+    kernel : `~miricigale.psf.MatchingKernel`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If a file cannot be read as what it should be.
+    ValueError
+        If the prior's PSF is not the narrower one.
+    """
     from miricigale.photometry.arrays import pixel_scale
     from miricigale.psf import MatchingKernel, hst_psf, miri_psf, psf_mosaic
 
@@ -162,14 +219,21 @@ def matching_kernel(
         else:
             scale = coarse if psf_scale is None else to_array(psf_scale, ANGLE, "psf_scale")
             wide = _read_psf(psf, float(scale), low_angle)
+        _check_widths(sharp.meta["fwhm"], wide.meta["fwhm"], image.path, highres.path)
         made = MatchingKernel.from_psfs(
             sharp, wide, pixel_scale=fine * ANGLE, grid_angle=high_angle
         )
-    if not made.source.max() > made.target.max():
+    # the peaks of two PSFs of the same light
+    _check_widths(1 / made.source.max(), 1 / made.target.max(), image.path, highres.path)
+    _log.info("%r", made)
+    return made
+
+
+def _check_widths(sharp, wide, path, highres_path):
+    # an unknown width is NaN
+    if sharp >= wide:
         msg = (
-            f"the PSF of {image.path} must be wider than that of {highres.path}, and it is not: are "
+            f"the PSF of {path} must be wider than that of {highres_path}, and it is not: are "
             "'image' and 'highres' swapped, or their PSFs?"
         )
         raise ValueError(msg)
-    _log.info("%r", made)
-    return made
