@@ -9,7 +9,10 @@ from miricigale.utils.compilation import njit
 
 __all__ = [
     "box_transfer",
+    "core_centroid",
     "gaussian_transfer",
+    "half_maximum_width",
+    "interpolate",
     "ipc_transfer",
     "line_scatter",
     "matrix_dft_intensity",
@@ -338,3 +341,89 @@ def radial_sums(image, x_center, y_center, radii):
     sums = np.empty(radii.size)
     sums[order] = _sorted_sums(image, float(x_center), float(y_center), radii[order])
     return sums
+
+
+def core_centroid(data, x, y, sigma):
+    """
+    Centroid of a PSF's core under a Gaussian window that moves with it.
+
+    Parameters
+    ----------
+    data : `~numpy.ndarray`, shape (ny, nx)
+    x, y : float
+        First guess in cells.
+    sigma : float
+        Of the window, in cells.
+
+    Returns
+    -------
+    x, y : float
+        In cells; NaN where it does not settle on the image.
+    """
+    columns, rows = np.arange(data.shape[1]), np.arange(data.shape[0])
+    for _ in range(100):
+        wx = np.exp(-0.5 * ((columns - x) / sigma) ** 2)
+        wy = np.exp(-0.5 * ((rows - y) / sigma) ** 2)
+        total = wy @ data @ wx
+        if not total > 0:
+            break
+        # twice the step: for a core as wide as the window this converges at once
+        dx = 2 * (wy @ data @ (wx * columns) / total - x)
+        dy = 2 * ((wy * rows) @ data @ wx / total - y)
+        x, y = x + dx, y + dy
+        if math.hypot(dx, dy) < 1e-7 * sigma:
+            return float(x), float(y)
+    return math.nan, math.nan
+
+
+def half_maximum_width(data, x, y):
+    """
+    Full width at half maximum of the azimuthal mean around a point, in cells.
+
+    Parameters
+    ----------
+    data : `~numpy.ndarray`, shape (ny, nx)
+    x, y : float
+        Centre in cells.
+
+    Returns
+    -------
+    width : float
+        NaN where the profile does not fall to a half.
+    """
+    limit = min(x, data.shape[1] - 1 - x, y, data.shape[0] - 1 - y)
+    angles = np.arange(48) * (2 * np.pi / 48)
+    for reach in (16.0, 64.0, limit):
+        radii = np.arange(0.0, min(reach, limit), 0.25)
+        rows = y + radii[:, None] * np.sin(angles)
+        columns = x + radii[:, None] * np.cos(angles)
+        profile = interpolate(data, columns, rows).mean(axis=1)
+        below = np.flatnonzero(profile < 0.5 * profile[0])
+        if below.size:
+            k = below[0]
+            part = (profile[k - 1] - 0.5 * profile[0]) / (profile[k - 1] - profile[k])
+            return 2 * (radii[k - 1] + part * 0.25)
+    return float("nan")
+
+
+def interpolate(data, x, y):
+    """
+    Cubic-spline values of an image at positions in cells, zero outside of it.
+
+    The image is cut to what the positions need (and 12 cells, over which a spline
+    forgets the cut).
+    """
+    from scipy.ndimage import map_coordinates
+
+    ny, nx = data.shape
+    x0, x1 = max(0, int(np.floor(x.min())) - 12), min(nx, int(np.ceil(x.max())) + 13)
+    y0, y1 = max(0, int(np.floor(y.min())) - 12), min(ny, int(np.ceil(y.max())) + 13)
+    if x1 <= x0 or y1 <= y0:
+        return np.zeros(np.broadcast(x, y).shape)
+    x, y = np.broadcast_arrays(x, y)
+    # cells on the very edge belong to the image: 'constant' alone would taper half a cell
+    values = map_coordinates(
+        np.asarray(data[y0:y1, x0:x1], dtype=float), (y - y0, x - x0), order=3, mode="nearest"
+    )
+    inside = (x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)
+    return np.where(inside, values, 0.0)

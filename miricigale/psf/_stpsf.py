@@ -105,6 +105,7 @@ def stpsf_grid(
         pixel_scales=[scale] * len(grid.data),
         frame="detector",
         includes=list(EFFECTS),
+        normalization="total",
         source="stpsf",
     )
     return grid
@@ -138,5 +139,5 @@ def stpsf_psf(filter, *, x=515.0, y=511.0, **options):
         x=x,
         y=y,
     )
-    psf.meta.update(filter=str(filter), instrument="MIRI", source="stpsf")
+    psf.meta.update(filter=str(filter), instrument="MIRI", source="stpsf", normalization="total")
     return psf

@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 
 from miricigale.instrument import imager_filters, psf_fwhm
 from miricigale.psf import _core
-from miricigale.psf.model import half_maximum_width, psf_info
+from miricigale.psf.model import psf_info
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, to_array
 
@@ -108,7 +108,7 @@ def fwhm(psf, *, method="half_maximum"):
         If the method is unknown.
     """
     info = psf_info(psf)
-    width = half_maximum_width(info.data, *info.origin)
+    width = _core.half_maximum_width(info.data, *info.origin)
     if method == "gaussian":
         width = _gaussian_width(info.data, *info.origin, width)
     elif method != "half_maximum":

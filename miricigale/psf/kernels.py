@@ -7,11 +7,10 @@ import json
 import astropy.units as u
 import numpy as np
 from astropy.io import fits
-from photutils.psf import ImagePSF
 from scipy.signal import fftconvolve, oaconvolve
 
-from miricigale.psf.model import make_psf, psf_info
-from miricigale.psf.resample import average_psf, psf_image, psf_mosaic, rotate_psf
+from miricigale.psf.model import fits_image
+from miricigale.psf.pairs import psf_pair, ready_arrays
 from miricigale.psf.wiener import (
     REGULARIZATIONS,
     choose,
@@ -34,8 +33,8 @@ class MatchingKernel:
 
     The sharp PSF is taken as the image of unit flux, so that a template of unit sum
     turns into what the wide image shows of a source of unit flux: the kernel's sum is
-    the fraction of light that the wide PSF's grid holds, a little below 1 (exactly 1 with
-    ``normalize=True`` in `from_psfs`).
+    the fraction of light that the wide PSF's grid holds, a little below 1, where that is known
+    and 1 where it is not (see ``normalize`` in `from_psfs`).
 
     Parameters
     ----------
@@ -95,7 +94,7 @@ class MatchingKernel:
         grid_angle=0.0 * u.deg,
         resampling=None,
         extent=None,
-        normalize=False,
+        normalize=None,
         tolerance=1e-3,
     ):
         """
@@ -105,7 +104,9 @@ class MatchingKernel:
         ----------
         hi, lo : `~photutils.psf.ImagePSF` or `~numpy.ndarray`
             The sharp and the wide PSF. An array is taken as sampled on the image's grid
-            (pixel and orientation), centred, its sum the fraction of light it holds.
+            (pixel and orientation), its sum the fraction of light it holds. Cores that do
+            not stand on the centre (by more than 0.01 pixel) are brought there, arrays with
+            an even number of pixels to an odd one; ``meta["centering"]`` has the shifts.
         pixel_scale : `~astropy.units.Quantity`
             Pixel of the image that is to be convolved.
         regularization : float, str, optional
@@ -113,12 +114,16 @@ class MatchingKernel:
             scale: the penalty of a given structure grows as the pixel's fourth power.
             ``"auto"`` goes through 0.1, 0.03, ... 1e-8, takes the largest error of the
             encircled energy at any radius for each, and chooses the largest mu (the
-            smoothest kernel) whose error is at most ``tolerance`` above the smallest.
+            smoothest kernel) whose error is at most ``tolerance`` above the smallest. Kernels
+            whose noise gain exceeds 1.25 times that of the Gaussian between Gaussians of the
+            two widths, or whose negative pixels sum to less than -1.5, are left out: PSFs with
+            noise or artefacts of resampling make those striped.
         penalty : {"laplacian", "biharmonic"}, `~numpy.ndarray` or None, optional
             What is rough, as for `photutils.psf_matching.make_wiener_kernel`.
         hi_angle, lo_angle : `~astropy.units.Quantity`, optional
             Position angle of the +y axis of a PSF in the detector frame; needed for those,
             refused for PSFs on the sky. An array of angles (rolls, dithers) gives the average.
+            A PSF whose meta has ``pa_aper`` (`read_psf`) is turned by that if none is given.
         grid_angle : `~astropy.units.Quantity`, optional
             Position angle of the image's +y axis.
         resampling : {"drizzle", None}, optional
@@ -127,19 +132,33 @@ class MatchingKernel:
         extent : `~astropy.units.Quantity`, optional
             Width of the kernel; that of the wide PSF if not given.
         normalize : bool, optional
-            Whether both PSFs are scaled to unit sum first, as the paper does.
+            Whether the kernel has unit sum, as the paper's: fluxes then lack the light beyond
+            the PSFs' grids. If not, its sum is the wide PSF's. By default a kernel is
+            normalised where it is not known what fraction of all light a PSF holds: for
+            arrays and for PSFs made without ``enclosed``.
         tolerance : float, optional
             See ``regularization``.
 
         Returns
         -------
         kernel : `MatchingKernel`
+            Its meta has ``noise_gain``, ``gaussian_gain``, ``negative_sum``, ``residual``,
+            ``max_error``, ``smallest_error``, ``within_limits`` (of the choice of mu),
+            ``centering`` (arcsec x, y), ``held`` (what the sharp and the wide PSF's grids
+            sum to, before any scaling), ``energy`` (what the wide one was scaled to).
 
         Raises
         ------
         ValueError
-            If an angle is missing or one too many, shapes do not fit, or an array's sum is
-            not that of a PSF.
+            If an angle is missing or one too many, shapes do not fit, an array's sum is
+            not that of a PSF, or the first PSF is the wider one.
+
+        Warns
+        -----
+        `~miricigale.utils.exceptions.MiricigaleWarning`
+            If the automatic choice cannot keep its limits or misses the wide PSF by more than
+            0.02 of the light; if a kernel is normalised by default although more than 0.01 of
+            the light lies beyond a grid.
 
         References
         ----------
@@ -159,29 +178,100 @@ class MatchingKernel:
         scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
         if resampling not in ("drizzle", None):
             raise argument_error("resampling", "'drizzle' or None", repr(resampling))
-        n = _size(hi, lo, scale, extent)
-        source = _on_grid(hi, "hi", hi_angle, grid_angle, scale, n, None)
-        target = _on_grid(lo, "lo", lo_angle, grid_angle, scale, n, resampling)
-        energy = 1.0 if normalize else float(target.sum())
-        source = source / source.sum()
-        target = target * (energy / target.sum())
+        source, target, mended = psf_pair(
+            hi, lo, scale, angles=(hi_angle, lo_angle), grid_angle=grid_angle,
+            resampling=resampling, extent=extent, normalize=normalize,
+        )  # fmt: skip
         make = wiener(source, target, penalty)
-        mu, errors = choose(regularization, make, source, target, tolerance)
+        mu, array, figures = choose(regularization, make, source, target, tolerance)
         return cls(
-            make(mu),
+            array,
             pixel_scale=scale * ANGLE,
             source=source,
             target=target,
             regularization=mu,
             meta={
                 "penalty": penalty,
-                "energy": energy,
                 "lost": 0.0,
                 "grid_angle": float(grid_angle.to_value(u.deg)),
                 "resampling": resampling or "none",
-                **errors,
+                **mended,
+                **figures,
             },
         )
+
+    @classmethod
+    def from_array(cls, array, *, pixel_scale, source=None, target=None):
+        """
+        Take a kernel that is ready, such as another program's.
+
+        Parameters
+        ----------
+        array : `~numpy.ndarray`, shape (n, n), n odd
+            The kernel. A sum between 0.9 and 1.1 is brought to 1.
+        pixel_scale : `~astropy.units.Quantity`
+            Pixel of the images that it is for.
+        source, target : `~photutils.psf.ImagePSF` or `~numpy.ndarray`, optional
+            The sharp and the wide PSF, on the sky or as arrays of the kernel's shape; the
+            target is the convolved source if only that is given.
+
+        Returns
+        -------
+        kernel : `MatchingKernel`
+            ``meta["sum"]`` is what the array summed to.
+
+        Raises
+        ------
+        ValueError
+            If the kernel is not square and odd, its sum is another, or a PSF does not fit.
+
+        Warns
+        -----
+        `~miricigale.utils.exceptions.MiricigaleWarning`
+            If the kernel was normalised by more than 0.001, or its core stands more than 0.1
+            pixel off the centre: it moves images by that.
+        """
+        scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
+        array, psfs, total = ready_arrays(array, scale, source=source, target=target)
+        return cls(array, pixel_scale=pixel_scale, meta={"sum": total, "lost": 0.0}, **psfs)
+
+    @classmethod
+    def blend(cls, kernels, weights=None):
+        """
+        The mean of kernels, such as those of several regions at a place between them.
+
+        Parameters
+        ----------
+        kernels : sequence of `MatchingKernel`
+            Alike in pixel, shape and in whether they have their PSFs.
+        weights : array_like, optional
+            Non-negative weights; equal if not given.
+
+        Returns
+        -------
+        kernel : `MatchingKernel`
+            With the mean PSFs; exact where one of the two PSFs is the same in all.
+
+        Raises
+        ------
+        ValueError
+            If there is none, they differ, or the weights do not fit.
+        """
+        n, names = len(kernels), ("array", "source", "target")
+        w = np.ones(n) if weights is None else np.asarray(weights, dtype=float)
+        if w.shape != (n,) or np.any(w < 0) or not w.sum() > 0:
+            raise argument_error("weights", f"{n} non-negative numbers, not all 0", weights)
+        forms = {(k.pixel_scale, *(np.shape(getattr(k, name)) for name in names)) for k in kernels}
+        if len(forms) > 1:
+            raise argument_error("kernels", "alike in pixel, shape and PSFs", forms)
+        w = w / w.sum()
+        mean = {
+            name: np.tensordot(w, [getattr(k, name) for k in kernels], axes=1)
+            for name in names
+            if getattr(kernels[0], name) is not None
+        }
+        meta = {"weights": w.tolist(), "lost": float(w @ [k.meta.get("lost", 0) for k in kernels])}
+        return cls(**mean, pixel_scale=kernels[0].pixel_scale, meta=meta)
 
     @property
     def noise_gain(self):
@@ -303,15 +393,35 @@ class MatchingKernel:
         write_fits(hdus, path, overwrite=overwrite)
 
     @classmethod
-    def read(cls, path):
+    def read(cls, path, *, ext=None, plane=None, pixel_scale=None, source=None):
         """
-        Read what `write` wrote.
+        Read what `write` wrote, or an image that is a kernel from any FITS file.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        ext : int or str, optional
+            The extension of an image; needed for files that `write` has not written.
+        plane : int, optional
+            Which plane of a cube.
+        pixel_scale : `~astropy.units.Quantity`, optional
+            As for `from_array`; from the header if it states it.
+        source : optional
+            As for `from_array`; for images only.
 
         Raises
         ------
         `~miricigale.utils.exceptions.DataError`
             If the file is missing or not a kernel.
+        ValueError
+            If the image is no kernel (`from_array`) or its pixel is unknown.
         """
+        if ext is not None:
+            data, _, pixel_scale, _ = fits_image(
+                path, ext, plane, pixel_scale, wanted="a matching kernel"
+            )
+            return cls.from_array(data, pixel_scale=pixel_scale, source=source)
         with open_fits(path, wanted="a matching kernel") as hdus:
             if "KERNEL" not in hdus:
                 msg = f"{path} has no KERNEL extension, only {[hdu.name for hdu in hdus]}"
@@ -337,55 +447,3 @@ class MatchingKernel:
     def _need_psfs(self):
         if self.source is None or self.target is None:
             raise argument_error("source, target", "the kernel's PSFs", "a kernel without them")
-
-
-def _size(hi, lo, scale, extent):
-    """Odd number of pixels on which both PSFs are sampled."""
-    arrays = {
-        name: odd_square(psf, name).shape[0]
-        for name, psf in (("hi", hi), ("lo", lo))
-        if not isinstance(psf, ImagePSF)
-    }
-    if len(set(arrays.values())) > 1:
-        raise argument_error("hi, lo", "arrays of the same shape", arrays)
-    if arrays:
-        n = next(iter(arrays.values()))
-    else:
-        n = 2 * int(psf_info(lo, "lo").half_width / scale) + 1
-    if extent is not None:
-        wanted = 2 * int(float(to_array(extent, ANGLE, "extent")) / scale / 2) + 1
-        if wanted > n or wanted < 5:
-            text = f"from 5 pixels to the {n * scale:.4g} arcsec of the PSFs"
-            raise argument_error("extent", text, extent)
-        n = wanted
-    return n
-
-
-def _on_grid(psf, name, angle, grid_angle, scale, n, resampling):
-    """One PSF on n x n pixels of the image, its sum the enclosed fraction."""
-    if not isinstance(psf, ImagePSF):
-        data = np.asarray(psf, dtype=float)
-        total = data.sum()
-        if not 0 < total < 1.02:
-            wanted = "a PSF whose sum is the fraction of light it holds (at most 1)"
-            raise argument_error(name, wanted, f"a sum of {total:.6g}")
-        cut = (data.shape[0] - n) // 2
-        if angle is None and resampling is None:
-            return data[cut : cut + n, cut : cut + n]
-        frame = "sky" if angle is None else "detector"
-        psf = make_psf(data, pixel_scale=scale * ANGLE, frame=frame)
-    info = psf_info(psf, name)
-    if info.frame == "detector" and angle is None:
-        wanted = "the position angle of the detector's +y (the PSF is in the detector frame)"
-        argument = name + "_angle"
-        raise argument_error(argument, wanted, "None")
-    if resampling:
-        psf = psf_mosaic(psf, scale * ANGLE, angle, grid_angle=grid_angle)
-    else:
-        angles = [None] if angle is None else list(np.atleast_1d(angle))
-        try:
-            turned = [rotate_psf(psf, one, grid_angle=grid_angle) for one in angles]
-        except ValueError as err:
-            raise ValueError(str(err).replace("'angle'", f"'{name}_angle'")) from None
-        psf = average_psf(turned) if len(turned) > 1 else turned[0]
-    return psf_image(psf, pixel_scale=scale * ANGLE, shape=n)

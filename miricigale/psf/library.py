@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 
 from miricigale.filters import Filter
 from miricigale.instrument import aperture, pixel_to_v2v3
+from miricigale.psf import _core
 from miricigale.psf.effects import (
     EFFECTS,
     cruciform,
@@ -16,7 +17,7 @@ from miricigale.psf.effects import (
     cruciform_shift,
     detector_response,
 )
-from miricigale.psf.model import half_maximum_width, interpolate, make_psf
+from miricigale.psf.model import make_psf
 from miricigale.psf.optics import hst_pupil, jwst_constants, jwst_pupil, polychromatic_psf
 from miricigale.refdata import citations
 from miricigale.utils.exceptions import argument_error, unknown_name
@@ -146,7 +147,7 @@ def _distorted_optics(map_, oversampling, n, cell, *optics):
     axis = (np.arange(n) - n // 2) * float(finer)
     x = map_[0, 0] * axis + map_[0, 1] * axis[:, None] + n_fine // 2
     y = map_[1, 0] * axis + map_[1, 1] * axis[:, None] + n_fine // 2
-    return interpolate(fine, x, y) * abs(np.linalg.det(map_)) * finer**2
+    return _core.interpolate(fine, x, y) * abs(np.linalg.det(map_)) * finer**2
 
 
 @functools.lru_cache(maxsize=24)
@@ -326,6 +327,7 @@ def miri_psf(
         calibration=calibration,
         cruciform_fraction=scattered,
         citations=citations("psf.jwst_pupil"),
+        normalization="total",
         **place,
     )
 
@@ -354,7 +356,7 @@ def _hst_blur(name, fwhm, scale, n_wavelengths):
 
     def excess(sigma):
         image = _hst_blurred(data, oversampling, scale, sigma)
-        return half_maximum_width(image, middle, middle) * cell - fwhm
+        return _core.half_maximum_width(image, middle, middle) * cell - fwhm
 
     sharpest = fwhm + excess(0.0)
     if sharpest > fwhm:
@@ -437,5 +439,6 @@ def hst_psf(
         filter=name,
         instrument="WFC3/IR",
         blur=sigma,
+        normalization="total",
         telescope_angle=float(to_array(angle, u.deg, "angle")),
     )

@@ -1,13 +1,15 @@
 """PSFs as photutils models that say what they are: scale, frame, angle, what they include."""
 
 import dataclasses
+import warnings
 
 import astropy.units as u
 import numpy as np
+from astropy.wcs import WCS
 from photutils.psf import GriddedPSFModel, ImagePSF
 
 from miricigale.psf import _core
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.files import open_fits
 from miricigale.utils.units import ANGLE, to_array
 
@@ -65,6 +67,11 @@ class PSFInfo:
         return float(self.data.sum()) / self.oversampling**2
 
     @property
+    def total_known(self):
+        """Whether the sum is known to be the fraction of all light, not only claimed."""
+        return self.meta.get("normalization") == "total"
+
+    @property
     def half_width(self):
         """Distance from the centre to the nearest edge in arcsec."""
         ny, nx = self.data.shape
@@ -119,59 +126,6 @@ def psf_info(psf, argument="psf"):
     )
 
 
-def half_maximum_width(data, x, y):
-    """
-    Full width at half maximum of the azimuthal mean around a point, in cells.
-
-    Parameters
-    ----------
-    data : `~numpy.ndarray`, shape (ny, nx)
-    x, y : float
-        Centre in cells.
-
-    Returns
-    -------
-    width : float
-        NaN where the profile does not fall to a half.
-    """
-    limit = min(x, data.shape[1] - 1 - x, y, data.shape[0] - 1 - y)
-    angles = np.arange(48) * (2 * np.pi / 48)
-    for reach in (16.0, 64.0, limit):
-        radii = np.arange(0.0, min(reach, limit), 0.25)
-        rows = y + radii[:, None] * np.sin(angles)
-        columns = x + radii[:, None] * np.cos(angles)
-        profile = interpolate(data, columns, rows).mean(axis=1)
-        below = np.flatnonzero(profile < 0.5 * profile[0])
-        if below.size:
-            k = below[0]
-            part = (profile[k - 1] - 0.5 * profile[0]) / (profile[k - 1] - profile[k])
-            return 2 * (radii[k - 1] + part * 0.25)
-    return float("nan")
-
-
-def interpolate(data, x, y):
-    """
-    Cubic-spline values of an image at positions in cells, zero outside of it.
-
-    The image is cut to what the positions need (and 12 cells, over which a spline
-    forgets the cut).
-    """
-    from scipy.ndimage import map_coordinates
-
-    ny, nx = data.shape
-    x0, x1 = max(0, int(np.floor(x.min())) - 12), min(nx, int(np.ceil(x.max())) + 13)
-    y0, y1 = max(0, int(np.floor(y.min())) - 12), min(ny, int(np.ceil(y.max())) + 13)
-    if x1 <= x0 or y1 <= y0:
-        return np.zeros(np.broadcast(x, y).shape)
-    x, y = np.broadcast_arrays(x, y)
-    # cells on the very edge belong to the image: 'constant' alone would taper half a cell
-    values = map_coordinates(
-        np.asarray(data[y0:y1, x0:x1], dtype=float), (y - y0, x - x0), order=3, mode="nearest"
-    )
-    inside = (x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)
-    return np.where(inside, values, 0.0)
-
-
 def make_psf(
     data,
     *,
@@ -181,6 +135,7 @@ def make_psf(
     angle=0.0 * u.deg,
     includes=(),
     origin=None,
+    enclosed=None,
     **meta,
 ):
     """
@@ -191,7 +146,7 @@ def make_psf(
     data : `~numpy.ndarray`, shape (ny, nx)
         Oversampled PSF, normalised so that the sum over the infinite plane would be
         ``oversampling**2``: the sum of ``data`` is that times the fraction of the light
-        that the grid holds.
+        that the grid holds. A sum of 1 on an oversampled grid is brought to that.
     pixel_scale : `~astropy.units.Quantity`
         Side of a pixel (not of a cell).
     oversampling : int, optional
@@ -206,6 +161,10 @@ def make_psf(
         ``"drizzle"``.
     origin : tuple of float, optional
         Cell x, y of the centre; the middle if not given.
+    enclosed : float, optional
+        Fraction of the light that the grid holds: the data, of any positive sum, are scaled
+        to it. Without it the sum itself is taken for that fraction, and a kernel made with
+        the PSF has unit sum (see `~miricigale.psf.MatchingKernel.from_psfs`).
     **meta
         Further entries of the meta.
 
@@ -214,12 +173,19 @@ def make_psf(
     psf : `~photutils.psf.ImagePSF`
         Its meta has ``pixel_scale`` (arcsec), ``oversampling``, ``frame``, ``angle``
         (deg), ``includes``, ``fwhm`` (arcsec), ``enclosed`` (fraction of the light on the
-        grid), ``eef_radius`` (arcsec) and ``eef``.
+        grid), ``normalization`` (``"total"`` if that fraction is known, ``"grid"`` if it is
+        no more than the sum that came), ``eef_radius`` (arcsec) and ``eef``.
 
     Raises
     ------
     ValueError
-        If the data are not a finite 2D array that holds light, or a name is unknown.
+        If the data are not a finite 2D array that holds light, a name is unknown, or the
+        sum claims more light beyond the grid than the profile at its edge allows.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        If an oversampled PSF of unit sum is scaled.
     """
     data = np.array(data, dtype=float)
     if data.ndim != 2 or not np.all(np.isfinite(data)) or not data.sum() > 0:
@@ -231,17 +197,36 @@ def make_psf(
     scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
     if not scale > 0:
         raise argument_error("pixel_scale", "positive", pixel_scale)
-    enclosed = float(data.sum()) / oversampling**2
+    total, cells = float(data.sum()), oversampling**2
+    if enclosed is not None:
+        if not 0 < enclosed <= 1:
+            raise argument_error("enclosed", "above 0 and at most 1", enclosed)
+        data *= enclosed * cells / total
+        meta["normalization"] = "total"
+    elif "normalization" not in meta and oversampling > 1 and 0.8 < total < 1.04:
+        # taken literally it would hold a quarter of the light or less
+        text = f"'data' sums to {total:.4g} with {oversampling} x {oversampling} cells per pixel: "
+        text += f"multiplied by {cells} (a PSF sums to {cells} over the infinite plane)"
+        warnings.warn(text, MiricigaleWarning, stacklevel=2)
+        data *= cells
+    enclosed = float(data.sum()) / cells
     # stpsf's sums reach 1.03 at the corners of the array, where its distortion adds light
     if enclosed > 1.04:
-        wanted = f"normalised to {oversampling**2} over the infinite plane"
+        wanted = f"normalised to {cells} over the infinite plane (or 'enclosed' given)"
         raise argument_error("data", wanted, f"a sum of {data.sum():.6g}")
     psf = ImagePSF(data, oversampling=int(oversampling), origin=origin)
     x, y = (float(v) for v in psf.origin)
     cell = scale / oversampling
     limit = (min(x, data.shape[1] - 1 - x, y, data.shape[0] - 1 - y) + 0.5) * cell
     radii = [r for r in _RADII if r < limit]
-    eef = _core.radial_sums(data, x, y, np.array(radii) / cell) / oversampling**2
+    sums = _core.radial_sums(data, x, y, np.array([*radii, limit / 2, limit]) / cell) / cells
+    eef, outer = sums[:-2], sums[-1] - sums[-2]
+    meta.setdefault("normalization", "grid")
+    # in wings as r**-3 as much light lies beyond a radius as between it and its half
+    if meta["normalization"] == "grid" and 1 - enclosed > max(0.15, 5 * outer):
+        wanted = "a PSF whose sum is the fraction of light it holds (or 'enclosed' given)"
+        got = f"a sum of {total:.4g}, though only {outer:.2g} lie in the outer half of the grid"
+        raise argument_error("data", wanted, got)
     psf.meta.update(meta)
     psf.meta.update(
         pixel_scale=scale,
@@ -249,7 +234,7 @@ def make_psf(
         frame=frame,
         angle=float(to_array(angle, u.deg, "angle", finite=True)) if frame == "sky" else 0.0,
         includes=list(includes),
-        fwhm=half_maximum_width(data, x, y) * cell,
+        fwhm=_core.half_maximum_width(data, x, y) * cell,
         enclosed=enclosed,
         eef_radius=radii,
         eef=[float(v) for v in eef],
@@ -257,7 +242,17 @@ def make_psf(
     return psf
 
 
-def from_photutils(model, *, pixel_scale, frame, angle=0.0 * u.deg, includes=(), x=None, y=None):
+def from_photutils(
+    model,
+    *,
+    pixel_scale,
+    frame,
+    angle=0.0 * u.deg,
+    includes=(),
+    enclosed=None,
+    x=None,
+    y=None,
+):
     """
     Take over a PSF from photutils (or from stpsf, which writes the gridded form).
 
@@ -265,7 +260,7 @@ def from_photutils(model, *, pixel_scale, frame, angle=0.0 * u.deg, includes=(),
     ----------
     model : `~photutils.psf.ImagePSF` or `~photutils.psf.GriddedPSFModel`
         Normalised as photutils asks: sum ``oversampling**2`` over the infinite plane.
-    pixel_scale, frame, angle, includes
+    pixel_scale, frame, angle, includes, enclosed
         As for `make_psf`: photutils' models do not know them.
     x, y : float, optional
         Detector position at which a gridded model is evaluated; needed for those.
@@ -303,7 +298,67 @@ def from_photutils(model, *, pixel_scale, frame, angle=0.0 * u.deg, includes=(),
         angle=angle,
         includes=includes,
         origin=origin,
+        enclosed=enclosed,
     )
+
+
+def _header_grid(header):
+    """Side of a pixel in arcsec and position angle of +y in deg, None where not stated."""
+    wcs = WCS(header, naxis=2, fix=False).celestial if "CTYPE1" in header else None
+    if wcs is not None and wcs.has_celestial:
+        (a, b), (c, d) = wcs.pixel_scale_matrix
+        if a * d - b * c > 0:
+            raise argument_error("path", "a file with east to the left where north is up", wcs)
+        return float(np.sqrt(b * c - a * d)) * 3600, float(np.degrees(np.arctan2(b, d)))
+    for key in ("PIXELSCL", "PIXSCALE"):
+        if isinstance(header.get(key), float) and header[key] > 0:
+            return header[key], None
+    return None, None
+
+
+def fits_image(path, ext, plane, pixel_scale, *, wanted, oversampling=1):
+    """
+    An image of any FITS file and what its header states of its grid.
+
+    Parameters
+    ----------
+    path, ext, plane, pixel_scale, oversampling
+        As for `read_psf`.
+    wanted : str
+        What the file is to hold, for messages.
+
+    Returns
+    -------
+    data : `~numpy.ndarray`, shape (ny, nx)
+    header : `~astropy.io.fits.Header`
+    pixel_scale : `~astropy.units.Quantity`
+    angle : float or None
+        Position angle of +y in deg.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`, ValueError
+        As `read_psf`.
+    """
+    with open_fits(path, wanted=wanted, output_verify="silentfix") as hdus:
+        data = hdus[ext].data
+        if data is not None and plane is not None:
+            data = data[plane]
+        if data is None or data.ndim != 2:
+            got = None if data is None else f"shape {data.shape}"
+            raise argument_error("path", f"a file with a 2D image in extension {ext!r}", got)
+        data, header = np.array(data, dtype=float), hdus[ext].header
+    cell, angle = _header_grid(header)
+    if pixel_scale is None:
+        if cell is None:
+            raise argument_error("pixel_scale", "given where the header does not state it", None)
+        pixel_scale = cell * oversampling * ANGLE
+    elif cell is not None:
+        mine = float(to_array(pixel_scale, ANGLE, "pixel_scale")) / oversampling
+        if abs(mine / cell - 1) > 0.02:
+            stated = f"{cell * oversampling:.4g} arcsec by the header and 'oversampling'"
+            raise argument_error("pixel_scale", stated, pixel_scale)
+    return data, header, pixel_scale, angle
 
 
 def read_psf(
@@ -311,10 +366,10 @@ def read_psf(
     *,
     ext=0,
     plane=None,
-    pixel_scale,
+    pixel_scale=None,
     oversampling=1,
     frame,
-    angle=0.0 * u.deg,
+    angle=None,
     includes=(),
     enclosed=None,
 ):
@@ -329,39 +384,43 @@ def read_psf(
         The extension.
     plane : int, optional
         Which plane of a cube.
-    pixel_scale, oversampling, frame, angle, includes
-        As for `make_psf`. Headers name these differently in every file, so they are given.
-    enclosed : float, optional
-        Fraction of the light that the image holds; the image is scaled to it. Without it
-        the image is taken as normalised already.
+    pixel_scale, angle : `~astropy.units.Quantity`, optional
+        As for `make_psf`. Where the header states them (world coordinates; PIXELSCL or
+        PIXSCALE, arcsec per cell) they can be left out, and must agree with it if given.
+    oversampling, frame, includes, enclosed
+        As for `make_psf`.
 
     Returns
     -------
     psf : `~photutils.psf.ImagePSF`
+        ``pa_aper`` in the meta is that of the header, for a PSF in the detector frame:
+        `~miricigale.psf.MatchingKernel.from_psfs` turns by it if no angle is given.
 
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
         If the file is missing or no FITS.
     ValueError
-        If there is no 2D image there.
+        If there is no 2D image there, or scale or angle are unknown or not the header's.
     """
-    with open_fits(path, wanted="a PSF", output_verify="silentfix") as hdus:
-        data = hdus[ext].data
-        if data is not None and plane is not None:
-            data = data[plane]
-        if data is None or data.ndim != 2:
-            got = None if data is None else f"shape {data.shape}"
-            raise argument_error("path", f"a file with a 2D image in extension {ext!r}", got)
-        data = np.array(data, dtype=float)
-    if enclosed is not None:
-        data *= enclosed * oversampling**2 / data.sum()
+    data, header, pixel_scale, turn = fits_image(
+        path, ext, plane, pixel_scale, wanted="a PSF", oversampling=oversampling
+    )
+    meta = {"file": str(path)}
+    if frame == "detector" and isinstance(header.get("PA_APER"), float):
+        meta["pa_aper"] = header["PA_APER"]
+    if frame == "sky" and turn is not None:
+        given = turn if angle is None else float(to_array(angle, u.deg, "angle", finite=True))
+        if abs((given - turn + 180) % 360 - 180) > 0.5:
+            raise argument_error("angle", f"the header's, {turn:.4g} deg", angle)
+        angle = given * u.deg
     return make_psf(
         data,
         pixel_scale=pixel_scale,
         oversampling=oversampling,
         frame=frame,
-        angle=angle,
+        angle=0.0 * u.deg if angle is None else angle,
         includes=includes,
-        file=str(path),
+        enclosed=enclosed,
+        **meta,
     )

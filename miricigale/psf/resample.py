@@ -1,5 +1,6 @@
 """PSFs on other grids: turned to the sky, averaged, sampled, drizzled."""
 
+import logging
 import math
 
 import astropy.units as u
@@ -7,12 +8,15 @@ import numpy as np
 from astropy.coordinates import Angle
 from photutils.psf import ImagePSF
 
+from miricigale.psf import _core
 from miricigale.psf.effects import detector_response
-from miricigale.psf.model import interpolate, make_psf, psf_info
+from miricigale.psf.model import make_psf, psf_info
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, to_array
 
 __all__ = ["average_psf", "psf_image", "psf_mosaic", "rotate_psf"]
+
+_log = logging.getLogger(__name__)
 
 # entries of the meta that make_psf works out itself
 _MADE = ("pixel_scale", "oversampling", "frame", "angle", "includes", "fwhm", "enclosed")
@@ -62,7 +66,9 @@ def _sample(info, x, y, turn):
     else:
         u_ = x * math.cos(a) + y * math.sin(a)
         v_ = -x * math.sin(a) + y * math.cos(a)
-    return interpolate(info.data, u_ / info.cell + info.origin[0], v_ / info.cell + info.origin[1])
+    return _core.interpolate(
+        info.data, u_ / info.cell + info.origin[0], v_ / info.cell + info.origin[1]
+    )
 
 
 def rotate_psf(psf, angle=None, *, grid_angle=0.0 * u.deg):
@@ -302,3 +308,45 @@ def psf_mosaic(
         includes=includes,
         **_carried(info.meta, telescope_angle=turns[0] + grid),
     )
+
+
+def centered_psf(psf, tolerance, argument="psf"):
+    """
+    Put a PSF's origin where its core is.
+
+    Parameters
+    ----------
+    psf : `~photutils.psf.ImagePSF`
+        A PSF with the meta of `~miricigale.psf.make_psf`.
+    tolerance : float
+        Distance in arcsec from which on it is moved.
+    argument : str, optional
+        The argument's name for messages.
+
+    Returns
+    -------
+    psf : `~photutils.psf.ImagePSF`
+        The same data; what is sampled from them has the core on its centre.
+    offset : tuple of float
+        Where the core was, x, y in arcsec from the old origin.
+
+    Raises
+    ------
+    ValueError
+        If no core is found, or it is nearer to the edge than to the origin.
+    """
+    info = psf_info(psf, argument)
+    row, column = np.unravel_index(np.argmax(info.data), info.data.shape)
+    width = _core.half_maximum_width(info.data, float(column), float(row))
+    x, y = _core.core_centroid(info.data, float(column), float(row), width / 2.355)
+    offset = (x - info.origin[0]) * info.cell, (y - info.origin[1]) * info.cell
+    if not np.hypot(*offset) < 0.5 * info.half_width:
+        wanted = "a PSF whose core stands near its centre"
+        raise argument_error(argument, wanted, f"a core at x, y = {column}, {row}")
+    if np.hypot(*offset) <= tolerance:
+        return psf, (0.0, 0.0)
+    moved = ImagePSF(info.data, oversampling=info.oversampling, origin=(x, y))
+    moved.meta.update(info.meta)
+    text = "'%s': the core stood (%.4f, %.4f) arcsec off the centre and was brought there"
+    _log.info(text, argument, *offset)
+    return moved, offset

@@ -18,7 +18,13 @@ def _round_psf(profile, pixel_scale, oversampling, fov):
     cell = scale / oversampling
     n = odd_cells(width, cell)
     axis = (np.arange(n) - n // 2) * cell
-    return profile(np.hypot(axis, axis[:, None])) * scale**2
+    return make_psf(
+        profile(np.hypot(axis, axis[:, None])) * scale**2,
+        pixel_scale=pixel_scale,
+        oversampling=oversampling,
+        frame="sky",
+        normalization="total",
+    )
 
 
 def gaussian_psf(fwhm, *, pixel_scale, oversampling=4, fov):
@@ -42,8 +48,7 @@ def gaussian_psf(fwhm, *, pixel_scale, oversampling=4, fov):
     def profile(r):
         return np.exp(-0.5 * (r / sigma) ** 2) / (2 * math.pi * sigma**2)
 
-    data = _round_psf(profile, pixel_scale, oversampling, fov)
-    return make_psf(data, pixel_scale=pixel_scale, oversampling=oversampling, frame="sky")
+    return _round_psf(profile, pixel_scale, oversampling, fov)
 
 
 def moffat_psf(fwhm, *, beta=3.0, pixel_scale, oversampling=4, fov):
@@ -80,5 +85,4 @@ def moffat_psf(fwhm, *, beta=3.0, pixel_scale, oversampling=4, fov):
     def profile(r):
         return (beta - 1) / (math.pi * core**2) * (1 + (r / core) ** 2) ** -beta
 
-    data = _round_psf(profile, pixel_scale, oversampling, fov)
-    return make_psf(data, pixel_scale=pixel_scale, oversampling=oversampling, frame="sky")
+    return _round_psf(profile, pixel_scale, oversampling, fov)

@@ -205,6 +205,8 @@ def psf_from_stars(
         frame=frame,
         angle=angle,
         includes=includes,
+        # 1 stands for a fraction that is not known
+        normalization="grid" if share == 1 else "total",
         source="stars",
         n_images=len(images),
         n_stamps=len(stamps) - failed,

@@ -1,13 +1,19 @@
 """The Wiener filter from one PSF to another, and the choice of its parameter."""
 
+import logging
+import math
+import warnings
+
 import numpy as np
 from scipy.fft import fftshift, ifftshift, irfft2, next_fast_len, rfft2
 from scipy.signal import convolve2d
 
 from miricigale.psf import _core
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 
 __all__ = ["REGULARIZATIONS", "choose", "energy_error", "energy_radii", "odd_square", "wiener"]
+
+_log = logging.getLogger(__name__)
 
 #: Regularisation parameters that have a name; they belong to pixels of 0.06 arcsec.
 REGULARIZATIONS = {"yang2021": 0.03}
@@ -18,6 +24,13 @@ _PENALTIES["biharmonic"] = convolve2d(_PENALTIES["laplacian"], _PENALTIES["lapla
 
 # from smooth to sharp: two steps per decade
 _SEQUENCE = tuple(10.0 ** (-0.5 * k) for k in range(2, 17))
+
+# what an automatic kernel may have: noise gain relative to that of the Gaussian between two
+# Gaussians of the PSFs' widths (MIRI from F160W: 0.8-1.2; striped kernels: 3-6), and sum of its
+# negative pixels (-0.03 to -0.95; striped kernels: -3 to -6)
+_GAIN, _NEGATIVE = 1.25, -1.5
+# largest error of the encircled energy that goes without a warning
+_ERROR = 0.02
 
 
 def odd_square(value, name):
@@ -90,6 +103,34 @@ def energy_error(image, target, radii):
     return _core.radial_sums(image - target, c, c, radii)
 
 
+def gaussian_gain(source, target):
+    """
+    Noise gain of the Gaussian kernel between two Gaussians of the PSFs' widths, at most 1.
+
+    Raises
+    ------
+    ValueError
+        If the sharp PSF is wider than the wide one by more than a tenth.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        If it is wider by less.
+    """
+    c = len(source) // 2
+    sharp, wide = (_core.half_maximum_width(image, c, c) for image in (source, target))
+    if not sharp < 1.02 * wide:
+        wanted = "the sharp and the wide PSF, in this order"
+        got = f"FWHM of {sharp:.4g} and {wide:.4g} pixels"
+        if not sharp < 1.1 * wide:
+            raise argument_error("hi, lo", wanted, got)
+        text = f"the sharp PSF is the wider one ({got}): the kernel sharpens"
+        warnings.warn(text, MiricigaleWarning, stacklevel=5)
+    # FWHM to rms: sqrt(8 ln 2)
+    variance = (wide**2 - sharp**2) / (8 * math.log(2))
+    return 1 / math.sqrt(max(4 * math.pi * variance, 1.0))
+
+
 def choose(regularization, make, source, target, tolerance):
     """
     Choose the Wiener parameter.
@@ -108,21 +149,40 @@ def choose(regularization, make, source, target, tolerance):
     Returns
     -------
     mu : float
-    errors : dict
-        ``max_error``, and ``smallest_error`` where several were tried.
+    kernel : `~numpy.ndarray`, shape (n, n)
+    figures : dict
+        ``max_error`` (of the encircled energy at any radius), ``noise_gain`` (factor on the rms
+        of white noise), ``gaussian_gain`` (see `gaussian_gain`), ``negative_sum`` and
+        ``residual`` (largest deviation from the wide PSF over its peak); where several were tried
+        also ``smallest_error`` (of those within the limits) and ``within_limits``.
 
     Raises
     ------
     ValueError
-        If it is neither positive nor a known name.
+        If it is neither positive nor a known name, or the PSFs are the wrong way round.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        If no kernel keeps the limits, or the one that was chosen misses the wide PSF's
+        encircled energy by more than 0.02.
     """
     n, half = len(source), len(source) // 2
     size = (next_fast_len(2 * n - 1, real=True),) * 2
     spectrum = rfft2(source, size)
 
-    def error(mu):
-        matched = irfft2(spectrum * rfft2(make(mu), size), size)[half : half + n, half : half + n]
-        return float(np.abs(energy_error(matched, target, energy_radii(target))).max())
+    reference = gaussian_gain(source, target)
+
+    def figures(mu):
+        kernel = make(mu)
+        matched = irfft2(spectrum * rfft2(kernel, size), size)[half : half + n, half : half + n]
+        return {
+            "max_error": float(np.abs(energy_error(matched, target, energy_radii(target))).max()),
+            "noise_gain": float(np.sqrt(np.sum(kernel**2))),
+            "gaussian_gain": reference,
+            "negative_sum": float(kernel[kernel < 0].sum()),
+            "residual": float(np.abs(matched - target).max() / target.max()),
+        }
 
     if isinstance(regularization, str):
         if regularization in REGULARIZATIONS:
@@ -133,8 +193,23 @@ def choose(regularization, make, source, target, tolerance):
     if regularization != "auto":
         if not regularization > 0:
             raise argument_error("regularization", "positive", regularization)
-        return float(regularization), {"max_error": error(regularization)}
-    errors = [error(mu) for mu in _SEQUENCE]
-    allowed = min(errors) + tolerance
-    best = next(k for k, value in enumerate(errors) if value <= allowed)
-    return _SEQUENCE[best], {"max_error": errors[best], "smallest_error": min(errors)}
+        mu = float(regularization)
+        return mu, make(mu), figures(mu)
+    tried = [(mu, figures(mu)) for mu in _SEQUENCE]
+    total = float(target.sum())
+    limits = _GAIN * reference * total, _NEGATIVE * total
+    allowed = [
+        one for one in tried
+        if one[1]["noise_gain"] <= limits[0] and one[1]["negative_sum"] >= limits[1]
+    ]  # fmt: skip
+    kept = bool(allowed) or [min(tried, key=lambda one: one[1]["noise_gain"])]
+    smallest = min(one["max_error"] for _, one in allowed or kept)
+    mu, best = next(t for t in allowed or kept if t[1]["max_error"] <= smallest + tolerance)
+    best |= {"smallest_error": smallest, "within_limits": bool(allowed)}
+    text = f"matching kernel with regularization {mu:.2g}: noise gain {best['noise_gain']:.4f} "
+    text += f"(limit {limits[0]:.4f}), negative pixels {best['negative_sum']:.3f} (limit "
+    text += f"{limits[1]:.3f}), error of the encircled energy {best['max_error']:.4f}"
+    if not allowed or best["max_error"] > _ERROR:
+        warnings.warn(text, MiricigaleWarning, stacklevel=3)
+    _log.info(text)
+    return mu, make(mu), best

@@ -1,0 +1,182 @@
+"""What a matching kernel is made of, on one grid: centred, turned, normalised, or refused."""
+
+import logging
+import warnings
+
+import astropy.units as u
+import numpy as np
+from photutils.psf import ImagePSF
+from scipy.signal import fftconvolve
+
+from miricigale.psf import _core
+from miricigale.psf.model import make_psf, psf_info
+from miricigale.psf.resample import average_psf, centered_psf, psf_image, psf_mosaic, rotate_psf
+from miricigale.psf.wiener import odd_square
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.units import ANGLE, to_array
+
+__all__ = ["psf_pair", "ready_arrays"]
+
+_log = logging.getLogger(__name__)
+
+
+def psf_pair(hi, lo, scale, *, angles, grid_angle, resampling, extent, normalize):
+    """
+    The sharp and the wide PSF on the pixels of an image, centred and normalised.
+
+    Parameters
+    ----------
+    hi, lo, grid_angle, resampling, extent, normalize
+        As for `~miricigale.psf.MatchingKernel.from_psfs`.
+    scale : float
+        Pixel in arcsec.
+    angles : tuple
+        ``hi_angle`` and ``lo_angle``.
+
+    Returns
+    -------
+    source, target : `~numpy.ndarray`, shape (n, n), n odd
+        The source of unit sum, the target of what it holds or of unit sum.
+    mended : dict
+        ``energy``, ``held`` and ``centering`` of the kernel's meta.
+    """
+    given, psfs, centering = {"hi": hi, "lo": lo}, {}, {}
+    arrays = {k: np.shape(v) for k, v in given.items() if not isinstance(v, ImagePSF)}
+    if len(set(arrays.values())) > 1:
+        raise argument_error("hi, lo", "arrays of the same shape", arrays)
+    for (name, psf), angle in zip(given.items(), angles, strict=True):
+        if name in arrays:
+            psf = _from_array(psf, name, scale, angle, grid_angle, normalize)
+        psfs[name], centering[name] = centered_psf(psf, 0.01 * scale, name)
+    infos = {name: psf_info(psf, name) for name, psf in psfs.items()}
+    # pixels whose centres lie on the arrays; a PSF that is resampled reaches to its edge
+    half = min((infos[k].half_width - 0.5 * scale for k in arrays), default=infos["lo"].half_width)
+    n = 2 * int(half / scale + 1e-6) + 1
+    if extent is not None:
+        wanted = 2 * int(float(to_array(extent, ANGLE, "extent")) / scale / 2) + 1
+        if wanted > n or wanted < 5:
+            text = f"from 5 pixels to the {n * scale:.4g} arcsec of the PSFs"
+            raise argument_error("extent", text, extent)
+        n = wanted
+    images = [
+        _on_grid(psf, name, angle, grid_angle, scale, n, resampling if name == "lo" else None)
+        for (name, psf), angle in zip(psfs.items(), angles, strict=True)
+    ]
+    held = [float(image.sum()) for image in images]
+    if normalize is None:
+        normalize = not all(info.total_known for info in infos.values())
+        missing = {name: max(0.0, _missing(info)) for name, info in infos.items()}
+        if normalize and max(missing.values()) > 0.01:
+            text = ", ".join(f"{value:.3f} of '{name}'" for name, value in missing.items())
+            text = f"light beyond the PSFs' grids, by their own sums and wings: {text}. The kernel "
+            text += "is normalised to 1: fluxes lack what lies beyond. Give the PSFs' 'enclosed' "
+            warnings.warn(text + "(make_psf, read_psf) or 'normalize'", MiricigaleWarning, 3)
+    energy = 1.0 if normalize else held[1]
+    mended = {"energy": energy, "held": held, "centering": centering}
+    return images[0] / held[0], images[1] * (energy / held[1]), mended
+
+
+def _missing(info):
+    """Light beyond the grid: what the sum leaves, or where it leaves nothing what wings say."""
+    claimed = 1 - info.enclosed
+    if info.total_known or claimed > 0.01:
+        return claimed
+    edge = info.half_width / info.cell
+    inner, middle, outer = _core.radial_sums(
+        info.data, *info.origin, np.array([0.5, 0.75, 1.0]) * edge
+    ) / float(info.data.sum())  # fmt: skip
+    # wings that fall as r**-3 hold half as much in the outer ring as in the inner one, and three
+    # times as much beyond it; those of a Gaussian or a steep Moffat fall faster
+    ring = outer - middle
+    return max(claimed, 3 * ring if ring > 0.35 * (middle - inner) else 0.0)
+
+
+def _from_array(array, name, scale, angle, grid_angle, normalize):
+    """An array on the image's pixels as a PSF."""
+    array = np.asarray(array, dtype=float)
+    if array.ndim != 2 or array.shape[0] != array.shape[1]:
+        raise argument_error(name, "square", f"shape {array.shape}")
+    if not np.all(np.isfinite(array)):
+        raise argument_error(name, "finite", "NaN or infinite pixels")
+    total = array.sum()
+    if not 0 < total < (np.inf if normalize else 1.02):
+        wanted = "a PSF whose sum is the fraction of light it holds (or 'normalize' True)"
+        raise argument_error(name, wanted, f"a sum of {total:.6g}")
+    frame = "sky" if angle is None else "detector"
+    try:
+        return make_psf(
+            array, pixel_scale=scale * ANGLE, frame=frame, angle=grid_angle,
+            enclosed=1.0 if normalize else None,
+        )  # fmt: skip
+    except ValueError as err:
+        raise ValueError(str(err).replace("'data'", f"'{name}'")) from None
+
+
+def _on_grid(psf, name, angle, grid_angle, scale, n, resampling):
+    """One PSF on n x n pixels of the image, its sum the enclosed fraction."""
+    info = psf_info(psf, name)
+    if info.frame == "detector" and angle is None:
+        if "pa_aper" not in info.meta:
+            wanted = "the position angle of the detector's +y (the PSF is in the detector frame)"
+            raise argument_error(name + "_angle", wanted, "None")
+        angle = info.meta["pa_aper"] * u.deg
+        _log.info("'%s' is turned by the %.4f deg of its header", name, info.meta["pa_aper"])
+    if resampling:
+        psf = psf_mosaic(psf, scale * ANGLE, angle, grid_angle=grid_angle)
+    else:
+        angles = [None] if angle is None else list(np.atleast_1d(angle))
+        try:
+            turned = [rotate_psf(psf, one, grid_angle=grid_angle) for one in angles]
+        except ValueError as err:
+            raise ValueError(str(err).replace("'angle'", f"'{name}_angle'")) from None
+        psf = average_psf(turned) if len(turned) > 1 else turned[0]
+    return psf_image(psf, pixel_scale=scale * ANGLE, shape=n)
+
+
+def ready_arrays(array, scale, **psfs):
+    """
+    A kernel that came ready and its PSFs, checked and normalised.
+
+    Parameters
+    ----------
+    array, psfs
+        As for `~miricigale.psf.MatchingKernel.from_array`.
+    scale : float
+        Pixel in arcsec.
+
+    Returns
+    -------
+    array : `~numpy.ndarray`, shape (n, n)
+        Of unit sum.
+    images : dict
+        The PSFs that are not None, of unit sum; ``target`` also if only ``source`` is given.
+    total : float
+        What the kernel summed to.
+    """
+    array = odd_square(array, "array")
+    total = float(array.sum())
+    if not 0.9 <= total <= 1.1:
+        raise argument_error("array", "a kernel whose sum is 1", f"a sum of {total:.6g}")
+    array = array / total
+    said = [f"summed to {total:.4f} and was brought to 1"] if abs(total - 1) > 1e-3 else []
+    c = array.shape[0] // 2
+    y, x = np.unravel_index(np.argmax(array), array.shape)
+    width = _core.half_maximum_width(array, float(x), float(y))
+    core = _core.core_centroid(array, float(x), float(y), max(width / 2.355, 1.0))
+    if not np.hypot(core[0] - c, core[1] - c) < 0.1:
+        said.append(f"stands ({core[0] - c:.2f}, {core[1] - c:.2f}) pixels off the centre")
+    for text in said:
+        warnings.warn(f"the matching kernel {text}", MiricigaleWarning, stacklevel=3)
+    images = {}
+    for name, psf in psfs.items():
+        if isinstance(psf, ImagePSF):
+            psf = psf_image(psf, pixel_scale=scale * ANGLE, shape=array.shape)
+        if psf is not None:
+            psf = odd_square(psf, name)
+            if psf.shape != array.shape or not psf.sum() > 0:
+                wanted = f"a PSF of the kernel's shape {array.shape}"
+                raise argument_error(name, wanted, f"{psf.shape} with a sum of {psf.sum():.4g}")
+            images[name] = psf / psf.sum()
+    if "source" in images and "target" not in images:
+        images["target"] = fftconvolve(images["source"], array, mode="same")
+    return array, images, total

@@ -1,0 +1,303 @@
+"""PSFs as people bring them: truncated, off-centre, even-sized, oversampled, unnormalised."""
+
+import os
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.wcs import WCS
+from photutils.psf import ImagePSF
+from scipy.signal import fftconvolve
+
+from miricigale.psf import (
+    MatchingKernel,
+    from_photutils,
+    gaussian_psf,
+    make_psf,
+    psf_info,
+    read_psf,
+)
+from miricigale.utils.exceptions import MiricigaleWarning
+
+SCALE = 0.04 * u.arcsec
+HI, LO = 1.7, 3.0  # rms of the two PSFs in pixels
+
+
+def offsets(n, x, y):
+    """Distances in pixels from a point x, y off the middle of an n x n image."""
+    axis = np.arange(n) - (n - 1) / 2
+    return axis - x, (axis - y)[:, None]
+
+
+def gaussian(n, sigma, x=0.0, y=0.0):
+    dx, dy = offsets(n, x, y)
+    return np.exp(-0.5 * (dx**2 + dy**2) / sigma**2) / (2 * np.pi * sigma**2)
+
+
+def moffat(n, core, beta, x=0.0, y=0.0):
+    dx, dy = offsets(n, x, y)
+    return (beta - 1) / (np.pi * core**2) * (1 + (dx**2 + dy**2) / core**2) ** -beta
+
+
+def expected_kernel(n):
+    """Gaussians: the kernel is that of the difference of the variances, and centred."""
+    return gaussian(n, np.sqrt(LO**2 - HI**2))
+
+
+def assert_is_the_gaussian_kernel(kernel):
+    n = kernel.array.shape[0]
+    expected = expected_kernel(n)
+    # the automatic regularization keeps the error of the encircled energy below 0.001
+    np.testing.assert_allclose(kernel.array, expected, rtol=0, atol=0.03 * expected.max())
+    assert kernel.array.sum() == pytest.approx(1, abs=1e-6)
+    # and what comes out of it is the wide PSF where it should stand
+    image = kernel.apply(gaussian(n, HI))
+    np.testing.assert_allclose(image, gaussian(n, LO), rtol=0, atol=5e-3 * image.max())
+    # a point of unit flux keeps it
+    point = np.zeros((2 * n + 1, 2 * n + 1))
+    point[n, n] = 1.0
+    assert kernel.apply(point).sum() == pytest.approx(1, abs=1e-6)
+
+
+@pytest.mark.parametrize("n", [51, 52])
+@pytest.mark.parametrize("off", [(0.0, 0.0), (1.3, -0.8), (-0.46, 1.77)])
+def test_off_centre_and_even_arrays_give_the_centred_kernel(n, off):
+    kernel = MatchingKernel.from_psfs(
+        gaussian(n, HI, -off[1], off[0]), gaussian(n, LO, *off), pixel_scale=SCALE
+    )
+    assert_is_the_gaussian_kernel(kernel)
+    assert kernel.array.shape[0] % 2 == 1
+    # the moving itself costs less than the regularization
+    m = kernel.array.shape[0]
+    straight = MatchingKernel.from_psfs(gaussian(m, HI), gaussian(m, LO), pixel_scale=SCALE)
+    np.testing.assert_allclose(kernel.array, straight.array, atol=5e-4 * kernel.array.max())
+    found = np.array(kernel.meta["centering"]["lo"]) / SCALE.value
+    np.testing.assert_allclose(found, off, atol=2e-3)
+
+
+def test_off_centre_psfs_keep_their_angles():
+    """The core is put on the axis before the PSF is turned about it."""
+    psfs = [
+        make_psf(gaussian(61, s, 1.2, -0.9), pixel_scale=SCALE, frame="detector") for s in (HI, LO)
+    ]
+    angles = {"hi_angle": 20 * u.deg, "lo_angle": [20, 140] * u.deg}
+    kernel = MatchingKernel.from_psfs(*psfs, pixel_scale=SCALE, **angles)
+    assert_is_the_gaussian_kernel(kernel)
+
+
+def test_core_that_is_nowhere_near_the_centre_is_refused():
+    with pytest.raises(ValueError, match="'lo' must be a PSF whose core stands near its centre"):
+        MatchingKernel.from_psfs(gaussian(51, HI), gaussian(51, LO, 15.0, 0.0), pixel_scale=SCALE)
+
+
+def test_oversampled_psf_of_unit_sum_is_scaled_and_said():
+    n, over = 121, 4
+    for make in (
+        lambda d: make_psf(d, pixel_scale=SCALE, oversampling=over, frame="sky"),
+        lambda d: from_photutils(ImagePSF(d, oversampling=over), pixel_scale=SCALE, frame="sky"),
+    ):
+        with pytest.warns(MiricigaleWarning, match="'data' sums to 1 with 4 x 4 cells per pixel"):
+            psf = make(gaussian(n, over * HI))
+        assert psf.data.sum() == pytest.approx(over**2, rel=1e-6)
+    lo = make_psf(gaussian(51, LO), pixel_scale=SCALE, frame="sky")
+    kernel = MatchingKernel.from_psfs(psf, lo, pixel_scale=SCALE)
+    assert_is_the_gaussian_kernel(kernel)
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.02, 7.0])
+def test_sums_that_are_no_fraction_are_refused_unless_scaled(factor):
+    data = factor * gaussian(51, HI)
+    kind = {"pixel_scale": SCALE, "frame": "sky"}
+    with pytest.raises(ValueError, match=r"'data' must be .*'enclosed' given"):
+        make_psf(data, **kind)
+    with pytest.raises(ValueError, match="'hi' must be a PSF whose sum is the fraction of light"):
+        MatchingKernel.from_psfs(data, gaussian(51, LO), pixel_scale=SCALE)
+    kernel = MatchingKernel.from_psfs(data, gaussian(51, LO), pixel_scale=SCALE, normalize=True)
+    assert_is_the_gaussian_kernel(kernel)
+    psf = make_psf(data, **kind, enclosed=0.97)
+    assert psf_info(psf).enclosed == pytest.approx(0.97)
+    with pytest.raises(ValueError, match="'enclosed' must be above 0 and at most 1"):
+        make_psf(data, **kind, enclosed=1.5)
+
+
+def test_truncated_wings_are_said_and_the_kernel_has_unit_sum():
+    """Wings as r**-3, of which a circle of R leaves (1 + R^2 / c^2)^-1/2 outside."""
+    hi, lo = moffat(101, 2.0, 1.5), moffat(101, 4.0, 1.5)
+    with pytest.warns(MiricigaleWarning, match="light beyond the PSFs' grids") as said:
+        kernel = MatchingKernel.from_psfs(hi, lo, pixel_scale=SCALE)
+    assert f"{1 - lo.sum():.3f} of 'lo'" in str(said[0].message)
+    assert kernel.array.sum() == pytest.approx(1, abs=1e-9)
+    assert kernel.meta["held"] == pytest.approx([hi.sum(), lo.sum()])
+    absolute = MatchingKernel.from_psfs(hi, lo, pixel_scale=SCALE, normalize=False)
+    assert absolute.array.sum() == pytest.approx(lo.sum(), abs=1e-9)
+    # known fractions stay as they are, without a word
+    known = [
+        make_psf(d, pixel_scale=SCALE, frame="sky", enclosed=e) for d, e in ((hi, 0.96), (lo, 0.93))
+    ]
+    assert MatchingKernel.from_psfs(*known, pixel_scale=SCALE).array.sum() == pytest.approx(0.93)
+    # scaled to 1 on their own grids, the wings alone can tell: the light beyond the circle
+    with pytest.warns(MiricigaleWarning, match="light beyond the PSFs' grids") as said:
+        MatchingKernel.from_psfs(hi / hi.sum(), lo / lo.sum(), pixel_scale=SCALE)
+    words = str(said[0].message).split("wings: ")[1].split()
+    truth = [1 / np.sqrt(1 + (50.5 / core) ** 2) for core in (2.0, 4.0)]
+    np.testing.assert_allclose([float(words[0]), float(words[3])], truth, rtol=0.15)
+
+
+def test_exchanged_psfs_are_refused():
+    with pytest.raises(ValueError, match="'hi, lo' must be the sharp and the wide PSF"):
+        MatchingKernel.from_psfs(gaussian(51, LO), gaussian(51, HI), pixel_scale=SCALE)
+    with pytest.warns(MiricigaleWarning, match="the sharp PSF is the wider one"):
+        MatchingKernel.from_psfs(gaussian(51, 3.15), gaussian(51, LO), pixel_scale=SCALE)
+
+
+def test_artefacts_of_resampling_make_no_stripes():
+    """A wide PSF with structure that the sharp one has lost: error alone asks for stripes."""
+    rng = np.random.default_rng(5)
+    n = 71
+    hi, lo = gaussian(n, HI), gaussian(n, LO)
+    lo = np.clip(lo * (1 + 0.05 * rng.normal(size=lo.shape)), 0, None)
+    lo /= lo.sum()
+    kernel = MatchingKernel.from_psfs(hi, lo, pixel_scale=SCALE)
+    truth = 1 / np.sqrt(4 * np.pi * (LO**2 - HI**2))
+    assert kernel.meta["within_limits"]
+    assert kernel.meta["noise_gain"] == pytest.approx(kernel.noise_gain)
+    assert kernel.noise_gain < 1.25 * truth * 1.01
+    negative = kernel.array[kernel.array < 0].sum()
+    assert kernel.meta["negative_sum"] == pytest.approx(negative)
+    assert kernel.meta["negative_sum"] > -0.5
+    deviation = np.abs(kernel.matched - kernel.target).max() / kernel.target.max()
+    assert kernel.meta["residual"] == pytest.approx(deviation)
+    # what the error alone would have taken
+    sharp = MatchingKernel.from_psfs(hi, lo, pixel_scale=SCALE, regularization=1e-6)
+    assert sharp.meta["max_error"] < kernel.meta["max_error"]
+    assert sharp.noise_gain > 1.5 * kernel.noise_gain
+
+
+def header(side=0.04, angle=30.0, flip=-1):
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    a, s = np.radians(angle), side / 3600
+    wcs.wcs.cd = s * np.array([[flip * np.cos(a), np.sin(a)], [-flip * np.sin(a), np.cos(a)]])
+    return wcs.to_header()
+
+
+def test_scale_and_angle_come_from_the_header(tmp_path):
+    path = tmp_path / "psf.fits"
+    fits.writeto(path, gaussian(51, HI), header())
+    psf = read_psf(path, frame="sky")
+    assert psf.meta["pixel_scale"] == pytest.approx(0.04)
+    assert psf.meta["angle"] == pytest.approx(30)
+    with pytest.raises(ValueError, match=r"'pixel_scale' must be 0\.04 arcsec by the header"):
+        read_psf(path, frame="sky", pixel_scale=0.06 * u.arcsec)
+    with pytest.raises(ValueError, match=r"'angle' must be the header's, 30 deg"):
+        read_psf(path, frame="sky", angle=0 * u.deg)
+    fits.writeto(path, gaussian(51, HI), header(flip=1), overwrite=True)
+    with pytest.raises(ValueError, match="'path' must be a file with east to the left"):
+        read_psf(path, frame="sky")
+    # stpsf's, arcsec per cell
+    fits.writeto(path, gaussian(51, 4 * HI), fits.Header({"PIXELSCL": 0.0275}), overwrite=True)
+    with pytest.warns(MiricigaleWarning, match="sums to"):
+        psf = read_psf(path, frame="detector", oversampling=4)
+    assert psf.meta["pixel_scale"] == pytest.approx(0.11)
+    fits.writeto(path, gaussian(51, HI), overwrite=True)
+    with pytest.raises(ValueError, match="'pixel_scale' must be given where the header"):
+        read_psf(path, frame="sky")
+
+
+def test_roll_of_the_header_turns_the_psf(tmp_path):
+    path = tmp_path / "psf.fits"
+    dx, dy = offsets(61, 0.0, 0.0)
+    data = np.exp(-0.5 * ((dx / 4) ** 2 + (dy / 2.5) ** 2)) / (2 * np.pi * 10)
+    fits.writeto(path, data, fits.Header({"PA_APER": 35.0}))
+    psf = read_psf(path, pixel_scale=SCALE, frame="detector")
+    hi = gaussian_psf(0.16 * u.arcsec, pixel_scale=SCALE, fov=2.4 * u.arcsec)
+    kernel = MatchingKernel.from_psfs(hi, psf, pixel_scale=SCALE)
+    # +y turned counter-clockwise by 35 deg: so is the long axis, which was x
+    x, y = offsets(kernel.target.shape[0], 0.0, 0.0)
+    total = kernel.target.sum()
+    xx, yy, xy = ((kernel.target * p).sum() / total for p in (x**2, y**2, x * y))
+    assert np.degrees(0.5 * np.arctan2(2 * xy, xx - yy)) == pytest.approx(35, abs=0.2)
+    given = MatchingKernel.from_psfs(hi, psf, pixel_scale=SCALE, lo_angle=35 * u.deg)
+    np.testing.assert_array_equal(given.array, kernel.array)
+
+
+def test_ready_kernels_are_taken(tmp_path):
+    array = expected_kernel(41)
+    kernel = MatchingKernel.from_array(array, pixel_scale=SCALE, source=gaussian(41, HI))
+    np.testing.assert_allclose(kernel.target, gaussian(41, LO), atol=1e-4 * kernel.target.max())
+    bare = MatchingKernel.from_array(array, pixel_scale=SCALE)
+    assert bare.source is None
+    with pytest.warns(MiricigaleWarning, match=r"summed to 0\.9430 and was brought to 1"):
+        mended = MatchingKernel.from_array(0.943 * array / array.sum(), pixel_scale=SCALE)
+    np.testing.assert_allclose(mended.array, array / array.sum(), rtol=1e-12)
+    assert mended.meta["sum"] == pytest.approx(0.943)
+    with pytest.raises(ValueError, match="'array' must be a kernel whose sum is 1, got a sum of 2"):
+        MatchingKernel.from_array(2 * array / array.sum(), pixel_scale=SCALE)
+    with pytest.raises(ValueError, match="'array' must be square with an odd number"):
+        MatchingKernel.from_array(expected_kernel(40), pixel_scale=SCALE)
+    with pytest.warns(MiricigaleWarning, match=r"stands \(1\.00, 0\.00\) pixels off the centre"):
+        MatchingKernel.from_array(np.roll(array, 1, axis=1), pixel_scale=SCALE)
+    with pytest.raises(ValueError, match="'source' must be a PSF of the kernel's shape"):
+        MatchingKernel.from_array(array, pixel_scale=SCALE, source=gaussian(51, HI))
+    path = tmp_path / "kernels.fits"
+    fits.writeto(path, np.stack([np.zeros_like(array), array]), fits.Header({"PIXSCALE": 0.04}))
+    read = MatchingKernel.read(path, ext=0, plane=1)
+    np.testing.assert_allclose(read.array, array / array.sum())
+    assert read.pixel_scale.value == 0.04
+    with pytest.raises(ValueError, match=r"'pixel_scale' must be 0\.04 arcsec by the header"):
+        MatchingKernel.read(path, ext=0, plane=1, pixel_scale=0.06 * u.arcsec)
+
+
+def test_kernels_of_regions_blend():
+    """One sharp PSF, several wide ones: the mean kernel is that of the mean wide PSF."""
+    hi = gaussian(51, HI)
+    wide = [gaussian(51, s) for s in (3.0, 3.4)]
+    kernels = [
+        MatchingKernel.from_psfs(hi, lo, pixel_scale=SCALE, regularization=1e-4) for lo in wide
+    ]
+    mean = MatchingKernel.blend(kernels, [3, 1])
+    direct = MatchingKernel.from_psfs(
+        hi, 0.75 * wide[0] + 0.25 * wide[1], pixel_scale=SCALE, regularization=1e-4
+    )
+    np.testing.assert_allclose(mean.array, direct.array, atol=1e-7)
+    np.testing.assert_allclose(mean.target, direct.target, atol=1e-7)
+    assert mean.meta["weights"] == [0.75, 0.25]
+    with pytest.raises(ValueError, match="'kernels' must be alike"):
+        MatchingKernel.blend([kernels[0], kernels[0].cropped(1 * u.arcsec)])
+    with pytest.raises(ValueError, match="'weights' must be 2 non-negative numbers"):
+        MatchingKernel.blend(kernels, [0, 0])
+
+
+def uds_file(name):
+    path = Path(os.environ.get("MIRICIGALE_DATA", "/nowhere")) / "uds" / "psf" / name
+    if not path.exists():
+        pytest.skip(f"needs uds/psf/{name} in $MIRICIGALE_DATA")
+    return path
+
+
+@pytest.mark.filterwarnings("ignore:light beyond the PSFs' grids")
+@pytest.mark.parametrize("region", range(26))
+def test_real_drizzled_psfs(region):
+    """PRIMER-UDS, F444W to F770W, against the kernels that another program made of them."""
+    paths = [uds_file(f"uds-test-{n}.fits.gz") for n in ("f444w_psf", "f770w_psf")]
+    theirs = fits.getdata(uds_file("uds-test-f444w_kernel_f770w.fits.gz"))[region]
+    hi, lo = (read_psf(p, plane=region, pixel_scale=SCALE, frame="sky") for p in paths)
+    kernel = MatchingKernel.from_psfs(hi, lo, pixel_scale=SCALE)
+    assert kernel.noise_gain < 1.1 * np.sqrt(np.sum(theirs.astype(float) ** 2))
+    assert kernel.meta["negative_sum"] > -0.2
+    assert kernel.meta["within_limits"]
+    error = kernel.encircled_energy_error(np.arange(0.15, 1.9, 0.02) * u.arcsec)
+    assert np.abs(error).max() < 0.005
+    assert kernel.array.sum() == pytest.approx(1, abs=1e-6)
+    # what was measured off the centre is gone: moments of the cores, no window
+    for image in (kernel.source, kernel.target):
+        c = image.shape[0] // 2
+        core = image[c - 4 : c + 5, c - 4 : c + 5]
+        axis = np.arange(-4, 5)
+        assert abs(core.sum(0) @ axis / core.sum()) < 0.06
+        assert abs(core.sum(1) @ axis / core.sum()) < 0.06
+    # light of the PSF after the convolution, as far as it stays on the grid
+    matched = fftconvolve(kernel.source, kernel.array, mode="full").sum()
+    assert matched == pytest.approx(1, abs=1e-6)
