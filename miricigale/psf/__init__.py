@@ -16,6 +16,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "kernels": ("REGULARIZATIONS", "MatchingKernel"),
         "library": ("MIRI_PIXEL_SCALE", "hst_psf", "miri_psf"),
         "model": ("PSFInfo", "from_photutils", "make_psf", "psf_info", "read_psf"),
+        "nircam": ("nircam_psf",),
         "optics": ("Pupil", "hst_pupil", "jwst_pupil"),
         "resample": ("average_psf", "psf_image", "psf_mosaic", "rotate_psf"),
         "shapes": ("gaussian_psf", "moffat_psf"),

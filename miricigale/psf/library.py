@@ -38,7 +38,8 @@ _WFC3_PIXEL, _WFC3_PIXFRAC = 0.128, 0.8
 _IN_FLIGHT_BLUR = {"miri.f560w": 0.03 / math.sqrt(2)}
 
 
-def _name(filter_, known):
+def filter_name(filter_, known):
+    """The name of a filter that has a PSF, out of the known ones."""
     name = filter_ if isinstance(filter_, str) else getattr(filter_, "name", None)
     if name not in known:
         raise unknown_name("PSF for the filter", name, known)
@@ -82,7 +83,8 @@ def odd_cells(width, cell):
     return 2 * round(0.5 * width / cell - 0.5) + 1
 
 
-def _checked(oversampling, fov, default):
+def checked_grid(oversampling, fov, default):
+    """Cells per pixel and width in arcsec of a PSF's grid."""
     if isinstance(oversampling, float) or oversampling < 1:
         raise argument_error("oversampling", "a positive integer", oversampling)
     width = default if fov is None else float(to_array(fov, ANGLE, "fov"))
@@ -287,8 +289,8 @@ def miri_psf(
     >>> psf.meta["frame"], psf.meta["includes"]
     ('detector', ['jitter', 'cruciform', 'pixel', 'ipc'])
     """
-    name = _name(filter, _MIRI)
-    oversampling, width = _checked(oversampling, fov, 21.0)
+    name = filter_name(filter, _MIRI)
+    oversampling, width = checked_grid(oversampling, fov, 21.0)
     unknown = set(includes) - set(EFFECTS)
     if unknown:
         raise argument_error("includes", f"out of {EFFECTS}", sorted(unknown))
@@ -417,8 +419,8 @@ def hst_psf(
     Krist, Hook & Stoehr 2011, SPIE 8127, 81270J; Skelton et al. 2014, ApJS 214, 24
     (mosaics of 0.06 arcsec pixels).
     """
-    name = _name(filter, _WFC3)
-    oversampling, width = _checked(oversampling, fov, 10.0)
+    name = filter_name(filter, _WFC3)
+    oversampling, width = checked_grid(oversampling, fov, 10.0)
     scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
     if fwhm is None:
         sigma = _hst_blur("wfc3.f160w", 0.20, scale, n_wavelengths)

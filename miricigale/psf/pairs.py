@@ -5,7 +5,7 @@ import warnings
 
 import astropy.units as u
 import numpy as np
-from photutils.psf import ImagePSF
+from photutils.psf import GriddedPSFModel, ImagePSF
 from scipy.signal import fftconvolve
 
 from miricigale.psf import _core
@@ -41,6 +41,11 @@ def psf_pair(hi, lo, scale, *, angles, grid_angle, resampling, extent, normalize
         ``energy``, ``held`` and ``centering`` of the kernel's meta.
     """
     given, psfs, centering = {"hi": hi, "lo": lo}, {}, {}
+    for name, psf in given.items():
+        if isinstance(psf, GriddedPSFModel):
+            msg = f"'{name}' must be an ImagePSF or an array, got a GriddedPSFModel: psf_at or "
+            msg += "from_photutils give its PSF at a position"
+            raise TypeError(msg)
     arrays = {k: np.shape(v) for k, v in given.items() if not isinstance(v, ImagePSF)}
     if len(set(arrays.values())) > 1:
         raise argument_error("hi, lo", "arrays of the same shape", arrays)

@@ -16,6 +16,8 @@ from miricigale.psf import (
     from_photutils,
     gaussian_psf,
     make_psf,
+    psf_at,
+    psf_grid,
     psf_info,
     read_psf,
 )
@@ -152,7 +154,25 @@ def test_exchanged_psfs_are_refused():
         MatchingKernel.from_psfs(gaussian(51, 3.15), gaussian(51, LO), pixel_scale=SCALE)
 
 
-def test_artefacts_of_resampling_make_no_stripes():
+def test_gridded_models_need_a_position():
+    """By position: a kernel for each place."""
+    hi = gaussian_psf(0.1 * u.arcsec, pixel_scale=SCALE, fov=2 * u.arcsec)
+    wide = [0.28, 0.28, 0.36, 0.36]
+    grid = psf_grid(
+        [gaussian_psf(w * u.arcsec, pixel_scale=SCALE, fov=2 * u.arcsec) for w in wide],
+        [(0, 0), (0, 100), (100, 0), (100, 100)],
+    )
+    with pytest.raises(TypeError, match="'lo' must be an ImagePSF or an array, got a Gridded"):
+        MatchingKernel.from_psfs(hi, grid, pixel_scale=SCALE)
+    gains = [
+        MatchingKernel.from_psfs(hi, psf_at(grid, x, 30), pixel_scale=SCALE).noise_gain
+        for x in (0, 100)
+    ]
+    variances = np.array([(w**2 - 0.1**2) / (8 * np.log(2)) for w in (0.28, 0.36)]) / 0.04**2
+    np.testing.assert_allclose(gains, 1 / np.sqrt(4 * np.pi * variances), rtol=0.01)
+
+
+def test_artefacts_of_resampling_make_no_stripes(tmp_path):
     """A wide PSF with structure that the sharp one has lost: error alone asks for stripes."""
     rng = np.random.default_rng(5)
     n = 71
@@ -169,6 +189,11 @@ def test_artefacts_of_resampling_make_no_stripes():
     assert kernel.meta["negative_sum"] > -0.5
     deviation = np.abs(kernel.matched - kernel.target).max() / kernel.target.max()
     assert kernel.meta["residual"] == pytest.approx(deviation)
+    # and the file says so too
+    kernel.write(tmp_path / "kernel.fits")
+    again = MatchingKernel.read(tmp_path / "kernel.fits").meta
+    for name in ("noise_gain", "negative_sum", "held", "within_limits"):
+        assert again[name] == kernel.meta[name]
     # what the error alone would have taken
     sharp = MatchingKernel.from_psfs(hi, lo, pixel_scale=SCALE, regularization=1e-6)
     assert sharp.meta["max_error"] < kernel.meta["max_error"]

@@ -1,0 +1,107 @@
+"""PSFs of NIRCam's wide filters, for priors of shorter wavelength."""
+
+import functools
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.psf.effects import detector_response
+from miricigale.psf.library import band_quantiles, checked_grid, filter_name, odd_cells
+from miricigale.psf.model import make_psf
+from miricigale.psf.optics import jwst_constants, jwst_pupil, polychromatic_psf
+from miricigale.refdata import citations
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import ANGLE, to_array
+
+__all__ = ["nircam_psf"]
+
+#: Pixel in arcsec of the wide filters, of the short- and the long-wavelength channel.
+_PIXELS = dict.fromkeys((f"nircam.f{n}w" for n in ("070", "090", "115", "150", "200")), 0.031)
+_PIXELS |= dict.fromkeys((f"nircam.f{n}w" for n in (277, 356, 444)), 0.063)
+
+
+@functools.lru_cache(maxsize=4)
+def _optics(name, cell, n, rms, seed, n_wavelengths, index, n_pupil):
+    # the detectors' axes stand within 0.6 deg of the telescope's
+    pupil = jwst_pupil(n_pupil, angle=0.0)
+    waves = band_quantiles(name, n_wavelengths, index)
+    data = polychromatic_psf(pupil, pupil.wavefront_error(rms, seed=seed), waves, step=cell, n=n)
+    data.flags.writeable = False
+    return data
+
+
+def nircam_psf(
+    filter,
+    *,
+    oversampling=4,
+    fov=None,
+    wavefront_error=75 * u.nm,
+    seed=1,
+    n_wavelengths=9,
+    spectral_index=0.0,
+    n_pupil=384,
+):
+    """
+    PSF of a wide filter of NIRCam, by the optics of `miri_psf`.
+
+    Telescope, jitter and the pixel's response: no interpixel capacitance, no charge
+    diffusion, no aberrations of NIRCam itself beyond the wavefront error of the whole, no
+    dependence on the field. It is for simulated and approximate priors; for photometry on a
+    real image, whose stars tell (`psf_from_stars`) or whose mosaic comes with PSFs, take those.
+
+    Parameters
+    ----------
+    filter : str or `~miricigale.filters.Filter`
+        F070W, F090W, F115W, F150W, F200W, F277W, F356W or F444W.
+    oversampling : int, optional
+        Cells per pixel of 0.031 arcsec (to F200W) or 0.063 arcsec.
+    fov : `~astropy.units.Quantity`, optional
+        Width of the grid; 6 arcsec to F200W, 10 arcsec beyond by default.
+    wavefront_error, seed, n_wavelengths, spectral_index, n_pupil
+        As for `miri_psf`: the same seed is the same telescope.
+
+    Returns
+    -------
+    psf : `~photutils.psf.ImagePSF`
+        In the detector frame, whose +y is taken along V3. A mosaic's: `psf_mosaic`.
+
+    Raises
+    ------
+    KeyError
+        If there is no such filter.
+    ValueError
+        If an option is out of its range.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.psf import nircam_psf
+    >>> nircam_psf("nircam.f444w", fov=4 * u.arcsec).meta["includes"]
+    ['jitter', 'pixel']
+    """
+    name = filter_name(filter, _PIXELS)
+    scale = _PIXELS[name]
+    oversampling, width = checked_grid(oversampling, fov, 6.0 if scale < 0.05 else 10.0)
+    if isinstance(n_wavelengths, float) or n_wavelengths < 1:
+        raise argument_error("n_wavelengths", "a positive integer", n_wavelengths)
+    rms = float(to_array(wavefront_error, u.nm, "wavefront_error"))
+    cell = scale / oversampling
+    n = odd_cells(width, cell)
+    data = _optics(
+        name, cell, n, rms, int(seed), int(n_wavelengths), float(spectral_index), int(n_pupil)
+    )
+    jitter = jwst_constants()["jitter"] / scale
+    data = detector_response(data, oversampling=oversampling, jitter=jitter)
+    return make_psf(
+        np.asarray(data) * oversampling**2,
+        pixel_scale=scale * ANGLE,
+        oversampling=oversampling,
+        frame="detector",
+        includes=("jitter", "pixel"),
+        filter=name,
+        instrument="NIRCam",
+        wavefront_error=rms,
+        seed=int(seed),
+        citations=citations("psf.jwst_pupil"),
+        normalization="total",
+    )

@@ -1,0 +1,66 @@
+import os
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from miricigale.psf import (
+    encircled_energy,
+    fwhm,
+    nircam_psf,
+    psf_info,
+    psf_mosaic,
+    read_psf,
+)
+
+
+# in flight (jwst-docs, NIRCam Point Spread Functions); the pixel's response is a part of ours
+@pytest.mark.parametrize(
+    ("name", "published"),
+    [("f115w", 0.040), ("f150w", 0.050), ("f200w", 0.066), ("f277w", 0.092), ("f356w", 0.116)]
+    + [("f444w", 0.145)],
+)
+def test_width_is_that_in_flight(name, published):
+    psf = nircam_psf(f"nircam.{name}", fov=2 * u.arcsec)
+    width = fwhm(psf, method="gaussian").to_value(u.arcsec)
+    assert width / published == pytest.approx(1.045, abs=0.035)
+
+
+def test_energy_is_that_of_drizzled_psfs():
+    """PRIMER-UDS, F444W on pixels of 0.04 arcsec."""
+    path = Path(os.environ.get("MIRICIGALE_DATA", "/nowhere"), "uds/psf/uds-test-f444w_psf.fits.gz")
+    if not path.exists():
+        pytest.skip("needs uds/psf/uds-test-f444w_psf.fits.gz in $MIRICIGALE_DATA")
+    radii = [0.15, 0.2, 0.3, 0.5, 0.8, 1.2, 1.6] * u.arcsec
+    scale = 0.04 * u.arcsec
+    # planes whose cores stand within 0.2 pixel of the centre
+    real = [
+        encircled_energy(read_psf(path, plane=k, pixel_scale=scale, frame="sky"), radii)
+        for k in (9, 15, 19)
+    ]
+    ours = encircled_energy(psf_mosaic(nircam_psf("nircam.f444w"), scale, 0 * u.deg), radii)
+    np.testing.assert_allclose(ours, np.mean(real, axis=0), atol=0.03)
+
+
+def test_is_centred_normalised_and_says_what_it_is():
+    psf = nircam_psf("nircam.f200w", oversampling=3, seed=4)
+    info = psf_info(psf)
+    assert np.unravel_index(info.data.argmax(), info.data.shape) == tuple(
+        n // 2 for n in info.data.shape
+    )
+    assert info.pixel_scale == 0.031
+    assert (info.frame, info.includes, info.total_known) == ("detector", ("jitter", "pixel"), True)
+    assert 0.97 < info.enclosed < 1
+    # wings fall as r**-3: the light outside of a radius as its inverse
+    outside = 1 - encircled_energy(psf, [1.0, 2.0] * u.arcsec)
+    assert outside[0] / outside[1] == pytest.approx(2, abs=0.35)
+
+
+def test_unknown_filters_and_options_are_named():
+    with pytest.raises(KeyError, match=r"no PSF for the filter 'nircam.f182m'; known: nircam"):
+        nircam_psf("nircam.f182m")
+    with pytest.raises(ValueError, match="'n_wavelengths' must be a positive integer"):
+        nircam_psf("nircam.f444w", n_wavelengths=0)
+    with pytest.raises(ValueError, match="'oversampling' must be a positive integer"):
+        nircam_psf("nircam.f444w", oversampling=0)
