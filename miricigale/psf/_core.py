@@ -9,7 +9,7 @@ from miricigale.utils.compilation import njit
 
 __all__ = [
     "box_transfer",
-    "core_centroid",
+    "core_moments",
     "gaussian_transfer",
     "half_maximum_width",
     "interpolate",
@@ -343,37 +343,42 @@ def radial_sums(image, x_center, y_center, radii):
     return sums
 
 
-def core_centroid(data, x, y, sigma):
+def core_moments(data):
     """
-    Centroid of a PSF's core under a Gaussian window that moves with it.
+    Centre and rms width of a PSF's core, under a round Gaussian window as wide as it.
+
+    Those of a Gaussian are its own. All of the core counts: noise in one pixel or a pattern
+    of resampling changes them little, and distant wings do not enter.
 
     Parameters
     ----------
     data : `~numpy.ndarray`, shape (ny, nx)
-    x, y : float
-        First guess in cells.
-    sigma : float
-        Of the window, in cells.
 
     Returns
     -------
-    x, y : float
-        In cells; NaN where it does not settle on the image.
+    x, y, sigma : float
+        In cells; NaN where they do not settle.
     """
     columns, rows = np.arange(data.shape[1]), np.arange(data.shape[0])
-    for _ in range(100):
+    y, x = (float(v) for v in np.unravel_index(np.argmax(data), data.shape))
+    sigma = 2.0
+    for _ in range(300):
         wx = np.exp(-0.5 * ((columns - x) / sigma) ** 2)
         wy = np.exp(-0.5 * ((rows - y) / sigma) ** 2)
         total = wy @ data @ wx
         if not total > 0:
             break
-        # twice the step: for a core as wide as the window this converges at once
-        dx = 2 * (wy @ data @ (wx * columns) / total - x)
-        dy = 2 * ((wy * rows) @ data @ wx / total - y)
-        x, y = x + dx, y + dy
-        if math.hypot(dx, dy) < 1e-7 * sigma:
-            return float(x), float(y)
-    return math.nan, math.nan
+        dx, dy = wy @ data @ (wx * (columns - x)) / total, (wy * (rows - y)) @ data @ wx / total
+        squares = wy @ data @ (wx * (columns - x) ** 2) + (wy * (rows - y) ** 2) @ data @ wx
+        # the window halves a Gaussian's offset and its variance, which is of two axes here
+        x, y, last = x + 2 * dx, y + 2 * dy, sigma
+        variance = squares / total - dx**2 - dy**2
+        if not 0 < variance < max(data.shape) ** 2:
+            break
+        sigma = math.sqrt(variance)
+        if max(abs(dx), abs(dy), abs(sigma - last)) < 1e-8 * sigma:
+            return float(x), float(y), sigma
+    return math.nan, math.nan, math.nan
 
 
 def half_maximum_width(data, x, y):

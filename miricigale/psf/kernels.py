@@ -115,8 +115,8 @@ class MatchingKernel:
             ``"auto"`` goes through 0.1, 0.03, ... 1e-8, takes the largest error of the
             encircled energy at any radius for each, and chooses the largest mu (the
             smoothest kernel) whose error is at most ``tolerance`` above the smallest. Kernels
-            whose noise gain exceeds 1.25 times that of the Gaussian between Gaussians of the
-            two widths, or whose negative pixels sum to less than -1.5, are left out: PSFs with
+            whose noise gain exceeds 1.25 times that of the Gaussian between Gaussians as wide
+            as the two cores, or whose negative pixels sum to less than -1.5, are left out: PSFs with
             noise or artefacts of resampling make those striped.
         penalty : {"laplacian", "biharmonic"}, `~numpy.ndarray` or None, optional
             What is rough, as for `photutils.psf_matching.make_wiener_kernel`.

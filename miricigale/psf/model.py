@@ -311,8 +311,8 @@ def _header_grid(header):
             raise argument_error("path", "a file with east to the left where north is up", wcs)
         return float(np.sqrt(b * c - a * d)) * 3600, float(np.degrees(np.arctan2(b, d)))
     for key in ("PIXELSCL", "PIXSCALE"):
-        if isinstance(header.get(key), float) and header[key] > 0:
-            return header[key], None
+        if isinstance(header.get(key), (int, float)) and header[key] > 0:
+            return float(header[key]), None
     return None, None
 
 
@@ -407,8 +407,8 @@ def read_psf(
         path, ext, plane, pixel_scale, wanted="a PSF", oversampling=oversampling
     )
     meta = {"file": str(path)}
-    if frame == "detector" and isinstance(header.get("PA_APER"), float):
-        meta["pa_aper"] = header["PA_APER"]
+    if frame == "detector" and isinstance(header.get("PA_APER"), (int, float)):
+        meta["pa_aper"] = float(header["PA_APER"])
     if frame == "sky" and turn is not None:
         given = turn if angle is None else float(to_array(angle, u.deg, "angle", finite=True))
         if abs((given - turn + 180) % 360 - 180) > 0.5:

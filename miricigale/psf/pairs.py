@@ -165,11 +165,9 @@ def ready_arrays(array, scale, **psfs):
     array = array / total
     said = [f"summed to {total:.4f} and was brought to 1"] if abs(total - 1) > 1e-3 else []
     c = array.shape[0] // 2
-    y, x = np.unravel_index(np.argmax(array), array.shape)
-    width = _core.half_maximum_width(array, float(x), float(y))
-    core = _core.core_centroid(array, float(x), float(y), max(width / 2.355, 1.0))
-    if not np.hypot(core[0] - c, core[1] - c) < 0.1:
-        said.append(f"stands ({core[0] - c:.2f}, {core[1] - c:.2f}) pixels off the centre")
+    x, y, _ = _core.core_moments(array)
+    if not np.hypot(x - c, y - c) < 0.1:
+        said.append(f"stands ({x - c:.2f}, {y - c:.2f}) pixels off the centre")
     for text in said:
         warnings.warn(f"the matching kernel {text}", MiricigaleWarning, stacklevel=3)
     images = {}

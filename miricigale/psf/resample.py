@@ -336,13 +336,11 @@ def centered_psf(psf, tolerance, argument="psf"):
         If no core is found, or it is nearer to the edge than to the origin.
     """
     info = psf_info(psf, argument)
-    row, column = np.unravel_index(np.argmax(info.data), info.data.shape)
-    width = _core.half_maximum_width(info.data, float(column), float(row))
-    x, y = _core.core_centroid(info.data, float(column), float(row), width / 2.355)
+    x, y, _ = _core.core_moments(info.data)
     offset = (x - info.origin[0]) * info.cell, (y - info.origin[1]) * info.cell
     if not np.hypot(*offset) < 0.5 * info.half_width:
         wanted = "a PSF whose core stands near its centre"
-        raise argument_error(argument, wanted, f"a core at x, y = {column}, {row}")
+        raise argument_error(argument, wanted, f"a core at x, y = {x:.4g}, {y:.4g}")
     if np.hypot(*offset) <= tolerance:
         return psf, (0.0, 0.0)
     moved = ImagePSF(info.data, oversampling=info.oversampling, origin=(x, y))

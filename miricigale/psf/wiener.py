@@ -26,8 +26,8 @@ _PENALTIES["biharmonic"] = convolve2d(_PENALTIES["laplacian"], _PENALTIES["lapla
 _SEQUENCE = tuple(10.0 ** (-0.5 * k) for k in range(2, 17))
 
 # what an automatic kernel may have: noise gain relative to that of the Gaussian between two
-# Gaussians of the PSFs' widths (MIRI from F160W: 0.8-1.2; striped kernels: 3-6), and sum of its
-# negative pixels (-0.03 to -0.95; striped kernels: -3 to -6)
+# Gaussians as wide as the PSFs' cores (MIRI from F160W: 0.4-1.0; striped kernels: 1.4-5), and sum
+# of its negative pixels (-0.03 to -0.95; striped kernels: -0.9 to -6.6)
 _GAIN, _NEGATIVE = 1.25, -1.5
 # largest error of the encircled energy that goes without a warning
 _ERROR = 0.02
@@ -105,30 +105,22 @@ def energy_error(image, target, radii):
 
 def gaussian_gain(source, target):
     """
-    Noise gain of the Gaussian kernel between two Gaussians of the PSFs' widths, at most 1.
+    Noise gain of the Gaussian kernel between two Gaussians as wide as the PSFs' cores, at most 1.
 
     Raises
     ------
     ValueError
-        If the sharp PSF is wider than the wide one by more than a tenth.
-
-    Warns
-    -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
-        If it is wider by less.
+        If the sharp PSF is the wider one by its core and at half maximum.
     """
     c = len(source) // 2
-    sharp, wide = (_core.half_maximum_width(image, c, c) for image in (source, target))
-    if not sharp < 1.02 * wide:
+    cores = [_core.core_moments(image)[2] for image in (source, target)]
+    halves = [_core.half_maximum_width(image, c, c) for image in (source, target)]
+    # one alone misleads: a blurred core has no wings, a pattern of resampling may be narrow
+    if cores[0] > 1.05 * cores[1] and halves[0] > 1.1 * halves[1]:
         wanted = "the sharp and the wide PSF, in this order"
-        got = f"FWHM of {sharp:.4g} and {wide:.4g} pixels"
-        if not sharp < 1.1 * wide:
-            raise argument_error("hi, lo", wanted, got)
-        text = f"the sharp PSF is the wider one ({got}): the kernel sharpens"
-        warnings.warn(text, MiricigaleWarning, stacklevel=5)
-    # FWHM to rms: sqrt(8 ln 2)
-    variance = (wide**2 - sharp**2) / (8 * math.log(2))
-    return 1 / math.sqrt(max(4 * math.pi * variance, 1.0))
+        got = f"FWHM of {halves[0]:.4g} and {halves[1]:.4g} pixels"
+        raise argument_error("hi, lo", wanted, got)
+    return 1 / math.sqrt(max(4 * math.pi * (cores[1] ** 2 - cores[0] ** 2), 1.0))
 
 
 def choose(regularization, make, source, target, tolerance):

@@ -150,8 +150,9 @@ def test_truncated_wings_are_said_and_the_kernel_has_unit_sum():
 def test_exchanged_psfs_are_refused():
     with pytest.raises(ValueError, match="'hi, lo' must be the sharp and the wide PSF"):
         MatchingKernel.from_psfs(gaussian(51, LO), gaussian(51, HI), pixel_scale=SCALE)
-    with pytest.warns(MiricigaleWarning, match="the sharp PSF is the wider one"):
-        MatchingKernel.from_psfs(gaussian(51, 3.15), gaussian(51, LO), pixel_scale=SCALE)
+    # MIRI's bluest bands and the longest of a smaller telescope are alike: that is no exchange
+    kernel = MatchingKernel.from_psfs(gaussian(51, 3.1), gaussian(51, LO), pixel_scale=SCALE)
+    assert kernel.array.sum() == pytest.approx(1, abs=1e-6)
 
 
 def test_gridded_models_need_a_position():
@@ -173,12 +174,10 @@ def test_gridded_models_need_a_position():
 
 
 def test_artefacts_of_resampling_make_no_stripes(tmp_path):
-    """A wide PSF with structure that the sharp one has lost: error alone asks for stripes."""
-    rng = np.random.default_rng(5)
-    n = 71
-    hi, lo = gaussian(n, HI), gaussian(n, LO)
-    lo = np.clip(lo * (1 + 0.05 * rng.normal(size=lo.shape)), 0, None)
-    lo /= lo.sum()
+    """A wide PSF of coarser, replicated pixels: its steps, which the sharp one lacks, ask for stripes."""
+    n = 69
+    hi, coarse = gaussian(n, HI), gaussian(n, LO).reshape(23, 3, 23, 3).mean((1, 3))
+    lo = np.kron(coarse, np.ones((3, 3)))
     kernel = MatchingKernel.from_psfs(hi, lo, pixel_scale=SCALE)
     truth = 1 / np.sqrt(4 * np.pi * (LO**2 - HI**2))
     assert kernel.meta["within_limits"]
@@ -195,9 +194,9 @@ def test_artefacts_of_resampling_make_no_stripes(tmp_path):
     for name in ("noise_gain", "negative_sum", "held", "within_limits"):
         assert again[name] == kernel.meta[name]
     # what the error alone would have taken
-    sharp = MatchingKernel.from_psfs(hi, lo, pixel_scale=SCALE, regularization=1e-6)
-    assert sharp.meta["max_error"] < kernel.meta["max_error"]
-    assert sharp.noise_gain > 1.5 * kernel.noise_gain
+    sharp = MatchingKernel.from_psfs(hi, lo, pixel_scale=SCALE, regularization=3e-7)
+    assert sharp.meta["max_error"] < kernel.meta["max_error"] - 2e-3
+    assert sharp.noise_gain > 10 * kernel.noise_gain
 
 
 def header(side=0.04, angle=30.0, flip=-1):
