@@ -112,6 +112,7 @@ def study_stages():
             "kernels",
             "images:make_kernel",
             "matching kernel",
+            version=2,
             sections=(*grid, *kernel),
             resources=IMAGE_RESOURCES,
             units=_filters,
