@@ -250,7 +250,8 @@ def compile_apart(name):
     """
     path = os.pathsep.join(filter(None, [str(_PACKAGE.parent), os.environ.get("PYTHONPATH")]))
     with subprocess.Popen(
-        [sys.executable, "-m", __name__, _check(name)],
+        # -P: nothing is imported from the folder in which this happens to be called
+        [sys.executable, "-P", "-m", __name__, _check(name)],
         # closed when this process ends, however it ends
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,

@@ -107,6 +107,19 @@ def test_compilation_ends_with_the_process_that_asked_for_it(tmp_path):
         assert not Path(f"/proc/{child}").exists()
 
 
+def test_nothing_is_imported_from_the_folder_of_the_call(tmp_path):
+    (tmp_path / "platform.py").write_text("import os\nopen('ran', 'w')\nos._exit(0)\n")
+    code = "from miricigale.workflow.warmup import compile_apart\ncompile_apart('images')"
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    command = [sys.executable, "-P", "-c", code]
+    with subprocess.Popen(command, env=env, cwd=tmp_path) as parent:
+        # the first kernel is kept long after all imports
+        while parent.poll() is None and not list(tmp_path.glob("cache/*/*.nbi")):
+            time.sleep(0.1)
+        parent.kill()
+    assert not (tmp_path / "ran").exists()
+
+
 def test_unknown_jobs_are_refused():
     for function in (warmup.is_compiled, warmup.compile_job, warmup.compile_apart):
         with pytest.raises(ValueError, match="'name' must be one of fit, images"):
