@@ -167,7 +167,9 @@ def header(exposure, *, filename="", start=None):
     )
 
 
-def write(path, data, exposure, *, pixel_dq=None, meta=None, start=None, overwrite=False):
+def write(
+    path, data, exposure, *, pixel_dq=None, meta=None, start=None, filename=None, overwrite=False
+):
     """
     Write counts as a level-1b file.
 
@@ -185,6 +187,8 @@ def write(path, data, exposure, *, pixel_dq=None, meta=None, start=None, overwri
         Goes to another, as JSON.
     start : `~astropy.time.Time`, optional
         See `header`.
+    filename : str, optional
+        For the keyword FILENAME; that of ``path`` if not given.
     overwrite : bool, optional
         Whether an existing file is replaced.
 
@@ -202,7 +206,8 @@ def write(path, data, exposure, *, pixel_dq=None, meta=None, start=None, overwri
     path = Path(path)
     if data.dtype != np.uint16:
         raise argument_error("data", "counts (uint16) to be written", data.dtype)
-    with _partial(path, exposure, data.shape, start, overwrite) as (partial, science):
+    opened = _partial(path, exposure, data.shape, start, overwrite, filename)
+    with opened as (partial, science):
         with fits.StreamingHDU(str(partial), science) as stream:
             for part in _chunks(data.reshape(-1)):
                 # BZERO 32768: the top bit is turned
@@ -212,12 +217,12 @@ def write(path, data, exposure, *, pixel_dq=None, meta=None, start=None, overwri
 
 
 @contextlib.contextmanager
-def _partial(path, exposure, shape, start, overwrite):
+def _partial(path, exposure, shape, start, overwrite, filename=None):
     """Give a file with its primary header, and the header of SCI; rename it when all is well."""
     if path.exists() and not overwrite:
         msg = f"{path} exists; give overwrite=True to replace it"
         raise OSError(msg)
-    primary, science = header(exposure, filename=path.name, start=start)
+    primary, science = header(exposure, filename=filename or path.name, start=start)
     axes = [("NAXIS", len(shape))] + [(f"NAXIS{i + 1}", n) for i, n in enumerate(shape[::-1])]
     structure = [("XTENSION", "IMAGE"), ("BITPIX", 16), *axes, ("PCOUNT", 0), ("GCOUNT", 1)]
     scaling = [("EXTNAME", "SCI"), ("BZERO", 32768), ("BSCALE", 1)]

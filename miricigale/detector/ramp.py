@@ -114,7 +114,7 @@ class Ramp(NDData):
 
     __str__ = __repr__
 
-    def write(self, path, *, start=None, overwrite=False):
+    def write(self, path, *, start=None, filename=None, overwrite=False):
         """
         Write a JWST level-1b file (``*_uncal.fits``).
 
@@ -124,6 +124,8 @@ class Ramp(NDData):
             The file; it appears under its name only when it is complete.
         start : `~astropy.time.Time`, optional
             When the exposure began; 2022-06-21 plus an hour for each dither if not given.
+        filename : str, optional
+            For the keyword FILENAME, if the file is renamed later; that of ``path`` if not given.
         overwrite : bool, optional
             Whether an existing file is replaced.
 
@@ -151,6 +153,7 @@ class Ramp(NDData):
             pixel_dq=self.pixel_dq,
             meta=dict(self.meta),
             start=start,
+            filename=filename,
             overwrite=overwrite,
         )
 

@@ -147,12 +147,12 @@ class Context:
         """Write a table as ECSV or FITS by the suffix of ``name``."""
         return self.save_result(name, table.copy(copy_data=False))
 
-    def save_result(self, name, result):
+    def save_result(self, name, result, **options):
         """Write a result by its own method, without dates: the manifest says when."""
         meta = undated(result.meta)
         result.meta.clear()
         result.meta.update(meta)
-        return self.save(name, lambda path: result.write(path, overwrite=True))
+        return self.save(name, lambda path: result.write(path, overwrite=True, **options))
 
     def save_image(self, name, image, **planes):
         """Write an image and further planes."""

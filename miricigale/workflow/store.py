@@ -93,7 +93,8 @@ class ProductFolder:
             what stood there before stays.
         """
         path = self.path(name)
-        partial = path.with_name(PARTIAL + path.name)
+        # a process of a run that was killed may end a moment later than the next run begins
+        partial = path.with_name(f"{PARTIAL}{os.getpid()}-{path.name}")
         try:
             with writing(path):
                 path.parent.mkdir(parents=True, exist_ok=True)

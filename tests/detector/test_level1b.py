@@ -64,6 +64,12 @@ def test_header_is_what_the_pipeline_asks_for(ramp, tmp_path):
         assert offset < 0.01 * u.arcsec
 
 
+def test_a_file_that_is_renamed_later_has_its_later_name(ramp, tmp_path):
+    for options, name in (({}, "a_uncal.fits"), ({"filename": "b_uncal.fits"}, "b_uncal.fits")):
+        path = ramp.write(tmp_path / "a_uncal.fits", overwrite=True, **options)
+        assert fits.getheader(path)["FILENAME"] == name
+
+
 def test_existing_files_are_kept(ramp, tmp_path):
     path = ramp.write(tmp_path / "a_uncal.fits")
     with pytest.raises(OSError, match="exists; give overwrite=True"):

@@ -9,6 +9,7 @@ import time
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.io import fits
 from astropy.table import QTable
 
 from miricigale.instrument import saturation_forecast
@@ -20,6 +21,7 @@ SMALL = """
 [run]
 name = "small"
 seed = 3
+keep_level1b = true
 
 [catalog]
 mag_limit = 22.5
@@ -149,6 +151,13 @@ def test_deleted_products_make_only_themselves_anew_with_the_same_bytes(study):
     ]
     changed = {name for name, (time_ns, _) in after.items() if time_ns != before[name][0]}
     assert changed == set().union(*units)
+
+
+def test_level1b_files_name_themselves(study):
+    paths = list((study["folder"] / "level1b").iterdir())
+    assert len(paths) == 3
+    for path in paths:
+        assert fits.getheader(path)["FILENAME"] == path.name
 
 
 def test_no_source_is_lost_between_catalogue_and_result(study):

@@ -109,7 +109,8 @@ def make_exposure(context, unit):
         context.save_table(f"exposures/{unit}_forecast.ecsv", forecast_table([forecast]))
 
     def keep(ramp):
-        context.save(f"level1b/{unit}_uncal.fits", ramp.write)
+        name = f"{unit}_uncal.fits"
+        context.save_result(f"level1b/{name}", ramp, filename=name)
 
     rate, cal = expose_and_reduce(
         config,
