@@ -307,8 +307,8 @@ class ProductStore(ProductFolder):
             self.path(name).unlink(missing_ok=True)
 
     def standing_bytes(self):
-        """Bytes that recorded products take now."""
-        paths = [self.path(name) for r in self.records.values() for name in r["products"]]
+        """Bytes that files in the folder take, also those of a stopped unit, which are replaced."""
+        paths = [path for path in self.folder.rglob("*") if not path.is_symlink()]
         return sum(path.stat().st_size for path in paths if path.is_file())
 
     def checksums(self, stage):

@@ -166,12 +166,16 @@ def test_a_finished_run_writes_nothing(tmp_path, monkeypatch, values):
 def test_what_stands_needs_no_disk_again(tmp_path, monkeypatch):
     recorder, folder = Recorder(), tmp_path / "run"
     recorder.run(folder)
-    size = sum((folder / name).stat().st_size for name in ("first_a.txt", "first_b.txt"))
     (folder / "second.txt").unlink()
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: types.SimpleNamespace(free=99))
+    # what a unit wrote before it was stopped is replaced, so that it needs no more either
+    (folder / "part").mkdir()
+    (folder / "part" / "of_second.txt").write_text("x" * 20_000)
+    size = sum(path.stat().st_size for path in folder.rglob("*.*") if path.is_file())
+    assert size > 20_000
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: types.SimpleNamespace(free=9_000))
     with pytest.raises(DataError, match="the run needs about"):
-        StudyRunner(StudyConfig(), folder, recorder.stages(), disk=size + 100).run()
-    StudyRunner(StudyConfig(), folder, recorder.stages(), disk=size + 99).run()
+        StudyRunner(StudyConfig(), folder, recorder.stages(), disk=size + 10_000).run()
+    StudyRunner(StudyConfig(), folder, recorder.stages(), disk=size + 9_000).run()
     assert recorder.ran[-1] == "second"
 
 
