@@ -248,17 +248,20 @@ def compile_apart(name):
     is_kept : bool
         Whether its kernels are on disk.
     """
-    path = os.pathsep.join(filter(None, [str(_PACKAGE.parent), os.environ.get("PYTHONPATH")]))
+    # the package may have been found by a path that the child would not have
+    code = (
+        "import sys; sys.path.append(sys.argv[2]); "
+        f"from {__name__} import compile_and_end; compile_and_end(sys.argv[1])"
+    )
     with subprocess.Popen(
         # -P: nothing is imported from the folder in which this happens to be called
-        [sys.executable, "-P", "-m", __name__, _check(name)],
+        [sys.executable, "-P", "-c", code, _check(name), str(_PACKAGE.parent)],
         # closed when this process ends, however it ends
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         # the terminal's Ctrl-C is for this process
         start_new_session=True,
-        env={**os.environ, "PYTHONPATH": path},
     ) as child:
         child.wait()
     return is_compiled(name)
@@ -309,13 +312,14 @@ def _processor():
     return "\n".join(dict.fromkeys(line for line in lines if line.startswith(wanted)))
 
 
+def compile_and_end(name):
+    """Run one job as the whole of a process, which also ends when its stdin is closed."""
+    threading.Thread(target=_end_with_stdin, daemon=True).start()
+    compile_job(name)
+    # at once: the thread holds the lock of stdin
+    os._exit(0)
+
+
 def _end_with_stdin():
     sys.stdin.buffer.read()
     os._exit(1)
-
-
-if __name__ == "__main__":
-    threading.Thread(target=_end_with_stdin, daemon=True).start()
-    compile_job(sys.argv[1])
-    # at once: the thread holds the lock of stdin
-    os._exit(0)
