@@ -7,6 +7,7 @@ import scipy.ndimage
 
 from miricigale.photometry import _core
 from miricigale.photometry.flags import ForcedFlags
+from miricigale.photometry.shapes import ShapeFitter
 from miricigale.profiles import ellipse_to_pixels, sersic_stamp
 from miricigale.utils.parallel import parallel_map
 
@@ -27,19 +28,29 @@ class Cutout:
         Light to be convolved.
     origin : (int, int)
         Fine pixel (y, x) of its corner.
-    wings : float
-        Amplitude of the point source that is added to it.
     noise : float
-        Sum of the noise variances of ``data``, for the errors-in-variables correction.
+        Sum of the noise variances of the light, for the errors-in-variables correction.
     convolved : bool
         Whether ``data`` has the sharp PSF already (a cutout) or not (a profile).
+    rest : `Cutout` or None
+        What is added to a profile: the image less the profile, which has the sharp PSF.
     """
 
     data: np.ndarray
     origin: tuple
-    wings: float = 0.0
     noise: float = 0.0
     convolved: bool = True
+    rest: "Cutout | None" = None
+
+    @property
+    def kind(self):
+        """``"cutout"`` if any of it is the image itself, else ``"sersic"``."""
+        return "cutout" if self.convolved or self.rest is not None else "sersic"
+
+    @property
+    def layers(self):
+        """The profile and the rest, or the one there is."""
+        return (self,) if self.rest is None else (self, self.rest)
 
 
 def own_segments(segmentation, labels, xy):
@@ -84,9 +95,12 @@ def own_segments(segmentation, labels, xy):
     return label, flags
 
 
-def cutouts(data, variance, segmentation, label, xy, source_psf, *, min_snr, wings, executor=None):
+def cutouts(
+    data, variance, segmentation, label, xy, source_psf, *, scale, min_snr, wings, select=True,
+    executor=None,
+):  # fmt: skip
     """
-    Cut sources from the high-resolution image and carry on where their segments end.
+    Make the template of each source from the high-resolution image.
 
     Parameters
     ----------
@@ -101,11 +115,16 @@ def cutouts(data, variance, segmentation, label, xy, source_psf, *, min_snr, win
         Positions of the sources on the image.
     source_psf : `~numpy.ndarray`, shape (k, k)
         PSF of the image, odd and centred.
+    scale : float
+        Arcsec per pixel.
     min_snr : float
         Least signal-to-noise of a segment.
     wings : bool
         Whether light outside of the segment is added; otherwise a cutout is the
         segment as it is.
+    select : bool, optional
+        Whether points and Sersic profiles are used where they explain the image;
+        otherwise the image itself always is.
     executor : `concurrent.futures.Executor`, optional
         Threads to work with.
 
@@ -120,65 +139,95 @@ def cutouts(data, variance, segmentation, label, xy, source_psf, *, min_snr, win
 
     Notes
     -----
-    The outskirts of a segment found at a low threshold are pixels whose noise is positive:
-    taken as they are they make a template too wide, and its flux too high. With ``wings`` the
-    pixels of the core (smoothed signal-to-noise above 4) are taken from the image, all
-    others from the mean on ellipses about it, neighbours' segments left out, as far as
-    that is significant; beyond it the PSF follows, or an exponential disk through the last
-    rings where that is brighter. A source whose rings are those of the PSF to the noise is
-    a point source (None, without a flag).
+    With ``wings`` a point and a Sersic profile through the PSF are fitted to the pixels about
+    each source, other sources' segments left out. A source is a point if that is the more probable
+    (see `~miricigale.photometry.shapes.ShapeFitter`). It is the profile where that leaves
+    nothing but noise on the core, which are the pixels whose smoothed signal-to-noise is
+    above 4; otherwise the core is taken from the image, and everything beyond from the profile.
     """
-    found = []
-    flags = np.zeros(len(label), int)
-    snr = np.full(len(label), np.nan)
-    coefficients = convolve_padded(source_psf, lambda shape: 1.0 / _core.spline_response(shape))
-    usable = np.isfinite(variance)
     slices = scipy.ndimage.find_objects(segmentation)
+    usable = np.isfinite(variance)
     smooth = _smooth_snr(data, variance, executor) if wings else None
-    for k, one in enumerate(label):
+    fitter = ShapeFitter(source_psf, scale) if wings else None
+    snr = np.full(len(label), np.nan)
+    flags = np.zeros(len(label), int)
+    totals = np.zeros(len(slices) + 1)
+    ratio = np.zeros(len(slices) + 1)
+    members = [None] * (len(slices) + 1)
+    for one, place in enumerate(slices, 1):
+        if place is None:
+            continue
+        members[one] = member = (segmentation[place] == one) & usable[place]
+        totals[one] = data[place][member].sum()
+        noise = variance[place][member].sum()
+        ratio[one] = totals[one] / np.sqrt(noise) if noise > 0 else np.inf
+    # what is no more than a peak of the noise hides nothing
+    others = np.where(ratio >= _OTHER_SNR, np.arange(len(ratio)), 0)
+
+    def make(k):
+        one = label[k]
         place = slices[one - 1] if 0 < one <= len(slices) else None
         if place is None:
-            found.append(None)
-            flags[k] |= int(ForcedFlags.NO_SEGMENT) if one > 0 else 0
-            continue
-        member = (segmentation[place] == one) & usable[place]
-        light = np.where(member, data[place], 0.0)
-        noise = float(variance[place][member].sum())
-        total = float(light.sum())
-        snr[k] = total / np.sqrt(noise) if noise > 0 else np.inf
-        if not (total > 0 and snr[k] >= min_snr):
-            flags[k] |= int(ForcedFlags.NOISY_SEGMENT)
-            found.append(None)
-            continue
-        beyond, rings = 0.0, None
-        if wings:
-            grown = _carry_on(data, variance, smooth, segmentation, one, place)
-            if grown is not None:
-                light, member, place, noise, beyond, rings = grown
-                total = float(light.sum())
-        origin = (place[0].start, place[1].start)
-        amplitude = 0.0
-        if wings:
-            # where the point source is added again, or the two would leave a dipole
-            psf = _psf_at(coefficients, xy[k], origin, light.shape)
-            if rings is not None and _is_point(psf, *rings):
-                found.append(None)
-                continue
-            inside = float(psf[member].sum())
-            # a cutout that hardly holds the PSF says nothing of the wings
-            if inside > 0.2:
-                amplitude = total / inside
-                light = np.where(
-                    member, light - amplitude * psf, np.maximum(beyond - amplitude * psf, 0.0)
-                )
-        norm = amplitude + float(light.sum())
-        found.append(Cutout(light / norm, origin, amplitude / norm, noise / norm**2))
-    return found, flags, snr
+            return None, int(ForcedFlags.NO_SEGMENT) if one > 0 else 0
+        snr[k] = ratio[one]
+        if not (totals[one] > 0 and snr[k] >= min_snr):
+            return None, int(ForcedFlags.NOISY_SEGMENT)
+        if not wings:
+            light = np.where(members[one], data[place], 0.0) / totals[one]
+            noise = float(variance[place][members[one]].sum()) / totals[one] ** 2
+            return Cutout(light, (place[0].start, place[1].start), noise=noise), 0
+        around = _around(place, xy[k], data.shape)
+        labels = segmentation[around]
+        free = usable[around] & ((labels == one) | (others[labels] == 0))
+        weight = np.where(free, 1.0 / np.sqrt(np.where(free, variance[around], 1.0)), 0.0)
+        corner = np.array([around[1].start, around[0].start])
+        shape = fitter.fit(data[around], weight, xy[k] - corner)
+        if shape is None:
+            return None, int(ForcedFlags.NOISY_SEGMENT)
+        if select and shape.point > 0.5:
+            return None, 0
+        core = (labels == one) & free & (smooth[around] > _CORE_SNR)
+        model = fitter.model(weight.shape, shape.parameters)
+        rest = np.where(core, data[around] - shape.flux * model, 0.0)
+        n = np.count_nonzero(core)
+        excess = np.sum((rest * weight) ** 2) - n
+        x, y = shape.parameters[:2] + corner
+        radius, axis_ratio, angle = shape.axes
+        profile, origin = sersic_stamp(
+            x=x, y=y, r_eff=radius, n=np.exp(shape.parameters[3]), axis_ratio=axis_ratio,
+            theta=angle, max_radius=max(source_psf.shape[0] / 2, 2 * radius),
+        )  # fmt: skip
+        if select and excess < _EXCESS * np.sqrt(2 * max(n, 1)):
+            return Cutout(profile, origin, convolved=False), 0
+        total = shape.flux + rest.sum()
+        noise = float(variance[around][core].sum()) / total**2
+        rest = Cutout(rest / total, (around[0].start, around[1].start), noise=noise)
+        return Cutout(
+            profile * (shape.flux / total), origin, noise=noise, convolved=False, rest=rest
+        ), 0
+
+    found = parallel_map(make, range(len(label)), executor=executor)
+    flags[:] = [flag for _, flag in found]
+    return [one for one, _ in found], flags, snr
 
 
-#: Width (pixels) of the Gaussian that tells the core, its least signal-to-noise, the width of
-#: rings, and how far around a segment they are looked for.
-_WIDTH, _CORE_SNR, _RING, _AROUND = 1.5, 4.0, 2.0, 16
+#: Width (pixels) of the Gaussian that tells the core, its least signal-to-noise, how many standard
+#: deviations of chi^2 a profile may miss it by, and the signal-to-noise that makes a neighbour.
+_WIDTH, _CORE_SNR, _EXCESS, _OTHER_SNR = 1.5, 4.0, 3.0, 4.0
+
+#: Half-width (pixels) of the stamps that profiles are fitted on: beyond the segment, least and most.
+_AROUND, _LEAST, _MOST = 6, 16, 48
+
+
+def _around(place, xy, shape):
+    """The stamp of a source: as far as its segment goes to either side, and a rim."""
+    x, y = round(float(xy[0])), round(float(xy[1]))
+    reach = max(place[0].stop - y, y - place[0].start, place[1].stop - x, x - place[1].start)
+    half = int(np.clip(reach + _AROUND, _LEAST, _MOST))
+    return tuple(
+        slice(min(max(c - half, 0), n - 1), max(min(c + half + 1, n), 1))
+        for c, n in zip((y, x), shape, strict=True)
+    )
 
 
 def _smooth_snr(data, variance, executor):
@@ -193,98 +242,6 @@ def _smooth_snr(data, variance, executor):
     noise = np.sqrt(noise)
     gain = 1.0 / (2.0 * np.sqrt(np.pi) * _WIDTH)
     return light / np.where(noise > 0, noise * gain, np.inf)
-
-
-def _carry_on(data, variance, smooth, segmentation, one, place):
-    """
-    Complete a source by its mean on ellipses.
-
-    Returns
-    -------
-    light, member, place, noise, beyond, rings
-        The light, the pixels on which it is known, where they are on the image, the
-        noise variance of its core, what an exponential disk
-        would have in all pixels, and the rings for `_is_point`; None if it has no core.
-    """
-    ny, nx = data.shape
-    place = (
-        slice(max(place[0].start - _AROUND, 0), min(place[0].stop + _AROUND, ny)),
-        slice(max(place[1].start - _AROUND, 0), min(place[1].stop + _AROUND, nx)),
-    )
-    values, labels = data[place], segmentation[place]
-    usable = np.isfinite(variance[place])
-    core = (labels == one) & usable & (smooth[place] > _CORE_SNR)
-    weight = np.where(core, values, 0.0)
-    total = weight.sum()
-    if np.count_nonzero(core) < 5 or total <= 0:
-        return None
-    y, x = np.indices(values.shape, dtype=float)
-    yc, xc = (weight * y).sum() / total, (weight * x).sum() / total
-    y, x = y - yc, x - xc
-    moments = np.array(
-        [[(weight * x * x).sum(), (weight * x * y).sum()], [0.0, (weight * y * y).sum()]]
-    )
-    size, axes = np.linalg.eigh(moments / total, UPLO="U")
-    # an area-preserving ellipse of the core's shape
-    ratio = np.sqrt(np.clip(size[0] / max(size[1], 1e-9), 0.09, 1.0))
-    along = x * axes[0, 1] + y * axes[1, 1]
-    across = x * axes[0, 0] + y * axes[1, 0]
-    radius = np.sqrt(ratio * along**2 + across**2 / ratio)
-    free = usable & ((labels == one) | (labels == 0))
-    ring = (radius / _RING).astype(int)
-    n_rings = int(ring.max()) + 1
-    counts = np.bincount(ring[free], minlength=n_rings)
-    all_pixels = np.bincount(ring.ravel(), minlength=n_rings)
-    safe = np.maximum(counts, 1)
-    mean = np.bincount(ring[free], values[free], n_rings) / safe
-    error = np.sqrt(np.bincount(ring[free], variance[place][free], n_rings)) / safe
-    at = np.bincount(ring[free], radius[free], n_rings) / safe
-    core_share = np.bincount(ring[core], minlength=n_rings) / np.maximum(all_pixels, 1)
-    # rings count while they are significant and mostly seen
-    edge = min(xc, yc, values.shape[1] - 1 - xc, values.shape[0] - 1 - yc) * np.sqrt(ratio)
-    good = (counts >= 6) & (counts > 0.3 * all_pixels) & (mean > 2 * error)
-    good &= at + _RING / 2 < max(edge, _RING)
-    good |= core_share > 0.7
-    last = n_rings if good.all() else int(np.argmin(good))
-    known = np.flatnonzero(counts[:last])
-    if len(known) < 2:
-        return None
-    inside = radius < last * _RING
-    filled = np.interp(radius, at[known], mean[known])
-    light = np.where(core, values, np.where(inside, filled, 0.0))
-    noise = float(variance[place][core].sum())
-    beyond = _disk(at[known], mean[known], error[known], radius)
-    rings = (np.where(free, ring, -1), known, mean[known], error[known])
-    return light, core | inside, place, noise, beyond, rings
-
-
-def _is_point(psf, ring, known, mean, error):
-    """Whether the means on rings are those of the PSF, to the noise."""
-    free = ring >= 0
-    n = int(ring.max()) + 1
-    counts = np.maximum(np.bincount(ring[free], minlength=n), 1)
-    model = (np.bincount(ring[free], psf[free], n) / counts)[known] / error
-    seen = mean / error
-    amplitude = np.sum(seen * model) / np.sum(model**2)
-    chi2 = np.sum((seen - amplitude * model) ** 2)
-    n_free = len(known) - 1
-    return chi2 < n_free + np.sqrt(2.0 * n_free)
-
-
-def _disk(at, mean, error, radius):
-    """Exponential through the last three rings, carried on outwards."""
-    at, mean, error = at[-3:], mean[-3:], error[-3:]
-    if np.any(mean <= 0):
-        return np.zeros(radius.shape)
-    weight = (mean / error) ** 2
-    log = np.log(mean)
-    middle = np.average(at, weights=weight)
-    level = np.average(log, weights=weight)
-    slope = np.sum(weight * (at - middle) * (log - level)) / np.sum(weight * (at - middle) ** 2)
-    # steeper by a quarter than the last rings: the PSF flattens them, and the last is one that
-    # noise let pass; found on Sersic profiles of index 1 to 2.5
-    slope = np.clip(1.25 * slope, -1.5, -0.25)
-    return np.exp(level + slope * (radius - middle))
 
 
 def sersic_cutouts(rows, xy, jacobian):
@@ -325,17 +282,3 @@ def convolve_padded(array, response):
     """Convolve one array with a rim around it, by the transform that ``response(shape)`` gives."""
     shape = tuple(n + 2 * RIM for n in array.shape)
     return _core.convolve_batch(np.pad(array, RIM)[None], response(shape), shape)
-
-
-def _psf_at(coefficients, xy, origin, shape):
-    """Evaluate a PSF with its centre at ``xy`` on the pixels of a cutout."""
-    middle = (coefficients.shape[1] - 1) / 2
-    poly = np.zeros((1, 2, 6))
-    poly[0, :, 0] = middle
-    poly[0, 0, 1] = poly[0, 1, 2] = 1.0
-    out = np.zeros(shape[0] * shape[1])
-    box = np.array([[0, 0, *shape]])
-    center = np.array([[xy[0] - origin[1], xy[1] - origin[0]]])
-    start = np.array([0, out.size])
-    _core.sample_stamps(coefficients, np.zeros(1, int), np.ones(1), center, poly, box, start, out)
-    return out.reshape(shape)

@@ -190,6 +190,8 @@ class ForcedPhotometer:
             catalog[near], sky[near], fine_xy, grid_wcs, fine_arrays, segments,
             None if labels is None else labels[near], executor,
         )  # fmt: skip
+        kinds = np.full(n, "none", "U6")
+        kinds[near] = ["point" if one is None else one.kind for one in parts]
         sides = None
         if self._integrate:
             middle = np.array([[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
@@ -214,7 +216,7 @@ class ForcedPhotometer:
             correlated_noise=self._correlated_noise,
             min_coverage=self._min_coverage,
         )
-        return fit.result(image, sky, xy, flags, snr, catalog)
+        return fit.result(image, sky, xy, flags, kinds, snr, catalog)
 
     def _fine(self, image, highres, segmentation, arrays):
         """Coordinates, arrays and labels of the fine grid."""
@@ -264,6 +266,8 @@ class ForcedPhotometer:
             label,
             fine_xy,
             self._kernel.source,
+            scale=self._kernel.pixel_scale.to_value(ANGLE),
+            select=self._template == "auto",
             min_snr=self._min_snr if self._template == "auto" else 0.0,
             wings=self._wings,
             executor=executor,

@@ -73,6 +73,10 @@ class ForcedPhotometryResult:
         Template-weighted mean of (residual / sigma)^2, about 1 for a good fit.
     residual_fraction : `~numpy.ndarray`, shape (n,)
         Light left below the template's core over what the fit took there.
+    template : str `~numpy.ndarray`, shape (n,)
+        Which template was used: ``"point"``, ``"sersic"`` (a profile alone), ``"cutout"`` (the
+        high-resolution image itself where it is significant), or ``"none"`` for sources
+        that are not on the image.
     template_snr : `~numpy.ndarray`, shape (n,)
         Signal-to-noise of the segment of the high-resolution image; NaN without one.
     crowded : bool `~numpy.ndarray`, shape (n,)
@@ -101,6 +105,7 @@ class ForcedPhotometryResult:
     coverage: np.ndarray
     chi2: np.ndarray
     residual_fraction: np.ndarray
+    template: np.ndarray
     template_snr: np.ndarray
     crowded: np.ndarray
     x: np.ndarray
@@ -163,6 +168,11 @@ class ForcedPhotometryResult:
             f"{prefix}residual_fraction": (
                 self.residual_fraction,
                 "Residual over fitted light in the core",
+            ),
+            f"{prefix}template": (self.template, "Template: cutout, sersic, point or none"),
+            f"{prefix}template_snr": (
+                self.template_snr,
+                "Signal-to-noise of the segment of the high-resolution image",
             ),
         }
         table = QTable({"id": self.id, "sky": self.sky}, meta=dict(self.meta), copy=True)

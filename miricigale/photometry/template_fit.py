@@ -174,7 +174,7 @@ class TemplateFit:
 
         self.bank.map(measure, block.parts())
 
-    def result(self, image, sky, xy, flags, snr, catalog):
+    def result(self, image, sky, xy, flags, kinds, snr, catalog):
         """Put everything in the order of the catalogue."""
         n = len(sky)
         source = self.near[self.bank.order]
@@ -262,6 +262,7 @@ class TemplateFit:
             coverage=coverage,
             chi2=chi2,
             residual_fraction=left,
+            template=kinds,
             template_snr=snr,
             crowded=crowded(sky, reference),
             x=xy[:, 0].copy(),

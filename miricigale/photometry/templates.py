@@ -75,6 +75,14 @@ class FineTemplates:
         half = (self.kernel if cutout.convolved else self.target).shape[0] // 2
         return cutout.origin[0] - half - RIM, cutout.origin[1] - half - RIM
 
+    def sides_of(self, cutout):
+        """First and last fine (x, y) that the light of a convolved cutout reaches."""
+        y, x = self.corner(cutout)
+        array = self.kernel if cutout.convolved else self.target
+        h, w = cutout.data.shape
+        first = np.array([x, y]) + RIM - 1.0
+        return first, first + [w + array.shape[1], h + array.shape[0]]
+
     def coefficients(self, group, shape):
         """Convolve cutouts of one shape, returning an array of shape (n, *shape)."""
         size = np.max([cutout.data.shape for cutout in group], axis=0) + RIM
@@ -197,17 +205,12 @@ class TemplateBank:
         low, high = np.empty((n, 2)), np.empty((n, 2))
         half = fine.target.shape[0] // 2 + 1
         for k, cutout in enumerate(self._cutout):
-            if cutout is None or cutout.wings:
+            if cutout is None:
                 low[k] = self._fine_xy[k] - half
                 high[k] = self._fine_xy[k] + half
-            if cutout is not None:
-                y, x = fine.corner(cutout)
-                array = fine.kernel if cutout.convolved else fine.target
-                h, w = cutout.data.shape
-                first = np.array([x, y]) + RIM - 1.0
-                last = first + [w + array.shape[1], h + array.shape[0]]
-                low[k] = np.minimum(low[k], first) if cutout.wings else first
-                high[k] = np.maximum(high[k], last) if cutout.wings else last
+                continue
+            sides = np.array([fine.sides_of(one) for one in cutout.layers])
+            low[k], high[k] = sides[:, 0].min(axis=0), sides[:, 1].max(axis=0)
         # corners of the fine rectangle through the inverse of the linear map
         matrix = np.linalg.inv(self._poly[:, :, 1:3])
         corners = np.stack(
@@ -290,7 +293,10 @@ class TemplateBank:
         block = Block(first, self.box[first:last], start, np.zeros(int(start[-1]), np.float32))
         sources = self.order[first:last]
         cutout = [self._cutout[k] for k in sources]
-        wings = np.array([1.0 if one is None else one.wings for one in cutout])
+        points = np.flatnonzero([one is None for one in cutout])
+        layers = [
+            (row, one) for row, all_of in enumerate(cutout) if all_of for one in all_of.layers
+        ]
         point = fine.point
         middle = (np.array(point.shape[2:0:-1]) - 1) / 2
 
@@ -307,22 +313,28 @@ class TemplateBank:
                 block.values[start[k] : start[k + 1]] += sums[low:high]
 
         def add_points(part):
-            rows = np.arange(part.start, part.stop)
+            rows = np.intersect1d(points, np.arange(part.start, part.stop))
+            n = len(rows)
             origin = self._fine_xy[sources[rows]] - middle
-            add(point, np.zeros(len(rows), int), wings[rows], rows, origin)
+            add(point, np.zeros(n, int), np.ones(n), rows, origin)
 
         def add_cutouts(batch):
-            (*shape, _), rows = batch
-            group = [cutout[k] for k in rows]
+            (*shape, _, _), members = batch
+            rows = np.array([layers[k][0] for k in members])
+            group = [layers[k][1] for k in members]
             origin = np.array([fine.corner(one)[::-1] for one in group])
             n = len(rows)
             add(fine.coefficients(group, tuple(shape)), np.arange(n), np.ones(n), rows, origin)
 
         self.map(add_points, block.parts())
         seen = (block.box[:, 2] > 0) & (block.box[:, 3] > 0)
-        shapes = (
-            (*fine.shape(one), one.convolved) if one is not None and inside else None
-            for one, inside in zip(cutout, seen, strict=True)
-        )
-        self.map(add_cutouts, batches(shapes))
+        # profiles first, what is added to them afterwards
+        for rest in (False, True):
+            shapes = (
+                (*fine.shape(one), one.convolved, rest)
+                if seen[row] and rest == (one is not cutout[row])
+                else None
+                for row, one in layers
+            )
+            self.map(add_cutouts, batches(shapes))
         return block

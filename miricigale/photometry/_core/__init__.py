@@ -14,6 +14,7 @@ from miricigale.photometry._core.sampling import (
     sample_stamps,
     spline_response,
 )
+from miricigale.photometry._core.shapes import INDEX_RANGE, shape_models
 from miricigale.photometry._core.solve import block_covariance, factorize
 from miricigale.photometry._core.stamps import (
     add_model,
@@ -26,6 +27,7 @@ from miricigale.photometry._core.stamps import (
 )
 
 __all__ = [
+    "INDEX_RANGE",
     "add_model",
     "autocorrelation",
     "block_covariance",
@@ -39,5 +41,6 @@ __all__ = [
     "residual_statistics",
     "sample_stamps",
     "scale_stamps",
+    "shape_models",
     "spline_response",
 ]

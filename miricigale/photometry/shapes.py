@@ -1,0 +1,244 @@
+"""Which shape the light of a source has: fits of a point and of a Sersic profile, and their evidence."""
+
+import dataclasses
+
+import numpy as np
+import scipy.fft
+
+from miricigale.photometry import _core
+
+__all__ = ["Shape", "ShapeFitter"]
+
+#: What is known of shapes beforehand (mean and width): ln of the circularised half-light radius
+#: (arcsec), ln of the Sersic index, the two ellipticities, and the offset of the centre (pixels).
+_RADIUS, _INDEX, _ELLIPTICITY, _OFFSET = (np.log(0.2), 0.8), (np.log(1.8), 0.8), 0.6, 0.7
+
+#: Largest number of steps, and the gain in chi^2 below which the fit ends.
+_STEPS, _GAIN = 25, 0.1
+
+#: Excess of chi^2 over twice the evidence of the profile that rules a point out at once.
+_HOPELESS = 200.0
+
+#: Radii (ln over the expected one) that the search begins with.
+_STARTS = (-0.9, 0.0, 0.9)
+
+#: Half-width (pixels) of the stamps, least and most, and in half-light radii; size of the transform
+#: over that of the stamp.
+_HALF, _MOST, _REACH, _PERIOD = 16, 48, 4.0, 1.8
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Shape:
+    """
+    A profile that was fitted.
+
+    Attributes
+    ----------
+    flux : float
+        Total light.
+    parameters : `~numpy.ndarray`, shape (6,)
+        As for `~miricigale.photometry._core.shape_models`.
+    point : float
+        Probability that the source is a point.
+    """
+
+    flux: float
+    parameters: np.ndarray
+    point: float
+
+    @property
+    def axes(self):
+        """Half-light radius along the major axis (pixels), axis ratio, angle from x (rad)."""
+        g1, g2 = self.parameters[4:]
+        eta = np.hypot(g1, g2)
+        return np.exp(self.parameters[2] + eta / 2), np.exp(-eta), 0.5 * np.arctan2(g2, g1)
+
+
+class ShapeFitter:
+    """
+    Fits light profiles through the PSF of an image.
+
+    Parameters
+    ----------
+    psf : `~numpy.ndarray`, shape (k, k)
+        PSF, odd and centred.
+    scale : float
+        Arcsec per pixel.
+    """
+
+    def __init__(self, psf, scale):
+        self._psf = np.asarray(psf, float)
+        self._log_scale = np.log(scale)
+        self._transforms = {}
+
+    def _transform(self, size):
+        found = self._transforms.get(size)
+        if found is None:
+            padded = np.zeros((size, size))
+            middle = self._psf.shape[0] // 2
+            half = min(middle, size // 2 - 1)
+            cut = self._psf[middle - half : middle + half + 1, middle - half : middle + half + 1]
+            padded[: 2 * half + 1, : 2 * half + 1] = cut
+            found = scipy.fft.rfft2(np.roll(padded, (-half, -half), axis=(0, 1)))
+            self._transforms[size] = found
+        return found
+
+    def fit(self, data, weight, xy):
+        """
+        Fit a point and a Sersic profile.
+
+        Parameters
+        ----------
+        data : `~numpy.ndarray`, shape (ny, nx)
+            Light of a stamp.
+        weight : `~numpy.ndarray`, shape (ny, nx)
+            Inverse of the noise, zero for pixels that do not count.
+        xy : (float, float)
+            Where the source is on the stamp.
+
+        Returns
+        -------
+        shape : `Shape` or None
+            None where no profile of positive light fits.
+        """
+        radius = (_RADIUS[0] - self._log_scale, _RADIUS[1])
+        mean = np.array([*xy, radius[0], _INDEX[0], 0.0, 0.0])
+        width = np.array([_OFFSET, _OFFSET, radius[1], _INDEX[1], _ELLIPTICITY, _ELLIPTICITY])
+        half = _HALF
+        inner = self._stamp(data, weight, mean, half)
+        start = mean.copy()
+        costs = []
+        for offset in _STARTS:
+            start[2] = mean[2] + offset
+            costs.append(_amplitude(inner.models(start, 0)[0], inner)[1])
+        start[2] = mean[2] + _STARTS[int(np.argmin(costs))]
+        extended = _minimum(inner, start, mean, width, 6)
+        if extended is None:
+            return None
+        reach = np.exp(extended[1][2] + 0.5 * np.hypot(*extended[1][4:]))
+        half = int(np.clip(np.ceil(_REACH * reach), _HALF, _MOST))
+        if half > _HALF:
+            inner = self._stamp(data, weight, mean, half)
+            extended = _minimum(inner, extended[1], mean, width, 6)
+        if extended is None or not extended[0] > 0:
+            return None
+        flux, parameters, evidence = extended
+        start = parameters.copy()
+        start[2] = -30.0
+        share = 0.0
+        # a point that is far worse in the same place need not be moved to the best one
+        if _amplitude(inner.models(start, 0)[0], inner)[1] < -2 * evidence + _HOPELESS:
+            point = _minimum(inner, start, mean, width, 2)
+            odds = np.inf if point is None else evidence - point[2]
+            share = 1.0 / (1.0 + np.exp(np.clip(odds, -50, 50)))
+        return Shape(flux, parameters, float(share))
+
+    def model(self, shape, parameters):
+        """Light of a profile of unit total through the PSF, on a stamp of some shape."""
+        size = _period(shape)
+        return _core.shape_models(
+            self._transform(size), size, shape, parameters, derivatives=0
+        )[0].astype(float)  # fmt: skip
+
+    def _stamp(self, data, weight, mean, half):
+        """The pixels within ``half`` of the middle."""
+        x, y = (round(float(c)) for c in mean[:2])
+        y0, x0 = max(y - half, 0), max(x - half, 0)
+        cut = np.s_[y0 : y + half + 1, x0 : x + half + 1]
+        shape = weight[cut].shape
+        use = np.flatnonzero(weight[cut])
+        size = _period(shape)
+        psf = self._transform(size)
+
+        def models(parameters, derivatives):
+            shifted = np.array(parameters)
+            shifted[:2] -= [x0, y0]
+            return _core.shape_models(psf, size, shape, shifted, derivatives=derivatives)
+
+        inverse = weight[cut].ravel()[use]
+        return _Stamp(models, use, inverse, data[cut].ravel()[use] * inverse, max(shape))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Stamp:
+    models: object
+    use: np.ndarray
+    inverse: np.ndarray
+    white: np.ndarray
+    size: int
+
+    def whitened(self, images):
+        return images.reshape(len(images), -1)[:, self.use] * self.inverse
+
+
+def _period(shape):
+    """Size of the transform: light that leaves the period on one side comes in on the other."""
+    return scipy.fft.next_fast_len(int(_PERIOD * max(shape)), True)
+
+
+def _amplitude(model, stamp):
+    """Light of a model of unit light that fits best, and the chi^2 then."""
+    scaled = stamp.whitened(model[None])[0]
+    power = scaled @ scaled
+    flux = (scaled @ stamp.white) / power if power > 0 else 0.0
+    return flux, float(np.sum((stamp.white - flux * scaled) ** 2))
+
+
+def _minimum(stamp, start, mean, width, n_free):
+    """
+    Levenberg-Marquardt for the light and the first parameters, with Gaussian priors.
+
+    Returns
+    -------
+    flux, parameters, evidence
+        The evidence is Laplace's, without the light's prior; None if nothing is found.
+    """
+    free = slice(0, n_free)
+    precision = np.concatenate([[0.0], width[free] ** -2])
+    low = np.array([-np.inf, -np.inf, np.log(0.05), np.log(_core.INDEX_RANGE[0]), -2.0, -2.0])
+    high = np.array([np.inf, np.inf, np.log(stamp.size), np.log(_core.INDEX_RANGE[1]), 2.0, 2.0])
+
+    def at(parameters):
+        columns = stamp.whitened(stamp.models(parameters, n_free))
+        power = columns[0] @ columns[0]
+        flux = (columns[0] @ stamp.white) / power if power > 0 else 0.0
+        z = stamp.white - flux * columns[0]
+        chi2 = z @ z + np.sum(((parameters - mean)[free] / width[free]) ** 2)
+        columns[1:] *= flux
+        return parameters, columns, flux, z, chi2
+
+    def curvature(columns):
+        matrix = columns @ columns.T
+        matrix[np.diag_indices_from(matrix)] += precision
+        return matrix
+
+    best = at(start.copy())
+    damping = 1e-2
+    for _ in range(_STEPS):
+        parameters, columns, _, z, chi2 = best
+        matrix = curvature(columns)
+        slope = columns @ z - precision * np.concatenate([[0.0], (parameters - mean)[free]])
+        gained = 0.0
+        while damping < 1e6:
+            damped = matrix + np.diag(damping * np.diag(matrix))
+            try:
+                step = np.linalg.solve(damped, slope)
+            except np.linalg.LinAlgError:
+                return None
+            trial = parameters.copy()
+            trial[free] += np.clip(step[1:], -1.0, 1.0)
+            trial[free] = np.clip(trial[free], low[free], high[free])
+            new = at(trial)
+            if new[-1] <= chi2:
+                gained = chi2 - new[-1]
+                best = new
+                damping = max(damping * 0.1, 1e-6)
+                break
+            damping *= 10.0
+        if gained < _GAIN:
+            break
+    parameters, columns, flux, _, chi2 = best
+    sign, log_det = np.linalg.slogdet(curvature(columns))
+    if not (sign > 0 and np.isfinite(chi2)):
+        return None
+    return flux, parameters, -0.5 * (chi2 + log_det - np.sum(np.log(precision[1:])))
