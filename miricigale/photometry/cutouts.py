@@ -149,6 +149,7 @@ def cutouts(
     usable = np.isfinite(variance)
     smooth = _smooth_snr(data, variance, executor) if wings else None
     fitter = ShapeFitter(source_psf, scale) if wings else None
+    reach = source_psf.shape[0] / 2
     snr = np.full(len(label), np.nan)
     flags = np.zeros(len(label), int)
     totals = np.zeros(len(slices) + 1)
@@ -187,23 +188,22 @@ def cutouts(
         if select and shape.point > 0.5:
             return None, 0
         core = (labels == one) & free & (smooth[around] > _CORE_SNR)
-        model = fitter.model(weight.shape, shape.parameters)
-        rest = np.where(core, data[around] - shape.flux * model, 0.0)
+        model = shape.flux * fitter.model(weight.shape, shape.parameters)
         n = np.count_nonzero(core)
-        excess = np.sum((rest * weight) ** 2) - n
-        x, y = shape.parameters[:2] + corner
-        radius, axis_ratio, angle = shape.axes
-        profile, origin = sersic_stamp(
-            x=x, y=y, r_eff=radius, n=np.exp(shape.parameters[3]), axis_ratio=axis_ratio,
-            theta=angle, max_radius=max(source_psf.shape[0] / 2, 2 * radius),
-        )  # fmt: skip
+        excess = np.sum(((data[around] - model) * weight)[core] ** 2) - n
         if select and excess < _EXCESS * np.sqrt(2 * max(n, 1)):
-            return Cutout(profile, origin, convolved=False), 0
+            return _profile(shape, corner, reach), 0
+        # what the profile cannot explain in the core must not bend its wings
+        looser = weight / np.hypot(1.0, _MISFIT * model * weight)
+        shape = fitter.fit(data[around], looser, xy[k] - corner) or shape
+        model = shape.flux * fitter.model(weight.shape, shape.parameters)
+        rest = np.where(core, data[around] - model, 0.0)
         total = shape.flux + rest.sum()
         noise = float(variance[around][core].sum()) / total**2
-        rest = Cutout(rest / total, (around[0].start, around[1].start), noise=noise)
-        return Cutout(
-            profile * (shape.flux / total), origin, noise=noise, convolved=False, rest=rest
+        return dataclasses.replace(
+            _profile(shape, corner, reach, light=shape.flux / total),
+            noise=noise,
+            rest=Cutout(rest / total, (around[0].start, around[1].start)),
         ), 0
 
     found = parallel_map(make, range(len(label)), executor=executor)
@@ -211,9 +211,23 @@ def cutouts(
     return [one for one, _ in found], flags, snr
 
 
+def _profile(shape, corner, reach, light=1.0):
+    """A fitted profile on the fine grid, as far as the PSF reaches at least."""
+    x, y = shape.parameters[:2] + corner
+    radius, axis_ratio, angle = shape.axes
+    stamp, origin = sersic_stamp(
+        x=x, y=y, total_flux=light, r_eff=radius, n=np.exp(shape.parameters[3]),
+        axis_ratio=axis_ratio, theta=angle, max_radius=max(reach, 2 * radius),
+    )  # fmt: skip
+    return Cutout(stamp, origin, convolved=False)
+
+
 #: Width (pixels) of the Gaussian that tells the core, its least signal-to-noise, how many standard
 #: deviations of chi^2 a profile may miss it by, and the signal-to-noise that makes a neighbour.
 _WIDTH, _CORE_SNR, _EXCESS, _OTHER_SNR = 1.5, 4.0, 3.0, 4.0
+
+#: Error of a profile that does not explain the core, as a fraction of its brightness.
+_MISFIT = 0.1
 
 #: Half-width (pixels) of the stamps that profiles are fitted on: beyond the segment, least and most.
 _AROUND, _LEAST, _MOST = 6, 16, 48
