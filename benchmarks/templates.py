@@ -4,9 +4,10 @@ Tells how near to the truth fluxes come with templates of a noisy high-resolutio
     python benchmarks/templates.py             tables for one band (F770W)
     python benchmarks/templates.py --seeds 3   with three times as many sources
 
-Isolated Sersic galaxies (index 0.5 to 4, half-light radius 0.1 to 0.6 arcsec) and points, detected on a noisy image like
-F160W (0.06 arcsec) and measured on a mosaic of 0.11 arcsec with little noise: what is off is the template's fault.
-Both images are made on a grid of 0.02 arcsec and sampled from there by splines, not by the package's own templates.
+Isolated Sersic galaxies (index 0.5 to 4, half-light radius 0.1 to 0.6 arcsec) and points, detected on a noisy
+image like F160W (0.06 arcsec) and measured on a mosaic of 0.11 arcsec with little noise: what is off is the
+template's fault. Both images are made on a grid of 0.02 arcsec and sampled from there by splines, not by the
+package's own templates.
 """
 
 import argparse

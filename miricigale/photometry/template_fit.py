@@ -15,7 +15,7 @@ from miricigale.photometry.errors import (
     normal_matrix,
     sandwich_matrix,
 )
-from miricigale.photometry.flags import ForcedFlags
+from miricigale.photometry.flags import POOR_CHI2, ForcedFlags, unexplained_neighbours
 from miricigale.photometry.results import ForcedPhotometryResult, crowded
 from miricigale.utils.exceptions import MiricigaleWarning
 from miricigale.utils.meta import provenance
@@ -114,6 +114,12 @@ class TemplateFit:
         half = min(int(self.radius * self.scale / fine), target.shape[0] // 2)
         middle = target.shape[0] // 2
         return target[middle - half : middle + half + 1, middle - half : middle + half + 1].sum()
+
+    def _width(self):
+        """Rms width in pixels of a Gaussian as peaked as the image's PSF."""
+        target = self.kernel.target
+        fine = self.kernel.pixel_scale.to_value(ANGLE)
+        return np.sqrt(target.sum() / (2 * np.pi * target.max())) * fine / self.scale
 
     def model(self):
         """The sources' model in uJy per pixel, without background."""
@@ -226,6 +232,15 @@ class TemplateFit:
         with np.errstate(divide="ignore", invalid="ignore"):
             left[source] = statistics[:, 1] / (self.flux * statistics[:, 2])
         chi2[np.isnan(flux)] = left[np.isnan(flux)] = np.nan
+        variance = (
+            1.0 if correlation is None else correlation[tuple(np.array(correlation.shape) // 2)]
+        )
+        flags[chi2 > POOR_CHI2 * variance] |= int(ForcedFlags.POOR_FIT)
+        near = unexplained_neighbours(
+            np.where(self.arrays.usable, residual, 0.0), model, self.inverse_sigma, self._width(),
+            xy, flux,
+        )  # fmt: skip
+        flags[near & np.isfinite(flux)] |= int(ForcedFlags.UNEXPLAINED_NEIGHBOUR)
         reference = catalog["flux"] if "flux" in catalog.colnames else np.nan_to_num(flux)
         filter_name = image.meta.get("filter", image.meta.get("FILTER"))
         common_err = np.sqrt(np.diag(common)) if n_columns else np.empty(0)

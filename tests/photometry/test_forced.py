@@ -119,6 +119,107 @@ def test_noisy_templates(tools, noise, snr, bias):
     assert np.median(np.concatenate(as_they_are)) < 1 - bias / 2
 
 
+def test_template_column_says_what_was_used(tools):
+    sky, _, high, low = galaxies(tools, noise=0.01, n=9)
+    segmentation, _ = detect_sources(high, threshold=1.0, min_area=10)
+    blank = tools.CENTER.spherical_offsets_by(1.6 * u.arcsec, 1.6 * u.arcsec)
+    far = tools.CENTER.spherical_offsets_by(1.0 * u.deg, 0 * u.deg)
+    ra, dec = (
+        [*getattr(sky, name).deg, *(getattr(one, name).deg for one in (blank, far))]
+        for name in ("ra", "dec")
+    )
+    catalog = QTable({"sky": SkyCoord(ra, dec, unit="deg")})
+    result = ForcedPhotometer(tools.kernel).measure(low, high, segmentation, catalog)
+    # Gaussians of this significance are profiles of index 1/2
+    assert result.template.tolist() == ["sersic"] * 9 + ["point", "none"]
+    assert np.all(result.template_snr[:9] > 20)
+    assert np.isnan(result.template_snr[9:]).all()
+    as_asked = ForcedPhotometer(tools.kernel, template="cutout")
+    result = as_asked.measure(low, high, segmentation, catalog)
+    assert result.template.tolist() == ["cutout"] * 9 + ["point", "none"]
+    table = result.to_table("miri.f770w")
+    assert_array_equal(table["miri.f770w_template"], result.template)
+    assert_array_equal(table["miri.f770w_template_snr"], result.template_snr)
+
+
+def test_poor_fits_and_unexplained_neighbours_are_flagged(tools):
+    rng = np.random.default_rng(8)
+    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (200, 200))
+    east = np.array([-6.0, -2.0, 2.0, 6.0])
+    sky = tools.CENTER.spherical_offsets_by(east * u.arcsec, np.zeros(4) * u.arcsec)
+    flux = np.full(4, 40.0)
+    # the first is as the catalogue says, the second is wider; the third has a companion at 0.9
+    # arcsec, the fourth one at 2.5 arcsec (the PSF's full width is 0.59 arcsec)
+    width = np.hypot(tools.LO, [0.0, 0.25, 0.0, 0.0])
+    more = tools.CENTER.spherical_offsets_by([2.0, 6.0] * u.arcsec, [0.9, 2.5] * u.arcsec)
+    data = tools.render(sky, flux, width, wcs, (200, 200))
+    data += tools.render(more, np.full(2, 20.0), tools.LO, wcs, (200, 200))
+    sigma = 0.1
+    image = tools.as_ccd(data + rng.normal(0, sigma, data.shape), wcs, sigma)
+    photometer = ForcedPhotometer(tools.kernel, template="psf")
+    result = photometer.measure(image, catalog=QTable({"sky": sky}))
+    assert result.snr.min() > 100
+    assert flagged(result, ForcedFlags.POOR_FIT).tolist() == [False, True, True, False]
+    neighbour = flagged(result, ForcedFlags.UNEXPLAINED_NEIGHBOUR)
+    assert neighbour.tolist() == [False, False, True, False]
+    # with all sources in the catalogue nothing is left
+    ra, dec = (np.concatenate([getattr(a, n).deg for a in (sky, more)]) for n in ("ra", "dec"))
+    catalog = QTable({"sky": SkyCoord(ra, dec, unit="deg")})
+    result = photometer.measure(image, catalog=catalog)
+    assert not flagged(result, ForcedFlags.UNEXPLAINED_NEIGHBOUR).any()
+    assert flagged(result, ForcedFlags.POOR_FIT).tolist() == [False, True, *[False] * 4]
+
+
+def sersic_galaxies(tools, index, seed, noise, n_side=5, spacing=5.4):
+    """Isolated galaxies of one index on a noisy image of 0.06 arcsec, and on one of 0.12 arcsec."""
+    from miricigale.profiles import sersic_image
+
+    rng = np.random.default_rng(seed)
+    n, cell = n_side**2, 0.03
+    size = 4 * int((n_side + 1.2) * spacing / cell / 4)
+    grid = (np.arange(n_side) - (n_side - 1) / 2) * spacing / cell + (size - 1) / 2
+    x, y = (a.ravel() + rng.uniform(-9, 9, n) for a in np.meshgrid(grid, grid))
+    scene, radius = np.zeros((size, size)), rng.uniform(0.2, 0.4, n)
+    for k in range(n):
+        row, column = int(y[k]) - 150, int(x[k]) - 150
+        scene[row : row + 301, column : column + 301] += sersic_image(
+            (301, 301), x=x[k] - column, y=y[k] - row, r_eff=radius[k] / cell, n=index,
+            axis_ratio=rng.uniform(0.4, 1), theta=rng.uniform(0, np.pi),
+        )  # fmt: skip
+    images = []
+    for sigma, step, error in ((tools.HI, 2, noise), (tools.LO, 4, 1e-4)):
+        # the small cells have a width of their own
+        width = np.sqrt((sigma / cell) ** 2 - 1 / 12)
+        light = scipy.ndimage.gaussian_filter(scene, width, truncate=7, mode="constant")
+        light = scipy.ndimage.shift(light, -(step - 1) / 2, order=5)[::step, ::step] * step**2
+        wcs = north_up_wcs(tools.CENTER, step * cell * u.arcsec, light.shape)
+        area = pixel_area_map(wcs, light.shape) * 1e12
+        images.append(tools.as_ccd(light / area, wcs, 1.0))
+        images[-1].data += rng.normal(0, error, light.shape) / area
+        images[-1].uncertainty.array[:] = error / area
+    sky = images[0].wcs.pixel_to_world((x - 0.5) / 2, (y - 0.5) / 2)
+    return sky, radius, *images
+
+
+@pytest.mark.parametrize(("index", "noise"), [(0.7, 2e-3), (3.5, 2e-3), (1.5, 6e-4)])
+def test_galaxies_of_all_indices(tools, index, noise):
+    from miricigale.utils.tables import match_sky
+
+    sky, _, high, low = sersic_galaxies(tools, index, 3, noise)
+    segmentation, detected = detect_sources(high)
+    row, _ = match_sky(detected["sky"], sky, radius=0.3 * u.arcsec)
+    result = ForcedPhotometer(tools.kernel).measure(low, high, segmentation, detected)
+    row = row[row >= 0]
+    assert len(row) >= 23
+    ratio = result.flux.value[row]
+    snr = np.median(result.template_snr[row])
+    assert 8 < snr < 100
+    assert np.mean(result.template[row] == "point") < 0.1
+    assert abs(np.median(ratio) - 1) < (0.04 if noise < 1e-3 else 0.08)
+    scatter = 1.4826 * np.median(np.abs(ratio - np.median(ratio)))
+    assert scatter < (0.04 if noise < 1e-3 else 0.1)
+
+
 def test_noise_in_the_template_is_taken_off_the_diagonal(tools):
     # noise of known variance in the cutout: expectation of the corrected power is that of the truth
     from miricigale.photometry.cutouts import Cutout

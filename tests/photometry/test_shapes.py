@@ -1,0 +1,177 @@
+import numpy as np
+import pytest
+import scipy.fft
+import scipy.ndimage
+from numpy.testing import assert_allclose
+
+from miricigale.photometry import _core
+from miricigale.photometry.cutouts import cutouts
+from miricigale.photometry.shapes import ShapeFitter
+from miricigale.profiles import sersic_image
+
+SCALE = 0.06  # arcsec per pixel
+WIDTH = 1.4  # rms width of the PSF in pixels
+
+
+def gaussian_psf(n=61, width=WIDTH):
+    x = np.arange(n) - n // 2
+    line = np.exp(-0.5 * (x / width) ** 2)
+    psf = line[:, None] * line
+    return psf / psf.sum()
+
+
+def transform(size, width=WIDTH):
+    x = scipy.fft.fftfreq(size, 1 / size)
+    line = np.exp(-0.5 * (x / width) ** 2)
+    psf = line[:, None] * line
+    return scipy.fft.rfft2(psf / psf.sum())
+
+
+def galaxy(shape, x, y, *, r_eff, n, q=1.0, theta=0.0, flux=1.0, fine=5):
+    """A Sersic profile through the PSF, by cells five times as small and a Gaussian filter."""
+    ny, nx = shape
+    image = sersic_image(
+        (ny * fine, nx * fine), x=fine * x + fine // 2, y=fine * y + fine // 2,
+        total_flux=flux, r_eff=fine * r_eff, n=n, axis_ratio=q, theta=theta,
+    )  # fmt: skip
+    # the cells have a width of their own
+    width = np.sqrt((fine * WIDTH) ** 2 - 1 / 12)
+    image = scipy.ndimage.gaussian_filter(image, width, truncate=7, mode="constant")
+    return image[fine // 2 :: fine, fine // 2 :: fine] * fine**2
+
+
+def test_gaussian_and_its_convolution():
+    # a profile of index 1/2 is a Gaussian of sigma = R_e / sqrt(2 ln 2)
+    r_eff, psf_width = 4.0, 1.5
+    sigma = np.hypot(r_eff / np.sqrt(2 * np.log(2)), psf_width)
+    parameters = [30.3, 29.6, np.log(r_eff), np.log(0.5), 0.0, 0.0]
+    image = _core.shape_models(
+        transform(128, psf_width), 128, (61, 61), parameters, derivatives=0
+    )[0]  # fmt: skip
+    y, x = np.indices((61, 61))
+    truth = np.exp(-0.5 * ((x - 30.3) ** 2 + (y - 29.6) ** 2) / sigma**2) / (2 * np.pi * sigma**2)
+    assert_allclose(image, truth, atol=1e-5 * truth.max())
+
+
+@pytest.mark.parametrize(("n", "r_eff", "q"), [(1.0, 3.0, 0.5), (2.5, 2.0, 0.8), (4.0, 3.0, 0.6)])
+def test_models_are_those_of_the_renderer(n, r_eff, q):
+    truth = galaxy((41, 41), 20.3, 19.6, r_eff=r_eff, n=n, q=q, theta=0.5)
+    eta = -np.log(q)
+    parameters = [
+        20.3, 19.6, np.log(r_eff * np.sqrt(q)), np.log(n), eta * np.cos(1.0), eta * np.sin(1.0),
+    ]  # fmt: skip
+    # a large period, for the wings of its images not to matter
+    image = _core.shape_models(transform(256), 256, (41, 41), parameters, derivatives=0)[0]
+    assert_allclose(image, truth, atol=1e-3 * truth.max())
+
+
+@pytest.mark.parametrize("ellipticity", [(0.4, -0.3), (1e-5, 0.0)])
+def test_derivatives(ellipticity):
+    psf = transform(64)
+    parameters = np.array([15.3, 16.2, np.log(3.0), np.log(1.7), *ellipticity])
+    images = _core.shape_models(psf, 64, (33, 33), parameters)
+    assert images.shape == (7, 33, 33)
+    for k in range(6):
+        step = np.zeros(6)
+        step[k] = 2e-2
+        high, low = (
+            _core.shape_models(psf, 64, (33, 33), parameters + s, derivatives=0)[0]
+            for s in (step, -step)
+        )
+        assert_allclose(images[1 + k], (high - low) / 4e-2, atol=5e-3 * np.abs(images[1 + k]).max())
+
+
+@pytest.mark.parametrize(("n", "r_eff", "q"), [(0.7, 4.0, 0.4), (1.0, 2.0, 0.9), (3.0, 5.0, 0.6)])
+def test_noiseless_galaxies_are_recovered(n, r_eff, q):
+    shape = (97, 97)
+    data = galaxy(shape, 48.2, 47.7, r_eff=r_eff, n=n, q=q, theta=2.0, flux=7.0)
+    weight = np.full(shape, 1e5)
+    # a neighbour's pixels do not count
+    data[60:, 50:70] += 0.1
+    weight[60:, 50:70] = 0.0
+    shape = ShapeFitter(gaussian_psf(), SCALE).fit(data, weight, (48.0, 48.0))
+    radius, ratio, angle = shape.axes
+    assert_allclose(shape.flux, 7.0, rtol=0.01)
+    assert_allclose([radius, ratio], [r_eff, q], rtol=0.01)
+    assert_allclose(np.exp(shape.parameters[3]), n, rtol=0.02)
+    assert_allclose(angle % np.pi, 2.0, atol=0.01)
+    assert_allclose(shape.parameters[:2], [48.2, 47.7], atol=0.01)
+    assert shape.point < 1e-6
+
+
+@pytest.mark.parametrize(("snr", "share"), [(8, 0.7), (30, 0.95)])
+def test_points_are_told_from_galaxies(snr, share):
+    rng = np.random.default_rng(snr)
+    fitter = ShapeFitter(gaussian_psf(), SCALE)
+    y, x = np.indices((41, 41))
+    point = np.exp(-0.5 * ((x - 20.2) ** 2 + (y - 19.7) ** 2) / WIDTH**2) / (2 * np.pi * WIDTH**2)
+    wide = galaxy((41, 41), 20.2, 19.7, r_eff=4.0, n=1.0, q=0.7)
+    found = {}
+    for name, image in (("point", point), ("galaxy", wide)):
+        # significance of the best filter
+        sigma = np.sqrt(np.sum(image**2)) / snr
+        fits = [
+            fitter.fit(
+                image + rng.normal(0, sigma, image.shape), np.full((41, 41), 1 / sigma), (20, 20)
+            )
+            for _ in range(40)
+        ]
+        found[name] = np.mean([one is not None and one.point > 0.5 for one in fits])
+    assert found["point"] >= share
+    assert found["galaxy"] <= 1 - share
+
+
+def test_no_light_gives_no_shape():
+    y, x = np.indices((41, 41))
+    hole = -np.exp(-0.5 * ((x - 20) ** 2 + (y - 20) ** 2) / 9.0)
+    assert ShapeFitter(gaussian_psf(), SCALE).fit(hole, np.full((41, 41), 50.0), (20, 20)) is None
+
+
+def one_cutout(image, sigma, **options):
+    labels = (scipy.ndimage.gaussian_filter(image, 1.5) > 0.6 * sigma).astype(int)
+    options = {"scale": SCALE, "min_snr": 5.0, "wings": True} | options
+    variance = np.full(image.shape, sigma**2)
+    xy = np.array([[40.0, 40.0]])
+    parts, flags, _ = cutouts(image, variance, labels, np.array([1]), xy, gaussian_psf(), **options)
+    assert flags[0] == 0
+    return parts[0]
+
+
+def test_template_is_the_simplest_that_explains_the_image():
+    rng = np.random.default_rng(2)
+    y, x = np.indices((81, 81))
+
+    def point(px, py):
+        return np.exp(-0.5 * ((x - px) ** 2 + (y - py) ** 2) / WIDTH**2) / (2 * np.pi * WIDTH**2)
+
+    sigma = 0.002
+    noise = rng.normal(0, sigma, (81, 81))
+    assert one_cutout(point(40, 40) + noise, sigma) is None
+    profile = galaxy((81, 81), 40, 40, r_eff=5.0, n=1.5, q=0.6)
+    assert one_cutout(profile + noise, sigma).kind == "sersic"
+    # two knots are no profile
+    knots = 0.6 * profile + 0.2 * point(36, 41) + 0.2 * point(45, 38)
+    cutout = one_cutout(knots + noise, sigma)
+    assert cutout.kind == "cutout"
+    # what is asked for is done even if a profile would do
+    assert one_cutout(profile + noise, sigma, select=False).kind == "cutout"
+    # the light of the parts is that of the whole
+    assert_allclose(sum(layer.data.sum() for layer in cutout.layers), 1.0, atol=0.01)
+
+
+def test_wings_beyond_the_noise_are_those_of_the_profile():
+    # half of the light of this galaxy is below the noise of a pixel
+    truth = galaxy((161, 161), 80, 80, r_eff=6.0, n=2.5)
+    rng = np.random.default_rng(5)
+    sigma = 1e-3
+    light = []
+    for _ in range(12):
+        image = truth + rng.normal(0, sigma, truth.shape)
+        core = scipy.ndimage.gaussian_filter(image, 1.5) > sigma
+        labels, _ = scipy.ndimage.label(core)
+        labels = (labels == labels[80, 80]).astype(int)
+        weight = np.where(core & (labels == 0), 0.0, 1 / sigma)
+        fit = ShapeFitter(gaussian_psf(), SCALE).fit(image, weight, (80.0, 80.0))
+        light.append(fit.flux)
+        assert image[labels == 1].sum() < 0.85
+    assert abs(np.median(light) - 1) < 0.05
