@@ -8,7 +8,7 @@ from miricigale.utils.tables import Flags
 
 __all__ = ["POOR_CHI2", "ForcedFlags", "unexplained_neighbours"]
 
-#: Template-weighted chi^2 (in units of the noise's measured variance) from which a fit is poor.
+#: Template-weighted chi^2 from which a fit is poor, in units of the noise's variance.
 POOR_CHI2 = 2.0
 
 #: Least signal-to-noise of light that no template explains, its least share of the model below it and
@@ -40,7 +40,7 @@ class ForcedFlags(Flags):
     NOISY_SEGMENT = 64
     #: The template is a point source because another source owns the segment.
     SHARED_SEGMENT = 128
-    #: Residuals below the template are more than twice what the noise gives (chi2 above 2).
+    #: Residuals below the template are more than noise (chi2 above 2, and above twice the measured noise).
     POOR_FIT = 256
     #: Light that no template explains (5 sigma, a tenth of the flux) is within two widths of the PSF.
     UNEXPLAINED_NEIGHBOUR = 512

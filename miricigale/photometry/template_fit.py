@@ -232,9 +232,9 @@ class TemplateFit:
         with np.errstate(divide="ignore", invalid="ignore"):
             left[source] = statistics[:, 1] / (self.flux * statistics[:, 2])
         chi2[np.isnan(flux)] = left[np.isnan(flux)] = np.nan
-        variance = (
-            1.0 if correlation is None else correlation[tuple(np.array(correlation.shape) // 2)]
-        )
+        # where the measured noise is above that of the uncertainty, it is the measure
+        lag = 0 if correlation is None else correlation.shape[0] // 2
+        variance = 1.0 if correlation is None else max(1.0, correlation[lag, lag])
         flags[chi2 > POOR_CHI2 * variance] |= int(ForcedFlags.POOR_FIT)
         near = unexplained_neighbours(
             np.where(self.arrays.usable, residual, 0.0), model, self.inverse_sigma, self._width(),
