@@ -122,7 +122,8 @@ def _photometry():
             mask=np.zeros(y.shape, bool),
         )
 
-    prior, mosaic = image(hires, 1.5), image(native, 1.2)
+    # wider than the PSF, for profiles to be fitted and drawn
+    prior, mosaic = image(hires, 2.5), image(native, 1.8)
     labels = np.zeros(prior.shape, np.int32)
     x, y = hires.world_to_pixel(sky)
     yy, xx = np.mgrid[: labels.shape[0], : labels.shape[1]]

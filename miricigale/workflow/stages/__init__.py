@@ -126,6 +126,7 @@ def study_stages():
             needs=("mosaics", "highres", "kernels"),
             units=_filters,
             kernels=("photometry",),
+            version=2,
         ),
         Stage(
             "points",
