@@ -132,6 +132,7 @@ def study_stages():
             "points",
             "points:measure_point_sources",
             "point sources",
+            version=2,
             needs=("kernels",),
             sections=(
                 *images,
