@@ -166,10 +166,11 @@ def table(columns):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
-    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--seeds", type=int, default=2, help="number of fields")
+    parser.add_argument("--first", type=int, default=1, help="seed of the first field")
     parser.add_argument("--band", default="miri.f770w")
     args = parser.parse_args()
-    fields = [make(seed, args.band) for seed in range(1, args.seeds + 1)]
+    fields = [make(seed, args.band) for seed in range(args.first, args.first + args.seeds)]
     columns, seconds = measure(fields)
     n = sum(len(field[-1]) for field in fields)
     print(f"{args.band}: {n} detections, measure() took {seconds:.1f} s of processor time")
