@@ -17,7 +17,7 @@ _RADIUS, _INDEX, _ELLIPTICITY, _OFFSET = (np.log(0.2), 0.8), (np.log(1.8), 0.8),
 _STEPS, _GAIN = 25, 0.1
 
 #: Excess of chi^2 over twice the evidence of the profile that rules a point out at once.
-_HOPELESS = 200.0
+_FAR_BELOW = 200.0
 
 #: Radii (ln over the expected one) that the search begins with.
 _STARTS = (-0.9, 0.0, 0.9)
@@ -127,7 +127,7 @@ class ShapeFitter:
         start[2] = -30.0
         share = 0.0
         # a point that is far worse in the same place need not be moved to the best one
-        if _amplitude(inner.models(start, 0)[0], inner)[1] < -2 * evidence + _HOPELESS:
+        if _amplitude(inner.models(start, 0)[0], inner)[1] < -2 * evidence + _FAR_BELOW:
             point = _minimum(inner, start, mean, width, 2)
             odds = np.inf if point is None else evidence - point[2]
             share = 1.0 / (1.0 + np.exp(np.clip(odds, -50, 50)))

@@ -251,7 +251,7 @@ def unpacked_size(path):
         n_bytes = _count(path, _bound(path)[1])
     except Exception as err:  # each packing has its own
         if getattr(err, "errno", None):
-            # whoever opens it says what is wrong
+            # the reader that opens it says what is wrong
             return 0
         raise _unreadable(path, "a packed file", err) from err
     check_unpacked(path, n_bytes)

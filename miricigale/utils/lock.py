@@ -165,7 +165,7 @@ class FolderLock:
         if held is None or not self._flocks:
             raise self._refusal(owner, gone=True)
         # of all who find this file only one holds it by flock, and while the name stands for it
-        # nobody else replaces it
+        # no other process replaces it
         with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(state, os.stat(self.path)):
                 os.replace(spare, self.path)
