@@ -14,8 +14,9 @@ from miricigale.photometry.arrays import (
     pixel_scale,
     sky_pixels,
 )
-from miricigale.photometry.cutouts import cutouts, own_segments, sersic_cutouts
+from miricigale.photometry.cutouts import own_segments, sersic_cutouts
 from miricigale.photometry.flags import ForcedFlags
+from miricigale.photometry.light import cutouts
 from miricigale.photometry.template_fit import TemplateFit
 from miricigale.photometry.templates import FineTemplates, TemplateBank
 from miricigale.utils.exceptions import argument_error

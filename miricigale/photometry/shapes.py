@@ -53,6 +53,15 @@ class Shape:
         eta = np.hypot(g1, g2)
         return np.exp(self.parameters[2] + eta / 2), np.exp(-eta), 0.5 * np.arctan2(g2, g1)
 
+    def semi_major(self, size, origin):
+        """Semi-major axis (pixels) of the ellipse through each pixel of an image at an origin (y, x)."""
+        _, axis_ratio, angle = self.axes
+        y, x = np.indices(size)
+        x, y = x + origin[1] - self.parameters[0], y + origin[0] - self.parameters[1]
+        along = x * np.cos(angle) + y * np.sin(angle)
+        across = y * np.cos(angle) - x * np.sin(angle)
+        return np.hypot(along, across / axis_ratio)
+
 
 class ShapeFitter:
     """
@@ -83,7 +92,7 @@ class ShapeFitter:
             self._transforms[size] = found
         return found
 
-    def fit(self, data, weight, xy):
+    def fit(self, data, weight, xy, start=None):
         """
         Fit a point and a Sersic profile.
 
@@ -95,6 +104,8 @@ class ShapeFitter:
             Inverse of the noise, zero for pixels that do not count.
         xy : (float, float)
             Where the source is on the stamp.
+        start : `Shape`, optional
+            A profile to begin with; several sizes are tried without.
 
         Returns
         -------
@@ -104,21 +115,20 @@ class ShapeFitter:
         radius = (_RADIUS[0] - self._log_scale, _RADIUS[1])
         mean = np.array([*xy, radius[0], _INDEX[0], 0.0, 0.0])
         width = np.array([_OFFSET, _OFFSET, radius[1], _INDEX[1], _ELLIPTICITY, _ELLIPTICITY])
-        half = _HALF
-        inner = self._stamp(data, weight, mean, half)
-        start = mean.copy()
-        costs = []
-        for offset in _STARTS:
-            start[2] = mean[2] + offset
-            costs.append(_amplitude(inner.models(start, 0)[0], inner)[1])
-        start[2] = mean[2] + _STARTS[int(np.argmin(costs))]
-        extended = _minimum(inner, start, mean, width, 6)
-        if extended is None:
-            return None
-        reach = np.exp(extended[1][2] + 0.5 * np.hypot(*extended[1][4:]))
-        half = int(np.clip(np.ceil(_REACH * reach), _HALF, _MOST))
-        if half > _HALF:
+        if start is None:
+            half, parameters = _HALF, mean.copy()
             inner = self._stamp(data, weight, mean, half)
+            sizes = mean[2] + np.array(_STARTS)
+            costs = []
+            for parameters[2] in sizes:
+                costs.append(_amplitude(inner.models(parameters, 0)[0], inner)[1])
+            parameters[2] = sizes[int(np.argmin(costs))]
+        else:
+            half, parameters = _half_width(start.parameters), start.parameters
+            inner = self._stamp(data, weight, mean, half)
+        extended = _minimum(inner, parameters, mean, width, 6)
+        if extended is not None and start is None and _half_width(extended[1]) > half:
+            inner = self._stamp(data, weight, mean, _half_width(extended[1]))
             extended = _minimum(inner, extended[1], mean, width, 6)
         if extended is None or not extended[0] > 0:
             return None
@@ -139,6 +149,38 @@ class ShapeFitter:
         return _core.shape_models(
             self._transform(size), size, shape, parameters, derivatives=0
         )[0].astype(float)  # fmt: skip
+
+    def convolve(self, images, origin, shape):
+        """
+        Bring light that is integrated over pixels to the resolution of the image.
+
+        Parameters
+        ----------
+        images : `~numpy.ndarray`, shape (n, h, w)
+            Light before convolution.
+        origin : (int, int)
+            Row and column of its corner on the stamp; what is far from the stamp does not count.
+        shape : (int, int)
+            Shape of the stamp.
+
+        Returns
+        -------
+        images : `~numpy.ndarray`, shape (n, *shape)
+        """
+        size = _period(shape)
+        rims = [(size - n) // 2 for n in shape]
+        padded = np.zeros((len(images), size, size), np.float32)
+        to, of = [slice(None)], [slice(None)]
+        for rim, begin, n in zip(rims, origin, images.shape[1:], strict=True):
+            low, high = max(begin + rim, 0), min(begin + rim + n, size)
+            to.append(slice(low, high))
+            of.append(slice(low - begin - rim, high - begin - rim))
+        padded[tuple(to)] = images[tuple(of)]
+        # the samples of the PSF are integrated over pixels too
+        response = self._transform(size) / _core.box_response((size, size), np.eye(2))
+        spectra = scipy.fft.rfft2(padded) * response.astype(np.complex64)
+        found = scipy.fft.irfft2(spectra, s=(size, size), overwrite_x=True)
+        return found[:, rims[0] : rims[0] + shape[0], rims[1] : rims[1] + shape[1]]
 
     def _stamp(self, data, weight, mean, half):
         """The pixels within ``half`` of the middle."""
@@ -169,6 +211,12 @@ class _Stamp:
 
     def whitened(self, images):
         return images.reshape(len(images), -1)[:, self.use] * self.inverse
+
+
+def _half_width(parameters):
+    """Half-width of the stamp that a profile is fitted on."""
+    reach = np.exp(parameters[2] + 0.5 * np.hypot(*parameters[4:]))
+    return int(np.clip(np.ceil(_REACH * reach), _HALF, _MOST))
 
 
 def _period(shape):
