@@ -26,7 +26,7 @@ _AROUND, _LEAST, _MOST = 6, 16, 48
 
 #: Passes in which neighbours' light is taken off, chi^2 of that light from which a source is fitted
 #: again, and sources that are painted at a time.
-_PASSES, _CONTAMINATED, _AT_A_TIME = 2, 4.0, 512
+_PASSES, _CONTAMINATED, _AT_A_TIME = 4, 4.0, 512
 
 
 def cutouts(

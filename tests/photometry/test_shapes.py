@@ -5,7 +5,7 @@ import scipy.ndimage
 from numpy.testing import assert_allclose
 
 from miricigale.photometry import _core
-from miricigale.photometry.cutouts import cutouts
+from miricigale.photometry.light import cutouts
 from miricigale.photometry.shapes import ShapeFitter
 from miricigale.profiles import sersic_image
 
@@ -175,3 +175,64 @@ def test_wings_beyond_the_noise_are_those_of_the_profile():
         light.append(fit.flux)
         assert image[labels == 1].sum() < 0.85
     assert abs(np.median(light) - 1) < 0.05
+
+
+def seen(cutout, shape):
+    """The light of a template at the resolution of the image, by plain convolution."""
+    image = np.zeros(shape)
+    for layer in cutout.layers:
+        y, x = layer.origin
+        part = np.zeros(shape)
+        h, w = layer.data.shape
+        rows = slice(max(y, 0), min(y + h, shape[0]))
+        columns = slice(max(x, 0), min(x + w, shape[1]))
+        part[rows, columns] = layer.data[
+            rows.start - y : rows.stop - y, columns.start - x : columns.stop - x
+        ]
+        image += part if layer.convolved else scipy.ndimage.gaussian_filter(part, WIDTH)
+    return image
+
+
+def test_wings_of_a_bulge_and_a_disk_are_what_is_seen():
+    """The bulge makes one profile for all far too bright outside."""
+    shape, sigma = (161, 161), 2e-5
+    truth = 0.5 * galaxy(shape, 80, 80, r_eff=2.5, n=4.0)
+    truth += 0.5 * galaxy(shape, 80, 80, r_eff=9.0, n=0.6)
+    image = truth + np.random.default_rng(4).normal(0, sigma, shape)
+    # a segment that ends where there is much light still
+    labels = (truth > 25 * sigma).astype(int)
+    variance, xy = np.full(shape, sigma**2), np.array([[80.0, 80.0]])
+    (cutout,), _, _ = cutouts(
+        image, variance, labels, np.array([1]), xy, gaussian_psf(), scale=SCALE, min_snr=5.0, wings=True
+    )  # fmt: skip
+    assert cutout.kind == "cutout"
+    radius = np.hypot(*(np.indices(shape) - 80))
+    template = seen(cutout, shape)
+    inside = [radius < r for r in (10, 20, 30, 40)]
+    growth = [truth[one].sum() / template[one].sum() for one in inside]
+    assert_allclose(growth, growth[0], rtol=0.01)
+    # light beyond the image's noise
+    assert_allclose(growth, 1.0, rtol=0.03)
+
+
+def test_neighbors_do_not_add_to_each_others_wings():
+    shape, sigma = (121, 161), 1e-4
+    places, light = np.array([[62.0, 60.0], [98.0, 60.0]]), np.array([1.0, 3.0])
+    alone = [flux * galaxy(shape, x, y, r_eff=9.0, n=1.5, q=0.7)
+             for (x, y), flux in zip(places, light, strict=True)]  # fmt: skip
+    image = sum(alone) + np.random.default_rng(3).normal(0, sigma, shape)
+    bright = scipy.ndimage.gaussian_filter(image, 1.5) > sigma
+    labels = np.where(bright, 1 + np.argmax(alone, axis=0), 0)
+    variance = np.full(shape, sigma**2)
+    parts, flags, _ = cutouts(
+        image, variance, labels, np.array([1, 2]), places, gaussian_psf(), scale=SCALE,
+        min_snr=5.0, wings=True,
+    )  # fmt: skip
+    assert not flags.any()
+    # fluxes by least squares, each pixel the same
+    matrix = np.stack([seen(one, shape).ravel() for one in parts], axis=1)
+    flux, *_ = np.linalg.lstsq(matrix, image.ravel())
+    assert_allclose(flux, light, rtol=0.02)
+    # each template holds its own light where the other's is
+    for one, flux, template in zip(alone, light, matrix.T, strict=True):
+        assert_allclose(template.reshape(shape)[:, :81].sum(), one[:, :81].sum() / flux, atol=0.02)
