@@ -225,7 +225,7 @@ def test_neighbors_do_not_add_to_each_others_wings():
     labels = np.where(bright, 1 + np.argmax(alone, axis=0), 0)
     variance = np.full(shape, sigma**2)
     parts, flags, _ = cutouts(
-        image, variance, labels, np.array([1, 2]), places, gaussian_psf(), scale=SCALE,
+        image, variance, labels, np.array([1, 2]), places, gaussian_psf(121), scale=SCALE,
         min_snr=5.0, wings=True,
     )  # fmt: skip
     assert not flags.any()
