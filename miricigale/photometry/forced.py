@@ -15,9 +15,11 @@ from miricigale.photometry.arrays import (
     sky_pixels,
 )
 from miricigale.photometry.cutouts import own_segments, sersic_cutouts
+from miricigale.photometry.diagnostics import diagnose
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.light import cutouts
-from miricigale.photometry.template_fit import TemplateFit
+from miricigale.photometry.packaging import CatalogRows, package
+from miricigale.photometry.template_fit import FitSettings, TemplateFit
 from miricigale.photometry.templates import FineTemplates, TemplateBank
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import single_threaded, thread_count
@@ -203,21 +205,28 @@ class ForcedPhotometer:
             fine, parts, fine_xy, xy[near], poly, shape,
             radius=radius, max_bytes=self._max_bytes, executor=executor,
         )  # fmt: skip
-        fit = TemplateFit(
-            arrays,
-            bank,
-            near,
-            ids,
-            scale,
-            radius,
+        settings = FitSettings(
             kernel=self._kernel,
             template=self._template,
             fit_background=self._fit_background,
             max_shift=self._max_shift,
             correlated_noise=self._correlated_noise,
             min_coverage=self._min_coverage,
+            radius=np.inf if self._radius is None else self._radius.value,
         )
-        return fit.result(image, sky, xy, flags, kinds, snr, catalog)
+        rows = CatalogRows(
+            id=ids,
+            sky=sky,
+            xy=xy,
+            near=near,
+            flags=flags,
+            template=kinds,
+            template_snr=snr,
+            reference=catalog["flux"] if "flux" in catalog.colnames else None,
+        )
+        fit = TemplateFit(arrays, bank, settings)
+        filter_name = image.meta.get("filter", image.meta.get("FILTER"))
+        return package(fit, diagnose(fit), rows, filter_name)
 
     def _fine(self, image, highres, segmentation, arrays):
         """Coordinates, arrays and labels of the fine grid."""
