@@ -4,7 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.photometry.flags import POOR_CHI2, ForcedFlags, unexplained_neighbours
+from miricigale.photometry.flags import POOR_CHI2, ForcedFlags
+from miricigale.photometry.residual_sources import ResidualPeaks, residual_peaks
 
 __all__ = ["Diagnostics", "diagnose", "source_flags"]
 
@@ -21,9 +22,11 @@ class Diagnostics:
     correlation : `~numpy.ndarray` or None
         Of the noise; None where it is taken as white.
     chi2, residual_fraction : `~numpy.ndarray`, shape (n,)
-        Of each row of the bank; NaN where not fitted.
+        Of each row of the bank; NaN where not fitted, and for second components.
     poor : bool `~numpy.ndarray`, shape (n,)
         Whether chi2 is too large for noise.
+    peaks : `~miricigale.photometry.residual_sources.ResidualPeaks`
+        Light that no template explains.
     """
 
     model: np.ndarray
@@ -32,15 +35,19 @@ class Diagnostics:
     chi2: np.ndarray
     residual_fraction: np.ndarray
     poor: np.ndarray
+    peaks: ResidualPeaks
 
 
-def diagnose(fit):
+def diagnose(fit, xy):
     """
     Compare a fit with its image.
 
     Parameters
     ----------
     fit : `~miricigale.photometry.template_fit.TemplateFit`
+        The fit.
+    xy : `~numpy.ndarray`, shape (n, 2)
+        Positions of all known sources on the image, NaN for those far outside.
 
     Returns
     -------
@@ -53,19 +60,22 @@ def diagnose(fit):
         correlation = fit.correlation(residual, model)
     chi2, left, core = fit.statistics(residual).T
     with np.errstate(divide="ignore", invalid="ignore"):
-        left = left / (fit.flux * core)
+        left = left / (fit.total * core)
     out = np.ones(len(chi2), bool)
     out[fit.rows] = False
+    out |= ~fit.main
     chi2, left = np.where(out, np.nan, chi2), np.where(out, np.nan, left)
     # where the measured noise is above that of the uncertainty, it is the measure
     lag = 0 if correlation is None else correlation.shape[0] // 2
     variance = 1.0 if correlation is None else max(1.0, correlation[lag, lag])
-    return Diagnostics(model, residual, correlation, chi2, left, chi2 > POOR_CHI2 * variance)
+    peaks = residual_peaks(residual, model, fit.inverse_sigma, fit.psf_width, xy)
+    poor = chi2 > POOR_CHI2 * variance
+    return Diagnostics(model, residual, correlation, chi2, left, poor, peaks)
 
 
-def source_flags(fit, diagnostics, catalog, flux, blending):
+def source_flags(fit, diagnostics, place, flux, blending):
     """
-    Flags of all sources of a catalogue.
+    Flags that follow from the fit.
 
     Parameters
     ----------
@@ -73,12 +83,12 @@ def source_flags(fit, diagnostics, catalog, flux, blending):
         The fit.
     diagnostics : `Diagnostics`
         What `diagnose` says of it.
-    catalog : `~miricigale.photometry.packaging.CatalogRows`
-        The catalogue.
+    place : int `~numpy.ndarray`, shape (k,)
+        Which source each row of the bank belongs to.
     flux : `~numpy.ndarray`, shape (n,)
-        Fluxes of its sources, NaN where not measured.
+        Fluxes of all sources, NaN where not measured.
     blending : `~numpy.ndarray`, shape (k,)
-        Formal error over that of the source alone, of each row of the bank; NaN where not fitted.
+        Formal error over that of the source alone; NaN where not fitted.
 
     Returns
     -------
@@ -86,24 +96,18 @@ def source_flags(fit, diagnostics, catalog, flux, blending):
     coverage : `~numpy.ndarray`, shape (n,)
         Fraction of each template's light on usable pixels.
     """
-    n = len(flux)
-    flags = np.array(catalog.flags)
-    source = catalog.near[fit.bank.order]
-    inside, coverage = np.zeros(n), np.zeros(n)
-    inside[source] = fit.light[:, 0]
-    coverage[source] = np.clip(fit.light[:, 1], 0.0, 1.0)
+    flags, inside, coverage = np.zeros(len(flux), int), np.zeros(len(flux)), np.zeros(len(flux))
+    inside[place[fit.main]] = fit.light[fit.main, 0]
+    coverage[place[fit.main]] = np.clip(fit.light[fit.main, 1], 0.0, 1.0)
     for rows, flag in (
         (inside < 0.9, ForcedFlags.EDGE),
         (coverage < 0.9 * np.minimum(inside, 1.0), ForcedFlags.MASKED),
-        (source[fit.degenerate], ForcedFlags.DEGENERATE),
-        (source[fit.noisy], ForcedFlags.NOISY_SEGMENT),
-        (source[blending > 2], ForcedFlags.BLENDED),
-        (source[diagnostics.poor], ForcedFlags.POOR_FIT),
+        (place[fit.degenerate], ForcedFlags.DEGENERATE),
+        (place[fit.inseparable], ForcedFlags.ONE_COMPONENT),
+        (place[fit.noisy], ForcedFlags.NOISY_SEGMENT),
+        (place[blending > 2], ForcedFlags.BLENDED),
+        (place[diagnostics.poor], ForcedFlags.POOR_FIT),
     ):
         flags[rows] |= int(flag)
     flags[np.isnan(flux) & (flags & int(ForcedFlags.DEGENERATE) == 0)] |= int(ForcedFlags.NO_DATA)
-    near = unexplained_neighbours(
-        diagnostics.residual, diagnostics.model, fit.inverse_sigma, fit.psf_width, catalog.xy, flux
-    )
-    flags[near & np.isfinite(flux)] |= int(ForcedFlags.UNEXPLAINED_NEIGHBOUR)
     return flags, coverage

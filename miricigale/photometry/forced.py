@@ -15,11 +15,11 @@ from miricigale.photometry.arrays import (
     sky_pixels,
 )
 from miricigale.photometry.cutouts import own_segments, sersic_cutouts
-from miricigale.photometry.diagnostics import diagnose
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.light import cutouts
 from miricigale.photometry.packaging import CatalogRows, package
-from miricigale.photometry.template_fit import FitSettings, TemplateFit
+from miricigale.photometry.passes import fit_image
+from miricigale.photometry.template_fit import FitSettings
 from miricigale.photometry.templates import FineTemplates, TemplateBank
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import single_threaded, thread_count
@@ -53,16 +53,29 @@ class ForcedPhotometer:
         Whether cutouts are carried on beyond their well-measured core, by their mean on
         ellipses and then by the PSF; otherwise they are the segments as they are.
     fit_background : bool, optional
-        Whether a constant is fitted with the sources.
+        Whether a background is fitted with the sources.
+    background_order : int, optional
+        Order of the polynomial in position that the background is, 0 (a constant) to 4. Its terms are images
+        that are kept during the fit.
     max_shift : `~astropy.units.Quantity`, optional
         If given, a shift of the whole image is fitted too. A larger one than this is not
         believed: a warning says so and the image is measured without.
+    offset_order : int, optional
+        If given (0 to 3), a map of offsets takes the place of the one shift: a polynomial in position of
+        this order through the offsets of bright isolated sources that are below ``max_shift``. With too few
+        of them the order is lowered, or one shift fitted, and a warning says so.
     correlated_noise : bool, optional
         Whether the noise's autocorrelation is measured on source-free pixels and goes into
         the errors; otherwise the image's uncertainty is taken as white noise.
     integrate : bool, optional
         Whether templates are averaged over the image's pixels, for a kernel whose target
         does not include the response of the pixel.
+    components : {1, 2}, optional
+        With 2, sources whose fit is poor (``POOR_FIT``) are fitted once more as their template and a point
+        on top of it. Column ``components`` of the catalogue (1 or 2) says which those are instead.
+    second_pass : bool, optional
+        Whether peaks of the residual that the catalogue lacks are fitted together with it, as
+        points; they are listed in ``new_sources`` of the result.
     radius : `~astropy.units.Quantity`, optional
         Half-width to which templates are cut; as far as the kernel reaches by default.
     min_coverage : float, optional
@@ -101,9 +114,13 @@ class ForcedPhotometer:
         min_snr=5.0,
         wings=True,
         fit_background=False,
+        background_order=0,
         max_shift=None,
+        offset_order=None,
         correlated_noise=True,
         integrate=False,
+        components=1,
+        second_pass=False,
         radius=None,
         min_coverage=0.05,
         max_bytes=1.5e9,
@@ -114,6 +131,15 @@ class ForcedPhotometer:
         for name in ("source", "target"):
             if getattr(kernel, name, None) is None:
                 raise argument_error("kernel", f"a MatchingKernel with its {name}", "one without")
+        _check_order("background_order", background_order, 4)
+        if background_order and not fit_background:
+            raise argument_error("background_order", "0 without 'fit_background'", background_order)
+        if offset_order is not None:
+            _check_order("offset_order", offset_order, 3)
+            if max_shift is None:
+                raise argument_error("max_shift", "given with 'offset_order'", "None")
+        if components not in (1, 2):
+            raise argument_error("components", "1 or 2", repr(components))
         if not min_snr >= 0:
             raise argument_error("min_snr", "at least 0", min_snr)
         if not 0 < min_coverage < 1:
@@ -127,8 +153,12 @@ class ForcedPhotometer:
         self._wings = bool(wings)
         self._fit_background = bool(fit_background)
         self._max_shift = None if max_shift is None else u.Quantity(max_shift, ANGLE)
+        self._background_order = int(background_order)
+        self._offset_order = None if offset_order is None else int(offset_order)
         self._correlated_noise = bool(correlated_noise)
         self._integrate = bool(integrate)
+        self._components = int(components)
+        self._second_pass = bool(second_pass)
         self._radius = None if radius is None else u.Quantity(radius, ANGLE)
         self._min_coverage = float(min_coverage)
         self._max_bytes = float(max_bytes)
@@ -159,7 +189,7 @@ class ForcedPhotometer:
         catalog : `~astropy.table.QTable`
             Column ``sky``, and if there are ``id`` (1, 2, ... otherwise), ``label`` (the
             segment; by default that at the position), ``flux`` (for the ``crowded``
-            flag; the measured fluxes otherwise) and, for Sersic templates, those of the scene's
+            flag; the measured fluxes otherwise), ``components`` and, for Sersic templates, those of the scene's
             catalogues.
 
         Returns
@@ -209,10 +239,14 @@ class ForcedPhotometer:
             kernel=self._kernel,
             template=self._template,
             fit_background=self._fit_background,
+            background_order=self._background_order,
             max_shift=self._max_shift,
+            offset_order=self._offset_order,
             correlated_noise=self._correlated_noise,
             min_coverage=self._min_coverage,
             radius=np.inf if self._radius is None else self._radius.value,
+            components=self._components,
+            second_pass=self._second_pass,
         )
         rows = CatalogRows(
             id=ids,
@@ -223,10 +257,11 @@ class ForcedPhotometer:
             template=kinds,
             template_snr=snr,
             reference=catalog["flux"] if "flux" in catalog.colnames else None,
+            double=_double(catalog),
         )
-        fit = TemplateFit(arrays, bank, settings)
         filter_name = image.meta.get("filter", image.meta.get("FILTER"))
-        return package(fit, diagnose(fit), rows, filter_name)
+        fit, diagnostics, new_xy = fit_image(arrays, bank, settings, rows, grid_wcs)
+        return package(fit, diagnostics, rows, new_xy, filter_name)
 
     def _fine(self, image, highres, segmentation, arrays):
         """Coordinates, arrays and labels of the fine grid."""
@@ -298,6 +333,22 @@ def _sources(catalog):
         ids = unique_ids(catalog["id"], "catalog")
     labels = np.asarray(catalog["label"]) if "label" in catalog.colnames else None
     return ids, sky, labels
+
+
+def _check_order(name, order, largest):
+    if isinstance(order, bool) or not hasattr(order, "__index__") or not 0 <= order <= largest:
+        raise argument_error(name, f"an integer from 0 to {largest}", repr(order))
+
+
+def _double(catalog):
+    """Which sources have two components, or None without such a column."""
+    if "components" not in catalog.colnames:
+        return None
+    number = np.asarray(catalog["components"])
+    if number.dtype.kind not in "iu" or not np.isin(number, (1, 2)).all():
+        found = np.unique(number)[:5].tolist()
+        raise argument_error("catalog", "a column 'components' of 1 and 2", f"{found}")
+    return number == 2
 
 
 def _sersic_rows(catalog):

@@ -1,13 +1,18 @@
 """From a fit in the order of its templates to the result in the order of the catalogue."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import scipy.sparse
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
+from astropy.table import QTable
 
 from miricigale.photometry.diagnostics import source_flags
+from miricigale.photometry.fields import SmoothField, n_terms
+from miricigale.photometry.flags import ForcedFlags
+from miricigale.photometry.residual_sources import unexplained_neighbours
 from miricigale.photometry.results import ForcedPhotometryResult, crowded
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS
@@ -30,6 +35,8 @@ class CatalogRows:
         The sources that have a template, in the order of the bank's sources.
     reference : `~numpy.ndarray` or None
         Fluxes that say who is crowded; None for those that are measured.
+    double : bool `~numpy.ndarray` or None
+        Which sources have two components; None where their fits decide.
     """
 
     id: np.ndarray
@@ -40,9 +47,10 @@ class CatalogRows:
     template: np.ndarray
     template_snr: np.ndarray
     reference: np.ndarray | None = None
+    double: np.ndarray | None = None
 
 
-def package(fit, diagnostics, catalog, filter_name=None):
+def package(fit, diagnostics, catalog, new_xy, filter_name=None):
     """
     Make the result of a fit.
 
@@ -54,6 +62,8 @@ def package(fit, diagnostics, catalog, filter_name=None):
         What was made of its residual.
     catalog : `CatalogRows`
         The catalogue.
+    new_xy : `~numpy.ndarray`, shape (m, 2)
+        Positions of the sources that were added to it.
     filter_name : str, optional
         The image's filter.
 
@@ -62,35 +72,43 @@ def package(fit, diagnostics, catalog, filter_name=None):
     result : `~miricigale.photometry.ForcedPhotometryResult`
     """
     n, n_columns = len(catalog.sky), len(fit.columns)
-    source = catalog.near[fit.bank.order]
-    covariance = scipy.sparse.csr_array((n, n))
+    n_all = n + len(new_xy)
+    # sources that were added have the last numbers, after second components
+    owner = np.full(len(fit.host), -1)
+    owner[: len(catalog.near)] = catalog.near
+    owner[len(owner) - len(new_xy) :] = np.arange(n, n_all)
+    place, main = owner[fit.host[fit.bank.order]], fit.main
     common = np.full((n_columns, n_columns), np.nan)
-    flux, flux_err = np.full(n, np.nan), np.full(n, np.nan)
-    blending = np.full(len(source), np.nan)
+    blending = np.full(len(place), np.nan)
+    flux, flux_err = np.full(n_all, np.nan), np.full(n_all, np.nan)
+    chi2, left = np.full(n_all, np.nan), np.full(n_all, np.nan)
+    joint = scipy.sparse.csr_array((2 * n_all, 2 * n_all))
     if len(fit.rows):
         found, common, blending[fit.rows] = fit.covariance(diagnostics.correlation)
-        member = source[fit.rows]
-        flux[member] = fit.flux[fit.rows]
-        flux_err[member] = np.sqrt(found.diagonal())
-        coo = found.tocoo()
-        covariance = scipy.sparse.coo_array(
-            (coo.data, (member[coo.row], member[coo.col])), shape=(n, n)
-        ).tocsr()
-    flags, coverage = source_flags(fit, diagnostics, catalog, flux, blending)
-    chi2, left = np.full(n, np.nan), np.full(n, np.nan)
-    chi2[source], left[source] = diagnostics.chi2, diagnostics.residual_fraction
-    reference = np.nan_to_num(flux) if catalog.reference is None else catalog.reference
+        joint = _by_source(found, place[fit.rows], main[fit.rows], n_all)
+        measured = fit.rows[main[fit.rows]]
+        flux[place[measured]] = fit.total[measured]
+        flux_err[place[measured]] = np.sqrt(joint.diagonal()[place[measured]])
+    flags, coverage = source_flags(fit, diagnostics, place, flux, blending)
+    flags[:n] |= catalog.flags
+    flags[n:] |= int(ForcedFlags.NOT_IN_CATALOG)
+    xy = np.concatenate([catalog.xy, new_xy])
+    near = unexplained_neighbours(diagnostics.peaks, xy, flux)
+    flags[near & np.isfinite(flux)] |= int(ForcedFlags.UNEXPLAINED_NEIGHBOUR)
+    chi2[place[main]] = diagnostics.chi2[main]
+    left[place[main]] = diagnostics.residual_fraction[main]
+    reference = np.nan_to_num(flux[:n]) if catalog.reference is None else catalog.reference
     meta = {} if filter_name is None else {"filter": str(filter_name)}
-    return ForcedPhotometryResult(
+    result = ForcedPhotometryResult(
         id=np.array(catalog.id),
         sky=catalog.sky,
-        flux=flux * FNU,
-        flux_err=flux_err * FNU,
-        covariance=covariance,
-        flags=flags,
-        coverage=coverage,
-        chi2=chi2,
-        residual_fraction=left,
+        flux=flux[:n] * FNU,
+        flux_err=flux_err[:n] * FNU,
+        covariance=joint[:n, :n],
+        flags=flags[:n],
+        coverage=coverage[:n],
+        chi2=chi2[:n],
+        residual_fraction=left[:n],
         template=catalog.template,
         template_snr=catalog.template_snr,
         crowded=crowded(catalog.sky, reference),
@@ -104,20 +122,78 @@ def package(fit, diagnostics, catalog, filter_name=None):
             correlated_noise=diagnostics.correlation is not None,
             measured_noise=fit.arrays.measured_noise,
         ),
+        **_components(fit, catalog, joint, place, n_all),
         **_common(fit, common),
         **_images(fit, diagnostics, meta),
     )
+    if not fit.settings.second_pass:
+        return result
+    more = {"flux": flux, "flux_err": flux_err, "flags": flags, "coverage": coverage, "chi2": chi2}
+    new = _new_sources(catalog, new_xy, fit.arrays.wcs, {k: v[n:] for k, v in more.items()})
+    return dataclasses.replace(result, new_sources=new)
+
+
+def _by_source(covariance, place, main, n):
+    """Covariance of sources' total fluxes, and after them of their second components, (2 n, 2 n)."""
+    k = np.arange(len(place))
+    rows = np.concatenate([place, n + place[~main]])
+    gather = scipy.sparse.coo_array(
+        (np.ones(len(rows)), (rows, np.concatenate([k, k[~main]]))), shape=(2 * n, len(k))
+    ).tocsr()
+    found = (gather @ covariance @ gather.T).tocsr()
+    found.sort_indices()
+    return found
+
+
+def _components(fit, catalog, joint, place, n_all):
+    """Fluxes of points on top of templates, if any were asked for."""
+    if catalog.double is None and fit.settings.components == 1:
+        return {}
+    n = len(catalog.sky)
+    flux, error = np.full(n, np.nan), np.full(n, np.nan)
+    second = fit.pairs[:, 1]
+    flux[place[second]] = fit.flux[second]
+    error[place[second]] = np.sqrt(joint.diagonal()[n_all + place[second]])
+    keep = np.concatenate([np.arange(n), n_all + np.arange(n)])
+    return {
+        "flux_point": flux * FNU,
+        "flux_point_err": error * FNU,
+        "joint_covariance": joint[keep][:, keep],
+    }
+
+
+def _new_sources(catalog, xy, wcs, columns):
+    n = len(xy)
+    ids = np.asarray(catalog.id)
+    if ids.dtype.kind in "iu":
+        new = int(ids.max(initial=0)) + 1 + np.arange(n)
+    else:
+        known = set(ids.tolist())
+        names = (f"new-{k}" for k in itertools.count(1))
+        new = list(itertools.islice((name for name in names if name not in known), n))
+    table = QTable({"id": np.array(new) if n else ids[:0]})
+    table["sky"] = wcs.pixel_to_world(*xy.T).transform_to(catalog.sky.frame)
+    table["x"], table["y"] = xy.T
+    for name, values in columns.items():
+        table[name] = values * FNU if name.startswith("flux") else values
+    table["snr"] = (table["flux"] / table["flux_err"]).value
+    return table
 
 
 def _common(fit, covariance):
     """Parameters of the whole image with their errors."""
     found, errors = {}, np.sqrt(np.diag(covariance)) if len(covariance) else np.empty(0)
     if fit.settings.fit_background and fit.fit is not None:
-        found["background"] = fit.level * SURFACE_BRIGHTNESS
+        order, shape = fit.settings.background_order, fit.arrays.flux.shape
+        terms = fit.fit.common[: n_terms(order)]
+        found["background"] = terms[0] * SURFACE_BRIGHTNESS
         found["background_err"] = errors[0] * SURFACE_BRIGHTNESS
+        found["background_field"] = SmoothField(terms, shape, order)
     if fit.shift is not None:
         found["shift"] = fit.shift * ANGLE
         found["shift_err"] = errors[-2:] * fit.scale * ANGLE
+    if fit.offset_map is not None:
+        found["offset_map"] = fit.offset_map
     return found
 
 
@@ -128,7 +204,7 @@ def _images(fit, diagnostics, meta):
     options = {"unit": SURFACE_BRIGHTNESS, "wcs": arrays.wcs}
     return {
         "model_image": CCDData(
-            diagnostics.model / arrays.area + fit.level, meta=dict(meta), **options
+            (diagnostics.model + fit.background) / arrays.area, meta=dict(meta), **options
         ),
         "residual_image": CCDData(
             residual, mask=~arrays.usable, uncertainty=StdDevUncertainty(sigma), meta=dict(meta),

@@ -10,7 +10,9 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.table import QTable
 
+from miricigale.photometry.fields import SmoothField
 from miricigale.photometry.flags import ForcedFlags
+from miricigale.photometry.offsets import OffsetMap
 from miricigale.utils.tables import error_column
 
 __all__ = ["ForcedPhotometryResult", "crowded"]
@@ -89,9 +91,21 @@ class ForcedPhotometryResult:
         Measured covariance of the noise in units of sigma^2 by separation; None where
         the noise was taken as white.
     background, background_err : `~astropy.units.Quantity` or None
-        Constant that was fitted, MJy/sr.
+        Constant that was fitted, or the mean over the image of a background that varies, MJy/sr.
+    background_field : `~miricigale.photometry.fields.SmoothField` or None
+        The background in MJy/sr as a function of the pixel, ``background_field(x, y)``.
     shift, shift_err : `~astropy.units.Quantity`, shape (2,), or None
         Shift (x, y) of the image against the catalogue, in arcsec along its axes.
+    offset_map : `~miricigale.photometry.offsets.OffsetMap` or None
+        Such shifts as a smooth function of the position, with the sources they were measured on.
+    flux_point, flux_point_err : `~astropy.units.Quantity`, shape (n,), or None
+        The part of ``flux`` that is a point on top of the template; NaN for sources of one component,
+        None where no second components were asked for.
+    joint_covariance : `~scipy.sparse.csr_array`, shape (2 n, 2 n), or None
+        In uJy^2: of all ``flux``, then of all ``flux_point``.
+    new_sources : `~astropy.table.QTable` or None
+        What the catalogue lacks, fitted with it: ``id`` (none of the catalogue's), ``sky``, ``x``, ``y``,
+        ``flux``, ``flux_err``, ``snr``, ``flags``, ``coverage`` and ``chi2``. None without a second pass.
     meta : dict
         Settings and provenance.
     """
@@ -115,8 +129,14 @@ class ForcedPhotometryResult:
     noise_correlation: np.ndarray | None = None
     background: u.Quantity | None = None
     background_err: u.Quantity | None = None
+    background_field: SmoothField | None = None
     shift: u.Quantity | None = None
     shift_err: u.Quantity | None = None
+    offset_map: OffsetMap | None = None
+    flux_point: u.Quantity | None = None
+    flux_point_err: u.Quantity | None = None
+    joint_covariance: scipy.sparse.csr_array | None = None
+    new_sources: QTable | None = None
     meta: dict = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
@@ -175,6 +195,10 @@ class ForcedPhotometryResult:
                 "Signal-to-noise of the segment of the high-resolution image",
             ),
         }
+        if self.flux_point is not None:
+            point = "flux_point" if name is None else f"{name}_point"
+            columns[point] = self.flux_point, "Flux of the point on top of the template"
+            columns[error_column(point)] = self.flux_point_err, "1-sigma error of the point's flux"
         table = QTable({"id": self.id, "sky": self.sky}, meta=dict(self.meta), copy=True)
         table["id"].info.description = "Id of the catalogue"
         table["sky"].info.description = "Position of the catalogue"

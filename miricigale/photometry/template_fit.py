@@ -16,6 +16,7 @@ from miricigale.photometry.errors import (
     normal_matrix,
     sandwich_matrix,
 )
+from miricigale.photometry.fields import legendre_terms
 from miricigale.utils.exceptions import MiricigaleWarning
 from miricigale.utils.units import ANGLE
 
@@ -23,6 +24,10 @@ __all__ = ["FitSettings", "TemplateFit"]
 
 #: Size of the covariance's blocks and of the margin around them.
 _CORE, _HALO = 18.0 * u.arcsec, 6.0 * u.arcsec
+
+#: Squared cosine between two components from which their sum alone is measured: errors of each are then
+#: ten times that of the sum, and a template that is a few percent wrong says all of the difference.
+_SEPARABLE = 0.99
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -40,21 +45,33 @@ class FitSettings:
         Whether a constant is fitted.
     max_shift : `~astropy.units.Quantity` or None
         Largest shift of the image; None for none.
+    offset_order : int or None
+        Order of a map of offsets; None for one shift.
+    background_order : int
+        Order of the background, 0 for a constant.
     correlated_noise : bool
         Whether errors are those of the measured correlation of the noise.
     min_coverage : float
         Least fraction of a template's light on usable pixels.
     radius : float
         Half-width in arcsec to which templates are cut, or infinity.
+    components : int
+        1, or 2 for a point on top of the templates of poor fits.
+    second_pass : bool
+        Whether peaks of the residual are fitted with the sources.
     """
 
     kernel: object
     template: str = "auto"
     fit_background: bool = False
     max_shift: u.Quantity | None = None
+    offset_order: int | None = None
+    background_order: int = 0
     correlated_noise: bool = True
     min_coverage: float = 0.05
     radius: float = np.inf
+    components: int = 1
+    second_pass: bool = False
 
 
 class TemplateFit:
@@ -69,6 +86,11 @@ class TemplateFit:
         The templates of the sources on or near it.
     settings : `FitSettings`
         How they are fitted.
+    host : int `~numpy.ndarray`, shape (n,), optional
+        For each source of the bank the one whose component it is: a second component has the
+        number of the source on which it stands, all others have their own.
+    moved : `~numpy.ndarray`, shape (2,) or (n, 2), optional
+        Pixels by which templates are moved; a shift that is fitted is searched from there.
 
     Attributes
     ----------
@@ -82,6 +104,10 @@ class TemplateFit:
         Rows that were fitted.
     degenerate, noisy : bool `~numpy.ndarray`, shape (n,)
         Templates that equal another's; those whose power is mostly noise.
+    inseparable : bool `~numpy.ndarray`, shape (n,)
+        Second components that cannot be told from the first.
+    pairs : int `~numpy.ndarray`, shape (k, 2)
+        Rows of the two components of the sources that have two.
     light : `~numpy.ndarray`, shape (n, 2)
         Fractions of the templates on the image, and on its usable pixels.
     columns : list of `~numpy.ndarray`
@@ -90,19 +116,33 @@ class TemplateFit:
         The solution; None without rows.
     shift : `~numpy.ndarray`, shape (2,), or None
         In arcsec.
+    offset_map : `~miricigale.photometry.offsets.OffsetMap` or None
+        The map by which templates are moved.
     """
 
-    def __init__(self, arrays, bank, settings):
+    def __init__(self, arrays, bank, settings, *, host=None, moved=None):
         self.arrays, self.settings = arrays, settings
+        self.host = np.arange(len(bank.order)) if host is None else host
         self.scale = pixel_scale(arrays.wcs)
         self.inverse_sigma = arrays.inverse_sigma
         self._radius = settings.radius / self.scale
         self._data = arrays.flux * self.inverse_sigma
-        self._background = [arrays.area] if settings.fit_background else []
-        self.shift = None
-        self._solve(bank, [])
-        if settings.max_shift is not None and len(self.rows):
-            self._find_shift()
+        self._background = self._background_columns() if settings.fit_background else []
+        self.shift = self.offset_map = None
+        moved = np.zeros(2) if moved is None else moved
+        self._solve(self._moved(bank, moved) if np.any(moved) else bank, [])
+        if settings.max_shift is not None and settings.offset_order is None and len(self.rows):
+            self._find_shift(bank, moved)
+
+    def _background_columns(self):
+        area, order = self.arrays.area, self.settings.background_order
+        if order == 0:
+            return [area]
+        y, x = np.ogrid[: area.shape[0], : area.shape[1]]
+        return [area * term for term in legendre_terms(x, y, area.shape, order)]
+
+    def _moved(self, bank, pixels):
+        return bank.shifted(pixels, self.arrays.flux.shape, self._radius)
 
     def _solve(self, bank, gradients):
         """Fit fluxes and common parameters with the templates of a bank."""
@@ -114,13 +154,15 @@ class TemplateFit:
         self.light = light / self._full_light()
         diagonal = matrix.diagonal()
         rows = (self.light[:, 1] >= self.settings.min_coverage) & (diagonal > 0)
-        self.degenerate = _duplicates(matrix, rows, bank.order)
-        self.rows = np.flatnonzero(rows & ~self.degenerate)
         with np.errstate(divide="ignore", invalid="ignore"):
             excess = bank.noise_terms() / np.where(power > 0, power, np.inf)
         self.noisy = excess > 0.5
         correction = scipy.sparse.diags_array(np.minimum(excess, 0.5) * diagonal)
-        matrix = (matrix - correction).tocsr()[self.rows][:, self.rows]
+        self.degenerate = _duplicates(matrix, rows, bank.order)
+        matrix = (matrix - correction).tocsr()
+        self._find_pairs(matrix, rows & ~self.degenerate)
+        self.rows = np.flatnonzero(rows & ~self.degenerate & ~self.inseparable)
+        matrix = matrix[self.rows][:, self.rows]
         corner = np.array([[np.sum(a * b) for b in white] for a in white])
         self.fit = None
         if len(self.rows):
@@ -136,6 +178,21 @@ class TemplateFit:
         if self.fit is not None:
             self.flux[self.rows] = self.fit.flux
 
+    def _find_pairs(self, matrix, rows):
+        """Tell which second components can be fitted beside the first."""
+        order = self.bank.order
+        row = np.argsort(order)
+        second = np.flatnonzero(self.host[order] != order)
+        first = row[self.host[order[second]]]
+        power = matrix.diagonal()
+        overlap = np.array([matrix[i, j] for i, j in zip(first, second, strict=True)])
+        apart = overlap**2 < _SEPARABLE * power[first] * power[second]
+        apart &= rows[first] & rows[second]
+        self.inseparable = np.zeros(len(order), bool)
+        self.inseparable[second[~apart]] = True
+        self.degenerate[second] = False
+        self.pairs = np.stack([first, second], axis=1)[apart]
+
     def _full_light(self):
         """Light of a whole template, within the radius to which they are cut."""
         target = self.settings.kernel.target
@@ -146,13 +203,11 @@ class TemplateFit:
         middle = target.shape[0] // 2
         return target[middle - half : middle + half + 1, middle - half : middle + half + 1].sum()
 
-    def _find_shift(self):
-        plain, shift = self.bank, np.zeros(2)
+    def _find_shift(self, plain, shift):
         limit = self.settings.max_shift.value / self.scale
-        shape = self.arrays.flux.shape
         for _ in range(8):
             dy, dx = np.gradient(self.model())
-            self._solve(plain.shifted(shift, shape, self._radius), [-dx, -dy])
+            self._solve(self._moved(plain, shift), [-dx, -dy])
             # the columns are steps from where the templates stand now
             step = self.fit.common[-2:]
             found = shift + step
@@ -161,13 +216,33 @@ class TemplateFit:
                     f"a shift of {np.round(found * self.scale, 3)} arcsec is beyond 'max_shift' "
                     f"{self.settings.max_shift}: measured without a shift"
                 )
-                warnings.warn(msg, MiricigaleWarning, stacklevel=5)
+                warnings.warn(msg, MiricigaleWarning, stacklevel=6)
                 self._solve(plain, [])
                 return
             if np.hypot(*step) < 1e-3:
                 break
             shift = shift + np.clip(step, -1.0, 1.0)
         self.shift = found * self.scale
+
+    def displacement(self, xy):
+        """Where templates stand less where the catalogue has them, (x, y) in pixels, at positions."""
+        if self.offset_map is not None:
+            return self.offset_map.field(*xy.T) / self.scale
+        shift = np.zeros(2) if self.shift is None else self.shift / self.scale
+        return np.broadcast_to(shift, xy.shape)
+
+    @property
+    def main(self):
+        """Which rows are no second components, shape (n,)."""
+        return self.host[self.bank.order] == self.bank.order
+
+    @property
+    def total(self):
+        """Flux of each row, that of both components where there are two."""
+        total = self.flux.copy()
+        first, second = self.pairs.T
+        total[first] += self.flux[second]
+        return total
 
     @property
     def psf_width(self):
@@ -177,9 +252,13 @@ class TemplateFit:
         return np.sqrt(target.sum() / (2 * np.pi * target.max())) * fine / self.scale
 
     @property
-    def level(self):
-        """The fitted background in MJy/sr, zero without."""
-        return self.fit.common[0] if self._background and self.fit is not None else 0.0
+    def background(self):
+        """The fitted background in uJy per pixel, shape (ny, nx); zero without."""
+        level = np.zeros(self.arrays.flux.shape)
+        if self.fit is not None:
+            for column, value in zip(self._background, self.fit.common, strict=False):
+                level += value * column
+        return level
 
     def model(self):
         """The sources' model in uJy per pixel, without background."""
@@ -192,7 +271,7 @@ class TemplateFit:
     def residual(self, model):
         """Image less a model of its sources and less the background, zero where not usable."""
         arrays = self.arrays
-        return arrays.flux - np.where(arrays.usable, model + self.level * arrays.area, 0.0)
+        return arrays.flux - np.where(arrays.usable, model + self.background, 0.0)
 
     def correlation(self, residual, model):
         """Measured correlation of the noise, or None where there is too little sky."""
@@ -220,12 +299,23 @@ class TemplateFit:
         covariance, common, blending
             See `~miricigale.photometry.errors.LinearFit.covariance`.
         """
-        return self.fit.covariance(
+        noise = None if correlation is None else self._sandwich(correlation)
+        found, common, blending = self.fit.covariance(
             self.bank.xy[self.rows],
             core=_CORE.value / self.scale,
             halo=_HALO.value / self.scale,
-            noise=None if correlation is None else self._sandwich(correlation),
+            noise=noise,
         )
+        if len(self.pairs):
+            # that of the sum of two components
+            first, second = np.searchsorted(self.rows, self.pairs.T)
+            filling = self.fit.matrix if noise is None else noise[0]
+            alone = np.sqrt(filling.diagonal()) / self.fit.matrix.diagonal()
+            both = np.array([found[i, j] for i, j in zip(first, second, strict=True)])
+            variance = found.diagonal()
+            blending[first] = np.sqrt(variance[first] + variance[second] + 2 * both) / alone[first]
+            blending[second] = blending[first]
+        return found, common, blending
 
     def _sandwich(self, correlation):
         keep = self.rows

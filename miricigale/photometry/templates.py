@@ -243,6 +243,20 @@ class TemplateBank:
             executor=self._executor,
         )
 
+    def with_points(self, xy, poly, shape, radius):
+        """Make the bank of the same sources and, after them, of point sources at positions."""
+        return TemplateBank(
+            self._fine,
+            [*self._cutout, *[None] * len(xy)],
+            np.concatenate([self._fine_xy, poly[:, :, 0]]),
+            np.concatenate([self._xy, xy]),
+            np.concatenate([self._poly, poly]),
+            shape,
+            radius=radius,
+            max_bytes=self._max_bytes,
+            executor=self._executor,
+        )
+
     def map(self, function, parts):
         """Call a function with each of some independent pieces of work, on the bank's threads."""
         parallel_map(function, parts, executor=self._executor)

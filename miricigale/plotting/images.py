@@ -10,6 +10,7 @@ __all__ = [
     "plot_color",
     "plot_image",
     "plot_model_residual",
+    "plot_offsets",
     "plot_segmentation",
 ]
 
@@ -189,6 +190,51 @@ def plot_model_residual(
     )
     for axes in ax[1:]:
         axes.set_ylabel("")
+    return ax
+
+
+def plot_offsets(xy, offset, field, *, used=None, ax=None, title=None, colors=("#c2410c", "0.7")):
+    """
+    Draw offsets of sources over those of a smooth map, as arrows on a grid of pixels.
+
+    Parameters
+    ----------
+    xy : array_like, shape (n, 2)
+        Positions in pixels.
+    offset : array_like, shape (n, 2)
+        Measured offsets in arcsec.
+    field : callable
+        The map: takes x and y, returns offsets of shape (..., 2); its ``shape`` is the image's.
+    used : bool array_like, shape (n,), optional
+        Sources that count; others are drawn as crosses.
+    ax : `~matplotlib.axes.Axes`, optional
+        Axes to draw on.
+    title : str, optional
+        Title.
+    colors : (str, str), optional
+        Of the sources and of the map.
+
+    Returns
+    -------
+    ax : `~matplotlib.axes.Axes`
+    """
+    ax = resolve_axes(ax)
+    xy, offset = np.asarray(xy, float).reshape(-1, 2), np.asarray(offset, float).reshape(-1, 2)
+    used = np.ones(len(xy), bool) if used is None else np.asarray(used, bool)
+    ny, nx = field.shape
+    step = max(nx, ny) / 12
+    x, y = np.meshgrid(np.arange(step / 2, nx, step), np.arange(step / 2, ny, step))
+    smooth = field(x, y)
+    sizes = np.hypot(*np.concatenate([offset[used], smooth.reshape(-1, 2)]).T)
+    unit = np.median(sizes) or 1.0
+    # arrows of the typical offset are as long as the map's grid is wide
+    options = {"angles": "xy", "scale_units": "xy", "scale": unit / step, "width": 0.004}
+    ax.quiver(x, y, *np.moveaxis(smooth, -1, 0), color=colors[1], **options)
+    arrows = ax.quiver(*xy[used].T, *offset[used].T, color=colors[0], **options)
+    ax.plot(*xy[~used].T, "x", color=colors[0], ms=4)
+    ax.quiverkey(arrows, 0.9, 1.03, unit, f"{1e3 * unit:.0f} mas", labelpos="W")
+    ax.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), aspect="equal")
+    ax.set(xlabel="x (pixels)", ylabel="y (pixels)", title=title)
     return ax
 
 

@@ -1,0 +1,64 @@
+"""Smooth functions of the position on an image."""
+
+import dataclasses
+
+import numpy as np
+from numpy.polynomial import legendre
+
+__all__ = ["SmoothField", "legendre_terms", "n_terms"]
+
+
+def n_terms(order):
+    """Number of terms of a polynomial of two variables."""
+    return (order + 1) * (order + 2) // 2
+
+
+def legendre_terms(x, y, shape, order):
+    """
+    Products of Legendre polynomials up to a total order, of size 1 at most on an image.
+
+    Parameters
+    ----------
+    x, y : array_like
+        Positions in pixels, of shapes that broadcast.
+    shape : (int, int)
+        Shape (ny, nx) of the image, whose edges are at -1 and 1.
+    order : int
+        Largest sum of the two orders.
+
+    Returns
+    -------
+    terms : list of `~numpy.ndarray`
+        ``(order + 1) (order + 2) / 2`` of the shape of ``x * y``, the constant first.
+    """
+    u, v = (
+        2.0 * np.asarray(a, float) / n - (n - 1) / n
+        for a, n in zip((x, y), shape[::-1], strict=True)
+    )
+    px, py = (legendre.legvander(a.ravel(), order).reshape(*a.shape, -1) for a in (u, v))
+    return [px[..., total - k] * py[..., k] for total in range(order + 1) for k in range(total + 1)]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SmoothField:
+    """
+    A polynomial of the position on an image.
+
+    Attributes
+    ----------
+    coefficients : `~numpy.ndarray`, shape (k,) or (k, m)
+        Of the terms of `legendre_terms`.
+    shape : (int, int)
+        The image's.
+    order : int
+        Of the polynomial.
+    """
+
+    coefficients: np.ndarray
+    shape: tuple
+    order: int
+
+    def __call__(self, x, y):
+        """Value at positions in pixels, shape (..., m) or that of the positions."""
+        terms = np.stack(legendre_terms(x, y, self.shape, self.order), axis=-1)
+        return terms @ self.coefficients

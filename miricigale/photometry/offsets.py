@@ -1,0 +1,255 @@
+"""Offsets of an image against a catalogue: source by source, and as a smooth map."""
+
+import dataclasses
+import warnings
+
+import numpy as np
+import scipy.optimize
+from astropy.table import QTable
+
+from miricigale.photometry.fields import SmoothField, legendre_terms, n_terms
+from miricigale.photometry.flags import ForcedFlags
+from miricigale.photometry.template_fit import TemplateFit
+from miricigale.utils.exceptions import MiricigaleWarning
+from miricigale.utils.units import ANGLE
+
+__all__ = ["OffsetMap", "fit_offsets", "source_offsets"]
+
+#: Least signal-to-noise of sources whose offsets are measured, largest light of others relative to
+#: their own, both below their template, and least number of sources for each term of the map.
+_BRIGHT, _ISOLATED, _SOURCES = 20.0, 0.2, 3
+
+#: Error (pixels) that no measured offset is believed to be below, distance from the map in errors beyond
+#: which a source does not count, and change of the map (pixels) at which it is done.
+_FLOOR, _CLIP, _DONE = 0.01, 4.0, 5e-3
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class OffsetMap:
+    """
+    Where an image shows sources, less where the catalogue has them.
+
+    Attributes
+    ----------
+    sources : `~astropy.table.QTable`
+        The sources it was measured on: ``id``, ``sky``, ``x``, ``y`` (pixels), ``dx``, ``dy`` (arcsec along the
+        image's axes), their error ``offset_err``, and ``used``, False for those that are too far off.
+    field : `~miricigale.photometry.fields.SmoothField`
+        (dx, dy) in arcsec.
+    wcs : `~astropy.wcs.WCS`
+        The image's.
+    """
+
+    sources: QTable
+    field: SmoothField
+    wcs: object
+
+    def __repr__(self):
+        n = int(np.count_nonzero(self.sources["used"]))
+        return f"<OffsetMap of order {self.field.order}, {n} of {len(self.sources)} sources>"
+
+    def evaluate(self, sky):
+        """
+        Offsets at positions.
+
+        Parameters
+        ----------
+        sky : `~astropy.coordinates.SkyCoord`
+            Positions.
+
+        Returns
+        -------
+        offset : `~astropy.units.Quantity`, shape (..., 2)
+            (dx, dy) along the image's axes, in arcsec.
+        """
+        return self.field(*self.wcs.world_to_pixel(sky)) * ANGLE
+
+    def plot(self, ax=None, **kwargs):
+        """
+        Draw the measured offsets over those of the map, as arrows.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw.
+        **kwargs
+            Passed to `~miricigale.plotting.images.plot_offsets`.
+
+        Returns
+        -------
+        ax : `~matplotlib.axes.Axes`
+        """
+        from miricigale.plotting.images import plot_offsets
+
+        table = self.sources
+        offset = np.stack([table["dx"].value, table["dy"].value], axis=1)
+        xy = np.stack([table["x"], table["y"]], axis=1)
+        return plot_offsets(xy, offset, self.field, used=np.asarray(table["used"]), ax=ax, **kwargs)
+
+
+def source_offsets(fit, residual, model, rows):
+    """
+    Measure where sources are, relative to where their templates stand.
+
+    Parameters
+    ----------
+    fit : `~miricigale.photometry.template_fit.TemplateFit`
+        The fit.
+    residual, model : `~numpy.ndarray`, shape (ny, nx)
+        What it left, and the model of all sources.
+    rows : int `~numpy.ndarray`, shape (k,), sorted
+        Rows of the bank that were fitted.
+
+    Returns
+    -------
+    step : `~numpy.ndarray`, shape (k, 2)
+        (dx, dy) in pixels; NaN where they cannot be measured.
+    error : `~numpy.ndarray`, shape (k,)
+        1 sigma along an axis, for white noise of the size of the residuals.
+    others : `~numpy.ndarray`, shape (k,)
+        Light of others below the template, over the template's own.
+
+    Notes
+    -----
+    The template times its flux and the derivatives of that by x and y are fitted to the residual within
+    two full widths at half maximum of the PSF. Derivatives are differences of neighbouring pixels:
+    steps are right to some tens of percent, so that they must be repeated.
+    """
+    step = np.full((len(rows), 2), np.nan)
+    error, others = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
+    half = max(3, int(np.ceil(2 * 2.3548 * fit.psf_width)))
+    for block in fit.bank.blocks():
+        for k in range(*np.searchsorted(rows, [block.first, block.last])):
+            one = rows[k] - block.first
+            y0, x0, ny, nx = block.box[one]
+            x, y = np.rint(fit.bank.xy[rows[k]]).astype(int)
+            place = tuple(
+                slice(max(c - half, low), max(min(c + half + 1, low + size), low))
+                for c, low, size in ((y, y0, ny), (x, x0, nx))
+            )
+            inner = (
+                slice(place[0].start - y0, place[0].stop - y0),
+                slice(place[1].start - x0, place[1].stop - x0),
+            )
+            stamp = block.values[block.start[one] : block.start[one + 1]].reshape(ny, nx)
+            light = fit.flux[rows[k]] * stamp[inner].astype(float)
+            if min(light.shape) < 5:
+                continue
+            dy, dx = np.gradient(light)
+            weight = fit.inverse_sigma[place]
+            columns = np.stack([(c * weight).ravel() for c in (light, -dx, -dy)], axis=1)
+            data = (residual[place] * weight).ravel()
+            found, _, rank, _ = np.linalg.lstsq(columns, data)
+            if rank < 3:
+                continue
+            step[k] = found[1:]
+            left = data - columns @ found
+            variance = np.linalg.inv(columns.T @ columns).diagonal()[1:].mean()
+            error[k] = np.sqrt(variance * left @ left / max(np.count_nonzero(weight) - 3, 1))
+            own = columns[:, 0] @ columns[:, 0]
+            rest = ((model[place] - light) * weight).ravel()
+            others[k] = np.abs(rest) @ np.abs(columns[:, 0]) / own
+    return step, error, others
+
+
+def fit_offsets(arrays, bank, settings, catalog):
+    """
+    Fit an image with templates at positions that follow a smooth map of offsets.
+
+    Parameters
+    ----------
+    arrays, bank, settings, catalog
+        As in `~miricigale.photometry.passes.fit_image`.
+
+    Returns
+    -------
+    fit : `~miricigale.photometry.template_fit.TemplateFit`
+        With the map as its ``offset_map``; where too few bright isolated sources are left, with one shift
+        of the image, and a warning.
+    """
+    fit, moved = TemplateFit(arrays, bank, settings), 0.0
+    xy, limit = catalog.xy[catalog.near], settings.max_shift.value / fit.scale
+    for _ in range(6):
+        rows, offset, error = _bright_offsets(fit, catalog, moved)
+        good = np.hypot(*offset.T) < limit
+        order = settings.offset_order
+        while order >= 0 and np.count_nonzero(good) < _SOURCES * n_terms(order):
+            order -= 1
+        if order < 0:
+            msg = (
+                f"an offset map needs at least {_SOURCES} bright isolated sources within 'max_shift', "
+                f"got {np.count_nonzero(good)}: one shift is fitted to all sources instead"
+            )
+            warnings.warn(msg, MiricigaleWarning, stacklevel=5)
+            return TemplateFit(arrays, bank, dataclasses.replace(settings, offset_order=None))
+        member = fit.bank.order[rows]
+        field, used = _robust_field(xy[member], offset, error, good, arrays.flux.shape, order)
+        change = field(*xy.T) - moved
+        if np.abs(change).max(initial=0.0) < _DONE:
+            break
+        moved = moved + change
+        fit = TemplateFit(arrays, bank, settings, moved=moved)
+    if order < settings.offset_order:
+        msg = (
+            f"an offset map of order {settings.offset_order} needs "
+            f"{_SOURCES * n_terms(settings.offset_order)} bright isolated sources within 'max_shift', "
+            f"got {np.count_nonzero(good)}: order {order} is taken"
+        )
+        warnings.warn(msg, MiricigaleWarning, stacklevel=5)
+    near = catalog.near[member]
+    table = QTable({"id": catalog.id[near], "sky": catalog.sky[near]})
+    table["x"], table["y"] = xy[member].T
+    table["dx"], table["dy"] = offset.T * fit.scale * ANGLE
+    table["offset_err"] = error * fit.scale * ANGLE
+    table["used"] = used
+    in_arcsec = SmoothField(field.coefficients * fit.scale, field.shape, order)
+    fit.offset_map = OffsetMap(table, in_arcsec, arrays.wcs)
+    return fit
+
+
+def _bright_offsets(fit, catalog, moved):
+    """Rows, offsets from the catalogue (pixels) and errors of bright isolated sources."""
+    if not len(fit.rows):
+        return np.empty(0, int), np.empty((0, 2)), np.empty(0)
+    moved = np.broadcast_to(moved, (len(fit.bank.order), 2))
+    model = fit.model()
+    residual = fit.residual(model)
+    snr = np.zeros(len(fit.bank.order))
+    snr[fit.rows] = fit.flux[fit.rows] * np.sqrt(fit.fit.matrix.diagonal())
+    source = catalog.near[fit.bank.order]
+    bad = int(ForcedFlags.SHARED_SEGMENT | ForcedFlags.NOISY_SEGMENT)
+    whole = (fit.light > 0.9).all(axis=1) & (catalog.flags[source] & bad == 0)
+    rows = np.flatnonzero(whole & ~fit.noisy & (snr > _BRIGHT))
+    step, error, others = source_offsets(fit, residual, model, rows)
+    with np.errstate(invalid="ignore"):
+        # where residuals are larger than the stated noise the latter overstates the significance
+        keep = np.isfinite(error) & (others < _ISOLATED) & (error < fit.psf_width / _BRIGHT * 2)
+    rows = rows[keep]
+    offset = moved[fit.bank.order[rows]] + step[keep]
+    return rows, offset, np.hypot(error[keep], _FLOOR)
+
+
+def _robust_field(xy, offset, error, good, shape, order):
+    """Polynomial through offsets that some of the sources do not follow, and which ones do."""
+    terms = np.stack(legendre_terms(*xy.T, shape, order), axis=-1)
+
+    def weighted(rows, total):
+        return terms[rows] / total[rows, None], offset[rows] / total[rows, None]
+
+    a, b = weighted(good, error)
+    start = np.linalg.lstsq(a, b)[0]
+
+    def misfit(flat):
+        return (a @ flat.reshape(start.shape) - b).ravel()
+
+    found = scipy.optimize.least_squares(misfit, start.ravel(), loss="soft_l1")
+    coefficients = found.x.reshape(start.shape)
+    for _ in range(5):
+        distance = np.hypot(*(offset - terms @ coefficients).T)
+        # galaxies differ from band to band: what scatters beyond the errors (of two normal
+        # errors the median distance is 1.18) is added to them
+        scatter = (np.median(distance[good]) / 1.1774) ** 2 - np.median(error[good]) ** 2
+        total = np.hypot(error, np.sqrt(max(scatter, 0.0)))
+        used = good & (distance < _CLIP * total)
+        coefficients = np.linalg.lstsq(*weighted(used, total))[0]
+    return SmoothField(coefficients, shape, order), used

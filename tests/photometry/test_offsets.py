@@ -1,0 +1,178 @@
+"""Maps of offsets and backgrounds that vary, on scenes that were distorted by a known amount."""
+
+import os
+import warnings
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+from numpy.testing import assert_allclose
+
+from miricigale.instrument import north_up_wcs
+from miricigale.photometry import ForcedPhotometer, read_mosaic, read_prior
+from miricigale.photometry.fields import SmoothField, legendre_terms
+from miricigale.utils.exceptions import MiricigaleWarning
+
+REAL = os.environ.get("MIRICIGALE_DATA")
+SHAPE, SIGMA = (400, 400), 0.02
+
+
+def distorted(tools, n=100, square=0.0, wrong=0):
+    """Points on a grid, their offsets (x, y) in arcsec up to 0.1 across the field, and the image."""
+    rng = np.random.default_rng(3)
+    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, SHAPE)
+    side = (np.arange(10) - 4.5) * 4.0
+    east, north = (a.ravel()[:n] + rng.uniform(-1, 1, n) for a in np.meshgrid(side, side))
+    flux = 10 ** rng.uniform(0, 1.7, n)
+    a, b = east / 22, north / 22
+    d_east = 0.05 * a + 0.02 * b + 0.03 + square * a**2
+    d_north = -0.04 * a + 0.05 * b - 0.01
+    sky = tools.CENTER.spherical_offsets_by(east * u.arcsec, north * u.arcsec)
+    # some do not stand where the catalogue says
+    away = np.where(np.arange(n) < wrong, 0.15, 0.0)
+    there = tools.CENTER.spherical_offsets_by(
+        (east + d_east + away) * u.arcsec, (north + d_north) * u.arcsec
+    )
+    data = tools.render(there, flux, tools.LO, wcs, SHAPE) + rng.normal(0, SIGMA, SHAPE)
+    # +x is west
+    return sky, flux, np.stack([-d_east, d_north], axis=1), tools.as_ccd(data, wcs, SIGMA)
+
+
+OPTIONS = {"template": "psf", "max_shift": 0.3 * u.arcsec}
+
+
+@pytest.mark.parametrize(("order", "square", "wrong"), [(1, 0.0, 0), (1, 0.0, 12), (2, 0.04, 0)])
+def test_distortion_is_recovered(tools, order, square, wrong):
+    sky, flux, offset, image = distorted(tools, square=square, wrong=wrong)
+    catalog = QTable({"id": np.arange(100, 200), "sky": sky})
+    plain = ForcedPhotometer(tools.kernel, template="psf").measure(image, catalog=catalog)
+    result = ForcedPhotometer(tools.kernel, offset_order=order, **OPTIONS).measure(
+        image, catalog=catalog
+    )
+    found = result.offset_map.evaluate(sky).to_value(u.arcsec)
+    assert np.ptp(offset, axis=0).min() > 0.08
+    assert_allclose(found, offset, atol=2e-3)
+    table = result.offset_map.sources
+    assert (~table["used"]).sum() == wrong
+    right = np.arange(wrong, 100)
+    measured = np.stack([table["dx"].value, table["dy"].value], axis=1)[table["used"]]
+    member = table["id"][table["used"]] - 100
+    pulls = (measured - offset[member]) / table["offset_err"].value[table["used"], None]
+    assert 0.3 < pulls.std() < 1.1
+    pulls = ((result.flux.value - flux) / result.flux_err.value)[right]
+    assert 0.8 < pulls.std() < 1.2
+    assert ((plain.flux.value - flux) / plain.flux_err.value)[right].std() > 2
+    assert result.shift is None
+    ax = result.offset_map.plot()
+    assert ax.get_xlabel() == "x (pixels)"
+
+
+def test_too_few_sources_lower_the_order(tools):
+    sky, _, _, image = distorted(tools, n=6)
+    photometer = ForcedPhotometer(tools.kernel, offset_order=2, **OPTIONS)
+    with pytest.warns(MiricigaleWarning, match="order 2 needs 18 .* got 6: order 0 is taken"):
+        result = photometer.measure(image, catalog=QTable({"sky": sky}))
+    assert result.offset_map.field.order == 0
+
+
+def test_without_bright_sources_there_is_one_shift(tools):
+    sky, _, offset, image = distorted(tools, n=2)
+    photometer = ForcedPhotometer(tools.kernel, offset_order=1, **OPTIONS)
+    with pytest.warns(MiricigaleWarning, match="at least 3 .* got 2: one shift"):
+        result = photometer.measure(image, catalog=QTable({"sky": sky}))
+    assert result.offset_map is None
+    assert_allclose(result.shift.value, offset.mean(axis=0), atol=0.01)
+
+
+def test_new_sources_of_a_distorted_image_are_in_the_catalogue_s_frame(tools):
+    sky, flux, _, image = distorted(tools)
+    photometer = ForcedPhotometer(tools.kernel, offset_order=1, second_pass=True, **OPTIONS)
+    result = photometer.measure(image, catalog=QTable({"sky": sky[5:]}))
+    assert len(result.new_sources) == 5
+    row, separation, _ = sky[:5].match_to_catalog_sky(result.new_sources["sky"])
+    assert separation.max() < 0.02 * u.arcsec
+    new = result.new_sources[row]
+    assert_allclose((new["flux"].value - flux[:5]) / new["flux_err"].value, 0, atol=3)
+
+
+def test_background_that_varies(tools, field):
+    ny, nx = field.image.shape
+    y, x = np.mgrid[:ny, :nx]
+    sky = 0.4 + 0.3 * (x / nx) - 0.2 * (y / ny) ** 2 + 0.1 * (x / nx) * (y / ny)
+    image = tools.as_ccd(field.image.data + sky, field.wcs, 0.01)
+    constant, varying = (
+        ForcedPhotometer(
+            tools.kernel, template="psf", fit_background=True, background_order=order
+        ).measure(image, catalog=field.catalog)
+        for order in (0, 2)
+    )
+    assert np.abs(constant.flux.value - field.flux).max() > 0.3
+    assert_allclose(varying.flux.value, field.flux, rtol=1e-5, atol=1e-5)
+    assert_allclose(varying.background_field(x, y), sky, atol=1e-6)
+    assert_allclose(varying.background.to_value("MJy/sr"), sky.mean(), rtol=1e-4)
+    assert np.abs(varying.residual_image.data).max() < 1e-5 * field.image.data.max()
+
+
+def test_terms_are_those_of_a_polynomial():
+    y, x = np.mgrid[:7, :9]
+    terms = legendre_terms(x, y, (7, 9), 2)
+    assert len(terms) == 6
+    assert max(np.abs(one).max() for one in terms) <= 1
+    # Legendre's polynomials, written out
+    u, v = (2 * x + 1) / 9 - 1, (2 * y + 1) / 7 - 1
+    expected = [np.ones((7, 9)), u, v, 1.5 * u**2 - 0.5, u * v, 1.5 * v**2 - 0.5]
+    assert_allclose(terms, [np.broadcast_to(one, (7, 9)) for one in expected], atol=1e-12)
+    field = SmoothField(np.eye(6), (7, 9), 2)
+    assert_allclose(field(2, 4), [one[4, 2] for one in terms], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"offset_order": 1}, "'max_shift' must be given with 'offset_order'"),
+        ({"offset_order": 4, "max_shift": 1 * u.arcsec}, "'offset_order' must be an integer"),
+        ({"background_order": 1}, "'background_order' must be 0 without"),
+        ({"background_order": True, "fit_background": True}, "must be an integer from 0 to 4"),
+    ],
+)
+def test_bad_orders_are_refused(tools, options, text):
+    with pytest.raises(ValueError, match=text):
+        ForcedPhotometer(tools.kernel, **options)
+
+
+@pytest.mark.skipif(
+    not REAL or not (Path(REAL) / "uds").is_dir(), reason="needs uds in MIRICIGALE_DATA"
+)
+def test_real_images_are_aligned():
+    """F770W of PRIMER-UDS against F444W: within a tenth of a native pixel (0.11 arcsec)."""
+    from astropy.io import fits
+
+    from miricigale.psf import MatchingKernel
+
+    start, psfs = f"{REAL}/uds/uds-test-", f"{REAL}/uds/psf/uds-test-f444w"
+    with warnings.catch_warnings():
+        # the scale of the weights, the kernel's centre
+        warnings.simplefilter("ignore")
+        image, prior = (
+            read_mosaic(f"{start}{band}_sci.fits.gz", weight=f"{start}{band}_wht.fits.gz")
+            for band in ("f770w", "f444w")
+        )
+        segments, sources = read_prior(prior, segmentation=f"{start}LW_seg.fits.gz")
+        kernel, psf = (
+            fits.getdata(f"{psfs}_{name}.fits.gz").mean(axis=0) for name in ("kernel_f770w", "psf")
+        )
+        kernel = MatchingKernel.from_array(kernel, pixel_scale=0.04 * u.arcsec, source=psf)
+    options = {"fit_background": True, "max_shift": 0.2 * u.arcsec}
+    one, mapped = (
+        ForcedPhotometer(kernel, offset_order=order, **options).measure(
+            image, prior, segments, sources
+        )
+        for order in (None, 0)
+    )
+    found = mapped.offset_map.evaluate(sources["sky"][0]).to_value(u.arcsec)
+    assert mapped.offset_map.sources["used"].sum() >= 15
+    assert np.hypot(*found) < 0.011
+    # as one shift of all sources is
+    assert_allclose(found, one.shift.to_value(u.arcsec), atol=0.005)

@@ -1,0 +1,209 @@
+"""Sources that the prior lacks, and points on top of galaxies, on scenes whose fluxes are known."""
+
+import types
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
+
+from miricigale.instrument import north_up_wcs
+from miricigale.photometry import ForcedFlags, ForcedPhotometer, detect_sources
+
+
+def flagged(flags, flag):
+    return (np.asarray(flags) & int(flag)) != 0
+
+
+def joined(*coords):
+    ra, dec = (np.concatenate([getattr(one, name).deg for one in coords]) for name in ("ra", "dec"))
+    return SkyCoord(ra, dec, unit="deg")
+
+
+def grid(rng, n, spacing, jitter):
+    side = (np.arange(int(np.sqrt(n))) - (np.sqrt(n) - 1) / 2) * spacing
+    return np.array([a.ravel() + rng.uniform(-jitter, jitter, n) for a in np.meshgrid(side, side)])
+
+
+@pytest.fixture(scope="module")
+def crowd(tools):
+    """Eighty-one points of which fifty have a companion at 0.45 to 1.2 arcsec, and two hidden ones apart."""
+    rng = np.random.default_rng(1)
+    shape, sigma = (360, 360), 0.05
+    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, shape)
+    east, north = grid(rng, 81, 4.0, 0.4)
+    distance, angle = rng.uniform(0.45, 1.2, 50), rng.uniform(0, 2 * np.pi, 50)
+    flux = 10 ** rng.uniform(0.7, 1.7, 81)
+    hidden_flux = np.append(flux[:50] * 10 ** rng.uniform(-0.6, 0.1, 50), [3.0, 8.0])
+    sky = tools.CENTER.spherical_offsets_by(east * u.arcsec, north * u.arcsec)
+    hidden = tools.CENTER.spherical_offsets_by(
+        np.append(east[:50] + distance * np.cos(angle), [-18.0, 2.0]) * u.arcsec,
+        np.append(north[:50] + distance * np.sin(angle), [2.0, 18.0]) * u.arcsec,
+    )
+    data = tools.render(joined(sky, hidden), np.append(flux, hidden_flux), tools.LO, wcs, shape)
+    image = tools.as_ccd(data + rng.normal(0, sigma, shape), wcs, sigma)
+    return types.SimpleNamespace(
+        sky=sky, flux=flux, hidden=hidden, hidden_flux=hidden_flux, image=image, wcs=wcs
+    )
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_second_pass_finds_what_the_catalogue_lacks(tools, crowd, moved):
+    ids = np.arange(300, 381)[::-1]
+    # a catalogue that is wrong by (0.05, -0.03) arcsec lists new sources in its own frame
+    east, north = (0.05, -0.03) if moved else (0.0, 0.0)
+    sky, truth = (
+        one.spherical_offsets_by(east * u.arcsec, north * u.arcsec)
+        for one in (crowd.sky, crowd.hidden)
+    )
+    catalog = QTable({"id": ids, "sky": sky})
+    options = {"template": "psf", "max_shift": 0.3 * u.arcsec if moved else None}
+    first = ForcedPhotometer(tools.kernel, **options).measure(crowd.image, catalog=catalog)
+    assert first.new_sources is None
+    result = ForcedPhotometer(tools.kernel, second_pass=True, **options).measure(
+        crowd.image, catalog=catalog
+    )
+    new = result.new_sources
+    row, separation, _ = truth.match_to_catalog_sky(new["sky"])
+    assert len(new) == 52
+    assert sorted(row) == list(range(52))
+    assert np.median(separation) < 0.01 * u.arcsec
+    assert separation.max() < 0.08 * u.arcsec
+    assert not np.isin(new["id"], ids).any()
+    assert flagged(new["flags"], ForcedFlags.NOT_IN_CATALOG).all()
+    assert not flagged(result.flags, ForcedFlags.NOT_IN_CATALOG).any()
+    assert_array_equal(result.id, ids)
+    pulls = (new["flux"].value[row] - crowd.hidden_flux) / new["flux_err"].value[row]
+    assert 0.8 < pulls.std() < 1.25
+    # their neighbours are freed of their light
+    companion = slice(50)
+    assert np.median(first.flux.value[companion] / crowd.flux[companion]) > 1.02
+    ratio = result.flux.value / crowd.flux
+    assert abs(np.median(ratio[companion]) - 1) < 0.005
+    pulls = (result.flux.value - crowd.flux) / result.flux_err.value
+    assert 0.85 < pulls.std() < 1.15
+    assert not flagged(result.flags, ForcedFlags.UNEXPLAINED_NEIGHBOUR).any()
+    # the errors are those of a catalogue that has them all
+    full = ForcedPhotometer(tools.kernel, template="psf").measure(
+        crowd.image, catalog=QTable({"sky": joined(crowd.sky, crowd.hidden)})
+    )
+    assert_allclose(result.flux_err.value, full.flux_err.value[:81], rtol=0.05)
+
+
+def test_second_pass_with_nothing_to_find_changes_nothing(tools, field):
+    plain, twice = (
+        ForcedPhotometer(tools.kernel, template="psf", second_pass=flag).measure(
+            field.image, catalog=field.catalog
+        )
+        for flag in (False, True)
+    )
+    assert_array_equal(twice.flux.value, plain.flux.value)
+    assert len(twice.new_sources) == 0
+    assert twice.new_sources["flux"].unit == u.uJy
+
+
+def test_ids_that_are_text_do_not_clash(tools, crowd):
+    names = np.array([f"source {k}" for k in range(80)] + ["new-2"])
+    result = ForcedPhotometer(tools.kernel, template="psf", second_pass=True).measure(
+        crowd.image, catalog=QTable({"id": names, "sky": crowd.sky})
+    )
+    assert result.new_sources["id"][:3].tolist() == ["new-1", "new-3", "new-4"]
+
+
+@pytest.fixture(scope="module")
+def nuclei(tools):
+    """Galaxies with and without a point in their middle that the high-resolution image does not show."""
+    rng = np.random.default_rng(1)
+    n, half = 25, int(10.5 / tools.FINE)
+    sky = tools.CENTER.spherical_offsets_by(*(grid(rng, n, 3.2, 0.2) * u.arcsec))
+    size = np.append(rng.uniform(0.2, 0.4, n - 1), 0.0)
+    wcs = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, (2 * half, 2 * half))
+    sigma = 0.01 / (tools.FINE**2 * tools.SR * 1e12)
+    high = tools.render(sky, np.full(n, 20.0), np.hypot(size, tools.HI), wcs, (2 * half, 2 * half))
+    high = tools.as_ccd(high + rng.normal(0, sigma, high.shape), wcs, sigma)
+    shape = (int(2 * half * tools.FINE / 0.11),) * 2
+    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, shape)
+    host = 10 ** rng.uniform(1, 1.7, n)
+    point = np.where(np.arange(n) < 8, 0.0, host * rng.uniform(0.3, 1, n))
+    low = tools.render(sky, host, np.hypot(size, tools.LO), wcs, shape)
+    low += tools.render(sky, point, tools.LO, wcs, shape)
+    low = tools.as_ccd(low + rng.normal(0, 0.02, shape), wcs, 0.02)
+    segmentation, _ = detect_sources(high, threshold=1.0, min_area=10)
+    return types.SimpleNamespace(
+        sky=sky, host=host, point=point, images=(low, high, segmentation), n=n
+    )
+
+
+def test_points_on_top_of_galaxies(tools, nuclei):
+    catalog = QTable({"sky": nuclei.sky})
+    one, two = (
+        ForcedPhotometer(tools.kernel, components=k).measure(*nuclei.images, catalog)
+        for k in (1, 2)
+    )
+    assert one.flux_point is None
+    total = nuclei.host + nuclei.point
+    # the last is a point, whose nucleus cannot be told from it and whose fit is good
+    double = np.arange(nuclei.n) >= 8
+    double[-1] = False
+    assert_array_equal(np.isfinite(two.flux_point.value), double)
+    assert np.all(one.flux.value[double] / total[double] > 1.05)
+    assert_allclose(two.flux.value[double], total[double], rtol=0.02)
+    for found, truth in (
+        (two.flux_point, nuclei.point),
+        (two.flux - two.flux_point, nuclei.host),
+    ):
+        ratio = found.value[double] / truth[double]
+        assert_allclose(ratio, 1, atol=0.06)
+        assert np.median(np.abs(ratio - 1)) < 0.015
+    assert not flagged(two.flags, ForcedFlags.POOR_FIT).any()
+    table = two.to_table("miri.f770w")
+    assert_array_equal(table["miri.f770w_point"], two.flux_point)
+    assert_array_equal(table["miri.f770w_point_err"], two.flux_point_err)
+
+
+def test_the_catalogue_says_who_has_two_components(tools, nuclei):
+    number = np.where(np.arange(nuclei.n) % 2 == 0, 2, 1)
+    catalog = QTable({"sky": nuclei.sky, "components": number})
+    result = ForcedPhotometer(tools.kernel).measure(*nuclei.images, catalog)
+    assert_array_equal(
+        np.isfinite(result.flux_point.value), (number == 2) & (np.arange(nuclei.n) < 24)
+    )
+    # a point on top of a point
+    assert flagged(result.flags, ForcedFlags.ONE_COMPONENT).tolist() == [False] * 24 + [True]
+    assert_allclose(result.flux.value[24], nuclei.host[24] + nuclei.point[24], rtol=0.01)
+    catalog["components"] = 3
+    with pytest.raises(ValueError, match="column 'components' of 1 and 2"):
+        ForcedPhotometer(tools.kernel).measure(*nuclei.images, catalog)
+
+
+def test_covariance_of_two_components_is_that_of_least_squares(tools):
+    # one Gaussian galaxy and a point, of known templates, on white noise: (A^T A)^-1 by hand
+    shape, sigma, width = (121, 121), 0.05, 0.35
+    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, shape)
+    fine = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, (221, 221))
+    sky = tools.CENTER.reshape(1)
+    high = tools.render(sky, [1.0], np.hypot(width, tools.HI), fine, (221, 221))
+    high = tools.as_ccd(high, fine, high.max() * 1e-6)
+    templates = [
+        tools.render(sky, [1.0], one, wcs, shape) for one in (np.hypot(width, tools.LO), tools.LO)
+    ]
+    matrix = np.array([[np.sum(a * b) for b in templates] for a in templates]) / sigma**2
+    expected = np.linalg.inv(matrix)
+    image = tools.as_ccd(30 * templates[0] + 12 * templates[1], wcs, sigma)
+    catalog = QTable({"sky": sky, "components": [2]})
+    result = ForcedPhotometer(
+        tools.kernel, template="cutout", wings=False, correlated_noise=False
+    ).measure(image, high, np.ones((221, 221), int), catalog)
+    assert_allclose(result.flux.value, 42, rtol=2e-3)
+    assert_allclose(result.flux_point.value, 12, rtol=0.01)
+    assert_allclose(result.flux_point_err.value**2, expected[1, 1], rtol=0.01)
+    assert_allclose(result.flux_err.value**2, expected.sum(), rtol=0.01)
+    joint = result.joint_covariance.toarray()
+    assert_allclose(joint[0, 1], expected[0, 1] + expected[1, 1], rtol=0.01)
+
+
+def test_bad_number_of_components_is_refused(tools):
+    with pytest.raises(ValueError, match="'components' must be 1 or 2"):
+        ForcedPhotometer(tools.kernel, components=3)
