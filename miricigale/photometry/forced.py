@@ -76,6 +76,9 @@ class ForcedPhotometer:
     second_pass : bool, optional
         Whether peaks of the residual that the catalogue lacks are fitted together with it, as
         points; they are listed in ``new_sources`` of the result.
+    positive : bool, optional
+        Whether the solution without negative fluxes is given too (``flux_positive``). All else belongs to
+        the fluxes without that condition, which alone have no bias.
     radius : `~astropy.units.Quantity`, optional
         Half-width to which templates are cut; as far as the kernel reaches by default.
     min_coverage : float, optional
@@ -121,6 +124,7 @@ class ForcedPhotometer:
         integrate=False,
         components=1,
         second_pass=False,
+        positive=False,
         radius=None,
         min_coverage=0.05,
         max_bytes=1.5e9,
@@ -159,6 +163,7 @@ class ForcedPhotometer:
         self._integrate = bool(integrate)
         self._components = int(components)
         self._second_pass = bool(second_pass)
+        self._positive = bool(positive)
         self._radius = None if radius is None else u.Quantity(radius, ANGLE)
         self._min_coverage = float(min_coverage)
         self._max_bytes = float(max_bytes)
@@ -247,6 +252,7 @@ class ForcedPhotometer:
             radius=np.inf if self._radius is None else self._radius.value,
             components=self._components,
             second_pass=self._second_pass,
+            positive=self._positive,
         )
         rows = CatalogRows(
             id=ids,

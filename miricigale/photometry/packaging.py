@@ -12,6 +12,7 @@ from astropy.table import QTable
 from miricigale.photometry.diagnostics import source_flags
 from miricigale.photometry.fields import SmoothField, n_terms
 from miricigale.photometry.flags import ForcedFlags
+from miricigale.photometry.nonnegative import nonnegative_fluxes
 from miricigale.photometry.residual_sources import unexplained_neighbours
 from miricigale.photometry.results import ForcedPhotometryResult, crowded
 from miricigale.utils.meta import provenance
@@ -126,6 +127,12 @@ def package(fit, diagnostics, catalog, new_xy, filter_name=None):
         **_common(fit, common),
         **_images(fit, diagnostics, meta),
     )
+    if fit.settings.positive:
+        positive = np.full(n_all, np.nan)
+        if len(fit.rows):
+            positive[place[fit.rows]] = 0.0
+            np.add.at(positive, place[fit.rows], nonnegative_fluxes(fit.fit))
+        result = dataclasses.replace(result, flux_positive=positive[:n] * FNU)
     if not fit.settings.second_pass:
         return result
     more = {"flux": flux, "flux_err": flux_err, "flags": flags, "coverage": coverage, "chi2": chi2}

@@ -103,6 +103,8 @@ class ForcedPhotometryResult:
         None where no second components were asked for.
     joint_covariance : `~scipy.sparse.csr_array`, shape (2 n, 2 n), or None
         In uJy^2: of all ``flux``, then of all ``flux_point``.
+    flux_positive : `~astropy.units.Quantity`, shape (n,), or None
+        The fluxes of least chi-square of which none is negative (neither component's is).
     new_sources : `~astropy.table.QTable` or None
         What the catalogue lacks, fitted with it: ``id`` (none of the catalogue's), ``sky``, ``x``, ``y``,
         ``flux``, ``flux_err``, ``snr``, ``flags``, ``coverage`` and ``chi2``. None without a second pass.
@@ -136,6 +138,7 @@ class ForcedPhotometryResult:
     flux_point: u.Quantity | None = None
     flux_point_err: u.Quantity | None = None
     joint_covariance: scipy.sparse.csr_array | None = None
+    flux_positive: u.Quantity | None = None
     new_sources: QTable | None = None
     meta: dict = dataclasses.field(default_factory=dict)
 
@@ -199,6 +202,11 @@ class ForcedPhotometryResult:
             point = "flux_point" if name is None else f"{name}_point"
             columns[point] = self.flux_point, "Flux of the point on top of the template"
             columns[error_column(point)] = self.flux_point_err, "1-sigma error of the point's flux"
+        if self.flux_positive is not None:
+            columns[f"{flux}_positive"] = (
+                self.flux_positive,
+                "Total flux if no flux may be negative; its error is not known",
+            )
         table = QTable({"id": self.id, "sky": self.sky}, meta=dict(self.meta), copy=True)
         table["id"].info.description = "Id of the catalogue"
         table["sky"].info.description = "Position of the catalogue"

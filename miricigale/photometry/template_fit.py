@@ -59,6 +59,8 @@ class FitSettings:
         1, or 2 for a point on top of the templates of poor fits.
     second_pass : bool
         Whether peaks of the residual are fitted with the sources.
+    positive : bool
+        Whether fluxes that are not negative are found too.
     """
 
     kernel: object
@@ -72,6 +74,7 @@ class FitSettings:
     radius: float = np.inf
     components: int = 1
     second_pass: bool = False
+    positive: bool = False
 
 
 class TemplateFit:

@@ -1,0 +1,92 @@
+"""Fluxes that are not negative, against the dense algorithm of scipy."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+import scipy.optimize
+import scipy.sparse
+from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
+
+from miricigale.instrument import north_up_wcs
+from miricigale.photometry import ForcedPhotometer
+from miricigale.photometry.errors import LinearFit
+from miricigale.photometry.nonnegative import nonnegative_fluxes
+from miricigale.utils.exceptions import MiricigaleWarning
+
+
+def problem(rng, n, overlap, n_common):
+    """Templates along a line that overlap, common columns of any sign, and noisy data."""
+    x = np.arange(4 * n)
+    a = np.exp(-0.5 * ((x[:, None] - 4 * np.arange(n) - 1.5) / (4 * overlap)) ** 2)
+    a[a < 1e-4] = 0
+    common = np.cos(np.outer(x, np.arange(n_common)) * 0.1)
+    truth = np.where(rng.random(n) < 0.5, 0.0, rng.exponential(3, n))
+    data = a @ truth - common @ np.ones(n_common) + rng.normal(0, 1, len(x))
+    return a, common, data
+
+
+@pytest.mark.parametrize("n_common", [0, 1, 3])
+@pytest.mark.parametrize("overlap", [0.3, 0.8, 1.2])
+def test_solution_is_that_of_lawson_and_hanson(overlap, n_common):
+    rng = np.random.default_rng(5)
+    for n in (1, 2, 10, 60):
+        a, common, data = problem(rng, n, overlap, n_common)
+        fit = LinearFit(
+            scipy.sparse.csr_array(a.T @ a), a.T @ data, a.T @ common, common.T @ common,
+            common.T @ data,
+        )  # fmt: skip
+        found = nonnegative_fluxes(fit)
+        # free parameters as the difference of two that are not negative
+        expected, _ = scipy.optimize.nnls(np.hstack([a, common, -common]), data)
+        assert_allclose(found, expected[:n], atol=1e-7 * max(1, np.abs(expected).max()))
+        # conditions of Karush, Kuhn and Tucker
+        rest = data - a @ found
+        rest = rest - common @ np.linalg.lstsq(common, rest)[0] if n_common else rest
+        slope = -a.T @ rest
+        assert found.min() >= 0
+        assert slope[found == 0].min(initial=0) > -1e-7
+        assert_allclose(slope[found > 0], 0, atol=1e-7)
+
+
+def test_positive_fluxes_are_kept_and_those_of_an_empty_sky_are_zero(tools):
+    fit = LinearFit(
+        scipy.sparse.csr_array(np.diag([2.0, 4.0])), np.array([2.0, 8.0]), np.ones((2, 0)),
+        np.ones((0, 0)), np.ones(0),
+    )  # fmt: skip
+    assert_array_equal(nonnegative_fluxes(fit), [1.0, 2.0])
+    fit = LinearFit(fit.matrix, -fit.rhs, fit.border, fit.corner, fit.corner_rhs)
+    assert_array_equal(nonnegative_fluxes(fit), [0.0, 0.0])
+
+
+def test_a_matrix_without_a_solution_warns():
+    # chi-square falls without end along x1 = x2
+    matrix = scipy.sparse.csr_array(np.array([[1.0, -2.0], [-2.0, 1.0]]))
+    fit = LinearFit(matrix, np.ones(2), np.ones((2, 0)), np.ones((0, 0)), np.ones(0))
+    with pytest.warns(MiricigaleWarning, match="no fluxes that are not negative"):
+        assert np.isnan(nonnegative_fluxes(fit)).all()
+
+
+def test_positive_fluxes_stand_beside_the_others(tools):
+    rng = np.random.default_rng(9)
+    n, shape, sigma = 40, (90, 90), 0.3
+    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, shape)
+    sky = tools.positions(rng, n, 3.0)
+    flux = np.where(rng.random(n) < 0.5, 0.0, rng.exponential(1.0, n))
+    data = tools.render(sky, flux, tools.LO, wcs, shape) + rng.normal(0, sigma, shape) + 0.5
+    image = tools.as_ccd(data, wcs, sigma)
+    plain, both = (
+        ForcedPhotometer(tools.kernel, template="psf", fit_background=True, positive=flag).measure(
+            image, catalog=QTable({"sky": sky})
+        )
+        for flag in (False, True)
+    )
+    assert plain.flux_positive is None
+    assert_array_equal(both.flux.value, plain.flux.value)
+    assert (both.flux.value < 0).sum() > 5
+    a = [tools.render(sky[k : k + 1], [1.0], tools.LO, wcs, shape).ravel() for k in range(n)]
+    ones = np.ones((data.size, 1))
+    expected, _ = scipy.optimize.nnls(np.hstack([np.stack(a, axis=1), ones, -ones]), data.ravel())
+    assert_allclose(both.flux_positive.value, expected[:n], atol=1e-3)
+    table = both.to_table("miri.f770w")
+    assert_array_equal(table["miri.f770w_positive"], both.flux_positive)
