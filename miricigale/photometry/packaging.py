@@ -116,6 +116,7 @@ def package(fit, diagnostics, catalog, new_xy, filter_name=None):
         x=catalog.xy[:, 0].copy(),
         y=catalog.xy[:, 1].copy(),
         noise_correlation=diagnostics.correlation,
+        psf_fwhm=np.sqrt(8 * np.log(2)) * fit.psf_width * fit.scale * ANGLE,
         meta=provenance(
             **meta,
             template=fit.settings.template,

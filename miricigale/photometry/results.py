@@ -5,15 +5,21 @@ import functools
 
 import astropy.units as u
 import numpy as np
+import scipy.ndimage
 import scipy.sparse
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.table import QTable
 
+from miricigale.photometry.arrays import pixel_scale
+from miricigale.photometry.draws import correlated_draws
 from miricigale.photometry.fields import SmoothField
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.offsets import OffsetMap
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.random import check_seed
 from miricigale.utils.tables import error_column
+from miricigale.utils.units import ANGLE, FNU
 
 __all__ = ["ForcedPhotometryResult", "crowded"]
 
@@ -108,6 +114,8 @@ class ForcedPhotometryResult:
     new_sources : `~astropy.table.QTable` or None
         What the catalogue lacks, fitted with it: ``id`` (none of the catalogue's), ``sky``, ``x``, ``y``,
         ``flux``, ``flux_err``, ``snr``, ``flags``, ``coverage`` and ``chi2``. None without a second pass.
+    psf_fwhm : `~astropy.units.Quantity` or None
+        Full width at half maximum of a Gaussian as peaked as the image's PSF, in arcsec.
     meta : dict
         Settings and provenance.
     """
@@ -140,6 +148,7 @@ class ForcedPhotometryResult:
     joint_covariance: scipy.sparse.csr_array | None = None
     flux_positive: u.Quantity | None = None
     new_sources: QTable | None = None
+    psf_fwhm: u.Quantity | None = None
     meta: dict = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
@@ -159,6 +168,88 @@ class ForcedPhotometryResult:
     def snr(self):
         """Flux over its error, shape (n,)."""
         return np.asarray((self.flux / self.flux_err).value)
+
+    @functools.cached_property
+    def chi2_image(self):
+        """
+        Goodness of fit over the image: (residual / sigma)^2, averaged over the PSF.
+
+        A `~astropy.nddata.CCDData` without unit, on average 1 where sigma is the noise; NaN and masked where the
+        image is not usable. The average is weighted with a Gaussian of the width ``psf_fwhm``, over usable pixels.
+        """
+        image = self.residual_image
+        usable = ~image.mask
+        square = np.where(usable, image.data / image.uncertainty.array, 0.0) ** 2
+        width = self.psf_fwhm.to_value(ANGLE) / pixel_scale(image.wcs) / np.sqrt(8 * np.log(2))
+        total, weight = (
+            scipy.ndimage.gaussian_filter(one, width, mode="constant")
+            for one in (square, usable.astype(float))
+        )
+        chi2 = np.divide(total, weight, out=np.full(total.shape, np.nan), where=usable)
+        return CCDData(chi2, unit="", wcs=image.wcs, mask=~usable, meta=dict(image.meta))
+
+    def sample(self, size, *, seed=None, point=False):
+        """
+        Draw fluxes from their covariance, so that those of blends vary together.
+
+        Parameters
+        ----------
+        size : int
+            Number of draws.
+        seed : int or `~numpy.random.Generator`, optional
+            The same seed gives the same draws, for a source that overlaps no other also in
+            another catalogue.
+        point : bool, optional
+            Whether the draws of ``flux_point`` are wanted, which belong to those of ``flux`` of the
+            same seed.
+
+        Returns
+        -------
+        flux : `~astropy.units.Quantity`, shape (size, n)
+            NaN where not measured. Draws hold what ``covariance`` holds, the noise of the image.
+
+        Raises
+        ------
+        ValueError
+            If ``size`` is not positive, or points are wanted that were not fitted.
+        """
+        if isinstance(size, bool) or not hasattr(size, "__index__") or size < 1:
+            raise argument_error("size", "an integer of at least 1", repr(size))
+        if point and self.flux_point is None:
+            raise argument_error("point", "False where no second components were fitted", point)
+        keys = [("forced flux", key) for key in self.id.tolist()]
+        covariance = self.covariance
+        if self.joint_covariance is not None:
+            covariance = self.joint_covariance
+            keys += [("forced point", key) for key in self.id.tolist()]
+        draws = correlated_draws(covariance, keys, int(size), check_seed(seed))
+        if point:
+            return (self.flux_point.value + draws[:, len(self) :]) * FNU
+        return (self.flux.value + draws[:, : len(self)]) * FNU
+
+    def correlation(self, first, second):
+        """
+        Correlation of the errors of two sources, given by id.
+
+        Returns
+        -------
+        correlation : float
+            0 where their templates do not overlap, NaN if one was not measured.
+
+        Raises
+        ------
+        KeyError
+            If the catalogue has no such id.
+        """
+        rows = []
+        for key in (first, second):
+            found = np.flatnonzero(self.id == key)
+            if len(found) == 0:
+                msg = f"no source with the id {key!r}"
+                raise KeyError(msg)
+            rows.append(found[0])
+        errors = self.flux_err.value[rows]
+        return float(self.covariance[rows[0], rows[1]] / np.prod(errors))
 
     def to_table(self, name=None):
         """
