@@ -6,6 +6,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "aperture": ("aperture_photometry", "source_extractor_photometry"),
+        "bands": ("join_bands", "measure_bands"),
         "corrections": ("aperture_correction", "encircled_flux", "flux_scaling"),
         "detection": ("DETECTION_PRESETS", "DetectionFlags", "DetectionPreset", "detect_sources"),
         "error_model": ("YANG2021_DEPTHS", "ErrorModel"),
@@ -15,6 +16,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "mosaics": ("MosaicFile", "read_mosaic"),
         "priors": ("read_prior",),
         "sky_noise": ("weight_scale",),
+        "sources": ("SourceTemplates",),
         "results": ("ForcedPhotometryResult", "crowded"),
     },
 )

@@ -1,11 +1,11 @@
 """Forced photometry: all sources of a catalogue fitted at once, with templates."""
 
 import concurrent.futures
+import dataclasses
+import warnings
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import SkyCoord
-from photutils.segmentation import SegmentationImage
 
 from miricigale.photometry.arrays import (
     fine_wcs,
@@ -14,16 +14,14 @@ from miricigale.photometry.arrays import (
     pixel_scale,
     sky_pixels,
 )
-from miricigale.photometry.cutouts import own_segments, sersic_cutouts
 from miricigale.photometry.flags import ForcedFlags
-from miricigale.photometry.light import cutouts
 from miricigale.photometry.packaging import CatalogRows, package
 from miricigale.photometry.passes import fit_image
+from miricigale.photometry.sources import SourceTemplates, catalog_sources
 from miricigale.photometry.template_fit import FitSettings
 from miricigale.photometry.templates import FineTemplates, TemplateBank
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.parallel import single_threaded, thread_count
-from miricigale.utils.tables import require_columns, unique_ids
 from miricigale.utils.units import ANGLE, to_array
 
 __all__ = ["ForcedPhotometer"]
@@ -177,7 +175,7 @@ class ForcedPhotometer:
     def __repr__(self):
         return f"<ForcedPhotometer template={self._template!r}, {self._kernel!r}>"
 
-    def measure(self, image, highres=None, segmentation=None, catalog=None):
+    def measure(self, image, highres=None, segmentation=None, catalog=None, *, templates=None):
         """
         Measure all sources of a catalogue.
 
@@ -194,8 +192,11 @@ class ForcedPhotometer:
         catalog : `~astropy.table.QTable`
             Column ``sky``, and if there are ``id`` (1, 2, ... otherwise), ``label`` (the
             segment; by default that at the position), ``flux`` (for the ``crowded``
-            flag; the measured fluxes otherwise), ``components`` and, for Sersic templates, those of the scene's
-            catalogues.
+            flag; the measured fluxes otherwise), ``components`` and, for Sersic templates, those of
+            the scene's catalogues.
+        templates : `SourceTemplates`, optional
+            What the sources look like, in place of the three above, made once for several
+            images. The settings ``template``, ``min_snr`` and ``wings`` are then theirs.
 
         Returns
         -------
@@ -206,43 +207,60 @@ class ForcedPhotometer:
         ValueError, TypeError, `~astropy.units.UnitsError`
             If an input does not fit; the message says which.
         """
+        arrays = image_arrays(image, "image")
+        given = [one is not None for one in (highres, segmentation, catalog)]
+        if templates is None:
+            sources = dataclasses.replace(catalog_sources(catalog), sky=catalog["sky"])
+        elif any(given):
+            raise argument_error("templates", "given alone with the image", "a catalogue too")
+        elif not isinstance(templates, SourceTemplates):
+            msg = f"'templates' must be SourceTemplates, got {type(templates).__name__}"
+            raise TypeError(msg)
+        else:
+            sources = templates
+        place = self._place(arrays, sources.sky)
+        if templates is None:
+            templates = self._templates(highres, segmentation, catalog[place.near])
+        else:
+            templates = templates[place.near]
+        self._check_grid(templates)
         with concurrent.futures.ThreadPoolExecutor(self._n_threads) as pool, single_threaded():
             executor = pool if self._n_threads > 1 else None
-            return self._measure(image, highres, segmentation, catalog, executor)
+            filter_name = image.meta.get("filter", image.meta.get("FILTER"))
+            return self._measure(arrays, sources, place, templates, filter_name, executor)
 
-    def _measure(self, image, highres, segmentation, catalog, executor):
-        arrays = image_arrays(image, "image")
-        ids, sky, labels = _sources(catalog)
-        scale = pixel_scale(image.wcs)
+    def _place(self, arrays, sky):
+        """Where the sources are on an image, and which are on or near it."""
+        scale, shape = pixel_scale(arrays.wcs), arrays.flux.shape
         fine_scale = self._kernel.pixel_scale.to_value(ANGLE)
-        n, shape = len(sky), arrays.flux.shape
         margin = (self._kernel.target.shape[0] // 2 + 1) * fine_scale / scale
-        xy = sky_pixels(sky, image.wcs, shape, margin)
-        near = np.flatnonzero(np.isfinite(xy[:, 0]))
-        grid_wcs, fine_arrays, segments = self._fine(image, highres, segmentation, arrays)
-        fine_xy = np.stack(grid_wcs.world_to_pixel(sky[near]), axis=-1).reshape(-1, 2)
-        poly = local_maps(xy[near], np.full(len(near), margin / 2), image.wcs, grid_wcs)
-        flags = np.zeros(n, int)
-        snr = np.full(n, np.nan)
-        parts, flags[near], snr[near] = self._parts(
-            catalog[near], sky[near], fine_xy, grid_wcs, fine_arrays, segments,
-            None if labels is None else labels[near], executor,
-        )  # fmt: skip
-        kinds = np.full(n, "none", "U6")
-        kinds[near] = ["point" if one is None else one.kind for one in parts]
+        xy = sky_pixels(sky, arrays.wcs, shape, margin)
+        return _Place(scale, margin, xy, np.flatnonzero(np.isfinite(xy[:, 0])))
+
+    def _measure(self, arrays, sources, place, templates, filter_name, executor):
+        n, near, shape = len(sources.id), place.near, arrays.flux.shape
+        grid = templates.wcs
+        if grid is None:
+            grid = fine_wcs(arrays.wcs, shape, self._kernel.pixel_scale.to_value(ANGLE))
+        fine_xy = np.stack(grid.world_to_pixel(templates.sky), axis=-1).reshape(-1, 2)
+        half = np.full(len(near), place.margin / 2)
+        poly = local_maps(place.xy[near], half, arrays.wcs, grid)
+        parts = templates.drawn(grid, fine_xy)
+        flags, snr, kinds = np.zeros(n, int), np.full(n, np.nan), np.full(n, "none", "U6")
+        flags[near], snr[near], kinds[near] = templates.flags, templates.snr, templates.kind
         sides = None
         if self._integrate:
             middle = np.array([[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
-            sides = local_maps(middle, [margin / 2], image.wcs, grid_wcs)[0, :, 1:3].T
+            sides = local_maps(middle, [place.margin / 2], arrays.wcs, grid)[0, :, 1:3].T
         fine = FineTemplates(self._kernel.array, self._kernel.target, sides)
-        radius = np.inf if self._radius is None else self._radius.value / scale
+        radius = np.inf if self._radius is None else self._radius.value / place.scale
         bank = TemplateBank(
-            fine, parts, fine_xy, xy[near], poly, shape,
+            fine, parts, fine_xy, place.xy[near], poly, shape,
             radius=radius, max_bytes=self._max_bytes, executor=executor,
         )  # fmt: skip
         settings = FitSettings(
             kernel=self._kernel,
-            template=self._template,
+            template=templates.meta.get("template", self._template),
             fit_background=self._fit_background,
             background_order=self._background_order,
             max_shift=self._max_shift,
@@ -255,131 +273,75 @@ class ForcedPhotometer:
             positive=self._positive,
         )
         rows = CatalogRows(
-            id=ids,
-            sky=sky,
-            xy=xy,
+            id=np.asarray(sources.id),
+            sky=sources.sky,
+            xy=place.xy,
             near=near,
             flags=flags,
             template=kinds,
             template_snr=snr,
-            reference=catalog["flux"] if "flux" in catalog.colnames else None,
-            double=_double(catalog),
+            reference=sources.flux,
+            double=None if sources.components is None else sources.components == 2,
         )
-        filter_name = image.meta.get("filter", image.meta.get("FILTER"))
-        fit, diagnostics, new_xy = fit_image(arrays, bank, settings, rows, grid_wcs)
+        fit, diagnostics, new_xy = fit_image(arrays, bank, settings, rows, grid)
         return package(fit, diagnostics, rows, new_xy, filter_name)
 
-    def _fine(self, image, highres, segmentation, arrays):
-        """Coordinates, arrays and labels of the fine grid."""
+    def _templates(self, highres, segmentation, catalog):
+        """The templates that the settings ask for."""
+        if highres is None and segmentation is not None:
+            raise argument_error("highres", "the image that the segments belong to", "None")
+        for name, value in (("highres", highres), ("segmentation", segmentation)):
+            if value is None and self._template == "cutout":
+                raise argument_error(name, "given for cutouts", "None")
+        if highres is not None:
+            if getattr(highres, "wcs", None) is None:
+                image_arrays(highres, "highres")
+            self._check_scale("highres", highres.wcs)
+        if self._template in ("psf", "sersic") or segmentation is None:
+            kind = "sersic" if self._template == "sersic" else "psf"
+            grid = None if highres is None else highres.wcs
+            found = SourceTemplates.from_catalog(catalog, template=kind, wcs=grid)
+            if self._template != "auto":
+                return found
+            flags = np.full(len(found), int(ForcedFlags.NO_SEGMENT))
+            return dataclasses.replace(found, flags=flags, meta={**found.meta, "template": "auto"})
+        return SourceTemplates.from_images(
+            highres, segmentation, catalog, psf=self._kernel.source, template=self._template,
+            min_snr=self._min_snr, wings=self._wings, n_threads=self._n_threads,
+        )  # fmt: skip
+
+    def _check_scale(self, name, wcs):
         scale = self._kernel.pixel_scale.to_value(ANGLE)
-        if highres is None:
-            if self._template == "cutout" or segmentation is not None:
-                raise argument_error("highres", "the image that the segments belong to", "None")
-            return fine_wcs(image.wcs, arrays.flux.shape, scale), None, None
-        fine_arrays = image_arrays(highres, "highres")
-        have = pixel_scale(highres.wcs)
+        have = pixel_scale(wcs)
         if abs(have / scale - 1) > 0.01:
-            raise argument_error(
-                "highres", f"on the kernel's pixels of {scale:.4g} arcsec", f"{have:.4g} arcsec"
-            )
-        if segmentation is None:
-            if self._template == "cutout":
-                raise argument_error("segmentation", "given for cutouts", "None")
-            return highres.wcs, fine_arrays, None
-        segments = segmentation
-        if isinstance(segmentation, SegmentationImage):
-            segments = segmentation.data
-        segments = np.asarray(segments)
-        if segments.shape != fine_arrays.flux.shape or segments.dtype.kind not in "iu":
-            raise argument_error(
-                "segmentation",
-                f"integers of the shape {fine_arrays.flux.shape} of 'highres'",
-                f"{segments.dtype} of shape {segments.shape}",
-            )
-        return highres.wcs, fine_arrays, segments
+            wanted = f"on the kernel's pixels of {scale:.4g} arcsec"
+            raise argument_error(name, wanted, f"{have:.4g} arcsec")
 
-    def _parts(self, catalog, sky, fine_xy, grid_wcs, fine_arrays, segments, labels, executor):
-        """The template of each source: a `Cutout`, or None for a point source."""
-        n = len(sky)
-        none = [None] * n, np.zeros(n, int), np.full(n, np.nan)
-        if self._template == "psf" or n == 0:
-            return none
-        if self._template == "sersic":
-            rows = _sersic_rows(catalog)
-            return sersic_cutouts(rows, fine_xy, _pixels_per_arcsec(sky[0], grid_wcs)), *none[1:]
-        if segments is None:
-            return none[0], np.full(n, int(ForcedFlags.NO_SEGMENT)), none[2]
-        label, flags = own_segments(segments, labels, fine_xy)
-        parts, more, snr = cutouts(
-            fine_arrays.flux,
-            fine_arrays.sigma**2,
-            segments,
-            label,
-            fine_xy,
-            self._kernel.source,
-            scale=self._kernel.pixel_scale.to_value(ANGLE),
-            select=self._template == "auto",
-            min_snr=self._min_snr if self._template == "auto" else 0.0,
-            wings=self._wings,
-            executor=executor,
-        )
-        return parts, flags | more, snr
+    def _check_grid(self, templates):
+        """Refuse templates on other pixels than the kernel's, warn of those of another PSF."""
+        if templates.wcs is None:
+            return
+        self._check_scale("templates", templates.wcs)
+        if templates.psf is not None:
+            peaks = templates.psf.max(), self._kernel.source.max() / self._kernel.source.sum()
+            if abs(peaks[0] / peaks[1] - 1) > 0.1:
+                msg = (
+                    f"the templates were made with a PSF whose peak holds {peaks[0]:.3g} of the light, the "
+                    f"kernel is from one whose peak holds {peaks[1]:.3g}: is it of the same image?"
+                )
+                warnings.warn(msg, MiricigaleWarning, stacklevel=3)
 
 
-def _sources(catalog):
-    """Ids, positions and labels of a catalogue."""
-    if catalog is None or not hasattr(catalog, "colnames"):
-        raise argument_error("catalog", "a table with the column 'sky'", type(catalog).__name__)
-    require_columns(catalog, ["sky"], "catalog")
-    sky = catalog["sky"]
-    if not isinstance(sky, SkyCoord):
-        raise argument_error("catalog", "a table whose 'sky' is a SkyCoord", type(sky).__name__)
-    ids = np.arange(1, len(sky) + 1)
-    if "id" in catalog.colnames:
-        ids = unique_ids(catalog["id"], "catalog")
-    labels = np.asarray(catalog["label"]) if "label" in catalog.colnames else None
-    return ids, sky, labels
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Place:
+    """Pixel scale (arcsec), margin (pixels), positions (NaN for those far off), rows that are near."""
+
+    scale: float
+    margin: float
+    xy: np.ndarray
+    near: np.ndarray
 
 
 def _check_order(name, order, largest):
     if isinstance(order, bool) or not hasattr(order, "__index__") or not 0 <= order <= largest:
         raise argument_error(name, f"an integer from 0 to {largest}", repr(order))
-
-
-def _double(catalog):
-    """Which sources have two components, or None without such a column."""
-    if "components" not in catalog.colnames:
-        return None
-    number = np.asarray(catalog["components"])
-    if number.dtype.kind not in "iu" or not np.isin(number, (1, 2)).all():
-        found = np.unique(number)[:5].tolist()
-        raise argument_error("catalog", "a column 'components' of 1 and 2", f"{found}")
-    return number == 2
-
-
-def _sersic_rows(catalog):
-    units = {"half_light_radius": u.arcsec, "position_angle": u.deg}
-    names = ["half_light_radius", "sersic_index", "axis_ratio", "position_angle"]
-    require_columns(catalog, names, "catalog", units=units)
-    rows = np.stack(
-        [
-            u.Quantity(catalog[names[0]]).to_value(u.arcsec),
-            np.asarray(catalog[names[1]], float),
-            np.asarray(catalog[names[2]], float),
-            u.Quantity(catalog[names[3]]).to_value(u.rad),
-        ],
-        axis=1,
-    )
-    if "profile" in catalog.colnames:
-        rows[np.asarray(catalog["profile"]) != "sersic"] = np.nan
-    return rows
-
-
-def _pixels_per_arcsec(sky, wcs):
-    """Jacobian [dx, dy] = J @ [east, north] of a WCS at a position."""
-    x, y = wcs.world_to_pixel(sky)
-    columns = []
-    for angle in (90, 0):
-        moved = sky.directional_offset_by(angle * u.deg, 1 * u.arcsec)
-        columns.append(np.array(wcs.world_to_pixel(moved)) - [x, y])
-    return np.stack(columns, axis=1)

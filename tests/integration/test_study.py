@@ -137,7 +137,7 @@ def test_deleted_products_make_only_themselves_anew_with_the_same_bytes(study):
     )
     assert done.returncode == 0, done.stderr
     # a line for each stage, and none that rewrites itself
-    assert "7 of 19 steps to do" in done.stderr
+    assert "7 of 20 steps to do" in done.stderr
     assert "mosaic (2): " in done.stderr
     assert "\r" not in done.stderr
     assert "\x1b" not in done.stderr
@@ -237,7 +237,7 @@ def test_the_same_seed_gives_the_same_numbers_on_one_thread(study, tmp_path):
     code = """
 import sys
 from miricigale.workflow import StudyRunner, load_config, study_stages
-wanted = "catalog seds truth exposures mosaics highres kernels photometry".split()
+wanted = "catalog seds truth exposures mosaics highres kernels templates photometry".split()
 stages = [stage for stage in study_stages() if stage.name in wanted]
 config = load_config(sys.argv[1], overrides={"run": {"threads": 1}})
 StudyRunner(config, sys.argv[2], stages).run()

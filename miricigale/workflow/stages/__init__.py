@@ -120,13 +120,21 @@ def study_stages():
             kernels=("images", "photometry"),
         ),
         Stage(
+            "templates",
+            "measure:make_templates",
+            "templates of the sources",
+            needs=("highres",),
+            sections=("highres.filter", "highres.pixel_scale"),
+            kernels=("photometry",),
+        ),
+        Stage(
             "photometry",
             "measure:measure_photometry",
             "forced photometry",
-            needs=("mosaics", "highres", "kernels"),
+            needs=("mosaics", "kernels", "templates"),
             units=_filters,
             kernels=("photometry",),
-            version=2,
+            version=3,
         ),
         Stage(
             "points",

@@ -5,33 +5,38 @@ from concurrent.futures import ThreadPoolExecutor
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
-from photutils.segmentation import SegmentationImage
 
 from miricigale.evaluation import match_truth
 from miricigale.fitting import BayesFitter
-from miricigale.photometry import ErrorModel, ForcedPhotometer
+from miricigale.photometry import ErrorModel, ForcedPhotometer, SourceTemplates, join_bands
 from miricigale.photometry.error_model import fractional_error
-from miricigale.psf import MatchingKernel
+from miricigale.psf import MatchingKernel, hst_psf
 from miricigale.sed import SEDModel
-from miricigale.utils.meta import provenance
 from miricigale.utils.tables import error_column
-from miricigale.workflow.products import read_image
 from miricigale.workflow.stages.sample import add_selection, in_field
 
 __all__ = [
     "band_photometry",
     "fit_photometry",
     "make_errors",
+    "make_templates",
     "measure_photometry",
     "mock_photometry",
-    "read_segmentation",
 ]
 
 
-def read_segmentation(path):
-    """The segmentation that stage 9 wrote."""
-    _, labels = read_image(path, planes=["segmentation"])
-    return SegmentationImage(labels.astype(np.int32))
+def make_templates(context, _):
+    """Stage 11, once for all bands: what the detected sources look like on the prior."""
+    options = context.config.highres
+    _, labels = context.image("segm.fits", "segmentation")
+    templates = SourceTemplates.from_images(
+        context.image("f160w.fits"),
+        labels.astype(np.int32),
+        QTable.read(context.path("detections.ecsv")),
+        psf=hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec),
+        n_threads=context.n_threads,
+    )
+    context.save_result("templates.fits", templates)
 
 
 def measure_photometry(context, name):
@@ -40,9 +45,7 @@ def measure_photometry(context, name):
     # a constant takes up what faint sources and wings left in the background
     result = ForcedPhotometer(kernel, fit_background=True, n_threads=context.n_threads).measure(
         context.image(f"mosaic_{name}.fits"),
-        context.image("f160w.fits"),
-        read_segmentation(context.path("segm.fits")),
-        QTable.read(context.path("detections.ecsv")),
+        templates=SourceTemplates.read(context.path("templates.fits")),
     )
     table = result.to_table()
     context.save_table(f"photometry/{name}.ecsv", table)
@@ -52,17 +55,10 @@ def measure_photometry(context, name):
 
 def band_photometry(context, bands):
     """The photometry of all bands in one table, a row for each detection."""
-    joined = None
-    for name in bands:
-        table = QTable.read(context.path(f"photometry/{name}.ecsv"))
-        if joined is None:
-            joined = table["id", "sky"]
-        joined[name] = table["flux"]
-        joined[error_column(name)] = table["flux_err"]
-        joined[f"{name}_flags"] = table["flags"]
-    joined.meta.clear()
-    joined.meta.update(provenance(stage="photometry"))
-    return joined
+    columns = ["id", "sky", "flux", error_column("flux"), "flags"]
+    return join_bands(
+        {name: QTable.read(context.path(f"photometry/{name}.ecsv"))[columns] for name in bands}
+    )
 
 
 def make_errors(context, _):

@@ -1,0 +1,118 @@
+"""Several bands with the same sources: measured with the same templates, joined in one table."""
+
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+
+from miricigale.photometry.flags import ForcedFlags
+from miricigale.photometry.forced import ForcedPhotometer
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.meta import provenance
+from miricigale.utils.tables import error_column
+
+__all__ = ["join_bands", "measure_bands"]
+
+
+def measure_bands(images, kernels, templates, **options):
+    """
+    Measure the same sources on images of several bands.
+
+    Parameters
+    ----------
+    images : dict of str to `~astropy.nddata.CCDData`
+        The images by name of the filter.
+    kernels : dict of str to `~miricigale.psf.MatchingKernel` or `ForcedPhotometer`
+        From the high-resolution image to each of them, or what measures it.
+    templates : `SourceTemplates`
+        The sources.
+    **options
+        Options of the `ForcedPhotometer` for those bands whose kernel is given.
+
+    Returns
+    -------
+    results : dict of str to `ForcedPhotometryResult`
+        By name of the filter, in the order of the images; `join_bands` makes one table of them.
+
+    Raises
+    ------
+    ValueError, TypeError, `~astropy.units.UnitsError`
+        If a band has no kernel or an input does not fit; a note tells the band.
+    """
+    missing = sorted(set(images) ^ set(kernels))
+    if missing:
+        raise argument_error("kernels", "one for each image", f"not in both: {missing}")
+    results = {}
+    for name, image in images.items():
+        one = kernels[name]
+        try:
+            photometer = one if hasattr(one, "measure") else ForcedPhotometer(one, **options)
+            results[name] = photometer.measure(image, templates=templates)
+        except (ValueError, TypeError) as err:
+            err.add_note(f"in the band {name!r}")
+            raise
+    return results
+
+
+def join_bands(results):
+    """
+    Put the photometry of several bands in one table, by id.
+
+    Parameters
+    ----------
+    results : dict of str to `ForcedPhotometryResult` or `~astropy.table.QTable`
+        By name of the filter; tables as `ForcedPhotometryResult.to_table` makes them without
+        a name, or some of their columns.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        ``id`` and ``sky`` (of the first band that has it), and for each band ``<name>``,
+        ``<name>_err``, ``<name>_flags`` and so on. A row for each id that any band has, in the order
+        in which they come; where a band lacks it its flux is NaN and flagged ``NO_DATA``.
+
+    Raises
+    ------
+    ValueError
+        If there is no band.
+    """
+    if not results:
+        raise argument_error("results", "at least one band", "none")
+    tables = {
+        name: one if hasattr(one, "colnames") else one.to_table() for name, one in results.items()
+    }
+    rows = {}
+    for one in tables.values():
+        for k, key in enumerate(np.asarray(one["id"]).tolist()):
+            rows.setdefault(key, (one, k))
+    ids = list(rows)
+    sky = [one["sky"][k].icrs for one, k in rows.values()] if len(tables) > 1 else []
+    joined = QTable(meta=provenance(stage="photometry"))
+    first = next(iter(tables.values()))
+    joined["id"] = np.array(ids, dtype=np.asarray(first["id"]).dtype if not ids else None)
+    same = all(np.array_equal(one["id"], first["id"]) for one in tables.values())
+    joined["sky"] = first["sky"] if same else SkyCoord(sky)
+    for name, one in tables.items():
+        at = {key: k for k, key in enumerate(np.asarray(one["id"]).tolist())}
+        index = np.array([at.get(key, -1) for key in ids], int)
+        for column in one.colnames:
+            if column in ("id", "sky"):
+                continue
+            label = {"flux": name, error_column("flux"): error_column(name)}.get(
+                column, f"{name}_{column}"
+            )
+            joined[label] = _spread(one[column], index, column)
+            joined[label].info.description = one[column].info.description
+    return joined
+
+
+def _spread(values, index, column):
+    """The rows of a column, or what stands for one that is missing."""
+    if np.all(index >= 0):
+        return values[index].copy()
+    kind = np.asarray(values).dtype.kind
+    empty = {"f": np.nan, "b": False}.get(kind, "none" if kind == "U" else 0)
+    if column == "flags":
+        empty = int(ForcedFlags.NO_DATA)
+    found = np.where(index >= 0, np.asarray(values)[index], empty)
+    unit = getattr(values, "unit", None)
+    return found if unit is None else found * unit

@@ -1,0 +1,561 @@
+"""What sources look like on a high-resolution image: made once, used for every band."""
+
+import concurrent.futures
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+from photutils.psf import ImagePSF
+from photutils.segmentation import SegmentationImage
+
+from miricigale.photometry.arrays import image_arrays, pixel_scale
+from miricigale.photometry.cutouts import Cutout, own_segments, sersic_cutouts
+from miricigale.photometry.light import cutouts
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.meta import provenance
+from miricigale.utils.parallel import single_threaded, thread_count
+from miricigale.utils.tables import require_columns, unique_ids
+from miricigale.utils.units import ANGLE
+
+__all__ = ["SourceTemplates", "catalog_sources"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class SourceTemplates:
+    """
+    The sources of a catalogue and what each looks like, before it is brought to an image.
+
+    It does not depend on the image that is measured: made once from a high-resolution image it
+    serves every band (`ForcedPhotometer.measure`, `measure_bands`). Made by `from_images`,
+    `from_catalog` or `from_arrays`; those of different kinds are put together by `concatenate`.
+
+    Attributes
+    ----------
+    id : `~numpy.ndarray`, shape (n,)
+        Ids, each there once.
+    sky : `~astropy.coordinates.SkyCoord`, shape (n,)
+        Positions (ICRS).
+    light : tuple of `~miricigale.photometry.cutouts.Cutout` or None
+        Light of each source on the pixels of ``wcs``; None for points and for ``sersic``.
+    sersic : `~numpy.ndarray`, shape (n, 4)
+        Profiles that are not on pixels: half-light radius (arcsec), Sersic index, axis ratio and
+        position angle (rad); NaN for all others.
+    flags : int `~numpy.ndarray`, shape (n,)
+        See `ForcedFlags`: why a source is a point.
+    snr : `~numpy.ndarray`, shape (n,)
+        Signal-to-noise of the segments; NaN without one.
+    wcs : `~astropy.wcs.WCS` or None
+        The grid of ``light``, whose pixels are those of the matching kernels; None where no
+        source needs one.
+    psf : `~numpy.ndarray`, shape (k, k), or None
+        PSF of the high-resolution image, of unit sum.
+    flux : `~numpy.ndarray`, shape (n,), or None
+        The catalogue's fluxes, in whatever unit, which tell the crowded sources.
+    components : int `~numpy.ndarray`, shape (n,), or None
+        1, or 2 for sources that are fitted with a point on top of their template.
+    meta : dict
+        Settings and provenance.
+    """
+
+    id: np.ndarray
+    sky: SkyCoord
+    light: tuple
+    sersic: np.ndarray
+    flags: np.ndarray
+    snr: np.ndarray
+    wcs: object = None
+    psf: np.ndarray | None = None
+    flux: np.ndarray | None = None
+    components: np.ndarray | None = None
+    meta: dict = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        n = len(self.id)
+        object.__setattr__(self, "light", tuple(self.light))
+        shapes = {"sersic": (n, 4), **dict.fromkeys(("flags", "snr", *_OPTIONAL), (n,))}
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value is not None and np.shape(value) != shape:
+                raise argument_error(name, f"of shape {shape}", np.shape(value))
+        if len(self.light) != n or len(self.sky) != n:
+            lengths = f"{len(self.sky)} and {len(self.light)}"
+            raise argument_error("sky, light", f"{n} each, as many as ids", lengths)
+        if self.wcs is None and any(one is not None for one in self.light):
+            raise argument_error("wcs", "the grid that the light is on", "None")
+        unique_ids(self.id, "id")
+        for name in ("id", "sersic", "flags", "snr", "psf", *_OPTIONAL):
+            value = getattr(self, name)
+            if value is not None:
+                value = np.array(value)
+                value.flags.writeable = False
+                object.__setattr__(self, name, value)
+
+    @classmethod
+    def from_images(
+        cls,
+        highres,
+        segmentation,
+        catalog,
+        *,
+        psf,
+        template="auto",
+        min_snr=5.0,
+        wings=True,
+        n_threads=None,
+    ):
+        """
+        Look at the sources of a catalogue on a high-resolution image.
+
+        Parameters
+        ----------
+        highres : `~astropy.nddata.CCDData`
+            The image, in units of surface brightness, background subtracted, with WCS,
+            uncertainty and mask.
+        segmentation : `~photutils.segmentation.SegmentationImage` or array
+            Segments of ``highres``.
+        catalog : `~astropy.table.QTable`
+            Column ``sky``, and if there are ``id`` (1, 2, ... otherwise), ``label`` (the
+            segment; by default that at the position), ``flux`` (for the ``crowded`` flag).
+        psf : `~numpy.ndarray` or `~photutils.psf.ImagePSF`
+            PSF of ``highres``: an array on its pixels, odd, square and centred, or one of the
+            package's PSFs on the sky. For kernels that is their ``source``.
+        template : {"auto", "cutout"}, optional
+            ``"auto"`` decides for each source whether it is a point, a Sersic profile or what the
+            image shows; ``"cutout"`` takes the image wherever there is a segment.
+        min_snr : float, optional
+            Least signal-to-noise of a segment for ``"auto"``.
+        wings : bool, optional
+            Whether cutouts are carried on beyond their core by a profile; otherwise they are the
+            segments as they are.
+        n_threads : int, optional
+            Number of threads; by default one for each processor. It changes nothing in the
+            result.
+
+        Returns
+        -------
+        templates : `SourceTemplates`
+
+        Raises
+        ------
+        ValueError, TypeError, `~astropy.units.UnitsError`
+            If an input does not fit; the message says which.
+        """
+        if template not in ("auto", "cutout"):
+            raise argument_error("template", "'auto' or 'cutout'", repr(template))
+        if not min_snr >= 0:
+            raise argument_error("min_snr", "at least 0", min_snr)
+        known = catalog_sources(catalog)
+        n = len(known.id)
+        fine = image_arrays(highres, "highres")
+        segments = _segments(segmentation, fine.flux.shape)
+        scale = pixel_scale(highres.wcs)
+        psf = _psf_array(psf, scale)
+        xy = np.stack(highres.wcs.world_to_pixel(known.sky), axis=-1).reshape(-1, 2)
+        label, flags = own_segments(segments, known.label, xy)
+        n_threads = thread_count(n_threads)
+        with concurrent.futures.ThreadPoolExecutor(n_threads) as pool, single_threaded():
+            light, more, snr = cutouts(
+                fine.flux, fine.sigma**2, segments, label, xy, psf,
+                scale=scale, select=template == "auto", wings=wings,
+                min_snr=min_snr if template == "auto" else 0.0,
+                executor=pool if n_threads > 1 else None,
+            )  # fmt: skip
+        return cls(
+            **known.kept(), light=light, sersic=np.full((n, 4), np.nan),
+            flags=flags | more, snr=snr, wcs=highres.wcs, psf=psf,
+            meta=provenance(template=template, min_snr=float(min_snr), wings=bool(wings)),
+        )  # fmt: skip
+
+    @classmethod
+    def from_catalog(cls, catalog, *, template="psf", wcs=None):
+        """
+        Take what a catalogue says: points, or the Sersic profiles that it states.
+
+        Parameters
+        ----------
+        catalog : `~astropy.table.QTable`
+            As for `from_images`; for profiles with ``half_light_radius``, ``sersic_index``,
+            ``axis_ratio`` and ``position_angle``, and if there is one ``profile``: rows in
+            which it is not ``"sersic"`` are points.
+        template : {"psf", "sersic"}, optional
+            Which of the two.
+        wcs : `~astropy.wcs.WCS`, optional
+            A grid on which profiles are drawn; by default one that is north up about the
+            middle of each image that is measured.
+
+        Returns
+        -------
+        templates : `SourceTemplates`
+
+        Raises
+        ------
+        ValueError, TypeError, `~astropy.units.UnitsError`
+            If an input does not fit; the message says which.
+        """
+        if template not in ("psf", "sersic"):
+            raise argument_error("template", "'psf' or 'sersic'", repr(template))
+        known = catalog_sources(catalog)
+        n = len(known.id)
+        rows = _sersic_rows(catalog) if template == "sersic" else np.full((n, 4), np.nan)
+        return cls(
+            **known.kept(), light=(None,) * n, sersic=rows, flags=np.zeros(n, int),
+            snr=np.full(n, np.nan), wcs=wcs, meta=provenance(template=template),
+        )  # fmt: skip
+
+    @classmethod
+    def from_arrays(cls, arrays, corners, catalog, *, wcs, convolved=True, noise=None):
+        """
+        Take pictures of the sources that others made.
+
+        Parameters
+        ----------
+        arrays : sequence of `~numpy.ndarray` or None
+            Light of each source on the grid, of any total; None for a point.
+        corners : int array_like, shape (n, 2)
+            Pixel (y, x) of the grid, from 0, on which the first pixel of each array lies.
+        catalog : `~astropy.table.QTable`
+            As for `from_images`, without labels.
+        wcs : `~astropy.wcs.WCS`
+            The grid, whose pixels are those of the matching kernels.
+        convolved : bool or array_like of bool, shape (n,), optional
+            Whether arrays show the sources through the high-resolution PSF (as that image does)
+            or as they are, integrated over the pixels.
+        noise : array_like, shape (n,), optional
+            Sum of the variances of each array's noise, in units of its total squared: what
+            noise adds to a template's power, and is taken off.
+
+        Returns
+        -------
+        templates : `SourceTemplates`
+
+        Raises
+        ------
+        ValueError, TypeError
+            If an array has no positive total or values that are not finite, or numbers differ.
+        """
+        known = catalog_sources(catalog)
+        n = len(known.id)
+        arrays, corners = list(arrays), np.asarray(corners)
+        if len(arrays) != n or corners.shape != (n, 2) or corners.dtype.kind not in "iu":
+            got = f"{len(arrays)} arrays, corners {corners.dtype} of shape {corners.shape}"
+            raise argument_error("arrays, corners", f"{n} each, as many as sources", got)
+        convolved = np.broadcast_to(np.asarray(convolved, bool), n)
+        noise = np.zeros(n) if noise is None else np.asarray(noise, float)
+        if noise.shape != (n,) or not np.all(noise >= 0):
+            raise argument_error("noise", f"{n} numbers that are not negative", noise)
+        light = []
+        for k, one in enumerate(arrays):
+            data = None if one is None else np.asarray(one, float)
+            if data is not None:
+                total = data.sum() if data.ndim == 2 else np.nan
+                if not (np.isfinite(total) and total > 0):
+                    wanted = "two-dimensional, finite and of positive total"
+                    got = f"shape {data.shape} and total {total} of source {known.id[k]}"
+                    raise argument_error("arrays", wanted, got)
+                at = tuple(int(c) for c in corners[k])
+                data = Cutout(data / total, at, float(noise[k]), bool(convolved[k]))
+            light.append(data)
+        return cls(
+            **known.kept(), light=light, sersic=np.full((n, 4), np.nan),
+            flags=np.zeros(n, int), snr=np.full(n, np.nan), wcs=wcs,
+            meta=provenance(template="arrays"),
+        )  # fmt: skip
+
+    @classmethod
+    def concatenate(cls, parts):
+        """
+        Put templates of several kinds together, such as galaxies and stars.
+
+        Parameters
+        ----------
+        parts : sequence of `SourceTemplates`
+            On one grid, or without any; no id may be in two. Two sources may stand at one place,
+            such as a galaxy and a point in its middle.
+
+        Returns
+        -------
+        templates : `SourceTemplates`
+            Without ``flux`` and ``components`` unless all parts have them; ``meta`` is that of the
+            first part.
+
+        Raises
+        ------
+        ValueError
+            If there is no part, grids differ, or an id is there twice.
+        """
+        parts = list(parts)
+        if not parts:
+            raise argument_error("parts", "at least one SourceTemplates", "none")
+        grids = [one.wcs for one in parts if one.wcs is not None]
+        if any(not _same_grid(one, grids[0]) for one in grids[1:]):
+            raise argument_error("parts", "on one grid", "different ones")
+
+        def joined(name):
+            return np.concatenate([getattr(one, name) for one in parts])
+
+        psfs = [one.psf for one in parts if one.psf is not None]
+        meta = dict(parts[0].meta)
+        names = {str(one.meta.get("template")): None for one in parts}
+        meta["template"] = ", ".join(names)
+        return cls(
+            id=joined("id"),
+            sky=SkyCoord(*(np.concatenate([getattr(p.sky, c).deg for p in parts]) for c in _ANGLES), unit="deg"),
+            light=sum((one.light for one in parts), ()),
+            sersic=joined("sersic"), flags=joined("flags"), snr=joined("snr"),
+            wcs=grids[0] if grids else None, psf=psfs[0] if psfs else None,
+            **{
+                name: joined(name) for name in _OPTIONAL
+                if all(getattr(one, name) is not None for one in parts)
+            },
+            meta=meta,
+        )  # fmt: skip
+
+    def __len__(self):
+        return len(self.id)
+
+    def __getitem__(self, rows):
+        """Some of the sources, by a slice, a mask or an array of row numbers."""
+        rows = np.atleast_1d(np.arange(len(self))[rows])
+        return dataclasses.replace(
+            self,
+            light=tuple(self.light[k] for k in rows),
+            **{name: getattr(self, name)[rows] for name in ("id", "sky", "sersic", "flags", "snr")},
+            **{
+                name: getattr(self, name)[rows]
+                for name in _OPTIONAL
+                if getattr(self, name) is not None
+            },
+        )
+
+    def __repr__(self):
+        kinds, counts = np.unique(self.kind, return_counts=True)
+        found = ", ".join(f"{n} {kind}" for kind, n in zip(kinds, counts, strict=True))
+        return f"<SourceTemplates {len(self)} sources{': ' if found else ''}{found}>"
+
+    @property
+    def kind(self):
+        """``"point"``, ``"sersic"`` or ``"cutout"``, shape (n,)."""
+        kinds = np.full(len(self), "point", "U6")
+        kinds[np.isfinite(self.sersic[:, 0])] = "sersic"
+        for k, one in enumerate(self.light):
+            if one is not None:
+                kinds[k] = one.kind
+        return kinds
+
+    def drawn(self, grid, xy):
+        """
+        The light of all sources on a grid, Sersic profiles of the catalogue drawn.
+
+        Parameters
+        ----------
+        grid : `~astropy.wcs.WCS`
+            The grid, which must be ``wcs`` if that is not None.
+        xy : `~numpy.ndarray`, shape (n, 2)
+            Positions of the sources on it.
+
+        Returns
+        -------
+        light : list of `~miricigale.photometry.cutouts.Cutout` or None
+            None for points.
+        """
+        light = list(self.light)
+        rows = np.flatnonzero(np.isfinite(self.sersic[:, 0]))
+        if len(rows):
+            jacobian = _pixels_per_arcsec(self.sky[rows[0]], grid)
+            found = sersic_cutouts(self.sersic[rows], xy[rows], jacobian)
+            for k, one in zip(rows, found, strict=True):
+                light[k] = one
+        return light
+
+    def write(self, path, *, overwrite=False):
+        """
+        Write everything to a FITS file, from which `read` gets it back bit for bit.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        overwrite : bool, optional
+            Whether a file that is there is replaced.
+
+        Raises
+        ------
+        ValueError
+            If an id is text that FITS cannot hold, or the grid one that a header cannot.
+        """
+        from miricigale.photometry.source_files import write_templates
+
+        write_templates(self, path, overwrite=overwrite)
+
+    @classmethod
+    def read(cls, path):
+        """
+        Read templates that `write` made.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+
+        Returns
+        -------
+        templates : `SourceTemplates`
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If the file is missing, something else or incomplete.
+        """
+        from miricigale.photometry.source_files import read_templates
+
+        return read_templates(cls, path)
+
+    def __getstate__(self):
+        # a WCS pickles through a header, which rounds its numbers
+        from miricigale.photometry.source_files import grid_text
+
+        return {**self.__dict__, "wcs": None if self.wcs is None else grid_text(self.wcs)}
+
+    def __setstate__(self, state):
+        from miricigale.photometry.source_files import text_grid
+
+        wcs = None if state["wcs"] is None else text_grid(state["wcs"])
+        self.__dict__.update({**state, "wcs": wcs})
+
+
+_ANGLES = ("ra", "dec")
+
+#: Columns of the catalogue that need not be there.
+_OPTIONAL = ("flux", "components")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CatalogSources:
+    """
+    What a catalogue says of its sources.
+
+    Attributes
+    ----------
+    id : `~numpy.ndarray`, shape (n,)
+    sky : `~astropy.coordinates.SkyCoord`, shape (n,)
+        ICRS.
+    label, flux, components : `~numpy.ndarray`, shape (n,), or None
+        None where the catalogue has no such column.
+    """
+
+    id: np.ndarray
+    sky: SkyCoord
+    label: np.ndarray | None
+    flux: np.ndarray | None
+    components: np.ndarray | None
+
+    def kept(self):
+        """What templates keep of it, by name."""
+        return {name: getattr(self, name) for name in ("id", "sky", *_OPTIONAL)}
+
+
+def catalog_sources(catalog):
+    """
+    Read the columns of a catalogue.
+
+    Parameters
+    ----------
+    catalog : `~astropy.table.QTable`
+        With the column ``sky``.
+
+    Returns
+    -------
+    sources : `CatalogSources`
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is no table, has no ``sky``, an id twice, or a number of components other than 1 and 2.
+    """
+    if catalog is None or not hasattr(catalog, "colnames"):
+        raise argument_error("catalog", "a table with the column 'sky'", type(catalog).__name__)
+    require_columns(catalog, ["sky"], "catalog")
+    sky = catalog["sky"]
+    if not isinstance(sky, SkyCoord):
+        raise argument_error("catalog", "a table whose 'sky' is a SkyCoord", type(sky).__name__)
+    ids = np.arange(1, len(sky) + 1)
+    if "id" in catalog.colnames:
+        ids = unique_ids(catalog["id"], "catalog")
+    label = np.asarray(catalog["label"]) if "label" in catalog.colnames else None
+    flux = components = None
+    if "flux" in catalog.colnames:
+        flux = np.asarray(getattr(catalog["flux"], "value", catalog["flux"]), float)
+    if "components" in catalog.colnames:
+        components = np.asarray(catalog["components"])
+        if components.dtype.kind not in "iu" or not np.isin(components, (1, 2)).all():
+            found = np.unique(components)[:5].tolist()
+            raise argument_error("catalog", "a column 'components' of 1 and 2", f"{found}")
+    icrs = sky.icrs
+    sky = SkyCoord(icrs.ra.deg, icrs.dec.deg, unit="deg")
+    return CatalogSources(ids, sky, label, flux, components)
+
+
+def _segments(segmentation, shape):
+    segments = segmentation
+    if isinstance(segmentation, SegmentationImage):
+        segments = segmentation.data
+    segments = np.asarray(segments)
+    if segments.shape != shape or segments.dtype.kind not in "iu":
+        raise argument_error(
+            "segmentation",
+            f"integers of the shape {shape} of 'highres'",
+            f"{segments.dtype} of shape {segments.shape}",
+        )
+    return segments
+
+
+def _psf_array(psf, scale):
+    """A PSF on the pixels of the image, of unit sum."""
+    if isinstance(psf, ImagePSF):
+        from miricigale.psf import psf_image, psf_info
+
+        n = 2 * int(psf_info(psf, "psf").half_width / scale - 0.5 + 1e-6) + 1
+        psf = psf_image(psf, pixel_scale=scale * ANGLE, shape=n)
+    psf = np.asarray(psf, float)
+    if psf.ndim != 2 or psf.shape[0] != psf.shape[1] or psf.shape[0] % 2 == 0:
+        raise argument_error("psf", "an ImagePSF, or an array that is odd and square", psf.shape)
+    total = psf.sum()
+    if not (np.isfinite(total) and total > 0):
+        raise argument_error("psf", "finite and of positive sum", f"a sum of {total}")
+    return psf / total
+
+
+def _sersic_rows(catalog):
+    units = {"half_light_radius": u.arcsec, "position_angle": u.deg}
+    names = ["half_light_radius", "sersic_index", "axis_ratio", "position_angle"]
+    require_columns(catalog, names, "catalog", units=units)
+    rows = np.stack(
+        [
+            u.Quantity(catalog[names[0]]).to_value(u.arcsec),
+            np.asarray(catalog[names[1]], float),
+            np.asarray(catalog[names[2]], float),
+            u.Quantity(catalog[names[3]]).to_value(u.rad),
+        ],
+        axis=1,
+    )
+    if "profile" in catalog.colnames:
+        rows[np.asarray(catalog["profile"]) != "sersic"] = np.nan
+    return rows
+
+
+def _pixels_per_arcsec(sky, wcs):
+    """Jacobian [dx, dy] = J @ [east, north] of a WCS at a position."""
+    x, y = wcs.world_to_pixel(sky)
+    columns = []
+    for angle in (90, 0):
+        moved = sky.directional_offset_by(angle * u.deg, 1 * u.arcsec)
+        columns.append(np.array(wcs.world_to_pixel(moved)) - [x, y])
+    return np.stack(columns, axis=1)
+
+
+def _same_grid(one, other):
+    """Whether two WCSs put a square of pixels at the same places (to 1e-3 pixel)."""
+    x, y = np.array([0.0, 1000.0, 0.0, 1000.0]), np.array([0.0, 0.0, 1000.0, 1000.0])
+    found = other.world_to_pixel(one.pixel_to_world(x, y))
+    return bool(np.all(np.abs(np.array(found) - [x, y]) < 1e-3))

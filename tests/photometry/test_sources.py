@@ -1,0 +1,203 @@
+import pickle
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
+
+from miricigale.instrument import imager_wcs, north_up_wcs
+from miricigale.photometry import (
+    ForcedFlags,
+    ForcedPhotometer,
+    SourceTemplates,
+    detect_sources,
+    join_bands,
+    measure_bands,
+)
+from miricigale.photometry.source_files import grid_text, text_grid
+from miricigale.profiles import sersic_stamp
+from miricigale.psf import gaussian_psf
+from miricigale.utils.exceptions import DataError, MiricigaleWarning
+
+
+@pytest.fixture(scope="module")
+def scene(tools):
+    """Galaxies (Gaussians of known width) and points, on a prior and on two bands."""
+    rng = np.random.default_rng(5)
+    n = 16
+    grid = (np.arange(4) - 1.5) * 3.2
+    dx, dy = (a.ravel() + rng.uniform(-0.2, 0.2, n) for a in np.meshgrid(grid, grid))
+    sky = tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
+    size = np.where(np.arange(n) % 4 == 0, 0.0, rng.uniform(0.1, 0.25, n))
+    fine = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, (290, 290))
+    high = tools.render(sky, np.full(n, 20.0), np.hypot(size, tools.HI), fine, (290, 290))
+    sigma = 0.02 / (tools.FINE**2 * tools.SR * 1e12)
+    high = tools.as_ccd(high + rng.normal(0, sigma, high.shape), fine, sigma)
+    images, flux = {}, {}
+    for name, scale, shape in (("one", 0.11, (158, 158)), ("two", 0.07, (249, 249))):
+        flux[name] = 10 ** rng.uniform(0.5, 2, n)
+        wcs = north_up_wcs(tools.CENTER, scale * u.arcsec, shape)
+        light = tools.render(sky, flux[name], np.hypot(size, tools.LO), wcs, shape)
+        images[name] = tools.as_ccd(light + rng.normal(0, 1.0, shape), wcs, 1.0)
+    segmentation, detected = detect_sources(high, threshold=1.0, min_area=10)
+    assert len(detected) == n
+    templates = SourceTemplates.from_images(
+        high, segmentation, detected, psf=tools.kernel.source, n_threads=2
+    )
+    return high, segmentation, detected, templates, images, sky, flux
+
+
+def assert_same(one, other):
+    for name in ("id", "flags", "snr", "sersic", "psf"):
+        assert_array_equal(getattr(one, name), getattr(other, name))
+    assert_array_equal(one.sky.ra.deg, other.sky.ra.deg)
+    assert_array_equal(one.sky.dec.deg, other.sky.dec.deg)
+    for a, b in zip(one.light, other.light, strict=True):
+        assert (a is None) == (b is None)
+        if a is None:
+            continue
+        assert len(a.layers) == len(b.layers)
+        for first, second in zip(a.layers, b.layers, strict=True):
+            assert_array_equal(first.data, second.data)
+            assert first.data.dtype == second.data.dtype
+            kept = "origin", "noise", "convolved"
+            assert [getattr(first, k) for k in kept] == [getattr(second, k) for k in kept]
+
+
+@pytest.mark.parametrize("way", ["file", "pickle"])
+def test_templates_come_back_bit_for_bit(scene, tmp_path, way):
+    high, _, _, templates, *_ = scene
+    rest = SourceTemplates.from_images(*scene[:3], psf=templates.psf, template="cutout")
+    assert any(len(one.layers) > 1 for one in rest.light)
+    for one in (templates, rest):
+        if way == "file":
+            path = tmp_path / "templates.fits"
+            one.write(path, overwrite=True)
+            back = SourceTemplates.read(path)
+        else:
+            back = pickle.loads(pickle.dumps(one))
+        assert_same(one, back)
+        assert back.meta == one.meta
+        x = np.array([0.0, 100.0, 289.0])
+        assert_array_equal(
+            back.wcs.pixel_to_world_values(x, x[::-1]), high.wcs.pixel_to_world_values(x, x[::-1])
+        )
+
+
+def test_one_set_of_templates_serves_all_bands(tools, scene):
+    high, segmentation, detected, templates, images, sky, flux = scene
+    assert {"point", "sersic"} <= set(templates.kind)
+    results = measure_bands(images, {"one": tools.kernel, "two": tools.kernel}, templates)
+    for name, result in results.items():
+        alone = ForcedPhotometer(tools.kernel).measure(images[name], high, segmentation, detected)
+        assert_array_equal(result.flux.value, alone.flux.value)
+        assert_array_equal(result.flux_err.value, alone.flux_err.value)
+        assert_array_equal(result.template, alone.template)
+        index, _, _ = result.sky.match_to_catalog_sky(sky)
+        pull = (result.flux.value - flux[name][index]) / result.flux_err.value
+        assert np.abs(pull).max() < 5
+    table = join_bands(results)
+    assert list(table["id"]) == list(detected["id"])
+    assert_array_equal(table["two"].value, results["two"].flux.value)
+    assert table["one_err"].unit == u.uJy
+    # bands of different sources
+    some = {"one": results["one"].to_table()[3:], "two": results["two"].to_table()[:-2]}
+    table = join_bands(some)
+    assert list(table["id"]) == [*detected["id"][3:], *detected["id"][:3]]
+    assert np.isnan(table["one"][-3:]).all()
+    assert (table["one_flags"][-3:] == int(ForcedFlags.NO_DATA)).all()
+    assert_array_equal(table["two"][-3:].value, results["two"].flux[:3].value)
+    assert np.max(table["sky"].separation(detected["sky"][np.r_[3:16, :3]]).arcsec) < 1e-6
+
+
+def test_rows_off_the_image_change_nothing(tools, scene):
+    *_, templates, images, _, _ = scene
+    far = QTable({"id": [99], "sky": SkyCoord([0.0], [0.0], unit="deg")})
+    all_of = SourceTemplates.concatenate([templates, SourceTemplates.from_catalog(far)])
+    assert len(all_of) == 17
+    photometer = ForcedPhotometer(tools.kernel)
+    one = photometer.measure(images["one"], templates=templates)
+    other = photometer.measure(images["one"], templates=all_of)
+    assert_array_equal(one.flux.value, other.flux.value[:-1])
+    assert other.template[-1] == "none"
+    assert np.isnan(other.flux[-1])
+    # some of the rows, in another order
+    rows = np.array([5, 2, 9])
+    assert_same(templates[rows], all_of[rows])
+
+
+def test_components_of_one_source(tools):
+    # a galaxy with a point in its middle, each given by hand, on a noiseless image
+    wcs = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, (200, 200))
+    sky = SkyCoord([tools.CENTER.spherical_offsets_by(0.3 * u.arcsec, 0.1 * u.arcsec)])
+    x, y = (float(v[0]) for v in wcs.world_to_pixel(sky))
+    light, (y0, x0) = sersic_stamp(x=x, y=y, r_eff=5.0, n=1.0, axis_ratio=0.6, theta=0.4)
+    galaxy = SourceTemplates.from_arrays(
+        [7.0 * light], [(y0, x0)], QTable({"id": [1], "sky": sky}), wcs=wcs, convolved=False
+    )
+    point = SourceTemplates.from_catalog(QTable({"id": [2], "sky": sky}))
+    both = SourceTemplates.concatenate([galaxy, point])
+    assert both.kind.tolist() == ["sersic", "point"]
+    image = np.zeros((200, 200))
+    image[y0 : y0 + light.shape[0], x0 : x0 + light.shape[1]] = 30.0 * light / light.sum()
+    from scipy.ndimage import gaussian_filter
+
+    # pixels of the profile are means already, so that the PSF is narrower by a pixel's own width
+    width = np.sqrt((tools.LO / tools.FINE) ** 2 - 1 / 12)
+    image = gaussian_filter(image, width, truncate=8, mode="constant")
+    area = tools.FINE**2 * tools.SR * 1e12
+    image = image / area + tools.render(sky, [12.0], tools.LO, wcs, (200, 200))
+    result = ForcedPhotometer(tools.kernel).measure(tools.as_ccd(image, wcs, 0.01), templates=both)
+    assert_allclose(result.flux.value, [30.0, 12.0], rtol=2e-3)
+    assert result.covariance[0, 1] < 0
+
+
+def test_grids_survive_as_text(tools):
+    wcs = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, (290, 290))
+    turned = wcs.deepcopy()
+    turned.wcs.crval = [53.1 + 1e-13, -27.8 / 3]
+    turned.wcs.cd = (
+        0.06 / 3600 * np.array([[-np.cos(0.3), np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    )
+    turned.wcs.set()
+    x = np.array([0.0, 100.0, 289.0])
+    for one in (wcs, turned):
+        back = text_grid(grid_text(one))
+        assert_array_equal(
+            back.pixel_to_world_values(x, 3 * x), one.pixel_to_world_values(x, 3 * x)
+        )
+    distorted = imager_wcs(tools.CENTER, 71 * u.deg)
+    back = text_grid(grid_text(distorted)).pixel_to_world_values(x, x)
+    assert_allclose(back, distorted.pixel_to_world_values(x, x), rtol=0, atol=1e-9)
+
+
+def test_what_does_not_fit_is_refused(tools, scene, tmp_path):
+    high, segmentation, detected, templates, images, *_ = scene
+    photometer = ForcedPhotometer(tools.kernel)
+    with pytest.raises(ValueError, match="'templates' must be given alone"):
+        photometer.measure(images["one"], catalog=detected, templates=templates)
+    with pytest.raises(TypeError, match="'templates' must be SourceTemplates"):
+        photometer.measure(images["one"], templates=detected)
+    coarse = north_up_wcs(tools.CENTER, 0.03 * u.arcsec, (9, 9))
+    other = SourceTemplates.from_arrays([np.ones((3, 3))], [(0, 0)], detected[:1], wcs=coarse)
+    with pytest.raises(ValueError, match="'templates' must be on the kernel's pixels"):
+        photometer.measure(images["one"], templates=other)
+    with pytest.raises(ValueError, match="'parts' must be on one grid"):
+        SourceTemplates.concatenate([templates, other])
+    with pytest.raises(ValueError, match="'id' must be a table whose ids are unique"):
+        SourceTemplates.concatenate([templates, templates])
+    with pytest.raises(ValueError, match="'arrays' must be two-dimensional, finite"):
+        SourceTemplates.from_arrays([-np.ones((3, 3))], [(0, 0)], detected[:1], wcs=coarse)
+    with pytest.raises(ValueError, match="'psf' must be an ImagePSF, or an array that is odd"):
+        SourceTemplates.from_images(high, segmentation, detected, psf=np.ones((4, 4)))
+    with pytest.raises(ValueError, match="'kernels' must be one for each image"):
+        measure_bands(images, {"one": tools.kernel}, templates)
+    wide = gaussian_psf(0.5 * u.arcsec, pixel_scale=tools.FINE * u.arcsec, fov=3 * u.arcsec)
+    blurred = SourceTemplates.from_images(high, segmentation, detected, psf=wide)
+    with pytest.warns(MiricigaleWarning, match="is it of the same image"):
+        photometer.measure(images["one"], templates=blurred)
+    high.write(tmp_path / "image.fits")
+    with pytest.raises(DataError, match="not a complete file of templates"):
+        SourceTemplates.read(tmp_path / "image.fits")
