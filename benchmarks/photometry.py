@@ -1,8 +1,8 @@
 """
 Times forced photometry and tells how near to the truth it comes.
 
-    python benchmarks/photometry.py            speed, up to 100k sources
-    python benchmarks/photometry.py --quick    without the 100k
+    python benchmarks/photometry.py            speed, up to 100k points and 20k cutouts
+    python benchmarks/photometry.py --quick    up to 5k points and 2k cutouts
     python benchmarks/photometry.py --bands    accuracy with MIRI and HST PSFs
 """
 
@@ -15,10 +15,11 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.table import QTable
-from scipy.signal import fftconvolve
+from scipy.interpolate import RectBivariateSpline
+from scipy.signal import fftconvolve, oaconvolve
 
 from miricigale.instrument import north_up_wcs, pixel_area_map
-from miricigale.photometry import ErrorModel, ForcedPhotometer, detect_sources
+from miricigale.photometry import ErrorModel, ForcedPhotometer, SourceTemplates, detect_sources
 from miricigale.profiles import sersic_image
 from miricigale.psf import MatchingKernel, gaussian_psf, hst_psf, miri_psf, psf_mosaic
 from miricigale.utils.tables import match_sky
@@ -53,17 +54,31 @@ def point_scene(n, shape, scale, width, rng):
     return wcs, image, wcs.pixel_to_world(*xy.T), flux
 
 
-def speed(quick):
+def measured(label, n, size, scale, truth, work, *args, **kwargs):
+    """Do some work; print a line of its wall and processor seconds and its pulls."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    result = work(*args, **kwargs)
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    pull = ""
+    if truth is not None:
+        pull = (result.flux.value - truth) / result.flux_err.value
+        pull = f"{1.4826 * np.nanmedian(np.abs(pull)):6.3f}"
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    print(
+        f"{label:10s} {n:7d} {size:6d}^2 {scale:6.2f} {wall:7.2f}s {cpu:7.2f}s {pull:>6s} "
+        f"{memory:7.2f}GB",
+        flush=True,
+    )
+    return result
+
+
+def points(quick):
     kind = {"pixel_scale": FINE, "fov": 3.1 * u.arcsec}
     fwhm = 0.5
     kernel = MatchingKernel.from_psfs(
         gaussian_psf(0.2 * u.arcsec, **kind),
         gaussian_psf(fwhm * u.arcsec, **kind),
         pixel_scale=FINE,
-    )
-    print("point-source templates of 3 arcsec, errors with measured noise correlation")
-    print(
-        f"{'sources':>8s} {'image':>12s} {'scale':>6s} {'time':>7s} {'pull':>6s} {'peak memory':>11s}"
     )
     cases = [(20, 300, 0.11), (500, 1100, 0.11), (500, 2700, 0.06), (5000, 2700, 0.06)]
     if not quick:
@@ -75,12 +90,92 @@ def speed(quick):
         )
         image = mosaic(image, wcs, 1.0)
         catalog = QTable({"sky": sky})
-        t = time.perf_counter()
-        result = ForcedPhotometer(kernel, template="psf").measure(image, catalog=catalog)
-        t = time.perf_counter() - t
-        pull = np.nanstd((result.flux.value - flux) / result.flux_err.value)
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-        print(f"{n:8d} {size:6d}^2 {'':3s} {scale:6.2f} {t:6.2f}s {pull:6.3f} {memory:9.2f}GB")
+        photometer = ForcedPhotometer(kernel, template="psf")
+        measured("points", n, size, scale, flux, photometer.measure, image, catalog=catalog)
+
+
+def galaxy_field(n, side, kernel, rng):
+    """
+    Galaxies and points at random places: the prior, its segments, and the light through the wide PSF.
+
+    ``side`` is in arcsec; positions keep 4 arcsec from the edge.
+    """
+    size = round(side / FINE.value)
+    x, y = rng.uniform(4, side - 4, (2, n)) / FINE.value
+    high, flux = 10 ** rng.uniform(-0.7, 1.3, n), 10 ** rng.uniform(-0.5, 1.5, n)
+    shapes = [
+        sersic_image((121, 121), x=60, y=60, r_eff=rng.uniform(2, 7), n=rng.choice([1.0, 1.5, 2.5]),
+                     axis_ratio=rng.uniform(0.3, 1), theta=rng.uniform(0, np.pi))
+        for _ in range(64)
+    ]  # fmt: skip
+    shapes.append(np.zeros((121, 121)))
+    shapes[-1][60, 60] = 1.0
+    kinds = np.where(rng.random(n) < 0.2, 64, rng.integers(0, 64, n))
+    x, y = np.rint(x), np.rint(y)
+    images = []
+    for light, psf in ((high, kernel.source), (flux, kernel.target)):
+        image = np.zeros((size, size))
+        for k in range(n):
+            i, j = int(y[k]), int(x[k])
+            image[i - 60 : i + 61, j - 60 : j + 61] += light[k] * shapes[kinds[k]]
+        images.append(oaconvolve(image, psf, mode="same"))
+    wcs = north_up_wcs(CENTER, FINE, (size, size))
+    noise = 0.004
+    prior = images[0] + rng.normal(0, noise, (size, size))
+    return mosaic(prior, wcs, noise), images[1], wcs.pixel_to_world(x, y), flux
+
+
+def cutout_kernel():
+    hst = hst_psf("wfc3.f160w", pixel_scale=FINE)
+    target = psf_mosaic(miri_psf("miri.f770w"), FINE, 40 * u.deg)
+    return MatchingKernel.from_psfs(hst, target, pixel_scale=FINE, extent=6 * u.arcsec)
+
+
+def cutouts(quick):
+    kernel = cutout_kernel()
+    cases = [(610, 110, (0.11, 0.06)), (2000, 160, (0.11,))]
+    if not quick:
+        cases += [(26_000, 720, (0.11,))]
+    for n, side, scales in cases:
+        rng = np.random.default_rng(n)
+        prior, light, sky, flux = galaxy_field(n, side, kernel, rng)
+        segmentation, detected = detect_sources(prior, threshold=1.0, min_area=8)
+        index, _ = match_sky(detected["sky"], sky, radius=0.3 * u.arcsec)
+        truth = np.full(len(detected), np.nan)
+        truth[index[index >= 0]] = flux[index >= 0]
+        templates = measured(
+            "prior", len(detected), prior.shape[0], FINE.value, None,
+            SourceTemplates.from_images, prior, segmentation, detected, psf=kernel.source,
+        )  # fmt: skip
+        for scale in scales:
+            size = round(side / scale)
+            low = north_up_wcs(CENTER, scale * u.arcsec, (size, size))
+            step = scale / FINE.value
+            at = (np.arange(size) - (size - 1) / 2) * step + (light.shape[0] - 1) / 2
+            image = light
+            if step != 1:
+                image = RectBivariateSpline(*(np.arange(k) for k in light.shape), light)(at, at)
+                image *= step**2
+            sigma = 0.02 * step
+            image = mosaic(image + rng.normal(0, sigma, image.shape), low, sigma)
+            photometer = ForcedPhotometer(kernel, fit_background=True)
+            measured(
+                "band", len(detected), size, scale, truth,
+                photometer.measure, image, templates=templates,
+            )  # fmt: skip
+
+
+def speed(quick):
+    print(
+        "points: templates of 3 arcsec; prior: what sources look like, once for all bands; band: one"
+    )
+    print(
+        "band with those (6 arcsec and more). Errors with the measured noise correlation throughout."
+    )
+    names = f"{'':10s} {'sources':>7s} {'image':>8s} {'scale':>6s} {'wall':>8s} {'cpu':>8s}"
+    print(f"{names} {'pull':>6s} {'memory':>9s}")
+    points(quick)
+    cutouts(quick)
 
 
 def galaxies(n_side, spacing, rng):
