@@ -20,6 +20,7 @@ from miricigale.photometry.passes import fit_image
 from miricigale.photometry.sources import SourceTemplates, catalog_sources
 from miricigale.photometry.template_fit import FitSettings
 from miricigale.photometry.templates import FineTemplates, TemplateBank
+from miricigale.psf import KernelField
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.parallel import single_threaded, thread_count
 from miricigale.utils.units import ANGLE, to_array
@@ -36,10 +37,11 @@ class ForcedPhotometer:
 
     Parameters
     ----------
-    kernel : `~miricigale.psf.MatchingKernel`
+    kernel : `~miricigale.psf.MatchingKernel` or `~miricigale.psf.KernelField`
         From the high-resolution image's PSF (``source``) to the image's (``target``), on the
         pixels of the high-resolution image. ``target`` must be the PSF of the image that is
-        measured: that of a drizzled mosaic for a drizzled mosaic.
+        measured: that of a drizzled mosaic for a drizzled mosaic. With kernels of several places
+        each source has that of its own; shapes are fitted with the mean of the sources.
     template : {"auto", "cutout", "psf", "sersic"}, optional
         What sources look like. ``"auto"`` cuts them from the high-resolution image where a
         segment of enough signal-to-noise belongs to them, otherwise takes a point source.
@@ -130,8 +132,9 @@ class ForcedPhotometer:
     ):
         if template not in ("auto", "cutout", "psf", "sersic"):
             raise argument_error("template", "'auto', 'cutout', 'psf' or 'sersic'", repr(template))
+        mean = kernel.mean if isinstance(kernel, KernelField) else kernel
         for name in ("source", "target"):
-            if getattr(kernel, name, None) is None:
+            if getattr(mean, name, None) is None:
                 raise argument_error("kernel", f"a MatchingKernel with its {name}", "one without")
         _check_order("background_order", background_order, 4)
         if background_order and not fit_background:
@@ -149,7 +152,7 @@ class ForcedPhotometer:
         for name, value in (("max_shift", max_shift), ("radius", radius)):
             if value is not None and not float(to_array(value, ANGLE, name)) > 0:
                 raise argument_error(name, "positive", value)
-        self._kernel = kernel
+        self._given, self._kernel = kernel, mean
         self._template = template
         self._min_snr = float(min_snr)
         self._wings = bool(wings)
@@ -169,11 +172,11 @@ class ForcedPhotometer:
 
     @property
     def kernel(self):
-        """The matching kernel."""
-        return self._kernel
+        """The matching kernel, or the kernels of several places."""
+        return self._given
 
     def __repr__(self):
-        return f"<ForcedPhotometer template={self._template!r}, {self._kernel!r}>"
+        return f"<ForcedPhotometer template={self._template!r}, {self._given!r}>"
 
     def measure(self, image, highres=None, segmentation=None, catalog=None, *, templates=None):
         """
@@ -238,26 +241,14 @@ class ForcedPhotometer:
         return _Place(scale, margin, xy, np.flatnonzero(np.isfinite(xy[:, 0])))
 
     def _measure(self, arrays, sources, place, templates, filter_name, executor):
-        n, near, shape = len(sources.id), place.near, arrays.flux.shape
+        n, near = len(sources.id), place.near
         grid = templates.wcs
         if grid is None:
-            grid = fine_wcs(arrays.wcs, shape, self._kernel.pixel_scale.to_value(ANGLE))
-        fine_xy = np.stack(grid.world_to_pixel(templates.sky), axis=-1).reshape(-1, 2)
-        half = np.full(len(near), place.margin / 2)
-        poly = local_maps(place.xy[near], half, arrays.wcs, grid)
-        parts = templates.drawn(grid, fine_xy)
+            scale = self._kernel.pixel_scale.to_value(ANGLE)
+            grid = fine_wcs(arrays.wcs, arrays.flux.shape, scale)
+        bank = self._bank(arrays, place, templates, grid, executor)
         flags, snr, kinds = np.zeros(n, int), np.full(n, np.nan), np.full(n, "none", "U6")
         flags[near], snr[near], kinds[near] = templates.flags, templates.snr, templates.kind
-        sides = None
-        if self._integrate:
-            middle = np.array([[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
-            sides = local_maps(middle, [place.margin / 2], arrays.wcs, grid)[0, :, 1:3].T
-        fine = FineTemplates(self._kernel.array, self._kernel.target, sides)
-        radius = np.inf if self._radius is None else self._radius.value / place.scale
-        bank = TemplateBank(
-            fine, parts, fine_xy, place.xy[near], poly, shape,
-            radius=radius, max_bytes=self._max_bytes, executor=executor,
-        )  # fmt: skip
         settings = FitSettings(
             kernel=self._kernel,
             template=templates.meta.get("template", self._template),
@@ -285,6 +276,40 @@ class ForcedPhotometer:
         )
         fit, diagnostics, new_xy = fit_image(arrays, bank, settings, rows, grid)
         return package(fit, diagnostics, rows, new_xy, filter_name)
+
+    def _bank(self, arrays, place, templates, grid, executor):
+        """The templates of the sources that are on or near an image."""
+        shape, xy = arrays.flux.shape, place.xy[place.near]
+        fine_xy = np.stack(grid.world_to_pixel(templates.sky), axis=-1).reshape(-1, 2)
+        poly = local_maps(xy, np.full(len(xy), place.margin / 2), arrays.wcs, grid)
+        sides = None
+        if self._integrate:
+            middle = np.array([[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
+            sides = local_maps(middle, [place.margin / 2], arrays.wcs, grid)[0, :, 1:3].T
+        kernels, weigh = [self._kernel], None
+        if isinstance(self._given, KernelField):
+            kernels = self._given.kernels
+
+            def weigh(xy):
+                return self._given.weights(arrays.wcs.pixel_to_world(*xy.T).icrs)
+
+        fine = FineTemplates(
+            np.stack([one.array for one in kernels]),
+            np.stack([one.target for one in kernels]),
+            sides,
+        )
+        return TemplateBank(
+            fine,
+            templates.drawn(grid, fine_xy),
+            fine_xy,
+            xy,
+            poly,
+            shape,
+            radius=np.inf if self._radius is None else self._radius.value / place.scale,
+            max_bytes=self._max_bytes,
+            weigh=weigh,
+            executor=executor,
+        )
 
     def _templates(self, highres, segmentation, catalog):
         """The templates that the settings ask for."""

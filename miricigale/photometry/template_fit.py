@@ -198,13 +198,8 @@ class TemplateFit:
 
     def _full_light(self):
         """Light of a whole template, within the radius to which they are cut."""
-        target = self.settings.kernel.target
-        if not np.isfinite(self._radius):
-            return target.sum()
-        fine = self.settings.kernel.pixel_scale.to_value(ANGLE)
-        half = min(int(self._radius * self.scale / fine), target.shape[0] // 2)
-        middle = target.shape[0] // 2
-        return target[middle - half : middle + half + 1, middle - half : middle + half + 1].sum()
+        half = self._radius * self.scale / self.settings.kernel.pixel_scale.to_value(ANGLE)
+        return self.bank.full_light(half)[:, None]
 
     def _find_shift(self, plain, shift):
         limit = self.settings.max_shift.value / self.scale

@@ -23,8 +23,9 @@ class FineTemplates:
 
     Attributes
     ----------
-    kernel, target : `~numpy.ndarray`, odd and square
-        The matching kernel, and the PSF of the image on the fine grid.
+    kernel, target : `~numpy.ndarray`, shape (n, n) or (k, n, n), n odd
+        The matching kernel, and the PSF of the image on the fine grid; those of all places of
+        the field.
     sides : `~numpy.ndarray`, shape (2, 2), or None
         Sides of the image's pixel in fine pixels, if templates are to be averaged over it.
     """
@@ -33,6 +34,11 @@ class FineTemplates:
     target: np.ndarray
     sides: np.ndarray | None = None
 
+    def __post_init__(self):
+        for name in ("kernel", "target"):
+            value = np.asarray(getattr(self, name), float)
+            object.__setattr__(self, name, value.reshape(-1, *value.shape[-2:]))
+
     def _response(self, shape):
         response = 1.0 / _core.spline_response(shape)
         if self.sides is not None:
@@ -40,39 +46,80 @@ class FineTemplates:
         return response
 
     @functools.cached_property
-    def point(self):
-        """Coefficients of the point source, shape (1, h, w), its centre in the middle."""
-        return convolve_padded(self.target, self._response)
+    def _points(self):
+        """Coefficients of the point source at each place, shape (k, h, w), its centre in the middle."""
+        return np.concatenate([convolve_padded(one, self._response) for one in self.target])
+
+    def points(self, weights):
+        """
+        Coefficients of point sources.
+
+        Parameters
+        ----------
+        weights : `~numpy.ndarray`, shape (n, k)
+            What each place's PSF counts for each source.
+
+        Returns
+        -------
+        coefficients : `~numpy.ndarray`, shape (m, h, w)
+            The centre in the middle; one for all sources that are alike.
+        which : int `~numpy.ndarray`, shape (n,)
+            Which of them is that of each source.
+        """
+        if len(self.target) == 1:
+            return self._points, np.zeros(len(weights), int)
+        alike, which = np.unique(weights, axis=0, return_inverse=True)
+        return np.tensordot(alike, self._points, axes=1), which.reshape(-1)
 
     @functools.cached_property
-    def kernel_power(self):
-        """Sum of squares of the kernel with the pixel's response."""
-        if self.sides is None:
-            return float(np.sum(self.kernel**2))
-        return float(np.sum(convolve_padded(self.kernel, self._sides_only) ** 2))
+    def _kernel_power(self):
+        """Sums of products of the kernels of two places, with the pixel's response, shape (k, k)."""
+        kernels = self.kernel
+        if self.sides is not None:
+            kernels = np.concatenate([convolve_padded(one, self._sides_only) for one in kernels])
+        flat = kernels.reshape(len(kernels), -1)
+        return flat @ flat.T
+
+    def kernel_power(self, weights):
+        """Sum of squares of each source's kernel with the pixel's response, shape (n,)."""
+        return np.einsum("nk,kl,nl->n", weights, self._kernel_power, weights)
 
     def _sides_only(self, shape):
         return _core.box_response(shape, self.sides)
 
-    @functools.lru_cache(maxsize=64)  # noqa: B019 - lives as long as one measurement
-    def _transfer(self, shape, convolved):
+    @functools.lru_cache(maxsize=256)  # noqa: B019 - lives as long as one measurement
+    def _transfer(self, shape, convolved, place):
         if convolved:
-            return scipy.fft.rfft2(self.kernel, s=shape) * self._response(shape)
+            return scipy.fft.rfft2(self.kernel[place], s=shape) * self._response(shape)
         # a profile is integrated over fine pixels already, which the PSF's samples are not
-        transfer = scipy.fft.rfft2(self.target, s=shape) * self._response(shape)
+        transfer = scipy.fft.rfft2(self.target[place], s=shape) * self._response(shape)
         return transfer / _core.box_response(shape, np.eye(2))
+
+    def _transfers(self, shape, convolved, weights):
+        """The transform for each of some sources, or for all if they are alike."""
+        used = np.flatnonzero(weights.any(axis=0))
+        found = [self._transfer(shape, convolved, int(k)) for k in used]
+        if len(used) == 1:
+            return found[0]
+        return sum(w[:, None, None] * one for w, one in zip(weights.T[used], found, strict=True))
+
+    def light_within(self, half):
+        """Light of each place's PSF within some pixels of the middle, shape (k,)."""
+        middle = self.target.shape[1] // 2
+        cut = slice(middle - int(min(half, middle)), middle + int(min(half, middle)) + 1)
+        return self.target[:, cut, cut].sum(axis=(1, 2))
 
     def shape(self, cutout):
         """Shape of the transform for a cutout, rounded up so that many share it."""
         array = self.kernel if cutout.convolved else self.target
         return tuple(
             scipy.fft.next_fast_len(-(-(n + m - 1 + 2 * RIM) // 16) * 16, True)
-            for n, m in zip(cutout.data.shape, array.shape, strict=True)
+            for n, m in zip(cutout.data.shape, array.shape[1:], strict=True)
         )
 
     def corner(self, cutout):
         """Fine pixel (y, x) of the first coefficient of a convolved cutout."""
-        half = (self.kernel if cutout.convolved else self.target).shape[0] // 2
+        half = (self.kernel if cutout.convolved else self.target).shape[1] // 2
         return cutout.origin[0] - half - RIM, cutout.origin[1] - half - RIM
 
     def sides_of(self, cutout):
@@ -81,16 +128,17 @@ class FineTemplates:
         array = self.kernel if cutout.convolved else self.target
         h, w = cutout.data.shape
         first = np.array([x, y]) + RIM - 1.0
-        return first, first + [w + array.shape[1], h + array.shape[0]]
+        return first, first + [w + array.shape[2], h + array.shape[1]]
 
-    def coefficients(self, group, shape):
+    def coefficients(self, group, shape, weights):
         """Convolve cutouts of one shape, returning an array of shape (n, *shape)."""
         size = np.max([cutout.data.shape for cutout in group], axis=0) + RIM
         stamps = np.zeros((len(group), *size))
         for stamp, cutout in zip(stamps, group, strict=True):
             h, w = cutout.data.shape
             stamp[RIM : RIM + h, RIM : RIM + w] = cutout.data
-        return _core.convolve_batch(stamps, self._transfer(shape, group[0].convolved), shape)
+        transfer = self._transfers(shape, group[0].convolved, weights)
+        return _core.convolve_batch(stamps, transfer, shape)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -173,6 +221,9 @@ class TemplateBank:
         Largest half-width of a stamp in image pixels.
     max_bytes : float, optional
         Memory for stamps; if they need more they are made anew whenever needed.
+    weigh : callable, optional
+        Called with positions on the image, shape (m, 2): what the kernel of each place counts there,
+        shape (m, k). Needed for several kernels.
     executor : `concurrent.futures.Executor`, optional
         Threads that the bank's `map` works with.
     """
@@ -188,9 +239,12 @@ class TemplateBank:
         *,
         radius=np.inf,
         max_bytes=1.5e9,
+        weigh=None,
         executor=None,
     ):
         self._fine, self._cutout = fine, cutout
+        self._weigh = weigh
+        self._weights = np.ones((len(cutout), 1)) if weigh is None else weigh(xy)
         self._fine_xy, self._xy, self._poly = fine_xy, xy, poly
         self._max_bytes, self._executor = max_bytes, executor
         box = self._boxes(shape, radius)
@@ -203,7 +257,7 @@ class TemplateBank:
         """Boxes on the image that hold the fine stamps, cut to the image."""
         fine, n = self._fine, len(self._cutout)
         low, high = np.empty((n, 2)), np.empty((n, 2))
-        half = fine.target.shape[0] // 2 + 1
+        half = fine.target.shape[1] // 2 + 1
         for k, cutout in enumerate(self._cutout):
             if cutout is None:
                 low[k] = self._fine_xy[k] - half
@@ -240,6 +294,7 @@ class TemplateBank:
             shape,
             radius=radius,
             max_bytes=self._max_bytes,
+            weigh=self._weigh,
             executor=self._executor,
         )
 
@@ -254,6 +309,7 @@ class TemplateBank:
             shape,
             radius=radius,
             max_bytes=self._max_bytes,
+            weigh=self._weigh,
             executor=self._executor,
         )
 
@@ -273,13 +329,13 @@ class TemplateBank:
 
     def noise_terms(self):
         """Sum over unit-weight pixels of the templates' variance, by row."""
-        terms = np.zeros(len(self.order))
-        for row, k in enumerate(self.order):
-            cutout = self._cutout[k]
-            if cutout is not None and cutout.noise > 0:
-                area = abs(np.linalg.det(self._poly[k, :, 1:3]))
-                terms[row] = cutout.noise * area * self._fine.kernel_power
-        return terms
+        noise = np.array([0.0 if one is None else one.noise for one in self._cutout])
+        area = np.abs(np.linalg.det(self._poly[:, :, 1:3]))
+        return (noise * area * self._fine.kernel_power(self._weights))[self.order]
+
+    def full_light(self, half):
+        """Light of a whole point source within some fine pixels of its middle, by row."""
+        return (self._weights @ self._fine.light_within(half))[self.order]
 
     def blocks(self):
         """Yield all templates in order, as `Block` of some tens of MB each."""
@@ -311,8 +367,7 @@ class TemplateBank:
         layers = [
             (row, one) for row, all_of in enumerate(cutout) if all_of for one in all_of.layers
         ]
-        point = fine.point
-        middle = (np.array(point.shape[2:0:-1]) - 1) / 2
+        weights = self._weights[sources]
 
         def add(coefficients, which, amplitude, rows, origin):
             # sums of a piece in double precision, where each stamp begins anew
@@ -328,17 +383,20 @@ class TemplateBank:
 
         def add_points(part):
             rows = np.intersect1d(points, np.arange(part.start, part.stop))
-            n = len(rows)
+            if len(rows) == 0:
+                return
+            point, which = fine.points(weights[rows])
+            middle = (np.array(point.shape[2:0:-1]) - 1) / 2
             origin = self._fine_xy[sources[rows]] - middle
-            add(point, np.zeros(n, int), np.ones(n), rows, origin)
+            add(point, which, np.ones(len(rows)), rows, origin)
 
         def add_cutouts(batch):
             (*shape, _, _), members = batch
             rows = np.array([layers[k][0] for k in members])
             group = [layers[k][1] for k in members]
             origin = np.array([fine.corner(one)[::-1] for one in group])
-            n = len(rows)
-            add(fine.coefficients(group, tuple(shape)), np.arange(n), np.ones(n), rows, origin)
+            found = fine.coefficients(group, tuple(shape), weights[rows])
+            add(found, np.arange(len(rows)), np.ones(len(rows)), rows, origin)
 
         self.map(add_points, block.parts())
         seen = (block.box[:, 2] > 0) & (block.box[:, 3] > 0)

@@ -13,6 +13,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "effects": ("EFFECTS", "cruciform_fraction"),
         "energy": ("encircled_energy", "fwhm", "psf_table", "radius_of_encircled_energy"),
         "field": ("grid_weights", "miri_psf_grid", "psf_at", "psf_grid"),
+        "kernel_field": ("KernelField",),
         "kernels": ("REGULARIZATIONS", "MatchingKernel"),
         "library": ("MIRI_PIXEL_SCALE", "hst_psf", "miri_psf"),
         "model": ("PSFInfo", "from_photutils", "make_psf", "psf_info", "read_psf"),

@@ -18,7 +18,7 @@ from miricigale.photometry import (
 )
 from miricigale.photometry.source_files import grid_text, text_grid
 from miricigale.profiles import sersic_stamp
-from miricigale.psf import gaussian_psf
+from miricigale.psf import KernelField, MatchingKernel, gaussian_psf
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 
 
@@ -201,3 +201,63 @@ def test_what_does_not_fit_is_refused(tools, scene, tmp_path):
     high.write(tmp_path / "image.fits")
     with pytest.raises(DataError, match="not a complete file of templates"):
         SourceTemplates.read(tmp_path / "image.fits")
+
+
+def test_psf_that_changes_over_the_field(tools):
+    # the width grows by a quarter from east to west: point sources and galaxies (Gaussians)
+    rng = np.random.default_rng(11)
+    shape = (190, 420)
+    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, shape)
+
+    def width(x):
+        return 0.22 + 0.055 * np.asarray(x) / (shape[1] - 1)
+
+    x = np.tile(np.linspace(20, 400, 12), 5) + rng.uniform(-3, 3, 60)
+    y = np.repeat(np.linspace(20, 170, 5), 12) + rng.uniform(-3, 3, 60)
+    sky, flux = wcs.pixel_to_world(x, y), 10 ** rng.uniform(1, 2, 60)
+    size = np.where(np.arange(60) % 2 == 0, 0.0, 0.2)
+    low = tools.render(sky, flux, np.hypot(width(x), size), wcs, shape)
+    low = tools.as_ccd(low, wcs, 0.01)
+    fine_shape = (350, 772)
+    fine = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, fine_shape)
+    sigma = 0.003 / (tools.FINE**2 * tools.SR * 1e12)
+    high = tools.render(sky, np.full(60, 20.0), np.hypot(tools.HI, size), fine, fine_shape)
+    high = tools.as_ccd(high + rng.normal(0, sigma, fine_shape), fine, sigma)
+    segmentation, _ = detect_sources(high, threshold=1.0, min_area=10)
+    templates = SourceTemplates.from_images(
+        high, segmentation, QTable({"sky": sky}), psf=tools.kernel.source
+    )
+    points = templates.kind == "point"
+    assert points.tolist() == (size == 0).tolist()
+
+    def kernel(at):
+        r = (np.arange(67) - 33) * tools.FINE
+        lo = np.exp(-0.5 * (r[:, None] ** 2 + r**2) / width(at) ** 2)
+        lo *= tools.FINE**2 / (2 * np.pi * width(at) ** 2)
+        return MatchingKernel.from_psfs(
+            tools.kernel.source, lo, pixel_scale=tools.FINE * u.arcsec, regularization=1e-4
+        )
+
+    nodes = np.linspace(0, shape[1] - 1, 5)
+    everywhere = [(a, b) for a in nodes for b in (0, 189)]
+    field = KernelField(
+        [kernel(a) for a, _ in everywhere], wcs.pixel_to_world(*np.array(everywhere).T)
+    )
+    result = ForcedPhotometer(field).measure(low, templates=templates)
+    assert_allclose(result.flux.value / flux, 1, atol=5e-3)
+    nearest = KernelField(field.kernels, field.sky, "nearest")
+    ratio = ForcedPhotometer(nearest).measure(low, templates=templates).flux.value / flux
+    # half a step of the width between two places
+    assert np.abs(ratio - 1).max() < 0.5 * 0.055 / 4 / 0.22 + 5e-3
+    # one kernel for all: a Gaussian of width t fitted to one of width s
+    middle = shape[1] / 2
+    ratio = ForcedPhotometer(kernel(middle)).measure(low, templates=templates).flux.value / flux
+    t2, s2 = width(middle) ** 2 + size**2, width(x) ** 2 + size**2
+    assert_allclose(ratio, 2 * t2 / (t2 + s2), atol=5e-3)
+    assert np.abs(ratio - 1).max() > 0.09
+    # all at one place, or all alike, are as one kernel
+    same = KernelField([kernel(middle)] * 3, field.sky[:3])
+    alike = ForcedPhotometer(same).measure(low, templates=templates).flux.value / flux
+    assert_allclose(alike, ratio, rtol=1e-7)
+    none = ForcedPhotometer(field).measure(low, templates=templates[:0])
+    assert len(none) == 0

@@ -1,0 +1,104 @@
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from numpy.testing import assert_allclose
+
+from miricigale.instrument import north_up_wcs
+from miricigale.psf import KernelField, MatchingKernel, gaussian_psf, psf_grid
+
+CENTER = SkyCoord(53.1, -27.8, unit="deg")
+KIND = {"pixel_scale": 0.06 * u.arcsec, "fov": 3 * u.arcsec}
+
+
+def kernel(fwhm):
+    return MatchingKernel.from_psfs(
+        gaussian_psf(0.2 * u.arcsec, **KIND),
+        gaussian_psf(fwhm * u.arcsec, **KIND),
+        pixel_scale=0.06 * u.arcsec,
+        regularization=1e-4,
+    )
+
+
+def places(*offsets):
+    east, north = np.array(offsets, float).T
+    return CENTER.spherical_offsets_by(east * u.arcmin, north * u.arcmin)
+
+
+KERNELS = [kernel(fwhm) for fwhm in (0.45, 0.5, 0.55, 0.6, 0.65)]
+
+
+def mean_place(weights, offsets):
+    return weights @ np.array(offsets, float)
+
+
+@pytest.mark.parametrize(
+    "offsets",
+    [[(0, 0), (2, 0), (0, 2), (2, 2), (1, 0.7)], [(0, 0), (1, 1), (2, 2), (3, 3), (5, 5)]],
+)
+def test_linear_weights_reproduce_the_position(offsets):
+    field = KernelField(KERNELS, places(*offsets))
+    rng = np.random.default_rng(1)
+    # inside, or on the line
+    inside = rng.uniform(0, 2, (30, 2))
+    if offsets[1] == (1, 1):
+        inside[:, 1] = inside[:, 0]
+    weights = field.weights(places(*inside))
+    assert_allclose(weights.sum(axis=1), 1)
+    assert (weights >= 0).all()
+    assert_allclose(mean_place(weights, offsets), inside, atol=2e-5)
+    # beyond, it is the nearest point of the rim
+    weights = field.weights(places((-3, -3), (-10, -10.1)))
+    assert_allclose(weights[0], [1, 0, 0, 0, 0], atol=1e-6)
+    assert_allclose(weights[1], [1, 0, 0, 0, 0], atol=1e-6)
+
+
+def test_nearest_and_ends():
+    offsets = [(0, 0), (2, 0), (0, 2), (2, 2), (1, 0.7)]
+    field = KernelField(KERNELS, places(*offsets), method="nearest")
+    weights = field.weights(places((0.3, 0.1), (1.9, 5), (1, 1)))
+    assert weights.tolist() == [[1, 0, 0, 0, 0], [0, 0, 0, 1, 0], [0, 0, 0, 0, 1]]
+    assert field.at(places((1, 1))[0]).array == pytest.approx(KERNELS[4].array)
+    alone = KernelField(KERNELS[:1], places((0, 0)))
+    assert alone.weights(places((4, 4), (0, 0))).tolist() == [[1], [1]]
+    assert field.weights(places((4, 4))[:0]).shape == (0, 5)
+
+
+def test_from_a_gridded_psf():
+    wcs = north_up_wcs(CENTER, 0.11 * u.arcsec, (1000, 1200))
+    xy = [(x, y) for x in (100, 1100) for y in (50, 950)]
+    fwhm = {100: 0.45, 1100: 0.55}
+    grid = psf_grid([gaussian_psf(fwhm[x] * u.arcsec, **KIND) for x, _ in xy], xy)
+    options = {"pixel_scale": 0.06 * u.arcsec, "regularization": 1e-4}
+    sharp = gaussian_psf(0.2 * u.arcsec, **KIND)
+    field = KernelField.from_psfs(sharp, grid, wcs=wcs, **options)
+    assert len(field) == 4
+    assert field.pixel_scale == 0.06 * u.arcsec
+    for x, width in fwhm.items():
+        made = field.at(wcs.pixel_to_world(x, 500.0))
+        assert_allclose(made.array, kernel(width).array, atol=1e-8)
+    middle = field.at(wcs.pixel_to_world(600.0, 300.0))
+    assert_allclose(middle.array, (kernel(0.45).array + kernel(0.55).array) / 2, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "text"),
+    [
+        ({"kernels": []}, ValueError, "'kernels' must be MatchingKernels, at least one"),
+        ({"sky": CENTER}, ValueError, "'sky' must be a SkyCoord of shape"),
+        ({"sky": places((0, 0), (0, 0))}, ValueError, "'sky' must be different places"),
+        ({"method": "cubic"}, ValueError, "'method' must be 'linear' or 'nearest'"),
+        ({"kernels": [KERNELS[0], KERNELS[1].array]}, ValueError, "'kernels' must be Matching"),
+        (
+            {"kernels": [KERNELS[0], MatchingKernel(np.eye(3), 0.06 * u.arcsec)]},
+            ValueError,
+            "'kernels' must be with their source",
+        ),
+    ],
+)
+def test_what_is_refused(change, error, text):
+    given = {"kernels": KERNELS[:2], "sky": places((0, 0), (1, 0)), **change}
+    with pytest.raises(error, match=text):
+        KernelField(**given)
+    with pytest.raises(TypeError, match="'lo' must be a photutils GriddedPSFModel"):
+        KernelField.from_psfs(None, gaussian_psf(0.5 * u.arcsec, **KIND), wcs=None)
