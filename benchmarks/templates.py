@@ -132,16 +132,18 @@ def measure(fields, **options):
         ratio = result.flux.value[index] / catalog["flux"][good] - 1
         rows.append(
             [ratio, result.template_snr[index], catalog["n"][good], kind, catalog["radius"][good],
-             catalog["q"][good]]
+             catalog["q"][good],
+             (result.flux.value[index] - catalog["flux"][good]) / result.flux_err.value[index]]
         )  # fmt: skip
     return [np.concatenate(column) for column in zip(*rows, strict=True)], seconds
 
 
 def table(columns):
     ratio, snr, index, kind = columns[:4]
-    print(f"{'':22s} {'n':>4s} {'median':>8s} {'scatter':>8s} {'p16':>7s} {'p84':>7s}  templates")
+    print(f"{'':22s} {'n':>4s} {'median':>8s} {'scatter':>8s} {'p16':>7s} {'p84':>7s}"
+          f" {'pulls: median, MAD, std':>20s}  templates")  # fmt: skip
     galaxy = index > 0
-    radius = columns[4]
+    radius, pull = columns[4], columns[6]
     cases = [(f"galaxies S/N {a}-{b}", galaxy & (snr >= a) & (snr < b))
              for a, b in ((5, 10), (10, 20), (20, 40), (40, 80), (80, 999))]  # fmt: skip
     cases += [(f"galaxies n {a}-{b}", galaxy & (snr >= 5) & (index >= a) & (index < b))
@@ -157,11 +159,14 @@ def table(columns):
         middle = np.median(r)
         scatter = 1.4826 * np.median(np.abs(r - middle))
         low, high = np.percentile(r, [16, 84])
+        p = pull[use & np.isfinite(ratio)]
+        width = 1.4826 * np.median(np.abs(p - np.median(p)))
+        pulls = f"{np.median(p):+6.2f} {width:6.2f} {p.std():6.2f}"
         kinds = ", ".join(
             f"{k} {c}" for k, c in zip(*np.unique(kind[use], return_counts=True), strict=True)
         )
         print(f"{name:22s} {len(r):4d} {100 * middle:+7.1f}% {100 * scatter:7.1f}% "
-              f"{100 * low:+6.1f}% {100 * high:+6.1f}%  {kinds}")  # fmt: skip
+              f"{100 * low:+6.1f}% {100 * high:+6.1f}% {pulls}  {kinds}")  # fmt: skip
 
 
 def main():

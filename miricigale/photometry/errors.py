@@ -11,7 +11,7 @@ from miricigale.photometry import _core
 from miricigale.photometry.templates import batches
 from miricigale.utils.parallel import chunks
 
-__all__ = ["LinearFit", "noise_correlation", "normal_matrix", "sandwich_matrix"]
+__all__ = ["LinearFit", "cross_matrix", "noise_correlation", "normal_matrix", "sandwich_matrix"]
 
 
 def noise_correlation(residual, usable, *, max_lag=8, clip=5.0, significance=3.0):
@@ -214,10 +214,20 @@ def sandwich_matrix(bank, inverse_sigma, correlation, images=()):
     correlation made once for each padded shape.
     """
     n = len(bank.order)
-    lag = correlation.shape[0] // 2
-    pairs = _core.find_pairs(bank.box, grow=lag)
+    pairs = _core.find_pairs(bank.box, grow=correlation.shape[0] // 2)
     products = np.zeros(len(pairs))
     diagonal, projection = np.empty(n), np.empty((n, len(images)))
+    spread = _spread_by(correlation, bank)
+    for block, white, mine in _walk(bank, inverse_sigma, pairs, products, spread):
+        rows = slice(block.first, block.last)
+        diagonal[rows] = _products(bank, white, mine, _own(block))
+        projection[rows] = _projected(bank, block, white[0], images)
+    return _gather(n, diagonal, pairs, products), projection
+
+
+def _spread_by(correlation, bank):
+    """A function that convolves the whitened stamps of a block with the noise's correlation."""
+    lag = correlation.shape[0] // 2
     kernel = np.asarray(correlation, np.float32)
 
     @functools.lru_cache(maxsize=64)
@@ -241,11 +251,58 @@ def sandwich_matrix(bank, inverse_sigma, correlation, images=()):
         bank.map(convolve, batches((fast[ny], fast[nx]) for ny, nx in shapes))
         return values, box, start
 
-    for block, white, mine in _walk(bank, inverse_sigma, pairs, products, spread):
-        rows = slice(block.first, block.last)
-        diagonal[rows] = _products(bank, white, mine, _own(block))
-        projection[rows] = _projected(bank, block, white[0], images)
-    return _gather(n, diagonal, pairs, products), projection
+    return spread
+
+
+def cross_matrix(bank, other, inverse_sigma, correlation=None):
+    """
+    Products of the whitened stamps of two banks.
+
+    Parameters
+    ----------
+    bank, other : `~miricigale.photometry.templates.TemplateBank`
+        Of n and m stamps.
+    inverse_sigma : `~numpy.ndarray`, shape (ny, nx)
+        1 / sigma, zero where masked.
+    correlation : `~numpy.ndarray`, optional
+        Covariance of the whitened noise by separation, with which the other bank's stamps are
+        convolved.
+
+    Returns
+    -------
+    matrix : `~scipy.sparse.csr_array`, shape (n, m)
+    """
+    rows, columns, values = [], [], []
+    spread = None if correlation is None else _spread_by(correlation, other)
+    for theirs in other.blocks():
+        right = (_whitened(other, theirs, inverse_sigma), theirs.box, theirs.start)
+        if spread is not None:
+            right = spread(theirs, right)
+        for mine in bank.blocks():
+            pairs = _overlaps(mine.box, right[1])
+            if len(pairs):
+                left = (_whitened(bank, mine, inverse_sigma), mine.box, mine.start)
+                values.append(_products(bank, left, right, pairs))
+                rows.append(pairs[:, 0] + mine.first)
+                columns.append(pairs[:, 1] + theirs.first)
+    shape = len(bank.order), len(other.order)
+    if not values:
+        return scipy.sparse.csr_array(shape)
+    where = (np.concatenate(rows), np.concatenate(columns))
+    return scipy.sparse.coo_array((np.concatenate(values), where), shape=shape).tocsr()
+
+
+def _overlaps(boxes, others):
+    """Pairs of two sets of boxes, the first sorted by its first row, that share pixels."""
+    found = []
+    tallest = boxes[:, 2].max(initial=0)
+    for j, (y0, x0, ny, nx) in enumerate(others):
+        low, high = np.searchsorted(boxes[:, 0], [y0 - tallest, y0 + ny])
+        y, x, h, w = boxes[low:high].T
+        seen = (y + h > y0) & (x < x0 + nx) & (x + w > x0) & (h > 0) & (ny > 0) & (nx > 0)
+        i = low + np.flatnonzero(seen)
+        found.append(np.stack([i, np.full(len(i), j)], axis=1))
+    return np.concatenate(found).astype(np.int32) if found else np.empty((0, 2), np.int32)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

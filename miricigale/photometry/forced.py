@@ -50,8 +50,8 @@ class ForcedPhotometer:
     min_snr : float, optional
         Least signal-to-noise of a segment for ``"auto"``.
     wings : bool, optional
-        Whether cutouts are carried on beyond their well-measured core, by their mean on
-        ellipses and then by the PSF; otherwise they are the segments as they are.
+        Whether cutouts are carried on beyond their well-measured core by a profile scaled to what is
+        seen; otherwise they are the segments as they are.
     fit_background : bool, optional
         Whether a background is fitted with the sources.
     background_order : int, optional
@@ -85,6 +85,15 @@ class ForcedPhotometer:
         Sources with less of their template's light on usable pixels are not measured.
     max_bytes : float, optional
         Memory for templates; beyond it they are made anew for each pass.
+    size_scatter : float or None, optional
+        Templates fitted to the high-resolution image (``"auto"`` and ``"cutout"`` with ``wings``) may
+        change as far as their fit leaves them open, and in size by this standard deviation of ln size,
+        since galaxies are not of one size in all bands. None takes them without error. Shapes that a
+        catalogue states always are.
+    psf_error : float, optional
+        Error of a point source's flux, as a fraction, by that of the image's PSF: about 0.8 of the
+        fractional error of its width. By default that of the kernel's encircled energy, for templates
+        that are images, and none for the others, which need the kernel's target only.
     n_threads : int, optional
         Number of threads; by default one for each processor. It changes nothing in the
         result.
@@ -99,6 +108,13 @@ class ForcedPhotometer:
     Normal equations in whitened form are factorised sparsely. Errors are the diagonal of
     H (A^T W C W A) H, where H is the inverse normal matrix and C the measured covariance
     of the noise; their scale is thus the one of the residuals, not that of the uncertainty.
+
+    Templates are not exact. The profile of each source is known up to the covariance of its fit to the
+    high-resolution image; at the image's resolution this is a few independent changes of its template,
+    which are fitted with the fluxes, each with a normal prior of the width it is known to. A bright source
+    thus finds its size in the image that is measured, a faint one keeps the high-resolution
+    image's, and errors (``flux_err_template``) are those of the two together. Changes that move no flux
+    by a tenth of its error are left out.
 
     Cutouts of noisy segments make the fit too faint, since the template's own noise adds to
     its power: that part (noise variance times the kernel's power) is taken off the diagonal.
@@ -128,6 +144,8 @@ class ForcedPhotometer:
         radius=None,
         min_coverage=0.05,
         max_bytes=1.5e9,
+        size_scatter=0.1,
+        psf_error=None,
         n_threads=None,
     ):
         if template not in ("auto", "cutout", "psf", "sersic"):
@@ -149,6 +167,9 @@ class ForcedPhotometer:
             raise argument_error("min_snr", "at least 0", min_snr)
         if not 0 < min_coverage < 1:
             raise argument_error("min_coverage", "between 0 and 1", min_coverage)
+        for name, value in (("size_scatter", size_scatter), ("psf_error", psf_error)):
+            if value is not None and not 0 <= value < 1:
+                raise argument_error(name, "from 0 to 1", value)
         for name, value in (("max_shift", max_shift), ("radius", radius)):
             if value is not None and not float(to_array(value, ANGLE, name)) > 0:
                 raise argument_error(name, "positive", value)
@@ -168,6 +189,8 @@ class ForcedPhotometer:
         self._radius = None if radius is None else u.Quantity(radius, ANGLE)
         self._min_coverage = float(min_coverage)
         self._max_bytes = float(max_bytes)
+        self._size_scatter = None if size_scatter is None else float(size_scatter)
+        self._psf_error = None if psf_error is None else float(psf_error)
         self._n_threads = thread_count(n_threads)
 
     @property
@@ -261,6 +284,8 @@ class ForcedPhotometer:
             radius=np.inf if self._radius is None else self._radius.value,
             components=self._components,
             second_pass=self._second_pass,
+            size_scatter=self._size_scatter,
+            psf_error=self._psf_error,
             positive=self._positive,
         )
         rows = CatalogRows(
@@ -271,6 +296,7 @@ class ForcedPhotometer:
             flags=flags,
             template=kinds,
             template_snr=snr,
+            fitted=templates.fitted,
             reference=sources.flux,
             double=None if sources.components is None else sources.components == 2,
         )

@@ -7,7 +7,7 @@ import scipy.ndimage
 
 from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.flags import ForcedFlags
-from miricigale.photometry.shapes import Shape, ShapeFitter
+from miricigale.photometry.shapes import Shape, ShapeFitter, not_fitted
 from miricigale.photometry.wings import adjust_wings
 from miricigale.profiles import sersic_stamp
 from miricigale.utils.parallel import parallel_map
@@ -70,6 +70,9 @@ def cutouts(
         ``NOISY_SEGMENT``, and ``NO_SEGMENT`` where the label is not on the image.
     snr : float `~numpy.ndarray`, shape (n,)
         Signal-to-noise of each segment; NaN without one.
+    fitted : `~numpy.ndarray` of `~miricigale.photometry.shapes.FITTED`, shape (n,)
+        The profiles, and how well they are known. Sources whose segment is too noisy have the shape that
+        is expected beforehand.
 
     Notes
     -----
@@ -83,8 +86,7 @@ def cutouts(
     """
     segments = _Segments.of(data, variance, segmentation)
     flags, snr = np.zeros(len(label), int), np.full(len(label), np.nan)
-    found = [None] * len(label)
-    chosen = []
+    found, fitted, chosen = [None] * len(label), not_fitted(len(label)), []
     for k, one in enumerate(label):
         if not 0 < one < len(segments.ratio) or segments.places[one - 1] is None:
             flags[k] = int(ForcedFlags.NO_SEGMENT) if one > 0 else 0
@@ -97,15 +99,18 @@ def cutouts(
     if not wings:
         for k in chosen:
             found[k] = _bare(data, variance, segments, label[k])
-        return found, flags, snr
+        return found, flags, snr, fitted
     lights = _Lights(data, variance, segments, source_psf, scale, select, executor)
     models = lights.fit([(label[k], xy[k]) for k in chosen])
     for k, model in zip(chosen, models, strict=True):
         if model is None:
             flags[k] = int(ForcedFlags.NOISY_SEGMENT)
         else:
-            found[k] = model.cutout
-    return found, flags, snr
+            found[k], fitted[k] = model.cutout, model.record
+    for k in np.flatnonzero(flags & int(ForcedFlags.NOISY_SEGMENT)):
+        shape = lights.fitter.unfitted(xy[k])
+        fitted[k] = shape.parameters, shape.covariance, shape.point, 1.0
+    return found, flags, snr, fitted
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -144,14 +149,21 @@ class _Model:
     """
     A fitted source: its stamp, profile and template (None for a point) of some total light.
 
-    ``others`` is the light on the stamp that was taken off before.
+    ``light`` is the profile's part of it, ``others`` that on the stamp that was taken off before.
     """
 
     around: tuple
     shape: Shape
     cutout: Cutout | None
     total: float = 1.0
+    light: float = 1.0
     others: np.ndarray | float = 0.0
+
+    @property
+    def record(self):
+        """What is kept of the fit."""
+        corner = [self.around[1].start, self.around[0].start, 0, 0, 0, 0]
+        return self.shape.parameters + corner, self.shape.covariance, self.shape.point, self.light
 
 
 class _Lights:
@@ -202,7 +214,7 @@ class _Lights:
         """The light of a model on its stamp."""
         size = tuple(s.stop - s.start for s in model.around)
         if model.cutout is None or model.cutout.rest is None:
-            return model.shape.flux * self.fitter.model(size, model.shape.parameters)
+            return model.shape.flux * self.fitter.profiles(size, model.shape.parameters)[0]
         corner = [s.start for s in model.around]
         profile, rest = model.cutout.layers
         origin = np.subtract(profile.origin, corner)
@@ -232,7 +244,7 @@ class _Lights:
         core = own & (self.snr[around] > _CORE_SNR)
         n = np.count_nonzero(core)
         if self.select:
-            model = shape.flux * self.fitter.model(weight.shape, shape.parameters)
+            model = shape.flux * self.fitter.profiles(weight.shape, shape.parameters)[0]
             excess = np.sum(((data - model) * weight)[core] ** 2) - n
             if excess < _EXCESS * np.sqrt(2 * max(n, 1)):
                 return _Model(around, shape, self._profile(shape, corner))
@@ -261,7 +273,7 @@ class _Lights:
             noise=float(self.variance[around][core].sum()) / total**2,
             rest=Cutout(rest / total, (around[0].start, around[1].start)),
         )
-        return _Model(around, shape, template, float(total))
+        return _Model(around, shape, template, float(total), shape.flux / total)
 
     def _profile(self, shape, corner, light=1.0):
         """A fitted profile on the fine grid, as far as the PSF reaches at least."""

@@ -13,7 +13,7 @@ __all__ = ["nonnegative_fluxes"]
 _PATIENCE, _STEPS = 3, 300
 
 
-def nonnegative_fluxes(fit):
+def nonnegative_fluxes(fit, n):
     """
     Solve a fit again under the condition that no flux is negative; common parameters are free.
 
@@ -21,6 +21,8 @@ def nonnegative_fluxes(fit):
     ----------
     fit : `~miricigale.photometry.errors.LinearFit`
         The fit without the condition.
+    n : int
+        How many of its unknowns are fluxes; those after them have no condition.
 
     Returns
     -------
@@ -45,9 +47,10 @@ def nonnegative_fluxes(fit):
     fewest, patience = len(flux) + 1, _PATIENCE
     for _ in range(_STEPS):
         wrong = np.where(fitted, flux * root, gradient / root) < -tolerance
+        wrong[n:] = False
         count = np.count_nonzero(wrong)
         if count == 0:
-            return np.maximum(flux, 0.0)
+            return np.maximum(flux[:n], 0.0)
         if count < fewest:
             fewest, patience = count, _PATIENCE
         elif patience > 0:
@@ -59,7 +62,7 @@ def nonnegative_fluxes(fit):
         gradient = fit.matrix @ flux + fit.border @ common - fit.rhs
     msg = f"no fluxes that are not negative were found in {_STEPS} steps: they are NaN"
     warnings.warn(msg, MiricigaleWarning, stacklevel=5)
-    return np.full(len(flux), np.nan)
+    return np.full(n, np.nan)
 
 
 def _solve(fit, fitted):

@@ -34,6 +34,8 @@ class CatalogRows:
         Positions on the image; NaN far outside.
     near : int `~numpy.ndarray`, shape (k,)
         The sources that have a template, in the order of the bank's sources.
+    fitted : `~numpy.ndarray` of `~miricigale.photometry.shapes.FITTED`, shape (k,)
+        What is known of the shapes of these.
     reference : `~numpy.ndarray` or None
         Fluxes that say who is crowded; None for those that are measured.
     double : bool `~numpy.ndarray` or None
@@ -47,6 +49,7 @@ class CatalogRows:
     flags: np.ndarray
     template: np.ndarray
     template_snr: np.ndarray
+    fitted: np.ndarray
     reference: np.ndarray | None = None
     double: np.ndarray | None = None
 
@@ -81,15 +84,21 @@ def package(fit, diagnostics, catalog, new_xy, filter_name=None):
     place, main = owner[fit.host[fit.bank.order]], fit.main
     common = np.full((n_columns, n_columns), np.nan)
     blending = np.full(len(place), np.nan)
-    flux, flux_err = np.full(n_all, np.nan), np.full(n_all, np.nan)
+    flux, flux_err = np.full(n_all, np.nan), np.full((4, n_all), np.nan)
     chi2, left = np.full(n_all, np.nan), np.full(n_all, np.nan)
     joint = scipy.sparse.csr_array((2 * n_all, 2 * n_all))
     if len(fit.rows):
-        found, common, blending[fit.rows] = fit.covariance(diagnostics.correlation)
-        joint = _by_source(found, place[fit.rows], main[fit.rows], n_all)
+        found = fit.covariance(diagnostics.correlation)
+        common, blending[fit.rows] = found.common, found.blending
+        terms = [
+            _by_source(one, place[fit.rows], main[fit.rows], n_all)
+            for one in (found.noise, found.template, _outer(found.psf, found.noise))
+        ]
+        joint = terms[0] + terms[1] + terms[2]
         measured = fit.rows[main[fit.rows]]
         flux[place[measured]] = fit.total[measured]
-        flux_err[place[measured]] = np.sqrt(joint.diagonal()[place[measured]])
+        for error, one in zip(flux_err, (joint, *terms), strict=True):
+            error[place[measured]] = np.sqrt(np.maximum(one.diagonal()[place[measured]], 0.0))
     flags, coverage = source_flags(fit, diagnostics, place, flux, blending)
     flags[:n] |= catalog.flags
     flags[n:] |= int(ForcedFlags.NOT_IN_CATALOG)
@@ -104,7 +113,10 @@ def package(fit, diagnostics, catalog, new_xy, filter_name=None):
         id=np.array(catalog.id),
         sky=catalog.sky,
         flux=flux[:n] * FNU,
-        flux_err=flux_err[:n] * FNU,
+        flux_err=flux_err[0, :n] * FNU,
+        flux_err_noise=flux_err[1, :n] * FNU,
+        flux_err_template=flux_err[2, :n] * FNU,
+        flux_err_psf=flux_err[3, :n] * FNU,
         covariance=joint[:n, :n],
         flags=flags[:n],
         coverage=coverage[:n],
@@ -132,11 +144,17 @@ def package(fit, diagnostics, catalog, new_xy, filter_name=None):
         positive = np.full(n_all, np.nan)
         if len(fit.rows):
             positive[place[fit.rows]] = 0.0
-            np.add.at(positive, place[fit.rows], nonnegative_fluxes(fit.fit))
+            np.add.at(positive, place[fit.rows], nonnegative_fluxes(*fit.solution))
         result = dataclasses.replace(result, flux_positive=positive[:n] * FNU)
     if not fit.settings.second_pass:
         return result
-    more = {"flux": flux, "flux_err": flux_err, "flags": flags, "coverage": coverage, "chi2": chi2}
+    more = {
+        "flux": flux,
+        "flux_err": flux_err[0],
+        "flags": flags,
+        "coverage": coverage,
+        "chi2": chi2,
+    }
     new = _new_sources(catalog, new_xy, fit.arrays.wcs, {k: v[n:] for k, v in more.items()})
     return dataclasses.replace(result, new_sources=new)
 
@@ -151,6 +169,13 @@ def _by_source(covariance, place, main, n):
     found = (gather @ covariance @ gather.T).tocsr()
     found.sort_indices()
     return found
+
+
+def _outer(error, pattern):
+    """Covariance of errors that go together, for the pairs of a pattern."""
+    coo = pattern.tocoo()
+    data = error[coo.row] * error[coo.col]
+    return scipy.sparse.coo_array((data, (coo.row, coo.col)), shape=pattern.shape).tocsr()
 
 
 def _components(fit, catalog, joint, place, n_all):
@@ -193,7 +218,7 @@ def _common(fit, covariance):
     found, errors = {}, np.sqrt(np.diag(covariance)) if len(covariance) else np.empty(0)
     if fit.settings.fit_background and fit.fit is not None:
         order, shape = fit.settings.background_order, fit.arrays.flux.shape
-        terms = fit.fit.common[: n_terms(order)]
+        terms = fit.common[: n_terms(order)]
         found["background"] = terms[0] * SURFACE_BRIGHTNESS
         found["background_err"] = errors[0] * SURFACE_BRIGHTNESS
         found["background_field"] = SmoothField(terms, shape, order)

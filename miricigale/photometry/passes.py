@@ -44,8 +44,10 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
         fit = TemplateFit(arrays, bank, settings)
     else:
         fit = fit_offsets(arrays, bank, settings, catalog)
+    # templates that may change hide some of the light of a point in their middle
+    double = np.flatnonzero(_double(fit, catalog))
+    fit.free_templates(catalog.fitted)
     diagnostics = diagnose(fit, catalog.xy)
-    double = np.flatnonzero(_double(fit, diagnostics, catalog))
     new_xy = np.empty((0, 2))
     if settings.second_pass:
         peaks = diagnostics.peaks.refined
@@ -56,13 +58,13 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
     return fit, diagnostics, new_xy
 
 
-def _double(fit, diagnostics, catalog):
+def _double(fit, catalog):
     """Which of the bank's sources get a second component."""
     if catalog.double is not None:
         return catalog.double[catalog.near]
     double = np.zeros(len(catalog.near), bool)
     if fit.settings.components == 2:
-        double[fit.bank.order] = diagnostics.poor
+        double[fit.bank.order] = diagnose(fit, catalog.xy).poor
     return double
 
 
@@ -97,5 +99,6 @@ def _refit(first, bank, double, new_xy, catalog, grid_wcs):
         step = np.clip(step[good], -limit, limit)
         new_xy[found.bank.order[rows[good]] - n - len(double)] += step
     found = fit()
+    found.free_templates(catalog.fitted)
     found.offset_map = first.offset_map
     return found, new_xy

@@ -70,8 +70,11 @@ class ForcedPhotometryResult:
         The catalogue's positions.
     flux, flux_err : `~astropy.units.Quantity`, shape (n,)
         Total fluxes and errors in uJy; NaN where not measured.
+    flux_err_noise, flux_err_template, flux_err_psf : `~astropy.units.Quantity`, shape (n,)
+        What the errors are the quadratic sum of: the noise of the image, what is not known of the
+        templates (their shapes, and the noise of the high-resolution image), and the PSF's error.
     covariance : `~scipy.sparse.csr_array`, shape (n, n)
-        In uJy^2, for pairs whose templates overlap; rows of sources that were not
+        In uJy^2, of all three terms, for pairs whose templates overlap; rows of sources that were not
         measured are empty.
     flags : int `~numpy.ndarray`, shape (n,)
         See `ForcedFlags`.
@@ -124,6 +127,9 @@ class ForcedPhotometryResult:
     sky: SkyCoord
     flux: u.Quantity
     flux_err: u.Quantity
+    flux_err_noise: u.Quantity
+    flux_err_template: u.Quantity
+    flux_err_psf: u.Quantity
     covariance: scipy.sparse.csr_array
     flags: np.ndarray
     coverage: np.ndarray
@@ -271,6 +277,12 @@ class ForcedPhotometryResult:
         columns = {
             flux: (self.flux, "Total flux"),
             error_column(flux): (self.flux_err, "1-sigma error of the flux"),
+            f"{error_column(flux)}_noise": (self.flux_err_noise, "Error by the image's noise"),
+            f"{error_column(flux)}_template": (
+                self.flux_err_template,
+                "Error by what is not known of the template",
+            ),
+            f"{error_column(flux)}_psf": (self.flux_err_psf, "Error by that of the PSF"),
             f"{prefix}flags": (self.flags, ForcedFlags.describe()),
             f"{prefix}snr": (self.snr, "Flux over error"),
             f"{prefix}crowded": (

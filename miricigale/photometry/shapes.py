@@ -7,11 +7,20 @@ import scipy.fft
 
 from miricigale.photometry import _core
 
-__all__ = ["Shape", "ShapeFitter"]
+__all__ = ["FITTED", "Shape", "ShapeFitter", "ShapeModels", "not_fitted"]
 
 #: What is known of shapes beforehand (mean and width): ln of the circularised half-light radius
 #: (arcsec), ln of the Sersic index, the two ellipticities, and the offset of the centre (pixels).
 _RADIUS, _INDEX, _ELLIPTICITY, _OFFSET = (np.log(0.2), 0.8), (np.log(1.8), 0.8), 0.6, 0.7
+
+_WIDTHS = (_OFFSET, _OFFSET, _RADIUS[1], _INDEX[1], _ELLIPTICITY, _ELLIPTICITY)
+
+#: What is kept of the profile fitted to a source: its parameters with x and y on the whole image, the
+#: covariance of ln flux and parameters, the probability of a point, and the profile's part of the
+#: light of the template. NaN where nothing is known.
+FITTED = np.dtype(
+    [("parameters", float, (6,)), ("covariance", float, (7, 7)), ("point", float), ("light", float)]
+)
 
 #: Largest number of steps, and the gain in chi^2 below which the fit ends.
 _STEPS, _GAIN = 25, 0.1
@@ -40,11 +49,14 @@ class Shape:
         As for `~miricigale.photometry._core.shape_models`.
     point : float
         Probability that the source is a point.
+    covariance : `~numpy.ndarray`, shape (7, 7)
+        Of ln flux and the parameters.
     """
 
     flux: float
     parameters: np.ndarray
     point: float
+    covariance: np.ndarray
 
     @property
     def axes(self):
@@ -63,21 +75,37 @@ class Shape:
         return np.hypot(along, across / axis_ratio)
 
 
-class ShapeFitter:
+def not_fitted(n):
     """
-    Fits light profiles through the PSF of an image.
+    Records of sources of whose shape nothing is known.
+
+    Parameters
+    ----------
+    n : int
+        Number of sources.
+
+    Returns
+    -------
+    fitted : `~numpy.ndarray` of `FITTED`, shape (n,)
+    """
+    found = np.empty(n, FITTED)
+    for name in FITTED.names:
+        found[name] = np.nan
+    return found
+
+
+class ShapeModels:
+    """
+    Draws light through a PSF.
 
     Parameters
     ----------
     psf : `~numpy.ndarray`, shape (k, k)
         PSF, odd and centred.
-    scale : float
-        Arcsec per pixel.
     """
 
-    def __init__(self, psf, scale):
+    def __init__(self, psf):
         self._psf = np.asarray(psf, float)
-        self._log_scale = np.log(scale)
         self._transforms = {}
 
     def _transform(self, size):
@@ -92,63 +120,25 @@ class ShapeFitter:
             self._transforms[size] = found
         return found
 
-    def fit(self, data, weight, xy, start=None):
+    def profiles(self, shape, parameters, derivatives=0):
         """
-        Fit a point and a Sersic profile.
+        A Sersic profile of unit light and its derivatives.
 
         Parameters
         ----------
-        data : `~numpy.ndarray`, shape (ny, nx)
-            Light of a stamp.
-        weight : `~numpy.ndarray`, shape (ny, nx)
-            Inverse of the noise, zero for pixels that do not count.
-        xy : (float, float)
-            Where the source is on the stamp.
-        start : `Shape`, optional
-            A profile to begin with; several sizes are tried without.
+        shape : (int, int)
+            Shape of the stamp.
+        parameters, derivatives
+            As for `~miricigale.photometry._core.shape_models`.
 
         Returns
         -------
-        shape : `Shape` or None
-            None where no profile of positive light fits.
+        images : `~numpy.ndarray`, shape (1 + derivatives, *shape)
         """
-        radius = (_RADIUS[0] - self._log_scale, _RADIUS[1])
-        mean = np.array([*xy, radius[0], _INDEX[0], 0.0, 0.0])
-        width = np.array([_OFFSET, _OFFSET, radius[1], _INDEX[1], _ELLIPTICITY, _ELLIPTICITY])
-        if start is None:
-            half, parameters = _HALF, mean.copy()
-            inner = self._stamp(data, weight, mean, half)
-            sizes = mean[2] + np.array(_STARTS)
-            costs = []
-            for parameters[2] in sizes:
-                costs.append(_amplitude(inner.models(parameters, 0)[0], inner)[1])
-            parameters[2] = sizes[int(np.argmin(costs))]
-        else:
-            half, parameters = _half_width(start.parameters), start.parameters
-            inner = self._stamp(data, weight, mean, half)
-        extended = _minimum(inner, parameters, mean, width, 6)
-        if extended is not None and start is None and _half_width(extended[1]) > half:
-            inner = self._stamp(data, weight, mean, _half_width(extended[1]))
-            extended = _minimum(inner, extended[1], mean, width, 6)
-        if extended is None or not extended[0] > 0:
-            return None
-        flux, parameters, evidence = extended
-        start = parameters.copy()
-        start[2] = -30.0
-        share = 0.0
-        # a point that is far worse in the same place need not be moved to the best one
-        if _amplitude(inner.models(start, 0)[0], inner)[1] < -2 * evidence + _FAR_BELOW:
-            point = _minimum(inner, start, mean, width, 2)
-            odds = np.inf if point is None else evidence - point[2]
-            share = 1.0 / (1.0 + np.exp(np.clip(odds, -50, 50)))
-        return Shape(flux, parameters, float(share))
-
-    def model(self, shape, parameters):
-        """Light of a profile of unit total through the PSF, on a stamp of some shape."""
         size = _period(shape)
         return _core.shape_models(
-            self._transform(size), size, shape, parameters, derivatives=0
-        )[0].astype(float)  # fmt: skip
+            self._transform(size), size, shape, parameters, derivatives=derivatives
+        )  # fmt: skip
 
     def convolve(self, images, origin, shape):
         """
@@ -182,6 +172,80 @@ class ShapeFitter:
         found = scipy.fft.irfft2(spectra, s=(size, size), overwrite_x=True)
         return found[:, rims[0] : rims[0] + shape[0], rims[1] : rims[1] + shape[1]]
 
+
+class ShapeFitter(ShapeModels):
+    """
+    Fits light profiles through the PSF of an image.
+
+    Parameters
+    ----------
+    psf : `~numpy.ndarray`, shape (k, k)
+        PSF, odd and centred.
+    scale : float
+        Arcsec per pixel.
+    """
+
+    def __init__(self, psf, scale):
+        super().__init__(psf)
+        self._log_scale = np.log(scale)
+
+    def fit(self, data, weight, xy, start=None):
+        """
+        Fit a point and a Sersic profile.
+
+        Parameters
+        ----------
+        data : `~numpy.ndarray`, shape (ny, nx)
+            Light of a stamp.
+        weight : `~numpy.ndarray`, shape (ny, nx)
+            Inverse of the noise, zero for pixels that do not count.
+        xy : (float, float)
+            Where the source is on the stamp.
+        start : `Shape`, optional
+            A profile to begin with; several sizes are tried without.
+
+        Returns
+        -------
+        shape : `Shape` or None
+            None where no profile of positive light fits.
+        """
+        mean, width = self._expected(xy), np.array(_WIDTHS)
+        if start is None:
+            half, parameters = _HALF, mean.copy()
+            inner = self._stamp(data, weight, mean, half)
+            sizes = mean[2] + np.array(_STARTS)
+            costs = []
+            for parameters[2] in sizes:
+                costs.append(_amplitude(inner.models(parameters, 0)[0], inner)[1])
+            parameters[2] = sizes[int(np.argmin(costs))]
+        else:
+            half, parameters = _half_width(start.parameters), start.parameters
+            inner = self._stamp(data, weight, mean, half)
+        extended = _minimum(inner, parameters, mean, width, 6)
+        if extended is not None and start is None and _half_width(extended[1]) > half:
+            inner = self._stamp(data, weight, mean, _half_width(extended[1]))
+            extended = _minimum(inner, extended[1], mean, width, 6)
+        if extended is None:
+            return None
+        flux, parameters, evidence, covariance = extended
+        start = parameters.copy()
+        start[2] = -30.0
+        share = 0.0
+        # a point that is far worse in the same place need not be moved to the best one
+        if _amplitude(inner.models(start, 0)[0], inner)[1] < -2 * evidence + _FAR_BELOW:
+            point = _minimum(inner, start, mean, width, 2)
+            odds = np.inf if point is None else evidence - point[2]
+            share = 1.0 / (1.0 + np.exp(np.clip(odds, -50, 50)))
+        return Shape(flux, parameters, float(share), covariance)
+
+    def _expected(self, xy):
+        return np.array([*xy, _RADIUS[0] - self._log_scale, _INDEX[0], 0.0, 0.0])
+
+    def unfitted(self, xy):
+        """What is known beforehand of a source at a position: the typical shape, or a point."""
+        widths = np.square([0.0, *_WIDTHS])
+        return Shape(np.nan, self._expected(xy), 0.5, np.diag(widths))
+
     def _stamp(self, data, weight, mean, half):
         """The pixels within ``half`` of the middle."""
         x, y = (round(float(c)) for c in mean[:2])
@@ -189,13 +253,11 @@ class ShapeFitter:
         cut = np.s_[y0 : y + half + 1, x0 : x + half + 1]
         shape = weight[cut].shape
         use = np.flatnonzero(weight[cut])
-        size = _period(shape)
-        psf = self._transform(size)
 
         def models(parameters, derivatives):
             shifted = np.array(parameters)
             shifted[:2] -= [x0, y0]
-            return _core.shape_models(psf, size, shape, shifted, derivatives=derivatives)
+            return self.profiles(shape, shifted, derivatives)
 
         inverse = weight[cut].ravel()[use]
         return _Stamp(models, use, inverse, data[cut].ravel()[use] * inverse, max(shape))
@@ -238,8 +300,9 @@ def _minimum(stamp, start, mean, width, n_free):
 
     Returns
     -------
-    flux, parameters, evidence
-        The evidence is Laplace's, without the light's prior; None if nothing is found.
+    flux, parameters, evidence, covariance
+        The evidence is Laplace's, without the light's prior; the covariance is that of ln flux and the
+        free parameters. None if nothing is found.
     """
     free = slice(0, n_free)
     precision = np.concatenate([[0.0], width[free] ** -2])
@@ -286,7 +349,12 @@ def _minimum(stamp, start, mean, width, n_free):
         if gained < _GAIN:
             break
     parameters, columns, flux, _, chi2 = best
-    sign, log_det = np.linalg.slogdet(curvature(columns))
-    if not (sign > 0 and np.isfinite(chi2)):
+    matrix = curvature(columns)
+    sign, log_det = np.linalg.slogdet(matrix)
+    if not (sign > 0 and np.isfinite(chi2) and flux > 0):
         return None
-    return flux, parameters, -0.5 * (chi2 + log_det - np.sum(np.log(precision[1:])))
+    evidence = -0.5 * (chi2 + log_det - np.sum(np.log(precision[1:])))
+    covariance = np.linalg.inv(matrix)
+    covariance[0] /= flux
+    covariance[:, 0] /= flux
+    return flux, parameters, evidence, covariance

@@ -9,6 +9,7 @@ from astropy.table import Table
 from astropy.wcs import WCS
 
 from miricigale.photometry.cutouts import Cutout
+from miricigale.photometry.shapes import FITTED, not_fitted
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits, write_fits
 from miricigale.utils.tables import ascii_ids
@@ -94,6 +95,8 @@ def write_templates(templates, path, *, overwrite):
     for name in ("sersic", "flags", "snr", "flux", "components"):
         if getattr(templates, name) is not None:
             table[name] = getattr(templates, name)
+    for name in FITTED.names:
+        table[f"fitted_{name}"] = templates.fitted[name]
     layers = [
         (row, one) for row, light in enumerate(templates.light) if light for one in light.layers
     ]
@@ -163,6 +166,9 @@ def read_templates(cls, path):
                     convolved=bool(rows["convolved"][k]),
                     rest=light[row],
                 )
+            fitted = not_fitted(len(table))
+            for name in FITTED.names:
+                fitted[name] = table[f"fitted_{name}"]
             return cls(
                 id=_native(table["id"]),
                 sky=SkyCoord(_native(table["ra"]), _native(table["dec"]), unit="deg"),
@@ -170,6 +176,7 @@ def read_templates(cls, path):
                 sersic=_native(table["sersic"]),
                 flags=_native(table["flags"]),
                 snr=_native(table["snr"]),
+                fitted=fitted,
                 **{k: _native(table[k]) for k in ("flux", "components") if k in table.colnames},
                 wcs=text_grid(header["GRID"]) if "GRID" in header else None,
                 psf=_native(hdus["PSF"].data) if "PSF" in hdus else None,

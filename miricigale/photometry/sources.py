@@ -12,6 +12,7 @@ from photutils.segmentation import SegmentationImage
 from miricigale.photometry.arrays import image_arrays, pixel_scale
 from miricigale.photometry.cutouts import Cutout, own_segments, sersic_cutouts
 from miricigale.photometry.light import cutouts
+from miricigale.photometry.shapes import not_fitted
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import single_threaded, thread_count
@@ -45,6 +46,9 @@ class SourceTemplates:
         See `ForcedFlags`: why a source is a point.
     snr : `~numpy.ndarray`, shape (n,)
         Signal-to-noise of the segments; NaN without one.
+    fitted : `~numpy.ndarray` of `~miricigale.photometry.shapes.FITTED`, shape (n,)
+        The profiles that were fitted to the sources and how well they are known, x and y on the grid;
+        NaN for templates that are taken without error.
     wcs : `~astropy.wcs.WCS` or None
         The grid of ``light``, whose pixels are those of the matching kernels; None where no
         source needs one.
@@ -64,6 +68,7 @@ class SourceTemplates:
     sersic: np.ndarray
     flags: np.ndarray
     snr: np.ndarray
+    fitted: np.ndarray | None = None
     wcs: object = None
     psf: np.ndarray | None = None
     flux: np.ndarray | None = None
@@ -73,7 +78,9 @@ class SourceTemplates:
     def __post_init__(self):
         n = len(self.id)
         object.__setattr__(self, "light", tuple(self.light))
-        shapes = {"sersic": (n, 4), **dict.fromkeys(("flags", "snr", *_OPTIONAL), (n,))}
+        if self.fitted is None:
+            object.__setattr__(self, "fitted", not_fitted(n))
+        shapes = {"sersic": (n, 4), **dict.fromkeys(("flags", "snr", "fitted", *_OPTIONAL), (n,))}
         for name, shape in shapes.items():
             value = getattr(self, name)
             if value is not None and np.shape(value) != shape:
@@ -84,7 +91,7 @@ class SourceTemplates:
         if self.wcs is None and any(one is not None for one in self.light):
             raise argument_error("wcs", "the grid that the light is on", "None")
         unique_ids(self.id, "id")
-        for name in ("id", "sersic", "flags", "snr", "psf", *_OPTIONAL):
+        for name in ("id", "sersic", "flags", "snr", "fitted", "psf", *_OPTIONAL):
             value = getattr(self, name)
             if value is not None:
                 value = np.array(value)
@@ -155,7 +162,7 @@ class SourceTemplates:
         label, flags = own_segments(segments, known.label, xy)
         n_threads = thread_count(n_threads)
         with concurrent.futures.ThreadPoolExecutor(n_threads) as pool, single_threaded():
-            light, more, snr = cutouts(
+            light, more, snr, fitted = cutouts(
                 fine.flux, fine.sigma**2, segments, label, xy, psf,
                 scale=scale, select=template == "auto", wings=wings,
                 min_snr=min_snr if template == "auto" else 0.0,
@@ -163,7 +170,7 @@ class SourceTemplates:
             )  # fmt: skip
         return cls(
             **known.kept(), light=light, sersic=np.full((n, 4), np.nan),
-            flags=flags | more, snr=snr, wcs=highres.wcs, psf=psf,
+            flags=flags | more, snr=snr, fitted=fitted, wcs=highres.wcs, psf=psf,
             meta=provenance(template=template, min_snr=float(min_snr), wings=bool(wings)),
         )  # fmt: skip
 
@@ -302,7 +309,7 @@ class SourceTemplates:
             id=joined("id"),
             sky=SkyCoord(*(np.concatenate([getattr(p.sky, c).deg for p in parts]) for c in _ANGLES), unit="deg"),
             light=sum((one.light for one in parts), ()),
-            sersic=joined("sersic"), flags=joined("flags"), snr=joined("snr"),
+            sersic=joined("sersic"), flags=joined("flags"), snr=joined("snr"), fitted=joined("fitted"),
             wcs=grids[0] if grids else None, psf=psfs[0] if psfs else None,
             **{
                 name: joined(name) for name in _OPTIONAL
@@ -320,7 +327,10 @@ class SourceTemplates:
         return dataclasses.replace(
             self,
             light=tuple(self.light[k] for k in rows),
-            **{name: getattr(self, name)[rows] for name in ("id", "sky", "sersic", "flags", "snr")},
+            **{
+                name: getattr(self, name)[rows]
+                for name in ("id", "sky", "sersic", "flags", "snr", "fitted")
+            },
             **{
                 name: getattr(self, name)[rows]
                 for name in _OPTIONAL

@@ -17,10 +17,13 @@ from miricigale.photometry.errors import (
     sandwich_matrix,
 )
 from miricigale.photometry.fields import legendre_terms
+from miricigale.photometry.free_templates import free_templates
+from miricigale.photometry.shapes import not_fitted
+from miricigale.photometry.template_changes import TemplateChanges
 from miricigale.utils.exceptions import MiricigaleWarning
 from miricigale.utils.units import ANGLE
 
-__all__ = ["FitSettings", "TemplateFit"]
+__all__ = ["Covariances", "FitSettings", "TemplateFit"]
 
 #: Size of the covariance's blocks and of the margin around them.
 _CORE, _HALO = 18.0 * u.arcsec, 6.0 * u.arcsec
@@ -59,6 +62,10 @@ class FitSettings:
         1, or 2 for a point on top of the templates of poor fits.
     second_pass : bool
         Whether peaks of the residual are fitted with the sources.
+    size_scatter : float or None
+        Standard deviation of ln size between the bands; None for templates without error.
+    psf_error : float or None
+        Error of a point source's flux by that of the PSF; None for that of the kernel.
     positive : bool
         Whether fluxes that are not negative are found too.
     """
@@ -74,7 +81,33 @@ class FitSettings:
     radius: float = np.inf
     components: int = 1
     second_pass: bool = False
+    size_scatter: float | None = None
+    psf_error: float | None = None
     positive: bool = False
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Covariances:
+    """
+    Errors of the fitted rows.
+
+    Attributes
+    ----------
+    noise, template : sparse array, shape (n, n)
+        By the image's noise, and by what is not known of the templates.
+    psf : `~numpy.ndarray`, shape (n,)
+        Errors by the PSF, which is the same for all.
+    common : `~numpy.ndarray`, shape (g, g)
+        Of the common parameters.
+    blending : `~numpy.ndarray`, shape (n,)
+        Formal error over that of the source alone.
+    """
+
+    noise: object
+    template: object
+    psf: np.ndarray
+    common: np.ndarray
+    blending: np.ndarray
 
 
 class TemplateFit:
@@ -117,6 +150,8 @@ class TemplateFit:
         The common parameters' images: the background's first, then those of the shift.
     fit : `~miricigale.photometry.errors.LinearFit` or None
         The solution; None without rows.
+    free : `~miricigale.photometry.free_templates.FreeTemplates` or None
+        The solution with templates that may change, after `free_templates`; its fluxes are ``flux`` then.
     shift : `~numpy.ndarray`, shape (2,), or None
         In arcsec.
     offset_map : `~miricigale.photometry.offsets.OffsetMap` or None
@@ -131,7 +166,7 @@ class TemplateFit:
         self._radius = settings.radius / self.scale
         self._data = arrays.flux * self.inverse_sigma
         self._background = self._background_columns() if settings.fit_background else []
-        self.shift = self.offset_map = None
+        self.shift = self.offset_map = self.free = None
         moved = np.zeros(2) if moved is None else moved
         self._solve(self._moved(bank, moved) if np.any(moved) else bank, [])
         if settings.max_shift is not None and settings.offset_order is None and len(self.rows):
@@ -154,7 +189,7 @@ class TemplateFit:
         matrix, projection, power, light = normal_matrix(
             bank, self.inverse_sigma, [self._data, *white]
         )
-        self.light = light / self._full_light()
+        self.light, self._power = light / self._full_light(), power
         diagonal = matrix.diagonal()
         rows = (self.light[:, 1] >= self.settings.min_coverage) & (diagonal > 0)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -180,6 +215,35 @@ class TemplateFit:
         self.flux = np.zeros(len(bank.order))
         if self.fit is not None:
             self.flux[self.rows] = self.fit.flux
+
+    def free_templates(self, fitted):
+        """
+        Let templates change as far as they are not known, and fit once more.
+
+        Parameters
+        ----------
+        fitted : `~numpy.ndarray` of `~miricigale.photometry.shapes.FITTED`, shape (k,)
+            What is known of the first sources of the bank; those after them are points.
+        """
+        if self.fit is None or self.settings.size_scatter is None:
+            return
+        known = not_fitted(len(self.bank.order))
+        known[: len(fitted)] = fitted
+        # a point on top of a template says more than whether the template is one
+        known[self.host[self.bank.order[self.pairs[:, 1]]]] = not_fitted(1)
+        self.free = free_templates(
+            self.fit,
+            self.bank,
+            self.rows,
+            known[self.bank.order[self.rows]],
+            TemplateChanges(
+                self.settings.kernel.source, self.settings.kernel.target, self.settings.size_scatter
+            ),
+            [one * self.inverse_sigma for one in (self.arrays.flux, *self.columns)],
+            self.inverse_sigma,
+        )
+        if self.free is not None:
+            self.flux[self.rows] = self.free.flux
 
     def _find_pairs(self, matrix, rows):
         """Tell which second components can be fitted beside the first."""
@@ -250,20 +314,36 @@ class TemplateFit:
         return np.sqrt(target.sum() / (2 * np.pi * target.max())) * fine / self.scale
 
     @property
+    def solution(self):
+        """The linear fit that the fluxes are from, and how many of its unknowns are fluxes."""
+        return (self.fit if self.free is None else self.free.fit), len(self.rows)
+
+    @property
+    def common(self):
+        """The common parameters, shape (g,)."""
+        return self.solution[0].common
+
+    @property
     def background(self):
         """The fitted background in uJy per pixel, shape (ny, nx); zero without."""
         level = np.zeros(self.arrays.flux.shape)
         if self.fit is not None:
-            for column, value in zip(self._background, self.fit.common, strict=False):
+            for column, value in zip(self._background, self.common, strict=False):
                 level += value * column
         return level
 
     def model(self):
         """The sources' model in uJy per pixel, without background."""
         image = np.zeros(self.arrays.flux.shape)
-        for block in self.bank.blocks():
-            flux = self.flux[block.first : block.last]
-            _core.add_model(image, block.values, block.box, block.start, flux)
+        layers = [(self.bank, self.flux)]
+        if self.free is not None:
+            flux = np.zeros(len(self.flux))
+            flux[self.rows], change = self.free.amplitudes
+            layers = [(self.bank, flux), (self.free.bank, change)]
+        for bank, flux in layers:
+            for block in bank.blocks():
+                part = flux[block.first : block.last]
+                _core.add_model(image, block.values, block.box, block.start, part)
         return image
 
     def residual(self, model):
@@ -294,26 +374,55 @@ class TemplateFit:
 
         Returns
         -------
-        covariance, common, blending
-            See `~miricigale.photometry.errors.LinearFit.covariance`.
+        covariances : `Covariances`
         """
+        n, g = len(self.rows), len(self.columns)
+        fit, free, xy = self.fit, self.free, self.bank.xy[self.rows]
+        if free is not None:
+            fit, xy = free.fit, np.concatenate([xy, free.xy])
         noise = None if correlation is None else self._sandwich(correlation)
-        found, common, blending = self.fit.covariance(
-            self.bank.xy[self.rows],
-            core=_CORE.value / self.scale,
-            halo=_HALO.value / self.scale,
-            noise=noise,
-        )
+        if noise is None and free is not None:
+            noise = (
+                (fit.matrix - scipy.sparse.diags_array(free.prior)).tocsr(),
+                fit.border,
+                fit.corner,
+            )
+        coo = self.fit.matrix.tocoo()
+        pattern = scipy.sparse.coo_array((coo.data, (coo.row, coo.col)), shape=fit.matrix.shape)
+        options = {
+            "core": _CORE.value / self.scale, "halo": _HALO.value / self.scale, "pattern": pattern
+        }  # fmt: skip
+        found, common, blending = fit.covariance(xy, noise=noise, **options)
+        found, blending = found[:n][:, :n], blending[:n]
+        template = scipy.sparse.csr_array((n, n))
+        if free is not None:
+            blending = blending * np.sqrt(free.alone())
+            filling = free.filling(self.fit.matrix)
+            nothing = np.zeros((len(fit.rhs), g)), np.zeros((g, g))
+            template, more, _ = fit.covariance(xy, noise=(filling, *nothing), **options)
+            template, common = template[:n][:, :n], common + more
         if len(self.pairs):
             # that of the sum of two components
             first, second = np.searchsorted(self.rows, self.pairs.T)
             filling = self.fit.matrix if noise is None else noise[0]
-            alone = np.sqrt(filling.diagonal()) / self.fit.matrix.diagonal()
+            alone = np.sqrt(filling.diagonal()[:n]) / self.fit.matrix.diagonal()
             both = np.array([found[i, j] for i, j in zip(first, second, strict=True)])
             variance = found.diagonal()
             blending[first] = np.sqrt(variance[first] + variance[second] + 2 * both) / alone[first]
             blending[second] = blending[first]
-        return found, common, blending
+        return Covariances(found, template, self._psf_errors()[self.rows], common, blending)
+
+    def _psf_errors(self):
+        """Errors of the fluxes of all rows by that of the PSF."""
+        kernel, fraction = self.settings.kernel, self.settings.psf_error
+        if fraction is None:
+            if self.settings.size_scatter is None:
+                return np.zeros(len(self.flux))
+            parts = self.bank.parts(np.arange(len(self.flux)))
+            image = np.array([one is not None and one.kind == "cutout" for one in parts], float)
+            fraction = image * np.max(np.abs(kernel.encircled_energy_error()))
+        point = np.sum(kernel.target**2) * (self.scale / kernel.pixel_scale.to_value(ANGLE)) ** 2
+        return fraction * np.minimum(self._power / point, 1.0) * np.abs(self.flux)
 
     def _sandwich(self, correlation):
         keep = self.rows
@@ -321,6 +430,10 @@ class TemplateFit:
         spread = [oaconvolve(w, correlation, mode="same") for w in white]
         middle, border = sandwich_matrix(self.bank, self.inverse_sigma, correlation, spread)
         middle, border = middle[keep][:, keep], border[keep]
+        if self.free is not None:
+            middle, border = self.free.sandwich(
+                self.bank, keep, self.inverse_sigma, correlation, middle, border, spread
+            )
         corner = np.array([[np.sum(a * b) for b in spread] for a in white])
         return middle, border, corner.reshape(len(white), len(white))
 

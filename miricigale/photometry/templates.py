@@ -246,7 +246,8 @@ class TemplateBank:
         self._weigh = weigh
         self._weights = np.ones((len(cutout), 1)) if weigh is None else weigh(xy)
         self._fine_xy, self._xy, self._poly = fine_xy, xy, poly
-        self._max_bytes, self._executor = max_bytes, executor
+        self._shape, self._radius = shape, radius
+        self._max_bytes, self.executor = max_bytes, executor
         box = self._boxes(shape, radius)
         self.order = np.argsort(box[:, 0], kind="stable")
         self.box = np.ascontiguousarray(box[self.order])
@@ -295,7 +296,7 @@ class TemplateBank:
             radius=radius,
             max_bytes=self._max_bytes,
             weigh=self._weigh,
-            executor=self._executor,
+            executor=self.executor,
         )
 
     def with_points(self, xy, poly, shape, radius):
@@ -310,12 +311,25 @@ class TemplateBank:
             radius=radius,
             max_bytes=self._max_bytes,
             weigh=self._weigh,
-            executor=self._executor,
+            executor=self.executor,
         )
+
+    def at_resolution(self, sources, cutout):
+        """Make the bank of cutouts that have the image's resolution, at some of the sources."""
+        one = np.ones((1, 1))
+        return TemplateBank(
+            dataclasses.replace(self._fine, kernel=one, target=one), cutout,
+            self._fine_xy[sources], self._xy[sources], self._poly[sources], self._shape,
+            radius=self._radius, max_bytes=self._max_bytes, executor=self.executor,
+        )  # fmt: skip
+
+    def parts(self, rows):
+        """The cutouts of some rows, None for points."""
+        return [self._cutout[k] for k in self.order[rows]]
 
     def map(self, function, parts):
         """Call a function with each of some independent pieces of work, on the bank's threads."""
-        parallel_map(function, parts, executor=self._executor)
+        parallel_map(function, parts, executor=self.executor)
 
     @property
     def xy(self):

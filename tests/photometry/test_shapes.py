@@ -132,7 +132,9 @@ def one_cutout(image, sigma, **options):
     options = {"scale": SCALE, "min_snr": 5.0, "wings": True} | options
     variance = np.full(image.shape, sigma**2)
     xy = np.array([[40.0, 40.0]])
-    parts, flags, _ = cutouts(image, variance, labels, np.array([1]), xy, gaussian_psf(), **options)
+    parts, flags, *_ = cutouts(
+        image, variance, labels, np.array([1]), xy, gaussian_psf(), **options
+    )
     assert flags[0] == 0
     return parts[0]
 
@@ -202,7 +204,7 @@ def test_wings_of_a_bulge_and_a_disk_are_what_is_seen():
     # a segment that ends where there is much light still
     labels = (truth > 25 * sigma).astype(int)
     variance, xy = np.full(shape, sigma**2), np.array([[80.0, 80.0]])
-    (cutout,), _, _ = cutouts(
+    (cutout,), *_ = cutouts(
         image, variance, labels, np.array([1]), xy, gaussian_psf(), scale=SCALE, min_snr=5.0, wings=True
     )  # fmt: skip
     assert cutout.kind == "cutout"
@@ -224,7 +226,7 @@ def test_neighbors_do_not_add_to_each_others_wings():
     bright = scipy.ndimage.gaussian_filter(image, 1.5) > sigma
     labels = np.where(bright, 1 + np.argmax(alone, axis=0), 0)
     variance = np.full(shape, sigma**2)
-    parts, flags, _ = cutouts(
+    parts, flags, *_ = cutouts(
         image, variance, labels, np.array([1, 2]), places, gaussian_psf(121), scale=SCALE,
         min_snr=5.0, wings=True,
     )  # fmt: skip

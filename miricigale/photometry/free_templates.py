@@ -1,0 +1,205 @@
+"""Templates that may change as far as they are not known, fitted together with the fluxes."""
+
+import dataclasses
+
+import numpy as np
+import scipy.sparse
+
+from miricigale.photometry.errors import (
+    LinearFit,
+    cross_matrix,
+    normal_matrix,
+    sandwich_matrix,
+)
+from miricigale.utils.parallel import parallel_map
+
+__all__ = ["FreeTemplates", "free_templates"]
+
+#: Changes of a template that move no flux by more than this many of its errors are left out.
+_LEAST = 0.1
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FreeTemplates:
+    """
+    Changes of templates as further columns of a fit, each with a Gaussian prior.
+
+    A change is scaled by the flux of its source, as far as it is one standard deviation; its light is
+    taken off the template, so that the fluxes stay those of all light.
+
+    Attributes
+    ----------
+    fit : `~miricigale.photometry.errors.LinearFit`
+        Of the fluxes, and after them of the changes.
+    bank : `~miricigale.photometry.templates.TemplateBank`
+        The changes.
+    light : sparse array, shape (n, m)
+        Light of each change, in the row of its source.
+    prior : `~numpy.ndarray`, shape (n + m,)
+        Inverse variances, zero for fluxes.
+    noise : `~numpy.ndarray`, shape (n,)
+        Variance of ln flux by noise in templates that are images.
+    """
+
+    fit: LinearFit
+    bank: object
+    light: object
+    prior: np.ndarray
+    noise: np.ndarray
+
+    @property
+    def flux(self):
+        """Fluxes, shape (n,)."""
+        return self.fit.flux[: len(self.noise)]
+
+    @property
+    def amplitudes(self):
+        """Of the templates and of the changes, shape (n,) and (m,)."""
+        change = self.fit.flux[len(self.noise) :]
+        return self.flux - self.light @ change, change
+
+    @property
+    def xy(self):
+        """Positions of the changes, shape (m, 2)."""
+        return self.bank.xy
+
+    def alone(self):
+        """What blending with its own changes leaves of each source's power, shape (n,)."""
+        n = len(self.noise)
+        matrix, left = self.fit.matrix.tocsr(), np.ones(n)
+        owner = self.light.tocoo()
+        owner = owner.row[np.argsort(owner.col)]
+        power = matrix.diagonal()
+        for k in np.unique(owner):
+            own = n + np.flatnonzero(owner == k)
+            side = matrix[own][:, [k]].toarray()[:, 0]
+            left[k] -= side @ np.linalg.solve(matrix[own][:, own].toarray(), side) / power[k]
+        return left
+
+    def filling(self, middle):
+        """
+        What the errors of the templates add to the right-hand side.
+
+        Parameters
+        ----------
+        middle : sparse array
+            Normal matrix of the templates, shape (n, n).
+
+        Returns
+        -------
+        filling : sparse array, shape (n + m, n + m)
+        """
+        filling = scipy.sparse.diags_array(self.prior).tocsr()
+        own = np.flatnonzero(self.noise > 0)
+        if len(own):
+            sides = middle.tocsc()[:, own] @ scipy.sparse.diags_array(
+                self.flux[own] * np.sqrt(self.noise[own])
+            )
+            block = (sides @ sides.T).tocoo()
+            n = len(self.prior)
+            filling = filling + scipy.sparse.coo_array(
+                (block.data, (block.row, block.col)), shape=(n, n)
+            )
+        return filling.tocsr()
+
+    def sandwich(self, bank, rows, inverse_sigma, correlation, middle, border, images):
+        """
+        Extend the sandwich of correlated noise.
+
+        Parameters
+        ----------
+        bank, rows
+            The templates, and those rows of theirs that were fitted.
+        inverse_sigma, correlation, images
+            As in `~miricigale.photometry.errors.sandwich_matrix`.
+        middle, border
+            That of the templates.
+
+        Returns
+        -------
+        middle, border
+            That of templates and changes.
+        """
+        own, more = sandwich_matrix(self.bank, inverse_sigma, correlation, images)
+        cross = cross_matrix(bank, self.bank, inverse_sigma, correlation).tocsr()[rows]
+        return _joined(middle, cross, own, self.light), _below(border, more, self.light)
+
+
+def free_templates(plain, bank, rows, fitted, changes, images, inverse_sigma):
+    """
+    Fit templates anew that may change as far as they are not known.
+
+    Parameters
+    ----------
+    plain : `~miricigale.photometry.errors.LinearFit`
+        The fit of templates that are taken as they are.
+    bank : `~miricigale.photometry.templates.TemplateBank`
+        The templates.
+    rows : int `~numpy.ndarray`, shape (n,)
+        Those rows of the bank that were fitted.
+    fitted : `~numpy.ndarray` of `~miricigale.photometry.shapes.FITTED`, shape (n,)
+        What is known of each.
+    changes : `~miricigale.photometry.template_changes.TemplateChanges`
+        Finds how they may change.
+    images : list of `~numpy.ndarray`, shape (ny, nx)
+        Whitened image, and whitened columns that are common to all sources.
+    inverse_sigma : `~numpy.ndarray`, shape (ny, nx)
+        1 / sigma, zero where masked.
+
+    Returns
+    -------
+    free : `FreeTemplates` or None
+        None if all templates are known well enough.
+
+    Notes
+    -----
+    With the template T of source k known up to changes c_j, whose amplitudes a_j have a normal
+    distribution of unit width, the image is f_k T + sum_j f_k a_j (c_j - s_j T), s_j being the light
+    of a change. This is linear in f_k and f_k a_j; the latter have the prior variance f_k^2, for which the
+    flux of the plain fit is taken.
+    """
+    snr = np.abs(plain.flux) * np.sqrt(plain.matrix.diagonal())
+    known = np.isfinite(fitted["parameters"][:, 0])
+    wanted = np.flatnonzero(known & (snr > _LEAST) & (plain.flux > 0))
+    parts = bank.parts(rows)
+
+    def find(k):
+        return changes.of(parts[k], fitted[k], _LEAST / snr[k])
+
+    found = parallel_map(find, wanted, executor=bank.executor)
+    owner = np.array([k for k, (some, _) in zip(wanted, found, strict=True) for _ in some], int)
+    noise = np.zeros(len(rows))
+    noise[wanted] = [one for _, one in found]
+    if not (len(owner) or noise.any()):
+        return None
+    every = [one for some, _ in found for one in some]
+    other = bank.at_resolution(bank.order[rows[owner]], [one.cutout for one in every])
+    owner = owner[other.order]
+    n, m = len(rows), len(owner)
+    light = np.array([one.light for one in every])[other.order]
+    light = scipy.sparse.coo_array((light, (owner, np.arange(m))), shape=(n, m)).tocsr()
+    own, projection, _, _ = normal_matrix(other, inverse_sigma, images)
+    cross = cross_matrix(bank, other, inverse_sigma).tocsr()[rows]
+    prior = np.concatenate([np.zeros(n), plain.flux[owner] ** -2.0])
+    matrix = _joined(plain.matrix, cross, own, light) + scipy.sparse.diags_array(prior)
+    fit = LinearFit(
+        matrix.tocsr(),
+        _below(plain.rhs, projection[:, 0], light),
+        _below(plain.border, projection[:, 1:], light),
+        plain.corner,
+        plain.corner_rhs,
+    )
+    return FreeTemplates(fit, other, light, prior, noise)
+
+
+def _joined(main, cross, own, light):
+    """Matrix of templates and of changes less their light in the template."""
+    product = cross.T @ light
+    side = cross - main @ light
+    own = own - product - product.T + light.T @ main @ light
+    return scipy.sparse.block_array([[main, side], [side.T, own]]).tocsr()
+
+
+def _below(main, own, light):
+    """Right-hand sides of templates and of changes less their light in the template."""
+    return np.concatenate([main, own - light.T @ main])
