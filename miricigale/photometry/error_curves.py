@@ -7,10 +7,9 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.instrument import background_level, miri_detector, photmjsr
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column, require_columns
-from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.units import FNU
 
 __all__ = [
     "STATISTICS",
@@ -19,7 +18,6 @@ __all__ = [
     "common_bands",
     "curves_from_table",
     "curves_to_table",
-    "exposure_curve",
     "limiting_flux",
     "measured_curve",
     "same_rows",
@@ -76,44 +74,6 @@ class Analytic:
         ]
 
 
-def exposure_curve(filter, time, *, background, size, psf, n_integrations, frame_time, fractional):
-    """Photon and read noise of an exposure; parameters are those of `ErrorModel.from_exposure`."""
-    from scipy.ndimage import gaussian_filter
-
-    from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
-
-    seconds = float(to_array(time, u.s, "time"))
-    if not seconds > 0:
-        raise argument_error("time", "positive", time)
-    if int(n_integrations) < 1:
-        raise argument_error("n_integrations", "at least 1", n_integrations)
-    step = float(to_array(frame_time, u.s, "frame_time"))
-    level = background_level(filter) if background is None else background
-    level = float(to_array(level, SURFACE_BRIGHTNESS, "background"))
-    detector = miri_detector()
-    conversion = photmjsr(filter)
-    n_frames = seconds / n_integrations / step
-    if n_frames < 2:
-        raise argument_error("time", f"at least two frames of {step} s in each integration", time)
-    electrons = level / conversion * detector.gain + detector.dark_current
-    variance = electrons / seconds
-    read = detector.read_noise * detector.gain
-    variance += 12 * read**2 / (n_frames * (n_frames**2 - 1) * step**2) / n_integrations
-    pixel_noise = np.sqrt(variance) / detector.gain * conversion
-    pixel = u.Quantity(MIRI_PIXEL_SCALE, ANGLE).value
-    per_pixel = (pixel * u.arcsec).to_value(u.rad) ** 2 * 1e12  # uJy per MJy/sr
-    share = psf_image(miri_psf(filter) if psf is None else psf, pixel_scale=pixel * ANGLE, shape=91)
-    width = float(to_array(size, ANGLE, "size"))
-    if not width >= 0:
-        raise argument_error("size", "at least 0", size)
-    if width > 0:
-        share = gaussian_filter(share, width / np.sqrt(8 * np.log(2)) / pixel)
-    power = np.sum(share**2)
-    sky = pixel_noise * per_pixel / np.sqrt(power)
-    photon = np.sum(share**3) / power**2 * per_pixel * conversion / detector.gain / seconds
-    return Analytic(float(sky), float(fractional), float(photon))
-
-
 def measured_curve(name, true, seen, size, statistic):
     """Errors of one band in bins of true flux, from arrays in uJy."""
     if len(true) < 3:
@@ -125,7 +85,8 @@ def measured_curve(name, true, seen, size, statistic):
     edges[-1] = len(true)
     parts = [order[a:b] for a, b in itertools.pairwise(edges)][::-1]
     flux, error = np.transpose([_scatter(true[part], seen[part]) for part in parts])
-    error = _pooled(flux, error)
+    if statistic != "median_abs":
+        error = _pooled(flux, error)
     return Binned(flux, error * STATISTICS[statistic], float(true.min()), float(true.max()))
 
 

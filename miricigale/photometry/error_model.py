@@ -13,11 +13,11 @@ from miricigale.photometry.error_curves import (
     common_bands,
     curves_from_table,
     curves_to_table,
-    exposure_curve,
     limiting_flux,
     measured_curve,
     same_rows,
 )
+from miricigale.photometry.exposure_errors import exposure_curve
 from miricigale.utils.exceptions import DataError, argument_error, unknown_name
 from miricigale.utils.files import read_ecsv, writing
 from miricigale.utils.meta import provenance
@@ -135,8 +135,8 @@ class ErrorModel:
             Bands; those that both tables have by default.
         statistic : {"mad", "median_abs"}, optional
             ``"mad"`` is 1.4826 times the median of abs(measured - true) in a bin, the
-            standard deviation of Gaussian errors. ``"median_abs"`` is that median itself, as
-            in the paper: two thirds of it.
+            standard deviation of Gaussian errors. ``"median_abs"`` is that median itself, two thirds
+            of it, bin by bin as in the paper.
         bin_size : int, optional
             Sources per bin, in order of true flux; a remainder joins the faintest bin.
 
@@ -144,8 +144,9 @@ class ErrorModel:
         -------
         model : `ErrorModel`
             Errors at the median true flux of each bin, joined in asinh(flux), constant
-            beyond the first and last. Bins are pooled until both the error and the
-            signal-to-noise rise with flux (isotonic regression).
+            beyond the first and last. With ``"mad"`` bins are pooled until both the error and
+            the signal-to-noise rise with flux (isotonic regression); with ``"median_abs"`` each stands
+            for itself, and the limit may be that of an unlucky one.
 
         Raises
         ------
@@ -227,9 +228,12 @@ class ErrorModel:
         n_integrations=1,
         frame_time=2.775 * u.s,
         fractional=0.0,
+        n_dithers=1,
+        residual=None,
+        mosaic=0.11 * u.arcsec,
     ):
         """
-        Compute photon and read noise of an exposure.
+        Compute the noise of sources fitted on the mosaic of an exposure.
 
         Parameters
         ----------
@@ -249,18 +253,36 @@ class ErrorModel:
             Time of one frame.
         fractional : float, optional
             Part of the flux that is added in quadrature.
+        n_dithers : int, optional
+            Positions over which the time is divided; a residual pattern averages down with them.
+        residual : str, float or None, optional
+            Fraction of the sky that stays as a fixed pattern (`~miricigale.detector.Residual`, of its
+            default correlation), or ``"etc"`` for what the exposure time calculator's limits imply.
+        mosaic : `~astropy.units.Quantity` or None, optional
+            Pixel of the drizzled mosaic (drops of a whole pixel) that is measured; None for the optimal
+            extraction from the exposures themselves.
 
         Returns
         -------
         model : `ErrorModel`
 
+        Raises
+        ------
+        ValueError
+            If a number is out of its range, or an integration has less than two frames.
+
         Notes
         -----
-        Optimal extraction: with P the share of light of each pixel, the sky counts with
-        1 / sum(P^2) pixels and the source's own photons with sum(P^3) / sum(P^2)^2. Ramps
-        are fitted with equal weights as to read noise. No calibration error, correlated
-        residual or crowding is in it: it is a lower limit, by a factor of about two
-        below the exposure time calculator's (see the guide).
+        With P the share of light of each pixel and K the smearing of the mosaic, a template that is
+        fitted with equal weights to the mosaic counts each pixel of the detector with W = P * K * K,
+        normalised to sum(W P) = 1: the sky comes in with sum(W^2), the source's own photons with
+        sum(W^2 P), the pattern with sum(W_i W_j rho_ij). Ramps are fitted optimally, as in
+        `sensitivity`.
+
+        Scatter of simulated, reduced and fitted point sources over these errors, nine filters at three
+        depths: see ``benchmarks/exposure_errors.py`` and the guide. Galaxies have larger errors, by
+        ``size`` and by what is not known of their templates (``flux_err_template`` of
+        `ForcedPhotometryResult`).
         """
         curve = exposure_curve(
             filter,
@@ -271,6 +293,9 @@ class ErrorModel:
             n_integrations=n_integrations,
             frame_time=frame_time,
             fractional=fractional,
+            n_dithers=n_dithers,
+            residual=residual,
+            mosaic=mosaic,
         )
         return cls({str(filter): curve}, provenance(source="exposure"))
 

@@ -133,8 +133,8 @@ def _radii(aperture, annulus, setup):
     return radius, (float(edges[0]), float(edges[1]))
 
 
-def _amplitude(residual, filter):
-    """Fraction of the light that stays as a pattern."""
+def pattern_amplitude(residual, filter):
+    """Fraction of the light that stays as a pattern: none, a number, or by its name."""
     if residual is None or residual is False:
         return 0.0
     if isinstance(residual, str):
@@ -289,7 +289,7 @@ def forecast(
     if not isinstance(detector, DetectorProperties):
         raise argument_error("detector", "a DetectorProperties", repr(detector))
     radius, edges = _radii(aperture, annulus, setup)
-    amplitude = _amplitude(residual, filter)
+    amplitude = pattern_amplitude(residual, filter)
     level = background_level(filter) if background is None else background
     level = float(to_array(level, SURFACE_BRIGHTNESS, "background", ndim=0, finite=True))
     seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))

@@ -33,8 +33,27 @@ def test_statistics_of_gaussian_errors(simulated):
     assert_allclose(robust.sigma(flux * u.uJy, BAND).value, expected, rtol=0.08)
     paper = ErrorModel.from_tables(*simulated, bin_size=600, statistic="median_abs")
     # the median of |x| is 0.6745 sigma
-    ratio = paper.sigma(flux * u.uJy, BAND) / robust.sigma(flux * u.uJy, BAND)
-    assert_allclose(ratio, 0.67449, rtol=1e-4)
+    assert_allclose(paper.sigma(flux * u.uJy, BAND).value, 0.67449 * expected, rtol=0.08)
+
+
+def test_the_papers_error_function_is_the_median_of_each_bin():
+    """Bins of 30 in order of true flux, no smoothing: errors here neither rise nor fall."""
+    rng = np.random.default_rng(4)
+    true = np.sort(10 ** rng.uniform(-1, 0.5, 240))
+    seen = true + rng.normal(0, 1, 240) * rng.choice([0.1, 1.0], 8).repeat(30)
+    truth, measured = (QTable({BAND: v * u.uJy}) for v in (true, seen))
+    nodes = ErrorModel.from_tables(truth, measured, statistic="median_abs").curves[BAND]
+    bins = true.reshape(8, 30)
+    assert_allclose(nodes.flux, np.median(bins, axis=1), rtol=1e-12)
+    median = np.median(np.abs(seen - true).reshape(8, 30), axis=1)
+    bright = nodes.flux > 5 * median
+    assert_allclose(nodes.error[~bright], median[~bright], rtol=1e-12)
+    # bright ones as magnitudes have it: relative to each flux
+    relative = np.median(np.abs(seen / true - 1).reshape(8, 30), axis=1) * nodes.flux
+    assert_allclose(nodes.error[bright], relative[bright], rtol=1e-12)
+    pooled = ErrorModel.from_tables(truth, measured).curves[BAND]
+    assert np.all(np.diff(pooled.error) >= -1e-12)
+    assert np.any(np.diff(nodes.error) < 0)
 
 
 def test_limit_is_where_the_signal_to_noise_is_reached(simulated):
@@ -120,6 +139,62 @@ def test_exposure_scales_as_photon_noise_does():
     assert_allclose(bright[1] / bright[0], 2, rtol=0.01)
     with pytest.raises(ValueError, match="at least two frames"):
         ErrorModel.from_exposure("miri.f1500w", 3 * u.s, **options)
+
+
+def test_a_mosaic_costs_what_its_smearing_does():
+    """Gaussian of rms w, smeared by squares of rms k in all: variance (w^2 + k)^2 / w^2 (w^2 + 2 k)."""
+    width, pixel, zero = 0.1, 0.1109, 0 * u.uJy
+    psf = gaussian_psf(width * 2.3548 * u.arcsec, pixel_scale=0.0277 * u.arcsec, fov=8 * u.arcsec)
+    options = {"psf": psf, "n_integrations": 1}
+    errors = [
+        ErrorModel.from_exposure(BAND, 2000 * u.s, mosaic=mosaic, **options).sigma(zero, BAND)
+        for mosaic in (None, 0.11 * u.arcsec, 0.03 * u.arcsec)
+    ]
+    for error, cell in zip(errors[1:], (0.11, 0.03), strict=True):
+        k = (pixel**2 + cell**2) / 12
+        expected = (width**2 + k) / (width * np.sqrt(width**2 + 2 * k))
+        assert (error / errors[0]).value == pytest.approx(expected, abs=0.01)
+    assert errors[1] > 1.01 * errors[0]
+
+
+def test_a_residual_pattern_falls_with_dithers_and_not_with_time():
+    zero, name = 0 * u.uJy, "miri.f1500w"
+
+    def variance(time, **options):
+        model = ErrorModel.from_exposure(name, time * u.s, n_integrations=10, **options)
+        return model.sigma(zero, name).value ** 2
+
+    added = variance(1000, residual=0.01) - variance(1000)
+    assert variance(9000, residual=0.01) - variance(9000) == pytest.approx(added, rel=1e-6)
+    four = variance(1000, residual=0.01, n_dithers=4) - variance(1000, n_dithers=4)
+    assert four == pytest.approx(added / 4, rel=1e-6)
+    twice = variance(1000, residual=0.02) - variance(1000)
+    assert twice == pytest.approx(4 * added, rel=1e-6)
+    # a wide source sees the pattern as white noise of 4 pi times its variance (Gaussian of 1 pixel)
+    psf = gaussian_psf(0.5 * u.arcsec, pixel_scale=0.11 * u.arcsec, fov=10 * u.arcsec)
+    options = {"size": 1.5 * u.arcsec, "mosaic": None, "psf": psf}
+    wide = variance(1000, residual=0.01, **options) - variance(1000, **options)
+    width = np.hypot(1.5, 0.5) / 2.3548
+    level = 0.01 * background_level(name).value * (1 * u.arcsec).to_value(u.rad) ** 2 * 1e12
+    # sum W^2 is 4 pi w^2 / pixel
+    expected = level**2 * 4 * np.pi * width**2 * 4 * np.pi * 0.1109**2
+    assert wide == pytest.approx(expected, rel=0.08)
+    assert variance(1000, residual="etc") > variance(1000)
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"n_dithers": 0}, "n_dithers"),
+        ({"n_integrations": 1.5}, "n_integrations"),
+        ({"residual": 0.5}, "residual"),
+        ({"mosaic": 0 * u.arcsec}, "mosaic"),
+        ({"size": -1 * u.arcsec}, "size"),
+    ],
+)
+def test_what_an_exposure_cannot_be_is_named(options, name):
+    with pytest.raises(ValueError, match=f"'{name}' must be"):
+        ErrorModel.from_exposure(BAND, 1000 * u.s, **options)
 
 
 def test_perturbed_fluxes_have_the_stated_scatter():
