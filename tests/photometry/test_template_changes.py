@@ -1,0 +1,302 @@
+"""Templates that may change: what is open, the fit with it, and the errors of fluxes by it and by the PSF."""
+
+import types
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+from numpy.testing import assert_allclose
+from scipy.signal import fftconvolve
+
+from miricigale.instrument import north_up_wcs
+from miricigale.photometry import ForcedPhotometer, detect_sources
+from miricigale.photometry.cutouts import Cutout
+from miricigale.photometry.shapes import not_fitted
+from miricigale.photometry.template_changes import TemplateChanges
+from miricigale.psf import MatchingKernel
+
+# a Gaussian profile has n = 0.5 and R_e = 1.1774 sigma
+HALF = np.sqrt(2 * np.log(2))
+
+
+#: A profile as template; its pixels are not looked at.
+PROFILE = Cutout(np.ones((1, 1)), (0, 0), convolved=False)
+
+
+def record(sigma, widths, *, point=0.0):
+    """A Gaussian profile of rms ``sigma`` pixels whose parameters are known to ``widths``."""
+    found = not_fitted(1)
+    found["parameters"] = [120.2, 69.7, np.log(HALF * sigma), np.log(0.5), 0.0, 0.0]
+    found["covariance"] = np.diag(np.square([0.0, *widths]))
+    found["point"], found["light"] = point, 1.0
+    return found[0]
+
+
+def pixels(n, sigma, x=None, y=None):
+    at = np.arange(n) - n // 2 if x is None else np.arange(n)
+    x, y = (0.0 if x is None else x), (0.0 if y is None else y)
+    one = [np.exp(-0.5 * ((at - c) / sigma) ** 2) for c in (y, x)]
+    return np.outer(*one) / (2 * np.pi * sigma**2)
+
+
+@pytest.fixture(scope="module")
+def changes():
+    """PSFs of rms 1.5 and 4 pixels."""
+    return TemplateChanges(pixels(41, 1.5), pixels(61, 4.0), 0.0)
+
+
+def own(change, sigma):
+    """Change of ln flux of an isolated source of rms ``sigma`` at the image's resolution."""
+    y, x = np.indices(change.cutout.data.shape)
+    x0, y0 = change.cutout.origin[::-1]
+    template = pixels(301, sigma, 120.2, 69.7)
+    cut = template[y + y0, x + x0]
+    return np.sum(cut * change.cutout.data) / np.sum(cut**2) - change.light
+
+
+def test_an_unknown_size_costs_what_the_closed_form_says(changes):
+    # T of width w fits data of the width w0 with 2 w^2 / (w^2 + w0^2) of the flux, so that
+    # d ln flux / d ln s = s^2 / (s^2 + psf^2) at w = w0
+    for sigma in (2.0, 5.0):
+        found, noise = changes.of(PROFILE, record(sigma, [0, 0, 0.02, 0, 0, 0]), 1e-6)
+        assert len(found) == 1
+        assert noise == 0
+        expected = 0.02 * sigma**2 / (sigma**2 + 16)
+        assert abs(own(found[0], np.hypot(sigma, 4))) == pytest.approx(expected, rel=0.01)
+    # a shift costs nothing to first order, but it is a change
+    (shift,), _ = changes.of(PROFILE, record(3.0, [0.1, 0, 0, 0, 0, 0]), 1e-6)
+    assert abs(own(shift, 5.0)) < 1e-4
+    assert np.abs(shift.cutout.data).sum() > 0.01
+
+
+def test_changes_that_do_not_matter_are_left_out(changes):
+    one = record(3.0, [0.01, 0.02, 0.05, 0, 0.01, 0.02])
+    assert len(changes.of(PROFILE, one, 1e-6)[0]) == 5
+    assert len(changes.of(PROFILE, one, 0.01)[0]) == 1
+    assert changes.of(PROFILE, one, 1.0)[0] == []
+
+
+def test_between_point_and_profile_the_other_counts_by_its_probability(changes):
+    (chosen,), _ = changes.of(PROFILE, record(4.0, np.zeros(6), point=0.1), 1e-6)
+    (point,), _ = changes.of(None, record(4.0, np.zeros(6), point=0.9), 1e-6)
+    # the same difference of the two, each with the root of 0.1
+    assert_allclose(chosen.cutout.data, point.cutout.data, atol=1e-9)
+    template = pixels(301, np.sqrt(32.0), 120.2, 69.7)
+    y, x = np.indices(chosen.cutout.data.shape)
+    x0, y0 = chosen.cutout.origin[::-1]
+    other = pixels(301, 4.0, 120.2, 69.7)
+    expected = np.sqrt(0.1) * (other - template)[y + y0, x + x0]
+    assert_allclose(chosen.cutout.data, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_noise_of_the_image_in_the_core(changes):
+    """A template that is the image all over: the noise of its light and of its fit."""
+    image = pixels(51, 3.0)
+    rest = Cutout(image, (45, 95))
+    # a profile of no light, all of the image being the rest
+    template = Cutout(np.zeros((3, 3)), (69, 119), 1e-8 * image.size, convolved=False, rest=rest)
+    one = record(3.0, np.zeros(6))
+    found, noise = changes.of(template, one, 1e-6)
+    assert found == []
+    # drawn: unit light from noisy pixels, blurred to the resolution, fitted to the true template
+    blur = pixels(51, np.sqrt(16 - 1.5**2))
+    true = fftconvolve(image, blur, "same")
+    rng = np.random.default_rng(3)
+    ratio = []
+    for _ in range(1500):
+        drawn = image + rng.normal(0, 1e-4, image.shape)
+        fitted = fftconvolve(drawn / drawn.sum(), blur, "same")
+        ratio.append(np.sum(fitted * true) / np.sum(fitted**2))
+    assert np.sqrt(noise) == pytest.approx(np.std(ratio), rel=0.06)
+
+
+def test_sizes_differ_between_bands():
+    free = TemplateChanges(pixels(41, 1.5), pixels(61, 4.0), 0.05)
+    (change,), _ = free.of(PROFILE, record(3.0, np.zeros(6)), 1e-6)
+    assert abs(own(change, 5.0)) == pytest.approx(0.05 * 9 / 25, rel=0.01)
+    # a point has no size
+    assert free.of(None, record(3.0, np.zeros(6), point=1.0), 1e-6)[0] == []
+
+
+@pytest.fixture(scope="module")
+def blend(tools):
+    """Three galaxies, two of them blended, on a noisy prior and a noisy image."""
+    rng = np.random.default_rng(2)
+    dx, dy = np.array([[-4.0, 3.0, 3.55], [0.0, -0.3, 0.3]]) * u.arcsec
+    sky = tools.CENTER.spherical_offsets_by(dx, dy)
+    widths, flux = np.array([0.25, 0.3, 0.2]), np.array([20.0, 40.0, 10.0])
+    noise = 0.15
+    images = []
+    for psf, scale, n in ((tools.HI, 0.06, 260), (tools.LO, 0.11, 150)):
+        wcs = north_up_wcs(tools.CENTER, scale * u.arcsec, (n, n))
+        light = tools.render(sky, flux, np.hypot(psf, widths), wcs, (n, n))
+        images.append(tools.as_ccd(light + rng.normal(0, noise, (n, n)), wcs, noise))
+        noise = 0.05
+    high, low = images
+    segments, found = detect_sources(high)
+    photometer = ForcedPhotometer(tools.kernel, psf_error=0.0, correlated_noise=False, n_threads=1)
+    return types.SimpleNamespace(
+        photometer=photometer,
+        low=low,
+        high=high,
+        segments=segments,
+        found=found,
+        sky=sky,
+        flux=flux,
+    )
+
+
+def test_terms_add_in_quadrature_and_are_columns(blend):
+    arguments = blend.low, blend.high, blend.segments, blend.found
+    result = ForcedPhotometer(
+        blend.photometer.kernel, psf_error=0.024, correlated_noise=False
+    ).measure(*arguments)
+    terms = [result.flux_err_noise, result.flux_err_template, result.flux_err_psf]
+    # peaks of the noise have no flux of which a part could be wrong
+    assert all(np.all(term[result.flux > 1 * u.uJy] > 0) for term in terms)
+    assert_allclose(result.flux_err, np.sqrt(sum(term**2 for term in terms)), rtol=1e-12)
+    assert_allclose(np.sqrt(result.covariance.diagonal()), result.flux_err.value, rtol=1e-9)
+    plain = blend.photometer.measure(*arguments)
+    assert_allclose(plain.flux_err_noise, result.flux_err_noise, rtol=1e-12)
+    assert_allclose(plain.flux_err_template, result.flux_err_template, rtol=1e-12)
+    assert np.all(plain.flux_err_psf == 0)
+    table = result.to_table("miri.f770w")
+    for name, term in zip(("noise", "template", "psf"), terms, strict=True):
+        assert np.all(table[f"miri.f770w_err_{name}"] == term)
+    # the errors of the PSF go together
+    more = (result.covariance - plain.covariance).toarray()
+    psf = result.flux_err_psf.value
+    pair = plain.covariance.toarray() != 0
+    assert_allclose(more[pair], np.outer(psf, psf)[pair], rtol=1e-6)
+
+
+def images(bank, shape):
+    """The stamps of a bank on whole images, in the order of its rows."""
+    found = np.zeros((len(bank.order), *shape))
+    for block in bank.blocks():
+        for k, (y0, x0, ny, nx) in enumerate(block.box):
+            stamp = block.values[block.start[k] : block.start[k + 1]].reshape(ny, nx)
+            found[block.first + k, y0 : y0 + ny, x0 : x0 + nx] = stamp
+    return found.reshape(len(found), -1)
+
+
+def test_a_blend_is_solved_as_by_dense_algebra(blend, monkeypatch):
+    """Least squares with the changes as columns and their priors as rows, all pixels written out."""
+    from miricigale.photometry import forced
+
+    kept = []
+    original = forced.package
+
+    def keep(fit, *args, **kwargs):
+        kept.append(fit)
+        return original(fit, *args, **kwargs)
+
+    monkeypatch.setattr(forced, "package", keep)
+    arguments = blend.low, blend.high, blend.segments, blend.found
+    result = blend.photometer.measure(*arguments)
+    exact = ForcedPhotometer(
+        blend.photometer.kernel, psf_error=0.0, correlated_noise=False, size_scatter=None
+    ).measure(*arguments)
+    fit = kept[0]
+    shape = blend.low.shape
+    templates, changes = images(fit.bank, shape)[fit.rows], images(fit.free.bank, shape)
+    light = fit.free.light.toarray()
+    member = fit.bank.order[fit.rows]
+    owner = np.argmax(fit.free.fit.matrix[len(member) :, : len(member)].toarray() != 0, axis=1)
+    assert light.shape == (len(member), len(changes))
+    assert len(changes) >= 6
+    columns = np.concatenate([templates, changes - light.T @ templates])
+    inverse = fit.inverse_sigma.ravel()
+    prior = np.sqrt(fit.free.prior)
+    # the prior of each change is the flux of the fit with exact templates
+    known = np.unique(1 / prior[len(member) :])
+    assert np.all(np.min(np.abs(known[:, None] / exact.flux.value - 1), axis=1) < 1e-6)
+    assert len(np.unique(owner)) >= len(known) - 1
+    white = np.concatenate([(columns * inverse).T, np.diag(prior)])
+    data = np.concatenate([(fit.arrays.flux * fit.inverse_sigma).ravel(), np.zeros(len(columns))])
+    solution = np.linalg.lstsq(white, data)[0]
+    # of a template that is an image the power of its noise is taken off besides
+    assert_allclose(result.flux.value[member], solution[: len(member)], rtol=5e-4)
+    covariance = np.linalg.inv(white.T @ white)
+    noise = covariance @ (columns * inverse) @ (columns * inverse).T @ covariance
+    # noise of a template that is an image changes its light, and all that the fit makes of it
+    scaled = templates * inverse
+    core = result.flux.value[member] * np.sqrt(fit.free.noise)
+    core = covariance[:, : len(member)] @ scaled @ scaled.T @ np.diag(core)
+    assert np.count_nonzero(fit.free.noise) == 1
+    template = covariance @ np.diag(prior**2) @ covariance + core @ core.T
+    for found, expected in ((result.flux_err_noise, noise), (result.flux_err_template, template)):
+        error = np.sqrt(expected.diagonal()[: len(member)])
+        assert_allclose(found.value[member], error, rtol=1e-3)
+    # what is not known of one galaxy is an error of its neighbor too
+    assert np.all(result.flux_err >= result.flux_err_noise)
+
+
+@pytest.mark.parametrize("width", [0.0, 0.25])
+def test_psf_error_is_what_a_wide_psf_does(tools, width):
+    """Fluxes with a PSF that is too wide, against the stated error for that width."""
+    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (150, 150))
+    sky = SkyCoord([tools.CENTER])
+    image = tools.as_ccd(
+        tools.render(sky, [100.0], np.hypot(tools.LO, width), wcs, (150, 150)), wcs, 0.01
+    )
+    x = (np.arange(101) - 50) * tools.FINE
+
+    def psf(sigma):
+        one = np.exp(-0.5 * (x / sigma) ** 2)
+        return np.outer(one, one) / one.sum() ** 2
+
+    kernel = MatchingKernel.from_psfs(
+        psf(tools.HI), psf(1.03 * tools.LO), pixel_scale=tools.FINE * u.arcsec
+    )
+    catalog = QTable({"sky": sky})
+    template = "psf"
+    if width:
+        template = "sersic"
+        catalog["half_light_radius"] = [HALF * width] * u.arcsec
+        catalog["sersic_index"] = [0.5]
+        catalog["axis_ratio"] = [1.0]
+        catalog["position_angle"] = [0.0] * u.deg
+    photometer = ForcedPhotometer(kernel, template=template, psf_error=0.03, correlated_noise=False)
+    result = photometer.measure(image, catalog=catalog)
+    # Gaussians: d ln flux / d ln width is 1 for points
+    assert result.flux.value[0] - 100 == pytest.approx(result.flux_err_psf.value[0], rel=0.05)
+
+
+def test_psf_error_out_of_range_is_named(tools):
+    with pytest.raises(ValueError, match="'psf_error' must be from 0 to 1, got 2"):
+        ForcedPhotometer(tools.kernel, psf_error=2)
+
+
+def test_pulls_of_galaxies_on_a_noisy_prior(tools):
+    """Gaussian galaxies and points of template signal-to-noise 8 to 40, bright on the image."""
+    rng = np.random.default_rng(12)
+    grid = np.arange(-3, 4) * 5.0
+    dx, dy = (a.ravel() + rng.uniform(-0.3, 0.3, 49) for a in np.meshgrid(grid, grid))
+    sky = tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
+    size = np.where(rng.random(49) < 0.25, 0.0, rng.uniform(0.1, 0.35, 49))
+    flux = 10 ** rng.uniform(0.7, 1.4, 49) * (0.4 + size) / 0.5
+    pulls, exact = [], []
+    wcs = [north_up_wcs(tools.CENTER, s * u.arcsec, (n, n)) for s, n in ((0.06, 660), (0.11, 360))]
+    truth = [
+        tools.render(sky, flux, np.hypot(psf, size), one, (n, n))
+        for one, psf, n in zip(wcs, (tools.HI, tools.LO), (660, 360), strict=True)
+    ]
+    photometer = ForcedPhotometer(tools.kernel, correlated_noise=False)
+    plain = ForcedPhotometer(tools.kernel, correlated_noise=False, size_scatter=None)
+    for _ in range(3):
+        high = tools.as_ccd(truth[0] + rng.normal(0, 2.5, (660, 660)), wcs[0], 2.5)
+        low = tools.as_ccd(truth[1] + rng.normal(0, 0.1, (360, 360)), wcs[1], 0.1)
+        segments, found = detect_sources(high)
+        index, distance, _ = sky.match_to_catalog_sky(found["sky"])
+        near = distance < 0.3 * u.arcsec
+        for kept, how in ((pulls, photometer), (exact, plain)):
+            result = how.measure(low, high, segments, found)
+            off = result.flux.value[index] - flux
+            kept.append((off / result.flux_err.value[index])[near])
+    pulls, exact = np.concatenate(pulls), np.concatenate(exact)
+    assert len(pulls) > 100
+    assert np.std(exact) > 3
+    assert 0.8 < np.std(pulls) < 1.25
