@@ -5,17 +5,19 @@ import dataclasses
 import astropy.units as u
 import numpy as np
 import scipy.ndimage
+import scipy.stats
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 from photutils.segmentation import SegmentationImage, make_2dgaussian_kernel
 
 from miricigale.photometry.arrays import image_arrays, pixel_scale
+from miricigale.photometry.segments import dilate_segments, dilation_rule
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.meta import provenance
 from miricigale.utils.sep_tools import background as sep_background
 from miricigale.utils.sep_tools import extract
 from miricigale.utils.tables import Flags
-from miricigale.utils.units import ANGLE, FNU
+from miricigale.utils.units import ANGLE, FNU, to_array
 
 __all__ = [
     "DETECTION_PRESETS",
@@ -23,6 +25,7 @@ __all__ = [
     "DetectionPreset",
     "bright_centroids",
     "detect_sources",
+    "detection_purity",
 ]
 
 
@@ -60,6 +63,28 @@ class DetectionPreset:
     n_levels: int = 32
     contrast: float = 0.005
 
+    def on_pixels(self, ratio):
+        """
+        The same settings for other pixels.
+
+        Parameters
+        ----------
+        ratio : float
+            The pixel on which they are stated over the image's.
+
+        Returns
+        -------
+        preset : `DetectionPreset`
+            Width and area cover the same sky, and the threshold is the same surface brightness
+            where noise is white, since the noise of a pixel's brightness goes as its inverse side.
+        """
+        return dataclasses.replace(
+            self,
+            threshold=self.threshold / ratio,
+            min_area=max(1, round(self.min_area * ratio**2)),
+            fwhm=self.fwhm and self.fwhm * ratio,
+        )
+
 
 #: ``"default"``, and what the paper used on F160W at 0.06 arcsec and on MIRI images.
 DETECTION_PRESETS = {
@@ -81,6 +106,8 @@ def detect_sources(
     subtract_background=False,
     box=64,
     filter_size=6,
+    stated_on=None,
+    dilation=None,
 ):
     """
     Detect sources with Source Extractor's algorithm.
@@ -105,6 +132,12 @@ def detect_sources(
         Whether a background is measured and subtracted first.
     box, filter_size : int, optional
         Its box in pixels and its median filter in boxes.
+    stated_on : `~astropy.units.Quantity`, optional
+        Pixel scale on which the settings are stated: they are brought to the image's pixels
+        (see `DetectionPreset.on_pixels`; the box too). By default they are for the image's own.
+    dilation : str or `DilationRule`, optional
+        How far segments are grown after detection, or a name in `DILATION_RULES`; as they
+        were detected by default. Positions, shapes and flags are those of the detection.
 
     Returns
     -------
@@ -113,21 +146,20 @@ def detect_sources(
     catalog : `~astropy.table.QTable`
         A row for each label: ``id`` and ``label``, ``sky``, ``x``, ``y`` (0-based pixels), ``flux``
         and ``flux_err`` (uJy, the light in the segment), ``a``, ``b`` (arcsec, rms along
-        the axes), ``theta`` (deg from +x to +y), ``n_pixels``, ``snr``, ``flags``.
+        the axes), ``theta`` (deg from +x to +y), ``n_pixels``, ``n_detected`` (pixels before
+        dilation), ``snr``, ``flags``.
 
     Raises
     ------
     ValueError
         If a setting is out of range.
     KeyError
-        If there is no such preset.
+        If there is no such preset or rule.
 
     References
     ----------
     Bertin & Arnouts 1996, A&AS 117, 393; Barbary 2016, JOSS 1, 58.
     """
-    if preset not in DETECTION_PRESETS:
-        raise unknown_name("detection preset", preset, DETECTION_PRESETS)
     given = {
         "threshold": threshold,
         "min_area": min_area,
@@ -135,20 +167,160 @@ def detect_sources(
         "n_levels": n_levels,
         "contrast": contrast,
     }
+    background = (box, filter_size) if subtract_background else None
+    arrays, settings = _prepare(image, preset, given, background, stated_on)
+    rule = None if dilation is None else dilation_rule(dilation)
+    objects, found = _extract(arrays.flux, arrays, settings)
+    labels = found
+    if rule is not None:
+        scale = pixel_scale(arrays.wcs)
+        labels = dilate_segments(found, rule, pixel_scale=scale, mask=~arrays.usable).data
+    catalog = _catalog(objects, found, labels, arrays)
+    catalog.meta.update(provenance(preset=preset, **dataclasses.asdict(settings)))
+    if rule is not None:
+        catalog.meta["dilation"] = dataclasses.asdict(rule)
+    return SegmentationImage(labels), catalog
+
+
+def detection_purity(
+    image,
+    *,
+    snr_edges=None,
+    preset="yang2021",
+    threshold=None,
+    min_area=None,
+    fwhm=None,
+    n_levels=None,
+    contrast=None,
+    subtract_background=False,
+    box=64,
+    filter_size=6,
+    stated_on=None,
+):
+    """
+    Estimate which share of the detections is real, from the image's negative.
+
+    Noise that is symmetric makes as many detections on the negative image as on the image;
+    sources make none there.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        As `detect_sources` takes it.
+    snr_edges : array_like, shape (n + 1,), optional
+        Signal-to-noise of segments (column ``snr`` of `detect_sources`) between which detections
+        are counted; ten bins from the least to the largest of the negative image and one above by
+        default.
+    preset, threshold, min_area, fwhm, n_levels, contrast : optional
+        Settings, as of `detect_sources`.
+    subtract_background, box, filter_size, stated_on : optional
+        Likewise. The background is estimated once, on the image, and subtracted from both.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        A row for each bin: ``snr_low``, ``snr_high``, ``n_positive``, ``n_negative``, ``purity``
+        (1 - n_negative / n_positive; below 0 where there are more negative detections, NaN without
+        positive ones) and ``purity_low``, ``purity_high``, its 68 % interval by the Poisson error of
+        ``n_negative``. ``meta`` has the total ``n_positive`` and ``n_negative``, those outside of the bins
+        included.
+
+    Raises
+    ------
+    ValueError
+        If edges do not ascend, or a setting is out of range.
+
+    Notes
+    -----
+    Holes beside bright sources (a background taken too high, ringing of a resampling) are counted as noise,
+    so that the purity is too low there; noise with a tail to positive values, such as cosmic rays that
+    were left, is not seen.
+
+    References
+    ----------
+    Gehrels 1986, ApJ 303, 336 (Poisson intervals).
+    """
+    given = {
+        "threshold": threshold,
+        "min_area": min_area,
+        "fwhm": fwhm,
+        "n_levels": n_levels,
+        "contrast": contrast,
+    }
+    background = (box, filter_size) if subtract_background else None
+    arrays, settings = _prepare(image, preset, given, background, stated_on)
+    positive, negative = (
+        _segment_snr(flux, arrays, settings) for flux in (arrays.flux, -arrays.flux)
+    )
+    if snr_edges is None:
+        snr_edges = [0.0, np.inf]
+        if len(negative):
+            top = np.nextafter(negative.max(), np.inf)
+            low = min(negative.min(), positive.min(initial=np.inf))
+            snr_edges = np.append(np.linspace(low, max(top, low + 1e-6), 11), np.inf)
+    edges = np.asarray(snr_edges, float)
+    if edges.ndim != 1 or len(edges) < 2 or not np.all(np.diff(edges) > 0):
+        raise argument_error("snr_edges", "two numbers or more that ascend", snr_edges)
+    counts = [np.histogram(snr, edges)[0] for snr in (positive, negative)]
+    n_positive, n_negative = counts
+    with np.errstate(divide="ignore", invalid="ignore"):
+        limits = (
+            scipy.stats.chi2.ppf(0.8413, 2 * (n_negative + 1)) / 2,
+            np.where(n_negative > 0, scipy.stats.chi2.ppf(0.1587, 2 * n_negative) / 2, 0.0),
+        )
+        purity, low, high = (
+            np.where(n_positive > 0, 1 - n / n_positive, np.nan) for n in (n_negative, *limits)
+        )
+    columns = {
+        "snr_low": (edges[:-1], "Least signal-to-noise of a segment"),
+        "snr_high": (edges[1:], "Largest signal-to-noise, not included"),
+        "n_positive": (n_positive, "Detections on the image"),
+        "n_negative": (n_negative, "Detections on its negative"),
+        "purity": (purity, "1 - n_negative / n_positive"),
+        "purity_low": (low, "Lower end of the 68 % interval"),
+        "purity_high": (high, "Upper end of the 68 % interval"),
+    }
+    table = QTable({name: values for name, (values, _) in columns.items()})
+    for name, (_, description) in columns.items():
+        table[name].info.description = description
+    table.meta.update(
+        provenance(n_positive=len(positive), n_negative=len(negative)),
+        **dataclasses.asdict(settings),
+    )
+    return table
+
+
+def _prepare(image, preset, given, background, stated_on):
+    """Arrays with the background (box, filter) taken off, and settings on the image's pixels."""
+    if preset not in DETECTION_PRESETS:
+        raise unknown_name("detection preset", preset, DETECTION_PRESETS)
     settings = dataclasses.replace(
         DETECTION_PRESETS[preset], **{k: v for k, v in given.items() if v is not None}
     )
     if not settings.threshold > 0:
         raise argument_error("threshold", "positive", settings.threshold)
     arrays = image_arrays(image, "image")
-    flux = arrays.flux
-    if subtract_background:
-        flux = flux - sep_background(flux, ~arrays.usable, box, filter_size)[0]
+    ratio = 1.0
+    if stated_on is not None:
+        stated = float(to_array(stated_on, ANGLE, "stated_on"))
+        if not stated > 0:
+            raise argument_error("stated_on", "positive", stated_on)
+        ratio = stated / pixel_scale(arrays.wcs)
+        settings = settings.on_pixels(ratio)
+    if background is not None:
+        box = max(1, round(background[0] * ratio))
+        level = sep_background(arrays.flux, ~arrays.usable, box, background[1])[0]
+        arrays = dataclasses.replace(arrays, flux=arrays.flux - level)
+    return arrays, settings
+
+
+def _extract(flux, arrays, settings):
+    """Objects and labels of an image of flux per pixel."""
     kernel = None
     if settings.fwhm:
         size = 2 * int(np.ceil(0.9 * settings.fwhm)) - 1
         kernel = make_2dgaussian_kernel(settings.fwhm, max(size, 3)).array
-    objects, labels = extract(
+    return extract(
         flux,
         settings.threshold,
         err=arrays.sigma,
@@ -158,9 +330,21 @@ def detect_sources(
         deblend_n_thresholds=settings.n_levels,
         deblend_contrast=settings.contrast,
     )
-    catalog = _catalog(objects, labels, flux, arrays)
-    catalog.meta.update(provenance(preset=preset, **dataclasses.asdict(settings)))
-    return SegmentationImage(labels), catalog
+
+
+def _segment_snr(flux, arrays, settings):
+    """Signal-to-noise of the segments found on an image."""
+    objects, labels = _extract(flux, arrays, settings)
+    total, noise = _segment_sums(labels, flux, arrays, len(objects))
+    return total / noise
+
+
+def _segment_sums(labels, flux, arrays, n):
+    """Light of each segment and its error for white noise."""
+    flat = labels.ravel()
+    variance = np.where(arrays.usable, arrays.sigma, 0.0) ** 2
+    total = np.bincount(flat, flux.ravel(), n + 1)[1:]
+    return total, np.sqrt(np.bincount(flat, variance.ravel(), n + 1)[1:])
 
 
 def bright_centroids(flux, labels, fallback):
@@ -203,15 +387,14 @@ def bright_centroids(flux, labels, fallback):
     return found
 
 
-def _catalog(objects, labels, flux, arrays):
+def _catalog(objects, found, labels, arrays):
+    """The table of the detections: segments as found, and as they are returned."""
     n = len(objects)
     index = np.arange(1, n + 1)
-    variance = np.where(arrays.usable, arrays.sigma, 0.0) ** 2
-    flat = labels.ravel()
-    total = np.bincount(flat, flux.ravel(), n + 1)[1:]
-    noise = np.sqrt(np.bincount(flat, variance.ravel(), n + 1)[1:])
+    flux = arrays.flux
+    total, noise = _segment_sums(labels, flux, arrays, n)
     scale = pixel_scale(arrays.wcs)
-    x, y = bright_centroids(flux, labels, (objects["x"], objects["y"]))
+    x, y = bright_centroids(flux, found, (objects["x"], objects["y"]))
     sky = arrays.wcs.pixel_to_world(x, y) if n else SkyCoord([], [], unit="deg")
     with np.errstate(divide="ignore", invalid="ignore"):
         snr = total / noise
@@ -227,7 +410,8 @@ def _catalog(objects, labels, flux, arrays):
         "a": (objects["a"] * scale * ANGLE, "Rms along the major axis"),
         "b": (objects["b"] * scale * ANGLE, "Rms along the minor axis"),
         "theta": (np.degrees(objects["theta"]) * u.deg, "Direction of the major axis, +x to +y"),
-        "n_pixels": (np.bincount(flat, minlength=n + 1)[1:], "Pixels of the segment"),
+        "n_pixels": (_sizes(labels, n), "Pixels of the segment"),
+        "n_detected": (_sizes(found, n), "Pixels of the segment before dilation"),
         "snr": (snr, "flux over flux_err"),
         "flags": (objects["flag"].astype(int) & known, DetectionFlags.describe()),
     }
@@ -235,3 +419,8 @@ def _catalog(objects, labels, flux, arrays):
     for name, (_, description) in columns.items():
         table[name].info.description = description
     return table
+
+
+def _sizes(labels, n):
+    """Pixels of each of n segments."""
+    return np.bincount(labels.ravel(), minlength=n + 1)[1:]

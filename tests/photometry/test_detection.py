@@ -5,7 +5,13 @@ from astropy.nddata import CCDData
 from numpy.testing import assert_allclose
 
 from miricigale.instrument import north_up_wcs
-from miricigale.photometry import DETECTION_PRESETS, detect_sources
+from miricigale.photometry import (
+    DETECTION_PRESETS,
+    DilationRule,
+    detect_sources,
+    detection_purity,
+    dilate_segments,
+)
 
 
 @pytest.fixture(scope="module")
@@ -81,3 +87,116 @@ def test_bad_settings(deep):
         detect_sources(image, threshold=-1)
     with pytest.raises(ValueError, match="'image' must be an image with a celestial WCS"):
         detect_sources(CCDData(np.ones((20, 20)), unit="MJy/sr"))
+
+
+def disk(shape, x, y, radius):
+    yy, xx = np.indices(shape)
+    return np.hypot(xx - x, yy - y) <= radius
+
+
+def test_a_disk_grows_to_a_disk_of_the_area_of_the_rule():
+    labels = np.where(disk((121, 121), 60, 60, 15), 7, 0)
+    rule = DilationRule(areas=(1.0, 100.0), factors=(4.0, 2.0))
+    area = np.count_nonzero(labels) * 0.06**2
+    # a power law between the nodes: slope log(1/2) / log(100)
+    assert_allclose(rule.area(area), area * 4 * area ** (-np.log(2) / np.log(100)))
+    assert_allclose(rule.area([0.5, 200.0]), [2.0, 400.0])
+    grown = dilate_segments(labels, rule, pixel_scale=0.06).data
+    radius = np.sqrt(rule.area(area) / np.pi) / 0.06
+    assert_allclose(np.count_nonzero(grown == 7), np.pi * radius**2, rtol=0.03)
+    assert np.all(grown[disk(labels.shape, 60, 60, radius - 1)] == 7)
+    assert not grown[~disk(labels.shape, 60, 60, radius + 1)].any()
+
+
+def test_segments_do_not_merge_nor_lose_pixels_nor_take_masked_ones():
+    labels = np.where(disk((80, 100), 35, 40, 8), 1, 0)
+    labels[disk((80, 100), 58, 40, 8)] = 2
+    labels[disk((80, 100), 85, 10, 3)] = 5
+    mask = np.zeros(labels.shape, bool)
+    mask[:, :24] = True
+    grown = dilate_segments(labels, DilationRule(factors=9.0), pixel_scale=1.0, mask=mask).data
+    assert np.array_equal(grown[labels > 0], labels[labels > 0])
+    assert set(np.unique(grown)) == {0, 1, 2, 5}
+    assert not grown[mask].any()
+    # the line half-way between equal disks divides them
+    assert not np.any(grown[:, :46] == 2)
+    assert not np.any(grown[:, 47:] == 1)
+    # the pair is hemmed in, by each other and by the mask; the third has its area
+    assert np.count_nonzero(grown == 1) < 9 * np.count_nonzero(labels == 1)
+    assert_allclose(np.count_nonzero(grown == 5), 9 * np.count_nonzero(labels == 5), rtol=0.15)
+    large = DilationRule(factors=9.0, max_area=100.0)
+    assert np.count_nonzero(dilate_segments(labels, large, pixel_scale=1.0).data == 1) == np.sum(
+        labels == 1
+    )
+
+
+def test_dilated_detections_hold_more_of_their_light(deep):
+    sky, flux, image = deep
+    _, bare = detect_sources(image, preset="default", threshold=5)
+    segmentation, grown = detect_sources(image, preset="default", threshold=5, dilation="area")
+    assert list(grown["label"]) == list(bare["label"])
+    assert np.all(grown["n_detected"] == bare["n_pixels"])
+    assert np.all(grown["n_pixels"] == np.bincount(segmentation.data.ravel())[1:])
+    assert np.all(grown["n_pixels"] > bare["n_pixels"])
+    for name in ("x", "y", "a", "flags"):
+        assert np.array_equal(grown[name], bare[name])
+    index = sky.match_to_catalog_sky(grown["sky"])[0]
+    lost, left = (1 - table["flux"].to_value(u.uJy)[index] / flux for table in (bare, grown))
+    # faint sources lose most where segments end at an isophote
+    assert np.median(lost[:5]) > 0.15
+    assert abs(np.median(left)) < 0.02
+    with pytest.raises(KeyError, match="no dilation rule 'twice'; known: area"):
+        detect_sources(image, dilation="twice")
+    with pytest.raises(ValueError, match="'factors' must be 1 numbers of at least 1"):
+        DilationRule(factors=0.5)
+
+
+def test_purity_of_noise_and_of_sources(tools):
+    rng = np.random.default_rng(7)
+    shape = (600, 600)
+    wcs = north_up_wcs(tools.CENTER, 0.06 * u.arcsec, shape)
+    noise = rng.normal(0, 1, shape)
+    options = {"preset": "yang2021", "min_area": 20}
+    table = detection_purity(
+        tools.as_ccd(noise, wcs, 1.0), snr_edges=[0, 2.5, 3, 3.5, np.inf], **options
+    )
+    # noise alone: as many on either side, so the purity is zero within its error
+    assert table["n_positive"].sum() == table.meta["n_positive"] > 150
+    error = np.sqrt(1 / table["n_positive"] + 1 / np.maximum(table["n_negative"], 1))
+    assert np.all(np.abs(table["purity"]) < 3.5 * error)
+    # forty sources of a known place among it: what is not one of them is spurious
+    sky = tools.positions(rng, 40, 16.0)
+    flux = 10 ** rng.uniform(1.0, 2.0, 40) * 10 * tools.FINE**2 * tools.SR * 1e12
+    image = tools.as_ccd(noise + tools.render(sky, flux, 0.15, wcs, shape), wcs, 1.0)
+    _, found = detect_sources(image, **options)
+    table = detection_purity(image, snr_edges=[0, 2.5, 3, 4, 5, np.inf], **options)
+    separation = found["sky"].match_to_catalog_sky(sky)[1].arcsec
+    snr = np.asarray(found["snr"])
+    true = [np.mean(separation[(snr >= a) & (snr < b)] < 0.3)
+            for a, b in table.iterrows("snr_low", "snr_high")]  # fmt: skip
+    assert true[-1] > 0.9
+    assert table["purity_low"][-1] > 0.85
+    error = np.hypot(table["purity_high"] - table["purity"], 1 / np.sqrt(table["n_positive"]))
+    assert np.all(np.abs(table["purity"] - true) < 3 * error)
+    with pytest.raises(ValueError, match="'snr_edges' must be two numbers or more that ascend"):
+        detection_purity(image, snr_edges=[3, 2])
+
+
+def test_settings_stated_on_other_pixels_find_the_same(tools):
+    # the same sky with white noise of the same depth, on pixels of 0.06 and 0.03 arcsec
+    areas = []
+    for scale, size in ((0.06, 300), (0.03, 600)):
+        rng = np.random.default_rng(2)
+        wcs = north_up_wcs(tools.CENTER, scale * u.arcsec, (size, size))
+        grid = np.linspace(-6, 6, 4)
+        dx, dy = (a.ravel() for a in np.meshgrid(grid, grid))
+        sky = tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
+        clean = tools.render(sky, np.full(16, 10.0), 0.15, wcs, (size, size))
+        sigma = 0.3 * 0.06 / scale
+        image = tools.as_ccd(clean + rng.normal(0, sigma, clean.shape), wcs, sigma)
+        _, found = detect_sources(image, threshold=1.5, min_area=16, stated_on=0.06 * u.arcsec)
+        index, separation, _ = sky.match_to_catalog_sky(found["sky"])
+        assert separation.arcsec.max() < 0.05
+        assert len(found) == 16
+        areas.append(np.median(found["n_pixels"][index]) * scale**2)
+    assert_allclose(areas[1], areas[0], rtol=0.05)
