@@ -13,7 +13,7 @@ __getattr__, __dir__, __all__ = lazy_names(
             "number_counts",
             "sfr_to_infrared_luminosity",
         ),
-        "match": ("match_truth",),
+        "match": ("AssociationFlags", "associate", "match_truth"),
         "metrics": (
             "PhotozMetrics",
             "RecoveryMetrics",

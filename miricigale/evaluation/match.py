@@ -2,13 +2,171 @@
 
 import astropy.units as u
 import numpy as np
+from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.tables import error_column, match_sky, require_columns
-from miricigale.utils.units import FNU
+from miricigale.utils.tables import Flags, error_column, match_sky, require_columns
+from miricigale.utils.units import ANGLE, FNU, to_array
 
-__all__ = ["match_truth"]
+__all__ = ["AssociationFlags", "associate", "match_truth"]
+
+
+class AssociationFlags(Flags):
+    """Why rows of two catalogues are no plain match."""
+
+    #: More than one row of the second catalogue is within the radius of the row of the first.
+    SEVERAL_SECOND = 1
+    #: More than one row of the first catalogue is within the radius of the row of the second.
+    SEVERAL_FIRST = 2
+    #: The nearest row of the other catalogue is nearer to another one.
+    NOT_MUTUAL = 4
+    #: No row of the other catalogue is within the radius.
+    NONE_NEAR = 8
+    #: The position is not finite.
+    NO_POSITION = 16
+
+
+#: What the flags come to.
+_STATUS = ("matched", "ambiguous", "unmatched")
+
+
+def associate(first, second, *, radius):
+    """
+    Sort the rows of two catalogues into matched, ambiguous and unmatched ones.
+
+    Parameters
+    ----------
+    first, second : `~astropy.coordinates.SkyCoord` or `~astropy.table.QTable`
+        Positions, or tables with ``sky`` and, if there is, ``id``.
+    radius : `~astropy.units.Quantity`
+        Largest separation.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        Every row of either catalogue once: those of the first in their order (with their
+        partner, if they have one), then those of the second without a partner. ``first`` and
+        ``second`` are row numbers, -1 for none; ``first_id`` and ``second_id`` the ids of tables
+        that have them (masked for none); ``separation`` (arcsec, NaN without partner); ``n_first``
+        and ``n_second``, how many rows of the first are within the radius of the row of the second
+        and the other way round (-1 without such a row); ``status`` and ``reasons``
+        (`AssociationFlags`). ``meta["counts"]`` has the number of rows of each status,
+        ``meta["reasons"]`` of each reason.
+
+    Raises
+    ------
+    ValueError
+        If the radius is not positive, or a table lacks ``sky``.
+
+    Notes
+    -----
+    Partners are two rows that are each other's nearest within the radius. They are ``matched`` if neither has
+    another candidate, otherwise ``ambiguous``. A row without a partner is ``ambiguous`` if it has
+    candidates, and ``unmatched`` if it has none.
+    """
+    limit = float(to_array(radius, ANGLE, "radius", ndim=0))
+    if not limit > 0:
+        raise argument_error("radius", "positive", radius)
+    sky = [_positions(one, name) for one, name in ((first, "first"), (second, "second"))]
+    near = _Candidates(*sky, limit)
+    pair = near.partner[0]
+    alone = np.flatnonzero(near.partner[1] < 0)
+    rows = (
+        np.concatenate([np.arange(len(sky[0])), np.full(len(alone), -1)]),
+        np.concatenate([pair, alone]),
+    )
+    reasons = np.zeros(len(rows[0]), int)
+    table = QTable({"first": rows[0], "second": rows[1]})
+    for name, catalog, row in (("first_id", first, rows[0]), ("second_id", second, rows[1])):
+        if "id" in getattr(catalog, "colnames", ()):
+            ids = np.asarray(catalog["id"])
+            blank = np.zeros(1, ids.dtype)
+            values = np.concatenate([ids, blank])[row]
+            table[name] = np.ma.MaskedArray(values, mask=row < 0)
+    separation = np.full(len(rows[0]), np.nan)
+    separation[: len(pair)] = near.separation
+    table["separation"] = separation * ANGLE
+    for k, column in ((0, "n_second"), (1, "n_first")):
+        here = rows[k] >= 0
+        count = np.full(len(here), -1)
+        count[here] = near.count[k][rows[k][here]]
+        table[column] = count
+        reasons[here] |= near.reasons(k)[rows[k][here]]
+    status = np.where(
+        reasons == 0, 0, np.where(reasons & (_NONE | _LOST), 2, 1)
+    )  # of rows with a partner neither is set
+    table["status"] = np.array(_STATUS)[status]
+    table["reasons"] = reasons
+    descriptions = {
+        "first": "Row of the first catalogue, -1 for none",
+        "second": "Row of the second catalogue, -1 for none",
+        "separation": "Of the partners",
+        "n_second": "Rows of the second catalogue within the radius of the row of the first",
+        "n_first": "Rows of the first catalogue within the radius of the row of the second",
+        "status": "matched, ambiguous or unmatched",
+        "reasons": AssociationFlags.describe(),
+    }
+    for name, text in descriptions.items():
+        table[name].info.description = text
+    table.meta["radius"] = limit
+    table.meta["counts"] = {
+        name: int(np.count_nonzero(status == k)) for k, name in enumerate(_STATUS)
+    }
+    table.meta["reasons"] = {
+        flag.name.lower(): int(np.count_nonzero(reasons & flag)) for flag in AssociationFlags
+    }
+    return table
+
+
+_NONE, _LOST = int(AssociationFlags.NONE_NEAR), int(AssociationFlags.NO_POSITION)
+
+
+class _Candidates:
+    """Which rows of two lists of positions are within a radius, and who is whose nearest."""
+
+    def __init__(self, first, second, limit):
+        self.sky = first, second
+        self.finite = [np.isfinite(sky.ra.deg) & np.isfinite(sky.dec.deg) for sky in self.sky]
+        rows = [np.flatnonzero(good) for good in self.finite]
+        i, j, distance = np.empty(0, int), np.empty(0, int), np.empty(0)
+        if len(rows[0]) and len(rows[1]):
+            a, b, angle, _ = second[rows[1]].search_around_sky(first[rows[0]], limit * ANGLE)
+            i, j, distance = rows[0][a], rows[1][b], angle.to_value(ANGLE)
+        size = len(first), len(second)
+        self.count = [np.bincount(k, minlength=n) for k, n in zip((i, j), size, strict=True)]
+        # of equal distances the first row counts
+        order = np.lexsort((j, i, distance))[::-1]
+        nearest = [np.full(n, -1) for n in size]
+        nearest[0][i[order]], nearest[1][j[order]] = j[order], i[order]
+        self.partner = []
+        for one, other in (nearest, nearest[::-1]):
+            mutual = one >= 0
+            mutual[mutual] = other[one[mutual]] == np.flatnonzero(mutual)
+            self.partner.append(np.where(mutual, one, -1))
+        self.separation = np.full(size[0], np.nan)
+        chosen = self.partner[0][i] == j
+        self.separation[i[chosen]] = distance[chosen]
+
+    def reasons(self, k):
+        """`AssociationFlags` of the rows of list ``k``."""
+        flags = np.zeros(len(self.sky[k]), int)
+        several = AssociationFlags.SEVERAL_SECOND if k == 0 else AssociationFlags.SEVERAL_FIRST
+        flags[self.count[k] > 1] |= int(several)
+        flags[(self.count[k] > 0) & (self.partner[k] < 0)] |= int(AssociationFlags.NOT_MUTUAL)
+        flags[self.count[k] == 0] |= _NONE
+        flags[~self.finite[k]] = _LOST
+        return flags
+
+
+def _positions(catalog, argument):
+    sky = catalog
+    if not isinstance(catalog, SkyCoord):
+        require_columns(catalog, ["sky"], argument)
+        sky = catalog["sky"]
+        if not isinstance(sky, SkyCoord):
+            raise argument_error(argument, "a table whose 'sky' is a SkyCoord", type(sky).__name__)
+    return sky.icrs.reshape(-1)
 
 
 def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):
@@ -30,7 +188,8 @@ def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):
     -------
     table : `~astropy.table.QTable`
         A row for each row of ``truth``, in its order: ``id``, ``sky``, ``measured_id``
-        (-1 where nothing matched), ``separation``, ``matched`` and, for each band,
+        (-1 where nothing matched), ``separation``, ``matched``, ``association``
+        (`AssociationFlags` of the row of the truth and of the one it was matched to) and, for each band,
         ``<band>_true``, ``<band>`` and ``<band>_err`` (NaN where nothing matched), and
         the flag columns of ``measured`` (``<band>_flags`` or ``flags``).
 
@@ -55,6 +214,13 @@ def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):
     )
     table["separation"] = separation
     table["matched"] = found
+    near = _Candidates(
+        truth["sky"].icrs, measured["sky"].icrs, float(to_array(radius, ANGLE, "radius"))
+    )
+    reasons = near.reasons(0)
+    reasons[found] |= near.reasons(1)[index[found]]
+    table["association"] = reasons
+    table["association"].info.description = AssociationFlags.describe()
     for band in bands:
         table[f"{band}_true"] = u.Quantity(truth[band]).to(u.uJy)
         for name in (band, error_column(band)):

@@ -4,7 +4,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
-from miricigale.evaluation import match_truth
+from miricigale.evaluation import AssociationFlags, associate, match_truth
 from miricigale.utils.tables import match_sky
 
 
@@ -67,3 +67,76 @@ def test_wrong_units_are_named(truth):
         match_truth(None, measured, ["miri.f770w"])
     with pytest.raises(ValueError, match="'bands' must be a list of filter names"):
         match_truth(truth, measured, "miri.f770w")
+
+
+def brute_force(first, second, radius):
+    """Status of every row of two lists of flat positions, by their distances alone."""
+    distance = np.hypot(*(first[:, None] - second[None]).T).T
+    near = distance < radius
+    pairs = {
+        (i, j)
+        for i, j in np.argwhere(near)
+        if distance[i].argmin() == j and distance[:, j].argmin() == i
+    }
+    return near, pairs
+
+
+def test_association_agrees_with_all_distances():
+    rng = np.random.default_rng(5)
+    first, second = rng.uniform(0, 30, (120, 2)), rng.uniform(0, 30, (90, 2))
+    first[:40] = second[:40] + rng.normal(0, 0.2, (40, 2))
+    near, pairs = brute_force(first, second, 1.0)
+    coords = [SkyCoord(*(xy.T * u.arcsec)) for xy in (first, second)]
+    tables = [QTable({"id": np.arange(len(c)) + 1000 * (k + 1), "sky": c})
+              for k, c in enumerate(coords)]  # fmt: skip
+    table = associate(*tables, radius=1 * u.arcsec)
+    # each row of either catalogue once
+    assert sorted(table["first"][table["first"] >= 0]) == list(range(120))
+    assert sorted(table["second"][table["second"] >= 0]) == list(range(90))
+    both = (table["first"] >= 0) & (table["second"] >= 0)
+    assert {*table[both].iterrows("first", "second")} == pairs
+    alone = {(i, j) for i, j in pairs if near[i].sum() == near[:, j].sum() == 1}
+    status = np.asarray(table["status"])
+    assert {*table[status == "matched"].iterrows("first", "second")} == alone
+    for row in table[~both]:
+        k, name = (0, "first") if row["first"] >= 0 else (1, "second")
+        some = near.any(axis=1 - k)[row[name]]
+        assert row["status"] == ("ambiguous" if some else "unmatched")
+        wanted = AssociationFlags.NOT_MUTUAL if some else AssociationFlags.NONE_NEAR
+        assert row["reasons"] & wanted
+    assert set(table.meta["counts"]) == set(status) == {"matched", "ambiguous", "unmatched"}
+    assert sum(table.meta["counts"].values()) == len(table) == 210 - len(pairs)
+    expected = np.hypot(*(first[table["first"][both]] - second[table["second"][both]]).T)
+    assert table["separation"][both].to_value(u.arcsec) == pytest.approx(expected, abs=1e-6)
+    assert table["second_id"][both].tolist() == (table["second"][both] + 2000).tolist()
+    assert table["second_id"].mask.tolist() == (table["second"] < 0).tolist()
+    # the other way round the pairs are the same
+    back = associate(coords[1], coords[0], radius=1 * u.arcsec)
+    both = (back["first"] >= 0) & (back["second"] >= 0)
+    assert {*back[both].iterrows("second", "first")} == pairs
+
+
+def test_association_of_what_cannot_be_placed():
+    nan = SkyCoord([np.nan, 10.0] * u.deg, [0.0, 0.0] * u.deg)
+    here = SkyCoord([10.0] * u.deg, [0.0] * u.deg)
+    table = associate(nan, here, radius=1 * u.arcsec)
+    assert table["second"].tolist() == [-1, 0]
+    assert table["status"].tolist() == ["unmatched", "matched"]
+    assert table["reasons"].tolist() == [AssociationFlags.NO_POSITION, 0]
+    none = associate(here[:0], here, radius=1 * u.arcsec)
+    assert none["status"].tolist() == ["unmatched"]
+    assert none.meta["counts"] == {"matched": 0, "ambiguous": 0, "unmatched": 1}
+    assert len(associate(here[:0], here[:0], radius=1 * u.arcsec)) == 0
+    with pytest.raises(ValueError, match="'radius' must be positive"):
+        associate(here, here, radius=0 * u.arcsec)
+    with pytest.raises(ValueError, match=r"'second' must be a table with the columns \['sky'\]"):
+        associate(here, QTable({"id": [1]}), radius=1 * u.arcsec)
+
+
+def test_matches_to_the_truth_say_which_are_ambiguous(truth):
+    sky = SkyCoord([10.0, 10.0021, 10.0022] * u.deg, [0, 0, 0] * u.deg)
+    measured = QTable({"id": [7, 8, 9], "sky": sky})
+    table = match_truth(truth, measured, [], radius=1 * u.arcsec)
+    assert table["measured_id"].tolist() == [7, -1, 8]
+    flags = AssociationFlags
+    assert table["association"].tolist() == [0, flags.NONE_NEAR, flags.SEVERAL_SECOND]
