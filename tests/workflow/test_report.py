@@ -109,10 +109,12 @@ def make_run(folder, filters, *, mass=3e10, points=False):
         image, light = noise_image(k)
         made.save_image(f"mosaic_{name}.fits", image)
         made.save_image(f"photometry/{name}_model.fits", sky_image(SCALE, SHAPE, light))
-        table = QTable({"id": truth["id"], "sky": sky})
-        table["flux"] = truth[name] + rng.normal(0, 0.2, count) * u.uJy
-        table["flux_err"] = np.full(count, 0.2) * u.uJy
-        table["flags"] = np.zeros(count, int)
+        # one more than there are sources, which no source is near; the first is at the edge
+        table = QTable({"id": np.arange(1, count + 2), "sky": _with_one_more(sky, center)})
+        flux = np.append(truth[name].value + rng.normal(0, 0.2, count), 5.0)
+        table["flux"] = flux * u.uJy
+        table["flux_err"] = np.full(count + 1, 0.2) * u.uJy
+        table["flags"] = np.append(1, np.zeros(count, int))
         made.save_table(f"photometry/{name}.ecsv", table)
         bright = QTable({"flux_true": np.full(5, 100.0) * u.uJy})
         bright["flux"] = bright["flux_true"] * np.array([0.98, 0.99, 1.0, 1.01, 5.0])
@@ -123,6 +125,11 @@ def make_run(folder, filters, *, mass=3e10, points=False):
     do_stage(config, folder, "fits", "without_miri")
     do_stage(config, folder, "report")
     return folder / "report"
+
+
+def _with_one_more(sky, center):
+    far = center.spherical_offsets_by(0 * u.arcsec, 5.4 * u.arcsec)
+    return SkyCoord([*sky.ra.deg, far.ra.deg] * u.deg, [*sky.dec.deg, far.dec.deg] * u.deg)
 
 
 def page_of(report):
@@ -174,10 +181,39 @@ def test_bands_stand_in_every_table_of_bands(reports):
         of_bands = [
             table for table in tables if "<th>band</th>" in table and "published" not in table
         ]
-        # exposures, recovery, limits
-        assert len(of_bands) == 3
+        # exposures, recovery, conditions, limits
+        assert len(of_bands) == 4
         for table in of_bands:
             assert re.findall(r"<tr><td>(F\d+W)</td>", table) == labels
+
+
+def test_edge_crowded_and_spurious_are_counted(reports):
+    for kind in ("one", "two", "four"):
+        metrics = json.loads((reports[kind] / "metrics.json").read_text())
+        assert metrics["detections"] == {
+            "n": 25, "n_field": 25, "n_spurious": 1, "n_ambiguous": 0,
+            "n_spurious_bright": dict.fromkeys(metrics["bands"], 1),
+        }  # fmt: skip
+        for entry in metrics["bands"].values():
+            found = entry["conditions"]
+            assert (found["n_field"], found["n_not_measured"]) == (24, 0)
+            assert found["edge"]["n"] == 1
+            assert found["ambiguous"]["n"] == 0
+            assert found["isolated"]["n"] >= 24 - 1 - found["crowded"]["n"] > 0
+        page = html.unescape(page_of(reports[kind])).replace(" class=n", "")
+        assert "<td>of them spurious: no source of the catalogue is near</td><td>1</td>" in page
+        assert "<th>crowded</th><th>edge</th><th>ambiguous</th>" in page
+        for name, n in metrics["n_left_out"].items():
+            assert f"<td>{name.replace('_', ' ')}</td><td>{n}</td>" in page
+    fits = metrics["fits"]["with_miri"]
+    assert fits["conditions"]["edge"]["n"] == 1
+    assert fits["conditions"]["isolated"]["n"] <= fits["n"] - 1
+    # every row of either catalogue stands in the association once
+    folder = reports["four"].parent
+    table = QTable.read(folder / "association.ecsv")
+    assert sorted(table["first"]) == [-1, *range(24)]
+    assert sorted(table["second"]) == list(range(25))
+    assert list(table["status"]).count("unmatched") == 1
 
 
 def test_colours_need_three_bands(reports):

@@ -159,6 +159,7 @@ def study_stages():
             "errors",
             "measure:make_errors",
             "error function",
+            version=2,
             needs=("truth", "mosaics", "photometry"),
             sections=(
                 "errors",
@@ -185,7 +186,7 @@ def study_stages():
             "report",
             "report:make_report",
             "report",
-            version=2,
+            version=3,
             needs=(
                 "catalog",
                 "truth",

@@ -114,18 +114,20 @@ def magnitude_figure(table, bands):
     return figure
 
 
-def offset_figure(table, bands, limits=None):
+def offset_figure(table, bands, limits=None, marks=()):
     """
     Magnitude differences with running medians.
 
     Parameters
     ----------
     table : `~astropy.table.QTable`
-        Matched sources.
+        Matched sources, with the conditions of stage 12.
     bands : list of str
         Bands.
     limits : dict of str to float, optional
         5-sigma limits in AB magnitudes, drawn as lines.
+    marks : iterable of (int, str, str), optional
+        Bit of the condition, marker and label of the sources that are marked.
     """
     figure, axes, tidy = _panels(bands, 2.9, sharex=True, sharey=True)
     for ax, name in zip(axes, bands, strict=True):
@@ -134,6 +136,12 @@ def offset_figure(table, bands, limits=None):
         good = np.isfinite(offset)
         running = running_median(true[good], offset[good], size=20)
         plot_offsets(true[good], offset[good], running=running, ax=ax, title=band_label(name))
+        condition = np.asarray(table[f"{name}_condition"])
+        for bit, marker, label in marks:
+            rows = good & ((condition & bit) > 0) & (np.abs(offset) <= 1)
+            ax.plot(
+                true[rows], offset[rows], marker, ms=5, mfc="none", mec="0.35", mew=0.7, label=label
+            )
         if limits and np.isfinite(limits[name]):
             ax.axvline(limits[name], color="0.35", ls=":", lw=1.2, label="5-sigma limit")
         if ax is axes[0] and ax.get_legend_handles_labels()[0]:

@@ -6,13 +6,14 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.evaluation import match_truth
+from miricigale.evaluation import associate, match_truth
 from miricigale.fitting import BayesFitter
 from miricigale.photometry import ErrorModel, ForcedPhotometer, SourceTemplates, join_bands
 from miricigale.photometry.error_model import fractional_error
 from miricigale.psf import MatchingKernel, hst_psf
 from miricigale.sed import SEDModel
 from miricigale.utils.tables import error_column
+from miricigale.workflow.stages.conditions import add_conditions
 from miricigale.workflow.stages.sample import add_selection, in_field
 
 __all__ = [
@@ -67,10 +68,11 @@ def make_errors(context, _):
     bands = config.exposures.filters
     photometry = band_photometry(context, bands)
     truth = QTable.read(context.path("truth.ecsv"))
-    matched = match_truth(
-        truth, photometry, bands, radius=config.photometry.match_radius * u.arcsec
-    )
-    inside = in_field(truth["sky"], [context.image(f"mosaic_{name}.fits") for name in bands])
+    radius = config.photometry.match_radius * u.arcsec
+    matched = match_truth(truth, photometry, bands, radius=radius)
+    association = associate(truth, photometry, radius=radius)
+    mosaics = [context.image(f"mosaic_{name}.fits") for name in bands]
+    inside = in_field(truth["sky"], mosaics)
     # the error function is for galaxies of the field: what was matched there
     errors = ErrorModel.from_tables(
         QTable({"id": matched["id"], **{name: matched[f"{name}_true"] for name in bands}})[inside],
@@ -92,6 +94,13 @@ def make_errors(context, _):
         min_detected=config.fit.min_detected,
         redshifts=(nodes[0], nodes[-1]),
     )
+    add_conditions(matched, bands, suffix="_true")
+    photometry["association"] = np.zeros(len(photometry), int)
+    here = np.asarray(association["second"]) >= 0
+    photometry["association"][association["second"][here]] = association["reasons"][here]
+    photometry["in_field"] = in_field(photometry["sky"], mosaics)
+    add_conditions(photometry, bands, detections=True)
+    context.save_table("association.ecsv", association)
     context.save_table("photometry.ecsv", photometry)
     context.save_table("matched.ecsv", matched)
     context.save_result("errors.ecsv", errors)

@@ -23,6 +23,12 @@ from miricigale.instrument import (
     scaled_limit,
 )
 from miricigale.photometry import ErrorModel, ForcedFlags
+from miricigale.workflow.stages.conditions import (
+    ConditionFlags,
+    band_conditions,
+    detection_counts,
+    fit_conditions,
+)
 from miricigale.workflow.stages.exposures import band_exposures
 from miricigale.workflow.stages.sample import SampleFlags, magnitude
 
@@ -42,6 +48,8 @@ class StudyTables:
     ----------
     truth, matched : `~astropy.table.QTable`
         Of stages 3 and 12, row by row the same sources.
+    detections : `~astropy.table.QTable`
+        The photometry of all detections, of stage 12.
     errors : `~miricigale.photometry.ErrorModel`
         The error function.
     results : dict of str to `~miricigale.fitting.FitResults`
@@ -52,6 +60,7 @@ class StudyTables:
 
     truth: QTable
     matched: QTable
+    detections: QTable
     errors: ErrorModel
     results: dict
     points: dict
@@ -64,6 +73,7 @@ class StudyTables:
         return cls(
             QTable.read(context.path("truth.ecsv")),
             QTable.read(context.path("matched.ecsv")),
+            QTable.read(context.path("photometry.ecsv")),
             ErrorModel.read(context.path("errors.ecsv")),
             {unit: FitResults.read(context.path(f"fits_{unit}.fits")) for unit in FITS},
             {name: QTable.read(context.path(f"points/{name}.ecsv")) for name in names},
@@ -121,15 +131,16 @@ def _point_metrics(table):
     )
 
 
-def _band_metrics(matched, truth, name):
+def _band_metrics(matched, name):
     """Recovery of the isolated sources above 20 sigma, and pulls, in one band."""
     selection = np.asarray(matched["selection"])
     usable = (selection & (SampleFlags.OUTSIDE_FIELD | SampleFlags.NOT_MATCHED)) == 0
     flux, true = matched[name].value, matched[f"{name}_true"].value
     formal = matched[f"{name}_formal_err"].value
     whole = (np.asarray(matched[f"{name}_flags"]) & (ForcedFlags.EDGE | ForcedFlags.MASKED)) == 0
+    near = (np.asarray(matched[f"{name}_condition"]) & ConditionFlags.CROWDED) > 0
     with np.errstate(invalid="ignore"):
-        bright = usable & whole & (true > 20 * formal) & ~_crowded(truth, name)
+        bright = usable & whole & (true > 20 * formal) & ~near
         faint = usable & whole & (true < 20 * formal) & np.isfinite(flux)
     pulls = (flux[faint] - true[faint]) / formal[faint]
     return {
@@ -153,18 +164,6 @@ def _coverage(truth, table, name):
     good = np.isfinite(low) & np.isfinite(high)
     inside = good & (truth >= low) & (truth <= high)
     return fraction_interval(int(np.count_nonzero(inside)), int(np.count_nonzero(good)))[0]
-
-
-def _crowded(truth, name, radius=2 * u.arcsec):
-    """Whether a neighbour within 2 arcsec is brighter than the source's magnitude plus one."""
-    sky, mag = truth["sky"], magnitude(truth[name])
-    here, there, _, _ = sky.search_around_sky(sky, radius)
-    other = here != there
-    with np.errstate(invalid="ignore"):
-        near = other & (mag[there] < mag[here] + 1)
-    crowded = np.zeros(len(truth), bool)
-    crowded[here[near]] = True
-    return crowded
 
 
 def _light(galaxies, bands, area):
@@ -214,6 +213,7 @@ def study_metrics(config, tables, area):
         },
         "area": float(area.to_value(u.arcmin**2)),
         "as_paper": as_paper(config),
+        "detections": detection_counts(tables.detections, bands),
         # of one band there are no two
         "n_bands_detected": min(2, len(bands)),
         "bands": {},
@@ -241,7 +241,7 @@ def study_metrics(config, tables, area):
     for name in bands:
         exposures = band_exposures(config, name)
         time = sum(e.exposure_time for e in exposures)
-        entry = _band_metrics(matched, truth, name)
+        entry = _band_metrics(matched, name)
         bright = entry.pop("bright_isolated")
         entry |= {
             "limit": float(errors.limiting_magnitude(name).value),
@@ -251,6 +251,7 @@ def study_metrics(config, tables, area):
             "bright_n": bright.n,
             "bright_median": bright.median,
             "bright_median_err": bright.median_err,
+            "conditions": band_conditions(matched, name),
         }
         if name in tables.points:
             points = _point_metrics(tables.points[name])
@@ -276,5 +277,6 @@ def study_metrics(config, tables, area):
             "frac_agn_sigma_mad": fraction.sigma_mad,
             "frac_agn_width": float(np.nanmedian(table["frac_agn_std"])) if len(table) else np.nan,
             "redshift_coverage": _coverage(sample["redshift"], table, "redshift"),
+            "conditions": fit_conditions(matched[selection == 0], sample["redshift"], table, bands),
         }
     return metrics

@@ -12,7 +12,7 @@ from miricigale.evaluation import (
     number,
 )
 from miricigale.sed import SEDModel
-from miricigale.workflow.stages import figures, pictures, provenance
+from miricigale.workflow.stages import conditions, figures, pictures, provenance
 from miricigale.workflow.stages.figures import band_label
 from miricigale.workflow.stages.metrics import FITS, StudyTables, study_metrics
 from miricigale.workflow.stages.sample import SampleFlags, footprint_area, typical_source
@@ -135,6 +135,7 @@ class _Writer:
             empty=f"The catalogue ends at {name} = {limit:g}: too bright for the shares of detected "
             f"galaxies that are published, to {prior} = 25 and 26.",
         )
+        conditions.write_left_out(self.report, m)
 
     def images(self):
         """The field in colour or grey; mosaic, model and residual."""
@@ -187,9 +188,10 @@ class _Writer:
                 "fainter than the axis.",
             )
             self.report.figure(
-                figures.offset_figure(table, self.bands, limits),
+                figures.offset_figure(table, self.bands, limits, conditions.MARKS),
                 "Measured minus true magnitude of sources with positive flux, with the running "
-                "median of 20 sources and its scatter; triangles lie beyond the axis.",
+                "median of 20 sources and its scatter; triangles lie beyond the axis, circles mark "
+                "crowded sources, squares those at the edge.",
             )
         points = self.tables.points
         rows = [
@@ -225,6 +227,7 @@ class _Writer:
             )
         else:
             self.report.text("The check with bright point sources was not made ([point_sources]).")
+        conditions.write_conditions(self.report, self.metrics)
 
     def errors(self):
         """The error function and the limits."""
@@ -343,6 +346,7 @@ class _Writer:
             f"fit, whose {100 * self.config.fit.model_error:g} % model error they do not have, so "
             "posteriors are wide",
         )
+        conditions.write_fits(self.report, self.metrics)
         results = self.tables.results
         key = typical_source(sample, results["with_miri"].fitted, self.bands[-1])
         if key is None:
