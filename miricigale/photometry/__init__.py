@@ -25,5 +25,6 @@ __getattr__, __dir__, __all__ = lazy_names(
         "sky_noise": ("weight_scale",),
         "sources": ("SourceTemplates",),
         "results": ("ForcedPhotometryResult", "crowded"),
+        "stars": ("psf_photometry",),
     },
 )

@@ -1,0 +1,189 @@
+"""PSF photometry of stars with photutils, to stand beside forced photometry."""
+
+import warnings
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable, Table
+from astropy.utils.exceptions import AstropyUserWarning
+from photutils.background import LocalBackground
+from photutils.psf import PSF_FLAGS, PSFPhotometry
+
+from miricigale.photometry.arrays import image_arrays, pixel_scale, sky_pixels
+from miricigale.psf import fwhm, psf_mosaic
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.meta import provenance
+from miricigale.utils.tables import require_columns, unique_ids
+from miricigale.utils.units import ANGLE, FNU, to_array
+
+__all__ = ["psf_photometry"]
+
+
+def psf_photometry(
+    image,
+    psf,
+    catalog,
+    *,
+    pa=None,
+    fit_size=None,
+    max_shift=0.1 * u.arcsec,
+    local_background=None,
+):
+    """
+    Fit a PSF to stars one by one, by `photutils.psf.PSFPhotometry`.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        In units of surface brightness, background subtracted, with WCS and uncertainty.
+    psf : `~photutils.psf.ImagePSF`
+        PSF of the image with the meta of `~miricigale.psf.make_psf`, on any pixel scale; it must
+        include the response of the image's pixels, and drizzling if the image is drizzled.
+    catalog : `~astropy.table.QTable`
+        Column ``sky`` and, if there is, ``id``.
+    pa : `~astropy.units.Quantity`, optional
+        Position angle of the +y axis of a PSF in the detector frame; needed for those. The PSF is
+        turned to the image's axes.
+    fit_size : `~astropy.units.Quantity`, optional
+        Side of the square that is fitted; four full widths at half maximum by default.
+    max_shift : `~astropy.units.Quantity` or None, optional
+        How far positions may move along either axis; None keeps those of the catalogue.
+    local_background : (`~astropy.units.Quantity`, `~astropy.units.Quantity`), optional
+        Inner and outer radius of an annulus whose sigma-clipped median is subtracted; none by
+        default.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        A row for each row of the catalogue, in its order: ``id``, ``sky``, ``flux``, ``flux_err`` (uJy, for
+        noise that is not correlated; NaN where not measured), ``x``, ``y`` (fitted, 0-based pixels), ``shift``
+        (arcsec from the catalogue's position), ``chi2`` (reduced), ``qfit``, ``cfit``, ``neighbour``
+        (whether another row is within the fitted square) and ``flags`` (photutils').
+
+    Raises
+    ------
+    ValueError
+        If a size is not positive, the angle of the PSF is not known, or the catalogue does not fit.
+
+    Notes
+    -----
+    Each star is fitted as if it were alone: ``neighbour`` tells where it is not, and forced photometry
+    is for those. Sources are not grouped on purpose: photutils 3.0 keeps the model of a group by the number
+    of its sources, so that groups of a second band in one process may be fitted with the PSF of the first.
+
+    References
+    ----------
+    Stetson 1987, PASP 99, 191; Bradley et al., photutils (https://photutils.readthedocs.io).
+    """
+    arrays = image_arrays(image, "image")
+    require_columns(catalog, ["sky"], "catalog")
+    sky = catalog["sky"]
+    if not isinstance(sky, SkyCoord):
+        raise argument_error("catalog", "a table whose 'sky' is a SkyCoord", type(sky).__name__)
+    n = len(sky)
+    ids = np.arange(1, n + 1)
+    if "id" in catalog.colnames:
+        ids = unique_ids(catalog["id"], "catalog")
+    scale = pixel_scale(image.wcs)
+    model = psf_mosaic(
+        psf,
+        scale * ANGLE,
+        pa,
+        grid_angle=_angle_of_y(image.wcs, arrays.flux.shape),
+        resampling=None,
+    )
+    width = fwhm(model)
+    size = 4 * width if fit_size is None else fit_size
+    side = _positive(size, "fit_size") / scale
+    side = max(3, 2 * int(np.ceil((side - 1) / 2)) + 1)
+    bound = None
+    if max_shift is None:
+        model.x_0.fixed = model.y_0.fixed = True
+    else:
+        bound = _positive(max_shift, "max_shift") / scale
+    xy = sky_pixels(sky, image.wcs, arrays.flux.shape, side / 2)
+    rows = np.flatnonzero(np.isfinite(xy[:, 0]))
+    names = ("flux", "flux_err", "x", "y", "chi2", "qfit", "cfit")
+    found = {name: np.full(n, np.nan) for name in names}
+    flags = np.full(n, int(PSF_FLAGS.NO_OVERLAP))
+    if len(rows):
+        fitted = _fit(arrays, model, xy[rows], side, bound, width.value / scale,
+                      _annulus(local_background, scale))  # fmt: skip
+        keys = ("flux_fit", "flux_err", "x_fit", "y_fit", "reduced_chi2", "qfit", "cfit")
+        for name, key in zip(names, keys, strict=True):
+            found[name][rows] = np.ma.filled(np.ma.asarray(fitted[key], float), np.nan)
+        flags[rows] = fitted["flags"]
+    if max_shift is None:
+        # errors of a position that is kept are none; its place is
+        found["x"][rows], found["y"][rows] = xy[rows].T
+    shift = np.hypot(found["x"] - xy[:, 0], found["y"] - xy[:, 1]) * scale
+    near = np.zeros(n, bool)
+    distance = np.abs(xy[rows, None] - xy[None, rows]).max(axis=2)
+    np.fill_diagonal(distance, np.inf)
+    near[rows] = (distance < side / 2).any(axis=1)
+    columns = {
+        "id": (ids, "Id of the catalogue"),
+        "sky": (sky, "Position of the catalogue"),
+        "flux": (found["flux"] * FNU, "Flux of the PSF"),
+        "flux_err": (found["flux_err"] * FNU, "Its error for noise that is not correlated"),
+        "x": (found["x"], "Fitted position, 0-based"),
+        "y": (found["y"], "Fitted position, 0-based"),
+        "shift": (shift * ANGLE, "From the position of the catalogue to the fitted one"),
+        "chi2": (found["chi2"], "Reduced chi^2"),
+        "qfit": (found["qfit"], "Sum of absolute residuals over the flux"),
+        "cfit": (found["cfit"], "Residual of the central pixel over the flux"),
+        "neighbour": (near, "Another row is within the fitted square: the flux is not its own"),
+        "flags": (flags, _describe_flags()),
+    }
+    table = QTable({name: values for name, (values, _) in columns.items()}, copy=True)
+    for name, (_, text) in columns.items():
+        table[name].info.description = text
+    table.meta.update(provenance(method="photutils PSFPhotometry", fit_size=round(side * scale, 6)))
+    return table
+
+
+def _fit(arrays, model, xy, side, bound, width, background):
+    """Run photutils on the flux per pixel."""
+    photometry = PSFPhotometry(
+        model, (side, side), grouper=None, xy_bounds=bound, aperture_radius=max(width, 1.5),
+        local_bkg_estimator=background,
+    )  # fmt: skip
+    with warnings.catch_warnings():
+        # what did not converge or has no pixels is in the flags
+        warnings.simplefilter("ignore", AstropyUserWarning)
+        return photometry(
+            arrays.flux,
+            mask=~arrays.usable,
+            error=np.where(arrays.usable, arrays.sigma, 1.0),
+            init_params=Table({"x": xy[:, 0], "y": xy[:, 1]}),
+        )
+
+
+def _annulus(radii, scale):
+    if radii is None:
+        return None
+    inner, outer = (_positive(r, "local_background") / scale for r in radii)
+    if not inner < outer:
+        raise argument_error("local_background", "an inner and a larger outer radius", radii)
+    return LocalBackground(inner, outer)
+
+
+def _positive(value, name):
+    """An angle in arcsec."""
+    number = float(to_array(value, ANGLE, name, ndim=0))
+    if not number > 0:
+        raise argument_error(name, "positive", value)
+    return number
+
+
+def _angle_of_y(wcs, shape):
+    """Position angle of an image's +y axis in its middle."""
+    x, y = (shape[1] - 1) / 2, (shape[0] - 1) / 2
+    here, above = wcs.pixel_to_world([x, x], [y, y + 1])
+    return here.position_angle(above).to(u.deg)
+
+
+def _describe_flags():
+    bits = [(f.bit_value, f.description) for f in PSF_FLAGS.FLAG_DEFINITIONS]
+    return "bit flags (sum): " + ", ".join(f"{bit} {text}" for bit, text in bits) + "; 0 good"

@@ -1,0 +1,132 @@
+"""PSF photometry by photutils: against closed-form images and forced photometry."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+from astropy.wcs import WCS
+from numpy.testing import assert_allclose
+
+from miricigale.instrument import north_up_wcs
+from miricigale.photometry import ForcedPhotometer, psf_photometry
+from miricigale.psf import gaussian_psf, make_psf
+
+SCALE = 0.11
+
+
+@pytest.fixture(scope="module")
+def psf(tools):
+    # integrated over no pixel, as the images are made
+    n = 161
+    x = (np.arange(n) - n // 2) * SCALE / 4
+    data = np.exp(-0.5 * (x[:, None] ** 2 + x**2) / tools.LO**2)
+    data *= 16 * (SCALE / 4) ** 2 / (2 * np.pi * tools.LO**2)
+    return make_psf(data, pixel_scale=SCALE * u.arcsec, oversampling=4, frame="sky")
+
+
+@pytest.fixture(scope="module")
+def stars(tools):
+    """Isolated stars with white noise, one masked, one off the image."""
+    rng = np.random.default_rng(8)
+    shape = (300, 300)
+    wcs = north_up_wcs(tools.CENTER, SCALE * u.arcsec, shape)
+    grid = np.linspace(-13, 13, 9)
+    dx, dy = (a.ravel() + rng.uniform(-0.05, 0.05, 81) for a in np.meshgrid(grid, grid))
+    dx[-1] = 60.0
+    sky = tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
+    flux = 10 ** rng.uniform(1, 2.5, 81)
+    sigma = 0.02 / (SCALE**2 * tools.SR * 1e12)
+    image = tools.as_ccd(
+        tools.render(sky, flux, tools.LO, wcs, shape) + rng.normal(0, sigma, shape), wcs, sigma
+    )
+    x, y = wcs.world_to_pixel(sky[0])
+    image.mask = np.zeros(shape, bool)
+    image.mask[int(y) - 12 : int(y) + 13, int(x) - 12 : int(x) + 13] = True
+    return image, QTable({"id": np.arange(81) + 500, "sky": sky}), flux
+
+
+def test_stars_come_back_with_true_errors_and_every_row_stays(stars, psf):
+    image, catalog, flux = stars
+    table = psf_photometry(image, psf, catalog)
+    assert table["id"].tolist() == catalog["id"].tolist()
+    assert table["flux"].unit == u.uJy
+    good = np.arange(1, 80)
+    assert np.isnan(table["flux"][[0, 80]]).all()
+    assert np.all(table["flags"][[0, 80]] > 0)
+    assert not table["flags"][good].any()
+    pull = ((table["flux"].value - flux) / table["flux_err"].value)[good]
+    assert 0.8 < pull.std() < 1.2
+    assert abs(pull.mean()) < 4 / np.sqrt(len(good))
+    # matched filter of a Gaussian in white noise: sigma sqrt(4 pi) width in pixels
+    assert_allclose(
+        table["flux_err"].value[good], 0.02 * np.sqrt(4 * np.pi) * 0.25 / SCALE, rtol=0.03
+    )
+    assert_allclose(table["chi2"][good], 1, atol=0.45)
+    # its position: sqrt(2) width over signal-to-noise along either axis
+    snr = flux[good] / table["flux_err"].value[good]
+    shift = table["shift"][good].to_value(u.arcsec) * snr / (np.sqrt(2) * 0.25)
+    assert np.median(shift) == pytest.approx(np.sqrt(2 * np.log(2)), rel=0.25)
+    assert shift.max() < 4.5
+    assert not table["neighbour"].any()
+
+
+def test_it_agrees_with_forced_photometry(tools, stars, psf):
+    image, catalog, _ = stars
+    fixed = psf_photometry(image, psf, catalog, max_shift=None)
+    forced = ForcedPhotometer(tools.kernel, template="psf", correlated_noise=False).measure(
+        image, catalog=catalog
+    )
+    good = np.isfinite(fixed["flux"].value)
+    assert good.sum() == 79
+    assert np.all(fixed["shift"][good] == 0)
+    difference = (fixed["flux"] - forced.flux).value[good] / forced.flux_err.value[good]
+    # the square that is fitted leaves out some of the light, not more
+    assert np.abs(difference).max() < 0.5
+    assert_allclose(fixed["flux_err"].value[good], forced.flux_err.value[good], rtol=0.03)
+
+
+def test_the_psf_is_turned_to_the_image(tools):
+    # an elliptical star on an image whose +y points 30 degrees east of north
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = "RA---TAN", "DEC--TAN"
+    wcs.wcs.crval, wcs.wcs.crpix = (53.1, -27.8), (61, 61)
+    c, s = np.cos(np.radians(30)), np.sin(np.radians(30))
+    wcs.wcs.cd = np.array([[-c, s], [s, c]]) * SCALE / 3600
+    sky = wcs.pixel_to_world(60.3, 59.8)
+    yy, xx = np.indices((121, 121))
+    world = wcs.pixel_to_world(xx, yy)
+    east, north = (v.to_value(u.arcsec) for v in sky.spherical_offsets_to(world))
+    wide, narrow = 0.4, 0.2
+    # 50 uJy, drawn out along north
+    light = np.exp(-0.5 * ((north / wide) ** 2 + (east / narrow) ** 2)) / (
+        2 * np.pi * wide * narrow
+    )
+    image = tools.as_ccd(light * 50e-12 / tools.SR, wcs, 0.01)
+    n = 201
+    g = (np.arange(n) - n // 2) * SCALE / 4
+    data = np.exp(-0.5 * ((g[:, None] / wide) ** 2 + (g / narrow) ** 2))
+    data *= 16 * (SCALE / 4) ** 2 / (2 * np.pi * wide * narrow)
+    catalog = QTable({"sky": sky.reshape(1)})
+    north_up = make_psf(data, pixel_scale=SCALE * u.arcsec, oversampling=4, frame="sky")
+    assert_allclose(psf_photometry(image, north_up, catalog)["flux"].value, 50, rtol=0.01)
+    detector = make_psf(data, pixel_scale=SCALE * u.arcsec, oversampling=4, frame="detector")
+    table = psf_photometry(image, detector, catalog, pa=0 * u.deg)
+    assert_allclose(table["flux"].value, 50, rtol=0.01)
+    wrong = psf_photometry(image, detector, catalog, pa=90 * u.deg)["flux"].value[0]
+    assert abs(wrong / 50 - 1) > 0.1
+    with pytest.raises(ValueError, match="pa"):
+        psf_photometry(image, detector, catalog)
+
+
+def test_neighbours_are_told_and_options_checked(tools, stars, psf):
+    image, catalog, _ = stars
+    two = QTable({"sky": tools.CENTER.spherical_offsets_by([0, 0.6] * u.arcsec, [0, 0] * u.arcsec)})
+    assert psf_photometry(image, psf, two)["neighbour"].tolist() == [True, True]
+    narrow = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.03 * u.arcsec, fov=3 * u.arcsec)
+    # a PSF on other pixels is brought to the image's
+    assert np.isfinite(psf_photometry(image, narrow, two)["flux"].value).all()
+    assert len(psf_photometry(image, psf, catalog[:0])) == 0
+    with pytest.raises(ValueError, match="'fit_size' must be positive"):
+        psf_photometry(image, psf, two, fit_size=0 * u.arcsec)
+    with pytest.raises(ValueError, match="'local_background' must be an inner and a larger"):
+        psf_photometry(image, psf, two, local_background=(2 * u.arcsec, 1 * u.arcsec))
