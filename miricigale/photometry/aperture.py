@@ -106,9 +106,14 @@ def source_extractor_photometry(
     background_box=64,
     background_filter=6,
     local_background=40,
+    stated_on=0.06 * u.arcsec,
 ):
     """
     Detect and measure on one image, blind, as Source Extractor does.
+
+    Settings in pixels are those of the paper's images of 0.06 arcsec. On other pixels they are brought to the
+    same sizes on the sky, and the threshold to the same surface brightness, so that a source has the same
+    flux on any.
 
     Parameters
     ----------
@@ -126,6 +131,8 @@ def source_extractor_photometry(
         BACK_SIZE in pixels and BACK_FILTERSIZE in boxes.
     local_background : int, optional
         Width of the ring for the local background in pixels, 0 for none.
+    stated_on : `~astropy.units.Quantity` or None, optional
+        Pixel scale for which settings in pixels are meant; None for the image's own.
 
     Returns
     -------
@@ -152,16 +159,21 @@ def source_extractor_photometry(
         subtract_background=True,
         box=background_box,
         filter_size=background_filter,
+        stated_on=stated_on,
     )
     arrays = image_arrays(image, "image")
-    level, _ = sep_background(arrays.flux, ~arrays.usable, background_box, background_filter)
+    ratio = 1.0
+    if stated_on is not None:
+        ratio = float(to_array(stated_on, ANGLE, "stated_on")) / pixel_scale(image.wcs)
+    box = max(1, round(background_box * ratio))
+    level, _ = sep_background(arrays.flux, ~arrays.usable, box, background_filter)
     flux = arrays.flux - np.where(arrays.usable, level, 0.0)
     names = ("flux_auto", "flux_auto_err", "flux_aper", "flux_aper_err")
     if len(catalog) == 0:
         values = [np.empty(0)] * 4
     else:
         values = _measure(
-            arrays, flux, segmentation, catalog, diameter, kron, local_background, image.wcs
+            arrays, flux, segmentation, catalog, diameter, kron, local_background * ratio, image.wcs
         )
     for name, value in zip(names, values, strict=True):
         catalog[name] = value * FNU
@@ -190,7 +202,7 @@ def _measure(arrays, flux, segmentation, catalog, diameter, kron, local_backgrou
         segmentation,
         error=sigma,
         mask=~arrays.usable,
-        local_bkg_width=int(local_background),
+        local_bkg_width=round(local_background),
         kron_params=(kron[0], kron[1] / kron[0], 0.0),
     )
     auto, auto_err = (np.atleast_1d(v) for v in (sources.kron_flux, sources.kron_flux_err))
@@ -199,6 +211,6 @@ def _measure(arrays, flux, segmentation, catalog, diameter, kron, local_backgrou
     shifted = type(arrays)(flux, sigma, arrays.usable, arrays.area, wcs, arrays.measured_noise)
     aper, aper_err, coverage = _circle_sums(shifted, xy, radius)
     if local_background:
-        ring = _annulus_levels(shifted, xy, radius, int(local_background))
+        ring = _annulus_levels(shifted, xy, radius, local_background)
         aper = aper - ring * np.pi * radius**2 * coverage
     return auto, auto_err, aper, aper_err

@@ -1,7 +1,9 @@
 import astropy.units as u
 import numpy as np
 import pytest
+import sep
 from numpy.testing import assert_allclose
+from scipy.special import ndtr
 
 from miricigale.instrument import north_up_wcs
 from miricigale.photometry import (
@@ -77,3 +79,56 @@ def test_encircled_energy_and_scale_of_point_sources(tools, stars):
     assert_allclose(aperture_correction(psf, 0.5 * u.arcsec), expected, rtol=2e-3)
     with pytest.raises(ValueError, match="'flux' must be positive"):
         encircled_flux(image, sky, -flux * u.uJy, radii)
+
+
+def extended(tools, scale, half=9.0):
+    """Nine sources of two integrated Gaussians each, the same light on pixels of any size."""
+    n = round(2 * half / scale)
+    wcs = north_up_wcs(tools.CENTER, scale * u.arcsec, (n, n))
+    edge = (np.arange(n + 1) - n / 2) * scale
+    grid = np.linspace(-5, 5, 3)
+    rng = np.random.default_rng(4)
+    dx, dy = (a.ravel() + rng.uniform(-0.2, 0.2, 9) for a in np.meshgrid(grid, grid))
+    flux = np.geomspace(20, 200, 9)
+    light = np.zeros((n, n))
+    for k, total in enumerate(flux):
+        for share, wide in ((0.6, 0.25), (0.4, 0.3 + 0.05 * k)):
+            column, row = (np.diff(ndtr((edge - at) / wide)) for at in (dx[k], dy[k]))
+            light += share * total * row[:, None] * column
+    sky = wcs.pixel_to_world(dx / scale + (n - 1) / 2, dy / scale + (n - 1) / 2)
+    sigma = 0.01 * scale / 0.06
+    area = scale**2 * tools.SR * 1e12
+    return sky, flux, light, tools.as_ccd(light / area, wcs, sigma / area)
+
+
+def test_a_source_has_one_flux_on_any_pixels(tools):
+    tables = {}
+    for scale in (0.03, 0.06, 0.11):
+        sky, flux, light, image = extended(tools, scale)
+        table = source_extractor_photometry(image)
+        index, separation, _ = sky.match_to_catalog_sky(table["sky"])
+        assert len(table) == 9
+        assert separation.arcsec.max() < 0.02
+        tables[scale] = table[index]
+        # AUTO of another program on the same pixels
+        kind = {"minarea": max(1, round(5 * (0.06 / scale) ** 2)), "deblend_cont": 1.0}
+        found = sep.extract(light, 0.02 * scale / 0.06, **kind)
+        x, y, a, b, theta = (found[name] for name in ("x", "y", "a", "b", "theta"))
+        radius, _ = sep.kron_radius(light, x, y, a, b, theta, 6.0)
+        auto, _, _ = sep.sum_ellipse(light, x, y, a, b, theta, np.maximum(2.5 * radius, 3.5))
+        order = np.argsort(auto)
+        assert_allclose(tables[scale]["flux_auto"].value, auto[order], rtol=0.02)
+        assert np.array_equal(np.argsort(tables[scale]["flux_auto"].value), np.argsort(flux))
+    for scale in (0.03, 0.11):
+        for name in ("flux_auto", "flux_aper", "flux_best"):
+            assert_allclose(tables[scale][name].value, tables[0.06][name].value, rtol=0.01)
+        # errors are those of the same noise
+        assert_allclose(
+            tables[scale]["flux_aper_err"].value, tables[0.06]["flux_aper_err"].value, rtol=0.01
+        )
+    # pixels of the image's own: another isophote and another ring
+    _, _, _, image = extended(tools, 0.03)
+    own = source_extractor_photometry(image, stated_on=None)
+    index = tables[0.03]["sky"].match_to_catalog_sky(own["sky"])[0]
+    off = own["flux_auto"].value[index] / tables[0.03]["flux_auto"].value - 1
+    assert np.abs(off).max() > 0.01
