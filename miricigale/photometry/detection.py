@@ -221,9 +221,9 @@ def detection_purity(
     table : `~astropy.table.QTable`
         A row for each bin: ``snr_low``, ``snr_high``, ``n_positive``, ``n_negative``, ``purity``
         (1 - n_negative / n_positive; below 0 where there are more negative detections, NaN without
-        positive ones) and ``purity_low``, ``purity_high``, its 68 % interval by the Poisson error of
-        ``n_negative``. ``meta`` has the total ``n_positive`` and ``n_negative``, those outside of the bins
-        included.
+        positive ones), ``purity_low``, ``purity_high``, its 68 % interval by the Poisson error of
+        ``n_negative``, and ``purity_above``, the purity of all detections from ``snr_low`` on.
+        ``meta`` has the total ``n_positive`` and ``n_negative``, those outside of the bins included.
 
     Raises
     ------
@@ -232,6 +232,9 @@ def detection_purity(
 
     Notes
     -----
+    Sources cover part of the image, and noise peaks that touch them are no detections of their own: at low
+    signal-to-noise the purity of a single bin is too low where sources are dense (F444W of a deep field: 51
+    detections on the image, 95 on its negative at 5 to 7 sigma); ``purity_above`` is the safer one.
     Holes beside bright sources (a background taken too high, ringing of a resampling) are counted as noise,
     so that the purity is too low there; noise with a tail to positive values, such as cosmic rays that
     were left, is not seen.
@@ -271,6 +274,8 @@ def detection_purity(
         purity, low, high = (
             np.where(n_positive > 0, 1 - n / n_positive, np.nan) for n in (n_negative, *limits)
         )
+        above = [np.cumsum(n[::-1])[::-1] for n in counts]
+        purity_above = np.where(above[0] > 0, 1 - above[1] / above[0], np.nan)
     columns = {
         "snr_low": (edges[:-1], "Least signal-to-noise of a segment"),
         "snr_high": (edges[1:], "Largest signal-to-noise, not included"),
@@ -279,6 +284,7 @@ def detection_purity(
         "purity": (purity, "1 - n_negative / n_positive"),
         "purity_low": (low, "Lower end of the 68 % interval"),
         "purity_high": (high, "Upper end of the 68 % interval"),
+        "purity_above": (purity_above, "Purity of all detections from snr_low on"),
     }
     table = QTable({name: values for name, (values, _) in columns.items()})
     for name, (_, description) in columns.items():

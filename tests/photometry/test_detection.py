@@ -175,6 +175,9 @@ def test_purity_of_noise_and_of_sources(tools):
     true = [np.mean(separation[(snr >= a) & (snr < b)] < 0.3)
             for a, b in table.iterrows("snr_low", "snr_high")]  # fmt: skip
     assert true[-1] > 0.9
+    whole = np.mean(separation < 0.3)
+    assert abs(table["purity_above"][0] - whole) < 3 / np.sqrt(len(found))
+    assert table["purity_above"][-1] == table["purity"][-1]
     assert table["purity_low"][-1] > 0.85
     error = np.hypot(table["purity_high"] - table["purity"], 1 / np.sqrt(table["n_positive"]))
     assert np.all(np.abs(table["purity"] - true) < 3 * error)
