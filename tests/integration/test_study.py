@@ -179,6 +179,10 @@ def test_point_sources_come_back_as_they_went_in(study):
         assert np.isfinite(ratio).all()
         # the promise of the study: 3 % in the median
         assert abs(np.median(ratio) - 1) < 0.03
+        # images and PSFs are of one calibration, so that the paper's factor is 1
+        meta = QTable.read(study["folder"] / "points" / f"{name}.ecsv").meta
+        assert abs(meta["f_scaling"] - 1) < 0.02
+        assert 1.05 < meta["f_aper"] < 1.25
 
 
 def test_the_mosaic_shows_the_truth(study):

@@ -119,6 +119,7 @@ def make_run(folder, filters, *, mass=3e10, points=False):
         bright = QTable({"flux_true": np.full(5, 100.0) * u.uJy})
         bright["flux"] = bright["flux_true"] * np.array([0.98, 0.99, 1.0, 1.01, 5.0])
         bright["in_field"] = np.ones(5, bool)
+        bright.meta.update(f_scaling=0.9987, f_scaling_err=0.001, f_aper=1.14)
         made.save_table(f"points/{name}.ecsv", bright)
     do_stage(config, folder, "errors")
     do_stage(config, folder, "fits", "with_miri")
@@ -234,6 +235,7 @@ def test_what_there_is_not_is_said(reports):
     assert "no band of this run" in page
     page = html.unescape(page_of(reports["two"]))
     assert "point sources</th>" in page
+    assert page.count("0.9987") == 2
     assert "No source is left to fit" not in page
     assert "no band of CEERS" in page
 

@@ -140,7 +140,7 @@ def study_stages():
             "points",
             "points:measure_point_sources",
             "point sources",
-            version=2,
+            version=3,
             needs=("kernels",),
             sections=(
                 *images,

@@ -22,6 +22,7 @@ __all__ = [
     "make_highres",
     "make_kernel",
     "make_mosaic",
+    "mosaic_psf",
     "reducer_of",
 ]
 
@@ -162,20 +163,23 @@ def make_highres(context, _):
     context.save_table("detections.ecsv", detected)
 
 
+def mosaic_psf(config, name):
+    """The PSF of the mosaic of one band."""
+    return psf_mosaic(
+        miri_psf(name),
+        config.reduction.pixel_scale * u.arcsec,
+        u.Quantity([e.pa_aper for e in band_exposures(config, name)]),
+        pixfrac=config.reduction.pixfrac,
+    )
+
+
 def kernel_of(config, name):
     """Kernel from the high-resolution image to the mosaic of one band."""
     options = config.highres
     value = config.photometry.regularization
-    exposures = band_exposures(config, name)
-    target = psf_mosaic(
-        miri_psf(name),
-        config.reduction.pixel_scale * u.arcsec,
-        u.Quantity([e.pa_aper for e in exposures]),
-        pixfrac=config.reduction.pixfrac,
-    )
     return MatchingKernel.from_psfs(
         hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec),
-        target,
+        mosaic_psf(config, name),
         pixel_scale=options.pixel_scale * u.arcsec,
         regularization=value if value in ("auto", "yang2021") else float(value),
     )

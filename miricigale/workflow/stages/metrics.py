@@ -259,6 +259,9 @@ def study_metrics(config, tables, area):
                 "points_n": points.n,
                 "points_median": points.median,
                 "points_scatter": points.sigma_mad,
+                "f_scaling": float(tables.points[name].meta.get("f_scaling", np.nan)),
+                "f_scaling_err": float(tables.points[name].meta.get("f_scaling_err", np.nan)),
+                "f_aper": float(tables.points[name].meta.get("f_aper", np.nan)),
             }
         metrics["bands"][name] = entry
     sample = truth[selection == 0]

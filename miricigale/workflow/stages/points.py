@@ -6,17 +6,24 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
 from miricigale.instrument import mosaic_wcs, scaled_limit, tangent_offset
-from miricigale.photometry import ForcedPhotometer, detect_sources
+from miricigale.photometry import (
+    ForcedPhotometer,
+    aperture_correction,
+    detect_sources,
+    flux_scaling,
+)
 from miricigale.psf import MatchingKernel, hst_psf
 from miricigale.scene import highres_image
 from miricigale.utils.random import text_key
 from miricigale.utils.tables import error_column, match_sky
 from miricigale.workflow.stages.exposures import study_exposures
-from miricigale.workflow.stages.images import expose_and_reduce, reducer_of
+from miricigale.workflow.stages.images import expose_and_reduce, mosaic_psf, reducer_of
 from miricigale.workflow.stages.sample import in_field
 
 __all__ = ["measure_point_sources", "point_catalog"]
 
+#: Radius of the paper's PSF stamps, at which f_aper is told.
+STAMP_RADIUS = 1.5 * u.arcsec
 #: Flux of the point sources on the high-resolution image: bright, so that noise is no matter.
 PRIOR_FLUX = 30 * u.uJy
 
@@ -106,4 +113,12 @@ def measure_point_sources(context, name):
         table[column] = np.where(index >= 0, measured[column][index].value, np.nan) * u.uJy
     table["flags"] = np.where(index >= 0, np.asarray(measured["flags"])[index], 0)
     table["in_field"] = in_field(table["sky"], [mosaic])
+    # the paper's two factors: ours must leave the image as it is
+    psf, inside = mosaic_psf(config, name), np.asarray(table["in_field"])
+    factors = {"f_aper": aperture_correction(psf, STAMP_RADIUS)}
+    if np.any(inside):
+        factors["f_scaling"], factors["f_scaling_err"] = flux_scaling(
+            mosaic, table["sky"][inside], table["flux_true"][inside], psf
+        )
+    table.meta.update(factors)
     context.save_table(f"points/{name}.ecsv", table)

@@ -207,6 +207,7 @@ class _Writer:
                         entry["points_n"],
                         _percent(entry["points_median"], "no point source measured", "+.2f"),
                         _percent(entry["points_scatter"], "no point source measured"),
+                        number(entry["f_scaling"], ".4f", "no whole point source in the field"),
                     )
                     if points
                     else ()
@@ -216,8 +217,14 @@ class _Writer:
         ]
         header = ("band", "isolated > 20 sigma", "median offset", "its error")
         if points:
-            header += ("point sources", "median offset", "scatter")
-        self.report.table(rows, header=header, caption="Measured over true flux minus one")
+            header += ("point sources", "median offset", "scatter", "f_scaling")
+        caption = "Measured over true flux minus one"
+        if points:
+            caption += (
+                "; f_scaling, the factor that brings the light of the point sources within the radius of 80 % to "
+                "that of the PSF, is 1 where images and PSF agree"
+            )
+        self.report.table(rows, header=header, caption=caption)
         if points:
             shown = {name: table[np.asarray(table["in_field"])] for name, table in points.items()}
             self.report.figure(
