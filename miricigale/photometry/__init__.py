@@ -26,5 +26,6 @@ __getattr__, __dir__, __all__ = lazy_names(
         "sources": ("SourceTemplates",),
         "results": ("ForcedPhotometryResult", "crowded"),
         "stars": ("psf_photometry",),
+        "yang2021": ("Yang2021Photometer",),
     },
 )

@@ -1,0 +1,159 @@
+"""Forced photometry as Yang et al. 2021 did it, to show what the package's own method gains."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+from astropy.nddata import StdDevUncertainty
+from astropy.wcs.utils import pixel_to_pixel
+
+from miricigale.photometry.arrays import image_arrays
+from miricigale.photometry.corrections import aperture_correction
+from miricigale.photometry.forced import ForcedPhotometer
+from miricigale.psf import MatchingKernel
+from miricigale.utils.exceptions import argument_error
+
+__all__ = ["Yang2021Photometer"]
+
+#: The grid of images and templates, and the width of the PSF stamps.
+_PIXEL, _STAMP = 0.06 * u.arcsec, 3.0 * u.arcsec
+#: The prior's noise is made this much smaller: T-PHOT takes templates as they are.
+_NOISELESS = 1e-6
+
+
+class Yang2021Photometer:
+    """
+    Measure sources with T-PHOT's templates, the paper's kernels and its two corrections.
+
+    Parameters
+    ----------
+    source, target : `~photutils.psf.ImagePSF`
+        PSF of the high-resolution image, and of the mosaic that is measured. Both must say what
+        fraction of all light they hold (as those of the package do).
+    source_angle, target_angle : `~astropy.units.Quantity`, optional
+        Position angles of PSFs in the detector frame, as of `~miricigale.psf.MatchingKernel.from_psfs`.
+    scaling : float, optional
+        The paper's f_scaling, by which the image is multiplied before it is measured: of
+        `~miricigale.photometry.flux_scaling` on bright point sources.
+    n_threads : int, optional
+        Number of threads; by default one for each processor.
+
+    Attributes
+    ----------
+    kernel : `~miricigale.psf.MatchingKernel`
+        Between the two PSFs cut to 3 x 3 arcsec and normalised, with mu = 0.03 on 0.06 arcsec.
+    scaling : float
+        As given.
+    aperture : float
+        The paper's f_aper, by which fluxes are multiplied: 1 / (light of the target within 1.5 arcsec).
+
+    Raises
+    ------
+    ValueError
+        If the scaling is not positive, or the target holds less than 1.5 arcsec.
+
+    Notes
+    -----
+    What differs from `~miricigale.photometry.ForcedPhotometer` with its own settings: templates are the bare
+    segments, without the light outside of them, whatever their signal-to-noise; the noise of the
+    high-resolution image counts nowhere; kernels are as above; the image is on pixels of 0.06 arcsec, on which the
+    noise is correlated, and errors take it as white. No background is fitted. The equations are those of the
+    package (all sources at once), not T-PHOT's cells; T-PHOT's second pass, in which kernels are shifted
+    locally, is not here.
+
+    References
+    ----------
+    Yang et al. 2021, ApJ 908, 144, sections 3.2 to 3.4; Merlin et al. 2015, A&A 582, A15 (T-PHOT).
+    """
+
+    def __init__(
+        self, source, target, *, source_angle=None, target_angle=None, scaling=1.0, n_threads=None
+    ):
+        if not (np.isfinite(scaling) and scaling > 0):
+            raise argument_error("scaling", "positive", scaling)
+        self.kernel = MatchingKernel.from_psfs(
+            source,
+            target,
+            pixel_scale=_PIXEL,
+            regularization="yang2021",
+            hi_angle=source_angle,
+            lo_angle=target_angle,
+            extent=_STAMP,
+            normalize=True,
+        )
+        self.scaling = float(scaling)
+        self.aperture = aperture_correction(target, _STAMP / 2)
+        self._photometer = ForcedPhotometer(
+            self.kernel,
+            template="cutout",
+            wings=False,
+            correlated_noise=False,
+            n_threads=n_threads,
+        )
+
+    def __repr__(self):
+        return (
+            f"<Yang2021Photometer scaling={self.scaling:.4f}, aperture={self.aperture:.4f}, "
+            f"{self.kernel!r}>"
+        )
+
+    def measure(self, image, highres, segmentation, catalog):
+        """
+        Measure all sources of a catalogue.
+
+        Parameters
+        ----------
+        image : `~astropy.nddata.CCDData`
+            The mosaic, background subtracted, on the pixels of ``highres``.
+        highres, segmentation, catalog
+            As of `ForcedPhotometer.measure`.
+
+        Returns
+        -------
+        result : `ForcedPhotometryResult`
+            Fluxes and errors are total ones, after both corrections. Its images are those of the
+            scaled mosaic.
+
+        Raises
+        ------
+        ValueError
+            If the image is not on the pixels of ``highres`` (of the same or another extent).
+        """
+        image_arrays(image, "image")
+        prior = image_arrays(highres, "highres")
+        _require_same_pixels(image, highres)
+        # as brightness, which the uncertainty of the image may not be given in
+        noise = StdDevUncertainty(
+            np.where(prior.usable, _NOISELESS * prior.sigma / prior.area, 0.0)
+        )
+        clean = highres.copy()
+        clean.data = prior.flux / prior.area
+        clean.unit = u.MJy / u.sr
+        clean.uncertainty = noise
+        clean.mask = ~prior.usable
+        scaled = image.multiply(self.scaling, handle_meta="first_found")
+        result = self._photometer.measure(scaled, clean, segmentation, catalog)
+        return dataclasses.replace(
+            result,
+            flux=result.flux * self.aperture,
+            flux_err=result.flux_err * self.aperture,
+            covariance=result.covariance * self.aperture**2,
+            template_snr=result.template_snr * _NOISELESS,
+            meta={
+                **result.meta,
+                "method": "yang2021",
+                "f_scaling": self.scaling,
+                "f_aper": self.aperture,
+            },
+        )
+
+
+def _require_same_pixels(image, highres):
+    """Check that pixels of two images coincide, up to a whole number of them."""
+    ny, nx = image.shape
+    x, y = np.array([0.0, nx - 1.0, 0.0]), np.array([0.0, 0.0, ny - 1.0])
+    offsets = np.stack(pixel_to_pixel(image.wcs, highres.wcs, x, y)) - [x, y]
+    whole = np.rint(offsets[:, :1])
+    if not np.all(np.abs(offsets - whole) < 0.02):
+        wanted = "on the pixels of 'highres', up to a shift of whole ones"
+        raise argument_error("image", wanted, f"offsets of {np.round(offsets, 2).tolist()} pixels")
