@@ -209,8 +209,11 @@ def test_edge_crowded_and_spurious_are_counted(reports):
     fits = metrics["fits"]["with_miri"]
     assert fits["conditions"]["edge"]["n"] == 1
     assert fits["conditions"]["isolated"]["n"] <= fits["n"] - 1
-    # every row of either catalogue stands in the association once
     folder = reports["four"].parent
+    condition = np.asarray(QTable.read(folder / "fits_with_miri.ecsv")["condition"])
+    assert np.count_nonzero(condition & 1) == 1
+    assert np.count_nonzero((condition & 7) == 0) == fits["conditions"]["isolated"]["n"]
+    # every row of either catalogue stands in the association once
     table = QTable.read(folder / "association.ecsv")
     assert sorted(table["first"]) == [-1, *range(24)]
     assert sorted(table["second"]) == list(range(25))

@@ -174,7 +174,7 @@ def study_stages():
             "fits",
             "measure:fit_photometry",
             "fit",
-            version=3,
+            version=4,
             needs=("truth", "errors"),
             sections=("fit", "exposures.filters"),
             resources=sed_data,

@@ -18,6 +18,7 @@ __all__ = [
     "MARKS",
     "ConditionFlags",
     "add_conditions",
+    "any_condition",
     "band_conditions",
     "detection_counts",
     "fit_conditions",
@@ -90,6 +91,11 @@ def add_conditions(table, bands, *, suffix="", detections=False):
         condition[~np.isfinite(table[name].value)] |= int(ConditionFlags.NOT_MEASURED)
         table[f"{name}_condition"] = condition
         table[f"{name}_condition"].info.description = ConditionFlags.describe()
+
+
+def any_condition(table, bands):
+    """The conditions of each row in any of the bands."""
+    return np.bitwise_or.reduce([np.asarray(table[f"{name}_condition"]) for name in bands])
 
 
 def _groups(condition):
@@ -196,7 +202,7 @@ def fit_conditions(sample, redshift, table, bands):
     groups : dict of str to dict
         ``n``, ``photoz_sigma_mad`` and ``photoz_n_outliers`` for each of `CONDITIONS`.
     """
-    condition = np.bitwise_or.reduce([np.asarray(sample[f"{name}_condition"]) for name in bands])
+    condition = any_condition(sample, bands)
     groups = {}
     for name, rows in _groups(condition).items():
         found = photoz_metrics(np.asarray(redshift)[rows], table["redshift_mean"][rows])

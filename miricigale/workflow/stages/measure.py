@@ -13,7 +13,7 @@ from miricigale.photometry.error_model import fractional_error
 from miricigale.psf import MatchingKernel, hst_psf
 from miricigale.sed import SEDModel
 from miricigale.utils.tables import error_column
-from miricigale.workflow.stages.conditions import add_conditions
+from miricigale.workflow.stages.conditions import ConditionFlags, add_conditions, any_condition
 from miricigale.workflow.stages.sample import add_selection, in_field
 
 __all__ = [
@@ -153,4 +153,9 @@ def fit_photometry(context, unit):
     with ThreadPoolExecutor(context.n_threads) as executor:
         results = fitter.fit(photometry, executor=executor, progress_bar=context.progress_bar)
     context.save_result(f"fits_{unit}.fits", results)
-    context.save_table(f"fits_{unit}.ecsv", results.to_table())
+    table = results.to_table()
+    table["condition"] = any_condition(matched, config.exposures.filters)[
+        np.asarray(matched["selection"]) == 0
+    ]
+    table["condition"].info.description = ConditionFlags.describe()
+    context.save_table(f"fits_{unit}.ecsv", table)
