@@ -19,6 +19,9 @@ from miricigale.utils.units import ANGLE, FNU, to_array
 
 __all__ = ["psf_photometry"]
 
+#: Bit of a star that is on no pixel; by its name, which all versions of photutils have.
+_NO_OVERLAP = next(f.bit_value for f in PSF_FLAGS.FLAG_DEFINITIONS if f.name == "no_overlap")
+
 
 def psf_photometry(
     image,
@@ -70,7 +73,8 @@ def psf_photometry(
     -----
     Each star is fitted as if it were alone: ``neighbour`` tells where it is not, and forced photometry
     is for those. Sources are not grouped on purpose: photutils 3.0 keeps the model of a group by the number
-    of its sources, so that groups of a second band in one process may be fitted with the PSF of the first.
+    of its sources, so that groups of a second band in one process may be fitted with the PSF of the first
+    (mended in 3.1).
 
     References
     ----------
@@ -106,7 +110,7 @@ def psf_photometry(
     rows = np.flatnonzero(np.isfinite(xy[:, 0]))
     names = ("flux", "flux_err", "x", "y", "chi2", "qfit", "cfit")
     found = {name: np.full(n, np.nan) for name in names}
-    flags = np.full(n, int(PSF_FLAGS.NO_OVERLAP))
+    flags = np.full(n, _NO_OVERLAP)
     if len(rows):
         fitted = _fit(arrays, model, xy[rows], side, bound, width.value / scale,
                       _annulus(local_background, scale))  # fmt: skip
