@@ -133,11 +133,16 @@ class Yang2021Photometer:
         clean.mask = ~prior.usable
         scaled = image.multiply(self.scaling, handle_meta="first_found")
         result = self._photometer.measure(scaled, clean, segmentation, catalog)
+        totals = {}
+        for field in dataclasses.fields(result):
+            value = getattr(result, field.name)
+            if field.name.startswith("flux") and value is not None:
+                totals[field.name] = value * self.aperture
+            elif field.name.endswith("covariance") and value is not None:
+                totals[field.name] = value * self.aperture**2
         return dataclasses.replace(
             result,
-            flux=result.flux * self.aperture,
-            flux_err=result.flux_err * self.aperture,
-            covariance=result.covariance * self.aperture**2,
+            **totals,
             template_snr=result.template_snr * _NOISELESS,
             meta={
                 **result.meta,
