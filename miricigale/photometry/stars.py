@@ -61,7 +61,7 @@ def psf_photometry(
     table : `~astropy.table.QTable`
         A row for each row of the catalogue, in its order: ``id``, ``sky``, ``flux``, ``flux_err`` (uJy, for
         noise that is not correlated; NaN where not measured), ``x``, ``y`` (fitted, 0-based pixels), ``shift``
-        (arcsec from the catalogue's position), ``chi2`` (reduced), ``qfit``, ``cfit``, ``neighbour``
+        (arcsec from the catalogue's position), ``chi2`` (reduced), ``qfit``, ``cfit``, ``neighbor``
         (whether another row is within the fitted square) and ``flags`` (photutils').
 
     Raises
@@ -71,7 +71,7 @@ def psf_photometry(
 
     Notes
     -----
-    Each star is fitted as if it were alone: ``neighbour`` tells where it is not, and forced photometry
+    Each star is fitted as if it were alone: ``neighbor`` tells where it is not, and forced photometry
     is for those. Sources are not grouped on purpose: photutils 3.0 keeps the model of a group by the number
     of its sources, so that groups of a second band in one process may be fitted with the PSF of the first
     (mended in 3.1).
@@ -137,7 +137,7 @@ def psf_photometry(
         "chi2": (found["chi2"], "Reduced chi^2"),
         "qfit": (found["qfit"], "Sum of absolute residuals over the flux"),
         "cfit": (found["cfit"], "Residual of the central pixel over the flux"),
-        "neighbour": (near, "Another row is within the fitted square: the flux is not its own"),
+        "neighbor": (near, "Another row is within the fitted square: the flux is not its own"),
         "flags": (flags, _describe_flags()),
     }
     table = QTable({name: values for name, (values, _) in columns.items()}, copy=True)

@@ -67,7 +67,7 @@ def test_stars_come_back_with_true_errors_and_every_row_stays(stars, psf):
     shift = table["shift"][good].to_value(u.arcsec) * snr / (np.sqrt(2) * 0.25)
     assert np.median(shift) == pytest.approx(np.sqrt(2 * np.log(2)), rel=0.25)
     assert shift.max() < 4.5
-    assert not table["neighbour"].any()
+    assert not table["neighbor"].any()
 
 
 def test_it_agrees_with_forced_photometry(tools, stars, psf):
@@ -118,10 +118,10 @@ def test_the_psf_is_turned_to_the_image(tools):
         psf_photometry(image, detector, catalog)
 
 
-def test_neighbours_are_told_and_options_checked(tools, stars, psf):
+def test_neighbors_are_told_and_options_checked(tools, stars, psf):
     image, catalog, _ = stars
     two = QTable({"sky": tools.CENTER.spherical_offsets_by([0, 0.6] * u.arcsec, [0, 0] * u.arcsec)})
-    assert psf_photometry(image, psf, two)["neighbour"].tolist() == [True, True]
+    assert psf_photometry(image, psf, two)["neighbor"].tolist() == [True, True]
     narrow = gaussian_psf(0.3 * u.arcsec, pixel_scale=0.03 * u.arcsec, fov=3 * u.arcsec)
     # a PSF on other pixels is brought to the image's
     assert np.isfinite(psf_photometry(image, narrow, two)["flux"].value).all()

@@ -19,10 +19,10 @@ BAND = "miri.f770w"
 
 
 def make():
-    """Six sources in a row: crowded, its bright neighbour, at the edge, ambiguous, alone, not found."""
+    """Six sources in a row: crowded, its bright neighbor, at the edge, ambiguous, alone, not found."""
     x = np.array([0.0, 1.5, 10.0, 20.0, 30.0, 40.0])
     truth = QTable({"id": np.arange(6), "sky": SkyCoord(x * u.arcsec, 0 * x * u.arcsec)})
-    # 0.9 mag fainter than its neighbour, which is not 1 mag brighter than itself
+    # 0.9 mag fainter than its neighbor, which is not 1 mag brighter than itself
     truth[BAND] = [10.0, 30.0, 10.0, 10.0, 10.0, 10.0] * u.uJy
     y = np.array([0.0, 1.5, 10.0, 20.0, 20.4, 30.0, 50.0])
     found = QTable({"id": np.arange(7) + 100, "sky": SkyCoord(y * u.arcsec, 0 * y * u.arcsec)})

@@ -1,4 +1,4 @@
-"""What tells sources and detections apart without leaving them out: edges, neighbours, doubtful matches."""
+"""What tells sources and detections apart without leaving them out: edges, neighbors, doubtful matches."""
 
 import numpy as np
 
@@ -33,7 +33,7 @@ class ConditionFlags(Flags):
 
     #: More than a tenth of its light falls off the image.
     EDGE = 1
-    #: A neighbour within 2 arcsec is brighter than its magnitude plus one.
+    #: A neighbor within 2 arcsec is brighter than its magnitude plus one.
     CROWDED = 2
     #: More than one candidate is within the radius of the match, or it is not mutual.
     AMBIGUOUS = 4
@@ -73,7 +73,7 @@ def add_conditions(table, bands, *, suffix="", detections=False):
     bands : iterable of str
         Bands.
     suffix : str, optional
-        Of the columns by whose fluxes neighbours are compared: ``"_true"`` for the truth.
+        Of the columns by whose fluxes neighbors are compared: ``"_true"`` for the truth.
     detections : bool, optional
         Whether rows are detections, of which those without a source are spurious.
     """
@@ -235,7 +235,7 @@ def write_conditions(report, metrics):
         rows,
         header=("band", "in the field", "no flux", *CONDITIONS),
         caption="Sources of the field by condition: their number, and median and scatter of measured "
-        "over true flux minus one of those above 5 sigma. Crowded: a neighbour within 2 arcsec is "
+        "over true flux minus one of those above 5 sigma. Crowded: a neighbor within 2 arcsec is "
         "brighter than the magnitude plus one; edge: more than a tenth of the light falls off the "
         "image; ambiguous: the match to the detections is not the only one possible; isolated: "
         "none of these. A source may be in several of the three",
