@@ -134,6 +134,9 @@ class ReductionSection:
 class PhotometrySection:
     """How sources are found and measured."""
 
+    method: str = _option(
+        "package", "Forced photometry: own, or Yang et al. 2021.", choices=("package", "yang2021")
+    )
     threshold: float = _option(
         0.25, "Detection threshold in sigma of a pixel.", low=0.01, high=100.0
     )
@@ -242,6 +245,10 @@ class StudyConfig:
                 f"[fit] depths must have one number per band ({len(self.fit.bands)}), "
                 f"got {len(self.fit.depths)}"
             )
+            raise ConfigError(msg)
+        pixel = self.highres.pixel_scale
+        if self.photometry.method == "yang2021" and pixel != 0.06:
+            msg = f"[highres] pixel_scale must be 0.06 with method = 'yang2021', got {pixel}"
             raise ConfigError(msg)
         if self.photometry.regularization not in ("auto", "yang2021"):
             try:

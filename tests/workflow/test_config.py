@@ -47,6 +47,10 @@ def test_presets_are_listed_without_their_variants():
             "[exposures]\nn_groups = [10]\n",
             r"n_groups must have one number per filter \(6\), got 1",
         ),
+        (
+            "[photometry]\nmethod = 'yang2021'\n[highres]\npixel_scale = 0.05\n",
+            "pixel_scale must be 0.06 with method = 'yang2021', got 0.05",
+        ),
         ("[photometry]\nregularization = '-1'\n", "regularization must be 'auto', 'yang2021'"),
         ("run = 3\n", r"\[run\] must be a section, got 3"),
         ("[run\n", "is not valid TOML"),

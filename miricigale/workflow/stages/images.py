@@ -22,6 +22,7 @@ __all__ = [
     "make_highres",
     "make_kernel",
     "make_mosaic",
+    "measured_mosaic",
     "mosaic_psf",
     "reducer_of",
 ]
@@ -163,14 +164,21 @@ def make_highres(context, _):
     context.save_table("detections.ecsv", detected)
 
 
-def mosaic_psf(config, name):
-    """The PSF of the mosaic of one band."""
+def mosaic_psf(config, name, scale):
+    """The PSF of the mosaic of one band on pixels of ``scale`` arcsec."""
     return psf_mosaic(
         miri_psf(name),
-        config.reduction.pixel_scale * u.arcsec,
+        scale * u.arcsec,
         u.Quantity([e.pa_aper for e in band_exposures(config, name)]),
         pixfrac=config.reduction.pixfrac,
     )
+
+
+def measured_mosaic(config):
+    """Suffix and pixel scale (arcsec) of the mosaics that are measured: the paper's are the prior's."""
+    if config.photometry.method == "yang2021":
+        return "_fine", config.highres.pixel_scale
+    return "", config.reduction.pixel_scale
 
 
 def kernel_of(config, name):
@@ -179,7 +187,7 @@ def kernel_of(config, name):
     value = config.photometry.regularization
     return MatchingKernel.from_psfs(
         hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec),
-        mosaic_psf(config, name),
+        mosaic_psf(config, name, config.reduction.pixel_scale),
         pixel_scale=options.pixel_scale * u.arcsec,
         regularization=value if value in ("auto", "yang2021") else float(value),
     )

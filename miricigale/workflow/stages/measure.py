@@ -8,12 +8,19 @@ from astropy.table import QTable
 
 from miricigale.evaluation import associate, match_truth
 from miricigale.fitting import BayesFitter
-from miricigale.photometry import ErrorModel, ForcedPhotometer, SourceTemplates, join_bands
+from miricigale.photometry import (
+    ErrorModel,
+    ForcedPhotometer,
+    SourceTemplates,
+    Yang2021Photometer,
+    join_bands,
+)
 from miricigale.photometry.error_model import fractional_error
 from miricigale.psf import MatchingKernel, hst_psf
 from miricigale.sed import SEDModel
 from miricigale.utils.tables import error_column
 from miricigale.workflow.stages.conditions import ConditionFlags, add_conditions, any_condition
+from miricigale.workflow.stages.images import measured_mosaic, mosaic_psf
 from miricigale.workflow.stages.sample import add_selection, in_field
 
 __all__ = [
@@ -23,6 +30,7 @@ __all__ = [
     "make_templates",
     "measure_photometry",
     "mock_photometry",
+    "yang2021_photometer",
 ]
 
 
@@ -41,17 +49,43 @@ def make_templates(context, _):
 
 
 def measure_photometry(context, name):
-    """Stage 11: forced photometry of one band on its own grid."""
-    kernel = MatchingKernel.read(context.path(f"kernel_{name}.fits"))
-    # a constant takes up what faint sources and wings left in the background
-    result = ForcedPhotometer(kernel, fit_background=True, n_threads=context.n_threads).measure(
-        context.image(f"mosaic_{name}.fits"),
-        templates=SourceTemplates.read(context.path("templates.fits")),
-    )
+    """Stage 11: forced photometry of one band, on its own grid or as the paper did."""
+    if context.config.photometry.method == "yang2021":
+        result = _as_yang2021(context, name)
+    else:
+        kernel = MatchingKernel.read(context.path(f"kernel_{name}.fits"))
+        # a constant takes up what faint sources and wings left in the background
+        result = ForcedPhotometer(kernel, fit_background=True, n_threads=context.n_threads).measure(
+            context.image(f"mosaic_{name}.fits"),
+            templates=SourceTemplates.read(context.path("templates.fits")),
+        )
     table = result.to_table()
     context.save_table(f"photometry/{name}.ecsv", table)
     context.save_image(f"photometry/{name}_model.fits", result.model_image)
     context.save_image(f"photometry/{name}_residual.fits", result.residual_image)
+
+
+def yang2021_photometer(config, name, n_threads):
+    """The paper's photometer of one band; images that are our own have the scale of the truth."""
+    options = config.highres
+    _, scale = measured_mosaic(config)
+    return Yang2021Photometer(
+        hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec),
+        mosaic_psf(config, name, scale),
+        n_threads=n_threads,
+    )
+
+
+def _as_yang2021(context, name):
+    """Forced photometry of one band by the steps of the paper."""
+    suffix, _ = measured_mosaic(context.config)
+    _, labels = context.image("segm.fits", "segmentation")
+    return yang2021_photometer(context.config, name, context.n_threads).measure(
+        context.image(f"mosaic_{name}{suffix}.fits"),
+        context.image("f160w.fits"),
+        labels.astype(np.int32),
+        QTable.read(context.path("detections.ecsv")),
+    )
 
 
 def band_photometry(context, bands):

@@ -17,7 +17,13 @@ from miricigale.scene import highres_image
 from miricigale.utils.random import text_key
 from miricigale.utils.tables import error_column, match_sky
 from miricigale.workflow.stages.exposures import study_exposures
-from miricigale.workflow.stages.images import expose_and_reduce, mosaic_psf, reducer_of
+from miricigale.workflow.stages.images import (
+    expose_and_reduce,
+    measured_mosaic,
+    mosaic_psf,
+    reducer_of,
+)
+from miricigale.workflow.stages.measure import yang2021_photometer
 from miricigale.workflow.stages.sample import in_field
 
 __all__ = ["measure_point_sources", "point_catalog"]
@@ -86,7 +92,8 @@ def measure_point_sources(context, name):
     catalog = point_catalog(exposure, flux, prior, spacing=options.spacing, seed=seed)
     _, cal = expose_and_reduce(config, exposure, catalog, seed=seed, n_threads=context.n_threads)
     reducer = reducer_of(config)
-    mosaic = reducer.mosaic([cal], mosaic_wcs([exposure], config.reduction.pixel_scale * u.arcsec))
+    _, scale = measured_mosaic(config)
+    mosaic = reducer.mosaic([cal], mosaic_wcs([exposure], scale * u.arcsec))
     mosaic, _ = reducer.subtract_background(mosaic)
     highres = highres_image(
         catalog,
@@ -99,11 +106,14 @@ def measure_point_sources(context, name):
     segmentation, detected = detect_sources(
         highres, threshold=config.photometry.threshold, min_area=config.photometry.min_area
     )
-    photometer = ForcedPhotometer(
-        MatchingKernel.read(context.path(f"kernel_{name}.fits")),
-        fit_background=True,
-        n_threads=context.n_threads,
-    )
+    if config.photometry.method == "yang2021":
+        photometer = yang2021_photometer(config, name, context.n_threads)
+    else:
+        photometer = ForcedPhotometer(
+            MatchingKernel.read(context.path(f"kernel_{name}.fits")),
+            fit_background=True,
+            n_threads=context.n_threads,
+        )
     result = photometer.measure(mosaic, highres, segmentation, detected)
     table = catalog["id", "sky"]
     table["flux_true"] = catalog[name]
@@ -114,7 +124,7 @@ def measure_point_sources(context, name):
     table["flags"] = np.where(index >= 0, np.asarray(measured["flags"])[index], 0)
     table["in_field"] = in_field(table["sky"], [mosaic])
     # the paper's two factors: ours must leave the image as it is
-    psf, inside = mosaic_psf(config, name), np.asarray(table["in_field"])
+    psf, inside = mosaic_psf(config, name, scale), np.asarray(table["in_field"])
     factors = {"f_aper": aperture_correction(psf, STAMP_RADIUS)}
     if np.any(inside):
         factors["f_scaling"], factors["f_scaling_err"] = flux_scaling(

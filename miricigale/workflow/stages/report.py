@@ -14,6 +14,7 @@ from miricigale.evaluation import (
 from miricigale.sed import SEDModel
 from miricigale.workflow.stages import conditions, figures, pictures, provenance
 from miricigale.workflow.stages.figures import band_label
+from miricigale.workflow.stages.images import measured_mosaic
 from miricigale.workflow.stages.metrics import FITS, StudyTables, study_metrics
 from miricigale.workflow.stages.sample import SampleFlags, footprint_area, typical_source
 
@@ -158,8 +159,12 @@ class _Writer:
             ),
             f"{told} The bar is 20 arcsec long.",
         )
+        suffix, _ = measured_mosaic(self.config)
         pairs = [
-            (self.mosaics[name], self.context.image(f"photometry/{name}_model.fits"))
+            (
+                self.context.image(f"mosaic_{name}{suffix}.fits"),
+                self.context.image(f"photometry/{name}_model.fits"),
+            )
             for name in chosen
         ]
         self.report.figure(
@@ -170,9 +175,12 @@ class _Writer:
 
     def photometry(self):
         """Measured against true fluxes, and the point sources."""
+        how = ""
+        if self.config.photometry.method == "yang2021":
+            how = ", by the steps of Yang et al. 2021 (bare segments, errors for white noise)"
         self.report.section(
             "Forced photometry",
-            "Every detection of the high-resolution image is fitted in each MIRI mosaic; matched "
+            f"Every detection of the high-resolution image is fitted in each MIRI mosaic{how}; matched "
             "sources inside the field are shown.",
         )
         matched = self.tables.matched
