@@ -146,18 +146,21 @@ def limiting_flux(curve, n_sigma):
 
 
 def common_bands(truth, measured):
-    """Names of the flux columns that two tables both have."""
+    """Names of the flux columns that two tables both have; an error if there is none."""
     require_columns(truth, [], "truth")
     require_columns(measured, [], "measured")
     errors = {error_column(name) for name in truth.colnames}
-    return [
+    shared = [name for name in truth.colnames if name in measured.colnames and name not in errors]
+    bands = [
         name
-        for name in truth.colnames
-        if name in measured.colnames
-        and name not in errors
-        and getattr(truth[name], "unit", None) is not None
+        for name in shared
+        if getattr(truth[name], "unit", None) is not None
         and u.Unit(truth[name].unit).is_equivalent(FNU)
     ]
+    if not bands:
+        wanted = "tables that share a column of fluxes with a unit (or 'filters' given)"
+        raise argument_error("truth, measured", wanted, f"the common columns {shared}")
+    return bands
 
 
 def same_rows(truth, measured):

@@ -42,16 +42,19 @@ def crowded(sky, flux, *, radius=2 * u.arcsec, delta_mag=1.0):
     Returns
     -------
     crowded : bool `~numpy.ndarray`, shape (n,)
-        A source whose flux is not positive is crowded by any positive neighbour.
+        A source whose flux is not positive is crowded by any positive neighbour, one whose
+        position is not known by none.
 
     References
     ----------
     Yang et al. 2021, ApJ 908, 144, section 4.1.
     """
     found = np.zeros(len(sky), bool)
-    if len(sky) > 1:
+    known = np.flatnonzero(np.isfinite(sky.spherical.lon) & np.isfinite(sky.spherical.lat))
+    if len(known) > 1:
         flux = np.asarray(getattr(flux, "value", flux), float)
-        i, j, _, _ = sky.search_around_sky(sky, radius)
+        i, j, _, _ = sky[known].search_around_sky(sky[known], radius)
+        i, j = known[i], known[j]
         limit = np.maximum(flux[i], 0.0) * 10 ** (-0.4 * delta_mag)
         found[i[(i != j) & (flux[j] > limit)]] = True
     return found

@@ -1,5 +1,7 @@
 """Numbers that describe a PSF: encircled energy and its radii, width, tables of them."""
 
+import math
+
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
@@ -7,6 +9,7 @@ from scipy.optimize import least_squares
 
 from miricigale.instrument import imager_filters, psf_fwhm
 from miricigale.psf import _core
+from miricigale.psf.effects import detector_response
 from miricigale.psf.model import psf_info
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, to_array
@@ -14,7 +17,7 @@ from miricigale.utils.units import ANGLE, to_array
 __all__ = ["encircled_energy", "fwhm", "psf_table", "radius_of_encircled_energy"]
 
 
-def encircled_energy(psf, radius):
+def encircled_energy(psf, radius, *, pixel_scale=None):
     """
     Fraction of a point source's light inside circles around the centre.
 
@@ -24,6 +27,9 @@ def encircled_energy(psf, radius):
         A PSF with the meta of `~miricigale.psf.make_psf`.
     radius : `~astropy.units.Quantity`
         Scalar or array of radii.
+    pixel_scale : `~astropy.units.Quantity`, optional
+        If given, the fraction is that of a sum over an image of such pixels, each taken as
+        constant over its square (the mean over all positions of the centre on a pixel).
 
     Returns
     -------
@@ -36,12 +42,19 @@ def encircled_energy(psf, radius):
         If a radius is negative or its circle leaves the grid.
     """
     info = psf_info(psf)
+    data = info.data
+    if pixel_scale is not None:
+        scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
+        # sums over cells take them as constant too
+        width = math.sqrt(max(scale**2 - info.cell**2, 0.0)) / info.pixel_scale
+        form = {"oversampling": info.oversampling, "pixel": False}
+        data = detector_response(data, **form, boxes=(width,))
     radii = to_array(radius, ANGLE, "radius", finite=True)
     if np.any(radii < 0) or np.any(radii > info.half_width):
         wanted = f"between 0 and the half width of the PSF, {info.half_width:.4g} arcsec"
         raise argument_error("radius", wanted, radius)
     flat = np.ascontiguousarray(radii.ravel() / info.cell)
-    sums = _core.radial_sums(info.data, *info.origin, flat) / info.oversampling**2
+    sums = _core.radial_sums(data, *info.origin, flat) / info.oversampling**2
     return float(sums[0]) if radii.ndim == 0 else sums.reshape(radii.shape)
 
 

@@ -13,7 +13,7 @@ from miricigale.photometry import (
     flux_scaling,
     source_extractor_photometry,
 )
-from miricigale.psf import gaussian_psf
+from miricigale.psf import encircled_energy, gaussian_psf
 
 
 @pytest.fixture(scope="module")
@@ -132,3 +132,27 @@ def test_a_source_has_one_flux_on_any_pixels(tools):
     index = tables[0.03]["sky"].match_to_catalog_sky(own["sky"])[0]
     off = own["flux_auto"].value[index] / tables[0.03]["flux_auto"].value - 1
     assert np.abs(off).max() > 0.01
+
+
+@pytest.mark.parametrize("width", [0.12, 0.25])
+def test_the_pixel_counts_once_in_the_scale(tools, width):
+    """Points sharper than the pixels are wide, at all places on them: the scale of the image is 1."""
+    rng, shape = np.random.default_rng(5), (400, 400)
+    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, shape)
+    steps = (np.arange(8) - 3.5) * 5.0
+    places = np.array(np.meshgrid(steps, steps)).reshape(2, -1) + rng.uniform(-0.5, 0.5, (2, 64))
+    sky = tools.CENTER.spherical_offsets_by(*(places * u.arcsec))
+    flux = np.full(64, 1e3)
+    image = tools.as_ccd(tools.render(sky, flux, width, wcs, shape), wcs, 1e-4)
+    fwhm = width * np.sqrt(8 * np.log(2)) * u.arcsec
+    psf = gaussian_psf(fwhm, pixel_scale=0.11 * u.arcsec, oversampling=4, fov=5 * u.arcsec)
+    factor, error = flux_scaling(image, sky, flux * u.uJy, psf)
+    assert abs(factor - 1) < 2 * error < 1.1e-3
+    # a square of side a is as wide as a Gaussian of a / sqrt(12)
+    radius = 0.4 * u.arcsec
+    total = np.hypot(width, 0.11 / np.sqrt(12))
+    assert_allclose(
+        encircled_energy(psf, radius, pixel_scale=0.11 * u.arcsec),
+        1 - np.exp(-0.5 * (0.4 / total) ** 2),
+        rtol=3e-3,
+    )

@@ -56,6 +56,16 @@ def test_the_papers_error_function_is_the_median_of_each_bin():
     assert np.any(np.diff(nodes.error) < 0)
 
 
+def test_columns_without_units_make_no_empty_model(simulated):
+    plain = [QTable({"id": table["id"], BAND: table[BAND].value}) for table in simulated]
+    with pytest.raises(ValueError, match=r"fluxes with a unit .*the common columns \['id', 'miri"):
+        ErrorModel.from_tables(*plain)
+    with pytest.raises(
+        u.UnitsError, match=r"'truth' column 'miri\.f770w' must be convertible to uJy"
+    ):
+        ErrorModel.from_tables(*plain, filters=[BAND])
+
+
 def test_limit_is_where_the_signal_to_noise_is_reached(simulated):
     model = ErrorModel.from_tables(*simulated, bin_size=600)
     # f = 5 sqrt(0.1^2 + (0.05 f)^2)
