@@ -1,6 +1,7 @@
 """From images with units and coordinates to the plain arrays that photometry works on."""
 
 import dataclasses
+import warnings
 
 import astropy.units as u
 import numpy as np
@@ -9,7 +10,8 @@ from astropy.stats import mad_std
 from astropy.wcs.utils import pixel_to_pixel, proj_plane_pixel_scales
 
 from miricigale.instrument import north_up_wcs, pixel_area_map
-from miricigale.utils.exceptions import argument_error
+from miricigale.photometry.sky_noise import filled_areas
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
 __all__ = ["ImageArrays", "fine_wcs", "image_arrays", "local_maps", "pixel_scale", "sky_pixels"]
@@ -74,6 +76,11 @@ def image_arrays(image, name):
         If it is not two-dimensional or has no celestial WCS or no usable pixel.
     `~astropy.units.UnitsError`
         If the unit is not one of surface brightness.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        If areas that are exactly 0 are taken as without data.
     """
     if not isinstance(image, CCDData):
         msg = f"'{name}' must be a CCDData, got {type(image).__name__}"
@@ -95,6 +102,14 @@ def image_arrays(image, name):
         scale = factor if noise.unit is None else (1 * noise.unit).to_value(SURFACE_BRIGHTNESS)
         noise = np.asarray(noise.array, float) * scale
     usable &= np.isfinite(noise) & (noise > 0)
+    filled = filled_areas(data, usable)
+    if filled.any():
+        msg = (
+            f"'{name}' has {np.count_nonzero(filled)} pixels in areas that are exactly 0, though not "
+            "masked, beside pixels with noise: they are taken as without data"
+        )
+        warnings.warn(msg, MiricigaleWarning, stacklevel=2)
+        usable &= ~filled
     if not usable.any():
         raise argument_error(name, "an image with usable pixels", "none (masked, NaN or no noise)")
     area = pixel_area_map(image.wcs, data.shape) * _MICRO

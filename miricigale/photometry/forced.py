@@ -17,6 +17,7 @@ from miricigale.photometry.arrays import (
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.packaging import CatalogRows, package
 from miricigale.photometry.passes import fit_image
+from miricigale.photometry.sky_noise import warn_of_background
 from miricigale.photometry.sources import SourceTemplates, catalog_sources
 from miricigale.photometry.template_fit import FitSettings
 from miricigale.photometry.templates import FineTemplates, TemplateBank
@@ -41,7 +42,9 @@ class ForcedPhotometer:
         From the high-resolution image's PSF (``source``) to the image's (``target``), on the
         pixels of the high-resolution image. ``target`` must be the PSF of the image that is
         measured: that of a drizzled mosaic for a drizzled mosaic. With kernels of several places
-        each source has that of its own; shapes are fitted with the mean of the sources.
+        each source has that of its own; shapes are fitted with the mean of the sources. Of a kernel
+        without PSFs sources are the segments as they are (``template="cutout"``, ``wings=False``),
+        which a warning says; those without a segment are not measured.
     template : {"auto", "cutout", "psf", "sersic"}, optional
         What sources look like. ``"auto"`` cuts them from the high-resolution image where a
         segment of enough signal-to-noise belongs to them, otherwise takes a point source.
@@ -101,7 +104,7 @@ class ForcedPhotometer:
     Raises
     ------
     ValueError
-        If an option is out of range, or the kernel has no PSFs.
+        If an option is out of range, or the kernel has no PSFs and points or profiles are asked for.
 
     Notes
     -----
@@ -151,9 +154,19 @@ class ForcedPhotometer:
         if template not in ("auto", "cutout", "psf", "sersic"):
             raise argument_error("template", "'auto', 'cutout', 'psf' or 'sersic'", repr(template))
         mean = kernel.mean if isinstance(kernel, KernelField) else kernel
-        for name in ("source", "target"):
-            if getattr(mean, name, None) is None:
-                raise argument_error("kernel", f"a MatchingKernel with its {name}", "one without")
+        self._bare = mean.source is None or mean.target is None
+        if self._bare:
+            if template not in ("auto", "cutout"):
+                wanted = f"a MatchingKernel with its PSFs for template={template!r}"
+                raise argument_error("kernel", wanted, "one without")
+            msg = (
+                "the kernel has no PSFs: sources are their segments as they are, without wings, and "
+                "those without a segment are not measured"
+            )
+            warnings.warn(msg, MiricigaleWarning, stacklevel=2)
+            template, wings = "cutout", False
+            # as far as it reaches, and as wide
+            mean = dataclasses.replace(mean, source=mean.array, target=mean.array)
         _check_order("background_order", background_order, 4)
         if background_order and not fit_background:
             raise argument_error("background_order", "0 without 'fit_background'", background_order)
@@ -232,6 +245,13 @@ class ForcedPhotometer:
         ------
         ValueError, TypeError, `~astropy.units.UnitsError`
             If an input does not fit; the message says which.
+
+        Warns
+        -----
+        `~miricigale.utils.exceptions.MiricigaleWarning`
+            If no source is on the image, labels are not those of the segmentation, areas that are
+            exactly 0 are not masked, or a background that was left in ``image`` or ``highres``
+            goes into the fluxes.
         """
         arrays = image_arrays(image, "image")
         given = [one is not None for one in (highres, segmentation, catalog)]
@@ -245,6 +265,9 @@ class ForcedPhotometer:
         else:
             sources = templates
         place = self._place(arrays, sources.sky)
+        if len(sources.id) and not len(place.near):
+            msg = f"none of the {len(sources.id)} sources is on or near 'image': nothing is measured"
+            warnings.warn(msg, MiricigaleWarning, stacklevel=2)
         if templates is None:
             templates = self._templates(highres, segmentation, catalog[place.near])
         else:
@@ -253,7 +276,10 @@ class ForcedPhotometer:
         with concurrent.futures.ThreadPoolExecutor(self._n_threads) as pool, single_threaded():
             executor = pool if self._n_threads > 1 else None
             filter_name = image.meta.get("filter", image.meta.get("FILTER"))
-            return self._measure(arrays, sources, place, templates, filter_name, executor)
+            result = self._measure(arrays, sources, place, templates, filter_name, executor)
+        if not self._fit_background:
+            warn_of_background(result, self._kernel)
+        return result
 
     def _place(self, arrays, sky):
         """Where the sources are on an image, and which are on or near it."""
@@ -265,13 +291,19 @@ class ForcedPhotometer:
 
     def _measure(self, arrays, sources, place, templates, filter_name, executor):
         n, near = len(sources.id), place.near
+        flags, snr, kinds = np.zeros(n, int), np.full(n, np.nan), np.full(n, "none", "U6")
+        flags[near], snr[near] = templates.flags, templates.snr
+        if self._bare:
+            # there is no PSF for points
+            kept = np.flatnonzero(templates.kind != "point")
+            near, templates = near[kept], templates[kept]
+            place = dataclasses.replace(place, near=near)
+        kinds[near] = templates.kind
         grid = templates.wcs
         if grid is None:
             scale = self._kernel.pixel_scale.to_value(ANGLE)
             grid = fine_wcs(arrays.wcs, arrays.flux.shape, scale)
         bank = self._bank(arrays, place, templates, grid, executor)
-        flags, snr, kinds = np.zeros(n, int), np.full(n, np.nan), np.full(n, "none", "U6")
-        flags[near], snr[near], kinds[near] = templates.flags, templates.snr, templates.kind
         settings = FitSettings(
             kernel=self._kernel,
             template=templates.meta.get("template", self._template),

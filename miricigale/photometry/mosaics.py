@@ -17,7 +17,7 @@ from miricigale.photometry.grids import (
     open_image,
     read_wcs,
 )
-from miricigale.photometry.sky_noise import sky_noise
+from miricigale.photometry.sky_noise import filled_areas, sky_noise
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
@@ -128,7 +128,8 @@ class MosaicFile:
         -------
         image : `~astropy.nddata.CCDData`
             In MJy/sr, with WCS and mask (True where a pixel is not finite, has no weight or no
-            error, or is marked in an extension MASK or, as not to be used, in DQ), and with a
+            error, is one of an area that is exactly 0, or is marked in an extension MASK or, as not
+            to be used, in DQ), and with a
             `~astropy.nddata.StdDevUncertainty` unless there is no map of the noise. Fluxes in
             pixels are divided by the solid angle of each pixel. ``meta`` has ``filter``, ``pa_aper``
             (deg), ``source`` (the file), ``source_unit``, ``calibration``, ``noise``, ``noise_scale``
@@ -147,7 +148,8 @@ class MosaicFile:
         Warns
         -----
         `~miricigale.utils.exceptions.MiricigaleWarning`
-            If there is no map of the noise, or its scale departs from 1 by more than 10 times.
+            If there is no map of the noise, its scale departs from 1 by more than 10 times, or areas
+            that are exactly 0 are masked.
         """
         from astropy.nddata import CCDData, StdDevUncertainty
 
@@ -180,6 +182,14 @@ class MosaicFile:
             sigma = _sigma(kind, values)
             usable &= np.isfinite(sigma) & (sigma > 0)
             meta["noise"] = f"{kind} ({source})"
+        filled = filled_areas(data, usable)
+        if filled.any():
+            msg = (
+                f"{self.path} has {np.count_nonzero(filled)} pixels in areas that are exactly 0, though "
+                "not masked, beside pixels with noise: they are taken as without data"
+            )
+            warnings.warn(msg, MiricigaleWarning, stacklevel=2)
+            usable &= ~filled
         if not usable.any():
             msg = f"{self.path} has no usable pixel: all are masked, not finite or without weight"
             raise DataError(msg)
@@ -261,6 +271,8 @@ class MosaicHeader:
         Position angle of the detector's +y axis.
     unit : str
         Unit of the pixels as the header or the caller has it; may be empty.
+    exposure : bool
+        Whether it is a single exposure of JWST (``_cal``, ``_rate``) rather than a mosaic.
     keywords : dict
         Those of the photometric calibration.
     meta : dict
@@ -273,6 +285,7 @@ class MosaicHeader:
     filter: str | None
     pa_aper: object
     unit: str
+    exposure: bool
     keywords: dict
     meta: dict
 
@@ -307,6 +320,8 @@ def _header(file, hdus, index):
         filter=name,
         pa_aper=None if angle is None else float(angle) * u.deg,
         unit=unit if file.unit is None else str(file.unit),
+        # what the pipeline has not resampled
+        exposure=get("S_WCS") == "COMPLETE" and get("S_RESAMP") != "COMPLETE",
         keywords={key: get(key) for key in ("PHOTMJSR", "PHOTFLAM", "PHOTPLAM")},
         meta={**meta, **{key: value for key, value in extra.items() if value is not None}},
     )

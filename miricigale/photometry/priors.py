@@ -7,11 +7,11 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.photometry.grids import check_same_grid, find_image, open_image, read_wcs
-from miricigale.utils.exceptions import DataError, MiricigaleWarning
+from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
 from miricigale.utils.files import open_fits, unpacked_size
 from miricigale.utils.tables import unique_ids
 
-__all__ = ["read_prior"]
+__all__ = ["check_labels", "read_catalog", "read_prior"]
 
 _log = logging.getLogger(__name__)
 
@@ -59,7 +59,8 @@ def read_prior(highres, *, segmentation=None, catalog=None, path=None):
     Warns
     -----
     `~miricigale.utils.exceptions.MiricigaleWarning`
-        If segments belong to no source of the catalogue: their light stays in the image.
+        If segments belong to no source of the catalogue: their light stays in the image; if most
+        sources have no segment, or some stand on another one than that of their id.
 
     Examples
     --------
@@ -79,7 +80,7 @@ def read_prior(highres, *, segmentation=None, catalog=None, path=None):
         segments, ids = _numbered(data, segmentation)
     if catalog is None:
         return segments, _from_segments(highres, segments, ids)
-    sources = _read_catalog(catalog)
+    sources = read_catalog(catalog)
     if segments is not None:
         sources["label"] = _labels(sources, segments, ids, highres.wcs, catalog, segmentation)
     return segments, sources
@@ -145,8 +146,27 @@ def _from_segments(highres, segments, ids):
     return QTable({"id": ids, "sky": sky, "label": index})
 
 
-def _read_catalog(path):
-    """``id`` and ``sky`` of a table in any of the usual formats."""
+def read_catalog(path):
+    """
+    Ids and positions of a table in any of the usual formats.
+
+    Parameters
+    ----------
+    path : path-like
+        As ``catalog`` of `read_prior`.
+
+    Returns
+    -------
+    sources : `~astropy.table.QTable`
+        ``id`` and ``sky``; a position that is missing is NaN.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file is missing or damaged, or has no positions.
+    ValueError
+        If ids are not unique.
+    """
     from astropy.coordinates import SkyCoord
     from astropy.table import QTable
 
@@ -216,6 +236,38 @@ def _degrees(column, name, path):
         raise DataError(msg) from err
 
 
+def check_labels(labels, here, what):
+    """
+    Refuse labels that are those of another segmentation map.
+
+    Parameters
+    ----------
+    labels, here : int `~numpy.ndarray`, shape (n,)
+        The label that each source says it has, and that of the segment at its position; 0 for none.
+    what : str
+        The labels, for messages.
+
+    Raises
+    ------
+    ValueError
+        If more than half of the sources stand on another segment than theirs.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        If three or more and a tenth of them do.
+    """
+    both = (labels > 0) & (here > 0)
+    n, wrong = (int(np.count_nonzero(one)) for one in (both, both & (labels != here)))
+    text = f"{wrong} of {n} sources that stand on another segment than theirs"
+    if wrong > 0.5 * n:
+        wanted = "labels of the segmentation map"
+        raise argument_error(what, wanted, f"{text}: is it the map of another detection?")
+    if wrong >= max(3, 0.1 * n):
+        msg = f"the labels of {what} are those of {text}"
+        warnings.warn(msg, MiricigaleWarning, stacklevel=4)
+
+
 def _labels(sources, segments, ids, wcs, catalog, segmentation):
     """The segment of each source: by id if that is what the ids are, by position otherwise."""
     ny, nx = segments.shape
@@ -235,10 +287,16 @@ def _labels(sources, segments, ids, wcs, catalog, segmentation):
     both = here > 0
     by_id = both.any() and np.mean(own[both] == here[both]) > 0.5
     label = own if by_id else here
+    check_labels(label, here, f"{catalog} by id")
     _log.info("%s: segments of %s by %s", catalog, segmentation, "id" if by_id else "position")
-    n_without = int(np.count_nonzero(label == 0))
-    if n_without:
-        _log.info("%s: %d sources have no segment and are taken as points", catalog, n_without)
+    n_without, n_inside = (int(np.count_nonzero(one)) for one in (inside & (label == 0), inside))
+    msg = f"{n_without} of the {n_inside} sources of {catalog} on the map have no segment"
+    msg += f" of {segmentation} and are taken as points"
+    if n_without > 0.5 * n_inside:
+        msg += ": is it the map of another detection?"
+        warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+    elif n_without:
+        _log.info(msg)
     orphans = np.setdiff1d(np.arange(1, len(ids) + 1), label)
     if orphans.size:
         some = ", ".join(map(str, ids[orphans[:5] - 1]))

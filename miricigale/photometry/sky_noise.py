@@ -1,10 +1,13 @@
 """The noise of an image on its source-free pixels, beside what a map says of it."""
 
+import warnings
+
 import numpy as np
 
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.units import FNU
 
-__all__ = ["sky_noise", "weight_scale"]
+__all__ = ["filled_areas", "sky_noise", "warn_of_background", "warn_of_sky", "weight_scale"]
 
 
 def weight_scale(data, weight, *, mask=None):
@@ -38,6 +41,42 @@ def weight_scale(data, weight, *, mask=None):
     if not usable.any():
         raise argument_error("weight", "positive in some usable pixels", "none")
     return sky_noise(np.where(usable, data * np.sqrt(np.where(usable, weight, 0)), 0.0), usable)[1]
+
+
+def filled_areas(values, usable, *, n_pixels=25):
+    """
+    Areas of pixels that are exactly 0 for want of data, such as the corners of drizzled images.
+
+    Parameters
+    ----------
+    values : `~numpy.ndarray`, shape (ny, nx)
+        The image.
+    usable : bool `~numpy.ndarray`, shape (ny, nx)
+        Pixels that count as data so far.
+    n_pixels : int, optional
+        Smallest connected area.
+
+    Returns
+    -------
+    filled : bool `~numpy.ndarray`, shape (ny, nx)
+        Nowhere True if the pixels beside such areas have no noise either (their median is below a
+        tenth of that of all others): then the image is a noiseless one, and 0 is its sky.
+    """
+    import scipy.ndimage
+
+    filled = usable & (values == 0)
+    if np.count_nonzero(filled) < n_pixels:
+        return np.zeros_like(usable)
+    labels, n = scipy.ndimage.label(filled)
+    large = np.bincount(labels.ravel(), minlength=n + 1) >= n_pixels
+    large[0] = False
+    filled = large[labels]
+    beside = scipy.ndimage.binary_dilation(filled, iterations=2) & usable & (values != 0)
+    others = usable & (values != 0)
+    if np.count_nonzero(beside) < 8:
+        return np.zeros_like(usable)
+    noise = [np.median(np.abs(values[where])) for where in (beside, others)]
+    return filled if noise[0] > 0.1 * noise[1] else np.zeros_like(usable)
 
 
 def sky_noise(values, usable, *, width=2.0, threshold=3.5, grow=3):
@@ -91,3 +130,80 @@ def sky_noise(values, usable, *, width=2.0, threshold=3.5, grow=3):
 def _median_rms(values):
     level = float(np.median(values))
     return level, 1.4826 * float(np.median(np.abs(values - level)))
+
+
+def warn_of_background(result, kernel):
+    """
+    Say that an image had a background that was not fitted and is in the fluxes.
+
+    Parameters
+    ----------
+    result : `~miricigale.photometry.ForcedPhotometryResult`
+        A measurement without a background.
+    kernel : `~miricigale.psf.MatchingKernel`
+        With which it was made.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        If the median of the residual between the sources adds more than the median error to the flux
+        of a point source, and is above 0.05 of the image's noise.
+    """
+    residual = result.residual_image
+    sigma = residual.uncertainty.array
+    with np.errstate(invalid="ignore"):
+        free = ~residual.mask & (np.abs(result.model_image.data) < 0.3 * sigma)
+    error = result.flux_err[np.isfinite(result.flux_err)]
+    if np.count_nonzero(free) < 400 or not len(error):
+        return
+    level = float(np.median(residual.data[free])) * residual.unit
+    # solid angle over which a fit of the PSF adds up a constant
+    target = kernel.target
+    area = target.sum() ** 2 / np.sum(target**2) * kernel.pixel_scale**2
+    added, error = (level * area).to(FNU), np.median(error)
+    # the errors of an image without noise are those of its model
+    if abs(added) > error and abs(level.value) > 0.05 * np.median(sigma[free]):
+        msg = (
+            f"'image' has a background of {level:.3g} between the sources, which is not fitted and adds "
+            f"about {added:.3g} to fluxes whose median error is {error:.3g}: subtract it, or give "
+            "'fit_background'"
+        )
+        warnings.warn(msg, MiricigaleWarning, stacklevel=5)
+
+
+def warn_of_sky(arrays, segments):
+    """
+    Say that a high-resolution image has a sky that goes into the templates.
+
+    Parameters
+    ----------
+    arrays : `~miricigale.photometry.arrays.ImageArrays`
+        The image.
+    segments : int `~numpy.ndarray`, shape (ny, nx)
+        Labels, 0 for the sky.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        If the median beyond the segments is more than 0.03 of the light of the median segment of
+        signal-to-noise above 5.
+    """
+    free = arrays.usable & (segments == 0)
+    if np.count_nonzero(free) < 400:
+        return
+    level = np.median(arrays.flux[free])
+    member = arrays.usable & (segments > 0)
+    label = segments[member]
+    light, variance = (
+        np.bincount(label, values[member]) for values in (arrays.flux, arrays.sigma**2)
+    )
+    good = light > 5 * np.sqrt(variance)
+    if not good.any():
+        return
+    part = float(np.median((level * np.bincount(label))[good] / light[good]))
+    if abs(part) > 0.03:
+        msg = (
+            f"'highres' has a sky of {level / np.median(arrays.sigma[free]):.3g} times its noise, "
+            f"{part:.0%} of the light of the median segment: it goes into the templates; subtract it"
+        )
+        warnings.warn(msg, MiricigaleWarning, stacklevel=5)

@@ -452,8 +452,8 @@ def test_bad_inputs_are_refused(tools, field):
     with pytest.raises(u.UnitsError, match="'image' must be convertible to MJy / sr"):
         photometer.measure(wrong, catalog=field.catalog)
     bare = MatchingKernel(tools.kernel.array, pixel_scale=0.06 * u.arcsec)
-    with pytest.raises(ValueError, match="'kernel' must be a MatchingKernel with its source"):
-        ForcedPhotometer(bare)
+    with pytest.raises(ValueError, match="'kernel' must be a MatchingKernel with its PSFs for"):
+        ForcedPhotometer(bare, template="sersic")
 
 
 def test_empty_catalogue(tools, field):
@@ -470,3 +470,90 @@ def test_result_is_frozen_and_plots(tools, field):
         result.flux = None
     axes = result.plot()
     assert [ax.get_title() for ax in axes] == ["image", "model", "residual"]
+
+
+def test_positions_that_are_not_known_are_flagged(tools, field):
+    catalog = field.catalog.copy()
+    ra = catalog["sky"].ra.deg.copy()
+    ra[[3, 7]] = np.nan
+    catalog["sky"] = SkyCoord(ra, catalog["sky"].dec.deg, unit="deg")
+    result = ForcedPhotometer(tools.kernel, template="psf").measure(field.image, catalog=catalog)
+    lost = flagged(result, ForcedFlags.NO_DATA)
+    assert np.flatnonzero(lost).tolist() == np.flatnonzero(np.isnan(result.flux)).tolist() == [3, 7]
+    assert not result.crowded[lost].any()
+    away = QTable({"sky": tools.CENTER.spherical_offsets_by([1] * u.deg, [0] * u.deg)})
+    with pytest.warns(MiricigaleWarning, match="none of the 1 sources of 'catalog' is on or near"):
+        result = ForcedPhotometer(tools.kernel, template="psf").measure(field.image, catalog=away)
+    assert flagged(result, ForcedFlags.NO_DATA).all()
+
+
+def test_arrays_with_the_mistakes_of_files(tools):
+    """A background, areas of zeros and labels of another map, without files."""
+    rng, shape = np.random.default_rng(6), (400, 400)
+    wcs = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, shape)
+    steps = (np.arange(5) - 2) * 4.0
+    sky = tools.CENTER.spherical_offsets_by(
+        *(np.array(np.meshgrid(steps, steps)).reshape(2, -1) * u.arcsec)
+    )
+    flux, noise = np.geomspace(3, 30, 25), 5e-3
+    sharp, wide = (
+        tools.as_ccd(
+            tools.render(sky, flux, width, wcs, shape) + rng.normal(0, noise, shape), wcs, noise
+        )
+        for width in (tools.HI, tools.LO)
+    )
+    labels, (y, x) = np.zeros(shape, int), np.indices(shape)
+    for k, (a, b) in enumerate(zip(*wcs.world_to_pixel(sky), strict=True), 1):
+        labels[(x - a) ** 2 + (y - b) ** 2 < 60] = k
+    catalog = QTable({"sky": sky, "label": np.arange(1, 26)})
+    photometer = ForcedPhotometer(tools.kernel)
+    assert_allclose(photometer.measure(wide, sharp, labels, catalog).flux.value, flux, rtol=0.03)
+    raised = wide.add(0.05 * u.MJy / u.sr, handle_meta="first_found")
+    with pytest.warns(MiricigaleWarning, match="background of 0.05.* 'fit_background'"):
+        photometer.measure(raised, sharp, labels, catalog)
+    fitted = ForcedPhotometer(tools.kernel, fit_background=True)
+    assert_allclose(fitted.measure(raised, sharp, labels, catalog).flux.value, flux, rtol=0.03)
+    with pytest.warns(MiricigaleWarning) as said:
+        photometer.measure(wide, sharp.add(0.05 * u.MJy / u.sr), labels, catalog)
+    assert str(said[0].message).startswith("'highres' has a sky of 10")
+    filled = wide.copy()
+    filled.data[:, :90] = 0
+    with pytest.warns(
+        MiricigaleWarning, match="'image' has 36000 pixels in areas that are exactly"
+    ):
+        result = photometer.measure(filled, sharp, labels, catalog)
+    good = np.isfinite(result.flux.value) & (result.coverage > 0.5)
+    assert np.count_nonzero(good) == 20
+    assert_allclose(result.flux.value[good], flux[good], rtol=0.05)
+    catalog["label"] = np.roll(catalog["label"], 1)
+    with pytest.raises(
+        ValueError, match=r"'catalog\['label'\]' must be labels of .*25 of 25 sources"
+    ):
+        photometer.measure(wide, sharp, labels, catalog)
+
+
+def test_a_kernel_alone_measures_segments(tools, field):
+    """Without PSFs the templates are the segments: what they hold, by closed form."""
+    wcs = north_up_wcs(tools.CENTER, tools.FINE * u.arcsec, (500, 500))
+    highres = tools.as_ccd(
+        tools.render(field.sky, field.flux, tools.HI, wcs, (500, 500)), wcs, 1e-3
+    )
+    labels, (y, x) = np.zeros((500, 500), int), np.indices((500, 500))
+    kept = np.arange(0, 60, 2)
+    for k in kept:
+        a, b = wcs.world_to_pixel(field.sky[k])
+        labels[(x - a) ** 2 + (y - b) ** 2 < 64] = k + 1
+    bare = MatchingKernel.from_array(
+        tools.kernel.array / tools.kernel.array.sum(), pixel_scale=tools.FINE * u.arcsec
+    )
+    with pytest.warns(MiricigaleWarning, match="kernel has no PSFs: sources are their segments"):
+        photometer = ForcedPhotometer(bare)
+    catalog = field.catalog.copy()
+    catalog["label"] = np.where(np.isin(np.arange(60), kept), np.arange(60) + 1, 0)
+    result = photometer.measure(field.image, highres, labels, catalog)
+    lost = flagged(result, ForcedFlags.NO_SEGMENT)
+    assert np.flatnonzero(~lost).tolist() == kept.tolist()
+    assert np.isnan(result.flux[lost]).all()
+    assert np.isfinite(result.flux[~lost]).all()
+    with pytest.raises(ValueError, match="'kernel' must be a MatchingKernel with its PSFs for"):
+        ForcedPhotometer(bare, template="psf")
