@@ -108,10 +108,25 @@ def _photometry_parser(commands):
     add("--kernel", metavar="FITS", help="kernel from prior to image; FILE[EXT,PLANE] of a cube")
     add("--psf", metavar="FITS", help="PSF of the image; FILE[EXT,PLANE] or FILE[EXT,mean]")
     add("--highres-psf", metavar="FITS", help="PSF of the prior, likewise")
-    add("--psf-scale", type=float, metavar="ARCSEC", help="pixel of the PSF (else: the image's)")
-    add("--highres-psf-scale", type=float, metavar="ARCSEC", help="pixel of the prior's PSF")
-    add("--pa-aper", type=float, metavar="DEG", help="PA of the detector's y axis, for MIRI's PSF")
     for prefix, what in (("", "image"), ("highres-", "prior")):
+        add(
+            f"--{prefix}psf-scale",
+            type=float,
+            metavar="ARCSEC",
+            help=f"pixel of the PSF of the {what} (else: its header's, or the {what}'s)",
+        )
+        add(
+            f"--{prefix}psf-angle",
+            type=float,
+            metavar="DEG",
+            help=f"position angle of the PSF's y axis (else: its header's, or the {what}'s)",
+        )
+        add(
+            f"--{prefix}pa-aper",
+            type=float,
+            metavar="DEG",
+            help=f"position angle of the detector's y axis ({what}), if the header does not tell",
+        )
         noise = phot.add_mutually_exclusive_group()
         for kind in _NOISE:
             noise.add_argument(
@@ -129,7 +144,9 @@ def _photometry_parser(commands):
     add("--max-shift", type=float, metavar="ARCSEC", help="fit a shift of the image up to this")
     add("-o", "--output", type=Path, default=Path("photometry.ecsv"), help="table, ECSV or FITS")
     add("--page", type=Path, help="HTML page (default: beside the table)")
-    add("--overwrite", action="store_true", help="replace table and page")
+    add("--model", type=Path, metavar="FITS", help="image of the fitted model")
+    add("--residual", type=Path, metavar="FITS", help="image less model, with errors and mask")
+    add("--overwrite", action="store_true", help="replace files that are there")
     add("--threads", type=int, help="threads (default: all cores)")
     add("--seed", type=int, default=1, help="seed of the empty positions of the page")
     add("--no-progress", action="store_true", help="no progress bar")
@@ -233,8 +250,8 @@ def _photometry(args):
         options = {name: getattr(args, f"{prefix}{name}") for name in names}
         return MosaicFile(path, filter=filter_, **options)
 
-    def arcsec(value):
-        return None if value is None else value * u.arcsec
+    def quantity(value, unit=u.arcsec):
+        return None if value is None else value * unit
 
     page = args.page or args.output.with_suffix(".html")
     table = measure_files(
@@ -245,13 +262,18 @@ def _photometry(args):
         kernel=args.kernel,
         psf=args.psf,
         highres_psf=args.highres_psf,
-        psf_scale=arcsec(args.psf_scale),
-        highres_psf_scale=arcsec(args.highres_psf_scale),
-        pa_aper=None if args.pa_aper is None else args.pa_aper * u.deg,
+        psf_scale=quantity(args.psf_scale),
+        highres_psf_scale=quantity(args.highres_psf_scale),
+        psf_angle=quantity(args.psf_angle, u.deg),
+        highres_psf_angle=quantity(args.highres_psf_angle, u.deg),
+        pa_aper=quantity(args.pa_aper, u.deg),
+        highres_pa_aper=quantity(args.highres_pa_aper, u.deg),
         fit_background=not args.no_background,
-        max_shift=arcsec(args.max_shift),
+        max_shift=quantity(args.max_shift),
         output=args.output,
         page=page,
+        model=args.model,
+        residual=args.residual,
         overwrite=args.overwrite,
         seed=args.seed,
         n_threads=args.threads,
@@ -385,8 +407,13 @@ def main(argv=None):
     """
     parser = _parser()
     args = parser.parse_args(argv)
+    handler = logging.StreamHandler()
+    # astropy shows its records itself, warnings among them
+    handler.addFilter(lambda record: not record.name.startswith("astropy"))
     logging.basicConfig(
-        level=logging.INFO if args.verbose else logging.WARNING, format="%(message)s"
+        level=logging.INFO if args.verbose else logging.WARNING,
+        format="%(message)s",
+        handlers=[handler],
     )
     # what is compiled, and for how long, is said to everyone
     logging.getLogger("miricigale.utils.compilation").setLevel(logging.INFO)

@@ -10,6 +10,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "_stpsf": ("stpsf_grid", "stpsf_psf"),
+        "by_filter": ("MODEL_FILTERS", "checked_psf", "filter_psf"),
         "effects": ("EFFECTS", "cruciform_fraction"),
         "energy": ("encircled_energy", "fwhm", "psf_table", "radius_of_encircled_energy"),
         "field": ("grid_weights", "miri_psf_grid", "psf_at", "psf_grid"),

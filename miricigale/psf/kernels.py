@@ -134,7 +134,7 @@ class MatchingKernel:
         normalize : bool, optional
             Whether the kernel has unit sum, as the paper's: fluxes then lack the light beyond
             the PSFs' grids. If not, its sum is the wide PSF's. By default a kernel is
-            normalised where it is not known what fraction of all light a PSF holds: for
+            normalised where it is not known what fraction of all light the wide PSF holds: for
             arrays and for PSFs made without ``enclosed``.
         tolerance : float, optional
             See ``regularization``.

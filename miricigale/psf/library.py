@@ -23,13 +23,21 @@ from miricigale.refdata import citations
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.units import ANGLE, WAVE, to_array
 
-__all__ = ["MIRI_PIXEL_SCALE", "hst_psf", "local_pixel", "miri_psf", "odd_cells"]
+__all__ = [
+    "MIRI_FILTERS",
+    "MIRI_PIXEL_SCALE",
+    "WFC3_FILTERS",
+    "hst_psf",
+    "local_pixel",
+    "miri_psf",
+    "odd_cells",
+]
 
 #: Geometric mean of the imager's pixel, 0.110498 x 0.111336 arcsec (SIAF, MIRIM_FULL).
 MIRI_PIXEL_SCALE = math.sqrt(0.110498 * 0.111336) * u.arcsec
 
-_MIRI = tuple(f"miri.f{n}w" for n in (560, 770, 1000, 1130, 1280, 1500, 1800, 2100, 2550))
-_WFC3 = ("wfc3.f105w", "wfc3.f125w", "wfc3.f140w", "wfc3.f160w")
+MIRI_FILTERS = tuple(f"miri.f{n}w" for n in (560, 770, 1000, 1130, 1280, 1500, 1800, 2100, 2550))
+WFC3_FILTERS = ("wfc3.f105w", "wfc3.f125w", "wfc3.f140w", "wfc3.f160w")
 
 #: Width of the WFC3/IR pixel in arcsec and of the drop relative to it in the mosaics.
 _WFC3_PIXEL, _WFC3_PIXFRAC = 0.128, 0.8
@@ -289,7 +297,7 @@ def miri_psf(
     >>> psf.meta["frame"], psf.meta["includes"]
     ('detector', ['jitter', 'cruciform', 'pixel', 'ipc'])
     """
-    name = filter_name(filter, _MIRI)
+    name = filter_name(filter, MIRI_FILTERS)
     oversampling, width = checked_grid(oversampling, fov, 21.0)
     unknown = set(includes) - set(EFFECTS)
     if unknown:
@@ -419,7 +427,7 @@ def hst_psf(
     Krist, Hook & Stoehr 2011, SPIE 8127, 81270J; Skelton et al. 2014, ApJS 214, 24
     (mosaics of 0.06 arcsec pixels).
     """
-    name = filter_name(filter, _WFC3)
+    name = filter_name(filter, WFC3_FILTERS)
     oversampling, width = checked_grid(oversampling, fov, 10.0)
     scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
     if fwhm is None:

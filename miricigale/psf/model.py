@@ -302,8 +302,27 @@ def from_photutils(
     )
 
 
-def _header_grid(header):
-    """Side of a pixel in arcsec and position angle of +y in deg, None where not stated."""
+def header_grid(header):
+    """
+    What the header of a PSF or kernel states of its grid.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header`
+        World coordinates, or PIXELSCL or PIXSCALE (arcsec).
+
+    Returns
+    -------
+    cell : float or None
+        Side of a pixel of the file in arcsec; None if not stated.
+    angle : float or None
+        Position angle of +y in deg; None without world coordinates.
+
+    Raises
+    ------
+    ValueError
+        If the image is mirrored.
+    """
     wcs = WCS(header, naxis=2, fix=False).celestial if "CTYPE1" in header else None
     if wcs is not None and wcs.has_celestial:
         (a, b), (c, d) = wcs.pixel_scale_matrix
@@ -348,7 +367,7 @@ def fits_image(path, ext, plane, pixel_scale, *, wanted, oversampling=1):
             got = None if data is None else f"shape {data.shape}"
             raise argument_error("path", f"a file with a 2D image in extension {ext!r}", got)
         data, header = np.array(data, dtype=float), hdus[ext].header
-    cell, angle = _header_grid(header)
+    cell, angle = header_grid(header)
     if pixel_scale is None:
         if cell is None:
             raise argument_error("pixel_scale", "given where the header does not state it", None)

@@ -13,11 +13,12 @@ from miricigale.refdata import citations
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, to_array
 
-__all__ = ["nircam_psf"]
+__all__ = ["NIRCAM_FILTERS", "nircam_psf"]
 
 #: Pixel in arcsec of the wide filters, of the short- and the long-wavelength channel.
 _PIXELS = dict.fromkeys((f"nircam.f{n}w" for n in ("070", "090", "115", "150", "200")), 0.031)
 _PIXELS |= dict.fromkeys((f"nircam.f{n}w" for n in (277, 356, 444)), 0.063)
+NIRCAM_FILTERS = tuple(_PIXELS)
 
 
 @functools.lru_cache(maxsize=4)

@@ -2,6 +2,7 @@
 
 import logging
 
+import astropy.units as u
 import numpy as np
 
 from miricigale.photometry.grids import grid_angle
@@ -9,7 +10,7 @@ from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.units import ANGLE, to_array
 
-__all__ = ["file_place", "is_own_kernel", "matching_kernel", "read_kernel"]
+__all__ = ["can_be_modelled", "file_place", "is_own_kernel", "matching_kernel", "read_kernel"]
 
 _log = logging.getLogger(__name__)
 
@@ -48,14 +49,15 @@ def file_place(path):
 
 
 def _planes(path, wanted):
-    """The planes that a path means, shape (n, ny, nx)."""
+    """The planes that a path means, shape (n, ny, nx), and the header."""
     name, extension, plane = file_place(path)
     with open_fits(name, wanted=wanted) as hdus:
         try:
-            data = hdus[extension].data
+            hdu = hdus[extension]
         except (KeyError, IndexError):
             msg = f"{path}: there is no such extension, only {[hdu.name for hdu in hdus]}"
             raise DataError(msg) from None
+        data = hdu.data
         shape = getattr(data, "shape", None)
         if shape is None or len(shape) != (2 if plane is None else 3):
             kind = "an image" if plane is None else "a cube"
@@ -66,7 +68,7 @@ def _planes(path, wanted):
             msg = f"{path}: the cube has the planes 0 to {shape[0] - 1}"
             raise DataError(msg)
         chosen = data[None] if plane is None else data if plane == "mean" else data[plane][None]
-        return np.array(chosen, dtype=float)
+        return np.array(chosen, dtype=float), hdu.header.copy()
 
 
 def _centred(data):
@@ -79,26 +81,81 @@ def _centred(data):
     return float((core * x).sum() / core.sum()), float((core * y).sum() / core.sum())
 
 
-def _read_psf(path, scale, angle):
-    """A PSF, or the mean of several, its centre in the middle."""
-    from miricigale.psf import average_psf, make_psf, psf_image
+def _read_psf(path, argument, header, *, scale, angle):
+    """
+    A PSF, or the mean of several, with its centre in the middle.
 
+    ``scale`` and ``angle`` are what the caller gave (or None), ``header`` is that of the image which
+    the PSF is for.
+    """
+    from miricigale.psf import MODEL_FILTERS, average_psf, make_psf, psf_image
+    from miricigale.psf.model import header_grid
+
+    known = header.filter in MODEL_FILTERS
+    planes, stated = _planes(path, "a PSF")
+    cell, turn = header_grid(stated)
+    if scale is not None:
+        given = float(to_array(scale, ANGLE, f"{argument}_scale"))
+        if cell is not None and abs(given / cell - 1) > 0.02:
+            wanted = f"{cell:.4g} arcsec, as the header of {path} says"
+            raise argument_error(argument + "_scale", wanted, scale)
+        cell = given
+    if angle is not None:
+        given = float(to_array(angle, u.deg, f"{argument}_angle", finite=True))
+        if turn is not None and abs((given - turn + 180) % 360 - 180) > 0.5:
+            wanted = f"{turn:.4g} deg, as the header of {path} says"
+            raise argument_error(argument + "_angle", wanted, angle)
+        turn = given
+    cell, turn = (
+        default if value is None else value
+        for value, default in zip((cell, turn), _grid(header), strict=True)
+    )
+    form = {"pixel_scale": cell * ANGLE, "frame": "sky", "angle": turn * u.deg}
     kept = []
-    for data in _planes(path, "a PSF"):
-        if not np.all(np.isfinite(data)) or not data.max() > 0:
+    for data in planes:
+        if not np.all(np.isfinite(data)) or not data.max() > 0 or not data.sum() > 0:
             msg = f"{path} is no PSF: it has no light, or pixels that are not finite"
             raise DataError(msg)
-        form = {"pixel_scale": scale * ANGLE, "frame": "sky", "angle": angle}
+        total = float(data.sum())
+        # the model tells what light it holds, whatever it was scaled to
+        scaled = known and not 0.8 < total < 0.995
+        if scaled:
+            _log.info("%s sums to %.4g and is scaled to 1", path, total)
         try:
-            psf = make_psf(data, origin=_centred(data), **form)
+            psf = make_psf(data / total if scaled else data, origin=_centred(data), **form)
         except ValueError as err:
             msg = f"{path} cannot be read as a PSF: {err}"
             raise DataError(msg) from err
         n = 2 * (min(data.shape) // 2) - 1
-        middle = psf_image(psf, pixel_scale=scale * ANGLE, shape=n)
+        middle = psf_image(psf, pixel_scale=cell * ANGLE, shape=n)
+        middle = middle / middle.sum() if scaled else middle
         # the shift loses nothing but what is beyond the edge
         kept.append(make_psf(middle, **form, file=str(path)))
-    return kept[0] if len(kept) == 1 else average_psf(kept)
+    psf = kept[0] if len(kept) == 1 else average_psf(kept)
+    # a pixel that was stated on purpose leaves only the image to be wider
+    return _compared(psf, header, argument, smoothed=scale is not None) if known else psf
+
+
+def _grid(header):
+    """Pixel in arcsec and position angle of +y in deg of an image."""
+    from miricigale.photometry.arrays import pixel_scale
+
+    return pixel_scale(header.wcs), grid_angle(header.wcs, header.shape).to_value(u.deg)
+
+
+def _compared(psf, header, argument, *, smoothed=False):
+    """A PSF beside the model of the image that it is for."""
+    from miricigale.psf import checked_psf
+
+    return checked_psf(
+        psf,
+        header.filter,
+        pixel_scale=_grid(header)[0] * ANGLE,
+        pa=header.pa_aper,
+        resampling=None if header.exposure else "drizzle",
+        smoothed=smoothed,
+        argument=argument,
+    )
 
 
 def is_own_kernel(path):
@@ -118,7 +175,7 @@ def is_own_kernel(path):
         return "KERNEL" in hdus and "SOURCE" in hdus and "TARGET" in hdus
 
 
-def read_kernel(path, *, highres_psf=None, pixel_scale=None):
+def read_kernel(path, *, pixel_scale, highres_psf=None):
     """
     Read a kernel that others made.
 
@@ -127,113 +184,141 @@ def read_kernel(path, *, highres_psf=None, pixel_scale=None):
     path : path-like
         What `~miricigale.psf.MatchingKernel.write` wrote, or any image of a kernel
         (``file.fits[EXTENSION,PLANE]`` of a cube, ``mean`` for the mean of its planes).
+    pixel_scale : `~astropy.units.Quantity`
+        Pixel of the prior.
     highres_psf : `~photutils.psf.ImagePSF`, optional
-        The sharp PSF, for points and for wings; needed unless the file has it. That of the
-        image is what the kernel makes of it.
-    pixel_scale : `~astropy.units.Quantity`, optional
-        Pixel of the kernel; needed likewise.
+        The sharp PSF on the prior's axes, for points and for wings, unless the file has it. That
+        of the image is what the kernel makes of it.
 
     Returns
     -------
     kernel : `~miricigale.psf.MatchingKernel`
+        Without PSFs if there is no sharp one.
 
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
-        If the file is missing, or holds no kernel of odd and square shape.
-    """
-    from scipy.signal import fftconvolve
+        If the file is missing, holds no kernel of odd and square shape whose sum is about 1, or one
+        for other pixels.
 
-    from miricigale.psf import MatchingKernel, psf_image
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        As `~miricigale.psf.MatchingKernel.from_array`.
+    """
+    from miricigale.psf import MatchingKernel
+    from miricigale.psf.model import header_grid
 
     if is_own_kernel(path):
-        return MatchingKernel.read(file_place(path)[0])
-    if highres_psf is None or pixel_scale is None:
-        wanted = f"given, for {path} holds the kernel alone"
-        raise argument_error("highres_psf, pixel_scale", wanted, None)
-    array = _planes(path, "a kernel").mean(axis=0)
-    n = array.shape[0]
-    if array.shape != (n, n) or n % 2 == 0 or not np.all(np.isfinite(array)):
-        msg = f"{path} must be a kernel, odd, square and finite, got the shape {array.shape}"
+        kernel = MatchingKernel.read(file_place(path)[0])
+        stated = kernel.pixel_scale.value
+    else:
+        planes, header = _planes(path, "a kernel")
+        stated = header_grid(header)[0]
+        try:
+            kernel = MatchingKernel.from_array(
+                planes.mean(axis=0), pixel_scale=pixel_scale, source=highres_psf
+            )
+        except ValueError as err:
+            msg = f"{path} cannot be read as a kernel: {err}"
+            raise DataError(msg) from err
+        kernel.meta["file"] = str(path)
+    wanted = pixel_scale.to_value(ANGLE)
+    if stated is not None and abs(stated / wanted - 1) > 0.02:
+        msg = (
+            f"{path} is a kernel for pixels of {stated:.4g} arcsec, and those of the prior have "
+            f"{wanted:.4g} arcsec"
+        )
         raise DataError(msg)
-    if not 0.8 < array.sum() < 1.05:
-        msg = f"{path} must be a kernel whose sum is about 1, got {array.sum():.4g}"
-        raise DataError(msg)
-    source = psf_image(highres_psf, pixel_scale=pixel_scale, shape=n)
-    source = source / source.sum()
-    return MatchingKernel(
-        array,
-        pixel_scale,
-        source=source,
-        target=fftconvolve(source, array, mode="same"),
-        meta={"file": str(path)},
-    )
+    return kernel
 
 
-def matching_kernel(
-    image, highres, filter_, pa_aper, *, kernel, psf, highres_psf, psf_scale, highres_psf_scale
-):
+def can_be_modelled(header):
+    """
+    Whether `~miricigale.psf.filter_psf` has the PSF of an image.
+
+    Parameters
+    ----------
+    header : `~miricigale.photometry.MosaicHeader`
+        Of the image.
+
+    Returns
+    -------
+    known : bool
+        Whether it knows the filter and, unless that is one of WFC3/IR, the position angle is known.
+    """
+    from miricigale.psf import MODEL_FILTERS
+
+    name = header.filter
+    return name in MODEL_FILTERS and (name.startswith("wfc3.") or header.pa_aper is not None)
+
+
+def matching_kernel(image, highres, *, kernel=None, psf=None, highres_psf=None, **options):
     """
     The kernel from the prior to the image.
 
     Parameters
     ----------
-    image, highres : `~miricigale.photometry.MosaicFile`
-        Their files.
-    filter_ : str
-        Filter of the image, for the model PSF.
-    pa_aper : `~astropy.units.Quantity` or None
-        Position angle of the detector's +y axis, for the model PSF.
-    kernel, psf, highres_psf, psf_scale, highres_psf_scale
-        As for `~miricigale.workflow.photometry.measure_files`, any of them None.
+    image, highres : `~miricigale.photometry.MosaicHeader`
+        Of the two images, with filters and position angles.
+    kernel, psf, highres_psf : path-like, optional
+        As for `~miricigale.workflow.photometry.measure_files`.
+    **options
+        ``psf_scale``, ``psf_angle``, ``highres_psf_scale`` and ``highres_psf_angle``, likewise.
 
     Returns
     -------
     kernel : `~miricigale.psf.MatchingKernel`
+        Without PSFs if a kernel was given and no PSF of the prior is known.
 
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
         If a file cannot be read as what it should be.
     ValueError
-        If the prior's PSF is not the narrower one.
+        If the prior's PSF is not the narrower one, or a PSF is not that of its filter.
     """
-    from miricigale.photometry.arrays import pixel_scale
-    from miricigale.psf import MatchingKernel, hst_psf, miri_psf, psf_mosaic
+    from miricigale.psf import MODEL_FILTERS, MatchingKernel, filter_psf, make_psf, rotate_psf
 
-    grid = [one.header for one in (image, highres)]
-    coarse, fine = (pixel_scale(one.wcs) for one in grid)
-    low_angle, high_angle = (grid_angle(one.wcs, one.shape) for one in grid)
-    sharp = None
-    if highres_psf is not None:
-        scale = fine if highres_psf_scale is None else to_array(highres_psf_scale, ANGLE, "scale")
-        sharp = _read_psf(highres_psf, float(scale), high_angle)
+    scale, angle = _grid(highres)
+    psfs, fine, turn = {}, scale * ANGLE, angle * u.deg
+    for what, header, path in (("psf", image, psf), ("highres_psf", highres, highres_psf)):
+        if path is not None:
+            form = {name: options.get(f"{what}_{name}") for name in ("scale", "angle")}
+            psfs[what] = _read_psf(path, what, header, **form)
+        elif kernel is None or (what == "highres_psf" and can_be_modelled(header)):
+            scale, angle = _grid(header)
+            psfs[what] = filter_psf(
+                header.filter,
+                pixel_scale=scale * ANGLE,
+                pa=header.pa_aper,
+                grid_angle=angle * u.deg,
+                resampling=None if header.exposure else "drizzle",
+            )
+            _log.info("%s: the model of %s", what, header.filter)
+    sharp, wide = psfs.get("highres_psf"), psfs.get("psf")
     if kernel is not None:
-        made = read_kernel(kernel, highres_psf=sharp, pixel_scale=fine * ANGLE)
+        if sharp is not None:
+            sharp = rotate_psf(sharp, grid_angle=turn)
+        made = read_kernel(kernel, highres_psf=sharp, pixel_scale=fine)
+        if made.target is not None and image.filter in MODEL_FILTERS:
+            form = {"pixel_scale": fine, "frame": "sky", "angle": turn, "enclosed": 1.0}
+            _compared(make_psf(made.target, **form), image, "kernel")
     else:
-        if sharp is None:
-            sharp = hst_psf(highres.header.filter, pixel_scale=fine * ANGLE)
-        if psf is None:
-            low = {"grid_angle": low_angle}
-            wide = psf_mosaic(miri_psf(filter_), coarse * ANGLE, pa_aper, **low)
-        else:
-            scale = coarse if psf_scale is None else to_array(psf_scale, ANGLE, "psf_scale")
-            wide = _read_psf(psf, float(scale), low_angle)
-        _check_widths(sharp.meta["fwhm"], wide.meta["fwhm"], image.path, highres.path)
-        made = MatchingKernel.from_psfs(
-            sharp, wide, pixel_scale=fine * ANGLE, grid_angle=high_angle
-        )
-    # the peaks of two PSFs of the same light
-    _check_widths(1 / made.source.max(), 1 / made.target.max(), image.path, highres.path)
+        _check_widths(sharp.meta["fwhm"], wide.meta["fwhm"])
+        made = MatchingKernel.from_psfs(sharp, wide, pixel_scale=fine, grid_angle=turn)
+    if made.target is not None:
+        # the peaks of two PSFs of the same light
+        _check_widths(1 / made.source.max(), made.target.sum() / made.target.max())
     _log.info("%r", made)
     return made
 
 
-def _check_widths(sharp, wide, path, highres_path):
+def _check_widths(sharp, wide):
     # an unknown width is NaN
     if sharp >= wide:
         msg = (
-            f"the PSF of {path} must be wider than that of {highres_path}, and it is not: are "
-            "'image' and 'highres' swapped, or their PSFs?"
+            "the PSF of 'image' must be wider than that of 'highres', and it is not: are the two "
+            "swapped, or their PSFs?"
         )
         raise ValueError(msg)

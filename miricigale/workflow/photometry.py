@@ -1,5 +1,6 @@
 """Forced photometry of files: what they are is checked first, then measured and put on a page."""
 
+import dataclasses
 import logging
 import os
 import tempfile
@@ -17,7 +18,8 @@ from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_e
 from miricigale.utils.files import split_extension, writing
 from miricigale.utils.progress import progress
 from miricigale.utils.units import to_array
-from miricigale.workflow.kernel_files import file_place, is_own_kernel, matching_kernel
+from miricigale.workflow.kernel_files import can_be_modelled, file_place, matching_kernel
+from miricigale.workflow.products import write_image
 
 __all__ = ["empty_positions", "measure_files"]
 
@@ -39,11 +41,16 @@ def measure_files(
     highres_psf=None,
     psf_scale=None,
     highres_psf_scale=None,
+    psf_angle=None,
+    highres_psf_angle=None,
     pa_aper=None,
+    highres_pa_aper=None,
     fit_background=True,
     max_shift=None,
     output=None,
     page=None,
+    model=None,
+    residual=None,
     overwrite=False,
     n_empty=400,
     seed=1,
@@ -65,23 +72,28 @@ def measure_files(
         on the prior.
     kernel : path-like, optional
         From the prior's resolution to that of the image, on the prior's pixels; see
-        ``miricigale.workflow.kernel_files.read_kernel``.
+        ``miricigale.workflow.kernel_files.read_kernel``. Without a PSF of the prior sources are
+        the segments as they are, and those without one are not measured.
     psf, highres_psf : path-like, optional
-        PSFs of image and prior with the pixel and the drizzling in them, +y along that of
-        their image: ``file.fits``, ``file.fits[EXTENSION]``, or of a cube
-        ``file.fits[EXTENSION,PLANE]`` (``mean`` for the mean of all planes). Their centres are
-        found. Without them and without a kernel MIRI images take
-        `~miricigale.psf.miri_psf` and WFC3/IR priors `~miricigale.psf.hst_psf`.
+        PSFs of image and prior with the pixel and the drizzling in them: ``file.fits``,
+        ``file.fits[EXTENSION]``, or of a cube ``file.fits[EXTENSION,PLANE]`` (``mean`` for the mean
+        of all planes). Their centres are found. Those of MIRI, NIRCam's wide filters and WFC3/IR
+        are compared with the model (`~miricigale.psf.checked_psf`), which is taken where none is
+        given (`~miricigale.psf.filter_psf`).
     psf_scale, highres_psf_scale : `~astropy.units.Quantity`, optional
-        Pixel of the PSFs; by default that of their images.
-    pa_aper : `~astropy.units.Quantity`, optional
-        Position angle of the detector's +y axis, for MIRI's PSF, if the header does not tell.
+        Pixel of the PSFs; by default that of their header, or else of their images.
+    psf_angle, highres_psf_angle : `~astropy.units.Quantity`, optional
+        Position angle of the PSFs' +y; by default that of their header, or else of their images'
+        +y.
+    pa_aper, highres_pa_aper : `~astropy.units.Quantity`, optional
+        Position angle of the detector's +y axis, if the header does not tell.
     fit_background : bool, optional
         Whether a constant is fitted to the image with the sources.
     max_shift : `~astropy.units.Quantity`, optional
         If given, a shift of the image up to this is fitted.
-    output, page : path-like, optional
-        Where the table (ECSV or FITS) and the HTML page are written; not if None.
+    output, page, model, residual : path-like, optional
+        Where the table (ECSV or FITS), the HTML page and FITS images of the fitted model (with its
+        background) and of the residual are written; not if None.
     overwrite : bool, optional
         Whether files that are there are replaced.
     n_empty : int, optional
@@ -112,26 +124,44 @@ def measure_files(
     extras = {"segmentation": segmentation, "catalog": catalog, "kernel": kernel}
     extras.update(psf=psf, highres_psf=highres_psf)
     inputs = [one for one in extras.values() if one is not None]
-    for what, path in (("output", output), ("page", page)):
+    results = {"output": output, "page": page, "model": model, "residual": residual}
+    for what, path in results.items():
         _check_output(what, path, overwrite, [image.path, highres.path, *inputs])
+    written = [Path(path).resolve() for path in results.values() if path is not None]
+    if len(set(written)) < len(written):
+        given = ", ".join(what for what, path in results.items() if path is not None)
+        raise argument_error(given, "different files", [str(path) for path in written])
     filter_ = _check_images(image, highres, filter)
     for what, path in extras.items():
         if path is not None and not os.path.isfile(file_place(path)[0]):
             msg = f"no file {path} ('{what}')"
             raise DataError(msg)
+    if catalog is not None:
+        _check_catalog(catalog, image, highres)
     psfs = {"kernel": kernel, "psf": psf, "highres_psf": highres_psf}
-    scales = {"psf_scale": psf_scale, "highres_psf_scale": highres_psf_scale}
-    angle = _check_psfs(image, highres, filter_, pa_aper, **psfs)
+    psfs.update(psf_scale=psf_scale, highres_psf_scale=highres_psf_scale)
+    psfs.update(psf_angle=psf_angle, highres_psf_angle=highres_psf_angle)
+    headers = [
+        dataclasses.replace(
+            one.header,
+            filter=name,
+            pa_aper=_checked_angle(one, angle, argument),
+        )
+        for one, name, angle, argument in (
+            (image, filter_, pa_aper, "pa_aper"),
+            (highres, highres.header.filter, highres_pa_aper, "highres_pa_aper"),
+        )
+    ]
+    _check_psfs(image, highres, headers, kernel, psf, highres_psf)
     # after what is wrong with the files is known
     from miricigale.photometry import ForcedPhotometer
 
     with progress(show=progress_bar, total=4, desc="images", unit="steps") as bar:
         mosaic, prior = image.read(), highres.read()
-        _check_sky(highres, prior)
         mosaic.meta["filter"] = filter_
         bar.update()
         bar.set_description("kernel and sources")
-        matching = matching_kernel(image, highres, filter_, angle, **psfs, **scales)
+        matching = matching_kernel(*headers, **psfs)
         segments, sources = _sources(prior, segmentation, catalog, highres.path)
         bar.update()
         bar.set_description("fluxes")
@@ -143,21 +173,21 @@ def measure_files(
         table.meta.update(image=str(image.path), highres=str(highres.path))
         bar.update()
         bar.set_description("page")
+        for path in written:
+            path.parent.mkdir(parents=True, exist_ok=True)
         if output is not None:
-            Path(output).parent.mkdir(parents=True, exist_ok=True)
             with writing(output), warnings.catch_warnings():
                 # of keywords of more than eight letters
                 warnings.simplefilter("ignore", VerifyWarning)
                 table.write(output, overwrite=overwrite)
+        for path, picture in ((model, result.model_image), (residual, result.residual_image)):
+            if path is not None:
+                write_image(picture, path)
         if page is not None:
             from miricigale.workflow.photometry_page import photometry_page
 
-            empty = empty_positions(result, n_empty, seed=seed)
-            blank = ForcedPhotometer(matching, template="psf", n_threads=n_threads)
-            pulls = blank.measure(result.residual_image, catalog=empty) if len(empty) else None
-            photometry_page(
-                result, filter_, mosaic, prior, matching, None if pulls is None else pulls.snr
-            ).write(page)
+            pulls = _pulls(result, matching, n_empty, seed, n_threads)
+            photometry_page(result, filter_, mosaic, prior, matching, pulls).write(page)
         bar.update()
     return table
 
@@ -169,6 +199,8 @@ def _check_output(what, path, overwrite, inputs):
     path = Path(path)
     if what == "output" and not path.name.lower().endswith(_TABLES):
         raise argument_error("output", f"a table ({', '.join(_TABLES)})", path)
+    if what in ("model", "residual") and not path.name.lower().endswith((".fits", ".fits.gz")):
+        raise argument_error(what, "a FITS file (.fits, .fits.gz)", path)
     if path.is_dir():
         raise argument_error(what, "a file", f"the folder {path}")
     if any(path.resolve() == Path(split_extension(one)[0]).resolve() for one in inputs):
@@ -235,46 +267,67 @@ def _overlap(one, other):
     return bool(np.any((x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)))
 
 
-def _check_psfs(image, highres, filter_, pa_aper, *, kernel, psf, highres_psf):
-    """The position angle for MIRI's PSF, after checking that there is a PSF of each."""
-    stated = image.header.pa_aper
-    if pa_aper is not None:
-        pa_aper = float(to_array(pa_aper, u.deg, "pa_aper", finite=True)) * u.deg
-        if stated is not None:
-            difference = (pa_aper - stated).to_value(u.deg)
-            if abs((difference + 180) % 360 - 180) > 1:
-                wanted = f"PA_APER of {image.path}, {stated.value:.2f} deg"
-                raise argument_error("pa_aper", wanted, pa_aper)
-    angle = stated if pa_aper is None else pa_aper
-    if kernel is not None:
-        if psf is not None:
-            raise argument_error("psf", "left out where a kernel is given", psf)
-        if highres_psf is None and not is_own_kernel(kernel):
-            wanted = f"given, for {kernel} holds the kernel alone"
-            raise argument_error("highres_psf", wanted, None)
-        return angle
-    if psf is None:
-        if not filter_.startswith("miri."):
-            wanted = f"given (or 'kernel'), for there is no model PSF for {filter_}"
-            raise argument_error("psf", wanted, None)
-        if angle is None:
-            wanted = f"given, for the header of {image.path} has no PA_APER"
-            raise argument_error("pa_aper", wanted, None)
-    if highres_psf is None and not (highres.header.filter or "").startswith("wfc3."):
-        name = highres.header.filter or "a prior whose filter is unknown ('highres_filter')"
-        wanted = f"given (or 'kernel'), for there is no model PSF for {name}"
-        raise argument_error("highres_psf", wanted, None)
+def _checked_angle(file, angle, argument):
+    """The position angle that was given or that the header states, which must agree."""
+    stated = file.header.pa_aper
+    if angle is None:
+        return stated
+    angle = float(to_array(angle, u.deg, argument, finite=True)) * u.deg
+    if stated is not None:
+        difference = (angle - stated).to_value(u.deg)
+        if abs((difference + 180) % 360 - 180) > 1:
+            wanted = f"PA_APER of {file.path}, {stated.value:.2f} deg"
+            raise argument_error(argument, wanted, angle)
     return angle
 
 
-def _check_sky(file, image):
-    level = image.meta["sky_over_noise"]
-    if abs(level) > 1:
-        msg = (
-            f"{file.path} has a sky of {level:.3g} times its noise, which goes into the templates; "
-            "subtract it ('background_box')"
-        )
-        warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+def _check_psfs(image, highres, headers, kernel, psf, highres_psf):
+    """Refuse images whose PSF is neither given nor known."""
+    from miricigale.psf import MODEL_FILTERS
+
+    if kernel is not None:
+        if psf is not None:
+            raise argument_error("psf", "left out where a kernel is given", psf)
+        return
+    for file, header, path, prefix in (
+        (image, headers[0], psf, ""),
+        (highres, headers[1], highres_psf, "highres_"),
+    ):
+        if path is not None or can_be_modelled(header):
+            continue
+        if header.filter in MODEL_FILTERS:
+            wanted = f"given, for the header of {file.path} has no PA_APER (or '{prefix}psf')"
+            raise argument_error(prefix + "pa_aper", wanted, None)
+        name = header.filter or "an image whose filter is unknown ('highres_filter')"
+        wanted = f"given (or 'kernel'), for there is no model PSF for {name}"
+        raise argument_error(prefix + "psf", wanted, None)
+
+
+def _check_catalog(path, image, highres):
+    """Refuse a catalogue of another field."""
+    from astropy.coordinates import SkyCoord
+
+    from miricigale.photometry.arrays import sky_pixels
+    from miricigale.photometry.priors import read_catalog
+
+    sky = read_catalog(path)["sky"]
+
+    def inside(sky, header):
+        return np.isfinite(sky_pixels(sky, header.wcs, header.shape, 0.0)).any()
+
+    for what, file in (("image", image), ("highres", highres)):
+        if inside(sky, file.header):
+            continue
+        msg = f"none of the {len(sky)} sources of {path} is on {file.path} ('{what}')"
+        known = np.isfinite(sky.ra.deg)
+        hours = SkyCoord(15 * sky.ra[known], sky.dec[known])
+        if inside(hours, file.header):
+            msg += ": is ra in hours? Wanted are degrees, or a column with a unit"
+        elif known.any():
+            first = sky[known][0].to_string("decimal", precision=4)
+            where = _middle(file.header).to_string("decimal", precision=4)
+            msg += f": the first is at {first}, the middle of the image at {where} deg"
+        raise ValueError(msg)
 
 
 def _sources(prior, segmentation, catalog, path):
@@ -287,6 +340,20 @@ def _sources(prior, segmentation, catalog, path):
     if catalog is None:
         return segments.data, detected
     return read_prior(prior, segmentation=segments.data, catalog=catalog, path=path)
+
+
+def _pulls(result, kernel, n, seed, n_threads):
+    """Flux over error of point sources where none is; None without a PSF or such places."""
+    from miricigale.photometry import ForcedPhotometer
+
+    empty = empty_positions(result, n, seed=seed)
+    if kernel.target is None or not len(empty):
+        return None
+    blank = ForcedPhotometer(kernel, template="psf", n_threads=n_threads)
+    with warnings.catch_warnings():
+        # a background has been told of
+        warnings.simplefilter("ignore", MiricigaleWarning)
+        return blank.measure(result.residual_image, catalog=empty).snr
 
 
 def empty_positions(result, n, *, seed, distance=0.3):

@@ -22,6 +22,8 @@ from miricigale.workflow.products import write_image
 CENTER = SkyCoord(34.3, -5.1, unit="deg")
 #: Pixels and rms of the PSFs of image and prior, arcsec.
 COARSE, FINE, WIDE, SHARP = 0.11, 0.06, 0.25, 0.09
+#: A filter without a model PSF, which could not be a Gaussian.
+BAND = "irac.ch4"
 REAL = os.environ.get("MIRICIGALE_DATA")
 
 
@@ -75,7 +77,7 @@ def files(tmp_path_factory):
         "image": save("image.fits", data * 100, image_wcs, BUNIT="10*nanoJansky"),
         # 1 / variance up to a factor of 4
         "weight": save("wht.fits", np.full(low, 0.25 / (100 * noise) ** 2), image_wcs),
-        "highres": save("prior.fits.gz", prior * 1e3, prior_wcs, BUNIT="nJy", FILTER="F444W",
+        "highres": save("prior.fits.gz", prior * 1e3, prior_wcs, BUNIT="nJy", FILTER="F430M",
                         INSTRUME="NIRCAM"),
         "highres-error": save("rms.fits", np.full(high, 2.0)),
         "segmentation": save("seg.fits", labels, prior_wcs),
@@ -90,7 +92,7 @@ def files(tmp_path_factory):
 
 
 def arguments(files, output, **changes):
-    options = {**files.paths, "filter": "miri.f770w", "output": output, **changes}
+    options = {**files.paths, "filter": BAND, "output": output, **changes}
     given = [[f"--{key}", str(value)] for key, value in options.items() if value is not None]
     return ["photometry", "--no-progress", *(part for pair in given for part in pair)]
 
@@ -102,7 +104,7 @@ def test_files_become_a_catalogue_that_can_be_fitted_and_a_page(files, tmp_path,
     assert f"25 sources in {output}" in capsys.readouterr().out
     table = QTable.read(output)
     assert list(table["id"]) == list(files.ids)
-    flux, error = (table[name].to_value(u.uJy) for name in ("miri.f770w", "miri.f770w_err"))
+    flux, error = (table[name].to_value(u.uJy) for name in (BAND, f"{BAND}_err"))
     assert np.all(table["sky"].separation(files.sky) < 0.05 * u.arcsec)
     # the error of a point source on white noise, in closed form: sigma sqrt(4 pi) width / pixel
     expected = 0.005 * np.sqrt(4 * np.pi) * WIDE / COARSE
@@ -112,7 +114,7 @@ def test_files_become_a_catalogue_that_can_be_fitted_and_a_page(files, tmp_path,
     assert np.abs(pulls).max() < 4
     assert 0.6 < pulls.std() < 1.4
     page = output.with_suffix(".html").read_text()
-    for text in ("Forced photometry: miri.f770w", "Image, model and residual", "Magnitudes",
+    for text in (f"Forced photometry: {BAND}", "Image, model and residual", "Magnitudes",
                  "pulls at empty positions", "Brightest sources", "10*nanoJansky", "150037"):  # fmt: skip
         assert text in page
     assert page.count("<img") == 4
@@ -140,7 +142,7 @@ def test_catalogue_kernel_and_the_plain_form(files, tmp_path):
         assert main([*command, files.paths["image"], files.paths["highres"]]) == 0
         table = QTable.read(output)
         assert list(table["id"]) == list(files.ids[order])
-        found.append(table["miri.f770w"].to_value(u.uJy))
+        found.append(table[BAND].to_value(u.uJy))
         np.testing.assert_allclose(found[-1], files.flux[order], rtol=0.03, atol=0.2)
     np.testing.assert_allclose(*found, rtol=0.01, atol=0.02)
 
@@ -155,7 +157,7 @@ def test_without_a_segmentation_sources_are_detected(files, tmp_path):
         assert main(command) == 0
     table = QTable.read(output)
     assert list(table["id"]) == list(files.ids)
-    ours = table["miri.f770w"].to_value(u.uJy)
+    ours = table[BAND].to_value(u.uJy)
     np.testing.assert_allclose(ours, files.flux, rtol=0.05, atol=0.2)
 
 
@@ -214,19 +216,21 @@ def test_model_psfs_are_turned_to_the_angle_of_the_aperture(tmp_path):
         ({"filter": None}, "'filter' must be given, for the header of"),
         ({"filter": "miri.f771w"}, "'filter' must be a filter that 'miricigale filters' lists"),
         ({"image": "highres", "highres": "image", "filter": "nircam.f356w", "weight": None},
-         "'filter' must be 'nircam.f444w', the filter in"),
-        ({"image": "highres", "highres": "f770w", "weight": None}, "seem to be swapped"),
+         "'filter' must be 'nircam.f430m', the filter in"),
+        ({"image": "highres", "highres": "f770w", "weight": None, "filter": "miri.f770w"},
+         "seem to be swapped"),
         ({"highres": "f770w", "image": "image", "psf": "highres-psf", "highres-psf": "psf",
           "psf-scale": 0.06, "highres-psf-scale": 0.11, "segmentation": None}, "must be wider than that of"),
         ({"highres": "far", "highres-error": None}, "show different fields: the middle of"),
         ({"highres": "plain", "highres-error": None}, "no celestial coordinates"),
         ({"segmentation": "moved"}, "is not on the pixels of"),
         ({"segmentation": "absent.fits"}, "no file absent.fits ('segmentation')"),
-        ({"psf": None}, "'pa_aper' must be given, for the header of"),
-        ({"highres-psf": None}, "there is no model PSF for nircam.f444w"),
+        ({"psf": None, "filter": "miri.f770w"}, "'pa_aper' must be given, for the header of"),
+        ({"highres-psf": None}, "there is no model PSF for nircam.f430m"),
+        ({"highres-psf": None, "highres": "f444w"}, "'highres_pa_aper' must be given, for the"),
         ({"psf": None, "filter": "nircam.f480m"}, "there is no model PSF for nircam.f480m"),
         ({"kernel": "psf"}, "'psf' must be left out where a kernel is given"),
-        ({"kernel": "psf", "psf": None, "highres-psf": None}, "holds the kernel alone"),
+        ({"kernel": "segmentation", "psf": None, "highres-psf": None}, "cannot be read as a kernel"),
         ({"psf": "segmentation"}, "seg.fits cannot be read as a PSF"),
         ({"psf": "cube"}, "must be an image with a PSF, got the shape"),
         ({"output": "out.txt"}, "'output' must be a table (.ecsv, .fits, .fits.gz)"),
@@ -242,10 +246,12 @@ def test_what_does_not_fit_is_refused_before_the_work(
     Path("there.ecsv").write_text("")
     data, header = fits.getdata(files.paths["highres"], header=True)
     made = {**files.paths, "cube": files.paths["highres-psf"].partition("[")[0]}
-    for name in ("f770w", "far", "plain", "moved"):
+    for name in ("f770w", "f444w", "far", "plain", "moved"):
         own = header.copy()
         if name == "f770w":
             own["FILTER"], own["INSTRUME"] = "F770W", "MIRI"
+        elif name == "f444w":
+            own["FILTER"] = "F444W"
         elif name == "far":
             own["CRVAL1"] += 1
         elif name == "moved":
@@ -257,7 +263,7 @@ def test_what_does_not_fit_is_refused_before_the_work(
         fits.writeto(f"{name}.fits", kept, own)
         made[name] = f"{name}.fits"
     if "f770w" in changes.values() and "psf" in changes:
-        fits.setval("f770w.fits", "FILTER", value="F444W")
+        fits.setval("f770w.fits", "FILTER", value="F430M")
         fits.setval("f770w.fits", "INSTRUME", value="NIRCAM")
     changes = {key: made.get(value, value) for key, value in changes.items()}
     status = main(arguments(files, **{"output": "out.ecsv", **changes}))
@@ -284,8 +290,8 @@ def test_kernels_that_are_none_are_refused(files):
     sharp = gaussian_psf(0.2 * u.arcsec, pixel_scale=FINE * u.arcsec, fov=3 * u.arcsec)
     options = {"highres_psf": sharp, "pixel_scale": FINE * u.arcsec}
     for name, data, message in (
-        ("even", np.ones((4, 4)) / 16, "odd, square and finite"),
-        ("sum", np.ones((5, 5)), "whose sum is about 1, got 25"),
+        ("even", np.ones((4, 4)) / 16, "square with an odd number of pixels, got shape"),
+        ("sum", np.ones((5, 5)), "a kernel whose sum is 1, got a sum of 25"),
     ):
         path = files.save(f"{name}.fits", data)
         with pytest.raises(DataError, match=message):

@@ -1,0 +1,224 @@
+"""The PSF that a filter should have: models by name, and what others' PSFs say beside them."""
+
+import logging
+import math
+import warnings
+
+import astropy.units as u
+import numpy as np
+from photutils.psf import ImagePSF
+
+from miricigale.psf import _core
+from miricigale.psf.library import MIRI_FILTERS, WFC3_FILTERS, hst_psf, miri_psf
+from miricigale.psf.model import psf_info
+from miricigale.psf.nircam import NIRCAM_FILTERS, nircam_psf
+from miricigale.psf.resample import psf_image, psf_mosaic, rotate_psf
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error, unknown_name
+from miricigale.utils.units import ANGLE
+
+__all__ = ["MODEL_FILTERS", "checked_psf", "filter_psf"]
+
+_log = logging.getLogger(__name__)
+
+#: Filters that `filter_psf` knows.
+MODEL_FILTERS = (*MIRI_FILTERS, *NIRCAM_FILTERS, *WFC3_FILTERS)
+
+#: Factor in FWHM beyond which a PSF is not that of the filter, and part from which on it is told.
+_OTHER_WIDTH, _ODD_WIDTH = 1.5, 0.05
+#: The same for NIRCam, whose model has no charge diffusion.
+_ODD_NIRCAM = 0.12
+#: How far a sum may be from the fraction of light that the model's grid holds to be taken for it, and
+#: the sum from which on a PSF counts as normalised on its own grid.
+_NEAR_SUM, _UNIT_SUM = 0.05, 0.995
+#: Least correlation with the model in the detector's axes, and how much better it must be than that
+#: with the model turned to the sky.
+_CORRELATED, _BETTER = 0.4, 0.3
+
+
+def filter_psf(filter, *, pixel_scale, pa=None, grid_angle=0.0 * u.deg, resampling="drizzle"):
+    """
+    Model PSF of an image in a filter: MIRI, NIRCam's wide filters, WFC3/IR.
+
+    Parameters
+    ----------
+    filter : str
+        One of those of `miri_psf`, `nircam_psf` and `hst_psf`.
+    pixel_scale : `~astropy.units.Quantity`
+        Pixel of the image.
+    pa : `~astropy.units.Quantity`, optional
+        Position angle of the detector's +y (PA_APER), several are averaged; needed for MIRI and
+        NIRCam. That of WFC3/IR is north up.
+    grid_angle : `~astropy.units.Quantity`, optional
+        Position angle of the image's +y.
+    resampling : {"drizzle", None}, optional
+        None for a single exposure. WFC3/IR is always drizzled.
+
+    Returns
+    -------
+    psf : `~photutils.psf.ImagePSF`
+        In the sky frame.
+
+    Raises
+    ------
+    KeyError
+        If there is no model for the filter.
+    ValueError
+        If the position angle is missing.
+    """
+    if filter in WFC3_FILTERS:
+        return rotate_psf(hst_psf(filter, pixel_scale=pixel_scale), grid_angle=grid_angle)
+    return psf_mosaic(
+        _exposure(filter), pixel_scale, pa, grid_angle=grid_angle, resampling=resampling
+    )
+
+
+def _exposure(filter_):
+    """The model of a single exposure, in the detector's axes."""
+    if filter_ in MIRI_FILTERS:
+        return miri_psf(filter_)
+    if filter_ in NIRCAM_FILTERS:
+        return nircam_psf(filter_)
+    raise unknown_name("model PSF for the filter", filter_, MODEL_FILTERS)
+
+
+def checked_psf(
+    psf, filter, *, pixel_scale=None, pa=None, resampling="drizzle", smoothed=False, argument="psf"
+):
+    """
+    Compare a PSF with the model of its filter, and take the light beyond its grid from that.
+
+    Parameters
+    ----------
+    psf : `~photutils.psf.ImagePSF`
+        With the meta of `make_psf`.
+    filter, resampling
+        As for `filter_psf`.
+    pixel_scale, pa : `~astropy.units.Quantity`, optional
+        Pixel of the image that the PSF is for, and position angle of the detector's +y there; the
+        pixel is that of the PSF by default, and without the angle none is compared.
+    smoothed : bool, optional
+        Whether a PSF of any larger width is taken as it is, with a warning: that of an image which
+        was brought to another resolution.
+    argument : str, optional
+        What to call the PSF in messages.
+
+    Returns
+    -------
+    psf : `~photutils.psf.ImagePSF`
+        The same, or with data of another sum: a PSF whose sum is not within 0.05 of what the model
+        has on this grid, or is 1, is taken to hold what the model does.
+
+    Raises
+    ------
+    KeyError
+        If there is no model for the filter.
+    ValueError
+        If the PSF is more than 1.5 times wider or narrower than the model (its pixel is another),
+        or its spikes stand as in the detector's axes although it is said to stand on the sky.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        If the light was scaled by more than 0.01, the width is off by more than 5 % (12 % for
+        NIRCam, whose model lacks charge diffusion), or the image seems to be smoothed.
+    """
+    info = psf_info(psf, argument)
+    scale = info.pixel_scale * ANGLE if pixel_scale is None else pixel_scale
+    angle = info.angle * u.deg
+    form = {"pixel_scale": scale, "grid_angle": angle, "resampling": resampling}
+    if info.frame == "detector":
+        model = _detector_model(filter, scale)
+    else:
+        model = filter_psf(filter, pa=angle if pa is None else pa, **form)
+    x, y, _ = _core.core_moments(info.data)
+    width = _core.half_maximum_width(info.data, x, y) * info.cell
+    ratio = width / model.meta["fwhm"]
+    if smoothed and ratio > _OTHER_WIDTH:
+        msg = (
+            f"'{argument}' is {ratio:.2g} times as wide (FWHM {width:.3g} arcsec) as the model of "
+            f"{filter}, with which it is not compared: was the image brought to this resolution?"
+        )
+        warnings.warn(msg, MiricigaleWarning, stacklevel=2)
+        return psf
+    if not 1 / _OTHER_WIDTH < ratio < _OTHER_WIDTH:
+        wanted = f"a PSF of {filter}, about {model.meta['fwhm']:.3g} arcsec wide (FWHM)"
+        got = f"one of {width:.3g} arcsec with pixels of {info.cell:.4g} arcsec: is that its pixel?"
+        raise argument_error(argument, wanted, got)
+    ny, nx = info.data.shape
+    place = {"pixel_scale": info.cell * ANGLE, "shape": (ny, nx)}
+    place["offset"] = (x - (nx - 1) / 2, y - (ny - 1) / 2)
+    stamp = psf_image(model, **place)
+    if pa is not None and info.frame == "sky" and filter not in WFC3_FILTERS:
+        other = filter_psf(filter, pa=angle, **form)
+        other = psf_image(other, **place)
+        _check_turn(info, (x, y), (stamp, other), (width, filter, pa), argument)
+    if abs(ratio - 1) > (_ODD_NIRCAM if filter in NIRCAM_FILTERS else _ODD_WIDTH):
+        word = "wider" if ratio > 1 else "narrower"
+        msg = (
+            f"'{argument}' is {abs(ratio - 1):.0%} {word} (FWHM {width:.3g} arcsec) than the model of "
+            f"{filter}: does it hold the pixel, the drizzling and no more?"
+        )
+        warnings.warn(msg, MiricigaleWarning, stacklevel=2)
+    return _scaled(psf, info, float(stamp.sum()), filter, argument)
+
+
+def _detector_model(filter_, scale):
+    if filter_ in WFC3_FILTERS:
+        return hst_psf(filter_, pixel_scale=scale)
+    return _exposure(filter_)
+
+
+def _check_turn(info, center, stamps, about, argument):
+    """Refuse a PSF whose spikes stand where those of the detector's axes are."""
+    width, filter_, pa = about
+    y, x = np.indices(info.data.shape)
+    radius = np.hypot(x - center[0], y - center[1])
+    ring = np.rint(radius).astype(int)
+    # spikes are beyond the core, and in distant wings lost in the noise
+    where = (radius * info.cell > width) & (radius * info.cell < min(3.0, 0.95 * info.half_width))
+    if np.count_nonzero(where) < 100:
+        return
+
+    def spikes(image):
+        count = np.maximum(np.bincount(ring[where]), 1)
+        mean = np.bincount(ring[where], image[where]) / count
+        # wings fall steeply: each ring has the same weight
+        return (image[where] - mean[ring[where]]) * radius[where]
+
+    given, turned, plain = (spikes(one) for one in (info.data, *stamps))
+    norm = math.sqrt(given @ given)
+    on_sky, on_detector = (
+        float(given @ one) / (norm * math.sqrt(one @ one) or 1.0) for one in (turned, plain)
+    )
+    _log.info("'%s': spikes follow the model at %.3g (turned), %.3g", argument, on_sky, on_detector)
+    if on_detector > max(_CORRELATED, on_sky + _BETTER):
+        wanted = f"turned to the image, as the model of {filter_} at PA_APER {pa:.4g} is"
+        got = (
+            f"one whose spikes stand as in the detector's axes (correlation {on_detector:.2f}, "
+            f"turned {on_sky:.2f}): state the angle of its +y"
+        )
+        raise argument_error(argument, wanted, got)
+
+
+def _scaled(psf, info, expected, filter_, argument):
+    """The PSF with the fraction of the light that it holds: its own or the model's."""
+    if info.total_known:
+        return psf
+    held = info.enclosed
+    taken = held if held < _UNIT_SUM and abs(held - expected) < _NEAR_SUM else expected
+    width = 2 * info.half_width
+    msg = (
+        f"'{argument}' sums to {held:.4g} and is taken to hold {taken:.3f} of the light on its "
+        f"{width:.3g} arcsec, as the model of {filter_} does ({expected:.3f})"
+    )
+    if abs(taken - held) > 0.01:
+        warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+    else:
+        _log.info(msg)
+    scaled = ImagePSF(
+        info.data * (taken / held), oversampling=info.oversampling, origin=info.origin
+    )
+    scaled.meta.update(psf.meta)
+    scaled.meta.update(normalization="total", enclosed=taken)
+    scaled.meta["eef"] = [value * taken / held for value in psf.meta.get("eef", ())]
+    return scaled

@@ -1,0 +1,294 @@
+"""Mistakes that are easily made with files: each is mended and said, or refused before the work."""
+
+import types
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.table import Table
+
+from miricigale.instrument import north_up_wcs, pixel_area_map
+from miricigale.photometry import read_mosaic
+from miricigale.psf import (
+    MatchingKernel,
+    filter_psf,
+    hst_psf,
+    miri_psf,
+    psf_image,
+    psf_mosaic,
+)
+from miricigale.utils.exceptions import DataError, MiricigaleWarning
+from miricigale.workflow.photometry import measure_files
+
+CENTER, ARCSEC = SkyCoord(34.3, -5.1, unit="deg"), u.arcsec
+COARSE, FINE, PA = 0.11, 0.06, 75.0
+SIZE = {"image": (COARSE, 241), "prior": (FINE, 441)}
+NOISE = {"image": 0.004, "prior": 0.002}
+
+
+def brightness(data, wcs):
+    return data / pixel_area_map(wcs, data.shape) / 1e12
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory):
+    """Sixteen points with the PSFs of F770W at a roll of 75 deg and of F160W."""
+    folder, rng = tmp_path_factory.mktemp("field"), np.random.default_rng(3)
+    steps = (np.arange(4) - 1.5) * 5.0
+    places = np.array(np.meshgrid(steps, steps)).reshape(2, -1) + rng.uniform(-0.7, 0.7, (2, 16))
+    sky, flux = CENTER.spherical_offsets_by(*(places * ARCSEC)), np.geomspace(2, 50, 16)
+    models = {
+        "image": psf_mosaic(miri_psf("miri.f770w"), COARSE * ARCSEC, PA * u.deg),
+        "prior": hst_psf(),
+    }
+    headers = {
+        "image": {"INSTRUME": "MIRI", "FILTER": "F770W", "PA_APER": PA},
+        "prior": {"INSTRUME": "WFC3", "FILTER": "F160W"},
+    }
+    made = types.SimpleNamespace(folder=folder, flux=flux, models=models)
+    for name, model in models.items():
+        scale, n = SIZE[name]
+        wcs, wide = north_up_wcs(CENTER, scale * ARCSEC, (n, n)), 2 * n + 1
+        data = rng.normal(0, NOISE[name], (n, n))
+        for light, x, y in zip(flux, *wcs.world_to_pixel(sky), strict=True):
+            i, j = round(float(x)), round(float(y))
+            stamp = psf_image(model, pixel_scale=scale * ARCSEC, shape=wide, offset=(x - i, y - j))
+            data += light * stamp[n - j : 2 * n - j, n - i : 2 * n - i]
+        header = wcs.to_header()
+        header.update({"BUNIT": "MJy/sr", **headers[name]})
+        error = brightness(np.full((n, n), NOISE[name]), wcs)
+        hdus = [fits.PrimaryHDU(), fits.ImageHDU(brightness(data, wcs), header, name="SCI")]
+        fits.HDUList([*hdus, fits.ImageHDU(error, name="ERR")]).writeto(folder / f"{name}.fits")
+    y, x = np.indices((n, n))
+    labels = np.zeros((n, n), np.int32)
+    for k, (a, b) in enumerate(zip(*wcs.world_to_pixel(sky), strict=True), 1):
+        labels[(x - a) ** 2 + (y - b) ** 2 < 100] = k
+    fits.writeto(folder / "seg.fits", labels, wcs.to_header())
+    made.catalog = Table({"id": np.arange(1, 17), "ra": sky.ra.deg, "dec": sky.dec.deg})
+    made.catalog.write(folder / "cat.fits")
+    made.paths = {
+        "image": folder / "image.fits",
+        "highres": folder / "prior.fits",
+        "segmentation": folder / "seg.fits",
+        "catalog": folder / "cat.fits",
+    }
+    return made
+
+
+def fluxes(field, **options):
+    options = {**field.paths, **options}
+    table = measure_files(options.pop("image"), options.pop("highres"), n_threads=1, **options)
+    return table["miri.f770w"].to_value(u.uJy)
+
+
+def edited(field, tmp_path, name, change):
+    path = tmp_path / f"{name}.fits"
+    with fits.open(field.folder / f"{name}.fits") as hdus:
+        change(hdus)
+        hdus.writeto(path)
+    return path
+
+
+def saved(tmp_path, data, name="psf.fits", **header):
+    hdu = fits.PrimaryHDU(data)
+    hdu.header.update(header)
+    hdu.writeto(tmp_path / name, overwrite=True)
+    return tmp_path / name
+
+
+@pytest.mark.parametrize(("width", "total"), [(17, 1.0), (17, 0.5), (91, 1.0), (91, 40.0)])
+def test_psfs_of_any_sum_hold_what_the_model_does(field, tmp_path, width, total):
+    """The light of a PSF within 1.9 arcsec is 0.85 of all."""
+    data = psf_image(field.models["image"], pixel_scale=COARSE * ARCSEC, shape=width + 2)
+    part = data[1:-1, 1:-1].sum()
+    path = saved(tmp_path, data * total / data.sum())
+    with pytest.warns(MiricigaleWarning, match=f"'psf' sums to 1 and is taken to hold {part:.3f}"):
+        found = fluxes(field, psf=path)
+    np.testing.assert_allclose(np.median(found / field.flux), 1, atol=0.007)
+
+
+def test_psfs_on_cells_of_a_pixel_are_told_by_their_width(field, tmp_path):
+    data = miri_psf("miri.f770w", fov=8 * ARCSEC).data
+    path = saved(tmp_path, data / data.sum())
+    with pytest.raises(
+        ValueError, match=r"'psf' must be a PSF of miri.f770w, about 0\.28.*its pix"
+    ):
+        fluxes(field, psf=path)
+    # the header tells the cell; then the roll is missing
+    path = saved(tmp_path, data / data.sum(), PIXELSCL=0.11092 / 4)
+    with pytest.raises(ValueError, match="one whose spikes stand as in the detector's axes"):
+        fluxes(field, psf=path)
+    with pytest.raises(ValueError, match=r"'psf_scale' must be 0\.02773 arcsec, as the header"):
+        fluxes(field, psf=path, psf_scale=0.11 * ARCSEC)
+    # of a single exposure: not as wide as that of a mosaic
+    with pytest.warns(MiricigaleWarning) as said:
+        fluxes(field, psf=path, psf_angle=PA * u.deg)
+    assert "'psf' is 6% narrower" in str(said[0].message)
+
+
+def test_a_turned_psf_with_its_angle_is_right(field, tmp_path):
+    drizzled = psf_mosaic(
+        miri_psf("miri.f770w"), COARSE * ARCSEC, 0 * u.deg, grid_angle=0 * u.deg, oversampling=4
+    )
+    data = psf_image(drizzled, pixel_scale=COARSE / 3 * ARCSEC, shape=301)
+    path = saved(tmp_path, data, PIXSCALE=COARSE / 3)
+    found = fluxes(field, psf=path, psf_angle=PA * u.deg)
+    np.testing.assert_allclose(np.median(found / field.flux), 1, atol=0.01)
+
+
+def test_kernels_of_other_pixels_filters_or_sums(field, tmp_path):
+    given = {"pixel_scale": FINE * ARCSEC}
+    made = MatchingKernel.from_psfs(field.models["prior"], field.models["image"], **given)
+    path = saved(tmp_path, 0.93 * made.array / made.array.sum(), "kernel.fits")
+    with pytest.warns(MiricigaleWarning, match=r"kernel summed to 0\.9300 and was brought to 1"):
+        found = fluxes(field, kernel=path)
+    # a bare kernel of unit sum leaves out what lies beyond its grid
+    np.testing.assert_allclose(np.median(found / field.flux), made.array.sum(), atol=0.01)
+    with pytest.raises(
+        DataError, match=r"kernel for pixels of 0\.04 arcsec, and those of the prior"
+    ):
+        fluxes(field, kernel=saved(tmp_path, made.array / made.array.sum(), PIXSCALE=0.04))
+    red = filter_psf("miri.f2100w", pixel_scale=COARSE * ARCSEC, pa=PA * u.deg)
+    other = MatchingKernel.from_psfs(field.models["prior"], red, **given)
+    with pytest.raises(ValueError, match=r"'kernel' must be a PSF of miri\.f770w, about"):
+        fluxes(field, kernel=saved(tmp_path, other.array / other.array.sum()))
+    # without the prior's PSF: segments as they are
+    nameless = edited(field, tmp_path, "prior", lambda hdus: hdus["SCI"].header.remove("FILTER"))
+    catalog = field.catalog.copy()
+    catalog.add_row((99, CENTER.ra.deg, CENTER.dec.deg))
+    catalog.write(tmp_path / "more.fits")
+    path = saved(tmp_path, made.array / made.array.sum())
+    with pytest.warns(MiricigaleWarning, match="kernel has no PSFs: sources are their segments"):
+        found = fluxes(field, kernel=path, highres=nameless, catalog=tmp_path / "more.fits",
+                       page=tmp_path / "page.html")  # fmt: skip
+    # the prior's light within 0.6 arcsec, as the model has it
+    held = field.models["prior"]
+    inside = np.interp(0.6, held.meta["eef_radius"], held.meta["eef"])
+    assert np.all((found[:-1] / field.flux > inside - 0.05) & (found[:-1] / field.flux < 0.97))
+    assert np.isnan(found[-1])
+
+
+def test_a_background_is_fitted_or_said(field, tmp_path):
+    def raised(hdus):
+        hdus["SCI"].data += 0.05
+
+    path = edited(field, tmp_path, "image", raised)
+    np.testing.assert_allclose(np.median(fluxes(field, image=path) / field.flux), 1, atol=0.007)
+    with pytest.warns(MiricigaleWarning, match=r"a background of 0\.05\d* MJy / sr between"):
+        fluxes(field, image=path, fit_background=False)
+    prior = edited(field, tmp_path, "prior", lambda hdus: hdus["SCI"].data.__iadd__(0.06))
+    with pytest.warns(MiricigaleWarning, match="'highres' has a sky of 2.* times its noise"):
+        fluxes(field, highres=prior)
+
+
+@pytest.mark.parametrize("name", ["image", "prior"])
+def test_areas_filled_with_zero_have_no_data(field, tmp_path, name):
+    def corner(hdus):
+        n = hdus["SCI"].shape[0]
+        y, x = np.indices(hdus["SCI"].shape)
+        hdus["SCI"].data[x + y < 0.5 * n] = 0
+        # of a single pixel nothing is said
+        hdus["SCI"].data[-1, -1] = 0
+
+    path = edited(field, tmp_path, name, corner)
+    n = SIZE[name][1]
+    zero = np.count_nonzero(np.add(*np.indices((n, n))) < 0.5 * n)
+    with pytest.warns(MiricigaleWarning, match=f"has {zero} pixels in areas that are exactly 0"):
+        image = read_mosaic(path)
+    assert np.count_nonzero(image.mask) == zero
+    with pytest.warns(MiricigaleWarning, match="exactly 0"):
+        found = fluxes(field, **{"image" if name == "image" else "highres": path})
+    good = np.isfinite(found)
+    assert np.count_nonzero(good) >= 13
+    np.testing.assert_allclose((found / field.flux)[good], 1, atol=0.05)
+
+
+def test_labels_of_another_detection_are_not_taken(field, tmp_path):
+    labels, header = fits.getdata(field.folder / "seg.fits", header=True)
+    # ids of the map say nothing of the catalogue's: positions do
+    order = np.append(0, np.random.default_rng(1).permutation(16) + 1)
+    fits.writeto(tmp_path / "stale.fits", order[labels].astype(np.int32), header)
+    found = fluxes(field, segmentation=tmp_path / "stale.fits")
+    np.testing.assert_allclose(np.median(found / field.flux), 1, atol=0.007)
+    # three of sixteen
+    some = np.arange(17)
+    some[[1, 2, 3]] = [2, 3, 1]
+    fits.writeto(tmp_path / "some.fits", some[labels].astype(np.int32), header)
+    with pytest.warns(
+        MiricigaleWarning, match="are those of 3 of 16 sources that stand on another"
+    ):
+        fluxes(field, segmentation=tmp_path / "some.fits")
+    # segments where no source is
+    fits.writeto(tmp_path / "moved.fits", np.roll(labels, 30, axis=1), header)
+    with pytest.warns(MiricigaleWarning) as said:
+        fluxes(field, segmentation=tmp_path / "moved.fits")
+    assert any("on the map have no segment" in str(one.message) for one in said)
+
+
+def test_catalogues_of_other_fields_and_missing_positions(field, tmp_path, monkeypatch):
+    def unread(self):
+        raise AssertionError
+
+    catalog = field.catalog.copy()
+    catalog["ra"][3] = np.nan
+    catalog.write(tmp_path / "gap.fits")
+    found = fluxes(field, catalog=tmp_path / "gap.fits")
+    assert np.flatnonzero(np.isnan(found)).tolist() == [3]
+    monkeypatch.setattr("miricigale.photometry.mosaics.MosaicFile.read", unread)
+    for change, message in (
+        (
+            lambda ra: ra + 1,
+            r"none of the 16 sources of .*far.fits is on .*image.fits \('image'\): the",
+        ),
+        (lambda ra: ra / 15, "is ra in hours"),
+    ):
+        catalog = field.catalog.copy()
+        catalog["ra"] = change(catalog["ra"])
+        catalog.write(tmp_path / "far.fits", overwrite=True)
+        with pytest.raises(ValueError, match=message):
+            fluxes(field, catalog=tmp_path / "far.fits")
+
+
+def test_model_psfs_of_a_nircam_prior(field, tmp_path):
+    """An image of points with NIRCam's model PSF, at the roll of its header."""
+    scale, n = SIZE["prior"]
+    wcs = north_up_wcs(CENTER, scale * ARCSEC, (n, n))
+    model = filter_psf("nircam.f444w", pixel_scale=scale * ARCSEC, pa=40 * u.deg)
+    sky = SkyCoord(field.catalog["ra"], field.catalog["dec"], unit="deg")
+    data = np.random.default_rng(4).normal(0, NOISE["prior"], (n, n))
+    for light, x, y in zip(field.flux, *wcs.world_to_pixel(sky), strict=True):
+        i, j = round(float(x)), round(float(y))
+        stamp = psf_image(model, pixel_scale=scale * ARCSEC, shape=2 * n + 1, offset=(x - i, y - j))
+        data += 2 * light * stamp[n - j : 2 * n - j, n - i : 2 * n - i]
+
+    def named(hdus):
+        hdus["SCI"].data[:] = brightness(data, wcs)
+        hdus["SCI"].header.update(INSTRUME="NIRCAM", FILTER="F444W", PUPIL="CLEAR")
+
+    path = edited(field, tmp_path, "prior", named)
+    with pytest.raises(
+        ValueError, match=r"'highres_pa_aper' must be given, .* \(or 'highres_psf'\)"
+    ):
+        fluxes(field, highres=path)
+    found = fluxes(field, highres=path, highres_pa_aper=40 * u.deg)
+    np.testing.assert_allclose(np.median(found / field.flux), 1, atol=0.007)
+
+
+def test_model_and_residual_are_written_with_their_coordinates(field, tmp_path):
+    paths = {name: tmp_path / "new" / f"{name}.fits" for name in ("model", "residual")}
+    fluxes(field, **paths)
+    image = read_mosaic(field.paths["image"])
+    with pytest.warns(MiricigaleWarning, match="no map of the noise"):
+        model = read_mosaic(paths["model"])
+    residual = read_mosaic(paths["residual"])
+    np.testing.assert_allclose(model.data + residual.data, image.data, rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(residual.uncertainty.array, image.uncertainty.array, rtol=1e-5)
+    assert 0.9 < np.std(residual.data / residual.uncertainty.array) < 1.1
+    for one in (model, residual):
+        assert one.wcs.wcs.compare(image.wcs.wcs, tolerance=1e-9)
+    with pytest.raises(ValueError, match="'model, residual' must be different files"):
+        fluxes(field, model=tmp_path / "a.fits", residual=tmp_path / "a.fits")
+    with pytest.raises(ValueError, match=r"'model' must be a FITS file \(.fits, .fits.gz\)"):
+        fluxes(field, model=tmp_path / "a.png")
