@@ -22,6 +22,9 @@ _COUNTS = (
     (r"(?<=/)\s*s(?:ec(?:onds?)?)?\b", "s"),
 )
 
+#: What counts may be.
+_BASES = (u.electron, u.ct, u.adu, u.DN, u.ph)
+
 
 def parsed_unit(text):
     """
@@ -35,7 +38,7 @@ def parsed_unit(text):
     Returns
     -------
     unit : `~astropy.units.Unit` or None
-        None if it means none.
+        Without pixels, as values are of one; None if it means none.
     """
     plain = text
     for pattern, name in _COUNTS:
@@ -45,7 +48,9 @@ def parsed_unit(text):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", u.UnitsWarning)
             with contextlib.suppress(TypeError, ValueError):
-                return u.Unit(one)
+                unit = u.Unit(one)
+                pixels = dict(zip(unit.bases, unit.powers, strict=True)).get(u.pix, 0)
+                return unit / u.pix**pixels
     return None
 
 
@@ -62,7 +67,7 @@ def calibration(path, text, zero_point, keywords):
     zero_point : float, `~astropy.units.Quantity` or None
         AB magnitude of one count.
     keywords : dict
-        Values of PHOTMJSR, PHOTFLAM and PHOTPLAM, or None.
+        Values of PHOTMJSR, PHOTFLAM, PHOTPLAM and EXPTIME, or None.
 
     Returns
     -------
@@ -79,8 +84,6 @@ def calibration(path, text, zero_point, keywords):
         If a zero point is given for fluxes, or is not finite.
     """
     unit = parsed_unit(text)
-    if unit is not None and u.pix in unit.bases:
-        unit = unit * u.pix
     if unit is not None and not unit.is_equivalent(u.dimensionless_unscaled):
         for target in (SURFACE_BRIGHTNESS, u.MJy):
             if unit.is_equivalent(target):
@@ -101,22 +104,31 @@ def calibration(path, text, zero_point, keywords):
             f"'zero_point'; what it states is {text!r}"
         )
         raise DataError(msg)
-    rates = [base / u.s for base in (u.electron, u.ct, u.adu, u.DN, u.ph)]
-    rate = next((one for one in rates if unit.is_equivalent(one)), None)
+    time, said = 1.0, ""
+    if any(unit.is_equivalent(base) for base in _BASES):
+        time = keywords["EXPTIME"]
+        if not time or not time > 0:
+            msg = (
+                f"{path} has pixels in {unit}, which is no rate, and its header no EXPTIME: counts need "
+                "'zero_point'"
+            )
+            raise DataError(msg)
+        unit, said = unit / u.s, f", EXPTIME {time:g} s"
+    rate = next((base / u.s for base in _BASES if unit.is_equivalent(base / u.s)), None)
     if rate is None:
         msg = (
             f"{path} has pixels in {unit}, and wanted is a surface brightness, a flux in each pixel, "
-            "or a rate of counts; counts need 'zero_point'"
+            "counts or a rate of counts"
         )
         raise DataError(msg)
-    scale = unit.to(rate)
+    scale = unit.to(rate) / time
     found = _header_calibrations(keywords)
     if len(found) != 1:
         what = "has both PHOTMJSR and PHOTFLAM" if found else "has neither PHOTMJSR nor PHOTFLAM"
         msg = f"{path} has pixels in {unit} and its header {what}: 'zero_point' must be given"
         raise DataError(msg)
     name, factor = found[0]
-    return factor * scale, name
+    return factor * scale, name + said
 
 
 def _header_calibrations(keywords):

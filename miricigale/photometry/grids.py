@@ -8,14 +8,16 @@ import warnings
 import astropy.units as u
 import numpy as np
 
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
 from miricigale.utils.files import open_fits, split_extension
+from miricigale.utils.optional import require
 
 __all__ = [
     "check_same_grid",
     "filter_name",
     "find_image",
     "grid_angle",
+    "is_exposure",
     "open_image",
     "read_wcs",
 ]
@@ -101,12 +103,24 @@ def read_wcs(header, hdus):
     header : `~astropy.io.fits.Header`
         Of the image.
     hdus : `~astropy.io.fits.HDUList`
-        The file, for tables of distortion.
+        The file, for tables of distortion and for the extension ASDF of JWST's pipeline.
 
     Returns
     -------
     wcs : `~astropy.wcs.WCS` or None
-        None without any.
+        Those of the header, or None without any. Those of the ASDF extension (a gwcs), as
+        polynomials good to 0.01 pixels, if the header has none, or those of a single exposure
+        without its distortion.
+
+    Raises
+    ------
+    ImportError
+        If the coordinates are in the ASDF extension alone and gwcs is not installed.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        If distortion is in the ASDF extension alone and gwcs is not installed.
     """
     from astropy.wcs import WCS, FITSFixedWarning
 
@@ -114,7 +128,55 @@ def read_wcs(header, hdus):
         # dates and the like that are written in another way
         warnings.simplefilter("ignore", FITSFixedWarning)
         wcs = WCS(header, hdus)
-    return wcs if wcs.has_celestial else None
+    if "ASDF" not in hdus:
+        return wcs if wcs.has_celestial else None
+    if not wcs.has_celestial:
+        return _asdf_wcs(header, hdus)
+    if is_exposure(lambda key: header.get(key, hdus[0].header.get(key))) and wcs.sip is None:
+        try:
+            return _asdf_wcs(header, hdus)
+        except ImportError as err:
+            msg = (
+                f"{hdus.filename()}: the coordinates in the header lack the distortion, which is in "
+                f"the extension ASDF: positions are pixels off. {err}"
+            )
+            warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+    return wcs
+
+
+def is_exposure(get):
+    """
+    Whether a header is that of a single exposure of JWST (``_cal``, ``_rate``), not resampled.
+
+    Parameters
+    ----------
+    get : callable
+        Called with a keyword, returns its value or None.
+
+    Returns
+    -------
+    exposure : bool
+    """
+    return get("S_WCS") == "COMPLETE" and get("S_RESAMP") != "COMPLETE"
+
+
+def _asdf_wcs(header, hdus):
+    """The gwcs of JWST's pipeline as FITS polynomials."""
+    import io
+
+    from astropy.wcs import WCS
+
+    require("gwcs", extra="gwcs")
+    asdf = require("asdf", extra="gwcs")
+    content = np.asarray(hdus["ASDF"].data["ASDF_METADATA"][0]).tobytes()
+    try:
+        with asdf.open(io.BytesIO(content)) as tree:
+            exact = tree["meta"]["wcs"]
+    except (KeyError, ValueError) as err:
+        msg = f"{hdus.filename()} has no coordinates (gwcs) in its extension ASDF: {err}"
+        raise DataError(msg) from err
+    box = tuple((-0.5, header[f"NAXIS{k}"] - 0.5) for k in (1, 2))
+    return WCS(exact.to_fits_sip(bounding_box=box, max_pix_error=0.01))
 
 
 def filter_name(get):

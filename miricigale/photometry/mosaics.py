@@ -9,11 +9,12 @@ import warnings
 import astropy.units as u
 import numpy as np
 
-from miricigale.photometry.calibration import calibration
+from miricigale.photometry.calibration import calibration, parsed_unit
 from miricigale.photometry.grids import (
     check_same_grid,
     filter_name,
     find_image,
+    is_exposure,
     open_image,
     read_wcs,
 )
@@ -78,12 +79,13 @@ class MosaicFile:
         each pixel (``"10 nJy"``), or a rate of counts.
     zero_point : float or `~astropy.units.Quantity`, optional
         AB magnitude of one count (or one count a second, if those are the pixels' values).
-        Without it rates of counts are calibrated by the header's PHOTMJSR or by PHOTFLAM and PHOTPLAM.
+        Without it rates of counts are calibrated by the header's PHOTMJSR or by PHOTFLAM and PHOTPLAM,
+        and counts likewise after division by EXPTIME.
     error, variance, inverse_variance, weight : path-like, optional
         File with a map of the noise, on the pixels of the image; at most one. Errors and variances
-        are in the unit of the image and its square, and are taken as they are, as inverse
-        variances are. The scale of weights is measured on the sky. By default the extensions ERR
-        (an error) or WHT (a weight) of the image's own file.
+        are in the unit of the image and its square, or in that of their own ``BUNIT``, and are taken
+        as they are, as inverse variances are. The scale of weights is measured on the sky. By
+        default the extensions ERR (an error) or WHT (a weight) of the image's own file.
     background_box : int, optional
         If given, a background is measured in boxes of so many pixels and subtracted.
     """
@@ -229,6 +231,8 @@ class MosaicFile:
 
     def _noise_map(self, hdus, header):
         """Kind, values and place of the map of the noise; the kind is None if there is none."""
+        # what the caller says of the image holds for its map
+        stated = "" if self.unit is not None else header.unit
         for kind, names in _NOISE.items():
             path = getattr(self, kind)
             if path is None:
@@ -244,11 +248,12 @@ class MosaicFile:
                 wcs = read_wcs(hdu.header, others)
                 if wcs is not None:
                     check_same_grid(wcs, header.wcs, header.shape, path, self.path)
-                return kind, _native(hdu.data), str(path)
+                return kind, _in_unit(hdu, kind, stated, path), str(path)
         for kind, names in _NOISE.items():
             for name in names:
                 if name in hdus and hdus[name].shape == header.shape:
-                    return kind, _native(hdus[name].data), f"extension {name}"
+                    values = _in_unit(hdus[name], kind, stated, f"{self.path}[{name}]")
+                    return kind, values, f"extension {name}"
         return None, None, None
 
 
@@ -320,9 +325,8 @@ def _header(file, hdus, index):
         filter=name,
         pa_aper=None if angle is None else float(angle) * u.deg,
         unit=unit if file.unit is None else str(file.unit),
-        # what the pipeline has not resampled
-        exposure=get("S_WCS") == "COMPLETE" and get("S_RESAMP") != "COMPLETE",
-        keywords={key: get(key) for key in ("PHOTMJSR", "PHOTFLAM", "PHOTPLAM")},
+        exposure=is_exposure(get),
+        keywords={key: get(key) for key in ("PHOTMJSR", "PHOTFLAM", "PHOTPLAM", "EXPTIME")},
         meta={**meta, **{key: value for key, value in extra.items() if value is not None}},
     )
 
@@ -332,6 +336,31 @@ def _native(data):
     data = np.asarray(data)
     single = data.dtype.kind == "f" and data.dtype.itemsize <= 4
     return np.array(data, dtype=np.float32 if single else np.float64)
+
+
+#: Power of the image's unit that a map of the noise has; the scale of weights is measured.
+_POWERS = {"error": 1, "variance": 2, "inverse_variance": -2}
+
+
+def _in_unit(hdu, kind, unit, path):
+    """A map of the noise in the unit that the image states, as far as both do."""
+    values = _native(hdu.data)
+    text = str(hdu.header.get("BUNIT", "") or "").strip()
+    power = _POWERS.get(kind)
+    have, wanted = parsed_unit(text), parsed_unit(unit)
+    # many squares are said to be in the unit of the image itself
+    if None in (power, have, wanted) or have in (wanted, wanted**power):
+        return values
+    try:
+        factor = have.to(wanted**power)
+    except u.UnitConversionError:
+        msg = (
+            f"{path} (the {kind.replace('_', ' ')}) is in {text!r}, and the image in "
+            f"{unit!r}: give 'unit' if a header is wrong"
+        )
+        raise DataError(msg) from None
+    _log.info("%s: from %s to %s", path, have, wanted**power)
+    return values * values.dtype.type(factor)
 
 
 def _unmarked(hdus, shape):

@@ -23,10 +23,9 @@ _log = logging.getLogger(__name__)
 #: Filters that `filter_psf` knows.
 MODEL_FILTERS = (*MIRI_FILTERS, *NIRCAM_FILTERS, *WFC3_FILTERS)
 
-#: Factor in FWHM beyond which a PSF is not that of the filter, and part from which on it is told.
-_OTHER_WIDTH, _ODD_WIDTH = 1.5, 0.05
-#: The same for NIRCam, whose model has no charge diffusion.
-_ODD_NIRCAM = 0.12
+#: Factor in FWHM beyond which a PSF is not that of the filter; parts from which on a narrower and a
+#: wider one is told (real mosaics are some percent wider than the models).
+_OTHER_WIDTH, _NARROWER, _WIDER = 1.5, 0.05, 0.15
 #: How far a sum may be from the fraction of light that the model's grid holds to be taken for it, and
 #: the sum from which on a PSF counts as normalised on its own grid.
 _NEAR_SUM, _UNIT_SUM = 0.05, 0.995
@@ -119,8 +118,8 @@ def checked_psf(
     Warns
     -----
     `~miricigale.utils.exceptions.MiricigaleWarning`
-        If the light was scaled by more than 0.01, the width is off by more than 5 % (12 % for
-        NIRCam, whose model lacks charge diffusion), or the image seems to be smoothed.
+        If the light was scaled by more than 0.01, the PSF is narrower by more than 5 % or
+        wider by more than 15 %, or the image seems to be smoothed.
     """
     info = psf_info(psf, argument)
     scale = info.pixel_scale * ANGLE if pixel_scale is None else pixel_scale
@@ -152,7 +151,7 @@ def checked_psf(
         other = filter_psf(filter, pa=angle, **form)
         other = psf_image(other, **place)
         _check_turn(info, (x, y), (stamp, other), (width, filter, pa), argument)
-    if abs(ratio - 1) > (_ODD_NIRCAM if filter in NIRCAM_FILTERS else _ODD_WIDTH):
+    if not 1 - _NARROWER < ratio < 1 + _WIDER:
         word = "wider" if ratio > 1 else "narrower"
         msg = (
             f"'{argument}' is {abs(ratio - 1):.0%} {word} (FWHM {width:.3g} arcsec) than the model of "

@@ -69,6 +69,11 @@ UNITS = {
         {},
         10 ** (0.4 * (HST_ZERO - 23.9)),
     ),
+    "HST, in total": (
+        {"BUNIT": "ELECTRONS", "PHOTFLAM": PHOTFLAM, "PHOTPLAM": PHOTPLAM, "EXPTIME": 1200.0},
+        {},
+        1200 * 10 ** (0.4 * (HST_ZERO - 23.9)),
+    ),
     "JWST rate": ({"BUNIT": "DN/s", "PHOTMJSR": 0.25}, {}, 1e-12 / PIXEL_SR / 0.25),
 }
 
@@ -93,6 +98,8 @@ def test_a_source_has_its_flux_in_every_unit(write, name):
         ({}, {}, "must state the unit of its pixels"),
         ({"BUNIT": "furlong x"}, {}, "what it states is 'furlong x'"),
         ({"BUNIT": "ELECTRONS"}, {}, "counts need 'zero_point'"),
+        ({"BUNIT": "COUNTS", "EXPTIME": 0.0}, {}, "no rate, and its header no EXPTIME"),
+        ({"BUNIT": "COUNTS", "EXPTIME": 10.0}, {}, "neither PHOTMJSR nor PHOTFLAM: 'zero_point'"),
         ({"BUNIT": "mJy/beam"}, {}, "wanted is a surface brightness"),
         ({"BUNIT": "counts/s"}, {}, "neither PHOTMJSR nor PHOTFLAM: 'zero_point'"),
         (
@@ -264,3 +271,105 @@ def test_a_real_i2d_file_of_the_jwst_pipeline():
     # the pipeline's nominal area of a pixel, which is constant, and the WCS's
     area = np.median(pixel_area_map(image.wcs, data.shape))
     assert area == pytest.approx(fits.getval(path, "PIXAR_SR", "SCI"), rel=0.005)
+
+
+@pytest.mark.parametrize("kind", ["error", "variance", "inverse_variance"])
+def test_maps_in_another_unit_than_the_image_are_converted(write, kind):
+    rng, power = np.random.default_rng(7), {"error": 1, "variance": 2, "inverse_variance": -2}[kind]
+    path = write(rng.normal(0, 0.1, SHAPE), BUNIT="MJy/sr")
+    unit = "kJy/sr" if power == 1 else f"kJy{power} sr{-power}"
+    map_ = write(np.full(SHAPE, 100.0) ** power, "map.fits", BUNIT=unit)
+    image = read_mosaic(path, **{kind: map_})
+    assert_allclose(image.uncertainty.array, 0.1, rtol=1e-5)
+    # said to be in the unit of the image: the power goes without saying
+    plain = write(np.full(SHAPE, 0.1) ** power, "plain.fits", BUNIT="MJy/sr")
+    assert_allclose(read_mosaic(path, **{kind: plain}).uncertainty.array, 0.1, rtol=1e-5)
+    other = write(np.full(SHAPE, 0.1) ** power, "other.fits", BUNIT="ELECTRONS/S")
+    with pytest.raises(
+        DataError, match=r"other.fits .* is in 'ELECTRONS/S', and the image in 'MJy/"
+    ):
+        read_mosaic(path, **{kind: other})
+    # what the caller states holds for both
+    counts = write(rng.normal(0, 0.1, SHAPE), "counts.fits", BUNIT="ELECTRONS/S")
+    assert read_mosaic(counts, unit="MJy/sr", **{kind: other}).meta["noise_scale"] == pytest.approx(
+        1, rel=0.03
+    )
+
+
+@pytest.mark.parametrize("kind", ["compressed", "integers", "big"])
+def test_stored_forms_give_the_same_image(write, tmp_path, kind):
+    sigma = np.full(SHAPE, 1e-3, np.float32)
+    path = write(micro_jansky() + np.random.default_rng(1).normal(0, 1e-3, SHAPE), BUNIT="uJy",
+                 planes={"ERR": sigma})  # fmt: skip
+    with fits.open(path) as hdus:
+        data, header = hdus["SCI"].data, hdus["SCI"].header
+        if kind == "compressed":
+            stored = fits.CompImageHDU(data, header, name="SCI", quantize_level=100)
+        else:
+            stored = fits.ImageHDU(data.astype(">f8"), header, name="SCI")
+            if kind == "integers":
+                stored.scale("int32", "minmax")
+        fits.HDUList([hdus[0], stored, hdus["ERR"]]).writeto(tmp_path / "other.fits")
+    one, other = read_mosaic(path), read_mosaic(tmp_path / "other.fits")
+    assert other.data.dtype.isnative
+    np.testing.assert_allclose(other.data, one.data, atol=0.05 * one.uncertainty.array.max())
+
+
+@pytest.fixture
+def exposure(write, tools):
+    """A single exposure whose distortion is in the ASDF extension alone, and its true coordinates."""
+    pytest.importorskip("gwcs")
+    asdf = pytest.importorskip("asdf")
+    import io
+
+    import gwcs
+    from astropy.coordinates import ICRS
+    from astropy.modeling import models
+    from gwcs import coordinate_frames
+
+    bend = models.Polynomial2D(2, c1_0=1, c2_0=3e-4), models.Polynomial2D(2, c0_1=1, c0_2=-2e-4)
+    plane = models.Shift(-69.5) & models.Shift(-59.5) | models.Mapping((0, 1, 0, 1))
+    plane = plane | bend[0] & bend[1] | models.Scale(-SCALE / 3600) & models.Scale(SCALE / 3600)
+    center = tools.CENTER
+    turn = models.RotateNative2Celestial(center.ra.deg, center.dec.deg, 180)
+    sky = coordinate_frames.CelestialFrame(reference_frame=ICRS(), unit=(u.deg, u.deg))
+    detector = coordinate_frames.Frame2D(name="detector", unit=(u.pix, u.pix))
+    exact = gwcs.WCS([(detector, plane | models.Pix2Sky_TAN() | turn), (sky, None)])
+    stream = io.BytesIO()
+    asdf.AsdfFile({"meta": {"wcs": exact}}).write_to(stream)
+
+    def made(name, **header):
+        path = write(np.random.default_rng(1).normal(size=SHAPE), name, BUNIT="MJy/sr",
+                     planes={"ERR": np.ones(SHAPE, np.float32)}, **header)  # fmt: skip
+        with fits.open(path, mode="append") as hdus:
+            content = np.frombuffer(stream.getvalue(), np.uint8)[None]
+            column = fits.Column("ASDF_METADATA", f"{content.shape[1]}B", array=content)
+            hdus.append(fits.BinTableHDU.from_columns([column], name="ASDF"))
+        return path
+
+    return made, exact
+
+
+def test_coordinates_of_an_exposure_are_those_of_its_gwcs(exposure, monkeypatch):
+    made, exact = exposure
+    cal = made("cal.fits", S_WCS="COMPLETE")
+    x, y = np.array([[3.0, 70, 130, 10], [5.0, 60, 110, 115]])
+    truth = exact(x, y)
+
+    def distance(path):
+        image = read_mosaic(path)
+        return np.max(np.hypot(*(np.subtract(image.wcs.world_to_pixel_values(*truth), (x, y)))))
+
+    assert distance(cal) < 0.02
+    # a mosaic has those of its header
+    mosaic = made("i2d.fits", S_WCS="COMPLETE", S_RESAMP="COMPLETE")
+    assert 0.5 < distance(mosaic) < 3
+    nothing = made("none.fits", wcs=None)
+    assert distance(nothing) < 0.02
+    monkeypatch.setitem(__import__("sys").modules, "gwcs", None)
+    with pytest.warns(
+        MiricigaleWarning, match=r"lack the distortion.*pip install 'miricigale\[gwcs\]'"
+    ):
+        assert 0.5 < distance(cal) < 3
+    with pytest.raises(ImportError, match=r"'gwcs' is needed for this: pip install"):
+        MosaicFile(nothing).header  # noqa: B018
