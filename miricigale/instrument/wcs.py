@@ -206,7 +206,7 @@ def tangent_offset(pointing, x_offset, y_offset, pa):
     )
 
 
-def pixel_area_map(wcs, shape):
+def pixel_area_map(wcs, shape, dtype=None):
     """
     Solid angle of each pixel.
 
@@ -216,13 +216,15 @@ def pixel_area_map(wcs, shape):
         Two celestial axes, distorted or not.
     shape : tuple of int
         ``(ny, nx)``.
+    dtype : `~numpy.dtype`, optional
+        Type of the map; one of single precision is made with less memory.
 
     Returns
     -------
     area : `~numpy.ndarray`, shape (ny, nx)
         In sr. The Jacobian of the WCS on a coarse grid, joined by bicubic splines.
     """
-    from scipy.interpolate import RectBivariateSpline
+    from scipy.interpolate import RectBivariateSpline, make_interp_spline
 
     ny, nx = shape
     nodes = [np.linspace(0, n - 1, min(max(n, 6), 33)) for n in (ny, nx)]
@@ -236,7 +238,19 @@ def pixel_area_map(wcs, shape):
     along_x = (direction(step, 0) - direction(-step, 0)) / (2 * step)
     along_y = (direction(0, step) - direction(0, -step)) / (2 * step)
     area = np.linalg.norm(np.cross(along_x, along_y, axis=0), axis=0).reshape(x.shape)
-    return RectBivariateSpline(nodes[0], nodes[1], area)(np.arange(ny), np.arange(nx))
+    if dtype is None:
+        return RectBivariateSpline(nodes[0], nodes[1], area)(np.arange(ny), np.arange(nx))
+    # the same splines as products: values at the nodes to those at all pixels, axis by axis
+    down, along = (
+        make_interp_spline(one, np.eye(len(one)))(np.arange(n))
+        for one, n in zip(nodes, shape, strict=True)
+    )
+    # about the mean, so that all digits are those of its changes
+    mean = area.mean()
+    found = (down @ (area / mean - 1)).astype(dtype) @ along.T.astype(dtype)
+    found += 1
+    found *= np.asarray(mean, dtype)
+    return found
 
 
 def north_up_wcs(center, pixel_scale, shape):

@@ -14,7 +14,16 @@ from miricigale.photometry.sky_noise import filled_areas
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
-__all__ = ["ImageArrays", "fine_wcs", "image_arrays", "local_maps", "pixel_scale", "sky_pixels"]
+__all__ = [
+    "FitArrays",
+    "ImageArrays",
+    "fine_wcs",
+    "fit_arrays",
+    "image_arrays",
+    "local_maps",
+    "pixel_scale",
+    "sky_pixels",
+]
 
 #: uJy per MJy.
 _MICRO = 1e12
@@ -46,10 +55,34 @@ class ImageArrays:
     wcs: object
     measured_noise: bool
 
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FitArrays:
+    """
+    An image as templates are fitted to it, in single precision: images can be large.
+
+    Attributes
+    ----------
+    flux : float32 `~numpy.ndarray`, shape (ny, nx)
+        Data in uJy per pixel, zero where not usable.
+    inverse_sigma : float32 `~numpy.ndarray`, shape (ny, nx)
+        Inverse of the noise, zero where not usable.
+    usable, area, wcs, measured_noise
+        As for `ImageArrays`.
+    """
+
+    flux: np.ndarray
+    inverse_sigma: np.ndarray
+    usable: np.ndarray
+    area: np.ndarray
+    wcs: object
+    measured_noise: bool
+
     @property
-    def inverse_sigma(self):
-        """1 / sigma, zero where not usable."""
-        return np.where(self.usable, 1.0 / self.sigma, 0.0)
+    def sigma(self):
+        """The noise, infinite where not usable."""
+        with np.errstate(divide="ignore"):
+            return 1.0 / self.inverse_sigma
 
 
 def image_arrays(image, name):
@@ -82,45 +115,82 @@ def image_arrays(image, name):
     `~miricigale.utils.exceptions.MiricigaleWarning`
         If areas that are exactly 0 are taken as without data.
     """
+    data, noise, usable = _checked(image, name)
+    area = pixel_area_map(image.wcs, usable.shape) * _MICRO
+    return ImageArrays(
+        flux=np.where(usable, np.asarray(data[0], float) * data[1], 0.0) * area,
+        sigma=np.where(usable, np.asarray(noise[0], float) * noise[1] * area, np.inf),
+        usable=usable,
+        area=area,
+        wcs=image.wcs,
+        measured_noise=image.uncertainty is None,
+    )
+
+
+def fit_arrays(image, name):
+    """
+    Take a `~astropy.nddata.CCDData` apart, for a fit of templates.
+
+    Parameters are those of `image_arrays`, and so are the errors.
+
+    Returns
+    -------
+    arrays : `FitArrays`
+    """
+    data, noise, usable = _checked(image, name)
+    area = pixel_area_map(image.wcs, usable.shape, dtype=np.float32)
+    area *= np.float32(_MICRO)
+    flux, inverse = (np.array(one, np.float32, order="C") for one, _ in (data, noise))
+    flux *= np.float32(data[1])
+    inverse *= np.float32(noise[1])
+    for one in (flux, inverse):
+        one *= area
+    with np.errstate(divide="ignore", invalid="ignore"):
+        np.divide(np.float32(1), inverse, out=inverse)
+    flux[~usable] = inverse[~usable] = 0
+    return FitArrays(
+        flux=flux,
+        inverse_sigma=inverse,
+        usable=usable,
+        area=area,
+        wcs=image.wcs,
+        measured_noise=image.uncertainty is None,
+    )
+
+
+def _checked(image, name):
+    """Data and noise, each with its factor to MJy/sr, and which pixels are usable."""
     if not isinstance(image, CCDData):
         msg = f"'{name}' must be a CCDData, got {type(image).__name__}"
         raise TypeError(msg)
-    if image.data.ndim != 2:
-        raise argument_error(name, "a two-dimensional image", f"shape {image.data.shape}")
+    data = np.asarray(image.data)
+    if data.ndim != 2:
+        raise argument_error(name, "a two-dimensional image", f"shape {data.shape}")
     if image.wcs is None or not image.wcs.has_celestial:
         raise argument_error(name, "an image with a celestial WCS", "one without")
-    data = to_array(image.data * image.unit, SURFACE_BRIGHTNESS, name)
-    factor = (1 * image.unit).to_value(SURFACE_BRIGHTNESS)
+    factor = float(to_array(1 * image.unit, SURFACE_BRIGHTNESS, name))
     usable = np.isfinite(data)
     if image.mask is not None:
         usable &= ~np.asarray(image.mask, bool)
     if image.uncertainty is None:
-        noise = mad_std(data[usable]) if usable.any() else 0.0
-        noise = np.full(data.shape, noise)
+        spread = mad_std(np.asarray(data[usable], float)) if usable.any() else 0.0
+        noise = np.broadcast_to(np.float64(spread), data.shape), factor
     else:
-        noise = image.uncertainty.represent_as(StdDevUncertainty)
-        scale = factor if noise.unit is None else (1 * noise.unit).to_value(SURFACE_BRIGHTNESS)
-        noise = np.asarray(noise.array, float) * scale
-    usable &= np.isfinite(noise) & (noise > 0)
+        given = image.uncertainty.represent_as(StdDevUncertainty)
+        scale = factor if given.unit is None else (1 * given.unit).to_value(SURFACE_BRIGHTNESS)
+        noise = np.asarray(given.array), float(scale)
+    usable &= np.isfinite(noise[0]) & (noise[0] > 0)
     filled = filled_areas(data, usable)
     if filled.any():
         msg = (
             f"'{name}' has {np.count_nonzero(filled)} pixels in areas that are exactly 0, though not "
             "masked, beside pixels with noise: they are taken as without data"
         )
-        warnings.warn(msg, MiricigaleWarning, stacklevel=2)
+        warnings.warn(msg, MiricigaleWarning, stacklevel=3)
         usable &= ~filled
     if not usable.any():
         raise argument_error(name, "an image with usable pixels", "none (masked, NaN or no noise)")
-    area = pixel_area_map(image.wcs, data.shape) * _MICRO
-    return ImageArrays(
-        flux=np.where(usable, data, 0.0) * area,
-        sigma=np.where(usable, noise * area, np.inf),
-        usable=usable,
-        area=area,
-        wcs=image.wcs,
-        measured_noise=image.uncertainty is None,
-    )
+    return (data, factor), noise, usable
 
 
 def pixel_scale(wcs):

@@ -9,12 +9,12 @@ import scipy.sparse
 
 from miricigale.photometry import _core
 from miricigale.photometry.templates import batches
-from miricigale.utils.parallel import chunks
+from miricigale.utils.parallel import chunks, parallel_map
 
 __all__ = ["LinearFit", "cross_matrix", "noise_correlation", "normal_matrix", "sandwich_matrix"]
 
 
-def noise_correlation(residual, usable, *, max_lag=8, clip=5.0, significance=3.0):
+def noise_correlation(residual, usable, *, max_lag=8, clip=5.0, significance=3.0, executor=None):
     """
     Measure the covariance of pixels' noise on a whitened residual image.
 
@@ -31,6 +31,8 @@ def noise_correlation(residual, usable, *, max_lag=8, clip=5.0, significance=3.0
         take part.
     significance : float, optional
         Rings of separations in which the mean is less significant than this are cut off.
+    executor : `concurrent.futures.Executor`, optional
+        Threads to work with.
 
     Returns
     -------
@@ -49,12 +51,16 @@ def noise_correlation(residual, usable, *, max_lag=8, clip=5.0, significance=3.0
         msg = f"'usable' must leave at least 100 pixels, got {np.count_nonzero(usable)}"
         raise ValueError(msg)
     values = residual[usable]
-    middle = np.median(values)
-    spread = 1.4826 * np.median(np.abs(values - middle))
+    # some millions of pixels tell the median and the spread well enough
+    some = values[:: max(1, len(values) // _SOME)]
+    middle = np.median(some)
+    spread = 1.4826 * np.median(np.abs(some - middle))
     usable = usable & (np.abs(residual - middle) <= clip * spread)
     lag = min(max_lag, (min(residual.shape) - 1) // 2)
-    level = residual[usable].mean()
-    covariance, error = _core.autocorrelation(residual - level, usable, lag)
+    level = values.dtype.type(residual[usable].mean(dtype=float))
+    covariance, error = _core.autocorrelation(
+        residual - level, usable, lag, functools.partial(parallel_map, executor=executor)
+    )
     if not covariance[lag, lag] > 0:
         return np.zeros((1, 1))
     index = np.arange(-lag, lag + 1)
@@ -75,16 +81,21 @@ def noise_correlation(residual, usable, *, max_lag=8, clip=5.0, significance=3.0
 #: Pairs of stamps that a thread works on at a time.
 _PAIRS = 1024
 
+#: Pixels of which the spread of the noise is taken, where there are more.
+_SOME = 4_000_000
+
 
 def _whitened(bank, block, inverse_sigma):
+    """A block's stamps over the noise, and their sums as `whiten_stamps` makes them."""
     values = np.empty_like(block.values)
+    sums = np.empty((len(block.box), 4))
 
     def scale(part):
         stamps = (block.values, block.box[part], block.start[part])
-        _core.scale_stamps(*stamps, inverse_sigma, values)
+        _core.whiten_stamps(*stamps, inverse_sigma, values, sums[part])
 
     bank.map(scale, block.parts())
-    return values
+    return values, sums
 
 
 def _projected(bank, block, values, images):
@@ -123,11 +134,12 @@ def _walk(bank, inverse_sigma, pairs, out, spread=None):
     Products of all pairs, with at most those blocks in memory that can still overlap.
 
     ``spread`` is what is done to the right-hand one of a pair, given its block and whitened
-    stamps; the walk yields each block, its whitened stamps and those after it.
+    stamps; the walk yields each block, its whitened stamps, those after it, and the stamps' sums.
     """
     live = []
     for block in bank.blocks():
-        white = (_whitened(bank, block, inverse_sigma), block.box, block.start)
+        values, sums = _whitened(bank, block, inverse_sigma)
+        white = (values, block.box, block.start)
         mine = white if spread is None else spread(block, white)
         live = [one for one in live if one[1] > block.box[0, 0]]
         live.append((block, _reach(block, mine), white))
@@ -139,7 +151,7 @@ def _walk(bank, inverse_sigma, pairs, out, spread=None):
             if len(rows):
                 local = pairs[rows] - np.array([other.first, block.first], pairs.dtype)
                 out[rows] = _products(bank, theirs, mine, local)
-        yield block, white, mine
+        yield block, white, mine, sums
 
 
 def _own(block):
@@ -179,17 +191,13 @@ def normal_matrix(bank, inverse_sigma, images=()):
     n = len(bank.order)
     pairs = _core.find_pairs(bank.box)
     products = np.zeros(len(pairs))
-    diagonal, power, light = np.empty(n), np.empty(n), np.empty((n, 2))
-    usable = np.array(inverse_sigma > 0, float)
-    everywhere = np.ones_like(usable)
+    sums = np.empty((n, 4))
     projection = np.empty((n, len(images)))
-    for block, white, _ in _walk(bank, inverse_sigma, pairs, products):
+    for block, white, _, found in _walk(bank, inverse_sigma, pairs, products):
         rows = slice(block.first, block.last)
-        for stamps, out in ((white, diagonal), (block.stamps, power)):
-            out[rows] = _products(bank, stamps, stamps, _own(block))
-        light[rows] = _projected(bank, block, block.values, [everywhere, usable])
+        sums[rows] = found
         projection[rows] = _projected(bank, block, white[0], images)
-    return _gather(n, diagonal, pairs, products), projection, power, light
+    return _gather(n, sums[:, 3], pairs, products), projection, sums[:, 2], sums[:, :2]
 
 
 def sandwich_matrix(bank, inverse_sigma, correlation, images=()):
@@ -218,7 +226,7 @@ def sandwich_matrix(bank, inverse_sigma, correlation, images=()):
     products = np.zeros(len(pairs))
     diagonal, projection = np.empty(n), np.empty((n, len(images)))
     spread = _spread_by(correlation, bank)
-    for block, white, mine in _walk(bank, inverse_sigma, pairs, products, spread):
+    for block, white, mine, _ in _walk(bank, inverse_sigma, pairs, products, spread):
         rows = slice(block.first, block.last)
         diagonal[rows] = _products(bank, white, mine, _own(block))
         projection[rows] = _projected(bank, block, white[0], images)
@@ -275,13 +283,13 @@ def cross_matrix(bank, other, inverse_sigma, correlation=None):
     rows, columns, values = [], [], []
     spread = None if correlation is None else _spread_by(correlation, other)
     for theirs in other.blocks():
-        right = (_whitened(other, theirs, inverse_sigma), theirs.box, theirs.start)
+        right = (_whitened(other, theirs, inverse_sigma)[0], theirs.box, theirs.start)
         if spread is not None:
             right = spread(theirs, right)
         for mine in bank.blocks():
             pairs = _overlaps(mine.box, right[1])
             if len(pairs):
-                left = (_whitened(bank, mine, inverse_sigma), mine.box, mine.start)
+                left = (_whitened(bank, mine, inverse_sigma)[0], mine.box, mine.start)
                 values.append(_products(bank, left, right, pairs))
                 rows.append(pairs[:, 0] + mine.first)
                 columns.append(pairs[:, 1] + theirs.first)

@@ -9,6 +9,7 @@ import numpy as np
 
 from miricigale.photometry.arrays import (
     fine_wcs,
+    fit_arrays,
     image_arrays,
     local_maps,
     pixel_scale,
@@ -253,7 +254,7 @@ class ForcedPhotometer:
             exactly 0 are not masked, or a background that was left in ``image`` or ``highres``
             goes into the fluxes.
         """
-        arrays = image_arrays(image, "image")
+        arrays = fit_arrays(image, "image")
         given = [one is not None for one in (highres, segmentation, catalog)]
         if templates is None:
             sources = dataclasses.replace(catalog_sources(catalog), sky=catalog["sky"])

@@ -232,8 +232,10 @@ def _common(fit, covariance):
 
 def _images(fit, diagnostics, meta):
     arrays = fit.arrays
-    residual = np.where(arrays.usable, diagnostics.residual / arrays.area, np.nan)
-    sigma = np.where(arrays.usable, arrays.sigma, np.nan) / arrays.area
+    residual, sigma = (
+        np.where(arrays.usable, one / arrays.area, np.float32(np.nan))
+        for one in (diagnostics.residual, arrays.sigma)
+    )
     options = {"unit": SURFACE_BRIGHTNESS, "wcs": arrays.wcs}
     return {
         "model_image": CCDData(

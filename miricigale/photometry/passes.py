@@ -22,7 +22,7 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
 
     Parameters
     ----------
-    arrays : `~miricigale.photometry.arrays.ImageArrays`
+    arrays : `~miricigale.photometry.arrays.FitArrays`
         The image.
     bank : `~miricigale.photometry.templates.TemplateBank`
         The templates of the sources on or near it.

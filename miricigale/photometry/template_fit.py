@@ -116,7 +116,7 @@ class TemplateFit:
 
     Parameters
     ----------
-    arrays : `~miricigale.photometry.arrays.ImageArrays`
+    arrays : `~miricigale.photometry.arrays.FitArrays`
         The image.
     bank : `~miricigale.photometry.templates.TemplateBank`
         The templates of the sources on or near it.
@@ -177,7 +177,8 @@ class TemplateFit:
         if order == 0:
             return [area]
         y, x = np.ogrid[: area.shape[0], : area.shape[1]]
-        return [area * term for term in legendre_terms(x, y, area.shape, order)]
+        terms = legendre_terms(x, y, area.shape, order)
+        return [area * np.asarray(term, area.dtype) for term in terms]
 
     def _moved(self, bank, pixels):
         return bank.shifted(pixels, self.arrays.flux.shape, self._radius)
@@ -201,7 +202,7 @@ class TemplateFit:
         self._find_pairs(matrix, rows & ~self.degenerate)
         self.rows = np.flatnonzero(rows & ~self.degenerate & ~self.inseparable)
         matrix = matrix[self.rows][:, self.rows]
-        corner = np.array([[np.sum(a * b) for b in white] for a in white])
+        corner = np.array([[_inner(a, b) for b in white] for a in white])
         self.fit = None
         if len(self.rows):
             g = len(white)
@@ -210,7 +211,7 @@ class TemplateFit:
                 projection[self.rows, 0],
                 projection[self.rows, 1:],
                 corner.reshape(g, g),
-                np.array([np.sum(a * self._data) for a in white]),
+                np.array([_inner(a, self._data) for a in white]),
             )
         self.flux = np.zeros(len(bank.order))
         if self.fit is not None:
@@ -326,15 +327,15 @@ class TemplateFit:
     @property
     def background(self):
         """The fitted background in uJy per pixel, shape (ny, nx); zero without."""
-        level = np.zeros(self.arrays.flux.shape)
+        level = np.zeros(self.arrays.flux.shape, np.float32)
         if self.fit is not None:
             for column, value in zip(self._background, self.common, strict=False):
-                level += value * column
+                level += np.float32(value) * column
         return level
 
     def model(self):
         """The sources' model in uJy per pixel, without background."""
-        image = np.zeros(self.arrays.flux.shape)
+        image = np.zeros(self.arrays.flux.shape, np.float32)
         layers = [(self.bank, self.flux)]
         if self.free is not None:
             flux = np.zeros(len(self.flux))
@@ -348,8 +349,11 @@ class TemplateFit:
 
     def residual(self, model):
         """Image less a model of its sources and less the background, zero where not usable."""
-        arrays = self.arrays
-        return arrays.flux - np.where(arrays.usable, model + self.background, 0.0)
+        found = self.arrays.flux - model
+        if self._background:
+            found -= self.background
+        found[~self.arrays.usable] = 0
+        return found
 
     def correlation(self, residual, model):
         """Measured correlation of the noise, or None where there is too little sky."""
@@ -360,7 +364,7 @@ class TemplateFit:
             free = usable
         if np.count_nonzero(free) < 400:
             return None
-        correlation = noise_correlation(z, free)
+        correlation = noise_correlation(z, free, executor=self.bank.executor)
         return correlation if correlation.any() else None
 
     def covariance(self, correlation=None):
@@ -427,14 +431,14 @@ class TemplateFit:
     def _sandwich(self, correlation):
         keep = self.rows
         white = [column * self.inverse_sigma for column in self.columns]
-        spread = [oaconvolve(w, correlation, mode="same") for w in white]
+        spread = [oaconvolve(w, correlation.astype(w.dtype), mode="same") for w in white]
         middle, border = sandwich_matrix(self.bank, self.inverse_sigma, correlation, spread)
         middle, border = middle[keep][:, keep], border[keep]
         if self.free is not None:
             middle, border = self.free.sandwich(
                 self.bank, keep, self.inverse_sigma, correlation, middle, border, spread
             )
-        corner = np.array([[np.sum(a * b) for b in spread] for a in white])
+        corner = np.array([[_inner(a, b) for b in spread] for a in white])
         return middle, border, corner.reshape(len(white), len(white))
 
     def statistics(self, residual):
@@ -452,6 +456,11 @@ class TemplateFit:
 
             self.bank.map(measure, block.parts())
         return out
+
+
+def _inner(one, other):
+    """Sum of the products of two images, in double precision."""
+    return float(np.einsum("ij,ij->", one, other, dtype=float, casting="same_kind"))
 
 
 def _duplicates(matrix, rows, order):

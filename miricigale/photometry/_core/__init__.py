@@ -23,7 +23,7 @@ from miricigale.photometry._core.stamps import (
     pair_products,
     projections,
     residual_statistics,
-    scale_stamps,
+    whiten_stamps,
 )
 
 __all__ = [
@@ -40,7 +40,7 @@ __all__ = [
     "projections",
     "residual_statistics",
     "sample_stamps",
-    "scale_stamps",
     "shape_models",
     "spline_response",
+    "whiten_stamps",
 ]

@@ -6,7 +6,7 @@ import scipy.fft
 __all__ = ["autocorrelation"]
 
 
-def autocorrelation(residual, usable, lag):
+def autocorrelation(residual, usable, lag, map_parts=map):
     """
     Mean product of pixel pairs by separation, over usable pixels.
 
@@ -18,6 +18,8 @@ def autocorrelation(residual, usable, lag):
         Pixels that count.
     lag : int
         Largest separation in pixels along each axis.
+    map_parts : callable, optional
+        Called as `map`, with a function and its arguments, to work in threads.
 
     Returns
     -------
@@ -28,22 +30,31 @@ def autocorrelation(residual, usable, lag):
     """
     good = np.asarray(usable, bool)
     ny, nx = good.shape
-    size = 1024
+    size = 512
     shape = (
         scipy.fft.next_fast_len(min(ny, size) + 2 * lag, True),
         scipy.fft.next_fast_len(nx + lag, True),
     )
-    sums = np.zeros((2, lag + 1, 2 * lag + 1))
-    for y0 in range(0, ny, size):
+    kind = np.result_type(residual, np.float32)
+    wanted = np.ix_(np.arange(lag + 1), np.arange(-lag, lag + 1))
+
+    def strip(y0):
         # products of the rows of a strip with those up to lag below
         mine = good[y0 : y0 + size]
         more = good[y0 : y0 + size + lag]
-        z = np.where(more, residual[y0 : y0 + size + lag], 0.0)
-        for k, (a, b) in enumerate(((z[: len(mine)], z), (mine, more))):
-            first = scipy.fft.rfft2(np.asarray(a, float), s=shape)
-            second = scipy.fft.rfft2(np.asarray(b, float), s=shape)
-            product = scipy.fft.irfft2(first.conj() * second, s=shape)
-            sums[k] += product[np.ix_(np.arange(lag + 1), np.arange(-lag, lag + 1))]
+        z = np.where(more, residual[y0 : y0 + size + lag], kind.type(0))
+        found = []
+        for a, b in ((z[: len(mine)], z), (mine, more)):
+            first = scipy.fft.rfft2(np.asarray(a, kind), s=shape)
+            second = scipy.fft.rfft2(np.asarray(b, kind), s=shape)
+            np.conj(first, out=first)
+            first *= second
+            found.append(scipy.fft.irfft2(first, s=shape, overwrite_x=True)[wanted])
+        return np.array(found, float)
+
+    sums = np.zeros((2, lag + 1, 2 * lag + 1))
+    for found in map_parts(strip, range(0, ny, size)):
+        sums += found
     # the half plane of negative separations is the mirror of the other
     full = np.concatenate([sums[:, :0:-1, ::-1], sums], axis=1)
     pairs = np.maximum(np.rint(full[1]), 1.0)

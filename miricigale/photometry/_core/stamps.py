@@ -12,7 +12,7 @@ __all__ = [
     "pair_products",
     "projections",
     "residual_statistics",
-    "scale_stamps",
+    "whiten_stamps",
 ]
 
 
@@ -86,33 +86,70 @@ def pair_products(a, a_box, a_start, b, b_box, b_start, pairs, out):
             row_a, row_b = a[na : na + x1 - x0], b[nb : nb + x1 - x0]
             part = 0.0
             for x in range(row_a.size):
-                part += row_a[x] * row_b[x]
+                part += np.float64(row_a[x]) * np.float64(row_b[x])
             total += part
         out[k] = total
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"reassoc"})
 def projections(values, box, start, image, out):
     """Sum each stamp times the image below it: ``out[k] = sum(stamp_k * image)``."""
     for k in range(box.shape[0]):
         n = start[k]
+        nx = box[k, 3]
         total = 0.0
         for y in range(box[k, 0], box[k, 0] + box[k, 2]):
-            for x in range(box[k, 1], box[k, 1] + box[k, 3]):
-                total += values[n] * image[y, x]
-                n += 1
+            row = values[n : n + nx]
+            below = image[y, box[k, 1] : box[k, 1] + nx]
+            part = 0.0
+            for x in range(nx):
+                part += np.float64(row[x]) * np.float64(below[x])
+            total += part
+            n += nx
         out[k] = total
 
 
-@njit(cache=True, nogil=True)
-def scale_stamps(values, box, start, image, out):
-    """Multiply each stamp by the image below it into ``out``."""
+@njit(cache=True, nogil=True, fastmath={"reassoc"})
+def whiten_stamps(values, box, start, inverse_sigma, out, sums):
+    """
+    Multiply each stamp by the inverse noise below it, and sum it up.
+
+    Parameters
+    ----------
+    values, box, start
+        Flat stamps.
+    inverse_sigma : `~numpy.ndarray`, shape (ny, nx)
+        Inverse of the noise.
+    out : `~numpy.ndarray`
+        Filled with the stamps' products with it.
+    sums : float array, shape (n, 4)
+        Filled with the sums of the stamp, of the stamp where the inverse noise is not zero, of its
+        squares, and of the squares of the products.
+    """
     for k in range(box.shape[0]):
         n = start[k]
+        nx = box[k, 3]
+        light = 0.0
+        seen = 0.0
+        power = 0.0
+        white_power = 0.0
         for y in range(box[k, 0], box[k, 0] + box[k, 2]):
-            for x in range(box[k, 1], box[k, 1] + box[k, 3]):
-                out[n] = values[n] * image[y, x]
-                n += 1
+            row = values[n : n + nx]
+            weight = inverse_sigma[y, box[k, 1] : box[k, 1] + nx]
+            white = out[n : n + nx]
+            for x in range(nx):
+                v = row[x]
+                w = v * weight[x]
+                white[x] = w
+                light += v
+                seen += v if weight[x] > 0 else np.float32(0)
+                power += np.float64(v) * np.float64(v)
+                white_power += np.float64(w) * np.float64(w)
+            n += nx
+        sums[k, 0] = light
+        sums[k, 1] = seen
+        sums[k, 2] = power
+        sums[k, 3] = white_power
 
 
 @njit(cache=True, nogil=True)
