@@ -68,7 +68,9 @@ def diagnose(fit, xy):
     # where the measured noise is above that of the uncertainty, it is the measure
     lag = 0 if correlation is None else correlation.shape[0] // 2
     variance = 1.0 if correlation is None else max(1.0, correlation[lag, lag])
-    peaks = residual_peaks(residual, model, fit.inverse_sigma, fit.psf_width, xy)
+    peaks = residual_peaks(
+        residual, model, fit.inverse_sigma, fit.psf_width, xy, executor=fit.bank.executor
+    )
     poor = chi2 > POOR_CHI2 * variance
     return Diagnostics(model, residual, correlation, chi2, left, poor, peaks)
 

@@ -6,6 +6,8 @@ import numpy as np
 import scipy.ndimage
 import scipy.spatial
 
+from miricigale.utils.parallel import chunks, parallel_map
+
 __all__ = ["ResidualPeaks", "residual_peaks", "unexplained_neighbours"]
 
 #: Least signal-to-noise of light that no template explains, its least share of the model below it and
@@ -37,7 +39,7 @@ class ResidualPeaks:
     full_width: float
 
 
-def residual_peaks(residual, model, inverse_sigma, width, xy):
+def residual_peaks(residual, model, inverse_sigma, width, xy, *, executor=None):
     """
     Find positive peaks of the residual that are sources of their own.
 
@@ -51,6 +53,8 @@ def residual_peaks(residual, model, inverse_sigma, width, xy):
         Rms width of a Gaussian like the PSF, in pixels.
     xy : `~numpy.ndarray`, shape (n, 2)
         Positions of all sources; NaN for those far outside.
+    executor : `concurrent.futures.Executor`, optional
+        Threads to work with.
 
     Returns
     -------
@@ -66,39 +70,50 @@ def residual_peaks(residual, model, inverse_sigma, width, xy):
     """
     full_width = 2.0 * np.sqrt(2.0 * np.log(2.0)) * width
     placed = xy[np.isfinite(xy).all(axis=1)]
-    weight = inverse_sigma**2
-    if not weight.any():
+    if not inverse_sigma.any():
         return ResidualPeaks(np.empty((0, 2), int), np.empty((0, 2)), np.empty(0), full_width)
-
-    def smooth(image, sigma):
-        return scipy.ndimage.gaussian_filter(image, sigma, mode="constant")
-
-    # fluxes of point sources by least squares, as if each stood alone
-    power = smooth(weight, width / np.sqrt(2)) / (4 * np.pi * width**2)
-    usable = power > 0.25 * np.median(power[weight > 0])
-    safe = np.where(usable, power, np.inf)
-    light = smooth(residual * weight, width) / safe
-    snr = light * np.sqrt(power)
-    middle = np.median(snr[usable])
+    # fluxes of point sources by least squares, as if each stood alone: signal over power
+    signal, power = _matched(residual, inverse_sigma, width, executor)
+    usable = power > 0.25 * np.median(_some(power, inverse_sigma > 0))
+    snr = np.divide(signal, np.sqrt(power), out=np.zeros_like(signal), where=usable)
+    values = _some(snr, usable)
+    middle = np.median(values)
     # what is a thousandth of the stated noise is that of the arithmetic
-    noise = max(1.4826 * np.median(np.abs(snr[usable] - middle)), 1e-3)
-    taken = smooth(model * weight, width) / safe
-    size = 2 * int(np.ceil(width)) + 1
-    peak = usable & (snr > _LEFT_SNR * noise) & (light > _LEFT_SHARE * taken)
-    peak &= snr == scipy.ndimage.maximum_filter(snr, size, mode="constant")
-    y, x = np.nonzero(peak)
-    order = np.argsort(-light[y, x], kind="stable")
-    pixel = np.stack([x, y], axis=1)[order]
+    noise = max(1.4826 * np.median(np.abs(values - middle)), 1e-3)
+    del values
+    # few pixels are left for what follows, unless the image has a background
+    near = np.arange(-int(np.ceil(width)), int(np.ceil(width)) + 1)
+    around = np.arange(-_radius(width), _radius(width) + 1)
+    hat = np.exp(-0.5 * (around / width) ** 2)
+    found = []
+    y, x = np.nonzero(snr > _LEFT_SNR * noise)
+    for part in chunks(len(y), _CANDIDATES):
+        i, j = y[part], x[part]
+        top = snr[i, j] >= _windows(snr, i, j, near).max(axis=(1, 2))
+        i, j = i[top], j[top]
+        taken = _windows(model, i, j, around) * _windows(inverse_sigma, i, j, around) ** 2
+        taken = np.einsum("kij,i,j->k", taken, hat, hat) / hat.sum() ** 2
+        top = signal[i, j] > _LEFT_SHARE * taken
+        found.append((i[top], j[top]))
+    y, x = (np.concatenate([one[k] for one in found] or [y]) for k in (0, 1))
+
+    def light_at(y, x):
+        return np.where(usable[y, x], signal[y, x] / np.where(usable[y, x], power[y, x], 1.0), 0.0)
+
+    light = light_at(y, x)
+    order = np.argsort(-light, kind="stable")
+    pixel, light = np.stack([x, y], axis=1)[order], light[order]
     distance = np.full(len(pixel), np.inf)
     if len(placed) and len(pixel):
         distance, nearest = scipy.spatial.KDTree(placed).query(pixel)
         # a template that is too narrow leaves as much on the other side of the source
         mirror = np.rint(2 * placed[nearest] - pixel).astype(int)
-        inside = np.all((mirror >= 0) & (mirror < light.shape[::-1]), axis=1)
+        inside = np.all((mirror >= 0) & (mirror < snr.shape[::-1]), axis=1)
         j, i = np.where(inside[:, None], mirror, 0).T
-        even = inside & (light[i, j] > 0.5 * light[tuple(pixel.T[::-1])])
+        even = inside & (light_at(i, j) > 0.5 * light)
         distance[even & (distance < _LEFT_REACH * full_width)] = 0.0
-    pixel = pixel[distance >= _LEFT_DISTANCE * full_width]
+    apart = distance >= _LEFT_DISTANCE * full_width
+    pixel, light = pixel[apart], light[apart]
     lone = np.ones(len(pixel), bool)
     if len(pixel):
         # brightest first: whoever is left takes away those that follow
@@ -107,18 +122,64 @@ def residual_peaks(residual, model, inverse_sigma, width, xy):
         ):
             lone[other] &= ~lone[one]
     kept = pixel[lone]
-    flux = light[kept[:, 1], kept[:, 0]]
-    return ResidualPeaks(kept, kept + _parabola(snr, kept), flux, full_width)
+    return ResidualPeaks(kept, kept + _parabola(snr, kept), light[lone], full_width)
+
+
+#: Rows that are filtered at a time, pixels of which medians are taken, where there are more, and pixels
+#: that are looked at together.
+_ROWS, _SOME, _CANDIDATES = 256, 4_000_000, 100_000
+
+
+def _radius(width):
+    """Half-width of the Gaussian's window, as `scipy.ndimage.gaussian_filter` has it."""
+    return int(4.0 * width + 0.5)
+
+
+def _matched(residual, inverse_sigma, width, executor):
+    """Residual over variance filtered with the Gaussian, and the power of a point source."""
+    signal, power = np.empty_like(inverse_sigma), np.empty_like(inverse_sigma)
+    ny, halo = len(residual), _radius(width)
+
+    def strip(low):
+        rows = slice(max(low - halo, 0), low + _ROWS + halo)
+        inner = slice(low - rows.start, min(low + _ROWS, ny) - rows.start)
+        weight = inverse_sigma[rows] ** 2
+        light = residual[rows] * weight
+        for image, sigma, out in (
+            (light, width, signal),
+            (weight, width / np.sqrt(2), power),
+        ):
+            found = scipy.ndimage.gaussian_filter(image, sigma, mode="constant")
+            out[low : low + _ROWS] = found[inner]
+        power[low : low + _ROWS] /= 4 * np.pi * width**2
+
+    parallel_map(strip, range(0, ny, _ROWS), executor=executor)
+    return signal, power
+
+
+def _some(image, which):
+    """Values of an image at some pixels; of very many, only a part."""
+    step = max(1, image.size // _SOME)
+    return image.reshape(-1)[::step][which.reshape(-1)[::step]]
+
+
+def _windows(image, y, x, around):
+    """Windows about some pixels, zero beyond the image, shape (n, k, k)."""
+    rows, columns = (place[:, None] + around for place in (y, x))
+    inside = [(c >= 0) & (c < n) for c, n in zip((rows, columns), image.shape, strict=True)]
+    found = image[
+        np.clip(rows, 0, image.shape[0] - 1)[:, :, None],
+        np.clip(columns, 0, image.shape[1] - 1)[:, None],
+    ]
+    return np.where(inside[0][:, :, None] & inside[1][:, None], found, 0.0)
 
 
 def _parabola(image, xy):
     """Offsets (x, y) of maxima from their pixels, at most half a pixel."""
-    padded = np.pad(image, 1)
-    x, y = xy.T + 1
+    near = _windows(image, xy[:, 1], xy[:, 0], np.arange(-1, 2))
     offsets = []
-    for dx, dy in ((1, 0), (0, 1)):
-        low, high = padded[y - dy, x - dx], padded[y + dy, x + dx]
-        curvature = 2 * padded[y, x] - low - high
+    for low, high in ((near[:, 1, 0], near[:, 1, 2]), (near[:, 0, 1], near[:, 2, 1])):
+        curvature = 2 * near[:, 1, 1] - low - high
         step = 0.5 * (high - low) / np.where(curvature > 0, curvature, np.inf)
         offsets.append(np.clip(step, -0.5, 0.5))
     return np.stack(offsets, axis=1)
