@@ -14,7 +14,9 @@ from miricigale.utils.parallel import chunks, parallel_map
 __all__ = ["LinearFit", "cross_matrix", "noise_correlation", "normal_matrix", "sandwich_matrix"]
 
 
-def noise_correlation(residual, usable, *, max_lag=8, clip=5.0, significance=3.0, executor=None):
+def noise_correlation(
+    residual, usable, *, weight=None, max_lag=8, clip=5.0, significance=3.0, executor=None
+):
     """
     Measure the covariance of pixels' noise on a whitened residual image.
 
@@ -24,6 +26,8 @@ def noise_correlation(residual, usable, *, max_lag=8, clip=5.0, significance=3.0
         Data minus model, over sigma.
     usable : bool `~numpy.ndarray`, shape (ny, nx)
         Source-free pixels with data.
+    weight : `~numpy.ndarray`, shape (ny, nx), optional
+        1 / sigma, if the residual is not over sigma yet.
     max_lag : int, optional
         Largest separation that is looked at, in pixels.
     clip : float, optional
@@ -50,16 +54,34 @@ def noise_correlation(residual, usable, *, max_lag=8, clip=5.0, significance=3.0
     if np.count_nonzero(usable) < 100:
         msg = f"'usable' must leave at least 100 pixels, got {np.count_nonzero(usable)}"
         raise ValueError(msg)
-    values = residual[usable]
+
+    def rows(part):
+        return residual[part] if weight is None else residual[part] * weight[part]
+
     # some millions of pixels tell the median and the spread well enough
-    some = values[:: max(1, len(values) // _SOME)]
+    every = np.s_[:: max(1, np.count_nonzero(usable) // _SOME)]
+    some, where = (np.ascontiguousarray(one).reshape(-1)[every] for one in (residual, usable))
+    if weight is not None:
+        some = some * np.ascontiguousarray(weight).reshape(-1)[every]
+    some = some[where]
     middle = np.median(some)
     spread = 1.4826 * np.median(np.abs(some - middle))
-    usable = usable & (np.abs(residual - middle) <= clip * spread)
+    kept = np.empty(usable.shape, bool)
+
+    def clipped(part):
+        z = rows(part)
+        kept[part] = usable[part] & (np.abs(z - middle) <= clip * spread)
+        return z[kept[part]].sum(dtype=float)
+
+    parts = list(chunks(len(residual), 256))
+    level = sum(parallel_map(clipped, parts, executor=executor)) / np.count_nonzero(kept)
+    level = residual.dtype.type(level)
     lag = min(max_lag, (min(residual.shape) - 1) // 2)
-    level = values.dtype.type(residual[usable].mean(dtype=float))
     covariance, error = _core.autocorrelation(
-        residual - level, usable, lag, functools.partial(parallel_map, executor=executor)
+        lambda part: rows(part) - level,
+        kept,
+        lag,
+        functools.partial(parallel_map, executor=executor),
     )
     if not covariance[lag, lag] > 0:
         return np.zeros((1, 1))

@@ -232,17 +232,19 @@ def _common(fit, covariance):
 
 def _images(fit, diagnostics, meta):
     arrays = fit.arrays
-    residual, sigma = (
-        np.where(arrays.usable, one / arrays.area, np.float32(np.nan))
-        for one in (diagnostics.residual, arrays.sigma)
-    )
+    # images can be large: what the fit needs no longer becomes the result
+    model, residual, sigma = diagnostics.model, diagnostics.residual, arrays.sigma
+    if fit.background is not None:
+        model += fit.background
+    for image in (model, residual, sigma):
+        image /= arrays.area
+    for image in (residual, sigma):
+        image[~arrays.usable] = np.nan
     options = {"unit": SURFACE_BRIGHTNESS, "wcs": arrays.wcs}
     return {
-        "model_image": CCDData(
-            (diagnostics.model + fit.background) / arrays.area, meta=dict(meta), **options
-        ),
+        "model_image": CCDData(model, meta=dict(meta), **options),
         "residual_image": CCDData(
-            residual, mask=~arrays.usable, uncertainty=StdDevUncertainty(sigma), meta=dict(meta),
-            **options,
+            residual, mask=~arrays.usable, uncertainty=StdDevUncertainty(sigma, copy=False),
+            meta=dict(meta), **options,
         ),
     }  # fmt: skip

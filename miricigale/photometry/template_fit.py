@@ -21,6 +21,7 @@ from miricigale.photometry.free_templates import free_templates
 from miricigale.photometry.shapes import not_fitted
 from miricigale.photometry.template_changes import TemplateChanges
 from miricigale.utils.exceptions import MiricigaleWarning
+from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
 
 __all__ = ["Covariances", "FitSettings", "TemplateFit"]
@@ -164,7 +165,6 @@ class TemplateFit:
         self.scale = pixel_scale(arrays.wcs)
         self.inverse_sigma = arrays.inverse_sigma
         self._radius = settings.radius / self.scale
-        self._data = arrays.flux * self.inverse_sigma
         self._background = self._background_columns() if settings.fit_background else []
         self.shift = self.offset_map = self.free = None
         moved = np.zeros(2) if moved is None else moved
@@ -187,9 +187,8 @@ class TemplateFit:
         """Fit fluxes and common parameters with the templates of a bank."""
         self.bank, self.columns = bank, [*self._background, *gradients]
         white = [column * self.inverse_sigma for column in self.columns]
-        matrix, projection, power, light = normal_matrix(
-            bank, self.inverse_sigma, [self._data, *white]
-        )
+        data = self.arrays.flux * self.inverse_sigma
+        matrix, projection, power, light = normal_matrix(bank, self.inverse_sigma, [data, *white])
         self.light, self._power = light / self._full_light(), power
         diagonal = matrix.diagonal()
         rows = (self.light[:, 1] >= self.settings.min_coverage) & (diagonal > 0)
@@ -211,7 +210,7 @@ class TemplateFit:
                 projection[self.rows, 0],
                 projection[self.rows, 1:],
                 corner.reshape(g, g),
-                np.array([_inner(a, self._data) for a in white]),
+                np.array([_inner(a, data) for a in white]),
             )
         self.flux = np.zeros(len(bank.order))
         if self.fit is not None:
@@ -326,12 +325,11 @@ class TemplateFit:
 
     @property
     def background(self):
-        """The fitted background in uJy per pixel, shape (ny, nx); zero without."""
-        level = np.zeros(self.arrays.flux.shape, np.float32)
-        if self.fit is not None:
-            for column, value in zip(self._background, self.common, strict=False):
-                level += np.float32(value) * column
-        return level
+        """The fitted background in uJy per pixel, shape (ny, nx); None without."""
+        if self.fit is None or not self._background:
+            return None
+        terms = zip(self._background, self.common, strict=False)
+        return sum(np.float32(value) * column for column, value in terms)
 
     def model(self):
         """The sources' model in uJy per pixel, without background."""
@@ -350,21 +348,26 @@ class TemplateFit:
     def residual(self, model):
         """Image less a model of its sources and less the background, zero where not usable."""
         found = self.arrays.flux - model
-        if self._background:
-            found -= self.background
-        found[~self.arrays.usable] = 0
+        background = self.background
+        if background is not None:
+            found -= background
+        found *= self.arrays.usable
         return found
 
     def correlation(self, residual, model):
         """Measured correlation of the noise, or None where there is too little sky."""
-        z = residual * self.inverse_sigma
         usable = self.arrays.usable
-        free = usable & (np.abs(model) * self.inverse_sigma < 0.3)
+        free = np.empty(usable.shape, bool)
+        for part in chunks(len(free), 256):
+            free[part] = np.abs(model[part]) * self.inverse_sigma[part] < 0.3
+        free &= usable
         if np.count_nonzero(free) < max(400, 0.02 * np.count_nonzero(usable)):
             free = usable
         if np.count_nonzero(free) < 400:
             return None
-        correlation = noise_correlation(z, free, executor=self.bank.executor)
+        correlation = noise_correlation(
+            residual, free, weight=self.inverse_sigma, executor=self.bank.executor
+        )
         return correlation if correlation.any() else None
 
     def covariance(self, correlation=None):

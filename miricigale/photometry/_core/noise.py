@@ -6,14 +6,14 @@ import scipy.fft
 __all__ = ["autocorrelation"]
 
 
-def autocorrelation(residual, usable, lag, map_parts=map):
+def autocorrelation(rows, usable, lag, map_parts=map):
     """
     Mean product of pixel pairs by separation, over usable pixels.
 
     Parameters
     ----------
-    residual : `~numpy.ndarray`, shape (ny, nx)
-        Whitened residual (data minus model, over sigma).
+    rows : callable
+        Called with a slice; those rows of the whitened residual (data minus model, over sigma).
     usable : bool array, shape (ny, nx)
         Pixels that count.
     lag : int
@@ -29,31 +29,33 @@ def autocorrelation(residual, usable, lag, map_parts=map):
         Its statistical error, from the number of pairs.
     """
     good = np.asarray(usable, bool)
-    ny, nx = good.shape
     size = 512
-    shape = (
-        scipy.fft.next_fast_len(min(ny, size) + 2 * lag, True),
-        scipy.fft.next_fast_len(nx + lag, True),
-    )
-    kind = np.result_type(residual, np.float32)
     wanted = np.ix_(np.arange(lag + 1), np.arange(-lag, lag + 1))
 
+    def products(image):
+        shape = [
+            scipy.fft.next_fast_len(n + more, True)
+            for n, more in zip(image.shape, (2 * lag, lag), strict=True)
+        ]
+        spectrum = scipy.fft.rfft2(image, s=shape)
+        power = spectrum.real**2
+        power += spectrum.imag**2
+        return scipy.fft.irfft2(power, s=shape, overwrite_x=True)[wanted].astype(float)
+
     def strip(y0):
-        # products of the rows of a strip with those up to lag below
-        mine = good[y0 : y0 + size]
-        more = good[y0 : y0 + size + lag]
-        z = np.where(more, residual[y0 : y0 + size + lag], kind.type(0))
-        found = []
-        for a, b in ((z[: len(mine)], z), (mine, more)):
-            first = scipy.fft.rfft2(np.asarray(a, kind), s=shape)
-            second = scipy.fft.rfft2(np.asarray(b, kind), s=shape)
-            np.conj(first, out=first)
-            first *= second
-            found.append(scipy.fft.irfft2(first, s=shape, overwrite_x=True)[wanted])
-        return np.array(found, float)
+        # products of the rows of a strip with those up to lag below: those of all these rows,
+        # without those among the rows below
+        member = good[y0 : y0 + size + lag]
+        z = rows(slice(y0, y0 + size + lag))
+        kind = np.result_type(z, np.float32)
+        z = np.where(member, z, kind.type(0))
+        found = np.array([products(z), products(member.astype(kind))])
+        if len(member) > size:
+            found -= [products(z[size:]), products(member[size:].astype(kind))]
+        return found
 
     sums = np.zeros((2, lag + 1, 2 * lag + 1))
-    for found in map_parts(strip, range(0, ny, size)):
+    for found in map_parts(strip, range(0, len(good), size)):
         sums += found
     # the half plane of negative separations is the mirror of the other
     full = np.concatenate([sums[:, :0:-1, ::-1], sums], axis=1)
