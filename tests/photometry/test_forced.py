@@ -482,7 +482,7 @@ def test_positions_that_are_not_known_are_flagged(tools, field):
     assert np.flatnonzero(lost).tolist() == np.flatnonzero(np.isnan(result.flux)).tolist() == [3, 7]
     assert not result.crowded[lost].any()
     away = QTable({"sky": tools.CENTER.spherical_offsets_by([1] * u.deg, [0] * u.deg)})
-    with pytest.warns(MiricigaleWarning, match="none of the 1 sources of 'catalog' is on or near"):
+    with pytest.warns(MiricigaleWarning, match="none of the 1 sources is on or near"):
         result = ForcedPhotometer(tools.kernel, template="psf").measure(field.image, catalog=away)
     assert flagged(result, ForcedFlags.NO_DATA).all()
 
