@@ -47,7 +47,7 @@ def diagnose(fit, xy):
     fit : `~miricigale.photometry.template_fit.TemplateFit`
         The fit.
     xy : `~numpy.ndarray`, shape (n, 2)
-        Positions of all known sources on the image, NaN for those far outside.
+        Positions of all known sources by the catalogue, NaN for those far outside.
 
     Returns
     -------
@@ -69,7 +69,12 @@ def diagnose(fit, xy):
     lag = 0 if correlation is None else correlation.shape[0] // 2
     variance = 1.0 if correlation is None else max(1.0, correlation[lag, lag])
     peaks = residual_peaks(
-        residual, model, fit.inverse_sigma, fit.psf_width, xy, executor=fit.bank.executor
+        residual,
+        model,
+        fit.inverse_sigma,
+        fit.psf_width,
+        xy + fit.displacement(xy),
+        executor=fit.bank.executor,
     )
     poor = chi2 > POOR_CHI2 * variance
     return Diagnostics(model, residual, correlation, chi2, left, poor, peaks)

@@ -267,7 +267,9 @@ class ForcedPhotometer:
             sources = templates
         place = self._place(arrays, sources.sky)
         if len(sources.id) and not len(place.near):
-            msg = f"none of the {len(sources.id)} sources is on or near 'image': nothing is measured"
+            msg = (
+                f"none of the {len(sources.id)} sources is on or near 'image': nothing is measured"
+            )
             warnings.warn(msg, MiricigaleWarning, stacklevel=2)
         if templates is None:
             templates = self._templates(highres, segmentation, catalog[place.near])

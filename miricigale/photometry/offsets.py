@@ -34,7 +34,7 @@ class OffsetMap:
     sources : `~astropy.table.QTable`
         The sources it was measured on: ``id``, ``sky``, ``x``, ``y`` (pixels), ``dx``, ``dy`` (arcsec along the
         image's axes), their error ``offset_err``, and ``used``, False for those that are too far off.
-    field : `~miricigale.photometry.fields.SmoothField`
+    field : `~miricigale.photometry.SmoothField`
         (dx, dy) in arcsec.
     wcs : `~astropy.wcs.WCS`
         The image's.
@@ -188,6 +188,7 @@ def fit_offsets(arrays, bank, settings, catalog):
         if np.abs(change).max(initial=0.0) < _DONE:
             break
         moved = moved + change
+        fit.bank.forget()
         fit = TemplateFit(arrays, bank, settings, moved=moved)
     if order < settings.offset_order:
         msg = (

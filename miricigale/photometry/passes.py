@@ -44,61 +44,80 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
         fit = TemplateFit(arrays, bank, settings)
     else:
         fit = fit_offsets(arrays, bank, settings, catalog)
-    # templates that may change hide some of the light of a point in their middle
-    double = np.flatnonzero(_double(fit, catalog))
-    fit.free_templates(catalog.fitted)
-    diagnostics = diagnose(fit, catalog.xy)
+    more = _More(bank, fit, catalog, grid_wcs)
+    by_catalog = catalog.double is not None
+    double = np.flatnonzero(catalog.double[catalog.near]) if by_catalog else np.empty(0, int)
+    choose = settings.components == 2 and not by_catalog
     new_xy = np.empty((0, 2))
+    if choose:
+        # before templates may change, which hides some of the light of a point in their middle
+        double = _poor(fit, catalog, new_xy)
     if settings.second_pass:
-        peaks = diagnostics.peaks.refined
+        fit.free_templates(catalog.fitted)
+        peaks = diagnose(fit, catalog.xy).peaks.refined
         new_xy = peaks - fit.displacement(peaks)
+        if len(new_xy):
+            fit.bank.forget()
+            new_xy = more.refined(double, new_xy)
+            if choose:
+                # what is poorly fitted also with what was lacking beside it
+                double = _poor(more.fit(double[:0], new_xy), catalog, new_xy)
     if len(double) or len(new_xy):
-        fit, new_xy = _refit(fit, bank, double, new_xy, catalog, grid_wcs)
-        diagnostics = diagnose(fit, np.concatenate([catalog.xy, new_xy]))
-    return fit, diagnostics, new_xy
+        fit.bank.forget()
+        fit = more.fit(double, new_xy)
+    if fit.free is None:
+        fit.free_templates(catalog.fitted)
+    return fit, diagnose(fit, np.concatenate([catalog.xy, new_xy])), new_xy
 
 
-def _double(fit, catalog):
-    """Which of the bank's sources get a second component."""
-    if catalog.double is not None:
-        return catalog.double[catalog.near]
-    double = np.zeros(len(catalog.near), bool)
-    if fit.settings.components == 2:
-        double[fit.bank.order] = diagnose(fit, catalog.xy).poor
-    return double
+def _poor(fit, catalog, new_xy):
+    """Which of the catalogue's sources in a bank are poorly fitted."""
+    diagnostics = diagnose(fit, np.concatenate([catalog.xy, new_xy]))
+    source = fit.bank.order[diagnostics.poor]
+    return np.sort(source[source < len(catalog.near)])
 
 
-def _refit(first, bank, double, new_xy, catalog, grid_wcs):
-    """Fit once more with second components and new sources, whose positions are refined."""
-    arrays, settings = first.arrays, first.settings
-    if first.shift is None and first.offset_map is None:
-        # one that was not believed is not searched again
-        settings = dataclasses.replace(settings, max_shift=None, offset_order=None)
-    n, shape = len(catalog.near), arrays.flux.shape
-    host = np.concatenate([np.arange(n), double, n + len(double) + np.arange(len(new_xy))])
-    half = settings.kernel.target.shape[0] // 2 + 1
-    half = half * settings.kernel.pixel_scale.to_value(ANGLE) / first.scale / 2
+class _More:
+    """Fits of a bank's sources with points that are added, templates moved as in a first fit."""
 
-    def fit(**changes):
-        xy = np.concatenate([catalog.xy[catalog.near[double]], new_xy])
-        poly = local_maps(xy, np.full(len(xy), half), arrays.wcs, grid_wcs)
-        both = bank.with_points(xy, poly, shape, settings.radius / first.scale)
-        moved = first.displacement(np.concatenate([catalog.xy[catalog.near], xy]))
-        if first.offset_map is None:
-            moved = moved[0]
-        changed = dataclasses.replace(settings, **changes)
-        return TemplateFit(arrays, both, changed, host=host, moved=moved)
+    def __init__(self, bank, first, catalog, grid_wcs):
+        self._bank, self._catalog, self._grid_wcs = bank, catalog, grid_wcs
+        self._arrays, self._settings, self._scale = first.arrays, first.settings, first.scale
+        self._displacement, self._map = first.displacement, first.offset_map
+        if first.shift is None and first.offset_map is None:
+            # one that was not believed is not searched again
+            self._settings = dataclasses.replace(first.settings, max_shift=None, offset_order=None)
 
-    for _ in range(_REFINED if len(new_xy) else 0):
-        found = fit(max_shift=None)
-        rows = found.rows[found.bank.order[found.rows] >= n + len(double)]
-        model = found.model()
-        step, error, _ = source_offsets(found, found.residual(model), model, rows)
-        limit = found.psf_width
-        good = error < 0.25 * limit
-        step = np.clip(step[good], -limit, limit)
-        new_xy[found.bank.order[rows[good]] - n - len(double)] += step
-    found = fit()
-    found.free_templates(catalog.fitted)
-    found.offset_map = first.offset_map
-    return found, new_xy
+    def fit(self, double, new_xy, **changes):
+        """Fit with second components of some of the sources, and new sources after those."""
+        settings = dataclasses.replace(self._settings, **changes)
+        arrays, near = self._arrays, self._catalog.near
+        n = len(near)
+        host = np.concatenate([np.arange(n), double, n + len(double) + np.arange(len(new_xy))])
+        all_xy = np.concatenate([self._catalog.xy[near], self._catalog.xy[near[double]], new_xy])
+        xy = all_xy[n:]
+        half = settings.kernel.target.shape[0] // 2 + 1
+        half = half * settings.kernel.pixel_scale.to_value(ANGLE) / self._scale / 2
+        poly = local_maps(xy, np.full(len(xy), half), arrays.wcs, self._grid_wcs)
+        bank = self._bank.with_points(xy, poly, arrays.flux.shape, settings.radius / self._scale)
+        moved = self._displacement(all_xy)
+        fit = TemplateFit(
+            arrays, bank, settings, host=host, moved=moved if self._map is not None else moved[0]
+        )
+        fit.offset_map = self._map
+        return fit
+
+    def refined(self, double, new_xy):
+        """Positions of new sources after some fits of where they are."""
+        first_new = len(self._catalog.near) + len(double)
+        new_xy = new_xy.copy()
+        for _ in range(_REFINED if len(new_xy) else 0):
+            fit = self.fit(double, new_xy, max_shift=None)
+            rows = fit.rows[fit.bank.order[fit.rows] >= first_new]
+            model = fit.model()
+            step, error, _ = source_offsets(fit, fit.residual(model), model, rows)
+            good = error < 0.25 * fit.psf_width
+            step = np.clip(step[good], -fit.psf_width, fit.psf_width)
+            new_xy[fit.bank.order[rows[good]] - first_new] += step
+            fit.bank.forget()
+        return new_xy

@@ -104,11 +104,11 @@ class ForcedPhotometryResult:
         the noise was taken as white.
     background, background_err : `~astropy.units.Quantity` or None
         Constant that was fitted, or the mean over the image of a background that varies, MJy/sr.
-    background_field : `~miricigale.photometry.fields.SmoothField` or None
+    background_field : `~miricigale.photometry.SmoothField` or None
         The background in MJy/sr as a function of the pixel, ``background_field(x, y)``.
     shift, shift_err : `~astropy.units.Quantity`, shape (2,), or None
         Shift (x, y) of the image against the catalogue, in arcsec along its axes.
-    offset_map : `~miricigale.photometry.offsets.OffsetMap` or None
+    offset_map : `~miricigale.photometry.OffsetMap` or None
         Such shifts as a smooth function of the position, with the sources they were measured on.
     flux_point, flux_point_err : `~astropy.units.Quantity`, shape (n,), or None
         The part of ``flux`` that is a point on top of the template; NaN for sources of one component,

@@ -167,6 +167,7 @@ class TemplateFit:
         self._radius = settings.radius / self.scale
         self._background = self._background_columns() if settings.fit_background else []
         self.shift = self.offset_map = self.free = None
+        self.bank = bank
         moved = np.zeros(2) if moved is None else moved
         self._solve(self._moved(bank, moved) if np.any(moved) else bank, [])
         if settings.max_shift is not None and settings.offset_order is None and len(self.rows):
@@ -185,6 +186,8 @@ class TemplateFit:
 
     def _solve(self, bank, gradients):
         """Fit fluxes and common parameters with the templates of a bank."""
+        if bank is not self.bank:
+            self.bank.forget()
         self.bank, self.columns = bank, [*self._background, *gradients]
         white = [column * self.inverse_sigma for column in self.columns]
         data = self.arrays.flux * self.inverse_sigma

@@ -327,6 +327,10 @@ class TemplateBank:
         """The cutouts of some rows, None for points."""
         return [self._cutout[k] for k in self.order[rows]]
 
+    def forget(self):
+        """Free the templates that are kept; they are made anew if they are needed again."""
+        self._kept = None
+
     def map(self, function, parts):
         """Call a function with each of some independent pieces of work, on the bank's threads."""
         parallel_map(function, parts, executor=self.executor)
