@@ -7,6 +7,7 @@ import numpy as np
 from miricigale.photometry.arrays import local_maps
 from miricigale.photometry.diagnostics import diagnose
 from miricigale.photometry.offsets import fit_offsets, source_offsets
+from miricigale.photometry.residual_sources import new_sources
 from miricigale.photometry.template_fit import TemplateFit
 from miricigale.utils.units import ANGLE
 
@@ -54,7 +55,11 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
         double = _poor(fit, catalog, new_xy)
     if settings.second_pass:
         fit.free_templates(catalog.fitted)
-        peaks = diagnose(fit, catalog.xy).peaks.refined
+        found = diagnose(fit, catalog.xy).peaks
+        flux = np.full(len(catalog.xy), np.nan)
+        flux[catalog.near[fit.bank.order]] = fit.total
+        new = new_sources(found, catalog.xy + fit.displacement(catalog.xy), flux)
+        peaks = found.refined[new]
         new_xy = peaks - fit.displacement(peaks)
         if len(new_xy):
             fit.bank.forget()

@@ -8,7 +8,7 @@ import scipy.spatial
 
 from miricigale.utils.parallel import chunks, parallel_map
 
-__all__ = ["ResidualPeaks", "residual_peaks", "unexplained_neighbours"]
+__all__ = ["ResidualPeaks", "new_sources", "residual_peaks", "unexplained_neighbours"]
 
 #: Least signal-to-noise of light that no template explains, its least share of the model below it and
 #: of a neighbour's flux, and its distance to sources in full widths at half maximum: the least to any,
@@ -185,6 +185,17 @@ def _parabola(image, xy):
     return np.stack(offsets, axis=1)
 
 
+def _near(peaks, xy):
+    """Pairs of a peak and a source within reach of it, as two arrays of numbers."""
+    placed = np.flatnonzero(np.isfinite(xy).all(axis=1))
+    if not len(placed) or not len(peaks.xy):
+        return np.empty(0, int), np.empty(0, int)
+    tree = scipy.spatial.KDTree(xy[placed])
+    found = tree.query_ball_point(peaks.xy, _LEFT_REACH * peaks.full_width)
+    peak = np.repeat(np.arange(len(found)), [len(rows) for rows in found])
+    return peak, placed[np.concatenate(found).astype(int)]
+
+
 def unexplained_neighbours(peaks, xy, flux):
     """
     Find sources next to light that is not in the catalogue.
@@ -205,11 +216,26 @@ def unexplained_neighbours(peaks, xy, flux):
         than a tenth of the flux.
     """
     found = np.zeros(len(xy), bool)
-    placed = np.flatnonzero(np.isfinite(xy).all(axis=1))
-    if len(placed) and len(peaks.xy):
-        tree = scipy.spatial.KDTree(xy[placed])
-        near = tree.query_ball_point(peaks.xy, _LEFT_REACH * peaks.full_width)
-        for left, rows in zip(peaks.flux, near, strict=True):
-            rows = placed[rows]
-            found[rows] |= left > _LEFT_SHARE * flux[rows]
+    peak, source = _near(peaks, xy)
+    found[source[peaks.flux[peak] > _LEFT_SHARE * flux[source]]] = True
     return found
+
+
+def new_sources(peaks, xy, flux):
+    """
+    Tell which peaks are more than what an imperfect template leaves of a bright source.
+
+    Parameters
+    ----------
+    peaks, xy, flux
+        As for `unexplained_neighbours`.
+
+    Returns
+    -------
+    new : bool `~numpy.ndarray`, shape (len(peaks.xy),)
+        False for peaks with less than a tenth of the flux of a source within two full widths.
+    """
+    new = np.ones(len(peaks.xy), bool)
+    peak, source = _near(peaks, xy)
+    new[peak[peaks.flux[peak] <= _LEFT_SHARE * flux[source]]] = False
+    return new

@@ -305,11 +305,11 @@ class ForcedPhotometryResult:
             ),
         }
         if self.flux_point is not None:
-            point = "flux_point" if name is None else f"{name}_point"
+            point = f"{prefix}flux_point"
             columns[point] = self.flux_point, "Flux of the point on top of the template"
             columns[error_column(point)] = self.flux_point_err, "1-sigma error of the point's flux"
         if self.flux_positive is not None:
-            columns[f"{flux}_positive"] = (
+            columns[f"{prefix}flux_positive"] = (
                 self.flux_positive,
                 "Total flux if no flux may be negative; its error is not known",
             )

@@ -89,4 +89,4 @@ def test_positive_fluxes_stand_beside_the_others(tools):
     expected, _ = scipy.optimize.nnls(np.hstack([np.stack(a, axis=1), ones, -ones]), data.ravel())
     assert_allclose(both.flux_positive.value, expected[:n], atol=1e-3)
     table = both.to_table("miri.f770w")
-    assert_array_equal(table["miri.f770w_positive"], both.flux_positive)
+    assert_array_equal(table["miri.f770w_flux_positive"], both.flux_positive)

@@ -161,8 +161,8 @@ def test_points_on_top_of_galaxies(tools, nuclei):
         assert np.median(np.abs(ratio - 1)) < 0.015
     assert not flagged(two.flags, ForcedFlags.POOR_FIT).any()
     table = two.to_table("miri.f770w")
-    assert_array_equal(table["miri.f770w_point"], two.flux_point)
-    assert_array_equal(table["miri.f770w_point_err"], two.flux_point_err)
+    assert_array_equal(table["miri.f770w_flux_point"], two.flux_point)
+    assert_array_equal(table["miri.f770w_flux_point_err"], two.flux_point_err)
 
 
 def test_the_catalogue_says_who_has_two_components(tools, nuclei):
