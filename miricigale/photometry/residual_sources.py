@@ -73,9 +73,7 @@ def residual_peaks(residual, model, inverse_sigma, width, xy, *, executor=None):
     if not inverse_sigma.any():
         return ResidualPeaks(np.empty((0, 2), int), np.empty((0, 2)), np.empty(0), full_width)
     # fluxes of point sources by least squares, as if each stood alone: signal over power
-    signal, power = _matched(residual, inverse_sigma, width, executor)
-    usable = power > 0.25 * np.median(_some(power, inverse_sigma > 0))
-    snr = np.divide(signal, np.sqrt(power), out=np.zeros_like(signal), where=usable)
+    snr, usable = _matched(residual, inverse_sigma, width, executor)
     values = _some(snr, usable)
     middle = np.median(values)
     # what is a thousandth of the stated noise is that of the arithmetic
@@ -83,22 +81,20 @@ def residual_peaks(residual, model, inverse_sigma, width, xy, *, executor=None):
     del values
     # few pixels are left for what follows, unless the image has a background
     near = np.arange(-int(np.ceil(width)), int(np.ceil(width)) + 1)
-    around = np.arange(-_radius(width), _radius(width) + 1)
-    hat = np.exp(-0.5 * (around / width) ** 2)
     found = []
     y, x = np.nonzero(snr > _LEFT_SNR * noise)
     for part in chunks(len(y), _CANDIDATES):
         i, j = y[part], x[part]
         top = snr[i, j] >= _windows(snr, i, j, near).max(axis=(1, 2))
         i, j = i[top], j[top]
-        taken = _windows(model, i, j, around) * _windows(inverse_sigma, i, j, around) ** 2
-        taken = np.einsum("kij,i,j->k", taken, hat, hat) / hat.sum() ** 2
-        top = signal[i, j] > _LEFT_SHARE * taken
+        taken = _filtered(inverse_sigma, i, j, width, model)
+        top = snr[i, j] * np.sqrt(_power(inverse_sigma, i, j, width)) > _LEFT_SHARE * taken
         found.append((i[top], j[top]))
     y, x = (np.concatenate([one[k] for one in found] or [y]) for k in (0, 1))
 
     def light_at(y, x):
-        return np.where(usable[y, x], signal[y, x] / np.where(usable[y, x], power[y, x], 1.0), 0.0)
+        power = np.where(usable[y, x], _power(inverse_sigma, y, x, width), 1.0)
+        return np.where(usable[y, x], snr[y, x] / np.sqrt(power), 0.0)
 
     light = light_at(y, x)
     order = np.argsort(-light, kind="stable")
@@ -136,25 +132,57 @@ def _radius(width):
 
 
 def _matched(residual, inverse_sigma, width, executor):
-    """Residual over variance filtered with the Gaussian, and the power of a point source."""
-    signal, power = np.empty_like(inverse_sigma), np.empty_like(inverse_sigma)
+    """Signal-to-noise of point sources at all pixels, and where enough of them is seen."""
+    snr, usable = np.zeros_like(residual), np.zeros(residual.shape, bool)
     ny, halo = len(residual), _radius(width)
 
     def strip(low):
         rows = slice(max(low - halo, 0), low + _ROWS + halo)
-        inner = slice(low - rows.start, min(low + _ROWS, ny) - rows.start)
-        weight = inverse_sigma[rows] ** 2
-        light = residual[rows] * weight
-        for image, sigma, out in (
-            (light, width, signal),
-            (weight, width / np.sqrt(2), power),
-        ):
-            found = scipy.ndimage.gaussian_filter(image, sigma, mode="constant")
-            out[low : low + _ROWS] = found[inner]
-        power[low : low + _ROWS] /= 4 * np.pi * width**2
+        return rows, slice(low - rows.start, min(low + _ROWS, ny) - rows.start)
 
-    parallel_map(strip, range(0, ny, _ROWS), executor=executor)
-    return signal, power
+    def smooth(image, sigma, inner):
+        return scipy.ndimage.gaussian_filter(image, sigma, mode="constant")[inner]
+
+    def point_power(low):
+        rows, inner = strip(low)
+        power = smooth(inverse_sigma[rows] ** 2, width / np.sqrt(2), inner)
+        power /= 4 * np.pi * width**2
+        return power
+
+    def seen(low):
+        return point_power(low)[inverse_sigma[low : low + _ROWS] > 0]
+
+    def fill(low):
+        rows, inner = strip(low)
+        place, power = slice(low, low + _ROWS), point_power(low)
+        usable[place] = power > limit
+        light = smooth(residual[rows] * inverse_sigma[rows] ** 2, width, inner)
+        np.divide(light, np.sqrt(power), out=snr[place], where=usable[place])
+
+    # of a large image, strips here and there
+    every = max(1, residual.size // _SOME)
+    power = parallel_map(seen, range(0, ny, _ROWS * every), executor=executor)
+    power = np.concatenate(power)
+    if not len(power):
+        power = np.concatenate(parallel_map(seen, range(0, ny, _ROWS), executor=executor))
+    limit = 0.25 * np.median(power)
+    parallel_map(fill, range(0, ny, _ROWS), executor=executor)
+    return snr, usable
+
+
+def _filtered(inverse_sigma, y, x, width, image=None):
+    """Inverse variance, times an image, filtered with a Gaussian at some pixels."""
+    around = np.arange(-_radius(width), _radius(width) + 1)
+    hat = np.exp(-0.5 * (around / width) ** 2)
+    values = _windows(inverse_sigma, y, x, around) ** 2
+    if image is not None:
+        values = values * _windows(image, y, x, around)
+    return np.einsum("kij,i,j->k", values, hat, hat) / hat.sum() ** 2
+
+
+def _power(inverse_sigma, y, x, width):
+    """Power of a point source at some pixels."""
+    return _filtered(inverse_sigma, y, x, width / np.sqrt(2)) / (4 * np.pi * width**2)
 
 
 def _some(image, which):
