@@ -88,6 +88,7 @@ class Yang2021Photometer:
             template="cutout",
             wings=False,
             correlated_noise=False,
+            size_scatter=None,
             n_threads=n_threads,
         )
 
