@@ -137,7 +137,8 @@ class MosaicFile:
             (deg), ``source`` (the file), ``source_unit``, ``calibration``, ``noise``, ``noise_scale``
             (rms of the source-free pixels in units of the map's errors), ``weight_scale``
             (by which errors of a weight map were multiplied), ``sky_over_noise`` (median over rms
-            of those pixels) and ``n_masked``, as far as they are known.
+            of those pixels), ``n_filled`` (pixels in areas that are exactly 0) and ``n_masked``, as
+            far as they are known.
 
         Raises
         ------
@@ -158,6 +159,7 @@ class MosaicFile:
         from miricigale.instrument import pixel_area_map
 
         header = self.header
+        meta = {**header.meta, "source": str(self.path)}
         with open_image(self.path, "an image") as (hdus, _):
             hdu = hdus[header.index]
             data = _native(hdu.data)
@@ -171,8 +173,7 @@ class MosaicFile:
                 factor = data.dtype.type(factor.to_value(SURFACE_BRIGHTNESS))
             usable = np.isfinite(data) & _unmarked(hdus, header.shape)
             kind, values, source = self._noise_map(hdus, header)
-        meta = dict(header.meta)
-        meta.update(source=str(self.path), source_unit=header.unit, calibration=calibrated)
+        meta.update(source_unit=header.unit, calibration=calibrated)
         sigma = None
         if kind is None:
             zeros = float(np.mean(data[usable] == 0)) if usable.any() else 0.0
@@ -192,6 +193,7 @@ class MosaicFile:
             )
             warnings.warn(msg, MiricigaleWarning, stacklevel=2)
             usable &= ~filled
+            meta["n_filled"] = int(np.count_nonzero(filled))
         if not usable.any():
             msg = f"{self.path} has no usable pixel: all are masked, not finite or without weight"
             raise DataError(msg)

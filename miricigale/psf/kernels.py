@@ -223,7 +223,8 @@ class MatchingKernel:
         Raises
         ------
         ValueError
-            If the kernel is not square and odd, its sum is another, or a PSF does not fit.
+            If the kernel is not square and odd, its sum is another, a PSF does not fit, or the
+            source is the wider one.
 
         Warns
         -----

@@ -11,7 +11,7 @@ from scipy.signal import fftconvolve
 from miricigale.psf import _core
 from miricigale.psf.model import make_psf, psf_info
 from miricigale.psf.resample import average_psf, centered_psf, psf_image, psf_mosaic, rotate_psf
-from miricigale.psf.wiener import odd_square
+from miricigale.psf.wiener import gaussian_gain, odd_square
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.units import ANGLE, to_array
 
@@ -183,4 +183,7 @@ def ready_arrays(array, scale, **psfs):
             images[name] = psf / psf.sum()
     if "source" in images and "target" not in images:
         images["target"] = fftconvolve(images["source"], array, mode="same")
+    elif len(images) == 2:
+        # refuses a pair in the wrong order
+        gaussian_gain(images["source"], images["target"], "source, target")
     return array, images, total

@@ -11,7 +11,15 @@ from scipy.signal import convolve2d
 from miricigale.psf import _core
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 
-__all__ = ["REGULARIZATIONS", "choose", "energy_error", "energy_radii", "odd_square", "wiener"]
+__all__ = [
+    "REGULARIZATIONS",
+    "choose",
+    "energy_error",
+    "energy_radii",
+    "gaussian_gain",
+    "odd_square",
+    "wiener",
+]
 
 _log = logging.getLogger(__name__)
 
@@ -103,9 +111,16 @@ def energy_error(image, target, radii):
     return _core.radial_sums(image - target, c, c, radii)
 
 
-def gaussian_gain(source, target):
+def gaussian_gain(source, target, names="hi, lo"):
     """
     Noise gain of the Gaussian kernel between two Gaussians as wide as the PSFs' cores, at most 1.
+
+    Parameters
+    ----------
+    source, target : `~numpy.ndarray`, shape (n, n)
+        The sharp and the wide PSF.
+    names : str, optional
+        What the caller calls them.
 
     Raises
     ------
@@ -119,7 +134,7 @@ def gaussian_gain(source, target):
     if cores[0] > 1.05 * cores[1] and halves[0] > 1.1 * halves[1]:
         wanted = "the sharp and the wide PSF, in this order"
         got = f"FWHM of {halves[0]:.4g} and {halves[1]:.4g} pixels"
-        raise argument_error("hi, lo", wanted, got)
+        raise argument_error(names, wanted, got)
     return 1 / math.sqrt(max(4 * math.pi * (cores[1] ** 2 - cores[0] ** 2), 1.0))
 
 

@@ -310,6 +310,13 @@ def matching_kernel(image, highres, *, kernel=None, psf=None, highres_psf=None, 
     if made.target is not None:
         # the peaks of two PSFs of the same light
         _check_widths(1 / made.source.max(), made.target.sum() / made.target.max())
+    made.meta["psfs"] = {
+        what: {
+            "from": str(one.meta.get("file", "model")),
+            **{k: one.meta[k] for k in ("fwhm", "enclosed")},
+        }
+        for what, one in psfs.items()
+    }
     _log.info("%r", made)
     return made
 

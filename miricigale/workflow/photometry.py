@@ -187,7 +187,7 @@ def measure_files(
             from miricigale.workflow.photometry_page import photometry_page
 
             pulls = _pulls(result, matching, n_empty, seed, n_threads)
-            photometry_page(result, filter_, mosaic, prior, matching, pulls).write(page)
+            photometry_page(result, filter_, mosaic, prior, matching, pulls, segments).write(page)
         bar.update()
     return table
 

@@ -1,5 +1,7 @@
 """The page of forced photometry: images, magnitudes, flags, errors at empty positions."""
 
+from pathlib import Path
+
 import astropy.units as u
 import numpy as np
 
@@ -7,16 +9,32 @@ from miricigale.evaluation import Report, number
 from miricigale.photometry import ForcedFlags
 from miricigale.photometry.arrays import pixel_scale
 from miricigale.plotting.axes import new_figure
-from miricigale.plotting.images import plot_model_residual
+from miricigale.plotting.images import plot_image, plot_model_residual, plot_segmentation
 from miricigale.utils.units import FNU
 
 __all__ = ["photometry_page"]
 
 #: Largest number of pixels across a drawing of a whole image, and rows of the table.
 _ACROSS, _ROWS = 1500, 40
+#: Signal-to-noise above which a poor fit tells of the PSF.
+_BRIGHT = 20.0
+
+#: What the flags mean, in a line.
+_MEANING = {
+    ForcedFlags.EDGE: "more than a tenth of the light is off the image",
+    ForcedFlags.MASKED: "more than a tenth of the light is on pixels without data",
+    ForcedFlags.NO_DATA: "too little light on usable pixels",
+    ForcedFlags.BLENDED: "neighbours make the error more than twice as large",
+    ForcedFlags.DEGENERATE: "the template is that of another source, which has the light",
+    ForcedFlags.NO_SEGMENT: "no segment at the position",
+    ForcedFlags.NOISY_SEGMENT: "a point source, for the segment is too noisy",
+    ForcedFlags.SHARED_SEGMENT: "a point source, for the segment is another one's",
+    ForcedFlags.POOR_FIT: "residuals above the noise: another shape, another PSF, a neighbour",
+    ForcedFlags.UNEXPLAINED_NEIGHBOUR: "light nearby that no source explains",
+}
 
 
-def photometry_page(result, filter_, image, highres, kernel, pulls=None):
+def photometry_page(result, filter_, image, highres, kernel, pulls=None, segments=None):
     """
     Make the page of one measurement.
 
@@ -32,6 +50,8 @@ def photometry_page(result, filter_, image, highres, kernel, pulls=None):
         Between them.
     pulls : `~numpy.ndarray`, optional
         Flux over error at empty positions.
+    segments : int `~numpy.ndarray`, optional
+        Segments of the prior, whose outlines are drawn.
 
     Returns
     -------
@@ -41,8 +61,8 @@ def photometry_page(result, filter_, image, highres, kernel, pulls=None):
     snr = result.snr
     page = Report(
         f"Forced photometry: {filter_}",
-        subtitle=f"{image.meta['source']} on the prior {highres.meta['source']}",
-        notices=_notices(image, highres, pulls),
+        subtitle=" on the prior ".join(Path(one.meta["source"]).name for one in (image, highres)),
+        notices=_notices(result, image, highres, kernel, pulls),
     )
     page.section("Summary")
     errors = result.flux_err[good & (result.flags == 0)]
@@ -63,12 +83,10 @@ def photometry_page(result, filter_, image, highres, kernel, pulls=None):
         "The residual is drawn from -5 to 5 times its own noise; pixels without data are white.",
     )
     page.figure(_whole(result), "The whole image.")
-    if good.any():
-        page.figure(*_zoom(result))
+    for k, what in _examples(result):
+        page.figure(_zoom(result, highres, segments, k), what)
     page.section("Magnitudes")
     page.figure(_magnitudes(result, filter_), "Measured sources by magnitude, and their errors.")
-    _flag_table(page, result)
-    _source_table(page, result)
     if pulls is not None:
         page.section(
             "Errors at empty positions",
@@ -76,14 +94,34 @@ def photometry_page(result, filter_, image, highres, kernel, pulls=None):
             "should scatter by 1 around 0.",
         )
         page.figure(_pull_figure(pulls), f"{len(pulls)} positions and a Gaussian of width 1.")
+    _flag_table(page, result)
+    _source_table(page, result)
     _input_table(page, image, highres, kernel)
     return page
 
 
-def _notices(image, highres, pulls):
+def _notices(result, image, highres, kernel, pulls):
     lines = []
+    if kernel.target is None:
+        lines.append(
+            "The kernel has no PSFs: sources are their segments as they are, without wings, and those "
+            "without a segment are not measured."
+        )
+    bright = np.nan_to_num(result.snr) > _BRIGHT
+    poor = bright & (result.flags & int(ForcedFlags.POOR_FIT) != 0)
+    n, n_poor = np.count_nonzero(bright), np.count_nonzero(poor)
+    if n >= 5 and n_poor > 0.5 * n:
+        lines.append(
+            f"{n_poor} of the {n} sources above {_BRIGHT:g} sigma leave residuals above the noise: "
+            "the PSFs or the shapes on the prior are not theirs to that precision."
+        )
     for what, one in (("image", image), ("prior", highres)):
         scale = one.meta.get("noise_scale")
+        if one.meta.get("n_filled"):
+            lines.append(
+                f"{one.meta['n_filled']} pixels of the {what} are in areas that are exactly 0: they "
+                "were taken as without data."
+            )
         if one.meta.get("noise") == "none":
             lines.append(f"The {what} has no map of the noise; it was measured on the image.")
         elif scale is not None and not 0.1 < scale < 10:
@@ -132,25 +170,58 @@ def _whole(result):
     return axes[0].figure
 
 
-def _zoom(result, size=12.0):
-    """Image, model and residual about the brightest source without flags."""
-    model = result.model_image.data
-    scale = pixel_scale(result.model_image.wcs)
-    ranked = np.where((result.flags == 0) & np.isfinite(result.snr), result.snr, -np.inf)
-    if not np.isfinite(ranked).any():
-        ranked = np.nan_to_num(result.snr, nan=-np.inf)
-    k = int(np.argmax(ranked))
-    half = max(8, round(size / 2 / scale))
-    x, y = round(float(result.x[k])), round(float(result.y[k]))
-    cut = tuple(
-        slice(max(0, p - half), min(n, p + half + 1))
-        for p, n in zip((y, x), model.shape, strict=True)
+def _examples(result):
+    """Sources to be shown, with captions: the best without flags, and the worst fit."""
+    snr = np.nan_to_num(result.snr, nan=-np.inf)
+    good = np.isfinite(result.snr)
+    clean = good & (result.flags == 0)
+    chosen = []
+    if good.any():
+        k = int(np.argmax(np.where(clean, snr, -np.inf) if clean.any() else snr))
+        what = "the brightest without a flag" if clean.any() else "the brightest"
+        chosen.append((k, what))
+    poor = good & (result.flags & int(ForcedFlags.POOR_FIT) != 0)
+    if poor.any():
+        chosen.append((int(np.argmax(np.where(poor, result.chi2, -np.inf))), "the poorest fit"))
+    return [
+        (
+            k,
+            f"Around source {result.id[k]}, {what}: signal-to-noise {snr[k]:.0f}, chi2 {result.chi2[k]:.1f}.",
+        )
+        for k, what in chosen
+    ]
+
+
+def _zoom(result, highres, segments, k, size=12.0):
+    """Prior, image, model and residual about a source."""
+    model = result.model_image
+    data = result.residual_image.data + model.data
+    x, y = (float(one) for one in highres.wcs.world_to_pixel(result.sky[k]))
+    fine, coarse = (pixel_scale(one.wcs) for one in (highres, model))
+    cut, middle = _cutout(highres.data.shape, x, y, size / fine)
+    _, axes = new_figure(1, 4, size=(2.9, 3.0))
+    sharp = np.asarray(highres.data[cut], float)
+    if highres.mask is not None:
+        sharp = np.where(highres.mask[cut], np.nan, sharp)
+    form = {"ax": axes[0, 0], "pixel_scale": fine, "title": "prior", "center": middle}
+    if sharp.size and segments is not None:
+        plot_segmentation(sharp, segments[cut], **form)
+    elif sharp.size:
+        plot_image(sharp, **form)
+    cut, middle = _cutout(data.shape, float(result.x[k]), float(result.y[k]), size / coarse)
+    plot_model_residual(
+        data[cut], model.data[cut], ax=axes[0, 1:], pixel_scale=coarse, center=middle
     )
-    data = result.residual_image.data + model
-    _, axes = new_figure(1, 3, size=(3.5, 3.0))
-    axes = plot_model_residual(data[cut], model[cut], ax=axes[0], pixel_scale=scale, unit="MJy/sr")
-    what = f"Around source {result.id[k]}, signal-to-noise {result.snr[k]:.0f}."
-    return axes[0].figure, what
+    axes[0, 1].set_ylabel("")
+    return axes[0, 0].figure
+
+
+def _cutout(shape, x, y, size):
+    """Slices of a square of ``size`` pixels about a position, and the position in it."""
+    half = max(8, round(size / 2))
+    low = [min(max(0, round(p) - half), n) for p, n in zip((y, x), shape, strict=True)]
+    high = [min(max(0, round(p) + half + 1), n) for p, n in zip((y, x), shape, strict=True)]
+    return tuple(slice(*pair) for pair in zip(low, high, strict=True)), (x - low[1], y - low[0])
 
 
 def _magnitude(flux):
@@ -203,27 +274,32 @@ def _pull_figure(pulls):
 
 def _flag_table(page, result):
     page.section("Flags", "Nothing is dropped: a source may have several flags, or none.")
-    rows = [("none", "usable", int(np.count_nonzero(result.flags == 0)))]
+    rows = [("none", "", "usable", int(np.count_nonzero(result.flags == 0)))]
     for flag in ForcedFlags:
         count = int(np.count_nonzero(result.flags & int(flag)))
         lost = flag in (ForcedFlags.NO_DATA, ForcedFlags.DEGENERATE)
         name = flag.name.lower().replace("_", " ")
-        rows.append((f"{int(flag)} {name}", "not measured" if lost else "usable", count))
-    rows.append(("crowded", "usable", int(np.count_nonzero(result.crowded))))
-    page.table(rows, header=("flag", "flux", "sources"), text=2)
+        meaning = _MEANING.get(flag, "see ForcedFlags")
+        rows.append((f"{int(flag)} {name}", meaning, "not measured" if lost else "usable", count))
+    crowded = "a neighbour within 2 arcsec brighter than the magnitude + 1 (a column of its own)"
+    rows.append(("crowded", crowded, "usable", int(np.count_nonzero(result.crowded))))
+    page.table(rows, header=("flag", "meaning", "flux", "sources"), text=3)
 
 
 def _source_table(page, result):
     order = np.argsort(np.nan_to_num(-result.flux.value, nan=np.inf), kind="stable")[:_ROWS]
-    page.section("Brightest sources", "All sources are in the table that was written.")
+    text = f"The {len(order)} brightest of {len(result)}; all are in the table that was written. "
+    text += "Residual is what the fit left in the core over what it took there."
+    page.section("Brightest sources", text)
     mag = _magnitude(result.flux)
     none = "no positive flux"
     rows = [
         (
             str(result.id[k]),
             ", ".join(ForcedFlags.names(result.flags[k])).replace("_", " ") or "none",
-            f"{result.sky[k].ra.deg:.6f}",
-            f"{result.sky[k].dec.deg:.6f}",
+            str(result.template[k]),
+            f"{result.sky[k].ra.deg:.5f}",
+            f"{result.sky[k].dec.deg:.5f}",
             number(result.flux[k].value, ".4g", "not measured"),
             number(result.flux_err[k].value, ".2g", "not measured"),
             number(mag[k], ".2f", none),
@@ -233,15 +309,14 @@ def _source_table(page, result):
         )
         for k in order
     ]
-    header = ("id", "flags", "RA", "Dec", "flux (uJy)", "error", "AB", "S/N", "chi2")
-    page.table(
-        rows, header=(*header, "residual / flux"), text=2, empty="The catalogue has no source."
-    )
+    header = ("id", "flags", "template", "RA", "Dec", "flux (uJy)", "error", "AB", "S/N", "chi2")
+    page.table(rows, header=(*header, "residual"), text=3, empty="The catalogue has no source.")
 
 
 def _input_table(page, image, highres, kernel):
     page.section("What was read")
     keys = [
+        ("source", "file"),
         ("filter", "filter"),
         ("source_unit", "unit of the pixels"),
         ("calibration", "calibration"),
@@ -261,6 +336,15 @@ def _input_table(page, image, highres, kernel):
     shapes = (f"{one.data.shape[1]} x {one.data.shape[0]}" for one in (image, highres))
     scales = (f"{pixel_scale(one.wcs):.4f}" for one in (image, highres))
     cells += [("pixels", *shapes), ("pixel (arcsec)", *scales)]
+    psfs = kernel.meta.get("psfs", {})
+    for key, label in (
+        ("from", "PSF"),
+        ("fwhm", "FWHM of the PSF (arcsec)"),
+        ("enclosed", "light on the grid of the PSF"),
+    ):
+        cells.append(
+            (label, *(_text(psfs.get(k, {}).get(key), none) for k in ("psf", "highres_psf")))
+        )
     page.table(cells, header=("", "image", "prior"), text=3)
     origin = kernel.meta.get("file", "made from two PSFs")
     page.text(

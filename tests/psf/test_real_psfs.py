@@ -265,6 +265,10 @@ def test_ready_kernels_are_taken(tmp_path):
         MatchingKernel.from_array(np.roll(array, 1, axis=1), pixel_scale=SCALE)
     with pytest.raises(ValueError, match="'source' must be a PSF of the kernel's shape"):
         MatchingKernel.from_array(array, pixel_scale=SCALE, source=gaussian(51, HI))
+    with pytest.raises(ValueError, match="'source, target' must be the sharp and the wide PSF"):
+        MatchingKernel.from_array(
+            array, pixel_scale=SCALE, source=gaussian(41, LO), target=gaussian(41, HI)
+        )
     path = tmp_path / "kernels.fits"
     fits.writeto(path, np.stack([np.zeros_like(array), array]), fits.Header({"PIXSCALE": 0.04}))
     read = MatchingKernel.read(path, ext=0, plane=1)

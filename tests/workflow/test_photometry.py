@@ -117,7 +117,9 @@ def test_files_become_a_catalogue_that_can_be_fitted_and_a_page(files, tmp_path,
     for text in (f"Forced photometry: {BAND}", "Image, model and residual", "Magnitudes",
                  "pulls at empty positions", "Brightest sources", "10*nanoJansky", "150037"):  # fmt: skip
         assert text in page
-    assert page.count("<img") == 4
+    # the whole, the brightest source without a flag and the poorest fit, magnitudes, pulls
+    assert page.count("<img") == 5
+    assert "the poorest fit: signal-to-noise" in page
 
 
 def test_catalogue_kernel_and_the_plain_form(files, tmp_path):

@@ -1,5 +1,7 @@
 """Mistakes that are easily made with files: each is mended and said, or refused before the work."""
 
+import subprocess
+import sys
 import types
 
 import astropy.units as u
@@ -168,6 +170,9 @@ def test_kernels_of_other_pixels_filters_or_sums(field, tmp_path):
     inside = np.interp(0.6, held.meta["eef_radius"], held.meta["eef"])
     assert np.all((found[:-1] / field.flux > inside - 0.05) & (found[:-1] / field.flux < 0.97))
     assert np.isnan(found[-1])
+    page = (tmp_path / "page.html").read_text()
+    assert "The kernel has no PSFs: sources are their segments as they are" in page
+    assert "no segment at the position" in page
 
 
 def test_a_background_is_fitted_or_said(field, tmp_path):
@@ -272,7 +277,8 @@ def test_model_psfs_of_a_nircam_prior(field, tmp_path):
         ValueError, match=r"'highres_pa_aper' must be given, .* \(or 'highres_psf'\)"
     ):
         fluxes(field, highres=path)
-    found = fluxes(field, highres=path, highres_pa_aper=40 * u.deg)
+    found = fluxes(field, highres=path, highres_pa_aper=40 * u.deg, page=tmp_path / "page.html")
+    assert "FWHM of the PSF (arcsec)" in (tmp_path / "page.html").read_text()
     np.testing.assert_allclose(np.median(found / field.flux), 1, atol=0.007)
 
 
@@ -292,3 +298,20 @@ def test_model_and_residual_are_written_with_their_coordinates(field, tmp_path):
         fluxes(field, model=tmp_path / "a.fits", residual=tmp_path / "a.fits")
     with pytest.raises(ValueError, match=r"'model' must be a FITS file \(.fits, .fits.gz\)"):
         fluxes(field, model=tmp_path / "a.png")
+
+
+def test_poor_fits_of_the_bright_stand_on_the_page_and_warnings_are_shown_once(field, tmp_path):
+    """The PSF of another band, said to be that of a smoothed image."""
+    wide = psf_image(
+        filter_psf("miri.f1500w", pixel_scale=COARSE * ARCSEC, pa=PA * u.deg),
+        pixel_scale=COARSE * ARCSEC, shape=91,
+    )  # fmt: skip
+    command = [sys.executable, "-m", "miricigale", "photometry", "--no-progress", "--threads", "1"]
+    for name, path in field.paths.items():
+        command += [f"--{name}", path]
+    command += ["--psf", saved(tmp_path, wide / wide.sum()), "--psf-scale", str(COARSE)]
+    command += ["-o", tmp_path / "out.ecsv", "--residual", tmp_path / "residual.fits"]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=True)
+    assert done.stderr.count("was the image brought to this resolution?") == 1
+    assert "leave residuals above the noise" in (tmp_path / "out.html").read_text()
+    assert (tmp_path / "residual.fits").is_file()
