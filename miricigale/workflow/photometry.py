@@ -240,7 +240,11 @@ def _check_images(image, highres, filter_):
         wanted = f"a filter that 'miricigale filters' lists, for {image.path}"
         raise argument_error("filter", wanted, repr(found))
     for one in (image, highres):
-        grid_angle(one.header.wcs, one.header.shape)
+        try:
+            grid_angle(one.header.wcs, one.header.shape)
+        except ValueError as err:
+            msg = f"{one.path}: {err}"
+            raise ValueError(msg) from err
     if not (_overlap(image.header, highres.header) or _overlap(highres.header, image.header)):
         where = [_middle(one.header).to_string("decimal", precision=4) for one in (image, highres)]
         msg = (

@@ -225,6 +225,7 @@ def test_model_psfs_are_turned_to_the_angle_of_the_aperture(tmp_path):
           "psf-scale": 0.06, "highres-psf-scale": 0.11, "segmentation": None}, "must be wider than that of"),
         ({"highres": "far", "highres-error": None}, "show different fields: the middle of"),
         ({"highres": "plain", "highres-error": None}, "no celestial coordinates"),
+        ({"highres": "mirrored", "highres-error": None}, "mirrored.fits: 'wcs' must be of an image of"),
         ({"segmentation": "moved"}, "is not on the pixels of"),
         ({"segmentation": "absent.fits"}, "no file absent.fits ('segmentation')"),
         ({"psf": None, "filter": "miri.f770w"}, "'pa_aper' must be given, for the header of"),
@@ -248,7 +249,7 @@ def test_what_does_not_fit_is_refused_before_the_work(
     Path("there.ecsv").write_text("")
     data, header = fits.getdata(files.paths["highres"], header=True)
     made = {**files.paths, "cube": files.paths["highres-psf"].partition("[")[0]}
-    for name in ("f770w", "f444w", "far", "plain", "moved"):
+    for name in ("f770w", "f444w", "far", "plain", "moved", "mirrored"):
         own = header.copy()
         if name == "f770w":
             own["FILTER"], own["INSTRUME"] = "F770W", "MIRI"
@@ -258,6 +259,8 @@ def test_what_does_not_fit_is_refused_before_the_work(
             own["CRVAL1"] += 1
         elif name == "moved":
             own["CRPIX1"] += 2
+        elif name == "mirrored":
+            own["CDELT1"] *= -1
         else:
             del own["CTYPE*"]
         whole = name == "moved"
