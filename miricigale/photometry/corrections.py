@@ -5,7 +5,8 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.photometry.aperture import _circle_sums
-from miricigale.photometry.arrays import image_arrays, pixel_scale
+from miricigale.photometry.arrays import image_arrays
+from miricigale.photometry.arrays import pixel_scale as image_scale
 from miricigale.psf import encircled_energy, radius_of_encircled_energy
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, FNU, to_array
@@ -46,7 +47,7 @@ def encircled_flux(image, sky, flux, radii):
     if len(true) == 0 or not np.all(true > 0):
         raise argument_error("flux", "positive fluxes", "none" if len(true) == 0 else true.min())
     radius = np.atleast_1d(to_array(radii, ANGLE, "radii"))
-    scale = pixel_scale(image.wcs)
+    scale = image_scale(image.wcs)
     xy = np.stack(arrays.wcs.world_to_pixel(sky), axis=-1).reshape(-1, 2)
     values = np.empty((len(radius), len(true)))
     for k, r in enumerate(radius):
@@ -93,14 +94,14 @@ def flux_scaling(image, sky, flux, psf, *, fraction=0.8):
     radius = radius_of_encircled_energy(psf, fraction)
     table = encircled_flux(image, sky, flux, u.Quantity([radius]))
     n = int(np.isfinite(table["values"][0]).sum())
-    expected = encircled_energy(psf, radius, pixel_scale=pixel_scale(image.wcs) * ANGLE)
+    expected = encircled_energy(psf, radius, pixel_scale=image_scale(image.wcs) * ANGLE)
     factor = expected / float(table["median"][0])
     # the error of a median is 1.2533 times that of a mean
     error = factor * 1.2533 * float(table["scatter"][0] / table["median"][0]) / np.sqrt(n)
     return factor, error
 
 
-def aperture_correction(psf, radius):
+def aperture_correction(psf, radius, *, pixel_scale=None):
     """
     The factor from light in a circle to total light, for a point source.
 
@@ -110,13 +111,16 @@ def aperture_correction(psf, radius):
         PSF of the image.
     radius : `~astropy.units.Quantity`
         Of the circle.
+    pixel_scale : `~astropy.units.Quantity`, optional
+        If given, the light is a sum over an image of such pixels (see
+        `~miricigale.psf.encircled_energy`).
 
     Returns
     -------
     factor : float or `~numpy.ndarray`
         1 / (encircled energy).
     """
-    energy = np.asarray(encircled_energy(psf, radius), float)
+    energy = np.asarray(encircled_energy(psf, radius, pixel_scale=pixel_scale), float)
     if np.any(energy <= 0):
         raise argument_error("radius", "positive", radius)
     factor = 1.0 / energy

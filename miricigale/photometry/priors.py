@@ -11,7 +11,7 @@ from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_e
 from miricigale.utils.files import open_fits, unpacked_size
 from miricigale.utils.tables import unique_ids
 
-__all__ = ["check_labels", "read_catalog", "read_prior"]
+__all__ = ["check_labels", "labels_at", "read_catalog", "read_prior"]
 
 _log = logging.getLogger(__name__)
 
@@ -236,6 +236,32 @@ def _degrees(column, name, path):
         raise DataError(msg) from err
 
 
+def labels_at(segments, xy):
+    """
+    The segments at positions.
+
+    Parameters
+    ----------
+    segments : int `~numpy.ndarray`, shape (ny, nx)
+        Labels, 0 for none.
+    xy : `~numpy.ndarray`, shape (n, 2)
+        Pixels; NaN if not known.
+
+    Returns
+    -------
+    label : int `~numpy.ndarray`, shape (n,)
+        0 for none.
+    inside : bool `~numpy.ndarray`, shape (n,)
+        Whether a position is on the map.
+    """
+    ny, nx = segments.shape
+    column, row = np.rint(np.where(np.isfinite(xy), xy, -1.0)).T
+    inside = (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
+    label = np.zeros(len(xy), np.int64)
+    label[inside] = segments[row[inside].astype(int), column[inside].astype(int)]
+    return label, inside
+
+
 def check_labels(labels, here, what):
     """
     Refuse labels that are those of another segmentation map.
@@ -270,16 +296,12 @@ def check_labels(labels, here, what):
 
 def _labels(sources, segments, ids, wcs, catalog, segmentation):
     """The segment of each source: by id if that is what the ids are, by position otherwise."""
-    ny, nx = segments.shape
     sky = sources["sky"]
     known = np.isfinite(sky.ra.deg) & np.isfinite(sky.dec.deg)
-    x, y = np.full((2, len(sources)), -1.0)
+    xy = np.full((len(sources), 2), np.nan)
     if known.any():
-        x[known], y[known] = wcs.world_to_pixel(sky[known])
-    column, row = (np.rint(np.nan_to_num(v, nan=-1.0)) for v in (x, y))
-    inside = known & (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
-    here = np.zeros(len(sources), np.int64)
-    here[inside] = segments[row[inside].astype(int), column[inside].astype(int)]
+        xy[known] = np.stack(wcs.world_to_pixel(sky[known]), axis=-1)
+    here, inside = labels_at(segments, xy)
     own = np.zeros(len(sources), np.int64)
     if np.asarray(sources["id"]).dtype.kind in "iu":
         place = np.clip(np.searchsorted(ids, sources["id"]), 0, len(ids) - 1)

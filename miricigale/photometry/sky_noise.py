@@ -132,6 +132,11 @@ def _median_rms(values):
     return level, 1.4826 * float(np.median(np.abs(values - level)))
 
 
+def _median(values):
+    """Median of a million of the values, or of all."""
+    return np.median(values[:: max(1, len(values) // 1_000_000)])
+
+
 def warn_of_background(result, kernel):
     """
     Say that an image had a background that was not fitted and is in the fluxes.
@@ -156,13 +161,13 @@ def warn_of_background(result, kernel):
     error = result.flux_err[np.isfinite(result.flux_err)]
     if np.count_nonzero(free) < 400 or not len(error):
         return
-    level = float(np.median(residual.data[free])) * residual.unit
+    level = float(_median(residual.data[free])) * residual.unit
     # solid angle over which a fit of the PSF adds up a constant
     target = kernel.target
     area = target.sum() ** 2 / np.sum(target**2) * kernel.pixel_scale**2
     added, error = (level * area).to(FNU), np.median(error)
     # the errors of an image without noise are those of its model
-    if abs(added) > error and abs(level.value) > 0.05 * np.median(sigma[free]):
+    if abs(added) > error and abs(level.value) > 0.05 * _median(sigma[free]):
         msg = (
             f"'image' has a background of {level:.3g} between the sources, which is not fitted and adds "
             f"about {added:.3g} to fluxes whose median error is {error:.3g}: subtract it, or give "
@@ -191,7 +196,7 @@ def warn_of_sky(arrays, segments):
     free = arrays.usable & (segments == 0)
     if np.count_nonzero(free) < 400:
         return
-    level = np.median(arrays.flux[free])
+    level = _median(arrays.flux[free])
     member = arrays.usable & (segments > 0)
     label = segments[member]
     light, variance = (
@@ -203,7 +208,7 @@ def warn_of_sky(arrays, segments):
     part = float(np.median((level * np.bincount(label))[good] / light[good]))
     if abs(part) > 0.03:
         msg = (
-            f"'highres' has a sky of {level / np.median(arrays.sigma[free]):.3g} times its noise, "
+            f"'highres' has a sky of {level / _median(arrays.sigma[free]):.3g} times its noise, "
             f"{part:.0%} of the light of the median segment: it goes into the templates; subtract it"
         )
         warnings.warn(msg, MiricigaleWarning, stacklevel=5)

@@ -12,7 +12,7 @@ from photutils.segmentation import SegmentationImage
 from miricigale.photometry.arrays import image_arrays, pixel_scale
 from miricigale.photometry.cutouts import Cutout, own_segments, sersic_cutouts
 from miricigale.photometry.light import cutouts
-from miricigale.photometry.priors import check_labels
+from miricigale.photometry.priors import check_labels, labels_at
 from miricigale.photometry.shapes import not_fitted
 from miricigale.photometry.sky_noise import warn_of_sky
 from miricigale.utils.exceptions import argument_error
@@ -163,7 +163,7 @@ class SourceTemplates:
         xy = np.stack(highres.wcs.world_to_pixel(known.sky), axis=-1).reshape(-1, 2)
         warn_of_sky(fine, segments)
         if known.label is not None:
-            check_labels(known.label, own_segments(segments, None, xy)[0], "catalog['label']")
+            check_labels(known.label, labels_at(segments, xy)[0], "catalog['label']")
         label, flags = own_segments(segments, known.label, xy)
         n_threads = thread_count(n_threads)
         with concurrent.futures.ThreadPoolExecutor(n_threads) as pool, single_threaded():

@@ -148,6 +148,9 @@ def test_the_pixel_counts_once_in_the_scale(tools, width):
     psf = gaussian_psf(fwhm, pixel_scale=0.11 * u.arcsec, oversampling=4, fov=5 * u.arcsec)
     factor, error = flux_scaling(image, sky, flux * u.uJy, psf)
     assert abs(factor - 1) < 2 * error < 1.1e-3
+    table = encircled_flux(image, sky, flux * u.uJy, [0.3] * u.arcsec)
+    correction = aperture_correction(psf, 0.3 * u.arcsec, pixel_scale=0.11 * u.arcsec)
+    assert_allclose(table["median"] * correction, 1, atol=0.003)
     # a square of side a is as wide as a Gaussian of a / sqrt(12)
     radius = 0.4 * u.arcsec
     total = np.hypot(width, 0.11 / np.sqrt(12))
