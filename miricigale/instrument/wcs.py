@@ -206,7 +206,7 @@ def tangent_offset(pointing, x_offset, y_offset, pa):
     )
 
 
-def pixel_area_map(wcs, shape, dtype=None):
+def pixel_area_map(wcs, shape, out=None):
     """
     Solid angle of each pixel.
 
@@ -216,8 +216,8 @@ def pixel_area_map(wcs, shape, dtype=None):
         Two celestial axes, distorted or not.
     shape : tuple of int
         ``(ny, nx)``.
-    dtype : `~numpy.dtype`, optional
-        Type of the map; one of single precision is made with less memory.
+    out : `~numpy.ndarray`, shape (ny, nx), optional
+        Filled with the map and returned, some rows at a time.
 
     Returns
     -------
@@ -238,7 +238,7 @@ def pixel_area_map(wcs, shape, dtype=None):
     along_x = (direction(step, 0) - direction(-step, 0)) / (2 * step)
     along_y = (direction(0, step) - direction(0, -step)) / (2 * step)
     area = np.linalg.norm(np.cross(along_x, along_y, axis=0), axis=0).reshape(x.shape)
-    if dtype is None:
+    if out is None:
         return RectBivariateSpline(nodes[0], nodes[1], area)(np.arange(ny), np.arange(nx))
     # the same splines as products: values at the nodes to those at all pixels, axis by axis
     down, along = (
@@ -247,10 +247,14 @@ def pixel_area_map(wcs, shape, dtype=None):
     )
     # about the mean, so that all digits are those of its changes
     mean = area.mean()
-    found = (down @ (area / mean - 1)).astype(dtype) @ along.T.astype(dtype)
-    found += 1
-    found *= np.asarray(mean, dtype)
-    return found
+    change = (down @ (area / mean - 1)).astype(out.dtype)
+    along = np.ascontiguousarray(along.T, out.dtype)
+    for first in range(0, ny, 256):
+        part = out[first : first + 256]
+        np.matmul(change[first : first + 256], along, out=part)
+        part += 1
+        part *= mean
+    return out
 
 
 def north_up_wcs(center, pixel_scale, shape):

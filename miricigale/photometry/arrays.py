@@ -1,6 +1,7 @@
 """From images with units and coordinates to the plain arrays that photometry works on."""
 
 import dataclasses
+import tempfile
 import warnings
 
 import astropy.units as u
@@ -12,6 +13,7 @@ from astropy.wcs.utils import pixel_to_pixel, proj_plane_pixel_scales
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry.sky_noise import filled_areas
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.parallel import chunks
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
 __all__ = [
@@ -69,6 +71,8 @@ class FitArrays:
         Inverse of the noise, zero where not usable.
     usable, area, wcs, measured_noise
         As for `ImageArrays`.
+    scratch : path-like or None
+        Folder of files that images are kept in; in memory if None.
     """
 
     flux: np.ndarray
@@ -77,12 +81,29 @@ class FitArrays:
     area: np.ndarray
     wcs: object
     measured_noise: bool
+    scratch: object = None
+
+    def new(self, dtype=np.float32):
+        """A new image of zeros."""
+        return _new_image(self.usable.shape, dtype, self.scratch)
+
+    def whitened(self, image):
+        """An image over the noise, zero where not usable."""
+        return np.multiply(image, self.inverse_sigma, out=self.new())
 
     @property
     def sigma(self):
         """The noise, infinite where not usable."""
         with np.errstate(divide="ignore"):
-            return 1.0 / self.inverse_sigma
+            return np.divide(np.float32(1), self.inverse_sigma, out=self.new())
+
+
+def _new_image(shape, dtype, scratch):
+    if scratch is None:
+        return np.zeros(shape, dtype)
+    # the file has no name, and goes with the array
+    with tempfile.TemporaryFile(dir=scratch) as file:
+        return np.asarray(np.memmap(file, dtype, "w+", shape=shape))
 
 
 def image_arrays(image, name):
@@ -127,27 +148,33 @@ def image_arrays(image, name):
     )
 
 
-def fit_arrays(image, name):
+def fit_arrays(image, name, scratch=None):
     """
     Take a `~astropy.nddata.CCDData` apart, for a fit of templates.
 
-    Parameters are those of `image_arrays`, and so are the errors.
+    Parameters
+    ----------
+    image, name
+        As for `image_arrays`, whose errors are raised.
+    scratch : path-like, optional
+        Folder of files that images are kept in, if not in memory.
 
     Returns
     -------
     arrays : `FitArrays`
     """
     data, noise, usable = _checked(image, name)
-    area = pixel_area_map(image.wcs, usable.shape, dtype=np.float32)
+    flux, inverse, area = (_new_image(usable.shape, np.float32, scratch) for _ in range(3))
+    pixel_area_map(image.wcs, usable.shape, out=area)
     area *= np.float32(_MICRO)
-    flux, inverse = (np.array(one, np.float32, order="C") for one, _ in (data, noise))
-    flux *= np.float32(data[1])
-    inverse *= np.float32(noise[1])
-    for one in (flux, inverse):
-        one *= area
-    with np.errstate(divide="ignore", invalid="ignore"):
-        np.divide(np.float32(1), inverse, out=inverse)
-    flux[~usable] = inverse[~usable] = 0
+    for part in chunks(len(usable), 256):
+        for out, (values, factor) in ((flux, data), (inverse, noise)):
+            out[part] = values[part]
+            out[part] *= np.float32(factor)
+            out[part] *= area[part]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            np.divide(np.float32(1), inverse[part], out=inverse[part])
+        flux[part][~usable[part]] = inverse[part][~usable[part]] = 0
     return FitArrays(
         flux=flux,
         inverse_sigma=inverse,
@@ -155,6 +182,7 @@ def fit_arrays(image, name):
         area=area,
         wcs=image.wcs,
         measured_noise=image.uncertainty is None,
+        scratch=scratch,
     )
 
 

@@ -74,6 +74,7 @@ def diagnose(fit, xy):
         fit.inverse_sigma,
         fit.psf_width,
         xy + fit.displacement(xy),
+        new=fit.arrays.new,
         executor=fit.bank.executor,
     )
     poor = chi2 > POOR_CHI2 * variance

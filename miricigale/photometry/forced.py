@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import dataclasses
+import os
 import warnings
 
 import astropy.units as u
@@ -98,6 +99,10 @@ class ForcedPhotometer:
         Error of a point source's flux, as a fraction, by that of the image's PSF: about 0.8 of the
         fractional error of its width. By default that of the kernel's encircled energy, for templates
         that are images, and none for the others, which need the kernel's target only.
+    scratch : path-like, optional
+        Folder with room for files of the size of the image, in which what is made of it is kept in place of
+        memory, for images that are larger. It changes nothing in the result, whose model and
+        residual are then such files too, which go with them.
     n_threads : int, optional
         Number of threads; by default one for each processor. It changes nothing in the
         result.
@@ -150,6 +155,7 @@ class ForcedPhotometer:
         max_bytes=1.5e9,
         size_scatter=0.1,
         psf_error=None,
+        scratch=None,
         n_threads=None,
     ):
         if template not in ("auto", "cutout", "psf", "sersic"):
@@ -205,6 +211,9 @@ class ForcedPhotometer:
         self._max_bytes = float(max_bytes)
         self._size_scatter = None if size_scatter is None else float(size_scatter)
         self._psf_error = None if psf_error is None else float(psf_error)
+        if scratch is not None and not os.path.isdir(scratch):
+            raise argument_error("scratch", "a folder that is there", scratch)
+        self._scratch = scratch
         self._n_threads = thread_count(n_threads)
 
     @property
@@ -254,7 +263,7 @@ class ForcedPhotometer:
             exactly 0 are not masked, or a background that was left in ``image`` or ``highres``
             goes into the fluxes.
         """
-        arrays = fit_arrays(image, "image")
+        arrays = fit_arrays(image, "image", self._scratch)
         given = [one is not None for one in (highres, segmentation, catalog)]
         if templates is None:
             sources = dataclasses.replace(catalog_sources(catalog), sky=catalog["sky"])

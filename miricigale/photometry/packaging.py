@@ -234,8 +234,7 @@ def _images(fit, diagnostics, meta):
     arrays = fit.arrays
     # images can be large: what the fit needs no longer becomes the result
     model, residual, sigma = diagnostics.model, diagnostics.residual, arrays.sigma
-    if fit.background is not None:
-        model += fit.background
+    fit.add_background(model)
     for image in (model, residual, sigma):
         image /= arrays.area
     for image in (residual, sigma):

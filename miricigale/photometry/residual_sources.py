@@ -39,7 +39,7 @@ class ResidualPeaks:
     full_width: float
 
 
-def residual_peaks(residual, model, inverse_sigma, width, xy, *, executor=None):
+def residual_peaks(residual, model, inverse_sigma, width, xy, *, new=None, executor=None):
     """
     Find positive peaks of the residual that are sources of their own.
 
@@ -53,6 +53,8 @@ def residual_peaks(residual, model, inverse_sigma, width, xy, *, executor=None):
         Rms width of a Gaussian like the PSF, in pixels.
     xy : `~numpy.ndarray`, shape (n, 2)
         Positions of all sources; NaN for those far outside.
+    new : callable, optional
+        Makes an image of zeros like the residual.
     executor : `concurrent.futures.Executor`, optional
         Threads to work with.
 
@@ -73,7 +75,7 @@ def residual_peaks(residual, model, inverse_sigma, width, xy, *, executor=None):
     if not inverse_sigma.any():
         return ResidualPeaks(np.empty((0, 2), int), np.empty((0, 2)), np.empty(0), full_width)
     # fluxes of point sources by least squares, as if each stood alone: signal over power
-    snr, usable = _matched(residual, inverse_sigma, width, executor)
+    snr, usable = _matched(residual, inverse_sigma, width, new, executor)
     values = _some(snr, usable)
     middle = np.median(values)
     # what is a thousandth of the stated noise is that of the arithmetic
@@ -131,9 +133,10 @@ def _radius(width):
     return int(4.0 * width + 0.5)
 
 
-def _matched(residual, inverse_sigma, width, executor):
+def _matched(residual, inverse_sigma, width, new, executor):
     """Signal-to-noise of point sources at all pixels, and where enough of them is seen."""
-    snr, usable = np.zeros_like(residual), np.zeros(residual.shape, bool)
+    snr = np.zeros_like(residual) if new is None else new()
+    usable = np.zeros(residual.shape, bool)
     ny, halo = len(residual), _radius(width)
 
     def strip(low):

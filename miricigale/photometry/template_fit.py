@@ -179,7 +179,9 @@ class TemplateFit:
             return [area]
         y, x = np.ogrid[: area.shape[0], : area.shape[1]]
         terms = legendre_terms(x, y, area.shape, order)
-        return [area * np.asarray(term, area.dtype) for term in terms]
+        return [
+            np.multiply(area, term, out=self.arrays.new(), casting="same_kind") for term in terms
+        ]
 
     def _moved(self, bank, pixels):
         return bank.shifted(pixels, self.arrays.flux.shape, self._radius)
@@ -189,8 +191,8 @@ class TemplateFit:
         if bank is not self.bank:
             self.bank.forget()
         self.bank, self.columns = bank, [*self._background, *gradients]
-        white = [column * self.inverse_sigma for column in self.columns]
-        data = self.arrays.flux * self.inverse_sigma
+        white = [self.arrays.whitened(column) for column in self.columns]
+        data = self.arrays.whitened(self.arrays.flux)
         matrix, projection, power, light = normal_matrix(bank, self.inverse_sigma, [data, *white])
         self.light, self._power = light / self._full_light(), power
         diagonal = matrix.diagonal()
@@ -242,7 +244,7 @@ class TemplateFit:
             TemplateChanges(
                 self.settings.kernel.source, self.settings.kernel.target, self.settings.size_scatter
             ),
-            [one * self.inverse_sigma for one in (self.arrays.flux, *self.columns)],
+            [self.arrays.whitened(one) for one in (self.arrays.flux, *self.columns)],
             self.inverse_sigma,
         )
         if self.free is not None:
@@ -326,17 +328,17 @@ class TemplateFit:
         """The common parameters, shape (g,)."""
         return self.solution[0].common
 
-    @property
-    def background(self):
-        """The fitted background in uJy per pixel, shape (ny, nx); None without."""
-        if self.fit is None or not self._background:
-            return None
-        terms = zip(self._background, self.common, strict=False)
-        return sum(np.float32(value) * column for column, value in terms)
+    def add_background(self, image, factor=1.0):
+        """Add the fitted background, in uJy per pixel, times a factor to an image in place."""
+        if self.fit is None:
+            return
+        for column, value in zip(self._background, self.common, strict=False):
+            for part in chunks(len(image), 256):
+                image[part] += np.float32(factor * value) * column[part]
 
     def model(self):
         """The sources' model in uJy per pixel, without background."""
-        image = np.zeros(self.arrays.flux.shape, np.float32)
+        image = self.arrays.new()
         layers = [(self.bank, self.flux)]
         if self.free is not None:
             flux = np.zeros(len(self.flux))
@@ -350,17 +352,15 @@ class TemplateFit:
 
     def residual(self, model):
         """Image less a model of its sources and less the background, zero where not usable."""
-        found = self.arrays.flux - model
-        background = self.background
-        if background is not None:
-            found -= background
+        found = np.subtract(self.arrays.flux, model, out=self.arrays.new())
+        self.add_background(found, -1.0)
         found *= self.arrays.usable
         return found
 
     def correlation(self, residual, model):
         """Measured correlation of the noise, or None where there is too little sky."""
         usable = self.arrays.usable
-        free = np.empty(usable.shape, bool)
+        free = self.arrays.new(bool)
         for part in chunks(len(free), 256):
             free[part] = np.abs(model[part]) * self.inverse_sigma[part] < 0.3
         free &= usable
@@ -436,8 +436,8 @@ class TemplateFit:
 
     def _sandwich(self, correlation):
         keep = self.rows
-        white = [column * self.inverse_sigma for column in self.columns]
-        spread = [oaconvolve(w, correlation.astype(w.dtype), mode="same") for w in white]
+        white = [self.arrays.whitened(column) for column in self.columns]
+        spread = [self._spread(image, correlation) for image in white]
         middle, border = sandwich_matrix(self.bank, self.inverse_sigma, correlation, spread)
         middle, border = middle[keep][:, keep], border[keep]
         if self.free is not None:
@@ -446,6 +446,19 @@ class TemplateFit:
             )
         corner = np.array([[_inner(a, b) for b in spread] for a in white])
         return middle, border, corner.reshape(len(white), len(white))
+
+    def _spread(self, image, correlation):
+        """An image convolved with the noise correlation."""
+        kernel, lag = correlation.astype(image.dtype), correlation.shape[0] // 2
+        out = self.arrays.new()
+
+        def convolve(part):
+            rows = slice(max(part.start - lag, 0), part.stop + lag)
+            found = oaconvolve(image[rows], kernel, mode="same")
+            out[part] = found[part.start - rows.start :][: part.stop - part.start]
+
+        self.bank.map(convolve, chunks(len(image), 512))
+        return out
 
     def statistics(self, residual):
         """Chi2, light left and light of each template's core (see the kernel), shape (n, 3)."""

@@ -380,6 +380,31 @@ def test_templates_made_anew_give_the_same(tools, field):
     assert_allclose(anew.flux_err.value, kept.flux_err.value, rtol=1e-12)
 
 
+def test_files_in_place_of_memory_change_nothing(tools, field, tmp_path):
+    rng = np.random.default_rng(3)
+    noise = scipy.ndimage.gaussian_filter(rng.normal(size=field.image.shape), 1.0)
+    image = tools.as_ccd(field.image.data + noise, field.wcs, 0.3, mask=noise > 0.7)
+    options = {"fit_background": True, "max_shift": 0.1 * u.arcsec, "second_pass": True}
+    one, other = (
+        ForcedPhotometer(tools.kernel, scratch=folder, **options).measure(
+            image, catalog=field.catalog[:-5]
+        )
+        for folder in (None, tmp_path)
+    )
+    assert len(one.new_sources) > 0
+    for name in ("flux", "flux_err", "background", "shift"):
+        assert_array_equal(getattr(one, name).value, getattr(other, name).value)
+    assert_array_equal(one.flags, other.flags)
+    for name in ("model_image", "residual_image"):
+        assert_array_equal(getattr(one, name).data, getattr(other, name).data)
+        assert isinstance(getattr(other, name).data.base, np.memmap)
+        assert not isinstance(getattr(one, name).data.base, np.memmap)
+    # nothing is left behind
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(ValueError, match="'scratch' must be a folder that is there"):
+        ForcedPhotometer(tools.kernel, scratch=tmp_path / "none")
+
+
 @pytest.mark.parametrize("n_threads", [2, 3])
 def test_threads_do_not_change_a_bit(tools, monkeypatch, n_threads):
     # pieces so small that there are many for each thread
