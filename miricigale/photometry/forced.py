@@ -122,8 +122,8 @@ class ForcedPhotometer:
     high-resolution image; at the image's resolution this is a few independent changes of its template,
     which are fitted with the fluxes, each with a normal prior of the width it is known to. A bright source
     thus finds its size in the image that is measured, a faint one keeps the high-resolution
-    image's, and errors (``flux_err_template``) are those of the two together. Changes that move no flux
-    by a tenth of its error are left out.
+    image's, and errors (``flux_err_template``) are those of the two together. Changes that are
+    below 0.3 of the noise in all pixels together are left out.
 
     Cutouts of noisy segments make the fit too faint, since the template's own noise adds to
     its power: that part (noise variance times the kernel's power) is taken off the diagonal.

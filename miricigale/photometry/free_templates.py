@@ -15,8 +15,9 @@ from miricigale.utils.parallel import parallel_map
 
 __all__ = ["FreeTemplates", "free_templates"]
 
-#: Changes of a template that move no flux by more than this many of its errors are left out.
-_LEAST = 0.1
+#: Changes whose root of the sum of squares over the noise is below this are left out: they can move
+#: no flux by more of its errors.
+_LEAST = 0.3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ __all__ = ["Change", "TemplateChanges"]
 
 #: Half-width (fine pixels) of the stamps of changes, least and most, in half-light radii and in rms
 #: widths of the PSF.
-_HALF, _MOST, _REACH, _WIDTHS = 16, 80, 4.0, 3.0
+_HALF, _MOST, _REACH, _WIDTHS = 16, 80, 4.0, 4.0
 
 #: Radius (fine pixels) of a profile that is as good as a point; largest step of ln radius, ln index
 #: or ellipticity that is taken as linear.
@@ -83,8 +83,8 @@ class TemplateChanges:
         """
         parameters = fitted["parameters"]
         middle = np.rint(parameters[:2])
-        half = _HALF + _reach(parameters) + _WIDTHS * self._width
-        half = int(min(np.ceil(half), _MOST + _WIDTHS * self._width))
+        half = min(_reach(parameters), _MOST) + _WIDTHS * self._width
+        half = int(np.ceil(max(half, _HALF)))
         origin = int(middle[1]) - half, int(middle[0]) - half
 
         def images(parameters, derivatives=0):
