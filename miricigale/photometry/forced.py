@@ -8,6 +8,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 
+from miricigale.photometry import _core
 from miricigale.photometry.arrays import (
     fine_wcs,
     fit_arrays,
@@ -26,7 +27,7 @@ from miricigale.photometry.templates import FineTemplates, TemplateBank
 from miricigale.psf import KernelField
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.parallel import single_threaded, thread_count
-from miricigale.utils.units import ANGLE, to_array
+from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, to_array
 
 __all__ = ["ForcedPhotometer"]
 
@@ -221,6 +222,16 @@ class ForcedPhotometer:
         """The matching kernel, or the kernels of several places."""
         return self._given
 
+    @property
+    def template(self):
+        """What sources look like."""
+        return self._template
+
+    @property
+    def min_snr(self):
+        """Least signal-to-noise of a segment."""
+        return self._min_snr
+
     def __repr__(self):
         return f"<ForcedPhotometer template={self._template!r}, {self._given!r}>"
 
@@ -293,6 +304,53 @@ class ForcedPhotometer:
             warn_of_background(result, self._kernel)
         return result
 
+    def render(self, image, templates, flux):
+        """
+        Draw sources as they are seen on an image.
+
+        Parameters
+        ----------
+        image : `~astropy.nddata.CCDData`
+            The image, as for `measure`; the values of its pixels do not count.
+        templates : `SourceTemplates`
+            What the sources look like.
+        flux : `~astropy.units.Quantity`, shape (n,)
+            Their fluxes.
+
+        Returns
+        -------
+        model : `~astropy.units.Quantity`, shape (ny, nx)
+            Surface brightness in MJy/sr.
+
+        Raises
+        ------
+        ValueError, TypeError, `~astropy.units.UnitsError`
+            If an input does not fit; the message says which.
+        """
+        arrays = image_arrays(image, "image")
+        flux = to_array(flux, FNU, "flux", ndim=1)
+        if len(flux) != len(templates):
+            raise argument_error("flux", f"{len(templates)} fluxes, one for each source", len(flux))
+        place = self._place(arrays, templates.sky)
+        near = templates[place.near]
+        self._check_grid(near)
+        model = np.zeros(arrays.flux.shape)
+        with concurrent.futures.ThreadPoolExecutor(self._n_threads) as pool, single_threaded():
+            grid = self._grid(arrays, near)
+            bank = self._bank(arrays, place, near, grid, pool if self._n_threads > 1 else None)
+            values = flux[place.near][bank.order]
+            for block in bank.blocks():
+                some = values[block.first : block.last]
+                _core.add_model(model, block.values, block.box, block.start, some)
+        return model / arrays.area * SURFACE_BRIGHTNESS
+
+    def _grid(self, arrays, templates):
+        """The grid on which templates are made."""
+        if templates.wcs is not None:
+            return templates.wcs
+        scale = self._kernel.pixel_scale.to_value(ANGLE)
+        return fine_wcs(arrays.wcs, arrays.flux.shape, scale)
+
     def _place(self, arrays, sky):
         """Where the sources are on an image, and which are on or near it."""
         scale, shape = pixel_scale(arrays.wcs), arrays.flux.shape
@@ -311,10 +369,7 @@ class ForcedPhotometer:
             near, templates = near[kept], templates[kept]
             place = dataclasses.replace(place, near=near)
         kinds[near] = templates.kind
-        grid = templates.wcs
-        if grid is None:
-            scale = self._kernel.pixel_scale.to_value(ANGLE)
-            grid = fine_wcs(arrays.wcs, arrays.flux.shape, scale)
+        grid = self._grid(arrays, templates)
         bank = self._bank(arrays, place, templates, grid, executor)
         settings = FitSettings(
             kernel=self._kernel,

@@ -1,0 +1,225 @@
+"""Factors by which errors are multiplied, from sources of known flux."""
+
+import dataclasses
+
+import numpy as np
+import scipy.sparse
+from astropy.table import QTable
+
+from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.files import read_ecsv, writing
+from miricigale.utils.meta import provenance
+from miricigale.utils.tables import require_columns
+from miricigale.utils.units import FNU
+
+__all__ = ["ErrorCalibration"]
+
+#: Least number of sources in a bin, and edges of the bins in flux over the error by noise.
+_LEAST = 30
+_EDGES = (1.0, 3.0, 5.0, 10.0, 20.0, 50.0)
+
+#: Part of Gaussian values within one standard deviation.
+_ONE_SIGMA = 68.27
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class ErrorCalibration:
+    """
+    What sources of known flux say of the errors; `calibrate_errors` makes it.
+
+    Attributes
+    ----------
+    sources : `~astropy.table.QTable`
+        A row for each source: ``kind`` (``point``, ``galaxy`` or ``empty``), ``flux_true``, ``flux``,
+        ``flux_err``, ``flux_err_noise``, ``flags``, ``template`` and ``template_snr``, all as they were
+        measured, ``sky`` and ``trial``.
+    bins : `~astropy.table.QTable`
+        Pulls (measured less true flux, over ``flux_err``) in bins of true flux over ``flux_err_noise``: ``low``,
+        ``high``, ``snr`` (median), ``n``, ``std``, ``mad`` (1.4826 times the median absolute deviation),
+        ``mean``, ``median``, ``bias`` (median of measured over true flux, less 1; NaN for empty places),
+        ``factor`` (within which 68.27 % of the pulls are) and ``factor_err``.
+    meta : dict
+        Provenance.
+    """
+
+    sources: QTable
+    bins: QTable
+    meta: dict = dataclasses.field(default_factory=dict)
+
+    def __repr__(self):
+        factors = ", ".join(f"{one:.2f}" for one in self.bins["factor"])
+        return f"<ErrorCalibration {len(self.sources)} sources, factors {factors}>"
+
+    @classmethod
+    def from_sources(cls, sources, **meta):
+        """
+        Bin sources of known flux.
+
+        Parameters
+        ----------
+        sources : `~astropy.table.QTable`
+            With ``flux_true``, ``flux``, ``flux_err`` and ``flux_err_noise`` at least. Rows without a
+            measured flux do not count.
+        **meta
+            What else is known of them.
+
+        Returns
+        -------
+        calibration : `ErrorCalibration`
+
+        Raises
+        ------
+        ValueError
+            If fewer than 30 sources have a flux.
+        """
+        names = ["flux_true", "flux", "flux_err", "flux_err_noise"]
+        require_columns(sources, names, "sources", units=dict.fromkeys(names, FNU))
+        true, flux, error, noise = (sources[name].to_value(FNU) for name in names)
+        good = np.flatnonzero(np.isfinite(flux) & (error > 0) & (noise > 0))
+        if len(good) < _LEAST:
+            wanted = f"at least {_LEAST} sources that are measured"
+            raise argument_error("sources", wanted, f"{len(good)}")
+        snr = true[good] / noise[good]
+        pull = (flux[good] - true[good]) / error[good]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = flux[good] / true[good] - 1.0
+        rows = [_row(snr, pull, ratio, member) for member in _members(snr)]
+        bins = QTable(rows=rows, names=list(_COLUMNS))
+        for name, text in _COLUMNS.items():
+            bins[name].info.description = text
+        return cls(sources, bins, provenance(source="injection", **meta))
+
+    def factor(self, flux, flux_err_noise):
+        """
+        The factor for fluxes.
+
+        Parameters
+        ----------
+        flux, flux_err_noise : `~astropy.units.Quantity`
+            Measured fluxes and their errors by noise.
+
+        Returns
+        -------
+        factor : `~numpy.ndarray`
+            Between the bins linear in asinh of flux over error, beyond them constant; NaN for NaN.
+        """
+        snr = np.asarray((flux / flux_err_noise).to_value(""))
+        nodes = np.arcsinh(np.asarray(self.bins["snr"]))
+        return np.interp(np.arcsinh(snr), nodes, np.asarray(self.bins["factor"]))
+
+    def apply(self, result):
+        """
+        Multiply the errors of a result.
+
+        Parameters
+        ----------
+        result : `ForcedPhotometryResult`
+            Of the same image, or one like it.
+
+        Returns
+        -------
+        result : `ForcedPhotometryResult`
+            A copy, with the errors, each of their terms and the covariances multiplied.
+
+        Raises
+        ------
+        ValueError
+            If the errors were multiplied before.
+        """
+        if "error_calibration" in result.meta:
+            raise argument_error(
+                "result", "one with errors as they were measured", "a calibrated one"
+            )
+        factor = self.factor(result.flux, result.flux_err_noise)
+        names = ["flux_err", "flux_err_noise", "flux_err_template", "flux_err_psf"]
+        changed = {name: getattr(result, name) * factor for name in names}
+        known = np.nan_to_num(factor, nan=1.0)
+        changed["covariance"] = _scaled(result.covariance, known)
+        if result.joint_covariance is not None:
+            changed["joint_covariance"] = _scaled(result.joint_covariance, np.tile(known, 2))
+            changed["flux_point_err"] = result.flux_point_err * factor
+        bins = {name: [float(v) for v in self.bins[name]] for name in ("snr", "factor")}
+        meta = {**result.meta, "error_calibration": bins}
+        return dataclasses.replace(result, **changed, meta=meta)
+
+    def write(self, path, *, overwrite=False):
+        """Write the table of sources, of which `read` makes the rest again."""
+        with writing(path):
+            table = self.sources.copy()
+            table.meta.clear()
+            table.meta.update(self.meta)
+            table.write(path, format="ascii.ecsv", overwrite=overwrite)
+
+    @classmethod
+    def read(cls, path):
+        """
+        Read what `write` wrote.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If the file is missing or something else.
+        """
+        table = read_ecsv(path, wanted="a calibration of errors")
+        try:
+            found = cls.from_sources(table)
+        except (TypeError, ValueError) as err:
+            msg = f"{path} is no calibration of errors: {err}"
+            raise DataError(msg) from err
+        return dataclasses.replace(found, meta=dict(table.meta))
+
+
+_COLUMNS = {
+    "low": "Least true flux over error by noise",
+    "high": "Largest true flux over error by noise",
+    "snr": "Median of it",
+    "n": "Number of sources",
+    "std": "Standard deviation of the pulls",
+    "mad": "1.4826 times the median absolute deviation of the pulls",
+    "mean": "Mean pull",
+    "median": "Median pull",
+    "bias": "Median of measured over true flux, less 1",
+    "factor": "Within which 68.27 % of the absolute pulls are",
+    "factor_err": "Its standard error, for Gaussian pulls",
+}
+
+
+def _members(snr):
+    """Rows of each bin: places without flux, then between the edges, small bins joined with the next."""
+    order = np.argsort(snr, kind="stable")
+    number = np.searchsorted(_EDGES, snr[order], side="right")
+    number[snr[order] <= 0] = -1
+    found, waiting = [], np.empty(0, int)
+    for k in np.unique(number):
+        waiting = np.concatenate([waiting, order[number == k]])
+        if len(waiting) >= _LEAST:
+            found.append(waiting)
+            waiting = np.empty(0, int)
+    if len(waiting):
+        found[-1:] = [np.concatenate([*found[-1:], waiting])]
+    return found
+
+
+def _row(snr, pull, ratio, member):
+    pull, middle = pull[member], np.median(pull[member])
+    ratio = ratio[member][np.isfinite(ratio[member])]
+    factor = np.percentile(np.abs(pull), _ONE_SIGMA)
+    return (
+        float(snr[member].min()),
+        float(snr[member].max()),
+        float(np.median(snr[member])),
+        len(member),
+        float(np.std(pull)),
+        float(1.4826 * np.median(np.abs(pull - middle))),
+        float(np.mean(pull)),
+        float(middle),
+        float(np.median(ratio)) if len(ratio) else np.nan,
+        float(factor),
+        # of a percentile: root of p (1 - p) / n over the density of |x| there, 0.484
+        float(factor * 0.4655 / 0.4839 / np.sqrt(len(member))),
+    )
+
+
+def _scaled(covariance, factor):
+    scale = scipy.sparse.diags_array(factor)
+    return (scale @ covariance @ scale).tocsr()

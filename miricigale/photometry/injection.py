@@ -1,0 +1,344 @@
+"""Calibration of errors by injection: sources of known flux, measured as all others are."""
+
+import dataclasses
+
+import numpy as np
+import scipy.ndimage
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData
+from astropy.table import QTable, vstack
+from photutils.segmentation import SegmentationImage
+
+from miricigale.photometry.arrays import image_arrays, pixel_scale
+from miricigale.photometry.cutouts import Cutout
+from miricigale.photometry.error_calibration import ErrorCalibration
+from miricigale.photometry.shapes import ShapeModels
+from miricigale.photometry.sources import SourceTemplates
+from miricigale.profiles import sersic_stamp
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.progress import progress
+from miricigale.utils.random import check_seed, stream
+from miricigale.utils.tables import require_columns
+from miricigale.utils.units import FNU, SURFACE_BRIGHTNESS
+
+__all__ = ["calibrate_errors"]
+
+#: Radius (fine pixels) of a profile that is as good as a point.
+_POINT = 0.05
+
+#: Least distance of two injected sources in widths of the PSF (FWHM), and attempts to place each.
+_APART, _ATTEMPTS = 4.0, 50
+
+#: Half-width (fine pixels) of the stamps that are injected into the prior, least and most.
+_HALF, _MOST = 16, 96
+
+
+def calibrate_errors(
+    photometer,
+    image,
+    highres=None,
+    segmentation=None,
+    catalog=None,
+    *,
+    n_trials=10,
+    n_sources=None,
+    snr_range=(1.0, 100.0),
+    seed=None,
+    progress_bar=False,
+):
+    """
+    Measure by injection how much the errors of forced photometry are off.
+
+    Copies of the prior's own sources (points and fitted profiles, with their segments) are put at random
+    places into the prior and, with other fluxes, into the image; all is measured anew together with the
+    sources that are there, and with as many empty places. The scatter of measured less true flux over the
+    error tells the factor by which errors must be multiplied.
+
+    Parameters
+    ----------
+    photometer : `ForcedPhotometer`
+        What measures, of any template but ``"sersic"``; its threads are used.
+    image, highres, segmentation, catalog
+        As for `ForcedPhotometer.measure`. Without ``highres`` points are injected into the image alone.
+        None of them is changed.
+    n_trials : int, optional
+        How often the image is measured.
+    n_sources : int, optional
+        Sources injected in each trial, and empty places; by default a seventh of the sources in the
+        catalogue, at least ten. Fewer, if there is no room for so many.
+    snr_range : tuple of float, optional
+        Fluxes over the median error of sources by noise, between which injected fluxes are drawn, uniform
+        in the logarithm.
+    seed : int or `~numpy.random.Generator`, optional
+        The same seed gives the same result.
+    progress_bar : bool, optional
+        Whether a progress bar is shown.
+
+    Returns
+    -------
+    calibration : `ErrorCalibration`
+
+    Raises
+    ------
+    ValueError, TypeError
+        If an input does not fit, no source can be copied or no place is free.
+
+    Notes
+    -----
+    Injected galaxies have the shapes of the fits, so that what no profile describes (arms, clumps) is not in the
+    scatter; their positions are those of the light that is seen in their segment.
+    """
+    template = getattr(photometer, "template", None)
+    if template not in ("auto", "cutout", "psf"):
+        wanted = "a ForcedPhotometer whose template is 'auto', 'cutout' or 'psf'"
+        raise argument_error("photometer", wanted, repr(photometer))
+    if isinstance(n_trials, bool) or int(n_trials) != n_trials or n_trials < 1:
+        raise argument_error("n_trials", "an integer of at least 1", n_trials)
+    low, high = snr_range
+    if not 0 < low < high:
+        raise argument_error("snr_range", "two increasing positive numbers", snr_range)
+    require_columns(catalog, ["sky"], "catalog")
+    seed = check_seed(seed)
+    if n_sources is None:
+        n_sources = max(10, len(catalog) // 7)
+    if int(n_sources) != n_sources or n_sources < 1:
+        raise argument_error("n_sources", "an integer of at least 1", n_sources)
+    field = _Field(photometer, image, highres, segmentation, catalog)
+    tables = []
+    for trial in progress(range(int(n_trials)), show=progress_bar, desc="inject"):
+        rng = stream(seed, "injection", trial)
+        found = field.trial(int(n_sources), (low, high), rng)
+        found["trial"] = trial
+        tables.append(found)
+    sources = vstack(tables, metadata_conflicts="silent")
+    return ErrorCalibration.from_sources(sources, seed=seed)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Donor:
+    """A source of the prior that is copied: fine profile, its light, and its segment about its middle."""
+
+    parameters: np.ndarray
+    light: float
+    mask: np.ndarray
+    corner: np.ndarray
+    point: bool
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Injected:
+    """Sources that were injected: catalogue, light, fluxes and kinds; the prior with them."""
+
+    catalog: QTable
+    light: SourceTemplates
+    flux: np.ndarray
+    kind: np.ndarray
+    highres: CCDData | None
+    labels: np.ndarray | None
+
+
+class _Field:
+    """The images, what is copied, and where there is room."""
+
+    def __init__(self, photometer, image, highres, segmentation, catalog):
+        self.photometer, self.image, self.highres = photometer, image, highres
+        self.base = photometer.measure(image, highres, segmentation, catalog)
+        error = self.base.flux_err_noise.value
+        if not np.isfinite(error).any():
+            raise argument_error("catalog", "sources of which some are measured", "none that is")
+        self.error = np.nanmedian(error)
+        self.arrays = image_arrays(image, "image")
+        self.sky = catalog["sky"]
+        self.fwhm = self.base.psf_fwhm.value
+        self.labels = self.own = None
+        self.donors = []
+        if highres is None or segmentation is None or photometer.template == "psf":
+            return
+        labels = segmentation.data if isinstance(segmentation, SegmentationImage) else segmentation
+        self.labels = np.array(labels)
+        self.fine = image_arrays(highres, "highres")
+        # of kernels of several places the mean
+        source = getattr(photometer.kernel, "mean", photometer.kernel).source
+        self.models = ShapeModels(source / source.sum())
+        self.reach = source.shape[0] / 2
+        templates = SourceTemplates.from_images(
+            highres, segmentation, catalog, psf=source, min_snr=photometer.min_snr
+        )
+        if "label" in catalog.colnames:
+            self.own = np.asarray(catalog["label"], int)
+        else:
+            x, y = np.rint(np.array(highres.wcs.world_to_pixel(catalog["sky"]))).astype(int)
+            inside = (x >= 0) & (y >= 0) & (x < self.labels.shape[1]) & (y < self.labels.shape[0])
+            self.own = np.zeros(len(catalog), int)
+            self.own[inside] = self.labels[y[inside], x[inside]]
+        places = scipy.ndimage.find_objects(self.labels)
+        usable = self.base.flags & ~int(_HARMLESS) == 0
+        kinds = templates.kind
+        for k in np.flatnonzero(usable & (templates.flags == 0)):
+            donor = self._donor(templates.fitted[k], kinds[k], self.own[k], places)
+            if donor is not None:
+                self.donors.append(donor)
+        if not self.donors:
+            wanted = "with sources that are points or profiles, to be copied"
+            raise argument_error("highres", wanted, "none")
+
+    def _donor(self, fitted, kind, label, places):
+        """What is copied of a source; None if it is no profile, or has no light."""
+        if kind == "cutout" or np.isnan(fitted["point"]) or not 0 < label <= len(places):
+            return None
+        place = places[label - 1]
+        if place is None:
+            return None
+        parameters = np.array(fitted["parameters"])
+        if kind == "point":
+            parameters[2], parameters[3:] = np.log(_POINT), 0.0
+        mask = self.labels[place] == label
+        corner = np.array([place[1].start, place[0].start])
+        moved = parameters - [*corner, 0, 0, 0, 0]
+        model = np.where(
+            mask & self.fine.usable[place], self.models.profiles(mask.shape, moved)[0], 0.0
+        )
+        power = np.sum(model**2)
+        light = np.sum(model * self.fine.flux[place]) / power if power > 0 else 0.0
+        if not light > 0:
+            return None
+        return _Donor(parameters, float(light), mask, corner, kind == "point")
+
+    def _places(self, n, rng, taken):
+        """Sky positions on usable pixels of the image, apart from each other."""
+        y, x = np.nonzero(self.arrays.usable)
+        apart = _APART * self.fwhm / pixel_scale(self.image.wcs)
+        found = []
+        for _ in range(_ATTEMPTS * n):
+            if len(found) == n:
+                break
+            k = rng.integers(len(x))
+            at = np.array([x[k], y[k]]) + rng.uniform(-0.5, 0.5, 2)
+            near = np.array([*taken, *found]).reshape(-1, 2)
+            if len(near) and np.min(np.hypot(*(near - at).T)) < apart:
+                continue
+            found.append(at)
+        return found
+
+    def trial(self, n, snr_range, rng):
+        """Inject, measure, and tell what came back."""
+        at = self._places(2 * n, rng, [])
+        if len(at) < 2:
+            raise argument_error("image", "with room for sources", "none")
+        full, empty = np.array(at[::2]), np.array(at[1::2])
+        flux = self.error * np.exp(rng.uniform(*np.log(snr_range), len(full)))
+        new = self._galaxies(full, flux, rng) if self.donors else self._points(full, flux)
+        light = self.photometer.render(self.image, new.light, new.flux * FNU)
+        image = _with_data(self.image, self.image.data + light.to_value(self.image.unit))
+        nothing = self.image.wcs.pixel_to_world(*empty.T).transform_to(self.sky.frame)
+        both = QTable({"sky": _joined([self.sky, new.catalog["sky"], nothing])})
+        if self.own is not None:
+            both["label"] = np.concatenate(
+                [self.own, new.catalog["label"], np.zeros(len(empty), int)]
+            )
+        result = self.photometer.measure(image, new.highres, new.labels, both)
+        table = QTable({"kind": np.append(new.kind, np.full(len(empty), "empty", "U6"))})
+        table["flux_true"] = np.append(new.flux, np.zeros(len(empty))) * FNU
+        rows = np.arange(len(self.sky), len(both))
+        for name in ("flux", "flux_err", "flux_err_noise", "flags", "template", "template_snr"):
+            table[name] = getattr(result, name)[rows]
+        table["sky"] = both["sky"][rows].icrs
+        return table
+
+    def _points(self, at, flux):
+        """Points, of which no prior tells."""
+        sky = self.image.wcs.pixel_to_world(*at.T).transform_to(self.sky.frame)
+        catalog = QTable({"sky": sky})
+        light = SourceTemplates.from_catalog(catalog)
+        kind = np.full(len(at), "point", "U6")
+        return _Injected(catalog, light, flux, kind, self.highres, self.labels)
+
+    def _galaxies(self, at, flux, rng):
+        """Copies of the prior's sources, with their segments."""
+        wcs = self.highres.wcs
+        places = np.array(wcs.world_to_pixel(self.image.wcs.pixel_to_world(*at.T))).T
+        data, labels = np.zeros(self.labels.shape), self.labels.copy()
+        rows, light = [], []
+        for (x, y), total in zip(places, flux, strict=True):
+            donor = self.donors[rng.integers(len(self.donors))]
+            shift = np.rint([x, y] - donor.parameters[:2]).astype(int)
+            corner = donor.corner + shift
+            h, w = donor.mask.shape
+            cut = np.s_[corner[1] : corner[1] + h, corner[0] : corner[0] + w]
+            free = labels[cut]
+            if corner.min() < 0 or free.shape != (h, w) or not self.fine.usable[cut].all():
+                continue
+            # another source there would own the light
+            if np.any(free[donor.mask] != 0):
+                continue
+            parameters = donor.parameters + [*shift, 0, 0, 0, 0]
+            self._paint(data, parameters, donor.light)
+            label = int(labels.max()) + 1
+            labels[cut][donor.mask] = label
+            rows.append((label, cut, donor, total))
+            light.append(_profile(parameters, self.reach))
+        if not rows:
+            raise argument_error("image", "with room for sources", "none")
+        noisy = self.fine.flux + data
+        centroids = []
+        for label, cut, _, _ in rows:
+            # where detection would put it: the middle of the light in its segment
+            y, x = np.nonzero(labels[cut] == label)
+            values = np.maximum(noisy[cut][y, x], 0.0)
+            middle = np.array([np.sum(x * values), np.sum(y * values)]) / max(values.sum(), 1e-300)
+            centroids.append(middle + [cut[1].start, cut[0].start])
+        catalog = QTable(
+            {"sky": wcs.pixel_to_world(*np.array(centroids).T).transform_to(self.sky.frame)}
+        )
+        catalog["label"] = [label for label, *_ in rows]
+        flux = np.array([total for *_, total in rows])
+        kinds = ["point" if donor.point else "galaxy" for _, _, donor, _ in rows]
+        truth = SourceTemplates(
+            id=np.arange(len(rows)), sky=catalog["sky"].icrs, light=light,
+            sersic=np.full((len(rows), 4), np.nan), flags=np.zeros(len(rows), int),
+            snr=np.full(len(rows), np.nan), wcs=wcs,
+        )  # fmt: skip
+        added = (data / self.fine.area * SURFACE_BRIGHTNESS).to_value(self.highres.unit)
+        highres = _with_data(self.highres, self.highres.data + added)
+        return _Injected(catalog, truth, flux, np.array(kinds, "U6"), highres, labels)
+
+    def _paint(self, image, parameters, light):
+        """Add a profile, seen through the sharp PSF, to an image."""
+        reach = np.exp(parameters[2] + 0.5 * np.hypot(*parameters[4:]))
+        half = int(np.clip(np.ceil(8 * reach), _HALF, _MOST))
+        x, y = np.rint(parameters[:2]).astype(int)
+        moved = parameters - [x - half, y - half, 0, 0, 0, 0]
+        stamp = light * self.models.profiles((2 * half + 1,) * 2, moved)[0]
+        y0, x0 = max(y - half, 0), max(x - half, 0)
+        target = image[y0 : y + half + 1, x0 : x + half + 1]
+        i, j = y0 - (y - half), x0 - (x - half)
+        target += stamp[i : i + target.shape[0], j : j + target.shape[1]]
+
+
+#: Flags with which a source may still be copied.
+_HARMLESS = 8 | 256 | 512
+
+
+def _profile(parameters, reach):
+    """The light of a profile on the fine grid, before convolution."""
+    eta = np.hypot(*parameters[4:])
+    radius, ratio = np.exp(parameters[2] + eta / 2), np.exp(-eta)
+    stamp, origin = sersic_stamp(
+        x=parameters[0], y=parameters[1], r_eff=radius, n=np.exp(parameters[3]), axis_ratio=ratio,
+        theta=0.5 * np.arctan2(parameters[5], parameters[4]), max_radius=max(reach, 2 * radius),
+    )  # fmt: skip
+    return Cutout(stamp, origin, convolved=False)
+
+
+def _with_data(image, data):
+    """An image with other pixels."""
+    return CCDData(
+        data, unit=image.unit, wcs=image.wcs, mask=image.mask, uncertainty=image.uncertainty,
+        meta=dict(image.meta),
+    )  # fmt: skip
+
+
+def _joined(skies):
+    skies = [sky.icrs for sky in skies]
+    angles = (np.concatenate([getattr(sky, one).deg for sky in skies]) for one in ("ra", "dec"))
+    return SkyCoord(*angles, unit="deg")

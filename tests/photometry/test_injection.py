@@ -1,0 +1,157 @@
+"""Calibration of errors by sources of known flux."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
+
+from miricigale.instrument import north_up_wcs
+from miricigale.photometry import (
+    ErrorCalibration,
+    ForcedPhotometer,
+    SourceTemplates,
+    calibrate_errors,
+    detect_sources,
+)
+from miricigale.utils.exceptions import DataError
+
+
+def known(factor, n=20000, seed=1):
+    """Fluxes whose scatter is ``factor(snr)`` times the stated error, and empty places."""
+    rng = np.random.default_rng(seed)
+    true = np.append(10 ** rng.uniform(0, 2, n), np.zeros(n // 4))
+    seen = true + rng.normal(size=len(true)) * factor(true)
+    table = QTable({"flux_true": true, "flux": seen, "flux_err": np.ones(len(true))})
+    table["flux_err_noise"] = np.ones(len(true))
+    return QTable({name: table[name] * u.uJy for name in table.colnames})
+
+
+def test_factors_are_those_of_the_scatter():
+    calibration = ErrorCalibration.from_sources(known(lambda snr: 1.2 + 0.01 * snr))
+    bins = calibration.bins
+    assert np.sum(bins["n"]) == 25000
+    expected = 1.2 + 0.01 * bins["snr"]
+    assert_allclose(bins["factor"], expected, rtol=0.03)
+    assert_allclose(bins["mad"], expected, rtol=0.03)
+    # the deviations from the truth are as the standard errors say
+    narrow = bins["snr"] < 10
+    pull = (bins["factor"] - expected) / bins["factor_err"]
+    assert np.all(np.abs(pull[narrow]) < 3.5)
+    one = [1.0] * u.uJy
+    assert_allclose(calibration.factor(0 * one, one), 1.2, rtol=0.03)
+    assert_allclose(calibration.factor(-3 * one, one), calibration.factor(0 * one, one))
+    assert_allclose(calibration.factor(1e4 * one, one), bins["factor"][-1])
+    assert np.isnan(calibration.factor(np.nan * one, one))[0]
+
+
+def test_few_sources_are_one_bin_and_fewer_none(tmp_path):
+    sources = known(np.ones_like, n=40)
+    calibration = ErrorCalibration.from_sources(sources)
+    assert len(calibration.bins) == 1
+    with pytest.raises(ValueError, match="'sources' must be at least 30 sources"):
+        ErrorCalibration.from_sources(sources[:20])
+    calibration.write(tmp_path / "c.ecsv")
+    again = ErrorCalibration.read(tmp_path / "c.ecsv")
+    assert_allclose(again.bins["factor"], calibration.bins["factor"], rtol=1e-12)
+    QTable({"a": [1]}).write(tmp_path / "other.ecsv")
+    with pytest.raises(DataError, match="is no calibration of errors"):
+        ErrorCalibration.read(tmp_path / "other.ecsv")
+
+
+@pytest.fixture(scope="module")
+def points(tools):
+    """Forty points on white noise."""
+    rng = np.random.default_rng(5)
+    wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, (300, 300))
+    sky, flux = tools.positions(rng, 40, 14.0), 10 ** rng.uniform(0, 2, 40)
+    light = tools.render(sky, flux, tools.LO, wcs, (300, 300))
+    noise = rng.normal(0, 0.5, (300, 300))
+    return light + noise, wcs, QTable({"sky": sky})
+
+
+@pytest.mark.parametrize("stated", [0.5, 0.2])
+def test_injected_points_tell_understated_errors(tools, points, stated):
+    data, wcs, catalog = points
+    image = tools.as_ccd(data, wcs, stated)
+    photometer = ForcedPhotometer(tools.kernel, template="psf", correlated_noise=False)
+    before = image.data.copy()
+    calibration = calibrate_errors(photometer, image, catalog=catalog, n_trials=8, seed=3)
+    assert_array_equal(image.data, before)
+    assert {"point", "empty"} == set(calibration.sources["kind"])
+    # errors of white noise are as wrong as the stated noise; some hundred sources know it to 6 %
+    n = len(calibration.sources)
+    assert n > 100
+    factors = np.average(calibration.bins["factor"], weights=calibration.bins["n"])
+    assert factors == pytest.approx(0.5 / stated, rel=3.5 * 0.97 / np.sqrt(n))
+    result = photometer.measure(image, catalog=catalog)
+    scaled = calibration.apply(result)
+    factor = (scaled.flux_err / result.flux_err).value
+    assert_allclose(factor, calibration.factor(result.flux, result.flux_err_noise), rtol=1e-12)
+    assert_allclose(np.sqrt(scaled.covariance.diagonal()), scaled.flux_err.value, rtol=1e-9)
+    assert_array_equal(scaled.flux, result.flux)
+    with pytest.raises(ValueError, match="'result' must be one with errors as they were measured"):
+        calibration.apply(scaled)
+
+
+def test_galaxies_are_injected_into_the_prior_too(tools):
+    rng = np.random.default_rng(7)
+    sky, size = tools.positions(rng, 25, 13.0), rng.uniform(0.05, 0.3, 25)
+    images = []
+    for psf, scale, n, noise in ((tools.HI, 0.06, 540, 2.0), (tools.LO, 0.11, 300, 0.2)):
+        wcs = north_up_wcs(tools.CENTER, scale * u.arcsec, (n, n))
+        light = tools.render(sky, np.full(25, 20.0), np.hypot(psf, size), wcs, (n, n))
+        images.append(tools.as_ccd(light + rng.normal(0, noise, (n, n)), wcs, noise))
+    high, low = images
+    segments, found = detect_sources(high)
+    kept = segments.data.copy(), high.data.copy(), low.data.copy()
+    options = {"n_trials": 3, "n_sources": 15, "seed": 2}
+    runs = [
+        calibrate_errors(
+            ForcedPhotometer(tools.kernel, n_threads=n), low, high, segments, found, **options
+        )
+        for n in (1, 2)
+    ]
+    for array, before in zip((segments.data, high.data, low.data), kept, strict=True):
+        assert_array_equal(array, before)
+    sources, others = (one.sources for one in runs)
+    assert_array_equal(sources["flux"], others["flux"])
+    assert {"galaxy", "empty"} <= set(sources["kind"])
+    galaxies = sources["kind"] == "galaxy"
+    # the prior shows them: they have templates of their own, not points
+    assert np.mean(sources["template"][galaxies] != "point") > 0.8
+    assert np.median(sources["template_snr"][galaxies]) > 5
+    bright = galaxies & (sources["flux_true"] > 20 * sources["flux_err_noise"])
+    ratio = (sources["flux"][bright] / sources["flux_true"][bright]).value
+    assert abs(np.median(ratio) - 1) < 0.05
+    pull = ((sources["flux"] - sources["flux_true"]) / sources["flux_err"]).value
+    assert 0.6 < 1.4826 * np.median(np.abs(pull)) < 1.5
+
+
+def test_rendered_sources_are_measured_as_they_are(tools, points):
+    _, wcs, catalog = points
+    empty = tools.as_ccd(np.zeros((300, 300)), wcs, 0.1)
+    photometer = ForcedPhotometer(tools.kernel, template="psf", correlated_noise=False)
+    flux = np.arange(1.0, 41.0) * u.uJy
+    light = photometer.render(empty, SourceTemplates.from_catalog(catalog), flux)
+    image = tools.as_ccd(light.to_value("MJy/sr"), wcs, 0.1)
+    assert_allclose(photometer.measure(image, catalog=catalog).flux, flux, rtol=1e-5)
+    with pytest.raises(ValueError, match="'flux' must be 40 fluxes"):
+        photometer.render(empty, SourceTemplates.from_catalog(catalog), flux[:3])
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"n_trials": 0}, "n_trials"),
+        ({"n_sources": 0}, "n_sources"),
+        ({"snr_range": (3, 1)}, "snr_range"),
+    ],
+)
+def test_options_out_of_range_are_named(tools, points, options, name):
+    data, wcs, catalog = points
+    photometer = ForcedPhotometer(tools.kernel, template="psf")
+    with pytest.raises(ValueError, match=f"'{name}' must be"):
+        calibrate_errors(photometer, tools.as_ccd(data, wcs, 0.5), catalog=catalog, **options)
+    with pytest.raises(ValueError, match="'photometer' must be a ForcedPhotometer"):
+        calibrate_errors(None, tools.as_ccd(data, wcs, 0.5), catalog=catalog)
