@@ -208,3 +208,11 @@ def test_equals_pysiaf(subarray):
     exposure = Exposure("miri.f770w", n_groups=5, subarray=subarray, pointing=FIELD, roll=ROLL)
     separation = exposure.wcs.pixel_to_world(x, y).separation(SkyCoord(ra, dec))
     assert separation.max() < 1e-6 * u.arcsec
+
+
+@pytest.mark.parametrize(("dtype", "rtol"), [(np.float64, 1e-12), (np.float32, 2e-7)])
+def test_areas_filled_into_an_array_are_the_same(dtype, rtol):
+    wcs = imager_wcs(FIELD, ROLL)
+    out = np.zeros((1024, 1032), dtype)
+    assert pixel_area_map(wcs, out.shape, out=out) is out
+    assert_allclose(out, pixel_area_map(wcs, out.shape), rtol=rtol)
