@@ -101,19 +101,27 @@ def nuclei(fields, rng):
         rows.append((
             once.flux.value[galaxy] / total, twice.flux.value[galaxy] / total,
             twice.flux_point.value[galaxy] / point, once.template_snr[galaxy],
+            (twice.flux.value[galaxy] - total) / twice.flux_err.value[galaxy],
+            (twice.flux_point.value[galaxy] - point) / twice.flux_point_err.value[galaxy],
             once.flags[galaxy] & int(ForcedFlags.POOR_FIT) != 0, catalog["radius"][host[known]],
         ))  # fmt: skip
     told("these, one template", np.concatenate([one[0] for one in others]))
     told("these, two components", np.concatenate([one[1] for one in others]))
-    once, twice, point, snr, poor, radius = map(np.concatenate, zip(*rows, strict=True))
+    once, twice, point, snr, pull, point_pull, poor, radius = map(
+        np.concatenate, zip(*rows, strict=True)
+    )
     for low, high in ((5, 20), (20, 999)):
         use = (snr >= low) & (snr < high)
         print(f"  template S/N {low}-{high}: {poor[use].sum()} of {use.sum()} are poor fits")
+        told("total, one template", once[use])
+        told("total, two components", twice[use])
         split = use & np.isfinite(point)
-        told("total, one template", once[split])
-        told("total, two components", twice[split])
+        print(f"  {split.sum()} of {use.sum()} are split")
         told("point", point[split])
         told("point, galaxies above 0.2 arcsec", point[split & (radius > 0.2)])
+        for name, one in (("totals", pull[use]), ("points", point_pull[split])):
+            spread = 1.4826 * np.nanmedian(np.abs(one))
+            print(f"  scatter of the pulls of {name}: {spread:.2f}")
 
 
 def distortion(fields):

@@ -48,31 +48,27 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
     more = _More(bank, fit, catalog, grid_wcs)
     by_catalog = catalog.double is not None
     double = np.flatnonzero(catalog.double[catalog.near]) if by_catalog else np.empty(0, int)
+    new_xy, poor = np.empty((0, 2)), np.empty(0, int)
     choose = settings.components == 2 and not by_catalog
-    new_xy = np.empty((0, 2))
     if choose:
         # before templates may change, which hides some of the light of a point in their middle
-        double = _poor(fit, catalog, new_xy)
+        poor = _poor(fit, catalog, new_xy)
     if settings.second_pass:
         fit.free_templates(catalog.fitted)
-        found = diagnose(fit, catalog.xy).peaks
-        flux = np.full(len(catalog.xy), np.nan)
-        flux[catalog.near[fit.bank.order]] = fit.total
-        new = new_sources(found, catalog.xy + fit.displacement(catalog.xy), flux)
-        peaks = found.refined[new]
-        new_xy = peaks - fit.displacement(peaks)
-        if len(new_xy):
-            fit.bank.forget()
-            new_xy = more.refined(double, new_xy)
-            if choose:
-                # what is poorly fitted also with what was lacking beside it
-                double = _poor(more.fit(double[:0], new_xy), catalog, new_xy)
-    if len(double) or len(new_xy):
+        new_xy = _new_positions(fit, catalog)
+    if len(new_xy) or len(double):
         fit.bank.forget()
+        new_xy = more.refined(double, new_xy)
         fit = more.fit(double, new_xy)
+        if choose:
+            # what is poorly fitted also with what was lacking beside it
+            poor = _poor(fit, catalog, new_xy)
     if fit.free is None:
         fit.free_templates(catalog.fitted)
-    return fit, diagnose(fit, np.concatenate([catalog.xy, new_xy])), new_xy
+    diagnostics = diagnose(fit, np.concatenate([catalog.xy, new_xy]))
+    if len(poor):
+        fit, diagnostics = _split(fit, diagnostics, more, poor, new_xy)
+    return fit, diagnostics, new_xy
 
 
 def _poor(fit, catalog, new_xy):
@@ -82,11 +78,43 @@ def _poor(fit, catalog, new_xy):
     return np.sort(source[source < len(catalog.near)])
 
 
+def _new_positions(fit, catalog):
+    """Where the residual shows sources that the catalogue lacks, in the catalogue's frame."""
+    peaks = diagnose(fit, catalog.xy).peaks
+    flux = np.full(len(catalog.xy), np.nan)
+    flux[catalog.near[fit.bank.order]] = fit.total
+    new = new_sources(peaks, catalog.xy + fit.displacement(catalog.xy), flux)
+    return peaks.refined[new] - fit.displacement(peaks.refined[new])
+
+
+def _split(fit, diagnostics, more, poor, new_xy):
+    """Fit with second components of those sources that are better fitted with them."""
+
+    def chi2(fit, diagnostics):
+        found = np.empty(len(fit.host))
+        found[fit.bank.order] = diagnostics.chi2
+        return found[poor]
+
+    split, chosen = (fit, diagnostics), poor
+    before = chi2(*split)
+    fit.bank.forget()
+    for _ in range(2):
+        found = more.fit(chosen, new_xy)
+        found.free_templates(more.catalog.fitted)
+        split = found, diagnose(found, np.concatenate([more.catalog.xy, new_xy]))
+        better = poor[chi2(*split) < before]
+        if len(chosen) == len(better) or not len(better):
+            break
+        chosen = better
+        found.bank.forget()
+    return split if len(better) else (fit, diagnostics)
+
+
 class _More:
     """Fits of a bank's sources with points that are added, templates moved as in a first fit."""
 
     def __init__(self, bank, first, catalog, grid_wcs):
-        self._bank, self._catalog, self._grid_wcs = bank, catalog, grid_wcs
+        self._bank, self.catalog, self._grid_wcs = bank, catalog, grid_wcs
         self._arrays, self._settings, self._scale = first.arrays, first.settings, first.scale
         self._displacement, self._map = first.displacement, first.offset_map
         if first.shift is None and first.offset_map is None:
@@ -96,10 +124,10 @@ class _More:
     def fit(self, double, new_xy, **changes):
         """Fit with second components of some of the sources, and new sources after those."""
         settings = dataclasses.replace(self._settings, **changes)
-        arrays, near = self._arrays, self._catalog.near
+        arrays, near = self._arrays, self.catalog.near
         n = len(near)
         host = np.concatenate([np.arange(n), double, n + len(double) + np.arange(len(new_xy))])
-        all_xy = np.concatenate([self._catalog.xy[near], self._catalog.xy[near[double]], new_xy])
+        all_xy = np.concatenate([self.catalog.xy[near], self.catalog.xy[near[double]], new_xy])
         xy = all_xy[n:]
         half = settings.kernel.target.shape[0] // 2 + 1
         half = half * settings.kernel.pixel_scale.to_value(ANGLE) / self._scale / 2
@@ -114,7 +142,7 @@ class _More:
 
     def refined(self, double, new_xy):
         """Positions of new sources after some fits of where they are."""
-        first_new = len(self._catalog.near) + len(double)
+        first_new = len(self.catalog.near) + len(double)
         new_xy = new_xy.copy()
         for _ in range(_REFINED if len(new_xy) else 0):
             fit = self.fit(double, new_xy, max_shift=None)

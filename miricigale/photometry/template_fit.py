@@ -234,8 +234,8 @@ class TemplateFit:
             return
         known = not_fitted(len(self.bank.order))
         known[: len(fitted)] = fitted
-        # a point on top of a template says more than whether the template is one
-        known[self.host[self.bank.order[self.pairs[:, 1]]]] = not_fitted(1)
+        # a point on top of a template leaves open how it is shaped, not whether it is a point
+        known["point"][self.host[self.bank.order[self.pairs[:, 1]]]] = 0.0
         self.free = free_templates(
             self.fit,
             self.bank,
