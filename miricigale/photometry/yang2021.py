@@ -4,12 +4,11 @@ import dataclasses
 
 import astropy.units as u
 import numpy as np
-from astropy.nddata import StdDevUncertainty
 from astropy.wcs.utils import pixel_to_pixel
 
-from miricigale.photometry.arrays import image_arrays
 from miricigale.photometry.corrections import aperture_correction
 from miricigale.photometry.forced import ForcedPhotometer
+from miricigale.photometry.sources import SourceTemplates
 from miricigale.psf import MatchingKernel
 from miricigale.utils.exceptions import argument_error
 
@@ -17,8 +16,6 @@ __all__ = ["Yang2021Photometer"]
 
 #: The grid of images and templates, and the width of the PSF stamps.
 _PIXEL, _STAMP = 0.06 * u.arcsec, 3.0 * u.arcsec
-#: The prior's noise is made this much smaller: T-PHOT takes templates as they are.
-_NOISELESS = 1e-6
 
 
 class Yang2021Photometer:
@@ -54,12 +51,13 @@ class Yang2021Photometer:
 
     Notes
     -----
-    What differs from `~miricigale.photometry.ForcedPhotometer` with its own settings: templates are the bare
-    segments, without the light outside of them, whatever their signal-to-noise; the noise of the
-    high-resolution image counts nowhere; kernels are as above; the image is on pixels of 0.06 arcsec, on which the
-    noise is correlated, and errors take it as white. No background is fitted. The equations are those of the
-    package (all sources at once), not T-PHOT's cells; T-PHOT's second pass, in which kernels are shifted
-    locally, is not here.
+    What differs from `~miricigale.photometry.ForcedPhotometer` with its own settings: templates are the
+    bare segments, without the light outside of them, whatever their signal-to-noise (sources whose segment has
+    no positive light are points); the noise of the high-resolution image and errors of the PSF count
+    nowhere; kernels are as above; the image is on pixels of 0.06 arcsec, on which the noise is
+    correlated, and errors take it as white. No background is fitted: the light of bright sources beyond the
+    stamps is left in the image, which a warning may take for one. The equations are those of the package (all
+    sources at once), not T-PHOT's cells; T-PHOT's second pass, in which kernels are shifted locally, is not here.
 
     References
     ----------
@@ -85,12 +83,13 @@ class Yang2021Photometer:
         self.aperture = aperture_correction(target, _STAMP / 2)
         self._photometer = ForcedPhotometer(
             self.kernel,
-            template="cutout",
-            wings=False,
             correlated_noise=False,
+            # errors are those of the image's noise alone
             size_scatter=None,
+            psf_error=0.0,
             n_threads=n_threads,
         )
+        self._n_threads = n_threads
 
     def __repr__(self):
         return (
@@ -120,20 +119,21 @@ class Yang2021Photometer:
         ValueError
             If the image is not on the pixels of ``highres`` (of the same or another extent).
         """
-        image_arrays(image, "image")
-        prior = image_arrays(highres, "highres")
         _require_same_pixels(image, highres)
-        # as brightness, which the uncertainty of the image may not be given in
-        noise = StdDevUncertainty(
-            np.where(prior.usable, _NOISELESS * prior.sigma / prior.area, 0.0)
+        templates = SourceTemplates.from_images(
+            highres,
+            segmentation,
+            catalog,
+            psf=self.kernel.source,
+            template="cutout",
+            wings=False,
+            n_threads=self._n_threads,
         )
-        clean = highres.copy()
-        clean.data = prior.flux / prior.area
-        clean.unit = u.MJy / u.sr
-        clean.uncertainty = noise
-        clean.mask = ~prior.usable
+        # T-PHOT takes templates as they are: nothing is taken off for their noise
+        light = [one and dataclasses.replace(one, noise=0.0) for one in templates.light]
+        templates = dataclasses.replace(templates, light=light)
         scaled = image.multiply(self.scaling, handle_meta="first_found")
-        result = self._photometer.measure(scaled, clean, segmentation, catalog)
+        result = self._photometer.measure(scaled, templates=templates)
         totals = {}
         for field in dataclasses.fields(result):
             value = getattr(result, field.name)
@@ -144,7 +144,6 @@ class Yang2021Photometer:
         return dataclasses.replace(
             result,
             **totals,
-            template_snr=result.template_snr * _NOISELESS,
             meta={
                 **result.meta,
                 "method": "yang2021",

@@ -57,7 +57,7 @@ def folder(tmp_path_factory):
         wcs = north_up_wcs(CENTER, scale * u.arcsec, (size, size))
         wcs.pixel_shape = size, size
         image = Scene(catalog, filter=BAND, wcs=wcs, psf=mosaic_psf(config, BAND, scale)).render()
-        noise = np.full(image.shape, 0.01 * 0.06 / scale)
+        noise = np.full(image.shape, 0.1 * 0.06 / scale)
         data = image.data + rng.normal(0, noise)
         made.save_image(
             f"mosaic_{BAND}{suffix}.fits",
