@@ -52,6 +52,8 @@ def scene(tools):
 def assert_same(one, other):
     for name in ("id", "flags", "snr", "sersic", "psf"):
         assert_array_equal(getattr(one, name), getattr(other, name))
+    for name in one.fitted.dtype.names:
+        assert_array_equal(one.fitted[name], other.fitted[name])
     assert_array_equal(one.sky.ra.deg, other.sky.ra.deg)
     assert_array_equal(one.sky.dec.deg, other.sky.dec.deg)
     for a, b in zip(one.light, other.light, strict=True):
