@@ -12,6 +12,8 @@ from photutils.segmentation import SegmentationImage
 from miricigale.photometry.arrays import image_arrays, pixel_scale
 from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.error_calibration import ErrorCalibration
+from miricigale.photometry.flags import ForcedFlags
+from miricigale.photometry.priors import labels_at
 from miricigale.photometry.shapes import ShapeModels
 from miricigale.photometry.sources import SourceTemplates
 from miricigale.profiles import sersic_stamp
@@ -28,6 +30,9 @@ _POINT = 0.05
 
 #: Least distance of two injected sources in widths of the PSF (FWHM), and attempts to place each.
 _APART, _ATTEMPTS = 4.0, 50
+
+#: Flags with which a source may still be copied.
+_HARMLESS = ForcedFlags.BLENDED | ForcedFlags.POOR_FIT | ForcedFlags.UNEXPLAINED_NEIGHBOUR
 
 #: Half-width (fine pixels) of the stamps that are injected into the prior, least and most.
 _HALF, _MOST = 16, 96
@@ -167,10 +172,8 @@ class _Field:
         if "label" in catalog.colnames:
             self.own = np.asarray(catalog["label"], int)
         else:
-            x, y = np.rint(np.array(highres.wcs.world_to_pixel(catalog["sky"]))).astype(int)
-            inside = (x >= 0) & (y >= 0) & (x < self.labels.shape[1]) & (y < self.labels.shape[0])
-            self.own = np.zeros(len(catalog), int)
-            self.own[inside] = self.labels[y[inside], x[inside]]
+            xy = np.stack(highres.wcs.world_to_pixel(catalog["sky"]), axis=-1).reshape(-1, 2)
+            self.own, _ = labels_at(self.labels, xy)
         places = scipy.ndimage.find_objects(self.labels)
         usable = self.base.flags & ~int(_HARMLESS) == 0
         kinds = templates.kind
@@ -313,10 +316,6 @@ class _Field:
         target = image[y0 : y + half + 1, x0 : x + half + 1]
         i, j = y0 - (y - half), x0 - (x - half)
         target += stamp[i : i + target.shape[0], j : j + target.shape[1]]
-
-
-#: Flags with which a source may still be copied.
-_HARMLESS = 8 | 256 | 512
 
 
 def _profile(parameters, reach):
