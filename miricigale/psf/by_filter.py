@@ -29,9 +29,9 @@ _OTHER_WIDTH, _NARROWER, _WIDER = 1.5, 0.05, 0.15
 #: How far a sum may be from the fraction of light that the model's grid holds to be taken for it, and
 #: the sum from which on a PSF counts as normalised on its own grid.
 _NEAR_SUM, _UNIT_SUM = 0.05, 0.995
-#: Least correlation with the model in the detector's axes, and how much better it must be than that
-#: with the model turned to the sky.
-_CORRELATED, _BETTER = 0.4, 0.3
+#: Least strength of the spikes in the detector's axes, in units of the model's, and by how much and how
+#: many standard deviations it must exceed that of spikes turned to the sky.
+_STRENGTH, _BETTER, _SIGNIFICANT = 0.4, 0.3, 5.0
 
 
 def filter_psf(filter, *, pixel_scale, pa=None, grid_angle=0.0 * u.deg, resampling="drizzle"):
@@ -130,8 +130,16 @@ def checked_psf(
     else:
         model = filter_psf(filter, pa=angle if pa is None else pa, **form)
     x, y, _ = _core.core_moments(info.data)
-    width = _core.half_maximum_width(info.data, x, y) * info.cell
-    ratio = width / model.meta["fwhm"]
+    if not np.isfinite(x + y):
+        # too few pixels in the core
+        x, y = info.origin
+    ny, nx = info.data.shape
+    place = {"pixel_scale": info.cell * ANGLE, "shape": (ny, nx)}
+    place["offset"] = (x - (nx - 1) / 2, y - (ny - 1) / 2)
+    stamp = psf_image(model, **place)
+    # both as these cells show them, which may be coarse
+    width, usual = (_core.half_maximum_width(data, x, y) * info.cell for data in (info.data, stamp))
+    ratio = width / usual
     if smoothed and ratio > _OTHER_WIDTH:
         msg = (
             f"'{argument}' is {ratio:.2g} times as wide (FWHM {width:.3g} arcsec) as the model of "
@@ -140,13 +148,9 @@ def checked_psf(
         warnings.warn(msg, MiricigaleWarning, stacklevel=2)
         return psf
     if not 1 / _OTHER_WIDTH < ratio < _OTHER_WIDTH:
-        wanted = f"a PSF of {filter}, about {model.meta['fwhm']:.3g} arcsec wide (FWHM)"
+        wanted = f"a PSF of {filter}, about {usual:.3g} arcsec wide (FWHM)"
         got = f"one of {width:.3g} arcsec with pixels of {info.cell:.4g} arcsec: is that its pixel?"
         raise argument_error(argument, wanted, got)
-    ny, nx = info.data.shape
-    place = {"pixel_scale": info.cell * ANGLE, "shape": (ny, nx)}
-    place["offset"] = (x - (nx - 1) / 2, y - (ny - 1) / 2)
-    stamp = psf_image(model, **place)
     if pa is not None and info.frame == "sky" and filter not in WFC3_FILTERS:
         other = filter_psf(filter, pa=angle, **form)
         other = psf_image(other, **place)
@@ -185,16 +189,19 @@ def _check_turn(info, center, stamps, about, argument):
         return (image[where] - mean[ring[where]]) * radius[where]
 
     given, turned, plain = (spikes(one) for one in (info.data, *stamps))
-    norm = math.sqrt(given @ given)
-    on_sky, on_detector = (
-        float(given @ one) / (norm * math.sqrt(one @ one) or 1.0) for one in (turned, plain)
-    )
-    _log.info("'%s': spikes follow the model at %.3g (turned), %.3g", argument, on_sky, on_detector)
-    if on_detector > max(_CORRELATED, on_sky + _BETTER):
+    given = given * (stamps[0].sum() / info.data.sum())
+    on_sky, on_detector = (float(given @ one) / float(one @ one) for one in (turned, plain))
+    noise = np.std(given - on_detector * plain) / math.sqrt(plain @ plain)
+    _log.info(
+        "'%s': spikes as strong as %.3g (turned) and %.3g (detector) +- %.2g times the model's",
+        argument, on_sky, on_detector, noise,
+    )  # fmt: skip
+    better = max(_BETTER, _SIGNIFICANT * math.sqrt(2) * noise)
+    if on_detector > max(_STRENGTH, on_sky + better):
         wanted = f"turned to the image, as the model of {filter_} at PA_APER {pa:.4g} is"
         got = (
-            f"one whose spikes stand as in the detector's axes (correlation {on_detector:.2f}, "
-            f"turned {on_sky:.2f}): state the angle of its +y"
+            f"one whose spikes stand as in the detector's axes ({on_detector:.2f} times those of the "
+            f"model, turned {on_sky:.2f}): state the angle of its +y"
         )
         raise argument_error(argument, wanted, got)
 

@@ -94,3 +94,22 @@ def test_exposures_are_sharper_than_mosaics(mosaic):
             "miri.f770w", pa=75 * u.deg,
         )  # fmt: skip
     assert np.isclose(mosaic.meta["fwhm"] / exposure.meta["fwhm"], 1.065, atol=0.01)
+
+
+def test_noise_and_coarse_pixels_refuse_nothing(mosaic):
+    """The turn is told from noisy PSFs too, and never of those that stand right."""
+    rng = np.random.default_rng(1)
+    for turn in (0, 75):
+        data = stamp(filter_psf("miri.f770w", pixel_scale=PIXEL, pa=turn * u.deg), 55)
+        psf = make_psf(data + rng.normal(0, data.max() / 500, data.shape), **SKY)
+        if turn == 75:
+            assert checked_psf(psf, "miri.f770w", pa=75 * u.deg) is not None
+            continue
+        with pytest.raises(ValueError, match="whose spikes stand as in the detector's axes"):
+            checked_psf(psf, "miri.f770w", pa=75 * u.deg)
+    # 1.3 pixels wide
+    coarse = {"pixel_scale": 0.06 * u.arcsec}
+    psf = filter_psf("nircam.f115w", **coarse, pa=0 * u.deg)
+    data = psf_image(psf, **coarse, shape=51)
+    psf = make_psf(data, **coarse, frame="sky")
+    assert checked_psf(psf, "nircam.f115w", pa=0 * u.deg, **coarse) is not None
