@@ -17,7 +17,6 @@ from miricigale.photometry.error_curves import (
     measured_curve,
     same_rows,
 )
-from miricigale.photometry.exposure_errors import exposure_curve
 from miricigale.utils.exceptions import DataError, argument_error, unknown_name
 from miricigale.utils.files import read_ecsv, writing
 from miricigale.utils.meta import provenance
@@ -284,6 +283,9 @@ class ErrorModel:
         ``size`` and by what is not known of their templates (``flux_err_template`` of
         `ForcedPhotometryResult`).
         """
+        # loads photutils, which a command that reads depths does without
+        from miricigale.photometry.exposure_errors import exposure_curve
+
         curve = exposure_curve(
             filter,
             time,

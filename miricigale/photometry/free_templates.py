@@ -26,7 +26,7 @@ class FreeTemplates:
     Changes of templates as further columns of a fit, each with a Gaussian prior.
 
     A change is scaled by the flux of its source, as far as it is one standard deviation; its light is
-    taken off the template, so that the fluxes stay those of all light.
+    taken off the template, so that the fluxes stay those of all light. Fixed changes belong to the template.
 
     Attributes
     ----------
@@ -34,8 +34,12 @@ class FreeTemplates:
         Of the fluxes, and after them of the changes.
     bank : `~miricigale.photometry.templates.TemplateBank`
         The changes.
-    light : sparse array, shape (n, m)
-        Light of each change, in the row of its source.
+    n : int
+        Number of fluxes.
+    basis : sparse array, shape (n + k, n + m)
+        Columns of the fit in terms of the templates and of all k changes, those that are fixed among them.
+    owner : int `~numpy.ndarray`, shape (m,)
+        Source of each change that is fitted.
     prior : `~numpy.ndarray`, shape (n + m,)
         Inverse variances, zero for fluxes.
     noise : `~numpy.ndarray`, shape (n,)
@@ -44,33 +48,34 @@ class FreeTemplates:
 
     fit: LinearFit
     bank: object
-    light: object
+    n: int
+    basis: object
+    owner: np.ndarray
     prior: np.ndarray
     noise: np.ndarray
 
     @property
     def flux(self):
         """Fluxes, shape (n,)."""
-        return self.fit.flux[: len(self.noise)]
+        return self.fit.flux[: self.n]
 
     @property
     def amplitudes(self):
-        """Of the templates and of the changes, shape (n,) and (m,)."""
-        change = self.fit.flux[len(self.noise) :]
-        return self.flux - self.light @ change, change
+        """Of the templates and of all changes, shape (n,) and (k,)."""
+        found = self.basis @ self.fit.flux
+        return found[: self.n], found[self.n :]
 
     @property
     def xy(self):
-        """Positions of the changes, shape (m, 2)."""
-        return self.bank.xy
+        """Positions of the changes that are fitted, shape (m, 2)."""
+        return self.bank.xy[self.basis[self.n :, self.n :].tocsc().indices]
 
     def alone(self):
         """What blending with its own changes leaves of each source's power, shape (n,)."""
-        n = len(self.noise)
+        n = self.n
         matrix, left = self.fit.matrix.tocsr(), np.ones(n)
-        owner = self.light.tocoo()
-        owner = owner.row[np.argsort(owner.col)]
         power = matrix.diagonal()
+        owner = self.owner
         for k in np.unique(owner):
             own = n + np.flatnonzero(owner == k)
             side = matrix[own][:, [k]].toarray()[:, 0]
@@ -123,7 +128,7 @@ class FreeTemplates:
         """
         own, more = sandwich_matrix(self.bank, inverse_sigma, correlation, images)
         cross = cross_matrix(bank, self.bank, inverse_sigma, correlation).tocsr()[rows]
-        return _joined(middle, cross, own, self.light), _below(border, more, self.light)
+        return _joined(middle, cross, own, self.basis), _below(border, more, self.basis)
 
 
 def free_templates(plain, bank, rows, fitted, changes, images, inverse_sigma):
@@ -176,31 +181,41 @@ def free_templates(plain, bank, rows, fitted, changes, images, inverse_sigma):
     every = [one for some, _ in found for one in some]
     other = bank.at_resolution(bank.order[rows[owner]], [one.cutout for one in every])
     owner = owner[other.order]
-    n, m = len(rows), len(owner)
-    light = np.array([one.light for one in every])[other.order]
-    light = scipy.sparse.coo_array((light, (owner, np.arange(m))), shape=(n, m)).tocsr()
+    fixed = np.array([one.fixed for one in every], bool)[other.order]
+    basis = _basis(len(rows), owner, np.array([one.light for one in every])[other.order], fixed)
     own, projection, _, _ = normal_matrix(other, inverse_sigma, images)
     cross = cross_matrix(bank, other, inverse_sigma).tocsr()[rows]
-    prior = np.concatenate([np.zeros(n), plain.flux[owner] ** -2.0])
-    matrix = _joined(plain.matrix, cross, own, light) + scipy.sparse.diags_array(prior)
+    owner = owner[~fixed]
+    prior = np.concatenate([np.zeros(len(rows)), plain.flux[owner] ** -2.0])
+    matrix = _joined(plain.matrix, cross, own, basis) + scipy.sparse.diags_array(prior)
     fit = LinearFit(
         matrix.tocsr(),
-        _below(plain.rhs, projection[:, 0], light),
-        _below(plain.border, projection[:, 1:], light),
+        _below(plain.rhs, projection[:, 0], basis),
+        _below(plain.border, projection[:, 1:], basis),
         plain.corner,
         plain.corner_rhs,
     )
-    return FreeTemplates(fit, other, light, prior, noise)
+    return FreeTemplates(fit, other, len(rows), basis, owner, prior, noise)
 
 
-def _joined(main, cross, own, light):
-    """Matrix of templates and of changes less their light in the template."""
-    product = cross.T @ light
-    side = cross - main @ light
-    own = own - product - product.T + light.T @ main @ light
-    return scipy.sparse.block_array([[main, side], [side.T, own]]).tocsr()
+def _basis(n, owner, light, fixed):
+    """Templates with their fixed changes, and the other changes less their light in the template."""
+    k = np.arange(len(owner))
+    column = np.where(fixed, owner, n + np.cumsum(~fixed) - 1)
+    free = ~fixed
+    rows = np.concatenate([np.arange(n), n + k, owner[free]])
+    columns = np.concatenate([np.arange(n), column, column[free]])
+    values = np.concatenate([np.ones(n + len(k)), -light[free]])
+    shape = (n + len(k), n + int(np.count_nonzero(free)))
+    return scipy.sparse.coo_array((values, (rows, columns)), shape=shape).tocsr()
 
 
-def _below(main, own, light):
-    """Right-hand sides of templates and of changes less their light in the template."""
-    return np.concatenate([main, own - light.T @ main])
+def _joined(main, cross, own, basis):
+    """Matrix of the columns of a basis."""
+    whole = scipy.sparse.block_array([[main, cross], [cross.T, own]]).tocsr()
+    return (basis.T @ whole @ basis).tocsr()
+
+
+def _below(main, own, basis):
+    """Right-hand sides of the columns of a basis."""
+    return basis.T @ np.concatenate([main, own])

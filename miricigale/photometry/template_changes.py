@@ -23,18 +23,22 @@ _POINT, _LINEAR = 0.05, 0.15
 @dataclasses.dataclass(frozen=True, eq=False)
 class Change:
     """
-    One standard deviation of a template along one direction.
+    How a template changes along one direction.
 
     Attributes
     ----------
     cutout : `~miricigale.photometry.cutouts.Cutout`
-        The change on the fine grid, at the resolution of the image.
+        The change by one standard deviation on the fine grid, at the resolution of the image.
     light : float
         How much light it adds.
+    fixed : bool
+        Whether it is no deviation but the mean's: what all templates that are possible have in the mean
+        beyond the one that fits best.
     """
 
     cutout: Cutout
     light: float = 0.0
+    fixed: bool = False
 
 
 class TemplateChanges:
@@ -43,7 +47,9 @@ class TemplateChanges:
 
     The covariance of the profile's parameters, the position apart, is turned to the directions that are independent
     of each other at the image's resolution. Between point and profile the difference of the two
-    counts, times the root of the probability of the one that was not taken.
+    counts as the probabilities say. The mean of all that is possible is another than the template that
+    fits best: half of what two steps to either side differ from it, and the other of point and profile times its
+    probability.
 
     Parameters
     ----------
@@ -106,17 +112,24 @@ class TemplateChanges:
             point = _as_point(images, parameters) if 0 < fitted["point"] < 1 else None
             template = point if cutout is None and point is not None else profile
             limit = least**2 * np.sum(template**2)
+        mean = np.zeros_like(profile)
         for step in _steps(_root(share * spread), derivatives, limit):
             change = np.tensordot(step, derivatives, 1)
             if np.max(np.abs(step[2:])) > _LINEAR:
                 sides = [images(_moved(parameters, sign * step))[0] for sign in (1, -1)]
                 change = 0.5 * (sides[0] - sides[1])
+                mean += 0.5 * (sides[0] + sides[1]) - profile
             found.append(Change(Cutout(change, origin)))
         if point is not None:
-            odds = share if cutout is None else fitted["point"]
-            change = np.sqrt(odds) * (point - profile)
+            odds = fitted["point"]
+            change = np.sqrt(odds * (1.0 - odds)) * (point - profile)
+            mean += (1.0 - odds if cutout is None else odds) * (
+                profile - point if cutout is None else point - profile
+            )
             if np.sum(change**2) > limit:
                 found.append(Change(Cutout(change, origin)))
+        if np.sum(mean**2) > limit:
+            found.append(Change(Cutout(mean, origin), fixed=True))
         return found, noise
 
     def _of_image(self, cutout, fitted, least):
@@ -135,7 +148,9 @@ class TemplateChanges:
         power = np.sum(template**2)
         changes = [
             Change(Cutout(np.tensordot(step, derivatives, 1), rest.origin), float(step @ light))
-            for step in _steps(_root(_of_shape(fitted["covariance"])), derivatives, least**2 * power)
+            for step in _steps(
+                _root(_of_shape(fitted["covariance"])), derivatives, least**2 * power
+            )
         ]
         # each pixel adds to the light, and to what is taken off by the fit
         weight = 1.0 - self._blurred(template) / power

@@ -77,16 +77,38 @@ def test_changes_that_do_not_matter_are_left_out(changes):
 
 
 def test_between_point_and_profile_the_other_counts_by_its_probability(changes):
-    (chosen,), _ = changes.of(PROFILE, record(4.0, np.zeros(6), point=0.1), 1e-6)
-    (point,), _ = changes.of(None, record(4.0, np.zeros(6), point=0.9), 1e-6)
-    # the same difference of the two, each with the root of 0.1
+    (chosen, mean), _ = changes.of(PROFILE, record(4.0, np.zeros(6), point=0.1), 1e-6)
+    (point, mean_of_point), _ = changes.of(None, record(4.0, np.zeros(6), point=0.9), 1e-6)
+    # a choice of probability 0.1: mean 0.1 and variance 0.1 * 0.9 of the difference
+    assert [one.fixed for one in (chosen, mean, mean_of_point)] == [False, True, True]
     assert_allclose(chosen.cutout.data, point.cutout.data, atol=1e-9)
+    assert_allclose(mean.cutout.data, chosen.cutout.data * 0.1 / 0.3, atol=1e-9)
+    assert_allclose(mean_of_point.cutout.data, -mean.cutout.data, atol=1e-9)
     template = pixels(301, np.sqrt(32.0), 120.2, 69.7)
     y, x = np.indices(chosen.cutout.data.shape)
     x0, y0 = chosen.cutout.origin[::-1]
     other = pixels(301, 4.0, 120.2, 69.7)
-    expected = np.sqrt(0.1) * (other - template)[y + y0, x + x0]
+    expected = 0.3 * (other - template)[y + y0, x + x0]
     assert_allclose(chosen.cutout.data, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_the_mean_of_possible_sizes_is_another_template(changes):
+    """ln sigma of normal distribution: the mean template is that of all draws."""
+    width = 0.25
+    found, _ = changes.of(PROFILE, record(4.0, [0, 0, width, 0, 0, 0]), 1e-3)
+    assert [one.fixed for one in found] == [False, True]
+    mean = found[1].cutout
+    y, x = np.indices(mean.data.shape)
+    at = y + mean.origin[0], x + mean.origin[1]
+    template = pixels(301, np.hypot(4.0, 4.0), 120.2, 69.7)[at]
+    # by Gauss-Hermite quadrature
+    nodes, weights = np.polynomial.hermite_e.hermegauss(9)
+    drawn = [
+        pixels(301, np.hypot(4.0 * np.exp(width * one), 4.0), 120.2, 69.7)[at] for one in nodes
+    ]
+    expected = np.tensordot(weights / weights.sum(), drawn, axes=1) - template
+    assert_allclose(mean.data, expected, atol=0.1 * np.abs(expected).max())
+    assert_allclose(mean.data.sum(), 0, atol=1e-3)
 
 
 def test_noise_of_the_image_in_the_core(changes):
@@ -200,18 +222,14 @@ def test_a_blend_is_solved_as_by_dense_algebra(blend, monkeypatch):
     fit = kept[0]
     shape = blend.low.shape
     templates, changes = images(fit.bank, shape)[fit.rows], images(fit.free.bank, shape)
-    light = fit.free.light.toarray()
     member = fit.bank.order[fit.rows]
-    owner = np.argmax(fit.free.fit.matrix[len(member) :, : len(member)].toarray() != 0, axis=1)
-    assert light.shape == (len(member), len(changes))
-    assert len(changes) >= 6
-    columns = np.concatenate([templates, changes - light.T @ templates])
+    assert len(fit.free.owner) >= 4
+    columns = fit.free.basis.T @ np.concatenate([templates, changes])
     inverse = fit.inverse_sigma.ravel()
     prior = np.sqrt(fit.free.prior)
     # the prior of each change is the flux of the fit with exact templates
     known = np.unique(1 / prior[len(member) :])
     assert np.all(np.min(np.abs(known[:, None] / exact.flux.value - 1), axis=1) < 1e-6)
-    assert len(np.unique(owner)) >= len(known) - 1
     white = np.concatenate([(columns * inverse).T, np.diag(prior)])
     data = np.concatenate([(fit.arrays.flux * fit.inverse_sigma).ravel(), np.zeros(len(columns))])
     solution = np.linalg.lstsq(white, data)[0]
