@@ -45,11 +45,11 @@ class TemplateChanges:
     """
     Finds the independent changes of a template that its fit to the high-resolution image leaves open.
 
-    The covariance of the profile's parameters, the position apart, is turned to the directions that are independent
-    of each other at the image's resolution. Between point and profile the difference of the two
+    The covariance of the profile's parameters, the position apart, is turned to the directions that are
+    independent of each other at the image's resolution. Between point and profile the difference of the two
     counts as the probabilities say. The mean of all that is possible is another than the template that
-    fits best: half of what two steps to either side differ from it, and the other of point and profile times its
-    probability.
+    fits best: half of what two steps to either side differ from it, and the other of point and profile
+    times its probability.
 
     Parameters
     ----------
