@@ -333,6 +333,7 @@ def test_a_real_field_agrees_with_another_program(tmp_path, capsys):
     theirs = np.asarray(other["flux_1"]) / 4 * 0.01
     bright = (ours > 10 * error) & np.isfinite(theirs)
     assert np.count_nonzero(bright) >= 15
-    assert 0.87 < np.median(ours[bright] / theirs[bright]) < 1.15
+    # light beyond their segments, and sizes that differ between the bands: see the guide
+    assert 0.97 < np.median(ours[bright] / theirs[bright]) < 1.10
     faint = (ours < 10 * error) & np.isfinite(theirs)
     assert np.abs(np.median(((ours - theirs) / error)[faint])) < 0.5
