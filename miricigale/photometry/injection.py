@@ -11,6 +11,7 @@ from photutils.segmentation import SegmentationImage
 
 from miricigale.photometry.arrays import image_arrays, pixel_scale
 from miricigale.photometry.cutouts import Cutout
+from miricigale.photometry.detection import bright_centroids
 from miricigale.photometry.error_calibration import ErrorCalibration
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.priors import labels_at
@@ -91,7 +92,7 @@ def calibrate_errors(
     Notes
     -----
     Injected galaxies have the shapes of the fits, so that what no profile describes (arms, clumps) is not in the
-    scatter; their positions are those of the light that is seen in their segment.
+    scatter; their positions are those that detection finds.
     """
     template = getattr(photometer, "template", None)
     if template not in ("auto", "cutout", "psf"):
@@ -282,17 +283,13 @@ class _Field:
             light.append(_profile(parameters, self.reach))
         if not rows:
             raise argument_error("image", "with room for sources", "none")
-        noisy = self.fine.flux + data
-        centroids = []
-        for label, cut, _, _ in rows:
-            # where detection would put it: the middle of the light in its segment
-            y, x = np.nonzero(labels[cut] == label)
-            values = np.maximum(noisy[cut][y, x], 0.0)
-            middle = np.array([np.sum(x * values), np.sum(y * values)]) / max(values.sum(), 1e-300)
-            centroids.append(middle + [cut[1].start, cut[0].start])
-        catalog = QTable(
-            {"sky": wcs.pixel_to_world(*np.array(centroids).T).transform_to(self.sky.frame)}
-        )
+        # positions are those that detection would find
+        own = np.zeros(labels.shape, int)
+        for k, (label, cut, *_) in enumerate(rows, 1):
+            own[cut][labels[cut] == label] = k
+        middle = np.array([(c[1].start + c[1].stop, c[0].start + c[0].stop) for _, c, *_ in rows])
+        x, y = bright_centroids(self.fine.flux + data, own, (middle - 1).T / 2)
+        catalog = QTable({"sky": wcs.pixel_to_world(x, y).transform_to(self.sky.frame)})
         catalog["label"] = [label for label, *_ in rows]
         flux = np.array([total for *_, total in rows])
         kinds = ["point" if donor.point else "galaxy" for _, _, donor, _ in rows]
