@@ -77,8 +77,9 @@ class ForcedPhotometer:
         Whether templates are averaged over the image's pixels, for a kernel whose target
         does not include the response of the pixel.
     components : {1, 2}, optional
-        With 2, sources whose fit is poor (``POOR_FIT``) are fitted once more as their template and a point
-        on top of it. Column ``components`` of the catalogue (1 or 2) says which those are instead.
+        With 2, sources whose template without error fits poorly are fitted once more as their template and
+        a point on top of it, and stay so where chi-square is less than without the point. Column
+        ``components`` of the catalogue (1 or 2) says which those are instead.
     second_pass : bool, optional
         Whether peaks of the residual that the catalogue lacks are fitted together with it, as
         points; they are listed in ``new_sources`` of the result.

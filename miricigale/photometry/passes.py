@@ -54,7 +54,7 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
         # before templates may change, which hides some of the light of a point in their middle
         poor = _poor(fit, catalog, new_xy)
     if settings.second_pass:
-        fit.free_templates(catalog.fitted)
+        # templates that may change take in some of the light of what is beside them
         new_xy = _new_positions(fit, catalog)
     if len(new_xy) or len(double):
         fit.bank.forget()
