@@ -304,14 +304,29 @@ def cross_matrix(bank, other, inverse_sigma, correlation=None):
     """
     rows, columns, values = [], [], []
     spread = None if correlation is None else _spread_by(correlation, other)
+    waiting, live = bank.blocks(), []
     for theirs in other.blocks():
         right = (_whitened(other, theirs, inverse_sigma)[0], theirs.box, theirs.start)
         if spread is not None:
             right = spread(theirs, right)
-        for mine in bank.blocks():
-            pairs = _overlaps(mine.box, right[1])
+        # of the first bank, those blocks only that this one and those after it can overlap
+        first, last = right[1][0, 0], (right[1][:, 0] + right[1][:, 2]).max()
+        live = [one for one in live if one[1] > first]
+        while not live or live[-1][0].box[0, 0] < last:
+            mine = next(waiting, None)
+            if mine is None:
+                break
+            values_of = _whitened(bank, mine, inverse_sigma)[0]
+            live.append(
+                (
+                    mine,
+                    int((mine.box[:, 0] + mine.box[:, 2]).max()),
+                    (values_of, mine.box, mine.start),
+                )
+            )
+        for mine, _, left in live:
+            pairs = _core.cross_pairs(mine.box, right[1])
             if len(pairs):
-                left = (_whitened(bank, mine, inverse_sigma)[0], mine.box, mine.start)
                 values.append(_products(bank, left, right, pairs))
                 rows.append(pairs[:, 0] + mine.first)
                 columns.append(pairs[:, 1] + theirs.first)
@@ -320,19 +335,6 @@ def cross_matrix(bank, other, inverse_sigma, correlation=None):
         return scipy.sparse.csr_array(shape)
     where = (np.concatenate(rows), np.concatenate(columns))
     return scipy.sparse.coo_array((np.concatenate(values), where), shape=shape).tocsr()
-
-
-def _overlaps(boxes, others):
-    """Pairs of two sets of boxes, the first sorted by its first row, that share pixels."""
-    found = []
-    tallest = boxes[:, 2].max(initial=0)
-    for j, (y0, x0, ny, nx) in enumerate(others):
-        low, high = np.searchsorted(boxes[:, 0], [y0 - tallest, y0 + ny])
-        y, x, h, w = boxes[low:high].T
-        seen = (y + h > y0) & (x < x0 + nx) & (x + w > x0) & (h > 0) & (ny > 0) & (nx > 0)
-        i = low + np.flatnonzero(seen)
-        found.append(np.stack([i, np.full(len(i), j)], axis=1))
-    return np.concatenate(found).astype(np.int32) if found else np.empty((0, 2), np.int32)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

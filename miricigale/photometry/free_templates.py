@@ -72,14 +72,28 @@ class FreeTemplates:
 
     def alone(self):
         """What blending with its own changes leaves of each source's power, shape (n,)."""
-        n = self.n
-        matrix, left = self.fit.matrix.tocsr(), np.ones(n)
-        power = matrix.diagonal()
-        owner = self.owner
-        for k in np.unique(owner):
-            own = n + np.flatnonzero(owner == k)
-            side = matrix[own][:, [k]].toarray()[:, 0]
-            left[k] -= side @ np.linalg.solve(matrix[own][:, own].toarray(), side) / power[k]
+        n, owner = self.n, self.owner
+        matrix, left = self.fit.matrix.tocoo(), np.ones(n)
+        if not len(owner):
+            return left
+        # the changes of each source by turns, in matrices that are filled up with ones
+        order = np.argsort(owner, kind="stable")
+        sources, first, count = np.unique(owner[order], return_index=True, return_counts=True)
+        turn = np.empty(len(owner), int)
+        turn[order] = np.arange(len(owner)) - np.repeat(first, count)
+        place = np.searchsorted(sources, owner)
+        block = np.tile(np.eye(count.max()), (len(sources), 1, 1))
+        side = np.zeros((len(sources), count.max()))
+        change = matrix.row - n
+        own = (change >= 0) & (matrix.col >= n)
+        own[own] = owner[change[own]] == owner[matrix.col[own] - n]
+        i, j = change[own], matrix.col[own] - n
+        block[place[i], turn[i], turn[j]] = matrix.data[own]
+        own = (change >= 0) & (matrix.col < n)
+        own[own] = owner[change[own]] == matrix.col[own]
+        side[place[change[own]], turn[change[own]]] = matrix.data[own]
+        lost = np.einsum("kq,kq->k", side, np.linalg.solve(block, side[..., None])[..., 0])
+        left[sources] -= lost / self.fit.matrix.diagonal()[sources]
         return left
 
     def filling(self, middle):

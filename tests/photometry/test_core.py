@@ -102,6 +102,23 @@ def test_pairs_are_all_that_overlap(stamps):
         assert found == expected
 
 
+def test_pairs_of_two_sets_are_all_that_overlap(stamps):
+    box, _, _ = stamps
+    other = np.concatenate([box[::2] + np.array([-3, 2, 4, 1]), [[20, 20, 0, 4], [5, 5, 40, 3]]])
+    other = other[np.argsort(other[:, 0], kind="stable")]
+    found = [tuple(p) for p in _core.cross_pairs(box, other)]
+    expected = set()
+    for i, (y0, x0, ny, nx) in enumerate(box):
+        for j, (v0, u0, nv, nu) in enumerate(other):
+            rows = set(range(y0, y0 + ny)) & set(range(v0, v0 + nv))
+            columns = set(range(x0, x0 + nx)) & set(range(u0, u0 + nu))
+            if rows and columns:
+                expected.add((i, j))
+    assert len(found) == len(expected) > 10
+    assert set(found) == expected
+    assert len(_core.cross_pairs(box[:0], other)) == 0
+
+
 def test_products_projections_and_models_are_those_of_dense_images(stamps):
     box, start, values = stamps
     images = dense(box, start, values)

@@ -19,6 +19,7 @@ from miricigale.photometry._core.solve import block_covariance, factorize
 from miricigale.photometry._core.stamps import (
     add_model,
     convolve_stamps,
+    cross_pairs,
     find_pairs,
     pair_products,
     projections,
@@ -34,6 +35,7 @@ __all__ = [
     "box_response",
     "convolve_batch",
     "convolve_stamps",
+    "cross_pairs",
     "factorize",
     "find_pairs",
     "pair_products",

@@ -8,6 +8,7 @@ from miricigale.utils.compilation import njit
 __all__ = [
     "add_model",
     "convolve_stamps",
+    "cross_pairs",
     "find_pairs",
     "pair_products",
     "projections",
@@ -55,6 +56,55 @@ def find_pairs(box, grow=0):
     pairs = np.empty((n, 2), np.int32)
     if n:
         _sweep(box, grow, pairs)
+    return pairs
+
+
+@njit(cache=True, nogil=True)
+def _cross(box, other, tallest, pairs):
+    # both sorted by y0: what ends above one of the others ends above all that follow
+    count = 0
+    low = 0
+    for j in range(other.shape[0]):
+        y0, x0 = other[j, 0], other[j, 1]
+        y1, x1 = y0 + other[j, 2], x0 + other[j, 3]
+        while low < box.shape[0] and box[low, 0] + tallest <= y0:
+            low += 1
+        if y1 == y0 or x1 == x0:
+            continue
+        for i in range(low, box.shape[0]):
+            if box[i, 0] >= y1:
+                break
+            if (
+                box[i, 0] + box[i, 2] > y0
+                and box[i, 1] < x1
+                and box[i, 1] + box[i, 3] > x0
+                and box[i, 2] > 0
+            ):
+                if pairs.shape[0] > 0:
+                    pairs[count, 0] = i
+                    pairs[count, 1] = j
+                count += 1
+    return count
+
+
+def cross_pairs(box, other):
+    """
+    List the pairs of boxes of two sets that overlap.
+
+    Parameters
+    ----------
+    box, other : int arrays, shape (n, 4) and (m, 4)
+        Boxes (y0, x0, ny, nx), each set sorted by y0.
+
+    Returns
+    -------
+    pairs : int array, shape (n_pairs, 2)
+    """
+    tallest = box[:, 2].max(initial=0)
+    n = _cross(box, other, tallest, np.empty((0, 2), np.int32))
+    pairs = np.empty((n, 2), np.int32)
+    if n:
+        _cross(box, other, tallest, pairs)
     return pairs
 
 
