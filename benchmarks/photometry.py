@@ -153,7 +153,7 @@ def cutouts(quick):
     kernel = cutout_kernel()
     cases = [(610, 110, (0.11, 0.06)), (2000, 160, (0.11,))]
     if not quick:
-        cases += [(26_000, 480, (0.11,))]
+        cases += [(6500, 240, (0.11,)), (26_000, 480, (0.11,))]
     for n, side, scales in cases:
         rng = np.random.default_rng(n)
         prior, light, sky, flux = galaxy_field(n, side, kernel, rng)
