@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.photometry.flags import POOR_CHI2, ForcedFlags
+from miricigale.photometry.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
 from miricigale.photometry.residual_sources import ResidualPeaks, residual_peaks
 
 __all__ = ["Diagnostics", "diagnose", "source_flags"]
@@ -78,6 +78,9 @@ def diagnose(fit, xy):
         executor=fit.bank.executor,
     )
     poor = chi2 > POOR_CHI2 * variance
+    if fit.free is not None:
+        # what the high-resolution image shows is not what is fitted here
+        poor[fit.rows] |= fit.free.strain > POOR_STRAIN
     return Diagnostics(model, residual, correlation, chi2, left, poor, peaks)
 
 

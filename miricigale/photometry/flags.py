@@ -2,10 +2,13 @@
 
 from miricigale.utils.tables import Flags
 
-__all__ = ["POOR_CHI2", "ForcedFlags"]
+__all__ = ["POOR_CHI2", "POOR_STRAIN", "ForcedFlags"]
 
 #: Template-weighted chi^2 from which a fit is poor, in units of the noise's variance.
 POOR_CHI2 = 2.0
+
+#: Chi^2 by their priors of a template's changes from which a fit is poor (3.5 standard deviations).
+POOR_STRAIN = 12.0
 
 
 class ForcedFlags(Flags):
@@ -31,7 +34,8 @@ class ForcedFlags(Flags):
     NOISY_SEGMENT = 64
     #: The template is a point source because another source owns the segment.
     SHARED_SEGMENT = 128
-    #: Residuals below the template are more than noise (chi2 above 2, and above twice the measured noise).
+    #: Residuals below the template are more than noise (chi2 above 2, and above twice the measured noise),
+    #: or the template had to change by far more than the high-resolution image leaves open.
     POOR_FIT = 256
     #: Light that no template explains (5 sigma, a tenth of the flux) is within two widths of the PSF.
     UNEXPLAINED_NEIGHBOUR = 512

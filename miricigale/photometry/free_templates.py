@@ -66,6 +66,12 @@ class FreeTemplates:
         return found[: self.n], found[self.n :]
 
     @property
+    def strain(self):
+        """Chi-square of the changes of each source by their priors, shape (n,)."""
+        pulls = self.fit.flux[self.n :] * np.sqrt(self.prior[self.n :])
+        return np.bincount(self.owner, pulls**2, minlength=self.n)
+
+    @property
     def xy(self):
         """Positions of the changes that are fitted, shape (m, 2)."""
         return self.bank.xy[self.basis[self.n :, self.n :].tocsc().indices]

@@ -45,11 +45,11 @@ class TemplateChanges:
     """
     Finds the independent changes of a template that its fit to the high-resolution image leaves open.
 
-    The covariance of the profile's parameters, the position apart, is turned to the directions that are
-    independent of each other at the image's resolution. Between point and profile the difference of the two
-    counts as the probabilities say. The mean of all that is possible is another than the template that
-    fits best: half of what two steps to either side differ from it, and the other of point and profile
-    times its probability.
+    The covariance of the profile's parameters is turned to the directions that are independent of each
+    other at the image's resolution. Between point and profile the difference of the two counts as the
+    probabilities say. The mean of all that is possible is another than the template that fits best:
+    half of what two steps to either side differ from it, and the other of point and profile times its
+    probability.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ class TemplateChanges:
             share, limit = fitted["light"] ** 2, least**2 * np.sum(profile**2)
             point = None
         else:
-            spread += _of_shape(fitted["covariance"])[1:, 1:]
+            spread += fitted["covariance"][1:, 1:]
             share = 1.0 if cutout is not None else 1.0 - fitted["point"]
             point = _as_point(images, parameters) if 0 < fitted["point"] < 1 else None
             template = point if cutout is None and point is not None else profile
@@ -148,9 +148,7 @@ class TemplateChanges:
         power = np.sum(template**2)
         changes = [
             Change(Cutout(np.tensordot(step, derivatives, 1), rest.origin), float(step @ light))
-            for step in _steps(
-                _root(_of_shape(fitted["covariance"])), derivatives, least**2 * power
-            )
+            for step in _steps(_root(fitted["covariance"]), derivatives, least**2 * power)
         ]
         # each pixel adds to the light, and to what is taken off by the fit
         weight = 1.0 - self._blurred(template) / power
@@ -170,13 +168,6 @@ def _as_point(images, parameters):
     point = np.array(parameters)
     point[2], point[4:] = np.log(_POINT), 0.0
     return images(point)[0]
-
-
-def _of_shape(covariance):
-    """The covariance without that of the position, which moves no flux to first order."""
-    found = np.array(covariance)
-    found[1:3] = found[:, 1:3] = 0.0
-    return found
 
 
 def _root(covariance):

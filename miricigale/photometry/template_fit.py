@@ -235,7 +235,12 @@ class TemplateFit:
         known = not_fitted(len(self.bank.order))
         known[: len(fitted)] = fitted
         # a point on top of a template leaves open how it is shaped, not whether it is a point
-        known["point"][self.host[self.bank.order[self.pairs[:, 1]]]] = 0.0
+        hosts = self.host[self.bank.order[self.pairs[:, 1]]]
+        known["point"][hosts] = 0.0
+        # positions move no flux to first order, unless there are two components
+        lone = np.setdiff1d(np.arange(len(known)), hosts)
+        known["covariance"][lone, 1:3] = 0.0
+        known["covariance"][lone, :, 1:3] = 0.0
         self.free = free_templates(
             self.fit,
             self.bank,
