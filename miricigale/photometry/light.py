@@ -130,7 +130,9 @@ class _Segments:
         flat, n = labels.ravel(), len(places) + 1
         totals = np.bincount(flat, np.where(usable, data, 0.0).ravel(), n)
         noise = np.bincount(flat, np.where(usable, variance, 0.0).ravel(), n)
-        ratio = np.where(noise > 0, totals / np.sqrt(np.where(noise > 0, noise, 1.0)), np.inf)
+        # infinite for noiseless images, zero for segments without data
+        ratio = np.where(totals > 0, np.inf, 0.0)
+        np.divide(totals, np.sqrt(noise), out=ratio, where=noise > 0)
         totals[0] = ratio[0] = 0.0
         return cls(labels, usable, places, totals, ratio)
 
