@@ -142,6 +142,14 @@ def _photometry_parser(commands):
         )
     add("--no-background", action="store_true", help="fit no constant with the sources")
     add("--max-shift", type=float, metavar="ARCSEC", help="fit a shift of the image up to this")
+    add("--background-order", type=int, default=0, help="order of the background, 0 for a constant")
+    add("--offset-order", type=int, help="order of a map of offsets in place of one shift")
+    add(
+        "--second-pass",
+        action="store_true",
+        help="fit what the prior lacks too; last rows of the table",
+    )
+    add("--components", type=int, default=1, help="2: poor fits get a point on top of the template")
     add("-o", "--output", type=Path, default=Path("photometry.ecsv"), help="table, ECSV or FITS")
     add("--page", type=Path, help="HTML page (default: beside the table)")
     add("--model", type=Path, metavar="FITS", help="image of the fitted model")
@@ -270,6 +278,10 @@ def _photometry(args):
         highres_pa_aper=quantity(args.highres_pa_aper, u.deg),
         fit_background=not args.no_background,
         max_shift=quantity(args.max_shift),
+        background_order=args.background_order,
+        offset_order=args.offset_order,
+        second_pass=args.second_pass,
+        components=args.components,
         output=args.output,
         page=page,
         model=args.model,

@@ -17,6 +17,7 @@ from miricigale.photometry.mosaics import MosaicFile
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
 from miricigale.utils.files import split_extension, writing
 from miricigale.utils.progress import progress
+from miricigale.utils.tables import error_column
 from miricigale.utils.units import to_array
 from miricigale.workflow.kernel_files import can_be_modelled, file_place, matching_kernel
 from miricigale.workflow.products import write_image
@@ -56,6 +57,7 @@ def measure_files(
     seed=1,
     n_threads=None,
     progress_bar=False,
+    **options,
 ):
     """
     Measure the sources of a high-resolution image on another one, from files to files.
@@ -104,6 +106,9 @@ def measure_files(
         Number of threads; all by default.
     progress_bar : bool, optional
         Whether progress is shown.
+    **options
+        Others of `~miricigale.photometry.ForcedPhotometer`, such as ``second_pass``: what the prior lacks is
+        then in the last rows of the table, flagged ``NOT_IN_CATALOG``.
 
     Returns
     -------
@@ -166,10 +171,11 @@ def measure_files(
         bar.update()
         bar.set_description("fluxes")
         photometer = ForcedPhotometer(
-            matching, fit_background=fit_background, max_shift=max_shift, n_threads=n_threads
-        )
+            matching, fit_background=fit_background, max_shift=max_shift, n_threads=n_threads,
+            **options,
+        )  # fmt: skip
         result = photometer.measure(mosaic, prior, segments, sources)
-        table = result.to_table(filter_)
+        table = _with_new_sources(result.to_table(filter_), result.new_sources, filter_)
         table.meta.update(image=str(image.path), highres=str(highres.path))
         bar.update()
         bar.set_description("page")
@@ -190,6 +196,27 @@ def measure_files(
             photometry_page(result, filter_, mosaic, prior, matching, pulls, segments).write(page)
         bar.update()
     return table
+
+
+def _with_new_sources(table, new, filter_):
+    """A table and, in its last rows, the sources that the catalog lacks."""
+    if new is None or len(new) == 0:
+        return table
+    from astropy.table import vstack
+
+    known = {"id": "id", "sky": "sky", "flux": filter_, "flux_err": error_column(filter_)}
+    known.update({name: f"{filter_}_{name}" for name in ("flags", "snr", "coverage", "chi2")})
+    rows = table[np.zeros(len(new), int)]
+    for name, column in known.items():
+        rows[column] = new[name]
+    for name in set(table.colnames) - set(known.values()):
+        values = rows[name]
+        if isinstance(values, u.Quantity) or values.dtype.kind == "f":
+            values[:] = np.nan
+        elif values.dtype.kind == "b":
+            values[:] = False
+    rows[f"{filter_}_template"] = "point"
+    return vstack([table, rows], metadata_conflicts="silent")
 
 
 def _check_output(what, path, overwrite, inputs):

@@ -14,7 +14,7 @@ from astropy.table import QTable, Table
 
 from miricigale.cli import main
 from miricigale.instrument import north_up_wcs, pixel_area_map
-from miricigale.photometry import read_mosaic
+from miricigale.photometry import ForcedFlags, read_mosaic
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 from miricigale.workflow.kernel_files import read_kernel
 from miricigale.workflow.products import write_image
@@ -161,6 +161,27 @@ def test_without_a_segmentation_sources_are_detected(files, tmp_path):
     assert list(table["id"]) == list(files.ids)
     ours = table[BAND].to_value(u.uJy)
     np.testing.assert_allclose(ours, files.flux, rtol=0.05, atol=0.2)
+
+
+def test_sources_that_the_prior_lacks_are_the_last_rows(files, tmp_path):
+    labels, header = fits.getdata(files.paths["segmentation"], header=True)
+    lost = np.argsort(-files.flux)[[2, 5]]
+    fits.writeto(
+        tmp_path / "seg.fits", np.where(np.isin(labels, files.ids[lost]), 0, labels), header
+    )
+    output = tmp_path / "out.fits"
+    command = arguments(files, output, segmentation=tmp_path / "seg.fits")
+    assert main([*command, "--second-pass", "--background-order", "1"]) == 0
+    table = QTable.read(output)
+    assert list(table["id"][:23]) == sorted(np.delete(files.ids, lost))
+    assert len(table) == 25
+    assert not np.isin(table["id"][23:], files.ids).any()
+    flagged = np.asarray(table["irac.ch4_flags"]) & int(ForcedFlags.NOT_IN_CATALOG) > 0
+    assert flagged.tolist() == [False] * 23 + [True] * 2
+    index, separation, _ = files.sky[lost].match_to_catalog_sky(table["sky"][23:])
+    assert separation.max() < 0.05 * u.arcsec
+    found = table["irac.ch4"][23:][index].to_value(u.uJy)
+    np.testing.assert_allclose(found, files.flux[lost], rtol=0.02)
 
 
 def test_our_own_files_are_read(files, tmp_path):
