@@ -24,6 +24,9 @@ _MISFIT = 0.1
 #: Half-width (pixels) of the stamps that profiles are fitted on: beyond the segment, least and most.
 _AROUND, _LEAST, _MOST = 6, 16, 48
 
+#: Semi-major axis to which profiles are drawn: in half-light radii, and at most (pixels).
+_DRAWN, _FARTHEST = 6.0, 200.0
+
 #: Passes in which neighbours' light is taken off, chi^2 of that light from which a source is fitted
 #: again, and sources that are painted at a time.
 _PASSES, _CONTAMINATED, _AT_A_TIME = 4, 4.0, 512
@@ -278,12 +281,13 @@ class _Lights:
         return _Model(around, shape, template, float(total), shape.flux / total)
 
     def _profile(self, shape, corner, light=1.0):
-        """A fitted profile on the fine grid, as far as the PSF reaches at least."""
+        """A fitted profile on the fine grid, as far as the PSF reaches at least: steps at its edge show."""
         x, y = shape.parameters[:2] + corner
         radius, axis_ratio, angle = shape.axes
         stamp, origin = sersic_stamp(
             x=x, y=y, total_flux=light, r_eff=radius, n=np.exp(shape.parameters[3]),
-            axis_ratio=axis_ratio, theta=angle, max_radius=max(self.reach, 2 * radius),
+            axis_ratio=axis_ratio, theta=angle,
+            max_radius=max(self.reach, min(_DRAWN * radius, _FARTHEST)),
         )  # fmt: skip
         return Cutout(stamp, origin, convolved=False)
 

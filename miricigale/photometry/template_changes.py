@@ -13,7 +13,7 @@ __all__ = ["Change", "TemplateChanges"]
 
 #: Half-width (fine pixels) of the stamps of changes, least and most, in half-light radii and in rms
 #: widths of the PSF.
-_HALF, _MOST, _REACH, _WIDTHS = 16, 80, 4.0, 4.0
+_HALF, _MOST, _REACH, _WIDTHS = 16, 160, 5.0, 4.0
 
 #: Radius (fine pixels) of a profile that is as good as a point; largest step of ln radius, ln index
 #: or ellipticity that is taken as linear.
