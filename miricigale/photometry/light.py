@@ -22,7 +22,7 @@ _WIDTH, _CORE_SNR, _EXCESS, _OTHER_SNR = 1.5, 4.0, 3.0, 4.0
 _MISFIT = 0.1
 
 #: Half-width (pixels) of the stamps that profiles are fitted on: beyond the segment, least and most.
-_AROUND, _LEAST, _MOST = 6, 16, 48
+_AROUND, _LEAST, _MOST = 6, 16, 160
 
 #: Semi-major axis to which profiles are drawn: in half-light radii, and at most (pixels).
 _DRAWN, _FARTHEST = 6.0, 200.0
