@@ -54,6 +54,7 @@ def main():
     tables = StudyTables(
         QTable.read(run / "truth.ecsv"),
         QTable.read(run / "matched.ecsv"),
+        QTable.read(run / "photometry.ecsv"),
         ErrorModel.read(run / "errors.ecsv"),
         {unit: FitResults.read(run / f"fits_{unit}.fits") for unit in FITS},
         {},
