@@ -21,7 +21,7 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
 
 from miricigale.instrument import north_up_wcs, pixel_area_map
-from miricigale.photometry import ForcedPhotometer, detect_sources
+from miricigale.photometry import ForcedFlags, ForcedPhotometer, detect_sources
 from miricigale.psf import MatchingKernel, hst_psf, miri_psf, psf_mosaic
 
 CENTER = SkyCoord(53.1, -27.8, unit="deg")
@@ -139,7 +139,7 @@ def line(name, pull, bias):
         return
     middle = np.median(pull)
     print(
-        f"{name:42s} {len(pull):6d} {np.std(pull):6.2f} {1.4826 * np.median(np.abs(pull - middle)):6.2f} "
+        f"{name:48s} {len(pull):6d} {np.std(pull):6.2f} {1.4826 * np.median(np.abs(pull - middle)):6.2f} "
         f"{np.mean(pull):+6.2f} {middle:+6.2f} {100 * np.nanmedian(bias[good]):+6.1f}% "
         f"{100 * np.mean(np.abs(pull) > 3):5.1f}%"
     )
@@ -147,23 +147,26 @@ def line(name, pull, bias):
 
 def table(fields, rows, grids):
     print(
-        f"{'':42s} {'n':>6s} {'std':>6s} {'MAD':>6s} {'mean':>6s} {'median':>6s} {'bias':>7s} {'> 3':>6s}"
+        f"{'':48s} {'n':>6s} {'std':>6s} {'MAD':>6s} {'mean':>6s} {'median':>6s} {'bias':>7s} {'> 3':>6s}"
     )
     truth = np.concatenate([f.catalog["flux"] for f in fields])
     pair = np.concatenate([f.catalog["pair"] for f in fields])
     point = np.concatenate([f.catalog["point"] for f in fields])
     for grid in grids:
         # columns, draws, sources
-        flux, err, noise, _, prior_snr, _ = np.concatenate(
+        flux, err, noise, _, prior_snr, flags = np.concatenate(
             [np.moveaxis(np.array(one[grid]), 0, 1) for one in rows], axis=2
         )
         bins = truth / np.nanmedian(noise, axis=0)
         pull, old, ratio = (flux - truth) / err, (flux - truth) / noise, flux / truth - 1
+        poor = int(ForcedFlags.POOR_FIT | ForcedFlags.UNEXPLAINED_NEIGHBOUR)
+        clear = np.where((np.nan_to_num(flags).astype(int) & poor) == 0, pull, np.nan)
         for kind, which in (("isolated", ~pair), ("blended", pair)):
             for low, high in BINS:
                 use = which & (bins >= low) & (bins < high)
                 label = f"{grid}, {kind}, S/N {low:g}-{high:g}".replace("-1e+09", "-")
                 line(label, pull[:, use], ratio[:, use])
+                line(f"{label}, without flagged", clear[:, use], ratio[:, use])
         for low, high in BINS:
             use = (bins >= low) & (bins < high)
             line(f"{grid}, noise only, S/N {low:g}-{high:g}", old[:, use], ratio[:, use])
