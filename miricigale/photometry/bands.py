@@ -2,7 +2,7 @@
 
 import numpy as np
 from astropy.coordinates import SkyCoord
-from astropy.table import QTable
+from astropy.table import QTable, Table
 
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.forced import ForcedPhotometer
@@ -45,7 +45,9 @@ def measure_bands(images, kernels, templates, **options):
     for name, image in images.items():
         one = kernels[name]
         try:
-            photometer = one if hasattr(one, "measure") else ForcedPhotometer(one, **options)
+            photometer = (
+                one if isinstance(one, ForcedPhotometer) else ForcedPhotometer(one, **options)
+            )
             results[name] = photometer.measure(image, templates=templates)
         except (ValueError, TypeError) as err:
             err.add_note(f"in the band {name!r}")
@@ -78,7 +80,7 @@ def join_bands(results):
     if not results:
         raise argument_error("results", "at least one band", "none")
     tables = {
-        name: one if hasattr(one, "colnames") else one.to_table() for name, one in results.items()
+        name: one if isinstance(one, Table) else one.to_table() for name, one in results.items()
     }
     rows = {}
     for one in tables.values():

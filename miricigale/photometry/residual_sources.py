@@ -114,7 +114,7 @@ def residual_peaks(residual, model, inverse_sigma, width, xy, *, new=None, execu
     pixel, light = pixel[apart], light[apart]
     lone = np.ones(len(pixel), bool)
     if len(pixel):
-        # brightest first: whoever is left takes away those that follow
+        # brightest first: each that is kept removes the fainter ones near it
         for one, other in sorted(
             scipy.spatial.KDTree(pixel).query_pairs(_LEFT_DISTANCE * full_width)
         ):
