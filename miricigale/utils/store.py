@@ -1,0 +1,202 @@
+"""Files of our own: written whole or not at all; arrays, tables and text in one FITS layout."""
+
+import contextlib
+import json
+import os
+import uuid
+from pathlib import Path
+
+import numpy as np
+
+from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import open_fits, write_fits, writing
+
+__all__ = ["PARTIAL", "Parts", "native", "open_parts", "plain_value", "replacing", "write_parts"]
+
+#: How the names of unfinished files begin.
+PARTIAL = ".partial-"
+_TEXT = "TEXT"
+
+
+@contextlib.contextmanager
+def replacing(path, *, overwrite=True, sync=False):
+    """
+    Write a file under a temporary name, and give it its own when it is whole.
+
+    Parameters
+    ----------
+    path : path-like
+        The file. Its folder exists.
+    overwrite : bool, optional
+        Whether a file that is there is replaced.
+    sync : bool, optional
+        Whether the content is on the disk before the name is.
+
+    Yields
+    ------
+    partial : `pathlib.Path`
+        What to write, in the same folder and with the same suffix.
+
+    Raises
+    ------
+    OSError
+        If the file is there and ``overwrite`` is not set, or it cannot be written: then what stood
+        there before stays.
+    """
+    path = Path(path)
+    if not overwrite and path.exists():
+        msg = f"{path} exists; overwrite=True replaces it"
+        raise OSError(msg)
+    partial = path.with_name(f"{PARTIAL}{os.getpid()}-{uuid.uuid4().hex[:8]}-{path.name}")
+    try:
+        with writing(path):
+            yield partial
+            if sync:
+                with open(partial, "rb+") as handle:
+                    os.fsync(handle.fileno())
+            os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def plain_value(value):
+    """Turn a value that JSON does not know into one that it does; others become text."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        return value.tolist()
+    return str(value)
+
+
+def write_parts(path, layout, *, text=None, arrays=None, tables=None, overwrite=False):
+    """
+    Write arrays, tables and text to one FITS file; the same content gives the same bytes.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    layout : str
+        Name and version of what it holds; the keyword ``FORMAT`` of the primary header.
+    text : dict, optional
+        Anything that JSON knows, and numbers and arrays of numpy: header cards are too short for
+        it. Extension ``TEXT``.
+    arrays : dict of str to `~numpy.ndarray`, optional
+        An image extension for each; truth values are stored as 0 and 1, quantities with their unit in
+        ``BUNIT``. Arrays without elements are left out, for FITS cannot hold them.
+    tables : dict of str to `~astropy.table.Table`, optional
+        A binary table extension for each, without the ``meta`` of the table. Text is ASCII.
+    overwrite : bool, optional
+        Whether a file that is there is replaced.
+
+    Raises
+    ------
+    OSError
+        See `replacing`.
+    """
+    from astropy.io import fits
+    from astropy.table import Table
+
+    hdus = [fits.PrimaryHDU(header=fits.Header({"FORMAT": layout}))]
+    if text is not None:
+        data = np.frombuffer(json.dumps(text, default=plain_value).encode(), dtype=np.uint8)
+        hdus.append(fits.ImageHDU(data, name=_TEXT))
+    for name, array in (arrays or {}).items():
+        unit = getattr(array, "unit", None)
+        array = np.asarray(array)
+        if array.size:
+            hdu = fits.ImageHDU(array.astype(np.uint8) if array.dtype == bool else array, name=name)
+            if unit is not None:
+                hdu.header["BUNIT"] = unit.to_string("fits")
+            hdus.append(hdu)
+    for name, table in (tables or {}).items():
+        table = type(table)(table, copy=False) if isinstance(table, Table) else Table(table)
+        table.meta = {}
+        hdus.append(fits.table_to_hdu(table))
+        hdus[-1].name = name
+    with replacing(path, overwrite=overwrite) as partial:
+        write_fits(hdus, partial)
+
+
+@contextlib.contextmanager
+def open_parts(path, layouts, *, wanted, memmap=False):
+    """
+    Open a file that `write_parts` wrote; what is wrong with it in the ``with`` block names it.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    layouts : tuple of str
+        Layouts that the reader knows.
+    wanted : str
+        What the file should hold, for the message, such as ``"fit results"``.
+    memmap : bool, optional
+        Whether arrays stay on the disk until they are used.
+
+    Yields
+    ------
+    parts : `Parts`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file is missing, truncated or of another layout, or if the block finds it incomplete
+        (a `KeyError`, `IndexError`, `TypeError` or `ValueError`).
+    """
+    with open_fits(path, wanted=wanted, memmap=memmap) as hdus:
+        layout = hdus[0].header.get("FORMAT")
+        if layout not in layouts:
+            msg = f"{path} holds no {wanted} (no FORMAT = {layouts[0]!r} in its header)"
+            raise DataError(msg)
+        try:
+            yield Parts(hdus, layout)
+        except (KeyError, IndexError, TypeError, ValueError) as err:
+            msg = f"{path} is not a complete file of {wanted}: {err}"
+            raise DataError(msg) from err
+
+
+class Parts:
+    """
+    What a file of `write_parts` holds.
+
+    Parameters
+    ----------
+    hdus : `~astropy.io.fits.HDUList`
+        The open file.
+    layout : str
+        Its layout.
+
+    Attributes
+    ----------
+    layout : str
+        Name and version of the layout.
+    text : dict
+        The text, empty if there is none.
+    """
+
+    def __init__(self, hdus, layout):
+        self._hdus, self.layout = hdus, layout
+        self._names = {hdu.name for hdu in hdus}
+        self.text = {}
+        if _TEXT in self._names:
+            self.text = json.loads(bytes(np.asarray(hdus[_TEXT].data)).decode())
+
+    def __contains__(self, name):
+        return name.upper() in self._names
+
+    def array(self, name):
+        """Array by name, in the byte order of the machine; truth values are 0 and 1."""
+        return native(self._hdus[name].data)
+
+    def table(self, name, cls=None):
+        """Table by name (a `~astropy.table.Table`, or another class of tables), its meta empty."""
+        from astropy.table import Table
+
+        table = (cls or Table).read(self._hdus[name], character_as_bytes=False)
+        table.meta.clear()
+        return table
+
+
+def native(array):
+    """Array in the byte order of the machine; the same one where it is."""
+    array = np.asarray(array)
+    return array.astype(array.dtype.newbyteorder("="), copy=False)

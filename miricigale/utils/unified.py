@@ -1,0 +1,99 @@
+"""Methods ``read`` and ``write`` of our classes by `astropy.io.registry`."""
+
+import importlib
+import os
+
+from astropy.io import registry
+from astropy.io.registry import UnifiedReadWrite, UnifiedReadWriteMethod
+
+__all__ = ["register", "unified_read", "unified_write"]
+
+_SUFFIXES = {"fits": (".fits", ".fit", ".fits.gz"), "ascii.ecsv": (".ecsv",)}
+
+
+class _Method(UnifiedReadWrite):
+    """What ``read`` and ``write`` share: the formats of a class are registered on first use."""
+
+    method = None
+
+    def __init__(self, instance, cls):
+        super().__init__(instance, cls, self.method)
+        # the method's own text, where it is looked up on an instance
+        self.__doc__ = type(self).__doc__
+
+    def _format(self, path, args, kwargs):
+        importlib.import_module(self._cls.io_module)
+        known = kwargs.pop("format", None)
+        if known is not None:
+            return known
+        path = os.fspath(path)
+        found = registry.identify_format(self.method, self._cls, path, None, [path, *args], kwargs)
+        if len(found) == 1:
+            return found[0]
+        column = "Read" if self.method == "read" else "Write"
+        formats = registry.get_formats(self._cls, column)["Format"].tolist()
+        suffixes = [suffix for name in formats for suffix in _SUFFIXES.get(name, ())]
+        msg = f"{path} must end in one of {', '.join(suffixes)}, or 'format' be one of {formats}"
+        raise registry.IORegistryError(msg)
+
+
+class _Read(_Method):
+    method = "read"
+
+    def __call__(self, path, *args, **kwargs):
+        found = self._format(path, args, kwargs)
+        return self.registry.read(self._cls, path, *args, format=found, **kwargs)
+
+
+class _Write(_Method):
+    method = "write"
+
+    def __call__(self, path, *args, **kwargs):
+        found = self._format(path, args, kwargs)
+        return self.registry.write(self._instance, path, *args, format=found, **kwargs)
+
+
+def unified_read(doc):
+    """
+    Class method ``read(path, *, format=None, **options)``.
+
+    The class has an attribute ``io_module``: the name of the module that registers its formats,
+    imported when a file is first read or written.
+
+    Parameters
+    ----------
+    doc : str
+        Docstring of the method, of several lines: astropy adds the list of formats.
+    """
+    return UnifiedReadWriteMethod(type("Read", (_Read,), {"__doc__": doc}))
+
+
+def unified_write(doc):
+    """Method ``write(path, *, format=None, overwrite=False)``; see `unified_read`."""
+    return UnifiedReadWriteMethod(type("Write", (_Write,), {"__doc__": doc}))
+
+
+def register(cls, *, read=None, write=None, name="fits"):
+    """
+    Register a format of a class; files are told by their suffix.
+
+    Parameters
+    ----------
+    cls : type
+        The class.
+    read : callable, optional
+        ``read(path, **options)`` returns an instance.
+    write : callable, optional
+        ``write(instance, path, *, overwrite=False)``.
+    name : {"fits", "ascii.ecsv"}, optional
+        Name of the format.
+    """
+
+    def matches(origin, path, fileobj, *args, **kwargs):
+        return path is not None and str(path).lower().endswith(_SUFFIXES[name])
+
+    if read is not None:
+        registry.register_reader(name, cls, read)
+    if write is not None:
+        registry.register_writer(name, cls, write)
+    registry.register_identifier(name, cls, matches)
