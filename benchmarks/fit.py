@@ -60,7 +60,7 @@ def make_photometry(grid, n, *, seed=1, miri=True):
 
 def time_each(fitter, table):
     """CPU milliseconds of one core for every object."""
-    engine = fitter._engine
+    engine = fitter.backend.engine
     results = fitter.fit(table)
     workspace = engine.workspace()
     prior = np.zeros(fitter.grid.redshift.size)

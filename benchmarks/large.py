@@ -22,7 +22,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.fitting import BayesFitter, fit_file, open_results
-from miricigale.fitting.part_files import _write_rows
+from miricigale.fitting.streaming import write_rows
 from miricigale.sed import SEDModel
 
 BANDS = ["megacam.u", "acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1", "irac.ch2"]
@@ -53,8 +53,7 @@ def catalogue(grid, n, step=20000):
 
 
 def write_catalogue(path, grid, n):
-    with open(path, "wb") as stream:
-        stream.write(bytes(-_write_rows(stream, catalogue(grid, n), n, 0) % 2880))
+    write_rows(path, catalogue(grid, n), n)
 
 
 def one(folder, n, chunk_rows, threads):

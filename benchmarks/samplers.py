@@ -11,7 +11,7 @@ import time
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.fitting import ContinuousFitter
+from miricigale.fitting import BayesFitter
 from miricigale.sed import SEDModel
 
 BANDS = ["acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1", "irac.ch2"]
@@ -46,7 +46,7 @@ def main(engines):
         photometry[f"{name}_err"] = 0.05 * fluxes[name]
     print("engine     id  s     models  effective  converged  redshift        ln evidence")
     for engine in engines:
-        fitter = ContinuousFitter(model, BANDS, priors=PRIORS, engine=engine)
+        fitter = BayesFitter(model, BANDS, priors=PRIORS, engine=engine)
         for row in range(2):
             start = time.process_time()
             results = fitter.fit(photometry[row : row + 1], seed=1)

@@ -1,9 +1,9 @@
 """
 Bayesian fits of galaxy and AGN spectra to photometry.
 
-`BayesFitter` evaluates every model of a `~miricigale.sed.ModelGrid` and returns `FitResults`,
-posteriors of all parameters and derived quantities. `Samples` are models drawn from them,
-`mock_analysis` and `leave_out` tell how far they can be trusted.
+`BayesFitter` evaluates every model of a `~miricigale.sed.ModelGrid`, or lets a nested sampler choose
+models, and returns `FitResults`, posteriors of all parameters and derived quantities. `Samples` are
+models drawn from them, `mock_analysis` and `leave_out` tell how far they can be trusted.
 """
 
 from miricigale.utils.lazy import lazy_names
@@ -19,16 +19,11 @@ __getattr__, __dir__, __all__ = lazy_names(
             "read_pcigale_ini",
             "write_cigale_results",
         ),
-        "continuous": ("ContinuousFitter",),
-        "continuous_results": ("ContinuousResults",),
+        "checks": ("LeaveOutResult", "MockResult", "leave_out", "mock_analysis"),
         "fitter": ("BayesFitter",),
         "flags": ("FitFlags",),
-        "left_out": ("LeaveOutResult", "leave_out"),
-        "mocks": ("MockResult", "mock_analysis"),
-        "part_files": ("FitResultsFiles", "open_results"),
-        "result": ("FitResult",),
         "results": ("FitResults",),
         "samples": ("Samples",),
-        "streaming": ("fit_file",),
+        "streaming": ("FitResultsFiles", "fit_file", "open_results"),
     },
 )

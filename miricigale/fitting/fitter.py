@@ -1,65 +1,93 @@
 """BayesFitter: posteriors of galaxy and AGN parameters from broad-band photometry."""
 
+import inspect
 import logging
 import warnings
 
 import numpy as np
 
-from miricigale.fitting.assembly import constants, fit_results
-from miricigale.fitting.engines.grid import GridEngine
 from miricigale.fitting.flags import FitFlags
-from miricigale.fitting.fractions import OtherFraction
+from miricigale.fitting.grid_fit import GridFit
 from miricigale.fitting.likelihood import per_band, read_photometry, unused_bands
-from miricigale.fitting.pairs import check_pairs
-from miricigale.fitting.pieces import DrawPiece, FitPiece, Part, cut
-from miricigale.fitting.priors import grid_priors
-from miricigale.fitting.quantities import DERIVED_LEVELS, Quantities
-from miricigale.fitting.redshifts import density_log_prior, fixed_log_prior, known_redshifts
-from miricigale.fitting.samples import Samples
+from miricigale.fitting.results import FitResults
+from miricigale.fitting.samplers import Request, get_sampler
+from miricigale.fitting.samplers.fit import SamplerFit
+from miricigale.sed import ModelGrid, SEDModel
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error, unknown_name
 from miricigale.utils.meta import provenance
-from miricigale.utils.parallel import parallel_map
-from miricigale.utils.random import check_seed, stream
+from miricigale.utils.parallel import chunks, parallel_map, single_threaded
+from miricigale.utils.random import check_seed
 from miricigale.utils.tables import require_columns
 
 __all__ = ["BayesFitter"]
 
 logger = logging.getLogger(__name__)
 
+#: S/N of the best model in all bands together below which an object is flagged.
+LOW_SIGNAL = 3.0
+#: Options that only one kind of engine has.
+_OF_GRID = ("axes", "prior_f", "redshift_tolerance", "compat", "rtol")
+_OF_SAMPLER = (
+    "predict",
+    "n_live",
+    "n_effective",
+    "max_calls",
+    "n_draws",
+    "n_cells",
+    "sampler_options",
+)
+_COUNTS = {
+    "n_bands_min": 1,
+    "n_live": 10,
+    "n_effective": 1,
+    "max_calls": 1,
+    "n_draws": 1,
+    "n_cells": 2,
+}
+
 
 class BayesFitter:
     """
-    Fit photometry with every model of a grid and sum up the posterior.
+    Fit photometry and sum up the posterior: with every model of a grid, or by a nested sampler.
 
-    The model flux of redshift z, galaxy g, torus k and AGN fraction f is
+    The model flux of redshift z, galaxy g, AGN template k and AGN fraction f is
     s (G[z, g] + c L_dust[g] A[z, k]) with c = f / (1 - f). The scale s (the stellar mass
     formed) that minimises chi2 is known in closed form, and weights are
     prior * exp(-chi2 / 2) there, as in CIGALE [1]_; the prior on s that this amounts to is flat
     in the signal-to-noise ratio of the model, which is that of a prior flat in log s to within
-    the relative variance of s. Pairs (galaxy, torus) that no AGN fraction can make good enough
-    are found by a bound and left out; of the rest those with most of the weight are evaluated in
-    double precision, the others in single precision unless ``rtol`` is below 5e-7.
+    the relative variance of s. Fluxes are Gaussian, with ``model_error`` of the flux added to the
+    error in quadrature; upper limits have an error-function term.
+
+    On a grid, pairs (galaxy, AGN template) that no AGN fraction can make good enough are found by a
+    bound and left out; of the rest those with most of the weight are evaluated in double precision,
+    the others in single precision unless ``rtol`` is below 5e-7. A sampler takes parameters as
+    they are, continuous, object by object; models older than the universe, or impossible together,
+    have no weight.
 
     Parameters
     ----------
     model : `~miricigale.sed.ModelGrid` or `~miricigale.sed.SEDModel`
-        A grid, or a model of which a grid is made with ``axes``.
+        A grid; a model of which a grid is made with ``axes``; or, for a sampler, a model.
     filters : list of str or `~miricigale.filters.FilterSet`, optional
         Bands to fit. By default those of the grid that the photometry has; of a model, these
         are the bands of the grid and must be given.
-    axes : dict, optional
-        Parameter name to values, for a model (see `~miricigale.sed.SEDModel.grid`).
     priors : dict, optional
-        Parameter name to prior: a function of the value, a frozen distribution of `scipy.stats`
-        (both are taken at the nodes), an array of weights of the nodes or ``"log"``. Others are
-        flat in the nodes of the grid.
-    prior_f : {"grid", "uniform"}, optional
-        Prior of the AGN fractions: equal for all values of the grid (so that f = 0, which is
-        evaluated once for each galaxy, carries the summed weight of all tori), or by the width
-        of their cells.
-    engine : {"grid", "nautilus", "dynesty"}, optional
-        How the posterior is found. The samplers are for continuous parameters: with one of them
-        this gives a `~miricigale.fitting.ContinuousFitter`, whose arguments it then takes.
+        Parameter name to prior. On a grid: a function of the value, a frozen distribution of
+        `scipy.stats` (both are taken at the nodes), an array of weights of the nodes or ``"log"``;
+        others are flat in the nodes. For a sampler, of every free parameter (others are at the
+        defaults of the model):
+
+        - ``(low, high)``: flat; ``(low, high, "log")``: flat in the logarithm; ``"flat"`` and
+          ``"log"``: the same over the bounds of the parameter;
+        - a list or array: these values only, as for parameters of libraries (metallicity, the
+          torus); ``(values, weights)``: of these weights;
+        - a frozen distribution of `scipy.stats`, cut to the bounds of the parameter;
+        - a number: a fixed value.
+
+        Unless ``mass`` is among them, each model has the mass that fits best, with its error.
+    engine : {"grid", "nautilus", "dynesty"} or callable, optional
+        How the posterior is found: on a grid, or by a sampler. A callable is a sampler of the
+        user's; see `miricigale.fitting.samplers.get_sampler`.
     model_error : float or dict of str to float, optional
         Part of the flux that is added to its error in quadrature, for all or by filter.
     error_floor : float or dict of str to float, optional
@@ -67,21 +95,58 @@ class BayesFitter:
     n_bands_min : int, optional
         Objects with fewer usable bands, upper limits among them, are flagged and not fitted. One
         band at least must be no limit.
-    redshift_tolerance : float, optional
-        How far, in abs(dz) / (1 + z), a fixed redshift may lie from its node of the grid; half the
-        distance of the nodes by default.
     max_reduced_chi2 : float, optional
         Above this reduced chi2 of the best model an object is flagged.
     scale_error : bool, optional
         Whether the uncertainty of each model's own scale is part of the posterior of masses,
         luminosities and fluxes: so by default, but CIGALE leaves it out.
+    axes : dict, optional
+        Parameter name to values, for a grid of a model (see `~miricigale.sed.SEDModel.grid`).
+    prior_f : {"grid", "uniform"}, optional
+        Prior of a grid's AGN fractions: equal for all values of the grid (so that f = 0, which is
+        evaluated once for each galaxy, carries the summed weight of all AGN templates), or by the
+        width of their cells.
+    redshift_tolerance : float, optional
+        How far, in abs(dz) / (1 + z), a fixed redshift may lie from its node of the grid; half the
+        distance of the nodes by default.
     compat : {"cigale"}, optional
         Reproduce choices of CIGALE that are not ours: no ``scale_error``, no result where the best
         chi2 is above 1417 (its weights, from which the best chi2 is not subtracted, all vanish;
         flagged ``NO_LIKELIHOOD``), and no standard deviation below 5 % of the mean.
     rtol : float, optional
         Largest relative error of posterior weights, means and standard deviations that leaving
-        out hopeless models may cause; 0 evaluates every model.
+        out models of a grid may cause; 0 evaluates every model.
+    predict : list of str or `~miricigale.filters.FilterSet`, optional
+        For a sampler: more bands, in which the fluxes of the models are predicted. A grid predicts
+        all of its bands.
+    n_live : int, optional
+        Live points of a sampler; more for posteriors of several narrow peaks.
+    n_effective : int, optional
+        Effective size that a sample shall have (nautilus; dynesty's follows from ``n_live``).
+    max_calls : int, optional
+        Models that a sampler evaluates for one object at most (dynesty counts the steps of its
+        walkers, some of which leave the prior); ``converged`` of the results tells.
+    n_draws : int, optional
+        Draws of equal weight that are kept of a sample; see `FitResults.samples`.
+    n_cells : int, optional
+        Cells of each axis, for PDFs and plots of a sample.
+    sampler_options : dict, optional
+        Passed on to the sampler.
+
+    Attributes
+    ----------
+    backend : `~miricigale.fitting.grid_fit.GridFit` or `~miricigale.fitting.samplers.fit.SamplerFit`
+        What fits, with the priors and the derived quantities.
+
+    Raises
+    ------
+    ImportError
+        If the sampler is not installed; the message holds the pip command.
+    KeyError
+        If there is no engine, filter or parameter of a name.
+    ValueError
+        If an option is of the wrong kind or of another engine, a prior is none, or leaves values that
+        the libraries of the model do not have.
 
     Examples
     --------
@@ -89,119 +154,109 @@ class BayesFitter:
     >>> fitter = BayesFitter(grid)  # doctest: +SKIP
     >>> results = fitter.fit(photometry)  # doctest: +SKIP
     >>> results.to_table()["id", "redshift_mean", "frac_agn_mean"]  # doctest: +SKIP
+    >>> priors = {"redshift": (0.01, 6), "tau": (0.1, 10, "log"), "age": (0.1, 13), "ebv": (0, 1)}
+    >>> fitter = BayesFitter(model, bands, priors=priors, engine="nautilus")  # doctest: +SKIP
+    >>> results = fitter.fit(photometry, seed=1)  # doctest: +SKIP
 
     References
     ----------
     .. [1] Boquien et al. 2019, A&A 622, A103, section 4.3
     """
 
-    def __new__(cls, *args, engine="grid", **options):
-        """Another engine than the grid samples continuous parameters: a `ContinuousFitter`."""
-        if engine == "grid":
-            return super().__new__(cls)
-        from miricigale.fitting.continuous import ContinuousFitter
-        from miricigale.fitting.engines.base import get_sampler
-
-        get_sampler(engine)
-        return ContinuousFitter(*args, engine=engine, **options)
-
-    def __getnewargs_ex__(self):
-        return (), {}
-
     def __init__(
         self,
         model,
         filters=None,
         *,
-        axes=None,
         priors=None,
-        prior_f="grid",
         engine="grid",
         model_error=0.1,
         error_floor=0.0,
         n_bands_min=2,
-        redshift_tolerance=None,
         max_reduced_chi2=100.0,
         scale_error=None,
+        axes=None,
+        prior_f="grid",
+        redshift_tolerance=None,
         compat=None,
         rtol=1e-6,
+        predict=(),
+        n_live=500,
+        n_effective=2000,
+        max_calls=500_000,
+        n_draws=1000,
+        n_cells=100,
+        sampler_options=None,
     ):
-        names = None if filters is None else tuple(getattr(filters, "names", filters))
-        if isinstance(names, tuple) and isinstance(filters, str):
-            raise argument_error("filters", "a list of names or a FilterSet", repr(filters))
-        self.model = None
-        if hasattr(model, "grid"):
-            if axes is None or names is None:
-                msg = "'axes' and 'filters' must be given when 'model' is an SEDModel"
-                raise ValueError(msg)
-            self.model = model
-            model = model.grid(axes, filters)
-        elif axes is not None:
-            raise argument_error("axes", "None when 'model' is a ModelGrid", "a value")
-        if not hasattr(model, "galaxy_properties"):
-            raise argument_error("model", "a ModelGrid or an SEDModel", type(model).__name__)
-        self.grid = model
-        for name in names or ():
-            if name not in model.filters:
-                raise unknown_name("filter of the grid", name, model.filters)
-        if names is not None and not len(set(names)) == len(names) > 0:
-            raise argument_error("filters", "different names, at least one", f"{list(names)}")
-        self.filters = names
-        if not (_is_number(n_bands_min, np.integer) and n_bands_min >= 1):
-            raise argument_error("n_bands_min", "an integer >= 1", repr(n_bands_min))
-        if not (_is_number(rtol) and 0 <= rtol < 0.1):
-            raise argument_error("rtol", "in [0, 0.1)", repr(rtol))
-        if not (_is_number(max_reduced_chi2) and max_reduced_chi2 > 0):
-            raise argument_error("max_reduced_chi2", "positive", repr(max_reduced_chi2))
-        if redshift_tolerance is not None and not (
-            _is_number(redshift_tolerance) and redshift_tolerance >= 0
-        ):
-            raise argument_error("redshift_tolerance", ">= 0", repr(redshift_tolerance))
-        if compat not in (None, "cigale"):
-            raise argument_error("compat", "None or 'cigale'", repr(compat))
-        if scale_error not in (None, True, False):
-            raise argument_error("scale_error", "True, False or None", repr(scale_error))
-        if compat and scale_error:
-            raise argument_error("scale_error", "False with compat='cigale'", repr(scale_error))
-        scale_error = compat is None if scale_error is None else scale_error
-        self.compat = compat
-        self.engine = engine
-        self.model_error = per_band(model_error, model.filters, "model_error")
-        self.error_floor = per_band(error_floor, model.filters, "error_floor")
+        given = dict(locals())
+        _check_options(given)
+        _check_numbers(given)
+        if engine != "grid":
+            get_sampler(engine)
+        names = None if filters is None and engine == "grid" else _names("filters", filters or ())
+        asked = (*(names or ()), *_names("predict", predict))
+        if names is not None and (not names or len(set(asked)) < len(asked)):
+            raise argument_error("filters", "different names, at least one", f"{list(asked)}")
+        self.engine, self.filters = engine, names
+        scale_error = compat is None if scale_error is None else bool(scale_error)
+        if engine == "grid":
+            grid, self.model = _grid_of(model, names, filters, axes)
+            self._error_bands = grid.filters
+            for name in names or ():
+                if name not in grid.filters:
+                    raise unknown_name("filter of the grid", name, grid.filters)
+            self.backend = GridFit.of_grid(
+                grid,
+                priors,
+                prior_f,
+                rtol=float(rtol),
+                scale_error=scale_error,
+                redshift_tolerance=redshift_tolerance,
+                compat=compat,
+            )
+        else:
+            self.model, self._error_bands = model, names
+            self.backend = SamplerFit.of_model(
+                model,
+                filters,
+                predict,
+                priors,
+                sampler=engine,
+                scale_error=scale_error,
+                request=Request(n_live, n_effective, max_calls, dict(sampler_options or {})),
+                n_draws=n_draws,
+                n_cells=n_cells,
+            )
+        self._model_error = per_band(model_error, self._error_bands, "model_error")
+        self._error_floor = per_band(error_floor, self._error_bands, "error_floor")
         self.n_bands_min = int(n_bands_min)
-        self.redshift_tolerance = redshift_tolerance
         self.max_reduced_chi2 = float(max_reduced_chi2)
-        self.prior_f = prior_f
-        self.priors = grid_priors(model, priors, prior_f=prior_f)
-        self.quantities = Quantities.of_grid(model)
-        self.fraction = OtherFraction.of_grid(model)
-        self._engine = self._make_engine(bool(scale_error), float(rtol))
 
     def __repr__(self):
         bands = "bands of the photometry" if self.filters is None else f"{len(self.filters)} bands"
-        return f"<BayesFitter of {self.grid!r}, {bands}>"
+        if self.engine == "grid":
+            return f"<BayesFitter of {self.grid!r}, {bands}>"
+        free = ", ".join(self.backend.space.free)
+        return f"<BayesFitter of {self.model!r}, {bands}, {self._engine_name}, free: {free}>"
 
-    def _make_engine(self, scale_error, rtol):
-        grid, priors, quantities = self.grid, self.priors, self.quantities
-        return GridEngine(
-            galaxy=np.asarray(grid.galaxy, dtype=float),
-            agn=np.asarray(grid.agn, dtype=float),
-            dust=np.asarray(grid.dust_luminosity, dtype=float),
-            frac=np.asarray(grid.frac_agn, dtype=float),
-            usable=np.asarray(grid.allowed, dtype=bool) & (priors.galaxy > 0),
-            prior_galaxy=priors.galaxy,
-            prior_agn=priors.agn,
-            prior_frac=priors.frac,
-            galaxy_scale=quantities.galaxy_scale,
-            agn_scale=quantities.agn_scale,
-            mixed_galaxy=quantities.mixed_galaxy,
-            mixed_agn=quantities.mixed_agn,
-            levels=DERIVED_LEVELS,
-            share_galaxy=None if self.fraction is None else self.fraction.galaxy,
-            share_agn=None if self.fraction is None else self.fraction.agn,
-            rtol=rtol,
-            scale_error=scale_error,
-        )
+    @property
+    def _engine_name(self):
+        return self.engine if isinstance(self.engine, str) else repr(self.engine)
+
+    @property
+    def bands(self):
+        """Bands of the models, in the order of the results: tuple of str."""
+        return self.backend.filters
+
+    @property
+    def grid(self):
+        """The `~miricigale.sed.ModelGrid`; None for a sampler."""
+        return self.backend.grid if self.engine == "grid" else None
+
+    @property
+    def priors(self):
+        """`~miricigale.fitting.priors.GridPriors`, or the prior of each free parameter by name."""
+        return self.backend.priors if self.engine == "grid" else self.backend.space.free
 
     def fit(
         self,
@@ -213,7 +268,7 @@ class BayesFitter:
         seed=None,
         executor=None,
         progress_bar=False,
-        chunk_size=64,
+        chunk_size=None,
     ):
         """
         Fit a catalogue.
@@ -228,25 +283,27 @@ class BayesFitter:
             measurement of the model lies below the limit [1]_ [2]_. Objects with limits only are
             flagged, not fitted.
         redshift : str or array_like, optional
-            Column of ``photometry``, or values, of known redshifts; each is taken to the nearest
-            redshift of the grid. Without it the redshift is free.
+            Column of ``photometry``, or values, of known redshifts; on a grid each is taken to the
+            nearest redshift. Without it the redshift is free.
         redshift_prior : tuple, optional
             Redshifts, shape (n_z,), and densities in redshift, shape (n_z,) or (n, n_z), joined by
-            straight lines: a p(z) for all or each object, which is integrated over the cells of
-            the grid's redshifts and takes the place of their prior.
+            straight lines: a p(z) for all or each object, which takes the place of the prior of
+            redshift (within its limits) and is integrated over the cells of a grid's redshifts.
         pairs : list of tuple of str, optional
             Pairs of parameters with several values (``results.axes``), of which the joint
-            posteriors are summed exactly as well: ``[("age", "tau"), ("redshift", "age")]``.
+            posteriors are kept as well: ``[("age", "tau"), ("redshift", "age")]``.
             That of redshift and AGN fraction is always there.
-        seed : optional
-            Not used by this engine; other engines draw from it.
+        seed : int or `~numpy.random.Generator`, optional
+            Of samplers: every object has its own stream, from the seed and its id. The sums over a
+            grid have nothing random.
         executor : `concurrent.futures.Executor`, optional
             Fits pieces of the catalogue at the same time; the answer is the same. Threads work
-            well: the kernels hold no lock.
+            well on a grid, whose kernels hold no lock; samplers are Python, for which processes
+            serve better.
         progress_bar : bool, optional
             Whether to show one.
         chunk_size : int, optional
-            Objects in a piece.
+            Objects in a piece: by default 64 on a grid, 1 for a sampler.
 
         Returns
         -------
@@ -267,9 +324,9 @@ class BayesFitter:
             If a name in ``pairs`` is unknown.
         ValueError
             If a column is missing, a flux is no number, an id is masked, one of limits is not
-            boolean, there are limits in a band in which a model has negative flux, ``redshift`` or
-            ``redshift_prior`` has the wrong shape, or both are given, or ``pairs`` has a parameter
-            twice or one with a single value.
+            boolean, there are limits in a band in which a model of the grid has negative flux,
+            ``redshift`` or ``redshift_prior`` has the wrong shape, or both are given, nothing is
+            free, or ``pairs`` has a parameter twice, one with a single value or a derived quantity.
         `~astropy.units.UnitsError`
             If a flux column has no unit of flux density.
 
@@ -278,52 +335,111 @@ class BayesFitter:
         .. [1] Sawicki 2012, PASP 124, 1208, appendix
         .. [2] Boquien et al. 2019, A&A 622, A103, section 4.3
         """
-        del seed
+        return self._fit_rows(
+            photometry,
+            {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs},
+            seed=seed,
+            chunk_size=chunk_size,
+            executor=executor,
+            progress_bar=progress_bar,
+        )
+
+    def _fit_rows(
+        self, photometry, options, *, seed=None, chunk_size=None, repeated=None, **parallel
+    ):
+        """Fit a catalogue, or a part of one of which earlier parts had the ``repeated`` rows."""
+        if chunk_size is None:
+            chunk_size = self.backend.chunk_size
         if not (_is_number(chunk_size, np.integer) and chunk_size >= 1):
             raise argument_error("chunk_size", "an integer >= 1", repr(chunk_size))
-        pairs = check_pairs(pairs, self)
-        data, flags, log_prior, settings = self._prepare(photometry, redshift, redshift_prior)
-        task = FitPiece(self._engine, self.priors, self.quantities, pairs)
-        pieces = cut(data, log_prior, int(chunk_size))
-        parts = parallel_map(task, pieces, executor=executor, progress_bar=progress_bar, desc="fit")
-        logger.debug("fitted %d objects", len(data.ids))
-        return fit_results(self, data, flags, Part.merge(parts), settings)
+        seed = None if self.engine == "grid" else check_seed(seed)
+        pairs = options.pop("pairs", None)
+        data, known, settings = self._prepare(photometry, **options, repeated=repeated)
+        task = self.backend.task(pairs, seed, known)
+        # the measured errors take no part, and what goes to other processes is kept small
+        sent = data._changed(flux_err=None)
+        pieces = [
+            (sent[rows], known[rows])
+            for rows in list(chunks(len(data), int(chunk_size))) or [slice(0, 0)]
+        ]
+        # for threads too, which share this setting with their process
+        with single_threaded():
+            results = FitResults.concatenate(parallel_map(task, pieces, desc="fit", **parallel))
+        logger.debug("fitted %d objects", len(data))
+        settings |= {} if seed is None else {"seed": seed}
+        return self._finish(results, data, settings)
 
-    def _prepare(self, photometry, redshift, redshift_prior):
-        """Fluxes, flags, ln(prior) of the redshifts of every object, and the settings."""
+    def _prepare(self, photometry, *, redshift=None, redshift_prior=None, repeated=None):
+        """Photometry with flags, what is known of the redshift of every object, and the settings."""
         require_columns(photometry, [], "photometry")
-        grid = self.grid
-        filters = self._bands(photometry)
+        if redshift is not None and redshift_prior is not None:
+            msg = "'redshift' and 'redshift_prior' must not be given both"
+            raise ValueError(msg)
+        filters = self._fitted_bands(photometry)
         unused = unused_bands(photometry, filters)
         if unused and self.filters is None:
             # who names the bands knows that others are left out
             warnings.warn(
                 f"bands of the photometry that the grid lacks are not fitted: {', '.join(unused)}",
                 MiricigaleWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
-        columns = [grid.filters.index(name) for name in filters]
+        columns = [self._error_bands.index(name) for name in filters]
         data = read_photometry(
             photometry,
             filters,
-            model_error=self.model_error[columns],
-            error_floor=self.error_floor[columns],
+            model_error=self._model_error[columns],
+            error_floor=self._error_floor[columns],
             n_bands_min=self.n_bands_min,
-            grid_filters=grid.filters,
+            grid_filters=self.bands,
+            repeated=repeated,
         )
-        bound = data.limit.any(axis=0)
-        for i in np.flatnonzero(bound & self._engine._negative) if bound.any() else ():
-            wanted = "without limits in bands in which a model has negative flux"
-            raise argument_error("photometry", wanted, f"some in {grid.filters[i]}")
-        flags = data.flags.copy()
-        log_prior = self._redshift_prior(photometry, redshift, redshift_prior, flags)
-        free = sum(axis.values.size > 1 for axis in self.priors.axes.values())
-        free += 1 - (redshift is not None and self.grid.redshift.size > 1)  # and the mass
-        few = (data.measured.sum(axis=1) < free) & ((flags & int(FitFlags.UNFITTED)) == 0)
+        self.backend.check_data(data)
+        flags = np.array(data.flags)
+        known, n_free, kind = self.backend.redshifts(photometry, redshift, redshift_prior, flags)
+        few = (data.measured.sum(axis=1) < n_free) & ((flags & int(FitFlags.UNFITTED)) == 0)
         flags[few] |= int(FitFlags.FEW_FOR_PARAMETERS)
-        log_prior[(flags & int(FitFlags.UNFITTED)) != 0] = -np.inf
-        settings = self.settings(filters, redshift is not None) | {"unused_bands": unused}
-        return data, flags, log_prior, settings
+        settings = self.settings(filters) | {"redshift": kind, "unused_bands": unused}
+        return data._changed(flags=flags), known, settings
+
+    def _fitted_bands(self, photometry):
+        """Filters to fit: those asked for, or those of the grid that the table has."""
+        if self.filters is not None:
+            return self.filters
+        filters = tuple(name for name in self.bands if name in photometry.colnames)
+        if not filters:
+            wanted = f"a table with at least one of the columns {list(self.bands)}"
+            raise argument_error("photometry", wanted, f"columns {photometry.colnames}")
+        return filters
+
+    def _finish(self, results, data, settings):
+        """Flag what the fits of a catalogue show, and say where the results come from."""
+        flags, fitted = np.array(results.flags), results.fitted
+        signal = np.where(data.measured, results.best_flux / results.sigma, 0.0)
+        with np.errstate(invalid="ignore"):
+            flags[fitted & (results.reduced_chi2 > self.max_reduced_chi2)] |= FitFlags.HIGH_CHI2
+            flags[fitted & ~(results.best_scale > 0)] |= FitFlags.NO_SIGNAL
+            faint = np.sqrt(np.sum(signal * signal, axis=1)) < LOW_SIGNAL
+            flags[fitted & faint] |= FitFlags.LOW_SIGNAL
+        unfitted = ~fitted & ((flags & FitFlags.UNFITTED) == 0)
+        flags[unfitted] |= FitFlags.NO_SIGNAL
+        pdf = results.pdf["redshift"]
+        fixed = settings["redshift"] == "fixed"
+        if not fixed and pdf.shape[1] > 2:
+            with np.errstate(invalid="ignore"):
+                edge = np.maximum(pdf[:, 0], pdf[:, -1]) > self.backend.edge_weight
+            flags[fitted & edge] |= FitFlags.REDSHIFT_EDGE
+        meta = provenance(
+            citations=self.backend.citations, fit=settings, **self.backend.provenance()
+        )
+        return results._changed(
+            flags=flags,
+            flux_err=data.flux_err,
+            fitted_filters=tuple(settings["filters"]),
+            redshift_fixed=fixed,
+            model=self.model,
+            meta=meta,
+        )
 
     def sample(
         self,
@@ -337,7 +453,7 @@ class BayesFitter:
         progress_bar=False,
     ):
         """
-        Draw models from the posterior of every object.
+        Draw models of the grid from the posterior of every object.
 
         Parameters
         ----------
@@ -358,87 +474,94 @@ class BayesFitter:
         Raises
         ------
         ValueError
-            See `fit`; or if ``n_draws`` is not positive.
+            See `fit`; or if ``n_draws`` is not positive, or the fitter has no grid: the results of
+            a sampler hold draws.
         """
+        if self.engine != "grid":
+            msg = "draws of a sampler are in its results: fitter.fit(photometry).samples(id)"
+            raise ValueError(msg)
         if not (_is_number(n_draws, np.integer) and n_draws >= 1):
             raise argument_error("n_draws", "an integer >= 1", repr(n_draws))
         seed = check_seed(seed)
-        data, flags, log_prior, settings = self._prepare(photometry, redshift, redshift_prior)
-        keys = [stream(seed, "fit", "draws", str(key)).integers(2**63) for key in data.ids]
-        parts = parallel_map(
-            DrawPiece(self._engine, int(n_draws)),
-            cut(data, log_prior, 16, seeds=np.array(keys, dtype=np.int64)),
-            executor=executor,
-            progress_bar=progress_bar,
-            desc="draws",
+        data, known, settings = self._prepare(
+            photometry, redshift=redshift, redshift_prior=redshift_prior
         )
-        index, scale = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
-        unfitted = ~np.isfinite(scale).all(axis=1) & ((flags & int(FitFlags.UNFITTED)) == 0)
-        flags[unfitted] |= int(FitFlags.NO_SIGNAL)
-        meta = provenance(
-            citations=self.grid.meta.get("citations", ()),
-            fit=settings,
-            seed=seed,
+        samples = self.backend.sample(
+            data, known, int(n_draws), seed, executor=executor, progress_bar=progress_bar
         )
-        return Samples(
-            grid=self.grid,
-            ids=data.ids,
-            flags=flags,
-            index=index,
-            scale=scale,
-            model=self.model,
-            meta=meta,
-            axes=self.priors.axes,
-        )
+        meta = provenance(citations=self.backend.citations, fit=settings, seed=seed)
+        return samples._changed(model=self.model, meta=meta)
 
-    def _bands(self, photometry):
-        """Filters to fit: those asked for, or those of the grid that the table has."""
-        if self.filters is not None:
-            return self.filters
-        have = getattr(photometry, "colnames", ())
-        filters = tuple(name for name in self.grid.filters if name in have)
-        if not filters:
-            wanted = f"a table with at least one of the columns {list(self.grid.filters)}"
-            raise argument_error("photometry", wanted, f"columns {list(have)}")
-        return filters
-
-    def _redshift_prior(self, photometry, redshift, redshift_prior, flags):
-        """ln(prior) of the grid's redshifts for every object, shape (n, nz)."""
-        if redshift is not None and redshift_prior is not None:
-            msg = "'redshift' and 'redshift_prior' must not be given both"
-            raise ValueError(msg)
-        z, prior = self.grid.redshift, self.priors.redshift
-        allowed = self._engine.usable.any(axis=1) & (prior > 0)
-        if redshift_prior is not None:
-            return density_log_prior(redshift_prior, z, allowed, flags)
-        if redshift is not None:
-            values = known_redshifts(photometry, redshift)
-            return fixed_log_prior(values, z, allowed, self.redshift_tolerance, flags)
-        log_prior = np.log(prior, where=allowed, out=np.full(z.size, -np.inf))
-        if not allowed.any():
-            flags |= int(FitFlags.NO_MODEL)
-        return np.tile(log_prior, (len(photometry), 1))
-
-    def settings(self, filters=None, fixed=False):
+    def settings(self, filters=None):
         """Return what the fit was told, for the meta of results: a dict of plain values."""
-        names = self.grid.filters
+        names = self._error_bands
         return {
-            "engine": self.engine,
-            "filters": list(filters or self.filters or names),
-            "redshift": "fixed" if fixed else "free",
-            "prior_f": self.prior_f,
-            "model_error": dict(zip(names, self.model_error.tolist(), strict=True)),
-            "error_floor": dict(zip(names, self.error_floor.tolist(), strict=True)),
+            "engine": self._engine_name,
+            "filters": list(filters or self.filters or self.bands),
+            "model_error": dict(zip(names, self._model_error.tolist(), strict=True)),
+            "error_floor": dict(zip(names, self._error_floor.tolist(), strict=True)),
             "n_bands_min": self.n_bands_min,
-            "rtol": self._engine.rtol,
-            "scale_error": self._engine.scale_error,
-            "compat": self.compat,
-            "n_models": int(self._engine.n_models),
-            "constants": constants(self.grid, self.priors.axes),
+            **self.backend.settings(),
         }
+
+
+def _names(argument, filters):
+    if isinstance(filters, str):
+        raise argument_error(argument, "a list of names or a FilterSet", repr(filters))
+    return tuple(getattr(filters, "names", filters))
 
 
 def _is_number(value, kind=np.number):
     """Whether a value is one number, and of a kind; True and False are none."""
     array = np.asarray(value)
     return array.ndim == 0 and np.issubdtype(array.dtype, kind)
+
+
+def _check_options(given):
+    """Refuse options of another engine than the one that was chosen."""
+    of_grid = isinstance(given["engine"], str) and given["engine"] == "grid"
+    foreign = _OF_SAMPLER if of_grid else _OF_GRID
+    declared = inspect.signature(BayesFitter).parameters
+    for name in foreign:
+        value, default = given[name], declared[name].default
+        if value is not default and not (np.ndim(value) == 0 and value == default):
+            wanted = "left out with engine='grid'" if of_grid else "left out with a sampler"
+            raise argument_error(name, wanted, repr(value))
+
+
+def _check_numbers(given):
+    """Refuse numbers that are none, or out of range."""
+    for name, least in _COUNTS.items():
+        value = given[name]
+        if not (_is_number(value, np.integer) and value >= least):
+            raise argument_error(name, f"an integer >= {least}", repr(value))
+    value = given["rtol"]
+    if not (_is_number(value) and 0 <= value < 0.1):
+        raise argument_error("rtol", "in [0, 0.1)", repr(value))
+    value = given["max_reduced_chi2"]
+    if not (_is_number(value) and value > 0):
+        raise argument_error("max_reduced_chi2", "positive", repr(value))
+    value = given["redshift_tolerance"]
+    if value is not None and not (_is_number(value) and value >= 0):
+        raise argument_error("redshift_tolerance", ">= 0", repr(value))
+    compat, scale_error = given["compat"], given["scale_error"]
+    if compat not in (None, "cigale"):
+        raise argument_error("compat", "None or 'cigale'", repr(compat))
+    if scale_error not in (None, True, False):
+        raise argument_error("scale_error", "True, False or None", repr(scale_error))
+    if compat and scale_error:
+        raise argument_error("scale_error", "False with compat='cigale'", repr(scale_error))
+
+
+def _grid_of(model, names, filters, axes):
+    """Return the grid to fit with, and the model that it is made of."""
+    if isinstance(model, SEDModel):
+        if axes is None or names is None:
+            msg = "'axes' and 'filters' must be given when 'model' is an SEDModel"
+            raise ValueError(msg)
+        return model.grid(axes, filters), model
+    if axes is not None:
+        raise argument_error("axes", "None when 'model' is a ModelGrid", "a value")
+    if not isinstance(model, ModelGrid):
+        raise argument_error("model", "a ModelGrid or an SEDModel", type(model).__name__)
+    return model, None

@@ -7,6 +7,7 @@ import numpy as np
 
 from miricigale.filters import Filter
 from miricigale.fitting.flags import FitFlags
+from miricigale.fitting.rows import ObjectRows, PerObject
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU, to_array
@@ -31,9 +32,9 @@ _KINDS = {"U": "text", "S": "text", "b": "true and false", "c": "complex numbers
 
 
 @dataclass(frozen=True, eq=False)
-class FitData:
+class FitData(ObjectRows):
     """
-    Photometry in arrays.
+    Photometry in arrays, which slices like `~miricigale.fitting.FitResults`.
 
     Parameters
     ----------
@@ -50,12 +51,12 @@ class FitData:
         `FitFlags`.
     """
 
-    ids: np.ndarray
-    flux: np.ndarray
-    flux_err: np.ndarray
-    sigma: np.ndarray
-    limit: np.ndarray
-    flags: np.ndarray
+    ids: PerObject
+    flux: PerObject
+    flux_err: PerObject
+    sigma: PerObject
+    limit: PerObject
+    flags: PerObject
 
     @property
     def used(self):
@@ -68,7 +69,9 @@ class FitData:
         return self.used & ~self.limit
 
 
-def read_photometry(table, filters, *, model_error, error_floor, n_bands_min, grid_filters=None):
+def read_photometry(
+    table, filters, *, model_error, error_floor, n_bands_min, grid_filters=None, repeated=None
+):
     """
     Take fluxes and errors from a table.
 
@@ -91,6 +94,8 @@ def read_photometry(table, filters, *, model_error, error_floor, n_bands_min, gr
         Objects with fewer usable bands are flagged.
     grid_filters : tuple of str, optional
         Order of the bands in the arrays returned, ``filters`` and others, which get no data.
+    repeated : `~numpy.ndarray` of bool, shape (n,), optional
+        Rows whose id is known from earlier parts of the catalogue.
 
     Returns
     -------
@@ -135,7 +140,7 @@ def read_photometry(table, filters, *, model_error, error_floor, n_bands_min, gr
     ids = read_ids(table)
     first = np.zeros(n, dtype=bool)
     first[np.unique(ids, return_index=True)[1]] = True
-    flags[~first] |= int(FitFlags.DUPLICATE_ID)
+    flags[~first if repeated is None else ~first | repeated] |= int(FitFlags.DUPLICATE_ID)
     return FitData(ids, flux, err, sigma, limit, flags)
 
 

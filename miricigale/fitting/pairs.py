@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from miricigale.fitting.assembly import constants
 from miricigale.utils.exceptions import argument_error, unknown_name
 
-__all__ = ["check_pairs", "joint_names", "joint_tables", "named_pairs"]
+__all__ = ["check_pairs", "joint_names", "joint_tables"]
 
 #: Letters of the engine's joint sums: redshift and fraction before galaxy, galaxy before torus.
 _LETTERS = {"redshift": "z", "frac_agn": "f", "galaxy": "g", "agn": "k"}
@@ -13,38 +12,7 @@ _LETTERS = {"redshift": "z", "frac_agn": "f", "galaxy": "g", "agn": "k"}
 _ALWAYS = {"redshift", "frac_agn"}
 
 
-def check_pairs(pairs, fitter):
-    """
-    Check pairs of parameters of a fit.
-
-    Parameters
-    ----------
-    pairs : list of tuple of str or None
-        Pairs of parameters.
-    fitter : `~miricigale.fitting.BayesFitter`
-        Knows the parameters.
-
-    Returns
-    -------
-    pairs : tuple of tuple of str
-        Each once, whatever its order; without redshift and AGN fraction, which every fit has.
-
-    Raises
-    ------
-    KeyError
-        If a name is unknown.
-    ValueError
-        If these are no pairs, both are one parameter, or one has a single value or is a derived
-        quantity.
-    """
-    axes = fitter.priors.axes
-    derived = (*fitter.quantities.names, getattr(fitter.fraction, "name", None))
-    constant = constants(fitter.grid, axes)
-    wanted = "of parameters of the grid ('sample' draws derived quantities jointly)"
-    return named_pairs(pairs, axes, constant, derived, wanted)
-
-
-def named_pairs(pairs, axes, constant, derived, wanted):
+def check_pairs(pairs, axes, constant, derived, wanted):
     """
     Check pairs of parameters.
 
@@ -62,7 +30,15 @@ def named_pairs(pairs, axes, constant, derived, wanted):
     Returns
     -------
     pairs : tuple of tuple of str
-        As of `check_pairs`, which tells the errors too.
+        Each once, whatever its order; without redshift and AGN fraction, which every fit has.
+
+    Raises
+    ------
+    KeyError
+        If a name is unknown.
+    ValueError
+        If these are no pairs, both are one parameter, or one has a single value or is a derived
+        quantity.
     """
     if isinstance(pairs, (str, dict)) or not np.iterable(() if pairs is None else pairs):
         raise argument_error("pairs", "a list of pairs of parameter names", repr(pairs))

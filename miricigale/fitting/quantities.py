@@ -1,4 +1,4 @@
-"""Derived quantities of a grid: what grows with the scale, and the shape of the galaxy."""
+"""Parameters and derived quantities of the models of a grid."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -7,10 +7,19 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.fitting.posterior import cell_percentiles
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.random import stream
 from miricigale.utils.units import LUMINOSITY, MASS
 
-__all__ = ["DERIVED_LEVELS", "Quantities", "ShapeQuantities", "kept_percentiles"]
+__all__ = [
+    "DERIVED_LEVELS",
+    "ModelValues",
+    "OtherFraction",
+    "Quantities",
+    "ShapeQuantities",
+    "check_draws",
+    "kept_percentiles",
+]
 
 #: Levels at which the distributions of derived quantities are kept.
 DERIVED_LEVELS = np.array(
@@ -22,6 +31,18 @@ DERIVED_LEVELS.flags.writeable = False
 _SAME = 1e-9
 #: Shape quantities whose outermost cells end at 0.
 _NOT_NEGATIVE = ("a_v", "age_mass", "age_light")
+#: AGN fractions by name, and what they are.
+FRACTIONS = {
+    "frac_agn_ir": "AGN share of 3-1000 um light",
+    "frac_agn_dust": "AGN power over the sum with the dust luminosity",
+}
+
+_ALL = 1e30
+#: AGN fractions in both definitions: the AGN's part and the galaxy's.
+_FRACTIONS = {
+    "frac_agn_dust": ("agn_power", "dust_luminosity"),
+    "frac_agn_ir": ("ir_luminosity_agn", "ir_luminosity_galaxy"),
+}
 
 
 def kept_percentiles(name, levels, kept):
@@ -304,3 +325,185 @@ class Quantities:
 def _text(column, ending):
     text = getattr(column.info, "description", None) or column.info.name
     return text.removesuffix(ending)
+
+
+@dataclass(frozen=True, eq=False)
+class OtherFraction:
+    """
+    AGN fraction of every model in a second definition: y / (1 + y), y = c galaxy[g] agn[k].
+
+    c = f / (1 - f) is that of the grid's own fraction f. If the latter refers to the dust
+    luminosity the other is the AGN's share of 3-1000 um light, and the other way round. It does
+    not scale with mass.
+
+    Parameters
+    ----------
+    name : str
+        ``frac_agn_ir`` or ``frac_agn_dust``.
+    description : str
+        One line.
+    galaxy, agn : `~numpy.ndarray`, shapes (nG,) and (nA,)
+        The two factors of y.
+    """
+
+    name: str
+    description: str
+    galaxy: np.ndarray
+    agn: np.ndarray
+
+    @classmethod
+    def of_grid(cls, grid):
+        """Of a `~miricigale.sed.ModelGrid`; None if it has no AGN or not the quantities needed."""
+        by_dust = grid.meta.get("frac_agn_definition", "dust") == "dust"
+        name = "frac_agn_ir" if by_dust else "frac_agn_dust"
+        of_galaxy = "ir_luminosity" if by_dust else "dust_luminosity"
+        of_agn = "ir_luminosity" if by_dust else "agn_power"
+        tables = (grid.galaxy_properties, of_galaxy), (grid.agn_properties, of_agn)
+        if not grid.n_agn or any(column not in table.colnames for table, column in tables):
+            return None
+        galaxy, agn = (np.asarray(_in_watt(table[column]), float) for table, column in tables)
+        reference = np.asarray(grid.dust_luminosity, float)
+        # where a galaxy has none of it all of it is the AGN's
+        ratio = np.where(reference > 0, _ALL, 0.0)
+        np.divide(reference, galaxy, out=ratio, where=galaxy > 0)
+        return cls(name, FRACTIONS[name], ratio, agn)
+
+    def evaluate(self, g, k, frac):
+        """Values for models of galaxies g and tori k at fractions of the grid."""
+        y = frac / (1.0 - frac) * self.galaxy[g] * self.agn[k]
+        return y / (1.0 + y)
+
+
+def _in_watt(column):
+    """Values in W for each solar mass, or plain ones."""
+    if hasattr(column, "to_value") and column.unit.is_equivalent("W / solMass"):
+        return column.to_value("W / solMass")
+    return getattr(column, "value", column)
+
+
+def check_draws(grid, ids, flags, index, scale):
+    """
+    Check models drawn from a grid; see `~miricigale.fitting.Samples` for the arguments.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not agree, an index is not one of the grid, or there is no torus where the
+        AGN fraction is above 0.
+    """
+    n, shape = ids.size, np.shape(scale)
+    if len(shape) != 2 or shape[0] != n or shape[1] < 1:
+        raise argument_error("scale", f"of shape ({n}, n_draws)", f"{shape}")
+    if np.shape(index) != (*shape, 4):
+        raise argument_error("index", f"of shape {(*shape, 4)}", f"{np.shape(index)}")
+    if np.shape(flags) != (n,):
+        raise argument_error("flags", f"of shape ({n},)", f"{np.shape(flags)}")
+    sizes = (grid.redshift.size, grid.n_galaxies, max(grid.n_agn, 1), grid.frac_agn.size)
+    index = np.asarray(index, dtype=np.int64)
+    drawn = index[(index[:, :, 0] >= 0).all(axis=1)].reshape(-1, 4)
+    lowest = np.array([0, 0, -1, 0])
+    if np.any(drawn < lowest) or np.any(drawn >= np.array(sizes)):
+        raise argument_error("index", f"within the grid's {sizes}", "others")
+    if np.any((drawn[:, 2] < 0) & (grid.frac_agn[drawn[:, 3]] > 0)):
+        raise argument_error("index", "with a torus where the AGN fraction is above 0", "none")
+
+
+class ModelValues:
+    """
+    Values of parameters and derived quantities of models of a grid.
+
+    Parameters
+    ----------
+    grid : `~miricigale.sed.ModelGrid`
+        The grid.
+    axes : dict of str to `~miricigale.fitting.priors.GridAxis`
+        Parameters that have several values, with ``share``.
+    seed : int
+        Chooses values of parameters without effect.
+    """
+
+    def __init__(self, grid, axes, seed):
+        self.grid, self.axes, self.seed = grid, axes, seed
+        self.quantities = Quantities.of_grid(grid)
+        have = set(self.quantities.names)
+        self.fractions = tuple(n for n, parts in _FRACTIONS.items() if set(parts) <= have)
+
+    @property
+    def names(self):
+        """Names of parameters, derived quantities and AGN fractions."""
+        return (*self.axes, *self.quantities.names, *self.fractions)
+
+    def unit(self, name):
+        """Unit of a parameter or quantity."""
+        if name in self.axes:
+            return u.Unit(self.axes[name].unit)
+        if name in self.fractions:
+            return u.dimensionless_unscaled
+        if name not in self.quantities.names:
+            raise unknown_name("parameter", name, self.names)
+        return self.quantities.units[self.quantities.names.index(name)]
+
+    def description(self, name):
+        """One line on a parameter or quantity."""
+        if name in self.quantities.names:
+            return self.quantities.descriptions[self.quantities.names.index(name)]
+        if name in self.fractions:
+            return FRACTIONS[name]
+        for table in (self.grid.galaxy_parameters, self.grid.agn_parameters):
+            if name in table.colnames and table[name].info.description:
+                return table[name].info.description
+        return name
+
+    def extensive(self, name):
+        """Whether a quantity scales with mass."""
+        return name in self.quantities.names and name not in self.quantities.shape.names
+
+    def values(self, name, ids, index, scale):
+        """
+        Values in models drawn for n objects.
+
+        Parameters
+        ----------
+        name : str
+            A parameter or quantity.
+        ids : `~numpy.ndarray`, shape (n,)
+            Ids of the objects, which key the streams of parameters without effect.
+        index : `~numpy.ndarray` of int, shape (n, n_draws, 4)
+            Redshift, galaxy, torus (-1: none) and AGN fraction.
+        scale : `~numpy.ndarray`, shape (n, n_draws)
+            Solar masses formed.
+
+        Returns
+        -------
+        values : `~numpy.ndarray`, shape (n, n_draws)
+            NaN for parameters of a torus that is not there.
+        """
+        z, g, k, f = np.moveaxis(index, -1, 0)
+        grid = self.grid
+        if name == "redshift":
+            return grid.redshift[z]
+        if name in self.axes:
+            axis = self.axes[name]
+            if axis.kind == "frac_agn":
+                return grid.frac_agn[f]
+            return self._of_axis(axis, g if axis.kind == "galaxy" else k, ids)
+        if name in self.fractions:
+            agn, galaxy = (self.values(part, ids, index, scale) for part in _FRACTIONS[name])
+            whole = agn + galaxy
+            return np.divide(agn, whole, out=np.zeros_like(whole), where=whole != 0)
+        frac = grid.frac_agn[f]
+        return self.quantities.evaluate(name, grid, g, np.maximum(k, 0), frac, scale)
+
+    def _of_axis(self, axis, model, ids):
+        """Values of a parameter; where a model stands for several, drawn as its prior has it."""
+        share = axis.share
+        out = axis.values[np.argmax(share, axis=0)][model]
+        several = np.count_nonzero(share > 0, axis=0) > 1
+        many = several[model] & (model >= 0)
+        total = np.cumsum(share, axis=0)
+        for i in np.flatnonzero(many.any(axis=1)):
+            rng = stream(self.seed, "samples", axis.name, str(ids[i]))
+            draw = rng.random(model.shape[1])[many[i]]
+            cdf = total[:, model[i][many[i]]]
+            out[i, many[i]] = axis.values[np.sum(draw * cdf[-1] >= cdf, axis=0)]
+        return np.where(model >= 0, out, np.nan)

@@ -1,35 +1,42 @@
-"""What a fit of a catalogue returns."""
+"""What a fit returns: posteriors of the objects of a catalogue."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
 from miricigale.fitting.flags import FitFlags
-from miricigale.fitting.keyed import find_row, rows_by_id
-from miricigale.fitting.posterior import cell_percentiles, check_levels, moments
-from miricigale.fitting.quantities import kept_percentiles
-from miricigale.fitting.result import FitResult
+from miricigale.fitting.posterior import cell_edges, cell_percentiles, check_levels, moments
+from miricigale.fitting.quantities import DERIVED_LEVELS, kept_percentiles
+from miricigale.fitting.rows import ObjectRows, PerObject, PerObjectDict
 from miricigale.utils.exceptions import argument_error, unknown_name
-from miricigale.utils.tables import error_column
-from miricigale.utils.units import FNU, frozen_array
+from miricigale.utils.tables import add_columns, error_column
+from miricigale.utils.unified import unified_read, unified_write
+from miricigale.utils.units import FNU
 
 __all__ = ["FitResults"]
 
 _LEVELS = (0.16, 0.5, 0.84)
-#: Part of the mean below which CIGALE gives no standard deviation.
-CIGALE_LEAST_ERROR = 0.05
-_SUFFIXES = ("p16", "p50", "p84")
+_PARTS = {
+    "mean": "posterior mean",
+    "std": "posterior standard deviation",
+    "p16": "16th percentile",
+    "p50": "median",
+    "p84": "84th percentile",
+    "best": "best model's value",
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FitResults:
+class FitResults(ObjectRows):
     """
     Posteriors of the objects of a catalogue, in its order.
 
     Made by `BayesFitter.fit`; every array is read-only, and NaN for objects that could not be
-    fitted.
+    fitted. ``results[id]`` and ``results[rows]`` are of this class too: of a single object the arrays
+    have no axis of objects (shapes below without ``n``), and only a single object has spectra and
+    plots.
 
     Parameters
     ----------
@@ -42,24 +49,25 @@ class FitResults:
     chi2 : `~numpy.ndarray`, shape (n,)
         Chi2 of the best model, model error and the terms of upper limits included.
     log_evidence : `~numpy.ndarray`, shape (n,)
-        ln of the sum of prior * likelihood (fluxes in uJy), each model at its best scale.
+        Of the grid ln of the sum of prior * likelihood (fluxes in uJy), each model at its best scale;
+        otherwise the sampler's ln(evidence).
     filters : tuple of str
-        Bands of the grid, nb of them.
+        Bands of the models, nb of them.
     flux, flux_err, sigma : `~numpy.ndarray`, shape (n, nb)
         Measured fluxes or upper limits, their errors, and the errors used (of fluxes with model
         error; infinite in bands that were not used), in uJy.
     axes : dict of str to `~miricigale.fitting.priors.GridAxis`
-        Parameters that have several values.
+        Parameters that have several values; of a sampler, cells of their priors.
     pdf : dict of str to `~numpy.ndarray`, shape (n, n_values)
         Posterior weights of their values.
     pdf_2d : `~numpy.ndarray`, shape (n, nz, nf)
         Joint posterior of redshift and AGN fraction.
     best_index : `~numpy.ndarray` of int, shape (n, 4)
-        Redshift, galaxy, torus and fraction of the best model in the grid.
+        Redshift, galaxy, AGN template and fraction of the best model in the grid; -1 of a sampler.
     best_scale : `~numpy.ndarray`, shape (n,)
         Its scale, in solar masses formed.
-    best : dict of str to `~numpy.ndarray`, shape (n,)
-        Parameters and derived quantities of the best model.
+    best : dict of str to array_like, shape (n,)
+        Parameters and derived quantities of the best model; attribute: `~astropy.units.Quantity`.
     quantities, units, descriptions : tuple
         Names, units and meanings of the n_q derived quantities.
     moments : `~numpy.ndarray`, shape (n, n_q, 3)
@@ -68,86 +76,98 @@ class FitResults:
         Quantiles at `miricigale.fitting.quantities.DERIVED_LEVELS`.
     model_flux, model_flux_std, best_flux : `~numpy.ndarray`, shape (n, nb)
         Mean and standard deviation of the model fluxes over the posterior, and the fluxes of
-        the best model, in uJy, in all bands of the grid.
-    meta : dict
-        Provenance and the settings of the fit.
-    model : `~miricigale.sed.SEDModel`, optional
-        The model the grid was made from; not written to files.
-    intensive : tuple of str, optional
-        Those of ``quantities`` that do not scale with mass: attenuation, ages, colours, the AGN
-        fraction in its other definition. They have no mean of log10.
+        the best model, in uJy, in all bands of the models.
     limit : `~numpy.ndarray` of bool, shape (n, nb), optional
         Which of the bands used are upper limits; none by default.
     pairs : dict of tuple of str to `~numpy.ndarray`, shape (n, nx, ny), optional
         Joint posteriors of other pairs of parameters, those that the fit was asked for; see
         `joint_pdf`.
+    log_evidence_err, n_calls, n_effective, converged : `~numpy.ndarray`, shape (n,), optional
+        Of a sampler: error of ``log_evidence``, models evaluated, effective size of the sample, and
+        whether it finished before ``max_calls``.
+    axis_moments, axis_quantiles : `~numpy.ndarray`, shapes (n, n_axes, 2) and (n, n_axes, n_levels), optional
+        Of a sampler: moments and quantiles of the parameters of ``axes``, from the sample itself.
+    draws : `~numpy.ndarray`, shape (n, n_draws, n_parameters), optional
+        Of a sampler: draws of equal weight of all `parameters`; see `samples`.
+    intensive : tuple of str, optional
+        Those of ``quantities`` that do not scale with mass: attenuation, ages, colours, the AGN
+        fraction in its other definition. They have no mean of log10.
+    fitted_filters : tuple of str, optional
+        The bands that were fitted; all of ``filters`` by default.
+    redshift_fixed : bool, optional
+        Whether the fit was at given redshifts.
+    constants : dict of str to float, optional
+        Parameters with one value, which have no posterior.
+    least_std : float, optional
+        Part of the mean below which no standard deviation is given (CIGALE: 0.05).
+    model : `~miricigale.sed.SEDModel`, optional
+        The model that was fitted; not written to files.
+    meta : dict, optional
+        Provenance and the settings of the fit, for people.
     """
 
-    ids: np.ndarray
-    flags: np.ndarray
-    n_bands: np.ndarray
-    chi2: np.ndarray
-    log_evidence: np.ndarray
+    ids: PerObject
+    flags: PerObject
+    n_bands: PerObject
+    chi2: PerObject
+    log_evidence: PerObject
     filters: tuple
-    flux: np.ndarray
-    flux_err: np.ndarray
-    sigma: np.ndarray
+    flux: PerObject
+    flux_err: PerObject
+    sigma: PerObject
     axes: dict
-    pdf: dict
-    pdf_2d: np.ndarray
-    best_index: np.ndarray
-    best_scale: np.ndarray
-    best: dict
+    pdf: PerObjectDict
+    pdf_2d: PerObject
+    best_index: PerObject
+    best_scale: PerObject
+    best: PerObjectDict
     quantities: tuple
     units: tuple
     descriptions: tuple
-    moments: np.ndarray
-    quantiles: np.ndarray
-    model_flux: np.ndarray
-    model_flux_std: np.ndarray
-    best_flux: np.ndarray
-    meta: dict = field(default_factory=dict)
-    model: object = None
+    moments: PerObject
+    quantiles: PerObject
+    model_flux: PerObject
+    model_flux_std: PerObject
+    best_flux: PerObject
+    limit: PerObject = None
+    pairs: PerObjectDict = field(default_factory=dict)
+    log_evidence_err: PerObject = None
+    n_calls: PerObject = None
+    n_effective: PerObject = None
+    converged: PerObject = None
+    axis_moments: PerObject = None
+    axis_quantiles: PerObject = None
+    draws: PerObject = None
     intensive: tuple = ()
-    limit: np.ndarray | None = None
-    pairs: dict = field(default_factory=dict)
+    fitted_filters: tuple | None = None
+    redshift_fixed: bool = False
+    constants: dict = field(default_factory=dict)
+    least_std: float = 0.0
+    model: object = None
+    meta: dict = field(default_factory=dict)
+
+    #: Where the formats of files are registered.
+    io_module = "miricigale.fitting.io"
 
     def __post_init__(self):
         if self.limit is None:
             object.__setattr__(self, "limit", np.zeros(np.shape(self.sigma), dtype=bool))
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(value, np.ndarray):
-                object.__setattr__(self, item.name, frozen_array(value, value.dtype))
-        for name in ("pdf", "best", "pairs"):
-            frozen = {k: frozen_array(v) for k, v in getattr(self, name).items()}
-            object.__setattr__(self, name, frozen)
-        object.__setattr__(self, "_rows", rows_by_id(self.ids))
-
-    def __len__(self):
-        return len(self.ids)
-
-    def __iter__(self):
-        return (FitResult(self, row) for row in range(len(self)))
-
-    def __getitem__(self, key):
-        """Return the result of the object with this id."""
-        return FitResult(self, self.row(key))
+        if self.fitted_filters is None:
+            object.__setattr__(self, "fitted_filters", tuple(self.filters))
+        best = {name: u.Quantity(value, self.unit(name)) for name, value in self.best.items()}
+        object.__setattr__(self, "best", best)
+        super().__post_init__()
 
     def __repr__(self):
+        bands = f"{len(self.filters)} bands"
+        if self.isscalar:
+            key = np.asarray(self.ids).item()
+            return f"<FitResults of {key!r}, chi2 {self.chi2:.4g} in {self.n_bands} of {bands}>"
         good = int(np.count_nonzero(self.fitted))
-        return f"<FitResults of {len(self)} objects, {good} fitted, {len(self.filters)} bands>"
+        return f"<FitResults of {len(self)} objects, {good} fitted, {bands}>"
 
-    def row(self, key):
-        """
-        Row of an id (the first, if it occurs twice).
-
-        Raises
-        ------
-        KeyError
-            If there is none.
-        """
-        return find_row(self._rows, key, len(self))
+    def _repr_html_(self):
+        return self._several().to_table()._repr_html_()
 
     @property
     def fitted(self):
@@ -157,13 +177,13 @@ class FitResults:
     @property
     def n_limits(self):
         """How many of the bands used are upper limits: array of int, shape (n,)."""
-        return np.count_nonzero(self.limit, axis=1)
+        return np.count_nonzero(self.limit, axis=-1)
 
     @property
     def reduced_chi2(self):
         """Chi2 over the number of bands (limits among them) less one; NaN with a single band."""
-        free = np.maximum(self.n_bands - 1, 0)
-        return np.divide(self.chi2, free, out=np.full(len(self), np.nan), where=free > 0)
+        free = np.asarray(np.maximum(self.n_bands - 1, 0))
+        return np.divide(self.chi2, free, out=np.full(free.shape, np.nan), where=free > 0)[()]
 
     @property
     def parameters(self):
@@ -176,10 +196,19 @@ class FitResults:
             return u.Unit(self.axes[name].unit)
         return self.units[self._quantity(name)]
 
+    def extensive(self, name):
+        """Whether it is a derived quantity that scales with mass."""
+        return name in self.quantities and name not in self.intensive
+
     def _quantity(self, name):
         if name not in self.quantities:
             raise unknown_name("parameter", name, self.parameters)
         return self.quantities.index(name)
+
+    def _meaning(self, name):
+        return self.descriptions[self._quantity(name)] if name in self.quantities else name
+
+    # ------------------------------------------------------------------ posteriors
 
     def mean(self, name):
         """Posterior means of a parameter or derived quantity: Quantity, shape (n,)."""
@@ -190,14 +219,15 @@ class FitResults:
         return self._moments(name)[1] * self.unit(name)
 
     def _moments(self, name):
-        if name in self.axes:
+        if name not in self.axes:
+            i = self._quantity(name)
+            mean, std = self.moments[..., i, 0], self.moments[..., i, 1]
+        elif self.axis_moments is None:
             mean, std = moments(self.axes[name].values, self.pdf[name])
         else:
-            i = self._quantity(name)
-            mean, std = self.moments[:, i, 0], self.moments[:, i, 1]
-        if self.meta.get("fit", {}).get("compat") == "cigale":
-            std = np.maximum(std, CIGALE_LEAST_ERROR * np.abs(mean))
-        return mean, std
+            i = list(self.axes).index(name)
+            mean, std = self.axis_moments[..., i, 0], self.axis_moments[..., i, 1]
+        return mean, np.maximum(std, self.least_std * np.abs(mean))
 
     def percentile(self, name, levels):
         """
@@ -208,8 +238,8 @@ class FitResults:
         name : str
             A parameter or derived quantity.
         levels : array_like
-            Levels in (0, 1); of derived quantities from 0.001 to 0.999, between which their
-            distribution is kept.
+            Levels in (0, 1); of derived quantities, and of all of a sampler, from 0.001 to 0.999,
+            between which their distribution is kept.
 
         Returns
         -------
@@ -224,12 +254,49 @@ class FitResults:
             If a level is outside.
         """
         levels = check_levels(levels)
+        some = self._several()
+        if name not in self.axes:
+            out = kept_percentiles(name, levels, some.quantiles[:, self._quantity(name)])
+        elif self.axis_quantiles is not None:
+            i = list(self.axes).index(name)
+            out = kept_percentiles(name, levels, some.axis_quantiles[:, i])
+        else:
+            axis = self.axes[name]
+            out = cell_percentiles(axis.values, some.pdf[name], levels, axis.bounds)
+        return (out[0] if self.isscalar else out) * self.unit(name)
+
+    def distribution(self, name):
+        """
+        Posterior of a parameter or derived quantity.
+
+        Returns
+        -------
+        edges : `~astropy.units.Quantity`, shape (n_cells + 1,) or (n, n_cells + 1)
+            Edges of the cells: those around the values of a parameter, or, for each object, the
+            quantiles of a derived quantity.
+        weights : `~numpy.ndarray`, shape (n, n_cells) or (n_cells,)
+            Weight of each cell; of the cells between quantiles the same for all.
+        """
         if name in self.axes:
             axis = self.axes[name]
-            out = cell_percentiles(axis.values, self.pdf[name], levels, axis.bounds)
-        else:
-            out = kept_percentiles(name, levels, self.quantiles[:, self._quantity(name)])
-        return out * self.unit(name)
+            return cell_edges(axis.values, axis.bounds) * self.unit(name), self.pdf[name]
+        edges = self.quantiles[..., self._quantity(name), :]
+        return edges * self.unit(name), np.diff(DERIVED_LEVELS)
+
+    def cdf(self, name):
+        """
+        Cumulative distribution of a parameter or derived quantity, linear between its points.
+
+        Returns
+        -------
+        values : `~astropy.units.Quantity`
+            Edges of the cells of a parameter, or quantiles; see `distribution`.
+        levels : `~numpy.ndarray`
+            Part of the posterior below each; from 0.001 to 0.999 for a derived quantity.
+        """
+        edges, weights = self.distribution(name)
+        first = np.full((*weights.shape[:-1], 1), 0.0 if name in self.axes else DERIVED_LEVELS[0])
+        return edges, np.concatenate([first, first + np.cumsum(weights, axis=-1)], axis=-1)
 
     def joint_pdf(self, x, y):
         """
@@ -257,13 +324,45 @@ class FitResults:
         if (x, y) in known:
             return known[x, y]
         if (y, x) in known:
-            return known[y, x].swapaxes(1, 2)
+            return np.swapaxes(known[y, x], -1, -2)
         for name in (x, y):
             if name not in self.parameters:
                 raise unknown_name("parameter", name, self.parameters)
         have = ", ".join(f"{a} and {b}" for a, b in known) or "none"
         msg = f"no joint posterior of {x} and {y}; known: {have} ('pairs' of BayesFitter.fit)"
         raise KeyError(msg)
+
+    def samples(self, key):
+        """
+        Draws of a sampler from the posterior of one object.
+
+        Parameters
+        ----------
+        key : object
+            Its id.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            A row for each draw, all of the same weight; a column for each parameter and derived
+            quantity.
+
+        Raises
+        ------
+        ValueError
+            If the object was not fitted, or the fit was no sampler's: `BayesFitter.sample` draws from
+            the posterior of a grid.
+        """
+        if self.draws is None:
+            msg = "results of a grid hold no draws; BayesFitter.sample makes some"
+            raise ValueError(msg)
+        one = self[key]._fitted_one()
+        out = QTable(meta=dict(self.meta) | {"id": str(key)})
+        columns = zip(self.parameters, one.draws.T, strict=True)
+        add_columns(out, {n: (u.Quantity(v, self.unit(n)), self._meaning(n)) for n, v in columns})
+        return out
+
+    # ---------------------------------------------------------------------- tables
 
     def to_table(self):
         """
@@ -273,47 +372,42 @@ class FitResults:
         -------
         table : `~astropy.table.QTable`
             One row for each object: ``id``, ``flags``, ``n_bands``, ``n_limits``,
-            ``chi2_best``, ``reduced_chi2``, ``log_evidence``, and for each parameter and derived
-            quantity ``<name>_mean``, ``_std``, ``_p16``, ``_p50``, ``_p84`` and ``_best``;
-            derived quantities that scale with mass also have ``_logmean``, the mean of log10
-            (dex, in their unit).
+            ``chi2_best``, ``reduced_chi2``, ``log_evidence`` (of a sampler also
+            ``log_evidence_err``, ``n_calls``, ``n_effective``, ``converged``), and for each
+            parameter and derived quantity ``<name>_mean``, ``_std``, ``_p16``, ``_p50``, ``_p84``
+            and ``_best``; derived quantities that scale with mass also have ``_logmean``, the mean
+            of log10 (dex, in their unit).
         """
-        out = QTable(meta=dict(self.meta))
+        some = self._several()
         columns = {
-            "id": (np.array(self.ids), "identifier"),
-            "flags": (np.array(self.flags), FitFlags.describe()),
-            "n_bands": (np.array(self.n_bands), "bands used, upper limits among them"),
-            "n_limits": (self.n_limits, "bands used that are upper limits"),
-            "chi2_best": (np.array(self.chi2), "chi2 of the best model"),
-            "reduced_chi2": (self.reduced_chi2, "chi2_best over the number of bands less one"),
-            "log_evidence": (np.array(self.log_evidence), "ln of the evidence, fluxes in uJy"),
+            "id": (some.ids, "identifier"),
+            "flags": (some.flags, FitFlags.describe()),
+            "n_bands": (some.n_bands, "bands used, upper limits among them"),
+            "n_limits": (some.n_limits, "bands used that are upper limits"),
+            "chi2_best": (some.chi2, "chi2 of the best model"),
+            "reduced_chi2": (some.reduced_chi2, "chi2_best over the number of bands less one"),
+            "log_evidence": (some.log_evidence, "ln of the evidence, fluxes in uJy"),
+            "log_evidence_err": (some.log_evidence_err, "its 1-sigma error"),
+            "n_calls": (some.n_calls, "models evaluated"),
+            "n_effective": (some.n_effective, "effective size of the sample"),
+            "converged": (some.converged, "whether the sampler finished"),
         }
-        for name, (values, text) in columns.items():
-            out[name] = values
-            out[name].info.description = text
-        for name in self.parameters:
-            unit = self.unit(name)
-            meaning = self._meaning(name)
-            percentiles = self.percentile(name, _LEVELS)
-            parts = {"mean": self.mean(name), "std": self.std(name)}
-            parts |= {s: percentiles[:, i] for i, s in enumerate(_SUFFIXES)}
-            parts["best"] = u.Quantity(self.best[name], unit)
-            for suffix, value in parts.items():
-                column = f"{name}_{suffix}"
-                out[column] = value
-                out[column].info.description = f"{_PARTS[suffix]} of {meaning}"
-            if name in self.quantities and name not in self.intensive:
-                column = f"{name}_logmean"
-                out[column] = self.moments[:, self._quantity(name), 2] * u.dex
-                out[
-                    column
-                ].info.description = f"posterior mean of log10 of {meaning}, in {unit.to_string()}"
+        columns = {n: (np.array(v), text) for n, (v, text) in columns.items() if v is not None}
+        for name in some.parameters:
+            unit, meaning = some.unit(name), some._meaning(name)
+            percentiles = some.percentile(name, _LEVELS)
+            parts = [some.mean(name), some.std(name), *percentiles.T, some.best[name].copy()]
+            for (suffix, text), value in zip(_PARTS.items(), parts, strict=True):
+                columns[f"{name}_{suffix}"] = (value, f"{text} of {meaning}")
+            if some.extensive(name):
+                text = f"posterior mean of log10 of {meaning}, in {unit.to_string()}"
+                columns[f"{name}_logmean"] = (
+                    some.moments[:, some._quantity(name), 2] * u.dex,
+                    text,
+                )
+        out = QTable(meta=dict(self.meta))
+        add_columns(out, columns)
         return out
-
-    def _meaning(self, name):
-        if name in self.quantities:
-            return self.descriptions[self._quantity(name)]
-        return name
 
     def predict(self, filters=None):
         """
@@ -323,8 +417,8 @@ class FitResults:
 
         Parameters
         ----------
-        filters : list of str, optional
-            Bands of the grid, fitted or not; all by default.
+        filters : list of str or `~miricigale.filters.FilterSet`, optional
+            Bands of the models, fitted or not; all by default.
 
         Returns
         -------
@@ -334,75 +428,190 @@ class FitResults:
         """
         if isinstance(filters, str):
             raise argument_error("filters", "a list of names or a FilterSet", repr(filters))
-        names = self.filters if filters is None else tuple(getattr(filters, "names", filters))
-        out = QTable({"id": np.array(self.ids)}, meta=dict(self.meta))
-        for name in names:
-            i = self._band(name)
-            out[name] = self.model_flux[:, i] * FNU
-            out[name].info.description = "posterior mean of the model flux"
-            out[error_column(name)] = self.model_flux_std[:, i] * FNU
-            out[error_column(name)].info.description = "its posterior standard deviation"
-            out[f"{name}_best"] = self.best_flux[:, i] * FNU
-            out[f"{name}_best"].info.description = "flux of the best model"
+        some = self._several()
+        out = QTable({"id": np.array(some.ids)}, meta=dict(self.meta))
+        for name in self.filters if filters is None else getattr(filters, "names", filters):
+            if name not in self.filters:
+                raise unknown_name("filter of the models", name, self.filters)
+            i = self.filters.index(name)
+            columns = {
+                name: (some.model_flux[:, i] * FNU, "posterior mean of the model flux"),
+                error_column(name): (
+                    some.model_flux_std[:, i] * FNU,
+                    "its posterior standard deviation",
+                ),
+                f"{name}_best": (some.best_flux[:, i] * FNU, "flux of the best model"),
+            }
+            add_columns(out, columns)
         return out
 
-    def _band(self, name):
-        if name not in self.filters:
-            raise unknown_name("filter of the grid", name, self.filters)
-        return self.filters.index(name)
+    # ---------------------------------------------------------------- single objects
 
     def with_model(self, model):
         """Return a copy that knows the `~miricigale.sed.SEDModel`, for spectra of the best fits."""
-        values = {item.name: getattr(self, item.name) for item in fields(self)}
-        return type(self)(**{**values, "model": model})
+        return replace(self, model=model)
 
-    def plot_sed(self, key, ax=None, **kwargs):
-        """Draw photometry and best model of an object; see `FitResult.plot_sed`."""
-        return self[key].plot_sed(ax=ax, **kwargs)
+    def _one(self, what):
+        """Refuse several objects where one is needed."""
+        if not self.isscalar:
+            msg = f"{what} is of a single object: results[id].{what}()"
+            raise TypeError(msg)
+        return self
 
-    def plot_pdf(self, key, name, ax=None, **kwargs):
-        """Draw the posterior of a parameter of an object; see `FitResult.plot_pdf`."""
-        return self[key].plot_pdf(name, ax=ax, **kwargs)
+    def _fitted_one(self):
+        if not self.fitted:
+            names = ", ".join(FitFlags.names(self.flags))
+            got = f"{np.asarray(self.ids).item()!r} ({names})"
+            raise argument_error("key", "the id of an object that was fitted", got)
+        return self
 
-    def plot_pdf2d(self, key, x="redshift", y="frac_agn", ax=None, **kwargs):
-        """Draw the joint posterior of two parameters of an object; see `FitResult.plot_pdf2d`."""
-        return self[key].plot_pdf2d(x, y, ax=ax, **kwargs)
-
-    def write(self, path, *, overwrite=False):
+    def best_sed(self, model=None, **changes):
         """
-        Write everything but the model to a FITS file.
+        Spectrum of the best model of a single object.
+
+        Parameters
+        ----------
+        model : `~miricigale.sed.SEDModel`, optional
+            If the results do not know it (those read from a file do not).
+        **changes
+            Parameters to change.
+
+        Returns
+        -------
+        sed : `~miricigale.sed.SED`
+
+        Raises
+        ------
+        ValueError
+            If no model is known or the object was not fitted.
+        """
+        model = self._one("best_sed").model if model is None else model
+        if model is None:
+            raise argument_error("model", "an SEDModel (these results know none)", "None")
+        best = self._fitted_one().best
+        known = dict(self.constants)
+        known |= {name: best[name] for name in self.axes if np.isfinite(best[name].value)}
+        values = {
+            name: u.Quantity(getattr(value, "value", value), model.parameters[name].unit)
+            for name, value in known.items()
+            if name in model.parameters
+        }
+        return model.evaluate(**{**values, "mass": best["mass"], **changes})
+
+    def plot_sed(self, ax=None, *, model=None, filters=None, **kwargs):
+        """
+        Draw photometry, upper limits (as arrows), best model and residuals of a single object.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes` or pair of them, optional
+            Where to draw; a pair also gets the residuals.
+        model : `~miricigale.sed.SEDModel`, optional
+            See `best_sed`; without one only the fluxes of the best model are drawn.
+        filters : `~miricigale.filters.FilterSet`, optional
+            Where the wavelengths of the bands are taken from.
+        **kwargs
+            Passed to `miricigale.plotting.posteriors.plot_sed_fit`.
+
+        Returns
+        -------
+        axes : `~matplotlib.axes.Axes` or pair of them
+        """
+        from miricigale.filters import FilterSet
+        from miricigale.plotting.posteriors import plot_sed_fit
+
+        self._one("plot_sed")
+        filters = FilterSet.from_names(self.filters) if filters is None else filters
+        order = [filters.names.index(name) for name in self.filters]
+        if model is not None or self.model is not None:
+            sed = self.best_sed(model)
+            kwargs.setdefault("spectrum", (sed.wave, sed.fnu))
+        used = np.isfinite(self.sigma)
+        text = f"{self.ids}: z = {self.best['redshift'].value:.3f}"
+        kwargs.setdefault("title", f"{text}, chi2 = {self.chi2:.1f} in {self.n_bands} bands")
+        return plot_sed_fit(
+            u.Quantity(filters.pivots)[order],
+            self.flux * FNU,
+            np.where(used, self.sigma, self.flux_err) * FNU,
+            self.best_flux * FNU,
+            used=used,
+            limit=self.limit,
+            ax=ax,
+            **kwargs,
+        )
+
+    def plot_pdf(self, name, ax=None, **kwargs):
+        """Draw the posterior of a parameter or derived quantity of a single object."""
+        from miricigale.plotting.posteriors import plot_pdf
+
+        edges, weights = self._one("plot_pdf").distribution(name)
+        kwargs.setdefault("label", name)
+        if self.extensive(name):
+            kwargs.setdefault("log", bool(edges.value[0] > 0))
+        return plot_pdf(edges, weights, ax=ax, **kwargs)
+
+    def plot_pdf2d(self, x="redshift", y="frac_agn", ax=None, **kwargs):
+        """
+        Draw the joint posterior of two parameters of a single object.
+
+        Parameters
+        ----------
+        x, y : str, optional
+            Parameters of which the results have it; see `joint_pdf`.
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw; the current axes by default.
+        **kwargs
+            Passed to `miricigale.plotting.posteriors.plot_pdf_2d`.
+
+        Returns
+        -------
+        ax : `~matplotlib.axes.Axes`
+        """
+        from miricigale.plotting.posteriors import plot_pdf_2d
+
+        if "frac_agn" in (x, y) and "frac_agn" not in self.axes:
+            raise argument_error("frac_agn", "an axis of the grid", "a grid without AGN")
+        weights = self._one("plot_pdf2d").joint_pdf(x, y)
+        edges = [cell_edges(self.axes[n].values, self.axes[n].bounds) for n in (x, y)]
+        kwargs.setdefault("labels", tuple(labeled(name, self.unit(name)) for name in (x, y)))
+        return plot_pdf_2d(*edges, weights, ax=ax, **kwargs)
+
+    # ----------------------------------------------------------------------- files
+
+    read = unified_read(
+        """
+        Read results that `write` made.
 
         Parameters
         ----------
         path : path-like
             The file.
-        overwrite : bool, optional
-            Whether a file that is there is replaced.
-        """
-        from miricigale.fitting.files import write_results
-
-        write_results(self, path, overwrite=overwrite)
-
-    @classmethod
-    def read(cls, path):
-        """
-        Read results that `write` made.
+        format : str, optional
+            By default told by the suffix.
 
         Raises
         ------
         `~miricigale.utils.exceptions.DataError`
             If the file is something else or incomplete.
         """
-        from miricigale.fitting.files import read_results
+    )
+    write = unified_write(
+        """
+        Write results: FITS holds everything but the model, ECSV the table of `to_table`.
 
-        return read_results(cls, path)
+        Parameters
+        ----------
+        path : path-like
+            The file; its suffix tells the format.
+        format : {"fits", "ascii.ecsv"}, optional
+            If the suffix does not tell it.
+        overwrite : bool, optional
+            Whether a file that is there is replaced.
+        """
+    )
 
 
-_PARTS = {
-    "mean": "posterior mean",
-    "std": "posterior standard deviation",
-    "p16": "16th percentile",
-    "p50": "median",
-    "p84": "84th percentile",
-    "best": "best model's value",
-}
+def labeled(name, unit):
+    """Label of an axis of a plot: a name and its unit."""
+    text = unit.to_string()
+    return f"{name} ({text})" if text else name

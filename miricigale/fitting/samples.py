@@ -7,15 +7,17 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.fitting import predictions, spectra
+from miricigale.fitting import spectra
 from miricigale.fitting.flags import FitFlags
-from miricigale.fitting.keyed import find_row, rows_by_id
-from miricigale.fitting.model_values import ModelValues, check_draws
 from miricigale.fitting.posterior import bin_cells, check_levels, node_cells
 from miricigale.fitting.priors import grid_priors
-from miricigale.fitting.sample_files import read_samples, write_samples
+from miricigale.fitting.quantities import ModelValues, check_draws
+from miricigale.fitting.results import labeled
+from miricigale.fitting.rows import ObjectRows, PerObject
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import FNU, WAVE, frozen_array
+from miricigale.utils.tables import add_columns, error_column
+from miricigale.utils.unified import unified_read, unified_write
+from miricigale.utils.units import FNU, WAVE
 
 __all__ = ["Samples"]
 
@@ -23,12 +25,13 @@ _LEVELS = (0.16, 0.5, 0.84)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Samples:
+class Samples(ObjectRows):
     """
     Models drawn from the posteriors of the objects of a catalogue.
 
     All draws of an object have the same weight. What a model is comes from the grid, so that
-    only four indices and a scale are kept for each.
+    only four indices and a scale are kept for each. ``samples[id]`` and ``samples[rows]`` are of
+    this class too; of a single object the arrays have no axis of objects.
 
     Parameters
     ----------
@@ -46,11 +49,13 @@ class Samples:
     model : `~miricigale.sed.SEDModel`, optional
         The model the grid was made from, for other bands and for spectra.
     meta : dict, optional
-        Provenance. ``meta["seed"]``, 0 by default, chooses values of parameters without effect.
+        Provenance, for people.
     axes : dict of str to `~miricigale.fitting.priors.GridAxis`, optional
         Parameters that have several values, with the prior of the fit (``fitter.priors.axes``);
         flat in the nodes by default. It matters only for parameters without effect: their
         posterior is their prior.
+    seed : int, optional
+        Chooses values of parameters without effect.
 
     Raises
     ------
@@ -59,57 +64,41 @@ class Samples:
     """
 
     grid: object
-    ids: np.ndarray
-    flags: np.ndarray
-    index: np.ndarray
-    scale: np.ndarray
+    ids: PerObject
+    flags: PerObject
+    index: PerObject
+    scale: PerObject
     model: object = None
     meta: dict = field(default_factory=dict)
     axes: dict | None = None
+    seed: int = 0
+
+    #: Where the formats of files are registered.
+    io_module = "miricigale.fitting.io"
 
     def __post_init__(self):
         ids = np.asarray(self.ids)
-        dtypes = {"ids": ids.dtype, "flags": np.int64, "index": np.int32, "scale": float}
         check_draws(self.grid, ids, self.flags, self.index, self.scale)
+        dtypes = {"ids": ids.dtype, "flags": np.int64, "index": np.int32, "scale": float}
         for name, dtype in dtypes.items():
-            object.__setattr__(self, name, frozen_array(getattr(self, name), dtype))
-        object.__setattr__(self, "meta", dict(self.meta))
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype))
         if self.axes is None:
             object.__setattr__(self, "axes", grid_priors(self.grid).axes)
-        object.__setattr__(self, "_rows", rows_by_id(self.ids))
-
-    def __len__(self):
-        return len(self.ids)
+        super().__post_init__()
 
     def __repr__(self):
-        return f"<Samples of {len(self)} objects, {self.n_draws} draws each>"
-
-    def __getitem__(self, key):
-        """Return the samples of the object with this id."""
-        rows = slice(self.row(key), self.row(key) + 1)
-        arrays = {name: getattr(self, name)[rows] for name in ("ids", "flags", "index", "scale")}
-        return replace(self, **arrays)
-
-    def row(self, key):
-        """
-        Row of an id (the first, if it occurs twice).
-
-        Raises
-        ------
-        KeyError
-            If there is none.
-        """
-        return find_row(self._rows, key, len(self))
+        what = repr(np.asarray(self.ids).item()) if self.isscalar else f"{len(self)} objects"
+        return f"<Samples of {what}, {self.n_draws} draws{'' if self.isscalar else ' each'}>"
 
     @property
     def n_draws(self):
         """Number of draws of each object."""
-        return self.scale.shape[1]
+        return self.scale.shape[-1]
 
     @property
     def fitted(self):
         """Which objects have draws."""
-        return (self.index[:, :, 0] >= 0).all(axis=1)
+        return (self.index[..., 0] >= 0).all(axis=-1)
 
     def with_model(self, model):
         """Return a copy that knows the `~miricigale.sed.SEDModel`."""
@@ -117,23 +106,7 @@ class Samples:
 
     # -------------------------------------------------------------------- files
 
-    def write(self, path, *, overwrite=False):
-        """
-        Write the draws to a FITS file, without the grid and the model.
-
-        For other programs ``to_table().write`` has the values.
-
-        Parameters
-        ----------
-        path : path-like
-            The file.
-        overwrite : bool, optional
-            Whether a file that is there is replaced.
-        """
-        write_samples(self, path, overwrite=overwrite)
-
-    @classmethod
-    def read(cls, path, grid, *, model=None):
+    read = unified_read(
         """
         Read samples that `write` made.
 
@@ -145,6 +118,8 @@ class Samples:
             The grid that was fitted (``fitter.grid``): draws are indices of it.
         model : `~miricigale.sed.SEDModel`, optional
             The model that it was made from, for other bands and for spectra.
+        format : str, optional
+            By default told by the suffix.
 
         Raises
         ------
@@ -153,13 +128,27 @@ class Samples:
         ValueError
             If the grid is another.
         """
-        return read_samples(cls, path, grid, model=model)
+    )
+    write = unified_write(
+        """
+        Write draws: FITS holds them without the grid and the model, ECSV the table of `to_table`.
+
+        Parameters
+        ----------
+        path : path-like
+            The file; its suffix tells the format.
+        format : {"fits", "ascii.ecsv"}, optional
+            If the suffix does not tell it.
+        overwrite : bool, optional
+            Whether a file that is there is replaced.
+        """
+    )
 
     # ------------------------------------------------------------------- values
 
     @cached_property
     def _models(self):
-        return ModelValues(self.grid, self.axes, int(self.meta.get("seed", 0)))
+        return ModelValues(self.grid, self.axes, int(self.seed))
 
     @property
     def parameters(self):
@@ -189,13 +178,13 @@ class Samples:
             NaN for objects that could not be fitted, and for parameters of the AGN where a
             draw has none.
         """
-        unit = self.unit(name)
-        fitted = self.fitted
-        out = np.full(self.scale.shape, np.nan)
+        some, unit = self._several(), self.unit(name)
+        fitted = some.fitted
+        out = np.full(some.scale.shape, np.nan)
         out[fitted] = self._models.values(
-            name, self.ids[fitted], self.index[fitted], self.scale[fitted]
+            name, some.ids[fitted], some.index[fitted], some.scale[fitted]
         )
-        return out * unit
+        return out.reshape(self.scale.shape) * unit
 
     def to_table(self, names=None):
         """
@@ -213,28 +202,26 @@ class Samples:
             quantity; the draws of an object follow one another. Objects that could not be
             fitted stay in place with NaN.
         """
-        n, draws = self.scale.shape
-        out = QTable(meta=dict(self.meta))
+        some = self._several()
+        n, draws = some.scale.shape
         columns = {
-            "id": (np.repeat(self.ids, draws), "identifier"),
+            "id": (np.repeat(some.ids, draws), "identifier"),
             "draw": (np.tile(np.arange(draws), n), "number of the draw"),
-            "flags": (np.repeat(self.flags, draws), FitFlags.describe()),
+            "flags": (np.repeat(some.flags, draws), FitFlags.describe()),
         }
-        for name, (values, text) in columns.items():
-            out[name] = values
-            out[name].info.description = text
         for name in self.parameters if names is None else names:
-            out[name] = self.values(name).ravel()
-            out[name].info.description = self.description(name)
+            columns[name] = (some.values(name).ravel(), self.description(name))
+        out = QTable(meta=dict(self.meta))
+        add_columns(out, columns)
         return out
 
     def mean(self, name):
         """Means of the draws: Quantity, shape (n,)."""
-        return self.values(name).mean(axis=1)
+        return self.values(name).mean(axis=-1)
 
     def std(self, name):
         """Standard deviations of the draws: Quantity, shape (n,)."""
-        return self.values(name).std(axis=1)
+        return self.values(name).std(axis=-1)
 
     def percentile(self, name, levels):
         """
@@ -252,7 +239,8 @@ class Samples:
         percentiles : `~astropy.units.Quantity`, shape (n, n_levels)
         """
         values = self.values(name)
-        return np.quantile(values.value, check_levels(levels), axis=1).T * values.unit
+        levels = check_levels(levels)
+        return np.moveaxis(np.quantile(values.value, levels, axis=-1), 0, -1) * values.unit
 
     # -------------------------------------------------------------- distributions
 
@@ -312,7 +300,7 @@ class Samples:
     def _binned(self, name, key, bins):
         """Edges of the cells, and the cell of every draw (-1: none)."""
         unit = self.unit(name)
-        values = self._one(key).values(name).value[0]
+        values = self._one(key).values(name).value
         if name in self.axes:
             axis = self.axes[name]
             edges, place = node_cells(values, axis.values, axis.bounds)
@@ -326,8 +314,8 @@ class Samples:
     def _one(self, key):
         """Return the samples of one object that was fitted."""
         one = self[key]
-        if not one.fitted[0]:
-            names = ", ".join(FitFlags.names(one.flags[0])) or "no draws"
+        if not one.fitted:
+            names = ", ".join(FitFlags.names(one.flags)) or "no draws"
             raise argument_error("key", "the id of an object that was fitted", f"{key!r} ({names})")
         return one
 
@@ -354,17 +342,18 @@ class Samples:
             If a band is not one of the grid and no model is known, or the model is another.
         """
         names, extra = self._bands(filters)
-        out = np.full((*self.scale.shape, len(names)), np.nan)
-        fitted = self.fitted
+        some = self._several()
+        out = np.full((*some.scale.shape, len(names)), np.nan)
+        fitted = some.fitted
         model = self._model() if extra else None
-        out[fitted] = predictions.draw_fluxes(
-            self.grid, self.index[fitted], self.scale[fitted], names, extra, model
+        out[fitted] = spectra.draw_fluxes(
+            self.grid, some.index[fitted], some.scale[fitted], names, extra, model
         )
-        return out * FNU
+        return out.reshape(*self.scale.shape, len(names)) * FNU
 
     def _bands(self, filters):
         """Names of the bands asked for, and those that only a model has."""
-        names, extra = predictions.band_names(self.grid, filters)
+        names, extra = spectra.band_names(self.grid, filters)
         if extra:
             self._model()
         return names, extra
@@ -394,7 +383,20 @@ class Samples:
         """
         levels = check_levels(levels)
         names, _ = self._bands(filters)
-        return predictions.flux_table(self, names, self.fluxes(filters).value, levels)
+        some = self._several()
+        columns = {
+            "id": (np.array(some.ids), "identifier"),
+            "flags": (np.array(some.flags), FitFlags.describe()),
+        }
+        for name, flux in zip(names, np.moveaxis(some.fluxes(filters), -1, 0), strict=True):
+            columns[name] = (flux.mean(axis=1), "posterior mean of the model flux")
+            columns[error_column(name)] = (flux.std(axis=1), "its standard deviation")
+            for level, values in zip(levels, np.quantile(flux, levels, axis=1), strict=True):
+                text = f"quantile {level:g} of the model flux"
+                columns[f"{name}_{_suffix(level)}"] = (values, text)
+        out = QTable(meta=dict(self.meta))
+        add_columns(out, columns)
+        return out
 
     def spectra(self, key, *, rest=True):
         """
@@ -418,7 +420,7 @@ class Samples:
         """
         one = self._one(key)
         function = spectra.rest_spectra if rest else spectra.observed_spectra
-        wave, values = function(self._model(), self.grid, one.index[0], one.scale[0])
+        wave, values = function(self._model(), self.grid, one.index, one.scale)
         return wave * WAVE, values * (u.W / u.Hz if rest else FNU)
 
     def sed_band(self, key, levels=_LEVELS, *, rest=True):
@@ -442,8 +444,13 @@ class Samples:
         """
         levels = check_levels(levels)
         wave, values = self.spectra(key, rest=rest)
-        meta = dict(self.meta) | {"id": str(key), "rest": bool(rest)}
-        return predictions.spectrum_table(wave, values, levels, rest=rest, meta=meta)
+        columns = {"wave": (wave, f"{'rest' if rest else 'observed'} wavelength")}
+        for level, row in zip(levels, np.quantile(values.value, levels, axis=0), strict=True):
+            text = f"quantile {level:g} of {'L_nu' if rest else 'F_nu'}"
+            columns[_suffix(level)] = (row * values.unit, text)
+        out = QTable(meta=dict(self.meta) | {"id": str(key), "rest": bool(rest)})
+        add_columns(out, columns)
+        return out
 
     # -------------------------------------------------------------------- drawing
 
@@ -460,9 +467,9 @@ class Samples:
         from miricigale.plotting.posteriors import plot_pdf_2d
 
         a_edges, b_edges, weights = self.pdf_2d(a, b, key, bins=bins)
-        kwargs.setdefault("labels", tuple(self._label(name) for name in (a, b)))
+        kwargs.setdefault("labels", tuple(labeled(name, self.unit(name)) for name in (a, b)))
         return plot_pdf_2d(a_edges.value, b_edges.value, weights, ax=ax, **kwargs)
 
-    def _label(self, name):
-        unit = self.unit(name).to_string()
-        return f"{name} ({unit})" if unit else name
+
+def _suffix(level):
+    return f"p{100 * level:g}"

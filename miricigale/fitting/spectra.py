@@ -1,13 +1,21 @@
-"""Fluxes and spectra of models of a grid in bands and wavelengths that it does not have."""
+"""Fluxes and spectra of models of a grid, also in bands and wavelengths that it does not have."""
 
 import numpy as np
 from astropy.table import QTable
 
+from miricigale.filters import FilterSet
 from miricigale.sed.spectrum import distance
 from miricigale.sed.tables import dilution
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["check_model", "model_fluxes", "observed_spectra", "plain_index", "rest_spectra"]
+__all__ = [
+    "band_names",
+    "check_model",
+    "draw_fluxes",
+    "model_fluxes",
+    "observed_spectra",
+    "rest_spectra",
+]
 
 #: What a model and the grid made from it have in common.
 _COMMON = ("components", "options", "imf", "frac_agn_definition", "cosmology")
@@ -39,6 +47,71 @@ def plain_index(grid, index):
     return index
 
 
+def band_names(grid, filters):
+    """
+    Names of the bands asked for, and those that the grid has not.
+
+    Parameters
+    ----------
+    grid : `~miricigale.sed.ModelGrid`
+        The grid.
+    filters : list of str or `~miricigale.filters.FilterSet` or None
+        Bands; None: those of the grid.
+
+    Returns
+    -------
+    names : list of str
+    extra : dict of str to `~miricigale.filters.Filter` or None
+        Those that are not in the grid; None where only a name was given.
+    """
+    if filters is None:
+        return list(grid.filters), {}
+    if isinstance(filters, str):
+        raise argument_error("filters", "a list of names or a FilterSet", repr(filters))
+    names = list(getattr(filters, "names", filters))
+    given = dict(zip(names, filters, strict=True)) if hasattr(filters, "names") else {}
+    return names, {name: given.get(name) for name in names if name not in grid.filters}
+
+
+def draw_fluxes(grid, index, scale, names, extra, model):
+    """
+    Fluxes of drawn models.
+
+    Parameters
+    ----------
+    grid : `~miricigale.sed.ModelGrid`
+        The grid.
+    index : `~numpy.ndarray` of int, shape (n, n_draws, 4)
+        Redshift, galaxy, torus and AGN fraction; none is missing but tori of no AGN.
+    scale : `~numpy.ndarray`, shape (n, n_draws)
+        Solar masses formed.
+    names, extra
+        From `band_names`.
+    model : `~miricigale.sed.SEDModel` or None
+        The model of the grid, for bands that this has not.
+
+    Returns
+    -------
+    fluxes : `~numpy.ndarray`, shape (n, n_draws, n_filters)
+        In uJy.
+    """
+    out = np.full((*scale.shape, len(names)), np.nan)
+    own = [i for i, name in enumerate(names) if name in grid.filters]
+    columns = [grid.filters.index(names[i]) for i in own]
+    for row in range(len(index)) if own else ():
+        z, g, k, f = plain_index(grid, index[row]).T
+        flux = grid.flux(z, g, k, f)[:, columns]
+        out[row][:, own] = scale[row][:, None] * flux
+    if extra and len(index):
+        missing = [name for name, band in extra.items() if band is None]
+        found = dict(zip(missing, FilterSet.from_names(missing), strict=True)) if missing else {}
+        bands = [found.get(name, band) for name, band in extra.items()]
+        other = [names.index(name) for name in extra]
+        flux = model_fluxes(model, grid, index, bands)
+        out[:, :, other] = flux * scale[:, :, None]
+    return out
+
+
 def model_fluxes(model, grid, index, filters):
     """
     Fluxes in any bands of models of a grid, each different one evaluated once.
@@ -59,8 +132,6 @@ def model_fluxes(model, grid, index, filters):
     fluxes : `~numpy.ndarray`, shape (..., n_filters)
         In uJy for each solar mass formed.
     """
-    from miricigale.filters import FilterSet
-
     filters = FilterSet(list(filters))
     rows = plain_index(grid, index).reshape(-1, 4)
     different, place = np.unique(rows, axis=0, return_inverse=True)

@@ -1,28 +1,24 @@
 """Fits of catalogues larger than memory: from file to file, in pieces that a later call goes on from."""
 
+import functools
 import importlib.metadata
+import io
 import json
 import logging
 import os
+import re
 import warnings
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
+from astropy.io import fits
+from astropy.table import vstack
 
+from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.likelihood import read_ids
-from miricigale.fitting.pairs import check_pairs
-from miricigale.fitting.part_files import (
-    LOCK,
-    MANIFEST,
-    PARTS_FORMAT,
-    open_results,
-    part_ids,
-    part_name,
-    read_manifest,
-    write_manifest,
-)
+from miricigale.fitting.results import FitResults
 from miricigale.refdata.locate import file_sha256
 from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import (
@@ -30,17 +26,24 @@ from miricigale.utils.exceptions import (
     MiricigaleWarning,
     OtherResultsError,
     argument_error,
+    unknown_name,
 )
+from miricigale.utils.files import open_fits
 from miricigale.utils.lock import FolderLock
 from miricigale.utils.progress import progress
+from miricigale.utils.random import check_seed
 from miricigale.utils.row_files import open_rows
+from miricigale.utils.store import PARTIAL, native, plain_value, replacing
 from miricigale.utils.tables import ascii_ids, error_column, require_columns
 from miricigale.utils.units import FNU
 
-__all__ = ["fit_file"]
+__all__ = ["FitResultsFiles", "fit_file", "open_results"]
 
 logger = logging.getLogger(__name__)
 
+_LOCK = "fit.lock"
+_MANIFEST = "manifest.json"
+_FORMAT = "miricigale-fitparts-1"
 _PACKAGES = ("miricigale", "numpy", "numba", "astropy")
 
 
@@ -53,6 +56,7 @@ def fit_file(
     redshift=None,
     redshift_prior=None,
     pairs=None,
+    seed=None,
     flux_unit=None,
     hdu=None,
     executor=None,
@@ -70,7 +74,8 @@ def fit_file(
     Parameters
     ----------
     fitter : `BayesFitter`
-        The fitter.
+        The fitter. (Of a sampler, the cells of a redshift axis that is not the same for all objects
+        are those of each part.)
     path_in : path-like
         The catalogue: FITS with a binary table, ECSV, or CSV with a line of names (``.csv``),
         with columns as `BayesFitter.fit` wants them.
@@ -86,6 +91,8 @@ def fit_file(
         row of the catalogue, or the name of a column that holds them.
     pairs : list of tuple of str, optional
         As for `BayesFitter.fit`: pairs of parameters of which joint posteriors are kept too.
+    seed : int, optional
+        As for `BayesFitter.fit`. A sampler needs one, so that a later call can go on.
     flux_unit : unit-like, optional
         Unit of flux columns and their errors where the file gives none, as CSV does.
     hdu : int or str, optional
@@ -119,30 +126,40 @@ def fit_file(
         What `BayesFitter.fit` raises; if an id is no ASCII text, which FITS cannot hold,
         before anything is fitted. A note tells the rows.
     """
-    if not all(hasattr(fitter, name) for name in ("fit", "settings", "grid")):
+    if not isinstance(fitter, BayesFitter):
         raise argument_error("fitter", "a BayesFitter", type(fitter).__name__)
     if not isinstance(path_in, (str, os.PathLike)):
         raise argument_error("path_in", "the path of a catalogue", type(path_in).__name__)
+    if fitter.engine != "grid":
+        if seed is None:
+            raise argument_error("seed", "given for a sampler, so that it can go on", "None")
+        seed = check_seed(seed)
+    else:
+        # the same fit, in whatever order they are given
+        pairs = fitter.backend.check_pairs(pairs)
     unit = None if flux_unit is None else u.Unit(flux_unit)
     if unit is not None and not unit.is_equivalent(FNU):
         msg = f"'flux_unit' must be convertible to {FNU}, got {unit}"
         raise u.UnitsError(msg)
-    fluxes = {c for name in fitter.grid.filters for c in (name, error_column(name))}
+    fluxes = {c for name in fitter.bands for c in (name, error_column(name))}
     unit_text = None if unit is None else unit.to_string()
     rows = open_rows(
         path_in, chunk_rows, hdu=hdu, units=lambda name: unit_text if name in fluxes else None
     )
-    pairs = check_pairs(pairs, fitter)
-    inputs = _Inputs(rows, redshift, redshift_prior, unit, fluxes, pairs)
+    options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
+    inputs = _Inputs(rows, options, unit, fluxes)
     _check_ids(rows)
     folder = Path(path_out)
-    job = _job(fitter, rows, redshift, redshift_prior, unit_text, hdu, pairs)
+    job = _job(fitter, rows, options | {"seed": seed}, {"hdu": hdu, "flux_unit": unit_text})
     _check_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    with FolderLock(folder, name=LOCK, purpose="fit"):
+    with FolderLock(folder, name=_LOCK, purpose="fit"):
+        for left in folder.glob(f"{PARTIAL}*"):
+            # of a fit that was killed
+            left.unlink()
         manifest = _open_folder(folder, job, resume)
-        _fit_parts(fitter, inputs, folder, manifest, executor, progress_bar)
-    return open_results(folder, model=getattr(fitter, "model", None))
+        _fit_parts(fitter, inputs, folder, manifest, seed, executor, progress_bar)
+    return open_results(folder, model=fitter.model)
 
 
 def _check_ids(rows):
@@ -158,7 +175,7 @@ def _check_ids(rows):
             raise
 
 
-def _fit_parts(fitter, inputs, folder, manifest, executor, progress_bar):
+def _fit_parts(fitter, inputs, folder, manifest, seed, executor, progress_bar):
     """Fit the pieces whose parts are not there, and write them."""
     rows = inputs.rows
     seen = _SeenIds()
@@ -166,9 +183,9 @@ def _fit_parts(fitter, inputs, folder, manifest, executor, progress_bar):
     with progress(show=progress_bar, total=rows.n_rows, desc="fit", unit="obj") as bar:
         for i in range(rows.n_chunks):
             start, stop = rows.span(i)
-            path = folder / part_name(i)
+            path = folder / _part_name(i)
             if _is_whole(path, manifest["parts"].get(path.name)):
-                seen.add(part_ids(path))
+                seen.add(_part_ids(path))
                 n_old += 1
             else:
                 table, options = inputs.take(i)
@@ -178,13 +195,16 @@ def _fit_parts(fitter, inputs, folder, manifest, executor, progress_bar):
                         text = "bands of the photometry"
                         warnings.filterwarnings("ignore", text, MiricigaleWarning)
                     try:
-                        results = _fit(fitter, table, options, seen, executor)
+                        repeated = seen.find(read_ids(table))
+                        results = fitter._fit_rows(
+                            table, options, seed=seed, repeated=repeated, executor=executor
+                        )
                     except (ValueError, u.UnitsError) as err:
                         err.add_note(f"in rows {start} to {stop - 1} of {rows.path}")
                         raise
                 n_new += 1
                 manifest["parts"][path.name] = _write_part(results, path)
-                write_manifest(folder, manifest)
+                _write_manifest(folder, manifest)
                 seen.add(results.ids)
             bar.update(stop - start)
     logger.info("%s: %d parts, %d of them from before", folder, rows.n_chunks, n_old)
@@ -193,29 +213,27 @@ def _fit_parts(fitter, inputs, folder, manifest, executor, progress_bar):
 class _Inputs:
     """The pieces of a catalogue, and of what was given beside it."""
 
-    def __init__(self, rows, redshift, redshift_prior, unit, fluxes, pairs):
-        self.pairs = pairs
+    def __init__(self, rows, options, unit, fluxes):
         self.rows, self.unit, self.fluxes = rows, unit, fluxes
-        self.redshift, self.prior = redshift, redshift_prior
+        self.options = dict(options)
+        redshift, prior = options["redshift"], options["redshift_prior"]
         n = rows.n_rows
         self.by_row = redshift is not None and not isinstance(redshift, str) and np.ndim(redshift)
         if isinstance(redshift, (list, tuple)):
             # rows are taken from it by number
-            self.redshift = np.array(redshift)
+            self.options["redshift"] = np.array(redshift)
         if self.by_row and np.shape(redshift) != (n,):
             raise argument_error("redshift", f"{n} values", f"shape {np.shape(redshift)}")
         self.prior_by_row = False
-        if redshift_prior is not None:
-            if isinstance(redshift_prior, str) or len(redshift_prior) != 2:
-                raise argument_error(
-                    "redshift_prior", "redshifts and densities", repr(redshift_prior)
-                )
-            density = redshift_prior[1]
+        if prior is not None:
+            if isinstance(prior, str) or len(prior) != 2:
+                raise argument_error("redshift_prior", "redshifts and densities", repr(prior))
+            density = prior[1]
             self.prior_by_row = not isinstance(density, str) and np.ndim(density) == 2
             if self.prior_by_row and len(density) != n:
                 raise argument_error("redshift_prior", f"{n} rows", f"{len(density)}")
             if isinstance(density, (list, tuple)):
-                self.prior = (redshift_prior[0], np.array(density))
+                self.options["redshift_prior"] = (prior[0], np.array(density))
 
     def take(self, i):
         """Piece ``i``: table, and the arguments of `fit` that go with it."""
@@ -225,11 +243,11 @@ class _Inputs:
                 if table[name].unit is None:
                     table[name] = table[name] * self.unit
         piece = slice(*self.rows.span(i))
-        options = {"pairs": self.pairs} if self.pairs else {}
-        if self.redshift is not None:
-            options["redshift"] = self.redshift[piece] if self.by_row else self.redshift
-        if self.prior is not None:
-            nodes, density = self.prior
+        options = dict(self.options)
+        if self.by_row:
+            options["redshift"] = options["redshift"][piece]
+        if options["redshift_prior"] is not None:
+            nodes, density = options["redshift_prior"]
             if isinstance(density, str):
                 require_columns(table, [density], "photometry")
                 density = table[density]
@@ -239,42 +257,6 @@ class _Inputs:
         return table, options
 
 
-def _fit(fitter, table, options, seen, executor):
-    """Fit a piece as a part of the whole: ids of earlier pieces are duplicates."""
-    n = len(table)
-    again = np.flatnonzero(seen.find(read_ids(table)))
-    if again.size == 0:
-        return fitter.fit(table, executor=executor, **options)
-    # rows with these ids come first, so that the fit itself sees that they occur twice
-    order = np.concatenate([again, np.arange(n)])
-    table = table[order]
-    for name in fitter.grid.filters:
-        if name in table.colnames and np.asarray(table[name]).dtype.kind == "f":
-            table[name][: again.size] = np.nan
-    for name, value in options.items():
-        if name == "redshift" and np.ndim(value) == 1:
-            options[name] = value[order]
-        elif name == "redshift_prior" and np.ndim(value[1]) == 2:
-            options[name] = (value[0], value[1][order])
-    results = fitter.fit(table, executor=executor, **options)
-    return _without_first(results, again.size)
-
-
-def _without_first(results, n):
-    """Leave the first ``n`` rows out."""
-    size = len(results)
-    changes = {}
-    for item in fields(results):
-        value = getattr(results, item.name)
-        if isinstance(value, np.ndarray):
-            changes[item.name] = value[n:]
-        elif isinstance(value, dict) and value:
-            arrays = [isinstance(v, np.ndarray) and v.shape[:1] == (size,) for v in value.values()]
-            if all(arrays):
-                changes[item.name] = {name: array[n:] for name, array in value.items()}
-    return replace(results, **changes)
-
-
 class _SeenIds:
     """Ids that occurred, in sorted runs whose lengths at least double: n log n, few bytes an id."""
 
@@ -282,15 +264,14 @@ class _SeenIds:
         self._runs = []
 
     @staticmethod
-    def _sorted(ids):
-        ids = np.asarray(ids)
+    def _bytes(ids):
         # one byte a character in place of four
-        return np.unique(np.char.encode(ids, "utf-8") if ids.dtype.kind == "U" else ids)
+        return np.char.encode(ids, "utf-8") if ids.dtype.kind == "U" else ids
 
     def find(self, ids):
         """Which of these ids occurred: array of bool."""
         known, inverse = np.unique(np.asarray(ids), return_inverse=True)
-        known = np.char.encode(known, "utf-8") if known.dtype.kind == "U" else known
+        known = self._bytes(known)
         found = np.zeros(len(known), dtype=bool)
         for run in self._runs:
             place = np.minimum(np.searchsorted(run, known), len(run) - 1)
@@ -299,37 +280,48 @@ class _SeenIds:
 
     def add(self, ids):
         """Add ids."""
-        run = self._sorted(ids)
+        run = np.unique(self._bytes(np.asarray(ids)))
         while self._runs and len(self._runs[-1]) <= len(run):
             run = np.union1d(self._runs.pop(), run)
         if len(run):
             self._runs.append(run)
 
 
-def _job(fitter, rows, redshift, redshift_prior, flux_unit, hdu, pairs):
+# ------------------------------------------------------------------- folder and manifest
+
+
+def _part_name(i):
+    """File name of part ``i``."""
+    return f"part-{i:05d}.fits"
+
+
+def _part_ids(path):
+    """Ids of a part, read without the rest."""
+    with open_fits(path, wanted="fit results", memmap=True) as hdus:
+        return native(np.array(hdus["RESULTS"].data["ids"]))
+
+
+def _job(fitter, rows, options, given):
     """What makes a fit another one, in plain values."""
-    values = vars(fitter)
-    content = {
-        name.strip("_"): content_sha256(value)
-        for name, value in sorted(values.items())
-        # the spectra are in the grid
-        if name != "model"
-    }
+    redshift, prior = options["redshift"], options["redshift_prior"]
     job = {
         "catalogue": {
             "sha256": rows.sha256,
             "bytes": rows.path.stat().st_size,
             "rows": rows.n_rows,
-            "hdu": hdu,
-            "flux_unit": flux_unit,
+            **given,
         },
         "chunk_rows": rows.chunk_rows,
         "redshift": redshift if isinstance(redshift, str) else content_sha256(redshift),
-        "redshift_prior": content_sha256(redshift_prior),
-        "fitter": content,
-        "settings": fitter.settings(),
+        "redshift_prior": content_sha256(prior),
+        "fitter": {
+            item.name: content_sha256(getattr(fitter.backend, item.name))
+            for item in fields(fitter.backend)
+        },
+        "settings": fitter.settings() | {"max_reduced_chi2": fitter.max_reduced_chi2},
     }
-    return job | ({"pairs": [list(names) for names in pairs]} if pairs else {})
+    job |= {"pairs": [list(names) for names in options["pairs"]]} if options["pairs"] else {}
+    return job if options["seed"] is None else job | {"seed": options["seed"]}
 
 
 def _check_folder(folder):
@@ -337,20 +329,20 @@ def _check_folder(folder):
     if folder.exists() and not folder.is_dir():
         msg = f"{folder} is a file; results of fit_file go to a folder"
         raise DataError(msg)
-    if not folder.is_dir() or (folder / MANIFEST).is_file():
+    if not folder.is_dir() or (folder / _MANIFEST).is_file():
         return
     # a fit that was killed at its first moment leaves these
-    ours = (LOCK, MANIFEST)
+    ours = (_LOCK, PARTIAL)
     if any(not entry.name.startswith(ours) for entry in folder.iterdir()):
-        msg = f"{folder} is not empty and holds no {MANIFEST}; results need a folder of their own"
+        msg = f"{folder} is not empty and holds no {_MANIFEST}; results need a folder of their own"
         raise DataError(msg)
 
 
 def _open_folder(folder, job, resume):
     """Manifest of the folder: the one that is there if it is of this fit, or a new one."""
-    job = json.loads(json.dumps(job, default=str))
-    if (folder / MANIFEST).is_file():
-        manifest = read_manifest(folder)
+    job = json.loads(json.dumps(job, default=plain_value))
+    if (folder / _MANIFEST).is_file():
+        manifest = _read_manifest(folder)
         # a call that failed before its first part leaves nothing to keep
         if resume and manifest["parts"]:
             other = _differences(manifest["job"], job)
@@ -361,9 +353,38 @@ def _open_folder(folder, job, resume):
         for name in manifest["parts"]:
             (folder / name).unlink(missing_ok=True)
     versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
-    manifest = {"format": PARTS_FORMAT, "versions": versions, "job": job, "parts": {}}
-    write_manifest(folder, manifest)
+    manifest = {"format": _FORMAT, "versions": versions, "job": job, "parts": {}}
+    _write_manifest(folder, manifest)
     return manifest
+
+
+def _read_manifest(folder):
+    """Read the manifest of a folder, or say that it is none."""
+    path = Path(folder) / _MANIFEST
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+        if manifest["format"] != _FORMAT:
+            msg = f"its format is {manifest['format']!r}, wanted {_FORMAT!r}"
+            raise ValueError(msg)
+        manifest["job"]["catalogue"]["rows"], manifest["job"]["chunk_rows"]
+        for name, record in manifest["parts"].items():
+            # parts are removed by these names
+            if not re.fullmatch(r"part-[0-9]{5,}\.fits", name):
+                msg = f"it names {name!r}, which is no part"
+                raise ValueError(msg)
+            record["rows"], record["fitted"], record["bytes"], record["sha256"]
+    except FileNotFoundError as err:
+        msg = f"{folder} holds no results of fit_file (no {_MANIFEST})"
+        raise DataError(msg) from err
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:
+        msg = f"{path} is no manifest of fit_file: {err}"
+        raise DataError(msg) from err
+    return manifest
+
+
+def _write_manifest(folder, manifest):
+    with replacing(folder / _MANIFEST) as partial:
+        partial.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
 
 
 def _differences(old, new, prefix=""):
@@ -376,26 +397,19 @@ def _differences(old, new, prefix=""):
         elif a != b:
             out.append(prefix + name)
     # checksums say less than settings
-    told = [name for name in out if not name.startswith("fitter.")]
+    told = [name for name in out if name.split(".")[0] != "fitter"]
     return told or out
 
 
 def _write_part(results, path):
-    """Write a part under another name and rename it; returns its record."""
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.unlink(missing_ok=True)
-    try:
-        results.write(temporary, overwrite=True)
-        record = {
-            "rows": len(results),
-            "fitted": int(np.count_nonzero(results.fitted)),
-            "bytes": temporary.stat().st_size,
-            "sha256": file_sha256(temporary),
-        }
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return record
+    """Write a part; returns its record."""
+    results.write(path, overwrite=True)
+    return {
+        "rows": len(results),
+        "fitted": int(np.count_nonzero(results.fitted)),
+        "bytes": path.stat().st_size,
+        "sha256": file_sha256(path),
+    }
 
 
 def _is_whole(path, record):
@@ -406,3 +420,219 @@ def _is_whole(path, record):
         return True
     logger.warning("%s is damaged and is made again", path)
     return False
+
+
+# ----------------------------------------------------------------------- results in files
+
+
+def open_results(path, *, partial=False, model=None):
+    """
+    Open the results that `fit_file` wrote.
+
+    Parameters
+    ----------
+    path : path-like
+        The folder.
+    partial : bool, optional
+        Whether a folder in which parts are missing is opened too.
+    model : `~miricigale.sed.SEDModel`, optional
+        The model the grid was made from, for spectra of the best fits.
+
+    Returns
+    -------
+    results : `FitResultsFiles`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the folder holds no such results, or parts are missing.
+    """
+    results = FitResultsFiles(path, model=model)
+    if not (partial or results.complete):
+        msg = (
+            f"{path} holds {len(results.paths)} of {results.n_parts} parts: fit_file with the "
+            "same arguments goes on; partial=True opens what is there"
+        )
+        raise DataError(msg)
+    return results
+
+
+class FitResultsFiles:
+    """
+    Results of a fit in files, of which one part at a time is in memory.
+
+    Made by `fit_file` and `open_results`. It has as many elements as objects, in the order of
+    the catalogue: iterating gives the `FitResults` of each object, ``[id]`` those of an id.
+
+    Parameters
+    ----------
+    path : path-like
+        The folder.
+    model : `~miricigale.sed.SEDModel`, optional
+        The model the grid was made from.
+    """
+
+    def __init__(self, path, *, model=None):
+        self.path = Path(path)
+        self.manifest = _read_manifest(path)
+        self.model = model
+        rows, size = self.manifest["job"]["catalogue"]["rows"], self.manifest["job"]["chunk_rows"]
+        self.n_parts = max(1, -(-rows // size))
+        parts = self.manifest["parts"]
+        names = [_part_name(i) for i in range(self.n_parts)]
+        self.paths = tuple(self.path / name for name in names if name in parts)
+        for item in self.paths:
+            if not item.is_file():
+                msg = f"{self.path} has lost {item.name}, which its {_MANIFEST} names"
+                raise DataError(msg)
+        self._records = tuple(parts[item.name] for item in self.paths)
+        self._kept = functools.lru_cache(maxsize=1)(self._read)
+
+    def __repr__(self):
+        n = sum(record["fitted"] for record in self._records)
+        state = "" if self.complete else f" of {self.n_parts}"
+        return (
+            f"<FitResultsFiles of {len(self)} objects, {n} fitted, "
+            f"{len(self.paths)}{state} parts in {self.path}>"
+        )
+
+    def __len__(self):
+        return sum(record["rows"] for record in self._records)
+
+    @property
+    def complete(self):
+        """Whether all parts are there."""
+        return len(self.paths) == self.n_parts
+
+    def _read(self, path):
+        return FitResults.read(path)._changed(model=self.model)
+
+    def parts(self):
+        """Iterate over the parts: one `FitResults` at a time."""
+        return map(self._read, self.paths)
+
+    def __iter__(self):
+        for part in self.parts():
+            yield from part
+
+    def __getitem__(self, key):
+        """Return the results of the object with this id (the first, if it occurs twice)."""
+        key = key.item() if isinstance(key, np.generic) else key
+        for path in self.paths:
+            # only the ids are read until the part is found
+            if key in _part_ids(path).tolist():
+                return self._kept(path)[key]
+        msg = f"no object with the id {key!r} among {len(self)}"
+        raise KeyError(msg)
+
+    def to_table(self, columns=None):
+        """
+        Results as one table; see `FitResults.to_table`.
+
+        Parameters
+        ----------
+        columns : list of str, optional
+            Columns to keep, all by default; memory is needed for these only.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+        """
+        tables = list(self._tables(columns))
+        meta = tables[0].meta
+        for table in tables:
+            table.meta = {}
+        out = tables[0] if len(tables) == 1 else vstack(tables, join_type="exact")
+        out.meta.update(meta)
+        return out
+
+    def _tables(self, columns):
+        if not self.paths:
+            msg = f"{self.path} holds no part yet"
+            raise DataError(msg)
+        for part in self.parts():
+            table = part.to_table()
+            for name in columns or ():
+                if name not in table.colnames:
+                    raise unknown_name("column", name, table.colnames)
+            yield table if columns is None else table[list(columns)]
+
+    def write_table(self, path, *, columns=None, overwrite=False):
+        """
+        Write the table of all results to one FITS file, a part at a time.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        columns : list of str, optional
+            Columns to write, all by default.
+        overwrite : bool, optional
+            Whether a file that is there is replaced.
+
+        Raises
+        ------
+        OSError
+            If the file is there and ``overwrite`` is not set.
+        """
+        # parts may have ids of different lengths
+        width = max((_part_ids(item).dtype.itemsize for item in self.paths), default=0)
+        write_rows(path, self._tables(columns), len(self), id_width=width, overwrite=overwrite)
+
+
+def write_rows(path, tables, n_rows, *, id_width=0, overwrite=False):
+    """
+    Write tables of the same columns as one FITS table, one at a time.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    tables : iterable of `~astropy.table.Table`
+        At least one.
+    n_rows : int
+        Rows of all.
+    id_width : int, optional
+        Bytes of the longest text in the columns ``id``, four a character.
+    overwrite : bool, optional
+        Whether a file that is there is replaced.
+    """
+    layout, n_bytes = None, 0
+    with replacing(path, overwrite=overwrite) as partial, open(partial, "wb") as stream:
+        for table in tables:
+            header, rows = _fits_rows(table, id_width)
+            columns = [header[f"TFORM{i + 1}"] for i in range(header["TFIELDS"])]
+            if layout is None:
+                layout = columns
+                header["NAXIS2"] = n_rows
+                for part in (fits.PrimaryHDU().header, header):
+                    stream.write(part.tostring().encode("ascii"))
+            elif columns != layout:
+                msg = "the parts have different columns"
+                raise DataError(msg)
+            n_bytes += stream.write(rows)
+        stream.write(bytes(-n_bytes % 2880))
+
+
+def _fits_rows(table, id_width):
+    """Header and rows of a table as astropy writes it, ids that are text as wide as told."""
+    if "id" in table.colnames and table["id"].dtype.kind == "U":
+        about = table["id"].info.description
+        table["id"] = np.asarray(table["id"]).astype(f"U{max(1, id_width // 4)}")
+        table["id"].info.description = about
+    meta, table.meta = dict(table.meta), {}
+    for key, value in meta.items():
+        if key == "citations":
+            key, value = "cite", "; ".join(value)
+        # headers hold no dicts
+        plain = isinstance(value, (str, int, float, bool))
+        table.meta[key] = value if plain else json.dumps(value, default=plain_value)
+    file = io.BytesIO()
+    with warnings.catch_warnings():
+        # FITS does not know dex; astropy does when it reads the table
+        warnings.filterwarnings("ignore", "The unit 'dex' could not be saved in native FITS")
+        table.write(file, format="fits")
+    data = file.getvalue()
+    with fits.open(io.BytesIO(data)) as hdus:
+        header, start = hdus[1].header.copy(), hdus[1].fileinfo()["datLoc"]
+    return header, data[start : start + header["NAXIS1"] * header["NAXIS2"]]

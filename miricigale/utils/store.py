@@ -45,7 +45,7 @@ def replacing(path, *, overwrite=True, sync=False):
     """
     path = Path(path)
     if not overwrite and path.exists():
-        msg = f"{path} exists; overwrite=True replaces it"
+        msg = f"{path} already exists; overwrite=True replaces it"
         raise OSError(msg)
     partial = path.with_name(f"{PARTIAL}{os.getpid()}-{uuid.uuid4().hex[:8]}-{path.name}")
     try:

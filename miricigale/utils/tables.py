@@ -11,6 +11,7 @@ from miricigale.utils.units import ANGLE, to_array
 
 __all__ = [
     "Flags",
+    "add_columns",
     "ascii_ids",
     "error_column",
     "match_sky",
@@ -32,6 +33,22 @@ class Flags(enum.IntFlag):
     def names(cls, value):
         """Names of the bits set in ``value``, lower case."""
         return [m.name.lower() for m in cls if m.value and int(value) & m.value]
+
+
+def add_columns(table, columns):
+    """
+    Add columns with their descriptions to a table.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+        The table.
+    columns : dict of str to tuple
+        Name to values and the one line that describes them.
+    """
+    for name, (values, text) in columns.items():
+        table[name] = values
+        table[name].info.description = text
 
 
 def error_column(name):

@@ -117,7 +117,7 @@ def brute_force(fitter, flux, sigma, log_prior=None, limit=None):
     ``limit`` says which bands are upper limits; ``flux`` and ``sigma`` hold them.
     """
     grid, priors = fitter.grid, fitter.priors
-    quantities = fitter.quantities
+    quantities = fitter.backend.quantities
     limit = np.zeros(flux.size, bool) if limit is None else np.asarray(limit)
     use = np.isfinite(sigma) & ~limit
     w = np.where(use, 1.0 / np.square(sigma), 0.0)
@@ -150,7 +150,7 @@ def brute_force(fitter, flux, sigma, log_prior=None, limit=None):
     if grid.n_agn:
         mixed = mixed + power * quantities.mixed_agn[None, None, :, None]
     unit = [np.broadcast_to(row, s.shape) for row in [*rows, mixed]]
-    more = fitter._engine.scale_error * variance
+    more = fitter.backend.engine.scale_error * variance
     mean = np.array([(like * s * row).sum() for row in unit])
     # about the means, so that narrow posteriors keep their digits
     std = [
@@ -160,8 +160,12 @@ def brute_force(fitter, flux, sigma, log_prior=None, limit=None):
     band = ((like * s)[..., None] * model).sum((0, 1, 2, 3))
     apart = (s[..., None] * model - band) ** 2 + more[..., None] * model**2
     values = [s * row for row in unit]
-    if fitter.fraction is not None:
-        y = (f / (1.0 - f)) * fitter.fraction.galaxy[:, None, None] * fitter.fraction.agn[:, None]
+    if fitter.backend.fraction is not None:
+        y = (
+            (f / (1.0 - f))
+            * fitter.backend.fraction.galaxy[:, None, None]
+            * fitter.backend.fraction.agn[:, None]
+        )
         values.append(np.broadcast_to(y / (1.0 + y), s.shape))
         mean = np.append(mean, (like * values[-1]).sum())
         std.append(np.sqrt((like * (values[-1] - mean[-1]) ** 2).sum()))

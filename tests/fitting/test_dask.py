@@ -90,7 +90,7 @@ def test_two_dask_workers_give_the_numbers_of_one_process(grid, photometry, tmp_
 def test_processes_get_the_grid_once(grid, photometry):
     fitter = BayesFitter(grid)
     whole = elsewhere(fitter, photometry)
-    engine = len(pickle.dumps(fitter._engine))
+    engine = len(pickle.dumps(fitter.backend.engine))
     assert engine > 400_000
     with Weighing(2, mp_context=get_context("spawn")) as executor:
         assert_same(fitter.fit(photometry, executor=executor, chunk_size=8), whole)

@@ -49,11 +49,11 @@ def test_processes_change_nothing(grid, photometry):
 
 def test_the_engine_is_picklable(grid, photometry):
     fitter = BayesFitter(grid)
-    again = pickle.loads(pickle.dumps(fitter._engine))
+    again = pickle.loads(pickle.dumps(fitter.backend.engine))
     flux = np.array([[photometry[name][0].value for name in grid.filters]])
     sigma = np.full(flux.shape, 1.0)
     prior = np.zeros((1, grid.redshift.size))
-    one, two = fitter._engine.fit(flux, sigma, prior), again.fit(flux, sigma, prior)
+    one, two = fitter.backend.engine.fit(flux, sigma, prior), again.fit(flux, sigma, prior)
     np.testing.assert_array_equal(one.zf, two.zf)
 
 
@@ -64,7 +64,7 @@ def test_noiseless_models_are_found(grid, draw_photometry):
         assert results.best["redshift"][i] == grid.redshift[z]
         if grid.dust_luminosity[g] > 0:
             assert results.best["frac_agn"][i] == grid.frac_agn[f]
-        assert results.best["tau"][i] == grid.galaxy_parameters["tau"][g].value
+        assert results.best["tau"][i] == grid.galaxy_parameters["tau"][g]
         assert results.best_scale[i] == pytest.approx(s, rel=1e-3)
 
 

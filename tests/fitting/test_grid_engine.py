@@ -137,7 +137,7 @@ def test_percentiles_of_derived_quantities(make_grid, draw_photometry, brute_for
     for i in range(6):
         want = brute_force(fitter, results.flux[i], results.sigma[i])
         weights = want["weights"].ravel()
-        for j, name in enumerate(fitter.quantities.names):
+        for j, name in enumerate(fitter.backend.quantities.names):
             values = np.broadcast_to(want["values"][j], want["weights"].shape).ravel()
             order = np.argsort(values)
             total = np.cumsum(weights[order])

@@ -11,8 +11,8 @@ from scipy.special import log_ndtr
 from scipy.stats import norm
 
 from miricigale.fitting import BayesFitter, FitFlags, FitResults, fit_file, leave_out, mock_analysis
-from miricigale.fitting.engines.scale import best_scale, chi2_at
 from miricigale.fitting.posterior import cell_edges
+from miricigale.fitting.samplers.scale import best_scale, chi2_at
 
 ERROR = {"band0": 0.1, "band1": 0.05, "band3": 0.2}
 FLOOR = {"band2": 0.15, "band3": 0.02}
@@ -179,7 +179,8 @@ def test_all_options_at_once_equal_the_plain_sums(
         std = np.sqrt(np.sum(weights * (share - mean) ** 2))
         assert results.std("frac_agn_ir")[i].value == pytest.approx(std, rel=1e-9, abs=1e-7)
         g, k, f = results.best_index[i, 1:]
-        assert results.best["frac_agn_ir"][i] == pytest.approx(share[g, max(k, 0), f], rel=1e-12)
+        best = results.best["frac_agn_ir"][i].value
+        assert best == pytest.approx(share[g, max(k, 0), f], rel=1e-12)
     unfitted = ~(np.isfinite(sigma) & ~limit).any(axis=1)
     np.testing.assert_array_equal(results.fitted, ~unfitted)
 

@@ -142,7 +142,7 @@ def test_a_wrong_zero_point_is_found(fitter, catalogue):
 
 
 def test_bands_that_are_not_there(fitter, catalogue):
-    with pytest.raises(KeyError, match="no filter of the grid 'band9'"):
+    with pytest.raises(KeyError, match="no filter of the models 'band9'"):
         leave_out(fitter, catalogue, ["band9"])
     with pytest.raises(ValueError, match="'bands' must be a list"):
         leave_out(fitter, catalogue, "band1")

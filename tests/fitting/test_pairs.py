@@ -219,7 +219,7 @@ def test_nothing_else_changes_nor_does_the_cut(fitter, results, photometry, monk
     with ThreadPoolExecutor(2) as executor:
         assert_same(fitter.fit(photometry, pairs=pairs, chunk_size=3, executor=executor), whole)
     # one object at a time, as on large grids
-    monkeypatch.setattr("miricigale.fitting.pieces._JOINT_SIZE", 1)
+    monkeypatch.setattr("miricigale.fitting.grid_fit._JOINT_SIZE", 1)
     assert_same(fitter.fit(photometry, pairs=pairs), whole)
     empty = fitter.fit(photometry[:0], pairs=pairs)
     assert empty.joint_pdf("age", "tau").shape == (0, 4, 5)
@@ -227,13 +227,13 @@ def test_nothing_else_changes_nor_does_the_cut(fitter, results, photometry, monk
 
 def test_only_what_is_needed_is_asked_of_the_engine(fitter, photometry, monkeypatch):
     asked = []
-    fit = type(fitter._engine).fit
+    fit = type(fitter.backend.engine).fit
 
     def listening(self, *args, joint=(), **kwargs):
         asked.append(set(joint))
         return fit(self, *args, joint=joint, **kwargs)
 
-    monkeypatch.setattr(type(fitter._engine), "fit", listening)
+    monkeypatch.setattr(type(fitter.backend.engine), "fit", listening)
     for pairs, want in (
         (None, set()),
         ([("age", "tau"), ("tau97", "ebv_polar"), ("frac_agn", "redshift")], set()),
@@ -353,7 +353,7 @@ def test_any_pair_is_drawn(results):
 
     for x, y in [("age", "tau"), ("tau", "age"), ("redshift", "frac_agn"), ("tau97", "redshift")]:
         ax = new_figure()[1][0, 0]
-        assert results.plot_pdf2d(2, x, y, ax=ax) is ax
+        assert results[2].plot_pdf2d(x, y, ax=ax) is ax
         assert ax.get_xlabel().split()[0] == x
         assert ax.get_ylabel().split()[0] == y
         drawn = ax.collections[0].get_array()

@@ -74,8 +74,8 @@ def test_parts_and_groups_stand_in_the_legend():
 def test_results_draw_themselves(grid, photometry):
     results = BayesFitter(grid).fit(photometry)
     ax = plt.figure().add_subplot()
-    assert results.plot_pdf(2, "frac_agn", ax=ax) is ax
+    assert results[2].plot_pdf("frac_agn", ax=ax) is ax
     ax = plt.figure().add_subplot()
     assert results[2].plot_pdf("mass", ax=ax) is ax
     ax = plt.figure().add_subplot()
-    assert results.plot_pdf2d(2, ax=ax) is ax
+    assert results[2].plot_pdf2d(ax=ax) is ax

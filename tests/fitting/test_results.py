@@ -72,23 +72,23 @@ def test_no_parameter_leaves_its_limits():
         low, high = model.parameters[name].bounds
         values = results.percentile(name, [0.001, 0.999]).value
         assert np.all((values >= low) & (values <= high)), name
-        edges, _ = results[0].pdf(name)
+        edges, _ = results[0].distribution(name)
         assert edges[0].value >= low
         assert edges[-1].value <= high
     # what may be negative is not cut at 0
-    assert results[0].pdf("slope")[0][-1].value == pytest.approx(0.2)
+    assert results[0].distribution("slope")[0][-1].value == pytest.approx(0.2)
 
 
 def test_views_agree_with_the_catalogue(results):
     view = results[3]
-    assert view.id == 3
+    assert view.ids == 3
     assert view.chi2 == results.chi2[3]
     assert view.mean("mass") == results.mean("mass")[3]
-    edges, weights = view.pdf("frac_agn")
+    edges, weights = view.distribution("frac_agn")
     np.testing.assert_allclose(edges, [0.0, 0.1, 0.35, 0.7, 1.0])
     assert weights.sum() == pytest.approx(1.0)
     np.testing.assert_allclose(view.pdf_2d.sum(axis=0), weights, atol=1e-12)
-    edges, weights = view.pdf("mass")
+    edges, weights = view.distribution("mass")
     assert edges.unit == u.Msun
     assert len(edges) == len(weights) + 1
     assert len(list(results)) == len(results)
@@ -106,7 +106,7 @@ def test_prediction_of_the_best_model(results, grid):
     want = results.best_scale[0] * grid.flux(z, g, k, f)
     got = [table[f"{name}_best"][0].value for name in grid.filters]
     np.testing.assert_allclose(got, want, rtol=1e-12)
-    with pytest.raises(KeyError, match="no filter of the grid 'band9'"):
+    with pytest.raises(KeyError, match="no filter of the models 'band9'"):
         results.predict(["band9"])
 
 

@@ -106,7 +106,7 @@ def test_parameters_without_effect_have_their_prior(real):
     # the same in any company
     two = Samples(grid, ["y", "x"], [0, 0], np.repeat(index, 2, axis=0), np.ones((2, n)), axes=axes)
     np.testing.assert_array_equal(
-        two["x"].values("temperature_polar"), one.values("temperature_polar")
+        two["x"].values("temperature_polar"), one.values("temperature_polar")[0]
     )
     index[..., 2:] = -1, 0
     none = Samples(grid, ["x"], [0], index, np.ones((1, n)))

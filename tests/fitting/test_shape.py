@@ -116,7 +116,7 @@ def test_tables_files_and_views(results, tmp_path):
     assert table["a_v_mean"].info.description == "posterior mean of attenuation"
     assert "a_v_logmean" not in table.colnames
     assert "mass_logmean" in table.colnames
-    edges, weights = results[0].pdf("u_v")
+    edges, weights = results[0].distribution("u_v")
     assert np.all(np.diff(edges.value) >= 0)
     assert weights.sum() == pytest.approx(0.998)
     for name in ("u_v", "mass", "redshift"):

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from concurrent.futures import Executor, Future
 from dataclasses import fields, replace
 
 import astropy.units as u
@@ -40,19 +41,19 @@ class Stopped(Exception):
     pass
 
 
-def count_fits(monkeypatch, *, stop=None):
-    """Count the calls of fit, and stop one of them."""
-    calls = []
-    fit = BayesFitter.fit
+class Counting(Executor):
+    """An executor that counts its tasks, one for each part of up to 64 rows, and stops at one."""
 
-    def counted(self, table, **options):
-        calls.append(len(table))
-        if len(calls) == stop:
+    def __init__(self, stop=None):
+        self.n_tasks, self.stop = 0, stop
+
+    def submit(self, function, *args):
+        self.n_tasks += 1
+        if self.n_tasks == self.stop:
             raise Stopped
-        return fit(self, table, **options)
-
-    monkeypatch.setattr(BayesFitter, "fit", counted)
-    return calls
+        future = Future()
+        future.set_result(function(*args))
+        return future
 
 
 @pytest.fixture
@@ -155,30 +156,27 @@ def test_csv_has_the_unit_that_it_is_told(fitter, catalogue, tmp_path):
         fit_file(fitter, path, tmp_path / "no unit", flux_unit="mag")
 
 
-def test_a_stopped_fit_goes_on(fitter, catalogue, tmp_path, monkeypatch):
+def test_a_stopped_fit_goes_on(fitter, catalogue, tmp_path):
     catalogue.write(tmp_path / "catalogue.fits")
     arguments = (fitter, tmp_path / "catalogue.fits", tmp_path / "out")
     whole = fitter.fit(catalogue)
-    with monkeypatch.context() as patch:
-        calls = count_fits(patch, stop=3)
-        with pytest.raises(Stopped):
-            fit_file(*arguments, chunk_rows=40)
-        with pytest.raises(DataError, match=r"holds 2 of 4 parts: fit_file .* goes on"):
-            open_results(tmp_path / "out")
-        there = open_results(tmp_path / "out", partial=True)
-        assert (len(there), there.complete) == (80, False)
-        assert len(there.to_table()) == 80
-    with monkeypatch.context() as patch:
-        calls = count_fits(patch)
-        results = fit_file(*arguments, chunk_rows=40)
-        assert len(calls) == 2
-        assert_same(results, whole)
-        # nothing is left to do
-        fit_file(*arguments, chunk_rows=40)
-        assert len(calls) == 2
+    with pytest.raises(Stopped):
+        fit_file(*arguments, chunk_rows=40, executor=Counting(stop=3))
+    with pytest.raises(DataError, match=r"holds 2 of 4 parts: fit_file .* goes on"):
+        open_results(tmp_path / "out")
+    there = open_results(tmp_path / "out", partial=True)
+    assert (len(there), there.complete) == (80, False)
+    assert len(there.to_table()) == 80
+    executor = Counting()
+    results = fit_file(*arguments, chunk_rows=40, executor=executor)
+    assert executor.n_tasks == 2
+    assert_same(results, whole)
+    # nothing is left to do
+    fit_file(*arguments, chunk_rows=40, executor=executor)
+    assert executor.n_tasks == 2
 
 
-def test_a_damaged_part_is_made_again(fitter, catalogue, tmp_path, monkeypatch):
+def test_a_damaged_part_is_made_again(fitter, catalogue, tmp_path):
     catalogue.write(tmp_path / "catalogue.fits")
     arguments = (fitter, tmp_path / "catalogue.fits", tmp_path / "out")
     fit_file(*arguments, chunk_rows=40)
@@ -188,10 +186,10 @@ def test_a_damaged_part_is_made_again(fitter, catalogue, tmp_path, monkeypatch):
     data = bytearray(two.read_bytes())
     data[-4000] ^= 1
     two.write_bytes(data)
-    (tmp_path / "out" / "part-00003.fits.tmp").write_bytes(b"half a part")
-    calls = count_fits(monkeypatch)
-    assert_same(fit_file(*arguments, chunk_rows=40), whole)
-    assert len(calls) == 2
+    (tmp_path / "out" / ".partial-1-part-00003.fits").write_bytes(b"half a part")
+    executor = Counting()
+    assert_same(fit_file(*arguments, chunk_rows=40, executor=executor), whole)
+    assert executor.n_tasks == 2
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
@@ -232,7 +230,8 @@ def test_a_killed_fit_goes_on(fitter, catalogue, tmp_path, moment):
     subprocess.run([*fitted, str(tmp_path / "first")], check=True)
     assert run(moment).returncode == -signal.SIGKILL
     names = {item.name for item in out.iterdir()}
-    assert names >= {"fit.lock", f"{moment}.tmp"}
+    assert "fit.lock" in names
+    assert any(name.startswith(".partial-") and name.endswith(moment) for name in names)
     assert moment not in names
     assert run().returncode == 0
     assert_same(open_results(out), FitResults.read(f"{out}.whole.fits"))
@@ -306,7 +305,7 @@ def test_results_are_read_as_if_they_were_one(fitter, catalogue, tmp_path):
     results = open_results(tmp_path / "out")
     assert (len(results), results.complete) == (150, True)
     assert repr(results).startswith("<FitResultsFiles of 150 objects, ")
-    assert [item.id for item in results] == catalogue["id"].tolist()
+    assert [item.ids for item in results] == catalogue["id"].tolist()
     key = catalogue["id"][90]
     assert results[key].best["mass"] == whole[key].best["mass"]
     with pytest.raises(KeyError, match="no object with the id 'nobody' among 150"):
@@ -340,23 +339,21 @@ def test_a_catalogue_without_rows_has_results_without_rows(fitter, catalogue, tm
 
 
 @pytest.mark.parametrize("suffix", ["ecsv", "csv"])
-def test_ids_that_parts_cannot_hold_are_refused_at_once(
-    fitter, catalogue, tmp_path, monkeypatch, suffix
-):
+def test_ids_that_parts_cannot_hold_are_refused_at_once(fitter, catalogue, tmp_path, suffix):
     name = "Kümmel 3"
     ids = np.array(catalogue["id"].astype("U20"))
     ids[5], ids[120] = 'with "quotes", and a\nline', name
     catalogue["id"] = ids
     path = tmp_path / f"catalogue.{suffix}"
     catalogue.write(path)
-    calls = count_fits(monkeypatch)
+    executor = Counting()
     with pytest.raises(ValueError, match=rf"'photometry' must be ASCII.* got '{name}'") as info:
-        fit_file(fitter, path, tmp_path / "out", chunk_rows=40, flux_unit="uJy")
+        fit_file(fitter, path, tmp_path / "out", chunk_rows=40, flux_unit="uJy", executor=executor)
     assert info.value.__notes__ == [f"in rows 120 to 149 of {path}"]
-    assert not calls
+    assert executor.n_tasks == 0
     assert not (tmp_path / "out").exists()
     # in memory they are as good as others
-    assert fitter.fit(catalogue)[name].id == name
+    assert fitter.fit(catalogue)[name].ids == name
 
 
 @pytest.mark.parametrize(
@@ -364,7 +361,7 @@ def test_ids_that_parts_cannot_hold_are_refused_at_once(
     [("é".encode(), "'photometry' must be ASCII.* got 'é"), (b"\xe9n", "bytes of text in UTF-8")],
 )
 def test_ids_in_fits_that_are_no_ascii_are_refused_at_once(
-    fitter, catalogue, tmp_path, monkeypatch, start, match
+    fitter, catalogue, tmp_path, start, match
 ):
     path = tmp_path / "catalogue.fits"
     catalogue.write(path)
@@ -372,29 +369,28 @@ def test_ids_in_fits_that_are_no_ascii_are_refused_at_once(
     data = path.read_bytes()
     assert data.count(key) == 1
     path.write_bytes(data.replace(key, start + key[2:]))
-    calls = count_fits(monkeypatch)
+    executor = Counting()
     with pytest.raises(ValueError, match=match) as info:
-        fit_file(fitter, path, tmp_path / "out", chunk_rows=40)
+        fit_file(fitter, path, tmp_path / "out", chunk_rows=40, executor=executor)
     assert info.value.__notes__ == [f"in rows 120 to 149 of {path}"]
-    assert not calls
+    assert executor.n_tasks == 0
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_takes_one_fit_at_a_time(fitter, catalogue, tmp_path, monkeypatch):
+def test_a_folder_takes_one_fit_at_a_time(fitter, catalogue, tmp_path):
     path, out = tmp_path / "catalogue.fits", tmp_path / "out"
     catalogue.write(path)
     inner = []
 
-    def fit(self, *args, **options):
-        with pytest.raises(DataError, match=r"in use by a fit: .* remove .*fit\.lock") as info:
-            fit_file(fitter, path, out, chunk_rows=80)
-        inner.append(info.value)
-        return BayesFitter.__dict__["_fit"](self, *args, **options)
+    class Second(Counting):
+        def submit(self, function, *args):
+            with pytest.raises(DataError, match=r"in use by a fit: .* remove .*fit\.lock") as info:
+                fit_file(fitter, path, out, chunk_rows=50)
+            inner.append(info.value)
+            return super().submit(function, *args)
 
-    monkeypatch.setattr(BayesFitter, "_fit", BayesFitter.fit, raising=False)
-    monkeypatch.setattr(BayesFitter, "fit", fit)
-    results = fit_file(fitter, path, out, chunk_rows=80)
-    assert len(inner) == results.n_parts == 2
+    results = fit_file(fitter, path, out, chunk_rows=50, executor=Second())
+    assert len(inner) == results.n_parts == 3
     assert not (out / "fit.lock").exists()
 
 
@@ -404,7 +400,7 @@ def test_a_fit_that_was_killed_at_its_first_moment_goes_on(fitter, catalogue, tm
     out.mkdir()
     # a number above the largest that Linux gives to a process
     (out / "fit.lock").write_text("4194305")
-    (out / "manifest.json.tmp").write_text("{")
+    (out / ".partial-1-manifest.json").write_text("{")
     assert len(fit_file(fitter, path, out)) == 150
     assert not (out / "fit.lock").exists()
 
@@ -431,9 +427,14 @@ def test_links_under_temporary_names_are_not_followed(fitter, catalogue, tmp_pat
     catalogue.write(path)
     (tmp_path / "victim").write_text("mine")
     fit_file(fitter, path, out)
-    for name in ("manifest.json", "part-00000.fits", "table.fits"):
-        (out / f"{name}.tmp").symlink_to(tmp_path / "victim")
-    fit_file(fitter, path, out, resume=False).write_table(out / "table.fits")
+    for name in ("manifest.json", "part-00000.fits"):
+        (out / f".partial-1-{name}").symlink_to(tmp_path / "victim")
+    # a name is replaced, not what it points to
+    (out / "part-00000.fits").unlink()
+    (out / "part-00000.fits").symlink_to(tmp_path / "victim")
+    results = fit_file(fitter, path, out, resume=False)
+    (out / "table.fits").symlink_to(tmp_path / "victim")
+    results.write_table(out / "table.fits", overwrite=True)
     assert (tmp_path / "victim").read_text() == "mine"
     assert not any(entry.is_symlink() for entry in out.iterdir())
 

@@ -33,7 +33,7 @@ def test_the_best_spectrum_has_the_best_fluxes(fitter, draw_photometry, tmp_path
     for result in results:
         sed = result.best_sed()
         got = filters.synthetic_fluxes(sed).to_value("uJy")
-        np.testing.assert_allclose(got, results.best_flux[results.row(result.id)], rtol=1e-3)
+        np.testing.assert_allclose(got, results.best_flux[results.row(result.ids)], rtol=1e-3)
     results.write(tmp_path / "r.fits")
     again = FitResults.read(tmp_path / "r.fits")
     with pytest.raises(ValueError, match="'model' must be an SEDModel"):
@@ -73,11 +73,11 @@ def test_agn_fraction_in_the_other_definition(definition, name, draw_photometry)
     assert np.all(np.abs(samples.mean(name).value - mean) < 4.5 * std / np.sqrt(3000) + 1e-6)
     np.testing.assert_allclose(samples.std(name).value, std, rtol=0.1, atol=1e-3)
     g, k, f = np.moveaxis(samples.index, -1, 0)[1:]
-    each = fitter.fraction.evaluate(g, np.maximum(k, 0), fitter.grid.frac_agn[f])
+    each = fitter.backend.fraction.evaluate(g, np.maximum(k, 0), fitter.grid.frac_agn[f])
     np.testing.assert_allclose(samples.values(name).value, each, rtol=1e-12, atol=1e-12)
     clear = np.flatnonzero(fitter.grid.galaxy_properties["dust_luminosity"].value == 0)
     # without dust there is no power of the AGN, or nothing else than it
-    alone = fitter.fraction.evaluate(clear, 0, 0.6)
+    alone = fitter.backend.fraction.evaluate(clear, 0, 0.6)
     assert clear.size == 4
     np.testing.assert_array_equal(alone, 0.0 if definition == "dust" else 1.0)
     column = results.to_table()[f"{name}_mean"]
@@ -92,7 +92,7 @@ def test_plot_sed(fitter, draw_photometry):
     import matplotlib.pyplot as plt
 
     table, _ = draw_photometry(fitter.grid, 1, noise=0.05)
-    top, bottom = fitter.fit(table).plot_sed(0)
+    top, bottom = fitter.fit(table)[0].plot_sed()
     assert len(top.lines) > 1
     assert bottom.get_xlabel() == "observed wavelength (µm)"
     plt.close("all")

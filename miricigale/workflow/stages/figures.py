@@ -413,7 +413,7 @@ def example_figure(results, truth, key, model):
     ):
         ax = figure.add_subplot(grid[:, column])
         for unit, color in FIT_COLORS.items():
-            edges, weights = results[unit][key].pdf(name)
+            edges, weights = results[unit][key].distribution(name)
             density = weights / np.diff(edges.value)
             if density.max() > 0:
                 density = density / density.max()

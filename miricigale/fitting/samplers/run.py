@@ -1,24 +1,35 @@
 """One object, fitted with continuous parameters by a sampler."""
 
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.fitting.engines.base import (
-    Request,
-    effective_size,
-    get_sampler,
-)
-from miricigale.fitting.engines.scale import best_scale, chi2_at
-from miricigale.fitting.engines.space import Space
+from miricigale.fitting.samplers import Request, effective_size, get_sampler
+from miricigale.fitting.samplers.scale import best_scale, chi2_at
+from miricigale.fitting.samplers.space import Space
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
 
-__all__ = ["ContinuousEngine", "Posterior", "Target"]
+__all__ = ["ContinuousEngine", "FluxModel", "Posterior", "Target"]
 
 #: Draws from the prior of which at least one has to be possible.
 _TRIALS = 2048
+
+
+@runtime_checkable
+class FluxModel(Protocol):
+    """What a sampler needs of a model: `~miricigale.sed.SEDModel`, or one of the user's."""
+
+    parameters: dict
+    meta: dict
+
+    def fluxes(self, table, filters):
+        """Fluxes and derived quantities for a table of parameters."""
+
+    def derived_columns(self):
+        """Derived quantities by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,8 +157,8 @@ class ContinuousEngine:
     names : tuple of str
         Their names.
     sampler : str or callable
-        See `~miricigale.fitting.engines.base.get_sampler`.
-    request : `~miricigale.fitting.engines.base.Request`
+        See `~miricigale.fitting.samplers.get_sampler`.
+    request : `~miricigale.fitting.samplers.Request`
         Settings of the sampler.
     profile : bool
         Whether the mass of each model is the one that fits best (with its Gaussian error if

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from miricigale.fitting.engines.base import Draws
+from miricigale.fitting.samplers import Draws
 from miricigale.utils.optional import require
 
 __all__ = ["load"]

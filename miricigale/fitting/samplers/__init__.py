@@ -1,4 +1,4 @@
-"""What a sampler is given and what it returns; the samplers by name."""
+"""Nested samplers for continuous parameters: what one is given, what it returns, and which there are."""
 
 import importlib
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ __all__ = [
 
 #: Module of each sampler in this folder: its ``load`` imports the package.
 SAMPLERS = {
-    "nautilus": "miricigale.fitting.engines.nautilus",
-    "dynesty": "miricigale.fitting.engines.dynesty",
+    "nautilus": "miricigale.fitting.samplers.nautilus",
+    "dynesty": "miricigale.fitting.samplers.dynesty",
 }
 
 #: What to cite for them.

@@ -4,10 +4,22 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from miricigale.fitting.flags import FitFlags
 from miricigale.fitting.posterior import cell_edges
+from miricigale.fitting.redshifts import known_redshifts, read_density
 from miricigale.utils.exceptions import argument_error, unknown_name
 
-__all__ = ["Choice", "Continuous", "Flat", "Log", "Space", "Table", "make_prior", "prior_cells"]
+__all__ = [
+    "Choice",
+    "Continuous",
+    "Flat",
+    "Log",
+    "Space",
+    "Table",
+    "make_prior",
+    "prior_cells",
+    "redshift_axis",
+]
 
 #: Part of a prior without limits that may lie outside the cells of its axis.
 _TAIL = 1e-3
@@ -296,6 +308,68 @@ class Space:
         """Number of free parameters."""
         return len(self.free)
 
+    @property
+    def redshift_limits(self):
+        """Least and largest redshift of the prior; None where it has none."""
+        prior = self.free.get("redshift")
+        if prior is None:
+            return None
+        return (prior.values[0], prior.values[-1]) if isinstance(prior, Choice) else prior.bounds
+
+    def at_redshifts(self, limits, photometry, redshift, flags):
+        """
+        Copies with the redshift of every object.
+
+        Parameters
+        ----------
+        limits : tuple of float
+            Least and largest redshift.
+        photometry : `~astropy.table.Table`
+            The catalogue of n objects.
+        redshift : str or array_like
+            One of its columns, or values.
+        flags : `~numpy.ndarray` of int, shape (n,)
+            Redshifts that cannot be used are flagged here.
+
+        Returns
+        -------
+        spaces : list of `Space`
+        """
+        values = known_redshifts(photometry, redshift)
+        missing = np.isnan(values)
+        low, high = limits
+        with np.errstate(invalid="ignore"):
+            outside = ~missing & ~((values >= low) & (values <= high))
+        flags[missing] |= int(FitFlags.NO_REDSHIFT)
+        flags[outside] |= int(FitFlags.REDSHIFT_OUTSIDE)
+        good = np.where(missing | outside, 0.5 * (low + high), values)
+        return [self.with_prior("redshift", float(z)) for z in good]
+
+    def with_densities(self, limits, redshift_prior, flags):
+        """
+        Copies with the prior of redshift of every object.
+
+        Parameters
+        ----------
+        limits, flags : object
+            As for `at_redshifts`; a prior that leaves nothing is flagged.
+        redshift_prior : tuple
+            Redshifts, shape (n_z,), and densities, shape (n_z,) or (n, n_z).
+
+        Returns
+        -------
+        spaces : list of `Space`
+        """
+        nodes, density = read_density(redshift_prior, len(flags))
+        out = []
+        for row, one in enumerate(np.broadcast_to(density, (len(flags), nodes.size))):
+            known = np.isfinite(one).all()
+            table = Table(nodes, np.array(one)).cut(*limits) if known else None
+            if table is None:
+                flags[row] |= int(FitFlags.NO_MODEL)
+            out.append(self.with_prior("redshift", Flat(*limits) if table is None else table))
+        return out
+
     def values(self, points):
         """
         Parameters of points of the unit cube.
@@ -344,6 +418,42 @@ def prior_cells(prior, n):
     edges = cell_edges(nodes, bounds)
     total = prior.cdf(edges[1:-1])
     return nodes, np.diff(np.concatenate([[0.0], total, [1.0]])), bounds
+
+
+def redshift_axis(spaces, limits, n):
+    """
+    Cells of redshift for objects that may each have a prior, or a redshift, of their own.
+
+    Parameters
+    ----------
+    spaces : list of `Space`
+        Parameters of the objects.
+    limits : tuple of float
+        Least and largest redshift.
+    n : int
+        Number of cells.
+
+    Returns
+    -------
+    nodes, weights, bounds
+        As of `prior_cells`; the prior is the mean over the objects.
+    """
+    free = [space.free["redshift"] for space in spaces if "redshift" in space.free]
+    if not free:
+        values = [space.fixed["redshift"] for space in spaces] or [0.0]
+        low, high = min(values), max(values)
+        if high > low:
+            return prior_cells(Flat(low, high), n)
+        return np.array([low]), np.ones(1), (low, low)
+    if all(prior is free[0] for prior in free):
+        return prior_cells(free[0], n)
+    tables = [prior for prior in free if isinstance(prior, Table)]
+    if tables:
+        limits = min(p.value[0] for p in tables), max(p.value[-1] for p in tables)
+    nodes, _, bounds = prior_cells(Flat(*limits), n)
+    edges = cell_edges(nodes, bounds)
+    cdf = np.mean([p.cdf(edges) for p in tables] or [edges], axis=0)
+    return nodes, np.diff(cdf) / (cdf[-1] - cdf[0]), bounds
 
 
 def _number(prior):

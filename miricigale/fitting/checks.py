@@ -1,0 +1,422 @@
+"""How far a fit can be trusted: mock catalogues fitted again, and bands left out and predicted."""
+
+from dataclasses import dataclass, field
+
+import astropy.units as u
+import numpy as np
+from astropy.stats import mad_std
+from astropy.table import QTable
+
+from miricigale.fitting.fitter import BayesFitter
+from miricigale.fitting.flags import FitFlags
+from miricigale.fitting.likelihood import flux_column, limits, read_ids
+from miricigale.fitting.posterior import randomised_ranks
+from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.random import check_seed, stream
+from miricigale.utils.tables import add_columns, error_column, require_columns
+from miricigale.utils.units import FNU, frozen_array
+
+__all__ = ["LeaveOutResult", "MockResult", "leave_out", "mock_analysis"]
+
+_LEVELS = (0.16, 0.84)
+
+
+def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **options):
+    """
+    Refit a mock catalogue whose true parameters are known: the best models with noise.
+
+    The best model of every object takes the object's place; its fluxes in the bands that were
+    used are perturbed by the measured errors of that object and fitted as the object was
+    (Boquien et al. 2019, A&A 622, A103, section 4.3). Upper limits stay as they are, for what
+    would have been measured there is not known.
+
+    Parameters
+    ----------
+    fitter : `BayesFitter`
+        What made the results.
+    results : `FitResults`
+        Results of the catalogue.
+    photometry : `~astropy.table.QTable`
+        The catalogue that was fitted.
+    seed : int, `~numpy.random.Generator` or None
+        Every object has its own stream, by its id.
+    model_error : bool, optional
+        Whether the noise has the model error in it that the fit allows for. Without it, as in
+        CIGALE, the intervals of a fit with model error are wider than the scatter.
+    **options
+        Passed to `BayesFitter.fit`; known redshifts have to be given again.
+
+    Returns
+    -------
+    mock : `MockResult`
+
+    Raises
+    ------
+    ValueError
+        If photometry and results are of different objects, or the redshifts were fixed and are
+        not given.
+    """
+    seed = check_seed(seed)
+    filters = results.fitted_filters
+    columns = [c for name in filters for c in (name, error_column(name))]
+    require_columns(photometry, ["id", *columns], "photometry", units=dict.fromkeys(columns, FNU))
+    if not np.array_equal(read_ids(photometry), results.ids):
+        raise argument_error("photometry", "of the objects of 'results', in order", "others")
+    if results.redshift_fixed and options.get("redshift") is None:
+        raise argument_error("redshift", "given again: it was fixed in 'results'", "None")
+    noise = np.array(
+        [stream(seed, "mock", str(key)).normal(size=len(results.filters)) for key in results.ids]
+    ).reshape(results.flux.shape)
+    error = results.sigma if model_error else results.flux_err
+    used = np.isfinite(results.sigma) & results.fitted[:, None] & np.isfinite(error)
+    mock = QTable(photometry, copy=True)
+    for name in filters:
+        i = results.filters.index(name)
+        change = used[:, i] & ~results.limit[:, i]
+        flux = flux_column(photometry, name)
+        flux[change] = (results.best_flux[:, i] + noise[:, i] * error[:, i])[change]
+        mock[name] = flux * FNU
+    recovered = fitter.fit(mock, **options)
+    return MockResult(results, recovered, mock, {"seed": seed, "model_error": bool(model_error)})
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MockResult:
+    """
+    A mock catalogue, fitted.
+
+    Parameters
+    ----------
+    truth : `FitResults`
+        Results whose best models are the truth.
+    recovered : `FitResults`
+        Fit of the mock catalogue.
+    photometry : `~astropy.table.QTable`
+        The mock catalogue.
+    meta : dict
+        Seed and settings.
+    """
+
+    truth: object
+    recovered: object
+    photometry: QTable
+    meta: dict = field(default_factory=dict)
+
+    def __len__(self):
+        return len(self.truth)
+
+    def __repr__(self):
+        good = int(np.count_nonzero(self.recovered.fitted & self.truth.fitted))
+        return f"<MockResult of {len(self)} objects, {good} fitted>"
+
+    @property
+    def parameters(self):
+        """Names of parameters and derived quantities."""
+        return self.truth.parameters
+
+    def true(self, name):
+        """True values: Quantity, shape (n,); NaN where there is none."""
+        return self.truth.best[name]
+
+    def to_table(self):
+        """
+        True and recovered values.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            ``id``, ``flags`` of the fit of the mock catalogue and, for every parameter and
+            derived quantity, ``<name>_true``, ``_mean``, ``_std``, ``_p16``, ``_p50`` and
+            ``_p84``.
+        """
+        columns = {
+            "id": (np.array(self.recovered.ids), "identifier"),
+            "flags": (np.array(self.recovered.flags), FitFlags.describe()),
+        }
+        table = self.recovered.to_table()
+        for name in self.parameters:
+            columns[f"{name}_true"] = (self.true(name), f"true value of {name}: the best model's")
+            for suffix in ("mean", "std", "p16", "p50", "p84"):
+                column = table[f"{name}_{suffix}"]
+                columns[f"{name}_{suffix}"] = (column, column.info.description)
+        out = QTable(meta=dict(self.recovered.meta) | {"mock": dict(self.meta)})
+        add_columns(out, columns)
+        return out
+
+    def metrics(self, parameters=None):
+        """
+        How well parameters are recovered.
+
+        Parameters
+        ----------
+        parameters : list of str, optional
+            Names; all by default.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            A row for each parameter. ``n`` objects with a true value; ``offset`` and
+            ``scatter``, median and 1.48 times the median absolute deviation of posterior mean
+            less truth, in ``unit`` (dex for what scales with mass, over the objects where both
+            are above 0); ``coverage``, the part of truths within the 16-84 % interval. Of
+            parameters of the grid, whose truth lies on a node, the coverage counts randomised
+            ranks.
+        """
+        names = self.parameters if parameters is None else tuple(parameters)
+        rows = [self._metric(name) for name in names]
+        texts = {
+            "unit": "unit of offset and scatter",
+            "n": "objects with a true value that were fitted",
+            "offset": "median of posterior mean less truth",
+            "scatter": "1.48 times the median absolute deviation of the same",
+            "coverage": "part of truths within the 16-84 % interval; 0.68 is right",
+        }
+        columns = {"parameter": (np.array(names, dtype=str), "parameter or derived quantity")}
+        for i, (name, text) in enumerate(texts.items()):
+            columns[name] = (np.array([row[i] for row in rows]), text)
+        out = QTable(meta={"mock": dict(self.meta)})
+        add_columns(out, columns)
+        return out
+
+    def _metric(self, name):
+        true, mean = self.true(name).value, self.recovered.mean(name).value
+        good = np.isfinite(true) & np.isfinite(mean)
+        if self.truth.extensive(name):
+            both = good & (true > 0) & (mean > 0)
+            difference = np.log10(mean[both] / true[both])
+            unit = "dex"
+        else:
+            difference = (mean - true)[good]
+            unit = self.truth.unit(name).to_string()
+        offset, scatter = np.nan, np.nan
+        if difference.size:
+            offset = float(np.median(difference))
+            scatter = float(mad_std(difference))
+        coverage = float(np.mean(self._inside(name, good))) if good.any() else np.nan
+        return unit, int(np.count_nonzero(good)), offset, scatter, coverage
+
+    def _inside(self, name, good):
+        """Whether the truth of good objects lies in the 16-84 % interval."""
+        low, high = _LEVELS
+        true = self.true(name).value[good]
+        if name in self.recovered.axes:
+            values = self.recovered.axes[name].values
+            node = np.argmin(np.abs(true[:, None] - values), axis=1)
+            seed = int(self.meta.get("seed", 0))
+            draw = [stream(seed, "rank", name, str(i)).random() for i in self.truth.ids[good]]
+            rank = randomised_ranks(self.recovered.pdf[name][good], node, draw)
+            return (rank > low) & (rank < high)
+        ends = self.recovered.percentile(name, _LEVELS).value[good]
+        return (true >= ends[:, 0]) & (true <= ends[:, 1])
+
+    def plot(self, name, ax=None, **kwargs):
+        """Draw recovered against true values of a parameter; returns the axes."""
+        from miricigale.plotting.posteriors import plot_recovery
+
+        unit, log = self.truth.unit(name), self.truth.extensive(name)
+        kwargs = {"name": name, "unit": unit.to_string(), "log": log} | kwargs
+        return plot_recovery(
+            self.true(name).value,
+            self.recovered.mean(name).value,
+            self.recovered.std(name).value,
+            ax=ax,
+            **kwargs,
+        )
+
+
+def leave_out(fitter, photometry, bands, *, separately=False, **options):
+    """
+    Fit without some bands, and compare what is measured there with what the rest predicts.
+
+    Upper limits in other bands take part in the fit; where a band left out is an upper limit there
+    is a prediction, but nothing to compare it with.
+
+    Parameters
+    ----------
+    fitter : `BayesFitter`
+        How to fit, on a grid that has the bands, or a sampler that predicts them (``predict``).
+    photometry : `~astropy.table.QTable`
+        The catalogue.
+    bands : list of str
+        Bands to leave out.
+    separately : bool, optional
+        Whether one at a time (a fit for each), rather than all at once.
+    **options
+        Passed to `BayesFitter.fit`.
+
+    Returns
+    -------
+    result : `LeaveOutResult`
+
+    Raises
+    ------
+    KeyError
+        If a band is not one of the grid.
+    ValueError
+        If the photometry does not have it, no object is measured in it, or too few bands are left
+        to fit (``n_bands_min`` of the fitter).
+    """
+    if not isinstance(fitter, BayesFitter):
+        raise argument_error("fitter", "a BayesFitter", type(fitter).__name__)
+    if isinstance(bands, str) or not len(bands):
+        raise argument_error("bands", "a list of one or more names", repr(bands))
+    bands = tuple(bands)
+    if len(set(bands)) < len(bands):
+        raise argument_error("bands", "different names", f"{list(bands)}")
+    for name in bands:
+        if name not in fitter.bands:
+            raise unknown_name("filter of the models", name, fitter.bands)
+    columns = [c for name in bands for c in (name, error_column(name))]
+    require_columns(photometry, ["id", *columns], "photometry", units=dict.fromkeys(columns, FNU))
+    groups = [(name,) for name in bands] if separately else [bands]
+    fitted = [f for f in fitter.filters or fitter.bands if f in photometry.colnames]
+    for group in groups:
+        left = [name for name in fitted if name not in group]
+        if len(left) < fitter.n_bands_min:
+            wanted = f"such that n_bands_min = {fitter.n_bands_min} or more of {fitted} are left"
+            raise argument_error("bands", wanted, f"{list(group)}")
+    flux = np.array([flux_column(photometry, name) for name in bands]).T
+    err = np.array([flux_column(photometry, error_column(name)) for name in bands]).T
+    limit = np.array([limits(photometry, name) for name in bands]).T
+    good = np.isfinite(flux) & np.isfinite(err) & (err > 0)
+    empty = [name for name, any_good in zip(bands, good.any(axis=0), strict=True) if not any_good]
+    if empty and len(photometry):
+        raise argument_error("bands", "measured for one object at least", f"{empty}")
+    good &= ~limit
+    results, predicted, scatter = {}, [], []
+    for group in groups:
+        blank = QTable(photometry, copy=True)
+        for name in group:
+            blank[name] = np.full(len(blank), np.nan) * FNU
+            if f"{name}_limit" in blank.colnames:
+                blank[f"{name}_limit"] = np.zeros(len(blank), dtype=bool)
+        found = fitter.fit(blank, **options)
+        for name in group:
+            i = found.filters.index(name)
+            results[name] = found
+            predicted.append(found.model_flux[:, i])
+            scatter.append(found.model_flux_std[:, i])
+    return LeaveOutResult(
+        bands=bands,
+        flux=np.where(good, flux, np.nan),
+        flux_err=np.where(good, err, np.nan),
+        predicted=np.array(predicted).T,
+        predicted_std=np.array(scatter).T,
+        results=results,
+    )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LeaveOutResult:
+    """
+    Bands that were not fitted, measured and predicted.
+
+    Parameters
+    ----------
+    bands : tuple of str
+        The bands.
+    flux, flux_err : `~numpy.ndarray`, shape (n, n_bands)
+        Measured fluxes and errors in uJy; NaN where there is none or an upper limit.
+    predicted, predicted_std : `~numpy.ndarray`, shape (n, n_bands)
+        Posterior means and standard deviations of the model fluxes in uJy, from the other
+        bands.
+    results : dict of str to `FitResults`
+        By band, the fit without it.
+    """
+
+    bands: tuple
+    flux: np.ndarray
+    flux_err: np.ndarray
+    predicted: np.ndarray
+    predicted_std: np.ndarray
+    results: dict
+
+    def __post_init__(self):
+        for name in ("flux", "flux_err", "predicted", "predicted_std"):
+            object.__setattr__(self, name, frozen_array(getattr(self, name)))
+
+    def __len__(self):
+        return len(self.flux)
+
+    def __repr__(self):
+        return f"<LeaveOutResult of {len(self)} objects, without {', '.join(self.bands)}>"
+
+    @property
+    def pull(self):
+        """Measured less predicted, over both errors in quadrature: shape (n, n_bands)."""
+        return (self.flux - self.predicted) / np.hypot(self.flux_err, self.predicted_std)
+
+    def to_table(self):
+        """
+        Measured and predicted fluxes.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            ``id`` and, for each band, ``<name>``, ``<name>_err``, ``<name>_predicted``,
+            ``<name>_predicted_err``, ``<name>_pull`` and ``<name>_flags``, those of the fit
+            without it.
+        """
+        some = self.results[self.bands[0]]
+        columns = {"id": (np.array(some.ids), "identifier")}
+        pull = self.pull * u.dimensionless_unscaled
+        text = "measured less predicted, over both errors in quadrature"
+        for i, name in enumerate(self.bands):
+            columns |= {
+                name: (self.flux[:, i] * FNU, "measured flux, not fitted"),
+                error_column(name): (self.flux_err[:, i] * FNU, "its error"),
+                f"{name}_predicted": (self.predicted[:, i] * FNU, "flux predicted by the others"),
+                f"{name}_predicted_err": (self.predicted_std[:, i] * FNU, "its error"),
+                f"{name}_pull": (pull[:, i], text),
+                f"{name}_flags": (np.array(self.results[name].flags), FitFlags.describe()),
+            }
+        out = QTable(meta=dict(some.meta) | {"left_out": [*self.bands]})
+        add_columns(out, columns)
+        return out
+
+    def metrics(self):
+        """
+        How well each band is predicted.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            A row for each band: ``n`` objects; ``offset``, the median of measured over
+            predicted less 1; ``pull`` and ``pull_scatter``, median and 1.48 times the median
+            absolute deviation of the pulls; ``within``, the part of pulls within 1 (0.68 if
+            errors and models are right).
+        """
+        rows = [self._metric(i) for i in range(len(self.bands))]
+        texts = {
+            "n": "objects measured and predicted",
+            "offset": "median of measured over predicted, less 1",
+            "pull": "median of the pulls",
+            "pull_scatter": "1.48 times their median absolute deviation",
+            "within": "part of the pulls within 1",
+        }
+        columns = {"band": (np.array(self.bands, dtype=str), "band that was left out")}
+        for i, (name, text) in enumerate(texts.items()):
+            columns[name] = (np.array([row[i] for row in rows]), text)
+        out = QTable()
+        add_columns(out, columns)
+        return out
+
+    def _metric(self, i):
+        good = np.isfinite(self.pull[:, i])
+        if not good.any():
+            return 0, np.nan, np.nan, np.nan, np.nan
+        pull, flux, model = self.pull[good, i], self.flux[good, i], self.predicted[good, i]
+        ratio = flux[model > 0] / model[model > 0]
+        offset = float(np.median(ratio)) - 1.0 if ratio.size else np.nan
+        within = float(np.mean(np.abs(pull) <= 1.0))
+        return int(pull.size), offset, float(np.median(pull)), float(mad_std(pull)), within
+
+    def plot(self, band=None, ax=None, **kwargs):
+        """Draw the distribution of the pulls of one band, or of all; returns the axes."""
+        from miricigale.plotting.posteriors import plot_pulls
+
+        if band is not None and band not in self.bands:
+            raise unknown_name("band that was left out", band, self.bands)
+        pull = self.pull if band is None else self.pull[:, self.bands.index(band)]
+        kwargs.setdefault("label", band)
+        return plot_pulls(pull.ravel(), ax=ax, **kwargs)

@@ -1,0 +1,374 @@
+"""Fits on a model grid: priors of redshift, joint posteriors, and what the engine finds as results."""
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.fitting.engines.grid import GridEngine
+from miricigale.fitting.flags import FitFlags
+from miricigale.fitting.pairs import check_pairs, joint_names, joint_tables
+from miricigale.fitting.priors import GridPriors, grid_priors
+from miricigale.fitting.quantities import DERIVED_LEVELS, OtherFraction, Quantities
+from miricigale.fitting.redshifts import density_log_prior, fixed_log_prior, known_redshifts
+from miricigale.fitting.results import FitResults
+from miricigale.fitting.samples import Samples
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.parallel import chunks, parallel_map
+from miricigale.utils.random import stream
+
+__all__ = ["GridFit"]
+
+#: Best chi2 above which exp(-chi2 / 2) is below the smallest normal number for every model.
+VANISHING_CHI2 = 1417.0
+#: Part of the mean below which CIGALE gives no standard deviation.
+CIGALE_LEAST_STD = 0.05
+#: Numbers of joint sums that a piece may have at once (32 MB).
+_JOINT_SIZE = 1 << 22
+#: Fluxes that are all 0 become negative by this part of their error; see `_engine_input`.
+_DARK = 1e-8
+#: Sum of squared S/N that counts as 0: smaller numbers have fewer digits, or none.
+_NO_SIGNAL = 1e-280
+
+
+@dataclass(frozen=True, eq=False)
+class GridFit:
+    """
+    How `~miricigale.fitting.BayesFitter` fits with every model of a grid; picklable.
+
+    Parameters
+    ----------
+    grid : `~miricigale.sed.ModelGrid`
+        The grid.
+    priors : `~miricigale.fitting.priors.GridPriors`
+        Priors of its parameters.
+    quantities : `~miricigale.fitting.quantities.Quantities`
+        Derived quantities.
+    fraction : `~miricigale.fitting.quantities.OtherFraction` or None
+        The AGN fraction in the definition that the grid does not use.
+    engine : `~miricigale.fitting.engines.grid.GridEngine`
+        What evaluates the models.
+    redshift_tolerance : float or None
+        How far a known redshift may lie from its node.
+    compat : {None, "cigale"}
+        Choices of CIGALE that are not ours.
+    prior_f : str
+        As told to the fitter.
+    """
+
+    grid: object
+    priors: GridPriors
+    quantities: Quantities
+    fraction: OtherFraction | None
+    engine: GridEngine
+    redshift_tolerance: float | None
+    compat: str | None
+    prior_f: str
+
+    #: Objects in a piece of the catalogue.
+    chunk_size = 64
+    #: Weight of the first or last redshift above which an object is flagged.
+    edge_weight = 0.01
+
+    @classmethod
+    def of_grid(cls, grid, priors, prior_f, *, rtol, scale_error, redshift_tolerance, compat):
+        """Work out priors and derived quantities of a grid, and set the engine up."""
+        priors = grid_priors(grid, priors, prior_f=prior_f)
+        quantities, fraction = Quantities.of_grid(grid), OtherFraction.of_grid(grid)
+        engine = GridEngine(
+            galaxy=np.asarray(grid.galaxy, dtype=float),
+            agn=np.asarray(grid.agn, dtype=float),
+            dust=np.asarray(grid.dust_luminosity, dtype=float),
+            frac=np.asarray(grid.frac_agn, dtype=float),
+            usable=np.asarray(grid.allowed, dtype=bool) & (priors.galaxy > 0),
+            prior_galaxy=priors.galaxy,
+            prior_agn=priors.agn,
+            prior_frac=priors.frac,
+            galaxy_scale=quantities.galaxy_scale,
+            agn_scale=quantities.agn_scale,
+            mixed_galaxy=quantities.mixed_galaxy,
+            mixed_agn=quantities.mixed_agn,
+            levels=DERIVED_LEVELS,
+            share_galaxy=None if fraction is None else fraction.galaxy,
+            share_agn=None if fraction is None else fraction.agn,
+            rtol=rtol,
+            scale_error=scale_error,
+        )
+        return cls(grid, priors, quantities, fraction, engine, redshift_tolerance, compat, prior_f)
+
+    @property
+    def filters(self):
+        """Bands of the models."""
+        return self.grid.filters
+
+    @property
+    def citations(self):
+        """What to cite for the models."""
+        return self.grid.meta.get("citations", ())
+
+    @property
+    def constants(self):
+        """Parameters of the grid that have one value, which have no posterior: name to float."""
+        return {
+            name: float(_plain(table[name])[0])
+            for table in (self.grid.galaxy_parameters, self.grid.agn_parameters)
+            for name in table.colnames
+            if name not in self.priors.axes and len(table)
+        }
+
+    def settings(self):
+        """Return what the fit was told, in plain values."""
+        return {
+            "prior_f": self.prior_f,
+            "rtol": self.engine.rtol,
+            "scale_error": self.engine.scale_error,
+            "compat": self.compat,
+            "n_models": int(self.engine.n_models),
+            "constants": self.constants,
+        }
+
+    def provenance(self):
+        """Return what results say of the grid."""
+        known = self.grid.meta.items()
+        return {"grid": {k: v for k, v in known if k not in ("citations", "axes")}}
+
+    def check_data(self, data):
+        """Refuse limits in bands in which a model has negative flux."""
+        bound = data.limit.any(axis=0)
+        for i in np.flatnonzero(bound & self.engine._negative) if bound.any() else ():
+            wanted = "without limits in bands in which a model has negative flux"
+            raise argument_error("photometry", wanted, f"some in {self.filters[i]}")
+
+    def redshifts(self, photometry, redshift, redshift_prior, flags):
+        """
+        ln(prior) of the grid's redshifts for every object.
+
+        Parameters are those of `~miricigale.fitting.BayesFitter.fit`; ``flags``, of the n objects,
+        are added to in place.
+
+        Returns
+        -------
+        log_prior : `~numpy.ndarray`, shape (n, nz)
+        n_free : int
+            Number of free parameters, the mass among them.
+        kind : {"fixed", "free"}
+        """
+        z, prior = self.grid.redshift, self.priors.redshift
+        allowed = self.engine.usable.any(axis=1) & (prior > 0)
+        if redshift_prior is not None:
+            log_prior = density_log_prior(redshift_prior, z, allowed, flags)
+        elif redshift is not None:
+            values = known_redshifts(photometry, redshift)
+            log_prior = fixed_log_prior(values, z, allowed, self.redshift_tolerance, flags)
+        else:
+            if not allowed.any():
+                flags |= int(FitFlags.NO_MODEL)
+            one = np.log(prior, where=allowed, out=np.full(z.size, -np.inf))
+            log_prior = np.tile(one, (len(flags), 1))
+        log_prior[(flags & int(FitFlags.UNFITTED)) != 0] = -np.inf
+        n_free = 1 + sum(axis.values.size > 1 for axis in self.priors.axes.values())
+        n_free -= redshift is not None and z.size > 1
+        return log_prior, n_free, "free" if redshift is None else "fixed"
+
+    # ------------------------------------------------------------------------- fit
+
+    def check_pairs(self, pairs):
+        """Check pairs of parameters; see `~miricigale.fitting.pairs.check_pairs`."""
+        derived = (*self.quantities.names, getattr(self.fraction, "name", None))
+        wanted = "of parameters of the grid ('sample' draws derived quantities jointly)"
+        return check_pairs(pairs, self.priors.axes, self.constants, derived, wanted)
+
+    def task(self, pairs, seed, log_prior):
+        """Function that fits a piece of the catalogue; nothing is drawn, and the prior comes with it."""
+        del seed, log_prior
+        return partial(self._fit_piece, self.check_pairs(pairs))
+
+    def _fit_piece(self, pairs, piece):
+        """`FitResults` of a piece: its photometry and priors of redshift."""
+        data, log_prior = piece
+        joint = joint_names(pairs, self.priors.axes)
+        options, step = {}, max(len(data), 1)
+        if joint:
+            # joint sums are large: those of a few objects are reduced before the next are made
+            n_z, n_galaxy, _ = self.engine.galaxy.shape
+            size = dict(zip("zgkf", (n_z, n_galaxy, self.engine.agn.shape[1], 0), strict=True))
+            size["f"] = self.engine.frac.size
+            step = max(1, _JOINT_SIZE // sum(size[name[0]] * size[name[1]] for name in joint))
+            options = {"joint": joint, "workspace": self.engine.workspace(joint=joint)}
+        parts = []
+        for rows in list(chunks(len(data), step)) or [slice(0, 0)]:
+            some = data[rows]
+            out = self.engine.fit(**_engine_input(some, log_prior[rows]), **options)
+            parts.append(self._results(some, out, pairs))
+        return FitResults.concatenate(parts)
+
+    def _results(self, data, out, pairs):
+        """From models to parameters and derived quantities."""
+        flags = np.array(data.flags)
+        if self.compat == "cigale":
+            vanished = out.chi2 > VANISHING_CHI2
+            flags[vanished] |= int(FitFlags.NO_LIKELIHOOD)
+            _forget(out, vanished)
+        axes = self.priors.axes
+        pdf = {"redshift": out.zf.sum(axis=2)}
+        for name, axis in axes.items():
+            if axis.kind == "frac_agn":
+                pdf[name] = out.zf.sum(axis=1)
+            elif axis.kind in ("galaxy", "agn"):
+                models = out.galaxy if axis.kind == "galaxy" else out.agn
+                # not a matrix product, whose last digits depend on how many rows there are
+                pdf[name] = np.einsum("ng,vg->nv", models, axis.share)
+        moments, quantiles = self.quantities.summarise(out)
+        names, units, texts, intensive = self._derived
+        if self.fraction is not None:
+            share = np.column_stack([out.share, np.full(len(out.share), np.nan)])
+            moments = np.concatenate([moments, share[:, None]], axis=1)
+            quantiles = np.concatenate([quantiles, out.share_quantiles[:, None]], axis=1)
+        # limits are probabilities, which have no unit
+        log_sigma = np.log(np.where(data.measured, data.sigma, 1.0)).sum(axis=1)
+        log_sigma += 0.5 * data.measured.sum(axis=1) * np.log(2.0 * np.pi)
+        return FitResults(
+            ids=data.ids,
+            flags=flags,
+            n_bands=data.used.sum(axis=1),
+            chi2=out.chi2,
+            log_evidence=out.log_sum - log_sigma,
+            filters=self.filters,
+            flux=data.flux,
+            flux_err=data.flux_err,
+            sigma=data.sigma,
+            limit=data.limit,
+            axes={name: replace(axis, share=None) for name, axis in axes.items()},
+            pdf=pdf,
+            pdf_2d=out.zf,
+            pairs=joint_tables(out, pairs, axes),
+            best_index=out.index,
+            best_scale=out.best_scale,
+            best=self._best(out),
+            quantities=names,
+            units=units,
+            descriptions=texts,
+            intensive=intensive,
+            moments=moments,
+            quantiles=quantiles,
+            model_flux=out.band[:, 0],
+            model_flux_std=out.band[:, 1],
+            best_flux=self._best_flux(out),
+            constants=self.constants,
+            least_std=CIGALE_LEAST_STD if self.compat == "cigale" else 0.0,
+        )
+
+    @property
+    def _derived(self):
+        """Derived quantities, the other AGN fraction the last: names, units, texts, intensive."""
+        known, other = self.quantities, self.fraction
+        names, units, texts = known.names, known.units, known.descriptions
+        if other is None:
+            return names, units, texts, known.shape.names
+        units, texts = (*units, u.dimensionless_unscaled), (*texts, other.description)
+        return (*names, other.name), units, texts, (*known.shape.names, other.name)
+
+    def _best_flux(self, out):
+        """Fluxes of the best models in uJy, shape (n, nb)."""
+        ok = np.isfinite(out.chi2)
+        flux = np.full((ok.size, len(self.filters)), np.nan)
+        if np.any(ok):
+            z, g, k, f = out.index[ok].T
+            flux[ok] = out.best_scale[ok, None] * self.grid.flux(z, g, np.maximum(k, 0), f)
+        return flux
+
+    def _best(self, out):
+        """Parameters and derived quantities of the best models: name to array."""
+        grid = self.grid
+        ok = np.isfinite(out.chi2)
+        z, g, k, f = np.where(ok[:, None], out.index, 0).T
+        frac = grid.frac_agn[f]
+        best = {}
+        for name, axis in self.priors.axes.items():
+            if axis.kind == "redshift":
+                values = grid.redshift[z]
+            elif axis.kind == "frac_agn":
+                values = frac
+            elif axis.kind == "galaxy":
+                values = _plain(grid.galaxy_parameters[name])[g]
+            else:
+                # without AGN light there is no template
+                values = np.where(frac > 0, _plain(grid.agn_parameters[name])[k], np.nan)
+            best[name] = np.where(ok, values, np.nan)
+        scale = np.where(ok, out.best_scale, np.nan)
+        derived = self.quantities.best(grid, g, k, frac, scale)
+        for i, name in enumerate(self.quantities.names):
+            best[name] = np.broadcast_to(derived[i], (ok.size,))
+        if self.fraction is not None:
+            values = self.fraction.evaluate(g, k, frac)
+            best[self.fraction.name] = np.where(ok, values, np.nan)
+        return best
+
+    # ----------------------------------------------------------------------- draws
+
+    def sample(self, data, log_prior, n_draws, seed, **parallel):
+        """
+        Draw models from the posteriors of objects.
+
+        Parameters
+        ----------
+        data : `~miricigale.fitting.likelihood.FitData`
+            Photometry and flags.
+        log_prior : `~numpy.ndarray`, shape (n, nz)
+            From `redshifts`.
+        n_draws, seed : int
+            As for `~miricigale.fitting.BayesFitter.sample`.
+        **parallel
+            Passed to `~miricigale.utils.parallel.parallel_map`.
+
+        Returns
+        -------
+        samples : `~miricigale.fitting.Samples`
+        """
+        keys = [stream(seed, "fit", "draws", str(key)).integers(2**63) for key in data.ids]
+        keys = np.array(keys, dtype=np.int64)
+        pieces = [
+            (data[rows], log_prior[rows], keys[rows])
+            for rows in list(chunks(len(data), 16)) or [slice(0, 0)]
+        ]
+        task = partial(_draw_piece, self.engine, n_draws)
+        parts = parallel_map(task, pieces, desc="draws", **parallel)
+        index, scale = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+        flags = np.array(data.flags)
+        unfitted = ~np.isfinite(scale).all(axis=1) & ((flags & int(FitFlags.UNFITTED)) == 0)
+        flags[unfitted] |= int(FitFlags.NO_SIGNAL)
+        axes = self.priors.axes
+        return Samples(self.grid, data.ids, flags, index, scale, axes=axes, seed=seed)
+
+
+def _draw_piece(engine, n_draws, piece):
+    data, log_prior, seeds = piece
+    return engine.draw(n_draws=n_draws, seeds=seeds, **_engine_input(data, log_prior))
+
+
+def _engine_input(data, log_prior):
+    """Keywords of `GridEngine.fit` for photometry and priors of redshift."""
+    flux, measured, limit = np.nan_to_num(data.flux), data.measured, data.limit
+    signal = np.divide(flux, data.sigma, out=np.zeros(flux.shape), where=measured)
+    # the engine compares directions, of which zeros have none. Just below zero the best scale
+    # of every model is 0 as well, and chi2 is larger by 1e-16 a band
+    dark = measured & (np.sum(signal * signal, axis=1) < _NO_SIGNAL)[:, None]
+    flux = np.where(dark, -_DARK * data.sigma, flux)
+    out = {"flux": flux, "sigma": np.where(limit, np.inf, data.sigma), "log_prior": log_prior}
+    if np.any(limit):
+        out |= {"limit": flux, "limit_sigma": np.where(limit, data.sigma, np.inf)}
+    return out
+
+
+def _forget(out, rows):
+    """Leave nothing of these objects, in place."""
+    sums = (out.chi2, out.log_sum, out.best_scale, out.zf, out.galaxy, out.agn, out.band)
+    derived = (out.moments, out.quantiles, out.share, out.share_quantiles)
+    for array in (*sums, *derived, *out.joint.values()):
+        array[rows] = np.nan
+    out.index[rows] = -1
+
+
+def _plain(column):
+    return np.asarray(getattr(column, "value", column), dtype=float)

@@ -1,0 +1,190 @@
+"""Frozen classes that hold a row for each object of a catalogue: slices, rows by id, joins."""
+
+from dataclasses import fields
+from functools import cached_property
+from typing import Annotated
+
+import numpy as np
+
+from miricigale.utils.exceptions import argument_error
+
+__all__ = ["ObjectRows", "PerObject", "PerObjectDict"]
+
+
+#: Types of fields: an array whose first axis is the objects, and a dict of such.
+PerObject = Annotated[np.ndarray, "per object"]
+PerObjectDict = Annotated[dict, "per object"]
+
+
+def _frozen(array):
+    array = np.array(array, order="C", subok=True)
+    array.flags.writeable = False
+    return array
+
+
+class ObjectRows:
+    """
+    Base of frozen dataclasses with a row for each object of a catalogue, and its ``ids``.
+
+    Fields of the types `PerObject` and `PerObjectDict` are read-only arrays, dicts of such, or None.
+    Indexing gives the same class:
+
+    - ``results[id]``, one number or text: the object of this id (the first, if it occurs twice),
+      whose arrays have no first axis, as an element of a `~astropy.coordinates.SkyCoord` has none;
+    - ``results[rows]``, a slice, a list or an array of row numbers or of truth values: these rows.
+    """
+
+    def __post_init__(self):
+        for name, value in self._per_object():
+            if isinstance(value, dict):
+                value = {key: _frozen(array) for key, array in value.items()}
+            elif value is not None:
+                value = _frozen(value)
+            object.__setattr__(self, name, value)
+
+    def _per_object(self):
+        for item in fields(self):
+            if item.type in (PerObject, PerObjectDict):
+                yield item.name, getattr(self, item.name)
+
+    @property
+    def isscalar(self):
+        """Whether this is a single object, whose arrays have no axis of objects."""
+        return np.ndim(self.ids) == 0
+
+    def __len__(self):
+        if self.isscalar:
+            msg = f"a {type(self).__name__} of a single object has no len()"
+            raise TypeError(msg)
+        return len(self.ids)
+
+    def __bool__(self):
+        return self.isscalar or len(self) > 0
+
+    def __iter__(self):
+        return (self._take(row) for row in range(len(self)))
+
+    def __getitem__(self, key):
+        if self.isscalar:
+            msg = f"a {type(self).__name__} of a single object cannot be indexed"
+            raise TypeError(msg)
+        if isinstance(key, (slice, list)) or (isinstance(key, np.ndarray) and key.ndim):
+            rows = key if isinstance(key, slice) else np.asarray(key)
+            if isinstance(rows, np.ndarray) and rows.size == 0 and rows.dtype != bool:
+                rows = rows.astype(np.intp)
+            return self._take(rows)
+        return self._take(self.row(key))
+
+    def _take(self, rows):
+        """Copy with these rows of every array; with a row number, a single object."""
+        new = object.__new__(type(self))
+        values = dict(self.__dict__)
+        # what was computed from all rows
+        for name in [n for n in values if n not in self.__dataclass_fields__]:
+            del values[name]
+        for name, value in self._per_object():
+            if isinstance(value, dict):
+                values[name] = {key: _rows(array, rows) for key, array in value.items()}
+            elif value is not None:
+                values[name] = _rows(value, rows)
+        new.__dict__.update(values)
+        return new
+
+    def _changed(self, **changes):
+        """Copy with other values of some fields, which are not checked; arrays are made read-only."""
+        new = self._take(slice(None)) if not self.isscalar else self._take(())
+        for name, value in changes.items():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+            new.__dict__[name] = value
+        return new
+
+    def _several(self):
+        """This, with an axis of objects where it is a single one."""
+        if not self.isscalar:
+            return self
+        new = self._take(())
+        for name, value in new._per_object():
+            if isinstance(value, dict):
+                value = {key: array[None] for key, array in value.items()}
+            elif value is not None:
+                value = np.asanyarray(value)[None]
+            new.__dict__[name] = value
+        return new
+
+    @cached_property
+    def _row_of_id(self):
+        rows = {}
+        for row, key in enumerate(self.ids.tolist()):
+            rows.setdefault(key, row)
+        return rows
+
+    def row(self, key):
+        """
+        Row of an id (the first, if it occurs twice).
+
+        Raises
+        ------
+        KeyError
+            If there is none.
+        """
+        key = key.item() if isinstance(key, np.generic) else key
+        try:
+            return self._row_of_id[key]
+        except (KeyError, TypeError):
+            some = ", ".join(map(repr, list(self._row_of_id)[:5]))
+            msg = f"no object with the id {key!r} among {len(self)}; the first are {some}"
+            raise KeyError(msg) from None
+
+    @classmethod
+    def concatenate(cls, parts):
+        """
+        Join the rows of several; all else is that of the first.
+
+        Parameters
+        ----------
+        parts : iterable
+            Of this class, with the same fields of arrays, at least one.
+
+        Returns
+        -------
+        joined : object
+            Of this class.
+
+        Raises
+        ------
+        ValueError
+            If there is none, or their arrays differ in names or shapes.
+        """
+        parts = [part._several() for part in parts]
+        if not parts:
+            raise argument_error("parts", f"at least one {cls.__name__}", "none")
+        new = parts[0]._take(slice(0))
+        for name, value in parts[0]._per_object():
+            values = [getattr(part, name) for part in parts]
+            if isinstance(value, dict):
+                if any(one.keys() != value.keys() for one in values):
+                    raise argument_error("parts", f"with the same {name!r}", "others")
+                joined = {k: _joined([one[k] for one in values], name) for k in value}
+            elif any((one is None) != (value is None) for one in values):
+                raise argument_error("parts", f"all with {name!r} or all without", "some")
+            else:
+                joined = None if value is None else _joined(values, name)
+            new.__dict__[name] = joined
+        return new
+
+
+def _rows(array, rows):
+    """Rows of an array, read-only."""
+    array = np.asanyarray(array)[rows]
+    if isinstance(array, np.ndarray) and array.ndim:
+        array.flags.writeable = False
+    return array
+
+
+def _joined(arrays, name):
+    if len({array.shape[1:] for array in arrays}) > 1:
+        raise argument_error("parts", f"with arrays {name!r} of one shape", "several")
+    array = np.concatenate(arrays)
+    array.flags.writeable = False
+    return array
