@@ -11,14 +11,6 @@ from miricigale.utils.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        "cigale": (
-            "CigaleSetup",
-            "fit_cigale",
-            "read_cigale_catalog",
-            "read_cigale_results",
-            "read_pcigale_ini",
-            "write_cigale_results",
-        ),
         "checks": ("LeaveOutResult", "MockResult", "leave_out", "mock_analysis"),
         "fitter": ("BayesFitter",),
         "flags": ("FitFlags",),

@@ -6,11 +6,11 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable, Table
 
-from miricigale.fitting.cigale.bands import cigale_band, filter_of_band
-from miricigale.fitting.cigale.catalog import read_table
-from miricigale.fitting.cigale.names import cigale_names, unit_of
+from miricigale.cigale.catalog import read_table
+from miricigale.cigale.names import cigale_band, cigale_names, filter_of_band, unit_of
 from miricigale.utils.exceptions import DataError, argument_error, unknown_name
-from miricigale.utils.files import writing
+from miricigale.utils.store import replacing
+from miricigale.utils.tables import error_column
 
 __all__ = ["read_cigale_results", "write_cigale_results"]
 
@@ -56,10 +56,6 @@ def write_cigale_results(
     parameters that have one value; ``best.<band>``. Units are CIGALE's: Myr, Msun, Msun/yr, W,
     mag, nm, deg, mJy.
     """
-    path = Path(path)
-    if path.exists() and not overwrite:
-        msg = f"{path} is there; overwrite=True replaces it"
-        raise OSError(msg)
     note = results.meta.get("cigale", {})
     modules = note.get("modules", {}) if modules is None else modules
     bands = {**note.get("bands", {}), **(bands or {})}
@@ -73,20 +69,20 @@ def write_cigale_results(
     written = {name: bands.get(name, cigale_band(name)) for name in results.filters}
     if len(set(written.values())) < len(written):
         raise argument_error("bands", "a different name for each filter", f"{written}")
-    for i, band in enumerate(written.values()):
-        table[f"bayes.{band}"] = (results.model_flux[:, i] * u.uJy).to(u.mJy)
-        table[f"bayes.{band}_err"] = (results.model_flux_std[:, i] * u.uJy).to(u.mJy)
+    fluxes = results.predict()
+    for name, band in written.items():
+        table[f"bayes.{band}"] = fluxes[name].to(u.mJy)
+        table[f"bayes.{band}_err"] = fluxes[error_column(name)].to(u.mJy)
     table[_CHI2[0]] = np.array(results.chi2)
     table[_CHI2[1]] = np.array(results.reduced_chi2)
     for name, (_, _, best, unit) in columns.items():
         table[f"best.{name}"] = u.Quantity(best, unit)
-    for i, band in enumerate(written.values()):
-        table[f"best.{band}"] = (results.best_flux[:, i] * u.uJy).to(u.mJy)
-    with writing(path):
-        if path.suffix.lower() == ".txt":
-            table.write(path, format="ascii.fixed_width", delimiter=None, overwrite=overwrite)
-        else:
-            table.write(path, format="fits", overwrite=overwrite)
+    for name, band in written.items():
+        table[f"best.{band}"] = fluxes[f"{name}_best"].to(u.mJy)
+    text = Path(path).suffix.lower() == ".txt"
+    form = {"format": "ascii.fixed_width", "delimiter": None} if text else {"format": "fits"}
+    with replacing(path, overwrite=overwrite) as partial:
+        table.write(partial, **form)
 
 
 def _columns(results, names, variables):

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
-from miricigale.fitting import CigaleSetup, FitFlags, fit_cigale, read_cigale_results
-from miricigale.fitting import read_pcigale_ini as read
-from miricigale.fitting.cigale.ini import parse_ini, parse_values
+from miricigale.cigale import CigaleSetup, fit_cigale, read_cigale_results
+from miricigale.cigale import read_pcigale_ini as read
+from miricigale.cigale.ini import parse_ini, parse_values
+from miricigale.fitting import FitFlags
 from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarning
 
 INI = """\
@@ -111,13 +112,37 @@ def quiet(path, **options):
 
 
 def test_the_dialect_is_that_of_configobj(tmp_path):
-    reference = pytest.importorskip("astropy.extern.configobj.configobj").ConfigObj
-    lines = ["[a]", "  list = 1, 'b, c' , \"d # e\" # f", "  one = 2,", "  none = ", "[[b]]"]
-    lines += ['x = "eval np.linspace(0, 1, 3)"', "[[c]]", "y = B_B90 & V_B90", "[d]", "z=3=4"]
+    lines = ["sed_modules = 'bc03',", "[sed_modules_params]", "[[a]]", "  one = 2,", "  none = "]
+    lines += ["  list = 1, 'b, c' , \"d # e\" # f", '  x = "eval np.linspace(0, 1, 3)"']
+    lines += ["  y = B_B90 & V_B90", "  z=3=4", "  [[[b]]]", "  open = %(home)s"]
     path = tmp_path / "a.ini"
     path.write_text("\n".join(lines))
-    assert parse_ini(path) == reference(str(path)).dict()
-    assert parse_ini(write(tmp_path)) == reference(str(write(tmp_path))).dict()
+    found = parse_ini(path)
+    assert found["sed_modules"] == ["bc03"]
+    assert found["sed_modules_params"]["a"] == {
+        "one": ["2"],
+        "none": "",
+        "list": ["1", "b, c", "d # e"],
+        "x": "eval np.linspace(0, 1, 3)",
+        "y": "B_B90 & V_B90",
+        "z": "3=4",
+        "b": {"open": "%(home)s"},
+    }
+
+
+def test_settings_have_their_types(tmp_path):
+    found = parse_ini(write(tmp_path))
+    assert (found["cores"], found["additionalerror"]) == (2, 0.05)
+    assert found["bands"][:2] == ["hst.wfc3.F160W", "hst.wfc3.F160W_err"]
+    assert found["properties"] == []
+    analysis = found["analysis_params"]
+    assert (analysis["mock_flag"], analysis["redshift_decimals"]) == (True, 1)
+    assert analysis["bands"] == ["jwst.miri.F2100W"]
+
+
+def test_an_expression_needs_no_quotes():
+    parted = ["eval np.append(np.linspace(0", "0.8", "3)", "0.99)"]
+    np.testing.assert_allclose(parse_values(parted, "x"), [0, 0.4, 0.8, 0.99])
 
 
 @pytest.mark.parametrize(
@@ -175,13 +200,15 @@ def test_nothing_else_is_evaluated(text):
 @pytest.mark.parametrize(
     ("content", "wanted"),
     [
-        ("a = 1\nb\n", "line 2: neither"),
-        ("a = 1\na = 2\n", "line 2: 'a' is there twice"),
-        ("[[b]]\n", "line 1: section 'b' is nested too deep"),
-        ("[b]\n[b]\n", "line 2: section 'b' is there twice"),
-        ("[b\n", "line 1: .* is no section"),
-        ('a = "b\n', "line 1: the quote"),
-        ('a = """b\n', "triple quotes"),
+        ("a = 1\nb\n", "neither section nor keyword.* line 2"),
+        ("a = 1\na = 2\n", "Duplicate keyword name at line 2"),
+        ("[[b]]\n", "nested at line 1"),
+        ("[b]\n[b]\n", "Duplicate section name at line 2"),
+        ("[b\n", "line 1"),
+        ('a = "b\n', "line 1"),
+        ('a = """b\n', "line 1"),
+        ("analysis_params = 1\nsed_modules = a\n[sed_modules_params]\n", "no configuration"),
+        (b"a = \xff\n".decode("latin1"), "no sed_modules"),
         ("a = 1\n", "no sed_modules"),
     ],
 )

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 from astropy.table import QTable, Table
 
+from miricigale.cigale import cigale_band, filter_of_band, read_cigale_catalog
 from miricigale.filters import Filter
-from miricigale.fitting import read_cigale_catalog
-from miricigale.fitting.cigale import cigale_band, filter_of_band
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 
 TEXT = """\

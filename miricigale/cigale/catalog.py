@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable, Table
 
-from miricigale.fitting.cigale.bands import filter_of_band, is_line
+from miricigale.cigale.names import band_filters, filter_of_band, is_line
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 from miricigale.utils.files import unpacked_size
 from miricigale.utils.tables import error_column
@@ -71,14 +71,26 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     Missing is a flux or error that is NaN, masked, -99, -999 or below -9990, and an error of 0.
     """
     path = Path(path)
+    bands = None if bands is None else list(bands)
     table = read_table(path, "a catalogue of CIGALE")
     for name in ("id", "redshift"):
         if name not in table.colnames:
             msg = f"{path} has no column {name!r}, only {', '.join(table.colnames)}"
             raise DataError(msg)
-    chosen, with_error = _choose(path, table, bands)
-    filters, left_out = _filters(path, table, chosen, names or {})
-    other = [] if bands is not None else _others(table, chosen)
+    chosen = _choose(path, table, bands)
+    with_error = {error_column(name) for name in chosen}.intersection(bands or table.colnames)
+    lines = [name for name in chosen if _is_flux_of_line(table[name])]
+    try:
+        filters, lost = band_filters([name for name in chosen if name not in lines], names or {})
+    except ValueError as err:
+        msg = f"{path}: {err}"
+        raise DataError(msg) from None
+    if not filters:
+        msg = f"{path} has no band that is known here, of {', '.join(chosen) or 'none'}"
+        raise DataError(msg)
+    left_out = [*lost, *(f"{name} (line)" for name in lines)]
+    own = {*_OWN, *chosen, *map(error_column, chosen)}
+    other = [] if bands is not None else [name for name in table.colnames if name not in own]
     out = QTable()
     out["id"] = np.array(table["id"])
     redshift = _numbers(path, table, "redshift")
@@ -86,10 +98,10 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     if "distance" in table.colnames:
         out["distance"] = _with_unit(path, table, "distance", u.Mpc)
     no_error = []
-    for band, name in filters.items():
+    for name, band in filters.items():
         flux = _missing(_with_unit(path, table, band, u.mJy).to_value(FNU), 1e3)
         column = error_column(band)
-        if band in with_error:
+        if column in with_error:
             error = _missing(_with_unit(path, table, column, u.mJy).to_value(FNU), 1e3)
         else:
             error = DEFAULT_ERROR * np.abs(flux)
@@ -98,75 +110,44 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
         out[name].info.description = band
     out.meta["cigale"] = {
         "file": path.name,
-        "bands": {name: band for band, name in filters.items()},
+        "bands": filters,
         "default_error": no_error,
         "left_out": left_out + other,
     }
-    _tell(path, left_out, other, no_error, strict)
+    told = {
+        "left out, no filter here": left_out,
+        "left out, no bands": other,
+        "10 % of the flux taken for the error": no_error,
+    }
+    text = "; ".join(f"{what}: {', '.join(which)}" for what, which in told.items() if which)
+    if strict and left_out:
+        msg = f"{path}: {text}"
+        raise DataError(msg)
+    if text:
+        warnings.warn(f"{path}: {text}", MiricigaleWarning, stacklevel=2)
     return out
 
 
-def _tell(path, left_out, other, no_error, strict):
-    parts = []
-    if left_out:
-        parts.append(f"left out, no filter here: {', '.join(left_out)}")
-    if other:
-        parts.append(f"left out, no bands: {', '.join(other)}")
-    if strict and left_out:
-        msg = f"{path}: {'; '.join(parts)}"
-        raise DataError(msg)
-    if no_error:
-        parts.append(f"10 % of the flux taken for the error: {', '.join(no_error)}")
-    if parts:
-        msg = f"{path}: {'; '.join(parts)}"
-        warnings.warn(msg, MiricigaleWarning, stacklevel=3)
-
-
 def _choose(path, table, bands):
-    """Bands to read, and those of them that have errors."""
-    have = set(table.colnames)
+    """Bands to read."""
     if bands is None:
-        chosen = [
+        return [
             name
             for name in table.colnames
             if name not in _OWN
             and not name.endswith("_err")
-            and (error_column(name) in have or filter_of_band(name) or is_line(name))
+            and (error_column(name) in table.colnames or filter_of_band(name) or is_line(name))
         ]
-        return chosen, {name for name in chosen if error_column(name) in have}
-    bands = list(bands)
-    lost = [name for name in bands if name not in have]
+    lost = [name for name in bands if name not in table.colnames]
     if lost:
         msg = f"{path} has no column {', '.join(lost)}; it has {', '.join(table.colnames)}"
         raise DataError(msg)
-    chosen = [name for name in dict.fromkeys(bands) if not name.endswith("_err")]
-    return chosen, {name for name in chosen if error_column(name) in bands}
+    return [name for name in dict.fromkeys(bands) if not name.endswith("_err")]
 
 
-def _others(table, chosen):
-    """Columns that are neither bands nor their errors."""
-    known = {*_OWN, *chosen, *map(error_column, chosen)}
-    return [name for name in table.colnames if name not in known]
-
-
-def _filters(path, table, chosen, names):
-    filters, left_out = {}, []
-    for band in chosen:
-        unit = table[band].unit
-        line = is_line(band) or (unit is not None and unit.is_equivalent(u.W / u.m**2))
-        name = None if line else names.get(band, filter_of_band(band))
-        if name is None:
-            left_out.append(f"{band} (line)" if line else band)
-            continue
-        twin = next((b for b, n in filters.items() if n == name), None)
-        if twin is not None:
-            msg = f"{path}: the bands {twin} and {band} are both the filter {name}"
-            raise DataError(msg)
-        filters[band] = name
-    if not filters:
-        msg = f"{path} has no band that is known here, of {', '.join(chosen) or 'none'}"
-        raise DataError(msg)
-    return filters, left_out
+def _is_flux_of_line(column):
+    unit = column.unit
+    return is_line(column.name) or (unit is not None and unit.is_equivalent(u.W / u.m**2))
 
 
 def _missing(values, factor):

@@ -1,26 +1,30 @@
-"""A run of CIGALE as a model, a grid and a fit here."""
+"""A run of CIGALE: read from ``pcigale.ini``, as a model, a grid and a fit here."""
 
 import dataclasses
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from miricigale.fitting.cigale.catalog import read_cigale_catalog
-from miricigale.fitting.cigale.results import write_cigale_results
-from miricigale.fitting.fitter import BayesFitter
+from miricigale.cigale.catalog import read_cigale_catalog
+from miricigale.cigale.ini import LIMIT_FLAGS, parse_ini
+from miricigale.cigale.modules import read_modules
+from miricigale.cigale.names import band_filters, cigale_names
+from miricigale.cigale.results import write_cigale_results
+from miricigale.fitting import BayesFitter
 from miricigale.sed import SEDModel
-from miricigale.utils.exceptions import ConfigError, argument_error
-from miricigale.utils.tables import require_columns
+from miricigale.utils.exceptions import ConfigError, MiricigaleWarning, argument_error
+from miricigale.utils.tables import error_column, require_columns
 
-__all__ = ["CigaleSetup"]
+__all__ = ["CigaleSetup", "fit_cigale", "read_pcigale_ini"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CigaleSetup:
     """
-    A run of CIGALE in our terms; made by `~miricigale.fitting.read_pcigale_ini`.
+    A run of CIGALE in our terms; made by `read_pcigale_ini`.
 
     Parameters
     ----------
@@ -273,3 +277,140 @@ def _join(one, two, fixed):
     if isinstance(one, Mapping) and one and all(isinstance(x, np.ndarray) for x in one.values()):
         return {name: _join(one[name], two[name], fixed) for name in one}
     return two
+
+
+def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
+    """
+    Read the configuration of a run of CIGALE.
+
+    Parameters
+    ----------
+    path : path-like
+        ``pcigale.ini`` of CIGALE 2018 to 2022, with a grid of parameters for the analysis
+        ``pdf_analysis``.
+    libraries : {"best", "bundled"}, optional
+        Whether libraries that are registered (`miricigale.sed`) are used, or the bundled tables
+        alone.
+    names : dict of str to str, optional
+        Filters of bands that are not known, or otherwise known: CIGALE's name to ours.
+    strict : bool, optional
+        Whether anything that is left out or replaced is an error, not a warning.
+
+    Returns
+    -------
+    setup : `CigaleSetup`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file cannot be read.
+    `~miricigale.utils.exceptions.ConfigError`
+        If a value cannot be read, nothing can be fitted, or with ``strict``, something would be
+        left out or replaced.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        Of all that is left out, replaced or different, in one message.
+    """
+    path = Path(path)
+    if libraries not in ("best", "bundled"):
+        raise argument_error("libraries", "'best' or 'bundled'", repr(libraries))
+    config = parse_ini(path)
+    analysis = config["analysis_params"]
+    if config["parameters_file"]:
+        msg = f"{path}: lists of models (parameters_file) are not read, grids are"
+        raise ConfigError(msg)
+    try:
+        chain = read_modules(
+            config["sed_modules"],
+            config["sed_modules_params"],
+            folder=path.parent,
+            libraries=libraries,
+        )
+        names = dict(names or {})
+        columns = config["bands"]
+        bands, lost = band_filters(dict.fromkeys(c.removesuffix("_err") for c in columns), names)
+        wanted = [band for band in analysis["bands"] if band not in bands.values()]
+        predicted, _ = band_filters(dict.fromkeys(wanted), names)
+    except (ConfigError, ValueError) as err:
+        msg = f"{path}: {err}"
+        raise ConfigError(msg) from err
+    if not bands:
+        msg = f"{path}: no band is known here, of {', '.join(lost) or 'none'}"
+        raise ConfigError(msg)
+    for band in bands.values():
+        if band not in columns:
+            msg = f"{path}: {error_column(band)} is among the bands, and {band} is not"
+            raise ConfigError(msg)
+    known = {theirs for theirs, *_ in cigale_names(chain.modules).values()}
+    variables = analysis["variables"]
+    chain.left_out[:] = [
+        *(f"module {x}" if "." not in x and " " not in x else x for x in chain.left_out),
+        *(f"band {x}" for x in lost),
+        *(f"variable {x}" for x in variables if x not in known),
+        *(f"property {x}" for x in config["properties"] if not x.endswith("_err")),
+    ]
+    flag = analysis["lim_flag"]
+    if flag == "noscaling":
+        chain.differs.append("lim_flag noscaling: upper limits act on the scale too, as with full")
+    setup = CigaleSetup(
+        path=path,
+        data_file=path.parent / config["data_file"] if config["data_file"] else None,
+        bands=bands,
+        predicted={name: band for name, band in predicted.items() if name not in bands},
+        columns=tuple(c for c in columns if c.removesuffix("_err") in bands.values()),
+        variables=tuple(name for name in variables if name in known),
+        additional_error=config["additionalerror"],
+        limits=LIMIT_FLAGS[flag] != "none",
+        redshift_decimals=analysis["redshift_decimals"],
+        mock=analysis["mock_flag"],
+        cores=config["cores"],
+        names=names,
+        **{k: tuple(v) if isinstance(v, list) else v for k, v in vars(chain).items()},
+    )
+    text = setup.describe()
+    if strict and (setup.left_out or setup.replaced):
+        msg = f"{path}:\n{text}"
+        raise ConfigError(msg)
+    if text:
+        warnings.warn(f"{path}:\n{text}", MiricigaleWarning, stacklevel=2)
+    return setup
+
+
+def fit_cigale(ini, *, output=None, libraries="best", names=None, strict=False, **options):
+    """
+    Do what a run of CIGALE does: read configuration and catalogue, fit, write.
+
+    Parameters
+    ----------
+    ini : path-like or `CigaleSetup`
+        ``pcigale.ini``, or what `read_pcigale_ini` made of it.
+    output : path-like, optional
+        File of results in CIGALE's columns (``results.fits`` or ``.txt``), replaced if it is
+        there.
+    libraries, names, strict : optional
+        As for `read_pcigale_ini`; no use for a `CigaleSetup`.
+    **options
+        Passed to `CigaleSetup.fit`.
+
+    Returns
+    -------
+    results : `~miricigale.fitting.FitResults`
+
+    Examples
+    --------
+    >>> from miricigale.cigale import fit_cigale
+    >>> results = fit_cigale("pcigale.ini", output="results.fits")  # doctest: +SKIP
+    """
+    setup = ini
+    if not isinstance(ini, CigaleSetup):
+        setup = read_pcigale_ini(ini, libraries=libraries, names=names, strict=strict)
+    photometry = setup.catalog(strict=strict)
+    if "distance" in photometry.colnames and np.any(np.isfinite(photometry["distance"])):
+        msg = f"{setup.data_file}: distances are not used, those of the redshifts are"
+        warnings.warn(msg, MiricigaleWarning, stacklevel=2)
+    results = setup.fit(photometry, **options)
+    if output is not None:
+        setup.write_results(results, output, overwrite=True)
+    return results

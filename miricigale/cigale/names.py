@@ -1,12 +1,21 @@
-"""Names of bands: CIGALE's, old and new, and the filters that they stand for here."""
+"""Names of bands and of physical quantities: CIGALE's, old and new, for ours."""
 
 import re
 from functools import cache
 
+import astropy.units as u
+
 from miricigale.filters import Filter
 from miricigale.filters.library import SEDPY, curve_folder
 
-__all__ = ["cigale_band", "filter_of_band", "is_line"]
+__all__ = [
+    "band_filters",
+    "cigale_band",
+    "cigale_names",
+    "filter_of_band",
+    "is_line",
+    "unit_of",
+]
 
 #: Names without a rule: CIGALE's to ours.
 _NAMES = {
@@ -152,3 +161,138 @@ def cigale_band(name):
 def is_line(band):
     """Whether a band is an emission line, in W/m2."""
     return band.startswith(("line.", "linefilter."))
+
+
+def band_filters(bands, known):
+    """
+    Filters of bands.
+
+    Parameters
+    ----------
+    bands : iterable of str
+        CIGALE's names.
+    known : dict of str to str
+        Filters that the user gave for bands.
+
+    Returns
+    -------
+    filters : dict of str to str
+        Our name to CIGALE's.
+    lost : list of str
+        Bands without a filter here, emission lines among them.
+
+    Raises
+    ------
+    ValueError
+        If two bands are the same filter.
+    """
+    filters, lost = {}, []
+    for band in bands:
+        name = None if is_line(band) else known.get(band, filter_of_band(band))
+        if name is None:
+            lost.append(band)
+        elif name in filters:
+            msg = f"the bands {filters[name]} and {band} are both the filter {name}"
+            raise ValueError(msg)
+        else:
+            filters[name] = band
+    return filters, lost
+
+
+# our name, CIGALE's, CIGALE's unit
+_PARAMETERS = (
+    ("redshift", "universe.redshift", ""),
+    ("frac_agn", "agn.fracAGN", ""),
+    ("tau97", "agn.t", ""),
+    ("p", "agn.pl", ""),
+    ("q", "agn.q", ""),
+    ("opening_angle", "agn.oa", "deg"),
+    ("radius_ratio", "agn.R", ""),
+    ("inclination", "agn.i", "deg"),
+    ("disk_slope", "agn.delta", ""),
+    ("ebv_polar", "agn.EBV", "mag"),
+    ("temperature_polar", "agn.temperature", "K"),
+    ("emissivity_polar", "agn.emissivity", ""),
+    ("alpha", "dust.alpha", ""),
+    ("temperature_dust", "dust.temperature", "K"),
+    ("emissivity_dust", "dust.beta", ""),
+    ("alpha_mir", "dust.alpha", ""),
+    ("u_min", "dust.umin", ""),
+    ("q_pah", "dust.qpah", ""),
+    ("gamma", "dust.gamma", ""),
+    ("tau", "sfh.tau_main", "Myr"),
+    ("age", "sfh.age_main", "Myr"),
+    ("f_burst", "sfh.f_burst", ""),
+    ("age_burst", "sfh.age_burst", "Myr"),
+    ("tau_burst", "sfh.tau_burst", "Myr"),
+    ("metallicity", "stellar.metallicity", ""),
+    ("separation_age", "stellar.old_young_separation_age", "Myr"),
+    ("log_u", "nebular.logU", ""),
+    ("metallicity_gas", "nebular.zgas", ""),
+    ("f_esc", "nebular.f_esc", ""),
+    ("f_dust", "nebular.f_dust", ""),
+    ("ebv", "attenuation.E_BVs.stellar.young", "mag"),
+    ("ebv_lines", "attenuation.E_BV_lines", "mag"),
+    ("ebv_factor_stars", "attenuation.E_BV_factor", ""),
+    ("ebv_factor", "attenuation.ebvs_old_factor", ""),
+    ("slope", "attenuation.powerlaw_slope", ""),
+    ("uv_bump", "attenuation.uv_bump_amplitude", ""),
+    ("uv_bump_wavelength", "attenuation.uv_bump_wavelength", "nm"),
+    ("uv_bump_width", "attenuation.uv_bump_width", "nm"),
+    ("av_ism", "attenuation.Av_ISM", "mag"),
+    ("mu", "attenuation.mu", ""),
+    ("slope_ism", "attenuation.slope_ISM", ""),
+    ("slope_bc", "attenuation.slope_BC", ""),
+    ("stellar_mass", "stellar.m_star", "solMass"),
+    ("mass", "sfh.integrated", "solMass"),
+    ("sfr", "sfh.sfr", "solMass / yr"),
+    ("sfr_10myr", "sfh.sfr10Myrs", "solMass / yr"),
+    ("sfr_100myr", "sfh.sfr100Myrs", "solMass / yr"),
+    ("dust_luminosity", "dust.luminosity", "W"),
+    ("agn_power", "agn.total_dust_luminosity", "W"),
+    ("agn_luminosity", "agn.luminosity", "W"),
+    ("accretion_power", "agn.accretion_power", "W"),
+)
+#: Our units where they are not CIGALE's.
+_OURS = {
+    **dict.fromkeys(("tau", "age", "age_burst", "tau_burst"), u.Gyr),
+    **dict.fromkeys(("uv_bump_wavelength", "uv_bump_width"), u.um),
+}
+#: Names that depend on the module.
+_OF_MODULE = {
+    "sfh2exp": {"age": "sfh.age", "age_burst": "sfh.burst_age"},
+    "sfhfromfile": {"age": "sfh.age"},
+}
+
+
+def cigale_names(modules=None):
+    """
+    CIGALE's names of what we have.
+
+    Parameters
+    ----------
+    modules : dict of str to str, optional
+        Role of a component to CIGALE's module, on which some names depend.
+
+    Returns
+    -------
+    names : dict of str to tuple
+        Our name to CIGALE's name, its unit, and the factor to it from ours.
+    """
+    names = {}
+    for ours, theirs, unit in _PARAMETERS:
+        unit = u.Unit(unit)
+        names[ours] = (theirs, unit, _OURS.get(ours, unit).to(unit))
+    for module in (modules or {}).values():
+        for ours, theirs in _OF_MODULE.get(module, {}).items():
+            names[ours] = (theirs, *names[ours][1:])
+    return names
+
+
+def unit_of(name):
+    """Unit of a quantity of CIGALE's name; None if it is not known."""
+    for module in ("", *_OF_MODULE):
+        for theirs, unit, _ in cigale_names({"": module}).values():
+            if theirs == name:
+                return unit
+    return None

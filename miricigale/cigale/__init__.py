@@ -1,0 +1,13 @@
+"""Files of CIGALE (Boquien et al. 2019): catalogues, configurations and results."""
+
+from miricigale.utils.lazy import lazy_names
+
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "catalog": ("read_cigale_catalog",),
+        "names": ("cigale_band", "filter_of_band"),
+        "results": ("read_cigale_results", "write_cigale_results"),
+        "setup": ("CigaleSetup", "fit_cigale", "read_pcigale_ini"),
+    },
+)

@@ -1,0 +1,219 @@
+"""The text of ``pcigale.ini``: sections and values by configobj, ranges and expressions here."""
+
+import ast
+import math
+import operator
+from pathlib import Path
+
+import numpy as np
+
+from miricigale.utils.exceptions import ConfigError, DataError
+
+__all__ = ["parse_ini", "parse_values"]
+
+#: What the settings beside the modules are; empty ones count as not given.
+_SPEC = """\
+data_file = string(default="")
+parameters_file = string(default="")
+sed_modules = force_list
+bands = force_list(default=list())
+properties = force_list(default=list())
+additionalerror = float(min=0, default=0.1)
+cores = integer(default=1)
+[analysis_params]
+variables = force_list(default=list())
+bands = force_list(default=list())
+lim_flag = option({limits}, default=none)
+mock_flag = boolean(default=False)
+redshift_decimals = integer(default=2)
+"""
+#: Values of ``lim_flag``, those of older versions too.
+LIMIT_FLAGS = {
+    "full": "full",
+    "noscaling": "noscaling",
+    "none": "none",
+    **dict.fromkeys(("True", "true", "yes", "on", "1"), "full"),
+    **dict.fromkeys(("False", "false", "no", "off", "0"), "none"),
+}
+#: No parameter has more values than this.
+_MAX_VALUES = 100_000
+
+
+def parse_ini(path):
+    """
+    Read a configuration file of CIGALE.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    sections : dict
+        Key to value, section to dict, as deep as they are nested. Values of modules are a str, or
+        a list of str where commas part them; the others have the types of CIGALE's specification.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file is missing, cannot be parsed or is no configuration of CIGALE.
+    `~miricigale.utils.exceptions.ConfigError`
+        If a setting has a wrong type or value.
+    """
+    # by the library that writes these files, of which astropy carries a copy
+    from astropy.extern.configobj import configobj, validate
+
+    spec = _SPEC.format(limits=", ".join(LIMIT_FLAGS)).splitlines()
+    try:
+        if not Path(path).is_file():
+            msg = "no such file"
+            raise OSError(msg)
+        config = configobj.ConfigObj(
+            str(path), configspec=spec, encoding="utf-8", interpolation=False
+        )
+    except (OSError, UnicodeError, configobj.ConfigObjError) as err:
+        msg = f"{path} cannot be read as a configuration of CIGALE: {err}"
+        raise DataError(msg) from None
+    analysis = config.get("analysis_params", {})
+    if "sed_modules" not in config or not all(
+        isinstance(section, dict) for section in (config.get("sed_modules_params"), analysis)
+    ):
+        msg = f"{path} is no configuration of CIGALE: no sed_modules, or no [sed_modules_params]"
+        raise DataError(msg)
+    for section in (config, analysis):
+        for key in [key for key, value in section.items() if value == ""]:
+            del section[key]
+    found = config.validate(validate.Validator(), preserve_errors=True)
+    for sections, key, error in configobj.flatten_errors(config, found):
+        msg = f"{path}: {'.'.join([*sections, str(key)])}: {error or 'missing'}"
+        raise ConfigError(msg)
+    return config.dict()
+
+
+def parse_values(value, name):
+    """
+    Numbers of a parameter.
+
+    Parameters
+    ----------
+    value : str or list of str
+        Numbers; ``range start stop step``, which includes ``stop``; or ``eval`` and an
+        expression of numbers, lists and the functions of numpy in `FUNCTIONS`. Nothing is
+        executed: the expression is taken apart, and anything else in it is refused.
+    name : str
+        Name of the parameter, for messages.
+
+    Returns
+    -------
+    values : `~numpy.ndarray`, shape (n,)
+        Ascending.
+
+    Raises
+    ------
+    ValueError
+        If it is something else, or a value is there twice.
+    """
+    items = [value] if isinstance(value, str) else value
+    # an expression without quotes was parted at its commas
+    text = ", ".join(items)
+    try:
+        if text.startswith("eval "):
+            numbers = np.atleast_1d(_evaluate(text[5:].strip()))
+        elif text.startswith("range "):
+            start, stop, step = (float(x) for x in text[6:].split())
+            # both ends are included
+            numbers = _arange(start, stop + step, step)
+        else:
+            numbers = np.array([float(item) for item in items])
+        numbers = np.asarray(numbers, dtype=float)
+    except (ValueError, TypeError, ArithmeticError, SyntaxError, RecursionError) as err:
+        msg = f"{name} = {text} cannot be read as numbers: {err}"
+        raise ValueError(msg) from None
+    if numbers.ndim != 1 or not numbers.size or not np.all(np.isfinite(numbers)):
+        msg = f"{name} must be a list of finite numbers, got {value}"
+        raise ValueError(msg)
+    unique = np.unique(numbers)
+    if unique.size < numbers.size:
+        msg = f"{name} has a value twice: {value}"
+        raise ValueError(msg)
+    return unique
+
+
+def _arange(*args):
+    start, stop, step = {1: (0.0, *args, 1.0), 2: (*args, 1.0)}.get(len(args), args)
+    # one too many would come from rounding, where (stop - start) / step is whole
+    number = math.ceil((stop - start) / step - 1e-9)
+    return start + step * np.arange(_count(max(number, 0)))
+
+
+def _count(number):
+    if number != int(number) or not 0 <= number <= _MAX_VALUES:
+        msg = f"{number:g} values are not from 0 to {_MAX_VALUES}"
+        raise ValueError(msg)
+    return int(number)
+
+
+def _spaced(function):
+    def made(start, stop, num=50, **options):
+        if not set(options) <= {"endpoint", "base"}:
+            msg = f"arguments {sorted(options)}"
+            raise ValueError(msg)
+        return function(float(start), float(stop), _count(num), **options)
+
+    return made
+
+
+def _round(values, decimals=0):
+    return np.round(values, int(decimals))
+
+
+#: What an expression may call, after ``np.``.
+FUNCTIONS = {name: getattr(np, name) for name in ("append", "concatenate", "exp", "log", "log10")}
+FUNCTIONS |= {name: _spaced(getattr(np, name)) for name in ("geomspace", "linspace", "logspace")}
+FUNCTIONS |= {"arange": _arange, "array": np.atleast_1d, "sqrt": np.sqrt}
+FUNCTIONS |= {"round": _round, "around": _round}
+_BUILTINS = {"round": _round, "list": np.atleast_1d, "range": _arange}
+_OPERATORS = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: lambda a, b: np.float64(a) ** b if np.ndim(a) == 0 else a**b,
+}
+
+
+def _evaluate(text):
+    with np.errstate(all="raise"):
+        try:
+            return _value(ast.parse(text, mode="eval").body)
+        except FloatingPointError as err:
+            raise ValueError(str(err)) from None
+
+
+def _value(node):
+    match node:
+        case ast.Constant(value=int() | float() | bool() as value):
+            return value if isinstance(value, bool) else float(value)
+        case ast.List() | ast.Tuple():
+            items = [_value(x) for x in node.elts]
+            return np.array(items) if all(np.ndim(x) == 0 for x in items) else items
+        case ast.UnaryOp(op=ast.USub()):
+            return -_value(node.operand)
+        case ast.UnaryOp(op=ast.UAdd()):
+            return _value(node.operand)
+        case ast.BinOp() if type(node.op) in _OPERATORS:
+            return _OPERATORS[type(node.op)](_value(node.left), _value(node.right))
+        case ast.Call(func=ast.Attribute(value=ast.Name(id="np" | "numpy"), attr=name)):
+            function = FUNCTIONS.get(name)
+        case ast.Call(func=ast.Name(id=name)):
+            function = _BUILTINS.get(name)
+        case ast.Attribute(value=ast.Name(id="np" | "numpy"), attr="pi"):
+            return math.pi
+        case _:
+            function = None
+    if function is None:
+        msg = f"{ast.unparse(node)!r} is not read; known: {', '.join(FUNCTIONS)}"
+        raise ValueError(msg)
+    options = {x.arg: _value(x.value) for x in node.keywords}
+    return function(*(_value(x) for x in node.args), **options)

@@ -1,0 +1,386 @@
+"""What the modules of CIGALE are here: components, their options, axes of a grid."""
+
+from dataclasses import dataclass, field
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.cigale.catalog import read_table
+from miricigale.cigale.ini import parse_values
+from miricigale.refdata import find_resource
+from miricigale.sed import components as c
+from miricigale.utils.exceptions import ConfigError
+
+__all__ = ["Chain", "read_modules"]
+
+#: Parameters of CIGALE that do not change a model's spectrum here or there.
+_WITHOUT_EFFECT = {
+    "sfhdelayed": ("sfr_A", "normalise"),
+    "sfh2exp": ("sfr_0", "normalise"),
+    "sfhfromfile": ("normalise",),
+    "dustatt_calzleit": ("filters",),
+    "dustatt_modified_CF00": ("filters",),
+    "dustatt_modified_starburst": ("filters",),
+    "redshifting": ("redshift",),
+}
+
+
+@dataclass
+class Chain:
+    """What came of the modules, by the names that it has in a `~miricigale.cigale.CigaleSetup`."""
+
+    components: list = field(default_factory=list)
+    parameters: dict = field(default_factory=dict)
+    redshift: object = None
+    modules: dict = field(default_factory=dict)
+    frac_agn_definition: str = "dust"
+    left_out: list = field(default_factory=list)
+    replaced: list = field(default_factory=list)
+    differs: list = field(default_factory=list)
+
+
+class Module:
+    """One module: its parameters as text, taken one by one, and the chain it adds to."""
+
+    def __init__(self, name, values, chain, *, folder, libraries):
+        self.name, self.chain, self.folder, self.libraries = name, chain, folder, libraries
+        self._values = dict(values)
+        self._taken = set(_WITHOUT_EFFECT.get(name, ()))
+
+    def label(self, key):
+        return f"{self.name}.{key}"
+
+    def numbers(self, key, default=None):
+        """Values of a parameter, ascending; ``default`` where it is not in the file."""
+        self._taken.add(key)
+        value = self._values.get(key, "")
+        if value in ("", []):
+            return None if default is None else np.atleast_1d(np.asarray(default, dtype=float))
+        try:
+            return parse_values(value, self.label(key))
+        except ValueError as err:
+            raise ConfigError(str(err)) from None
+
+    def text(self, key, default=""):
+        self._taken.add(key)
+        value = self._values.get(key, default)
+        return value if isinstance(value, str) else ", ".join(value)
+
+    def one(self, key, default):
+        """A parameter that can have one value here: the first; others are left out."""
+        values = self.numbers(key, default)
+        if values.size > 1:
+            others = ", ".join(f"{x:g}" for x in values[1:])
+            self.chain.left_out.append(f"{self.label(key)} = {others} (one value at a time)")
+        return float(values[0])
+
+    def option(self, key, default, choices):
+        """Take one value, by number, of an option."""
+        number = self.one(key, default)
+        if number not in choices:
+            first = next(iter(choices))
+            self.chain.replaced.append(f"{self.label(key)} = {number:g} by {first}")
+            number = first
+        return choices[number]
+
+    def ignore(self, *keys):
+        """Take parameters that change nothing, or that another line of the report tells of."""
+        self._taken.update(keys)
+
+    def rest(self):
+        """Name parameters that nobody asked for."""
+        lost = [self.label(key) for key in self._values if key not in self._taken]
+        self.chain.left_out.extend(lost)
+
+    def add(self, kind, values, *, why=None, **options):
+        """
+        Make a component of values of its parameters, and axes where there are several.
+
+        Values outside the bounds are left out; where none is left the nearest bound is taken.
+        """
+        declared = kind.declared()
+        defaults = {}
+        for name, (key, numbers) in values.items():
+            if numbers is None:
+                continue
+            numbers = self._inside(declared[name], key, numbers)
+            if numbers.size > 1:
+                self.chain.parameters[name] = numbers
+            defaults[name] = float(numbers[0])
+        component = kind(**defaults, **options)
+        self.chain.components.append(component)
+        self.chain.modules[component.role] = self.name
+        if why:
+            self.chain.replaced.append(f"{self.name} by {component.name}: {why}")
+
+    def _inside(self, parameter, key, numbers):
+        numbers = np.round(numbers, 12)
+        low, high = parameter.bounds
+        good = (numbers >= low) & (numbers <= high)
+        if np.any(good):
+            for value in numbers[~good]:
+                self.chain.left_out.append(f"{self.label(key)} = {value:g} (not {low:g}-{high:g})")
+            return numbers[good]
+        value = np.clip(numbers[:1], low, high)
+        text = ", ".join(f"{x:.9g}" for x in numbers)
+        self.chain.replaced.append(f"{self.label(key)} = {text} by {value[0]:g}, the limit here")
+        return value
+
+    def values(self, keys):
+        """Parameter name here to key there, or to key and factor, as `add` takes them."""
+        out = {}
+        for name, key in keys.items():
+            key, factor = key if isinstance(key, tuple) else (key, 1.0)
+            numbers = self.numbers(key)
+            out[name] = (key, None if numbers is None else numbers * factor)
+        return out
+
+    def choose(self, better, plain, covers):
+        """The registered library if it holds the values, or what stands in for it, and why."""
+        if self.libraries == "bundled":
+            return plain, "the bundled tables were asked for"
+        if find_resource(better.resource) is None:
+            return plain, f"{better.resource} is not registered"
+        why = covers(better())
+        return (plain, why) if why else (better, None)
+
+
+_IMF = {0: "Salpeter", 1: "Chabrier"}
+_MYR, _NM = 1e-3, 1e-3  # to Gyr, to um
+
+
+#: Modules that are one component each: our names to theirs, or to theirs and a factor.
+_BURST = {"tau": ("tau_main", _MYR), "f_burst": "f_burst", "tau_burst": ("tau_burst", _MYR)}
+_DELAYED = _BURST | {"age": ("age_main", _MYR), "age_burst": ("age_burst", _MYR)}
+_DOUBLE = _BURST | {"age": ("age", _MYR), "age_burst": ("burst_age", _MYR)}
+_CF00 = {"av_ism": "Av_ISM", "mu": "mu", "slope_ism": "slope_ISM", "slope_bc": "slope_BC"}
+_CASEY = {"temperature_dust": "temperature", "emissivity_dust": "beta", "alpha_mir": "alpha"}
+_DL07 = {"u_min": "umin", "q_pah": "qpah", "gamma": "gamma"}
+_CURVE = {
+    "slope": "powerlaw_slope",
+    "uv_bump": "uv_bump_amplitude",
+    "uv_bump_wavelength": ("uv_bump_wavelength", _NM),
+    "uv_bump_width": ("uv_bump_width", _NM),
+}
+_CALZETTI = {"ebv": "E_BVs_young", "ebv_factor": "E_BVs_old_factor"} | _CURVE
+_STARBURST = {
+    "ebv_lines": "E_BV_lines",
+    "ebv_factor_stars": "E_BV_factor",
+    "r_v_gas": "Rv",
+} | _CURVE
+_SKIRTOR = {
+    "tau97": "t",
+    "p": "pl",
+    "q": "q",
+    "opening_angle": "oa",
+    "radius_ratio": "R",
+    "inclination": "i",
+    "disk_slope": "delta",
+    "frac_agn": "fracAGN",
+    "ebv_polar": "EBV",
+    "temperature_polar": "temperature",
+    "emissivity_polar": "emissivity",
+}
+
+
+def _plain(kind, keys, **options):
+    """Reader of a module without rules of its own."""
+    return lambda m: m.add(kind, m.values(keys), **options)
+
+
+def _sfhfromfile(m):
+    path = m.folder / m.text("filename")
+    table = read_table(path, "a star-formation history")
+    rates = QTable()
+    for i, name in enumerate(table.colnames):
+        unit = table[name].unit or (u.Myr if i == 0 else u.Msun / u.yr)
+        rates["time" if i == 0 else name] = np.asarray(table[name], dtype=float) * u.Unit(unit)
+    columns = m.numbers("sfr_column", 1)
+    m.chain.differs.append("sfhfromfile: one step of 1 Myr less at the same age")
+    values = {"sfh_index": ("sfr_column", columns - 1.0)} | m.values({"age": ("age", _MYR)})
+    m.add(c.TableSFH, values, table=rates)
+
+
+def _bc03(m):
+    imf = _IMF.get(int(m.one("imf", 0)), "another")
+    metallicity = m.numbers("metallicity", 0.02)
+    values = {"metallicity": ("metallicity", metallicity)}
+    values["separation_age"] = ("separation_age", np.array([m.one("separation_age", 10.0)]))
+
+    def covers(library):
+        if imf.lower() not in library.imf.lower():
+            return f"the files have a {library.imf} IMF, not {imf}"
+        return next(filter(None, (library.invalid({"metallicity": z}) for z in metallicity)), None)
+
+    kind, _ = m.choose(c.BC03Library, c.BC03, covers)
+    if kind is c.BC03:
+        m.chain.differs.append(f"{imf} IMF: {kind.imf} (bundled BC03)")
+    m.add(kind, values)
+
+
+def _nebular(m):
+    if m.text("emission", "True").lower() in ("false", "0", "no"):
+        m.ignore("logU", "zgas", "ne", "f_esc", "f_dust", "lines_width")
+        m.chain.differs.append("nebular.emission = False: no gas at all")
+        return
+    values = m.values({"log_u": "logU", "f_esc": "f_esc", "f_dust": "f_dust"})
+    zgas, stellar = m.numbers("zgas"), _metallicity(m.chain)
+    if m.numbers("ne", 100.0).tolist() != [100.0]:
+        m.chain.left_out.append("nebular.ne")
+    options = {"line_width": m.one("lines_width", 300.0), "gas": "stellar"}
+    if zgas is not None and not np.array_equal(zgas, stellar):
+        known = np.array(c.Nebular().table.metallicities)
+        nearest = known[np.argmin(np.abs(np.log(zgas[:, None] / known)), axis=1)]
+        for have, got in zip(zgas, nearest, strict=True):
+            if abs(got / have - 1.0) > 1e-3:
+                m.chain.replaced.append(f"nebular.zgas = {have:g} by {got:g}")
+        values["metallicity_gas"] = ("zgas", np.unique(nearest))
+        options["gas"] = "free"
+    m.chain.differs.append("nebular: Cloudy tables of another make")
+    m.add(c.Nebular, values, **options)
+
+
+def _metallicity(chain):
+    """Metallicities of the stars."""
+    stars = next((x for x in chain.components if x.role == "stellar"), None)
+    if stars is None:
+        return np.zeros(0)
+    return chain.parameters.get("metallicity", np.array([stars.metallicity]))
+
+
+def _modified_starburst(m):
+    law = m.option("Ext_law_emission_lines", 1, {1: "mw", 2: "lmc", 3: "smc"})
+    m.add(c.ModifiedStarburst, m.values(_STARBURST), gas_law=law, ebv_scaling="cigale")
+
+
+def _dale2014(m):
+    if np.any(m.numbers("fracAGN", 0.0) != 0.0):
+        m.chain.left_out.append("dale2014.fracAGN")
+    kind, why = m.choose(c.Dale2014, c.DraineLi2007Alpha, lambda _: None)
+    m.add(kind, m.values({"alpha": "alpha"}), why=why)
+
+
+def _dl2007(m):
+    if m.numbers("umax", 1e6).tolist() != [1e6]:
+        m.chain.replaced.append("dl2007.umax by 1e6")
+    m.add(c.DraineLi2007, m.values(_DL07))
+
+
+def _skirtor2016(m):
+    values = m.values(_SKIRTOR)
+    options = {
+        "polar_law": m.option("law", 0, {0: "smc", 1: "calzetti", 2: "gaskell"}),
+        # files of older versions have no choice
+        "disk": m.option("disk_type", 0, {0: "skirtor", 1: "schartmann2005"}),
+    }
+    if m.numbers("Mcl", 0.97).tolist() != [0.97]:
+        m.chain.replaced.append("skirtor2016.Mcl by 0.97")
+    m.chain.frac_agn_definition = _definition(m)
+
+    def covers(library):
+        wanted = {name: got for name, (_, got) in values.items() if got is not None}
+        lacks = library.missing(**wanted)
+        return lacks and f"the library has not all values of {', '.join(lacks)}"
+
+    kind, why = m.choose(c.Skirtor2016, c.ParametricTorus, covers)
+    m.add(kind, values, why=why, **options)
+
+
+def _definition(m):
+    text = m.text("lambda_fracAGN", "0/0").replace(" ", "")
+    try:
+        low, high = (float(x) for x in text.split("/"))
+    except ValueError:
+        msg = f"skirtor2016.lambda_fracAGN must be two wavelengths as 3/1000, got {text!r}"
+        raise ConfigError(msg) from None
+    if (low, high) == (0.0, 0.0):
+        return "dust"
+    if (low, high) == (3.0, 1000.0):
+        return "3-1000um"
+    m.chain.replaced.append(f"skirtor2016.lambda_fracAGN = {text} by 0/0")
+    return "dust"
+
+
+def _xray(m):
+    values = {"photon_index": ("gam", np.array([m.one("gam", 1.8)]))}
+    m.ignore("E_cut", "alpha_ox", "max_dev_alpha_ox", "angle_coef")
+    m.ignore("gam_lmxb", "gam_hmxb", "det_lmxb", "det_hmxb")
+    m.chain.differs.append("xray: of the AGN alone, from L(6 um), without a part in the fit")
+    if m.chain.modules.get("agn") is None:
+        m.chain.left_out.append("xray (without skirtor2016)")
+        return
+    m.add(c.XRay, values)
+
+
+def _redshifting(m):
+    m.chain.redshift = m.numbers("redshift")
+    m.add(c.Meiksin2006, {})
+
+
+_MODULES = {
+    "sfhdelayed": _plain(c.DelayedSFH, _DELAYED),
+    "sfh2exp": _plain(c.DoubleExponentialSFH, _DOUBLE),
+    "sfhfromfile": _sfhfromfile,
+    "bc03": _bc03,
+    "nebular": _nebular,
+    "dustatt_calzleit": _plain(c.CalzettiLeitherer, _CALZETTI, ebv_scaling="cigale"),
+    "dustatt_modified_starburst": _modified_starburst,
+    "dustatt_modified_CF00": _plain(c.CharlotFall, _CF00),
+    "dale2014": _dale2014,
+    "casey2012": _plain(c.Casey2012, _CASEY),
+    "dl2007": _dl2007,
+    "skirtor2016": _skirtor2016,
+    "xray": _xray,
+    "redshifting": _redshifting,
+}
+
+
+def read_modules(names, parameters, *, folder, libraries):
+    """
+    Take modules for components.
+
+    Parameters
+    ----------
+    names : list of str
+        Modules of CIGALE, in order.
+    parameters : dict of str to dict
+        Their sections in ``pcigale.ini``.
+    folder : `~pathlib.Path`
+        Where files are that the modules name.
+    libraries : {"best", "bundled"}
+        Whether registered libraries are used.
+
+    Returns
+    -------
+    chain : `Chain`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.ConfigError`
+        If a value cannot be read, or no model comes of it.
+    """
+    chain = Chain()
+    for name in names:
+        if name not in _MODULES:
+            chain.left_out.append(name)
+            continue
+        values = parameters.get(name, {})
+        module = Module(name, values, chain, folder=folder, libraries=libraries)
+        try:
+            _MODULES[name](module)
+        except ConfigError:
+            raise
+        except (ValueError, TypeError) as err:
+            msg = f"[[{name}]]: {err}"
+            raise ConfigError(msg) from err
+        module.rest()
+    have = {component.role for component in chain.components}
+    lack = [role for role in ("sfh", "stellar") if role not in have]
+    if "dust" in have and "attenuation" not in have:
+        lack.append("attenuation")
+    if lack:
+        text = ", ".join(chain.left_out) or "none"
+        msg = f"no module for {', '.join(lack)} is known here; left out: {text}"
+        raise ConfigError(msg)
+    return chain
