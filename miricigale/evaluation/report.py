@@ -4,7 +4,6 @@ import base64
 import dataclasses
 import html
 import io
-import os
 import string
 from importlib import resources
 from pathlib import Path
@@ -12,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.files import writing
+from miricigale.utils.store import replacing
 
 __all__ = ["Missing", "Report", "number"]
 
@@ -232,7 +231,7 @@ class Report:
 
     def write(self, path):
         """
-        Write the page under a temporary name, then rename it.
+        Write the page, whole or not at all.
 
         Returns
         -------
@@ -240,10 +239,8 @@ class Report:
         """
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(path.name + ".partial")
-        with writing(path):
+        with replacing(path) as partial:
             partial.write_text(self.to_html(), encoding="utf-8")
-        os.replace(partial, path)
         return path
 
 

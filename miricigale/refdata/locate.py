@@ -13,6 +13,7 @@ from astropy import config as _config
 from astropy.config import ConfigItem, ConfigNamespace
 
 from miricigale.refdata.registry import resource
+from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
 
 __all__ = [
@@ -74,12 +75,6 @@ def cache_folder():
     if conf.cache_folder:
         return Path(conf.cache_folder).expanduser()
     return Path(_config.get_cache_dir()) / "miricigale" / "cache"
-
-
-def file_sha256(path):
-    """The sha256 of a file as hexadecimal text."""
-    with open(path, "rb") as handle:
-        return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
 def record_path(path):

@@ -1,4 +1,4 @@
-"""Checksums of values: the same for the same content, in any session."""
+"""Checksums of values and files: the same for the same content, in any session."""
 
 import hashlib
 from dataclasses import fields, is_dataclass
@@ -7,7 +7,13 @@ import astropy.units as u
 import numpy as np
 from astropy.table import Table
 
-__all__ = ["content_sha256"]
+__all__ = ["content_sha256", "file_sha256"]
+
+
+def file_sha256(path):
+    """The sha256 of a file as hexadecimal text."""
+    with open(path, "rb") as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
 def content_sha256(value):

@@ -9,7 +9,8 @@ import os
 import shutil
 from pathlib import Path
 
-from miricigale.refdata.locate import file_sha256, fingerprint
+from miricigale.refdata.locate import fingerprint
+from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import ConfigError, DataError, OtherResultsError
 from miricigale.utils.parallel import available_memory, thread_count
 from miricigale.utils.progress import on_terminal, print_line, progress

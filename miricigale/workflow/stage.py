@@ -6,10 +6,10 @@ import time
 import types
 from collections.abc import Callable
 
+from miricigale.utils.folder import FileFolder
 from miricigale.utils.meta import undated
 from miricigale.utils.parallel import single_threaded
 from miricigale.workflow.products import read_image, write_image
-from miricigale.workflow.store import ProductFolder
 
 __all__ = ["Context", "Stage", "run_unit"]
 
@@ -126,7 +126,7 @@ class Context:
 
     def __init__(self, config, folder, *, stage=None, n_threads=1, progress_bar=False):
         self.config = config if stage is None else ConfigView(config, stage)
-        self.products = ProductFolder(folder)
+        self.products = FileFolder(folder)
         self.progress_bar = progress_bar
         self.saved = []
         # neither changes a product by itself: the seed is in every hash, threads in none

@@ -1,0 +1,310 @@
+"""A folder of files that belong together: written whole or not at all, and what stands in it noted."""
+
+import hashlib
+import json
+import logging
+import operator
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from miricigale.utils.content import file_sha256
+from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import writing
+from miricigale.utils.lock import FolderLock
+from miricigale.utils.store import PARTIAL, replacing
+
+__all__ = ["FileFolder", "RecordFolder"]
+
+log = logging.getLogger(__name__)
+
+MANIFEST = "manifest.json"
+#: The same text once more: what is noted outlives the loss of either file.
+SECOND_MANIFEST = ".manifest.copy.json"
+
+
+class FileFolder:
+    """
+    Where files lie, and how they are written.
+
+    Parameters
+    ----------
+    folder : path-like
+        The folder.
+    """
+
+    def __init__(self, folder):
+        self.folder = Path(folder)
+
+    def path(self, name):
+        """
+        Path of a file.
+
+        Parameters
+        ----------
+        name : str
+            Its name in the folder, with ``/`` between sub-folders.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If the name leads out of the folder, by itself or by a symbolic link.
+        """
+        parts = PurePosixPath(name).parts
+        windows = PureWindowsPath(name)
+        if (
+            not parts
+            or ".." in windows.parts
+            or windows.drive
+            or windows.root
+            or "/".join(parts) != name
+            or "\0" in name
+        ):
+            msg = f"{name!r} is not the name of a product: products lie in {self.folder}"
+            raise DataError(msg)
+        path = self.folder
+        for part in parts:
+            path = path / part
+            if path.is_symlink():
+                msg = f"{path} is a symbolic link; products must lie in {self.folder} itself"
+                raise DataError(msg)
+        return path
+
+    def save(self, name, writer):
+        """
+        Write a file under a temporary name, then rename it.
+
+        Parameters
+        ----------
+        name : str
+            Name in the folder; sub-folders are made.
+        writer : callable
+            Called with the temporary path, whose suffix is that of ``name``.
+
+        Returns
+        -------
+        path : `pathlib.Path`
+
+        Raises
+        ------
+        OSError
+            If it cannot be written, for instance on a full disk; it names the file, and what stood
+            there before stays.
+        """
+        path = self.path(name)
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as partial:
+            writer(partial)
+        return path
+
+    def describe(self, name):
+        """Checksum and size of a file, as the manifest holds them."""
+        path = self.path(name)
+        return {"sha256": file_sha256(path), "bytes": path.stat().st_size}
+
+
+class RecordFolder(FileFolder):
+    """
+    A folder of files and the manifest of what stands in it.
+
+    The manifest is kept twice, each with a checksum. Used in a ``with`` statement the folder is
+    locked for other processes. Subclasses say by class attributes what the folder is for.
+
+    Parameters
+    ----------
+    folder : path-like
+        Made when something is written, if it does not exist.
+
+    Attributes
+    ----------
+    facts : dict
+        Plain values that the manifest holds beside the records, such as a configuration.
+    records : dict of str to dict
+        By key (a stage, a piece): ``hash`` of all that its files depend on, ``products`` (name of
+        each file to its ``sha256`` and ``bytes``), and what else was noted.
+    is_sound : bool
+        Whether both manifests stand and say the same.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the folder holds files but no manifest (it is another's), or a manifest names a file
+        outside the folder.
+    """
+
+    #: Whose folder it is, for messages; the name of its lock; and the name of the records in it.
+    purpose = "run"
+    lock_name = "run.lock"
+    records_name = "records"
+    #: What to do about a folder that cannot be used.
+    remedy = "choose another folder"
+
+    def __init__(self, folder):
+        super().__init__(folder)
+        self._whole = {}
+        self._lock = FolderLock(self.folder, name=self.lock_name, purpose=self.purpose)
+        self._load()
+
+    def _load(self):
+        self.facts, self.records = {}, {}
+        paths = [self.path(name) for name in (MANIFEST, SECOND_MANIFEST)]
+        texts = [path.read_bytes() if path.is_file() else None for path in paths]
+        self.is_sound = texts[0] is not None and texts[0] == texts[1]
+        for path, text in zip(paths, texts, strict=True):
+            if text is not None and self._read_manifest(path, text):
+                break
+        else:
+            self._refuse_foreign(damaged=texts != [None, None])
+
+    def _read_manifest(self, path, text):
+        """Take over a manifest; False if it is damaged."""
+        try:
+            values = json.loads(text)
+            facts, records = self.parse(values)
+            for record in records.values():
+                self.check_record(record)
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:
+            log.warning("%s is damaged (%s: %s)", path, type(err).__name__, err)
+            return False
+        for record in records.values():
+            for name in record["products"]:
+                try:
+                    self.path(name)
+                except DataError as err:
+                    msg = f"{path} cannot be used: {err}"
+                    raise DataError(msg) from None
+        # earlier versions wrote none
+        if values.get("sha256", _checksum(values)) != _checksum(values):
+            log.warning("%s is damaged (its checksum is wrong)", path)
+            return False
+        self.facts, self.records = facts, records
+        return True
+
+    def parse(self, values):
+        """
+        Facts and records of the values of a manifest.
+
+        A subclass that reads manifests of earlier layouts brings them to the present one here.
+        """
+        facts = {k: v for k, v in values.items() if k not in ("sha256", self.records_name)}
+        return facts, values[self.records_name]
+
+    def check_record(self, record):
+        """Raise an error (a `KeyError`, `TypeError` or `ValueError`) for a damaged record."""
+        record["hash"]
+        for product in record["products"].values():
+            product["sha256"], operator.index(product["bytes"])
+
+    def _refuse_foreign(self, *, damaged):
+        """Refuse a folder that is another's, or whose files cannot be told any more."""
+        if damaged:
+            msg = (
+                f"neither {MANIFEST} nor {SECOND_MANIFEST} in {self.folder} can be read, so that "
+                f"none of its products can be used; remove the folder, or {self.remedy}"
+            )
+            raise DataError(msg)
+        # what was killed at its first moment leaves these
+        ours = (self.lock_name, PARTIAL)
+        if self.folder.exists() and (
+            not self.folder.is_dir()
+            or any(not entry.name.startswith(ours) for entry in self.folder.iterdir())
+        ):
+            if self.path(MANIFEST).is_file():
+                # another process began between the two looks
+                self._load()
+                return
+            msg = (
+                f"{self.folder} exists, is not empty and is no {self.purpose}'s folder; "
+                f"{self.remedy}"
+            )
+            raise DataError(msg)
+
+    def __enter__(self):
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._lock.__enter__()
+        try:
+            # another process may have changed it since it was looked at
+            self._load()
+            for path in self.folder.rglob(f"{PARTIAL}*"):
+                # left over by a process that was killed
+                path.unlink()
+            if not self.is_sound:
+                # also in a new folder: from the first moment on it is taken
+                self.write_manifest()
+        except BaseException:
+            self._lock.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(self, *exc):
+        self._lock.__exit__(*exc)
+
+    def is_whole(self, key):
+        """Whether all files of a record stand with the right checksums."""
+        return all(
+            self._is_whole(name, product) for name, product in self.records[key]["products"].items()
+        )
+
+    def _is_whole(self, name, product):
+        path = self.path(name)
+        if not path.is_file() or path.stat().st_size != product["bytes"]:
+            return False
+        # a file of many megabytes is read once
+        state = (path.stat().st_mtime_ns, product["sha256"])
+        if self._whole.get(name) != state:
+            if file_sha256(path) != product["sha256"]:
+                return False
+            self._whole[name] = state
+        return True
+
+    def is_current(self, key, digest):
+        """
+        Whether files stand as their record says.
+
+        Parameters
+        ----------
+        key : str
+            Of the record.
+        digest : str
+            Hash of everything that the files depend on.
+        """
+        record = self.records.get(key)
+        return record is not None and record["hash"] == digest and self.is_whole(key)
+
+    def finish(self, key, digest, products, **notes):
+        """
+        Record that a piece of work is done.
+
+        Parameters
+        ----------
+        key, digest : str
+            As for `is_current`.
+        products : dict of str to dict
+            By name: what `FileFolder.describe` says of it.
+        **notes
+            Plain values that are kept with it.
+        """
+        self.records[key] = {"hash": digest, **notes, "products": products}
+        self.write_manifest()
+
+    def drop(self, key):
+        """Forget a record and remove the files that it names."""
+        for name in self.records.pop(key, {}).get("products", {}):
+            self.path(name).unlink(missing_ok=True)
+
+    def standing_bytes(self):
+        """Bytes that files in the folder take, also those of work that was stopped."""
+        paths = [path for path in self.folder.rglob("*") if not path.is_symlink()]
+        return sum(path.stat().st_size for path in paths if path.is_file())
+
+    def write_manifest(self):
+        """Write both manifests."""
+        values = {**self.facts, self.records_name: dict(sorted(self.records.items()))}
+        text = json.dumps({"sha256": _checksum(values), **values}, indent=1)
+        for name in (MANIFEST, SECOND_MANIFEST):
+            self.save(name, lambda path: path.write_text(text, encoding="utf-8"))
+
+
+def _checksum(values):
+    """Checksum of what a manifest says."""
+    said = {key: value for key, value in values.items() if key != "sha256"}
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()

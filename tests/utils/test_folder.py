@@ -1,0 +1,68 @@
+"""Folders of files with a record; that of runs is tested in tests/workflow/test_store.py."""
+
+import json
+
+import pytest
+
+from miricigale.utils.exceptions import DataError
+from miricigale.utils.folder import RecordFolder
+
+
+class Parts(RecordFolder):
+    """Part files of a fit, of which there is an earlier layout of the manifest."""
+
+    purpose, lock_name, records_name = "fit", "fit.lock", "parts"
+
+    def parse(self, values):
+        if values.get("format") != "parts-1":
+            return super().parse(values)
+        records = {
+            name: {"hash": "old", "products": {name: dict(record)}}
+            for name, record in values["parts"].items()
+        }
+        return {"job": values["job"]}, records
+
+
+def write(store, name, text):
+    store.save(name, lambda path: path.write_text(text))
+    store.finish(name, "hash", {name: store.describe(name)}, rows=len(text))
+
+
+def test_what_was_noted_is_there_again(tmp_path):
+    with Parts(tmp_path / "fit") as store:
+        store.facts["job"] = {"chunk_rows": 3}
+        write(store, "part-0.txt", "abc")
+    again = Parts(tmp_path / "fit")
+    assert again.facts == {"job": {"chunk_rows": 3}}
+    assert again.records["part-0.txt"]["rows"] == 3
+    assert again.is_current("part-0.txt", "hash")
+    assert not again.is_current("part-1.txt", "hash")
+    with again:
+        again.drop("part-0.txt")
+        again.write_manifest()
+    assert not (tmp_path / "fit" / "part-0.txt").exists()
+    assert Parts(tmp_path / "fit").records == {}
+
+
+def test_an_earlier_layout_stays_readable(tmp_path):
+    with Parts(tmp_path) as store:
+        write(store, "part-0.txt", "abc")
+        product = store.describe("part-0.txt")
+    old = {"format": "parts-1", "job": {"chunk_rows": 3}, "parts": {"part-0.txt": product}}
+    (tmp_path / "manifest.json").write_text(json.dumps(old))
+    (tmp_path / ".manifest.copy.json").unlink()
+    store = Parts(tmp_path)
+    assert store.facts == {"job": {"chunk_rows": 3}}
+    assert store.is_whole("part-0.txt")
+    assert not store.is_sound
+
+
+def test_messages_say_whose_folder_it_is(tmp_path):
+    (tmp_path / "mine").write_text("x")
+    with pytest.raises(DataError, match="is no fit's folder; choose another folder"):
+        Parts(tmp_path)
+    with (
+        Parts(tmp_path / "fit"),
+        pytest.raises(DataError, match=r"is in use by a fit: .* remove .*fit\.lock"),
+    ):
+        Parts(tmp_path / "fit").__enter__()
