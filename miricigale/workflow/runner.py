@@ -115,7 +115,7 @@ class StudyRunner:
             "seed": self.config.run.seed,
             "config": self.config.values(*stage.sections),
             "inputs": {name: store.checksums(name) for name in stage.needs},
-            "data": {name: fingerprint(name) for name in stage.resources},
+            "data": {name: fingerprint(name) for name in stage.resource_names()},
         }
         if stage.plan is not None:
             values["plan"] = stage.plan(self.config, unit)
@@ -302,6 +302,7 @@ class StudyRunner:
                 self._source,
                 stage.name,
                 job.unit,
+                inputs=[product for name in stage.needs for product in store.checksums(name)],
                 n_threads=n_threads,
                 progress_bar=display.is_bar and inline,
             )

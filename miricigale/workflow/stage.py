@@ -1,7 +1,6 @@
 """A stage of the study, and what it sees of the run."""
 
 import dataclasses
-import pkgutil
 import time
 import types
 from collections.abc import Callable
@@ -11,30 +10,29 @@ from miricigale.utils.meta import undated
 from miricigale.utils.parallel import single_threaded
 from miricigale.workflow.products import read_image, write_image
 
-__all__ = ["Context", "Stage", "run_unit"]
+__all__ = ["Context", "Stage", "run_unit", "stage"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
     """
-    One step of the study.
+    One step of the study; made by the decorator `stage` beside its function.
 
     Parameters
     ----------
     name : str
-        Such as ``"mosaic"``.
-    function : callable or str
-        Called as ``function(context, unit)``; saves its products through the context. As text,
-        ``"module:name"`` in `miricigale.workflow.stages`, it is imported when it is called.
+        Such as ``"mosaics"``.
+    function : callable
+        Called as ``function(context, unit)``; saves its products through the context.
     title : str
         What it does, for the progress line.
     needs : tuple of str
-        Stages whose products it reads.
+        Stages whose products it reads; reading another product is an error.
     sections : tuple of str
         Sections (``"scene"``) or keys (``"run.keep_level1b"``) of the configuration that it
         reads; reading another one is an error.
-    resources : tuple of str
-        Reference data that it depends on.
+    resources : tuple of str or callable
+        Reference data that it depends on, or a function that gives their names.
     version : int
         Raised when the stage's own algorithm changes its products.
     units : callable, optional
@@ -47,15 +45,15 @@ class Stage:
     memory : callable, optional
         Called with the configuration and the unit; about how many bytes it takes to do it.
     kernels : tuple of str, optional
-        Groups of compiled kernels (`miricigale.workflow.compilation`) that it calls.
+        Groups of compiled kernels (`miricigale.workflow.warmup`) that it calls.
     """
 
     name: str
-    function: Callable | str
+    function: Callable
     title: str
     needs: tuple = ()
     sections: tuple = ()
-    resources: tuple = ()
+    resources: tuple | Callable = ()
     version: int = 1
     units: Callable | None = None
     plan: Callable | None = None
@@ -66,16 +64,30 @@ class Stage:
         """Names of the pieces; a single empty one for a stage that has none."""
         return tuple(self.units(config)) if self.units else ("",)
 
-    def call(self, context, unit):
-        """Do a piece."""
-        function = self.function
-        if isinstance(function, str):
-            function = pkgutil.resolve_name(f"miricigale.workflow.stages.{function}")
-        function(context, unit)
+    def resource_names(self):
+        """Names of the reference data that it depends on."""
+        return tuple(self.resources() if callable(self.resources) else self.resources)
 
     def key(self, unit):
         """Name of a piece in the manifest."""
         return f"{self.name}:{unit}" if unit else self.name
+
+
+def stage(name, title, **declaration):
+    """
+    Declare a function as a stage of the study.
+
+    Parameters
+    ----------
+    name, title, **declaration
+        As for `Stage`.
+
+    Returns
+    -------
+    decorator : callable
+        Makes a `Stage` of a function.
+    """
+    return lambda function: Stage(name, function, title, **declaration)
 
 
 class ConfigView:
@@ -118,13 +130,16 @@ class Context:
         The folder of the run.
     stage : `Stage`, optional
         Whose declaration limits what is seen of the configuration.
+    inputs : iterable of str, optional
+        Names of the products of the stages that it needs, which are all that it may read; any by
+        default.
     n_threads : int, optional
         Threads that the stage may use; they change no product.
     progress_bar : bool, optional
         Whether progress bars are shown.
     """
 
-    def __init__(self, config, folder, *, stage=None, n_threads=1, progress_bar=False):
+    def __init__(self, config, folder, *, stage=None, inputs=None, n_threads=1, progress_bar=False):
         self.config = config if stage is None else ConfigView(config, stage)
         self.products = FileFolder(folder)
         self.progress_bar = progress_bar
@@ -132,9 +147,14 @@ class Context:
         # neither changes a product by itself: the seed is in every hash, threads in none
         self.seed = config.run.seed
         self.n_threads = n_threads
+        self._name = "" if stage is None else stage.name
+        self._inputs = None if inputs is None else frozenset(inputs)
 
     def path(self, name):
-        """Path of a product."""
+        """Path of a product that an earlier stage wrote."""
+        if self._inputs is not None and name not in self._inputs:
+            msg = f"stage {self._name!r} reads {name!r} without declaring the stage that makes it"
+            raise RuntimeError(msg)
         return self.products.path(name)
 
     def save(self, name, writer):
@@ -163,7 +183,7 @@ class Context:
         return read_image(self.path(name), planes=planes)
 
 
-def run_unit(config, folder, stages, name, unit, *, n_threads=1, progress_bar=False):
+def run_unit(config, folder, stages, name, unit, **options):
     """
     Do one unit of a stage, in whatever process or thread this is called.
 
@@ -177,8 +197,8 @@ def run_unit(config, folder, stages, name, unit, *, n_threads=1, progress_bar=Fa
         The stages, or a function that makes them.
     name, unit : str
         Which.
-    n_threads, progress_bar
-        As for `Context`.
+    **options
+        ``inputs``, ``n_threads`` and ``progress_bar`` of `Context`.
 
     Returns
     -------
@@ -188,12 +208,12 @@ def run_unit(config, folder, stages, name, unit, *, n_threads=1, progress_bar=Fa
         Time that it took.
     """
     (stage,) = (s for s in (stages() if callable(stages) else stages) if s.name == name)
-    context = Context(config, folder, stage=stage, n_threads=n_threads, progress_bar=progress_bar)
+    context = Context(config, folder, stage=stage, **options)
     begin = time.perf_counter()
     try:
         # the same last digits on any number of cores
         with single_threaded():
-            stage.call(context, unit)
+            stage.function(context, unit)
     except (ValueError, KeyError, OSError) as err:
         err.add_note(f"in stage {stage.key(unit)}")
         raise

@@ -77,7 +77,7 @@ def folder(tmp_path_factory):
 def test_points_come_back_by_either_method(folder, method, scale):
     config = config_of(method)
     for name, unit in (("kernels", BAND), ("templates", ""), ("photometry", BAND)):
-        STAGES[name].call(Context(config, folder, stage=STAGES[name]), unit)
+        STAGES[name].function(Context(config, folder, stage=STAGES[name]), unit)
     table = QTable.read(folder / "photometry" / f"{BAND}.ecsv")
     truth = QTable.read(folder / "truth.ecsv")
     index, separation, _ = truth["sky"].match_to_catalog_sky(table["sky"])

@@ -77,7 +77,7 @@ def small_config(filters, *, points=False):
 
 
 def do_stage(config, folder, name, unit=""):
-    STAGES[name].call(Context(config, folder, stage=STAGES[name]), unit)
+    STAGES[name].function(Context(config, folder, stage=STAGES[name]), unit)
 
 
 def make_run(folder, filters, *, mass=3e10, points=False):

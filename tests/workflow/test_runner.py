@@ -11,7 +11,7 @@ from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarnin
 from miricigale.workflow import runner
 from miricigale.workflow.config import StudyConfig, load_config
 from miricigale.workflow.runner import StudyRunner, check_disk
-from miricigale.workflow.stage import Stage
+from miricigale.workflow.stage import Stage, stage
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.store import ProductStore
 
@@ -271,6 +271,40 @@ def test_a_stage_that_reads_what_it_has_not_declared_is_an_error(tmp_path):
     )
     with pytest.raises(AttributeError, match="keep_level1b"):
         StudyRunner(StudyConfig(), tmp_path / "run", [stage]).run()
+
+
+def test_a_product_of_a_stage_that_is_not_declared_cannot_be_read(tmp_path):
+    def make(context, unit):
+        context.save(f"{unit}.txt", lambda path: path.write_text(unit))
+
+    def read(context, _):
+        text = "".join(context.path(f"{unit}.txt").read_text() for unit in "ab")
+        context.save("sum.txt", lambda path: path.write_text(text))
+
+    first = Stage("first", make, "first", units=lambda _: "ab")
+    between = Stage("between", lambda context, _: None, "between", needs=("first",))
+    for needs in ((), ("between",)):
+        stages = [first, between, Stage("last", read, "last", needs=needs)]
+        with pytest.raises(RuntimeError, match=r"stage 'last' reads 'a\.txt' without declaring"):
+            StudyRunner(StudyConfig(), tmp_path / "run", stages).run()
+    StudyRunner(
+        StudyConfig(), tmp_path / "run", [first, Stage("last", read, "last", needs=("first",))],
+        redo=True,
+    ).run()  # fmt: skip
+    assert (tmp_path / "run" / "sum.txt").read_text() == "ab"
+
+
+def test_a_stage_is_declared_beside_its_function():
+    @stage("name", "title", needs=("other",), resources=lambda: ["a", "b"], version=3)
+    def make(context, unit):
+        return context, unit
+
+    assert (make.name, make.title, make.needs, make.version) == ("name", "title", ("other",), 3)
+    assert make.resource_names() == ("a", "b")
+    assert make.function(1, 2) == (1, 2)
+    names = [one.name for one in study_stages()]
+    assert names[:3] == ["catalog", "seds", "truth"]
+    assert len(set(names)) == len(names) == 13
 
 
 def test_stages_must_come_after_what_they_need(tmp_path):

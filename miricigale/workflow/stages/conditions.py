@@ -2,13 +2,13 @@
 
 import numpy as np
 
+from miricigale import photometry
 from miricigale.evaluation import (
     AssociationFlags,
     number,
     photoz_metrics,
     recovery_metrics,
 )
-from miricigale.photometry import ForcedFlags, crowded
 from miricigale.utils.tables import Flags, error_column
 from miricigale.workflow.stages.figures import band_label
 from miricigale.workflow.stages.sample import SampleFlags
@@ -80,9 +80,9 @@ def add_conditions(table, bands, *, suffix="", detections=False):
     association = np.asarray(table["association"])
     for name in bands:
         condition = np.zeros(len(table), int)
-        at_edge = (np.asarray(table[f"{name}_flags"]) & ForcedFlags.EDGE) > 0
+        at_edge = (np.asarray(table[f"{name}_flags"]) & photometry.ForcedFlags.EDGE) > 0
         condition[at_edge] |= int(ConditionFlags.EDGE)
-        near = crowded(table["sky"], table[f"{name}{suffix}"])
+        near = photometry.crowded(table["sky"], table[f"{name}{suffix}"])
         condition[near] |= int(ConditionFlags.CROWDED)
         condition[(association & _DOUBTFUL) > 0] |= int(ConditionFlags.AMBIGUOUS)
         if detections:

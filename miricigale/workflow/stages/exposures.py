@@ -9,14 +9,24 @@ from astropy.coordinates import SkyCoord
 from miricigale.instrument import Exposure, ceers_exposures, mosaic_wcs
 
 __all__ = [
+    "EXPOSURE_RESOURCES",
+    "GRID",
+    "IMAGES",
     "IMAGE_RESOURCES",
+    "KERNEL",
     "band_exposures",
+    "band_names",
     "exposure_memory",
     "exposure_plan",
     "exposure_units",
     "grid_of",
     "study_exposures",
 ]
+
+#: Sections of the configuration on which the grids of images depend, what is exposed, and kernels.
+GRID = ("pointing", "exposures")
+IMAGES = (*GRID, "scene", "detector", "reduction")
+KERNEL = (*GRID, "highres", "photometry.regularization", "reduction")
 
 #: Reference data of the simulated images.
 IMAGE_RESOURCES = (
@@ -26,6 +36,8 @@ IMAGE_RESOURCES = (
     "psf.jwst_pupil",
     "filters.sedpy",
 )
+# residual = "etc" says whose pattern it is, not how strong
+EXPOSURE_RESOURCES = (*IMAGE_RESOURCES, "instrument.etc")
 
 
 def study_exposures(config):
@@ -60,6 +72,11 @@ def study_exposures(config):
         for exposure in exposures:
             units[f"{name}-{exposure.dither}"] = exposure
     return units
+
+
+def band_names(config):
+    """Names of the bands."""
+    return config.exposures.filters
 
 
 def exposure_units(config):

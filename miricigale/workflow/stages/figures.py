@@ -3,6 +3,7 @@
 import astropy.units as u
 import numpy as np
 
+from miricigale import sed
 from miricigale.evaluation import (
     main_sequence_sfr,
     number_counts,
@@ -22,7 +23,6 @@ from miricigale.plotting.comparison import (
     plot_redshifts,
     plot_relation,
 )
-from miricigale.sed import COSMOLOGY
 from miricigale.workflow.stages.sample import magnitude
 
 __all__ = [
@@ -328,7 +328,7 @@ def input_figure(galaxies):
     axes[0, 0].set(xlim=(0, end), ylim=(LEAST_LUMINOSITY.value, None))
     line_mass = np.geomspace(1e8, 2e11, 30) * u.Msun
     lines = [
-        (line_mass.value, main_sequence_sfr(line_mass, COSMOLOGY.age(z)).value, f"z = {z:g}")
+        (line_mass.value, main_sequence_sfr(line_mass, sed.COSMOLOGY.age(z)).value, f"z = {z:g}")
         for z in (0.5, 1, 2)
     ]
     plot_relation(

@@ -7,13 +7,23 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
-from miricigale.detector import Detector, forecast_table
+from miricigale import detector, photometry, psf, reduction, scene
 from miricigale.instrument import background_level
-from miricigale.photometry import detect_sources
-from miricigale.psf import MatchingKernel, hst_psf, miri_psf, psf_mosaic
-from miricigale.reduction import Reducer
-from miricigale.scene import Background, Scene, highres_image
-from miricigale.workflow.stages.exposures import band_exposures, grid_of, study_exposures
+from miricigale.workflow.stage import stage
+from miricigale.workflow.stages.exposures import (
+    EXPOSURE_RESOURCES,
+    GRID,
+    IMAGE_RESOURCES,
+    IMAGES,
+    KERNEL,
+    band_exposures,
+    band_names,
+    exposure_memory,
+    exposure_plan,
+    exposure_units,
+    grid_of,
+    study_exposures,
+)
 
 __all__ = [
     "expose_and_reduce",
@@ -33,7 +43,7 @@ log = logging.getLogger(__name__)
 def reducer_of(config, n_threads=None):
     """The reducer that a configuration describes."""
     options = config.reduction
-    return Reducer(
+    return reduction.Reducer(
         jump_threshold=options.jump_threshold,
         box=options.background_box,
         filter_size=options.background_filter,
@@ -69,27 +79,27 @@ def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, tell=N
         In DN/s and, background subtracted, in MJy/sr.
     """
     options = config.scene
-    background = Background(
+    background = scene.Background(
         background_level(exposure.filter) * options.background_scale,
         gradient=options.background_gradient / u.arcmin,
         position_angle=options.gradient_angle * u.deg,
         center=SkyCoord(config.pointing.ra * u.deg, config.pointing.dec * u.deg),
     )
-    scene = Scene(
+    sky = scene.Scene(
         catalog,
         filter=exposure.filter,
         wcs=exposure.wcs,
-        psf=miri_psf(exposure.filter),
+        psf=psf.miri_psf(exposure.filter),
         background=background,
         workers=n_threads,
     )
-    detector = Detector.miri_imager(
+    imager = detector.Detector.miri_imager(
         cosmic_rays=config.detector.cosmic_rays, residual=config.detector.residual or False
     )
-    image = scene.render()
+    image = sky.render()
     if tell is not None:
-        tell(detector.forecast(image, exposure, sources=scene.truth))
-    ramp = detector.expose(image, exposure, seed=seed, n_threads=n_threads)
+        tell(imager.forecast(image, exposure, sources=sky.truth))
+    ramp = imager.expose(image, exposure, seed=seed, n_threads=n_threads)
     del image
     if keep is not None:
         keep(ramp)
@@ -100,6 +110,18 @@ def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, tell=N
     return rate, cal
 
 
+@stage(
+    "exposures",
+    "exposure",
+    version=3,
+    needs=("truth",),
+    sections=(*IMAGES, "run.keep_level1b"),
+    resources=EXPOSURE_RESOURCES,
+    units=exposure_units,
+    plan=exposure_plan,
+    memory=exposure_memory,
+    kernels=("images",),
+)
 def make_exposure(context, unit):
     """Stages 4 to 7 of one exposure: scene, ramp, rate, calibrated image."""
     config = context.config
@@ -108,7 +130,7 @@ def make_exposure(context, unit):
 
     def tell(forecast):
         log.info(forecast.describe())
-        context.save_table(f"exposures/{unit}_forecast.ecsv", forecast_table([forecast]))
+        context.save_table(f"exposures/{unit}_forecast.ecsv", detector.forecast_table([forecast]))
 
     def keep(ramp):
         name = f"{unit}_uncal.fits"
@@ -127,6 +149,15 @@ def make_exposure(context, unit):
         context.save_image(f"exposures/{unit}_{label}.fits", image, dq=image.flags)
 
 
+@stage(
+    "mosaics",
+    "mosaic",
+    needs=("exposures",),
+    sections=(*GRID, "reduction", "highres.pixel_scale"),
+    units=band_names,
+    plan=exposure_plan,
+    kernels=("images",),
+)
 def make_mosaic(context, name):
     """Stage 8: drizzle the dithers of one band, on its own grid and on the prior's."""
     config = context.config
@@ -141,20 +172,30 @@ def make_mosaic(context, name):
         context.save_image(f"mosaic_{name}{label}.fits", mosaic)
 
 
+@stage(
+    "highres",
+    "high-resolution image",
+    version=2,
+    needs=("truth",),
+    sections=(*GRID, "highres", "photometry.threshold", "photometry.min_area"),
+    resources=("filters.sedpy",),
+    plan=exposure_plan,
+    kernels=("images",),
+)
 def make_highres(context, _):
     """Stage 9: the high-resolution image, its segmentation and the detected sources."""
     config = context.config
     truth = QTable.read(context.path("truth.ecsv"))
     options = config.highres
-    image = highres_image(
+    image = scene.highres_image(
         truth,
         filter=options.filter,
         wcs=grid_of(config, options.pixel_scale),
-        psf=hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec),
+        psf=psf.hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec),
         depth=options.depth * u.ABmag,
         seed=context.seed,
     )
-    segmentation, detected = detect_sources(
+    segmentation, detected = photometry.detect_sources(
         image,
         threshold=config.photometry.threshold,
         min_area=config.photometry.min_area,
@@ -166,8 +207,8 @@ def make_highres(context, _):
 
 def mosaic_psf(config, name, scale):
     """The PSF of the mosaic of one band on pixels of ``scale`` arcsec."""
-    return psf_mosaic(
-        miri_psf(name),
+    return psf.psf_mosaic(
+        psf.miri_psf(name),
         scale * u.arcsec,
         u.Quantity([e.pa_aper for e in band_exposures(config, name)]),
         pixfrac=config.reduction.pixfrac,
@@ -185,14 +226,24 @@ def kernel_of(config, name):
     """Kernel from the high-resolution image to the mosaic of one band."""
     options = config.highres
     value = config.photometry.regularization
-    return MatchingKernel.from_psfs(
-        hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec),
+    return psf.MatchingKernel.from_psfs(
+        psf.hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec),
         mosaic_psf(config, name, config.reduction.pixel_scale),
         pixel_scale=options.pixel_scale * u.arcsec,
         regularization=value if value in ("auto", "yang2021") else float(value),
     )
 
 
+@stage(
+    "kernels",
+    "matching kernel",
+    version=2,
+    sections=KERNEL,
+    resources=IMAGE_RESOURCES,
+    units=band_names,
+    plan=exposure_plan,
+    kernels=("images", "photometry"),
+)
 def make_kernel(context, name):
     """Stage 10: the kernel of one band."""
     kernel = kernel_of(context.config, name)

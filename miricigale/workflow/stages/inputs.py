@@ -3,24 +3,27 @@
 import numpy as np
 from astropy.table import QTable, hstack
 
+from miricigale import fitting, sed
 from miricigale.filters import Filter
-from miricigale.fitting import BayesFitter, FitResults
+from miricigale.refdata import resources
+from miricigale.refdata.locate import fingerprint
 from miricigale.scene import read_catalog
-from miricigale.sed import ModelFlags, SEDModel
 from miricigale.utils.exceptions import ConfigError, DataError, argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.random import stream
 from miricigale.utils.tables import error_column
+from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.stars import star_fluxes
 
 __all__ = [
     "add_agn",
     "catalog_bands",
     "fit_inputs",
+    "fit_plan",
     "input_axes",
     "make_catalog",
     "make_truth",
-    "plain_axes",
+    "sed_resources",
 ]
 
 #: Redshifts closer than this share a node of the grid of the input fit.
@@ -45,7 +48,7 @@ def input_axes(kind):
     axes : dict of str to `~numpy.ndarray`
         Without redshift.
     """
-    axes = SEDModel.yang2021_axes(kind)
+    axes = sed.SEDModel.yang2021_axes(kind)
     return {
         "tau": axes["tau"],
         "age": axes["age"],
@@ -54,9 +57,19 @@ def input_axes(kind):
     }
 
 
-def plain_axes(axes):
+def _plain_axes(axes):
     """Plain values of a grid's axes, for hashing."""
     return {name: list(values) for name, values in axes.items()}
+
+
+def fit_plan(config, _):
+    """The axes of the final fit, for hashing."""
+    return _plain_axes(sed.SEDModel.yang2021_axes(config.fit.axes))
+
+
+def sed_resources():
+    """Reference data of the models: the preset takes the best libraries that there are."""
+    return (*sed.SEDModel.yang2021().resources, "filters.sedpy")
 
 
 def catalog_bands(catalog):
@@ -64,6 +77,14 @@ def catalog_bands(catalog):
     return [name for name in catalog.colnames if "." in name and not name.endswith("_err")]
 
 
+@stage(
+    "catalog",
+    "catalogue",
+    sections=("catalog",),
+    plan=lambda config, _: (
+        fingerprint(config.catalog.source) if config.catalog.source in resources() else ""
+    ),
+)
 def make_catalog(context, _):
     """Stage 1: read the catalogue and cut it at the faint limit."""
     options = context.config.catalog
@@ -82,6 +103,16 @@ def make_catalog(context, _):
     context.save_table("catalog.ecsv", chosen)
 
 
+@stage(
+    "seds",
+    "input SEDs",
+    version=2,
+    needs=("catalog",),
+    sections=("sed.axes", "sed.catalog_error", "sed.max_wavelength", "fit.model_error"),
+    resources=sed_resources,
+    plan=lambda config, _: _plain_axes(input_axes(config.sed.axes)),
+    kernels=("fit",),
+)
 def fit_inputs(context, _):
     """Stage 2: fit a galaxy grid to the catalogue's fluxes at the known redshifts."""
     options = context.config.sed
@@ -102,9 +133,9 @@ def fit_inputs(context, _):
         photometry[name] = catalog[name]
         photometry[error_column(name)] = np.abs(catalog[name]) * options.catalog_error
     nodes = np.unique(np.round(photometry["redshift"] / REDSHIFT_STEP) * REDSHIFT_STEP)
-    model = SEDModel.yang2021(agn=False)
+    model = sed.SEDModel.yang2021(agn=False)
     axes = input_axes(options.axes) | {"redshift": nodes[nodes > 0]}
-    fitter = BayesFitter(
+    fitter = fitting.BayesFitter(
         model,
         bands,
         axes=axes,
@@ -152,11 +183,20 @@ def add_agn(table, frac_agn, seed):
         table[name] = values
 
 
+@stage(
+    "truth",
+    "model fluxes",
+    version=2,
+    needs=("catalog", "seds"),
+    sections=("sed.frac_agn", "sed.alpha", "exposures.filters", "fit.bands", "highres.filter"),
+    resources=sed_resources,
+    kernels=("fit",),
+)
 def make_truth(context, _):
     """Stage 3: the best-fit SED (and its AGN) of each source through every band."""
     config = context.config
     catalog = QTable.read(context.path("catalog.ecsv"))
-    best = FitResults.read(context.path("input_seds.fits")).to_table()
+    best = fitting.FitResults.read(context.path("input_seds.fits")).to_table()
     parameters = QTable({"id": catalog["id"]})
     parameters["redshift"] = np.asarray(catalog["redshift"], float)
     for name in (*GALAXY_PARAMETERS, "mass"):
@@ -167,7 +207,7 @@ def make_truth(context, _):
         stream(context.seed, "truth", "alpha", str(key)).uniform(low, high)
         for key in parameters["id"]
     ]
-    model = SEDModel.yang2021(agn=config.sed.frac_agn > 0)
+    model = sed.SEDModel.yang2021(agn=config.sed.frac_agn > 0)
     if config.sed.frac_agn > 0:
         add_agn(parameters, config.sed.frac_agn, context.seed)
     bands = list(
@@ -182,7 +222,7 @@ def make_truth(context, _):
         parameters["mass"] = parameters["mass"] * ratio
         parameters["prior_ratio"] = np.where(usable, ratio, np.nan)
     light = model.fluxes(parameters, bands)
-    lacking = (light["flags"] & int(ModelFlags.NOT_IN_LIBRARY)) > 0
+    lacking = (light["flags"] & int(sed.ModelFlags.NOT_IN_LIBRARY)) > 0
     if np.any(lacking):
         msg = (
             f"{np.count_nonzero(lacking)} of {len(light)} sources have parameters that the "

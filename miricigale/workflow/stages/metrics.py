@@ -7,6 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from miricigale import fitting, photometry
 from miricigale.evaluation import (
     PUBLISHED_LIGHT,
     fraction_interval,
@@ -15,14 +16,12 @@ from miricigale.evaluation import (
     recovery_metrics,
     sigma_mad,
 )
-from miricigale.fitting import FitResults
 from miricigale.instrument import (
     CEERS_FILTERS,
     ceers_exposures,
     proposal_limit,
     scaled_limit,
 )
-from miricigale.photometry import ErrorModel, ForcedFlags
 from miricigale.workflow.stages.conditions import (
     ConditionFlags,
     band_conditions,
@@ -61,7 +60,7 @@ class StudyTables:
     truth: QTable
     matched: QTable
     detections: QTable
-    errors: ErrorModel
+    errors: object
     results: dict
     points: dict
 
@@ -74,8 +73,8 @@ class StudyTables:
             QTable.read(context.path("truth.ecsv")),
             QTable.read(context.path("matched.ecsv")),
             QTable.read(context.path("photometry.ecsv")),
-            ErrorModel.read(context.path("errors.ecsv")),
-            {unit: FitResults.read(context.path(f"fits_{unit}.fits")) for unit in FITS},
+            photometry.ErrorModel.read(context.path("errors.ecsv")),
+            {unit: fitting.FitResults.read(context.path(f"fits_{unit}.fits")) for unit in FITS},
             {name: QTable.read(context.path(f"points/{name}.ecsv")) for name in names},
         )
 
@@ -137,7 +136,8 @@ def _band_metrics(matched, name):
     usable = (selection & (SampleFlags.OUTSIDE_FIELD | SampleFlags.NOT_MATCHED)) == 0
     flux, true = matched[name].value, matched[f"{name}_true"].value
     formal = matched[f"{name}_formal_err"].value
-    whole = (np.asarray(matched[f"{name}_flags"]) & (ForcedFlags.EDGE | ForcedFlags.MASKED)) == 0
+    off = photometry.ForcedFlags.EDGE | photometry.ForcedFlags.MASKED
+    whole = (np.asarray(matched[f"{name}_flags"]) & off) == 0
     near = (np.asarray(matched[f"{name}_condition"]) & ConditionFlags.CROWDED) > 0
     with np.errstate(invalid="ignore"):
         bright = usable & whole & (true > 20 * formal) & ~near

@@ -5,18 +5,19 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
+from miricigale import photometry, psf, scene
 from miricigale.instrument import mosaic_wcs, scaled_limit, tangent_offset
-from miricigale.photometry import (
-    ForcedPhotometer,
-    aperture_correction,
-    detect_sources,
-    flux_scaling,
-)
-from miricigale.psf import MatchingKernel, hst_psf
-from miricigale.scene import highres_image
 from miricigale.utils.random import text_key
 from miricigale.utils.tables import error_column, match_sky
-from miricigale.workflow.stages.exposures import study_exposures
+from miricigale.workflow.stage import stage
+from miricigale.workflow.stages.exposures import (
+    EXPOSURE_RESOURCES,
+    IMAGES,
+    band_names,
+    exposure_memory,
+    exposure_plan,
+    study_exposures,
+)
 from miricigale.workflow.stages.images import (
     expose_and_reduce,
     measured_mosaic,
@@ -81,6 +82,25 @@ def point_catalog(exposure, band_flux, prior, *, spacing, seed):
     return catalog
 
 
+@stage(
+    "points",
+    "point sources",
+    version=3,
+    needs=("kernels",),
+    sections=(
+        *IMAGES,
+        "highres",
+        "photometry.threshold",
+        "photometry.min_area",
+        "photometry.method",
+        "point_sources",
+    ),
+    resources=EXPOSURE_RESOURCES,
+    units=lambda config: band_names(config) if config.point_sources.enabled else (),
+    plan=exposure_plan,
+    memory=exposure_memory,
+    kernels=("images", "photometry"),
+)
 def measure_point_sources(context, name):
     """Simulate, reduce and measure bright point sources in one band, as the study does."""
     config = context.config
@@ -95,22 +115,22 @@ def measure_point_sources(context, name):
     _, scale = measured_mosaic(config)
     mosaic = reducer.mosaic([cal], mosaic_wcs([exposure], scale * u.arcsec))
     mosaic, _ = reducer.subtract_background(mosaic)
-    highres = highres_image(
+    highres = scene.highres_image(
         catalog,
         filter=prior,
         wcs=mosaic_wcs([exposure], config.highres.pixel_scale * u.arcsec),
-        psf=hst_psf(prior, pixel_scale=config.highres.pixel_scale * u.arcsec),
+        psf=psf.hst_psf(prior, pixel_scale=config.highres.pixel_scale * u.arcsec),
         depth=config.highres.depth * u.ABmag,
         seed=seed,
     )
-    segmentation, detected = detect_sources(
+    segmentation, detected = photometry.detect_sources(
         highres, threshold=config.photometry.threshold, min_area=config.photometry.min_area
     )
     if config.photometry.method == "yang2021":
         photometer = yang2021_photometer(config, name, context.n_threads)
     else:
-        photometer = ForcedPhotometer(
-            MatchingKernel.read(context.path(f"kernel_{name}.fits")),
+        photometer = photometry.ForcedPhotometer(
+            psf.MatchingKernel.read(context.path(f"kernel_{name}.fits")),
             fit_background=True,
             n_threads=context.n_threads,
         )
@@ -124,11 +144,11 @@ def measure_point_sources(context, name):
     table["flags"] = np.where(index >= 0, np.asarray(measured["flags"])[index], 0)
     table["in_field"] = in_field(table["sky"], [mosaic])
     # the paper's two factors: ours must leave the image as it is
-    psf, inside = mosaic_psf(config, name, scale), np.asarray(table["in_field"])
-    factors = {"f_aper": aperture_correction(psf, STAMP_RADIUS)}
+    blur, inside = mosaic_psf(config, name, scale), np.asarray(table["in_field"])
+    factors = {"f_aper": photometry.aperture_correction(blur, STAMP_RADIUS)}
     if np.any(inside):
-        factors["f_scaling"], factors["f_scaling_err"] = flux_scaling(
-            mosaic, table["sky"][inside], table["flux_true"][inside], psf
+        factors["f_scaling"], factors["f_scaling_err"] = photometry.flux_scaling(
+            mosaic, table["sky"][inside], table["flux_true"][inside], blur
         )
     table.meta.update(factors)
     context.save_table(f"points/{name}.ecsv", table)

@@ -6,15 +6,18 @@ import logging
 import astropy.units as u
 import numpy as np
 
+from miricigale import sed
 from miricigale.evaluation import (
     Missing,
     Report,
     number,
 )
-from miricigale.sed import SEDModel
+from miricigale.workflow.stage import stage
 from miricigale.workflow.stages import conditions, figures, pictures, provenance
+from miricigale.workflow.stages.exposures import EXPOSURE_RESOURCES, GRID, exposure_plan
 from miricigale.workflow.stages.figures import band_label
 from miricigale.workflow.stages.images import measured_mosaic
+from miricigale.workflow.stages.inputs import sed_resources
 from miricigale.workflow.stages.metrics import FITS, StudyTables, study_metrics
 from miricigale.workflow.stages.sample import SampleFlags, footprint_area, typical_source
 
@@ -23,6 +26,40 @@ __all__ = ["make_report"]
 log = logging.getLogger(__name__)
 
 
+@stage(
+    "report",
+    "report",
+    version=3,
+    needs=(
+        "catalog",
+        "truth",
+        "exposures",
+        "mosaics",
+        "highres",
+        "photometry",
+        "points",
+        "errors",
+        "fits",
+    ),
+    sections=(
+        *GRID,
+        "run.name",
+        "catalog",
+        "sed",
+        "detector",
+        "highres.filter",
+        "highres.pixel_scale",
+        "photometry.method",
+        "reduction.pixel_scale",
+        "fit",
+        "errors",
+        "point_sources",
+        "report",
+    ),
+    resources=lambda: (*sed_resources(), *EXPOSURE_RESOURCES),
+    plan=exposure_plan,
+    kernels=("fit",),
+)
 def make_report(context, _):
     """Stage 14: the page with its figures, and the numbers as JSON."""
     config = context.config
@@ -34,7 +71,7 @@ def make_report(context, _):
         log.warning("no source is left to fit: %s", metrics["n_left_out"])
     text = json.dumps(_without_nan(metrics), indent=1, allow_nan=False)
     context.save("report/metrics.json", lambda path: path.write_text(text, encoding="utf-8"))
-    model = SEDModel.yang2021()
+    model = sed.SEDModel.yang2021()
     report = Report(
         f"miricigale: {config.run.name}",
         subtitle=(
