@@ -19,8 +19,9 @@ from miricigale.evaluation import number
 from miricigale.fitting import FitResults
 from miricigale.photometry import ErrorModel
 from miricigale.sed import SEDModel
-from miricigale.workflow import load_config, read_image
-from miricigale.workflow.stages import figures, pictures
+from miricigale.workflow import load_config
+from miricigale.workflow.products import read_image
+from miricigale.workflow.stages import figures, pictures, provenance
 from miricigale.workflow.stages.metrics import FITS, StudyTables
 from miricigale.workflow.stages.sample import SampleFlags, typical_source
 
@@ -86,6 +87,10 @@ def main():
     }
     for name, figure in drawn.items():
         figure.savefig(args.images / f"{name}.png", dpi=80, metadata={"Software": None})
+    model = SEDModel.yang2021()
+    print(*(f"* {text}" for text in provenance.stand_ins(config, model)), sep="\n", end="\n\n")
+    rows = provenance.library_rows(model)
+    print(rst_table(("part", "component", "library", "reference"), rows), "\n")
     print(f"{metrics['area']:.2f} square arcmin, {len(galaxies)} galaxies\n")
     rows = [
         (

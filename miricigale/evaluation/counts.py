@@ -55,7 +55,7 @@ def sfr_to_infrared_luminosity(sfr):
     Parameters
     ----------
     sfr : `~astropy.units.Quantity`
-        Star-formation rate (Salpeter IMF, as in the paper's second axis).
+        Star-formation rate (Salpeter IMF).
 
     Returns
     -------

@@ -6,7 +6,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "config": ("StudyConfig", "load_config", "preset_names"),
-        "products": ("read_image", "write_image"),
+        "products": ("write_image",),
         "runner": ("StudyRunner",),
         "stage": ("Context", "Stage"),
         "stages": ("study_stages",),

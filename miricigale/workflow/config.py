@@ -59,16 +59,16 @@ class SedSection:
 
     axes: str = _option("galaxy", "Grid of the input fit.", choices=("galaxy", "quick"))
     catalog_error: float = _option(
-        0.05, "Relative error given to the catalogue's fluxes.", low=1e-4, high=1.0
+        0.05, "Relative error of fluxes whose band has no column of errors.", low=1e-4, high=1.0
     )
     max_wavelength: float = _option(
         3.0,
-        "Longest pivot wavelength (um) of the catalogue's bands that are fitted.",
+        "Longest pivot wavelength (um) of the bands without errors that are fitted.",
         low=0.3,
         high=30.0,
     )
     alpha: tuple[float, ...] = _option(
-        (1.5, 2.5), "Range from which the dust's alpha is drawn, since these bands do not show it."
+        (1.5, 2.5), "Range from which the dust's alpha is drawn where no band shows it."
     )
     frac_agn: float = _option(0.0, "fracAGN of the injected sources.", low=0.0, high=0.99)
 

@@ -9,19 +9,14 @@ from astropy.io import fits
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import image_unit, open_fits, write_fits
 from miricigale.utils.meta import undated
+from miricigale.utils.store import plain_value
 
 __all__ = ["read_image", "write_image"]
 
 
 def _plain(value):
-    """A value as JSON knows it."""
-    if isinstance(value, u.Quantity):
-        return f"{value}"
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, np.generic):
-        return value.item()
-    return str(value)
+    """A value as JSON knows it; a quantity keeps its unit as text."""
+    return f"{value}" if isinstance(value, u.Quantity) else plain_value(value)
 
 
 def write_image(image, path, *, planes=None):
@@ -54,9 +49,9 @@ def write_image(image, path, *, planes=None):
     write_fits(hdus, path, overwrite=True)
 
 
-def read_image(path, *, planes=(), unit=None):
+def read_image(path, *, planes=()):
     """
-    Read what `write_image` wrote.
+    Read what `write_image` wrote, in the byte order of the machine and with its own meta.
 
     Parameters
     ----------
@@ -64,8 +59,6 @@ def read_image(path, *, planes=(), unit=None):
         The file.
     planes : iterable of str, optional
         Names of further planes wanted.
-    unit : unit-like, optional
-        Unit that the image's own must be convertible to.
 
     Returns
     -------
@@ -77,23 +70,21 @@ def read_image(path, *, planes=(), unit=None):
     `~miricigale.utils.exceptions.DataError`
         If the file is missing, or has no SCI extension or no unit of an image.
     """
-    hdus = open_fits(path, wanted="an image (FITS with SCI)")
     from astropy.nddata import CCDData, StdDevUncertainty
     from astropy.wcs import WCS
 
-    with hdus:
+    with open_fits(path, wanted="an image (FITS with SCI)") as hdus:
         if "SCI" not in hdus:
             msg = f"{path} has no SCI extension, only {[hdu.name for hdu in hdus]}"
             raise DataError(msg)
         header = hdus["SCI"].header
         wcs = WCS(header)
+        error = np.array(hdus["ERR"].data, np.float32) if "ERR" in hdus else None
         image = CCDData(
             np.array(hdus["SCI"].data, np.float32),
-            unit=image_unit(header, path, like=unit),
+            unit=image_unit(header, path, like=None),
             wcs=wcs if wcs.has_celestial else None,
-            uncertainty=StdDevUncertainty(np.array(hdus["ERR"].data, np.float32))
-            if "ERR" in hdus
-            else None,
+            uncertainty=None if error is None else StdDevUncertainty(error),
             mask=np.array(hdus["MASK"].data, bool) if "MASK" in hdus else None,
             meta=json.loads(header.get("META", "{}")),
         )

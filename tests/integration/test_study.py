@@ -14,7 +14,8 @@ from astropy.table import QTable
 
 from miricigale.instrument import saturation_forecast
 from miricigale.reduction import PixelFlags
-from miricigale.workflow import load_config, read_image
+from miricigale.workflow import load_config
+from miricigale.workflow.products import read_image
 from miricigale.workflow.stages.exposures import study_exposures
 
 SMALL = """

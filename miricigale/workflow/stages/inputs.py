@@ -21,6 +21,7 @@ __all__ = [
     "fit_inputs",
     "fit_plan",
     "input_axes",
+    "input_bands",
     "make_catalog",
     "make_truth",
     "sed_resources",
@@ -31,17 +32,20 @@ REDSHIFT_STEP = 0.01
 GALAXY_PARAMETERS = ("tau", "age", "ebv", "alpha", "metallicity")
 
 
-def input_axes(kind):
+def input_axes(kind, *, dust=False):
     """
     Axes of the fit of the input SEDs.
 
-    Those of the paper, but one value of the dust's alpha: bands shorter than a few um say
-    nothing of it, and a fit of it would run to the edge of the grid (see `make_truth`).
+    Those of Yang et al. 2021, but one value of the dust's alpha where no band shows the dust: bands
+    shorter than a few um say nothing of it, and a fit of it would run to the edge of the grid
+    (see `make_truth`).
 
     Parameters
     ----------
     kind : {"galaxy", "quick"}
-        The paper's galaxy grid or the thinner one.
+        The galaxy grid of Yang et al. 2021 or the thinner one.
+    dust : bool, optional
+        Whether alpha is fitted.
 
     Returns
     -------
@@ -49,12 +53,8 @@ def input_axes(kind):
         Without redshift.
     """
     axes = sed.SEDModel.yang2021_axes(kind)
-    return {
-        "tau": axes["tau"],
-        "age": axes["age"],
-        "ebv": axes["ebv"],
-        "alpha": np.array([2.0]),
-    }
+    fitted = {name: axes[name] for name in ("tau", "age", "ebv", "alpha")}
+    return fitted if dust else fitted | {"alpha": np.array([2.0])}
 
 
 def _plain_axes(axes):
@@ -75,6 +75,44 @@ def sed_resources():
 def catalog_bands(catalog):
     """Names of the flux columns of a catalogue: those with a dot in the name."""
     return [name for name in catalog.colnames if "." in name and not name.endswith("_err")]
+
+
+def input_bands(catalog, max_wavelength):
+    """
+    Bands of a catalogue that its SEDs are fitted to.
+
+    Parameters
+    ----------
+    catalog : `~astropy.table.QTable`
+        With flux columns, and columns of errors or not.
+    max_wavelength : float
+        Longest pivot wavelength in um of the bands without errors.
+
+    Returns
+    -------
+    bands : dict of str to bool
+        Whether each band has a column of errors, in the order of the catalogue.
+    longest : float
+        Their longest pivot wavelength in um; 0 without bands.
+    """
+    bands, longest = {}, 0.0
+    for name in catalog_bands(catalog):
+        pivot = Filter.from_name(name).pivot.value
+        own = error_column(name) in catalog.colnames
+        if own or pivot <= max_wavelength:
+            bands[name], longest = own, max(longest, pivot)
+    return bands, longest
+
+
+def _input_plan(config, _):
+    """Axes of the input fit, and the bands whose errors a user's catalogue has, for hashing."""
+    plan = _plain_axes(input_axes(config.sed.axes))
+    if config.catalog.source not in resources():
+        catalog = read_catalog(config.catalog.source)
+        bands, _ = input_bands(catalog, config.sed.max_wavelength)
+        own = [name for name, errors in bands.items() if errors]
+        plan |= {"own errors": own} if own else {}
+    return plan
 
 
 @stage(
@@ -110,18 +148,14 @@ def make_catalog(context, _):
     needs=("catalog",),
     sections=("sed.axes", "sed.catalog_error", "sed.max_wavelength", "fit.model_error"),
     resources=sed_resources,
-    plan=lambda config, _: _plain_axes(input_axes(config.sed.axes)),
+    plan=_input_plan,
     kernels=("fit",),
 )
 def fit_inputs(context, _):
     """Stage 2: fit a galaxy grid to the catalogue's fluxes at the known redshifts."""
     options = context.config.sed
     catalog = QTable.read(context.path("catalog.ecsv"))
-    bands = [
-        name
-        for name in catalog_bands(catalog)
-        if Filter.from_name(name).pivot.value <= options.max_wavelength
-    ]
+    bands, longest = input_bands(catalog, options.max_wavelength)
     if not bands:
         msg = (
             f"[sed] max_wavelength = {options.max_wavelength} leaves none of the catalogue's bands"
@@ -129,15 +163,22 @@ def fit_inputs(context, _):
         raise ConfigError(msg)
     photometry = QTable({"id": catalog["id"]})
     photometry["redshift"] = np.asarray(catalog["redshift"], float)
-    for name in bands:
+    for name, own in bands.items():
         photometry[name] = catalog[name]
-        photometry[error_column(name)] = np.abs(catalog[name]) * options.catalog_error
+        if own:
+            error = catalog[error_column(name)].value
+            # a flux without an error is no measurement
+            error = np.where(error > 0, error, np.nan) * catalog[error_column(name)].unit
+        else:
+            error = np.abs(catalog[name]) * options.catalog_error
+        photometry[error_column(name)] = error
     nodes = np.unique(np.round(photometry["redshift"] / REDSHIFT_STEP) * REDSHIFT_STEP)
     model = sed.SEDModel.yang2021(agn=False)
-    axes = input_axes(options.axes) | {"redshift": nodes[nodes > 0]}
+    axes = input_axes(options.axes, dust=longest > options.max_wavelength)
+    axes |= {"redshift": nodes[nodes > 0]}
     fitter = fitting.BayesFitter(
         model,
-        bands,
+        list(bands),
         axes=axes,
         model_error=context.config.fit.model_error,
         redshift_tolerance=REDSHIFT_STEP,
@@ -148,7 +189,7 @@ def fit_inputs(context, _):
 
 def add_agn(table, frac_agn, seed):
     """
-    Give each source an AGN drawn from the paper's ranges.
+    Give each source an AGN drawn from the ranges of Yang et al. 2021 (those of q are inferred).
 
     Parameters
     ----------
@@ -202,11 +243,13 @@ def make_truth(context, _):
     for name in (*GALAXY_PARAMETERS, "mass"):
         if f"{name}_best" in best.colnames:
             parameters[name] = best[f"{name}_best"]
-    low, high = config.sed.alpha
-    parameters["alpha"] = [
-        stream(context.seed, "truth", "alpha", str(key)).uniform(low, high)
-        for key in parameters["id"]
-    ]
+    if "alpha" not in parameters.colnames:
+        # the bands of the fit do not show it
+        low, high = config.sed.alpha
+        parameters["alpha"] = [
+            stream(context.seed, "truth", "alpha", str(key)).uniform(low, high)
+            for key in parameters["id"]
+        ]
     model = sed.SEDModel.yang2021(agn=config.sed.frac_agn > 0)
     if config.sed.frac_agn > 0:
         add_agn(parameters, config.sed.frac_agn, context.seed)

@@ -8,12 +8,11 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.evaluation import number
-from miricigale.filters import Filter
 from miricigale.refdata import citations, resource, resources
 from miricigale.utils.meta import provenance
 from miricigale.workflow.stages.exposures import IMAGE_RESOURCES, study_exposures
 from miricigale.workflow.stages.figures import band_label
-from miricigale.workflow.stages.inputs import catalog_bands
+from miricigale.workflow.stages.inputs import catalog_bands, input_bands
 
 __all__ = [
     "catalog_facts",
@@ -27,11 +26,11 @@ __all__ = [
 ]
 
 
-#: What is not the paper's library, and what that changes, by resource.
+#: What is not the library of Yang et al. 2021, and what that changes, by resource.
 STAND_INS = {
     "ssp.bc03": (
         "Stars: a thinned table of Bruzual & Charlot's populations (2016 version) with a Kroupa IMF "
-        "(inferred) stands in for their files with a Chabrier IMF, which the paper has "
+        "(inferred) stands in for their files with a Chabrier IMF, which Yang et al. 2021 have "
         "(ssp.bc03_user)."
     ),
     "dust.dl07": (
@@ -102,7 +101,7 @@ def exposure_rows(config, forecasts, ceers):
 
 def stand_ins(config, model):
     """
-    Sentences on everything that is not what the paper, or the observatory, has.
+    Sentences on everything that is not what Yang et al. 2021, or the observatory, have.
 
     Parameters
     ----------
@@ -130,6 +129,10 @@ def stand_ins(config, model):
     else:
         noise += f"; residual of flat field and sky: {config.detector.residual}"
     found.append(f"{noise}.")
+    found.append(
+        "Existing bands of the fit: true fluxes with Gaussian noise of the depths in [fit], and 3 % of "
+        "the flux (10 % in IRAC and MIPS bands), fractions of our own. Stars: black bodies."
+    )
     return found
 
 
@@ -168,19 +171,26 @@ def catalog_facts(config, catalog):
     source = f"{options.source}: {resource(options.source).title}" if bundled else (
         f"{Path(options.source).name}, the user's file")  # fmt: skip
     bands = catalog_bands(catalog)
-    fitted = [
-        name for name in bands if Filter.from_name(name).pivot.value <= config.sed.max_wavelength
-    ]
+    fitted, longest = input_bands(catalog, config.sed.max_wavelength)
     told = dict.fromkeys(
         text for name in bands if (text := catalog[name].info.description) is not None
     )
     fluxes = f"{len(bands)} bands; the description in the file: {'; '.join(told)}" if told else (
         f"{len(bands)} bands, as the file gives them, without a description")  # fmt: skip
     prior = config.highres.filter
-    how = (
-        f" (pivot up to {config.sed.max_wavelength:g} µm), "
-        f"{100 * config.sed.catalog_error:g} % error each"
-    )
+    own = [name for name, errors in fitted.items() if errors]
+    guess = f"{100 * config.sed.catalog_error:g} % error"
+    if not own:
+        how = (
+            f" (pivot up to {config.sed.max_wavelength:g} µm), {guess} each, for the catalogue "
+            "gives none"
+        )
+    elif len(own) == len(fitted):
+        how = ", with the catalogue's errors"
+    else:
+        how = f", with the catalogue's errors in {', '.join(own)}; {guess} each in the others"
+    if longest > config.sed.max_wavelength:
+        how += "; the dust's alpha is fitted too"
     if prior in bands:
         how += f"; each SED is scaled to the flux in {prior}"
     facts = [
@@ -247,7 +257,8 @@ def write_exposures(context, report, metrics):
         exposure_rows(config, forecasts, ceers),
         header=EXPOSURE_HEADER,
         caption="Exposures; time is that of all dithers, filling (by the last group) and saturated "
-        "pixels are the highest of a dither",
+        "pixels are the highest of a dither; 'as CEERS' holds for read-out, frames and dithers, not for "
+        "the split of the frames into groups and integrations, which is our own",
         text=2,
     )
     catalog = QTable.read(context.path("catalog.ecsv"))

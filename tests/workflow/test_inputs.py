@@ -1,0 +1,105 @@
+"""Input SEDs: whose errors are used, which bands are fitted, and what is drawn."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+
+from miricigale.fitting import FitResults
+from miricigale.scene import check_catalog
+from miricigale.sed import SEDModel
+from miricigale.utils.exceptions import ConfigError
+from miricigale.workflow import Context, StudyRunner
+from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.stages import study_stages
+from miricigale.workflow.stages.provenance import catalog_facts
+
+STAGES = {stage.name: stage for stage in study_stages()}
+SHORT, LONG = ["nircam.f090w", "nircam.f150w", "nircam.f200w"], ["mips.24"]
+ALPHA = [1.5, 2.5]
+
+
+@pytest.fixture(scope="module")
+def galaxies():
+    """Two galaxies of the model, alike but for the dust's alpha."""
+    rows = {"redshift": [0.8, 0.8], "mass": [1e10, 1e10], "tau": [1.0, 1.0], "age": [1.0, 1.0]}
+    rows |= {"ebv": [0.4, 0.4], "alpha": ALPHA}
+    fluxes = SEDModel.yang2021(agn=False).fluxes(QTable(rows), [*SHORT, *LONG])
+    table = QTable({"id": [1, 2], "redshift": [0.8, 0.8], "profile": ["point", "point"]})
+    table["sky"] = SkyCoord([53.1, 53.101] * u.deg, [-27.8, -27.8] * u.deg)
+    table["half_light_radius"] = [0, 0] * u.arcsec
+    table["sersic_index"] = table["axis_ratio"] = [1.0, 1.0]
+    table["position_angle"] = [0, 0] * u.deg
+    table["mag_f160w"] = [20.0, 20.0]
+    for name in (*SHORT, *LONG):
+        table[name] = fluxes[name]
+    return table
+
+
+def run(folder, table, **sed):
+    """The first stages; returns the fit of the inputs, their truth and what the report says."""
+    table.write(folder / "mine.ecsv")
+    config = StudyConfig.from_dict(
+        {"catalog": {"source": str(folder / "mine.ecsv")}, "fit": {"model_error": 0.02}, "sed": sed}
+    )
+    for name in ("catalog", "seds", "truth"):
+        STAGES[name].function(Context(config, folder, stage=STAGES[name]), "")
+    facts = dict(catalog_facts(config, check_catalog(table)))
+    truth = QTable.read(folder / "truth.ecsv")
+    return config, FitResults.read(folder / "input_seds.fits"), truth, facts["input SEDs fitted to"]
+
+
+def test_without_errors_short_bands_get_five_percent(galaxies, tmp_path):
+    _, results, truth, told = run(tmp_path, galaxies.copy())
+    assert list(results.filters) == SHORT
+    np.testing.assert_allclose(results.flux_err, 0.05 * results.flux)
+    assert "mips.24" not in told
+    assert "5 % error each, for the catalogue gives none" in told
+    # drawn, each its own
+    assert np.all((truth["alpha"] >= 1.5) & (truth["alpha"] <= 2.5))
+    assert truth["alpha"][0] != truth["alpha"][1]
+
+
+def test_the_catalogues_own_errors_are_used_beyond_three_micron_too(galaxies, tmp_path):
+    table = galaxies.copy()
+    for k, name in enumerate((*SHORT[:2], *LONG)):
+        table[f"{name}_err"] = (0.01 + 0.01 * k) * table[name]
+    _, results, truth, told = run(tmp_path, table)
+    assert list(results.filters) == [*SHORT, *LONG]
+    wanted = np.array([0.01, 0.02, 0.05, 0.03])
+    np.testing.assert_allclose(results.flux_err / results.flux, [wanted, wanted], rtol=1e-6)
+    assert "the catalogue's errors in nircam.f090w, nircam.f150w, mips.24; 5 % error each" in told
+    assert "alpha is fitted too" in told
+    # 24 um shows the dust: alpha is that of the fit, and the flux comes back
+    np.testing.assert_array_equal(truth["alpha"], ALPHA)
+
+
+def test_a_flux_whose_error_is_not_positive_is_left_out(galaxies, tmp_path):
+    table = galaxies.copy()
+    table["nircam.f200w_err"] = [-1, 0.01] * table["nircam.f200w"]
+    _, results, _, _ = run(tmp_path, table)
+    assert results.n_bands.tolist() == [2, 3]
+
+
+def test_new_errors_make_other_inputs(galaxies, tmp_path):
+    class Nothing:
+        def checksums(self, name):
+            return {}
+
+    def digest(name, table):
+        path = tmp_path / f"{name}.ecsv"
+        table.write(path)
+        config = StudyConfig.from_dict({"catalog": {"source": str(path)}})
+        runner = StudyRunner(config, tmp_path, study_stages)
+        return runner.digest(STAGES["seds"], "", Nothing())
+
+    table = galaxies.copy()
+    table["nircam.f200w_err"] = 0.01 * table["nircam.f200w"]
+    first, second = digest("plain", galaxies), digest("again", galaxies)
+    assert first == second != digest("errors", table)
+
+
+def test_no_band_is_refused(galaxies, tmp_path):
+    with pytest.raises(ConfigError, match="leaves none of the catalogue's bands"):
+        run(tmp_path, galaxies.copy(), max_wavelength=0.5)
