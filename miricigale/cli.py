@@ -19,6 +19,7 @@ def _parser():
     )
     parser.add_argument("--version", action="store_true", help="print the version and stop")
     parser.add_argument("-v", "--verbose", action="store_true", help="say what is done")
+    parser.set_defaults(stopped=lambda _: "miricigale: stopped")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
 
     run = commands.add_parser("run", help="run a study: a preset (goodss) or a TOML file")
@@ -35,6 +36,7 @@ def _parser():
     )
     run.add_argument("--print-config", action="store_true", help="print the configuration and stop")
     run.add_argument("--no-progress", action="store_true", help="no progress bars")
+    run.set_defaults(call=_run, stopped=lambda _: _GOES_ON)
 
     fit = commands.add_parser("fit", help="fit redshift and AGN fraction of a photometry table")
     fit.add_argument(
@@ -73,25 +75,33 @@ def _parser():
     )
     fit.add_argument("--threads", type=int, default=1, help="threads (0 for all cores)")
     fit.add_argument("--no-progress", action="store_true", help="no progress bar")
+    fit.set_defaults(call=_fit, stopped=_fit_stopped)
 
     _photometry_parser(commands)
 
     plan = commands.add_parser("plan", help="saturation and depth of the CEERS exposures")
     plan.add_argument("--quick", action="store_true", help="of the quick exposures instead")
+    plan.set_defaults(call=_plan)
 
     filters = commands.add_parser("filters", help="list the filters")
     filters.add_argument("pattern", nargs="?", default="", help="part of the name")
+    filters.set_defaults(call=_filters)
 
-    commands.add_parser("compile", help="compile all kernels now, once for each installation")
+    what = "compile all kernels now, once for each installation"
+    compilation = commands.add_parser("compile", help=what)
+    compilation.set_defaults(call=_compile, stopped=lambda _: _GOES_ON)
 
     data = commands.add_parser("data", help="reference data: list, check or add")
     actions = data.add_subparsers(dest="action", metavar="ACTION", required=True)
     listing = actions.add_parser("list", help="what there is, where, its licence, what to cite")
     listing.add_argument("pattern", nargs="?", default="", help="part of the name")
-    actions.add_parser("check", help="whether each file is there and whole")
+    listing.set_defaults(call=_data_list)
+    check = actions.add_parser("check", help="whether each file is there and whole")
+    check.set_defaults(call=_data_check)
     add = actions.add_parser("add", help="bring a file into the data folder; convert a library")
     add.add_argument("name", help="resource name, as 'miricigale data list' has it")
     add.add_argument("path", type=Path, help="file, folder or archive as distributed")
+    add.set_defaults(call=_data_add, stopped=lambda _: "stopped; nothing was changed")
     return parser
 
 
@@ -111,19 +121,19 @@ def _photometry_parser(commands):
     for prefix, what in (("", "image"), ("highres-", "prior")):
         add(
             f"--{prefix}psf-scale",
-            type=float,
+            type=_in("arcsec"),
             metavar="ARCSEC",
             help=f"pixel of the PSF of the {what} (else: its header's, or the {what}'s)",
         )
         add(
             f"--{prefix}psf-angle",
-            type=float,
+            type=_in("deg"),
             metavar="DEG",
             help=f"position angle of the PSF's y axis (else: its header's, or the {what}'s)",
         )
         add(
             f"--{prefix}pa-aper",
-            type=float,
+            type=_in("deg"),
             metavar="DEG",
             help=f"position angle of the detector's y axis ({what}), if the header does not tell",
         )
@@ -140,15 +150,18 @@ def _photometry_parser(commands):
             metavar="PIXELS",
             help=f"subtract a background measured in such boxes of the {what}",
         )
-    add("--no-background", action="store_true", help="fit no constant with the sources")
-    add("--max-shift", type=float, metavar="ARCSEC", help="fit a shift of the image up to this")
+    what = "fit no constant with the sources"
+    add("--no-background", dest="fit_background", action="store_false", help=what)
+    add(
+        "--max-shift",
+        type=_in("arcsec"),
+        metavar="ARCSEC",
+        help="fit a shift of the image up to this",
+    )
     add("--background-order", type=int, default=0, help="order of the background, 0 for a constant")
     add("--offset-order", type=int, help="order of a map of offsets in place of one shift")
-    add(
-        "--second-pass",
-        action="store_true",
-        help="fit what the prior lacks too; last rows of the table",
-    )
+    what = "fit what the prior lacks too; last rows of the table"
+    add("--second-pass", action="store_true", help=what)
     add("--components", type=int, default=1, help="2: poor fits get a point on top of the template")
     add("-o", "--output", type=Path, default=Path("photometry.ecsv"), help="table, ECSV or FITS")
     add("--page", type=Path, help="HTML page (default: beside the table)")
@@ -158,9 +171,29 @@ def _photometry_parser(commands):
     add("--threads", type=int, help="threads (default: all cores)")
     add("--seed", type=int, default=1, help="seed of the empty positions of the page")
     add("--no-progress", action="store_true", help="no progress bar")
+    phot.set_defaults(call=_photometry)
 
 
 _NOISE = ("error", "variance", "inverse-variance", "weight")
+
+
+_GOES_ON = "stopped; the same command goes on from here"
+
+
+def _in(unit):
+    """Type of an option that is a number in a unit."""
+
+    def number(text):
+        import astropy.units as u
+
+        return float(text) * u.Unit(unit)
+
+    return number
+
+
+def _chosen(args, names):
+    """Options by the names of the arguments that they become."""
+    return {name: getattr(args, name) for name in names.split()}
 
 
 def _pair(text):
@@ -177,29 +210,22 @@ def _run(args):
     from miricigale.utils.parallel import process_pool, thread_count
     from miricigale.workflow import load_config, run_study
 
-    overrides = {"run": {}}
-    if args.keep_level1b:
-        overrides["run"]["keep_level1b"] = True
-    if args.threads is not None:
-        overrides["run"]["threads"] = args.threads
-    if args.seed is not None:
-        overrides["run"]["seed"] = args.seed
-    config = load_config(args.config, quick=args.quick, overrides=overrides)
+    options = _chosen(args, "threads seed") | {"keep_level1b": args.keep_level1b or None}
+    given = {name: value for name, value in options.items() if value is not None}
+    config = load_config(args.config, quick=args.quick, overrides={"run": given})
     if args.print_config:
         print(config.to_toml(), end="")
         return 0
     folder = args.output or Path(config.run.name)
     begin = time.monotonic()
     options = {"redo": args.redo, "progress_bar": not args.no_progress}
+    n_processes = thread_count(config.run.threads or None)
     try:
-        with process_pool(thread_count(config.run.threads or None)) as executor:
+        with process_pool(n_processes) as executor:
             report = run_study(config, folder, executor=executor, **options)
     except OtherResultsError as err:
         # in the words of this command
         raise OtherResultsError(err.reason, "--redo to replace it") from err
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on from here", file=sys.stderr)
-        return 130
     print(f"done in {(time.monotonic() - begin) / 60:.1f} min; report: {report}")
     return 0
 
@@ -215,14 +241,8 @@ def _fit(args):
             results = fit_catalogue(
                 args.photometry,
                 args.output,
-                axes=args.axes,
-                redshift=args.redshift,
-                model_error=args.model_error,
-                pairs=args.pairs,
-                flux_unit=args.flux_unit,
+                **_chosen(args, "axes redshift model_error pairs flux_unit chunk_rows resume"),
                 hdu=int(args.hdu) if (args.hdu or "").isdigit() else args.hdu,
-                chunk_rows=args.chunk_rows,
-                resume=args.resume,
                 executor=executor if n_threads > 1 else None,
                 progress_bar=not args.no_progress,
             )
@@ -231,19 +251,17 @@ def _fit(args):
     except OtherResultsError as err:
         # in the words of this command
         raise OtherResultsError(err.reason, "--no-resume to replace them") from err
-    except KeyboardInterrupt:
-        n_parts = len(list(args.output.glob("part-*.fits")))
-        kept = f"{n_parts} finished parts are in {args.output}/"
-        how = "the same command, without --no-resume," if not args.resume else "the same command"
-        print(f"stopped; {kept}; {how} goes on from here", file=sys.stderr)
-        return 130
     print(f"{results!r}; all in {table}")
     return 0
 
 
-def _photometry(args):
-    import astropy.units as u
+def _fit_stopped(args):
+    n_parts = len(list(args.output.glob("part-*.fits")))
+    how = "the same command, without --no-resume," if not args.resume else "the same command"
+    return f"stopped; {n_parts} finished parts are in {args.output}/; {how} goes on from here"
 
+
+def _photometry(args):
     from miricigale.photometry import MosaicFile
     from miricigale.workflow.photometry import measure_files
 
@@ -251,43 +269,20 @@ def _photometry(args):
     if len(paths) != 2 or (args.positional and len(args.positional) != 2):
         msg = "wanted are --image and --highres, or the two files without options"
         raise ValueError(msg)
-
-    def described(path, prefix, filter_):
-        names = (*(kind.replace("-", "_") for kind in _NOISE), "unit", "zero_point")
-        names += ("background_box",)
-        options = {name: getattr(args, f"{prefix}{name}") for name in names}
-        return MosaicFile(path, filter=filter_, **options)
-
-    def quantity(value, unit=u.arcsec):
-        return None if value is None else value * unit
-
+    known = [*(kind.replace("-", "_") for kind in _NOISE), "filter", "unit", "zero_point"]
+    images = [
+        MosaicFile(path, **{n: getattr(args, prefix + n) for n in (*known, "background_box")})
+        for path, prefix in zip(paths, ("", "highres_"), strict=True)
+    ]
+    psfs = "psf psf_scale psf_angle pa_aper"
     page = args.page or args.output.with_suffix(".html")
     table = measure_files(
-        described(paths[0], "", args.filter),
-        described(paths[1], "highres_", args.highres_filter),
-        segmentation=args.segmentation,
-        catalog=args.catalog,
-        kernel=args.kernel,
-        psf=args.psf,
-        highres_psf=args.highres_psf,
-        psf_scale=quantity(args.psf_scale),
-        highres_psf_scale=quantity(args.highres_psf_scale),
-        psf_angle=quantity(args.psf_angle, u.deg),
-        highres_psf_angle=quantity(args.highres_psf_angle, u.deg),
-        pa_aper=quantity(args.pa_aper, u.deg),
-        highres_pa_aper=quantity(args.highres_pa_aper, u.deg),
-        fit_background=not args.no_background,
-        max_shift=quantity(args.max_shift),
-        background_order=args.background_order,
-        offset_order=args.offset_order,
-        second_pass=args.second_pass,
-        components=args.components,
-        output=args.output,
+        *images,
+        **_chosen(args, f"segmentation catalog kernel {psfs}"),
+        **{f"highres_{name}": getattr(args, f"highres_{name}") for name in psfs.split()},
+        **_chosen(args, "fit_background max_shift background_order offset_order second_pass"),
+        **_chosen(args, "components output model residual overwrite seed"),
         page=page,
-        model=args.model,
-        residual=args.residual,
-        overwrite=args.overwrite,
-        seed=args.seed,
         n_threads=args.threads,
         progress_bar=not args.no_progress,
     )
@@ -307,15 +302,11 @@ def _compile(args):
     from miricigale.workflow.warmup import JOBS, compile_apart, describe_job, is_compiled
 
     names = [name for name in JOBS if not is_compiled(name)]
-    try:
-        with thread_pool(thread_count()) as executor:
-            jobs = [executor.submit(compile_apart, name) for name in names]
-            for name in names:
-                print(describe_job(name), flush=True)
-            kept = [job.result() for job in jobs]
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on from here", file=sys.stderr)
-        return 130
+    with thread_pool(thread_count()) as executor:
+        jobs = [executor.submit(compile_apart, name) for name in names]
+        for name in names:
+            print(describe_job(name), flush=True)
+        kept = [job.result() for job in jobs]
     if not all(kept):
         print("miricigale: compiled code cannot be kept; set NUMBA_CACHE_DIR", file=sys.stderr)
         return 1
@@ -332,10 +323,6 @@ def _filters(args):
         return 1
     table.pprint_all()
     return 0
-
-
-def _data(args):
-    return {"list": _data_list, "check": _data_check, "add": _data_add}[args.action](args)
 
 
 def _data_list(args):
@@ -385,22 +372,11 @@ def _data_add(args):
     from miricigale.refdata import add_resource
     from miricigale.sed.libraries import READERS, add_library
 
-    try:
-        if args.name in READERS:
-            print(add_library(args.name, args.path, progress_bar=sys.stderr.isatty()))
-        else:
-            print(add_resource(args.name, args.path))
-    except KeyboardInterrupt:
-        print("stopped; nothing was changed", file=sys.stderr)
-        return 130
+    if args.name in READERS:
+        print(add_library(args.name, args.path, progress_bar=sys.stderr.isatty()))
+    else:
+        print(add_resource(args.name, args.path))
     return 0
-
-
-def _input_errors():
-    """Errors that tell of input that cannot be used."""
-    from astropy.units import UnitsError
-
-    return (ValueError, KeyError, OSError, ImportError, UnitsError)
 
 
 def main(argv=None):
@@ -437,31 +413,22 @@ def main(argv=None):
     if args.command is None:
         parser.print_help()
         return 2
-    commands = {
-        "run": _run,
-        "fit": _fit,
-        "photometry": _photometry,
-        "plan": _plan,
-        "compile": _compile,
-        "filters": _filters,
-        "data": _data,
-    }
     try:
-        return commands[args.command](args)
+        return args.call(args)
     except KeyboardInterrupt:
-        print("miricigale: stopped", file=sys.stderr)
+        print(args.stopped(args), file=sys.stderr)
         return 130
     except Exception as err:
-        # one clear sentence; the traceback is for --verbose
-        if args.verbose or not isinstance(err, _input_errors()):
+        from astropy.units import UnitsError
+
+        # one clear sentence for input that cannot be used; the traceback is for --verbose
+        expected = (ValueError, KeyError, OSError, ImportError, UnitsError)
+        if args.verbose or not isinstance(err, expected):
             raise
         message = err.args[0] if isinstance(err, KeyError) and err.args else err
         # a bare key says nothing to a reader
-        kind = (
-            f"{type(err).__name__} "
-            if isinstance(err, KeyError) and " " not in str(message)
-            else ""
-        )
+        bare = isinstance(err, KeyError) and " " not in str(message)
+        kind = f"{type(err).__name__} " if bare else ""
         where = "".join(f" ({note})" for note in getattr(err, "__notes__", ()))
         print(f"miricigale: {kind}{' '.join(str(message).split())}{where}", file=sys.stderr)
         return 2
