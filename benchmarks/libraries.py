@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from miricigale.sed.libraries import LibraryTable, open_library, verify_library, write_library
+from miricigale.refdata.libraries import LibraryTable, open_library, verify_library, write_library
 
 AXES = {
     "tau97": (3, 5, 7, 9, 11),

@@ -354,9 +354,8 @@ def _data_list(args):
 
 def _data_check(args):
     from miricigale.refdata import check_resources
-    from miricigale.sed.libraries import openers
 
-    rows = check_resources(openers())
+    rows = check_resources()
     length = max(len(row.name) for row in rows)
     for row in rows:
         print(f"{row.name:{length}s}  {row.state:14s}  {row.where}")
@@ -370,7 +369,7 @@ def _data_check(args):
 
 def _data_add(args):
     from miricigale.refdata import add_resource
-    from miricigale.sed.libraries import READERS, add_library
+    from miricigale.refdata.libraries import READERS, add_library
 
     if args.name in READERS:
         print(add_library(args.name, args.path, progress_bar=sys.stderr.isatty()))

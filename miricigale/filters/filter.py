@@ -8,12 +8,15 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.filters import _core
-from miricigale.filters.library import FILTERS, load_curve
+from miricigale.filters.library import FILTERS, full_name, load_curve
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import unpacked_size
-from miricigale.utils.units import FNU, WAVE, frozen_array, frozen_quantity, to_array
+from miricigale.utils.units import FNU, WAVE, Frozen, frozen_array, frozen_quantity, to_array
 
 __all__ = ["Filter"]
+
+#: Version of the band averages: raised when the same curve gives other numbers.
+VERSION = 1
 
 #: Share of a band that a spectrum may leave uncovered.
 UNCOVERED = 1e-4
@@ -37,7 +40,7 @@ def _padded(wave, throughput):
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class Filter:
+class Filter(Frozen):
     """
     A passband: the response to photons against wavelength.
 
@@ -102,8 +105,8 @@ class Filter:
         Parameters
         ----------
         name : str
-            One of `names`, such as ``"miri.f770w"``, or ``"sedpy."`` and the name of any
-            curve of astro-sedpy.
+            One of `names`, such as ``"miri.f770w"``, also written ``"MIRI.F770W"`` or ``"F770W"``,
+            or ``"sedpy."`` and the name of any curve of astro-sedpy.
 
         Returns
         -------
@@ -115,7 +118,7 @@ class Filter:
         KeyError
             If there is no such filter; the message lists the known ones.
         """
-        return _from_name(str(name))
+        return _from_name(full_name(name))
 
     @staticmethod
     def names():

@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.filters.filter import UNCOVERED, Filter, check_wave, spectrum_arrays
+from miricigale.filters.library import full_name
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.units import FNU, WAVE
 
@@ -70,7 +71,8 @@ class FilterSet:
         return iter(self.filters)
 
     def __contains__(self, name):
-        return getattr(name, "name", name) in self.names
+        name = getattr(name, "name", name)
+        return name in self.names or (isinstance(name, str) and full_name(name) in self.names)
 
     def __getitem__(self, key):
         """The filter of a name or number; for a slice or a list of names, a set."""
@@ -79,9 +81,11 @@ class FilterSet:
         if isinstance(key, (list, tuple)):
             return FilterSet([self[name] for name in key])
         if isinstance(key, str):
-            if key not in self.names:
-                raise unknown_name("filter in this set", key, self.names)
-            return self.filters[self.names.index(key)]
+            known = self.names
+            name = key if key in known else full_name(key)
+            if name not in known:
+                raise unknown_name("filter in this set", key, known)
+            return self.filters[known.index(name)]
         return self.filters[key]
 
     def __repr__(self):

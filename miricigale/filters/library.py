@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.refdata import Registry, citations
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import DataError, unknown_name
 
-__all__ = ["FILTERS", "load_curve"]
+__all__ = ["FILTERS", "full_name", "load_curve"]
 
 _RESOURCE = "filters.sedpy"
 
@@ -97,6 +97,25 @@ def _load(name):
     return wave, throughput, meta
 
 
+def full_name(name):
+    """
+    Name in the library of a filter that may be written ``MIRI.F770W`` or ``F770W``.
+
+    Parameters
+    ----------
+    name : str
+        In upper or lower case, with its instrument or without where that leaves no choice.
+
+    Returns
+    -------
+    name : str
+        As it came if the library has nothing of the kind.
+    """
+    lower = str(name).lower()
+    found = [one for one in FILTERS.names() if lower in (one, one.partition(".")[2])]
+    return found[0] if len(found) == 1 else str(name)
+
+
 def load_curve(name):
     """
     Curve and meta of a filter of the library.
@@ -107,10 +126,9 @@ def load_curve(name):
         If there is no such filter.
     """
     if name.startswith(SEDPY):
-        known = sorted(path.stem for path in curve_folder().glob("*.par"))
+        known = [path.stem for path in curve_folder().glob("*.par")]
         if name.removeprefix(SEDPY) not in known:
-            msg = f"no curve {name.removeprefix(SEDPY)!r} in astro-sedpy; known: {', '.join(known)}"
-            raise KeyError(msg)
+            raise unknown_name("curve of astro-sedpy", name.removeprefix(SEDPY), known)
         return _load(name)
     return FILTERS.get(name)
 

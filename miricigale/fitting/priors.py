@@ -1,13 +1,11 @@
 """Priors on grid parameters: a product over parameters, in weights of the nodes."""
 
-import itertools
 from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
 
 from miricigale.fitting.posterior import cell_edges
-from miricigale.sed import COMPONENTS
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.units import to_array
 
@@ -97,7 +95,7 @@ def grid_priors(grid, priors=None, *, prior_f="grid"):
         if prior_f == "uniform" and "frac_agn" not in priors:
             priors["frac_agn"] = np.diff(cell_edges(f, (0.0, 1.0)))
         axes["frac_agn"] = _axis("frac_agn", f, 1, "frac_agn", priors, bounds=(0.0, 1.0))
-    bounds = _bounds(grid)
+    bounds = grid.bounds
     galaxy = np.ones(grid.dust_luminosity.size)
     for name in grid.galaxy_parameters.colnames:
         galaxy *= _add_axis(axes, name, grid.galaxy_parameters[name], "galaxy", priors, bounds)
@@ -119,17 +117,6 @@ def grid_priors(grid, priors=None, *, prior_f="grid"):
         raise argument_error("priors", "positive for at least one model", "0 for all")
     frac = axes["frac_agn"].weights if agn.size else np.ones(1)
     return GridPriors(axes, galaxy, agn, frac, axes["redshift"].weights)
-
-
-def _bounds(grid):
-    """Limits of the parameters of the components that the grid was made of: name to (low, high)."""
-    out = {}
-    for text in grid.meta.get("components", ()):
-        name = text.partition(": ")[2].partition(" (")[0]
-        if name in COMPONENTS:
-            declared = COMPONENTS.get(name).declared()
-            out.update({key: parameter.bounds for key, parameter in declared.items()})
-    return out
 
 
 def _add_axis(axes, name, column, kind, priors, bounds, rows=None, nodes=None):
@@ -191,44 +178,11 @@ def _density(function, values, argument):
 
 
 def _inert(grid):
-    """
-    Find the parameters without effect in rows that stand for several models.
-
-    The grid keeps the mean of the values that were merged. Returned is, by name, the rows and
-    the values of the whole axis.
-    """
+    """Rows in which a parameter has no effect, and all values of its axis: by name."""
     found = {}
-    nodes = {
-        name: np.unique(grid.meta.get("axes", {}).get(name, []))
-        for name in grid.agn_parameters.colnames
-    }
-    many = [name for name in nodes if nodes[name].size > 1]
-    table = {
-        name: np.asarray(getattr(grid.agn_parameters[name], "value", grid.agn_parameters[name]))
-        for name in many
-    }
-    for row in np.flatnonzero(grid.agn_multiplicity > 1):
-        merged = [n for n in many if np.isclose(table[n][row], nodes[n].mean())]
-        # another row that differs in this parameter alone shows that it has an effect
-        for name in list(merged):
-            same = np.ones(len(grid.agn_parameters), bool)
-            for other in many:
-                if other != name:
-                    same &= table[other] == table[other][row]
-            if np.count_nonzero(same) > 1:
-                merged.remove(name)
-        count = grid.agn_multiplicity[row]
-        for size in range(1, len(merged) + 1):
-            names = next(
-                (
-                    c
-                    for c in itertools.combinations(merged, size)
-                    if np.prod([nodes[n].size for n in c]) == count
-                ),
-                None,
-            )
-            if names:
-                for name in names:
-                    found.setdefault(name, ([], nodes[name]))[0].append(row)
-                break
+    for row, names in enumerate(grid.inert):
+        for name in names:
+            nodes = np.unique(grid.axes.get(name, []))
+            if nodes.size > 1:
+                found.setdefault(name, ([], nodes))[0].append(row)
     return found

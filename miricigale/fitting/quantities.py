@@ -354,7 +354,7 @@ class OtherFraction:
     @classmethod
     def of_grid(cls, grid):
         """Of a `~miricigale.sed.ModelGrid`; None if it has no AGN or not the quantities needed."""
-        by_dust = grid.meta.get("frac_agn_definition", "dust") == "dust"
+        by_dust = grid.frac_agn_definition == "dust"
         name = "frac_agn_ir" if by_dust else "frac_agn_dust"
         of_galaxy = "ir_luminosity" if by_dust else "dust_luminosity"
         of_agn = "ir_luminosity" if by_dust else "agn_power"

@@ -17,9 +17,6 @@ __all__ = [
     "rest_spectra",
 ]
 
-#: What a model and the grid made from it have in common.
-_COMMON = ("components", "options", "imf", "frac_agn_definition", "cosmology")
-
 
 def check_model(model, grid):
     """
@@ -30,11 +27,11 @@ def check_model(model, grid):
     ValueError
         If components, options or definitions differ.
     """
-    meta = model.meta
-    for name in _COMMON:
-        if name in grid.meta and meta.get(name) != grid.meta[name]:
+    recipe = model.recipe
+    for name, value in grid.recipe.items():
+        if recipe.get(name) != value:
             raise argument_error(
-                "model", f"the one of the grid ({name}: {grid.meta[name]})", f"{meta.get(name)}"
+                "model", f"the one of the grid ({name}: {value})", f"{recipe.get(name)}"
             )
 
 

@@ -38,29 +38,24 @@ class ResourceState(NamedTuple):
         return self.state in ("wrong checksum", "damaged")
 
 
-def check_resources(openers=None):
+def check_resources():
     """
     State of every resource, from its whole content.
 
     Files are compared with the checksum of the record in ``resources.toml``, or with that of
-    the record that was written beside them when they were added.
-
-    Parameters
-    ----------
-    openers : dict of str to callable, optional
-        By resource: called with the path, raises
-        `~miricigale.utils.exceptions.DataError` if the file is not whole (those of
-        libraries: `miricigale.sed.libraries.openers`).
+    the record that was written beside them when they were added; libraries are read as a whole.
 
     Returns
     -------
     rows : list of `ResourceState`
         One for each record.
     """
-    return [_state(record, (openers or {}).get(record.name)) for record in resources().values()]
+    return [_state(record) for record in resources().values()]
 
 
-def _state(record, opener):
+def _state(record):
+    from miricigale.refdata.libraries import READERS, verify_library
+
     name = record.name
     if not record.file:
         return ResourceState(name, "from package", record.source)
@@ -70,8 +65,8 @@ def _state(record, opener):
     where = str(path)
     try:
         beside = stored_record(path)
-        if opener is not None:
-            opener(path)
+        if name in READERS:
+            verify_library(path, name)
         wanted = record.sha256 or (beside or {}).get("sha256", "")
         if not wanted or not path.is_file():
             return ResourceState(name, "unchecked", where, "no record of its checksum")

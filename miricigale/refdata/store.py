@@ -3,56 +3,31 @@
 import contextlib
 import json
 import os
-import secrets
 import shutil
 from pathlib import Path
 
 from miricigale.refdata.locate import data_folder, file_sha256, record_path
 from miricigale.refdata.registry import resource
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import unpacked_size, writing
+from miricigale.utils.files import unpacked_size
+from miricigale.utils.store import PARTIAL, replacing
 
 try:
     import fcntl
 except ImportError:  # no such locks on Windows
     fcntl = None
 
-__all__ = ["add_resource", "install", "locked", "partial_path"]
-
-_PARTIAL = ".partial"
-
-
-def partial_path(target):
-    """
-    A new name beside a file, under which it is written before it gets its own.
-
-    Parameters
-    ----------
-    target : `pathlib.Path`
-        The file or folder that is to be.
-
-    Returns
-    -------
-    path : `pathlib.Path`
-        Hidden, and not the name of any resource.
-    """
-    token = f"{os.getpid()}-{secrets.token_hex(4)}"
-    return target.with_name(f".{target.name.lstrip('.')}.{token}{_PARTIAL}")
+__all__ = ["add_resource", "installing"]
 
 
 @contextlib.contextmanager
-def locked(target):
+def _locked(target):
     """
     Keep other processes from writing the same file or folder; wait if one does.
 
     What an interrupted process left half written is removed. The lock is advisory
     (``flock``); where the system has none two processes that add the same resource at the
     same moment may leave a record that does not fit the file, which `check_resources` tells.
-
-    Parameters
-    ----------
-    target : `pathlib.Path`
-        The file or folder; its parent is made.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     with open(target.with_name(f".{target.name}.lock"), "ab") as handle:
@@ -65,7 +40,7 @@ def locked(target):
             held = False
         if held:
             # nobody else is writing: these are leftovers
-            for path in target.parent.glob(f".{target.name}.*{_PARTIAL}"):
+            for path in target.parent.glob(f"{PARTIAL}*-{target.name}*"):
                 _remove(path)
         yield
 
@@ -77,46 +52,57 @@ def _remove(path):
         path.unlink(missing_ok=True)
 
 
-def install(partial, target, record=None):
+@contextlib.contextmanager
+def installing(target):
     """
-    Give what was written under a partial name its own, with a record beside it.
+    Write a file of the data folder and a record beside it; other processes wait.
 
-    To be called while `locked`. Whoever looks finds the old file or the new one whole; if
-    the process dies in between, a file without record ("unchecked").
+    Whoever looks finds the old file or the new one whole; if the process dies in between, a
+    file without record ("unchecked").
 
     Parameters
     ----------
-    partial, target : `pathlib.Path`
-        What was written, and where it is to be found.
-    record : dict, optional
-        Plain values, kept as JSON in ``<file>.json``; checksum, size and time of the file
-        are added.
+    target : `pathlib.Path`
+        Where it is to be found; its folder is made.
+
+    Yields
+    ------
+    partial : `pathlib.Path`
+        What to write.
+    record : dict
+        To be filled with plain values, kept as JSON in ``<file>.json``; checksum, size and time
+        of the file are added. Left empty there is no record.
     """
-    beside = record_path(target)
-    new = partial_path(beside)
-    try:
-        if record is not None:
+    beside, record = record_path(target), {}
+    with _locked(target), contextlib.ExitStack() as last, replacing(target) as partial:
+        yield partial, record
+        # before anything of the old one goes
+        with open(partial, "rb+") as handle:
+            os.fsync(handle.fileno())
+        if record:
             status = partial.stat()
             known = {
                 "sha256": file_sha256(partial),
                 "size": status.st_size,
                 "mtime_ns": status.st_mtime_ns,
             }
-            with writing(beside):
-                new.write_text(json.dumps(known | record, indent=1) + "\n", encoding="utf-8")
+            new = last.enter_context(replacing(beside))
+            new.write_text(json.dumps(known | record, indent=1) + "\n", encoding="utf-8")
         beside.unlink(missing_ok=True)
-        if target.is_dir():
-            # a folder cannot be replaced in one step
-            old = partial_path(target)
-            os.replace(target, old)
-            os.replace(partial, target)
+
+
+def _replace_folder(path, target):
+    """Copy a folder to the place of another, which cannot be replaced in one step."""
+    new, old = (target.with_name(f"{PARTIAL}{word}-{target.name}") for word in ("new", "old"))
+    with _locked(target):
+        try:
+            shutil.copytree(path, new)
+            if target.is_dir():
+                os.replace(target, old)
+            os.replace(new, target)
             _remove(old)
-        else:
-            os.replace(partial, target)
-        if record is not None:
-            os.replace(new, beside)
-    finally:
-        _remove(new)
+        finally:
+            _remove(new)
 
 
 def add_resource(name, path):
@@ -124,7 +110,7 @@ def add_resource(name, path):
     Copy a file or folder that the user brings into the data folder.
 
     Libraries of spectra are converted, not copied: see
-    `miricigale.sed.libraries.add_library`.
+    `miricigale.refdata.libraries.add_library`.
 
     Parameters
     ----------
@@ -159,14 +145,9 @@ def add_resource(name, path):
     # a copy has no holes
     unpacked_size(path)
     target = data_folder() / record.file
-    with locked(target):
-        partial = partial_path(target)
-        try:
-            if path.is_dir():
-                shutil.copytree(path, partial)
-            else:
-                shutil.copyfile(path, partial)
-            install(partial, target)
-        finally:
-            _remove(partial)
+    if path.is_dir():
+        _replace_folder(path, target)
+    else:
+        with installing(target) as (partial, _):
+            shutil.copyfile(path, partial)
     return target

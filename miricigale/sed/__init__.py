@@ -15,7 +15,6 @@ __getattr__, __dir__, __all__ = lazy_names(
         "derived": ("DERIVED", "Derived"),
         "foreground": ("band_extinction", "deredden"),
         "grid": ("ModelGrid",),
-        "libraries": ("add_library",),
         "model": ("ModelSpectra", "SEDModel"),
         "parameter": ("Parameter",),
         # with all components, which make themselves known

@@ -11,6 +11,10 @@ from miricigale.sed.component import ROLES
 
 __all__ = ["COLOURS", "Attenuated", "Chain", "Galaxy", "Stars"]
 
+#: Version of the numbers that follow from the components: raised when the chain, the derived
+#: quantities or the grids change, so that grids kept on the disk are made anew.
+VERSION = 1
+
 INFRARED = (3.0, 1000.0)  # um
 SIX = 6.0  # um
 VISUAL = 0.55  # um, where A_V and the light-weighted age are taken

@@ -61,7 +61,8 @@ class Component:
     A subclass gives ``name``, ``role`` (one of `ROLES`), ``reference`` (what to cite) and
     declares its parameters as `~miricigale.sed.Parameter` in the class body. Numbers go in
     and arrays come out; units are the model's business. Choices that are names and not
-    numbers, such as a law, are `options`: fixed when the component is made.
+    numbers, such as a law, are `options`: fixed when the component is made. A change of the code
+    that changes the spectra raises ``version``, so that grids kept on the disk are made anew.
 
     Parameters
     ----------
@@ -81,6 +82,13 @@ class Component:
     role = ""
     reference = ""
     resource = None
+
+    #: Version of the numbers that this class is responsible for; kept grids of others are not
+    #: taken. A subclass that states its own has it besides those of its bases.
+    version = 1
+
+    #: Packages whose numbers the component takes over, such as curves of extinction.
+    packages = ()
 
     #: Parameters of other components that this one looks at.
     others = ()

@@ -1,22 +1,24 @@
-"""Factorised flux tables of a grid of models: what the grid fitter eats."""
+"""Factorised flux tables of a grid of models, as the grid fitter takes them."""
 
-import json
+import functools
 from dataclasses import dataclass, field
-from functools import cached_property
-from pathlib import Path
 
 import astropy.units as u
 import numpy as np
-from astropy.io import fits
 from astropy.table import QTable
 
-from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import open_fits, writing
-from miricigale.utils.units import frozen_array
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.store import open_parts, write_parts
+from miricigale.utils.unified import register, unified_read, unified_write
+from miricigale.utils.units import Frozen, frozen_array
 
-__all__ = ["ModelGrid"]
+__all__ = ["DEFINITIONS", "ModelGrid"]
 
-_FORMAT = "miricigale-modelgrid-2"
+#: What the AGN fraction is a fraction of.
+DEFINITIONS = ("dust", "3-1000um")
+
+#: Layouts of files; in the second the facts that decide stood in the meta.
+_LAYOUTS = ("miricigale-modelgrid-3", "miricigale-modelgrid-2")
 _TABLES = (
     "galaxy_parameters",
     "agn_parameters",
@@ -25,18 +27,21 @@ _TABLES = (
     "agn_properties",
 )
 _ARRAYS = {
-    "redshift": ("", float),
-    "galaxy": ("uJy / solMass", float),
-    "agn": ("uJy / W", float),
-    "dust_luminosity": ("W / solMass", float),
-    "frac_agn": ("", float),
-    "allowed": ("", bool),
-    "agn_multiplicity": ("", np.int64),
+    "redshift": (u.one, float),
+    "galaxy": (u.uJy / u.Msun, float),
+    "agn": (u.uJy / u.W, float),
+    "dust_luminosity": (u.W / u.Msun, float),
+    "frac_agn": (u.one, float),
+    "allowed": (u.one, bool),
+    "agn_multiplicity": (u.one, np.int64),
 }
+#: What a model and the grids that it made have in common.
+RECIPE = ("components", "options", "imf", "frac_agn_definition", "cosmology")
+_FACTS = ("axes", "inert", "bounds", "frac_agn_definition", "recipe")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ModelGrid:
+class ModelGrid(Frozen):
     """
     Band fluxes of a grid of galaxy and AGN models, kept as two factors.
 
@@ -60,8 +65,7 @@ class ModelGrid:
     dust_luminosity : `~numpy.ndarray`, shape (nG,)
         Luminosity that the AGN fraction refers to, in W for each solar mass formed: the
         dust luminosity of the galaxy in the definition ``"dust"``, its 3-1000 um light in
-        the definition ``"3-1000um"`` (``meta["frac_agn_definition"]``); AGN power is the
-        same quantity of the AGN.
+        the definition ``"3-1000um"``; AGN power is the same quantity of the AGN.
     frac_agn : `~numpy.ndarray`, shape (nf,)
         AGN fractions in [0, 1), ascending.
     allowed : `~numpy.ndarray` of bool, shape (nz, nG)
@@ -81,7 +85,18 @@ class ModelGrid:
         How many identical models of the grid each row stands for: without polar dust
         the temperatures of that dust make no difference, and are evaluated once.
     meta : dict, optional
-        Provenance: libraries, citations, cosmology, definitions.
+        Provenance, for people: libraries, citations, cosmology.
+    axes : dict of str to `~numpy.ndarray`, optional
+        Values of the axes that the grid was made with, in the units of the parameters.
+    inert : tuple of tuple of str, length nA, optional
+        Parameters that make no difference to each AGN model; its row in ``agn_parameters`` holds
+        the mean of the values that were merged.
+    bounds : dict of str to tuple of float, optional
+        Smallest and largest value that the model allows for its parameters, in their units.
+    frac_agn_definition : {"dust", "3-1000um"}, optional
+        What the AGN fraction is a fraction of; see ``dust_luminosity``.
+    recipe : dict, optional
+        `SEDModel.recipe` of the model that made the grid; empty if that is unknown.
 
     Raises
     ------
@@ -103,16 +118,35 @@ class ModelGrid:
     agn_multiplicity: np.ndarray
     meta: dict = field(default_factory=dict)
     galaxy_shape: QTable | None = None
+    axes: dict = field(default_factory=dict)
+    inert: tuple = ()
+    bounds: dict = field(default_factory=dict)
+    frac_agn_definition: str = "dust"
+    recipe: dict = field(default_factory=dict)
+
+    io_module = __name__
 
     def __post_init__(self):
         object.__setattr__(self, "filters", tuple(str(name) for name in self.filters))
-        object.__setattr__(self, "meta", dict(self.meta))
+        for name in ("meta", "recipe"):
+            object.__setattr__(self, name, dict(getattr(self, name)))
+        axes = {name: frozen_array(values, float) for name, values in self.axes.items()}
+        object.__setattr__(self, "axes", axes)
+        bounds = {name: (float(low), float(high)) for name, (low, high) in self.bounds.items()}
+        object.__setattr__(self, "bounds", bounds)
         if self.galaxy_shape is None:
             object.__setattr__(self, "galaxy_shape", QTable())
         for name, (_, dtype) in _ARRAYS.items():
             object.__setattr__(self, name, frozen_array(getattr(self, name), dtype))
         n_z, n_b = self.redshift.size, len(self.filters)
         n_g, n_a = self.dust_luminosity.size, self.agn_multiplicity.size
+        inert = tuple(map(tuple, self.inert)) or ((),) * n_a
+        object.__setattr__(self, "inert", inert)
+        if len(inert) != n_a:
+            raise argument_error("inert", f"names for each of {n_a} AGN models", len(inert))
+        if self.frac_agn_definition not in DEFINITIONS:
+            wanted = f"one of {DEFINITIONS}"
+            raise argument_error("frac_agn_definition", wanted, repr(self.frac_agn_definition))
         shapes = {
             "redshift": (n_z,),
             "galaxy": (n_z, n_g, n_b),
@@ -157,7 +191,7 @@ class ModelGrid:
         """Number of AGN models nA (0: a grid without AGN)."""
         return self.agn_multiplicity.size
 
-    @cached_property
+    @functools.cached_property
     def n_models(self):
         """
         Number of models of the grid, identical ones counted as often as they occur.
@@ -167,7 +201,7 @@ class ModelGrid:
         """
         return int(self.redshift.size * self.n_galaxies * self._agn_count)
 
-    @cached_property
+    @functools.cached_property
     def n_allowed(self):
         """Number of models with galaxies younger than the universe."""
         return int(np.count_nonzero(self.allowed) * self._agn_count)
@@ -197,7 +231,22 @@ class ModelGrid:
             out = out + power[..., np.newaxis] * self.agn[z, agn]
         return out
 
-    def write(self, path, *, overwrite=False):
+    read = unified_read(
+        """
+        Read a grid that `write` made.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If the file is missing, something else or truncated.
+        """
+    )
+    write = unified_write(
         """
         Write the grid to a FITS file.
 
@@ -208,69 +257,7 @@ class ModelGrid:
         overwrite : bool, optional
             Whether a file that is there is replaced.
         """
-        header = fits.Header({"FORMAT": _FORMAT})
-        hdus = [fits.PrimaryHDU(header=header)]
-        described = {
-            table: {
-                c: getattr(self, table)[c].info.description for c in getattr(self, table).colnames
-            }
-            for table in _TABLES
-        }
-        text = {"filters": list(self.filters), "meta": self.meta, "descriptions": described}
-        hdus.append(_text_hdu(json.dumps(text, default=str)))
-        for name, (unit, dtype) in _ARRAYS.items():
-            array = getattr(self, name)
-            if array.size == 0:
-                continue
-            hdu = fits.ImageHDU(array.astype(np.uint8) if dtype is bool else array, name=name)
-            if unit:
-                hdu.header["BUNIT"] = unit
-            hdus.append(hdu)
-        for name in _TABLES:
-            hdu = fits.table_to_hdu(_plain(getattr(self, name)))
-            hdu.name = name
-            hdus.append(hdu)
-        with writing(path):
-            fits.HDUList(hdus).writeto(Path(path), overwrite=overwrite, output_verify="exception")
-
-    @classmethod
-    def read(cls, path):
-        """
-        Read a grid that `write` made.
-
-        Raises
-        ------
-        `~miricigale.utils.exceptions.DataError`
-            If the file is missing, something else or truncated.
-        """
-        try:
-            with open_fits(path, wanted="a model grid", memmap=False) as hdus:
-                if hdus[0].header.get("FORMAT") != _FORMAT:
-                    msg = f"{path} is not a model grid (no FORMAT = {_FORMAT!r} in its header)"
-                    raise DataError(msg)
-                text = json.loads(bytes(np.asarray(hdus["TEXT"].data)).decode())
-                values = {name: hdus[name].data for name in _ARRAYS if name in hdus}
-                tables = {
-                    name: _restore(QTable.read(hdus[name]), text["descriptions"][name])
-                    for name in _TABLES
-                }
-        except (KeyError, ValueError, TypeError) as err:
-            msg = f"{path} is not a complete model grid: {err}"
-            raise DataError(msg) from err
-        missing = [n for n in _ARRAYS if n not in values and n not in ("agn", "agn_multiplicity")]
-        if missing:
-            msg = f"{path} is not a complete model grid: no {', '.join(missing)}"
-            raise DataError(msg)
-        for table in tables.values():
-            table.meta.clear()
-        n_z, n_b = len(values["redshift"]), len(text["filters"])
-        values.setdefault("agn", np.zeros((n_z, 0, n_b)))
-        values.setdefault("agn_multiplicity", np.zeros(0, int))
-        try:
-            return cls(tuple(text["filters"]), **values, **tables, meta=text["meta"])
-        except ValueError as err:
-            msg = f"{path} is not a sound model grid: {err}"
-            raise DataError(msg) from err
+    )
 
     def __repr__(self):
         return (
@@ -280,23 +267,66 @@ class ModelGrid:
         )
 
 
-def _text_hdu(text):
-    data = np.frombuffer(text.encode(), dtype=np.uint8)
-    return fits.ImageHDU(data, name="TEXT")
+def _write(grid, path, *, overwrite=False):
+    tables = {name: getattr(grid, name) for name in _TABLES}
+    text = {name: getattr(grid, name) for name in ("filters", "meta", *_FACTS)}
+    text["descriptions"] = {
+        name: {column: table[column].info.description for column in table.colnames}
+        for name, table in tables.items()
+    }
+    arrays = {}
+    for name, (unit, _) in _ARRAYS.items():
+        array = getattr(grid, name)
+        arrays[name] = array if unit == u.one else u.Quantity(array, unit, copy=False)
+    write_parts(path, _LAYOUTS[0], text=text, arrays=arrays, tables=tables, overwrite=overwrite)
 
 
-def _restore(table, descriptions):
+def _read(path):
+    with open_parts(path, _LAYOUTS, wanted="model grid data") as parts:
+        text = parts.text
+        facts = text if parts.layout == _LAYOUTS[0] else _former_facts(text["meta"])
+        # FITS cannot hold arrays without elements
+        empty = {"agn": np.zeros((len(parts.array("redshift")), 0, len(text["filters"])))}
+        empty["agn_multiplicity"] = np.zeros(0, int)
+        arrays = {n: parts.array(n) if n in parts else empty[n] for n in _ARRAYS}
+        tables = {
+            name: _described(parts.table(name, QTable), text["descriptions"][name])
+            for name in _TABLES
+        }
+        return ModelGrid(
+            tuple(text["filters"]),
+            **arrays,
+            **tables,
+            meta=text["meta"],
+            **{name: facts[name] for name in _FACTS},
+        )
+
+
+def _former_facts(meta):
+    """Take the facts of a file of the layout before out of its meta."""
+    from miricigale.sed.presets import COMPONENTS
+
+    bounds = {}
+    for text in meta.get("components", ()):
+        name = text.partition(": ")[2].partition(" (")[0]
+        if name in COMPONENTS:
+            declared = COMPONENTS.get(name).declared()
+            bounds |= {key: parameter.bounds for key, parameter in declared.items()}
+    return {
+        "axes": meta.pop("axes", {}),
+        "inert": meta.pop("inert", ()),
+        "bounds": bounds,
+        "frac_agn_definition": meta.get("frac_agn_definition", DEFINITIONS[0]),
+        "recipe": {name: meta[name] for name in RECIPE if name in meta},
+    }
+
+
+def _described(table, descriptions):
     """Columns are quantities again, pure numbers too, and say what they are."""
     for name, description in descriptions.items():
-        column = table[name]
-        if not hasattr(column, "to_value"):
-            table[name] = u.Quantity(np.asarray(column, dtype=float))
+        table[name] = u.Quantity(table[name], dtype=float)
         table[name].info.description = description
     return table
 
 
-def _plain(table):
-    """Copy a table without meta, whose long lists FITS headers cannot hold."""
-    out = QTable(table, copy=False)
-    out.meta = {}
-    return out
+register(ModelGrid, read=_read, write=_write)

@@ -1,22 +1,22 @@
 """Grids kept between sessions, under a name made of everything that shapes them."""
 
-import functools
 import hashlib
 import importlib.metadata
 import json
 import logging
 import os
 import time
-import uuid
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from miricigale.filters import filter as filter_curves
 from miricigale.refdata.locate import cache_folder, conf, fingerprint_of
+from miricigale.sed import chain
 from miricigale.sed.grid import ModelGrid
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.meta import provenance
+from miricigale.utils.store import PARTIAL
 from miricigale.utils.units import WAVE
 
 __all__ = ["cached_grid", "grid_key"]
@@ -24,18 +24,6 @@ __all__ = ["cached_grid", "grid_key"]
 ABANDONED = 86400.0  # seconds after which an unfinished file is nobody's any more
 
 _log = logging.getLogger(__name__)
-
-
-@functools.cache
-def _code():
-    """Checksum of the code that makes grids: one of another version is not taken."""
-    package = Path(__file__).parents[1]
-    digest = hashlib.sha256()
-    for room in ("filters", "sed"):
-        for path in sorted((package / room).rglob("*.py")):
-            digest.update(path.relative_to(package).as_posix().encode())
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 def grid_key(model, axes, filters):
@@ -55,21 +43,26 @@ def grid_key(model, axes, filters):
     -------
     key : str
         Hexadecimal sha256.
+
+    Notes
+    -----
+    Code is known by the versions that it states, ``Component.version`` of a component and its
+    bases and ``VERSION`` of what all share: whoever changes numbers raises one of them.
     """
     parts = [
         {
             "name": c.name,
-            "class": f"{type(c).__module__}.{type(c).__qualname__}",
+            "versions": [vars(t)["version"] for t in type(c).__mro__ if "version" in vars(t)],
             "settings": c.settings,
             "defaults": {n: p.default for n, p in c.parameters.items()},
             "data": c.fingerprint,
-            "extinction": c.role == "foreground" and _version("dust_extinction"),
+            "packages": {name: importlib.metadata.version(name) for name in c.packages},
         }
         for c in model.components
     ]
     bands = [[f.name, _digest(f.wave.to_value(WAVE)), _digest(f.throughput)] for f in filters]
     content = {
-        "code": _code(),
+        "versions": [chain.VERSION, filter_curves.VERSION],
         "components": parts,
         "cosmology": [repr(model.cosmology), *_exact(model.cosmology)],
         "definition": model.frac_agn_definition,
@@ -78,11 +71,6 @@ def grid_key(model, axes, filters):
     }
     text = json.dumps(content, sort_keys=True, default=repr)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-@functools.cache
-def _version(package):
-    return importlib.metadata.version(package)
 
 
 def _exact(cosmology):
@@ -141,20 +129,14 @@ def cached_grid(model, axes, filters, make):
             _log.warning("cached grid not used: %s", err)
         else:
             # the numbers are the same, whoever asks; the words are those of this model
-            kept = {name: grid.meta[name] for name in ("axes", "inert")}
-            return replace(grid, meta=provenance(**model.meta) | kept)
+            return replace(grid, meta=model.meta, recipe=model.recipe)
     grid = make(model, axes, filters)
     if grid.galaxy.nbytes + grid.agn.nbytes > limit or not _unchanged(model):
         return grid
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         # another thread, process or machine may be at the same grid
-        partial = path.with_name(f"{path.stem}.{uuid.uuid4().hex}.partial")
-        try:
-            grid.write(partial)
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
+        grid.write(path, overwrite=True)
         _make_room(path.parent, limit, keep=path)
     except OSError as err:
         _log.warning("grid not kept in the cache: %s", err)
@@ -168,11 +150,11 @@ def _make_room(folder, limit, keep):
             stat = path.stat()
         except FileNotFoundError:
             continue
-        if path.suffix == ".partial" and time.time() - stat.st_mtime > ABANDONED:
-            path.unlink(missing_ok=True)
-        if path.suffix != ".fits":
-            continue
-        files.append((stat.st_mtime_ns, stat.st_size, path))
+        if path.name.startswith(PARTIAL):
+            if time.time() - stat.st_mtime > ABANDONED:
+                path.unlink(missing_ok=True)
+        elif path.suffix == ".fits":
+            files.append((stat.st_mtime_ns, stat.st_size, path))
     total = sum(size for _, size, _ in files)
     for _, size, path in sorted(files):
         if total <= limit:

@@ -12,7 +12,6 @@ from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import distance
 from miricigale.sed.tables import dilution, seen_agn
 from miricigale.utils.exceptions import argument_error, unknown_name
-from miricigale.utils.meta import provenance
 
 __all__ = ["check_axes", "model_grid"]
 
@@ -210,8 +209,6 @@ def model_grid(model, axes, filters):
         agn[i] = agn_spectra @ weights
     age = np.array([row["age"] for row in rows])
     universe = model.cosmology.age(redshift).to_value(u.Gyr)
-    meta = provenance(**model.meta)
-    meta |= {"axes": {name: values.tolist() for name, values in axes.items()}, "inert": inert}
     return ModelGrid(
         filters=filters.names,
         redshift=redshift,
@@ -226,7 +223,12 @@ def model_grid(model, axes, filters):
         galaxy_shape=shape,
         agn_properties=agn_properties,
         agn_multiplicity=count,
-        meta=meta,
+        meta=model.meta,
+        axes=axes,
+        inert=inert,
+        bounds={name: parameter.bounds for name, parameter in model.parameters.items()},
+        frac_agn_definition=model.frac_agn_definition,
+        recipe=model.recipe,
     )
 
 

@@ -21,6 +21,7 @@ from miricigale.sed.derived import (
     galaxy_quantities,
     scaled_quantities,
 )
+from miricigale.sed.grid import DEFINITIONS
 from miricigale.sed.grid_cache import cached_grid
 from miricigale.sed.parameter import Parameter
 from miricigale.sed.spectrum import COSMOLOGY, SED, distance
@@ -29,9 +30,6 @@ from miricigale.utils.meta import provenance
 from miricigale.utils.units import FNU, WAVE
 
 __all__ = ["DEFINITIONS", "ModelSpectra", "SEDModel"]
-
-#: What the AGN fraction is a fraction of.
-DEFINITIONS = ("dust", "3-1000um")
 
 _MODEL_PARAMETERS = {
     "redshift": Parameter(default=1.0, bounds=(0.0, 20.0), doc="Redshift."),
@@ -246,22 +244,24 @@ class SEDModel:
         return tuple(c.resource for c in self.components if c.resource)
 
     @property
+    def recipe(self):
+        """Components with their libraries and options, IMF, definition and cosmology, in words."""
+        options = [f"{c.name}: {n} = {v}" for c in self.components for n, v in c.settings.items()]
+        out = {
+            "components": [f"{c.role}: {c.name} ({c.library})" for c in self.components],
+            "options": options or None,
+            "imf": self.component("stellar").imf,
+            "frac_agn_definition": self.frac_agn_definition if self.has_agn else None,
+            "cosmology": f"H0={self.cosmology.H0.value:g}, Om0={self.cosmology.Om0:g}",
+        }
+        return {name: value for name, value in out.items() if value is not None}
+
+    @property
     def meta(self):
         """Libraries, citations and definitions: a dict that fits into any header."""
-        resources = [c.resource for c in self.components if c.resource]
-        cite = [*citations(*resources), *(c.reference for c in self.components if c.reference)]
-        return provenance(
-            citations=cite,
-            components=[f"{c.role}: {c.name} ({c.library})" for c in self.components],
-            libraries=list(self._notes) or None,
-            options=self._options() or None,
-            imf=self.component("stellar").imf,
-            frac_agn_definition=self.frac_agn_definition if self.has_agn else None,
-            cosmology=f"H0={self.cosmology.H0.value:g}, Om0={self.cosmology.Om0:g}",
-        )
-
-    def _options(self):
-        return [f"{c.name}: {n} = {v}" for c in self.components for n, v in c.settings.items()]
+        cite = [*citations(*self.resources), *(c.reference for c in self.components)]
+        notes = list(self._notes) or None
+        return provenance(citations=filter(None, cite), libraries=notes, **self.recipe)
 
     @functools.cached_property
     def chain(self):

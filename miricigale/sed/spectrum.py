@@ -8,7 +8,7 @@ import numpy as np
 from astropy.cosmology import FlatLambdaCDM
 
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import FNU, WAVE, frozen_quantity, to_array
+from miricigale.utils.units import FNU, WAVE, Frozen, frozen_quantity, to_array
 
 __all__ = ["COSMOLOGY", "SED", "distance"]
 
@@ -33,7 +33,7 @@ def distance(redshift, cosmology):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SED:
+class SED(Frozen):
     """
     Spectral energy distribution: flux density against observed wavelength.
 

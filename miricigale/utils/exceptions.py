@@ -1,5 +1,7 @@
 """Errors and warnings of the package, and the one way to word them."""
 
+import difflib
+
 from astropy.utils.exceptions import AstropyUserWarning
 
 __all__ = [
@@ -47,5 +49,9 @@ def argument_error(name, wanted, got):
 
 
 def unknown_name(kind, name, known):
-    """Make the `KeyError` for an unknown name that lists the right ones."""
-    return KeyError(f"no {kind} {name!r}; known: {', '.join(sorted(map(str, known)))}")
+    """Make the `KeyError` for an unknown name that lists the right ones, the nearest at the end."""
+    known = sorted(map(str, known))
+    lower = {one.lower(): one for one in known}
+    close = difflib.get_close_matches(str(name).lower(), lower, n=1, cutoff=0.7)
+    hint = f"; did you mean {lower[close[0]]!r}?" if close else ""
+    return KeyError(f"no {kind} {name!r}; known: {', '.join(known)}{hint}")

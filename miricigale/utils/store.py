@@ -187,6 +187,12 @@ class Parts:
         """Array by name, in the byte order of the machine; truth values are 0 and 1."""
         return native(self._hdus[name].data)
 
+    def mapped(self, name):
+        """Array as it stands in the file, on the disk until it is used; not to be written to."""
+        data = self._hdus[name].data
+        data.flags.writeable = False
+        return data
+
     def table(self, name, cls=None):
         """Table by name (a `~astropy.table.Table`, or another class of tables), its meta empty."""
         from astropy.table import Table

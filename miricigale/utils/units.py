@@ -1,5 +1,7 @@
 """The units that arrays have inside the package, and the doors that convert to them."""
 
+import dataclasses
+
 import astropy.units as u
 import numpy as np
 
@@ -15,6 +17,7 @@ __all__ = [
     "SURFACE_BRIGHTNESS",
     "TIME",
     "WAVE",
+    "Frozen",
     "frozen_array",
     "frozen_quantity",
     "to_array",
@@ -90,6 +93,18 @@ def to_array(value, unit, name, *, ndim=None, finite=False, equivalencies=None):
         n_bad = int(np.count_nonzero(~np.isfinite(array)))
         raise argument_error(name, "finite values", f"{n_bad} that are NaN or infinite")
     return array
+
+
+class Frozen:
+    """Base of frozen dataclasses: copies and pickles go through the constructor and stay read-only."""
+
+    def __reduce__(self):
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return _remake, (type(self), values)
+
+
+def _remake(cls, values):
+    return cls(**values)
 
 
 def frozen_array(value, dtype=float):

@@ -179,7 +179,7 @@ def test_rejects_wrong_units():
 def test_unknown_name_lists_the_known():
     with pytest.raises(KeyError, match=r"no filter 'miri.f707w'; known: .*miri.f770w"):
         Filter.from_name("miri.f707w")
-    with pytest.raises(KeyError, match=r"no curve 'nonsense' in astro-sedpy"):
+    with pytest.raises(KeyError, match=r"no curve of astro-sedpy 'nonsense'"):
         Filter.from_name("sedpy.nonsense")
 
 

@@ -1,5 +1,6 @@
 """Sets of filters."""
 
+import copy
 import pickle
 from types import SimpleNamespace
 
@@ -90,10 +91,39 @@ def test_rejects_bad_sets(filters):
         filters.weights([3.0, 2.0])
 
 
-def test_pickles(filters):
-    again = pickle.loads(pickle.dumps(filters))
+@pytest.mark.parametrize(
+    "make", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))]
+)
+def test_copies_and_pickles(filters, make):
+    again = make(filters)
     assert again.names == filters.names
     assert_quantity_allclose(again.pivots, filters.pivots)
+    one = make(filters[0])
+    assert (one.name, one.meta) == (filters[0].name, filters[0].meta)
+    np.testing.assert_array_equal(one.throughput, filters[0].throughput)
+    assert not one.throughput.flags.writeable
+    assert not one.wave.flags.writeable
+
+
+def test_names_are_forgiving():
+    want = Filter.from_name("miri.f770w")
+    for name in ("F770W", "f770w", "MIRI.F770W", "Miri.f770W"):
+        assert Filter.from_name(name) is want
+    filters = FilterSet(["F770W", "IRAC.CH1", "WFC3.F160W"])
+    assert filters.names == ("miri.f770w", "irac.ch1", "wfc3.f160w")
+    assert filters["F770W"] is want
+    assert "CH1" in filters
+    assert "F1000W" not in filters
+    # a filter of one's own keeps its name
+    own = Filter([1, 2] * u.um, [1, 1], name="F770W")
+    assert FilterSet([own, "miri.f770w"])["F770W"] is own
+    with pytest.raises(KeyError, match=r"no filter 'miri.f707w'; .*; did you mean 'miri.f770w'\?"):
+        Filter.from_name("miri.f707w")
+    with pytest.raises(KeyError, match=r"no curve .* 'jwst_f707w'; .*did you mean 'jwst_f770w'"):
+        Filter.from_name("sedpy.jwst_f707w")
+    with pytest.raises(KeyError) as info:
+        Filter.from_name("something else")
+    assert "did you mean" not in str(info.value)
 
 
 def test_own_filters_stand_beside_those_of_the_library():

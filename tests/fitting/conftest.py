@@ -60,7 +60,9 @@ def make_grid(seed=0, *, n_z=4, n_tau=5, n_age=4, polar=(0.0, 0.1, 0.3), frac=No
         ),
         agn_properties=agn_properties,
         agn_multiplicity=np.array(count, dtype=int),
-        meta={"axes": axes, "citations": ["nobody"]},
+        meta={"citations": ["nobody"]},
+        axes=axes,
+        inert=[("temperature_polar",) if row[1] == 0.0 else () for row in rows],
     )
 
 

@@ -238,7 +238,7 @@ def test_galaxies_without_dust_where_fractions_refer_to_all_infrared_light(
         dust_luminosity=galaxy["ir_luminosity"].value,
         galaxy_properties=galaxy,
         agn_properties=agn,
-        meta=dict(grid.meta) | {"frac_agn_definition": "3-1000um"},
+        frac_agn_definition="3-1000um",
     )
     # tori so bright that no AGN at all fits best
     grid = replace(grid, agn=grid.agn * 1e3)

@@ -166,7 +166,7 @@ def test_identical_models_are_counted_with_their_weight(make_grid, draw_photomet
         agn_parameters=grid.agn_parameters[rows],
         agn_properties=grid.agn_properties[rows],
         agn_multiplicity=np.ones(rows.size, int),
-        meta={},
+        inert=(),
     )
     table, _ = draw_photometry(grid, 5)
     one, two = BayesFitter(grid).fit(table), BayesFitter(copied).fit(table)

@@ -58,7 +58,7 @@ def prior_by_hand(fitter):
     for weights, table in ((galaxy, grid.galaxy_parameters), (agn, grid.agn_parameters)):
         for name in table.colnames:
             column = np.asarray(getattr(table[name], "value", table[name]))
-            values = np.unique(grid.meta["axes"].get(name, column))
+            values = np.unique(grid.axes.get(name, column))
             prior = PRIORS[name]
             if isinstance(prior, str):
                 prior = 1.0 / values

@@ -122,7 +122,8 @@ def test_merged_models_are_as_all_of_them_apart(make_grid, draw_photometry):
         agn_parameters=QTable({"ebv_polar": ebv, "temperature_polar": temperature, "law": law}),
         agn_properties=QTable({"accretion_power": power, "ir_luminosity": power}),
         agn_multiplicity=np.ones(8, int),
-        meta={"axes": names},
+        axes=names,
+        inert=(),
     )
     keep = np.array([0, 4, 5, 6, 7])
     parameters = apart.agn_parameters[keep]
@@ -133,6 +134,7 @@ def test_merged_models_are_as_all_of_them_apart(make_grid, draw_photometry):
         agn_parameters=parameters,
         agn_properties=apart.agn_properties[keep],
         agn_multiplicity=np.array([4, 1, 1, 1, 1]),
+        inert=[("temperature_polar", "law"), (), (), (), ()],
     )
     table, _ = draw_photometry(apart, 5, noise=0.3)
     priors = {"temperature_polar": [1.0, 3.0], "law": [2.0, 1.0]}

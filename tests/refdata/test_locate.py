@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import shutil
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -15,10 +17,10 @@ from miricigale.refdata import (
     find_resource,
     locate,
     registry,
-    store,
 )
 from miricigale.refdata.locate import data_folder, file_sha256, fingerprint, record_path
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
+from miricigale.utils.store import PARTIAL
 
 TEXT = b"some numbers\n"
 
@@ -108,7 +110,7 @@ def test_added_file_is_found(folders):
     assert target == folders / "data" / "sub" / "file.dat"
     assert locate("test.file", check=True) == target
     assert target.read_bytes() == TEXT
-    assert not list(target.parent.glob(".*.partial"))
+    assert not list(target.parent.glob(f"{PARTIAL}*"))
 
 
 def test_added_folder_replaces_the_old(folders):
@@ -132,15 +134,16 @@ def test_an_interrupted_copy_leaves_the_old_one(folders, monkeypatch, name):
     before = fingerprint(name)
     (folders / "old" / "new.dat").write_text("x")
 
-    def interrupt(*args):
+    def interrupt(_, partial):
+        Path(partial).mkdir() if name == "test.folder" else Path(partial).write_bytes(b"half")
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(store, "install", interrupt)
+        patch.setattr(shutil, "copyfile" if name == "test.file" else "copytree", interrupt)
         with pytest.raises(KeyboardInterrupt):
             add_resource(name, mine)
     assert fingerprint(name) == before
-    assert not list(target.parent.glob(".*.partial"))
+    assert not list(target.parent.glob(f"{PARTIAL}*"))
 
 
 def test_the_record_beside_a_file_answers_only_while_it_is_fresh(folders):

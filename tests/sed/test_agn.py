@@ -7,11 +7,11 @@ import pytest
 from astropy.io import fits
 from scipy.integrate import quad
 
+from miricigale.refdata.libraries import open_library, write_library
+from miricigale.refdata.libraries.skirtor import read_skirtor
 from miricigale.sed import _core
 from miricigale.sed.components import ParametricTorus, Skirtor2016, TorusSpectra
 from miricigale.sed.components.agn.parametric import _absorbed, _constants, _seen_fraction
-from miricigale.sed.libraries import open_library, write_library
-from miricigale.sed.libraries.skirtor import read_skirtor
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import conf
 

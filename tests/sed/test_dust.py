@@ -10,6 +10,8 @@ from astropy.modeling.models import BlackBody
 from scipy.optimize import brentq
 
 from miricigale.filters import FilterSet
+from miricigale.refdata.libraries import write_library
+from miricigale.refdata.libraries.dale2014 import read_dale2014
 from miricigale.sed import SEDModel, _core
 from miricigale.sed.components import BC03, CalzettiLeitherer, DelayedSFH, Meiksin2006
 from miricigale.sed.components.dust import (
@@ -19,8 +21,6 @@ from miricigale.sed.components.dust import (
     DraineLi2007Alpha,
 )
 from miricigale.sed.components.dust.dl07 import load_dl07
-from miricigale.sed.libraries import write_library
-from miricigale.sed.libraries.dale2014 import read_dale2014
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import conf
 

@@ -1,3 +1,6 @@
+import copy
+import pickle
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -5,6 +8,7 @@ from astropy.table import QTable
 
 from miricigale.sed import ModelGrid
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.store import write_parts
 
 
 def make(**changes):
@@ -41,6 +45,8 @@ def test_flux_is_the_stated_sum():
         ({"galaxy": np.full((2, 3, 2), np.nan)}, "'galaxy' must be finite"),
         ({"agn_parameters": QTable()}, "'agn_parameters' must be a table of 1 rows"),
         ({"filters": ("a", "a")}, "'filters' must be one or more different names"),
+        ({"inert": [(), ()]}, "'inert' must be names for each of 1 AGN models, got 2"),
+        ({"frac_agn_definition": "all"}, "'frac_agn_definition' must be one of"),
     ],
 )
 def test_arrays_that_do_not_agree_are_refused(changes, match):
@@ -58,14 +64,63 @@ def test_foreign_and_truncated_files_are_refused(tmp_path):
     (tmp_path / "text.fits").write_text("text")
     for name, text in (("text", ""), ("none", "no such file")):
         with pytest.raises(
-            DataError, match=rf"{name}\.fits cannot be read as a model grid: {text}"
+            DataError, match=rf"{name}\.fits cannot be read as model grid data: {text}"
         ):
             ModelGrid.read(tmp_path / f"{name}.fits")
-    with pytest.raises(DataError, match="is not a model grid"):
+    with pytest.raises(DataError, match="holds no model grid data"):
         ModelGrid.read(tmp_path / "other.fits")
     make().write(tmp_path / "grid.fits")
     with fits.open(tmp_path / "grid.fits") as hdus:
         del hdus["GALAXY"]
         hdus.writeto(tmp_path / "part.fits")
-    with pytest.raises(DataError, match="not a complete model grid"):
+    with pytest.raises(DataError, match="not a complete file of model grid data"):
         ModelGrid.read(tmp_path / "part.fits")
+
+
+FACTS = {
+    "axes": {"tau97": [3.0, 7.0]},
+    "inert": [("temperature_polar",)],
+    "bounds": {"tau": (0.001, 100.0)},
+    "frac_agn_definition": "3-1000um",
+    "recipe": {"components": ["sfh: delayed (delayed)"], "imf": "Kroupa (inferred)"},
+}
+
+
+def same_facts(grid):
+    assert {name: values.tolist() for name, values in grid.axes.items()} == FACTS["axes"]
+    assert grid.inert == (("temperature_polar",),)
+    assert grid.bounds["tau"] == (0.001, 100.0)
+    assert grid.frac_agn_definition == "3-1000um"
+    assert grid.recipe["imf"] == "Kroupa (inferred)"
+
+
+def test_facts_that_decide_are_attributes_and_survive_writing_copying_and_pickling(tmp_path):
+    grid = make(**FACTS, meta={"note": "for people"})
+    grid.write(tmp_path / "grid.fits")
+    copies = (ModelGrid.read(tmp_path / "grid.fits"), copy.deepcopy(grid), copy.copy(grid))
+    for other in (*copies, pickle.loads(pickle.dumps(grid))):
+        same_facts(other)
+        assert other.meta == {"note": "for people"}
+        np.testing.assert_array_equal(other.galaxy, grid.galaxy)
+        assert not other.galaxy.flags.writeable
+
+
+def test_files_of_the_layout_before_are_read(tmp_path):
+    """There the facts stood in the meta, and bounds were those of the components that it names."""
+    grid = make()
+    tables = ("galaxy_parameters", "agn_parameters", "galaxy_properties", "agn_properties")
+    tables = {name: getattr(grid, name) for name in (*tables, "galaxy_shape")}
+    arrays = ("redshift", "galaxy", "agn", "dust_luminosity", "frac_agn", "allowed")
+    arrays = {name: getattr(grid, name) for name in (*arrays, "agn_multiplicity")}
+    meta = {name: FACTS[name] for name in ("axes", "inert", "frac_agn_definition")}
+    text = {
+        "filters": grid.filters,
+        "meta": meta | FACTS["recipe"],
+        "descriptions": {n: dict.fromkeys(t.colnames, "words") for n, t in tables.items()},
+    }
+    path = tmp_path / "old.fits"
+    write_parts(path, "miricigale-modelgrid-2", text=text, arrays=arrays, tables=tables)
+    old = ModelGrid.read(path)
+    same_facts(old)
+    assert old.galaxy_parameters["tau"].info.description == "words"
+    np.testing.assert_array_equal(old.agn, grid.agn)

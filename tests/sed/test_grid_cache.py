@@ -1,25 +1,32 @@
+import functools
+import json
 import logging
 import os
 import re
 import time
 from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
+from pathlib import Path
 
+import astropy.units as u
 import numpy as np
 import pytest
 from astropy.cosmology import Planck18
 
 from miricigale.filters import Filter, FilterSet
+from miricigale.filters import filter as filter_curves
 from miricigale.refdata import conf, resource
-from miricigale.sed import SEDModel, gridding
+from miricigale.sed import COMPONENTS, Component, SEDModel, chain, gridding
 from miricigale.sed.components import (
     BC03,
+    Attenuation,
     CalzettiLeitherer,
     DelayedSFH,
     DraineLi2007,
     ParametricTorus,
 )
 from miricigale.sed.grid_cache import grid_key
+from miricigale.utils.store import PARTIAL
 
 AXES = {"age": [0.5, 2.0], "ebv": [0.1, 0.4], "redshift": [0.3, 1.0]}
 BANDS = FilterSet.from_names(["wfc3.f160w", "miri.f770w"])
@@ -93,6 +100,60 @@ def test_everything_that_shapes_a_grid_is_in_its_name(folder):
     assert grid_key(model(), axes, BANDS) == keys[0]
 
 
+def test_code_is_known_by_the_versions_that_it_states(monkeypatch):
+    """A docstring, a comment or another module changes nothing; numbers that change say so."""
+    axes = gridding.check_axes(model(), AXES)
+    key = functools.partial(grid_key, model(), axes, BANDS)
+    before = key()
+    monkeypatch.setattr(CalzettiLeitherer, "__doc__", "In other words.")
+    monkeypatch.setattr(CalzettiLeitherer, "__module__", "miricigale.sed.elsewhere")
+    assert key() == before
+    keys = [before]
+    for owner, name, version in (
+        (CalzettiLeitherer, "version", 2),  # of the class
+        (Attenuation, "version", 3),  # of its base
+        (Component, "version", 4),
+        (chain, "VERSION", 2),  # of what all components share
+        (filter_curves, "VERSION", 2),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, version, raising=False)
+            keys.append(key())
+    assert len(set(keys)) == len(keys)
+    assert key() == before
+
+
+def numbers(name):
+    """Some numbers of a component of a role in an otherwise simple chain."""
+    cls = COMPONENTS.get(name)
+    parts = {"sfh": "delayed", "stellar": "bc03", "attenuation": "calzetti", "dust": "dl07"}
+    parts |= {"agn": "parametric_torus"} if cls.role == "xray" else {}
+    parts[cls.role] = name
+    chosen = [COMPONENTS.get(part)() for part in parts.values()]
+    chain = SEDModel(chosen)
+    values = {"age": 0.5, "redshift": 3.0}
+    values |= {"frac_agn": 0.5} if chain.has_agn else {}
+    values |= {"ebv_galactic": 0.1} if cls.role == "foreground" else {}
+    table = chain.fluxes({key: [value] for key, value in values.items()}, NUMBER_BANDS)
+    skip = ("flags", "stellar_mass_formed")
+    return [table[column][0] for column in table.colnames if column not in skip]
+
+
+NUMBER_BANDS = ["acs.f435w", "wfc3.f160w", "miri.f770w", "miri.f2550w"]
+KEPT = Path(__file__).with_name("numbers.json")
+
+
+@pytest.mark.parametrize("name", sorted(json.loads(KEPT.read_text())))
+def test_numbers_do_not_change_without_a_new_version(name):
+    """Where this fails by intent: raise ``version`` of the component and note the new numbers."""
+    kept = json.loads(KEPT.read_text())[name]
+    cls = COMPONENTS.get(name)
+    versions = [vars(base)["version"] for base in cls.__mro__ if "version" in vars(base)]
+    assert versions == kept["versions"], f"note the new numbers of {name} in {KEPT.name}"
+    got = [float(u.Quantity(value).value) for value in numbers(name)]
+    np.testing.assert_allclose(got, kept["numbers"], rtol=1e-9, err_msg=f"raise {name}.version")
+
+
 def change_torus(folder, width):
     """A torus of other constants in the data folder, which goes before the bundled one."""
     target = folder / resource("torus.parametric").file
@@ -155,7 +216,7 @@ def test_the_words_are_those_of_whoever_asks(folder, made):
     grid = SEDModel.yang2021(agn=False).grid(axes, BANDS)
     assert len(made) == 1
     assert all("not registered" in note for note in grid.meta["libraries"])
-    assert grid.meta["axes"] == {"age": [1.0], "redshift": [0.3]}
+    assert {n: v.tolist() for n, v in grid.axes.items()} == {"age": [1.0], "redshift": [0.3]}
 
 
 def test_threads_at_the_same_grid_get_the_same_numbers(folder):
@@ -168,7 +229,7 @@ def test_threads_at_the_same_grid_get_the_same_numbers(folder):
 
 def test_leftovers_of_a_killed_run_go(folder):
     folder.mkdir()
-    old, new = folder / "a.partial", folder / "b.partial"
+    old, new = folder / f"{PARTIAL}a.fits", folder / f"{PARTIAL}b.fits"
     for path, age in ((old, 1e6), (new, 0.0)):
         path.write_text("")
         os.utime(path, (time.time() - age,) * 2)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
+from miricigale.refdata.libraries import add_library
+from miricigale.refdata.libraries.bc03 import read_bc03, read_ised
 from miricigale.refdata.locate import conf
 from miricigale.sed import SEDModel
 from miricigale.sed.components import BC03Library, ConstantSFH
-from miricigale.sed.libraries import add_library
-from miricigale.sed.libraries.bc03 import read_bc03, read_ised
 from miricigale.utils.exceptions import DataError
 
 AGE = np.array([0.0, 125893.0, 1e6, 1e7, 1e8, 1e9, 1e10, 2e10])

@@ -1,3 +1,4 @@
+import copy
 import pickle
 
 import astropy.units as u
@@ -215,9 +216,17 @@ def test_from_dict():
         SEDModel.from_dict({"part": 1})
 
 
-def test_model_survives_pickling(model):
-    copy = pickle.loads(pickle.dumps(model))
-    assert_quantity_allclose(copy.evaluate(age=1.0).fnu, model.evaluate(age=1.0).fnu)
+@pytest.mark.parametrize(
+    "make", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))]
+)
+def test_models_and_spectra_survive_copying_and_pickling(model, make):
+    sed = model.evaluate(age=1.0)
+    assert_quantity_allclose(make(model).evaluate(age=1.0).fnu, sed.fnu)
+    again = make(sed)
+    assert again.redshift == sed.redshift
+    assert again.meta.keys() == sed.meta.keys()
+    assert_quantity_allclose(again.fnu, sed.fnu)
+    assert not again.fnu.flags.writeable
 
 
 # --------------------------------------------------------------------- many models
@@ -299,7 +308,10 @@ def test_grid_survives_writing(grid, tmp_path):
     for name in ("redshift", "galaxy", "agn", "dust_luminosity", "frac_agn", "allowed"):
         np.testing.assert_array_equal(getattr(back, name), getattr(grid, name))
     assert back.filters == grid.filters
-    assert back.meta["axes"] == grid.meta["axes"]
+    for name, values in grid.axes.items():
+        np.testing.assert_array_equal(back.axes[name], values)
+    for name in ("inert", "bounds", "recipe", "frac_agn_definition"):
+        assert getattr(back, name) == getattr(grid, name)
     for name in grid.galaxy_properties.colnames:
         assert_quantity_allclose(back.galaxy_properties[name], grid.galaxy_properties[name])
     assert back.n_models == grid.n_models

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from miricigale.refdata import conf, resource
+from miricigale.refdata.libraries import LibraryTable, add_library, write_library
 from miricigale.sed import SEDModel
-from miricigale.sed.libraries import LibraryTable, add_library, write_library
 from miricigale.utils.exceptions import DataError
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from miricigale.refdata.libraries.bc03 import read_ised
 from miricigale.sed import _core
 from miricigale.sed.components import BC03, ConstantSFH, DelayedSFH
-from miricigale.sed.libraries.bc03 import read_ised
 
 HC = 6.62607015e-34 * 2.99792458e14  # J um
 

@@ -7,8 +7,8 @@ import pytest
 
 from miricigale.cli import main
 from miricigale.refdata import Resource, conf, locate, registry
+from miricigale.refdata.libraries import READERS, LibraryTable
 from miricigale.refdata.locate import file_sha256
-from miricigale.sed.libraries import READERS, LibraryTable
 
 NAME = "test.library"
 

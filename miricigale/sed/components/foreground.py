@@ -222,6 +222,7 @@ class GalacticExtinction(Foreground):
     reference = (
         "Gordon et al. 2023, ApJ 950, 86 (G23) or that of the law; Gordon 2024, JOSS 9, 7023"
     )
+    packages = ("dust_extinction",)
     options = {"law": tuple(LAWS), "beyond": BEYOND}
     ebv_galactic = Parameter(
         default=0.0, bounds=(0.0, 5.0), unit="mag", doc="Colour excess of the Milky Way's dust."

@@ -5,11 +5,11 @@ import os
 
 import numpy as np
 
+from miricigale.refdata.libraries.skirtor import SKIRTOR_AXES
+from miricigale.refdata.libraries.table import open_library
 from miricigale.sed import _core
 from miricigale.sed.component import register
 from miricigale.sed.components.agn.base import AGN, TorusSpectra
-from miricigale.sed.libraries.skirtor import SKIRTOR_AXES
-from miricigale.sed.libraries.table import open_library
 from miricigale.sed.parameter import Parameter
 
 __all__ = ["Skirtor2016"]
@@ -49,7 +49,7 @@ class Skirtor2016(AGN):
 
     @property
     def table(self):
-        """The library: `~miricigale.sed.libraries.LibraryTable`, read from disk as needed."""
+        """The library: `~miricigale.refdata.libraries.LibraryTable`, read from disk as needed."""
         return open_library(self.path, self.resource)
 
     def missing(self, **values):

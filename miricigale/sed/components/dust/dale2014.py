@@ -4,9 +4,9 @@ import functools
 
 import numpy as np
 
+from miricigale.refdata.libraries.table import open_library
 from miricigale.sed.component import register
 from miricigale.sed.components.dust.base import DustEmission
-from miricigale.sed.libraries.table import open_library
 from miricigale.sed.parameter import Parameter
 
 __all__ = ["Dale2014"]

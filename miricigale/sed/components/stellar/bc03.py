@@ -1,49 +1,11 @@
 """The bundled simple stellar populations."""
 
+from miricigale.refdata.libraries.bc03 import load_ssp
 from miricigale.sed.component import register
 from miricigale.sed.components.stellar.base import StellarPopulations
 from miricigale.sed.parameter import Parameter
-from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import cached_by_file, open_fits
 
-__all__ = ["BC03", "load_ssp"]
-
-SOLAR_LUMINOSITY = 3.828e26  # W, IAU 2015
-
-
-@cached_by_file(maxsize=2)
-def load_ssp(path):
-    """
-    Read a bundled SSP file.
-
-    Returns
-    -------
-    wave : `~numpy.ndarray`, shape (n_wave,)
-        Wavelengths in um.
-    age : `~numpy.ndarray`, shape (n_age,)
-        Ages in Myr.
-    spectra : dict of float to `~numpy.ndarray`, shape (n_age, n_wave)
-        W/um for one solar mass formed, by metallicity.
-    living : dict of float to `~numpy.ndarray`, shape (n_age,)
-        Mass fraction still alive.
-    """
-    spectra, living = {}, {}
-    try:
-        with open_fits(path, wanted="a table of simple stellar populations") as hdus:
-            wave = hdus["WAVE"].data.astype(float) / 1e4
-            age = hdus["AGE"].data.astype(float) / 1e6
-            alive = hdus["LIVING"].data
-            for k in range(len(alive)):
-                hdu = hdus[f"Z{k + 1}"]
-                value = float(hdu.header["METAL"])
-                spectra[value] = hdu.data.astype(float) * (SOLAR_LUMINOSITY * 1e4)
-                living[value] = alive[k].astype(float)
-    except KeyError as err:
-        msg = f"{path} is not a table of simple stellar populations: {err}"
-        raise DataError(msg) from err
-    for array in (wave, age, *spectra.values(), *living.values()):
-        array.flags.writeable = False
-    return wave, age, spectra, living
+__all__ = ["BC03"]
 
 
 @register

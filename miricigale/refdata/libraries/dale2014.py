@@ -7,9 +7,9 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from miricigale.sed import _core
-from miricigale.sed.components.stellar import BC03
-from miricigale.sed.libraries.table import LibraryTable
+from miricigale.refdata.libraries.bc03 import load_ssp
+from miricigale.refdata.libraries.table import LibraryTable
+from miricigale.refdata.locate import locate
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import check_unpacked, unpacked_size
 
@@ -51,7 +51,7 @@ def read_dale2014(path):
 
     Returns
     -------
-    library : `~miricigale.sed.libraries.LibraryTable`
+    library : `~miricigale.refdata.libraries.LibraryTable`
         64 rows; axis ``alpha``; spectra ``removed`` and ``kept`` (with and without the
         subtraction of starlight) in W/um for 1 W; value ``log_f60_f100`` of ``dhcal.dat``.
 
@@ -220,8 +220,8 @@ def _check_order(wave, log_power, colour, places):
 
 def _bundled_starlight(wave):
     """L_lambda at 13 Gyr of a history exp(-t / 10 Gyr), from the bundled SSPs; arbitrary scale."""
-    stars = BC03()
-    age, spectra, _ = stars.table(0.02)
+    nodes, age, spectra, _ = load_ssp(locate("ssp.bc03"))
     born = np.arange(13000) + 0.5  # Myr ago
-    weights = _core.hat_matrix(age, born).T @ np.exp(born / 1e4)
-    return np.interp(wave, stars.nodes(), weights @ spectra, right=0)
+    # what each age counts for where spectra are linear between ages
+    weights = [np.interp(born, age, one) @ np.exp(born / 1e4) for one in np.eye(age.size)]
+    return np.interp(wave, nodes, weights @ spectra[0.02], right=0)

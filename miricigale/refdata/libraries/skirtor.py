@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from miricigale.sed.libraries.table import LibraryTable
+from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import check_unpacked, open_fits, unpacked_size
 
@@ -66,7 +66,7 @@ def read_skirtor(path):
 
     Returns
     -------
-    library : `~miricigale.sed.libraries.LibraryTable`
+    library : `~miricigale.refdata.libraries.LibraryTable`
         ``torus.skirtor2016``: ``disk`` (direct and scattered) and ``dust``, L_lambda in 1/um for
         one watt of accretion power, 32 bit. The whole library has 19,200 rows; a part is
         taken where it is a full product of values and has inclination 0, which is

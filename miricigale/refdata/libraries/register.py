@@ -16,21 +16,21 @@ from pathlib import Path
 
 import numpy as np
 
-from miricigale.refdata import resource
+from miricigale.refdata.libraries.table import LibraryTable, verify_library, write_library
 from miricigale.refdata.locate import data_folder, record_path, stored_record
-from miricigale.refdata.store import install, locked, partial_path
-from miricigale.sed.libraries.table import LibraryTable, verify_library, write_library
+from miricigale.refdata.registry import resource
+from miricigale.refdata.store import installing
 from miricigale.utils.exceptions import DataError, argument_error, unknown_name
 from miricigale.utils.progress import progress
 
-__all__ = ["READERS", "Report", "add_library", "openers"]
+__all__ = ["READERS", "Report", "add_library"]
 
 #: What reads the distributed files of a library: a function, or ``"module:function"``,
 #: imported on first use; called with a `~pathlib.Path`, it gives a `LibraryTable`.
 READERS = {
-    "torus.skirtor2016": "miricigale.sed.libraries.skirtor:read_skirtor",
-    "dust.dale2014": "miricigale.sed.libraries.dale2014:read_dale2014",
-    "ssp.bc03_user": "miricigale.sed.libraries.bc03:read_bc03",
+    "torus.skirtor2016": "miricigale.refdata.libraries.skirtor:read_skirtor",
+    "dust.dale2014": "miricigale.refdata.libraries.dale2014:read_dale2014",
+    "ssp.bc03_user": "miricigale.refdata.libraries.bc03:read_bc03",
 }
 
 #: What a reader raises when a file is not what it should be.
@@ -192,19 +192,14 @@ def add_library(name, path, *, progress_bar=False):
     with _steps(name, show=progress_bar) as step:
         step("reading")
         library = _read(reader, name, path, progress_bar)
-        with locked(target):
-            partial = partial_path(target)
-            try:
-                step("writing")
-                write_library(library, partial)
-                step("checking")
-                # what was written is what counts
-                library = verify_library(partial, name)
-                replaced = _present(target)
-                entry = _entry(library, path)
-                install(partial, target, entry)
-            finally:
-                partial.unlink(missing_ok=True)
+        with installing(target) as (partial, entry):
+            step("writing")
+            write_library(library, partial)
+            step("checking")
+            # what was written is what counts
+            library = verify_library(partial, name)
+            replaced = _present(target)
+            entry |= _entry(library, path)
     known = stored_record(target)
     return Report(
         name=name,
@@ -223,19 +218,6 @@ def add_library(name, path, *, progress_bar=False):
         summary=library.summary,
         replaced=replaced,
     )
-
-
-def openers():
-    """
-    What opens each library and says whether it is whole.
-
-    Returns
-    -------
-    openers : dict of str to callable
-        For `miricigale.refdata.check_resources`: called with the path of the converted file.
-    """
-    # the name is bound now, not when called
-    return {name: lambda path, name=name: verify_library(path, name) for name in READERS}
 
 
 def _reader(name):

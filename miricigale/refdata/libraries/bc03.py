@@ -5,15 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
+from miricigale.refdata.libraries.ised import Ised, parse_ised, read_bytes, read_ised
+from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.refdata.locate import file_sha256
-from miricigale.sed.libraries.ised import Ised, parse_ised, read_bytes, read_ised
-from miricigale.sed.libraries.table import LibraryTable
 from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.files import cached_by_file, open_fits
 
-__all__ = ["Ised", "read_bc03", "read_ised"]
+__all__ = ["Ised", "load_ssp", "read_bc03", "read_ised"]
 
 #: Of GALAXEV, in W: its files are in this unit (3.826e33 erg/s).
 SOLAR_LUMINOSITY = 3.826e26
+BUNDLED_SOLAR_LUMINOSITY = 3.828e26  # IAU 2015
 #: Metallicities by their code in file names: tracks of Padova 1994, and of Padova 2000.
 PADOVA_1994 = {22: 0.0001, 32: 0.0004, 42: 0.004, 52: 0.008, 62: 0.02, 72: 0.05, 82: 0.1}
 PADOVA_2000 = {122: 0.0004, 132: 0.001, 142: 0.004, 152: 0.008, 162: 0.019, 172: 0.03}
@@ -24,6 +26,41 @@ SECOND_AGE = {2003: 125893.0, 2016: 1.0e5}
 LONGEST = 160.0  # um
 DENSE_FROM = 10.0  # um
 DENSITY = 30.0  # wavelengths for each e-fold
+
+
+@cached_by_file(maxsize=2)
+def load_ssp(path):
+    """
+    Read a bundled SSP file.
+
+    Returns
+    -------
+    wave : `~numpy.ndarray`, shape (n_wave,)
+        Wavelengths in um.
+    age : `~numpy.ndarray`, shape (n_age,)
+        Ages in Myr.
+    spectra : dict of float to `~numpy.ndarray`, shape (n_age, n_wave)
+        W/um for one solar mass formed, by metallicity.
+    living : dict of float to `~numpy.ndarray`, shape (n_age,)
+        Mass fraction still alive.
+    """
+    spectra, living = {}, {}
+    try:
+        with open_fits(path, wanted="a table of simple stellar populations") as hdus:
+            wave = hdus["WAVE"].data.astype(float) / 1e4
+            age = hdus["AGE"].data.astype(float) / 1e6
+            alive = hdus["LIVING"].data
+            for k in range(len(alive)):
+                hdu = hdus[f"Z{k + 1}"]
+                value = float(hdu.header["METAL"])
+                spectra[value] = hdu.data.astype(float) * (BUNDLED_SOLAR_LUMINOSITY * 1e4)
+                living[value] = alive[k].astype(float)
+    except KeyError as err:
+        msg = f"{path} is not a table of simple stellar populations: {err}"
+        raise DataError(msg) from err
+    for array in (wave, age, *spectra.values(), *living.values()):
+        array.flags.writeable = False
+    return wave, age, spectra, living
 
 
 def read_bc03(path):
@@ -47,7 +84,7 @@ def read_bc03(path):
 
     Returns
     -------
-    library : `~miricigale.sed.libraries.LibraryTable`
+    library : `~miricigale.refdata.libraries.LibraryTable`
         Axes ``metallicity`` and ``age`` (Myr); spectra ``luminosity`` in W/um for one solar
         mass formed; values ``living`` and ``remnants`` (Msun for one solar mass formed).
 

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import mmap
+import os
 import subprocess
 import sys
 import tracemalloc
@@ -15,20 +16,27 @@ import pytest
 from astropy.io import fits
 
 from miricigale import refdata
-from miricigale.refdata import Resource, check_resources, conf, find_resource, locate, registry
-from miricigale.refdata.locate import file_sha256, fingerprint, record_path, stored_record
-from miricigale.sed.libraries import (
+from miricigale.refdata import (
+    Resource,
+    check_resources,
+    conf,
+    find_resource,
+    locate,
+    registry,
+    store,
+)
+from miricigale.refdata.libraries import (
     READERS,
     LibraryTable,
     add_library,
     open_library,
-    openers,
     register,
-    table,
     verify_library,
     write_library,
 )
+from miricigale.refdata.locate import file_sha256, fingerprint, record_path, stored_record
 from miricigale.utils.exceptions import DataError
+from miricigale.utils.store import PARTIAL
 
 NAME = "test.library"
 AXES = {"tau": [3.0, 3.0, 7.0, 7.0], "q": [0.0, 0.97, 0.0, 0.97]}
@@ -75,14 +83,39 @@ def test_what_is_written_comes_back(tmp_path):
     assert [p.name for p in path.parent.iterdir()] == ["x.fits"]
 
 
+def test_files_of_the_layout_before_are_read(tmp_path):
+    """There the kinds of spectra were versions of one extension, in the order of the text."""
+    library = make()
+    kinds = {name: list(getattr(library, name)) for name in ("axes", "values", "spectra")}
+    text = kinds | {"name": NAME, "units": library.units, "meta": library.meta, "summary": ["s"]}
+    data = np.frombuffer(json.dumps(text).encode(), dtype=np.uint8)
+    columns = [fits.Column(n, "D", array=c) for n, c in (library.axes | library.values).items()]
+    hdus = [
+        fits.PrimaryHDU(header=fits.Header({"FORMAT": "miricigale-library-1"})),
+        fits.ImageHDU(library.wave, name="WAVE"),
+        fits.BinTableHDU.from_columns(columns, name="ROWS"),
+        fits.ImageHDU(data, name="TEXT"),
+    ]
+    for k, spectra in enumerate(library.spectra.values()):
+        hdus.append(fits.ImageHDU(spectra, name="SPECTRA", ver=k + 1))
+    for hdu in hdus:
+        hdu.add_checksum()
+    fits.HDUList(hdus).writeto(tmp_path / "x.fits", checksum=True)
+    found = verify_library(tmp_path / "x.fits", NAME)
+    for kind in ("axes", "values", "spectra"):
+        for name, column in getattr(library, kind).items():
+            np.testing.assert_array_equal(getattr(found, kind)[name], column)
+    assert (found.units, found.meta, found.summary) == (library.units, library.meta, ("s",))
+
+
 def test_other_programs_read_it(tmp_path):
     """A FITS reader finds images with units, a table of axes, and checksums that hold."""
     path = tmp_path / "x.fits"
     write_library(make(), path)
     with fits.open(path, checksum=True) as hdus:
         hdus.verify("exception")
-        assert hdus["SPECTRA", 1].data[3, 0] == pytest.approx(30.1)
-        assert u.Unit(hdus["SPECTRA", 2].header["BUNIT"]) == u.L_sun / u.AA
+        assert hdus["SPECTRA_DUST"].data[3, 0] == pytest.approx(30.1)
+        assert u.Unit(hdus["SPECTRA_DISK"].header["BUNIT"]) == u.L_sun / u.AA
         assert hdus["WAVE"].header["BUNIT"] == "um"
         assert hdus["ROWS"].columns.names == ["tau", "q", "mass"]
 
@@ -194,15 +227,15 @@ def test_foreign_and_other_files_are_refused_by_name(tmp_path):
     with pytest.raises(DataError, match=r"x.fits cannot be read as .*'test.library'.*no such file"):
         open_library(path, NAME)
     path.write_text("not FITS at all")
-    with pytest.raises(DataError, match=r"x.fits cannot be read as the library"):
+    with pytest.raises(DataError, match=r"x.fits cannot be read as library 'test.library'"):
         open_library(path, NAME)
     fits.PrimaryHDU(np.zeros(3)).writeto(path, overwrite=True)
-    with pytest.raises(DataError, match=r"x.fits is not a library .*miricigale data add"):
+    with pytest.raises(DataError, match=r"x.fits holds no library .*miricigale data add"):
         open_library(path, NAME)
     write_library(make("other"), path)
     with pytest.raises(DataError, match=r"x.fits holds 'other', not 'test.library'"):
         open_library(path, NAME)
-    with pytest.raises(DataError, match=r"cannot be read as the library"):
+    with pytest.raises(DataError, match=r"cannot be read as library"):
         open_library(tmp_path, NAME)
 
 
@@ -213,7 +246,9 @@ def test_a_truncated_file_is_refused(tmp_path, kept):
     whole = path.read_bytes()
     for size in {int(kept * len(whole)), 2880 * int(kept * len(whole) / 2880)}:
         path.write_bytes(whole[:size])
-        with pytest.raises(DataError, match=r"x.fits (cannot be read as|is not a whole)"):
+        with pytest.raises(
+            DataError, match=r"x.fits (cannot be read as|is not a complete file of) library"
+        ):
             open_library(path, NAME)
 
 
@@ -296,7 +331,7 @@ def source(folder, text="3 0 1.5\n3 90 2.5\n7 0 3.5\n7 90 4.5\nend\n"):
 
 
 def state():
-    (row,) = check_resources(openers())
+    (row,) = check_resources()
     return row
 
 
@@ -403,9 +438,9 @@ def test_an_interrupted_conversion_changes_nothing(folder, monkeypatch, error, p
         raise error
 
     where = {
-        "written": (table.os, "fsync"),
+        "written": (os, "fsync"),
         "checked": (register, "verify_library"),
-        "recorded": (register, "install"),
+        "recorded": (store, "file_sha256"),
     }[place]
     with monkeypatch.context() as patch:
         patch.setattr(*where, interrupt)
@@ -418,7 +453,7 @@ def test_an_interrupted_conversion_changes_nothing(folder, monkeypatch, error, p
 
 def test_what_a_killed_process_left_is_ignored_and_swept(folder):
     report = add_library(NAME, source(folder))
-    left = report.path.with_name(f".{report.path.name}.1-abc.partial")
+    left = report.path.with_name(f"{PARTIAL}1-abc-{report.path.name}")
     left.write_bytes(b"half")
     assert locate(NAME) == report.path
     assert state().state == "ok"
@@ -430,7 +465,7 @@ def test_a_process_that_dies_between_file_and_record_leaves_a_library_that_works
     folder, monkeypatch
 ):
     add_library(NAME, source(folder))
-    replace = sys.modules["miricigale.refdata.store"].os.replace
+    replace = os.replace
 
     def die(old, new):
         if str(new).endswith(".json"):
@@ -438,7 +473,7 @@ def test_a_process_that_dies_between_file_and_record_leaves_a_library_that_works
         replace(old, new)
 
     with monkeypatch.context() as patch:
-        patch.setattr("miricigale.refdata.store.os.replace", die)
+        patch.setattr(os, "replace", die)
         with pytest.raises(KeyboardInterrupt):
             add_library(NAME, source(folder, "3 0 9.5\nend\n"))
     assert open_library(locate(NAME), NAME).spectrum("dust", 0) == pytest.approx(9.5)
@@ -450,7 +485,7 @@ ADD = """
 import sys
 import numpy as np
 from miricigale.refdata import Resource, conf, registry
-from miricigale.sed.libraries import READERS, LibraryTable, add_library
+from miricigale.refdata.libraries import READERS, LibraryTable, add_library
 
 value, folder = float(sys.argv[1]), sys.argv[2]
 record = Resource("t", "user", "T", "L", "C", "S", file="sed/t.fits")
@@ -492,7 +527,7 @@ def test_two_processes_may_add_at_once(tmp_path):
     # one of the two won, and the record is of that one
     assert record["sha256"] == file_sha256(path)
     assert float(record["files"]["f"]) == library.spectra["dust"][0, 0]
-    assert not list(path.parent.glob(".*.partial"))
+    assert not list(path.parent.glob(f"{PARTIAL}*"))
 
 
 def test_damage_is_told(folder):

@@ -3,23 +3,23 @@
 import bisect
 import functools
 import json
-import os
 import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
-from astropy.io import fits
+from astropy.table import Table
 
-from miricigale.refdata.store import partial_path
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import open_fits, writing
+from miricigale.utils.files import open_fits
+from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import WAVE, frozen_array, to_array
 
 __all__ = ["LibraryTable", "open_library", "verify_library", "write_library"]
 
-_FORMAT = "miricigale-library-1"
+#: Layouts of files; in the first the kinds of spectra were versions of one extension.
+_LAYOUTS = ("miricigale-library-2", "miricigale-library-1")
 
 #: Values of an axis that differ by less than this, relatively, are the same.
 _SAME = 1e-6
@@ -172,7 +172,7 @@ class LibraryTable:
             codes = np.array([self._code(name, value) for value in found.tolist()])
             if np.any(codes < 0):
                 wanted = f"of values that differ by more than {_SAME:g}, relatively"
-                raise argument_error(name, wanted, "some that creep")
+                raise argument_error(name, wanted, "values closer together")
             keys[:, k] = codes[which]
         # bytes, unlike thousands of tuples, set off no collection of garbage
         text, size = keys.tobytes(), keys.itemsize * keys.shape[1]
@@ -250,55 +250,31 @@ def write_library(library, path):
     ValueError
         If ``meta`` does not consist of plain values.
     """
-    path = Path(path)
-    text = {
-        "name": library.name,
-        "axes": list(library.axes),
-        "values": list(library.values),
-        "spectra": list(library.spectra),
-        "units": {name: str(unit) for name, unit in library.units.items()},
-        "meta": library.meta,
-        "summary": list(library.summary),
-    }
     try:
-        data = np.frombuffer(json.dumps(text, default=_plain).encode(), dtype=np.uint8)
+        # a path or a date would come back as text
+        meta = json.loads(json.dumps(library.meta, default=_plain))
     except (TypeError, ValueError) as err:
         raise argument_error("meta", "plain values (text, numbers, lists, dicts)", err) from None
-    wave = fits.ImageHDU(library.wave, name="WAVE")
-    wave.header["BUNIT"] = "um"
-    columns = [
-        fits.Column(name, "D", unit=_fits_unit(library, name), array=column)
-        for name, column in (library.axes | library.values).items()
-    ]
-    hdus = [
-        fits.PrimaryHDU(header=fits.Header({"FORMAT": _FORMAT})),
-        wave,
-        fits.BinTableHDU.from_columns(columns, name="ROWS"),
-        fits.ImageHDU(data, name="TEXT"),
-    ]
-    for k, (name, spectra) in enumerate(library.spectra.items()):
+    text = {name: list(getattr(library, name)) for name in ("axes", "values", "spectra", "summary")}
+    text["units"] = {name: str(unit) for name, unit in library.units.items()}
+    rows = Table(library.axes | library.values)
+    for name in rows.colnames:
+        rows[name].unit = _fits_unit(library, name)
+    arrays = {"WAVE": library.wave * WAVE}
+    for name, spectra in library.spectra.items():
         array = np.asarray(spectra)
         if array.dtype.kind != "f" or array.dtype.itemsize not in (4, 8):
             array = array.astype(float)
-        hdu = fits.ImageHDU(array, name="SPECTRA", ver=k + 1)
-        hdu.header["KIND"] = name
-        hdu.header["BUNIT"] = _fits_unit(library, name) or ""
-        hdus.append(hdu)
-    hdus = fits.HDUList(hdus)
-    hdus.update_extend()
-    for hdu in hdus:
-        # no date in the comment: it would change the checksum of the file
-        hdu.add_checksum(when="sum of this HDU")
+        unit = _fits_unit(library, name)
+        arrays[_extension(name)] = array if unit is None else u.Quantity(array, unit, copy=False)
+    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = partial_path(path)
-    try:
-        with writing(path), open(partial, "wb") as handle:
-            hdus.writeto(handle)
-            handle.flush()
-            os.fsync(handle.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    text |= {"name": library.name, "meta": meta}
+    write_parts(path, _LAYOUTS[0], text=text, arrays=arrays, tables={"ROWS": rows}, overwrite=True)
+
+
+def _extension(kind):
+    return f"SPECTRA_{kind.upper()}"
 
 
 def _plain(value):
@@ -310,12 +286,12 @@ def _plain(value):
 
 
 def _fits_unit(library, name):
-    """The unit in FITS's words for other readers; ours is in the text."""
+    """The unit for other readers, or None where there is none that FITS knows; ours is in the text."""
     unit = u.Unit(library.units.get(name, ""))
     try:
-        return unit.to_string("fits") or None
+        return u.Unit(unit.to_string("fits")) if unit != u.one else None
     except ValueError:
-        return str(unit)
+        return None
 
 
 def open_library(path, name):
@@ -358,44 +334,27 @@ _lock = threading.Lock()
 @functools.lru_cache(maxsize=8)
 def _open(path, key, name):
     del key
-    try:
-        # the mapping lives as long as the arrays that use it
-        with open_fits(path, wanted=f"the library {name!r}", memmap=True) as hdus:
-            if hdus[0].header.get("FORMAT") != _FORMAT:
-                msg = (
-                    f"{path} is not a library in this package's format; "
-                    "distributed files are converted by 'miricigale data add NAME PATH'"
-                )
-                raise DataError(msg)
-            text = json.loads(bytes(np.asarray(hdus["TEXT"].data)).decode())
-            if text["name"] != name:
-                msg = f"{path} holds {text['name']!r}, not {name!r}"
-                raise DataError(msg)
-            rows = hdus["ROWS"].data
-            return LibraryTable(
-                name=name,
-                wave=hdus["WAVE"].data,
-                axes={n: rows[n] for n in text["axes"]},
-                values={n: rows[n] for n in text["values"]},
-                spectra={n: _mapped(hdus, k + 1, n) for k, n in enumerate(text["spectra"])},
-                units=text["units"],
-                meta=text["meta"],
-                summary=tuple(text["summary"]),
-            )
-    except (KeyError, ValueError, TypeError) as err:
-        reason = err.args[0] if err.args else err
-        msg = f"{path} is not a whole library: {reason}"
-        raise DataError(msg) from err
-
-
-def _mapped(hdus, version, kind):
-    hdu = hdus["SPECTRA", version]
-    if hdu.header.get("KIND") != kind:
-        msg = f"spectra {version} are {hdu.header.get('KIND')!r}, not {kind!r}"
-        raise ValueError(msg)
-    data = hdu.data
-    data.flags.writeable = False
-    return data
+    wanted = f"library {name!r} (made by 'miricigale data add')"
+    # the mapping lives as long as the arrays that use it
+    with open_parts(path, _LAYOUTS, wanted=wanted, memmap=True) as parts:
+        text = parts.text
+        if text["name"] != name:
+            msg = f"{path} holds {text['name']!r}, not {name!r}"
+            raise DataError(msg)
+        rows, kinds = parts.table("ROWS"), text["spectra"]
+        places = map(_extension, kinds)
+        if parts.layout == _LAYOUTS[1]:
+            places = [("SPECTRA", k) for k in range(1, len(kinds) + 1)]
+        return LibraryTable(
+            name=name,
+            wave=parts.array("WAVE"),
+            axes={n: np.asarray(rows[n]) for n in text["axes"]},
+            values={n: np.asarray(rows[n]) for n in text["values"]},
+            spectra={n: parts.mapped(place) for n, place in zip(kinds, places, strict=True)},
+            units=text["units"],
+            meta=text["meta"],
+            summary=tuple(text["summary"]),
+        )
 
 
 def verify_library(path, name):
