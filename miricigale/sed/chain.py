@@ -9,7 +9,7 @@ from miricigale.filters import FilterSet
 from miricigale.sed import _core
 from miricigale.sed.component import ROLES
 
-__all__ = ["COLOURS", "Attenuated", "Chain", "Galaxy", "Stars"]
+__all__ = ["COLOURS", "Chain", "Galaxy", "Starlight", "Stars", "distinct"]
 
 #: Version of the numbers that follow from the components: raised when the chain, the derived
 #: quantities or the grids change, so that grids kept on the disk are made anew.
@@ -42,6 +42,11 @@ COLOUR_BANDS = {
 #: Rest-frame colours: name to the two bands.
 COLOURS = {"nuv_r": ("nuv", "r"), "u_v": ("u", "v"), "v_j": ("v", "j")}
 
+#: Roles whose parameters shape the stars with their gas, and what lies between source and us.
+STELLAR = ("sfh", "stellar", "nebular")
+SKY = ("igm", "foreground")
+KEPT = 128  # stars of so many histories are kept
+
 
 @dataclass(frozen=True, eq=False)
 class Stars:
@@ -50,7 +55,7 @@ class Stars:
 
     Spectra are L_lambda in W/um; ``nebular_young`` and ``nebular_old`` are the gas's part
     of ``young`` and ``old``; ``dust_power`` in W is what dust takes of the ionising light;
-    ages are in Gyr, rates in Msun/yr, masses in Msun.
+    ``visual`` is L_lambda at 0.55 um; ages are in Gyr, rates in Msun/yr, masses in Msun.
     """
 
     young: np.ndarray
@@ -58,6 +63,7 @@ class Stars:
     nebular_young: np.ndarray | None
     nebular_old: np.ndarray | None
     dust_power: float
+    visual: float
     stellar_mass: float
     sfr: float
     sfr_10myr: float
@@ -67,21 +73,20 @@ class Stars:
 
 
 @dataclass(frozen=True, eq=False)
-class Attenuated:
-    """Starlight behind dust, L_lambda in W/um, and the power in W that the dust took."""
+class Starlight:
+    """Starlight behind dust and before, and the gas's part of the former; L_lambda in W/um."""
 
     light: np.ndarray
     intrinsic: np.ndarray
     nebular: np.ndarray | None
-    absorbed: float
 
 
 @dataclass(frozen=True, eq=False)
 class Galaxy:
-    """A galaxy without its nucleus, for one solar mass formed."""
+    """A galaxy without its nucleus, for one solar mass formed; ``dust_luminosity`` in W."""
 
     stars: Stars
-    starlight: Attenuated
+    starlight: Starlight
     dust: np.ndarray
     dust_luminosity: float
 
@@ -99,9 +104,36 @@ def trapezoid_weights(wave):
     return weights
 
 
+def distinct(items):
+    """Different items in the order of their first appearance, and which of them each one is."""
+    seen = {}
+    index = [seen.setdefault(item, len(seen)) for item in items]
+    return list(seen), np.array(index, dtype=np.int64)
+
+
+def _kept(maxsize):
+    """Decorator: a method keeps what it made last, by its arguments, as long as its object lives."""
+
+    def decorate(method):
+        @functools.wraps(method)
+        def call(self, *key):
+            made = self._made.get(method)
+            if made is None:
+                made = functools.lru_cache(maxsize=maxsize)(functools.partial(method, self))
+                self._made[method] = made
+            return made(*key)
+
+        return call
+
+    return decorate
+
+
 class Chain:
     """
     Components in order, on the union of their nodes.
+
+    Values of all parameters of some roles, as a tuple (`key`), stand for what these components
+    make; the keys of ``sfh``, ``stellar`` and ``nebular`` together are one.
 
     Parameters
     ----------
@@ -114,6 +146,9 @@ class Chain:
         Rest wavelengths in um.
     weights : `~numpy.ndarray`, shape (n_wave,)
         Weights of the trapezoid rule on them.
+    functionals : `~numpy.ndarray`, shape (n_functional, n_wave)
+        Sums over a galaxy's light: of 3-1000 um, L_lambda at 0.55 um, means of the windows of
+        `UV_WINDOWS`, means of `COLOUR_BANDS`.
     """
 
     def __init__(self, components):
@@ -129,41 +164,28 @@ class Chain:
         self.to_lnu = wave**2 / _core.LIGHT
         self._ionising = wave < _core.LYMAN_LIMIT
         self._at = {x: int(np.searchsorted(wave, x * (1 - 1e-9))) for x in (SIX, VISUAL, *INFRARED)}
-        self._functionals()
-        self._keys = {
+        self.functionals = self._functionals()
+        self._names = {
             role: tuple(part.parameters) if part else () for role, part in self.by_role.items()
         }
-        self._caches()
-
-    def _caches(self):
-        self._table = functools.lru_cache(maxsize=8)(self._make_table)
-        self._factors = functools.lru_cache(maxsize=256)(self._make_factors)
-        self._gas_factors = functools.lru_cache(maxsize=256)(self._make_gas_factor)
-        self._stars = functools.lru_cache(maxsize=64)(self._make_stars)
-        self._starlight = functools.lru_cache(maxsize=256)(self._make_starlight)
-        self._dust = functools.lru_cache(maxsize=256)(self._make_dust)
-        self._agn = functools.lru_cache(maxsize=256)(self._make_agn)
-        self._sky = functools.lru_cache(maxsize=64)(self._make_sky)
+        self._made, self._stars = {}, {}
 
     def _functionals(self):
-        """Everything derived from a galaxy's light by a sum over wavelengths, in one matrix."""
         wave, n = self.wave, self.wave.size
-        infrared = np.zeros(n)
+        infrared, visual = np.zeros((2, n))
         part = slice(self._at[INFRARED[0]], self._at[INFRARED[1]] + 1)
         infrared[part] = trapezoid_weights(wave[part])
+        visual[self._at[VISUAL]] = 1.0
         windows = np.zeros((len(UV_WINDOWS), n))
         for row, (low, high) in zip(windows, UV_WINDOWS, strict=True):
             first, last = np.searchsorted(wave, [low * (1 - 1e-9), high * (1 + 1e-9)])
             row[first:last] = trapezoid_weights(wave[first:last]) / (high - low)
         bands = FilterSet.from_names(list(COLOUR_BANDS.values())).weights(wave) * self.to_lnu
-        visual = np.zeros((1, n))
-        visual[0, self._at[VISUAL]] = 1.0
-        self.functionals = np.concatenate([infrared[None], visual, windows, bands])
+        return np.concatenate([[infrared, visual], windows, bands])
 
-    # values of the parameters of some roles, as a key for the caches
     def names(self, *roles):
         """Names of the parameters of these roles."""
-        return tuple(name for role in roles for name in self._keys[role])
+        return tuple(name for role in roles for name in self._names[role])
 
     def key(self, values, *roles):
         """Values of all parameters of these roles, as a tuple."""
@@ -174,44 +196,36 @@ class Chain:
 
     # ------------------------------------------------------------------ stars
 
-    def _make_table(self, metallicity):
-        """Ages, spectra on our grid, living mass and ionising photons of one metallicity."""
+    @_kept(8)
+    def _populations(self, metallicity):
+        """Ages, spectra on our grid, surviving mass and ionising photons of one metallicity."""
         stellar = self.by_role["stellar"]
-        age, spectra, living = stellar.table(metallicity)
+        age, spectra, surviving = stellar.table(metallicity)
         matrix = _core.hat_matrix(np.asarray(stellar.nodes()), self.wave)
         spectra = np.ascontiguousarray((matrix @ np.asarray(spectra, dtype=float).T).T)
         ionising = stellar.ionizing(metallicity) if self.by_role["nebular"] else None
-        return age, spectra, living, ionising
+        return age, spectra, surviving, ionising
 
     @functools.cached_property
     def _nebular_hat(self):
         return _core.hat_matrix(np.asarray(self.by_role["nebular"].nodes()), self.wave)
 
-    def _make_stars(self, key):
-        return self.stars_of([key])[0]
-
-    def stars_of(self, keys):
-        """
-        `Stars` of several histories at once.
-
-        Parameters
-        ----------
-        keys : list of tuple
-            As `key` gives them for ``sfh``, ``stellar`` and ``nebular``.
-        """
-        values = [self._dict(key, "sfh", "stellar", "nebular") for key in keys]
-        out = [None] * len(keys)
+    def stars(self, keys):
+        """`Stars` of several histories at once, by their keys: list, the same one for the same key."""
+        known = {key: self._stars[key] for key in keys if key in self._stars}
+        new = [key for key in dict.fromkeys(keys) if key not in known]
+        values = [self._dict(key, *STELLAR) for key in new]
         for metallicity in {v["metallicity"] for v in values}:
             rows = [i for i, v in enumerate(values) if v["metallicity"] == metallicity]
-            for i, stars in zip(
-                rows, self._stars_of_metal(metallicity, [values[i] for i in rows]), strict=True
-            ):
-                out[i] = stars
-        return out
+            made = self._make_stars(metallicity, [values[i] for i in rows])
+            known.update(zip([new[i] for i in rows], made, strict=True))
+        # histories that follow on one another share what was made last
+        self._stars = dict(list((self._stars | known).items())[-KEPT:])
+        return [known[key] for key in keys]
 
-    def _stars_of_metal(self, metallicity, values):
-        age, spectra, living, ionising = self._table(metallicity)
-        sfh, stellar, nebular = (self.by_role[r] for r in ("sfh", "stellar", "nebular"))
+    def _make_stars(self, metallicity, values):
+        age, spectra, surviving, ionising = self._populations(metallicity)
+        sfh, stellar, nebular = (self.by_role[r] for r in STELLAR)
         histories = [sfh.history(v) for v in values]
         pairs = [stellar.age_weights(h, v) for h, v in zip(histories, values, strict=True)]
         young, old = (np.array([pair[i] for pair in pairs]) for i in (0, 1))
@@ -221,7 +235,7 @@ class Chain:
         light = both @ visual
         age_light = (both * visual) @ age / np.where(light > 0, light, np.nan) * 1e-3
         age_mass = both @ age / both.sum(axis=1) * 1e-3
-        mass = both @ living
+        mass = both @ surviving
         for i, (v, h) in enumerate(zip(values, histories, strict=True)):
             parts = [young_light[i], old_light[i]]
             gas, dusty = [None, None], 0.0
@@ -242,6 +256,7 @@ class Chain:
                 nebular_young=gas[0],
                 nebular_old=gas[1],
                 dust_power=dusty,
+                visual=float(self.visual(parts[0] + parts[1])),
                 stellar_mass=float(mass[i]),
                 sfr=float(h[-1]),
                 sfr_10myr=float(h[-10:].mean()),
@@ -250,57 +265,67 @@ class Chain:
                 age_light=float(age_light[i]),
             )
 
-    def stars(self, values):
-        """`Stars` for a dict of values."""
-        return self._stars(self.key(values, "sfh", "stellar", "nebular"))
-
     # ------------------------------------------------------- attenuation and dust
 
-    def _make_factors(self, key):
-        attenuation = self.by_role["attenuation"]
+    @_kept(256)
+    def factors(self, key):
+        """Transmissions for young stars, old stars and gas; None for gas that is as the stars."""
+        attenuation, values = self.by_role["attenuation"], self._dict(key, "attenuation")
         if attenuation is None:
             ones = np.ones(self.wave.size)
-            return ones, ones
-        return attenuation.factors(self.wave, self._dict(key, "attenuation"))
+            return ones, ones, None
+        gas = attenuation.gas_factor(self.wave, values) if self.by_role["nebular"] else None
+        return *attenuation.factors(self.wave, values), gas
 
-    def factors(self, key):
-        """Transmissions for young and old stars, by the key of ``attenuation``."""
-        return self._factors(key)
+    def attenuated(self, stars, keys, dust_keys=None, out=None):
+        """
+        Starlight behind dust, with the light of that dust if it is asked for.
 
-    def gas_factor(self, key):
-        """Transmission for gas by the key of ``attenuation``; None if that of the stars."""
-        return self._gas_factors(key)
+        Parameters
+        ----------
+        stars : list of `Stars`
+            Of n galaxies.
+        keys : list of tuple
+            Keys of ``attenuation``.
+        dust_keys : list of tuple, optional
+            Keys of ``dust``.
+        out : `~numpy.ndarray`, shape (n, n_wave), optional
+            To be filled.
 
-    def _make_gas_factor(self, key):
-        attenuation = self.by_role["attenuation"]
-        if attenuation is None or self.by_role["nebular"] is None:
-            return None
-        return attenuation.gas_factor(self.wave, self._dict(key, "attenuation"))
+        Returns
+        -------
+        light : `~numpy.ndarray`, shape (n, n_wave)
+            L_lambda in W/um.
+        absorbed : `~numpy.ndarray`, shape (n,)
+            Power in W that dust took.
+        """
+        n, none = len(stars), np.zeros((0, self.wave.size))
+        some, star = distinct(stars)
+        different, dim = distinct(keys)
+        dust, dusty = np.zeros((1, self.wave.size)), np.zeros(n, dtype=np.int64)
+        if dust_keys is not None:
+            dust_keys, dusty = distinct(dust_keys)
+            dust = np.array([self.dust(key) for key in dust_keys])
+        parts = [np.array([getattr(s, age) for s in some]) for age in ("young", "old")]
+        *dims, gas = zip(*map(self.factors, different), strict=True)
+        parts, dims = [*parts, none], [*map(np.array, dims), none]
+        if gas[0] is not None:
+            young, old = (
+                np.array([getattr(s, f"nebular_{a}") for s in some]) for a in ("young", "old")
+            )
+            parts = [parts[0] - young, parts[1] - old, young + old]
+            dims[2] = np.array(gas)
+        extra = np.array([s.dust_power for s in some])
+        out = np.empty((n, self.wave.size)) if out is None else out
+        absorbed = np.empty(n)
+        _core.mix_light(
+            self.weights, *parts, star, *dims, dim, extra, dust, dusty, out, absorbed
+        )  # fmt: skip
+        return out, absorbed
 
-    def _make_starlight(self, star_key, key):
-        return self.attenuate(self._stars(star_key), key)
-
-    def attenuate(self, stars, key):
-        """`Attenuated` light of `Stars` behind the dust of a key of ``attenuation``."""
-        young, old = self._factors(key)
-        intrinsic = stars.young + stars.old
-        light = stars.young * young + stars.old * old
-        nebular = None
-        if stars.nebular_young is not None:
-            gas = self.gas_factor(key)
-            nebular = stars.nebular_young * (young if gas is None else gas)
-            nebular += stars.nebular_old * (old if gas is None else gas)
-            if gas is not None:
-                light = light - stars.nebular_young * young - stars.nebular_old * old + nebular
-        absorbed = float(self.weights @ (intrinsic - light)) + stars.dust_power
-        return Attenuated(light, intrinsic, nebular, absorbed)
-
-    def starlight(self, values):
-        """`Attenuated` starlight for a dict of values."""
-        stars = self.key(values, "sfh", "stellar", "nebular")
-        return self._starlight(stars, self.key(values, "attenuation"))
-
-    def _make_dust(self, key):
+    @_kept(256)
+    def dust(self, key):
+        """Dust spectrum in W/um for one watt, by the key of ``dust``; zeros without the component."""
         if self.by_role["dust"] is None:
             return np.zeros(self.wave.size)
         template = self.by_role["dust"].template(self.wave, **self._dict(key, "dust"))
@@ -309,24 +334,20 @@ class Chain:
         template.flags.writeable = False
         return template
 
-    def dust(self, values):
-        """Dust spectrum in W/um for one watt; zeros without a dust component."""
-        return self._dust(self.key(values, "dust"))
-
-    def dust_of(self, key):
-        """The same by the key of ``dust``."""
-        return self._dust(key)
-
     def galaxy(self, values):
         """`Galaxy` for a dict of values."""
-        starlight = self.starlight(values)
-        dust = starlight.absorbed * self.dust(values)
-        return Galaxy(self.stars(values), starlight, dust, starlight.absorbed)
+        (stars,), dim = self.stars([self.key(values, *STELLAR)]), self.key(values, "attenuation")
+        (light,), (absorbed,) = self.attenuated([stars], [dim])
+        nebular = None
+        if stars.nebular_young is not None:
+            young, old, gas = self.factors(dim)
+            nebular = stars.nebular_young * (young if gas is None else gas)
+            nebular += stars.nebular_old * (old if gas is None else gas)
+        starlight = Starlight(light, stars.young + stars.old, nebular)
+        dust = absorbed * self.dust(self.key(values, "dust"))
+        return Galaxy(stars, starlight, dust, float(absorbed))
 
     # ------------------------------------------------------------- AGN and the sky
-
-    def _make_agn(self, key):
-        return self.by_role["agn"].templates(self.wave, self._dict(key, "agn"))
 
     def agn_key(self, values):
         """Values of the AGN's parameters, those without effect at their defaults."""
@@ -336,18 +357,20 @@ class Chain:
             changed[name] = agn.parameters[name].default
         return self.key(changed, "agn")
 
-    def agn_of(self, key):
+    @_kept(256)
+    def agn_templates(self, key):
         """`~miricigale.sed.components.AGNTemplates` by a key of `agn_key`."""
-        return self._agn(key)
+        return self.by_role["agn"].templates(self.wave, self._dict(key, "agn"))
 
     def agn(self, values):
         """`~miricigale.sed.components.AGNTemplates` for a dict of values, whatever its fraction."""
-        return self._agn(self.agn_key(values))
+        return self.agn_templates(self.agn_key(values))
 
-    def _make_sky(self, redshift, key):
-        observed = self.wave * (1.0 + redshift)
-        igm, foreground = self.by_role["igm"], self.by_role["foreground"]
-        values = self._dict(key, "igm", "foreground")
+    @_kept(64)
+    def sky_transmission(self, redshift, key):
+        """Transmission between the source and us, by the key of ``igm`` and ``foreground``."""
+        observed, values = self.wave * (1.0 + redshift), self._dict(key, *SKY)
+        igm, foreground = (self.by_role[role] for role in SKY)
         out = np.ones(self.wave.size)
         if igm is not None:
             own = {name: values[name] for name in igm.parameters}
@@ -357,12 +380,8 @@ class Chain:
         return out
 
     def sky(self, values):
-        """Transmission between the source and us at every rest wavelength."""
-        return self._sky(values["redshift"], self.key(values, "igm", "foreground"))
-
-    def sky_of(self, redshift, key):
-        """The same by redshift and the key of ``igm`` and ``foreground``."""
-        return self._sky(redshift, key)
+        """Transmission between the source and us at every rest wavelength, for a dict of values."""
+        return self.sky_transmission(values["redshift"], self.key(values, *SKY))
 
     # --------------------------------------------------------------- derived values
 

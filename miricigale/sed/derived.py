@@ -81,7 +81,7 @@ def columns(model):
     return out
 
 
-def galaxy_quantities(stars, absorbed, sums, intrinsic_visual):
+def galaxy_quantities(stars, absorbed, sums):
     """
     Derived quantities of galaxies, for one solar mass formed.
 
@@ -93,8 +93,6 @@ def galaxy_quantities(stars, absorbed, sums, intrinsic_visual):
         Power that dust took, in W.
     sums : `~numpy.ndarray`, shape (n, n_functional)
         The galaxies' light times ``Chain.functionals``.
-    intrinsic_visual : `~numpy.ndarray`, shape (n,)
-        L_lambda at 0.55 um before dust.
 
     Returns
     -------
@@ -106,7 +104,7 @@ def galaxy_quantities(stars, absorbed, sums, intrinsic_visual):
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.log10(windows)
         magnitude = -2.5 * np.log10(bands)
-        a_v = 2.5 * np.log10(intrinsic_visual / visual)
+        a_v = 2.5 * np.log10(np.array([s.visual for s in stars]) / visual)
     step = _LOG_UV - _LOG_UV.mean()
     out = {
         name: np.array([getattr(s, name) for s in stars])

@@ -7,6 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from miricigale.sed.chain import STELLAR, distinct
 from miricigale.sed.derived import DERIVED, galaxy_quantities
 from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import distance
@@ -55,19 +56,17 @@ def _products(parameters, axes):
 
 
 def _distinct_agn(component, rows):
-    """Merge rows that differ in parameters without effect: rows, counts."""
+    """Merge rows that differ in parameters without effect: rows, counts, names of those."""
     groups = {}
     for row in rows:
         inert = component.inert(row)
         key = tuple((name, value) for name, value in row.items() if name not in inert)
-        groups.setdefault(key, []).append(row)
-    out = []
-    for group in groups.values():
-        merged = dict(group[0])
-        for name in component.inert(merged):
-            merged[name] = float(np.mean([row[name] for row in group]))
-        out.append(merged)
-    return out, np.array([len(group) for group in groups.values()], dtype=np.int64)
+        groups.setdefault((key, tuple(sorted(inert))), []).append(row)
+    out, names = [], [inert for _, inert in groups]
+    for group, inert in zip(groups.values(), names, strict=True):
+        mean = {name: float(np.mean([row[name] for row in group])) for name in inert}
+        out.append(group[0] | mean)
+    return out, np.array([len(group) for group in groups.values()], dtype=np.int64), names
 
 
 def _parameter_table(parameters, rows):
@@ -79,54 +78,29 @@ def _parameter_table(parameters, rows):
     return out
 
 
-class _Distinct:
-    """Different items of a long list, by key."""
-
-    def __init__(self, keys):
-        self._seen = {}
-        self.rows = np.array(
-            [self._seen.setdefault(key, len(self._seen)) for key in keys], dtype=np.int64
-        )
-        self.keys = list(self._seen)
-
-
 class _Galaxies:
-    """Galaxies of a grid: their different stars, attenuated starlight and dust."""
+    """Galaxies of a grid: their different attenuated starlight and dust."""
 
     def __init__(self, model, rows):
         chain = self.chain = model.chain
-        self.parameters = rows
-        star_keys = [chain.key(row, "sfh", "stellar", "nebular") for row in rows]
-        light_keys = [
-            (star, chain.key(row, "attenuation")) for star, row in zip(star_keys, rows, strict=True)
-        ]
-        stars, light = _Distinct(star_keys), _Distinct(light_keys)
-        dust = _Distinct([chain.key(row, "dust") for row in rows])
-        self.light_rows, self.dust_rows = light.rows, dust.rows
-        made = dict(zip(stars.keys, chain.stars_of(stars.keys), strict=True))
-        self._stars = [made[key] for key in star_keys]
+        self._stars = chain.stars([chain.key(row, *STELLAR) for row in rows])
+        dims = [chain.key(row, "attenuation") for row in rows]
         # many galaxies: their spectra are in memory once
-        self.starlight = np.empty((len(light.keys), chain.wave.size))
-        absorbed, visual = np.empty((2, len(light.keys)))
-        for i, (star, dim) in enumerate(light.keys):
-            behind = chain.attenuate(made[star], dim)
-            self.starlight[i] = behind.light
-            absorbed[i], visual[i] = behind.absorbed, chain.visual(behind.intrinsic)
-        self.dust = np.array([chain.dust_of(key) for key in dust.keys])
-        self.absorbed, self._visual = absorbed[light.rows], visual[light.rows]
+        pairs, self.light_rows = distinct(zip(self._stars, dims, strict=True))
+        self.starlight, absorbed = chain.attenuated(*map(list, zip(*pairs, strict=True)))
+        dusts, self.dust_rows = distinct([chain.key(row, "dust") for row in rows])
+        self.dust = np.array(list(map(chain.dust, dusts)))
+        self.absorbed = absorbed[self.light_rows]
 
-    def quantities(self):
-        """Derived quantities: dict of arrays, one value for each galaxy."""
-        functionals = self.chain.functionals.T
-        sums = (self.starlight @ functionals)[self.light_rows]
-        sums = sums + self.absorbed[:, None] * (self.dust @ functionals)[self.dust_rows]
-        return galaxy_quantities(self._stars, self.absorbed, sums, self._visual)
-
-    def fluxes(self, weights):
-        """Band values of every galaxy for weights of shape (n_wave, n_band)."""
+    def sums(self, weights):
+        """Sums over the light of every galaxy for weights of shape (n_wave, n)."""
         out = (self.starlight @ weights)[self.light_rows]
         out += self.absorbed[:, None] * (self.dust @ weights)[self.dust_rows]
         return out
+
+    def quantities(self):
+        """Derived quantities: dict of arrays, one value for each galaxy."""
+        return galaxy_quantities(self._stars, self.absorbed, self.sums(self.chain.functionals.T))
 
 
 def _galaxy_tables(quantities):
@@ -190,8 +164,7 @@ def model_grid(model, axes, filters):
     if with_agn:
         every = [r | {"frac_agn": 0.0} for r in _products(agn_parameters, axes)]
         _refuse_invalid(model, [defaults | row for row in every], ("agn",))
-        agn_rows, count = _distinct_agn(agn_component, every)
-        inert = [sorted(agn_component.inert(row)) for row in agn_rows]
+        agn_rows, count, inert = _distinct_agn(agn_component, every)
         parts = [chain.agn(row) for row in agn_rows]
         scale, agn_properties = _agn_table(model, parts)
         agn_spectra = chain.lnu(np.array([t.total for t in parts])) * scale[:, None]
@@ -205,7 +178,7 @@ def model_grid(model, axes, filters):
     for i, z in enumerate(redshift):
         sky = chain.sky(defaults | {"redshift": float(z)})
         weights = (filters.weights(chain.wave * (1.0 + z)) * sky).T * dilution(z, far[i])
-        galaxy[i] = galaxies.fluxes(weights * chain.to_lnu[:, None])
+        galaxy[i] = galaxies.sums(weights * chain.to_lnu[:, None])
         agn[i] = agn_spectra @ weights
     age = np.array([row["age"] for row in rows])
     universe = model.cosmology.age(redshift).to_value(u.Gyr)

@@ -367,13 +367,8 @@ class SEDModel:
         values = self.values(parameters)
         chain, z = self.chain, values["redshift"]
         galaxy, agn = chain.galaxy(values), None
-        got = galaxy_quantities(
-            [galaxy.stars],
-            np.array([galaxy.dust_luminosity]),
-            galaxy.light[None] @ chain.functionals.T,
-            chain.visual(galaxy.starlight.intrinsic[None]),
-        )
-        spectrum = galaxy.light
+        spectrum, absorbed = galaxy.light, np.array([galaxy.dust_luminosity])
+        got = galaxy_quantities([galaxy.stars], absorbed, spectrum[None] @ chain.functionals.T)
         if self.has_agn:
             agn, fraction = chain.agn(values), values["frac_agn"]
             ratio = np.array([fraction / (1.0 - fraction)])

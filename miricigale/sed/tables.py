@@ -8,6 +8,7 @@ from astropy.table import QTable
 
 from miricigale.filters.filter import UNCOVERED
 from miricigale.sed import _core
+from miricigale.sed.chain import SKY, STELLAR, distinct
 from miricigale.sed.derived import agn_quantities, columns, galaxy_quantities, scaled_quantities
 from miricigale.sed.spectrum import distance
 from miricigale.utils.exceptions import argument_error
@@ -62,13 +63,11 @@ def _columns(model, table):
     return out
 
 
-def _distinct(model_columns, names, rows):
-    """Different sets of values: array (n_different, n_names) and which of them each row has."""
+def _keys(columns, names, rows):
+    """Values of some columns as a tuple for each row."""
     if not names:
-        return np.zeros((1, 0)), np.zeros(len(rows), dtype=np.int64)
-    values = np.column_stack([model_columns[name][rows] for name in names])
-    different, index = np.unique(values, axis=0, return_inverse=True)
-    return different, index.ravel().astype(np.int64)
+        return [()] * len(rows)
+    return list(zip(*(columns[name][rows].tolist() for name in names), strict=True))
 
 
 def _row_flags(model, values, n):
@@ -87,10 +86,10 @@ def _row_flags(model, values, n):
         if not component.refuses or not np.any(good):
             continue
         # each different set of values is asked for once
-        names = [*component.parameters, *component.others]
-        different, index = _distinct(values, names, np.flatnonzero(good))
+        names, rows = [*component.parameters, *component.others], np.flatnonzero(good)
+        different, index = distinct(_keys(values, names, rows))
         bad = [bool(component.invalid(dict(zip(names, row, strict=True)))) for row in different]
-        flags[np.flatnonzero(good)[np.array(bad)[index]]] |= int(ModelFlags.NOT_IN_LIBRARY)
+        flags[rows[np.array(bad)[index]]] |= int(ModelFlags.NOT_IN_LIBRARY)
     return flags
 
 
@@ -112,62 +111,17 @@ class _Blocks:
         self.chain = model.chain
         self.bands = bands
         self._light = np.empty((BLOCK, self.chain.wave.size))
-        self._last = {}
 
-    def _stars(self, rows):
-        chain = self.chain
-        names = chain.names("sfh", "stellar", "nebular")
-        different, index = _distinct(self.values, names, rows)
-        keys = [tuple(map(float, row)) for row in different]
-        # histories that follow on one another share what was computed last
-        known = {key: stars for key, stars in self._last.items() if key in keys}
-        new = [key for key in keys if key not in known]
-        known.update(zip(new, chain.stars_of(new), strict=True))
-        self._last = known
-        return [known[key] for key in keys], index
-
-    def _of(self, role, rows, make):
-        different, index = _distinct(self.values, self.chain.names(role), rows)
-        return [make(tuple(map(float, row))) for row in different], index
+    def _keys(self, rows, *roles):
+        return _keys(self.values, self.chain.names(*roles), rows)
 
     def galaxies(self, rows):
         """Light of galaxies, and their derived quantities."""
-        chain, n = self.chain, len(rows)
-        stars, star = self._stars(rows)
-        factors, dim = self._of("attenuation", rows, chain.factors)
-        gas, _ = self._of("attenuation", rows, chain.gas_factor)
-        dust, dusty = self._of("dust", rows, chain.dust_of)
-        light, taken = self._light[:n], np.empty(n)
-        parts, dims = self._screens(stars, factors, gas)
-        _core.mix_light(
-            chain.weights,
-            *parts,
-            star,
-            *dims,
-            dim,
-            np.array([s.dust_power for s in stars]),
-            np.array(dust),
-            dusty,
-            light,
-            taken,
-        )
-        visual = np.sum([chain.visual(p) for p in parts if p.size], axis=0)[star]
-        sums = light @ chain.functionals.T
-        return light, galaxy_quantities([stars[i] for i in star], taken, sums, visual)
-
-    def _screens(self, stars, factors, gas):
-        """Light of young stars, old stars and gas on its own, and the transmission of each."""
-        none = np.zeros((0, self.chain.wave.size))
-        young, old = np.array([s.young for s in stars]), np.array([s.old for s in stars])
-        parts = [young, old, none]
-        dims = [np.array([f[0] for f in factors]), np.array([f[1] for f in factors]), none]
-        if stars[0].nebular_young is not None and gas[0] is not None:
-            glow = [
-                np.array([getattr(s, f"nebular_{age}") for s in stars]) for age in ("young", "old")
-            ]
-            parts = [young - glow[0], old - glow[1], glow[0] + glow[1]]
-            dims[2] = np.array(gas)
-        return parts, dims
+        chain = self.chain
+        stars = chain.stars(self._keys(rows, *STELLAR))
+        dim, dust = self._keys(rows, "attenuation"), self._keys(rows, "dust")
+        light, absorbed = chain.attenuated(stars, dim, dust, self._light[: len(rows)])
+        return light, galaxy_quantities(stars, absorbed, light @ chain.functionals.T)
 
     def agn(self, rows):
         """Spectra of AGN for one watt, which of them each row has, and their sums."""
@@ -178,11 +132,10 @@ class _Blocks:
             blank = dict.fromkeys(("infrared", "luminosity", "six", "accretion"), np.ones(n))
             return np.zeros((1, chain.wave.size)), which, blank
         names = chain.names("agn")
-        different, index = _distinct(self.values, names, rows[active])
-        keys = [chain.agn_key(dict(zip(names, map(float, row), strict=True))) for row in different]
-        unique = list(dict.fromkeys(keys))
-        place = np.array([unique.index(key) for key in keys], dtype=np.int64)
-        parts = [chain.agn_of(key) for key in unique]
+        different, index = distinct(self._keys(rows[active], "agn"))
+        keys = [chain.agn_key(dict(zip(names, row, strict=True))) for row in different]
+        keys, place = distinct(keys)
+        parts = list(map(chain.agn_templates, keys))
         # the others have the first one, at no power
         which[active] = place[index]
         seen = {name: array[which] for name, array in seen_agn(chain, parts).items()}
@@ -201,9 +154,9 @@ class _Blocks:
             definition = self.model.frac_agn_definition
             derived |= agn_quantities(definition, fraction / (1 - fraction), derived, seen)
             power = derived["agn_power"]
-        names = ("redshift", *chain.names("igm", "foreground"))
-        different, sky = _distinct(values, names, rows)
-        dim = np.array([chain.sky_of(float(r[0]), tuple(map(float, r[1:]))) for r in different])
+        names = ("redshift", *chain.names(*SKY))
+        different, sky = distinct(_keys(values, names, rows))
+        dim = np.array([chain.sky_transmission(key[0], key[1:]) for key in different])
         flux = np.empty((n, self.bands[0].size - 1))
         scale = mass * dilution(z, self.far[rows])
         _core.block_fluxes(
