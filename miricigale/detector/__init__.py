@@ -6,7 +6,6 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "detector": ("Detector",),
-        "dq": ("DQ",),
         "effects": (
             "ADConversion",
             "BadPixels",
@@ -29,6 +28,7 @@ __getattr__, __dir__, __all__ = lazy_names(
             "Saturation",
         ),
         "forecast": ("SaturationForecast", "forecast_table"),
+        "level1b": ("DQ",),
         "ramp": ("Ramp",),
     },
 )

@@ -19,8 +19,7 @@ from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.time import Time, TimeDelta
 
-from miricigale.detector.dq import DQ
-from miricigale.instrument import Exposure, reference_pixel_mask
+from miricigale.instrument import DQ, Exposure, reference_pixel_mask
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits, writing
 

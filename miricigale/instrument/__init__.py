@@ -14,6 +14,7 @@ __getattr__, __dir__, __all__ = lazy_names(
             "reference_pixel_mask",
         ),
         "dithers": ("dither_offsets", "dither_patterns", "read_dithers"),
+        "dq": ("DQ", "dq_legend", "read_dq"),
         "etc": ("EtcSetup", "etc_setup", "residual_amplitude", "residual_presets"),
         "exposure": (
             "CEERS_FILTERS",

@@ -7,7 +7,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     {
         "background": ("Background", "estimate_background", "subtract_background"),
         "calibration": ("calibrate", "find_cosmic_rays"),
-        "flags": ("PixelFlags",),
+        "images": ("DQ",),
         "mosaic": (
             "Mosaic",
             "drizzle_images",

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from scipy.ndimage import binary_dilation, gaussian_filter, label
 
-from miricigale.reduction.flags import PixelFlags
+from miricigale.instrument import DQ
 from miricigale.reduction.images import flag_pixels, plain_mask, sigma, with_data
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import argument_error
@@ -210,7 +210,7 @@ def subtract_background(image, *, negative_threshold=10.0, **options):
         Any unit.
     negative_threshold : float or None, optional
         Pixels below the background by more than this many sigma are masked with
-        `PixelFlags.NEGATIVE`; None for none.
+        `DQ.NEGATIVE`; None for none.
     **options
         Passed to `estimate_background`.
 
@@ -231,5 +231,5 @@ def subtract_background(image, *, negative_threshold=10.0, **options):
             raise argument_error("negative_threshold", "positive or None", negative_threshold)
         noise = np.fmax(background.rms, sigma(image))
         low = ~plain_mask(out) & (out.data < -negative_threshold * noise)
-        out = flag_pixels(out, low, PixelFlags.NEGATIVE)
+        out = flag_pixels(out, low, DQ.NEGATIVE | DQ.DO_NOT_USE)
     return out, background

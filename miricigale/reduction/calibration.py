@@ -4,8 +4,7 @@ import astroscrappy
 import numpy as np
 from scipy.ndimage import binary_dilation, convolve, find_objects, label, maximum_filter
 
-from miricigale.instrument import field_mask, flat_field, photmjsr, psf_fwhm
-from miricigale.reduction.flags import PixelFlags
+from miricigale.instrument import DQ, field_mask, flat_field, photmjsr, psf_fwhm
 from miricigale.reduction.images import flag_pixels, plain_flags, plain_mask, sigma, with_data
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
@@ -212,12 +211,12 @@ def calibrate(
     if field_only:
         inside = field_mask(rate.shape, subarray=subarray)
         outside = ~inside if inside.any() else np.zeros_like(inside)
-        outside &= (plain_flags(rate) & np.uint32(PixelFlags.REFERENCE)) == 0
-        out = flag_pixels(out, outside, PixelFlags.OUTSIDE_FIELD)
+        outside &= (plain_flags(rate) & DQ.REFERENCE_PIXEL) == 0
+        out = flag_pixels(out, outside, DQ.NON_SCIENCE | DQ.DO_NOT_USE)
     if cosmic_rays is not None:
         fwhm = psf_fwhm(filter)
         fwhm = float(getattr(fwhm, "value", fwhm)) / _PIXEL_SCALE
         hits = find_cosmic_rays(out, fwhm=fwhm, **cosmic_rays)
-        out = flag_pixels(out, hits, PixelFlags.COSMIC_RAY)
+        out = flag_pixels(out, hits, DQ.COSMIC_RAY | DQ.DO_NOT_USE)
         out.meta["n_cosmic_rays"] = int(np.count_nonzero(hits))
     return out

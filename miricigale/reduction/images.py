@@ -4,11 +4,12 @@ import numpy as np
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.wcs import WCS
 
-from miricigale.reduction.flags import MASKED
+from miricigale.instrument import DQ
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
 __all__ = [
+    "DQ",
     "check_images",
     "check_overlap",
     "exposure_values",
@@ -24,11 +25,11 @@ __all__ = [
 
 
 def image(data, unit, *, error, flags, wcs, meta):
-    """Make an image whose mask says which flags forbid a pixel, or where it is not finite."""
+    """Make an image that is masked where its flags say so, or where it is not finite."""
     data = np.asarray(data, np.float32)
     error = np.asarray(error, np.float32)
-    flags = np.asarray(flags, np.uint32)
-    mask = (flags & np.uint32(MASKED)) != 0
+    flags = np.asarray(flags, np.int64)
+    mask = (flags & DQ.DO_NOT_USE) != 0
     return CCDData(
         data,
         unit=unit,
@@ -47,10 +48,10 @@ def plain_mask(image):
 
 
 def plain_flags(image):
-    """Flags of an image as a new uint32 array; zeros where it has none."""
+    """Flags of an image as a new int64 array; zeros where it has none."""
     if image.flags is None:
-        return np.zeros(image.data.shape, np.uint32)
-    return np.array(image.flags, np.uint32)
+        return np.zeros(image.data.shape, np.int64)
+    return np.array(image.flags, np.int64)
 
 
 def sigma(image, name="image"):
@@ -109,8 +110,8 @@ def with_data(source, data, *, factor=None, unit=None, **meta):
 def flag_pixels(source, where, flag):
     """Copy an image with ``flag`` set, and masked if the flag says so, where ``where``."""
     out = with_data(source, source.data)
-    out.flags[where] |= np.uint32(flag)
-    if int(flag) & int(MASKED):
+    out.flags[where] |= int(flag)
+    if flag & DQ.DO_NOT_USE:
         out.mask |= where
     return out
 

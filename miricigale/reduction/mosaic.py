@@ -10,7 +10,7 @@ from drizzle.resample import Drizzle
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import map_coordinates
 
-from miricigale.reduction.flags import PixelFlags
+from miricigale.instrument import DQ
 from miricigale.reduction.images import (
     check_images,
     check_overlap,
@@ -259,7 +259,7 @@ def _drizzle(images, wcs, shape, pixfrac, weights, pixel_maps):
         data = np.full(shape, np.nan, np.float32)
         variance, weight = data, np.zeros(shape, np.float32)
     covered = (weight > 0) & np.isfinite(data)
-    flags = np.where(covered, 0, int(PixelFlags.NO_DATA)).astype(np.uint32)
+    flags = np.where(covered, 0, int(DQ.NON_SCIENCE | DQ.DO_NOT_USE))
     scales = [_scale(im.wcs) for im in images]
     ratio = _scale(wcs) / float(np.mean(scales))
     meta = _meta(images)
@@ -302,7 +302,7 @@ def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None,
     Returns
     -------
     images : list of `~astropy.nddata.CCDData`
-        With `PixelFlags.OUTLIER` set and masked; ``meta["n_outliers"]`` counts them. Only
+        With `DQ.OUTLIER` set and masked; ``meta["n_outliers"]`` counts them. Only
         pixels that at least three images cover are judged.
 
     Notes
@@ -356,7 +356,7 @@ def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None,
         with np.errstate(invalid="ignore"):
             far = np.abs(im.data - expected) > threshold * noise + derivative * slope
         outlier = far & known & ~plain_mask(im)
-        flagged = flag_pixels(im, outlier, PixelFlags.OUTLIER)
+        flagged = flag_pixels(im, outlier, DQ.OUTLIER | DQ.DO_NOT_USE)
         flagged.meta["n_outliers"] = int(np.count_nonzero(outlier))
         out.append(flagged)
     return out

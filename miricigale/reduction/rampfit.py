@@ -17,8 +17,8 @@ import dataclasses
 
 import numpy as np
 
+from miricigale.instrument import DQ
 from miricigale.reduction import _core
-from miricigale.reduction.flags import PixelFlags
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks, parallel_map, thread_count
 
@@ -43,8 +43,8 @@ class RampFit:
         Differences of groups that the slope stands on, all integrations.
     n_jump : `~numpy.ndarray` of int16, shape (ny, nx)
         Jumps found in the pixel.
-    flags : `~numpy.ndarray` of uint32, shape (ny, nx)
-        `PixelFlags`.
+    flags : `~numpy.ndarray` of int64, shape (ny, nx)
+        `~miricigale.instrument.DQ`.
     jumps : `~numpy.ndarray`, shape (n_jumps,)
         Every jump found: structured array with ``y``, ``x``, ``integration``, ``group`` (the
         first after the jump) and signed ``significance`` in sigma.
@@ -214,7 +214,7 @@ def fit_groups(
         np.zeros((ny, nx), np.float32),
         np.zeros((ny, nx), np.int16),
         np.zeros((ny, nx), np.int16),
-        np.zeros((ny, nx), np.uint32),
+        np.zeros((ny, nx), np.int64),
     )
     ramp = (data, offset, coef, float(saturation))
     groups = (first_group, last_group)
@@ -243,7 +243,7 @@ def fit_groups(
         parallel_map(refit_block, parts, executor=executor)
 
     rate, var_poisson, var_read, n_used, n_jump, flags = out
-    flags[np.isnan(rate)] |= np.uint32(PixelFlags.NO_SLOPE)
+    flags[np.isnan(rate)] |= int(DQ.NO_SLOPE | DQ.DO_NOT_USE)
     jumps = np.empty(len(events), _JUMP_TYPE)
     for i, name in enumerate(("y", "x", "integration", "group", "significance")):
         jumps[name] = events[:, i]

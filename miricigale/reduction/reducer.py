@@ -5,11 +5,10 @@ import warnings
 
 import numpy as np
 
-from miricigale.detector import DQ, Ramp, ResetAnomaly
-from miricigale.instrument import DetectorProperties, miri_detector, mosaic_wcs
+from miricigale.detector import Ramp, ResetAnomaly
+from miricigale.instrument import DQ, DetectorProperties, miri_detector, mosaic_wcs
 from miricigale.reduction.background import estimate_background, subtract_background
 from miricigale.reduction.calibration import calibrate
-from miricigale.reduction.flags import PixelFlags
 from miricigale.reduction.images import (
     check_images,
     check_overlap,
@@ -179,9 +178,9 @@ class Reducer:
         if not isinstance(ramp, Ramp):
             raise argument_error("ramp", "a Ramp", type(ramp).__name__)
         exposure, detector = ramp.exposure, self._detector
-        dq = np.asarray(ramp.pixel_dq)
-        reference = (dq & np.uint32(DQ.REFERENCE_PIXEL)) != 0
-        usable = (dq & np.uint32(_UNUSABLE)) == 0
+        dq = ramp.pixel_dq.astype(np.int64)
+        reference = (dq & DQ.REFERENCE_PIXEL) != 0
+        usable = (dq & _UNUSABLE) == 0
         n_group = ramp.data.shape[1]
         skip_first, skip_last = self._skipped(ramp)
         if skip_first + skip_last > n_group - 2:
@@ -206,8 +205,8 @@ class Reducer:
             n_threads=self.n_threads,
             progress_bar=progress_bar,
         )
-        fit.flags[reference] |= np.uint32(PixelFlags.REFERENCE)
-        fit.flags[~usable & ~reference] |= np.uint32(PixelFlags.BAD_PIXEL)
+        fit.flags[...] |= dq
+        fit.flags[~usable] |= int(DQ.DO_NOT_USE)
         return fit
 
     def fit_ramp(self, ramp, *, progress_bar=False):
@@ -224,7 +223,7 @@ class Reducer:
         Returns
         -------
         rate : `~astropy.nddata.CCDData`
-            Slope in DN/s with standard deviation, mask, ``flags`` (`PixelFlags`) and WCS;
+            Slope in DN/s with standard deviation, mask, ``flags`` (`DQ`) and WCS;
             masked pixels without a slope are NaN. The meta dictionary has the exposure in
             plain values, and ``noise_correction``: by how much the sum over many pixels is
             noisier than their errors in quadrature, because neighbours share charge.

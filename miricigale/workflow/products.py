@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 from astropy.io import fits
 
+from miricigale.instrument import dq_legend, read_dq
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import image_unit, open_fits, write_fits
 from miricigale.utils.meta import undated
@@ -31,7 +32,7 @@ def write_image(image, path, *, planes=None):
     path : path-like
         Where to; an existing file is replaced.
     planes : dict of str to `~numpy.ndarray`, optional
-        Further image extensions by name.
+        Further image extensions by name; ``dq`` holds flags (`~miricigale.instrument.DQ`).
     """
     header = image.wcs.to_header(relax=True) if image.wcs is not None else fits.Header()
     header["BUNIT"] = image.unit.to_string("fits")
@@ -45,7 +46,8 @@ def write_image(image, path, *, planes=None):
     if image.mask is not None:
         hdus.append(fits.ImageHDU(np.asarray(image.mask, np.uint8), name="MASK"))
     for name, plane in (planes or {}).items():
-        hdus.append(fits.ImageHDU(np.asarray(plane), name=name.upper()))
+        header = dq_legend() if name.lower() == "dq" else None
+        hdus.append(fits.ImageHDU(np.asarray(plane), header, name=name.upper()))
     write_fits(hdus, path, overwrite=True)
 
 
@@ -88,5 +90,8 @@ def read_image(path, *, planes=()):
             mask=np.array(hdus["MASK"].data, bool) if "MASK" in hdus else None,
             meta=json.loads(header.get("META", "{}")),
         )
-        extra = [np.array(hdus[name.upper()].data) for name in planes]
+        extra = []
+        for name in planes:
+            hdu = hdus[name.upper()]
+            extra.append(read_dq(hdu) if name.lower() == "dq" else np.array(hdu.data))
     return (image, *extra) if extra else image

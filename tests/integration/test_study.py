@@ -12,8 +12,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable
 
-from miricigale.instrument import saturation_forecast
-from miricigale.reduction import PixelFlags
+from miricigale.instrument import DQ, saturation_forecast
 from miricigale.workflow import load_config
 from miricigale.workflow.products import read_image
 from miricigale.workflow.stages.exposures import study_exposures
@@ -210,7 +209,7 @@ def test_saturation_is_told_before_each_exposure(study):
         assert told["sky_fraction"] == pytest.approx(saturation_forecast(exposure), rel=0.06)
         # and the image has no slope where the well was full from the start
         _, flags = read_image(study["folder"] / f"exposures/{unit}_rate.fits", planes=["dq"])
-        full = np.count_nonzero(flags & np.uint32(PixelFlags.SATURATED))
+        full = np.count_nonzero(flags & DQ.SATURATED)
         assert abs(full - told["n_pixels"]) <= 3 + 0.3 * told["n_pixels"]
 
 

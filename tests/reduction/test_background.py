@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from astropy.nddata import CCDData, StdDevUncertainty
 
-from miricigale.reduction import PixelFlags, estimate_background, subtract_background
+from miricigale.reduction import DQ, estimate_background, subtract_background
 
 SHAPE = (400, 420)
 
@@ -63,7 +63,7 @@ def test_far_negative_pixels_are_masked_with_the_reason(noise):
     noise[50, 60] = -25.0
     noise[51, 90] = -8.0
     image, background = subtract_background(make(noise + 7))
-    assert image.flags[50, 60] == PixelFlags.NEGATIVE
+    assert image.flags[50, 60] == DQ.NEGATIVE | DQ.DO_NOT_USE
     assert image.mask[50, 60]
     assert image.mask.sum() == 1
     assert image.meta["background"] == pytest.approx(7, abs=0.02)

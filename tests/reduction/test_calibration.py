@@ -6,7 +6,7 @@ from astropy.nddata import CCDData, StdDevUncertainty
 
 from miricigale.instrument import field_mask, flat_field, photmjsr, psf_fwhm
 from miricigale.psf import miri_psf
-from miricigale.reduction import PixelFlags, calibrate, calibration, find_cosmic_rays
+from miricigale.reduction import DQ, calibrate, calibration, find_cosmic_rays
 from miricigale.reduction.images import image
 
 SHAPE = (1024, 1032)
@@ -17,8 +17,8 @@ def rate():
     filt = "miri.f1000w"
     data = 20.0 * flat_field(filt) + 0.05
     meta = {"filter": filt, "subarray": "FULL"}
-    flags = np.zeros(SHAPE, np.uint32)
-    flags[:, :4] = PixelFlags.REFERENCE
+    flags = np.zeros(SHAPE, np.int64)
+    flags[:, :4] = DQ.REFERENCE_PIXEL | DQ.DO_NOT_USE
     return image(data, "adu / s", error=np.full(SHAPE, 0.1), flags=flags, wcs=None, meta=meta)
 
 
@@ -35,8 +35,8 @@ def test_uniform_sky_comes_out_uniform(rate):
 
 def test_pixels_off_the_field_are_masked_with_the_reason(rate):
     cal = calibrate(rate, filter="miri.f1000w", subarray="FULL", dark=0.05, gain=4.0)
-    outside = (cal.flags & np.uint32(PixelFlags.OUTSIDE_FIELD)) != 0
-    reference = (cal.flags & np.uint32(PixelFlags.REFERENCE)) != 0
+    outside = (cal.flags & DQ.NON_SCIENCE) != 0
+    reference = (cal.flags & DQ.REFERENCE_PIXEL) != 0
     np.testing.assert_array_equal(outside, ~field_mask() & ~reference)
     np.testing.assert_array_equal(cal.mask, ~field_mask() | reference)
     whole = calibrate(

@@ -71,3 +71,20 @@ def test_images_without_a_unit_are_named(tmp_path, header):
     fits.HDUList([fits.PrimaryHDU(), sci]).writeto(path)
     with pytest.raises(DataError, match=r"bare\.fits must state the unit of its pixels"):
         read_image(path)
+
+
+def test_flags_have_the_bits_of_jwst_and_say_so(tmp_path):
+    image = CCDData(np.zeros((2, 2)), unit=u.MJy / u.sr)
+    write_image(image, tmp_path / "new.fits", planes={"dq": np.array([[0, 2], [2**33, 1]])})
+    header = fits.getheader(tmp_path / "new.fits", "DQ")
+    assert (header["DQSCHEME"], header["DQBIT1"]) == ("JWST", "SATURATED")
+    _, flags = read_image(tmp_path / "new.fits", planes=["dq"])
+    np.testing.assert_array_equal(flags, [[0, 2], [2**33, 1]])
+    # bits of earlier versions: 4 was what 2 is now
+    old = fits.ImageHDU(np.array([[0, 4], [0, 0]], np.uint32), name="DQ")
+    science = fits.ImageHDU(
+        np.zeros((2, 2), np.float32), fits.Header({"BUNIT": "MJy/sr"}), name="SCI"
+    )
+    fits.HDUList([fits.PrimaryHDU(), science, old]).writeto(tmp_path / "old.fits")
+    _, flags = read_image(tmp_path / "old.fits", planes=["dq"])
+    np.testing.assert_array_equal(flags, [[0, 2], [0, 0]])

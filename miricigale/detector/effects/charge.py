@@ -6,9 +6,8 @@ import numpy as np
 from scipy import ndimage
 
 from miricigale.detector import _core
-from miricigale.detector.dq import DQ
 from miricigale.detector.effects.base import Effect, check_amounts, check_ramp
-from miricigale.instrument import bad_pixel_mask, reference_pixel_mask
+from miricigale.instrument import DQ, bad_pixel_mask, reference_pixel_mask
 from miricigale.utils.exceptions import argument_error
 
 __all__ = [

@@ -14,10 +14,9 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.detector import _core
-from miricigale.detector.dq import DQ
 from miricigale.detector.effects.base import Effect, check_ramp
 from miricigale.detector.ramp import Ramp
-from miricigale.instrument import aperture, miri_detector
+from miricigale.instrument import DQ, aperture, miri_detector
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import TIME, frozen_array, to_array
 

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 
 from miricigale.detector import _core
-from miricigale.detector.dq import DQ
 from miricigale.detector.effects.base import Effect, check_amounts, check_ramp
+from miricigale.instrument import DQ
 from miricigale.utils.exceptions import argument_error
 
 __all__ = ["ADConversion", "Bias", "Nonlinearity", "ReadNoise"]

@@ -20,12 +20,11 @@ All integrations of a pixel share one slope and one Poisson variance.
 """
 
 from miricigale.reduction._core.pixel import (
-    FULLY_SATURATED,
     JUMP,
-    JUMP_NEIGHBOUR,
+    JUMP_NEIGHBOR,
     SATURATED,
     refit,
 )
 from miricigale.reduction._core.rows import BLOCK, fit_rows
 
-__all__ = ["BLOCK", "FULLY_SATURATED", "JUMP", "JUMP_NEIGHBOUR", "SATURATED", "fit_rows", "refit"]
+__all__ = ["BLOCK", "JUMP", "JUMP_NEIGHBOR", "SATURATED", "fit_rows", "refit"]

@@ -5,9 +5,8 @@ import numpy as np
 from miricigale.utils.compilation import njit
 
 __all__ = [
-    "FULLY_SATURATED",
     "JUMP",
-    "JUMP_NEIGHBOUR",
+    "JUMP_NEIGHBOR",
     "SATURATED",
     "X_MIN",
     "fit_pixel",
@@ -17,11 +16,10 @@ __all__ = [
     "store",
 ]
 
-# bits that the kernels set; reduction.flags gives them names
-SATURATED = 4
-FULLY_SATURATED = 8
-JUMP = 16
-JUMP_NEIGHBOUR = 32
+# bits that the kernels set; instrument.DQ gives them names
+SATURATED = 2
+JUMP = 4
+JUMP_NEIGHBOR = 2**32
 
 #: Least ratio of Poisson to read variance, to keep the closed forms finite.
 X_MIN = 1e-8
@@ -217,12 +215,10 @@ def store(y, x, scale, result, saturated, had_cut, rate, var_poisson, var_read, 
     flag = 0
     if saturated:
         flag |= SATURATED
-        if used == 0:
-            flag |= FULLY_SATURATED
     if jumps > 0:
         flag |= JUMP
     if had_cut:
-        flag |= JUMP_NEIGHBOUR
+        flag |= JUMP | JUMP_NEIGHBOR
     dq[y, x] = flag
 
 

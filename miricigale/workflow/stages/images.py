@@ -169,7 +169,7 @@ def make_mosaic(context, name):
         drizzled, images = reducer.drizzle(images, grid_of(config, scale))
         # the second pass: what the dithers' own meshes left
         mosaic, _ = reducer.subtract_background(drizzled.image)
-        context.save_image(f"mosaic_{name}{label}.fits", mosaic)
+        context.save_image(f"mosaic_{name}{label}.fits", mosaic, dq=mosaic.flags)
 
 
 @stage(

@@ -1,0 +1,55 @@
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from miricigale.instrument import DQ, dq_legend, read_dq
+from miricigale.utils.exceptions import DataError
+
+#: Bits of JWST from the lowest, as its pipeline documents them.
+JWST = """
+DO_NOT_USE SATURATED JUMP_DET DROPOUT OUTLIER PERSISTENCE AD_FLOOR CHARGELOSS UNRELIABLE_ERROR
+NON_SCIENCE DEAD HOT WARM LOW_QE RC TELEGRAPH NONLINEAR BAD_REF_PIXEL NO_FLAT_FIELD NO_GAIN_VALUE
+NO_LIN_CORR NO_SAT_CHECK UNRELIABLE_BIAS UNRELIABLE_DARK UNRELIABLE_SLOPE UNRELIABLE_FLAT OPEN
+ADJ_OPEN FLUX_ESTIMATED MSA_FAILED_OPEN OTHER_BAD_PIXEL REFERENCE_PIXEL
+"""
+
+
+def test_bits_of_jwst_have_its_values_and_our_own_lie_above():
+    assert [DQ[name] for name in JWST.split()] == [2**n for n in range(32)]
+    assert all(flag >= 2**32 for flag in DQ if flag and flag.name not in JWST.split())
+
+
+def test_the_legend_names_every_bit():
+    header = dq_legend()
+    assert header["DQBIT1"] == "SATURATED"
+    names = {key[5:]: value for key, value in header.items() if key.startswith("DQBIT")}
+    assert {DQ[name]: 2 ** int(bit) for bit, name in names.items()} == {
+        flag: flag.value for flag in DQ if flag
+    }
+
+
+def test_planes_with_a_legend_are_read_as_they_are(tmp_path):
+    flags = np.array([[0, 2**35 + 1], [2**31, 6]])
+    fits.ImageHDU(flags, dq_legend(), name="DQ").writeto(tmp_path / "dq.fits")
+    with fits.open(tmp_path / "dq.fits") as hdus:
+        np.testing.assert_array_equal(read_dq(hdus["DQ"]), flags)
+
+
+def test_planes_of_earlier_versions_are_translated():
+    # reference, saturated, saturated from the start, jump, outlier and bad pixel
+    old = np.array([[2, 4, 4 + 8 + 64], [16, 1024 + 1, 0]], np.uint32)
+    gone = DQ.SATURATED | DQ.NO_SLOPE | DQ.DO_NOT_USE
+    new = [
+        [DQ.REFERENCE_PIXEL | DQ.NON_SCIENCE | DQ.DO_NOT_USE, DQ.SATURATED, gone],
+        [DQ.JUMP_DET, DQ.OUTLIER | DQ.DO_NOT_USE, 0],
+    ]
+    np.testing.assert_array_equal(read_dq(fits.ImageHDU(old, name="DQ")), new)
+
+
+def test_flags_of_another_kind_are_refused():
+    with pytest.raises(DataError, match="DQ holds flags of another kind"):
+        read_dq(fits.ImageHDU(np.array([[2**20]]), name="DQ"))
+    hdu = fits.ImageHDU(np.zeros((2, 2), np.int32), name="DQ")
+    hdu.header["DQSCHEME"] = "HST"
+    with pytest.raises(DataError, match="DQSCHEME HST"):
+        read_dq(hdu)
