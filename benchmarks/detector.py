@@ -17,7 +17,17 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 
-from miricigale.detector import Block, Detector, Ramp
+from miricigale.detector import (
+    Block,
+    CosmicRays,
+    Detector,
+    FirstFrame,
+    LastFrame,
+    Ramp,
+    ReadNoise,
+    ResetAnomaly,
+    Residual,
+)
 from miricigale.detector.effects import stream_key
 from miricigale.instrument import Exposure, background_level, miri_detector
 
@@ -82,12 +92,12 @@ def main():
         image, exposure = make(band, **extra)
         timed(label, lambda i=image, e=exposure: detector.expose(i, e, **options))
     everything = Detector.miri_imager(
-        showers=True,
-        residual=0.001,
-        pink_noise=2.0,
-        reset_anomaly=True,
-        first_frame=True,
-        last_frame=True,
+        CosmicRays(shower_fraction=0.001),
+        Residual(0.001),
+        ReadNoise(pink=2.0),
+        ResetAnomaly(),
+        FirstFrame(),
+        LastFrame(),
     )
     image, exposure = make("miri.f770w", includes=())
     timed("F770W with every option on", lambda: everything.expose(image, exposure, **options))

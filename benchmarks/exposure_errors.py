@@ -20,7 +20,11 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
-from miricigale.detector import Detector
+from miricigale.detector import (
+    CosmicRays,
+    Detector,
+    Residual,
+)
 from miricigale.instrument import (
     Exposure,
     background_level,
@@ -80,7 +84,11 @@ def simulate(name, depth, residual, seed, limit, cosmic_rays=True):
     plan = exposures(name, *DEPTHS[depth])
     truth = catalog(name, limit, rng)
     psf = miri_psf(name)
-    detector = Detector.miri_imager(residual=residual or False, cosmic_rays=cosmic_rays)
+    detector = Detector.miri_imager()
+    if residual:
+        detector = detector.replaced(Residual(residual))
+    if not cosmic_rays:
+        detector = detector.without(CosmicRays)
     ramps = (
         detector.expose(
             Scene(

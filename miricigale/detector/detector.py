@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import dataclasses
+import itertools
 import logging
 import warnings
 from pathlib import Path
@@ -11,31 +12,29 @@ import numpy as np
 
 from miricigale.detector import level1b
 from miricigale.detector.effects import (
+    ORDER,
     ADConversion,
-    BadPixels,
-    Bias,
     Block,
-    CosmicRays,
-    Dark,
     Effect,
     FirstFrame,
-    InterpixelCapacitance,
     LastFrame,
-    Latent,
-    Nonlinearity,
     Persistence,
     Photons,
-    ReadNoise,
-    ReferencePixels,
     ResetAnomaly,
     Residual,
-    Saturation,
     stream_key,
 )
 from miricigale.detector.forecast import SKY_FRACTION, forecast
-from miricigale.detector.image import checked_light, included_effects
+from miricigale.detector.image import checked_light
+from miricigale.detector.latent import Latent
 from miricigale.detector.ramp import Ramp
-from miricigale.instrument import DetectorProperties, Exposure, miri_detector, saturation_forecast
+from miricigale.instrument import (
+    DetectorProperties,
+    Exposure,
+    ImageFacts,
+    miri_detector,
+    saturation_forecast,
+)
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import parallel_map
@@ -45,6 +44,13 @@ from miricigale.utils.units import SURFACE_BRIGHTNESS
 __all__ = ["Detector"]
 
 logger = logging.getLogger(__name__)
+
+#: What acts unless it is asked for more.
+_STANDARD = [
+    kind
+    for kind in ORDER
+    if kind not in (Residual, Persistence, ResetAnomaly, FirstFrame, LastFrame)
+]
 
 # samples (float32) that one thread has in hand: a few MB, so that they stay in the cache
 _BLOCK_SAMPLES = 2**21
@@ -57,9 +63,16 @@ class Detector:
     Parameters
     ----------
     effects : iterable of `~miricigale.detector.Effect`
-        The first act on light; `Photons` makes a ramp of it; `ADConversion` ends.
+        In the order of ``miricigale.detector.effects.ORDER``: the first act on light; `Photons`
+        makes a ramp of it; `ADConversion` ends. Effects of other kinds stand where they are put.
     properties : `~miricigale.instrument.DetectorProperties`, optional
         Gain, noise and the rest; `~miricigale.instrument.miri_detector` if not given.
+
+    Raises
+    ------
+    ValueError
+        If an effect is none, one is not in its place, or there is not one Photons, or no ADConversion
+        at the end.
 
     Examples
     --------
@@ -73,6 +86,7 @@ class Detector:
         for effect in effects:
             if not isinstance(effect, Effect):
                 raise argument_error("effects", "made of detector effects", repr(effect))
+        _check_order(effects)
         properties = miri_detector() if properties is None else properties
         if not isinstance(properties, DetectorProperties):
             raise argument_error("properties", "a DetectorProperties", repr(properties))
@@ -80,71 +94,79 @@ class Detector:
         self._properties = properties
 
     @classmethod
-    def miri_imager(
-        cls,
-        *,
-        residual=False,
-        showers=False,
-        cosmic_rays=True,
-        bad_pixels=True,
-        pink_noise=0.0,
-        persistence=False,
-        reset_anomaly=False,
-        first_frame=False,
-        last_frame=False,
-        properties=None,
-    ):
+    def miri_imager(cls, *effects, properties=None):
         """
         The MIRI imager's detector.
 
         Parameters
         ----------
-        residual : float, str or False, optional
-            Fraction of the light that stays as a fixed pattern (`Residual`), or ``"etc"`` for
-            that of each filter with which the exposure time calculator's limits come out;
-            False for none.
-        showers : bool or float, optional
-            Share of the cosmic rays that make showers; True for 0.001.
-        cosmic_rays, bad_pixels : bool, optional
-            Whether there are any.
-        pink_noise : float, optional
-            Standard deviation of the 1/f noise in DN.
-        persistence : bool, optional
-            Whether exposures before (``previous`` of `expose`) leave latent images
-            (`Persistence`).
-        reset_anomaly, first_frame, last_frame : bool, optional
-            Whether resets leave their marks on the first and last groups
-            (`ResetAnomaly`, `FirstFrame`, `LastFrame`, at their defaults).
+        *effects : `~miricigale.detector.Effect`
+            Effects with settings of their own, or beyond the standard ones; see `replaced`.
         properties : `~miricigale.instrument.DetectorProperties`, optional
             `~miricigale.instrument.miri_detector` if not given.
 
         Returns
         -------
         detector : `Detector`
+            With photons, dark current, interpixel capacitance, cosmic rays, bad and reference
+            pixels, saturation, non-linearity, bias, read noise and conversion.
+
+        Examples
+        --------
+        >>> from miricigale.detector import CosmicRays, Detector, ReadNoise, Residual
+        >>> detector = Detector.miri_imager(Residual("etc"), ReadNoise(pink=2.0))
+        >>> [type(effect).__name__ for effect in detector.without(CosmicRays).effects][:3]
+        ['Residual', 'Photons', 'Dark']
         """
-        if residual is True:
-            raise argument_error("residual", "False or a fraction of the light", residual)
-        effects = []
-        if residual:
-            effects.append(Residual(residual if isinstance(residual, str) else float(residual)))
-        effects += [Photons(), Dark(), InterpixelCapacitance()]
-        if cosmic_rays:
-            fraction = 0.001 if showers is True else float(showers)
-            effects.append(CosmicRays(shower_fraction=fraction))
-        if persistence:
-            effects.append(Persistence())
-        if bad_pixels:
-            effects.append(BadPixels())
-        effects += [ReferencePixels(), Saturation(), Nonlinearity()]
-        for wanted, kind in (
-            (reset_anomaly, ResetAnomaly),
-            (first_frame, FirstFrame),
-            (last_frame, LastFrame),
-        ):
-            if wanted:
-                effects.append(kind())
-        effects += [Bias(), ReadNoise(pink=float(pink_noise)), ADConversion()]
-        return cls(effects, properties=properties)
+        return cls([kind() for kind in _STANDARD], properties=properties).replaced(*effects)
+
+    def replaced(self, *effects):
+        """
+        Detector with other effects: each takes the place of those of its kind.
+
+        Parameters
+        ----------
+        *effects : `~miricigale.detector.Effect`
+            Where there is none of the kind, it is put where the order wants it.
+
+        Returns
+        -------
+        detector : `Detector`
+
+        Raises
+        ------
+        ValueError
+            If it is no effect, or one of a kind that has no place in the order.
+        """
+        chain = list(self._effects)
+        for effect in effects:
+            place = _place(effect)
+            if place is None:
+                wanted = "of the package's kinds (make a Detector of a tuple with any other)"
+                raise argument_error("effects", wanted, repr(effect))
+            chain = [e for e in chain if _place(e) != place]
+            after = [i for i, e in enumerate(chain) if (_place(e) or 0) > place]
+            chain.insert(after[0] if after else len(chain), effect)
+        return type(self)(chain, properties=self._properties)
+
+    def without(self, *kinds):
+        """
+        Detector without some effects.
+
+        Parameters
+        ----------
+        *kinds : type
+            Classes of effects, such as `CosmicRays`. Photons and the conversion must stay.
+
+        Returns
+        -------
+        detector : `Detector`
+        """
+        for kind in kinds:
+            if not (isinstance(kind, type) and issubclass(kind, Effect)):
+                raise argument_error("kinds", "classes of effects", repr(kind))
+        chain = [effect for effect in self._effects if not isinstance(effect, kinds)]
+        return type(self)(chain, properties=self._properties)
 
     @property
     def effects(self):
@@ -219,7 +241,14 @@ class Detector:
                 group_dq[i, g, rows.start + r] = group_flags[i, g, r]
 
         self._run(task, store, n_threads, progress_bar)
-        return Ramp(data, exposure, pixel_dq=pixel_dq, group_dq=group_dq, meta=task.meta)
+        return Ramp(
+            data,
+            exposure,
+            pixel_dq=pixel_dq,
+            group_dq=group_dq,
+            effects=task.effects,
+            meta=task.meta,
+        )
 
     def expose_to(
         self,
@@ -272,7 +301,7 @@ class Detector:
                 pixel_dq[rows] = pixel_flags
 
             self._run(task, store, n_threads, progress_bar)
-            finish(pixel_dq, task.meta)
+            finish(pixel_dq, task.effects, task.meta)
         return path
 
     def forecast(self, image, exposure, *, sources=None):
@@ -318,7 +347,7 @@ class Detector:
 
     def _acting(self, image):
         """Return the effects that the image does not hold already, and what it holds."""
-        included = included_effects(image)
+        included = ImageFacts.of(image).psf_includes
         return tuple(e for e in self._effects if e.included_as not in included), sorted(included)
 
     def _task(self, image, exposure, seed, previous):
@@ -330,7 +359,6 @@ class Detector:
         fraction = self._check_sky(light, exposure)
         meta = provenance(
             seed=seed,
-            effects=[repr(effect) for effect in effects],
             psf_includes=included,
             sky_well_fraction=round(fraction, 4),
             previous=[repr(latent) for latent in previous] or None,
@@ -370,12 +398,6 @@ class Detector:
                 task.exposure, self._properties, wide, pixel_dq, group_dq, key, task.previous
             )
             array = effect.apply(array, block)
-        if array.shape != shape or array.dtype != np.uint16:
-            msg = (
-                "'effects' must turn light into counts, beginning with Photons and ending with "
-                f"ADConversion, got {[type(effect).__name__ for effect, _ in task.keyed]}"
-            )
-            raise ValueError(msg)
         inner = slice(rows.start - wide.start, rows.stop - wide.start)
         return array[:, :, inner], pixel_dq[inner], group_dq[:, :, inner]
 
@@ -410,6 +432,25 @@ class Detector:
         return fraction
 
 
+def _place(effect):
+    """Place of an effect in the order; None for one of another kind."""
+    return next((i for i, kind in enumerate(ORDER) if isinstance(effect, kind)), None)
+
+
+def _check_order(effects):
+    """Refuse effects that cannot turn light into counts, or that do not act in their order."""
+    names = ", ".join(type(effect).__name__ for effect in effects)
+    if sum(isinstance(effect, Photons) for effect in effects) != 1:
+        raise argument_error("effects", "a tuple with one Photons in it", names or "none")
+    if not isinstance(effects[-1], ADConversion):
+        raise argument_error("effects", "a tuple that ends with ADConversion", names)
+    known = [(place, effect) for effect in effects if (place := _place(effect)) is not None]
+    for (place, effect), (following, other) in itertools.pairwise(known):
+        if place > following:
+            wanted = f"in their order, {type(other).__name__} before {type(effect).__name__}"
+            raise argument_error("effects", wanted, names)
+
+
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class _Task:
     """What all blocks of one exposure share."""
@@ -419,6 +460,10 @@ class _Task:
     keyed: tuple
     previous: tuple
     meta: dict
+
+    @property
+    def effects(self):
+        return tuple(effect for effect, _ in self.keyed)
 
     @property
     def shape(self):

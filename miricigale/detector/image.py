@@ -1,14 +1,14 @@
-"""The image that is exposed: its light, checked against the exposure, and what it holds."""
+"""The image that is exposed: its light, checked against the exposure."""
 
 import numpy as np
 from astropy.wcs import WCS
 from astropy.wcs.utils import proj_plane_pixel_area
 
-from miricigale.instrument import Exposure
+from miricigale.instrument import Exposure, ImageFacts
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
-__all__ = ["checked_light", "included_effects"]
+__all__ = ["checked_light"]
 
 # pixels by which the image may lie off the exposure
 _PLACE = 0.1
@@ -54,7 +54,11 @@ def checked_light(image, exposure):
         raise argument_error(
             "image", f"of the exposure's shape {tuple(exposure.shape)}", np.shape(data)
         )
-    _check_filter(image, exposure)
+    facts = ImageFacts.of(image)
+    if facts.band not in (None, exposure.filter[5:]):
+        raise argument_error(
+            "image", f"one of the filter {exposure.filter}", f"one of {facts.filter}"
+        )
     _check_place(image, exposure)
     light = to_array(data * image.unit, SURFACE_BRIGHTNESS, "image", ndim=2, finite=True)
     lowest = light.min()
@@ -62,23 +66,6 @@ def checked_light(image, exposure):
     if lowest < -1e-6 * np.abs(light).max():
         raise argument_error("image", "surface brightness that is nowhere negative", lowest)
     return np.maximum(light, 0.0)
-
-
-def included_effects(image):
-    """Names, in small letters, of what the image's PSF holds (its ``meta["psf_includes"]``)."""
-    included = getattr(image, "meta", {}).get("psf_includes") or ()
-    if isinstance(included, str):
-        # as a header keeps it
-        included = included.replace(",", " ").split()
-    return {str(name).lower() for name in included}
-
-
-def _check_filter(image, exposure):
-    """An image that names its filter must be one of the exposure's."""
-    have = getattr(image, "meta", {}).get("filter")
-    # headers write F770W where we write miri.f770w
-    if isinstance(have, str) and have.lower().rpartition(".")[2] != exposure.filter[5:]:
-        raise argument_error("image", f"one of the filter {exposure.filter}", f"one of {have}")
 
 
 def _check_place(image, exposure):

@@ -19,9 +19,11 @@ from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.time import Time, TimeDelta
 
+from miricigale.detector.effects import effect_from_record
 from miricigale.instrument import DQ, Exposure, reference_pixel_mask
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import open_fits, writing
+from miricigale.utils.files import open_fits
+from miricigale.utils.store import plain_value, replacing
 
 __all__ = ["RowWriter", "header", "read", "row_writer", "write"]
 
@@ -166,24 +168,17 @@ def header(exposure, *, filename="", start=None):
     )
 
 
-def write(
-    path, data, exposure, *, pixel_dq=None, meta=None, start=None, filename=None, overwrite=False
-):
+def write(path, ramp, *, start=None, filename=None, overwrite=False):
     """
-    Write counts as a level-1b file.
+    Write a level-1b file.
 
     Parameters
     ----------
     path : path-like
         The file; it appears under its name only when it is complete.
-    data : `~numpy.ndarray` of uint16, shape (n_int, n_group, ny, nx)
-        Counts.
-    exposure : `~miricigale.instrument.Exposure`
-        What was exposed.
-    pixel_dq : `~numpy.ndarray` of uint32, shape (ny, nx), optional
-        Goes to an extension of our own.
-    meta : dict, optional
-        Goes to another, as JSON.
+    ramp : `~miricigale.detector.Ramp`
+        Its flags of pixels go to an extension of our own, ``SIM_PIXELDQ``, its effects and meta
+        dictionary as JSON to ``SIM_META``.
     start : `~astropy.time.Time`, optional
         See `header`.
     filename : str, optional
@@ -202,43 +197,42 @@ def write(
     ValueError
         If the data are not counts (uint16).
     """
-    path = Path(path)
+    path, data = Path(path), ramp.data
     if data.dtype != np.uint16:
         raise argument_error("data", "counts (uint16) to be written", data.dtype)
-    opened = _partial(path, exposure, data.shape, start, overwrite, filename)
-    with opened as (partial, science):
+    with _begun(path, ramp.exposure, start, overwrite, filename) as (partial, science):
         with fits.StreamingHDU(str(partial), science) as stream:
             for part in _chunks(data.reshape(-1)):
                 # BZERO 32768: the top bit is turned
                 stream.write((part ^ np.uint16(0x8000)).view(np.int16))
-        _append(partial, pixel_dq, meta)
+        _append(partial, ramp.pixel_dq, ramp.effects, ramp.meta)
     return path
 
 
 @contextlib.contextmanager
-def _partial(path, exposure, shape, start, overwrite, filename=None):
-    """Give a file with its primary header, and the header of SCI; rename it when all is well."""
-    if path.exists() and not overwrite:
-        msg = f"{path} exists; give overwrite=True to replace it"
-        raise OSError(msg)
+def _begun(path, exposure, start, overwrite, filename=None):
+    """Give an unfinished file with its primary header, and the header of SCI."""
     primary, science = header(exposure, filename=filename or path.name, start=start)
+    shape = (exposure.n_integrations, exposure.n_groups, *exposure.shape)
     axes = [("NAXIS", len(shape))] + [(f"NAXIS{i + 1}", n) for i, n in enumerate(shape[::-1])]
     structure = [("XTENSION", "IMAGE"), ("BITPIX", 16), *axes, ("PCOUNT", 0), ("GCOUNT", 1)]
     scaling = [("EXTNAME", "SCI"), ("BZERO", 32768), ("BSCALE", 1)]
-    partial = path.with_name(path.name + ".partial")
-    try:
-        with writing(path):
-            fits.PrimaryHDU(header=primary).writeto(partial, overwrite=True)
-            yield partial, fits.Header(structure + scaling) + science
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with replacing(path, overwrite=overwrite) as partial:
+        fits.PrimaryHDU(header=primary).writeto(partial)
+        yield partial, fits.Header(structure + scaling) + science
 
 
-def _append(partial, pixel_dq, meta):
+def _append(partial, pixel_dq, effects, meta):
+    """Add what level 1b does not know: flags, effects and provenance."""
+    meta = dict(meta)
+    if effects is not None:
+        meta["effects"] = [effect.record() for effect in effects]
+    text = json.dumps(meta, default=plain_value).encode()
     with fits.open(partial, mode="append") as hdus:
-        for hdu in _extensions(pixel_dq, meta):
-            hdus.append(hdu)
+        hdus.append(fits.ImageHDU(np.asarray(pixel_dq), name="SIM_PIXELDQ"))
+        hdus.append(_bytes_table(text, "JSON", "SIM_META"))
+        # the pipeline looks for it last
+        hdus.append(_bytes_table(_ASDF, "ASDF_METADATA", "ASDF"))
 
 
 class RowWriter:
@@ -304,7 +298,7 @@ def row_writer(path, exposure, *, start=None, overwrite=False):
     ------
     writer : `RowWriter`
     finish : callable
-        To be called last, with ``pixel_dq`` and ``meta`` as in `write`.
+        To be called last, with the pixel_dq, effects and meta of a `~miricigale.detector.Ramp`.
 
     Raises
     ------
@@ -314,7 +308,7 @@ def row_writer(path, exposure, *, start=None, overwrite=False):
     path = Path(path)
     shape = (exposure.n_integrations, exposure.n_groups, *exposure.shape)
     with (
-        _partial(path, exposure, shape, start, overwrite) as (partial, science),
+        _begun(path, exposure, start, overwrite) as (partial, science),
         open(partial, "r+b", buffering=0) as handle,
     ):
         handle.seek(0, os.SEEK_END)
@@ -337,16 +331,6 @@ def _bytes_table(text, column, name):
     return fits.BinTableHDU.from_columns(fields, name=name)
 
 
-def _extensions(pixel_dq, meta):
-    if pixel_dq is not None:
-        yield fits.ImageHDU(np.asarray(pixel_dq), name="SIM_PIXELDQ")
-    if meta:
-        text = json.dumps(meta, default=str).encode()
-        yield _bytes_table(text, "JSON", "SIM_META")
-    # the pipeline looks for it last
-    yield _bytes_table(_ASDF, "ASDF_METADATA", "ASDF")
-
-
 def read(path):
     """
     Read a level-1b file of the MIRI imager, our own or real.
@@ -358,14 +342,10 @@ def read(path):
 
     Returns
     -------
-    data : `~numpy.ndarray` of uint16, shape (n_int, n_group, ny, nx)
-    exposure : `~miricigale.instrument.Exposure`
-        Made from the keywords; its counts are those of the data. A dither is the
-        position number in the pattern, from 0.
-    pixel_dq : `~numpy.ndarray` of uint32, shape (ny, nx)
-        As written; the reference pixels alone are flagged in a file that is not ours.
-    meta : dict
-        As written, or origin and file name.
+    values : dict
+        Arguments of `~miricigale.detector.Ramp`. The exposure is made from the keywords, its
+        counts from the data; a dither is the position number in the pattern, from 0. In a file that is
+        not ours the reference pixels alone are flagged, and it is not known what acted.
 
     Raises
     ------
@@ -376,7 +356,7 @@ def read(path):
     try:
         with open_fits(path, wanted=wanted, memmap=True, do_not_scale_image_data=True) as hdus:
             return _read(path, hdus)
-    except (KeyError, TypeError, ValueError, OSError) as err:
+    except (AttributeError, KeyError, SyntaxError, TypeError, ValueError, OSError) as err:
         if isinstance(err, DataError):
             raise
         msg = f"{path} cannot be read as {wanted}: {err}"
@@ -422,14 +402,18 @@ def _read(path, hdus):
     if data.shape[2:] != exposure.shape:
         msg = f"{path} must have {exposure.shape} pixels for {exposure.subarray}, got {data.shape[2:]}"
         raise DataError(msg)
-    meta = {"origin": primary.get("ORIGIN", "unknown"), "filename": path.name}
+    values = {"data": data, "exposure": exposure}
+    values["meta"] = {"origin": primary.get("ORIGIN", "unknown"), "filename": path.name}
     if "SIM_META" in hdus:
-        meta = json.loads(hdus["SIM_META"].data["JSON"][0].tobytes())
+        values["meta"] = json.loads(hdus["SIM_META"].data["JSON"][0].tobytes())
+        records = values["meta"].pop("effects", None)
+        if records is not None:
+            values["effects"] = [effect_from_record(record) for record in records]
     if "SIM_PIXELDQ" in hdus:
-        dq = hdus["SIM_PIXELDQ"]
         # unsigned 32 bits as FITS keeps them: BZERO 2^31
-        pixel_dq = dq.data.astype(np.int32).view(np.uint32) ^ np.uint32(2**31)
+        stored = hdus["SIM_PIXELDQ"].data.astype(np.int32).view(np.uint32)
+        values["pixel_dq"] = stored ^ np.uint32(2**31)
     else:
         mask = reference_pixel_mask(subarray=exposure.subarray)
-        pixel_dq = np.where(mask, _REFERENCE, np.uint32(0))
-    return data, exposure, pixel_dq, meta
+        values["pixel_dq"] = np.where(mask, _REFERENCE, np.uint32(0))
+    return values

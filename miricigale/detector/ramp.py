@@ -4,6 +4,7 @@ import numpy as np
 from astropy.nddata import NDData
 
 from miricigale.detector import level1b
+from miricigale.detector.effects import Effect
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import DN
 
@@ -34,6 +35,9 @@ class Ramp(NDData):
     group_dq : `~numpy.ndarray` of uint8, shape like ``data``, optional
         Flags of groups (the lower eight bits of `DQ`); None where they are not known, as
         in a file of level 1b.
+    effects : tuple of `Effect`, optional
+        What acted on the light and the charge, in order; None where it is not known, as for
+        ramps of the observatory.
     meta : dict, optional
         Where it came from.
 
@@ -43,7 +47,7 @@ class Ramp(NDData):
         If a shape is not that of the exposure or a dtype is another.
     """
 
-    def __init__(self, data, exposure, *, pixel_dq=None, group_dq=None, meta=None):
+    def __init__(self, data, exposure, *, pixel_dq=None, group_dq=None, effects=None, meta=None):
         data = np.asarray(data)
         shape = (exposure.n_integrations, exposure.n_groups, *exposure.shape)
         if data.shape != shape:
@@ -62,10 +66,16 @@ class Ramp(NDData):
                 got = f"shape {group_dq.shape}, dtype {group_dq.dtype}"
                 raise argument_error("group_dq", f"of shape {shape}, dtype uint8", got)
             group_dq = _read_only(group_dq)
+        if effects is not None:
+            effects = tuple(effects)
+            for effect in effects:
+                if not isinstance(effect, Effect):
+                    raise argument_error("effects", "made of detector effects", repr(effect))
         super().__init__(_read_only(data), unit=DN, meta=dict(meta or {}))
         self._exposure = exposure
         self._pixel_dq = _read_only(pixel_dq)
         self._group_dq = group_dq
+        self._effects = effects
         self._frozen = True
 
     def __setattr__(self, name, value):
@@ -88,6 +98,29 @@ class Ramp(NDData):
     def group_dq(self):
         """Flags of groups, uint8 like the data, or None."""
         return self._group_dq
+
+    @property
+    def effects(self):
+        """What acted, a tuple of `Effect` in their order; None where it is not known."""
+        return self._effects
+
+    def shows(self, kind):
+        """
+        Whether an effect acted on this ramp.
+
+        Parameters
+        ----------
+        kind : type
+            A class of effects, such as `LastFrame`.
+
+        Returns
+        -------
+        shows : bool or None
+            None where it is not known what acted.
+        """
+        if self._effects is None:
+            return None
+        return any(isinstance(effect, kind) for effect in self._effects)
 
     @property
     def wcs(self):
@@ -142,20 +175,11 @@ class Ramp(NDData):
 
         Notes
         -----
-        Level 1b holds no flags. Those of pixels and the meta dictionary stand in two
+        Level 1b holds no flags. Those of pixels, and the effects with the meta dictionary, stand in two
         extensions of our own (``SIM_PIXELDQ``, ``SIM_META``) that the official pipeline
         passes over; those of groups are not written.
         """
-        return level1b.write(
-            path,
-            self.data,
-            self.exposure,
-            pixel_dq=self.pixel_dq,
-            meta=dict(self.meta),
-            start=start,
-            filename=filename,
-            overwrite=overwrite,
-        )
+        return level1b.write(path, self, start=start, filename=filename, overwrite=overwrite)
 
     @classmethod
     def read(cls, path):
@@ -177,5 +201,4 @@ class Ramp(NDData):
         `~miricigale.utils.exceptions.DataError`
             If the file is missing, truncated or not of that kind.
         """
-        data, exposure, pixel_dq, meta = level1b.read(path)
-        return cls(data, exposure, pixel_dq=pixel_dq, meta=meta)
+        return cls(**level1b.read(path))

@@ -35,6 +35,7 @@ __getattr__, __dir__, __all__ = lazy_names(
             "saturation_time",
             "scaled_limit",
         ),
+        "image_facts": ("ImageFacts",),
         "siaf": (
             "Aperture",
             "aperture",

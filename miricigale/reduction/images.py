@@ -4,7 +4,7 @@ import numpy as np
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.wcs import WCS
 
-from miricigale.instrument import DQ
+from miricigale.instrument import DQ, ImageFacts
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
@@ -162,9 +162,10 @@ def check_images(images, wcs, *, shape=None):
     if not images[0].unit.is_equivalent(SURFACE_BRIGHTNESS):
         wanted = f"surface brightness (convertible to {SURFACE_BRIGHTNESS}; see calibrate)"
         raise argument_error("images", wanted, f"unit {images[0].unit}")
-    filters = sorted({str(im.meta["filter"]) for im in images if "filter" in im.meta})
+    facts = [ImageFacts.of(im) for im in images]
+    filters = {fact.band: fact.filter for fact in facts if fact.band is not None}
     if len(filters) > 1:
-        raise argument_error("images", "of one filter", ", ".join(filters))
+        raise argument_error("images", "of one filter", ", ".join(sorted(filters.values())))
 
 
 def check_overlap(pixel_maps, shape):

@@ -10,7 +10,7 @@ from drizzle.resample import Drizzle
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import map_coordinates
 
-from miricigale.instrument import DQ
+from miricigale.instrument import DQ, ImageFacts
 from miricigale.reduction.images import (
     check_images,
     check_overlap,
@@ -267,7 +267,7 @@ def _drizzle(images, wcs, shape, pixfrac, weights, pixel_maps):
         pixfrac=float(pixfrac),
         pixel_scale=_scale(wcs) * 3600,
         noise_correction=noise_correction(pixfrac, ratio)
-        * float(np.mean([im.meta.get("noise_correction", 1.0) for im in images])),
+        * float(np.mean([ImageFacts.of(im).noise_correction for im in images])),
     )
     out = image(
         np.where(covered, data, np.nan),

@@ -5,8 +5,14 @@ import warnings
 
 import numpy as np
 
-from miricigale.detector import Ramp, ResetAnomaly
-from miricigale.instrument import DQ, DetectorProperties, miri_detector, mosaic_wcs
+from miricigale.detector import (
+    FirstFrame,
+    InterpixelCapacitance,
+    LastFrame,
+    Ramp,
+    ResetAnomaly,
+)
+from miricigale.instrument import DQ, DetectorProperties, ImageFacts, miri_detector, mosaic_wcs
 from miricigale.reduction.background import estimate_background, subtract_background
 from miricigale.reduction.calibration import calibrate
 from miricigale.reduction.images import (
@@ -258,8 +264,9 @@ class Reducer:
         cal : `~astropy.nddata.CCDData`
             MJy/sr.
         """
+        facts = ImageFacts.of(rate)
         for key in ("filter", "subarray"):
-            if key not in rate.meta:
+            if getattr(facts, key) is None:
                 raise argument_error("rate", f"an image whose meta has {key!r}", "none")
         detector = self._detector
         options = {
@@ -268,11 +275,11 @@ class Reducer:
         }
         return calibrate(
             rate,
-            filter=rate.meta["filter"],
-            subarray=rate.meta["subarray"],
+            filter=facts.filter,
+            subarray=facts.subarray,
             dark=detector.dark_current / detector.gain,
             gain=detector.gain,
-            ipc_kernel=detector.ipc_kernel if rate.meta.get("ipc") else None,
+            ipc_kernel=detector.ipc_kernel if facts.ipc else None,
             field_only=self.field_only,
             cosmic_rays=options if self.cosmic_rays else None,
         )
@@ -354,7 +361,7 @@ class Reducer:
         weights = [weight_map(im) for im in images]
         maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
         check_overlap(maps, wcs.pixel_shape[::-1])
-        judged = all("n_outliers" in im.meta for im in images)
+        judged = all(ImageFacts.of(im).n_outliers is not None for im in images)
         if self.outlier_threshold is not None and len(images) >= 3 and not judged:
             images = reject_outliers(
                 images, wcs, threshold=self.outlier_threshold, weights=weights, pixel_maps=maps
@@ -388,11 +395,11 @@ class Reducer:
             If there are no ramps, or of more than one filter.
         """
         to_array(pixel_scale, ANGLE, "pixel_scale", ndim=0, finite=True)
-        rates, images, backgrounds = [], [], []
+        rates, images, backgrounds, name = [], [], [], None
         for ramp in progress(ramps, show=progress_bar, desc="reduce"):
-            if rates and ramp.exposure.filter != rates[0].meta["filter"]:
-                wanted = f"of one filter ({rates[0].meta['filter']})"
-                raise argument_error("ramps", wanted, ramp.exposure.filter)
+            name = ramp.exposure.filter if name is None else name
+            if ramp.exposure.filter != name:
+                raise argument_error("ramps", f"of one filter ({name})", ramp.exposure.filter)
             rates.append(self.fit_ramp(ramp))
             del ramp
             subtracted, background = self.subtract_background(self.calibrate(rates[-1]))
@@ -431,32 +438,26 @@ class Reducer:
         """Whether the charge of this ramp was coupled between neighbours."""
         if self.ipc is not None:
             return bool(self.ipc)
-        return ramp.meta.get("effects") is None or _acted(ramp, "InterpixelCapacitance")
+        return ramp.shows(InterpixelCapacitance) is not False
 
     def _skipped(self, ramp):
         """Groups left out at the start and the end of the integrations of a ramp."""
         n_group = ramp.data.shape[1]
         first, last = self.skip_first, self.skip_last
         if first is None:
-            first = int(_acted(ramp, "FirstFrame") and n_group > 3)
+            first = int(bool(ramp.shows(FirstFrame)) and n_group > 3)
         if last is None:
-            last = int(_acted(ramp, "LastFrame") and n_group > 2)
+            last = int(bool(ramp.shows(LastFrame)) and n_group > 2)
         return first, last
 
     def _anomaly(self, ramp):
         """Offset of each group after a reset, DN."""
         if self.reset_anomaly is not None:
             return self.reset_anomaly.offsets(*ramp.data.shape[:2])
-        if self.skip_first is None and _acted(ramp, "ResetAnomaly"):
+        if self.skip_first is None and ramp.shows(ResetAnomaly):
             msg = (
                 "the ramp shows a reset anomaly that this Reducer leaves in: give it "
                 "'reset_anomaly', or 'skip_first' groups to be left out"
             )
             warnings.warn(msg, MiricigaleWarning, stacklevel=4)
         return 0.0
-
-
-def _acted(ramp, name):
-    """Whether a simulated ramp says that an effect of this name acted."""
-    effects = ramp.meta.get("effects") or ()
-    return any(str(effect).startswith(f"{name}(") for effect in effects)

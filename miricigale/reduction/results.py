@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 from astropy.nddata import CCDData
 
+from miricigale.instrument import ImageFacts
 from miricigale.reduction.background import Background
 
 __all__ = ["ReductionResult"]
@@ -44,7 +45,7 @@ class ReductionResult:
     @property
     def filter(self):
         """Name of the filter."""
-        return self.mosaic.meta.get("filter")
+        return ImageFacts.of(self.mosaic).filter
 
     def __repr__(self):
         ny, nx = self.mosaic.shape

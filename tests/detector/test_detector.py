@@ -1,3 +1,5 @@
+import dataclasses
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -8,15 +10,20 @@ import miricigale.detector.detector as module
 from miricigale.detector import (
     DQ,
     ADConversion,
+    BadPixels,
     Bias,
     CosmicRays,
     Dark,
     Detector,
+    Effect,
     InterpixelCapacitance,
+    LastFrame,
     Nonlinearity,
+    Persistence,
     Photons,
     Ramp,
     ReadNoise,
+    Residual,
 )
 from miricigale.instrument import flat_field, miri_detector, photmjsr
 from miricigale.utils.exceptions import MiricigaleWarning
@@ -68,7 +75,9 @@ def test_same_seed_same_counts_on_any_threads_and_blocks(
     make_exposure, make_sky, detector, monkeypatch
 ):
     exposure = make_exposure(n_groups=5, n_integrations=2, subarray="SUB128")
-    detector = Detector.miri_imager(showers=0.2, residual=0.01, pink_noise=2.0)
+    detector = Detector.miri_imager(
+        CosmicRays(shower_fraction=0.2), Residual(0.01), ReadNoise(pink=2.0)
+    )
     # without 'ipc' in the image, neighbours across blocks are coupled
     sky = make_sky(exposure, 30.0, includes=())
     one = detector.expose(sky, exposure, seed=5, n_threads=1)
@@ -129,7 +138,7 @@ def test_what_the_psf_holds_is_left_out(make_exposure, make_sky, detector):
         image.meta["psf_includes"] = includes
         ramp = Detector(chain).expose(image, exposure, seed=0)
         assert ramp.data[0, -1, 30, 41] == 0
-        assert not any("Interpixel" in text for text in ramp.meta["effects"])
+        assert ramp.effects == tuple(e for e in chain if e != InterpixelCapacitance())
     # a text without it
     image.meta["psf_includes"] = "pixel"
     ramp = Detector(chain).expose(image, exposure, seed=0)
@@ -253,21 +262,62 @@ def test_other_units_of_surface_brightness(make_exposure, make_sky):
     )
 
 
-def test_refuses_wrong_effects(make_exposure, make_sky):
-    exposure = make_exposure()
-    sky = make_sky(exposure, 1.0)
+def test_refuses_wrong_effects():
     with pytest.raises(ValueError, match="'effects' must be made of detector effects"):
         Detector((Photons(), "noise"))
     with pytest.raises(ValueError, match="'properties' must be"):
         Detector(PLAIN, properties={"gain": 4})
-    with pytest.raises(ValueError, match="'effects' must hold Photons before it"):
-        Detector((Dark(), Photons(), ADConversion())).expose(sky, exposure)
-    with pytest.raises(ValueError, match="ending with ADConversion, got"):
-        Detector((Photons(), Dark())).expose(sky, exposure)
+    # when it is made, not when it is used
+    with pytest.raises(ValueError, match="'effects' must be in their order, Photons before Dark"):
+        Detector((Dark(), Photons(), ADConversion()))
+    with pytest.raises(
+        ValueError, match="'effects' must be a tuple that ends with ADConversion, got"
+    ):
+        Detector((Photons(), Dark()))
     with pytest.raises(ValueError, match="'effects' must be a tuple with one Photons"):
-        Detector((Photons(), Photons(), ADConversion())).expose(sky, exposure)
-    with pytest.raises(ValueError, match="'residual' must be"):
-        Detector.miri_imager(residual=True)
+        Detector((Photons(), Photons(), ADConversion()))
+    with pytest.raises(ValueError, match="'effects' must be a tuple with one Photons"):
+        Detector(())
+    with pytest.raises(ValueError, match="Nonlinearity before ReadNoise, got Photons, ReadNoise"):
+        Detector((Photons(), ReadNoise(), Nonlinearity(), ADConversion()))
+    with pytest.raises(ValueError, match="'effects' must be a tuple with one Photons"):
+        Detector.miri_imager().without(Photons)
+    with pytest.raises(ValueError, match="'kinds' must be classes of effects"):
+        Detector.miri_imager().without(Dark())
+    with pytest.raises(ValueError, match="'effects' must be of the package's kinds"):
+        Detector.miri_imager().replaced(Dark)
+
+
+def test_effects_of_other_kinds_act_where_they_are_put(make_exposure, make_sky):
+    @dataclasses.dataclass(frozen=True)
+    class Doubling(Effect):
+        def apply(self, array, block):
+            return 2 * array
+
+    exposure, chain = make_exposure(n_groups=2), (Photons(flat=False), ADConversion())
+    sky = make_sky(exposure, 100.0)
+    plain = Detector(chain).expose(sky, exposure, seed=1)
+    double = Detector((chain[0], Doubling(), chain[1])).expose(sky, exposure, seed=1)
+    np.testing.assert_array_equal(double.data, 2 * plain.data)
+    assert double.shows(Doubling)
+    assert not plain.shows(Doubling)
+
+
+def test_effects_take_the_place_of_their_kind():
+    detector = Detector.miri_imager()
+    other = detector.replaced(Dark(current=2.0), Residual(0.01), Persistence(), LastFrame())
+    assert other.effects[:2] == (Residual(0.01), Photons())
+    assert other.effects[other.effects.index(Dark(current=2.0)) - 1] == Photons()
+    assert other.effects[other.effects.index(Persistence()) - 1] == CosmicRays()
+    assert other.effects[other.effects.index(LastFrame()) + 1] == Bias()
+    assert len(other.effects) == len(detector.effects) + 3
+    assert (
+        other.without(Residual, Persistence, LastFrame).replaced(Dark()).effects == detector.effects
+    )
+    assert Detector.miri_imager(Dark(current=2.0)).effects == detector.replaced(Dark(2.0)).effects
+    # settings of the detector stay
+    properties = miri_detector().replace(gain=2.0)
+    assert Detector.miri_imager(properties=properties).without(Dark).properties is properties
 
 
 def test_gain_cancels_in_the_rate(make_exposure, make_sky):
@@ -298,7 +348,7 @@ def test_detector_says_what_it_does(detector):
         "ADConversion",
     ]
     assert "CosmicRays(flux=None" in repr(detector)
-    bare = Detector.miri_imager(cosmic_rays=False, bad_pixels=False, residual=0.01, showers=True)
+    bare = Detector.miri_imager(Residual(0.01)).without(CosmicRays, BadPixels)
     assert type(bare.effects[0]).__name__ == "Residual"
     assert len(bare.effects) == 10
 

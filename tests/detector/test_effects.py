@@ -285,7 +285,7 @@ def test_residual_by_name_has_the_amplitude_of_the_filter(make_block, name):
     pattern = Residual("etc").apply(light, block)
     # 65536 pixels, of which the correlation leaves one in 4 pi independent
     assert pattern.std() / 100 == pytest.approx(residual_amplitude(name), rel=0.05)
-    assert Residual("etc") in Detector.miri_imager(residual="etc").effects
+    assert Residual("etc") in Detector.miri_imager(Residual("etc")).effects
     with pytest.raises(KeyError, match="no residual preset 'flat'; known: etc"):
         Residual("flat")
 

@@ -8,6 +8,8 @@ from astropy.table import QTable
 from miricigale.detector import (
     DQ,
     ADConversion,
+    BadPixels,
+    CosmicRays,
     Detector,
     Nonlinearity,
     Photons,
@@ -66,7 +68,7 @@ def test_it_is_the_closed_form(make_exposure, make_sky, plain):
 
 def test_the_exposure_saturates_as_told(make_exposure, make_sky):
     # everything on but the particles: flat field, dark, capacitance, noise, response
-    detector = Detector.miri_imager(cosmic_rays=False)
+    detector = Detector.miri_imager().without(CosmicRays)
     exposure = make_exposure(n_groups=25, n_integrations=2, subarray="SUB256")
     step, well = exposure.group_time.to_value("s"), miri_detector().full_well
     image = make_sky(exposure, brightness(0.3 * well / (25 * step)), includes=())
@@ -98,7 +100,7 @@ def test_the_well_is_that_of_the_effects(make_exposure, make_sky, plain):
     step = exposure.group_time.to_value("s")
     sky = make_sky(exposure, brightness(1000 / step))
     assert plain.forecast(sky, exposure).sky_fraction == pytest.approx(1e4 / 210e3)
-    small = Detector((Photons(flat=False), Saturation(full_well=2e4), Nonlinearity()))
+    small = plain.replaced(Saturation(full_well=2e4))
     assert small.forecast(sky, exposure).sky_fraction == pytest.approx(0.5)
     # a converter that ends before the well: 65535.5 DN less the bias, made linear
     properties = miri_detector().replace(bias=45_000.0)
@@ -142,7 +144,7 @@ def test_flat_dark_and_bad_pixels(make_exposure, make_sky):
 
 def test_capacitance_is_taken_once(make_exposure, make_sky):
     exposure = make_exposure(n_groups=5)
-    detector = Detector.miri_imager(bad_pixels=False)
+    detector = Detector.miri_imager().without(BadPixels)
     image = make_sky(exposure, 0.0, includes=())
     image.data[30, 40] = 1e4
     there = sources_at([40], [30])

@@ -1,3 +1,4 @@
+import json
 import warnings
 
 import astropy.units as u
@@ -7,7 +8,17 @@ from astropy.io import fits
 from astropy.time import Time
 from astropy.wcs import WCS
 
-from miricigale.detector import DQ, Detector, Ramp
+from miricigale.detector import (
+    DQ,
+    Detector,
+    LastFrame,
+    OtherEffect,
+    Persistence,
+    Photons,
+    Ramp,
+    ResetAnomaly,
+    Residual,
+)
 from miricigale.utils.exceptions import DataError
 
 
@@ -72,7 +83,7 @@ def test_a_file_that_is_renamed_later_has_its_later_name(ramp, tmp_path):
 
 def test_existing_files_are_kept(ramp, tmp_path):
     path = ramp.write(tmp_path / "a_uncal.fits")
-    with pytest.raises(OSError, match="exists; give overwrite=True"):
+    with pytest.raises(OSError, match="exists; overwrite=True"):
         ramp.write(path)
     ramp.write(path, overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == ["a_uncal.fits"]
@@ -166,3 +177,45 @@ def test_a_start_that_is_no_time_is_named(make_exposure, make_sky, tmp_path, sta
             tmp_path / "a_uncal.fits", make_sky(exposure, 1.0), exposure, start=start
         )
     assert not list(tmp_path.iterdir())
+
+
+def with_meta(path, new, meta):
+    """Copy of a file with another SIM_META."""
+    with fits.open(path) as hdus:
+        array = np.frombuffer(json.dumps(meta).encode(), np.uint8)[None]
+        column = fits.Column(name="JSON", format=f"{array.size}B", array=array)
+        hdus["SIM_META"] = fits.BinTableHDU.from_columns([column], name="SIM_META")
+        hdus.writeto(new)
+    return new
+
+
+def test_effects_survive_the_file(make_exposure, make_sky, tmp_path):
+    exposure = make_exposure(n_groups=3)
+    detector = Detector.miri_imager(Residual("etc"), Persistence((0.01,), (np.float32(20),)))
+    ramp = detector.expose(make_sky(exposure, 1.0, includes=()), exposure, seed=1)
+    back = Ramp.read(ramp.write(tmp_path / "a_uncal.fits"))
+    assert back.effects == ramp.effects == detector.effects
+    assert back.shows(Persistence)
+    assert back.shows(LastFrame) is False
+    assert Ramp.read(foreign(tmp_path / "b_uncal.fits")).shows(LastFrame) is None
+
+
+def test_effects_of_earlier_files_and_of_other_packages_are_read(ramp, tmp_path):
+    # as their repr, in the meta dictionary
+    first = ramp.write(tmp_path / "a_uncal.fits")
+    texts = [
+        "Photons(flat=True)",
+        "ResetAnomaly(amplitudes=(-3.0,), groups=4.0)",
+        "Glow(rate=-2.5)",
+    ]
+    old = Ramp.read(with_meta(first, tmp_path / "old.fits", {"seed": 9, "effects": texts}))
+    other = OtherEffect("Glow", (("rate", -2.5),))
+    assert old.effects == (Photons(), ResetAnomaly((-3.0,)), other)
+    assert old.meta == {"seed": 9}
+    assert Ramp.read(old.write(tmp_path / "new.fits")).effects == old.effects
+    with pytest.raises(DataError, match=r"broken\.fits cannot be read as a level-1b file"):
+        Ramp.read(with_meta(first, tmp_path / "broken.fits", {"effects": ["Dark("]}))
+    with pytest.raises(DataError, match=r"wrong\.fits cannot be read as a level-1b file"):
+        Ramp.read(
+            with_meta(first, tmp_path / "wrong.fits", {"effects": [{"effect": "Dark", "x": 1}]})
+        )

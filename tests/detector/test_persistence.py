@@ -9,6 +9,8 @@ import miricigale.detector.detector as module
 from miricigale.detector import (
     DQ,
     ADConversion,
+    BadPixels,
+    CosmicRays,
     Detector,
     Latent,
     Nonlinearity,
@@ -36,7 +38,7 @@ def counts(exposure, sky, effect, previous, *, seed=3, **options):
 def test_nothing_before_leaves_nothing(make_exposure, make_sky):
     exposure = make_exposure(n_groups=3)
     sky = make_sky(exposure, 50.0)
-    with_effect = Detector.miri_imager(persistence=True)
+    with_effect = Detector.miri_imager(Persistence())
     plain = Detector.miri_imager().expose(sky, exposure, seed=2)
     for previous in (None, [], latent_of(exposure, 0.0)):
         ramp = with_effect.expose(sky, exposure, seed=2, previous=previous)
@@ -107,7 +109,7 @@ def test_it_does_not_know_blocks_or_threads(make_exposure, make_sky, monkeypatch
     exposure = make_exposure(n_groups=4, n_integrations=2, subarray="SUB128")
     rates = np.random.default_rng(1).exponential(2e4, exposure.shape)
     latent = Latent(rates * RATE, 3 * u.s, "SUB128")
-    detector = Detector.miri_imager(persistence=True)
+    detector = Detector.miri_imager(Persistence())
     sky = make_sky(exposure, 20.0, includes=())
     options = {"seed": 6, "previous": latent}
     one = detector.expose(sky, exposure, n_threads=1, **options)
@@ -121,7 +123,7 @@ def test_a_saturated_star_comes_back_in_the_next_exposure(make_exposure, make_sk
     exposure = make_exposure(n_groups=40)
     image = make_sky(exposure, 5.0)
     image.data[30, 40] = 1e5
-    detector = Detector.miri_imager(persistence=True, cosmic_rays=False, bad_pixels=False)
+    detector = Detector.miri_imager(Persistence()).without(CosmicRays, BadPixels)
     first = detector.expose(image, exposure, seed=1)
     assert first.group_dq[0, -1, 30, 40] & DQ.SATURATED
     latent = Latent.from_ramp(first, 20 * u.s)
@@ -142,7 +144,9 @@ def test_a_saturated_star_comes_back_in_the_next_exposure(make_exposure, make_sk
 
 def test_reference_and_bad_pixels_are_not_remembered(make_exposure, make_sky):
     exposure = make_exposure(n_groups=3, subarray="SUB64")
-    ramp = Detector.miri_imager(cosmic_rays=False).expose(make_sky(exposure, 2e4), exposure, seed=0)
+    ramp = (
+        Detector.miri_imager().without(CosmicRays).expose(make_sky(exposure, 2e4), exposure, seed=0)
+    )
     latent = Latent.from_ramp(ramp, 1 * u.s, threshold=0)
     out = ramp.pixel_dq & np.uint32(DQ.REFERENCE_PIXEL | DQ.DO_NOT_USE) != 0
     assert out.any()
@@ -156,7 +160,7 @@ def test_refuses_what_cannot_be_remembered(make_exposure, make_sky):
     latent = latent_of(exposure, 10.0)
     with pytest.raises(ValueError, match="'previous' must be given to a detector whose effects"):
         Detector.miri_imager().expose(sky, exposure, previous=latent)
-    detector = Detector.miri_imager(persistence=True)
+    detector = Detector.miri_imager(Persistence())
     with pytest.raises(ValueError, match="'previous' must be of SUB64"):
         detector.expose(sky, exposure, previous=Latent(np.ones((3, 4)) * RATE, 1 * u.s))
     with pytest.raises(ValueError, match="'previous' must be a Latent or several"):

@@ -5,12 +5,15 @@ import pytest
 
 from miricigale.detector import (
     ADConversion,
+    BadPixels,
     Bias,
     Block,
+    CosmicRays,
     Detector,
     FirstFrame,
     LastFrame,
     Nonlinearity,
+    Persistence,
     Photons,
     ResetAnomaly,
 )
@@ -95,7 +98,7 @@ def test_every_reset_effect_is_the_same_in_any_blocks(make_exposure, make_sky, m
     import miricigale.detector.detector as module
 
     exposure = make_exposure(n_groups=5, n_integrations=2, subarray="SUB128")
-    detector = Detector.miri_imager(reset_anomaly=True, first_frame=True, last_frame=True)
+    detector = Detector.miri_imager(ResetAnomaly(), FirstFrame(), LastFrame())
     sky = make_sky(exposure, 300.0, includes=())
     one = detector.expose(sky, exposure, seed=5, n_threads=1)
     # an odd number of rows: pairs are cut in two
@@ -113,9 +116,8 @@ def test_the_rate_does_not_know_of_them(make_exposure, make_sky, band, n_groups,
         band, n_groups=n_groups, n_integrations=n_integrations, subarray="SUB256"
     )
     sky = make_sky(exposure, background_level(band).value, includes=())
-    options = {"cosmic_rays": False, "bad_pixels": False}
-    plain = Detector.miri_imager(**options)
-    spoilt = Detector.miri_imager(reset_anomaly=True, first_frame=True, last_frame=True, **options)
+    plain = Detector.miri_imager().without(CosmicRays, BadPixels)
+    spoilt = plain.replaced(ResetAnomaly(), FirstFrame(), LastFrame())
     reducer = Reducer(reset_anomaly=ResetAnomaly())
     clean = Reducer(skip_first=1, skip_last=1).fit_groups(plain.expose(sky, exposure, seed=1))
     fit = reducer.fit_groups(spoilt.expose(sky, exposure, seed=1))
@@ -134,9 +136,8 @@ def test_the_rate_does_not_know_of_them(make_exposure, make_sky, band, n_groups,
 
 def test_an_anomaly_that_stays_is_told(make_exposure, make_sky):
     exposure = make_exposure(n_groups=5)
-    ramp = Detector.miri_imager(reset_anomaly=True).expose(
-        make_sky(exposure, 300.0), exposure, seed=0
-    )
+    detector = Detector.miri_imager(ResetAnomaly())
+    ramp = detector.expose(make_sky(exposure, 300.0), exposure, seed=0)
     with pytest.warns(MiricigaleWarning, match="shows a reset anomaly"):
         Reducer().fit_groups(ramp)
     Reducer(skip_first=2).fit_groups(ramp)
@@ -145,10 +146,10 @@ def test_an_anomaly_that_stays_is_told(make_exposure, make_sky):
 
 
 def test_short_integrations_keep_two_groups(make_exposure, make_sky):
-    options = {"first_frame": True, "last_frame": True, "cosmic_rays": False}
+    detector = Detector.miri_imager(FirstFrame(), LastFrame()).without(CosmicRays)
     for n_groups, left in ((2, 2), (3, 2), (4, 2), (6, 4)):
         exposure = make_exposure(n_groups=n_groups)
-        ramp = Detector.miri_imager(**options).expose(make_sky(exposure, 30.0), exposure, seed=0)
+        ramp = detector.expose(make_sky(exposure, 30.0), exposure, seed=0)
         assert Reducer().fit_groups(ramp).n_used.max() == left - 1
 
 
@@ -156,7 +157,7 @@ def test_they_stand_between_response_and_bias(make_exposure, make_sky):
     names = [
         type(e).__name__
         for e in Detector.miri_imager(
-            reset_anomaly=True, first_frame=True, last_frame=True, persistence=True
+            ResetAnomaly(), FirstFrame(), LastFrame(), Persistence()
         ).effects
     ]
     assert names[names.index("Nonlinearity") : names.index("ReadNoise")] == [

@@ -8,22 +8,33 @@ from astropy.io import fits
 from astropy.time import Time
 
 import miricigale.detector.detector as module
-from miricigale.detector import Detector, Latent, Ramp
+from miricigale.detector import (
+    CosmicRays,
+    Detector,
+    FirstFrame,
+    LastFrame,
+    Latent,
+    Persistence,
+    Ramp,
+    ReadNoise,
+    ResetAnomaly,
+    Residual,
+)
 
-EVERYTHING = {
-    "showers": 0.2,
-    "residual": 0.01,
-    "pink_noise": 2.0,
-    "persistence": True,
-    "reset_anomaly": True,
-    "first_frame": True,
-    "last_frame": True,
-}
+EVERYTHING = (
+    CosmicRays(shower_fraction=0.2),
+    Residual(0.01),
+    ReadNoise(pink=2.0),
+    Persistence(),
+    ResetAnomaly(),
+    FirstFrame(),
+    LastFrame(),
+)
 
 
 def test_the_file_is_the_same_with_every_effect(make_exposure, make_sky, tmp_path, monkeypatch):
     exposure = make_exposure(n_groups=5, n_integrations=2, subarray="SUB128")
-    detector = Detector.miri_imager(**EVERYTHING)
+    detector = Detector.miri_imager(*EVERYTHING)
     sky = make_sky(exposure, 300.0, includes=())
     before = detector.expose(make_sky(exposure, 2e4), exposure.replace(dither=1), seed=1)
     options = {"seed": 5, "previous": Latent.from_ramp(before, before.exposure.frame_time)}
@@ -37,6 +48,7 @@ def test_the_file_is_the_same_with_every_effect(make_exposure, make_sky, tmp_pat
     back = Ramp.read(two)
     np.testing.assert_array_equal(back.data, held.data)
     np.testing.assert_array_equal(back.pixel_dq, held.pixel_dq)
+    assert back.effects == held.effects == detector.effects
     assert {k: v for k, v in back.meta.items() if k != "created"} == {
         k: v for k, v in held.meta.items() if k != "created"
     }
@@ -84,7 +96,7 @@ def test_nothing_is_left_of_a_failure(make_exposure, make_sky, tmp_path, monkeyp
             detector.expose_to(path, sky, exposure, seed=0)
     assert not list(tmp_path.iterdir())
     detector.expose_to(path, sky, exposure, seed=0)
-    with pytest.raises(OSError, match="exists; give overwrite=True"):
+    with pytest.raises(OSError, match="exists; overwrite=True"):
         detector.expose_to(path, sky, exposure, seed=0)
     detector.expose_to(path, sky, exposure, seed=0, overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == ["a_uncal.fits"]

@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from miricigale.detector import DQ, Detector, Ramp, ResetAnomaly
+from miricigale.detector import (
+    DQ,
+    Detector,
+    FirstFrame,
+    LastFrame,
+    Ramp,
+    ResetAnomaly,
+)
 from miricigale.instrument import Exposure, field_mask, flat_field, photmjsr
 from miricigale.reduction import Reducer
 
@@ -107,7 +114,7 @@ def test_what_resets_do_is_taken_off(tmp_path, tools):
     )
     x, y = (g.ravel() for g in np.meshgrid([60.3, 128.0, 190.6], [55.1, 130.4, 200.0]))
     catalog = tools.star_field(exposure, x, y, np.full(9, 1e3))
-    detector = Detector.miri_imager(reset_anomaly=True, first_frame=True, last_frame=True)
+    detector = Detector.miri_imager(ResetAnomaly(), FirstFrame(), LastFrame())
     seen = reduce(
         tools,
         tmp_path,

@@ -10,7 +10,12 @@ from numpy.testing import assert_allclose
 from photutils.aperture import ApertureStats, CircularAnnulus, CircularAperture
 from scipy.ndimage import gaussian_filter
 
-from miricigale.detector import Detector
+from miricigale.detector import (
+    BadPixels,
+    CosmicRays,
+    Detector,
+    Residual,
+)
 from miricigale.instrument import (
     DetectorProperties,
     Exposure,
@@ -200,7 +205,9 @@ def test_noise_is_that_of_simulated_and_reduced_exposures(residual, n_exposures,
         pointing=SkyCoord(53.1, -27.8, unit="deg"),
         roll=0 * u.deg,
     )
-    detector = Detector.miri_imager(residual=residual or False, cosmic_rays=False, bad_pixels=False)
+    detector = Detector.miri_imager().without(CosmicRays, BadPixels)
+    if residual:
+        detector = detector.replaced(Residual(residual))
     sky = CCDData(
         np.full(exposure.shape, background_level(name).value),
         unit="MJy/sr",

@@ -5,7 +5,11 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
 from scipy.ndimage import convolve
 
-from miricigale.detector import Detector
+from miricigale.detector import (
+    BadPixels,
+    CosmicRays,
+    Detector,
+)
 from miricigale.instrument import (
     DetectorProperties,
     Exposure,
@@ -32,9 +36,9 @@ def exposure(dither=0, *, filt=FILTER, subarray="SUB256", **options):
     )
 
 
-def expose(light, exp, *, seed=1, **options):
+def expose(light, exp, *, seed=1, without=()):
     image = CCDData(np.broadcast_to(light, exp.shape).copy(), unit="MJy/sr")
-    return Detector.miri_imager(**options).expose(image, exp, seed=seed, n_threads=1)
+    return Detector.miri_imager().without(*without).expose(image, exp, seed=seed, n_threads=1)
 
 
 def expected_rate(exp, sky, *, ipc=True):
@@ -206,7 +210,7 @@ def test_saturated_stars_are_used_or_masked_with_the_reason():
     light = np.full(exp.shape, SKY)
     light[100, 100] = 1e4
     light[150, 150] = 1e5
-    rate = Reducer().fit_ramp(expose(light, exp, cosmic_rays=False, bad_pixels=False))
+    rate = Reducer().fit_ramp(expose(light, exp, without=(CosmicRays, BadPixels)))
     assert rate.flags[100, 100] & DQ.SATURATED
     assert not rate.mask[100, 100]
     assert rate.flags[150, 150] == DQ.SATURATED | DQ.NO_SLOPE | DQ.DO_NOT_USE
@@ -221,7 +225,7 @@ def test_saturated_stars_are_used_or_masked_with_the_reason():
 
 def test_groups_can_be_left_out():
     exp = exposure(n_groups=8)
-    ramp = expose(SKY, exp, cosmic_rays=False)
+    ramp = expose(SKY, exp, without=[CosmicRays])
     fit = Reducer(skip_first=2, skip_last=1).fit_groups(ramp)
     assert fit.n_used.max() == 4
     with pytest.raises(ValueError, match="'skip_first, skip_last' must be at most 6 groups"):
@@ -251,7 +255,7 @@ def test_refuses_what_does_not_belong_together():
     with pytest.raises(ValueError, match="'ramps' must be at least one ramp"):
         reducer.run([])
     ramps = [
-        expose(5.0, exposure(n_groups=2, filt=f), cosmic_rays=False)
+        expose(5.0, exposure(n_groups=2, filt=f), without=[CosmicRays])
         for f in ("miri.f770w", "miri.f1000w")
     ]
     with pytest.raises(ValueError, match=r"'ramps' must be of one filter \(miri.f770w\)"):

@@ -8,7 +8,15 @@ from miricigale.instrument import DetectorProperties, Exposure
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import stream
 
-__all__ = ["Block", "Effect", "check_amounts", "check_ramp", "key_words", "stream_key"]
+__all__ = [
+    "Block",
+    "Effect",
+    "OtherEffect",
+    "check_amounts",
+    "check_ramp",
+    "key_words",
+    "stream_key",
+]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -101,6 +109,17 @@ class Effect:
     halo = 0
     included_as = None
 
+    def record(self):
+        """
+        Name and settings of the effect, for files.
+
+        Returns
+        -------
+        record : dict
+            ``effect``, the name of the class, and the settings by name.
+        """
+        return {"effect": type(self).__name__, **dataclasses.asdict(self)}
+
     def apply(self, array, block):
         """
         Return the array as it is after the effect.
@@ -154,3 +173,24 @@ class Effect:
             Infinite for effects that do not.
         """
         return np.inf
+
+
+@dataclasses.dataclass(frozen=True)
+class OtherEffect(Effect):
+    """
+    An effect of a ramp that was read from a file and that this package does not have.
+
+    Parameters
+    ----------
+    name : str
+        Name of its class.
+    settings : tuple of (str, object)
+        Its settings.
+    """
+
+    name: str
+    settings: tuple = ()
+
+    def record(self):
+        """See `Effect.record`."""
+        return {"effect": self.name, **dict(self.settings)}

@@ -88,8 +88,6 @@ class Photons(Effect):
 
     def apply(self, array, block):
         """Turn surface brightness (MJy/sr) into a ramp (electrons)."""
-        if array.ndim != 2:
-            raise argument_error("effects", "a tuple with one Photons in it", "two")
         mean = self.expected(array, block) * block.group_time
         ramp = np.zeros(block.ramp_shape, np.float32)
         _core.add_poisson(ramp, np.ascontiguousarray(mean, float), block.key, block.rows.start)

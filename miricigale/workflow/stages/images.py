@@ -93,9 +93,11 @@ def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, tell=N
         background=background,
         workers=n_threads,
     )
-    imager = detector.Detector.miri_imager(
-        cosmic_rays=config.detector.cosmic_rays, residual=config.detector.residual or False
-    )
+    imager = detector.Detector.miri_imager()
+    if config.detector.residual:
+        imager = imager.replaced(detector.Residual(config.detector.residual))
+    if not config.detector.cosmic_rays:
+        imager = imager.without(detector.CosmicRays)
     image = sky.render()
     if tell is not None:
         tell(imager.forecast(image, exposure, sources=sky.truth))
