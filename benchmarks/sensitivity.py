@@ -4,7 +4,7 @@ Point-source limits, 10 sigma in 10 ks, from simulated exposures beside the calc
     python benchmarks/sensitivity.py [--filters miri.f770w ...] [--seed 1] [--full]
 
 Each filter is exposed as for the published limits of the exposure time calculator
-(`miricigale.instrument.etc_setup`) to the low background, by our detector with cosmic rays and bad
+(`miricigale.depth.etc_setup`) to the low background, by our detector with cosmic rays and bad
 pixels, and reduced; the limit is the flux at which the mean of injected point sources is ten
 times the scatter of empty apertures. Aperture as the calculator's, sky known as there; the
 columns "annulus" measure the sky in its annulus instead.
@@ -27,21 +27,18 @@ from astropy.stats import sigma_clip
 from astropy.table import QTable
 from photutils.aperture import ApertureStats, CircularAnnulus, CircularAperture
 
+from miricigale.depth import etc_limit, etc_setup, proposal_limit, sensitivity
 from miricigale.detector import Block, Detector, Residual
 from miricigale.instrument import (
     CEERS_FILTERS,
     Exposure,
     background_level,
     ceers_exposures,
-    etc_limit,
-    etc_setup,
     imager_columns,
     imager_filters,
     miri_detector,
     pixel_area_map,
-    proposal_limit,
 )
-from miricigale.photometry import sensitivity
 from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf
 from miricigale.reduction import Reducer
 from miricigale.scene import Scene

@@ -22,7 +22,8 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.table import QTable
 
-from miricigale.instrument import ceers_exposures, mosaic_wcs, pixel_area_map, scaled_limit
+from miricigale.depth import scaled_limit
+from miricigale.instrument import ceers_exposures, mosaic_wcs, pixel_area_map
 from miricigale.photometry import (
     ForcedPhotometer,
     Yang2021Photometer,

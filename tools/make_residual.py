@@ -19,8 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from miricigale.instrument import etc_limit, etc_setup
-from miricigale.photometry.limits import forecast
+from miricigale.depth import aperture_noise, etc_limit, etc_setup
 
 OUT = Path(__file__).parents[1] / "miricigale/refdata/files/instrument/etc.toml"
 
@@ -70,7 +69,7 @@ def write(amplitudes):
 
 def amplitude(name):
     """The amplitude with which the closed form gives the published limit."""
-    row = forecast(f"miri.{name}", etc_setup(name).time, 10.0, None)
+    row = aperture_noise(f"miri.{name}", etc_setup(name).time)
     limit = etc_limit(f"miri.{name}").value
     rest = (limit * row["light"] / 10) ** 2 - row["white"] ** 2 - row["shot"] * limit
     print(
@@ -83,7 +82,7 @@ def amplitude(name):
 
 
 def main():
-    write(dict.fromkeys(SETUP, 0.0))  # the forecast reads the set-up from it
+    write(dict.fromkeys(SETUP, 0.0))  # the closed form reads the set-up from it
     write({name: amplitude(name) for name in SETUP})
     print(f"etc.toml: sha256 {hashlib.sha256(OUT.read_bytes()).hexdigest()}")
 

@@ -27,9 +27,9 @@ __getattr__, __dir__, __all__ = lazy_names(
             "Residual",
             "Saturation",
         ),
-        "forecast": ("SaturationForecast", "forecast_table"),
         "latent": ("Latent",),
         "level1b": ("DQ",),
         "ramp": ("Ramp",),
     },
+    moved={"miricigale.depth": ("SaturationForecast", "forecast_table")},
 )

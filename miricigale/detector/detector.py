@@ -10,6 +10,7 @@ from pathlib import Path
 import numba
 import numpy as np
 
+from miricigale.depth.saturation import SKY_FRACTION, SaturationForecast, saturation_forecast
 from miricigale.detector import level1b
 from miricigale.detector.effects import (
     ORDER,
@@ -24,17 +25,10 @@ from miricigale.detector.effects import (
     Residual,
     stream_key,
 )
-from miricigale.detector.forecast import SKY_FRACTION, forecast
 from miricigale.detector.image import checked_light
 from miricigale.detector.latent import Latent
 from miricigale.detector.ramp import Ramp
-from miricigale.instrument import (
-    DetectorProperties,
-    Exposure,
-    ImageFacts,
-    miri_detector,
-    saturation_forecast,
-)
+from miricigale.instrument import DetectorProperties, Exposure, ImageFacts, miri_detector
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import parallel_map
@@ -324,7 +318,7 @@ class Detector:
 
         Returns
         -------
-        forecast : `SaturationForecast`
+        forecast : `~miricigale.depth.SaturationForecast`
 
         Raises
         ------
@@ -338,7 +332,11 @@ class Detector:
         """
         light = checked_light(image, exposure)
         effects, _ = self._acting(image)
-        told = forecast(light, exposure, effects, self._properties, sources=sources)
+        block = Block(exposure, self._properties, slice(0, light.shape[0]), None, None, None)
+        for effect in effects:
+            light = effect.expected(light, block)
+        limit = min(effect.limit(self._properties) for effect in effects)
+        told = SaturationForecast.from_rate(light, exposure, limit, sources)
         if told.sky_too_bright:
             warnings.warn(
                 _sky_message(exposure, told.sky_fraction), MiricigaleWarning, stacklevel=2

@@ -15,7 +15,6 @@ __getattr__, __dir__, __all__ = lazy_names(
         ),
         "dithers": ("dither_offsets", "dither_patterns", "read_dithers"),
         "dq": ("DQ", "dq_legend", "read_dq"),
-        "etc": ("EtcSetup", "etc_setup", "residual_amplitude", "residual_presets"),
         "exposure": (
             "CEERS_FILTERS",
             "Exposure",
@@ -24,16 +23,13 @@ __getattr__, __dir__, __all__ = lazy_names(
             "readout_patterns",
         ),
         "figures": ("imager_filters",),
-        "sensitivity": (
+        "photometric": (
             "background_level",
             "background_spectrum",
-            "etc_limit",
+            "electron_rate",
+            "electrons_per_brightness",
             "photmjsr",
-            "proposal_limit",
             "psf_fwhm",
-            "saturation_forecast",
-            "saturation_time",
-            "scaled_limit",
         ),
         "image_facts": ("ImageFacts",),
         "siaf": (
@@ -53,5 +49,18 @@ __getattr__, __dir__, __all__ = lazy_names(
             "pixel_to_sky",
             "tangent_offset",
         ),
+    },
+    moved={
+        "miricigale.depth": (
+            "EtcSetup",
+            "etc_limit",
+            "etc_setup",
+            "proposal_limit",
+            "residual_amplitude",
+            "residual_presets",
+            "saturation_forecast",
+            "saturation_time",
+            "scaled_limit",
+        )
     },
 )

@@ -7,9 +7,10 @@ import math
 import astropy.units as u
 from astropy.coordinates import SkyCoord
 
+from miricigale.instrument.detector import miri_detector
 from miricigale.instrument.dithers import dither_offsets
 from miricigale.instrument.figures import filter_row, table
-from miricigale.instrument.sensitivity import saturation_time
+from miricigale.instrument.photometric import electron_rate
 from miricigale.instrument.siaf import aperture, attitude_matrix, pixel_to_v2v3, v2v3_to_sky
 from miricigale.instrument.wcs import imager_wcs, scalar_position, tangent_offset
 from miricigale.utils.exceptions import argument_error, unknown_name
@@ -156,7 +157,8 @@ class Exposure:
         frames = round(seconds / frame.value)
         if frames < 2:
             raise argument_error("time", f"at least two frames of {frame}", time)
-        most = max(2, math.floor(max_fill * (saturation_time(filter) / frame).value))
+        fills = miri_detector().full_well / electron_rate(filter)
+        most = max(2, math.floor(max_fill * fills / frame.value))
         n_integrations = math.ceil(frames / most)
         n_groups = max(2, round(frames / n_integrations))
         return cls(filter, n_groups=n_groups, n_integrations=n_integrations, **options)

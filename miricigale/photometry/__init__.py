@@ -21,7 +21,6 @@ __getattr__, __dir__, __all__ = lazy_names(
         "flags": ("ForcedFlags",),
         "forced": ("ForcedPhotometer",),
         "injection": ("calibrate_errors",),
-        "limits": ("sensitivity", "sensitivity_table"),
         "offsets": ("OffsetMap",),
         "mosaics": ("MosaicFile", "read_mosaic"),
         "priors": ("read_prior",),
@@ -32,4 +31,5 @@ __getattr__, __dir__, __all__ = lazy_names(
         "stars": ("psf_photometry",),
         "yang2021": ("Yang2021Photometer",),
     },
+    moved={"miricigale.depth": ("sensitivity", "sensitivity_table")},
 )

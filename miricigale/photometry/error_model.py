@@ -284,9 +284,9 @@ class ErrorModel:
         `ForcedPhotometryResult`).
         """
         # loads photutils, which a command that reads depths does without
-        from miricigale.photometry.exposure_errors import exposure_curve
+        from miricigale.depth import fitted_noise
 
-        curve = exposure_curve(
+        sky, photon = fitted_noise(
             filter,
             time,
             background=background,
@@ -294,11 +294,11 @@ class ErrorModel:
             psf=psf,
             n_integrations=n_integrations,
             frame_time=frame_time,
-            fractional=fractional,
             n_dithers=n_dithers,
             residual=residual,
             mosaic=mosaic,
         )
+        curve = Analytic(sky, float(fractional), photon)
         return cls({str(filter): curve}, provenance(source="exposure"))
 
     def sigma(self, flux, filter):

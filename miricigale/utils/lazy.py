@@ -2,11 +2,12 @@
 
 import importlib
 import sys
+import warnings
 
 __all__ = ["lazy_names"]
 
 
-def lazy_names(package, names):
+def lazy_names(package, names, *, moved=None):
     """
     Let a package import its modules when one of their names is first asked for.
 
@@ -16,6 +17,8 @@ def lazy_names(package, names):
         Name of the package, ``__name__``.
     names : dict of str to tuple of str
         The public names of each module of the package; none for a module that is public itself.
+    moved : dict of str to tuple of str, optional
+        Names that now stand in other packages, by the package: they work, with a warning.
 
     Returns
     -------
@@ -29,8 +32,15 @@ def lazy_names(package, names):
         __getattr__, __dir__, __all__ = lazy_names(__name__, {"filter": ("Filter",)})
     """
     home = {name: module for module, own in names.items() for name in own or (module,)}
+    gone = {name: other for other, own in (moved or {}).items() for name in own}
 
     def getter(name):
+        if name in gone:
+            msg = f"{package}.{name} has moved: import it from {gone[name]}"
+            from astropy.utils.exceptions import AstropyDeprecationWarning
+
+            warnings.warn(msg, AstropyDeprecationWarning, stacklevel=2)
+            return getattr(importlib.import_module(gone[name]), name)
         if name not in home:
             msg = f"module {package!r} has no attribute {name!r}"
             raise AttributeError(msg)

@@ -58,13 +58,8 @@ def plan_table(*, quick=False):
     """
     from astropy.coordinates import SkyCoord
 
-    from miricigale.instrument import (
-        ceers_exposures,
-        proposal_limit,
-        psf_fwhm,
-        saturation_forecast,
-        scaled_limit,
-    )
+    from miricigale.depth import proposal_limit, saturation_forecast, scaled_limit
+    from miricigale.instrument import ceers_exposures, psf_fwhm
 
     exposures = ceers_exposures(SkyCoord(0 * u.deg, 0 * u.deg), 0 * u.deg, quick=quick)
     names = list(dict.fromkeys(e.filter for e in exposures))
@@ -93,7 +88,7 @@ def plan_table(*, quick=False):
 
 def _limit(exposures, time):
     """Our own limit of the dithers of one band."""
-    from miricigale.photometry import sensitivity
+    from miricigale.depth import sensitivity
 
     first = exposures[0]
     return sensitivity(

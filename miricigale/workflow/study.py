@@ -5,8 +5,9 @@ import math
 import astropy.units as u
 import numpy as np
 
+from miricigale.depth import saturation_forecast
 from miricigale.filters import Filter
-from miricigale.instrument import background_level, imager_filters, saturation_forecast
+from miricigale.instrument import background_level, imager_filters
 from miricigale.scene import read_catalog
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.config import HighresSection

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from miricigale.depth import residual_amplitude
 from miricigale.detector import (
     DQ,
     BadPixels,
@@ -19,14 +20,7 @@ from miricigale.detector import (
     Saturation,
 )
 from miricigale.detector.effects import stream_key
-from miricigale.instrument import (
-    aperture,
-    bad_pixel_mask,
-    flat_field,
-    miri_detector,
-    photmjsr,
-    residual_amplitude,
-)
+from miricigale.instrument import aperture, bad_pixel_mask, flat_field, miri_detector, photmjsr
 
 
 @pytest.fixture

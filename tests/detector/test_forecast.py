@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
+from miricigale.depth import forecast_table
+from miricigale.depth.saturation import NEVER, saturation_group
 from miricigale.detector import (
     DQ,
     ADConversion,
@@ -14,9 +16,7 @@ from miricigale.detector import (
     Nonlinearity,
     Photons,
     Saturation,
-    forecast_table,
 )
-from miricigale.detector.forecast import NEVER, saturation_group
 from miricigale.instrument import flat_field, miri_detector, photmjsr
 from miricigale.utils.exceptions import MiricigaleWarning
 

@@ -9,6 +9,7 @@ from astropy.coordinates import SkyCoord
 from astropy.tests.helper import assert_quantity_allclose
 from numpy.testing import assert_allclose
 
+from miricigale.depth import saturation_forecast
 from miricigale.instrument import (
     CEERS_FILTERS,
     Exposure,
@@ -16,7 +17,6 @@ from miricigale.instrument import (
     dither_offsets,
     dither_patterns,
     frame_time,
-    saturation_forecast,
 )
 
 FIELD = SkyCoord(214.9533, 52.95101, unit="deg")

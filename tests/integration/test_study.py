@@ -12,7 +12,8 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable
 
-from miricigale.instrument import DQ, saturation_forecast
+from miricigale.depth import saturation_forecast
+from miricigale.instrument import DQ
 from miricigale.workflow import load_config
 from miricigale.workflow.products import read_image
 from miricigale.workflow.stages.exposures import study_exposures

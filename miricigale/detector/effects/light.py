@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from miricigale.depth import residual_amplitude, residual_presets
 from miricigale.detector import _core
 from miricigale.detector.effects.base import Effect, key_words
-from miricigale.instrument import flat_field, photmjsr, residual_amplitude, residual_presets
+from miricigale.instrument import electrons_per_brightness, flat_field
 from miricigale.utils.exceptions import argument_error, unknown_name
 
 __all__ = ["Photons", "Residual"]
@@ -26,7 +27,7 @@ class Residual(Effect):
     amplitude : float or str
         Standard deviation of the pattern, as a fraction of the light; or ``"etc"`` for one per
         filter, which holds at the default correlation
-        (`~miricigale.instrument.residual_amplitude`).
+        (`~miricigale.depth.residual_amplitude`).
     correlation : float, optional
         Gaussian width of the pattern's correlation in pixels; 0 for white.
     pattern : int, optional
@@ -96,8 +97,7 @@ class Photons(Effect):
     def expected(self, array, block):
         """Electrons per second of the brightness (MJy/sr)."""
         exposure = block.exposure
-        gain = block.properties.gain
-        rate = array * (gain / photmjsr(exposure.filter, gain=gain))
+        rate = array * electrons_per_brightness(exposure.filter, block.properties)
         if self.flat:
             rate = rate * flat_field(exposure.filter, subarray=exposure.subarray)[block.rows]
         return rate

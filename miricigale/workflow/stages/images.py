@@ -7,7 +7,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
-from miricigale import detector, photometry, psf, reduction, scene
+from miricigale import depth, detector, photometry, psf, reduction, scene
 from miricigale.instrument import background_level
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.exposures import (
@@ -69,7 +69,7 @@ def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, tell=N
     n_threads : int, optional
         Threads; it changes nothing in the result.
     tell : callable, optional
-        Called with the `~miricigale.detector.SaturationForecast`, before anything is exposed.
+        Called with the `~miricigale.depth.SaturationForecast`, before anything is exposed.
     keep : callable, optional
         Called with the `~miricigale.detector.Ramp`, to write it.
 
@@ -132,7 +132,7 @@ def make_exposure(context, unit):
 
     def tell(forecast):
         log.info(forecast.describe())
-        context.save_table(f"exposures/{unit}_forecast.ecsv", detector.forecast_table([forecast]))
+        context.save_table(f"exposures/{unit}_forecast.ecsv", depth.forecast_table([forecast]))
 
     def keep(ramp):
         name = f"{unit}_uncal.fits"

@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale import fitting, photometry
+from miricigale import depth, fitting, photometry
 from miricigale.evaluation import (
     PUBLISHED_LIGHT,
     fraction_interval,
@@ -19,8 +19,6 @@ from miricigale.evaluation import (
 from miricigale.instrument import (
     CEERS_FILTERS,
     ceers_exposures,
-    proposal_limit,
-    scaled_limit,
 )
 from miricigale.workflow.stages.conditions import (
     ConditionFlags,
@@ -111,7 +109,10 @@ def _proposal(name, exposure):
         return {"proposal": np.nan, "proposal_time": np.nan}
     exposures = ceers_exposures(exposure.pointing, exposure.roll, filters=[name])
     time = sum(e.exposure_time for e in exposures)
-    return {"proposal": float(proposal_limit(name).value), "proposal_time": time.to_value(u.s)}
+    return {
+        "proposal": float(depth.proposal_limit(name).value),
+        "proposal_time": time.to_value(u.s),
+    }
 
 
 def as_paper(config):
@@ -245,7 +246,7 @@ def study_metrics(config, tables, area):
         bright = entry.pop("bright_isolated")
         entry |= {
             "limit": float(errors.limiting_magnitude(name).value),
-            "etc_limit": float(scaled_limit(name, time).to_value(u.ABmag)),
+            "etc_limit": float(depth.scaled_limit(name, time).to_value(u.ABmag)),
             **_proposal(name, exposures[0]),
             "ceers": as_ceers(config, name),
             "bright_n": bright.n,

@@ -5,8 +5,8 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
-from miricigale import photometry, psf, scene
-from miricigale.instrument import mosaic_wcs, scaled_limit, tangent_offset
+from miricigale import depth, photometry, psf, scene
+from miricigale.instrument import mosaic_wcs, tangent_offset
 from miricigale.utils.random import text_key
 from miricigale.utils.tables import error_column, match_sky
 from miricigale.workflow.stage import stage
@@ -106,7 +106,7 @@ def measure_point_sources(context, name):
     config = context.config
     options, prior = config.point_sources, config.highres.filter
     exposure = next(e for e in study_exposures(config).values() if e.filter == name)
-    flux = options.signal_to_noise * scaled_limit(name, exposure.exposure_time, n_sigma=1.0)
+    flux = options.signal_to_noise * depth.scaled_limit(name, exposure.exposure_time, n_sigma=1.0)
     # own streams: these exposures are not those of the study
     seed = (context.seed + text_key(f"points/{name}")) % 2**63
     catalog = point_catalog(exposure, flux, prior, spacing=options.spacing, seed=seed)

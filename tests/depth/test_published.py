@@ -1,19 +1,25 @@
-"""The exposure time calculator's set-up against its public description."""
+"""Published limits, and the exposure time calculator's set-up against its public description."""
+
+import importlib
 
 import astropy.units as u
 import numpy as np
 import pytest
 from astropy.tests.helper import assert_quantity_allclose
+from astropy.utils.exceptions import AstropyDeprecationWarning
 from numpy.testing import assert_allclose
 
-from miricigale.instrument import (
+from miricigale import depth
+from miricigale.depth import (
     etc_limit,
     etc_setup,
-    imager_filters,
+    proposal_limit,
     residual_amplitude,
     residual_presets,
     saturation_time,
+    scaled_limit,
 )
+from miricigale.instrument import CEERS_FILTERS, imager_filters
 
 # JWST user documentation, MIRI Sensitivity, 10 sigma in 10 ks (uJy): tables of ETC 2.0 and 4.0,
 # the latter's digits cut off
@@ -59,3 +65,42 @@ def test_residuals_are_small_and_named():
         residual_amplitude("miri.f770w", "best")
     with pytest.raises(KeyError, match="no imaging filter"):
         etc_setup("miri.f600w")
+
+
+def test_scaled_limits_of_the_survey():
+    # exposure time calculator 4.0 scaled to the survey's exposures, AB at 5 sigma
+    times = [1665] * 5 + [4662]
+    expected = [25.20, 24.50, 23.87, 23.49, 22.72, 22.56]
+    for name, time, magnitude in zip(CEERS_FILTERS, times, expected, strict=True):
+        limit = scaled_limit(name, time * u.s).to_value(u.ABmag)
+        assert_allclose(limit, magnitude, atol=0.012)
+        assert abs(proposal_limit(name).value - limit) < 0.45
+    assert_quantity_allclose(
+        scaled_limit("miri.f770w", 1e4 * u.s, n_sigma=10), etc_limit("miri.f770w")
+    )
+
+
+def test_versions_of_the_calculator():
+    for name in imager_filters():
+        assert_quantity_allclose(etc_limit(name, "2.0"), etc_limit(name), rtol=0.25)
+    assert_quantity_allclose(etc_limit("miri.f2100w", "2.0"), 3.99 * u.uJy)
+    with pytest.raises(KeyError, match=r"version of the exposure time calculator '3.0'"):
+        etc_limit("miri.f770w", "3.0")
+    with pytest.raises(KeyError, match=r"no band of the survey 'miri.f560w'"):
+        proposal_limit("miri.f560w")
+
+
+@pytest.mark.parametrize(
+    ("package", "name"),
+    [
+        ("instrument", "etc_limit"),
+        ("instrument", "saturation_time"),
+        ("detector", "forecast_table"),
+        ("photometry", "sensitivity"),
+    ],
+)
+def test_names_that_moved_here_work_with_a_warning(package, name):
+    old = importlib.import_module(f"miricigale.{package}")
+    with pytest.warns(AstropyDeprecationWarning, match=f"{name} has moved: import it from"):
+        assert getattr(old, name) is getattr(depth, name)
+    assert name not in dir(old)

@@ -1,22 +1,16 @@
-"""Errors of point and extended sources that an exposure and its mosaic allow."""
+"""Noise of point and extended sources that are fitted on the mosaic of an exposure."""
 
 import astropy.units as u
 import numpy as np
 import scipy.fft
 from scipy.ndimage import gaussian_filter
 
-from miricigale.instrument import (
-    background_level,
-    miri_detector,
-    photmjsr,
-)
-from miricigale.photometry.error_curves import Analytic
-from miricigale.photometry.limits import noise_power, pattern_amplitude, ramp_variance
+from miricigale.depth.noise import ExposureNoise, noise_power, pattern_amplitude
 from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.units import ANGLE, to_array
 
-__all__ = ["exposure_curve", "extraction_map"]
+__all__ = ["extraction_map", "fitted_noise"]
 
 #: Samples of a pixel's side, and pixels of the detector on which sources are weighed.
 _SAMPLES, _SIZE = 4, 91
@@ -55,21 +49,36 @@ def extraction_map(share, boxes):
     return weight * _SAMPLES**2 / np.sum(weight * share)
 
 
-def exposure_curve(
+def fitted_noise(
     filter,
     time,
     *,
-    background,
-    size,
-    psf,
-    n_integrations,
-    frame_time,
-    fractional,
-    n_dithers,
-    residual,
-    mosaic,
+    background=None,
+    size=0.0 * u.arcsec,
+    psf=None,
+    n_integrations=1,
+    frame_time=2.775 * u.s,
+    n_dithers=1,
+    residual=None,
+    mosaic=0.11 * u.arcsec,
 ):
-    """Noise of an exposure; parameters are those of `ErrorModel.from_exposure`."""
+    """
+    Noise of sources fitted on the mosaic of an exposure.
+
+    Parameters are those of `~miricigale.photometry.ErrorModel.from_exposure`, which says more.
+
+    Returns
+    -------
+    sky : float
+        Standard deviation of the flux of a faint source, uJy.
+    photon : float
+        Variance by the source's own photons, uJy^2 for each uJy.
+
+    Raises
+    ------
+    ValueError
+        If a number is out of its range, or an integration has less than two frames.
+    """
     seconds = float(to_array(time, u.s, "time"))
     if not seconds > 0:
         raise argument_error("time", "positive", time)
@@ -77,31 +86,22 @@ def exposure_curve(
         if int(value) != value or value < 1:
             raise argument_error(name, "an integer of at least 1", value)
     step = float(to_array(frame_time, u.s, "frame_time"))
-    level = background_level(filter) if background is None else background
-    level = float(to_array(level, SURFACE_BRIGHTNESS, "background"))
-    detector = miri_detector()
     n_frames = int(seconds / n_integrations / step * (1 + 1e-9))
     if n_frames < 2:
         raise argument_error("time", f"at least two frames of {step} s in each integration", time)
     share = _share(filter, psf, size)
     boxes = () if mosaic is None else (1.0, _pixels(mosaic, "mosaic"))
     weight = extraction_map(share, boxes)
-
-    # electrons per second of a brightness, and uJy of a brightness in a pixel
-    per_level = detector.gain / photmjsr(filter, gain=detector.gain)
-    electrons = per_level / (MIRI_PIXEL_SCALE.to_value(u.rad) ** 2 * 1e12)
-    rate = level * per_level + detector.dark_current
-    ramp = {
-        "n_groups": n_frames,
-        "group_time": step,
-        "read_noise": detector.read_noise * detector.gain,
-    }
-    used = seconds / (n_frames * step * n_integrations)
-    variance = ramp_variance(rate, **ramp) / (n_integrations * used)
-    brighter = ramp_variance(1.01 * rate + 1e-3, **ramp) / (n_integrations * used)
-    growth = (brighter - variance) / (0.01 * rate + 1e-3)
+    noise = ExposureNoise(
+        filter=filter,
+        background=background,
+        n_groups=n_frames,
+        group_time=step,
+        n_ramps=seconds / (n_frames * step),
+    )
+    electrons = noise.electrons
     power = np.sum(weight**2) / _SAMPLES**2
-    sky = variance * power / electrons**2
+    sky = noise.variance() * power / electrons**2
     amplitude = pattern_amplitude(residual, filter)
     if amplitude:
         # the pattern is that of whole pixels, wherever the source falls
@@ -109,9 +109,9 @@ def exposure_curve(
             weight[y::_SAMPLES, x::_SAMPLES] for y in range(_SAMPLES) for x in range(_SAMPLES)
         ]
         pattern = np.mean([noise_power(one, 1.0) for one in phases])
-        sky += (amplitude * level * per_level / electrons) ** 2 * pattern / n_dithers
-    photon = growth * np.sum(weight**2 * share) / _SAMPLES**2 / electrons
-    return Analytic(float(np.sqrt(sky)), float(fractional), float(photon))
+        sky += (amplitude * noise.sky / electrons) ** 2 * pattern / n_dithers
+    photon = noise.growth * np.sum(weight**2 * share) / _SAMPLES**2 / electrons
+    return float(np.sqrt(sky)), float(photon)
 
 
 def _pixels(angle, name):

@@ -4,61 +4,19 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 from photutils.aperture import CircularAnnulus, CircularAperture
-from scipy.linalg import solveh_banded
-from scipy.ndimage import gaussian_filter1d
 
-from miricigale.instrument import (
-    DetectorProperties,
-    background_level,
-    etc_limit,
-    etc_setup,
-    frame_time,
-    imager_filters,
-    miri_detector,
-    photmjsr,
-    residual_amplitude,
-)
+from miricigale.depth.noise import ExposureNoise, noise_power, pattern_amplitude
+from miricigale.depth.published import etc_setup, scaled_limit
+from miricigale.instrument import frame_time, imager_filters
 from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image, psf_info
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, TIME, to_array
 
-__all__ = ["sensitivity", "sensitivity_table"]
+__all__ = ["aperture_noise", "extraction_weights", "sensitivity", "sensitivity_table"]
 
 # positions of the source's centre within the pixel, per axis, over which is averaged
 _PHASES = (np.arange(4) + 0.5) / 4 - 0.5
-
-
-def ramp_variance(rate, *, n_groups, group_time, read_noise):
-    """
-    Variance of the optimally weighted slope of one ramp.
-
-    The differences of groups have Poisson variance on the diagonal and share the read
-    noise with their neighbours; the best slope has the variance 1 / (1^T C^-1 1).
-
-    Parameters
-    ----------
-    rate : float
-        Electrons per second.
-    n_groups : int
-        Groups, at least 2.
-    group_time : float
-        In s.
-    read_noise : float
-        Of one group, electrons.
-
-    Returns
-    -------
-    variance : float
-        (Electrons per second) squared.
-    """
-    if rate == 0 and read_noise == 0:
-        return 0.0
-    n = n_groups - 1
-    band = np.zeros((2, n))
-    band[0] = -(read_noise**2)  # above the diagonal; the first is not used
-    band[1] = rate * group_time + 2 * read_noise**2
-    return 1.0 / (np.sum(solveh_banded(band, np.ones(n))) * group_time**2)
 
 
 def extraction_weights(radius, annulus=None, *, offset=(0.0, 0.0)):
@@ -89,35 +47,6 @@ def extraction_weights(radius, annulus=None, *, offset=(0.0, 0.0)):
     return weights
 
 
-def noise_power(weights, correlation=None):
-    """
-    Variance of a weighted sum of pixels of unit variance.
-
-    Parameters
-    ----------
-    weights : `~numpy.ndarray`, shape (ny, nx)
-        Weights.
-    correlation : float or None, optional
-        Gaussian width in pixels with which white noise was smoothed (and brought back to
-        unit variance); None or 0 for white noise.
-
-    Returns
-    -------
-    power : float
-        Sum of w_i w_j rho_ij.
-    """
-    if not correlation:
-        return float(np.sum(weights**2))
-    reach = int(np.ceil(4 * correlation))
-    smooth = np.pad(weights, reach)
-    delta = np.zeros(2 * reach + 1)
-    delta[reach] = 1.0
-    shape = gaussian_filter1d(delta, correlation, truncate=4.0)
-    for axis in (0, 1):
-        smooth = gaussian_filter1d(smooth, correlation, axis=axis, truncate=4.0, mode="constant")
-    return float(np.sum(smooth**2) / np.sum(shape**2) ** 2)
-
-
 def _radii(aperture, annulus, setup):
     """Radii in arcsec, checked."""
     radius = setup.radius if aperture is None else aperture
@@ -131,18 +60,6 @@ def _radii(aperture, annulus, setup):
         wanted = "an inner and outer radius outside the aperture, up to 10 arcsec"
         raise argument_error("annulus", wanted, annulus)
     return radius, (float(edges[0]), float(edges[1]))
-
-
-def pattern_amplitude(residual, filter):
-    """Fraction of the light that stays as a pattern: none, a number, or by its name."""
-    if residual is None or residual is False:
-        return 0.0
-    if isinstance(residual, str):
-        return residual_amplitude(filter, residual)
-    value = float(to_array(residual, u.dimensionless_unscaled, "residual", ndim=0))
-    if residual is True or not 0 <= value < 0.2:
-        raise argument_error("residual", "None, a name or a fraction from 0 to 0.2", residual)
-    return value
 
 
 def _extraction(radius, annulus, psf, correlation, filter):
@@ -207,7 +124,7 @@ def sensitivity(
         Flux over its error.
     aperture : `~astropy.units.Quantity`, optional
         Radius; that of the exposure time calculator's own limits by default
-        (`~miricigale.instrument.etc_setup`).
+        (`etc_setup`).
     annulus : `~astropy.units.Quantity`, shape (2,), optional
         Inner and outer radius of a sky annulus whose mean is taken off. By default the sky is
         known, as in those limits.
@@ -216,7 +133,7 @@ def sensitivity(
     residual : str, float or None, optional
         Fraction of the sky that stays as a fixed pattern
         (`~miricigale.detector.Residual`), or ``"etc"``
-        (`~miricigale.instrument.residual_amplitude`). It does not average down with time.
+        (`residual_amplitude`). It does not average down with time.
     correlation : float, optional
         Gaussian width of the pattern's correlation in pixels.
     n_dithers : int, optional
@@ -247,33 +164,45 @@ def sensitivity(
     -----
     Means over the positions of a source within a pixel. Time lost to cosmic rays, resets
     between integrations and bad pixels is not counted. Optimal extraction instead of an
-    aperture: `ErrorModel.from_exposure`.
+    aperture: `fitted_noise`.
 
     Examples
     --------
     >>> import astropy.units as u
-    >>> from miricigale.photometry import sensitivity
+    >>> from miricigale.depth import sensitivity
     >>> print(f"{sensitivity('miri.f1000w'):.2f}, {sensitivity('miri.f1000w', residual='etc'):.2f}")
     0.32 uJy, 0.47 uJy
     >>> print(f"{sensitivity('miri.f1000w', 1665 * u.s, n_sigma=5, residual='etc', n_dithers=3):.2f}")
     0.41 uJy
     """
-    options = {"annulus": annulus, "background": background, "correlation": correlation}
-    options |= {"n_dithers": n_dithers, "n_groups": n_groups, "readout": readout}
-    options |= {"subarray": subarray, "psf": psf, "detector": detector}
-    row = forecast(filter, time, n_sigma, residual, aperture=aperture, **options)
-    return row["flux"] * u.uJy
+    values = aperture_noise(
+        filter,
+        time,
+        n_sigma=n_sigma,
+        aperture=aperture,
+        annulus=annulus,
+        background=background,
+        residual=residual,
+        correlation=correlation,
+        n_dithers=n_dithers,
+        n_groups=n_groups,
+        readout=readout,
+        subarray=subarray,
+        psf=psf,
+        detector=detector,
+    )
+    return values["flux"] * u.uJy
 
 
-def forecast(
+def aperture_noise(
     filter,
-    time,
-    n_sigma,
-    residual,
+    time=1e4 * u.s,
     *,
+    n_sigma=10.0,
     aperture=None,
     annulus=None,
     background=None,
+    residual=None,
     correlation=1.0,
     n_dithers=1,
     n_groups=None,
@@ -282,56 +211,54 @@ def forecast(
     psf=None,
     detector=None,
 ):
-    """Everything `sensitivity` works out, in uJy, arcsec, electrons and s."""
+    """
+    Work out what `sensitivity` stands on.
+
+    Parameters are those of `sensitivity`.
+
+    Returns
+    -------
+    values : dict
+        ``flux`` and, without the pattern, ``flux_white``; within the extraction the standard deviations
+        ``white`` of photons and read noise and ``residual`` of the pattern, ``pattern``, that of a
+        pattern of amplitude 1, and ``shot``, the variance for each uJy of the source (all uJy); ``light``,
+        the share of the source in it; ``radius`` (arcsec) and ``background`` (MJy/sr).
+    """
     setup = etc_setup(filter)
     filter = setup.filter  # with the instrument's name, if that was left out
-    detector = miri_detector() if detector is None else detector
-    if not isinstance(detector, DetectorProperties):
-        raise argument_error("detector", "a DetectorProperties", repr(detector))
     radius, edges = _radii(aperture, annulus, setup)
     amplitude = pattern_amplitude(residual, filter)
-    level = background_level(filter) if background is None else background
-    level = float(to_array(level, SURFACE_BRIGHTNESS, "background", ndim=0, finite=True))
     seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
     groups = setup.n_groups if n_groups is None else n_groups
     step = frame_time(readout, subarray).to_value(TIME)
-    for name, value, good in (
-        ("n_sigma", n_sigma, n_sigma > 0),
-        ("background", background, level >= 0),
-        ("correlation", correlation, 0 <= correlation <= 30),
-        ("n_dithers", n_dithers, n_dithers >= 1),
-        ("n_groups", n_groups, groups >= 2 and int(groups) == groups),
+    for name, value, good, wanted in (
+        ("n_sigma", n_sigma, n_sigma > 0, "positive"),
+        ("correlation", correlation, 0 <= correlation <= 30, "from 0 to 30 pixels"),
+        ("n_dithers", n_dithers, n_dithers >= 1, "at least 1"),
+        ("n_groups", n_groups, groups >= 2 and int(groups) == groups, "an integer of at least 2"),
     ):
         if not good:
-            wanted = {"n_sigma": "positive", "background": "at least 0"}
-            wanted |= {"correlation": "from 0 to 30 pixels", "n_dithers": "at least 1"}
-            raise argument_error(name, wanted.get(name, "an integer of at least 2"), value)
+            raise argument_error(name, wanted, value)
     if seconds < groups * step * (1 - 1e-9):
         wanted = f"at least one integration of {groups} groups, {groups * step:.4g} s"
         raise argument_error("time", wanted, time)
-
-    # electrons per second and pixel of 1 MJy/sr; uJy of 1 MJy/sr in a pixel
-    per_level = detector.gain / photmjsr(filter, gain=detector.gain)
-    area = (MIRI_PIXEL_SCALE.to_value(u.rad) ** 2) * 1e12
-    sky = level * per_level
-    rate = sky + detector.dark_current
-    if rate * groups * step >= detector.full_well:
+    noise = ExposureNoise(
+        filter=filter,
+        background=background,
+        n_groups=int(groups),
+        group_time=step,
+        n_ramps=seconds / (groups * step),
+        detector=detector,
+    )
+    if noise.rate * groups * step >= noise.detector.full_well:
         wanted = "so few that the sky does not fill the well"
         raise argument_error("n_groups", wanted, groups)
-    ramp = {
-        "n_groups": int(groups),
-        "group_time": step,
-        "read_noise": detector.read_noise * detector.gain,
-    }
-    n_ramps = seconds / (groups * step)
-    variance = ramp_variance(rate, **ramp) / n_ramps
-    growth = (ramp_variance(1.01 * rate + 1e-3, **ramp) / n_ramps - variance) / (0.01 * rate + 1e-3)
+    variance, growth, sky, electrons = noise.variance(), noise.growth, noise.sky, noise.electrons
 
     psf = miri_psf(filter) if psf is None else psf
     light, white, shot, pattern = _extraction(radius, edges, psf, correlation, filter)
     if not light > 0:
         raise argument_error("annulus", "such that light of the source is left", annulus)
-    electrons = per_level / area  # per second and uJy
     shot_noise = n_sigma**2 * growth * shot / (light**2 * electrons)
     white_noise = n_sigma**2 * variance * white / (light * electrons) ** 2
     residual_noise = (n_sigma * amplitude * sky / (light * electrons)) ** 2 * pattern / n_dithers
@@ -345,7 +272,7 @@ def forecast(
         "flux_white": limit(white_noise),
         "radius": radius,
         "light": float(light),
-        "background": level,
+        "background": noise.background.value,
         "white": float(np.sqrt(variance * white) / electrons),
         "residual": float(amplitude * sky * np.sqrt(pattern / n_dithers) / electrons),
         # what a calibration of the amplitude needs, per unit amplitude
@@ -375,7 +302,7 @@ def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=1
 
     Examples
     --------
-    >>> from miricigale.photometry import sensitivity_table
+    >>> from miricigale.depth import sensitivity_table
     >>> table = sensitivity_table(["miri.f770w", "miri.f2100w"])
     >>> bool((abs(table["limit"] / table["etc_40"] - 1) < 0.02).all())
     True
@@ -386,8 +313,7 @@ def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=1
     seconds = float(to_array(time, TIME, "time", ndim=0, finite=True))
     rows = []
     for name in names:
-        row = forecast(name, time, n_sigma, residual, **options)
-        scale = n_sigma / 10 * np.sqrt(1e4 / seconds)
+        row = aperture_noise(name, time, n_sigma=n_sigma, residual=residual, **options)
         rows.append(
             (
                 etc_setup(name).filter,
@@ -398,8 +324,8 @@ def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=1
                 row["residual"] * u.uJy,
                 row["flux_white"] * u.uJy,
                 row["flux"] * u.uJy,
-                etc_limit(name, "4.0") * scale,
-                etc_limit(name, "2.0") * scale,
+                scaled_limit(name, time, n_sigma=n_sigma, version="4.0"),
+                scaled_limit(name, time, n_sigma=n_sigma, version="2.0"),
             )
         )
     columns = ("filter", "radius", "light", "background", "noise", "residual")

@@ -1,4 +1,4 @@
-"""What will saturate, told before an exposure is simulated."""
+"""What sky and sources fill the wells, and when."""
 
 import dataclasses
 
@@ -6,8 +6,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.detector.effects import Block
-from miricigale.instrument import Exposure
+from miricigale.instrument import Exposure, electron_rate, miri_detector
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import require_columns
 
@@ -15,15 +14,16 @@ __all__ = [
     "NEVER",
     "SKY_FRACTION",
     "SaturationForecast",
-    "forecast",
     "forecast_table",
+    "saturation_forecast",
     "saturation_group",
+    "saturation_time",
 ]
 
-#: Share of the full well from which the sky is spoken of.
+#: Share of the full well above which the sky is reported.
 SKY_FRACTION = 0.6
 
-#: Group of what is never full.
+#: Group of a pixel that is never full.
 NEVER = 2**31 - 1
 
 #: Pixels around a source's own in which its brightest is looked for.
@@ -33,7 +33,7 @@ _REACH = 1
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class SaturationForecast:
     """
-    What an exposure fills, made by `Detector.forecast`; it never changes.
+    What an exposure fills, made by `~miricigale.detector.Detector.forecast`; it never changes.
 
     Groups are counted from 1, as in n_groups.
 
@@ -62,6 +62,39 @@ class SaturationForecast:
     sky_group: int
     n_pixels: int
     sources: QTable
+
+    @classmethod
+    def from_rate(cls, rate, exposure, limit, sources=None):
+        """
+        Forecast from the rate of charge of every pixel.
+
+        Parameters
+        ----------
+        rate : `~numpy.ndarray`, shape (ny, nx)
+            Electrons per second; NaN where a pixel does not count.
+        exposure : `~miricigale.instrument.Exposure`
+            What is exposed.
+        limit : float
+            The well in electrons.
+        sources : `~astropy.table.Table`, optional
+            With ``id`` and pixel positions ``x``, ``y``.
+
+        Returns
+        -------
+        forecast : `SaturationForecast`
+        """
+        step = exposure.group_time.to_value(u.s)
+        group = saturation_group(rate, limit, step)
+        good = rate[np.isfinite(rate)]
+        sky = float(np.median(good)) if good.size else np.nan
+        return cls(
+            exposure,
+            sky * u.electron / u.s,
+            _filled(sky, exposure, limit),
+            int(saturation_group(sky, limit, step)),
+            int(np.count_nonzero(group <= exposure.n_groups)),
+            _sources(sources, rate, group, limit, exposure),
+        )
 
     @property
     def saturated(self):
@@ -96,44 +129,49 @@ class SaturationForecast:
         return f"<SaturationForecast {self.describe()}>"
 
 
-def forecast(light, exposure, effects, properties, *, sources=None):
+def saturation_forecast(exposure, *, background=None, detector=None):
     """
-    Forecast an exposure; see `Detector.forecast`, which checks the image.
+    How full the sky and the dark current make the wells by the end of an integration.
 
     Parameters
     ----------
-    light : `~numpy.ndarray`, shape (ny, nx)
-        The image in MJy/sr.
     exposure : `~miricigale.instrument.Exposure`
         What is exposed.
-    effects : tuple of `Effect`
-        Those that act on this image.
-    properties : `~miricigale.instrument.DetectorProperties`
-        The detector.
-    sources : `~astropy.table.Table`, optional
-        Sources with ``id``, ``x``, ``y``.
+    background : `~astropy.units.Quantity`, optional
+        Surface brightness; the low background of the filter if not given. An array (an
+        image of sources and sky, say) gives an array.
+    detector : `~miricigale.instrument.DetectorProperties`, optional
+        `~miricigale.instrument.miri_detector` if not given.
 
     Returns
     -------
-    forecast : `SaturationForecast`
+    fraction : float or `~numpy.ndarray`
+        Of the full well; above 0.6 little room is left for sources.
     """
-    rate = light
-    block = Block(exposure, properties, slice(0, light.shape[0]), None, None, None)
-    for effect in effects:
-        rate = effect.expected(rate, block)
-    limit = min((effect.limit(properties) for effect in effects), default=np.inf)
-    step = exposure.group_time.to_value(u.s)
-    group = saturation_group(rate, limit, step)
-    good = rate[np.isfinite(rate)]
-    sky = float(np.median(good)) if good.size else np.nan
-    return SaturationForecast(
-        exposure,
-        sky * u.electron / u.s,
-        sky * step * exposure.n_groups / limit,
-        int(saturation_group(sky, limit, step)),
-        int(np.count_nonzero(group <= exposure.n_groups)),
-        _sources(sources, rate, group, limit, exposure),
-    )
+    detector = miri_detector() if detector is None else detector
+    rate = electron_rate(exposure.filter, background, detector=detector)
+    fraction = _filled(rate, exposure, detector.full_well)
+    return float(fraction) if np.ndim(fraction) == 0 else fraction
+
+
+def saturation_time(filter, *, background=None, detector=None):
+    """
+    Time in which the sky and the dark current fill the well.
+
+    Parameters are those of `saturation_forecast`, with the filter for the exposure.
+
+    Returns
+    -------
+    time : `~astropy.units.Quantity`
+        In s.
+    """
+    detector = miri_detector() if detector is None else detector
+    return detector.full_well / electron_rate(filter, background, detector=detector) * u.s
+
+
+def _filled(rate, exposure, limit):
+    """Share of a well that a rate fills by the last group of an integration."""
+    return rate * exposure.integration_time.to_value(u.s) / limit
 
 
 def saturation_group(rate, limit, step):
@@ -182,9 +220,8 @@ def _sources(sources, rate, group, limit, exposure):
             r, c = np.clip(row + dy, 0, ny - 1), np.clip(column + dx, 0, nx - 1)
             peak = np.fmax(peak, rate[r, c])
             first = np.minimum(first, group[r, c])
-    filled = peak * exposure.integration_time.to_value(u.s)
     table["peak_rate"] = peak * u.electron / u.s
-    table["peak_fraction"] = filled / limit
+    table["peak_fraction"] = _filled(peak, exposure, limit)
     table["saturated"] = first <= exposure.n_groups
     table["group"] = np.where(table["saturated"], first, 0)
     return table

@@ -1,17 +1,27 @@
-"""How the exposure time calculator gets its published limits, and the residual they imply."""
+"""Published limits, how the exposure time calculator gets its own, and the residual they imply."""
 
 import dataclasses
 import functools
 import tomllib
 
 import astropy.units as u
+import numpy as np
 
-from miricigale.instrument.exposure import frame_time
+from miricigale.instrument import frame_time, imager_filters
 from miricigale.instrument.figures import filter_row
 from miricigale.refdata import locate
-from miricigale.utils.exceptions import unknown_name
+from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.units import to_array
 
-__all__ = ["EtcSetup", "etc_setup", "residual_amplitude", "residual_presets"]
+__all__ = [
+    "EtcSetup",
+    "etc_limit",
+    "etc_setup",
+    "proposal_limit",
+    "residual_amplitude",
+    "residual_presets",
+    "scaled_limit",
+]
 
 
 @functools.cache
@@ -70,7 +80,7 @@ def etc_setup(filter):
     Parameters
     ----------
     filter : str
-        One of `imager_filters`.
+        One of `~miricigale.instrument.imager_filters`.
 
     Returns
     -------
@@ -84,7 +94,7 @@ def etc_setup(filter):
 
     Examples
     --------
-    >>> from miricigale.instrument import etc_setup
+    >>> from miricigale.depth import etc_setup
     >>> setup = etc_setup("miri.f1000w")
     >>> print(f"{setup.radius:.2f}, {setup.n_groups} groups, {setup.time:.0f}")
     0.42 arcsec, 106 groups, 10001 s
@@ -105,6 +115,80 @@ def etc_setup(filter):
     )
 
 
+def etc_limit(filter, version="4.0"):
+    """
+    Point-source limit of the exposure time calculator: 10 sigma in 10 ks.
+
+    Parameters
+    ----------
+    filter : str
+        One of `~miricigale.instrument.imager_filters`.
+    version : str, optional
+        ``"4.0"`` or ``"2.0"``.
+
+    Returns
+    -------
+    limit : `~astropy.units.Quantity`
+        In uJy.
+    """
+    versions = {"4.0": "etc_40", "2.0": "etc_20"}
+    if str(version) not in versions:
+        raise unknown_name("version of the exposure time calculator", version, versions)
+    return filter_row(filter)[versions[str(version)]] * u.uJy
+
+
+def scaled_limit(filter, time, *, n_sigma=5.0, version="4.0"):
+    """
+    The calculator's limit scaled to another exposure, as the root of the time.
+
+    Parameters
+    ----------
+    filter : str
+        One of `~miricigale.instrument.imager_filters`.
+    time : `~astropy.units.Quantity`
+        Total exposure time.
+    n_sigma : float, optional
+        Significance.
+    version : str, optional
+        As in `etc_limit`.
+
+    Returns
+    -------
+    limit : `~astropy.units.Quantity`
+        In uJy.
+    """
+    seconds = to_array(time, u.s, "time")
+    if not np.all(seconds > 0):
+        raise argument_error("time", "positive", time)
+    return etc_limit(filter, version) * (n_sigma / 10) * np.sqrt(1e4 / seconds)
+
+
+def proposal_limit(filter):
+    """
+    The 5-sigma limit that the CEERS proposal quotes for its exposures.
+
+    Parameters
+    ----------
+    filter : str
+        One of the six bands of the survey.
+
+    Returns
+    -------
+    limit : `~astropy.units.Magnitude`
+        AB.
+
+    Raises
+    ------
+    KeyError
+        If the survey has no such band.
+    """
+    row = filter_row(filter)
+    if "proposal" not in row:
+        known = [name for name in imager_filters() if "proposal" in filter_row(name)]
+        raise unknown_name("band of the survey", filter, known)
+    return row["proposal"] * u.ABmag
+
+
 def residual_presets():
     """Names of the sets of residuals that `residual_amplitude` knows."""
     return tuple(_table()["residual"])
@@ -117,7 +201,7 @@ def residual_amplitude(filter, preset="etc"):
     Parameters
     ----------
     filter : str
-        One of `imager_filters`.
+        One of `~miricigale.instrument.imager_filters`.
     preset : str, optional
         ``"etc"``: with it, the limits of the exposure time calculator 4.0 come out of its own
         exposures and extraction.
@@ -137,7 +221,7 @@ def residual_amplitude(filter, preset="etc"):
 
     Examples
     --------
-    >>> from miricigale.instrument import residual_amplitude
+    >>> from miricigale.depth import residual_amplitude
     >>> 1e-5 < residual_amplitude("miri.f2550w") < residual_amplitude("miri.f560w") < 1e-2
     True
     """

@@ -1,27 +1,21 @@
-"""Sensitivity figures against published ones and against the throughput curves."""
+"""Photometric figures against published ones and against the throughput curves."""
 
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
 from astropy.tests.helper import assert_quantity_allclose
 from numpy.testing import assert_allclose
 
 from miricigale.filters import Filter
 from miricigale.instrument import (
-    CEERS_FILTERS,
-    DetectorProperties,
-    Exposure,
     background_level,
     background_spectrum,
-    etc_limit,
+    electron_rate,
+    electrons_per_brightness,
     imager_filters,
+    miri_detector,
     photmjsr,
-    proposal_limit,
     psf_fwhm,
-    saturation_forecast,
-    saturation_time,
-    scaled_limit,
 )
 
 # low background at the nominal wavelengths 5.6, 7.7, 10, 11.3, 12.8, 15, 18, 21, 25.5 um
@@ -77,29 +71,6 @@ def test_background_beyond_the_curve_is_refused():
         background_level("miri.f770w", zodi="bright")
 
 
-def test_scaled_limits_of_the_survey():
-    # exposure time calculator 4.0 scaled to the survey's exposures, AB at 5 sigma
-    times = [1665] * 5 + [4662]
-    expected = [25.20, 24.50, 23.87, 23.49, 22.72, 22.56]
-    for name, time, magnitude in zip(CEERS_FILTERS, times, expected, strict=True):
-        limit = scaled_limit(name, time * u.s).to_value(u.ABmag)
-        assert_allclose(limit, magnitude, atol=0.012)
-        assert abs(proposal_limit(name).value - limit) < 0.45
-    assert_quantity_allclose(
-        scaled_limit("miri.f770w", 1e4 * u.s, n_sigma=10), etc_limit("miri.f770w")
-    )
-
-
-def test_versions_of_the_calculator():
-    for name in imager_filters():
-        assert_quantity_allclose(etc_limit(name, "2.0"), etc_limit(name), rtol=0.25)
-    assert_quantity_allclose(etc_limit("miri.f2100w", "2.0"), 3.99 * u.uJy)
-    with pytest.raises(KeyError, match=r"version of the exposure time calculator '3.0'"):
-        etc_limit("miri.f770w", "3.0")
-    with pytest.raises(KeyError, match=r"no band of the survey 'miri.f560w'"):
-        proposal_limit("miri.f560w")
-
-
 def test_widths_grow_as_the_diffraction_limit():
     for name in imager_filters():
         diffraction = (Filter.from_name(name).pivot / (6.5 * u.m)).to(
@@ -109,18 +80,10 @@ def test_widths_grow_as_the_diffraction_limit():
         assert 0.95 < psf_fwhm(name) / diffraction < 1.2
 
 
-def test_sky_fills_the_wells_in_the_known_times():
-    for name, time in (("miri.f2100w", 107), ("miri.f1800w", 347), ("miri.f1500w", 693)):
-        assert_quantity_allclose(saturation_time(name), time * u.s, rtol=0.07)
-
-
-def test_forecast_counts_photons():
-    # without dark: level / photmjsr DN/s times gain, over the well
-    detector = DetectorProperties(gain=4.0, dark_current=0.0, full_well=1e5)
-    exposure = Exposure(
-        "miri.f770w", n_groups=100, pointing=SkyCoord(1, 2, unit="deg"), roll=0 * u.deg
-    )
-    forecast = saturation_forecast(exposure, background=10 * u.MJy / u.sr, detector=detector)
-    assert_allclose(forecast, 10 / (0.272 / 3.1) * 277.5 / 1e5)
-    image = np.full((3, 4), 10.0) * u.MJy / u.sr
-    assert saturation_forecast(exposure, background=image, detector=detector).shape == (3, 4)
+def test_charge_of_the_sky_is_light_times_conversion_and_dark():
+    # DN/s by the conversion, times the gain; the conversion is in proportion to it
+    detector = miri_detector().replace(gain=2.0, dark_current=0.5)
+    assert_allclose(electrons_per_brightness("miri.f770w", detector), 3.1 / 0.272)
+    assert_allclose(electrons_per_brightness("miri.f770w"), 3.1 / 0.272)
+    rate = electron_rate("miri.f770w", 10 * u.MJy / u.sr, detector=detector)
+    assert_allclose(rate, 10 * 3.1 / 0.272 + 0.5)

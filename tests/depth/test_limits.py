@@ -10,6 +10,9 @@ from numpy.testing import assert_allclose
 from photutils.aperture import ApertureStats, CircularAnnulus, CircularAperture
 from scipy.ndimage import gaussian_filter
 
+from miricigale.depth import etc_limit, etc_setup, sensitivity, sensitivity_table
+from miricigale.depth.limits import extraction_weights
+from miricigale.depth.noise import noise_power, ramp_variance
 from miricigale.detector import (
     BadPixels,
     CosmicRays,
@@ -20,14 +23,10 @@ from miricigale.instrument import (
     DetectorProperties,
     Exposure,
     background_level,
-    etc_limit,
-    etc_setup,
     imager_filters,
     photmjsr,
     pixel_area_map,
 )
-from miricigale.photometry import sensitivity, sensitivity_table
-from miricigale.photometry.limits import extraction_weights, noise_power, ramp_variance
 from miricigale.psf import MIRI_PIXEL_SCALE, encircled_energy, gaussian_psf, miri_psf
 from miricigale.reduction import Reducer
 

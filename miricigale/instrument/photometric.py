@@ -1,4 +1,4 @@
-"""Photometric conversion, backgrounds and published limits of the imaging filters."""
+"""Photometric conversion, backgrounds and image quality of the imaging filters."""
 
 import functools
 
@@ -7,7 +7,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.instrument.detector import miri_detector
-from miricigale.instrument.figures import filter_row, imager_filters, table
+from miricigale.instrument.figures import filter_row, table
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.units import SURFACE_BRIGHTNESS, WAVE, to_array
@@ -15,13 +15,10 @@ from miricigale.utils.units import SURFACE_BRIGHTNESS, WAVE, to_array
 __all__ = [
     "background_level",
     "background_spectrum",
-    "etc_limit",
+    "electron_rate",
+    "electrons_per_brightness",
     "photmjsr",
-    "proposal_limit",
     "psf_fwhm",
-    "saturation_forecast",
-    "saturation_time",
-    "scaled_limit",
 ]
 
 #: Factor on the low zodiacal light for each name that ``zodi`` may have.
@@ -134,80 +131,6 @@ def background_spectrum(wave, *, zodi="low"):
     return level
 
 
-def etc_limit(filter, version="4.0"):
-    """
-    Point-source limit of the exposure time calculator: 10 sigma in 10 ks.
-
-    Parameters
-    ----------
-    filter : str
-        One of `imager_filters`.
-    version : str, optional
-        ``"4.0"`` or ``"2.0"``.
-
-    Returns
-    -------
-    limit : `~astropy.units.Quantity`
-        In uJy.
-    """
-    versions = {"4.0": "etc_40", "2.0": "etc_20"}
-    if str(version) not in versions:
-        raise unknown_name("version of the exposure time calculator", version, versions)
-    return filter_row(filter)[versions[str(version)]] * u.uJy
-
-
-def scaled_limit(filter, time, *, n_sigma=5.0, version="4.0"):
-    """
-    The calculator's limit scaled to another exposure, as the root of the time.
-
-    Parameters
-    ----------
-    filter : str
-        One of `imager_filters`.
-    time : `~astropy.units.Quantity`
-        Total exposure time.
-    n_sigma : float, optional
-        Significance.
-    version : str, optional
-        As in `etc_limit`.
-
-    Returns
-    -------
-    limit : `~astropy.units.Quantity`
-        In uJy.
-    """
-    seconds = to_array(time, u.s, "time")
-    if not np.all(seconds > 0):
-        raise argument_error("time", "positive", time)
-    return etc_limit(filter, version) * (n_sigma / 10) * np.sqrt(1e4 / seconds)
-
-
-def proposal_limit(filter):
-    """
-    The 5-sigma limit that the CEERS proposal quotes for its exposures.
-
-    Parameters
-    ----------
-    filter : str
-        One of the six bands of the survey.
-
-    Returns
-    -------
-    limit : `~astropy.units.Magnitude`
-        AB.
-
-    Raises
-    ------
-    KeyError
-        If the survey has no such band.
-    """
-    row = filter_row(filter)
-    if "proposal" not in row:
-        known = [name for name in imager_filters() if "proposal" in filter_row(name)]
-        raise unknown_name("band of the survey", filter, known)
-    return row["proposal"] * u.ABmag
-
-
 def psf_fwhm(filter):
     """
     Full width at half maximum of the point-spread function in flight.
@@ -225,47 +148,44 @@ def psf_fwhm(filter):
     return filter_row(filter)["fwhm"] * u.arcsec
 
 
-def _electron_rate(filter, background, detector):
-    level = background_level(filter) if background is None else background
-    level = to_array(level, SURFACE_BRIGHTNESS, "background")
-    return level / photmjsr(filter, gain=detector.gain) * detector.gain + detector.dark_current
-
-
-def saturation_forecast(exposure, *, background=None, detector=None):
+def electrons_per_brightness(filter, detector=None):
     """
-    How full the sky and the dark current make the wells by the end of an integration.
+    Electrons per second and pixel of 1 MJy/sr, where the flat field is 1.
 
     Parameters
     ----------
-    exposure : `~miricigale.instrument.Exposure`
-        What is exposed.
-    background : `~astropy.units.Quantity`, optional
-        Surface brightness; the low background of the filter if not given. An array (an
-        image of sources and sky, say) gives an array.
+    filter : str
+        One of `imager_filters`.
     detector : `DetectorProperties`, optional
         `miri_detector` if not given.
 
     Returns
     -------
-    fraction : float or `~numpy.ndarray`
-        Of the full well; above 0.6 little room is left for sources.
+    electrons : float
     """
-    detector = miri_detector() if detector is None else detector
-    rate = _electron_rate(exposure.filter, background, detector)
-    fraction = rate * exposure.integration_time.to_value(u.s) / detector.full_well
-    return float(fraction) if np.ndim(fraction) == 0 else fraction
+    gain = (miri_detector() if detector is None else detector).gain
+    return gain / photmjsr(filter, gain=gain)
 
 
-def saturation_time(filter, *, background=None, detector=None):
+def electron_rate(filter, background=None, *, detector=None):
     """
-    Time in which the sky and the dark current fill the well.
+    Charge that a pixel of the sky collects.
 
-    Parameters are those of `saturation_forecast`, with the filter for the exposure.
+    Parameters
+    ----------
+    filter : str
+        One of `imager_filters`.
+    background : `~astropy.units.Quantity`, optional
+        Surface brightness; the low background of the filter if not given.
+    detector : `DetectorProperties`, optional
+        `miri_detector` if not given.
 
     Returns
     -------
-    time : `~astropy.units.Quantity`
-        In s.
+    rate : float or `~numpy.ndarray`
+        Electrons per second, dark current included.
     """
     detector = miri_detector() if detector is None else detector
-    return detector.full_well / _electron_rate(filter, background, detector) * u.s
+    level = background_level(filter) if background is None else background
+    level = to_array(level, SURFACE_BRIGHTNESS, "background")
+    return level * electrons_per_brightness(filter, detector) + detector.dark_current

@@ -1,0 +1,184 @@
+"""Noise of a pixel's rate: photons, dark current and read noise of optimally fitted ramps."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+from scipy.linalg import solveh_banded
+from scipy.ndimage import gaussian_filter1d
+
+from miricigale.depth.published import residual_amplitude
+from miricigale.instrument import (
+    DetectorProperties,
+    background_level,
+    electron_rate,
+    electrons_per_brightness,
+    miri_detector,
+)
+from miricigale.psf import MIRI_PIXEL_SCALE
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
+
+__all__ = ["ExposureNoise", "noise_power", "pattern_amplitude", "ramp_variance"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExposureNoise:
+    """
+    Noise of one pixel of an exposure, and how it grows with a source.
+
+    Parameters
+    ----------
+    filter : str
+        One of `~miricigale.instrument.imager_filters`.
+    background : `~astropy.units.Quantity` or None
+        Surface brightness of sky and telescope; the low background if None.
+    n_groups : int
+        Groups of an integration.
+    group_time : float
+        In s.
+    n_ramps : float
+        Integrations of all exposures together.
+    detector : `~miricigale.instrument.DetectorProperties` or None
+        `~miricigale.instrument.miri_detector` if None.
+
+    Raises
+    ------
+    ValueError
+        If the background is negative or the detector is none.
+    """
+
+    filter: str
+    background: u.Quantity | None
+    n_groups: int
+    group_time: float
+    n_ramps: float
+    detector: DetectorProperties | None = None
+
+    def __post_init__(self):
+        detector = miri_detector() if self.detector is None else self.detector
+        if not isinstance(detector, DetectorProperties):
+            raise argument_error("detector", "a DetectorProperties", repr(detector))
+        level = background_level(self.filter) if self.background is None else self.background
+        value = float(to_array(level, SURFACE_BRIGHTNESS, "background", ndim=0, finite=True))
+        if value < 0:
+            raise argument_error("background", "at least 0", self.background)
+        object.__setattr__(self, "detector", detector)
+        object.__setattr__(self, "background", value * SURFACE_BRIGHTNESS)
+
+    @property
+    def rate(self):
+        """Electrons per second of sky and dark current."""
+        return float(electron_rate(self.filter, self.background, detector=self.detector))
+
+    @property
+    def sky(self):
+        """Electrons per second of the sky alone."""
+        return self.background.value * electrons_per_brightness(self.filter, self.detector)
+
+    @property
+    def electrons(self):
+        """Electrons per second of 1 uJy in a pixel."""
+        area = MIRI_PIXEL_SCALE.to_value(u.rad) ** 2 * 1e12
+        return electrons_per_brightness(self.filter, self.detector) / area
+
+    def variance(self, more=0.0):
+        """
+        Variance of the mean slope.
+
+        Parameters
+        ----------
+        more : float, optional
+            Electrons per second beyond sky and dark current.
+
+        Returns
+        -------
+        variance : float
+            (Electrons per second) squared.
+        """
+        variance = ramp_variance(
+            self.rate + more,
+            n_groups=self.n_groups,
+            group_time=self.group_time,
+            read_noise=self.detector.read_noise * self.detector.gain,
+        )
+        return variance / self.n_ramps
+
+    @property
+    def growth(self):
+        """By how much the variance grows with the rate of a faint source, electrons per second."""
+        step = 0.01 * self.rate + 1e-3
+        return (self.variance(step) - self.variance()) / step
+
+
+def ramp_variance(rate, *, n_groups, group_time, read_noise):
+    """
+    Variance of the optimally weighted slope of one ramp.
+
+    The differences of groups have Poisson variance on the diagonal and share the read
+    noise with their neighbors; the best slope has the variance 1 / (1^T C^-1 1).
+
+    Parameters
+    ----------
+    rate : float
+        Electrons per second.
+    n_groups : int
+        Groups, at least 2.
+    group_time : float
+        In s.
+    read_noise : float
+        Of one group, electrons.
+
+    Returns
+    -------
+    variance : float
+        (Electrons per second) squared.
+    """
+    if rate == 0 and read_noise == 0:
+        return 0.0
+    n = n_groups - 1
+    band = np.zeros((2, n))
+    band[0] = -(read_noise**2)  # above the diagonal; the first is not used
+    band[1] = rate * group_time + 2 * read_noise**2
+    return 1.0 / (np.sum(solveh_banded(band, np.ones(n))) * group_time**2)
+
+
+def noise_power(weights, correlation=None):
+    """
+    Variance of a weighted sum of pixels of unit variance.
+
+    Parameters
+    ----------
+    weights : `~numpy.ndarray`, shape (ny, nx)
+        Weights.
+    correlation : float or None, optional
+        Gaussian width in pixels with which white noise was smoothed (and brought back to
+        unit variance); None or 0 for white noise.
+
+    Returns
+    -------
+    power : float
+        Sum of w_i w_j rho_ij.
+    """
+    if not correlation:
+        return float(np.sum(weights**2))
+    reach = int(np.ceil(4 * correlation))
+    smooth = np.pad(weights, reach)
+    delta = np.zeros(2 * reach + 1)
+    delta[reach] = 1.0
+    shape = gaussian_filter1d(delta, correlation, truncate=4.0)
+    for axis in (0, 1):
+        smooth = gaussian_filter1d(smooth, correlation, axis=axis, truncate=4.0, mode="constant")
+    return float(np.sum(smooth**2) / np.sum(shape**2) ** 2)
+
+
+def pattern_amplitude(residual, filter):
+    """Fraction of the light that stays as a pattern: none, a number, or by its name."""
+    if residual is None or residual is False:
+        return 0.0
+    if isinstance(residual, str):
+        return residual_amplitude(filter, residual)
+    value = float(to_array(residual, u.dimensionless_unscaled, "residual", ndim=0))
+    if residual is True or not 0 <= value < 0.2:
+        raise argument_error("residual", "None, a name or a fraction from 0 to 0.2", residual)
+    return value
