@@ -64,7 +64,7 @@ def main():
             f"F{number}W".ljust(8),
             f"{seconds:6.2f} {fwhm(psf).value:6.3f} {gauss:6.3f} {flight:6.3f}",
             f"{gauss / flight:6.3f} {radius_of_encircled_energy(psf, 0.8).value:5.2f} ",
-            " ".join(f"{e:.3f}" for e in (*energies, psf.meta["enclosed"])),
+            " ".join(f"{e:.3f}" for e in (*energies, psf.enclosed)),
         )
     library._miri_data.cache_clear()
     library._miri_optics.cache_clear()

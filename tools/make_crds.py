@@ -43,7 +43,7 @@ from miricigale.instrument import (
     reference_pixel_mask,
     subarrays,
 )
-from miricigale.psf import encircled_energy, miri_psf, psf_info, radius_of_encircled_energy
+from miricigale.psf import encircled_energy, miri_psf, radius_of_encircled_energy
 
 CONTEXT = "jwst_9999.pmap"
 USEAFTER = "2000-01-01 00:00:00"
@@ -390,7 +390,7 @@ def add_catalog_references(cache, filters):
     rows = []
     for name in filters:
         psf = miri_psf(name)
-        pixel = psf_info(psf).pixel_scale * u.arcsec
+        pixel = psf.pixel_scale
         sky = (radius_of_encircled_energy(psf, 0.8) / pixel).value * np.array([2.0, 3.0])
         # the sky is taken where the wings still have light
         wings = np.diff(encircled_energy(psf, sky * pixel)) / np.diff(np.pi * sky**2)

@@ -8,7 +8,7 @@ from photutils.aperture import CircularAnnulus, CircularAperture
 from miricigale.depth.noise import ExposureNoise, noise_power, pattern_amplitude
 from miricigale.depth.published import etc_setup, scaled_limit
 from miricigale.instrument import frame_time, imager_filters
-from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image, psf_info
+from miricigale.psf import MIRI_PIXEL_SCALE, instrument_psf, miri_psf, psf_image
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, TIME, to_array
@@ -64,13 +64,13 @@ def _radii(aperture, annulus, setup):
 
 def _extraction(radius, annulus, psf, correlation, filter):
     """Light in the extraction and noise powers, means over positions within the pixel."""
-    info = psf_info(psf)
-    have = psf.meta.get("filter")
+    psf = instrument_psf(psf)
+    have = psf.filter
     # other packages write F770W where we write miri.f770w
     if isinstance(have, str) and have.lower().rpartition(".")[2] != filter.rpartition(".")[2]:
         raise argument_error("psf", f"one of the filter {filter}", f"one of {have}")
-    if "pixel" not in info.includes:
-        raise argument_error("psf", "a PSF that includes the pixel", f"one with {info.includes}")
+    if "pixel" not in psf.includes:
+        raise argument_error("psf", "a PSF that includes the pixel", f"one with {psf.includes}")
     scale = MIRI_PIXEL_SCALE.value
     edges = None if annulus is None else tuple(edge / scale for edge in annulus)
     values = []

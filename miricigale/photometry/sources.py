@@ -528,9 +528,9 @@ def _segments(segmentation, shape):
 def _psf_array(psf, scale):
     """A PSF on the pixels of the image, of unit sum."""
     if isinstance(psf, ImagePSF):
-        from miricigale.psf import psf_image, psf_info
+        from miricigale.psf import instrument_psf, psf_image
 
-        n = 2 * int(psf_info(psf, "psf").half_width / scale - 0.5 + 1e-6) + 1
+        n = 2 * int(instrument_psf(psf).half_width / scale - 0.5 + 1e-6) + 1
         psf = psf_image(psf, pixel_scale=scale * ANGLE, shape=n)
     psf = np.asarray(psf, float)
     if psf.ndim != 2 or psf.shape[0] != psf.shape[1] or psf.shape[0] % 2 == 0:

@@ -1,7 +1,7 @@
 """
 Point spread functions as photutils models, and the kernels between them.
 
-Every PSF says in its ``meta`` what it includes, its pixel scale, its frame and angle.
+Every PSF says what it includes, its pixel scale, its frame and angle.
 """
 
 from miricigale.utils.lazy import lazy_names
@@ -16,8 +16,10 @@ __getattr__, __dir__, __all__ = lazy_names(
         "field": ("grid_weights", "miri_psf_grid", "psf_at", "psf_grid"),
         "kernel_field": ("KernelField",),
         "kernels": ("REGULARIZATIONS", "MatchingKernel"),
-        "library": ("MIRI_PIXEL_SCALE", "hst_psf", "miri_psf"),
-        "model": ("PSFInfo", "from_photutils", "make_psf", "psf_info", "read_psf"),
+        "files": ("read_psf",),
+        "hst": ("hst_psf",),
+        "miri": ("MIRI_PIXEL_SCALE", "miri_psf"),
+        "model": ("InstrumentPSF", "PSFGrid", "from_photutils", "instrument_psf", "make_psf"),
         "nircam": ("nircam_psf",),
         "optics": ("Pupil", "hst_pupil", "jwst_pupil"),
         "resample": ("average_psf", "psf_image", "psf_mosaic", "rotate_psf"),

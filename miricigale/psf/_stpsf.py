@@ -6,8 +6,9 @@ import numpy as np
 from astropy.io import fits
 
 from miricigale.psf.effects import EFFECTS
-from miricigale.psf.library import MIRI_PIXEL_SCALE
-from miricigale.psf.model import from_photutils
+from miricigale.psf.field import psf_at
+from miricigale.psf.miri import MIRI_PIXEL_SCALE
+from miricigale.psf.model import InstrumentPSF, PSFGrid
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.optional import require
 from miricigale.utils.units import ANGLE, to_array
@@ -70,8 +71,7 @@ def stpsf_grid(
 
     Returns
     -------
-    grid : `~photutils.psf.GriddedPSFModel`
-        With the entries of the meta that `~miricigale.psf.psf_grid` gives, so that
+    grid : `~miricigale.psf.PSFGrid`
         `~miricigale.psf.psf_at` and `~miricigale.scene.Scene` take it. The pixel is the same all
         over the field.
 
@@ -98,17 +98,20 @@ def stpsf_grid(
         nlambda=int(n_wavelengths),
         verbose=False,
     )
-    scale = float(MIRI_PIXEL_SCALE.value)
-    grid.meta.update(
-        filter=f"miri.{str(filter).removeprefix('miri.').lower()}",
-        pixel_scale=scale,
-        pixel_scales=[scale] * len(grid.data),
-        frame="detector",
-        includes=list(EFFECTS),
-        normalization="total",
-        source="stpsf",
-    )
-    return grid
+    psfs = [
+        InstrumentPSF(
+            np.asarray(data),
+            pixel_scale=MIRI_PIXEL_SCALE,
+            frame="detector",
+            oversampling=int(oversampling),
+            includes=EFFECTS,
+            filter=f"miri.{str(filter).removeprefix('miri.').lower()}",
+            total_known=True,
+            meta={"instrument": "MIRI", "source": "stpsf"},
+        )
+        for data in grid.data
+    ]
+    return PSFGrid(psfs, grid.grid_xypos)
 
 
 def stpsf_psf(filter, *, x=515.0, y=511.0, **options):
@@ -131,13 +134,4 @@ def stpsf_psf(filter, *, x=515.0, y=511.0, **options):
         stpsf keeps the light that the cruciform scatters out of its grid inside of it.
     """
     grid = stpsf_grid(filter, **options)
-    psf = from_photutils(
-        grid,
-        pixel_scale=MIRI_PIXEL_SCALE,
-        frame="detector",
-        includes=EFFECTS,
-        x=x,
-        y=y,
-    )
-    psf.meta.update(filter=str(filter), instrument="MIRI", source="stpsf", normalization="total")
-    return psf
+    return psf_at(grid, x, y)

@@ -6,11 +6,11 @@ import warnings
 
 import astropy.units as u
 import numpy as np
-from photutils.psf import ImagePSF
 
 from miricigale.psf import _core
-from miricigale.psf.library import MIRI_FILTERS, WFC3_FILTERS, hst_psf, miri_psf
-from miricigale.psf.model import psf_info
+from miricigale.psf.hst import WFC3_FILTERS, hst_psf
+from miricigale.psf.miri import MIRI_FILTERS, miri_psf
+from miricigale.psf.model import instrument_psf
 from miricigale.psf.nircam import NIRCAM_FILTERS, nircam_psf
 from miricigale.psf.resample import psf_image, psf_mosaic, rotate_psf
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error, unknown_name
@@ -121,24 +121,24 @@ def checked_psf(
         If the light was scaled by more than 0.01, the PSF is narrower by more than 5 % or
         wider by more than 15 %, or the image seems to be smoothed.
     """
-    info = psf_info(psf, argument)
-    scale = info.pixel_scale * ANGLE if pixel_scale is None else pixel_scale
-    angle = info.angle * u.deg
+    psf = instrument_psf(psf, argument)
+    scale = psf.pixel_scale if pixel_scale is None else pixel_scale
+    angle = psf.angle
     form = {"pixel_scale": scale, "grid_angle": angle, "resampling": resampling}
-    if info.frame == "detector":
+    if psf.frame == "detector":
         model = _detector_model(filter, scale)
     else:
         model = filter_psf(filter, pa=angle if pa is None else pa, **form)
-    x, y, _ = _core.core_moments(info.data)
+    x, y, _ = _core.core_moments(psf.data)
     if not np.isfinite(x + y):
         # too few pixels in the core
-        x, y = info.origin
-    ny, nx = info.data.shape
-    place = {"pixel_scale": info.cell * ANGLE, "shape": (ny, nx)}
+        x, y = psf.origin
+    ny, nx = psf.data.shape
+    place = {"pixel_scale": psf.cell * ANGLE, "shape": (ny, nx)}
     place["offset"] = (x - (nx - 1) / 2, y - (ny - 1) / 2)
     stamp = psf_image(model, **place)
     # both as these cells show them, which may be coarse
-    width, usual = (_core.half_maximum_width(data, x, y) * info.cell for data in (info.data, stamp))
+    width, usual = (_core.half_maximum_width(data, x, y) * psf.cell for data in (psf.data, stamp))
     ratio = width / usual
     if smoothed and ratio > _OTHER_WIDTH:
         msg = (
@@ -149,12 +149,12 @@ def checked_psf(
         return psf
     if not 1 / _OTHER_WIDTH < ratio < _OTHER_WIDTH:
         wanted = f"a PSF of {filter}, about {usual:.3g} arcsec wide (FWHM)"
-        got = f"one of {width:.3g} arcsec with pixels of {info.cell:.4g} arcsec: is that its pixel?"
+        got = f"one of {width:.3g} arcsec with pixels of {psf.cell:.4g} arcsec: is that its pixel?"
         raise argument_error(argument, wanted, got)
-    if pa is not None and info.frame == "sky" and filter not in WFC3_FILTERS:
+    if pa is not None and psf.frame == "sky" and filter not in WFC3_FILTERS:
         other = filter_psf(filter, pa=angle, **form)
         other = psf_image(other, **place)
-        _check_turn(info, (x, y), (stamp, other), (width, filter, pa), argument)
+        _check_turn(psf, (x, y), (stamp, other), (width, filter, pa), argument)
     if not 1 - _NARROWER < ratio < 1 + _WIDER:
         word = "wider" if ratio > 1 else "narrower"
         msg = (
@@ -162,7 +162,7 @@ def checked_psf(
             f"{filter}: does it hold the pixel, the drizzling and no more?"
         )
         warnings.warn(msg, MiricigaleWarning, stacklevel=2)
-    return _scaled(psf, info, float(stamp.sum()), filter, argument)
+    return _scaled(psf, float(stamp.sum()), filter, argument)
 
 
 def _detector_model(filter_, scale):
@@ -171,14 +171,14 @@ def _detector_model(filter_, scale):
     return _exposure(filter_)
 
 
-def _check_turn(info, center, stamps, about, argument):
+def _check_turn(psf, center, stamps, about, argument):
     """Refuse a PSF whose spikes stand where those of the detector's axes are."""
     width, filter_, pa = about
-    y, x = np.indices(info.data.shape)
+    y, x = np.indices(psf.data.shape)
     radius = np.hypot(x - center[0], y - center[1])
     ring = np.rint(radius).astype(int)
     # spikes are beyond the core, and in distant wings lost in the noise
-    where = (radius * info.cell > width) & (radius * info.cell < min(3.0, 0.95 * info.half_width))
+    where = (radius * psf.cell > width) & (radius * psf.cell < min(3.0, 0.95 * psf.half_width))
     if np.count_nonzero(where) < 100:
         return
 
@@ -188,8 +188,8 @@ def _check_turn(info, center, stamps, about, argument):
         # wings fall steeply: each ring has the same weight
         return (image[where] - mean[ring[where]]) * radius[where]
 
-    given, turned, plain = (spikes(one) for one in (info.data, *stamps))
-    given = given * (stamps[0].sum() / info.data.sum())
+    given, turned, plain = (spikes(one) for one in (psf.data, *stamps))
+    given = given * (stamps[0].sum() / psf.data.sum())
     on_sky, on_detector = (float(given @ one) / float(one @ one) for one in (turned, plain))
     noise = np.std(given - on_detector * plain) / math.sqrt(plain @ plain)
     _log.info(
@@ -206,13 +206,13 @@ def _check_turn(info, center, stamps, about, argument):
         raise argument_error(argument, wanted, got)
 
 
-def _scaled(psf, info, expected, filter_, argument):
+def _scaled(psf, expected, filter_, argument):
     """The PSF with the fraction of the light that it holds: its own or the model's."""
-    if info.total_known:
+    if psf.total_known:
         return psf
-    held = info.enclosed
+    held = psf.enclosed
     taken = held if held < _UNIT_SUM and abs(held - expected) < _NEAR_SUM else expected
-    width = 2 * info.half_width
+    width = 2 * psf.half_width
     msg = (
         f"'{argument}' sums to {held:.4g} and is taken to hold {taken:.3f} of the light on its "
         f"{width:.3g} arcsec, as the model of {filter_} does ({expected:.3f})"
@@ -221,10 +221,4 @@ def _scaled(psf, info, expected, filter_, argument):
         warnings.warn(msg, MiricigaleWarning, stacklevel=3)
     else:
         _log.info(msg)
-    scaled = ImagePSF(
-        info.data * (taken / held), oversampling=info.oversampling, origin=info.origin
-    )
-    scaled.meta.update(psf.meta)
-    scaled.meta.update(normalization="total", enclosed=taken)
-    scaled.meta["eef"] = [value * taken / held for value in psf.meta.get("eef", ())]
-    return scaled
+    return psf.replaced(psf.data * (taken / held), total_known=True)

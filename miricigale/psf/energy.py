@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from miricigale.instrument import imager_filters, psf_fwhm
 from miricigale.psf import _core
 from miricigale.psf.effects import detector_response
-from miricigale.psf.model import psf_info
+from miricigale.psf.model import instrument_psf
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, to_array
 
@@ -41,20 +41,20 @@ def encircled_energy(psf, radius, *, pixel_scale=None):
     ValueError
         If a radius is negative or its circle leaves the grid.
     """
-    info = psf_info(psf)
-    data = info.data
+    psf = instrument_psf(psf)
+    data = psf.data
     if pixel_scale is not None:
         scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
         # sums over cells take them as constant too
-        width = math.sqrt(max(scale**2 - info.cell**2, 0.0)) / info.pixel_scale
-        form = {"oversampling": info.oversampling, "pixel": False}
+        width = math.sqrt(max(scale**2 - psf.cell**2, 0.0)) / psf.pixel_scale.value
+        form = {"oversampling": psf.n_cells, "pixel": False}
         data = detector_response(data, **form, boxes=(width,))
     radii = to_array(radius, ANGLE, "radius", finite=True)
-    if np.any(radii < 0) or np.any(radii > info.half_width):
-        wanted = f"between 0 and the half width of the PSF, {info.half_width:.4g} arcsec"
+    if np.any(radii < 0) or np.any(radii > psf.half_width):
+        wanted = f"between 0 and the half width of the PSF, {psf.half_width:.4g} arcsec"
         raise argument_error("radius", wanted, radius)
-    flat = np.ascontiguousarray(radii.ravel() / info.cell)
-    sums = _core.radial_sums(data, *info.origin, flat) / info.oversampling**2
+    flat = np.ascontiguousarray(radii.ravel() / psf.cell)
+    sums = _core.radial_sums(data, *psf.origin, flat) / psf.n_cells**2
     return float(sums[0]) if radii.ndim == 0 else sums.reshape(radii.shape)
 
 
@@ -81,11 +81,11 @@ def radius_of_encircled_energy(psf, fraction, *, relative_to="total"):
     ValueError
         If the grid does not hold the fraction.
     """
-    info = psf_info(psf)
+    psf = instrument_psf(psf)
     if relative_to not in ("total", "grid"):
         raise argument_error("relative_to", "'total' or 'grid'", repr(relative_to))
-    cells = np.arange(0.0, info.half_width / info.cell, 0.25)
-    sums = _core.radial_sums(info.data, *info.origin, cells) / info.oversampling**2
+    cells = np.arange(0.0, psf.half_width / psf.cell, 0.25)
+    sums = _core.radial_sums(psf.data, *psf.origin, cells) / psf.n_cells**2
     level = fraction * (sums[-1] if relative_to == "grid" else 1.0)
     if not 0 < fraction <= 1 or level > sums[-1]:
         wanted = f"positive and at most the {sums[-1]:.4f} that the PSF's grid holds"
@@ -94,7 +94,7 @@ def radius_of_encircled_energy(psf, fraction, *, relative_to="total"):
     if k == 0:
         return 0.0 * ANGLE
     part = (level - sums[k - 1]) / (sums[k] - sums[k - 1])
-    return (cells[k - 1] + part * 0.25) * info.cell * ANGLE
+    return (cells[k - 1] + part * 0.25) * psf.cell * ANGLE
 
 
 def fwhm(psf, *, method="half_maximum"):
@@ -106,7 +106,7 @@ def fwhm(psf, *, method="half_maximum"):
     psf : `~photutils.psf.ImagePSF`
         A PSF with the meta of `~miricigale.psf.make_psf`.
     method : {"half_maximum", "gaussian"}, optional
-        Where the azimuthal mean falls to a half (what the meta holds), or that of a round
+        Where the azimuthal mean falls to a half (the attribute ``fwhm``), or that of a round
         Gaussian fitted out to 0.75 FWHM, the usual way to measure stars. The core of a
         diffraction pattern falls more steeply than a Gaussian: the fit is 1-3 % narrower.
 
@@ -120,13 +120,13 @@ def fwhm(psf, *, method="half_maximum"):
     ValueError
         If the method is unknown.
     """
-    info = psf_info(psf)
-    width = _core.half_maximum_width(info.data, *info.origin)
+    psf = instrument_psf(psf)
+    if method == "half_maximum":
+        return psf.fwhm
     if method == "gaussian":
-        width = _gaussian_width(info.data, *info.origin, width)
-    elif method != "half_maximum":
-        raise argument_error("method", "'half_maximum' or 'gaussian'", repr(method))
-    return width * info.cell * ANGLE
+        start = psf.fwhm.value / psf.cell
+        return _gaussian_width(psf.data, *psf.origin, start) * psf.cell * ANGLE
+    raise argument_error("method", "'half_maximum' or 'gaussian'", repr(method))
 
 
 def _gaussian_width(data, x, y, start):
@@ -166,19 +166,18 @@ def psf_table(psfs, *, radii=(0.5, 1.0, 1.5, 2.5, 5.0) * u.arcsec):
         ``fwhm_gaussian``, ``fwhm_flight`` (NaN but for MIRI's filters), ``r80`` (NaN if the
         grid holds less), ``enclosed`` and ``eef_<radius>``, with units and descriptions.
     """
-    psfs = list(psfs)
-    infos = [psf_info(psf, f"psfs[{i}]") for i, psf in enumerate(psfs)]
+    psfs = [instrument_psf(psf, f"psfs[{i}]") for i, psf in enumerate(psfs)]
     table = QTable()
-    table["filter"] = [str(psf.meta.get("filter", "")) for psf in psfs]
-    table["frame"] = [info.frame for info in infos]
-    table["angle"] = [info.angle if info.frame == "sky" else np.nan for info in infos] * u.deg
-    table["includes"] = [" ".join(info.includes) for info in infos]
+    table["filter"] = [psf.filter or "" for psf in psfs]
+    table["frame"] = [psf.frame for psf in psfs]
+    table["angle"] = [psf.angle.value if psf.frame == "sky" else np.nan for psf in psfs] * u.deg
+    table["includes"] = [" ".join(psf.includes) for psf in psfs]
     table["fwhm"] = u.Quantity([fwhm(psf) for psf in psfs])
     table["fwhm_gaussian"] = u.Quantity([fwhm(psf, method="gaussian") for psf in psfs])
     flight = [psf_fwhm(n).value if n in imager_filters() else np.nan for n in table["filter"]]
     table["fwhm_flight"] = flight * ANGLE
     table["r80"] = [_r80(psf) for psf in psfs] * ANGLE
-    table["enclosed"] = [info.enclosed for info in infos]
+    table["enclosed"] = [psf.enclosed for psf in psfs]
     for radius in radii:
         name = f"eef_{radius.to_value(ANGLE):g}"
         table[name] = [encircled_energy(psf, radius) for psf in psfs]

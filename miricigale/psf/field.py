@@ -1,43 +1,33 @@
 """PSFs over the field, as photutils' gridded models."""
 
-import astropy.units as u
 import numpy as np
-from astropy.nddata import NDData
 from photutils.psf import GriddedPSFModel
 
 from miricigale.instrument import aperture, imager_columns
-from miricigale.psf.library import miri_psf
-from miricigale.psf.model import make_psf, psf_info
+from miricigale.psf.miri import miri_psf
+from miricigale.psf.model import SHARED, InstrumentPSF, PSFGrid
+from miricigale.psf.resample import alike
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import ANGLE
 
 __all__ = ["grid_weights", "miri_psf_grid", "psf_at", "psf_grid"]
-
-# entries of the meta that belong to one PSF, or that photutils adds
-_OWN = ("fwhm", "enclosed", "eef_radius", "eef", "position", "pixel_scale", "oversampling")
-_OWN += ("grid_xypos", "grid_shape", "pixel_scales")
 
 
 def psf_grid(psfs, positions):
     """
-    Put PSFs of different places in one `~photutils.psf.GriddedPSFModel`.
+    Put PSFs of different places in one gridded model.
 
     Parameters
     ----------
     psfs : sequence of `~photutils.psf.ImagePSF`
-        PSFs with the meta of `~miricigale.psf.make_psf`, centred on their middle cell,
-        alike in shape, oversampling, frame, angle and effects.
+        Centred on their middle cell, alike in shape, oversampling, frame, angle and effects.
     positions : array_like, shape (n, 2)
         Where on the image they hold, 0-based pixels x, y; all points of a rectangular grid
         of at least 2 x 2.
 
     Returns
     -------
-    grid : `~photutils.psf.GriddedPSFModel`
-        Bilinear between the positions, constant beyond them. Its meta is that of the first
-        PSF with ``pixel_scale`` (arcsec) the mean and ``pixel_scales`` that of each PSF in
-        the grid's order, and without what differs from place to place (``fwhm``,
-        ``enclosed``, ``eef``): `psf_at` gives a PSF with its own.
+    grid : `PSFGrid`
+        Bilinear between the positions, constant beyond them.
 
     Raises
     ------
@@ -54,30 +44,12 @@ def psf_grid(psfs, positions):
         raise argument_error("positions", "all points of a rectangular grid", positions.tolist())
     if len(points) != len(psfs):
         raise argument_error("positions", "different places", positions.tolist())
-    infos = [psf_info(psf, f"psfs[{i}]") for i, psf in enumerate(psfs)]
-    first = infos[0]
-    middle = ((first.data.shape[1] - 1) / 2, (first.data.shape[0] - 1) / 2)
-    for i, info in enumerate(infos):
-        for name in ("oversampling", "frame", "angle", "includes"):
-            mine, theirs = getattr(info, name), getattr(first, name)
-            if mine != theirs:
-                raise argument_error("psfs", f"alike in {name}", f"{theirs} and {mine} (psfs[{i}])")
-        if info.data.shape != first.data.shape:
-            shapes = f"{first.data.shape} and {info.data.shape} (psfs[{i}])"
-            raise argument_error("psfs", "alike in shape", shapes)
-        if not np.allclose(info.origin, middle):
-            raise argument_error("psfs", "centred on the middle", f"{info.origin} (psfs[{i}])")
-    # photutils' own order: by y, then by x
-    order = np.lexsort(positions.T)
-    scales = [infos[i].pixel_scale for i in order]
-    meta = {key: value for key, value in first.meta.items() if key not in _OWN}
-    meta.update(
-        grid_xypos=[tuple(float(v) for v in positions[i]) for i in order],
-        oversampling=first.oversampling,
-        pixel_scale=float(np.mean(scales)),
-        pixel_scales=scales,
-    )
-    return GriddedPSFModel(NDData(np.stack([infos[i].data for i in order]), meta=meta))
+    psfs = alike(psfs, ("oversampling", "frame", "angle", "includes"))
+    for i, psf in enumerate(psfs):
+        ny, nx = psf.data.shape
+        if not np.allclose(psf.origin, ((nx - 1) / 2, (ny - 1) / 2)):
+            raise argument_error("psfs", "centred on the middle", f"{psf.origin} (psfs[{i}])")
+    return PSFGrid(psfs, positions)
 
 
 def miri_psf_grid(filter, *, n_psfs=9, subarray="FULL", positions=None, **options):
@@ -106,8 +78,8 @@ def miri_psf_grid(filter, *, n_psfs=9, subarray="FULL", positions=None, **option
 
     Returns
     -------
-    grid : `~photutils.psf.GriddedPSFModel`
-        As made by `psf_grid`; `~miricigale.scene.Scene` takes it for its PSF.
+    grid : `PSFGrid`
+        `~miricigale.scene.Scene` takes it for its PSF.
 
     Raises
     ------
@@ -172,7 +144,7 @@ def psf_at(grid, x, y):
 
     Parameters
     ----------
-    grid : `~photutils.psf.GriddedPSFModel`
+    grid : `PSFGrid`
         As made by `psf_grid`. Other gridded models know neither pixel nor frame: see
         `~miricigale.psf.from_photutils`.
     x, y : float
@@ -180,32 +152,27 @@ def psf_at(grid, x, y):
 
     Returns
     -------
-    psf : `~photutils.psf.ImagePSF`
-        With its own ``fwhm``, ``eef``, ``pixel_scale`` and ``position``.
+    psf : `InstrumentPSF`
+        With its own ``pixel_scale`` and ``position``.
 
     Raises
     ------
-    TypeError
-        If it is no gridded model.
-    ValueError
-        If its meta lacks ``pixel_scales`` or ``frame``.
+    TypeError, ValueError
+        If it is no gridded model, or one of photutils' own.
     """
     if not isinstance(grid, GriddedPSFModel):
         msg = f"'grid' must be a photutils GriddedPSFModel, got {type(grid).__name__}"
         raise TypeError(msg)
-    missing = [key for key in ("pixel_scales", "frame") if key not in grid.meta]
-    if missing:
-        wanted = f"a grid whose meta has {missing} (see miricigale.psf.from_photutils)"
-        raise argument_error("grid", wanted, f"meta with {sorted(grid.meta)}")
+    if not isinstance(grid, PSFGrid):
+        wanted = "a PSFGrid (see miricigale.psf.from_photutils for others)"
+        raise argument_error("grid", wanted, "one whose pixel and frame are not known")
     weights = grid_weights(grid, float(x), float(y))[0]
-    meta = {k: v for k, v in grid.meta.items() if k not in (*_OWN, "frame", "angle", "includes")}
-    return make_psf(
+    own = ("oversampling", "grid_xypos", "grid_shape")
+    return InstrumentPSF(
         np.tensordot(weights, np.asarray(grid.data), axes=1),
-        pixel_scale=float(weights @ np.asarray(grid.meta["pixel_scales"])) * ANGLE,
-        oversampling=int(np.atleast_1d(grid.oversampling)[0]),
-        frame=grid.meta["frame"],
-        angle=grid.meta.get("angle", 0.0) * u.deg,
-        includes=grid.meta.get("includes", ()),
-        position=(float(x), float(y)),
-        **meta,
+        pixel_scale=weights @ grid.pixel_scales,
+        oversampling=int(grid.oversampling[0]),
+        position=(x, y),
+        meta={key: value for key, value in grid.meta.items() if key not in own},
+        **{name: getattr(grid, name) for name in SHARED},
     )

@@ -2,15 +2,17 @@
 
 import dataclasses
 import functools
+from typing import ClassVar
 
 import numpy as np
 from astropy.coordinates import SkyCoord, SkyOffsetFrame
-from photutils.psf import GriddedPSFModel
 from scipy.spatial import Delaunay, KDTree, QhullError
 
 from miricigale.psf.field import psf_at
 from miricigale.psf.kernels import MatchingKernel
+from miricigale.psf.model import PSFGrid
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.unified import unified_read, unified_write
 
 __all__ = ["KernelField"]
 
@@ -57,6 +59,30 @@ class KernelField:
            [0.  , 1.  ]])
     """
 
+    io_module: ClassVar[str] = "miricigale.psf.files"
+    read = unified_read(
+        """
+        Read what `write` wrote.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        """
+    )
+    write = unified_write(
+        """
+        Write the kernels and their places as FITS.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        overwrite : bool, optional
+            Whether a file that is there is replaced.
+        """
+    )
+
     kernels: tuple
     sky: SkyCoord
     method: str = "linear"
@@ -88,7 +114,7 @@ class KernelField:
         ----------
         hi : `~photutils.psf.ImagePSF` or `~numpy.ndarray`
             The sharp PSF.
-        lo : `~photutils.psf.GriddedPSFModel`
+        lo : `~miricigale.psf.PSFGrid`
             The wide PSF on a grid of places, as `psf_grid` and `miri_psf_grid` make it.
         wcs : `~astropy.wcs.WCS`
             Coordinates of the image in whose pixels the places of ``lo`` are.
@@ -109,8 +135,8 @@ class KernelField:
         ValueError
             As `MatchingKernel.from_psfs` and `psf_at`.
         """
-        if not isinstance(lo, GriddedPSFModel):
-            msg = f"'lo' must be a photutils GriddedPSFModel, got {type(lo).__name__}"
+        if not isinstance(lo, PSFGrid):
+            msg = f"'lo' must be a PSFGrid (see miricigale.psf.psf_grid), got {type(lo).__name__}"
             raise TypeError(msg)
         places = np.asarray(lo.grid_xypos, float)
         kernels = [MatchingKernel.from_psfs(hi, psf_at(lo, x, y), **options) for x, y in places]

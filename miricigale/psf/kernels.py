@@ -2,14 +2,12 @@
 
 import dataclasses
 import functools
-import json
+from typing import ClassVar
 
 import astropy.units as u
 import numpy as np
-from astropy.io import fits
 from scipy.signal import fftconvolve, oaconvolve
 
-from miricigale.psf.model import fits_image
 from miricigale.psf.pairs import psf_pair, ready_arrays
 from miricigale.psf.wiener import (
     REGULARIZATIONS,
@@ -19,8 +17,8 @@ from miricigale.psf.wiener import (
     odd_square,
     wiener,
 )
-from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import open_fits, write_fits
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.unified import unified_read, unified_write
 from miricigale.utils.units import ANGLE, frozen_array, to_array
 
 __all__ = ["REGULARIZATIONS", "MatchingKernel"]
@@ -54,6 +52,38 @@ class MatchingKernel:
     ValueError
         If an array is not square, odd and finite.
     """
+
+    io_module: ClassVar[str] = "miricigale.psf.files"
+    read = unified_read(
+        """
+        Read what `write` wrote, or an image that is a kernel from any FITS file.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        ext : int or str, optional
+            The extension of an image; needed for files that `write` has not written.
+        plane : int, optional
+            Which plane of a cube.
+        pixel_scale : `~astropy.units.Quantity`, optional
+            As for `from_array`; from the header if it states it.
+        source : optional
+            As for `from_array`; for images only.
+        """
+    )
+    write = unified_write(
+        """
+        Write the kernel and its PSFs as FITS.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+        overwrite : bool, optional
+            Whether a file that is there is replaced.
+        """
+    )
 
     array: np.ndarray
     pixel_scale: u.Quantity
@@ -123,7 +153,7 @@ class MatchingKernel:
         hi_angle, lo_angle : `~astropy.units.Quantity`, optional
             Position angle of the +y axis of a PSF in the detector frame; needed for those,
             refused for PSFs on the sky. An array of angles (rolls, dithers) gives the average.
-            A PSF whose meta has ``pa_aper`` (`read_psf`) is turned by that if none is given.
+            A PSF with ``pa_aper`` (`read_psf`) is turned by that if none is given.
         grid_angle : `~astropy.units.Quantity`, optional
             Position angle of the image's +y axis.
         resampling : {"drizzle", None}, optional
@@ -370,80 +400,6 @@ class MatchingKernel:
         array = self.array[old - half : old + half + 1, old - half : old + half + 1]
         lost = self.meta.get("lost", 0.0) + float(self.array.sum() - array.sum())
         return dataclasses.replace(self, array=array, meta={**self.meta, "lost": lost})
-
-    def write(self, path, *, overwrite=False):
-        """
-        Write the kernel and its PSFs as FITS.
-
-        Parameters
-        ----------
-        path : path-like
-            The file.
-        overwrite : bool, optional
-            Whether an existing file is replaced.
-        """
-        hdus = [fits.PrimaryHDU(), fits.ImageHDU(self.array, name="KERNEL")]
-        header = hdus[1].header
-        header["PIXSCALE"] = (self.pixel_scale.value, "arcsec")
-        if np.isfinite(self.regularization):
-            header["REGULAR"] = (self.regularization, "Wiener parameter")
-        header["META"] = json.dumps(self.meta, default=str)
-        for name in ("source", "target"):
-            if getattr(self, name) is not None:
-                hdus.append(fits.ImageHDU(getattr(self, name), name=name.upper()))
-        write_fits(hdus, path, overwrite=overwrite)
-
-    @classmethod
-    def read(cls, path, *, ext=None, plane=None, pixel_scale=None, source=None):
-        """
-        Read what `write` wrote, or an image that is a kernel from any FITS file.
-
-        Parameters
-        ----------
-        path : path-like
-            The file.
-        ext : int or str, optional
-            The extension of an image; needed for files that `write` has not written.
-        plane : int, optional
-            Which plane of a cube.
-        pixel_scale : `~astropy.units.Quantity`, optional
-            As for `from_array`; from the header if it states it.
-        source : optional
-            As for `from_array`; for images only.
-
-        Raises
-        ------
-        `~miricigale.utils.exceptions.DataError`
-            If the file is missing or not a kernel.
-        ValueError
-            If the image is no kernel (`from_array`) or its pixel is unknown.
-        """
-        if ext is not None:
-            data, _, pixel_scale, _ = fits_image(
-                path, ext, plane, pixel_scale, wanted="a matching kernel"
-            )
-            return cls.from_array(data, pixel_scale=pixel_scale, source=source)
-        with open_fits(path, wanted="a matching kernel") as hdus:
-            if "KERNEL" not in hdus:
-                msg = f"{path} has no KERNEL extension, only {[hdu.name for hdu in hdus]}"
-                raise DataError(msg)
-            header = hdus["KERNEL"].header
-            try:
-                arrays = {
-                    name: np.array(hdus[name.upper()].data, dtype=float)
-                    for name in ("source", "target")
-                    if name.upper() in hdus
-                }
-                return cls(
-                    np.array(hdus["KERNEL"].data, dtype=float),
-                    header["PIXSCALE"] * ANGLE,
-                    regularization=header.get("REGULAR", float("nan")),
-                    meta=json.loads(header.get("META", "{}")),
-                    **arrays,
-                )
-            except (KeyError, TypeError, ValueError) as err:
-                msg = f"{path} is not a complete matching kernel: {err}"
-                raise DataError(msg) from err
 
     def _need_psfs(self):
         if self.source is None or self.target is None:

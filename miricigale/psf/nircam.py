@@ -1,17 +1,12 @@
 """PSFs of NIRCam's wide filters, for priors of shorter wavelength."""
 
-import functools
-
 import astropy.units as u
-import numpy as np
 
 from miricigale.psf.effects import detector_response
-from miricigale.psf.library import band_quantiles, checked_grid, filter_name, odd_cells
 from miricigale.psf.model import make_psf
-from miricigale.psf.optics import jwst_constants, jwst_pupil, polychromatic_psf
-from miricigale.refdata import citations
-from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import ANGLE, to_array
+from miricigale.psf.optics import jwst_constants
+from miricigale.psf.telescope import Telescope, checked_grid, filter_name, odd_cells
+from miricigale.utils.units import ANGLE
 
 __all__ = ["NIRCAM_FILTERS", "nircam_psf"]
 
@@ -19,16 +14,6 @@ __all__ = ["NIRCAM_FILTERS", "nircam_psf"]
 _PIXELS = dict.fromkeys((f"nircam.f{n}w" for n in ("070", "090", "115", "150", "200")), 0.031)
 _PIXELS |= dict.fromkeys((f"nircam.f{n}w" for n in (277, 356, 444)), 0.063)
 NIRCAM_FILTERS = tuple(_PIXELS)
-
-
-@functools.lru_cache(maxsize=4)
-def _optics(name, cell, n, rms, seed, n_wavelengths, index, n_pupil):
-    # the detectors' axes stand within 0.6 deg of the telescope's
-    pupil = jwst_pupil(n_pupil, angle=0.0)
-    waves = band_quantiles(name, n_wavelengths, index)
-    data = polychromatic_psf(pupil, pupil.wavefront_error(rms, seed=seed), waves, step=cell, n=n)
-    data.flags.writeable = False
-    return data
 
 
 def nircam_psf(
@@ -77,32 +62,26 @@ def nircam_psf(
     --------
     >>> import astropy.units as u
     >>> from miricigale.psf import nircam_psf
-    >>> nircam_psf("nircam.f444w", fov=4 * u.arcsec).meta["includes"]
-    ['jitter', 'pixel']
+    >>> nircam_psf("nircam.f444w", fov=4 * u.arcsec).includes
+    ('jitter', 'pixel')
     """
     name = filter_name(filter, _PIXELS)
     scale = _PIXELS[name]
     oversampling, width = checked_grid(oversampling, fov, 6.0 if scale < 0.05 else 10.0)
-    if isinstance(n_wavelengths, float) or n_wavelengths < 1:
-        raise argument_error("n_wavelengths", "a positive integer", n_wavelengths)
-    rms = float(to_array(wavefront_error, u.nm, "wavefront_error"))
+    options = (wavefront_error, seed, n_wavelengths, spectral_index, n_pupil)
+    # the detectors' axes stand within 0.6 deg of the telescope's
+    telescope = Telescope.of(name, 0.0, *options)
     cell = scale / oversampling
-    n = odd_cells(width, cell)
-    data = _optics(
-        name, cell, n, rms, int(seed), int(n_wavelengths), float(spectral_index), int(n_pupil)
-    )
+    data = telescope.image(cell, odd_cells(width, cell))
     jitter = jwst_constants()["jitter"] / scale
     data = detector_response(data, oversampling=oversampling, jitter=jitter)
     return make_psf(
-        np.asarray(data) * oversampling**2,
+        data * oversampling**2,
         pixel_scale=scale * ANGLE,
         oversampling=oversampling,
         frame="detector",
         includes=("jitter", "pixel"),
         filter=name,
-        instrument="NIRCam",
-        wavefront_error=rms,
-        seed=int(seed),
-        citations=citations("psf.jwst_pupil"),
-        normalization="total",
+        total_known=True,
+        meta={"instrument": "NIRCam", **telescope.meta},
     )

@@ -3,13 +3,12 @@
 import logging
 import warnings
 
-import astropy.units as u
 import numpy as np
 from photutils.psf import GriddedPSFModel, ImagePSF
 from scipy.signal import fftconvolve
 
 from miricigale.psf import _core
-from miricigale.psf.model import make_psf, psf_info
+from miricigale.psf.model import make_psf
 from miricigale.psf.resample import average_psf, centered_psf, psf_image, psf_mosaic, rotate_psf
 from miricigale.psf.wiener import gaussian_gain, odd_square
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
@@ -53,9 +52,8 @@ def psf_pair(hi, lo, scale, *, angles, grid_angle, resampling, extent, normalize
         if name in arrays:
             psf = _from_array(psf, name, scale, angle, grid_angle, normalize)
         psfs[name], centering[name] = centered_psf(psf, 0.01 * scale, name)
-    infos = {name: psf_info(psf, name) for name, psf in psfs.items()}
     # pixels whose centres lie on the arrays; a PSF that is resampled reaches to its edge
-    half = min((infos[k].half_width - 0.5 * scale for k in arrays), default=infos["lo"].half_width)
+    half = min((psfs[k].half_width - 0.5 * scale for k in arrays), default=psfs["lo"].half_width)
     n = 2 * int(half / scale + 1e-6) + 1
     if extent is not None:
         wanted = 2 * int(float(to_array(extent, ANGLE, "extent")) / scale / 2) + 1
@@ -70,8 +68,8 @@ def psf_pair(hi, lo, scale, *, angles, grid_angle, resampling, extent, normalize
     held = [float(image.sum()) for image in images]
     if normalize is None:
         # templates are of unit sum through the sharp PSF, whatever that holds
-        normalize = not infos["lo"].total_known
-        missing = {name: max(0.0, _missing(info)) for name, info in infos.items()}
+        normalize = not psfs["lo"].total_known
+        missing = {name: max(0.0, _missing(psf)) for name, psf in psfs.items()}
         if normalize and max(missing.values()) > 0.01:
             text = ", ".join(f"{value:.3f} of '{name}'" for name, value in missing.items())
             text = f"light beyond the PSFs' grids, by their own sums and wings: {text}. The kernel "
@@ -82,15 +80,15 @@ def psf_pair(hi, lo, scale, *, angles, grid_angle, resampling, extent, normalize
     return images[0] / held[0], images[1] * (energy / held[1]), mended
 
 
-def _missing(info):
+def _missing(psf):
     """Light beyond the grid: what the sum leaves, or where it leaves nothing what wings say."""
-    claimed = 1 - info.enclosed
-    if info.total_known or claimed > 0.01:
+    claimed = 1 - psf.enclosed
+    if psf.total_known or claimed > 0.01:
         return claimed
-    edge = info.half_width / info.cell
+    edge = psf.half_width / psf.cell
     inner, middle, outer = _core.radial_sums(
-        info.data, *info.origin, np.array([0.5, 0.75, 1.0]) * edge
-    ) / float(info.data.sum())  # fmt: skip
+        psf.data, *psf.origin, np.array([0.5, 0.75, 1.0]) * edge
+    ) / float(psf.data.sum())  # fmt: skip
     # wings that fall as r**-3 hold half as much in the outer ring as in the inner one, and three
     # times as much beyond it; those of a Gaussian or a steep Moffat fall faster
     ring = outer - middle
@@ -120,13 +118,12 @@ def _from_array(array, name, scale, angle, grid_angle, normalize):
 
 def _on_grid(psf, name, angle, grid_angle, scale, n, resampling):
     """One PSF on n x n pixels of the image, its sum the enclosed fraction."""
-    info = psf_info(psf, name)
-    if info.frame == "detector" and angle is None:
-        if "pa_aper" not in info.meta:
+    if psf.frame == "detector" and angle is None:
+        if psf.pa_aper is None:
             wanted = "the position angle of the detector's +y (the PSF is in the detector frame)"
             raise argument_error(name + "_angle", wanted, "None")
-        angle = info.meta["pa_aper"] * u.deg
-        _log.info("'%s' is turned by the %.4f deg of its header", name, info.meta["pa_aper"])
+        angle = psf.pa_aper
+        _log.info("'%s' is turned by the %.4f deg of its header", name, angle.value)
     if resampling:
         psf = psf_mosaic(psf, scale * ANGLE, angle, grid_angle=grid_angle)
     else:

@@ -6,11 +6,10 @@ import math
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import Angle
-from photutils.psf import ImagePSF
 
 from miricigale.psf import _core
 from miricigale.psf.effects import detector_response
-from miricigale.psf.model import make_psf, psf_info
+from miricigale.psf.model import instrument_psf
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, to_array
 
@@ -18,14 +17,7 @@ __all__ = ["average_psf", "psf_image", "psf_mosaic", "rotate_psf"]
 
 _log = logging.getLogger(__name__)
 
-# entries of the meta that make_psf works out itself
-_MADE = ("pixel_scale", "oversampling", "frame", "angle", "includes", "fwhm", "enclosed")
-_MADE += ("eef_radius", "eef")
-
-
-def _carried(meta, **changes):
-    kept = {key: value for key, value in meta.items() if key not in _MADE}
-    return {**kept, **changes}
+_ANGLES = ("pixel_scale", "angle")
 
 
 def _degrees(angle, argument):
@@ -46,29 +38,28 @@ def _positive(value, argument):
     return size
 
 
-def _turn_by(info, angle, grid_angle, argument):
+def _turn_by(psf, angle, grid_angle, argument):
     """Counter-clockwise turn in deg that brings the PSF to the grid."""
-    if info.frame == "sky":
+    if psf.frame == "sky":
         if angle is not None:
             wanted = "left out for a PSF that stands on the sky already"
             raise argument_error(argument, wanted, angle)
-        start = info.angle
+        start = psf.angle.value
     else:
         start = _degrees(angle, argument)
     return start - grid_angle
 
 
-def _sample(info, x, y, turn):
-    """Values per cell at offsets x, y in arcsec (broadcast), after a turn in deg."""
+def sampled(psf, x, y, turn=0.0, data=None):
+    """Values per cell at offsets x, y in arcsec (broadcast), after a turn in deg; of other data if given."""
     a = math.radians(turn)
     if turn % 360 == 0:
         u_, v_ = x, y
     else:
         u_ = x * math.cos(a) + y * math.sin(a)
         v_ = -x * math.sin(a) + y * math.cos(a)
-    return _core.interpolate(
-        info.data, u_ / info.cell + info.origin[0], v_ / info.cell + info.origin[1]
-    )
+    data = psf.data if data is None else data
+    return _core.interpolate(data, u_ / psf.cell + psf.origin[0], v_ / psf.cell + psf.origin[1])
 
 
 def rotate_psf(psf, angle=None, *, grid_angle=0.0 * u.deg):
@@ -101,27 +92,19 @@ def rotate_psf(psf, angle=None, *, grid_angle=0.0 * u.deg):
     With north up and east left a position angle grows counter-clockwise, and so does the
     turn.
     """
-    info = psf_info(psf)
+    psf = instrument_psf(psf)
     grid = _degrees(grid_angle, "grid_angle")
-    turn = _turn_by(info, angle, grid, "angle")
-    ny, nx = info.data.shape
-    if turn % 90 == 0 and nx == ny and info.origin == ((nx - 1) / 2, (ny - 1) / 2):
+    turn = _turn_by(psf, angle, grid, "angle")
+    ny, nx = psf.data.shape
+    if turn % 90 == 0 and nx == ny and tuple(psf.origin) == ((nx - 1) / 2, (ny - 1) / 2):
         # counter-clockwise with y up
-        data = np.rot90(info.data, -round(turn / 90))
+        data = np.rot90(psf.data, -round(turn / 90))
     else:
-        x = (np.arange(nx) - info.origin[0]) * info.cell
-        y = ((np.arange(ny) - info.origin[1]) * info.cell)[:, None]
-        data = _sample(info, x, y, turn)
-    return make_psf(
-        data,
-        pixel_scale=info.pixel_scale * ANGLE,
-        oversampling=info.oversampling,
-        frame="sky",
-        angle=grid * u.deg,
-        includes=info.includes,
-        origin=info.origin,
-        **_carried(info.meta, telescope_angle=turn + grid),
-    )
+        x = (np.arange(nx) - psf.origin[0]) * psf.cell
+        y = ((np.arange(ny) - psf.origin[1]) * psf.cell)[:, None]
+        data = sampled(psf, x, y, turn)
+    meta = {"telescope_angle": turn + grid}
+    return psf.replaced(data, frame="sky", angle=grid * u.deg, meta=meta)
 
 
 def average_psf(psfs, weights=None):
@@ -147,34 +130,28 @@ def average_psf(psfs, weights=None):
     psfs = list(psfs)
     if not psfs:
         raise argument_error("psfs", "at least one PSF", "none")
-    infos = [psf_info(psf, f"psfs[{i}]") for i, psf in enumerate(psfs)]
-    first = infos[0]
-    for i, info in enumerate(infos[1:], start=1):
-        for name in ("pixel_scale", "oversampling", "frame", "angle", "includes", "origin"):
-            mine, theirs = getattr(info, name), getattr(first, name)
-            same = (
-                np.allclose(mine, theirs, rtol=1e-6) if isinstance(mine, float) else mine == theirs
-            )
-            if not same:
-                raise argument_error("psfs", f"alike in {name}", f"{theirs} and {mine} (psfs[{i}])")
-        if info.data.shape != first.data.shape:
-            raise argument_error(
-                "psfs", "alike in shape", f"{first.data.shape} and {info.data.shape} (psfs[{i}])"
-            )
+    psfs = alike(psfs, ("pixel_scale", "oversampling", "frame", "angle", "includes", "origin"))
     w = np.ones(len(psfs)) if weights is None else np.asarray(weights, dtype=float)
     if w.shape != (len(psfs),) or np.any(w < 0) or not w.sum() > 0:
         raise argument_error("weights", f"{len(psfs)} non-negative numbers", weights)
-    data = np.tensordot(w / w.sum(), np.stack([info.data for info in infos]), axes=1)
-    return make_psf(
-        data,
-        pixel_scale=first.pixel_scale * ANGLE,
-        oversampling=first.oversampling,
-        frame=first.frame,
-        angle=first.angle * u.deg,
-        includes=first.includes,
-        origin=first.origin,
-        **_carried(first.meta, n_averaged=len(psfs)),
-    )
+    data = np.tensordot(w / w.sum(), np.stack([psf.data for psf in psfs]), axes=1)
+    return psfs[0].replaced(data, meta={"n_averaged": len(psfs)})
+
+
+def alike(psfs, names):
+    """PSFs, checked: of one shape, and with the same ``names`` among their facts."""
+    psfs = [instrument_psf(psf, f"psfs[{i}]") for i, psf in enumerate(psfs)]
+    first = psfs[0].facts
+    for i, psf in enumerate(psfs[1:], start=1):
+        for name in names:
+            mine, theirs = psf.facts[name], first[name]
+            close = name in _ANGLES and np.isclose(mine.value, theirs.value, rtol=1e-6)
+            if not (close or mine == theirs):
+                raise argument_error("psfs", f"alike in {name}", f"{theirs} and {mine} (psfs[{i}])")
+        if psf.data.shape != psfs[0].data.shape:
+            shapes = f"{psfs[0].data.shape} and {psf.data.shape} (psfs[{i}])"
+            raise argument_error("psfs", "alike in shape", shapes)
+    return psfs
 
 
 def psf_image(psf, *, pixel_scale, shape, offset=(0.0, 0.0)):
@@ -205,14 +182,14 @@ def psf_image(psf, *, pixel_scale, shape, offset=(0.0, 0.0)):
     ValueError
         If the pixel or the shape is not positive.
     """
-    info = psf_info(psf)
+    psf = instrument_psf(psf)
     scale = _positive(pixel_scale, "pixel_scale")
     ny, nx = (shape, shape) if np.isscalar(shape) else shape
     if min(ny, nx) < 1:
         raise argument_error("shape", "at least one row and column", shape)
     x = (np.arange(nx) - (nx - 1) / 2 - offset[0]) * scale
     y = ((np.arange(ny) - (ny - 1) / 2 - offset[1]) * scale)[:, None]
-    return _sample(info, x, y, 0.0) * (scale / info.pixel_scale) ** 2
+    return sampled(psf, x, y) * (scale / psf.pixel_scale.value) ** 2
 
 
 def psf_mosaic(
@@ -265,7 +242,7 @@ def psf_mosaic(
     ----------
     Fruchter & Hook 2002, PASP 114, 144.
     """
-    info = psf_info(psf)
+    psf = instrument_psf(psf)
     if resampling not in ("drizzle", None):
         raise argument_error("resampling", "'drizzle' or None", repr(resampling))
     if not 0 < pixfrac <= 1:
@@ -273,40 +250,40 @@ def psf_mosaic(
     scale = _positive(pixel_scale, "pixel_scale")
     grid = _degrees(grid_angle, "grid_angle")
     angles = [None] if pa is None else list(np.atleast_1d(pa))
-    turns = [_turn_by(info, angle, grid, "pa") for angle in angles]
+    turns = [_turn_by(psf, angle, grid, "pa") for angle in angles]
     if oversampling is None:
-        oversampling = max(1, math.ceil(scale / info.cell - 1e-6))
+        oversampling = max(1, math.ceil(scale / psf.cell - 1e-6))
     if int(oversampling) != oversampling or oversampling < 1:
         raise argument_error("oversampling", "a positive integer", oversampling)
     cell = scale / oversampling
-    width = 2 * info.half_width if fov is None else _positive(fov, "fov")
+    width = 2 * psf.half_width if fov is None else _positive(fov, "fov")
     n = 2 * round(0.5 * width / cell - 0.5) + 1
+    blurred = psf.data
     if resampling == "drizzle":
-        data = detector_response(
-            info.data, oversampling=info.oversampling, pixel=False, boxes=(pixfrac,)
-        )
-        blurred = ImagePSF(data, oversampling=info.oversampling, origin=info.origin)
-        blurred.meta.update(info.meta)
-        info = psf_info(blurred)
+        form = {"oversampling": psf.n_cells, "pixel": False, "boxes": (pixfrac,)}
+        blurred = detector_response(psf.data, **form)
     axis = (np.arange(n) - n // 2) * cell
     # dithers of one roll are alike
-    alike, counts = np.unique(turns, return_counts=True)
+    different, counts = np.unique(turns, return_counts=True)
     data = np.average(
-        [_sample(info, axis, axis[:, None], turn) for turn in alike], axis=0, weights=counts
+        [sampled(psf, axis, axis[:, None], turn, blurred) for turn in different],
+        axis=0,
+        weights=counts,
     )
-    data *= (scale / info.pixel_scale) ** 2
-    includes = list(info.includes)
+    data *= (scale / psf.pixel_scale.value) ** 2
+    includes = psf.includes
     if resampling == "drizzle":
         data = detector_response(data, oversampling=oversampling, pixel=True)
-        includes.append("drizzle")
-    return make_psf(
+        includes = (*includes, "drizzle")
+    return psf.replaced(
         data,
         pixel_scale=scale * ANGLE,
         oversampling=oversampling,
+        origin=None,
         frame="sky",
         angle=grid * u.deg,
         includes=includes,
-        **_carried(info.meta, telescope_angle=turns[0] + grid),
+        meta={"telescope_angle": turns[0] + grid},
     )
 
 
@@ -335,16 +312,14 @@ def centered_psf(psf, tolerance, argument="psf"):
     ValueError
         If no core is found, or it is nearer to the edge than to the origin.
     """
-    info = psf_info(psf, argument)
-    x, y, _ = _core.core_moments(info.data)
-    offset = (x - info.origin[0]) * info.cell, (y - info.origin[1]) * info.cell
-    if not np.hypot(*offset) < 0.5 * info.half_width:
+    psf = instrument_psf(psf, argument)
+    x, y, _ = _core.core_moments(psf.data)
+    offset = (x - psf.origin[0]) * psf.cell, (y - psf.origin[1]) * psf.cell
+    if not np.hypot(*offset) < 0.5 * psf.half_width:
         wanted = "a PSF whose core stands near its centre"
         raise argument_error(argument, wanted, f"a core at x, y = {x:.4g}, {y:.4g}")
     if np.hypot(*offset) <= tolerance:
         return psf, (0.0, 0.0)
-    moved = ImagePSF(info.data, oversampling=info.oversampling, origin=(x, y))
-    moved.meta.update(info.meta)
     text = "'%s': the core stood (%.4f, %.4f) arcsec off the centre and was brought there"
     _log.info(text, argument, *offset)
-    return moved, offset
+    return psf.replaced(origin=(x, y)), offset

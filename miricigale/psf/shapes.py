@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from miricigale.psf.library import odd_cells
 from miricigale.psf.model import make_psf
+from miricigale.psf.telescope import odd_cells
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import ANGLE, to_array
 
@@ -23,7 +23,7 @@ def _round_psf(profile, pixel_scale, oversampling, fov):
         pixel_scale=pixel_scale,
         oversampling=oversampling,
         frame="sky",
-        normalization="total",
+        total_known=True,
     )
 
 

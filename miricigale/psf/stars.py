@@ -1,6 +1,7 @@
 """PSFs measured from stars, with photutils' builder of effective PSFs."""
 
 import math
+import numbers
 import warnings
 
 import astropy.units as u
@@ -149,7 +150,7 @@ def psf_from_stars(
     Returns
     -------
     psf : `~photutils.psf.ImagePSF`
-        Its meta has the entries of `~miricigale.psf.make_psf` and ``n_images``, ``n_stamps``
+        Its meta has ``n_images``, ``n_stamps``
         (used), ``n_left_out`` (off the images or not fitted), ``iterations`` and
         ``converged`` (positions settled to 0.001 pixel).
 
@@ -206,19 +207,21 @@ def psf_from_stars(
         angle=angle,
         includes=includes,
         # 1 stands for a fraction that is not known
-        normalization="grid" if share == 1 else "total",
-        source="stars",
-        n_images=len(images),
-        n_stamps=len(stamps) - failed,
-        n_left_out=wanted - len(stamps) + failed,
-        iterations=int(result.iterations),
-        converged=bool(result.converged),
+        total_known=share != 1,
+        meta={
+            "source": "stars",
+            "n_images": len(images),
+            "n_stamps": len(stamps) - failed,
+            "n_left_out": wanted - len(stamps) + failed,
+            "iterations": int(result.iterations),
+            "converged": bool(result.converged),
+        },
     )
 
 
 def _enclosed(enclosed, shape, oversampling, scale):
     """Fraction of the light on the stamp's grid."""
-    if not hasattr(enclosed, "data"):
+    if isinstance(enclosed, numbers.Real):
         if not 0 < enclosed <= 1:
             raise argument_error("enclosed", "above 0 and at most 1, or a PSF", enclosed)
         return float(enclosed)

@@ -11,6 +11,7 @@ from photutils.psf import GriddedPSFModel
 
 from miricigale.instrument import aperture, pixel_area_map
 from miricigale.profiles import ellipse_to_pixels
+from miricigale.psf import InstrumentPSF, PSFGrid
 from miricigale.scene.background import Background
 from miricigale.scene.catalog import CatalogFlags, check_catalog, read_catalog, unmasked
 from miricigale.scene.cutouts import Cutout
@@ -22,6 +23,9 @@ from miricigale.utils.tables import Flags
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, to_array
 
 __all__ = ["Scene", "SceneFlags"]
+
+#: PSFs that tell what they are.
+_TYPED = (InstrumentPSF, PSFGrid)
 
 #: uJy per sr in MJy per sr.
 _UJY_TO_MJY = 1e-12
@@ -52,10 +56,10 @@ class Scene:
         World coordinates of the image with their ``pixel_shape``, distorted or not.
     psf : `~photutils.psf.ImagePSF` or `~photutils.psf.GriddedPSFModel`
         PSF on the image's pixels with the pixel response in it, or PSFs over the field (see
-        `~miricigale.psf.miri_psf_grid`). If its meta gives a
-        ``pixel_scale`` (arcsec) or, in the frame of the sky, an ``angle`` (deg), they are
-        compared with the WCS; a ``filter`` in it must be ``filter``, and a grid's
-        ``subarray`` have the image's shape.
+        `~miricigale.psf.miri_psf_grid`). The pixel of an
+        `~miricigale.psf.InstrumentPSF` or a `~miricigale.psf.PSFGrid` and, in the frame of the
+        sky, its angle are compared with the WCS; its filter, if it has one, must be ``filter``,
+        and the sub-array of a grid have the image's shape.
     background : `~miricigale.scene.Background` or `~astropy.units.Quantity`, optional
         Background, or its constant level; none by default.
     enclosed : float, optional
@@ -208,31 +212,32 @@ class Scene:
         return float(np.abs(np.linalg.det(self._center_jacobian())) ** -0.5)
 
     def _check_psf(self, psf, scale):
-        meta = getattr(psf, "meta", None) or {}
-        if "pixel_scale" in meta:
-            have = u.Quantity(meta["pixel_scale"], ANGLE).value
-            if abs(have / scale - 1) > 0.03:
-                got = f"pixels of {have:.4f} arcsec where the WCS has {scale:.4f}"
-                raise argument_error("psf", "on the pixels of the WCS", got)
-        if meta.get("frame") == "sky" and meta.get("angle") is not None:
+        if not isinstance(psf, _TYPED):
+            # a plain photutils model is taken as it is
+            return
+        have = psf.pixel_scale.to_value(ANGLE)
+        if abs(have / scale - 1) > 0.03:
+            got = f"pixels of {have:.4f} arcsec where the WCS has {scale:.4f}"
+            raise argument_error("psf", "on the pixels of the WCS", got)
+        if psf.frame == "sky":
             # the direction on the sky in which +y points
             east, north = np.linalg.inv(self._center_jacobian()) @ [0.0, 1.0]
             angle = np.degrees(np.arctan2(east, north))
-            turn = (float(u.Quantity(meta["angle"], u.deg).value) - angle + 180) % 360 - 180
+            turn = (psf.angle.to_value(u.deg) - angle + 180) % 360 - 180
             if abs(turn) > 1:
                 got = f"turned by {turn:.1f} deg (see miricigale.psf.rotate_psf)"
                 raise argument_error("psf", "in the orientation of the WCS", got)
-        if isinstance(psf, GriddedPSFModel) and "subarray" in meta:
-            own = aperture(meta["subarray"]).shape
+        if isinstance(psf, PSFGrid) and psf.subarray is not None:
+            own = aperture(psf.subarray).shape
             if own != self._shape:
-                got = f"those of {meta['subarray']}, {own[1]} x {own[0]} pixels"
+                got = f"those of {psf.subarray}, {own[1]} x {own[0]} pixels"
                 raise argument_error("psf", "a grid of places on this image", got)
-        have = meta.get("filter")
-        if isinstance(have, str):
+        if psf.filter is not None:
             # other packages write F770W where we write miri.f770w
-            wanted, have = self._filter.lower(), have.lower()
+            wanted, have = self._filter.lower(), psf.filter.lower()
             if have not in (wanted, wanted.rpartition(".")[2]):
-                raise argument_error("psf", f"one of the filter {self._filter}", f"one of {have}")
+                got = f"one of {psf.filter}"
+                raise argument_error("psf", f"one of the filter {self._filter}", got)
 
     @functools.cached_property
     def _painted(self):
@@ -349,7 +354,7 @@ class Scene:
         brightness = light * _UJY_TO_MJY / pixel_area_map(self._wcs, self._shape)
         meta = provenance(
             filter=self._filter,
-            psf_includes=list(self.psf.meta.get("includes", ())),
+            psf_includes=list(self.psf.includes) if isinstance(self.psf, _TYPED) else [],
             n_sources=len(self._catalog),
         )
         if self._background is not None:

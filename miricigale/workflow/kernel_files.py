@@ -89,7 +89,7 @@ def _read_psf(path, argument, header, *, scale, angle):
     the PSF is for.
     """
     from miricigale.psf import MODEL_FILTERS, average_psf, make_psf, psf_image
-    from miricigale.psf.model import header_grid
+    from miricigale.psf.files import header_grid
 
     known = header.filter in MODEL_FILTERS
     planes, stated = _planes(path, "a PSF")
@@ -130,7 +130,7 @@ def _read_psf(path, argument, header, *, scale, angle):
         middle = psf_image(psf, pixel_scale=cell * ANGLE, shape=n)
         middle = middle / middle.sum() if scaled else middle
         # the shift loses nothing but what is beyond the edge
-        kept.append(make_psf(middle, **form, file=str(path)))
+        kept.append(make_psf(middle, **form, meta={"file": str(path)}))
     psf = kept[0] if len(kept) == 1 else average_psf(kept)
     # a pixel that was stated on purpose leaves only the image to be wider
     return _compared(psf, header, argument, smoothed=scale is not None) if known else psf
@@ -207,10 +207,10 @@ def read_kernel(path, *, pixel_scale, highres_psf=None):
         As `~miricigale.psf.MatchingKernel.from_array`.
     """
     from miricigale.psf import MatchingKernel
-    from miricigale.psf.model import header_grid
+    from miricigale.psf.files import header_grid
 
     if is_own_kernel(path):
-        kernel = MatchingKernel.read(file_place(path)[0])
+        kernel = MatchingKernel.read(file_place(path)[0], format="fits")
         stated = kernel.pixel_scale.value
     else:
         planes, header = _planes(path, "a kernel")
@@ -305,7 +305,7 @@ def matching_kernel(image, highres, *, kernel=None, psf=None, highres_psf=None, 
             form = {"pixel_scale": fine, "frame": "sky", "angle": turn, "enclosed": 1.0}
             _compared(make_psf(made.target, **form), image, "kernel")
     else:
-        _check_widths(sharp.meta["fwhm"], wide.meta["fwhm"])
+        _check_widths(sharp.fwhm, wide.fwhm)
         made = MatchingKernel.from_psfs(sharp, wide, pixel_scale=fine, grid_angle=turn)
     if made.target is not None:
         # the peaks of two PSFs of the same light
@@ -313,7 +313,8 @@ def matching_kernel(image, highres, *, kernel=None, psf=None, highres_psf=None, 
     made.meta["psfs"] = {
         what: {
             "from": str(one.meta.get("file", "model")),
-            **{k: one.meta[k] for k in ("fwhm", "enclosed")},
+            "fwhm": one.fwhm.value,
+            "enclosed": one.enclosed,
         }
         for what, one in psfs.items()
     }

@@ -12,7 +12,6 @@ from miricigale.psf import (
     make_psf,
     miri_psf,
     psf_image,
-    psf_info,
 )
 from miricigale.utils.exceptions import MiricigaleWarning
 
@@ -33,9 +32,9 @@ def stamp(psf, n, factor=None):
 @pytest.mark.parametrize("name", ["miri.f1500w", "nircam.f200w", "wfc3.f160w"])
 def test_models_stand_on_the_sky_by_name(name):
     psf = filter_psf(name, pixel_scale=0.06 * u.arcsec, pa=20 * u.deg, grid_angle=5 * u.deg)
-    assert psf.meta["frame"] == "sky"
-    assert psf.meta["angle"] == pytest.approx(5)
-    assert "drizzle" in psf.meta["includes"]
+    assert psf.frame == "sky"
+    assert psf.angle.value == pytest.approx(5)
+    assert "drizzle" in psf.includes
     with pytest.raises(KeyError, match=r"no model PSF for the filter 'miri\.f771w'; known: miri"):
         filter_psf("miri.f771w", pixel_scale=PIXEL)
 
@@ -45,8 +44,8 @@ def test_the_light_beyond_the_grid_is_that_of_the_model(mosaic):
         held = stamp(mosaic, n).sum()
         with pytest.warns(MiricigaleWarning, match=r"taken to hold 0\."):
             psf = checked_psf(make_psf(stamp(mosaic, n, 1.0), **SKY), "miri.f770w", pa=75 * u.deg)
-        assert psf_info(psf).enclosed == pytest.approx(held, rel=1e-3)
-        assert psf_info(psf).total_known
+        assert psf.enclosed == pytest.approx(held, rel=1e-3)
+        assert psf.total_known
         radius = 0.7 * u.arcsec
         truth = encircled_energy(mosaic, radius)
         assert encircled_energy(psf, radius) == pytest.approx(truth, rel=0.01)
@@ -54,8 +53,8 @@ def test_the_light_beyond_the_grid_is_that_of_the_model(mosaic):
     near = make_psf(stamp(mosaic, 61, held - 0.03), **SKY)
     with pytest.warns(MiricigaleWarning, match="taken to hold"):
         kept = checked_psf(make_psf(stamp(mosaic, 61, held - 0.08), **SKY), "miri.f770w")
-    assert psf_info(kept).enclosed == pytest.approx(held, rel=2e-3)
-    assert psf_info(checked_psf(near, "miri.f770w")).enclosed == pytest.approx(held - 0.03)
+    assert kept.enclosed == pytest.approx(held, rel=2e-3)
+    assert checked_psf(near, "miri.f770w").enclosed == pytest.approx(held - 0.03)
     known = make_psf(stamp(mosaic, 61), **SKY, enclosed=0.9)
     assert checked_psf(known, "miri.f770w") is known
 
@@ -93,7 +92,7 @@ def test_exposures_are_sharper_than_mosaics(mosaic):
             ),
             "miri.f770w", pa=75 * u.deg,
         )  # fmt: skip
-    assert np.isclose(mosaic.meta["fwhm"] / exposure.meta["fwhm"], 1.065, atol=0.01)
+    assert np.isclose(mosaic.fwhm.value / exposure.fwhm.value, 1.065, atol=0.01)
 
 
 def test_noise_and_coarse_pixels_refuse_nothing(mosaic):

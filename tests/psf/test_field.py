@@ -21,8 +21,9 @@ from miricigale.psf import (
     psf_grid,
     psf_mosaic,
 )
-from miricigale.psf.library import band_quantiles, local_pixel
+from miricigale.psf.miri import local_pixel
 from miricigale.psf.optics import _to_image, jwst_constants
+from miricigale.psf.telescope import band_quantiles
 
 CORNERS = [(359.0, 0.0), (1026.0, 0.0), (1026.0, 1023.0), (700.0, 300.0)]
 SMALL = {"fov": 4 * u.arcsec, "oversampling": 3}
@@ -83,7 +84,7 @@ def test_optics_at_a_position_are_those_of_the_warped_pupil(name, oversampling):
     )
     truth *= oversampling**2
     np.testing.assert_allclose(got.data, truth, atol=2e-3 * truth.max())
-    assert got.meta["enclosed"] == pytest.approx(truth.sum() / oversampling**2, abs=1e-3)
+    assert got.enclosed == pytest.approx(truth.sum() / oversampling**2, abs=1e-3)
     # the square pixel's image is no such thing
     square = miri_psf(
         name,
@@ -101,7 +102,7 @@ def test_widths_on_the_sky_are_the_same_all_over_the_field():
     reference = encircled_energy(miri_psf("miri.f1000w", **kind), radii)
     for position in CORNERS:
         psf = miri_psf("miri.f1000w", position=position, **kind)
-        assert psf.meta["pixel_scale"] == pytest.approx(
+        assert psf.pixel_scale.value == pytest.approx(
             np.sqrt(abs(np.linalg.det(local_pixel(*position))))
         )
         np.testing.assert_allclose(encircled_energy(psf, radii), reference, atol=2e-3)
@@ -131,18 +132,18 @@ def grid():
 
 def test_grid_is_photutils_model_and_says_what_it_is(grid):
     assert isinstance(grid, GriddedPSFModel)
-    assert grid.meta["frame"] == "detector"
-    assert grid.meta["includes"] == ["jitter", "cruciform", "pixel", "ipc"]
-    assert grid.meta["filter"] == "miri.f770w"
+    assert grid.frame == "detector"
+    assert list(grid.includes) == ["jitter", "cruciform", "pixel", "ipc"]
+    assert grid.filter == "miri.f770w"
     assert "fwhm" not in grid.meta
     for k, (x, y) in enumerate(grid.grid_xypos):
         alone = miri_psf("miri.f770w", position=(x, y), **SMALL)
         np.testing.assert_array_equal(grid.data[k], alone.data)
         here = psf_at(grid, x, y)
         np.testing.assert_allclose(here.data, alone.data, rtol=1e-12)
-        assert here.meta["pixel_scale"] == pytest.approx(alone.meta["pixel_scale"])
-        assert here.meta["fwhm"] == pytest.approx(alone.meta["fwhm"])
-        assert here.meta["position"] == (x, y)
+        assert here.pixel_scale.value == pytest.approx(alone.pixel_scale.value)
+        assert here.fwhm.value == pytest.approx(alone.fwhm.value)
+        assert here.position == (x, y)
 
 
 @pytest.mark.parametrize(("x", "y"), [(600.0, 200.0), (359.0, 900.0), (100.0, 1500.0)])
@@ -173,14 +174,14 @@ def test_dithers_of_a_source_average_on_the_mosaic(grid):
     ]
     mean = average_psf(parts)
     np.testing.assert_allclose(mean.data, np.mean([p.data for p in parts], axis=0), rtol=1e-12)
-    assert mean.meta["frame"] == "sky"
+    assert mean.frame == "sky"
 
 
 def test_f160w_over_a_mosaic_of_two_rolls():
     kind = {"fov": 3 * u.arcsec}
     a, b = hst_psf(angle=0 * u.deg, **kind), hst_psf(angle=30 * u.deg, **kind)
     grid = psf_grid([a, b, a, b], [(0, 0), (900, 0), (0, 900), (900, 900)])
-    assert grid.meta["pixel_scale"] == pytest.approx(0.06)
+    assert grid.pixel_scale.value == pytest.approx(0.06)
     middle = psf_at(grid, 450, 10)
     np.testing.assert_allclose(middle.data, 0.5 * (a.data + b.data), rtol=1e-12)
 

@@ -100,5 +100,5 @@ def test_what_is_refused(change, error, text):
     given = {"kernels": KERNELS[:2], "sky": places((0, 0), (1, 0)), **change}
     with pytest.raises(error, match=text):
         KernelField(**given)
-    with pytest.raises(TypeError, match="'lo' must be a photutils GriddedPSFModel"):
+    with pytest.raises(TypeError, match="'lo' must be a PSFGrid"):
         KernelField.from_psfs(None, gaussian_psf(0.5 * u.arcsec, **KIND), wcs=None)

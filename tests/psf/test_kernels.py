@@ -109,7 +109,7 @@ def test_convolved_template_of_unit_flux_is_the_wide_psf(hi, lo):
     expected = psf_image(psf, pixel_scale=SCALE, shape=n)
     np.testing.assert_allclose(image, expected, atol=0.01 * expected.max())
     assert kernel.array.sum() == pytest.approx(expected.sum(), rel=1e-9)
-    assert kernel.array.sum() == pytest.approx(psf.meta["enclosed"], abs=5e-3)
+    assert kernel.array.sum() == pytest.approx(psf.enclosed, abs=5e-3)
     normalised = MatchingKernel.from_psfs(hi, psf, pixel_scale=SCALE, normalize=True)
     assert normalised.array.sum() == pytest.approx(1, rel=1e-9)
     assert normalised.target.sum() == pytest.approx(1, rel=1e-9)

@@ -9,7 +9,6 @@ from miricigale.psf import (
     encircled_energy,
     fwhm,
     nircam_psf,
-    psf_info,
     psf_mosaic,
     read_psf,
 )
@@ -45,11 +44,11 @@ def test_energy_is_that_of_drizzled_psfs():
 
 def test_is_centred_normalised_and_says_what_it_is():
     psf = nircam_psf("nircam.f200w", oversampling=3, seed=4)
-    info = psf_info(psf)
+    info = psf
     assert np.unravel_index(info.data.argmax(), info.data.shape) == tuple(
         n // 2 for n in info.data.shape
     )
-    assert info.pixel_scale == 0.031
+    assert info.pixel_scale.value == 0.031
     assert (info.frame, info.includes, info.total_known) == ("detector", ("jitter", "pixel"), True)
     assert 0.97 < info.enclosed < 1
     # wings fall as r**-3: the light outside of a radius as its inverse

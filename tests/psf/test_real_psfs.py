@@ -18,7 +18,6 @@ from miricigale.psf import (
     make_psf,
     psf_at,
     psf_grid,
-    psf_info,
     read_psf,
 )
 from miricigale.utils.exceptions import MiricigaleWarning
@@ -119,7 +118,7 @@ def test_sums_that_are_no_fraction_are_refused_unless_scaled(factor):
     kernel = MatchingKernel.from_psfs(data, gaussian(51, LO), pixel_scale=SCALE, normalize=True)
     assert_is_the_gaussian_kernel(kernel)
     psf = make_psf(data, **kind, enclosed=0.97)
-    assert psf_info(psf).enclosed == pytest.approx(0.97)
+    assert psf.enclosed == pytest.approx(0.97)
     with pytest.raises(ValueError, match="'enclosed' must be above 0 and at most 1"):
         make_psf(data, **kind, enclosed=1.5)
 
@@ -211,8 +210,8 @@ def test_scale_and_angle_come_from_the_header(tmp_path):
     path = tmp_path / "psf.fits"
     fits.writeto(path, gaussian(51, HI), header())
     psf = read_psf(path, frame="sky")
-    assert psf.meta["pixel_scale"] == pytest.approx(0.04)
-    assert psf.meta["angle"] == pytest.approx(30)
+    assert psf.pixel_scale.value == pytest.approx(0.04)
+    assert psf.angle.value == pytest.approx(30)
     with pytest.raises(ValueError, match=r"'pixel_scale' must be 0\.04 arcsec by the header"):
         read_psf(path, frame="sky", pixel_scale=0.06 * u.arcsec)
     with pytest.raises(ValueError, match=r"'angle' must be the header's, 30 deg"):
@@ -224,7 +223,7 @@ def test_scale_and_angle_come_from_the_header(tmp_path):
     fits.writeto(path, gaussian(51, 4 * HI), fits.Header({"PIXELSCL": 0.0275}), overwrite=True)
     with pytest.warns(MiricigaleWarning, match="sums to"):
         psf = read_psf(path, frame="detector", oversampling=4)
-    assert psf.meta["pixel_scale"] == pytest.approx(0.11)
+    assert psf.pixel_scale.value == pytest.approx(0.11)
     fits.writeto(path, gaussian(51, HI), overwrite=True)
     with pytest.raises(ValueError, match="'pixel_scale' must be given where the header"):
         read_psf(path, frame="sky")

@@ -86,12 +86,12 @@ def test_image_stands_as_the_truth_does(truth, measured):
 def test_meta_says_where_it_comes_from(measured):
     meta = measured.meta
     assert (meta["n_images"], meta["n_stamps"], meta["n_left_out"]) == (7, 63, 0)
-    assert meta["frame"] == "detector"
-    assert meta["includes"] == ["jitter", "cruciform", "pixel", "ipc"]
-    assert meta["pixel_scale"] == pytest.approx(SCALE)
+    assert measured.frame == "detector"
+    assert measured.includes == ("jitter", "cruciform", "pixel", "ipc")
+    assert measured.pixel_scale.value == pytest.approx(SCALE)
     assert measured.data.shape == (91, 91)
     # what the truth has within the stamp
-    assert 0.9 < meta["enclosed"] < 0.97
+    assert 0.9 < measured.enclosed < 0.97
 
 
 def test_sky_positions_serve_all_images_and_bad_pixels_are_left_out(truth, field, measured):
@@ -104,7 +104,7 @@ def test_sky_positions_serve_all_images_and_bad_pixels_are_left_out(truth, field
         data[mask] = 1e6
         spoilt.append(CCDData(data, unit="DN/s", mask=mask, wcs=image.wcs))
     psf = psf_from_stars(spoilt, sky, enclosed=truth, frame="detector")
-    assert psf.meta["pixel_scale"] == pytest.approx(SCALE, rel=1e-6)
+    assert psf.pixel_scale.value == pytest.approx(SCALE, rel=1e-6)
     assert psf.meta["n_stamps"] == 63
     np.testing.assert_allclose(
         encircled_energy(psf, RADII), encircled_energy(measured, RADII), atol=0.01
@@ -119,7 +119,7 @@ def test_stars_near_edges_are_counted(truth, field):
     psf = psf_from_stars(images[0], table, pixel_scale=SCALE * u.arcsec, max_iterations=2)
     assert (psf.meta["n_stamps"], psf.meta["n_left_out"]) == (9, 2)
     # relative to the stamp if nothing else is said
-    assert psf.meta["enclosed"] == pytest.approx(1, abs=1e-6)
+    assert psf.enclosed == pytest.approx(1, abs=1e-6)
 
 
 def test_refuses(field):

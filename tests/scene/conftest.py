@@ -7,6 +7,8 @@ from astropy.wcs import WCS
 from photutils.psf import ImagePSF
 from scipy.special import erf
 
+from miricigale.psf import InstrumentPSF
+
 CENTER = SkyCoord(53.13440 * u.deg, -27.83444 * u.deg)
 
 
@@ -30,11 +32,13 @@ def tan_wcs(shape=(90, 100), scale=0.11, pa=0.0, parity=-1):
     return wcs
 
 
-def gaussian_psf(sigma=0.85, oversampling=4, half=9, **meta):
+def gaussian_psf(sigma=0.85, oversampling=4, half=9, **facts):
     grid = pixel_gaussian(2 * half * oversampling + 1, half * oversampling, sigma, 1 / oversampling)
-    psf = ImagePSF(np.outer(grid, grid), oversampling=oversampling)
-    psf.meta.update(meta)
-    return psf
+    data = np.outer(grid, grid)
+    if not facts:
+        return ImagePSF(data, oversampling=oversampling)
+    facts = {"pixel_scale": 0.11 * u.arcsec, "frame": "detector", **facts}
+    return InstrumentPSF(data, oversampling=oversampling, **facts)
 
 
 def make_catalog(wcs, x, y, *, flux=10.0, profile="point", **columns):

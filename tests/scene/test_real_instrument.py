@@ -44,7 +44,7 @@ def test_goodss_through_the_imager():
     y, x = np.mgrid[80:120, 130:170]
     star = ImagePSF(psf.data, oversampling=psf.oversampling, x_0=150.3, y_0=99.6, flux=1e4)(x, y)
     np.testing.assert_allclose(light[80:120, 130:170], star, atol=1e-3 * star.max())
-    assert set(image.meta["psf_includes"]) == set(psf.meta["includes"])
+    assert set(image.meta["psf_includes"]) == set(psf.includes)
 
 
 @pytest.mark.parametrize("subarray", ["FULL", "BRIGHTSKY", "SUB256"])

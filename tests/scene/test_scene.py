@@ -233,7 +233,7 @@ def test_the_same_on_any_number_of_threads(wcs, psf):
 
 
 def test_image_says_what_it_is(wcs):
-    psf = tools.gaussian_psf(includes=("pixel", "ipc"), pixel_scale=0.11, frame="detector")
+    psf = tools.gaussian_psf(includes=("pixel", "ipc"), frame="detector")
     catalog = tools.make_catalog(wcs, 50, 45)
     image = Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, background=3 * u.MJy / u.sr).render()
     assert image.unit == u.MJy / u.sr
@@ -252,8 +252,8 @@ def test_refuses(wcs, psf):
     with pytest.raises(ValueError, match="'psf' must be a photutils ImagePSF, got ndarray"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=np.ones((3, 3)))
     with pytest.raises(ValueError, match=r"pixels of 0\.0600 arcsec where the WCS has 0\.1100"):
-        Scene(catalog, filter=FILTER, wcs=wcs, psf=tools.gaussian_psf(pixel_scale=0.06))
-    turned = tools.gaussian_psf(pixel_scale=0.11, frame="sky", angle=40.0)
+        Scene(catalog, filter=FILTER, wcs=wcs, psf=tools.gaussian_psf(pixel_scale=0.06 * u.arcsec))
+    turned = tools.gaussian_psf(frame="sky", angle=40.0 * u.deg)
     with pytest.raises(ValueError, match=r"turned by 40\.0 deg"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=turned)
     Scene(catalog, filter=FILTER, wcs=tools.tan_wcs(pa=40.0), psf=turned)

@@ -1,0 +1,133 @@
+"""PSFs of WFC3/IR mosaics."""
+
+import functools
+import math
+
+import astropy.units as u
+import numpy as np
+from scipy.optimize import brentq
+
+from miricigale.psf import _core
+from miricigale.psf.effects import detector_response
+from miricigale.psf.model import make_psf
+from miricigale.psf.optics import hst_pupil, polychromatic_psf
+from miricigale.psf.telescope import band_quantiles, checked_grid, filter_name, odd_cells
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import ANGLE, to_array
+
+__all__ = ["WFC3_FILTERS", "hst_psf"]
+
+WFC3_FILTERS = ("wfc3.f105w", "wfc3.f125w", "wfc3.f140w", "wfc3.f160w")
+
+#: Width of the WFC3/IR pixel in arcsec and of the drop relative to it in the mosaics.
+_WFC3_PIXEL, _WFC3_PIXFRAC = 0.128, 0.8
+
+
+@functools.lru_cache(maxsize=8)
+def _hst_optics(name, cell, n, n_wavelengths, angle):
+    pupil = hst_pupil(angle=angle)
+    waves = band_quantiles(name, n_wavelengths)
+    data = polychromatic_psf(pupil, np.zeros((pupil.n, pupil.n)), waves, step=cell, n=n)
+    data.flags.writeable = False
+    return data
+
+
+def _hst_blurred(data, oversampling, scale, sigma):
+    boxes = (_WFC3_PIXEL / scale, _WFC3_PIXEL * _WFC3_PIXFRAC / scale)
+    return detector_response(data, oversampling=oversampling, boxes=boxes, jitter=sigma / scale)
+
+
+@functools.lru_cache(maxsize=16)
+def _hst_blur(name, fwhm, scale, n_wavelengths):
+    """Gaussian sigma in arcsec with which the mosaic's PSF has the width asked for."""
+    oversampling = max(1, math.ceil(scale / 0.015))
+    cell = scale / oversampling
+    middle = odd_cells(2.4, cell) // 2
+    data = _hst_optics(name, cell, 2 * middle + 1, n_wavelengths, 45.0)
+
+    def excess(sigma):
+        image = _hst_blurred(data, oversampling, scale, sigma)
+        return _core.half_maximum_width(image, middle, middle) * cell - fwhm
+
+    sharpest = fwhm + excess(0.0)
+    if sharpest > fwhm:
+        wanted = f"at least the {sharpest:.4f} arcsec that optics and pixels alone have"
+        raise argument_error("fwhm", wanted, f"{fwhm} arcsec")
+    return brentq(excess, 0.0, fwhm, xtol=1e-5)
+
+
+def hst_psf(
+    filter="wfc3.f160w",
+    *,
+    pixel_scale=0.06 * u.arcsec,
+    fwhm=None,
+    oversampling=4,
+    fov=None,
+    n_wavelengths=9,
+    angle=0.0 * u.deg,
+):
+    """
+    PSF of a north-up WFC3/IR mosaic.
+
+    The annular pupil with its vanes over the band, the detector's pixel (0.128 arcsec),
+    the drop (0.8 of it), the mosaic's pixel, and a Gaussian for all else (interpixel
+    capacitance, jitter, registration), so wide that the FWHM is the one asked for.
+
+    Parameters
+    ----------
+    filter : str or `~miricigale.filters.Filter`, optional
+        A WFC3/IR filter.
+    pixel_scale : `~astropy.units.Quantity`, optional
+        Pixel of the mosaic.
+    fwhm : `~astropy.units.Quantity`, optional
+        Of the mosaic's PSF. By default 0.20 arcsec at F160W, and in other filters what
+        the same blur gives.
+    oversampling : int, optional
+        Cells per mosaic pixel.
+    fov : `~astropy.units.Quantity`, optional
+        Width of the grid; 10 arcsec by default.
+    n_wavelengths : int, optional
+        Wavelengths per band, of equal weight.
+    angle : `~astropy.units.Quantity`, optional
+        Position angle of the telescope's +y; the vanes are at 45 deg to it.
+
+    Returns
+    -------
+    psf : `~photutils.psf.ImagePSF`
+        In the sky frame, normalised as `miri_psf`.
+
+    Raises
+    ------
+    KeyError
+        If there is no such filter.
+    ValueError
+        If the FWHM is below what optics and pixels have.
+
+    References
+    ----------
+    Krist, Hook & Stoehr 2011, SPIE 8127, 81270J; Skelton et al. 2014, ApJS 214, 24
+    (mosaics of 0.06 arcsec pixels).
+    """
+    name = filter_name(filter, WFC3_FILTERS)
+    oversampling, width = checked_grid(oversampling, fov, 10.0)
+    scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
+    if fwhm is None:
+        sigma = _hst_blur("wfc3.f160w", 0.20, scale, n_wavelengths)
+    else:
+        target = float(to_array(fwhm, ANGLE, "fwhm"))
+        sigma = _hst_blur(name, target, scale, n_wavelengths)
+    cell = scale / oversampling
+    # vanes at 45 deg to +y; on the sky an angle east of north is counter-clockwise
+    turn = float(to_array(angle, u.deg, "angle"))
+    data = _hst_optics(name, cell, odd_cells(width, cell), n_wavelengths, (45.0 + turn) % 360.0)
+    data = _hst_blurred(data, oversampling, scale, sigma) * oversampling**2
+    return make_psf(
+        data,
+        pixel_scale=pixel_scale,
+        oversampling=oversampling,
+        frame="sky",
+        includes=("pixel", "ipc", "jitter", "drizzle"),
+        filter=name,
+        total_known=True,
+        meta={"instrument": "WFC3/IR", "blur": sigma, "telescope_angle": turn},
+    )

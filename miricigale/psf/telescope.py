@@ -1,0 +1,126 @@
+"""What the PSFs of all instruments share: names, grids, wavelengths, the optics of JWST."""
+
+import dataclasses
+import functools
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.filters import Filter
+from miricigale.psf.optics import jwst_pupil, polychromatic_psf
+from miricigale.refdata import citations
+from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.units import ANGLE, WAVE, to_array
+
+__all__ = ["Telescope", "band_quantiles", "checked_grid", "filter_name", "odd_cells"]
+
+
+def filter_name(filter_, known):
+    """The name of a filter that has a PSF, out of the known ones."""
+    name = filter_ if isinstance(filter_, str) else getattr(filter_, "name", None)
+    if name not in known:
+        raise unknown_name("PSF for the filter", name, known)
+    return name
+
+
+@functools.lru_cache(maxsize=64)
+def band_quantiles(name, n, spectral_index=0.0):
+    """
+    Wavelengths of equal weight that stand for a band.
+
+    The photon rate of a source with ``F_nu ~ nu**spectral_index`` is cut into ``n``
+    equal parts; each is represented by its median.
+
+    Parameters
+    ----------
+    name : str
+        Name of the filter.
+    n : int
+        Number of wavelengths.
+    spectral_index : float, optional
+        Index of the spectrum.
+
+    Returns
+    -------
+    wavelengths : `~numpy.ndarray`, shape (n,)
+        In um, ascending, read-only.
+    """
+    band = Filter.from_name(name)
+    wave = to_array(band.wave, WAVE, "wave")
+    rate = np.asarray(band.throughput, dtype=float) * wave ** (-1.0 - spectral_index)
+    total = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(wave))])
+    inside = np.concatenate([[True], np.diff(total) > 0])
+    result = np.interp((np.arange(n) + 0.5) / n, total[inside] / total[-1], wave[inside])
+    result.flags.writeable = False
+    return result
+
+
+def odd_cells(width, cell):
+    """Odd number of cells that covers a width, nearest to it."""
+    return 2 * round(0.5 * width / cell - 0.5) + 1
+
+
+def checked_grid(oversampling, fov, default):
+    """Cells per pixel and width in arcsec of a PSF's grid."""
+    if isinstance(oversampling, float) or oversampling < 1:
+        raise argument_error("oversampling", "a positive integer", oversampling)
+    width = default if fov is None else float(to_array(fov, ANGLE, "fov"))
+    if not width > 0:
+        raise argument_error("fov", "positive", fov)
+    return int(oversampling), width
+
+
+@dataclasses.dataclass(frozen=True)
+class Telescope:
+    """
+    JWST and a band: light of a point source in the focal plane.
+
+    Attributes
+    ----------
+    filter : str
+        Name of the band.
+    angle : float
+        V3IdlYAngle of the detector in deg (see `jwst_pupil`).
+    wavefront_error : float
+        Root mean square in nm.
+    seed : int
+        The same telescope in all filters.
+    n_wavelengths, spectral_index, n_pupil
+        As for `~miricigale.psf.miri_psf`.
+    """
+
+    filter: str
+    angle: float
+    wavefront_error: float
+    seed: int
+    n_wavelengths: int
+    spectral_index: float
+    n_pupil: int
+
+    @classmethod
+    def of(cls, filter, angle, wavefront_error, seed, n_wavelengths, spectral_index, n_pupil):
+        """The telescope of the options of `~miricigale.psf.miri_psf`, checked."""
+        if isinstance(n_wavelengths, float) or n_wavelengths < 1:
+            raise argument_error("n_wavelengths", "a positive integer", n_wavelengths)
+        rms = float(to_array(wavefront_error, u.nm, "wavefront_error"))
+        options = int(n_wavelengths), float(spectral_index), int(n_pupil)
+        return cls(filter, angle, rms, int(seed), *options)
+
+    @property
+    def meta(self):
+        """Provenance of PSFs."""
+        return {
+            "wavefront_error": self.wavefront_error,
+            "seed": self.seed,
+            "citations": citations("psf.jwst_pupil"),
+        }
+
+    @functools.lru_cache(maxsize=8)  # noqa: B019 - by value, a telescope is a few numbers
+    def image(self, cell, n):
+        """Fraction of the light in each of n x n cells of ``cell`` arcsec, read-only."""
+        pupil = jwst_pupil(self.n_pupil, angle=self.angle)
+        opd = pupil.wavefront_error(self.wavefront_error, seed=self.seed)
+        waves = band_quantiles(self.filter, self.n_wavelengths, self.spectral_index)
+        data = polychromatic_psf(pupil, opd, waves, step=cell, n=n)
+        data.flags.writeable = False
+        return data
