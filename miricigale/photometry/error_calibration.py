@@ -1,15 +1,17 @@
 """Factors by which errors are multiplied, from sources of known flux."""
 
 import dataclasses
+from typing import ClassVar
 
 import numpy as np
 import scipy.sparse
+from astropy.stats import mad_std
 from astropy.table import QTable
 
-from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import read_ecsv, writing
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.tables import require_columns
+from miricigale.utils.unified import read_write
 from miricigale.utils.units import FNU
 
 __all__ = ["ErrorCalibration"]
@@ -41,6 +43,9 @@ class ErrorCalibration:
     meta : dict
         Provenance.
     """
+
+    io_module: ClassVar[str] = "miricigale.photometry.error_files"
+    read, write = read_write("the sources of a calibration")
 
     sources: QTable
     bins: QTable
@@ -142,32 +147,6 @@ class ErrorCalibration:
         meta = {**result.meta, "error_calibration": bins}
         return dataclasses.replace(result, **changed, meta=meta)
 
-    def write(self, path, *, overwrite=False):
-        """Write the table of sources, of which `read` makes the rest again."""
-        with writing(path):
-            table = self.sources.copy()
-            table.meta.clear()
-            table.meta.update(self.meta)
-            table.write(path, format="ascii.ecsv", overwrite=overwrite)
-
-    @classmethod
-    def read(cls, path):
-        """
-        Read what `write` wrote.
-
-        Raises
-        ------
-        `~miricigale.utils.exceptions.DataError`
-            If the file is missing or something else.
-        """
-        table = read_ecsv(path, wanted="a calibration of errors")
-        try:
-            found = cls.from_sources(table)
-        except (TypeError, ValueError) as err:
-            msg = f"{path} is no calibration of errors: {err}"
-            raise DataError(msg) from err
-        return dataclasses.replace(found, meta=dict(table.meta))
-
 
 _COLUMNS = {
     "low": "Least true flux over error by noise",
@@ -210,7 +189,7 @@ def _row(snr, pull, ratio, member):
         float(np.median(snr[member])),
         len(member),
         float(np.std(pull)),
-        float(1.4826 * np.median(np.abs(pull - middle))),
+        float(mad_std(pull)),
         float(np.mean(pull)),
         float(middle),
         float(np.median(ratio)) if len(ratio) else np.nan,

@@ -2,6 +2,7 @@
 
 import dataclasses
 import types
+from typing import ClassVar
 
 import astropy.units as u
 import numpy as np
@@ -17,11 +18,11 @@ from miricigale.photometry.error_curves import (
     measured_curve,
     same_rows,
 )
-from miricigale.utils.exceptions import DataError, argument_error, unknown_name
-from miricigale.utils.files import read_ecsv, writing
+from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.meta import provenance
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import error_column, require_columns
+from miricigale.utils.unified import read_write
 from miricigale.utils.units import FNU, to_array
 
 __all__ = ["YANG2021_DEPTHS", "ErrorModel"]
@@ -89,6 +90,9 @@ class ErrorModel:
     >>> print(f"{model.sigma(10 * u.uJy, 'wfc3.f160w'):.4f}")
     0.3001 uJy
     """
+
+    io_module: ClassVar[str] = "miricigale.photometry.error_files"
+    read, write = read_write("the curves of all bands")
 
     curves: dict
     meta: dict = dataclasses.field(default_factory=dict)
@@ -470,28 +474,6 @@ class ErrorModel:
     def from_table(cls, table):
         """Make the model of a table that `to_table` made."""
         return cls(curves_from_table(table), dict(table.meta))
-
-    def write(self, path, *, overwrite=False):
-        """Write the curves as an ECSV table."""
-        with writing(path):
-            self.to_table().write(path, format="ascii.ecsv", overwrite=overwrite)
-
-    @classmethod
-    def read(cls, path):
-        """
-        Read what `write` wrote.
-
-        Raises
-        ------
-        `~miricigale.utils.exceptions.DataError`
-            If the file is missing or something else.
-        """
-        table = read_ecsv(path, wanted="an error model")
-        try:
-            return cls.from_table(table)
-        except (TypeError, ValueError) as err:
-            msg = f"{path} is no error model: {err}"
-            raise DataError(msg) from err
 
     def plot(self, ax=None, *, filters=None):
         """

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import ClassVar
 
 import astropy.units as u
 import numpy as np
@@ -19,6 +20,7 @@ from miricigale.photometry.offsets import OffsetMap
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import check_seed
 from miricigale.utils.tables import error_column
+from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, FNU
 
 __all__ = ["ForcedPhotometryResult", "crowded"]
@@ -126,6 +128,9 @@ class ForcedPhotometryResult:
         Settings and provenance.
     """
 
+    io_module: ClassVar[str] = "miricigale.photometry.files"
+    read, write = read_write("the result (FITS), or its table (ECSV),")
+
     id: np.ndarray
     sky: SkyCoord
     flux: u.Quantity
@@ -161,6 +166,8 @@ class ForcedPhotometryResult:
     meta: dict = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
+        # a column refers to its table, and does not pickle
+        object.__setattr__(self, "sky", self.sky.copy())
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if isinstance(value, np.ndarray):

@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import dataclasses
+from typing import ClassVar
 
 import astropy.units as u
 import numpy as np
@@ -19,6 +20,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import single_threaded, thread_count
 from miricigale.utils.tables import require_columns, unique_ids
+from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE
 
 __all__ = ["SourceTemplates", "catalog_sources"]
@@ -63,6 +65,9 @@ class SourceTemplates:
     meta : dict
         Settings and provenance.
     """
+
+    io_module: ClassVar[str] = "miricigale.photometry.files"
+    read, write = read_write("the templates, bit for bit,")
 
     id: np.ndarray
     sky: SkyCoord
@@ -383,57 +388,14 @@ class SourceTemplates:
                 light[k] = one
         return light
 
-    def write(self, path, *, overwrite=False):
-        """
-        Write everything to a FITS file, from which `read` gets it back bit for bit.
-
-        Parameters
-        ----------
-        path : path-like
-            The file.
-        overwrite : bool, optional
-            Whether a file that is there is replaced.
-
-        Raises
-        ------
-        ValueError
-            If an id is text that FITS cannot hold, or the grid one that a header cannot.
-        """
-        from miricigale.photometry.source_files import write_templates
-
-        write_templates(self, path, overwrite=overwrite)
-
-    @classmethod
-    def read(cls, path):
-        """
-        Read templates that `write` made.
-
-        Parameters
-        ----------
-        path : path-like
-            The file.
-
-        Returns
-        -------
-        templates : `SourceTemplates`
-
-        Raises
-        ------
-        `~miricigale.utils.exceptions.DataError`
-            If the file is missing, something else or incomplete.
-        """
-        from miricigale.photometry.source_files import read_templates
-
-        return read_templates(cls, path)
-
     def __getstate__(self):
         # a WCS pickles through a header, which rounds its numbers
-        from miricigale.photometry.source_files import grid_text
+        from miricigale.photometry.files import grid_text
 
         return {**self.__dict__, "wcs": None if self.wcs is None else grid_text(self.wcs)}
 
     def __setstate__(self, state):
-        from miricigale.photometry.source_files import text_grid
+        from miricigale.photometry.files import text_grid
 
         wcs = None if state["wcs"] is None else text_grid(state["wcs"])
         self.__dict__.update({**state, "wcs": wcs})

@@ -12,7 +12,7 @@ from miricigale.psf.field import psf_at
 from miricigale.psf.kernels import MatchingKernel
 from miricigale.psf.model import PSFGrid
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.unified import unified_read, unified_write
+from miricigale.utils.unified import read_write
 
 __all__ = ["KernelField"]
 
@@ -60,28 +60,7 @@ class KernelField:
     """
 
     io_module: ClassVar[str] = "miricigale.psf.files"
-    read = unified_read(
-        """
-        Read what `write` wrote.
-
-        Parameters
-        ----------
-        path : path-like
-            The file.
-        """
-    )
-    write = unified_write(
-        """
-        Write the kernels and their places as FITS.
-
-        Parameters
-        ----------
-        path : path-like
-            The file.
-        overwrite : bool, optional
-            Whether a file that is there is replaced.
-        """
-    )
+    read, write = read_write("kernels and their places")
 
     kernels: tuple
     sky: SkyCoord

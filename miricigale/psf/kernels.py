@@ -18,7 +18,7 @@ from miricigale.psf.wiener import (
     wiener,
 )
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.unified import unified_read, unified_write
+from miricigale.utils.unified import read_write, unified_read
 from miricigale.utils.units import ANGLE, frozen_array, to_array
 
 __all__ = ["REGULARIZATIONS", "MatchingKernel"]
@@ -72,18 +72,7 @@ class MatchingKernel:
             As for `from_array`; for images only.
         """
     )
-    write = unified_write(
-        """
-        Write the kernel and its PSFs as FITS.
-
-        Parameters
-        ----------
-        path : path-like
-            The file.
-        overwrite : bool, optional
-            Whether a file that is there is replaced.
-        """
-    )
+    write = read_write("a kernel and its PSFs")[1]
 
     array: np.ndarray
     pixel_scale: u.Quantity

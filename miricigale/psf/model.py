@@ -10,7 +10,7 @@ from photutils.psf import GriddedPSFModel, ImagePSF
 
 from miricigale.psf import _core
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
-from miricigale.utils.unified import unified_read, unified_write
+from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, to_array
 
 __all__ = ["FRAMES", "InstrumentPSF", "PSFGrid", "from_photutils", "instrument_psf", "make_psf"]
@@ -72,28 +72,7 @@ class InstrumentPSF(ImagePSF):
     """
 
     io_module = "miricigale.psf.files"
-    read = unified_read(
-        """
-        Read a PSF that `write` wrote; see `~miricigale.psf.read_psf` for files of others.
-
-        Parameters
-        ----------
-        path : path-like
-            The file.
-        """
-    )
-    write = unified_write(
-        """
-        Write the PSF and all that is known of it to FITS.
-
-        Parameters
-        ----------
-        path : path-like
-            The file.
-        overwrite : bool, optional
-            Whether a file that is there is replaced.
-        """
-    )
+    read, write = read_write("a PSF and all that is known of it")
 
     def __init__(
         self,

@@ -6,7 +6,7 @@ import os
 from astropy.io import registry
 from astropy.io.registry import UnifiedReadWrite, UnifiedReadWriteMethod
 
-__all__ = ["register", "unified_read", "unified_write"]
+__all__ = ["read_write", "register", "unified_read", "unified_write"]
 
 _SUFFIXES = {"fits": (".fits", ".fit", ".fits.gz"), "ascii.ecsv": (".ecsv",)}
 
@@ -71,6 +71,44 @@ def unified_read(doc):
 def unified_write(doc):
     """Method ``write(path, *, format=None, overwrite=False)``; see `unified_read`."""
     return UnifiedReadWriteMethod(type("Write", (_Write,), {"__doc__": doc}))
+
+
+def read_write(what):
+    """
+    Class attributes ``read`` and ``write`` of a class whose files have no options of their own.
+
+    Parameters
+    ----------
+    what : str
+        What a file holds, such as ``"a PSF"``.
+
+    Returns
+    -------
+    read, write
+        See `unified_read`.
+    """
+    path = "Parameters\n----------\npath : path-like\n    The file.\n"
+    read = f"""
+Read {what} from a file that `write` made.
+
+{path}
+Raises
+------
+`~miricigale.utils.exceptions.DataError`
+    If the file is missing, something else or incomplete.
+"""
+    write = f"""
+Write {what} to a file, from which `read` gets it back.
+
+{path}overwrite : bool, optional
+    Whether a file that is there is replaced.
+
+Raises
+------
+OSError
+    If the file is there and ``overwrite`` is not set.
+"""
+    return unified_read(read), unified_write(write)
 
 
 def register(cls, *, read=None, write=None, name="fits"):

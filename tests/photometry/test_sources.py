@@ -16,7 +16,7 @@ from miricigale.photometry import (
     join_bands,
     measure_bands,
 )
-from miricigale.photometry.source_files import grid_text, text_grid
+from miricigale.photometry.files import grid_text, text_grid
 from miricigale.profiles import sersic_stamp
 from miricigale.psf import KernelField, MatchingKernel, gaussian_psf
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
@@ -201,7 +201,7 @@ def test_what_does_not_fit_is_refused(tools, scene, tmp_path):
     with pytest.warns(MiricigaleWarning, match="is it of the same image"):
         photometer.measure(images["one"], templates=blurred)
     high.write(tmp_path / "image.fits")
-    with pytest.raises(DataError, match="not a complete file of templates"):
+    with pytest.raises(DataError, match="holds no templates of sources"):
         SourceTemplates.read(tmp_path / "image.fits")
 
 

@@ -1,0 +1,282 @@
+"""What photometry keeps in files: results and templates."""
+
+import dataclasses
+import json
+
+import astropy.units as u
+import numpy as np
+import scipy.sparse
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.nddata import CCDData, StdDevUncertainty
+from astropy.table import QTable, Table
+from astropy.wcs import WCS
+
+from miricigale.photometry.cutouts import Cutout
+from miricigale.photometry.error_files import write_ecsv
+from miricigale.photometry.fields import SmoothField
+from miricigale.photometry.offsets import OffsetMap
+from miricigale.photometry.results import ForcedPhotometryResult
+from miricigale.photometry.shapes import FITTED, not_fitted
+from miricigale.photometry.sources import SourceTemplates
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.store import native, open_parts, write_parts
+from miricigale.utils.tables import ascii_ids
+from miricigale.utils.unified import register
+from miricigale.utils.units import SURFACE_BRIGHTNESS
+
+__all__ = ["grid_text", "text_grid"]
+
+
+def _exact(has_cd):
+    """Names of the numbers of a WCS that a header rounds."""
+    return ("crpix", "crval", "cd") if has_cd else ("crpix", "crval", "cdelt", "pc")
+
+
+def grid_text(wcs):
+    """
+    A WCS as text.
+
+    Parameters
+    ----------
+    wcs : `~astropy.wcs.WCS`
+        Celestial, of two axes.
+
+    Returns
+    -------
+    text : str
+        JSON: its header, and all digits of what a header rounds.
+
+    Raises
+    ------
+    ValueError
+        If a header cannot hold it, such as one with lookup tables.
+    """
+    exact = {name: getattr(wcs.wcs, name).tolist() for name in _exact(wcs.wcs.has_cd())}
+    cards = wcs.to_header(relax=True).cards
+    header = {c.keyword: c.value for c in cards if c.keyword not in ("COMMENT", "HISTORY", "")}
+    text = json.dumps({"header": header, **exact})
+    x = y = np.array([0.0, 1000.0])
+    again = text_grid(text).pixel_to_world_values(x, y)
+    if not np.allclose(again, wcs.pixel_to_world_values(x, y), rtol=0, atol=1e-9):
+        raise argument_error("wcs", "one that a FITS header can hold", f"{wcs!r}")
+    return text
+
+
+def text_grid(text):
+    """
+    The WCS that `grid_text` wrote.
+
+    Parameters
+    ----------
+    text : str
+        The text.
+
+    Returns
+    -------
+    wcs : `~astropy.wcs.WCS`
+    """
+    state = json.loads(text)
+    wcs = WCS(fits.Header(state["header"]))
+    has_cd = "cd" in state
+    if has_cd:
+        # the header has PC and CDELT instead
+        del wcs.wcs.pc
+    for name in _exact(has_cd):
+        setattr(wcs.wcs, name, state[name])
+    wcs.wcs.set()
+    return wcs
+
+
+def _sky_columns(sky):
+    icrs = sky.icrs
+    return {"ra": icrs.ra.deg, "dec": icrs.dec.deg}
+
+
+def _columns(table):
+    """Columns of a table that was read, without masks: what is not finite stays so."""
+    return {name: native(np.asarray(table[name])) for name in table.colnames}
+
+
+def _sky(columns):
+    return SkyCoord(columns.pop("ra"), columns.pop("dec"), unit="deg")
+
+
+def _write_templates(templates, path, *, overwrite=False):
+    names = ("sersic", "flags", "snr", "flux", "components")
+    table = {"id": ascii_ids(templates.id, "id"), **_sky_columns(templates.sky)}
+    table |= {k: getattr(templates, k) for k in names if getattr(templates, k) is not None}
+    table |= {f"fitted_{name}": templates.fitted[name] for name in FITTED.names}
+    layers = [
+        (row, one) for row, light in enumerate(templates.light) if light for one in light.layers
+    ]
+    rows = {
+        "row": np.array([row for row, _ in layers], int),
+        "corner": np.array([one.origin for _, one in layers], int).reshape(-1, 2),
+        "shape": np.array([one.data.shape for _, one in layers], int).reshape(-1, 2),
+        "noise": np.array([one.noise for _, one in layers], float),
+        "convolved": np.array([one.convolved for _, one in layers], bool),
+    }
+    pixels = np.concatenate([one.data.ravel() for _, one in layers] or [np.empty(0)])
+    arrays = {"pixels": pixels} | ({} if templates.psf is None else {"psf": templates.psf})
+    grid = None if templates.wcs is None else grid_text(templates.wcs)
+    write_parts(
+        path, "source-templates-2", text={"meta": templates.meta, "grid": grid}, arrays=arrays,
+        tables={"sources": Table(table), "layers": Table(rows)}, overwrite=overwrite,
+    )  # fmt: skip
+
+
+def _read_templates(path):
+    with open_parts(path, ("source-templates-2",), wanted="templates of sources") as parts:
+        columns, rows = (_columns(parts.table(name)) for name in ("sources", "layers"))
+        pixels = parts.array("pixels") if "pixels" in parts else np.empty(0)
+        light = [None] * len(columns["id"])
+        ends = np.cumsum(np.prod(rows["shape"], axis=1, dtype=int))
+        # the last layer of a source first: each is what is added to the one before
+        for k in range(len(ends) - 1, -1, -1):
+            h, w = (int(n) for n in rows["shape"][k])
+            row, origin = int(rows["row"][k]), tuple(int(c) for c in rows["corner"][k])
+            light[row] = Cutout(
+                pixels[ends[k] - h * w : ends[k]].reshape(h, w),
+                origin,
+                noise=float(rows["noise"][k]),
+                convolved=bool(rows["convolved"][k]),
+                rest=light[row],
+            )
+        fitted = not_fitted(len(light))
+        for name in FITTED.names:
+            fitted[name] = columns.pop(f"fitted_{name}")
+        grid = parts.text["grid"]
+        return SourceTemplates(
+            sky=_sky(columns),
+            **columns,
+            light=light,
+            fitted=fitted,
+            wcs=None if grid is None else text_grid(grid),
+            psf=parts.array("psf") if "psf" in parts else None,
+            meta=parts.text["meta"],
+        )
+
+
+#: Columns of a result's table, its quantities that are few, and its sparse matrices.
+_ROWS = [
+    "flux", "flux_err", "flux_err_noise", "flux_err_template", "flux_err_psf", "flags", "coverage",
+    "chi2", "residual_fraction", "template", "template_snr", "crowded", "x", "y", "flux_point",
+    "flux_point_err", "flux_positive",
+]  # fmt: skip
+_QUANTITIES = ("background", "background_err", "shift", "shift_err", "psf_fwhm")
+_MATRICES = ("covariance", "joint_covariance")
+
+
+def _given(result, names):
+    return {k: getattr(result, k) for k in names if getattr(result, k) is not None}
+
+
+def _write_result(result, path, *, overwrite=False):
+    residual = result.residual_image
+    arrays = {
+        "model": result.model_image.data,
+        "residual": residual.data,
+        "sigma": residual.uncertainty.array,
+        "mask": np.asarray(residual.mask),
+        **_given(result, ("noise_correlation",)),
+    }
+    for name, matrix in _given(result, _MATRICES).items():
+        arrays |= {f"{name}_{k}": getattr(matrix, k) for k in ("data", "indices", "indptr")}
+    text = {
+        "meta": result.meta,
+        "image_meta": residual.meta,
+        "wcs": grid_text(residual.wcs),
+        "quantities": {
+            k: (v.value, v.unit.to_string()) for k, v in _given(result, _QUANTITIES).items()
+        },
+    }
+    table = {"id": ascii_ids(result.id, "id"), **_sky_columns(result.sky)}
+    tables = {"sources": QTable({**table, **_given(result, _ROWS)})}
+    fields = {"background_field": result.background_field}
+    if result.offset_map is not None:
+        fields["offset_map"] = result.offset_map.field
+        tables["offsets"] = _without_sky(result.offset_map.sources)
+    if result.new_sources is not None:
+        tables["new"] = _without_sky(result.new_sources)
+    for name, field in fields.items():
+        if field is not None:
+            text[name] = {**dataclasses.asdict(field)}
+    write_parts(
+        path, "forced-photometry-1", text=text, arrays=arrays, tables=tables, overwrite=overwrite
+    )
+
+
+def _without_sky(table):
+    table = table.copy()
+    angles = _sky_columns(table["sky"])
+    table.remove_column("sky")
+    for name, values in angles.items():
+        table[name] = values
+    return table
+
+
+def _read_result(path):
+    with open_parts(path, ("forced-photometry-1",), wanted="forced photometry") as parts:
+        text = parts.text
+        wcs = text_grid(text["wcs"])
+        columns = _table(parts, "sources")
+        found = {name: columns[name] for name in columns.colnames if name != "sky"}
+        for name, (value, unit) in text["quantities"].items():
+            found[name] = value * u.Unit(unit)
+        n = len(columns)
+        for name, size in zip(_MATRICES, (n, 2 * n), strict=True):
+            if f"{name}_indptr" in parts:
+                arrays = [
+                    parts.array(f"{name}_{k}") if f"{name}_{k}" in parts else np.empty(0, kind)
+                    for k, kind in (("data", float), ("indices", np.int32), ("indptr", np.int32))
+                ]
+                found[name] = scipy.sparse.csr_array(tuple(arrays), shape=(size, size))
+        if "noise_correlation" in parts:
+            found["noise_correlation"] = parts.array("noise_correlation")
+        if "background_field" in text:
+            found["background_field"] = _field(text["background_field"])
+        if "offset_map" in text:
+            field = _field(text["offset_map"])
+            found["offset_map"] = OffsetMap(_table(parts, "offsets"), field, wcs)
+        if "new" in parts:
+            found["new_sources"] = _table(parts, "new")
+        options = {"unit": SURFACE_BRIGHTNESS, "wcs": wcs}
+        return ForcedPhotometryResult(
+            sky=columns["sky"],
+            **found,
+            model_image=CCDData(parts.array("model"), meta=dict(text["image_meta"]), **options),
+            residual_image=CCDData(
+                parts.array("residual"),
+                mask=parts.array("mask").astype(bool),
+                uncertainty=StdDevUncertainty(parts.array("sigma"), copy=False),
+                meta=dict(text["image_meta"]),
+                **options,
+            ),
+            meta=text["meta"],
+        )
+
+
+def _table(parts, name):
+    """A table with positions."""
+    read = parts.table(name)
+    columns = _columns(read)
+    sky = _sky(columns)
+    units = {k: read[k].unit for k in columns}
+    table = QTable({k: v if units[k] is None else v * units[k] for k, v in columns.items()})
+    table.add_column(sky, name="sky", index=1)
+    return table
+
+
+def _field(state):
+    coefficients = np.array(state["coefficients"])
+    return SmoothField(coefficients, tuple(state["shape"]), state["order"])
+
+
+register(SourceTemplates, read=_read_templates, write=_write_templates)
+register(ForcedPhotometryResult, read=_read_result, write=_write_result)
+register(
+    ForcedPhotometryResult,
+    write=lambda result, path, **options: write_ecsv(result.to_table(), path, **options),
+    name="ascii.ecsv",
+)
