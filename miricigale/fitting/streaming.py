@@ -6,7 +6,6 @@ import io
 import json
 import logging
 import os
-import re
 import warnings
 from dataclasses import fields
 from pathlib import Path
@@ -19,7 +18,6 @@ from astropy.table import vstack
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.likelihood import read_ids
 from miricigale.fitting.results import FitResults
-from miricigale.refdata.locate import file_sha256
 from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import (
     DataError,
@@ -29,11 +27,11 @@ from miricigale.utils.exceptions import (
     unknown_name,
 )
 from miricigale.utils.files import open_fits
-from miricigale.utils.lock import FolderLock
+from miricigale.utils.folder import RecordFolder
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed
 from miricigale.utils.row_files import open_rows
-from miricigale.utils.store import PARTIAL, native, plain_value, replacing
+from miricigale.utils.store import native, plain_value, replacing
 from miricigale.utils.tables import ascii_ids, error_column, require_columns
 from miricigale.utils.units import FNU
 
@@ -41,9 +39,8 @@ __all__ = ["FitResultsFiles", "fit_file", "open_results"]
 
 logger = logging.getLogger(__name__)
 
-_LOCK = "fit.lock"
-_MANIFEST = "manifest.json"
-_FORMAT = "miricigale-fitparts-1"
+_FORMAT = "miricigale-fitparts-2"
+_OLD_FORMAT = "miricigale-fitparts-1"
 _PACKAGES = ("miricigale", "numpy", "numba", "astropy")
 
 
@@ -149,17 +146,11 @@ def fit_file(
     options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
     inputs = _Inputs(rows, options, unit, fluxes)
     _check_ids(rows)
-    folder = Path(path_out)
     job = _job(fitter, rows, options | {"seed": seed}, {"hdu": hdu, "flux_unit": unit_text})
-    _check_folder(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    with FolderLock(folder, name=_LOCK, purpose="fit"):
-        for left in folder.glob(f"{PARTIAL}*"):
-            # of a fit that was killed
-            left.unlink()
-        manifest = _open_folder(folder, job, resume)
-        _fit_parts(fitter, inputs, folder, manifest, seed, executor, progress_bar)
-    return open_results(folder, model=fitter.model)
+    with _FitFolder(path_out) as folder:
+        _begin(folder, job, resume)
+        _fit_parts(fitter, inputs, folder, seed, executor, progress_bar)
+    return open_results(path_out, model=fitter.model)
 
 
 def _check_ids(rows):
@@ -175,19 +166,19 @@ def _check_ids(rows):
             raise
 
 
-def _fit_parts(fitter, inputs, folder, manifest, seed, executor, progress_bar):
+def _fit_parts(fitter, inputs, folder, seed, executor, progress_bar):
     """Fit the pieces whose parts are not there, and write them."""
     rows = inputs.rows
-    seen = _SeenIds()
-    n_old, n_new = 0, 0
+    seen, n_new = set(), 0
     with progress(show=progress_bar, total=rows.n_rows, desc="fit", unit="obj") as bar:
         for i in range(rows.n_chunks):
             start, stop = rows.span(i)
-            path = folder / _part_name(i)
-            if _is_whole(path, manifest["parts"].get(path.name)):
-                seen.add(_part_ids(path))
-                n_old += 1
+            name = _part_name(i)
+            if name in folder.records and folder.is_whole(name):
+                seen.update(_keys(_part_ids(folder.path(name))))
             else:
+                if name in folder.records:
+                    logger.warning("%s is damaged and is made again", folder.path(name))
                 table, options = inputs.take(i)
                 with warnings.catch_warnings():
                     if n_new:
@@ -195,7 +186,8 @@ def _fit_parts(fitter, inputs, folder, manifest, seed, executor, progress_bar):
                         text = "bands of the photometry"
                         warnings.filterwarnings("ignore", text, MiricigaleWarning)
                     try:
-                        repeated = seen.find(read_ids(table))
+                        keys = _keys(read_ids(table))
+                        repeated = np.array([key in seen for key in keys], dtype=bool)
                         results = fitter._fit_rows(
                             table, options, seed=seed, repeated=repeated, executor=executor
                         )
@@ -203,11 +195,22 @@ def _fit_parts(fitter, inputs, folder, manifest, seed, executor, progress_bar):
                         err.add_note(f"in rows {start} to {stop - 1} of {rows.path}")
                         raise
                 n_new += 1
-                manifest["parts"][path.name] = _write_part(results, path)
-                _write_manifest(folder, manifest)
-                seen.add(results.ids)
+                folder.save(name, lambda path, results=results: results.write(path))
+                folder.finish(
+                    name,
+                    "",
+                    {name: folder.describe(name)},
+                    rows=len(results),
+                    fitted=int(np.count_nonzero(results.fitted)),
+                )
+                seen.update(keys)
             bar.update(stop - start)
-    logger.info("%s: %d parts, %d of them from before", folder, rows.n_chunks, n_old)
+    logger.info("%s: %d parts, %d of them new", folder.folder, rows.n_chunks, n_new)
+
+
+def _keys(ids):
+    """Ids as a set knows them: numbers that are NaN are one."""
+    return [key if key == key else None for key in ids.tolist()]
 
 
 class _Inputs:
@@ -257,37 +260,32 @@ class _Inputs:
         return table, options
 
 
-class _SeenIds:
-    """Ids that occurred, in sorted runs whose lengths at least double: n log n, few bytes an id."""
-
-    def __init__(self):
-        self._runs = []
-
-    @staticmethod
-    def _bytes(ids):
-        # one byte a character in place of four
-        return np.char.encode(ids, "utf-8") if ids.dtype.kind == "U" else ids
-
-    def find(self, ids):
-        """Which of these ids occurred: array of bool."""
-        known, inverse = np.unique(np.asarray(ids), return_inverse=True)
-        known = self._bytes(known)
-        found = np.zeros(len(known), dtype=bool)
-        for run in self._runs:
-            place = np.minimum(np.searchsorted(run, known), len(run) - 1)
-            found |= (run[place] == known) | ((run[place] != run[place]) & (known != known))
-        return found[inverse]
-
-    def add(self, ids):
-        """Add ids."""
-        run = np.unique(self._bytes(np.asarray(ids)))
-        while self._runs and len(self._runs[-1]) <= len(run):
-            run = np.union1d(self._runs.pop(), run)
-        if len(run):
-            self._runs.append(run)
-
-
 # ------------------------------------------------------------------- folder and manifest
+
+
+class _FitFolder(RecordFolder):
+    """Folder of the parts of a fit: each a record of one file, the fit itself in the facts."""
+
+    purpose = "fit"
+    lock_name = "fit.lock"
+    records_name = "parts"
+    remedy = "results of fit_file need a folder of their own"
+
+    def parse(self, values):
+        """Facts and records; those of the layout before say sizes and checksums by themselves."""
+        facts, parts = super().parse(values)
+        facts["job"]["catalogue"]["rows"], facts["job"]["chunk_rows"]
+        if facts["format"] == _OLD_FORMAT:
+            parts = {
+                name: {
+                    "hash": "",
+                    "rows": part["rows"],
+                    "fitted": part["fitted"],
+                    "products": {name: {key: part[key] for key in ("sha256", "bytes")}},
+                }
+                for name, part in parts.items()
+            }
+        return facts | {"format": _FORMAT}, parts
 
 
 def _part_name(i):
@@ -324,67 +322,21 @@ def _job(fitter, rows, options, given):
     return job if options["seed"] is None else job | {"seed": options["seed"]}
 
 
-def _check_folder(folder):
-    """Refuse a folder of something else, before anything is made in it."""
-    if folder.exists() and not folder.is_dir():
-        msg = f"{folder} is a file; results of fit_file go to a folder"
-        raise DataError(msg)
-    if not folder.is_dir() or (folder / _MANIFEST).is_file():
-        return
-    # a fit that was killed at its first moment leaves these
-    ours = (_LOCK, PARTIAL)
-    if any(not entry.name.startswith(ours) for entry in folder.iterdir()):
-        msg = f"{folder} is not empty and holds no {_MANIFEST}; results need a folder of their own"
-        raise DataError(msg)
-
-
-def _open_folder(folder, job, resume):
-    """Manifest of the folder: the one that is there if it is of this fit, or a new one."""
+def _begin(folder, job, resume):
+    """Keep the parts of this fit, or remove those of another if ``resume`` is not set."""
     job = json.loads(json.dumps(job, default=plain_value))
-    if (folder / _MANIFEST).is_file():
-        manifest = _read_manifest(folder)
-        # a call that failed before its first part leaves nothing to keep
-        if resume and manifest["parts"]:
-            other = _differences(manifest["job"], job)
-            if other:
-                msg = f"{folder} holds results of another fit: {', '.join(other)} differ"
-                raise OtherResultsError(msg, "resume=False to replace them")
-            return manifest
-        for name in manifest["parts"]:
-            (folder / name).unlink(missing_ok=True)
+    # a call that failed before its first part leaves nothing to keep
+    if resume and folder.records:
+        other = _differences(folder.facts["job"], job)
+        if other:
+            msg = f"{folder.folder} holds results of another fit: {', '.join(other)} differ"
+            raise OtherResultsError(msg, "resume=False to replace them")
+        return
+    for key in list(folder.records):
+        folder.drop(key)
     versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
-    manifest = {"format": _FORMAT, "versions": versions, "job": job, "parts": {}}
-    _write_manifest(folder, manifest)
-    return manifest
-
-
-def _read_manifest(folder):
-    """Read the manifest of a folder, or say that it is none."""
-    path = Path(folder) / _MANIFEST
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        if manifest["format"] != _FORMAT:
-            msg = f"its format is {manifest['format']!r}, wanted {_FORMAT!r}"
-            raise ValueError(msg)
-        manifest["job"]["catalogue"]["rows"], manifest["job"]["chunk_rows"]
-        for name, record in manifest["parts"].items():
-            # parts are removed by these names
-            if not re.fullmatch(r"part-[0-9]{5,}\.fits", name):
-                msg = f"it names {name!r}, which is no part"
-                raise ValueError(msg)
-            record["rows"], record["fitted"], record["bytes"], record["sha256"]
-    except FileNotFoundError as err:
-        msg = f"{folder} holds no results of fit_file (no {_MANIFEST})"
-        raise DataError(msg) from err
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:
-        msg = f"{path} is no manifest of fit_file: {err}"
-        raise DataError(msg) from err
-    return manifest
-
-
-def _write_manifest(folder, manifest):
-    with replacing(folder / _MANIFEST) as partial:
-        partial.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+    folder.facts = {"format": _FORMAT, "versions": versions, "job": job}
+    folder.write_manifest()
 
 
 def _differences(old, new, prefix=""):
@@ -399,27 +351,6 @@ def _differences(old, new, prefix=""):
     # checksums say less than settings
     told = [name for name in out if name.split(".")[0] != "fitter"]
     return told or out
-
-
-def _write_part(results, path):
-    """Write a part; returns its record."""
-    results.write(path, overwrite=True)
-    return {
-        "rows": len(results),
-        "fitted": int(np.count_nonzero(results.fitted)),
-        "bytes": path.stat().st_size,
-        "sha256": file_sha256(path),
-    }
-
-
-def _is_whole(path, record):
-    """Whether a part is there as it was written."""
-    if record is None or not path.is_file():
-        return False
-    if path.stat().st_size == record["bytes"] and file_sha256(path) == record["sha256"]:
-        return True
-    logger.warning("%s is damaged and is made again", path)
-    return False
 
 
 # ----------------------------------------------------------------------- results in files
@@ -474,16 +405,20 @@ class FitResultsFiles:
 
     def __init__(self, path, *, model=None):
         self.path = Path(path)
-        self.manifest = _read_manifest(path)
         self.model = model
-        rows, size = self.manifest["job"]["catalogue"]["rows"], self.manifest["job"]["chunk_rows"]
-        self.n_parts = max(1, -(-rows // size))
-        parts = self.manifest["parts"]
+        folder = _FitFolder(path)
+        if not folder.facts:
+            msg = f"{path} holds no results of fit_file (no manifest)"
+            raise DataError(msg)
+        #: What was fitted, and how.
+        self.job = folder.facts["job"]
+        self.n_parts = max(1, -(-self.job["catalogue"]["rows"] // self.job["chunk_rows"]))
+        parts = folder.records
         names = [_part_name(i) for i in range(self.n_parts)]
         self.paths = tuple(self.path / name for name in names if name in parts)
         for item in self.paths:
             if not item.is_file():
-                msg = f"{self.path} has lost {item.name}, which its {_MANIFEST} names"
+                msg = f"{self.path} has lost {item.name}, which its manifest names"
                 raise DataError(msg)
         self._records = tuple(parts[item.name] for item in self.paths)
         self._kept = functools.lru_cache(maxsize=1)(self._read)

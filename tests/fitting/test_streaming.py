@@ -37,6 +37,9 @@ def assert_same(results, whole):
                 np.testing.assert_array_equal(joined, array, err_msg=name, strict=True)
 
 
+MANIFESTS = [".manifest.copy.json", "manifest.json"]
+
+
 class Stopped(Exception):
     pass
 
@@ -236,7 +239,7 @@ def test_a_killed_fit_goes_on(fitter, catalogue, tmp_path, moment):
     assert run().returncode == 0
     assert_same(open_results(out), FitResults.read(f"{out}.whole.fits"))
     names = sorted(item.name for item in out.iterdir())
-    assert names == ["manifest.json", "part-00000.fits", "part-00001.fits"]
+    assert names == [*MANIFESTS, "part-00000.fits", "part-00001.fits"]
 
 
 def test_a_full_disk_is_told_with_the_file_and_left_behind(fitter, catalogue, tmp_path, full_disk):
@@ -248,7 +251,7 @@ def test_a_full_disk_is_told_with_the_file_and_left_behind(fitter, catalogue, tm
         full_disk(20000),
     ):
         fit_file(fitter, path, out, chunk_rows=80)
-    assert [item.name for item in out.iterdir()] == ["manifest.json"]
+    assert sorted(item.name for item in out.iterdir()) == MANIFESTS
     with pytest.raises(OSError, match=r"fit\.lock"), full_disk(10):
         fit_file(fitter, path, out, chunk_rows=80)
     results = fit_file(fitter, path, out, chunk_rows=80)
@@ -284,7 +287,7 @@ def test_parts_of_another_fit_are_refused(fitter, grid, catalogue, tmp_path):
     catalogue.write(path, overwrite=True)
     refused(r"catalogue\.sha256")
     results = fit_file(fitter, path, out, chunk_rows=150, resume=False)
-    assert [item.name for item in sorted(out.iterdir())] == ["manifest.json", "part-00000.fits"]
+    assert [item.name for item in sorted(out.iterdir())] == [*MANIFESTS, "part-00000.fits"]
     assert_same(results, fitter.fit(catalogue))
 
 
@@ -405,6 +408,34 @@ def test_a_fit_that_was_killed_at_its_first_moment_goes_on(fitter, catalogue, tm
     assert not (out / "fit.lock").exists()
 
 
+def old_manifest(out, **more):
+    """Turn the manifest of a folder to that of the layout before, which has no checksum."""
+    new = json.loads((out / "manifest.json").read_text())
+    parts = {
+        name: {key: part[key] for key in ("rows", "fitted")} | part["products"][name]
+        for name, part in new["parts"].items()
+    }
+    old = {"format": "miricigale-fitparts-1", "versions": new["versions"], "job": new["job"]}
+    (out / "manifest.json").write_text(json.dumps(old | {"parts": parts | more}))
+    (out / ".manifest.copy.json").unlink()
+    return parts
+
+
+def test_folders_of_the_layout_before_are_read(fitter, catalogue, tmp_path):
+    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
+    catalogue.write(path)
+    want = fit_file(fitter, path, out, chunk_rows=80).to_table(["id", "mass_mean"])
+    old_manifest(out)
+    results = open_results(out)
+    assert repr(results).startswith("<FitResultsFiles of 150 objects, 146 fitted, 2 parts")
+    got = results.to_table(["id", "mass_mean"])
+    assert got["id"].tolist() == want["id"].tolist()
+    np.testing.assert_array_equal(got["mass_mean"].value, want["mass_mean"].value)
+    executor = Counting()
+    fit_file(fitter, path, out, chunk_rows=80, executor=executor)
+    assert executor.n_tasks == 0
+
+
 @pytest.mark.parametrize("resume", [True, False])
 @pytest.mark.parametrize("name", ["../victim", "{}/victim", "part-00000.fits/../../victim"])
 def test_a_manifest_that_names_other_files_is_refused(fitter, catalogue, tmp_path, name, resume):
@@ -413,30 +444,32 @@ def test_a_manifest_that_names_other_files_is_refused(fitter, catalogue, tmp_pat
     fit_file(fitter, path, out)
     (tmp_path / "victim").write_text("mine")
     name = name.format(tmp_path)
-    manifest = json.loads((out / "manifest.json").read_text())
-    manifest["parts"][name] = manifest["parts"]["part-00000.fits"]
-    (out / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(DataError, match=f"names '{re.escape(name)}', which is no part"):
+    known = json.loads((out / "manifest.json").read_text())["parts"]["part-00000.fits"]
+    old_manifest(out, **{name: {"rows": 1, "fitted": 1} | known["products"]["part-00000.fits"]})
+    with pytest.raises(DataError, match=f"'{re.escape(name)}' is not the name of a product"):
         fit_file(fitter, path, out, resume=resume)
     assert (tmp_path / "victim").read_text() == "mine"
     assert (out / "part-00000.fits").is_file()
 
 
-def test_links_under_temporary_names_are_not_followed(fitter, catalogue, tmp_path):
+def test_links_are_not_followed(fitter, catalogue, tmp_path):
     path, out = tmp_path / "catalogue.fits", tmp_path / "out"
     catalogue.write(path)
     (tmp_path / "victim").write_text("mine")
-    fit_file(fitter, path, out)
+    results = fit_file(fitter, path, out)
     for name in ("manifest.json", "part-00000.fits"):
         (out / f".partial-1-{name}").symlink_to(tmp_path / "victim")
     # a name is replaced, not what it points to
+    (tmp_path / "table.fits").symlink_to(tmp_path / "victim")
+    results.write_table(tmp_path / "table.fits", overwrite=True)
+    fit_file(fitter, path, out, resume=False)
+    assert not any(entry.is_symlink() for entry in out.iterdir())
+    assert not (tmp_path / "table.fits").is_symlink()
     (out / "part-00000.fits").unlink()
     (out / "part-00000.fits").symlink_to(tmp_path / "victim")
-    results = fit_file(fitter, path, out, resume=False)
-    (out / "table.fits").symlink_to(tmp_path / "victim")
-    results.write_table(out / "table.fits", overwrite=True)
+    with pytest.raises(DataError, match="symbolic link"):
+        fit_file(fitter, path, out, resume=False)
     assert (tmp_path / "victim").read_text() == "mine"
-    assert not any(entry.is_symlink() for entry in out.iterdir())
 
 
 def test_numbers_as_ids(fitter, catalogue, tmp_path):
@@ -487,10 +520,10 @@ def test_what_cannot_be_read_by_rows_is_refused(fitter, catalogue, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("mine")
     for resume in (True, False):
-        with pytest.raises(DataError, match="is not empty and holds no manifest"):
+        with pytest.raises(DataError, match="is not empty and is no fit's folder"):
             fit_file(fitter, good, tmp_path / "full", resume=resume)
     assert (tmp_path / "full" / "thesis.tex").read_text() == "mine"
-    with pytest.raises(DataError, match="is a file; results of fit_file go to a folder"):
+    with pytest.raises(DataError, match="need a folder of their own"):
         fit_file(fitter, good, good)
 
 
@@ -498,5 +531,5 @@ def test_a_folder_of_something_else_is_no_results(tmp_path):
     with pytest.raises(DataError, match="holds no results of fit_file"):
         open_results(tmp_path)
     (tmp_path / "manifest.json").write_text('{"format": "photos"}')
-    with pytest.raises(DataError, match=r"manifest.json is no manifest of fit_file: its format"):
+    with pytest.raises(DataError, match=r"neither manifest.json nor .* can be read"):
         open_results(tmp_path)
