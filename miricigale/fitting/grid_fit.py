@@ -8,10 +8,15 @@ import numpy as np
 
 from miricigale.fitting.engines.grid import GridEngine
 from miricigale.fitting.flags import FitFlags
-from miricigale.fitting.pairs import check_pairs, joint_names, joint_tables
-from miricigale.fitting.priors import GridPriors, grid_priors
+from miricigale.fitting.posterior import check_pairs, joint_names, joint_tables
+from miricigale.fitting.priors import (
+    GridPriors,
+    density_log_prior,
+    fixed_log_prior,
+    grid_priors,
+    known_redshifts,
+)
 from miricigale.fitting.quantities import DERIVED_LEVELS, OtherFraction, Quantities
-from miricigale.fitting.redshifts import density_log_prior, fixed_log_prior, known_redshifts
 from miricigale.fitting.results import FitResults
 from miricigale.fitting.samples import Samples
 from miricigale.utils.exceptions import argument_error
@@ -174,7 +179,7 @@ class GridFit:
     # ------------------------------------------------------------------------- fit
 
     def check_pairs(self, pairs):
-        """Check pairs of parameters; see `~miricigale.fitting.pairs.check_pairs`."""
+        """Check pairs of parameters; see `~miricigale.fitting.posterior.check_pairs`."""
         derived = (*self.quantities.names, getattr(self.fraction, "name", None))
         wanted = "of parameters of the grid ('sample' draws derived quantities jointly)"
         return check_pairs(pairs, self.priors.axes, self.constants, derived, wanted)

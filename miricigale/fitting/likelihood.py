@@ -7,8 +7,8 @@ import numpy as np
 
 from miricigale.filters import Filter
 from miricigale.fitting.flags import FitFlags
-from miricigale.fitting.rows import ObjectRows, PerObject
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU, to_array
 

@@ -9,8 +9,8 @@ from astropy.table import QTable
 from miricigale.fitting.flags import FitFlags
 from miricigale.fitting.posterior import cell_edges, cell_percentiles, check_levels, moments
 from miricigale.fitting.quantities import DERIVED_LEVELS, kept_percentiles
-from miricigale.fitting.rows import ObjectRows, PerObject, PerObjectDict
 from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.object_rows import ObjectRows, PerObject, PerObjectDict
 from miricigale.utils.tables import add_columns, error_column
 from miricigale.utils.unified import unified_read, unified_write
 from miricigale.utils.units import FNU

@@ -13,8 +13,8 @@ from miricigale.fitting.posterior import bin_cells, check_levels, node_cells
 from miricigale.fitting.priors import grid_priors
 from miricigale.fitting.quantities import ModelValues, check_draws
 from miricigale.fitting.results import labeled
-from miricigale.fitting.rows import ObjectRows, PerObject
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.tables import add_columns, error_column
 from miricigale.utils.unified import unified_read, unified_write
 from miricigale.utils.units import FNU, WAVE

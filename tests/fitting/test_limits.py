@@ -12,7 +12,7 @@ from scipy.stats import norm
 
 from miricigale.fitting import BayesFitter, FitFlags, FitResults, fit_file, leave_out, mock_analysis
 from miricigale.fitting.posterior import cell_edges
-from miricigale.fitting.samplers.scale import best_scale, chi2_at
+from miricigale.fitting.samplers.run import best_scale, chi2_at
 
 ERROR = {"band0": 0.1, "band1": 0.05, "band3": 0.2}
 FLOOR = {"band2": 0.15, "band3": 0.02}

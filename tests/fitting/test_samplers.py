@@ -13,8 +13,8 @@ from scipy import integrate, optimize, special, stats
 
 from miricigale.fitting import BayesFitter, FitFlags, FitResults, samplers
 from miricigale.fitting.samplers import space
-from miricigale.fitting.samplers.dynesty import Lockstep
-from miricigale.fitting.samplers.scale import best_scale, chi2_at
+from miricigale.fitting.samplers.packages import Lockstep
+from miricigale.fitting.samplers.run import best_scale, chi2_at
 from miricigale.sed import Parameter, SEDModel
 
 BANDS = ("b0", "b1", "b2", "b3")

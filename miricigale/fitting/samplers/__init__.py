@@ -1,6 +1,5 @@
 """Nested samplers for continuous parameters: what one is given, what it returns, and which there are."""
 
-import importlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,11 +15,8 @@ __all__ = [
     "get_sampler",
 ]
 
-#: Module of each sampler in this folder: its ``load`` imports the package.
-SAMPLERS = {
-    "nautilus": "miricigale.fitting.samplers.nautilus",
-    "dynesty": "miricigale.fitting.samplers.dynesty",
-}
+#: Samplers by name; those of other packages are in the module ``packages``, by the same names.
+SAMPLERS = ("nautilus", "dynesty")
 
 #: What to cite for them.
 CITATIONS = {
@@ -119,4 +115,6 @@ def get_sampler(engine):
         return engine
     if engine not in SAMPLERS:
         raise unknown_name("engine", engine, SAMPLERS)
-    return importlib.import_module(SAMPLERS[engine]).load()
+    from miricigale.fitting.samplers import packages
+
+    return getattr(packages, engine)()

@@ -7,8 +7,7 @@ import numpy as np
 
 from miricigale.filters import FilterSet
 from miricigale.fitting.flags import FitFlags
-from miricigale.fitting.pairs import check_pairs
-from miricigale.fitting.posterior import cell_edges
+from miricigale.fitting.posterior import cell_edges, check_pairs
 from miricigale.fitting.priors import GridAxis
 from miricigale.fitting.quantities import DERIVED_LEVELS
 from miricigale.fitting.results import FitResults

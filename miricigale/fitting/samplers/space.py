@@ -6,7 +6,7 @@ import numpy as np
 
 from miricigale.fitting.flags import FitFlags
 from miricigale.fitting.posterior import cell_edges
-from miricigale.fitting.redshifts import known_redshifts, read_density
+from miricigale.fitting.priors import known_redshifts, read_density
 from miricigale.utils.exceptions import argument_error, unknown_name
 
 __all__ = [
