@@ -8,6 +8,7 @@ from astropy.table import QTable
 
 from miricigale.cigale.catalog import read_table
 from miricigale.cigale.ini import parse_values
+from miricigale.cigale.names import cigale_names
 from miricigale.refdata import find_resource
 from miricigale.sed import components as c
 from miricigale.utils.exceptions import ConfigError
@@ -127,13 +128,16 @@ class Module:
         self.chain.replaced.append(f"{self.label(key)} = {text} by {value[0]:g}, the limit here")
         return value
 
-    def values(self, keys):
-        """Parameter name here to key there, or to key and factor, as `add` takes them."""
-        out = {}
-        for name, key in keys.items():
-            key, factor = key if isinstance(key, tuple) else (key, 1.0)
+    def values(self, kind):
+        """Values of the parameters of a component, each with its key in the file, for `add`."""
+        names = cigale_names({kind.role: self.name})
+        out, declared = {}, kind.declared()
+        # in the order of the names there, which is that of the axes of a grid
+        for name in sorted(declared, key=[*names, *declared].index):
+            theirs, _, factor = names.get(name, (name, None, 1.0))
+            key = _KEYS.get(name, theirs.rpartition(".")[2])
             numbers = self.numbers(key)
-            out[name] = (key, None if numbers is None else numbers * factor)
+            out[name] = (key, None if numbers is None else numbers / factor)
         return out
 
     def choose(self, better, plain, covers):
@@ -147,46 +151,13 @@ class Module:
 
 
 _IMF = {0: "Salpeter", 1: "Chabrier"}
-_MYR, _NM = 1e-3, 1e-3  # to Gyr, to um
+#: Keys in the file that are not the end of the name among the results.
+_KEYS = {"ebv": "E_BVs_young", "ebv_factor": "E_BVs_old_factor", "r_v_gas": "Rv"}
 
 
-#: Modules that are one component each: our names to theirs, or to theirs and a factor.
-_BURST = {"tau": ("tau_main", _MYR), "f_burst": "f_burst", "tau_burst": ("tau_burst", _MYR)}
-_DELAYED = _BURST | {"age": ("age_main", _MYR), "age_burst": ("age_burst", _MYR)}
-_DOUBLE = _BURST | {"age": ("age", _MYR), "age_burst": ("burst_age", _MYR)}
-_CF00 = {"av_ism": "Av_ISM", "mu": "mu", "slope_ism": "slope_ISM", "slope_bc": "slope_BC"}
-_CASEY = {"temperature_dust": "temperature", "emissivity_dust": "beta", "alpha_mir": "alpha"}
-_DL07 = {"u_min": "umin", "q_pah": "qpah", "gamma": "gamma"}
-_CURVE = {
-    "slope": "powerlaw_slope",
-    "uv_bump": "uv_bump_amplitude",
-    "uv_bump_wavelength": ("uv_bump_wavelength", _NM),
-    "uv_bump_width": ("uv_bump_width", _NM),
-}
-_CALZETTI = {"ebv": "E_BVs_young", "ebv_factor": "E_BVs_old_factor"} | _CURVE
-_STARBURST = {
-    "ebv_lines": "E_BV_lines",
-    "ebv_factor_stars": "E_BV_factor",
-    "r_v_gas": "Rv",
-} | _CURVE
-_SKIRTOR = {
-    "tau97": "t",
-    "p": "pl",
-    "q": "q",
-    "opening_angle": "oa",
-    "radius_ratio": "R",
-    "inclination": "i",
-    "disk_slope": "delta",
-    "frac_agn": "fracAGN",
-    "ebv_polar": "EBV",
-    "temperature_polar": "temperature",
-    "emissivity_polar": "emissivity",
-}
-
-
-def _plain(kind, keys, **options):
+def _plain(kind, **options):
     """Reader of a module without rules of its own."""
-    return lambda m: m.add(kind, m.values(keys), **options)
+    return lambda m: m.add(kind, m.values(kind), **options)
 
 
 def _sfhfromfile(m):
@@ -198,7 +169,7 @@ def _sfhfromfile(m):
         rates["time" if i == 0 else name] = np.asarray(table[name], dtype=float) * u.Unit(unit)
     columns = m.numbers("sfr_column", 1)
     m.chain.differs.append("sfhfromfile: one step of 1 Myr less at the same age")
-    values = {"sfh_index": ("sfr_column", columns - 1.0)} | m.values({"age": ("age", _MYR)})
+    values = m.values(c.TableSFH) | {"sfh_index": ("sfr_column", columns - 1.0)}
     m.add(c.TableSFH, values, table=rates)
 
 
@@ -224,8 +195,8 @@ def _nebular(m):
         m.ignore("logU", "zgas", "ne", "f_esc", "f_dust", "lines_width")
         m.chain.differs.append("nebular.emission = False: no gas at all")
         return
-    values = m.values({"log_u": "logU", "f_esc": "f_esc", "f_dust": "f_dust"})
-    zgas, stellar = m.numbers("zgas"), _metallicity(m.chain)
+    values = m.values(c.Nebular)
+    (_, zgas), stellar = values.pop("metallicity_gas"), _metallicity(m.chain)
     if m.numbers("ne", 100.0).tolist() != [100.0]:
         m.chain.left_out.append("nebular.ne")
     options = {"line_width": m.one("lines_width", 300.0), "gas": "stellar"}
@@ -251,24 +222,24 @@ def _metallicity(chain):
 
 def _modified_starburst(m):
     law = m.option("Ext_law_emission_lines", 1, {1: "mw", 2: "lmc", 3: "smc"})
-    m.add(c.ModifiedStarburst, m.values(_STARBURST), gas_law=law, ebv_scaling="cigale")
+    m.add(c.ModifiedStarburst, m.values(c.ModifiedStarburst), gas_law=law, ebv_scaling="cigale")
 
 
 def _dale2014(m):
     if np.any(m.numbers("fracAGN", 0.0) != 0.0):
         m.chain.left_out.append("dale2014.fracAGN")
     kind, why = m.choose(c.Dale2014, c.DraineLi2007Alpha, lambda _: None)
-    m.add(kind, m.values({"alpha": "alpha"}), why=why)
+    m.add(kind, m.values(kind), why=why)
 
 
 def _dl2007(m):
     if m.numbers("umax", 1e6).tolist() != [1e6]:
         m.chain.replaced.append("dl2007.umax by 1e6")
-    m.add(c.DraineLi2007, m.values(_DL07))
+    m.add(c.DraineLi2007, m.values(c.DraineLi2007))
 
 
 def _skirtor2016(m):
-    values = m.values(_SKIRTOR)
+    values = m.values(c.Skirtor2016)
     options = {
         "polar_law": m.option("law", 0, {0: "smc", 1: "calzetti", 2: "gaskell"}),
         # files of older versions have no choice
@@ -319,16 +290,16 @@ def _redshifting(m):
 
 
 _MODULES = {
-    "sfhdelayed": _plain(c.DelayedSFH, _DELAYED),
-    "sfh2exp": _plain(c.DoubleExponentialSFH, _DOUBLE),
+    "sfhdelayed": _plain(c.DelayedSFH),
+    "sfh2exp": _plain(c.DoubleExponentialSFH),
     "sfhfromfile": _sfhfromfile,
     "bc03": _bc03,
     "nebular": _nebular,
-    "dustatt_calzleit": _plain(c.CalzettiLeitherer, _CALZETTI, ebv_scaling="cigale"),
+    "dustatt_calzleit": _plain(c.CalzettiLeitherer, ebv_scaling="cigale"),
     "dustatt_modified_starburst": _modified_starburst,
-    "dustatt_modified_CF00": _plain(c.CharlotFall, _CF00),
+    "dustatt_modified_CF00": _plain(c.CharlotFall),
     "dale2014": _dale2014,
-    "casey2012": _plain(c.Casey2012, _CASEY),
+    "casey2012": _plain(c.Casey2012),
     "dl2007": _dl2007,
     "skirtor2016": _skirtor2016,
     "xray": _xray,

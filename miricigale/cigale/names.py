@@ -202,7 +202,6 @@ def band_filters(bands, known):
 # our name, CIGALE's, CIGALE's unit
 _PARAMETERS = (
     ("redshift", "universe.redshift", ""),
-    ("frac_agn", "agn.fracAGN", ""),
     ("tau97", "agn.t", ""),
     ("p", "agn.pl", ""),
     ("q", "agn.q", ""),
@@ -210,6 +209,7 @@ _PARAMETERS = (
     ("radius_ratio", "agn.R", ""),
     ("inclination", "agn.i", "deg"),
     ("disk_slope", "agn.delta", ""),
+    ("frac_agn", "agn.fracAGN", ""),
     ("ebv_polar", "agn.EBV", "mag"),
     ("temperature_polar", "agn.temperature", "K"),
     ("emissivity_polar", "agn.emissivity", ""),
