@@ -87,10 +87,11 @@ def write_cigale_results(
 
 def _columns(results, names, variables):
     """CIGALE's name to mean, standard deviation (None if not wanted), best value and unit."""
-    constants = results.meta.get("fit", {}).get("constants", {})
-    options = results.meta.get("grid", {}).get("options") or ()
-    if "nebular: gas = stellar" in options:
-        constants = {name: x for name, x in constants.items() if name != "metallicity_gas"}
+    constants = dict(results.constants)
+    gas = [part.gas for part in getattr(results.model, "components", ()) if part.role == "nebular"]
+    if gas != ["free"]:
+        # it has that of the stars
+        constants.pop("metallicity_gas", None)
     columns = {}
     for ours, (theirs, unit, factor) in names.items():
         if ours in results.parameters:

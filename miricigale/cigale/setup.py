@@ -2,7 +2,6 @@
 
 import dataclasses
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from miricigale.cigale.ini import LIMIT_FLAGS, parse_ini
 from miricigale.cigale.modules import read_modules
 from miricigale.cigale.names import band_filters, cigale_names
 from miricigale.cigale.results import write_cigale_results
-from miricigale.fitting import BayesFitter
+from miricigale.fitting import BayesFitter, FitResults
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError, MiricigaleWarning, argument_error
 from miricigale.utils.tables import error_column, require_columns
@@ -239,8 +238,8 @@ class CigaleSetup:
             "replaced": list(self.replaced),
             "differs": list(self.differs),
         }
-        changed = dataclasses.replace(results, meta=dict(results.meta) | {"cigale": note})
-        return changed.with_model(self.model())
+        meta = dict(results.meta) | {"cigale": note}
+        return dataclasses.replace(results, meta=meta, model=self.model())
 
     def write_results(self, results, path, *, overwrite=False):
         """Write results as `write_cigale_results` does, with the names of this configuration."""
@@ -264,19 +263,8 @@ def _by_redshift(fitter, photometry, z, known):
         return free
     # all objects go through both, so that ids that are there twice are found as such
     at = fitter.fit(photometry, redshift=np.where(fixed, z, fitter.grid.redshift[0]), **known)
-    values = {}
-    for item in dataclasses.fields(free):
-        one, two = getattr(at, item.name), getattr(free, item.name)
-        values[item.name] = _join(one, two, fixed) if item.name != "meta" else two
-    return type(free)(**values)
-
-
-def _join(one, two, fixed):
-    if isinstance(one, np.ndarray) and one.ndim and len(one) == len(fixed):
-        return np.where(fixed.reshape(-1, *[1] * (one.ndim - 1)), one, two)
-    if isinstance(one, Mapping) and one and all(isinstance(x, np.ndarray) for x in one.values()):
-        return {name: _join(one[name], two[name], fixed) for name in one}
-    return two
+    rows = np.concatenate([np.flatnonzero(~fixed), np.flatnonzero(fixed)])
+    return FitResults.concatenate([free[~fixed], at[fixed]])[np.argsort(rows)]
 
 
 def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):

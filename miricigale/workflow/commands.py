@@ -58,65 +58,43 @@ def plan_table(*, quick=False):
     """
     from astropy.coordinates import SkyCoord
 
-    from miricigale.depth import proposal_limit, saturation_forecast, scaled_limit
+    from miricigale.depth import proposal_limit, saturation_forecast, scaled_limit, sensitivity
     from miricigale.instrument import ceers_exposures, psf_fwhm
 
     exposures = ceers_exposures(SkyCoord(0 * u.deg, 0 * u.deg), 0 * u.deg, quick=quick)
-    names = list(dict.fromkeys(e.filter for e in exposures))
     rows = []
-    for name in names:
+    for name in dict.fromkeys(e.filter for e in exposures):
         mine = [e for e in exposures if e.filter == name]
-        time = u.Quantity([e.exposure_time for e in mine]).sum()
-        rows.append(
-            (
-                name,
-                mine[0].n_groups,
-                mine[0].n_integrations,
-                len(mine),
-                np.round(time.to(u.s), 1),
-                round(float(saturation_forecast(mine[0])), 3),
-                np.round(scaled_limit(name, time).to(u.ABmag), 2),
-                np.round(_limit(mine, time).to(u.ABmag), 2),
-                np.round(proposal_limit(name), 2),
-                psf_fwhm(name),
-            )
+        first, time = mine[0], u.Quantity([e.exposure_time for e in mine]).sum()
+        limit = sensitivity(
+            name,
+            time,
+            n_sigma=5,
+            residual="etc",
+            n_groups=first.n_groups,
+            n_dithers=len(mine),
+            readout=first.readout,
+            subarray=first.subarray,
         )
-    columns = ("filter", "groups", "integrations", "dithers", "time", "sky_in_well")
-    columns += ("limit_etc", "limit", "limit_proposal", "fwhm")
-    return QTable(rows=rows, names=columns)
-
-
-def _limit(exposures, time):
-    """Our own limit of the dithers of one band."""
-    from miricigale.depth import sensitivity
-
-    first = exposures[0]
-    return sensitivity(
-        first.filter,
-        time,
-        n_sigma=5,
-        residual="etc",
-        n_groups=first.n_groups,
-        n_dithers=len(exposures),
-        readout=first.readout,
-        subarray=first.subarray,
-    )
+        rows.append(
+            {
+                "filter": name,
+                "groups": first.n_groups,
+                "integrations": first.n_integrations,
+                "dithers": len(mine),
+                "time": np.round(time.to(u.s), 1),
+                "sky_in_well": round(float(saturation_forecast(first)), 3),
+                "limit_etc": np.round(scaled_limit(name, time).to(u.ABmag), 2),
+                "limit": np.round(limit.to(u.ABmag), 2),
+                "limit_proposal": np.round(proposal_limit(name), 2),
+                "fwhm": psf_fwhm(name),
+            }
+        )
+    return QTable(rows)
 
 
 def fit_catalogue(
-    path,
-    output,
-    *,
-    axes="fit",
-    redshift=None,
-    model_error=0.1,
-    pairs=None,
-    flux_unit=None,
-    hdu=None,
-    chunk_rows=10000,
-    resume=True,
-    executor=None,
-    progress_bar=False,
+    path, output, *, axes="fit", model_error=0.1, hdu=None, chunk_rows=10000, **options
 ):
     """
     Fit a catalogue of photometry of any length with the chain of Yang et al. 2021.
@@ -129,12 +107,11 @@ def fit_catalogue(
         Folder of the results.
     axes : {"fit", "quick"}, optional
         Model grid; see `miricigale.sed.yang2021_axes`.
-    redshift : str, optional
-        Column of known redshifts; fitted if not given.
     model_error : float, optional
         Relative model error.
-    pairs, flux_unit, hdu, chunk_rows, resume, executor, progress_bar : optional
-        As for `miricigale.fitting.fit_file`.
+    hdu, chunk_rows, **options
+        As for `miricigale.fitting.fit_file`, such as ``redshift``, a column of known redshifts, and
+        ``resume``.
 
     Returns
     -------
@@ -181,16 +158,4 @@ def fit_catalogue(
     fitter = BayesFitter(
         SEDModel.yang2021(), bands, axes=SEDModel.yang2021_axes(axes), model_error=model_error
     )
-    return fit_file(
-        fitter,
-        path,
-        output,
-        redshift=redshift,
-        pairs=pairs,
-        flux_unit=flux_unit,
-        hdu=hdu,
-        chunk_rows=chunk_rows,
-        resume=resume,
-        executor=executor,
-        progress_bar=progress_bar,
-    )
+    return fit_file(fitter, path, output, hdu=hdu, chunk_rows=chunk_rows, **options)

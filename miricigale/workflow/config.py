@@ -214,53 +214,32 @@ class StudyConfig:
     report: ReportSection = dataclasses.field(default_factory=ReportSection)
 
     def __post_init__(self):
+        exposures, fit, n = self.exposures, self.fit, len(self.exposures.filters)
+        kernels, alpha, pixel = (
+            self.photometry.regularization,
+            self.sed.alpha,
+            self.highres.pixel_scale,
+        )
         for key in ("n_groups", "n_integrations", "n_dithers"):
-            values = getattr(self.exposures, key)
-            if values and len(values) != len(self.exposures.filters):
-                msg = (
-                    f"[exposures] {key} must have one number per filter "
-                    f"({len(self.exposures.filters)}), got {len(values)}"
-                )
-                raise ConfigError(msg)
-            if any(value < 1 for value in values):
-                msg = f"[exposures] {key} must be at least 1, got {min(values)}"
-                raise ConfigError(msg)
-        if not self.exposures.filters:
-            msg = "[exposures] filters must name at least one filter, got none"
-            raise ConfigError(msg)
-        if len(set(self.exposures.filters)) != len(self.exposures.filters):
-            msg = f"[exposures] filters must not repeat, got {list(self.exposures.filters)}"
-            raise ConfigError(msg)
-        if len(self.sed.alpha) != 2 or not 0 < self.sed.alpha[0] <= self.sed.alpha[1] <= 4:
-            msg = f"[sed] alpha must be two numbers in order, above 0 to 4, got {list(self.sed.alpha)}"
-            raise ConfigError(msg)
-        if self.fit.min_detected > len(self.exposures.filters):
-            msg = (
-                f"[fit] min_detected must be at most the number of MIRI filters "
-                f"({len(self.exposures.filters)}), got {self.fit.min_detected}"
-            )
-            raise ConfigError(msg)
-        if len(self.fit.bands) != len(self.fit.depths):
-            msg = (
-                f"[fit] depths must have one number per band ({len(self.fit.bands)}), "
-                f"got {len(self.fit.depths)}"
-            )
-            raise ConfigError(msg)
-        pixel = self.highres.pixel_scale
-        if self.photometry.method == "yang2021" and pixel != 0.06:
-            msg = f"[highres] pixel_scale must be 0.06 with method = 'yang2021', got {pixel}"
-            raise ConfigError(msg)
-        if self.photometry.regularization not in ("auto", "yang2021"):
-            try:
-                positive = float(self.photometry.regularization) > 0
-            except ValueError:
-                positive = False
-            if not positive:
-                msg = (
-                    "[photometry] regularization must be 'auto', 'yang2021' or a positive "
-                    f"number as text, got {self.photometry.regularization!r}"
-                )
-                raise ConfigError(msg)
+            values = getattr(exposures, key)
+            wanted = f"must have one number per filter ({n})"
+            _require(len(values) in (0, n), "exposures", key, wanted, len(values))
+            least = min(values, default=1)
+            _require(least >= 1, "exposures", key, "must be at least 1", least)
+        _require(n, "exposures", "filters", "must name at least one filter", "none")
+        names = list(exposures.filters)
+        _require(len(set(names)) == n, "exposures", "filters", "must not repeat", names)
+        good = len(alpha) == 2 and 0 < alpha[0] <= alpha[1] <= 4
+        _require(good, "sed", "alpha", "must be two numbers in order, above 0 to 4", list(alpha))
+        wanted = f"must be at most the number of MIRI filters ({n})"
+        _require(fit.min_detected <= n, "fit", "min_detected", wanted, fit.min_detected)
+        wanted = f"must have one number per band ({len(fit.bands)})"
+        _require(len(fit.bands) == len(fit.depths), "fit", "depths", wanted, len(fit.depths))
+        good = self.photometry.method != "yang2021" or pixel == 0.06
+        _require(good, "highres", "pixel_scale", "must be 0.06 with method = 'yang2021'", pixel)
+        good = kernels in ("auto", "yang2021") or _is_positive(kernels)
+        wanted = "must be 'auto', 'yang2021' or a positive number as text"
+        _require(good, "photometry", "regularization", wanted, repr(kernels))
 
     @classmethod
     def from_dict(cls, values, *, base=None):
@@ -319,6 +298,19 @@ class StudyConfig:
                 lines.append(f"# {entry.metadata['doc']}{_limits_text(entry.metadata)}")
                 lines.append(f"{entry.name} = {_toml_value(getattr(section, entry.name))}")
         return "\n".join(lines) + "\n"
+
+
+def _require(good, section, key, wanted, got):
+    if not good:
+        msg = f"[{section}] {key} {wanted}, got {got}"
+        raise ConfigError(msg)
+
+
+def _is_positive(text):
+    try:
+        return float(text) > 0
+    except ValueError:
+        return False
 
 
 def _limits_text(limits):

@@ -115,7 +115,7 @@ def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, tell=N
 @stage(
     "exposures",
     "exposure",
-    version=3,
+    version=4,
     needs=("truth",),
     sections=(*IMAGES, "run.keep_level1b"),
     resources=EXPOSURE_RESOURCES,
@@ -154,6 +154,7 @@ def make_exposure(context, unit):
 @stage(
     "mosaics",
     "mosaic",
+    version=2,
     needs=("exposures",),
     sections=(*GRID, "reduction", "highres.pixel_scale"),
     units=band_names,
