@@ -15,7 +15,7 @@ __all__ = ["command", "main"]
 
 def _parser():
     parser = argparse.ArgumentParser(
-        prog="miricigale", description="Plan and analyse JWST/MIRI deep imaging."
+        prog="miricigale", description="Plan and analyze JWST/MIRI deep imaging."
     )
     parser.add_argument("--version", action="store_true", help="print the version and stop")
     parser.add_argument("-v", "--verbose", action="store_true", help="say what is done")
@@ -42,7 +42,7 @@ def _parser():
     fit.add_argument(
         "photometry",
         type=Path,
-        metavar="CATALOGUE",
+        metavar="CATALOG",
         help="FITS or ECSV with id, <filter> and <filter>_err; CSV with --flux-unit",
     )
     fit.add_argument(
@@ -93,7 +93,7 @@ def _parser():
 
     data = commands.add_parser("data", help="reference data: list, check or add")
     actions = data.add_subparsers(dest="action", metavar="ACTION", required=True)
-    listing = actions.add_parser("list", help="what there is, where, its licence, what to cite")
+    listing = actions.add_parser("list", help="what there is, where, its license, what to cite")
     listing.add_argument("pattern", nargs="?", default="", help="part of the name")
     listing.set_defaults(call=_data_list)
     check = actions.add_parser("check", help="whether each file is there and whole")
@@ -233,12 +233,12 @@ def _run(args):
 def _fit(args):
     from miricigale.utils.exceptions import OtherResultsError
     from miricigale.utils.parallel import thread_count, thread_pool
-    from miricigale.workflow.commands import fit_catalogue
+    from miricigale.workflow.commands import fit_catalog
 
     n_threads = thread_count(args.threads or None)
     try:
         with thread_pool(n_threads) as executor:
-            results = fit_catalogue(
+            results = fit_catalog(
                 args.photometry,
                 args.output,
                 **_chosen(args, "axes redshift model_error pairs flux_unit chunk_rows resume"),
@@ -342,7 +342,7 @@ def _data_list(args):
         else:
             state = f"absent; miricigale data add {name} PATH"
         print(f"{name} ({record.kind}): {state}")
-        lines = [record.title, f"licence: {record.licence}", f"cite: {record.citation}"]
+        lines = [record.title, f"license: {record.licence}", f"cite: {record.citation}"]
         if record.file and path is None:
             lines.append(f"source: {record.source}")
         for line in lines:

@@ -79,7 +79,7 @@ def main():
         "redshifts": figures.redshift_figure(sample, fits),
         "fractions": figures.fraction_figure(fits, config.sed.frac_agn),
         "example": figures.example_figure(results, truth, typical, SEDModel.yang2021()),
-        "colour": pictures.field_figure(
+        "color": pictures.field_figure(
             [read_image(run / f"mosaic_{name}.fits") for name in chosen],
             read_image(run / "f160w.fits"),
             [*chosen, config.highres.filter],

@@ -1,4 +1,4 @@
-"""Files of CIGALE (Boquien et al. 2019): catalogues, configurations and results."""
+"""Files of CIGALE (Boquien et al. 2019): catalogs, configurations and results."""
 
 from miricigale.utils.lazy import lazy_names
 

@@ -1,4 +1,4 @@
-"""Catalogues of photometry as CIGALE reads them."""
+"""Catalogs of photometry as CIGALE reads them."""
 
 import warnings
 from pathlib import Path
@@ -26,7 +26,7 @@ _OWN = ("id", "redshift", "distance")
 
 def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=False):
     """
-    Read a catalogue of photometry in CIGALE's format.
+    Read a catalog of photometry in CIGALE's format.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     """
     path = Path(path)
     bands = None if bands is None else list(bands)
-    table = read_table(path, "a catalogue of CIGALE")
+    table = read_table(path, "a catalog of CIGALE")
     for name in ("id", "redshift"):
         if name not in table.colnames:
             msg = f"{path} has no column {name!r}, only {', '.join(table.colnames)}"

@@ -30,7 +30,7 @@ class CigaleSetup:
     path : `~pathlib.Path`
         The configuration.
     data_file : `~pathlib.Path` or None
-        The catalogue.
+        The catalog.
     components : tuple of `~miricigale.sed.Component`
         The chain.
     parameters : dict of str to `~numpy.ndarray`
@@ -152,14 +152,14 @@ class CigaleSetup:
         Parameters
         ----------
         path : path-like, optional
-            Another catalogue than that of the configuration.
+            Another catalog than that of the configuration.
         strict : bool, optional
             Whether a band without a filter is an error.
 
         Raises
         ------
         `~miricigale.utils.exceptions.ConfigError`
-            If the configuration names no catalogue.
+            If the configuration names no catalog.
         """
         path = self.data_file if path is None else path
         if path is None:
@@ -368,7 +368,7 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
 
 def fit_cigale(ini, *, output=None, libraries="best", names=None, strict=False, **options):
     """
-    Do what a run of CIGALE does: read configuration and catalogue, fit, write.
+    Do what a run of CIGALE does: read configuration and catalog, fit, write.
 
     Parameters
     ----------

@@ -13,15 +13,15 @@ __all__ = ["AssociationFlags", "associate", "match_truth"]
 
 
 class AssociationFlags(Flags):
-    """Why rows of two catalogues are no plain match."""
+    """Why rows of two catalogs are no plain match."""
 
-    #: More than one row of the second catalogue is within the radius of the row of the first.
+    #: More than one row of the second catalog is within the radius of the row of the first.
     SEVERAL_SECOND = 1
-    #: More than one row of the first catalogue is within the radius of the row of the second.
+    #: More than one row of the first catalog is within the radius of the row of the second.
     SEVERAL_FIRST = 2
-    #: The nearest row of the other catalogue is nearer to another one.
+    #: The nearest row of the other catalog is nearer to another one.
     NOT_MUTUAL = 4
-    #: No row of the other catalogue is within the radius.
+    #: No row of the other catalog is within the radius.
     NONE_NEAR = 8
     #: The position is not finite.
     NO_POSITION = 16
@@ -33,7 +33,7 @@ _STATUS = ("matched", "ambiguous", "unmatched")
 
 def associate(first, second, *, radius):
     """
-    Sort the rows of two catalogues into matched, ambiguous and unmatched ones.
+    Sort the rows of two catalogs into matched, ambiguous and unmatched ones.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def associate(first, second, *, radius):
     Returns
     -------
     table : `~astropy.table.QTable`
-        Every row of either catalogue once: those of the first in their order (with their
+        Every row of either catalog once: those of the first in their order (with their
         partner, if they have one), then those of the second without a partner. ``first`` and
         ``second`` are row numbers, -1 for none; ``first_id`` and ``second_id`` the ids of tables
         that have them (masked for none); ``separation`` (arcsec, NaN without partner); ``n_first``
@@ -99,11 +99,11 @@ def associate(first, second, *, radius):
     table["status"] = np.array(_STATUS)[status]
     table["reasons"] = reasons
     descriptions = {
-        "first": "Row of the first catalogue, -1 for none",
-        "second": "Row of the second catalogue, -1 for none",
+        "first": "Row of the first catalog, -1 for none",
+        "second": "Row of the second catalog, -1 for none",
         "separation": "Of the partners",
-        "n_second": "Rows of the second catalogue within the radius of the row of the first",
-        "n_first": "Rows of the first catalogue within the radius of the row of the second",
+        "n_second": "Rows of the second catalog within the radius of the row of the first",
+        "n_first": "Rows of the first catalog within the radius of the row of the second",
         "status": "matched, ambiguous or unmatched",
         "reasons": AssociationFlags.describe(),
     }
@@ -171,7 +171,7 @@ def _positions(catalog, argument):
 
 def match_truth(truth, measured, bands, *, radius=0.5 * u.arcsec):
     """
-    Match a measured catalogue to the truth, one to one.
+    Match a measured catalog to the truth, one to one.
 
     Parameters
     ----------

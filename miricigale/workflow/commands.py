@@ -11,7 +11,7 @@ from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column
 
-__all__ = ["filter_table", "fit_catalogue", "plan_table"]
+__all__ = ["filter_table", "fit_catalog", "plan_table"]
 
 
 def filter_table(pattern=""):
@@ -93,11 +93,11 @@ def plan_table(*, quick=False):
     return QTable(rows)
 
 
-def fit_catalogue(
+def fit_catalog(
     path, output, *, axes="fit", model_error=0.1, hdu=None, chunk_rows=10000, **options
 ):
     """
-    Fit a catalogue of photometry of any length with the chain of Yang et al. 2021.
+    Fit a catalog of photometry of any length with the chain of Yang et al. 2021.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def fit_catalogue(
     Warns
     -----
     `~miricigale.utils.exceptions.MiricigaleWarning`
-        If the catalogue has bands under names that no filter has, or without errors.
+        If the catalog has bands under names that no filter has, or without errors.
 
     Raises
     ------

@@ -37,7 +37,7 @@ class RunSection:
 class CatalogSection:
     """The real sources that are simulated."""
 
-    source: str = _option("catalog.goodss", "Resource name or path of the catalogue.")
+    source: str = _option("catalog.goodss", "Resource name or path of the catalog.")
     mag_limit: float = _option(26.6, "Faint limit in the magnitude column.", low=10.0, high=40.0)
     mag_column: str = _option("mag_f160w", "Column that the limit applies to.")
 
@@ -47,9 +47,9 @@ class PointingSection:
     """Where the telescope looks."""
 
     ra: float = _option(
-        53.13440, "Right ascension of the field centre in degrees.", low=0, high=360
+        53.13440, "Right ascension of the field center in degrees.", low=0, high=360
     )
-    dec: float = _option(-27.83444, "Declination of the field centre in degrees.", low=-90, high=90)
+    dec: float = _option(-27.83444, "Declination of the field center in degrees.", low=-90, high=90)
     roll: float = _option(0.0, "Position angle of V3 in degrees.", low=-360, high=360)
 
 
@@ -142,7 +142,7 @@ class PhotometrySection:
     )
     min_area: int = _option(60, "Smallest area of a detection in pixels.", low=1, high=10000)
     regularization: str = _option(
-        "auto", "Regularisation of the matching kernels: auto, yang2021 (0.03) or a number."
+        "auto", "Regularization of the matching kernels: auto, yang2021 (0.03) or a number."
     )
     match_radius: float = _option(
         0.5, "Radius of the match to the truth in arcsec.", low=0.05, high=3.0

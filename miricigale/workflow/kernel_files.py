@@ -10,7 +10,7 @@ from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.units import ANGLE, to_array
 
-__all__ = ["can_be_modelled", "file_place", "is_own_kernel", "matching_kernel", "read_kernel"]
+__all__ = ["can_be_modeled", "file_place", "is_own_kernel", "matching_kernel", "read_kernel"]
 
 _log = logging.getLogger(__name__)
 
@@ -71,7 +71,7 @@ def _planes(path, wanted):
         return np.array(chosen, dtype=float), hdu.header.copy()
 
 
-def _centred(data):
+def _centered(data):
     """The position x, y of the bright core of a PSF."""
     y, x = np.indices(data.shape)
     core = np.where(data > 0.3 * data.max(), data, 0.0)
@@ -83,7 +83,7 @@ def _centred(data):
 
 def _read_psf(path, argument, header, *, scale, angle):
     """
-    A PSF, or the mean of several, with its centre in the middle.
+    A PSF, or the mean of several, with its center in the middle.
 
     ``scale`` and ``angle`` are what the caller gave (or None), ``header`` is that of the image which
     the PSF is for.
@@ -122,7 +122,7 @@ def _read_psf(path, argument, header, *, scale, angle):
         if scaled:
             _log.info("%s sums to %.4g and is scaled to 1", path, total)
         try:
-            psf = make_psf(data / total if scaled else data, origin=_centred(data), **form)
+            psf = make_psf(data / total if scaled else data, origin=_centered(data), **form)
         except ValueError as err:
             msg = f"{path} cannot be read as a PSF: {err}"
             raise DataError(msg) from err
@@ -233,7 +233,7 @@ def read_kernel(path, *, pixel_scale, highres_psf=None):
     return kernel
 
 
-def can_be_modelled(header):
+def can_be_modeled(header):
     """
     Whether `~miricigale.psf.filter_psf` has the PSF of an image.
 
@@ -286,7 +286,7 @@ def matching_kernel(image, highres, *, kernel=None, psf=None, highres_psf=None, 
         if path is not None:
             form = {name: options.get(f"{what}_{name}") for name in ("scale", "angle")}
             psfs[what] = _read_psf(path, what, header, **form)
-        elif kernel is None or (what == "highres_psf" and can_be_modelled(header)):
+        elif kernel is None or (what == "highres_psf" and can_be_modeled(header)):
             scale, angle = _grid(header)
             psfs[what] = filter_psf(
                 header.filter,

@@ -19,7 +19,7 @@ from miricigale.utils.files import split_extension, writing
 from miricigale.utils.progress import progress
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import to_array
-from miricigale.workflow.kernel_files import can_be_modelled, file_place, matching_kernel
+from miricigale.workflow.kernel_files import can_be_modeled, file_place, matching_kernel
 from miricigale.workflow.products import write_image
 
 __all__ = ["empty_positions", "measure_files"]
@@ -79,7 +79,7 @@ def measure_files(
     psf, highres_psf : path-like, optional
         PSFs of image and prior with the pixel and the drizzling in them: ``file.fits``,
         ``file.fits[EXTENSION]``, or of a cube ``file.fits[EXTENSION,PLANE]`` (``mean`` for the mean
-        of all planes). Their centres are found. Those of MIRI, NIRCam's wide filters and WFC3/IR
+        of all planes). Their centers are found. Those of MIRI, NIRCam's wide filters and WFC3/IR
         are compared with the model (`~miricigale.psf.checked_psf`), which is taken where none is
         given (`~miricigale.psf.filter_psf`).
     psf_scale, highres_psf_scale : `~astropy.units.Quantity`, optional
@@ -324,7 +324,7 @@ def _check_psfs(image, highres, headers, kernel, psf, highres_psf):
         (image, headers[0], psf, ""),
         (highres, headers[1], highres_psf, "highres_"),
     ):
-        if path is not None or can_be_modelled(header):
+        if path is not None or can_be_modeled(header):
             continue
         if header.filter in MODEL_FILTERS:
             wanted = f"given, for the header of {file.path} has no PA_APER (or '{prefix}psf')"
@@ -335,7 +335,7 @@ def _check_psfs(image, highres, headers, kernel, psf, highres_psf):
 
 
 def _check_catalog(path, image, highres):
-    """Refuse a catalogue of another field."""
+    """Refuse a catalog of another field."""
     from astropy.coordinates import SkyCoord
 
     from miricigale.photometry.arrays import sky_pixels

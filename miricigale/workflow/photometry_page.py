@@ -24,12 +24,12 @@ _MEANING = {
     ForcedFlags.EDGE: "more than a tenth of the light is off the image",
     ForcedFlags.MASKED: "more than a tenth of the light is on pixels without data",
     ForcedFlags.NO_DATA: "too little light on usable pixels",
-    ForcedFlags.BLENDED: "neighbours make the error more than twice as large",
+    ForcedFlags.BLENDED: "neighbors make the error more than twice as large",
     ForcedFlags.DEGENERATE: "the template is that of another source, which has the light",
     ForcedFlags.NO_SEGMENT: "no segment at the position",
     ForcedFlags.NOISY_SEGMENT: "a point source, for the segment is too noisy",
     ForcedFlags.SHARED_SEGMENT: "a point source, for the segment is another one's",
-    ForcedFlags.POOR_FIT: "residuals above the noise: another shape, another PSF, a neighbour",
+    ForcedFlags.POOR_FIT: "residuals above the noise: another shape, another PSF, a neighbor",
     ForcedFlags.UNEXPLAINED_NEIGHBOUR: "light nearby that no source explains",
 }
 
@@ -281,7 +281,7 @@ def _flag_table(page, result):
         name = flag.name.lower().replace("_", " ")
         meaning = _MEANING.get(flag, "see ForcedFlags")
         rows.append((f"{int(flag)} {name}", meaning, "not measured" if lost else "usable", count))
-    crowded = "a neighbour within 2 arcsec brighter than the magnitude + 1 (a column of its own)"
+    crowded = "a neighbor within 2 arcsec brighter than the magnitude + 1 (a column of its own)"
     rows.append(("crowded", crowded, "usable", int(np.count_nonzero(result.crowded))))
     page.table(rows, header=("flag", "meaning", "flux", "sources"), text=3)
 
@@ -310,7 +310,7 @@ def _source_table(page, result):
         for k in order
     ]
     header = ("id", "flags", "template", "RA", "Dec", "flux (uJy)", "error", "AB", "S/N", "chi2")
-    page.table(rows, header=(*header, "residual"), text=3, empty="The catalogue has no source.")
+    page.table(rows, header=(*header, "residual"), text=3, empty="The catalog has no source.")
 
 
 def _input_table(page, image, highres, kernel):

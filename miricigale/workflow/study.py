@@ -63,7 +63,7 @@ def check_study(config):
     ------
     `~miricigale.utils.exceptions.ConfigError`
         If a filter is unknown, the high-resolution image has no PSF, the sky fills the well, or
-        fewer than `MIN_SOURCES` sources of the catalogue fall in the field.
+        fewer than `MIN_SOURCES` sources of the catalog fall in the field.
     """
     known = set(Filter.names())
     unknown = [name for name in config.fit.bands if name not in known]

@@ -622,6 +622,6 @@ def test_the_example_of_cigale():
     assert np.all(results.fitted)
     # quasars: red ones are behind dust, and the models describe the most of them
     assert np.median(results.reduced_chi2) < 2
-    colour = np.log10(catalog["sedpy.sdss_i0"] / catalog["sedpy.sdss_g0"])[:300].value
+    color = np.log10(catalog["sedpy.sdss_i0"] / catalog["sedpy.sdss_g0"])[:300].value
     dust = results.mean("ebv_polar").value
-    assert np.corrcoef(colour, dust)[0, 1] > 0.7
+    assert np.corrcoef(color, dust)[0, 1] > 0.7

@@ -90,7 +90,7 @@ def test_association_agrees_with_all_distances():
     tables = [QTable({"id": np.arange(len(c)) + 1000 * (k + 1), "sky": c})
               for k, c in enumerate(coords)]  # fmt: skip
     table = associate(*tables, radius=1 * u.arcsec)
-    # each row of either catalogue once
+    # each row of either catalog once
     assert sorted(table["first"][table["first"] >= 0]) == list(range(120))
     assert sorted(table["second"][table["second"] >= 0]) == list(range(90))
     both = (table["first"] >= 0) & (table["second"] >= 0)

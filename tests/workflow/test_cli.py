@@ -40,7 +40,7 @@ def test_what_cannot_be_used_is_one_sentence_on_stderr(
     assert "Traceback" not in captured.err
 
 
-def test_a_catalogue_that_is_none_is_refused(capsys, tmp_path):
+def test_a_catalog_that_is_none_is_refused(capsys, tmp_path):
     (tmp_path / "cat.ecsv").write_text("not a table")
     config = tmp_path / "my.toml"
     config.write_text(f"[catalog]\nsource = '{tmp_path / 'cat.ecsv'}'\n")
@@ -73,12 +73,12 @@ def test_what_would_fail_late_is_refused_at_once(capsys, tmp_path, text, message
     assert not (tmp_path / "run").exists()
 
 
-def test_data_names_licences_and_checks_sums(capsys, monkeypatch, tmp_path):
+def test_data_names_licenses_and_checks_sums(capsys, monkeypatch, tmp_path):
     monkeypatch.delenv("MIRICIGALE_DATA", raising=False)
     assert main(["data", "list"]) == 0
     text = capsys.readouterr().out
     assert "ssp.bc03 (bundled)" in text
-    assert text.count("licence:") == text.count("cite:") > 5
+    assert text.count("license:") == text.count("cite:") > 5
     assert main(["data", "check"]) == 0
     assert "wrong checksum" not in capsys.readouterr().out
 

@@ -59,7 +59,7 @@ def test_a_library_is_added_listed_and_checked(folder, capsys):
     path = locate(NAME)
     assert main(["data", "list", NAME]) == 0
     text = capsys.readouterr().out
-    for part in (f"test.library (user): {path}", "A test", "licence: Free", "cite: Nobody 2030"):
+    for part in (f"test.library (user): {path}", "A test", "license: Free", "cite: Nobody 2030"):
         assert part in text
     assert main(["data", "check"]) == 0
     assert f"ok              {path}" in capsys.readouterr().out

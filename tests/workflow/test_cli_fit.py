@@ -15,7 +15,7 @@ BANDS = ("wfc3.f125w", "wfc3.f160w", "irac.ch1", "irac.ch2", "miri.f770w", "miri
 
 
 @pytest.fixture(scope="module")
-def catalogue():
+def catalog():
     """Five galaxies of the model, with 5 % errors."""
     axes = SEDModel.yang2021_axes("quick")
     z = axes["redshift"]
@@ -31,8 +31,8 @@ def catalogue():
     return out
 
 
-def test_a_catalogue_becomes_a_folder_of_results(catalogue, tmp_path, capsys):
-    catalogue.write(tmp_path / "cat.fits")
+def test_a_catalog_becomes_a_folder_of_results(catalog, tmp_path, capsys):
+    catalog.write(tmp_path / "cat.fits")
     out = tmp_path / "out"
     command = ["fit", str(tmp_path / "cat.fits"), "-o", str(out), "--axes", "quick"]
     command += ["--chunk-rows", "2", "--redshift", "z_spec", "--threads", "2", "--no-progress"]
@@ -56,16 +56,16 @@ def test_a_catalogue_becomes_a_folder_of_results(catalogue, tmp_path, capsys):
     assert open_results(out).n_parts == 2
 
 
-def test_a_number_of_threads_that_cannot_be_is_refused(catalogue, tmp_path, capsys):
-    catalogue.write(tmp_path / "cat.fits")
+def test_a_number_of_threads_that_cannot_be_is_refused(catalog, tmp_path, capsys):
+    catalog.write(tmp_path / "cat.fits")
     out = tmp_path / "out"
     assert main(["fit", str(tmp_path / "cat.fits"), "-o", str(out), "--threads", "-1"]) == 2
     assert "at least 1 and an integer, got -1" in capsys.readouterr().err
     assert not out.exists()
 
 
-def test_ctrl_c_keeps_what_is_finished(catalogue, tmp_path, capsys, monkeypatch):
-    catalogue.write(tmp_path / "cat.ecsv")
+def test_ctrl_c_keeps_what_is_finished(catalog, tmp_path, capsys, monkeypatch):
+    catalog.write(tmp_path / "cat.ecsv")
     out = tmp_path / "out"
     command = ["fit", str(tmp_path / "cat.ecsv"), "-o", str(out), "--axes", "quick"]
     command += ["--chunk-rows", "2", "--no-progress"]
@@ -96,10 +96,8 @@ def test_ctrl_c_keeps_what_is_finished(catalogue, tmp_path, capsys, monkeypatch)
         (["--flux-unit", "mag"], "'flux_unit' must be convertible to uJy, got mag"),
     ],
 )
-def test_options_that_cannot_be_used_are_one_sentence(
-    catalogue, tmp_path, capsys, options, message
-):
-    catalogue.write(tmp_path / "cat.fits")
+def test_options_that_cannot_be_used_are_one_sentence(catalog, tmp_path, capsys, options, message):
+    catalog.write(tmp_path / "cat.fits")
     command = ["fit", str(tmp_path / "cat.fits"), "-o", str(tmp_path / "out"), "--axes", "quick"]
     assert main([*command, *options]) == 2
     assert message in capsys.readouterr().err
@@ -118,8 +116,8 @@ def test_pairs_are_two_names(capsys):
     assert "'cat.fits' is no pair NAME:NAME" in capsys.readouterr().err
 
 
-def test_bands_of_no_filter_are_told(catalogue, tmp_path):
-    table = catalogue.copy()
+def test_bands_of_no_filter_are_told(catalog, tmp_path):
+    table = catalog.copy()
     table["hst.f606w"], table["hst.f606w_err"] = table["irac.ch1"], table["irac.ch1_err"]
     table.write(tmp_path / "cat.fits")
     command = ["fit", str(tmp_path / "cat.fits"), "-o", str(tmp_path / "out"), "--axes", "quick"]

@@ -55,13 +55,13 @@ def test_without_errors_short_bands_get_five_percent(galaxies, tmp_path):
     assert list(results.filters) == SHORT
     np.testing.assert_allclose(results.flux_err, 0.05 * results.flux)
     assert "mips.24" not in told
-    assert "5 % error each, for the catalogue gives none" in told
+    assert "5 % error each, for the catalog gives none" in told
     # drawn, each its own
     assert np.all((truth["alpha"] >= 1.5) & (truth["alpha"] <= 2.5))
     assert truth["alpha"][0] != truth["alpha"][1]
 
 
-def test_the_catalogues_own_errors_are_used_beyond_three_micron_too(galaxies, tmp_path):
+def test_the_catalogs_own_errors_are_used_beyond_three_micron_too(galaxies, tmp_path):
     table = galaxies.copy()
     for k, name in enumerate((*SHORT[:2], *LONG)):
         table[f"{name}_err"] = (0.01 + 0.01 * k) * table[name]
@@ -69,7 +69,7 @@ def test_the_catalogues_own_errors_are_used_beyond_three_micron_too(galaxies, tm
     assert list(results.filters) == [*SHORT, *LONG]
     wanted = np.array([0.01, 0.02, 0.05, 0.03])
     np.testing.assert_allclose(results.flux_err / results.flux, [wanted, wanted], rtol=1e-6)
-    assert "the catalogue's errors in nircam.f090w, nircam.f150w, mips.24; 5 % error each" in told
+    assert "the catalog's errors in nircam.f090w, nircam.f150w, mips.24; 5 % error each" in told
     assert "alpha is fitted too" in told
     # 24 um shows the dust: alpha is that of the fit, and the flux comes back
     np.testing.assert_array_equal(truth["alpha"], ALPHA)
@@ -101,5 +101,5 @@ def test_new_errors_make_other_inputs(galaxies, tmp_path):
 
 
 def test_no_band_is_refused(galaxies, tmp_path):
-    with pytest.raises(ConfigError, match="leaves none of the catalogue's bands"):
+    with pytest.raises(ConfigError, match="leaves none of the catalog's bands"):
         run(tmp_path, galaxies.copy(), max_wavelength=0.5)

@@ -98,7 +98,7 @@ def arguments(files, output, **changes):
 
 
 @pytest.mark.parametrize("form", ["ecsv", "fits"])
-def test_files_become_a_catalogue_that_can_be_fitted_and_a_page(files, tmp_path, form, capsys):
+def test_files_become_a_catalog_that_can_be_fitted_and_a_page(files, tmp_path, form, capsys):
     output = tmp_path / "new" / f"fluxes.{form}"
     assert main(arguments(files, output)) == 0
     assert f"25 sources in {output}" in capsys.readouterr().out
@@ -122,8 +122,8 @@ def test_files_become_a_catalogue_that_can_be_fitted_and_a_page(files, tmp_path,
     assert "the poorest fit: signal-to-noise" in page
 
 
-def test_catalogue_kernel_and_the_plain_form(files, tmp_path):
-    """A kernel of others alone, a catalogue, and the two files without options, packed."""
+def test_catalog_kernel_and_the_plain_form(files, tmp_path):
+    """A kernel of others alone, a catalog, and the two files without options, packed."""
     from miricigale.psf import MatchingKernel
 
     made = MatchingKernel.from_psfs(
@@ -154,7 +154,7 @@ def test_without_a_segmentation_sources_are_detected(files, tmp_path):
     Table({"id": files.ids, "ra": files.sky.ra.deg, "dec": files.sky.dec.deg}).write(catalog)
     output = tmp_path / "out.ecsv"
     command = arguments(files, output, segmentation=None, catalog=catalog)
-    # noise peaks at the low threshold of the detection are in no catalogue
+    # noise peaks at the low threshold of the detection are in no catalog
     with pytest.warns(MiricigaleWarning, match="segments of the segmentation belong to no source"):
         assert main(command) == 0
     table = QTable.read(output)
@@ -196,7 +196,7 @@ def test_our_own_files_are_read(files, tmp_path):
 
 @pytest.mark.slow
 def test_model_psfs_are_turned_to_the_angle_of_the_aperture(tmp_path):
-    """Our own files, without options but filter and angle; sources on centres of both grids."""
+    """Our own files, without options but filter and angle; sources on centers of both grids."""
     from miricigale.psf import hst_psf, miri_psf, psf_image, psf_mosaic
 
     places, flux = np.array([[-4.8, -3.6], [3.6, 3.6], [-2.4, 6.0]]), np.array([10.0, 20.0, 5.0])

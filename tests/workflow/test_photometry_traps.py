@@ -220,7 +220,7 @@ def test_areas_filled_with_zero_have_no_data(field, tmp_path, name):
 
 def test_labels_of_another_detection_are_not_taken(field, tmp_path):
     labels, header = fits.getdata(field.folder / "seg.fits", header=True)
-    # ids of the map say nothing of the catalogue's: positions do
+    # ids of the map say nothing of the catalog's: positions do
     order = np.append(0, np.random.default_rng(1).permutation(16) + 1)
     fits.writeto(tmp_path / "stale.fits", order[labels].astype(np.int32), header)
     found = fluxes(field, segmentation=tmp_path / "stale.fits")
@@ -240,7 +240,7 @@ def test_labels_of_another_detection_are_not_taken(field, tmp_path):
     assert any("on the map have no segment" in str(one.message) for one in said)
 
 
-def test_catalogues_of_other_fields_and_missing_positions(field, tmp_path, monkeypatch):
+def test_catalogs_of_other_fields_and_missing_positions(field, tmp_path, monkeypatch):
     def unread(self):
         raise AssertionError
 

@@ -202,7 +202,7 @@ def test_edge_crowded_and_spurious_are_counted(reports):
             assert found["ambiguous"]["n"] == 0
             assert found["isolated"]["n"] >= 24 - 1 - found["crowded"]["n"] > 0
         page = html.unescape(page_of(reports[kind])).replace(" class=n", "")
-        assert "<td>of them spurious: no source of the catalogue is near</td><td>1</td>" in page
+        assert "<td>of them spurious: no source of the catalog is near</td><td>1</td>" in page
         assert "<th>crowded</th><th>edge</th><th>ambiguous</th>" in page
         for name, n in metrics["n_left_out"].items():
             assert f"<td>{name.replace('_', ' ')}</td><td>{n}</td>" in page
@@ -213,16 +213,16 @@ def test_edge_crowded_and_spurious_are_counted(reports):
     condition = np.asarray(QTable.read(folder / "fits_with_miri.ecsv")["condition"])
     assert np.count_nonzero(condition & 1) == 1
     assert np.count_nonzero((condition & 7) == 0) == fits["conditions"]["isolated"]["n"]
-    # every row of either catalogue stands in the association once
+    # every row of either catalog stands in the association once
     table = QTable.read(folder / "association.ecsv")
     assert sorted(table["first"]) == [-1, *range(24)]
     assert sorted(table["second"]) == list(range(25))
     assert list(table["status"]).count("unmatched") == 1
 
 
-def test_colours_need_three_bands(reports):
-    assert "too few bands for colours" in page_of(reports["one"])
-    assert "too few bands for colours" in page_of(reports["two"])
+def test_colors_need_three_bands(reports):
+    assert "too few bands for colors" in page_of(reports["one"])
+    assert "too few bands for colors" in page_of(reports["two"])
     page = page_of(reports["four"])
     # in order of wavelength, whatever the order of the configuration
     assert "F560W, F1800W, F2550W (the shortest, the middle and the longest" in page
@@ -286,7 +286,7 @@ def test_bands_of_a_picture():
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
-def test_fields_of_fewer_than_three_bands_are_grey(n):
+def test_fields_of_fewer_than_three_bands_are_gray(n):
     prior = noise_image(9, rim=0, scale=0.06, shape=(238, 312))[0]
     names = ["miri.f770w", "miri.f1000w", "miri.f2100w"][:n]
     figure = field_figure([noise_image(k)[0] for k in range(n)], prior, [*names, "wfc3.f160w"])

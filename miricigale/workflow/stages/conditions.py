@@ -37,7 +37,7 @@ class ConditionFlags(Flags):
     CROWDED = 2
     #: More than one candidate is within the radius of the match, or it is not mutual.
     AMBIGUOUS = 4
-    #: A detection that belongs to no source of the catalogue.
+    #: A detection that belongs to no source of the catalog.
     SPURIOUS = 8
     #: It has no flux: not detected on the high-resolution image, or no data.
     NOT_MEASURED = 16
@@ -215,11 +215,11 @@ def fit_conditions(sample, redshift, table, bands):
 
 
 def write_left_out(report, metrics):
-    """Why sources of the catalogue are not in the fit."""
+    """Why sources of the catalog are not in the fit."""
     report.table(
         [(name.replace("_", " "), n) for name, n in metrics["n_left_out"].items()],
         header=("reason", "sources"),
-        caption=f"Why sources of the catalogue ({metrics['n_catalog']}) are not in the fit "
+        caption=f"Why sources of the catalog ({metrics['n_catalog']}) are not in the fit "
         f"({metrics['n_sample']}), each for one reason or more",
     )
 
@@ -245,7 +245,7 @@ def write_conditions(report, metrics):
     report.table(
         [
             ("detections in the field", found["n_field"]),
-            ("of them spurious: no source of the catalogue is near", found["n_spurious"]),
+            ("of them spurious: no source of the catalog is near", found["n_spurious"]),
             ("of them ambiguous", found["n_ambiguous"]),
             *(
                 (f"spurious above 5 sigma in {band_label(name)}", count)

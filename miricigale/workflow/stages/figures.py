@@ -153,7 +153,7 @@ def offset_figure(table, bands, limits=None, marks=()):
 
 
 def _wave_colors(bands):
-    """A colour for each band, darker at shorter wavelengths, distinct to colour-blind readers."""
+    """A color for each band, darker at shorter wavelengths, distinct to color-blind readers."""
     from matplotlib import colormaps
 
     order = sorted(bands, key=lambda name: Filter.from_name(name).pivot)

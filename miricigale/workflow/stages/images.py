@@ -54,7 +54,7 @@ def reducer_of(config, n_threads=None):
 
 def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, tell=None, keep=None):
     """
-    Take one exposure of a catalogue from the scene to the calibrated image.
+    Take one exposure of a catalog from the scene to the calibrated image.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Stages 1 to 3: catalogue, input SEDs, model fluxes."""
+"""Stages 1 to 3: catalog, input SEDs, model fluxes."""
 
 import numpy as np
 from astropy.table import QTable, hstack
@@ -73,13 +73,13 @@ def sed_resources():
 
 
 def catalog_bands(catalog):
-    """Names of the flux columns of a catalogue: those with a dot in the name."""
+    """Names of the flux columns of a catalog: those with a dot in the name."""
     return [name for name in catalog.colnames if "." in name and not name.endswith("_err")]
 
 
 def input_bands(catalog, max_wavelength):
     """
-    Bands of a catalogue that its SEDs are fitted to.
+    Bands of a catalog that its SEDs are fitted to.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def input_bands(catalog, max_wavelength):
     Returns
     -------
     bands : dict of str to bool
-        Whether each band has a column of errors, in the order of the catalogue.
+        Whether each band has a column of errors, in the order of the catalog.
     longest : float
         Their longest pivot wavelength in um; 0 without bands.
     """
@@ -105,7 +105,7 @@ def input_bands(catalog, max_wavelength):
 
 
 def _input_plan(config, _):
-    """Axes of the input fit, and the bands whose errors a user's catalogue has, for hashing."""
+    """Axes of the input fit, and the bands whose errors a user's catalog has, for hashing."""
     plan = _plain_axes(input_axes(config.sed.axes))
     if config.catalog.source not in resources():
         catalog = read_catalog(config.catalog.source)
@@ -117,14 +117,14 @@ def _input_plan(config, _):
 
 @stage(
     "catalog",
-    "catalogue",
+    "catalog",
     sections=("catalog",),
     plan=lambda config, _: (
         fingerprint(config.catalog.source) if config.catalog.source in resources() else ""
     ),
 )
 def make_catalog(context, _):
-    """Stage 1: read the catalogue and cut it at the faint limit."""
+    """Stage 1: read the catalog and cut it at the faint limit."""
     options = context.config.catalog
     catalog = read_catalog(options.source)
     if options.mag_column not in catalog.colnames:
@@ -152,14 +152,12 @@ def make_catalog(context, _):
     kernels=("fit",),
 )
 def fit_inputs(context, _):
-    """Stage 2: fit a galaxy grid to the catalogue's fluxes at the known redshifts."""
+    """Stage 2: fit a galaxy grid to the catalog's fluxes at the known redshifts."""
     options = context.config.sed
     catalog = QTable.read(context.path("catalog.ecsv"))
     bands, longest = input_bands(catalog, options.max_wavelength)
     if not bands:
-        msg = (
-            f"[sed] max_wavelength = {options.max_wavelength} leaves none of the catalogue's bands"
-        )
+        msg = f"[sed] max_wavelength = {options.max_wavelength} leaves none of the catalog's bands"
         raise ConfigError(msg)
     photometry = QTable({"id": catalog["id"]})
     photometry["redshift"] = np.asarray(catalog["redshift"], float)

@@ -44,13 +44,13 @@ def _directions(image):
 
 def field_figure(images, prior, names):
     """
-    The field: the high-resolution image beside a colour image of three bands, or each band in grey.
+    The field: the high-resolution image beside a color image of three bands, or each band in gray.
 
     Parameters
     ----------
     images : list of `~astropy.nddata.CCDData`
         Mosaics on one grid, the shortest wavelength first; other numbers than three are drawn
-        in grey.
+        in gray.
     prior : `~astropy.nddata.CCDData`
         The high-resolution image.
     names : list of str
@@ -66,28 +66,28 @@ def field_figure(images, prior, names):
     factor = max(1, round(_scale(images[0]) / _scale(prior)))
     field = _binned(_filled(prior)[y[0] : y[1], x[0] : x[1]], factor)
     labels = [band_label(name) for name in names]
-    colour = len(planes) == 3
-    n = 2 if colour else 1 + len(planes)
+    color = len(planes) == 3
+    n = 2 if color else 1 + len(planes)
     width = WIDTH / n
-    bar = 0 if colour else 0.8
+    bar = 0 if color else 0.8
     size = (width, (width - bar) * (y1 - y0) / (x1 - x0) + 0.4)
     figure, axes = new_figure(1, n, size=size)
     axes = axes.ravel()
-    grey = {"colorbar": None if colour else "MJy/sr"}
+    gray = {"colorbar": None if color else "MJy/sr"}
     scale = factor * _scale(prior)
-    plot_image(field, ax=axes[0], pixel_scale=scale, title=f"{labels[-1]} (prior)", **grey)
-    if colour:
+    plot_image(field, ax=axes[0], pixel_scale=scale, title=f"{labels[-1]} (prior)", **gray)
+    if color:
         parts = zip(("blue", "green", "red"), labels, strict=False)
         title = ", ".join(f"{label} {color}" for color, label in parts)
-        # the noise of single pixels would be a grain of all colours
+        # the noise of single pixels would be a grain of all colors
         planes = [_binned(plane, 2) for plane in planes]
         options = {"stretch": 4.0, "softening": 7.0, "title": title}
         plot_color(*planes[::-1], ax=axes[1], pixel_scale=2 * _scale(images[0]), **options)
     else:
         for ax, plane, image, label in zip(axes[1:], planes, images, labels, strict=False):
-            plot_image(plane, ax=ax, pixel_scale=_scale(image), title=label, **grey)
+            plot_image(plane, ax=ax, pixel_scale=_scale(image), title=label, **gray)
     for k, ax in enumerate(axes):
-        mark_sky(ax, 20, **_directions(images[0]), color="white" if colour and k else "black")
+        mark_sky(ax, 20, **_directions(images[0]), color="white" if color and k else "black")
     return figure
 
 

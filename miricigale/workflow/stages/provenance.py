@@ -152,7 +152,7 @@ def library_rows(model):
 
 def catalog_facts(config, catalog):
     """
-    What the catalogue is: pairs of a label and text.
+    What the catalog is: pairs of a label and text.
 
     Parameters
     ----------
@@ -182,13 +182,13 @@ def catalog_facts(config, catalog):
     guess = f"{100 * config.sed.catalog_error:g} % error"
     if not own:
         how = (
-            f" (pivot up to {config.sed.max_wavelength:g} µm), {guess} each, for the catalogue "
+            f" (pivot up to {config.sed.max_wavelength:g} µm), {guess} each, for the catalog "
             "gives none"
         )
     elif len(own) == len(fitted):
-        how = ", with the catalogue's errors"
+        how = ", with the catalog's errors"
     else:
-        how = f", with the catalogue's errors in {', '.join(own)}; {guess} each in the others"
+        how = f", with the catalog's errors in {', '.join(own)}; {guess} each in the others"
     if longest > config.sed.max_wavelength:
         how += "; the dust's alpha is fitted too"
     if prior in bands:
@@ -247,7 +247,7 @@ def sources_to_cite(names, metas):
 def write_exposures(context, report, metrics):
     """Add the section on what was exposed, and of which sources."""
     config = context.config
-    report.section("Exposures and catalogue")
+    report.section("Exposures and catalog")
     forecasts = {
         unit: QTable.read(context.path(f"exposures/{unit}_forecast.ecsv"))
         for unit in study_exposures(config)
@@ -262,7 +262,7 @@ def write_exposures(context, report, metrics):
         text=2,
     )
     catalog = QTable.read(context.path("catalog.ecsv"))
-    report.table(catalog_facts(config, catalog), header=("catalogue", ""), text=2)
+    report.table(catalog_facts(config, catalog), header=("catalog", ""), text=2)
 
 
 def write_origin(report, config, model, metas):

@@ -168,15 +168,15 @@ class _Writer:
             ],
             header=("sample", "galaxies", f"detected in {least}+ bands", "68 % interval", paper),
             caption="Galaxies of the field detected (5 sigma by the error function) in "
-            f"{'two or more bands' if least == 2 else 'the one band'}; the catalogue ends at "
+            f"{'two or more bands' if least == 2 else 'the one band'}; the catalog ends at "
             f"{name} = {limit:g}{note}",
-            empty=f"The catalogue ends at {name} = {limit:g}: too bright for the shares of detected "
+            empty=f"The catalog ends at {name} = {limit:g}: too bright for the shares of detected "
             f"galaxies that are published, to {prior} = 25 and 26.",
         )
         conditions.write_left_out(self.report, m)
 
     def images(self):
-        """The field in colour or grey; mosaic, model and residual."""
+        """The field in color or gray; mosaic, model and residual."""
         self.report.section("Images")
         chosen = figures.three_bands(self.bands)
         labels = ", ".join(band_label(name) for name in chosen)
@@ -187,7 +187,7 @@ class _Writer:
                 "the longest of the bands by wavelength) in blue, green and red, each in units of its own noise."
             )
         else:
-            told = f"The field: the high-resolution image and {labels}; too few bands for colours."
+            told = f"The field: the high-resolution image and {labels}; too few bands for colors."
         self.report.figure(
             pictures.field_figure(
                 [self.mosaics[name] for name in chosen],
@@ -275,7 +275,7 @@ class _Writer:
             self.report.figure(
                 figures.point_figure(shown, self.bands),
                 "Bright point sources on a grid, one exposure a band through the whole chain; "
-                "blue: median, grey: 3 %; triangles lie beyond the axis.",
+                "blue: median, gray: 3 %; triangles lie beyond the axis.",
             )
         else:
             self.report.text("The check with bright point sources was not made ([point_sources]).")
@@ -353,7 +353,7 @@ class _Writer:
             )
             self.report.text(
                 f"No source is left to fit. Why the {self.metrics['n_catalog']} sources of the "
-                f"catalogue were left out, each for one reason or more: {left}."
+                f"catalog were left out, each for one reason or more: {left}."
             )
             return
         fits = self.tables.fits
@@ -418,13 +418,13 @@ class _Writer:
         )
         galaxies = self.tables.galaxies()
         if len(galaxies) == 0:
-            self.report.text("No galaxy of the catalogue has a model.")
+            self.report.text("No galaxy of the catalog has a model.")
             return
         figure, (faint, passive) = figures.input_figure(galaxies)
         agn = ", AGN included," if self.config.sed.frac_agn > 0 else ""
         self.report.figure(
             figure,
-            f"Galaxies of the catalogue. Left: luminosity of 3-1000 µm{agn} against redshift, with "
+            f"Galaxies of the catalog. Left: luminosity of 3-1000 µm{agn} against redshift, with "
             "the 8-1000 µm luminosities of three star-formation rates after Kennicutt 1998 (Salpeter IMF). Right: "
             "star-formation rate (100 Myr) against stellar mass, with the main sequence of Speagle et "
             f"al. 2014 (Kroupa IMF). {faint} and {passive} galaxies lie below the axes.",

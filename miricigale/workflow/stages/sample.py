@@ -19,7 +19,7 @@ __all__ = [
 
 
 class SampleFlags(Flags):
-    """Why a source of the catalogue is not in the fitted sample."""
+    """Why a source of the catalog is not in the fitted sample."""
 
     #: Outside the pixels that all bands share.
     OUTSIDE_FIELD = 1
