@@ -21,8 +21,8 @@ from scipy.optimize import least_squares
 
 from miricigale.sed import _core
 from miricigale.sed.components import ParametricTorus
-from miricigale.sed.components.agn.base import DISK_MEAN
-from miricigale.sed.components.agn.parametric import _constants
+from miricigale.sed.components.agn import DISK_MEAN
+from miricigale.sed.components.parametric_torus import _constants
 
 
 class Library:

@@ -96,14 +96,6 @@ class Galaxy:
         return self.starlight.light + self.dust
 
 
-def trapezoid_weights(wave):
-    """Weights of the trapezoid rule: ``weights @ spectrum`` is its integral."""
-    weights = np.zeros(wave.size)
-    weights[:-1] += 0.5 * np.diff(wave)
-    weights[1:] += 0.5 * np.diff(wave)
-    return weights
-
-
 def distinct(items):
     """Different items in the order of their first appearance, and which of them each one is."""
     seen = {}
@@ -160,7 +152,7 @@ class Chain:
         wave.flags.writeable = False
         self.wave = wave
         self.log_wave = np.log(wave)
-        self.weights = trapezoid_weights(wave)
+        self.weights = _core.trapezoid_weights(wave)
         self.to_lnu = wave**2 / _core.LIGHT
         self._ionising = wave < _core.LYMAN_LIMIT
         self._at = {x: int(np.searchsorted(wave, x * (1 - 1e-9))) for x in (SIX, VISUAL, *INFRARED)}
@@ -174,12 +166,12 @@ class Chain:
         wave, n = self.wave, self.wave.size
         infrared, visual = np.zeros((2, n))
         part = slice(self._at[INFRARED[0]], self._at[INFRARED[1]] + 1)
-        infrared[part] = trapezoid_weights(wave[part])
+        infrared[part] = _core.trapezoid_weights(wave[part])
         visual[self._at[VISUAL]] = 1.0
         windows = np.zeros((len(UV_WINDOWS), n))
         for row, (low, high) in zip(windows, UV_WINDOWS, strict=True):
             first, last = np.searchsorted(wave, [low * (1 - 1e-9), high * (1 + 1e-9)])
-            row[first:last] = trapezoid_weights(wave[first:last]) / (high - low)
+            row[first:last] = _core.trapezoid_weights(wave[first:last]) / (high - low)
         bands = FilterSet.from_names(list(COLOUR_BANDS.values())).weights(wave) * self.to_lnu
         return np.concatenate([[infrared, visual], windows, bands])
 

@@ -33,7 +33,7 @@ _NONE = u.dimensionless_unscaled
 
 #: All derived quantities, in the order of the output.
 DERIVED = {
-    "stellar_mass": Derived(MASS, "mass of living stars, without remnants"),
+    "stellar_mass": Derived(MASS, "mass of surviving stars, without remnants"),
     "stellar_mass_formed": Derived(MASS, "mass of all stars ever formed"),
     "sfr": Derived(_RATE, "star-formation rate of the last 1 Myr"),
     "sfr_10myr": Derived(

@@ -34,7 +34,7 @@ __all__ = ["DEFINITIONS", "ModelSpectra", "SEDModel"]
 _MODEL_PARAMETERS = {
     "redshift": Parameter(default=1.0, bounds=(0.0, 20.0), doc="Redshift."),
     "mass": Parameter(
-        default=1e10, bounds=(0.0, 1e16), unit="Msun", doc="Stellar mass formed, living or not."
+        default=1e10, bounds=(0.0, 1e16), unit="Msun", doc="Mass of all stars ever formed."
     ),
 }
 for _name, _parameter in _MODEL_PARAMETERS.items():

@@ -3,8 +3,8 @@ import pytest
 from astropy.io import fits
 
 from miricigale.refdata import locate, resource
-from miricigale.refdata.libraries.bc03 import load_ssp
-from miricigale.sed.components.dust.dl07 import load_dl07
+from miricigale.refdata.tables import load_ssp
+from miricigale.sed.components.dust import load_dl07
 
 
 @pytest.mark.parametrize("name", ["ssp.bc03", "dust.dl07", "torus.parametric"])

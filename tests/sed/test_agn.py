@@ -1,6 +1,8 @@
 import io
 import tarfile
+import tomllib
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +13,6 @@ from miricigale.refdata.libraries import open_library, write_library
 from miricigale.refdata.libraries.skirtor import read_skirtor
 from miricigale.sed import _core
 from miricigale.sed.components import ParametricTorus, Skirtor2016, TorusSpectra
-from miricigale.sed.components.agn.parametric import _absorbed, _constants, _seen_fraction
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import conf
 
@@ -267,9 +268,11 @@ def test_torus_emits_what_the_disk_loses(torus, wave, tau, q):
 @pytest.mark.parametrize("tau", [1.0, 7.0, 15.0])
 def test_no_torus_takes_more_than_shines_on_it_nor_less_than_nothing(torus, tau, q, opening):
     """The disk's light between equator and edge, int mu (1 + 2 mu) dmu, in closed form."""
-    s = np.sin(np.radians(opening + _constants(torus.path)["extinction"]["edge"]))
+    constants = tomllib.loads(Path(torus.path).read_text())
+    s = np.sin(np.radians(opening + constants["extinction"]["edge"]))
     belt = (s**2 / 2 + 2 * s**3 / 3) / (7 / 6)
-    assert 0.5 * belt < _absorbed(torus.path, tau, opening, q) < belt
+    values = values_of(torus, tau97=tau, opening_angle=opening, q=q)
+    assert 0.5 * belt < torus.absorbed_share(values) < belt
 
 
 def test_opening_angles_beyond_the_fit_are_refused():
@@ -282,7 +285,8 @@ def test_absorbed_share_is_near_that_of_the_geometry(torus):
     """Everything below the edge is lost: (s^2/6 + 2 s^3/9) / (7/18), less what is scattered."""
     s = np.cos(np.radians(47.0))
     geometric = (s**2 / 6 + 2 * s**3 / 9) / (7 / 18)
-    assert _absorbed(torus.path, 11.0, 40.0, 0.0) == pytest.approx(geometric, abs=0.03)
+    values = values_of(torus, tau97=11.0, opening_angle=40.0, q=0.0)
+    assert torus.absorbed_share(values) == pytest.approx(geometric, abs=0.03)
 
 
 def test_silicate_feature_turns_from_emission_to_absorption(torus, wave):
@@ -303,9 +307,10 @@ def test_steeper_density_makes_a_hotter_torus(torus, wave):
     assert colour(0.0) < colour(1.0) < colour(1.5)
 
 
-def test_hidden_disk_is_weak_in_the_visible(torus):
-    seen = _seen_fraction(_constants(torus.path), np.array([0.5]), 7.0, 70.0, 40.0, 1.0)
-    assert 1e-5 < seen[0] < 1e-3
+def test_hidden_disk_is_weak_in_the_visible(torus, wave):
+    values = values_of(torus, tau97=7.0, inclination=70.0, opening_angle=40.0, q=1.0)
+    parts = torus.torus_spectra(wave, values)
+    assert 1e-5 < np.interp(0.5, wave, parts.disk) / np.interp(0.5, wave, parts.face_on) < 1e-3
 
 
 def test_torus_against_skirtor(data_file, torus, wave):

@@ -102,7 +102,7 @@ def test_old_stars_have_their_share_of_the_colour_excess():
 
 
 def test_foreign_files_are_refused(tmp_path):
-    from miricigale.refdata.libraries.bc03 import load_ssp
+    from miricigale.refdata.tables import load_ssp
 
     path = tmp_path / "other.fits"
     fits.PrimaryHDU(np.zeros((2, 2))).writeto(path)

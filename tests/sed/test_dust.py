@@ -19,8 +19,8 @@ from miricigale.sed.components.dust import (
     Dale2014,
     DraineLi2007,
     DraineLi2007Alpha,
+    load_dl07,
 )
-from miricigale.sed.components.dust.dl07 import load_dl07
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import conf
 
@@ -439,7 +439,7 @@ def test_warmer_dust_peaks_at_shorter_wavelengths():
 
 def test_straight_lines_between_the_nodes_are_good_enough(monkeypatch):
     """Ten times as many nodes change means over 20 % in wavelength by less than 1.3e-4."""
-    from miricigale.sed.components.dust import casey2012
+    from miricigale.sed.components import dust
 
     part = Casey2012()
     wave = part.nodes()
@@ -452,7 +452,7 @@ def test_straight_lines_between_the_nodes_are_good_enough(monkeypatch):
     ):
         coarse = part.spectrum(values)
         with monkeypatch.context() as patch:
-            patch.setattr(casey2012, "NODES", fine)
+            patch.setattr(dust, "NODES", fine)
             truth = part.spectrum(values)
         coarse = coarse / np.trapezoid(coarse, wave)
         truth = truth / np.trapezoid(truth, fine)

@@ -243,14 +243,14 @@ def test_a_folder_is_one_library(folder):
 
 def test_living_mass_is_without_remnants(write):
     library, parts = read_bc03(write()), content()
-    living = library.values["living"]
+    living = library.values["surviving"]
     assert living[0] == 1.0
     np.testing.assert_allclose(living[1:], (parts["vectors"][1] - parts["vectors"][9])[1:])
     np.testing.assert_allclose(library.values["remnants"], parts["vectors"][9])
     # the files of 2016 have living stars
     age = np.where(AGE == 125893.0, 1e5, AGE)
     library = read_bc03(write("bc2003_lr_xmiless_m62_chab_ssp", age=age))
-    np.testing.assert_allclose(library.values["living"][1:], content(age=age)["vectors"][1][1:])
+    np.testing.assert_allclose(library.values["surviving"][1:], content(age=age)["vectors"][1][1:])
     assert library.meta["version"] == 2016
     with pytest.raises(DataError, match="whether its mass of stars includes remnants"):
         read_bc03(write(age=np.where(AGE == 125893.0, 3e5, AGE)))
@@ -265,7 +265,7 @@ def test_mass_of_gas_tells_what_the_mass_of_stars_is(tmp_path, remnants_counted)
     path = tmp_path / f"{NAME}.ised"
     path.write_bytes(binary(parts, n_vectors=14))
     want = mass - remnants if remnants_counted else mass
-    np.testing.assert_allclose(read_bc03(path).values["living"][1:], want[1:])
+    np.testing.assert_allclose(read_bc03(path).values["surviving"][1:], want[1:])
     parts["vectors"][12] = 2 * gas
     path.write_bytes(binary(parts, n_vectors=14))
     with pytest.raises(DataError, match="do not sum to 1 Msun"):

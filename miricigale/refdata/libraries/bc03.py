@@ -9,13 +9,11 @@ from miricigale.refdata.libraries.ised import Ised, parse_ised, read_bytes, read
 from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.refdata.locate import file_sha256
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import cached_by_file, open_fits
 
-__all__ = ["Ised", "load_ssp", "read_bc03", "read_ised"]
+__all__ = ["Ised", "read_bc03", "read_ised"]
 
 #: Of GALAXEV, in W: its files are in this unit (3.826e33 erg/s).
 SOLAR_LUMINOSITY = 3.826e26
-BUNDLED_SOLAR_LUMINOSITY = 3.828e26  # IAU 2015
 #: Metallicities by their code in file names: tracks of Padova 1994, and of Padova 2000.
 PADOVA_1994 = {22: 0.0001, 32: 0.0004, 42: 0.004, 52: 0.008, 62: 0.02, 72: 0.05, 82: 0.1}
 PADOVA_2000 = {122: 0.0004, 132: 0.001, 142: 0.004, 152: 0.008, 162: 0.019, 172: 0.03}
@@ -28,41 +26,6 @@ DENSE_FROM = 10.0  # um
 DENSITY = 30.0  # wavelengths for each e-fold
 
 
-@cached_by_file(maxsize=2)
-def load_ssp(path):
-    """
-    Read a bundled SSP file.
-
-    Returns
-    -------
-    wave : `~numpy.ndarray`, shape (n_wave,)
-        Wavelengths in um.
-    age : `~numpy.ndarray`, shape (n_age,)
-        Ages in Myr.
-    spectra : dict of float to `~numpy.ndarray`, shape (n_age, n_wave)
-        W/um for one solar mass formed, by metallicity.
-    living : dict of float to `~numpy.ndarray`, shape (n_age,)
-        Mass fraction still alive.
-    """
-    spectra, living = {}, {}
-    try:
-        with open_fits(path, wanted="a table of simple stellar populations") as hdus:
-            wave = hdus["WAVE"].data.astype(float) / 1e4
-            age = hdus["AGE"].data.astype(float) / 1e6
-            alive = hdus["LIVING"].data
-            for k in range(len(alive)):
-                hdu = hdus[f"Z{k + 1}"]
-                value = float(hdu.header["METAL"])
-                spectra[value] = hdu.data.astype(float) * (BUNDLED_SOLAR_LUMINOSITY * 1e4)
-                living[value] = alive[k].astype(float)
-    except KeyError as err:
-        msg = f"{path} is not a table of simple stellar populations: {err}"
-        raise DataError(msg) from err
-    for array in (wave, age, *spectra.values(), *living.values()):
-        array.flags.writeable = False
-    return wave, age, spectra, living
-
-
 def read_bc03(path):
     """
     Read SSPs of Bruzual & Charlot (2003, 2016), any IMF, any number of metallicities.
@@ -72,9 +35,9 @@ def read_bc03(path):
     the files sample coarsely, wavelengths are inserted by interpolation in the logarithms, and
     files that end before 160 um go on to there with their last slope.
 
-    The living mass leaves out remnants. Files of 2003 give the mass in stars with remnants,
-    of which their mass of remnants is taken away; those of 2016 give living stars. Which it
-    is, the mass of gas says where the file has it, else the second age. At age 0 all live.
+    The surviving mass leaves out remnants. Files of 2003 give the mass in stars with remnants,
+    of which their mass of remnants is taken away; those of 2016 give that in stars. Which it
+    is, the mass of gas says where the file has it, else the second age. At age 0 it is all.
 
     Parameters
     ----------
@@ -86,7 +49,7 @@ def read_bc03(path):
     -------
     library : `~miricigale.refdata.libraries.LibraryTable`
         Axes ``metallicity`` and ``age`` (Myr); spectra ``luminosity`` in W/um for one solar
-        mass formed; values ``living`` and ``remnants`` (Msun for one solar mass formed).
+        mass formed; values ``surviving`` and ``remnants`` (Msun for one solar mass formed).
 
     Raises
     ------
@@ -109,11 +72,11 @@ def read_bc03(path):
     wave, _ = _refine(first.wave / 1e4, first.spectra[:1])
     n_age = first.age.size
     spectra = np.empty((len(parts) * n_age, wave.size), dtype=np.float32)
-    living, remnants, basis = np.empty(len(spectra)), np.empty(len(spectra)), set()
+    surviving, remnants, basis = np.empty(len(spectra)), np.empty(len(spectra)), set()
     for i, (file, part, _, _) in enumerate(parts):
         rows = slice(i * n_age, (i + 1) * n_age)
         spectra[rows] = _refine(part.wave / 1e4, part.spectra)[1] * (SOLAR_LUMINOSITY * 1e4)
-        living[rows], how = _living(part, file)
+        surviving[rows], how = _surviving(part, file)
         remnants[rows] = part.quantities["remnants"]
         basis.add(how)
     metal, name, (low, high) = [p[2] for p in parts], _set_name(paths[0].name), first.mass_limits
@@ -125,20 +88,20 @@ def read_bc03(path):
         axes={"metallicity": np.repeat(metal, n_age), "age": np.tile(first.age / 1e6, len(parts))},
         spectra={"luminosity": spectra},
         units={"age": "Myr", "luminosity": "W / um"},
-        values={"living": living, "remnants": remnants},
+        values={"surviving": surviving, "remnants": remnants},
         meta={
             "files": files,
             "imf": imf,
             "mass_limits": list(first.mass_limits),
             "version": versions[0] if versions else None,
             "models": name,
-            "living": sorted(basis),
+            "surviving": sorted(basis),
         },
         summary=(
             f"{name}: {imf} IMF, {low:g} to {high:g} Msun, Z = {', '.join(f'{z:g}' for z in metal)}",
             f"{n_age} ages to {first.age[-1] / 1e9:g} Gyr, {first.wave.size} wavelengths",
             f"{wave.size - first.wave.size} wavelengths inserted beyond {DENSE_FROM:g} um",
-            f"living mass: {', '.join(sorted(basis))}",
+            f"surviving mass: {', '.join(sorted(basis))}",
             f"continued from {first.wave[-1] / 1e4:g} to {LONGEST:g} um"
             if extended
             else f"the files reach {first.wave[-1] / 1e4:g} um",
@@ -225,8 +188,8 @@ def _check_set(parts):
         seen[metallicity] = other
 
 
-def _living(part, file):
-    """Mass of living stars without remnants, and how it was found."""
+def _surviving(part, file):
+    """Mass in surviving stars without remnants, and how it was found."""
     mass, remnants = part.quantities["mass"], part.quantities["remnants"]
     gas = part.quantities.get("gas")
     old = part.age > 1e8
@@ -248,12 +211,12 @@ def _living(part, file):
             f"(2016), got {part.age[1]:g} yr"
         )
         raise DataError(msg)
-    living = mass - remnants if take else mass.copy()
-    living[part.age == 0] = 1.0
-    if living.min() < 0 or living.max() > 1.05:
-        msg = f"{file} must have living masses of 0 to 1 Msun, got up to {living.max():g}"
+    surviving = mass - remnants if take else mass.copy()
+    surviving[part.age == 0] = 1.0
+    if surviving.min() < 0 or surviving.max() > 1.05:
+        msg = f"{file} must have surviving masses of 0 to 1 Msun, got up to {surviving.max():g}"
         raise DataError(msg)
-    return living, "mass in stars less remnants" if take else "mass in stars, as in the file"
+    return surviving, "mass in stars less remnants" if take else "mass in stars, as in the file"
 
 
 def _refine(wave, spectra):

@@ -7,9 +7,9 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from miricigale.refdata.libraries.bc03 import load_ssp
 from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.refdata.locate import locate
+from miricigale.refdata.tables import load_ssp
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import check_unpacked, unpacked_size
 

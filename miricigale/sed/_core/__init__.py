@@ -2,7 +2,6 @@
 
 from miricigale.sed._core.attenuation import (
     attenuation_curve,
-    cardelli_odonnell,
     leitherer_calzetti,
     pei_extinction,
     power_law_attenuation,
@@ -36,7 +35,7 @@ from miricigale.sed._core.igm import (
     meiksin_transmission,
 )
 from miricigale.sed._core.nebular import absorbed_share, line_operator, photons_by_age
-from miricigale.sed._core.nodes import hat_matrix, merge_nodes
+from miricigale.sed._core.nodes import cells, hat_matrix, merge_nodes, trapezoid_weights
 from miricigale.sed._core.photons import photon_weights
 from miricigale.sed._core.polar import (
     DISK_MEAN,
@@ -70,7 +69,7 @@ __all__ = [
     "band_means",
     "band_tables",
     "block_fluxes",
-    "cardelli_odonnell",
+    "cells",
     "constant_history",
     "delayed_history",
     "disk_nodes",
@@ -102,5 +101,6 @@ __all__ = [
     "stern2015",
     "table_history",
     "time_weights",
+    "trapezoid_weights",
     "xray_flux",
 ]

@@ -6,7 +6,6 @@ from miricigale.sed._core.thermal import drude
 
 __all__ = [
     "attenuation_curve",
-    "cardelli_odonnell",
     "leitherer_calzetti",
     "pei_extinction",
     "power_law_attenuation",
@@ -46,15 +45,6 @@ _PEI = {
 }
 _PEI_RV = {"mw": 3.08, "lmc": 3.16, "smc": 2.93}
 
-# a and b of A(lambda) / A(V) = a(x) + b(x) / R_V, x = 1 um / lambda: highest power first
-_INFRARED, _INFRARED_POWER = (0.574, -0.527), 1.61  # Cardelli et al. 1989, equation 2
-_OPTICAL = (  # O'Donnell 1994, in x - 1.82
-    (-0.505, 1.647, -0.827, -1.718, 1.137, 0.701, -0.609, 0.104, 1.0),
-    (3.347, -10.805, 5.491, 11.102, -7.985, -3.989, 2.908, 1.952, 0.0),
-)
-_RISE = ((-0.009779, -0.04473, 0.0, 0.0), (0.1207, 0.2130, 0.0, 0.0))  # equation 4, in x - 5.9
-_FAR = ((-0.070, 0.137, -0.628, -1.073), (0.374, -0.420, 4.257, 13.670))  # equation 5, in x - 8
-
 
 def leitherer_calzetti(wave):
     """k(lambda) of starbursts: Calzetti 2000, Leitherer 2002 in 0.0912-0.15 um, 0 below."""
@@ -92,54 +82,19 @@ def attenuation_curve(wave, slope=0.0, bump=0.0, centre=0.2175, width=0.035, sca
 
 
 def power_law_attenuation(wave, slope):
-    """A(lambda) / A_V = (lambda / 0.55 um)^slope; 0 at 0.0912 um and below."""
-    wave = np.asarray(wave, dtype=float)
-    return np.where(wave <= _BREAK, 0.0, (wave / _V) ** slope)
+    """A(lambda) / A_V = (lambda / 0.55 um)^slope."""
+    return (np.asarray(wave, dtype=float) / _V) ** slope
 
 
 def smc_power_law(wave):
-    """k(lambda) = 1.39 (lambda / um)^-1.2 of the SMC; 0 at 0.0912 um and below."""
-    wave = np.asarray(wave, dtype=float)
-    return np.where(wave <= _BREAK, 0.0, 1.39 * wave**-1.2)
+    """k(lambda) = 1.39 (lambda / um)^-1.2 of the SMC."""
+    return 1.39 * np.asarray(wave, dtype=float) ** -1.2
 
 
 def pei_extinction(wave, galaxy):
-    """k(lambda) = (1 + R_V) xi(lambda), Pei 1992, of mw, lmc or smc; 0 at 0.0912 um and below."""
-    wave = np.asarray(wave, dtype=float)
-    xi = np.zeros_like(wave)
+    """k(lambda) = (1 + R_V) xi(lambda), Pei 1992, of mw, lmc or smc."""
+    xi = 0.0
     for amplitude, centre, b, n in _PEI[galaxy]:
         ratio = (wave / centre) ** n
-        xi += amplitude / (ratio + 1.0 / ratio + b)
-    return np.where(wave <= _BREAK, 0.0, (1.0 + _PEI_RV[galaxy]) * xi)
-
-
-def cardelli_odonnell(wave, r_v):
-    """
-    k(lambda) of the Milky Way: Cardelli et al. 1989, the optical part of O'Donnell 1994.
-
-    Given for 0.1-3.3 um; the cubic of the far ultraviolet goes on to 0.0912 um, with 0 from there
-    down, and the power law of the infrared has no end.
-    """
-    wave = np.asarray(wave, dtype=float)
-    # no powers of what lies far outside
-    x = 1.0 / np.maximum(wave, _BREAK)
-    infrared = x**_INFRARED_POWER
-    ultraviolet = (
-        1.752 - 0.316 * x - 0.104 / ((x - 4.67) ** 2 + 0.341),
-        -3.090 + 1.825 * x + 1.206 / ((x - 4.62) ** 2 + 0.263),
-    )
-    pieces = [x < 1.1, x < 3.3, x < 5.9, x < 8.0]
-    parts = [
-        np.select(
-            pieces,
-            [
-                _INFRARED[i] * infrared,
-                np.polyval(_OPTICAL[i], x - 1.82),
-                ultraviolet[i],
-                ultraviolet[i] + np.polyval(_RISE[i], x - 5.9),
-            ],
-            np.polyval(_FAR[i], x - 8.0),
-        )
-        for i in (0, 1)
-    ]
-    return np.where(wave <= _BREAK, 0.0, r_v * parts[0] + parts[1])
+        xi = xi + amplitude / (ratio + 1.0 / ratio + b)
+    return (1.0 + _PEI_RV[galaxy]) * xi

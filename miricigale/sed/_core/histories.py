@@ -5,6 +5,7 @@ import math
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from miricigale.sed._core.nodes import cells
 from miricigale.utils.compilation import njit
 
 __all__ = [
@@ -132,8 +133,8 @@ def time_weights(age, n_steps):
     """
     sample = (np.arange(n_steps)[:, None] + np.arange(1, 11) / 10.0).ravel()
     step = np.repeat(np.arange(n_steps), 10)
-    cell = np.clip(np.searchsorted(age, sample, side="right") - 1, 0, age.size - 2)
-    t = np.clip((sample - age[cell]) / (age[cell + 1] - age[cell]), 0.0, 1.0)
+    cell, t = cells(age, sample)
+    t = np.clip(t, 0.0, 1.0)
     data = np.concatenate([1 - t, t]) / 10.0
     index = (np.concatenate([step, step]), np.concatenate([cell, cell + 1]))
     return csr_matrix((data, index), shape=(n_steps, age.size))
@@ -161,7 +162,7 @@ def age_steps(age, n_steps):
         Their rows of the matrix.
     """
     k = np.arange(n_steps)
-    cell = np.clip(np.searchsorted(age, k + 0.1, side="right") - 1, 0, age.size - 2)
+    cell, _ = cells(age, k + 0.1)
     inside = (k + 0.1 >= age[cell]) & (k + 1.0 <= age[cell + 1])
     runs = []
     for j in np.unique(cell[inside]):

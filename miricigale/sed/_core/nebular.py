@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.sparse import csr_matrix, hstack
 
-from miricigale.sed._core.nodes import hat_matrix, merge_nodes
+from miricigale.sed._core.nodes import cells, hat_matrix, merge_nodes
 
 __all__ = ["absorbed_share", "line_nodes", "line_operator", "photons_by_age"]
 
@@ -50,8 +50,7 @@ def photons_by_age(age, photons, nodes):
         The sum is that of ``photons``.
     """
     inside = np.clip(age, nodes[0], nodes[-1])
-    cell = np.clip(np.searchsorted(nodes, inside, side="right") - 1, 0, nodes.size - 2)
-    t = (inside - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
+    cell, t = cells(nodes, inside)
     out = np.bincount(cell, photons * (1.0 - t), nodes.size)
     return out + np.bincount(cell + 1, photons * t, nodes.size)
 

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.sparse import csr_matrix
 
-__all__ = ["hat_matrix", "merge_nodes"]
+__all__ = ["cells", "hat_matrix", "merge_nodes", "trapezoid_weights"]
 
 
 def merge_nodes(parts):
@@ -13,10 +13,23 @@ def merge_nodes(parts):
     return nodes[keep]
 
 
+def trapezoid_weights(wave):
+    """Weights of the trapezoid rule: ``weights @ spectrum`` is its integral."""
+    weights = np.zeros(wave.size)
+    weights[:-1] += 0.5 * np.diff(wave)
+    weights[1:] += 0.5 * np.diff(wave)
+    return weights
+
+
+def cells(nodes, x):
+    """Cell between ascending nodes, the outermost beyond them, and place in it from 0 to 1."""
+    cell = np.clip(np.searchsorted(nodes, x, side="right") - 1, 0, nodes.size - 2)
+    return cell, (x - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
+
+
 def hat_matrix(nodes, wave):
     """Sparse matrix that interpolates linearly from nodes to wavelengths, 0 outside."""
-    cell = np.clip(np.searchsorted(nodes, wave, side="right") - 1, 0, nodes.size - 2)
-    t = (wave - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
+    cell, t = cells(nodes, wave)
     inside = (t >= 0) & (t <= 1)
     row = np.flatnonzero(inside)
     cell, t = cell[inside], t[inside]

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from miricigale.sed._core.attenuation import leitherer_calzetti
+from miricigale.sed._core.attenuation import leitherer_calzetti, smc_power_law
+from miricigale.sed._core.nodes import trapezoid_weights
 from miricigale.sed._core.thermal import PLANCK_K
 from miricigale.utils.compilation import njit
 
@@ -40,7 +41,7 @@ def polar_curve(wave, law):
     """
     wave = np.asarray(wave, dtype=float)
     if law == "smc":
-        return 1.39 * wave**-1.2
+        return smc_power_law(wave)
     x = 1.0 / wave
     if law == "calzetti":
         short = wave < 0.15
@@ -63,10 +64,7 @@ def polar_grid(wave, law):
     trapezoidal rule.
     """
     wave = np.asarray(wave, dtype=float)
-    step = np.diff(wave)
-    weight = np.zeros(wave.size)
-    weight[:-1] += 0.5 * step
-    weight[1:] += 0.5 * step
+    weight = trapezoid_weights(wave)
     absorption = -0.4 * math.log(10.0) * polar_curve(wave, law)
     return np.stack([absorption, wave**-5.0, PLANCK_K / wave, np.log(_WAVE_THICK / wave), weight])
 

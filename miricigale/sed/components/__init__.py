@@ -1,12 +1,6 @@
 """The links of a model's chain, by what they do."""
 
-from miricigale.sed.components.agn import (
-    AGN,
-    AGNTemplates,
-    ParametricTorus,
-    Skirtor2016,
-    TorusSpectra,
-)
+from miricigale.sed.components.agn import AGN, AGNTemplates, Skirtor2016, TorusSpectra
 from miricigale.sed.components.attenuation import (
     SMC,
     Attenuation,
@@ -24,6 +18,7 @@ from miricigale.sed.components.dust import (
 from miricigale.sed.components.foreground import Foreground, GalacticExtinction
 from miricigale.sed.components.igm import IGM, Inoue2014, Madau1995, Meiksin2006
 from miricigale.sed.components.nebular import Nebular
+from miricigale.sed.components.parametric_torus import ParametricTorus
 from miricigale.sed.components.sfh import (
     ConstantSFH,
     DelayedSFH,

@@ -10,9 +10,30 @@ from miricigale.sed.parameter import Parameter
 
 __all__ = ["SMC", "Attenuation", "CalzettiLeitherer", "CharlotFall", "ModifiedStarburst"]
 
+# Cardelli et al. 1989, equation 5, in 1 um / lambda - 8: the highest power first
+_FAR = ((-0.070, 0.137, -0.628, -1.073), (0.374, -0.420, 4.257, 13.670))
+
+
+def milky_way(wave, r_v):
+    """
+    k(lambda) of the Milky Way: Cardelli et al. 1989, the optical part of O'Donnell 1994.
+
+    Given for 0.1-3.33 um (from dust_extinction); the cubic of the far ultraviolet goes on below
+    and the power law of the infrared has no end.
+    """
+    import astropy.units as u
+    from dust_extinction.parameter_averages import O94
+
+    low, high = O94.x_range
+    x = 1.0 / np.asarray(wave, dtype=float)
+    k = r_v * np.asarray(O94(Rv=r_v)(np.clip(x, low, high) / u.um), dtype=float)
+    k = np.where(x < low, k * (x / low) ** 1.61, k)
+    return np.where(x > high, r_v * np.polyval(_FAR[0], x - 8) + np.polyval(_FAR[1], x - 8), k)
+
+
 _CURVES = {
     "calzetti": _core.attenuation_curve,
-    "cardelli_odonnell": _core.cardelli_odonnell,
+    "milky_way": milky_way,
     "power_law": _core.power_law_attenuation,
     "smc": _core.smc_power_law,
     "pei1992": _core.pei_extinction,
@@ -28,7 +49,10 @@ def _exponents(wave, law, *shape):
     A grid is asked for with thousands of amounts of dust: it is known by its bytes, which are
     hashed in 2 us.
     """
-    exponent = _MAG * _CURVES[law](np.frombuffer(wave), *shape)
+    wave = np.frombuffer(wave)
+    exponent = _MAG * _CURVES[law](wave, *shape)
+    if law != "calzetti":  # of whose curve the wing of a bump is left there
+        exponent[wave <= _core.LYMAN_LIMIT] = 0.0
     inside = np.flatnonzero(exponent)
     first, last = (int(inside[0]), int(inside[-1]) + 1) if inside.size else (0, 0)
     part = exponent[first:last].copy()
@@ -210,6 +234,7 @@ class ModifiedStarburst(_Starburst):
         "Calzetti et al. 1994, ApJ 429, 582; Calzetti et al. 2000, ApJ 533, 682; "
         "Cardelli et al. 1989, ApJ 345, 245; O'Donnell 1994, ApJ 422, 158; Pei 1992, ApJ 395, 130"
     )
+    packages = ("dust_extinction",)
     options = {"gas_law": ("mw", "lmc", "smc", "mw_pei1992")}
     ebv_lines = Parameter(
         default=0.3, bounds=(0.0, 5.0), unit="mag", doc="Colour excess of the gas."
@@ -233,7 +258,7 @@ class ModifiedStarburst(_Starburst):
     def gas_factor(self, wave, values):
         """See `Attenuation.gas_factor`."""
         if self.gas_law == "mw":
-            law = ("cardelli_odonnell", values["r_v_gas"])
+            law = ("milky_way", values["r_v_gas"])
         else:
             law = ("pei1992", self.gas_law.removesuffix("_pei1992"))
         return _transmission(np.shape(wave), _exponents(_key(wave), *law), values["ebv_lines"])

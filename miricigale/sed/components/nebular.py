@@ -5,11 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from miricigale.refdata.tables import read_images
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import cached_by_file, open_fits
+from miricigale.utils.units import frozen_array
 
 __all__ = ["Nebular", "NebularTable", "load_nebular"]
 
@@ -85,8 +87,7 @@ class NebularTable:
         nodes = self.log_u[models]
         if not nodes[0] <= log_u <= nodes[-1]:
             raise argument_error("log_u", f"from {nodes[0]:g} to {nodes[-1]:g}", f"{log_u:g}")
-        cell = int(np.clip(np.searchsorted(nodes, log_u, side="right") - 1, 0, nodes.size - 2))
-        t = (log_u - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
+        cell, t = _core.cells(nodes, log_u)
         low, high = (
             np.concatenate([self.continuum[m], self.lines[m]], axis=1)
             for m in models[cell : cell + 2]
@@ -116,17 +117,18 @@ def load_nebular(path):
     `~miricigale.utils.exceptions.DataError`
         If the file is something else.
     """
-    with open_fits(path, wanted="a table of nebular emission") as hdus:
-        try:
-            arrays = {
-                name: np.array(hdus[name.upper().replace("_", "")].data, dtype=float)
-                for name in ("metallicity", "log_u", "age", "wave", "continuum", "lines")
-            }
-            names = tuple(str(name).strip() for name in hdus["LINE_LIST"].data["NAME"])
-            arrays["line_wave"] = np.array(hdus["LINE_LIST"].data["WAVE"], dtype=float)
-        except KeyError as err:
-            msg = f"{path} is not a table of nebular emission: {err.args[0]}"
-            raise DataError(msg) from err
+    wanted = "a table of nebular emission"
+    names = ("metallicity", "log_u", "age", "wave", "continuum", "lines")
+    images = [name.replace("_", "") for name in names]
+    arrays = dict(zip(names, read_images(path, images, wanted=wanted).values(), strict=True))
+    try:
+        with open_fits(path, wanted=wanted) as hdus:
+            rows = hdus["LINE_LIST"].data
+            names = tuple(str(name).strip() for name in rows["NAME"])
+            arrays["line_wave"] = frozen_array(rows["WAVE"])
+    except KeyError as err:
+        msg = f"{path} is not {wanted}: {err.args[0]}"
+        raise DataError(msg) from err
     shape = (arrays["metallicity"].size, arrays["age"].size)
     wanted = {
         "continuum": (*shape, arrays["wave"].size),
@@ -137,8 +139,6 @@ def load_nebular(path):
         if arrays[name].shape != size:
             msg = f"{path}: '{name}' must have shape {size}, got {arrays[name].shape}"
             raise DataError(msg)
-    for array in arrays.values():
-        array.flags.writeable = False
     return NebularTable(names=names, **arrays)
 
 

@@ -3,15 +3,17 @@
 import functools
 import tomllib
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from miricigale.sed import _core
 from miricigale.sed.component import register
-from miricigale.sed.components.agn.base import AGN, DISK_MEAN, TorusSpectra
+from miricigale.sed.components.agn import AGN, DISK_MEAN, TorusSpectra
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import cached_by_file
+from miricigale.utils.units import frozen_array
 
 __all__ = ["ParametricTorus"]
 
@@ -59,9 +61,39 @@ class ParametricTorus(AGN):
         return np.concatenate([_core.disk_nodes(self.disk), high])
 
     def torus_spectra(self, wave, values):
-        names = ("tau97", "inclination", "opening_angle", "p", "q", "radius_ratio")
-        disk = (self.disk, float(values["disk_slope"]))
-        return _torus(self.path, wave.tobytes(), disk, *(float(values[n]) for n in names))
+        shape = _shape(values)
+        return _torus(self.path, wave.tobytes(), self.disk, float(values["disk_slope"]), shape)
+
+    def absorbed_share(self, values):
+        """
+        Share of the disk's light, over all directions, that neither passes nor is scattered.
+
+        Parameters
+        ----------
+        values : dict
+            Values of all parameters of the component.
+
+        Returns
+        -------
+        share : float
+        """
+        shape = _shape(values)
+        return _absorbed(self.path, shape.tau97, shape.opening_angle, shape.q)
+
+
+class _Shape(NamedTuple):
+    """Torus and line of sight: angles in degrees."""
+
+    tau97: float
+    inclination: float
+    opening_angle: float
+    p: float
+    q: float
+    radius_ratio: float
+
+
+def _shape(values):
+    return _Shape(*(float(values[name]) for name in _Shape._fields))
 
 
 @cached_by_file(maxsize=2)
@@ -74,22 +106,16 @@ def _constants(path):
 
 
 @cached_by_file(maxsize=512)
-def _torus(path, wave_bytes, disk, tau, inclination, opening, p, q, ratio):
-    const = _constants(path)
-    wave = np.frombuffer(wave_bytes)
-    mu = np.cos(np.radians(inclination))
-    form, slope = disk
-    face_on = _core.disk_spectrum(wave, slope, form)
+def _torus(path, wave_bytes, disk, slope, shape):
+    const, wave = _constants(path), np.frombuffer(wave_bytes)
+    tau, inclination, opening, _, q, _ = shape
+    face_on = _core.disk_spectrum(wave, slope, disk)
     face_on /= DISK_MEAN * np.trapezoid(face_on, wave)
     seen = face_on * _seen_fraction(const, wave, tau, inclination, opening, q)
-    dust = _dust_shape(
-        path, wave_bytes, tau * np.exp(-q * mu), tau, opening, inclination, p, q, ratio
-    )
+    dust = _dust_shape(const["emission"], wave_bytes, shape)
     power = _absorbed(path, tau, opening, q) * _anisotropy(const, tau, inclination, opening)
     dust *= power / np.trapezoid(dust, wave)
-    for array in (face_on, seen, dust):
-        array.flags.writeable = False
-    return TorusSpectra(face_on, seen, dust)
+    return TorusSpectra(*map(frozen_array, (face_on, seen, dust)))
 
 
 def _seen_fraction(const, wave, tau, inclination, opening, q):
@@ -102,12 +128,10 @@ def _seen_fraction(const, wave, tau, inclination, opening, q):
     mu = np.cos(np.radians(angle))
     direct = mu * (1.0 + 2.0 * mu) / 3.0
     x, depth = np.log10(wave), np.log(tau / 7.0)
-    scatter = const["scattering"]
-    if np.all(angle < 90.0 - opening - const["extinction"]["edge"]):
+    ext, scatter = const["extinction"], const["scattering"]
+    if np.all(angle < 90.0 - opening - ext["edge"]):
         a, b, cut, power = scatter["clear"]
-        scattered = 10.0 ** (a + b * x) / (1.0 + (wave / cut) ** power)
-        return direct + scattered
-    ext = const["extinction"]
+        return direct + 10.0 ** (a + b * x) / (1.0 + (wave / cut) ** power)
     curve = ext["amplitude"] * wave ** -ext["power"]
     curve += ext["silicate97"] * _core.drude(wave, 9.7, ext["width97"])
     curve += ext["silicate18"] * _core.drude(wave, 18.0, ext["width18"])
@@ -134,7 +158,7 @@ def _anisotropy(const, tau, inclination, opening):
 
 @cached_by_file(maxsize=256)
 def _absorbed(path, tau, opening, q):
-    """Share of the disk's light, over all directions, that neither passes nor is scattered."""
+    """See `ParametricTorus.absorbed_share`."""
     const = _constants(path)
     wave = np.geomspace(_core.DISK_BREAKS[0], 100.0, 400)
     spectrum = _core.disk_spectrum(wave)
@@ -149,23 +173,23 @@ def _absorbed(path, tau, opening, q):
     return float(1.0 - escaped / DISK_MEAN)
 
 
-def _dust_shape(path, wave_bytes, tau_sight, tau, opening, inclination, p, q, ratio):
+def _dust_shape(e, wave_bytes, shape):
     """Dust emission at an inclination, arbitrary scale."""
-    e = _constants(path)["emission"]
     wave = np.frombuffer(wave_bytes)
     opacity = e["c0"] * (wave / 9.7) ** -e["s1"] + _core.drude(wave, 9.7, e["w97"])
     opacity += e["g18"] * _core.drude(wave, 18.0, e["w18"])
-    rho, planck = _planck_by_radius(wave_bytes, e["temperature"], e["b"], ratio)
-    weight = rho ** (e["c"] - (p - 1.0))
-    emission = planck @ (weight * _steps(np.log(rho)))
+    rho, planck = _planck_by_radius(wave_bytes, e["temperature"], e["b"], shape.radius_ratio)
+    weight = rho ** (e["c"] - (shape.p - 1.0))
+    emission = planck @ (weight * _core.trapezoid_weights(np.log(rho)))
     # mean over the torus of exp(-q |cos theta|), the layer that shines
-    s = np.sin(np.radians(opening))
+    q, s = shape.q, np.sin(np.radians(shape.opening_angle))
     mean = -np.expm1(-q * s) / (q * s) if q > 0.0 else 1.0
-    layer = e["te"] * (tau * mean / 7.0) ** e["te_power"]
-    shift = opening - 40.0
-    sight = e["tl"] * (tau_sight / 7.0) ** e["tl_power"]
-    sight *= max(0.0, 1.0 + e["gi"] * (inclination - 60.0 + shift) / 30.0)
-    sight /= 1.0 + np.exp(-(inclination - e["i0"] + shift) / e["width"])
+    layer = e["te"] * (shape.tau97 * mean / 7.0) ** e["te_power"]
+    angle = shape.inclination + shape.opening_angle - 40.0
+    mu = np.cos(np.radians(shape.inclination))
+    sight = e["tl"] * (shape.tau97 * np.exp(-q * mu) / 7.0) ** e["tl_power"]
+    sight *= max(0.0, 1.0 + e["gi"] * (angle - 60.0) / 30.0)
+    sight /= 1.0 + np.exp(-(angle - e["i0"]) / e["width"])
     return emission * -np.expm1(-layer * opacity) * np.exp(-sight * opacity)
 
 
@@ -174,13 +198,6 @@ def _planck_by_radius(wave_bytes, temperature, b, ratio):
     wave = np.frombuffer(wave_bytes)
     rho = np.geomspace(1.0, ratio, 60)
     return rho, _core.planck_lambda(wave[:, None], temperature * rho**-b)
-
-
-def _steps(x):
-    out = np.zeros(x.size)
-    out[:-1] += 0.5 * np.diff(x)
-    out[1:] += 0.5 * np.diff(x)
-    return out
 
 
 @functools.cache

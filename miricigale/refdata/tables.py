@@ -1,0 +1,76 @@
+"""Reading of the bundled tables: images of FITS files, as read-only arrays."""
+
+from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import cached_by_file, open_fits
+from miricigale.utils.units import frozen_array
+
+__all__ = ["load_ssp", "read_images"]
+
+SOLAR_LUMINOSITY = 3.828e26  # W, IAU 2015
+
+
+def read_images(path, names, *, wanted):
+    """
+    Read images of a FITS file.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    names : iterable of str
+        Names of the extensions.
+    wanted : str
+        What the file should be, for the message.
+
+    Returns
+    -------
+    arrays : dict of str to `~numpy.ndarray` of float
+        Read-only, by the names that were asked for.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file is something else.
+    """
+    try:
+        with open_fits(path, wanted=wanted) as hdus:
+            return {name: frozen_array(hdus[name].data) for name in names}
+    except KeyError as err:
+        msg = f"{path} is not {wanted}: {err.args[0]}"
+        raise DataError(msg) from err
+
+
+@cached_by_file(maxsize=2)
+def load_ssp(path):
+    """
+    Read the bundled simple stellar populations.
+
+    Returns
+    -------
+    wave : `~numpy.ndarray`, shape (n_wave,)
+        Wavelengths in um.
+    age : `~numpy.ndarray`, shape (n_age,)
+        Ages in Myr.
+    spectra : dict of float to `~numpy.ndarray`, shape (n_age, n_wave)
+        W/um for one solar mass formed, by metallicity.
+    surviving : dict of float to `~numpy.ndarray`, shape (n_age,)
+        Mass fraction in surviving stars, without remnants.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If it is another file.
+    """
+    wanted = "a table of simple stellar populations"
+    part = read_images(path, ("WAVE", "AGE", "LIVING"), wanted=wanted)
+    names = [f"Z{k + 1}" for k in range(len(part["LIVING"]))]
+    with open_fits(path, wanted=wanted) as hdus:
+        metallicities = [float(hdus[name].header["METAL"]) for name in names if name in hdus]
+    images = read_images(path, names, wanted=wanted).values()
+    spectra = [frozen_array(image * (SOLAR_LUMINOSITY * 1e4)) for image in images]
+    return (
+        frozen_array(part["WAVE"] / 1e4),
+        frozen_array(part["AGE"] / 1e6),
+        dict(zip(metallicities, spectra, strict=True)),
+        dict(zip(metallicities, part["LIVING"], strict=True)),
+    )

@@ -1,0 +1,278 @@
+"""Active nuclei: accretion disk, dusty torus and polar dust."""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from miricigale.refdata.libraries.skirtor import SKIRTOR_AXES
+from miricigale.refdata.libraries.table import open_library
+from miricigale.sed import _core
+from miricigale.sed._core import DISK_MEAN
+from miricigale.sed.component import Component, register
+from miricigale.sed.parameter import Parameter
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.files import cached_by_file
+from miricigale.utils.units import frozen_array
+
+__all__ = ["AGN", "DISK_MEAN", "AGNTemplates", "Skirtor2016", "TorusSpectra"]
+
+
+@dataclass(frozen=True, eq=False)
+class TorusSpectra:
+    """
+    What a torus library says for one set of parameters, in W/um on a common scale.
+
+    Parameters
+    ----------
+    face_on : `~numpy.ndarray`
+        The disk without obscuration, seen from above.
+    disk : `~numpy.ndarray`
+        Disk light seen at the inclination, direct and scattered.
+    dust : `~numpy.ndarray`
+        Dust emission seen at the inclination.
+    """
+
+    face_on: np.ndarray
+    disk: np.ndarray
+    dust: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class AGNTemplates:
+    """
+    Spectra for one watt of AGN dust emission (torus + polar), in W/um.
+
+    Parameters
+    ----------
+    disk, torus, polar : `~numpy.ndarray`
+        The parts as seen; torus + polar integrate to 1 W.
+    accretion_power : float
+        Luminosity of the disk over all directions, in W for each W of dust emission.
+    """
+
+    disk: np.ndarray
+    torus: np.ndarray
+    polar: np.ndarray
+    accretion_power: float
+
+    @property
+    def total(self):
+        """Sum of the parts."""
+        return self.disk + self.torus + self.polar
+
+
+class AGN(Component):
+    """
+    Base of nuclei with a torus and polar dust; a subclass gives `torus_spectra`.
+
+    Polar dust (option ``polar_law``: ``smc``, ``calzetti`` or ``gaskell``) dims the disk where the
+    line of sight misses the torus (i <= 90 deg - opening angle). What it takes from the disk
+    over its cone, (7/18 - sin^2 oa / 6 - 2 sin^3 oa / 9) int disk (1 - 10^(-0.4 k E)), it sends
+    out evenly as a modified blackbody, (1 - exp(-(200 um / lambda)^beta)) B_lambda(T); torus
+    and polar emission together are then scaled to 1 W (Yang et al. 2020, MNRAS 491, 740).
+
+    The disk (option ``disk``) is a power law between breaks; ``disk_slope`` changes its slope
+    in the optical and keeps its power. The torus's emission does not follow such changes.
+    """
+
+    role = "agn"
+    options = {"polar_law": _core.POLAR_LAWS, "disk": tuple(_core.DISKS)}
+    frac_agn = Parameter(
+        default=0.0, bounds=(0.0, 0.999999), doc="AGN fraction, in the model's definition."
+    )
+    inclination = Parameter(
+        default=70.0, bounds=(0.0, 90.0), unit="deg", doc="Angle between axis and line of sight."
+    )
+    opening_angle = Parameter(
+        default=40.0, bounds=(10.0, 80.0), unit="deg",
+        doc="Angle between the equator and the edge of the torus.",
+    )  # fmt: skip
+    disk_slope = Parameter(
+        default=0.0, bounds=(-1.0, 1.0),
+        doc="Added to the disk's optical slope, L_lambda ~ lambda^(-1.5 + disk_slope).",
+    )  # fmt: skip
+    ebv_polar = Parameter(
+        default=0.1, bounds=(0.0, 3.0), unit="mag", doc="Colour excess of the polar dust."
+    )
+    temperature_polar = Parameter(
+        default=100.0, bounds=(20.0, 1500.0), unit="K", doc="Temperature of the polar dust."
+    )
+    emissivity_polar = Parameter(
+        default=1.6, bounds=(0.5, 3.0), doc="Emissivity index of the polar dust."
+    )
+
+    def torus_spectra(self, wave, values):
+        """
+        Disk and torus of the library.
+
+        Parameters
+        ----------
+        wave : `~numpy.ndarray`
+            Rest wavelengths in um.
+        values : dict
+            Values of all parameters of the component.
+
+        Returns
+        -------
+        spectra : `TorusSpectra`
+        """
+        raise NotImplementedError
+
+    def templates(self, wave, values):
+        """
+        Spectra for one watt of dust emission.
+
+        Parameters
+        ----------
+        wave : `~numpy.ndarray`
+            Rest wavelengths in um, ascending, from the disk's beginning to where dust is dark.
+        values : dict
+            Values of all parameters of the component.
+
+        Returns
+        -------
+        templates : `AGNTemplates`
+
+        Raises
+        ------
+        ValueError
+            If the wavelengths hold no dust emission.
+        """
+        base = self.torus_spectra(wave, values)
+        opening = values["opening_angle"]
+        parts, power, total = _core.add_polar(
+            _polar_grid(wave.tobytes(), self.polar_law), base.face_on, base.disk, base.dust,
+            float(values["ebv_polar"]), float(values["temperature_polar"]),
+            float(values["emissivity_polar"]), _core.polar_share(opening),
+            values["inclination"] <= 90.0 - opening,
+        )  # fmt: skip
+        if not total > 0.0:
+            span = f"{wave.size} points from {wave[0]:g} to {wave[-1]:g} um"
+            raise argument_error("wave", "a grid that holds the dust emission", span)
+        return AGNTemplates(parts[0], parts[1], parts[2], power)
+
+    def inert(self, values):
+        polar = values["ebv_polar"] == 0.0
+        return ("temperature_polar", "emissivity_polar") if polar else ()
+
+
+@functools.lru_cache(maxsize=16)
+def _polar_grid(wave_bytes, law):
+    return _core.polar_grid(np.frombuffer(wave_bytes), law)
+
+
+@register
+class Skirtor2016(AGN):
+    """
+    Clumpy two-phase tori, SKIRTOR, as the user registered them (``torus.skirtor2016``).
+
+    The dust spectrum is the library's, straight between its 132 wavelengths, zero outside.
+    Disk light at the inclination is the chosen disk times direct plus scattered light over
+    that at inclination 0, both the library's: the disk changes and what the torus does to it
+    stays (as in CIGALE 2020). The chosen disk has the power that the library's has at
+    inclination 0, from which ``accretion_power`` follows.
+
+    Parameters of the torus take the library's values only; `missing` names those without.
+    """
+
+    name = "skirtor2016"
+    reference = "Stalevski et al. 2012, MNRAS 420, 2756; 2016, MNRAS 458, 2288"
+    resource = "torus.skirtor2016"
+    tau97 = Parameter(
+        default=7.0, bounds=(3.0, 11.0),
+        doc="Optical depth at 9.7 um along the equator: 3, 5, 7, 9 or 11.",
+    )  # fmt: skip
+    p = Parameter(
+        default=1.0, bounds=(0.0, 1.5), doc="Slope of density with radius: 0, 0.5, 1 or 1.5."
+    )
+    q = Parameter(
+        default=1.0, bounds=(0.0, 1.5), doc="Slope of density with angle: 0, 0.5, 1 or 1.5."
+    )
+    radius_ratio = Parameter(
+        default=20.0, bounds=(10.0, 30.0),
+        doc="Outer over inner radius of the torus: 10, 20 or 30.",
+    )  # fmt: skip
+
+    @property
+    def table(self):
+        """The library: `~miricigale.refdata.libraries.LibraryTable`, read from disk as needed."""
+        return open_library(self.path, self.resource)
+
+    def missing(self, **values):
+        """
+        Axes on which the library has not these values.
+
+        Parameters
+        ----------
+        **values : float or sequence of float
+            Values of axes of the library, in the parameters' units; other names are ignored.
+
+        Returns
+        -------
+        missing : dict of str to tuple of float
+            Name of the axis to the values that the library has; empty if it has them all.
+        """
+        return _missing(self.table, values)
+
+    def covers(self, **values):
+        """Whether the library has these values of its axes, as for `missing`: bool."""
+        return not self.missing(**values)
+
+    def invalid(self, values):
+        return _refusal(self.path, tuple([float(values[name]) for name in SKIRTOR_AXES]))
+
+    def nodes(self):
+        return _core.merge_nodes([self.table.wave, _core.disk_nodes(self.disk, number=161)])
+
+    def torus_spectra(self, wave, values):
+        axes = tuple([float(values[name]) for name in SKIRTOR_AXES])
+        return _torus(self.path, wave.tobytes(), self.disk, float(values["disk_slope"]), axes)
+
+
+@functools.lru_cache(maxsize=8)
+def _values(table):
+    return {name: tuple(table.values_of(name).tolist()) for name in table.axes}
+
+
+def _missing(table, values):
+    return {
+        name: there
+        for name, there in _values(table).items()
+        if name in values
+        and not all(np.isclose(v, there, 1e-6, 0.0).any() for v in np.atleast_1d(values[name]))
+    }
+
+
+@cached_by_file(maxsize=4096)
+def _refusal(path, axes):
+    values = dict(zip(SKIRTOR_AXES, axes, strict=True))
+    parts = [
+        f"'{name}' must be one of {', '.join(f'{v:g}' for v in there)}, got {values[name]:g}"
+        for name, there in _missing(open_library(path, Skirtor2016.resource), values).items()
+    ]
+    return f"{'; '.join(parts)} (the library at {path} has no more)" if parts else None
+
+
+@cached_by_file(maxsize=512)
+def _torus(path, wave_bytes, disk, slope, axes):
+    refusal = _refusal(path, axes)
+    if refusal is not None:
+        raise ValueError(refusal)
+    table = open_library(path, Skirtor2016.resource)
+    values = dict(zip(SKIRTOR_AXES, axes, strict=True))
+    row, above = table.row(**values), table.row(**values | {"inclination": 0.0})
+    wave = np.frombuffer(wave_bytes)
+    seen, top, dust = (
+        table.spectrum(name, k) for name, k in (("disk", row), ("disk", above), ("dust", row))
+    )
+    scale = 1.0 / np.trapezoid(dust, table.wave)
+    through = np.divide(seen, top, out=np.zeros_like(top), where=top > 0.0)
+    face_on = _core.disk_spectrum(wave, slope, disk)
+    face_on *= scale * np.trapezoid(top, table.wave) / np.trapezoid(face_on, wave)
+    parts = (
+        face_on,
+        face_on * np.interp(wave, table.wave, through),
+        np.interp(wave, table.wave, dust * scale, left=0.0, right=0.0),
+    )
+    return TorusSpectra(*map(frozen_array, parts))

@@ -1,0 +1,316 @@
+"""Emission of dust in galaxies; the energy is what attenuation took."""
+
+import functools
+
+import numpy as np
+
+from miricigale.refdata.libraries.table import open_library
+from miricigale.refdata.tables import read_images
+from miricigale.sed import _core
+from miricigale.sed.component import Component, register
+from miricigale.sed.parameter import Parameter
+from miricigale.utils.files import cached_by_file
+from miricigale.utils.units import frozen_array
+
+__all__ = ["Casey2012", "Dale2014", "DraineLi2007", "DraineLi2007Alpha", "DustEmission"]
+
+
+class DustEmission(Component):
+    """Base: `template` gives a spectrum that integrates to 1."""
+
+    role = "dust"
+
+    def spectrum(self, values):
+        """
+        Spectrum at `nodes`.
+
+        Parameters
+        ----------
+        values : dict of str to float
+            Values of all parameters.
+
+        Returns
+        -------
+        spectrum : `~numpy.ndarray`
+            L_lambda, not negative, arbitrary scale.
+        """
+        raise NotImplementedError
+
+    def template(self, wave, **values):
+        """
+        Spectrum for one watt.
+
+        Parameters
+        ----------
+        wave : `~numpy.ndarray`
+            Rest wavelengths in um.
+        **values
+            Values of the parameters; defaults where not given.
+
+        Returns
+        -------
+        spectrum : `~numpy.ndarray`
+            L_lambda in W/um; the integral over `nodes`, by trapezoids, is 1 W.
+        """
+        full = {name: par.default for name, par in self.parameters.items()} | values
+        nodes, spectrum = self.nodes(), self.spectrum(full)
+        return np.interp(wave, nodes, spectrum / np.trapezoid(spectrum, nodes), left=0, right=0)
+
+
+@functools.lru_cache(maxsize=4)
+def _sequence(library, column):
+    """Alphas and spectra of an open library, in memory."""
+    order = np.argsort(library.axes["alpha"])
+    return library.axes["alpha"][order], frozen_array(library.spectra[column][order])
+
+
+@register
+class Dale2014(DustEmission):
+    """
+    Dale et al. 2014 without AGN: dust mass goes as dM ~ U^-alpha dU in the intensity U.
+
+    The 64 templates (alpha in steps of 1/16) are those of the distributed files, normalised to
+    1 W; between them a spectrum is the linear interpolation of its neighbours. The option
+    ``starlight`` says whether the starlight that CIGALE's builder takes away near 2 um is
+    taken away here (``"removed"``) or not (``"kept"``). The files are the user's to bring:
+    ``miricigale data add dust.dale2014 PATH``.
+    """
+
+    name = "dale2014"
+    reference = "Dale et al. 2014, ApJ 784, 83"
+    resource = "dust.dale2014"
+    options = {"starlight": ("removed", "kept")}
+    alpha = Parameter(
+        default=2.0, bounds=(0.0625, 4.0), doc="Slope of dust mass in intensity, dM ~ U^-alpha dU."
+    )
+
+    def _library(self):
+        return open_library(self.path, self.resource)
+
+    def nodes(self):
+        return self._library().wave
+
+    def spectrum(self, values):
+        alphas, spectra = _sequence(self._library(), self.starlight)
+        low, part = _core.cells(alphas, values["alpha"])
+        return (1.0 - part) * spectra[low] + part * spectra[low + 1]
+
+
+WAVE_THICK = 200.0  # um, where the optical depth is 1
+#: Constants of L(alpha, T) in um^1/2, um^1/2, 1 / (um K), 1 / (um K), of Casey 2012.
+B = (26.68, 6.246, 1.905e-4, 7.243e-5)
+
+
+#: Steps of 0.014 in ln(wavelength) where there is only the power law, of 0.0052 where the
+#: spectrum bends: see docs/guide/sed/casey2012.rst for what straight lines between them cost.
+NODES = np.append(np.geomspace(1.0, 3.0, 80)[:-1], np.geomspace(3.0, 3000.0, 1330))
+NODES.flags.writeable = False
+
+
+@register
+class Casey2012(DustEmission):
+    """
+    Casey 2012: one blackbody of general opacity and a mid-infrared power law (her equation 3).
+
+    S_nu = [1 - exp(-(200 um / l)^beta)] B_nu(T) + N l^alpha exp(-(l / l_c)^2); l_c is 3/4 of
+    L(alpha, T), the wavelength where the slope of the blackbody is alpha, and N is such that
+    the power law without its cut-off meets the blackbody at l_c, as in CIGALE.
+    """
+
+    name = "casey2012"
+    reference = "Casey 2012, MNRAS 425, 3094"
+    temperature_dust = Parameter(
+        default=35.0, bounds=(10.0, 150.0), unit="K", doc="Temperature of the dust."
+    )
+    emissivity_dust = Parameter(
+        default=1.6, bounds=(0.5, 3.0), doc="Slope beta of the opacity in frequency."
+    )
+    alpha_mir = Parameter(
+        default=2.0, bounds=(1.0, 5.0), doc="Slope of S_nu in wavelength in the mid-infrared."
+    )
+
+    def nodes(self):
+        return NODES
+
+    @staticmethod
+    def turnover(alpha_mir, temperature_dust):
+        """
+        Wavelength l_c above which the power law is cut off.
+
+        Parameters
+        ----------
+        alpha_mir, temperature_dust : float or `~numpy.ndarray`
+            Slope of the power law, and temperature in K.
+
+        Returns
+        -------
+        wave : float or `~numpy.ndarray`
+            In um, 3/4 of L(alpha, T) of Casey 2012.
+        """
+        slope = (B[0] + B[1] * alpha_mir) ** -2.0
+        return 0.75 / (slope + (B[2] + B[3] * alpha_mir) * temperature_dust)
+
+    def parts(self, values):
+        """
+        Blackbody and power law on one scale.
+
+        Parameters
+        ----------
+        values : dict of str to float
+            Values of all parameters.
+
+        Returns
+        -------
+        blackbody, power_law : `~numpy.ndarray`
+            L_lambda at `nodes`, arbitrary scale.
+        """
+        temperature, beta = values["temperature_dust"], values["emissivity_dust"]
+        alpha = values["alpha_mir"]
+        turn = self.turnover(alpha, temperature)
+        # L_lambda goes as S_nu / lambda^2
+        at_turn = _core.modified_blackbody(turn, temperature, beta, WAVE_THICK) * turn**2
+        power_law = at_turn * (NODES / turn) ** alpha * np.exp(-((NODES / turn) ** 2)) / NODES**2
+        return _core.modified_blackbody(NODES, temperature, beta, WAVE_THICK), power_law
+
+    def spectrum(self, values):
+        blackbody, power_law = self.parts(values)
+        return blackbody + power_law
+
+
+U_MAX = 1e6  # of the power law dM/dU ~ U^-2
+
+
+@cached_by_file(maxsize=2)
+def load_dl07(path):
+    """
+    Read the bundled Draine & Li 2007 table.
+
+    Returns
+    -------
+    table : dict
+        ``wave`` (um), ``qpah`` (per cent), ``u`` and ``umin``; ``single`` (n_q, n_u, n_wave) and
+        ``powerlaw`` (n_q, n_umin, n_wave) in W/um with integral 1; ``single_power`` and
+        ``powerlaw_power``: power per dust mass in units of that at U = 1.
+    """
+    names = ["wave", "qpah", "u", "umin", "single", "powerlaw", "single_power", "powerlaw_power"]
+    return read_images(path, names, wanted="a Draine & Li table")
+
+
+class _DraineLi(DustEmission):
+    reference = "Draine & Li 2007, ApJ 657, 810"
+    resource = "dust.dl07"
+
+    def _table(self):
+        return load_dl07(self.path)
+
+    def nodes(self):
+        return self._table()["wave"]
+
+
+@register
+class DraineLi2007(_DraineLi):
+    """
+    Draine & Li 2007 with its own parameters.
+
+    The mass fraction 1 - gamma is heated by U_min, gamma by dM/dU ~ U^-2 from U_min to 1e6.
+    Between tabulated q_PAH and U_min the spectra per dust mass are interpolated (linear in
+    q_PAH, linear in log U with the power scaled by U).
+    """
+
+    name = "dl07"
+    u_min = Parameter(default=1.0, bounds=(0.1, 25.0), doc="Least intensity of starlight.")
+    gamma = Parameter(default=0.02, bounds=(0.0, 1.0), doc="Mass fraction heated by more.")
+    q_pah = Parameter(default=2.5, bounds=(0.47, 4.58), doc="Mass fraction in PAHs, per cent.")
+
+    @staticmethod
+    def mean_intensity(values):
+        """
+        Mean intensity <U> over the dust mass, Draine & Li 2007, equation 33.
+
+        The power per dust mass is P0 <U>, P0 being that at U = 1 (135 to 139 L_sun / M_sun in
+        the table's source, by q_PAH).
+
+        Parameters
+        ----------
+        values : dict of str to float
+            Values of all parameters.
+
+        Returns
+        -------
+        mean : float
+            In units of the starlight near the Sun.
+        """
+        least, gamma = values["u_min"], values["gamma"]
+        lump = least * np.log(U_MAX / least) / (1.0 - least / U_MAX)
+        return float((1.0 - gamma) * least + gamma * lump)
+
+    def spectrum(self, values):
+        table = self._table()
+        q_low, q_part = _cell(table["qpah"], values["q_pah"])
+        u_low, u_part = _cell(np.log(table["umin"]), np.log(values["u_min"]))
+        out = 0.0
+        for j, weight in ((u_low, 1.0 - u_part), (u_low + 1, u_part)):
+            scale = weight * values["u_min"] / table["umin"][j]
+            for i, share in ((q_low, 1.0 - q_part), (q_low + 1, q_part)):
+                single = table["single"][i, j] * table["single_power"][i, j]
+                lump = table["powerlaw"][i, j] * table["powerlaw_power"][i, j]
+                mixture = (1.0 - values["gamma"]) * single + values["gamma"] * lump
+                out = out + share * scale * mixture
+        return out
+
+
+@register
+class DraineLi2007Alpha(_DraineLi):
+    """
+    Draine & Li 2007 arranged as a sequence in the slope alpha of dM/dU ~ U^-alpha.
+
+    A mapping with eight constants, fitted to the sequence of Dale et al. 2014 and scored on
+    it: 0.10 dex rms in 5-25 um and 0.06 dex beyond for alpha from 1 to 3.5. MIRI bands differ
+    by up to 0.4 mag, the 3.3 um feature by 1 mag. It is **no substitute for Dale et al. 2014**
+    in a paper.
+    """
+
+    name = "dl07_alpha"
+    reference = "Draine & Li 2007, ApJ 657, 810; alpha after Dale et al. 2014, ApJ 784, 83"
+    alpha = Parameter(
+        default=2.0, bounds=(1.0, 3.5), doc="Slope of dust mass in intensity, as Dale's alpha."
+    )
+
+    def spectrum(self, values):
+        path = self.path
+        intensity, cool, warm = _alpha_tables(path)
+        step = values["alpha"] - 2.0
+        slope = ALPHA_SLOPE[0] + ALPHA_SLOPE[1] * step + ALPHA_SLOPE[2] * step**2
+        log_u = np.log10(intensity)
+        edges = _logistic((log_u - ALPHA_U[0]) / 0.05) * _logistic((ALPHA_U[1] - log_u) / 0.05)
+        weight = intensity ** (1.0 - slope) * edges
+        rich = _logistic((ALPHA_U_PAH - log_u) / 0.1)
+        return (weight * rich) @ cool + (weight * (1.0 - rich)) @ warm
+
+
+#: Ends of log U, where PAHs are destroyed (log U), and the slope's polynomial in alpha - 2.
+ALPHA_U = (0.20, 3.19)
+ALPHA_U_PAH = 1.373
+ALPHA_SLOPE = (2.415, 1.425, 0.5)
+
+
+def _logistic(x):
+    return 1.0 / (1.0 + np.exp(-np.clip(x, -500, 500)))
+
+
+def _cell(axis, value):
+    low, part = _core.cells(axis, value)
+    return low, np.clip(part, 0.0, 1.0)
+
+
+@cached_by_file(maxsize=2)
+def _alpha_tables(path):
+    """Spectra per dust mass on an even grid in log U, PAH-rich and PAH-poor."""
+    table = load_dl07(path)
+    intensity = np.geomspace(0.1, U_MAX, 141)
+    matrix = _core.hat_matrix(np.log(table["u"]), np.clip(np.log(intensity), None, np.log(U_MAX)))
+    out = [intensity]
+    for q in (-1, 0):
+        mass = table["single"][q] * table["single_power"][q][:, None]
+        out.append(np.exp(matrix @ np.log(np.maximum(mass, 1e-300))))
+    return out
