@@ -20,21 +20,9 @@ DISK_BREAKS, DISK_SLOPES = DISKS["skirtor"]
 
 def disk_spectrum(wave, delta=0.0, disk="skirtor"):
     """
-    Accretion disk, L_lambda in powers of wavelength between breaks, integral 1.
+    Accretion disk, L_lambda in 1/um in powers of wavelength between breaks, 0 outside; integral 1.
 
-    Parameters
-    ----------
-    wave : `~numpy.ndarray`
-        Wavelengths in um; zero outside the breaks.
-    delta : float, optional
-        Added to the third slope, -1.5, which holds in the optical and near infrared.
-    disk : str, optional
-        One of `DISKS`.
-
-    Returns
-    -------
-    spectrum : `~numpy.ndarray`
-        In 1/um; over all wavelengths it integrates to 1, whatever ``delta``.
+    ``delta`` is added to the third slope, -1.5, which holds in the optical and near infrared.
     """
     wave = np.asarray(wave, dtype=float)
     breaks, slopes = DISKS[disk]

@@ -92,20 +92,9 @@ def constant_history(age):
 
 def table_history(time, rate):
     """
-    Put a history in bins of any width on steps of 1 Myr.
+    Put rates in bins of any width (edges in Myr, one more than rates) on steps of 1 Myr.
 
-    Parameters
-    ----------
-    time : `~numpy.ndarray`, shape (n_bin + 1,)
-        Edges of the bins in Myr, ascending.
-    rate : `~numpy.ndarray`, shape (n_bin,)
-        Rate in each bin.
-
-    Returns
-    -------
-    rate : `~numpy.ndarray`, shape (n_steps,)
-        Mean rates in steps of 1 Myr from the first edge, the last of which holds what is left:
-        the integral is that of the table.
+    Mean rates from the first edge, the last step holding what is left: the integral is kept.
     """
     formed = np.concatenate([[0.0], np.cumsum(rate * np.diff(time))])
     n = int(np.ceil(np.round(time[-1] - time[0], 6)))
@@ -116,20 +105,9 @@ def table_history(time, rate):
 
 def time_weights(age, n_steps):
     """
-    Weights of tabulated ages for every step of 1 Myr.
+    Weights of tabulated ages (Myr, from 0) for every step of 1 Myr, shape (n_steps, n_age), sparse.
 
     A step k is the mean of ten linear interpolations, at k + 0.1 ... k + 1.0 Myr.
-
-    Parameters
-    ----------
-    age : `~numpy.ndarray`, shape (n_age,)
-        Ages of the table in Myr, from 0.
-    n_steps : int
-        Number of steps.
-
-    Returns
-    -------
-    weights : `scipy.sparse.csr_matrix`, shape (n_steps, n_age)
     """
     sample = (np.arange(n_steps)[:, None] + np.arange(1, 11) / 10.0).ravel()
     step = np.repeat(np.arange(n_steps), 10)
@@ -142,23 +120,16 @@ def time_weights(age, n_steps):
 
 def age_steps(age, n_steps):
     """
-    The matrix of `time_weights`, arranged for `split_by_age`.
-
-    Parameters
-    ----------
-    age : `~numpy.ndarray`, shape (n_age,)
-        Ages of the table in Myr, from 0.
-    n_steps : int
-        Number of steps.
+    Arrange the matrix of `time_weights` for `split_by_age`.
 
     Returns
     -------
-    runs : `~numpy.ndarray` of int, shape (3, n_run)
+    runs : int, shape (3, n_run)
         Steps that lie between two neighbouring ages: first, last + 1, number of the younger age.
         A step k of them counts as mass at k + 0.55 Myr, the mean of its ten times.
-    mixed : `~numpy.ndarray` of int, shape (n_mixed,)
+    mixed : int, shape (n_mixed,)
         The other steps.
-    indptr, indices, data : `~numpy.ndarray`
+    indptr, indices, data
         Their rows of the matrix.
     """
     k = np.arange(n_steps)
@@ -188,23 +159,10 @@ def _moments(history, first, last):
 @njit(cache=True)
 def split_by_age(history, n_young, age, runs, mixed, indptr, indices, data):
     """
-    Masses at tabulated ages, of young and of old stars, without making a sparse product.
+    Masses in Msun at tabulated ages, of young and of old stars, shape (2, n_age).
 
-    Parameters
-    ----------
-    history : `~numpy.ndarray`, shape (n_steps,)
-        Rates in Msun/yr in steps of 1 Myr, oldest first.
-    n_young : int
-        Number of steps, counted from the last, that are young.
-    age : `~numpy.ndarray`, shape (n_age,)
-        Ages of the table in Myr.
-    runs, mixed, indptr, indices, data : `~numpy.ndarray`
-        `age_steps` of ``age``, for as many steps as the history has or more.
-
-    Returns
-    -------
-    mass : `~numpy.ndarray`, shape (2, n_age)
-        Msun of young and of old stars.
+    ``history`` holds rates in Msun/yr in steps of 1 Myr, oldest first, of which the last ``n_young``
+    are young; ``runs`` and the following are `age_steps` of ``age``, for as many steps or more.
     """
     mass = np.zeros((2, age.size))
     n = history.size

@@ -1,5 +1,5 @@
 """
-Mean transmission of the intergalactic medium; observed wavelengths in um.
+Mean transmission of the intergalactic medium at observed wavelengths (um, in any order).
 
 Absorbers stand between redshift 0 and the source: nothing absorbs at a source redshift of 0, a
 line takes nothing below its rest wavelength, and the continuum seen below the Lyman limit
@@ -71,21 +71,8 @@ def _meiksin_lines():
 
 def meiksin_transmission(wave, redshift):
     """
-    Mean transmission of the intergalactic medium, Meiksin 2006, as CIGALE has it.
+    Meiksin 2006, as CIGALE has it.
 
-    Parameters
-    ----------
-    wave : `~numpy.ndarray`, shape (n,)
-        Observed wavelengths in um, in any order.
-    redshift : float
-        Redshift of the source, >= 0.
-
-    Returns
-    -------
-    transmission : `~numpy.ndarray`, shape (n,)
-
-    Notes
-    -----
     The optical depths of the higher lines are those of Table 1 times the Lyman-alpha depth
     at the source's redshift (CIGALE's reading; it absorbs a little more than the depth at
     the absorber's would). Below 0.07 (1 + z) um the transmission falls as wavelength squared, for
@@ -155,20 +142,7 @@ def _meiksin(wave, redshift, first, series, lines, depth):
 
 
 def madau_transmission(wave, redshift):
-    """
-    Mean transmission after Madau 1995: four lines and the continuum (footnote 3).
-
-    Parameters
-    ----------
-    wave : `~numpy.ndarray`, shape (n,)
-        Observed wavelengths in um, in any order.
-    redshift : float
-        Redshift of the source, >= 0.
-
-    Returns
-    -------
-    transmission : `~numpy.ndarray`, shape (n,)
-    """
+    """Madau 1995: four lines and the continuum (footnote 3)."""
     wave = np.ascontiguousarray(wave, dtype=float)
     return _madau(wave, 1.0 + float(redshift), lyman_lines(6), _MADAU)
 
@@ -207,18 +181,11 @@ def _madau(wave, z1, lines, amplitudes):
 
 def inoue_lines(table):
     """
-    Prepare the Lyman series of Inoue et al. 2014 for `inoue_transmission`.
+    Prepare table 2 of Inoue et al. 2014 for `inoue_transmission`.
 
-    Parameters
-    ----------
-    table : `~numpy.ndarray`, shape (n_line, 6)
-        Their table 2, longest wavelength first: wavelength in um, A_LAF,1 to 3, A_DLA,1 and 2.
-
-    Returns
-    -------
-    lines : tuple of `~numpy.ndarray`
-        Wavelengths, and amplitudes of forest and damped systems over the wavelength to the
-        power that goes with them: shapes (n_line,), (n_line, 3), (n_line, 2).
+    Columns, longest wavelength first: wavelength in um, A_LAF,1 to 3, A_DLA,1 and 2. Returned are
+    wavelengths, and amplitudes of forest and damped systems over the wavelength to the
+    power that goes with them: shapes (n_line,), (n_line, 3), (n_line, 2).
     """
     table = np.asarray(table, dtype=float)
     wave = np.ascontiguousarray(table[:, 0])
@@ -228,26 +195,7 @@ def inoue_lines(table):
 
 
 def inoue_transmission(wave, redshift, lines):
-    """
-    Mean transmission of the intergalactic medium, Inoue et al. 2014, section 4.
-
-    Parameters
-    ----------
-    wave : `~numpy.ndarray`, shape (n,)
-        Observed wavelengths in um, in any order.
-    redshift : float
-        Redshift of the source, >= 0.
-    lines : tuple of `~numpy.ndarray`
-        From `inoue_lines`.
-
-    Returns
-    -------
-    transmission : `~numpy.ndarray`, shape (n,)
-
-    Notes
-    -----
-    Lyman series: eq. 20 to 22 with table 2; Lyman continuum: eq. 25 to 29.
-    """
+    """Inoue et al. 2014, section 4: lines by eq. 20 to 22 with table 2, continuum by eq. 25 to 29."""
     wave = np.ascontiguousarray(wave, dtype=float)
     return _inoue(wave, 1.0 + float(redshift), *lines)
 

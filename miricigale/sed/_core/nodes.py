@@ -3,7 +3,9 @@
 import numpy as np
 from scipy.sparse import csr_matrix
 
-__all__ = ["cells", "hat_matrix", "merge_nodes", "trapezoid_weights"]
+__all__ = ["cells", "hat_matrix", "merge_nodes", "photon_weights", "trapezoid_weights"]
+
+_HC = 1.98644586e-19  # J um
 
 
 def merge_nodes(parts):
@@ -36,3 +38,26 @@ def hat_matrix(nodes, wave):
     data = np.concatenate([1 - t, t])
     index = (np.concatenate([row, row]), np.concatenate([cell, cell + 1]))
     return csr_matrix((data, index), shape=(wave.size, nodes.size))
+
+
+def photon_weights(wave, limit):
+    """
+    Weights that turn L_lambda (W/um) at nodes into photons per second below a wavelength.
+
+    The integral of ``L_lambda lambda / (h c)`` is exact for spectra that are straight lines
+    between the nodes and zero outside them.
+    """
+    out = np.zeros(wave.size)
+    n = int(np.searchsorted(wave, limit, side="left"))  # nodes below the limit
+    if n == 0:
+        return out
+    low = wave[:n] if n < wave.size else wave[:-1]
+    cell = np.arange(low.size)
+    step = wave[cell + 1] - low
+    width = np.minimum(wave[cell + 1], limit) - low
+    # integrals of lambda and of lambda t over the cell, t rising from 0 to 1
+    flat = low * width + 0.5 * width**2
+    rise = (0.5 * low * width**2 + width**3 / 3.0) / step
+    out[cell] += flat - rise
+    out[cell + 1] += rise
+    return out / _HC

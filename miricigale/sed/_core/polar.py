@@ -31,13 +31,6 @@ def polar_curve(wave, law):
     ``gaskell``: Gaskell et al. 2004, fit of their appendix for x = 1 / lambda in 1.6-8 um^-1;
     the cubic goes on below 1.6 until it is zero (x = 0.60, 1.68 um), the line goes on above
     8; divided by A(B)/A(V) - 1 = 0.182 (their table 3), as CIGALE does.
-
-    Parameters
-    ----------
-    wave : `~numpy.ndarray`
-        Wavelengths in um.
-    law : str
-        One of `POLAR_LAWS`.
     """
     wave = np.asarray(wave, dtype=float)
     if law == "smc":
@@ -85,28 +78,12 @@ def add_polar(grid, face_on, disk, dust, ebv, temperature, beta, share, dims_dis
     """
     Disk, torus and polar dust for one watt of dust emission.
 
-    Parameters
-    ----------
-    grid : `~numpy.ndarray`, shape (5, n_wave)
-        From `polar_grid`.
-    face_on, disk, dust : `~numpy.ndarray`, shape (n_wave,)
-        Disk without obscuration seen from above, disk as seen through the torus, torus, on one
-        scale (W/um).
-    ebv, temperature, beta : float
-        Colour excess in mag, temperature in K and emissivity index of the polar dust.
-    share : float
-        From `polar_share`.
-    dims_disk : bool
-        Whether the line of sight passes the polar dust.
-
-    Returns
-    -------
-    parts : `~numpy.ndarray`, shape (3, n_wave)
-        Disk, torus and polar dust as seen.
-    power : float
-        Light of the disk over all directions.
-    total : float
-        Torus and polar emission on the given scale; if it is not positive, nothing is scaled.
+    ``grid`` is that of `polar_grid`; ``face_on``, ``disk`` and ``dust``, shape (n_wave,), are the disk
+    without obscuration seen from above, the disk as seen through the torus, and the torus, on one
+    scale (W/um); ``share`` is that of `polar_share`; ``dims_disk`` whether the line of sight passes
+    the polar dust. Returned are the parts as seen, shape (3, n_wave), the disk's light over all
+    directions, and torus and polar emission on the given scale: where that is not positive,
+    nothing is scaled.
     """
     absorption, front, exponent, thick, weight = grid[0], grid[1], grid[2], grid[3], grid[4]
     n = face_on.size

@@ -19,21 +19,21 @@ def mix_light(
 
     Parameters
     ----------
-    weight : `~numpy.ndarray`, shape (n_wave,)
-        Weights of the trapezoid rule on the grid of wavelengths.
-    young, old : `~numpy.ndarray`, shape (n_star, n_wave)
+    weight : shape (n_wave,)
+        Weights of the trapezoid rule.
+    young, old : shape (n_star, n_wave)
         Light of young and old stars in W/um, with that of their gas if it is dimmed as they are.
-    gas : `~numpy.ndarray`, shape (n_star, n_wave) or (0, n_wave)
+    gas : shape (n_star, n_wave) or (0, n_wave)
         Light of gas that has a transmission of its own.
-    star, dim, dusty : `~numpy.ndarray` of int, shape (n,)
+    star, dim, dusty : int, shape (n,)
         Which stars, attenuation and dust spectrum each galaxy has.
-    dim_young, dim_old, dim_gas : `~numpy.ndarray`, shape (n_dim, n_wave)
+    dim_young, dim_old, dim_gas : shape (n_dim, n_wave)
         Transmissions for young and old stars and for ``gas``.
-    extra : `~numpy.ndarray`, shape (n_star,)
+    extra : shape (n_star,)
         Power in W that dust takes besides.
-    dust : `~numpy.ndarray`, shape (n_dust, n_wave)
+    dust : shape (n_dust, n_wave)
         Dust spectra in W/um with integral 1.
-    out, taken : `~numpy.ndarray`, shape (n, n_wave) and (n,)
+    out, taken : shape (n, n_wave) and (n,)
         Filled with the light in W/um and the power in W that dust took.
     """
     own_gas = gas.shape[0] > 0
@@ -56,50 +56,27 @@ def mix_light(
 
 @njit(cache=True)
 def block_fluxes(
-    wave,
-    log_wave,
-    to_lnu,
-    light,
-    agn,
-    which,
-    power,
-    dim,
-    sky,
-    z,
-    scale,
-    start,
-    band,
-    moments,
-    bucket,
-    tolerance,
-    out,
-):
+    wave, log_wave, to_lnu, light, agn, which, power, dim, sky, z, scale,
+    start, band, moments, bucket, tolerance, out,
+):  # fmt: skip
     """
     Band fluxes of a block of models, each at its own redshift.
 
     Parameters
     ----------
-    wave, log_wave, to_lnu : `~numpy.ndarray`, shape (n_wave,)
+    wave, log_wave, to_lnu : shape (n_wave,)
         Rest wavelengths in um, their logarithms, and the factor from L_lambda to L_nu.
-    light : `~numpy.ndarray`, shape (n, n_wave)
-        L_lambda of the galaxies.
-    agn : `~numpy.ndarray`, shape (n_agn, n_wave)
-        L_lambda of AGN for one watt.
-    which : `~numpy.ndarray` of int, shape (n,)
-        Which of the AGN each model has.
-    power : `~numpy.ndarray`, shape (n,)
-        Power of the AGN in W.
-    dim : `~numpy.ndarray`, shape (n_dim, n_wave)
-        Transmissions between the source and us.
-    sky : `~numpy.ndarray` of int, shape (n,)
-        Which of them each model has.
-    z, scale : `~numpy.ndarray`, shape (n,)
+    light, agn : shape (n, n_wave) and (n_agn, n_wave)
+        L_lambda of the galaxies, and of AGN for one watt.
+    which, power : shape (n,)
+        Which of the AGN each model has (int), and its power in W.
+    dim, sky : shape (n_dim, n_wave) and (n,)
+        Transmissions between the source and us, and which of them each model has (int).
+    z, scale : shape (n,)
         Redshift, and factor from L_nu to flux.
-    start, band, moments, bucket : `~numpy.ndarray`
-        Passbands as for `band_means`.
-    tolerance : float
-        Share of a band that may lie outside the spectra.
-    out : `~numpy.ndarray`, shape (n, n_band)
+    start, band, moments, bucket, tolerance
+        As for `band_means`.
+    out : shape (n, n_band)
         Filled with the fluxes; NaN in bands that the spectrum does not cover.
     """
     observed, log_observed = np.empty(wave.size), np.empty(wave.size)

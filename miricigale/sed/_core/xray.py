@@ -12,19 +12,7 @@ _BAND = (2.0, 10.0)  # keV
 
 
 def stern2015(l_6um):
-    """
-    Intrinsic rest-frame 2-10 keV luminosity from that at 6 um, Stern 2015, equation 2.
-
-    Parameters
-    ----------
-    l_6um : `~numpy.ndarray`
-        nu L_nu of the AGN at rest 6 um in W, >= 0.
-
-    Returns
-    -------
-    l_2_10kev : `~numpy.ndarray`
-        W; 0 where there is no light at 6 um.
-    """
+    """Rest-frame 2-10 keV luminosity in W from nu L_nu at 6 um (>= 0), Stern 2015, equation 2."""
     l_6um = np.asarray(l_6um, dtype=float)
     none = l_6um == 0.0
     x = np.log10(np.where(none, _UNIT_6UM, l_6um) / _UNIT_6UM)
@@ -39,25 +27,10 @@ def power_law_energy(low, high, photon_index):
 
 def xray_flux(l_2_10kev, redshift, far, *, low, high, photon_index, transmission=1.0):
     """
-    Observed flux of a power law in a band fixed in the observer's frame.
+    Observed flux in W/m2 of a power law N(E) ~ E^-Gamma in a band of the observer's frame.
 
-    Parameters
-    ----------
-    l_2_10kev : `~numpy.ndarray`
-        Rest-frame 2-10 keV luminosity, W.
-    redshift, far : `~numpy.ndarray`
-        Redshift and luminosity distance in m.
-    low, high : float or `~numpy.ndarray`
-        Ends of the band, keV.
-    photon_index : float or `~numpy.ndarray`
-        Gamma of N(E) ~ E^-Gamma.
-    transmission : float or `~numpy.ndarray`, optional
-        What absorption leaves of the flux.
-
-    Returns
-    -------
-    flux : `~numpy.ndarray`
-        W/m2: L (rest, low to high) (1 + z)^(2 - Gamma) / (4 pi far^2) times the transmission.
+    L (2-10 keV, rest) times the ratio of the bands, (1 + z)^(2 - Gamma) / (4 pi far^2), and what
+    absorption leaves.
     """
     ratio = power_law_energy(low, high, photon_index) / power_law_energy(*_BAND, photon_index)
     stretch = (1.0 + np.asarray(redshift, dtype=float)) ** (2.0 - np.asarray(photon_index))
