@@ -1,23 +1,19 @@
 """Grids kept between sessions, under a name made of everything that shapes them."""
 
-import hashlib
 import importlib.metadata
-import json
 import logging
 import os
 import time
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from miricigale.filters import filter as filter_curves
 from miricigale.refdata.locate import cache_folder, conf, fingerprint_of
 from miricigale.sed import chain
 from miricigale.sed.grid import ModelGrid
+from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.store import PARTIAL
-from miricigale.utils.units import WAVE
 
 __all__ = ["cached_grid", "grid_key"]
 
@@ -60,24 +56,16 @@ def grid_key(model, axes, filters):
         }
         for c in model.components
     ]
-    bands = [[f.name, _digest(f.wave.to_value(WAVE)), _digest(f.throughput)] for f in filters]
+    cosmology = model.cosmology
     content = {
         "versions": [chain.VERSION, filter_curves.VERSION],
         "components": parts,
-        "cosmology": [repr(model.cosmology), *_exact(model.cosmology)],
+        "cosmology": [type(cosmology), dict(cosmology.parameters)],
         "definition": model.frac_agn_definition,
-        "axes": {name: [v.hex() for v in values.tolist()] for name, values in axes.items()},
-        "bands": bands,
+        "axes": dict(axes),
+        "bands": [[f.name, f.wave, f.throughput] for f in filters],
     }
-    text = json.dumps(content, sort_keys=True, default=repr)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _exact(cosmology):
-    """Parameters of a cosmology to the last digit."""
-    for name, value in sorted(cosmology.parameters.items()):
-        plain = getattr(value, "value", value)
-        yield name, np.asarray(plain).tolist() if plain is not None else None
+    return content_sha256(content)
 
 
 def _own(component):
@@ -89,10 +77,6 @@ def _unchanged(model):
     return all(
         c.fingerprint == fingerprint_of(Path(c.path)) for c in model.components if c.resource
     )
-
-
-def _digest(values):
-    return hashlib.sha256(np.ascontiguousarray(values, dtype="<f8").tobytes()).hexdigest()
 
 
 def cached_grid(model, axes, filters, make):

@@ -1,20 +1,24 @@
-"""X-ray luminosities and fluxes of AGN from their light at 6 um."""
+"""X-rays of AGN from their light at 6 um: a component, and the same for any luminosities."""
 
 import astropy.units as u
 import numpy as np
 
 from miricigale.sed import _core
+from miricigale.sed.component import Component, register
+from miricigale.sed.parameter import Parameter
 from miricigale.sed.spectrum import COSMOLOGY, distance
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import LUMINOSITY, to_array
 
-__all__ = ["STERN2015_RANGE", "XRAY_FLUX", "band_luminosity", "stern2015", "xray_flux"]
+__all__ = ["STERN2015_RANGE", "XRAY_FLUX", "XRay", "band_luminosity", "stern2015", "xray_flux"]
 
 #: nu L_nu at 6 um that the samples of Stern 2015 span, roughly: Seyferts to luminous quasars.
 STERN2015_RANGE = (1e42, 1e47) * u.erg / u.s
 
 #: Unit of X-ray fluxes that these functions return.
 XRAY_FLUX = u.erg / u.s / u.cm**2
+
+_LAWS = {"stern2015": _core.stern2015}
 
 
 def stern2015(l_6um):
@@ -158,16 +162,8 @@ def xray_flux(
     index = to_array(photon_index, u.dimensionless_unscaled, "photon_index", finite=True)
     share = to_array(transmission, u.dimensionless_unscaled, "transmission", finite=True)
     _check("transmission", "from 0 to 1", share, (share < 0) | (share > 1))
-    low, high = _band(band, "band")
-    flux = _core.xray_flux(
-        power,
-        z,
-        distance(z, cosmology),
-        low=low,
-        high=high,
-        photon_index=index,
-        transmission=share,
-    )
+    far = distance(z, cosmology)
+    flux = _core.xray_flux(power, z, far, _band(band, "band"), index, share)
     return (flux * u.W / u.m**2).to(XRAY_FLUX)
 
 
@@ -182,3 +178,70 @@ def _band(band, name):
 def _check(name, wanted, values, bad):
     if np.any(bad):
         raise argument_error(name, wanted, np.atleast_1d(values)[np.atleast_1d(bad)][0])
+
+
+@register
+class XRay(Component):
+    """
+    X-rays of the AGN: 2-10 keV luminosity from 6 um, and flux of a power law in an observed band.
+
+    It adds no light to the spectrum, only derived quantities (`columns`). The relation is not
+    linear in luminosity: it takes that of the whole galaxy, not of a solar mass.
+
+    Yang et al. 2021 have Gamma 1.8, 0.5-7 keV and ``xray_transmission`` 0.5.
+    """
+
+    name = "xray"
+    role = "xray"
+    reference = "Stern 2015, ApJ 807, 129"
+
+    options = {"law": tuple(_LAWS)}
+
+    #: Derived quantities: name to unit and description.
+    columns = {
+        "l_2_10kev": (LUMINOSITY, "rest-frame 2-10 keV luminosity of the AGN, unabsorbed"),
+        "xray_flux": (u.W / u.m**2, "X-ray flux of the AGN in the observed band"),
+    }
+
+    photon_index = Parameter(
+        default=1.8, bounds=(0.0, 4.0), doc="Gamma of the power law, N(E) ~ E^-Gamma."
+    )
+    xray_low = Parameter(
+        default=0.5, bounds=(0.01, 100.0), unit="keV", doc="Lowest observed energy."
+    )
+    xray_high = Parameter(
+        default=7.0, bounds=(0.01, 1000.0), unit="keV", doc="Highest observed energy."
+    )
+    xray_transmission = Parameter(
+        default=1.0, bounds=(0.0, 1.0), doc="Share of the flux that absorption leaves."
+    )
+
+    def invalid(self, values):
+        """Say so if the band is empty."""
+        if values["xray_low"] < values["xray_high"]:
+            return None
+        low, high = values["xray_low"], values["xray_high"]
+        return f"'xray_high' must be above 'xray_low', got {low:g} to {high:g} keV"
+
+    def derived(self, l_6um, redshift, far, values):
+        """
+        X-ray luminosity and flux.
+
+        Parameters
+        ----------
+        l_6um : float or `~numpy.ndarray`
+            nu L_nu of the AGN at rest 6 um in W, of the whole galaxy; 0 without an AGN.
+        redshift, far : float or `~numpy.ndarray`
+            Redshift and luminosity distance in m.
+        values : dict
+            Values of `parameters`, numbers or arrays that broadcast with the rest.
+
+        Returns
+        -------
+        derived : dict of str to `~numpy.ndarray`
+            ``l_2_10kev`` in W and ``xray_flux`` in W/m2, see `columns`.
+        """
+        power, (low, high) = _LAWS[self.law](l_6um), (values["xray_low"], values["xray_high"])
+        index, share = values["photon_index"], values["xray_transmission"]
+        flux = _core.xray_flux(power, redshift, far, (low, high), index, share)
+        return {"l_2_10kev": power, "xray_flux": flux}

@@ -7,13 +7,14 @@ from astropy.utils.masked import Masked
 
 from miricigale.filters import Filter, FilterSet
 from miricigale.sed import SED
-from miricigale.sed.components.foreground import (
+from miricigale.sed.foreground import (
     LAWS,
     GalacticExtinction,
+    band_extinction,
     coverage,
+    deredden,
     extinction_curve,
 )
-from miricigale.sed.foreground import band_extinction, deredden
 
 PAPER = (
     ["megacam.u", "megacam.g", "megacam.r", "megacam.i", "megacam.z", "acs.f606w", "acs.f814w"]

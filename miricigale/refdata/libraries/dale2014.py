@@ -1,17 +1,15 @@
 """Reading of the templates of Dale et al. 2014 as CIGALE distributes them."""
 
 import hashlib
-import tarfile
-import zipfile
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
+from miricigale.refdata.libraries.members import is_archive, members
 from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.refdata.locate import locate
 from miricigale.refdata.tables import load_ssp
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import check_unpacked, unpacked_size
 
 __all__ = ["read_dale2014"]
 
@@ -106,52 +104,27 @@ def read_dale2014(path):
 
 def _find(path):
     """Contents of the files by name, and where each was found."""
-    if path.is_dir():
-        found = {p.as_posix(): p for p in path.rglob("*.dat") if p.is_file()}
-        found |= {p.as_posix(): p for p in path.rglob(STARS) if p.is_file()}
-        return _pick(path, found, lambda p: p.read_bytes())
-    if not path.is_file():
-        msg = f"{path} cannot be read as templates of Dale et al. 2014: no such file or folder"
+    wanted = (SPECTRA, CALIBRATION, STARS)
+    if not path.is_dir() and not (path.is_file() and is_archive(path)):
+        got = "got another file" if path.is_file() else "no such file or folder"
+        msg = (
+            f"{path} cannot be read as templates of Dale et al. 2014: wanted a folder or an "
+            f"archive that holds {SPECTRA} and {CALIBRATION}, {got}"
+        )
         raise DataError(msg)
-    try:
-        if zipfile.is_zipfile(path):
-            with zipfile.ZipFile(path) as archive:
-                members = {m.filename: m for m in archive.infolist()}
-                return _pick(path, members, archive.read, lambda m: m.file_size)
-        if tarfile.is_tarfile(path):
-            unpacked_size(path)
-            with tarfile.open(path) as archive:
-                members = {m.name: m for m in archive if m.isfile()}
-                return _pick(
-                    path, members, lambda m: archive.extractfile(m).read(), lambda m: m.size
-                )
-    except (zipfile.BadZipFile, tarfile.TarError, EOFError) as err:
-        msg = f"{path} is not a whole archive: {err}"
-        raise DataError(msg) from err
-    msg = (
-        f"{path} cannot be read as templates of Dale et al. 2014: wanted a folder or an archive "
-        f"that holds {SPECTRA} and {CALIBRATION}, got another file"
-    )
-    raise DataError(msg)
-
-
-def _pick(path, found, read, size=lambda file: 0):
-    """Choose the one folder with the spectra among the names found, and read its files."""
-    folders = [PurePosixPath(n).parent for n in found if PurePosixPath(n).name == SPECTRA]
+    found = list(members(path, lambda name: name in wanted))
+    folders = [place.parent for place, _, _ in found if place.name == SPECTRA]
     if len(folders) > 1:
         folders = [f for f in folders if f.parts[-2:] == ("database_builder", "dale2014")]
     if len(folders) != 1:
         msg = f"{path} must hold one {SPECTRA}, got {len(folders) or 'none'}"
         raise DataError(msg)
-    here = {PurePosixPath(n).name: n for n in found if PurePosixPath(n).parent == folders[0]}
-    if CALIBRATION not in here:
+    here = [(place.name, *rest) for place, *rest in found if place.parent == folders[0]]
+    contents = {name: data for name, data, _ in here}
+    if CALIBRATION not in contents:
         msg = f"{path} has {SPECTRA} without {CALIBRATION}, which lists the alphas of its columns"
         raise DataError(msg)
-    wanted = [name for name in (SPECTRA, CALIBRATION, STARS) if name in here]
-    check_unpacked(path, sum(size(found[here[name]]) for name in wanted))
-    contents = {name: read(found[here[name]]) for name in wanted}
-    inside = {name: here[name] if path.is_dir() else f"{path}:{here[name]}" for name in wanted}
-    return contents, inside
+    return contents, {name: source for name, _, source in here}
 
 
 def _numbers(data, place, n_columns, wanted):

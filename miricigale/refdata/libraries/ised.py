@@ -45,7 +45,7 @@ QUANTITIES = (
 N_NEEDED = 10
 
 _LAWS = {0: "single burst (SSP)", 4: "exponential", 6: "delayed"}
-_MOST_AGES = 100000
+_MOST_AGES, _MOST_NUMBERS = 10**5, 10**7
 _TEXT = 80
 
 
@@ -143,19 +143,50 @@ def read_bytes(path):
 def parse_ised(data, path):
     """Like `read_ised`, from the decompressed content; ``path`` is for messages."""
     order = _byte_order(data)
-    parts = _ascii_parts(data, path) if order is None else _binary_parts(data, order, path)
-    head, wave, spectra, vectors = parts
-    quantities = dict(zip(QUANTITIES, vectors, strict=False))
-    out = Ised(path.name, head.pop("age"), wave, spectra, quantities, **head)
+    source = _Words(data, path) if order is None else _Records(data, order, path)
+    out = _content(source, path.name)
     for name, array in (("ages", out.age), ("wavelengths", out.wave)):
         if array.size < 2 or not np.all(np.diff(array) > 0) or array[0] < 0:
             raise _foreign(path, f"{name} must be positive and ascending")
-    for name, array in (("spectra", spectra), *quantities.items()):
+    for name, array in (("spectra", out.spectra), *out.quantities.items()):
         if not np.all(np.isfinite(array)):
             raise _foreign(path, f"{name} must be finite")
-    if spectra.min() < 0:
-        raise _foreign(path, f"spectra must be 0 or more, got {spectra.min():g}")
+    if out.spectra.min() < 0:
+        raise _foreign(path, f"spectra must be 0 or more, got {out.spectra.min():g}")
     return out
+
+
+def _content(source, name):
+    """The numbers of a file in their order, whatever its form."""
+    source.begin("the head")
+    age = source.vector().astype(float)
+    limits = source.floats(2)
+    slopes = [source.floats(6)[0] for _ in range(source.integer())]
+    source.floats(3)  # mass, number of stars and mean mass of the IMF
+    law, tau, texts = source.integer(), float(source.floats(1)[0]), source.texts()
+    source.begin("wavelengths")
+    wave = source.vector().astype(float)
+    spectra = np.empty((age.size, wave.size), dtype=np.float32)
+    for i, row in enumerate(spectra, 1):
+        source.begin(f"spectrum {i} of {age.size}")
+        row[:] = source.vector(wave.size)
+        source.indices()
+    vectors = []
+    while len(vectors) < N_NEEDED or not source.ended():
+        source.begin(f"vector {len(vectors) + 1} after the spectra")
+        vectors.append(source.vector(age.size).astype(float))
+    return Ised(
+        name,
+        age,
+        wave,
+        spectra,
+        dict(zip(QUANTITIES, vectors, strict=False)),
+        mass_limits=tuple(float(x) for x in limits),
+        slopes=tuple(round(float(x), 6) for x in slopes),
+        law=law,
+        tau=tau,
+        texts=tuple(texts),
+    )
 
 
 def _foreign(path, why):
@@ -164,6 +195,21 @@ def _foreign(path, why):
 
 def _truncated(path, where):
     return _foreign(path, f"it ends {where}: truncated")
+
+
+class _Source:
+    """Numbers of a file, read from its beginning; `begin` starts a record."""
+
+    def __init__(self, path):
+        self.path, self.title = path, ""
+
+    def vector(self, n=None):
+        """Numbers after their count, which may be known."""
+        count = self.integer()
+        if not 0 <= count < _MOST_NUMBERS or (n is not None and count != n):
+            wanted = "a count of" if n is None else n
+            raise _foreign(self.path, f"{self.title} must hold {wanted} numbers, got {count}")
+        return self.floats(count)
 
 
 # --------------------------------------------------------------------------- binary
@@ -199,15 +245,25 @@ def _records(data, order, path):
     return out
 
 
-class _Record:
-    """One record, read from its beginning."""
+class _Records(_Source):
+    """Records of Fortran's unformatted output."""
 
-    def __init__(self, data, order, path, title):
-        self.data, self.order, self.path, self.title = data, order, path, title
-        self.at = 0
+    def __init__(self, data, order, path):
+        super().__init__(path)
+        self.records, self.order, self.number = _records(data, order, path), order, 0
 
-    def take(self, kind, n):
-        if n < 0 or self.at + 4 * n > len(self.data):
+    def begin(self, title):
+        if self.ended():
+            raise _truncated(self.path, f"after {self.number} records, before {title}")
+        self.data, self.at = self.records[self.number], 0
+        self.number += 1
+        self.title = f"record {self.number}"
+
+    def ended(self):
+        return self.number == len(self.records)
+
+    def _take(self, kind, n):
+        if self.at + 4 * n > len(self.data):
             got = f"{len(self.data)} bytes"
             raise _foreign(self.path, f"{self.title} must hold {n} numbers more, got {got}")
         out = np.frombuffer(self.data, self.order + kind, n, self.at)
@@ -215,88 +271,60 @@ class _Record:
         return out
 
     def integer(self):
-        return int(self.take("i4", 1)[0])
+        return int(self._take("i4", 1)[0])
 
     def floats(self, n):
-        return self.take("f4", n).astype(np.float32)
+        return self._take("f4", n).astype(np.float32)
 
-    def vector(self, n=None):
-        count = self.integer()
-        if n is not None and count != n:
-            raise _foreign(self.path, f"{self.title} must hold {n} numbers, got {count}")
-        return self.floats(count)
+    def indices(self):
+        """Fluxes for spectral indices, which need not be there."""
+        if self.at < len(self.data):
+            self.vector()
 
-    def text(self):
-        out = self.data[self.at : self.at + _TEXT]
+    def texts(self):
+        out = [self._text()]
+        if len(self.data) - self.at >= 16 + 2 * _TEXT:
+            self.floats(4)
+            out += [self._text(), self._text()]
+        return out
+
+    def _text(self):
         self.at += _TEXT
-        return out.decode("latin-1").strip()
-
-    @property
-    def left(self):
-        return len(self.data) - self.at
-
-
-def _binary_parts(data, order, path):
-    records = [
-        _Record(record, order, path, f"record {i}")
-        for i, record in enumerate(_records(data, order, path), 1)
-    ]
-    head = records[0]
-    age = head.vector().astype(float)
-    limits, slopes = head.floats(2), [head.floats(6)[0] for _ in range(head.integer())]
-    head.floats(3)  # mass, number of stars and mean mass of the IMF
-    law, tau, texts = head.integer(), float(head.floats(1)[0]), [head.text()]
-    if head.left >= 16 + 2 * _TEXT:
-        head.floats(4)
-        texts += [head.text(), head.text()]
-    wanted = 2 + age.size + N_NEEDED
-    if len(records) < wanted:
-        raise _truncated(path, f"after {len(records)} of {wanted} or more records")
-    wave = records[1].vector().astype(float)
-    spectra = np.empty((age.size, wave.size), dtype=np.float32)
-    for row, record in zip(spectra, records[2:], strict=False):
-        row[:] = record.vector(wave.size)
-        if record.left:
-            record.vector()  # fluxes for indices
-    vectors = [r.vector(age.size).astype(float) for r in records[2 + age.size :]]
-    return _head(age, limits, slopes, law, tau, texts), wave, spectra, vectors
-
-
-def _head(age, limits, slopes, law, tau, texts):
-    return {
-        "age": age,
-        "mass_limits": tuple(float(x) for x in limits),
-        "slopes": tuple(round(float(x), 6) for x in slopes),
-        "law": law,
-        "tau": tau,
-        "texts": tuple(texts),
-    }
+        return self.data[self.at - _TEXT : self.at].decode("latin-1").strip()
 
 
 # ---------------------------------------------------------------------------- ASCII
 
 
-class _Words:
-    """Numbers and lines of list-directed text, read from its beginning."""
+class _Words(_Source):
+    """Numbers and lines of Fortran's list-directed output."""
 
     def __init__(self, data, path):
-        self.path = path
+        super().__init__(path)
+        if (
+            b"\0" in data[:4096]
+            or not data[:4096].split()[:1]
+            or not data.split(None, 1)[0].isdigit()
+        ):
+            raise _foreign(path, "wanted a record of Fortran or a count of ages at its beginning")
         text = data.decode("latin-1")
         if not text.endswith("\n"):
             raise _truncated(path, "within a line")
         self.lines = text.splitlines()
         self.at, self.words = 0, []
 
+    def begin(self, title):
+        self.title = title
+
     def ended(self):
-        """Whether nothing but white space is left."""
         return not self.words and not any(line.strip() for line in self.lines[self.at :])
 
-    def take(self, n, title):
+    def _take(self, n):
         """Take n words; what is left of their last line waits."""
         blocks, have = [self.words], len(self.words)
         while have < n:
             if self.at >= len(self.lines):
-                raise _truncated(self.path, f"within {title}")
+                raise _truncated(self.path, f"within {self.title}")
             line = self.lines[self.at]
             self.at += 1
             blocks.append(_repeated(line) if "*" in line else line.split())
@@ -305,32 +333,31 @@ class _Words:
         self.words = words[n:]
         return words[:n]
 
-    def floats(self, n, title):
-        words = self.take(n, title)
-        try:
-            return np.array(words, dtype=np.float32)
-        except ValueError as err:
-            raise _foreign(self.path, f"{title} must be numbers: {err}") from err
-
-    def integer(self, title):
-        word = self.take(1, title)[0]
+    def integer(self):
+        word = self._take(1)[0]
         try:
             return int(word)
         except ValueError:
-            raise _foreign(self.path, f"{title} must begin with a count, got {word!r}") from None
+            raise _foreign(
+                self.path, f"{self.title} must begin with a count, got {word!r}"
+            ) from None
 
-    def vector(self, title, n=None):
-        count = self.integer(title)
-        if not 0 <= count < 10**7 or (n is not None and count != n):
-            wanted = "a count" if n is None else n
-            raise _foreign(self.path, f"{title} must hold {wanted} numbers, got {count}")
-        return self.floats(count, title)
+    def floats(self, n):
+        try:
+            return np.array(self._take(n), dtype=np.float32)
+        except ValueError as err:
+            raise _foreign(self.path, f"{self.title} must be numbers: {err}") from err
 
-    def text(self):
-        if self.words or self.at >= len(self.lines):
+    def indices(self):
+        """Fluxes for spectral indices."""
+        self.vector()
+
+    def texts(self):
+        self._take(6)  # four times, a number and a truth value
+        if self.words or self.at + 3 > len(self.lines):
             raise _foreign(self.path, "three lines of text must follow the numbers of its head")
-        self.at += 1
-        return self.lines[self.at - 1].strip()
+        self.at += 3
+        return [line.strip() for line in self.lines[self.at - 3 : self.at]]
 
 
 def _repeated(line):
@@ -340,29 +367,3 @@ def _repeated(line):
         times, star, value = word.partition("*")
         out += [value] * int(times) if star and times.isdigit() else [word]
     return out
-
-
-def _ascii_parts(data, path):
-    if b"\0" in data[:4096] or not data[:4096].split()[:1] or not data.split(None, 1)[0].isdigit():
-        wanted = "wanted a record of Fortran or a count of ages at its beginning"
-        raise _foreign(path, wanted)
-    words = _Words(data, path)
-    age = words.vector("ages").astype(float)
-    limits = words.floats(2, "the IMF")
-    segments = words.integer("the IMF")
-    slopes = [words.floats(6, "the IMF")[0] for _ in range(segments)]
-    words.floats(3, "the IMF")
-    law = words.integer("the star-formation law")
-    tau = float(words.floats(1, "the star-formation law")[0])
-    words.take(6, "the star-formation law")  # four times, a number and a truth value
-    texts = [words.text() for _ in range(3)]
-    wave = words.vector("wavelengths").astype(float)
-    spectra = np.empty((age.size, wave.size), dtype=np.float32)
-    for i, row in enumerate(spectra, 1):
-        row[:] = words.vector(f"spectrum {i} of {age.size}", wave.size)
-        words.vector(f"the indices of spectrum {i} of {age.size}")
-    vectors = []
-    while len(vectors) < N_NEEDED or not words.ended():
-        title = f"vector {len(vectors) + 1} after the spectra"
-        vectors.append(words.vector(title, age.size).astype(float))
-    return _head(age, limits, slopes, law, tau, texts), wave, spectra, vectors

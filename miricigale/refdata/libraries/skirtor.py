@@ -3,16 +3,14 @@
 import hashlib
 import itertools
 import re
-import tarfile
-import zipfile
-import zlib
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
+from miricigale.refdata.libraries.members import is_archive, members
 from miricigale.refdata.libraries.table import LibraryTable
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import check_unpacked, open_fits, unpacked_size
+from miricigale.utils.files import open_fits
 
 __all__ = ["SKIRTOR_AXES", "read_skirtor"]
 
@@ -82,7 +80,7 @@ def read_skirtor(path):
     if not path.exists():
         msg = f"{path} does not exist; wanted {_WANTED}"
         raise DataError(msg)
-    if path.is_file() and not _is_archive(path) and not _NAME.fullmatch(path.name):
+    if path.is_file() and not is_archive(path) and not _NAME.fullmatch(path.name):
         wave, axes, spectra, files = _read_fits(path)
     else:
         wave, axes, spectra, files = _read_texts(path)
@@ -137,75 +135,46 @@ def _file_name(key):
     return f"t{t}_p{p}_q{q}_oa{oa}_R{ratio}_Mcl0.97_i{i}_sed.dat"
 
 
-# ------------------------------------------------------------------ the authors' files
-
-
-def _is_archive(path):
-    return zipfile.is_zipfile(path) or tarfile.is_tarfile(path)
-
-
-def _members(path):
-    """Name and bytes of each spectrum below a folder or in an archive, and of its source."""
-    n_bytes = 0
-    if path.is_dir():
-        texts = [p for p in sorted(path.rglob("*_sed.dat")) if _NAME.fullmatch(p.name)]
-        if texts:
-            for text in texts:
-                yield text.name, text.read_bytes(), str(text)
-            return
+def _texts(path):
+    """Name, bytes and source of each spectrum below a folder, or in an archive or a folder of them."""
+    if _NAME.fullmatch(path.name):
+        yield path.name, path.read_bytes(), str(path)
+        return
+    n = 0
+    for place, data, source in members(path, _NAME.fullmatch):
+        n += 1
+        yield place.name, data, source
+    if path.is_dir() and n == 0:
         for archive in sorted(path.rglob("*")):
             if archive.name.endswith((".zip", ".tar", ".tar.gz", ".tgz")):
-                yield from _members(archive)
-    elif _NAME.fullmatch(path.name):
-        yield path.name, path.read_bytes(), str(path)
-    elif zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as archive:
-            for member in sorted(archive.infolist(), key=lambda member: member.filename):
-                name = PurePosixPath(member.filename).name
-                if _NAME.fullmatch(name):
-                    n_bytes += member.file_size
-                    check_unpacked(path, n_bytes)
-                    yield name, archive.read(member), f"{path}:{member.filename}"
-    else:
-        unpacked_size(path)
-        with tarfile.open(path) as archive:
-            for member in archive:
-                name = PurePosixPath(member.name).name
-                if member.isfile() and _NAME.fullmatch(name):
-                    n_bytes += member.size
-                    check_unpacked(path, n_bytes)
-                    yield name, archive.extractfile(member).read(), f"{path}:{member.name}"
+                yield from _texts(archive)
 
 
 def _read_texts(path):
     """Wavelengths, axes, spectra and checksums from the authors' text files."""
     wave, keys, disk, dust, files, known = None, [], [], [], {}, {}
-    try:
-        for name, data, source in _members(path):
-            key = tuple(map(float, _NAME.fullmatch(name).groups()))
-            digest = hashlib.sha256(data).hexdigest()
-            if key in known:
-                if known[key][0] != digest:
-                    msg = f"{source} and {known[key][1]} are the same model with different numbers"
-                    raise DataError(msg)
-                continue
-            known[key] = (digest, source)
-            table = _parse(data, source)
-            if wave is None:
-                wave = table[0]
-                _check_wave(wave, source)
-            elif not np.allclose(table[0], wave, rtol=1e-4, atol=0.0):
-                msg = f"{source} has other wavelengths than the files before it"
+    for name, data, source in _texts(path):
+        key = tuple(map(float, _NAME.fullmatch(name).groups()))
+        digest = hashlib.sha256(data).hexdigest()
+        if key in known:
+            if known[key][0] != digest:
+                msg = f"{source} and {known[key][1]} are the same model with different numbers"
                 raise DataError(msg)
-            seen = table[2] + table[3]
-            _check_columns(wave, table[1:], seen, key[-1], _FLUX, source)
-            keys.append(key)
-            disk.append((seen / (wave * _FLUX)).astype(np.float32))
-            dust.append((table[4] / (wave * _FLUX)).astype(np.float32))
-            files[_short(source, path)] = digest
-    except (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error) as err:
-        msg = f"{path} is a truncated or damaged archive: {err}"
-        raise DataError(msg) from err
+            continue
+        known[key] = (digest, source)
+        table = _parse(data, source)
+        if wave is None:
+            wave = table[0]
+            _check_wave(wave, source)
+        elif not np.allclose(table[0], wave, rtol=1e-4, atol=0.0):
+            msg = f"{source} has other wavelengths than the files before it"
+            raise DataError(msg)
+        seen = table[2] + table[3]
+        _check_columns(wave, table[1:], seen, key[-1], _FLUX, source)
+        keys.append(key)
+        disk.append((seen / (wave * _FLUX)).astype(np.float32))
+        dust.append((table[4] / (wave * _FLUX)).astype(np.float32))
+        files[_short(source, path)] = digest
     if not keys:
         msg = f"{path} holds no spectrum; wanted {_WANTED}"
         raise DataError(msg)

@@ -15,7 +15,6 @@ from miricigale.sed.components.dust import (
     DraineLi2007Alpha,
     DustEmission,
 )
-from miricigale.sed.components.foreground import Foreground, GalacticExtinction
 from miricigale.sed.components.igm import IGM, Inoue2014, Madau1995, Meiksin2006
 from miricigale.sed.components.nebular import Nebular
 from miricigale.sed.components.parametric_torus import ParametricTorus
@@ -27,7 +26,8 @@ from miricigale.sed.components.sfh import (
     TableSFH,
 )
 from miricigale.sed.components.stellar import BC03, BC03Library, StellarPopulations
-from miricigale.sed.components.xray import XRay
+from miricigale.sed.foreground import Foreground, GalacticExtinction
+from miricigale.sed.xray import XRay
 
 __all__ = [
     "AGN",

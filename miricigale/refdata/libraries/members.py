@@ -1,0 +1,74 @@
+"""Files as they were distributed: in folders and archives."""
+
+import tarfile
+import zipfile
+import zlib
+from pathlib import PurePosixPath
+
+from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import check_unpacked, unpacked_size
+
+__all__ = ["is_archive", "members"]
+
+
+def is_archive(path):
+    """Whether a file is a zip or tar archive."""
+    return zipfile.is_zipfile(path) or tarfile.is_tarfile(path)
+
+
+def members(path, accept):
+    """
+    Read files of a folder, or of a zip or tar archive.
+
+    Parameters
+    ----------
+    path : `pathlib.Path`
+        The folder or archive.
+    accept : callable
+        Called with the name of a file, says whether it is wanted.
+
+    Yields
+    ------
+    place : `pathlib.PurePosixPath`
+        Where it is, in the folder or the archive.
+    data : bytes
+        Its content.
+    source : str
+        Its place with that of the archive, for messages.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If an archive is damaged, or unpacks to more than the bound.
+    """
+    if path.is_dir():
+        for file in sorted(path.rglob("*")):
+            if accept(file.name) and file.is_file():
+                yield PurePosixPath(file.as_posix()), file.read_bytes(), str(file)
+        return
+    n_bytes = 0
+    try:
+        for place, size, read in _zipped(path) if zipfile.is_zipfile(path) else _tarred(path):
+            if accept(place.name):
+                n_bytes += size
+                check_unpacked(path, n_bytes)
+                yield place, read(), f"{path}:{place}"
+    except (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error) as err:
+        msg = f"{path} is a truncated or damaged archive: {err}"
+        raise DataError(msg) from err
+
+
+def _zipped(path):
+    with zipfile.ZipFile(path) as archive:
+        for member in sorted(archive.infolist(), key=lambda member: member.filename):
+            place = PurePosixPath(member.filename)
+            yield place, member.file_size, lambda member=member: archive.read(member)
+
+
+def _tarred(path):
+    unpacked_size(path)
+    with tarfile.open(path) as archive:
+        for member in archive:
+            if member.isfile():
+                place = PurePosixPath(member.name)
+                yield place, member.size, lambda member=member: archive.extractfile(member).read()
