@@ -4,6 +4,7 @@ import difflib
 import functools
 import warnings
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
@@ -41,11 +42,12 @@ for _name, _parameter in _MODEL_PARAMETERS.items():
     _parameter.name = _name
 
 
+@dataclass(frozen=True, eq=False)
 class ModelSpectra:
     """
     Spectra of one model, part by part.
 
-    Attributes
+    Parameters
     ----------
     total : `SED`
         The whole, as observed.
@@ -59,11 +61,10 @@ class ModelSpectra:
         All parameters.
     """
 
-    def __init__(self, total, components, derived, parameters):
-        self.total = total
-        self.components = components
-        self.derived = derived
-        self.parameters = parameters
+    total: SED
+    components: dict
+    derived: dict
+    parameters: dict
 
 
 class SEDModel:
@@ -99,9 +100,8 @@ class SEDModel:
     def __init__(self, components, *, cosmology=COSMOLOGY, frac_agn_definition="dust"):
         self.components = tuple(sorted(components, key=_role_order))
         if frac_agn_definition not in DEFINITIONS:
-            raise argument_error(
-                "frac_agn_definition", f"one of {DEFINITIONS}", repr(frac_agn_definition)
-            )
+            wanted = f"one of {DEFINITIONS}"
+            raise argument_error("frac_agn_definition", wanted, repr(frac_agn_definition))
         self.cosmology = cosmology
         self.frac_agn_definition = frac_agn_definition
         roles = [c.role for c in self.components]
@@ -113,16 +113,14 @@ class SEDModel:
                 raise argument_error("components", f"with a component of role {role!r}", roles)
         if len(set(roles)) < len(roles):
             raise argument_error("components", "at most one of each role", roles)
-        if "dust" in roles and "attenuation" not in roles:
-            raise argument_error("components", "with 'attenuation' if there is 'dust'", roles)
-        if "xray" in roles and "agn" not in roles:
-            raise argument_error("components", "with 'agn' if there is 'xray'", roles)
+        for role, other in (("dust", "attenuation"), ("xray", "agn")):
+            if role in roles and other not in roles:
+                raise argument_error("components", f"with {other!r} if there is {role!r}", roles)
         for role, name in (("sfh", "age"), ("stellar", "metallicity")):
-            if name not in self.component(role).parameters:
-                raise argument_error(
-                    "components", f"with a parameter {name!r} in the {role!r} component",
-                    self.component(role),
-                )  # fmt: skip
+            component = self.component(role)
+            if name not in component.parameters:
+                wanted = f"with a parameter {name!r} in the {role!r} component"
+                raise argument_error("components", wanted, component)
         merged = {}
         for component in self.components:
             twice = set(component.parameters) & (set(merged) | set(_MODEL_PARAMETERS))
@@ -170,8 +168,7 @@ class SEDModel:
                 msg = f"[sed] component {entry}: {err.args[0]}"
                 raise ConfigError(msg) from err
         try:
-            definition = config.get("frac_agn_definition", "dust")
-            return cls(parts, frac_agn_definition=definition)
+            return cls(parts, frac_agn_definition=config.get("frac_agn_definition", "dust"))
         except ValueError as err:
             msg = f"[sed] {err}"
             raise ConfigError(msg) from err
@@ -191,11 +188,12 @@ class SEDModel:
         The chain of Yang et al. 2021, from the best libraries at hand; ``meta`` names them.
 
         Delayed history, BC03 at solar metallicity, Calzetti-Leitherer attenuation, dust in a
-        sequence of alpha, torus with SMC polar dust (oa 40 deg, i 70 deg, p 1, q 1, R 20,
-        emissivity 1.6), intergalactic absorption. BC03 files (the paper: Chabrier IMF), Dale et
-        al. 2014 and SKIRTOR are used where they are registered (``miricigale data add``) and
-        hold the paper's values; bundled tables stand in for what is not: BC03 with a Kroupa IMF,
-        a Draine & Li sequence, a parametric torus.
+        sequence of alpha, torus with SMC polar dust (oa 40 deg, i 70 deg, p 1, R 20,
+        emissivity 1.6), intergalactic absorption; q 1 and one colour excess for stars of all ages
+        are inferred. BC03 files (the paper: Chabrier IMF), Dale et al. 2014 and SKIRTOR are used
+        where they are registered (``miricigale data add``) and hold the paper's values; bundled
+        tables stand in for what is not: BC03 with a Kroupa IMF, a Draine & Li sequence, a
+        parametric torus.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Chains and axes of published studies."""
+"""Chains and axes after published studies, with what stands in where libraries are missing."""
 
 import numpy as np
 
@@ -12,31 +12,16 @@ __all__ = ["LIBRARIES", "yang2021_axes", "yang2021_components"]
 #: Where a preset takes its libraries from.
 LIBRARIES = ("best", "bundled")
 
-#: Torus of the fits of Yang et al. 2021 (table 1; q is inferred).
+#: AGN templates of the fits of Yang et al. 2021 (table 1; q is inferred).
 TORUS = {"p": 1.0, "q": 1.0, "opening_angle": 40.0, "radius_ratio": 20.0}
 
 
 def yang2021_components(*, agn=True, xray=False, igm="meiksin2006", libraries="best"):
     """
-    Components of the chain of Yang et al. 2021.
+    Components of the chain of Yang et al. 2021, and which library each part comes from.
 
-    Parameters
-    ----------
-    agn : bool, optional
-        Whether there is an AGN.
-    xray : bool, optional
-        Whether its X-rays are derived.
-    igm : str, optional
-        Name of the intergalactic component.
-    libraries : {"best", "bundled"}, optional
-        ``"best"``: what the user has registered where it holds the paper's values, the bundled
-        tables for the rest; ``"bundled"``: the bundled tables alone.
-
-    Returns
-    -------
-    components : list of `~miricigale.sed.Component`
-    notes : list of str
-        Which library each part comes from, and why not a better one.
+    Parameters are those of `SEDModel.yang2021`. Of the paper are the libraries' kinds and the values
+    of its table 1; ``q`` and one colour excess for stars of all ages are inferred.
     """
     if libraries not in LIBRARIES:
         raise argument_error("libraries", f"one of {LIBRARIES}", repr(libraries))
@@ -81,14 +66,14 @@ def yang2021_components(*, agn=True, xray=False, igm="meiksin2006", libraries="b
 
 def yang2021_axes(kind="fit"):
     """
-    Axes of the grids of Yang et al. 2021 (table 1 and 3).
+    Axes after the grids of Yang et al. 2021 (tables 1 and 3).
 
     Parameters
     ----------
     kind : {"fit", "galaxy", "quick"}
         ``"fit"``: the grid of the fits, 560 galaxies, 60 AGN, 11 fractions, 65 redshifts;
-        ``"galaxy"``: the same without AGN; ``"quick"``: a thinner one, 96 galaxies, 9 AGN
-        (polar dust at 100 and 300 K), 6 fractions, 33 redshifts.
+        ``"galaxy"``: the same without AGN; ``"quick"``: a thinner one, not the paper's, 96
+        galaxies, 9 AGN (polar dust at 100 and 300 K), 6 fractions, 33 redshifts.
 
     Returns
     -------

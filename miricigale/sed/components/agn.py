@@ -8,14 +8,13 @@ import numpy as np
 from miricigale.refdata.libraries.skirtor import SKIRTOR_AXES
 from miricigale.refdata.libraries.table import open_library
 from miricigale.sed import _core
-from miricigale.sed._core import DISK_MEAN
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.files import cached_by_file
 from miricigale.utils.units import frozen_array
 
-__all__ = ["AGN", "DISK_MEAN", "AGNTemplates", "Skirtor2016", "TorusSpectra"]
+__all__ = ["AGN", "AGNTemplates", "Skirtor2016", "TorusSpectra"]
 
 
 @dataclass(frozen=True, eq=False)

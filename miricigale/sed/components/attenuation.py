@@ -60,15 +60,11 @@ def _exponents(wave, law, *shape):
     return first, last, part
 
 
-def _key(wave):
-    """Bytes of a grid of wavelengths."""
-    return np.ascontiguousarray(wave, dtype=float).tobytes()
-
-
-def _transmission(shape, found, amount):
+def _dimmed(wave, amount, law, *shape):
     """10^(-0.4 k amount), as a new array that cannot be written to."""
-    first, last, part = found
-    out = np.ones(shape)
+    key = np.ascontiguousarray(wave, dtype=float).tobytes()
+    first, last, part = _exponents(key, law, *shape)
+    out = np.ones(np.shape(wave))
     flat = out.reshape(-1)[first:last]
     np.multiply(part, amount, out=flat)
     np.exp(flat, out=flat)
@@ -104,18 +100,13 @@ class Attenuation(Component):
         """
         Transmission for lines and continuum of the gas, where it is not that of the stars.
 
-        Parameters
-        ----------
-        wave : `~numpy.ndarray`
-            Rest wavelengths in um.
-        values : dict
-            Values of the parameters.
+        Parameters are those of `factors`.
 
         Returns
         -------
         gas : `~numpy.ndarray`, shape of ``wave``, or None
             From 0 to 1, not to be written to, for the gas around stars of any age. None: gas is
-            dimmed as the stars that it surrounds, by `factors`.
+            dimmed as the stars that it surrounds.
         """
         return None
 
@@ -135,10 +126,9 @@ class _Screen(Attenuation):
 
     def factors(self, wave, values):
         """See `Attenuation.factors`."""
-        found = _exponents(_key(wave), *self._law(values))
-        ebv, factor, shape = values["ebv"], values["ebv_factor"], np.shape(wave)
-        young = _transmission(shape, found, ebv)
-        return young, young if factor == 1.0 else _transmission(shape, found, ebv * factor)
+        law, ebv, factor = self._law(values), values["ebv"], values["ebv_factor"]
+        young = _dimmed(wave, ebv, *law)
+        return young, young if factor == 1.0 else _dimmed(wave, ebv * factor, *law)
 
     def inert(self, values):
         """Every other parameter, where there is no dust."""
@@ -250,9 +240,8 @@ class ModifiedStarburst(_Starburst):
 
     def factors(self, wave, values):
         """See `Attenuation.factors`; the same for young and old stars."""
-        found = _exponents(_key(wave), *self._law(values))
         ebv = values["ebv_lines"] * values["ebv_factor_stars"]
-        stars = _transmission(np.shape(wave), found, ebv)
+        stars = _dimmed(wave, ebv, *self._law(values))
         return stars, stars
 
     def gas_factor(self, wave, values):
@@ -261,7 +250,7 @@ class ModifiedStarburst(_Starburst):
             law = ("milky_way", values["r_v_gas"])
         else:
             law = ("pei1992", self.gas_law.removesuffix("_pei1992"))
-        return _transmission(np.shape(wave), _exponents(_key(wave), *law), values["ebv_lines"])
+        return _dimmed(wave, values["ebv_lines"], *law)
 
     def inert(self, values):
         """R_V of a law that has its own, the curve of stars or a bump that is not there."""
@@ -330,13 +319,11 @@ class CharlotFall(Attenuation):
 
     def factors(self, wave, values):
         """See `Attenuation.factors`."""
-        key, shape = _key(wave), np.shape(wave)
         av, mu = values["av_ism"], values["mu"]
-        old = _transmission(shape, _exponents(key, "power_law", values["slope_ism"]), av)
+        old = _dimmed(wave, av, "power_law", values["slope_ism"])
         if mu == 1.0:
             return old, old
-        clouds = _exponents(key, "power_law", values["slope_bc"])
-        young = old * _transmission(shape, clouds, av * (1.0 - mu) / mu)
+        young = old * _dimmed(wave, av * (1.0 - mu) / mu, "power_law", values["slope_bc"])
         young.flags.writeable = False
         return young, old
 

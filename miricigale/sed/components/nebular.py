@@ -13,7 +13,7 @@ from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import cached_by_file, open_fits
 from miricigale.utils.units import frozen_array
 
-__all__ = ["Nebular", "NebularTable", "load_nebular"]
+__all__ = ["Nebular"]
 
 _KM_S = 1e-9 * _core.LIGHT  # speed of light
 _WIDTH = Parameter(

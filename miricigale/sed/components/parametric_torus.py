@@ -9,7 +9,7 @@ import numpy as np
 
 from miricigale.sed import _core
 from miricigale.sed.component import register
-from miricigale.sed.components.agn import AGN, DISK_MEAN, TorusSpectra
+from miricigale.sed.components.agn import AGN, TorusSpectra
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import cached_by_file
@@ -110,7 +110,7 @@ def _torus(path, wave_bytes, disk, slope, shape):
     const, wave = _constants(path), np.frombuffer(wave_bytes)
     tau, inclination, opening, _, q, _ = shape
     face_on = _core.disk_spectrum(wave, slope, disk)
-    face_on /= DISK_MEAN * np.trapezoid(face_on, wave)
+    face_on /= _core.DISK_MEAN * np.trapezoid(face_on, wave)
     seen = face_on * _seen_fraction(const, wave, tau, inclination, opening, q)
     dust = _dust_shape(const["emission"], wave_bytes, shape)
     power = _absorbed(path, tau, opening, q) * _anisotropy(const, tau, inclination, opening)
@@ -170,7 +170,7 @@ def _absorbed(path, tau, opening, q):
         angle = np.degrees(np.arccos(low + (high - low) * nodes))[:, None]
         seen = _seen_fraction(const, wave, tau, angle, opening, q)
         escaped += (high - low) * (weights @ np.trapezoid(spectrum * seen, wave, axis=1))
-    return float(1.0 - escaped / DISK_MEAN)
+    return float(1.0 - escaped / _core.DISK_MEAN)
 
 
 def _dust_shape(e, wave_bytes, shape):
