@@ -1,6 +1,5 @@
 """Finding reference data: environment, the user's folder, bundled files."""
 
-import functools
 import hashlib
 import importlib.metadata
 import json
@@ -15,6 +14,7 @@ from astropy.config import ConfigItem, ConfigNamespace
 from miricigale.refdata.registry import resource
 from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
+from miricigale.utils.files import cached_by_file
 
 __all__ = [
     "cache_folder",
@@ -77,6 +77,9 @@ def cache_folder():
     return Path(_config.get_cache_dir()) / "miricigale" / "cache"
 
 
+_kept_sha256 = cached_by_file(256)(file_sha256)
+
+
 def record_path(path):
     """Path of the record that is kept beside a file that was added: ``<file>.json``."""
     return path.with_name(path.name + ".json")
@@ -103,8 +106,8 @@ def stored_record(path):
     """
     beside = record_path(path)
     try:
-        status = beside.stat()
-        record = _json(beside, status.st_ino, status.st_size, status.st_mtime_ns)
+        # thousands of checksums: read once
+        record = _json(beside)
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError) as err:
@@ -116,11 +119,9 @@ def stored_record(path):
     return dict(record)
 
 
-@functools.lru_cache(maxsize=16)
-def _json(path, inode, size, modified):
-    """Content of a JSON file, kept as long as it does not change: thousands of checksums."""
-    del inode, size, modified
-    return json.loads(path.read_text(encoding="utf-8"))
+@cached_by_file(16)
+def _json(path):
+    return json.loads(Path(path).read_text(encoding="utf-8"))
 
 
 def _places(record):
@@ -157,7 +158,8 @@ def _warn_of_override(record, label, path):
         warnings.warn(msg, MiricigaleWarning, stacklevel=3)
 
 
-def _file_record(name):
+def file_record(name):
+    """Record of a resource that is a file; others are refused."""
     record = resource(name)
     if not record.file:
         raise argument_error("name", "a resource that is a file", f"{name!r} ({record.source})")
@@ -183,7 +185,7 @@ def find_resource(name):
     KeyError
         If there is no such resource.
     """
-    return find_place(_file_record(name))[1]
+    return find_place(file_record(name))[1]
 
 
 def locate(name, *, check=False):
@@ -212,7 +214,7 @@ def locate(name, *, check=False):
     `~miricigale.utils.exceptions.DataError`
         If it is in none of the places, or its checksum differs.
     """
-    record = _file_record(name)
+    record = file_record(name)
     label, path = find_place(record)
     if path is None:
         tried = ", ".join(f"{label} ({folder})" for label, folder in _places(record))
@@ -278,19 +280,11 @@ def fingerprint_of(path, *, trust=True):
     if not trust:
         return file_sha256(path)
     status = path.stat()
-    size, modified = status.st_size, status.st_mtime_ns
     try:
         record = stored_record(path) or {}
     except DataError:
         # 'miricigale data check' tells; the file itself is what counts
         record = {}
-    if (record.get("size"), record.get("mtime_ns")) == (size, modified):
+    if (record.get("size"), record.get("mtime_ns")) == (status.st_size, status.st_mtime_ns):
         return record["sha256"]
-    return _sha256_of(path, status.st_ino, size, modified)
-
-
-@functools.lru_cache(maxsize=256)
-def _sha256_of(path, inode, size, modified):
-    """Checksum of a file, kept as long as it does not change."""
-    del inode, size, modified
-    return file_sha256(path)
+    return _kept_sha256(path)

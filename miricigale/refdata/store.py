@@ -6,9 +6,8 @@ import os
 import shutil
 from pathlib import Path
 
-from miricigale.refdata.locate import data_folder, file_sha256, record_path
-from miricigale.refdata.registry import resource
-from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.refdata.locate import data_folder, file_record, file_sha256, record_path
+from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import unpacked_size
 from miricigale.utils.store import PARTIAL, replacing
 
@@ -133,9 +132,7 @@ def add_resource(name, path):
     `~miricigale.utils.exceptions.DataError`
         If there is no such path, or its checksum is not the record's.
     """
-    record, path = resource(name), Path(path).expanduser()
-    if not record.file:
-        raise argument_error("name", "a resource that is a file", f"{name!r} ({record.source})")
+    record, path = file_record(name), Path(path).expanduser()
     if not path.exists():
         msg = f"no file or folder {path}"
         raise DataError(msg)
