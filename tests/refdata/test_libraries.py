@@ -350,11 +350,12 @@ def test_a_library_is_registered_and_found(folder):
     assert names(folder) == ["test.fits", "test.fits.json"]
     library = open_library(report.path, NAME)
     assert library.spectrum("dust", library.row(tau=7, angle=90)) == pytest.approx(4.5)
-    assert (report.n_spectra, report.complete, report.n_wave) == (4, True, 7)
-    assert report.axes["angle"].tolist() == [0.0, 90.0]
-    assert report.units["angle"] == "deg"
+    found = report.library
+    assert (found.n_rows, found.complete, found.wave.size) == (4, True, 7)
+    assert found.values_of("angle").tolist() == [0.0, 90.0]
+    assert found.units["angle"] == "deg"
     assert report.sha256 == hashlib.sha256(report.path.read_bytes()).hexdigest()
-    assert report.files == {"fake.dat": hashlib.sha256(path.read_bytes()).hexdigest()}
+    assert report.library.meta["files"] == {"fake.dat": hashlib.sha256(path.read_bytes()).hexdigest()}
     assert report.replaced == ""
     assert state().state == "ok"
 
@@ -380,7 +381,7 @@ def test_the_record_says_what_it_was_made_from(folder):
     record = json.loads(record_path(report.path).read_text())
     assert record == stored_record(report.path)
     assert record["source"] == str((folder / "fake.dat").resolve())
-    assert record["files"] == report.files
+    assert record["files"] == report.library.meta["files"]
     assert record["sha256"] == report.sha256
     assert record["size"] == report.path.stat().st_size
     assert record["axes"] == {"tau": [3.0, 7.0], "angle": [0.0, 90.0]}

@@ -57,80 +57,55 @@ class Report:
 
     Parameters
     ----------
-    name : str
-        The resource.
+    library : `LibraryTable`
+        As it was read back.
     path : `~pathlib.Path`
         The converted file; its record stands beside it, as ``<file>.json``.
     source : `~pathlib.Path`
         What was read.
-    n_spectra : int
-        Number of spectra of each kind.
-    kinds : dict of str to str
-        Unit of each kind of spectra.
-    axes : dict of str to `~numpy.ndarray`
-        Different values of each axis.
-    units : dict of str to str
-        Unit of each axis.
-    complete : bool
-        Whether every combination of these values is there.
-    wave : tuple of float
-        First and last wavelength in um.
-    n_wave : int
-        Number of wavelengths.
-    files : dict of str to str
-        sha256 of every source file.
     sha256 : str
         Of the converted file.
     size : int
         Of the converted file, in bytes.
-    summary : tuple of str
-        What the reader says.
     replaced : str
         Date and checksum of the library that stood there, or empty.
     """
 
-    name: str
+    library: LibraryTable
     path: Path
     source: Path
-    n_spectra: int
-    kinds: dict
-    axes: dict
-    units: dict
-    complete: bool
-    wave: tuple
-    n_wave: int
-    files: dict
     sha256: str
     size: int
-    summary: tuple = ()
     replaced: str = ""
 
     def __str__(self):
-        number = f"{len(self.files):,} file{'s' if len(self.files) != 1 else ''}"
+        library, files = self.library, self.library.meta["files"]
+        units, n, wave = library.units, library.n_rows, library.wave
+        axes = {axis: library.values_of(axis) for axis in library.axes}
+        number = f"{len(files):,} file{'s' if len(files) != 1 else ''}"
         rows = [("source", f"{self.source} ({number} read)")]
-        kinds = ", ".join(f"{kind} ({unit or 'no unit'})" for kind, unit in self.kinds.items())
-        wave = f"{self.n_wave} wavelengths, {self.wave[0]:g} to {self.wave[1]:g} um"
-        rows += [("spectra", f"{self.n_spectra} of each kind: {kinds}; {wave}")]
-        for name, values in self.axes.items():
-            unit = f" {self.units[name]}" if self.units.get(name) else ""
-            rows.append((name, f"{_some(values)}{unit}"))
-        grid = " x ".join(str(values.size) for values in self.axes.values())
-        total = int(np.prod([values.size for values in self.axes.values()]))
-        missing = "complete" if self.complete else f"{total - self.n_spectra} of {total} not there"
+        kinds = ", ".join(f"{kind} ({units.get(kind) or 'no unit'})" for kind in library.spectra)
+        span = f"{wave.size} wavelengths, {wave[0]:g} to {wave[-1]:g} um"
+        rows += [("spectra", f"{n} of each kind: {kinds}; {span}")]
+        for name, values in axes.items():
+            rows.append((name, f"{_some(values)} {units.get(name, '')}".rstrip()))
+        grid = " x ".join(str(values.size) for values in axes.values())
+        total = int(np.prod([values.size for values in axes.values()]))
+        missing = "complete" if library.complete else f"{total - n} of {total} not there"
         rows += [("grid", f"{grid}: {missing}")]
-        rows += [("found", sentence) for sentence in self.summary]
-        if len(self.files) <= 5:
-            rows += [("sha256", f"{value}  {name}") for name, value in self.files.items()]
+        rows += [("found", sentence) for sentence in library.summary]
+        if len(files) <= 5:
+            rows += [("sha256", f"{value}  {name}") for name, value in files.items()]
         rows += [("sha256", f"{self.sha256}  {self.path.name}")]
         rows += [("written", f"{self.path} ({self.size / 1e6:.1f} MB)")]
         rows += [("record", f"{record_path(self.path)} (checksums of all files)")]
         if self.replaced:
             rows += [("replaces", self.replaced)]
         width = max(shutil.get_terminal_size((100, 24)).columns, 60)
-        lines, column = [self.name], max(len(key) for key, _ in rows) + 5
+        lines, column = [library.name], max(len(key) for key, _ in rows) + 5
         for key, text in rows:
             # checksums and paths stay whole, to be copied
-            fill = key in ("found", "spectra", *self.axes)
+            fill = key in ("found", "spectra", *axes)
             lines += textwrap.wrap(
                 text,
                 width=width if fill else 10**6,
@@ -201,23 +176,7 @@ def add_library(name, path, *, progress_bar=False):
             replaced = _present(target)
             entry |= _entry(library, path)
     known = stored_record(target)
-    return Report(
-        name=name,
-        path=target,
-        source=path,
-        n_spectra=library.n_rows,
-        kinds={kind: library.units.get(kind, "") for kind in library.spectra},
-        axes={axis: library.values_of(axis) for axis in library.axes},
-        units={axis: library.units.get(axis, "") for axis in library.axes},
-        complete=bool(library.complete),
-        wave=(float(library.wave[0]), float(library.wave[-1])),
-        n_wave=library.wave.size,
-        files=dict(library.meta["files"]),
-        sha256=known["sha256"],
-        size=known["size"],
-        summary=library.summary,
-        replaced=replaced,
-    )
+    return Report(library, target, path, known["sha256"], known["size"], replaced)
 
 
 def _reader(name):

@@ -84,14 +84,11 @@ class Dale2014(DustEmission):
         default=2.0, bounds=(0.0625, 4.0), doc="Slope of dust mass in intensity, dM ~ U^-alpha dU."
     )
 
-    def _library(self):
-        return open_library(self.path, self.resource)
-
     def nodes(self):
-        return self._library().wave
+        return open_library(self.path, self.resource).wave
 
     def spectrum(self, values):
-        alphas, spectra = _sequence(self._library(), self.starlight)
+        alphas, spectra = _sequence(open_library(self.path, self.resource), self.starlight)
         low, part = _core.cells(alphas, values["alpha"])
         return (1.0 - part) * spectra[low] + part * spectra[low + 1]
 

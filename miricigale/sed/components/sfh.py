@@ -12,6 +12,7 @@ from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import unpacked_size
+from miricigale.utils.units import to_array
 
 __all__ = [
     "ConstantSFH",
@@ -263,11 +264,4 @@ def _column(table, name, unit):
     if getattr(column, "unit", None) is None:
         msg = f"'{name}' must have a unit convertible to {unit}, got none"
         raise u.UnitsError(msg)
-    try:
-        array = np.asarray(u.Quantity(column).to_value(unit), dtype=float)
-    except u.UnitConversionError:
-        msg = f"'{name}' must be convertible to {unit}, got {column.unit}"
-        raise u.UnitsError(msg) from None
-    if array.ndim != 1 or not np.all(np.isfinite(array)):
-        raise argument_error(name, "finite numbers, one in a row", "others")
-    return array
+    return to_array(column, unit, name, ndim=1, finite=True)
