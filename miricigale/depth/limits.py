@@ -15,7 +15,7 @@ from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, TIME, to_array
 
 __all__ = ["aperture_noise", "extraction_weights", "sensitivity", "sensitivity_table"]
 
-# positions of the source's centre within the pixel, per axis, over which is averaged
+# positions of the source's center within the pixel, per axis, over which is averaged
 _PHASES = (np.arange(4) + 0.5) / 4 - 0.5
 
 
@@ -30,7 +30,7 @@ def extraction_weights(radius, annulus=None, *, offset=(0.0, 0.0)):
     annulus : tuple of float or None, optional
         Inner and outer radius in pixels; None if the sky is known.
     offset : tuple of float, optional
-        Of the centre from that of the middle pixel, x, y.
+        Of the center from that of the middle pixel, x, y.
 
     Returns
     -------
@@ -38,11 +38,11 @@ def extraction_weights(radius, annulus=None, *, offset=(0.0, 0.0)):
         Overlap of pixel and circle; in the annulus minus the ratio of the areas.
     """
     half = int(np.ceil(max(radius, *(annulus or (0.0,))))) + 2
-    centre = (half + offset[0], half + offset[1])
+    center = (half + offset[0], half + offset[1])
     shape = (2 * half + 1, 2 * half + 1)
-    weights = CircularAperture(centre, radius).to_mask(method="exact").to_image(shape)
+    weights = CircularAperture(center, radius).to_mask(method="exact").to_image(shape)
     if annulus is not None:
-        sky = CircularAnnulus(centre, *annulus).to_mask(method="exact").to_image(shape)
+        sky = CircularAnnulus(center, *annulus).to_mask(method="exact").to_image(shape)
         weights = weights - sky * (weights.sum() / sky.sum())
     return weights
 

@@ -1,13 +1,11 @@
 """The detector: a tuple of effects, applied block by block."""
 
-import concurrent.futures
 import dataclasses
 import itertools
 import logging
 import warnings
 from pathlib import Path
 
-import numba
 import numpy as np
 
 from miricigale.depth.saturation import SKY_FRACTION, SaturationForecast, saturation_forecast
@@ -31,7 +29,7 @@ from miricigale.detector.ramp import Ramp
 from miricigale.instrument import DetectorProperties, Exposure, ImageFacts, miri_detector
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.meta import provenance
-from miricigale.utils.parallel import parallel_map
+from miricigale.utils.parallel import chunks, parallel_map, threads
 from miricigale.utils.random import check_seed
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
@@ -196,8 +194,8 @@ class Detector:
         previous : `Latent` or iterable of `Latent`, optional
             Exposures before, for a detector with `Persistence`.
         n_threads : int, optional
-            Number of threads; as many as there are processors if not given
-            (``NUMBA_NUM_THREADS``). It changes nothing in the result.
+            Number of threads; as many as there are processors if not given. It changes nothing
+            in the result.
         progress_bar : bool, optional
             Whether a progress bar is shown.
 
@@ -365,23 +363,17 @@ class Detector:
 
     def _run(self, task, store, n_threads, progress_bar):
         """Expose all rows, block by block, and hand each block to ``store``."""
-        if n_threads is None:
-            n_threads = numba.config.NUMBA_NUM_THREADS
-        if n_threads < 1 or int(n_threads) != n_threads:
-            raise argument_error("n_threads", "at least 1 and an integer", n_threads)
         n_int, n_group, ny, nx = task.shape
         height = max(1, _BLOCK_SAMPLES // (n_int * n_group * nx))
-        blocks = [slice(start, min(start + height, ny)) for start in range(0, ny, height)]
 
         def work(rows):
             store(rows, *self._expose_rows(task, rows))
 
         desc = f"ramp {task.exposure.filter}"
-        if n_threads == 1:
-            parallel_map(work, blocks, progress_bar=progress_bar, desc=desc)
-        else:
-            with concurrent.futures.ThreadPoolExecutor(int(n_threads)) as pool:
-                parallel_map(work, blocks, executor=pool, progress_bar=progress_bar, desc=desc)
+        with threads(n_threads) as executor:
+            parallel_map(
+                work, chunks(ny, height), executor=executor, progress_bar=progress_bar, desc=desc
+            )
 
     def _expose_rows(self, task, rows):
         """Apply the effects to some rows: counts, flags of pixels, flags of groups."""

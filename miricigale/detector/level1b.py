@@ -2,7 +2,7 @@
 Files of JWST level 1b (``*_uncal.fits``), written and read with astropy alone.
 
 The counts stand in ``SCI`` as unsigned 16-bit numbers (BZERO 32768). A constant ASDF stub
-of a hundred bytes is what the official pipeline needs to recognise the file. Keywords
+of a hundred bytes is what the official pipeline needs to recognize the file. Keywords
 follow the JWST keyword dictionary; those that the pipeline asks for are all there.
 """
 

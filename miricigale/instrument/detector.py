@@ -46,7 +46,7 @@ class DetectorProperties:
         Coefficients, lowest power first, of the polynomial that turns measured DN above
         the bias into linear DN. The first must be 0 and the second 1.
     ipc : tuple of float
-        Share of a pixel's signal seen by each horizontal, vertical and diagonal neighbour.
+        Share of a pixel's signal seen by each horizontal, vertical and diagonal neighbor.
     reference_columns : int
         Columns without light on each side of the full frame.
     pixel_pitch : float
@@ -113,11 +113,11 @@ class DetectorProperties:
     def ipc_kernel(self):
         """Interpixel capacitance, shape (3, 3), sum 1."""
         horizontal, vertical, diagonal = self.ipc
-        centre = 1 - 2 * horizontal - 2 * vertical - 4 * diagonal
+        center = 1 - 2 * horizontal - 2 * vertical - 4 * diagonal
         return np.array(
             [
                 [diagonal, vertical, diagonal],
-                [horizontal, centre, horizontal],
+                [horizontal, center, horizontal],
                 [diagonal, vertical, diagonal],
             ]
         )
@@ -251,7 +251,7 @@ def _full_bad_pixels():
     shape = aperture("FULL").shape
     rng = stream(_SEED, "bad pixels")
     mask = rng.random(shape) < 7e-4
-    # and some clusters of a few neighbours
+    # and some clusters of a few neighbors
     rows, columns = (rng.integers(1, n - 2, size=60) for n in shape)
     for row, column in zip(rows, columns, strict=True):
         mask[row : row + 2, column : column + 3] |= rng.random((2, 3)) < 0.8

@@ -96,7 +96,7 @@ def dither_offsets(pattern, n=None, *, start=0):
     Parameters
     ----------
     pattern : str, path-like, `~astropy.units.Quantity` or `~astropy.table.Table`
-        ``"ceers"`` (3 points within 2.6" of the centre, or 6 within 5"), ``"4-point"`` (a box
+        ``"ceers"`` (3 points within 2.6" of the center, or 6 within 5"), ``"4-point"`` (a box
         of 2" by 3" with half-pixel phases), ``"cycling-small"``, ``"cycling-medium"`` or
         ``"cycling-large"`` (311 points within 1.2", 7" or 14", Gaussian, half-pixel phases in
         turn of four), ``"none"``; or offsets: of shape (m, 2), a table with ``x_offset`` and

@@ -280,7 +280,7 @@ def ceers_exposures(pointing, roll, *, filters=None, quick=False):
     Parameters
     ----------
     pointing : `~astropy.coordinates.SkyCoord`
-        Centre of the field: where the reference pixel looks before dithering.
+        Center of the field: where the reference pixel looks before dithering.
     roll : `~astropy.units.Quantity`
         Position angle of +V3 there.
     filters : iterable of str, optional

@@ -143,7 +143,7 @@ def psf_fwhm(filter):
     Returns
     -------
     fwhm : `~astropy.units.Quantity`
-        In arcsec (JWST programme 1028).
+        In arcsec (JWST program 1028).
     """
     return filter_row(filter)["fwhm"] * u.arcsec
 

@@ -3,7 +3,7 @@ Where the pixels of the MIRI imager look.
 
 The chain is that of the Science Instrument Aperture File: pixel -> ideal plane (a
 polynomial of degree 4) -> telescope frame V2, V3 -> sky (rotations of the sphere). Pixels
-are 0-based here, with integers at their centres.
+are 0-based here, with integers at their centers.
 """
 
 import dataclasses

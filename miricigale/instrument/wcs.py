@@ -264,7 +264,7 @@ def north_up_wcs(center, pixel_scale, shape):
     Parameters
     ----------
     center : `~astropy.coordinates.SkyCoord`
-        Position of the centre of the image.
+        Position of the center of the image.
     pixel_scale : `~astropy.units.Quantity`
         Side of a pixel.
     shape : tuple of int

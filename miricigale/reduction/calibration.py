@@ -34,7 +34,7 @@ def find_cosmic_rays(
     Find what is sharper than a point source.
 
     L.A.Cosmic proposes hits; of these only pixels stay that rise more steeply above
-    their neighbours than a point source does, with the hits that touch them.
+    their neighbors than a point source does, with the hits that touch them.
 
     Parameters
     ----------
@@ -45,16 +45,16 @@ def find_cosmic_rays(
     sigma_clip : float, optional
         Laplacian over noise from which a pixel counts.
     sigma_fraction : float, optional
-        Fraction of that for the neighbours of a hit.
+        Fraction of that for the neighbors of a hit.
     object_limit : float, optional
         Least contrast between the Laplacian and the fine structure (differences of
         median filters): higher values protect point sources better.
     iterations : int, optional
         Passes.
     sharpness : float, optional
-        How many times steeper than a Gaussian of ``fwhm``, centred on a pixel, a hit must be:
-        the peak less the mean of its four neighbours, over the highest of the eight
-        neighbours.
+        How many times steeper than a Gaussian of ``fwhm``, centered on a pixel, a hit must be:
+        the peak less the mean of its four neighbors, over the highest of the eight
+        neighbors.
 
     Returns
     -------
@@ -95,7 +95,7 @@ def find_cosmic_rays(
     hits &= good
     if not hits.any():
         return hits
-    # a Gaussian's pixel over its neighbour: exp(1 / (2 sigma^2))
+    # a Gaussian's pixel over its neighbor: exp(1 / (2 sigma^2))
     ratio = np.exp(0.5 * (2 * np.sqrt(2 * np.log(2)) / fwhm) ** 2)
     steep = max(sharpness * (ratio - 1), 1.0)
     mean = convolve(data, np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], np.float32) / 4)
@@ -115,7 +115,7 @@ def _lacosmic(data, variance, mask, sigma_clip, iterations, **options):
     lies within two pixels of where it is above the threshold. And later passes change nothing
     but around the hits of the first.
     """
-    # by halves of pixels: twice the pixel less its neighbours on two sides, four times
+    # by halves of pixels: twice the pixel less its neighbors on two sides, four times
     wide = np.pad(data, 1)
     up, down, left, right = wide[:-2, 1:-1], wide[2:, 1:-1], wide[1:-1, :-2], wide[1:-1, 2:]
     laplacian = sum(np.maximum(2 * data - y - x, 0) for y in (up, down) for x in (left, right))
@@ -175,7 +175,7 @@ def calibrate(
     gain : float
         Electrons per DN.
     ipc_kernel : `~numpy.ndarray`, shape (3, 3), optional
-        Coupling of neighbours that blurs the flat field as it blurs the image: a uniform
+        Coupling of neighbors that blurs the flat field as it blurs the image: a uniform
         sky comes out uniform.
     field_only : bool, optional
         Whether pixels behind the coronagraph masks are masked; sub-arrays that lie wholly

@@ -130,7 +130,7 @@ def weight_map(source, *, box=32, filter_size=3):
 
     Notes
     -----
-    The variance of a pixel is estimated from its own counts: weights by it would favour
+    The variance of a pixel is estimated from its own counts: weights by it would favor
     pixels that fluctuated low, and lower the mosaic by about sigma^2 / rate.
     """
     mask = plain_mask(source)
@@ -159,7 +159,7 @@ def noise_correction(pixfrac, ratio):
     Returns
     -------
     factor : float
-        At least 1: drizzling correlates neighbours, so that the sum over N pixels is this
+        At least 1: drizzling correlates neighbors, so that the sum over N pixels is this
         factor noisier than the pixels' errors in quadrature.
 
     References
@@ -294,7 +294,7 @@ def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None,
         In sigma of the pixel (with the noise of the median).
     derivative : float, optional
         A pixel may differ, beyond the noise, by this times the steepest difference to its
-        four neighbours in the median image: point sources are sampled differently in
+        four neighbors in the median image: point sources are sampled differently in
         each dither.
     weights, pixel_maps : list, optional
         As in `drizzle_images`.
@@ -312,7 +312,7 @@ def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None,
 
     References
     ----------
-    Fruchter & Hook 2002, PASP 114, 144, sec. 5 (without the second pass on neighbours).
+    Fruchter & Hook 2002, PASP 114, 144, sec. 5 (without the second pass on neighbors).
     """
     images = list(images)
     check_images(images, wcs)

@@ -1,7 +1,7 @@
 """
 Ramps to slopes: saturation, reference columns, linearity, jumps and the fit in one pass.
 
-The slope is the exact generalised-least-squares one for Poisson and read noise (Brandt
+The slope is the exact generalized-least-squares one for Poisson and read noise (Brandt
 2024a), and a jump is what raises the likelihood by more than a threshold (Brandt 2024b);
 see `miricigale.reduction._core` for the closed forms.
 
@@ -12,7 +12,6 @@ a contrast of differences that is uncorrelated with this slope (Gauss-Markov the
 that there is no bias to first order.
 """
 
-import concurrent.futures
 import dataclasses
 
 import numpy as np
@@ -20,7 +19,7 @@ import numpy as np
 from miricigale.instrument import DQ
 from miricigale.reduction import _core
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.parallel import chunks, parallel_map, thread_count
+from miricigale.utils.parallel import chunks, parallel_map, threads
 
 __all__ = ["RampFit", "fit_groups", "reference_drift"]
 
@@ -113,7 +112,7 @@ def fit_groups(
     first_group=0,
     last_group=None,
     jump_threshold=5.0,
-    neighbour_threshold=10.0,
+    neighbor_threshold=10.0,
     poisson_factor=1.0,
     n_threads=None,
     progress_bar=False,
@@ -145,12 +144,12 @@ def fit_groups(
     jump_threshold : float or None, optional
         A difference of groups is cut out if freeing it lowers chi squared by more than the
         square of this; None for no jump detection.
-    neighbour_threshold : float or None, optional
-        Where a jump is more significant than this, the four neighbours are cut at the same
+    neighbor_threshold : float or None, optional
+        Where a jump is more significant than this, the four neighbors are cut at the same
         difference too.
     poisson_factor : float, optional
         Variance of the photon noise of a pixel over that of independent electrons: below 1
-        where neighbours share charge (interpixel capacitance), by the sum of the squared
+        where neighbors share charge (interpixel capacitance), by the sum of the squared
         coupling kernel.
     n_threads : int, optional
         Number of threads; by default one for each processor. It changes nothing in the
@@ -196,8 +195,7 @@ def fit_groups(
     if not (np.isfinite(read_noise) and read_noise >= 0):
         raise argument_error("read_noise", "at least 0", read_noise)
     jump = _threshold(jump_threshold, "jump_threshold")
-    neighbour = _threshold(neighbour_threshold, "neighbour_threshold")
-    n_threads = thread_count(n_threads)
+    neighbor = _threshold(neighbor_threshold, "neighbor_threshold")
     usable = np.ones((ny, nx), bool) if usable is None else np.ascontiguousarray(usable, bool)
     if usable.shape != (ny, nx):
         raise argument_error("usable", f"of shape {(ny, nx)}", usable.shape)
@@ -228,8 +226,7 @@ def fit_groups(
         ys, xs, start, cuts = part
         _core.refit(*ramp, ys, xs, start, cuts, *groups, *noise, *out)
 
-    with concurrent.futures.ThreadPoolExecutor(n_threads) as pool:
-        executor = pool if n_threads > 1 else None
+    with threads(n_threads) as executor:
         events = parallel_map(
             fit_block,
             chunks(ny, _ROWS),
@@ -239,7 +236,7 @@ def fit_groups(
         )
         events = np.concatenate(events)
         n_diff = last_group - first_group - 1
-        parts = list(_neighbours(events, neighbour, usable, n_diff))
+        parts = list(_neighbors(events, neighbor, usable, n_diff))
         parallel_map(refit_block, parts, executor=executor)
 
     rate, var_poisson, var_read, n_used, n_jump, flags = out
@@ -260,7 +257,7 @@ def _threshold(value, name):
     return float(value)
 
 
-def _neighbours(events, threshold, usable, n_diff):
+def _neighbors(events, threshold, usable, n_diff):
     """
     Yield the pixels beside large jumps and where they are to be cut.
 

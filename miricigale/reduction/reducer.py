@@ -32,6 +32,7 @@ from miricigale.reduction.rampfit import fit_groups, reference_drift
 from miricigale.reduction.results import ReductionResult
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.meta import provenance
+from miricigale.utils.parallel import thread_count
 from miricigale.utils.progress import progress
 from miricigale.utils.units import ANGLE, RATE, to_array
 
@@ -55,8 +56,8 @@ class Reducer:
         Who does the work.
     jump_threshold : float or None, optional
         Sigma above which a jump is cut out of a ramp; None for no jump detection.
-    neighbour_threshold : float or None, optional
-        Sigma above which a jump is cut in the four neighbours too.
+    neighbor_threshold : float or None, optional
+        Sigma above which a jump is cut in the four neighbors too.
     skip_first, skip_last : int or None, optional
         Groups left out at the start and end of each integration. None: one each where the
         ramp says that `~miricigale.detector.FirstFrame` or
@@ -69,7 +70,7 @@ class Reducer:
     reference_correction : bool, optional
         Whether the mean of the reference columns is taken off, group by group.
     ipc : bool or None, optional
-        Whether neighbours share their charge, which lowers the photon noise of a pixel
+        Whether neighbors share their charge, which lowers the photon noise of a pixel
         (and correlates it) and blurs the flat field. None: as the ramp says, True where
         it does not.
     field_only : bool, optional
@@ -106,7 +107,7 @@ class Reducer:
 
     backend: str = "native"
     jump_threshold: float | None = 5.0
-    neighbour_threshold: float | None = 10.0
+    neighbor_threshold: float | None = 10.0
     skip_first: int | None = None
     skip_last: int | None = None
     reset_anomaly: ResetAnomaly | None = None
@@ -130,7 +131,7 @@ class Reducer:
             known = " or ".join(repr(name) for name in BACKENDS)
             raise argument_error("backend", known, repr(self.backend))
         for name in (
-            "jump_threshold", "neighbour_threshold", "negative_threshold", "outlier_threshold"
+            "jump_threshold", "neighbor_threshold", "negative_threshold", "outlier_threshold"
         ):  # fmt: skip
             value = getattr(self, name)
             if value is not None and not value > 0:
@@ -149,8 +150,7 @@ class Reducer:
         for name in ("saturation", "pixfrac"):
             if not 0 < getattr(self, name) <= 1:
                 raise argument_error(name, "above 0 and at most 1", getattr(self, name))
-        if self.n_threads is not None and self.n_threads < 1:
-            raise argument_error("n_threads", "at least 1 or None", self.n_threads)
+        thread_count(self.n_threads)
         if self.properties is not None and not isinstance(self.properties, DetectorProperties):
             raise argument_error("properties", "a DetectorProperties", repr(self.properties))
 
@@ -206,7 +206,7 @@ class Reducer:
             first_group=skip_first,
             last_group=n_group - skip_last,
             jump_threshold=self.jump_threshold,
-            neighbour_threshold=self.neighbour_threshold,
+            neighbor_threshold=self.neighbor_threshold,
             poisson_factor=factor,
             n_threads=self.n_threads,
             progress_bar=progress_bar,
@@ -232,7 +232,7 @@ class Reducer:
             Slope in DN/s with standard deviation, mask, ``flags`` (`DQ`) and WCS;
             masked pixels without a slope are NaN. The meta dictionary has the exposure in
             plain values, and ``noise_correction``: by how much the sum over many pixels is
-            noisier than their errors in quadrature, because neighbours share charge.
+            noisier than their errors in quadrature, because neighbors share charge.
         """
         fit = self.fit_groups(ramp, progress_bar=progress_bar)
         ipc = self._shares_charge(ramp)
@@ -435,7 +435,7 @@ class Reducer:
         return float(np.sqrt((photon / shared + read) / (photon + read)))
 
     def _shares_charge(self, ramp):
-        """Whether the charge of this ramp was coupled between neighbours."""
+        """Whether the charge of this ramp was coupled between neighbors."""
         if self.ipc is not None:
             return bool(self.ipc)
         return ramp.shows(InterpixelCapacitance) is not False

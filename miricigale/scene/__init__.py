@@ -1,4 +1,4 @@
-"""Scenes: catalogues of galaxies painted through the instrument's distortion and PSF."""
+"""Scenes: catalogs of galaxies painted through the instrument's distortion and PSF."""
 
 from miricigale.utils.lazy import lazy_names
 

@@ -395,7 +395,7 @@ def fill_outskirts(grid, start, stop, rows, tables, w_zone, w_smooth, w_cut, lan
                     else:
                         total += _add_smooth(row, own, par, dy, first, inner_first - 1)
                         total += _add_smooth(row, own, par, dy, inner_last + 1, last)
-                # the cells that reach inner nodes of this row and its neighbours
+                # the cells that reach inner nodes of this row and its neighbors
                 first, last = nx, -1
                 for step in range(-1, 2):
                     one, two = _row_span(par, dy + step, w_smooth[k], nx)

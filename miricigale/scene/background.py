@@ -22,14 +22,14 @@ class Background:
     Parameters
     ----------
     level : `~astropy.units.Quantity`
-        Surface brightness at the centre.
+        Surface brightness at the center.
     gradient : `~astropy.units.Quantity`, optional
         Relative change per angle (such as ``0.05 / u.arcmin``).
     position_angle : `~astropy.units.Quantity`, optional
         Direction in which it grows, east of north.
     center : `~astropy.coordinates.SkyCoord`, optional
-        Where the level holds; the centre of each image if not given. Dithers of one field
-        share a background only with one common centre.
+        Where the level holds; the center of each image if not given. Dithers of one field
+        share a background only with one common center.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The catalogue of sources: its columns, how it is read and what is refused."""
+"""The catalog of sources: its columns, how it is read and what is refused."""
 
 import warnings
 from pathlib import Path
@@ -20,7 +20,7 @@ from miricigale.utils.units import FNU
 
 __all__ = ["CATALOG_COLUMNS", "CatalogFlags", "check_catalog", "read_catalog"]
 
-#: Columns that every catalogue has, with their unit (None: dimensionless or not a number).
+#: Columns that every catalog has, with their unit (None: dimensionless or not a number).
 CATALOG_COLUMNS = {
     "id": None,
     "sky": None,
@@ -36,7 +36,7 @@ PROFILES = ("sersic", "point", "cutout")
 
 
 class CatalogFlags(Flags):
-    """What is wrong with a row of a catalogue; the row is kept."""
+    """What is wrong with a row of a catalog; the row is kept."""
 
     BAD_RADIUS = 1  # a Sersic profile without a positive radius: drawn as a point
     BAD_INDEX = 2  # index outside the range that profiles are made for: drawn as a point
@@ -83,7 +83,7 @@ def _plain(table, name, unit, argument):
 
 def check_catalog(table, *, filters=(), argument="catalog"):
     """
-    Check a catalogue and bring it into the package's units.
+    Check a catalog and bring it into the package's units.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def _flags(catalog):
 
 def read_catalog(path):
     """
-    Read a catalogue of sources.
+    Read a catalog of sources.
 
     Parameters
     ----------
@@ -224,7 +224,7 @@ def read_catalog(path):
     path = Path(path).expanduser()
     if not path.is_file():
         known = ", ".join(key for key in sorted(resources()) if key.startswith("catalog."))
-        msg = f"no catalogue {name!r}: neither a file nor one of {known}"
+        msg = f"no catalog {name!r}: neither a file nor one of {known}"
         raise DataError(msg)
     unpacked_size(path)
     plain = path.name.removesuffix(".gz")

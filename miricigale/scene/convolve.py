@@ -9,11 +9,12 @@ pixel: one forward transform of the light serves all four.
 
 import itertools
 import math
-import os
 
 import numpy as np
 from scipy.fft import fft, irfft2, next_fast_len, rfft
 from scipy.ndimage import spline_filter
+
+from miricigale.utils.parallel import thread_count
 
 __all__ = ["Places", "add_nodes", "convolve", "phases"]
 
@@ -83,21 +84,21 @@ def _window(first, stop, n_pixels, margin, oversampling):
     return start, end, low, high, next_fast_len(size, real=True)
 
 
-def _spectrum(part, size, workers):
+def _spectrum(part, size, n_threads):
     """Half of the transform of an image padded with zeros, without work on empty rows."""
-    rows = rfft(part, size[1], axis=1, workers=workers)
-    return fft(rows, size[0], axis=0, workers=workers, overwrite_x=True)
+    rows = rfft(part, size[1], axis=1, workers=n_threads)
+    return fft(rows, size[0], axis=0, workers=n_threads, overwrite_x=True)
 
 
-def _kernel_spectrum(kernel, size, workers):
+def _kernel_spectrum(kernel, size, n_threads):
     """The same for a kernel whose middle is the origin."""
     half = kernel.shape[0] // 2
     taps = np.arange(-half, half + 1)
     wrapped = np.zeros((kernel.shape[0], size[1]))
     wrapped[:, taps % size[1]] = kernel
     rows = np.zeros((size[0], size[1] // 2 + 1), dtype=complex)
-    rows[taps % size[0]] = rfft(wrapped, axis=1, workers=workers)
-    return fft(rows, axis=0, workers=workers, overwrite_x=True)
+    rows[taps % size[0]] = rfft(wrapped, axis=1, workers=n_threads)
+    return fft(rows, axis=0, workers=n_threads, overwrite_x=True)
 
 
 def phases(data, origin, oversampling):
@@ -109,7 +110,7 @@ def phases(data, origin, oversampling):
     data : `~numpy.ndarray`, shape (ny, nx)
         Values on the nodes.
     origin : tuple of int
-        The node x, y that is its centre.
+        The node x, y that is its center.
     oversampling : int
         Nodes per pixel.
 
@@ -185,7 +186,7 @@ def _kernels(data, origin, oversampling, order, y, x):
     return {power: phases(kernel, origin, oversampling) for power, kernel in kernels.items()}
 
 
-def convolve(grid, data, order, rows, columns, *, origin, margin, oversampling, workers=None):
+def convolve(grid, data, order, rows, columns, *, origin, margin, oversampling, n_threads=None):
     """
     Convolve the light on the nodes with the local coefficients; keep one node for each pixel.
 
@@ -200,13 +201,13 @@ def convolve(grid, data, order, rows, columns, *, origin, margin, oversampling, 
     rows, columns : `Places`
         Where the grid's rows and columns stand.
     origin : tuple of int
-        The node x, y of each PSF that is its centre.
+        The node x, y of each PSF that is its center.
     margin : int
         Pixels beyond each edge.
     oversampling : int
         Nodes per pixel.
-    workers : int, optional
-        Threads of the Fourier transforms; all processors if not given.
+    n_threads : int, optional
+        Threads of the Fourier transforms; as many as there are processors if not given.
 
     Returns
     -------
@@ -214,7 +215,7 @@ def convolve(grid, data, order, rows, columns, *, origin, margin, oversampling, 
         Light in each pixel.
     """
     os_ = oversampling
-    workers = workers or os.cpu_count() or 1
+    n_threads = thread_count(n_threads)
     image = np.zeros((rows.n_pixels, columns.n_pixels))
     for y_first, y_stop, k_y, y_0, length_y in rows.tiles():
         y0, y1, low_y, high_y, size_y = _window(y_first, y_stop, rows.n_pixels, margin, os_)
@@ -239,9 +240,9 @@ def convolve(grid, data, order, rows, columns, *, origin, margin, oversampling, 
                     part = light[a::os_, b::os_]
                     if not part.any():
                         continue
-                    spectrum = _spectrum(part.astype(float), size, workers)
+                    spectrum = _spectrum(part.astype(float), size, n_threads)
                     for power, kernel in kernels.items():
-                        product = _kernel_spectrum(kernel[a, b], size, workers)
+                        product = _kernel_spectrum(kernel[a, b], size, n_threads)
                         product *= spectrum
                         if power in totals:
                             totals[power] += product
@@ -252,7 +253,7 @@ def convolve(grid, data, order, rows, columns, *, origin, margin, oversampling, 
             taken = np.ix_((y + margin - y0) % size_y, (x + margin - x0) % size_x)
             target = image[y[0] : y[-1] + 1, x[0] : x[-1] + 1]
             for (in_y, in_x), total in totals.items():
-                piece = irfft2(total, size, workers=workers)[taken]
+                piece = irfft2(total, size, workers=n_threads)[taken]
                 if in_y:
                     piece *= ((y - y_0) / length_y)[:, None]
                 if in_x:

@@ -31,13 +31,13 @@ class Cutout:
     ----------
     data : `~numpy.ndarray`, shape (ny, nx)
         Light per pixel in any unit, background subtracted; the scene scales its sum to the
-        flux of the catalogue.
+        flux of the catalog.
     pixel_scale : `~astropy.units.Quantity`
         Side of a pixel.
     angle : `~astropy.units.Quantity`, optional
         Position angle of +y, east of north; +x is west of it, as on any image of the sky.
     center : tuple of float, optional
-        Pixel x, y (0-based) that stands at the catalogue's position; the middle of the
+        Pixel x, y (0-based) that stands at the catalog's position; the middle of the
         stamp if not given.
     n_filled : int, optional
         How many of the pixels are no measurements but were filled in (`from_image`).
@@ -80,7 +80,7 @@ class Cutout:
     @classmethod
     def from_image(cls, image, position=None, *, fill=None):
         """
-        Take the stamp, its scale, its angle and its centre from an image with a WCS.
+        Take the stamp, its scale, its angle and its center from an image with a WCS.
 
         Parameters
         ----------
@@ -88,7 +88,7 @@ class Cutout:
             Background subtracted, such as a `~astropy.nddata.Cutout2D` of a mosaic made a
             CCDData.
         position : `~astropy.coordinates.SkyCoord`, optional
-            What stands at the catalogue's position; the middle of the stamp if not given.
+            What stands at the catalog's position; the middle of the stamp if not given.
         fill : float or `~astropy.units.Quantity`, optional
             Value, in the image's unit, for pixels that are masked or not finite. Without it
             they are an error; with it they are counted in ``n_filled``.

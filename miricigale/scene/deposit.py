@@ -1,13 +1,11 @@
 """Light of Sersic profiles on the nodes of a grid, by as many threads as there are."""
 
-import concurrent.futures
 import math
-import os
 
 import numpy as np
 
 from miricigale.scene import _core
-from miricigale.utils.parallel import chunks, parallel_map
+from miricigale.utils.parallel import chunks, parallel_map, threads
 
 __all__ = ["deposit_profiles", "smooth_from"]
 
@@ -17,7 +15,7 @@ _ROWS = 64
 #: Nodes in double precision that the cusps of one batch of sources take.
 _BATCH = 2_000_000
 
-#: The smooth part begins so many nodes from the centre along a row and across the major axis,
+#: The smooth part begins so many nodes from the center along a row and across the major axis,
 #: and where the brightness changes by less than these fractions from node to node: the error is
 #: below 3e-5 of the brightness there.
 SMOOTH_ALONG, SMOOTH_ACROSS = 40.0, 16.0
@@ -54,7 +52,7 @@ def smooth_from(rows, w_zone, w_cut):
     return np.where(w < w_cut, w, np.inf)
 
 
-def deposit_profiles(grid, rows, tables, w_zone, w_smooth, w_cut, land, *, workers=None):
+def deposit_profiles(grid, rows, tables, w_zone, w_smooth, w_cut, land, *, n_threads=None):
     """
     Put Sersic profiles on the grid.
 
@@ -64,17 +62,15 @@ def deposit_profiles(grid, rows, tables, w_zone, w_smooth, w_cut, land, *, worke
         Light on the nodes, changed in place.
     rows, tables, w_zone, w_smooth, w_cut, land
         As in ``_core.fill_outskirts``.
-    workers : int, optional
-        Threads; all processors if not given. The result does not depend on it.
+    n_threads : int, optional
+        Threads; as many as there are processors if not given. The result does not depend on it.
 
     Returns
     -------
     landed : `~numpy.ndarray`, shape (N,)
         Light of each source that lands on the image.
     """
-    n_threads = workers or os.cpu_count() or 1
-    with concurrent.futures.ThreadPoolExecutor(n_threads) as pool:
-        executor = pool if n_threads > 1 else None
+    with threads(n_threads) as executor:
         landed = _outskirts(grid, rows, tables, w_zone, w_smooth, w_cut, land, executor)
         landed += _cusps(grid, rows, tables, w_zone, land, executor)
     return landed

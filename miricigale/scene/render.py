@@ -12,6 +12,7 @@ from miricigale.scene import _core
 from miricigale.scene.convolve import Places, add_nodes, convolve, phases
 from miricigale.scene.deposit import deposit_profiles, smooth_from
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.parallel import thread_count
 
 __all__ = ["FieldPainter", "Painter"]
 
@@ -24,20 +25,18 @@ _DIRECT = 8
 
 
 def _check(painter, origin):
-    """Refuse a painter's settings; return its oversampling and the node of its centre."""
+    """Refuse a painter's settings; return its oversampling and the node of its center."""
     oversampling = np.broadcast_to(painter.psf.oversampling, 2)
     if oversampling[0] != oversampling[1]:
         raise argument_error("psf", "oversampled alike in x and y", oversampling.tolist())
     origin = np.asarray(origin, dtype=float)
     if np.any(np.abs(origin - np.round(origin)) > 1e-6):
-        raise argument_error("psf", "centred on a node (odd shape)", f"origin {origin.tolist()}")
+        raise argument_error("psf", "centered on a node (odd shape)", f"origin {origin.tolist()}")
     if not 0 < painter.enclosed < 1:
         raise argument_error("enclosed", "between 0 and 1", painter.enclosed)
     if not painter.max_radius > 0:
         raise argument_error("max_radius", "positive", painter.max_radius)
-    workers = painter.workers
-    if workers is not None and (workers < 1 or int(workers) != workers):
-        raise argument_error("workers", "an integer of at least 1", workers)
+    thread_count(painter.n_threads)
     return int(oversampling[0]), tuple(round(float(v)) for v in origin)
 
 
@@ -51,22 +50,22 @@ class Painter:
     shape : tuple of int
         Rows and columns of the image.
     psf : `~photutils.psf.ImagePSF`
-        PSF with the pixel response in it, oversampled alike in x and y, centred on one of
+        PSF with the pixel response in it, oversampled alike in x and y, centered on one of
         its nodes. Its ``flux``, ``x_0`` and ``y_0`` are not looked at; light beyond its
         edge is lost.
     enclosed : float, optional
         A Sersic profile is painted to the isophote that holds this fraction.
     max_radius : float, optional
         Largest semi-major axis of that isophote in pixels.
-    workers : int, optional
-        Threads; all processors if not given. The image does not depend on it.
+    n_threads : int, optional
+        Threads; as many as there are processors if not given. The image does not depend on it.
     """
 
     shape: tuple
     psf: ImagePSF
     enclosed: float = 0.995
     max_radius: float = math.inf
-    workers: int | None = None
+    n_threads: int | None = None
 
     def __post_init__(self):
         if not isinstance(self.psf, ImagePSF):
@@ -201,7 +200,7 @@ class Painter:
             w_zone, w_cut = (zone / radius) ** 2, (cut / radius) ** 2
             w_smooth = smooth_from(rows, w_zone, w_cut)
             in_image[extended] = deposit_profiles(
-                grid, rows, tables, w_zone, w_smooth, w_cut, land, workers=self.workers
+                grid, rows, tables, w_zone, w_smooth, w_cut, land, n_threads=self.n_threads
             )
             kept[extended] = sersic_enclosed_fraction(cut / radius, index)
         for row, (dx, dy, share) in (images or {}).items():
@@ -217,7 +216,7 @@ class Painter:
             origin=self._origin,
             margin=margin,
             oversampling=os_,
-            workers=self.workers,
+            n_threads=self.n_threads,
         )
         return image, in_image, kept
 
@@ -247,7 +246,7 @@ class FieldPainter(Painter):
 
     Parameters
     ----------
-    shape, enclosed, max_radius, workers
+    shape, enclosed, max_radius, n_threads
         As of `Painter`.
     psf : `~photutils.psf.GriddedPSFModel`
         PSFs with the pixel response in them, at positions on the image.

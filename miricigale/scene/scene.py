@@ -1,4 +1,4 @@
-"""A noiseless image of a catalogue of sources, and the truth that belongs to it."""
+"""A noiseless image of a catalog of sources, and the truth that belongs to it."""
 
 import functools
 
@@ -34,8 +34,8 @@ _UJY_TO_MJY = 1e-12
 class SceneFlags(Flags):
     """What happened to a source on its way into an image."""
 
-    OUTSIDE_IMAGE = 1  # its centre is on no pixel
-    NEAR_EDGE = 2  # its centre is on the image, but less than 95 % of its painted light
+    OUTSIDE_IMAGE = 1  # its center is on no pixel
+    NEAR_EDGE = 2  # its center is on the image, but less than 95 % of its painted light
     CUT_PROFILE = 4  # more than 1 % of its light lies beyond the isophote where it was cut
     NO_FLUX = 8  # its flux is not finite or negative: not painted
     DRAWN_AS_POINT = 16  # a Sersic profile whose parameters cannot be used
@@ -43,7 +43,7 @@ class SceneFlags(Flags):
 
 class Scene:
     """
-    A catalogue of sources as an instrument would see it without noise.
+    A catalog of sources as an instrument would see it without noise.
 
     Parameters
     ----------
@@ -66,12 +66,13 @@ class Scene:
         Sersic profiles are painted to the isophote that holds this fraction.
     max_radius : `~astropy.units.Quantity`, optional
         Largest semi-major axis of that isophote.
-    workers : int, optional
-        Threads of the Fourier transforms; the image does not depend on it.
+    n_threads : int, optional
+        Threads of the Fourier transforms and kernels; as many as there are processors if not
+        given. The image does not depend on it.
     cutouts : dict, optional
         For each id whose profile is ``"cutout"`` its `~miricigale.scene.Cutout`.
     agn : str, optional
-        Column of the catalogue that gives a source a point source at its centre besides its
+        Column of the catalog that gives a source a point source at its center besides its
         profile: a flux comes on top of the column ``filter``; a number without unit, 0 to 1,
         is the share of the column ``filter`` that is in the point. NaN means none.
 
@@ -99,7 +100,7 @@ class Scene:
         background=None,
         enclosed=0.9995,
         max_radius=12 * u.arcsec,
-        workers=None,
+        n_threads=None,
         cutouts=None,
         agn=None,
     ):
@@ -121,7 +122,7 @@ class Scene:
             raise argument_error("max_radius", "positive", max_radius)
         painter = FieldPainter if isinstance(psf, GriddedPSFModel) else Painter
         self._painter = painter(
-            self._shape, psf, enclosed=enclosed, max_radius=radius / scale, workers=workers
+            self._shape, psf, enclosed=enclosed, max_radius=radius / scale, n_threads=n_threads
         )
         self._cutouts = self._check_cutouts(cutouts)
         self._galaxy_flux, self._agn_flux = self._split_flux(agn)
@@ -132,7 +133,7 @@ class Scene:
 
     @property
     def catalog(self):
-        """The checked catalogue."""
+        """The checked catalog."""
         return self._catalog
 
     @property
@@ -156,7 +157,7 @@ class Scene:
         return self._background
 
     def _check_cutouts(self, cutouts):
-        """Cutouts by row of the catalogue."""
+        """Cutouts by row of the catalog."""
         cutouts = dict(cutouts or {})
         for key, value in cutouts.items():
             if not isinstance(value, Cutout):
@@ -172,7 +173,7 @@ class Scene:
         return {ids[key]: value for key, value in cutouts.items()}
 
     def _split_flux(self, agn):
-        """Light of the profiles and of the points at their centres, uJy."""
+        """Light of the profiles and of the points at their centers, uJy."""
         flux = self._catalog[self._filter].to_value(FNU)
         if agn is None:
             return flux, np.zeros(len(flux))
@@ -257,7 +258,7 @@ class Scene:
         flags[sersic & spoilt] |= SceneFlags.DRAWN_AS_POINT
         sersic &= ~spoilt
 
-        # rows of the profiles, then those of the points at their centres
+        # rows of the profiles, then those of the points at their centers
         rows = np.flatnonzero(near & valid)
         n_profiles = rows.size
         rows = np.append(rows, rows[agn[rows] > 0])
@@ -321,7 +322,7 @@ class Scene:
         if filled:
             truth.meta["cutout_pixels_filled"] = filled
         truth["flux_total"].info.description = "light to infinity, the AGN's included"
-        truth["flux_agn"].info.description = "light of the point at the centre"
+        truth["flux_agn"].info.description = "light of the point at the center"
         truth[
             "flux_in_image"
         ].info.description = "light that the image holds, through PSF and edges"
@@ -331,7 +332,7 @@ class Scene:
     @property
     def truth(self):
         """
-        What is in the image, one row for each row of the catalogue.
+        What is in the image, one row for each row of the catalog.
 
         A `~astropy.table.QTable` with ``id``, ``sky``, ``x``, ``y`` (pixels), ``profile`` as
         painted, ``flux_total``, ``flux_agn`` (of it), ``flux_in_image`` and ``flags`` (`SceneFlags`).
@@ -348,7 +349,7 @@ class Scene:
         image : `~astropy.nddata.CCDData`
             Surface brightness in MJy/sr on the WCS; ``meta["psf_includes"]`` says what of
             the detector is in the PSF already, ``meta["background"]`` the level at the
-            centre.
+            center.
         """
         light = self._painted[0]
         brightness = light * _UJY_TO_MJY / pixel_area_map(self._wcs, self._shape)

@@ -26,6 +26,7 @@ __all__ = [
     "single_threaded",
     "thread_count",
     "thread_pool",
+    "threads",
 ]
 
 #: Functions whose pickle is longer (bytes) go to other processes once, not with every piece.
@@ -251,6 +252,29 @@ def thread_count(n_threads=None):
     if n_threads < 1 or int(n_threads) != n_threads:
         raise argument_error("n_threads", "at least 1 and an integer", n_threads)
     return int(n_threads)
+
+
+@contextlib.contextmanager
+def threads(n_threads=None):
+    """
+    Threads for kernels and transforms that release the interpreter lock.
+
+    Parameters
+    ----------
+    n_threads : int, optional
+        As for `thread_count`.
+
+    Yields
+    ------
+    executor : `concurrent.futures.ThreadPoolExecutor` or None
+        None, for `parallel_map` to work serially, where it is one thread.
+    """
+    n_threads = thread_count(n_threads)
+    if n_threads == 1:
+        yield None
+        return
+    with ThreadPoolExecutor(n_threads) as executor:
+        yield executor
 
 
 class _SingleThreaded:

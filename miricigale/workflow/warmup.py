@@ -77,7 +77,7 @@ def _images():
             for exposure in exposures
         ]
     # thresholds so low that there are large jumps among so few pixels
-    Reducer(jump_threshold=2.0, neighbour_threshold=2.0).fit_ramp(ramps[0])
+    Reducer(jump_threshold=2.0, neighbor_threshold=2.0).fit_ramp(ramps[0])
     grid = north_up_wcs(center, 0.06 * u.arcsec, (128, 128))
     reducer_of(config).drizzle(images, grid)
     prior = highres_image(

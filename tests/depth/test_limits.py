@@ -50,7 +50,7 @@ def test_slope_of_read_noise_alone_is_the_least_squares_line():
     assert_allclose(variance, 12 * 30.0**2 / (n * (n**2 - 1) * 2.0**2), rtol=1e-6)
 
 
-def test_slope_is_the_generalised_least_squares_line():
+def test_slope_is_the_generalized_least_squares_line():
     # straight line with free level through groups of covariance rate t_min + read noise
     rate, n, step, read = 20.0, 12, 3.0, 25.0
     time = step * np.arange(1, n + 1)

@@ -116,7 +116,7 @@ def test_coupling_is_a_convolution():
     ramp = rng.uniform(0, 1000, (1, 2, 9, 11)).astype(np.float32)
     kernel = np.array([[1, 2, 1], [3, 10, 4], [1, 5, 1]], np.float32) / 28
     expected = [ndimage.correlate(plane, kernel, mode="nearest") for plane in ramp[0]]
-    _core.couple_neighbours(ramp, kernel)
+    _core.couple_neighbors(ramp, kernel)
     np.testing.assert_allclose(ramp[0], expected, rtol=1e-5)
 
 

@@ -78,7 +78,7 @@ def test_same_seed_same_counts_on_any_threads_and_blocks(
     detector = Detector.miri_imager(
         CosmicRays(shower_fraction=0.2), Residual(0.01), ReadNoise(pink=2.0)
     )
-    # without 'ipc' in the image, neighbours across blocks are coupled
+    # without 'ipc' in the image, neighbors across blocks are coupled
     sky = make_sky(exposure, 30.0, includes=())
     one = detector.expose(sky, exposure, seed=5, n_threads=1)
     for samples in (1, 136 * 10 * 7, 10**9):

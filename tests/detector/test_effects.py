@@ -105,7 +105,7 @@ def test_number_of_cosmic_rays(make_block):
     assert stats.kstest(when / 400, "uniform").pvalue > 1e-3
 
 
-def test_cosmic_rays_leak_to_their_neighbours(make_block):
+def test_cosmic_rays_leak_to_their_neighbors(make_block):
     effect = CosmicRays(flux=3e-5, track_max=0, yield_dex=0, leakage=0.03)
     block = make_block(n_groups=2)
     image = effect.apply(empty(block), block)[0, -1]

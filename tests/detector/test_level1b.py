@@ -67,7 +67,7 @@ def test_header_is_what_the_pipeline_asks_for(ramp, tmp_path):
     assert primary["EXPEND"] - primary["EXPSTART"] == pytest.approx(
         ramp.exposure.duration.to_value("d"), abs=1e-10
     )
-    # the linear WCS of the header finds the reference pixel and its neighbours
+    # the linear WCS of the header finds the reference pixel and its neighbors
     linear = WCS(science, naxis=2)
     x, y = ramp.exposure.aperture.reference
     for dx in (0, 5):

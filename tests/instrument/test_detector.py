@@ -64,7 +64,7 @@ def test_flat_field():
     light = ~reference_pixel_mask()
     assert_allclose(flat[light].mean(), 1, rtol=1e-5)
     assert np.all(flat[~light] == 1)
-    # differences of neighbours hold the pixels, without what is smooth
+    # differences of neighbors hold the pixels, without what is smooth
     pixels = np.diff(flat[:, 4:-4].astype(float), axis=1).std() / np.sqrt(2)
     assert_allclose(pixels, 0.01, rtol=0.02)
     assert flat[light].std() < 0.015

@@ -120,7 +120,7 @@ def test_keywords_of_the_pointing():
     assert_allclose(words["PA_V3"] - 120, turn, atol=2e-3)
 
 
-def test_normalises_and_freezes():
+def test_normalizes_and_freezes():
     one = Exposure("f770w", n_groups=10, pointing=FIELD.galactic, roll=-10 * u.deg)
     assert one.filter == "miri.f770w"
     assert one.pointing.separation(FIELD) < 1e-6 * u.arcsec

@@ -111,7 +111,7 @@ def test_detector1_flags_what_the_detector_spoilt(rates):
     assert np.all(dq[bad] & DQ.DO_NOT_USE)
     assert not np.any(dq[~bad] & DQ.DO_NOT_USE)
     # about 8.3e-8 hits per um2 and s times 625 um2 times 55 s is 0.3 % of the pixels, each
-    # hit on a track of a few and its neighbours
+    # hit on a track of a few and its neighbors
     hit = np.mean((dq[~bad] & DQ.JUMP_DET) > 0)
     assert 0.005 < hit < 0.1
 
@@ -206,7 +206,7 @@ def test_image3_conserves_the_fluxes(folder, observations, mosaic, psf):
     assert np.mean(ratio) == pytest.approx(1, abs=2e-3)
 
 
-def test_the_pipelines_own_catalogue_agrees(folder, observations, image3):
+def test_the_pipelines_own_catalog_agrees(folder, observations, image3):
     catalog = Table.read(folder / "mosaic_cat.ecsv")
     truth = observations[0].truth
     assert len(catalog) == len(truth)

@@ -68,7 +68,7 @@ def test_pure_photon_noise_has_the_variance_of_the_count():
 
 @pytest.mark.parametrize(("n_int", "n_group"), [(1, 2), (1, 9), (3, 5), (1, 60)])
 @pytest.mark.parametrize("rate", [0.3, 20.0])
-def test_agrees_with_dense_generalised_least_squares(n_int, n_group, rate):
+def test_agrees_with_dense_generalized_least_squares(n_int, n_group, rate):
     data = simulate(np.full((2, 67), rate), n_int, n_group, dtype=np.float32, seed=5)
     fit = fit_groups(data, **OPTIONS, jump_threshold=None)
     s = READ**2
@@ -109,7 +109,7 @@ def test_statistic_of_a_jump_is_the_drop_of_chi_squared():
     n_group = 12
     data = simulate(np.full((1, 1), 8.0), 2, n_group, dtype=np.float32, seed=3)
     data[1, 7:] += 120
-    fit = fit_groups(data, **OPTIONS, neighbour_threshold=None)
+    fit = fit_groups(data, **OPTIONS, neighbor_threshold=None)
     assert fit.jumps[["y", "x", "integration", "group"]].tolist() == [(0, 0, 1, 7)]
     segments = list(np.diff(data[:, :, 0, 0].astype(float), axis=1))
     s, slope = READ**2, np.mean(segments)
@@ -149,7 +149,7 @@ def test_jump_efficiency_follows_from_the_noise(n_sigma):
     precision = inverse[at - 1, at - 1] - w[at - 1] ** 2 / w.sum()
     amplitude = n_sigma / np.sqrt(precision)
     data = simulate(np.full((60, 64), rate), 1, n, seed=7, jumps=[(0, at, amplitude)])
-    fit = fit_groups(data, **OPTIONS, neighbour_threshold=None)
+    fit = fit_groups(data, **OPTIONS, neighbor_threshold=None)
     found = fit.jumps[np.abs(fit.jumps["group"] - at) <= 1]
     assert len(found) / 3840 == pytest.approx(norm.sf(5 - n_sigma), abs=0.03)
     # better than two reads alone could do
@@ -169,7 +169,7 @@ def test_large_jumps_leave_the_slope_alone(n_int, n_group, amplitude):
     rate = 10.0
     jumps = [(0, n_group - 1, amplitude)]
     data = simulate(np.full((40, 64), rate), n_int, n_group, seed=9, jumps=jumps)
-    fit = fit_groups(data, **OPTIONS, neighbour_threshold=None)
+    fit = fit_groups(data, **OPTIONS, neighbor_threshold=None)
     assert np.all(fit.flags == DQ.JUMP_DET)
     pull = (fit.rate - rate) / fit.error
     assert abs(pull.mean()) < 0.1
@@ -184,7 +184,7 @@ def test_negative_jumps_are_cut_too():
     assert np.all(np.abs(fit.rate - 10) < 5 * fit.error)
 
 
-def test_neighbours_of_a_large_jump_are_cut_at_the_same_group():
+def test_neighbors_of_a_large_jump_are_cut_at_the_same_group():
     data = simulate(np.full((7, 9), 10.0), 1, 30, seed=1)
     data[0, 20:, 3, 4] += 3000
     fit = fit_groups(data, **OPTIONS)
@@ -194,7 +194,7 @@ def test_neighbours_of_a_large_jump_are_cut_at_the_same_group():
         expected[y, x] = DQ.JUMP_DET | DQ.JUMP_NEIGHBOR
     np.testing.assert_array_equal(fit.flags, expected)
     assert np.all(fit.n_used[expected > 0] == 28)
-    alone = fit_groups(data, **OPTIONS, neighbour_threshold=None)
+    alone = fit_groups(data, **OPTIONS, neighbor_threshold=None)
     np.testing.assert_array_equal(alone.flags == DQ.JUMP_DET, expected == DQ.JUMP_DET)
 
 
@@ -254,8 +254,8 @@ def test_result_does_not_depend_on_threads_or_on_the_rest_of_the_frame():
         data[k, g:, y, x] += np.uint16(rng.uniform(50, 5000))
     one = fit_groups(data, **OPTIONS, n_threads=1)
     three = fit_groups(data, **OPTIONS, n_threads=3)
-    part = fit_groups(data[:, :, 20:70], **OPTIONS, neighbour_threshold=None)
-    whole = fit_groups(data, **OPTIONS, neighbour_threshold=None)
+    part = fit_groups(data[:, :, 20:70], **OPTIONS, neighbor_threshold=None)
+    whole = fit_groups(data, **OPTIONS, neighbor_threshold=None)
     for name in ("rate", "var_poisson", "var_read", "n_used", "n_jump", "flags"):
         np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
         np.testing.assert_array_equal(getattr(part, name), getattr(whole, name)[20:70])

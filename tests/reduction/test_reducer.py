@@ -154,7 +154,7 @@ def test_the_whole_way_keeps_fluxes_and_errors(field):
     for x, y in zip(*mosaic.wcs.world_to_pixel(positions), strict=True):
         blank &= np.hypot(xx - x, yy - y) > 10
     pull = (mosaic.data / mosaic.uncertainty.array)[blank]
-    # neighbours share charge, and drizzle puts them together
+    # neighbors share charge, and drizzle puts them together
     assert 0.97 < pull.std() < 1.1
 
 
@@ -219,7 +219,7 @@ def test_saturated_stars_are_used_or_masked_with_the_reason():
     spread = convolve(light * flat_field(FILTER, subarray="SUB256"), kernel, mode="nearest")
     truth = spread / photmjsr(FILTER) + 0.05
     error = rate.uncertainty.array[100, 100]
-    # a core has the full photon noise of its own light, less what its neighbours share
+    # a core has the full photon noise of its own light, less what its neighbors share
     assert abs(rate.data[100, 100] - truth[100, 100]) < 5 * error
 
 
@@ -241,7 +241,7 @@ def test_groups_can_be_left_out():
         ({"box": 1}, "'box' must be at least 4"),
         ({"skip_first": -1}, "'skip_first' must be an integer of at least 0"),
         ({"cosmic_ray_sigma": 0}, "'cosmic_ray_sigma' must be positive"),
-        ({"n_threads": 0}, "'n_threads' must be at least 1 or None"),
+        ({"n_threads": 0}, "'n_threads' must be at least 1 and an integer"),
         ({"properties": 3}, "'properties' must be a DetectorProperties"),
     ],
 )

@@ -42,7 +42,7 @@ def gaussian_psf(sigma=0.85, oversampling=4, half=9, **facts):
 
 
 def make_catalog(wcs, x, y, *, flux=10.0, profile="point", **columns):
-    """A catalogue of sources at given pixels."""
+    """A catalog of sources at given pixels."""
     x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.atleast_1d(y))
     n = len(x)
     table = QTable()

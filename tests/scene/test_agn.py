@@ -1,4 +1,4 @@
-"""A point source at the centre of a galaxy, as a share of its light or on top of it."""
+"""A point source at the center of a galaxy, as a share of its light or on top of it."""
 
 import importlib.util
 from pathlib import Path

@@ -118,7 +118,7 @@ def test_refuses(table):
 
 def test_unreadable_files(tmp_path):
     with pytest.raises(
-        DataError, match=r"no catalogue 'catalog.cosmos': neither a file nor one of catalog.goodss"
+        DataError, match=r"no catalog 'catalog.cosmos': neither a file nor one of catalog.goodss"
     ):
         read_catalog("catalog.cosmos")
     path = tmp_path / "broken.ecsv"
@@ -127,12 +127,12 @@ def test_unreadable_files(tmp_path):
         read_catalog(path)
 
 
-def test_bundled_catalogue():
+def test_bundled_catalog():
     catalog = read_catalog("catalog.goodss")
     center = SkyCoord(53.13440, -27.83444, unit="deg")
     separation = catalog["sky"].separation(center)
     assert separation.max() < 95 * u.arcsec
-    # the counts of the 3D-HST catalogue in the bare field of view, 74 by 113 arcsec
+    # the counts of the 3D-HST catalog in the bare field of view, 74 by 113 arcsec
     east = (catalog["sky"].ra - center.ra) * np.cos(center.dec)
     north = catalog["sky"].dec - center.dec
     field = (abs(east) < 37 * u.arcsec) & (abs(north) < 56.5 * u.arcsec)
@@ -148,9 +148,9 @@ def test_bundled_catalogue():
     fluxes = [name for name in catalog.colnames if name.startswith("nircam.")]
     assert len(fluxes) == 22
     for name in fluxes:
-        colour = -2.5 * np.log10(catalog[name] / catalog["wfc3.f160w"]).value
-        good = np.isfinite(colour)
-        assert np.all(np.abs(colour[good]) < 5)
+        color = -2.5 * np.log10(catalog[name] / catalog["wfc3.f160w"]).value
+        good = np.isfinite(color)
+        assert np.all(np.abs(color[good]) < 5)
         assert np.all((catalog["quality"][~good] & 3) != 0)
     sersic = catalog["profile"] == "sersic"
     assert np.all(catalog["mag_f160w"][sersic].value <= 24.5)

@@ -51,7 +51,7 @@ def gaussian_stamp(sigma_x, sigma_y, scale, n=81, **options):
 def test_light_is_kept_to_1e6_and_the_place_to_a_hundredth_of_a_pixel(psf, scale, x, y):
     wcs = tools.tan_wcs(pa=25.0)
     stamp = gaussian_stamp(0.35, 0.35, scale, n=4 * round(1.5 / scale) + 1)
-    # the catalogue's flux, whatever the stamp's own unit
+    # the catalog's flux, whatever the stamp's own unit
     stamp = Cutout(17.0 * stamp.data, pixel_scale=stamp.pixel_scale)
     scene = Scene(one(wcs, x, y), filter=FILTER, wcs=wcs, psf=psf, cutouts={1: stamp})
     image = light(scene)

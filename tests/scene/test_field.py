@@ -47,7 +47,7 @@ def test_points_are_what_photutils_evaluates(wcs, grid):
 
 
 def test_galaxies_widen_by_the_local_psf(wcs, grid):
-    """Variances add: the galaxy's and the mixture's of the PSFs at its centre."""
+    """Variances add: the galaxy's and the mixture's of the PSFs at its center."""
     catalog = tools.make_catalog(
         wcs, 60.0, 30.0, profile="sersic", radius=0.4, index=0.5, ratio=1.0
     )

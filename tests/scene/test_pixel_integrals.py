@@ -45,7 +45,7 @@ def by_small_cells(n, radius, ratio, x, y, theta, *, size, sigma, fine=16, pad=9
     """
     Closed-form light of small cells (tested by quadrature on their own), times a Gaussian.
 
-    The centre must be in the middle of a cell, where a cusp's light is as well. A cell's own
+    The center must be in the middle of a cell, where a cusp's light is as well. A cell's own
     width, and the sum over points in place of the pixel's integral, change the variance by the
     same small amount with opposite signs.
     """
@@ -72,7 +72,7 @@ def check(galaxy, *, size, sigma=1.0):
     list(itertools.product([0.3, 1.0, 4.0, 8.0], [0.02, 0.5, 5.0], [0.1, 1.0]))
     + [(2.0, 1.0, 0.4), (0.7, 2.0, 0.6), (6.0, 0.2, 0.3)],
 )
-def test_corners_of_the_catalogue(n, arcsec, ratio):
+def test_corners_of_the_catalog(n, arcsec, ratio):
     """Indices, radii and axis ratios at their limits, at a place within the pixel of their own."""
     rng = np.random.default_rng(int(1000 * n + 100 * arcsec + 10 * ratio))
     x, y = on_cells(20 + rng.uniform(-0.5, 0.5, 2), 16)
@@ -90,7 +90,7 @@ def test_any_place_within_the_pixel(x, y):
     ("n", "ratio"), [(0.8, 0.9), (1.0, 0.5), (2.5, 0.3), (4.0, 0.8), (8.0, 0.2)]
 )
 def test_wide_outskirts(n, ratio, theta):
-    """Far from the centre, where only one node in four is worked out: every pixel to 1e-4."""
+    """Far from the center, where only one node in four is worked out: every pixel to 1e-4."""
     galaxy = (n, 40.0, ratio, 20.3, 25.8, theta)
     got = painted(*galaxy, size=150, sigma=1.0)
     want = by_small_cells(*galaxy, size=150, sigma=1.0, fine=4)

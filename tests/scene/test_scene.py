@@ -92,7 +92,7 @@ def test_position_angles_land_right(psf, pa, parity):
 def test_distorted_positions_shapes_and_fluxes(psf):
     wcs = tools.tan_wcs(pa=20.0)
     a, b = np.zeros((3, 3)), np.zeros((3, 3))
-    a[2, 0], b[1, 1] = 1.5e-3, -8e-4  # 0.15 px per px at 50 px from the centre
+    a[2, 0], b[1, 1] = 1.5e-3, -8e-4  # 0.15 px per px at 50 px from the center
     wcs.wcs.ctype = ["RA---TAN-SIP", "DEC--TAN-SIP"]
     wcs.sip = Sip(a, b, None, None, wcs.wcs.crpix)
     wcs.wcs.set()
@@ -221,8 +221,8 @@ def test_the_same_on_any_number_of_threads(wcs, psf):
         wcs, [30.0, 60.0], [40.0, 50.0], profile="sersic", radius=0.5, index=4.0, ratio=0.4
     )
 
-    def light(workers):
-        return Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, workers=workers).render().data
+    def light(n_threads):
+        return Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, n_threads=n_threads).render().data
 
     alone = light(1)
     np.testing.assert_array_equal(light(3), alone)
@@ -274,14 +274,16 @@ def test_refuses(wcs, psf):
     with pytest.raises(u.UnitsError, match=r"'miri\.f770w' must be convertible to uJy, got mag"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=psf)
     catalog = tools.make_catalog(wcs, 50, 45)
-    with pytest.raises(ValueError, match="'workers' must be an integer of at least 1, got 0"):
-        Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, workers=0)
-    with pytest.raises(ValueError, match=r"'workers' must be an integer of at least 1, got 1\.5"):
-        Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, workers=1.5)
+    with pytest.raises(ValueError, match="'n_threads' must be at least 1 and an integer, got 0"):
+        Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, n_threads=0)
+    with pytest.raises(
+        ValueError, match=r"'n_threads' must be at least 1 and an integer, got 1\.5"
+    ):
+        Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, n_threads=1.5)
     with pytest.raises(ValueError, match=r"'max_radius' must be positive, got -1\.0 arcsec"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, max_radius=-1 * u.arcsec)
     even = ImagePSF(np.ones((8, 8)), oversampling=4)
-    with pytest.raises(ValueError, match="'psf' must be centred on a node"):
+    with pytest.raises(ValueError, match="'psf' must be centered on a node"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=even)
 
 

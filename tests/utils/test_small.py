@@ -12,7 +12,7 @@ import miricigale
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.meta import provenance
 from miricigale.utils.optional import require
-from miricigale.utils.parallel import chunks, parallel_map, single_threaded, thread_count
+from miricigale.utils.parallel import chunks, parallel_map, single_threaded, thread_count, threads
 from miricigale.utils.progress import progress
 
 
@@ -45,6 +45,15 @@ def test_number_of_threads():
     for wrong in (0, -1, 1.5):
         with pytest.raises(ValueError, match="'n_threads' must be at least 1 and an integer"):
             thread_count(wrong)
+
+
+def test_one_thread_is_no_executor():
+    with threads(1) as executor:
+        assert executor is None
+    with threads(3) as executor:
+        assert parallel_map(math.sqrt, range(20), executor=executor) == list(
+            map(math.sqrt, range(20))
+        )
 
 
 def test_parallel_map_gives_the_same_answer_in_order():

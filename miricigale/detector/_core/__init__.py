@@ -4,7 +4,7 @@ Numerical core of the detector: random numbers and what happens to charge, on ar
 Every kernel that draws gives each detector row (of each integration) its own
 xoshiro256++ stream, seeded from four key words, the integration and the row. What a row
 gets depends on nothing else, so blocks of any height on any number of threads give the
-same numbers, and a kernel may draw a neighbouring row again where it needs it.
+same numbers, and a kernel may draw a neighboring row again where it needs it.
 
 All kernels release the interpreter lock. Ramps have shape (n_int, n_group, n_row, n_col),
 float32; ``first_row`` is the detector row of the block's first row.
@@ -14,7 +14,7 @@ from miricigale.detector._core.charge import (
     add_cosmic_rays,
     add_latent,
     add_poisson,
-    couple_neighbours,
+    couple_neighbors,
 )
 from miricigale.detector._core.random import standard_normals
 from miricigale.detector._core.readout import (
@@ -33,7 +33,7 @@ __all__ = [
     "add_pink_noise",
     "add_poisson",
     "clip_well",
-    "couple_neighbours",
+    "couple_neighbors",
     "digitize",
     "interpolate_response",
     "pull_last_group",

@@ -20,7 +20,7 @@ from miricigale.detector._core.random import (
 )
 from miricigale.utils.compilation import njit
 
-__all__ = ["add_cosmic_rays", "add_latent", "add_poisson", "couple_neighbours"]
+__all__ = ["add_cosmic_rays", "add_latent", "add_poisson", "couple_neighbors"]
 
 #: Greatest mean for which a draw is done; beyond it a pixel is saturated a thousandfold.
 _MEAN_MAX = 1e9
@@ -202,7 +202,7 @@ def add_cosmic_rays(
     track_max : float
         Longest track in pixels.
     leakage : float
-        Share of a pixel's deposit that goes to each of its four neighbours.
+        Share of a pixel's deposit that goes to each of its four neighbors.
     shower_fraction, shower_charge, shower_sigma : float
         Share of hits that make a shower, its charge (electrons) and Gaussian width
         (pixels).
@@ -283,11 +283,11 @@ def add_cosmic_rays(
 
 
 @njit(cache=True, nogil=True)
-def couple_neighbours(ramp, kernel):
+def couple_neighbors(ramp, kernel):
     """
-    Replace each pixel by the sum of its 3 x 3 neighbours, weighted by a kernel.
+    Replace each pixel by the sum of its 3 x 3 neighbors, weighted by a kernel.
 
-    At an edge the missing neighbour is the pixel nearest to it, so that a symmetric
+    At an edge the missing neighbor is the pixel nearest to it, so that a symmetric
     kernel of sum 1 keeps a uniform field.
 
     Parameters

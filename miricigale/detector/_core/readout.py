@@ -39,7 +39,7 @@ def clip_well(ramp, well, group_dq, flag):
     for i in range(n_int):
         for g in range(n_group):
             for r in range(n_row):
-                # most rows hold no such pixel: a quick look first, which vectorises
+                # most rows hold no such pixel: a quick look first, which vectorizes
                 highest = np.float32(0.0)
                 for x in range(n_col):
                     highest = max(highest, ramp[i, g, r, x])

@@ -56,7 +56,7 @@ class Dark(Effect):
 @dataclasses.dataclass(frozen=True)
 class InterpixelCapacitance(Effect):
     """
-    Coupling of a pixel's voltage to its eight neighbours.
+    Coupling of a pixel's voltage to its eight neighbors.
 
     Left out where the image's ``psf_includes`` holds ``"ipc"``.
     """
@@ -65,14 +65,14 @@ class InterpixelCapacitance(Effect):
     included_as = "ipc"
 
     def apply(self, array, block):
-        """Couple the accumulated charge of neighbours."""
+        """Couple the accumulated charge of neighbors."""
         ramp = check_ramp(array, block, self)
         kernel = np.asarray(block.properties.ipc_kernel, np.float32)
-        _core.couple_neighbours(ramp, kernel)
+        _core.couple_neighbors(ramp, kernel)
         return ramp
 
     def expected(self, array, block):
-        """Couple the rates of neighbours."""
+        """Couple the rates of neighbors."""
         kernel = np.asarray(block.properties.ipc_kernel)
         return ndimage.correlate(array, kernel, mode="nearest")
 
@@ -87,7 +87,7 @@ class CosmicRays(Effect):
     sets charge free in proportion to its length in the layer. The charge per length is
     log-normal. With the defaults half of the hits leave more than 5000 electrons, 1 % more
     than 10^5. Of each pixel's charge the share ``leakage`` goes to each of its four
-    neighbours (this stands in for `InterpixelCapacitance`, which acts before).
+    neighbors (this stands in for `InterpixelCapacitance`, which acts before).
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class CosmicRays(Effect):
     track_max : float, optional
         Longest track in pixels; longer ones are cut there.
     leakage : float, optional
-        Share of the charge that goes to each of the four neighbours.
+        Share of the charge that goes to each of the four neighbors.
     shower_fraction : float, optional
         Share of hits that come with a shower, a faint Gaussian cloud; 0 for none.
     shower_charge : float, optional

@@ -138,7 +138,7 @@ class LastFrame(Effect):
     offset : float, optional
         In DN, of every pixel but those of the first pair; of our own.
     coupling : float, optional
-        Share of the neighbouring pair's signal that is lost; of our own.
+        Share of the neighboring pair's signal that is lost; of our own.
     """
 
     offset: float = -10.0

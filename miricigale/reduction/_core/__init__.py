@@ -1,5 +1,5 @@
 """
-Ramp fitting kernels: exact generalised least squares on group differences, with jumps.
+Ramp fitting kernels: exact generalized least squares on group differences, with jumps.
 
 Arrays only. Differences of consecutive groups of one segment (no jump inside) have the
 covariance C = v I + s T, with v the Poisson variance of a difference, s the variance of a

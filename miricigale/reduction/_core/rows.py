@@ -7,7 +7,7 @@ from miricigale.utils.compilation import njit
 
 __all__ = ["BLOCK", "fit_rows"]
 
-#: Pixels that are worked on together (inner, vectorised loop).
+#: Pixels that are worked on together (inner, vectorized loop).
 BLOCK = 64
 
 
@@ -41,7 +41,7 @@ def fit_rows(
     data : `~numpy.ndarray`, shape (n_int, n_group, ny, nx)
         Groups in DN, as read.
     offset : `~numpy.ndarray` of float64, shape (n_int, n_group)
-        Subtracted before linearisation (bias and common drift).
+        Subtracted before linearization (bias and common drift).
     coef : `~numpy.ndarray` of float64
         Linearity polynomial, ascending.
     saturation : float

@@ -91,7 +91,7 @@ def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, tell=N
         wcs=exposure.wcs,
         psf=psf.miri_psf(exposure.filter),
         background=background,
-        workers=n_threads,
+        n_threads=n_threads,
     )
     imager = detector.Detector.miri_imager()
     if config.detector.residual:
