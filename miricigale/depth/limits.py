@@ -1,5 +1,7 @@
 """How faint a point source an exposure reaches through an aperture: the closed form."""
 
+import inspect
+
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
@@ -91,23 +93,7 @@ def _extraction(radius, annulus, psf, correlation, filter):
     return np.mean(values, axis=0)
 
 
-def sensitivity(
-    filter,
-    time=1e4 * u.s,
-    *,
-    n_sigma=10.0,
-    aperture=None,
-    annulus=None,
-    background=None,
-    residual=None,
-    correlation=1.0,
-    n_dithers=1,
-    n_groups=None,
-    readout="FASTR1",
-    subarray="FULL",
-    psf=None,
-    detector=None,
-):
+def sensitivity(filter, time=1e4 * u.s, **options):
     """
     Flux of the point source that an exposure measures with a given significance.
 
@@ -175,23 +161,7 @@ def sensitivity(
     >>> print(f"{sensitivity('miri.f1000w', 1665 * u.s, n_sigma=5, residual='etc', n_dithers=3):.2f}")
     0.41 uJy
     """
-    values = aperture_noise(
-        filter,
-        time,
-        n_sigma=n_sigma,
-        aperture=aperture,
-        annulus=annulus,
-        background=background,
-        residual=residual,
-        correlation=correlation,
-        n_dithers=n_dithers,
-        n_groups=n_groups,
-        readout=readout,
-        subarray=subarray,
-        psf=psf,
-        detector=detector,
-    )
-    return values["flux"] * u.uJy
+    return aperture_noise(filter, time, **options)["flux"] * u.uJy
 
 
 def aperture_noise(
@@ -279,6 +249,9 @@ def aperture_noise(
         "pattern": float(sky * np.sqrt(pattern / n_dithers) / electrons),
         "shot": float(growth * shot / electrons),
     }
+
+
+sensitivity.__signature__ = inspect.signature(aperture_noise)
 
 
 def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=10.0, **options):

@@ -284,12 +284,12 @@ class Detector:
         path = Path(path)
         task = self._task(image, exposure, seed, previous)
         pixel_dq = np.zeros(task.shape[2:], np.uint32)
-        with level1b.row_writer(path, exposure, start=start, overwrite=overwrite) as parts:
-            writer, finish = parts
+        options = {"start": start, "overwrite": overwrite}
+        with level1b.row_writer(path, exposure, **options) as (write_rows, finish):
 
             def store(rows, counts, pixel_flags, group_flags):
                 # level 1b holds no flags of groups
-                writer.write(rows, counts)
+                write_rows(rows, counts)
                 pixel_dq[rows] = pixel_flags
 
             self._run(task, store, n_threads, progress_bar)

@@ -1,6 +1,8 @@
 """The image that is exposed: its light, checked against the exposure."""
 
+import astropy.units as u
 import numpy as np
+from astropy.nddata import NDData
 from astropy.wcs import WCS
 from astropy.wcs.utils import proj_plane_pixel_area
 
@@ -42,25 +44,24 @@ def checked_light(image, exposure):
     """
     if not isinstance(exposure, Exposure):
         raise argument_error("exposure", "an Exposure", type(exposure).__name__)
-    if getattr(image, "unit", None) is None:
+    if isinstance(image, u.Quantity):
+        image = NDData(image)
+    if not isinstance(image, NDData) or image.unit is None:
         msg = f"'image' must be a CCDData in {SURFACE_BRIGHTNESS}, got {type(image).__name__}"
         raise TypeError(msg)
-    masked = np.count_nonzero(getattr(image, "mask", None))
+    masked = np.count_nonzero(image.mask)
     if masked:
         wanted = "without masked pixels, as each of them collects light"
         raise argument_error("image", wanted, f"{masked} of them")
-    data = getattr(image, "data", None) if not hasattr(image, "to_value") else image.value
-    if np.shape(data) != tuple(exposure.shape):
-        raise argument_error(
-            "image", f"of the exposure's shape {tuple(exposure.shape)}", np.shape(data)
-        )
+    if image.data.shape != exposure.shape:
+        raise argument_error("image", f"of the exposure's shape {exposure.shape}", image.data.shape)
     facts = ImageFacts.of(image)
     if facts.band not in (None, exposure.filter[5:]):
         raise argument_error(
             "image", f"one of the filter {exposure.filter}", f"one of {facts.filter}"
         )
     _check_place(image, exposure)
-    light = to_array(data * image.unit, SURFACE_BRIGHTNESS, "image", ndim=2, finite=True)
+    light = to_array(image.data * image.unit, SURFACE_BRIGHTNESS, "image", ndim=2, finite=True)
     lowest = light.min()
     # an FFT leaves noise of this size around bright sources
     if lowest < -1e-6 * np.abs(light).max():
@@ -70,7 +71,7 @@ def checked_light(image, exposure):
 
 def _check_place(image, exposure):
     """An image with a WCS must lie where the exposure points: each dither has its own."""
-    wcs = getattr(image, "wcs", None)
+    wcs = image.wcs
     if not isinstance(wcs, WCS) or not wcs.has_celestial:
         return
     ny, nx = exposure.shape

@@ -25,7 +25,7 @@ from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits
 from miricigale.utils.store import plain_value, replacing
 
-__all__ = ["RowWriter", "header", "read", "row_writer", "write"]
+__all__ = ["header", "read", "row_writer", "write"]
 
 _ASDF = (
     b"#ASDF 1.0.0\n#ASDF_STANDARD 1.6.0\n%YAML 1.1\n%TAG ! tag:stsci.edu:asdf/\n"
@@ -197,29 +197,71 @@ def write(path, ramp, *, start=None, filename=None, overwrite=False):
     ValueError
         If the data are not counts (uint16).
     """
-    path, data = Path(path), ramp.data
-    if data.dtype != np.uint16:
-        raise argument_error("data", "counts (uint16) to be written", data.dtype)
-    with _begun(path, ramp.exposure, start, overwrite, filename) as (partial, science):
-        with fits.StreamingHDU(str(partial), science) as stream:
-            for part in _chunks(data.reshape(-1)):
-                # BZERO 32768: the top bit is turned
-                stream.write((part ^ np.uint16(0x8000)).view(np.int16))
-        _append(partial, ramp.pixel_dq, ramp.effects, ramp.meta)
-    return path
+    if ramp.data.dtype != np.uint16:
+        raise argument_error("data", "counts (uint16) to be written", ramp.data.dtype)
+    options = {"start": start, "filename": filename, "overwrite": overwrite}
+    with row_writer(path, ramp.exposure, **options) as (write_rows, finish):
+        write_rows(slice(0, ramp.shape[2]), ramp.data)
+        finish(ramp.pixel_dq, ramp.effects, ramp.meta)
+    return Path(path)
 
 
 @contextlib.contextmanager
-def _begun(path, exposure, start, overwrite, filename=None):
-    """Give an unfinished file with its primary header, and the header of SCI."""
+def row_writer(path, exposure, *, start=None, filename=None, overwrite=False):
+    """
+    Write a level-1b file block by block.
+
+    Parameters
+    ----------
+    path : path-like
+        The file; it appears under its name only when the context ends without an error.
+    exposure : `~miricigale.instrument.Exposure`
+        What is exposed.
+    start, filename, overwrite : optional
+        As for `write`.
+
+    Yields
+    ------
+    write_rows : callable
+        Takes a slice of detector rows and their counts (uint16, shape (n_int, n_group, n_row,
+        nx)), in any order and from any thread.
+    finish : callable
+        To be called last, with the pixel_dq, effects and meta of a `~miricigale.detector.Ramp`.
+
+    Raises
+    ------
+    OSError
+        If the file exists and ``overwrite`` is False.
+    """
+    path = Path(path)
     primary, science = header(exposure, filename=filename or path.name, start=start)
     shape = (exposure.n_integrations, exposure.n_groups, *exposure.shape)
     axes = [("NAXIS", len(shape))] + [(f"NAXIS{i + 1}", n) for i, n in enumerate(shape[::-1])]
     structure = [("XTENSION", "IMAGE"), ("BITPIX", 16), *axes, ("PCOUNT", 0), ("GCOUNT", 1)]
     scaling = [("EXTNAME", "SCI"), ("BZERO", 32768), ("BSCALE", 1)]
+    science = fits.Header(structure + scaling) + science
+    lock = threading.Lock()
     with replacing(path, overwrite=overwrite) as partial:
         fits.PrimaryHDU(header=primary).writeto(partial)
-        yield partial, fits.Header(structure + scaling) + science
+        with open(partial, "r+b", buffering=0) as handle:
+            handle.seek(0, os.SEEK_END)
+            handle.write(science.tostring().encode("ascii"))
+            begin = handle.tell()
+            # FITS files are made of blocks of 2880 bytes
+            handle.truncate(begin + -(-2 * int(np.prod(shape)) // 2880) * 2880)
+
+            def write_rows(rows, counts):
+                _, n_group, ny, nx = shape
+                for i, g in np.ndindex(*shape[:2]):
+                    # BZERO 32768: the top bit is turned
+                    stored = (counts[i, g] ^ np.uint16(0x8000)).astype(">u2")
+                    with lock:
+                        handle.seek(begin + 2 * nx * ((i * n_group + g) * ny + rows.start))
+                        if handle.write(stored.data) != stored.nbytes:
+                            msg = f"{path} could not be written: is the disk full?"
+                            raise OSError(msg)
+
+            yield write_rows, functools.partial(_append, partial)
 
 
 def _append(partial, pixel_dq, effects, meta):
@@ -230,93 +272,10 @@ def _append(partial, pixel_dq, effects, meta):
     text = json.dumps(meta, default=plain_value).encode()
     with fits.open(partial, mode="append") as hdus:
         hdus.append(fits.ImageHDU(np.asarray(pixel_dq), name="SIM_PIXELDQ"))
-        hdus.append(_bytes_table(text, "JSON", "SIM_META"))
+        if meta:
+            hdus.append(_bytes_table(text, "JSON", "SIM_META"))
         # the pipeline looks for it last
         hdus.append(_bytes_table(_ASDF, "ASDF_METADATA", "ASDF"))
-
-
-class RowWriter:
-    """
-    Counts of a level-1b file, taken in blocks of rows and in any order.
-
-    Made by `row_writer`. Threads may share one.
-
-    Parameters
-    ----------
-    handle : file
-        Opened for writing without a buffer.
-    start : int
-        Where the counts begin.
-    shape : tuple of int
-        (n_int, n_group, ny, nx).
-    """
-
-    def __init__(self, handle, start, shape):
-        self._handle, self._start, self._shape = handle, start, shape
-        self._lock = threading.Lock()
-
-    def write(self, rows, counts):
-        """
-        Write the counts of some rows.
-
-        Parameters
-        ----------
-        rows : slice
-            Detector rows, start and stop given.
-        counts : `~numpy.ndarray` of uint16, shape (n_int, n_group, n_row, nx)
-            All groups of them.
-        """
-        n_int, n_group, ny, nx = self._shape
-        # BZERO 32768: the top bit is turned
-        stored = (counts ^ np.uint16(0x8000)).view(np.int16).astype(">i2")
-        with self._lock:
-            for i, g in np.ndindex(n_int, n_group):
-                row = (i * n_group + g) * ny + rows.start
-                self._handle.seek(self._start + 2 * nx * row)
-                if self._handle.write(stored[i, g].data) != stored[i, g].nbytes:
-                    msg = f"{self._handle.name} could not be written: is the disk full?"
-                    raise OSError(msg)
-
-
-@contextlib.contextmanager
-def row_writer(path, exposure, *, start=None, overwrite=False):
-    """
-    Write a level-1b file block by block.
-
-    Parameters
-    ----------
-    path : path-like
-        The file; it appears under its name only when the context ends without an error.
-    exposure : `~miricigale.instrument.Exposure`
-        What is exposed.
-    start : `~astropy.time.Time`, optional
-        See `header`.
-    overwrite : bool, optional
-        Whether an existing file is replaced.
-
-    Yields
-    ------
-    writer : `RowWriter`
-    finish : callable
-        To be called last, with the pixel_dq, effects and meta of a `~miricigale.detector.Ramp`.
-
-    Raises
-    ------
-    OSError
-        If the file exists and ``overwrite`` is False.
-    """
-    path = Path(path)
-    shape = (exposure.n_integrations, exposure.n_groups, *exposure.shape)
-    with (
-        _begun(path, exposure, start, overwrite) as (partial, science),
-        open(partial, "r+b", buffering=0) as handle,
-    ):
-        handle.seek(0, os.SEEK_END)
-        handle.write(science.tostring().encode("ascii"))
-        begin = handle.tell()
-        # FITS files are made of blocks of 2880 bytes
-        handle.truncate(begin + -(-2 * int(np.prod(shape)) // 2880) * 2880)
-        yield RowWriter(handle, begin, shape), functools.partial(_append, partial)
 
 
 def _chunks(flat):

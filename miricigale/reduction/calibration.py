@@ -214,8 +214,7 @@ def calibrate(
         outside &= (plain_flags(rate) & DQ.REFERENCE_PIXEL) == 0
         out = flag_pixels(out, outside, DQ.NON_SCIENCE | DQ.DO_NOT_USE)
     if cosmic_rays is not None:
-        fwhm = psf_fwhm(filter)
-        fwhm = float(getattr(fwhm, "value", fwhm)) / _PIXEL_SCALE
+        fwhm = psf_fwhm(filter).value / _PIXEL_SCALE
         hits = find_cosmic_rays(out, fwhm=fwhm, **cosmic_rays)
         out = flag_pixels(out, hits, DQ.COSMIC_RAY | DQ.DO_NOT_USE)
         out.meta["n_cosmic_rays"] = int(np.count_nonzero(hits))

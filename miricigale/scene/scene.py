@@ -5,7 +5,7 @@ import functools
 import astropy.units as u
 import numpy as np
 from astropy.nddata import CCDData
-from astropy.table import QTable
+from astropy.table import QTable, Table
 from astropy.wcs import WCS
 from photutils.psf import GriddedPSFModel
 
@@ -104,8 +104,7 @@ class Scene:
         cutouts=None,
         agn=None,
     ):
-        if not isinstance(catalog, QTable):
-            catalog = read_catalog(catalog) if not hasattr(catalog, "colnames") else catalog
+        catalog = catalog if isinstance(catalog, Table) else read_catalog(catalog)
         self._filter = filter if isinstance(filter, str) else filter.name
         self._catalog = check_catalog(catalog, filters=[self._filter])
         if not isinstance(wcs, WCS):
@@ -198,7 +197,7 @@ class Scene:
     def _check_background(background):
         if background is None or isinstance(background, Background):
             return background
-        if not hasattr(background, "unit"):
+        if not isinstance(background, u.Quantity):
             raise argument_error("background", "a Background or a Quantity", repr(background))
         level = to_array(background, SURFACE_BRIGHTNESS, "background", ndim=0, finite=True)
         if level < 0:

@@ -13,6 +13,7 @@ __all__ = [
     "Effect",
     "OtherEffect",
     "check_amounts",
+    "check_finite",
     "check_ramp",
     "key_words",
     "stream_key",
@@ -85,6 +86,13 @@ def check_ramp(array, block, effect):
         )
         raise ValueError(msg)
     return array
+
+
+def check_finite(**values):
+    """Check that settings are finite."""
+    for name, value in values.items():
+        if not np.all(np.isfinite(value)):
+            raise argument_error(name, "finite", value)
 
 
 def check_amounts(*, above_zero=False, **values):

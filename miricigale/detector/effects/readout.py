@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from miricigale.detector import _core
-from miricigale.detector.effects.base import Effect, check_amounts, check_ramp
+from miricigale.detector.effects.base import Effect, check_amounts, check_finite, check_ramp
 from miricigale.instrument import DQ
 from miricigale.utils.exceptions import argument_error
 
@@ -61,8 +61,8 @@ class Bias(Effect):
 
     def __post_init__(self):
         check_amounts(reset_noise=self.reset_noise)
-        if self.level is not None and not np.isfinite(self.level):
-            raise argument_error("level", "finite", self.level)
+        if self.level is not None:
+            check_finite(level=self.level)
 
     def apply(self, array, block):
         """Add the level."""

@@ -21,17 +21,11 @@ import dataclasses
 import numpy as np
 
 from miricigale.detector import _core
-from miricigale.detector.effects.base import Effect, check_ramp
+from miricigale.detector.effects.base import Effect, check_finite, check_ramp
 from miricigale.instrument import reference_pixel_mask
 from miricigale.utils.exceptions import argument_error
 
 __all__ = ["FirstFrame", "LastFrame", "ResetAnomaly"]
-
-
-def _check_finite(**values):
-    for name, value in values.items():
-        if not np.all(np.isfinite(value)):
-            raise argument_error(name, "finite", value)
 
 
 def _light_sensitive(block):
@@ -68,7 +62,7 @@ class ResetAnomaly(Effect):
         object.__setattr__(self, "amplitudes", amplitudes)
         if not amplitudes:
             raise argument_error("amplitudes", "at least one amplitude", "none")
-        _check_finite(amplitudes=amplitudes)
+        check_finite(amplitudes=amplitudes)
         if not (np.isfinite(self.groups) and self.groups > 0):
             raise argument_error("groups", "positive", self.groups)
 
@@ -114,7 +108,7 @@ class FirstFrame(Effect):
     offset: float = -15.0
 
     def __post_init__(self):
-        _check_finite(offset=self.offset)
+        check_finite(offset=self.offset)
 
     def apply(self, array, block):
         """Offset the first groups."""
@@ -148,7 +142,7 @@ class LastFrame(Effect):
     halo = 3
 
     def __post_init__(self):
-        _check_finite(offset=self.offset)
+        check_finite(offset=self.offset)
         if not 0 <= self.coupling < 1:
             raise argument_error("coupling", "a share from 0 to 1", self.coupling)
 
