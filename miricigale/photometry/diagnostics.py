@@ -4,8 +4,11 @@ import dataclasses
 
 import numpy as np
 
+from miricigale.photometry import _core
+from miricigale.photometry.errors import noise_correlation
 from miricigale.photometry.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
 from miricigale.photometry.residual_sources import ResidualPeaks, residual_peaks
+from miricigale.utils.parallel import chunks
 
 __all__ = ["Diagnostics", "diagnose", "source_flags"]
 
@@ -39,26 +42,13 @@ class Diagnostics:
 
 
 def diagnose(fit, xy):
-    """
-    Compare a fit with its image.
-
-    Parameters
-    ----------
-    fit : `~miricigale.photometry.template_fit.TemplateFit`
-        The fit.
-    xy : `~numpy.ndarray`, shape (n, 2)
-        Positions of all known sources by the catalogue, NaN for those far outside.
-
-    Returns
-    -------
-    diagnostics : `Diagnostics`
-    """
+    """Compare a `TemplateFit` with its image; ``xy``, (n, 2), are all known sources, NaN far outside."""
     model = fit.model()
     residual = fit.residual(model)
     correlation = None
     if fit.settings.correlated_noise and len(fit.rows):
-        correlation = fit.correlation(residual, model)
-    chi2, left, core = fit.statistics(residual).T
+        correlation = _correlation(fit, residual, model)
+    chi2, left, core = _statistics(fit, residual).T
     with np.errstate(divide="ignore", invalid="ignore"):
         left = left / (fit.total * core)
     out = np.ones(len(chi2), bool)
@@ -84,28 +74,46 @@ def diagnose(fit, xy):
     return Diagnostics(model, residual, correlation, chi2, left, poor, peaks)
 
 
+def _correlation(fit, residual, model):
+    """Measured correlation of the noise, or None where there is too little sky."""
+    usable = fit.arrays.usable
+    free = fit.arrays.new(bool)
+    for part in chunks(len(free), 256):
+        free[part] = np.abs(model[part]) * fit.inverse_sigma[part] < 0.3
+    free &= usable
+    if np.count_nonzero(free) < max(400, 0.02 * np.count_nonzero(usable)):
+        free = usable
+    if np.count_nonzero(free) < 400:
+        return None
+    correlation = noise_correlation(
+        residual, free, weight=fit.inverse_sigma, executor=fit.bank.executor
+    )
+    return correlation if correlation.any() else None
+
+
+def _statistics(fit, residual):
+    """Chi2, light left and light of each template's core (see the kernel), shape (n, 3)."""
+    out = np.full((len(fit.bank.order), 3), np.nan)
+    if not len(fit.rows):
+        return out
+    for block in fit.bank.blocks():
+
+        def measure(part, block=block):
+            start = block.start[part.start : part.stop + 1]
+            rows = slice(block.first + part.start, block.first + part.stop)
+            stamps = (block.values, block.box[part], start)
+            _core.residual_statistics(*stamps, residual, fit.inverse_sigma, out[rows])
+
+        fit.bank.map(measure, block.parts())
+    return out
+
+
 def source_flags(fit, diagnostics, place, flux, blending):
     """
-    Flags that follow from the fit.
+    Flags, (n,), that follow from a fit, and the fraction of each template on usable pixels.
 
-    Parameters
-    ----------
-    fit : `~miricigale.photometry.template_fit.TemplateFit`
-        The fit.
-    diagnostics : `Diagnostics`
-        What `diagnose` says of it.
-    place : int `~numpy.ndarray`, shape (k,)
-        Which source each row of the bank belongs to.
-    flux : `~numpy.ndarray`, shape (n,)
-        Fluxes of all sources, NaN where not measured.
-    blending : `~numpy.ndarray`, shape (k,)
-        Formal error over that of the source alone; NaN where not fitted.
-
-    Returns
-    -------
-    flags : int `~numpy.ndarray`, shape (n,)
-    coverage : `~numpy.ndarray`, shape (n,)
-        Fraction of each template's light on usable pixels.
+    ``place`` is the source of each row of the bank, ``flux`` those of all sources (NaN where not
+    measured), ``blending`` each row's formal error over that of the source alone (NaN where not fitted).
     """
     flags, inside, coverage = np.zeros(len(flux), int), np.zeros(len(flux)), np.zeros(len(flux))
     inside[place[fit.main]] = fit.light[fit.main, 0]

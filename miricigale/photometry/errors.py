@@ -6,6 +6,7 @@ import functools
 import numpy as np
 import scipy.fft
 import scipy.sparse
+from astropy.stats import mad_std
 
 from miricigale.photometry import _core
 from miricigale.photometry.templates import batches
@@ -65,7 +66,7 @@ def noise_correlation(
         some = some * np.ascontiguousarray(weight).reshape(-1)[every]
     some = some[where]
     middle = np.median(some)
-    spread = 1.4826 * np.median(np.abs(some - middle))
+    spread = mad_std(some)
     kept = np.empty(usable.shape, bool)
 
     def clipped(part):
@@ -378,7 +379,7 @@ class LinearFit:
         ):
             object.__setattr__(self, name, value)
 
-    def covariance(self, xy, *, core, halo, noise=None, pattern=None):
+    def covariances(self, xy, fillings, *, core, halo, pattern=None):
         """
         Covariances of sources that overlap, and of the common parameters.
 
@@ -386,39 +387,44 @@ class LinearFit:
         ----------
         xy : `~numpy.ndarray`, shape (n, 2)
             Positions in pixels.
-        core, halo : float
+        fillings : sequence of tuple or None
+            Fillings of the sandwich, each its sparse matrix, border and corner; None for noise
+            that is white with the given sigmas.
+        core, halo, pattern
             See `~miricigale.photometry._core.block_covariance`.
-        noise : tuple, optional
-            The sandwich's filling: its sparse matrix, border and corner. Without it
-            the noise is white with the given sigmas.
-        pattern : sparse array, optional
-            Elements wanted.
 
         Returns
         -------
-        covariance : `~scipy.sparse.csr_array`, shape (n, n)
-        common : `~numpy.ndarray`, shape (g, g)
+        covariances : list of tuple
+            For each filling the covariance of the sources (`~scipy.sparse.csr_array`, shape (n, n))
+            and that of the common parameters, shape (g, g).
         blending : `~numpy.ndarray`, shape (n,)
             Formal error over that of the source alone.
         """
         z, q = self._z, self._q
-        options = {"core": core, "halo": halo, "pattern": pattern}
-        middle, border, corner = (None, None, None) if noise is None else noise
         local, inverse = _core.block_covariance(
-            self.matrix, xy[:, 1], xy[:, 0], middle=middle, **options
-        )
+            self.matrix, xy[:, 1], xy[:, 0], core=core, halo=halo, pattern=pattern,
+            middles=[None if one is None else one[0] for one in fillings],
+        )  # fmt: skip
         inverse = inverse + np.einsum("kg,kg->k", z @ q, z)
         blending = np.sqrt(inverse * self.matrix.diagonal())
+        found = [self._with_common(*both) for both in zip(local, fillings, strict=True)]
+        return found, blending
+
+    def _with_common(self, local, filling):
+        """The sources' covariance with what the common parameters add, and that of those."""
+        z, q = self._z, self._q
         if not len(q):
-            return local, q, blending
-        if noise is None:
-            return _add_low_rank(local, [(z @ q, z)]), q, blending
+            return local, q
+        if filling is None:
+            return _add_low_rank(local, [(z @ q, z)]), q
+        middle, border, corner = filling
         # theta = Q (b_g - Z^T b_s), x = S^-1 b_s - Z theta
         cross = (border - middle @ z) @ q
         common = corner - border.T @ z - z.T @ border + z.T @ (middle @ z)
         common = q @ common @ q
         e = self.solve(cross)
-        return _add_low_rank(local, [(z @ common, z), (-e, z), (-z, e)]), common, blending
+        return _add_low_rank(local, [(z @ common, z), (-e, z), (-z, e)]), common
 
 
 def _add_low_rank(matrix, terms):

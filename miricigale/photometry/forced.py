@@ -1,7 +1,9 @@
 """Forced photometry: all sources of a catalogue fitted at once, with templates."""
 
 import concurrent.futures
+import contextlib
 import dataclasses
+import numbers
 import os
 import warnings
 
@@ -22,8 +24,7 @@ from miricigale.photometry.packaging import CatalogRows, package
 from miricigale.photometry.passes import fit_image
 from miricigale.photometry.sky_noise import warn_of_background
 from miricigale.photometry.sources import SourceTemplates, catalog_sources
-from miricigale.photometry.template_fit import FitSettings
-from miricigale.photometry.templates import FineTemplates, TemplateBank
+from miricigale.photometry.templates import BankSources, FineTemplates, TemplateBank
 from miricigale.psf import KernelField
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.parallel import single_threaded, thread_count
@@ -32,6 +33,7 @@ from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, to_array
 __all__ = ["ForcedPhotometer"]
 
 
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ForcedPhotometer:
     """
     Measure the sources of a catalogue on an image of lower resolution.
@@ -136,35 +138,36 @@ class ForcedPhotometer:
     Fuller 1987, Measurement Error Models (errors in variables).
     """
 
-    def __init__(
-        self,
-        kernel,
-        *,
-        template="auto",
-        min_snr=5.0,
-        wings=True,
-        fit_background=False,
-        background_order=0,
-        max_shift=None,
-        offset_order=None,
-        correlated_noise=True,
-        integrate=False,
-        components=1,
-        second_pass=False,
-        positive=False,
-        radius=None,
-        min_coverage=0.05,
-        max_bytes=1.5e9,
-        size_scatter=0.1,
-        psf_error=None,
-        scratch=None,
-        n_threads=None,
-    ):
+    kernel: object
+    _: dataclasses.KW_ONLY
+    template: str = "auto"
+    min_snr: float = 5.0
+    wings: bool = True
+    fit_background: bool = False
+    background_order: int = 0
+    max_shift: u.Quantity | None = None
+    offset_order: int | None = None
+    correlated_noise: bool = True
+    integrate: bool = False
+    components: int = 1
+    second_pass: bool = False
+    positive: bool = False
+    radius: u.Quantity | None = None
+    min_coverage: float = 0.05
+    max_bytes: float = 1.5e9
+    size_scatter: float | None = 0.1
+    psf_error: float | None = None
+    scratch: object = None
+    n_threads: int | None = None
+
+    def __post_init__(self):
+        template = self.template
         if template not in ("auto", "cutout", "psf", "sersic"):
             raise argument_error("template", "'auto', 'cutout', 'psf' or 'sersic'", repr(template))
-        mean = kernel.mean if isinstance(kernel, KernelField) else kernel
-        self._bare = mean.source is None or mean.target is None
-        if self._bare:
+        mean = self.kernel.mean if isinstance(self.kernel, KernelField) else self.kernel
+        bare = mean.source is None or mean.target is None
+        changed = {"bare": bare, "mean_kernel": mean, "n_threads": thread_count(self.n_threads)}
+        if bare:
             if template not in ("auto", "cutout"):
                 wanted = f"a MatchingKernel with its PSFs for template={template!r}"
                 raise argument_error("kernel", wanted, "one without")
@@ -172,69 +175,47 @@ class ForcedPhotometer:
                 "the kernel has no PSFs: sources are their segments as they are, without wings, and "
                 "those without a segment are not measured"
             )
-            warnings.warn(msg, MiricigaleWarning, stacklevel=2)
-            template, wings = "cutout", False
+            warnings.warn(msg, MiricigaleWarning, stacklevel=3)
             # as far as it reaches, and as wide
             mean = dataclasses.replace(mean, source=mean.array, target=mean.array)
-        _check_order("background_order", background_order, 4)
-        if background_order and not fit_background:
-            raise argument_error("background_order", "0 without 'fit_background'", background_order)
-        if offset_order is not None:
-            _check_order("offset_order", offset_order, 3)
-            if max_shift is None:
+            changed |= {"template": "cutout", "wings": False, "mean_kernel": mean}
+        _check_order("background_order", self.background_order, 4)
+        if self.background_order and not self.fit_background:
+            wanted = "0 without 'fit_background'"
+            raise argument_error("background_order", wanted, self.background_order)
+        if self.offset_order is not None:
+            _check_order("offset_order", self.offset_order, 3)
+            if self.max_shift is None:
                 raise argument_error("max_shift", "given with 'offset_order'", "None")
-        if components not in (1, 2):
-            raise argument_error("components", "1 or 2", repr(components))
-        if not min_snr >= 0:
-            raise argument_error("min_snr", "at least 0", min_snr)
-        if not 0 < min_coverage < 1:
-            raise argument_error("min_coverage", "between 0 and 1", min_coverage)
-        for name, value in (("size_scatter", size_scatter), ("psf_error", psf_error)):
+        if self.components not in (1, 2):
+            raise argument_error("components", "1 or 2", repr(self.components))
+        if not self.min_snr >= 0:
+            raise argument_error("min_snr", "at least 0", self.min_snr)
+        if not 0 < self.min_coverage < 1:
+            raise argument_error("min_coverage", "between 0 and 1", self.min_coverage)
+        for name in ("size_scatter", "psf_error"):
+            value = getattr(self, name)
             if value is not None and not 0 <= value < 1:
                 raise argument_error(name, "from 0 to 1", value)
-        for name, value in (("max_shift", max_shift), ("radius", radius)):
-            if value is not None and not float(to_array(value, ANGLE, name)) > 0:
-                raise argument_error(name, "positive", value)
-        self._given, self._kernel = kernel, mean
-        self._template = template
-        self._min_snr = float(min_snr)
-        self._wings = bool(wings)
-        self._fit_background = bool(fit_background)
-        self._max_shift = None if max_shift is None else u.Quantity(max_shift, ANGLE)
-        self._background_order = int(background_order)
-        self._offset_order = None if offset_order is None else int(offset_order)
-        self._correlated_noise = bool(correlated_noise)
-        self._integrate = bool(integrate)
-        self._components = int(components)
-        self._second_pass = bool(second_pass)
-        self._positive = bool(positive)
-        self._radius = None if radius is None else u.Quantity(radius, ANGLE)
-        self._min_coverage = float(min_coverage)
-        self._max_bytes = float(max_bytes)
-        self._size_scatter = None if size_scatter is None else float(size_scatter)
-        self._psf_error = None if psf_error is None else float(psf_error)
-        if scratch is not None and not os.path.isdir(scratch):
-            raise argument_error("scratch", "a folder that is there", scratch)
-        self._scratch = scratch
-        self._n_threads = thread_count(n_threads)
+        for name in ("max_shift", "radius"):
+            value = getattr(self, name)
+            if value is not None:
+                if not float(to_array(value, ANGLE, name)) > 0:
+                    raise argument_error(name, "positive", value)
+                changed[name] = u.Quantity(value, ANGLE)
+        if self.scratch is not None and not os.path.isdir(self.scratch):
+            raise argument_error("scratch", "a folder that is there", self.scratch)
+        # the kernel that all have in common: the mean, with PSFs in any case
+        for name, value in changed.items():
+            object.__setattr__(self, name, value)
 
     @property
-    def kernel(self):
-        """The matching kernel, or the kernels of several places."""
-        return self._given
-
-    @property
-    def template(self):
-        """What sources look like."""
-        return self._template
-
-    @property
-    def min_snr(self):
-        """Least signal-to-noise of a segment."""
-        return self._min_snr
+    def reach(self):
+        """Half-width in arcsec to which templates are cut, or infinity (float)."""
+        return np.inf if self.radius is None else self.radius.value
 
     def __repr__(self):
-        return f"<ForcedPhotometer template={self._template!r}, {self._given!r}>"
+        return f"<ForcedPhotometer template={self.template!r}, {self.kernel!r}>"
 
     def measure(self, image, highres=None, segmentation=None, catalog=None, *, templates=None):
         """
@@ -275,7 +256,7 @@ class ForcedPhotometer:
             exactly 0 are not masked, or a background that was left in ``image`` or ``highres``
             goes into the fluxes.
         """
-        arrays = fit_arrays(image, "image", self._scratch)
+        arrays = fit_arrays(image, "image", self.scratch)
         given = [one is not None for one in (highres, segmentation, catalog)]
         if templates is None:
             sources = dataclasses.replace(catalog_sources(catalog), sky=catalog["sky"])
@@ -297,12 +278,16 @@ class ForcedPhotometer:
         else:
             templates = templates[place.near]
         self._check_grid(templates)
-        with concurrent.futures.ThreadPoolExecutor(self._n_threads) as pool, single_threaded():
-            executor = pool if self._n_threads > 1 else None
-            filter_name = image.meta.get("filter", image.meta.get("FILTER"))
-            result = self._measure(arrays, sources, place, templates, filter_name, executor)
-        if not self._fit_background:
-            warn_of_background(result, self._kernel)
+        rows, templates = self._rows(sources, place, templates)
+        meta = {"template": templates.meta.get("template", self.template)}
+        name = image.meta.get("filter", image.meta.get("FILTER"))
+        meta |= {} if name is None else {"filter": str(name)}
+        with self._executor() as executor:
+            grid = self._grid(arrays, templates)
+            bank = self._bank(arrays, rows.xy[rows.near], place, templates, executor)
+            result = package(*fit_image(arrays, bank, self, rows, grid), rows, meta)
+        if not self.fit_background:
+            warn_of_background(result, self.mean_kernel)
         return result
 
     def render(self, image, templates, flux):
@@ -336,58 +321,45 @@ class ForcedPhotometer:
         near = templates[place.near]
         self._check_grid(near)
         model = np.zeros(arrays.flux.shape)
-        with concurrent.futures.ThreadPoolExecutor(self._n_threads) as pool, single_threaded():
-            grid = self._grid(arrays, near)
-            bank = self._bank(arrays, place, near, grid, pool if self._n_threads > 1 else None)
+        with self._executor() as executor:
+            bank = self._bank(arrays, place.xy[place.near], place, near, executor)
             values = flux[place.near][bank.order]
             for block in bank.blocks():
                 some = values[block.first : block.last]
                 _core.add_model(model, block.values, block.box, block.start, some)
         return model / arrays.area * SURFACE_BRIGHTNESS
 
+    @contextlib.contextmanager
+    def _executor(self):
+        """Threads to work with, None for one alone; linear algebra keeps to one each."""
+        with concurrent.futures.ThreadPoolExecutor(self.n_threads) as pool, single_threaded():
+            yield pool if self.n_threads > 1 else None
+
     def _grid(self, arrays, templates):
         """The grid on which templates are made."""
         if templates.wcs is not None:
             return templates.wcs
-        scale = self._kernel.pixel_scale.to_value(ANGLE)
+        scale = self.mean_kernel.pixel_scale.to_value(ANGLE)
         return fine_wcs(arrays.wcs, arrays.flux.shape, scale)
 
     def _place(self, arrays, sky):
         """Where the sources are on an image, and which are on or near it."""
         scale, shape = pixel_scale(arrays.wcs), arrays.flux.shape
-        fine_scale = self._kernel.pixel_scale.to_value(ANGLE)
-        margin = (self._kernel.target.shape[0] // 2 + 1) * fine_scale / scale
+        fine_scale = self.mean_kernel.pixel_scale.to_value(ANGLE)
+        margin = (self.mean_kernel.target.shape[0] // 2 + 1) * fine_scale / scale
         xy = sky_pixels(sky, arrays.wcs, shape, margin)
         return _Place(scale, margin, xy, np.flatnonzero(np.isfinite(xy[:, 0])))
 
-    def _measure(self, arrays, sources, place, templates, filter_name, executor):
+    def _rows(self, sources, place, templates):
+        """The catalogue as the fit takes it, and the templates of its sources that are near."""
         n, near = len(sources.id), place.near
         flags, snr, kinds = np.zeros(n, int), np.full(n, np.nan), np.full(n, "none", "U6")
         flags[near], snr[near] = templates.flags, templates.snr
-        if self._bare:
+        if self.bare:
             # there is no PSF for points
             kept = np.flatnonzero(templates.kind != "point")
             near, templates = near[kept], templates[kept]
-            place = dataclasses.replace(place, near=near)
         kinds[near] = templates.kind
-        grid = self._grid(arrays, templates)
-        bank = self._bank(arrays, place, templates, grid, executor)
-        settings = FitSettings(
-            kernel=self._kernel,
-            template=templates.meta.get("template", self._template),
-            fit_background=self._fit_background,
-            background_order=self._background_order,
-            max_shift=self._max_shift,
-            offset_order=self._offset_order,
-            correlated_noise=self._correlated_noise,
-            min_coverage=self._min_coverage,
-            radius=np.inf if self._radius is None else self._radius.value,
-            components=self._components,
-            second_pass=self._second_pass,
-            size_scatter=self._size_scatter,
-            psf_error=self._psf_error,
-            positive=self._positive,
-        )
         rows = CatalogRows(
             id=np.asarray(sources.id),
             sky=sources.sky,
@@ -400,24 +372,23 @@ class ForcedPhotometer:
             reference=sources.flux,
             double=None if sources.components is None else sources.components == 2,
         )
-        fit, diagnostics, new_xy = fit_image(arrays, bank, settings, rows, grid)
-        return package(fit, diagnostics, rows, new_xy, filter_name)
+        return rows, templates
 
-    def _bank(self, arrays, place, templates, grid, executor):
-        """The templates of the sources that are on or near an image."""
-        shape, xy = arrays.flux.shape, place.xy[place.near]
+    def _bank(self, arrays, xy, place, templates, executor):
+        """The templates of sources at some pixels of an image."""
+        shape, grid = arrays.flux.shape, self._grid(arrays, templates)
         fine_xy = np.stack(grid.world_to_pixel(templates.sky), axis=-1).reshape(-1, 2)
         poly = local_maps(xy, np.full(len(xy), place.margin / 2), arrays.wcs, grid)
         sides = None
-        if self._integrate:
+        if self.integrate:
             middle = np.array([[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
             sides = local_maps(middle, [place.margin / 2], arrays.wcs, grid)[0, :, 1:3].T
-        kernels, weigh = [self._kernel], None
-        if isinstance(self._given, KernelField):
-            kernels = self._given.kernels
+        kernels, weigh = [self.mean_kernel], None
+        if isinstance(self.kernel, KernelField):
+            kernels = self.kernel.kernels
 
             def weigh(xy):
-                return self._given.weights(arrays.wcs.pixel_to_world(*xy.T).icrs)
+                return self.kernel.weights(arrays.wcs.pixel_to_world(*xy.T).icrs)
 
         fine = FineTemplates(
             np.stack([one.array for one in kernels]),
@@ -426,13 +397,10 @@ class ForcedPhotometer:
         )
         return TemplateBank(
             fine,
-            templates.drawn(grid, fine_xy),
-            fine_xy,
-            xy,
-            poly,
+            BankSources(templates.drawn(grid, fine_xy), fine_xy, xy, poly),
             shape,
-            radius=np.inf if self._radius is None else self._radius.value / place.scale,
-            max_bytes=self._max_bytes,
+            radius=self.reach / place.scale,
+            max_bytes=self.max_bytes,
             weigh=weigh,
             executor=executor,
         )
@@ -442,27 +410,27 @@ class ForcedPhotometer:
         if highres is None and segmentation is not None:
             raise argument_error("highres", "the image that the segments belong to", "None")
         for name, value in (("highres", highres), ("segmentation", segmentation)):
-            if value is None and self._template == "cutout":
+            if value is None and self.template == "cutout":
                 raise argument_error(name, "given for cutouts", "None")
         if highres is not None:
             if getattr(highres, "wcs", None) is None:
                 image_arrays(highres, "highres")
             self._check_scale("highres", highres.wcs)
-        if self._template in ("psf", "sersic") or segmentation is None:
-            kind = "sersic" if self._template == "sersic" else "psf"
+        if self.template in ("psf", "sersic") or segmentation is None:
+            kind = "sersic" if self.template == "sersic" else "psf"
             grid = None if highres is None else highres.wcs
             found = SourceTemplates.from_catalog(catalog, template=kind, wcs=grid)
-            if self._template != "auto":
+            if self.template != "auto":
                 return found
             flags = np.full(len(found), int(ForcedFlags.NO_SEGMENT))
             return dataclasses.replace(found, flags=flags, meta={**found.meta, "template": "auto"})
         return SourceTemplates.from_images(
-            highres, segmentation, catalog, psf=self._kernel.source, template=self._template,
-            min_snr=self._min_snr, wings=self._wings, n_threads=self._n_threads,
+            highres, segmentation, catalog, psf=self.mean_kernel.source, template=self.template,
+            min_snr=self.min_snr, wings=self.wings, n_threads=self.n_threads,
         )  # fmt: skip
 
     def _check_scale(self, name, wcs):
-        scale = self._kernel.pixel_scale.to_value(ANGLE)
+        scale = self.mean_kernel.pixel_scale.to_value(ANGLE)
         have = pixel_scale(wcs)
         if abs(have / scale - 1) > 0.01:
             wanted = f"on the kernel's pixels of {scale:.4g} arcsec"
@@ -474,7 +442,8 @@ class ForcedPhotometer:
             return
         self._check_scale("templates", templates.wcs)
         if templates.psf is not None:
-            peaks = templates.psf.max(), self._kernel.source.max() / self._kernel.source.sum()
+            source = self.mean_kernel.source
+            peaks = templates.psf.max(), source.max() / source.sum()
             if abs(peaks[0] / peaks[1] - 1) > 0.1:
                 msg = (
                     f"the templates were made with a PSF whose peak holds {peaks[0]:.3g} of the light, the "
@@ -494,5 +463,9 @@ class _Place:
 
 
 def _check_order(name, order, largest):
-    if isinstance(order, bool) or not hasattr(order, "__index__") or not 0 <= order <= largest:
+    if (
+        not isinstance(order, numbers.Integral)
+        or isinstance(order, bool)
+        or not 0 <= order <= largest
+    ):
         raise argument_error(name, f"an integer from 0 to {largest}", repr(order))

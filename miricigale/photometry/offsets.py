@@ -181,7 +181,7 @@ def fit_offsets(arrays, bank, settings, catalog):
                 f"got {np.count_nonzero(good)}: one shift is fitted to all sources instead"
             )
             warnings.warn(msg, MiricigaleWarning, stacklevel=5)
-            return TemplateFit(arrays, bank, dataclasses.replace(settings, offset_order=None))
+            return TemplateFit(arrays, bank, settings, search=True)
         member = fit.bank.order[rows]
         field, used = _robust_field(xy[member], offset, error, good, arrays.flux.shape, order)
         change = field(*xy.T) - moved

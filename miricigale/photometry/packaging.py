@@ -11,6 +11,7 @@ from astropy.table import QTable
 
 from miricigale.photometry.diagnostics import source_flags
 from miricigale.photometry.fields import SmoothField, n_terms
+from miricigale.photometry.fit_errors import fit_covariances
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.nonnegative import nonnegative_fluxes
 from miricigale.photometry.residual_sources import unexplained_neighbours
@@ -54,7 +55,7 @@ class CatalogRows:
     double: np.ndarray | None = None
 
 
-def package(fit, diagnostics, catalog, new_xy, filter_name=None):
+def package(fit, diagnostics, new_xy, catalog, meta):
     """
     Make the result of a fit.
 
@@ -64,12 +65,12 @@ def package(fit, diagnostics, catalog, new_xy, filter_name=None):
         The fit.
     diagnostics : `~miricigale.photometry.diagnostics.Diagnostics`
         What was made of its residual.
+    new_xy : `~numpy.ndarray`, shape (m, 2)
+        Positions of the sources that were added to the catalogue.
     catalog : `CatalogRows`
         The catalogue.
-    new_xy : `~numpy.ndarray`, shape (m, 2)
-        Positions of the sources that were added to it.
-    filter_name : str, optional
-        The image's filter.
+    meta : dict
+        Provenance: the ``template``, and the ``filter`` if that is known.
 
     Returns
     -------
@@ -88,7 +89,7 @@ def package(fit, diagnostics, catalog, new_xy, filter_name=None):
     chi2, left = np.full(n_all, np.nan), np.full(n_all, np.nan)
     joint = scipy.sparse.csr_array((2 * n_all, 2 * n_all))
     if len(fit.rows):
-        found = fit.covariance(diagnostics.correlation)
+        found = fit_covariances(fit, diagnostics.correlation)
         common, blending[fit.rows] = found.common, found.blending
         terms = [
             _by_source(one, place[fit.rows], main[fit.rows], n_all)
@@ -108,7 +109,6 @@ def package(fit, diagnostics, catalog, new_xy, filter_name=None):
     chi2[place[main]] = diagnostics.chi2[main]
     left[place[main]] = diagnostics.residual_fraction[main]
     reference = np.nan_to_num(flux[:n]) if catalog.reference is None else catalog.reference
-    meta = {} if filter_name is None else {"filter": str(filter_name)}
     result = ForcedPhotometryResult(
         id=np.array(catalog.id),
         sky=catalog.sky,
@@ -131,14 +131,13 @@ def package(fit, diagnostics, catalog, new_xy, filter_name=None):
         psf_fwhm=np.sqrt(8 * np.log(2)) * fit.psf_width * fit.scale * ANGLE,
         meta=provenance(
             **meta,
-            template=fit.settings.template,
             pixel_scale=round(fit.scale, 6),
             correlated_noise=diagnostics.correlation is not None,
             measured_noise=fit.arrays.measured_noise,
         ),
         **_components(fit, catalog, joint, place, n_all),
         **_common(fit, common),
-        **_images(fit, diagnostics, meta),
+        **_images(fit, diagnostics, {k: v for k, v in meta.items() if k == "filter"}),
     )
     if fit.settings.positive:
         positive = np.full(n_all, np.nan)

@@ -1,9 +1,6 @@
 """The fits of one image: the catalogue, then with what its residual shows to be lacking."""
 
-import dataclasses
-
 import numpy as np
-from astropy.wcs.utils import pixel_to_pixel
 
 from miricigale.photometry.arrays import local_maps
 from miricigale.photometry.diagnostics import diagnose
@@ -14,9 +11,8 @@ from miricigale.utils.units import ANGLE
 
 __all__ = ["fit_image"]
 
-#: How often positions of new sources are refined, and errors by which the center of a profile differs
-#: from the catalogue's position where it is taken instead.
-_REFINED, _ELSEWHERE = 2, 3.0
+#: How often positions of new sources are refined.
+_REFINED = 2
 
 
 def fit_image(arrays, bank, settings, catalog, grid_wcs):
@@ -29,7 +25,7 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
         The image.
     bank : `~miricigale.photometry.templates.TemplateBank`
         The templates of the sources on or near it.
-    settings : `~miricigale.photometry.template_fit.FitSettings`
+    settings : `~miricigale.photometry.ForcedPhotometer`
         How they are fitted.
     catalog : `~miricigale.photometry.packaging.CatalogRows`
         The catalogue; ``near`` lists the bank's sources.
@@ -119,51 +115,34 @@ class _More:
         self._bank, self.catalog, self._grid_wcs = bank, catalog, grid_wcs
         self._arrays, self._settings, self._scale = first.arrays, first.settings, first.scale
         self._displacement, self._map = first.displacement, first.offset_map
-        if first.shift is None and first.offset_map is None:
-            # one that was not believed is not searched again
-            self._settings = dataclasses.replace(first.settings, max_shift=None, offset_order=None)
+        # one that was not believed is not searched again
+        self._search = first.shift is not None
 
-    def fit(self, double, new_xy, **changes):
+    def fit(self, double, new_xy, search=None):
         """Fit with second components of some of the sources, and new sources after those."""
-        settings = dataclasses.replace(self._settings, **changes)
-        arrays, near = self._arrays, self.catalog.near
+        settings, arrays, near = self._settings, self._arrays, self.catalog.near
         n = len(near)
         host = np.concatenate([np.arange(n), double, n + len(double) + np.arange(len(new_xy))])
-        all_xy = np.concatenate([self.catalog.xy[near], self._centers(double), new_xy])
+        all_xy = np.concatenate([self.catalog.xy[near], self.catalog.xy[near[double]], new_xy])
         xy = all_xy[n:]
-        half = settings.kernel.target.shape[0] // 2 + 1
-        half = half * settings.kernel.pixel_scale.to_value(ANGLE) / self._scale / 2
+        half = settings.mean_kernel.target.shape[0] // 2 + 1
+        half = half * settings.mean_kernel.pixel_scale.to_value(ANGLE) / self._scale / 2
         poly = local_maps(xy, np.full(len(xy), half), arrays.wcs, self._grid_wcs)
-        bank = self._bank.with_points(xy, poly, arrays.flux.shape, settings.radius / self._scale)
+        bank = self._bank.with_points(xy, poly)
         moved = self._displacement(all_xy)
         fit = TemplateFit(
-            arrays, bank, settings, host=host, moved=moved if self._map is not None else moved[0]
-        )
+            arrays, bank, settings, host=host, moved=moved if self._map is not None else moved[0],
+            search=self._search if search is None else search,
+        )  # fmt: skip
         fit.offset_map = self._map
         return fit
-
-    def _centers(self, double):
-        """Positions of sources; the centers of their profiles where those are certainly elsewhere."""
-        xy = self.catalog.xy[self.catalog.near[double]]
-        fitted = self.catalog.fitted[double]
-        rows = np.flatnonzero(np.isfinite(fitted["parameters"]).all(axis=1))
-        if len(rows):
-            center = fitted["parameters"][rows, :2]
-            place = pixel_to_pixel(self._arrays.wcs, self._grid_wcs, *xy[rows].T)
-            offset = center - np.stack(place, axis=1)
-            inverse = np.linalg.pinv(fitted["covariance"][rows, 1:3, 1:3])
-            far = np.einsum("ki,kij,kj->k", offset, inverse, offset) > _ELSEWHERE**2
-            if far.any():
-                found = pixel_to_pixel(self._grid_wcs, self._arrays.wcs, *center[far].T)
-                xy[rows[far]] = np.stack(found, axis=1)
-        return xy
 
     def refined(self, double, new_xy):
         """Positions of new sources after some fits of where they are."""
         first_new = len(self.catalog.near) + len(double)
         new_xy = new_xy.copy()
         for _ in range(_REFINED if len(new_xy) else 0):
-            fit = self.fit(double, new_xy, max_shift=None)
+            fit = self.fit(double, new_xy, search=False)
             rows = fit.rows[fit.bank.order[fit.rows] >= first_new]
             model = fit.model()
             step, error, _ = source_offsets(fit, fit.residual(model), model, rows)

@@ -1,21 +1,13 @@
 """The fit of one image: all templates at once, with what they have in common."""
 
-import dataclasses
 import warnings
 
-import astropy.units as u
 import numpy as np
 import scipy.sparse
-from scipy.signal import oaconvolve
 
 from miricigale.photometry import _core
 from miricigale.photometry.arrays import pixel_scale
-from miricigale.photometry.errors import (
-    LinearFit,
-    noise_correlation,
-    normal_matrix,
-    sandwich_matrix,
-)
+from miricigale.photometry.errors import LinearFit, normal_matrix
 from miricigale.photometry.fields import legendre_terms
 from miricigale.photometry.free_templates import free_templates
 from miricigale.photometry.shapes import not_fitted
@@ -24,91 +16,11 @@ from miricigale.utils.exceptions import MiricigaleWarning
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
 
-__all__ = ["Covariances", "FitSettings", "TemplateFit"]
-
-#: Size of the covariance's blocks and of the margin around them.
-_CORE, _HALO = 18.0 * u.arcsec, 6.0 * u.arcsec
+__all__ = ["TemplateFit", "inner"]
 
 #: Squared cosine between two components from which their sum alone is measured: errors of each are then
 #: ten times that of the sum, and a template that is a few percent wrong says all of the difference.
 _SEPARABLE = 0.99
-
-
-@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class FitSettings:
-    """
-    How an image is fitted; see `~miricigale.photometry.ForcedPhotometer`.
-
-    Attributes
-    ----------
-    kernel : `~miricigale.psf.MatchingKernel`
-        Its target is the image's PSF.
-    template : str
-        What sources look like.
-    fit_background : bool
-        Whether a constant is fitted.
-    max_shift : `~astropy.units.Quantity` or None
-        Largest shift of the image; None for none.
-    offset_order : int or None
-        Order of a map of offsets; None for one shift.
-    background_order : int
-        Order of the background, 0 for a constant.
-    correlated_noise : bool
-        Whether errors are those of the measured correlation of the noise.
-    min_coverage : float
-        Least fraction of a template's light on usable pixels.
-    radius : float
-        Half-width in arcsec to which templates are cut, or infinity.
-    components : int
-        1, or 2 for a point on top of the templates of poor fits.
-    second_pass : bool
-        Whether peaks of the residual are fitted with the sources.
-    size_scatter : float or None
-        Standard deviation of ln size between the bands; None for templates without error.
-    psf_error : float or None
-        Error of a point source's flux by that of the PSF; None for that of the kernel.
-    positive : bool
-        Whether fluxes that are not negative are found too.
-    """
-
-    kernel: object
-    template: str = "auto"
-    fit_background: bool = False
-    max_shift: u.Quantity | None = None
-    offset_order: int | None = None
-    background_order: int = 0
-    correlated_noise: bool = True
-    min_coverage: float = 0.05
-    radius: float = np.inf
-    components: int = 1
-    second_pass: bool = False
-    size_scatter: float | None = None
-    psf_error: float | None = None
-    positive: bool = False
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Covariances:
-    """
-    Errors of the fitted rows.
-
-    Attributes
-    ----------
-    noise, template : sparse array, shape (n, n)
-        By the image's noise, and by what is not known of the templates.
-    psf : `~numpy.ndarray`, shape (n,)
-        Errors by the PSF, which is the same for all.
-    common : `~numpy.ndarray`, shape (g, g)
-        Of the common parameters.
-    blending : `~numpy.ndarray`, shape (n,)
-        Formal error over that of the source alone.
-    """
-
-    noise: object
-    template: object
-    psf: np.ndarray
-    common: np.ndarray
-    blending: np.ndarray
 
 
 class TemplateFit:
@@ -121,13 +33,15 @@ class TemplateFit:
         The image.
     bank : `~miricigale.photometry.templates.TemplateBank`
         The templates of the sources on or near it.
-    settings : `FitSettings`
+    settings : `~miricigale.photometry.ForcedPhotometer`
         How they are fitted.
     host : int `~numpy.ndarray`, shape (n,), optional
         For each source of the bank the one whose component it is: a second component has the
         number of the source on which it stands, all others have their own.
     moved : `~numpy.ndarray`, shape (2,) or (n, 2), optional
         Pixels by which templates are moved; a shift that is fitted is searched from there.
+    search : bool, optional
+        Whether one shift of the image is fitted; if the settings ask for one by default.
 
     Attributes
     ----------
@@ -145,6 +59,8 @@ class TemplateFit:
         Second components that cannot be told from the first.
     pairs : int `~numpy.ndarray`, shape (k, 2)
         Rows of the two components of the sources that have two.
+    power : `~numpy.ndarray`, shape (n,)
+        Sums of squares of the templates.
     light : `~numpy.ndarray`, shape (n, 2)
         Fractions of the templates on the image, and on its usable pixels.
     columns : list of `~numpy.ndarray`
@@ -159,18 +75,20 @@ class TemplateFit:
         The map by which templates are moved.
     """
 
-    def __init__(self, arrays, bank, settings, *, host=None, moved=None):
+    def __init__(self, arrays, bank, settings, *, host=None, moved=None, search=None):
         self.arrays, self.settings = arrays, settings
         self.host = np.arange(len(bank.order)) if host is None else host
         self.scale = pixel_scale(arrays.wcs)
         self.inverse_sigma = arrays.inverse_sigma
-        self._radius = settings.radius / self.scale
+        self._radius = settings.reach / self.scale
         self._background = self._background_columns() if settings.fit_background else []
         self.shift = self.offset_map = self.free = None
         self.bank = bank
         moved = np.zeros(2) if moved is None else moved
-        self._solve(self._moved(bank, moved) if np.any(moved) else bank, [])
-        if settings.max_shift is not None and settings.offset_order is None and len(self.rows):
+        self._solve(bank.shifted(moved) if np.any(moved) else bank, [])
+        if search is None:
+            search = settings.max_shift is not None and settings.offset_order is None
+        if search and len(self.rows):
             self._find_shift(bank, moved)
 
     def _background_columns(self):
@@ -183,9 +101,6 @@ class TemplateFit:
             np.multiply(area, term, out=self.arrays.new(), casting="same_kind") for term in terms
         ]
 
-    def _moved(self, bank, pixels):
-        return bank.shifted(pixels, self.arrays.flux.shape, self._radius)
-
     def _solve(self, bank, gradients):
         """Fit fluxes and common parameters with the templates of a bank."""
         if bank is not self.bank:
@@ -194,7 +109,7 @@ class TemplateFit:
         white = [self.arrays.whitened(column) for column in self.columns]
         data = self.arrays.whitened(self.arrays.flux)
         matrix, projection, power, light = normal_matrix(bank, self.inverse_sigma, [data, *white])
-        self.light, self._power = light / self._full_light(), power
+        self.light, self.power = light / self._full_light(), power
         diagonal = matrix.diagonal()
         rows = (self.light[:, 1] >= self.settings.min_coverage) & (diagonal > 0)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -206,7 +121,7 @@ class TemplateFit:
         self._find_pairs(matrix, rows & ~self.degenerate)
         self.rows = np.flatnonzero(rows & ~self.degenerate & ~self.inseparable)
         matrix = matrix[self.rows][:, self.rows]
-        corner = np.array([[_inner(a, b) for b in white] for a in white])
+        corner = np.array([[inner(a, b) for b in white] for a in white])
         self.fit = None
         if len(self.rows):
             g = len(white)
@@ -215,7 +130,7 @@ class TemplateFit:
                 projection[self.rows, 0],
                 projection[self.rows, 1:],
                 corner.reshape(g, g),
-                np.array([_inner(a, data) for a in white]),
+                np.array([inner(a, data) for a in white]),
             )
         self.flux = np.zeros(len(bank.order))
         if self.fit is not None:
@@ -247,7 +162,9 @@ class TemplateFit:
             self.rows,
             known[self.bank.order[self.rows]],
             TemplateChanges(
-                self.settings.kernel.source, self.settings.kernel.target, self.settings.size_scatter
+                self.settings.mean_kernel.source,
+                self.settings.mean_kernel.target,
+                self.settings.size_scatter,
             ),
             [self.arrays.whitened(one) for one in (self.arrays.flux, *self.columns)],
             self.inverse_sigma,
@@ -272,14 +189,14 @@ class TemplateFit:
 
     def _full_light(self):
         """Light of a whole template, within the radius to which they are cut."""
-        half = self._radius * self.scale / self.settings.kernel.pixel_scale.to_value(ANGLE)
+        half = self._radius * self.scale / self.settings.mean_kernel.pixel_scale.to_value(ANGLE)
         return self.bank.full_light(half)[:, None]
 
     def _find_shift(self, plain, shift):
         limit = self.settings.max_shift.value / self.scale
         for _ in range(8):
             dy, dx = np.gradient(self.model())
-            self._solve(self._moved(plain, shift), [-dx, -dy])
+            self._solve(plain.shifted(shift), [-dx, -dy])
             # the columns are steps from where the templates stand now
             step = self.fit.common[-2:]
             found = shift + step
@@ -319,8 +236,8 @@ class TemplateFit:
     @property
     def psf_width(self):
         """Rms width in pixels of a Gaussian as peaked as the image's PSF."""
-        target = self.settings.kernel.target
-        fine = self.settings.kernel.pixel_scale.to_value(ANGLE)
+        target = self.settings.mean_kernel.target
+        fine = self.settings.mean_kernel.pixel_scale.to_value(ANGLE)
         return np.sqrt(target.sum() / (2 * np.pi * target.max())) * fine / self.scale
 
     @property
@@ -362,127 +279,8 @@ class TemplateFit:
         found *= self.arrays.usable
         return found
 
-    def correlation(self, residual, model):
-        """Measured correlation of the noise, or None where there is too little sky."""
-        usable = self.arrays.usable
-        free = self.arrays.new(bool)
-        for part in chunks(len(free), 256):
-            free[part] = np.abs(model[part]) * self.inverse_sigma[part] < 0.3
-        free &= usable
-        if np.count_nonzero(free) < max(400, 0.02 * np.count_nonzero(usable)):
-            free = usable
-        if np.count_nonzero(free) < 400:
-            return None
-        correlation = noise_correlation(
-            residual, free, weight=self.inverse_sigma, executor=self.bank.executor
-        )
-        return correlation if correlation.any() else None
 
-    def covariance(self, correlation=None):
-        """
-        Covariance of the fitted rows and of the common parameters, and the blending.
-
-        Parameters
-        ----------
-        correlation : `~numpy.ndarray`, optional
-            That of the noise, which is white without.
-
-        Returns
-        -------
-        covariances : `Covariances`
-        """
-        n, g = len(self.rows), len(self.columns)
-        fit, free, xy = self.fit, self.free, self.bank.xy[self.rows]
-        if free is not None:
-            fit, xy = free.fit, np.concatenate([xy, free.xy])
-        noise = None if correlation is None else self._sandwich(correlation)
-        if noise is None and free is not None:
-            noise = (
-                (fit.matrix - scipy.sparse.diags_array(free.prior)).tocsr(),
-                fit.border,
-                fit.corner,
-            )
-        coo = self.fit.matrix.tocoo()
-        pattern = scipy.sparse.coo_array((coo.data, (coo.row, coo.col)), shape=fit.matrix.shape)
-        options = {
-            "core": _CORE.value / self.scale, "halo": _HALO.value / self.scale, "pattern": pattern
-        }  # fmt: skip
-        found, common, blending = fit.covariance(xy, noise=noise, **options)
-        found, blending = found[:n][:, :n], blending[:n]
-        template = scipy.sparse.csr_array((n, n))
-        if free is not None:
-            blending = blending * np.sqrt(free.alone())
-            filling = free.filling(self.fit.matrix)
-            nothing = np.zeros((len(fit.rhs), g)), np.zeros((g, g))
-            template, more, _ = fit.covariance(xy, noise=(filling, *nothing), **options)
-            template, common = template[:n][:, :n], common + more
-        if len(self.pairs):
-            # that of the sum of two components
-            first, second = np.searchsorted(self.rows, self.pairs.T)
-            filling = self.fit.matrix if noise is None else noise[0]
-            alone = np.sqrt(filling.diagonal()[:n]) / self.fit.matrix.diagonal()
-            both = np.array([found[i, j] for i, j in zip(first, second, strict=True)])
-            variance = found.diagonal()
-            blending[first] = np.sqrt(variance[first] + variance[second] + 2 * both) / alone[first]
-            blending[second] = blending[first]
-        return Covariances(found, template, self._psf_errors()[self.rows], common, blending)
-
-    def _psf_errors(self):
-        """Errors of the fluxes of all rows by that of the PSF."""
-        kernel, fraction = self.settings.kernel, self.settings.psf_error
-        if fraction is None:
-            if self.settings.size_scatter is None:
-                return np.zeros(len(self.flux))
-            parts = self.bank.parts(np.arange(len(self.flux)))
-            image = np.array([one is not None and one.kind == "cutout" for one in parts], float)
-            fraction = image * np.max(np.abs(kernel.encircled_energy_error()))
-        point = np.sum(kernel.target**2) * (self.scale / kernel.pixel_scale.to_value(ANGLE)) ** 2
-        return fraction * np.minimum(self._power / point, 1.0) * np.abs(self.flux)
-
-    def _sandwich(self, correlation):
-        keep = self.rows
-        white = [self.arrays.whitened(column) for column in self.columns]
-        spread = [self._spread(image, correlation) for image in white]
-        middle, border = sandwich_matrix(self.bank, self.inverse_sigma, correlation, spread)
-        middle, border = middle[keep][:, keep], border[keep]
-        if self.free is not None:
-            middle, border = self.free.sandwich(
-                self.bank, keep, self.inverse_sigma, correlation, middle, border, spread
-            )
-        corner = np.array([[_inner(a, b) for b in spread] for a in white])
-        return middle, border, corner.reshape(len(white), len(white))
-
-    def _spread(self, image, correlation):
-        """An image convolved with the noise correlation."""
-        kernel, lag = correlation.astype(image.dtype), correlation.shape[0] // 2
-        out = self.arrays.new()
-
-        def convolve(part):
-            rows = slice(max(part.start - lag, 0), part.stop + lag)
-            found = oaconvolve(image[rows], kernel, mode="same")
-            out[part] = found[part.start - rows.start :][: part.stop - part.start]
-
-        self.bank.map(convolve, chunks(len(image), 512))
-        return out
-
-    def statistics(self, residual):
-        """Chi2, light left and light of each template's core (see the kernel), shape (n, 3)."""
-        out = np.full((len(self.bank.order), 3), np.nan)
-        if not len(self.rows):
-            return out
-        for block in self.bank.blocks():
-
-            def measure(part, block=block):
-                start = block.start[part.start : part.stop + 1]
-                rows = slice(block.first + part.start, block.first + part.stop)
-                stamps = (block.values, block.box[part], start)
-                _core.residual_statistics(*stamps, residual, self.inverse_sigma, out[rows])
-
-            self.bank.map(measure, block.parts())
-        return out
-
-
-def _inner(one, other):
+def inner(one, other):
     """Sum of the products of two images, in double precision."""
     return float(np.einsum("ij,ij->", one, other, dtype=float, casting="same_kind"))
 

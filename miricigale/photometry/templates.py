@@ -10,7 +10,7 @@ from miricigale.photometry import _core
 from miricigale.photometry.cutouts import RIM, convolve_padded
 from miricigale.utils.parallel import parallel_map
 
-__all__ = ["Block", "FineTemplates", "TemplateBank", "batches"]
+__all__ = ["BankSources", "Block", "FineTemplates", "TemplateBank", "batches"]
 
 #: Pixels of the stamps that a thread works on at a time.
 _PART = 250_000
@@ -196,6 +196,27 @@ def batches(shapes):
             yield shape, rows[first : first + size]
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class BankSources:
+    """
+    The sources of a bank.
+
+    Attributes
+    ----------
+    cutout : list of `Cutout` or None
+        One for each source; None is a point source.
+    fine_xy, xy : `~numpy.ndarray`, shape (n, 2)
+        Positions on the fine grid and on the image.
+    poly : `~numpy.ndarray`, shape (n, 2, 6)
+        Maps from image to fine pixels (see `~miricigale.photometry.arrays.local_maps`).
+    """
+
+    cutout: list
+    fine_xy: np.ndarray
+    xy: np.ndarray
+    poly: np.ndarray
+
+
 class TemplateBank:
     """
     All templates of an image, made block by block and kept only if there is room.
@@ -207,14 +228,8 @@ class TemplateBank:
     ----------
     fine : `FineTemplates`
         What convolves.
-    cutout : list of `Cutout` or None
-        One for each source; None is a point source.
-    fine_xy : `~numpy.ndarray`, shape (n, 2)
-        Positions on the fine grid.
-    xy : `~numpy.ndarray`, shape (n, 2)
-        Positions on the image.
-    poly : `~numpy.ndarray`, shape (n, 2, 6)
-        Maps from image to fine pixels (see `~miricigale.photometry.arrays.local_maps`).
+    sources : `BankSources`
+        What stands where.
     shape : (int, int)
         Shape of the image.
     radius : float, optional
@@ -229,23 +244,10 @@ class TemplateBank:
     """
 
     def __init__(
-        self,
-        fine,
-        cutout,
-        fine_xy,
-        xy,
-        poly,
-        shape,
-        *,
-        radius=np.inf,
-        max_bytes=1.5e9,
-        weigh=None,
-        executor=None,
+        self, fine, sources, shape, *, radius=np.inf, max_bytes=1.5e9, weigh=None, executor=None
     ):
-        self._fine, self._cutout = fine, cutout
-        self._weigh = weigh
-        self._weights = np.ones((len(cutout), 1)) if weigh is None else weigh(xy)
-        self._fine_xy, self._xy, self._poly = fine_xy, xy, poly
+        self._fine, self._sources, self._weigh = fine, sources, weigh
+        self._weights = np.ones((len(sources.cutout), 1)) if weigh is None else weigh(sources.xy)
         self._shape, self._radius = shape, radius
         self._max_bytes, self.executor = max_bytes, executor
         box = self._boxes(shape, radius)
@@ -256,76 +258,66 @@ class TemplateBank:
 
     def _boxes(self, shape, radius):
         """Boxes on the image that hold the fine stamps, cut to the image."""
-        fine, n = self._fine, len(self._cutout)
+        fine, n = self._fine, len(self._sources.cutout)
         low, high = np.empty((n, 2)), np.empty((n, 2))
         half = fine.target.shape[1] // 2 + 1
-        for k, cutout in enumerate(self._cutout):
+        for k, cutout in enumerate(self._sources.cutout):
             if cutout is None:
-                low[k] = self._fine_xy[k] - half
-                high[k] = self._fine_xy[k] + half
+                low[k] = self._sources.fine_xy[k] - half
+                high[k] = self._sources.fine_xy[k] + half
                 continue
             sides = np.array([fine.sides_of(one) for one in cutout.layers])
             low[k], high[k] = sides[:, 0].min(axis=0), sides[:, 1].max(axis=0)
         # corners of the fine rectangle through the inverse of the linear map
-        matrix = np.linalg.inv(self._poly[:, :, 1:3])
+        matrix = np.linalg.inv(self._sources.poly[:, :, 1:3])
         corners = np.stack(
             [
-                np.stack([a[:, 0], b[:, 1]], axis=-1) - self._poly[:, :, 0]
+                np.stack([a[:, 0], b[:, 1]], axis=-1) - self._sources.poly[:, :, 0]
                 for a in (low, high)
                 for b in (low, high)
             ]
         )
         offset = np.einsum("kij,ckj->cki", matrix, corners)
-        first = np.maximum(offset.min(axis=0), -radius) + self._xy
-        last = np.minimum(offset.max(axis=0), radius) + self._xy
+        first = np.maximum(offset.min(axis=0), -radius) + self._sources.xy
+        last = np.minimum(offset.max(axis=0), radius) + self._sources.xy
         limit = np.array(shape)[::-1]
         first = np.clip(np.floor(first), 0, limit).astype(int)
         last = np.clip(np.ceil(last) + 1, 0, limit).astype(int)
         size = np.maximum(last - first, 0)
         return np.stack([first[:, 1], first[:, 0], size[:, 1], size[:, 0]], axis=1)
 
-    def shifted(self, shift, shape, radius):
+    def _of(self, sources, **changes):
+        """A bank of other sources."""
+        form = {"radius": self._radius, "max_bytes": self._max_bytes, "weigh": self._weigh}
+        form |= {"fine": self._fine, "shape": self._shape, "executor": self.executor}
+        return TemplateBank(sources=sources, **{**form, **changes})
+
+    def shifted(self, shift):
         """Make the bank of the same sources moved by (dx, dy) image pixels."""
-        return TemplateBank(
-            self._fine,
-            self._cutout,
-            self._fine_xy,
-            self._xy + shift,
-            self._poly,
-            shape,
-            radius=radius,
-            max_bytes=self._max_bytes,
-            weigh=self._weigh,
-            executor=self.executor,
-        )
+        return self._of(dataclasses.replace(self._sources, xy=self._sources.xy + shift))
 
-    def with_points(self, xy, poly, shape, radius):
+    def with_points(self, xy, poly):
         """Make the bank of the same sources and, after them, of point sources at positions."""
-        return TemplateBank(
-            self._fine,
-            [*self._cutout, *[None] * len(xy)],
-            np.concatenate([self._fine_xy, poly[:, :, 0]]),
-            np.concatenate([self._xy, xy]),
-            np.concatenate([self._poly, poly]),
-            shape,
-            radius=radius,
-            max_bytes=self._max_bytes,
-            weigh=self._weigh,
-            executor=self.executor,
+        old = self._sources
+        return self._of(
+            BankSources(
+                [*old.cutout, *[None] * len(xy)],
+                np.concatenate([old.fine_xy, poly[:, :, 0]]),
+                np.concatenate([old.xy, xy]),
+                np.concatenate([old.poly, poly]),
+            )
         )
 
-    def at_resolution(self, sources, cutout):
+    def at_resolution(self, rows, cutout):
         """Make the bank of cutouts that have the image's resolution, at some of the sources."""
-        one = np.ones((1, 1))
-        return TemplateBank(
-            dataclasses.replace(self._fine, kernel=one, target=one), cutout,
-            self._fine_xy[sources], self._xy[sources], self._poly[sources], self._shape,
-            radius=self._radius, max_bytes=self._max_bytes, executor=self.executor,
-        )  # fmt: skip
+        one, old = np.ones((1, 1)), self._sources
+        sources = BankSources(cutout, old.fine_xy[rows], old.xy[rows], old.poly[rows])
+        fine = dataclasses.replace(self._fine, kernel=one, target=one)
+        return self._of(sources, fine=fine, weigh=None)
 
     def parts(self, rows):
         """The cutouts of some rows, None for points."""
-        return [self._cutout[k] for k in self.order[rows]]
+        return [self._sources.cutout[k] for k in self.order[rows]]
 
     def forget(self):
         """Free the templates that are kept; they are made anew if they are needed again."""
@@ -338,7 +330,7 @@ class TemplateBank:
     @property
     def xy(self):
         """Positions of the sources on the image, in the order of the rows."""
-        return self._xy[self.order]
+        return self._sources.xy[self.order]
 
     @property
     def n_values(self):
@@ -347,8 +339,8 @@ class TemplateBank:
 
     def noise_terms(self):
         """Sum over unit-weight pixels of the templates' variance, by row."""
-        noise = np.array([0.0 if one is None else one.noise for one in self._cutout])
-        area = np.abs(np.linalg.det(self._poly[:, :, 1:3]))
+        noise = np.array([0.0 if one is None else one.noise for one in self._sources.cutout])
+        area = np.abs(np.linalg.det(self._sources.poly[:, :, 1:3]))
         return (noise * area * self._fine.kernel_power(self._weights))[self.order]
 
     def full_light(self, half):
@@ -380,7 +372,7 @@ class TemplateBank:
         start = self.start[first : last + 1] - self.start[first]
         block = Block(first, self.box[first:last], start, np.zeros(int(start[-1]), np.float32))
         sources = self.order[first:last]
-        cutout = [self._cutout[k] for k in sources]
+        cutout = [self._sources.cutout[k] for k in sources]
         points = np.flatnonzero([one is None for one in cutout])
         layers = [
             (row, one) for row, all_of in enumerate(cutout) if all_of for one in all_of.layers
@@ -390,11 +382,11 @@ class TemplateBank:
         def add(coefficients, which, amplitude, rows, origin):
             # sums of a piece in double precision, where each stamp begins anew
             box = block.box[rows]
-            poly = self._poly[sources[rows]]
+            poly = self._sources.poly[sources[rows]]
             poly[:, :, 0] -= origin
             begin = np.concatenate([[0], np.cumsum(box[:, 2] * box[:, 3])])
             sums = np.zeros(int(begin[-1]))
-            center = self._xy[sources[rows]]
+            center = self._sources.xy[sources[rows]]
             _core.sample_stamps(coefficients, which, amplitude, center, poly, box, begin, sums)
             for k, low, high in zip(rows, begin[:-1], begin[1:], strict=True):
                 block.values[start[k] : start[k + 1]] += sums[low:high]
@@ -405,7 +397,7 @@ class TemplateBank:
                 return
             point, which = fine.points(weights[rows])
             middle = (np.array(point.shape[2:0:-1]) - 1) / 2
-            origin = self._fine_xy[sources[rows]] - middle
+            origin = self._sources.fine_xy[sources[rows]] - middle
             add(point, which, np.ones(len(rows)), rows, origin)
 
         def add_cutouts(batch):

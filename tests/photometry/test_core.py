@@ -185,8 +185,8 @@ def test_sparse_solution_is_the_dense_one():
 def test_covariance_by_blocks_is_that_of_the_dense_inverse(sandwich):
     matrix, y, x = crowded_matrix(n=500)
     middle = crowded_matrix(n=500, seed=0)[0] * 1.7 if sandwich else None
-    found, diagonal = _core.block_covariance(
-        matrix, y, x, core=100.0, halo=80.0, middle=middle, exact=0
+    (found,), diagonal = _core.block_covariance(
+        matrix, y, x, core=100.0, halo=80.0, middles=[middle], exact=0
     )
     inverse = np.linalg.inv(matrix.toarray())
     assert_allclose(diagonal, np.diag(inverse), rtol=1e-4)

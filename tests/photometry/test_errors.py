@@ -160,7 +160,7 @@ def test_errors_are_those_of_the_direct_convolution(tools, monkeypatch, max_byte
         seen.append(np.abs(difference / scale[:, None] / scale).max())
         return expected, projection
 
-    monkeypatch.setattr("miricigale.photometry.template_fit.sandwich_matrix", direct)
+    monkeypatch.setattr("miricigale.photometry.fit_errors.sandwich_matrix", direct)
     truth = photometer.measure(image, catalog=catalog)
     assert seen[0] < 1e-6
     assert_allclose(found.flux.value, truth.flux.value, rtol=1e-12)
@@ -213,11 +213,11 @@ def test_common_parameters_like_dense_least_squares():
     full = scipy.sparse.csr_array(np.ones((6, 6)))
     options = {"core": 10.0, "halo": 10.0, "pattern": full}
     xy = rng.random((6, 2))
-    covariance, common, _ = fit.covariance(xy, **options)
+    [(covariance, common)], _ = fit.covariances(xy, [None], **options)
     assert_allclose(covariance.toarray(), inverse[:6, :6], atol=1e-12)
     assert_allclose(common, inverse[6:, 6:], atol=1e-12)
     filling = (scipy.sparse.csr_array(a.T @ noise @ a), a.T @ noise @ g, g.T @ noise @ g)
-    covariance, common, blending = fit.covariance(xy, noise=filling, **options)
+    [(covariance, common)], blending = fit.covariances(xy, [filling], **options)
     expected = inverse @ design.T @ noise @ design @ inverse
     assert_allclose(covariance.toarray(), expected[:6, :6], atol=1e-12)
     assert_allclose(common, expected[6:, 6:], atol=1e-12)

@@ -224,7 +224,7 @@ def test_galaxies_of_all_indices(tools, index, noise):
 def test_noise_in_the_template_is_taken_off_the_diagonal(tools):
     # noise of known variance in the cutout: expectation of the corrected power is that of the truth
     from miricigale.photometry.cutouts import Cutout
-    from miricigale.photometry.templates import FineTemplates, TemplateBank
+    from miricigale.photometry.templates import BankSources, FineTemplates, TemplateBank
 
     rng = np.random.default_rng(2)
     fine = FineTemplates(tools.kernel.array, tools.kernel.target)
@@ -239,7 +239,8 @@ def test_noise_in_the_template_is_taken_off_the_diagonal(tools):
     poly[:, 0, 1] = poly[:, 1, 2] = 11 / 6
     poly[:, :, 0] = 29.0
     at = np.full((n + 1, 2), 29.0)
-    bank = TemplateBank(fine, parts, at, np.full((n + 1, 2), 40.0), poly, (81, 81))
+    sources = BankSources(parts, at, np.full((n + 1, 2), 40.0), poly)
+    bank = TemplateBank(fine, sources, (81, 81))
     from miricigale.photometry.errors import normal_matrix
 
     matrix, _, power, _ = normal_matrix(bank, np.ones((81, 81)))

@@ -51,7 +51,7 @@ def factorize(matrix):
     return solve
 
 
-def block_covariance(matrix, y, x, *, core, halo, middle=None, pattern=None, exact=1500):
+def block_covariance(matrix, y, x, *, core, halo, middles=(None,), pattern=None, exact=1500):
     """
     Elements of the inverse of a normal matrix, by dense inversion of blocks on the sky.
 
@@ -64,8 +64,8 @@ def block_covariance(matrix, y, x, *, core, halo, middle=None, pattern=None, exa
     core, halo : float
         Size of the blocks and of the margin around each, in pixels. The inverse decays
         exponentially away from a source, so that a margin of several PSF widths suffices.
-    middle : sparse array, shape (n, n), optional
-        If given, elements of H middle H are returned instead of H.
+    middles : sequence of sparse array, shape (n, n), or None, optional
+        For each of them elements of H middle H are returned, for None those of H.
     pattern : sparse array, shape (n, n), optional
         Which elements are wanted (its non-zeros); those of ``matrix`` by default.
     exact : int, optional
@@ -73,8 +73,8 @@ def block_covariance(matrix, y, x, *, core, halo, middle=None, pattern=None, exa
 
     Returns
     -------
-    covariance : `~scipy.sparse.csr_array`, shape (n, n)
-        Symmetric, with the elements of ``pattern``.
+    covariances : list of `~scipy.sparse.csr_array`, shape (n, n)
+        Symmetric, with the elements of ``pattern``; one for each middle.
     inverse_diagonal : `~numpy.ndarray`, shape (n,)
         Diagonal of H.
     """
@@ -82,26 +82,31 @@ def block_covariance(matrix, y, x, *, core, halo, middle=None, pattern=None, exa
     scale = 1.0 / np.sqrt(matrix.diagonal())
     unit = scipy.sparse.diags_array(scale)
     matrix = (unit @ matrix @ unit).tocsr()
-    if middle is not None:
-        # H M H = D (S^-1 (D M D) S^-1) D with S = D H^-1 D
-        middle = (unit @ middle @ unit).tocsr()
+    # H M H = D (S^-1 (D M D) S^-1) D with S = D H^-1 D
+    middles = [None if one is None else (unit @ one @ unit).tocsr() for one in middles]
     pattern = (matrix if pattern is None else pattern).tocsr()
-    rows, columns, values = [], [], []
+    rows, columns, values = [], [], [[] for _ in middles]
     inverse_diagonal = np.empty(n)
     for near, inner in _blocks(n, y, x, core, halo, exact):
         inverse = _dense_inverse(matrix[near][:, near].toarray())
         inverse_diagonal[near[inner]] = np.diag(inverse)[inner]
-        if middle is not None:
-            inverse = inverse @ middle[near][:, near].toarray() @ inverse
         wanted = pattern[near[inner]][:, near].tocoo()
         i = np.flatnonzero(inner)[wanted.row]
         rows.append(near[i])
         columns.append(near[wanted.col])
-        values.append(inverse[i, wanted.col])
+        for middle, found in zip(middles, values, strict=True):
+            block = inverse
+            if middle is not None:
+                block = inverse @ middle[near][:, near].toarray() @ inverse
+            found.append(block[i, wanted.col])
     rows, columns = np.concatenate(rows), np.concatenate(columns)
-    values = np.concatenate(values) * scale[rows] * scale[columns]
-    found = scipy.sparse.coo_array((values, (rows, columns)), shape=(n, n)).tocsr()
-    return ((found + found.T) * 0.5).tocsr(), inverse_diagonal * scale**2
+
+    def matrix_of(found):
+        data = np.concatenate(found) * scale[rows] * scale[columns]
+        half = scipy.sparse.coo_array((data, (rows, columns)), shape=(n, n)).tocsr()
+        return ((half + half.T) * 0.5).tocsr()
+
+    return [matrix_of(found) for found in values], inverse_diagonal * scale**2
 
 
 def _blocks(n, y, x, core, halo, exact):
