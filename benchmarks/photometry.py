@@ -157,7 +157,7 @@ def cutouts(quick):
     for n, side, scales in cases:
         rng = np.random.default_rng(n)
         prior, light, sky, flux = galaxy_field(n, side, kernel, rng)
-        segmentation, detected = detect_sources(prior, threshold=1.0, min_area=8)
+        segmentation, detected = detect_sources(prior, threshold=1.0, n_pixels=8)
         index, _ = match_sky(detected["sky"], sky, radius=0.3 * u.arcsec)
         truth = np.full(len(detected), np.nan)
         truth[index[index >= 0]] = flux[index >= 0]

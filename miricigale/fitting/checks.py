@@ -13,7 +13,7 @@ from miricigale.fitting.likelihood import flux_column, limits, read_ids
 from miricigale.fitting.posterior import randomised_ranks
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.random import check_seed, stream
-from miricigale.utils.tables import add_columns, error_column, require_columns
+from miricigale.utils.tables import described_table, error_column, require_columns
 from miricigale.utils.units import FNU, frozen_array
 
 __all__ = ["LeaveOutResult", "MockResult", "leave_out", "mock_analysis"]
@@ -139,9 +139,7 @@ class MockResult:
             for suffix in ("mean", "std", "p16", "p50", "p84"):
                 column = table[f"{name}_{suffix}"]
                 columns[f"{name}_{suffix}"] = (column, column.info.description)
-        out = QTable(meta=dict(self.recovered.meta) | {"mock": dict(self.meta)})
-        add_columns(out, columns)
-        return out
+        return described_table(columns, dict(self.recovered.meta) | {"mock": dict(self.meta)})
 
     def metrics(self, parameters=None):
         """
@@ -174,9 +172,7 @@ class MockResult:
         columns = {"parameter": (np.array(names, dtype=str), "parameter or derived quantity")}
         for i, (name, text) in enumerate(texts.items()):
             columns[name] = (np.array([row[i] for row in rows]), text)
-        out = QTable(meta={"mock": dict(self.meta)})
-        add_columns(out, columns)
-        return out
+        return described_table(columns, {"mock": dict(self.meta)})
 
     def _metric(self, name):
         true, mean = self.true(name).value, self.recovered.mean(name).value
@@ -370,9 +366,7 @@ class LeaveOutResult:
                 f"{name}_pull": (pull[:, i], text),
                 f"{name}_flags": (np.array(self.results[name].flags), FitFlags.describe()),
             }
-        out = QTable(meta=dict(some.meta) | {"left_out": [*self.bands]})
-        add_columns(out, columns)
-        return out
+        return described_table(columns, dict(some.meta) | {"left_out": [*self.bands]})
 
     def metrics(self):
         """
@@ -397,9 +391,7 @@ class LeaveOutResult:
         columns = {"band": (np.array(self.bands, dtype=str), "band that was left out")}
         for i, (name, text) in enumerate(texts.items()):
             columns[name] = (np.array([row[i] for row in rows]), text)
-        out = QTable()
-        add_columns(out, columns)
-        return out
+        return described_table(columns)
 
     def _metric(self, i):
         good = np.isfinite(self.pull[:, i])

@@ -4,14 +4,13 @@ from dataclasses import dataclass, field, replace
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 
 from miricigale.fitting.flags import FitFlags
 from miricigale.fitting.posterior import cell_edges, cell_percentiles, check_levels, moments
 from miricigale.fitting.quantities import DERIVED_LEVELS, kept_percentiles
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.object_rows import ObjectRows, PerObject, PerObjectDict
-from miricigale.utils.tables import add_columns, error_column
+from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import unified_read, unified_write
 from miricigale.utils.units import FNU
 
@@ -357,10 +356,9 @@ class FitResults(ObjectRows):
             msg = "results of a grid hold no draws; BayesFitter.sample makes some"
             raise ValueError(msg)
         one = self[key]._fitted_one()
-        out = QTable(meta=dict(self.meta) | {"id": str(key)})
-        columns = zip(self.parameters, one.draws.T, strict=True)
-        add_columns(out, {n: (u.Quantity(v, self.unit(n)), self._meaning(n)) for n, v in columns})
-        return out
+        values = zip(self.parameters, one.draws.T, strict=True)
+        columns = {n: (u.Quantity(v, self.unit(n)), self._meaning(n)) for n, v in values}
+        return described_table(columns, dict(self.meta) | {"id": str(key)})
 
     # ---------------------------------------------------------------------- tables
 
@@ -392,11 +390,11 @@ class FitResults(ObjectRows):
             "n_effective": (some.n_effective, "effective size of the sample"),
             "converged": (some.converged, "whether the sampler finished"),
         }
-        columns = {n: (np.array(v), text) for n, (v, text) in columns.items() if v is not None}
+        columns = {n: value for n, value in columns.items() if value[0] is not None}
         for name in some.parameters:
             unit, meaning = some.unit(name), some._meaning(name)
             percentiles = some.percentile(name, _LEVELS)
-            parts = [some.mean(name), some.std(name), *percentiles.T, some.best[name].copy()]
+            parts = [some.mean(name), some.std(name), *percentiles.T, some.best[name]]
             for (suffix, text), value in zip(_PARTS.items(), parts, strict=True):
                 columns[f"{name}_{suffix}"] = (value, f"{text} of {meaning}")
             if some.extensive(name):
@@ -405,9 +403,7 @@ class FitResults(ObjectRows):
                     some.moments[:, some._quantity(name), 2] * u.dex,
                     text,
                 )
-        out = QTable(meta=dict(self.meta))
-        add_columns(out, columns)
-        return out
+        return described_table(columns, dict(self.meta))
 
     def predict(self, filters=None):
         """
@@ -429,21 +425,18 @@ class FitResults(ObjectRows):
         if isinstance(filters, str):
             raise argument_error("filters", "a list of names or a FilterSet", repr(filters))
         some = self._several()
-        out = QTable({"id": np.array(some.ids)}, meta=dict(self.meta))
+        columns = {"id": (some.ids, "identifier")}
         for name in self.filters if filters is None else getattr(filters, "names", filters):
             if name not in self.filters:
                 raise unknown_name("filter of the models", name, self.filters)
             i = self.filters.index(name)
-            columns = {
-                name: (some.model_flux[:, i] * FNU, "posterior mean of the model flux"),
-                error_column(name): (
-                    some.model_flux_std[:, i] * FNU,
-                    "its posterior standard deviation",
-                ),
+            texts = ("posterior mean of the model flux", "its posterior standard deviation")
+            columns |= {
+                name: (some.model_flux[:, i] * FNU, texts[0]),
+                error_column(name): (some.model_flux_std[:, i] * FNU, texts[1]),
                 f"{name}_best": (some.best_flux[:, i] * FNU, "flux of the best model"),
             }
-            add_columns(out, columns)
-        return out
+        return described_table(columns, dict(self.meta))
 
     # ---------------------------------------------------------------- single objects
 

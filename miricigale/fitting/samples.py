@@ -5,7 +5,6 @@ from functools import cached_property
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 
 from miricigale.fitting import spectra
 from miricigale.fitting.flags import FitFlags
@@ -15,7 +14,7 @@ from miricigale.fitting.quantities import ModelValues, check_draws
 from miricigale.fitting.results import labeled
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.object_rows import ObjectRows, PerObject
-from miricigale.utils.tables import add_columns, error_column
+from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import unified_read, unified_write
 from miricigale.utils.units import FNU, WAVE
 
@@ -211,9 +210,7 @@ class Samples(ObjectRows):
         }
         for name in self.parameters if names is None else names:
             columns[name] = (some.values(name).ravel(), self.description(name))
-        out = QTable(meta=dict(self.meta))
-        add_columns(out, columns)
-        return out
+        return described_table(columns, dict(self.meta))
 
     def mean(self, name):
         """Means of the draws: Quantity, shape (n,)."""
@@ -394,9 +391,7 @@ class Samples(ObjectRows):
             for level, values in zip(levels, np.quantile(flux, levels, axis=1), strict=True):
                 text = f"quantile {level:g} of the model flux"
                 columns[f"{name}_{_suffix(level)}"] = (values, text)
-        out = QTable(meta=dict(self.meta))
-        add_columns(out, columns)
-        return out
+        return described_table(columns, dict(self.meta))
 
     def spectra(self, key, *, rest=True):
         """
@@ -448,9 +443,7 @@ class Samples(ObjectRows):
         for level, row in zip(levels, np.quantile(values.value, levels, axis=0), strict=True):
             text = f"quantile {level:g} of {'L_nu' if rest else 'F_nu'}"
             columns[_suffix(level)] = (row * values.unit, text)
-        out = QTable(meta=dict(self.meta) | {"id": str(key), "rest": bool(rest)})
-        add_columns(out, columns)
-        return out
+        return described_table(columns, dict(self.meta) | {"id": str(key), "rest": bool(rest)})
 
     # -------------------------------------------------------------------- drawing
 

@@ -3,6 +3,7 @@
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
+from astropy.utils.decorators import deprecated_renamed_argument
 from photutils.aperture import ApertureStats, CircularAperture
 from photutils.background import LocalBackground
 from photutils.segmentation import SourceCatalog
@@ -93,12 +94,13 @@ def _annulus_levels(arrays, xy, radius, width):
     return levels
 
 
+@deprecated_renamed_argument("min_area", "n_pixels", "0.1")
 def source_extractor_photometry(
     image,
     *,
     preset="yang2021_miri",
     threshold=None,
-    min_area=None,
+    n_pixels=None,
     diameter=1.86 * u.arcsec,
     kron=(2.5, 3.5),
     aperture_fraction=0.8,
@@ -119,7 +121,7 @@ def source_extractor_photometry(
     ----------
     image : `~astropy.nddata.CCDData`
         In units of surface brightness, with WCS.
-    preset, threshold, min_area : optional
+    preset, threshold, n_pixels : optional
         See `~miricigale.photometry.detect_sources`.
     diameter : `~astropy.units.Quantity`, optional
         Of the circular aperture; 31 pixels of 0.06 arcsec by default.
@@ -155,7 +157,7 @@ def source_extractor_photometry(
         image,
         preset=preset,
         threshold=threshold,
-        min_area=min_area,
+        n_pixels=n_pixels,
         subtract_background=True,
         box=background_box,
         filter_size=background_filter,
@@ -207,7 +209,7 @@ def _measure(arrays, flux, segmentation, catalog, diameter, kron, local_backgrou
     )
     auto, auto_err = (np.atleast_1d(v) for v in (sources.kron_flux, sources.kron_flux_err))
     radius = float(to_array(diameter, ANGLE, "diameter")) / 2 / pixel_scale(wcs)
-    xy = np.stack([catalog["x"], catalog["y"]], axis=-1)
+    xy = np.stack([catalog["x_centroid"], catalog["y_centroid"]], axis=-1)
     shifted = type(arrays)(flux, sigma, arrays.usable, arrays.area, wcs, arrays.measured_noise)
     aper, aper_err, coverage = _circle_sums(shifted, xy, radius)
     if local_background:

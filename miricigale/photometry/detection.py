@@ -7,7 +7,7 @@ import numpy as np
 import scipy.ndimage
 import scipy.stats
 from astropy.coordinates import SkyCoord
-from astropy.table import QTable
+from astropy.utils.decorators import deprecated_renamed_argument
 from photutils.segmentation import SegmentationImage, make_2dgaussian_kernel
 
 from miricigale.photometry.arrays import image_arrays, pixel_scale
@@ -16,7 +16,7 @@ from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.meta import provenance
 from miricigale.utils.sep_tools import background as sep_background
 from miricigale.utils.sep_tools import extract
-from miricigale.utils.tables import Flags
+from miricigale.utils.tables import Flags, described_table
 from miricigale.utils.units import ANGLE, FNU, to_array
 
 __all__ = [
@@ -49,16 +49,16 @@ class DetectionPreset:
     ----------
     threshold : float
         In units of the noise of a pixel, on the filtered image.
-    min_area : int
+    n_pixels : int
         Least number of connected pixels.
     fwhm : float or None
-        Width of the Gaussian detection filter in pixels, None for none.
+        Width of the Gaussian detection filter in pixels, None or 0 for none.
     n_levels, contrast : optional
         Number of levels and contrast of the deblending (contrast 1 is none).
     """
 
     threshold: float
-    min_area: int
+    n_pixels: int
     fwhm: float | None = 5.0
     n_levels: int = 32
     contrast: float = 0.005
@@ -81,25 +81,27 @@ class DetectionPreset:
         return dataclasses.replace(
             self,
             threshold=self.threshold / ratio,
-            min_area=max(1, round(self.min_area * ratio**2)),
+            n_pixels=max(1, round(self.n_pixels * ratio**2)),
             fwhm=self.fwhm and self.fwhm * ratio,
         )
 
 
-#: ``"default"``, and what the paper used on F160W at 0.06 arcsec and on MIRI images.
+#: ``"default"``, the threshold and area of the paper on F160W at 0.06 arcsec, and its settings for MIRI
+#: images. The paper states no filter for F160W: there too it is the one of 5 pixels for MIRI.
 DETECTION_PRESETS = {
-    "default": DetectionPreset(threshold=1.0, min_area=10, fwhm=3.0),
-    "yang2021": DetectionPreset(threshold=0.25, min_area=60),
-    "yang2021_miri": DetectionPreset(threshold=1.5, min_area=5),
+    "default": DetectionPreset(threshold=1.0, n_pixels=10, fwhm=3.0),
+    "yang2021": DetectionPreset(threshold=0.25, n_pixels=60),
+    "yang2021_miri": DetectionPreset(threshold=1.5, n_pixels=5),
 }
 
 
+@deprecated_renamed_argument("min_area", "n_pixels", "0.1")
 def detect_sources(
     image,
     *,
     preset="yang2021",
     threshold=None,
-    min_area=None,
+    n_pixels=None,
     fwhm=None,
     n_levels=None,
     contrast=None,
@@ -122,8 +124,8 @@ def detect_sources(
     threshold : float, optional
         In units of the noise of a pixel; it applies to the image after filtering, as
         Source Extractor's DETECT_THRESH does.
-    min_area : int, optional
-        Least number of connected pixels.
+    n_pixels : int, optional
+        Least number of connected pixels (``min_area`` in former versions).
     fwhm : float, optional
         Width of the Gaussian filter in pixels; 0 for no filter.
     n_levels, contrast : optional
@@ -144,10 +146,10 @@ def detect_sources(
     segmentation : `~photutils.segmentation.SegmentationImage`
         Label 0 is the sky.
     catalog : `~astropy.table.QTable`
-        A row for each label: ``id`` and ``label``, ``sky``, ``x``, ``y`` (0-based pixels), ``flux``
-        and ``flux_err`` (uJy, the light in the segment), ``a``, ``b`` (arcsec, rms along
-        the axes), ``theta`` (deg from +x to +y), ``n_pixels``, ``n_detected`` (pixels before
-        dilation), ``snr``, ``flags``.
+        A row for each label: ``id`` and ``label``, ``sky``, ``x_centroid``, ``y_centroid`` (0-based
+        pixels), ``flux`` and ``flux_err`` (uJy, the light in the segment), ``semimajor_axis``,
+        ``semiminor_axis`` (arcsec, rms along the axes), ``orientation`` (deg from +x to +y),
+        ``n_pixels``, ``n_detected`` (pixels before dilation), ``snr``, ``flags``.
 
     Raises
     ------
@@ -160,15 +162,10 @@ def detect_sources(
     ----------
     Bertin & Arnouts 1996, A&AS 117, 393; Barbary 2016, JOSS 1, 58.
     """
-    given = {
-        "threshold": threshold,
-        "min_area": min_area,
-        "fwhm": fwhm,
-        "n_levels": n_levels,
-        "contrast": contrast,
-    }
-    background = (box, filter_size) if subtract_background else None
-    arrays, settings = _prepare(image, preset, given, background, stated_on)
+    arrays, settings = _prepared(
+        image, preset, (box, filter_size) if subtract_background else None, stated_on,
+        threshold=threshold, n_pixels=n_pixels, fwhm=fwhm, n_levels=n_levels, contrast=contrast,
+    )  # fmt: skip
     rule = None if dilation is None else dilation_rule(dilation)
     objects, found = _extract(arrays.flux, arrays, settings)
     labels = found
@@ -182,20 +179,17 @@ def detect_sources(
     return SegmentationImage(labels), catalog
 
 
+@deprecated_renamed_argument("min_area", "n_pixels", "0.1", arg_in_kwargs=True)
 def detection_purity(
     image,
     *,
     snr_edges=None,
     preset="yang2021",
-    threshold=None,
-    min_area=None,
-    fwhm=None,
-    n_levels=None,
-    contrast=None,
     subtract_background=False,
     box=64,
     filter_size=6,
     stated_on=None,
+    **settings,
 ):
     """
     Estimate which share of the detections is real, from the image's negative.
@@ -205,16 +199,16 @@ def detection_purity(
 
     Parameters
     ----------
-    image : `~astropy.nddata.CCDData`
-        As `detect_sources` takes it.
+    image, preset, stated_on
+        As for `detect_sources`.
     snr_edges : array_like, shape (n + 1,), optional
         Signal-to-noise of segments (column ``snr`` of `detect_sources`) between which detections
         are counted; ten bins from the least to the largest of the negative image and one above by
         default.
-    preset, threshold, min_area, fwhm, n_levels, contrast : optional
-        Settings, as of `detect_sources`.
-    subtract_background, box, filter_size, stated_on : optional
+    subtract_background, box, filter_size : optional
         Likewise. The background is estimated once, on the image, and subtracted from both.
+    **settings
+        ``threshold``, ``n_pixels``, ``fwhm``, ``n_levels`` and ``contrast``, likewise.
 
     Returns
     -------
@@ -243,15 +237,8 @@ def detection_purity(
     ----------
     Gehrels 1986, ApJ 303, 336 (Poisson intervals).
     """
-    given = {
-        "threshold": threshold,
-        "min_area": min_area,
-        "fwhm": fwhm,
-        "n_levels": n_levels,
-        "contrast": contrast,
-    }
     background = (box, filter_size) if subtract_background else None
-    arrays, settings = _prepare(image, preset, given, background, stated_on)
+    arrays, settings = _prepared(image, preset, background, stated_on, **settings)
     positive, negative = (
         _segment_snr(flux, arrays, settings) for flux in (arrays.flux, -arrays.flux)
     )
@@ -286,17 +273,11 @@ def detection_purity(
         "purity_high": (high, "Upper end of the 68 % interval"),
         "purity_above": (purity_above, "Purity of all detections from snr_low on"),
     }
-    table = QTable({name: values for name, (values, _) in columns.items()})
-    for name, (_, description) in columns.items():
-        table[name].info.description = description
-    table.meta.update(
-        provenance(n_positive=len(positive), n_negative=len(negative)),
-        **dataclasses.asdict(settings),
-    )
-    return table
+    meta = provenance(n_positive=len(positive), n_negative=len(negative))
+    return described_table(columns, {**meta, **dataclasses.asdict(settings)})
 
 
-def _prepare(image, preset, given, background, stated_on):
+def _prepared(image, preset, background, stated_on, **given):
     """Arrays with the background (box, filter) taken off, and settings on the image's pixels."""
     if preset not in DETECTION_PRESETS:
         raise unknown_name("detection preset", preset, DETECTION_PRESETS)
@@ -331,7 +312,7 @@ def _extract(flux, arrays, settings):
         settings.threshold,
         err=arrays.sigma,
         mask=~arrays.usable,
-        min_area=settings.min_area,
+        min_area=settings.n_pixels,
         filter_kernel=kernel,
         deblend_n_thresholds=settings.n_levels,
         deblend_contrast=settings.contrast,
@@ -355,24 +336,10 @@ def _segment_sums(labels, flux, arrays, n):
 
 def bright_centroids(flux, labels, fallback):
     """
-    Centroids of the bright part of each segment.
+    Centroids x, y, (n,), of the bright part of each segment, label 1 first.
 
-    The centroid of a whole segment found at a low threshold is led astray by its ragged
-    rim.
-
-    Parameters
-    ----------
-    flux : `~numpy.ndarray`, shape (ny, nx)
-        Light.
-    labels : int `~numpy.ndarray`, shape (ny, nx)
-        1 to n, 0 for the sky.
-    fallback : tuple of `~numpy.ndarray`, shape (n,)
-        Positions x, y of those without a bright part.
-
-    Returns
-    -------
-    x, y : `~numpy.ndarray`, shape (n,)
-        0-based pixels.
+    The centroid of a whole segment found at a low threshold is led astray by its ragged rim.
+    ``fallback`` are positions of those without a bright part.
     """
     n = len(fallback[0])
     if n == 0:
@@ -409,22 +376,22 @@ def _catalog(objects, found, labels, arrays):
         "id": (index, "Number of the detection"),
         "label": (index, "Label in the segmentation image"),
         "sky": (sky.icrs, "Position of the bright part"),
-        "x": (x, "Centroid of the bright part, 0-based"),
-        "y": (y, "Centroid of the bright part, 0-based"),
+        "x_centroid": (x, "Centroid of the bright part, 0-based"),
+        "y_centroid": (y, "Centroid of the bright part, 0-based"),
         "flux": (total * FNU, "Light in the segment"),
         "flux_err": (noise * FNU, "Its error for noise that is not correlated"),
-        "a": (objects["a"] * scale * ANGLE, "Rms along the major axis"),
-        "b": (objects["b"] * scale * ANGLE, "Rms along the minor axis"),
-        "theta": (np.degrees(objects["theta"]) * u.deg, "Direction of the major axis, +x to +y"),
+        "semimajor_axis": (objects["a"] * scale * ANGLE, "Rms along the major axis"),
+        "semiminor_axis": (objects["b"] * scale * ANGLE, "Rms along the minor axis"),
+        "orientation": (
+            np.degrees(objects["theta"]) * u.deg,
+            "Direction of the major axis, +x to +y",
+        ),
         "n_pixels": (_sizes(labels, n), "Pixels of the segment"),
         "n_detected": (_sizes(found, n), "Pixels of the segment before dilation"),
         "snr": (snr, "flux over flux_err"),
         "flags": (objects["flag"].astype(int) & known, DetectionFlags.describe()),
     }
-    table = QTable({name: values for name, (values, _) in columns.items()})
-    for name, (_, description) in columns.items():
-        table[name].info.description = description
-    return table
+    return described_table(columns)
 
 
 def _sizes(labels, n):

@@ -19,11 +19,12 @@ from miricigale.photometry.arrays import (
     pixel_scale,
     sky_pixels,
 )
+from miricigale.photometry.catalogs import catalog_sources
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.packaging import CatalogRows, package
 from miricigale.photometry.passes import fit_image
 from miricigale.photometry.sky_noise import warn_of_background
-from miricigale.photometry.sources import SourceTemplates, catalog_sources
+from miricigale.photometry.sources import SourceTemplates
 from miricigale.photometry.templates import BankSources, FineTemplates, TemplateBank
 from miricigale.psf import KernelField
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
@@ -232,10 +233,7 @@ class ForcedPhotometer:
         segmentation : `~photutils.segmentation.SegmentationImage` or array, optional
             Segments of ``highres``; needed for cutouts.
         catalog : `~astropy.table.QTable`
-            Column ``sky``, and if there are ``id`` (1, 2, ... otherwise), ``label`` (the
-            segment; by default that at the position), ``flux`` (for the ``crowded``
-            flag; the measured fluxes otherwise), ``components`` and, for Sersic templates, those of
-            the scene's catalogues.
+            As for `SourceTemplates.from_images`, or for Sersic templates `SourceTemplates.from_catalog`.
         templates : `SourceTemplates`, optional
             What the sources look like, in place of the three above, made once for several
             images. The settings ``template``, ``min_snr`` and ``wings`` are then theirs.

@@ -32,8 +32,9 @@ class OffsetMap:
     Attributes
     ----------
     sources : `~astropy.table.QTable`
-        The sources it was measured on: ``id``, ``sky``, ``x``, ``y`` (pixels), ``dx``, ``dy`` (arcsec along the
-        image's axes), their error ``offset_err``, and ``used``, False for those that are too far off.
+        The sources it was measured on: ``id``, ``sky``, ``x_centroid``, ``y_centroid`` (pixels),
+        ``dx``, ``dy`` (arcsec along the image's axes), their error ``offset_err``, and ``used``,
+        False for those that are too far off.
     field : `~miricigale.photometry.SmoothField`
         (dx, dy) in arcsec.
     wcs : `~astropy.wcs.WCS`
@@ -83,7 +84,7 @@ class OffsetMap:
 
         table = self.sources
         offset = np.stack([table["dx"].value, table["dy"].value], axis=1)
-        xy = np.stack([table["x"], table["y"]], axis=1)
+        xy = np.stack([table["x_centroid"], table["y_centroid"]], axis=1)
         return plot_offsets(xy, offset, self.field, used=np.asarray(table["used"]), ax=ax, **kwargs)
 
 
@@ -199,7 +200,7 @@ def fit_offsets(arrays, bank, settings, catalog):
         warnings.warn(msg, MiricigaleWarning, stacklevel=5)
     near = catalog.near[member]
     table = QTable({"id": catalog.id[near], "sky": catalog.sky[near]})
-    table["x"], table["y"] = xy[member].T
+    table["x_centroid"], table["y_centroid"] = xy[member].T
     table["dx"], table["dy"] = offset.T * fit.scale * ANGLE
     table["offset_err"] = error * fit.scale * ANGLE
     table["used"] = used

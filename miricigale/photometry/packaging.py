@@ -205,7 +205,7 @@ def _new_sources(catalog, xy, wcs, columns):
         new = list(itertools.islice((name for name in names if name not in known), n))
     table = QTable({"id": np.array(new) if n else ids[:0]})
     table["sky"] = wcs.pixel_to_world(*xy.T).transform_to(catalog.sky.frame)
-    table["x"], table["y"] = xy.T
+    table["x_centroid"], table["y_centroid"] = xy.T
     for name, values in columns.items():
         table[name] = values * FNU if name.startswith("flux") else values
     table["snr"] = (table["flux"] / table["flux_err"]).value

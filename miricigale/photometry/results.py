@@ -19,7 +19,7 @@ from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.offsets import OffsetMap
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import check_seed
-from miricigale.utils.tables import error_column
+from miricigale.utils.tables import described_table, error_column
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE, FNU
 
@@ -120,8 +120,9 @@ class ForcedPhotometryResult:
     flux_positive : `~astropy.units.Quantity`, shape (n,), or None
         The fluxes of least chi-square of which none is negative (neither component's is).
     new_sources : `~astropy.table.QTable` or None
-        What the catalogue lacks, fitted with it: ``id`` (none of the catalogue's), ``sky``, ``x``, ``y``,
-        ``flux``, ``flux_err``, ``snr``, ``flags``, ``coverage`` and ``chi2``. None without a second pass.
+        What the catalogue lacks, fitted with it: ``id`` (none of the catalogue's), ``sky``,
+        ``x_centroid``, ``y_centroid``, ``flux``, ``flux_err``, ``snr``, ``flags``, ``coverage`` and
+        ``chi2``. None without a second pass.
     psf_fwhm : `~astropy.units.Quantity` or None
         Full width at half maximum of a Gaussian as peaked as the image's PSF, in arcsec.
     meta : dict
@@ -284,49 +285,37 @@ class ForcedPhotometryResult:
             With units, descriptions, and provenance in ``meta``.
         """
         flux, prefix = ("flux", "") if name is None else (name, f"{name}_")
+        error, point = error_column(flux), f"{prefix}flux_point"
         columns = {
+            "id": (self.id, "Id of the catalogue"),
+            "sky": (self.sky, "Position of the catalogue"),
             flux: (self.flux, "Total flux"),
-            error_column(flux): (self.flux_err, "1-sigma error of the flux"),
-            f"{error_column(flux)}_noise": (self.flux_err_noise, "Error by the image's noise"),
-            f"{error_column(flux)}_template": (
+            error: (self.flux_err, "1-sigma error of the flux"),
+            f"{error}_noise": (self.flux_err_noise, "Error by the image's noise"),
+            f"{error}_template": (
                 self.flux_err_template,
                 "Error by what is not known of the template",
             ),
-            f"{error_column(flux)}_psf": (self.flux_err_psf, "Error by that of the PSF"),
-            f"{prefix}flags": (self.flags, ForcedFlags.describe()),
-            f"{prefix}snr": (self.snr, "Flux over error"),
-            f"{prefix}crowded": (
-                self.crowded,
-                "Neighbour within 2 arcsec brighter than the magnitude + 1",
-            ),
-            f"{prefix}coverage": (self.coverage, "Fraction of the light on usable pixels"),
-            f"{prefix}chi2": (self.chi2, "Template-weighted mean of (residual / sigma)^2"),
-            f"{prefix}residual_fraction": (
-                self.residual_fraction,
-                "Residual over fitted light in the core",
-            ),
-            f"{prefix}template": (self.template, "Template: cutout, sersic, point or none"),
-            f"{prefix}template_snr": (
-                self.template_snr,
-                "Signal-to-noise of the segment of the high-resolution image",
-            ),
+            f"{error}_psf": (self.flux_err_psf, "Error by that of the PSF"),
         }
+        texts = {
+            "flags": ForcedFlags.describe(),
+            "snr": "Flux over error",
+            "crowded": "Neighbour within 2 arcsec brighter than the magnitude + 1",
+            "coverage": "Fraction of the light on usable pixels",
+            "chi2": "Template-weighted mean of (residual / sigma)^2",
+            "residual_fraction": "Residual over fitted light in the core",
+            "template": "Template: cutout, sersic, point or none",
+            "template_snr": "Signal-to-noise of the segment of the high-resolution image",
+        }
+        columns |= {f"{prefix}{key}": (getattr(self, key), text) for key, text in texts.items()}
         if self.flux_point is not None:
-            point = f"{prefix}flux_point"
             columns[point] = self.flux_point, "Flux of the point on top of the template"
             columns[error_column(point)] = self.flux_point_err, "1-sigma error of the point's flux"
         if self.flux_positive is not None:
-            columns[f"{prefix}flux_positive"] = (
-                self.flux_positive,
-                "Total flux if no flux may be negative; its error is not known",
-            )
-        table = QTable({"id": self.id, "sky": self.sky}, meta=dict(self.meta), copy=True)
-        table["id"].info.description = "Id of the catalogue"
-        table["sky"].info.description = "Position of the catalogue"
-        for key, (values, description) in columns.items():
-            table[key] = values
-            table[key].info.description = description
-        return table
+            text = "Total flux if no flux may be negative; its error is not known"
+            columns[f"{prefix}flux_positive"] = self.flux_positive, text
+        return described_table(columns, dict(self.meta))
 
     def plot(self, ax=None, **kwargs):
         """

@@ -11,6 +11,7 @@ from photutils.psf import ImagePSF
 from photutils.segmentation import SegmentationImage
 
 from miricigale.photometry.arrays import image_arrays, pixel_scale
+from miricigale.photometry.catalogs import OPTIONAL, catalog_sources, sersic_rows
 from miricigale.photometry.cutouts import Cutout, own_segments, sersic_cutouts
 from miricigale.photometry.light import cutouts
 from miricigale.photometry.priors import check_labels, labels_at
@@ -19,11 +20,11 @@ from miricigale.photometry.sky_noise import warn_of_sky
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import single_threaded, thread_count
-from miricigale.utils.tables import require_columns, unique_ids
+from miricigale.utils.tables import unique_ids
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE
 
-__all__ = ["SourceTemplates", "catalog_sources"]
+__all__ = ["SourceTemplates"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -87,7 +88,7 @@ class SourceTemplates:
         object.__setattr__(self, "light", tuple(self.light))
         if self.fitted is None:
             object.__setattr__(self, "fitted", not_fitted(n))
-        shapes = {"sersic": (n, 4), **dict.fromkeys(("flags", "snr", "fitted", *_OPTIONAL), (n,))}
+        shapes = {"sersic": (n, 4), **dict.fromkeys(("flags", "snr", "fitted", *OPTIONAL), (n,))}
         for name, shape in shapes.items():
             value = getattr(self, name)
             if value is not None and np.shape(value) != shape:
@@ -98,7 +99,7 @@ class SourceTemplates:
         if self.wcs is None and any(one is not None for one in self.light):
             raise argument_error("wcs", "the grid that the light is on", "None")
         unique_ids(self.id, "id")
-        for name in ("id", "sersic", "flags", "snr", "fitted", "psf", *_OPTIONAL):
+        for name in ("id", "sersic", "flags", "snr", "fitted", "psf", *OPTIONAL):
             value = getattr(self, name)
             if value is not None:
                 value = np.array(value)
@@ -130,7 +131,8 @@ class SourceTemplates:
             Segments of ``highres``.
         catalog : `~astropy.table.QTable`
             Column ``sky``, and if there are ``id`` (1, 2, ... otherwise), ``label`` (the
-            segment; by default that at the position), ``flux`` (for the ``crowded`` flag).
+            segment; by default that at the position), ``flux`` (which tells who is crowded; the
+            measured fluxes otherwise) and ``components`` (1, or 2 for a point on top of the template).
         psf : `~numpy.ndarray` or `~photutils.psf.ImagePSF`
             PSF of ``highres``: an array on its pixels, odd, square and centred, or one of the
             package's PSFs on the sky. For kernels that is their ``source``.
@@ -214,7 +216,7 @@ class SourceTemplates:
             raise argument_error("template", "'psf' or 'sersic'", repr(template))
         known = catalog_sources(catalog)
         n = len(known.id)
-        rows = _sersic_rows(catalog) if template == "sersic" else np.full((n, 4), np.nan)
+        rows = sersic_rows(catalog) if template == "sersic" else np.full((n, 4), np.nan)
         return cls(
             **known.kept(), light=(None,) * n, sersic=rows, flags=np.zeros(n, int),
             snr=np.full(n, np.nan), wcs=wcs, meta=provenance(template=template),
@@ -322,7 +324,7 @@ class SourceTemplates:
             sersic=joined("sersic"), flags=joined("flags"), snr=joined("snr"), fitted=joined("fitted"),
             wcs=grids[0] if grids else None, psf=psfs[0] if psfs else None,
             **{
-                name: joined(name) for name in _OPTIONAL
+                name: joined(name) for name in OPTIONAL
                 if all(getattr(one, name) is not None for one in parts)
             },
             meta=meta,
@@ -334,19 +336,10 @@ class SourceTemplates:
     def __getitem__(self, rows):
         """Some of the sources, by a slice, a mask or an array of row numbers."""
         rows = np.atleast_1d(np.arange(len(self))[rows])
-        return dataclasses.replace(
-            self,
-            light=tuple(self.light[k] for k in rows),
-            **{
-                name: getattr(self, name)[rows]
-                for name in ("id", "sky", "sersic", "flags", "snr", "fitted")
-            },
-            **{
-                name: getattr(self, name)[rows]
-                for name in _OPTIONAL
-                if getattr(self, name) is not None
-            },
-        )
+        names = ["id", "sky", "sersic", "flags", "snr", "fitted"]
+        names += [name for name in OPTIONAL if getattr(self, name) is not None]
+        some = {name: getattr(self, name)[rows] for name in names}
+        return dataclasses.replace(self, light=tuple(self.light[k] for k in rows), **some)
 
     def __repr__(self):
         kinds, counts = np.unique(self.kind, return_counts=True)
@@ -403,75 +396,6 @@ class SourceTemplates:
 
 _ANGLES = ("ra", "dec")
 
-#: Columns of the catalogue that need not be there.
-_OPTIONAL = ("flux", "components")
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class CatalogSources:
-    """
-    What a catalogue says of its sources.
-
-    Attributes
-    ----------
-    id : `~numpy.ndarray`, shape (n,)
-    sky : `~astropy.coordinates.SkyCoord`, shape (n,)
-        ICRS.
-    label, flux, components : `~numpy.ndarray`, shape (n,), or None
-        None where the catalogue has no such column.
-    """
-
-    id: np.ndarray
-    sky: SkyCoord
-    label: np.ndarray | None
-    flux: np.ndarray | None
-    components: np.ndarray | None
-
-    def kept(self):
-        """What templates keep of it, by name."""
-        return {name: getattr(self, name) for name in ("id", "sky", *_OPTIONAL)}
-
-
-def catalog_sources(catalog):
-    """
-    Read the columns of a catalogue.
-
-    Parameters
-    ----------
-    catalog : `~astropy.table.QTable`
-        With the column ``sky``.
-
-    Returns
-    -------
-    sources : `CatalogSources`
-
-    Raises
-    ------
-    TypeError, ValueError
-        If it is no table, has no ``sky``, an id twice, or a number of components other than 1 and 2.
-    """
-    if catalog is None or not hasattr(catalog, "colnames"):
-        raise argument_error("catalog", "a table with the column 'sky'", type(catalog).__name__)
-    require_columns(catalog, ["sky"], "catalog")
-    sky = catalog["sky"]
-    if not isinstance(sky, SkyCoord):
-        raise argument_error("catalog", "a table whose 'sky' is a SkyCoord", type(sky).__name__)
-    ids = np.arange(1, len(sky) + 1)
-    if "id" in catalog.colnames:
-        ids = unique_ids(catalog["id"], "catalog")
-    label = np.asarray(catalog["label"]) if "label" in catalog.colnames else None
-    flux = components = None
-    if "flux" in catalog.colnames:
-        flux = np.asarray(getattr(catalog["flux"], "value", catalog["flux"]), float)
-    if "components" in catalog.colnames:
-        components = np.asarray(catalog["components"])
-        if components.dtype.kind not in "iu" or not np.isin(components, (1, 2)).all():
-            found = np.unique(components)[:5].tolist()
-            raise argument_error("catalog", "a column 'components' of 1 and 2", f"{found}")
-    icrs = sky.icrs
-    sky = SkyCoord(icrs.ra.deg, icrs.dec.deg, unit="deg")
-    return CatalogSources(ids, sky, label, flux, components)
-
 
 def _segments(segmentation, shape):
     segments = segmentation
@@ -501,24 +425,6 @@ def _psf_array(psf, scale):
     if not (np.isfinite(total) and total > 0):
         raise argument_error("psf", "finite and of positive sum", f"a sum of {total}")
     return psf / total
-
-
-def _sersic_rows(catalog):
-    units = {"half_light_radius": u.arcsec, "position_angle": u.deg}
-    names = ["half_light_radius", "sersic_index", "axis_ratio", "position_angle"]
-    require_columns(catalog, names, "catalog", units=units)
-    rows = np.stack(
-        [
-            u.Quantity(catalog[names[0]]).to_value(u.arcsec),
-            np.asarray(catalog[names[1]], float),
-            np.asarray(catalog[names[2]], float),
-            u.Quantity(catalog[names[3]]).to_value(u.rad),
-        ],
-        axis=1,
-    )
-    if "profile" in catalog.colnames:
-        rows[np.asarray(catalog["profile"]) != "sersic"] = np.nan
-    return rows
 
 
 def _pixels_per_arcsec(sky, wcs):

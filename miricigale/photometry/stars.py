@@ -4,17 +4,18 @@ import warnings
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import SkyCoord
-from astropy.table import QTable, Table
+from astropy.table import Table
 from astropy.utils.exceptions import AstropyUserWarning
 from photutils.background import LocalBackground
 from photutils.psf import PSF_FLAGS, PSFPhotometry
 
 from miricigale.photometry.arrays import image_arrays, pixel_scale, sky_pixels
-from miricigale.psf import fwhm, psf_mosaic
+from miricigale.photometry.catalogs import catalog_sources
+from miricigale.photometry.grids import grid_angle
+from miricigale.psf import psf_mosaic
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
-from miricigale.utils.tables import require_columns, unique_ids
+from miricigale.utils.tables import described_table
 from miricigale.utils.units import ANGLE, FNU, to_array
 
 __all__ = ["psf_photometry"]
@@ -60,7 +61,7 @@ def psf_photometry(
     -------
     table : `~astropy.table.QTable`
         A row for each row of the catalogue, in its order: ``id``, ``sky``, ``flux``, ``flux_err`` (uJy, for
-        noise that is not correlated; NaN where not measured), ``x``, ``y`` (fitted, 0-based pixels), ``shift``
+        noise that is not correlated; NaN where not measured), ``x_fit``, ``y_fit`` (0-based pixels), ``shift``
         (arcsec from the catalogue's position), ``chi2`` (reduced), ``qfit``, ``cfit``, ``neighbor``
         (whether another row is within the fitted square) and ``flags`` (photutils').
 
@@ -81,23 +82,17 @@ def psf_photometry(
     Stetson 1987, PASP 99, 191; Bradley et al., photutils (https://photutils.readthedocs.io).
     """
     arrays = image_arrays(image, "image")
-    require_columns(catalog, ["sky"], "catalog")
-    sky = catalog["sky"]
-    if not isinstance(sky, SkyCoord):
-        raise argument_error("catalog", "a table whose 'sky' is a SkyCoord", type(sky).__name__)
-    n = len(sky)
-    ids = np.arange(1, n + 1)
-    if "id" in catalog.colnames:
-        ids = unique_ids(catalog["id"], "catalog")
+    known = catalog_sources(catalog)
+    n, ids, sky = len(known.id), known.id, catalog["sky"]
     scale = pixel_scale(image.wcs)
     model = psf_mosaic(
         psf,
         scale * ANGLE,
         pa,
-        grid_angle=_angle_of_y(image.wcs, arrays.flux.shape),
+        grid_angle=grid_angle(image.wcs, arrays.flux.shape),
         resampling=None,
     )
-    width = fwhm(model)
+    width = model.fwhm
     size = 4 * width if fit_size is None else fit_size
     side = _positive(size, "fit_size") / scale
     side = max(3, 2 * int(np.ceil((side - 1) / 2)) + 1)
@@ -108,7 +103,7 @@ def psf_photometry(
         bound = _positive(max_shift, "max_shift") / scale
     xy = sky_pixels(sky, image.wcs, arrays.flux.shape, side / 2)
     rows = np.flatnonzero(np.isfinite(xy[:, 0]))
-    names = ("flux", "flux_err", "x", "y", "chi2", "qfit", "cfit")
+    names = ("flux", "flux_err", "x_fit", "y_fit", "chi2", "qfit", "cfit")
     found = {name: np.full(n, np.nan) for name in names}
     flags = np.full(n, _NO_OVERLAP)
     if len(rows):
@@ -120,8 +115,8 @@ def psf_photometry(
         flags[rows] = fitted["flags"]
     if max_shift is None:
         # errors of a position that is kept are none; its place is
-        found["x"][rows], found["y"][rows] = xy[rows].T
-    shift = np.hypot(found["x"] - xy[:, 0], found["y"] - xy[:, 1]) * scale
+        found["x_fit"][rows], found["y_fit"][rows] = xy[rows].T
+    shift = np.hypot(found["x_fit"] - xy[:, 0], found["y_fit"] - xy[:, 1]) * scale
     near = np.zeros(n, bool)
     distance = np.abs(xy[rows, None] - xy[None, rows]).max(axis=2)
     np.fill_diagonal(distance, np.inf)
@@ -131,8 +126,8 @@ def psf_photometry(
         "sky": (sky, "Position of the catalogue"),
         "flux": (found["flux"] * FNU, "Flux of the PSF"),
         "flux_err": (found["flux_err"] * FNU, "Its error for noise that is not correlated"),
-        "x": (found["x"], "Fitted position, 0-based"),
-        "y": (found["y"], "Fitted position, 0-based"),
+        "x_fit": (found["x_fit"], "Fitted position, 0-based"),
+        "y_fit": (found["y_fit"], "Fitted position, 0-based"),
         "shift": (shift * ANGLE, "From the position of the catalogue to the fitted one"),
         "chi2": (found["chi2"], "Reduced chi^2"),
         "qfit": (found["qfit"], "Sum of absolute residuals over the flux"),
@@ -140,11 +135,8 @@ def psf_photometry(
         "neighbor": (near, "Another row is within the fitted square: the flux is not its own"),
         "flags": (flags, _describe_flags()),
     }
-    table = QTable({name: values for name, (values, _) in columns.items()}, copy=True)
-    for name, (_, text) in columns.items():
-        table[name].info.description = text
-    table.meta.update(provenance(method="photutils PSFPhotometry", fit_size=round(side * scale, 6)))
-    return table
+    meta = provenance(method="photutils PSFPhotometry", fit_size=round(side * scale, 6))
+    return described_table(columns, meta)
 
 
 def _fit(arrays, model, xy, side, bound, width, background):
@@ -179,13 +171,6 @@ def _positive(value, name):
     if not number > 0:
         raise argument_error(name, "positive", value)
     return number
-
-
-def _angle_of_y(wcs, shape):
-    """Position angle of an image's +y axis in its middle."""
-    x, y = (shape[1] - 1) / 2, (shape[0] - 1) / 2
-    here, above = wcs.pixel_to_world([x, x], [y, y + 1])
-    return here.position_angle(above).to(u.deg)
 
 
 def _describe_flags():

@@ -11,8 +11,8 @@ from miricigale.utils.units import ANGLE, to_array
 
 __all__ = [
     "Flags",
-    "add_columns",
     "ascii_ids",
+    "described_table",
     "error_column",
     "match_sky",
     "require_columns",
@@ -35,20 +35,28 @@ class Flags(enum.IntFlag):
         return [m.name.lower() for m in cls if m.value and int(value) & m.value]
 
 
-def add_columns(table, columns):
+def described_table(columns, meta=None):
     """
-    Add columns with their descriptions to a table.
+    Make a table whose columns say what they are.
 
     Parameters
     ----------
-    table : `~astropy.table.QTable`
-        The table.
     columns : dict of str to tuple
-        Name to values and the one line that describes them.
+        Values and description by name; no description if that is None.
+    meta : dict, optional
+        Provenance.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        With copies of the values.
     """
-    for name, (values, text) in columns.items():
-        table[name] = values
+    from astropy.table import QTable
+
+    table = QTable({name: values for name, (values, _) in columns.items()}, meta=meta, copy=True)
+    for name, (_, text) in columns.items():
         table[name].info.description = text
+    return table
 
 
 def error_column(name):

@@ -2,6 +2,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.nddata import CCDData
+from astropy.utils.exceptions import AstropyDeprecationWarning
 from numpy.testing import assert_allclose
 
 from miricigale.instrument import north_up_wcs
@@ -40,8 +41,10 @@ def test_all_sources_are_found_where_they_are(deep):
     matched = catalog[index]
     assert_allclose(matched["flux"].to_value(u.uJy), flux, rtol=0.15)
     assert np.all(matched["flux"][5:] > 0.9 * flux[5:] * u.uJy)
-    assert_allclose(matched["a"].to_value(u.arcsec)[10:], 0.15, rtol=0.15)
-    labels = segmentation.data[np.rint(matched["y"]).astype(int), np.rint(matched["x"]).astype(int)]
+    assert_allclose(matched["semimajor_axis"].to_value(u.arcsec)[10:], 0.15, rtol=0.15)
+    labels = segmentation.data[
+        np.rint(matched["y_centroid"]).astype(int), np.rint(matched["x_centroid"]).astype(int)
+    ]
     assert list(labels) == list(matched["label"])
 
 
@@ -53,8 +56,8 @@ def test_threshold_is_source_extractors(deep):
     assert covered < 0.15
     assert 25 <= len(catalog) < 120
     assert catalog.meta["threshold"] == 0.25
-    assert catalog.meta["min_area"] == 60
-    assert DETECTION_PRESETS["yang2021"].min_area == 60
+    assert catalog.meta["n_pixels"] == 60
+    assert DETECTION_PRESETS["yang2021"].n_pixels == 60
 
 
 def test_mask_background_and_missing_uncertainty(deep):
@@ -138,7 +141,7 @@ def test_dilated_detections_hold_more_of_their_light(deep):
     assert np.all(grown["n_detected"] == bare["n_pixels"])
     assert np.all(grown["n_pixels"] == np.bincount(segmentation.data.ravel())[1:])
     assert np.all(grown["n_pixels"] > bare["n_pixels"])
-    for name in ("x", "y", "a", "flags"):
+    for name in ("x_centroid", "y_centroid", "semimajor_axis", "flags"):
         assert np.array_equal(grown[name], bare[name])
     index = sky.match_to_catalog_sky(grown["sky"])[0]
     lost, left = (1 - table["flux"].to_value(u.uJy)[index] / flux for table in (bare, grown))
@@ -156,7 +159,7 @@ def test_purity_of_noise_and_of_sources(tools):
     shape = (600, 600)
     wcs = north_up_wcs(tools.CENTER, 0.06 * u.arcsec, shape)
     noise = rng.normal(0, 1, shape)
-    options = {"preset": "yang2021", "min_area": 20}
+    options = {"preset": "yang2021", "n_pixels": 20}
     table = detection_purity(
         tools.as_ccd(noise, wcs, 1.0), snr_edges=[0, 2.5, 3, 3.5, np.inf], **options
     )
@@ -197,9 +200,19 @@ def test_settings_stated_on_other_pixels_find_the_same(tools):
         clean = tools.render(sky, np.full(16, 10.0), 0.15, wcs, (size, size))
         sigma = 0.3 * 0.06 / scale
         image = tools.as_ccd(clean + rng.normal(0, sigma, clean.shape), wcs, sigma)
-        _, found = detect_sources(image, threshold=1.5, min_area=16, stated_on=0.06 * u.arcsec)
+        _, found = detect_sources(image, threshold=1.5, n_pixels=16, stated_on=0.06 * u.arcsec)
         index, separation, _ = sky.match_to_catalog_sky(found["sky"])
         assert separation.arcsec.max() < 0.05
         assert len(found) == 16
         areas.append(np.median(found["n_pixels"][index]) * scale**2)
     assert_allclose(areas[1], areas[0], rtol=0.05)
+
+
+def test_the_former_name_of_the_area_works(deep):
+    image = deep[2]
+    with pytest.warns(AstropyDeprecationWarning, match="min_area"):
+        _, old = detect_sources(image, threshold=1.0, min_area=12)
+    _, new = detect_sources(image, threshold=1.0, n_pixels=12)
+    assert len(old) == len(new)
+    with pytest.warns(AstropyDeprecationWarning, match="min_area"):
+        assert detection_purity(image, min_area=12).meta["n_pixels"] == 12

@@ -75,7 +75,7 @@ def galaxies(tools, noise=0.002, n=30, seed=7, spacing=3.2):
 
 def test_extended_sources_through_kernel_and_cutouts(tools):
     sky, flux, high, low = galaxies(tools)
-    segmentation, detected = detect_sources(high, threshold=1.0, min_area=10)
+    segmentation, detected = detect_sources(high, threshold=1.0, n_pixels=10)
     assert len(detected) == len(sky)
     result = ForcedPhotometer(tools.kernel).measure(low, high, segmentation, QTable({"sky": sky}))
     assert not result.flags.any()
@@ -91,7 +91,7 @@ def test_extended_sources_through_kernel_and_cutouts(tools):
 
 def test_segments_as_they_are_lose_light(tools):
     sky, flux, high, low = galaxies(tools, noise=0.02)
-    segmentation, _ = detect_sources(high, threshold=1.5, min_area=10)
+    segmentation, _ = detect_sources(high, threshold=1.5, n_pixels=10)
     catalog = QTable({"sky": sky})
     plain = ForcedPhotometer(tools.kernel, wings=False).measure(low, high, segmentation, catalog)
     full = ForcedPhotometer(tools.kernel).measure(low, high, segmentation, catalog)
@@ -104,7 +104,7 @@ def test_noisy_templates(tools, noise, snr, bias):
     ratios, as_they_are = [], []
     for seed in range(3):
         sky, flux, high, low = galaxies(tools, noise=noise, n=49, seed=seed)
-        segmentation, _ = detect_sources(high, threshold=1.0, min_area=10)
+        segmentation, _ = detect_sources(high, threshold=1.0, n_pixels=10)
         catalog = QTable({"sky": sky})
         result = ForcedPhotometer(tools.kernel).measure(low, high, segmentation, catalog)
         # the image has hardly any noise: what the templates' noise leaves is a poor fit
@@ -122,7 +122,7 @@ def test_noisy_templates(tools, noise, snr, bias):
 
 def test_template_column_says_what_was_used(tools):
     sky, _, high, low = galaxies(tools, noise=0.01, n=9)
-    segmentation, _ = detect_sources(high, threshold=1.0, min_area=10)
+    segmentation, _ = detect_sources(high, threshold=1.0, n_pixels=10)
     blank = tools.CENTER.spherical_offsets_by(1.6 * u.arcsec, 1.6 * u.arcsec)
     far = tools.CENTER.spherical_offsets_by(1.0 * u.deg, 0 * u.deg)
     ra, dec = (
@@ -253,7 +253,7 @@ def test_noise_in_the_template_is_taken_off_the_diagonal(tools):
 
 def test_blank_positions_and_shared_segments_are_point_sources(tools):
     sky, _, high, low = galaxies(tools, n=9)
-    segmentation, detected = detect_sources(high, threshold=1.0, min_area=10)
+    segmentation, detected = detect_sources(high, threshold=1.0, n_pixels=10)
     blank = tools.CENTER.spherical_offsets_by(1.6 * u.arcsec, 1.6 * u.arcsec)
     double = sky[0].spherical_offsets_by(0.15 * u.arcsec, 0 * u.arcsec)
     ra, dec = (
@@ -414,7 +414,7 @@ def test_threads_do_not_change_a_bit(tools, monkeypatch, n_threads):
     sky, _, high, low = galaxies(tools, noise=0.02, n=36, spacing=1.6)
     noise = np.random.default_rng(3).normal(0, 0.5, low.data.shape)
     low.data[:] += scipy.ndimage.gaussian_filter(noise, 1.0)
-    segmentation, _ = detect_sources(high, threshold=1.0, min_area=10)
+    segmentation, _ = detect_sources(high, threshold=1.0, n_pixels=10)
     alone, shared = (
         ForcedPhotometer(tools.kernel, fit_background=True, n_threads=n).measure(
             low, high, segmentation, QTable({"sky": sky})

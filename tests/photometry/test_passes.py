@@ -130,7 +130,7 @@ def nuclei(tools):
     low = tools.render(sky, host, np.hypot(size, tools.LO), wcs, shape)
     low += tools.render(sky, point, tools.LO, wcs, shape)
     low = tools.as_ccd(low + rng.normal(0, 0.02, shape), wcs, 0.02)
-    segmentation, _ = detect_sources(high, threshold=1.0, min_area=10)
+    segmentation, _ = detect_sources(high, threshold=1.0, n_pixels=10)
     return types.SimpleNamespace(
         sky=sky, host=host, point=point, images=(low, high, segmentation), n=n
     )

@@ -41,7 +41,7 @@ def scene(tools):
         wcs = north_up_wcs(tools.CENTER, scale * u.arcsec, shape)
         light = tools.render(sky, flux[name], np.hypot(size, tools.LO), wcs, shape)
         images[name] = tools.as_ccd(light + rng.normal(0, 1.0, shape), wcs, 1.0)
-    segmentation, detected = detect_sources(high, threshold=1.0, min_area=10)
+    segmentation, detected = detect_sources(high, threshold=1.0, n_pixels=10)
     assert len(detected) == n
     templates = SourceTemplates.from_images(
         high, segmentation, detected, psf=tools.kernel.source, n_threads=2
@@ -225,7 +225,7 @@ def test_psf_that_changes_over_the_field(tools):
     sigma = 0.003 / (tools.FINE**2 * tools.SR * 1e12)
     high = tools.render(sky, np.full(60, 20.0), np.hypot(tools.HI, size), fine, fine_shape)
     high = tools.as_ccd(high + rng.normal(0, sigma, fine_shape), fine, sigma)
-    segmentation, _ = detect_sources(high, threshold=1.0, min_area=10)
+    segmentation, _ = detect_sources(high, threshold=1.0, n_pixels=10)
     templates = SourceTemplates.from_images(
         high, segmentation, QTable({"sky": sky}), psf=tools.kernel.source
     )

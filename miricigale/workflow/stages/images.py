@@ -201,7 +201,7 @@ def make_highres(context, _):
     segmentation, detected = photometry.detect_sources(
         image,
         threshold=config.photometry.threshold,
-        min_area=config.photometry.min_area,
+        n_pixels=config.photometry.min_area,
     )
     context.save_image("f160w.fits", image)
     context.save_image("segm.fits", image, segmentation=np.asarray(segmentation.data, np.int32))

@@ -124,7 +124,7 @@ def measure_point_sources(context, name):
         seed=seed,
     )
     segmentation, detected = photometry.detect_sources(
-        highres, threshold=config.photometry.threshold, min_area=config.photometry.min_area
+        highres, threshold=config.photometry.threshold, n_pixels=config.photometry.min_area
     )
     if config.photometry.method == "yang2021":
         photometer = yang2021_photometer(config, name, context.n_threads)

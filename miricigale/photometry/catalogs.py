@@ -1,0 +1,101 @@
+"""The columns of a catalogue that photometry knows."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.table import Table
+
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.tables import require_columns, unique_ids
+
+__all__ = ["OPTIONAL", "CatalogSources", "catalog_sources", "sersic_rows"]
+
+#: Columns of a catalogue that need not be there, and that templates keep.
+OPTIONAL = ("flux", "components")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CatalogSources:
+    """
+    What a catalogue says of its sources.
+
+    Attributes
+    ----------
+    id : `~numpy.ndarray`, shape (n,)
+    sky : `~astropy.coordinates.SkyCoord`, shape (n,)
+        ICRS.
+    label, flux, components : `~numpy.ndarray`, shape (n,), or None
+        None where the catalogue has no such column.
+    """
+
+    id: np.ndarray
+    sky: SkyCoord
+    label: np.ndarray | None
+    flux: np.ndarray | None
+    components: np.ndarray | None
+
+    def kept(self):
+        """What templates keep of it, by name."""
+        return {name: getattr(self, name) for name in ("id", "sky", *OPTIONAL)}
+
+
+def catalog_sources(catalog):
+    """
+    Read the columns of a catalogue.
+
+    Parameters
+    ----------
+    catalog : `~astropy.table.QTable`
+        With the column ``sky``.
+
+    Returns
+    -------
+    sources : `CatalogSources`
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is no table, has no ``sky``, an id twice, or a number of components other than 1 and 2.
+    """
+    if not isinstance(catalog, Table):
+        raise argument_error("catalog", "a table with the column 'sky'", type(catalog).__name__)
+    require_columns(catalog, ["sky"], "catalog")
+    sky = catalog["sky"]
+    if not isinstance(sky, SkyCoord):
+        raise argument_error("catalog", "a table whose 'sky' is a SkyCoord", type(sky).__name__)
+    ids = np.arange(1, len(sky) + 1)
+    if "id" in catalog.colnames:
+        ids = unique_ids(catalog["id"], "catalog")
+    label = np.asarray(catalog["label"]) if "label" in catalog.colnames else None
+    flux = components = None
+    if "flux" in catalog.colnames:
+        flux = np.asarray(getattr(catalog["flux"], "value", catalog["flux"]), float)
+    if "components" in catalog.colnames:
+        components = np.asarray(catalog["components"])
+        if components.dtype.kind not in "iu" or not np.isin(components, (1, 2)).all():
+            found = np.unique(components)[:5].tolist()
+            raise argument_error("catalog", "a column 'components' of 1 and 2", f"{found}")
+    icrs = sky.icrs
+    sky = SkyCoord(icrs.ra.deg, icrs.dec.deg, unit="deg")
+    return CatalogSources(ids, sky, label, flux, components)
+
+
+def sersic_rows(catalog):
+    """Half-light radius (arcsec), index, axis ratio and angle (rad) of a catalogue, (n, 4); NaN for points."""
+    units = {"half_light_radius": u.arcsec, "position_angle": u.deg}
+    names = ["half_light_radius", "sersic_index", "axis_ratio", "position_angle"]
+    require_columns(catalog, names, "catalog", units=units)
+    rows = np.stack(
+        [
+            u.Quantity(catalog[names[0]]).to_value(u.arcsec),
+            np.asarray(catalog[names[1]], float),
+            np.asarray(catalog[names[2]], float),
+            u.Quantity(catalog[names[3]]).to_value(u.rad),
+        ],
+        axis=1,
+    )
+    if "profile" in catalog.colnames:
+        rows[np.asarray(catalog["profile"]) != "sersic"] = np.nan
+    return rows
