@@ -1,5 +1,6 @@
 """What a fit returns: posteriors of the objects of a catalogue."""
 
+import html
 from dataclasses import dataclass, field, replace
 
 import astropy.units as u
@@ -17,6 +18,8 @@ from miricigale.utils.units import FNU
 __all__ = ["FitResults"]
 
 _LEVELS = (0.16, 0.5, 0.84)
+#: Objects that a notebook shows.
+_SHOWN = 20
 _PARTS = {
     "mean": "posterior mean",
     "std": "posterior standard deviation",
@@ -166,7 +169,9 @@ class FitResults(ObjectRows):
         return f"<FitResults of {len(self)} objects, {good} fitted, {bands}>"
 
     def _repr_html_(self):
-        return self._several().to_table()._repr_html_()
+        table = self._several()[:_SHOWN].to_table()._repr_html_()
+        more = "" if self.isscalar or len(self) <= _SHOWN else f", the first {_SHOWN}"
+        return f"<p>{html.escape(repr(self))}{more}</p>{table}"
 
     @property
     def fitted(self):

@@ -43,7 +43,8 @@ def lazy_names(package, names, *, moved=None):
             return getattr(importlib.import_module(gone[name]), name)
         if name not in home:
             msg = f"module {package!r} has no attribute {name!r}"
-            raise AttributeError(msg)
+            # with these Python tells the nearest name
+            raise AttributeError(msg, name=name, obj=sys.modules[package])
         module = importlib.import_module(f"{package}.{home[name]}")
         value = module if name == home[name] and not names[name] else getattr(module, name)
         # next time the name is there
@@ -51,6 +52,6 @@ def lazy_names(package, names, *, moved=None):
         return value
 
     def lister():
-        return sorted({*vars(sys.modules[package]), *home})
+        return sorted(home)
 
     return getter, lister, sorted(home)
