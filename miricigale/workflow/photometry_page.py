@@ -4,13 +4,14 @@ from pathlib import Path
 
 import astropy.units as u
 import numpy as np
+from astropy.stats import mad_std
 
 from miricigale.evaluation import Report, number
 from miricigale.photometry import ForcedFlags
 from miricigale.photometry.arrays import pixel_scale
 from miricigale.plotting.axes import new_figure
 from miricigale.plotting.images import plot_image, plot_model_residual, plot_segmentation
-from miricigale.utils.units import FNU
+from miricigale.workflow.stages.sample import magnitude
 
 __all__ = ["photometry_page"]
 
@@ -139,7 +140,7 @@ def _notices(result, image, highres, kernel, pulls):
 
 def _rms(values):
     values = values[np.isfinite(values)]
-    return 1.4826 * float(np.median(np.abs(values - np.median(values)))) if len(values) else np.nan
+    return float(mad_std(values)) if len(values) else np.nan
 
 
 def _pull(pulls):
@@ -224,15 +225,10 @@ def _cutout(shape, x, y, size):
     return tuple(slice(*pair) for pair in zip(low, high, strict=True)), (x - low[1], y - low[0])
 
 
-def _magnitude(flux):
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(flux.value > 0, 23.9 - 2.5 * np.log10(flux.to_value(FNU)), np.nan)
-
-
 def _magnitudes(result, filter_):
     figure, axes = new_figure(1, 2, size=(5.2, 3.6))
     detected = result.snr > 3
-    mag = _magnitude(result.flux)
+    mag = magnitude(result.flux)
     error = 1.0857 / np.where(detected, result.snr, np.nan)
     clean = detected & (result.flags == 0)
     ax = axes[0, 0]
@@ -291,7 +287,7 @@ def _source_table(page, result):
     text = f"The {len(order)} brightest of {len(result)}; all are in the table that was written. "
     text += "Residual is what the fit left in the core over what it took there."
     page.section("Brightest sources", text)
-    mag = _magnitude(result.flux)
+    mag = magnitude(result.flux)
     none = "no positive flux"
     rows = [
         (

@@ -20,6 +20,7 @@ __all__ = ["make_templates", "measure_photometry", "yang2021_photometer"]
 @stage(
     "templates",
     "templates of the sources",
+    version=2,
     needs=("highres",),
     sections=("highres.filter", "highres.pixel_scale"),
     kernels=("photometry",),

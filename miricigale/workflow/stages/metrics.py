@@ -147,16 +147,13 @@ def _band_metrics(matched, name):
     return {
         "bright_isolated": recovery_metrics(true[bright], flux[bright], relative=True),
         "n_measured": int(np.count_nonzero(usable & np.isfinite(flux))),
-        "formal_limit": _magnitude_of(5 * np.nanmedian(formal[usable])) if usable.any() else np.nan,
+        "formal_limit": float(magnitude(5 * np.nanmedian(formal[usable]) * u.uJy))
+        if usable.any()
+        else np.nan,
         "pull_n": int(pulls.size),
         "pull_median": float(np.median(pulls)) if pulls.size else np.nan,
         "pull_scatter": sigma_mad(pulls),
     }
-
-
-def _magnitude_of(flux):
-    """AB magnitude of a flux in uJy."""
-    return float(23.9 - 2.5 * np.log10(flux))
 
 
 def _coverage(truth, table, name):
