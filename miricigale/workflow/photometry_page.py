@@ -123,7 +123,7 @@ def _notices(result, image, highres, kernel, pulls):
                 f"{one.meta['n_filled']} pixels of the {what} are in areas that are exactly 0: they "
                 "were taken as without data."
             )
-        if one.meta.get("noise") == "none":
+        if one.uncertainty is None:
             lines.append(f"The {what} has no map of the noise; it was measured on the image.")
         elif scale is not None and not 0.1 < scale < 10:
             done = "were scaled by it" if "weight_scale" in one.meta else "were kept"

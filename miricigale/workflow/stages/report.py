@@ -117,6 +117,11 @@ class _Writer:
         self.mosaics, self.area = mosaics, area
         self.selection = np.asarray(tables.matched["selection"])
 
+    def _table(self, entries, columns, **options):
+        """A table of a row for each entry, and of columns: header to the cell of an entry."""
+        rows = [[cell(entry) for cell in columns.values()] for entry in entries]
+        self.report.table(rows, header=tuple(columns), **options)
+
     def summary(self):
         """Headline numbers."""
         m, fits = self.metrics, self.metrics["fits"]
@@ -153,20 +158,21 @@ class _Writer:
             note = ""
         name, prior = self.config.catalog.mag_column, band_label(self.config.highres.filter)
         limit = self.config.catalog.mag_limit
-        self.report.table(
-            [
-                (
-                    f"{prior} < {row['limit']:g}",
-                    row["n"],
-                    _percent(row["fraction"], "no galaxy"),
-                    f"{_percent(row['low'], 'no galaxy')} to {_percent(row['high'], 'no galaxy')}"
-                    if row["n"]
-                    else Missing("no galaxy"),
-                    _percent(row["paper"], ""),
-                )
-                for row in m["detected"]
-            ],
-            header=("sample", "galaxies", f"detected in {least}+ bands", "68 % interval", paper),
+        none = "no galaxy"
+        columns = {
+            "sample": lambda row: f"{prior} < {row['limit']:g}",
+            "galaxies": lambda row: row["n"],
+            f"detected in {least}+ bands": lambda row: _percent(row["fraction"], none),
+            "68 % interval": lambda row: (
+                f"{_percent(row['low'], none)} to {_percent(row['high'], none)}"
+                if row["n"]
+                else Missing(none)
+            ),
+            paper: lambda row: _percent(row["paper"], ""),
+        }
+        self._table(
+            m["detected"],
+            columns,
             caption="Galaxies of the field detected (5 sigma by the error function) in "
             f"{'two or more bands' if least == 2 else 'the one band'}; the catalog ends at "
             f"{name} = {limit:g}{note}",
@@ -239,37 +245,28 @@ class _Writer:
                 "crowded sources, squares those at the edge.",
             )
         points = self.tables.points
-        rows = [
-            (
-                band_label(name),
-                entry["bright_n"],
-                _percent(
-                    entry["bright_median"], reason := "no isolated source above 20 sigma", "+.2f"
-                ),
-                _percent(entry["bright_median_err"], reason),
-                *(
-                    (
-                        entry["points_n"],
-                        _percent(entry["points_median"], "no point source measured", "+.2f"),
-                        _percent(entry["points_scatter"], "no point source measured"),
-                        number(entry["f_scaling"], ".4f", "no whole point source in the field"),
-                    )
-                    if points
-                    else ()
-                ),
-            )
-            for name, entry in self.metrics["bands"].items()
-        ]
-        header = ("band", "isolated > 20 sigma", "median offset", "its error")
-        if points:
-            header += ("point sources", "median offset", "scatter", "f_scaling")
+        entries = self.metrics["bands"].items()
+        reason, lost = "no isolated source above 20 sigma", "no point source measured"
+        columns = {
+            "band": lambda x: band_label(x[0]),
+            "isolated > 20 sigma": lambda x: x[1]["bright_n"],
+            "median offset": lambda x: _percent(x[1]["bright_median"], reason, "+.2f"),
+            "its error": lambda x: _percent(x[1]["bright_median_err"], reason),
+        }
         caption = "Measured over true flux minus one"
         if points:
+            whole = "no whole point source in the field"
+            columns |= {
+                "point sources": lambda x: x[1]["points_n"],
+                "their median offset": lambda x: _percent(x[1]["points_median"], lost, "+.2f"),
+                "scatter": lambda x: _percent(x[1]["points_scatter"], lost),
+                "f_scaling": lambda x: number(x[1]["f_scaling"], ".4f", whole),
+            }
             caption += (
                 "; f_scaling, the factor that brings the light of the point sources within the radius of 80 % to "
                 "that of the PSF, is 1 where images and PSF agree"
             )
-        self.report.table(rows, header=header, caption=caption)
+        self._table(entries, columns, caption=caption)
         if points:
             shown = {name: table[np.asarray(table["in_field"])] for name, table in points.items()}
             self.report.figure(
@@ -306,32 +303,19 @@ class _Writer:
         proposal = "CEERS proposal"
         if not all(entry["ceers"] for entry in bands.values()):
             proposal += ", for other exposures"
-        self.report.table(
-            [
-                (
-                    band_label(name),
-                    number(entry["limit"], ".2f", none),
-                    number(entry["formal_limit"], ".2f", "no source measured"),
-                    f"{entry['etc_limit']:.2f}",
-                    number(entry["limit"] - entry["etc_limit"], "+.2f", none),
-                    number(entry["proposal"], ".1f", "no band of CEERS")
-                    if entry["ceers"] or not np.isfinite(entry["proposal"])
-                    else f"{entry['proposal']:.1f} in {entry['proposal_time']:.0f} s",
-                    number(entry["pull_median"], "+.2f", few),
-                    number(entry["pull_scatter"], ".2f", few),
-                )
-                for name, entry in bands.items()
-            ],
-            header=(
-                "band",
-                "5 sigma, error function",
-                "formal",
-                "calculator, scaled",
-                "minus calculator",
-                proposal,
-                "pull median",
-                "pull scatter",
-            ),
+        columns = {
+            "band": lambda x: band_label(x[0]),
+            "5 sigma, error function": lambda x: number(x[1]["limit"], ".2f", none),
+            "formal": lambda x: number(x[1]["formal_limit"], ".2f", "no source measured"),
+            "calculator, scaled": lambda x: f"{x[1]['etc_limit']:.2f}",
+            "minus calculator": lambda x: number(x[1]["limit"] - x[1]["etc_limit"], "+.2f", none),
+            proposal: lambda x: _proposal(x[1]),
+            "pull median": lambda x: number(x[1]["pull_median"], "+.2f", few),
+            "pull scatter": lambda x: number(x[1]["pull_scatter"], ".2f", few),
+        }
+        self._table(
+            bands.items(),
+            columns,
             caption=(
                 "5-sigma limits (AB magnitudes), and (measured - true) / formal error of the sources "
                 "below 20 sigma, blends and template errors included"
@@ -366,34 +350,21 @@ class _Writer:
             "Posterior means and widths of the AGN fraction.",
         )
         none = "no source fitted"
-        self.report.table(
-            [
-                (
-                    unit.replace("_", " ").replace("miri", "MIRI"),
-                    entry["n"],
-                    number(entry["photoz_bias"], "+.4f", none),
-                    number(entry["photoz_sigma_mad"], ".4f", none),
-                    entry["photoz_n_outliers"],
-                    _percent(entry["photoz_outliers"], none),
-                    number(entry["frac_agn_bias"], "+.3f", none),
-                    number(entry["frac_agn_sigma_mad"], ".3f", none),
-                    number(entry["frac_agn_width"], ".3f", none),
-                    _percent(entry["redshift_coverage"], none),
-                )
-                for unit, entry in self.metrics["fits"].items()
-            ],
-            header=(
-                "fit",
-                "sources",
-                "dz/(1+z) median",
-                "sigma_MAD",
-                "outliers",
-                "share",
-                "fracAGN offset",
-                "scatter",
-                "width",
-                "z in 16-84 %",
-            ),
+        columns = {
+            "fit": lambda x: x[0].replace("_", " ").replace("miri", "MIRI"),
+            "sources": lambda x: x[1]["n"],
+            "dz/(1+z) median": lambda x: number(x[1]["photoz_bias"], "+.4f", none),
+            "sigma_MAD": lambda x: number(x[1]["photoz_sigma_mad"], ".4f", none),
+            "outliers": lambda x: x[1]["photoz_n_outliers"],
+            "share": lambda x: _percent(x[1]["photoz_outliers"], none),
+            "fracAGN offset": lambda x: number(x[1]["frac_agn_bias"], "+.3f", none),
+            "scatter": lambda x: number(x[1]["frac_agn_sigma_mad"], ".3f", none),
+            "width": lambda x: number(x[1]["frac_agn_width"], ".3f", none),
+            "z in 16-84 %": lambda x: _percent(x[1]["redshift_coverage"], none),
+        }
+        self._table(
+            self.metrics["fits"].items(),
+            columns,
             caption="Redshift and AGN fraction against truth; truths lie within the models of the "
             f"fit, whose {100 * self.config.fit.model_error:g} % model error they do not have, so "
             "posteriors are wide",
@@ -444,24 +415,31 @@ class _Writer:
             f"{options.mag_column} = {options.mag_limit:g}; Poisson errors.",
         )
         none = "no source above the limit in the imaged area"
-        self.report.table(
-            [
-                (
-                    f"{band_label(row['band'])}, {row['wavelength']:g} µm",
-                    f"{row['least']:g} µJy" if row["least"] else "none",
-                    row["n"],
-                    f"{row['light']:.2f} ± {row['light_err']:.2f}" if row["n"] else Missing(none),
-                    f"{row['published']:.2f} -{row['down']:.2f} +{row['up']:.2f}",
-                    row["reference"],
-                )
-                for row in self.metrics["light"]
-            ],
-            header=("band", "faint limit", "sources", "here", "published", "reference"),
+        columns = {
+            "band": lambda row: f"{band_label(row['band'])}, {row['wavelength']:g} µm",
+            "faint limit": lambda row: f"{row['least']:g} µJy" if row["least"] else "none",
+            "sources": lambda row: row["n"],
+            "here": lambda row: (
+                f"{row['light']:.2f} ± {row['light_err']:.2f}" if row["n"] else Missing(none)
+            ),
+            "published": lambda row: f"{row['published']:.2f} -{row['down']:.2f} +{row['up']:.2f}",
+            "reference": lambda row: row["reference"],
+        }
+        self._table(
+            self.metrics["light"],
+            columns,
             caption="Light of all galaxies above a flux, nu I_nu in nW / m2 / sr; Poisson errors, without "
             "cosmic variance",
             empty="The light of all galaxies together is published near 15 and 24 µm; no band of "
             "this run (F1500W, F2100W) is there.",
         )
+
+
+def _proposal(entry):
+    """The limit of CEERS' proposal, and the time that it is for where that is another."""
+    if entry["ceers"] or not np.isfinite(entry["proposal"]):
+        return number(entry["proposal"], ".1f", "no band of CEERS")
+    return f"{entry['proposal']:.1f} in {entry['proposal_time']:.0f} s"
 
 
 def _plus_minus(fit):
