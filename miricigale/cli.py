@@ -224,7 +224,7 @@ def _run(args):
         with process_pool(n_processes) as executor:
             report = run_study(config, folder, executor=executor, **options)
     except OtherResultsError as err:
-        # in the words of this command
+        # name the option of this command instead of the argument
         raise OtherResultsError(err.reason, "--redo to replace it") from err
     print(f"done in {(time.monotonic() - begin) / 60:.1f} min; report: {report}")
     return 0
@@ -249,7 +249,7 @@ def _fit(args):
         table = args.output / "table.fits"
         results.write_table(table, overwrite=True)
     except OtherResultsError as err:
-        # in the words of this command
+        # name the option of this command instead of the argument
         raise OtherResultsError(err.reason, "--no-resume to replace them") from err
     print(f"{results!r}; all in {table}")
     return 0
@@ -346,7 +346,7 @@ def _data_list(args):
         if record.file and path is None:
             lines.append(f"source: {record.source}")
         for line in lines:
-            # addresses stay whole, to be copied
+            # do not break URLs
             wrapped = textwrap.wrap(line, width - 4, break_long_words=False, break_on_hyphens=False)
             print(textwrap.indent("\n  ".join(wrapped), "    "))
     return 0
@@ -395,14 +395,14 @@ def main(argv=None):
     parser = _parser()
     args = parser.parse_args(argv)
     handler = logging.StreamHandler()
-    # astropy shows its records itself, warnings among them
+    # astropy has a handler of its own
     handler.addFilter(lambda record: not record.name.startswith("astropy"))
     logging.basicConfig(
         level=logging.INFO if args.verbose else logging.WARNING,
         format="%(message)s",
         handlers=[handler],
     )
-    # what is compiled, and for how long, is said to everyone
+    # messages about compilation are shown at any verbosity
     logging.getLogger("miricigale.utils.compilation").setLevel(logging.INFO)
     if args.version:
         from miricigale import __version__
@@ -425,7 +425,7 @@ def main(argv=None):
         if args.verbose or not isinstance(err, expected):
             raise
         message = err.args[0] if isinstance(err, KeyError) and err.args else err
-        # a bare key says nothing to a reader
+        # the message of a KeyError may be the key alone
         bare = isinstance(err, KeyError) and " " not in str(message)
         kind = f"{type(err).__name__} " if bare else ""
         where = "".join(f" ({note})" for note in getattr(err, "__notes__", ()))
@@ -440,6 +440,6 @@ def command():
     sys.stderr.flush()
     others = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
     if status == 130 and not all(thread.daemon for thread in others):
-        # threads in compiled code hear of no interrupt, and the interpreter would wait for them
+        # threads in compiled code ignore interrupts, and the interpreter would wait for them
         os._exit(status)
     sys.exit(status)

@@ -220,7 +220,7 @@ def read_table(path, wanted):
     unpacked_size(path)
     try:
         table = Table.read(path, **_format(path))
-    except Exception as err:  # readers of all formats raise as they like
+    except Exception as err:  # readers of different formats raise different exceptions
         lines = str(err).strip().splitlines() or [type(err).__name__]
         msg = f"{path} cannot be read as {wanted}: {lines[0]}"
         raise DataError(msg) from err

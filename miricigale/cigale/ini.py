@@ -61,7 +61,7 @@ def parse_ini(path):
     `~miricigale.utils.exceptions.ConfigError`
         If a setting has a wrong type or value.
     """
-    # by the library that writes these files, of which astropy carries a copy
+    # the library that CIGALE itself uses; astropy bundles a copy
     from astropy.extern.configobj import configobj, validate
 
     spec = _SPEC.format(limits=", ".join(LIMIT_FLAGS)).splitlines()
@@ -115,7 +115,7 @@ def parse_values(value, name):
         If it is something else, or a value is there twice.
     """
     items = [value] if isinstance(value, str) else value
-    # an expression without quotes was parted at its commas
+    # an expression without quotes was split at its commas
     text = ", ".join(items)
     try:
         if text.startswith("eval "):

@@ -90,7 +90,7 @@ def _columns(results, names, variables):
     constants = dict(results.constants)
     gas = [part.gas for part in getattr(results.model, "components", ()) if part.role == "nebular"]
     if gas != ["free"]:
-        # it has that of the stars
+        # the gas has the metallicity of the stars
         constants.pop("metallicity_gas", None)
     columns = {}
     for ours, (theirs, unit, factor) in names.items():

@@ -218,7 +218,7 @@ class CigaleSetup:
             In the order of the table; ``meta["cigale"]`` says what was left out.
         """
         if self.redshift is not None:
-            # the node next to the redshift is taken, however far
+            # the nearest node is taken at any distance
             options = {"redshift_tolerance": np.inf} | options
         fitter = self.fitter(photometry, compat=compat, **options)
         known = {"executor": executor, "progress_bar": progress_bar}
@@ -261,7 +261,7 @@ def _by_redshift(fitter, photometry, z, known):
     free = fitter.fit(photometry, **known)
     if not np.any(fixed):
         return free
-    # all objects go through both, so that ids that are there twice are found as such
+    # both fits get all objects, so that duplicate ids are flagged
     at = fitter.fit(photometry, redshift=np.where(fixed, z, fitter.grid.redshift[0]), **known)
     rows = np.concatenate([np.flatnonzero(~fixed), np.flatnonzero(fixed)])
     return FitResults.concatenate([free[~fixed], at[fixed]])[np.argsort(rows)]

@@ -135,7 +135,7 @@ class _Candidates:
             i, j, distance = rows[0][a], rows[1][b], angle.to_value(ANGLE)
         size = len(first), len(second)
         self.count = [np.bincount(k, minlength=n) for k, n in zip((i, j), size, strict=True)]
-        # of equal distances the first row counts
+        # of equal distances the first row is taken
         order = np.lexsort((j, i, distance))[::-1]
         nearest = [np.full(n, -1) for n in size]
         nearest[0][i[order]], nearest[1][j[order]] = j[order], i[order]

@@ -153,7 +153,7 @@ class Report:
         reasons = list(
             dict.fromkeys(cell.reason for row in rows for cell in row if isinstance(cell, Missing))
         )
-        # one reason needs no number
+        # a single reason is not numbered
         marks = {why: str(k) if len(reasons) > 1 else "" for k, why in enumerate(reasons, start=1)}
 
         def shown(cell):
@@ -191,9 +191,9 @@ class Report:
             Folder for the separate PNG.
         """
         buffer = io.BytesIO()
-        # a layout engine has found room for all texts already
+        # with a layout engine all labels are within the figure already
         tight = None if figure.get_layout_engine() else "tight"
-        # without the version of matplotlib, which is no part of the picture
+        # omit the version of matplotlib, so that the bytes do not depend on it
         meta = {"Software": None}
         figure.savefig(buffer, format="png", dpi=self.dpi, bbox_inches=tight, metadata=meta)
         figure.clear()

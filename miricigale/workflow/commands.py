@@ -143,7 +143,7 @@ def fit_catalog(
             "a table with columns <filter> and <filter>_err ('miricigale filters' lists the names)",
             f"columns {list(names)}",
         )
-    # what takes long to import, after what is wrong with the file is known
+    # heavy imports only after the file was checked
     from miricigale.fitting import BayesFitter, fit_file
     from miricigale.fitting.likelihood import unused_bands
     from miricigale.sed import SEDModel

@@ -75,7 +75,7 @@ def _centered(data):
     """The position x, y of the bright core of a PSF."""
     y, x = np.indices(data.shape)
     core = np.where(data > 0.3 * data.max(), data, 0.0)
-    # of one peak only
+    # only the brightest peak
     peak = np.unravel_index(np.argmax(data), data.shape)
     core[np.hypot(y - peak[0], x - peak[1]) > 0.25 * min(data.shape)] = 0
     return float((core * x).sum() / core.sum()), float((core * y).sum() / core.sum())
@@ -117,7 +117,7 @@ def _read_psf(path, argument, header, *, scale, angle):
             msg = f"{path} is no PSF: it has no light, or pixels that are not finite"
             raise DataError(msg)
         total = float(data.sum())
-        # the model tells what light it holds, whatever it was scaled to
+        # the model PSF says which fraction of the light its array holds
         scaled = known and not 0.8 < total < 0.995
         if scaled:
             _log.info("%s sums to %.4g and is scaled to 1", path, total)
@@ -129,10 +129,10 @@ def _read_psf(path, argument, header, *, scale, angle):
         n = 2 * (min(data.shape) // 2) - 1
         middle = psf_image(psf, pixel_scale=cell * ANGLE, shape=n)
         middle = middle / middle.sum() if scaled else middle
-        # the shift loses nothing but what is beyond the edge
+        # only light beyond the edge is lost by the shift
         kept.append(make_psf(middle, **form, meta={"file": str(path)}))
     psf = kept[0] if len(kept) == 1 else average_psf(kept)
-    # a pixel that was stated on purpose leaves only the image to be wider
+    # if the user stated the pixel scale, only smoothing of the image can explain a wider PSF
     return _compared(psf, header, argument, smoothed=scale is not None) if known else psf
 
 
@@ -323,7 +323,7 @@ def matching_kernel(image, highres, *, kernel=None, psf=None, highres_psf=None, 
 
 
 def _check_widths(sharp, wide):
-    # an unknown width is NaN
+    # NaN (unknown width) passes
     if sharp >= wide:
         msg = (
             "the PSF of 'image' must be wider than that of 'highres', and it is not: are the two "

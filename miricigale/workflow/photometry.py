@@ -158,7 +158,7 @@ def measure_files(
         )
     ]
     _check_psfs(image, highres, headers, kernel, psf, highres_psf)
-    # after what is wrong with the files is known
+    # heavy imports only after the files were checked
     from miricigale.photometry import ForcedPhotometer
 
     with progress(show=progress_bar, total=4, desc="images", unit="steps") as bar:
@@ -183,7 +183,7 @@ def measure_files(
             path.parent.mkdir(parents=True, exist_ok=True)
         if output is not None:
             with writing(output), warnings.catch_warnings():
-                # of keywords of more than eight letters
+                # keywords of more than eight letters
                 warnings.simplefilter("ignore", VerifyWarning)
                 table.write(output, overwrite=overwrite)
         for path, picture in ((model, result.model_image), (residual, result.residual_image)):
@@ -238,7 +238,7 @@ def _check_output(what, path, overwrite, inputs):
     while not folder.exists():
         folder = folder.parent
     try:
-        # permissions alone do not tell, for a superuser or on a read-only disk
+        # permission bits are not enough for a superuser or on a read-only disk
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as err:
@@ -382,7 +382,7 @@ def _pulls(result, kernel, n, seed, n_threads):
         return None
     blank = ForcedPhotometer(kernel, template="psf", n_threads=n_threads)
     with warnings.catch_warnings():
-        # a background has been told of
+        # the warning about a background was given already
         warnings.simplefilter("ignore", MiricigaleWarning)
         return blank.measure(result.residual_image, catalog=empty).snr
 
@@ -419,7 +419,7 @@ def empty_positions(result, n, *, seed, distance=0.3):
     free = ~np.asarray(residual.mask, bool)
     free &= np.abs(result.model_image.data - level) < 0.3 * np.where(free, sigma, 1.0)
     steps = max(1, round(distance / pixel_scale(residual.wcs)))
-    # what is beyond the image has no data
+    # pixels beyond the image count as without data
     free = scipy.ndimage.binary_erosion(free, iterations=steps)
     y, x = np.nonzero(free)
     rng = np.random.default_rng(seed)

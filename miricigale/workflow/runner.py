@@ -23,7 +23,7 @@ from miricigale.workflow.warmup import JOBS, compile_apart, describe_job, is_com
 __all__ = ["StudyRunner", "run_stages"]
 
 log = logging.getLogger(__name__)
-# the command line shows what it says to everyone
+# shown by the command line at any verbosity
 _compilation_log = logging.getLogger("miricigale.utils.compilation")
 
 #: Bytes that a process takes for a unit whose stage does not say how many: measured, of a field
@@ -121,7 +121,7 @@ class StudyRunner:
             values["plan"] = stage.plan(self.config, unit)
         source = Path(self.config.catalog.source).expanduser()
         if "catalog" in stage.sections and source.is_file():
-            # a user's own file may change under the same name
+            # the content of a user's file may change
             values["catalog"] = file_sha256(source)
         text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
@@ -153,7 +153,7 @@ class StudyRunner:
             ):
                 state = "changed"
             else:
-                # the same bytes come back, so that what depends on them stays
+                # making them again gives the same bytes, so that dependent stages stay current
                 state = "current" if store.is_whole(job.key) else "lost"
             states[job.key] = state
             if state in ("new", "changed"):
@@ -373,7 +373,7 @@ class _Display:
 def _values(config):
     """Plain values of what products may depend on."""
     values = json.loads(json.dumps(dataclasses.asdict(config)))
-    # how a run is done changes no product
+    # threads and memory do not change products
     del values["run"]["threads"], values["run"]["memory"]
     return values
 

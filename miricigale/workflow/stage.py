@@ -144,7 +144,7 @@ class Context:
         self.products = FileFolder(folder)
         self.progress_bar = progress_bar
         self.saved = []
-        # neither changes a product by itself: the seed is in every hash, threads in none
+        # available without a declaration: the seed enters every hash, threads change no product
         self.seed = config.run.seed
         self.n_threads = n_threads
         self._name = "" if stage is None else stage.name
@@ -211,7 +211,7 @@ def run_unit(config, folder, stages, name, unit, **options):
     context = Context(config, folder, stage=stage, **options)
     begin = time.perf_counter()
     try:
-        # the same last digits on any number of cores
+        # results independent of the number of cores to the last digit
         with single_threaded():
             stage.function(context, unit)
     except (ValueError, KeyError, OSError) as err:

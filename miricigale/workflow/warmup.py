@@ -34,7 +34,7 @@ def _fit():
 
     table = QTable({"id": [1], "redshift": [1.0], "mass": [1e10]})
     SEDModel.yang2021(agn=False).fluxes(table, _BANDS)
-    # without a share of the light an AGN is left out
+    # with frac_agn = 0 the AGN would be skipped
     table["frac_agn"] = [0.4]
     SEDModel.yang2021().fluxes(table, _BANDS)
     fitter = BayesFitter(SEDModel.yang2021(), _BANDS, axes=_axes(), model_error=0.1)
@@ -56,7 +56,7 @@ def _images():
     from miricigale.workflow.config import load_config
     from miricigale.workflow.stages.images import expose_and_reduce, reducer_of
 
-    # what is off by default calls more
+    # options that are off by default call further kernels
     config = load_config("goodss", quick=True, overrides={"detector": {"residual": 0.01}})
     center = SkyCoord(config.pointing.ra * u.deg, config.pointing.dec * u.deg)
     catalog = _catalog(center)
@@ -76,7 +76,7 @@ def _images():
             )[1]
             for exposure in exposures
         ]
-    # thresholds so low that there are large jumps among so few pixels
+    # low thresholds, so that few pixels contain large jumps
     Reducer(jump_threshold=2.0, neighbor_threshold=2.0).fit_ramp(ramps[0])
     grid = north_up_wcs(center, 0.06 * u.arcsec, (128, 128))
     reducer_of(config).drizzle(images, grid)
@@ -110,7 +110,7 @@ def _photometry():
 
     def image(wcs, width):
         y, x = np.mgrid[: wcs.pixel_shape[1], : wcs.pixel_shape[0]]
-        # correlated, as that of a mosaic
+        # correlated noise, as in a mosaic
         light = 0.03 * gaussian_filter(rng.standard_normal(y.shape), 1.0)
         for px, py in zip(*wcs.world_to_pixel(sky), strict=True):
             light += np.exp(-0.5 * ((x - px) ** 2 + (y - py) ** 2) / width**2)
@@ -122,7 +122,7 @@ def _photometry():
             mask=np.zeros(y.shape, bool),
         )
 
-    # wider than the PSF, for profiles to be fitted and drawn
+    # wider than the PSF, so that profiles are fitted
     prior, mosaic = image(hires, 2.5), image(native, 1.8)
     labels = np.zeros(prior.shape, np.int32)
     x, y = hires.world_to_pixel(sky)
@@ -255,13 +255,13 @@ def compile_apart(name):
         f"from {__name__} import compile_and_end; compile_and_end(sys.argv[1])"
     )
     with subprocess.Popen(
-        # -P: nothing is imported from the folder in which this happens to be called
+        # -P: do not import modules from the current working directory
         [sys.executable, "-P", "-c", code, _check(name), str(_PACKAGE.parent)],
-        # closed when this process ends, however it ends
+        # the pipe closes when this process ends, even if it is killed
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        # the terminal's Ctrl-C is for this process
+        # Ctrl-C in the terminal reaches this process only
         start_new_session=True,
     ) as child:
         child.wait()
@@ -271,7 +271,7 @@ def compile_apart(name):
 def is_compiled(name):
     """Whether the kernels of a job were compiled by this installation, on this machine."""
     marker = _marker(_check(name))
-    # somebody may have emptied the cache around the marker
+    # the cache may have been emptied without removing the marker
     folder = _PACKAGE if marker.parent.name == "__pycache__" else _numba_folder()
     return marker.is_file() and any(folder.rglob("*.nbi"))
 
@@ -317,7 +317,7 @@ def compile_and_end(name):
     """Run one job as the whole of a process, which also ends when its stdin is closed."""
     threading.Thread(target=_end_with_stdin, daemon=True).start()
     compile_job(name)
-    # at once: the thread holds the lock of stdin
+    # not sys.exit: the thread holds the lock of stdin
     os._exit(0)
 
 

@@ -76,7 +76,7 @@ def _panels(bands, height, **share):
     """A panel for each band, three in a row, with labels on the outer axes only."""
     columns = min(3, len(bands))
     rows = -(-len(bands) // columns)
-    # one or two bands do not fill the page
+    # panels of one or two bands are half a page wide
     width = WIDTH / max(2, columns)
     figure, axes = new_figure(rows, columns, size=(width, height), **share)
     panels = axes.ravel()
@@ -387,7 +387,7 @@ def example_figure(results, truth, key, model):
         parts["best model without MIRI"] = (sed.wave, sed.fnu)
     fraction = best.best["frac_agn"].value
     if fraction > 0:
-        # nothing else changes: what is left is the galaxy
+        # the same model without its AGN
         galaxy = best.best_sed(model, frac_agn=0.0)
         parts["its galaxy"] = (galaxy.wave, galaxy.fnu)
         parts["its AGN"] = (total.wave, total.fnu - galaxy.fnu)
@@ -406,7 +406,7 @@ def example_figure(results, truth, key, model):
     names = ["best model with MIRI" if name == "best model" else name for name in names]
     upper.legend(handles, names, fontsize=7, frameon=False, loc="upper left", ncols=2)
     low, high = upper.get_ylim()
-    # room for the legend above the spectrum
+    # space for the legend above the spectrum
     upper.set_ylim(low, high * (high / low) ** 0.35)
     for column, (name, label) in enumerate(
         (("redshift", "redshift"), ("frac_agn", "fracAGN")), start=1

@@ -49,7 +49,7 @@ def make_errors(context, _):
     association = evaluation.associate(truth, detections, radius=radius)
     mosaics = [context.image(f"mosaic_{name}.fits") for name in bands]
     inside = in_field(truth["sky"], mosaics)
-    # the error function is for galaxies of the field: what was matched there
+    # the error function is measured with the matched sources of the field
     errors = photometry.ErrorModel.from_tables(
         QTable({"id": matched["id"], **{name: matched[f"{name}_true"] for name in bands}})[inside],
         matched[inside],

@@ -168,9 +168,9 @@ def make_mosaic(context, name):
     units = [unit for unit, e in study_exposures(config).items() if e.filter == name]
     images = [context.image(f"exposures/{unit}_cal.fits") for unit in units]
     for label, scale in (("", config.reduction.pixel_scale), ("_fine", config.highres.pixel_scale)):
-        # outliers are found once: the images come back with them masked
+        # outliers are found in the first pass, which returns the images with them masked
         drizzled, images = reducer.drizzle(images, grid_of(config, scale))
-        # the second pass: what the dithers' own meshes left
+        # second pass: background that remained after subtraction from single dithers
         mosaic, _ = reducer.subtract_background(drizzled.image)
         context.save_image(f"mosaic_{name}{label}.fits", mosaic, dq=mosaic.flags)
 

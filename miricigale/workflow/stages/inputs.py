@@ -165,7 +165,7 @@ def fit_inputs(context, _):
         photometry[name] = catalog[name]
         if own:
             error = catalog[error_column(name)].value
-            # a flux without an error is no measurement
+            # a flux without a positive error is treated as missing
             error = np.where(error > 0, error, np.nan) * catalog[error_column(name)].unit
         else:
             error = np.abs(catalog[name]) * options.catalog_error
@@ -256,7 +256,7 @@ def make_truth(context, _):
     )
     prior = config.highres.filter
     if prior in catalog.colnames:
-        # the prior image shows what was measured: each SED is scaled to it
+        # each SED is scaled to the measured flux in the band of the prior image
         fitted, measured = model.fluxes(parameters, [prior])[prior], catalog[prior]
         usable = np.isfinite(fitted) & (fitted > 0) & np.isfinite(measured) & (measured > 0)
         ratio = np.where(usable, (measured / np.where(usable, fitted, 1 * fitted.unit)).value, 1.0)

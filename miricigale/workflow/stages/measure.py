@@ -56,7 +56,7 @@ def measure_photometry(context, name):
         result = _as_yang2021(context, name)
     else:
         kernel = psf.MatchingKernel.read(context.path(f"kernel_{name}.fits"))
-        # a constant takes up what faint sources and wings left in the background
+        # the constant absorbs the light of faint sources and of wings in the background
         result = photometry.ForcedPhotometer(
             kernel, fit_background=True, n_threads=context.n_threads
         ).measure(

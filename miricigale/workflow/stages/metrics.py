@@ -173,7 +173,7 @@ def _light(galaxies, bands, area):
             light, error = integrated_light(flux, area, wave * u.um)
             published = {"published": value, "down": down, "up": up, "reference": reference}
             here = {"n": len(flux), "light": light.value, "light_err": error.value}
-            # of no source there is no error either
+            # without sources the error is undefined too
             here |= {} if len(flux) else {"light": np.nan, "light_err": np.nan}
             rows.append({"band": name, "wavelength": wave, "least": least, **here, **published})
     return rows
@@ -212,7 +212,7 @@ def study_metrics(config, tables, area):
         "area": float(area.to_value(u.arcmin**2)),
         "as_paper": as_paper(config),
         "detections": detection_counts(tables.detections, bands),
-        # of one band there are no two
+        # with a single band, detections in that band are counted
         "n_bands_detected": min(2, len(bands)),
         "bands": {},
         "detected": [],

@@ -79,7 +79,7 @@ def field_figure(images, prior, names):
     if color:
         parts = zip(("blue", "green", "red"), labels, strict=False)
         title = ", ".join(f"{label} {color}" for color, label in parts)
-        # the noise of single pixels would be a grain of all colors
+        # binned, to reduce the noise of single pixels in the color image
         planes = [_binned(plane, 2) for plane in planes]
         options = {"stretch": 4.0, "softening": 7.0, "title": title}
         plot_color(*planes[::-1], ax=axes[1], pixel_scale=2 * _scale(images[0]), **options)
@@ -106,9 +106,9 @@ def residual_figure(images, names, *, size=220):
     """
     panel = WIDTH / 3
     figure, axes = new_figure(len(images), 3, size=(panel, 0.8 * panel))
-    # the model goes on where nothing was exposed
+    # the model also covers pixels that were not exposed
     model = np.where(np.isfinite(_filled(images[0][0])), _filled(images[0][1]), 0.0)
-    # where the model has most light: the part that tests deblending
+    # the brightest part of the model, where deblending matters most
     rows, columns = np.arange(0, model.shape[0], 60), np.arange(0, model.shape[1], 60)
     light = np.sqrt(np.clip(model, 0, None))
     smooth = np.add.reduceat(np.add.reduceat(light, rows, axis=0), columns, axis=1)

@@ -107,7 +107,7 @@ def measure_point_sources(context, name):
     options, prior = config.point_sources, config.highres.filter
     exposure = next(e for e in study_exposures(config).values() if e.filter == name)
     flux = options.signal_to_noise * depth.scaled_limit(name, exposure.exposure_time, n_sigma=1.0)
-    # own streams: these exposures are not those of the study
+    # random streams other than those of the exposures of the study
     seed = (context.seed + text_key(f"points/{name}")) % 2**63
     catalog = point_catalog(exposure, flux, prior, spacing=options.spacing, seed=seed)
     _, cal = expose_and_reduce(config, exposure, catalog, seed=seed, n_threads=context.n_threads)
@@ -143,7 +143,7 @@ def measure_point_sources(context, name):
         table[column] = np.where(index >= 0, measured[column][index].value, np.nan) * u.uJy
     table["flags"] = np.where(index >= 0, np.asarray(measured["flags"])[index], 0)
     table["in_field"] = in_field(table["sky"], [mosaic])
-    # the paper's two factors: ours must leave the image as it is
+    # the two factors of Yang et al. 2021; they are reported and not applied
     blur, inside = mosaic_psf(config, name, scale), np.asarray(table["in_field"])
     factors = {"f_aper": photometry.aperture_correction(blur, STAMP_RADIUS)}
     if np.any(inside):

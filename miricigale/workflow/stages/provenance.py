@@ -167,7 +167,7 @@ def catalog_facts(config, catalog):
     """
     options = config.catalog
     bundled = options.source in resources()
-    # where a user's file lies is no part of the result
+    # the folder of a user's file is not part of the result
     source = f"{options.source}: {resource(options.source).title}" if bundled else (
         f"{Path(options.source).name}, the user's file")  # fmt: skip
     bands = catalog_bands(catalog)
