@@ -13,7 +13,7 @@ from miricigale.photometry.detection import detect_sources
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.sep_tools import background as sep_background
-from miricigale.utils.units import ANGLE, FNU, to_array
+from miricigale.utils.units import ANGLE, FNU, positive, to_array
 
 __all__ = ["aperture_photometry", "source_extractor_photometry"]
 
@@ -46,9 +46,7 @@ def aperture_photometry(image, sky, diameter, *, local_background=None):
         If the diameter is not positive.
     """
     arrays = image_arrays(image, "image")
-    size = float(to_array(diameter, ANGLE, "diameter"))
-    if not size > 0:
-        raise argument_error("diameter", "positive", diameter)
+    size = positive(diameter, ANGLE, "diameter")
     scale = pixel_scale(image.wcs)
     radius = size / 2 / scale
     xy = np.stack(arrays.wcs.world_to_pixel(sky), axis=-1).reshape(-1, 2)

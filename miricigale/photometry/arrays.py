@@ -33,55 +33,29 @@ _MICRO = 1e12
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ImageArrays:
-    """
-    An image as arrays of flux per pixel.
+    """An image as arrays of flux per pixel."""
 
-    Attributes
-    ----------
-    flux, sigma : `~numpy.ndarray`, shape (ny, nx)
-        Data and noise in uJy per pixel; zero and infinite where not usable.
-    usable : bool `~numpy.ndarray`, shape (ny, nx)
-        False where masked, not finite or without noise.
-    area : `~numpy.ndarray`, shape (ny, nx)
-        uJy per MJy/sr: the solid angle of each pixel.
-    wcs : `~astropy.wcs.WCS`
-        The image's coordinates.
-    measured_noise : bool
-        Whether sigma was measured on the image for want of an uncertainty.
-    """
-
+    #: (ny, nx): Data and noise in uJy per pixel; zero and infinite where not usable.
     flux: np.ndarray
     sigma: np.ndarray
-    usable: np.ndarray
-    area: np.ndarray
-    wcs: object
-    measured_noise: bool
+    usable: np.ndarray  # (ny, nx): False where masked, not finite or without noise.
+    area: np.ndarray  # (ny, nx): uJy per MJy/sr: the solid angle of each pixel.
+    wcs: object  # The image's coordinates.
+    measured_noise: bool  # Whether sigma was measured on the image for want of an uncertainty.
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FitArrays:
-    """
-    An image as templates are fitted to it, in single precision: images can be large.
+    """An image as templates are fitted to it, in single precision: images can be large."""
 
-    Attributes
-    ----------
-    flux : float32 `~numpy.ndarray`, shape (ny, nx)
-        Data in uJy per pixel, zero where not usable.
-    inverse_sigma : float32 `~numpy.ndarray`, shape (ny, nx)
-        Inverse of the noise, zero where not usable.
-    usable, area, wcs, measured_noise
-        As for `ImageArrays`.
-    scratch : path-like or None
-        Folder of files that images are kept in; in memory if None.
-    """
-
-    flux: np.ndarray
-    inverse_sigma: np.ndarray
+    flux: np.ndarray  # (ny, nx): Data in uJy per pixel, zero where not usable.
+    inverse_sigma: np.ndarray  # (ny, nx): Inverse of the noise, zero where not usable.
+    #: As for `ImageArrays`.
     usable: np.ndarray
     area: np.ndarray
     wcs: object
     measured_noise: bool
-    scratch: object = None
+    scratch: object = None  # Folder of files that images are kept in; in memory if None.
 
     def new(self, dtype=np.float32):
         """A new image of zeros."""
@@ -150,18 +124,9 @@ def image_arrays(image, name):
 
 def fit_arrays(image, name, scratch=None):
     """
-    Take a `~astropy.nddata.CCDData` apart, for a fit of templates.
+    Take a `~astropy.nddata.CCDData` apart for a fit of templates; see `image_arrays`.
 
-    Parameters
-    ----------
-    image, name
-        As for `image_arrays`, whose errors are raised.
-    scratch : path-like, optional
-        Folder of files that images are kept in, if not in memory.
-
-    Returns
-    -------
-    arrays : `FitArrays`
+    ``scratch`` is a folder of files that images are kept in, if not in memory.
     """
     data, noise, usable = _checked(image, name)
     flux, inverse, area = (_new_image(usable.shape, np.float32, scratch) for _ in range(3))
@@ -234,23 +199,9 @@ def fine_wcs(image_wcs, shape, scale):
 
 def sky_pixels(sky, wcs, shape, margin):
     """
-    Pixel positions of those coordinates that are on or near an image.
+    Pixels (x, y) of those coordinates that are on or near an image, shape (n, 2).
 
-    Parameters
-    ----------
-    sky : `~astropy.coordinates.SkyCoord`, shape (n,)
-        Positions.
-    wcs : `~astropy.wcs.WCS`
-        The image's coordinates.
-    shape : (int, int)
-        The image's shape.
-    margin : float
-        Rim in pixels.
-
-    Returns
-    -------
-    xy : `~numpy.ndarray`, shape (n, 2)
-        NaN for positions outside of the image and its rim.
+    NaN for positions outside of the image, of a shape, and of a rim of ``margin`` pixels.
     """
     xy = np.full((len(sky), 2), np.nan)
     ny, nx = shape
@@ -269,21 +220,10 @@ def sky_pixels(sky, wcs, shape, margin):
 
 def local_maps(xy, half, image_wcs, grid_wcs):
     """
-    Quadratic maps from pixel offsets on an image to positions on a finer grid.
+    Quadratic maps from pixel offsets on an image to positions on a finer grid, shape (n, 2, 6).
 
-    Parameters
-    ----------
-    xy : `~numpy.ndarray`, shape (n, 2)
-        Image positions about which the maps expand.
-    half : `~numpy.ndarray`, shape (n,)
-        Offset in pixels at which the map is exact.
-    image_wcs, grid_wcs : `~astropy.wcs.WCS`
-        The two grids.
-
-    Returns
-    -------
-    poly : `~numpy.ndarray`, shape (n, 2, 6)
-        Coefficients of 1, u, v, u^2, u v, v^2 for x and y on the grid.
+    Coefficients of 1, u, v, u^2, u v, v^2 for x and y on the grid. They expand about the image positions
+    ``xy``, (n, 2), and are exact at offsets of ``half`` pixels, (n,).
     """
     step = np.maximum(np.asarray(half, float), 2.0)
     u3, v3 = np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0])

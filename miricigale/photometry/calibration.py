@@ -8,7 +8,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.units import SURFACE_BRIGHTNESS
+from miricigale.utils.units import SURFACE_BRIGHTNESS, ab_quantity
 
 __all__ = ["calibration", "parsed_unit"]
 
@@ -28,17 +28,9 @@ _BASES = (u.electron, u.ct, u.adu, u.DN, u.ph)
 
 def parsed_unit(text):
     """
-    The unit that a header's text means.
+    The unit that a header's text means, such as ``10.0*nanoJansky`` or ``ELECTRONS/S``.
 
-    Parameters
-    ----------
-    text : str
-        Such as ``MJy/sr``, ``10.0*nanoJansky`` or ``ELECTRONS/S``.
-
-    Returns
-    -------
-    unit : `~astropy.units.Unit` or None
-        Without pixels, as values are of one; None if it means none.
+    Without pixels, as values are of one; None if it means none.
     """
     plain = text
     for pattern, name in _COUNTS:
@@ -93,11 +85,10 @@ def calibration(path, text, zero_point, keywords):
                     )
                 return unit.to(target) * target, f"unit {unit}"
     if zero_point is not None:
-        zero = zero_point
-        zero = float(zero.to_value(u.ABmag) if hasattr(zero, "unit") else zero)
+        zero = ab_quantity(zero_point).to(u.ABmag)
         if not np.isfinite(zero):
             raise argument_error("zero_point", "a finite AB magnitude", zero_point)
-        return (zero * u.ABmag).to(u.MJy), f"zero point {zero:g} AB"
+        return zero.to(u.MJy), f"zero point {zero.value:g} AB"
     if unit is None or unit.is_equivalent(u.dimensionless_unscaled):
         msg = (
             f"{path} must state the unit of its pixels: 'unit' such as 'MJy/sr' or '10 nJy', or "

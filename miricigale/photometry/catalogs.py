@@ -18,17 +18,7 @@ OPTIONAL = ("flux", "components")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CatalogSources:
-    """
-    What a catalogue says of its sources.
-
-    Attributes
-    ----------
-    id : `~numpy.ndarray`, shape (n,)
-    sky : `~astropy.coordinates.SkyCoord`, shape (n,)
-        ICRS.
-    label, flux, components : `~numpy.ndarray`, shape (n,), or None
-        None where the catalogue has no such column.
-    """
+    """What a catalogue says of its sources: arrays of shape (n,), None for columns that it does not have."""
 
     id: np.ndarray
     sky: SkyCoord
@@ -43,16 +33,7 @@ class CatalogSources:
 
 def catalog_sources(catalog):
     """
-    Read the columns of a catalogue.
-
-    Parameters
-    ----------
-    catalog : `~astropy.table.QTable`
-        With the column ``sky``.
-
-    Returns
-    -------
-    sources : `CatalogSources`
+    Read the columns of a catalogue with ``sky``.
 
     Raises
     ------

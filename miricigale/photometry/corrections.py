@@ -2,6 +2,7 @@
 
 import astropy.units as u
 import numpy as np
+from astropy.stats import mad_std
 from astropy.table import QTable
 
 from miricigale.photometry.aperture import _circle_sums
@@ -56,7 +57,7 @@ def encircled_flux(image, sky, flux, radii):
     if not np.isfinite(values).any(axis=1).all():
         raise argument_error("sky", "positions whose apertures are on the image", "none")
     median = np.nanmedian(values, axis=1)
-    scatter = 1.4826 * np.nanmedian(np.abs(values - median[:, None]), axis=1)
+    scatter = mad_std(values, axis=1, ignore_nan=True)
     return QTable(
         {"radius": radius * ANGLE, "median": median, "scatter": scatter, "values": values}
     )

@@ -16,27 +16,16 @@ RIM = 8
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Cutout:
-    """
-    The light of one source on the fine grid, before convolution, of unit total.
+    """The light of one source on the fine grid, before convolution, of unit total."""
 
-    Attributes
-    ----------
-    data : `~numpy.ndarray`, shape (h, w)
-        Light to be convolved.
-    origin : (int, int)
-        Fine pixel (y, x) of its corner.
-    noise : float
-        Sum of the noise variances of the light, for the errors-in-variables correction.
-    convolved : bool
-        Whether ``data`` has the sharp PSF already (a cutout) or not (a profile).
-    rest : `Cutout` or None
-        What is added to a profile: the image less the profile, which has the sharp PSF.
-    """
-
-    data: np.ndarray
-    origin: tuple
+    data: np.ndarray  # (h, w): Light to be convolved.
+    origin: tuple  # Fine pixel (y, x) of its corner.
+    #: Sum of the noise variances of the light, for the errors-in-variables correction.
     noise: float = 0.0
+    #: Whether ``data`` has the sharp PSF already (a cutout) or not (a profile).
     convolved: bool = True
+    #: What is added to a profile: the image less the profile, which has the sharp PSF; None
+    #: without.
     rest: "Cutout | None" = None
 
     @property
@@ -65,11 +54,9 @@ def own_segments(segmentation, labels, xy):
 
     Returns
     -------
-    label : int `~numpy.ndarray`, shape (n,)
-        The source's own label, 0 if it has none.
-    flags : int `~numpy.ndarray`, shape (n,)
-        ``NO_SEGMENT`` and ``SHARED_SEGMENT``. Of several sources on a segment the one
-        nearest to the segment's middle owns it.
+    label, flags : int `~numpy.ndarray`, shape (n,)
+        The source's own label, 0 if it has none; ``NO_SEGMENT`` and ``SHARED_SEGMENT``. Of several
+        sources on a segment the one nearest to its middle owns it.
     """
     ny, nx = segmentation.shape
     x, y = np.rint(np.where(np.isfinite(xy), xy, -1)).astype(int).T
@@ -94,22 +81,11 @@ def own_segments(segmentation, labels, xy):
 
 def sersic_cutouts(rows, xy, jacobian):
     """
-    Draw Sersic profiles on the fine grid.
+    Draw Sersic profiles on the fine grid: a `Cutout` for each source, None for points.
 
-    Parameters
-    ----------
-    rows : `~numpy.ndarray`, shape (n, 4)
-        Half-light radius (arcsec), Sersic index, axis ratio and position angle (rad);
-        NaN for a point source.
-    xy : `~numpy.ndarray`, shape (n, 2)
-        Positions on the fine grid.
-    jacobian : `~numpy.ndarray`, shape (2, 2)
-        Fine pixels per arcsec, ``[dx, dy] = jacobian @ [east, north]``.
-
-    Returns
-    -------
-    cutout : list of `Cutout` or None
-        None for point sources. The profile is cut at the isophote of 99.5 % of the light.
+    ``rows``, (n, 4), are half-light radius (arcsec; NaN for a point), index, axis ratio and position angle
+    (rad), ``xy``, (n, 2), positions on the grid, ``jacobian`` its pixels per arcsec, ``[dx, dy] = jacobian
+    @ [east, north]``. A profile is cut at the isophote of 99.5 % of the light.
     """
     found = []
     for (radius, index, ratio, angle), (x, y) in zip(rows, xy, strict=True):

@@ -17,7 +17,7 @@ from miricigale.utils.meta import provenance
 from miricigale.utils.sep_tools import background as sep_background
 from miricigale.utils.sep_tools import extract
 from miricigale.utils.tables import Flags, described_table
-from miricigale.utils.units import ANGLE, FNU, to_array
+from miricigale.utils.units import ANGLE, FNU, positive
 
 __all__ = [
     "DETECTION_PRESETS",
@@ -289,10 +289,7 @@ def _prepared(image, preset, background, stated_on, **given):
     arrays = image_arrays(image, "image")
     ratio = 1.0
     if stated_on is not None:
-        stated = float(to_array(stated_on, ANGLE, "stated_on"))
-        if not stated > 0:
-            raise argument_error("stated_on", "positive", stated_on)
-        ratio = stated / pixel_scale(arrays.wcs)
+        ratio = positive(stated_on, ANGLE, "stated_on") / pixel_scale(arrays.wcs)
         settings = settings.on_pixels(ratio)
     if background is not None:
         box = max(1, round(background[0] * ratio))

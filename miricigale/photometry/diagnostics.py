@@ -15,30 +15,17 @@ __all__ = ["Diagnostics", "diagnose", "source_flags"]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Diagnostics:
-    """
-    A fit held against its image.
+    """A fit held against its image."""
 
-    Attributes
-    ----------
-    model, residual : `~numpy.ndarray`, shape (ny, nx)
-        uJy per pixel; the residual is zero where the image is not usable.
-    correlation : `~numpy.ndarray` or None
-        Of the noise; None where it is taken as white.
-    chi2, residual_fraction : `~numpy.ndarray`, shape (n,)
-        Of each row of the bank; NaN where not fitted, and for second components.
-    poor : bool `~numpy.ndarray`, shape (n,)
-        Whether chi2 is too large for noise.
-    peaks : `~miricigale.photometry.residual_sources.ResidualPeaks`
-        Light that no template explains.
-    """
-
+    #: (ny, nx): uJy per pixel; the residual is zero where the image is not usable.
     model: np.ndarray
     residual: np.ndarray
-    correlation: np.ndarray | None
+    correlation: np.ndarray | None  # Of the noise; None where it is taken as white.
+    #: (n,): Of each row of the bank; NaN where not fitted, and for second components.
     chi2: np.ndarray
     residual_fraction: np.ndarray
-    poor: np.ndarray
-    peaks: ResidualPeaks
+    poor: np.ndarray  # (n,): Whether chi2 is too large for noise.
+    peaks: ResidualPeaks  # Light that no template explains.
 
 
 def diagnose(fit, xy):

@@ -14,7 +14,7 @@ _SHRINK = (1.0, 1 - 1e-9, 1 - 1e-6, 1 - 1e-4, 0.999, 0.99, 0.95, 0.9, 0.8, 0.5, 
 
 def correlated_draws(covariance, keys, size, seed):
     """
-    Draw from normal distributions of zero mean with a sparse covariance.
+    Draw from normal distributions of zero mean with a sparse covariance, shape (size, m).
 
     Parameters
     ----------
@@ -23,14 +23,8 @@ def correlated_draws(covariance, keys, size, seed):
     keys : sequence of tuple, length m
         What each row's random stream is for (see `~miricigale.utils.random.stream`): a row that
         is correlated with no other has the same draws whatever other rows there are.
-    size : int
-        Number of draws.
-    seed : int
-        Seed.
-
-    Returns
-    -------
-    draws : `~numpy.ndarray`, shape (size, m)
+    size, seed : int
+        Number of draws, and their seed.
 
     Notes
     -----

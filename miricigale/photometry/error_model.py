@@ -18,56 +18,15 @@ from miricigale.photometry.error_curves import (
     measured_curve,
     same_rows,
 )
+from miricigale.photometry.surveys import YANG2021_DEPTHS, fractional_error
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.meta import provenance
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.unified import read_write
-from miricigale.utils.units import FNU, to_array
+from miricigale.utils.units import FNU, ab_quantity, to_array
 
-__all__ = ["YANG2021_DEPTHS", "ErrorModel"]
-
-#: 5-sigma AB depths of the paper's 15 existing bands (after Stefanon 2017 and FIDEL).
-YANG2021_DEPTHS = types.MappingProxyType(
-    {
-        "megacam.u": 27.1,
-        "megacam.g": 27.3,
-        "megacam.r": 27.2,
-        "megacam.i": 27.0,
-        "megacam.z": 26.1,
-        "acs.f606w": 28.8,
-        "acs.f814w": 28.2,
-        "wfc3.f125w": 27.6,
-        "wfc3.f140w": 26.8,
-        "wfc3.f160w": 27.6,
-        "irac.ch1": 23.9,
-        "irac.ch2": 24.2,
-        "irac.ch3": 22.5,
-        "irac.ch4": 22.8,
-        "mips.24": 19.3,
-    }
-)
-
-
-def fractional_error(name):
-    """
-    Part of the flux that the paper adds to the error of an existing band, in quadrature.
-
-    Parameters
-    ----------
-    name : str
-        Filter.
-
-    Returns
-    -------
-    fraction : float
-        0.10 for IRAC and MIPS, 0.03 otherwise.
-
-    References
-    ----------
-    Yang et al. 2021, ApJ 908, 144.
-    """
-    return 0.10 if name.startswith(("irac", "mips")) else 0.03
+__all__ = ["ErrorModel"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -196,8 +155,7 @@ class ErrorModel:
         """
         curves = {}
         for name, depth in depths.items():
-            depth = depth if hasattr(depth, "unit") else float(depth) * u.ABmag
-            limit = float(depth.to_value(FNU))
+            limit = ab_quantity(depth).to_value(FNU)
             part = fractional.get(name, 0.0) if isinstance(fractional, dict) else fractional
             if not (np.isfinite(limit) and limit > 0):
                 raise argument_error("depths", "finite depths", f"{depth} for {name!r}")
@@ -209,7 +167,7 @@ class ErrorModel:
     @classmethod
     def yang2021(cls):
         """
-        Errors of the paper's 15 existing bands.
+        Errors of 15 existing bands like the paper's; depths and fractions are the package's choice.
 
         Returns
         -------

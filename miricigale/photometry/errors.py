@@ -190,12 +190,12 @@ def _reach(block, grown):
 
 def normal_matrix(bank, inverse_sigma, images=()):
     """
-    Build the whitened normal equations.
+    Build the whitened normal equations of the templates of a bank.
 
     Parameters
     ----------
     bank : `~miricigale.photometry.templates.TemplateBank`
-        Templates.
+        n templates.
     inverse_sigma : `~numpy.ndarray`, shape (ny, nx)
         1 / sigma, zero where masked.
     images : list of `~numpy.ndarray`, shape (ny, nx)
@@ -206,10 +206,8 @@ def normal_matrix(bank, inverse_sigma, images=()):
     matrix : `~scipy.sparse.csr_array`, shape (n, n)
         Products of the whitened templates.
     projection : `~numpy.ndarray`, shape (n, len(images))
-    power : `~numpy.ndarray`, shape (n,)
-        Sums of squares of the templates without weights.
-    light : `~numpy.ndarray`, shape (n, 2)
-        Sums of the templates inside the image, and on usable pixels.
+    power, light : `~numpy.ndarray`, shape (n,) and (n, 2)
+        Sums of squares of the templates without weights; their sums inside the image, and on usable pixels.
     """
     n = len(bank.order)
     pairs = _core.find_pairs(bank.box)
@@ -225,23 +223,10 @@ def normal_matrix(bank, inverse_sigma, images=()):
 
 def sandwich_matrix(bank, inverse_sigma, correlation, images=()):
     """
-    Build A^T W C W A, what the correlated noise does to the right-hand side.
+    Build A^T W C W A, (n, n), and its projection: what correlated noise does to the right-hand side.
 
-    Parameters
-    ----------
-    bank, inverse_sigma, images
-        As in `normal_matrix`.
-    correlation : `~numpy.ndarray`, shape (2 m + 1, 2 m + 1)
-        Covariance of the whitened noise by separation.
-
-    Returns
-    -------
-    matrix : `~scipy.sparse.csr_array`, shape (n, n)
-    projection : `~numpy.ndarray`, shape (n, len(images))
-
-    Notes
-    -----
-    Stamps are convolved with the correlation by transforms in single precision, that of the
+    ``correlation``, (2 m + 1, 2 m + 1), is the covariance of the whitened noise by separation; the rest is as
+    in `normal_matrix`. Stamps are convolved with it by transforms in single precision, that of the
     correlation made once for each padded shape.
     """
     n = len(bank.order)
@@ -287,21 +272,9 @@ def _spread_by(correlation, bank):
 
 def cross_matrix(bank, other, inverse_sigma, correlation=None):
     """
-    Products of the whitened stamps of two banks.
+    Products, (n, m), of the whitened stamps of two banks.
 
-    Parameters
-    ----------
-    bank, other : `~miricigale.photometry.templates.TemplateBank`
-        Of n and m stamps.
-    inverse_sigma : `~numpy.ndarray`, shape (ny, nx)
-        1 / sigma, zero where masked.
-    correlation : `~numpy.ndarray`, optional
-        Covariance of the whitened noise by separation, with which the other bank's stamps are
-        convolved.
-
-    Returns
-    -------
-    matrix : `~scipy.sparse.csr_array`, shape (n, m)
+    With a ``correlation`` (as of `sandwich_matrix`) the other bank's stamps are convolved with it.
     """
     rows, columns, values = [], [], []
     spread = None if correlation is None else _spread_by(correlation, other)
@@ -343,25 +316,16 @@ class LinearFit:
     """
     Least squares for sparse sources plus a few parameters of the whole image.
 
-    Attributes
-    ----------
-    matrix : sparse array, shape (n, n)
-        Normal matrix of the sources.
-    rhs : `~numpy.ndarray`, shape (n,)
-    border : `~numpy.ndarray`, shape (n, g)
-        Products of sources and common parameters.
-    corner, corner_rhs : `~numpy.ndarray`, shape (g, g) and (g,)
-        The common parameters' own part.
-
     Notes
     -----
     The common parameters are eliminated by their Schur complement, so that the sparse
     factor is that of the sources alone.
     """
 
-    matrix: object
-    rhs: np.ndarray
-    border: np.ndarray
+    matrix: object  # (n, n): Normal matrix of the sources.
+    rhs: np.ndarray  # (n,)
+    border: np.ndarray  # (n, g): Products of sources and common parameters.
+    #: (g, g) and (g,): The common parameters' own part.
     corner: np.ndarray
     corner_rhs: np.ndarray
 

@@ -17,19 +17,8 @@ def legendre_terms(x, y, shape, order):
     """
     Products of Legendre polynomials up to a total order, of size 1 at most on an image.
 
-    Parameters
-    ----------
-    x, y : array_like
-        Positions in pixels, of shapes that broadcast.
-    shape : (int, int)
-        Shape (ny, nx) of the image, whose edges are at -1 and 1.
-    order : int
-        Largest sum of the two orders.
-
-    Returns
-    -------
-    terms : list of `~numpy.ndarray`
-        ``(order + 1) (order + 2) / 2`` of the shape of ``x * y``, the constant first.
+    Positions are in pixels, ``shape`` is that of the image, (ny, nx), whose edges are at -1 and 1. A list of
+    ``(order + 1) (order + 2) / 2`` arrays of the shape of ``x * y``, the constant first.
     """
     u, v = (
         2.0 * np.asarray(a, float) / n - (n - 1) / n

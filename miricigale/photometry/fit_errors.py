@@ -19,26 +19,14 @@ _CORE, _HALO = 18.0, 6.0
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Covariances:
-    """
-    Errors of the fitted rows.
+    """Errors of the fitted rows."""
 
-    Attributes
-    ----------
-    noise, template : sparse array, shape (n, n)
-        By the image's noise, and by what is not known of the templates.
-    psf : `~numpy.ndarray`, shape (n,)
-        Errors by the PSF, which is the same for all.
-    common : `~numpy.ndarray`, shape (g, g)
-        Of the common parameters.
-    blending : `~numpy.ndarray`, shape (n,)
-        Formal error over that of the source alone.
-    """
-
+    #: (n, n): By the image's noise, and by what is not known of the templates.
     noise: object
     template: object
-    psf: np.ndarray
-    common: np.ndarray
-    blending: np.ndarray
+    psf: np.ndarray  # (n,): Errors by the PSF, which is the same for all.
+    common: np.ndarray  # (g, g): Of the common parameters.
+    blending: np.ndarray  # (n,): Formal error over that of the source alone.
 
 
 def fit_covariances(fit, correlation=None):

@@ -12,24 +12,21 @@ import numpy as np
 
 from miricigale.photometry import _core
 from miricigale.photometry.arrays import (
-    fine_wcs,
     fit_arrays,
     image_arrays,
-    local_maps,
     pixel_scale,
-    sky_pixels,
 )
 from miricigale.photometry.catalogs import catalog_sources
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.packaging import CatalogRows, package
 from miricigale.photometry.passes import fit_image
+from miricigale.photometry.placement import Placement
 from miricigale.photometry.sky_noise import warn_of_background
 from miricigale.photometry.sources import SourceTemplates
-from miricigale.photometry.templates import BankSources, FineTemplates, TemplateBank
 from miricigale.psf import KernelField
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.parallel import single_threaded, thread_count
-from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
 
 __all__ = ["ForcedPhotometer"]
 
@@ -201,9 +198,7 @@ class ForcedPhotometer:
         for name in ("max_shift", "radius"):
             value = getattr(self, name)
             if value is not None:
-                if not float(to_array(value, ANGLE, name)) > 0:
-                    raise argument_error(name, "positive", value)
-                changed[name] = u.Quantity(value, ANGLE)
+                changed[name] = positive(value, ANGLE, name) * ANGLE
         if self.scratch is not None and not os.path.isdir(self.scratch):
             raise argument_error("scratch", "a folder that is there", self.scratch)
         # the kernel that all have in common: the mean, with PSFs in any case
@@ -265,7 +260,7 @@ class ForcedPhotometer:
             raise TypeError(msg)
         else:
             sources = templates
-        place = self._place(arrays, sources.sky)
+        place = Placement.of(self, arrays, sources.sky)
         if len(sources.id) and not len(place.near):
             msg = (
                 f"none of the {len(sources.id)} sources is on or near 'image': nothing is measured"
@@ -281,9 +276,9 @@ class ForcedPhotometer:
         name = image.meta.get("filter", image.meta.get("FILTER"))
         meta |= {} if name is None else {"filter": str(name)}
         with self._executor() as executor:
-            grid = self._grid(arrays, templates)
-            bank = self._bank(arrays, rows.xy[rows.near], place, templates, executor)
-            result = package(*fit_image(arrays, bank, self, rows, grid), rows, meta)
+            bank = place.bank(rows.near, templates, executor)
+            found = fit_image(arrays, bank, self, rows, place.grid(templates))
+            result = package(*found, rows, meta)
         if not self.fit_background:
             warn_of_background(result, self.mean_kernel)
         return result
@@ -315,12 +310,12 @@ class ForcedPhotometer:
         flux = to_array(flux, FNU, "flux", ndim=1)
         if len(flux) != len(templates):
             raise argument_error("flux", f"{len(templates)} fluxes, one for each source", len(flux))
-        place = self._place(arrays, templates.sky)
+        place = Placement.of(self, arrays, templates.sky)
         near = templates[place.near]
         self._check_grid(near)
         model = np.zeros(arrays.flux.shape)
         with self._executor() as executor:
-            bank = self._bank(arrays, place.xy[place.near], place, near, executor)
+            bank = place.bank(place.near, near, executor)
             values = flux[place.near][bank.order]
             for block in bank.blocks():
                 some = values[block.first : block.last]
@@ -332,21 +327,6 @@ class ForcedPhotometer:
         """Threads to work with, None for one alone; linear algebra keeps to one each."""
         with concurrent.futures.ThreadPoolExecutor(self.n_threads) as pool, single_threaded():
             yield pool if self.n_threads > 1 else None
-
-    def _grid(self, arrays, templates):
-        """The grid on which templates are made."""
-        if templates.wcs is not None:
-            return templates.wcs
-        scale = self.mean_kernel.pixel_scale.to_value(ANGLE)
-        return fine_wcs(arrays.wcs, arrays.flux.shape, scale)
-
-    def _place(self, arrays, sky):
-        """Where the sources are on an image, and which are on or near it."""
-        scale, shape = pixel_scale(arrays.wcs), arrays.flux.shape
-        fine_scale = self.mean_kernel.pixel_scale.to_value(ANGLE)
-        margin = (self.mean_kernel.target.shape[0] // 2 + 1) * fine_scale / scale
-        xy = sky_pixels(sky, arrays.wcs, shape, margin)
-        return _Place(scale, margin, xy, np.flatnonzero(np.isfinite(xy[:, 0])))
 
     def _rows(self, sources, place, templates):
         """The catalogue as the fit takes it, and the templates of its sources that are near."""
@@ -371,37 +351,6 @@ class ForcedPhotometer:
             double=None if sources.components is None else sources.components == 2,
         )
         return rows, templates
-
-    def _bank(self, arrays, xy, place, templates, executor):
-        """The templates of sources at some pixels of an image."""
-        shape, grid = arrays.flux.shape, self._grid(arrays, templates)
-        fine_xy = np.stack(grid.world_to_pixel(templates.sky), axis=-1).reshape(-1, 2)
-        poly = local_maps(xy, np.full(len(xy), place.margin / 2), arrays.wcs, grid)
-        sides = None
-        if self.integrate:
-            middle = np.array([[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
-            sides = local_maps(middle, [place.margin / 2], arrays.wcs, grid)[0, :, 1:3].T
-        kernels, weigh = [self.mean_kernel], None
-        if isinstance(self.kernel, KernelField):
-            kernels = self.kernel.kernels
-
-            def weigh(xy):
-                return self.kernel.weights(arrays.wcs.pixel_to_world(*xy.T).icrs)
-
-        fine = FineTemplates(
-            np.stack([one.array for one in kernels]),
-            np.stack([one.target for one in kernels]),
-            sides,
-        )
-        return TemplateBank(
-            fine,
-            BankSources(templates.drawn(grid, fine_xy), fine_xy, xy, poly),
-            shape,
-            radius=self.reach / place.scale,
-            max_bytes=self.max_bytes,
-            weigh=weigh,
-            executor=executor,
-        )
 
     def _templates(self, highres, segmentation, catalog):
         """The templates that the settings ask for."""
@@ -448,16 +397,6 @@ class ForcedPhotometer:
                     f"kernel is from one whose peak holds {peaks[1]:.3g}: is it of the same image?"
                 )
                 warnings.warn(msg, MiricigaleWarning, stacklevel=3)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Place:
-    """Pixel scale (arcsec), margin (pixels), positions (NaN for those far off), rows that are near."""
-
-    scale: float
-    margin: float
-    xy: np.ndarray
-    near: np.ndarray
 
 
 def _check_order(name, order, largest):

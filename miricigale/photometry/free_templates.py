@@ -27,32 +27,17 @@ class FreeTemplates:
 
     A change is scaled by the flux of its source, as far as it is one standard deviation; its light is
     taken off the template, so that the fluxes stay those of all light. Fixed changes belong to the template.
-
-    Attributes
-    ----------
-    fit : `~miricigale.photometry.errors.LinearFit`
-        Of the fluxes, and after them of the changes.
-    bank : `~miricigale.photometry.templates.TemplateBank`
-        The changes.
-    n : int
-        Number of fluxes.
-    basis : sparse array, shape (n + k, n + m)
-        Columns of the fit in terms of the templates and of all k changes, those that are fixed among them.
-    owner : int `~numpy.ndarray`, shape (m,)
-        Source of each change that is fitted.
-    prior : `~numpy.ndarray`, shape (n + m,)
-        Inverse variances, zero for fluxes.
-    noise : `~numpy.ndarray`, shape (n,)
-        Variance of ln flux by noise in templates that are images.
     """
 
-    fit: LinearFit
-    bank: object
-    n: int
+    fit: LinearFit  # Of the fluxes, and after them of the changes.
+    bank: object  # The changes.
+    n: int  # Number of fluxes.
+    #: (n + k, n + m): Columns of the fit in terms of the templates and of all k changes, those
+    #: that are fixed among them.
     basis: object
-    owner: np.ndarray
-    prior: np.ndarray
-    noise: np.ndarray
+    owner: np.ndarray  # (m,): Source of each change that is fitted.
+    prior: np.ndarray  # (n + m,): Inverse variances, zero for fluxes.
+    noise: np.ndarray  # (n,): Variance of ln flux by noise in templates that are images.
 
     @property
     def flux(self):
@@ -104,16 +89,9 @@ class FreeTemplates:
 
     def filling(self, middle):
         """
-        What the errors of the templates add to the right-hand side.
+        What the errors of the templates add to the right-hand side, (n + m, n + m).
 
-        Parameters
-        ----------
-        middle : sparse array
-            Normal matrix of the templates, shape (n, n).
-
-        Returns
-        -------
-        filling : sparse array, shape (n + m, n + m)
+        ``middle`` is the normal matrix of the templates, (n, n).
         """
         filling = scipy.sparse.diags_array(self.prior).tocsr()
         own = np.flatnonzero(self.noise > 0)
@@ -130,21 +108,10 @@ class FreeTemplates:
 
     def sandwich(self, bank, rows, inverse_sigma, correlation, middle, border, images):
         """
-        Extend the sandwich of correlated noise.
+        Extend the sandwich of correlated noise of the templates, ``middle`` and ``border``, by the changes.
 
-        Parameters
-        ----------
-        bank, rows
-            The templates, and those rows of theirs that were fitted.
-        inverse_sigma, correlation, images
-            As in `~miricigale.photometry.errors.sandwich_matrix`.
-        middle, border
-            That of the templates.
-
-        Returns
-        -------
-        middle, border
-            That of templates and changes.
+        ``rows`` are those of the templates that were fitted; the rest is as for
+        `~miricigale.photometry.errors.sandwich_matrix`.
         """
         own, more = sandwich_matrix(self.bank, inverse_sigma, correlation, images)
         cross = cross_matrix(bank, self.bank, inverse_sigma, correlation).tocsr()[rows]

@@ -26,19 +26,9 @@ __all__ = [
 @contextlib.contextmanager
 def open_image(path, wanted):
     """
-    Open ``file.fits[EXTENSION]``.
+    Open ``file.fits[EXTENSION]``: yields its HDUs and the extension (str, int or None).
 
-    Parameters
-    ----------
-    path : path-like
-        The file, with an extension in brackets or without.
-    wanted : str
-        What it should be, for messages.
-
-    Yields
-    ------
-    hdus : `~astropy.io.fits.HDUList`
-    extension : str, int or None
+    ``wanted`` says what the file should be, for messages.
     """
     name, extension = split_extension(path)
     with open_fits(name, wanted=wanted) as hdus:
@@ -59,10 +49,6 @@ def find_image(hdus, extension, path, names):
         The file, for messages.
     names : iterable of str
         Names of extensions that are preferred to the first image.
-
-    Returns
-    -------
-    index : int
 
     Raises
     ------
@@ -96,21 +82,10 @@ def find_image(hdus, extension, path, names):
 
 def read_wcs(header, hdus):
     """
-    The celestial coordinates of an image.
+    The celestial coordinates of an image, None without any.
 
-    Parameters
-    ----------
-    header : `~astropy.io.fits.Header`
-        Of the image.
-    hdus : `~astropy.io.fits.HDUList`
-        The file, for tables of distortion and for the extension ASDF of JWST's pipeline.
-
-    Returns
-    -------
-    wcs : `~astropy.wcs.WCS` or None
-        Those of the header, or None without any. Those of the ASDF extension (a gwcs), as
-        polynomials good to 0.01 pixels, if the header has none, or those of a single exposure
-        without its distortion.
+    Those of its header; those of the extension ASDF of JWST's pipeline (a gwcs), as polynomials good to 0.01
+    pixels, if the header has none, or those of a single exposure without its distortion.
 
     Raises
     ------
@@ -145,18 +120,7 @@ def read_wcs(header, hdus):
 
 
 def is_exposure(get):
-    """
-    Whether a header is that of a single exposure of JWST (``_cal``, ``_rate``), not resampled.
-
-    Parameters
-    ----------
-    get : callable
-        Called with a keyword, returns its value or None.
-
-    Returns
-    -------
-    exposure : bool
-    """
+    """Whether a header (``get(keyword)``) is that of a single exposure of JWST, not resampled."""
     return get("S_WCS") == "COMPLETE" and get("S_RESAMP") != "COMPLETE"
 
 
@@ -180,19 +144,7 @@ def _asdf_wcs(header, hdus):
 
 
 def filter_name(get):
-    """
-    The filter that a header names.
-
-    Parameters
-    ----------
-    get : callable
-        Called with a keyword, returns its value or None.
-
-    Returns
-    -------
-    name : str or None
-        ``instrument.filter`` in lower case; None if the header does not tell.
-    """
+    """The filter that a header (``get(keyword)``) names, ``instrument.filter``; None if it does not tell."""
     instrument = str(get("INSTRUME") or "").strip().lower()
     names = [str(get(key) or "").strip().lower() for key in ("FILTER", "FILTER1", "FILTER2")]
     names = [name for name in names if name and not name.startswith("clear")]
@@ -205,19 +157,7 @@ def filter_name(get):
 
 def grid_angle(wcs, shape):
     """
-    Position angle of an image's +y axis at its middle.
-
-    Parameters
-    ----------
-    wcs : `~astropy.wcs.WCS`
-        Celestial coordinates.
-    shape : (int, int)
-        Rows and columns.
-
-    Returns
-    -------
-    angle : `~astropy.units.Quantity`
-        In deg, east of north.
+    Position angle (a quantity in deg, east of north) of an image's +y axis at its middle.
 
     Raises
     ------
@@ -238,16 +178,7 @@ def check_same_grid(wcs, reference, shape, path, reference_path, *, tolerance=0.
     """
     Refuse a map whose pixels are elsewhere on the sky than those of its image.
 
-    Parameters
-    ----------
-    wcs, reference : `~astropy.wcs.WCS`
-        Coordinates of the map and of the image.
-    shape : (int, int)
-        Rows and columns of both.
-    path, reference_path : path-like
-        Their files, for the message.
-    tolerance : float, optional
-        Largest distance in pixels, in the corners and the middle.
+    ``tolerance`` is the largest distance in pixels, in the corners and the middle; the paths are for the message.
 
     Raises
     ------

@@ -261,40 +261,18 @@ class MosaicFile:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MosaicHeader:
-    """
-    What the header of an image says.
+    """What the header of an image says."""
 
-    Attributes
-    ----------
-    index : int
-        Extension of the image.
-    shape : (int, int)
-        Rows and columns.
-    wcs : `~astropy.wcs.WCS`
-        Celestial coordinates.
-    filter : str or None
-        As ``instrument.filter`` in lower case, or as it was given.
-    pa_aper : `~astropy.units.Quantity` or None
-        Position angle of the detector's +y axis.
-    unit : str
-        Unit of the pixels as the header or the caller has it; may be empty.
-    exposure : bool
-        Whether it is a single exposure of JWST (``_cal``, ``_rate``) rather than a mosaic.
-    keywords : dict
-        Those of the photometric calibration.
-    meta : dict
-        What our own files carry, with ``filter`` and ``pa_aper`` (deg).
-    """
-
-    index: int
-    shape: tuple
-    wcs: object
-    filter: str | None
-    pa_aper: object
-    unit: str
+    index: int  # Extension of the image.
+    shape: tuple  # Rows and columns.
+    wcs: object  # Celestial coordinates.
+    filter: str | None  # As ``instrument.filter`` in lower case, or as it was given; None without.
+    pa_aper: object  # Position angle of the detector's +y axis; None without.
+    unit: str  # Unit of the pixels as the header or the caller has it; may be empty.
+    #: Whether it is a single exposure of JWST (``_cal``, ``_rate``) rather than a mosaic.
     exposure: bool
-    keywords: dict
-    meta: dict
+    keywords: dict  # Those of the photometric calibration.
+    meta: dict  # What our own files carry, with ``filter`` and ``pa_aper`` (deg).
 
 
 def _header(file, hdus, index):

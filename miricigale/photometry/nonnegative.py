@@ -15,20 +15,10 @@ _PATIENCE, _STEPS = 3, 300
 
 def nonnegative_fluxes(fit, n):
     """
-    Solve a fit again under the condition that no flux is negative; common parameters are free.
+    Solve a `LinearFit` again under the condition that no flux is negative; other parameters are free.
 
-    Parameters
-    ----------
-    fit : `~miricigale.photometry.errors.LinearFit`
-        The fit without the condition.
-    n : int
-        How many of its unknowns are fluxes; those after them have no condition.
-
-    Returns
-    -------
-    flux : `~numpy.ndarray`, shape (n,)
-        NaN, with a warning, if no solution is found in 300 steps, which happens only where the normal
-        matrix is not positive.
+    ``n`` is how many of its unknowns are fluxes. Shape (n,); NaN, with a warning, if no solution is found in 300
+    steps, which happens only where the normal matrix is not positive.
 
     Notes
     -----

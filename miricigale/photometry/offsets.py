@@ -105,10 +105,9 @@ def source_offsets(fit, residual, model, rows):
     -------
     step : `~numpy.ndarray`, shape (k, 2)
         (dx, dy) in pixels; NaN where they cannot be measured.
-    error : `~numpy.ndarray`, shape (k,)
-        1 sigma along an axis, for white noise of the size of the residuals.
-    others : `~numpy.ndarray`, shape (k,)
-        Light of others below the template, over the template's own.
+    error, others : `~numpy.ndarray`, shape (k,)
+        1 sigma along an axis, for white noise of the size of the residuals; light of others below the
+        template, over the template's own.
 
     Notes
     -----
@@ -155,18 +154,10 @@ def source_offsets(fit, residual, model, rows):
 
 def fit_offsets(arrays, bank, settings, catalog):
     """
-    Fit an image with templates at positions that follow a smooth map of offsets.
+    The `TemplateFit` of an image with templates at positions that follow a smooth map of offsets.
 
-    Parameters
-    ----------
-    arrays, bank, settings, catalog
-        As in `~miricigale.photometry.passes.fit_image`.
-
-    Returns
-    -------
-    fit : `~miricigale.photometry.template_fit.TemplateFit`
-        With the map as its ``offset_map``; where too few bright isolated sources are left, with one shift
-        of the image, and a warning.
+    Where too few bright isolated sources are left, with one shift of the image, and a warning. Parameters
+    are those of `~miricigale.photometry.passes.fit_image`.
     """
     fit, moved = TemplateFit(arrays, bank, settings), 0.0
     xy, limit = catalog.xy[catalog.near], settings.max_shift.value / fit.scale

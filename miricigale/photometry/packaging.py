@@ -24,34 +24,20 @@ __all__ = ["CatalogRows", "package"]
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class CatalogRows:
-    """
-    The sources of a catalogue, as far as they are known before the fit.
+    """The sources of a catalogue, as far as they are known before the fit."""
 
-    Attributes
-    ----------
-    id, sky, flags, template, template_snr
-        As in `~miricigale.photometry.ForcedPhotometryResult`, shape (n,).
-    xy : `~numpy.ndarray`, shape (n, 2)
-        Positions on the image; NaN far outside.
-    near : int `~numpy.ndarray`, shape (k,)
-        The sources that have a template, in the order of the bank's sources.
-    fitted : `~numpy.ndarray` of `~miricigale.photometry.shapes.FITTED`, shape (k,)
-        What is known of the shapes of these.
-    reference : `~numpy.ndarray` or None
-        Fluxes that say who is crowded; None for those that are measured.
-    double : bool `~numpy.ndarray` or None
-        Which sources have two components; None where their fits decide.
-    """
-
+    #: As in `~miricigale.photometry.ForcedPhotometryResult`, shape (n,).
     id: np.ndarray
     sky: SkyCoord
-    xy: np.ndarray
-    near: np.ndarray
     flags: np.ndarray
     template: np.ndarray
     template_snr: np.ndarray
-    fitted: np.ndarray
+    xy: np.ndarray  # (n, 2): Positions on the image; NaN far outside.
+    near: np.ndarray  # (k,): The sources that have a template, in the order of the bank's sources.
+    fitted: np.ndarray  # (k,): What is known of the shapes of these.
+    #: Fluxes that say who is crowded; None for those that are measured.
     reference: np.ndarray | None = None
+    #: Which sources have two components; None where their fits decide.
     double: np.ndarray | None = None
 
 

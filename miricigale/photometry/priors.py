@@ -148,24 +148,14 @@ def _from_segments(highres, segments, ids):
 
 def read_catalog(path):
     """
-    Ids and positions of a table in any of the usual formats.
+    Ids and positions of a table in any of the usual formats; see ``catalog`` of `read_prior`.
 
-    Parameters
-    ----------
-    path : path-like
-        As ``catalog`` of `read_prior`.
-
-    Returns
-    -------
-    sources : `~astropy.table.QTable`
-        ``id`` and ``sky``; a position that is missing is NaN.
+    A position that is missing is NaN.
 
     Raises
     ------
-    `~miricigale.utils.exceptions.DataError`
-        If the file is missing or damaged, or has no positions.
-    ValueError
-        If ids are not unique.
+    `~miricigale.utils.exceptions.DataError`, ValueError
+        If the file is missing or damaged, or has no positions; if ids are not unique.
     """
     from astropy.coordinates import SkyCoord
     from astropy.table import QTable
@@ -237,23 +227,7 @@ def _degrees(column, name, path):
 
 
 def labels_at(segments, xy):
-    """
-    The segments at positions.
-
-    Parameters
-    ----------
-    segments : int `~numpy.ndarray`, shape (ny, nx)
-        Labels, 0 for none.
-    xy : `~numpy.ndarray`, shape (n, 2)
-        Pixels; NaN if not known.
-
-    Returns
-    -------
-    label : int `~numpy.ndarray`, shape (n,)
-        0 for none.
-    inside : bool `~numpy.ndarray`, shape (n,)
-        Whether a position is on the map.
-    """
+    """The segments at pixels, (n, 2): labels (0 for none), and whether a position is on the map."""
     ny, nx = segments.shape
     column, row = np.rint(np.where(np.isfinite(xy), xy, -1.0)).T
     inside = (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
@@ -264,24 +238,11 @@ def labels_at(segments, xy):
 
 def check_labels(labels, here, what):
     """
-    Refuse labels that are those of another segmentation map.
+    Refuse labels that are those of another segmentation map, or warn of them.
 
-    Parameters
-    ----------
-    labels, here : int `~numpy.ndarray`, shape (n,)
-        The label that each source says it has, and that of the segment at its position; 0 for none.
-    what : str
-        The labels, for messages.
-
-    Raises
-    ------
-    ValueError
-        If more than half of the sources stand on another segment than theirs.
-
-    Warns
-    -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
-        If three or more and a tenth of them do.
+    ``labels`` are those that sources say they have, ``here`` those at their positions (0 for none),
+    ``what`` is the name for messages. Refused if more than half of the sources stand on another segment than
+    theirs, warned of from three and a tenth on.
     """
     both = (labels > 0) & (here > 0)
     n, wrong = (int(np.count_nonzero(one)) for one in (both, both & (labels != here)))

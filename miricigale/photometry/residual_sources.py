@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import scipy.ndimage
 import scipy.spatial
+from astropy.stats import mad_std
 
 from miricigale.utils.parallel import chunks, parallel_map
 
@@ -18,25 +19,12 @@ _LEFT_SNR, _LEFT_SHARE, _LEFT_DISTANCE, _LEFT_REACH = 5.0, 0.1, 0.7, 2.0
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ResidualPeaks:
-    """
-    Peaks of a residual image, the brightest first.
+    """Peaks of a residual image, the brightest first."""
 
-    Attributes
-    ----------
-    xy : `~numpy.ndarray`, shape (n, 2)
-        Their pixels.
-    refined : `~numpy.ndarray`, shape (n, 2)
-        Tops of the parabolas through each pixel and its neighbours.
-    flux : `~numpy.ndarray`, shape (n,)
-        As point sources that stand alone, in the residual's unit.
-    full_width : float
-        Full width at half maximum of the PSF, in pixels.
-    """
-
-    xy: np.ndarray
-    refined: np.ndarray
-    flux: np.ndarray
-    full_width: float
+    xy: np.ndarray  # (n, 2): Their pixels.
+    refined: np.ndarray  # (n, 2): Tops of the parabolas through each pixel and its neighbours.
+    flux: np.ndarray  # (n,): As point sources that stand alone, in the residual's unit.
+    full_width: float  # Full width at half maximum of the PSF, in pixels.
 
 
 def residual_peaks(residual, model, inverse_sigma, width, xy, *, new=None, executor=None):
@@ -76,11 +64,8 @@ def residual_peaks(residual, model, inverse_sigma, width, xy, *, new=None, execu
         return ResidualPeaks(np.empty((0, 2), int), np.empty((0, 2)), np.empty(0), full_width)
     # fluxes of point sources by least squares, as if each stood alone: signal over power
     snr, usable = _matched(residual, inverse_sigma, width, new, executor)
-    values = _some(snr, usable)
-    middle = np.median(values)
     # what is a thousandth of the stated noise is that of the arithmetic
-    noise = max(1.4826 * np.median(np.abs(values - middle)), 1e-3)
-    del values
+    noise = max(mad_std(_some(snr, usable)), 1e-3)
     # few pixels are left for what follows, unless the image has a background
     near = np.arange(-int(np.ceil(width)), int(np.ceil(width)) + 1)
     found = []
@@ -229,22 +214,10 @@ def _near(peaks, xy):
 
 def unexplained_neighbours(peaks, xy, flux):
     """
-    Find sources next to light that is not in the catalogue.
+    Find sources, (n,), next to light that is not in the catalogue.
 
-    Parameters
-    ----------
-    peaks : `ResidualPeaks`
-        What the fit left.
-    xy : `~numpy.ndarray`, shape (n, 2)
-        Positions of all sources.
-    flux : `~numpy.ndarray`, shape (n,)
-        Their fluxes; NaN where not measured.
-
-    Returns
-    -------
-    found : bool `~numpy.ndarray`, shape (n,)
-        Whether a peak is within two full widths at half maximum, and as a point source has more
-        than a tenth of the flux.
+    A peak is within two full widths at half maximum of these, and as a point source has more than a tenth of
+    the flux (NaN where not measured).
     """
     found = np.zeros(len(xy), bool)
     peak, source = _near(peaks, xy)
@@ -256,15 +229,7 @@ def new_sources(peaks, xy, flux):
     """
     Tell which peaks are more than what an imperfect template leaves of a bright source.
 
-    Parameters
-    ----------
-    peaks, xy, flux
-        As for `unexplained_neighbours`.
-
-    Returns
-    -------
-    new : bool `~numpy.ndarray`, shape (len(peaks.xy),)
-        False for peaks with less than a tenth of the flux of a source within two full widths.
+    False for peaks with less than a tenth of the flux of a source within two full widths.
     """
     new = np.ones(len(peaks.xy), bool)
     peak, source = _near(peaks, xy)

@@ -38,25 +38,12 @@ _HALF, _MOST, _REACH, _PERIOD = 16, 48, 4.0, 1.8
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Shape:
-    """
-    A profile that was fitted.
+    """A profile that was fitted."""
 
-    Attributes
-    ----------
-    flux : float
-        Total light.
-    parameters : `~numpy.ndarray`, shape (6,)
-        As for `~miricigale.photometry._core.shape_models`.
-    point : float
-        Probability that the source is a point.
-    covariance : `~numpy.ndarray`, shape (7, 7)
-        Of ln flux and the parameters.
-    """
-
-    flux: float
-    parameters: np.ndarray
-    point: float
-    covariance: np.ndarray
+    flux: float  # Total light.
+    parameters: np.ndarray  # (6,): As for `~miricigale.photometry._core.shape_models`.
+    point: float  # Probability that the source is a point.
+    covariance: np.ndarray  # (7, 7): Of ln flux and the parameters.
 
     @property
     def axes(self):
@@ -76,18 +63,7 @@ class Shape:
 
 
 def not_fitted(n):
-    """
-    Records of sources of whose shape nothing is known.
-
-    Parameters
-    ----------
-    n : int
-        Number of sources.
-
-    Returns
-    -------
-    fitted : `~numpy.ndarray` of `FITTED`, shape (n,)
-    """
+    """Records (`FITTED`) of n sources of whose shape nothing is known."""
     found = np.empty(n, FITTED)
     for name in FITTED.names:
         found[name] = np.nan
@@ -95,14 +71,7 @@ def not_fitted(n):
 
 
 class ShapeModels:
-    """
-    Draws light through a PSF.
-
-    Parameters
-    ----------
-    psf : `~numpy.ndarray`, shape (k, k)
-        PSF, odd and centred.
-    """
+    """Draws light through a PSF, odd and centred."""
 
     def __init__(self, psf):
         self._psf = np.asarray(psf, float)
@@ -122,18 +91,9 @@ class ShapeModels:
 
     def profiles(self, shape, parameters, derivatives=0):
         """
-        A Sersic profile of unit light and its derivatives.
+        A Sersic profile of unit light and its derivatives on a stamp, (1 + derivatives, *shape).
 
-        Parameters
-        ----------
-        shape : (int, int)
-            Shape of the stamp.
-        parameters, derivatives
-            As for `~miricigale.photometry._core.shape_models`.
-
-        Returns
-        -------
-        images : `~numpy.ndarray`, shape (1 + derivatives, *shape)
+        Parameters are those of `~miricigale.photometry._core.shape_models`.
         """
         size = _period(shape)
         return _core.shape_models(
@@ -142,20 +102,9 @@ class ShapeModels:
 
     def convolve(self, images, origin, shape):
         """
-        Bring light that is integrated over pixels to the resolution of the image.
+        Bring light, (n, h, w), that is integrated over pixels to the resolution of the image, (n, *shape).
 
-        Parameters
-        ----------
-        images : `~numpy.ndarray`, shape (n, h, w)
-            Light before convolution.
-        origin : (int, int)
-            Row and column of its corner on the stamp; what is far from the stamp does not count.
-        shape : (int, int)
-            Shape of the stamp.
-
-        Returns
-        -------
-        images : `~numpy.ndarray`, shape (n, *shape)
+        ``origin`` is the row and column of its corner on the stamp; what is far from the stamp does not count.
         """
         size = _period(shape)
         rims = [(size - n) // 2 for n in shape]
@@ -174,16 +123,7 @@ class ShapeModels:
 
 
 class ShapeFitter(ShapeModels):
-    """
-    Fits light profiles through the PSF of an image.
-
-    Parameters
-    ----------
-    psf : `~numpy.ndarray`, shape (k, k)
-        PSF, odd and centred.
-    scale : float
-        Arcsec per pixel.
-    """
+    """Fits light profiles through the PSF of an image of ``scale`` arcsec per pixel."""
 
     def __init__(self, psf, scale):
         super().__init__(psf)
@@ -195,10 +135,8 @@ class ShapeFitter(ShapeModels):
 
         Parameters
         ----------
-        data : `~numpy.ndarray`, shape (ny, nx)
-            Light of a stamp.
-        weight : `~numpy.ndarray`, shape (ny, nx)
-            Inverse of the noise, zero for pixels that do not count.
+        data, weight : `~numpy.ndarray`, shape (ny, nx)
+            Light of a stamp, and the inverse of its noise, zero for pixels that do not count.
         xy : (float, float)
             Where the source is on the stamp.
         start : `Shape`, optional
@@ -298,11 +236,8 @@ def _minimum(stamp, start, mean, width, n_free):
     """
     Levenberg-Marquardt for the light and the first parameters, with Gaussian priors.
 
-    Returns
-    -------
-    flux, parameters, evidence, covariance
-        The evidence is Laplace's, without the light's prior; the covariance is that of ln flux and the
-        free parameters. None if nothing is found.
+    Flux, parameters, evidence (Laplace's, without the light's prior) and covariance of ln flux and the free
+    parameters; None if nothing is found.
     """
     free = slice(0, n_free)
     precision = np.concatenate([[0.0], width[free] ** -2])

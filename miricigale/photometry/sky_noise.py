@@ -3,6 +3,7 @@
 import warnings
 
 import numpy as np
+from astropy.stats import mad_std
 
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.units import FNU
@@ -47,20 +48,9 @@ def filled_areas(values, usable, *, n_pixels=25):
     """
     Areas of pixels that are exactly 0 for want of data, such as the corners of drizzled images.
 
-    Parameters
-    ----------
-    values : `~numpy.ndarray`, shape (ny, nx)
-        The image.
-    usable : bool `~numpy.ndarray`, shape (ny, nx)
-        Pixels that count as data so far.
-    n_pixels : int, optional
-        Smallest connected area.
-
-    Returns
-    -------
-    filled : bool `~numpy.ndarray`, shape (ny, nx)
-        Nowhere True if the pixels beside such areas have no noise either (their median is below a
-        tenth of that of all others): then the image is a noiseless one, and 0 is its sky.
+    ``usable`` are the pixels that count as data so far, ``n_pixels`` is the smallest connected area. Nowhere True
+    if the pixels beside such areas have no noise either (their median is below a tenth of that of all
+    others): then the image is a noiseless one, and 0 is its sky.
     """
     import scipy.ndimage
 
@@ -129,7 +119,7 @@ def sky_noise(values, usable, *, width=2.0, threshold=3.5, grow=3):
 
 def _median_rms(values):
     level = float(np.median(values))
-    return level, 1.4826 * float(np.median(np.abs(values - level)))
+    return level, float(mad_std(values))
 
 
 def _median(values):
@@ -139,20 +129,10 @@ def _median(values):
 
 def warn_of_background(result, kernel):
     """
-    Say that an image had a background that was not fitted and is in the fluxes.
+    Warn if an image had a background that was not fitted and is in the fluxes.
 
-    Parameters
-    ----------
-    result : `~miricigale.photometry.ForcedPhotometryResult`
-        A measurement without a background.
-    kernel : `~miricigale.psf.MatchingKernel`
-        With which it was made.
-
-    Warns
-    -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
-        If the median of the residual between the sources adds more than the median error to the flux
-        of a point source, and is above 0.05 of the image's noise.
+    If, that is, the median of the residual between the sources adds more than the median error to the flux of a
+    point source, and is above 0.05 of the image's noise. ``kernel`` is that of the result.
     """
     residual = result.residual_image
     sigma = residual.uncertainty.array
@@ -178,20 +158,10 @@ def warn_of_background(result, kernel):
 
 def warn_of_sky(arrays, segments):
     """
-    Say that a high-resolution image has a sky that goes into the templates.
+    Warn if a high-resolution image (`ImageArrays`) has a sky that goes into the templates.
 
-    Parameters
-    ----------
-    arrays : `~miricigale.photometry.arrays.ImageArrays`
-        The image.
-    segments : int `~numpy.ndarray`, shape (ny, nx)
-        Labels, 0 for the sky.
-
-    Warns
-    -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
-        If the median beyond the segments is more than 0.03 of the light of the median segment of
-        signal-to-noise above 5.
+    If, that is, the median beyond the segments is more than 0.03 of the light of the median segment of
+    signal-to-noise above 5.
     """
     free = arrays.usable & (segments == 0)
     if np.count_nonzero(free) < 400:

@@ -16,7 +16,7 @@ from miricigale.psf import psf_mosaic
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.tables import described_table
-from miricigale.utils.units import ANGLE, FNU, to_array
+from miricigale.utils.units import ANGLE, FNU, positive
 
 __all__ = ["psf_photometry"]
 
@@ -94,13 +94,13 @@ def psf_photometry(
     )
     width = model.fwhm
     size = 4 * width if fit_size is None else fit_size
-    side = _positive(size, "fit_size") / scale
+    side = positive(size, ANGLE, "fit_size") / scale
     side = max(3, 2 * int(np.ceil((side - 1) / 2)) + 1)
     bound = None
     if max_shift is None:
         model.x_0.fixed = model.y_0.fixed = True
     else:
-        bound = _positive(max_shift, "max_shift") / scale
+        bound = positive(max_shift, ANGLE, "max_shift") / scale
     xy = sky_pixels(sky, image.wcs, arrays.flux.shape, side / 2)
     rows = np.flatnonzero(np.isfinite(xy[:, 0]))
     names = ("flux", "flux_err", "x_fit", "y_fit", "chi2", "qfit", "cfit")
@@ -159,18 +159,10 @@ def _fit(arrays, model, xy, side, bound, width, background):
 def _annulus(radii, scale):
     if radii is None:
         return None
-    inner, outer = (_positive(r, "local_background") / scale for r in radii)
+    inner, outer = (positive(r, ANGLE, "local_background") / scale for r in radii)
     if not inner < outer:
         raise argument_error("local_background", "an inner and a larger outer radius", radii)
     return LocalBackground(inner, outer)
-
-
-def _positive(value, name):
-    """An angle in arcsec."""
-    number = float(to_array(value, ANGLE, name, ndim=0))
-    if not number > 0:
-        raise argument_error(name, "positive", value)
-    return number
 
 
 def _describe_flags():

@@ -22,22 +22,13 @@ _POINT, _LINEAR = 0.05, 0.15
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Change:
-    """
-    How a template changes along one direction.
+    """How a template changes along one direction."""
 
-    Attributes
-    ----------
-    cutout : `~miricigale.photometry.cutouts.Cutout`
-        The change by one standard deviation on the fine grid, at the resolution of the image.
-    light : float
-        How much light it adds.
-    fixed : bool
-        Whether it is no deviation but the mean's: what all templates that are possible have in the mean
-        beyond the one that fits best.
-    """
-
+    #: The change by one standard deviation on the fine grid, at the resolution of the image.
     cutout: Cutout
-    light: float = 0.0
+    light: float = 0.0  # How much light it adds.
+    #: Whether it is no deviation but the mean's: what all templates that are possible have in the
+    #: mean beyond the one that fits best.
     fixed: bool = False
 
 
@@ -69,23 +60,10 @@ class TemplateChanges:
 
     def of(self, cutout, fitted, least):
         """
-        Changes of one template.
+        Changes of one template, and the variance of ln flux by noise of the pixels that are the image's.
 
-        Parameters
-        ----------
-        cutout : `~miricigale.photometry.cutouts.Cutout` or None
-            The template; None for a point.
-        fitted : record of `~miricigale.photometry.shapes.FITTED`
-            What is known of it.
-        least : float
-            Changes with less than this root of the sum of squares, over that of the template, are
-            left out.
-
-        Returns
-        -------
-        changes : list of `Change`
-        noise : float
-            Variance of ln flux by the noise of the pixels that were taken from the image.
+        ``cutout`` is the template, None for a point, ``fitted`` what is known of it. Changes with less than the
+        part ``least`` of the root of the sum of squares of the template are left out.
         """
         parameters = fitted["parameters"]
         middle = np.rint(parameters[:2])

@@ -140,10 +140,8 @@ class TemplateFit:
         """
         Let templates change as far as they are not known, and fit once more.
 
-        Parameters
-        ----------
-        fitted : `~numpy.ndarray` of `~miricigale.photometry.shapes.FITTED`, shape (k,)
-            What is known of the first sources of the bank; those after them are points.
+        ``fitted`` (`~miricigale.photometry.shapes.FITTED`, (k,)) is what is known of the bank's first sources;
+        those after them are points.
         """
         if self.fit is None or self.settings.size_scatter is None:
             return

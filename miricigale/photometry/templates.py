@@ -18,20 +18,14 @@ _PART = 250_000
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FineTemplates:
-    """
-    Convolve cutouts on the fine grid, as spline coefficients.
+    """Convolve cutouts on the fine grid, as spline coefficients."""
 
-    Attributes
-    ----------
-    kernel, target : `~numpy.ndarray`, shape (n, n) or (k, n, n), n odd
-        The matching kernel, and the PSF of the image on the fine grid; those of all places of
-        the field.
-    sides : `~numpy.ndarray`, shape (2, 2), or None
-        Sides of the image's pixel in fine pixels, if templates are to be averaged over it.
-    """
-
+    #: (n, n) or (k, n, n): Matching kernel, and PSF of the image on the fine grid; of all places
+    #: of the field.
     kernel: np.ndarray
     target: np.ndarray
+    #: (2, 2): Sides of the image's pixel in fine pixels, if templates are to be averaged over it;
+    #: None without.
     sides: np.ndarray | None = None
 
     def __post_init__(self):
@@ -52,19 +46,9 @@ class FineTemplates:
 
     def points(self, weights):
         """
-        Coefficients of point sources.
+        Coefficients of point sources, (m, h, w), the centre in the middle, and which is each source's, (n,).
 
-        Parameters
-        ----------
-        weights : `~numpy.ndarray`, shape (n, k)
-            What each place's PSF counts for each source.
-
-        Returns
-        -------
-        coefficients : `~numpy.ndarray`, shape (m, h, w)
-            The centre in the middle; one for all sources that are alike.
-        which : int `~numpy.ndarray`, shape (n,)
-            Which of them is that of each source.
+        ``weights``, (n, k), are what each place's PSF counts for each source.
         """
         if len(self.target) == 1:
             return self._points, np.zeros(len(weights), int)
@@ -174,17 +158,8 @@ def batches(shapes):
     """
     Put stamps of one shape together, some hundred thousand pixels at a time.
 
-    Parameters
-    ----------
-    shapes : iterable
-        The shape of each stamp, or a tuple that begins with it; None for those left out.
-
-    Yields
-    ------
-    shape : tuple
-        As it was given.
-    rows : list of int
-        Stamps of this shape.
+    Yields each shape, as it was given (the shape of a stamp, or a tuple that begins with it; None for those
+    left out), and the numbers of its stamps.
     """
     groups = {}
     for row, shape in enumerate(shapes):
@@ -198,22 +173,13 @@ def batches(shapes):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BankSources:
-    """
-    The sources of a bank.
+    """The sources of a bank."""
 
-    Attributes
-    ----------
-    cutout : list of `Cutout` or None
-        One for each source; None is a point source.
-    fine_xy, xy : `~numpy.ndarray`, shape (n, 2)
-        Positions on the fine grid and on the image.
-    poly : `~numpy.ndarray`, shape (n, 2, 6)
-        Maps from image to fine pixels (see `~miricigale.photometry.arrays.local_maps`).
-    """
-
-    cutout: list
+    cutout: list  # One for each source; None is a point source.
+    #: (n, 2): Positions on the fine grid and on the image.
     fine_xy: np.ndarray
     xy: np.ndarray
+    #: (n, 2, 6): Maps from image to fine pixels (see `~miricigale.photometry.arrays.local_maps`).
     poly: np.ndarray
 
 

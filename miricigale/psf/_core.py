@@ -26,25 +26,10 @@ __all__ = [
 @njit(cache=True, nogil=True)
 def polygon_coverage(vertices, n, step, rows):
     """
-    Fraction of each cell of a centred square grid that lies inside a polygon.
+    Fraction, (n, n) by y and x, of each cell of a centred square grid that lies inside a polygon.
 
-    Exact along x, sampled by ``rows`` lines along y; even-odd rule.
-
-    Parameters
-    ----------
-    vertices : `~numpy.ndarray`, shape (m, 2)
-        Corners x, y; the outline closes itself.
-    n : int
-        Cells per side.
-    step : float
-        Side of a cell, in the unit of the corners; the origin is the grid's centre.
-    rows : int
-        Sampled lines per cell.
-
-    Returns
-    -------
-    coverage : `~numpy.ndarray`, shape (n, n)
-        Between 0 and 1, indexed [y, x].
+    Exact along x, sampled by ``rows`` lines per cell along y; even-odd rule. ``vertices``, (m, 2), are corners
+    x, y from the grid's centre in the unit of ``step``, the side of a cell; the outline closes itself.
     """
     m = vertices.shape[0]
     coverage = np.zeros((n, n))
@@ -81,19 +66,9 @@ def polygon_coverage(vertices, n, step, rows):
 
 def remove_plane(values, weights, *, degree=1):
     """
-    Subtract the weighted mean (degree 0) or the best plane (degree 1) of an image.
+    Subtract the weighted mean (degree 0) or the best plane (degree 1) of an image, (n, n).
 
-    Parameters
-    ----------
-    values, weights : `~numpy.ndarray`, shape (n, n)
-        Values and non-negative weights.
-    degree : {0, 1}, optional
-        What is removed.
-
-    Returns
-    -------
-    values : `~numpy.ndarray`, shape (n, n)
-        Zero where the weight is zero.
+    Weights are not negative; zero where the weight is zero.
     """
     inside = weights > 0
     y, x = np.nonzero(inside)
@@ -119,16 +94,13 @@ def wavefront(amplitude, segments, x, y, rms, segment_fraction, rng):
 
     Parameters
     ----------
-    amplitude : `~numpy.ndarray`, shape (n, n)
-        Transmission of the pupil, the weight of the rms.
-    segments : `~numpy.ndarray` of int, shape (n, n)
-        Segment of each cell from 1, 0 outside.
+    amplitude, segments : `~numpy.ndarray`, shape (n, n)
+        Transmission of the pupil, the weight of the rms; segment of each cell from 1, 0 outside.
     x, y : `~numpy.ndarray`, shape (n, n)
         Pupil coordinates in units of its radius, in a frame fixed to the telescope.
-    rms : float
-        Root mean square over the pupil, piston and tilt removed, in any unit.
-    segment_fraction : float
-        Share of the variance that the segment terms have.
+    rms, segment_fraction : float
+        Root mean square over the pupil, piston and tilt removed, in any unit; share of the variance
+        that the segment terms have.
     rng : `~numpy.random.Generator`
         Source of the coefficients.
 
@@ -244,19 +216,9 @@ def ipc_transfer(fx, fy, along_x, along_y, diagonal):
 
 def line_scatter(image, kernel, axis):
     """
-    Convolve an image with a symmetric kernel along one axis (zeros outside).
+    Convolve an image, (n, n), with a symmetric kernel along one axis (zeros outside).
 
-    Parameters
-    ----------
-    image : `~numpy.ndarray`, shape (n, n)
-    kernel : `~numpy.ndarray`, shape (n,)
-        Value at distances 0, 1, ... n - 1.
-    axis : int
-        The axis.
-
-    Returns
-    -------
-    scattered : `~numpy.ndarray`, shape (n, n)
+    ``kernel``, (n,), is its value at distances 0, 1, ... n - 1.
     """
     n = image.shape[axis]
     size = next_fast_len(2 * n, real=True)
@@ -318,23 +280,11 @@ def _sorted_sums(image, x_center, y_center, radii):
 
 def radial_sums(image, x_center, y_center, radii):
     """
-    Sums of an image inside circles.
+    Sums, (m,), of an image inside circles.
 
     Pixels cut by the circle count by the part inside: by 16 chords below a radius of 12
     pixels, to first order beyond (relative error of a smooth PSF's sum below 1e-3).
-
-    Parameters
-    ----------
-    image : `~numpy.ndarray`, shape (ny, nx)
-        Values per pixel.
-    x_center, y_center : float
-        Centre in pixels.
-    radii : `~numpy.ndarray`, shape (m,)
-        Radii in pixels, in any order.
-
-    Returns
-    -------
-    sums : `~numpy.ndarray`, shape (m,)
+    Centre and ``radii``, (m,), in any order, are in pixels.
     """
     image, radii = np.ascontiguousarray(image, float), np.asarray(radii, float)
     order = np.argsort(radii)
@@ -345,19 +295,10 @@ def radial_sums(image, x_center, y_center, radii):
 
 def core_moments(data):
     """
-    Centre and rms width of a PSF's core, under a round Gaussian window as wide as it.
+    Centre and rms width (cells) of a PSF's core, under a round Gaussian window as wide as it.
 
     Those of a Gaussian are its own. All of the core counts: noise in one pixel or a pattern
-    of resampling changes them little, and distant wings do not enter.
-
-    Parameters
-    ----------
-    data : `~numpy.ndarray`, shape (ny, nx)
-
-    Returns
-    -------
-    x, y, sigma : float
-        In cells; NaN where they do not settle.
+    of resampling changes them little, and distant wings do not enter. NaN where they do not settle.
     """
     columns, rows = np.arange(data.shape[1]), np.arange(data.shape[0])
     y, x = (float(v) for v in np.unravel_index(np.argmax(data), data.shape))
@@ -382,20 +323,7 @@ def core_moments(data):
 
 
 def half_maximum_width(data, x, y):
-    """
-    Full width at half maximum of the azimuthal mean around a point, in cells.
-
-    Parameters
-    ----------
-    data : `~numpy.ndarray`, shape (ny, nx)
-    x, y : float
-        Centre in cells.
-
-    Returns
-    -------
-    width : float
-        NaN where the profile does not fall to a half.
-    """
+    """Full width at half maximum (cells) of the azimuthal mean around a point; NaN without a half."""
     limit = min(x, data.shape[1] - 1 - x, y, data.shape[0] - 1 - y)
     angles = np.arange(48) * (2 * np.pi / 48)
     for reach in (16.0, 64.0, limit):

@@ -76,16 +76,8 @@ def cruciform_shift(x, y):
     """
     Offset of the cruciform's centre from the source, which leads to the array's middle.
 
-    Parameters
-    ----------
-    x, y : float
-        Position in the full frame, 0-based pixels.
-
-    Returns
-    -------
-    shift : tuple of float
-        Offset of the arm along the columns in x and of that along the rows in y, pixels;
-        nothing at about (598, 511).
+    At 0-based pixels x, y of the full frame: the offset of the arm along the columns in x and of that along
+    the rows in y, pixels; nothing at about (598, 511).
 
     References
     ----------
@@ -121,18 +113,12 @@ def cruciform(image, filter_name, *, oversampling, calibration="flight", shift=(
     ----------
     image : `~numpy.ndarray`, shape (n, n)
         Oversampled image of a point source, detector axes.
-    filter_name : str
-        Such as ``"miri.f770w"``.
-    oversampling : int
-        Cells per pixel.
+    filter_name, oversampling
+        Such as ``"miri.f770w"``; cells per pixel.
     calibration : {"flight", "stpsf"}, optional
         stpsf's amplitudes, or those with the factor 2 that in-flight F560W images want.
     shift : tuple of float, optional
         Offset of the cross in x, y in pixels (see `cruciform_shift`).
-
-    Returns
-    -------
-    image : `~numpy.ndarray`, shape (n, n)
 
     References
     ----------
@@ -162,27 +148,10 @@ def _apply_transfer(image, transfer, margin):
 
 def detector_response(image, *, oversampling, pixel=True, ipc=None, jitter=0.0, boxes=()):
     """
-    Convolve with jitter, the pixel and the interpixel capacitance in one transform.
+    Convolve an oversampled image with jitter, the pixel and the interpixel capacitance in one transform.
 
-    Parameters
-    ----------
-    image : `~numpy.ndarray`, shape (n, n)
-        Oversampled image of a point source.
-    oversampling : int
-        Cells per pixel.
-    pixel : bool, optional
-        Whether the square pixel's response enters.
-    ipc : tuple of float, optional
-        Couplings along x, along y, diagonal.
-    jitter : float, optional
-        Standard deviation per axis in pixels.
-    boxes : iterable of float, optional
-        Widths in pixels of further square boxes (drops, output pixels).
-
-    Returns
-    -------
-    image : `~numpy.ndarray`, shape (n, n)
-        Same grid: the effective PSF.
+    ``ipc`` are couplings along x, along y and diagonal, ``jitter`` is a standard deviation per axis in pixels,
+    ``boxes`` are widths in pixels of further square boxes (drops, output pixels).
     """
     widths = [*boxes, 1.0] if pixel else list(boxes)
 

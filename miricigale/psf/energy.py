@@ -4,7 +4,6 @@ import math
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 from scipy.optimize import least_squares
 
 from miricigale.instrument import imager_filters, psf_fwhm
@@ -12,6 +11,7 @@ from miricigale.psf import _core
 from miricigale.psf.effects import detector_response
 from miricigale.psf.model import instrument_psf
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.tables import described_table
 from miricigale.utils.units import ANGLE, to_array
 
 __all__ = ["encircled_energy", "fwhm", "psf_table", "radius_of_encircled_energy"]
@@ -167,27 +167,32 @@ def psf_table(psfs, *, radii=(0.5, 1.0, 1.5, 2.5, 5.0) * u.arcsec):
         grid holds less), ``enclosed`` and ``eef_<radius>``, with units and descriptions.
     """
     psfs = [instrument_psf(psf, f"psfs[{i}]") for i, psf in enumerate(psfs)]
-    table = QTable()
-    table["filter"] = [psf.filter or "" for psf in psfs]
-    table["frame"] = [psf.frame for psf in psfs]
-    table["angle"] = [psf.angle.value if psf.frame == "sky" else np.nan for psf in psfs] * u.deg
-    table["includes"] = [" ".join(psf.includes) for psf in psfs]
-    table["fwhm"] = u.Quantity([fwhm(psf) for psf in psfs])
-    table["fwhm_gaussian"] = u.Quantity([fwhm(psf, method="gaussian") for psf in psfs])
-    flight = [psf_fwhm(n).value if n in imager_filters() else np.nan for n in table["filter"]]
-    table["fwhm_flight"] = flight * ANGLE
-    table["r80"] = [_r80(psf) for psf in psfs] * ANGLE
-    table["enclosed"] = [psf.enclosed for psf in psfs]
+    names = [psf.filter or "" for psf in psfs]
+    flight = [psf_fwhm(n).value if n in imager_filters() else np.nan for n in names] * ANGLE
+    angles = [psf.angle.value if psf.frame == "sky" else np.nan for psf in psfs] * u.deg
+    gaussian = u.Quantity([fwhm(psf, method="gaussian") for psf in psfs])
+    columns = {
+        "filter": (names, None),
+        "frame": ([psf.frame for psf in psfs], "axes of the detector, or turned to the sky"),
+        "angle": (angles, "position angle of +y, east of north"),
+        "includes": (
+            [" ".join(psf.includes) for psf in psfs],
+            "what the PSF holds besides the optics",
+        ),
+        "fwhm": (
+            u.Quantity([psf.fwhm for psf in psfs]),
+            "full width at half maximum of the azimuthal mean",
+        ),
+        "fwhm_gaussian": (gaussian, "that of a Gaussian fitted out to 0.75 FWHM"),
+        "fwhm_flight": (flight, "of stars in flight (JWST program 1028)"),
+        "r80": ([_r80(psf) for psf in psfs] * ANGLE, "radius that holds 80 % of all light"),
+        "enclosed": (
+            [psf.enclosed for psf in psfs],
+            "fraction of all light on the PSF's grid",
+        ),
+    }
     for radius in radii:
-        name = f"eef_{radius.to_value(ANGLE):g}"
-        table[name] = [encircled_energy(psf, radius) for psf in psfs]
-        table[name].info.description = f"fraction of all light within {radius}"
-    table["frame"].info.description = "axes of the detector, or turned to the sky"
-    table["angle"].info.description = "position angle of +y, east of north"
-    table["includes"].info.description = "what the PSF holds besides the optics"
-    table["fwhm_flight"].info.description = "of stars in flight (JWST programme 1028)"
-    table["fwhm"].info.description = "full width at half maximum of the azimuthal mean"
-    table["fwhm_gaussian"].info.description = "that of a Gaussian fitted out to 0.75 FWHM"
-    table["r80"].info.description = "radius that holds 80 % of all light"
-    table["enclosed"].info.description = "fraction of all light on the PSF's grid"
-    return table
+        within = [encircled_energy(psf, radius) for psf in psfs]
+        text = f"fraction of all light within {radius}"
+        columns[f"eef_{radius.to_value(ANGLE):g}"] = within, text
+    return described_table(columns)

@@ -26,19 +26,9 @@ _ARRAYS = ("array", "source", "target")
 
 def header_grid(header):
     """
-    What the header of a PSF or kernel states of its grid.
+    Side of a pixel (arcsec) and position angle of +y (deg) that the header of a PSF or kernel states.
 
-    Parameters
-    ----------
-    header : `~astropy.io.fits.Header`
-        World coordinates, or PIXELSCL or PIXSCALE (arcsec).
-
-    Returns
-    -------
-    cell : float or None
-        Side of a pixel of the file in arcsec; None if not stated.
-    angle : float or None
-        Position angle of +y in deg; None without world coordinates.
+    By world coordinates, or PIXELSCL or PIXSCALE (arcsec); None for what is not stated.
 
     Raises
     ------
@@ -59,27 +49,9 @@ def header_grid(header):
 
 def fits_image(path, ext, plane, pixel_scale, *, wanted, oversampling=1):
     """
-    An image of any FITS file and what its header states of its grid.
+    An image of any FITS file, its header, its pixel (a quantity) and its position angle (deg or None).
 
-    Parameters
-    ----------
-    path, ext, plane, pixel_scale, oversampling
-        As for `read_psf`.
-    wanted : str
-        What the file is to hold, for messages.
-
-    Returns
-    -------
-    data : `~numpy.ndarray`, shape (ny, nx)
-    header : `~astropy.io.fits.Header`
-    pixel_scale : `~astropy.units.Quantity`
-    angle : float or None
-        Position angle of +y in deg.
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`, ValueError
-        As `read_psf`.
+    Parameters and errors are those of `read_psf`; ``wanted`` says what the file is to hold.
     """
     with open_fits(path, wanted=wanted, output_verify="silentfix") as hdus:
         data = hdus[ext].data

@@ -19,7 +19,7 @@ from miricigale.psf.wiener import (
 )
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.unified import read_write, unified_read
-from miricigale.utils.units import ANGLE, frozen_array, to_array
+from miricigale.utils.units import ANGLE, frozen_array, positive, to_array
 
 __all__ = ["REGULARIZATIONS", "MatchingKernel"]
 
@@ -86,9 +86,7 @@ class MatchingKernel:
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, frozen_array(odd_square(value, name)))
-        scale = float(to_array(self.pixel_scale, ANGLE, "pixel_scale"))
-        if not scale > 0:
-            raise argument_error("pixel_scale", "positive", self.pixel_scale)
+        scale = positive(self.pixel_scale, ANGLE, "pixel_scale")
         object.__setattr__(self, "pixel_scale", scale * ANGLE)
         object.__setattr__(self, "meta", dict(self.meta))
 

@@ -37,20 +37,10 @@ _IN_FLIGHT_BLUR = {"miri.f560w": 0.03 / math.sqrt(2)}
 
 def local_pixel(x, y, *, subarray="FULL"):
     """
-    The pixel at a position of the imager, as the distortion has it.
+    The pixel at a 0-based position of a sub-array, as the distortion has it.
 
-    Parameters
-    ----------
-    x, y : float
-        0-based position in the sub-array.
-    subarray : str, optional
-        One of `~miricigale.instrument.subarrays`.
-
-    Returns
-    -------
-    jacobian : `~numpy.ndarray`, shape (2, 2)
-        Arcsec along the axes of the ideal plane (parity of an image of the sky, +y at
-        V3IdlYAngle from V3) per pixel: its columns are the sides of the pixel.
+    The Jacobian, (2, 2), in arcsec along the axes of the ideal plane (parity of an image of the sky, +y at
+    V3IdlYAngle from V3) per pixel: its columns are the sides of the pixel.
 
     Raises
     ------

@@ -11,7 +11,7 @@ from photutils.psf import GriddedPSFModel, ImagePSF
 from miricigale.psf import _core
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.unified import read_write
-from miricigale.utils.units import ANGLE, to_array
+from miricigale.utils.units import ANGLE, positive, to_array
 
 __all__ = ["FRAMES", "InstrumentPSF", "PSFGrid", "from_photutils", "instrument_psf", "make_psf"]
 
@@ -95,9 +95,7 @@ class InstrumentPSF(ImagePSF):
             raise argument_error("frame", f"one of {FRAMES}", repr(frame))
         if int(oversampling) != oversampling or oversampling < 1:
             raise argument_error("oversampling", "a positive integer", oversampling)
-        scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
-        if not scale > 0:
-            raise argument_error("pixel_scale", "positive", pixel_scale)
+        scale = positive(pixel_scale, ANGLE, "pixel_scale")
         super().__init__(data, oversampling=int(oversampling), origin=origin, meta=dict(meta or {}))
         turn = float(to_array(angle, u.deg, "angle", finite=True)) if frame == "sky" else 0.0
         self.pixel_scale, self.frame, self.angle = scale * ANGLE, frame, turn * u.deg

@@ -109,14 +109,7 @@ class Pupil:
 
 @functools.cache
 def jwst_constants():
-    """
-    The telescope's outlines and MIRI's couplings, from ``psf.jwst_pupil``.
-
-    Returns
-    -------
-    constants : dict
-        The content of the file; see its comments for units.
-    """
+    """The telescope's outlines and MIRI's couplings, from ``psf.jwst_pupil``; see its comments for units."""
     return tomllib.loads(locate("psf.jwst_pupil").read_text())
 
 
@@ -266,7 +259,7 @@ def _centre(pupil, opd, wavelength):
 
 def polychromatic_psf(pupil, opd, wavelengths, *, weights=None, step, n):
     """
-    Light of a point source summed over a band, before any detector.
+    Light of a point source summed over a band, before any detector, as a fraction in each cell, (n, n).
 
     Parameters
     ----------
@@ -274,19 +267,12 @@ def polychromatic_psf(pupil, opd, wavelengths, *, weights=None, step, n):
         The pupil in the axes of the image.
     opd : `~numpy.ndarray`, shape (n_pupil, n_pupil)
         Optical path difference in nm.
-    wavelengths : `~numpy.ndarray`, shape (m,)
-        In um.
-    weights : `~numpy.ndarray`, shape (m,), optional
-        Weights of the wavelengths; equal if not given.
+    wavelengths, weights : `~numpy.ndarray`, shape (m,)
+        In um; equal weights if not given.
     step : float
         Side of an image cell in arcsec.
     n : int
         Cells per side, odd; the core's centroid stands on the middle one.
-
-    Returns
-    -------
-    image : `~numpy.ndarray`, shape (n, n)
-        Fraction of the light in each cell.
 
     Raises
     ------

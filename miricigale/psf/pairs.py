@@ -21,23 +21,11 @@ _log = logging.getLogger(__name__)
 
 def psf_pair(hi, lo, scale, *, angles, grid_angle, resampling, extent, normalize):
     """
-    The sharp and the wide PSF on the pixels of an image, centred and normalised.
+    The sharp PSF, of unit sum, and the wide one, of what it holds or of unit sum, on the pixels of an image.
 
-    Parameters
-    ----------
-    hi, lo, grid_angle, resampling, extent, normalize
-        As for `~miricigale.psf.MatchingKernel.from_psfs`.
-    scale : float
-        Pixel in arcsec.
-    angles : tuple
-        ``hi_angle`` and ``lo_angle``.
-
-    Returns
-    -------
-    source, target : `~numpy.ndarray`, shape (n, n), n odd
-        The source of unit sum, the target of what it holds or of unit sum.
-    mended : dict
-        ``energy``, ``held`` and ``centering`` of the kernel's meta.
+    Two arrays, (n, n), n odd, centred, and ``energy``, ``held`` and ``centering`` of the kernel's meta. Parameters
+    are those of `~miricigale.psf.MatchingKernel.from_psfs`, ``scale`` the pixel in arcsec, ``angles`` those of
+    the two.
     """
     given, psfs, centering = {"hi": hi, "lo": lo}, {}, {}
     for name, psf in given.items():
@@ -138,23 +126,10 @@ def _on_grid(psf, name, angle, grid_angle, scale, n, resampling):
 
 def ready_arrays(array, scale, **psfs):
     """
-    A kernel that came ready and its PSFs, checked and normalised.
+    A kernel that came ready, of unit sum, its PSFs that are not None, of unit sum, and what it summed to.
 
-    Parameters
-    ----------
-    array, psfs
-        As for `~miricigale.psf.MatchingKernel.from_array`.
-    scale : float
-        Pixel in arcsec.
-
-    Returns
-    -------
-    array : `~numpy.ndarray`, shape (n, n)
-        Of unit sum.
-    images : dict
-        The PSFs that are not None, of unit sum; ``target`` also if only ``source`` is given.
-    total : float
-        What the kernel summed to.
+    Parameters are those of `~miricigale.psf.MatchingKernel.from_array`, ``scale`` the pixel in arcsec. There is a
+    target also if only the source is given.
     """
     array = odd_square(array, "array")
     total = float(array.sum())

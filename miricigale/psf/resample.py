@@ -11,7 +11,7 @@ from miricigale.psf import _core
 from miricigale.psf.effects import detector_response
 from miricigale.psf.model import instrument_psf
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import ANGLE, to_array
+from miricigale.utils.units import ANGLE, positive, to_array
 
 __all__ = ["average_psf", "psf_image", "psf_mosaic", "rotate_psf"]
 
@@ -28,14 +28,6 @@ def _degrees(angle, argument):
         msg = f"'{argument}' must be a quantity convertible to deg, got a bare number"
         raise u.UnitsError(msg)
     return float(to_array(angle, u.deg, argument, finite=True))
-
-
-def _positive(value, argument):
-    """An angle in arcsec that is finite and above 0."""
-    size = float(to_array(value, ANGLE, argument, ndim=0, finite=True))
-    if not size > 0:
-        raise argument_error(argument, "positive", value)
-    return size
 
 
 def _turn_by(psf, angle, grid_angle, argument):
@@ -183,7 +175,7 @@ def psf_image(psf, *, pixel_scale, shape, offset=(0.0, 0.0)):
         If the pixel or the shape is not positive.
     """
     psf = instrument_psf(psf)
-    scale = _positive(pixel_scale, "pixel_scale")
+    scale = positive(pixel_scale, ANGLE, "pixel_scale")
     ny, nx = (shape, shape) if np.isscalar(shape) else shape
     if min(ny, nx) < 1:
         raise argument_error("shape", "at least one row and column", shape)
@@ -247,7 +239,7 @@ def psf_mosaic(
         raise argument_error("resampling", "'drizzle' or None", repr(resampling))
     if not 0 < pixfrac <= 1:
         raise argument_error("pixfrac", "above 0 and at most 1", pixfrac)
-    scale = _positive(pixel_scale, "pixel_scale")
+    scale = positive(pixel_scale, ANGLE, "pixel_scale")
     grid = _degrees(grid_angle, "grid_angle")
     angles = [None] if pa is None else list(np.atleast_1d(pa))
     turns = [_turn_by(psf, angle, grid, "pa") for angle in angles]
@@ -256,7 +248,7 @@ def psf_mosaic(
     if int(oversampling) != oversampling or oversampling < 1:
         raise argument_error("oversampling", "a positive integer", oversampling)
     cell = scale / oversampling
-    width = 2 * psf.half_width if fov is None else _positive(fov, "fov")
+    width = 2 * psf.half_width if fov is None else positive(fov, ANGLE, "fov")
     n = 2 * round(0.5 * width / cell - 0.5) + 1
     blurred = psf.data
     if resampling == "drizzle":
@@ -289,23 +281,9 @@ def psf_mosaic(
 
 def centered_psf(psf, tolerance, argument="psf"):
     """
-    Put a PSF's origin where its core is.
+    Put a PSF's origin where its core is, if that is more than ``tolerance`` arcsec away.
 
-    Parameters
-    ----------
-    psf : `~photutils.psf.ImagePSF`
-        A PSF with the meta of `~miricigale.psf.make_psf`.
-    tolerance : float
-        Distance in arcsec from which on it is moved.
-    argument : str, optional
-        The argument's name for messages.
-
-    Returns
-    -------
-    psf : `~photutils.psf.ImagePSF`
-        The same data; what is sampled from them has the core on its centre.
-    offset : tuple of float
-        Where the core was, x, y in arcsec from the old origin.
+    The PSF with the same data, and where the core was, x, y in arcsec from the old origin.
 
     Raises
     ------

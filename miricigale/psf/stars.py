@@ -17,7 +17,7 @@ from miricigale.psf.effects import EFFECTS
 from miricigale.psf.model import make_psf
 from miricigale.psf.resample import psf_image
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import ANGLE, to_array
+from miricigale.utils.units import ANGLE, positive, to_array
 
 __all__ = ["psf_from_stars"]
 
@@ -40,10 +40,7 @@ def _checked_images(images):
 def _pixel_scale(images, pixel_scale):
     """Geometric mean of the pixel's sides in arcsec."""
     if pixel_scale is not None:
-        scale = float(to_array(pixel_scale, ANGLE, "pixel_scale", ndim=0))
-        if not scale > 0:
-            raise argument_error("pixel_scale", "positive", pixel_scale)
-        return scale
+        return positive(pixel_scale, ANGLE, "pixel_scale")
     wcs = images[0].wcs
     if wcs is None:
         raise argument_error("pixel_scale", "given for images without world coordinates", None)

@@ -10,7 +10,7 @@ from miricigale.filters import Filter
 from miricigale.psf.optics import jwst_pupil, polychromatic_psf
 from miricigale.refdata import citations
 from miricigale.utils.exceptions import argument_error, unknown_name
-from miricigale.utils.units import ANGLE, WAVE, to_array
+from miricigale.utils.units import ANGLE, WAVE, positive, to_array
 
 __all__ = ["Telescope", "band_quantiles", "checked_grid", "filter_name", "odd_cells"]
 
@@ -26,24 +26,10 @@ def filter_name(filter_, known):
 @functools.lru_cache(maxsize=64)
 def band_quantiles(name, n, spectral_index=0.0):
     """
-    Wavelengths of equal weight that stand for a band.
+    Wavelengths (um, ascending) of equal weight that stand for a band.
 
-    The photon rate of a source with ``F_nu ~ nu**spectral_index`` is cut into ``n``
-    equal parts; each is represented by its median.
-
-    Parameters
-    ----------
-    name : str
-        Name of the filter.
-    n : int
-        Number of wavelengths.
-    spectral_index : float, optional
-        Index of the spectrum.
-
-    Returns
-    -------
-    wavelengths : `~numpy.ndarray`, shape (n,)
-        In um, ascending, read-only.
+    The photon rate of a source with ``F_nu ~ nu**spectral_index`` is cut into ``n`` equal parts; each is
+    represented by its median.
     """
     band = Filter.from_name(name)
     wave = to_array(band.wave, WAVE, "wave")
@@ -64,10 +50,7 @@ def checked_grid(oversampling, fov, default):
     """Cells per pixel and width in arcsec of a PSF's grid."""
     if isinstance(oversampling, float) or oversampling < 1:
         raise argument_error("oversampling", "a positive integer", oversampling)
-    width = default if fov is None else float(to_array(fov, ANGLE, "fov"))
-    if not width > 0:
-        raise argument_error("fov", "positive", fov)
-    return int(oversampling), width
+    return int(oversampling), default if fov is None else positive(fov, ANGLE, "fov")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -66,22 +66,10 @@ def _penalty_power(penalty, shape):
 
 def wiener(source, target, penalty):
     """
-    The matching kernel as a function of the Wiener parameter.
+    The matching kernel, (n, n), of the sum of the wide PSF, as a function of the Wiener parameter.
 
     That of `photutils.psf_matching.make_wiener_kernel`; but what does not depend on the parameter
-    is worked out once for all that are tried.
-
-    Parameters
-    ----------
-    source, target : `~numpy.ndarray`, shape (n, n), n odd
-        The sharp and the wide PSF.
-    penalty : str, `~numpy.ndarray` or None
-        As for `~miricigale.psf.MatchingKernel.from_psfs`.
-
-    Returns
-    -------
-    make : callable
-        ``make(mu)`` is the kernel, shape (n, n), of the sum of ``target``.
+    is worked out once for all that are tried. ``penalty`` is that of `MatchingKernel.from_psfs`.
 
     Raises
     ------
@@ -115,17 +103,10 @@ def gaussian_gain(source, target, names="hi, lo"):
     """
     Noise gain of the Gaussian kernel between two Gaussians as wide as the PSFs' cores, at most 1.
 
-    Parameters
-    ----------
-    source, target : `~numpy.ndarray`, shape (n, n)
-        The sharp and the wide PSF.
-    names : str, optional
-        What the caller calls them.
-
     Raises
     ------
     ValueError
-        If the sharp PSF is the wider one by its core and at half maximum.
+        If the sharp PSF is the wider one by its core and at half maximum; ``names`` are the caller's for the two.
     """
     c = len(source) // 2
     cores = [_core.core_moments(image)[2] for image in (source, target)]
@@ -155,8 +136,7 @@ def choose(regularization, make, source, target, tolerance):
 
     Returns
     -------
-    mu : float
-    kernel : `~numpy.ndarray`, shape (n, n)
+    mu, kernel
     figures : dict
         ``max_error`` (of the encircled energy at any radius), ``noise_gain`` (factor on the rms
         of white noise), ``gaussian_gain`` (see `gaussian_gain`), ``negative_sum`` and

@@ -18,8 +18,10 @@ __all__ = [
     "TIME",
     "WAVE",
     "Frozen",
+    "ab_quantity",
     "frozen_array",
     "frozen_quantity",
+    "positive",
     "to_array",
 ]
 
@@ -105,6 +107,19 @@ class Frozen:
 
 def _remake(cls, values):
     return cls(**values)
+
+
+def positive(value, unit, name):
+    """A quantity as a number in ``unit``, after checking that it is one, above 0 (errors as `to_array`)."""
+    number = float(to_array(value, unit, name, ndim=0, finite=True))
+    if not number > 0:
+        raise argument_error(name, "positive", value)
+    return number
+
+
+def ab_quantity(value):
+    """A flux or magnitude as a quantity; a bare number is an AB magnitude."""
+    return value if isinstance(value, u.Quantity) else float(value) * u.ABmag
 
 
 def frozen_array(value, dtype=float):

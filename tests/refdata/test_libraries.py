@@ -355,7 +355,9 @@ def test_a_library_is_registered_and_found(folder):
     assert found.values_of("angle").tolist() == [0.0, 90.0]
     assert found.units["angle"] == "deg"
     assert report.sha256 == hashlib.sha256(report.path.read_bytes()).hexdigest()
-    assert report.library.meta["files"] == {"fake.dat": hashlib.sha256(path.read_bytes()).hexdigest()}
+    assert report.library.meta["files"] == {
+        "fake.dat": hashlib.sha256(path.read_bytes()).hexdigest()
+    }
     assert report.replaced == ""
     assert state().state == "ok"
 

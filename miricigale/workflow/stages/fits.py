@@ -100,7 +100,7 @@ def mock_photometry(config, truth, matched, *, seed):
     photometry : `~astropy.table.QTable`
         A row for each source of the sample (``selection`` 0).
     """
-    from miricigale.photometry.error_model import fractional_error
+    from miricigale.photometry.surveys import fractional_error
 
     bands = config.fit.bands
     errors = photometry.ErrorModel.from_depths(

@@ -1,0 +1,24 @@
+"""Depths and errors of bands that surveys have beside MIRI's."""
+
+import types
+
+__all__ = ["YANG2021_DEPTHS", "fractional_error"]
+
+#: 5-sigma AB depths of 15 bands of CANDELS/EGS like the paper's (after Stefanon 2017 and FIDEL): the
+#: paper states none.
+YANG2021_DEPTHS = types.MappingProxyType(
+    {
+        "megacam.u": 27.1, "megacam.g": 27.3, "megacam.r": 27.2, "megacam.i": 27.0, "megacam.z": 26.1,
+        "acs.f606w": 28.8, "acs.f814w": 28.2, "wfc3.f125w": 27.6, "wfc3.f140w": 26.8, "wfc3.f160w": 27.6,
+        "irac.ch1": 23.9, "irac.ch2": 24.2, "irac.ch3": 22.5, "irac.ch4": 22.8, "mips.24": 19.3,
+    }
+)  # fmt: skip
+
+
+def fractional_error(name):
+    """
+    Part of the flux that is added to the error of a band other than MIRI's, in quadrature.
+
+    0.10 for IRAC and MIPS, 0.03 otherwise: the package's own choice, not the paper's.
+    """
+    return 0.10 if name.startswith(("irac", "mips")) else 0.03
