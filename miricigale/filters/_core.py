@@ -22,7 +22,7 @@ def refine(wave, throughput):
     Returns
     -------
     wave, throughput : `~numpy.ndarray`
-        The same piecewise-linear curve; neighbours differ by 5 % in wavelength at most.
+        The same piecewise-linear curve; neighbors differ by 5 % in wavelength at most.
     """
     ratio = np.log(wave[1:] / wave[:-1]) / np.log(_LARGEST_RATIO)
     if ratio.max() <= 1:

@@ -55,7 +55,7 @@ class Filter(Frozen):
     name : str
         Name of the filter, and of its flux columns.
     meta : dict, optional
-        Source, citation, flux convention of the catalogues.
+        Source, citation, flux convention of the catalogs.
 
     Raises
     ------
@@ -238,14 +238,14 @@ class Filter(Frozen):
         return _core.photon_integral(wave, throughput, 1) / throughput.max() * WAVE
 
     @functools.cached_property
-    def catalogue_factor(self):
+    def catalog_factor(self):
         """
-        What turns the AB flux of a band into the one that catalogues quote.
+        What turns the AB flux of a band into the one that catalogs quote.
 
         1 where they are the same. IRAC fluxes are quoted at a nominal wavelength for
         nu F_nu = const, those of MIPS for a black body of 10^4 K; for a source of
         that spectrum the quoted flux is the true monochromatic one. Multiply
-        `synthetic_flux` by this factor to compare with such a catalogue.
+        `synthetic_flux` by this factor to compare with such a catalog.
 
         References
         ----------

@@ -21,7 +21,7 @@ _NIRCAM = (
 _ACS = "f435w f475w f555w f606w f625w f775w f814w f850lp"
 _WFC3 = "f098m f105w f110w f125w f140w f160w"
 
-# nominal wavelengths (um) at which the catalogues of Spitzer quote fluxes
+# nominal wavelengths (um) at which the catalogs of Spitzer quote fluxes
 _IRAC = {"ch1": 3.550, "ch2": 4.493, "ch3": 5.731, "ch4": 7.872}
 _MIPS = {"24": 23.68, "70": 71.42, "160": 155.9}
 

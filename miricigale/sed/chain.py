@@ -9,7 +9,7 @@ from miricigale.filters import FilterSet
 from miricigale.sed import _core
 from miricigale.sed.component import ROLES
 
-__all__ = ["COLOURS", "Chain", "Galaxy", "Starlight", "Stars", "distinct"]
+__all__ = ["COLORS", "Chain", "Galaxy", "Starlight", "Stars", "distinct"]
 
 #: Version of the numbers that follow from the components: raised when the chain, the derived
 #: quantities or the grids change, so that grids kept on the disk are made anew.
@@ -31,16 +31,16 @@ UV_WINDOWS = (
     (0.1930, 0.1950),
     (0.2400, 0.2580),
 )
-#: Bands of the rest-frame colours.
-COLOUR_BANDS = {
+#: Bands of the rest-frame colors.
+COLOR_BANDS = {
     "nuv": "sedpy.galex_NUV",
     "u": "sedpy.bessell_U",
     "v": "sedpy.bessell_V",
     "r": "sedpy.sdss_r0",
     "j": "sedpy.twomass_J",
 }
-#: Rest-frame colours: name to the two bands.
-COLOURS = {"nuv_r": ("nuv", "r"), "u_v": ("u", "v"), "v_j": ("v", "j")}
+#: Rest-frame colors: name to the two bands.
+COLORS = {"nuv_r": ("nuv", "r"), "u_v": ("u", "v"), "v_j": ("v", "j")}
 
 #: Roles whose parameters shape the stars with their gas, and what lies between source and us.
 STELLAR = ("sfh", "stellar", "nebular")
@@ -51,10 +51,10 @@ KEPT = 128  # stars of so many histories are kept
 @dataclass(frozen=True, eq=False)
 class Stars:
     """
-    Light of stars and of the gas they ionise, for one solar mass formed.
+    Light of stars and of the gas they ionize, for one solar mass formed.
 
     Spectra are L_lambda in W/um; ``nebular_young`` and ``nebular_old`` are the gas's part
-    of ``young`` and ``old``; ``dust_power`` in W is what dust takes of the ionising light;
+    of ``young`` and ``old``; ``dust_power`` in W is what dust takes of the ionizing light;
     ``visual`` is L_lambda at 0.55 um; ages are in Gyr, rates in Msun/yr, masses in Msun.
     """
 
@@ -140,7 +140,7 @@ class Chain:
         Weights of the trapezoid rule on them.
     functionals : `~numpy.ndarray`, shape (n_functional, n_wave)
         Sums over a galaxy's light: of 3-1000 um, L_lambda at 0.55 um, means of the windows of
-        `UV_WINDOWS`, means of `COLOUR_BANDS`.
+        `UV_WINDOWS`, means of `COLOR_BANDS`.
     """
 
     def __init__(self, components):
@@ -154,7 +154,7 @@ class Chain:
         self.log_wave = np.log(wave)
         self.weights = _core.trapezoid_weights(wave)
         self.to_lnu = wave**2 / _core.LIGHT
-        self._ionising = wave < _core.LYMAN_LIMIT
+        self._ionizing = wave < _core.LYMAN_LIMIT
         self._at = {x: int(np.searchsorted(wave, x * (1 - 1e-9))) for x in (SIX, VISUAL, *INFRARED)}
         self.functionals = self._functionals()
         self._names = {
@@ -172,7 +172,7 @@ class Chain:
         for row, (low, high) in zip(windows, UV_WINDOWS, strict=True):
             first, last = np.searchsorted(wave, [low * (1 - 1e-9), high * (1 + 1e-9)])
             row[first:last] = _core.trapezoid_weights(wave[first:last]) / (high - low)
-        bands = FilterSet.from_names(list(COLOUR_BANDS.values())).weights(wave) * self.to_lnu
+        bands = FilterSet.from_names(list(COLOR_BANDS.values())).weights(wave) * self.to_lnu
         return np.concatenate([[infrared, visual], windows, bands])
 
     def names(self, *roles):
@@ -190,13 +190,13 @@ class Chain:
 
     @_kept(8)
     def _populations(self, metallicity):
-        """Ages, spectra on our grid, surviving mass and ionising photons of one metallicity."""
+        """Ages, spectra on our grid, surviving mass and ionizing photons of one metallicity."""
         stellar = self.by_role["stellar"]
         age, spectra, surviving = stellar.table(metallicity)
         matrix = _core.hat_matrix(np.asarray(stellar.nodes()), self.wave)
         spectra = np.ascontiguousarray((matrix @ np.asarray(spectra, dtype=float).T).T)
-        ionising = stellar.ionizing(metallicity) if self.by_role["nebular"] else None
-        return age, spectra, surviving, ionising
+        ionizing = stellar.ionizing(metallicity) if self.by_role["nebular"] else None
+        return age, spectra, surviving, ionizing
 
     @functools.cached_property
     def _nebular_hat(self):
@@ -216,7 +216,7 @@ class Chain:
         return [known[key] for key in keys]
 
     def _make_stars(self, metallicity, values):
-        age, spectra, surviving, ionising = self._populations(metallicity)
+        age, spectra, surviving, ionizing = self._populations(metallicity)
         sfh, stellar, nebular = (self.by_role[r] for r in STELLAR)
         histories = [sfh.history(v) for v in values]
         pairs = [stellar.age_weights(h, v) for h, v in zip(histories, values, strict=True)]
@@ -232,11 +232,11 @@ class Chain:
             parts = [young_light[i], old_light[i]]
             gas, dusty = [None, None], 0.0
             if nebular is not None:
-                hard = sum(self.weights @ (part * self._ionising) for part in parts)
+                hard = sum(self.weights @ (part * self._ionizing) for part in parts)
                 dusty = v["f_dust"] * float(hard)
-                passed = np.where(self._ionising, v["f_esc"], 1.0)
+                passed = np.where(self._ionizing, v["f_esc"], 1.0)
                 gas = [
-                    self._nebular_hat @ nebular.spectra(age, w, ionising, v)
+                    self._nebular_hat @ nebular.spectra(age, w, ionizing, v)
                     for w in (young[i], old[i])
                 ]
                 parts = [part * passed + glow for part, glow in zip(parts, gas, strict=True)]

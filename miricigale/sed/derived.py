@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import astropy.units as u
 import numpy as np
 
-from miricigale.sed.chain import COLOUR_BANDS, COLOURS, UV_WINDOWS
+from miricigale.sed.chain import COLOR_BANDS, COLORS, UV_WINDOWS
 from miricigale.utils.units import LUMINOSITY, MASS
 
 __all__ = [
@@ -54,9 +54,9 @@ DERIVED = {
         "slope of L_lambda in the ten windows of Calzetti et al. 1994, 0.127-0.258 um, galaxy",
         extensive=False,
     ),
-    "nuv_r": Derived(u.mag, "rest-frame colour NUV - r of the galaxy, AB", extensive=False),
-    "u_v": Derived(u.mag, "rest-frame colour U - V of the galaxy, AB", extensive=False),
-    "v_j": Derived(u.mag, "rest-frame colour V - J of the galaxy, AB", extensive=False),
+    "nuv_r": Derived(u.mag, "rest-frame color NUV - r of the galaxy, AB", extensive=False),
+    "u_v": Derived(u.mag, "rest-frame color U - V of the galaxy, AB", extensive=False),
+    "v_j": Derived(u.mag, "rest-frame color V - J of the galaxy, AB", extensive=False),
     "agn_power": Derived(LUMINOSITY, "emission of torus and polar dust as seen", of="agn"),
     "agn_luminosity": Derived(LUMINOSITY, "all light of the AGN as seen", of="agn"),
     "accretion_power": Derived(
@@ -68,7 +68,7 @@ DERIVED = {
 }
 
 _LOG_UV = np.log10(np.mean(UV_WINDOWS, axis=1))
-_BAND = {name: i for i, name in enumerate(COLOUR_BANDS)}
+_BAND = {name: i for i, name in enumerate(COLOR_BANDS)}
 
 
 def columns(model):
@@ -117,7 +117,7 @@ def galaxy_quantities(stars, absorbed, sums):
         "a_v": a_v,
         "beta": logs @ step / (step @ step),
     }
-    for name, (blue, red) in COLOURS.items():
+    for name, (blue, red) in COLORS.items():
         out[name] = magnitude[:, _BAND[blue]] - magnitude[:, _BAND[red]]
     return out
 

@@ -77,7 +77,7 @@ def _table(law, r_v):
 
 def extinction_curve(wave, law="G23", r_v=3.1):
     """
-    Extinction for one magnitude of colour excess, A(lambda) / E(B-V), at wavelengths in um.
+    Extinction for one magnitude of color excess, A(lambda) / E(B-V), at wavelengths in um.
 
     NaN outside the `coverage` of the law. Interpolated in a table of 8192 steps in ln(lambda).
 
@@ -184,7 +184,7 @@ class GalacticExtinction(Foreground):
     packages = ("dust_extinction",)
     options = {"law": tuple(LAWS), "beyond": BEYOND}
     ebv_galactic = Parameter(
-        default=0.0, bounds=(0.0, 5.0), unit="mag", doc="Colour excess of the Milky Way's dust."
+        default=0.0, bounds=(0.0, 5.0), unit="mag", doc="Color excess of the Milky Way's dust."
     )
     r_v = Parameter(default=3.1, bounds=_R_V, doc="A(V) / E(B-V) of the Milky Way's dust.")
 
@@ -227,8 +227,8 @@ class GalacticExtinction(Foreground):
         return _outside(self.law, values["r_v"])
 
 
-def _colour_excess(ebv):
-    """Colour excesses in mag as an array of one dimension, and whether it was one number."""
+def _color_excess(ebv):
+    """Color excesses in mag as an array of one dimension, and whether it was one number."""
     masked = np.ravel(getattr(ebv, "mask", False))
     value = getattr(ebv, "unmasked", ebv)
     value = value.data if isinstance(value, np.ma.MaskedArray) else value
@@ -278,7 +278,7 @@ def band_extinction(filters, ebv, *, law="G23", r_v=3.1, sed=None, beyond="refus
     filters : `~miricigale.filters.FilterSet` or iterable of str
         The bands.
     ebv : float, array_like or `~astropy.units.Quantity`, shape () or (n,)
-        Colour excess E(B-V) of each source; a bare number is in mag. Those of the map of Schlegel,
+        Color excess E(B-V) of each source; a bare number is in mag. Those of the map of Schlegel,
         Finkbeiner & Davis (1998) are to be multiplied by 0.86 (Schlafly & Finkbeiner 2011).
     law : {"G23", "F99", "F19", "F04", "M14", "O94", "CCM89"}, optional
         The law.
@@ -300,7 +300,7 @@ def band_extinction(filters, ebv, *, law="G23", r_v=3.1, sed=None, beyond="refus
     Raises
     ------
     ValueError
-        If a colour excess is missing or negative (the message names the rows), the law is not
+        If a color excess is missing or negative (the message names the rows), the law is not
         defined for the R_V or over a band, or the spectrum does not cover a band.
     `~astropy.units.UnitsError`
         If ``ebv`` is no magnitude.
@@ -313,7 +313,7 @@ def band_extinction(filters, ebv, *, law="G23", r_v=3.1, sed=None, beyond="refus
     (<Quantity [0.029] mag>, <Quantity [0.0009] mag>)
     """
     bands = filters if isinstance(filters, FilterSet) else FilterSet(filters)
-    values, _ = _colour_excess(ebv)
+    values, _ = _color_excess(ebv)
     check_bands(bands, law, beyond)
     low, high = coverage(law)
     points = None if sed is None else spectrum_arrays(sed)
@@ -346,7 +346,7 @@ def deredden(photometry, ebv, filters, *, law="G23", r_v=3.1, sed=None, beyond="
         With a column of flux density for each band, in any linear unit; those of their errors,
         ``<band>_err``, where they are there. Missing fluxes are NaN or masked and stay so.
     ebv : float, array_like or `~astropy.units.Quantity`, shape () or (n,)
-        Colour excess; see `band_extinction`.
+        Color excess; see `band_extinction`.
     filters : `~miricigale.filters.FilterSet` or iterable of str
         The bands to be corrected.
     law, r_v, sed, beyond
@@ -360,7 +360,7 @@ def deredden(photometry, ebv, filters, *, law="G23", r_v=3.1, sed=None, beyond="
     Raises
     ------
     ValueError
-        If a band or a colour excess is missing (the message names the rows), if there are not as
+        If a band or a color excess is missing (the message names the rows), if there are not as
         many as rows, or if the meta say that the table is corrected already.
     `~astropy.units.UnitsError`
         If a flux or an error is in magnitudes or in no unit.
@@ -372,7 +372,7 @@ def deredden(photometry, ebv, filters, *, law="G23", r_v=3.1, sed=None, beyond="
         got = f"one whose meta say {_KEY}: {photometry.meta[_KEY]}"
         raise argument_error("photometry", "a table not corrected yet", got)
     require_columns(photometry, bands.names, "photometry")
-    values, scalar = _colour_excess(ebv)
+    values, scalar = _color_excess(ebv)
     if not scalar and values.size != len(photometry):
         got = f"{values.size} for {len(photometry)} rows"
         raise argument_error("ebv", "one number or one for each row", got)

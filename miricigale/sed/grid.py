@@ -80,7 +80,7 @@ class ModelGrid(Frozen):
         ...).
     galaxy_shape : `~astropy.table.QTable`, nG rows, optional
         Derived quantities of the galaxy that do not scale with mass (``a_v``, ``beta``,
-        ``age_light``, colours, ...).
+        ``age_light``, colors, ...).
     agn_multiplicity : `~numpy.ndarray` of int, shape (nA,)
         How many identical models of the grid each row stands for: without polar dust
         the temperatures of that dust make no difference, and are evaluated once.

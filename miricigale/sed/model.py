@@ -189,7 +189,7 @@ class SEDModel:
 
         Delayed history, BC03 at solar metallicity, Calzetti-Leitherer attenuation, dust in a
         sequence of alpha, torus with SMC polar dust (oa 40 deg, i 70 deg, p 1, R 20,
-        emissivity 1.6), intergalactic absorption; q 1 and one colour excess for stars of all ages
+        emissivity 1.6), intergalactic absorption; q 1 and one color excess for stars of all ages
         are inferred. BC03 files (the paper: Chabrier IMF), Dale et al. 2014 and SKIRTOR are used
         where they are registered (``miricigale data add``) and hold the paper's values; bundled
         tables stand in for what is not: BC03 with a Kroupa IMF, a Draine & Li sequence, a

@@ -21,7 +21,7 @@ def yang2021_components(*, agn=True, xray=False, igm="meiksin2006", libraries="b
     Components of the chain of Yang et al. 2021, and which library each part comes from.
 
     Parameters are those of `SEDModel.yang2021`. Of the paper are the libraries' kinds and the values
-    of its table 1; ``q`` and one colour excess for stars of all ages are inferred.
+    of its table 1; ``q`` and one color excess for stars of all ages are inferred.
     """
     if libraries not in LIBRARIES:
         raise argument_error("libraries", f"one of {LIBRARIES}", repr(libraries))

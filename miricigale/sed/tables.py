@@ -184,7 +184,7 @@ def flux_table(model, table, filters):
     good = np.flatnonzero(flags == 0)
     far = np.zeros(n)
     far[good] = distance(values["redshift"][good], model.cosmology)
-    # neighbours share stars, then dust, then nuclei
+    # neighbors share stars, then dust, then nuclei
     order = np.lexsort([values[name][good] for name in reversed(model.parameters)])
     blocks = _Blocks(model, values, _stack(filters), far)
     for first in range(0, good.size, BLOCK):

@@ -128,7 +128,7 @@ def test_a_filter_cites_its_source():
     assert any("sedpy" in text for text in meta["citations"])
 
 
-def test_catalogue_convention_gives_the_true_flux_of_its_reference_spectrum():
+def test_catalog_convention_gives_the_true_flux_of_its_reference_spectrum():
     for name in ("irac.ch1", "irac.ch4", "mips.24"):
         band = Filter.from_name(name)
         nominal = band.meta["reference_wavelength"]
@@ -139,9 +139,9 @@ def test_catalogue_convention_gives_the_true_flux_of_its_reference_spectrum():
                 return lam
             return BlackBody(1e4 * u.K)(lam * u.um).value * 1e6
 
-        flux = band.synthetic_flux(spectrum(wave, reference(wave))) * band.catalogue_factor
+        flux = band.synthetic_flux(spectrum(wave, reference(wave))) * band.catalog_factor
         assert_quantity_allclose(flux, reference(np.array(nominal)) * u.uJy, rtol=5e-5)
-    assert Filter.from_name("miri.f770w").catalogue_factor == 1
+    assert Filter.from_name("miri.f770w").catalog_factor == 1
 
 
 def test_spectrum_that_does_not_cover_the_band_is_refused():

@@ -33,8 +33,8 @@ def test_citations_are_sorted_without_repeats():
 def test_registry_loads_on_first_use():
     calls = []
     registry = Registry("thing")
-    registry.register("a", lambda name: calls.append(name) or name.upper(), colour="red")
-    assert registry.metadata("a") == {"colour": "red"}
+    registry.register("a", lambda name: calls.append(name) or name.upper(), color="red")
+    assert registry.metadata("a") == {"color": "red"}
     assert calls == []
     assert registry.get("a") == "A"
     assert calls == ["a"]
@@ -53,6 +53,6 @@ def test_registry_refuses():
 
 def test_metadata_is_a_copy():
     registry = Registry("thing")
-    registry.register("a", str, colour="red")
-    registry.metadata("a")["colour"] = "blue"
-    assert registry.metadata("a")["colour"] == "red"
+    registry.register("a", str, color="red")
+    registry.metadata("a")["color"] = "blue"
+    assert registry.metadata("a")["color"] == "red"

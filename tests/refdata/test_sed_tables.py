@@ -33,7 +33,7 @@ def test_ssp_table_is_whole():
     assert 0.1 < solar[np.argmin(abs(age - 10000.0))] < 1.0
 
 
-def test_dust_spectra_are_normalised():
+def test_dust_spectra_are_normalized():
     table = load_dl07(str(locate("dust.dl07")))
     for name in ("single", "powerlaw"):
         total = np.trapezoid(table[name], table["wave"], axis=-1)

@@ -95,11 +95,11 @@ def test_other_disks_have_the_same_power_and_leave_the_dust_alone(torus, disk):
 
 
 def test_shallower_disk_is_redder(torus, wave):
-    def colour(delta):
+    def color(delta):
         disk = torus.torus_spectra(wave, values_of(torus, inclination=0.0, disk_slope=delta)).disk
         return np.divide(*np.interp([2.0, 0.3], wave, disk))
 
-    assert colour(0.5) / colour(0.0) == pytest.approx((2.0 / 0.3) ** 0.5, rel=0.01)
+    assert color(0.5) / color(0.0) == pytest.approx((2.0 / 0.3) ** 0.5, rel=0.01)
 
 
 # ------------------------------------------------------------------------- polar dust
@@ -213,7 +213,7 @@ def test_wavelengths_without_dust_emission_are_refused(torus):
 # ------------------------------------------------------------------------------ power
 
 
-def test_torus_and_polar_dust_are_normalised_to_one_watt(torus, wave):
+def test_torus_and_polar_dust_are_normalized_to_one_watt(torus, wave):
     parts = torus.templates(wave, values_of(torus, ebv_polar=0.2))
     assert np.trapezoid(parts.torus + parts.polar, wave) == pytest.approx(1.0, rel=1e-12)
     assert np.all(parts.polar >= 0)
@@ -300,11 +300,11 @@ def test_silicate_feature_turns_from_emission_to_absorption(torus, wave):
 
 
 def test_steeper_density_makes_a_hotter_torus(torus, wave):
-    def colour(p):
+    def color(p):
         dust = torus.torus_spectra(wave, values_of(torus, p=p)).dust
         return np.divide(*np.interp([4.0, 20.0], wave, dust))
 
-    assert colour(0.0) < colour(1.0) < colour(1.5)
+    assert color(0.0) < color(1.0) < color(1.5)
 
 
 def test_hidden_disk_is_weak_in_the_visible(torus, wave):
@@ -624,7 +624,7 @@ def test_skirtor_gives_the_library_where_nothing_is_changed(skirtor, angle):
         base.dust[at], (table[:, 4] / WAVE / dust)[:-1], rtol=1e-5, atol=1e-25
     )
     # power laws instead of straight lines between 132 points: 0.3 %; scattered light, 2 % of the
-    # disk at inclination 0, takes the disk's colour there
+    # disk at inclination 0, takes the disk's color there
     np.testing.assert_allclose(
         base.disk[at], ((table[:, 2] + table[:, 3]) / WAVE / dust)[:-1], rtol=0.015, atol=1e-12
     )
@@ -736,7 +736,7 @@ def test_disk_of_the_real_library_is_the_form_of_2016(real):
 
 
 def test_real_spectrum_that_looks_wrong(real):
-    """tau 5, inclination 80: far above its neighbours in tau at 2.3 um."""
+    """tau 5, inclination 80: far above its neighbors in tau at 2.3 um."""
     at = np.argmin(np.abs(real.wave - 2.3))
     light = [
         real.spectra["dust"][

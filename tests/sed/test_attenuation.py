@@ -79,7 +79,7 @@ def test_nothing_is_dimmed_below_the_lyman_limit_nor_where_the_fit_turns_negativ
 
 @pytest.mark.parametrize("slope", [-1.2, -0.3, 0.0, 0.6])
 @pytest.mark.parametrize("bump", [0.0, 3.0, 10.0])
-def test_colour_excess_is_kept(slope, bump):
+def test_color_excess_is_kept(slope, bump):
     b, v = curve([0.44, 0.55], slope=slope, uv_bump=bump)
     want = 2.659 * (1.509 * (1 / 0.44 - 1 / 0.55) - 0.198 * (0.44**-2 - 0.55**-2))
     want += 2.659 * 0.011 * (0.44**-3 - 0.55**-3)
@@ -93,9 +93,9 @@ def test_slope_is_a_power_law():
     np.testing.assert_allclose(np.diff(np.log(ratio)), -0.5 * np.log(2.0))
 
 
-def drude(wave, centre=0.2175, width=0.035):
+def drude(wave, center=0.2175, width=0.035):
     """Noll et al. 2009, equation 2 of Kriek & Conroy 2013."""
-    return (wave * width) ** 2 / ((wave**2 - centre**2) ** 2 + (wave * width) ** 2)
+    return (wave * width) ** 2 / ((wave**2 - center**2) ** 2 + (wave * width) ** 2)
 
 
 def test_cigale_scaling_adds_the_bump_after_the_power_law():
@@ -128,10 +128,10 @@ def test_scalings_agree_without_a_bump():
 
 def test_bump_has_its_place_and_width():
     """A Drude profile is at half its height where |l^2 - l0^2| = l w, w apart."""
-    part, centre, width = CalzettiLeitherer(ebv_scaling="cigale"), 0.21, 0.05
-    options = {"uv_bump": 4.0, "uv_bump_wavelength": centre, "uv_bump_width": width}
-    middle = np.sqrt(centre**2 + width**2 / 4)
-    wave = np.array([middle - width / 2, centre, middle + width / 2])
+    part, center, width = CalzettiLeitherer(ebv_scaling="cigale"), 0.21, 0.05
+    options = {"uv_bump": 4.0, "uv_bump_wavelength": center, "uv_bump_width": width}
+    middle = np.sqrt(center**2 + width**2 / 4)
+    wave = np.array([middle - width / 2, center, middle + width / 2])
     np.testing.assert_allclose(curve(wave, part, **options) - curve(wave, part), [2.0, 4.0, 2.0])
 
 
@@ -167,7 +167,7 @@ def test_pei_fits_prevot(wave, excess):
     assert curve(wave, SMC(law="pei1992"))[0] == pytest.approx(excess + 2.93, rel=0.03)
 
 
-def test_pei_has_r_v_and_colour_excess():
+def test_pei_has_r_v_and_color_excess():
     """R_V = 2.93 in Pei 1992; his fit leaves 4 % at 0.44 um, where xi should be 1."""
     b, v = curve([0.44, 0.55], SMC(law="pei1992"))
     assert v == pytest.approx(2.93, rel=0.05)
@@ -216,8 +216,8 @@ def pei(wave, galaxy):
     """k(lambda) of the package dust_extinction, whose P92 divides by A_V."""
     r_v, terms = PEI[galaxy]
     keys = {}
-    for name, (a, centre, b, n) in terms.items():
-        keys |= {f"{name}_amp": a * (1.0 + 1.0 / r_v), f"{name}_lambda": centre}
+    for name, (a, center, b, n) in terms.items():
+        keys |= {f"{name}_amp": a * (1.0 + 1.0 / r_v), f"{name}_lambda": center}
         keys |= {f"{name}_b": b, f"{name}_n": n}
     return r_v * np.asarray(P92(**keys)(wave * u.um))
 
@@ -256,7 +256,7 @@ def test_screens_leave_light_below_the_lyman_limit():
 
 
 def gas_curve(wave, law="mw", **changes):
-    """A(lambda) of the gas for one magnitude of colour excess."""
+    """A(lambda) of the gas for one magnitude of color excess."""
     part, wave = ModifiedStarburst(gas_law=law), np.atleast_1d(np.asarray(wave, float))
     return -2.5 * np.log10(part.gas_factor(wave, values_of(part, ebv_lines=1.0, **changes)))
 
@@ -339,9 +339,9 @@ def chain_of(part, nebular=True):
 def line_power(sed, name):
     """Power of a line above a straight line through the light on both sides."""
     nebular = Nebular()
-    centre = dict(zip(nebular.line_names, nebular.line_wave, strict=True))[name]
+    center = dict(zip(nebular.line_names, nebular.line_wave, strict=True))[name]
     wave = sed.wave.to_value(u.um)
-    part = np.abs(wave / centre - 1.0) < 500.0 / 299792.458
+    part = np.abs(wave / center - 1.0) < 500.0 / 299792.458
     x, y = wave[part], (sed.fnu.value / wave**2)[part]
     return np.trapezoid(y - np.interp(x, x[[0, -1]], y[[0, -1]]), x)
 

@@ -38,7 +38,7 @@ def test_energy_balance_of_every_chain(sfh, attenuation, dust, gas):
     """
     Light of stars and gas in = light out + dust light, to 1e-6 of what dust took.
 
-    With gas, dust also takes the share f_dust of the ionising light.
+    With gas, dust also takes the share f_dust of the ionizing light.
     """
     parts = [sfh, "bc03", attenuation, dust, *(["nebular"] if gas else [])]
     options = {"nebular": {"f_dust": 0.3, "f_esc": 0.1}} if gas else {}
@@ -166,7 +166,7 @@ def test_beta_of_young_stars_without_dust_is_the_published_one():
     assert 9.97 * 0.3 / (betas[1] - betas[0]) == pytest.approx(1.99, rel=0.15)
 
 
-def test_rest_frame_colours_against_synphot(full):
+def test_rest_frame_colors_against_synphot(full):
     """The galaxy at 10 pc through the same curves, by synphot's own integration."""
     synphot = pytest.importorskip("synphot")
     model = make("delayed", "bc03", "nebular", "calzetti", "dl07")
@@ -195,7 +195,7 @@ def test_passive_and_star_forming_galaxies_fall_on_their_sides_of_uvj():
 # ---------------------------------------------------------------- gas, X-rays, the sky
 
 
-def test_gas_takes_ionising_light_and_lets_the_rest_pass():
+def test_gas_takes_ionizing_light_and_lets_the_rest_pass():
     with_gas = make("constant", "bc03", "nebular")
     got = with_gas.decompose(age=0.05, redshift=0.0)
     leak = with_gas.decompose(age=0.05, redshift=0.0, f_esc=1.0)

@@ -82,17 +82,17 @@ def test_delayed_composites_agree_with_those_of_bc03(data_file, name):
         _, spectra, _ = stars.table(0.02)
         mine = sum(stars.age_weights(history, values_of(stars))) @ spectra / (3.828e26 * 1e4)
         formed = 1 - (1 + age[row] / 1e9 / tau) * np.exp(-age[row] / 1e9 / tau)
-        for centre in (0.44, 0.55, 0.7, 0.9, 1.25, 1.65, 2.2):
-            band = np.linspace(0.95 * centre, 1.05 * centre, 200)
+        for center in (0.44, 0.55, 0.7, 0.9, 1.25, 1.65, 2.2):
+            band = np.linspace(0.95 * center, 1.05 * center, 200)
             theirs = np.interp(band, lam, flux).mean()
             ours = np.interp(band, stars.nodes(), mine).mean() * formed
-            assert np.log10(ours / theirs) == pytest.approx(-0.034, abs=0.02), (target, centre)
+            assert np.log10(ours / theirs) == pytest.approx(-0.034, abs=0.02), (target, center)
 
 
 # ------------------------------------------------------------------------ attenuation
 
 
-def test_old_stars_have_their_share_of_the_colour_excess():
+def test_old_stars_have_their_share_of_the_color_excess():
     part = CalzettiLeitherer()
     wave = np.array([0.2, 0.55])
     young, old = part.factors(wave, values_of(part, ebv=0.5, ebv_factor=0.44))

@@ -57,7 +57,7 @@ def test_starburst_curve_at_points(wave, k):
     assert _core.leitherer_calzetti(np.array([wave]))[0] == pytest.approx(k, rel=1e-6)
 
 
-def test_starburst_curve_has_r_v_and_colour_excess():
+def test_starburst_curve_has_r_v_and_color_excess():
     b, v = _core.leitherer_calzetti(np.array([0.44, 0.55]))
     assert v == pytest.approx(4.05, abs=0.01)
     assert b - v == pytest.approx(1.0, abs=0.05)
@@ -69,7 +69,7 @@ def test_leitherer_joins_calzetti():
 
 
 @pytest.mark.parametrize(("slope", "bump"), [(0.0, 3.0), (-0.5, 0.0), (0.3, 1.5)])
-def test_modified_curve_keeps_the_colour_excess(slope, bump):
+def test_modified_curve_keeps_the_color_excess(slope, bump):
     band = np.array([0.44, 0.55])
     want = np.diff(_core.leitherer_calzetti(band))
     np.testing.assert_allclose(np.diff(_core.attenuation_curve(band, slope, bump)), want)

@@ -56,18 +56,18 @@ def dale_folder(tmp_path_factory):
     """A folder with files of the distributed format, made of known starlight and dust."""
     folder = tmp_path_factory.mktemp("dale2014")
     wave = synthetic_wave()
-    stars, columns, colours = synthetic_stars(wave), [wave], []
+    stars, columns, colors = synthetic_stars(wave), [wave], []
     for alpha in ALPHA:
         dust = synthetic_dust(wave, alpha)
         columns.append(np.log10((stars + dust) * wave))
         at60, at100 = np.interp([60.0, 100.0], wave, synthetic_dust(wave, alpha))
-        colours.append(np.log10(at60 * 60.0**2 / (at100 * 100.0**2)))
+        colors.append(np.log10(at60 * 60.0**2 / (at100 * 100.0**2)))
     formats = ["%10.3f"] + ["%9.5f"] * ALPHA.size
     np.savetxt(folder / "spectra.0.00AGN.dat", np.column_stack(columns), fmt=formats)
     lines = ["# Ndhmod", "# 64", "# Ndh alpha lgfnu60_fnu100 lgLIR_M[Lsol] lgLIR_C[Lsol]"]
     lines += [
         f"{i:02d} {a:.4f} {c:7.4f} 12.0 11.9"
-        for i, (a, c) in enumerate(zip(ALPHA, colours, strict=True), 1)
+        for i, (a, c) in enumerate(zip(ALPHA, colors, strict=True), 1)
     ]
     (folder / "dhcal.dat").write_text("\n".join(lines) + "\n")
     grid = np.geomspace(0.1, 160.0, 4000)
@@ -303,14 +303,14 @@ def test_starlight_is_an_option(dale, dale_folder):
         Dale2014(starlight="both")
 
 
-def test_distributed_templates_have_the_colours_that_are_listed(real_dale):
+def test_distributed_templates_have_the_colors_that_are_listed(real_dale):
     """dhcal.dat lists log f_nu(60)/f_nu(100) of IRAS bands; ours are monochromatic."""
     wave = real_dale.wave
-    for row, colour in zip(
+    for row, color in zip(
         real_dale.spectra["removed"], real_dale.values["log_f60_f100"], strict=True
     ):
         at60, at100 = np.interp([60.0, 100.0], wave, row * wave**2)
-        assert np.log10(at60 / at100) == pytest.approx(colour, abs=0.04)
+        assert np.log10(at60 / at100) == pytest.approx(color, abs=0.04)
     assert real_dale.meta["negative"] == 0
     assert any("CIGALE 0.9" in line for line in real_dale.summary)
 
@@ -456,8 +456,8 @@ def test_straight_lines_between_the_nodes_are_good_enough(monkeypatch):
             truth = part.spectrum(values)
         coarse = coarse / np.trapezoid(coarse, wave)
         truth = truth / np.trapezoid(truth, fine)
-        for centre in np.geomspace(1.3, 2600.0, 30):
-            x = np.geomspace(0.9 * centre, 1.1 * centre, 4001)
+        for center in np.geomspace(1.3, 2600.0, 30):
+            x = np.geomspace(0.9 * center, 1.1 * center, 4001)
             means = [
                 np.trapezoid(np.interp(x, w, y), x) for w, y in ((wave, coarse), (fine, truth))
             ]

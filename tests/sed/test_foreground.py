@@ -33,7 +33,7 @@ def values_of(component, **changes):
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("r_v", [2.6, 3.1, 5.0])
-def test_r_v_is_extinction_over_colour_excess(law, r_v):
+def test_r_v_is_extinction_over_color_excess(law, r_v):
     """A(V) = R_V E(B-V). F99, F04 are scaled in the bands B, V: 3 % at 0.55 um, more at large R_V."""
     k = extinction_curve(np.array([0.44, 0.55]), law, r_v)
     assert k[1] == pytest.approx(r_v, rel=0.03)
@@ -237,12 +237,12 @@ def test_band_extinction_of_a_component():
         ("much", "numbers in mag"),
     ],
 )
-def test_bad_colour_excess(ebv, match):
+def test_bad_color_excess(ebv, match):
     with pytest.raises(ValueError, match=match):
         band_extinction(["wfc3.f160w"], ebv)
 
 
-def test_colour_excess_in_wrong_units():
+def test_color_excess_in_wrong_units():
     with pytest.raises(u.UnitsError, match="'ebv' must be convertible to mag, got Jy"):
         band_extinction(["wfc3.f160w"], 0.1 * u.Jy)
 
@@ -255,7 +255,7 @@ def test_sed_must_cover_the_bands():
 # ---------------------------------------------------------------------------------- tables
 
 
-def catalogue(cls=QTable):
+def catalog(cls=QTable):
     table = cls(meta={"field": "mine"})
     table["id"] = ["a", "b", "c"]
     table["acs.f606w"] = [1.0, 2.0, np.nan] * u.uJy
@@ -268,7 +268,7 @@ def catalogue(cls=QTable):
 
 @pytest.mark.parametrize("cls", [QTable, Table])
 def test_dereddening_undoes_the_extinction(cls):
-    table, ebv = catalogue(cls), np.array([0.02, 0.0, 0.3])
+    table, ebv = catalog(cls), np.array([0.02, 0.0, 0.3])
     bands = ["acs.f606w", "miri.f770w"]
     got = deredden(table, ebv, bands, law="G23")
     lost = band_extinction(bands, ebv)
@@ -301,7 +301,7 @@ def test_masked_fluxes_stay_masked():
 
 
 def test_a_table_is_corrected_once():
-    once = deredden(catalogue(), 0.05, ["acs.f606w"])
+    once = deredden(catalog(), 0.05, ["acs.f606w"])
     with pytest.raises(ValueError, match="not corrected yet, got one whose meta say"):
         deredden(once, 0.05, ["acs.f606w"])
 
@@ -316,7 +316,7 @@ def test_a_table_is_corrected_once():
 )
 def test_dereddening_refuses(ebv, bands, match):
     with pytest.raises(ValueError, match=match):
-        deredden(catalogue(), ebv, bands)
+        deredden(catalog(), ebv, bands)
 
 
 def test_dereddening_refuses_magnitudes():

@@ -2,7 +2,7 @@
 Intergalactic absorption against published formulae, measurements and direct integration.
 
 The distribution of absorbers behind Inoue et al. 2014 (their table 1 and eq. 4 to 7): per unit
-redshift and column density, f(z) g(N), g normalised to one above 1e12 cm-2 and of shape
+redshift and column density, f(z) g(N), g normalized to one above 1e12 cm-2 and of shape
 N^-beta exp(-N / 1e21); Doppler parameter 28 km/s.
 """
 

@@ -195,7 +195,7 @@ def test_a_record_of_another_length_is_refused(tmp_path):
 
 
 def test_composites_of_the_authors(data_file):
-    """Exponential rates normalised to 1 Msun in infinite time, of a Chabrier IMF, solar."""
+    """Exponential rates normalized to 1 Msun in infinite time, of a Chabrier IMF, solar."""
     part = read_ised(data_file("bc03/bc2003_lr_m62_chab_tau3_dust00.ised.gz"))
     assert part.spectra.shape == (221, 1221)
     assert (part.law, part.tau, part.metallicity) == (4, 3e9, 0.02)
@@ -371,7 +371,7 @@ def read_bc03_living(parts):
     return out
 
 
-def test_ionising_photons_of_a_ramp(registered):
+def test_ionizing_photons_of_a_ramp(registered):
     """L = c lambda below 1 um: photons c (l^3 - l0^3) / (3 h c) below the Lyman limit."""
     got = registered.ionizing(0.02)
     level = 1e-3 * 0.02**-0.1 / (1 + AGE / 1e6) * 3.826e30

@@ -13,7 +13,7 @@ LIMIT = 0.0912  # um
 METALLICITIES = (0.0001, 0.0004, 0.004, 0.008, 0.02)
 
 
-def ionising(wave, spectra):
+def ionizing(wave, spectra):
     """Photons per second and power in W below the Lyman limit, by trapezoids."""
     part = wave <= LIMIT
     x, y = wave[part], spectra[:, part]
@@ -26,10 +26,10 @@ def gas():
 
 
 def stars(metallicity):
-    """Ages in Myr, ionising photons and power per solar mass formed."""
+    """Ages in Myr, ionizing photons and power per solar mass formed."""
     component = BC03()
     age, spectra, _ = component.table(metallicity)
-    return age, *ionising(component.nodes(), spectra)
+    return age, *ionizing(component.nodes(), spectra)
 
 
 def constant_rate(age, duration):
@@ -46,7 +46,7 @@ def full(gas, **values):
 
 
 def one_photon(gas, method="lines", at=2.0, **values):
-    """What the gas gives for one ionising photon per second from stars of an age in Myr."""
+    """What the gas gives for one ionizing photon per second from stars of an age in Myr."""
     return getattr(gas, method)(np.array([at]), np.ones(1), np.ones(1), full(gas, **values))
 
 
@@ -87,7 +87,7 @@ def test_balmer_jump_is_that_of_recombination_to_the_second_level(gas, metallici
     assert (low - high) / beta == pytest.approx(jump, rel=0.2)
 
 
-def test_free_free_light_at_one_centimetre_is_that_of_the_radio_relation(gas):
+def test_free_free_light_at_one_centimeter_is_that_of_the_radio_relation(gas):
     # Murphy et al. 2011, ApJ 737, 67, eqs 2 and 11, for 10^4 K
     expected = 5.37e-42 / 4.6e-28 * 30.0**-0.1  # L_nu / L(H-alpha) at 30 GHz, 1/Hz
     table = gas.table
@@ -160,7 +160,7 @@ def test_gas_emits_nearly_all_of_the_power_that_it_takes(gas, metallicity, log_u
     assert 0.88 < emitted / (weights @ power) < 1.0
 
 
-def test_gas_follows_the_ionising_photons(gas):
+def test_gas_follows_the_ionizing_photons(gas):
     age, photons, _ = stars(0.02)
     weights = constant_rate(age, 30.0)
     values = full(gas)
@@ -204,7 +204,7 @@ def test_nothing_shines_when_all_photons_escape(gas):
 # ------------------------------------------------------------------- metallicity, log U
 
 
-def test_oxygen_lines_follow_ionisation_and_metallicity(gas):
+def test_oxygen_lines_follow_ionization_and_metallicity(gas):
     def o32(**values):
         lines = one_photon(gas, **values)
         return lines["OIII-5007"] / (lines["OII-3726"] + lines["OII-3729"])
@@ -271,16 +271,16 @@ def test_line_power_is_kept_on_any_grid_that_holds_the_nodes(width):
     drawn = _core.hat_matrix(nodes, merged) @ (spectrum - continuum)
     assert np.trapezoid(drawn, merged) == pytest.approx(sum(lines.values()), rel=1e-6)
     # a line that stands alone
-    centre = dict(zip(component.line_names, component.line_wave, strict=True))["SIV-10.51um"]
-    part = np.abs(merged / centre - 1.0) < 2.0 * width / 299792.458
+    center = dict(zip(component.line_names, component.line_wave, strict=True))["SIV-10.51um"]
+    part = np.abs(merged / center - 1.0) < 2.0 * width / 299792.458
     x, y = merged[part], drawn[part]
     assert np.trapezoid(y, x) == pytest.approx(lines["SIV-10.51um"], rel=1e-6)
     fine = np.linspace(x[0], x[-1], 20001)
     y = np.interp(fine, x, y)
     mean = np.trapezoid(y * fine, fine) / np.trapezoid(y, fine)
-    assert mean == pytest.approx(centre, rel=1e-2 * width / 299792.458)
+    assert mean == pytest.approx(center, rel=1e-2 * width / 299792.458)
     high = fine[y > 0.5 * y.max()]
-    assert (high[-1] - high[0]) / centre * 299792.458 == pytest.approx(width, rel=0.06)
+    assert (high[-1] - high[0]) / center * 299792.458 == pytest.approx(width, rel=0.06)
 
 
 def test_line_width_is_a_setting_with_a_unit():
@@ -293,7 +293,7 @@ def test_line_width_is_a_setting_with_a_unit():
     with pytest.raises(u.UnitsError, match="'line_width' must be convertible to km / s"):
         Nebular(line_width=3.0 * u.um)
     with pytest.raises(ValueError, match="'gas' must be one of stellar, free"):
-        Nebular(gas="ionised")
+        Nebular(gas="ionized")
 
 
 def test_is_known_by_name():

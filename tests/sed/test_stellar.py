@@ -65,7 +65,7 @@ def test_a_history_longer_than_the_universe_is_refused(stars):
         stars.age_weights(np.ones(14001), values_of(stars))
 
 
-# --------------------------------------------------------------- ionising photons
+# --------------------------------------------------------------- ionizing photons
 
 
 def test_photon_weights_by_numerical_integration():
@@ -90,7 +90,7 @@ def photons_per_sfr(stars, metallicity, age=0.1):
     return weights @ stars.ionizing(metallicity) / history[-1]
 
 
-def test_ionising_photons_of_constant_star_formation(stars):
+def test_ionizing_photons_of_constant_star_formation(stars):
     """
     Murphy et al. 2011, eq. 2: 1 Msun/yr (Kroupa, solar) gives 1 / 7.29e-54 photons per second.
 
@@ -101,14 +101,14 @@ def test_ionising_photons_of_constant_star_formation(stars):
     assert rate == pytest.approx(np.log10(9.26e52 * 1.59), abs=0.2)
 
 
-def test_metal_poor_stars_ionise_more(stars):
+def test_metal_poor_stars_ionize_more(stars):
     rates = [photons_per_sfr(stars, z) for z in (0.0001, 0.0004, 0.004, 0.008, 0.02, 0.05)]
     assert rates == sorted(rates, reverse=True)
     # Raiter et al. 2010 and Schaerer 2003: 0.2-0.3 dex from solar to 1/50 solar
     assert 0.1 < np.log10(rates[1] / rates[4]) < 0.35
 
 
-def test_ionising_light_of_old_stars_is_gone(stars):
+def test_ionizing_light_of_old_stars_is_gone(stars):
     age = stars.table(0.02)[0]
     rate = stars.ionizing(0.02)
     assert np.interp(30.0, age, rate) < 1e-3 * rate[0]
@@ -160,12 +160,12 @@ def test_delayed_composites_follow_from_the_exponential_ones(composite, name):
     for time in TIMES:
         row = int(np.argmin(np.abs(part.age / 1e6 - time)))
         mine, _ = with_ssp(part, row, age, table)
-        for centre in (500, 730, 1300, 1600, 2000, 2500, 3500, 4400, 5500, 9000, 16000, 22000):
-            band = (part.wave > 0.95 * centre) & (part.wave < 1.05 * centre)
+        for center in (500, 730, 1300, 1600, 2000, 2500, 3500, 4400, 5500, 9000, 16000, 22000):
+            band = (part.wave > 0.95 * center) & (part.wave < 1.05 * center)
             ratio = np.log10(mine[band].mean() / part.spectra[row][band].mean())
             # the composite itself is sampled coarsely where its young stars die out
-            dying = name == "delayed0.1" and 500 <= time <= 1000 and centre <= 2500
-            assert abs(ratio) < (0.05 if dying else 0.01), (time, centre)
+            dying = name == "delayed0.1" and 500 <= time <= 1000 and center <= 2500
+            assert abs(ratio) < (0.05 if dying else 0.01), (time, center)
 
 
 @pytest.mark.parametrize("name", COMPOSITES)
@@ -197,7 +197,7 @@ def test_living_mass_against_the_composites(composite, stars, name):
         assert mine / formed == pytest.approx(living[row] / formed, abs=0.08)
 
 
-def test_ionising_photons_of_the_composites(composite, stars):
+def test_ionizing_photons_of_the_composites(composite, stars):
     """The files of 2003 (Chabrier) have log Q = 53.17 for 1 Msun/yr; ours of 2016 0.12 more."""
     part = composite("tau3")
     weights = _core.photon_weights(part.wave / 1e4, 0.0912)

@@ -221,18 +221,18 @@ def test_absorption_between_the_galaxies_takes_nothing_longward_of_lyman_alpha(b
 # ------------------------------------------------------------------------------ blackbodies
 
 
-@pytest.mark.parametrize(("kelvin", "centre"), [(5800.0, 0.8), (1000.0, 4.5), (60.0, 70.0)])
-def test_blackbody_through_a_narrow_band(kelvin, centre):
+@pytest.mark.parametrize(("kelvin", "center"), [(5800.0, 0.8), (1000.0, 4.5), (60.0, 70.0)])
+def test_blackbody_through_a_narrow_band(kelvin, center):
     """Constants and Planck's law are astropy's; photon mean over the band by quadrature."""
     body = BlackBody(kelvin * u.K)
-    wave = np.geomspace(centre / 2, centre * 2, 6000)
+    wave = np.geomspace(center / 2, center * 2, 6000)
     sed = SED(wave * u.um, body(wave * u.um).value * u.uJy)
-    low, high = centre * 0.99, centre * 1.01
+    low, high = center * 0.99, center * 1.01
     box = Filter([low, high] * u.um, [1, 1], name="box")
     want = quad(lambda x: body(x * u.um).value / x, low, high)[0] / np.log(high / low)
     assert box.synthetic_flux(sed).value == pytest.approx(want, rel=1e-5)
     # Wien and Rayleigh-Jeans would be off by more
-    assert want == pytest.approx(body(centre * u.um).value, rel=3e-4)
+    assert want == pytest.approx(body(center * u.um).value, rel=3e-4)
 
 
 @pytest.mark.parametrize(("kelvin", "beta"), [(100.0, 1.6), (300.0, 1.0)])

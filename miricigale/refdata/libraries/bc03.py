@@ -220,7 +220,7 @@ def _surviving(part, file):
 
 
 def _refine(wave, spectra):
-    """Insert wavelengths beyond 10 um, log-log between neighbours, and go on to 160 um."""
+    """Insert wavelengths beyond 10 um, log-log between neighbors, and go on to 160 um."""
     ends = wave[-1] < LONGEST * (1 - 1e-6)
     target = max(LONGEST, wave[-1])
     points = np.append(wave, LONGEST) if ends else wave

@@ -60,9 +60,9 @@ def read_dale2014(path):
     """
     path = Path(path)
     contents, places = _find(path)
-    alpha, colour = _read_calibration(contents[CALIBRATION], places[CALIBRATION])
+    alpha, color = _read_calibration(contents[CALIBRATION], places[CALIBRATION])
     wave, log_power = _read_spectra(contents[SPECTRA], places[SPECTRA])
-    _check_order(wave, log_power, colour, places)
+    _check_order(wave, log_power, color, places)
     if STARS in contents:
         stars = np.interp(wave, *_read_stars(contents[STARS], places[STARS]), right=0)
         source = STARS
@@ -89,7 +89,7 @@ def read_dale2014(path):
         axes={"alpha": alpha},
         spectra=spectra,
         units={"removed": "W / um", "kept": "W / um"},
-        values={"log_f60_f100": colour},
+        values={"log_f60_f100": color},
         meta={"files": files, "starlight": source, "negative": negative},
         summary=(
             f"{alpha.size} templates in alpha, {nodes[0]:g} to {nodes[-1]:g} um",
@@ -178,15 +178,15 @@ def _read_stars(data, place):
     return wave, light
 
 
-def _check_order(wave, log_power, colour, places):
-    """Columns belong to the alphas if their colours do (dhcal.dat has those of IRAS bands)."""
+def _check_order(wave, log_power, color, places):
+    """Columns belong to the alphas if their colors do (dhcal.dat has those of IRAS bands)."""
     log_fnu = (log_power + np.log10(wave)[:, None]).T
     at = np.log([60.0, 100.0])
     seen = np.array([np.subtract(*np.interp(at, np.log(wave), row)) for row in log_fnu])
-    if np.abs(seen - colour).max() > 0.06:
+    if np.abs(seen - color).max() > 0.06:
         msg = (
             f"{places[SPECTRA]} does not fit {places[CALIBRATION]}: log f60/f100 differs by "
-            f"{np.abs(seen - colour).max():.2f}, wanted less than 0.06"
+            f"{np.abs(seen - color).max():.2f}, wanted less than 0.06"
         )
         raise DataError(msg)
 

@@ -151,7 +151,7 @@ class LibraryTable:
         """Levels of each axis as floats, and how near to each a value must be."""
         ladders = {}
         for name, levels in self._levels.items():
-            # zero has no relative neighbourhood: there the extent of the axis is the measure
+            # zero has no relative neighborhood: there the extent of the axis is the measure
             near = _SAME * np.maximum(np.abs(levels), 1e-3 * (levels[-1] - levels[0]))
             ladders[name] = (levels.tolist(), near.tolist())
         return ladders

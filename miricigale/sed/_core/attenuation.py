@@ -57,7 +57,7 @@ def leitherer_calzetti(wave):
     return np.where(nm <= _BREAK * 1e3, 0.0, np.maximum(k, 0.0))
 
 
-def attenuation_curve(wave, slope=0.0, bump=0.0, centre=0.2175, width=0.035, scaling="exact"):
+def attenuation_curve(wave, slope=0.0, bump=0.0, center=0.2175, width=0.035, scaling="exact"):
     """
     Starburst curve times (lambda / 0.55 um)^slope, plus a Drude bump, scaled in E(B-V).
 
@@ -73,11 +73,11 @@ def attenuation_curve(wave, slope=0.0, bump=0.0, centre=0.2175, width=0.035, sca
     if slope:
         curve = curve * (wave / _V) ** slope
     if bump:
-        extra = bump * drude(band, centre, width)
+        extra = bump * drude(band, center, width)
         new = new + extra
         if scaling == "cigale":
             old = old + extra
-        curve = curve + bump * drude(wave, centre, width)
+        curve = curve + bump * drude(wave, center, width)
     return curve * ((old[0] - old[1]) / (new[0] - new[1]))
 
 
@@ -94,7 +94,7 @@ def smc_power_law(wave):
 def pei_extinction(wave, galaxy):
     """k(lambda) = (1 + R_V) xi(lambda), Pei 1992, of mw, lmc or smc."""
     xi = 0.0
-    for amplitude, centre, b, n in _PEI[galaxy]:
-        ratio = (wave / centre) ** n
+    for amplitude, center, b, n in _PEI[galaxy]:
+        ratio = (wave / center) ** n
         xi = xi + amplitude / (ratio + 1.0 / ratio + b)
     return (1.0 + _PEI_RV[galaxy]) * xi

@@ -125,7 +125,7 @@ def age_steps(age, n_steps):
     Returns
     -------
     runs : int, shape (3, n_run)
-        Steps that lie between two neighbouring ages: first, last + 1, number of the younger age.
+        Steps that lie between two neighboring ages: first, last + 1, number of the younger age.
         A step k of them counts as mass at k + 0.55 Myr, the mean of its ten times.
     mixed : int, shape (n_mixed,)
         The other steps.

@@ -1,4 +1,4 @@
-"""Emission of ionised gas: shares of ionising photons, profiles of lines."""
+"""Emission of ionized gas: shares of ionizing photons, profiles of lines."""
 
 import numpy as np
 from scipy.sparse import csr_matrix, hstack
@@ -17,7 +17,7 @@ HEIGHTS = np.where(np.abs(OFFSETS) < 1.4, np.exp(-4.0 * np.log(2.0) * OFFSETS**2
 
 def absorbed_share(f_esc, f_dust):
     """
-    Line emission relative to gas that absorbs every ionising photon.
+    Line emission relative to gas that absorbs every ionizing photon.
 
     Photons that leave or that dust takes are lost to the gas, and those of recombinations to
     the ground state are lost with them (Inoue 2011, MNRAS 415, 2920, eq. 2 with dust).
@@ -28,7 +28,7 @@ def absorbed_share(f_esc, f_dust):
 
 def photons_by_age(age, photons, nodes):
     """
-    Share ionising photons of some ages out among the ages of a table; their sum is kept.
+    Share ionizing photons of some ages out among the ages of a table; their sum is kept.
 
     Linear between ages; what is younger than the first or older than the last counts for it.
     """

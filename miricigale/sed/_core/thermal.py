@@ -18,7 +18,7 @@ def modified_blackbody(wave, temperature, beta, wave_thick=200.0):
     return -np.expm1(-((wave_thick / wave) ** beta)) * planck_lambda(wave, temperature)
 
 
-def drude(wave, centre, width):
-    """Drude profile, 1 at the centre."""
-    w = (width / centre) ** 2
-    return w / ((wave / centre - centre / wave) ** 2 + w)
+def drude(wave, center, width):
+    """Drude profile, 1 at the center."""
+    w = (width / center) ** 2
+    return w / ((wave / center - center / wave) ** 2 + w)

@@ -92,7 +92,7 @@ class AGN(Component):
         doc="Added to the disk's optical slope, L_lambda ~ lambda^(-1.5 + disk_slope).",
     )  # fmt: skip
     ebv_polar = Parameter(
-        default=0.1, bounds=(0.0, 3.0), unit="mag", doc="Colour excess of the polar dust."
+        default=0.1, bounds=(0.0, 3.0), unit="mag", doc="Color excess of the polar dust."
     )
     temperature_polar = Parameter(
         default=100.0, bounds=(20.0, 1500.0), unit="K", doc="Temperature of the polar dust."

@@ -112,13 +112,13 @@ class Attenuation(Component):
 
 
 class _Screen(Attenuation):
-    """A curve k(lambda) times a colour excess, which old stars have a share of."""
+    """A curve k(lambda) times a color excess, which old stars have a share of."""
 
     ebv = Parameter(
-        default=0.3, bounds=(0.0, 3.0), unit="mag", doc="Colour excess of stars below 10 Myr."
+        default=0.3, bounds=(0.0, 3.0), unit="mag", doc="Color excess of stars below 10 Myr."
     )
     ebv_factor = Parameter(
-        default=1.0, bounds=(0.0, 1.0), doc="Colour excess of older stars over that of young ones."
+        default=1.0, bounds=(0.0, 1.0), doc="Color excess of older stars over that of young ones."
     )
 
     def _law(self, values):
@@ -146,7 +146,7 @@ class _Starburst(Attenuation):
     )
     slope = Parameter(default=0.0, bounds=(-1.2, 0.6), doc="Change of the curve's power-law slope.")
     uv_bump_wavelength = Parameter(
-        default=0.2175, bounds=(0.18, 0.26), unit="um", doc="Centre of the bump."
+        default=0.2175, bounds=(0.18, 0.26), unit="um", doc="Center of the bump."
     )
     uv_bump_width = Parameter(
         default=0.035, bounds=(0.005, 0.1), unit="um", doc="Full width at half maximum of the bump."
@@ -156,8 +156,8 @@ class _Starburst(Attenuation):
         bump = values["uv_bump"]
         if bump == 0.0:
             return "calzetti", values["slope"]
-        centre, width = values["uv_bump_wavelength"], values["uv_bump_width"]
-        return "calzetti", values["slope"], bump, centre, width, self.ebv_scaling
+        center, width = values["uv_bump_wavelength"], values["uv_bump_width"]
+        return "calzetti", values["slope"], bump, center, width, self.ebv_scaling
 
 
 @register
@@ -200,7 +200,7 @@ class ModifiedStarburst(_Starburst):
     Gas behind more dust than the stars: an extinction law for the one, the starburst curve for
     the other.
 
-    Lines and continuum of the gas have the colour excess ``ebv_lines`` and one of four laws of
+    Lines and continuum of the gas have the color excess ``ebv_lines`` and one of four laws of
     extinction; stars of every age have ``ebv_factor_stars`` of it (0.44: Calzetti et al. 1994,
     2000) and the curve of `CalzettiLeitherer`. What both lose heats the dust. Without gas in the
     chain only the stars' part is left.
@@ -227,10 +227,10 @@ class ModifiedStarburst(_Starburst):
     packages = ("dust_extinction",)
     options = {"gas_law": ("mw", "lmc", "smc", "mw_pei1992")}
     ebv_lines = Parameter(
-        default=0.3, bounds=(0.0, 5.0), unit="mag", doc="Colour excess of the gas."
+        default=0.3, bounds=(0.0, 5.0), unit="mag", doc="Color excess of the gas."
     )
     ebv_factor_stars = Parameter(
-        default=0.44, bounds=(0.0, 1.0), doc="Colour excess of the stars over that of the gas."
+        default=0.44, bounds=(0.0, 1.0), doc="Color excess of the stars over that of the gas."
     )
     r_v_gas = Parameter(
         default=3.1,
@@ -276,7 +276,7 @@ class SMC(_Screen):
     law : {"smc", "pei1992"}
         ``"smc"``: k = 1.39 (lambda / um)^-1.2, the law of the polar dust of AGN (a fit to Prevot et
         al. 1984 in the ultraviolet; k(0.55 um) = 2.85 and k(0.44 um) - k(0.55 um) = 0.87, so
-        that ``ebv`` is the colour excess but for 13 %). ``"pei1992"``: the six terms of Pei 1992,
+        that ``ebv`` is the color excess but for 13 %). ``"pei1992"``: the six terms of Pei 1992,
         with silicates and R_V = 2.93.
     **defaults
         New defaults of parameters.

@@ -69,8 +69,8 @@ class Dale2014(DustEmission):
     """
     Dale et al. 2014 without AGN: dust mass goes as dM ~ U^-alpha dU in the intensity U.
 
-    The 64 templates (alpha in steps of 1/16) are those of the distributed files, normalised to
-    1 W; between them a spectrum is the linear interpolation of its neighbours. The option
+    The 64 templates (alpha in steps of 1/16) are those of the distributed files, normalized to
+    1 W; between them a spectrum is the linear interpolation of its neighbors. The option
     ``starlight`` says whether the starlight that CIGALE's builder takes away near 2 um is
     taken away here (``"removed"``) or not (``"kept"``). The files are the user's to bring:
     ``miricigale data add dust.dale2014 PATH``.

@@ -1,4 +1,4 @@
-"""Lines and continuum of the gas that young stars ionise."""
+"""Lines and continuum of the gas that young stars ionize."""
 
 import functools
 from dataclasses import dataclass
@@ -28,14 +28,14 @@ _WIDTH.name = "line_width"
 @dataclass(frozen=True, eq=False)
 class NebularTable:
     """
-    Emission of HII regions for each ionising photon per second.
+    Emission of HII regions for each ionizing photon per second.
 
     Attributes
     ----------
     metallicity, log_u : `~numpy.ndarray`, shape (n_model,)
         Of the gas; log U is that at its inner edge.
     age : `~numpy.ndarray`, shape (n_age,)
-        Ages in Myr of the stars that ionise.
+        Ages in Myr of the stars that ionize.
     wave : `~numpy.ndarray`, shape (n_wave,)
         Wavelengths of the continuum in um.
     continuum : `~numpy.ndarray`, shape (n_model, n_age, n_wave)
@@ -145,9 +145,9 @@ def load_nebular(path):
 @register
 class Nebular(Component):
     """
-    HII regions computed with Cloudy, for each ionising photon.
+    HII regions computed with Cloudy, for each ionizing photon.
 
-    Every population lights its gas in proportion to its hydrogen-ionising photons, with the
+    Every population lights its gas in proportion to its hydrogen-ionizing photons, with the
     spectrum that its age gives; lines are Gaussians. Grains are not in the gas: its light
     meets dust in the chain, as starlight does.
 
@@ -178,7 +178,7 @@ class Nebular(Component):
     log_u = Parameter(
         default=-2.0,
         bounds=(-4.0, 0.0),
-        doc="Ionisation parameter U at the inner edge of the gas, in log; to -3 at Z = 0.05.",
+        doc="Ionization parameter U at the inner edge of the gas, in log; to -3 at Z = 0.05.",
     )
     metallicity_gas = Parameter(
         default=0.02,
@@ -186,10 +186,10 @@ class Nebular(Component):
         doc="Metallicity of the gas if gas='free': 0.0001, 0.0004, 0.004, 0.008, 0.02 or 0.05.",
     )
     f_esc = Parameter(
-        default=0.0, bounds=(0.0, 1.0), doc="Share of ionising photons that leave the galaxy."
+        default=0.0, bounds=(0.0, 1.0), doc="Share of ionizing photons that leave the galaxy."
     )
     f_dust = Parameter(
-        default=0.0, bounds=(0.0, 1.0), doc="Share of ionising photons that dust absorbs."
+        default=0.0, bounds=(0.0, 1.0), doc="Share of ionizing photons that dust absorbs."
     )
 
     def __init__(self, *, line_width=_WIDTH.default, **defaults):
@@ -273,7 +273,7 @@ class Nebular(Component):
         weights : `~numpy.ndarray`, shape (n_age,)
             Solar masses formed of each.
         ionizing : `~numpy.ndarray`, shape (n_age,)
-            Hydrogen-ionising photons per second for each solar mass formed.
+            Hydrogen-ionizing photons per second for each solar mass formed.
         values : dict
             Values of all parameters, those of the stars among them.
 

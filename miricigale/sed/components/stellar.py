@@ -65,7 +65,7 @@ class StellarPopulations(Component):
 
     def ionizing(self, metallicity):
         """
-        Photons that ionise hydrogen, of one metallicity.
+        Photons that ionize hydrogen, of one metallicity.
 
         Returns
         -------
@@ -133,7 +133,7 @@ class BC03(StellarPopulations):
     Six metallicities; others are refused rather than interpolated, and so is the source's
     seventh, 0.1, whose populations below 300 Myr lack most of their light. The surviving mass
     leaves out remnants. Yang et al. 2021 use BC03 of 2003 with a Chabrier IMF: light for each
-    solar mass differs by 0.03 dex, ionising photons by 0.12 dex.
+    solar mass differs by 0.03 dex, ionizing photons by 0.12 dex.
     """
 
     name = "bc03"
