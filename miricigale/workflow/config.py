@@ -6,14 +6,21 @@ import math
 import tomllib
 import types
 import typing
+import warnings
 from importlib import resources
 from pathlib import Path
+
+from astropy.utils.exceptions import AstropyDeprecationWarning
 
 from miricigale.instrument import CEERS_FILTERS
 from miricigale.photometry import YANG2021_DEPTHS
 from miricigale.utils.exceptions import ConfigError, unknown_name
 
-__all__ = ["StudyConfig", "load_config", "preset_names"]
+__all__ = ["StudyConfig", "load_config", "preset_names", "toml_value"]
+
+
+#: Keys that had another name, which files may still have.
+_FORMER = {"photometry.n_pixels": "photometry.min_area"}
 
 
 def _option(default, doc, *, low=None, high=None, choices=None):
@@ -140,7 +147,9 @@ class PhotometrySection:
     threshold: float = _option(
         0.25, "Detection threshold in sigma of a pixel.", low=0.01, high=100.0
     )
-    min_area: int = _option(60, "Smallest area of a detection in pixels.", low=1, high=10000)
+    n_pixels: int = _option(
+        60, "Least number of connected pixels of a detection.", low=1, high=10000
+    )
     regularization: str = _option(
         "auto", "Regularization of the matching kernels: auto, yang2021 (0.03) or a number."
     )
@@ -278,7 +287,9 @@ class StudyConfig:
         for name in names:
             section, _, key = name.partition(".")
             values = getattr(self, section)
-            found[name] = getattr(values, key) if key else dataclasses.asdict(values)
+            value = getattr(values, key) if key else dataclasses.asdict(values)
+            # under the former name, so that the new one makes no other hash
+            found[_FORMER.get(name, name)] = value
         return found
 
     def to_toml(self):
@@ -296,7 +307,7 @@ class StudyConfig:
             lines += ["", f"[{field.name}]  # {type(section).__doc__.strip()}"]
             for entry in dataclasses.fields(section):
                 lines.append(f"# {entry.metadata['doc']}{_limits_text(entry.metadata)}")
-                lines.append(f"{entry.name} = {_toml_value(getattr(section, entry.name))}")
+                lines.append(f"{entry.name} = {toml_value(getattr(section, entry.name))}")
         return "\n".join(lines) + "\n"
 
 
@@ -325,9 +336,10 @@ def _limits_text(limits):
     return ""
 
 
-def _toml_value(value):
+def toml_value(value):
+    """Text of a value (text, a number, a truth value or a tuple of these) as TOML has it."""
     if isinstance(value, tuple):
-        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
+        return "[" + ", ".join(toml_value(v) for v in value) + "]"
     if isinstance(value, float):
         # nan, inf and -inf as TOML has them, and a point or an exponent in all others
         return float.__repr__(value)
@@ -338,6 +350,12 @@ def _toml_value(value):
 
 def _replace_section(name, section, entries):
     fields = {field.name: field for field in dataclasses.fields(section)}
+    for new, old in (pair for pair in _FORMER.items() if pair[0].startswith(f"{name}.")):
+        new, old = new.partition(".")[2], old.partition(".")[2]
+        if old in entries and new not in entries:
+            msg = f"[{name}] {old} is called {new} now"
+            warnings.warn(msg, AstropyDeprecationWarning, stacklevel=2)
+            entries = {new if key == old else key: value for key, value in entries.items()}
     unknown = sorted(set(entries) - set(fields))
     if unknown:
         msg = f"[{name}] does not know {unknown}; known: {sorted(fields)}"

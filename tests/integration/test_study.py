@@ -38,7 +38,7 @@ axes = "quick"
 
 [photometry]
 threshold = 1.0
-min_area = 20
+n_pixels = 20
 
 [errors]
 bin_size = 10

@@ -3,9 +3,10 @@ import tomllib
 
 import numpy as np
 import pytest
+from astropy.utils.exceptions import AstropyDeprecationWarning
 
 from miricigale.utils.exceptions import ConfigError
-from miricigale.workflow.config import StudyConfig, _toml_value, load_config, preset_names
+from miricigale.workflow.config import StudyConfig, load_config, preset_names, toml_value
 
 
 @pytest.mark.parametrize("quick", [False, True])
@@ -109,18 +110,18 @@ def test_all_text_comes_back_from_toml():
     texts = ["", '"""', "\\", "C:\\new", "\\u007f", *nasty]
     texts += ["".join(rng.choice(nasty, size=12)) for _ in range(300)]
     for text in texts:
-        line = f"x = {_toml_value(text)}\n"
+        line = f"x = {toml_value(text)}\n"
         assert tomllib.loads(line.encode().decode())["x"] == text
-    assert tomllib.loads(f"x = {_toml_value(tuple(texts))}")["x"] == texts
+    assert tomllib.loads(f"x = {toml_value(tuple(texts))}")["x"] == texts
 
 
 def test_all_numbers_come_back_from_toml():
     floats = [0.0, -0.0, 1e16, 1e-7, 5e-324, 1.7976931348623157e308, 0.1, math.inf, -math.inf]
     for value in (*floats, *np.array(floats), True, False, 0, -3, 2**60):
-        read = tomllib.loads(f"x = {_toml_value(value)}")["x"]
+        read = tomllib.loads(f"x = {toml_value(value)}")["x"]
         assert isinstance(value, type(read))
         assert (read, math.copysign(1, read)) == (value, math.copysign(1, value))
-    assert math.isnan(tomllib.loads(f"x = {_toml_value(math.nan)}")["x"])
+    assert math.isnan(tomllib.loads(f"x = {toml_value(math.nan)}")["x"])
 
 
 def test_a_name_with_any_character_survives_a_printed_configuration(tmp_path):
@@ -133,3 +134,15 @@ def test_a_name_with_any_character_survives_a_printed_configuration(tmp_path):
     assert config.catalog.source == "été 😀 \x9c.fits"
     path.write_text(config.to_toml(), encoding="utf-8")
     assert load_config(path) == config
+
+
+def test_a_former_name_of_a_key_is_read_with_a_warning_and_makes_the_same_hash(tmp_path):
+    path = tmp_path / "old.toml"
+    path.write_text("[photometry]\nmin_area = 45\n")
+    with pytest.warns(
+        AstropyDeprecationWarning, match=r"\[photometry\] min_area is called n_pixels"
+    ):
+        config = load_config(path)
+    assert config.photometry.n_pixels == 45
+    assert config.values("photometry.n_pixels") == {"photometry.min_area": 45}
+    assert "n_pixels = 45" in config.to_toml()

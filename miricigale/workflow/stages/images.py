@@ -180,7 +180,7 @@ def make_mosaic(context, name):
     "high-resolution image",
     version=2,
     needs=("truth",),
-    sections=(*GRID, "highres", "photometry.threshold", "photometry.min_area"),
+    sections=(*GRID, "highres", "photometry.threshold", "photometry.n_pixels"),
     resources=("filters.sedpy",),
     plan=exposure_plan,
     kernels=("images",),
@@ -201,7 +201,7 @@ def make_highres(context, _):
     segmentation, detected = photometry.detect_sources(
         image,
         threshold=config.photometry.threshold,
-        n_pixels=config.photometry.min_area,
+        n_pixels=config.photometry.n_pixels,
     )
     context.save_image("f160w.fits", image)
     context.save_image("segm.fits", image, segmentation=np.asarray(segmentation.data, np.int32))

@@ -91,7 +91,7 @@ def point_catalog(exposure, band_flux, prior, *, spacing, seed):
         *IMAGES,
         "highres",
         "photometry.threshold",
-        "photometry.min_area",
+        "photometry.n_pixels",
         "photometry.method",
         "point_sources",
     ),
@@ -124,7 +124,7 @@ def measure_point_sources(context, name):
         seed=seed,
     )
     segmentation, detected = photometry.detect_sources(
-        highres, threshold=config.photometry.threshold, n_pixels=config.photometry.min_area
+        highres, threshold=config.photometry.threshold, n_pixels=config.photometry.n_pixels
     )
     if config.photometry.method == "yang2021":
         photometer = yang2021_photometer(config, name, context.n_threads)
