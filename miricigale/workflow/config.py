@@ -16,7 +16,7 @@ from miricigale.instrument import CEERS_FILTERS
 from miricigale.photometry import YANG2021_DEPTHS
 from miricigale.utils.exceptions import ConfigError, unknown_name
 
-__all__ = ["StudyConfig", "load_config", "preset_names", "toml_value"]
+__all__ = ["StudyConfig", "load_config", "present_names", "preset_names", "toml_value"]
 
 
 #: Keys that had another name, which files may still have.
@@ -348,14 +348,20 @@ def toml_value(value):
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
+def present_names(section, entries):
+    """Values of a section by key, former names of keys replaced by the present ones."""
+    names = {former: name.partition(".")[2] for name, former in _FORMER.items()}
+    return {names.get(f"{section}.{key}", key): value for key, value in entries.items()}
+
+
 def _replace_section(name, section, entries):
     fields = {field.name: field for field in dataclasses.fields(section)}
-    for new, old in (pair for pair in _FORMER.items() if pair[0].startswith(f"{name}.")):
-        new, old = new.partition(".")[2], old.partition(".")[2]
-        if old in entries and new not in entries:
+    present = present_names(name, entries)
+    for old, new in zip(entries, present, strict=True):
+        if old != new:
             msg = f"[{name}] {old} is called {new} now"
             warnings.warn(msg, AstropyDeprecationWarning, stacklevel=2)
-            entries = {new if key == old else key: value for key, value in entries.items()}
+    entries = present
     unknown = sorted(set(entries) - set(fields))
     if unknown:
         msg = f"[{name}] does not know {unknown}; known: {sorted(fields)}"

@@ -4,6 +4,7 @@ import hashlib
 
 from miricigale.utils.content import file_sha256
 from miricigale.utils.folder import RecordFolder
+from miricigale.workflow.config import present_names
 
 __all__ = ["ProductStore"]
 
@@ -28,7 +29,8 @@ class ProductStore(RecordFolder):
     @property
     def config(self):
         """Plain values of the configuration that the products were made with; None if not known."""
-        return self.facts.get("config")
+        config = self.facts.get("config")
+        return config and {name: present_names(name, values) for name, values in config.items()}
 
     def check_record(self, record):
         super().check_record(record)
