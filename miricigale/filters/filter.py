@@ -55,7 +55,11 @@ class Filter(Frozen):
     name : str
         Name of the filter, and of its flux columns.
     meta : dict, optional
-        Source, citation, flux convention of the catalogs.
+        Source, citation, flux convention of the catalogs, in words.
+    reference_wavelength : `~astropy.units.Quantity`, optional
+        Where catalogs quote fluxes, if these are not AB means; see `catalog_factor`.
+    reference_temperature : `~astropy.units.Quantity`, optional
+        Of the black body whose flux is quoted; none: of nu F_nu = const.
 
     Raises
     ------
@@ -77,6 +81,8 @@ class Filter(Frozen):
     _: dataclasses.KW_ONLY
     name: str
     meta: dict | None = None
+    reference_wavelength: u.Quantity | None = None
+    reference_temperature: u.Quantity | None = None
 
     def __post_init__(self):
         wave = to_array(self.wave, WAVE, "wave", ndim=1, finite=True)
@@ -93,6 +99,11 @@ class Filter(Frozen):
         object.__setattr__(self, "throughput", frozen_array(throughput))
         object.__setattr__(self, "name", str(self.name))
         object.__setattr__(self, "meta", dict(self.meta or {}))
+        for argument, unit in (("reference_wavelength", WAVE), ("reference_temperature", u.K)):
+            value = getattr(self, argument)
+            if value is not None:
+                value = frozen_quantity(value, unit, argument, ndim=0, finite=True)
+                object.__setattr__(self, argument, value)
 
     def __repr__(self):
         return f"<Filter {self.name}: pivot {self.pivot:.4f}, width {self.width:.3f}>"
@@ -251,17 +262,16 @@ class Filter(Frozen):
         ----------
         IRAC Instrument Handbook, section 4.4; MIPS Instrument Handbook, section 4.3.
         """
-        convention = self.meta.get("flux_convention", "AB")
-        if convention == "AB":
+        if self.reference_wavelength is None:
             return 1.0
-        reference = self.meta["reference_wavelength"]
         wave, throughput, norm = self._fine
-        if convention == "nu F_nu = const":
-            return reference / (_core.photon_integral(wave, throughput, 1) / norm)
+        if self.reference_temperature is None:
+            mean = _core.photon_integral(wave, throughput, 1) / norm
+            return float(self.reference_wavelength.value / mean)
         from astropy.modeling.physical_models import BlackBody
 
-        body = BlackBody(temperature=self.meta["reference_temperature"] * u.K)
-        spectrum = body(wave * WAVE).value / body(reference * WAVE).value
+        body = BlackBody(temperature=self.reference_temperature)
+        spectrum = body(wave * WAVE).value / body(self.reference_wavelength).value
         return float(norm / _core.photon_integral(wave, throughput * spectrum))
 
     def weights(self, wave, *, tolerance=UNCOVERED):
@@ -376,5 +386,5 @@ def spectrum_arrays(sed):
 
 @functools.lru_cache(maxsize=512)
 def _from_name(name):
-    wave, throughput, meta = load_curve(name)
-    return Filter(wave * WAVE, throughput, name=name, meta=meta)
+    wave, throughput, options = load_curve(name)
+    return Filter(wave, throughput, name=name, **options)

@@ -4,10 +4,12 @@ import importlib.metadata
 from importlib.util import find_spec
 from pathlib import Path
 
+import astropy.units as u
 import numpy as np
 
 from miricigale.refdata import Registry, citations
 from miricigale.utils.exceptions import DataError, unknown_name
+from miricigale.utils.units import WAVE
 
 __all__ = ["FILTERS", "full_name", "load_curve"]
 
@@ -80,21 +82,18 @@ def read_curve(curve):
 
 
 def _load(name):
-    if name.startswith(SEDPY):
-        curve, metadata = name.removeprefix(SEDPY), {"resource": _RESOURCE}
-    else:
-        metadata = FILTERS.metadata(name)
-        curve = metadata.pop("curve")
+    metadata = {"curve": name.removeprefix(SEDPY)} if name.startswith(SEDPY) else {}
+    metadata = metadata or FILTERS.metadata(name)
+    curve = metadata.pop("curve")
     wave, throughput, n_negative = read_curve(curve)
     meta = {
         "source": f"astro-sedpy {importlib.metadata.version('astro-sedpy')}, {curve}",
-        "citations": citations(metadata.pop("resource")),
-        "flux_convention": "AB",
-        **metadata,
+        "citations": citations(_RESOURCE),
+        "flux_convention": metadata.pop("flux_convention", "AB"),
     }
     if n_negative:
         meta["n_negative"] = n_negative
-    return wave, throughput, meta
+    return wave * WAVE, throughput, {"meta": meta, **metadata}
 
 
 def full_name(name):
@@ -118,7 +117,7 @@ def full_name(name):
 
 def load_curve(name):
     """
-    Curve and meta of a filter of the library.
+    Wavelengths, throughput and options of `Filter` of a filter of the library.
 
     Raises
     ------
@@ -137,7 +136,7 @@ def _register():
     registry = Registry("filter")
 
     def add(name, curve, **metadata):
-        registry.register(name, _load, curve=curve, resource=_RESOURCE, **metadata)
+        registry.register(name, _load, curve=curve, **metadata)
 
     for room, prefix, bands in (
         ("miri", "jwst_", _MIRI),
@@ -156,15 +155,15 @@ def _register():
             f"irac.{band}",
             f"spitzer_irac_{band}",
             flux_convention="nu F_nu = const",
-            reference_wavelength=wave,
+            reference_wavelength=wave * WAVE,
         )
     for band, wave in _MIPS.items():
         add(
             f"mips.{band}",
             f"spitzer_mips_{band}",
             flux_convention="black body",
-            reference_wavelength=wave,
-            reference_temperature=1e4,
+            reference_wavelength=wave * WAVE,
+            reference_temperature=1e4 * u.K,
         )
     return registry
 

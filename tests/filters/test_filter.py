@@ -131,7 +131,7 @@ def test_a_filter_cites_its_source():
 def test_catalog_convention_gives_the_true_flux_of_its_reference_spectrum():
     for name in ("irac.ch1", "irac.ch4", "mips.24"):
         band = Filter.from_name(name)
-        nominal = band.meta["reference_wavelength"]
+        nominal = band.reference_wavelength.value
         wave = np.geomspace(band.wave.value[0] / 1.01, band.wave.value[-1] * 1.01, 5000)
 
         def reference(lam, name=name):
