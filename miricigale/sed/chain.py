@@ -275,11 +275,11 @@ class Chain:
 
         Parameters
         ----------
-        stars : list of `Stars`
+        stars : sequence of `Stars`
             Of n galaxies.
-        keys : list of tuple
+        keys : sequence of tuple
             Keys of ``attenuation``.
-        dust_keys : list of tuple, optional
+        dust_keys : sequence of tuple, optional
             Keys of ``dust``.
         out : `~numpy.ndarray`, shape (n, n_wave), optional
             To be filled.

@@ -11,7 +11,7 @@ from miricigale.sed.chain import STELLAR, distinct
 from miricigale.sed.derived import DERIVED, galaxy_quantities
 from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import distance
-from miricigale.sed.tables import dilution, seen_agn
+from miricigale.sed.tables import BLOCK, dilution, seen_agn
 from miricigale.utils.exceptions import argument_error, unknown_name
 
 __all__ = ["check_axes", "model_grid"]
@@ -87,7 +87,11 @@ class _Galaxies:
         dims = [chain.key(row, "attenuation") for row in rows]
         # many galaxies: their spectra are in memory once
         pairs, self.light_rows = distinct(zip(self._stars, dims, strict=True))
-        self.starlight, absorbed = chain.attenuated(*map(list, zip(*pairs, strict=True)))
+        self.starlight, absorbed = np.empty((len(pairs), chain.wave.size)), np.empty(len(pairs))
+        for first in range(0, len(pairs), BLOCK):
+            part = slice(first, first + BLOCK)
+            stars, keys = zip(*pairs[part], strict=True)
+            _, absorbed[part] = chain.attenuated(stars, keys, out=self.starlight[part])
         dusts, self.dust_rows = distinct([chain.key(row, "dust") for row in rows])
         self.dust = np.array(list(map(chain.dust, dusts)))
         self.absorbed = absorbed[self.light_rows]

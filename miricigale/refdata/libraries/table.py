@@ -186,6 +186,26 @@ class LibraryTable:
             index[row] = i
         return index
 
+    def missing(self, **values):
+        """
+        Axes on which the library has not these values.
+
+        Parameters
+        ----------
+        **values : float or sequence of float
+            In the units of the axes; the same to 1e-6, relatively. Other names are ignored.
+
+        Returns
+        -------
+        missing : dict of str to tuple of float
+            Name of the axis to the values that the library has; empty if it has them all.
+        """
+        return {
+            name: tuple(levels.tolist())
+            for name, levels in self._levels.items()
+            if any(self._code(name, value) < 0 for value in np.atleast_1d(values.get(name, [])))
+        }
+
     @property
     def complete(self):
         """Whether every combination of the values of the axes has a row."""

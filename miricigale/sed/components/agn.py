@@ -199,20 +199,8 @@ class Skirtor2016(AGN):
         return open_library(self.path, self.resource)
 
     def missing(self, **values):
-        """
-        Axes on which the library has not these values.
-
-        Parameters
-        ----------
-        **values : float or sequence of float
-            Values of axes of the library, in the parameters' units; other names are ignored.
-
-        Returns
-        -------
-        missing : dict of str to tuple of float
-            Name of the axis to the values that the library has; empty if it has them all.
-        """
-        return _missing(self.table, values)
+        """Axes on which the library has not these values: see `LibraryTable.missing`."""
+        return self.table.missing(**values)
 
     def covers(self, **values):
         """Whether the library has these values of its axes, as for `missing`: bool."""
@@ -229,26 +217,12 @@ class Skirtor2016(AGN):
         return _torus(self.path, wave.tobytes(), self.disk, float(values["disk_slope"]), axes)
 
 
-@functools.lru_cache(maxsize=8)
-def _values(table):
-    return {name: tuple(table.values_of(name).tolist()) for name in table.axes}
-
-
-def _missing(table, values):
-    return {
-        name: there
-        for name, there in _values(table).items()
-        if name in values
-        and not all(np.isclose(v, there, 1e-6, 0.0).any() for v in np.atleast_1d(values[name]))
-    }
-
-
 @cached_by_file(maxsize=4096)
 def _refusal(path, axes):
     values = dict(zip(SKIRTOR_AXES, axes, strict=True))
     parts = [
         f"'{name}' must be one of {', '.join(f'{v:g}' for v in there)}, got {values[name]:g}"
-        for name, there in _missing(open_library(path, Skirtor2016.resource), values).items()
+        for name, there in open_library(path, Skirtor2016.resource).missing(**values).items()
     ]
     return f"{'; '.join(parts)} (the library at {path} has no more)" if parts else None
 
