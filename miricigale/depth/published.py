@@ -1,15 +1,12 @@
 """Published limits, how the exposure time calculator gets its own, and the residual they imply."""
 
 import dataclasses
-import functools
-import tomllib
 
 import astropy.units as u
 import numpy as np
 
 from miricigale.instrument import frame_time, imager_filters
-from miricigale.instrument.figures import filter_row
-from miricigale.refdata import locate
+from miricigale.instrument.figures import filter_row, table
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.units import to_array
 
@@ -22,12 +19,6 @@ __all__ = [
     "residual_presets",
     "scaled_limit",
 ]
-
-
-@functools.cache
-def _table():
-    """The whole of ``etc.toml`` as a dict."""
-    return tomllib.loads(locate("instrument.etc").read_text())
 
 
 def _short(filter):
@@ -100,8 +91,7 @@ def etc_setup(filter):
     0.42 arcsec, 106 groups, 10001 s
     """
     name = _short(filter)
-    table = _table()
-    common, row = table["setup"], table["filters"][name]
+    common, row = table("etc")["setup"], table("etc")["filters"][name]
     radius = common["radius_per_um"] * row["wavelength"] * u.arcsec
     return EtcSetup(
         filter=f"miri.{name}",
@@ -191,7 +181,7 @@ def proposal_limit(filter):
 
 def residual_presets():
     """Names of the sets of residuals that `residual_amplitude` knows."""
-    return tuple(_table()["residual"])
+    return tuple(table("etc")["residual"])
 
 
 def residual_amplitude(filter, preset="etc"):
@@ -226,7 +216,7 @@ def residual_amplitude(filter, preset="etc"):
     True
     """
     name = _short(filter)
-    presets = _table()["residual"]
+    presets = table("etc")["residual"]
     if preset not in presets:
         raise unknown_name("residual preset", preset, presets)
     return presets[preset][name]

@@ -1,4 +1,4 @@
-"""The table of published figures that the modules of this room read."""
+"""Tables of published figures."""
 
 import functools
 import tomllib
@@ -10,9 +10,9 @@ __all__ = ["imager_filters"]
 
 
 @functools.cache
-def table():
-    """The whole of ``imager.toml`` as a dict."""
-    return tomllib.loads(locate("instrument.imager").read_text())
+def table(name="imager"):
+    """A table of the instrument (``imager``, ``siaf``, ``etc``) as a dict."""
+    return tomllib.loads(locate(f"instrument.{name}").read_text())
 
 
 def imager_filters():

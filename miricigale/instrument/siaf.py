@@ -8,11 +8,10 @@ are 0-based here, with integers at their centers.
 
 import dataclasses
 import functools
-import tomllib
 
 import numpy as np
 
-from miricigale.refdata import locate
+from miricigale.instrument.figures import table
 from miricigale.utils.exceptions import argument_error, unknown_name
 
 __all__ = [
@@ -26,11 +25,6 @@ __all__ = [
 ]
 
 _ARCSEC = np.pi / 180 / 3600
-
-
-@functools.cache
-def _table():
-    return tomllib.loads(locate("instrument.siaf").read_text())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,12 +68,12 @@ class Aperture:
 
 def subarrays():
     """Names of the sub-arrays, ``"FULL"`` first."""
-    return tuple(_table()["subarrays"])
+    return tuple(table("siaf")["subarrays"])
 
 
 def imager_columns():
     """First and last (excluded) column of the full frame that sees the sky through the filters."""
-    return tuple(_table()["imager_columns"])
+    return tuple(table("siaf")["imager_columns"])
 
 
 @functools.cache
@@ -101,11 +95,11 @@ def aperture(name="FULL"):
     KeyError
         If there is no such sub-array; the message lists the known ones.
     """
-    table = _table()
+    siaf = table("siaf")
     try:
-        row = table["subarrays"][name]
+        row = siaf["subarrays"][name]
     except KeyError:
-        raise unknown_name("sub-array", name, table["subarrays"]) from None
+        raise unknown_name("sub-array", name, siaf["subarrays"]) from None
     nx, ny = row["size"]
     return Aperture(
         name=name,
@@ -114,8 +108,8 @@ def aperture(name="FULL"):
         reference=(row["reference"][0] - 1, row["reference"][1] - 1),
         v2=row["v2"],
         v3=row["v3"],
-        v3_ideal_y_angle=table["v3_ideal_y_angle"],
-        parity=table["parity"],
+        v3_ideal_y_angle=siaf["v3_ideal_y_angle"],
+        parity=siaf["parity"],
     )
 
 
@@ -125,7 +119,7 @@ def _ideal(x, y):
     sums = []
     for axis in ("x_ideal", "y_ideal"):
         total = np.zeros(np.broadcast(x, y).shape)
-        for i, row in enumerate(_table()[axis]):
+        for i, row in enumerate(table("siaf")[axis]):
             for j, coefficient in enumerate(row):
                 total = total + coefficient * x ** (i - j) * y**j
         sums.append(total)
