@@ -17,6 +17,10 @@ def _read_only(array):
     return view
 
 
+def _remade(data, exposure, values):
+    return Ramp(data, exposure, **values)
+
+
 class Ramp(NDData):
     """
     Counts of one exposure: every group of every integration.
@@ -83,6 +87,12 @@ class Ramp(NDData):
             msg = f"a ramp does not change: {name!r} cannot be set"
             raise AttributeError(msg)
         super().__setattr__(name, value)
+
+    def __reduce__(self):
+        # made anew, for arrays to be read-only again
+        planes = {"pixel_dq": self.pixel_dq, "group_dq": self.group_dq}
+        values = {**planes, "effects": self.effects, "meta": dict(self.meta)}
+        return _remade, (self.data, self.exposure, values)
 
     @property
     def exposure(self):

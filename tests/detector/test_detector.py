@@ -1,4 +1,6 @@
+import copy
 import dataclasses
+import pickle
 
 import astropy.units as u
 import numpy as np
@@ -366,6 +368,20 @@ def test_ramp_does_not_change(make_exposure, make_sky, detector):
     for array in (ramp.data, ramp.pixel_dq, ramp.group_dq):
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 0
+
+
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda ramp: pickle.loads(pickle.dumps(ramp))])
+def test_copies_of_a_ramp_do_not_change_either(make_exposure, make_sky, detector, again):
+    exposure = make_exposure(n_groups=2)
+    ramp = detector.expose(make_sky(exposure, 1.0), exposure, seed=0)
+    other = again(ramp)
+    assert other.effects == ramp.effects
+    assert other.meta == ramp.meta
+    for name in ("data", "pixel_dq", "group_dq"):
+        np.testing.assert_array_equal(getattr(other, name), getattr(ramp, name))
+        assert not getattr(other, name).flags.writeable
+    with pytest.raises(AttributeError, match="a ramp does not change"):
+        other.mask = None
 
 
 def test_ramp_checks_its_arrays(make_exposure):
