@@ -7,8 +7,8 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.utils.exceptions import argument_error
-from miricigale.utils.tables import error_column, require_columns
+from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.tables import described_table, error_column, require_columns
 from miricigale.utils.units import FNU
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "common_bands",
     "curves_from_table",
     "curves_to_table",
+    "flux_table",
     "limiting_flux",
     "measured_curve",
     "same_rows",
@@ -178,28 +179,43 @@ def same_rows(truth, measured):
     return rows, rows
 
 
+def flux_table(photometry, filters, known):
+    """A copy of a table with fluxes in uJy, and the bands: those of ``known`` that it has by default."""
+    require_columns(photometry, [], "photometry")
+    if filters is None:
+        filters = [name for name in known if name in photometry.colnames]
+    filters = list(filters)
+    if not filters:
+        wanted = f"a table with at least one of the columns {list(known)}"
+        raise argument_error("photometry", wanted, f"columns {photometry.colnames}")
+    require_columns(photometry, filters, "photometry", units=dict.fromkeys(filters, FNU))
+    table = QTable(photometry, copy=True)
+    for name in filters:
+        if name not in known:
+            raise unknown_name("band of this error model", name, known)
+        table[name] = u.Quantity(table[name]).to(FNU)
+    return table, filters
+
+
 def curves_to_table(curves, meta):
     """Make the table of curves by filter name."""
-    names, kinds, rows = [], [], []
-    for name, curve in curves.items():
-        values = np.stack(curve.rows())
-        rows.append(values)
-        names += [name] * values.shape[1]
-        kinds += [curve.kind] * values.shape[1]
-    values = np.concatenate(rows, axis=1) if rows else np.empty((6, 0))
-    table = QTable({"filter": names, "kind": kinds}, meta=dict(meta))
-    columns = (
-        ("flux", FNU, "Median true flux of the bin"),
-        ("sigma", FNU, "1-sigma error there, or that of the sky"),
-        ("low", FNU, "Least true flux of all bins"),
-        ("high", FNU, "Greatest true flux of all bins"),
-        ("fraction", u.dimensionless_unscaled, "Part of the flux added in quadrature"),
-        ("photon", FNU, "Variance per flux of the source's own photons"),
-    )
-    for (name, unit, text), value in zip(columns, values, strict=True):
-        table[name] = value * unit
-        table[name].info.description = text
-    return table
+    rows = [np.stack(curve.rows()) for curve in curves.values()]
+    counts = [values.shape[1] for values in rows]
+    flux, sigma, low, high, fraction, photon = np.concatenate([np.empty((6, 0)), *rows], axis=1)
+    columns = {
+        "filter": (np.repeat(np.array(list(curves), str), counts), None),
+        "kind": (np.repeat(np.array([one.kind for one in curves.values()], str), counts), None),
+        "flux": (flux * FNU, "Median true flux of the bin"),
+        "sigma": (sigma * FNU, "1-sigma error there, or that of the sky"),
+        "low": (low * FNU, "Least true flux of all bins"),
+        "high": (high * FNU, "Greatest true flux of all bins"),
+        "fraction": (
+            fraction * u.dimensionless_unscaled,
+            "Part of the flux added in quadrature",
+        ),
+        "photon": (photon * FNU, "Variance per flux of the source's own photons"),
+    }
+    return described_table(columns, dict(meta))
 
 
 def curves_from_table(table):

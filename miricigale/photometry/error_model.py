@@ -6,7 +6,6 @@ from typing import ClassVar
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 
 from miricigale.photometry.error_curves import (
     STATISTICS,
@@ -14,6 +13,7 @@ from miricigale.photometry.error_curves import (
     common_bands,
     curves_from_table,
     curves_to_table,
+    flux_table,
     limiting_flux,
     measured_curve,
     same_rows,
@@ -361,7 +361,7 @@ class ErrorModel:
         ValueError
             If the table has no band that the model knows, or lacks one of ``filters``.
         """
-        table, filters = self._prepare(photometry, filters)
+        table, filters = flux_table(photometry, filters, self.filters)
         for name in filters:
             table[error_column(name)] = self.sigma(table[name], name)
         return table
@@ -391,7 +391,7 @@ class ErrorModel:
         ValueError
             As `assign`.
         """
-        table, filters = self._prepare(photometry, filters)
+        table, filters = flux_table(photometry, filters, self.filters)
         seed = check_seed(seed)
         keys = table["id"] if "id" in table.colnames else np.arange(len(table))
         for name in filters:
@@ -400,22 +400,6 @@ class ErrorModel:
             table[name] = table[name] + np.array(noise) * sigma
             table[error_column(name)] = sigma
         return table
-
-    def _prepare(self, photometry, filters):
-        require_columns(photometry, [], "photometry")
-        if filters is None:
-            filters = [name for name in self.filters if name in photometry.colnames]
-        filters = list(filters)
-        if not filters:
-            wanted = f"a table with at least one of the columns {list(self.filters)}"
-            raise argument_error("photometry", wanted, f"columns {photometry.colnames}")
-        require_columns(photometry, filters, "photometry", units=dict.fromkeys(filters, FNU))
-        for name in filters:
-            self._curve(name)
-        table = QTable(photometry, copy=True)
-        for name in filters:
-            table[name] = u.Quantity(table[name]).to(FNU)
-        return table, filters
 
     def to_table(self):
         """

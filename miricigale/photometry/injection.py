@@ -14,6 +14,7 @@ from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.detection import bright_centroids
 from miricigale.photometry.error_calibration import ErrorCalibration
 from miricigale.photometry.flags import ForcedFlags
+from miricigale.photometry.forced import ForcedPhotometer
 from miricigale.photometry.priors import labels_at
 from miricigale.photometry.shapes import ShapeModels
 from miricigale.photometry.sources import SourceTemplates
@@ -94,8 +95,7 @@ def calibrate_errors(
     Injected galaxies have the shapes of the fits, so that what no profile describes (arms, clumps) is not in the
     scatter; their positions are those that detection finds.
     """
-    template = getattr(photometer, "template", None)
-    if template not in ("auto", "cutout", "psf"):
+    if not isinstance(photometer, ForcedPhotometer) or photometer.template == "sersic":
         wanted = "a ForcedPhotometer whose template is 'auto', 'cutout' or 'psf'"
         raise argument_error("photometer", wanted, repr(photometer))
     if isinstance(n_trials, bool) or int(n_trials) != n_trials or n_trials < 1:
@@ -164,7 +164,7 @@ class _Field:
         self.labels = np.array(labels)
         self.fine = image_arrays(highres, "highres")
         # of kernels of several places the mean
-        source = getattr(photometer.kernel, "mean", photometer.kernel).source
+        source = photometer.mean_kernel.source
         self.models = ShapeModels(source / source.sum())
         self.reach = source.shape[0] / 2
         templates = SourceTemplates.from_images(

@@ -12,7 +12,7 @@ from miricigale.photometry.wings import adjust_wings
 from miricigale.profiles import sersic_stamp
 from miricigale.utils.parallel import parallel_map
 
-__all__ = ["cutouts"]
+__all__ = ["FineImage", "cutouts"]
 
 #: Width (pixels) of the Gaussian that tells the core, its least signal-to-noise, how many standard
 #: deviations of chi^2 a profile may miss it by, and the signal-to-noise that makes a neighbour.
@@ -32,31 +32,33 @@ _DRAWN, _FARTHEST = 6.0, 200.0
 _PASSES, _CONTAMINATED, _AT_A_TIME = 4, 4.0, 512
 
 
-def cutouts(
-    data, variance, segmentation, label, xy, source_psf, *, scale, min_snr, wings, select=True,
-    executor=None,
-):  # fmt: skip
+@dataclasses.dataclass(frozen=True, eq=False)
+class FineImage:
+    """A high-resolution image on which sources are looked at."""
+
+    data: np.ndarray  # (ny, nx): light per pixel (any unit), background subtracted
+    variance: np.ndarray  # (ny, nx): its variance, infinite where not usable
+    psf: np.ndarray  # (k, k): odd and centred
+    scale: float  # arcsec per pixel
+
+
+def cutouts(image, segmentation, label, xy, *, min_snr=0.0, wings=True, select=True, executor=None):
     """
     Make the template of each source from the high-resolution image.
 
     Parameters
     ----------
-    data, variance : `~numpy.ndarray`, shape (ny, nx)
-        Light per pixel (any unit, background subtracted) and its variance, zero and
-        infinite where not usable.
+    image : `FineImage`
+        The image.
     segmentation : int `~numpy.ndarray`, shape (ny, nx)
         Labels.
     label : int `~numpy.ndarray`, shape (n,)
         Label of each source, 0 for none.
     xy : `~numpy.ndarray`, shape (n, 2)
         Positions of the sources on the image.
-    source_psf : `~numpy.ndarray`, shape (k, k)
-        PSF of the image, odd and centred.
-    scale : float
-        Arcsec per pixel.
-    min_snr : float
+    min_snr : float, optional
         Least signal-to-noise of a segment.
-    wings : bool
+    wings : bool, optional
         Whether light outside of the segment is added; otherwise a cutout is the
         segment as it is.
     select : bool, optional
@@ -87,7 +89,7 @@ def cutouts(
     scaled with radius to what is seen (see `~miricigale.photometry.wings.adjust_wings`). Sources
     whose pixels hold light of others' models are fitted again without that light.
     """
-    segments = _Segments.of(data, variance, segmentation)
+    segments = _Segments.of(image, segmentation)
     flags, snr = np.zeros(len(label), int), np.full(len(label), np.nan)
     found, fitted, chosen = [None] * len(label), not_fitted(len(label)), []
     for k, one in enumerate(label):
@@ -101,9 +103,9 @@ def cutouts(
             flags[k] = int(ForcedFlags.NOISY_SEGMENT)
     if not wings:
         for k in chosen:
-            found[k] = _bare(data, variance, segments, label[k])
+            found[k] = _bare(image, segments, label[k])
         return found, flags, snr, fitted
-    lights = _Lights(data, variance, segments, source_psf, scale, select, executor)
+    lights = _Lights(image, segments, select, executor)
     models = lights.fit([(label[k], xy[k]) for k in chosen])
     for k, model in zip(chosen, models, strict=True):
         if model is None:
@@ -127,7 +129,8 @@ class _Segments:
     ratio: np.ndarray
 
     @classmethod
-    def of(cls, data, variance, labels):
+    def of(cls, image, labels):
+        data, variance = image.data, image.variance
         places = scipy.ndimage.find_objects(labels)
         usable = np.isfinite(variance)
         flat, n = labels.ravel(), len(places) + 1
@@ -140,12 +143,12 @@ class _Segments:
         return cls(labels, usable, places, totals, ratio)
 
 
-def _bare(data, variance, segments, label):
+def _bare(image, segments, label):
     """The segment as it is."""
     place, total = segments.places[label - 1], segments.totals[label]
     member = (segments.labels[place] == label) & segments.usable[place]
-    light = np.where(member, data[place], 0.0) / total
-    noise = float(variance[place][member].sum()) / total**2
+    light = np.where(member, image.data[place], 0.0) / total
+    noise = float(image.variance[place][member].sum()) / total**2
     return Cutout(light, (place[0].start, place[1].start), noise=noise)
 
 
@@ -174,12 +177,12 @@ class _Model:
 class _Lights:
     """All sources of one image, whose pixels may hold light of each other."""
 
-    def __init__(self, data, variance, segments, psf, scale, select, executor):
-        self.data, self.variance, self.segments = data, variance, segments
+    def __init__(self, image, segments, select, executor):
+        self.data, self.variance, self.segments = image.data, image.variance, segments
         self.select, self.executor = select, executor
-        self.fitter = ShapeFitter(psf, scale)
-        self.reach = psf.shape[0] / 2
-        self.light, self.snr = _smooth(data, variance, executor)
+        self.fitter = ShapeFitter(image.psf, image.scale)
+        self.reach = image.psf.shape[0] / 2
+        self.light, self.snr = _smooth(image.data, image.variance, executor)
         # what is no more than a peak of the noise hides nothing
         self.others = segments.ratio >= _OTHER_SNR
 

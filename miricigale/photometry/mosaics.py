@@ -91,14 +91,15 @@ class MosaicFile:
     """
 
     path: object
-    filter: str | None = dataclasses.field(default=None, kw_only=True)
-    unit: object = dataclasses.field(default=None, kw_only=True)
-    zero_point: object = dataclasses.field(default=None, kw_only=True)
-    error: object = dataclasses.field(default=None, kw_only=True)
-    variance: object = dataclasses.field(default=None, kw_only=True)
-    inverse_variance: object = dataclasses.field(default=None, kw_only=True)
-    weight: object = dataclasses.field(default=None, kw_only=True)
-    background_box: int | None = dataclasses.field(default=None, kw_only=True)
+    _: dataclasses.KW_ONLY
+    filter: str | None = None
+    unit: object = None
+    zero_point: object = None
+    error: object = None
+    variance: object = None
+    inverse_variance: object = None
+    weight: object = None
+    background_box: int | None = None
 
     def __post_init__(self):
         given = [name for name in _NOISE if getattr(self, name) is not None]

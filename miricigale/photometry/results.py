@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import numbers
 from typing import ClassVar
 
 import astropy.units as u
@@ -230,7 +231,7 @@ class ForcedPhotometryResult:
         ValueError
             If ``size`` is not positive, or points are wanted that were not fitted.
         """
-        if isinstance(size, bool) or not hasattr(size, "__index__") or size < 1:
+        if isinstance(size, bool) or not isinstance(size, numbers.Integral) or size < 1:
             raise argument_error("size", "an integer of at least 1", repr(size))
         if point and self.flux_point is None:
             raise argument_error("point", "False where no second components were fitted", point)

@@ -13,7 +13,7 @@ from photutils.segmentation import SegmentationImage
 from miricigale.photometry.arrays import image_arrays, pixel_scale
 from miricigale.photometry.catalogs import OPTIONAL, catalog_sources, sersic_rows
 from miricigale.photometry.cutouts import Cutout, own_segments, sersic_cutouts
-from miricigale.photometry.light import cutouts
+from miricigale.photometry.light import FineImage, cutouts
 from miricigale.photometry.priors import check_labels, labels_at
 from miricigale.photometry.shapes import not_fitted
 from miricigale.photometry.sky_noise import warn_of_sky
@@ -175,8 +175,8 @@ class SourceTemplates:
         n_threads = thread_count(n_threads)
         with concurrent.futures.ThreadPoolExecutor(n_threads) as pool, single_threaded():
             light, more, snr, fitted = cutouts(
-                fine.flux, fine.sigma**2, segments, label, xy, psf,
-                scale=scale, select=template == "auto", wings=wings,
+                FineImage(fine.flux, fine.sigma**2, psf, scale), segments, label, xy,
+                select=template == "auto", wings=wings,
                 min_snr=min_snr if template == "auto" else 0.0,
                 executor=pool if n_threads > 1 else None,
             )  # fmt: skip

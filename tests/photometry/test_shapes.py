@@ -5,7 +5,7 @@ import scipy.ndimage
 from numpy.testing import assert_allclose
 
 from miricigale.photometry import _core
-from miricigale.photometry.light import cutouts
+from miricigale.photometry.light import FineImage, cutouts
 from miricigale.photometry.shapes import ShapeFitter
 from miricigale.profiles import sersic_image
 
@@ -129,12 +129,11 @@ def test_no_light_gives_no_shape():
 
 def one_cutout(image, sigma, **options):
     labels = (scipy.ndimage.gaussian_filter(image, 1.5) > 0.6 * sigma).astype(int)
-    options = {"scale": SCALE, "min_snr": 5.0, "wings": True} | options
+    options = {"min_snr": 5.0} | options
     variance = np.full(image.shape, sigma**2)
     xy = np.array([[40.0, 40.0]])
-    parts, flags, *_ = cutouts(
-        image, variance, labels, np.array([1]), xy, gaussian_psf(), **options
-    )
+    fine = FineImage(image, variance, gaussian_psf(), SCALE)
+    parts, flags, *_ = cutouts(fine, labels, np.array([1]), xy, **options)
     assert flags[0] == 0
     return parts[0]
 
@@ -204,9 +203,8 @@ def test_wings_of_a_bulge_and_a_disk_are_what_is_seen():
     # a segment that ends where there is much light still
     labels = (truth > 25 * sigma).astype(int)
     variance, xy = np.full(shape, sigma**2), np.array([[80.0, 80.0]])
-    (cutout,), *_ = cutouts(
-        image, variance, labels, np.array([1]), xy, gaussian_psf(), scale=SCALE, min_snr=5.0, wings=True
-    )  # fmt: skip
+    fine = FineImage(image, variance, gaussian_psf(), SCALE)
+    (cutout,), *_ = cutouts(fine, labels, np.array([1]), xy, min_snr=5.0)
     assert cutout.kind == "cutout"
     radius = np.hypot(*(np.indices(shape) - 80))
     template = seen(cutout, shape)
@@ -226,10 +224,8 @@ def test_neighbors_do_not_add_to_each_others_wings():
     bright = scipy.ndimage.gaussian_filter(image, 1.5) > sigma
     labels = np.where(bright, 1 + np.argmax(alone, axis=0), 0)
     variance = np.full(shape, sigma**2)
-    parts, flags, *_ = cutouts(
-        image, variance, labels, np.array([1, 2]), places, gaussian_psf(121), scale=SCALE,
-        min_snr=5.0, wings=True,
-    )  # fmt: skip
+    fine = FineImage(image, variance, gaussian_psf(121), SCALE)
+    parts, flags, *_ = cutouts(fine, labels, np.array([1, 2]), places, min_snr=5.0)
     assert not flags.any()
     # fluxes by least squares, each pixel the same
     matrix = np.stack([seen(one, shape).ravel() for one in parts], axis=1)
