@@ -2,7 +2,6 @@
 
 import dataclasses
 import tempfile
-import warnings
 
 import astropy.units as u
 import numpy as np
@@ -11,8 +10,8 @@ from astropy.stats import mad_std
 from astropy.wcs.utils import pixel_to_pixel, proj_plane_pixel_scales
 
 from miricigale.instrument import north_up_wcs, pixel_area_map
-from miricigale.photometry.sky_noise import filled_areas
-from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.photometry.sky_noise import mask_filled
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
@@ -173,14 +172,7 @@ def _checked(image, name):
         scale = factor if given.unit is None else (1 * given.unit).to_value(SURFACE_BRIGHTNESS)
         noise = np.asarray(given.array), float(scale)
     usable &= np.isfinite(noise[0]) & (noise[0] > 0)
-    filled = filled_areas(data, usable)
-    if filled.any():
-        msg = (
-            f"'{name}' has {np.count_nonzero(filled)} pixels in areas that are exactly 0, though not "
-            "masked, beside pixels with noise: they are taken as without data"
-        )
-        warnings.warn(msg, MiricigaleWarning, stacklevel=3)
-        usable &= ~filled
+    mask_filled(data, usable, f"'{name}'")
     if not usable.any():
         raise argument_error(name, "an image with usable pixels", "none (masked, NaN or no noise)")
     return (data, factor), noise, usable

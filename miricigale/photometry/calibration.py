@@ -48,25 +48,16 @@ def parsed_unit(text):
 
 def calibration(path, text, zero_point, keywords):
     """
-    What one unit of a pixel's value is.
+    What one unit of a pixel's value is, in MJy/sr, or in MJy for fluxes in pixels, and where that is from.
 
     Parameters
     ----------
-    path : path-like
-        The file, for messages.
-    text : str
-        Unit of the pixels; may be empty.
+    path, text
+        The file, for messages; unit of the pixels, which may be empty.
     zero_point : float, `~astropy.units.Quantity` or None
         AB magnitude of one count.
     keywords : dict
         Values of PHOTMJSR, PHOTFLAM, PHOTPLAM and EXPTIME, or None.
-
-    Returns
-    -------
-    factor : `~astropy.units.Quantity`
-        In MJy/sr, or in MJy for fluxes in pixels.
-    source : str
-        Where it is from.
 
     Raises
     ------

@@ -23,17 +23,14 @@ def noise_correlation(
 
     Parameters
     ----------
-    residual : `~numpy.ndarray`, shape (ny, nx)
-        Data minus model, over sigma.
-    usable : bool `~numpy.ndarray`, shape (ny, nx)
-        Source-free pixels with data.
+    residual, usable : `~numpy.ndarray`, shape (ny, nx)
+        Data minus model, over sigma, and which pixels are free of sources and have data.
     weight : `~numpy.ndarray`, shape (ny, nx), optional
         1 / sigma, if the residual is not over sigma yet.
     max_lag : int, optional
         Largest separation that is looked at, in pixels.
     clip : float, optional
-        Pixels further from the median than this many robust standard deviations do not
-        take part.
+        Pixels further from the median than this many robust standard deviations do not take part.
     significance : float, optional
         Rings of separations in which the mean is less significant than this are cut off.
     executor : `concurrent.futures.Executor`, optional

@@ -19,6 +19,7 @@ __all__ = [
     "grid_angle",
     "is_exposure",
     "open_image",
+    "open_map",
     "read_wcs",
 ]
 
@@ -78,6 +79,34 @@ def find_image(hdus, extension, path, names):
         )
         raise DataError(msg)
     return found[0]
+
+
+@contextlib.contextmanager
+def open_map(path, wanted, role, names, image):
+    """
+    Open a map on the pixels of an image; yields its HDU.
+
+    ``wanted`` and ``names`` are as for `open_image` and `find_image`, ``role`` is what the map is to the
+    image, ``image`` the shape, the WCS and the file of the image.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If it has another shape, or its coordinates are elsewhere.
+    """
+    shape, wcs, image_path = image
+    with open_image(path, wanted) as (hdus, extension):
+        hdu = hdus[find_image(hdus, extension, path, names)]
+        if hdu.shape != shape:
+            msg = (
+                f"{path} ({role}) has the shape {hdu.shape}, and {image_path} has {shape}: they are not "
+                "on the same pixels"
+            )
+            raise DataError(msg)
+        own = read_wcs(hdu.header, hdus)
+        if own is not None:
+            check_same_grid(own, wcs, shape, path, image_path)
+        yield hdu
 
 
 def read_wcs(header, hdus):

@@ -11,14 +11,14 @@ import numpy as np
 
 from miricigale.photometry.calibration import calibration, parsed_unit
 from miricigale.photometry.grids import (
-    check_same_grid,
     filter_name,
     find_image,
     is_exposure,
     open_image,
+    open_map,
     read_wcs,
 )
-from miricigale.photometry.sky_noise import filled_areas, sky_noise
+from miricigale.photometry.sky_noise import mask_filled, sky_noise
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
@@ -186,15 +186,9 @@ class MosaicFile:
             sigma = _sigma(kind, values)
             usable &= np.isfinite(sigma) & (sigma > 0)
             meta["noise"] = f"{kind} ({source})"
-        filled = filled_areas(data, usable)
-        if filled.any():
-            msg = (
-                f"{self.path} has {np.count_nonzero(filled)} pixels in areas that are exactly 0, though "
-                "not masked, beside pixels with noise: they are taken as without data"
-            )
-            warnings.warn(msg, MiricigaleWarning, stacklevel=2)
-            usable &= ~filled
-            meta["n_filled"] = int(np.count_nonzero(filled))
+        filled = mask_filled(data, usable, self.path)
+        if filled:
+            meta["n_filled"] = filled
         if not usable.any():
             msg = f"{self.path} has no usable pixel: all are masked, not finite or without weight"
             raise DataError(msg)
@@ -240,17 +234,9 @@ class MosaicFile:
             path = getattr(self, kind)
             if path is None:
                 continue
-            with open_image(path, f"a map of the {kind.replace('_', ' ')}") as (others, extension):
-                hdu = others[find_image(others, extension, path, names)]
-                if hdu.shape != header.shape:
-                    msg = (
-                        f"{path} (the {kind} of {self.path}) has the shape {hdu.shape}, and the "
-                        f"image {header.shape}"
-                    )
-                    raise DataError(msg)
-                wcs = read_wcs(hdu.header, others)
-                if wcs is not None:
-                    check_same_grid(wcs, header.wcs, header.shape, path, self.path)
+            image = header.shape, header.wcs, self.path
+            what = f"a map of the {kind.replace('_', ' ')}", f"the {kind} of {self.path}"
+            with open_map(path, *what, names, image) as hdu:
                 return kind, _in_unit(hdu, kind, stated, path), str(path)
         for kind, names in _NOISE.items():
             for name in names:

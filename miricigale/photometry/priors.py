@@ -6,7 +6,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 
-from miricigale.photometry.grids import check_same_grid, find_image, open_image, read_wcs
+from miricigale.photometry.grids import open_map
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
 from miricigale.utils.files import open_fits, unpacked_size
 from miricigale.utils.tables import unique_ids
@@ -15,6 +15,8 @@ __all__ = ["check_labels", "labels_at", "read_catalog", "read_prior"]
 
 _log = logging.getLogger(__name__)
 
+#: Extensions of segmentation maps, and names of columns.
+_SEGMENTS = ("SEGMENTATION", "SEGMAP", "SEG", "SCI")
 _SKY = ("sky", "skycoord", "sky_centroid", "coord")
 _RA = ("ra", "alpha_j2000", "raj2000", "ra_j2000", "alphawin_j2000")
 _DEC = ("dec", "delta_j2000", "dej2000", "dec_j2000", "decj2000", "deltawin_j2000")
@@ -76,7 +78,10 @@ def read_prior(highres, *, segmentation=None, catalog=None, path=None):
         if isinstance(segmentation, np.ndarray):
             data, segmentation = segmentation, "the segmentation"
         else:
-            data = _read_segments(segmentation, highres.data.shape, highres.wcs, where)
+            image = highres.data.shape, highres.wcs, where
+            what = "a segmentation map", "the segmentation"
+            with open_map(segmentation, *what, _SEGMENTS, image) as hdu:
+                data = np.array(hdu.data)
         segments, ids = _numbered(data, segmentation)
     if catalog is None:
         return segments, _from_segments(highres, segments, ids)
@@ -84,22 +89,6 @@ def read_prior(highres, *, segmentation=None, catalog=None, path=None):
     if segments is not None:
         sources["label"] = _labels(sources, segments, ids, highres.wcs, catalog, segmentation)
     return segments, sources
-
-
-def _read_segments(path, shape, wcs, image_path):
-    """The map in a file, after checking that it is on the image's pixels."""
-    with open_image(path, "a segmentation map") as (hdus, extension):
-        hdu = hdus[find_image(hdus, extension, path, ("SEGMENTATION", "SEGMAP", "SEG", "SCI"))]
-        if hdu.shape != shape:
-            msg = (
-                f"{path} (the segmentation) has the shape {hdu.shape}, and {image_path} has {shape}: "
-                "they are not on the same pixels"
-            )
-            raise DataError(msg)
-        own = read_wcs(hdu.header, hdus)
-        if own is not None:
-            check_same_grid(own, wcs, shape, path, image_path)
-        return np.array(hdu.data)
 
 
 def _numbered(data, path):

@@ -8,7 +8,14 @@ from astropy.stats import mad_std
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.units import FNU
 
-__all__ = ["filled_areas", "sky_noise", "warn_of_background", "warn_of_sky", "weight_scale"]
+__all__ = [
+    "filled_areas",
+    "mask_filled",
+    "sky_noise",
+    "warn_of_background",
+    "warn_of_sky",
+    "weight_scale",
+]
 
 
 def weight_scale(data, weight, *, mask=None):
@@ -67,6 +74,20 @@ def filled_areas(values, usable, *, n_pixels=25):
         return np.zeros_like(usable)
     noise = [np.median(np.abs(values[where])) for where in (beside, others)]
     return filled if noise[0] > 0.1 * noise[1] else np.zeros_like(usable)
+
+
+def mask_filled(values, usable, what):
+    """Take `filled_areas` off the usable pixels, in place, with a warning; their number."""
+    filled = filled_areas(values, usable)
+    n = int(np.count_nonzero(filled))
+    if n:
+        msg = (
+            f"{what} has {n} pixels in areas that are exactly 0, though not masked, beside pixels with "
+            "noise: they are taken as without data"
+        )
+        warnings.warn(msg, MiricigaleWarning, stacklevel=4)
+        usable &= ~filled
+    return n
 
 
 def sky_noise(values, usable, *, width=2.0, threshold=3.5, grow=3):

@@ -19,10 +19,8 @@ def adjust_wings(stamp, radius, core, *, convolve, data, weight):
 
     Parameters
     ----------
-    stamp : `~numpy.ndarray`, shape (h, w)
-        The profile before convolution.
-    radius : `~numpy.ndarray`, shape (h, w)
-        Semi-major axis (pixels) of the ellipse through each pixel of the stamp.
+    stamp, radius : `~numpy.ndarray`, shape (h, w)
+        The profile before convolution, and the semi-major axis (pixels) of the ellipse through each pixel.
     core : float
         Semi-major axis up to which the profile stays as it is.
     convolve : callable
@@ -32,10 +30,8 @@ def adjust_wings(stamp, radius, core, *, convolve, data, weight):
 
     Returns
     -------
-    scale : `~numpy.ndarray`, shape (h, w)
-        What the profile is to be multiplied with; never negative.
-    outer : float
-        The same beyond the stamp.
+    scale, outer : `~numpy.ndarray`, shape (h, w), and float
+        What the profile is to be multiplied with, never negative; the same beyond the stamp.
 
     Notes
     -----

@@ -8,25 +8,11 @@ __all__ = ["autocorrelation"]
 
 def autocorrelation(rows, usable, lag, map_parts=map):
     """
-    Mean product of pixel pairs by separation, over usable pixels.
+    Mean product of pixel pairs by separation, over usable pixels, and its statistical error.
 
-    Parameters
-    ----------
-    rows : callable
-        Called with a slice; those rows of the whitened residual (data minus model, over sigma).
-    usable : bool array, shape (ny, nx)
-        Pixels that count.
-    lag : int
-        Largest separation in pixels along each axis.
-    map_parts : callable, optional
-        Called as `map`, with a function and its arguments, to work in threads.
-
-    Returns
-    -------
-    covariance : float array, shape (2 lag + 1, 2 lag + 1)
-        Mean product, lag (0, 0) in the middle; symmetric through the centre.
-    error : float array of the same shape
-        Its statistical error, from the number of pairs.
+    Both of shape (2 lag + 1, 2 lag + 1), lag (0, 0) in the middle; symmetric through the centre.
+    ``rows(slice)`` are rows of the whitened residual (data minus model, over sigma), ``map_parts`` is called
+    as `map` to work in threads.
     """
     good = np.asarray(usable, bool)
     size = 512

@@ -25,16 +25,7 @@ def box_response(shape, sides):
     """
     Transform of the mean over a parallelogram, for `scipy.fft.rfft2` of ``shape``.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Shape of the image.
-    sides : array_like, shape (2, 2)
-        The two sides of the parallelogram as vectors (x, y) in pixels.
-
-    Returns
-    -------
-    response : `~numpy.ndarray`, shape (ny, nx // 2 + 1)
+    ``sides``, (2, 2), are its two sides as vectors (x, y) in pixels.
     """
     fy = np.fft.fftfreq(shape[0])[:, None]
     fx = np.fft.rfftfreq(shape[1])[None]
@@ -46,20 +37,9 @@ def box_response(shape, sides):
 
 def convolve_batch(stamps, transfer, shape):
     """
-    Convolve stamps with one kernel given by its transform.
+    Convolve stamps, (n, ny, nx), with one kernel given by its transform, its centre where that has it.
 
-    Parameters
-    ----------
-    stamps : `~numpy.ndarray`, shape (n, ny, nx)
-        Images, which are zero-padded to ``shape`` at their far ends.
-    transfer : `~numpy.ndarray`, shape (shape[0], shape[1] // 2 + 1)
-        Transform of the kernel, its centre where the caller put it.
-    shape : (int, int)
-        Shape of the transform; the result is periodic on it.
-
-    Returns
-    -------
-    convolved : `~numpy.ndarray`, shape (n, shape[0], shape[1])
+    Stamps are zero-padded at their far ends to ``shape``, on which the result, (n, *shape), is periodic.
     """
     # axis by axis, so that rows of padding are not transformed
     spectrum = scipy.fft.rfft(stamps, n=shape[1], axis=2)
@@ -103,14 +83,10 @@ def sample_stamps(coefficients, which, amplitude, center, poly, box, start, out)
     ----------
     coefficients : `~numpy.ndarray`, shape (m, h, w)
         Quintic spline coefficients of fine-grid stamps (fraction per fine pixel).
-    which : int array, shape (n,)
-        Which of them each template uses.
-    amplitude : float array, shape (n,)
-        Factor of each; a template of amplitude zero is skipped.
-    center : float array, shape (n, 2)
-        Target position (x, y) about which ``poly`` expands.
-    poly : float array, shape (n, 2, 6)
-        Fine coordinates X, Y in the frame of the stamp as quadratics
+    which, amplitude : int and float arrays, shape (n,)
+        Which of them each template uses, and its factor; a template of amplitude zero is skipped.
+    center, poly : float arrays, shape (n, 2) and (n, 2, 6)
+        Target positions (x, y), and about them fine coordinates X, Y in the frame of the stamp as quadratics
         c0 + c1 u + c2 v + c3 u^2 + c4 u v + c5 v^2 of the offset (u, v) in target pixels.
     box, start : int arrays, shape (n, 4) and (n + 1,)
         Where the target stamps lie on the image and in ``out``.

@@ -12,15 +12,7 @@ def factorize(matrix):
     """
     Factorise a symmetric positive sparse matrix after scaling it to a unit diagonal.
 
-    Parameters
-    ----------
-    matrix : sparse array, shape (n, n)
-        Normal matrix; every diagonal element must be positive.
-
-    Returns
-    -------
-    solve : callable
-        Solves for a vector or a matrix of right-hand sides.
+    A function that solves for a vector or a matrix of right-hand sides.
 
     Raises
     ------

@@ -39,18 +39,9 @@ def _sweep(box, grow, pairs):
 
 def find_pairs(box, grow=0):
     """
-    List the pairs i < j whose boxes overlap after one of them is grown.
+    List the pairs i < j, (n_pairs, 2), of boxes that overlap after one of them is grown by some pixels.
 
-    Parameters
-    ----------
-    box : int array, shape (n, 4)
-        Boxes (y0, x0, ny, nx) sorted by y0.
-    grow : int, optional
-        Pixels by which a box is grown on each side.
-
-    Returns
-    -------
-    pairs : int array, shape (n_pairs, 2)
+    Boxes, (n, 4), are (y0, x0, ny, nx), sorted by y0.
     """
     n = _sweep(box, grow, np.empty((0, 2), np.int32))
     pairs = np.empty((n, 2), np.int32)
@@ -89,16 +80,9 @@ def _cross(box, other, tallest, pairs):
 
 def cross_pairs(box, other):
     """
-    List the pairs of boxes of two sets that overlap.
+    List the pairs, (n_pairs, 2), of boxes of two sets that overlap.
 
-    Parameters
-    ----------
-    box, other : int arrays, shape (n, 4) and (m, 4)
-        Boxes (y0, x0, ny, nx), each set sorted by y0.
-
-    Returns
-    -------
-    pairs : int array, shape (n_pairs, 2)
+    Boxes, (n, 4) and (m, 4), are (y0, x0, ny, nx), each set sorted by y0.
     """
     tallest = box[:, 2].max(initial=0)
     n = _cross(box, other, tallest, np.empty((0, 2), np.int32))
@@ -112,16 +96,9 @@ def cross_pairs(box, other):
 @njit(cache=True, nogil=True, fastmath={"reassoc"})
 def pair_products(a, a_box, a_start, b, b_box, b_start, pairs, out):
     """
-    Sum products of two sets of stamps over the pixels they share.
+    Sum products of two sets of flat stamps, with boxes and starts, over the pixels they share.
 
-    Parameters
-    ----------
-    a, b : `~numpy.ndarray`
-        Flat stamps with their boxes and starts.
-    pairs : int array, shape (n, 2)
-        Rows of ``a`` and ``b``.
-    out : float array, shape (n,)
-        Filled with the sums.
+    ``pairs``, (n, 2), are rows of ``a`` and ``b``; ``out``, (n,), is filled with the sums.
     """
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
@@ -162,19 +139,10 @@ def projections(values, box, start, image, out):
 @njit(cache=True, nogil=True, fastmath={"reassoc"})
 def whiten_stamps(values, box, start, inverse_sigma, out, sums):
     """
-    Multiply each stamp by the inverse noise below it, and sum it up.
+    Multiply each flat stamp by the inverse noise below it, (ny, nx), and sum it up.
 
-    Parameters
-    ----------
-    values, box, start
-        Flat stamps.
-    inverse_sigma : `~numpy.ndarray`, shape (ny, nx)
-        Inverse of the noise.
-    out : `~numpy.ndarray`
-        Filled with the stamps' products with it.
-    sums : float array, shape (n, 4)
-        Filled with the sums of the stamp, of the stamp where the inverse noise is not zero, of its
-        squares, and of the squares of the products.
+    ``out`` is filled with the products; ``sums``, (n, 4), with the sums of the stamp, of the stamp where the
+    inverse noise is not zero, of its squares, and of the squares of the products.
     """
     for k in range(box.shape[0]):
         n = start[k]
@@ -253,21 +221,11 @@ def residual_statistics(values, box, start, residual, inverse_sigma, out):
 
 def convolve_stamps(values, box, start, rows, transfer, shape, out_box, out_start, out):
     """
-    Convolve some of the stamps with a kernel given by its transform; the results are larger.
+    Convolve some of the flat stamps with a kernel given by its transform; the results are larger.
 
-    Parameters
-    ----------
-    values, box, start
-        Flat stamps.
-    rows : int array, shape (n,)
-        Which of them.
-    transfer : `~numpy.ndarray`, shape (shape[0], shape[1] // 2 + 1)
-        Transform of the kernel, its corner on the first pixel.
-    shape : (int, int)
-        Shape of the transform, at least that of the largest result.
-    out_box, out_start, out
-        Boxes of all stamps, grown by the kernel's half-width on each side, their starts, and the
-        flat result.
+    ``rows``, (n,), tell which. ``transfer`` has the kernel's corner on the first pixel; ``shape`` is that of the
+    transform, at least that of the largest result. Boxes of all results are grown by the kernel's
+    half-width on each side, with their starts and the flat result.
     """
     batch = np.zeros((len(rows), *shape), values.dtype)
     for padded, k in zip(batch, rows, strict=True):
