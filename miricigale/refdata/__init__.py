@@ -19,3 +19,7 @@ __all__ = [
     "resource",
     "resources",
 ]
+
+
+def __dir__():
+    return sorted(__all__)

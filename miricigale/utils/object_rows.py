@@ -16,8 +16,8 @@ PerObject = Annotated[np.ndarray, "per object"]
 PerObjectDict = Annotated[dict, "per object"]
 
 
-def _frozen(array):
-    array = np.array(array, order="C", subok=True)
+def _frozen(array, copy):
+    array = np.array(array, order="C", subok=True, copy=copy or None)
     array.flags.writeable = False
     return array
 
@@ -35,12 +35,20 @@ class ObjectRows:
     """
 
     def __post_init__(self):
+        self._freeze(copy=True)
+
+    def _freeze(self, copy):
         for name, value in self._per_object():
             if isinstance(value, dict):
-                value = {key: _frozen(array) for key, array in value.items()}
+                value = {key: _frozen(array, copy) for key, array in value.items()}
             elif value is not None:
-                value = _frozen(value)
-            object.__setattr__(self, name, value)
+                value = _frozen(value, copy)
+            self.__dict__[name] = value
+
+    def __setstate__(self, state):
+        # arrays come back from pickles as ones that can be written to
+        self.__dict__.update(state)
+        self._freeze(copy=False)
 
     def _per_object(self):
         for item in fields(self):

@@ -1,0 +1,120 @@
+"""What `miricigale` offers: names that import, objects that pickle and copy."""
+
+import copy
+import importlib
+import pickle
+import pkgutil
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData
+from astropy.table import QTable
+
+import miricigale
+from miricigale.detector import Dark
+
+ROOMS = [
+    item.name
+    for item in pkgutil.iter_modules(miricigale.__path__)
+    if item.ispkg and item.name not in ("plotting", "utils")
+]
+BANDS = ["wfc3.f160w", "irac.ch1", "miri.f770w"]
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_room_has_the_names_that_it_lists_and_no_others(room):
+    module = importlib.import_module(f"miricigale.{room}")
+    for name in module.__all__:
+        assert getattr(module, name) is not None
+    names = [name for name in dir(module) if not name.startswith("__")]
+    assert sorted(names) == sorted(module.__all__)
+
+
+def test_the_classes_of_the_package_import_from_it():
+    from miricigale import ErrorModel, FitResults, MatchingKernel, ModelGrid, Ramp
+
+    for cls in (ErrorModel, FitResults, MatchingKernel, ModelGrid, Ramp):
+        assert cls.__name__ in dir(miricigale)
+    with pytest.raises(AttributeError, match="has no attribute 'FitResult'") as caught:
+        miricigale.FitResult  # noqa: B018
+    assert caught.value.name == "FitResult"
+
+
+@pytest.fixture(scope="module")
+def objects():
+    """Public objects that other tests do not pickle, by name, and what shows that they are whole."""
+    from miricigale import BayesFitter, Detector, Exposure, Filter, Reducer, SEDModel
+
+    model = SEDModel.yang2021(libraries="bundled")
+    axes = SEDModel.yang2021_axes("quick") | {"redshift": [0.5, 1.0, 1.5]}
+    fitter = BayesFitter(model, BANDS, axes=axes)
+    table = QTable({"id": ["a", "b", "c"]})
+    for name in BANDS:
+        table[name] = [1.0, 2.0, np.nan] * u.uJy
+        table[f"{name}_err"] = [0.1, 0.1, np.nan] * u.uJy
+    results = fitter.fit(table)
+    pointing = SkyCoord(53.1, -27.8, unit="deg")
+    exposure = Exposure(
+        "miri.f770w", n_groups=4, subarray="SUB64", pointing=pointing, roll=0 * u.deg
+    )
+    detector = Detector.miri_imager().without(Dark)
+    image = CCDData(np.full(exposure.shape, 5.0), unit="MJy/sr", meta={})
+    ramp = detector.expose(image, exposure, seed=1)
+    reducer = Reducer()
+
+    def fit(fitter):
+        return fitter.fit(table).pdf["redshift"]
+
+    def table_of(results):
+        return [np.asarray(column) for column in results.to_table().itercols()]
+
+    return {
+        "filter": (Filter.from_name("F770W"), lambda x: x.throughput),
+        "SED": (model.evaluate(redshift=1.0), lambda x: x.fnu.value),
+        "model": (model, lambda x: x.evaluate(redshift=1.0).fnu.value),
+        "grid": (fitter.grid, lambda x: x.galaxy),
+        "fitter": (fitter, fit),
+        "results": (results, table_of),
+        "rows": (results[[2, 0]], table_of),
+        "object": (results["b"], table_of),
+        "samples": (fitter.sample(table, 3, seed=1), table_of),
+        "drawn object": (fitter.sample(table, 3, seed=1)["a"], table_of),
+        "exposure": (exposure, lambda x: x.exposure_time.value),
+        "detector": (detector, lambda x: x.expose(image, exposure, seed=1).data),
+        "ramp": (ramp, lambda x: x.data),
+        "reducer": (reducer, lambda x: x.fit_ramp(ramp).data),
+    }
+
+
+NAMES = ["filter", "SED", "model", "grid", "fitter", "results", "rows", "object", "samples"]
+NAMES += ["drawn object", "exposure", "detector", "ramp", "reducer"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "again", [lambda x: pickle.loads(pickle.dumps(x)), copy.copy, copy.deepcopy],
+    ids=["pickle", "copy", "deepcopy"],
+)  # fmt: skip
+def test_public_objects_pickle_and_copy(objects, name, again):
+    obj, content = objects[name]
+    other = again(obj)
+    assert type(other) is type(obj)
+    assert repr(other) == repr(obj)
+    np.testing.assert_equal(content(other), content(obj))
+
+
+def test_copies_of_results_are_read_only(objects):
+    results = objects["results"][0]
+    for other in (pickle.loads(pickle.dumps(results)), copy.deepcopy(results), results[:2]):
+        with pytest.raises(ValueError, match="read-only"):
+            other.chi2[0] = 0.0
+        with pytest.raises(ValueError, match="read-only"):
+            other.pdf["redshift"][0] = 0.0
+
+
+def test_results_show_themselves_in_notebooks(objects):
+    html = objects["results"][0]._repr_html_()
+    assert "redshift_mean" in html
+    assert "&lt;FitResults of 3 objects, 2 fitted, 3 bands&gt;" in html
