@@ -313,24 +313,7 @@ class GridFit:
     # ----------------------------------------------------------------------- draws
 
     def sample(self, data, log_prior, n_draws, seed, **parallel):
-        """
-        Draw models from the posteriors of objects.
-
-        Parameters
-        ----------
-        data : `~miricigale.fitting.likelihood.FitData`
-            Photometry and flags.
-        log_prior : `~numpy.ndarray`, shape (n, nz)
-            From `redshifts`.
-        n_draws, seed : int
-            As for `~miricigale.fitting.BayesFitter.sample`.
-        **parallel
-            Passed to `~miricigale.utils.parallel.parallel_map`.
-
-        Returns
-        -------
-        samples : `~miricigale.fitting.Samples`
-        """
+        """`~miricigale.fitting.Samples` of objects; ``parallel`` is for `parallel_map`."""
         keys = [stream(seed, "fit", "draws", str(key)).integers(2**63) for key in data.ids]
         keys = np.array(keys, dtype=np.int64)
         pieces = [

@@ -31,15 +31,6 @@ def write_results(results, path, *, overwrite=False):
     """
     Write results: a table extension of all arrays, and a text extension of all else.
 
-    Parameters
-    ----------
-    results : `~miricigale.fitting.FitResults`
-        The results, of several objects or a single one.
-    path : path-like
-        The file.
-    overwrite : bool, optional
-        Whether a file that is there is replaced.
-
     Raises
     ------
     ValueError
@@ -68,19 +59,7 @@ def write_results(results, path, *, overwrite=False):
 
 
 def read_results(path):
-    """
-    Read results.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If the file is missing, something else or incomplete.
-    """
+    """Read results; see `~miricigale.fitting.FitResults`."""
     with open_parts(path, (_RESULTS, *_OLD_RESULTS), wanted="fit results") as parts:
         text, table = parts.text, parts.table("RESULTS")
         n = len(table)
@@ -123,15 +102,6 @@ def write_samples(samples, path, *, overwrite=False):
     """
     Write samples: a table extension of the draws, a text extension, and the axes' shares.
 
-    Parameters
-    ----------
-    samples : `~miricigale.fitting.Samples`
-        The samples.
-    path : path-like
-        The file.
-    overwrite : bool, optional
-        Whether a file that is there is replaced.
-
     Raises
     ------
     ValueError
@@ -159,21 +129,10 @@ def write_samples(samples, path, *, overwrite=False):
 
 def read_samples(path, grid, *, model=None):
     """
-    Read samples.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    grid : `~miricigale.sed.ModelGrid`
-        The grid that was fitted (``fitter.grid``): draws are indices of it.
-    model : `~miricigale.sed.SEDModel`, optional
-        The model that it was made from, for other bands and for spectra.
+    Read samples, with the grid that was fitted and, if it is known, its model.
 
     Raises
     ------
-    `~miricigale.utils.exceptions.DataError`
-        If the file is missing, something else or incomplete.
     ValueError
         If the grid is another.
     """

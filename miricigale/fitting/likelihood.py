@@ -146,23 +146,13 @@ def read_photometry(
 
 def read_ids(table):
     """
-    Ids of a catalogue.
-
-    Parameters
-    ----------
-    table : `~astropy.table.Table`
-        The catalogue of n objects, with the column ``id``.
-
-    Returns
-    -------
-    ids : `~numpy.ndarray`, shape (n,)
-        Numbers, or text whether it came as such or as bytes.
+    Ids of a catalogue: numbers, or text whether it came as such or as bytes.
 
     Raises
     ------
     ValueError
-        If one is masked or empty text, for nothing would tell its object from
-        others; if some are numbers and some text, several are in a row, or bytes are not UTF-8.
+        If one is masked or empty text, for nothing would tell its object from others; if some are
+        numbers and some text, several are in a row, or bytes are not UTF-8.
     """
     require_columns(table, ["id"], "photometry")
     column = table["id"]
@@ -198,22 +188,10 @@ def read_ids(table):
 
 def unused_bands(table, filters):
     """
-    Bands of a catalogue that are not fitted.
+    Names of the bands of a catalogue that are not fitted (``filters``), in the order of the columns.
 
     A column is a band if it has an error ``<name>_err`` beside it and both are in a unit of flux
     density, or if its name is that of a filter.
-
-    Parameters
-    ----------
-    table : `~astropy.table.Table`
-        Photometry.
-    filters : iterable of str
-        The bands that are fitted.
-
-    Returns
-    -------
-    names : list of str
-        In the order of the columns.
     """
     known, columns = set(Filter.names()), set(table.colnames)
     out = []
@@ -238,24 +216,11 @@ def _is_flux(column):
 
 def limits(table, name):
     """
-    Rows whose flux in a band is an upper limit.
+    Rows whose flux in a band is an upper limit: array of bool, shape (n,).
 
-    Parameters
-    ----------
-    table : `~astropy.table.QTable`
-        Photometry. Its column ``<name>_limit``, if it is there, is boolean, or holds 0 and 1 or
-        ``true`` and ``false`` as text files do; masked and empty values are no limits.
-    name : str
-        The band.
-
-    Returns
-    -------
-    limit : `~numpy.ndarray` of bool, shape (n,)
-
-    Raises
-    ------
-    ValueError
-        If the column holds something else, such as the limit itself.
+    The column ``<name>_limit``, if it is there, is boolean, or holds 0 and 1 or ``true`` and
+    ``false`` as text files do; masked and empty values are no limits. A `ValueError` tells a column
+    that holds something else, such as the limit itself.
     """
     column = f"{name}_limit"
     if column not in table.colnames:
@@ -303,26 +268,14 @@ def per_band(value, filters, name):
 
 def flux_column(table, name):
     """
-    Fluxes of a column.
-
-    Parameters
-    ----------
-    table : `~astropy.table.Table`
-        The table.
-    name : str
-        Its column, of numbers, with a unit of flux density.
-
-    Returns
-    -------
-    flux : `~numpy.ndarray`, shape (n,)
-        In uJy, NaN where masked: a new array.
+    Fluxes of a column in uJy, NaN where masked: a new array, shape (n,).
 
     Raises
     ------
     ValueError
         If the column holds no real numbers, or several in a row.
     `~astropy.units.UnitsError`
-        If its unit is another.
+        If it has no unit of flux density.
     """
     column = table[name]
     column = getattr(column, "unmasked", column)

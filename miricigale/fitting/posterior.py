@@ -26,20 +26,10 @@ _ALWAYS = {"redshift", "frac_agn"}
 
 def cell_edges(values, bounds=(-np.inf, np.inf)):
     """
-    Edges of the cells around the nodes of an axis.
+    Edges of the cells around ascending nodes: shape (n,) to (n + 1,).
 
-    Parameters
-    ----------
-    values : array_like, shape (n,)
-        Ascending nodes.
-    bounds : tuple of float, optional
-        Limits of the outermost cells.
-
-    Returns
-    -------
-    edges : `~numpy.ndarray`, shape (n + 1,)
-        Half way between the nodes; the outermost cells are symmetric about their nodes, as far
-        as the bounds allow. A single node has a cell of no width.
+    Half way between the nodes; the outermost cells are symmetric about their nodes, as far as the
+    bounds allow. A single node has a cell of no width.
     """
     values = np.asarray(values, dtype=float)
     if values.size == 1:
@@ -51,20 +41,7 @@ def cell_edges(values, bounds=(-np.inf, np.inf)):
 
 
 def moments(values, pdf):
-    """
-    Mean and standard deviation.
-
-    Parameters
-    ----------
-    values : `~numpy.ndarray`, shape (n,)
-        Nodes.
-    pdf : `~numpy.ndarray`, shape (..., n)
-        Weights of the nodes; the last axis sums to 1.
-
-    Returns
-    -------
-    mean, std : `~numpy.ndarray`, shape (...)
-    """
+    """Mean and standard deviation, shape (...), for weights (..., n) of nodes (n,) that sum to 1."""
     # a matrix product's last digit would depend on how many rows there are
     mean = np.sum(pdf * values, axis=-1)
     # about the mean, so that narrow posteriors do not lose digits
@@ -91,22 +68,10 @@ def check_levels(levels):
 
 def cell_percentiles(values, pdf, levels, bounds=(-np.inf, np.inf)):
     """
-    Percentiles from the cumulative distribution, linear within each cell.
+    Percentiles from the cumulative distribution, linear within each cell of `cell_edges`.
 
-    Parameters
-    ----------
-    values : array_like, shape (n,)
-        Ascending nodes.
-    pdf : `~numpy.ndarray`, shape (m, n)
-        Weights of the nodes of m objects; rows of NaN give NaN.
-    levels : array_like, shape (k,)
-        Levels in (0, 1).
-    bounds : tuple of float, optional
-        See `cell_edges`.
-
-    Returns
-    -------
-    percentiles : `~numpy.ndarray`, shape (m, k)
+    Levels in (0, 1), shape (k,), of m objects whose nodes have the weights ``pdf``, shape (m, n):
+    shape (m, k). Rows of NaN give NaN.
     """
     edges = cell_edges(values, bounds)
     levels = np.asarray(levels, dtype=float)
@@ -149,23 +114,10 @@ def _first_not_below(total, target, place):
 
 def randomised_ranks(pdf, node, draw):
     """
-    Ranks of true values that lie on nodes, uniform if the posteriors are right.
+    Ranks of true values that lie on nodes, shape (m,), uniform if the posteriors are right.
 
-    The distribution steps at every node: the rank is drawn from the step of the true one, for
-    otherwise narrow posteriors have ranks of 0 and 1 only.
-
-    Parameters
-    ----------
-    pdf : `~numpy.ndarray`, shape (m, n)
-        Weights of the nodes of m objects.
-    node : `~numpy.ndarray` of int, shape (m,)
-        Node of each object's true value.
-    draw : `~numpy.ndarray`, shape (m,)
-        Uniform random numbers in [0, 1).
-
-    Returns
-    -------
-    ranks : `~numpy.ndarray`, shape (m,)
+    The distribution steps at every node: the rank is drawn (a uniform number for each object) from
+    the step of the true node, for otherwise narrow posteriors have ranks of 0 and 1 only.
     """
     node = np.asarray(node)[:, None]
     own = np.take_along_axis(pdf, node, axis=1)[:, 0]
@@ -174,24 +126,7 @@ def randomised_ranks(pdf, node, draw):
 
 
 def node_cells(values, nodes, bounds=(-np.inf, np.inf)):
-    """
-    Cells of values that lie on nodes.
-
-    Parameters
-    ----------
-    values : `~numpy.ndarray`, shape (m,)
-        Values; NaN is in no cell.
-    nodes : `~numpy.ndarray`, shape (n,)
-        Ascending nodes.
-    bounds : tuple of float, optional
-        See `cell_edges`.
-
-    Returns
-    -------
-    edges : `~numpy.ndarray`, shape (n + 1,)
-    place : `~numpy.ndarray` of int, shape (m,)
-        Cell of the nearest node, -1 for NaN.
-    """
+    """Edges of the cells around nodes, and the cell of each value that lies on one; -1 for NaN."""
     finite = np.isfinite(values)
     place = np.argmin(np.abs(np.where(finite, values, 0.0) - nodes[:, None]), axis=0)
     return cell_edges(nodes, bounds), np.where(finite, place, -1)
@@ -199,22 +134,10 @@ def node_cells(values, nodes, bounds=(-np.inf, np.inf)):
 
 def bin_cells(values, bins, *, log=False):
     """
-    Bins of values.
+    Edges of bins, and the bin of each value; -1 for those in none. The last has its upper edge too.
 
-    Parameters
-    ----------
-    values : `~numpy.ndarray`, shape (m,)
-        Values; NaN is in no bin.
-    bins : int or array_like
-        Number of bins between the least and the largest value, or edges.
-    log : bool, optional
-        Whether bins have equal widths in the logarithm, if all values are above 0.
-
-    Returns
-    -------
-    edges : `~numpy.ndarray`, shape (n + 1,)
-    place : `~numpy.ndarray` of int, shape (m,)
-        Bin of each value; the last holds its upper edge too. -1 for those in none.
+    A number of bins lies between the least and the largest value, with equal widths in the logarithm
+    with ``log``, if all values are above 0.
     """
     finite = np.isfinite(values)
     if np.ndim(bins):
@@ -235,23 +158,11 @@ def bin_cells(values, bins, *, log=False):
 
 def check_pairs(pairs, axes, constant, derived, wanted):
     """
-    Check pairs of parameters.
+    Check pairs of parameters that have a posterior (``axes``).
 
-    Parameters
-    ----------
-    pairs : list of tuple of str or None
-        Pairs of parameters.
-    axes : dict of str to `~miricigale.fitting.priors.GridAxis`
-        Parameters that have a posterior.
-    constant, derived : iterable of str
-        Names of parameters with one value, and of derived quantities.
-    wanted : str
-        What is asked for in place of derived quantities, for the message.
-
-    Returns
-    -------
-    pairs : tuple of tuple of str
-        Each once, whatever its order; without redshift and AGN fraction, which every fit has.
+    ``constant`` and ``derived`` are the names of parameters with one value, and of derived quantities,
+    in place of which the message wants what ``wanted`` says. Returned is a tuple of pairs, each once,
+    whatever its order, without redshift and AGN fraction, which every fit has.
 
     Raises
     ------
@@ -300,26 +211,13 @@ def _letters(a, b):
 
 def joint_tables(out, pairs, axes):
     """
-    Sum joint posteriors of models up to those of parameters.
+    Sum joint posteriors of models up to those of parameters: by pair, shape (n, nx, ny).
 
-    A galaxy or torus model has one value of each of its parameters, or is shared by their values
+    A galaxy or AGN model has one value of each of its parameters, or is shared by their values
     as the prior has it (a torus without polar dust by all temperatures of it). The prior being a
     product over parameters, two that share the same model are independent within it, and the
-    product of their shares is exact.
-
-    Parameters
-    ----------
-    out : `~miricigale.fitting.engines.output.GridOutput`
-        What the engine found for n objects, with the sums that `joint_names` names.
-    pairs : tuple of tuple of str
-        See `check_pairs`.
-    axes : dict of str to `~miricigale.fitting.priors.GridAxis`
-        Parameters of the fit, with their shares.
-
-    Returns
-    -------
-    tables : dict of tuple of str to `~numpy.ndarray`, shape (n, nx, ny)
-        Each sums to 1; NaN for objects that were not fitted.
+    product of their shares is exact. ``out`` is what the engine found, with the sums that
+    `joint_names` names.
     """
     tables, folded = {}, {}
     for x, y in pairs:

@@ -199,24 +199,10 @@ def _inert(grid):
 
 def known_redshifts(photometry, redshift):
     """
-    Redshifts of a catalogue as an array.
+    Redshifts of a catalogue: a column by its name, one value, or one for each object.
 
-    Parameters
-    ----------
-    photometry : `~astropy.table.Table`
-        The catalogue of n objects.
-    redshift : str or array_like
-        One of its columns, or values: one, or n.
-
-    Returns
-    -------
-    values : `~numpy.ndarray`, shape (n,)
-        NaN where one is missing, masked, not finite or not positive.
-
-    Raises
-    ------
-    ValueError
-        If there is no such column, or the shape is another.
+    NaN where one is missing, masked, not finite or not positive. A `ValueError` tells a column that
+    is not there, or another shape.
     """
     n = len(photometry)
     if isinstance(redshift, str):
@@ -236,26 +222,11 @@ def known_redshifts(photometry, redshift):
 
 def read_density(redshift_prior, n):
     """
-    Check densities of redshift.
+    Check densities of redshift for n objects: (redshifts, shape (n_z,), densities).
 
-    Parameters
-    ----------
-    redshift_prior : tuple
-        Redshifts, shape (n_z,), ascending, and densities in redshift, shape (n_z,) for all
-        objects or (n, n_z); straight lines join them, and they are 0 outside.
-    n : int
-        Number of objects.
-
-    Returns
-    -------
-    nodes, density : `~numpy.ndarray`
-        As given; densities that are masked are NaN.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not agree, redshifts do not ascend or are masked, or a density is negative or
-        infinite.
+    Densities have the shape (n_z,), for all, or (n, n_z); straight lines join them, and they are 0
+    outside. Masked ones are NaN. A `ValueError` tells shapes that do not agree, redshifts that do
+    not ascend or are masked, and densities that are negative or infinite.
     """
     wanted = "(redshifts of shape (n_z,), densities of shape (n_z,) or (n, n_z))"
     if not (isinstance(redshift_prior, tuple) and len(redshift_prior) == 2):
@@ -281,26 +252,12 @@ def _unmasked(value, name):
 
 def density_log_prior(redshift_prior, grid_redshift, allowed, flags):
     """
-    ln(prior) of the redshifts of a grid, from a density for each object.
+    ln(prior) of the redshifts of a grid, shape (n, nz), from a density for each object.
 
     The prior of a redshift is the integral of the density over its cell, as a share of the whole
-    density: what lies outside the grid is missing from the evidence.
-
-    Parameters
-    ----------
-    redshift_prior : tuple
-        As for `read_density`.
-    grid_redshift : `~numpy.ndarray`, shape (nz,)
-        Redshifts of the grid.
-    allowed : `~numpy.ndarray` of bool, shape (nz,)
-        Whether there are models at that redshift.
-    flags : `~numpy.ndarray` of int, shape (n,)
-        Densities that are masked, hold NaN or sum to 0 are flagged here as ``NO_REDSHIFT``, those that leave
-        nothing of the grid as ``NO_MODEL``.
-
-    Returns
-    -------
-    log_prior : `~numpy.ndarray`, shape (n, nz)
+    density: what lies outside the grid is missing from the evidence. Only redshifts that are
+    ``allowed`` have one. Densities that are masked, hold NaN or sum to 0 are flagged in ``flags``
+    as ``NO_REDSHIFT``, those that leave nothing of the grid as ``NO_MODEL``.
     """
     n = flags.size
     nodes, density = read_density(redshift_prior, n)
@@ -327,22 +284,10 @@ def density_log_prior(redshift_prior, grid_redshift, allowed, flags):
 
 def fixed_log_prior(values, grid_redshift, allowed, tolerance, flags):
     """
-    ln(prior) of the redshifts of a grid where they are known: 0 at the nearest, else -inf.
+    ln(prior) of the redshifts of a grid, shape (n, nz), where they are known: 0 at the nearest.
 
-    Parameters
-    ----------
-    values : `~numpy.ndarray`, shape (n,)
-        From `known_redshifts`.
-    grid_redshift, allowed : `~numpy.ndarray`, shape (nz,)
-        As for `density_log_prior`.
-    tolerance : float or None
-        Largest abs(dz) / (1 + z) to the nearest redshift of the grid; None: half a cell.
-    flags : `~numpy.ndarray` of int, shape (n,)
-        Redshifts that are missing, too far from the grid, or without a model are flagged here.
-
-    Returns
-    -------
-    log_prior : `~numpy.ndarray`, shape (n, nz)
+    It is -inf elsewhere. The nearest lies within ``tolerance`` in abs(dz) / (1 + z), or half a cell.
+    Redshifts that are missing, too far from the grid, or without a model are flagged in ``flags``.
     """
     n, z = values.size, grid_redshift
     missing = np.isnan(values)

@@ -47,25 +47,10 @@ _FRACTIONS = {
 
 def kept_percentiles(name, levels, kept):
     """
-    Percentiles of a quantity from its kept quantiles, linear between them.
+    Percentiles of a quantity, shape (n, n_levels), linear between its kept quantiles.
 
-    Parameters
-    ----------
-    name : str
-        The quantity, for the message.
-    levels : `~numpy.ndarray`, shape (n_levels,)
-        Levels.
-    kept : `~numpy.ndarray`, shape (n, n_kept)
-        Quantiles at `DERIVED_LEVELS` of n objects.
-
-    Returns
-    -------
-    percentiles : `~numpy.ndarray`, shape (n, n_levels)
-
-    Raises
-    ------
-    ValueError
-        If a level is beyond the kept ones: nothing is known of the tails.
+    ``kept`` has those at `DERIVED_LEVELS`, shape (n, n_kept). A `ValueError` tells levels beyond
+    these: nothing is known of the tails.
     """
     low, high = DERIVED_LEVELS[[0, -1]]
     if np.any((levels < low) | (levels > high)):
@@ -140,21 +125,11 @@ class ShapeQuantities:
 
     def summarise(self, weights, levels):
         """
-        Reduce posterior weights of galaxy models to moments and quantiles.
+        Moments, shape (n, n_quantities, 3), and quantiles, from posterior weights of galaxies (n, nG).
 
-        Parameters
-        ----------
-        weights : `~numpy.ndarray`, shape (n, nG)
-            Weights of the galaxy models for n objects; rows of NaN give NaN.
-        levels : `~numpy.ndarray`, shape (n_levels,)
-            Levels of the quantiles, in (0, 1).
-
-        Returns
-        -------
-        moments : `~numpy.ndarray`, shape (n, n_quantities, 3)
-            Mean, standard deviation, and NaN (a mean of log10 has no meaning here).
-        quantiles : `~numpy.ndarray`, shape (n, n_quantities, n_levels)
-            From the distribution over the different values, linear within each cell.
+        The moments are mean, standard deviation, and NaN (a mean of log10 has no meaning here); the
+        quantiles, at ``levels``, those of the distribution over the different values, linear within each
+        cell. Rows of NaN give NaN.
         """
         n = len(weights)
         out = np.full((n, len(self.names), 3), np.nan)
@@ -263,20 +238,7 @@ class Quantities:
         )
 
     def summarise(self, out):
-        """
-        Join the quantities that scale with those that do not.
-
-        Parameters
-        ----------
-        out : `~miricigale.fitting.engines.output.GridOutput`
-            What the grid engine returns for n objects: ``moments`` and ``quantiles`` of what
-            scales, ``galaxy``, the weights of the galaxy models.
-
-        Returns
-        -------
-        moments : `~numpy.ndarray`, shape (n, n_quantities, 3)
-        quantiles : `~numpy.ndarray`, shape (n, n_quantities, n_levels)
-        """
+        """Moments and quantiles of all quantities, from what the grid engine found for n objects."""
         moments, quantiles = self.shape.summarise(out.galaxy, DERIVED_LEVELS)
         return (
             np.concatenate([out.moments, moments], axis=1),
@@ -285,22 +247,9 @@ class Quantities:
 
     def evaluate(self, name, grid, g, k, frac, scale):
         """
-        Values of one quantity for single models.
+        Values of a quantity for single models: galaxies, AGN templates, fractions and scales.
 
-        Parameters
-        ----------
-        name : str
-            The quantity.
-        grid : `~miricigale.sed.ModelGrid`
-            The grid.
-        g, k : `~numpy.ndarray` of int, shape (...)
-            Galaxies and tori.
-        frac, scale : `~numpy.ndarray`, shape (...)
-            AGN fractions and solar masses formed; NaN gives NaN.
-
-        Returns
-        -------
-        values : `~numpy.ndarray`, shape (...)
+        Indices and numbers have one shape, and the values have it too; a scale of NaN gives NaN.
         """
         i = self.names.index(name)
         n_galaxy, n_agn = len(self.galaxy_scale), len(self.agn_scale)
@@ -382,15 +331,7 @@ def _in_watt(column):
 
 
 def check_draws(grid, ids, flags, index, scale):
-    """
-    Check models drawn from a grid; see `~miricigale.fitting.Samples` for the arguments.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not agree, an index is not one of the grid, or there is no torus where the
-        AGN fraction is above 0.
-    """
+    """Refuse models drawn from a grid whose shapes do not agree, or that are none of the grid."""
     n, shape = ids.size, np.shape(scale)
     if len(shape) != 2 or shape[0] != n or shape[1] < 1:
         raise argument_error("scale", f"of shape ({n}, n_draws)", f"{shape}")
@@ -412,14 +353,8 @@ class ModelValues:
     """
     Values of parameters and derived quantities of models of a grid.
 
-    Parameters
-    ----------
-    grid : `~miricigale.sed.ModelGrid`
-        The grid.
-    axes : dict of str to `~miricigale.fitting.priors.GridAxis`
-        Parameters that have several values, with ``share``.
-    seed : int
-        Chooses values of parameters without effect.
+    ``axes`` are the parameters that have several values, with ``share``; ``seed`` chooses values of
+    parameters without effect.
     """
 
     def __init__(self, grid, axes, seed):
@@ -460,23 +395,10 @@ class ModelValues:
 
     def values(self, name, ids, index, scale):
         """
-        Values in models drawn for n objects.
+        Values of a parameter or quantity in models drawn for n objects: shape (n, n_draws).
 
-        Parameters
-        ----------
-        name : str
-            A parameter or quantity.
-        ids : `~numpy.ndarray`, shape (n,)
-            Ids of the objects, which key the streams of parameters without effect.
-        index : `~numpy.ndarray` of int, shape (n, n_draws, 4)
-            Redshift, galaxy, torus (-1: none) and AGN fraction.
-        scale : `~numpy.ndarray`, shape (n, n_draws)
-            Solar masses formed.
-
-        Returns
-        -------
-        values : `~numpy.ndarray`, shape (n, n_draws)
-            NaN for parameters of a torus that is not there.
+        ``ids`` key the streams of parameters without effect; NaN for parameters of an AGN that is not
+        there. See `~miricigale.fitting.Samples` for ``index`` and ``scale``.
         """
         z, g, k, f = np.moveaxis(index, -1, 0)
         grid = self.grid

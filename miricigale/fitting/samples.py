@@ -6,12 +6,12 @@ from functools import cached_property
 import astropy.units as u
 import numpy as np
 
-from miricigale.fitting import spectra
 from miricigale.fitting.flags import FitFlags
 from miricigale.fitting.posterior import bin_cells, check_levels, node_cells
 from miricigale.fitting.priors import grid_priors
 from miricigale.fitting.quantities import ModelValues, check_draws
 from miricigale.fitting.results import labeled
+from miricigale.sed import grid_spectra as spectra
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.tables import described_table, error_column

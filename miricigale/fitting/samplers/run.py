@@ -188,21 +188,10 @@ class ContinuousEngine:
 
     def models(self, values, mass=None):
         """
-        Fluxes and derived quantities of models.
+        Fluxes in uJy (m, n_bands), NaN where a model is not possible, and derived quantities by name.
 
-        Parameters
-        ----------
-        values : dict of str to `~numpy.ndarray`, shape (m,)
-            Values of all parameters but mass.
-        mass : `~numpy.ndarray`, shape (m,), optional
-            Solar masses formed; 1 by default.
-
-        Returns
-        -------
-        flux : `~numpy.ndarray`, shape (m, n_bands)
-            In uJy; NaN where a model is not possible.
-        derived : dict of str to `~numpy.ndarray`, shape (m,)
-            Derived quantities in the units of the model.
+        ``values`` has all parameters but mass by name, each of shape (m,); ``mass`` is in solar masses
+        formed, 1 by default.
         """
         n = len(next(iter(values.values())))
         table = QTable(values | {"mass": np.ones(n) if mass is None else mass}, copy=False)
@@ -224,21 +213,7 @@ class ContinuousEngine:
         return False
 
     def fit(self, target, seed):
-        """
-        Sample the posterior of one object.
-
-        Parameters
-        ----------
-        target : `Target`
-            The object; one band at least is measured.
-        seed : int
-            Seed of the whole catalogue.
-
-        Returns
-        -------
-        posterior : `Posterior` or None
-            None if the prior leaves no model.
-        """
+        """Sample the posterior of one `Target`; None if its prior leaves no model."""
         with single_threaded():
             if not self.possible(target, stream(seed, "fit", "prior", target.key)):
                 return None
@@ -320,24 +295,10 @@ def _hazard(x):
 
 def chi2_at(scale, model, flux, sigma, limit):
     """
-    Chi2 of models at given scales.
+    Chi2 of m models, shape (m, n_bands) for a scale of 1, at given scales: shape (m,).
 
-    Parameters
-    ----------
-    scale : `~numpy.ndarray`, shape (m,)
-        Scales.
-    model : `~numpy.ndarray`, shape (m, n_bands)
-        Fluxes for a scale of 1.
-    flux, sigma : `~numpy.ndarray`, shape (n_bands,)
-        Measured fluxes and errors, or upper limits and their 1-sigma errors.
-    limit : `~numpy.ndarray` of bool, shape (n_bands,)
-        Which bands are upper limits.
-
-    Returns
-    -------
-    chi2 : `~numpy.ndarray`, shape (m,)
-        Sum of ((F - s m) / sigma)^2 and, of limits, of -2 ln(1/2 (1 + erf((F - s m) / (sqrt2
-        sigma)))) (Sawicki 2012, PASP 124, 1208, eq. A10; Boquien et al. 2019, section 4.3).
+    Sum of ((F - s m) / sigma)^2 and, of limits, of -2 ln(1/2 (1 + erf((F - s m) / (sqrt2 sigma))))
+    (Sawicki 2012, PASP 124, 1208, eq. A10; Boquien et al. 2019, section 4.3).
     """
     apart = (flux - scale[:, None] * model) / sigma
     return np.sum(np.where(limit, -2.0 * log_ndtr(apart), np.square(apart)), axis=1)
@@ -345,22 +306,12 @@ def chi2_at(scale, model, flux, sigma, limit):
 
 def best_scale(model, flux, sigma, limit):
     """
-    Scales at which chi2 is least, not below 0, and their variances.
+    Scales at which chi2 is least, not below 0, and their variances; arguments as of `chi2_at`.
 
     Without limits the minimum is closed-form. With limits chi2 is convex in the scale, its
-    derivative convex too, and the scale of the measured bands alone lies above the minimum: from
-    there Newton's steps go down to it without passing it.
-
-    Parameters
-    ----------
-    model, flux, sigma, limit : `~numpy.ndarray`
-        As for `chi2_at`; one band at least is measured.
-
-    Returns
-    -------
-    scale, variance : `~numpy.ndarray`, shape (m,)
-        The variance is that of the Gaussian with the curvature of chi2 at the minimum; both are
-        0 for a model without light in the measured bands.
+    derivative convex too, and the scale of the measured bands alone (one at least) lies above the
+    minimum: from there Newton's steps go down to it without passing it. The variance is that of the
+    Gaussian with the curvature of chi2 at the minimum; both are 0 for a model without light there.
     """
     unit = model / sigma
     measured, bound = unit[:, ~limit], unit[:, limit]

@@ -317,24 +317,7 @@ class Space:
         return (prior.values[0], prior.values[-1]) if isinstance(prior, Choice) else prior.bounds
 
     def at_redshifts(self, limits, photometry, redshift, flags):
-        """
-        Copies with the redshift of every object.
-
-        Parameters
-        ----------
-        limits : tuple of float
-            Least and largest redshift.
-        photometry : `~astropy.table.Table`
-            The catalogue of n objects.
-        redshift : str or array_like
-            One of its columns, or values.
-        flags : `~numpy.ndarray` of int, shape (n,)
-            Redshifts that cannot be used are flagged here.
-
-        Returns
-        -------
-        spaces : list of `Space`
-        """
+        """Copies with the redshift of every object, within ``limits``; what cannot be used is flagged."""
         values = known_redshifts(photometry, redshift)
         missing = np.isnan(values)
         low, high = limits
@@ -347,18 +330,9 @@ class Space:
 
     def with_densities(self, limits, redshift_prior, flags):
         """
-        Copies with the prior of redshift of every object.
+        Copies with the prior of redshift of every object (`read_density`), cut to ``limits``.
 
-        Parameters
-        ----------
-        limits, flags : object
-            As for `at_redshifts`; a prior that leaves nothing is flagged.
-        redshift_prior : tuple
-            Redshifts, shape (n_z,), and densities, shape (n_z,) or (n, n_z).
-
-        Returns
-        -------
-        spaces : list of `Space`
+        A prior that leaves nothing is flagged.
         """
         nodes, density = read_density(redshift_prior, len(flags))
         out = []
@@ -371,19 +345,7 @@ class Space:
         return out
 
     def values(self, points):
-        """
-        Parameters of points of the unit cube.
-
-        Parameters
-        ----------
-        points : `~numpy.ndarray`, shape (m, n_dim)
-            Points, in the order of ``free``.
-
-        Returns
-        -------
-        values : dict of str to `~numpy.ndarray`, shape (m,)
-            Of all parameters, fixed ones included.
-        """
+        """Parameters, fixed ones included, by name at points of the unit cube, shape (m, n_dim)."""
         out = {name: np.full(len(points), value) for name, value in self.fixed.items()}
         for i, (name, prior) in enumerate(self.free.items()):
             out[name] = prior.transform(points[:, i])
@@ -391,23 +353,7 @@ class Space:
 
 
 def prior_cells(prior, n):
-    """
-    Cells of an axis for a prior.
-
-    Parameters
-    ----------
-    prior : object
-        A prior of this module.
-    n : int
-        Number of cells, unless the prior has values of its own.
-
-    Returns
-    -------
-    nodes, weights : `~numpy.ndarray`, shape (n,)
-        Nodes of the cells and their prior.
-    bounds : tuple of float
-        Limits of the outermost cells.
-    """
+    """Nodes of n cells (or the prior's own values), their weights, and the limits of the outermost."""
     if isinstance(prior, Choice):
         return prior.values, prior.weights, (-np.inf, np.inf)
     if isinstance(prior, Table):
@@ -422,21 +368,9 @@ def prior_cells(prior, n):
 
 def redshift_axis(spaces, limits, n):
     """
-    Cells of redshift for objects that may each have a prior, or a redshift, of their own.
+    Cells of redshift (`prior_cells`) for objects that may have a prior, or a redshift, of their own.
 
-    Parameters
-    ----------
-    spaces : list of `Space`
-        Parameters of the objects.
-    limits : tuple of float
-        Least and largest redshift.
-    n : int
-        Number of cells.
-
-    Returns
-    -------
-    nodes, weights, bounds
-        As of `prior_cells`; the prior is the mean over the objects.
+    The weights are the mean prior of the objects.
     """
     free = [space.free["redshift"] for space in spaces if "redshift" in space.free]
     if not free:
