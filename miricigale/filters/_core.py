@@ -11,19 +11,7 @@ _LARGEST_RATIO = 1.05
 
 
 def refine(wave, throughput):
-    """
-    Add nodes on the straight pieces of a curve until none is wide.
-
-    Parameters
-    ----------
-    wave, throughput : `~numpy.ndarray`, shape (n,)
-        Ascending wavelengths and values.
-
-    Returns
-    -------
-    wave, throughput : `~numpy.ndarray`
-        The same piecewise-linear curve; neighbors differ by 5 % in wavelength at most.
-    """
+    """Add nodes on the straight pieces of a curve until neighbors differ by 5 % in wavelength at most."""
     ratio = np.log(wave[1:] / wave[:-1]) / np.log(_LARGEST_RATIO)
     if ratio.max() <= 1:
         return wave, throughput
@@ -50,21 +38,10 @@ def band_weights(wave, band_wave, throughput, norm):
     """
     Weights of the values at ``wave`` in the photon-counting mean over a band.
 
-    Parameters
-    ----------
-    wave : `~numpy.ndarray`, shape (n,)
-        Strictly ascending; values between them are taken as linear in wavelength.
-    band_wave, throughput : `~numpy.ndarray`, shape (m,)
-        Refined passband, zero at both ends.
-    norm : float
-        Its `photon_integral`.
-
-    Returns
-    -------
-    first : int
-        Index in ``wave`` of the first weight.
-    weights : `~numpy.ndarray`
-        Sum 1, or less by the share of the band that ``wave`` does not cover.
+    ``wave`` ascends, values between are linear in wavelength; ``band_wave`` and ``throughput`` are a
+    refined passband, zero at both ends, ``norm`` its `photon_integral`. Returned are the index in
+    ``wave`` of the first weight, and the weights: sum 1, or less by the share of the band that
+    ``wave`` does not cover.
     """
     low, high = max(band_wave[0], wave[0]), min(band_wave[-1], wave[-1])
     if not low < high:

@@ -44,21 +44,8 @@ def curve_folder():
 
 def read_curve(curve):
     """
-    Read a curve of astro-sedpy.
-
-    Parameters
-    ----------
-    curve : str
-        Its name there.
-
-    Returns
-    -------
-    wave : `~numpy.ndarray`
-        In um, strictly ascending.
-    throughput : `~numpy.ndarray`
-        Photon response; negative values (noise of the measurement) are set to 0.
-    n_negative : int
-        How many were.
+    Read a curve of astro-sedpy: wavelengths in um, ascending, photon response, and how many values
+    were negative (noise of the measurement) and are set to 0.
     """
     path = curve_folder() / f"{curve}.par"
     # the files are yanny tables; in some the rows lack the leading table name
@@ -100,15 +87,8 @@ def full_name(name):
     """
     Name in the library of a filter that may be written ``MIRI.F770W`` or ``F770W``.
 
-    Parameters
-    ----------
-    name : str
-        In upper or lower case, with its instrument or without where that leaves no choice.
-
-    Returns
-    -------
-    name : str
-        As it came if the library has nothing of the kind.
+    In upper or lower case, with its instrument or without where that leaves no choice; as it came
+    if the library has nothing of the kind.
     """
     lower = str(name).lower()
     found = [one for one in FILTERS.names() if lower in (one, one.partition(".")[2])]
@@ -116,14 +96,7 @@ def full_name(name):
 
 
 def load_curve(name):
-    """
-    Wavelengths, throughput and options of `Filter` of a filter of the library.
-
-    Raises
-    ------
-    KeyError
-        If there is no such filter.
-    """
+    """Wavelengths, throughput and options of `Filter` of a filter of the library."""
     if name.startswith(SEDPY):
         known = [path.stem for path in curve_folder().glob("*.par")]
         if name.removeprefix(SEDPY) not in known:

@@ -11,26 +11,9 @@ SOLAR_LUMINOSITY = 3.828e26  # W, IAU 2015
 
 def read_images(path, names, *, wanted):
     """
-    Read images of a FITS file.
+    Images of a FITS file by the names of their extensions: dict of read-only arrays of float.
 
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    names : iterable of str
-        Names of the extensions.
-    wanted : str
-        What the file should be, for the message.
-
-    Returns
-    -------
-    arrays : dict of str to `~numpy.ndarray` of float
-        Read-only, by the names that were asked for.
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If the file is something else.
+    What ``wanted`` says that the file should be stands in the `DataError` if it is something else.
     """
     try:
         with open_fits(path, wanted=wanted) as hdus:

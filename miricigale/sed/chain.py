@@ -271,25 +271,20 @@ class Chain:
 
     def attenuated(self, stars, keys, dust_keys=None, out=None):
         """
-        Starlight behind dust, with the light of that dust if it is asked for.
+        Starlight of n galaxies behind dust, and the power that dust took.
 
         Parameters
         ----------
         stars : sequence of `Stars`
-            Of n galaxies.
-        keys : sequence of tuple
-            Keys of ``attenuation``.
-        dust_keys : sequence of tuple, optional
-            Keys of ``dust``.
+        keys, dust_keys : sequence of tuple
+            Keys of ``attenuation``, and of ``dust`` if its light is to be added.
         out : `~numpy.ndarray`, shape (n, n_wave), optional
             To be filled.
 
         Returns
         -------
-        light : `~numpy.ndarray`, shape (n, n_wave)
-            L_lambda in W/um.
-        absorbed : `~numpy.ndarray`, shape (n,)
-            Power in W that dust took.
+        light, absorbed : `~numpy.ndarray`, shape (n, n_wave) and (n,)
+            L_lambda in W/um, and W.
         """
         n, none = len(stars), np.zeros((0, self.wave.size))
         some, star = distinct(stars)

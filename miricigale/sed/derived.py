@@ -83,21 +83,10 @@ def columns(model):
 
 def galaxy_quantities(stars, absorbed, sums):
     """
-    Derived quantities of galaxies, for one solar mass formed.
+    Derived quantities of n galaxies for one solar mass formed, in the units of `DERIVED`.
 
-    Parameters
-    ----------
-    stars : list of `~miricigale.sed.chain.Stars`
-        The n galaxies' stars.
-    absorbed : `~numpy.ndarray`, shape (n,)
-        Power that dust took, in W.
-    sums : `~numpy.ndarray`, shape (n, n_functional)
-        The galaxies' light times ``Chain.functionals``.
-
-    Returns
-    -------
-    values : dict of str to `~numpy.ndarray`, shape (n,)
-        In the units of `DERIVED`.
+    ``stars`` are their `~miricigale.sed.chain.Stars`, ``absorbed``, shape (n,), the power in W that dust took,
+    ``sums``, shape (n, n_functional), their light times ``Chain.functionals``.
     """
     n = len(_LOG_UV)
     visual, windows, bands = sums[:, 1], sums[:, 2 : 2 + n], sums[:, 2 + n :]
@@ -124,24 +113,11 @@ def galaxy_quantities(stars, absorbed, sums):
 
 def agn_quantities(definition, ratio, galaxy, seen):
     """
-    Derived quantities of nuclei, and the power that the fraction asks for.
+    Derived quantities of AGN, and ``ir_luminosity`` of galaxies with them: arrays of shape (n,).
 
-    Parameters
-    ----------
-    definition : {"dust", "3-1000um"}
-        What the fraction f refers to.
-    ratio : `~numpy.ndarray`, shape (n,)
-        f / (1 - f).
-    galaxy : dict of str to `~numpy.ndarray`, shape (n,)
-        From `galaxy_quantities`.
-    seen : dict of str to `~numpy.ndarray`, shape (n,)
-        For one watt of torus and polar emission: ``infrared``, ``luminosity``, ``six`` and
-        ``accretion``.
-
-    Returns
-    -------
-    values : dict of str to `~numpy.ndarray`, shape (n,)
-        Those of the AGN, and ``ir_luminosity`` of both.
+    ``definition`` says what the fraction f refers to, ``ratio`` is f / (1 - f), ``galaxy`` comes from
+    `galaxy_quantities`; ``seen`` holds, for one watt of torus and polar emission, ``infrared``,
+    ``luminosity``, ``six`` and ``accretion``.
     """
     dust, infrared = galaxy["dust_luminosity"], galaxy["ir_luminosity"]
     power = ratio * (dust if definition == "dust" else infrared / seen["infrared"])
@@ -164,22 +140,9 @@ def _fraction(part, whole):
 
 def scaled_quantities(model, values, mass, redshift, far, parameters):
     """
-    Derived quantities of galaxies of given masses.
+    Derived quantities of galaxies of given masses (Msun formed), from those for one solar mass.
 
-    Parameters
-    ----------
-    model : `~miricigale.sed.SEDModel`
-        The model.
-    values : dict of str to `~numpy.ndarray`, shape (n,)
-        For one solar mass formed.
-    mass, redshift, far : `~numpy.ndarray` or float
-        Mass formed in Msun, redshift, luminosity distance in m.
-    parameters : dict of str to `~numpy.ndarray` or float
-        Values of the parameters.
-
-    Returns
-    -------
-    values : dict of str to `~numpy.ndarray`, shape (n,)
+    ``far`` is the luminosity distance in m, ``parameters`` holds values of all parameters.
     """
     out = {
         name: values[name] * mass if entry.extensive else values[name]

@@ -24,24 +24,8 @@ _log = logging.getLogger(__name__)
 
 def grid_key(model, axes, filters):
     """
-    Checksum of everything that a grid depends on.
+    Checksum of everything that a grid depends on: components, data, cosmology, axes, curves of bands.
 
-    Parameters
-    ----------
-    model : `~miricigale.sed.SEDModel`
-        The model: components, their options and defaults, cosmology, definition.
-    axes : dict of str to `~numpy.ndarray`
-        The axes.
-    filters : `~miricigale.filters.FilterSet`
-        The bands, by their curves.
-
-    Returns
-    -------
-    key : str
-        Hexadecimal sha256.
-
-    Notes
-    -----
     Code is known by the versions that it states, ``Component.version`` of a component and its
     bases and ``VERSION`` of what all share: whoever changes numbers raises one of them.
     """
@@ -81,21 +65,8 @@ def _unchanged(model):
 
 def cached_grid(model, axes, filters, make):
     """
-    A grid from the cache folder, or a new one that is then kept there.
+    A grid from the cache folder, or one of ``make(model, axes, filters)`` that is then kept there.
 
-    Parameters
-    ----------
-    model, axes, filters
-        As for `grid_key`.
-    make : callable
-        ``make(model, axes, filters)`` makes the grid.
-
-    Returns
-    -------
-    grid : `~miricigale.sed.ModelGrid`
-
-    Notes
-    -----
     The least recently used grids go when all together are larger than
     ``miricigale.refdata.conf.grid_cache_size`` (MB; 0: nothing is kept). A cache that cannot be
     read or written is logged and done without: the grid is the same. Models with components from

@@ -133,7 +133,6 @@ def numbers(name):
     chain = SEDModel(chosen)
     values = {"age": 0.5, "redshift": 3.0}
     values |= {"frac_agn": 0.5} if chain.has_agn else {}
-    values |= {"ebv_galactic": 0.1} if cls.role == "foreground" else {}
     table = chain.fluxes({key: [value] for key, value in values.items()}, NUMBER_BANDS)
     skip = ("flags", "stellar_mass_formed")
     return [table[column][0] for column in table.colnames if column not in skip]

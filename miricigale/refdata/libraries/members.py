@@ -18,14 +18,7 @@ def is_archive(path):
 
 def members(path, accept):
     """
-    Read files of a folder, or of a zip or tar archive.
-
-    Parameters
-    ----------
-    path : `pathlib.Path`
-        The folder or archive.
-    accept : callable
-        Called with the name of a file, says whether it is wanted.
+    Files of a folder, or of a zip or tar archive, whose names ``accept`` takes.
 
     Yields
     ------
@@ -35,11 +28,6 @@ def members(path, accept):
         Its content.
     source : str
         Its place with that of the archive, for messages.
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If an archive is damaged, or unpacks to more than the bound.
     """
     if path.is_dir():
         for file in sorted(path.rglob("*")):

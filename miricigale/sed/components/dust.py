@@ -180,14 +180,11 @@ U_MAX = 1e6  # of the power law dM/dU ~ U^-2
 @cached_by_file(maxsize=2)
 def load_dl07(path):
     """
-    Read the bundled Draine & Li 2007 table.
+    Read the bundled Draine & Li 2007 table: dict of arrays.
 
-    Returns
-    -------
-    table : dict
-        ``wave`` (um), ``qpah`` (per cent), ``u`` and ``umin``; ``single`` (n_q, n_u, n_wave) and
-        ``powerlaw`` (n_q, n_umin, n_wave) in W/um with integral 1; ``single_power`` and
-        ``powerlaw_power``: power per dust mass in units of that at U = 1.
+    ``wave`` (um), ``qpah`` (per cent), ``u`` and ``umin``; ``single`` (n_q, n_u, n_wave) and
+    ``powerlaw`` (n_q, n_umin, n_wave) in W/um with integral 1; ``single_power`` and
+    ``powerlaw_power``: power per dust mass in units of that at U = 1.
     """
     names = ["wave", "qpah", "u", "umin", "single", "powerlaw", "single_power", "powerlaw_power"]
     return read_images(path, names, wanted="a Draine & Li table")

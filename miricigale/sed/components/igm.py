@@ -111,22 +111,9 @@ _COLUMNS = ("wavelength", "laf1", "laf2", "laf3", "dla1", "dla2")
 @cached_by_file(maxsize=2)
 def load_lines(path):
     """
-    Read the Lyman series of Inoue et al. 2014, table 2.
+    Read the Lyman series of Inoue et al. 2014, table 2, as `miricigale.sed._core.inoue_lines` gives it.
 
-    Parameters
-    ----------
-    path : str
-        A TOML file with the arrays ``wavelength`` (um), ``laf1`` to ``laf3``, ``dla1``, ``dla2``.
-
-    Returns
-    -------
-    lines : tuple of `~numpy.ndarray`
-        See `miricigale.sed._core.inoue_lines`; read-only.
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If it is another file, or columns are short, not positive or not in order.
+    A TOML file with the arrays ``wavelength`` (um), ``laf1`` to ``laf3``, ``dla1``, ``dla2``; others are refused.
     """
     try:
         columns = tomllib.loads(Path(path).read_text())

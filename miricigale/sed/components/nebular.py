@@ -100,23 +100,7 @@ class NebularTable:
 
 @cached_by_file(maxsize=2)
 def load_nebular(path):
-    """
-    Read a table that ``tools/make_nebular.py`` made.
-
-    Parameters
-    ----------
-    path : str
-        The file.
-
-    Returns
-    -------
-    table : `NebularTable`
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If the file is something else.
-    """
+    """Read a `NebularTable` that ``tools/make_nebular.py`` made; other files are refused."""
     wanted = "a table of nebular emission"
     names = ("metallicity", "log_u", "age", "wave", "continuum", "lines")
     images = [name.replace("_", "") for name in names]
