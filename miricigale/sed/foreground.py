@@ -105,7 +105,7 @@ def check_bands(filters, law, beyond="refuse"):
         raise argument_error("beyond", f"one of {', '.join(BEYOND)}", repr(beyond))
     low, high = coverage(law)
     out = []
-    for band in filters if isinstance(filters, FilterSet) else FilterSet(filters):
+    for band in FilterSet(filters):
         first, last = band.wave.value[[0, -1]]
         top = max(high, 1.01 * last) if beyond == "transparent" else high
         if first >= low and last <= top:
@@ -229,28 +229,15 @@ class GalacticExtinction(Foreground):
 
 def _color_excess(ebv):
     """Color excesses in mag as an array of one dimension, and whether it was one number."""
-    masked = np.ravel(getattr(ebv, "mask", False))
-    value = getattr(ebv, "unmasked", ebv)
-    value = value.data if isinstance(value, np.ma.MaskedArray) else value
-    unit = getattr(ebv, "unit", None)
-    try:
-        array = np.asarray(getattr(value, "value", value), dtype=float)
-        if unit is not None:
-            array = u.Quantity(array, unit).to_value(u.mag)
-    except (u.UnitConversionError, u.UnitTypeError):
-        msg = f"'ebv' must be convertible to mag, got {unit}"
-        raise u.UnitsError(msg) from None
-    except (TypeError, ValueError):
-        raise argument_error("ebv", "numbers in mag", repr(ebv)) from None
-    if array.ndim > 1:
-        raise argument_error("ebv", "one number or one for each row", f"shape {array.shape}")
-    flat = np.atleast_1d(array)
-    wrong = np.flatnonzero(masked | ~(np.isfinite(flat) & (flat >= 0)))
+    if np.ndim(ebv) > 1:
+        raise argument_error("ebv", "one number or one for each row", f"shape {np.shape(ebv)}")
+    flat = GalacticExtinction.ebv_galactic.replace(0.0, name="ebv").array(ebv)
+    wrong = np.flatnonzero(~(np.isfinite(flat) & (flat >= 0)))
     if wrong.size:
         some = ", ".join(map(str, wrong[:10])) + (", ..." if wrong.size > 10 else "")
         got = f"something else in {wrong.size} of {flat.size} rows: {some}"
         raise argument_error("ebv", "finite and not negative", got)
-    return flat, array.ndim == 0
+    return flat, np.ndim(ebv) == 0
 
 
 def _band_grid(band, low, high, sed):
@@ -312,7 +299,7 @@ def band_extinction(filters, ebv, *, law="G23", r_v=3.1, sed=None, beyond="refus
     >>> table["acs.f606w"].round(3), table["miri.f770w"].round(4)
     (<Quantity [0.029] mag>, <Quantity [0.0009] mag>)
     """
-    bands = filters if isinstance(filters, FilterSet) else FilterSet(filters)
+    bands = FilterSet(filters)
     values, _ = _color_excess(ebv)
     check_bands(bands, law, beyond)
     low, high = coverage(law)
@@ -365,7 +352,7 @@ def deredden(photometry, ebv, filters, *, law="G23", r_v=3.1, sed=None, beyond="
     `~astropy.units.UnitsError`
         If a flux or an error is in magnitudes or in no unit.
     """
-    bands = filters if isinstance(filters, FilterSet) else FilterSet(filters)
+    bands = FilterSet(filters)
     if not isinstance(photometry, Table):
         raise argument_error("photometry", "a table", type(photometry).__name__)
     if _KEY in photometry.meta:

@@ -55,10 +55,10 @@ class Parameter:
         msg = f"parameter {self.name!r} is set when the component is made"
         raise AttributeError(msg)
 
-    def replace(self, default):
-        """Copy with another default."""
+    def replace(self, default, name=None):
+        """Copy with another default, and another name if one is given."""
         new = Parameter(default=default, bounds=self.bounds, doc=self.doc, unit=self.unit)
-        new.name = self.name
+        new.name = name or self.name
         return new
 
     def contains(self, value):

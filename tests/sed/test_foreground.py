@@ -234,7 +234,7 @@ def test_band_extinction_of_a_component():
         (MaskedColumn([0.1, 0.2], mask=[1, 0], unit="mag"), "in 1 of 2 rows: 0"),
         (Masked([0.1, 0.2] * u.mag, mask=[0, 1]), "in 1 of 2 rows: 1"),
         (np.full((2, 2), 0.1), "one number or one for each row"),
-        ("much", "numbers in mag"),
+        ("much", "'ebv' must be numbers, got values of type"),
     ],
 )
 def test_bad_color_excess(ebv, match):
