@@ -18,22 +18,13 @@ _SAMPLES, _SIZE = 4, 91
 
 def extraction_map(share, boxes):
     """
-    Weight of the detector's pixels in the flux that is fitted on a mosaic.
+    Weight of the detector's pixels in the flux that is fitted on a mosaic, shape (n, n).
 
-    A template fitted with equal weights to a mosaic that is the exposures smeared with K counts each
-    detector pixel with P * K * K, where P is the PSF; without K that is the optimal extraction.
-
-    Parameters
-    ----------
-    share : `~numpy.ndarray`, shape (n, n)
-        Light of a detector's pixel whose middle is there, sampled ``_SAMPLES`` times a side.
-    boxes : sequence of float
-        Widths in detector pixels of the squares that K is the convolution of.
-
-    Returns
-    -------
-    weight : `~numpy.ndarray`, shape (n, n)
-        Such that every lattice of pixels finds unit flux in the mean.
+    ``share`` (n, n) is the light of a detector's pixel whose middle is there, sampled
+    ``_SAMPLES`` times a side. A template fitted with equal weights to a mosaic that is the
+    exposures smeared with K counts each detector pixel with P * K * K, where P is the PSF;
+    without K that is the optimal extraction. K is the convolution of squares of the widths
+    ``boxes`` in detector pixels. Every lattice of pixels finds unit flux in the mean.
     """
     n = share.shape[0]
     period = scipy.fft.next_fast_len(n + 8 * _SAMPLES, True)

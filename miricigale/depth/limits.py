@@ -23,21 +23,11 @@ _PHASES = (np.arange(4) + 0.5) / 4 - 0.5
 
 def extraction_weights(radius, annulus=None, *, offset=(0.0, 0.0)):
     """
-    Weight of each pixel in the flux: aperture less the sky of the annulus.
+    Weight of each pixel, (n, n) with n odd, in the flux: aperture less the sky of the annulus.
 
-    Parameters
-    ----------
-    radius : float
-        Of the aperture, pixels.
-    annulus : tuple of float or None, optional
-        Inner and outer radius in pixels; None if the sky is known.
-    offset : tuple of float, optional
-        Of the center from that of the middle pixel, x, y.
-
-    Returns
-    -------
-    weights : `~numpy.ndarray`, shape (n, n), n odd
-        Overlap of pixel and circle; in the annulus minus the ratio of the areas.
+    Overlap of pixel and circle, and in the annulus minus the ratio of the areas. Radii are in
+    pixels; ``annulus`` is None if the sky is known, ``offset`` that of the center from the middle
+    pixel's, x, y.
     """
     half = int(np.ceil(max(radius, *(annulus or (0.0,))))) + 2
     center = (half + offset[0], half + offset[1])
@@ -158,7 +148,8 @@ def sensitivity(filter, time=1e4 * u.s, **options):
     >>> from miricigale.depth import sensitivity
     >>> print(f"{sensitivity('miri.f1000w'):.2f}, {sensitivity('miri.f1000w', residual='etc'):.2f}")
     0.32 uJy, 0.47 uJy
-    >>> print(f"{sensitivity('miri.f1000w', 1665 * u.s, n_sigma=5, residual='etc', n_dithers=3):.2f}")
+    >>> short = {"n_sigma": 5, "residual": "etc", "n_dithers": 3}
+    >>> print(f"{sensitivity('miri.f1000w', 1665 * u.s, **short):.2f}")
     0.41 uJy
     """
     return aperture_noise(filter, time, **options)["flux"] * u.uJy
@@ -189,10 +180,11 @@ def aperture_noise(
     Returns
     -------
     values : dict
-        ``flux`` and, without the pattern, ``flux_white``; within the extraction the standard deviations
-        ``white`` of photons and read noise and ``residual`` of the pattern, ``pattern``, that of a
-        pattern of amplitude 1, and ``shot``, the variance for each uJy of the source (all uJy); ``light``,
-        the share of the source in it; ``radius`` (arcsec) and ``background`` (MJy/sr).
+        ``flux`` and, without the pattern, ``flux_white``; within the extraction the standard
+        deviations ``white`` of photons and read noise and ``residual`` of the pattern,
+        ``pattern``, that of a pattern of amplitude 1, and ``shot``, the variance for each uJy of
+        the source (all uJy); ``light``, the share of the source in it; ``radius`` (arcsec) and
+        ``background`` (MJy/sr).
     """
     setup = etc_setup(filter)
     filter = setup.filter  # with the instrument's name, if that was left out

@@ -113,26 +113,11 @@ class ExposureNoise:
 
 def ramp_variance(rate, *, n_groups, group_time, read_noise):
     """
-    Variance of the optimally weighted slope of one ramp.
+    Variance of the optimally weighted slope of one ramp, (electrons per second) squared.
 
-    The differences of groups have Poisson variance on the diagonal and share the read
-    noise with their neighbors; the best slope has the variance 1 / (1^T C^-1 1).
-
-    Parameters
-    ----------
-    rate : float
-        Electrons per second.
-    n_groups : int
-        Groups, at least 2.
-    group_time : float
-        In s.
-    read_noise : float
-        Of one group, electrons.
-
-    Returns
-    -------
-    variance : float
-        (Electrons per second) squared.
+    The differences of groups have Poisson variance on the diagonal (``rate`` in electrons per
+    second times ``group_time`` in s) and share the ``read_noise`` (electrons) with their
+    neighbors; the best slope has the variance 1 / (1^T C^-1 1).
     """
     if rate == 0 and read_noise == 0:
         return 0.0
@@ -145,20 +130,10 @@ def ramp_variance(rate, *, n_groups, group_time, read_noise):
 
 def noise_power(weights, correlation=None):
     """
-    Variance of a weighted sum of pixels of unit variance.
+    Variance of a weighted sum of pixels of unit variance: the sum of w_i w_j rho_ij.
 
-    Parameters
-    ----------
-    weights : `~numpy.ndarray`, shape (ny, nx)
-        Weights.
-    correlation : float or None, optional
-        Gaussian width in pixels with which white noise was smoothed (and brought back to
-        unit variance); None or 0 for white noise.
-
-    Returns
-    -------
-    power : float
-        Sum of w_i w_j rho_ij.
+    ``correlation`` is the Gaussian width in pixels with which white noise was smoothed (and brought
+    back to unit variance); None or 0 for white noise.
     """
     if not correlation:
         return float(np.sum(weights**2))

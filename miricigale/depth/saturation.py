@@ -178,21 +178,9 @@ def saturation_group(rate, limit, step):
     """
     Group, from 1, by which a constant rate fills the well: the ceiling of limit / (rate step).
 
-    Non-linearity plays no part in it: the well is one of charge, before the response.
-
-    Parameters
-    ----------
-    rate : array_like
-        Electrons per second.
-    limit : float
-        The well in electrons.
-    step : float
-        Time of a group in s.
-
-    Returns
-    -------
-    group : `~numpy.ndarray` of int
-        At least 1; `NEVER` where nothing fills it.
+    ``rate`` is in electrons per second, ``limit`` the well in electrons, ``step`` the time of a
+    group in s; `NEVER` where nothing fills it. Non-linearity plays no part: the well is one of
+    charge.
     """
     rate = np.asarray(rate, float)
     with np.errstate(divide="ignore", invalid="ignore"):

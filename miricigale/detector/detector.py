@@ -63,8 +63,8 @@ class Detector:
     Raises
     ------
     ValueError
-        If an effect is none, one is not in its place, or there is not one Photons, or no ADConversion
-        at the end.
+        If an effect is none, one is not in its place, or there is not one Photons, or no
+        ADConversion at the end.
 
     Examples
     --------
@@ -300,9 +300,9 @@ class Detector:
         """
         Say what an exposure will saturate, without simulating it.
 
-        The mean rate of charge of every pixel is what the effects make of the light (flat
-        field, dark current, interpixel capacitance where it acts); noise, cosmic rays and
-        latent images are left out. It is constant, so that a pixel is full in group ceil(well / (rate x group
+        The mean rate of charge of every pixel is what the effects make of the light (flat field,
+        dark current, interpixel capacitance where it acts); noise, cosmic rays and latent images
+        are left out. It is constant, so that a pixel is full in group ceil(well / (rate x group
         time)). The well is that of `Saturation`, or the charge at which the converter ends.
 
         Parameters

@@ -18,19 +18,7 @@ _PLACE = 0.1
 
 def checked_light(image, exposure):
     """
-    Surface brightness of an image, if the exposure can be one of it.
-
-    Parameters
-    ----------
-    image : `~astropy.nddata.CCDData` or `~astropy.units.Quantity`
-        As for `Detector.expose`.
-    exposure : `~miricigale.instrument.Exposure`
-        How it is exposed.
-
-    Returns
-    -------
-    light : `~numpy.ndarray`, shape (ny, nx)
-        In MJy/sr, nowhere negative.
+    Surface brightness of an image in MJy/sr, (ny, nx), nowhere negative.
 
     Raises
     ------
@@ -39,8 +27,8 @@ def checked_light(image, exposure):
     `~astropy.units.UnitsError`
         If that is none of surface brightness.
     ValueError
-        If the image has another shape, filter or place on the sky, masked pixels, or values
-        that are not finite or that are negative.
+        If the image has another shape, filter or place on the sky than the exposure, masked
+        pixels, or values that are not finite or that are negative.
     """
     if not isinstance(exposure, Exposure):
         raise argument_error("exposure", "an Exposure", type(exposure).__name__)

@@ -41,21 +41,10 @@ _REFERENCE = np.uint32(DQ.REFERENCE_PIXEL | DQ.NON_SCIENCE)
 
 def header(exposure, *, filename="", start=None):
     """
-    Headers of a level-1b file.
+    Headers of the primary and the SCI extension of a file (without the structural keywords).
 
-    Parameters
-    ----------
-    exposure : `~miricigale.instrument.Exposure`
-        What was exposed.
-    filename : str, optional
-        For the keyword FILENAME.
-    start : `~astropy.time.Time`, optional
-        When it began; 2022-06-21 plus an hour for each dither if not given.
-
-    Returns
-    -------
-    primary, science : `~astropy.io.fits.Header`
-        Of the primary and the SCI extension (without the structural keywords).
+    ``start`` is the `~astropy.time.Time` when the exposure began; 2022-06-21 plus an hour for each
+    dither if not given.
     """
     if start is None:
         start = Time(_START, scale="utc") + TimeDelta(exposure.dither * 3600.0, format="sec")
@@ -169,34 +158,7 @@ def header(exposure, *, filename="", start=None):
 
 
 def write(path, ramp, *, start=None, filename=None, overwrite=False):
-    """
-    Write a level-1b file.
-
-    Parameters
-    ----------
-    path : path-like
-        The file; it appears under its name only when it is complete.
-    ramp : `~miricigale.detector.Ramp`
-        Its flags of pixels go to an extension of our own, ``SIM_PIXELDQ``, its effects and meta
-        dictionary as JSON to ``SIM_META``.
-    start : `~astropy.time.Time`, optional
-        See `header`.
-    filename : str, optional
-        For the keyword FILENAME; that of ``path`` if not given.
-    overwrite : bool, optional
-        Whether an existing file is replaced.
-
-    Returns
-    -------
-    path : `pathlib.Path`
-
-    Raises
-    ------
-    OSError
-        If the file exists and ``overwrite`` is False.
-    ValueError
-        If the data are not counts (uint16).
-    """
+    """Write a level-1b file: see `~miricigale.detector.Ramp.write`."""
     if ramp.data.dtype != np.uint16:
         raise argument_error("data", "counts (uint16) to be written", ramp.data.dtype)
     options = {"start": start, "filename": filename, "overwrite": overwrite}
@@ -303,8 +265,8 @@ def read(path):
     -------
     values : dict
         Arguments of `~miricigale.detector.Ramp`. The exposure is made from the keywords, its
-        counts from the data; a dither is the position number in the pattern, from 0. In a file that is
-        not ours the reference pixels alone are flagged, and it is not known what acted.
+        counts from the data; a dither is the position number in the pattern, from 0. In a file
+        that is not ours the reference pixels alone are flagged, and it is not known what acted.
 
     Raises
     ------
@@ -359,7 +321,8 @@ def _read(path, hdus):
         dither=int(keyword("PATT_NUM", 1)) - 1,
     )
     if data.shape[2:] != exposure.shape:
-        msg = f"{path} must have {exposure.shape} pixels for {exposure.subarray}, got {data.shape[2:]}"
+        wanted = f"{exposure.shape} pixels for {exposure.subarray}"
+        msg = f"{path} must have {wanted}, got {data.shape[2:]}"
         raise DataError(msg)
     values = {"data": data, "exposure": exposure}
     values["meta"] = {"origin": primary.get("ORIGIN", "unknown"), "filename": path.name}

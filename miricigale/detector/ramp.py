@@ -185,8 +185,8 @@ class Ramp(NDData):
 
         Notes
         -----
-        Level 1b holds no flags. Those of pixels, and the effects with the meta dictionary, stand in two
-        extensions of our own (``SIM_PIXELDQ``, ``SIM_META``) that the official pipeline
+        Level 1b holds no flags. Those of pixels, and the effects with the meta dictionary, stand
+        in two extensions of our own (``SIM_PIXELDQ``, ``SIM_META``) that the official pipeline
         passes over; those of groups are not written.
         """
         return level1b.write(path, self, start=start, filename=filename, overwrite=overwrite)

@@ -117,7 +117,7 @@ def _sip(subarray):
 
 
 def _rotate(angle):
-    """Tangent plane (east, north) coordinates when its axes turn by ``angle`` (deg) east of north."""
+    """Tangent plane (east, north) coordinates, axes turned by ``angle`` (deg) east of north."""
     cos, sin = np.cos(np.radians(angle)), np.sin(np.radians(angle))
     return np.array([[cos, sin], [-sin, cos]])
 

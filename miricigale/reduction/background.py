@@ -85,8 +85,11 @@ def estimate_background(image, *, box=32, filter_size=3, threshold=3.0, grow=3, 
     clipped as Source Extractor does it (mode estimate).
     """
     for name, value, least in (
-        ("box", box, 4), ("filter_size", filter_size, 1), ("grow", grow, 0), ("iterations", iterations, 0)
-    ):  # fmt: skip
+        ("box", box, 4),
+        ("filter_size", filter_size, 1),
+        ("grow", grow, 0),
+        ("iterations", iterations, 0),
+    ):
         if value < least:
             raise argument_error(name, f"at least {least}", value)
     if not threshold > 0:

@@ -55,14 +55,7 @@ def plain_flags(image):
 
 
 def sigma(image, name="image"):
-    """
-    Standard deviation of each pixel as an array.
-
-    Raises
-    ------
-    ValueError
-        If the image has no uncertainty.
-    """
+    """Standard deviation of each pixel as an array; an image without uncertainty is refused."""
     if image.uncertainty is None:
         raise argument_error(name, "an image with an uncertainty", "one without")
     uncertainty = image.uncertainty
@@ -73,24 +66,9 @@ def sigma(image, name="image"):
 
 def with_data(source, data, *, factor=None, unit=None, **meta):
     """
-    Copy an image with other data.
+    Copy an image with other data, its uncertainty multiplied by ``factor``, in another ``unit``.
 
-    Parameters
-    ----------
-    source : `~astropy.nddata.CCDData`
-        Gives everything else.
-    data : `~numpy.ndarray`
-        The new data.
-    factor : float or `~numpy.ndarray`, optional
-        Multiplies the uncertainty.
-    unit : `~astropy.units.Unit`, optional
-        The new unit.
-    **meta
-        Added to the meta dictionary.
-
-    Returns
-    -------
-    image : `~astropy.nddata.CCDData`
+    Further keywords are added to the meta dictionary.
     """
     uncertainty = None
     if source.uncertainty is not None:

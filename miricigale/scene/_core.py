@@ -46,19 +46,12 @@ class Landing(NamedTuple):
     """
     Which part of the light deposited on a node lands on the image.
 
-    Parameters
-    ----------
-    sums : array, shape (n_psfs, oversampling, oversampling, 2 L + 2, 2 L + 2)
-        Cumulative sums of each PSF's coefficients, one table for each sub-pixel phase.
-    low_y, high_y, low_x, high_x : array of int
-        For each row or column of nodes the range in ``sums`` that lies on the image.
-    oversampling : int
-    order : array of int, shape (n_y, n_x)
-        The PSFs on their rectangular grid over the field.
-    k_y, k_x : array of int
-        For each row or column of nodes the place on that grid below it,
-    t_y, t_x : array
-        and the weight of the next place.
+    ``sums``, shape (n_psfs, oversampling, oversampling, 2 L + 2, 2 L + 2), are cumulative sums of
+    each PSF's coefficients, one table for each sub-pixel phase; ``low_y`` to ``high_x`` give for
+    each row or column of nodes the range in them that lies on the image. ``order`` (n_y, n_x)
+    holds the PSFs on their rectangular grid over the field; ``k_y``, ``k_x`` are for each row or
+    column of nodes the place on that grid below it, ``t_y``, ``t_x`` the weight of the next
+    place.
     """
 
     sums: np.ndarray
@@ -120,22 +113,10 @@ def _alike(land, i, k):
 @njit(cache=True, nogil=True)
 def point_nodes(x, y, flux, land):
     """
-    The nodes on which the light of points is deposited.
+    The nodes on which the light of points is deposited; ``x``, ``y`` in nodes.
 
-    Parameters
-    ----------
-    x, y, flux : array, shape (N,)
-        Positions in nodes and light.
-    land : `Landing`
-
-    Returns
-    -------
-    i, j : array of int, shape (n,)
-        Row and column of each node of the grid that gets light.
-    light : array, shape (n,)
-        The light that it gets.
-    landed : array, shape (N,)
-        Light of each point that lands on the image.
+    Returns row, column and light of each node that gets any, and the light of each point that lands
+    on the image.
     """
     ny, nx = land.low_y.size, land.low_x.size
     rows, columns = np.empty(16 * x.size, np.int64), np.empty(16 * x.size, np.int64)
@@ -185,16 +166,7 @@ def _deposit(part, y, x, light, wy, wx):
 
 @njit(cache=True, nogil=True)
 def deposit_pieces(part, x, y, light):
-    """
-    Put the pieces of one source on a grid of its own.
-
-    Parameters
-    ----------
-    part : array, shape (ny, nx)
-        Light on the nodes, changed in place; what falls beside it is lost.
-    x, y, light : array, shape (N,)
-        Positions in nodes and light.
-    """
+    """Put pieces at ``x``, ``y`` (nodes) on a grid of their own; what falls beside it is lost."""
     wy, wx = np.empty(4), np.empty(4)
     for k in range(x.size):
         _deposit(part, y[k], x[k], light[k], wy, wx)
@@ -230,20 +202,10 @@ def fill_cusp(part, i0, j0, n_x, par, table, w_zone):
     """
     Put the inner part of a Sersic profile on a grid of its own, in small cells.
 
-    Parameters
-    ----------
-    part : array, shape (ny, nx)
-        Light on the nodes, changed in place.
-    i0, j0 : int
-        Row and column of its first node on the whole grid.
-    n_x : int
-        Columns of the whole grid.
-    par : array, shape (13,)
-        Parameters of the profile in nodes.
-    table : array, shape (5, TABLE_SIZE)
-        Its enclosed light.
-    w_zone : float
-        Squared elliptical radius (in half-light radii) that is done here.
+    The grid ``part`` begins at row ``i0`` and column ``j0`` of the whole one, which has ``n_x``
+    columns. ``par`` (13,) are the parameters of the profile in nodes, ``table`` (5, TABLE_SIZE)
+    its enclosed light; ``w_zone`` is the squared elliptical radius (half-light radii) that is
+    done here.
     """
     size = 1.0 / SUB
     wy, wx, out = np.empty(4), np.empty(4), np.empty(3)
@@ -340,27 +302,13 @@ def _add_smooth(row, share, par, dy, first, last):
 @njit(cache=True, nogil=True)
 def fill_outskirts(grid, start, stop, rows, tables, w_zone, w_smooth, w_cut, land, landed):
     """
-    Add the outer parts of Sersic profiles to some rows: one cell for each node, then the smooth part.
+    Add the outer parts of Sersic profiles to the rows ``start`` to ``stop`` of a grid, in place.
 
-    Parameters
-    ----------
-    grid : array, shape (ny, nx)
-        Light on the nodes, changed in place in the rows ``start`` to ``stop`` only.
-    start, stop : int
-        Rows that are done here.
-    rows : array, shape (N, 13)
-        Parameters of the profiles in nodes.
-    tables : array, shape (N, 5, TABLE_SIZE)
-        Their enclosed light.
-    w_zone : array, shape (N,)
-        Squared elliptical radius up to which `fill_cusp` does them.
-    w_smooth : array, shape (N,)
-        Squared elliptical radius from which the profiles are smooth (``deposit.smooth_from``).
-    w_cut : array, shape (N,)
-        Squared elliptical radius at which the profiles end.
-    land : `Landing`
-    landed : array, shape (N,)
-        Light of these rows that lands on the image, overwritten.
+    One cell for each node, then the smooth part. ``rows`` (N, 13) are the parameters of the
+    profiles in nodes, ``tables`` (N, 5, TABLE_SIZE) their enclosed light. Squared elliptical
+    radii, all (N,): up to ``w_zone`` `fill_cusp` does them, from ``w_smooth``
+    (``deposit.smooth_from``) they are smooth, at ``w_cut`` they end. ``landed`` (N,) is set to
+    the light of these rows that lands on the image.
     """
     ny, nx = grid.shape
     light, shift_x, shift_y = np.empty(nx + 5), np.empty(nx + 5), np.empty(nx + 5)

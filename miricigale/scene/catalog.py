@@ -106,8 +106,8 @@ def check_catalog(table, *, filters=(), argument="catalog"):
     Raises
     ------
     ValueError
-        If a column is missing, ``star`` is not bool, an id is there twice, a position is not finite, a profile
-        has an unknown name or there are no rows.
+        If a column is missing, ``star`` is not bool, an id is there twice, a position is not
+        finite, a profile has an unknown name or there are no rows.
     `~astropy.units.UnitsError`
         If a column has no unit or a wrong one; a column called by a filter must be a flux.
     """

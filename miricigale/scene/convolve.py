@@ -23,14 +23,8 @@ class Places:
     """
     Places of PSFs along one axis of the image: linear between them, constant beyond.
 
-    Parameters
-    ----------
-    at : array_like, shape (n,)
-        Sorted places in pixels.
-    n_pixels, margin : int
-        Pixels of the image, and those painted beyond each edge.
-    oversampling : int
-        Nodes per pixel.
+    ``at`` are sorted places in pixels; the image has ``n_pixels`` and is painted ``margin`` pixels
+    beyond each edge, with ``oversampling`` nodes per pixel.
     """
 
     def __init__(self, at, *, n_pixels, margin, oversampling):
@@ -50,17 +44,10 @@ class Places:
 
     def tiles(self):
         """
-        Stretches of nodes over which the weights are linear.
+        Yield stretches of nodes over which the weights are linear.
 
-        Yields
-        ------
-        first, stop : int
-            Nodes.
-        below : int
-            The place below.
-        origin, length : float
-            Its pixel and the distance of the next place; the length is infinite where the
-            weights are constant.
+        Each is its first and last (excluded) node, the place below, that one's pixel and the
+        distance of the next place, infinite where the weights are constant.
         """
         edges = np.ceil((self._at + self._margin) * self._oversampling - 1e-9)
         edges = np.clip(np.append(np.append(0, edges), self._n_nodes), 0, self._n_nodes).astype(int)
@@ -105,19 +92,9 @@ def phases(data, origin, oversampling):
     """
     Cubic spline coefficients of a PSF by sub-pixel phase.
 
-    Parameters
-    ----------
-    data : `~numpy.ndarray`, shape (ny, nx)
-        Values on the nodes.
-    origin : tuple of int
-        The node x, y that is its center.
-    oversampling : int
-        Nodes per pixel.
-
-    Returns
-    -------
-    phases : `~numpy.ndarray`, shape (oversampling, oversampling, 2 L + 1, 2 L + 1)
-        Coefficients at the offsets of whole pixels less ``a`` and ``b`` nodes in y and x.
+    ``data`` are its values on the nodes, ``origin`` the node x, y of its center. Shape of the
+    result: (oversampling, oversampling, 2 L + 1, 2 L + 1), coefficients at the offsets of whole
+    pixels less ``a`` and ``b`` nodes in y and x.
     """
     os_, (cx, cy) = oversampling, origin
     # room for the splines to die out
@@ -137,19 +114,10 @@ def phases(data, origin, oversampling):
 
 def add_nodes(image, i, j, light, phases, *, margin):
     """
-    Add the light of single nodes: what `convolve` does with one PSF, which takes as long for one
-    node as for all.
+    Add the light of single nodes (row i, column j) to an image, in place.
 
-    Parameters
-    ----------
-    image : `~numpy.ndarray`, shape (ny, nx)
-        Light in each pixel, changed in place.
-    i, j, light : `~numpy.ndarray`, shape (n,)
-        Row and column of each node, and its light.
-    phases : `~numpy.ndarray`, shape (oversampling, oversampling, 2 L + 1, 2 L + 1)
-        Coefficients of the PSF (`phases`).
-    margin : int
-        Pixels beyond each edge that have nodes.
+    It is what `convolve` does with one PSF of these `phases`, which takes as long for one node as
+    for all.
     """
     os_, half = phases.shape[0], phases.shape[-1] // 2
     for row, column, value in zip(i, j, light, strict=True):
@@ -200,14 +168,8 @@ def convolve(grid, data, order, rows, columns, *, origin, margin, oversampling, 
         The PSFs on their rectangular grid.
     rows, columns : `Places`
         Where the grid's rows and columns stand.
-    origin : tuple of int
-        The node x, y of each PSF that is its center.
-    margin : int
-        Pixels beyond each edge.
-    oversampling : int
-        Nodes per pixel.
-    n_threads : int, optional
-        Threads of the Fourier transforms; as many as there are processors if not given.
+    origin, margin, oversampling, n_threads : optional
+        As of `phases`, `Places` and `~miricigale.utils.parallel.thread_count`.
 
     Returns
     -------

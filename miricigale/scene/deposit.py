@@ -24,17 +24,9 @@ SLOPE_ALONG, SLOPE_ACROSS = 0.075, 0.12
 
 def smooth_from(rows, w_zone, w_cut):
     """
-    Where profiles are smooth enough for ``_core._add_smooth``.
+    Squared elliptical radius (N,) beyond which profiles are smooth for ``_core._add_smooth``.
 
-    Parameters
-    ----------
-    rows, w_zone, w_cut
-        As in ``_core.fill_outskirts``.
-
-    Returns
-    -------
-    w_smooth : array, shape (N,)
-        Squared elliptical radius beyond which they are; infinite where they never are.
+    Infinite where they never are; parameters as of ``_core.fill_outskirts``.
     """
     a, b, c, power, bn = rows[:, 8:].T
     # the steepest direction, across the major axis
@@ -54,21 +46,9 @@ def smooth_from(rows, w_zone, w_cut):
 
 def deposit_profiles(grid, rows, tables, w_zone, w_smooth, w_cut, land, *, n_threads=None):
     """
-    Put Sersic profiles on the grid.
+    Put Sersic profiles on the grid, in place, and return the light of each that lands on the image.
 
-    Parameters
-    ----------
-    grid : `~numpy.ndarray`, shape (ny, nx)
-        Light on the nodes, changed in place.
-    rows, tables, w_zone, w_smooth, w_cut, land
-        As in ``_core.fill_outskirts``.
-    n_threads : int, optional
-        Threads; as many as there are processors if not given. The result does not depend on it.
-
-    Returns
-    -------
-    landed : `~numpy.ndarray`, shape (N,)
-        Light of each source that lands on the image.
+    Parameters are those of ``_core.fill_outskirts``.
     """
     with threads(n_threads) as executor:
         landed = _outskirts(grid, rows, tables, w_zone, w_smooth, w_cut, land, executor)

@@ -334,8 +334,9 @@ class Scene:
         What is in the image, one row for each row of the catalog.
 
         A `~astropy.table.QTable` with ``id``, ``sky``, ``x``, ``y`` (pixels), ``profile`` as
-        painted, ``flux_total``, ``flux_agn`` (of it), ``flux_in_image`` and ``flags`` (`SceneFlags`).
-        Its meta has ``cutout_pixels_filled``, by id, where stamps have pixels that were filled in.
+        painted, ``flux_total``, ``flux_agn`` (of it), ``flux_in_image`` and ``flags``
+        (`SceneFlags`). Its meta has ``cutout_pixels_filled``, by id, where stamps have pixels
+        that were filled in.
         """
         return self._painted[1].copy()
 

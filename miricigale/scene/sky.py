@@ -7,19 +7,9 @@ __all__ = ["local_jacobian", "pixel_positions"]
 
 def local_jacobian(wcs, x, y):
     """
-    Local linear map from the sky to the pixels.
+    Local linear map from the sky to the pixels at positions ``x``, ``y``, (N,).
 
-    Parameters
-    ----------
-    wcs : `~astropy.wcs.WCS`
-        World coordinates, distorted or not.
-    x, y : `~numpy.ndarray`, shape (N,)
-        Pixel positions.
-
-    Returns
-    -------
-    jacobian : `~numpy.ndarray`, shape (N, 2, 2)
-        Pixels per arcsec: ``[dx, dy] = jacobian @ [east, north]``.
+    Shape (N, 2, 2), in pixels per arcsec: ``[dx, dy] = jacobian @ [east, north]``.
     """
 
     def world(dx, dy):
@@ -36,23 +26,10 @@ def local_jacobian(wcs, x, y):
 
 def pixel_positions(wcs, sky, shape):
     """
-    Pixel positions, by the distortion where it is defined and linear far from the image.
+    Pixels of a SkyCoord, by the distortion where it is defined and linear far from the image.
 
-    Parameters
-    ----------
-    wcs : `~astropy.wcs.WCS`
-        World coordinates.
-    sky : `~astropy.coordinates.SkyCoord`, shape (N,)
-        Positions.
-    shape : tuple of int
-        ``(ny, nx)`` of the image.
-
-    Returns
-    -------
-    x, y : `~numpy.ndarray`, shape (N,)
-        Pixels; NaN on the other side of the sky.
-    near : `~numpy.ndarray` of bool, shape (N,)
-        Within half an image of the image.
+    Returns x, y (NaN on the other side of the sky), and which of them lie within half an image of
+    the image, whose ``shape`` is (ny, nx).
     """
     ny, nx = shape
     ra, dec = sky.icrs.ra.deg, sky.icrs.dec.deg

@@ -28,20 +28,7 @@ _MEAN_MAX = 1e9
 
 @njit(cache=True, nogil=True)
 def add_poisson(ramp, mean, key, first_row):
-    """
-    Add charge that arrives at random, accumulating over the groups of an integration.
-
-    Parameters
-    ----------
-    ramp : `~numpy.ndarray` of float32, shape (n_int, n_group, n_row, n_col)
-        Accumulated charge (electrons); added to in place.
-    mean : `~numpy.ndarray` of float64, shape (n_row, n_col)
-        Expected electrons per group; at most 1e9 is drawn.
-    key : `~numpy.ndarray` of uint64, shape (4,)
-        Key words of the streams.
-    first_row : int
-        Detector row of the first row.
-    """
+    """Add charge that arrives at random: ``mean`` electrons per group, (n_row, n_col)."""
     n_int, n_group, n_row, n_col = ramp.shape
     state = np.empty(4, np.uint64)
     columns = np.empty(n_col, np.int64)
@@ -114,20 +101,10 @@ def add_poisson(ramp, mean, key, first_row):
 @njit(cache=True, nogil=True)
 def add_latent(ramp, rates, released, key, first_row):
     """
-    Add charge that earlier exposures left, accumulating over the groups of an integration.
+    Add charge that earlier exposures left.
 
-    Parameters
-    ----------
-    ramp : `~numpy.ndarray` of float32, shape (n_int, n_group, n_row, n_col)
-        Accumulated charge (electrons); added to in place.
-    rates : `~numpy.ndarray` of float64, shape (n_latent, n_row, n_col)
-        Former rates of charge (electrons per second), one plane for each exposure.
-    released : `~numpy.ndarray` of float64, shape (n_latent, n_int, n_group)
-        Expected electrons in each group for a former rate of one.
-    key : `~numpy.ndarray` of uint64, shape (4,)
-        Key words of the streams.
-    first_row : int
-        Detector row of the first row.
+    ``rates`` (n_latent, n_row, n_col) are the former rates, ``released`` (n_latent, n_int, n_group)
+    the expected electrons in each group for a former rate of one.
     """
     n_int, n_group, n_row, n_col = ramp.shape
     n_latent = rates.shape[0]
@@ -181,31 +158,12 @@ def add_cosmic_rays(
     shower_sigma,
 ):
     """
-    Add the charge of cosmic-ray hits.
+    Add the charge of cosmic-ray hits, of which ``hits_per_row`` are expected in all integrations.
 
-    Parameters
-    ----------
-    ramp : `~numpy.ndarray` of float32, shape (n_int, n_group, n_row, n_col)
-        Accumulated charge (electrons); added to in place.
-    key : `~numpy.ndarray` of uint64, shape (4,)
-        Key words of the streams.
-    first_row, n_detector_rows : int
-        Detector row of the first row, and how many there are.
-    hits_per_row : float
-        Expected hits in one row during all integrations.
-    thickness : float
-        Thickness of the layer in pixels.
-    yield_median : float
-        Median electrons set free per pixel length of path.
-    yield_sigma : float
-        Standard deviation of the natural logarithm of that yield.
-    track_max : float
-        Longest track in pixels.
-    leakage : float
-        Share of a pixel's deposit that goes to each of its four neighbors.
-    shower_fraction, shower_charge, shower_sigma : float
-        Share of hits that make a shower, its charge (electrons) and Gaussian width
-        (pixels).
+    ``thickness`` of the layer and ``track_max`` are in pixels; ``yield_median`` is in electrons per
+    pixel of path and ``yield_sigma`` the scatter of its natural logarithm. ``leakage`` is the share
+    of a deposit that goes to each of the four neighbors. A ``shower_fraction`` of the hits make a
+    shower of ``shower_charge`` electrons and a Gaussian width of ``shower_sigma`` pixels.
     """
     n_int, n_group, n_row, n_col = ramp.shape
     reach = math.ceil(track_max) + 2
@@ -285,16 +243,10 @@ def add_cosmic_rays(
 @njit(cache=True, nogil=True)
 def couple_neighbors(ramp, kernel):
     """
-    Replace each pixel by the sum of its 3 x 3 neighbors, weighted by a kernel.
+    Replace each pixel by the sum of its 3 x 3 neighbors, weighted by a float32 kernel (3, 3).
 
     At an edge the missing neighbor is the pixel nearest to it, so that a symmetric
     kernel of sum 1 keeps a uniform field.
-
-    Parameters
-    ----------
-    ramp : `~numpy.ndarray` of float32, shape (n_int, n_group, n_row, n_col)
-        Changed in place.
-    kernel : `~numpy.ndarray` of float32, shape (3, 3)
     """
     n_int, n_group, n_row, n_col = ramp.shape
     padded = np.empty((n_row + 2, n_col + 2), np.float32)

@@ -199,17 +199,8 @@ def inversion_table(mean):
     """
     Where `poisson_inversion` goes from one number to the next, for many draws of one mean.
 
-    Parameters
-    ----------
-    mean : float
-        Below about 10.
-
-    Returns
-    -------
-    steps : `~numpy.ndarray` of int64, shape (n,)
-        The first of the 2^53 draws that gives more than 0, more than 1, ...; the last is 2^53.
-    guide : `~numpy.ndarray` of int64, shape (GUIDE,)
-        The number that the first draw of each of so many equal parts gives.
+    Returns the first of the 2^53 draws that gives more than 0, more than 1, ... (the last is 2^53),
+    and the number that the first draw of each of ``GUIDE`` equal parts gives.
     """
     p0 = math.exp(-mean)
     steps = np.empty(201, np.int64)
@@ -237,7 +228,7 @@ def inversion_table(mean):
 
 @njit(cache=True, nogil=True, inline="always")
 def poisson_lookup(bits, steps, guide):
-    """The number that `poisson_inversion` gives for a draw, bit for bit, from the tables of its mean."""
+    """The number that `poisson_inversion` gives for a draw, bit for bit, from its mean's tables."""
     draw = np.int64(bits >> _U11)
     k = guide[draw >> _TO_GUIDE]
     while draw >= steps[k]:
@@ -283,18 +274,7 @@ def poisson(s, mean):
 
 @njit(cache=True, nogil=True)
 def standard_normals(key, first_row, out):
-    """
-    Fill rows with standard normal numbers.
-
-    Parameters
-    ----------
-    key : `~numpy.ndarray` of uint64, shape (4,)
-        Key words of the streams.
-    first_row : int
-        Detector row of the first row of ``out``.
-    out : `~numpy.ndarray`, shape (n_row, n_col)
-        Overwritten.
-    """
+    """Fill the rows of ``out`` (n_row, n_col) with standard normal numbers."""
     state = np.empty(4, np.uint64)
     for r in range(out.shape[0]):
         seed_stream(state, key, 0, first_row + r)

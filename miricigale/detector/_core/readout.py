@@ -20,20 +20,7 @@ __all__ = [
 
 @njit(cache=True, nogil=True)
 def clip_well(ramp, well, group_dq, flag):
-    """
-    Stop charge at the full well, flagging the groups in which it was reached.
-
-    Parameters
-    ----------
-    ramp : `~numpy.ndarray` of float32, shape (n_int, n_group, n_row, n_col)
-        Electrons; changed in place.
-    well : float
-        Full well (electrons).
-    group_dq : `~numpy.ndarray` of uint8, like ``ramp``
-        Flags; changed in place.
-    flag : uint8
-        The bit to set.
-    """
+    """Stop charge at ``well`` electrons, setting ``flag`` in ``group_dq`` where it was reached."""
     n_int, n_group, n_row, n_col = ramp.shape
     limit = np.float32(well)
     for i in range(n_int):
@@ -56,17 +43,8 @@ def interpolate_response(ramp, gain, response, step):
     """
     Turn electrons into DN through a table of the response, linear between its nodes.
 
-    Parameters
-    ----------
-    ramp : `~numpy.ndarray` of float32, shape (n_int, n_group, n_row, n_col)
-        Electrons; changed in place to DN.
-    gain : float
-        Electrons per DN.
-    response : `~numpy.ndarray` of float32, shape (n_node,)
-        Measured DN at linear DN of 0, ``step``, 2 ``step`` ...; continued along its last
-        (first) piece beyond.
-    step : float
-        Distance of the nodes in linear DN.
+    ``response`` is the measured DN at linear DN of 0, ``step``, 2 ``step`` ...; it is continued
+    along its last (first) piece beyond.
     """
     n_int, n_group, n_row, n_col = ramp.shape
     scale = np.float32(1.0 / (gain * step))
@@ -86,19 +64,8 @@ def pull_last_group(ramp, sees, first_row, offset, coupling):
     """
     Offset the last group of each integration by what the reset of the row pair before does.
 
-    Parameters
-    ----------
-    ramp : `~numpy.ndarray` of float32, shape (n_int, n_group, n_row, n_col)
-        DN above the bias; changed in place. Rows whose preceding pair is not in the array
-        are left.
-    sees : `~numpy.ndarray` of bool, shape (n_row, n_col)
-        Pixels that are changed.
-    first_row : int
-        Detector row of the first row.
-    offset : float32
-        DN.
-    coupling : float32
-        Share of the mean signal of the preceding pair that is taken off.
+    Pixels of ``sees`` (n_row, n_col) lose the share ``coupling`` of the pair's mean signal and get
+    ``offset`` DN; rows whose preceding pair is not in the array are left.
     """
     n_int, _, n_row, n_col = ramp.shape
     for i in range(n_int):
@@ -115,20 +82,7 @@ def pull_last_group(ramp, sees, first_row, offset, coupling):
 
 @njit(cache=True, nogil=True)
 def add_noise(ramp, sigma, key, first_row):
-    """
-    Add independent Gaussian noise to every read.
-
-    Parameters
-    ----------
-    ramp : `~numpy.ndarray` of float32, shape (n_int, n_group, n_row, n_col)
-        Changed in place.
-    sigma : float
-        Standard deviation.
-    key : `~numpy.ndarray` of uint64, shape (4,)
-        Key words of the streams.
-    first_row : int
-        Detector row of the first row.
-    """
+    """Add independent Gaussian noise of standard deviation ``sigma`` to every read."""
     n_int, n_group, n_row, n_col = ramp.shape
     state = np.empty(4, np.uint64)
     normals = np.empty(n_col)
@@ -144,23 +98,11 @@ def add_noise(ramp, sigma, key, first_row):
 @njit(cache=True, nogil=True)
 def add_pink_noise(ramp, sigma, n_octave, n_output, key, first_row, n_detector_rows):
     """
-    Add 1/f noise: a drift common to the pixels of one row that share an output.
+    Add 1/f noise of standard deviation ``sigma``: a drift of the pixels of one row and output.
 
     Sum of ``n_octave`` steps of equal variance, the k-th of which keeps its value over 2^k
-    rows in read-out order (Voss & McCartney; Gardner 1978, Sci. Am. 238, 16).
-
-    Parameters
-    ----------
-    ramp : `~numpy.ndarray` of float32, shape (n_int, n_group, n_row, n_col)
-        Changed in place.
-    sigma : float
-        Total standard deviation.
-    n_octave, n_output : int
-        Number of octaves; number of outputs, to which columns belong in turn.
-    key : `~numpy.ndarray` of uint64, shape (4,)
-        Key words of the streams.
-    first_row, n_detector_rows : int
-        Detector row of the first row, and how many there are.
+    rows in read-out order (Voss & McCartney; Gardner 1978, Sci. Am. 238, 16). Columns belong to
+    the ``n_output`` outputs in turn.
     """
     n_int, n_group, n_row, n_col = ramp.shape
     state = np.empty(4, np.uint64)
@@ -187,20 +129,7 @@ def add_pink_noise(ramp, sigma, n_octave, n_output, key, first_row, n_detector_r
 
 @njit(cache=True, nogil=True)
 def digitize(ramp, counts, group_dq, flag_floor, flag_ceiling):
-    """
-    Round DN to unsigned 16-bit numbers, flagging those out of range.
-
-    Parameters
-    ----------
-    ramp : `~numpy.ndarray` of float32, shape (n_int, n_group, n_row, n_col)
-        DN.
-    counts : `~numpy.ndarray` of uint16, like ``ramp``
-        Overwritten.
-    group_dq : `~numpy.ndarray` of uint8, like ``ramp``
-        Flags; changed in place.
-    flag_floor, flag_ceiling : uint8
-        Bits to set below 0 and above 65535.
-    """
+    """Round DN to ``counts`` (uint16), setting flags in ``group_dq`` out of their range."""
     n_int, n_group, n_row, n_col = ramp.shape
     low, high = np.float32(-0.5), np.float32(65535.5)
     for i in range(n_int):

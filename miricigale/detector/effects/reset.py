@@ -12,8 +12,8 @@ below is of our own, plausible in size, and can be given.
 References
 ----------
 Morrison et al. 2023, PASP 135, 075004, arXiv:2308.16327 (detector effects in flight and the
-pipeline's algorithms); Ressler et al. 2015, PASP 127, 675; documentation of the JWST pipeline, steps
-``reset``, ``rscd``, ``firstframe`` and ``lastframe``.
+pipeline's algorithms); Ressler et al. 2015, PASP 127, 675; documentation of the JWST pipeline,
+steps ``reset``, ``rscd``, ``firstframe`` and ``lastframe``.
 """
 
 import dataclasses

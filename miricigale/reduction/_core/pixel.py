@@ -246,19 +246,11 @@ def refit(
     dq,
 ):
     """
-    Fit single pixels again with differences that are cut from outside.
+    Fit the pixels ``ys``, ``xs`` again with differences that are cut from outside.
 
-    Parameters
-    ----------
-    ys, xs : `~numpy.ndarray` of int64, shape (n_pixel,)
-        The pixels.
-    start : `~numpy.ndarray` of int64, shape (n_pixel + 1,)
-        Pixel i is cut at ``cuts[start[i]:start[i + 1]]``.
-    cuts : `~numpy.ndarray` of int64
-        Index of the difference, integration times number of differences plus difference.
-
-    Other parameters are those of `fit_rows`. Jumps that were found before belong to the
-    cuts; new ones are added to their number.
+    Pixel i is cut at ``cuts[start[i]:start[i + 1]]``, each the index of a difference: integration
+    times number of differences plus difference. The other parameters are those of `fit_rows`.
+    Jumps that were found before belong to the cuts; new ones are added to their number.
     """
     n_int = data.shape[0]
     n_diff = g1 - g0 - 1

@@ -34,37 +34,17 @@ def fit_rows(
     dq,
 ):
     """
-    Fit the ramps of rows ``y0`` to ``y1`` and find their jumps.
+    Fit the ramps of rows ``y0`` to ``y1``, groups ``g0`` to ``g1``, and find their jumps.
 
-    Parameters
-    ----------
-    data : `~numpy.ndarray`, shape (n_int, n_group, ny, nx)
-        Groups in DN, as read.
-    offset : `~numpy.ndarray` of float64, shape (n_int, n_group)
-        Subtracted before linearization (bias and common drift).
-    coef : `~numpy.ndarray` of float64
-        Linearity polynomial, ascending.
-    saturation : float
-        Raw DN from which a group, and all after it, is dropped.
-    usable : `~numpy.ndarray` of bool, shape (ny, nx)
-        Pixels to fit; the others get NaN.
-    y0, y1, g0, g1 : int
-        Range of rows, and of groups that take part.
-    s : float
-        Variance of one read in DN^2.
-    inv_gain : float
-        DN per electron: Poisson variance of a difference is slope times this.
-    scale : float
-        Inverse group time: DN per group to DN/s.
-    threshold : float
-        Jumps are cut above this many sigma; infinity for none.
-    rate, var_poisson, var_read, n_used, n_jump, dq : `~numpy.ndarray`, shape (ny, nx)
-        Filled in place.
+    ``data`` are DN as read, (n_int, n_group, ny, nx); ``offset`` (n_int, n_group) is subtracted
+    before the polynomial ``coef`` (ascending) makes them linear. A group from ``saturation`` (raw
+    DN) and all after it are dropped, and pixels that are not ``usable`` get NaN. ``s`` is the
+    variance of one read in DN^2, ``inv_gain`` times the slope the Poisson variance of a
+    difference, ``scale`` the inverse group time, and jumps are cut above ``threshold`` sigma. The
+    images ``rate`` to ``dq`` are filled in place.
 
-    Returns
-    -------
-    events : `~numpy.ndarray` of float64, shape (n_event, 5)
-        y, x, integration, difference (counted from ``g0``) and signed significance.
+    Returns an array (n_event, 5): y, x, integration, difference (counted from ``g0``) and signed
+    significance of each jump.
     """
     n_int, _, _, nx = data.shape
     n_diff = g1 - g0 - 1
