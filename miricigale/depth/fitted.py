@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 from miricigale.depth.noise import ExposureNoise, noise_power, pattern_amplitude
 from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import ANGLE, to_array
+from miricigale.utils.units import ANGLE, positive, to_array
 
 __all__ = ["extraction_map", "fitted_noise"]
 
@@ -70,9 +70,7 @@ def fitted_noise(
     ValueError
         If a number is out of its range, or an integration has less than two frames.
     """
-    seconds = float(to_array(time, u.s, "time"))
-    if not seconds > 0:
-        raise argument_error("time", "positive", time)
+    seconds = positive(time, u.s, "time")
     for name, value in (("n_integrations", n_integrations), ("n_dithers", n_dithers)):
         if int(value) != value or value < 1:
             raise argument_error(name, "an integer of at least 1", value)

@@ -8,7 +8,7 @@ import numpy as np
 from miricigale.detector.ramp import Ramp
 from miricigale.instrument import DQ, aperture, miri_detector
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import TIME, frozen_array, to_array
+from miricigale.utils.units import TIME, Frozen, frozen_array, to_array
 
 __all__ = ["Latent"]
 
@@ -17,7 +17,7 @@ _NO_LIGHT = DQ.DO_NOT_USE | DQ.NON_SCIENCE | DQ.REFERENCE_PIXEL | DQ.DEAD
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class Latent:
+class Latent(Frozen):
     """
     What an exposure leaves behind for those after it.
 

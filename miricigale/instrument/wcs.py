@@ -14,7 +14,7 @@ from miricigale.instrument.siaf import (
     v2v3_to_sky,
 )
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import to_array
+from miricigale.utils.units import positive, to_array
 
 __all__ = [
     "imager_wcs",
@@ -276,9 +276,7 @@ def north_up_wcs(center, pixel_scale, shape):
         With ``pixel_shape`` (nx, ny).
     """
     ra, dec = scalar_position(center, "center")
-    scale = float(to_array(pixel_scale, u.deg, "pixel_scale", ndim=0))
-    if not scale > 0:
-        raise argument_error("pixel_scale", "positive", pixel_scale)
+    scale = positive(pixel_scale, u.deg, "pixel_scale")
     ny, nx = (int(n) for n in shape)
     if ny < 1 or nx < 1:
         raise argument_error("shape", "two positive integers", shape)

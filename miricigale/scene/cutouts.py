@@ -10,7 +10,7 @@ from astropy.nddata import NDData
 
 from miricigale.scene.sky import local_jacobian
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import ANGLE, frozen_array, to_array
+from miricigale.utils.units import ANGLE, Frozen, frozen_array, positive, to_array
 
 __all__ = ["Cutout"]
 
@@ -23,7 +23,7 @@ _CELL = 0.375
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class Cutout:
+class Cutout(Frozen):
     """
     An image of a source, to be painted into a scene.
 
@@ -64,9 +64,7 @@ class Cutout:
         data = frozen_array(np.asarray(self.data, dtype=float))
         if data.ndim != 2 or not np.all(np.isfinite(data)) or not data.sum() > 0:
             raise argument_error("data", "a finite 2D array with a positive sum", data.shape)
-        scale = float(to_array(self.pixel_scale, ANGLE, "pixel_scale", ndim=0))
-        if not (math.isfinite(scale) and scale > 0):
-            raise argument_error("pixel_scale", "positive", self.pixel_scale)
+        scale = positive(self.pixel_scale, ANGLE, "pixel_scale")
         angle = float(to_array(self.angle, u.deg, "angle", ndim=0, finite=True))
         ny, nx = data.shape
         center = ((nx - 1) / 2, (ny - 1) / 2) if self.center is None else self.center

@@ -10,7 +10,7 @@ from miricigale.instrument import pixel_area_map
 from miricigale.scene.scene import Scene
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import check_seed, stream
-from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, positive, to_array
 
 __all__ = ["depth_to_rms", "highres_image"]
 
@@ -52,13 +52,10 @@ def depth_to_rms(depth, *, pixel_area, aperture_radius=0.2 * u.arcsec, n_sigma=5
     >>> round(float(depth_to_rms(27.6 * u.ABmag, pixel_area=area.to_value(u.sr))), 5)
     0.01325
     """
-    flux = depth.to(u.uJy) if getattr(depth, "unit", None) == u.ABmag else depth
-    limit = float(to_array(flux, u.uJy, "depth", ndim=0, finite=True))
-    if not limit > 0:
-        raise argument_error("depth", "positive", depth)
-    radius = float(to_array(aperture_radius, u.rad, "aperture_radius", ndim=0, finite=True))
-    if not radius > 0:
-        raise argument_error("aperture_radius", "positive", aperture_radius)
+    # magnitudes become fluxes
+    flux = depth.to(u.uJy) if isinstance(depth, u.Magnitude) else depth
+    limit = positive(flux, u.uJy, "depth")
+    radius = positive(aperture_radius, u.rad, "aperture_radius")
     if not (np.isfinite(n_sigma) and n_sigma > 0):
         raise argument_error("n_sigma", "positive", n_sigma)
     pixel_area = np.asarray(pixel_area, dtype=float)

@@ -20,7 +20,7 @@ from miricigale.scene.sky import local_jacobian, pixel_positions
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.tables import Flags
-from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, to_array
+from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
 
 __all__ = ["Scene", "SceneFlags"]
 
@@ -116,9 +116,7 @@ class Scene:
         self._background = self._check_background(background)
         scale = self._pixel_scale()
         self._check_psf(psf, scale)
-        radius = float(to_array(max_radius, ANGLE, "max_radius", ndim=0))
-        if not radius > 0:
-            raise argument_error("max_radius", "positive", max_radius)
+        radius = positive(max_radius, ANGLE, "max_radius")
         painter = FieldPainter if isinstance(psf, GriddedPSFModel) else Painter
         self._painter = painter(
             self._shape, psf, enclosed=enclosed, max_radius=radius / scale, n_threads=n_threads

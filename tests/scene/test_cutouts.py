@@ -1,5 +1,8 @@
 """Images of galaxies as sources: light, place, orientation and shape."""
 
+import copy
+import pickle
+
 import importlib.util
 from pathlib import Path
 
@@ -222,3 +225,11 @@ def test_refuses(wcs, psf):
     with pytest.raises(ValueError, match="read-only"):
         stamp.data[0, 0] = 1
     assert repr(stamp) == "<Cutout 81 x 81 pixels of 0.06 arcsec, angle 0 deg>"
+
+
+def test_copies_cannot_be_changed_either():
+    cutout = Cutout(np.ones((3, 5)), pixel_scale=0.1 * u.arcsec, angle=30 * u.deg, n_filled=2)
+    for other in (copy.deepcopy(cutout), pickle.loads(pickle.dumps(cutout))):
+        assert repr(other) == repr(cutout)
+        assert other.center == cutout.center
+        assert not other.data.flags.writeable
