@@ -22,7 +22,7 @@ __all__ = [
     "unused_bands",
 ]
 
-#: Part of a flux below which no error is believed: chi2 in double precision ends there.
+#: Least error in units of the flux: below it chi2 in double precision has no digits left.
 _LEAST_ERROR = 1e-6
 #: Least and largest error, and largest flux, in uJy; beyond, their squares are no numbers.
 _SMALL, _LARGE = 1e-60, 1e60
@@ -89,7 +89,7 @@ def read_photometry(
     model_error : `~numpy.ndarray`, shape (n_filters,)
         Part of the flux that is added to its error in quadrature.
     error_floor : `~numpy.ndarray`, shape (n_filters,)
-        Part of the flux below which no measured error is believed.
+        Least error, as a part of the flux.
     n_bands_min : int
         Objects with fewer usable bands are flagged.
     grid_filters : tuple of str, optional
@@ -123,7 +123,7 @@ def read_photometry(
         has_flux = np.abs(f) < _LARGE
         known = (e > _SMALL) & (e < _LARGE)
         flags[~np.isnan(f) & ~has_flux] |= int(FitFlags.BAD_FLUX)
-        # a flux without error is a missing band; errors of no use are worth a word
+        # a flux without error is a missing band; an error that cannot be used is flagged
         flags[has_flux & ~known & ~np.isnan(e)] |= int(FitFlags.BAD_ERROR)
         good = has_flux & known
         flux[:, i], err[:, i] = f, e

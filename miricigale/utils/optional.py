@@ -1,4 +1,4 @@
-"""The door through which optional packages enter."""
+"""Import of optional packages, with the pip command in the error if one is missing."""
 
 import importlib
 

@@ -1,5 +1,5 @@
 """
-The thin door to sep: native byte order, contiguous memory, and honest defaults.
+Interface to sep: native byte order, contiguous memory, and explicit defaults.
 
 sep wants C-contiguous arrays in native byte order and knows no NaN; and its ``extract``
 filters with ``filter_type='matched'`` unless told otherwise, which reads the threshold as

@@ -1,4 +1,4 @@
-"""The doors to nautilus (Lange 2023, MNRAS 525, 3181) and dynesty (Speagle 2020, MNRAS 493, 3132)."""
+"""Interfaces to nautilus (Lange 2023, MNRAS 525, 3181) and dynesty (Speagle 2020, MNRAS 493, 3132)."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -153,7 +153,7 @@ class Lockstep:
                 self._answer()
 
     def _answer(self):
-        """Evaluate what was asked for, if nobody is left who could ask."""
+        """Evaluate all points that are waited for, once every running task waits or has ended."""
         if not self._asked or len(self._asked) < self._running:
             return
         numbers = sorted(self._asked)
@@ -161,7 +161,7 @@ class Lockstep:
         try:
             values, calls = self._log_like(points)
             answers = list(zip(map(float, values), map(np.asarray, calls), strict=True))
-        except Exception as err:  # whoever asked has to know
+        except Exception as err:  # raised again in the tasks that wait
             answers = [err] * len(numbers)
         self._answers.update(zip(numbers, answers, strict=True))
         self._turn.notify_all()
