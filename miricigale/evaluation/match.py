@@ -3,10 +3,16 @@
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
-from astropy.table import QTable
+from astropy.table import QTable, Table
 
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.tables import Flags, error_column, match_sky, require_columns
+from miricigale.utils.tables import (
+    Flags,
+    described_table,
+    error_column,
+    match_sky,
+    require_columns,
+)
 from miricigale.utils.units import ANGLE, FNU, to_array
 
 __all__ = ["AssociationFlags", "associate", "match_truth"]
@@ -77,46 +83,32 @@ def associate(first, second, *, radius):
         np.concatenate([pair, alone]),
     )
     reasons = np.zeros(len(rows[0]), int)
-    table = QTable({"first": rows[0], "second": rows[1]})
+    columns = {
+        "first": (rows[0], "Row of the first catalog, -1 for none"),
+        "second": (rows[1], "Row of the second catalog, -1 for none"),
+    }
     for name, catalog, row in (("first_id", first, rows[0]), ("second_id", second, rows[1])):
-        if "id" in getattr(catalog, "colnames", ()):
+        if isinstance(catalog, Table) and "id" in catalog.colnames:
             ids = np.asarray(catalog["id"])
-            blank = np.zeros(1, ids.dtype)
-            values = np.concatenate([ids, blank])[row]
-            table[name] = np.ma.MaskedArray(values, mask=row < 0)
+            values = np.concatenate([ids, np.zeros(1, ids.dtype)])[row]
+            columns[name] = (np.ma.MaskedArray(values, mask=row < 0), None)
     separation = np.full(len(rows[0]), np.nan)
     separation[: len(pair)] = near.separation
-    table["separation"] = separation * ANGLE
-    for k, column in ((0, "n_second"), (1, "n_first")):
+    columns["separation"] = (separation * ANGLE, "Of the partners")
+    for k, names in enumerate((("n_second", "second", "first"), ("n_first", "first", "second"))):
         here = rows[k] >= 0
         count = np.full(len(here), -1)
         count[here] = near.count[k][rows[k][here]]
-        table[column] = count
+        text = f"Rows of the {names[1]} catalog within the radius of the row of the {names[2]}"
+        columns[names[0]] = (count, text)
         reasons[here] |= near.reasons(k)[rows[k][here]]
-    status = np.where(
-        reasons == 0, 0, np.where(reasons & (_NONE | _LOST), 2, 1)
-    )  # of rows with a partner neither is set
-    table["status"] = np.array(_STATUS)[status]
-    table["reasons"] = reasons
-    descriptions = {
-        "first": "Row of the first catalog, -1 for none",
-        "second": "Row of the second catalog, -1 for none",
-        "separation": "Of the partners",
-        "n_second": "Rows of the second catalog within the radius of the row of the first",
-        "n_first": "Rows of the first catalog within the radius of the row of the second",
-        "status": "matched, ambiguous or unmatched",
-        "reasons": AssociationFlags.describe(),
-    }
-    for name, text in descriptions.items():
-        table[name].info.description = text
-    table.meta["radius"] = limit
-    table.meta["counts"] = {
-        name: int(np.count_nonzero(status == k)) for k, name in enumerate(_STATUS)
-    }
-    table.meta["reasons"] = {
-        flag.name.lower(): int(np.count_nonzero(reasons & flag)) for flag in AssociationFlags
-    }
-    return table
+    # of rows with a partner neither of the two reasons is set
+    status = np.where(reasons == 0, 0, np.where(reasons & (_NONE | _LOST), 2, 1))
+    columns["status"] = (np.array(_STATUS)[status], "matched, ambiguous or unmatched")
+    columns["reasons"] = (reasons, AssociationFlags.describe())
+    counts = {name: int(np.count_nonzero(status == k)) for k, name in enumerate(_STATUS)}
+    why = {flag.name.lower(): int(np.count_nonzero(reasons & flag)) for flag in AssociationFlags}
+    return described_table(columns, {"radius": limit, "counts": counts, "reasons": why})
 
 
 _NONE, _LOST = int(AssociationFlags.NONE_NEAR), int(AssociationFlags.NO_POSITION)

@@ -29,7 +29,7 @@ __all__ = [
 
 
 class ConditionFlags(Flags):
-    """Conditions of a source, or a detection, in a band; those of the paper and doubtful matches."""
+    """Conditions of a source, or a detection, in a band; those of Yang et al. 2021 and doubtful matches."""
 
     #: More than a tenth of its light falls off the image.
     EDGE = 1

@@ -219,7 +219,7 @@ def mosaic_psf(config, name, scale):
 
 
 def measured_mosaic(config):
-    """Suffix and pixel scale (arcsec) of the mosaics that are measured: the paper's are the prior's."""
+    """Suffix and pixel scale (arcsec) of the mosaics that are measured: 'yang2021' takes the prior's grid."""
     if config.photometry.method == "yang2021":
         return "_fine", config.highres.pixel_scale
     return "", config.reduction.pixel_scale

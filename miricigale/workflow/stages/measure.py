@@ -51,7 +51,7 @@ def make_templates(context, _):
     kernels=("photometry",),
 )
 def measure_photometry(context, name):
-    """Stage 11: forced photometry of one band, on its own grid or as the paper did."""
+    """Stage 11: forced photometry of one band, on its own grid or by the steps of Yang et al. 2021."""
     if context.config.photometry.method == "yang2021":
         result = _as_yang2021(context, name)
     else:
@@ -70,7 +70,7 @@ def measure_photometry(context, name):
 
 
 def yang2021_photometer(config, name, n_threads):
-    """The paper's photometer of one band; images that are our own have the scale of the truth."""
+    """Photometer of one band by the steps of Yang et al. 2021, without a scaling of the image."""
     options = config.highres
     _, scale = measured_mosaic(config)
     return photometry.Yang2021Photometer(
@@ -81,7 +81,7 @@ def yang2021_photometer(config, name, n_threads):
 
 
 def _as_yang2021(context, name):
-    """Forced photometry of one band by the steps of the paper."""
+    """Forced photometry of one band by the steps of Yang et al. 2021."""
     suffix, _ = measured_mosaic(context.config)
     _, labels = context.image("segm.fits", "segmentation")
     return yang2021_photometer(context.config, name, context.n_threads).measure(

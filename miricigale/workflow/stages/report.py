@@ -153,7 +153,7 @@ class _Writer:
             paper += ", six bands, other exposures"
         # of Gaussian errors it is 0.67 sigma
         if self.config.errors.statistic == "mad":
-            note = "; the paper's 5 sigma are of the median absolute difference, 3.4 of these"
+            note = "; 5 sigma in Yang et al. are of the median absolute difference, 3.4 of these"
         else:
             note = ""
         name, prior = self.config.catalog.mag_column, band_label(self.config.highres.filter)
