@@ -9,7 +9,7 @@ from miricigale.filters import FilterSet
 from miricigale.sed import _core
 from miricigale.sed.component import ROLES
 
-__all__ = ["COLORS", "Chain", "Galaxy", "Starlight", "Stars", "distinct"]
+__all__ = ["COLORS", "Chain", "Galaxy", "Stars", "distinct"]
 
 #: Version of the numbers that follow from the components: raised when the chain, the derived
 #: quantities or the grids change, so that grids kept on the disk are made anew.
@@ -73,27 +73,25 @@ class Stars:
 
 
 @dataclass(frozen=True, eq=False)
-class Starlight:
-    """Starlight behind dust and before, and the gas's part of the former; L_lambda in W/um."""
-
-    light: np.ndarray
-    intrinsic: np.ndarray
-    nebular: np.ndarray | None
-
-
-@dataclass(frozen=True, eq=False)
 class Galaxy:
-    """A galaxy without its nucleus, for one solar mass formed; ``dust_luminosity`` in W."""
+    """
+    A galaxy without AGN, for one solar mass formed; L_lambda in W/um.
+
+    ``starlight`` is that of stars and gas behind dust, ``nebular`` the gas's part of it,
+    ``intrinsic`` the same before dust; ``dust_luminosity`` is in W.
+    """
 
     stars: Stars
-    starlight: Starlight
+    starlight: np.ndarray
+    intrinsic: np.ndarray
+    nebular: np.ndarray | None
     dust: np.ndarray
     dust_luminosity: float
 
     @property
     def light(self):
         """L_lambda of stars and dust in W/um."""
-        return self.starlight.light + self.dust
+        return self.starlight + self.dust
 
 
 def distinct(items):
@@ -330,9 +328,8 @@ class Chain:
             young, old, gas = self.factors(dim)
             nebular = stars.nebular_young * (young if gas is None else gas)
             nebular += stars.nebular_old * (old if gas is None else gas)
-        starlight = Starlight(light, stars.young + stars.old, nebular)
         dust = absorbed * self.dust(self.key(values, "dust"))
-        return Galaxy(stars, starlight, dust, float(absorbed))
+        return Galaxy(stars, light, stars.young + stars.old, nebular, dust, float(absorbed))
 
     # ------------------------------------------------------------- AGN and the sky
 

@@ -391,11 +391,10 @@ class SEDModel:
         def sed(spectrum, **meta):
             return SED(wave, chain.lnu(spectrum) * factor * FNU, redshift=z, meta=meta)
 
-        starlight = galaxy.starlight
-        parts = {"stellar_intrinsic": sed(starlight.intrinsic), "stellar": sed(starlight.light)}
-        if starlight.nebular is not None:
-            parts["stellar"] = sed(starlight.light - starlight.nebular)
-            parts["nebular"] = sed(starlight.nebular)
+        parts = {"stellar_intrinsic": sed(galaxy.intrinsic), "stellar": sed(galaxy.starlight)}
+        if galaxy.nebular is not None:
+            parts["stellar"] = sed(galaxy.starlight - galaxy.nebular)
+            parts["nebular"] = sed(galaxy.nebular)
         parts["dust"] = sed(galaxy.dust)
         if agn is not None:
             for name in ("disk", "torus", "polar"):

@@ -48,10 +48,10 @@ def test_energy_balance(model, ebv):
     values = model.values({"ebv": ebv, "age": 3.0, "slope": -0.3})
     galaxy = model.chain.galaxy(values)
     wave = model.chain.wave
-    starlight = galaxy.starlight
-    lost = np.trapezoid(starlight.intrinsic, wave) - np.trapezoid(starlight.light, wave)
+    lost = np.trapezoid(galaxy.intrinsic, wave) - np.trapezoid(galaxy.starlight, wave)
     emitted = np.trapezoid(galaxy.dust, wave)
-    assert emitted == pytest.approx(lost, rel=1e-6, abs=1e-12 * np.trapezoid(starlight.light, wave))
+    seen = np.trapezoid(galaxy.starlight, wave)
+    assert emitted == pytest.approx(lost, rel=1e-6, abs=1e-12 * seen)
 
 
 def test_dust_luminosity_of_the_observed_spectrum(model):

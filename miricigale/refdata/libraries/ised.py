@@ -2,14 +2,8 @@
 Reading of the files of GALAXEV (Bruzual & Charlot 2003 and later), binary and ASCII.
 
 A binary ``.ised`` file is a Fortran unformatted file of four-byte numbers, in either byte
-order. Its records are: a head (number of ages, ages in yr, IMF, star-formation law, three
-lines of text), wavelengths in A, a spectrum in Lsun/A for each age, followed in the same
-record by a short vector of fluxes for spectral indices, and then quantities as functions of
-age, each with its count: bolometric flux, mass in stars, star-formation rate, evolutionary
-flux, rates of supernovae and of planetary nebulae, numbers of black holes, neutron stars and
-white dwarfs, mass of remnants; later versions go on (turn-off mass, flux of the main
-sequence, mass of gas, mass of the galaxy ...). ``.ised_ASCII`` is the same, written with
-Fortran's list-directed format, the texts on lines of their own.
+order; ``.ised_ASCII`` is the same, written with Fortran's list-directed format, the texts on
+lines of their own. `_content` has the order of the numbers.
 """
 
 import gzip
@@ -26,7 +20,7 @@ from miricigale.utils.files import unpacked_size
 __all__ = ["Ised", "read_ised"]
 
 #: Quantities after the spectra, in their order.
-QUANTITIES = (
+QUANTITIES = [
     "bolometric",
     "mass",
     "sfr",
@@ -41,8 +35,8 @@ QUANTITIES = (
     "main_sequence",
     "gas",
     "galaxy",
-)
-N_NEEDED = 10
+]
+N_NEEDED = 10  # of them; later versions go on
 
 _LAWS = {0: "single burst (SSP)", 4: "exponential", 6: "delayed"}
 _MOST_AGES, _MOST_NUMBERS = 10**5, 10**7
