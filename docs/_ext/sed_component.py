@@ -11,6 +11,7 @@ import re
 from docutils.statemachine import StringList
 from sphinx.util.docutils import SphinxDirective
 
+from miricigale import sed
 from miricigale.refdata import resource
 from miricigale.sed import COMPONENTS, DERIVED, components
 
@@ -47,7 +48,9 @@ def component_lines(name):
         If no such component is registered.
     """
     cls = COMPONENTS.get(name)
-    where = components.__name__ if hasattr(components, cls.__name__) else cls.__module__
+    # where the reference has it
+    home = components if cls.__module__.startswith(components.__name__) else sed
+    where = home.__name__ if hasattr(home, cls.__name__) else cls.__module__
     fields = [
         ("Component", f"``{name}``, :class:`~{where}.{cls.__name__}`"),
         ("Role", f"``{cls.role}``"),

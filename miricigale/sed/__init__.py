@@ -13,7 +13,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "components": (),
         "component": ("ROLES", "Component"),
         "derived": ("DERIVED", "Derived"),
-        "foreground": ("band_extinction", "deredden"),
+        "foreground": ("Foreground", "GalacticExtinction", "band_extinction", "deredden"),
         "grid": ("ModelGrid",),
         "model": ("ModelSpectra", "SEDModel"),
         "parameter": ("Parameter",),
@@ -21,6 +21,6 @@ __getattr__, __dir__, __all__ = lazy_names(
         "presets": ("COMPONENTS", "yang2021_axes"),
         "spectrum": ("COSMOLOGY", "SED"),
         "tables": ("ModelFlags",),
-        "xray": ("band_luminosity", "stern2015", "xray_flux"),
+        "xray": ("XRay", "band_luminosity", "stern2015", "xray_flux"),
     },
 )
