@@ -1,9 +1,8 @@
 """Images of galaxies as sources: light, place, orientation and shape."""
 
 import copy
-import pickle
-
 import importlib.util
+import pickle
 from pathlib import Path
 
 import astropy.units as u
