@@ -159,7 +159,7 @@ def table(fields, rows, grids):
         )
         bins = truth / np.nanmedian(noise, axis=0)
         pull, old, ratio = (flux - truth) / err, (flux - truth) / noise, flux / truth - 1
-        poor = int(ForcedFlags.POOR_FIT | ForcedFlags.UNEXPLAINED_NEIGHBOUR)
+        poor = int(ForcedFlags.POOR_FIT | ForcedFlags.UNEXPLAINED_NEIGHBOR)
         clear = np.where((np.nan_to_num(flags).astype(int) & poor) == 0, pull, np.nan)
         for kind, which in (("isolated", ~pair), ("blended", pair)):
             for low, high in BINS:

@@ -1,4 +1,4 @@
-"""The columns of a catalogue that photometry knows."""
+"""The columns of a catalog that photometry knows."""
 
 import dataclasses
 
@@ -12,13 +12,13 @@ from miricigale.utils.tables import require_columns, unique_ids
 
 __all__ = ["OPTIONAL", "CatalogSources", "catalog_sources", "sersic_rows"]
 
-#: Columns of a catalogue that need not be there, and that templates keep.
+#: Columns of a catalog that need not be there, and that templates keep.
 OPTIONAL = ("flux", "components")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CatalogSources:
-    """What a catalogue says of its sources: arrays of shape (n,), None for columns that it does not have."""
+    """What a catalog says of its sources: arrays of shape (n,), None for columns that it does not have."""
 
     id: np.ndarray
     sky: SkyCoord
@@ -33,7 +33,7 @@ class CatalogSources:
 
 def catalog_sources(catalog):
     """
-    Read the columns of a catalogue with ``sky``.
+    Read the columns of a catalog with ``sky``.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def catalog_sources(catalog):
 
 
 def sersic_rows(catalog):
-    """Half-light radius (arcsec), index, axis ratio and angle (rad) of a catalogue, (n, 4); NaN for points."""
+    """Half-light radius (arcsec), index, axis ratio and angle (rad) of a catalog, (n, 4); NaN for points."""
     units = {"half_light_radius": u.arcsec, "position_angle": u.deg}
     names = ["half_light_radius", "sersic_index", "axis_ratio", "position_angle"]
     require_columns(catalog, names, "catalog", units=units)

@@ -32,7 +32,7 @@ __all__ = [
 class DetectionFlags(Flags):
     """Flags of detections, those of Source Extractor and sep."""
 
-    #: Deblended from a neighbour, or blended with one.
+    #: Deblended from a neighbor, or blended with one.
     MERGED = 1
     #: Cut by the edge of the image.
     TRUNCATED = 2

@@ -236,7 +236,7 @@ class ErrorModel:
         -----
         With P the share of light of each pixel and K the smearing of the mosaic, a template that is
         fitted with equal weights to the mosaic counts each pixel of the detector with W = P * K * K,
-        normalised to sum(W P) = 1: the sky comes in with sum(W^2), the source's own photons with
+        normalized to sum(W P) = 1: the sky comes in with sum(W^2), the source's own photons with
         sum(W^2 P), the pattern with sum(W_i W_j rho_ij). Ramps are fitted optimally, as in
         `sensitivity`.
 

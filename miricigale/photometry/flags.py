@@ -28,7 +28,7 @@ class ForcedFlags(Flags):
     BLENDED = 8
     #: The template is the same as another one's: not measured, the other has the light.
     DEGENERATE = 16
-    #: The template is a point source because the catalogue position has no segment.
+    #: The template is a point source because the catalog position has no segment.
     NO_SEGMENT = 32
     #: The template is a point source because the segment is too noisy.
     NOISY_SEGMENT = 64
@@ -38,8 +38,10 @@ class ForcedFlags(Flags):
     #: or the template had to change by far more than the high-resolution image leaves open.
     POOR_FIT = 256
     #: Light that no template explains (5 sigma, a tenth of the flux) is within two widths of the PSF.
+    UNEXPLAINED_NEIGHBOR = 512
+    # the name of former versions
     UNEXPLAINED_NEIGHBOUR = 512
     #: The point on top of the template cannot be told from it, or the template was not measured: one flux only.
     ONE_COMPONENT = 1024
-    #: Not in the catalogue: found on the residual of a first fit.
+    #: Not in the catalog: found on the residual of a first fit.
     NOT_IN_CATALOG = 2048

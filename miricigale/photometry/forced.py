@@ -1,4 +1,4 @@
-"""Forced photometry: all sources of a catalogue fitted at once, with templates."""
+"""Forced photometry: all sources of a catalog fitted at once, with templates."""
 
 import concurrent.futures
 import contextlib
@@ -34,7 +34,7 @@ __all__ = ["ForcedPhotometer"]
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ForcedPhotometer:
     """
-    Measure the sources of a catalogue on an image of lower resolution.
+    Measure the sources of a catalog on an image of lower resolution.
 
     Each source's light on a high-resolution image is brought to the image's resolution
     and pixels; the sum of all such templates, each times its flux, is fitted to the image.
@@ -52,7 +52,7 @@ class ForcedPhotometer:
         What sources look like. ``"auto"`` cuts them from the high-resolution image where a
         segment of enough signal-to-noise belongs to them, otherwise takes a point source.
         ``"cutout"`` does so without regard to the signal-to-noise. ``"sersic"`` draws the
-        profile that the catalogue states.
+        profile that the catalog states.
     min_snr : float, optional
         Least signal-to-noise of a segment for ``"auto"``.
     wings : bool, optional
@@ -79,9 +79,9 @@ class ForcedPhotometer:
     components : {1, 2}, optional
         With 2, sources whose template without error fits poorly are fitted once more as their template and
         a point on top of it, and stay so where chi-square is less than without the point. Column
-        ``components`` of the catalogue (1 or 2) says which those are instead.
+        ``components`` of the catalog (1 or 2) says which those are instead.
     second_pass : bool, optional
-        Whether peaks of the residual that the catalogue lacks are fitted together with it, as
+        Whether peaks of the residual that the catalog lacks are fitted together with it, as
         points; they are listed in ``new_sources`` of the result.
     positive : bool, optional
         Whether the solution without negative fluxes is given too (``flux_positive``). All else belongs to
@@ -96,7 +96,7 @@ class ForcedPhotometer:
         Templates fitted to the high-resolution image (``"auto"`` and ``"cutout"`` with ``wings``) may
         change as far as their fit leaves them open, and in size by this standard deviation of ln size,
         since galaxies are not of one size in all bands. None takes them without error. Shapes that a
-        catalogue states always are.
+        catalog states always are.
     psf_error : float, optional
         Error of a point source's flux, as a fraction, by that of the image's PSF: about 0.8 of the
         fractional error of its width. By default that of the kernel's encircled energy, for templates
@@ -116,7 +116,7 @@ class ForcedPhotometer:
 
     Notes
     -----
-    Normal equations in whitened form are factorised sparsely. Errors are the diagonal of
+    Normal equations in whitened form are factorized sparsely. Errors are the diagonal of
     H (A^T W C W A) H, where H is the inverse normal matrix and C the measured covariance
     of the noise; their scale is thus the one of the residuals, not that of the uncertainty.
 
@@ -215,7 +215,7 @@ class ForcedPhotometer:
 
     def measure(self, image, highres=None, segmentation=None, catalog=None, *, templates=None):
         """
-        Measure all sources of a catalogue.
+        Measure all sources of a catalog.
 
         Parameters
         ----------
@@ -254,7 +254,7 @@ class ForcedPhotometer:
         if templates is None:
             sources = dataclasses.replace(catalog_sources(catalog), sky=catalog["sky"])
         elif any(given):
-            raise argument_error("templates", "given alone with the image", "a catalogue too")
+            raise argument_error("templates", "given alone with the image", "a catalog too")
         elif not isinstance(templates, SourceTemplates):
             msg = f"'templates' must be SourceTemplates, got {type(templates).__name__}"
             raise TypeError(msg)
@@ -329,7 +329,7 @@ class ForcedPhotometer:
             yield pool if self.n_threads > 1 else None
 
     def _rows(self, sources, place, templates):
-        """The catalogue as the fit takes it, and the templates of its sources that are near."""
+        """The catalog as the fit takes it, and the templates of its sources that are near."""
         n, near = len(sources.id), place.near
         flags, snr, kinds = np.zeros(n, int), np.full(n, np.nan), np.full(n, "none", "U6")
         flags[near], snr[near] = templates.flags, templates.snr

@@ -34,7 +34,7 @@ _POINT = 0.05
 _APART, _ATTEMPTS = 4.0, 50
 
 #: Flags with which a source may still be copied.
-_HARMLESS = ForcedFlags.BLENDED | ForcedFlags.POOR_FIT | ForcedFlags.UNEXPLAINED_NEIGHBOUR
+_HARMLESS = ForcedFlags.BLENDED | ForcedFlags.POOR_FIT | ForcedFlags.UNEXPLAINED_NEIGHBOR
 
 #: Half-width (fine pixels) of the stamps that are injected into the prior, least and most.
 _HALF, _MOST = 16, 96
@@ -72,7 +72,7 @@ def calibrate_errors(
         How often the image is measured.
     n_sources : int, optional
         Sources injected in each trial, and empty places; by default a seventh of the sources in the
-        catalogue, at least ten. Fewer, if there is no room for so many.
+        catalog, at least ten. Fewer, if there is no room for so many.
     snr_range : tuple of float, optional
         Fluxes over the median error of sources by noise, between which injected fluxes are drawn, uniform
         in the logarithm.
@@ -133,7 +133,7 @@ class _Donor:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Injected:
-    """Sources that were injected: catalogue, light, fluxes and kinds; the prior with them."""
+    """Sources that were injected: catalog, light, fluxes and kinds; the prior with them."""
 
     catalog: QTable
     light: SourceTemplates

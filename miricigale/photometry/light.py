@@ -15,7 +15,7 @@ from miricigale.utils.parallel import parallel_map
 __all__ = ["FineImage", "cutouts"]
 
 #: Width (pixels) of the Gaussian that tells the core, its least signal-to-noise, how many standard
-#: deviations of chi^2 a profile may miss it by, and the signal-to-noise that makes a neighbour.
+#: deviations of chi^2 a profile may miss it by, and the signal-to-noise that makes a neighbor.
 _WIDTH, _CORE_SNR, _EXCESS, _OTHER_SNR = 1.5, 4.0, 3.0, 4.0
 
 #: Error of a profile, as a fraction of the brightness: no galaxy is one to better than that.
@@ -27,7 +27,7 @@ _AROUND, _LEAST, _MOST = 6, 16, 160
 #: Semi-major axis to which profiles are drawn: in half-light radii, and at most (pixels).
 _DRAWN, _FARTHEST = 6.0, 200.0
 
-#: Passes in which neighbours' light is taken off, chi^2 of that light from which a source is fitted
+#: Passes in which neighbors' light is taken off, chi^2 of that light from which a source is fitted
 #: again, and sources that are painted at a time.
 _PASSES, _CONTAMINATED, _AT_A_TIME = 4, 4.0, 512
 
@@ -38,7 +38,7 @@ class FineImage:
 
     data: np.ndarray  # (ny, nx): light per pixel (any unit), background subtracted
     variance: np.ndarray  # (ny, nx): its variance, infinite where not usable
-    psf: np.ndarray  # (k, k): odd and centred
+    psf: np.ndarray  # (k, k): odd and centered
     scale: float  # arcsec per pixel
 
 

@@ -1,4 +1,4 @@
-"""Offsets of an image against a catalogue: source by source, and as a smooth map."""
+"""Offsets of an image against a catalog: source by source, and as a smooth map."""
 
 import dataclasses
 import warnings
@@ -27,7 +27,7 @@ _FLOOR, _CLIP, _DONE = 0.01, 4.0, 5e-3
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class OffsetMap:
     """
-    Where an image shows sources, less where the catalogue has them.
+    Where an image shows sources, less where the catalog has them.
 
     Attributes
     ----------
@@ -112,7 +112,7 @@ def source_offsets(fit, residual, model, rows):
     Notes
     -----
     The template times its flux and the derivatives of that by x and y are fitted to the residual within
-    two full widths at half maximum of the PSF. Derivatives are differences of neighbouring pixels:
+    two full widths at half maximum of the PSF. Derivatives are differences of neighboring pixels:
     steps are right to some tens of percent, so that they must be repeated.
     """
     step = np.full((len(rows), 2), np.nan)
@@ -201,7 +201,7 @@ def fit_offsets(arrays, bank, settings, catalog):
 
 
 def _bright_offsets(fit, catalog, moved):
-    """Rows, offsets from the catalogue (pixels) and errors of bright isolated sources."""
+    """Rows, offsets from the catalog (pixels) and errors of bright isolated sources."""
     if not len(fit.rows):
         return np.empty(0, int), np.empty((0, 2)), np.empty(0)
     moved = np.broadcast_to(moved, (len(fit.bank.order), 2))

@@ -1,4 +1,4 @@
-"""From a fit in the order of its templates to the result in the order of the catalogue."""
+"""From a fit in the order of its templates to the result in the order of the catalog."""
 
 import dataclasses
 import itertools
@@ -14,7 +14,7 @@ from miricigale.photometry.fields import SmoothField, n_terms
 from miricigale.photometry.fit_errors import fit_covariances
 from miricigale.photometry.flags import ForcedFlags
 from miricigale.photometry.nonnegative import nonnegative_fluxes
-from miricigale.photometry.residual_sources import unexplained_neighbours
+from miricigale.photometry.residual_sources import unexplained_neighbors
 from miricigale.photometry.results import ForcedPhotometryResult, crowded
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS
@@ -24,7 +24,7 @@ __all__ = ["CatalogRows", "package"]
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class CatalogRows:
-    """The sources of a catalogue, as far as they are known before the fit."""
+    """The sources of a catalog, as far as they are known before the fit."""
 
     #: As in `~miricigale.photometry.ForcedPhotometryResult`, shape (n,).
     id: np.ndarray
@@ -52,9 +52,9 @@ def package(fit, diagnostics, new_xy, catalog, meta):
     diagnostics : `~miricigale.photometry.diagnostics.Diagnostics`
         What was made of its residual.
     new_xy : `~numpy.ndarray`, shape (m, 2)
-        Positions of the sources that were added to the catalogue.
+        Positions of the sources that were added to the catalog.
     catalog : `CatalogRows`
-        The catalogue.
+        The catalog.
     meta : dict
         Provenance: the ``template``, and the ``filter`` if that is known.
 
@@ -90,8 +90,8 @@ def package(fit, diagnostics, new_xy, catalog, meta):
     flags[:n] |= catalog.flags
     flags[n:] |= int(ForcedFlags.NOT_IN_CATALOG)
     xy = np.concatenate([catalog.xy, new_xy])
-    near = unexplained_neighbours(diagnostics.peaks, xy + fit.displacement(xy), flux)
-    flags[near & np.isfinite(flux)] |= int(ForcedFlags.UNEXPLAINED_NEIGHBOUR)
+    near = unexplained_neighbors(diagnostics.peaks, xy + fit.displacement(xy), flux)
+    flags[near & np.isfinite(flux)] |= int(ForcedFlags.UNEXPLAINED_NEIGHBOR)
     chi2[place[main]] = diagnostics.chi2[main]
     left[place[main]] = diagnostics.residual_fraction[main]
     reference = np.nan_to_num(flux[:n]) if catalog.reference is None else catalog.reference

@@ -1,4 +1,4 @@
-"""The fits of one image: the catalogue, then with what its residual shows to be lacking."""
+"""The fits of one image: the catalog, then with what its residual shows to be lacking."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ _REFINED = 2
 
 def fit_image(arrays, bank, settings, catalog, grid_wcs):
     """
-    Fit an image, and once more with second components and sources that the catalogue lacks.
+    Fit an image, and once more with second components and sources that the catalog lacks.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
     settings : `~miricigale.photometry.ForcedPhotometer`
         How they are fitted.
     catalog : `~miricigale.photometry.packaging.CatalogRows`
-        The catalogue; ``near`` lists the bank's sources.
+        The catalog; ``near`` lists the bank's sources.
     grid_wcs : `~astropy.wcs.WCS`
         Of the grid on which templates are made.
 
@@ -37,7 +37,7 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
     fit : `~miricigale.photometry.template_fit.TemplateFit`
     diagnostics : `~miricigale.photometry.diagnostics.Diagnostics`
     new_xy : `~numpy.ndarray`, shape (m, 2)
-        Positions, in the catalogue's frame, of sources that it lacks: the last of the fit's sources.
+        Positions, in the catalog's frame, of sources that it lacks: the last of the fit's sources.
     """
     if settings.offset_order is None:
         fit = TemplateFit(arrays, bank, settings)
@@ -70,14 +70,14 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
 
 
 def _poor(fit, catalog, new_xy):
-    """Which of the catalogue's sources in a bank are poorly fitted."""
+    """Which of the catalog's sources in a bank are poorly fitted."""
     diagnostics = diagnose(fit, np.concatenate([catalog.xy, new_xy]))
     source = fit.bank.order[diagnostics.poor]
     return np.sort(source[source < len(catalog.near)])
 
 
 def _new_positions(fit, catalog):
-    """Where the residual shows sources that the catalogue lacks, in the catalogue's frame."""
+    """Where the residual shows sources that the catalog lacks, in the catalog's frame."""
     peaks = diagnose(fit, catalog.xy).peaks
     flux = np.full(len(catalog.xy), np.nan)
     flux[catalog.near[fit.bank.order]] = fit.total

@@ -1,4 +1,4 @@
-"""The sources of a catalogue on one image: where they are, and their templates there."""
+"""The sources of a catalog on one image: where they are, and their templates there."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Segmentation maps and catalogues that others made, as the prior of forced photometry."""
+"""Segmentation maps and catalogs that others made, as the prior of forced photometry."""
 
 import logging
 import warnings
@@ -47,7 +47,7 @@ def read_prior(highres, *, segmentation=None, catalog=None, path=None):
         Labels 1 to n; None without a segmentation.
     sources : `~astropy.table.QTable`
         ``id``, ``sky`` and, with a segmentation, ``label``: the segment of the same id if
-        most of the catalogue's ids are those of the segments at their positions, and the segment
+        most of the catalog's ids are those of the segments at their positions, and the segment
         at the position otherwise (0 for none).
 
     Raises
@@ -61,7 +61,7 @@ def read_prior(highres, *, segmentation=None, catalog=None, path=None):
     Warns
     -----
     `~miricigale.utils.exceptions.MiricigaleWarning`
-        If segments belong to no source of the catalogue: their light stays in the image; if most
+        If segments belong to no source of the catalog: their light stays in the image; if most
         sources have no segment, or some stand on another one than that of their id.
 
     Examples
@@ -181,7 +181,7 @@ def _read_table(path):
     from astropy.table import QTable
 
     if not Path(path).is_file():
-        msg = f"no catalogue {path}"
+        msg = f"no catalog {path}"
         raise DataError(msg)
     with open(path, "rb") as stream:
         start = stream.read(9)
@@ -189,7 +189,7 @@ def _read_table(path):
     fits = start.startswith(b"SIMPLE") or name.endswith((".fits", ".fits.gz", ".fit"))
     try:
         if fits:
-            with open_fits(path, wanted="a catalogue") as hdus:
+            with open_fits(path, wanted="a catalog") as hdus:
                 return QTable.read(hdus, format="fits", character_as_bytes=False)
         unpacked_size(path)
         if start.startswith(b"# %ECSV"):
@@ -200,7 +200,7 @@ def _read_table(path):
         raise
     except (OSError, TypeError, ValueError) as err:
         reason = (str(err).strip().splitlines() or [type(err).__name__])[0]
-        msg = f"{path} cannot be read as a catalogue (FITS, ECSV, CSV or a plain table): {reason}"
+        msg = f"{path} cannot be read as a catalog (FITS, ECSV, CSV or a plain table): {reason}"
         raise DataError(msg) from err
 
 

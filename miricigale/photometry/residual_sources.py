@@ -9,10 +9,10 @@ from astropy.stats import mad_std
 
 from miricigale.utils.parallel import chunks, parallel_map
 
-__all__ = ["ResidualPeaks", "new_sources", "residual_peaks", "unexplained_neighbours"]
+__all__ = ["ResidualPeaks", "new_sources", "residual_peaks", "unexplained_neighbors"]
 
 #: Least signal-to-noise of light that no template explains, its least share of the model below it and
-#: of a neighbour's flux, and its distance to sources in full widths at half maximum: the least to any,
+#: of a neighbor's flux, and its distance to sources in full widths at half maximum: the least to any,
 #: and the largest to one that is flagged.
 _LEFT_SNR, _LEFT_SHARE, _LEFT_DISTANCE, _LEFT_REACH = 5.0, 0.1, 0.7, 2.0
 
@@ -22,7 +22,7 @@ class ResidualPeaks:
     """Peaks of a residual image, the brightest first."""
 
     xy: np.ndarray  # (n, 2): Their pixels.
-    refined: np.ndarray  # (n, 2): Tops of the parabolas through each pixel and its neighbours.
+    refined: np.ndarray  # (n, 2): Tops of the parabolas through each pixel and its neighbors.
     flux: np.ndarray  # (n,): As point sources that stand alone, in the residual's unit.
     full_width: float  # Full width at half maximum of the PSF, in pixels.
 
@@ -212,9 +212,9 @@ def _near(peaks, xy):
     return peak, placed[np.concatenate(found).astype(int)]
 
 
-def unexplained_neighbours(peaks, xy, flux):
+def unexplained_neighbors(peaks, xy, flux):
     """
-    Find sources, (n,), next to light that is not in the catalogue.
+    Find sources, (n,), next to light that is not in the catalog.
 
     A peak is within two full widths at half maximum of these, and as a point source has more than a tenth of
     the flux (NaN where not measured).

@@ -29,7 +29,7 @@ __all__ = ["ForcedPhotometryResult", "crowded"]
 
 def crowded(sky, flux, *, radius=2 * u.arcsec, delta_mag=1.0):
     """
-    Find sources that have a neighbour which is bright enough to matter.
+    Find sources that have a neighbor which is bright enough to matter.
 
     Parameters
     ----------
@@ -38,14 +38,14 @@ def crowded(sky, flux, *, radius=2 * u.arcsec, delta_mag=1.0):
     flux : array_like or `~astropy.units.Quantity`, shape (n,)
         Fluxes.
     radius : `~astropy.units.Quantity`, optional
-        How near a neighbour is.
+        How near a neighbor is.
     delta_mag : float, optional
-        A neighbour counts if it is brighter than the source's magnitude plus this.
+        A neighbor counts if it is brighter than the source's magnitude plus this.
 
     Returns
     -------
     crowded : bool `~numpy.ndarray`, shape (n,)
-        A source whose flux is not positive is crowded by any positive neighbour, one whose
+        A source whose flux is not positive is crowded by any positive neighbor, one whose
         position is not known by none.
 
     References
@@ -66,14 +66,14 @@ def crowded(sky, flux, *, radius=2 * u.arcsec, delta_mag=1.0):
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ForcedPhotometryResult:
     """
-    Fluxes of all sources of a catalogue on one image.
+    Fluxes of all sources of a catalog on one image.
 
     Attributes
     ----------
     id : `~numpy.ndarray`, shape (n,)
-        The catalogue's ids, in its order.
+        The catalog's ids, in its order.
     sky : `~astropy.coordinates.SkyCoord`, shape (n,)
-        The catalogue's positions.
+        The catalog's positions.
     flux, flux_err : `~astropy.units.Quantity`, shape (n,)
         Total fluxes and errors in uJy; NaN where not measured.
     flux_err_noise, flux_err_template, flux_err_psf : `~astropy.units.Quantity`, shape (n,)
@@ -97,7 +97,7 @@ class ForcedPhotometryResult:
     template_snr : `~numpy.ndarray`, shape (n,)
         Signal-to-noise of the segment of the high-resolution image; NaN without one.
     crowded : bool `~numpy.ndarray`, shape (n,)
-        Whether a neighbour within 2 arcsec is brighter than the source's magnitude + 1.
+        Whether a neighbor within 2 arcsec is brighter than the source's magnitude + 1.
     x, y : `~numpy.ndarray`, shape (n,)
         Positions on the image; NaN far outside.
     model_image, residual_image : `~astropy.nddata.CCDData`
@@ -110,7 +110,7 @@ class ForcedPhotometryResult:
     background_field : `~miricigale.photometry.SmoothField` or None
         The background in MJy/sr as a function of the pixel, ``background_field(x, y)``.
     shift, shift_err : `~astropy.units.Quantity`, shape (2,), or None
-        Shift (x, y) of the image against the catalogue, in arcsec along its axes.
+        Shift (x, y) of the image against the catalog, in arcsec along its axes.
     offset_map : `~miricigale.photometry.OffsetMap` or None
         Such shifts as a smooth function of the position, with the sources they were measured on.
     flux_point, flux_point_err : `~astropy.units.Quantity`, shape (n,), or None
@@ -121,7 +121,7 @@ class ForcedPhotometryResult:
     flux_positive : `~astropy.units.Quantity`, shape (n,), or None
         The fluxes of least chi-square of which none is negative (neither component's is).
     new_sources : `~astropy.table.QTable` or None
-        What the catalogue lacks, fitted with it: ``id`` (none of the catalogue's), ``sky``,
+        What the catalog lacks, fitted with it: ``id`` (none of the catalog's), ``sky``,
         ``x_centroid``, ``y_centroid``, ``flux``, ``flux_err``, ``snr``, ``flags``, ``coverage`` and
         ``chi2``. None without a second pass.
     psf_fwhm : `~astropy.units.Quantity` or None
@@ -216,7 +216,7 @@ class ForcedPhotometryResult:
             Number of draws.
         seed : int or `~numpy.random.Generator`, optional
             The same seed gives the same draws, for a source that overlaps no other also in
-            another catalogue.
+            another catalog.
         point : bool, optional
             Whether the draws of ``flux_point`` are wanted, which belong to those of ``flux`` of the
             same seed.
@@ -257,7 +257,7 @@ class ForcedPhotometryResult:
         Raises
         ------
         KeyError
-            If the catalogue has no such id.
+            If the catalog has no such id.
         """
         rows = []
         for key in (first, second):
@@ -288,8 +288,8 @@ class ForcedPhotometryResult:
         flux, prefix = ("flux", "") if name is None else (name, f"{name}_")
         error, point = error_column(flux), f"{prefix}flux_point"
         columns = {
-            "id": (self.id, "Id of the catalogue"),
-            "sky": (self.sky, "Position of the catalogue"),
+            "id": (self.id, "Id of the catalog"),
+            "sky": (self.sky, "Position of the catalog"),
             flux: (self.flux, "Total flux"),
             error: (self.flux_err, "1-sigma error of the flux"),
             f"{error}_noise": (self.flux_err_noise, "Error by the image's noise"),
@@ -302,7 +302,7 @@ class ForcedPhotometryResult:
         texts = {
             "flags": ForcedFlags.describe(),
             "snr": "Flux over error",
-            "crowded": "Neighbour within 2 arcsec brighter than the magnitude + 1",
+            "crowded": "Neighbor within 2 arcsec brighter than the magnitude + 1",
             "coverage": "Fraction of the light on usable pixels",
             "chi2": "Template-weighted mean of (residual / sigma)^2",
             "residual_fraction": "Residual over fitted light in the core",

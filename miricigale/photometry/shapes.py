@@ -10,7 +10,7 @@ from miricigale.photometry import _core
 __all__ = ["FITTED", "Shape", "ShapeFitter", "ShapeModels", "not_fitted"]
 
 #: What is known of shapes beforehand (mean and width): ln of the circularised half-light radius
-#: (arcsec), ln of the Sersic index, the two ellipticities, and the offset of the centre (pixels).
+#: (arcsec), ln of the Sersic index, the two ellipticities, and the offset of the center (pixels).
 _RADIUS, _INDEX, _ELLIPTICITY, _OFFSET = (np.log(0.2), 0.8), (np.log(1.8), 0.8), 0.6, 0.7
 
 _WIDTHS = (_OFFSET, _OFFSET, _RADIUS[1], _INDEX[1], _ELLIPTICITY, _ELLIPTICITY)
@@ -71,7 +71,7 @@ def not_fitted(n):
 
 
 class ShapeModels:
-    """Draws light through a PSF, odd and centred."""
+    """Draws light through a PSF, odd and centered."""
 
     def __init__(self, psf):
         self._psf = np.asarray(psf, float)

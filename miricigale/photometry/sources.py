@@ -30,7 +30,7 @@ __all__ = ["SourceTemplates"]
 @dataclasses.dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class SourceTemplates:
     """
-    The sources of a catalogue and what each looks like, before it is brought to an image.
+    The sources of a catalog and what each looks like, before it is brought to an image.
 
     It does not depend on the image that is measured: made once from a high-resolution image it
     serves every band (`ForcedPhotometer.measure`, `measure_bands`). Made by `from_images`,
@@ -60,7 +60,7 @@ class SourceTemplates:
     psf : `~numpy.ndarray`, shape (k, k), or None
         PSF of the high-resolution image, of unit sum.
     flux : `~numpy.ndarray`, shape (n,), or None
-        The catalogue's fluxes, in whatever unit, which tell the crowded sources.
+        The catalog's fluxes, in whatever unit, which tell the crowded sources.
     components : int `~numpy.ndarray`, shape (n,), or None
         1, or 2 for sources that are fitted with a point on top of their template.
     meta : dict
@@ -120,7 +120,7 @@ class SourceTemplates:
         n_threads=None,
     ):
         """
-        Look at the sources of a catalogue on a high-resolution image.
+        Look at the sources of a catalog on a high-resolution image.
 
         Parameters
         ----------
@@ -134,7 +134,7 @@ class SourceTemplates:
             segment; by default that at the position), ``flux`` (which tells who is crowded; the
             measured fluxes otherwise) and ``components`` (1, or 2 for a point on top of the template).
         psf : `~numpy.ndarray` or `~photutils.psf.ImagePSF`
-            PSF of ``highres``: an array on its pixels, odd, square and centred, or one of the
+            PSF of ``highres``: an array on its pixels, odd, square and centered, or one of the
             package's PSFs on the sky. For kernels that is their ``source``.
         template : {"auto", "cutout"}, optional
             ``"auto"`` decides for each source whether it is a point, a Sersic profile or what the
@@ -189,7 +189,7 @@ class SourceTemplates:
     @classmethod
     def from_catalog(cls, catalog, *, template="psf", wcs=None):
         """
-        Take what a catalogue says: points, or the Sersic profiles that it states.
+        Take what a catalog says: points, or the Sersic profiles that it states.
 
         Parameters
         ----------
@@ -358,7 +358,7 @@ class SourceTemplates:
 
     def drawn(self, grid, xy):
         """
-        The light of all sources on a grid, Sersic profiles of the catalogue drawn.
+        The light of all sources on a grid, Sersic profiles of the catalog drawn.
 
         Parameters
         ----------

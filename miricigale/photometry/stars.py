@@ -52,7 +52,7 @@ def psf_photometry(
     fit_size : `~astropy.units.Quantity`, optional
         Side of the square that is fitted; four full widths at half maximum by default.
     max_shift : `~astropy.units.Quantity` or None, optional
-        How far positions may move along either axis; None keeps those of the catalogue.
+        How far positions may move along either axis; None keeps those of the catalog.
     local_background : (`~astropy.units.Quantity`, `~astropy.units.Quantity`), optional
         Inner and outer radius of an annulus whose sigma-clipped median is subtracted; none by
         default.
@@ -60,15 +60,15 @@ def psf_photometry(
     Returns
     -------
     table : `~astropy.table.QTable`
-        A row for each row of the catalogue, in its order: ``id``, ``sky``, ``flux``, ``flux_err`` (uJy, for
+        A row for each row of the catalog, in its order: ``id``, ``sky``, ``flux``, ``flux_err`` (uJy, for
         noise that is not correlated; NaN where not measured), ``x_fit``, ``y_fit`` (0-based pixels), ``shift``
-        (arcsec from the catalogue's position), ``chi2`` (reduced), ``qfit``, ``cfit``, ``neighbor``
+        (arcsec from the catalog's position), ``chi2`` (reduced), ``qfit``, ``cfit``, ``neighbor``
         (whether another row is within the fitted square) and ``flags`` (photutils').
 
     Raises
     ------
     ValueError
-        If a size is not positive, the angle of the PSF is not known, or the catalogue does not fit.
+        If a size is not positive, the angle of the PSF is not known, or the catalog does not fit.
 
     Notes
     -----
@@ -122,13 +122,13 @@ def psf_photometry(
     np.fill_diagonal(distance, np.inf)
     near[rows] = (distance < side / 2).any(axis=1)
     columns = {
-        "id": (ids, "Id of the catalogue"),
-        "sky": (sky, "Position of the catalogue"),
+        "id": (ids, "Id of the catalog"),
+        "sky": (sky, "Position of the catalog"),
         "flux": (found["flux"] * FNU, "Flux of the PSF"),
         "flux_err": (found["flux_err"] * FNU, "Its error for noise that is not correlated"),
         "x_fit": (found["x_fit"], "Fitted position, 0-based"),
         "y_fit": (found["y_fit"], "Fitted position, 0-based"),
-        "shift": (shift * ANGLE, "From the position of the catalogue to the fitted one"),
+        "shift": (shift * ANGLE, "From the position of the catalog to the fitted one"),
         "chi2": (found["chi2"], "Reduced chi^2"),
         "qfit": (found["qfit"], "Sum of absolute residuals over the flux"),
         "cfit": (found["cfit"], "Residual of the central pixel over the flux"),

@@ -212,7 +212,7 @@ class TemplateFit:
         self.shift = found * self.scale
 
     def displacement(self, xy):
-        """Where templates stand less where the catalogue has them, (x, y) in pixels, at positions."""
+        """Where templates stand less where the catalog has them, (x, y) in pixels, at positions."""
         if self.offset_map is not None:
             return self.offset_map.field(*xy.T) / self.scale
         shift = np.zeros(2) if self.shift is None else self.shift / self.scale
@@ -284,7 +284,7 @@ def inner(one, other):
 
 
 def _duplicates(matrix, rows, order):
-    """Templates that equal another one's; the first in the catalogue is kept."""
+    """Templates that equal another one's; the first in the catalog is kept."""
     coo = matrix.tocoo()
     scale = np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
     same = coo.data > (1 - 1e-6) * scale[coo.row] * scale[coo.col]

@@ -41,12 +41,12 @@ class FineTemplates:
 
     @functools.cached_property
     def _points(self):
-        """Coefficients of the point source at each place, shape (k, h, w), its centre in the middle."""
+        """Coefficients of the point source at each place, shape (k, h, w), its center in the middle."""
         return np.concatenate([convolve_padded(one, self._response) for one in self.target])
 
     def points(self, weights):
         """
-        Coefficients of point sources, (m, h, w), the centre in the middle, and which is each source's, (n,).
+        Coefficients of point sources, (m, h, w), the center in the middle, and which is each source's, (n,).
 
         ``weights``, (n, k), are what each place's PSF counts for each source.
         """

@@ -38,7 +38,7 @@ class Yang2021Photometer:
     Attributes
     ----------
     kernel : `~miricigale.psf.MatchingKernel`
-        Between the two PSFs cut to 3 x 3 arcsec and normalised, with mu = 0.03 on 0.06 arcsec.
+        Between the two PSFs cut to 3 x 3 arcsec and normalized, with mu = 0.03 on 0.06 arcsec.
     scaling : float
         As given.
     aperture : float
@@ -99,7 +99,7 @@ class Yang2021Photometer:
 
     def measure(self, image, highres, segmentation, catalog):
         """
-        Measure all sources of a catalogue.
+        Measure all sources of a catalog.
 
         Parameters
         ----------

@@ -120,7 +120,7 @@ def plot_error_function(flux, sigma, *, limits=None, ax=None, colors=None):
     ax : `~matplotlib.axes.Axes`, optional
         Axes to draw on.
     colors : dict, optional
-        Colour of each band.
+        Color of each band.
 
     Returns
     -------
@@ -128,7 +128,7 @@ def plot_error_function(flux, sigma, *, limits=None, ax=None, colors=None):
     """
     ax = resolve_axes(ax)
     for k, name in enumerate(flux):
-        # neighbours differ in more than a shade
+        # neighbors differ in more than a shade
         style = {"color": (colors or {}).get(name), "ls": ("-", "--")[k % 2]}
         (line,) = ax.loglog(flux[name], sigma[name], lw=1.6, label=name, **style)
         if limits and np.isfinite(limits[name]):
@@ -236,7 +236,7 @@ def plot_relation(x, y, *, lines=(), ax=None, labels=("", ""), color=None, log=(
     labels : tuple of str, optional
         Labels of the axes.
     color : array-like, optional
-        Value by which the points are coloured.
+        Value by which the points are colored.
     log : tuple of bool, optional
         Whether each axis is logarithmic.
 

@@ -1,4 +1,4 @@
-"""Images: stretched, in colour, with segments, and image beside model and residual."""
+"""Images: stretched, in color, with segments, and image beside model and residual."""
 
 import numpy as np
 
@@ -66,18 +66,18 @@ def plot_image(
     pixel_scale : float, optional
         Arcsec per pixel.
     stretch : {"asinh", "linear"}, optional
-        How values become colours.
+        How values become colors.
     softening : float, optional
         Value at which ``"asinh"`` turns over; twice the image's own noise by default.
     limits : (float, float), optional
-        Values of the two ends of the colours; by default two sigma below the median, and
+        Values of the two ends of the colors; by default two sigma below the median, and
         the 99.7th percentile or eight sigma above it, whichever is higher.
     cmap : str, optional
-        Colours.
+        Colors.
     title : str, optional
         Title.
     colorbar : str, optional
-        If given, a colour bar with this label.
+        If given, a color bar with this label.
     center : (float, float), optional
         Pixel (x, y) of the origin of the axes; the middle by default.
 
@@ -152,7 +152,7 @@ def plot_model_residual(
     titles : tuple of str, optional
         Titles.
     unit : str, optional
-        Label of the colour bars; none are drawn without it.
+        Label of the color bars; none are drawn without it.
     center : (float, float), optional
         As in `plot_image`.
 
@@ -240,7 +240,7 @@ def plot_offsets(xy, offset, field, *, used=None, ax=None, title=None, colors=("
 
 def color_image(red, green, blue, *, scale=None, softening=8.0, stretch=6.0):
     """
-    Make a colour image whose hues do not depend on brightness.
+    Make a color image whose hues do not depend on brightness.
 
     Parameters
     ----------
@@ -248,7 +248,7 @@ def color_image(red, green, blue, *, scale=None, softening=8.0, stretch=6.0):
         Images on the same pixels. A pixel with NaN in one of them is black.
     scale : (float, float, float), optional
         Factors for the three; by default each is divided by its own noise, so that the
-        sky is grey.
+        sky is gray.
     softening, stretch : float, optional
         Q and linear stretch of Lupton et al., in units of the noise.
 
@@ -277,14 +277,14 @@ def color_image(red, green, blue, *, scale=None, softening=8.0, stretch=6.0):
         factor = 1 / sigma if scale is None else scale[k]
         scaled.append(np.nan_to_num((plane - middle) * factor, nan=0.0))
     image = make_lupton_rgb(*scaled, minimum=-1.0, stretch=stretch, Q=softening)
-    # a colour of two bands would be a wrong one
+    # a color of two bands would be a wrong one
     image[np.any(np.isnan(planes), axis=0)] = 0
     return image
 
 
 def plot_color(red, green, blue, *, ax=None, pixel_scale=1.0, title=None, center=None, **kwargs):
     """
-    Draw a colour image on axes in arcsec.
+    Draw a color image on axes in arcsec.
 
     Parameters
     ----------

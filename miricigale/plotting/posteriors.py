@@ -19,7 +19,7 @@ __all__ = [
 #: Upper limits: a bar, and an arrow down from it.
 _ARROW = {"fmt": "_", "uplims": True, "color": "tab:blue", "markersize": 10, "zorder": 4}
 
-#: Colours and markers of groups of bands, which differ in shade too.
+#: Colors and markers of groups of bands, which differ in shade too.
 _GROUPS = (("tab:blue", "o"), ("#9a3412", "D"), ("0.35", "^"))
 
 
@@ -184,7 +184,7 @@ def plot_sed_fit(
     parts : dict of str to pair of `~astropy.units.Quantity`, optional
         Further spectra by label, such as the components of the best model.
     groups : array_like of str, shape (n,), optional
-        Label of each measured band; every label has its own colour and marker. With ``parts`` or
+        Label of each measured band; every label has its own color and marker. With ``parts`` or
         ``groups`` there is a legend.
     ax : `~matplotlib.axes.Axes` or pair of them, optional
         Where to draw. One gets no residuals; without, a new figure is made.
@@ -298,7 +298,7 @@ def plot_sed_band(wave, bands, *, ax=None, rest=True, color="tab:blue", label=No
     rest : bool, optional
         Whether these are rest-frame luminosities, drawn as nu L_nu.
     color : str, optional
-        Colour.
+        Color.
     label : str, optional
         Label of the line or the outermost band.
     **kwargs

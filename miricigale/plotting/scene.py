@@ -20,7 +20,7 @@ def plot_scene(image, *, ax=None, marks=None, label="", **kwargs):
     marks : tuple of `~numpy.ndarray`, optional
         Pixel positions x and y to be marked.
     label : str, optional
-        Label of the colour bar.
+        Label of the color bar.
     **kwargs
         Passed to `~matplotlib.axes.Axes.imshow`.
 

@@ -8,7 +8,7 @@ polygon is a sum over its edges of integrals over the polar angle,
     flux / total = 1 / (2 pi) sum_edges integral F(R(phi)) dphi,
 
 where F is the enclosed fraction, a closed form (incomplete gamma function); the same with
-the first radial moment gives the centroid. Cells that the centre is near to are done
+the first radial moment gives the centroid. Cells that the center is near to are done
 like that, whatever the cusp. Elsewhere the profile is smooth over a cell and one
 evaluation with the analytic Laplacian, or Gauss-Legendre points, suffice.
 """
@@ -21,7 +21,7 @@ from miricigale.utils.compilation import njit
 
 #: Columns of a parameter row.
 PARAMETERS = (
-    *("x", "y", "total", "intensity"),  # centre, total light, central intensity per cell
+    *("x", "y", "total", "intensity"),  # center, total light, central intensity per cell
     *("xx", "xy", "yx", "yy"),  # pixel offsets to the unit circle: X = xx dx + xy dy, ...
     *("a", "b", "c"),  # w = R^2 = a dx^2 + 2 b dx dy + c dy^2
     *("power", "bn"),  # intensity ~ exp(-bn w^power), power = 1 / (2 n)
@@ -138,7 +138,7 @@ def cell(dx, dy, size, par, table, out):
     Parameters
     ----------
     dx, dy : float
-        Centre of the cell minus the source's.
+        Center of the cell minus the source's.
     size : float
         Side of the cell.
     par : array, shape (13,)
@@ -146,7 +146,7 @@ def cell(dx, dy, size, par, table, out):
     table : array, shape (5, TABLE_SIZE)
         Its enclosed light (`miricigale.profiles.sersic.light_table`).
     out : array, shape (3,)
-        Filled with the light and the offset of its centroid from the cell's centre.
+        Filled with the light and the offset of its centroid from the cell's center.
     """
     a, b, c = par[8], par[9], par[10]
     gx, gy = a * dx + b * dy, b * dx + c * dy
@@ -203,7 +203,7 @@ def cell(dx, dy, size, par, table, out):
 
 @njit(cache=True, nogil=True)
 def sersic_cells(image, par, table):
-    """Add the light of one source to an image whose pixel centres are integers."""
+    """Add the light of one source to an image whose pixel centers are integers."""
     out = np.empty(3)
     for i in range(image.shape[0]):
         for j in range(image.shape[1]):

@@ -64,7 +64,7 @@ def ellipse_to_pixels(jacobian, *, radius, axis_ratio, position_angle):
     Returns
     -------
     radius, axis_ratio, theta : `~numpy.ndarray`
-        Pixels, ratio and radians from +x towards +y.
+        Pixels, ratio and radians from +x toward +y.
     """
     direction = np.pi / 2 - np.asarray(position_angle, dtype=float)
     return ellipse_through(jacobian, radius=radius, axis_ratio=axis_ratio, direction=direction)

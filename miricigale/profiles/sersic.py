@@ -163,7 +163,7 @@ def sersic_image(shape, *, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta
     shape : tuple of int
         Rows and columns of the image.
     x, y : float
-        Centre in pixels; pixel centres are integers.
+        Center in pixels; pixel centers are integers.
     total_flux : float, optional
         Light to infinity.
     r_eff : float
@@ -173,7 +173,7 @@ def sersic_image(shape, *, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta
     axis_ratio : float, optional
         Minor over major axis.
     theta : float, optional
-        Radians from +x towards +y.
+        Radians from +x toward +y.
 
     Returns
     -------
@@ -188,7 +188,7 @@ def sersic_image(shape, *, x, y, total_flux=1.0, r_eff, n, axis_ratio=1.0, theta
 
     Notes
     -----
-    The cusp is integrated: pixels near the centre are exact sums over their edges of the
+    The cusp is integrated: pixels near the center are exact sums over their edges of the
     closed-form enclosed light, the others one evaluation with the analytic Laplacian or
     Gauss-Legendre points.
 

@@ -26,10 +26,10 @@ __all__ = [
 @njit(cache=True, nogil=True)
 def polygon_coverage(vertices, n, step, rows):
     """
-    Fraction, (n, n) by y and x, of each cell of a centred square grid that lies inside a polygon.
+    Fraction, (n, n) by y and x, of each cell of a centered square grid that lies inside a polygon.
 
     Exact along x, sampled by ``rows`` lines per cell along y; even-odd rule. ``vertices``, (m, 2), are corners
-    x, y from the grid's centre in the unit of ``step``, the side of a cell; the outline closes itself.
+    x, y from the grid's center in the unit of ``step``, the side of a cell; the outline closes itself.
     """
     m = vertices.shape[0]
     coverage = np.zeros((n, n))
@@ -83,7 +83,7 @@ def remove_plane(values, weights, *, degree=1):
     return result
 
 
-def _standardise(values, weights):
+def _standardize(values, weights):
     values = remove_plane(values, weights)
     return values / np.sqrt(np.sum(weights * values**2) / np.sum(weights))
 
@@ -131,9 +131,9 @@ def wavefront(amplitude, segments, x, y, rms, segment_fraction, rng):
     ):
         low += rng.normal() * weight * term
     weights = np.where(segments > 0, amplitude, 0.0)
-    total = math.sqrt(segment_fraction) * _standardise(single, weights)
-    total += math.sqrt(1 - segment_fraction) * _standardise(low, weights)
-    return rms * _standardise(total, weights)
+    total = math.sqrt(segment_fraction) * _standardize(single, weights)
+    total += math.sqrt(1 - segment_fraction) * _standardize(low, weights)
+    return rms * _standardize(total, weights)
 
 
 def _phases(angles, frequencies, dtype):
@@ -155,7 +155,7 @@ def matrix_dft_intensity(
     Parameters
     ----------
     pupil : `~numpy.ndarray`, shape (n, n)
-        Complex pupil function, indexed [y, x], centred.
+        Complex pupil function, indexed [y, x], centered.
     step : float
         Side of a pupil cell in m.
     wavelength : float
@@ -206,12 +206,12 @@ def ipc_transfer(fx, fy, along_x, along_y, diagonal):
     """
     Transfer function of interpixel capacitance, frequencies in cycles per pixel.
 
-    Each neighbour along x, along y and on the diagonals gets the given share of a
+    Each neighbor along x, along y and on the diagonals gets the given share of a
     pixel's charge; what they get the pixel loses.
     """
     cx, cy = np.cos(2 * np.pi * fx), np.cos(2 * np.pi * fy)
-    centre = 1.0 - 2 * along_x - 2 * along_y - 4 * diagonal
-    return centre + 2 * along_x * cx + 2 * along_y * cy + 4 * diagonal * cx * cy
+    center = 1.0 - 2 * along_x - 2 * along_y - 4 * diagonal
+    return center + 2 * along_x * cx + 2 * along_y * cy + 4 * diagonal * cx * cy
 
 
 def line_scatter(image, kernel, axis):
@@ -284,7 +284,7 @@ def radial_sums(image, x_center, y_center, radii):
 
     Pixels cut by the circle count by the part inside: by 16 chords below a radius of 12
     pixels, to first order beyond (relative error of a smooth PSF's sum below 1e-3).
-    Centre and ``radii``, (m,), in any order, are in pixels.
+    Center and ``radii``, (m,), in any order, are in pixels.
     """
     image, radii = np.ascontiguousarray(image, float), np.asarray(radii, float)
     order = np.argsort(radii)
@@ -295,7 +295,7 @@ def radial_sums(image, x_center, y_center, radii):
 
 def core_moments(data):
     """
-    Centre and rms width (cells) of a PSF's core, under a round Gaussian window as wide as it.
+    Center and rms width (cells) of a PSF's core, under a round Gaussian window as wide as it.
 
     Those of a Gaussian are its own. All of the core counts: noise in one pixel or a pattern
     of resampling changes them little, and distant wings do not enter. NaN where they do not settle.

@@ -27,7 +27,7 @@ MODEL_FILTERS = (*MIRI_FILTERS, *NIRCAM_FILTERS, *WFC3_FILTERS)
 #: wider one is told (real mosaics are some percent wider than the models).
 _OTHER_WIDTH, _NARROWER, _WIDER = 1.5, 0.05, 0.15
 #: How far a sum may be from the fraction of light that the model's grid holds to be taken for it, and
-#: the sum from which on a PSF counts as normalised on its own grid.
+#: the sum from which on a PSF counts as normalized on its own grid.
 _NEAR_SUM, _UNIT_SUM = 0.05, 0.995
 #: Least strength of the spikes in the detector's axes, in units of the model's, and by how much and how
 #: many standard deviations it must exceed that of spikes turned to the sky.

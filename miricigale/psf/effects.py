@@ -74,7 +74,7 @@ def cruciform_fraction(filter_name, *, calibration="flight"):
 
 def cruciform_shift(x, y):
     """
-    Offset of the cruciform's centre from the source, which leads to the array's middle.
+    Offset of the cruciform's center from the source, which leads to the array's middle.
 
     At 0-based pixels x, y of the full frame: the offset of the arm along the columns in x and of that along
     the rows in y, pixels; nothing at about (598, 511).

@@ -19,7 +19,7 @@ __all__ = ["encircled_energy", "fwhm", "psf_table", "radius_of_encircled_energy"
 
 def encircled_energy(psf, radius, *, pixel_scale=None):
     """
-    Fraction of a point source's light inside circles around the centre.
+    Fraction of a point source's light inside circles around the center.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ def encircled_energy(psf, radius, *, pixel_scale=None):
         Scalar or array of radii.
     pixel_scale : `~astropy.units.Quantity`, optional
         If given, the fraction is that of a sum over an image of such pixels, each taken as
-        constant over its square (the mean over all positions of the centre on a pixel).
+        constant over its square (the mean over all positions of the center on a pixel).
 
     Returns
     -------

@@ -19,7 +19,7 @@ def psf_grid(psfs, positions):
     Parameters
     ----------
     psfs : sequence of `~photutils.psf.ImagePSF`
-        Centred on their middle cell, alike in shape, oversampling, frame, angle and effects.
+        Centered on their middle cell, alike in shape, oversampling, frame, angle and effects.
     positions : array_like, shape (n, 2)
         Where on the image they hold, 0-based pixels x, y; all points of a rectangular grid
         of at least 2 x 2.
@@ -48,7 +48,7 @@ def psf_grid(psfs, positions):
     for i, psf in enumerate(psfs):
         ny, nx = psf.data.shape
         if not np.allclose(psf.origin, ((nx - 1) / 2, (ny - 1) / 2)):
-            raise argument_error("psfs", "centred on the middle", f"{psf.origin} (psfs[{i}])")
+            raise argument_error("psfs", "centered on the middle", f"{psf.origin} (psfs[{i}])")
     return PSFGrid(psfs, positions)
 
 
@@ -57,8 +57,8 @@ def miri_psf_grid(filter, *, n_psfs=9, subarray="FULL", positions=None, **option
     PSFs of the MIRI imager over the field.
 
     What varies from place to place: the pixel, by the distortion of the SIAF (its sides,
-    0.107 to 0.1114 arcsec, its turn by -0.7 to 0.5 deg, its shear), and the centre of the
-    cruciform, which shifts by up to 1.6 pixels towards the middle of the array. The wavefront
+    0.107 to 0.1114 arcsec, its turn by -0.7 to 0.5 deg, its shear), and the center of the
+    cruciform, which shifts by up to 1.6 pixels toward the middle of the array. The wavefront
     does not vary.
 
     Parameters

@@ -94,7 +94,7 @@ def hst_psf(
     Returns
     -------
     psf : `~photutils.psf.ImagePSF`
-        In the sky frame, normalised as `miri_psf`.
+        In the sky frame, normalized as `miri_psf`.
 
     Raises
     ------

@@ -217,7 +217,7 @@ class KernelField:
 
     @functools.cached_property
     def _sides(self):
-        """Pairs of places that are sides of the rim, or neighbours on a line."""
+        """Pairs of places that are sides of the rim, or neighbors on a line."""
         if self._triangles is not None:
             return self._triangles.convex_hull
         at = self._plane(self.sky)

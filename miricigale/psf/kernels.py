@@ -115,14 +115,14 @@ class MatchingKernel:
         tolerance=1e-3,
     ):
         """
-        Make the kernel by a Wiener filter that penalises roughness.
+        Make the kernel by a Wiener filter that penalizes roughness.
 
         Parameters
         ----------
         hi, lo : `~photutils.psf.ImagePSF` or `~numpy.ndarray`
             The sharp and the wide PSF. An array is taken as sampled on the image's grid
             (pixel and orientation), its sum the fraction of light it holds. Cores that do
-            not stand on the centre (by more than 0.01 pixel) are brought there, arrays with
+            not stand on the center (by more than 0.01 pixel) are brought there, arrays with
             an even number of pixels to an odd one; ``meta["centering"]`` has the shifts.
         pixel_scale : `~astropy.units.Quantity`
             Pixel of the image that is to be convolved.
@@ -134,7 +134,7 @@ class MatchingKernel:
             smoothest kernel) whose error is at most ``tolerance`` above the smallest. Kernels
             whose noise gain exceeds 1.25 times that of the Gaussian between Gaussians as wide
             as the two cores, or whose negative pixels sum to less than -1.5, are left out: PSFs with
-            noise or artefacts of resampling make those striped.
+            noise or artifacts of resampling make those striped.
         penalty : {"laplacian", "biharmonic"}, `~numpy.ndarray` or None, optional
             What is rough, as for `photutils.psf_matching.make_wiener_kernel`.
         hi_angle, lo_angle : `~astropy.units.Quantity`, optional
@@ -151,7 +151,7 @@ class MatchingKernel:
         normalize : bool, optional
             Whether the kernel has unit sum, as the paper's: fluxes then lack the light beyond
             the PSFs' grids. If not, its sum is the wide PSF's. By default a kernel is
-            normalised where it is not known what fraction of all light the wide PSF holds: for
+            normalized where it is not known what fraction of all light the wide PSF holds: for
             arrays and for PSFs made without ``enclosed``.
         tolerance : float, optional
             See ``regularization``.
@@ -174,7 +174,7 @@ class MatchingKernel:
         -----
         `~miricigale.utils.exceptions.MiricigaleWarning`
             If the automatic choice cannot keep its limits or misses the wide PSF by more than
-            0.02 of the light; if a kernel is normalised by default although more than 0.01 of
+            0.02 of the light; if a kernel is normalized by default although more than 0.01 of
             the light lies beyond a grid.
 
         References
@@ -246,8 +246,8 @@ class MatchingKernel:
         Warns
         -----
         `~miricigale.utils.exceptions.MiricigaleWarning`
-            If the kernel was normalised by more than 0.001, or its core stands more than 0.1
-            pixel off the centre: it moves images by that.
+            If the kernel was normalized by more than 0.001, or its core stands more than 0.1
+            pixel off the center: it moves images by that.
         """
         scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
         array, psfs, total = ready_arrays(array, scale, source=source, target=target)
@@ -376,7 +376,7 @@ class MatchingKernel:
         Returns
         -------
         kernel : `MatchingKernel`
-            Not renormalised: its sum is smaller by ``meta['lost']``. ``source`` and
+            Not renormalized: its sum is smaller by ``meta['lost']``. ``source`` and
             ``target`` stay as they are.
         """
         width = float(to_array(extent, ANGLE, "extent")) / self.pixel_scale.value

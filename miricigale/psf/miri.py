@@ -162,8 +162,8 @@ def miri_psf(
     position : tuple of float, optional
         Where on the array, 0-based pixels x, y: the image is then sampled by the pixel
         that the distortion makes there (its sides, turn and shear) and the cruciform's
-        centre shifted as stars in flight have it. Without a position the pixel is square
-        and the cruciform centred, as at about (598, 511) of the full frame.
+        center shifted as stars in flight have it. Without a position the pixel is square
+        and the cruciform centered, as at about (598, 511) of the full frame.
     subarray : str, optional
         Whose pixels ``position`` counts, one of `~miricigale.instrument.subarrays`.
 

@@ -30,7 +30,7 @@ class InstrumentPSF(ImagePSF):
     """
     A PSF of an instrument or a mosaic, with what must be known of it to use it.
 
-    `make_psf` makes one from any array, normalised and checked; those of the instruments are
+    `make_psf` makes one from any array, normalized and checked; those of the instruments are
     made by `miri_psf`, `nircam_psf` and `hst_psf`.
 
     Parameters
@@ -45,7 +45,7 @@ class InstrumentPSF(ImagePSF):
     oversampling : int, optional
         Cells per pixel.
     origin : tuple of float, optional
-        Cell x, y of the centre; the middle if not given.
+        Cell x, y of the center; the middle if not given.
     angle : `~astropy.units.Quantity`, optional
         Position angle of +y, east of north; 0 in the detector frame, where it has no meaning.
     includes : iterable of str, optional
@@ -147,7 +147,7 @@ class InstrumentPSF(ImagePSF):
 
     @property
     def half_width(self):
-        """Distance from the centre to the nearest edge in arcsec (float)."""
+        """Distance from the center to the nearest edge in arcsec (float)."""
         return _half_width(self.data, self.origin) * self.cell
 
     @functools.cached_property
@@ -251,12 +251,12 @@ def _cells(model, argument):
 
 def make_psf(data, *, pixel_scale, frame, oversampling=1, enclosed=None, **facts):
     """
-    Make a PSF of an array, normalised and checked.
+    Make a PSF of an array, normalized and checked.
 
     Parameters
     ----------
     data : `~numpy.ndarray`, shape (ny, nx)
-        Oversampled PSF, normalised so that the sum over the infinite plane would be
+        Oversampled PSF, normalized so that the sum over the infinite plane would be
         ``oversampling**2``: the sum of ``data`` is that times the fraction of the light
         that the grid holds. A sum of 1 on an oversampled grid is brought to that.
     pixel_scale, frame, oversampling
@@ -305,7 +305,7 @@ def make_psf(data, *, pixel_scale, frame, oversampling=1, enclosed=None, **facts
     )
     # stpsf's sums reach 1.03 at the corners of the array, where its distortion adds light
     if psf.enclosed > 1.04:
-        wanted = f"normalised to {psf.n_cells**2} over the infinite plane (or 'enclosed' given)"
+        wanted = f"normalized to {psf.n_cells**2} over the infinite plane (or 'enclosed' given)"
         raise argument_error("data", wanted, f"a sum of {data.sum():.6g}")
     if not psf.total_known:
         limit = _half_width(data, psf.origin)
@@ -326,7 +326,7 @@ def from_photutils(model, *, x=None, y=None, **options):
     Parameters
     ----------
     model : `~photutils.psf.ImagePSF` or `~photutils.psf.GriddedPSFModel`
-        Normalised as photutils asks: sum ``oversampling**2`` over the infinite plane.
+        Normalized as photutils asks: sum ``oversampling**2`` over the infinite plane.
     x, y : float, optional
         Detector position at which a gridded model is evaluated; needed for those.
     **options
@@ -362,6 +362,6 @@ def from_photutils(model, *, x=None, y=None, **options):
 
 
 def _half_width(data, origin):
-    """Cells from the centre to the nearest edge."""
+    """Cells from the center to the nearest edge."""
     x, y = (float(v) for v in origin)
     return min(x, data.shape[1] - 1 - x, y, data.shape[0] - 1 - y) + 0.5

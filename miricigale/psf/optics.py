@@ -236,7 +236,7 @@ def hst_pupil(n=256, *, angle=45.0, obscuration=0.40):
     return Pupil(amplitude * (1 - blocked), segments, diameter, 0.0)
 
 
-def _centre(pupil, opd, wavelength):
+def _center(pupil, opd, wavelength):
     """Offset of the image's core from the axis in rad (Gaussian-weighted centroid)."""
     scale = wavelength / pupil.diameter
     grid = np.linspace(-4, 4, 65) * scale
@@ -295,7 +295,7 @@ def polychromatic_psf(pupil, opd, wavelengths, *, weights=None, step, n):
 
 def _image(pupil, opd, wavelengths, step, n, weights):
     """Weighted sum of the images at some wavelengths, their core in the middle."""
-    shift = _centre(pupil, opd, float(np.average(wavelengths, weights=weights)))
+    shift = _center(pupil, opd, float(np.average(wavelengths, weights=weights)))
     axis = (np.arange(n) - (n - 1) // 2) * step * ARCSEC
     image = np.zeros((n, n))
     power = float(pupil.amplitude.sum())

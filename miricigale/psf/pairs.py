@@ -1,4 +1,4 @@
-"""What a matching kernel is made of, on one grid: centred, turned, normalised, or refused."""
+"""What a matching kernel is made of, on one grid: centered, turned, normalized, or refused."""
 
 import logging
 import warnings
@@ -23,9 +23,9 @@ def psf_pair(hi, lo, scale, *, angles, grid_angle, resampling, extent, normalize
     """
     The sharp PSF, of unit sum, and the wide one, of what it holds or of unit sum, on the pixels of an image.
 
-    Two arrays, (n, n), n odd, centred, and ``energy``, ``held`` and ``centering`` of the kernel's meta. Parameters
-    are those of `~miricigale.psf.MatchingKernel.from_psfs`, ``scale`` the pixel in arcsec, ``angles`` those of
-    the two.
+    Two arrays, (n, n), n odd, centered, and ``energy``, ``held`` and ``centering`` of the kernel's meta.
+    Parameters are those of `~miricigale.psf.MatchingKernel.from_psfs`, ``scale`` the pixel in arcsec,
+    ``angles`` those of the two.
     """
     given, psfs, centering = {"hi": hi, "lo": lo}, {}, {}
     for name, psf in given.items():
@@ -40,7 +40,7 @@ def psf_pair(hi, lo, scale, *, angles, grid_angle, resampling, extent, normalize
         if name in arrays:
             psf = _from_array(psf, name, scale, angle, grid_angle, normalize)
         psfs[name], centering[name] = centered_psf(psf, 0.01 * scale, name)
-    # pixels whose centres lie on the arrays; a PSF that is resampled reaches to its edge
+    # pixels whose centers lie on the arrays; a PSF that is resampled reaches to its edge
     half = min((psfs[k].half_width - 0.5 * scale for k in arrays), default=psfs["lo"].half_width)
     n = 2 * int(half / scale + 1e-6) + 1
     if extent is not None:
@@ -61,7 +61,7 @@ def psf_pair(hi, lo, scale, *, angles, grid_angle, resampling, extent, normalize
         if normalize and max(missing.values()) > 0.01:
             text = ", ".join(f"{value:.3f} of '{name}'" for name, value in missing.items())
             text = f"light beyond the PSFs' grids, by their own sums and wings: {text}. The kernel "
-            text += "is normalised to 1: fluxes lack what lies beyond. Give the PSFs' 'enclosed' "
+            text += "is normalized to 1: fluxes lack what lies beyond. Give the PSFs' 'enclosed' "
             warnings.warn(text + "(make_psf, read_psf) or 'normalize'", MiricigaleWarning, 3)
     energy = 1.0 if normalize else held[1]
     mended = {"energy": energy, "held": held, "centering": centering}
@@ -140,7 +140,7 @@ def ready_arrays(array, scale, **psfs):
     c = array.shape[0] // 2
     x, y, _ = _core.core_moments(array)
     if not np.hypot(x - c, y - c) < 0.1:
-        said.append(f"stands ({x - c:.2f}, {y - c:.2f}) pixels off the centre")
+        said.append(f"stands ({x - c:.2f}, {y - c:.2f}) pixels off the center")
     for text in said:
         warnings.warn(f"the matching kernel {text}", MiricigaleWarning, stacklevel=3)
     images = {}

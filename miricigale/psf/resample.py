@@ -150,7 +150,7 @@ def psf_image(psf, *, pixel_scale, shape, offset=(0.0, 0.0)):
     """
     Sample a PSF on another pixel grid of the same orientation.
 
-    The PSF is evaluated at the pixels' centres and scaled by the ratio of the areas;
+    The PSF is evaluated at the pixels' centers and scaled by the ratio of the areas;
     no further pixel response is applied (see `psf_mosaic` for that).
 
     Parameters
@@ -160,9 +160,9 @@ def psf_image(psf, *, pixel_scale, shape, offset=(0.0, 0.0)):
     pixel_scale : `~astropy.units.Quantity`
         Side of a pixel of the image.
     shape : int or tuple of int
-        Rows and columns; the PSF's centre is the middle of the image.
+        Rows and columns; the PSF's center is the middle of the image.
     offset : tuple of float, optional
-        Shift of the centre in x, y, in pixels of the image.
+        Shift of the center in x, y, in pixels of the image.
 
     Returns
     -------
@@ -294,10 +294,10 @@ def centered_psf(psf, tolerance, argument="psf"):
     x, y, _ = _core.core_moments(psf.data)
     offset = tuple(float(v) for v in ([x, y] - psf.origin) * psf.cell)
     if not np.hypot(*offset) < 0.5 * psf.half_width:
-        wanted = "a PSF whose core stands near its centre"
+        wanted = "a PSF whose core stands near its center"
         raise argument_error(argument, wanted, f"a core at x, y = {x:.4g}, {y:.4g}")
     if np.hypot(*offset) <= tolerance:
         return psf, (0.0, 0.0)
-    text = "'%s': the core stood (%.4f, %.4f) arcsec off the centre and was brought there"
+    text = "'%s': the core stood (%.4f, %.4f) arcsec off the center and was brought there"
     _log.info(text, argument, *offset)
     return psf.replaced(origin=(x, y)), offset

@@ -48,7 +48,7 @@ def _pixel_scale(images, pixel_scale):
     return float(np.sqrt(np.prod(sides))) * 3600
 
 
-def _catalogues(images, stars):
+def _catalogs(images, stars):
     """One table of ``x`` and ``y`` for each image."""
     tables = _as_list(stars, Table)
     if len(tables) == 1 and "sky" in tables[0].colnames:
@@ -111,7 +111,7 @@ def psf_from_stars(
     Measure the PSF from stars in one or several (dithered) images.
 
     Photutils' `~photutils.psf.EPSFBuilder` stacks the residuals of all stars on a finer grid,
-    centred on their fitted positions, until the positions settle. Each star in each image
+    centered on their fitted positions, until the positions settle. Each star in each image
     counts by itself: errors of the pointings do not widen the PSF.
 
     Parameters
@@ -174,7 +174,7 @@ def psf_from_stars(
     size = 2 * round(0.5 * width / scale - 0.5) + 1
     if not size >= 7:
         raise argument_error("fov", f"at least 7 pixels of {scale:.4g} arcsec", fov)
-    stamps, wanted = _stamps(images, _catalogues(images, stars), size)
+    stamps, wanted = _stamps(images, _catalogs(images, stars), size)
     least = max(2, oversampling**2)
     if len(stamps) < least:
         raise argument_error("stars", f"at least {least} with stamps on the images", len(stamps))

@@ -23,7 +23,7 @@ __all__ = [
 
 _log = logging.getLogger(__name__)
 
-#: Regularisation parameters that have a name; they belong to pixels of 0.06 arcsec.
+#: Regularization parameters that have a name; they belong to pixels of 0.06 arcsec.
 REGULARIZATIONS = {"yang2021": 0.03}
 
 # the second and fourth derivatives
@@ -94,7 +94,7 @@ def energy_radii(image):
 
 
 def energy_error(image, target, radii):
-    """Encircled energy of an image minus that of another, both centred, at radii in pixels."""
+    """Encircled energy of an image minus that of another, both centered, at radii in pixels."""
     c = target.shape[0] // 2
     return _core.radial_sums(image - target, c, c, radii)
 

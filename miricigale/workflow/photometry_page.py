@@ -31,7 +31,7 @@ _MEANING = {
     ForcedFlags.NOISY_SEGMENT: "a point source, for the segment is too noisy",
     ForcedFlags.SHARED_SEGMENT: "a point source, for the segment is another one's",
     ForcedFlags.POOR_FIT: "residuals above the noise: another shape, another PSF, a neighbor",
-    ForcedFlags.UNEXPLAINED_NEIGHBOUR: "light nearby that no source explains",
+    ForcedFlags.UNEXPLAINED_NEIGHBOR: "light nearby that no source explains",
 }
 
 

@@ -161,13 +161,13 @@ def test_poor_fits_and_unexplained_neighbours_are_flagged(tools):
     result = photometer.measure(image, catalog=QTable({"sky": sky}))
     assert result.snr.min() > 100
     assert flagged(result, ForcedFlags.POOR_FIT).tolist() == [False, True, True, False]
-    neighbour = flagged(result, ForcedFlags.UNEXPLAINED_NEIGHBOUR)
+    neighbour = flagged(result, ForcedFlags.UNEXPLAINED_NEIGHBOR)
     assert neighbour.tolist() == [False, False, True, False]
     # with all sources in the catalogue nothing is left
     ra, dec = (np.concatenate([getattr(a, n).deg for a in (sky, more)]) for n in ("ra", "dec"))
     catalog = QTable({"sky": SkyCoord(ra, dec, unit="deg")})
     result = photometer.measure(image, catalog=catalog)
-    assert not flagged(result, ForcedFlags.UNEXPLAINED_NEIGHBOUR).any()
+    assert not flagged(result, ForcedFlags.UNEXPLAINED_NEIGHBOR).any()
     assert flagged(result, ForcedFlags.POOR_FIT).tolist() == [False, True, *[False] * 4]
 
 

@@ -84,7 +84,7 @@ def test_second_pass_finds_what_the_catalogue_lacks(tools, crowd, moved):
     assert abs(np.median(ratio[companion]) - 1) < 0.005
     pulls = (result.flux.value - crowd.flux) / result.flux_err.value
     assert 0.85 < pulls.std() < 1.15
-    assert not flagged(result.flags, ForcedFlags.UNEXPLAINED_NEIGHBOUR).any()
+    assert not flagged(result.flags, ForcedFlags.UNEXPLAINED_NEIGHBOR).any()
     # the errors are those of a catalogue that has them all
     full = ForcedPhotometer(tools.kernel, template="psf").measure(
         crowd.image, catalog=QTable({"sky": joined(crowd.sky, crowd.hidden)})

@@ -263,7 +263,7 @@ def test_wrong_arguments_are_named():
         encircled_energy(psf, 3 * u.arcsec)
     with pytest.raises(ValueError, match="'fraction' must be positive and at most"):
         radius_of_encircled_energy(psf, 1.5)
-    with pytest.raises(ValueError, match="'data' must be normalised to 4"):
+    with pytest.raises(ValueError, match="'data' must be normalized to 4"):
         make_psf(np.ones((9, 9)), pixel_scale=1 * u.arcsec, oversampling=2, frame="sky")
     bare = ImagePSF(np.ones((9, 9)) / 81)
     with pytest.raises(ValueError, match="from_photutils"):

@@ -89,7 +89,7 @@ def test_off_centre_psfs_keep_their_angles():
 
 
 def test_core_that_is_nowhere_near_the_centre_is_refused():
-    with pytest.raises(ValueError, match="'lo' must be a PSF whose core stands near its centre"):
+    with pytest.raises(ValueError, match="'lo' must be a PSF whose core stands near its center"):
         MatchingKernel.from_psfs(gaussian(51, HI), gaussian(51, LO, 15.0, 0.0), pixel_scale=SCALE)
 
 
@@ -260,7 +260,7 @@ def test_ready_kernels_are_taken(tmp_path):
         MatchingKernel.from_array(2 * array / array.sum(), pixel_scale=SCALE)
     with pytest.raises(ValueError, match="'array' must be square with an odd number"):
         MatchingKernel.from_array(expected_kernel(40), pixel_scale=SCALE)
-    with pytest.warns(MiricigaleWarning, match=r"stands \(1\.00, 0\.00\) pixels off the centre"):
+    with pytest.warns(MiricigaleWarning, match=r"stands \(1\.00, 0\.00\) pixels off the center"):
         MatchingKernel.from_array(np.roll(array, 1, axis=1), pixel_scale=SCALE)
     with pytest.raises(ValueError, match="'source' must be a PSF of the kernel's shape"):
         MatchingKernel.from_array(array, pixel_scale=SCALE, source=gaussian(51, HI))

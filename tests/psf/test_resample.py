@@ -280,7 +280,7 @@ def test_reads_any_fits_image(tmp_path):
     assert one.enclosed == pytest.approx(0.9)
     with pytest.raises(ValueError, match="a file with a 2D image in extension 0"):
         read_psf(path, **kind)
-    with pytest.raises(ValueError, match="'data' must be normalised to 16"):
+    with pytest.raises(ValueError, match="'data' must be normalized to 16"):
         read_psf(path, ext=1, plane=1, **kind)
 
 

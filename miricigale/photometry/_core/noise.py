@@ -10,7 +10,7 @@ def autocorrelation(rows, usable, lag, map_parts=map):
     """
     Mean product of pixel pairs by separation, over usable pixels, and its statistical error.
 
-    Both of shape (2 lag + 1, 2 lag + 1), lag (0, 0) in the middle; symmetric through the centre.
+    Both of shape (2 lag + 1, 2 lag + 1), lag (0, 0) in the middle; symmetric through the center.
     ``rows(slice)`` are rows of the whitened residual (data minus model, over sigma), ``map_parts`` is called
     as `map` to work in threads.
     """

@@ -37,7 +37,7 @@ def box_response(shape, sides):
 
 def convolve_batch(stamps, transfer, shape):
     """
-    Convolve stamps, (n, ny, nx), with one kernel given by its transform, its centre where that has it.
+    Convolve stamps, (n, ny, nx), with one kernel given by its transform, its center where that has it.
 
     Stamps are zero-padded at their far ends to ``shape``, on which the result, (n, *shape), is periodic.
     """
@@ -77,7 +77,7 @@ def _quintic(position, node, weight):
 @njit(cache=True, nogil=True)
 def sample_stamps(coefficients, which, amplitude, center, poly, box, start, out):
     """
-    Add splines evaluated at the centres of target pixels, as fractions per target pixel.
+    Add splines evaluated at the centers of target pixels, as fractions per target pixel.
 
     Parameters
     ----------

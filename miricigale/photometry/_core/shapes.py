@@ -26,7 +26,7 @@ def _table():
     indices = np.exp(np.arange(low - 2 * _INDEX_STEP, high + 2.5 * _INDEX_STEP, _INDEX_STEP))
     step = _STEP / 2
     log_r = (np.arange(2048) - 1023.5) * step
-    log_k = log_r  # reciprocal grids, centred on 1
+    log_k = log_r  # reciprocal grids, centered on 1
     rows = np.empty((len(indices), _NODES))
     at = _START + _STEP * np.arange(_NODES)
     for row, n in zip(rows, indices, strict=True):
@@ -122,13 +122,13 @@ def shape_models(psf, size, shape, parameters, *, derivatives=6):
     Parameters
     ----------
     psf : complex `~numpy.ndarray`, shape (size, size // 2 + 1)
-        Transform of the PSF, its centre on the first pixel.
+        Transform of the PSF, its center on the first pixel.
     size : int
         Size of the transform; images are periodic on it.
     shape : (int, int)
         Shape of the images returned, a corner of the transform's.
     parameters : sequence of 6 floats
-        Centre x and y, ln of the circularised half-light radius (pixels), ln of the
+        Center x and y, ln of the circularised half-light radius (pixels), ln of the
         index, and the ellipticity ln(major / minor) (cos 2 theta, sin 2 theta).
     derivatives : {6, 2, 0}, optional
         How many of the derivatives are wanted.

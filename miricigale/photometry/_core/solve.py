@@ -10,7 +10,7 @@ __all__ = ["block_covariance", "factorize"]
 
 def factorize(matrix):
     """
-    Factorise a symmetric positive sparse matrix after scaling it to a unit diagonal.
+    Factorize a symmetric positive sparse matrix after scaling it to a unit diagonal.
 
     A function that solves for a vector or a matrix of right-hand sides.
 
