@@ -10,7 +10,7 @@ from astropy.table import Table
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import require_columns, unique_ids
 
-__all__ = ["OPTIONAL", "CatalogSources", "catalog_sources", "sersic_rows"]
+__all__ = ["OPTIONAL", "CatalogSources", "catalog_sources", "joined_sky", "sersic_rows"]
 
 #: Columns of a catalog that need not be there, and that templates keep.
 OPTIONAL = ("flux", "components")
@@ -80,3 +80,10 @@ def sersic_rows(catalog):
     if "profile" in catalog.colnames:
         rows[np.asarray(catalog["profile"]) != "sersic"] = np.nan
     return rows
+
+
+def joined_sky(skies):
+    """Positions (ICRS) one after the other."""
+    skies = [sky.icrs for sky in skies]
+    angles = (np.concatenate([getattr(sky, one).deg for sky in skies]) for one in ("ra", "dec"))
+    return SkyCoord(*angles, unit="deg")

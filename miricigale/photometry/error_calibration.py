@@ -10,7 +10,7 @@ from astropy.table import QTable
 
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
-from miricigale.utils.tables import require_columns
+from miricigale.utils.tables import described_table, require_columns
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import FNU
 
@@ -88,10 +88,9 @@ class ErrorCalibration:
         pull = (flux[good] - true[good]) / error[good]
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = flux[good] / true[good] - 1.0
-        rows = [_row(snr, pull, ratio, member) for member in _members(snr)]
-        bins = QTable(rows=rows, names=list(_COLUMNS))
-        for name, text in _COLUMNS.items():
-            bins[name].info.description = text
+        rows = zip(*(_row(snr, pull, ratio, member) for member in _members(snr)), strict=True)
+        columns = zip(_COLUMNS, rows, _COLUMNS.values(), strict=True)
+        bins = described_table({name: (list(values), text) for name, values, text in columns})
         return cls(sources, bins, provenance(source="injection", **meta))
 
     def factor(self, flux, flux_err_noise):

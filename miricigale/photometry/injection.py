@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 import scipy.ndimage
-from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.table import QTable, vstack
 from photutils.segmentation import SegmentationImage
 
 from miricigale.photometry.arrays import image_arrays, pixel_scale
+from miricigale.photometry.catalogs import joined_sky
 from miricigale.photometry.cutouts import Cutout
 from miricigale.photometry.detection import bright_centroids
 from miricigale.photometry.error_calibration import ErrorCalibration
@@ -235,7 +235,7 @@ class _Field:
         light = self.photometer.render(self.image, new.light, new.flux * FNU)
         image = _with_data(self.image, self.image.data + light.to_value(self.image.unit))
         nothing = self.image.wcs.pixel_to_world(*empty.T).transform_to(self.sky.frame)
-        both = QTable({"sky": _joined([self.sky, new.catalog["sky"], nothing])})
+        both = QTable({"sky": joined_sky([self.sky, new.catalog["sky"], nothing])})
         if self.own is not None:
             both["label"] = np.concatenate(
                 [self.own, new.catalog["label"], np.zeros(len(empty), int)]
@@ -332,9 +332,3 @@ def _with_data(image, data):
         data, unit=image.unit, wcs=image.wcs, mask=image.mask, uncertainty=image.uncertainty,
         meta=dict(image.meta),
     )  # fmt: skip
-
-
-def _joined(skies):
-    skies = [sky.icrs for sky in skies]
-    angles = (np.concatenate([getattr(sky, one).deg for sky in skies]) for one in ("ra", "dec"))
-    return SkyCoord(*angles, unit="deg")

@@ -29,7 +29,7 @@ class ResidualPeaks:
 
 def residual_peaks(residual, model, inverse_sigma, width, xy, *, new=None, executor=None):
     """
-    Find positive peaks of the residual that are sources of their own.
+    Find positive peaks of the residual that are sources of their own (`ResidualPeaks`).
 
     Parameters
     ----------
@@ -45,10 +45,6 @@ def residual_peaks(residual, model, inverse_sigma, width, xy, *, new=None, execu
         Makes an image of zeros like the residual.
     executor : `concurrent.futures.Executor`, optional
         Threads to work with.
-
-    Returns
-    -------
-    peaks : `ResidualPeaks`
 
     Notes
     -----

@@ -11,7 +11,7 @@ from photutils.psf import ImagePSF
 from photutils.segmentation import SegmentationImage
 
 from miricigale.photometry.arrays import image_arrays, pixel_scale
-from miricigale.photometry.catalogs import OPTIONAL, catalog_sources, sersic_rows
+from miricigale.photometry.catalogs import OPTIONAL, catalog_sources, joined_sky, sersic_rows
 from miricigale.photometry.cutouts import Cutout, own_segments, sersic_cutouts
 from miricigale.photometry.light import FineImage, cutouts
 from miricigale.photometry.priors import check_labels, labels_at
@@ -319,7 +319,7 @@ class SourceTemplates:
         meta["template"] = ", ".join(names)
         return cls(
             id=joined("id"),
-            sky=SkyCoord(*(np.concatenate([getattr(p.sky, c).deg for p in parts]) for c in _ANGLES), unit="deg"),
+            sky=joined_sky([one.sky for one in parts]),
             light=sum((one.light for one in parts), ()),
             sersic=joined("sersic"), flags=joined("flags"), snr=joined("snr"), fitted=joined("fitted"),
             wcs=grids[0] if grids else None, psf=psfs[0] if psfs else None,
@@ -392,9 +392,6 @@ class SourceTemplates:
 
         wcs = None if state["wcs"] is None else text_grid(state["wcs"])
         self.__dict__.update({**state, "wcs": wcs})
-
-
-_ANGLES = ("ra", "dec")
 
 
 def _segments(segmentation, shape):

@@ -47,32 +47,24 @@ class TemplateFit:
     ----------
     scale : float
         Arcsec per pixel.
-    bank
-        The templates where they were fitted.
+    bank, fit, free
+        The templates where they were fitted; the solution (`LinearFit`, None without rows); that with
+        templates that may change (`FreeTemplates` or None), whose fluxes are ``flux`` then.
     flux : `~numpy.ndarray`, shape (n,)
         uJy, in the order of the bank's rows as all that follows; zero where not fitted.
     rows : int `~numpy.ndarray`
         Rows that were fitted.
-    degenerate, noisy : bool `~numpy.ndarray`, shape (n,)
-        Templates that equal another's; those whose power is mostly noise.
-    inseparable : bool `~numpy.ndarray`, shape (n,)
-        Second components that cannot be told from the first.
+    degenerate, noisy, inseparable : bool `~numpy.ndarray`, shape (n,)
+        Templates that equal another's; those whose power is mostly noise; second components that
+        cannot be told from the first.
     pairs : int `~numpy.ndarray`, shape (k, 2)
         Rows of the two components of the sources that have two.
-    power : `~numpy.ndarray`, shape (n,)
-        Sums of squares of the templates.
-    light : `~numpy.ndarray`, shape (n, 2)
-        Fractions of the templates on the image, and on its usable pixels.
+    power, light : `~numpy.ndarray`, shape (n,) and (n, 2)
+        Sums of squares of the templates; their fractions on the image, and on its usable pixels.
     columns : list of `~numpy.ndarray`
         The common parameters' images: the background's first, then those of the shift.
-    fit : `~miricigale.photometry.errors.LinearFit` or None
-        The solution; None without rows.
-    free : `~miricigale.photometry.free_templates.FreeTemplates` or None
-        The solution with templates that may change, after `free_templates`; its fluxes are ``flux`` then.
-    shift : `~numpy.ndarray`, shape (2,), or None
-        In arcsec.
-    offset_map : `~miricigale.photometry.offsets.OffsetMap` or None
-        The map by which templates are moved.
+    shift, offset_map
+        In arcsec, shape (2,), and the `OffsetMap` by which templates are moved; None without.
     """
 
     def __init__(self, arrays, bank, settings, *, host=None, moved=None, search=None):

@@ -187,21 +187,17 @@ class TemplateBank:
     """
     All templates of an image, made block by block and kept only if there is room.
 
-    Rows are in the order of the stamps' first image rows, ``order`` gives the source of
-    each.
+    Rows are in the order of the stamps' first image rows, ``order`` gives the source of each.
 
     Parameters
     ----------
-    fine : `FineTemplates`
-        What convolves.
-    sources : `BankSources`
-        What stands where.
+    fine, sources : `FineTemplates`, `BankSources`
+        What convolves, and what stands where.
     shape : (int, int)
         Shape of the image.
-    radius : float, optional
-        Largest half-width of a stamp in image pixels.
-    max_bytes : float, optional
-        Memory for stamps; if they need more they are made anew whenever needed.
+    radius, max_bytes : float, optional
+        Largest half-width of a stamp in image pixels; memory for stamps: if they need more they are made
+        anew whenever needed.
     weigh : callable, optional
         Called with positions on the image, shape (m, 2): what the kernel of each place counts there,
         shape (m, k). Needed for several kernels.
