@@ -15,8 +15,9 @@ from miricigale.filters import Filter
 from miricigale.photometry.grids import grid_angle
 from miricigale.photometry.mosaics import MosaicFile
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
-from miricigale.utils.files import split_extension, writing
+from miricigale.utils.files import split_extension
 from miricigale.utils.progress import progress
+from miricigale.utils.store import replacing
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import to_array
 from miricigale.workflow.kernel_files import can_be_modeled, file_place, matching_kernel
@@ -182,13 +183,14 @@ def measure_files(
         for path in written:
             path.parent.mkdir(parents=True, exist_ok=True)
         if output is not None:
-            with writing(output), warnings.catch_warnings():
+            with replacing(output, overwrite=overwrite) as partial, warnings.catch_warnings():
                 # keywords of more than eight letters
                 warnings.simplefilter("ignore", VerifyWarning)
-                table.write(output, overwrite=overwrite)
+                table.write(partial)
         for path, picture in ((model, result.model_image), (residual, result.residual_image)):
             if path is not None:
-                write_image(picture, path)
+                with replacing(path) as partial:
+                    write_image(picture, partial)
         if page is not None:
             from miricigale.workflow.photometry_page import photometry_page
 

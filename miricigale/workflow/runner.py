@@ -20,7 +20,7 @@ from miricigale.workflow.stage import run_unit
 from miricigale.workflow.store import CONFIG, ProductStore
 from miricigale.workflow.warmup import JOBS, compile_apart, describe_job, is_compiled
 
-__all__ = ["StudyRunner", "run_stages"]
+__all__ = ["StudyRunner"]
 
 log = logging.getLogger(__name__)
 # shown by the command line at any verbosity
@@ -415,8 +415,3 @@ def check_disk(folder, needed):
     if needed > free:
         msg = f"the run needs about {needed / 1e9:.2f} GB in {folder}, only {free / 1e9:.2f} GB are free"
         raise DataError(msg)
-
-
-def run_stages(config, folder, stages, **options):
-    """Run ``stages`` in ``folder``; see `StudyRunner`."""
-    return StudyRunner(config, folder, stages, **options).run()

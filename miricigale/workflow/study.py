@@ -11,7 +11,7 @@ from miricigale.instrument import background_level, imager_filters
 from miricigale.scene import read_catalog
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.config import HighresSection
-from miricigale.workflow.runner import run_stages
+from miricigale.workflow.runner import StudyRunner
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.exposures import grid_of, study_exposures
 
@@ -143,7 +143,7 @@ def run_study(config, folder, *, executor=None, redo=False, progress_bar=False):
         If the configuration names what does not exist or leaves nothing to do.
     """
     check_study(config)
-    store = run_stages(
+    runner = StudyRunner(
         config,
         folder,
         study_stages,
@@ -152,4 +152,4 @@ def run_study(config, folder, *, executor=None, redo=False, progress_bar=False):
         disk=disk_use(config),
         progress_bar=progress_bar,
     )
-    return store.path("report/index.html")
+    return runner.run().path("report/index.html")
