@@ -42,8 +42,10 @@ COLOR_BANDS = {
 #: Rest-frame colors: name to the two bands.
 COLORS = {"nuv_r": ("nuv", "r"), "u_v": ("u", "v"), "v_j": ("v", "j")}
 
-#: Roles whose parameters shape the stars with their gas, and what lies between source and us.
+#: Roles whose parameters together shape stars with their gas, the parts of a galaxy, and what lies
+#: between the source and us.
 STELLAR = ("sfh", "stellar", "nebular")
+GALAXY = (STELLAR, ("attenuation",), ("dust",))
 SKY = ("igm", "foreground")
 KEPT = 128  # stars of so many histories are kept
 

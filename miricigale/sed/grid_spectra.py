@@ -4,6 +4,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.filters import FilterSet
+from miricigale.sed.chain import GALAXY
 from miricigale.sed.spectrum import distance
 from miricigale.sed.tables import dilution
 from miricigale.utils.exceptions import argument_error
@@ -19,14 +20,7 @@ __all__ = [
 
 
 def check_model(model, grid):
-    """
-    Refuse a model that is not the one of the grid, as far as the grid says what it was.
-
-    Raises
-    ------
-    ValueError
-        If components, options or definitions differ.
-    """
+    """Refuse a model that is not the one of the grid, as far as the grid says what it was."""
     recipe = model.recipe
     for name, value in grid.recipe.items():
         if recipe.get(name) != value:
@@ -38,7 +32,7 @@ def check_model(model, grid):
 def plain_index(grid, index):
     """Indices of models with those that make no difference set to 0: shape (..., 4)."""
     index = np.array(index)
-    # without AGN light all tori are the same
+    # without AGN light all AGN models are the same
     dark = grid.frac_agn[index[..., 3]] == 0.0
     index[..., 2] = np.where(dark, 0, index[..., 2])
     return index
@@ -46,20 +40,9 @@ def plain_index(grid, index):
 
 def band_names(grid, filters):
     """
-    Names of the bands asked for, and those that the grid has not.
+    Names of the bands asked for (None: those of the grid), and those that the grid has not.
 
-    Parameters
-    ----------
-    grid : `~miricigale.sed.ModelGrid`
-        The grid.
-    filters : list of str or `~miricigale.filters.FilterSet` or None
-        Bands; None: those of the grid.
-
-    Returns
-    -------
-    names : list of str
-    extra : dict of str to `~miricigale.filters.Filter` or None
-        Those that are not in the grid; None where only a name was given.
+    The latter as a dict of name to `~miricigale.filters.Filter`, None where only a name was given.
     """
     if filters is None:
         return list(grid.filters), {}
@@ -72,25 +55,12 @@ def band_names(grid, filters):
 
 def draw_fluxes(grid, index, scale, names, extra, model):
     """
-    Fluxes of drawn models.
+    Fluxes of drawn models in uJy, shape (n, n_draws, n_filters).
 
-    Parameters
-    ----------
-    grid : `~miricigale.sed.ModelGrid`
-        The grid.
-    index : `~numpy.ndarray` of int, shape (n, n_draws, 4)
-        Redshift, galaxy, torus and AGN fraction; none is missing but tori of no AGN.
-    scale : `~numpy.ndarray`, shape (n, n_draws)
-        Solar masses formed.
-    names, extra
-        From `band_names`.
-    model : `~miricigale.sed.SEDModel` or None
-        The model of the grid, for bands that this has not.
-
-    Returns
-    -------
-    fluxes : `~numpy.ndarray`, shape (n, n_draws, n_filters)
-        In uJy.
+    ``index``, shape (n, n_draws, 4), numbers redshift, galaxy, AGN model and AGN fraction of each,
+    none of them missing but AGN models at no fraction; ``scale``, shape (n, n_draws), is in Msun
+    formed; ``names`` and ``extra`` come from `band_names`; ``model`` is that of the grid, for bands
+    that this has not, or None.
     """
     out = np.full((*scale.shape, len(names)), np.nan)
     own = [i for i, name in enumerate(names) if name in grid.filters]
@@ -113,21 +83,7 @@ def model_fluxes(model, grid, index, filters):
     """
     Fluxes in any bands of models of a grid, each different one evaluated once.
 
-    Parameters
-    ----------
-    model : `~miricigale.sed.SEDModel`
-        The model the grid was made from.
-    grid : `~miricigale.sed.ModelGrid`
-        The grid.
-    index : `~numpy.ndarray` of int, shape (..., 4)
-        Redshift, galaxy, torus and AGN fraction.
-    filters : iterable of `~miricigale.filters.Filter`
-        The bands.
-
-    Returns
-    -------
-    fluxes : `~numpy.ndarray`, shape (..., n_filters)
-        In uJy for each solar mass formed.
+    In uJy for each solar mass formed, shape (..., n_filters), for ``index`` of shape (..., 4).
     """
     filters = FilterSet(list(filters))
     rows = plain_index(grid, index).reshape(-1, 4)
@@ -154,18 +110,14 @@ def model_fluxes(model, grid, index, filters):
 def _factors(model, grid, index):
     """L_nu in W/Hz of different galaxies (per solar mass) and tori (per W), and their places."""
     chain = model.chain
-    defaults = {name: parameter.default for name, parameter in model.parameters.items()}
     galaxies, galaxy = np.unique(index[:, 1], return_inverse=True)
     tori, torus = np.unique(index[:, 2], return_inverse=True)
-    light = np.array(
-        [
-            chain.galaxy(defaults | _row(model, grid.galaxy_parameters, g)).light
-            for g in galaxies.tolist()
-        ]
-    )
+    rows = [_row(model, grid.galaxy_parameters, g) for g in galaxies.tolist()]
+    keys = [[chain.key(row, *roles) for row in rows] for roles in GALAXY]
+    light, _ = chain.attenuated(chain.stars(keys[0]), *keys[1:])
     nuclei = np.zeros((1, chain.wave.size))
     if grid.n_agn and np.any(grid.frac_agn[index[:, 3]] > 0):
-        parts = [chain.agn(defaults | _row(model, grid.agn_parameters, k)) for k in tori.tolist()]
+        parts = [chain.agn(_row(model, grid.agn_parameters, k)) for k in tori.tolist()]
         nuclei = np.array([part.total for part in parts])
         if model.frac_agn_definition != "dust":
             nuclei = nuclei / chain.infrared(nuclei)[:, None]
@@ -175,33 +127,18 @@ def _factors(model, grid, index):
 
 
 def _row(model, table, row):
-    """Parameters of one row as plain numbers in the model's units."""
-    return {
+    """Parameters of one row as plain numbers in the model's units, with defaults for the others."""
+    return model.defaults | {
         name: float(model.parameters[name].convert(table[name][row])) for name in table.colnames
     }
 
 
 def rest_spectra(model, grid, index, scale):
     """
-    Rest-frame spectra of models of a grid.
+    Rest-frame spectra of models of a grid, without absorption outside of the galaxy.
 
-    Parameters
-    ----------
-    model : `~miricigale.sed.SEDModel`
-        The model the grid was made from.
-    grid : `~miricigale.sed.ModelGrid`
-        The grid.
-    index : `~numpy.ndarray` of int, shape (n, 4)
-        Redshift, galaxy, torus and AGN fraction.
-    scale : `~numpy.ndarray`, shape (n,)
-        Solar masses formed.
-
-    Returns
-    -------
-    wave : `~numpy.ndarray`, shape (n_wave,)
-        Rest wavelengths in um.
-    lnu : `~numpy.ndarray`, shape (n, n_wave)
-        L_nu in W/Hz, without absorption outside of the galaxy.
+    For ``index`` of shape (n, 4) and ``scale``, shape (n,), in Msun formed: wavelengths in um, and L_nu
+    in W/Hz, shape (n, n_wave).
     """
     index = plain_index(grid, index)
     light, galaxy, nuclei, torus = _factors(model, grid, index)
@@ -213,26 +150,18 @@ def rest_spectra(model, grid, index, scale):
 
 def observed_spectra(model, grid, index, scale):
     """
-    Observed spectra of models of a grid, on one grid of wavelengths.
+    Observed spectra of models of a grid, with absorption between the galaxies and in the Milky Way.
 
-    Parameters are those of `rest_spectra`.
-
-    Returns
-    -------
-    wave : `~numpy.ndarray`, shape (n_wave,)
-        Observed wavelengths in um that all models cover.
-    fnu : `~numpy.ndarray`, shape (n, n_wave)
-        F_nu in uJy, with absorption between the galaxies and in the Milky Way.
+    As `rest_spectra`, but observed wavelengths that all models cover, and F_nu in uJy.
     """
     rest, lnu = rest_spectra(model, grid, index, scale)
     redshift = grid.redshift[index[:, 0]]
     wave = rest * (1.0 + np.median(redshift))
     low, high = rest[0] * (1.0 + redshift.max()), rest[-1] * (1.0 + redshift.min())
     wave = wave[(wave >= low) & (wave <= high)]
-    defaults = {name: parameter.default for name, parameter in model.parameters.items()}
     out = np.empty((redshift.size, wave.size))
     for z in np.unique(redshift):
-        sky = model.chain.sky(defaults | {"redshift": float(z)})
+        sky = model.chain.sky(model.defaults | {"redshift": float(z)})
         factor = sky * float(dilution(z, distance(z, model.cosmology)))
         for row in np.flatnonzero(redshift == z):
             out[row] = np.interp(wave, rest * (1.0 + z), lnu[row] * factor)

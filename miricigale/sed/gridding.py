@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.sed.chain import STELLAR, distinct
+from miricigale.sed.chain import GALAXY, distinct
 from miricigale.sed.derived import DERIVED, galaxy_quantities
 from miricigale.sed.grid import ModelGrid
 from miricigale.sed.spectrum import distance
@@ -17,7 +17,7 @@ from miricigale.utils.exceptions import argument_error, unknown_name
 __all__ = ["check_axes", "model_grid"]
 
 #: Roles whose parameters shape the galaxy.
-GALAXY_ROLES = ("sfh", "stellar", "nebular", "attenuation", "dust")
+GALAXY_ROLES = sum(GALAXY, ())
 
 
 def check_axes(model, axes):
@@ -83,8 +83,8 @@ class _Galaxies:
 
     def __init__(self, model, rows):
         chain = self.chain = model.chain
-        self._stars = chain.stars([chain.key(row, *STELLAR) for row in rows])
-        dims = [chain.key(row, "attenuation") for row in rows]
+        stars, dims, dusts = ([chain.key(row, *roles) for row in rows] for roles in GALAXY)
+        self._stars = chain.stars(stars)
         # many galaxies: their spectra are in memory once
         pairs, self.light_rows = distinct(zip(self._stars, dims, strict=True))
         self.starlight, absorbed = np.empty((len(pairs), chain.wave.size)), np.empty(len(pairs))
@@ -92,7 +92,7 @@ class _Galaxies:
             part = slice(first, first + BLOCK)
             stars, keys = zip(*pairs[part], strict=True)
             _, absorbed[part] = chain.attenuated(stars, keys, out=self.starlight[part])
-        dusts, self.dust_rows = distinct([chain.key(row, "dust") for row in rows])
+        dusts, self.dust_rows = distinct(dusts)
         self.dust = np.array(list(map(chain.dust, dusts)))
         self.absorbed = absorbed[self.light_rows]
 
@@ -157,7 +157,7 @@ def model_grid(model, axes, filters):
     with_agn = bool(np.any(frac_agn > 0.0))
     of_galaxy = {n: model.parameters[n] for n in _names(model, GALAXY_ROLES)}
     rows = _products(of_galaxy, axes)
-    defaults = {name: parameter.default for name, parameter in model.parameters.items()}
+    defaults = model.defaults
     _refuse_invalid(model, [defaults | row for row in rows], GALAXY_ROLES)
     galaxies = _Galaxies(model, rows)
     properties, shape = _galaxy_tables(galaxies.quantities())

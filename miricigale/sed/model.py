@@ -227,6 +227,11 @@ class SEDModel:
         """All parameters, in the order of the chain: dict of name to `Parameter`."""
         return dict(self._parameters)
 
+    @property
+    def defaults(self):
+        """Default of every parameter in its unit: dict of name to float."""
+        return {name: parameter.default for name, parameter in self._parameters.items()}
+
     def component(self, role):
         """The component of a role (one of `~miricigale.sed.ROLES`), or None."""
         return next((c for c in self.components if c.role == role), None)

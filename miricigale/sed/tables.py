@@ -8,7 +8,7 @@ from astropy.table import QTable
 
 from miricigale.filters.filter import UNCOVERED
 from miricigale.sed import _core
-from miricigale.sed.chain import SKY, STELLAR, distinct
+from miricigale.sed.chain import GALAXY, SKY, distinct
 from miricigale.sed.derived import agn_quantities, columns, galaxy_quantities, scaled_quantities
 from miricigale.sed.spectrum import distance
 from miricigale.utils.exceptions import argument_error
@@ -118,9 +118,9 @@ class _Blocks:
     def galaxies(self, rows):
         """Light of galaxies, and their derived quantities."""
         chain = self.chain
-        stars = chain.stars(self._keys(rows, *STELLAR))
-        dim, dust = self._keys(rows, "attenuation"), self._keys(rows, "dust")
-        light, absorbed = chain.attenuated(stars, dim, dust, self._light[: len(rows)])
+        stars, dims, dusts = (self._keys(rows, *roles) for roles in GALAXY)
+        stars = chain.stars(stars)
+        light, absorbed = chain.attenuated(stars, dims, dusts, self._light[: len(rows)])
         return light, galaxy_quantities(stars, absorbed, light @ chain.functionals.T)
 
     def agn(self, rows):
