@@ -48,15 +48,7 @@ conf = Conf()
 
 
 def data_folder():
-    """
-    The user's folder for reference data.
-
-    Returns
-    -------
-    folder : `pathlib.Path`
-        ``conf.data_folder``, or ``miricigale`` in astropy's cache folder; it need not
-        exist.
-    """
+    """The user's folder for reference data: ``conf.data_folder``, or one in astropy's cache folder."""
     if conf.data_folder:
         return Path(conf.data_folder).expanduser()
     return Path(_config.get_cache_dir()) / "miricigale"
@@ -87,22 +79,9 @@ def record_path(path):
 
 def stored_record(path):
     """
-    The record that was written when a file was added.
+    Record that was written when a file was added: dict, or None if there is none.
 
-    Parameters
-    ----------
-    path : `pathlib.Path`
-        The file.
-
-    Returns
-    -------
-    record : dict or None
-        Checksum, size, source and what was found; None if there is none.
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If it is there and cannot be read.
+    Checksum, size, source and what was found; a `DataError` if it is there and cannot be read.
     """
     beside = record_path(path)
     try:
@@ -134,13 +113,9 @@ def _places(record):
 
 def find_place(record):
     """
-    Where the file of a record is found first.
+    Where the file of a record is found first: label and path.
 
-    Returns
-    -------
-    label : str
-        ``"MIRICIGALE_DATA"``, ``"the data folder"``, ``"the package"`` or ``""``.
-    path : `pathlib.Path` or None
+    The label is ``"MIRICIGALE_DATA"``, ``"the data folder"``, ``"the package"`` or, with no path, ``""``.
     """
     for label, folder in _places(record):
         path = folder / record.file
@@ -236,16 +211,8 @@ def fingerprint(name):
     """
     What identifies the data that a resource stands for now.
 
-    Parameters
-    ----------
-    name : str
-        The resource.
-
-    Returns
-    -------
-    text : str
-        sha256 of the file that `locate` finds (over names and contents for a folder), or the
-        version of the package that it comes from.
+    The sha256 of the file that `locate` finds (over names and contents for a folder), or the
+    version of the package that it comes from.
     """
     record = resource(name)
     if not record.file:
@@ -258,17 +225,8 @@ def fingerprint_of(path, *, trust=True):
     """
     The sha256 of a file, or over names and contents of a folder.
 
-    Parameters
-    ----------
-    path : `pathlib.Path`
-        The file or folder.
-    trust : bool, optional
-        Whether the file is not read where its size and time are those of the record beside
-        it, or of an earlier call.
-
-    Returns
-    -------
-    text : str
+    With ``trust`` the file is not read where its size and time are those of the record beside it, or
+    of an earlier call.
     """
     if path.is_dir():
         parts = [

@@ -28,21 +28,8 @@ def load_ssp(path):
     """
     Read the bundled simple stellar populations.
 
-    Returns
-    -------
-    wave : `~numpy.ndarray`, shape (n_wave,)
-        Wavelengths in um.
-    age : `~numpy.ndarray`, shape (n_age,)
-        Ages in Myr.
-    spectra : dict of float to `~numpy.ndarray`, shape (n_age, n_wave)
-        W/um for one solar mass formed, by metallicity.
-    surviving : dict of float to `~numpy.ndarray`, shape (n_age,)
-        Mass fraction in surviving stars, without remnants.
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If it is another file.
+    Wavelengths in um, ages in Myr, and by metallicity: spectra, shape (n_age, n_wave), in W/um for
+    one solar mass formed, and the mass fraction in surviving stars, without remnants.
     """
     wanted = "a table of simple stellar populations"
     part = read_images(path, ("WAVE", "AGE", "LIVING"), wanted=wanted)

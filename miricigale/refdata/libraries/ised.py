@@ -52,22 +52,17 @@ class Ised:
     ----------
     name : str
         Name of the file.
-    age : `~numpy.ndarray`, shape (n_age,)
-        Ages in yr.
-    wave : `~numpy.ndarray`, shape (n_wave,)
-        Wavelengths in A.
+    age, wave : `~numpy.ndarray`, shape (n_age,) and (n_wave,)
+        Ages in yr, wavelengths in A.
     spectra : `~numpy.ndarray`, shape (n_age, n_wave)
         L_lambda in Lsun/A, float32.
     quantities : dict of str to `~numpy.ndarray`, shape (n_age,)
         ``bolometric`` (Lsun), ``mass`` (Msun), ``sfr`` (Msun/yr), ``remnants`` (Msun) and so on.
-    mass_limits : tuple of float
-        Of the IMF, in Msun.
-    slopes : tuple of float
-        Exponents x of the segments of the IMF (dn/dlogm ~ m^-x); empty if it is no power law.
-    law : int
-        Star-formation law: 0 a single burst, 4 exponential, 6 delayed, others.
-    tau : float
-        Time of the law in yr.
+    mass_limits, slopes : tuple of float
+        Of the IMF: Msun, and exponents x of its segments (dn/dlogm ~ m^-x), none if it is no
+        power law.
+    law, tau : int, float
+        Star-formation law (0 a single burst, 4 exponential, 6 delayed, others), its time in yr.
     texts : tuple of str
         The lines of text.
     """

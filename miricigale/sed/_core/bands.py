@@ -16,19 +16,15 @@ def band_tables(start, band_wave, throughput):
     """
     What `band_means` needs to know of passbands that are linear between their points.
 
-    Parameters
-    ----------
-    start : `~numpy.ndarray` of int, shape (n_band + 1,)
-        Where each band begins in the next two, which hold all bands one after the other.
-    band_wave, throughput : `~numpy.ndarray`, shape (n,)
-        Wavelengths and throughputs.
+    ``start``, int, shape (n_band + 1,), tells where each band begins in ``band_wave`` and ``throughput``,
+    which hold all bands one after the other.
 
     Returns
     -------
-    moments : `~numpy.ndarray`, shape (5, n)
+    moments : shape (5, n)
         Integrals of T / lambda and of T from the first point of the band to each point, the
         logarithm of the wavelength, and offset and slope of the curve beyond each point.
-    bucket : `~numpy.ndarray` of int, shape (n_band, BUCKETS)
+    bucket : int, shape (n_band, BUCKETS)
         The last point at or before the lower edge of each bucket.
     """
     out = np.zeros((5, band_wave.size))
@@ -74,19 +70,10 @@ def band_means(wave, log_wave, fnu, start, band_wave, moments, bucket, tolerance
     """
     Photon-counting means of F_nu in bands, without making a matrix of weights.
 
-    Parameters
-    ----------
-    wave, log_wave, fnu : `~numpy.ndarray`, shape (n_wave,)
-        Observed wavelengths, their logarithms, and a spectrum linear between them.
-    start, band_wave : `~numpy.ndarray`
-        Passbands as for `band_tables`.
-    moments, bucket : `~numpy.ndarray`
-        From `band_tables`.
-    tolerance : float
-        Share of a band that may lie outside the spectrum; the mean is that of the rest.
-    out : `~numpy.ndarray`, shape (n_band,)
-        Filled with ``int F T / lambda dlambda / int T / lambda dlambda``, exact; NaN where more
-        of a band is not covered.
+    ``fnu`` is linear between observed wavelengths ``wave`` with logarithms ``log_wave``; ``moments`` and
+    ``bucket`` come from `band_tables`. ``tolerance`` is the share of a band that may lie outside the
+    spectrum: the mean is that of the rest. ``out``, shape (n_band,), is filled with ``int F T / lambda
+    dlambda / int T / lambda dlambda``, exact; NaN where more of a band is not covered.
     """
     n = wave.size
     for band in range(start.size - 1):

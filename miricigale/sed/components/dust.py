@@ -131,36 +131,12 @@ class Casey2012(DustEmission):
 
     @staticmethod
     def turnover(alpha_mir, temperature_dust):
-        """
-        Wavelength l_c above which the power law is cut off.
-
-        Parameters
-        ----------
-        alpha_mir, temperature_dust : float or `~numpy.ndarray`
-            Slope of the power law, and temperature in K.
-
-        Returns
-        -------
-        wave : float or `~numpy.ndarray`
-            In um, 3/4 of L(alpha, T) of Casey 2012.
-        """
+        """Wavelength l_c in um above which the power law is cut off, 3/4 of L(alpha, T) of Casey 2012."""
         slope = (B[0] + B[1] * alpha_mir) ** -2.0
         return 0.75 / (slope + (B[2] + B[3] * alpha_mir) * temperature_dust)
 
     def parts(self, values):
-        """
-        Blackbody and power law on one scale.
-
-        Parameters
-        ----------
-        values : dict of str to float
-            Values of all parameters.
-
-        Returns
-        -------
-        blackbody, power_law : `~numpy.ndarray`
-            L_lambda at `nodes`, arbitrary scale.
-        """
+        """Blackbody and power law on one, arbitrary scale: L_lambda at `nodes`."""
         temperature, beta = values["temperature_dust"], values["emissivity_dust"]
         alpha = values["alpha_mir"]
         turn = self.turnover(alpha, temperature)
@@ -221,18 +197,8 @@ class DraineLi2007(_DraineLi):
         """
         Mean intensity <U> over the dust mass, Draine & Li 2007, equation 33.
 
-        The power per dust mass is P0 <U>, P0 being that at U = 1 (135 to 139 L_sun / M_sun in
-        the table's source, by q_PAH).
-
-        Parameters
-        ----------
-        values : dict of str to float
-            Values of all parameters.
-
-        Returns
-        -------
-        mean : float
-            In units of the starlight near the Sun.
+        In units of the starlight near the Sun. The power per dust mass is P0 <U>, P0 being that at
+        U = 1 (135 to 139 L_sun / M_sun in the table's source, by q_PAH).
         """
         least, gamma = values["u_min"], values["gamma"]
         lump = least * np.log(U_MAX / least) / (1.0 - least / U_MAX)

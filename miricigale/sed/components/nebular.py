@@ -69,16 +69,8 @@ class NebularTable:
     @functools.lru_cache(maxsize=64)  # noqa: B019 -- tables live as long as the process
     def emission(self, metallicity, log_u):
         """
-        Continuum and lines one after the other, linear in log U between logarithms.
-
-        Returns
-        -------
-        emission : `~numpy.ndarray`, shape (n_age, n_wave + n_line)
-
-        Raises
-        ------
-        ValueError
-            If the table has no such metallicity, or not this log U for it.
+        Continuum and lines one after the other, shape (n_age, n_wave + n_line), linear in log U
+        between logarithms; a ValueError if the table has no such metallicity, or not this log U for it.
         """
         models = self.models(metallicity)
         if not models.size:
@@ -270,14 +262,9 @@ class Nebular(Component):
 
     def lines(self, age, weights, ionizing, values):
         """
-        Luminosities of the lines before any dust.
+        Luminosities of the lines before any dust: dict of W by `line_names`.
 
         Parameters are those of `spectra`.
-
-        Returns
-        -------
-        lines : dict of str to float
-            W, by `line_names`.
         """
         emission = self._emission(age, weights, ionizing, values)[self.table.wave.size :]
         return dict(zip(self.line_names, emission.tolist(), strict=True))

@@ -65,18 +65,7 @@ class ParametricTorus(AGN):
         return _torus(self.path, wave.tobytes(), self.disk, float(values["disk_slope"]), shape)
 
     def absorbed_share(self, values):
-        """
-        Share of the disk's light, over all directions, that neither passes nor is scattered.
-
-        Parameters
-        ----------
-        values : dict
-            Values of all parameters of the component.
-
-        Returns
-        -------
-        share : float
-        """
+        """Share of the disk's light, over all directions, that neither passes nor is scattered."""
         shape = _shape(values)
         return _absorbed(self.path, shape.tau97, shape.opening_angle, shape.q)
 
