@@ -48,8 +48,10 @@ def band_names(grid, filters):
         return list(grid.filters), {}
     if isinstance(filters, str):
         raise argument_error("filters", "a list of names or a FilterSet", repr(filters))
-    names = list(getattr(filters, "names", filters))
-    given = dict(zip(names, filters, strict=True)) if hasattr(filters, "names") else {}
+    if not isinstance(filters, FilterSet):
+        names, given = list(filters), {}
+    else:
+        names, given = list(filters.names), dict(zip(filters.names, filters, strict=True))
     return names, {name: given.get(name) for name in names if name not in grid.filters}
 
 
@@ -108,22 +110,22 @@ def model_fluxes(model, grid, index, filters):
 
 
 def _factors(model, grid, index):
-    """L_nu in W/Hz of different galaxies (per solar mass) and tori (per W), and their places."""
+    """L_nu in W/Hz of different galaxies (per solar mass) and AGN (per W), and their places."""
     chain = model.chain
     galaxies, galaxy = np.unique(index[:, 1], return_inverse=True)
-    tori, torus = np.unique(index[:, 2], return_inverse=True)
+    models, agn = np.unique(index[:, 2], return_inverse=True)
     rows = [_row(model, grid.galaxy_parameters, g) for g in galaxies.tolist()]
     keys = [[chain.key(row, *roles) for row in rows] for roles in GALAXY]
     light, _ = chain.attenuated(chain.stars(keys[0]), *keys[1:])
     nuclei = np.zeros((1, chain.wave.size))
     if grid.n_agn and np.any(grid.frac_agn[index[:, 3]] > 0):
-        parts = [chain.agn(_row(model, grid.agn_parameters, k)) for k in tori.tolist()]
+        parts = [chain.agn(_row(model, grid.agn_parameters, k)) for k in models.tolist()]
         nuclei = np.array([part.total for part in parts])
         if model.frac_agn_definition != "dust":
             nuclei = nuclei / chain.infrared(nuclei)[:, None]
     else:
-        torus = np.zeros_like(torus)
-    return chain.lnu(light), galaxy.ravel(), chain.lnu(nuclei), torus.ravel()
+        agn = np.zeros_like(agn)
+    return chain.lnu(light), galaxy.ravel(), chain.lnu(nuclei), agn.ravel()
 
 
 def _row(model, table, row):
@@ -141,10 +143,10 @@ def rest_spectra(model, grid, index, scale):
     in W/Hz, shape (n, n_wave).
     """
     index = plain_index(grid, index)
-    light, galaxy, nuclei, torus = _factors(model, grid, index)
+    light, galaxy, nuclei, agn = _factors(model, grid, index)
     f = grid.frac_agn[index[:, 3]]
     power = scale * f / (1.0 - f) * grid.dust_luminosity[index[:, 1]]
-    lnu = scale[:, None] * light[galaxy] + power[:, None] * nuclei[torus]
+    lnu = scale[:, None] * light[galaxy] + power[:, None] * nuclei[agn]
     return model.chain.wave, lnu
 
 
