@@ -1,10 +1,11 @@
+import dataclasses
 import gzip
 
 import numpy as np
 import pytest
 from astropy.table import QTable
 
-from miricigale.refdata.libraries import add_library
+from miricigale.refdata.libraries import add_library, write_library
 from miricigale.refdata.libraries.bc03 import read_bc03, read_ised
 from miricigale.refdata.locate import conf
 from miricigale.sed import SEDModel
@@ -397,3 +398,13 @@ def test_without_the_files_the_error_says_what_to_do(tmp_path):
         assert "BC03Library" in repr(part)
         with pytest.raises(DataError, match=r"miricigale data add ssp\.bc03_user PATH"):
             part.nodes()
+
+
+def test_libraries_of_former_versions_name_the_surviving_mass_living(write, tmp_path):
+    library = read_bc03(write())
+    values = dict(library.values)
+    values["living"] = values.pop("surviving")
+    write_library(dataclasses.replace(library, values=values), tmp_path / "old.fits")
+    stars = BC03Library()
+    stars.path = str(tmp_path / "old.fits")
+    np.testing.assert_array_equal(stars.table(0.02)[2], library.values["surviving"])
