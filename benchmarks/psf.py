@@ -13,13 +13,14 @@ from miricigale.psf import (
     fwhm,
     hst_psf,
     jwst_pupil,
-    library,
     miri_psf,
     miri_psf_grid,
     psf_mosaic,
     radius_of_encircled_energy,
     rotate_psf,
 )
+from miricigale.psf.miri import _miri_data
+from miricigale.psf.telescope import Telescope
 
 # arcsec; jwst-docs, MIRI Point Spread Functions, table 1 (commissioning, PID 1028)
 IN_FLIGHT = dict(
@@ -44,8 +45,8 @@ def timed(function, *args, repeat=3, clock=time.perf_counter, **kwargs):
 
 def make(name):
     """One PSF without the cache."""
-    library._miri_data.cache_clear()
-    library._miri_optics.cache_clear()
+    _miri_data.cache_clear()
+    Telescope.image.cache_clear()
     return miri_psf(name)
 
 
@@ -66,12 +67,12 @@ def main():
             f"{gauss / flight:6.3f} {radius_of_encircled_energy(psf, 0.8).value:5.2f} ",
             " ".join(f"{e:.3f}" for e in (*energies, psf.enclosed)),
         )
-    library._miri_data.cache_clear()
-    library._miri_optics.cache_clear()
+    _miri_data.cache_clear()
+    Telescope.image.cache_clear()
     grid, seconds = timed(miri_psf_grid, "miri.f770w", repeat=1, clock=time.process_time)
     print(f"miri_psf_grid, {len(grid.data)} places {seconds:.2f} s CPU")
     hst, seconds = timed(hst_psf)
-    print(f"hst_psf (cached optics) {seconds:.2f} s, FWHM {hst.meta['fwhm']:.4f} arcsec")
+    print(f"hst_psf (cached optics) {seconds:.2f} s, FWHM {hst.fwhm:.4f}")
     print(f"rotate_psf {timed(rotate_psf, psfs[770], 33 * u.deg)[1]:.2f} s")
     print(f"psf_mosaic {timed(psf_mosaic, psfs[770], SCALE, 33 * u.deg)[1]:.2f} s")
     print(

@@ -8,12 +8,9 @@ from scipy.fft import irfft, next_fast_len, rfft
 from miricigale.utils.compilation import njit
 
 __all__ = [
-    "box_transfer",
     "core_moments",
-    "gaussian_transfer",
     "half_maximum_width",
     "interpolate",
-    "ipc_transfer",
     "line_scatter",
     "matrix_dft_intensity",
     "polygon_coverage",
@@ -190,28 +187,6 @@ def matrix_dft_intensity(
     cell = (theta_x[1] - theta_x[0]) * (theta_y[1] - theta_y[0]) * (step / wavelength) ** 2
     scale = cell / (np.sum(np.abs(pupil) ** 2) if power is None else power)
     return (field.real.astype(float) ** 2 + field.imag.astype(float) ** 2) * scale
-
-
-def box_transfer(frequency, width):
-    """Transfer function of a box of ``width`` at ``frequency`` (inverse units)."""
-    return np.sinc(frequency * width)
-
-
-def gaussian_transfer(frequency2, sigma):
-    """Transfer function of a round Gaussian at squared frequency ``frequency2``."""
-    return np.exp(-2.0 * (math.pi * sigma) ** 2 * frequency2)
-
-
-def ipc_transfer(fx, fy, along_x, along_y, diagonal):
-    """
-    Transfer function of interpixel capacitance, frequencies in cycles per pixel.
-
-    Each neighbor along x, along y and on the diagonals gets the given share of a
-    pixel's charge; what they get the pixel loses.
-    """
-    cx, cy = np.cos(2 * np.pi * fx), np.cos(2 * np.pi * fy)
-    center = 1.0 - 2 * along_x - 2 * along_y - 4 * diagonal
-    return center + 2 * along_x * cx + 2 * along_y * cy + 4 * diagonal * cx * cy
 
 
 def line_scatter(image, kernel, axis):

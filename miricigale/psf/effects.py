@@ -11,7 +11,6 @@ from miricigale.utils.exceptions import argument_error
 
 __all__ = [
     "EFFECTS",
-    "blur",
     "cruciform",
     "cruciform_fraction",
     "cruciform_shift",
@@ -159,17 +158,16 @@ def detector_response(image, *, oversampling, pixel=True, ipc=None, jitter=0.0, 
         px, py = fx * oversampling, fy * oversampling
         total = np.ones((py.size, px.size))
         for width in widths:
-            total *= _core.box_transfer(px, width) * _core.box_transfer(py, width)
+            total *= np.sinc(px * width) * np.sinc(py * width)
         if ipc is not None:
-            total *= _core.ipc_transfer(px, py, *ipc)
+            # what its neighbors get of a pixel's charge the pixel loses
+            along_x, along_y, diagonal = ipc
+            cx, cy = np.cos(2 * np.pi * px), np.cos(2 * np.pi * py)
+            left = 1.0 - 2 * along_x - 2 * along_y - 4 * diagonal
+            total *= left + 2 * along_x * cx + 2 * along_y * cy + 4 * diagonal * cx * cy
         if jitter > 0:
-            total *= _core.gaussian_transfer(px**2 + py**2, jitter)
+            total *= np.exp(-2.0 * (math.pi * jitter) ** 2 * (px**2 + py**2))
         return total
 
     extent = sum(widths) + 5 * jitter + (1 if ipc is not None else 0)
     return _apply_transfer(image, transfer, math.ceil(extent * oversampling) + 1)
-
-
-def blur(image, sigma):
-    """Convolve with a round Gaussian of ``sigma`` cells."""
-    return detector_response(image, oversampling=1, pixel=False, jitter=sigma)
