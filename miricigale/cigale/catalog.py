@@ -194,25 +194,7 @@ def _with_unit(path, table, name, default):
 
 
 def read_table(path, wanted):
-    """
-    Read a table in any of CIGALE's formats.
-
-    Parameters
-    ----------
-    path : path-like
-        Text, FITS or VOTable.
-    wanted : str
-        What it should be, for the message.
-
-    Returns
-    -------
-    table : `~astropy.table.Table`
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If it cannot be read.
-    """
+    """Read a table in any of CIGALE's formats; ``wanted`` says for messages what it should be."""
     path = Path(path)
     if not path.is_file():
         msg = f"{path} cannot be read as {wanted}: no such file"

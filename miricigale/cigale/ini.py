@@ -41,25 +41,11 @@ _MAX_VALUES = 100_000
 
 def parse_ini(path):
     """
-    Read a configuration file of CIGALE.
+    Read a configuration file of CIGALE: key to value, section to dict, as deep as they are nested.
 
-    Parameters
-    ----------
-    path : path-like
-        The file.
-
-    Returns
-    -------
-    sections : dict
-        Key to value, section to dict, as deep as they are nested. Values of modules are a str, or
-        a list of str where commas part them; the others have the types of CIGALE's specification.
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If the file is missing, cannot be parsed or is no configuration of CIGALE.
-    `~miricigale.utils.exceptions.ConfigError`
-        If a setting has a wrong type or value.
+    Values of modules are a str, or a list of str where commas part them; the others have the types of
+    CIGALE's specification. A file that cannot be read is a `DataError`, a setting of a wrong type or
+    value a `ConfigError`.
     """
     # the library that CIGALE itself uses; astropy bundles a copy
     from astropy.extern.configobj import configobj, validate
@@ -93,26 +79,11 @@ def parse_ini(path):
 
 def parse_values(value, name):
     """
-    Numbers of a parameter.
+    Numbers of a parameter, ascending: array of shape (n,); ``name`` is for messages.
 
-    Parameters
-    ----------
-    value : str or list of str
-        Numbers; ``range start stop step``, which includes ``stop``; or ``eval`` and an
-        expression of numbers, lists and the functions of numpy in `FUNCTIONS`. Nothing is
-        executed: the expression is taken apart, and anything else in it is refused.
-    name : str
-        Name of the parameter, for messages.
-
-    Returns
-    -------
-    values : `~numpy.ndarray`, shape (n,)
-        Ascending.
-
-    Raises
-    ------
-    ValueError
-        If it is something else, or a value is there twice.
+    ``value`` is numbers; ``range start stop step``, which includes ``stop``; or ``eval`` and an
+    expression of numbers, lists and the functions of numpy in `FUNCTIONS`. Nothing is executed: the
+    expression is taken apart, and anything else in it, or a value that is there twice, is a ValueError.
     """
     items = [value] if isinstance(value, str) else value
     # an expression without quotes was split at its commas

@@ -309,27 +309,11 @@ _MODULES = {
 
 def read_modules(names, parameters, *, folder, libraries):
     """
-    Take modules for components.
+    Take modules of CIGALE, in order, for components: a `Chain`.
 
-    Parameters
-    ----------
-    names : list of str
-        Modules of CIGALE, in order.
-    parameters : dict of str to dict
-        Their sections in ``pcigale.ini``.
-    folder : `~pathlib.Path`
-        Where files are that the modules name.
-    libraries : {"best", "bundled"}
-        Whether registered libraries are used.
-
-    Returns
-    -------
-    chain : `Chain`
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.ConfigError`
-        If a value cannot be read, or no model comes of it.
+    ``parameters`` are their sections in ``pcigale.ini``, ``folder`` is where files are that they name,
+    and ``libraries`` (``"best"`` or ``"bundled"``) says whether registered libraries are used. A value
+    that cannot be read, or a chain that is no model, is a `ConfigError`.
     """
     chain = Chain()
     for name in names:

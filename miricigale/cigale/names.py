@@ -165,26 +165,10 @@ def is_line(band):
 
 def band_filters(bands, known):
     """
-    Filters of bands.
+    Filters of bands: a dict of our name to CIGALE's, and the bands without a filter here.
 
-    Parameters
-    ----------
-    bands : iterable of str
-        CIGALE's names.
-    known : dict of str to str
-        Filters that the user gave for bands.
-
-    Returns
-    -------
-    filters : dict of str to str
-        Our name to CIGALE's.
-    lost : list of str
-        Bands without a filter here, emission lines among them.
-
-    Raises
-    ------
-    ValueError
-        If two bands are the same filter.
+    ``known`` are filters that the user gave by CIGALE's names. Emission lines have no filter; two bands
+    of the same filter are a ValueError.
     """
     filters, lost = {}, []
     for band in bands:
@@ -267,17 +251,9 @@ _OF_MODULE = {
 
 def cigale_names(modules=None):
     """
-    CIGALE's names of what we have.
+    CIGALE's names of what we have: our name to CIGALE's, its unit, and the factor to it from ours.
 
-    Parameters
-    ----------
-    modules : dict of str to str, optional
-        Role of a component to CIGALE's module, on which some names depend.
-
-    Returns
-    -------
-    names : dict of str to tuple
-        Our name to CIGALE's name, its unit, and the factor to it from ours.
+    ``modules`` is the role of a component to CIGALE's module, on which some names depend.
     """
     names = {}
     for ours, theirs, unit in _PARAMETERS:

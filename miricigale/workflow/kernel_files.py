@@ -17,26 +17,10 @@ _log = logging.getLogger(__name__)
 
 def file_place(path):
     """
-    Take ``file.fits[EXTENSION,PLANE]`` apart.
+    Take ``file.fits[EXTENSION,PLANE]`` apart: path, extension, plane.
 
-    Parameters
-    ----------
-    path : path-like
-        A file, with an extension and the plane of a cube in brackets or without.
-
-    Returns
-    -------
-    path : str
-        The file.
-    extension : str or int
-        The first without brackets.
-    plane : int, "mean" or None
-        None for an image.
-
-    Raises
-    ------
-    ValueError
-        If the plane is neither a number nor ``mean``.
+    The extension is the first without brackets; the plane of a cube is a number or ``"mean"``, None of an
+    image. Anything else is a ValueError.
     """
     name, extension = split_extension(path)
     if not isinstance(extension, str) or "," not in extension:
@@ -159,18 +143,7 @@ def _compared(psf, header, argument, *, smoothed=False):
 
 
 def is_own_kernel(path):
-    """
-    Whether a file is a kernel with its PSFs, as `~miricigale.psf.MatchingKernel.write` makes it.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-
-    Returns
-    -------
-    own : bool
-    """
+    """Whether a file is a kernel with its PSFs, as `~miricigale.psf.MatchingKernel.write` makes it."""
     with open_fits(file_place(path)[0], wanted="a matching kernel") as hdus:
         return "KERNEL" in hdus and "SOURCE" in hdus and "TARGET" in hdus
 
@@ -235,17 +208,9 @@ def read_kernel(path, *, pixel_scale, highres_psf=None):
 
 def can_be_modeled(header):
     """
-    Whether `~miricigale.psf.filter_psf` has the PSF of an image.
+    Whether `~miricigale.psf.filter_psf` has the PSF of an image, of which the header is given.
 
-    Parameters
-    ----------
-    header : `~miricigale.photometry.MosaicHeader`
-        Of the image.
-
-    Returns
-    -------
-    known : bool
-        Whether it knows the filter and, unless that is one of WFC3/IR, the position angle is known.
+    It must know the filter and, unless that is one of WFC3/IR, the position angle.
     """
     from miricigale.psf import MODEL_FILTERS
 

@@ -391,24 +391,10 @@ def _pulls(result, kernel, n, seed, n_threads):
 
 def empty_positions(result, n, *, seed, distance=0.3):
     """
-    Positions at which a measurement left no light.
+    Up to ``n`` random positions at which a measurement left no light: ``id`` and ``sky``.
 
-    Parameters
-    ----------
-    result : `~miricigale.photometry.ForcedPhotometryResult`
-        A measurement.
-    n : int
-        How many are wanted; there may be fewer.
-    seed : int
-        Seed of the draw.
-    distance : float, optional
-        Least distance in arcsec to pixels with light of a model (above a third of the noise) or
-        without data.
-
-    Returns
-    -------
-    catalog : `~astropy.table.QTable`
-        ``id`` and ``sky``.
+    They are at least ``distance`` (arcsec) from pixels with light of a model (above a third of the
+    noise) or without data.
     """
     import scipy.ndimage
     from astropy.table import QTable

@@ -37,26 +37,11 @@ _MEANING = {
 
 def photometry_page(result, filter_, image, highres, kernel, pulls=None, segments=None):
     """
-    Make the page of one measurement.
+    Make the page (`~miricigale.evaluation.Report`) of one measurement in a filter.
 
-    Parameters
-    ----------
-    result : `~miricigale.photometry.ForcedPhotometryResult`
-        The measurement.
-    filter_ : str
-        Filter of the image.
-    image, highres : `~astropy.nddata.CCDData`
-        What was measured and the prior, of `~miricigale.photometry.read_mosaic`.
-    kernel : `~miricigale.psf.MatchingKernel`
-        Between them.
-    pulls : `~numpy.ndarray`, optional
-        Flux over error at empty positions.
-    segments : int `~numpy.ndarray`, optional
-        Segments of the prior, whose outlines are drawn.
-
-    Returns
-    -------
-    report : `~miricigale.evaluation.Report`
+    ``image`` and ``highres`` are what was measured and the prior, of
+    `~miricigale.photometry.read_mosaic`, ``kernel`` is between them; ``pulls`` are flux over error at
+    empty positions, and ``segments`` (int array) those of the prior, whose outlines are drawn.
     """
     good = np.isfinite(result.flux.value)
     snr = result.snr

@@ -204,22 +204,9 @@ def describe_job(name):
 
 def compile_job(name):
     """
-    Run one job in this process, and note that its kernels are on disk.
+    Run one job of `JOBS` in this process, and note that its kernels are on disk.
 
-    Parameters
-    ----------
-    name : str
-        One of `JOBS`.
-
-    Returns
-    -------
-    is_kept : bool
-        Whether they are.
-
-    Raises
-    ------
-    ValueError
-        If there is no such job.
+    Returns whether they are.
     """
     JOBS[_check(name)][0]()
     path = _marker(name)

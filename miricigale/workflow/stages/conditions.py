@@ -63,19 +63,11 @@ _DOUBTFUL = int(
 
 def add_conditions(table, bands, *, suffix="", detections=False):
     """
-    Add ``<band>_condition`` (`ConditionFlags`) to the sources or the detections.
+    Add ``<band>_condition`` (`ConditionFlags`) to sources, or to detections (``detections``).
 
-    Parameters
-    ----------
-    table : `~astropy.table.QTable`
-        With ``sky``, ``association`` (`~miricigale.evaluation.AssociationFlags`) and for each band the
-        flux and ``<band>_flags`` (`~miricigale.photometry.ForcedFlags`).
-    bands : iterable of str
-        Bands.
-    suffix : str, optional
-        Of the columns by whose fluxes neighbors are compared: ``"_true"`` for the truth.
-    detections : bool, optional
-        Whether rows are detections, of which those without a source are spurious.
+    The table has ``sky``, ``association`` (`~miricigale.evaluation.AssociationFlags`) and, for each band,
+    the flux and ``<band>_flags``; neighbors are compared by the fluxes ``<band><suffix>``, ``"_true"``
+    for the truth. Detections without a source are spurious.
     """
     association = np.asarray(table["association"])
     for name in bands:
@@ -108,21 +100,11 @@ def _groups(condition):
 
 def band_conditions(matched, name):
     """
-    Count the sources of the field by condition, and tell how well each kind is measured.
+    Count the sources of the field by condition, and tell how well each kind is measured in a band.
 
-    Parameters
-    ----------
-    matched : `~astropy.table.QTable`
-        Of stage 12.
-    name : str
-        Band.
-
-    Returns
-    -------
-    counts : dict
-        ``n_field`` (galaxies and stars of the field with a model), ``n_not_measured`` of them, and for
-        each of `CONDITIONS` of the measured ones ``n``, and ``n_bright``, ``median`` and ``scatter`` of measured
-        over true flux minus one of those above five formal errors.
+    Of ``matched`` (stage 12): ``n_field`` (galaxies and stars with a model), ``n_not_measured`` of
+    them, and for each of `CONDITIONS` ``n`` of the measured ones, and ``n_bright``, ``median`` and
+    ``scatter`` of measured over true flux minus one of those above five formal errors.
     """
     selection = np.asarray(matched["selection"])
     field = (selection & (SampleFlags.OUTSIDE_FIELD | SampleFlags.NO_MODEL)) == 0
@@ -149,20 +131,10 @@ def band_conditions(matched, name):
 
 def detection_counts(detections, bands):
     """
-    Count the detections of the field.
+    Count the detections of ``photometry.ecsv`` (stage 12).
 
-    Parameters
-    ----------
-    detections : `~astropy.table.QTable`
-        ``photometry.ecsv`` of stage 12.
-    bands : iterable of str
-        Bands.
-
-    Returns
-    -------
-    counts : dict
-        ``n``, ``n_field`` and of these ``n_spurious``, ``n_ambiguous``, and by band the spurious ones
-        above five formal errors (``n_spurious_bright``).
+    ``n``, ``n_field`` and of these ``n_spurious``, ``n_ambiguous``, and by band the spurious ones above
+    five formal errors (``n_spurious_bright``).
     """
     bands = list(bands)
     field = np.asarray(detections["in_field"], bool)
@@ -184,23 +156,11 @@ def detection_counts(detections, bands):
 
 def fit_conditions(sample, redshift, table, bands):
     """
-    Photometric redshifts of the sample by condition.
+    Quality of photometric redshifts by condition: ``n``, ``photoz_sigma_mad``, ``photoz_n_outliers``.
 
-    Parameters
-    ----------
-    sample : `~astropy.table.QTable`
-        The rows of ``matched`` that were fitted.
-    redshift : array_like
-        Their true redshifts.
-    table : `~astropy.table.QTable`
-        The fits, row by row the same sources.
-    bands : iterable of str
-        Bands; a source has a condition if it has it in one of them.
-
-    Returns
-    -------
-    groups : dict of str to dict
-        ``n``, ``photoz_sigma_mad`` and ``photoz_n_outliers`` for each of `CONDITIONS`.
+    ``sample`` are the rows of ``matched`` that were fitted, ``redshift`` the true redshifts and
+    ``table`` the fits of the same sources, row by row; a source has a condition if it has it in one of
+    the bands.
     """
     condition = any_condition(sample, bands)
     groups = {}

@@ -41,14 +41,7 @@ EXPOSURE_RESOURCES = (*IMAGE_RESOURCES, "instrument.etc")
 
 
 def study_exposures(config):
-    """
-    All exposures of a configuration.
-
-    Returns
-    -------
-    exposures : dict of str to `~miricigale.instrument.Exposure`
-        By unit name, ``<filter>-<dither>``.
-    """
+    """All exposures of a configuration: unit name, ``<filter>-<dither>``, to `Exposure`."""
     options = config.exposures
     pointing = SkyCoord(config.pointing.ra * u.deg, config.pointing.dec * u.deg)
     roll = config.pointing.roll * u.deg
@@ -113,19 +106,9 @@ def grid_of(config, pixel_scale):
 
 def exposure_memory(config, unit):
     """
-    About how many bytes a process takes that simulates and reduces an exposure.
+    About how many bytes a process takes for an exposure, of a unit or the largest of a filter.
 
-    Parameters
-    ----------
-    config : `~miricigale.workflow.config.StudyConfig`
-        The configuration.
-    unit : str
-        Of `study_exposures`, or a filter.
-
-    Returns
-    -------
-    n_bytes : int
-        Measured: 0.5 GB, and counts and flags of each group.
+    Measured: 0.5 GB, and counts and flags of each group.
     """
     exposures = study_exposures(config)
     chosen = [e for name, e in exposures.items() if unit in (name, e.filter)]

@@ -53,19 +53,7 @@ def band_label(name):
 
 
 def three_bands(names):
-    """
-    Bands that a picture shows: the shortest, the middle one and the longest in wavelength.
-
-    Parameters
-    ----------
-    names : iterable of str
-        Names of filters.
-
-    Returns
-    -------
-    chosen : list of str
-        In order of wavelength; all of them where there are fewer than three.
-    """
+    """Bands that a picture shows: the shortest, the middle one and the longest in wavelength."""
     by_wave = sorted(names, key=lambda name: Filter.from_name(name).pivot)
     if len(by_wave) < 3:
         return by_wave
@@ -116,18 +104,10 @@ def magnitude_figure(table, bands):
 
 def offset_figure(table, bands, limits=None, marks=()):
     """
-    Magnitude differences with running medians.
+    Magnitude differences of matched sources with running medians.
 
-    Parameters
-    ----------
-    table : `~astropy.table.QTable`
-        Matched sources, with the conditions of stage 12.
-    bands : list of str
-        Bands.
-    limits : dict of str to float, optional
-        5-sigma limits in AB magnitudes, drawn as lines.
-    marks : iterable of (int, str, str), optional
-        Bit of the condition, marker and label of the sources that are marked.
+    ``limits`` are 5-sigma limits (AB), drawn as lines; ``marks`` are bit of the condition, marker and
+    label of the sources that are marked.
     """
     figure, axes, tidy = _panels(bands, 2.9, sharex=True, sharey=True)
     for ax, name in zip(axes, bands, strict=True):
@@ -184,11 +164,8 @@ def limit_figure(entries):
     """
     Limits against wavelength.
 
-    Parameters
-    ----------
-    entries : dict of str to dict
-        Of each band: ``limit``, ``formal_limit``, ``etc_limit``, ``proposal`` (AB or NaN) and
-        ``ceers``, whether the exposures are those of the proposal.
+    Entries have ``limit``, ``formal_limit``, ``etc_limit``, ``proposal`` (AB or NaN) and ``ceers``,
+    whether the exposures are those of the proposal.
     """
     figure, axes = new_figure(size=(WIDTH, 3.4))
     ax = axes[0, 0]
@@ -297,16 +274,8 @@ def input_figure(galaxies):
     """
     Infrared luminosity against redshift, and star-formation rate against mass.
 
-    Parameters
-    ----------
-    galaxies : `~astropy.table.QTable`
-        With ``redshift``, ``ir_luminosity``, ``stellar_mass`` and ``sfr_100myr``.
-
-    Returns
-    -------
-    figure : `~matplotlib.figure.Figure`
-    n_outside : tuple of int
-        Galaxies below the axes, left and right.
+    Of a table with ``redshift``, ``ir_luminosity``, ``stellar_mass`` and ``sfr_100myr``. Returns the
+    figure and the numbers of galaxies below the axes, left and right.
     """
     figure, axes = new_figure(1, 2, size=(WIDTH / 2, 4.0))
     redshift = np.asarray(galaxies["redshift"])
@@ -360,16 +329,8 @@ def example_figure(results, truth, key, model):
     """
     One source: photometry with the best fit, and posteriors of redshift and AGN fraction.
 
-    Parameters
-    ----------
-    results : dict of str to `~miricigale.fitting.FitResults`
-        ``with_miri`` and ``without_miri``.
-    truth : `~astropy.table.QTable`
-        With ``id``, ``redshift`` and ``frac_agn``.
-    key : object
-        Id of the source.
-    model : `~miricigale.sed.SEDModel`
-        Of the fits.
+    ``results`` has a `~miricigale.fitting.FitResults` ``with_miri`` and one ``without_miri``, ``truth``
+    the columns ``id``, ``redshift`` and ``frac_agn``; ``model`` is that of the fits.
     """
     from matplotlib.figure import Figure
 

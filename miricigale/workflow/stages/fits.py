@@ -84,21 +84,10 @@ def make_errors(context, _):
 
 def mock_photometry(config, truth, matched, *, seed):
     """
-    Photometry of the fitted sample: mock existing bands, measured MIRI bands.
+    Photometry of the fitted sample (``selection`` 0): mock existing bands, measured MIRI bands.
 
-    Parameters
-    ----------
-    config : `~miricigale.workflow.config.StudyConfig`
-        Bands and depths.
-    truth, matched : `~astropy.table.QTable`, n rows
-        Of stages 3 and 12.
-    seed : int
-        Noise of a source in a band depends on its id and the band only.
-
-    Returns
-    -------
-    photometry : `~astropy.table.QTable`
-        A row for each source of the sample (``selection`` 0).
+    ``truth`` and ``matched`` have the same sources row by row; the noise of a source in a band depends
+    on ``seed``, its id and the band only.
     """
     from miricigale.photometry.surveys import fractional_error
 

@@ -34,23 +34,10 @@ GALAXY_PARAMETERS = ("tau", "age", "ebv", "alpha", "metallicity")
 
 def input_axes(kind, *, dust=False):
     """
-    Axes of the fit of the input SEDs.
+    Axes of the fit of the input SEDs but redshift, of the grid ``"galaxy"`` or ``"quick"``.
 
-    Those of Yang et al. 2021, but one value of the dust's alpha where no band shows the dust: bands
-    shorter than a few um say nothing of it, and a fit of it would run to the edge of the grid
-    (see `make_truth`).
-
-    Parameters
-    ----------
-    kind : {"galaxy", "quick"}
-        The galaxy grid of Yang et al. 2021 or the thinner one.
-    dust : bool, optional
-        Whether alpha is fitted.
-
-    Returns
-    -------
-    axes : dict of str to `~numpy.ndarray`
-        Without redshift.
+    Those of Yang et al. 2021, but one value of the dust's alpha unless ``dust``: bands shorter than a
+    few um do not constrain it, and a fit would run to the edge of the grid (see `make_truth`).
     """
     axes = sed.SEDModel.yang2021_axes(kind)
     fitted = {name: axes[name] for name in ("tau", "age", "ebv", "alpha")}
@@ -79,21 +66,10 @@ def catalog_bands(catalog):
 
 def input_bands(catalog, max_wavelength):
     """
-    Bands of a catalog that its SEDs are fitted to.
+    Bands of a catalog that its SEDs are fitted to, and their longest pivot wavelength in um.
 
-    Parameters
-    ----------
-    catalog : `~astropy.table.QTable`
-        With flux columns, and columns of errors or not.
-    max_wavelength : float
-        Longest pivot wavelength in um of the bands without errors.
-
-    Returns
-    -------
-    bands : dict of str to bool
-        Whether each band has a column of errors, in the order of the catalog.
-    longest : float
-        Their longest pivot wavelength in um; 0 without bands.
+    A dict of band to whether it has a column of errors; those without end at ``max_wavelength`` (um).
+    The wavelength is 0 without bands.
     """
     bands, longest = {}, 0.0
     for name in catalog_bands(catalog):
@@ -189,18 +165,8 @@ def add_agn(table, frac_agn, seed):
     """
     Give each source an AGN drawn from the ranges of Yang et al. 2021 (those of q are inferred).
 
-    Parameters
-    ----------
-    table : `~astropy.table.QTable`
-        Parameters of the galaxies, with ``id``; the AGN's columns are added.
-    frac_agn : float
-        fracAGN of every source.
-    seed : int
-        Each source has its own stream, keyed by its id.
-
-    References
-    ----------
-    Yang et al. 2021, ApJ 908, 144, table 3.
+    Columns are added to ``table``, which has ``id``: each source has its own random stream. See table 3
+    of Yang et al. 2021, ApJ 908, 144.
     """
     drawn = {
         name: np.empty(len(table))

@@ -41,18 +41,10 @@ class StudyTables:
     """
     The tables of a run, each read once.
 
-    Parameters
-    ----------
-    truth, matched : `~astropy.table.QTable`
-        Of stages 3 and 12, row by row the same sources.
-    detections : `~astropy.table.QTable`
-        The photometry of all detections, of stage 12.
-    errors : `~miricigale.photometry.ErrorModel`
-        The error function.
-    results : dict of str to `~miricigale.fitting.FitResults`
-        Results by `FITS`, a row for each source of the sample.
-    points : dict of str to `~astropy.table.QTable`
-        Bright point sources by band; empty where the check was not made.
+    ``truth`` and ``matched`` (stages 3 and 12) have the same sources row by row; ``detections`` is the
+    photometry of stage 12, ``errors`` the `~miricigale.photometry.ErrorModel`, ``results`` a
+    `~miricigale.fitting.FitResults` for each of `FITS` with a row for each source of the sample, and
+    ``points`` a table of bright point sources by band, empty where the check was not made.
     """
 
     truth: QTable
@@ -181,21 +173,10 @@ def _light(galaxies, bands, area):
 
 def study_metrics(config, tables, area):
     """
-    All numbers of the report.
+    All numbers of the report, as plain values for ``report/metrics.json``.
 
-    Parameters
-    ----------
-    config : `~miricigale.workflow.config.StudyConfig`
-        The configuration.
-    tables : `StudyTables`
-        Of a run whose other stages are done.
-    area : `~astropy.units.Quantity`
-        Solid angle of the imaged field.
-
-    Returns
-    -------
-    metrics : dict
-        Plain values, as written to ``report/metrics.json``; NaN where there is nothing to count.
+    ``tables`` are of a run whose other stages are done, ``area`` is the solid angle of the imaged
+    field; NaN where there is nothing to count.
     """
     bands = config.exposures.filters
     truth, matched, errors = tables.truth, tables.matched, tables.errors

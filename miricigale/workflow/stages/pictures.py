@@ -46,15 +46,8 @@ def field_figure(images, prior, names):
     """
     The field: the high-resolution image beside a color image of three bands, or each band in gray.
 
-    Parameters
-    ----------
-    images : list of `~astropy.nddata.CCDData`
-        Mosaics on one grid, the shortest wavelength first; other numbers than three are drawn
-        in gray.
-    prior : `~astropy.nddata.CCDData`
-        The high-resolution image.
-    names : list of str
-        Bands of the images, and of the prior.
+    ``images`` are mosaics on one grid, the shortest wavelength first (other numbers than three are drawn
+    in gray); ``names`` are their bands and that of the prior.
     """
     planes = [_filled(image) for image in images]
     used = np.argwhere(np.any([np.isfinite(plane) for plane in planes], axis=0))
@@ -93,16 +86,9 @@ def field_figure(images, prior, names):
 
 def residual_figure(images, names, *, size=220):
     """
-    Mosaic, model and residual of several bands, cut to the same crowded part.
+    Mosaic, model and residual of several bands, cut to the same crowded part of ``size`` pixels.
 
-    Parameters
-    ----------
-    images : list of tuple of `~astropy.nddata.CCDData`
-        Mosaic and model of each band, on one grid.
-    names : list of str
-        Their filters.
-    size : int, optional
-        Side of the cutout in pixels.
+    ``images`` are pairs of mosaic and model, all on one grid.
     """
     panel = WIDTH / 3
     figure, axes = new_figure(len(images), 3, size=(panel, 0.8 * panel))

@@ -37,25 +37,10 @@ PRIOR_FLUX = 30 * u.uJy
 
 def point_catalog(exposure, band_flux, prior, *, spacing, seed):
     """
-    Point sources on a grid over the field of an exposure.
+    Point sources on a grid over the field of an exposure, as `~miricigale.scene.Scene` takes them.
 
-    Parameters
-    ----------
-    exposure : `~miricigale.instrument.Exposure`
-        Whose field is filled.
-    band_flux : `~astropy.units.Quantity`
-        Flux in its filter.
-    prior : str
-        Filter of the high-resolution image.
-    spacing : float
-        Spacing in arcsec; each source is moved by a random part of a pixel.
-    seed : int
-        Seed of those shifts.
-
-    Returns
-    -------
-    catalog : `~astropy.table.QTable`
-        As `~miricigale.scene.Scene` takes it.
+    ``band_flux`` is their flux in its filter, ``prior`` the filter of the high-resolution image and
+    ``spacing`` in arcsec; each is moved by a random part of a pixel.
     """
     rng = np.random.default_rng(seed)
     steps = np.arange(-70, 70.1, spacing)

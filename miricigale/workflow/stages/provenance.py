@@ -59,21 +59,10 @@ EXPOSURE_HEADER = (
 
 def exposure_rows(config, forecasts, ceers):
     """
-    A row for each kind of exposure of a band, in the order of the configuration.
+    Rows under `EXPOSURE_HEADER`, one for each kind of exposure of a band.
 
-    Parameters
-    ----------
-    config : `~miricigale.workflow.config.StudyConfig`
-        The configuration.
-    forecasts : dict of str to `~astropy.table.Table`
-        Forecast of each exposure, by unit.
-    ceers : dict of str to bool
-        Whether each band is exposed as CEERS did.
-
-    Returns
-    -------
-    rows : list of tuple
-        Under `EXPOSURE_HEADER`; filling and saturation are the highest of the dithers.
+    ``forecasts`` are tables by unit, ``ceers`` says of each band whether it is exposed as CEERS did;
+    filling and saturation are the highest of the dithers.
     """
     kinds = {}
     for unit, e in study_exposures(config).items():
@@ -100,20 +89,7 @@ def exposure_rows(config, forecasts, ceers):
 
 
 def stand_ins(config, model):
-    """
-    Sentences on everything that is not what Yang et al. 2021, or the observatory, have.
-
-    Parameters
-    ----------
-    config : `~miricigale.workflow.config.StudyConfig`
-        The configuration.
-    model : `~miricigale.sed.SEDModel`
-        Of the truth and the fits.
-
-    Returns
-    -------
-    sentences : list of str
-    """
+    """Sentences on everything that is not what Yang et al. 2021, or the observatory, have."""
     found = [STAND_INS[name] for name in model.resources if name in STAND_INS]
     found.append(
         "Instrument: PSFs are computed from the outline of the pupil; non-linearity, flat field and "
@@ -151,20 +127,7 @@ def library_rows(model):
 
 
 def catalog_facts(config, catalog):
-    """
-    What the catalog is: pairs of a label and text.
-
-    Parameters
-    ----------
-    config : `~miricigale.workflow.config.StudyConfig`
-        The configuration.
-    catalog : `~astropy.table.QTable`
-        The sources that were taken.
-
-    Returns
-    -------
-    facts : list of tuple of str
-    """
+    """What the sources that were taken are, and how their SEDs are fitted: pairs of text."""
     options = config.catalog
     bundled = options.source in resources()
     # the folder of a user's file is not part of the result
@@ -211,10 +174,7 @@ def versions(*metas):
     """
     Software: pairs of package and version.
 
-    Parameters
-    ----------
-    *metas : dict
-        Meta of products, whose version of this package may be another than today's.
+    ``metas`` are those of products, whose version of this package may be another than today's.
     """
     here = provenance()["version"]
     made = sorted({meta["version"] for meta in metas if "version" in meta})
@@ -225,19 +185,9 @@ def versions(*metas):
 
 def sources_to_cite(names, metas):
     """
-    What to cite: of reference data and of products, each once.
+    What to cite for resources (``names``) and for products (their ``metas``), each once.
 
-    Parameters
-    ----------
-    names : iterable of str
-        Resources.
-    metas : iterable of dict
-        Meta of products, with ``citations``.
-
-    Returns
-    -------
-    entries : list of str
-        Sorted; one that another contains is left out.
+    Entries are sorted, and one that another contains is left out.
     """
     entries = {entry for meta in metas for entry in meta.get("citations", ())}
     entries |= set(citations(*names))

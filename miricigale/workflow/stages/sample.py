@@ -43,20 +43,7 @@ def magnitude(flux):
 
 
 def in_field(sky, images):
-    """
-    Whether positions fall on a usable pixel of every image.
-
-    Parameters
-    ----------
-    sky : `~astropy.coordinates.SkyCoord`, shape (n,)
-        Positions.
-    images : iterable of `~astropy.nddata.CCDData`
-        With WCS and mask.
-
-    Returns
-    -------
-    inside : `~numpy.ndarray` of bool, shape (n,)
-    """
+    """Whether positions, shape (n,), fall on a usable pixel of every image (with WCS and mask)."""
     inside = np.ones(len(sky), bool)
     for image in images:
         x, y = (np.round(v).astype(int) for v in image.wcs.world_to_pixel(sky))
@@ -69,23 +56,7 @@ def in_field(sky, images):
 
 
 def footprint_area(images):
-    """
-    Solid angle of the pixels that are usable in every image: the field of `in_field`.
-
-    Parameters
-    ----------
-    images : iterable of `~astropy.nddata.CCDData`
-        With mask, on one grid with pixels of one size.
-
-    Returns
-    -------
-    area : `~astropy.units.Quantity`
-
-    Raises
-    ------
-    ValueError
-        If the images differ in shape.
-    """
+    """Solid angle of the pixels that are usable in every image on one grid: the field of `in_field`."""
     images = list(images)
     if len({image.shape for image in images}) != 1:
         raise argument_error("images", "on one grid", [image.shape for image in images])
@@ -104,20 +75,9 @@ def add_selection(matched, truth, bands, *, inside, min_detected, redshifts):
     """
     Add ``n_detected`` and ``selection`` (`SampleFlags`, 0 in the sample) to a matched table.
 
-    Parameters
-    ----------
-    matched : `~astropy.table.QTable`
-        From `~miricigale.evaluation.match_truth`, with errors from the error function.
-    truth : `~astropy.table.QTable`
-        Row by row the same sources, with ``star``.
-    bands : iterable of str
-        MIRI bands.
-    inside : array of bool
-        See `in_field`.
-    min_detected : int
-        Bands in which a source of the sample is detected.
-    redshifts : tuple of float
-        Range of the grid of the fit.
+    ``matched`` is of `~miricigale.evaluation.match_truth` with errors from the error function,
+    ``truth`` has the same sources row by row, with ``star``; ``inside`` is that of `in_field`, and
+    ``redshifts`` the range of the grid of the fit.
     """
     flags = np.zeros(len(matched), int)
     matched["n_detected"] = detected_bands(matched, bands)
@@ -135,21 +95,9 @@ def add_selection(matched, truth, bands, *, inside, min_detected, redshifts):
 
 def typical_source(sample, fitted, band):
     """
-    A source to be shown: among the brighter of those nearest to redshift 1.2.
+    Id of a source to be shown: a bright one among those nearest to redshift 1.2.
 
-    Parameters
-    ----------
-    sample : `~astropy.table.QTable`
-        Truth of the fitted sources, with ``id``, ``redshift`` and the band.
-    fitted : array of bool
-        Which of them have a fit.
-    band : str
-        In which they are bright.
-
-    Returns
-    -------
-    key : object or None
-        Its id; None if there is none with a fit.
+    ``fitted`` says which rows of ``sample`` have a fit; None if there is none.
     """
     sample = sample[np.asarray(fitted, bool)]
     if len(sample) == 0:

@@ -15,20 +15,11 @@ WAVELENGTHS = np.geomspace(0.2, 40, 1500) * u.um
 
 def star_fluxes(catalog, known, wanted):
     """
-    Fluxes of stars in any band, from the black body that fits their known ones best.
+    Fluxes (uJy) of stars in any band, from the black body that fits their known ones best.
 
-    Parameters
-    ----------
-    catalog : `~astropy.table.QTable`, n rows
-        Stars with fluxes in the ``known`` bands; NaN is left out.
-    known, wanted : iterable of str
-        Filter names.
-
-    Returns
-    -------
-    fluxes : `~astropy.table.QTable`, n rows
-        ``temperature`` and a column in uJy for each wanted band. Beyond a few um any
-        photosphere without dust is close to the Rayleigh-Jeans law.
+    ``catalog`` has fluxes in the ``known`` bands, of which NaN is left out. A table with
+    ``temperature`` and a column for each wanted band; beyond a few um any photosphere without dust is
+    close to the Rayleigh-Jeans law.
     """
     known, wanted = list(known), list(wanted)
     filters = FilterSet.from_names(list(dict.fromkeys([*known, *wanted])))
