@@ -126,18 +126,14 @@ def free_templates(plain, bank, rows, fitted, changes, images, inverse_sigma):
     ----------
     plain : `~miricigale.photometry.errors.LinearFit`
         The fit of templates that are taken as they are.
-    bank : `~miricigale.photometry.templates.TemplateBank`
-        The templates.
-    rows : int `~numpy.ndarray`, shape (n,)
-        Those rows of the bank that were fitted.
+    bank, rows
+        The templates, and those rows of theirs that were fitted, shape (n,).
     fitted : `~numpy.ndarray` of `~miricigale.photometry.shapes.FITTED`, shape (n,)
         What is known of each.
     changes : `~miricigale.photometry.template_changes.TemplateChanges`
         Finds how they may change.
-    images : list of `~numpy.ndarray`, shape (ny, nx)
-        Whitened image, and whitened columns that are common to all sources.
-    inverse_sigma : `~numpy.ndarray`, shape (ny, nx)
-        1 / sigma, zero where masked.
+    images, inverse_sigma
+        Whitened image, and whitened columns that are common to all sources; 1 / sigma, zero where masked.
 
     Returns
     -------

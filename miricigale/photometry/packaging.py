@@ -43,24 +43,11 @@ class CatalogRows:
 
 def package(fit, diagnostics, new_xy, catalog, meta):
     """
-    Make the result of a fit.
+    Make the `ForcedPhotometryResult` of a fit.
 
-    Parameters
-    ----------
-    fit : `~miricigale.photometry.template_fit.TemplateFit`
-        The fit.
-    diagnostics : `~miricigale.photometry.diagnostics.Diagnostics`
-        What was made of its residual.
-    new_xy : `~numpy.ndarray`, shape (m, 2)
-        Positions of the sources that were added to the catalog.
-    catalog : `CatalogRows`
-        The catalog.
-    meta : dict
-        Provenance: the ``template``, and the ``filter`` if that is known.
-
-    Returns
-    -------
-    result : `~miricigale.photometry.ForcedPhotometryResult`
+    ``fit``, ``diagnostics`` and ``new_xy``, (m, 2), are what `~miricigale.photometry.passes.fit_image`
+    returns, ``catalog`` are the `CatalogRows`, ``meta`` is provenance: the ``template``, and the
+    ``filter`` if that is known.
     """
     n, n_columns = len(catalog.sky), len(fit.columns)
     n_all = n + len(new_xy)

@@ -21,12 +21,8 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
 
     Parameters
     ----------
-    arrays : `~miricigale.photometry.arrays.FitArrays`
-        The image.
-    bank : `~miricigale.photometry.templates.TemplateBank`
-        The templates of the sources on or near it.
-    settings : `~miricigale.photometry.ForcedPhotometer`
-        How they are fitted.
+    arrays, bank, settings
+        As for `~miricigale.photometry.template_fit.TemplateFit`.
     catalog : `~miricigale.photometry.packaging.CatalogRows`
         The catalog; ``near`` lists the bank's sources.
     grid_wcs : `~astropy.wcs.WCS`
@@ -34,8 +30,8 @@ def fit_image(arrays, bank, settings, catalog, grid_wcs):
 
     Returns
     -------
-    fit : `~miricigale.photometry.template_fit.TemplateFit`
-    diagnostics : `~miricigale.photometry.diagnostics.Diagnostics`
+    fit, diagnostics
+        The `TemplateFit` and its `Diagnostics`.
     new_xy : `~numpy.ndarray`, shape (m, 2)
         Positions, in the catalog's frame, of sources that it lacks: the last of the fit's sources.
     """

@@ -56,19 +56,7 @@ class DilationRule:
         object.__setattr__(self, "factors", tuple(factors.tolist()))
 
     def area(self, before):
-        """
-        Area that segments are to have.
-
-        Parameters
-        ----------
-        before : array_like
-            Areas in arcsec2, not negative.
-
-        Returns
-        -------
-        after : `~numpy.ndarray`
-            In arcsec2, never below ``before``.
-        """
+        """Areas (arcsec2) that segments of some areas are to have, never below these."""
         before = np.asarray(before, float)
         with np.errstate(divide="ignore"):
             factor = np.exp(np.interp(np.log(before), np.log(self.areas), np.log(self.factors)))
