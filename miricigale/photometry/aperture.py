@@ -168,27 +168,21 @@ def source_extractor_photometry(
     box = max(1, round(background_box * ratio))
     level, _ = sep_background(arrays.flux, ~arrays.usable, box, background_filter)
     flux = arrays.flux - np.where(arrays.usable, level, 0.0)
-    names = ("flux_auto", "flux_auto_err", "flux_aper", "flux_aper_err")
-    if len(catalog) == 0:
-        values = [np.empty(0)] * 4
-    else:
+    values = [np.empty(0)] * 4
+    if len(catalog):
         values = _measure(
             arrays, flux, segmentation, catalog, diameter, kron, local_background * ratio, image.wcs
         )
-    for name, value in zip(names, values, strict=True):
-        catalog[name] = value * FNU
     auto, auto_err, aper, aper_err = values
-    brighter = np.nan_to_num(auto, nan=-np.inf) / auto_fraction > aper / aperture_fraction
-    catalog["flux_best"] = np.where(brighter, auto / auto_fraction, aper / aperture_fraction) * FNU
-    catalog["flux_best_err"] = (
-        np.where(brighter, auto_err / auto_fraction, aper_err / aperture_fraction) * FNU
-    )
-    descriptions = {
-        "flux_auto": "Light in the Kron ellipse",
-        "flux_aper": "Light in the circle",
-        "flux_best": "Brighter of the two after correction to total",
-    }
-    for name, text in descriptions.items():
+    best = np.stack([auto, auto_err]) / auto_fraction
+    others = np.stack([aper, aper_err]) / aperture_fraction
+    best = np.where(np.nan_to_num(best[0], nan=-np.inf) > others[0], best, others)
+    for name, flux, error, text in (
+        ("flux_auto", auto, auto_err, "Light in the Kron ellipse"),
+        ("flux_aper", aper, aper_err, "Light in the circle"),
+        ("flux_best", *best, "Brighter of the two after correction to total"),
+    ):
+        catalog[name], catalog[f"{name}_err"] = flux * FNU, error * FNU
         catalog[name].info.description = text
         catalog[f"{name}_err"].info.description = "Error for noise that is not correlated"
     catalog.meta.update(provenance(preset=preset))

@@ -294,9 +294,7 @@ class _Field:
         flux = np.array([total for *_, total in rows])
         kinds = ["point" if donor.point else "galaxy" for _, _, donor, _ in rows]
         truth = SourceTemplates(
-            id=np.arange(len(rows)), sky=catalog["sky"].icrs, light=light,
-            sersic=np.full((len(rows), 4), np.nan), flags=np.zeros(len(rows), int),
-            snr=np.full(len(rows), np.nan), wcs=wcs,
+            id=np.arange(len(rows)), sky=catalog["sky"].icrs, light=light, wcs=wcs
         )  # fmt: skip
         added = (data / self.fine.area * SURFACE_BRIGHTNESS).to_value(self.highres.unit)
         highres = _with_data(self.highres, self.highres.data + added)

@@ -73,9 +73,9 @@ class SourceTemplates:
     id: np.ndarray
     sky: SkyCoord
     light: tuple
-    sersic: np.ndarray
-    flags: np.ndarray
-    snr: np.ndarray
+    sersic: np.ndarray | None = None
+    flags: np.ndarray | None = None
+    snr: np.ndarray | None = None
     fitted: np.ndarray | None = None
     wcs: object = None
     psf: np.ndarray | None = None
@@ -86,8 +86,13 @@ class SourceTemplates:
     def __post_init__(self):
         n = len(self.id)
         object.__setattr__(self, "light", tuple(self.light))
-        if self.fitted is None:
-            object.__setattr__(self, "fitted", not_fitted(n))
+        nothing = {
+            "sersic": np.full((n, 4), np.nan), "flags": np.zeros(n, int), "snr": np.full(n, np.nan),
+            "fitted": not_fitted(n),
+        }  # fmt: skip
+        for name, value in nothing.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)
         shapes = {"sersic": (n, 4), **dict.fromkeys(("flags", "snr", "fitted", *OPTIONAL), (n,))}
         for name, shape in shapes.items():
             value = getattr(self, name)
@@ -162,7 +167,6 @@ class SourceTemplates:
         if not min_snr >= 0:
             raise argument_error("min_snr", "at least 0", min_snr)
         known = catalog_sources(catalog)
-        n = len(known.id)
         fine = image_arrays(highres, "highres")
         segments = _segments(segmentation, fine.flux.shape)
         scale = pixel_scale(highres.wcs)
@@ -181,8 +185,7 @@ class SourceTemplates:
                 executor=pool if n_threads > 1 else None,
             )  # fmt: skip
         return cls(
-            **known.kept(), light=light, sersic=np.full((n, 4), np.nan),
-            flags=flags | more, snr=snr, fitted=fitted, wcs=highres.wcs, psf=psf,
+            **known.kept(), light=light, flags=flags | more, snr=snr, fitted=fitted, wcs=highres.wcs, psf=psf,
             meta=provenance(template=template, min_snr=float(min_snr), wings=bool(wings)),
         )  # fmt: skip
 
@@ -216,10 +219,10 @@ class SourceTemplates:
             raise argument_error("template", "'psf' or 'sersic'", repr(template))
         known = catalog_sources(catalog)
         n = len(known.id)
-        rows = sersic_rows(catalog) if template == "sersic" else np.full((n, 4), np.nan)
+        rows = sersic_rows(catalog) if template == "sersic" else None
         return cls(
-            **known.kept(), light=(None,) * n, sersic=rows, flags=np.zeros(n, int),
-            snr=np.full(n, np.nan), wcs=wcs, meta=provenance(template=template),
+            **known.kept(), light=(None,) * n, sersic=rows, wcs=wcs,
+            meta=provenance(template=template),
         )  # fmt: skip
 
     @classmethod
@@ -276,9 +279,7 @@ class SourceTemplates:
                 data = Cutout(data / total, at, float(noise[k]), bool(convolved[k]))
             light.append(data)
         return cls(
-            **known.kept(), light=light, sersic=np.full((n, 4), np.nan),
-            flags=np.zeros(n, int), snr=np.full(n, np.nan), wcs=wcs,
-            meta=provenance(template="arrays"),
+            **known.kept(), light=light, wcs=wcs, meta=provenance(template="arrays"),
         )  # fmt: skip
 
     @classmethod
