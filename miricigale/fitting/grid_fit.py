@@ -6,8 +6,8 @@ from functools import partial
 import astropy.units as u
 import numpy as np
 
-from miricigale.fitting.engines.grid import GridEngine
 from miricigale.fitting.flags import FitFlags
+from miricigale.fitting.grid import GridEngine
 from miricigale.fitting.posterior import check_pairs, joint_names, joint_tables
 from miricigale.fitting.priors import (
     GridPriors,
@@ -52,7 +52,7 @@ class GridFit:
         Derived quantities.
     fraction : `~miricigale.fitting.quantities.OtherFraction` or None
         The AGN fraction in the definition that the grid does not use.
-    engine : `~miricigale.fitting.engines.grid.GridEngine`
+    engine : `~miricigale.fitting.grid.GridEngine`
         What evaluates the models.
     redshift_tolerance : float or None
         How far a known redshift may lie from its node.

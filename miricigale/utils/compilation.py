@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 #: What the kernels of a room do, and about how many seconds all of them take to compile.
 _ROOMS = {
     "detector": ("the detector", 15),
-    "fitting": ("the fit", 30),
+    "fitting": ("the fit", 20),
     "photometry": ("photometry", 10),
     "profiles": ("light profiles", 5),
     "psf": ("PSFs", 10),

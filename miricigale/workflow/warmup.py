@@ -184,7 +184,7 @@ def _catalog(center):
 
 #: What is compiled together: what it is, and about how many seconds it takes on a slow machine.
 JOBS = {
-    "fit": (_fit, "model spectra and their fit", 60),
+    "fit": (_fit, "model spectra and their fit", 40),
     "images": (_images, "scenes, detector and reduction", 50),
     "photometry": (_photometry, "photometry", 20),
 }

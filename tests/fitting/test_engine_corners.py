@@ -10,7 +10,7 @@ import pytest
 from astropy.table import QTable
 
 from miricigale.fitting import BayesFitter, FitFlags, fit_file
-from miricigale.fitting.engines import grid as engine_module
+from miricigale.fitting import grid as engine_module
 
 
 def _table(grid, flux, err, **columns):

@@ -192,7 +192,7 @@ def test_galaxies_alone_weigh_one_over_the_number_of_fractions(make_grid, draw_p
 
 def test_a_short_list_of_pairs_changes_nothing(make_grid, draw_photometry, monkeypatch):
     """When the list is full it is worked off, and the search goes on."""
-    from miricigale.fitting.engines import grid as module
+    from miricigale.fitting import grid as module
 
     grid = make_grid(8, n_tau=20, n_age=16)
     table, _ = draw_photometry(grid, 6, noise=1.0)

@@ -7,7 +7,7 @@ from astropy.table import QTable
 
 from miricigale.cli import main
 from miricigale.fitting import open_results
-from miricigale.fitting.engines.grid import GridEngine
+from miricigale.fitting.grid import GridEngine
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import MiricigaleWarning
 

@@ -73,7 +73,7 @@ def test_a_fit_after_its_job_compiles_nothing(cache):
     found = eval(out.splitlines()[-1])
     assert {name for name, (_, misses) in found.items() if misses} == set()
     assert {name for name, (n, _) in found.items() if n > 1} == set()
-    assert found["miricigale.fitting._core.posterior.sum_up"][0] == 1
+    assert found["miricigale.fitting._core.evaluate._evaluate_runs"][0] == 1
     of_limits = [name for name in found if "_core.limit" in name]
     assert len(of_limits) > 5
     assert [name for name in of_limits if found[name][0]] == []

@@ -8,138 +8,71 @@ negative the best scale that is not negative is 0 and R = 0.
 """
 
 import numpy as np
+from numba.extending import intrinsic
 
-from miricigale.fitting._core.limits import limited_scale
-from miricigale.fitting._core.options import INNER, ONCE
-from miricigale.fitting._core.structs import NO_LIGHT
+from miricigale.fitting._core.structs import (
+    BLOCK,
+    DUST,
+    LOG_GALAXY,
+    NO_LIGHT,
+    PART,
+    PRIOR_FRAC,
+    RATIO,
+    SHARE_AGN,
+    SHARE_GALAXY,
+)
 from miricigale.utils.compilation import njit
 
 __all__ = [
-    "LANES",
     "N_INPUT",
     "SIZE",
+    "as_type",
+    "best_mixture",
     "exponential",
+    "exponential32",
     "fill_block",
     "fill_dead",
+    "galaxy_products",
     "gather",
-    "lane_model",
-    "light_exponential",
     "likelihoods",
+    "run_products",
 ]
 
-#: Pairs evaluated side by side: a block of galaxies with one torus, or single pairs.
-LANES = 64
-
-
-# Offsets of the vectors in Scratch.buffer, with A, X and B for x = c: what the pairs
-# are ...
-P, Q, X2, A, B, PRIOR, SHARE, DUST = (i * LANES for i in range(8))
+# Offsets of the vectors in Lanes.buffer, which lets the compiler see that they do not overlap. What
+# the pairs are, with A, X and B for x = c ...
+P, Q, X2, A, B, PRIOR, SHARE, POWER = (i * BLOCK for i in range(8))
 # ... sums over the fractions of prior * likelihood l, l s, l s^2, l c s, l c s^2, l c^2 s^2, the
-# other fraction phi and its square, l of s = 0 and l (s / sigma_s)^2; the largest R ...
-W0, W1, W2, V1, U2, V2, F1, F2, WZ, WR, TOP = (i * LANES for i in range(8, 19))
-# ... and work space.
-_T, _S, _S2, _PHI = (i * LANES for i in range(19, 23))
+# other fraction phi and its square, l of s = 0 and l (s / sigma_s)^2; the largest R, work space.
+W0, W1, W2, V1, U2, V2, F1, F2, WZ, WR, TOP, _T = (i * BLOCK for i in range(8, 20))
 #: Number of vectors that say what the pairs are, and length of the whole buffer.
 N_INPUT = 8
-SIZE = 23 * LANES
+SIZE = 20 * BLOCK
+
+# Products of fewer than so many pairs are worked out one by one.
+_FEW = 8
 
 _LOG2E = 1.4426950408889634
 _LN2_HIGH = 0.6931471803691238
 _LN2_LOW = 1.9082149292705877e-10
-_LOWEST = -700.0
 _LOG2E_32 = np.float32(1.4426950408889634)
 _LN2_HIGH_32 = np.float32(0.693359375)
 _LN2_LOW_32 = np.float32(-2.12194440e-4)
 
 
-@njit(**ONCE)
-def fill_dead(buffer, index, start):
-    """Fill the lanes from ``start`` on with pairs of no weight."""
-    for i in range(max(start, 0), LANES):
-        buffer[P + i] = -1e300
-        buffer[Q + i] = 1.0
-        buffer[X2 + i] = 0.0
-        buffer[A + i] = 0.0
-        buffer[B + i] = 0.0
-        buffer[PRIOR + i] = -1e300
-        buffer[SHARE + i] = 0.0
-        buffer[DUST + i] = 0.0
-        index[0, i] = 0
-        index[1, i] = 0
+@intrinsic
+def as_type(_, x, to):
+    """Bits of a number as a number of another type of the same size."""
+    out = to.instance_type
+
+    def generate(context, builder, signature, args):
+        return builder.bitcast(args[0], context.get_value_type(signature.return_type))
+
+    return out(x, to), generate
 
 
-@njit(**ONCE)
-def fill_block(buffer, index, run, n_run, pq, blocks, block, cross, a, b, k, log_torus, share):
-    """Fill the lanes with a block of galaxies and one torus; those not in the run are dead."""
-    last = run[n_run - 1]
-    for i in range(LANES):
-        d = blocks[0, block, i]
-        buffer[P + i] = -1e300
-        buffer[Q + i] = pq[1, block, i]
-        buffer[X2 + i] = 2.0 * cross[0, i] * d
-        buffer[A + i] = a * d
-        buffer[B + i] = b * d * d
-        buffer[PRIOR + i] = -1e300
-        buffer[SHARE + i] = blocks[2, block, i] * share
-        buffer[DUST + i] = d
-    for i in range(LANES):
-        index[0, i] = block * LANES + min(i, last)
-        index[1, i] = k
-    for j in range(n_run):
-        i = run[j]
-        buffer[P + i] = pq[0, block, i]
-        buffer[PRIOR + i] = log_torus + blocks[1, block, i]
-
-
-@njit(**ONCE)
-def gather(pending, index, run, n_run, pq, blocks, block, cross, a, b, k, log_torus, share, filled):
-    """Add the pairs of a short run to those gathered; returns how many there are now."""
-    for j in range(n_run):
-        i = run[j]
-        d = blocks[0, block, i]
-        pending[P + filled] = pq[0, block, i]
-        pending[Q + filled] = pq[1, block, i]
-        pending[X2 + filled] = 2.0 * cross[0, i] * d
-        pending[A + filled] = a * d
-        pending[B + filled] = b * d * d
-        pending[PRIOR + filled] = log_torus + blocks[1, block, i]
-        pending[SHARE + filled] = blocks[2, block, i] * share
-        pending[DUST + filled] = d
-        index[2, filled] = block * LANES + i
-        index[3, filled] = k
-        filled += 1
-    return filled
-
-
-@njit(**INNER)
-def lane_model(lanes, limits, c, i, floor):
-    """
-    Scale, R and variance of the scale of the pair in lane i at one fraction, c = f / (1 - f).
-
-    With limits, those whose R is below ``floor`` without them are left as they are then.
-    """
-    buffer, slope = lanes.buffer, lanes.slope
-    p = buffer[P + i] + c * buffer[A + i]
-    q = buffer[Q + i] + c * (buffer[X2 + i] + c * buffer[B + i])
-    q = q if q > NO_LIGHT else 1.0 / NO_LIGHT
-    inverse = 1.0 / q
-    s = max(p, 0.0) * inverse
-    r = max(p, 0.0) * s
-    if limits is not None and r >= floor:
-        n = limits.bands.size
-        for m in range(n):
-            slope[m] = lanes.limit[m, i] + c * lanes.limit[n + m, i]
-        s, r, inverse = limited_scale(p, q, slope, limits.level, limits.dark)
-    return s, r, inverse
-
-
-@njit(**INNER)
+@njit(**PART)
 def exponential(e):
-    """
-    exp(e) for e from -700 to 700 to 1e-11, as a number and the bits of a power of two.
-
-    After Cody & Waite.
-    """
+    """exp(e) for e from -700 to 700, to 1e-11 (after Cody & Waite)."""
     m = np.floor(e * _LOG2E + 0.5)
     r = e - m * _LN2_HIGH
     r = r - m * _LN2_LOW
@@ -153,12 +86,12 @@ def exponential(e):
     v = v * r + 0.5
     v = v * r + 1.0
     v = v * r + 1.0
-    return v, np.int64(np.int32(m) + 1023) << np.int64(52)
+    return v * as_type(np.int64(np.int32(m) + 1023) << np.int64(52), np.float64)
 
 
-@njit(**INNER)
-def light_exponential(e):
-    """Do what `exponential` does for e from -80 to 80, in single precision."""
+@njit(**PART)
+def exponential32(e):
+    """exp(e) for e from -80 to 80, in single precision."""
     m = np.floor(e * _LOG2E_32 + np.float32(0.5))
     r = e - m * _LN2_HIGH_32
     r = r - m * _LN2_LOW_32
@@ -169,58 +102,170 @@ def light_exponential(e):
     v = v * r + np.float32(1.6666665459e-1)
     v = v * r + np.float32(5.0000001201e-1)
     v = v * (r * r) + r + np.float32(1)
-    return v, (np.int32(m) + np.int32(127)) << np.int32(23)
+    return v * as_type(np.int32((np.int32(m) + 127) << 23), np.float32)
 
 
-@njit(**ONCE)
-def likelihoods(
-    buffer, power, weight, ratio, frac_prior, first, reference, scale_error, out
-):  # fmt: skip
+@njit(**PART)
+def galaxy_products(tables, target, z, block, pq):
+    """Fill ``Lanes.pq`` with <G, wF> and <G, wG> of a block of the galaxies of one redshift."""
+    p, q = pq[0, block * BLOCK : (block + 1) * BLOCK], pq[1, block * BLOCK : (block + 1) * BLOCK]
+    for i in range(BLOCK):
+        p[i] = 0.0
+        q[i] = 0.0
+    for b in target.bands:
+        w = target.weight[b]
+        wf = w * target.flux[b]
+        tile = tables.tiles[z, block, b]
+        for i in range(BLOCK):
+            t = tile[i]
+            p[i] += t * wf
+            q[i] += t * t * w
+
+
+@njit(**PART)
+def best_mixture(p, q, t, a, b, low, high):
+    """
+    Best R of a galaxy with a torus, x = c L_dust anything from low to high.
+
+    With p = <G, wF>, q = <G, wG>, t = <G, wA>, a = <A, wF>, b = <A, wA>.
+    """
+    rise = a * q - p * t
+    fall = p * b - a * t
+    x = rise / fall if fall > 0.0 else high
+    x = min(max(x, low), high) if rise > 0.0 else low
+    num = max(p + x * a, 0.0)
+    return num * num / max(q + x * (2.0 * t + x * b), 1e-300)
+
+
+@njit(**PART)
+def run_products(tables, bands, pairs, lanes, z, block, k, n_run):
+    """Fill ``lanes.cross`` with <G, wA> and the best R of the galaxies of a run with its torus."""
+    cross, pq, run, weighted = lanes.cross, lanes.pq, lanes.run, pairs.agn_weighted
+    a, b = pairs.agn_pq[k, 0], pairs.agn_pq[k, 1]
+    low, high = tables.of_frac[RATIO, 0], tables.of_frac[RATIO, -1]
+    start = block * BLOCK
+    if n_run < _FEW:
+        for j in range(n_run):
+            i = run[j]
+            t = 0.0
+            for m in bands:
+                t += tables.tiles[z, block, m, i] * weighted[k, m]
+            d = tables.of_galaxy[DUST, start + i]
+            cross[0, i] = t
+            cross[1, i] = best_mixture(
+                pq[0, start + i], pq[1, start + i], t, a, b, low * d, high * d
+            )
+        return
+    x, best, tiles = cross[0], cross[1], tables.tiles[z, block]
+    for i in range(BLOCK):
+        x[i] = 0.0
+    m = 0
+    while m + 4 <= bands.size:
+        b0, b1, b2, b3 = bands[m], bands[m + 1], bands[m + 2], bands[m + 3]
+        u0, u1, u2, u3 = weighted[k, b0], weighted[k, b1], weighted[k, b2], weighted[k, b3]
+        t0, t1, t2, t3 = tiles[b0], tiles[b1], tiles[b2], tiles[b3]
+        for i in range(BLOCK):
+            x[i] += t0[i] * u0 + t1[i] * u1 + t2[i] * u2 + t3[i] * u3
+        m += 4
+    while m < bands.size:
+        u0, t0 = weighted[k, bands[m]], tiles[bands[m]]
+        for i in range(BLOCK):
+            x[i] += t0[i] * u0
+        m += 1
+    p, q = pq[0, start : start + BLOCK], pq[1, start : start + BLOCK]
+    dust = tables.of_galaxy[DUST, start : start + BLOCK]
+    for i in range(BLOCK):
+        best[i] = best_mixture(p[i], q[i], x[i], a, b, low * dust[i], high * dust[i])
+
+
+@njit(**PART)
+def fill_dead(buffer, index, start):
+    """Fill the lanes from ``start`` on with pairs of no weight."""
+    for i in range(max(start, 0), BLOCK):
+        for v in range(N_INPUT):
+            buffer[v * BLOCK + i] = 0.0
+        buffer[P + i] = -1e300
+        buffer[Q + i] = 1.0
+        buffer[PRIOR + i] = -1e300
+        index[0, i] = 0
+        index[1, i] = 0
+
+
+@njit(**PART)
+def fill_block(tables, pairs, lanes, block, k, n_run, log_torus):
+    """Fill the lanes with a block of galaxies and one torus; those not in the run are dead."""
+    buffer, index, run, pq, of_galaxy = (
+        lanes.buffer, lanes.index, lanes.run, lanes.pq, tables.of_galaxy,
+    )  # fmt: skip
+    a, b, share = pairs.agn_pq[k, 0], pairs.agn_pq[k, 1], tables.of_agn[SHARE_AGN, k]
+    start = block * BLOCK
+    last = run[n_run - 1]
+    for i in range(BLOCK):
+        d = of_galaxy[DUST, start + i]
+        buffer[P + i] = -1e300
+        buffer[Q + i] = pq[1, start + i]
+        buffer[X2 + i] = 2.0 * lanes.cross[0, i] * d
+        buffer[A + i] = a * d
+        buffer[B + i] = b * d * d
+        buffer[PRIOR + i] = -1e300
+        buffer[SHARE + i] = of_galaxy[SHARE_GALAXY, start + i] * share
+        buffer[POWER + i] = d
+    for i in range(BLOCK):
+        index[0, i] = start + min(i, last)
+        index[1, i] = k
+    for j in range(n_run):
+        i = run[j]
+        buffer[P + i] = pq[0, start + i]
+        buffer[PRIOR + i] = log_torus + of_galaxy[LOG_GALAXY, start + i]
+
+
+@njit(**PART)
+def gather(tables, pairs, lanes, block, k, n_run, log_torus, filled):
+    """Add the pairs of a short run to those gathered; returns how many there are now."""
+    pending, index, run, pq, of_galaxy = (
+        lanes.pending, lanes.index, lanes.run, lanes.pq, tables.of_galaxy,
+    )  # fmt: skip
+    a, b, share = pairs.agn_pq[k, 0], pairs.agn_pq[k, 1], tables.of_agn[SHARE_AGN, k]
+    for j in range(n_run):
+        g = block * BLOCK + run[j]
+        d = of_galaxy[DUST, g]
+        pending[P + filled] = pq[0, g]
+        pending[Q + filled] = pq[1, g]
+        pending[X2 + filled] = 2.0 * lanes.cross[0, run[j]] * d
+        pending[A + filled] = a * d
+        pending[B + filled] = b * d * d
+        pending[PRIOR + filled] = log_torus + of_galaxy[LOG_GALAXY, g]
+        pending[SHARE + filled] = of_galaxy[SHARE_GALAXY, g] * share
+        pending[POWER + filled] = d
+        index[2, filled] = g
+        index[3, filled] = k
+        filled += 1
+    return filled
+
+
+@njit(**PART)
+def likelihoods(of_frac, lanes, reference, scale_error):
     """
     Evaluate the pairs in the lanes at every AGN fraction and sum over the fractions.
 
-    Parameters
-    ----------
-    buffer : `~numpy.ndarray`
-        Vectors of LANES pairs at offsets known to the compiler, which can then see that they do
-        not overlap.
-    power : `~numpy.ndarray` of int64, shape (LANES,)
-        Scratch.
-    weight : `~numpy.ndarray`, shape (n_ratio * LANES,) or more
-        Filled with prior * likelihood.
-    ratio, frac_prior, first
-        c = f / (1 - f) of the fractions above 0, and priors of all, these from ``first`` on.
-    reference, scale_error : float
-        R + 2 ln(prior) that has weight 1; whether the scale's variance counts.
-    out : `~numpy.ndarray`, shape (n_ratio,)
-        Filled with the sums of the weights.
-
-    Returns
-    -------
-    top : float
-        Largest R.
+    ``lanes.weight`` is filled with prior * likelihood, ``frac_sum`` with the sums of it over the pairs.
+    ``reference`` is R + 2 ln(prior) that has weight 1, ``scale_error`` whether the scale's variance
+    counts. Returned is the largest R.
     """
-    two = power.view(np.float64)
+    buffer, weight = lanes.buffer, lanes.weight
     low = 1e300
-    c_0, c_1 = ratio[0], ratio[-1]
-    for i in range(LANES):
+    c_0, c_1 = of_frac[RATIO, 0], of_frac[RATIO, -1]
+    for i in range(BLOCK):
         # the numerator of the scale is linear in c
         p, a = buffer[P + i], buffer[A + i]
         low = min(low, min(p + c_0 * a, p + c_1 * a) if p > -1e29 else 1e300)
-        buffer[W0 + i] = 0.0
-        buffer[W1 + i] = 0.0
-        buffer[W2 + i] = 0.0
-        buffer[V1 + i] = 0.0
-        buffer[U2 + i] = 0.0
-        buffer[V2 + i] = 0.0
-        buffer[F1 + i] = 0.0
-        buffer[F2 + i] = 0.0
-        buffer[WZ + i] = 0.0
-        buffer[TOP + i] = 0.0
-    for j in range(ratio.size):
-        c = ratio[j]
-        f = frac_prior[j + first]
-        for i in range(LANES):
+    for i in range(W0, _T):
+        buffer[i] = 0.0
+    for j in range(of_frac.shape[1]):
+        c = of_frac[RATIO, j]
+        f = of_frac[PRIOR_FRAC, j]
+        now = weight[j * BLOCK : (j + 1) * BLOCK]
+        for i in range(BLOCK):
             p = max(buffer[P + i] + c * buffer[A + i], 0.0)
             q = buffer[Q + i] + c * (buffer[X2 + i] + c * buffer[B + i])
             # without light in the used bands there is no scale to speak of
@@ -233,21 +278,12 @@ def likelihoods(
             s = p * inverse
             r = p * s
             e = 0.5 * (r + buffer[PRIOR + i] - reference)
-            buffer[TOP + i] = max(buffer[TOP + i], r)
-            v, power[i] = exponential(min(max(e, _LOWEST), 700.0))
-            buffer[_T + i] = v * f
-            buffer[_S + i] = s
-            buffer[_S2 + i] = s * s + scale_error * inverse
-            buffer[_PHI + i] = phi
-        for i in range(LANES):
-            t = buffer[_T + i] * two[i]
-            s = buffer[_S + i]
-            phi = buffer[_PHI + i]
-            buffer[_T + i] = t
-            weight[j * LANES + i] = t
+            t = exponential(min(max(e, -700.0), 700.0)) * f
             t1 = t * s
-            t2 = t * buffer[_S2 + i]
+            t2 = t * (s * s + scale_error * inverse)
             tp = t * phi
+            buffer[_T + i] = t
+            buffer[TOP + i] = max(buffer[TOP + i], r)
             buffer[W0 + i] += t
             buffer[W1 + i] += t1
             buffer[V1 + i] += t1 * c
@@ -258,18 +294,19 @@ def likelihoods(
             buffer[F2 + i] += tp * phi
         # sums apart from stores: see `agn_products`
         f_sum = 0.0
-        for i in range(LANES):
+        for i in range(BLOCK):
             f_sum += buffer[_T + i]
-        out[j] = f_sum
-    if low <= 0.0:
-        for j in range(ratio.size):
-            c = ratio[j]
-            for i in range(LANES):
-                dark = buffer[P + i] + c * buffer[A + i] <= 0.0
-                buffer[WZ + i] += weight[j * LANES + i] if dark else 0.0
+        lanes.frac_sum[j] = f_sum
+        for i in range(BLOCK):
+            now[i] = buffer[_T + i]
     top = 0.0
-    for i in range(LANES):
+    for i in range(BLOCK):
         # sum of l R, with R = (p + c a) s; lanes without weight have no p either
         buffer[WR + i] = buffer[P + i] * buffer[W1 + i] + buffer[A + i] * buffer[V1 + i]
         top = max(top, buffer[TOP + i])
+    if low <= 0.0:
+        for j in range(of_frac.shape[1]):
+            for i in range(BLOCK):
+                dark = buffer[P + i] + of_frac[RATIO, j] * buffer[A + i] <= 0.0
+                buffer[WZ + i] += weight[j * BLOCK + i] if dark else 0.0
     return top

@@ -6,90 +6,412 @@ the probability that a measurement of the model flux s m lies below F (Sawicki 2
 1208; Boquien et al. 2019, A&A 622, A103, section 4.3). T is convex and grows with u, so that what
 detections alone allow is an upper bound, and Newton's method on the derivative, begun at the
 scale that detections alone would have, comes down to the minimum from one side.
+
+One limit (`_limit`) and one step (`_step`) stand once, for single models and for pairs side by side,
+in either precision. Side by side the probabilities of the limits are multiplied rather than their
+logarithms summed. For pairs that have little weight each single precision will do: what it could
+not hold, the scale and the part of chi2 that detections add, stays in double precision; the limits'
+part is of order 1, and rounding changes a weight by some 1e-6.
 """
 
 import math
 
-from miricigale.fitting._core.options import EXACT
+import numpy as np
+from numba import types
+from numba.extending import overload
+
+from miricigale.fitting._core.lanes import (
+    F1,
+    F2,
+    PRIOR,
+    SHARE,
+    U2,
+    V1,
+    V2,
+    W0,
+    W1,
+    W2,
+    WR,
+    WZ,
+    X2,
+    A,
+    B,
+    P,
+    Q,
+    exponential,
+    exponential32,
+)
+from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART, PRIOR_FRAC, RATIO
 from miricigale.utils.compilation import njit
 
-__all__ = ["limit_term", "limited_scale"]
+__all__ = ["LIMITED_SIZE", "limited_likelihoods", "limited_scale"]
 
+# Offsets of the vectors in Lanes.limited: scale, half of chi2 and of its second derivative, the
+# limits' probability over exp(exponent), the exponent, the scale without limits (0 in lanes that do
+# not count), whether a model counts, change of what limits leave, unit of 1 / scale, work space.
+_SCALE, _CHI2, _CURVATURE, _FACTOR, _EXPONENT, _DETECTED, _ALIVE, _CHANGE, _UNIT, _V = (
+    i * BLOCK for i in range(10)
+)
+# Offsets in Lanes.limited32 or, in double precision, behind those: scale, derivatives of half of the
+# limits' chi2, product of probabilities, their exponent.
+_S, _G, _D, _H, _PRODUCT, _SUM = (i * BLOCK for i in range(6))
+_TERMS = 10 * BLOCK
+LIMITED_SIZE = 16 * BLOCK
 
 _ROOT_HALF = 0.70710678118654752
-_ROOT_2PI = 2.5066282746310002
-# Below this the term is 0 in double precision, above the other the asymptotic series is used.
+_ROOT_TWO_OVER_PI = 0.79788456080286536
+# Below this a term is 0 in double precision.
 _NOTHING = -9.0
-_SERIES = 20.0
+# Steps of Newton's method, and the size of the last, over the scale or its error.
+_MOST = 60
+_CLOSE = 1e-5
+_CLOSE_32 = 5e-3
+# The third derivative is taken into account in steps of less than one sigma, where it matters by
+# less than this part.
+_BEND = 0.1
+# Minus logarithm of a weight for which a step may be seven times as large.
+_SLIGHT = 10.0
+# Factors multiplied before they could be too small, and largest flux ratio of single precision.
+_FACTORS = 8
+_LARGEST = 1e15
+# What single precision may miss of the largest R.
+_ROUNDING = 1e-3
 
 
-@njit(**EXACT)
-def _far(u):
-    """1 - u times Mills' ratio of the normal distribution, for u >= 20 (to 1e-15)."""
-    t = 1.0 / (u * u)
-    return t * (1.0 - t * (3.0 - t * (15.0 - t * (105.0 - t * (945.0 - t * 10395.0)))))
-
-
-@njit(**EXACT)
-def limit_term(u):
-    """T(u), the term of chi2 of one limit."""
-    if u < _SERIES:
-        return -2.0 * math.log(0.5 * math.erfc(u * _ROOT_HALF))
-    return u * u + 2.0 * math.log(u * _ROOT_2PI) - 2.0 * math.log1p(-_far(u))
-
-
-@njit(**EXACT)
-def _slopes(u):
-    """Half the first and second derivative of T."""
-    if u < _SERIES:
-        hazard = math.exp(-0.5 * u * u) / (0.5 * _ROOT_2PI * math.erfc(u * _ROOT_HALF))
-        return hazard, hazard * (hazard - u)
-    rest = _far(u)
-    hazard = u / (1.0 - rest)
-    return hazard, hazard * hazard * rest
-
-
-@njit(**EXACT)
-def limited_scale(p, q, slope, level, dark):
+@njit(**PART)
+def _scaled_erfc(z):
     """
-    Best scale of one model.
+    exp(z^2) erfc(z) for z >= 0, to 2e-12.
 
-    Parameters
-    ----------
-    p, q : float
-        <m, wF> and <m, wm> over the detections.
-    slope, level : `~numpy.ndarray`, shape (n_limits,) or more
-        Model flux (not negative) and limiting flux over the error of the limit.
-    dark : float
-        Sum of the terms of a model without light.
+    t = 3 / (3 + z) times a polynomial in 2 t - 1, the Chebyshev interpolation of degree 16 (of
+    scipy.special.erfcx).
+    """
+    t = 3.0 / (3.0 + z)
+    x = 2.0 * t - 1.0
+    v = -7.909679668678854e-08
+    v = v * x - 1.327470214572296e-07
+    v = v * x + 8.281839527992843e-07
+    v = v * x + 1.295421122182736e-06
+    v = v * x - 5.739579827718830e-06
+    v = v * x - 9.890937187676496e-06
+    v = v * x + 3.581041826229913e-05
+    v = v * x + 9.213853674066139e-05
+    v = v * x - 1.827570762553639e-04
+    v = v * x - 1.011319029730867e-03
+    v = v * x - 4.041408907881644e-04
+    v = v * x + 8.942406098304561e-03
+    v = v * x + 3.984258723799971e-02
+    v = v * x + 1.034890876840956e-01
+    v = v * x + 1.967427856984673e-01
+    v = v * x + 2.944648177153389e-01
+    v = v * x + 3.580023023627791e-01
+    return v * t
+
+
+@njit(**PART)
+def _scaled_erfc32(z):
+    """Do what `_scaled_erfc` does in single precision: of degree 10, to 3e-7."""
+    t = np.float32(3) / (np.float32(3) + z)
+    x = t + t - np.float32(1)
+    v = np.float32(2.346841757e-5)
+    v = v * x + np.float32(7.026003732e-5)
+    v = v * x - np.float32(1.714378741e-4)
+    v = v * x - np.float32(9.910109220e-4)
+    v = v * x - np.float32(4.088962160e-4)
+    v = v * x + np.float32(8.933821693e-3)
+    v = v * x + np.float32(3.984341770e-2)
+    v = v * x + np.float32(1.034905910e-1)
+    v = v * x + np.float32(1.967427433e-1)
+    v = v * x + np.float32(2.944647372e-1)
+    v = v * x + np.float32(3.580023050e-1)
+    return v * t
+
+
+def _of_type(u):
+    """What depends on the precision of u: a converter of numbers."""
+
+
+def _bell_and_mills(u):
+    """exp(-u^2 / 2), Mills' ratio of the normal distribution at abs(u) over sqrt(pi / 2)."""
+
+
+@overload(_bell_and_mills, jit_options=PART)
+def _bell_and_mills_of_type(u):
+    if u == types.float32:
+        root, half, low = np.float32(_ROOT_HALF), np.float32(-0.5), np.float32(-80.0)
+        return lambda u: (
+            exponential32(max(half * u * u, low)),
+            _scaled_erfc32(abs(u) * root),
+        )
+    return lambda u: (exponential(max(-0.5 * u * u, -700.0)), _scaled_erfc(abs(u) * _ROOT_HALF))
+
+
+@overload(_of_type, jit_options=PART)
+def _of_type_(u):
+    return (lambda u: np.float32) if u == types.float32 else (lambda u: np.float64)
+
+
+@njit(**PART)
+def _limit(u):
+    """
+    What one limit adds at u, in the precision of u.
 
     Returns
     -------
-    s : float
-        Scale, not negative.
-    r : float
-        Chi2 of a model without light minus that of this one, not negative.
-    inverse : float
-        Variance of the scale: 2 over the second derivative of chi2.
+    first, second, third : float
+        Derivatives of half of T: the hazard h, h (h - u) and so on.
+    factor, exponent : float
+        The probability is factor exp(exponent).
+    """
+    real = _of_type(u)
+    zero, one, half = real(0.0), real(1.0), real(0.5)
+    bell, mills = _bell_and_mills(u)
+    above = mills if u > zero else real(2.0) - mills * bell
+    hazard = real(_ROOT_TWO_OVER_PI) * (one if u > zero else bell) / above
+    first = hazard * (hazard - u)
+    third = first * (hazard - u) + hazard * (first - one)
+    # far out differences have no digits
+    t = one / max(u * u, one)
+    rest = t * (one - t * (real(3.0) - t * (real(15.0) - t * (real(105.0) - t * real(945.0)))))
+    far = u > real(15.0)
+    first = hazard * hazard * rest if far else first
+    third = real(2.0) * t / max(u, one) if far else third
+    return hazard, first, third, half * above, (-half * u * u if u > zero else zero)
+
+
+@njit(**PART)
+def _step(s, g, d, h):
+    """
+    Step to a lower chi2 from a scale s.
+
+    Newton's, which converges from anywhere, and near the minimum (where it cannot lead astray) what
+    the third derivative changes; g, d and h are the derivatives of half of chi2.
+    """
+    inverse = 1.0 / d
+    step = -g * inverse
+    bend = 0.5 * h * step * inverse
+    step *= 1.0 - (bend if abs(bend) < _BEND and step * step * d < 1.0 else 0.0)
+    return max(s + step, 0.0) - s
+
+
+@njit(**PART)
+def limited_scale(p, q, limits):
+    """
+    Best scale of one model, not negative.
+
+    p = <m, wF> and q = <m, wm> are over the detections, ``limits.slope`` holds the model's fluxes
+    (not negative) over the errors of the limits. Returned are also R, chi2 of a model without light
+    minus that of this one, and the variance of the scale: 2 over the second derivative of chi2.
     """
     q = max(q, 1e-300)
     s = max(p, 0.0) / q
-    for _ in range(100):
-        first = q * s - p
-        second = q
-        for i in range(level.size):
-            u = s * slope[i] - level[i]
+    d = q
+    chi2 = 0.0
+    for _ in range(_MOST):
+        g = q * s - p
+        d = q
+        h = 0.0
+        chi2 = s * (q * s - 2.0 * p)
+        for i in range(limits.level.size):
+            m = limits.slope[i]
+            u = s * m - limits.level[i]
             if u > _NOTHING:
-                h, d = _slopes(u)
-                first += h * slope[i]
-                second += d * slope[i] * slope[i]
-        step = first / second
-        if s == 0.0 or abs(step) <= 1e-10 * s:
+                first, second, third, factor, exponent = _limit(u)
+                g += first * m
+                d += second * m * m
+                h += third * m * m * m
+                chi2 -= 2.0 * (math.log(factor) + exponent)
+        step = _step(s, g, d, h)
+        s += step
+        # the last step is small enough for a series
+        chi2 += step * (2.0 * g + step * (d + step * h / 3.0))
+        d += step * h
+        near = _CLOSE * _CLOSE
+        if step * step <= near * max(near * s * s, 1.0 / d):
             break
-        s = max(s - step, 0.0)
-    r = s * (2.0 * p - q * s) + dark
-    for i in range(level.size):
-        u = s * slope[i] - level[i]
-        if u > _NOTHING:
-            r -= limit_term(u)
-    return s, max(r, 0.0) if s > 0.0 else 0.0, 1.0 / second
+    return s, max(limits.dark - chi2, 0.0) if s > 0.0 else 0.0, 1.0 / d
+
+
+@njit(**PART)
+def _best_scales(buffer, work, terms, limit, c, level, reference, close):
+    """
+    Fill the scales that minimise chi2 at one fraction, and what goes with them.
+
+    work[_DETECTED] says which lanes count, work[_SCALE] where to begin. Filled are work[_SCALE],
+    work[_CHI2] with half of chi2 but for a constant and the probabilities, work[_CURVATURE] with half
+    its second derivative, and probabilities work[_FACTOR] times exp(work[_EXPONENT]). The limits' part
+    is worked out in the precision of ``terms``, which is scratch, and ``limit``, fluxes of galaxies
+    and (for c = 1) tori over the errors of the limits and the unit of the scale. ``reference`` is half
+    of chi2 less ln(prior) that has weight 1: models of less need not be as good. ``close`` is the
+    size of the last step over the scale or its error.
+    """
+    real = terms.dtype.type
+    ratio = real(c)
+    n = level.size
+    far = 1.0
+    steps = 0
+    while far > 0.0 and steps < _MOST:
+        steps += 1
+        for i in range(BLOCK):
+            terms[_S + i] = real(work[_SCALE + i] * work[_UNIT + i])
+            terms[_PRODUCT + i] = real(1.0)
+            work[_FACTOR + i] = 1.0
+        for i in range(BLOCK):
+            terms[_G + i] = real(0.0)
+            terms[_D + i] = real(0.0)
+            terms[_H + i] = real(0.0)
+            terms[_SUM + i] = real(0.0)
+        for j in range(n):
+            galaxy, agn = limit[j], limit[n + j]
+            top = real(level[j])
+            for i in range(BLOCK):
+                m = galaxy[i] + ratio * agn[i]
+                first, second, third, factor, exponent = _limit(terms[_S + i] * m - top)
+                terms[_G + i] += first * m
+                terms[_D + i] += second * m * m
+                terms[_H + i] += third * m * m * m
+                terms[_PRODUCT + i] *= factor
+                terms[_SUM + i] += exponent
+            if j % _FACTORS == _FACTORS - 1 or j == n - 1:
+                for i in range(BLOCK):
+                    work[_FACTOR + i] *= terms[_PRODUCT + i]
+                    terms[_PRODUCT + i] = real(1.0)
+        for i in range(BLOCK):
+            q = buffer[Q + i] + c * (buffer[X2 + i] + c * buffer[B + i])
+            q = q if q > NO_LIGHT else 1.0 / NO_LIGHT
+            # a pair that is not there has no p either
+            p = max(buffer[P + i], -1e200) + c * buffer[A + i]
+            s = work[_SCALE + i]
+            t = work[_UNIT + i]
+            g = q * s - p + terms[_G + i] * t
+            d = q + terms[_D + i] * (t * t)
+            h = terms[_H + i] * (t * t * t)
+            step = _step(s, g, d, h)
+            # the last step is small enough for a series
+            chi2 = s * (0.5 * q * s - p) + step * (g + step * (0.5 * d + step * h / 6.0))
+            work[_SCALE + i] = s + step
+            work[_CHI2 + i] = chi2
+            work[_CURVATURE + i] = d + step * h
+            work[_EXPONENT + i] = terms[_SUM + i]
+            # what the series misses goes with the fourth power of the step
+            e = chi2 - terms[_SUM + i] - 0.5 * max(buffer[PRIOR + i], -1e200)
+            e = min(max(e - reference, 0.0), _SLIGHT)
+            near = close * (1.0 + e * (0.25 + 0.03125 * e))
+            work[_V + i] = step * step - near * near * max(s * s, 1.0 / d)
+        far = 0.0
+        for i in range(BLOCK):
+            far = max(far, work[_V + i] if work[_DETECTED + i] > 0.0 else 0.0)
+
+
+@njit(**PART)
+def limited_likelihoods(of_frac, lanes, limits, reference, scale_error, delta, single):
+    """
+    Do what `lanes.likelihoods` does, for objects with upper limits.
+
+    Scales are sought where pairs evaluated before have theirs; models that are more than ``delta``
+    below the reference without the limits get no weight.
+
+    Returns
+    -------
+    top : float
+        Largest R, to rounding; in single precision somewhat more.
+    over : float
+        Largest exponent of a weight; where it is large the reference must be raised.
+    """
+    buffer, work, level, n = lanes.buffer, lanes.limited, limits.level, limits.level.size
+    for i in range(BLOCK):
+        # of the order of the signal-to-noise ratio of a scale of 1
+        unit = np.sqrt(max(buffer[Q + i] + buffer[B + i], NO_LIGHT))
+        work[_UNIT + i] = unit if single else 1.0
+    if single:
+        for m in range(2 * n):
+            for i in range(BLOCK):
+                lanes.limit32[m, i] = min(lanes.limit[m, i] / work[_UNIT + i], _LARGEST)
+    for i in range(W0, WR + BLOCK):
+        buffer[i] = 0.0
+    top = 0.0
+    over = 0.0
+    warm = False
+    zero_level = 0.5 * (limits.dark - reference)
+    least = max(reference - delta, -1e200)
+    for j in range(of_frac.shape[1]):
+        c = of_frac[RATIO, j]
+        f = of_frac[PRIOR_FRAC, j]
+        lanes.frac_sum[j] = 0.0
+        now = lanes.left[j * BLOCK : (j + 1) * BLOCK]
+        weight = lanes.weight[j * BLOCK : (j + 1) * BLOCK]
+        for i in range(BLOCK):
+            q = buffer[Q + i] + c * (buffer[X2 + i] + c * buffer[B + i])
+            q = q if q > NO_LIGHT else 1.0 / NO_LIGHT
+            p = max(max(buffer[P + i], -1e200) + c * buffer[A + i], 0.0)
+            s = p / q
+            # limits only lower R: what has no weight without them has none with them
+            value = max(p * s, 0.0) + buffer[PRIOR + i]
+            work[_ALIVE + i] = 1.0 if value >= least else 0.0
+            work[_DETECTED + i] = s if value >= least else 0.0
+            # begin where limits leave as much of the scale as of the last pair's at this fraction,
+            # but for what was different at the last fraction
+            part = now[i] * (work[_CHANGE + i] if warm else 1.0)
+            work[_SCALE + i] = s * min(part, 1.0)
+        some = 0.0
+        for i in range(BLOCK):
+            some += work[_ALIVE + i]
+        warm = some > 0.0
+        if not warm:
+            for i in range(BLOCK):
+                weight[i] = 0.0
+            continue
+        if single:
+            _best_scales(
+                buffer, work, lanes.limited32, lanes.limit32, c, level, zero_level, _CLOSE_32
+            )
+        else:
+            _best_scales(buffer, work, work[_TERMS:], lanes.limit, c, level, zero_level, _CLOSE)
+        for i in range(BLOCK):
+            whole = work[_DETECTED + i]
+            whole = whole if whole > 0.0 else max(work[_SCALE + i], NO_LIGHT)
+            part = min(max(work[_SCALE + i] / whole, 1e-3), 1.0)
+            work[_CHANGE + i] = min(part / now[i], 4.0)
+            now[i] = part
+        most = -1e300
+        for i in range(BLOCK):
+            # half of R but for the product of probabilities
+            e = 0.5 * limits.dark - work[_CHI2 + i] + work[_EXPONENT + i]
+            e = e if work[_ALIVE + i] > 0.0 else -1e4
+            work[_EXPONENT + i] = e
+            most = max(most, e)
+        for i in range(BLOCK if 2.0 * most > top else 0):
+            e = work[_EXPONENT + i]
+            if 2.0 * e > top:
+                top = max(top, 2.0 * e + 2.0 * math.log(max(work[_FACTOR + i], 1e-300)))
+        for i in range(BLOCK):
+            alive = work[_ALIVE + i]
+            e = work[_EXPONENT + i] + 0.5 * (max(buffer[PRIOR + i], -1e200) - reference)
+            over = max(over, e if alive > 0.0 else 0.0)
+            t = exponential(min(max(e, -700.0), 700.0)) * f * work[_FACTOR + i] * alive
+            work[_V + i] = t
+        for i in range(BLOCK):
+            t = work[_V + i]
+            s = work[_SCALE + i]
+            inverse = 1.0 / work[_CURVATURE + i]
+            y = c * buffer[SHARE + i]
+            phi = y / (1.0 + y)
+            s2 = s * s + scale_error * inverse
+            buffer[W0 + i] += t
+            buffer[W1 + i] += t * s
+            buffer[V1 + i] += t * s * c
+            buffer[W2 + i] += t * s2
+            buffer[U2 + i] += t * s2 * c
+            buffer[V2 + i] += t * s2 * c * c
+            buffer[F1 + i] += t * phi
+            buffer[F2 + i] += t * phi * phi
+            buffer[WR + i] += t * s * s * work[_CURVATURE + i]
+            buffer[WZ + i] += t if s == 0.0 else 0.0
+        # sums apart from stores: see `agn_products`
+        total = 0.0
+        for i in range(BLOCK):
+            total += work[_V + i]
+        lanes.frac_sum[j] = total
+        for i in range(BLOCK):
+            weight[i] = work[_V + i]
+    return top + _ROUNDING if single else top, over

@@ -16,7 +16,6 @@ import numpy as np
 from miricigale.fitting._core.lanes import (
     F1,
     F2,
-    LANES,
     PRIOR,
     SHARE,
     TOP,
@@ -34,52 +33,50 @@ from miricigale.fitting._core.lanes import (
     P,
     Q,
     exponential,
-    light_exponential,
+    exponential32,
 )
-from miricigale.fitting._core.options import INNER, ONCE
-from miricigale.fitting._core.structs import NO_LIGHT
+from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART, PRIOR_FRAC, RATIO
 from miricigale.utils.compilation import njit
 
-__all__ = ["light_likelihoods", "light_size", "pair_weight"]
+__all__ = ["pair_weight", "single_likelihoods", "single_size"]
 
-
-# Offsets of the vectors in Lanes.light: N, D, K, M, the scale's variance, the share, x*, the
-# other fraction there, ...
-_P, _A, _Q, _X, _B, _K, _M, _VAR, _SHARE, _BEST, _OTHER = (i * LANES for i in range(11))
+# Offsets of the vectors in Lanes.single: N, D, K, M, the scale's variance, the share, x*, the
+# other fraction there ...
+_P, _A, _Q, _X, _B, _K, _M, _VAR, _SHARE, _BEST, _OTHER = (i * BLOCK for i in range(11))
 # ... sums over the fractions ...
-_S0, _S1, _S2, _Y1, _SY, _Y2, _F1, _F2, _SZ = (i * LANES for i in range(11, 20))
-# ... and work space.
-_D, _I, _PHI = (i * LANES for i in range(20, 23))
-# ... and weights at every fraction, over those at x*.
-_T = 23 * LANES
+_S0, _S1, _S2, _Y1, _SY, _Y2, _F1, _F2, _SZ = (i * BLOCK for i in range(11, 20))
+# ... exponents, work space, and weights at every fraction, over those at x*.
+_D, _I, _PHI = (i * BLOCK for i in range(20, 23))
+_T = 23 * BLOCK
 
 # Above this a share times any odds is as good as infinite, and would not fit with others.
 _MOST = 1e11
+# Products of the exponential of what is less than this would be too small for fast numbers.
+_LOWEST = np.float32(-50.0)
 
 
-def light_size(n_ratio):
-    """Length of Lanes.light."""
-    return _T + n_ratio * LANES
+def single_size(n_ratio):
+    """Length of ``Lanes.single``."""
+    return _T + n_ratio * BLOCK
 
 
-@njit(**INNER)
+@njit(**PART)
 def pair_weight(lanes, single, j, i):
     """Prior * likelihood of the pair in lane i at a fraction."""
     if single:
-        return lanes.buffer[TOP + i] * lanes.light[_T + j * LANES + i]
-    return lanes.weight[j * LANES + i]
+        return lanes.buffer[TOP + i] * lanes.single[_T + j * BLOCK + i]
+    return lanes.weight[j * BLOCK + i]
 
 
-@njit(**ONCE)
-def _prepare(buffer, light, power, low, high, reference, scale_error):
+@njit(**PART)
+def _prepare(buffer, light, low, high, reference, scale_error):
     """
     Fill the vectors of ``light`` that say what the pairs are.
 
     Weights at x* go to buffer[W0], units of the scales to buffer[W1], R* to buffer[W2], x* to
     buffer[WR], which are not needed before the sums. Returned is the largest R*.
     """
-    two = power.view(np.float64)
-    for i in range(LANES):
+    for i in range(BLOCK):
         p, a = buffer[P + i], buffer[A + i]
         q, x2, b = buffer[Q + i], buffer[X2 + i], buffer[B + i]
         t = 0.5 * x2
@@ -98,7 +95,8 @@ def _prepare(buffer, light, power, low, high, reference, scale_error):
         unit = max(each, np.sqrt(one))
         each = one / unit
         e = 0.5 * (r + buffer[PRIOR + i] - reference)
-        buffer[W0 + i], power[i] = exponential(min(max(e, -700.0), 700.0))
+        e = exponential(min(max(e, -700.0), 700.0))
+        buffer[W0 + i] = e if buffer[PRIOR + i] > -1e200 else 0.0
         buffer[W1 + i] = unit
         buffer[W2 + i] = r
         buffer[WR + i] = best
@@ -114,56 +112,40 @@ def _prepare(buffer, light, power, low, high, reference, scale_error):
         light[_BEST + i] = best
         y = best * buffer[SHARE + i]
         light[_OTHER + i] = y / (1.0 + y)
-    for i in range(LANES):
-        buffer[W0 + i] *= two[i] if buffer[PRIOR + i] > -1e200 else 0.0
     top = 0.0
-    for i in range(LANES):
+    for i in range(BLOCK):
         top = max(top, buffer[W2 + i])
     return top
 
 
-@njit(**ONCE)
-def light_likelihoods(
-    buffer, light, power, power32, ratio, frac_prior, first, reference, scale_error, out
-):
+@njit(**PART)
+def single_likelihoods(of_frac, lanes, reference, scale_error):
     """
     Do what `lanes.likelihoods` does, in single precision.
 
-    Parameters
-    ----------
-    light : `~numpy.ndarray` of float32, shape (light_size(n_ratio),) or more
-        Vectors of LANES pairs.
-    power32 : `~numpy.ndarray` of int32, shape (LANES,)
-        Scratch.
-    buffer, power, ratio, frac_prior, first, reference, scale_error, out
-        As there.
-
-    Returns
-    -------
-    top : float
-        Largest R*, which no R exceeds.
+    Weights at every fraction are those of `pair_weight`; returned is the largest R*, which no R
+    exceeds.
     """
+    buffer, light = lanes.buffer, lanes.single
     zero = np.float32(0)
     one = np.float32(1)
-    # products of what is less than this would be too small for fast numbers
-    lowest = np.float32(-50.0)
-    two = power32.view(np.float32)
-    c_0, c_1 = ratio[0], ratio[-1]
-    top = _prepare(buffer, light, power, c_0, c_1, reference, scale_error)
-    for i in range(_S0, _SZ + LANES):
+    c_0, c_1 = of_frac[RATIO, 0], of_frac[RATIO, -1]
+    top = _prepare(buffer, light, c_0, c_1, reference, scale_error)
+    for i in range(_S0, _SZ + BLOCK):
         light[i] = zero
     least = 1e300
-    for i in range(LANES):
+    for i in range(BLOCK):
         p, a = buffer[P + i], buffer[A + i]
         least = min(least, min(p + c_0 * a, p + c_1 * a) if p > -1e29 else 1e300)
     # where a fraction has R = 0 the difference to R* is not that of the formula
     some_dark = least <= 0.0
-    for j in range(ratio.size):
-        at = _T + j * LANES
-        c = np.float32(ratio[j])
-        f = np.float32(frac_prior[j + first])
-        for i in range(LANES):
-            d = np.float32(ratio[j] - buffer[WR + i])
+    for j in range(of_frac.shape[1]):
+        at = _T + j * BLOCK
+        c_64 = of_frac[RATIO, j]
+        c = np.float32(c_64)
+        f = np.float32(of_frac[PRIOR_FRAC, j])
+        for i in range(BLOCK):
+            d = np.float32(c_64 - buffer[WR + i])
             y = c * light[_SHARE + i]
             den = light[_Q + i] + c * (light[_X + i] + c * light[_B + i])
             # one division for both 1 / D and y / (1 + y)
@@ -173,16 +155,12 @@ def light_likelihoods(
             light[_I + i] = inverse
             light[_D + i] = d * (light[_K + i] * d + light[_M + i]) * inverse
         if some_dark:
-            for i in range(LANES):
+            for i in range(BLOCK):
                 # R* - R is R* there
-                num = buffer[P + i] + ratio[j] * buffer[A + i]
+                num = buffer[P + i] + c_64 * buffer[A + i]
                 light[_D + i] = light[_D + i] if num > 0.0 else -0.5 * buffer[W2 + i]
-        for i in range(LANES):
-            e = max(light[_D + i], lowest)
-            v, power32[i] = light_exponential(e)
-            light[at + i] = v * f
-        for i in range(LANES):
-            t = light[at + i] * two[i]
+        for i in range(BLOCK):
+            t = exponential32(max(light[_D + i], _LOWEST)) * f
             light[at + i] = t
             s = max(light[_P + i] + c * light[_A + i], zero) * light[_I + i]
             # about the values at x*, so that means and squares keep their digits
@@ -203,16 +181,15 @@ def light_likelihoods(
             light[_F1 + i] += t_phi
             light[_F2 + i] += t_phi * phi
         if some_dark:
-            for i in range(LANES):
+            for i in range(BLOCK):
                 dark = light[_P + i] + c * light[_A + i] <= zero
                 light[_SZ + i] += light[at + i] if dark else zero
-    for j in range(ratio.size):
-        at = _T + j * LANES
+    for j in range(of_frac.shape[1]):
         total = 0.0
-        for i in range(LANES):
-            total += buffer[W0 + i] * light[at + i]
-        out[j] = total
-    for i in range(LANES):
+        for i in range(BLOCK):
+            total += buffer[W0 + i] * light[_T + j * BLOCK + i]
+        lanes.frac_sum[j] = total
+    for i in range(BLOCK):
         w0 = buffer[W0 + i]
         unit = buffer[W1 + i]
         first = w0 * unit
@@ -220,7 +197,9 @@ def light_likelihoods(
         s0 = np.float64(light[_S0 + i])
         s1 = np.float64(light[_S1 + i])
         y1 = np.float64(light[_Y1 + i])
+        f1 = np.float64(light[_F1 + i])
         best = np.float64(light[_BEST + i])
+        other = np.float64(light[_OTHER + i])
         w1 = first * (s0 + s1)
         v1 = first * (best * s0 + y1)
         buffer[W0 + i] = w0 * s0
@@ -230,8 +209,6 @@ def light_likelihoods(
         buffer[V1 + i] = v1
         buffer[U2 + i] = second * (best * (s0 + s1) + y1 + light[_SY + i])
         buffer[V2 + i] = second * (best * (best * s0 + 2.0 * y1) + light[_Y2 + i])
-        f1 = np.float64(light[_F1 + i])
-        other = np.float64(light[_OTHER + i])
         buffer[F1 + i] = w0 * (other * s0 + f1)
         buffer[F2 + i] = w0 * (other * (other * s0 + 2.0 * f1) + light[_F2 + i])
         buffer[WZ + i] = w0 * light[_SZ + i]

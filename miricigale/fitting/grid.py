@@ -2,16 +2,16 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import log_ndtr, ndtr, ndtri
 
 from miricigale.fitting import _core
-from miricigale.fitting.engines.layout import make_tables
-from miricigale.fitting.engines.output import GridOutput
+from miricigale.fitting.posterior import cell_edges
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["GridEngine"]
+__all__ = ["GridEngine", "GridOutput"]
 
 #: Runs of up to 64 pairs listed at once by one worker (260 bytes each).
 _CAPACITY = 1 << 16
@@ -23,6 +23,27 @@ _TAIL = 10.0
 _THIN = 1e-4
 #: Least ``rtol`` with which pairs of little weight are evaluated in single precision.
 _SINGLE = 5e-7
+
+
+class GridOutput(NamedTuple):
+    """What a fit of n objects returns; not a number, or -1, in rows that were not fitted."""
+
+    chi2: np.ndarray  # (n,), of the best model
+    log_sum: np.ndarray  # (n,): ln of the sum of prior exp(-chi2 / 2)
+    n_models: np.ndarray  # (n,): how many models were evaluated
+    best_scale: np.ndarray  # (n,): solar masses formed of the best model
+    index: np.ndarray  # int (n, 4): its redshift, galaxy, torus and AGN fraction
+    zf: np.ndarray  # (n, nz, nf): joint posterior of redshift and AGN fraction
+    galaxy: np.ndarray  # (n, nG) and
+    agn: np.ndarray  # (n, nA): posteriors of galaxy models and tori
+    band: np.ndarray  # (n, 2, nb): posterior mean and standard deviation of model fluxes
+    moments: np.ndarray  # (n, n_quantities, 3): mean, standard deviation and mean log10 and
+    quantiles: np.ndarray  # (n, n_quantities, n_levels) of derived quantities
+    share: np.ndarray  # (n, 2): mean and standard deviation and
+    share_quantiles: np.ndarray  # (n, n_levels) of the other AGN fraction
+    draw_index: np.ndarray  # int (n, n_draws, 4): models drawn from the posterior
+    draw_scale: np.ndarray  # (n, n_draws, 2): their scales and the variances of these
+    joint: dict  # (n, ...): joint posteriors that were asked for, by two letters of z, g, k and f
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -86,7 +107,7 @@ class GridEngine:
     def n_models(self):
         """Number of different models that are evaluated or bounded."""
         n_row = int(np.count_nonzero(self.usable))
-        n_zero = int(self.frac[0] == 0.0)
+        n_zero = int(self._zero_frac)
         return n_row * (n_zero + self.agn.shape[1] * (self.frac.size - n_zero))
 
     @property
@@ -103,14 +124,75 @@ class GridEngine:
 
     @cached_property
     def _tables(self):
-        return make_tables(self)
+        """
+        The model grid and its priors, as the kernels take them.
+
+        All arrays can be written to, for the kernels are compiled once more for those that cannot.
+        """
+        n_z, n_galaxy, n_bands = self.galaxy.shape
+        block = _core.BLOCK
+        n_padded = -(-n_galaxy // block) * block
+        padded = np.ones((n_z, n_padded, n_bands))
+        padded[:, :n_galaxy] = self.galaxy
+        tiles = padded.reshape(n_z, -1, block, n_bands).transpose(0, 1, 3, 2).copy()
+        unit, agn_unit = _unit(self.galaxy), _unit(self.agn)
+        padded[:, :n_galaxy] /= unit
+        log_galaxy = _two_log(self.prior_galaxy / self.prior_galaxy.sum())
+        log_usable = np.full((n_z, n_padded), -1e300)
+        log_usable[:, :n_galaxy] = np.where(self.usable, log_galaxy, -1e300)
+        share_galaxy, share_agn = self.share_galaxy, self.share_agn
+        if share_galaxy is None or share_agn is None:
+            share_galaxy, share_agn = np.zeros(n_galaxy), np.zeros(self.agn.shape[1])
+        log_dust = np.log10(self.dust, where=self.dust > 0, out=np.full(n_galaxy, -400.0))
+        of_galaxy = np.zeros((5, n_padded))
+        of_galaxy[:, :n_galaxy] = (self.dust, log_dust, log_galaxy, share_galaxy, self.mixed_galaxy)
+        n_agn = self.agn.shape[1]
+        of_agn = np.zeros((3, max(n_agn, 1)))
+        of_agn[:, :n_agn] = (_two_log(self._agn_prior), share_agn, self.mixed_agn)
+        prior_frac = self.prior_frac / self.prior_frac.sum()
+        log_frac = _two_log(prior_frac)
+        ratio, edge = _ratio(self.frac), _ratio(cell_edges(self.frac, (0.0, 1.0)))
+        above = self.frac > 0
+        log_ratio = np.log10(ratio, where=above, out=np.zeros(ratio.size)) * _core.PER_DEX
+        of_frac = np.array([ratio, log_ratio, prior_frac, log_frac, edge[:-1], edge[1:]])
+        return _core.Tables(
+            galaxy=np.array(self.galaxy, order="C"),
+            agn=np.array(self.agn, order="C"),
+            tiles=tiles,
+            galaxy32=padded.transpose(0, 2, 1).astype(np.float32, order="C"),
+            agn32=(self.agn / agn_unit).astype(np.float32, order="C"),
+            galaxy_unit=np.array(unit[:, :, 0], order="C"),
+            log_usable=log_usable,
+            of_galaxy=of_galaxy,
+            of_agn=of_agn,
+            of_frac=np.array(of_frac[:, above], order="C"),
+            zero_frac=int(self._zero_frac),
+            prior_zero=float(prior_frac[0]) if self._zero_frac else 0.0,
+            log_zero=float(log_frac[0]) if self._zero_frac else -1e300,
+            edge_zero=float(edge[1]),
+            share_mean=float(self._agn_prior @ share_agn),
+        )
+
+    @property
+    def _zero_frac(self):
+        return bool(self.frac[0] == 0.0)
+
+    @cached_property
+    def _agn_prior(self):
+        return self.prior_agn / max(self.prior_agn.sum(), 1e-300)
+
+    @cached_property
+    def _scales(self):
+        agn = np.zeros((self.agn_scale.shape[0] + 1, max(self.agn.shape[1], 1)))
+        agn[:, : self.agn.shape[1]] = np.vstack([self.agn_scale, self.mixed_agn])
+        return _core.Scales(np.vstack([self.galaxy_scale, self.mixed_galaxy]), agn)
 
     def workspace(self, n_draws=0, joint=()):
         """Make the accumulators and work space of one worker (some tens of MB)."""
         n_z, n_galaxy, n_bands = self.galaxy.shape
         size = (n_z, n_galaxy, self.agn.shape[1], self.frac.size, n_bands)
-        return _core.make_sums(*size, n_draws, joint), _core.make_scratch(
-            *size, self.n_quantities, int(self.frac[0] == 0.0), _CAPACITY
+        return _core.make_sums(*size, n_draws, joint), *_core.make_workspace(
+            *size, int(self._zero_frac), _CAPACITY
         )
 
     def fit(
@@ -191,22 +273,23 @@ class GridEngine:
             draw_scale=np.full((n, n_draws, 2), np.nan),
             joint={name: np.full((n, size[name[0]], size[name[1]]), np.nan) for name in joint},
         )
-        sums, scratch = self.workspace(n_draws, joint) if workspace is None else workspace
-        tables, request, single = self._tables, self._request, self.rtol >= _SINGLE
+        workspace = self.workspace(n_draws, joint) if workspace is None else workspace
+        sums = workspace[0]
+        single = self.rtol >= _SINGLE
         for i in np.flatnonzero(log_prior.max(axis=1, initial=-1e300) > -1e200):
             target = _target(data[i], weight[i], log_prior[i])
             limits = _limits(limit[i], inverse[i])
             sums.draws.state[0] = seeds[i]
             _core.clear(sums)
             if target.norm > 0.0 and _core.sum_up(
-                tables, request, target, limits, sums, scratch, single
+                self._tables, self._scales, self._request, target, limits, *workspace, single=single
             ):
                 self._summarise(target, limits, sums, out, i)
         return out
 
     def _summarise(self, target, limits, sums, out, i):
         """Fill row i of the output."""
-        total, tables = sums.total[0], self._tables
+        total = sums.total[0]
         z, g, k, f = out.index[i] = sums.index
         scale = out.best_scale[i] = sums.best[1]
         model = scale * self.galaxy[z, g]
@@ -227,16 +310,17 @@ class GridEngine:
         out.zf[i] = sums.zf / sums.zf.sum()
         out.galaxy[i] = sums.galaxy[:, 0] / sums.galaxy[:, 0].sum()
         # without AGN the data say nothing on the torus: its prior
-        prior = tables.prior_agn
+        prior = self._agn_prior
         if prior.size:
             agn = sums.agn[:, 0] + sums.alone.sum() * prior
             out.agn[i] = agn / agn.sum()
         mean, square = sums.band / total
         out.band[i] = mean, np.sqrt(np.maximum(square - mean * mean, 0.0))
         _core.summarise(
-            tables,
-            self._request,
+            self._scales,
             sums,
+            float(self.scale_error),
+            self.levels,
             out.moments[i],
             out.quantiles[i],
             out.share[i],
@@ -245,12 +329,12 @@ class GridEngine:
         out.draw_index[i] = sums.draws.index
         out.draw_scale[i] = sums.draws.scale
         for name, table in out.joint.items():
-            table[i] = getattr(sums, name)
-            if name == "zk" and tables.zero_frac:
+            table[i] = getattr(sums.joint, name)
+            if name == "zk" and self._zero_frac:
                 table[i] += sums.zf[:, :1] * prior
             elif name == "gk":
                 table[i] += sums.alone[:, None] * prior
-            elif name == "fk" and tables.zero_frac:
+            elif name == "fk" and self._zero_frac:
                 table[i, 0] += sums.alone.sum() * prior
             table[i] /= table[i].sum()
 
@@ -306,7 +390,6 @@ class GridEngine:
             tail=_TAIL,
             thin=_THIN * self.rtol,
             scale_error=float(self.scale_error),
-            levels=self.levels.copy(),
         )
 
     @cached_property
@@ -317,18 +400,41 @@ class GridEngine:
 
     def __getstate__(self):
         # the prepared tables are made again by whoever unpickles
-        hidden = ("_tables", "_request", "_negative")
-        return {name: value for name, value in self.__dict__.items() if name not in hidden}
+        names = self.__dataclass_fields__
+        return {name: value for name, value in self.__dict__.items() if name in names}
+
+
+def _unit(table):
+    """Largest flux of every model, shape (nz, n, 1); 1 where there is none."""
+    top = table.max(axis=-1, keepdims=True, initial=0.0)
+    return np.where(top > 0, top, 1.0)
+
+
+def _ratio(frac):
+    """Odds f / (1 - f), of 1 a large number."""
+    return frac / np.maximum(1.0 - frac, 1e-12)
+
+
+def _two_log(prior):
+    """Return 2 ln(prior), -1e300 where it is zero."""
+    return 2.0 * np.log(prior, where=prior > 0, out=np.full(prior.shape, -5e299))
 
 
 def _target(flux, weight, log_prior):
     """Bundle the data of one object."""
+    bands = np.flatnonzero(weight > 0)
+    used, norm = weight[bands], float(np.sum(weight * flux * flux))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root32 = np.sqrt(used / used.max(initial=0.0)).astype(np.float32)
+        data32 = (flux[bands] * np.sqrt(used / norm)).astype(np.float32)
     return _core.Target(
         flux=flux,
         weight=weight,
         log_prior=log_prior,
-        bands=np.flatnonzero(weight > 0),
-        norm=float(np.sum(weight * flux * flux)),
+        bands=bands,
+        root32=root32,
+        data32=data32,
+        norm=norm,
     )
 
 
@@ -342,5 +448,6 @@ def _limits(limit, inverse):
         bands=bands,
         level=level,
         inverse=inverse[bands],
+        slope=np.empty(bands.size),
         dark=float(-2.0 * log_ndtr(level).sum()),
     )

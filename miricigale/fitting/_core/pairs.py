@@ -1,0 +1,493 @@
+"""
+Which (galaxy, torus) pairs can matter at all: bounds in single precision, and how deep to go.
+
+With whitened data d = F sqrt(w) and unit vectors g, t of a galaxy and a torus in the used
+bands, p = <g, d>, a = <t, d>, X = <g, t>, the best chi2 of any non-negative mixture of the
+two is |d|^2 - R with ::
+
+    R = p^2 + (a - p X)^2 / (1 - X^2)    where a > p X and p > a X,
+    R = max(p, a, 0)^2                   elsewhere.
+
+No AGN fraction can do better, so a pair whose R lies far below the best is skipped. The
+test is done without division, and leans to keeping a pair by more than the rounding of
+single precision can amount to.
+"""
+
+import math
+
+import numpy as np
+
+from miricigale.fitting._core.limits import limited_scale
+from miricigale.fitting._core.structs import (
+    BLOCK,
+    DUST,
+    KERNEL,
+    LOG_AGN,
+    LOG_FRAC,
+    PART,
+    PRIOR_FRAC,
+    RATIO,
+)
+from miricigale.utils.compilation import njit
+
+__all__ = [
+    "DONE",
+    "GROUP",
+    "KEY_BITS",
+    "N_LEVELS",
+    "ROWS",
+    "agn_products",
+    "best_of_galaxy",
+    "first_floor",
+    "list_runs",
+    "project",
+    "raise_bounds",
+    "second_floor",
+]
+
+#: Tori handled side by side; arrays of unit vectors are padded with zeros to a multiple.
+GROUP = 4
+#: A run is a torus with a block of galaxies at one redshift; its key has so many bits for the
+#: torus, as many for the block, and the redshift above.
+KEY_BITS = 20
+#: Bound of a pair that is not listed, or is no more.
+DONE = np.float32(-3e38)
+#: Steps of the histogram of bounds.
+N_LEVELS = 8000
+
+# Rounding of 64 products of unit vectors in float32, generously.
+_ETA = np.float32(3e-6)
+_EPS = np.float32(6e-6)
+_TINY = np.float32(1e-28)
+_ALWAYS = np.float32(4.0)
+_NEVER = np.float32(1e30)
+_NOWHERE = np.float32(-1e3)
+_SLACK = np.float32(1e-6)
+_MASK = (1 << KEY_BITS) - 1
+# Vectors of Pairs.rows: <g, t> of GROUP tori; of the galaxies the least R / |d|^2 to keep, 2 ln(prior)
+# with that of their best partner, <g, d>, their largest bound, and work space.
+_LEAST, _BASE, _P, _TOP, _ALONE, _REST, _PASS, _SCORE = (i * BLOCK for i in range(GROUP, GROUP + 8))
+ROWS = GROUP + 8
+
+# Steps of the histogram of bounds for each unit of chi2.
+_PER_UNIT = 4.0
+# Pairs whose bound is within this of the best are evaluated first ...
+_FIRST = 10.0
+# ... but not many more than so many of them.
+_MOST = 8192
+# ... and in double precision if there are fewer than so many times as many.
+_FEW = 4
+# Below every bound, above `DONE`.
+_ALL = -1e37
+_DECAY = np.exp(-0.5 / _PER_UNIT * np.arange(N_LEVELS))
+
+
+@njit(**KERNEL)
+def project(tables, target, pairs):
+    """
+    Look at galaxies without AGN, for each redshift.
+
+    Filled are ``pairs.p32`` and ``inverse_norm`` (4 and 0 for a galaxy too faint for single
+    precision: no bound can drop it), ``promise`` (the best they reach, -1e30 where there is none)
+    and ``galaxy_of`` (the one that does).
+    """
+    zero = np.float32(0)
+    one = np.float32(1)
+    for z in range(target.log_prior.size):
+        pairs.promise[z] = -1e30
+        pairs.galaxy_of[z] = -1
+        if target.log_prior[z] < -1e200:
+            continue
+        p, norm = pairs.p32[z], pairs.inverse_norm[z]
+        for i in range(p.size):
+            p[i] = zero
+            norm[i] = zero
+        for j in range(target.bands.size):
+            row = tables.galaxy32[z, target.bands[j]]
+            s, d = target.root32[j], target.data32[j]
+            for i in range(p.size):
+                t = row[i] * s
+                norm[i] += t * t
+                p[i] += t * d
+        for i in range(p.size):
+            q = norm[i]
+            r = one / np.sqrt(max(q, _TINY))
+            norm[i] = zero if q < _TINY else r
+            p[i] = _ALWAYS if q < _TINY else p[i] * r
+        top = np.float32(-2)
+        row_top = np.float32(-2)
+        best = np.int64(-1)
+        for g in range(tables.galaxy.shape[1]):
+            if tables.log_usable[z, g] < -1e200:
+                continue
+            top = max(top, p[g])
+            # one too faint for single precision has 4, and may have no light at all
+            if best < 0 or (p[g] < 2.0 and p[g] > row_top):
+                best = g
+                row_top = p[g] if p[g] < 2.0 else row_top
+        pairs.galaxy_of[z] = best
+        if best >= 0:
+            value = np.float64(max(top, zero))
+            pairs.promise[z] = value * value * target.norm + target.log_prior[z]
+
+
+@njit(**PART)
+def agn_products(agn, target, agn_pq, agn_weighted):
+    """Fill agn_pq[k] = <A, wF>, <A, wA> and agn_weighted[k] = w A for all tori of one redshift."""
+    weight, flux = target.weight, target.flux
+    for k in range(agn_pq.shape[0]):
+        for b in range(agn.shape[1]):
+            agn_weighted[k, b] = agn[k, b] * weight[b]
+        # apart from the loop above: a sum beside a store is taken in an order that depends on
+        # where the arrays lie, and results shall not
+        p = 0.0
+        q = 0.0
+        for b in range(agn.shape[1]):
+            p += agn_weighted[k, b] * flux[b]
+            q += agn_weighted[k, b] * agn[k, b]
+        agn_pq[k, 0] = p
+        agn_pq[k, 1] = q
+
+
+@njit(**KERNEL)
+def best_of_galaxy(tables, target, limits, pairs, z, g):
+    """
+    Best model of one galaxy at one redshift, f = 0 included; with limits, a good one.
+
+    ``pairs.agn_pq`` must hold that redshift's.
+
+    Returns
+    -------
+    value, s : float
+        Largest R + 2 ln(prior), and the scale of the model that has it.
+    """
+    galaxy, agn, of_frac = tables.galaxy[z, g], tables.agn[z], tables.of_frac
+    weight, bands, agn_pq = target.weight, target.bands, pairs.agn_pq
+    log_prior = target.log_prior[z] + tables.log_usable[z, g]
+    p = 0.0
+    q = 0.0
+    for b in bands:
+        t = galaxy[b] * weight[b]
+        p += t * target.flux[b]
+        q += t * galaxy[b]
+    best_value = -1e300
+    best_s = 0.0
+    without = -1e300
+    if tables.zero_frac == 1 and q > 0.0 and tables.log_zero > -1e200:
+        best_s = max(p, 0.0) / q
+        r = max(p, 0.0) * best_s
+        if limits is not None:
+            for m in range(limits.bands.size):
+                limits.slope[m] = galaxy[limits.bands[m]] * limits.inverse[m]
+            best_s, r, _ = limited_scale(p, q, limits)
+        best_value = r + tables.log_zero
+    for k in range(agn_pq.shape[0]):
+        if tables.of_agn[LOG_AGN, k] < -1e200:
+            continue
+        cross = 0.0
+        for b in bands:
+            cross += galaxy[b] * weight[b] * agn[k, b]
+        a = agn_pq[k, 0]
+        b2 = agn_pq[k, 1]
+        for j in range(of_frac.shape[1]):
+            x = of_frac[RATIO, j] * tables.of_galaxy[DUST, g]
+            num = max(p + x * a, 0.0)
+            den = q + x * (2.0 * cross + x * b2)
+            if not den > 0.0:
+                continue
+            s = num / den
+            log_pair = tables.of_agn[LOG_AGN, k] + of_frac[LOG_FRAC, j]
+            value = num * s + log_pair
+            # with limits, only at what would be better without them than all before
+            if limits is not None:
+                if value <= without:
+                    continue
+                without = value
+                for m in range(limits.bands.size):
+                    band = limits.bands[m]
+                    limits.slope[m] = (galaxy[band] + x * agn[k, band]) * limits.inverse[m]
+                s, r, _ = limited_scale(num, den, limits)
+                value = r + log_pair
+            if value > best_value:
+                best_value = value
+                best_s = s
+    return best_value + log_prior, best_s
+
+
+@njit(**PART)
+def _project_tori(agn, target, unit, of_torus):
+    """
+    Fill unit vectors t of the tori of one redshift, <t, d>, and the square of its positive part.
+
+    The latter has the rounding added, and is 4 for tori too faint for single precision.
+    """
+    zero = np.float32(0)
+    n_used = target.bands.size
+    for k in range(agn.shape[0]):
+        for j in range(n_used):
+            unit[k, j] = agn[k, target.bands[j]] * target.root32[j]
+        # sums apart from stores: see `agn_products`
+        norm = zero
+        s = zero
+        for j in range(n_used):
+            norm += unit[k, j] * unit[k, j]
+            s += unit[k, j] * target.data32[j]
+        faint = norm < _TINY
+        r = zero if faint else np.float32(1) / np.sqrt(norm)
+        a = s * r
+        m = max(a, zero) + _ETA
+        of_torus[0, k] = a
+        of_torus[1, k] = m * m if not faint else (_ALWAYS if norm > zero else zero)
+        for j in range(n_used):
+            unit[k, j] *= r
+
+
+@njit(**PART)
+def _products(unit_galaxy, unit_agn, k, n_used, rows):
+    """Fill rows[m * BLOCK + i] = <galaxy i, torus k + m> for GROUP tori (register blocking)."""
+    zero = np.float32(0)
+    for i in range(GROUP * BLOCK):
+        rows[i] = zero
+    t0, t1, t2, t3 = unit_agn[k], unit_agn[k + 1], unit_agn[k + 2], unit_agn[k + 3]
+    # what is beyond the used bands is 0
+    for j in range(0, n_used, 3):
+        g0, g1, g2 = unit_galaxy[j], unit_galaxy[j + 1], unit_galaxy[j + 2]
+        u00, u01, u02 = t0[j], t0[j + 1], t0[j + 2]
+        u10, u11, u12 = t1[j], t1[j + 1], t1[j + 2]
+        u20, u21, u22 = t2[j], t2[j + 1], t2[j + 2]
+        u30, u31, u32 = t3[j], t3[j + 1], t3[j + 2]
+        for i in range(BLOCK):
+            h0, h1, h2 = g0[i], g1[i], g2[i]
+            rows[i] += h0 * u00 + h1 * u01 + h2 * u02
+            rows[BLOCK + i] += h0 * u10 + h1 * u11 + h2 * u12
+            rows[2 * BLOCK + i] += h0 * u20 + h1 * u21 + h2 * u22
+            rows[3 * BLOCK + i] += h0 * u30 + h1 * u31 + h2 * u32
+
+
+@njit(**PART)
+def _list_block(pairs, norm, n_used, key, n):
+    """
+    List the pairs of one block of galaxies whose bound reaches a threshold.
+
+    ``pairs.rows`` says what the galaxies are, and is filled with their largest bounds; bounds are of
+    R + 2 ln(prior), `DONE` for pairs that are not kept. ``key`` is that of the first torus, ``n``
+    runs are in the list, which must have room for one of every torus; returned is how many are now.
+    """
+    one = np.float32(1)
+    zero = np.float32(0)
+    rows, of_torus = pairs.rows, pairs.agn32
+    for i in range(BLOCK):
+        p2 = max(rows[_P + i], zero) + _ETA
+        p2 = p2 * p2
+        rows[_ALONE + i] = p2
+        rows[_REST + i] = rows[_LEAST + i] - p2
+        # a galaxy that passes alone passes with every torus
+        rows[_PASS + i] = -one if p2 >= rows[_LEAST + i] else rows[_LEAST + i]
+        rows[_TOP + i] = DONE
+    for k in range(of_torus.shape[1]):
+        if k % GROUP == 0:
+            _products(pairs.unit_galaxy, pairs.unit_agn, k, n_used, rows)
+        a, a2 = of_torus[0, k], of_torus[1, k]
+        x = (k % GROUP) * BLOCK
+        for i in range(BLOCK):
+            cross = rows[x + i]
+            n1 = a - rows[_P + i] * cross + _ETA
+            n2 = rows[_P + i] - a * cross + _ETA
+            r = n1 * n1 - rows[_REST + i] * (one - cross * cross - _EPS)
+            rows[_SCORE + i] = max(min(r, min(n1, n2)), a2 - rows[_PASS + i])
+        most = rows[_SCORE]
+        for i in range(BLOCK):
+            most = max(most, rows[_SCORE + i])
+        if most < zero:
+            continue
+        pairs.run_key[n] = key + k
+        bound = pairs.bound[n]
+        for i in range(BLOCK):
+            cross = rows[x + i]
+            n1 = a - rows[_P + i] * cross + _ETA
+            n2 = rows[_P + i] - a * cross + _ETA
+            both = rows[_ALONE + i] + n1 * n1 / max(one - cross * cross - _EPS, _EPS)
+            r = max(rows[_ALONE + i], a2)
+            r = max(r, both) if min(n1, n2) >= zero else r
+            r = min(r, one) * norm
+            # rounding of single precision is added
+            value = r + rows[_BASE + i] + _SLACK * (r + abs(rows[_BASE + i]))
+            value = value if rows[_SCORE + i] >= zero else DONE
+            bound[i] = value
+            rows[_TOP + i] = max(rows[_TOP + i], value)
+        n += 1
+    return n
+
+
+@njit(**KERNEL)
+def list_runs(tables, target, limits, pairs, delta, reference, position):
+    """
+    List runs of pairs that can matter, until the list is full or all are seen.
+
+    ``position`` is where to begin: place of the redshift in ``pairs.order`` times the number of
+    blocks, plus the block. ``reference`` is R + 2 ln(prior) that some model reaches, pairs that are
+    more than ``delta`` below it are left out.
+
+    Returns
+    -------
+    n, position : int
+        Number of runs in the list, and where to go on.
+    reference : float
+        Raised when a better model is met.
+    """
+    n_z, n_blocks = tables.tiles.shape[0], tables.tiles.shape[1]
+    n_agn = tables.agn.shape[1]
+    rows, bands, norm = pairs.rows, target.bands, target.norm
+    # the largest prior a pair can have from torus and fraction
+    log_pair = -1e300
+    for k in range(n_agn):
+        log_pair = max(log_pair, tables.of_agn[LOG_AGN, k])
+    top_frac = 0.0
+    for j in range(tables.of_frac.shape[1]):
+        top_frac = max(top_frac, tables.of_frac[PRIOR_FRAC, j])
+    log_pair += 2.0 * math.log(max(top_frac, 1e-300))
+    # `_products` takes three bands at a time
+    for j in range(bands.size, bands.size + 2):
+        for i in range(BLOCK):
+            pairs.unit_galaxy[j, i] = np.float32(0)
+    margin = 2.0
+    n = np.int64(0)
+    z_now = np.int64(-1)
+    agn_known = False
+    while position < n_z * n_blocks and n + n_agn <= pairs.run_key.size:
+        z = pairs.order[position // n_blocks]
+        block = position % n_blocks
+        if pairs.promise[z] < -1e29:
+            position = np.int64(n_z * n_blocks)
+            break
+        position += 1
+        if z != z_now:
+            z_now = z
+            agn_known = False
+            _project_tori(tables.agn32[z], target, pairs.unit_agn, pairs.agn32)
+        start = block * BLOCK
+        lowest = reference - delta - target.log_prior[z] - log_pair
+        log_usable = tables.log_usable[z, start : start + BLOCK]
+        p32 = pairs.p32[z, start : start + BLOCK]
+        inverse = pairs.inverse_norm[z, start : start + BLOCK]
+        some = -1e300
+        for i in range(BLOCK):
+            some = max(some, log_usable[i])
+        if some < -1e200:
+            continue
+        for i in range(BLOCK):
+            # what may not be used is parallel to nothing and reaches nothing
+            t = np.float32(max(min((lowest - log_usable[i]) / norm, 1.0), -1.0) - 1e-6)
+            usable = log_usable[i] > -1e200
+            rows[_LEAST + i] = t if usable else _NEVER
+            rows[_P + i] = p32[i] if usable else _NOWHERE
+            rows[_BASE + i] = max(log_usable[i] + (target.log_prior[z] + log_pair), -1e30)
+        for j in range(bands.size):
+            row = tables.galaxy32[z, bands[j], start : start + BLOCK]
+            s32 = target.root32[j]
+            for i in range(BLOCK):
+                pairs.unit_galaxy[j, i] = row[i] * s32 * inverse[i]
+        key = ((z << KEY_BITS) + block) << KEY_BITS
+        n = _list_block(pairs, np.float32(norm), bands.size, key, n)
+        # galaxies that promise more than the reference are evaluated at once; when that does
+        # not pay, only those that promise much more
+        for i in range(BLOCK):
+            if rows[_TOP + i] > reference + margin:
+                if not agn_known:
+                    agn_known = True
+                    agn_products(tables.agn[z], target, pairs.agn_pq, pairs.agn_weighted)
+                value, _ = best_of_galaxy(tables, target, limits, pairs, z, start + i)
+                if value > reference:
+                    reference = value
+                    margin = 2.0
+                else:
+                    # exponents of models that are not looked at stay in range
+                    margin = min(1.5 * margin, 400.0)
+    return n, position, reference
+
+
+@njit(**KERNEL)
+def _count(bound, n, reference, count):
+    """Fill the histogram of the bounds of n runs."""
+    for j in range(count.size):
+        count[j] = 0.0
+    for r in range(n):
+        row = bound[r]
+        for i in range(BLOCK):
+            if row[i] > DONE:
+                column = (reference - row[i]) * _PER_UNIT
+                count[np.int64(min(max(column, 0.0), N_LEVELS))] += 1.0
+
+
+def first_floor(bound, n, reference):
+    """
+    Least bound to evaluate first, and whether in double precision.
+
+    That is where these pairs are few; where many could be as good as the best (``reference``), none
+    has much weight.
+    """
+    count = np.empty(N_LEVELS + 1)
+    _count(bound, n, reference, count)
+    total = np.cumsum(count[: int(_FIRST * _PER_UNIT)])
+    many = np.flatnonzero(total > _MOST)
+    if many.size == 0:
+        return reference - _FIRST, True
+    return reference - (many[0] + 1) / _PER_UNIT, bool(total[many[0]] < _FEW * _MOST)
+
+
+@njit(**KERNEL)
+def raise_bounds(tables, target, pairs, n, room, tail_galaxy, tail_agn):
+    """
+    Raise the bounds of the n listed runs by what second moments ask for.
+
+    A model has s^2 <= R / <G, wG> and power^2 <= R / <A, wA>, R <= |F|^2_w. Their product with
+    the quantities' squares is compared with the variances: ``tail_galaxy`` and ``tail_agn`` are from
+    `widest`, ``room`` is |F|^2_w over how much more second moments may miss than weights. A bound is
+    raised by 2 ln of how much more than its weight a pair can add to second moments.
+    """
+    weight = target.weight
+    top = 0.0
+    for b in range(weight.size):
+        top = max(top, weight[b])
+    z_now = np.int64(-1)
+    for r in range(n):
+        key = pairs.run_key[r]
+        z = key >> (2 * KEY_BITS)
+        if z != z_now:
+            z_now = z
+            for g in range(tail_galaxy.size):
+                unit = tables.galaxy_unit[z, g]
+                inverse = np.float64(pairs.inverse_norm[z, g])
+                amp = tail_galaxy[g] * room * inverse * inverse / max(unit * unit * top, 1e-300)
+                pairs.tail_galaxy[z, g] = 2.0 * math.log(amp) if amp > 1.0 else 0.0
+            for k in range(tail_agn.size):
+                b2 = 0.0
+                for b in range(weight.size):
+                    b2 += tables.agn[z, k, b] * tables.agn[z, k, b] * weight[b]
+                amp = tail_agn[k] * room / b2 if b2 > 0.0 else 0.0
+                pairs.tail_agn[z, k] = 2.0 * math.log(amp) if amp > 1.0 else 0.0
+        start = ((key >> KEY_BITS) & _MASK) * BLOCK
+        more = pairs.tail_agn[z, key & _MASK]
+        for i in range(BLOCK):
+            value = pairs.bound[r, i] + (pairs.tail_galaxy[z, start + i] + more)
+            pairs.bound[r, i] = value if pairs.bound[r, i] > DONE else DONE
+
+
+def second_floor(bound, n, reference, room, unit, delta):
+    """
+    Least bound to evaluate, once the weight of the best pairs is known.
+
+    The weight of a pair is at most ``unit`` times exp((bound - reference) / 2), and ``room`` is what
+    may be left out: the pairs below ``floor`` sum up to no more, and neither would all pairs if they
+    were at ``sure``. A floor is at most ``delta`` below the reference.
+    """
+    if not room > 0.0:
+        return _ALL, _ALL
+    count = np.empty(N_LEVELS + 1)
+    _count(bound, n, reference, count)
+    # from the lowest up
+    left = np.cumsum((count[:-1] * _DECAY * unit)[::-1])
+    last = N_LEVELS - np.searchsorted(left, room, side="right")
+    floor = reference - min(last / _PER_UNIT, delta)
+    whole = math.log(max(count.sum() * unit, 1e-300)) - math.log(room)
+    return floor, min(floor, reference - 2.0 * whole)

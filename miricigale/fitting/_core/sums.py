@@ -1,0 +1,396 @@
+"""What models add to the sums: moments, the best one, joint sums, histograms, draws."""
+
+import math
+
+import numpy as np
+
+from miricigale.fitting._core.histogram import add_model
+from miricigale.fitting._core.lanes import (
+    F1,
+    F2,
+    POWER,
+    PRIOR,
+    U2,
+    V1,
+    V2,
+    W0,
+    W1,
+    W2,
+    WR,
+    WZ,
+    X2,
+    A,
+    B,
+    P,
+    Q,
+    best_mixture,
+)
+from miricigale.fitting._core.limits import limited_scale
+from miricigale.fitting._core.single import pair_weight
+from miricigale.fitting._core.structs import (
+    BLOCK,
+    MIXED_AGN,
+    MIXED_GALAXY,
+    NO_LIGHT,
+    PART,
+    PRIOR_FRAC,
+    RATIO,
+)
+from miricigale.utils.compilation import njit
+
+__all__ = [
+    "PARTS",
+    "add_all",
+    "add_block",
+    "add_gathered",
+    "add_joint",
+    "deposit",
+    "draw",
+    "find_best",
+    "finish_redshift",
+    "keep_best",
+    "take_draw",
+]
+
+#: Parts of the weight so far by which light models are sampled for the histograms ...
+PARTS = 10_000.0
+# ... and how many of them a pair must have to go there with all its fractions.
+_HEAVY = 8.0
+
+
+@njit(**PART)
+def _model(lanes, limits, c, i, floor):
+    """
+    Scale, R and variance of the scale of the pair in lane i at one fraction, c = f / (1 - f).
+
+    With limits, those whose R is below ``floor`` without them are left as they are then.
+    """
+    buffer = lanes.buffer
+    p = buffer[P + i] + c * buffer[A + i]
+    q = buffer[Q + i] + c * (buffer[X2 + i] + c * buffer[B + i])
+    q = q if q > NO_LIGHT else 1.0 / NO_LIGHT
+    inverse = 1.0 / q
+    s = max(p, 0.0) * inverse
+    r = max(p, 0.0) * s
+    if limits is not None and r >= floor:
+        n = limits.bands.size
+        for m in range(n):
+            limits.slope[m] = lanes.limit[m, i] + c * lanes.limit[n + m, i]
+        s, r, inverse = limited_scale(p, q, limits)
+    return s, r, inverse
+
+
+@njit(**PART)
+def keep_best(sums, r, s, z, g, k, f):
+    """Keep the best model; of equals the one with the lowest indices."""
+    best, index = sums.best, sums.index
+    if r < best[0]:
+        return
+    if r == best[0] and index[0] >= 0:
+        # compare (z, g, f, k), so that f = 0 comes before its copies
+        if z != index[0]:
+            if z > index[0]:
+                return
+        elif g != index[1]:
+            if g > index[1]:
+                return
+        elif f != index[3]:
+            if f > index[3]:
+                return
+        elif k >= index[2]:
+            return
+    best[0] = r
+    best[1] = s
+    index[0] = z
+    index[1] = g
+    index[2] = k
+    index[3] = f
+
+
+@njit(**PART)
+def find_best(tables, limits, lanes, sums, z):
+    """Look for the best model among the lanes."""
+    buffer, of_frac, best = lanes.buffer, tables.of_frac, sums.best
+    for i in range(BLOCK):
+        if buffer[PRIOR + i] < -1e200:
+            continue
+        r = best_mixture(
+            buffer[P + i], buffer[Q + i], 0.5 * buffer[X2 + i], buffer[A + i], buffer[B + i],
+            of_frac[RATIO, 0], of_frac[RATIO, -1],
+        )  # fmt: skip
+        if r * (1.0 + 1e-12) < best[0]:
+            continue
+        for j in range(of_frac.shape[1]):
+            if not of_frac[PRIOR_FRAC, j] > 0.0:
+                continue
+            s, r, _ = _model(lanes, limits, of_frac[RATIO, j], i, best[0])
+            keep_best(sums, r, s, z, lanes.index[0, i], lanes.index[1, i], j + tables.zero_frac)
+
+
+@njit(**PART)
+def finish_redshift(tables, lanes, sums, z):
+    """Add what was summed up over one redshift to the sums over all, and begin anew."""
+    galaxy_z, agn_z, band = lanes.galaxy_z, lanes.agn_z, sums.band
+    zg, zk = sums.joint.zg, sums.joint.zk
+    n_galaxy, n_bands = tables.galaxy.shape[1], band.shape[1]
+    for block in range(tables.tiles.shape[1]):
+        start = block * BLOCK
+        used = 0.0
+        for i in range(BLOCK):
+            used = max(used, galaxy_z[0, start + i])
+        if not used > 0.0:
+            continue
+        for g in range(start, min(start + BLOCK, n_galaxy)):
+            for m in range(3):
+                sums.galaxy[g, m] += galaxy_z[m, g]
+            if zg.size > 0:
+                zg[z, g] += galaxy_z[0, g]
+        for b in range(n_bands):
+            first = 0.0
+            second = 0.0
+            for i in range(BLOCK):
+                t = tables.tiles[z, block, b, i]
+                first += galaxy_z[1, start + i] * t
+                second += galaxy_z[2, start + i] * t * t
+            band[0, b] += first
+            band[1, b] += second
+        for m in range(3):
+            for i in range(BLOCK):
+                galaxy_z[m, start + i] = 0.0
+    for k in range(agn_z.shape[1]):
+        if not agn_z[0, k] > 0.0:
+            continue
+        if zk.size > 0:
+            zk[z, k] += agn_z[0, k]
+        for b in range(n_bands):
+            t = tables.agn[z, k, b]
+            band[0, b] += agn_z[1, k] * t
+            band[1, b] += agn_z[2, k] * t * t
+        for m in range(3):
+            sums.agn[k, m] += agn_z[m, k]
+            agn_z[m, k] = 0.0
+
+
+@njit(**PART)
+def add_all(lanes, sums, z, first):
+    """Add what needs no index; returns the weight of all pairs in the lanes."""
+    buffer, frac_sum, total = lanes.buffer, lanes.frac_sum, sums.total
+    for j in range(frac_sum.size):
+        sums.zf[z, j + first] += frac_sum[j]
+    weight = 0.0
+    total_r = 0.0
+    total_zero = 0.0
+    share_1 = 0.0
+    share_2 = 0.0
+    n_alive = 0.0
+    for i in range(BLOCK):
+        weight += buffer[W0 + i]
+        total_r += buffer[WR + i]
+        total_zero += buffer[WZ + i]
+        share_1 += buffer[F1 + i]
+        share_2 += buffer[F2 + i]
+        n_alive += 1.0 if buffer[PRIOR + i] > -1e200 else 0.0
+    total[0] += weight
+    total[1] += total_r
+    total[2] += total_zero
+    total[4] += share_1
+    total[5] += share_2
+    sums.best[3] += n_alive * frac_sum.size
+    return weight
+
+
+@njit(**PART)
+def add_block(tables, lanes, sums, z, block, k):
+    """Add a block of galaxies with one torus."""
+    buffer, agn_z, band = lanes.buffer, lanes.agn_z, sums.band
+    start = block * BLOCK
+    for i in range(BLOCK):
+        lanes.galaxy_z[0, start + i] += buffer[W0 + i]
+        lanes.galaxy_z[1, start + i] += buffer[W1 + i]
+        lanes.galaxy_z[2, start + i] += buffer[W2 + i]
+        # from here on the correlation of galaxy and AGN
+        buffer[U2 + i] *= buffer[POWER + i]
+    # sums apart from stores: see `agn_products`
+    y0 = 0.0
+    y1 = 0.0
+    y2 = 0.0
+    cross = 0.0
+    for i in range(BLOCK):
+        power = buffer[POWER + i]
+        y0 += buffer[W0 + i]
+        y1 += buffer[V1 + i] * power
+        y2 += buffer[V2 + i] * power * power
+        cross += buffer[U2 + i] * tables.of_galaxy[MIXED_GALAXY, start + i]
+    sums.total[3] += cross * tables.of_agn[MIXED_AGN, k]
+    agn_z[0, k] += y0
+    agn_z[1, k] += y1
+    agn_z[2, k] += y2
+    tiles, n = tables.tiles[z, block], band.shape[1]
+    for m in range(0, n, 3):
+        # three at a time; a last one or two go with the last again
+        m1, m2 = min(m + 1, n - 1), min(m + 2, n - 1)
+        row0, row1, row2 = tiles[m], tiles[m1], tiles[m2]
+        t0 = 0.0
+        t1 = 0.0
+        t2 = 0.0
+        for i in range(BLOCK):
+            u = buffer[U2 + i]
+            t0 += u * row0[i]
+            t1 += u * row1[i]
+            t2 += u * row2[i]
+        band[1, m] += 2.0 * t0 * tables.agn[z, k, m]
+        if m1 > m:
+            band[1, m1] += 2.0 * t1 * tables.agn[z, k, m1]
+        if m2 > m1:
+            band[1, m2] += 2.0 * t2 * tables.agn[z, k, m2]
+
+
+@njit(**PART)
+def add_gathered(tables, lanes, sums, z, least):
+    """
+    Add gathered pairs.
+
+    Those of a weight below ``least`` are left out of the correlation of galaxy and AGN in model
+    fluxes, and of nothing else.
+    """
+    buffer, galaxy_z, agn_z, band = lanes.buffer, lanes.galaxy_z, lanes.agn_z, sums.band
+    total_cross = 0.0
+    for i in range(BLOCK):
+        w = buffer[W0 + i]
+        if not w > 0.0 or buffer[PRIOR + i] < -1e200:
+            continue
+        g, k = lanes.index[0, i], lanes.index[1, i]
+        power = buffer[POWER + i]
+        cross = buffer[U2 + i] * power
+        total_cross += cross * tables.of_galaxy[MIXED_GALAXY, g] * tables.of_agn[MIXED_AGN, k]
+        galaxy_z[0, g] += w
+        galaxy_z[1, g] += buffer[W1 + i]
+        galaxy_z[2, g] += buffer[W2 + i]
+        agn_z[0, k] += w
+        agn_z[1, k] += buffer[V1 + i] * power
+        agn_z[2, k] += buffer[V2 + i] * power * power
+        if w > least:
+            cross *= 2.0
+            for m in range(band.shape[1]):
+                band[1, m] += cross * tables.galaxy[z, g, m] * tables.agn[z, k, m]
+    sums.total[3] += total_cross
+
+
+@njit(**PART)
+def add_joint(joint, lanes, single, first, n_ratio):
+    """Add to the joint sums that were asked for."""
+    gk, fg, fk = joint.gk, joint.fg, joint.fk
+    for i in range(BLOCK):
+        w = lanes.buffer[W0 + i]
+        if not w > 0.0 or lanes.buffer[PRIOR + i] < -1e200:
+            continue
+        g, k = lanes.index[0, i], lanes.index[1, i]
+        if gk.size > 0:
+            gk[g, k] += w
+        for j in range(n_ratio):
+            if fg.size > 0:
+                fg[j + first, g] += pair_weight(lanes, single, j, i)
+            if fk.size > 0:
+                fk[j + first, k] += pair_weight(lanes, single, j, i)
+
+
+@njit(**PART)
+def deposit(tables, limits, lanes, sums, single, added):
+    """
+    Put models in the lanes into the histograms.
+
+    Heavy pairs go there with all their fractions. Of the light ones' weight, summed up from model
+    to model, every ``PARTS``-th part of the weight so far goes to the model that it is full with
+    (systematic sampling, proportional to weight). ``added`` is the weight of all lanes.
+    """
+    buffer, index, of_frac = lanes.buffer, lanes.index, tables.of_frac
+    part = sums.total[0] / PARTS
+    carry = sums.total[6]
+    if carry + added < part:
+        sums.total[6] += added
+        return
+    for i in range(BLOCK):
+        w = buffer[W0 + i]
+        if not w > 0.0 or buffer[PRIOR + i] < -1e200:
+            continue
+        whole = w >= _HEAVY * part
+        if not whole and carry + w < part:
+            carry += w
+            continue
+        for j in range(of_frac.shape[1]):
+            t = pair_weight(lanes, single, j, i)
+            if not whole:
+                carry += t
+                if carry < part:
+                    continue
+                # a model has less than all of it: as many parts as there are
+                t = part * math.floor(carry / part)
+                carry -= t
+            if t > 0.0:
+                s, _, _ = _model(lanes, limits, of_frac[RATIO, j], i, 0.0)
+                add_model(tables, sums.hist, index[0, i], index[1, i], j, s, t)
+    sums.total[6] = carry
+
+
+@njit(**PART)
+def _uniform(state):
+    """Next of the random numbers in (0, 1] (splitmix64; Steele et al. 2014)."""
+    state[0] += np.uint64(0x9E3779B97F4A7C15)
+    x = state[0]
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    x = x ^ (x >> np.uint64(31))
+    return (np.float64(x >> np.uint64(11)) + 1.0) / 9007199254740992.0
+
+
+@njit(**PART)
+def take_draw(draws, d, total, z, g, k, f, s, variance):
+    """
+    Replace draw d by a model, ``total`` being the weight of all models so far and this one.
+
+    A sample of one that gives way to model i with the probability of its weight over the sum so
+    far is a draw from all of them; it stays until the sum has grown by 1 / u, u uniform.
+    """
+    draws.index[d, 0] = z
+    draws.index[d, 1] = g
+    draws.index[d, 2] = k
+    draws.index[d, 3] = f
+    draws.scale[d, 0] = s
+    draws.scale[d, 1] = variance
+    draws.next[d] = total / _uniform(draws.state)
+
+
+@njit(**PART)
+def draw(tables, limits, lanes, sums, single, z, before):
+    """Let the models in the lanes replace draws; the sum of weight was ``before``."""
+    buffer, of_frac, draws, after = lanes.buffer, tables.of_frac, sums.draws, sums.total[0]
+    for d in range(draws.next.size):
+        while draws.next[d] <= after:
+            total = before
+            lane = -1
+            for i in range(BLOCK):
+                w = buffer[W0 + i]
+                if not w > 0.0 or buffer[PRIOR + i] < -1e200:
+                    continue
+                # rounding may leave the last one short
+                lane = i
+                if total + w >= draws.next[d]:
+                    break
+                total += w
+            if lane < 0:
+                break
+            f = -1
+            for j in range(of_frac.shape[1]):
+                t = pair_weight(lanes, single, j, lane)
+                if not t > 0.0:
+                    continue
+                f = j
+                total += t
+                if total >= draws.next[d]:
+                    break
+            if f < 0:
+                break
+            g, k = lanes.index[0, lane], lanes.index[1, lane]
+            s, _, variance = _model(lanes, limits, of_frac[RATIO, f], lane, 0.0)
+            now = max(total, draws.next[d])
+            take_draw(draws, d, now, z, g, k, f + tables.zero_frac, s, variance)
