@@ -1,6 +1,7 @@
 """Tests see neither the data nor the caches of whoever runs them."""
 
 import contextlib
+import os
 import shutil
 import tempfile
 from pathlib import Path
@@ -18,6 +19,19 @@ def pytest_configure(config):
 
 def pytest_unconfigure(config):
     shutil.rmtree(config.own_folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def data_file():
+    """Path of a file or folder of the development data, or a skip that names it."""
+
+    def find(name):
+        folder = os.environ.get("MIRICIGALE_DATA")
+        if not folder or not (Path(folder) / name).exists():
+            pytest.skip(f"needs {name} in $MIRICIGALE_DATA")
+        return Path(folder) / name
+
+    return find
 
 
 @pytest.fixture

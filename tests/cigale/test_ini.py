@@ -1,6 +1,4 @@
-import os
 import warnings
-from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -601,11 +599,8 @@ def test_limits_take_part_only_if_asked(run, tmp_path):
     assert fit_cigale(without).n_bands.tolist() == [3, 4, 4]
 
 
-def test_the_example_of_cigale():
-    folder = os.environ.get("MIRICIGALE_DATA")
-    path = Path(folder or "") / "cigale/sdss_qso/pcigale.ini"
-    if not folder or not path.exists():
-        pytest.skip("needs cigale/sdss_qso/pcigale.ini in $MIRICIGALE_DATA")
+def test_the_example_of_cigale(data_file):
+    path = data_file("cigale/sdss_qso/pcigale.ini")
     with pytest.warns(MiricigaleWarning) as record:
         setup = read(path, libraries="bundled")
     assert len(record) == 1

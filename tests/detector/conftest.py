@@ -4,7 +4,9 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 
-from miricigale.instrument import Exposure
+from miricigale.detector import Block
+from miricigale.detector.effects import stream_key
+from miricigale.instrument import Exposure, miri_detector
 
 
 @pytest.fixture
@@ -31,5 +33,24 @@ def make_sky():
         image = CCDData(np.full(exposure.shape, float(level)), unit="MJy/sr")
         image.meta["psf_includes"] = list(includes)
         return image
+
+    return make
+
+
+@pytest.fixture
+def make_block(make_exposure):
+    """What an effect works on: all rows of an exposure before the first effect."""
+
+    def make(band="miri.f770w", *, seed=1, properties=None, **options):
+        exposure = make_exposure(band, **options)
+        shape = (exposure.n_integrations, exposure.n_groups, *exposure.shape)
+        return Block(
+            exposure,
+            properties or miri_detector(),
+            slice(0, exposure.shape[0]),
+            np.zeros(exposure.shape, np.uint32),
+            np.zeros(shape, np.uint8),
+            stream_key(seed, exposure, "test"),
+        )
 
     return make

@@ -19,25 +19,7 @@ from miricigale.detector import (
     Residual,
     Saturation,
 )
-from miricigale.detector.effects import stream_key
 from miricigale.instrument import aperture, bad_pixel_mask, flat_field, miri_detector, photmjsr
-
-
-@pytest.fixture
-def make_block(make_exposure):
-    def make(band="miri.f770w", *, seed=1, properties=None, **options):
-        exposure = make_exposure(band, **options)
-        shape = (exposure.n_integrations, exposure.n_groups, *exposure.shape)
-        return Block(
-            exposure,
-            properties or miri_detector(),
-            slice(0, exposure.shape[0]),
-            np.zeros(exposure.shape, np.uint32),
-            np.zeros(shape, np.uint8),
-            stream_key(seed, exposure, "test"),
-        )
-
-    return make
 
 
 def empty(block):

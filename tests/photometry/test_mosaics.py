@@ -1,8 +1,6 @@
 """Images of known flux in every unit and noise map; what cannot be used is refused by name."""
 
 import gzip
-import os
-from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -16,7 +14,6 @@ from miricigale.photometry.grids import grid_angle
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 
 SHAPE, SCALE, FLUX = (120, 140), 0.06, 20.0
-REAL = os.environ.get("MIRICIGALE_DATA")
 
 
 def micro_jansky():
@@ -253,12 +250,8 @@ def test_the_angle_of_a_grid_is_that_of_its_columns(tools, angle):
         grid_angle(wcs, SHAPE)
 
 
-@pytest.mark.skipif(
-    not REAL or not (Path(REAL) / "real" / "i2d").is_dir(),
-    reason="needs real/i2d in MIRICIGALE_DATA",
-)
-def test_a_real_i2d_file_of_the_jwst_pipeline():
-    path = next((Path(REAL) / "real" / "i2d").glob("*04101*_i2d.fits"))
+def test_a_real_i2d_file_of_the_jwst_pipeline(data_file):
+    path = next(data_file("real/i2d").glob("*04101*_i2d.fits"))
     # a nebula has no empty sky
     with pytest.warns(MiricigaleWarning, match="times what the error map says"):
         image = read_mosaic(path)

@@ -1,8 +1,6 @@
 """Maps of offsets and backgrounds that vary, on scenes that were distorted by a known amount."""
 
-import os
 import warnings
-from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -15,7 +13,6 @@ from miricigale.photometry import ForcedPhotometer, read_mosaic, read_prior
 from miricigale.photometry.fields import SmoothField, legendre_terms
 from miricigale.utils.exceptions import MiricigaleWarning
 
-REAL = os.environ.get("MIRICIGALE_DATA")
 SHAPE, SIGMA = (400, 400), 0.02
 
 
@@ -142,16 +139,14 @@ def test_bad_orders_are_refused(tools, options, text):
         ForcedPhotometer(tools.kernel, **options)
 
 
-@pytest.mark.skipif(
-    not REAL or not (Path(REAL) / "uds").is_dir(), reason="needs uds in MIRICIGALE_DATA"
-)
-def test_real_images_are_aligned():
+def test_real_images_are_aligned(data_file):
     """F770W of PRIMER-UDS against F444W: within a tenth of a native pixel (0.11 arcsec)."""
     from astropy.io import fits
 
     from miricigale.psf import MatchingKernel
 
-    start, psfs = f"{REAL}/uds/uds-test-", f"{REAL}/uds/psf/uds-test-f444w"
+    uds = data_file("uds")
+    start, psfs = f"{uds}/uds-test-", f"{uds}/psf/uds-test-f444w"
     with warnings.catch_warnings():
         # the scale of the weights, the kernel's centre
         warnings.simplefilter("ignore")

@@ -3,8 +3,9 @@ import itertools
 import numpy as np
 import pytest
 from astropy.modeling.models import Sersic2D
-from scipy.special import erf, gamma
+from scipy.special import gamma
 
+from helpers.light import pixel_gaussian
 from miricigale.profiles import (
     sersic_bn,
     sersic_enclosed_fraction,
@@ -14,11 +15,6 @@ from miricigale.profiles import (
 )
 
 INDICES = (0.3, 0.5, 1.0, 2.5, 4.0, 8.0)
-
-
-def pixel_gaussian(n, center, sigma):
-    at = np.arange(n) - center
-    return 0.5 * (erf((at + 0.5) / sigma / 2**0.5) - erf((at - 0.5) / sigma / 2**0.5))
 
 
 def test_bn_is_what_ciotti_and_bertin_give():

@@ -1,12 +1,8 @@
 import numpy as np
 import pytest
 
+from helpers.light import gaussian_image
 from miricigale.psf import cruciform_fraction, effects
-
-
-def gaussian(n, s):
-    axis = np.arange(n) - n // 2
-    return np.exp(-0.5 * (axis**2 + axis[:, None] ** 2) / s**2) / (2 * np.pi * s**2)
 
 
 def moments(image):
@@ -19,7 +15,7 @@ def moments(image):
 @pytest.mark.parametrize("oversampling", [3, 4])
 def test_pixel_response_is_a_box(oversampling):
     """A box of width w adds w^2 / 12 to the variance and keeps the light."""
-    image = gaussian(121, 5.0)
+    image = gaussian_image(121, 5.0)
     out = effects.detector_response(image, oversampling=oversampling)
     total, vx, vy = moments(out)
     assert total == pytest.approx(1.0, abs=1e-9)
@@ -40,7 +36,7 @@ def test_interpixel_capacitance_moves_charge_to_the_neighbours():
 
 def test_jitter_adds_its_variance():
     total, vx, _ = moments(
-        effects.detector_response(gaussian(121, 4.0), oversampling=2, pixel=False, jitter=1.5)
+        effects.detector_response(gaussian_image(121, 4.0), oversampling=2, pixel=False, jitter=1.5)
     )
     assert total == pytest.approx(1.0, abs=1e-9)
     assert vx == pytest.approx(16 + 9, rel=1e-6)

@@ -5,6 +5,7 @@ from astropy.io import fits
 from photutils.psf_matching import make_wiener_kernel
 from scipy.signal import fftconvolve
 
+from helpers.light import gaussian_image
 from miricigale.psf import (
     MatchingKernel,
     gaussian_psf,
@@ -16,11 +17,6 @@ from miricigale.psf import (
 from miricigale.utils.exceptions import DataError
 
 SCALE = 0.06 * u.arcsec
-
-
-def gaussian(n, sigma):
-    axis = np.arange(n) - n // 2
-    return np.exp(-0.5 * (axis**2 + axis[:, None] ** 2) / sigma**2) / (2 * np.pi * sigma**2)
 
 
 @pytest.fixture(scope="module")
@@ -35,9 +31,9 @@ def lo():
 
 def test_kernel_between_gaussians_is_the_gaussian_of_the_difference():
     kernel = MatchingKernel.from_psfs(
-        gaussian(101, 2.0), gaussian(101, 5.0), pixel_scale=SCALE, regularization=1e-6
+        gaussian_image(101, 2.0), gaussian_image(101, 5.0), pixel_scale=SCALE, regularization=1e-6
     )
-    expected = gaussian(101, np.sqrt(25 - 4))
+    expected = gaussian_image(101, np.sqrt(25 - 4))
     np.testing.assert_allclose(kernel.array, expected, atol=2e-3 * expected.max())
     assert kernel.array.sum() == pytest.approx(1, abs=1e-6)
     assert kernel.noise_gain == pytest.approx(1 / np.sqrt(4 * np.pi * 21), rel=1e-3)
@@ -193,7 +189,7 @@ def test_cropping_says_what_is_lost(hi, lo):
 def test_noisy_psfs_still_match():
     """Noise at a peak signal-to-noise of 1000 in both."""
     rng = np.random.default_rng(7)
-    sharp, wide = gaussian(101, 1.5), gaussian(101, 2.5)
+    sharp, wide = gaussian_image(101, 1.5), gaussian_image(101, 2.5)
     noisy = [p + rng.normal(scale=1e-3 * p.max(), size=p.shape) for p in (sharp, wide)]
     noisy = [p / p.sum() for p in noisy]
     kernel = MatchingKernel.from_psfs(*noisy, pixel_scale=SCALE)
@@ -202,7 +198,7 @@ def test_noisy_psfs_still_match():
 
 
 def test_values_are_frozen_and_checked():
-    kernel = MatchingKernel(gaussian(5, 1.0), pixel_scale=SCALE)
+    kernel = MatchingKernel(gaussian_image(5, 1.0), pixel_scale=SCALE)
     with pytest.raises(ValueError, match="read-only"):
         kernel.array[0, 0] = 1
     with pytest.raises(ValueError, match="'source, target' must be the kernel's PSFs"):
@@ -212,12 +208,14 @@ def test_values_are_frozen_and_checked():
     with pytest.raises(ValueError, match="'image' must be finite, got 1 pixels"):
         kernel.apply(np.array([[1.0, np.nan], [0.0, 0.0]]))
     with pytest.raises(ValueError, match="'hi' must be a PSF whose sum"):
-        MatchingKernel.from_psfs(5 * gaussian(31, 1), gaussian(31, 2), pixel_scale=SCALE)
+        MatchingKernel.from_psfs(
+            5 * gaussian_image(31, 1), gaussian_image(31, 2), pixel_scale=SCALE
+        )
     with pytest.raises(ValueError, match="'hi, lo' must be arrays of the same shape"):
-        MatchingKernel.from_psfs(gaussian(31, 1), gaussian(33, 2), pixel_scale=SCALE)
+        MatchingKernel.from_psfs(gaussian_image(31, 1), gaussian_image(33, 2), pixel_scale=SCALE)
     with pytest.raises(ValueError, match="'regularization' must be positive or one of"):
         MatchingKernel.from_psfs(
-            gaussian(31, 1), gaussian(31, 2), pixel_scale=SCALE, regularization="best"
+            gaussian_image(31, 1), gaussian_image(31, 2), pixel_scale=SCALE, regularization="best"
         )
     assert "5 x 5 px of 0.06 arcsec" in repr(kernel)
 
@@ -231,7 +229,7 @@ def test_foreign_files_are_named(tmp_path):
     path.write_text("text")
     with pytest.raises(DataError, match=r"kernel\.fits cannot be read as a matching kernel: "):
         MatchingKernel.read(path)
-    hdus = [fits.PrimaryHDU(), fits.ImageHDU(gaussian(5, 1.0), name="KERNEL")]
+    hdus = [fits.PrimaryHDU(), fits.ImageHDU(gaussian_image(5, 1.0), name="KERNEL")]
     fits.HDUList(hdus).writeto(path, overwrite=True)
     with pytest.raises(DataError, match=r"kernel\.fits is not a complete .*PIXSCALE"):
         MatchingKernel.read(path)

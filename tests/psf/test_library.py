@@ -1,6 +1,3 @@
-import os
-from pathlib import Path
-
 import astropy.units as u
 import numpy as np
 import pytest
@@ -43,12 +40,6 @@ STPSF = {
     "miri.f1000w": (0.3457, [0.4563, 0.6415, 0.7207, 0.8510, 0.8913, 0.9233]),
     "miri.f2100w": (0.6954, [0.1602, 0.3154, 0.5874, 0.7209, 0.8418, 0.8764]),
 }
-
-DATA = os.environ.get("MIRICIGALE_DATA")
-needs_data = pytest.mark.skipif(
-    DATA is None or not (Path(DATA) / "psf").exists(),
-    reason="needs the psf folder of MIRICIGALE_DATA",
-)
 
 
 @pytest.mark.parametrize("name", IN_FLIGHT)
@@ -203,15 +194,14 @@ def test_hst_spikes_turn_with_the_telescope():
     assert min(abs(peak - 70), abs(peak - 160)) < 2
 
 
-@needs_data
 @pytest.mark.filterwarnings("ignore::astropy.io.fits.verify.VerifyWarning")
-def test_hst_agrees_with_empirical_psfs():
+def test_hst_agrees_with_empirical_psfs(data_file):
     from miricigale.psf import read_psf
 
     radii = [0.1, 0.2, 0.3, 0.5, 1.0, 1.5] * u.arcsec
     # STScI's ePSF: no drizzle, so only beyond the core
     empirical = read_psf(
-        Path(DATA) / "psf" / "PSFSTD_WFC3IR_F160W.fits",
+        data_file("psf/PSFSTD_WFC3IR_F160W.fits"),
         plane=4,
         pixel_scale=0.128 * u.arcsec,
         oversampling=4,
@@ -222,7 +212,7 @@ def test_hst_agrees_with_empirical_psfs():
     np.testing.assert_allclose((b / b[-1])[2:], (a / a[-1])[2:], atol=0.025)
     # CEERS mosaics, 0.04 arcsec pixels as the header says
     ceers = read_psf(
-        Path(DATA) / "psf" / "psf-ceers-f160w.fits",
+        data_file("psf/psf-ceers-f160w.fits"),
         pixel_scale=0.04 * u.arcsec,
         frame="sky",
         enclosed=1.0,

@@ -1,6 +1,3 @@
-import os
-from pathlib import Path
-
 import astropy.units as u
 import numpy as np
 import pytest
@@ -26,11 +23,9 @@ def test_width_is_that_in_flight(name, published):
     assert width / published == pytest.approx(1.045, abs=0.035)
 
 
-def test_energy_is_that_of_drizzled_psfs():
+def test_energy_is_that_of_drizzled_psfs(data_file):
     """PRIMER-UDS, F444W on pixels of 0.04 arcsec."""
-    path = Path(os.environ.get("MIRICIGALE_DATA", "/nowhere"), "uds/psf/uds-test-f444w_psf.fits.gz")
-    if not path.exists():
-        pytest.skip("needs uds/psf/uds-test-f444w_psf.fits.gz in $MIRICIGALE_DATA")
+    path = data_file("uds/psf/uds-test-f444w_psf.fits.gz")
     radii = [0.15, 0.2, 0.3, 0.5, 0.8, 1.2, 1.6] * u.arcsec
     scale = 0.04 * u.arcsec
     # planes whose cores stand within 0.2 pixel of the centre

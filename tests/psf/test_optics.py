@@ -2,6 +2,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 
+from helpers.light import gaussian_image
 from miricigale.psf import _core, hst_pupil, jwst_pupil, optics
 
 ARCSEC = np.pi / 180 / 3600
@@ -75,9 +76,8 @@ def test_transform_equals_the_fourier_sum():
 
 
 def test_radial_sums_of_a_gaussian():
-    n, s = 101, 6.0
-    axis = np.arange(n) - n // 2
-    image = np.exp(-0.5 * (axis**2 + axis[:, None] ** 2) / s**2) / (2 * np.pi * s**2)
+    s = 6.0
+    image = gaussian_image(101, s)
     radii = np.array([20.0, 2.0, 5.0, 11.3])
     expected = 1 - np.exp(-0.5 * radii**2 / s**2)
     # (a Gaussian sampled, not averaged, over the pixels)

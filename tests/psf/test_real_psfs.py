@@ -1,8 +1,5 @@
 """PSFs as people bring them: truncated, off-centre, even-sized, oversampled, unnormalised."""
 
-import os
-from pathlib import Path
-
 import astropy.units as u
 import numpy as np
 import pytest
@@ -11,6 +8,7 @@ from astropy.wcs import WCS
 from photutils.psf import ImagePSF
 from scipy.signal import fftconvolve
 
+from helpers.light import gaussian_image
 from miricigale.psf import (
     MatchingKernel,
     from_photutils,
@@ -32,11 +30,6 @@ def offsets(n, x, y):
     return axis - x, (axis - y)[:, None]
 
 
-def gaussian(n, sigma, x=0.0, y=0.0):
-    dx, dy = offsets(n, x, y)
-    return np.exp(-0.5 * (dx**2 + dy**2) / sigma**2) / (2 * np.pi * sigma**2)
-
-
 def moffat(n, core, beta, x=0.0, y=0.0):
     dx, dy = offsets(n, x, y)
     return (beta - 1) / (np.pi * core**2) * (1 + (dx**2 + dy**2) / core**2) ** -beta
@@ -44,7 +37,7 @@ def moffat(n, core, beta, x=0.0, y=0.0):
 
 def expected_kernel(n):
     """Gaussians: the kernel is that of the difference of the variances, and centred."""
-    return gaussian(n, np.sqrt(LO**2 - HI**2))
+    return gaussian_image(n, np.sqrt(LO**2 - HI**2))
 
 
 def assert_is_the_gaussian_kernel(kernel):
@@ -54,8 +47,8 @@ def assert_is_the_gaussian_kernel(kernel):
     np.testing.assert_allclose(kernel.array, expected, rtol=0, atol=0.03 * expected.max())
     assert kernel.array.sum() == pytest.approx(1, abs=1e-6)
     # and what comes out of it is the wide PSF where it should stand
-    image = kernel.apply(gaussian(n, HI))
-    np.testing.assert_allclose(image, gaussian(n, LO), rtol=0, atol=5e-3 * image.max())
+    image = kernel.apply(gaussian_image(n, HI))
+    np.testing.assert_allclose(image, gaussian_image(n, LO), rtol=0, atol=5e-3 * image.max())
     # a point of unit flux keeps it
     point = np.zeros((2 * n + 1, 2 * n + 1))
     point[n, n] = 1.0
@@ -66,13 +59,15 @@ def assert_is_the_gaussian_kernel(kernel):
 @pytest.mark.parametrize("off", [(0.0, 0.0), (1.3, -0.8), (-0.46, 1.77)])
 def test_off_centre_and_even_arrays_give_the_centred_kernel(n, off):
     kernel = MatchingKernel.from_psfs(
-        gaussian(n, HI, -off[1], off[0]), gaussian(n, LO, *off), pixel_scale=SCALE
+        gaussian_image(n, HI, -off[1], off[0]), gaussian_image(n, LO, *off), pixel_scale=SCALE
     )
     assert_is_the_gaussian_kernel(kernel)
     assert kernel.array.shape[0] % 2 == 1
     # the moving itself costs less than the regularization
     m = kernel.array.shape[0]
-    straight = MatchingKernel.from_psfs(gaussian(m, HI), gaussian(m, LO), pixel_scale=SCALE)
+    straight = MatchingKernel.from_psfs(
+        gaussian_image(m, HI), gaussian_image(m, LO), pixel_scale=SCALE
+    )
     np.testing.assert_allclose(kernel.array, straight.array, atol=5e-4 * kernel.array.max())
     found = np.array(kernel.meta["centering"]["lo"]) / SCALE.value
     np.testing.assert_allclose(found, off, atol=2e-3)
@@ -81,7 +76,8 @@ def test_off_centre_and_even_arrays_give_the_centred_kernel(n, off):
 def test_off_centre_psfs_keep_their_angles():
     """The core is put on the axis before the PSF is turned about it."""
     psfs = [
-        make_psf(gaussian(61, s, 1.2, -0.9), pixel_scale=SCALE, frame="detector") for s in (HI, LO)
+        make_psf(gaussian_image(61, s, 1.2, -0.9), pixel_scale=SCALE, frame="detector")
+        for s in (HI, LO)
     ]
     angles = {"hi_angle": 20 * u.deg, "lo_angle": [20, 140] * u.deg}
     kernel = MatchingKernel.from_psfs(*psfs, pixel_scale=SCALE, **angles)
@@ -90,7 +86,9 @@ def test_off_centre_psfs_keep_their_angles():
 
 def test_core_that_is_nowhere_near_the_centre_is_refused():
     with pytest.raises(ValueError, match="'lo' must be a PSF whose core stands near its center"):
-        MatchingKernel.from_psfs(gaussian(51, HI), gaussian(51, LO, 15.0, 0.0), pixel_scale=SCALE)
+        MatchingKernel.from_psfs(
+            gaussian_image(51, HI), gaussian_image(51, LO, 15.0, 0.0), pixel_scale=SCALE
+        )
 
 
 def test_oversampled_psf_of_unit_sum_is_scaled_and_said():
@@ -100,22 +98,24 @@ def test_oversampled_psf_of_unit_sum_is_scaled_and_said():
         lambda d: from_photutils(ImagePSF(d, oversampling=over), pixel_scale=SCALE, frame="sky"),
     ):
         with pytest.warns(MiricigaleWarning, match="'data' sums to 1 with 4 x 4 cells per pixel"):
-            psf = make(gaussian(n, over * HI))
+            psf = make(gaussian_image(n, over * HI))
         assert psf.data.sum() == pytest.approx(over**2, rel=1e-6)
-    lo = make_psf(gaussian(51, LO), pixel_scale=SCALE, frame="sky")
+    lo = make_psf(gaussian_image(51, LO), pixel_scale=SCALE, frame="sky")
     kernel = MatchingKernel.from_psfs(psf, lo, pixel_scale=SCALE)
     assert_is_the_gaussian_kernel(kernel)
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.02, 7.0])
 def test_sums_that_are_no_fraction_are_refused_unless_scaled(factor):
-    data = factor * gaussian(51, HI)
+    data = factor * gaussian_image(51, HI)
     kind = {"pixel_scale": SCALE, "frame": "sky"}
     with pytest.raises(ValueError, match=r"'data' must be .*'enclosed' given"):
         make_psf(data, **kind)
     with pytest.raises(ValueError, match="'hi' must be a PSF whose sum is the fraction of light"):
-        MatchingKernel.from_psfs(data, gaussian(51, LO), pixel_scale=SCALE)
-    kernel = MatchingKernel.from_psfs(data, gaussian(51, LO), pixel_scale=SCALE, normalize=True)
+        MatchingKernel.from_psfs(data, gaussian_image(51, LO), pixel_scale=SCALE)
+    kernel = MatchingKernel.from_psfs(
+        data, gaussian_image(51, LO), pixel_scale=SCALE, normalize=True
+    )
     assert_is_the_gaussian_kernel(kernel)
     psf = make_psf(data, **kind, enclosed=0.97)
     assert psf.enclosed == pytest.approx(0.97)
@@ -148,9 +148,11 @@ def test_truncated_wings_are_said_and_the_kernel_has_unit_sum():
 
 def test_exchanged_psfs_are_refused():
     with pytest.raises(ValueError, match="'hi, lo' must be the sharp and the wide PSF"):
-        MatchingKernel.from_psfs(gaussian(51, LO), gaussian(51, HI), pixel_scale=SCALE)
+        MatchingKernel.from_psfs(gaussian_image(51, LO), gaussian_image(51, HI), pixel_scale=SCALE)
     # MIRI's bluest bands and the longest of a smaller telescope are alike: that is no exchange
-    kernel = MatchingKernel.from_psfs(gaussian(51, 3.1), gaussian(51, LO), pixel_scale=SCALE)
+    kernel = MatchingKernel.from_psfs(
+        gaussian_image(51, 3.1), gaussian_image(51, LO), pixel_scale=SCALE
+    )
     assert kernel.array.sum() == pytest.approx(1, abs=1e-6)
 
 
@@ -175,7 +177,7 @@ def test_gridded_models_need_a_position():
 def test_artefacts_of_resampling_make_no_stripes(tmp_path):
     """A wide PSF of coarser, replicated pixels: its steps, which the sharp one lacks, ask for stripes."""
     n = 69
-    hi, coarse = gaussian(n, HI), gaussian(n, LO).reshape(23, 3, 23, 3).mean((1, 3))
+    hi, coarse = gaussian_image(n, HI), gaussian_image(n, LO).reshape(23, 3, 23, 3).mean((1, 3))
     lo = np.kron(coarse, np.ones((3, 3)))
     kernel = MatchingKernel.from_psfs(hi, lo, pixel_scale=SCALE)
     truth = 1 / np.sqrt(4 * np.pi * (LO**2 - HI**2))
@@ -208,7 +210,7 @@ def header(side=0.04, angle=30.0, flip=-1):
 
 def test_scale_and_angle_come_from_the_header(tmp_path):
     path = tmp_path / "psf.fits"
-    fits.writeto(path, gaussian(51, HI), header())
+    fits.writeto(path, gaussian_image(51, HI), header())
     psf = read_psf(path, frame="sky")
     assert psf.pixel_scale.value == pytest.approx(0.04)
     assert psf.angle.value == pytest.approx(30)
@@ -216,15 +218,17 @@ def test_scale_and_angle_come_from_the_header(tmp_path):
         read_psf(path, frame="sky", pixel_scale=0.06 * u.arcsec)
     with pytest.raises(ValueError, match=r"'angle' must be the header's, 30 deg"):
         read_psf(path, frame="sky", angle=0 * u.deg)
-    fits.writeto(path, gaussian(51, HI), header(flip=1), overwrite=True)
+    fits.writeto(path, gaussian_image(51, HI), header(flip=1), overwrite=True)
     with pytest.raises(ValueError, match="'path' must be a file with east to the left"):
         read_psf(path, frame="sky")
     # stpsf's, arcsec per cell
-    fits.writeto(path, gaussian(51, 4 * HI), fits.Header({"PIXELSCL": 0.0275}), overwrite=True)
+    fits.writeto(
+        path, gaussian_image(51, 4 * HI), fits.Header({"PIXELSCL": 0.0275}), overwrite=True
+    )
     with pytest.warns(MiricigaleWarning, match="sums to"):
         psf = read_psf(path, frame="detector", oversampling=4)
     assert psf.pixel_scale.value == pytest.approx(0.11)
-    fits.writeto(path, gaussian(51, HI), overwrite=True)
+    fits.writeto(path, gaussian_image(51, HI), overwrite=True)
     with pytest.raises(ValueError, match="'pixel_scale' must be given where the header"):
         read_psf(path, frame="sky")
 
@@ -248,8 +252,10 @@ def test_roll_of_the_header_turns_the_psf(tmp_path):
 
 def test_ready_kernels_are_taken(tmp_path):
     array = expected_kernel(41)
-    kernel = MatchingKernel.from_array(array, pixel_scale=SCALE, source=gaussian(41, HI))
-    np.testing.assert_allclose(kernel.target, gaussian(41, LO), atol=1e-4 * kernel.target.max())
+    kernel = MatchingKernel.from_array(array, pixel_scale=SCALE, source=gaussian_image(41, HI))
+    np.testing.assert_allclose(
+        kernel.target, gaussian_image(41, LO), atol=1e-4 * kernel.target.max()
+    )
     bare = MatchingKernel.from_array(array, pixel_scale=SCALE)
     assert bare.source is None
     with pytest.warns(MiricigaleWarning, match=r"summed to 0\.9430 and was brought to 1"):
@@ -263,10 +269,10 @@ def test_ready_kernels_are_taken(tmp_path):
     with pytest.warns(MiricigaleWarning, match=r"stands \(1\.00, 0\.00\) pixels off the center"):
         MatchingKernel.from_array(np.roll(array, 1, axis=1), pixel_scale=SCALE)
     with pytest.raises(ValueError, match="'source' must be a PSF of the kernel's shape"):
-        MatchingKernel.from_array(array, pixel_scale=SCALE, source=gaussian(51, HI))
+        MatchingKernel.from_array(array, pixel_scale=SCALE, source=gaussian_image(51, HI))
     with pytest.raises(ValueError, match="'source, target' must be the sharp and the wide PSF"):
         MatchingKernel.from_array(
-            array, pixel_scale=SCALE, source=gaussian(41, LO), target=gaussian(41, HI)
+            array, pixel_scale=SCALE, source=gaussian_image(41, LO), target=gaussian_image(41, HI)
         )
     path = tmp_path / "kernels.fits"
     fits.writeto(path, np.stack([np.zeros_like(array), array]), fits.Header({"PIXSCALE": 0.04}))
@@ -279,8 +285,8 @@ def test_ready_kernels_are_taken(tmp_path):
 
 def test_kernels_of_regions_blend():
     """One sharp PSF, several wide ones: the mean kernel is that of the mean wide PSF."""
-    hi = gaussian(51, HI)
-    wide = [gaussian(51, s) for s in (3.0, 3.4)]
+    hi = gaussian_image(51, HI)
+    wide = [gaussian_image(51, s) for s in (3.0, 3.4)]
     kernels = [
         MatchingKernel.from_psfs(hi, lo, pixel_scale=SCALE, regularization=1e-4) for lo in wide
     ]
@@ -297,19 +303,13 @@ def test_kernels_of_regions_blend():
         MatchingKernel.blend(kernels, [0, 0])
 
 
-def uds_file(name):
-    path = Path(os.environ.get("MIRICIGALE_DATA", "/nowhere")) / "uds" / "psf" / name
-    if not path.exists():
-        pytest.skip(f"needs uds/psf/{name} in $MIRICIGALE_DATA")
-    return path
-
-
 @pytest.mark.filterwarnings("ignore:light beyond the PSFs' grids")
 @pytest.mark.parametrize("region", range(26))
-def test_real_drizzled_psfs(region):
+def test_real_drizzled_psfs(data_file, region):
     """PRIMER-UDS, F444W to F770W, against the kernels that another program made of them."""
-    paths = [uds_file(f"uds-test-{n}.fits.gz") for n in ("f444w_psf", "f770w_psf")]
-    theirs = fits.getdata(uds_file("uds-test-f444w_kernel_f770w.fits.gz"))[region]
+    names = ("f444w_psf", "f770w_psf", "f444w_kernel_f770w")
+    *paths, path = (data_file(f"uds/psf/uds-test-{name}.fits.gz") for name in names)
+    theirs = fits.getdata(path)[region]
     hi, lo = (read_psf(p, plane=region, pixel_scale=SCALE, frame="sky") for p in paths)
     kernel = MatchingKernel.from_psfs(hi, lo, pixel_scale=SCALE)
     assert kernel.noise_gain < 1.1 * np.sqrt(np.sum(theirs.astype(float) ** 2))

@@ -1,68 +1,13 @@
-import astropy.units as u
-import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
-from astropy.table import QTable
-from astropy.wcs import WCS
-from photutils.psf import ImagePSF
-from scipy.special import erf
 
-from miricigale.psf import InstrumentPSF
-
-CENTER = SkyCoord(53.13440 * u.deg, -27.83444 * u.deg)
-
-
-def pixel_gaussian(n, center, sigma, step=1.0):
-    at = (np.arange(n) - center) * step
-    return 0.5 * (erf((at + 0.5) / sigma / 2**0.5) - erf((at - 0.5) / sigma / 2**0.5))
-
-
-def tan_wcs(shape=(90, 100), scale=0.11, pa=0.0, parity=-1):
-    """TAN with +y at position angle ``pa``; parity -1 is the sky as seen (east left)."""
-    ny, nx = shape
-    cos, sin = np.cos(np.radians(pa)), np.sin(np.radians(pa))
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
-    wcs.wcs.crval = [CENTER.ra.deg, CENTER.dec.deg]
-    wcs.wcs.crpix = [(nx + 1) / 2, (ny + 1) / 2]
-    # columns: east, north of a step in x and in y
-    wcs.wcs.cd = scale / 3600 * np.array([[parity * cos, sin], [-parity * sin, cos]])
-    wcs.pixel_shape = (nx, ny)
-    wcs.wcs.set()
-    return wcs
-
-
-def gaussian_psf(sigma=0.85, oversampling=4, half=9, **facts):
-    grid = pixel_gaussian(2 * half * oversampling + 1, half * oversampling, sigma, 1 / oversampling)
-    data = np.outer(grid, grid)
-    if not facts:
-        return ImagePSF(data, oversampling=oversampling)
-    facts = {"pixel_scale": 0.11 * u.arcsec, "frame": "detector", **facts}
-    return InstrumentPSF(data, oversampling=oversampling, **facts)
-
-
-def make_catalog(wcs, x, y, *, flux=10.0, profile="point", **columns):
-    """A catalog of sources at given pixels."""
-    x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.atleast_1d(y))
-    n = len(x)
-    table = QTable()
-    table["id"] = np.arange(1, n + 1)
-    table["sky"] = SkyCoord(*wcs.all_pix2world(x, y, 0), unit="deg")
-    table["redshift"] = np.full(n, 1.0)
-    table["profile"] = np.broadcast_to(profile, n)
-    table["half_light_radius"] = np.broadcast_to(columns.get("radius", 0.3), n) * u.arcsec
-    table["sersic_index"] = np.broadcast_to(columns.get("index", 1.0), n)
-    table["axis_ratio"] = np.broadcast_to(columns.get("ratio", 1.0), n)
-    table["position_angle"] = np.broadcast_to(columns.get("angle", 0.0), n) * u.deg
-    table["miri.f770w"] = np.broadcast_to(np.asarray(flux, float), n) * u.uJy
-    return table
+from helpers import scenes
 
 
 @pytest.fixture
 def wcs():
-    return tan_wcs()
+    return scenes.tan_wcs()
 
 
 @pytest.fixture
 def psf():
-    return gaussian_psf()
+    return scenes.gaussian_psf()

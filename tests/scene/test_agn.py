@@ -1,18 +1,12 @@
 """A point source at the center of a galaxy, as a share of its light or on top of it."""
 
-import importlib.util
-from pathlib import Path
-
 import astropy.units as u
 import numpy as np
 import pytest
 
+from helpers import scenes
 from miricigale.instrument import pixel_area_map
 from miricigale.scene import Scene, SceneFlags
-
-_spec = importlib.util.spec_from_file_location("scene_tools", Path(__file__).parent / "conftest.py")
-tools = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(tools)
 
 FILTER = "miri.f770w"
 GALAXY = {"profile": "sersic", "radius": 0.5, "index": 2.0, "ratio": 0.4, "angle": 40.0}
@@ -24,8 +18,8 @@ def light(catalog, wcs, psf, **options):
 
 
 def test_a_share_of_the_light_is_in_the_point(wcs, psf):
-    galaxy = tools.make_catalog(wcs, 50.3, 44.6, **GALAXY)
-    point = tools.make_catalog(wcs, 50.3, 44.6)
+    galaxy = scenes.make_catalog(wcs, 50.3, 44.6, **GALAXY)
+    point = scenes.make_catalog(wcs, 50.3, 44.6)
     host, _ = light(galaxy, wcs, psf)
     nucleus, _ = light(point, wcs, psf)
     galaxy["frac_agn"] = [0.3]
@@ -38,12 +32,12 @@ def test_a_share_of_the_light_is_in_the_point(wcs, psf):
 
 
 def test_a_flux_comes_on_top(wcs, psf):
-    galaxy = tools.make_catalog(wcs, [30.0, 70.0, 60.0], [40.0, 50.0, 20.0], **GALAXY)
+    galaxy = scenes.make_catalog(wcs, [30.0, 70.0, 60.0], [40.0, 50.0, 20.0], **GALAXY)
     host, alone = light(galaxy, wcs, psf)
     assert alone["flux_agn"].value.tolist() == [0, 0, 0]
     galaxy["agn"] = [0.004, np.nan, 0.0] * u.mJy
     image, truth = light(galaxy, wcs, psf, agn="agn")
-    nucleus, _ = light(tools.make_catalog(wcs, 30.0, 40.0, flux=4.0), wcs, psf)
+    nucleus, _ = light(scenes.make_catalog(wcs, 30.0, 40.0, flux=4.0), wcs, psf)
     np.testing.assert_allclose(image, host + nucleus, atol=1e-6 * image.max())
     np.testing.assert_allclose(truth["flux_total"].value, [14, 10, 10])
     np.testing.assert_allclose(truth["flux_agn"].value, [4, 0, 0])
@@ -52,7 +46,7 @@ def test_a_flux_comes_on_top(wcs, psf):
 def test_what_is_cut_is_of_all_light(wcs, psf):
     """A profile of index 8 cut at 4 arcsec loses a few per cent, a bright point in it less."""
     steep = {**GALAXY, "index": 8.0, "radius": 1.0}
-    galaxy = tools.make_catalog(wcs, 50.0, 45.0, **steep)
+    galaxy = scenes.make_catalog(wcs, 50.0, 45.0, **steep)
     cut = int(SceneFlags.CUT_PROFILE)
     galaxy["frac_agn"] = [0.99]
     kind = {"max_radius": 4 * u.arcsec}
@@ -61,7 +55,7 @@ def test_what_is_cut_is_of_all_light(wcs, psf):
 
 
 def test_refuses(wcs, psf):
-    galaxy = tools.make_catalog(wcs, [50.0, 30.0], 45.0, **GALAXY)
+    galaxy = scenes.make_catalog(wcs, [50.0, 30.0], 45.0, **GALAXY)
     with pytest.raises(ValueError, match=r"'agn' must be a column of .* got 'nucleus'"):
         light(galaxy, wcs, psf, agn="nucleus")
     galaxy["share"] = [0.2, 1.3]
@@ -78,7 +72,7 @@ def test_refuses(wcs, psf):
 
 
 def test_nothing_near_is_an_empty_image(wcs, psf):
-    galaxy = tools.make_catalog(wcs, 50.0, 45.0, **GALAXY)
+    galaxy = scenes.make_catalog(wcs, 50.0, 45.0, **GALAXY)
     galaxy["sky"] = galaxy["sky"].directional_offset_by(0 * u.deg, 5 * u.arcmin)
     galaxy["share"] = [0.5]
     image, truth = light(galaxy, wcs, psf, agn="share")

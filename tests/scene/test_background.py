@@ -1,16 +1,10 @@
-import importlib.util
-from pathlib import Path
-
 import astropy.units as u
 import numpy as np
 import pytest
 
+from helpers import scenes
 from miricigale.instrument import background_level
 from miricigale.scene import Background
-
-_spec = importlib.util.spec_from_file_location("scene_tools", Path(__file__).parent / "conftest.py")
-tools = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(tools)
 
 LEVEL = 10 * u.MJy / u.sr
 
@@ -30,9 +24,9 @@ def test_grows_along_the_position_angle(wcs):
 
 
 def test_stands_on_the_sky_whatever_the_roll(wcs):
-    background = Background(LEVEL, gradient=0.6 / u.arcmin, center=tools.CENTER)
+    background = Background(LEVEL, gradient=0.6 / u.arcmin, center=scenes.CENTER)
     north_up = background.image(wcs, (90, 100))
-    turned_wcs = tools.tan_wcs(pa=70.0)
+    turned_wcs = scenes.tan_wcs(pa=70.0)
     turned = background.image(turned_wcs, (90, 100))
     x, y = turned_wcs.world_to_pixel(wcs.pixel_to_world(60, 30))
     inverse = turned[round(float(y)), round(float(x))]

@@ -1,9 +1,7 @@
 """Images of galaxies as sources: light, place, orientation and shape."""
 
 import copy
-import importlib.util
 import pickle
-from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -12,13 +10,10 @@ from astropy.nddata import CCDData
 from astropy.wcs import Sip
 from photutils.psf import ImagePSF
 
+from helpers import scenes
 from miricigale.instrument import pixel_area_map
 from miricigale.profiles import sersic_image
 from miricigale.scene import Cutout, Scene
-
-_spec = importlib.util.spec_from_file_location("scene_tools", Path(__file__).parent / "conftest.py")
-tools = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(tools)
 
 FILTER = "miri.f770w"
 
@@ -36,14 +31,14 @@ def moments(image):
 
 
 def one(wcs, x, y, **columns):
-    return tools.make_catalog(wcs, x, y, profile="cutout", **columns)
+    return scenes.make_catalog(wcs, x, y, profile="cutout", **columns)
 
 
 def gaussian_stamp(sigma_x, sigma_y, scale, n=81, **options):
     """A Gaussian integrated over the pixels of a stamp; widths in arcsec."""
     data = np.outer(
-        tools.pixel_gaussian(n, (n - 1) / 2, sigma_y / scale),
-        tools.pixel_gaussian(n, (n - 1) / 2, sigma_x / scale),
+        scenes.pixel_gaussian(n, (n - 1) / 2, sigma_y / scale),
+        scenes.pixel_gaussian(n, (n - 1) / 2, sigma_x / scale),
     )
     return Cutout(data, pixel_scale=scale * u.arcsec, **options)
 
@@ -51,7 +46,7 @@ def gaussian_stamp(sigma_x, sigma_y, scale, n=81, **options):
 @pytest.mark.parametrize("scale", [0.03, 0.06, 0.2])
 @pytest.mark.parametrize(("x", "y"), [(50.0, 45.0), (50.37, 44.81), (49.5, 45.24)])
 def test_light_is_kept_to_1e6_and_the_place_to_a_hundredth_of_a_pixel(psf, scale, x, y):
-    wcs = tools.tan_wcs(pa=25.0)
+    wcs = scenes.tan_wcs(pa=25.0)
     stamp = gaussian_stamp(0.35, 0.35, scale, n=4 * round(1.5 / scale) + 1)
     # the catalog's flux, whatever the stamp's own unit
     stamp = Cutout(17.0 * stamp.data, pixel_scale=stamp.pixel_scale)
@@ -67,7 +62,7 @@ def test_light_is_kept_to_1e6_and_the_place_to_a_hundredth_of_a_pixel(psf, scale
 @pytest.mark.parametrize(("pa", "angle"), [(0.0, 0.0), (35.0, 0.0), (20.0, 80.0), (200.0, -30.0)])
 def test_second_moments_through_angle_and_parity(psf, pa, angle, parity):
     """Widths add in squares: profile, stamp pixel (twice: drawn and spread), PSF, pixel."""
-    wcs = tools.tan_wcs(pa=pa, parity=parity)
+    wcs = scenes.tan_wcs(pa=pa, parity=parity)
     scale = 0.05
     stamp = gaussian_stamp(0.2, 0.5, scale, angle=angle * u.deg)
     scene = Scene(one(wcs, 50, 45), filter=FILTER, wcs=wcs, psf=psf, cutouts={1: stamp})
@@ -94,7 +89,7 @@ def test_a_very_small_stamp_is_a_point(wcs, psf):
 def test_a_drawn_galaxy_is_the_galaxy(wcs, psf):
     """A finely drawn Sersic stamp and the profile itself."""
     kwargs = {"radius": 0.4, "index": 1.5, "ratio": 0.5, "angle": 30.0}
-    galaxy = tools.make_catalog(wcs, 50.3, 44.8, profile="sersic", **kwargs)
+    galaxy = scenes.make_catalog(wcs, 50.3, 44.8, profile="sersic", **kwargs)
     # position angle 30 deg on a north-up stamp: 120 deg from +x
     data = sersic_image(
         (601, 601), x=300, y=300, r_eff=40, n=1.5, axis_ratio=0.5, theta=np.radians(120)
@@ -111,7 +106,7 @@ def test_a_drawn_galaxy_is_the_galaxy(wcs, psf):
 @pytest.mark.parametrize("parity", [-1, 1])
 def test_stamp_of_an_image_stands_as_the_image_does(psf, parity):
     """A companion lands where the WCS of its own image says."""
-    own = tools.tan_wcs((61, 71), scale=0.05, pa=130.0, parity=parity)
+    own = scenes.tan_wcs((61, 71), scale=0.05, pa=130.0, parity=parity)
     y, x = np.mgrid[:61, :71]
     data = np.exp(-0.5 * ((x - 35) ** 2 + (y - 30) ** 2) / 2.0)
     data += 0.8 * np.exp(-0.5 * ((x - 60) ** 2 + (y - 45) ** 2) / 2.0)
@@ -121,7 +116,7 @@ def test_stamp_of_an_image_stands_as_the_image_does(psf, parity):
     stamp = Cutout.from_image(image, sky, fill=0)
     assert stamp.n_filled == 2
     assert stamp.pixel_scale.to_value(u.arcsec) == pytest.approx(0.05, rel=1e-6)
-    wcs = tools.tan_wcs(pa=20.0)
+    wcs = scenes.tan_wcs(pa=20.0)
     catalog = one(wcs, 50, 45)
     catalog["sky"] = sky.reshape((1,))
     scene = Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, cutouts={1: stamp})
@@ -136,7 +131,7 @@ def test_stamp_of_an_image_stands_as_the_image_does(psf, parity):
 
 
 def test_pixels_without_a_measurement_are_an_error_or_counted(wcs, psf):
-    own = tools.tan_wcs((7, 9), scale=0.1)
+    own = scenes.tan_wcs((7, 9), scale=0.1)
     data, mask = np.ones((7, 9)), np.zeros((7, 9), dtype=bool)
     data[2, 3], data[4, 4] = np.nan, -np.inf
     mask[2, 3] = mask[6, 0] = True
@@ -157,7 +152,7 @@ def test_pixels_without_a_measurement_are_an_error_or_counted(wcs, psf):
 
 
 def test_distortion_stretches_the_stamp(psf):
-    wcs = tools.tan_wcs(pa=20.0)
+    wcs = scenes.tan_wcs(pa=20.0)
     a, b = np.zeros((3, 3)), np.zeros((3, 3))
     a[2, 0], b[1, 1] = 1.5e-3, -8e-4
     wcs.wcs.ctype = ["RA---TAN-SIP", "DEC--TAN-SIP"]
@@ -187,7 +182,7 @@ def test_light_beyond_the_edge_is_in_no_pixel(wcs, psf):
 
 
 def test_beside_other_sources(wcs, psf):
-    table = tools.make_catalog(
+    table = scenes.make_catalog(
         wcs, [30.0, 60.0, 70.0], [40.0, 50.0, 20.0], profile=["sersic", "cutout", "point"]
     )
     stamp = gaussian_stamp(0.2, 0.2, 0.06)
@@ -217,7 +212,7 @@ def test_refuses(wcs, psf):
         Cutout(np.ones((5, 5)), pixel_scale=0.1)
     with pytest.raises(ValueError, match="'image' must be NDData with a WCS"):
         Cutout.from_image(CCDData(np.ones((5, 5)), unit="adu"))
-    long = tools.tan_wcs((5, 5))
+    long = scenes.tan_wcs((5, 5))
     long.wcs.cd = long.wcs.cd * np.array([1.0, 1.2])
     with pytest.raises(ValueError, match="'image' must be with square pixels"):
         Cutout.from_image(CCDData(np.ones((5, 5)), unit="adu", wcs=long))

@@ -1,8 +1,5 @@
 """Scenes through a PSF that varies over the field."""
 
-import importlib.util
-from pathlib import Path
-
 import astropy.units as u
 import numpy as np
 import pytest
@@ -10,13 +7,10 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import NDData
 from photutils.psf import GriddedPSFModel
 
+from helpers import scenes
 from miricigale.instrument import aperture, imager_wcs, pixel_area_map
 from miricigale.psf import miri_psf_grid
 from miricigale.scene import Cutout, Scene
-
-_spec = importlib.util.spec_from_file_location("scene_tools", Path(__file__).parent / "conftest.py")
-tools = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(tools)
 
 FILTER = "miri.f770w"
 CORNERS = [(0, 0), (99, 0), (0, 89), (99, 89)]
@@ -24,7 +18,7 @@ CORNERS = [(0, 0), (99, 0), (0, 89), (99, 89)]
 
 @pytest.fixture(scope="module")
 def grid():
-    data = np.stack([tools.gaussian_psf(sigma).data for sigma in (0.8, 1.0, 1.2, 1.6)])
+    data = np.stack([scenes.gaussian_psf(sigma).data for sigma in (0.8, 1.0, 1.2, 1.6)])
     return GriddedPSFModel(NDData(data, meta={"grid_xypos": CORNERS, "oversampling": 4}))
 
 
@@ -34,7 +28,7 @@ def light(scene):
 
 def test_points_are_what_photutils_evaluates(wcs, grid):
     x, y = [20.3, 49.5, 80.7, -2.0], [15.2, 44.5, 70.9, 50.0]
-    catalog = tools.make_catalog(wcs, x, y, flux=[10.0, 20.0, 30.0, 40.0])
+    catalog = scenes.make_catalog(wcs, x, y, flux=[10.0, 20.0, 30.0, 40.0])
     scene = Scene(catalog, filter=FILTER, wcs=wcs, psf=grid)
     yy, xx = np.mgrid[:90, :100]
     expected = sum(
@@ -48,7 +42,7 @@ def test_points_are_what_photutils_evaluates(wcs, grid):
 
 def test_galaxies_widen_by_the_local_psf(wcs, grid):
     """Variances add: the galaxy's and the mixture's of the PSFs at its center."""
-    catalog = tools.make_catalog(
+    catalog = scenes.make_catalog(
         wcs, 60.0, 30.0, profile="sersic", radius=0.4, index=0.5, ratio=1.0
     )
     scene = Scene(catalog, filter=FILTER, wcs=wcs, psf=grid, enclosed=0.99999)
@@ -67,12 +61,12 @@ def test_galaxies_widen_by_the_local_psf(wcs, grid):
 def test_many_places_and_the_lines_between_them(wcs):
     """On both sides of an inner row and column of PSFs, on them, and beyond the last ones."""
     places = [(x, y) for y in (10, 41.3, 80) for x in (15.2, 49.5, 70, 95)]
-    data = np.stack([tools.gaussian_psf(0.9 + 0.05 * (k % 5)).data for k in range(12)])
+    data = np.stack([scenes.gaussian_psf(0.9 + 0.05 * (k % 5)).data for k in range(12)])
     grid = GriddedPSFModel(NDData(data, meta={"grid_xypos": places, "oversampling": 4}))
     x = [49.3, 49.5, 49.9, 30.0, 97.0, 5.0, 82.1]
     y = [41.1, 60.0, 41.3, 41.5, 5.0, 70.2, 84.9]
     flux = np.arange(10.0, 80.0, 10.0)
-    scene = Scene(tools.make_catalog(wcs, x, y, flux=flux), filter=FILTER, wcs=wcs, psf=grid)
+    scene = Scene(scenes.make_catalog(wcs, x, y, flux=flux), filter=FILTER, wcs=wcs, psf=grid)
     yy, xx = np.mgrid[:90, :100]
     expected = sum(grid.evaluate(xx, yy, f, a, b) for f, a, b in zip(flux, x, y, strict=True))
     image = light(scene)
@@ -89,7 +83,7 @@ def test_alike_psfs_are_one_psf(wcs, psf):
     grid = GriddedPSFModel(
         NDData(np.stack([psf.data] * 4), meta={"grid_xypos": CORNERS, "oversampling": 4})
     )
-    catalog = tools.make_catalog(
+    catalog = scenes.make_catalog(
         wcs,
         [20.3, 99.2, 50.0, 3.0],
         [15.2, 44.5, 70.9, 88.0],
@@ -113,7 +107,7 @@ def test_each_part_of_a_galaxy_has_the_psf_of_its_own_place(wcs, grid):
     for place, share in zip(lit, shares, strict=True):
         stamp[place] = share
     kind = {"filter": FILTER, "wcs": wcs, "psf": grid}
-    catalog = tools.make_catalog(wcs, 50.0, 45.0, profile="cutout")
+    catalog = scenes.make_catalog(wcs, 50.0, 45.0, profile="cutout")
     stamps = {1: Cutout(stamp, pixel_scale=0.01 * u.arcsec)}
     image = light(Scene(catalog, cutouts=stamps, **kind))
     yy, xx = np.mgrid[:90, :100]
@@ -129,7 +123,7 @@ def test_the_imagers_psfs_belong_to_their_subarray():
     kind = {"fov": 3 * u.arcsec, "oversampling": 2, "n_psfs": 4}
     grid = miri_psf_grid(FILTER, subarray="SUB64", **kind)
     wcs = imager_wcs(field, 30 * u.deg, subarray="SUB64")
-    catalog = tools.make_catalog(wcs, 30.2, 20.7)
+    catalog = scenes.make_catalog(wcs, 30.2, 20.7)
     scene = Scene(catalog, filter=FILTER, wcs=wcs, psf=grid)
     image = light(scene)
     ny, nx = aperture("SUB64").shape
@@ -141,4 +135,4 @@ def test_the_imagers_psfs_belong_to_their_subarray():
     assert scene.render().meta["psf_includes"] == ["jitter", "cruciform", "pixel", "ipc"]
     wcs = imager_wcs(field, 30 * u.deg, subarray="SUB128")
     with pytest.raises(ValueError, match="'psf' must be a grid of places on this image, got those"):
-        Scene(tools.make_catalog(wcs, 30.2, 20.7), filter=FILTER, wcs=wcs, psf=grid)
+        Scene(scenes.make_catalog(wcs, 30.2, 20.7), filter=FILTER, wcs=wcs, psf=grid)

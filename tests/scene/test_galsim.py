@@ -1,21 +1,15 @@
 """Sersic light and scenes against GalSim (extra ``galsim``)."""
 
-import importlib.util
-from pathlib import Path
-
 import astropy.units as u
 import numpy as np
 import pytest
 
+from helpers import scenes
 from miricigale.instrument import pixel_area_map
 from miricigale.profiles import sersic_image
 from miricigale.scene import Scene
 
 galsim = pytest.importorskip("galsim", reason="needs galsim: pip install miricigale[galsim]")
-
-_spec = importlib.util.spec_from_file_location("scene_tools", Path(__file__).parent / "conftest.py")
-tools = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(tools)
 
 # GalSim's defaults are good to some 1e-3: ask for more than is tested
 SHARP = galsim.GSParams(
@@ -97,8 +91,8 @@ def test_galaxies_through_a_psf(n, radius, ratio):
     rng = np.random.default_rng(int(100 * n + 1000 * radius))
     dx, dy = rng.uniform(-0.5, 0.5, 2)
     pa = 25.0
-    wcs = tools.tan_wcs(pa=pa)
-    catalog = tools.make_catalog(
+    wcs = scenes.tan_wcs(pa=pa)
+    catalog = scenes.make_catalog(
         wcs,
         49.5 + dx,
         44.5 + dy,
@@ -108,7 +102,7 @@ def test_galaxies_through_a_psf(n, radius, ratio):
         ratio=ratio,
         angle=70.0,
     )
-    psf = tools.gaussian_psf(1.0)
+    psf = scenes.gaussian_psf(1.0)
     scene = Scene(
         catalog, filter="miri.f770w", wcs=wcs, psf=psf, enclosed=0.9999, max_radius=30 * u.arcsec
     )

@@ -1,17 +1,11 @@
-import importlib.util
-from pathlib import Path
-
 import astropy.units as u
 import numpy as np
 import pytest
 
+from helpers import scenes
 from miricigale.instrument import north_up_wcs
 from miricigale.psf import encircled_energy, hst_psf
 from miricigale.scene import Scene, depth_to_rms, highres_image
-
-_spec = importlib.util.spec_from_file_location("scene_tools", Path(__file__).parent / "conftest.py")
-tools = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(tools)
 
 FILTER = "miri.f770w"
 SHAPE = (240, 250)
@@ -19,12 +13,12 @@ SHAPE = (240, 250)
 
 @pytest.fixture
 def fine():
-    return tools.tan_wcs(SHAPE, 0.06)
+    return scenes.tan_wcs(SHAPE, 0.06)
 
 
 @pytest.fixture
 def catalog(fine):
-    return tools.make_catalog(fine, [100.0, 180.0], [60.0, 120.0], flux=[1.0, 2.0])
+    return scenes.make_catalog(fine, [100.0, 180.0], [60.0, 120.0], flux=[1.0, 2.0])
 
 
 def test_noise_belongs_to_the_depth(fine, psf, catalog):
@@ -89,8 +83,8 @@ def test_refuses(fine, psf, catalog):
 
 def test_f160w_mosaic_through_its_psf_with_a_map_of_the_noise():
     """The bundled F160W PSF on a north-up grid of 0.06 arcsec: a star's light, width and noise."""
-    wcs = north_up_wcs(tools.CENTER, 0.06 * u.arcsec, (201, 221))
-    catalog = tools.make_catalog(wcs, [110.0], [100.0], flux=[100.0])
+    wcs = north_up_wcs(scenes.CENTER, 0.06 * u.arcsec, (201, 221))
+    catalog = scenes.make_catalog(wcs, [110.0], [100.0], flux=[100.0])
     catalog.rename_column(FILTER, "wfc3.f160w")
     y, x = np.mgrid[:201, :221]
     rms = np.where(x < 110, 0.002, 0.004) * u.MJy / u.sr

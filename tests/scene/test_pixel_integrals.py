@@ -1,19 +1,14 @@
 """Painted Sersic profiles are the integrals over the pixels, through a PSF, to 0.1 %."""
 
-import importlib.util
 import itertools
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
+from helpers import scenes
 from miricigale.profiles import sersic_image
 from miricigale.scene import Painter
-
-_spec = importlib.util.spec_from_file_location("scene_tools", Path(__file__).parent / "conftest.py")
-tools = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(tools)
 
 #: Arcsec of the imager's pixel.
 PIXEL = 0.11
@@ -21,7 +16,7 @@ PIXEL = 0.11
 
 def painted(n, radius, ratio, x, y, theta, *, size, sigma, oversampling=4):
     """One galaxy of unit light, painted as far as double precision goes."""
-    painter = Painter((size, size), tools.gaussian_psf(sigma, oversampling), enclosed=0.999999)
+    painter = Painter((size, size), scenes.gaussian_psf(sigma, oversampling), enclosed=0.999999)
     image, in_image, _ = painter.paint(
         x=np.array([x]),
         y=np.array([y]),

@@ -1,6 +1,4 @@
-import importlib.util
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -9,12 +7,9 @@ from astropy.coordinates import SkyCoord
 from astropy.wcs import Sip
 from photutils.psf import ImagePSF
 
+from helpers import scenes
 from miricigale.instrument import pixel_area_map
 from miricigale.scene import Background, Scene, SceneFlags
-
-_spec = importlib.util.spec_from_file_location("scene_tools", Path(__file__).parent / "conftest.py")
-tools = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(tools)
 
 FILTER = "miri.f770w"
 
@@ -26,7 +21,7 @@ def light(scene):
 
 
 def test_a_point_source_is_the_psf(wcs, psf):
-    catalog = tools.make_catalog(wcs, [40.37, 60.0], [30.81, 50.5], flux=[10.0, 3.0])
+    catalog = scenes.make_catalog(wcs, [40.37, 60.0], [30.81, 50.5], flux=[10.0, 3.0])
     image = light(Scene(catalog, filter=FILTER, wcs=wcs, psf=psf))
     y, x = np.mgrid[:90, :100]
     expected = 0
@@ -38,11 +33,11 @@ def test_a_point_source_is_the_psf(wcs, psf):
 @pytest.mark.parametrize("oversampling", [1, 3, 4])
 def test_placement_to_a_thousandth_of_the_peak(wcs, oversampling):
     # against the closed form, not the sampled PSF
-    psf = tools.gaussian_psf(1.0, oversampling)
-    catalog = tools.make_catalog(wcs, 50.13, 44.62)
+    psf = scenes.gaussian_psf(1.0, oversampling)
+    catalog = scenes.make_catalog(wcs, 50.13, 44.62)
     image = light(Scene(catalog, filter=FILTER, wcs=wcs, psf=psf))
     truth = 10 * np.outer(
-        tools.pixel_gaussian(90, 44.62, 1.0), tools.pixel_gaussian(100, 50.13, 1.0)
+        scenes.pixel_gaussian(90, 44.62, 1.0), scenes.pixel_gaussian(100, 50.13, 1.0)
     )
     limit = 1e-3 if oversampling > 1 else 2e-2
     np.testing.assert_allclose(image, truth, atol=limit * truth.max())
@@ -52,14 +47,14 @@ def test_placement_to_a_thousandth_of_the_peak(wcs, oversampling):
 @pytest.mark.parametrize("ratio", [0.1, 0.4, 1.0])
 def test_gaussian_galaxy_adds_its_variance(wcs, psf, radius, ratio):
     # position angle 90 deg is along x on a north-up image
-    catalog = tools.make_catalog(
+    catalog = scenes.make_catalog(
         wcs, 50.3, 44.7, profile="sersic", radius=radius, index=0.5, ratio=ratio, angle=90.0
     )
     image = light(Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, enclosed=0.99999))
     own = radius / 0.11 / np.sqrt(2 * np.log(2))
     truth = 10 * np.outer(
-        tools.pixel_gaussian(90, 44.7, np.hypot(0.85, ratio * own)),
-        tools.pixel_gaussian(100, 50.3, np.hypot(0.85, own)),
+        scenes.pixel_gaussian(90, 44.7, np.hypot(0.85, ratio * own)),
+        scenes.pixel_gaussian(100, 50.3, np.hypot(0.85, own)),
     )
     np.testing.assert_allclose(image, truth, atol=1e-3 * truth.max())
 
@@ -75,8 +70,8 @@ def moments(image):
 @pytest.mark.parametrize("parity", [-1, 1])
 @pytest.mark.parametrize("pa", [0.0, 35.0, 200.0])
 def test_position_angles_land_right(psf, pa, parity):
-    wcs = tools.tan_wcs(pa=pa, parity=parity)
-    catalog = tools.make_catalog(
+    wcs = scenes.tan_wcs(pa=pa, parity=parity)
+    catalog = scenes.make_catalog(
         wcs, 50.0, 45.0, profile="sersic", radius=0.5, index=1.0, ratio=0.2, angle=70.0
     )
     scene = Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, max_radius=3 * u.arcsec)
@@ -90,13 +85,13 @@ def test_position_angles_land_right(psf, pa, parity):
 
 
 def test_distorted_positions_shapes_and_fluxes(psf):
-    wcs = tools.tan_wcs(pa=20.0)
+    wcs = scenes.tan_wcs(pa=20.0)
     a, b = np.zeros((3, 3)), np.zeros((3, 3))
     a[2, 0], b[1, 1] = 1.5e-3, -8e-4  # 0.15 px per px at 50 px from the center
     wcs.wcs.ctype = ["RA---TAN-SIP", "DEC--TAN-SIP"]
     wcs.sip = Sip(a, b, None, None, wcs.wcs.crpix)
     wcs.wcs.set()
-    catalog = tools.make_catalog(
+    catalog = scenes.make_catalog(
         wcs, [15.0, 80.0], [20.0, 70.0], profile="sersic", radius=0.25, ratio=1.0, index=0.5
     )
     scene = Scene(catalog, filter=FILTER, wcs=wcs, psf=psf)
@@ -123,7 +118,7 @@ def test_distorted_positions_shapes_and_fluxes(psf):
 def test_light_is_conserved_with_background_and_edges(wcs, psf):
     rng = np.random.default_rng(3)
     n = 40
-    catalog = tools.make_catalog(
+    catalog = scenes.make_catalog(
         wcs,
         rng.uniform(-8, 108, n),
         rng.uniform(-8, 98, n),
@@ -149,9 +144,9 @@ def test_light_is_conserved_with_background_and_edges(wcs, psf):
 def test_in_image_flux_is_the_sum_of_each_source_alone(wcs, psf):
     kwargs = {"profile": "sersic", "radius": 0.6, "index": 3.0, "ratio": 0.5, "angle": 30.0}
     x, y = [2.0, 50.0, -3.0], [45.0, 88.0, 40.0]
-    truth = Scene(tools.make_catalog(wcs, x, y, **kwargs), filter=FILTER, wcs=wcs, psf=psf).truth
+    truth = Scene(scenes.make_catalog(wcs, x, y, **kwargs), filter=FILTER, wcs=wcs, psf=psf).truth
     for k in range(3):
-        alone = tools.make_catalog(wcs, x[k], y[k], **kwargs)
+        alone = scenes.make_catalog(wcs, x[k], y[k], **kwargs)
         total = light(Scene(alone, filter=FILTER, wcs=wcs, psf=psf)).sum()
         assert truth["flux_in_image"].value[k] == pytest.approx(total, rel=1e-4)
     assert truth["flags"].tolist() == [
@@ -162,7 +157,7 @@ def test_in_image_flux_is_the_sum_of_each_source_alone(wcs, psf):
 
 
 def test_flags_say_what_happened(wcs, psf):
-    catalog = tools.make_catalog(
+    catalog = scenes.make_catalog(
         wcs,
         [50.0, 20.0, 70.0, 30.0],
         [45.0, 30.0, 60.0, 60.0],
@@ -186,7 +181,7 @@ def test_flags_say_what_happened(wcs, psf):
 
 
 def test_sources_on_the_other_side_of_the_sky_do_no_harm(wcs, psf):
-    catalog = tools.make_catalog(wcs, [50.0, 20.0], [45.0, 30.0])
+    catalog = scenes.make_catalog(wcs, [50.0, 20.0], [45.0, 30.0])
     catalog["sky"] = SkyCoord(
         [catalog["sky"].ra.deg[0], 233.0], [catalog["sky"].dec.deg[0], 27], unit="deg"
     )
@@ -198,9 +193,9 @@ def test_sources_on_the_other_side_of_the_sky_do_no_harm(wcs, psf):
 def test_points_alone_are_those_beside_a_galaxy(wcs, psf):
     # alone they are added one by one, beside a galaxy convolved with it
     x, y = [20.3, 47.9, -1.2, 60.0, 61.5], [31.2, 12.6, 40.4, 60.0, 60.5]
-    points = tools.make_catalog(wcs, x, y)
-    galaxy = tools.make_catalog(wcs, [35.0], [38.0], profile="sersic", radius=0.3, index=1.0)
-    both = tools.make_catalog(
+    points = scenes.make_catalog(wcs, x, y)
+    galaxy = scenes.make_catalog(wcs, [35.0], [38.0], profile="sersic", radius=0.3, index=1.0)
+    both = scenes.make_catalog(
         wcs,
         [*x, 35.0],
         [*y, 38.0],
@@ -208,16 +203,16 @@ def test_points_alone_are_those_beside_a_galaxy(wcs, psf):
         radius=[0.0] * len(x) + [0.3],
         index=1.0,
     )
-    scenes = [Scene(one, filter=FILTER, wcs=wcs, psf=psf) for one in (points, galaxy, both)]
-    alone, extended, together = (scene.render().data for scene in scenes)
+    three = [Scene(one, filter=FILTER, wcs=wcs, psf=psf) for one in (points, galaxy, both)]
+    alone, extended, together = (scene.render().data for scene in three)
     # the grid of the transforms is in single precision
     np.testing.assert_allclose(alone + extended, together, rtol=0, atol=3e-7 * alone.max())
-    flux = [scene.truth["flux_in_image"].value for scene in scenes]
+    flux = [scene.truth["flux_in_image"].value for scene in three]
     np.testing.assert_allclose(np.append(flux[0], flux[1]), flux[2], rtol=1e-12)
 
 
 def test_the_same_on_any_number_of_threads(wcs, psf):
-    catalog = tools.make_catalog(
+    catalog = scenes.make_catalog(
         wcs, [30.0, 60.0], [40.0, 50.0], profile="sersic", radius=0.5, index=4.0, ratio=0.4
     )
 
@@ -233,8 +228,8 @@ def test_the_same_on_any_number_of_threads(wcs, psf):
 
 
 def test_image_says_what_it_is(wcs):
-    psf = tools.gaussian_psf(includes=("pixel", "ipc"), frame="detector")
-    catalog = tools.make_catalog(wcs, 50, 45)
+    psf = scenes.gaussian_psf(includes=("pixel", "ipc"), frame="detector")
+    catalog = scenes.make_catalog(wcs, 50, 45)
     image = Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, background=3 * u.MJy / u.sr).render()
     assert image.unit == u.MJy / u.sr
     assert image.shape == (90, 100)
@@ -246,34 +241,34 @@ def test_image_says_what_it_is(wcs):
 
 
 def test_refuses(wcs, psf):
-    catalog = tools.make_catalog(wcs, 50, 45)
+    catalog = scenes.make_catalog(wcs, 50, 45)
     with pytest.raises(ValueError, match="'catalog' must be a table with the columns"):
         Scene(catalog, filter="miri.f1000w", wcs=wcs, psf=psf)
     with pytest.raises(ValueError, match="'psf' must be a photutils ImagePSF, got ndarray"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=np.ones((3, 3)))
     with pytest.raises(ValueError, match=r"pixels of 0\.0600 arcsec where the WCS has 0\.1100"):
-        Scene(catalog, filter=FILTER, wcs=wcs, psf=tools.gaussian_psf(pixel_scale=0.06 * u.arcsec))
-    turned = tools.gaussian_psf(frame="sky", angle=40.0 * u.deg)
+        Scene(catalog, filter=FILTER, wcs=wcs, psf=scenes.gaussian_psf(pixel_scale=0.06 * u.arcsec))
+    turned = scenes.gaussian_psf(frame="sky", angle=40.0 * u.deg)
     with pytest.raises(ValueError, match=r"turned by 40\.0 deg"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=turned)
-    Scene(catalog, filter=FILTER, wcs=tools.tan_wcs(pa=40.0), psf=turned)
+    Scene(catalog, filter=FILTER, wcs=scenes.tan_wcs(pa=40.0), psf=turned)
     with pytest.raises(ValueError, match="'background' must be a Background or a Quantity"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, background=3.0)
     with pytest.raises(ValueError, match=r"'background' must be at least 0, got -3\.0 MJy"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, background=-3 * u.MJy / u.sr)
-    bare = tools.tan_wcs()
+    bare = scenes.tan_wcs()
     bare.pixel_shape = None
     with pytest.raises(ValueError, match="'wcs' must be a WCS with its pixel_shape"):
         Scene(catalog, filter=FILTER, wcs=bare, psf=psf)
-    other = tools.gaussian_psf(filter="miri.f2100w")
+    other = scenes.gaussian_psf(filter="miri.f2100w")
     with pytest.raises(ValueError, match=r"'psf' must be one of the filter miri\.f770w, got one"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=other)
     for name in (FILTER, "F770W"):
-        Scene(catalog, filter=FILTER, wcs=wcs, psf=tools.gaussian_psf(filter=name))
+        Scene(catalog, filter=FILTER, wcs=wcs, psf=scenes.gaussian_psf(filter=name))
     catalog[FILTER] = [20.0] * u.ABmag
     with pytest.raises(u.UnitsError, match=r"'miri\.f770w' must be convertible to uJy, got mag"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=psf)
-    catalog = tools.make_catalog(wcs, 50, 45)
+    catalog = scenes.make_catalog(wcs, 50, 45)
     with pytest.raises(ValueError, match="'n_threads' must be at least 1 and an integer, got 0"):
         Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, n_threads=0)
     with pytest.raises(
@@ -290,7 +285,7 @@ def test_refuses(wcs, psf):
 def test_plot_draws_on_the_axes_given(wcs, psf):
     from matplotlib.figure import Figure
 
-    catalog = tools.make_catalog(wcs, [50, 70], [45, 20])
+    catalog = scenes.make_catalog(wcs, [50, 70], [45, 20])
     scene = Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, background=1 * u.MJy / u.sr)
     ax = Figure().subplots()
     assert scene.plot(ax, sources=True) is ax

@@ -1,20 +1,4 @@
-import os
-from pathlib import Path
-
 import pytest
-
-
-@pytest.fixture(scope="session")
-def data_file():
-    """Path of a file of the development data, or a skip that names it."""
-
-    def find(name):
-        folder = os.environ.get("MIRICIGALE_DATA")
-        if not folder or not (Path(folder) / name).exists():
-            pytest.skip(f"needs {name} in $MIRICIGALE_DATA")
-        return Path(folder) / name
-
-    return find
 
 
 @pytest.fixture(scope="session")

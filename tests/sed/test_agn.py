@@ -9,6 +9,7 @@ import pytest
 from astropy.io import fits
 from scipy.integrate import quad
 
+from helpers.components import values_of
 from miricigale.refdata.libraries import open_library, write_library
 from miricigale.refdata.libraries.skirtor import read_skirtor
 from miricigale.sed import _core
@@ -17,10 +18,6 @@ from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import conf
 
 LAWS = ("smc", "calzetti", "gaskell")
-
-
-def values_of(component, **changes):
-    return {name: par.default for name, par in component.parameters.items()} | changes
 
 
 @pytest.fixture(scope="module")

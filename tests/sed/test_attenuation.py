@@ -6,6 +6,7 @@ from dust_extinction.parameter_averages import O94
 from dust_extinction.shapes import P92
 from scipy.integrate import quad
 
+from helpers.components import values_of
 from miricigale.filters import FilterSet
 from miricigale.sed import SEDModel, _core
 from miricigale.sed.components import DelayedSFH, DraineLi2007, Madau1995, Nebular
@@ -18,10 +19,6 @@ from miricigale.sed.components.attenuation import (
 from miricigale.sed.components.stellar import BC03
 
 WAVE = np.geomspace(0.01, 1000.0, 1500)
-
-
-def values_of(component, **changes):
-    return {name: par.default for name, par in component.parameters.items()} | changes
 
 
 def magnitudes(component, wave, **changes):

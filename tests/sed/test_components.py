@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+from helpers.components import values_of
 from miricigale.sed import _core
 from miricigale.sed.components import (
     BC03,
@@ -10,11 +11,6 @@ from miricigale.sed.components import (
     DelayedSFH,
 )
 from miricigale.utils.exceptions import DataError
-
-
-def values_of(component, **changes):
-    return {name: par.default for name, par in component.parameters.items()} | changes
-
 
 # ----------------------------------------------------------------------------- stars
 

@@ -9,6 +9,7 @@ from astropy.io import fits
 from astropy.modeling.models import BlackBody
 from scipy.optimize import brentq
 
+from helpers.components import values_of
 from miricigale.filters import FilterSet
 from miricigale.refdata.libraries import write_library
 from miricigale.refdata.libraries.dale2014 import read_dale2014
@@ -26,10 +27,6 @@ from miricigale.utils.files import conf
 
 EVERY = [Casey2012, Dale2014, DraineLi2007, DraineLi2007Alpha]
 ALPHA = np.arange(1, 65) / 16.0
-
-
-def values_of(component, **changes):
-    return {name: par.default for name, par in component.parameters.items()} | changes
 
 
 # ------------------------------------------------------- files like Dale et al.'s

@@ -5,6 +5,7 @@ from astropy.table import MaskedColumn, QTable, Table
 from astropy.tests.helper import assert_quantity_allclose
 from astropy.utils.masked import Masked
 
+from helpers.components import values_of
 from miricigale.filters import Filter, FilterSet
 from miricigale.sed import SED
 from miricigale.sed.foreground import (
@@ -22,10 +23,6 @@ PAPER = (
     + ["mips.24", "miri.f770w", "miri.f1000w", "miri.f1280w", "miri.f1500w", "miri.f1800w"]
     + ["miri.f2100w"]
 )
-
-
-def values_of(component, **changes):
-    return {name: par.default for name, par in component.parameters.items()} | changes
 
 
 # ------------------------------------------------------------------------------------ laws

@@ -3,15 +3,12 @@ import numpy as np
 import pytest
 from astropy.table import MaskedColumn, QTable, Table
 
+from helpers.components import values_of
 from miricigale.sed import SEDModel
 from miricigale.sed.components import ConstantSFH, DelayedSFH, DoubleExponentialSFH, TableSFH
 from miricigale.utils.exceptions import DataError
 
 RATE = u.Msun / u.yr
-
-
-def values_of(component, **changes):
-    return {name: par.default for name, par in component.parameters.items()} | changes
 
 
 def table_of(time, *rates):

@@ -4,15 +4,12 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from helpers.components import values_of
 from miricigale.refdata.libraries.bc03 import read_ised
 from miricigale.sed import _core
 from miricigale.sed.components import BC03, ConstantSFH, DelayedSFH
 
 HC = 6.62607015e-34 * 2.99792458e14  # J um
-
-
-def values_of(component, **changes):
-    return {name: par.default for name, par in component.parameters.items()} | changes
 
 
 @pytest.fixture(scope="module")

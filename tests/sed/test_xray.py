@@ -7,6 +7,7 @@ from astropy.cosmology import FlatLambdaCDM
 from astropy.tests.helper import assert_quantity_allclose
 from scipy.integrate import quad
 
+from helpers.components import values_of
 from miricigale.sed import COSMOLOGY
 from miricigale.sed.component import COMPONENTS
 from miricigale.sed.components import XRay
@@ -15,10 +16,6 @@ from miricigale.sed.xray import band_luminosity, stern2015, xray_flux
 ERG = u.erg / u.s
 CGS = u.erg / u.s / u.cm**2
 FULL, HARD = [0.5, 7] * u.keV, [2, 10] * u.keV
-
-
-def values_of(component, **changes):
-    return {name: par.default for name, par in component.parameters.items()} | changes
 
 
 # ----------------------------------------------------------------------------- Stern 2015

@@ -1,6 +1,5 @@
 """The command `miricigale photometry` on files of a small field whose fluxes are known."""
 
-import os
 import types
 from pathlib import Path
 
@@ -12,6 +11,8 @@ from astropy.io import fits
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.table import QTable, Table
 
+from helpers.light import gaussian_image
+from helpers.mosaics import render
 from miricigale.cli import main
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import ForcedFlags, read_mosaic
@@ -24,25 +25,11 @@ CENTER = SkyCoord(34.3, -5.1, unit="deg")
 COARSE, FINE, WIDE, SHARP = 0.11, 0.06, 0.25, 0.09
 #: A filter without a model PSF, which could not be a Gaussian.
 BAND = "irac.ch4"
-REAL = os.environ.get("MIRICIGALE_DATA")
 
 
-def gaussian(sky, flux, width, wcs, shape):
+def points(sky, flux, width, wcs, shape):
     """Points of ``flux`` (uJy) as Gaussians, uJy in each pixel."""
-    y, x = np.indices(shape)
-    dx, dy = CENTER.spherical_offsets_to(wcs.pixel_to_world(x, y))
-    image = np.zeros(shape)
-    for one, light in zip(sky, flux, strict=True):
-        a, b = CENTER.spherical_offsets_to(one)
-        r2 = (dx - a).to_value(u.arcsec) ** 2 + (dy - b).to_value(u.arcsec) ** 2
-        image += light * np.exp(-0.5 * r2 / width**2) / (2 * np.pi * width**2)
-    return image * pixel_area_map(wcs, shape) / (1 * u.arcsec**2).to_value(u.sr)
-
-
-def psf(width, scale, n, shift=(0.0, 0.0)):
-    x, y = (np.arange(n) - n // 2 - one for one in shift)
-    s = width / scale
-    return np.exp(-0.5 * (x[None] ** 2 + y[:, None] ** 2) / s**2) / (2 * np.pi * s**2)
+    return render(sky, flux, width, wcs, shape) * pixel_area_map(wcs, shape) * 1e12
 
 
 @pytest.fixture(scope="module")
@@ -71,8 +58,8 @@ def files(tmp_path_factory):
     for one, a, b in zip(ids, *prior_wcs.world_to_pixel(sky), strict=True):
         labels[(x - a) ** 2 + (y - b) ** 2 < 64] = one
     noise = 0.005
-    data = gaussian(sky, flux, WIDE, image_wcs, low) + rng.normal(0, noise, low)
-    prior = gaussian(sky, 3 * flux, SHARP, prior_wcs, high) + rng.normal(0, 0.002, high)
+    data = points(sky, flux, WIDE, image_wcs, low) + rng.normal(0, noise, low)
+    prior = points(sky, 3 * flux, SHARP, prior_wcs, high) + rng.normal(0, 0.002, high)
     paths = {
         "image": save("image.fits", data * 100, image_wcs, BUNIT="10*nanoJansky"),
         # 1 / variance up to a factor of 4
@@ -81,9 +68,9 @@ def files(tmp_path_factory):
                         INSTRUME="NIRCAM"),
         "highres-error": save("rms.fits", np.full(high, 2.0)),
         "segmentation": save("seg.fits", labels, prior_wcs),
-        "psf": save("psf.fits", psf(WIDE, COARSE, 41)),
+        "psf": save("psf.fits", gaussian_image(41, WIDE / COARSE)),
         # a cube of PSFs that are off their middle
-        "highres-psf": save("hipsf.fits", [psf(SHARP, FINE, 61, s) for s in [(1.3, -0.6), (0, 0.4)]])
+        "highres-psf": save("hipsf.fits", [gaussian_image(61, SHARP / FINE, *s) for s in [(1.3, -0.6), (0, 0.4)]])
         + "[0,mean]",
     }  # fmt: skip
     return types.SimpleNamespace(
@@ -127,7 +114,9 @@ def test_catalog_kernel_and_the_plain_form(files, tmp_path):
     from miricigale.psf import MatchingKernel
 
     made = MatchingKernel.from_psfs(
-        psf(SHARP, FINE, 61), psf(WIDE, FINE, 61), pixel_scale=FINE * u.arcsec
+        gaussian_image(61, SHARP / FINE),
+        gaussian_image(61, WIDE / FINE),
+        pixel_scale=FINE * u.arcsec,
     )
     kernel = files.save("kernel.fits", made.array)
     made.write(files.folder / "own.fits")
@@ -324,13 +313,11 @@ def test_kernels_that_are_none_are_refused(files):
             read_kernel(path, **options)
 
 
-@pytest.mark.skipif(
-    not REAL or not (Path(REAL) / "uds").is_dir(), reason="needs uds in MIRICIGALE_DATA"
-)
-def test_a_real_field_agrees_with_another_program(tmp_path, capsys):
+def test_a_real_field_agrees_with_another_program(data_file, tmp_path, capsys):
     """PRIMER-UDS, F444W to F770W; the other program's fluxes are no truth."""
-    start = f"{REAL}/uds/uds-test-"
-    psfs = f"{REAL}/uds/psf/uds-test-f444w"
+    uds = data_file("uds")
+    start = f"{uds}/uds-test-"
+    psfs = f"{uds}/psf/uds-test-f444w"
     output = tmp_path / "uds.ecsv"
     command = ["photometry", "--no-progress", "--filter", "miri.f770w", "-o", str(output)]
     for key, path in {
@@ -347,7 +334,7 @@ def test_a_real_field_agrees_with_another_program(tmp_path, capsys):
     with pytest.warns(UserWarning, match="noise on the sky is 2.. times what the weight map says"):
         assert main(command) == 0
     table = QTable.read(output)
-    other = Table.read(f"{REAL}/uds/photometry_ca3cf34.cat", format="ascii")
+    other = Table.read(uds / "photometry_ca3cf34.cat", format="ascii")
     assert list(table["id"]) == list(other["id"])
     ours = table["miri.f770w"].to_value(u.uJy)
     error = table["miri.f770w_err"].to_value(u.uJy)

@@ -1,0 +1,1 @@
+"""What the tests of several rooms share: light in closed form, scenes, mosaics, grids, results."""
