@@ -221,13 +221,14 @@ class Chain:
         histories = [sfh.history(v) for v in values]
         pairs = [stellar.age_weights(h, v) for h, v in zip(histories, values, strict=True)]
         young, old = (np.array([pair[i] for pair in pairs]) for i in (0, 1))
-        young_light, old_light = young @ spectra, old @ spectra
+        # sums row by row: what is kept does not depend on what was asked for with it
+        young_light, old_light = (_core.weighted_sums(w, spectra) for w in (young, old))
         both = young + old
-        visual = spectra[:, self._at[VISUAL]]
-        light = both @ visual
-        age_light = (both * visual) @ age / np.where(light > 0, light, np.nan) * 1e-3
-        age_mass = both @ age / both.sum(axis=1) * 1e-3
-        mass = both @ surviving
+        bright = both * spectra[:, self._at[VISUAL]]
+        light = bright.sum(axis=1)
+        age_light = (bright * age).sum(axis=1) / np.where(light > 0, light, np.nan) * 1e-3
+        age_mass = (both * age).sum(axis=1) / both.sum(axis=1) * 1e-3
+        mass = (both * surviving).sum(axis=1)
         for i, (v, h) in enumerate(zip(values, histories, strict=True)):
             parts = [young_light[i], old_light[i]]
             gas, dusty = [None, None], 0.0

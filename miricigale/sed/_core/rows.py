@@ -7,7 +7,32 @@ import numpy as np
 from miricigale.sed._core.bands import band_means
 from miricigale.utils.compilation import njit
 
-__all__ = ["block_fluxes", "mix_light"]
+__all__ = ["block_fluxes", "mix_light", "weighted_sums"]
+
+_TILE = 256  # wavelengths of all ages that stay in the cache
+
+
+@njit(cache=True)
+def weighted_sums(weights, spectra):
+    """
+    Sums of spectra, shape (n_age, n_wave), with the weights of each row: shape (n, n_wave).
+
+    The digits of a row do not depend on the others, as those of a matrix product do, and ages
+    without weight cost nothing.
+    """
+    n_wave = spectra.shape[1]
+    out = np.zeros((weights.shape[0], n_wave))
+    for first in range(0, n_wave, _TILE):
+        last = min(first + _TILE, n_wave)
+        for i in range(weights.shape[0]):
+            total = out[i, first:last]
+            for a in range(weights.shape[1]):
+                weight = weights[i, a]
+                if weight != 0.0:
+                    part = spectra[a, first:last]
+                    for j in range(last - first):
+                        total[j] += weight * part[j]
+    return out
 
 
 @njit(cache=True)
