@@ -185,7 +185,7 @@ class GridEngine:
     def _scales(self):
         agn = np.zeros((self.agn_scale.shape[0] + 1, max(self.agn.shape[1], 1)))
         agn[:, : self.agn.shape[1]] = np.vstack([self.agn_scale, self.mixed_agn])
-        return _core.Scales(np.vstack([self.galaxy_scale, self.mixed_galaxy]), agn)
+        return _core.make_scales(np.vstack([self.galaxy_scale, self.mixed_galaxy]), agn)
 
     def workspace(self, n_draws=0, joint=()):
         """Make the accumulators and work space of one worker (some tens of MB)."""

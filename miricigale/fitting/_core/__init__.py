@@ -10,12 +10,11 @@ holds the compiled code of those it calls, and does not see when they change: wh
 """
 
 from miricigale.fitting._core.evaluate import sum_up
-from miricigale.fitting._core.histogram import PER_DEX, summarise
+from miricigale.fitting._core.histogram import PER_DEX, make_scales, summarise
 from miricigale.fitting._core.structs import (
     BLOCK,
     Limits,
     Request,
-    Scales,
     Tables,
     Target,
 )
@@ -27,10 +26,10 @@ __all__ = [
     "PER_DEX",
     "Limits",
     "Request",
-    "Scales",
     "Tables",
     "Target",
     "clear",
+    "make_scales",
     "make_sums",
     "make_workspace",
     "sum_up",

@@ -24,6 +24,7 @@ from miricigale.fitting._core.structs import (
     RATIO,
     SHARE_AGN,
     SHARE_GALAXY,
+    Scales,
 )
 from miricigale.utils.compilation import njit
 
@@ -34,6 +35,7 @@ __all__ = [
     "add_alone",
     "add_model",
     "clear_rows",
+    "make_scales",
     "summarise",
     "widest",
 ]
@@ -52,7 +54,8 @@ _LOG10_E2 = 0.86858896380650366  # 2 log10(e)
 _MANTISSA = np.int64(0x000FFFFFFFFFFFFF)
 _HALF_ONE = np.int64(0x3FE0000000000000)
 _ROOT_HALF = 0.70710678118654752
-_NO_SCALE = -1e9
+#: Logarithm of a scale of 0.
+NO_SCALE = -1e9
 # Standard deviations of AGN quantities below this part of the mean total luminosity need not hold
 # their relative accuracy.
 _FAINT = 1e-3
@@ -156,101 +159,75 @@ def clear_rows(table, used):
         used[i, 1] = -1
 
 
-@njit(**KERNEL)
-def _add_scaled(table, used, shift, keep, out):
+@njit(**{**KERNEL, "fastmath": False})
+def _log_quantiles(
+    table, used, log, weight, least, zero, origin, kernel, work, levels, out, quantiles
+):
     """
-    Sum rows of histograms of log y to those of log(scale y), for several scales.
+    Mean logarithms and quantiles of quantities that scale with the same histograms.
 
-    ``shift``, of shape (n_quantities, n), is log10 of the scales in bins, `_NO_SCALE` where a scale
-    is 0; ``keep`` says which of the n rows are not left out. ``out``, of shape (n_quantities,
-    N_BINS + 1), is added to; in the last column the weight of rows whose scale is 0.
+    ``log``, of shape (n_quantities, n), is log10 of their scales in the n rows of the table, `NO_SCALE`
+    where one is 0; rows of less weight than ``least`` are left out. ``zero`` is the weight of models in
+    which all quantities are zero, ``origin`` log10 of the rows' middle bins, ``kernel`` that by which
+    histograms are broadened, ``work`` scratch of shape (2, n_bins + its length). ``out`` and
+    ``quantiles`` are filled; NaN where there is no weight.
     """
-    for q in range(shift.shape[0]):
-        for i in range(shift.shape[1]):
+    reach = kernel.size // 2
+    for q in range(log.shape[0]):
+        hist, wide = work[0, :N_BINS], work[1]
+        hist[:] = 0.0
+        wide[:] = 0.0
+        top = 0.0
+        middle = 0.0
+        for i in range(weight.size):
+            if log[q, i] > NO_SCALE and weight[i] > top:
+                top = weight[i]
+                middle = log[q, i]
+        nothing = zero
+        for i in range(weight.size):
             first, last = used[i, 0], used[i, 1]
-            if not keep[i] or last < 0:
+            if weight[i] <= least or last < 0:
                 continue
-            if shift[q, i] == _NO_SCALE:
+            if log[q, i] <= NO_SCALE:
                 for j in range(first, last + 1):
-                    out[q, N_BINS] += table[i, j]
+                    nothing += table[i, j]
                 continue
-            step = math.floor(shift[q, i])
-            part = shift[q, i] - step
+            offset = (log[q, i] - middle) * PER_DEX
+            step = math.floor(offset)
+            part = offset - step
             step = min(max(np.int64(step), -2 * N_BINS), 2 * N_BINS)
             # what leaves the histogram is counted in its outermost bins
-            low = max(first, -step)
-            high = min(last, N_BINS - 2 - step)
-            for j in range(first, min(low, last + 1)):
-                out[q, 0] += table[i, j]
-            for j in range(max(high + 1, first), last + 1):
-                out[q, N_BINS - 1] += table[i, j]
-            if high < low:
+            for j in range(first, last + 1):
+                column = min(max(j + step, 0), N_BINS - 1)
+                hist[column] += (1.0 - part) * table[i, j]
+                hist[min(max(j + step + 1, 0), N_BINS - 1)] += part * table[i, j]
+        total = 0.0
+        moment = 0.0
+        for j in range(N_BINS):
+            total += hist[j]
+            moment += hist[j] * (j + 0.5)
+        for j in range(N_BINS):
+            if hist[j] > 0.0:
+                for i in range(kernel.size):
+                    wide[j + i] += hist[j] * kernel[i]
+        for j in range(reach):
+            wide[reach] += wide[j]
+            wide[reach + N_BINS - 1] += wide[reach + N_BINS + j]
+        middle += origin
+        out[q] = middle + (moment / total - _HALF) / PER_DEX if total > 0.0 else np.nan
+        below = nothing
+        j = 0
+        for i in range(levels.size):
+            target = levels[i] * (total + nothing)
+            if target <= nothing or total == 0.0:
+                quantiles[q, i] = 0.0 if total + nothing > 0.0 else np.nan
                 continue
-            row = table[i, low : high + 1]
-            left = out[q, low + step : high + step + 1]
-            for j in range(row.size):
-                left[j] += (1.0 - part) * row[j]
-            right = out[q, low + step + 1 : high + step + 2]
-            for j in range(row.size):
-                right[j] += part * row[j]
-
-
-def _scaled(table, used, scale, weight, floor):
-    """
-    Sum rows of histograms of log y to those of log(scale y).
-
-    Rows of no more weight than ``floor`` are left out. Returned are what the log10 of the middle bin
-    is above that of the rows, for each quantity, and the sums, of shape (n_quantities, N_BINS + 1),
-    with the weight of rows whose scale is 0 in the last column.
-    """
-    lit = scale > 0
-    log = _LOG10_E * np.log(scale, where=lit, out=np.zeros(scale.shape))
-    top = np.argmax(np.where(lit, weight, 0.0), axis=1)
-    middle = np.take_along_axis(log, top[:, None], axis=1)
-    shift = np.where(lit, (log - middle) * PER_DEX, _NO_SCALE)
-    out = np.zeros((len(scale), N_BINS + 1))
-    _add_scaled(table, used, shift, weight > floor, out)
-    return middle[:, 0], out
-
-
-def _log_quantiles(hist, middle, zero, sigma, levels):
-    """
-    Mean logarithms and quantiles of quantities from their histograms, of shape (n, N_BINS).
-
-    ``middle`` is log10 of the lower edge of the middle bin, ``zero`` the weight of models in which a
-    quantity is zero: the former are of the others. Histograms are broadened by ``sigma``, the
-    relative error of the scale. NaN where there is no weight.
-    """
-    used = np.flatnonzero(hist.any(axis=0))
-    first, last = (used[0], used[-1]) if used.size else (0, 0)
-    hist = hist[:, first : last + 1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        column = hist @ np.arange(first + 0.5, last + 1) / hist.sum(axis=1)
-    width = min(sigma * _LOG10_E * PER_DEX, 200.0)
-    # what bins of equal density, and sharing between two of them, have added is left out
-    width = math.sqrt(max(width * width - _BINNED, 0.0))
-    if width > 0.15:
-        reach = math.ceil(4.0 * width)
-        kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
-        kernel /= kernel.sum()
-        hist = np.array([np.convolve(row, kernel) for row in hist])
-        # what leaves the histogram is counted in its outermost bins
-        low, high = max(reach - first, 0), max(last + reach + 1 - N_BINS, 0)
-        first, n = max(first - reach, 0), hist.shape[1] - high
-        hist[:, low] += hist[:, :low].sum(axis=1)
-        hist[:, n - 1] += hist[:, n:].sum(axis=1)
-        hist = hist[:, low:n]
-    below = np.cumsum(np.column_stack([zero, hist]), axis=1)
-    quantiles = np.empty((len(hist), levels.size))
-    for q, (row, sums) in enumerate(zip(hist, below, strict=True)):
-        target = levels * sums[-1]
-        j = np.minimum(np.searchsorted(sums[1:], target), row.size - 1)
-        part = np.clip(target - sums[j], 0.0, row[j])
-        part = np.divide(part, row[j], where=row[j] > 0, out=np.full(j.size, 0.5))
-        bins = j + part + (first - _HALF)
-        quantiles[q] = np.where(target > zero[q], 10.0 ** (middle[q] + bins / PER_DEX), 0.0)
-    quantiles[below[:, -1] <= 0.0] = np.nan
-    return middle + (column - _HALF) / PER_DEX, quantiles
+            while j < N_BINS - 1 and below + wide[reach + j] < target:
+                below += wide[reach + j]
+                j += 1
+            now = wide[reach + j]
+            part = min(max((target - below) / now, 0.0), 1.0) if now > 0.0 else 0.5
+            quantiles[q, i] = 10.0 ** (middle + (j - _HALF + part) / PER_DEX)
 
 
 def _share_quantiles(change, levels):
@@ -265,13 +242,25 @@ def _share_quantiles(change, levels):
     return (j + np.divide(part, slope[j], where=slope[j] > 0, out=np.zeros(j.size))) / N_SHARE
 
 
+def make_scales(galaxy, agn):
+    """Bundle derived quantities, as `Scales` has them."""
+    logs = [
+        np.log10(scale, where=scale > 0, out=np.full(scale.shape, NO_SCALE))
+        for scale in (galaxy, agn)
+    ]
+    return Scales(galaxy, agn, np.square(galaxy), np.square(agn), *logs)
+
+
 def _moments(scales, sums):
     """Means and variances of the derived quantities, scales' own variances included."""
     moments = []
-    for power in (1, 2):
-        galaxy = scales.galaxy**power @ sums.galaxy[:, power]
-        agn = scales.agn**power @ sums.agn[:, power]
-        moments.append(np.concatenate([galaxy[:-1], agn[:-1], galaxy[-1:] + agn[-1:]]))
+    for power, galaxy, agn in (
+        (1, scales.galaxy, scales.agn),
+        (2, scales.galaxy_square, scales.agn_square),
+    ):
+        of_galaxy, of_agn = galaxy @ sums.galaxy[:, power], agn @ sums.agn[:, power]
+        of_galaxy[-1] += of_agn[-1]
+        moments.append(np.concatenate([of_galaxy[:-1], of_agn[:-1], of_galaxy[-1:]]))
     first, second = moments
     second[-1] += 2.0 * sums.total[3]
     mean = first / sums.total[0]
@@ -288,8 +277,8 @@ def widest(scales, sums):
     # of what is the same for all models, in numbers too small to square, nothing is asked
     inverse = np.divide(1.0, value, where=value > 1e-290, out=np.zeros(value.size))
     of_galaxy = np.append(inverse[:n], inverse[-1])
-    galaxy = np.max(scales.galaxy**2 * of_galaxy[:, None], axis=0)
-    return galaxy, np.max(scales.agn**2 * inverse[n:, None], axis=0)
+    galaxy = np.max(scales.galaxy_square * of_galaxy[:, None], axis=0)
+    return galaxy, np.max(scales.agn_square * inverse[n:, None], axis=0)
 
 
 def summarise(scales, sums, scale_error, levels, out, quantiles, share, share_quantiles):
@@ -315,24 +304,32 @@ def summarise(scales, sums, scale_error, levels, out, quantiles, share, share_qu
     mean, variance = _moments(scales, sums)
     out[:, 0] = mean
     out[:, 1] = np.sqrt(np.maximum(variance, 0.0))
+    width = min(sigma * _LOG10_E * PER_DEX, 200.0)
+    # what bins of equal density, and sharing between two of them, have added is left out
+    width = math.sqrt(max(width * width - _BINNED, 0.0))
+    kernel = np.ones(1)
+    if width > 0.15:
+        reach = math.ceil(4.0 * width)
+        kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
+        kernel /= kernel.sum()
+    work = np.empty((2, N_BINS + kernel.size))
     n_galaxy, n_agn = len(sums.galaxy), len(sums.agn)
-    groups = (
-        (0, scales.galaxy[:-1], sums.galaxy[:, 0], 1e-6 * total / n_galaxy),
-        (n_galaxy, scales.agn[:-1], sums.agn[:, 0], 0.0),
-        (n_galaxy + n_agn, np.ones((1, 1)), np.array([total]), 0.0),
-    )
-    middle, zero, tables = [], [], []
-    for origin, (first, scale, weight, floor) in zip(hist.origin, groups, strict=True):
-        rows = slice(first, first + weight.size)
-        shift, table = _scaled(hist.table[rows], hist.used[rows], scale, weight, floor)
-        middle.append(origin + shift)
+    mean_log = np.empty(len(out))
+    row = 0
+    for first, log, weight, least, origin in (
+        (0, scales.log_galaxy[:-1], sums.galaxy[:, 0].copy(), 1e-6 * total / n_galaxy, 0),
+        (n_galaxy, scales.log_agn[:-1], sums.agn[:, 0].copy(), 0.0, 1),
+        (n_galaxy + n_agn, np.zeros((1, 1)), np.array([total]), 0.0, 2),
+    ):
+        rows, these = slice(first, first + weight.size), slice(row, row + len(log))
         # models without light, or any without AGN power, or without either
         dark = sums.total[2] if first == 0 else max(total - hist.table[rows].sum(), 0.0)
-        zero.append(dark + table[:, N_BINS])
-        tables.append(table[:, :N_BINS])
-    out[:, 2], quantiles[:] = _log_quantiles(
-        np.concatenate(tables), np.concatenate(middle), np.concatenate(zero), sigma, levels
-    )
+        _log_quantiles(
+            hist.table[rows], hist.used[rows], log, weight, least, dark, hist.origin[origin], kernel,
+            work, levels, mean_log[these], quantiles[these],
+        )  # fmt: skip
+        row += len(log)
+    out[:, 2] = mean_log
     share[0] = sums.total[4] / total
     share[1] = np.sqrt(max(sums.total[5] / total - share[0] ** 2, 0.0))
     share_quantiles[:] = _share_quantiles(hist.share, levels)

@@ -407,16 +407,18 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
 
 
 @njit(**KERNEL)
-def _count(bound, n, reference, count):
-    """Fill the histogram of the bounds of n runs."""
-    for j in range(count.size):
-        count[j] = 0.0
+def _count(bound, n, reference, lowest, count):
+    """Fill the histogram of the bounds of n runs above the lowest, of shape (4, N_LEVELS + 1)."""
+    for m in range(4):
+        for j in range(N_LEVELS + 1):
+            count[m, j] = 0
     for r in range(n):
         row = bound[r]
         for i in range(BLOCK):
-            if row[i] > DONE:
+            if row[i] > lowest:
                 column = (reference - row[i]) * _PER_UNIT
-                count[np.int64(min(max(column, 0.0), N_LEVELS))] += 1.0
+                # neighbors, which are often in the same bin, are counted apart
+                count[i & 3, np.int64(min(max(column, 0.0), N_LEVELS))] += 1
 
 
 def first_floor(bound, n, reference):
@@ -426,9 +428,10 @@ def first_floor(bound, n, reference):
     That is where these pairs are few; where many could be as good as the best (``reference``), none
     has much weight.
     """
-    count = np.empty(N_LEVELS + 1)
-    _count(bound, n, reference, count)
-    total = np.cumsum(count[: int(_FIRST * _PER_UNIT)])
+    count = np.empty((4, N_LEVELS + 1), np.int64)
+    # a bin more than are looked at, for rounding
+    _count(bound, n, reference, np.float32(reference - _FIRST - 1.0), count)
+    total = np.cumsum(count[:, : int(_FIRST * _PER_UNIT)].sum(axis=0))
     many = np.flatnonzero(total > _MOST)
     if many.size == 0:
         return reference - _FIRST, True
@@ -483,8 +486,9 @@ def second_floor(bound, n, reference, room, unit, delta):
     """
     if not room > 0.0:
         return _ALL, _ALL
-    count = np.empty(N_LEVELS + 1)
-    _count(bound, n, reference, count)
+    count = np.empty((4, N_LEVELS + 1), np.int64)
+    _count(bound, n, reference, DONE, count)
+    count = count.sum(axis=0)
     # from the lowest up
     left = np.cumsum((count[:-1] * _DECAY * unit)[::-1])
     last = N_LEVELS - np.searchsorted(left, room, side="right")

@@ -83,8 +83,12 @@ class Tables(NamedTuple):
 class Scales(NamedTuple):
     """Derived quantities of the models, in the last rows the parts of the one that is a sum."""
 
-    galaxy: np.ndarray  # float64 (n_qg + 1, nG), for each Msun formed
+    galaxy: np.ndarray  # float64 (n_qg + 1, nG), for each Msun formed, and
     agn: np.ndarray  # float64 (n_qa + 1, nA), for each W
+    galaxy_square: np.ndarray  # their squares
+    agn_square: np.ndarray
+    log_galaxy: np.ndarray  # their log10; NO_SCALE of 0
+    log_agn: np.ndarray
 
 
 class Request(NamedTuple):
