@@ -10,6 +10,7 @@ from scipy.integrate import quad
 from scipy.special import log_ndtr
 from scipy.stats import norm
 
+from helpers.grids import free_parameters, model_priors, other_fraction
 from miricigale.fitting import BayesFitter, FitFlags, FitResults, fit_file, leave_out, mock_analysis
 from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.samplers.run import best_scale, chi2_at
@@ -51,35 +52,6 @@ def by_hand(table, grid, error=ERROR, floor=FLOOR):
     return flux, np.where(np.isfinite(flux), sigma, np.inf), limit & np.isfinite(flux)
 
 
-def prior_by_hand(fitter):
-    """Weights of galaxies and tori as products over their parameters."""
-    grid = fitter.grid
-    galaxy, agn = np.ones(grid.n_galaxies), np.ones(grid.n_agn)
-    for weights, table in ((galaxy, grid.galaxy_parameters), (agn, grid.agn_parameters)):
-        for name in table.colnames:
-            column = np.asarray(getattr(table[name], "value", table[name]))
-            values = np.unique(grid.axes.get(name, column))
-            prior = PRIORS[name]
-            if isinstance(prior, str):
-                prior = 1.0 / values
-            elif callable(prior):
-                prior = prior(values)
-            prior = np.asarray(prior) / np.sum(prior)
-            # a torus without polar dust stands for all its temperatures
-            hit = column[:, None] == values
-            weights *= np.where(hit.any(axis=1), hit @ prior, 1.0)
-    return galaxy / galaxy.sum(), agn / agn.sum()
-
-
-def other_fraction(grid):
-    """AGN share of the infrared light, shape (nG, nA, nf)."""
-    f = grid.frac_agn
-    power = (f / (1 - f)) * grid.dust_luminosity[:, None, None]
-    agn = power * grid.agn_properties["ir_luminosity"].value[:, None]
-    whole = agn + grid.galaxy_properties["ir_luminosity"].value[:, None, None]
-    return np.divide(agn, whole, out=np.zeros(agn.shape), where=whole > 0)
-
-
 def compare(results, fitter, i, want, sigma, limit, *, rtol=1e-9):
     """Every sum of one object."""
     assert results.chi2[i] == pytest.approx(want["chi2"], rel=rtol, abs=rtol)
@@ -87,10 +59,9 @@ def compare(results, fitter, i, want, sigma, limit, *, rtol=1e-9):
     constant = np.log(sigma[measured]).sum() + 0.5 * measured.sum() * np.log(2 * np.pi)
     assert results.log_evidence[i] == pytest.approx(want["log_sum"] - constant, abs=1e-8)
     np.testing.assert_allclose(results.pdf_2d[i], want["zf"], rtol=rtol, atol=1e-13)
-    for name, axis in fitter.priors.axes.items():
-        if axis.kind in ("galaxy", "agn"):
-            expected = axis.share @ want[axis.kind]
-            np.testing.assert_allclose(results.pdf[name][i], expected, rtol=rtol, atol=1e-13)
+    for name, kind, _, share, _ in free_parameters(fitter.grid, PRIORS):
+        expected = share @ want[kind]
+        np.testing.assert_allclose(results.pdf[name][i], expected, rtol=rtol, atol=1e-13)
     np.testing.assert_allclose(results.moments[i, :, 0], want["mean"], rtol=rtol)
     np.testing.assert_allclose(results.model_flux[i], want["band"], rtol=rtol)
     # variances are the difference of two sums: to rtol and rounding
@@ -134,7 +105,8 @@ def test_all_options_at_once_equal_the_plain_sums(
 ):
     of_grid, options = CASES[case]
     grid = make_grid(3, **of_grid)
-    fitter = BayesFitter(grid, **EVERYTHING, scale_error=options.get("scale_error", True))
+    scale_error = options.get("scale_error", True)
+    fitter = BayesFitter(grid, **EVERYTHING, scale_error=scale_error)
     noise = options.get("noise", 0.15)
     table = draw_photometry(grid, 8, seed=5, noise=noise, missing=0.15)[0]
     table = add_limits(table, grid)
@@ -165,14 +137,16 @@ def test_all_options_at_once_equal_the_plain_sums(
     results = fitter.fit(table, **known)
     np.testing.assert_allclose(results.sigma, sigma, rtol=1e-15)
     np.testing.assert_array_equal(results.limit, limit)
-    galaxy, agn = prior_by_hand(fitter)
+    _, galaxy, agn, _ = model_priors(grid, PRIORS)
     np.testing.assert_allclose(fitter.priors.galaxy / fitter.priors.galaxy.sum(), galaxy)
     np.testing.assert_allclose(fitter.priors.agn / fitter.priors.agn.sum(), agn)
     for i in np.flatnonzero(results.fitted):
-        want = brute_force(fitter, flux[i], sigma[i], log_prior[i], limit[i])
+        want = brute_force(
+            grid, flux[i], sigma[i], log_prior[i], limit[i], priors=PRIORS, scale_error=scale_error
+        )
         compare(results, fitter, i, want, sigma[i], limit[i])
         # the fraction in its second definition, from luminosities
-        share = other_fraction(grid)
+        share = other_fraction(grid)[1]
         weights = want["weights"].sum(axis=0)
         mean = np.sum(weights * share)
         assert results.mean("frac_agn_ir")[i].value == pytest.approx(mean, rel=1e-9)
@@ -254,7 +228,7 @@ def test_percentiles_of_the_other_fraction(make_grid, draw_photometry, brute_for
     galaxy = grid.galaxy_properties["ir_luminosity"].value
     torus = grid.agn_properties["ir_luminosity"].value
     # where there is no AGN its torus is a mean one
-    mean = np.average(torus, weights=fitter.priors.agn)
+    mean = np.average(torus, weights=grid.agn_multiplicity)
     y = np.divide(grid.dust_luminosity, galaxy, out=np.zeros(galaxy.size), where=galaxy > 0)
     y = (ends / (1 - ends)) * y[:, None, None] * torus[:, None]
     share = y / (1 + y)
@@ -263,9 +237,8 @@ def test_percentiles_of_the_other_fraction(make_grid, draw_photometry, brute_for
     high[..., 0] = alone / (1 + alone)
     levels = np.array([0.025, 0.16, 0.5, 0.84, 0.975])
     for i in np.flatnonzero(results.fitted):
-        weights = brute_force(fitter, results.flux[i], results.sigma[i], limit=results.limit[i])[
-            "weights"
-        ].sum(axis=0)
+        want = brute_force(grid, results.flux[i], results.sigma[i], limit=results.limit[i])
+        weights = want["weights"].sum(axis=0)
         got = results.percentile("frac_agn_ir", levels)[i].value
 
         def below(x, weights=weights):

@@ -43,7 +43,7 @@ def results(fitter, photometry):
 def test_mean_and_scatter_against_every_model(fitter, results, brute_force):
     table = fitter.grid.galaxy_shape
     for row in range(3):
-        want = brute_force(fitter, results.flux[row], results.sigma[row])["galaxy"]
+        want = brute_force(fitter.grid, results.flux[row], results.sigma[row])["galaxy"]
         for name in table.colnames:
             value = table[name].value
             w = np.where(np.isfinite(value), want, 0.0) / want[np.isfinite(value)].sum()

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import textwrap
 from concurrent.futures import Executor, Future
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import astropy.units as u
 import numpy as np
@@ -18,24 +18,9 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable
 
+from helpers.results import assert_joined
 from miricigale.fitting import BayesFitter, FitFlags, FitResults, fit_file, open_results
 from miricigale.utils.exceptions import DataError
-
-
-def assert_same(results, whole):
-    """Parts joined are the whole, bit for bit."""
-    parts = list(results.parts())
-    assert sum(map(len, parts)) == len(whole)
-    for item in fields(FitResults):
-        value = getattr(whole, item.name)
-        if isinstance(value, np.ndarray):
-            joined = np.concatenate([getattr(part, item.name) for part in parts])
-            np.testing.assert_array_equal(joined, value, err_msg=item.name, strict=True)
-        elif item.name in ("pdf", "best"):
-            for name, array in value.items():
-                joined = np.concatenate([getattr(part, item.name)[name] for part in parts])
-                np.testing.assert_array_equal(joined, array, err_msg=name, strict=True)
-
 
 MANIFESTS = [".manifest.copy.json", "manifest.json"]
 
@@ -93,7 +78,7 @@ def test_the_pieces_are_one_fit_bit_for_bit(fitter, catalogue, tmp_path, chunk_r
     whole = fitter.fit(catalogue)
     results = fit_file(fitter, tmp_path / "catalogue.fits", tmp_path / "out", chunk_rows=chunk_rows)
     assert len(results.paths) == -(-len(catalogue) // chunk_rows)
-    assert_same(results, whole)
+    assert_joined(results.parts(), whole)
     twice = (whole.flags & FitFlags.DUPLICATE_ID) > 0
     assert np.flatnonzero(twice).tolist() == [i for i in (5, 120, 140) if i < len(catalogue)]
 
@@ -124,7 +109,7 @@ def test_redshifts_go_with_their_rows(fitter, catalogue, tmp_path, how):
         chunk_rows=40,
         **(options_file or options),
     )
-    assert_same(results, whole)
+    assert_joined(results.parts(), whole)
 
 
 def test_text_tables_are_read_by_rows(fitter, catalogue, tmp_path):
@@ -135,7 +120,7 @@ def test_text_tables_are_read_by_rows(fitter, catalogue, tmp_path):
         results = fit_file(
             fitter, tmp_path / "catalogue.ecsv", tmp_path / "out", chunk_rows=40, resume=False
         )
-        assert_same(results, whole)
+        assert_joined(results.parts(), whole)
 
 
 def test_csv_has_the_unit_that_it_is_told(fitter, catalogue, tmp_path):
@@ -173,7 +158,7 @@ def test_a_stopped_fit_goes_on(fitter, catalogue, tmp_path):
     executor = Counting()
     results = fit_file(*arguments, chunk_rows=40, executor=executor)
     assert executor.n_tasks == 2
-    assert_same(results, whole)
+    assert_joined(results.parts(), whole)
     # nothing is left to do
     fit_file(*arguments, chunk_rows=40, executor=executor)
     assert executor.n_tasks == 2
@@ -191,7 +176,8 @@ def test_a_damaged_part_is_made_again(fitter, catalogue, tmp_path):
     two.write_bytes(data)
     (tmp_path / "out" / ".partial-1-part-00003.fits").write_bytes(b"half a part")
     executor = Counting()
-    assert_same(fit_file(*arguments, chunk_rows=40, executor=executor), whole)
+    joined = fit_file(*arguments, chunk_rows=40, executor=executor)
+    assert_joined(joined.parts(), whole)
     assert executor.n_tasks == 2
 
 
@@ -237,7 +223,7 @@ def test_a_killed_fit_goes_on(fitter, catalogue, tmp_path, moment):
     assert any(name.startswith(".partial-") and name.endswith(moment) for name in names)
     assert moment not in names
     assert run().returncode == 0
-    assert_same(open_results(out), FitResults.read(f"{out}.whole.fits"))
+    assert_joined(open_results(out).parts(), FitResults.read(f"{out}.whole.fits"))
     names = sorted(item.name for item in out.iterdir())
     assert names == [*MANIFESTS, "part-00000.fits", "part-00001.fits"]
 
@@ -255,7 +241,7 @@ def test_a_full_disk_is_told_with_the_file_and_left_behind(fitter, catalogue, tm
     with pytest.raises(OSError, match=r"fit\.lock"), full_disk(10):
         fit_file(fitter, path, out, chunk_rows=80)
     results = fit_file(fitter, path, out, chunk_rows=80)
-    assert_same(results, whole)
+    assert_joined(results.parts(), whole)
     with pytest.raises(OSError, match=r"table\.fits'?$"), full_disk(20000):
         results.write_table(tmp_path / "table.fits")
     assert sorted(item.name for item in tmp_path.iterdir()) == ["catalogue.fits", "out"]
@@ -288,7 +274,7 @@ def test_parts_of_another_fit_are_refused(fitter, grid, catalogue, tmp_path):
     refused(r"catalogue\.sha256")
     results = fit_file(fitter, path, out, chunk_rows=150, resume=False)
     assert [item.name for item in sorted(out.iterdir())] == [*MANIFESTS, "part-00000.fits"]
-    assert_same(results, fitter.fit(catalogue))
+    assert_joined(results.parts(), fitter.fit(catalogue))
 
 
 def test_a_call_that_failed_at_once_binds_no_other(fitter, catalogue, tmp_path):
@@ -481,7 +467,7 @@ def test_numbers_as_ids(fitter, catalogue, tmp_path):
         results = fit_file(
             fitter, tmp_path / "catalogue.fits", tmp_path / "out", chunk_rows=40, resume=False
         )
-        assert_same(results, fitter.fit(catalogue))
+        assert_joined(results.parts(), fitter.fit(catalogue))
 
 
 def test_what_cannot_be_read_by_rows_is_refused(fitter, catalogue, tmp_path):

@@ -1,8 +1,11 @@
 """The fitter with real spectra and filters."""
 
+import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import QTable
 
+from helpers.grids import other_fraction
 from miricigale.fitting import BayesFitter, FitResults
 from miricigale.sed import SEDModel
 
@@ -73,12 +76,22 @@ def test_agn_fraction_in_the_other_definition(definition, name, draw_photometry)
     assert np.all(np.abs(samples.mean(name).value - mean) < 4.5 * std / np.sqrt(3000) + 1e-6)
     np.testing.assert_allclose(samples.std(name).value, std, rtol=0.1, atol=1e-3)
     g, k, f = np.moveaxis(samples.index, -1, 0)[1:]
-    each = fitter.backend.fraction.evaluate(g, np.maximum(k, 0), fitter.grid.frac_agn[f])
+    found, fraction = other_fraction(fitter.grid)
+    assert found == name
+    each = fraction[g, np.maximum(k, 0), f]
     np.testing.assert_allclose(samples.values(name).value, each, rtol=1e-12, atol=1e-12)
-    clear = np.flatnonzero(fitter.grid.galaxy_properties["dust_luminosity"].value == 0)
     # without dust there is no power of the AGN, or nothing else than it
-    alone = fitter.backend.fraction.evaluate(clear, 0, 0.6)
+    clear = np.flatnonzero(fitter.grid.galaxy_properties["dust_luminosity"].value == 0)
     assert clear.size == 4
+    flux = 1e10 * fitter.grid.flux(0, clear[0], 0, 2)
+    bright = QTable({"id": [0]})
+    for band, value in zip(fitter.grid.filters, flux, strict=True):
+        bright[band] = [value] * u.uJy
+        bright[f"{band}_err"] = [1e-3 * value] * u.uJy
+    drawn = BayesFitter(fitter.grid, model_error=0.0).sample(bright, 500, seed=4)
+    _, g, _, f = np.moveaxis(drawn.index, -1, 0)
+    alone = drawn.values(name).value[np.isin(g, clear) & (f > 0)]
+    assert alone.size > 50
     np.testing.assert_array_equal(alone, 0.0 if definition == "dust" else 1.0)
     column = results.to_table()[f"{name}_mean"]
     np.testing.assert_array_equal(column.value, mean)
