@@ -156,4 +156,6 @@ class FilterSet:
         from miricigale.plotting.filters import plot_filters
 
         curves = [(f.wave.value, f.throughput / f.throughput.max(), f.name) for f in self.filters]
-        return plot_filters(curves, ax=ax, **kwargs)
+        ax = plot_filters(curves, ax=ax, **kwargs)
+        ax.set_ylabel("throughput over its peak")
+        return ax

@@ -116,7 +116,7 @@ def plot_error_function(flux, sigma, *, limits=None, ax=None, colors=None):
     flux, sigma : dict of str to array-like
         Flux and 1-sigma error in uJy by band.
     limits : dict of str to float, optional
-        5-sigma limit in uJy, marked on the curve.
+        5-sigma limits in uJy of some or all bands, marked on their curves.
     ax : `~matplotlib.axes.Axes`, optional
         Axes to draw on.
     colors : dict, optional
@@ -131,8 +131,9 @@ def plot_error_function(flux, sigma, *, limits=None, ax=None, colors=None):
         # neighbors differ in more than a shade
         style = {"color": (colors or {}).get(name), "ls": ("-", "--")[k % 2]}
         (line,) = ax.loglog(flux[name], sigma[name], lw=1.6, label=name, **style)
-        if limits and np.isfinite(limits[name]):
-            ax.plot(limits[name], limits[name] / 5, "o", color=line.get_color(), ms=5)
+        limit = (limits or {}).get(name, np.nan)
+        if np.isfinite(limit):
+            ax.plot(limit, limit / 5, "o", color=line.get_color(), ms=5)
     ax.set(xlabel="flux (µJy)", ylabel=r"1$\sigma$ error (µJy)")
     ax.legend(fontsize=8, frameon=False)
     return ax
@@ -207,13 +208,12 @@ def plot_histogram(samples, bins, *, ax=None, xlabel=None, title=None, truth=Non
     ax : `~matplotlib.axes.Axes`
     """
     ax = resolve_axes(ax)
-    for (label, values), color in zip(
-        samples.items(), (MEASURED, SECOND, "0.4", "#15803d"), strict=False
-    ):
+    colors = (MEASURED, SECOND, "0.4", "#15803d")
+    for k, (label, values) in enumerate(samples.items()):
         values = np.asarray(values, float)
-        ax.hist(
-            values[np.isfinite(values)], bins, histtype="step", lw=1.6, label=label, color=color
-        )
+        # the fifth has the first color, dashed
+        style = {"color": colors[k % 4], "ls": ("-", "--", ":")[k // 4 % 3], "lw": 1.6}
+        ax.hist(values[np.isfinite(values)], bins, histtype="step", label=label, **style)
     if truth is not None:
         ax.axvline(truth, color=TRUE, lw=1, ls="--", label="truth")
     ax.set(xlabel=xlabel, ylabel="sources", title=title)
@@ -236,7 +236,7 @@ def plot_relation(x, y, *, lines=(), ax=None, labels=("", ""), color=None, log=(
     labels : tuple of str, optional
         Labels of the axes.
     color : array-like, optional
-        Value by which the points are colored.
+        Redshifts, by which the points are colored.
     log : tuple of bool, optional
         Whether each axis is logarithmic.
 

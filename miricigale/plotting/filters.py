@@ -7,7 +7,7 @@ __all__ = ["plot_filters"]
 
 def plot_filters(curves, ax=None, **kwargs):
     """
-    Draw filter curves.
+    Draw filter curves, with a legend if there are several.
 
     Parameters
     ----------
@@ -22,9 +22,11 @@ def plot_filters(curves, ax=None, **kwargs):
     -------
     ax : `~matplotlib.axes.Axes`
     """
-    ax = resolve_axes(ax)
+    ax, curves = resolve_axes(ax), list(curves)
     for wave, throughput, name in curves:
         ax.plot(wave, throughput, **{"label": name, **kwargs})
     ax.set_xlabel("wavelength (µm)")
     ax.set_ylabel("throughput")
+    if len(curves) > 1:
+        ax.legend(fontsize=8, frameon=False)
     return ax

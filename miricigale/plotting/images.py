@@ -5,6 +5,7 @@ import numpy as np
 from miricigale.plotting.axes import new_figure, resolve_axes
 
 __all__ = [
+    "add_colorbar",
     "color_image",
     "mark_sky",
     "plot_color",
@@ -39,6 +40,35 @@ def _extent(shape, pixel_scale, center):
 def _label(ax, title):
     ax.set(xlabel="x (arcsec)", ylabel="y (arcsec)", title=title)
     return ax
+
+
+def add_colorbar(drawn, label):
+    """
+    Draw a color bar beside an image, whose ticks do not run into each other.
+
+    Parameters
+    ----------
+    drawn : `~matplotlib.image.AxesImage`
+        The image on its axes.
+    label : str
+        Label of the bar.
+
+    Returns
+    -------
+    bar : `~matplotlib.colorbar.Colorbar`
+    """
+    from matplotlib.colors import AsinhNorm
+
+    bar = drawn.axes.figure.colorbar(drawn, ax=drawn.axes, label=label, shrink=0.85)
+    if isinstance(drawn.norm, AsinhNorm):
+        # from the bright end, as many as there is room for on the bar
+        ticks = []
+        for tick in drawn.norm.vmax * np.array([1.0, 0.2, 0.03, 0.0]):
+            if not ticks or drawn.norm(ticks[-1]) - drawn.norm(tick) > 0.08:
+                ticks.append(tick)
+        bar.set_ticks(ticks, labels=[f"{float(f'{tick:.2g}'):g}" for tick in ticks])
+        bar.minorticks_off()
+    return bar
 
 
 def plot_image(
@@ -110,17 +140,7 @@ def plot_image(
         extent=_extent(image.shape, pixel_scale, center),
     )
     if colorbar is not None:
-        ticks = None
-        if stretch == "asinh":
-            # from the bright end, as many as there is room for on the bar
-            ticks = []
-            for tick in limits[1] * np.array([1.0, 0.2, 0.03, 0.0]):
-                if not ticks or norm(ticks[-1]) - norm(tick) > 0.08:
-                    ticks.append(tick)
-        bar = ax.figure.colorbar(drawn, ax=ax, label=colorbar, shrink=0.85, ticks=ticks)
-        if ticks is not None:
-            bar.set_ticks(ticks, labels=[f"{tick:.2g}" for tick in ticks])
-            bar.minorticks_off()
+        add_colorbar(drawn, colorbar)
     return _label(ax, title)
 
 

@@ -53,9 +53,7 @@ def plot_pdf(edges, weights, *, ax=None, label=None, truth=None, log=False, **kw
     -------
     ax : `~matplotlib.axes.Axes`
     """
-    import matplotlib.pyplot as plt
-
-    ax = plt.gca() if ax is None else ax
+    ax = resolve_axes(ax)
     unit = getattr(edges, "unit", u.dimensionless_unscaled)
     edges = np.asarray(_value(edges), dtype=float)
     weights = np.asarray(weights, dtype=float)
@@ -107,9 +105,7 @@ def plot_pdf_2d(
     -------
     ax : `~matplotlib.axes.Axes`
     """
-    import matplotlib.pyplot as plt
-
-    ax = plt.gca() if ax is None else ax
+    ax = resolve_axes(ax)
     x, y = np.asarray(x_edges, dtype=float), np.asarray(y_edges, dtype=float)
     weights = np.asarray(weights, dtype=float)
     area = np.diff(x)[:, None] * np.diff(y)
@@ -122,8 +118,8 @@ def plot_pdf_2d(
     # the cell that passes a level belongs to it
     inside[order] = np.concatenate([[0.0], total[:-1]]) / max(total[-1], 1e-300)
     inside = inside.reshape(weights.shape)
-    for level, width in zip(levels, (1.5, 0.8, 0.5, 0.5), strict=False):
-        _outline(ax, x, y, inside < level, linewidth=width)
+    for i, level in enumerate(levels):
+        _outline(ax, x, y, inside < level, linewidth=max(1.5 - 0.7 * i, 0.5))
     for edges, sums, limits in ((x, weights.sum(axis=1), "xlim"), (y, weights.sum(axis=0), "ylim")):
         seen = np.flatnonzero(sums > 1e-4 * sums.sum())
         if seen.size:
@@ -172,7 +168,8 @@ def plot_sed_fit(
     wave : `~astropy.units.Quantity`, shape (n,)
         Wavelengths of the bands.
     flux, flux_err : `~astropy.units.Quantity`, shape (n,)
-        Measured fluxes and errors; NaN where there is none.
+        Measured fluxes and errors; NaN where there is none. A flux that is not positive is drawn
+        as a triangle at two errors.
     model_flux : `~astropy.units.Quantity`, shape (n,)
         Fluxes of the best model.
     used : array_like of bool, shape (n,), optional
@@ -184,7 +181,7 @@ def plot_sed_fit(
     parts : dict of str to pair of `~astropy.units.Quantity`, optional
         Further spectra by label, such as the components of the best model.
     groups : array_like of str, shape (n,), optional
-        Label of each measured band; every label has its own color and marker. With ``parts`` or
+        Label of each measured band; labels differ in color and marker. With ``parts`` or
         ``groups`` there is a legend.
     ax : `~matplotlib.axes.Axes` or pair of them, optional
         Where to draw. One gets no residuals; without, a new figure is made.
@@ -226,6 +223,7 @@ def plot_sed_fit(
         wave, model, "s", color="tab:orange", markersize=7, fillstyle="none", zorder=3,
         label="best model in the bands",
     )  # fmt: skip
+    legend = bool(parts) or groups is not None
     groups = np.full(wave.size, "") if groups is None else np.asarray(groups, str)
     kinds = dict(zip(dict.fromkeys(groups.tolist()), itertools.cycle(_GROUPS)))
     above = have & (flux > 0) & ~limit
@@ -246,7 +244,6 @@ def plot_sed_fit(
             )
     top = np.maximum(flux, 0.0) + 2.0 * err
     if np.any(below):
-        # two sigma above a flux that is not positive
         ax.plot(wave[below], np.maximum(top[below], low), "v", color="tab:blue", zorder=4)
     bound = have & limit
     if np.any(bound):
@@ -257,7 +254,7 @@ def plot_sed_fit(
     ax.set_xlim(0.7 * wave.min(), 1.4 * wave.max())
     ax.set_ylim(low, high)
     ax.set_ylabel("flux density (µJy)")
-    if parts or len(kinds) > 1:
+    if legend:
         ax.legend(fontsize=8, frameon=False)
     if title is not None:
         ax.set_title(title, fontsize="medium")
@@ -328,7 +325,7 @@ def plot_sed_band(wave, bands, *, ax=None, rest=True, color="tab:blue", label=No
     if top > 0:
         ax.set_ylim(1e-5 * top, 3.0 * top)
     ax.set_xlabel(f"{'rest' if rest else 'observed'} wavelength (µm)")
-    ax.set_ylabel("nu L_nu (W)" if rest else "flux density (µJy)")
+    ax.set_ylabel(r"$\nu L_\nu$ (W)" if rest else "flux density (µJy)")
     return ax
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from miricigale.plotting.axes import resolve_axes
+from miricigale.plotting.images import add_colorbar
 
 __all__ = ["plot_scene"]
 
@@ -43,7 +44,7 @@ def plot_scene(image, *, ax=None, marks=None, label="", **kwargs):
     drawn = ax.imshow(image, **{**options, **kwargs})
     ax.set_xlabel("x [pixel]")
     ax.set_ylabel("y [pixel]")
-    ax.figure.colorbar(drawn, ax=ax, label=label, shrink=0.8)
+    add_colorbar(drawn, label)
     if marks is not None:
         ax.plot(*marks, "o", mfc="none", mec="tab:orange", ms=5, mew=0.6)
     return ax

@@ -496,20 +496,3 @@ def test_bands_left_out_have_predictions_but_no_pull_for_limits(grid, catalogue)
     assert not found.limit[:, 2].any()
     assert found.limit[:, 3].any()
     assert np.isfinite(out.pull[~limit & found.fitted & np.isfinite(catalogue["band2"])]).all()
-
-
-def test_plots_show_arrows():
-    from matplotlib.lines import CARETDOWNBASE
-
-    from miricigale.plotting.axes import new_figure
-    from miricigale.plotting.posteriors import plot_sed_fit
-
-    wave = np.array([1.0, 3.0, 9.0]) * u.um
-    flux, err = np.array([3.0, 5.0, -1.0]) * u.uJy, np.array([0.3, 0.5, 0.2]) * u.uJy
-    _, axes = new_figure(2)
-    top, bottom = axes.ravel()[:2]
-    plot_sed_fit(wave, flux, err, flux, limit=[False, True, True], ax=(top, bottom))
-    for ax in (top, bottom):
-        caps = [line for bar in ax.containers for line in bar.lines[1]]
-        arrows = [line for line in caps if line.get_marker() == CARETDOWNBASE]
-        assert [len(line.get_xdata()) for line in arrows] == [2]

@@ -2,6 +2,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
+from matplotlib.figure import Figure
 
 from miricigale.fitting import BayesFitter, FitResults
 from miricigale.fitting.posterior import cell_edges, cell_percentiles, moments
@@ -191,3 +192,18 @@ def test_percentiles_of_a_uniform_distribution():
     mean, std = moments(values, pdf[:1])
     assert mean[0] == pytest.approx(5.0)
     assert std[0] == pytest.approx(np.sqrt(99 / 12))
+
+
+def test_results_draw_what_they_hold(results):
+    for name, label in (("frac_agn", "frac_agn"), ("mass", "mass (solMass)")):
+        ax = Figure().subplots()
+        assert results[2].plot_pdf(name, ax=ax) is ax
+        edges, weights = results[2].distribution(name)
+        density, drawn, _ = ax.patches[0].get_data()
+        np.testing.assert_array_equal(drawn, edges.value)
+        width = np.diff(np.log10(drawn) if name == "mass" else drawn)
+        np.testing.assert_allclose(density * width, weights, atol=1e-12)
+        assert ax.get_xlabel() == label
+    ax = Figure().subplots()
+    assert results[2].plot_pdf2d(ax=ax) is ax
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("redshift", "frac_agn")

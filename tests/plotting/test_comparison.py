@@ -1,0 +1,136 @@
+import numpy as np
+import pytest
+
+from helpers.figures import error_bars, legend_texts, line_data
+from miricigale.plotting.comparison import (
+    plot_counts,
+    plot_error_function,
+    plot_histogram,
+    plot_magnitudes,
+    plot_offsets,
+    plot_redshifts,
+    plot_relation,
+)
+
+
+def labels(ax):
+    return ax.get_xlabel(), ax.get_ylabel()
+
+
+def test_magnitudes_leave_out_what_is_not_measured(ax):
+    true = np.array([20.0, 22.0, 24.0])
+    assert plot_magnitudes(true, [20.1, np.nan, 23.9], ax=ax, lost=[25.0], title="F770W") is ax
+    np.testing.assert_allclose(line_data(ax, ".")[0], [[20, 20.1], [24, 23.9]])
+    (equality,) = (one.get_xydata() for one in ax.lines if one.get_marker() == "None")
+    np.testing.assert_array_equal(equality[:, 0], equality[:, 1])
+    assert line_data(ax, "|")[0][0, 0] == 25.0
+    # bright sources are at the top
+    assert ax.get_ylim()[0] > ax.get_ylim()[1]
+    assert ax.get_title() == "F770W"
+    assert labels(ax) == ("true magnitude (AB)", "measured magnitude (AB)")
+
+
+def test_offsets_beyond_the_limit_are_triangles_at_its_edge(ax):
+    running = [20.5], np.array([0.1]), np.array([0.2])
+    assert plot_offsets([20.0, 21.0, 22.0], [0.1, 3.0, -2.0], running=running, ax=ax) is ax
+    np.testing.assert_allclose(line_data(ax, ".")[0], [[20, 0.1]])
+    np.testing.assert_allclose(line_data(ax, "^")[0], [[21, 0.97]])
+    np.testing.assert_allclose(line_data(ax, "v")[0], [[22, -0.97]])
+    # a single bin is a point
+    np.testing.assert_allclose(line_data(ax, "o")[0], [[20.5, 0.1]])
+    assert ax.get_ylim() == (-1.0, 1.0)
+    assert labels(ax) == ("true magnitude (AB)", "measured - true (mag)")
+
+
+def test_the_running_median_has_a_band_of_its_scatter(ax):
+    middle, median, scatter = [20.0, 21.0, 22.0], np.array([0.1, 0.0, -0.1]), np.full(3, 0.2)
+    plot_offsets(
+        [20.0], [0.0], running=(middle, median, scatter), ax=ax, limit=0.5, labels=("a", "b")
+    )
+    (line,) = (one for one in ax.lines if one.get_label() == "running median, scatter")
+    np.testing.assert_allclose(line.get_xydata(), np.transpose([middle, median]))
+    corners = ax.collections[0].get_paths()[0].vertices
+    for x, m in zip(middle, median, strict=True):
+        y = corners[corners[:, 0] == x, 1]
+        assert (y.min(), y.max()) == pytest.approx((m - 0.2, m + 0.2))
+    assert ax.get_ylim() == (-0.5, 0.5)
+    assert labels(ax) == ("a", "b")
+
+
+def test_error_functions_meet_their_limits_at_five_sigma(ax):
+    flux = {name: np.geomspace(0.1, 10, 5) for name in "abc"}
+    sigma = {"a": np.full(5, 0.2), "b": np.full(5, 0.3), "c": np.full(5, 0.4)}
+    limits = {"a": 1.0, "b": np.nan}
+    assert plot_error_function(flux, sigma, limits=limits, ax=ax, colors={"a": "red"}) is ax
+    curves = [line for line in ax.lines if len(line.get_xdata()) == 5]
+    for line, name in zip(curves, "abc", strict=True):
+        np.testing.assert_array_equal(line.get_xydata(), np.transpose([flux[name], sigma[name]]))
+    assert curves[0].get_color() == "red"
+    np.testing.assert_allclose(line_data(ax, "o"), [[[1.0, 0.2]]])
+    assert legend_texts(ax) == ["a", "b", "c"]
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    assert labels(ax) == ("flux (µJy)", r"1$\sigma$ error (µJy)")
+
+
+def test_outliers_of_redshifts_are_marked(ax):
+    true = np.array([0.5, 1.0, 3.0])
+    assert plot_redshifts(true, true + [0.01, 1.0, -0.1], z_err=[0.1] * 3, ax=ax) is ax
+    np.testing.assert_allclose(line_data(ax, "x")[0], [[1.0, 2.0]])
+    np.testing.assert_allclose(line_data(ax, ".")[0], [[0.5, 0.51], [3.0, 2.9]])
+    _, low, high = error_bars(ax)[0]
+    np.testing.assert_allclose(high - low, 0.2)
+    for sign, curve in zip((1, -1), line_data(ax, "--"), strict=True):
+        np.testing.assert_allclose(curve[:, 1], curve[:, 0] + sign * 0.15 * (1 + curve[:, 0]))
+    # equal steps in log(1 + z)
+    places = ax.transData.transform([(0.0, 0.0), (1.0, 0.0), (3.0, 0.0)])[:, 0]
+    assert places[2] - places[1] == pytest.approx(places[1] - places[0])
+    assert legend_texts(ax) == ["outliers"]
+    assert labels(ax) == ("true redshift", "fitted redshift")
+
+
+def test_histograms_count_what_is_finite(ax):
+    samples = {"one": [0.1, 0.2, np.nan], "two": [0.7]}
+    assert plot_histogram(samples, [0, 0.5, 1], ax=ax, xlabel="dex", truth=0.4) is ax
+    heights = sorted(patch.get_xy()[:, 1].max() for patch in ax.patches)
+    assert heights == [1.0, 2.0]
+    assert line_data(ax, "--")[0][:, 0].tolist() == [0.4, 0.4]
+    assert set(legend_texts(ax)) == {"one", "two", "truth"}
+    assert labels(ax) == ("dex", "sources")
+
+
+def test_every_one_of_many_samples_is_drawn_and_differs(ax):
+    plot_histogram({f"s{i}": [0.1] * (i + 1) for i in range(6)}, [0, 1], ax=ax)
+    assert [patch.get_xy()[:, 1].max() for patch in ax.patches] == [1, 2, 3, 4, 5, 6]
+    assert len({(patch.get_edgecolor(), patch.get_linestyle()) for patch in ax.patches}) == 6
+
+
+def test_points_and_the_relations_over_them(ax):
+    lines = [([1, 2], [5, 6], "law"), ([1, 2], [7, 8], "rule")]
+    assert plot_relation([1, 2], [10, 20], lines=lines, ax=ax, labels=("M", "SFR")) is ax
+    np.testing.assert_allclose(line_data(ax, ".")[0], [[1, 10], [2, 20]])
+    for line, (x, y, label) in zip(ax.lines[1:], lines, strict=True):
+        np.testing.assert_allclose(line.get_xydata(), np.transpose([x, y]))
+        assert line.get_label() == label
+    assert legend_texts(ax) == ["law", "rule"]
+    assert (ax.get_xscale(), ax.get_yscale()) == ("linear", "log")
+    assert labels(ax) == ("M", "SFR")
+
+
+def test_points_may_have_the_color_of_their_redshift(ax):
+    plot_relation([1, 2], [10, 20], color=[0.5, 1.5], ax=ax, log=(True, False))
+    (points,) = ax.collections
+    np.testing.assert_allclose(points.get_offsets(), [[1, 10], [2, 20]])
+    np.testing.assert_allclose(points.get_array(), [0.5, 1.5])
+    assert points.colorbar.ax.get_ylabel() == "redshift"
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "linear")
+    assert ax.get_legend() is None
+
+
+def test_counts_stand_in_the_middle_of_their_bins(ax):
+    assert plot_counts([20, 21, 22], [5.0, 0.0], [1.0, 0.0], ax=ax, title="counts") is ax
+    ((xy, low, high),) = error_bars(ax)
+    np.testing.assert_allclose(xy, [[20.5, 5.0]])
+    np.testing.assert_allclose((low, high), ([4.0], [6.0]))
+    assert ax.get_yscale() == "log"
+    assert labels(ax) == ("magnitude (AB)", r"N (deg$^{-2}$ mag$^{-1}$)")
+    assert ax.get_title() == "counts"
