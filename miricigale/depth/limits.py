@@ -1,7 +1,5 @@
 """How faint a point source an exposure reaches through an aperture: the closed form."""
 
-import inspect
-
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
@@ -83,7 +81,23 @@ def _extraction(radius, annulus, psf, correlation, filter):
     return np.mean(values, axis=0)
 
 
-def sensitivity(filter, time=1e4 * u.s, **options):
+def sensitivity(
+    filter,
+    time=1e4 * u.s,
+    *,
+    n_sigma=10.0,
+    aperture=None,
+    annulus=None,
+    background=None,
+    residual=None,
+    correlation=1.0,
+    n_dithers=1,
+    n_groups=None,
+    readout="FASTR1",
+    subarray="FULL",
+    psf=None,
+    detector=None,
+):
     """
     Flux of the point source that an exposure measures with a given significance.
 
@@ -152,7 +166,7 @@ def sensitivity(filter, time=1e4 * u.s, **options):
     >>> print(f"{sensitivity('miri.f1000w', 1665 * u.s, **short):.2f}")
     0.41 uJy
     """
-    return aperture_noise(filter, time, **options)["flux"] * u.uJy
+    return aperture_noise(**locals())["flux"] * u.uJy
 
 
 def aperture_noise(
@@ -241,9 +255,6 @@ def aperture_noise(
         "pattern": float(sky * np.sqrt(pattern / n_dithers) / electrons),
         "shot": float(growth * shot / electrons),
     }
-
-
-sensitivity.__signature__ = inspect.signature(aperture_noise)
 
 
 def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=10.0, **options):

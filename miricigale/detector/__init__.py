@@ -28,8 +28,10 @@ __getattr__, __dir__, __all__ = lazy_names(
             "Saturation",
         ),
         "latent": ("Latent",),
-        "level1b": ("DQ",),
         "ramp": ("Ramp",),
     },
-    moved={"miricigale.depth": ("SaturationForecast", "forecast_table")},
+    moved={
+        "miricigale.depth": ("SaturationForecast", "forecast_table"),
+        "miricigale.instrument": ("DQ",),
+    },
 )

@@ -17,6 +17,7 @@ from miricigale.photometry.light import FineImage, cutouts
 from miricigale.photometry.priors import check_labels, labels_at
 from miricigale.photometry.shapes import not_fitted
 from miricigale.photometry.sky_noise import warn_of_sky
+from miricigale.photometry.wcs_text import grid_text, text_grid
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import single_threaded, thread_count
@@ -384,13 +385,9 @@ class SourceTemplates:
 
     def __getstate__(self):
         # a WCS pickles through a header, which rounds its numbers
-        from miricigale.photometry.files import grid_text
-
         return {**self.__dict__, "wcs": None if self.wcs is None else grid_text(self.wcs)}
 
     def __setstate__(self, state):
-        from miricigale.photometry.files import text_grid
-
         wcs = None if state["wcs"] is None else text_grid(state["wcs"])
         self.__dict__.update({**state, "wcs": wcs})
 

@@ -18,8 +18,8 @@ from photutils.aperture import CircularAnnulus, CircularAperture, aperture_photo
 from photutils.centroids import centroid_2dg, centroid_sources
 from photutils.psf import ImagePSF, PSFPhotometry
 
-from miricigale.detector import DQ
 from miricigale.instrument import (
+    DQ,
     bad_pixel_mask,
     field_mask,
     flat_field,

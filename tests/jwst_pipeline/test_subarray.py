@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from miricigale.detector import DQ
-from miricigale.instrument import Exposure, flat_field, photmjsr
+from miricigale.instrument import DQ, Exposure, flat_field, photmjsr
 
 pytest.importorskip("jwst", reason="needs the official pipeline: pip install miricigale[jwst]")
 pytestmark = pytest.mark.slow
