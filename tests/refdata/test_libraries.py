@@ -4,6 +4,7 @@ import hashlib
 import json
 import mmap
 import os
+import pkgutil
 import subprocess
 import sys
 import tracemalloc
@@ -581,8 +582,8 @@ def test_names_and_readers_are_checked(folder, monkeypatch):
 
 
 def test_every_reader_has_a_record_of_a_user_library():
-    for name in READERS:
+    for name, reader in READERS.items():
         record = refdata.resource(name)
         assert record.kind == "user"
         assert record.file.endswith(".fits")
-        assert callable(register._reader(name))
+        assert callable(pkgutil.resolve_name(reader) if isinstance(reader, str) else reader)

@@ -144,8 +144,9 @@ def test_a_number_that_the_system_gave_away_again_is_not_the_owner(tmp_path):
 
 
 def test_a_process_of_before_the_last_boot_is_gone(tmp_path):
-    if not lock._identity()["boot"]:
-        pytest.skip("the system tells no boot")
+    with FolderLock(tmp_path):
+        if not content(tmp_path)["boot"]:
+            pytest.skip("the system tells no boot")
     leave(tmp_path, boot="another")
     with FolderLock(tmp_path):
         assert content(tmp_path)["boot"] != "another"
