@@ -208,7 +208,10 @@ def _fill_limits(tables, limits, lane_limit, z, g, k, lane):
 
 def _rescale(sums, lanes, factor):
     """Multiply all weights, when a better model becomes the reference."""
-    for array in (sums.flat, sums.hist.flat, sums.draws.next, lanes.galaxy_z, lanes.agn_z):
+    hist = sums.hist
+    # columns in use; all others are 0
+    table = hist.table[:, hist.used[:, 0].min() : hist.used[:, 1].max() + 1]
+    for array in (sums.flat, table, hist.share, sums.draws.next, lanes.galaxy_z, lanes.agn_z):
         array *= factor
 
 

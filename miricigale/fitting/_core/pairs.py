@@ -53,7 +53,7 @@ KEY_BITS = 20
 #: Bound of a pair that is not listed, or is no more.
 DONE = np.float32(-3e38)
 #: Steps of the histogram of bounds.
-N_LEVELS = 8000
+N_LEVELS = 1024
 
 # Rounding of 64 products of unit vectors in float32, generously.
 _ETA = np.float32(3e-6)
@@ -408,8 +408,8 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
 
 @njit(**KERNEL)
 def _count(bound, n, reference, lowest, count):
-    """Fill the histogram of the bounds of n runs above the lowest, of shape (4, N_LEVELS + 1)."""
-    for m in range(4):
+    """Fill the histogram of the bounds of n runs above the lowest, of shape (2, N_LEVELS + 1)."""
+    for m in range(2):
         for j in range(N_LEVELS + 1):
             count[m, j] = 0
     for r in range(n):
@@ -418,7 +418,7 @@ def _count(bound, n, reference, lowest, count):
             if row[i] > lowest:
                 column = (reference - row[i]) * _PER_UNIT
                 # neighbors, which are often in the same bin, are counted apart
-                count[i & 3, np.int64(min(max(column, 0.0), N_LEVELS))] += 1
+                count[i & 1, np.int64(min(max(column, 0.0), N_LEVELS))] += 1
 
 
 def first_floor(bound, n, reference):
@@ -428,7 +428,7 @@ def first_floor(bound, n, reference):
     That is where these pairs are few; where many could be as good as the best (``reference``), none
     has much weight.
     """
-    count = np.empty((4, N_LEVELS + 1), np.int64)
+    count = np.empty((2, N_LEVELS + 1), np.int64)
     # a bin more than are looked at, for rounding
     _count(bound, n, reference, np.float32(reference - _FIRST - 1.0), count)
     total = np.cumsum(count[:, : int(_FIRST * _PER_UNIT)].sum(axis=0))
@@ -486,7 +486,7 @@ def second_floor(bound, n, reference, room, unit, delta):
     """
     if not room > 0.0:
         return _ALL, _ALL
-    count = np.empty((4, N_LEVELS + 1), np.int64)
+    count = np.empty((2, N_LEVELS + 1), np.int64)
     _count(bound, n, reference, DONE, count)
     count = count.sum(axis=0)
     # from the lowest up
