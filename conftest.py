@@ -10,6 +10,8 @@ import pytest
 
 
 def pytest_configure(config):
+    # figures belong to no window
+    os.environ.setdefault("MPLBACKEND", "agg")
     from miricigale.refdata import conf
 
     config.own_folder = Path(tempfile.mkdtemp(prefix="miricigale-tests-"))

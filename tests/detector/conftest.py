@@ -38,6 +38,16 @@ def make_sky():
 
 
 @pytest.fixture
+def set_block_size(monkeypatch):
+    """Let a detector work on blocks of some number of samples, which changes no count."""
+
+    def set_size(n_samples):
+        monkeypatch.setattr("miricigale.detector.detector._BLOCK_SAMPLES", n_samples)
+
+    return set_size
+
+
+@pytest.fixture
 def make_block(make_exposure):
     """What an effect works on: all rows of an exposure before the first effect."""
 

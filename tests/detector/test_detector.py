@@ -8,7 +8,6 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 
-import miricigale.detector.detector as module
 from miricigale.detector import (
     DQ,
     ADConversion,
@@ -74,7 +73,7 @@ def test_full_chain_returns_the_sky_after_linearization(make_exposure, make_sky,
 
 
 def test_same_seed_same_counts_on_any_threads_and_blocks(
-    make_exposure, make_sky, detector, monkeypatch
+    make_exposure, make_sky, detector, set_block_size
 ):
     exposure = make_exposure(n_groups=5, n_integrations=2, subarray="SUB128")
     detector = Detector.miri_imager(
@@ -84,7 +83,7 @@ def test_same_seed_same_counts_on_any_threads_and_blocks(
     sky = make_sky(exposure, 30.0, includes=())
     one = detector.expose(sky, exposure, seed=5, n_threads=1)
     for samples in (1, 136 * 10 * 7, 10**9):
-        monkeypatch.setattr(module, "_BLOCK_SAMPLES", samples)
+        set_block_size(samples)
         other = detector.expose(sky, exposure, seed=5, n_threads=3)
         np.testing.assert_array_equal(other.data, one.data)
         np.testing.assert_array_equal(other.pixel_dq, one.pixel_dq)

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-import miricigale.detector.detector as module
 from miricigale.detector import (
     DQ,
     ADConversion,
@@ -105,7 +104,7 @@ def test_time_that_passes_is_a_longer_gap(make_exposure, make_sky):
     np.testing.assert_array_equal(later, other)
 
 
-def test_it_does_not_know_blocks_or_threads(make_exposure, make_sky, monkeypatch):
+def test_it_does_not_know_blocks_or_threads(make_exposure, make_sky, set_block_size):
     exposure = make_exposure(n_groups=4, n_integrations=2, subarray="SUB128")
     rates = np.random.default_rng(1).exponential(2e4, exposure.shape)
     latent = Latent(rates * RATE, 3 * u.s, "SUB128")
@@ -114,7 +113,7 @@ def test_it_does_not_know_blocks_or_threads(make_exposure, make_sky, monkeypatch
     options = {"seed": 6, "previous": latent}
     one = detector.expose(sky, exposure, n_threads=1, **options)
     for samples in (1, 136 * 8 * 7):
-        monkeypatch.setattr(module, "_BLOCK_SAMPLES", samples)
+        set_block_size(samples)
         other = detector.expose(sky, exposure, n_threads=2, **options)
         np.testing.assert_array_equal(other.data, one.data)
 

@@ -75,16 +75,14 @@ def test_the_last_frame_feels_the_row_pair_before(make_block):
     assert not change[:, ~sees].any()
 
 
-def test_every_reset_effect_is_the_same_in_any_blocks(make_exposure, make_sky, monkeypatch):
-    import miricigale.detector.detector as module
-
+def test_every_reset_effect_is_the_same_in_any_blocks(make_exposure, make_sky, set_block_size):
     exposure = make_exposure(n_groups=5, n_integrations=2, subarray="SUB128")
     detector = Detector.miri_imager(ResetAnomaly(), FirstFrame(), LastFrame())
     sky = make_sky(exposure, 300.0, includes=())
     one = detector.expose(sky, exposure, seed=5, n_threads=1)
     # an odd number of rows: pairs are cut in two
     for samples in (1, 136 * 10 * 7):
-        monkeypatch.setattr(module, "_BLOCK_SAMPLES", samples)
+        set_block_size(samples)
         other = detector.expose(sky, exposure, seed=5, n_threads=2)
         np.testing.assert_array_equal(other.data, one.data)
 

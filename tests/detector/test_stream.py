@@ -7,7 +7,6 @@ import pytest
 from astropy.io import fits
 from astropy.time import Time
 
-import miricigale.detector.detector as module
 from miricigale.detector import (
     CosmicRays,
     Detector,
@@ -32,7 +31,7 @@ EVERYTHING = (
 )
 
 
-def test_the_file_is_the_same_with_every_effect(make_exposure, make_sky, tmp_path, monkeypatch):
+def test_the_file_is_the_same_with_every_effect(make_exposure, make_sky, tmp_path, set_block_size):
     exposure = make_exposure(n_groups=5, n_integrations=2, subarray="SUB128")
     detector = Detector.miri_imager(*EVERYTHING)
     sky = make_sky(exposure, 300.0, includes=())
@@ -41,7 +40,7 @@ def test_the_file_is_the_same_with_every_effect(make_exposure, make_sky, tmp_pat
     start = Time("2023-01-02T03:04:05")
     held = detector.expose(sky, exposure, **options)
     one = held.write(tmp_path / "a_uncal.fits", start=start)
-    monkeypatch.setattr(module, "_BLOCK_SAMPLES", 136 * 10 * 7)
+    set_block_size(136 * 10 * 7)
     two = detector.expose_to(
         tmp_path / "b_uncal.fits", sky, exposure, start=start, n_threads=3, **options
     )
@@ -62,12 +61,12 @@ def test_the_file_is_the_same_with_every_effect(make_exposure, make_sky, tmp_pat
     assert one.stat().st_size == two.stat().st_size
 
 
-def test_memory_is_that_of_the_blocks(make_exposure, make_sky, tmp_path, monkeypatch):
+def test_memory_is_that_of_the_blocks(make_exposure, make_sky, tmp_path, set_block_size):
     exposure = make_exposure(n_groups=150, subarray="SUB256")
     detector = Detector.miri_imager()
     sky = make_sky(exposure, 5.0)
     detector.expose(sky, exposure.replace(n_groups=2), seed=0)
-    monkeypatch.setattr(module, "_BLOCK_SAMPLES", 2**18)
+    set_block_size(2**18)
     tracemalloc.start()
     try:
         detector.expose_to(tmp_path / "a_uncal.fits", sky, exposure, seed=0, n_threads=2)

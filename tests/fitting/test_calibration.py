@@ -8,8 +8,9 @@ import pytest
 from astropy.table import QTable
 from scipy import stats
 
+from helpers.grids import cells
 from miricigale.fitting import BayesFitter
-from miricigale.fitting.posterior import cell_edges, randomised_ranks
+from miricigale.fitting.posterior import randomised_ranks
 from miricigale.fitting.quantities import DERIVED_LEVELS
 
 N = 3000
@@ -74,10 +75,10 @@ def test_percentiles_of_the_distribution_linear_in_cells(fitted, name):
     grid, results, (z, g, _k, f, _s), rng = fitted
     if name in results.axes:
         axis = results.axes[name]
-        node, edges = {"redshift": z, "frac_agn": f}[name], cell_edges(axis.values, axis.bounds)
+        node, edges = {"redshift": z, "frac_agn": f}[name], cells(axis.values, axis.bounds)
     else:
         values, node = np.unique(grid.galaxy_shape[name].value, return_inverse=True)
-        node, edges = node[g], cell_edges(values, (0, np.inf) if name == "a_v" else (-9, 9))
+        node, edges = node[g], cells(values, (0, np.inf) if name == "a_v" else (-9, 9))
     truth = edges[node] + rng.random(N) * (edges[node + 1] - edges[node])
     percentiles = results.percentile(name, DERIVED_LEVELS).value
     below = np.mean(truth[:, None] < percentiles, axis=0)

@@ -10,9 +10,9 @@ from astropy.table import QTable
 from scipy.integrate import quad
 from scipy.stats import norm
 
+from helpers.grids import cells
 from helpers.results import assert_same
 from miricigale.fitting import BayesFitter, FitFlags, leave_out
-from miricigale.fitting.posterior import cell_edges
 from miricigale.sed import SEDModel
 
 
@@ -250,7 +250,7 @@ def test_a_density_weighs_the_redshifts_by_its_integral_over_their_cells(
     nodes = np.array([0.0, 0.4, 0.9, 2.0, 9.0])
     density = np.array([0.1, 2.0, 0.3, 0.5, 0.0])
     z = grid.redshift
-    edges = cell_edges(z, (0.0, np.inf))
+    edges = cells(z, (0.0, np.inf))
     weights = [
         quad(lambda x: np.interp(x, nodes, density, right=0.0), a, b, points=nodes[1:-1])[0]
         for a, b in itertools.pairwise(edges)

@@ -10,9 +10,8 @@ from scipy.integrate import quad
 from scipy.special import log_ndtr
 from scipy.stats import norm
 
-from helpers.grids import free_parameters, model_priors, other_fraction
+from helpers.grids import cells, free_parameters, model_priors, other_fraction
 from miricigale.fitting import BayesFitter, FitFlags, FitResults, fit_file, leave_out, mock_analysis
-from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.samplers.run import best_scale, chi2_at
 
 ERROR = {"band0": 0.1, "band1": 0.05, "band3": 0.2}
@@ -122,7 +121,7 @@ def test_all_options_at_once_equal_the_plain_sums(
         nodes = np.array([0.0, 0.3, 1.1, 2.0, 4.0])
         density = np.random.default_rng(4).uniform(0.1, 2.0, (8, 5))
         known = {"redshift_prior": (nodes, density)}
-        edges = cell_edges(z, (0.0, np.inf))
+        edges = cells(z, (0.0, np.inf))
         whole = np.trapezoid(density, nodes, axis=1)
         log_prior = [
             np.log(
@@ -223,7 +222,7 @@ def test_percentiles_of_the_other_fraction(make_grid, draw_photometry, brute_for
     fitter = BayesFitter(grid, rtol=0)
     table = add_limits(draw_photometry(grid, 8, seed=7, noise=0.4)[0], grid, part=0.2)
     results = fitter.fit(table)
-    edges = cell_edges(grid.frac_agn, (0.0, 1.0))
+    edges = cells(grid.frac_agn, (0.0, 1.0))
     ends = np.minimum(edges, 1 - 1e-12)
     galaxy = grid.galaxy_properties["ir_luminosity"].value
     torus = grid.agn_properties["ir_luminosity"].value

@@ -324,8 +324,6 @@ def test_what_was_not_asked_for_is_named(fitter, photometry):
 
 
 def test_any_pair_is_drawn(results):
-    mpl = pytest.importorskip("matplotlib")
-    mpl.use("Agg")
     from miricigale.plotting.axes import new_figure
 
     for x, y in [("age", "tau"), ("tau", "age"), ("redshift", "frac_agn"), ("tau97", "redshift")]:

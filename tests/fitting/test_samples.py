@@ -189,9 +189,6 @@ def test_band_of_the_spectrum(real):
 
 
 def test_drawing(real):
-    import matplotlib as mpl
-
-    mpl.use("Agg")
     from miricigale.plotting.axes import new_figure
 
     for rest, label in ((True, "rest wavelength (µm)"), (False, "observed wavelength (µm)")):

@@ -99,9 +99,6 @@ def test_agn_fraction_in_the_other_definition(definition, name, draw_photometry)
 
 
 def test_plot_sed(fitter, draw_photometry):
-    import matplotlib as mpl
-
-    mpl.use("Agg")
     import matplotlib.pyplot as plt
 
     table, _ = draw_photometry(fitter.grid, 1, noise=0.05)

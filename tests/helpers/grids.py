@@ -119,6 +119,13 @@ def plain(column):
     return np.asarray(getattr(column, "value", column), float)
 
 
+def cells(values, bounds):
+    """Edges of cells from half way to half way, the outermost symmetric within the bounds."""
+    middle = (values[1:] + values[:-1]) / 2
+    first, last = 2 * values[0] - middle[0], 2 * values[-1] - middle[-1]
+    return np.array([max(first, bounds[0]), *middle, min(last, bounds[1])])
+
+
 def node_weights(values, prior):
     """Prior of the values of one parameter, which sums to 1; None is flat in them."""
     if prior is None:
@@ -154,10 +161,7 @@ def model_priors(grid, priors=None, prior_f="grid"):
     priors = dict(priors or {})
     f = grid.frac_agn
     if prior_f == "uniform" and f.size > 1:
-        # cells from half way to half way, the outermost symmetric within 0 and 1
-        middle = (f[1:] + f[:-1]) / 2
-        ends = max(2 * f[0] - middle[0], 0.0), min(2 * f[-1] - middle[-1], 1.0)
-        priors.setdefault("frac_agn", np.diff([ends[0], *middle, ends[1]]))
+        priors.setdefault("frac_agn", np.diff(cells(f, (0.0, 1.0))))
     models = {"galaxy": np.ones(grid.n_galaxies), "agn": np.ones(1)}
     if grid.n_agn:
         models["agn"] = np.array(grid.agn_multiplicity, float)
