@@ -7,7 +7,6 @@ __getattr__, __dir__, __all__ = lazy_names(
     {
         "background": ("Background", "estimate_background", "subtract_background"),
         "calibration": ("calibrate", "find_cosmic_rays"),
-        "images": ("DQ",),
         "mosaic": (
             "Mosaic",
             "drizzle_images",

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from astropy.nddata import CCDData, StdDevUncertainty
 
-from miricigale.reduction import DQ, estimate_background, subtract_background
+from miricigale.instrument import DQ
+from miricigale.reduction import estimate_background, subtract_background
 
 SHAPE = (400, 420)
 

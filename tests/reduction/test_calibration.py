@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from astropy.nddata import CCDData, StdDevUncertainty
 
-from miricigale.instrument import field_mask, flat_field, photmjsr, psf_fwhm
+from miricigale.instrument import DQ, field_mask, flat_field, photmjsr, psf_fwhm
 from miricigale.psf import miri_psf
-from miricigale.reduction import DQ, calibrate, calibration, find_cosmic_rays
+from miricigale.reduction import calibrate, calibration, find_cosmic_rays
 from miricigale.reduction.images import image
 
 SHAPE = (1024, 1032)

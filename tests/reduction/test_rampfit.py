@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from miricigale.instrument import miri_detector
-from miricigale.reduction import DQ, fit_groups, reference_drift
+from miricigale.instrument import DQ, miri_detector
+from miricigale.reduction import fit_groups, reference_drift
 
 DT, GAIN, READ, BIAS = 2.775, 4.0, 6.0, 11000.0
 OPTIONS = {"group_time": DT, "gain": GAIN, "read_noise": READ, "bias": BIAS}

@@ -11,6 +11,7 @@ from miricigale.detector import (
     Detector,
 )
 from miricigale.instrument import (
+    DQ,
     DetectorProperties,
     Exposure,
     background_level,
@@ -21,7 +22,7 @@ from miricigale.instrument import (
     photmjsr,
     pixel_area_map,
 )
-from miricigale.reduction import DQ, Reducer, ReductionResult
+from miricigale.reduction import Reducer, ReductionResult
 
 FILTER = "miri.f1000w"
 SKY = background_level(FILTER).value
