@@ -1,4 +1,4 @@
-"""How far a fit can be trusted: mock catalogues fitted again, and bands left out and predicted."""
+"""How far a fit can be trusted: mock catalogs fitted again, and bands left out and predicted."""
 
 from dataclasses import dataclass, field
 
@@ -10,7 +10,7 @@ from astropy.table import QTable
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.flags import FitFlags
 from miricigale.fitting.likelihood import flux_column, limits, read_ids
-from miricigale.fitting.posterior import randomised_ranks
+from miricigale.fitting.posterior import randomized_ranks
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_table, error_column, require_columns
@@ -23,7 +23,7 @@ _LEVELS = (0.16, 0.84)
 
 def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **options):
     """
-    Refit a mock catalogue whose true parameters are known: the best models with noise.
+    Refit a mock catalog whose true parameters are known: the best models with noise.
 
     The best model of every object takes the object's place; its fluxes in the bands that were
     used are perturbed by the measured errors of that object and fitted as the object was
@@ -35,9 +35,9 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
     fitter : `BayesFitter`
         What made the results.
     results : `FitResults`
-        Results of the catalogue.
+        Results of the catalog.
     photometry : `~astropy.table.QTable`
-        The catalogue that was fitted.
+        The catalog that was fitted.
     seed : int, `~numpy.random.Generator` or None
         Every object has its own stream, by its id.
     model_error : bool, optional
@@ -83,16 +83,16 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
 @dataclass(frozen=True, eq=False, repr=False)
 class MockResult:
     """
-    A mock catalogue, fitted.
+    A mock catalog, fitted.
 
     Parameters
     ----------
     truth : `FitResults`
         Results whose best models are the truth.
     recovered : `FitResults`
-        Fit of the mock catalogue.
+        Fit of the mock catalog.
     photometry : `~astropy.table.QTable`
-        The mock catalogue.
+        The mock catalog.
     meta : dict
         Seed and settings.
     """
@@ -125,7 +125,7 @@ class MockResult:
         Returns
         -------
         table : `~astropy.table.QTable`
-            ``id``, ``flags`` of the fit of the mock catalogue and, for every parameter and
+            ``id``, ``flags`` of the fit of the mock catalog and, for every parameter and
             derived quantity, ``<name>_true``, ``_mean``, ``_std``, ``_p16``, ``_p50`` and
             ``_p84``.
         """
@@ -157,7 +157,7 @@ class MockResult:
             ``scatter``, median and 1.48 times the median absolute deviation of posterior mean
             less truth, in ``unit`` (dex for what scales with mass, over the objects where both
             are above 0); ``coverage``, the part of truths within the 16-84 % interval. Of
-            parameters of the grid, whose truth lies on a node, the coverage counts randomised
+            parameters of the grid, whose truth lies on a node, the coverage counts randomized
             ranks.
         """
         names = self.parameters if parameters is None else tuple(parameters)
@@ -200,7 +200,7 @@ class MockResult:
             node = np.argmin(np.abs(true[:, None] - values), axis=1)
             seed = int(self.meta.get("seed", 0))
             draw = [stream(seed, "rank", name, str(i)).random() for i in self.truth.ids[good]]
-            rank = randomised_ranks(self.recovered.pdf[name][good], node, draw)
+            rank = randomized_ranks(self.recovered.pdf[name][good], node, draw)
             return (rank > low) & (rank < high)
         ends = self.recovered.percentile(name, _LEVELS).value[good]
         return (true >= ends[:, 0]) & (true <= ends[:, 1])
@@ -232,7 +232,7 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     fitter : `BayesFitter`
         How to fit, on a grid that has the bands, or a sampler that predicts them (``predict``).
     photometry : `~astropy.table.QTable`
-        The catalogue.
+        The catalog.
     bands : list of str
         Bands to leave out.
     separately : bool, optional

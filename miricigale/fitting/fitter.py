@@ -52,7 +52,7 @@ class BayesFitter:
 
     The model flux of redshift z, galaxy g, AGN template k and AGN fraction f is
     s (G[z, g] + c L_dust[g] A[z, k]) with c = f / (1 - f). The scale s (the stellar mass
-    formed) that minimises chi2 is known in closed form, and weights are
+    formed) that minimizes chi2 is known in closed form, and weights are
     prior * exp(-chi2 / 2) there, as in CIGALE [1]_; the prior on s that this amounts to is flat
     in the signal-to-noise ratio of the model, which is that of a prior flat in log s to within
     the relative variance of s. Fluxes are Gaussian, with ``model_error`` of the flux added to the
@@ -271,7 +271,7 @@ class BayesFitter:
         chunk_size=None,
     ):
         """
-        Fit a catalogue.
+        Fit a catalog.
 
         Parameters
         ----------
@@ -297,7 +297,7 @@ class BayesFitter:
             Of samplers: every object has its own stream, from the seed and its id. The sums over a
             grid have nothing random.
         executor : `concurrent.futures.Executor`, optional
-            Fits pieces of the catalogue at the same time; the answer is the same. Threads work
+            Fits pieces of the catalog at the same time; the answer is the same. Threads work
             well on a grid, whose kernels hold no lock; samplers are Python, for which processes
             serve better.
         progress_bar : bool, optional
@@ -308,7 +308,7 @@ class BayesFitter:
         Returns
         -------
         results : `FitResults`
-            One row for each object, in the order of the catalogue; those that could not be
+            One row for each object, in the order of the catalog; those that could not be
             fitted are flagged.
 
         Warns
@@ -347,7 +347,7 @@ class BayesFitter:
     def _fit_rows(
         self, photometry, options, *, seed=None, chunk_size=None, repeated=None, **parallel
     ):
-        """Fit a catalogue, or a part of one of which earlier parts had the ``repeated`` rows."""
+        """Fit a catalog, or a part of one of which earlier parts had the ``repeated`` rows."""
         if chunk_size is None:
             chunk_size = self.backend.chunk_size
         if not (_is_number(chunk_size, np.integer) and chunk_size >= 1):
@@ -413,7 +413,7 @@ class BayesFitter:
         return filters
 
     def _finish(self, results, data, settings):
-        """Flag what the fits of a catalogue show, and say where the results come from."""
+        """Flag what the fits of a catalog show, and say where the results come from."""
         flags, fitted = np.array(results.flags), results.fitted
         signal = np.where(data.measured, results.best_flux / results.sigma, 0.0)
         with np.errstate(invalid="ignore"):

@@ -6,7 +6,7 @@ __all__ = ["FitFlags"]
 
 
 class FitFlags(Flags):
-    """Flags of a fitted catalogue; `FitFlags.UNFITTED` is the sum of those that prevent a fit."""
+    """Flags of a fitted catalog; `FitFlags.UNFITTED` is the sum of those that prevent a fit."""
 
     NO_BAND = 1
     """No usable band."""

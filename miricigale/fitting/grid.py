@@ -32,10 +32,10 @@ class GridOutput(NamedTuple):
     log_sum: np.ndarray  # (n,): ln of the sum of prior exp(-chi2 / 2)
     n_models: np.ndarray  # (n,): how many models were evaluated
     best_scale: np.ndarray  # (n,): solar masses formed of the best model
-    index: np.ndarray  # int (n, 4): its redshift, galaxy, torus and AGN fraction
+    index: np.ndarray  # int (n, 4): its redshift, galaxy, AGN model and AGN fraction
     zf: np.ndarray  # (n, nz, nf): joint posterior of redshift and AGN fraction
     galaxy: np.ndarray  # (n, nG) and
-    agn: np.ndarray  # (n, nA): posteriors of galaxy models and tori
+    agn: np.ndarray  # (n, nA): posteriors of galaxy models and AGN models
     band: np.ndarray  # (n, 2, nb): posterior mean and standard deviation of model fluxes
     moments: np.ndarray  # (n, n_quantities, 3): mean, standard deviation and mean log10 and
     quantiles: np.ndarray  # (n, n_quantities, n_levels) of derived quantities
@@ -49,7 +49,7 @@ class GridOutput(NamedTuple):
 @dataclass(frozen=True, eq=False, repr=False)
 class GridEngine:
     """
-    Posterior of many objects over a factorised model grid.
+    Posterior of many objects over a factorized model grid.
 
     Parameters
     ----------
@@ -64,11 +64,11 @@ class GridEngine:
     usable : `~numpy.ndarray` of bool, shape (nz, nG)
         Models that may be used.
     prior_galaxy, prior_agn, prior_frac : `~numpy.ndarray`
-        Prior weights of galaxy models, tori and fractions.
+        Prior weights of galaxy models, AGN models and fractions.
     galaxy_scale, agn_scale : `~numpy.ndarray`, shapes (n_qg, nG) and (n_qa, nA)
         Derived quantities for each solar mass formed and for each W.
     mixed_galaxy, mixed_agn : `~numpy.ndarray`, shapes (nG,) and (nA,)
-        Parts of galaxy and torus in one quantity that is the sum of both.
+        Parts of galaxy and AGN model in one quantity that is the sum of both.
     levels : `~numpy.ndarray`
         Ascending levels of the quantiles of derived quantities.
     share_galaxy, share_agn : `~numpy.ndarray`, shapes (nG,) and (nA,), optional
@@ -112,7 +112,7 @@ class GridEngine:
 
     @property
     def n_quantities(self):
-        """Number of derived quantities: the galaxy's, the torus's and the sum of both."""
+        """Number of derived quantities: the galaxy's, the AGN model's and the sum of both."""
         return self.galaxy_scale.shape[0] + self.agn_scale.shape[0] + 1
 
     @property
@@ -226,7 +226,7 @@ class GridEngine:
             Seeds of the draws.
         joint : tuple of str, optional
             Joint posteriors to return as well: ``"zg"``, ``"zk"``, ``"gk"``, ``"fg"``, ``"fk"``
-            with z redshift, g galaxy, k torus, f AGN fraction.
+            with z redshift, g galaxy, k AGN model, f AGN fraction.
         workspace : tuple, optional
             What `workspace` returned for this ``n_draws`` and ``joint``, for use by one thread at
             a time; made if not given.
@@ -284,10 +284,10 @@ class GridEngine:
             if target.norm > 0.0 and _core.sum_up(
                 self._tables, self._scales, self._request, target, limits, *workspace, single=single
             ):
-                self._summarise(target, limits, sums, out, i)
+                self._summarize(target, limits, sums, out, i)
         return out
 
-    def _summarise(self, target, limits, sums, out, i):
+    def _summarize(self, target, limits, sums, out, i):
         """Fill row i of the output."""
         total = sums.total[0]
         z, g, k, f = out.index[i] = sums.index
@@ -309,14 +309,14 @@ class GridEngine:
         # sums in single precision differ by some 1e-8
         out.zf[i] = sums.zf / sums.zf.sum()
         out.galaxy[i] = sums.galaxy[:, 0] / sums.galaxy[:, 0].sum()
-        # without AGN the data say nothing on the torus: its prior
+        # without AGN the data say nothing on the AGN model: its prior
         prior = self._agn_prior
         if prior.size:
             agn = sums.agn[:, 0] + sums.alone.sum() * prior
             out.agn[i] = agn / agn.sum()
         mean, square = sums.band / total
         out.band[i] = mean, np.sqrt(np.maximum(square - mean * mean, 0.0))
-        _core.summarise(
+        _core.summarize(
             self._scales,
             sums,
             float(self.scale_error),
@@ -354,8 +354,8 @@ class GridEngine:
         Returns
         -------
         index : `~numpy.ndarray` of int, shape (n, n_draws, 4)
-            Redshift, galaxy, torus and AGN fraction; -1 for objects that could not be fitted.
-            Where the fraction is 0 the torus is one drawn from the prior.
+            Redshift, galaxy, AGN model and AGN fraction; -1 for objects that could not be fitted.
+            Where the fraction is 0 the AGN model is one drawn from the prior.
         scale : `~numpy.ndarray`, shape (n, n_draws)
             Solar masses formed: with ``scale_error`` drawn from the Gaussian about the model's
             best scale, as far as it is positive.
@@ -373,8 +373,8 @@ class GridEngine:
         prior = self.prior_agn / self.prior_agn.sum() if self.agn.shape[1] else np.ones(1)
         for i in np.flatnonzero(np.isfinite(out.chi2)):
             rng = np.random.default_rng(int(seeds[i]))
-            torus = rng.choice(prior.size, size=n_draws, p=prior)
-            index[i, :, 2] = np.where(index[i, :, 2] < 0, torus, index[i, :, 2])
+            drawn = rng.choice(prior.size, size=n_draws, p=prior)
+            index[i, :, 2] = np.where(index[i, :, 2] < 0, drawn, index[i, :, 2])
             if self.scale_error:
                 error = np.sqrt(out.draw_scale[i, :, 1])
                 low = ndtr(-scale[i] / error)

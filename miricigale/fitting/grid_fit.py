@@ -71,7 +71,7 @@ class GridFit:
     compat: str | None
     prior_f: str
 
-    #: Objects in a piece of the catalogue.
+    #: Objects in a piece of the catalog.
     chunk_size = 64
     #: Weight of the first or last redshift above which an object is flagged.
     edge_weight = 0.01
@@ -185,7 +185,7 @@ class GridFit:
         return check_pairs(pairs, self.priors.axes, self.constants, derived, wanted)
 
     def task(self, pairs, seed, log_prior):
-        """Function that fits a piece of the catalogue; nothing is drawn, and the prior comes with it."""
+        """Function that fits a piece of the catalog; nothing is drawn, and the prior comes with it."""
         del seed, log_prior
         return partial(self._fit_piece, self.check_pairs(pairs))
 
@@ -224,7 +224,7 @@ class GridFit:
                 models = out.galaxy if axis.kind == "galaxy" else out.agn
                 # not a matrix product, whose last digits depend on how many rows there are
                 pdf[name] = np.einsum("ng,vg->nv", models, axis.share)
-        moments, quantiles = self.quantities.summarise(out)
+        moments, quantiles = self.quantities.summarize(out)
         names, units, texts, intensive = self._derived
         if self.fraction is not None:
             share = np.column_stack([out.share, np.full(len(out.share), np.nan)])

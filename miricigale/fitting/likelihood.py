@@ -1,4 +1,4 @@
-"""From a catalogue of photometry to fluxes, errors and flags that a fit can use."""
+"""From a catalog of photometry to fluxes, errors and flags that a fit can use."""
 
 from dataclasses import dataclass
 
@@ -95,7 +95,7 @@ def read_photometry(
     grid_filters : tuple of str, optional
         Order of the bands in the arrays returned, ``filters`` and others, which get no data.
     repeated : `~numpy.ndarray` of bool, shape (n,), optional
-        Rows whose id is known from earlier parts of the catalogue.
+        Rows whose id is known from earlier parts of the catalog.
 
     Returns
     -------
@@ -146,7 +146,7 @@ def read_photometry(
 
 def read_ids(table):
     """
-    Ids of a catalogue: numbers, or text whether it came as such or as bytes.
+    Ids of a catalog: numbers, or text whether it came as such or as bytes.
 
     Raises
     ------
@@ -188,7 +188,7 @@ def read_ids(table):
 
 def unused_bands(table, filters):
     """
-    Names of the bands of a catalogue that are not fitted (``filters``), in the order of the columns.
+    Names of the bands of a catalog that are not fitted (``filters``), in the order of the columns.
 
     A column is a band if it has an error ``<name>_err`` beside it and both are in a unit of flux
     density, or if its name is that of a filter.

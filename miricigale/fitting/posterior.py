@@ -14,11 +14,11 @@ __all__ = [
     "joint_tables",
     "moments",
     "node_cells",
-    "randomised_ranks",
+    "randomized_ranks",
 ]
 
 _ROWS = 256  # searched at once; more would cost digits
-#: Letters of the engine's joint sums: redshift and fraction before galaxy, galaxy before torus.
+#: Letters of the engine's joint sums: redshift and fraction before galaxy, galaxy before AGN model.
 _LETTERS = {"redshift": "z", "frac_agn": "f", "galaxy": "g", "agn": "k"}
 #: The pair that every fit has.
 _ALWAYS = {"redshift", "frac_agn"}
@@ -112,7 +112,7 @@ def _first_not_below(total, target, place):
         place = place + up - (down & ~up)
 
 
-def randomised_ranks(pdf, node, draw):
+def randomized_ranks(pdf, node, draw):
     """
     Ranks of true values that lie on nodes, shape (m,), uniform if the posteriors are right.
 

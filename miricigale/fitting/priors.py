@@ -56,7 +56,7 @@ class GridAxis:
 
 @dataclass(frozen=True, eq=False)
 class GridPriors:
-    """Axes with priors, and the prior weights of galaxies, tori, fractions and redshifts."""
+    """Axes with priors, and the prior weights of galaxies, AGN models, fractions and redshifts."""
 
     axes: dict
     galaxy: np.ndarray
@@ -199,7 +199,7 @@ def _inert(grid):
 
 def known_redshifts(photometry, redshift):
     """
-    Redshifts of a catalogue: a column by its name, one value, or one for each object.
+    Redshifts of a catalog: a column by its name, one value, or one for each object.
 
     NaN where one is missing, masked, not finite or not positive. A `ValueError` tells a column that
     is not there, or another shape.

@@ -65,7 +65,7 @@ class ShapeQuantities:
     """
     What is derived from a galaxy model and does not scale with its mass.
 
-    Attenuation, ages, colours: one value for each galaxy model, so that their posterior
+    Attenuation, ages, colors: one value for each galaxy model, so that their posterior
     follows from the marginal weights of the galaxy models.
 
     Parameters
@@ -123,7 +123,7 @@ class ShapeQuantities:
         """Limits that the outermost cells do not pass."""
         return (0.0 if name in _NOT_NEGATIVE else -np.inf, np.inf)
 
-    def summarise(self, weights, levels):
+    def summarize(self, weights, levels):
         """
         Moments, shape (n, n_quantities, 3), and quantiles, from posterior weights of galaxies (n, nG).
 
@@ -137,7 +137,7 @@ class ShapeQuantities:
         for i, (order, start, nodes) in enumerate(self._nodes):
             if nodes.size == 0:
                 continue
-            # sums along rows in memory, so that pieces of a catalogue give the same digits
+            # sums along rows in memory, so that pieces of a catalog give the same digits
             part = np.take(weights, order, axis=1)
             total = part.sum(axis=1, keepdims=True)
             # an object may have all its weight on models without a value
@@ -237,9 +237,9 @@ class Quantities:
             shape,
         )
 
-    def summarise(self, out):
+    def summarize(self, out):
         """Moments and quantiles of all quantities, from what the grid engine found for n objects."""
-        moments, quantiles = self.shape.summarise(out.galaxy, DERIVED_LEVELS)
+        moments, quantiles = self.shape.summarize(out.galaxy, DERIVED_LEVELS)
         return (
             np.concatenate([out.moments, moments], axis=1),
             np.concatenate([out.quantiles, quantiles], axis=1),
@@ -318,7 +318,7 @@ class OtherFraction:
         return cls(name, FRACTIONS[name], ratio, agn)
 
     def evaluate(self, g, k, frac):
-        """Values for models of galaxies g and tori k at fractions of the grid."""
+        """Values for models of galaxies g and AGN models k at fractions of the grid."""
         y = frac / (1.0 - frac) * self.galaxy[g] * self.agn[k]
         return y / (1.0 + y)
 
@@ -346,7 +346,7 @@ def check_draws(grid, ids, flags, index, scale):
     if np.any(drawn < lowest) or np.any(drawn >= np.array(sizes)):
         raise argument_error("index", f"within the grid's {sizes}", "others")
     if np.any((drawn[:, 2] < 0) & (grid.frac_agn[drawn[:, 3]] > 0)):
-        raise argument_error("index", "with a torus where the AGN fraction is above 0", "none")
+        raise argument_error("index", "with an AGN model where the AGN fraction is above 0", "none")
 
 
 class ModelValues:

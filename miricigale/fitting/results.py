@@ -1,4 +1,4 @@
-"""What a fit returns: posteriors of the objects of a catalogue."""
+"""What a fit returns: posteriors of the objects of a catalog."""
 
 import html
 from dataclasses import dataclass, field, replace
@@ -33,7 +33,7 @@ _PARTS = {
 @dataclass(frozen=True, eq=False, repr=False)
 class FitResults(ObjectRows):
     """
-    Posteriors of the objects of a catalogue, in its order.
+    Posteriors of the objects of a catalog, in its order.
 
     Made by `BayesFitter.fit`; every array is read-only, and NaN for objects that could not be
     fitted. ``results[id]`` and ``results[rows]`` are of this class too: of a single object the arrays
@@ -92,7 +92,7 @@ class FitResults(ObjectRows):
     draws : `~numpy.ndarray`, shape (n, n_draws, n_parameters), optional
         Of a sampler: draws of equal weight of all `parameters`; see `samples`.
     intensive : tuple of str, optional
-        Those of ``quantities`` that do not scale with mass: attenuation, ages, colours, the AGN
+        Those of ``quantities`` that do not scale with mass: attenuation, ages, colors, the AGN
         fraction in its other definition. They have no mean of log10.
     fitted_filters : tuple of str, optional
         The bands that were fitted; all of ``filters`` by default.

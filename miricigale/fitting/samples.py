@@ -26,7 +26,7 @@ _LEVELS = (0.16, 0.5, 0.84)
 @dataclass(frozen=True, eq=False, repr=False)
 class Samples(ObjectRows):
     """
-    Models drawn from the posteriors of the objects of a catalogue.
+    Models drawn from the posteriors of the objects of a catalog.
 
     All draws of an object have the same weight. What a model is comes from the grid, so that
     only four indices and a scale are kept for each. ``samples[id]`` and ``samples[rows]`` are of
@@ -41,8 +41,8 @@ class Samples(ObjectRows):
     flags : array_like of int, shape (n,)
         `FitFlags`.
     index : array_like of int, shape (n, n_draws, 4)
-        Redshift, galaxy, torus and AGN fraction of every draw, as indices of the grid; -1 for
-        objects that could not be fitted. Where the fraction is 0 the torus may be -1: none.
+        Redshift, galaxy, AGN model and AGN fraction of every draw, as indices of the grid; -1 for
+        objects that could not be fitted. Where the fraction is 0 the AGN model may be -1: none.
     scale : array_like, shape (n, n_draws)
         Solar masses formed.
     model : `~miricigale.sed.SEDModel`, optional
@@ -395,7 +395,7 @@ class Samples(ObjectRows):
 
     def spectra(self, key, *, rest=True):
         """
-        Spectra of the draws of one object; different galaxies and tori are evaluated once.
+        Spectra of the draws of one object; different galaxies and AGN models are evaluated once.
 
         Parameters
         ----------

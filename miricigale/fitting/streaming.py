@@ -1,4 +1,4 @@
-"""Fits of catalogues larger than memory: from file to file, in pieces that a later call goes on from."""
+"""Fits of catalogs larger than memory: from file to file, in pieces that a later call goes on from."""
 
 import functools
 import importlib.metadata
@@ -61,9 +61,9 @@ def fit_file(
     resume=True,
 ):
     """
-    Fit a catalogue on disk and write the results to disk, a piece at a time.
+    Fit a catalog on disk and write the results to disk, a piece at a time.
 
-    The results are those of `BayesFitter.fit` for the whole catalogue, number for number; only
+    The results are those of `BayesFitter.fit` for the whole catalog, number for number; only
     one piece is in memory. They lie in a folder: ``part-00000.fits`` and so on, each a file that
     `FitResults.read` reads, and ``manifest.json``, which says of what fit they are. A call that
     was stopped goes on with the same arguments and fits what is missing.
@@ -74,7 +74,7 @@ def fit_file(
         The fitter. (Of a sampler, the cells of a redshift axis that is not the same for all objects
         are those of each part.)
     path_in : path-like
-        The catalogue: FITS with a binary table, ECSV, or CSV with a line of names (``.csv``),
+        The catalog: FITS with a binary table, ECSV, or CSV with a line of names (``.csv``),
         with columns as `BayesFitter.fit` wants them.
     path_out : path-like
         The folder; made if it is not there.
@@ -82,10 +82,10 @@ def fit_file(
         Rows of a piece and so of a part file. 10000 objects of a grid of 65 redshifts and 11 AGN
         fractions take some 100 MB of results.
     redshift : str or array_like, optional
-        As for `BayesFitter.fit`: a column, or values for all rows of the catalogue.
+        As for `BayesFitter.fit`: a column, or values for all rows of the catalog.
     redshift_prior : tuple, optional
         As for `BayesFitter.fit`: redshifts and densities, of which there may be one row for each
-        row of the catalogue, or the name of a column that holds them.
+        row of the catalog, or the name of a column that holds them.
     pairs : list of tuple of str, optional
         As for `BayesFitter.fit`: pairs of parameters of which joint posteriors are kept too.
     seed : int, optional
@@ -100,7 +100,7 @@ def fit_file(
         Whether to show one.
     resume : bool, optional
         Whether to keep the parts that are there. Parts of another fit (other settings, grid,
-        catalogue or ``chunk_rows``) are refused. False replaces what an earlier call wrote.
+        catalog or ``chunk_rows``) are refused. False replaces what an earlier call wrote.
 
     Returns
     -------
@@ -115,7 +115,7 @@ def fit_file(
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
-        If the catalogue cannot be read by rows, the folder holds something else, or another
+        If the catalog cannot be read by rows, the folder holds something else, or another
         process fits into it: then the message says which file to remove if that is gone.
     `~miricigale.utils.exceptions.OtherResultsError`
         If the folder holds parts of another fit.
@@ -214,7 +214,7 @@ def _keys(ids):
 
 
 class _Inputs:
-    """The pieces of a catalogue, and of what was given beside it."""
+    """The pieces of a catalog, and of what was given beside it."""
 
     def __init__(self, rows, options, unit, fluxes):
         self.rows, self.unit, self.fluxes = rows, unit, fluxes
@@ -393,7 +393,7 @@ class FitResultsFiles:
     Results of a fit in files, of which one part at a time is in memory.
 
     Made by `fit_file` and `open_results`. It has as many elements as objects, in the order of
-    the catalogue: iterating gives the `FitResults` of each object, ``[id]`` those of an id.
+    the catalog: iterating gives the `FitResults` of each object, ``[id]`` those of an id.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Frozen classes that hold a row for each object of a catalogue: slices, rows by id, joins."""
+"""Frozen classes that hold a row for each object of a catalog: slices, rows by id, joins."""
 
 from dataclasses import fields
 from functools import cached_property
@@ -24,7 +24,7 @@ def _frozen(array, copy):
 
 class ObjectRows:
     """
-    Base of frozen dataclasses with a row for each object of a catalogue, and its ``ids``.
+    Base of frozen dataclasses with a row for each object of a catalog, and its ``ids``.
 
     Fields of the types `PerObject` and `PerObjectDict` are read-only arrays, dicts of such, or None.
     Indexing gives the same class:

@@ -10,7 +10,7 @@ from scipy import stats
 
 from helpers.grids import cells
 from miricigale.fitting import BayesFitter
-from miricigale.fitting.posterior import randomised_ranks
+from miricigale.fitting.posterior import randomized_ranks
 from miricigale.fitting.quantities import DERIVED_LEVELS
 
 N = 3000
@@ -63,10 +63,10 @@ def _check(rank, name):
     assert abs(cover - 0.68) < 0.03, (name, cover)
 
 
-def test_randomised_ranks_of_nodes(fitted):
+def test_randomized_ranks_of_nodes(fitted):
     _grid, results, (z, _g, _k, f, _s), rng = fitted
     for name, node in (("redshift", z), ("frac_agn", f)):
-        _check(randomised_ranks(results.pdf[name], node, rng.random(N)), name)
+        _check(randomized_ranks(results.pdf[name], node, rng.random(N)), name)
 
 
 @pytest.mark.parametrize("name", ["redshift", "frac_agn", "a_v", "u_v"])

@@ -80,7 +80,7 @@ def test_uniform_weights_give_straight_quantiles():
     shape = ShapeQuantities(("v",), (u.mag,), ("",), np.concatenate([values, values + 1e-12])[None])
     weights = np.full((300, 40), 1 / 40)
     weights[7] = np.nan
-    moments, quantiles = shape.summarise(weights, DERIVED_LEVELS)
+    moments, quantiles = shape.summarize(weights, DERIVED_LEVELS)
     np.testing.assert_allclose(quantiles[0, 0], 20 * DERIVED_LEVELS, atol=1e-9)
     np.testing.assert_allclose(quantiles[299, 0], quantiles[0, 0], rtol=1e-12)
     assert moments[0, 0, 0] == pytest.approx(10)
@@ -104,7 +104,7 @@ def test_the_place_in_a_catalogue_makes_no_difference():
 def test_objects_without_a_value():
     """All weight on models without a colour: no value, and no warning."""
     shape = ShapeQuantities(("c", "d"), (u.mag,) * 2, ("",) * 2, np.array([[np.nan, 1.0]] * 2))
-    moments, quantiles = shape.summarise(np.array([[1.0, 0.0], [0.5, 0.5]]), np.array([0.5]))
+    moments, quantiles = shape.summarize(np.array([[1.0, 0.0], [0.5, 0.5]]), np.array([0.5]))
     assert np.isnan(moments[0]).all()
     np.testing.assert_array_equal(moments[1, :, 0], 1.0)
     np.testing.assert_array_equal(quantiles[:, 0, 0], [np.nan, 1.0])

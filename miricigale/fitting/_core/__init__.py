@@ -1,16 +1,16 @@
 """
 Kernels of the grid fit: arrays in, arrays out.
 
-`sum_up` (`evaluate`) does one object. The pairs of galaxy and torus that can matter are listed by
+`sum_up` (`evaluate`) does one object. The pairs of galaxy and AGN model that can matter are listed by
 their bounds (`pairs`), evaluated side by side (`lanes`, `single` in single precision, `limits` with
-upper limits) and summed up (`sums`, `histogram`); `summarise` turns the sums into moments and
+upper limits) and summed up (`sums`, `histogram`); `summarize` turns the sums into moments and
 quantiles. `structs` says what the kernels take, `workspace` makes it. numba's cache of a function
 holds the compiled code of those it calls, and does not see when they change: who edits one empties
 ``__pycache__``.
 """
 
 from miricigale.fitting._core.evaluate import sum_up
-from miricigale.fitting._core.histogram import PER_DEX, make_scales, summarise
+from miricigale.fitting._core.histogram import PER_DEX, make_scales, summarize
 from miricigale.fitting._core.structs import (
     BLOCK,
     Limits,
@@ -33,5 +33,5 @@ __all__ = [
     "make_sums",
     "make_workspace",
     "sum_up",
-    "summarise",
+    "summarize",
 ]

@@ -1,7 +1,7 @@
 """
 The posterior of one object: the search for the models that matter, and their exact evaluation.
 
-Pairs come in runs: a torus with galaxies of one block. A run of many is evaluated as a block, so
+Pairs come in runs: an AGN model with galaxies of one block. A run of many is evaluated as a block, so
 that everything stands side by side in memory; those of short runs are gathered. Sums over one
 redshift are kept apart, and model fluxes are summed up when a redshift is finished.
 """
@@ -197,7 +197,7 @@ def _drop(tables, pairs, lanes, r, z, block, n_run, rest, sure):
 
 @njit(**PART)
 def _fill_limits(tables, limits, lane_limit, z, g, k, lane):
-    """Fill a lane with the fluxes of galaxy and torus (for c = 1) in bands with limits."""
+    """Fill a lane with the fluxes of galaxy and AGN model (for c = 1) in bands with limits."""
     n = limits.bands.size
     for m in range(n):
         band = limits.bands[m]

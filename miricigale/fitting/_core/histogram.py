@@ -36,7 +36,7 @@ __all__ = [
     "add_model",
     "clear_rows",
     "make_scales",
-    "summarise",
+    "summarize",
     "widest",
 ]
 
@@ -46,7 +46,7 @@ N_BINS = 2048
 N_SHARE = 4096
 
 _HALF = N_BINS // 2
-# Variance in bins: 1/12 of a bin, and 1/6 of the sharing between neighbours.
+# Variance in bins: 1/12 of a bin, and 1/6 of the sharing between neighbors.
 _BINNED = 0.25
 _LOG10_E = 0.43429448190325183
 _LOG10_2 = 0.30102999566398120
@@ -136,7 +136,7 @@ def add_model(tables, hist, g, k, j, s, t):
 @njit(**PART)
 def add_alone(tables, hist, g, s, t):
     """Add a model without AGN."""
-    # what is spread over the cell of f = 0 need not be as many pieces as there are tori
+    # what is spread over the cell of f = 0 need not be as many pieces as there are AGN models
     y = tables.edge_zero * tables.share_mean * tables.of_galaxy[SHARE_GALAXY, g]
     _add_share(hist.share, 0.0, y / (1.0 + y), t)
     if s > 0.0:
@@ -268,7 +268,7 @@ def _moments(scales, sums):
 
 
 def widest(scales, sums):
-    """Squares of quantities over their variance so far, the largest of each galaxy and torus."""
+    """Squares of quantities over their variance so far, the largest of each galaxy and AGN model."""
     mean, variance = _moments(scales, sums)
     n = len(scales.galaxy) - 1
     part = 1e-6 * mean
@@ -281,7 +281,7 @@ def widest(scales, sums):
     return galaxy, np.max(scales.agn_square * inverse[n:, None], axis=0)
 
 
-def summarise(scales, sums, scale_error, levels, out, quantiles, share, share_quantiles):
+def summarize(scales, sums, scale_error, levels, out, quantiles, share, share_quantiles):
     """
     Moments and quantiles of all derived quantities of one object.
 
@@ -295,7 +295,7 @@ def summarise(scales, sums, scale_error, levels, out, quantiles, share, share_qu
         Of the quantiles, ascending.
     out, quantiles : `~numpy.ndarray`, shapes (n_quantities, 3) and (n_quantities, n_levels)
         Filled: mean, standard deviation and mean of log10; quantiles. The order is the galaxy's
-        quantities, the torus's, then the one of both.
+        quantities, the AGN model's, then the one of both.
     share, share_quantiles : `~numpy.ndarray`, shapes (2,) and (n_levels,)
         Filled: mean and standard deviation, and quantiles of the other fraction.
     """

@@ -1,7 +1,7 @@
 """
-Pairs of galaxy and torus side by side, in double precision, at every AGN fraction.
+Pairs of galaxy and AGN model side by side, in double precision, at every AGN fraction.
 
-For a galaxy with p = <G, wF>, q = <G, wG> and a torus with a = <A, wF>, b = <A, wA>,
+For a galaxy with p = <G, wF>, q = <G, wG> and an AGN model with a = <A, wF>, b = <A, wA>,
 X = <G, wA>, the model s (G + x A) with x = c L_dust has the best scale
 s = (p + x a) / (q + 2 x X + x^2 b) and |F|^2_w - chi2 = R = (p + x a) s. Where p + x a is
 negative the best scale that is not negative is 0 and R = 0.
@@ -125,7 +125,7 @@ def galaxy_products(tables, target, z, block, pq):
 @njit(**PART)
 def best_mixture(p, q, t, a, b, low, high):
     """
-    Best R of a galaxy with a torus, x = c L_dust anything from low to high.
+    Best R of a galaxy with an AGN model, x = c L_dust anything from low to high.
 
     With p = <G, wF>, q = <G, wG>, t = <G, wA>, a = <A, wF>, b = <A, wA>.
     """
@@ -139,7 +139,7 @@ def best_mixture(p, q, t, a, b, low, high):
 
 @njit(**PART)
 def run_products(tables, bands, pairs, lanes, z, block, k, n_run):
-    """Fill ``lanes.cross`` with <G, wA> and the best R of the galaxies of a run with its torus."""
+    """Fill ``lanes.cross`` with <G, wA> and the best R of the galaxies of a run with its AGN model."""
     cross, pq, run, weighted = lanes.cross, lanes.pq, lanes.run, pairs.agn_weighted
     a, b = pairs.agn_pq[k, 0], pairs.agn_pq[k, 1]
     low, high = tables.of_frac[RATIO, 0], tables.of_frac[RATIO, -1]
@@ -193,7 +193,7 @@ def fill_dead(buffer, index, start):
 
 @njit(**PART)
 def fill_block(tables, pairs, lanes, block, k, n_run, log_torus):
-    """Fill the lanes with a block of galaxies and one torus; those not in the run are dead."""
+    """Fill the lanes with a block of galaxies and one AGN model; those not in the run are dead."""
     buffer, index, run, pq, of_galaxy = (
         lanes.buffer, lanes.index, lanes.run, lanes.pq, tables.of_galaxy,
     )  # fmt: skip

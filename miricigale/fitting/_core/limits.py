@@ -1,5 +1,5 @@
 """
-Upper limits: the scale of a model that minimises chi2 with error-function terms.
+Upper limits: the scale of a model that minimizes chi2 with error-function terms.
 
 A limit F with error sigma adds T(u) = -2 ln(erfc(u / sqrt(2)) / 2), u = (s m - F) / sigma,
 the probability that a measurement of the model flux s m lies below F (Sawicki 2012, PASP 124,
@@ -235,13 +235,13 @@ def limited_scale(p, q, limits):
 @njit(**PART)
 def _best_scales(buffer, work, terms, limit, c, level, reference, close):
     """
-    Fill the scales that minimise chi2 at one fraction, and what goes with them.
+    Fill the scales that minimize chi2 at one fraction, and what goes with them.
 
     work[_DETECTED] says which lanes count, work[_SCALE] where to begin. Filled are work[_SCALE],
     work[_CHI2] with half of chi2 but for a constant and the probabilities, work[_CURVATURE] with half
     its second derivative, and probabilities work[_FACTOR] times exp(work[_EXPONENT]). The limits' part
     is worked out in the precision of ``terms``, which is scratch, and ``limit``, fluxes of galaxies
-    and (for c = 1) tori over the errors of the limits and the unit of the scale. ``reference`` is half
+    and (for c = 1) AGN models over the errors of the limits and the unit of the scale. ``reference`` is half
     of chi2 less ln(prior) that has weight 1: models of less need not be as good. ``close`` is the
     size of the last step over the scale or its error.
     """

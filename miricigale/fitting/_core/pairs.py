@@ -1,7 +1,7 @@
 """
-Which (galaxy, torus) pairs can matter at all: bounds in single precision, and how deep to go.
+Which (galaxy, AGN model) pairs can matter at all: bounds in single precision, and how deep to go.
 
-With whitened data d = F sqrt(w) and unit vectors g, t of a galaxy and a torus in the used
+With whitened data d = F sqrt(w) and unit vectors g, t of a galaxy and an AGN model in the used
 bands, p = <g, d>, a = <t, d>, X = <g, t>, the best chi2 of any non-negative mixture of the
 two is |d|^2 - R with ::
 
@@ -47,8 +47,8 @@ __all__ = [
 
 #: Tori handled side by side; arrays of unit vectors are padded with zeros to a multiple.
 GROUP = 4
-#: A run is a torus with a block of galaxies at one redshift; its key has so many bits for the
-#: torus, as many for the block, and the redshift above.
+#: A run is an AGN model with a block of galaxies at one redshift; its key has so many bits for the
+#: AGN model, as many for the block, and the redshift above.
 KEY_BITS = 20
 #: Bound of a pair that is not listed, or is no more.
 DONE = np.float32(-3e38)
@@ -64,7 +64,7 @@ _NEVER = np.float32(1e30)
 _NOWHERE = np.float32(-1e3)
 _SLACK = np.float32(1e-6)
 _MASK = (1 << KEY_BITS) - 1
-# Vectors of Pairs.rows: <g, t> of GROUP tori; of the galaxies the least R / |d|^2 to keep, 2 ln(prior)
+# Vectors of Pairs.rows: <g, t> of GROUP AGN models; of the galaxies the least R / |d|^2 to keep, 2 ln(prior)
 # with that of their best partner, <g, d>, their largest bound, and work space.
 _LEAST, _BASE, _P, _TOP, _ALONE, _REST, _PASS, _SCORE = (i * BLOCK for i in range(GROUP, GROUP + 8))
 ROWS = GROUP + 8
@@ -133,7 +133,7 @@ def project(tables, target, pairs):
 
 @njit(**PART)
 def agn_products(agn, target, agn_pq, agn_weighted):
-    """Fill agn_pq[k] = <A, wF>, <A, wA> and agn_weighted[k] = w A for all tori of one redshift."""
+    """Fill agn_pq[k] = <A, wF>, <A, wA> and agn_weighted[k] = w A for all AGN models of one redshift."""
     weight, flux = target.weight, target.flux
     for k in range(agn_pq.shape[0]):
         for b in range(agn.shape[1]):
@@ -217,9 +217,9 @@ def best_of_galaxy(tables, target, limits, pairs, z, g):
 @njit(**PART)
 def _project_tori(agn, target, unit, of_torus):
     """
-    Fill unit vectors t of the tori of one redshift, <t, d>, and the square of its positive part.
+    Fill unit vectors t of the AGN models of one redshift, <t, d>, and the square of its positive part.
 
-    The latter has the rounding added, and is 4 for tori too faint for single precision.
+    The latter has the rounding added, and is 4 for AGN models too faint for single precision.
     """
     zero = np.float32(0)
     n_used = target.bands.size
@@ -244,7 +244,7 @@ def _project_tori(agn, target, unit, of_torus):
 
 @njit(**PART)
 def _products(unit_galaxy, unit_agn, k, n_used, rows):
-    """Fill rows[m * BLOCK + i] = <galaxy i, torus k + m> for GROUP tori (register blocking)."""
+    """Fill rows[m * BLOCK + i] = <galaxy i, AGN model k + m> for GROUP AGN models (register blocking)."""
     zero = np.float32(0)
     for i in range(GROUP * BLOCK):
         rows[i] = zero
@@ -270,8 +270,8 @@ def _list_block(pairs, norm, n_used, key, n):
     List the pairs of one block of galaxies whose bound reaches a threshold.
 
     ``pairs.rows`` says what the galaxies are, and is filled with their largest bounds; bounds are of
-    R + 2 ln(prior), `DONE` for pairs that are not kept. ``key`` is that of the first torus, ``n``
-    runs are in the list, which must have room for one of every torus; returned is how many are now.
+    R + 2 ln(prior), `DONE` for pairs that are not kept. ``key`` is that of the first AGN model, ``n``
+    runs are in the list, which must have room for one of every AGN model; returned is how many are now.
     """
     one = np.float32(1)
     zero = np.float32(0)
@@ -281,7 +281,7 @@ def _list_block(pairs, norm, n_used, key, n):
         p2 = p2 * p2
         rows[_ALONE + i] = p2
         rows[_REST + i] = rows[_LEAST + i] - p2
-        # a galaxy that passes alone passes with every torus
+        # a galaxy that passes alone passes with every AGN model
         rows[_PASS + i] = -one if p2 >= rows[_LEAST + i] else rows[_LEAST + i]
         rows[_TOP + i] = DONE
     for k in range(of_torus.shape[1]):
@@ -338,7 +338,7 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
     n_z, n_blocks = tables.tiles.shape[0], tables.tiles.shape[1]
     n_agn = tables.agn.shape[1]
     rows, bands, norm = pairs.rows, target.bands, target.norm
-    # the largest prior a pair can have from torus and fraction
+    # the largest prior a pair can have from AGN model and fraction
     log_pair = -1e300
     for k in range(n_agn):
         log_pair = max(log_pair, tables.of_agn[LOG_AGN, k])

@@ -37,7 +37,7 @@ NO_LIGHT = 1e-290
 #: Rows of ``Tables.of_galaxy``: dust luminosity in W for each solar mass formed and its log10 (-400
 #: where it is 0), 2 ln(prior), the galaxy's parts of the other fraction and of the quantity of both.
 DUST, LOG_DUST, LOG_GALAXY, SHARE_GALAXY, MIXED_GALAXY = range(5)
-#: Rows of ``Tables.of_agn``: 2 ln(prior), the torus's parts of these.
+#: Rows of ``Tables.of_agn``: 2 ln(prior), the AGN model's parts of these.
 LOG_AGN, SHARE_AGN, MIXED_AGN = range(3)
 #: Rows of ``Tables.of_frac``, fractions above 0: c = f / (1 - f), its log10 in bins, prior,
 #: 2 ln(prior), c at the edges of the fractions' cells.
@@ -67,7 +67,7 @@ class Tables(NamedTuple):
     agn: np.ndarray  # float64 (nz, nA, nb), uJy / W
     tiles: np.ndarray  # float64 (nz, n_blocks, nb, BLOCK): ``galaxy``, padded with ones
     galaxy32: np.ndarray  # float32 (nz, nb, n_padded), each galaxy in its own unit
-    agn32: np.ndarray  # float32 (nz, nA, nb), each torus in its own unit
+    agn32: np.ndarray  # float32 (nz, nA, nb), each AGN model in its own unit
     galaxy_unit: np.ndarray  # float64 (nz, nG): these units, uJy / Msun
     log_usable: np.ndarray  # float64 (nz, n_padded): 2 ln(prior) where usable, else -1e300
     of_galaxy: np.ndarray  # float64 (5, n_padded)
@@ -77,7 +77,7 @@ class Tables(NamedTuple):
     prior_zero: float  # its prior,
     log_zero: float  # 2 ln of it,
     edge_zero: float  # and c at the upper edge of its cell
-    share_mean: float  # mean of the tori's share over the prior
+    share_mean: float  # mean of the AGN models's share over the prior
 
 
 class Scales(NamedTuple):
@@ -132,7 +132,7 @@ class Histograms(NamedTuple):
 
     flat: np.ndarray  # (n,): what the next two are parts of
     table: np.ndarray  # (nG + nA + 1, N_BINS): l in bins of log s of every galaxy, of
-    #     log(s c L_dust) of every torus, of the log of the mixed quantity
+    #     log(s c L_dust) of every AGN model, of the log of the mixed quantity
     share: np.ndarray  # (N_SHARE + 2,): changes of slope of the other fraction's distribution
     used: np.ndarray  # int64 (nG + nA + 1, 2): first and last bin in use
     origin: np.ndarray  # (3,): log10 of s, power and mixed quantity in the middle bins
@@ -148,7 +148,7 @@ class Draws(NamedTuple):
 
 
 class Joint(NamedTuple):
-    """Joint sums of redshift, galaxy, torus and fraction; without elements if not asked for."""
+    """Joint sums of redshift, galaxy, AGN model and fraction; without elements if not asked for."""
 
     zg: np.ndarray  # (nz, nG): sum l
     zk: np.ndarray  # (nz, nA), f > 0 only
@@ -180,7 +180,7 @@ class Sums(NamedTuple):
 class Pairs(NamedTuple):
     """The list of pairs that can matter, and work space of the search."""
 
-    run_key: np.ndarray  # int64 (capacity,): redshift, block of galaxies and torus of a run
+    run_key: np.ndarray  # int64 (capacity,): redshift, block of galaxies and AGN model of a run
     bound: np.ndarray  # float32 (capacity, BLOCK): bounds of its pairs, DONE where none
     promise: np.ndarray  # float64 (nz,): what galaxies alone reach there
     order: np.ndarray  # int64 (nz,): redshifts, the most promising first
@@ -191,7 +191,7 @@ class Pairs(NamedTuple):
     tail_agn: np.ndarray  # float32 (nz, nA): second moments
     agn_pq: np.ndarray  # float64 (nA, 2): <A, wF>, <A, wA> of one redshift
     agn_weighted: np.ndarray  # float64 (nA, nb): w A
-    unit_agn: np.ndarray  # float32 (n, nb + 2): unit vectors t of tori
+    unit_agn: np.ndarray  # float32 (n, nb + 2): unit vectors t of AGN models
     agn32: np.ndarray  # float32 (2, nA): <t, d>, the square of its positive part
     unit_galaxy: np.ndarray  # float32 (nb + 2, BLOCK)
     rows: np.ndarray  # float32 (ROWS * BLOCK,): vectors of a block of galaxies
@@ -203,13 +203,13 @@ class Lanes(NamedTuple):
     buffer: np.ndarray  # float64 (SIZE,): vectors of the pairs being evaluated
     single: np.ndarray  # float32 (single_size(nf),): the same in single precision
     pending: np.ndarray  # float64 (N_INPUT * BLOCK,): the first of them, of gathered pairs
-    index: np.ndarray  # int64 (4, BLOCK): galaxies and tori of the pairs; of gathered ones
+    index: np.ndarray  # int64 (4, BLOCK): galaxies and AGN models of the pairs; of gathered ones
     run: np.ndarray  # int64 (BLOCK,): galaxies of a block that a run is about
     weight: np.ndarray  # float64 (nf * BLOCK,): prior * likelihood
     frac_sum: np.ndarray  # float64 (nf > 0,)
     pq: np.ndarray  # float64 (2, n_padded): <G, wF> and <G, wG> of one redshift
     known: np.ndarray  # int64 (n_blocks,): redshift + 1 for which they hold
-    cross: np.ndarray  # float64 (2, BLOCK): products of a block with a torus, best R
+    cross: np.ndarray  # float64 (2, BLOCK): products of a block with an AGN model, best R
     galaxy_z: np.ndarray  # float64 (3, n_padded): sums over one redshift
     agn_z: np.ndarray  # float64 (3, nA)
     limited: np.ndarray  # float64 (LIMITED_SIZE,): vectors of scales with limits

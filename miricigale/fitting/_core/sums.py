@@ -201,7 +201,7 @@ def add_all(lanes, sums, z, first):
 
 @njit(**PART)
 def add_block(tables, lanes, sums, z, block, k):
-    """Add a block of galaxies with one torus."""
+    """Add a block of galaxies with one AGN model."""
     buffer, agn_z, band = lanes.buffer, lanes.agn_z, sums.band
     start = block * BLOCK
     for i in range(BLOCK):

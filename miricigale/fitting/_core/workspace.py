@@ -13,7 +13,7 @@ from miricigale.fitting._core.structs import BLOCK, Draws, Histograms, Joint, La
 
 __all__ = ["JOINT", "clear", "make_sums", "make_workspace"]
 
-#: Joint sums that can be asked for: of redshift, galaxy, torus and fraction.
+#: Joint sums that can be asked for: of redshift, galaxy, AGN model and fraction.
 JOINT = Joint._fields
 
 

@@ -51,7 +51,7 @@ class SamplerFit:
     n_draws: int
     n_cells: int
 
-    #: Objects in a piece of the catalogue.
+    #: Objects in a piece of the catalog.
     chunk_size = 1
 
     @classmethod
@@ -174,7 +174,7 @@ class SamplerFit:
     # ------------------------------------------------------------------------- fit
 
     def task(self, pairs, seed, spaces):
-        """Function that fits a piece of the catalogue; every object has its own random stream."""
+        """Function that fits a piece of the catalog; every object has its own random stream."""
         axes = self._axes(spaces)
         parameters = self.engine.model.parameters
         constant = [name for name in parameters if name not in axes and name != "mass"]
