@@ -77,7 +77,9 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
         flux[change] = (results.best_flux[:, i] + noise[:, i] * error[:, i])[change]
         mock[name] = flux * FNU
     recovered = fitter.fit(mock, **options)
-    return MockResult(results, recovered, mock, {"seed": seed, "model_error": bool(model_error)})
+    return MockResult(
+        results, recovered, mock, seed, {"seed": seed, "model_error": bool(model_error)}
+    )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -93,13 +95,16 @@ class MockResult:
         Fit of the mock catalog.
     photometry : `~astropy.table.QTable`
         The mock catalog.
-    meta : dict
-        Seed and settings.
+    seed : int, optional
+        Of the ranks of truths within their cells.
+    meta : dict, optional
+        Settings.
     """
 
     truth: object
     recovered: object
     photometry: QTable
+    seed: int = 0
     meta: dict = field(default_factory=dict)
 
     def __len__(self):
@@ -198,8 +203,7 @@ class MockResult:
         if name in self.recovered.axes:
             values = self.recovered.axes[name].values
             node = np.argmin(np.abs(true[:, None] - values), axis=1)
-            seed = int(self.meta.get("seed", 0))
-            draw = [stream(seed, "rank", name, str(i)).random() for i in self.truth.ids[good]]
+            draw = [stream(self.seed, "rank", name, str(i)).random() for i in self.truth.ids[good]]
             rank = randomized_ranks(self.recovered.pdf[name][good], node, draw)
             return (rank > low) & (rank < high)
         ends = self.recovered.percentile(name, _LEVELS).value[good]

@@ -153,7 +153,8 @@ class RowFile(abc.ABC):
 class _FitsRows(RowFile):
     def __init__(self, path, chunk_rows, hdu):
         super().__init__(path, chunk_rows)
-        with open_fits(path, wanted="a catalogue") as hdus:
+        self._hdu = hdu
+        with open_fits(path, wanted="a catalog") as hdus:
             table = self._choose(hdus, hdu)
             self._header = table.header.copy()
             self._start = table.fileinfo()["datLoc"]
@@ -215,15 +216,10 @@ class _FitsRows(RowFile):
         return bool(np.any(np.ascontiguousarray(rows[name]).view(np.uint8) > 127))
 
     def _read(self, start, stop):
-        # a small file of its own, so that units, masks and text are what astropy makes of them
-        header = self._header.copy()
-        header["NAXIS2"] = stop - start
-        with open(self.path, "rb") as stream:
-            stream.seek(self._start + start * self._width)
-            data = stream.read((stop - start) * self._width)
-        first = fits.PrimaryHDU().header.tostring() + header.tostring()
-        file = io.BytesIO(first.encode("ascii") + data + bytes(-len(data) % 2880))
-        return QTable.read(file, format="fits", hdu=1, character_as_bytes=False)
+        with open_fits(self.path, wanted="a catalog", memmap=True) as hdus:
+            table = self._choose(hdus, self._hdu)
+            part = fits.BinTableHDU(table.data[start:stop], header=self._header)
+            return QTable.read(part, character_as_bytes=False)
 
 
 class _TextRows(RowFile):
