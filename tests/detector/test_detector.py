@@ -9,7 +9,6 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 
 from miricigale.detector import (
-    DQ,
     ADConversion,
     BadPixels,
     Bias,
@@ -26,7 +25,7 @@ from miricigale.detector import (
     ReadNoise,
     Residual,
 )
-from miricigale.instrument import flat_field, miri_detector, photmjsr
+from miricigale.instrument import DQ, flat_field, miri_detector, photmjsr
 from miricigale.utils.exceptions import MiricigaleWarning
 
 PLAIN = (Photons(flat=False), Nonlinearity(linear=True), Bias(), ReadNoise(), ADConversion())

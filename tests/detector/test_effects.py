@@ -4,7 +4,6 @@ from scipy import stats
 
 from miricigale.depth import residual_amplitude
 from miricigale.detector import (
-    DQ,
     BadPixels,
     Bias,
     Block,
@@ -19,7 +18,7 @@ from miricigale.detector import (
     Residual,
     Saturation,
 )
-from miricigale.instrument import aperture, bad_pixel_mask, flat_field, miri_detector, photmjsr
+from miricigale.instrument import DQ, aperture, bad_pixel_mask, flat_field, miri_detector, photmjsr
 
 
 def empty(block):

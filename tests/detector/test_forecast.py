@@ -8,7 +8,6 @@ from astropy.table import QTable
 from miricigale.depth import forecast_table
 from miricigale.depth.saturation import NEVER, saturation_group
 from miricigale.detector import (
-    DQ,
     ADConversion,
     BadPixels,
     CosmicRays,
@@ -17,7 +16,7 @@ from miricigale.detector import (
     Photons,
     Saturation,
 )
-from miricigale.instrument import flat_field, miri_detector, photmjsr
+from miricigale.instrument import DQ, flat_field, miri_detector, photmjsr
 from miricigale.utils.exceptions import MiricigaleWarning
 
 FILTER = "miri.f770w"

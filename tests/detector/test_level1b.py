@@ -9,7 +9,6 @@ from astropy.time import Time
 from astropy.wcs import WCS
 
 from miricigale.detector import (
-    DQ,
     Detector,
     LastFrame,
     OtherEffect,
@@ -19,6 +18,7 @@ from miricigale.detector import (
     ResetAnomaly,
     Residual,
 )
+from miricigale.instrument import DQ
 from miricigale.utils.exceptions import DataError
 
 

@@ -6,7 +6,6 @@ import pytest
 from scipy.integrate import quad
 
 from miricigale.detector import (
-    DQ,
     ADConversion,
     BadPixels,
     CosmicRays,
@@ -16,7 +15,7 @@ from miricigale.detector import (
     Persistence,
     Photons,
 )
-from miricigale.instrument import miri_detector
+from miricigale.instrument import DQ, miri_detector
 
 RATE = u.electron / u.s
 GAIN = miri_detector().gain

@@ -6,14 +6,13 @@ import pytest
 from astropy.io import fits
 
 from miricigale.detector import (
-    DQ,
     Detector,
     FirstFrame,
     LastFrame,
     Ramp,
     ResetAnomaly,
 )
-from miricigale.instrument import Exposure, field_mask, flat_field, photmjsr
+from miricigale.instrument import DQ, Exposure, field_mask, flat_field, photmjsr
 from miricigale.reduction import Reducer
 
 pytest.importorskip("jwst", reason="needs the official pipeline: pip install miricigale[jwst]")

@@ -5,9 +5,8 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
 from reproject import reproject_exact
 
-from miricigale.instrument import imager_wcs, mosaic_wcs, north_up_wcs, pixel_area_map
+from miricigale.instrument import DQ, imager_wcs, mosaic_wcs, north_up_wcs, pixel_area_map
 from miricigale.reduction import (
-    DQ,
     drizzle_images,
     noise_correction,
     pixel_map,
