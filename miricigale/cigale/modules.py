@@ -90,7 +90,7 @@ class Module:
         self._taken.update(keys)
 
     def rest(self):
-        """Name parameters that nobody asked for."""
+        """Report the parameters of the module that nothing here takes."""
         lost = [self.label(key) for key in self._values if key not in self._taken]
         self.chain.left_out.extend(lost)
 

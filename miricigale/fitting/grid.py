@@ -309,7 +309,7 @@ class GridEngine:
         # sums in single precision differ by some 1e-8
         out.zf[i] = sums.zf / sums.zf.sum()
         out.galaxy[i] = sums.galaxy[:, 0] / sums.galaxy[:, 0].sum()
-        # without AGN the data say nothing on the AGN model: its prior
+        # without AGN light the data do not constrain the AGN model: its prior
         prior = self._agn_prior
         if prior.size:
             agn = sums.agn[:, 0] + sums.alone.sum() * prior
@@ -399,7 +399,7 @@ class GridEngine:
         return negative | np.any(self.agn < 0, axis=(0, 1))
 
     def __getstate__(self):
-        # the prepared tables are made again by whoever unpickles
+        # the prepared tables are made again after unpickling
         names = self.__dataclass_fields__
         return {name: value for name, value in self.__dict__.items() if name in names}
 

@@ -17,7 +17,7 @@ from miricigale.fitting.priors import (
     known_redshifts,
 )
 from miricigale.fitting.quantities import DERIVED_LEVELS, OtherFraction, Quantities
-from miricigale.fitting.results import FitResults
+from miricigale.fitting.results import CIGALE_LEAST_STD, FitResults
 from miricigale.fitting.samples import Samples
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks, parallel_map
@@ -27,8 +27,6 @@ __all__ = ["GridFit"]
 
 #: Best chi2 above which exp(-chi2 / 2) is below the smallest normal number for every model.
 VANISHING_CHI2 = 1417.0
-#: Part of the mean below which CIGALE gives no standard deviation.
-CIGALE_LEAST_STD = 0.05
 #: Numbers of joint sums that a piece may have at once (32 MB).
 _JOINT_SIZE = 1 << 22
 #: Fluxes that are all 0 become negative by this part of their error; see `_engine_input`.
@@ -111,6 +109,11 @@ class GridFit:
     def citations(self):
         """What to cite for the models."""
         return self.grid.meta.get("citations", ())
+
+    @property
+    def content(self):
+        """What makes a fit another one, besides `settings`: name to anything with a checksum."""
+        return {"grid": self.grid, "priors": self.priors}
 
     @property
     def constants(self):

@@ -5,7 +5,7 @@ import numpy as np
 from astropy.table import Table
 
 from miricigale.fitting.priors import GridAxis
-from miricigale.fitting.results import FitResults
+from miricigale.fitting.results import CIGALE_LEAST_STD, FitResults
 from miricigale.fitting.samples import Samples
 from miricigale.sed import ModelGrid
 from miricigale.utils.content import content_sha256
@@ -23,8 +23,6 @@ _SAMPLES = "miricigale-samples-1"
 _DICTS = ("pdf", "best")
 _TUPLES = ("filters", "quantities", "descriptions", "intensive", "fitted_filters")
 _FACTS = ("redshift_fixed", "constants", "least_std", "meta")
-#: Part of the mean below which CIGALE gives no standard deviation.
-CIGALE_LEAST_STD = 0.05
 
 
 def write_results(results, path, *, overwrite=False):

@@ -18,6 +18,8 @@ from miricigale.utils.units import FNU
 __all__ = ["FitResults"]
 
 _LEVELS = (0.16, 0.5, 0.84)
+#: Part of the mean below which CIGALE gives no standard deviation.
+CIGALE_LEAST_STD = 0.05
 #: Objects that a notebook shows.
 _SHOWN = 20
 _PARTS = {

@@ -7,7 +7,6 @@ import json
 import logging
 import os
 import warnings
-from dataclasses import fields
 from pathlib import Path
 
 import astropy.units as u
@@ -312,10 +311,7 @@ def _job(fitter, rows, options, given):
         "chunk_rows": rows.chunk_rows,
         "redshift": redshift if isinstance(redshift, str) else content_sha256(redshift),
         "redshift_prior": content_sha256(prior),
-        "fitter": {
-            item.name: content_sha256(getattr(fitter.backend, item.name))
-            for item in fields(fitter.backend)
-        },
+        "fitter": {name: content_sha256(value) for name, value in fitter.backend.content.items()},
         "settings": fitter.settings() | {"max_reduced_chi2": fitter.max_reduced_chi2},
     }
     job |= {"pairs": [list(names) for names in options["pairs"]]} if options["pairs"] else {}

@@ -29,7 +29,7 @@ class ImageFacts:
     noise_correction : float, optional
         By how much sums over many pixels are noisier than their errors in quadrature.
     n_outliers : int, optional
-        Pixels that disagreed with the other dithers; None if nobody looked.
+        Pixels that disagreed with the other dithers; None if outliers were not searched for.
 
     Raises
     ------

@@ -149,7 +149,7 @@ def miri_psf(
         Seed of the wavefront; the same telescope in all filters.
     includes : iterable of str, optional
         What is applied, out of ``"jitter"``, ``"cruciform"``, ``"pixel"`` and ``"ipc"``.
-        Whoever simulates with the PSF must not apply these again.
+        A simulation with the PSF must not apply these again.
     calibration : {"flight", "stpsf"}, optional
         With ``"flight"``, F560W gets twice the cruciform of stpsf and, as part of the
         jitter, a blur of 0.03 arcsec (rms of the radius; 0.021 per axis).

@@ -200,7 +200,7 @@ def fit_groups(
     if usable.shape != (ny, nx):
         raise argument_error("usable", f"of shape {(ny, nx)}", usable.shape)
 
-    # one type of array for the compiled kernels, whoever owns it
+    # one type of array for the compiled kernels, also of arrays that own no memory
     data = data.view()
     data.flags.writeable = False
     offset = np.array(np.broadcast_to(np.asarray(bias, float), (n_int, n_group)), order="C")

@@ -25,7 +25,7 @@ class Resource:
     title : str
         One line that says what it is.
     licence : str
-        Terms of whoever made the numbers and of the package they came in.
+        License of the numbers' authors and of the package they came in.
     citation : str
         What to cite.
     source : str

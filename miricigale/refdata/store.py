@@ -38,7 +38,7 @@ def _locked(target):
             # some network file systems have no locks
             held = False
         if held:
-            # nobody else is writing: these are leftovers
+            # no other process writes: these are left over from ones that ended
             for path in target.parent.glob(f"{PARTIAL}*-{target.name}*"):
                 _remove(path)
         yield
@@ -56,7 +56,7 @@ def installing(target):
     """
     Write a file of the data folder and a record beside it; other processes wait.
 
-    Whoever looks finds the old file or the new one whole; if the process dies in between, a
+    Other processes find the old file or the new one whole; if the process dies in between, a
     file without record ("unchecked").
 
     Parameters

@@ -17,7 +17,7 @@ from miricigale.utils.store import PARTIAL
 
 __all__ = ["cached_grid", "grid_key"]
 
-ABANDONED = 86400.0  # seconds after which an unfinished file is nobody's any more
+ABANDONED = 86400.0  # seconds after which an unfinished file counts as abandoned
 
 _log = logging.getLogger(__name__)
 
@@ -27,7 +27,7 @@ def grid_key(model, axes, filters):
     Checksum of everything that a grid depends on: components, data, cosmology, axes, curves of bands.
 
     Code is known by the versions that it states, ``Component.version`` of a component and its
-    bases and ``VERSION`` of what all share: whoever changes numbers raises one of them.
+    bases and ``VERSION`` of what all share: a change of numbers raises one of them.
     """
     parts = [
         {
@@ -83,7 +83,7 @@ def cached_grid(model, axes, filters, make):
         except (DataError, OSError) as err:
             _log.warning("cached grid not used: %s", err)
         else:
-            # the numbers are the same, whoever asks; the words are those of this model
+            # the numbers are those of the file, the provenance is that of this model
             return replace(grid, meta=model.meta, recipe=model.recipe)
     grid = make(model, axes, filters)
     if grid.galaxy.nbytes + grid.agn.nbytes > limit or not _unchanged(model):

@@ -11,7 +11,14 @@ from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import integrate, optimize, special, stats
 
-from miricigale.fitting import BayesFitter, FitFlags, FitResults, samplers
+from miricigale.fitting import (
+    BayesFitter,
+    FitFlags,
+    FitResults,
+    fit_file,
+    leave_out,
+    samplers,
+)
 from miricigale.fitting.samplers import space
 from miricigale.fitting.samplers.packages import Lockstep
 from miricigale.fitting.samplers.run import best_scale, chi2_at
@@ -501,3 +508,26 @@ def test_lockstep_answers_every_task_with_its_own_value():
     failing = Lockstep(broken, 4)
     with pytest.raises(RuntimeError, match="no such model"):
         failing.map(lambda item: failing.evaluate(np.array([item])), range(4))
+
+
+@pytest.mark.parametrize("engine", NAUTILUS)
+def test_fits_from_file_to_file_and_without_a_band(engine, tmp_path):
+    fitter = linear_fitter({"redshift": (0.5, 1.5), "a": (-0.5, 0.5)}, engine)
+    model = 2.0 + 0.2 * SLOPES[0]
+    table = photometry(np.array([5.0, 8.0, 3.0])[:, None] * model, 0.1)
+    whole = fitter.fit(table, seed=3)
+    table.write(tmp_path / "cat.fits")
+    arguments = (fitter, tmp_path / "cat.fits", tmp_path / "out")
+    with pytest.raises(ValueError, match="'seed' must be given for a sampler"):
+        fit_file(*arguments)
+    results = fit_file(*arguments, chunk_rows=2, seed=3)
+    assert results.n_parts == 2
+    joined = FitResults.concatenate(results.parts())
+    for name in ("chi2", "log_evidence", "draws", "axis_quantiles", "model_flux"):
+        assert_array_equal(getattr(joined, name), getattr(whole, name), err_msg=name)
+    # nothing is left to do, and another seed is another fit
+    assert len(fit_file(*arguments, chunk_rows=2, seed=3)) == 3
+    with pytest.raises(ValueError, match="results of another fit: seed differ"):
+        fit_file(*arguments, chunk_rows=2, seed=4)
+    left = leave_out(fitter, table, ["b3"], seed=3)
+    assert_allclose(left.predicted[:, 0], table["b3"].value, rtol=0.1)

@@ -105,6 +105,13 @@ class SamplerFit:
         return (*known, *(CITATIONS.get(engine, ()) if isinstance(engine, str) else ()))
 
     @property
+    def content(self):
+        """What makes a fit another one, besides `settings`: name to anything with a checksum."""
+        model = self.engine.model
+        recipe = model.recipe if isinstance(model, SEDModel) else type(model)
+        return {"space": self.space, "model": recipe, "draws": (self.n_draws, self.n_cells)}
+
+    @property
     def edge_weight(self):
         """Weight of the first or last cell of redshift above which an object is flagged."""
         return max(0.01, 2.0 / self.n_cells)

@@ -32,7 +32,7 @@ def _sample_nautilus(package, log_like, n_dim, rng, request):
     sampler = package.Sampler(
         np.asarray,
         lambda points: log_like(points[:, :n_dim]),
-        # it knows no single dimension: a second one goes along that nothing depends on
+        # nautilus needs two dimensions at least: the likelihood ignores the second
         n_dim=max(n_dim, 2),
         n_live=request.n_live,
         vectorized=True,

@@ -49,7 +49,7 @@ class LibraryTable:
     meta : dict, optional
         Plain values: what was read, checksums of the files (``"files"``), notes.
     summary : tuple of str, optional
-        What was found, in sentences for whoever registers it.
+        What was found, in sentences for the user who adds it.
 
     Raises
     ------
