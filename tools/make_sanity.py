@@ -13,17 +13,15 @@ from pathlib import Path
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
 
 from miricigale.evaluation import number
-from miricigale.fitting import FitResults
-from miricigale.photometry import ErrorModel
 from miricigale.sed import SEDModel
-from miricigale.workflow import load_config
+from miricigale.workflow import Context, load_config
 from miricigale.workflow.products import read_image
 from miricigale.workflow.stages import figures, pictures, provenance
-from miricigale.workflow.stages.metrics import FITS, StudyTables
+from miricigale.workflow.stages.metrics import StudyTables
 from miricigale.workflow.stages.sample import SampleFlags, typical_source
+from miricigale.workflow.truths import reference
 
 
 def rst_table(header, rows):
@@ -52,14 +50,8 @@ def main():
     config = load_config(run / "config.toml")
     bands = config.exposures.filters
     metrics = json.loads((run / "report" / "metrics.json").read_text())
-    tables = StudyTables(
-        QTable.read(run / "truth.ecsv"),
-        QTable.read(run / "matched.ecsv"),
-        QTable.read(run / "photometry.ecsv"),
-        ErrorModel.read(run / "errors.ecsv"),
-        {unit: FitResults.read(run / f"fits_{unit}.fits") for unit in FITS},
-        {},
-    )
+    shown = reference(config)
+    tables = StudyTables.read(Context(config, run), shown)
     truth, matched, errors = tables.truth, tables.matched, tables.errors
     galaxies = tables.galaxies(field=True)
     area = metrics["area"] * u.arcmin**2
@@ -70,17 +62,17 @@ def main():
     magnitudes = {name: errors.limiting_magnitude(name).value for name in bands}
     chosen = figures.three_bands(bands)
     sample = truth[selection == 0]
-    typical = typical_source(sample, results["with_miri"].fitted, bands[-1])
+    typical = typical_source(sample, results["all"].fitted, bands[-1])
     drawn = {
         "inputs": figures.input_figure(tables.galaxies())[0],
         "counts": figures.counts_figure(galaxies, bands, area),
         "offsets": figures.offset_figure(inside, bands, magnitudes),
         "errors": figures.error_figure(errors, bands, limits),
         "redshifts": figures.redshift_figure(sample, fits),
-        "fractions": figures.fraction_figure(fits, config.sed.frac_agn),
+        "fractions": figures.fraction_figure(fits, config.sed.frac_agn[0]),
         "example": figures.example_figure(results, truth, typical, SEDModel.yang2021()),
         "color": pictures.field_figure(
-            [read_image(run / f"mosaic_{name}.fits") for name in chosen],
+            [read_image(run / shown / f"mosaic_{name}.fits") for name in chosen],
             read_image(run / "f160w.fits"),
             [*chosen, config.highres.filter],
         ),
@@ -143,7 +135,7 @@ def main():
     print(rst_table(header, rows), "\n")
     rows = [
         (
-            unit.replace("_", " "),
+            figures.SET_LABELS[unit],
             m["n"],
             shown(m["photoz_bias"], "+.4f"),
             shown(m["photoz_sigma_mad"], ".4f"),

@@ -15,6 +15,7 @@ from astropy.utils.exceptions import AstropyDeprecationWarning
 from miricigale.instrument import CEERS_FILTERS
 from miricigale.photometry import YANG2021_DEPTHS
 from miricigale.utils.exceptions import ConfigError, unknown_name
+from miricigale.workflow.truths import SETS
 
 __all__ = ["StudyConfig", "load_config", "present_names", "preset_names", "toml_value"]
 
@@ -23,9 +24,9 @@ __all__ = ["StudyConfig", "load_config", "present_names", "preset_names", "toml_
 _FORMER = {"photometry.n_pixels": "photometry.min_area"}
 
 
-def _option(default, doc, *, low=None, high=None, choices=None):
-    """A field with its documentation and limits in the metadata."""
-    limits = {"doc": doc, "low": low, "high": high, "choices": choices}
+def _option(default, doc, *, low=None, high=None, choices=None, single=False):
+    """A field with its documentation and limits in the metadata; ``single``: a list may be one value."""
+    limits = {"doc": doc, "low": low, "high": high, "choices": choices, "single": single}
     return dataclasses.field(default=default, metadata=limits)
 
 
@@ -77,7 +78,13 @@ class SedSection:
     alpha: tuple[float, ...] = _option(
         (1.5, 2.5), "Range from which the dust's alpha is drawn where no band shows it."
     )
-    frac_agn: float = _option(0.0, "fracAGN of the injected sources.", low=0.0, high=0.99)
+    frac_agn: tuple[float, ...] = _option(
+        (0.0,),
+        "fracAGN of the injected sources, one simulated sky for each; the first gives the error functions.",
+        low=0.0,
+        high=0.99,
+        single=True,
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,13 +175,18 @@ class ErrorSection:
 
 @dataclasses.dataclass(frozen=True)
 class FitSection:
-    """The final fit, with and without MIRI."""
+    """The final fits, with and without MIRI."""
 
     bands: tuple[str, ...] = _option(tuple(YANG2021_DEPTHS), "Existing bands.")
     depths: tuple[float, ...] = _option(tuple(YANG2021_DEPTHS.values()), "Their 5-sigma AB depths.")
     axes: str = _option("fit", "Grid of the fit.", choices=("fit", "quick"))
     model_error: float = _option(0.1, "Relative model error.", low=0.0, high=1.0)
     min_detected: int = _option(2, "MIRI bands a source must be detected in.", low=0, high=9)
+    sets: tuple[str, ...] = _option(
+        ("all", "none"),
+        "Sets of the MIRI bands that are fitted with the existing ones.",
+        choices=SETS,
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -238,6 +250,16 @@ class StudyConfig:
         _require(n, "exposures", "filters", "must name at least one filter", "none")
         names = list(exposures.filters)
         _require(len(set(names)) == n, "exposures", "filters", "must not repeat", names)
+        for section, key, values in (
+            ("sed", "frac_agn", list(self.sed.frac_agn)),
+            ("fit", "sets", list(fit.sets)),
+        ):
+            _require(values, section, key, "must have at least one value", "none")
+            _require(len(set(values)) == len(values), section, key, "must not repeat", values)
+        _require("all" in fit.sets, "fit", "sets", "must have 'all'", list(fit.sets))
+        halves = {"blue", "red"}.intersection(fit.sets)
+        wanted = "may have 'blue' and 'red' with two filters and more only"
+        _require(n > 1 or not halves, "fit", "sets", wanted, list(fit.sets))
         good = len(alpha) == 2 and 0 < alpha[0] <= alpha[1] <= 4
         _require(good, "sed", "alpha", "must be two numbers in order, above 0 to 4", list(alpha))
         wanted = f"must be at most the number of MIRI filters ({n})"
@@ -376,6 +398,8 @@ def _replace_section(name, section, entries):
 
 def _checked(label, value, hint, limits):
     if typing.get_origin(hint) is tuple:
+        if limits["single"] and isinstance(value, (int, float)):
+            value = (value,)
         if not isinstance(value, (list, tuple)):
             msg = f"{label} must be a list, got {value!r}"
             raise ConfigError(msg)

@@ -47,6 +47,11 @@ class _Job:
     def title(self):
         return f"{self.stage.title}{' ' + self.unit if self.unit else ''}"
 
+    def needed(self, config, units):
+        """Keys of all units that this one reads."""
+        groups = self.stage.needed(config, self.unit, units).values()
+        return frozenset(itertools.chain.from_iterable(groups))
+
 
 class StudyRunner:
     """
@@ -90,9 +95,8 @@ class StudyRunner:
         self.disk = disk
         self.progress_bar = progress_bar
         self.n_threads = thread_count(config.run.threads or None)
-        self.jobs = [
-            _Job(stage, unit) for stage in self.stages for unit in stage.unit_names(config)
-        ]
+        self.units = {stage.name: stage.unit_names(config) for stage in self.stages}
+        self.jobs = [_Job(stage, unit) for stage in self.stages for unit in self.units[stage.name]]
         seen = set()
         for stage in self.stages:
             missing = set(stage.needs) - seen
@@ -114,7 +118,10 @@ class StudyRunner:
             "version": stage.version,
             "seed": self.config.run.seed,
             "config": self.config.values(*stage.sections),
-            "inputs": {name: store.checksums(name) for name in stage.needs},
+            "inputs": {
+                name: store.checksums(keys)
+                for name, keys in stage.needed(self.config, unit, self.units).items()
+            },
             "data": {name: fingerprint(name) for name in stage.resource_names()},
         }
         if stage.plan is not None:
@@ -148,16 +155,16 @@ class StudyRunner:
             record = store.records.get(job.key)
             if record is None:
                 state = "new"
-            elif moved.intersection(job.stage.needs) or record["hash"] != self.digest(
-                job.stage, job.unit, store
-            ):
+            elif moved.intersection(job.needed(self.config, self.units)) or record[
+                "hash"
+            ] != self.digest(job.stage, job.unit, store):
                 state = "changed"
             else:
                 # making them again gives the same bytes, so that dependent stages stay current
                 state = "current" if store.is_whole(job.key) else "lost"
             states[job.key] = state
             if state in ("new", "changed"):
-                moved.add(job.stage.name)
+                moved.add(job.key)
         return states | {key: "surplus" for key in store.records if key not in states}
 
     def run(self):
@@ -269,7 +276,7 @@ class StudyRunner:
     def _execute(self, store, states):
         """Do all units, each when what it needs is done."""
         with _Display(self.progress_bar, len(self.jobs)) as display:
-            begun = {job.stage for job in self.jobs if states[job.key] != "current"}
+            begun = [job.stage for job in self.jobs if states[job.key] != "current"]
             kernels = {name for stage in begun for name in stage.kernels}
             run_tasks(
                 [
@@ -284,6 +291,7 @@ class StudyRunner:
 
     def _task(self, job, store, display):
         stage = job.stage
+        needed = job.needed(self.config, self.units)
         inline = self.executor is None
         digest = None
 
@@ -302,7 +310,7 @@ class StudyRunner:
                 self._source,
                 stage.name,
                 job.unit,
-                inputs=[product for name in stage.needs for product in store.checksums(name)],
+                inputs=list(store.checksums(needed)),
                 n_threads=n_threads,
                 progress_bar=display.is_bar and inline,
             )
@@ -314,11 +322,11 @@ class StudyRunner:
             display.finish(stage, self.config, seconds)
 
         return Task(
-            stage.name,
+            job.key,
             job.title,
             begin,
             finish,
-            needs=frozenset((*stage.needs, *(f"compile {name}" for name in stage.kernels))),
+            needs=needed | {f"compile {name}" for name in stage.kernels},
             memory=stage.memory(self.config, job.unit) if stage.memory else _MEMORY,
         )
 

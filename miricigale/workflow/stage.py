@@ -26,8 +26,10 @@ class Stage:
         Called as ``function(context, unit)``; saves its products through the context.
     title : str
         What it does, for the progress line.
-    needs : tuple of str
-        Stages whose products it reads; reading another product is an error.
+    needs : tuple of str or dict of str to callable
+        Stages whose products it reads; reading another product is an error. A function is called
+        with the configuration and the unit, and gives the units of that stage that are read; all
+        are without one (None).
     sections : tuple of str
         Sections (``"scene"``) or keys (``"run.keep_level1b"``) of the configuration that it
         reads; reading another one is an error.
@@ -40,8 +42,8 @@ class Stage:
         by one.
     plan : callable, optional
         Called with the configuration and the unit; plain values that the stage takes from the
-        package (the exposures of a named plan, the axes of a named grid), so that a change
-        of those is seen.
+        package (the exposures of a named plan, the axes of a named grid) or from a part of the
+        configuration, so that a change of those is seen. The stage has them as ``context.plan``.
     memory : callable, optional
         Called with the configuration and the unit; about how many bytes it takes to do it.
     kernels : tuple of str, optional
@@ -51,7 +53,7 @@ class Stage:
     name: str
     function: Callable
     title: str
-    needs: tuple = ()
+    needs: tuple | dict = ()
     sections: tuple = ()
     resources: tuple | Callable = ()
     version: int = 1
@@ -63,6 +65,33 @@ class Stage:
     def unit_names(self, config):
         """Names of the pieces; a single empty one for a stage that has none."""
         return tuple(self.units(config)) if self.units else ("",)
+
+    def needed(self, config, unit, units):
+        """
+        What a unit reads.
+
+        Parameters
+        ----------
+        config : `~miricigale.workflow.config.StudyConfig`
+            The configuration.
+        unit : str
+            Which.
+        units : dict of str to tuple of str
+            Names of the units of each stage.
+
+        Returns
+        -------
+        keys : dict of str to list of str
+            By stage: keys of its units in the manifest.
+        """
+        select = self.needs if isinstance(self.needs, dict) else dict.fromkeys(self.needs)
+        return {
+            name: [
+                f"{name}:{part}" if part else name
+                for part in (choose(config, unit) if choose else units[name])
+            ]
+            for name, choose in select.items()
+        }
 
     def resource_names(self):
         """Names of the reference data that it depends on."""
@@ -130,6 +159,8 @@ class Context:
         The folder of the run.
     stage : `Stage`, optional
         Whose declaration limits what is seen of the configuration.
+    unit : str, optional
+        Which piece of the stage.
     inputs : iterable of str, optional
         Names of the products of the stages that it needs, which are all that it may read; any by
         default.
@@ -139,8 +170,11 @@ class Context:
         Whether progress bars are shown.
     """
 
-    def __init__(self, config, folder, *, stage=None, inputs=None, n_threads=1, progress_bar=False):
+    def __init__(
+        self, config, folder, *, stage=None, unit="", inputs=None, n_threads=1, progress_bar=False
+    ):
         self.config = config if stage is None else ConfigView(config, stage)
+        self.plan = stage.plan(config, unit) if stage is not None and stage.plan else None
         self.products = FileFolder(folder)
         self.progress_bar = progress_bar
         self.saved = []
@@ -208,7 +242,7 @@ def run_unit(config, folder, stages, name, unit, **options):
         Time that it took.
     """
     (stage,) = (s for s in (stages() if callable(stages) else stages) if s.name == name)
-    context = Context(config, folder, stage=stage, **options)
+    context = Context(config, folder, stage=stage, unit=unit, **options)
     begin = time.perf_counter()
     try:
         # results independent of the number of cores to the last digit

@@ -76,11 +76,10 @@ class ProductStore(RecordFolder):
         """
         super().finish(key, digest, products, seconds=round(seconds, 2))
 
-    def checksums(self, stage):
-        """Checksums of all products of a stage, over its units."""
+    def checksums(self, keys):
+        """Checksums of all products of units by their keys; those that are not done have none."""
         return {
             name: product["sha256"]
-            for key, record in sorted(self.records.items())
-            if key.split(":")[0] == stage
-            for name, product in record["products"].items()
+            for key in sorted(set(keys).intersection(self.records))
+            for name, product in self.records[key]["products"].items()
         }

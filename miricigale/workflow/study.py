@@ -14,6 +14,7 @@ from miricigale.workflow.config import HighresSection
 from miricigale.workflow.runner import StudyRunner
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.exposures import grid_of, study_exposures
+from miricigale.workflow.truths import study_truths
 
 __all__ = ["MIN_SOURCES", "check_study", "disk_use", "run_study"]
 
@@ -35,6 +36,7 @@ def disk_use(config):
     n_bytes : int
     """
     exposures = study_exposures(config)
+    n_truths = len(study_truths(config))
     total = 20_000_000  # tables, fits, report
     for exposure in exposures.values():
         pixels = math.prod(exposure.shape)
@@ -47,7 +49,7 @@ def disk_use(config):
     fine = math.prod(grid_of(config, config.highres.pixel_scale).pixel_shape)
     # mosaic, model and residual; mosaic on the fine grid
     total += len(config.exposures.filters) * 9 * (3 * native + fine)
-    return total + 9 * fine + 13 * fine
+    return n_truths * total + 9 * fine + 13 * fine
 
 
 def check_study(config):

@@ -43,10 +43,10 @@ def run(folder, table, **sed):
     config = StudyConfig.from_dict(
         {"catalog": {"source": str(folder / "mine.ecsv")}, "fit": {"model_error": 0.02}, "sed": sed}
     )
-    for name in ("catalog", "seds", "truth"):
-        STAGES[name].function(Context(config, folder, stage=STAGES[name]), "")
+    for name, unit in (("catalog", ""), ("seds", ""), ("truth", "agn00")):
+        STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
     facts = dict(catalog_facts(config, check_catalog(table)))
-    truth = QTable.read(folder / "truth.ecsv")
+    truth = QTable.read(folder / "agn00" / "truth.ecsv")
     return config, FitResults.read(folder / "input_seds.fits"), truth, facts["input SEDs fitted to"]
 
 

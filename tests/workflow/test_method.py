@@ -52,7 +52,7 @@ def folder(tmp_path_factory):
     catalog[BAND] = np.geomspace(20, 200, n) * u.uJy
     catalog[PRIOR] = np.full(n, 30.0) * u.uJy
     made = Context(config, folder)
-    made.save_table("truth.ecsv", catalog)
+    made.save_table("agn00/truth.ecsv", catalog)
     for suffix, scale, size in (("", 0.11, 280), ("_fine", 0.06, 514)):
         wcs = north_up_wcs(CENTER, scale * u.arcsec, (size, size))
         wcs.pixel_shape = size, size
@@ -60,7 +60,7 @@ def folder(tmp_path_factory):
         noise = np.full(image.shape, 0.1 * 0.06 / scale)
         data = image.data + rng.normal(0, noise)
         made.save_image(
-            f"mosaic_{BAND}{suffix}.fits",
+            f"agn00/mosaic_{BAND}{suffix}.fits",
             CCDData(data, unit="MJy/sr", wcs=wcs, uncertainty=StdDevUncertainty(noise),
                     mask=np.zeros(image.shape, bool)),
         )  # fmt: skip
@@ -76,10 +76,10 @@ def folder(tmp_path_factory):
 @pytest.mark.parametrize(("method", "scale"), [("package", 0.11), ("yang2021", 0.06)])
 def test_points_come_back_by_either_method(folder, method, scale):
     config = config_of(method)
-    for name, unit in (("kernels", BAND), ("templates", ""), ("photometry", BAND)):
-        STAGES[name].function(Context(config, folder, stage=STAGES[name]), unit)
-    table = QTable.read(folder / "photometry" / f"{BAND}.ecsv")
-    truth = QTable.read(folder / "truth.ecsv")
+    for name, unit in (("kernels", BAND), ("templates", ""), ("photometry", f"agn00/{BAND}")):
+        STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
+    table = QTable.read(folder / "agn00" / "photometry" / f"{BAND}.ecsv")
+    truth = QTable.read(folder / "agn00" / "truth.ecsv")
     index, separation, _ = truth["sky"].match_to_catalog_sky(table["sky"])
     assert separation.arcsec.max() < 0.05
     ratio = (table["flux"][index] / truth[BAND]).to_value(u.one)
@@ -88,5 +88,5 @@ def test_points_come_back_by_either_method(folder, method, scale):
     assert np.ptp(ratio) < 0.03
     assert table.meta["pixel_scale"] == pytest.approx(scale, rel=1e-3)
     assert table.meta.get("method", "package") == method
-    model = Context(config, folder).image(f"photometry/{BAND}_model.fits")
+    model = Context(config, folder).image(f"agn00/photometry/{BAND}_model.fits")
     assert model.shape == ((280, 280) if method == "package" else (514, 514))

@@ -77,13 +77,13 @@ def small_config(filters, *, points=False):
 
 
 def do_stage(config, folder, name, unit=""):
-    STAGES[name].function(Context(config, folder, stage=STAGES[name]), unit)
+    STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
 
 
 def make_run(folder, filters, *, mass=3e10, points=False):
     """Make up what the stage ``report`` reads, and run it."""
     config = small_config(filters, points=points)
-    made = Context(config, folder, stage=STAGES["truth"])
+    made = Context(config, folder)
     rng = np.random.default_rng(1)
     count = 24
     center = SkyCoord(53.13440 * u.deg, -27.83444 * u.deg)
@@ -97,33 +97,34 @@ def make_run(folder, filters, *, mass=3e10, points=False):
     truth["star"], truth["frac_agn"] = np.zeros(count, bool), np.zeros(count)
     truth.meta.clear()
     truth.meta.update(version="1.2", citations=["Somebody 2001", "Somebody 2001, with page"])
-    made.save_table("truth.ecsv", truth)
+    made.save_table("agn00/truth.ecsv", truth)
     catalog = QTable({"id": truth["id"], "sky": sky, "star": truth["star"]})
     catalog["wfc3.f160w"] = truth["wfc3.f160w"]
     made.save_table("catalog.ecsv", catalog)
     for unit in study_exposures(config):
         table = QTable({"sky_fraction": [0.31], "n_pixels": [4]})
-        made.save_table(f"exposures/{unit}_forecast.ecsv", table)
+        made.save_table(f"agn00/exposures/{unit}_forecast.ecsv", table)
     made.save_image("f160w.fits", noise_image(9, rim=0)[0])
     for k, name in enumerate(filters):
         image, light = noise_image(k)
-        made.save_image(f"mosaic_{name}.fits", image)
-        made.save_image(f"photometry/{name}_model.fits", sky_image(SCALE, SHAPE, light))
+        made.save_image(f"agn00/mosaic_{name}.fits", image)
+        made.save_image(f"agn00/photometry/{name}_model.fits", sky_image(SCALE, SHAPE, light))
         # one more than there are sources, which no source is near; the first is at the edge
         table = QTable({"id": np.arange(1, count + 2), "sky": _with_one_more(sky, center)})
         flux = np.append(truth[name].value + rng.normal(0, 0.2, count), 5.0)
         table["flux"] = flux * u.uJy
         table["flux_err"] = np.full(count + 1, 0.2) * u.uJy
         table["flags"] = np.append(1, np.zeros(count, int))
-        made.save_table(f"photometry/{name}.ecsv", table)
+        made.save_table(f"agn00/photometry/{name}.ecsv", table)
         bright = QTable({"flux_true": np.full(5, 100.0) * u.uJy})
         bright["flux"] = bright["flux_true"] * np.array([0.98, 0.99, 1.0, 1.01, 5.0])
         bright["in_field"] = np.ones(5, bool)
         bright.meta.update(f_scaling=0.9987, f_scaling_err=0.001, f_aper=1.14)
         made.save_table(f"points/{name}.ecsv", bright)
     do_stage(config, folder, "errors")
-    do_stage(config, folder, "fits", "with_miri")
-    do_stage(config, folder, "fits", "without_miri")
+    do_stage(config, folder, "matches", "agn00")
+    do_stage(config, folder, "fits", "agn00/all")
+    do_stage(config, folder, "fits", "agn00/none")
     do_stage(config, folder, "report")
     return folder / "report"
 
@@ -206,15 +207,15 @@ def test_edge_crowded_and_spurious_are_counted(reports):
         assert "<th>crowded</th><th>edge</th><th>ambiguous</th>" in page
         for name, n in metrics["n_left_out"].items():
             assert f"<td>{name.replace('_', ' ')}</td><td>{n}</td>" in page
-    fits = metrics["fits"]["with_miri"]
+    fits = metrics["fits"]["all"]
     assert fits["conditions"]["edge"]["n"] == 1
     assert fits["conditions"]["isolated"]["n"] <= fits["n"] - 1
     folder = reports["four"].parent
-    condition = np.asarray(QTable.read(folder / "fits_with_miri.ecsv")["condition"])
+    condition = np.asarray(QTable.read(folder / "agn00" / "fits_all.ecsv")["condition"])
     assert np.count_nonzero(condition & 1) == 1
     assert np.count_nonzero((condition & 7) == 0) == fits["conditions"]["isolated"]["n"]
     # every row of either catalog stands in the association once
-    table = QTable.read(folder / "association.ecsv")
+    table = QTable.read(folder / "agn00" / "association.ecsv")
     assert sorted(table["first"]) == [-1, *range(24)]
     assert sorted(table["second"]) == list(range(25))
     assert list(table["status"]).count("unmatched") == 1

@@ -304,7 +304,45 @@ def test_a_stage_is_declared_beside_its_function():
     assert make.function(1, 2) == (1, 2)
     names = [one.name for one in study_stages()]
     assert names[:3] == ["catalog", "seds", "truth"]
-    assert len(set(names)) == len(names) == 13
+    assert len(set(names)) == len(names) == 14
+
+
+def test_a_unit_depends_on_the_units_that_it_reads_only(tmp_path):
+    ran, texts = [], {"a": "1", "b": "1"}
+
+    def first(context, unit):
+        ran.append(f"first:{unit}")
+        context.save(f"{unit}/first.txt", lambda path: path.write_text(context.plan))
+
+    def second(context, unit):
+        ran.append(f"second:{unit}")
+        text = context.path(f"{unit}/first.txt").read_text()
+        context.save(f"{unit}/second.txt", lambda path: path.write_text(text))
+        other = {"a": "b", "b": "a"}[unit]
+        with pytest.raises(RuntimeError, match="without declaring"):
+            context.path(f"{other}/first.txt")
+
+    def run(units):
+        ran.clear()
+        stages = [
+            Stage("first", first, "first", units=lambda _: units, plan=lambda _, unit: texts[unit]),
+            Stage(
+                "second",
+                second,
+                "second",
+                units=lambda _: units,
+                needs={"first": lambda _, unit: (unit,)},
+            ),
+        ]
+        StudyRunner(StudyConfig(), tmp_path / "run", stages, redo=True).run()
+        return sorted(ran)
+
+    assert run("a") == ["first:a", "second:a"]
+    # a further unit leaves what stands
+    assert run("ab") == ["first:b", "second:b"]
+    texts["b"] = "2"
+    assert run("ab") == ["first:b", "second:b"]
+    assert run("ab") == []
 
 
 def test_stages_must_come_after_what_they_need(tmp_path):

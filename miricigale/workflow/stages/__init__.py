@@ -25,6 +25,7 @@ def study_stages():
         measure.measure_photometry,
         points.measure_point_sources,
         fits.make_errors,
+        fits.match_sources,
         fits.fit_photometry,
         report.make_report,
     )

@@ -10,7 +10,7 @@ from miricigale.evaluation import (
     recovery_metrics,
 )
 from miricigale.utils.tables import Flags, error_column
-from miricigale.workflow.stages.figures import band_label
+from miricigale.workflow.stages.figures import SET_LABELS, band_label
 from miricigale.workflow.stages.sample import SampleFlags
 
 __all__ = [
@@ -230,7 +230,7 @@ def write_fits(report, metrics):
     report.table(
         [
             (
-                unit.replace("_", " ").replace("miri", "MIRI"),
+                SET_LABELS[unit],
                 group,
                 found["n"],
                 number(found["photoz_sigma_mad"], ".4f", none),

@@ -1,12 +1,14 @@
 """What is exposed, and the grids that cover it, from the configuration alone."""
 
 import dataclasses
+import functools
 import math
 
 import astropy.units as u
 from astropy.coordinates import SkyCoord
 
 from miricigale.instrument import Exposure, ceers_exposures, mosaic_wcs
+from miricigale.workflow.truths import truth_names
 
 __all__ = [
     "EXPOSURE_RESOURCES",
@@ -16,11 +18,14 @@ __all__ = [
     "KERNEL",
     "band_exposures",
     "band_names",
+    "bands_of_truth",
+    "dithers_of_band",
     "exposure_memory",
     "exposure_plan",
     "exposure_units",
     "grid_of",
     "study_exposures",
+    "truth_bands",
 ]
 
 #: Sections of the configuration on which the grids of images depend, what is exposed, and kernels.
@@ -41,10 +46,15 @@ EXPOSURE_RESOURCES = (*IMAGE_RESOURCES, "instrument.etc")
 
 
 def study_exposures(config):
-    """All exposures of a configuration: unit name, ``<filter>-<dither>``, to `Exposure`."""
-    options = config.exposures
-    pointing = SkyCoord(config.pointing.ra * u.deg, config.pointing.dec * u.deg)
-    roll = config.pointing.roll * u.deg
+    """The exposures of each truth: name, ``<filter>-<dither>``, to `Exposure`."""
+    return dict(_exposures(config.pointing, config.exposures))
+
+
+@functools.lru_cache(maxsize=8)
+def _exposures(field, options):
+    """Names and exposures of two sections of a configuration."""
+    pointing = SkyCoord(field.ra * u.deg, field.dec * u.deg)
+    roll = field.roll * u.deg
     quick = options.plan == "quick"
     units = {}
     for k, name in enumerate(options.filters):
@@ -64,7 +74,7 @@ def study_exposures(config):
             exposures = [dataclasses.replace(exposure, **own) for exposure in exposures]
         for exposure in exposures:
             units[f"{name}-{exposure.dither}"] = exposure
-    return units
+    return tuple(units.items())
 
 
 def band_names(config):
@@ -73,8 +83,27 @@ def band_names(config):
 
 
 def exposure_units(config):
-    """Names of the exposures, ``<filter>-<dither>``."""
-    return tuple(study_exposures(config))
+    """Names of all exposures, ``<truth>/<filter>-<dither>``."""
+    return tuple(f"{t}/{name}" for t in truth_names(config) for name in study_exposures(config))
+
+
+def truth_bands(config):
+    """Names of the bands of all truths, ``<truth>/<filter>``."""
+    return tuple(f"{truth}/{name}" for truth in truth_names(config) for name in band_names(config))
+
+
+def bands_of_truth(config, unit):
+    """Units of `truth_bands` of the truth with which a unit begins."""
+    truth = unit.partition("/")[0]
+    return tuple(f"{truth}/{name}" for name in band_names(config))
+
+
+def dithers_of_band(config, unit):
+    """Units of `exposure_units` of a unit of `truth_bands`."""
+    truth, _, band = unit.partition("/")
+    return tuple(
+        f"{truth}/{name}" for name, e in study_exposures(config).items() if e.filter == band
+    )
 
 
 def exposure_plan(config, unit=None):
@@ -90,7 +119,7 @@ def exposure_plan(config, unit=None):
             e.roll.value,
         ]
         for name, e in study_exposures(config).items()
-        if not unit or unit in (name, e.filter)
+        if not unit or unit.rpartition("/")[2] in (name, e.filter)
     }
 
 
@@ -110,7 +139,7 @@ def exposure_memory(config, unit):
 
     Measured: 0.5 GB, and counts and flags of each group.
     """
-    exposures = study_exposures(config)
-    chosen = [e for name, e in exposures.items() if unit in (name, e.filter)]
+    name = unit.rpartition("/")[2]
+    chosen = [e for own, e in study_exposures(config).items() if name in (own, e.filter)]
     groups = max(math.prod(e.shape) * e.n_groups * e.n_integrations for e in chosen)
     return 500_000_000 + int(3.3 * groups)

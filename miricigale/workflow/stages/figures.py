@@ -26,6 +26,8 @@ from miricigale.plotting.comparison import (
 from miricigale.workflow.stages.sample import magnitude
 
 __all__ = [
+    "SET_COLORS",
+    "SET_LABELS",
     "WIDTH",
     "band_label",
     "counts_figure",
@@ -43,8 +45,14 @@ __all__ = [
 
 #: Inches across: all figures of the page are shown at one width, so that letters have one size.
 WIDTH = 10.5
-#: With and without MIRI.
-FIT_COLORS = {"with_miri": MEASURED, "without_miri": SECOND}
+#: Sets of bands: what they are called, and their colors.
+SET_LABELS = {
+    "all": "with MIRI",
+    "none": "without MIRI",
+    "blue": "with the shorter half of MIRI",
+    "red": "with the longer half of MIRI",
+}
+SET_COLORS = {"all": MEASURED, "none": SECOND, "blue": "tab:blue", "red": "tab:red"}
 
 
 def band_label(name):
@@ -197,7 +205,7 @@ def limit_figure(entries):
 
 
 def redshift_figure(truth, fits):
-    """Fitted against true redshifts, with and without MIRI."""
+    """Fitted against true redshifts, by set of bands."""
     figure, axes = new_figure(1, len(fits), size=(WIDTH / len(fits), 4.7))
     for ax, (unit, table) in zip(axes.flat, fits.items(), strict=True):
         plot_redshifts(
@@ -205,21 +213,18 @@ def redshift_figure(truth, fits):
             table["redshift_mean"],
             z_err=table["redshift_std"],
             ax=ax,
-            title=_fit_label(unit),
+            title=SET_LABELS[unit],
         )
-    axes[0, -1].set_ylabel("")
+    for ax in axes[0, 1:]:
+        ax.set_ylabel("")
     return figure
 
 
-def _fit_label(unit):
-    return unit.replace("_", " ").replace("miri", "MIRI")
-
-
 def fraction_figure(fits, frac_true):
-    """Posterior means and widths of fracAGN, with and without MIRI."""
+    """Posterior means and widths of fracAGN, by set of bands."""
     figure, axes = new_figure(1, 2, size=(WIDTH / 2, 3.6))
-    means = {_fit_label(unit): table["frac_agn_mean"] for unit, table in fits.items()}
-    widths = {_fit_label(unit): table["frac_agn_std"] for unit, table in fits.items()}
+    means = {SET_LABELS[unit]: table["frac_agn_mean"] for unit, table in fits.items()}
+    widths = {SET_LABELS[unit]: table["frac_agn_std"] for unit, table in fits.items()}
     plot_histogram(
         means,
         np.linspace(0, 1, 26),
@@ -329,8 +334,9 @@ def example_figure(results, truth, key, model):
     """
     One source: photometry with the best fit, and posteriors of redshift and AGN fraction.
 
-    ``results`` has a `~miricigale.fitting.FitResults` ``with_miri`` and one ``without_miri``, ``truth``
-    the columns ``id``, ``redshift`` and ``frac_agn``; ``model`` is that of the fits.
+    ``results`` has a `~miricigale.fitting.FitResults` for each set of bands, "all" among them; "none" is
+    drawn too if it is there. ``truth`` has the columns ``id``,
+    ``redshift`` and ``frac_agn``; ``model`` is that of the fits.
     """
     from matplotlib.figure import Figure
 
@@ -339,11 +345,11 @@ def example_figure(results, truth, key, model):
     grid = figure.add_gridspec(2, 3, height_ratios=(3, 1), width_ratios=(1.9, 1, 1))
     upper = figure.add_subplot(grid[0, 0])
     lower = figure.add_subplot(grid[1, 0], sharex=upper)
-    best = results["with_miri"][key]
+    best = results["all"][key]
     total = best.best_sed(model)
     parts = {}
-    other = results["without_miri"][key]
-    if np.isfinite(other.chi2):
+    other = results["none"][key] if "none" in results else None
+    if other is not None and np.isfinite(other.chi2):
         sed = other.best_sed(model)
         parts["best model without MIRI"] = (sed.wave, sed.fnu)
     fraction = best.best["frac_agn"].value
@@ -352,7 +358,7 @@ def example_figure(results, truth, key, model):
         galaxy = best.best_sed(model, frac_agn=0.0)
         parts["its galaxy"] = (galaxy.wave, galaxy.fnu)
         parts["its AGN"] = (total.wave, total.fnu - galaxy.fnu)
-    bands = results["with_miri"].filters
+    bands = results["all"].filters
     best.plot_sed(
         ax=(upper, lower),
         spectrum=(total.wave, total.fnu),
@@ -373,15 +379,16 @@ def example_figure(results, truth, key, model):
         (("redshift", "redshift"), ("frac_agn", "fracAGN")), start=1
     ):
         ax = figure.add_subplot(grid[:, column])
-        for unit, color in FIT_COLORS.items():
+        for unit in (name for name in ("all", "none") if name in results):
+            color = SET_COLORS[unit]
             edges, weights = results[unit][key].distribution(name)
             density = weights / np.diff(edges.value)
             if density.max() > 0:
                 density = density / density.max()
-            style = {"color": color, "lw": 1.6, "label": _fit_label(unit)}
-            if unit == "with_miri":
+            style = {"color": color, "lw": 1.6, "label": SET_LABELS[unit]}
+            if unit == "all":
                 ax.stairs(density, edges.value, fill=True, alpha=0.2, color=color)
-            ax.stairs(density, edges.value, ls="-" if unit == "with_miri" else "--", **style)
+            ax.stairs(density, edges.value, ls="-" if unit == "all" else "--", **style)
         ax.axvline(row[name], color="0.2", ls=":", lw=1.4, label="truth")
         ax.set(xlabel=label, ylim=(0, 1.25))
         if name == "redshift":

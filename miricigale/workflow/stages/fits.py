@@ -1,4 +1,4 @@
-"""Stages 12 and 13: error function, fits."""
+"""Stages 12 and 13: error function, matches, fits."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -10,46 +10,63 @@ from miricigale import evaluation, fitting, photometry, sed
 from miricigale.utils.tables import error_column
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.conditions import ConditionFlags, add_conditions, any_condition
+from miricigale.workflow.stages.exposures import bands_of_truth
 from miricigale.workflow.stages.inputs import fit_plan, sed_resources
 from miricigale.workflow.stages.sample import add_selection, in_field
+from miricigale.workflow.truths import band_sets, of_truth, reference, truth_names
 
-__all__ = ["band_photometry", "fit_photometry", "make_errors", "mock_photometry"]
+__all__ = [
+    "band_photometry",
+    "fit_photometry",
+    "fit_units",
+    "make_errors",
+    "match_sources",
+    "mock_photometry",
+]
 
 
-def band_photometry(context, bands):
-    """The photometry of all bands in one table, a row for each detection."""
+def band_photometry(context, truth, bands):
+    """The photometry of all bands of a truth in one table, a row for each detection."""
     columns = ["id", "sky", "flux", error_column("flux"), "flags"]
-    return photometry.join_bands(
-        {name: QTable.read(context.path(f"photometry/{name}.ecsv"))[columns] for name in bands}
-    )
+    tables = {n: QTable.read(context.path(f"{truth}/photometry/{n}.ecsv")) for n in bands}
+    return photometry.join_bands({name: table[columns] for name, table in tables.items()})
+
+
+class _Field:
+    """Truth, detections and the two matched: what error functions and samples are made of."""
+
+    def __init__(self, context, name):
+        config = context.config
+        bands = config.exposures.filters
+        radius = config.photometry.match_radius * u.arcsec
+        self.truth = QTable.read(context.path(f"{name}/truth.ecsv"))
+        self.detections = band_photometry(context, name, bands)
+        self.matched = evaluation.match_truth(self.truth, self.detections, bands, radius=radius)
+        self.association = evaluation.associate(self.truth, self.detections, radius=radius)
+        mosaics = [context.image(f"{name}/mosaic_{band}.fits") for band in bands]
+        self.inside = in_field(self.truth["sky"], mosaics)
+        self.detections["in_field"] = in_field(self.detections["sky"], mosaics)
+
+
+_MATCHED = {"truth": of_truth, "mosaics": bands_of_truth, "photometry": bands_of_truth}
 
 
 @stage(
     "errors",
     "error function",
-    version=2,
-    needs=("truth", "mosaics", "photometry"),
-    sections=(
-        "errors",
-        "exposures.filters",
-        "photometry.match_radius",
-        "fit.min_detected",
-        "fit.axes",
-    ),
-    plan=fit_plan,
+    version=3,
+    needs={
+        name: lambda config, _, select=select: select(config, reference(config))
+        for name, select in _MATCHED.items()
+    },
+    sections=("errors", "exposures.filters", "photometry.match_radius"),
+    plan=lambda config, _: reference(config),
 )
 def make_errors(context, _):
-    """Stage 12: match to the truth, error function of every band, sample of the fit."""
-    config = context.config
-    bands = config.exposures.filters
-    detections = band_photometry(context, bands)
-    truth = QTable.read(context.path("truth.ecsv"))
-    radius = config.photometry.match_radius * u.arcsec
-    matched = evaluation.match_truth(truth, detections, bands, radius=radius)
-    association = evaluation.associate(truth, detections, radius=radius)
-    mosaics = [context.image(f"mosaic_{name}.fits") for name in bands]
-    inside = in_field(truth["sky"], mosaics)
-    # the error function is measured with the matched sources of the field
+    """Stage 12: error function of every band, of the matched sources of the reference truth."""
+    config, bands = context.config, context.config.exposures.filters
+    field = _Field(context, context.plan)
+    matched, inside = field.matched, field.inside
     errors = photometry.ErrorModel.from_tables(
         QTable({"id": matched["id"], **{name: matched[f"{name}_true"] for name in bands}})[inside],
         matched[inside],
@@ -57,6 +74,23 @@ def make_errors(context, _):
         statistic=config.errors.statistic,
         bin_size=config.errors.bin_size,
     )
+    context.save_result("errors.ecsv", errors)
+
+
+@stage(
+    "matches",
+    "match to the truth",
+    needs={**_MATCHED, "errors": None},
+    sections=("exposures.filters", "photometry.match_radius", "fit.min_detected", "fit.axes"),
+    units=truth_names,
+    plan=fit_plan,
+)
+def match_sources(context, unit):
+    """Stage 12: each truth matched, with the errors of the error function; sample of the fit."""
+    config, bands = context.config, context.config.exposures.filters
+    field = _Field(context, unit)
+    matched, detections = field.matched, field.detections
+    errors = photometry.ErrorModel.read(context.path("errors.ecsv"))
     for name in bands:
         matched[f"{name}_formal_err"] = matched[error_column(name)]
         matched[f"{name}_extrapolated"] = errors.extrapolated(matched[name], name)
@@ -64,22 +98,21 @@ def make_errors(context, _):
     nodes = sed.SEDModel.yang2021_axes(config.fit.axes)["redshift"]
     add_selection(
         matched,
-        truth,
+        field.truth,
         bands,
-        inside=inside,
+        inside=field.inside,
         min_detected=config.fit.min_detected,
         redshifts=(nodes[0], nodes[-1]),
     )
     add_conditions(matched, bands, suffix="_true")
+    association = field.association
     detections["association"] = np.zeros(len(detections), int)
     here = np.asarray(association["second"]) >= 0
     detections["association"][association["second"][here]] = association["reasons"][here]
-    detections["in_field"] = in_field(detections["sky"], mosaics)
     add_conditions(detections, bands, detections=True)
-    context.save_table("association.ecsv", association)
-    context.save_table("photometry.ecsv", detections)
-    context.save_table("matched.ecsv", matched)
-    context.save_result("errors.ecsv", errors)
+    context.save_table(f"{unit}/association.ecsv", association)
+    context.save_table(f"{unit}/photometry.ecsv", detections)
+    context.save_table(f"{unit}/matched.ecsv", matched)
 
 
 def mock_photometry(config, truth, matched, *, seed):
@@ -104,36 +137,50 @@ def mock_photometry(config, truth, matched, *, seed):
     return table
 
 
+def fit_units(config):
+    """Names of the fits, ``<truth>/<set>``."""
+    return tuple(f"{truth}/{name}" for truth in truth_names(config) for name in config.fit.sets)
+
+
 @stage(
     "fits",
     "fit",
-    version=4,
-    needs=("truth", "errors"),
-    sections=("fit", "exposures.filters"),
+    version=5,
+    needs={"truth": of_truth, "matches": of_truth},
+    sections=(
+        "fit.bands",
+        "fit.depths",
+        "fit.axes",
+        "fit.model_error",
+        "exposures.filters",
+    ),
     resources=sed_resources,
-    plan=fit_plan,
-    units=lambda _: ("with_miri", "without_miri"),
+    plan=lambda config, unit: {
+        "axes": fit_plan(config, unit),
+        "bands": band_sets(config)[unit.partition("/")[2]],
+    },
+    units=fit_units,
     kernels=("fit",),
 )
 def fit_photometry(context, unit):
-    """Stage 13: fit the detected sources with or without MIRI."""
+    """Stage 13: fit the detected sources of a truth with a set of the MIRI bands."""
     config = context.config
-    truth = QTable.read(context.path("truth.ecsv"))
-    matched = QTable.read(context.path("matched.ecsv"))
+    name, chosen = unit.split("/")
+    truth = QTable.read(context.path(f"{name}/truth.ecsv"))
+    matched = QTable.read(context.path(f"{name}/matched.ecsv"))
     mock = mock_photometry(config, truth, matched, seed=context.seed)
-    miri = config.exposures.filters if unit == "with_miri" else ()
     fitter = fitting.BayesFitter(
         sed.SEDModel.yang2021(),
-        [*config.fit.bands, *miri],
+        [*config.fit.bands, *context.plan["bands"]],
         axes=sed.SEDModel.yang2021_axes(config.fit.axes),
         model_error=config.fit.model_error,
     )
     with ThreadPoolExecutor(context.n_threads) as executor:
         results = fitter.fit(mock, executor=executor, progress_bar=context.progress_bar)
-    context.save_result(f"fits_{unit}.fits", results)
+    context.save_result(f"{name}/fits_{chosen}.fits", results)
     table = results.to_table()
     table["condition"] = any_condition(matched, config.exposures.filters)[
         np.asarray(matched["selection"]) == 0
     ]
     table["condition"].info.description = ConditionFlags.describe()
-    context.save_table(f"fits_{unit}.ecsv", table)
+    context.save_table(f"{name}/fits_{chosen}.ecsv", table)

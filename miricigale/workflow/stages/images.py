@@ -18,12 +18,15 @@ from miricigale.workflow.stages.exposures import (
     KERNEL,
     band_exposures,
     band_names,
+    dithers_of_band,
     exposure_memory,
     exposure_plan,
     exposure_units,
     grid_of,
     study_exposures,
+    truth_bands,
 )
+from miricigale.workflow.truths import of_truth, reference
 
 __all__ = [
     "expose_and_reduce",
@@ -115,8 +118,8 @@ def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, tell=N
 @stage(
     "exposures",
     "exposure",
-    version=4,
-    needs=("truth",),
+    version=5,
+    needs={"truth": of_truth},
     sections=(*IMAGES, "run.keep_level1b"),
     resources=EXPOSURE_RESOURCES,
     units=exposure_units,
@@ -127,68 +130,70 @@ def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, tell=N
 def make_exposure(context, unit):
     """Stages 4 to 7 of one exposure: scene, ramp, rate, calibrated image."""
     config = context.config
-    exposure = study_exposures(config)[unit]
-    truth = QTable.read(context.path("truth.ecsv"))
+    truth, name = unit.split("/")
+    exposure = study_exposures(config)[name]
 
     def tell(forecast):
         log.info(forecast.describe())
-        context.save_table(f"exposures/{unit}_forecast.ecsv", depth.forecast_table([forecast]))
+        table = depth.forecast_table([forecast])
+        context.save_table(f"{truth}/exposures/{name}_forecast.ecsv", table)
 
     def keep(ramp):
-        name = f"{unit}_uncal.fits"
-        context.save_result(f"level1b/{name}", ramp, filename=name)
+        filename = f"{name}_uncal.fits"
+        context.save_result(f"{truth}/level1b/{filename}", ramp, filename=filename)
 
     rate, cal = expose_and_reduce(
         config,
         exposure,
-        truth,
+        QTable.read(context.path(f"{truth}/truth.ecsv")),
         seed=context.seed,
         n_threads=context.n_threads,
         tell=tell,
         keep=keep if config.run.keep_level1b else None,
     )
     for label, image in (("rate", rate), ("cal", cal)):
-        context.save_image(f"exposures/{unit}_{label}.fits", image, dq=image.flags)
+        context.save_image(f"{truth}/exposures/{name}_{label}.fits", image, dq=image.flags)
 
 
 @stage(
     "mosaics",
     "mosaic",
-    version=2,
-    needs=("exposures",),
+    version=3,
+    needs={"exposures": dithers_of_band},
     sections=(*GRID, "reduction", "highres.pixel_scale"),
-    units=band_names,
+    units=truth_bands,
     plan=exposure_plan,
     kernels=("images",),
 )
-def make_mosaic(context, name):
+def make_mosaic(context, unit):
     """Stage 8: drizzle the dithers of one band, on its own grid and on the prior's."""
     config = context.config
     reducer = reducer_of(config)
-    units = [unit for unit, e in study_exposures(config).items() if e.filter == name]
-    images = [context.image(f"exposures/{unit}_cal.fits") for unit in units]
+    truth, band = unit.split("/")
+    names = [name for name, e in study_exposures(config).items() if e.filter == band]
+    images = [context.image(f"{truth}/exposures/{name}_cal.fits") for name in names]
     for label, scale in (("", config.reduction.pixel_scale), ("_fine", config.highres.pixel_scale)):
         # outliers are found in the first pass, which returns the images with them masked
         drizzled, images = reducer.drizzle(images, grid_of(config, scale))
         # second pass: background that remained after subtraction from single dithers
         mosaic, _ = reducer.subtract_background(drizzled.image)
-        context.save_image(f"mosaic_{name}{label}.fits", mosaic, dq=mosaic.flags)
+        context.save_image(f"{truth}/mosaic_{band}{label}.fits", mosaic, dq=mosaic.flags)
 
 
 @stage(
     "highres",
     "high-resolution image",
-    version=2,
-    needs=("truth",),
+    version=3,
+    needs={"truth": lambda config, _: (reference(config),)},
     sections=(*GRID, "highres", "photometry.threshold", "photometry.n_pixels"),
     resources=("filters.sedpy",),
-    plan=exposure_plan,
+    plan=lambda config, _: {"exposures": exposure_plan(config), "truth": reference(config)},
     kernels=("images",),
 )
 def make_highres(context, _):
     """Stage 9: the high-resolution image, its segmentation and the detected sources."""
     config = context.config
-    truth = QTable.read(context.path("truth.ecsv"))
+    truth = QTable.read(context.path(f"{context.plan['truth']}/truth.ecsv"))
     options = config.highres
     image = scene.highres_image(
         truth,

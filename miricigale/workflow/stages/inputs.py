@@ -14,6 +14,7 @@ from miricigale.utils.random import stream
 from miricigale.utils.tables import error_column
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.stars import star_fluxes
+from miricigale.workflow.truths import study_truths, truth_names
 
 __all__ = [
     "add_agn",
@@ -191,22 +192,24 @@ def add_agn(table, frac_agn, seed):
 @stage(
     "truth",
     "model fluxes",
-    version=2,
+    version=3,
     needs=("catalog", "seds"),
-    sections=("sed.frac_agn", "sed.alpha", "exposures.filters", "fit.bands", "highres.filter"),
+    sections=("sed.alpha", "exposures.filters", "fit.bands", "highres.filter"),
     resources=sed_resources,
+    units=truth_names,
+    plan=lambda config, unit: study_truths(config)[unit].values(),
     kernels=("fit",),
 )
-def make_truth(context, _):
+def make_truth(context, name):
     """Stage 3: the best-fit SED (and its AGN) of each source through every band."""
-    config = context.config
+    config, frac_agn = context.config, context.plan["frac_agn"]
     catalog = QTable.read(context.path("catalog.ecsv"))
     best = fitting.FitResults.read(context.path("input_seds.fits")).to_table()
     parameters = QTable({"id": catalog["id"]})
     parameters["redshift"] = np.asarray(catalog["redshift"], float)
-    for name in (*GALAXY_PARAMETERS, "mass"):
-        if f"{name}_best" in best.colnames:
-            parameters[name] = best[f"{name}_best"]
+    for parameter in (*GALAXY_PARAMETERS, "mass"):
+        if f"{parameter}_best" in best.colnames:
+            parameters[parameter] = best[f"{parameter}_best"]
     if "alpha" not in parameters.colnames:
         # the bands of the fit do not show it
         low, high = config.sed.alpha
@@ -214,9 +217,9 @@ def make_truth(context, _):
             stream(context.seed, "truth", "alpha", str(key)).uniform(low, high)
             for key in parameters["id"]
         ]
-    model = sed.SEDModel.yang2021(agn=config.sed.frac_agn > 0)
-    if config.sed.frac_agn > 0:
-        add_agn(parameters, config.sed.frac_agn, context.seed)
+    model = sed.SEDModel.yang2021(agn=frac_agn > 0)
+    if frac_agn > 0:
+        add_agn(parameters, frac_agn, context.seed)
     bands = list(
         dict.fromkeys([*config.fit.bands, *config.exposures.filters, config.highres.filter])
     )
@@ -241,8 +244,8 @@ def make_truth(context, _):
     star = np.asarray(catalog["star"], bool)
     if np.any(star):
         stars = star_fluxes(catalog[star], catalog_bands(catalog), bands)
-        for name in bands:
-            light[name][star] = stars[name]
+        for band in bands:
+            light[band][star] = stars[band]
     own = {*light.colnames, *parameters.colnames}
     truth = hstack(
         [
@@ -257,4 +260,4 @@ def make_truth(context, _):
     citations = [*catalog.meta.get("citations", ()), *model.meta["citations"]]
     truth.meta.clear()
     truth.meta.update(provenance(citations=citations, stage="truth"))
-    context.save_table("truth.ecsv", truth)
+    context.save_table(f"{name}/truth.ecsv", truth)

@@ -9,8 +9,8 @@ from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.exposures import (
     IMAGE_RESOURCES,
     KERNEL,
-    band_names,
     exposure_plan,
+    truth_bands,
 )
 from miricigale.workflow.stages.images import measured_mosaic, mosaic_psf
 
@@ -42,31 +42,37 @@ def make_templates(context, _):
 @stage(
     "photometry",
     "forced photometry",
-    version=4,
-    needs=("mosaics", "highres", "kernels", "templates"),
+    version=5,
+    needs={
+        "mosaics": lambda config, unit: (unit,),
+        "highres": None,
+        "kernels": lambda config, unit: (unit.partition("/")[2],),
+        "templates": None,
+    },
     sections=(*KERNEL, "photometry.method"),
     resources=IMAGE_RESOURCES,
-    units=band_names,
+    units=truth_bands,
     plan=exposure_plan,
     kernels=("photometry",),
 )
-def measure_photometry(context, name):
+def measure_photometry(context, unit):
     """Stage 11: forced photometry of one band, on its own grid or by the steps of Yang et al. 2021."""
+    truth, name = unit.split("/")
     if context.config.photometry.method == "yang2021":
-        result = _as_yang2021(context, name)
+        result = _as_yang2021(context, truth, name)
     else:
         kernel = psf.MatchingKernel.read(context.path(f"kernel_{name}.fits"))
         # the constant absorbs the light of faint sources and of wings in the background
         result = photometry.ForcedPhotometer(
             kernel, fit_background=True, n_threads=context.n_threads
         ).measure(
-            context.image(f"mosaic_{name}.fits"),
+            context.image(f"{truth}/mosaic_{name}.fits"),
             templates=photometry.SourceTemplates.read(context.path("templates.fits")),
         )
     table = result.to_table()
-    context.save_table(f"photometry/{name}.ecsv", table)
-    context.save_image(f"photometry/{name}_model.fits", result.model_image)
-    context.save_image(f"photometry/{name}_residual.fits", result.residual_image)
+    context.save_table(f"{truth}/photometry/{name}.ecsv", table)
+    context.save_image(f"{truth}/photometry/{name}_model.fits", result.model_image)
+    context.save_image(f"{truth}/photometry/{name}_residual.fits", result.residual_image)
 
 
 def yang2021_photometer(config, name, n_threads):
@@ -80,12 +86,12 @@ def yang2021_photometer(config, name, n_threads):
     )
 
 
-def _as_yang2021(context, name):
+def _as_yang2021(context, truth, name):
     """Forced photometry of one band by the steps of Yang et al. 2021."""
     suffix, _ = measured_mosaic(context.config)
     _, labels = context.image("segm.fits", "segmentation")
     return yang2021_photometer(context.config, name, context.n_threads).measure(
-        context.image(f"mosaic_{name}{suffix}.fits"),
+        context.image(f"{truth}/mosaic_{name}{suffix}.fits"),
         context.image("f160w.fits"),
         labels.astype(np.int32),
         QTable.read(context.path("detections.ecsv")),

@@ -29,9 +29,8 @@ from miricigale.workflow.stages.conditions import (
 from miricigale.workflow.stages.exposures import band_exposures
 from miricigale.workflow.stages.sample import SampleFlags, magnitude
 
-__all__ = ["FITS", "StudyTables", "as_ceers", "as_paper", "study_metrics"]
+__all__ = ["StudyTables", "as_ceers", "as_paper", "fit_metrics", "study_metrics", "truth_metrics"]
 
-FITS = ("with_miri", "without_miri")
 #: Shares of sources detected in two or more bands, by F160W limit: Yang et al. 2021.
 PAPER_DETECTED = ((26.0, 0.53), (25.0, 0.75))
 
@@ -39,11 +38,11 @@ PAPER_DETECTED = ((26.0, 0.53), (25.0, 0.75))
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class StudyTables:
     """
-    The tables of a run, each read once.
+    The tables of one truth of a run, each read once.
 
     ``truth`` and ``matched`` (stages 3 and 12) have the same sources row by row; ``detections`` is the
     photometry of stage 12, ``errors`` the `~miricigale.photometry.ErrorModel`, ``results`` a
-    `~miricigale.fitting.FitResults` for each of `FITS` with a row for each source of the sample, and
+    `~miricigale.fitting.FitResults` for each set of bands with a row for each source of the sample, and
     ``points`` a table of bright point sources by band, empty where the check was not made.
     """
 
@@ -55,18 +54,27 @@ class StudyTables:
     points: dict
 
     @classmethod
-    def read(cls, context):
-        """Read those that the stage ``report`` sees."""
+    def read(cls, context, name):
+        """Read those of a truth; ``context`` is that of a stage, or of none."""
         config = context.config
-        names = config.exposures.filters if config.point_sources.enabled else ()
+        bands = config.exposures.filters if config.point_sources.enabled else ()
+        results = {
+            unit: fitting.FitResults.read(context.path(f"{name}/fits_{unit}.fits"))
+            for unit in config.fit.sets
+        }
         return cls(
-            QTable.read(context.path("truth.ecsv")),
-            QTable.read(context.path("matched.ecsv")),
-            QTable.read(context.path("photometry.ecsv")),
+            QTable.read(context.path(f"{name}/truth.ecsv")),
+            QTable.read(context.path(f"{name}/matched.ecsv")),
+            QTable.read(context.path(f"{name}/photometry.ecsv")),
             photometry.ErrorModel.read(context.path("errors.ecsv")),
-            {unit: fitting.FitResults.read(context.path(f"fits_{unit}.fits")) for unit in FITS},
-            {name: QTable.read(context.path(f"points/{name}.ecsv")) for name in names},
+            results,
+            {band: QTable.read(context.path(f"points/{band}.ecsv")) for band in bands},
         )
+
+    @property
+    def sample(self):
+        """Rows of the truth that were fitted."""
+        return self.truth[np.asarray(self.matched["selection"]) == 0]
 
     @functools.cached_property
     def fits(self):
@@ -175,7 +183,7 @@ def study_metrics(config, tables, area):
     """
     All numbers of the report, as plain values for ``report/metrics.json``.
 
-    ``tables`` are of a run whose other stages are done, ``area`` is the solid angle of the imaged
+    ``tables`` are those of the reference truth, ``area`` is the solid angle of the imaged
     field; NaN where there is nothing to count.
     """
     bands = config.exposures.filters
@@ -198,7 +206,7 @@ def study_metrics(config, tables, area):
         "bands": {},
         "detected": [],
         "light": _light(tables.galaxies(field=True), bands, area),
-        "fits": {},
+        "fits": fit_metrics(tables, bands),
     }
     prior = magnitude(truth[config.highres.filter])
     for limit, paper in PAPER_DETECTED:
@@ -243,11 +251,17 @@ def study_metrics(config, tables, area):
                 "f_aper": float(tables.points[name].meta.get("f_aper", np.nan)),
             }
         metrics["bands"][name] = entry
-    sample = truth[selection == 0]
+    return metrics
+
+
+def fit_metrics(tables, bands):
+    """How well redshift and fracAGN are recovered, by set of bands; ``tables`` are `StudyTables`."""
+    sample, found = tables.sample, {}
+    matched = tables.matched[np.asarray(tables.matched["selection"]) == 0]
     for unit, table in tables.fits.items():
         photoz = photoz_metrics(sample["redshift"], table["redshift_mean"])
         fraction = recovery_metrics(sample["frac_agn"], table["frac_agn_mean"])
-        metrics["fits"][unit] = {
+        found[unit] = {
             "n": photoz.n,
             "photoz_bias": photoz.bias,
             "photoz_sigma_mad": photoz.sigma_mad,
@@ -259,6 +273,12 @@ def study_metrics(config, tables, area):
             "frac_agn_sigma_mad": fraction.sigma_mad,
             "frac_agn_width": float(np.nanmedian(table["frac_agn_std"])) if len(table) else np.nan,
             "redshift_coverage": _coverage(sample["redshift"], table, "redshift"),
-            "conditions": fit_conditions(matched[selection == 0], sample["redshift"], table, bands),
+            "conditions": fit_conditions(matched, sample["redshift"], table, bands),
         }
-    return metrics
+    return found
+
+
+def truth_metrics(truth, tables, bands):
+    """Numbers of one truth (`~miricigale.workflow.truths.Truth`) as plain values."""
+    fits = fit_metrics(tables, bands)
+    return {**truth.values(), "n_sample": len(tables.sample), "fits": fits}

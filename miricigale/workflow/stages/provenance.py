@@ -194,12 +194,12 @@ def sources_to_cite(names, metas):
     return sorted(one for one in entries if not any(one != two and one in two for two in entries))
 
 
-def write_exposures(context, report, metrics):
-    """Add the section on what was exposed, and of which sources."""
+def write_exposures(context, report, metrics, truth):
+    """Add the section on what was exposed, of a truth by name, and of which sources."""
     config = context.config
     report.section("Exposures and catalog")
     forecasts = {
-        unit: QTable.read(context.path(f"exposures/{unit}_forecast.ecsv"))
+        unit: QTable.read(context.path(f"{truth}/exposures/{unit}_forecast.ecsv"))
         for unit in study_exposures(config)
     }
     ceers = {name: entry["ceers"] for name, entry in metrics["bands"].items()}

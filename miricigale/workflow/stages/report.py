@@ -15,11 +15,12 @@ from miricigale.evaluation import (
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages import conditions, figures, pictures, provenance
 from miricigale.workflow.stages.exposures import EXPOSURE_RESOURCES, GRID, exposure_plan
-from miricigale.workflow.stages.figures import band_label
+from miricigale.workflow.stages.figures import SET_LABELS, band_label
 from miricigale.workflow.stages.images import measured_mosaic
 from miricigale.workflow.stages.inputs import sed_resources
-from miricigale.workflow.stages.metrics import FITS, StudyTables, study_metrics
+from miricigale.workflow.stages.metrics import StudyTables, study_metrics, truth_metrics
 from miricigale.workflow.stages.sample import SampleFlags, footprint_area, typical_source
+from miricigale.workflow.truths import reference, study_truths
 
 __all__ = ["make_report"]
 
@@ -29,7 +30,7 @@ log = logging.getLogger(__name__)
 @stage(
     "report",
     "report",
-    version=3,
+    version=4,
     needs=(
         "catalog",
         "truth",
@@ -39,6 +40,7 @@ log = logging.getLogger(__name__)
         "photometry",
         "points",
         "errors",
+        "matches",
         "fits",
     ),
     sections=(
@@ -63,10 +65,16 @@ log = logging.getLogger(__name__)
 def make_report(context, _):
     """Stage 14: the page with its figures, and the numbers as JSON."""
     config = context.config
-    tables = StudyTables.read(context)
-    mosaics = {name: context.image(f"mosaic_{name}.fits") for name in config.exposures.filters}
+    bands, truths = config.exposures.filters, study_truths(config)
+    every = {name: StudyTables.read(context, name) for name in truths}
+    shown = reference(config)
+    tables = every[shown]
+    mosaics = {name: context.image(f"{shown}/mosaic_{name}.fits") for name in bands}
     area = footprint_area(mosaics.values())
     metrics = study_metrics(config, tables, area)
+    metrics["truths"] = {
+        name: truth_metrics(truth, every[name], bands) for name, truth in truths.items()
+    }
     if metrics["n_sample"] == 0:
         log.warning("no source is left to fit: %s", metrics["n_left_out"])
     text = json.dumps(_without_nan(metrics), indent=1, allow_nan=False)
@@ -76,19 +84,20 @@ def make_report(context, _):
         f"miricigale: {config.run.name}",
         subtitle=(
             f"{metrics['n_field']} galaxies in a MIRI field at RA {config.pointing.ra:.5f}, "
-            f"Dec {config.pointing.dec:.5f}, injected fracAGN {config.sed.frac_agn:g}, "
-            f"seed {context.seed}"
+            f"Dec {config.pointing.dec:.5f}, injected fracAGN "
+            f"{', '.join(f'{value:g}' for value in config.sed.frac_agn)}, seed {context.seed}"
         ),
         notices=provenance.stand_ins(config, model),
         dpi=config.report.dpi,
     )
-    writer = _Writer(context, report, tables, metrics, model, mosaics, area)
+    writer = _Writer(context, report, tables, metrics, model, mosaics, area, truths[shown])
     writer.summary()
-    provenance.write_exposures(context, report, metrics)
+    provenance.write_exposures(context, report, metrics, shown)
     writer.images()
     writer.photometry()
     writer.errors()
     writer.fits()
+    writer.truths(every)
     writer.inputs()
     provenance.write_origin(report, config, model, [tables.truth.meta, tables.matched.meta])
     context.save("report/index.html", lambda path: report.write(path))
@@ -108,10 +117,10 @@ NO_SAMPLE = "no source in the fit"
 
 
 class _Writer:
-    """The sections of the page; each reads the products that it shows."""
+    """The sections of the page; each reads the products that it shows, of the reference truth."""
 
-    def __init__(self, context, report, tables, metrics, model, mosaics, area):
-        self.context, self.report, self.metrics = context, report, metrics
+    def __init__(self, context, report, tables, metrics, model, mosaics, area, truth):
+        self.context, self.report, self.metrics, self.truth = context, report, metrics, truth
         self.tables, self.model, self.config = tables, model, context.config
         self.bands = context.config.exposures.filters
         self.mosaics, self.area = mosaics, area
@@ -125,7 +134,7 @@ class _Writer:
     def summary(self):
         """Headline numbers."""
         m, fits = self.metrics, self.metrics["fits"]
-        with_miri, without = (fits[unit] for unit in FITS)
+        compared = [unit for unit in ("all", "none") if unit in fits]
         self.report.section(
             "At a glance",
             "Real galaxies with known redshifts were given the mid-infrared light of their fitted "
@@ -141,10 +150,17 @@ class _Writer:
                 ),
                 ("found on the high-resolution image", m["n_matched"]),
                 (f"in the fit: {self.config.fit.min_detected}+ MIRI bands", m["n_sample"]),
-                ("photo-z outliers with MIRI", _percent(with_miri["photoz_outliers"], NO_SAMPLE)),
-                ("photo-z outliers without", _percent(without["photoz_outliers"], NO_SAMPLE)),
-                ("fracAGN offset ± scatter with MIRI", _plus_minus(with_miri)),
-                ("fracAGN offset ± scatter without", _plus_minus(without)),
+                *(
+                    (
+                        f"photo-z outliers {SET_LABELS[unit]}",
+                        _percent(fits[unit]["photoz_outliers"], NO_SAMPLE),
+                    )
+                    for unit in compared
+                ),
+                *(
+                    (f"fracAGN offset ± scatter {SET_LABELS[unit]}", _plus_minus(fits[unit]))
+                    for unit in compared
+                ),
             ]
         )
         least = m["n_bands_detected"]
@@ -205,8 +221,8 @@ class _Writer:
         suffix, _ = measured_mosaic(self.config)
         pairs = [
             (
-                self.context.image(f"mosaic_{name}{suffix}.fits"),
-                self.context.image(f"photometry/{name}_model.fits"),
+                self.context.image(f"{self.truth.name}/mosaic_{name}{suffix}.fits"),
+                self.context.image(f"{self.truth.name}/photometry/{name}_model.fits"),
             )
             for name in chosen
         ]
@@ -346,32 +362,19 @@ class _Writer:
             "Fitted against true redshift; dashed: the limits beyond which a source is an outlier.",
         )
         self.report.figure(
-            figures.fraction_figure(fits, self.config.sed.frac_agn),
+            figures.fraction_figure(fits, self.truth.frac_agn),
             "Posterior means and widths of the AGN fraction.",
         )
-        none = "no source fitted"
-        columns = {
-            "fit": lambda x: x[0].replace("_", " ").replace("miri", "MIRI"),
-            "sources": lambda x: x[1]["n"],
-            "dz/(1+z) median": lambda x: number(x[1]["photoz_bias"], "+.4f", none),
-            "sigma_MAD": lambda x: number(x[1]["photoz_sigma_mad"], ".4f", none),
-            "outliers": lambda x: x[1]["photoz_n_outliers"],
-            "share": lambda x: _percent(x[1]["photoz_outliers"], none),
-            "fracAGN offset": lambda x: number(x[1]["frac_agn_bias"], "+.3f", none),
-            "scatter": lambda x: number(x[1]["frac_agn_sigma_mad"], ".3f", none),
-            "width": lambda x: number(x[1]["frac_agn_width"], ".3f", none),
-            "z in 16-84 %": lambda x: _percent(x[1]["redshift_coverage"], none),
-        }
         self._table(
             self.metrics["fits"].items(),
-            columns,
+            FIT_COLUMNS,
             caption="Redshift and AGN fraction against truth; truths lie within the models of the "
             f"fit, whose {100 * self.config.fit.model_error:g} % model error they do not have, so "
             "posteriors are wide",
         )
         conditions.write_fits(self.report, self.metrics)
         results = self.tables.results
-        key = typical_source(sample, results["with_miri"].fitted, self.bands[-1])
+        key = typical_source(sample, results["all"].fitted, self.bands[-1])
         if key is None:
             self.report.text("No source of the sample could be fitted.")
             return
@@ -379,6 +382,30 @@ class _Writer:
             figures.example_figure(results, self.tables.truth, key, self.model),
             f"Source {key}: photometry and best models, residuals of the fit with MIRI, and the "
             "posteriors of redshift and AGN fraction with and without MIRI.",
+        )
+
+    def truths(self, every):
+        """Redshifts and AGN fractions of all truths, ``every`` with its tables by name."""
+        if len(every) < 2:
+            return
+        self.report.section(
+            "AGN of different strength",
+            "The same galaxies with an AGN of each fracAGN, drawn from the ranges of Yang et al. 2021, "
+            "each sky exposed, reduced, measured and fitted alike; errors of the fluxes are by the "
+            f"error function of fracAGN = {self.truth.frac_agn:g}.",
+        )
+        rows = [
+            (truth, (unit, fit))
+            for truth in self.metrics["truths"].values()
+            for unit, fit in truth["fits"].items()
+        ]
+        columns = {"injected fracAGN": lambda x: f"{x[0]['frac_agn']:g}"}
+        columns |= {name: lambda x, cell=cell: cell(x[1]) for name, cell in FIT_COLUMNS.items()}
+        self._table(
+            rows,
+            columns,
+            caption="Sources detected in enough MIRI bands, the same with each set of bands",
+            text=2,
         )
 
     def inputs(self):
@@ -392,7 +419,7 @@ class _Writer:
             self.report.text("No galaxy of the catalog has a model.")
             return
         figure, (faint, passive) = figures.input_figure(galaxies)
-        agn = ", AGN included," if self.config.sed.frac_agn > 0 else ""
+        agn = ", AGN included," if self.truth.frac_agn > 0 else ""
         self.report.figure(
             figure,
             f"Galaxies of the catalog. Left: luminosity of 3-1000 µm{agn} against redshift, with "
@@ -433,6 +460,26 @@ class _Writer:
             empty="The light of all galaxies together is published near 15 and 24 µm; no band of "
             "this run (F1500W, F2100W) is there.",
         )
+
+
+def _fit_columns():
+    """Columns of a table of fits: header to the cell of a set of bands and its metrics."""
+    none = "no source fitted"
+    return {
+        "fit": lambda x: SET_LABELS[x[0]],
+        "sources": lambda x: x[1]["n"],
+        "dz/(1+z) median": lambda x: number(x[1]["photoz_bias"], "+.4f", none),
+        "sigma_MAD": lambda x: number(x[1]["photoz_sigma_mad"], ".4f", none),
+        "outliers": lambda x: x[1]["photoz_n_outliers"],
+        "share": lambda x: _percent(x[1]["photoz_outliers"], none),
+        "fracAGN offset": lambda x: number(x[1]["frac_agn_bias"], "+.3f", none),
+        "scatter": lambda x: number(x[1]["frac_agn_sigma_mad"], ".3f", none),
+        "width": lambda x: number(x[1]["frac_agn_width"], ".3f", none),
+        "z in 16-84 %": lambda x: _percent(x[1]["redshift_coverage"], none),
+    }
+
+
+FIT_COLUMNS = _fit_columns()
 
 
 def _proposal(entry):
