@@ -56,7 +56,30 @@ def fitted_noise(
     """
     Noise of sources fitted on the mosaic of an exposure.
 
-    Parameters are those of `~miricigale.photometry.ErrorModel.from_exposure`, which says more.
+    Parameters
+    ----------
+    filter : str
+        One of the imaging filters.
+    time : `~astropy.units.Quantity`
+        Total exposure time.
+    background : `~astropy.units.Quantity`, optional
+        Surface brightness of sky and telescope; the low background by default.
+    size : `~astropy.units.Quantity`, optional
+        FWHM of the source (a Gaussian) before the PSF; a point by default.
+    psf : `~photutils.psf.ImagePSF`, optional
+        PSF of the exposure; `~miricigale.psf.miri_psf` by default.
+    n_integrations : int, optional
+        Ramps into which the time is divided (over all dithers).
+    frame_time : `~astropy.units.Quantity`, optional
+        Time of one frame.
+    n_dithers : int, optional
+        Positions over which the time is divided; a residual pattern averages down with them.
+    residual : str, float or None, optional
+        Fraction of the sky that stays as a fixed pattern (`~miricigale.detector.Residual`, of its
+        default correlation), or ``"etc"`` for what the exposure time calculator's limits imply.
+    mosaic : `~astropy.units.Quantity` or None, optional
+        Pixel of the drizzled mosaic (drops of a whole pixel) that is measured; None for the optimal
+        extraction from the exposures themselves.
 
     Returns
     -------
@@ -69,6 +92,14 @@ def fitted_noise(
     ------
     ValueError
         If a number is out of its range, or an integration has less than two frames.
+
+    Notes
+    -----
+    With P the share of light of each pixel and K the smearing of the mosaic, a template that is
+    fitted with equal weights to the mosaic counts each pixel of the detector with W = P * K * K,
+    normalized to sum(W P) = 1: the sky comes in with sum(W^2), the source's own photons with
+    sum(W^2 P), the pattern with sum(W_i W_j rho_ij). Ramps are fitted optimally, as in
+    `sensitivity`.
     """
     seconds = positive(time, u.s, "time")
     for name, value in (("n_integrations", n_integrations), ("n_dithers", n_dithers)):

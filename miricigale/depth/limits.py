@@ -81,7 +81,7 @@ def _extraction(radius, annulus, psf, correlation, filter):
     return np.mean(values, axis=0)
 
 
-def sensitivity(
+def aperture_noise(
     filter,
     time=1e4 * u.s,
     *,
@@ -99,10 +99,10 @@ def sensitivity(
     detector=None,
 ):
     """
-    Flux of the point source that an exposure measures with a given significance.
+    Noise and light in a circular aperture, and the flux of the point source that is measured there.
 
     Photon noise of sky, dark current and source, read noise of optimally fitted ramps, and,
-    if asked for, a residual pattern, summed in a circular aperture.
+    if asked for, a residual pattern, summed in the aperture.
 
     Parameters
     ----------
@@ -139,8 +139,12 @@ def sensitivity(
 
     Returns
     -------
-    flux : `~astropy.units.Quantity`
-        Total flux of the source, uJy.
+    values : dict
+        ``flux`` and, without the pattern, ``flux_white``; within the extraction the standard
+        deviations ``white`` of photons and read noise and ``residual`` of the pattern,
+        ``pattern``, that of a pattern of amplitude 1, and ``shot``, the variance for each uJy of
+        the source (all uJy); ``light``, the share of the source in it; ``radius`` (arcsec) and
+        ``background`` (MJy/sr).
 
     Raises
     ------
@@ -155,50 +159,6 @@ def sensitivity(
     Means over the positions of a source within a pixel. Time lost to cosmic rays, resets
     between integrations and bad pixels is not counted. Optimal extraction instead of an
     aperture: `fitted_noise`.
-
-    Examples
-    --------
-    >>> import astropy.units as u
-    >>> from miricigale.depth import sensitivity
-    >>> print(f"{sensitivity('miri.f1000w'):.2f}, {sensitivity('miri.f1000w', residual='etc'):.2f}")
-    0.32 uJy, 0.47 uJy
-    >>> short = {"n_sigma": 5, "residual": "etc", "n_dithers": 3}
-    >>> print(f"{sensitivity('miri.f1000w', 1665 * u.s, **short):.2f}")
-    0.41 uJy
-    """
-    return aperture_noise(**locals())["flux"] * u.uJy
-
-
-def aperture_noise(
-    filter,
-    time=1e4 * u.s,
-    *,
-    n_sigma=10.0,
-    aperture=None,
-    annulus=None,
-    background=None,
-    residual=None,
-    correlation=1.0,
-    n_dithers=1,
-    n_groups=None,
-    readout="FASTR1",
-    subarray="FULL",
-    psf=None,
-    detector=None,
-):
-    """
-    Work out what `sensitivity` stands on.
-
-    Parameters are those of `sensitivity`.
-
-    Returns
-    -------
-    values : dict
-        ``flux`` and, without the pattern, ``flux_white``; within the extraction the standard
-        deviations ``white`` of photons and read noise and ``residual`` of the pattern,
-        ``pattern``, that of a pattern of amplitude 1, and ``shot``, the variance for each uJy of
-        the source (all uJy); ``light``, the share of the source in it; ``radius`` (arcsec) and
-        ``background`` (MJy/sr).
     """
     setup = etc_setup(filter)
     filter = setup.filter  # with the instrument's name, if that was left out
@@ -257,6 +217,42 @@ def aperture_noise(
     }
 
 
+def sensitivity(filter, time=1e4 * u.s, *, n_sigma=10.0, residual=None, **options):
+    """
+    Flux of the point source that an exposure measures with a given significance.
+
+    Parameters
+    ----------
+    filter, time, n_sigma, residual, **options
+        As for `aperture_noise`, which says what is counted.
+
+    Returns
+    -------
+    flux : `~astropy.units.Quantity`
+        Total flux of the source, uJy.
+
+    Raises
+    ------
+    KeyError
+        If a name is not known.
+    ValueError
+        If a number is out of its range, the time is shorter than one integration or the sky
+        fills the well within it.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.depth import sensitivity
+    >>> print(f"{sensitivity('miri.f1000w'):.2f}, {sensitivity('miri.f1000w', residual='etc'):.2f}")
+    0.32 uJy, 0.47 uJy
+    >>> short = {"n_sigma": 5, "residual": "etc", "n_dithers": 3}
+    >>> print(f"{sensitivity('miri.f1000w', 1665 * u.s, **short):.2f}")
+    0.41 uJy
+    """
+    found = aperture_noise(filter, time, n_sigma=n_sigma, residual=residual, **options)
+    return found["flux"] * u.uJy
+
+
 def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=10.0, **options):
     """
     Limits of several filters beside those of the exposure time calculator.
@@ -266,7 +262,7 @@ def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=1
     filters : iterable of str, optional
         All nine imaging filters by default.
     time, n_sigma, residual, **options
-        As for `sensitivity`.
+        As for `aperture_noise`.
 
     Returns
     -------

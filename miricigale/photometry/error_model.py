@@ -178,21 +178,7 @@ class ErrorModel:
         return cls.from_depths(YANG2021_DEPTHS, fractional=fractional)
 
     @classmethod
-    def from_exposure(
-        cls,
-        filter,
-        time,
-        *,
-        background=None,
-        size=0.0 * u.arcsec,
-        psf=None,
-        n_integrations=1,
-        frame_time=2.775 * u.s,
-        fractional=0.0,
-        n_dithers=1,
-        residual=None,
-        mosaic=0.11 * u.arcsec,
-    ):
+    def from_exposure(cls, filter, time, *, fractional=0.0, **options):
         """
         Compute the noise of sources fitted on the mosaic of an exposure.
 
@@ -202,26 +188,11 @@ class ErrorModel:
             One of the imaging filters.
         time : `~astropy.units.Quantity`
             Total exposure time.
-        background : `~astropy.units.Quantity`, optional
-            Surface brightness of sky and telescope; the low background by default.
-        size : `~astropy.units.Quantity`, optional
-            FWHM of the source (a Gaussian) before the PSF; a point by default.
-        psf : `~photutils.psf.ImagePSF`, optional
-            PSF of the exposure; `~miricigale.psf.miri_psf` by default.
-        n_integrations : int, optional
-            Ramps into which the time is divided (over all dithers).
-        frame_time : `~astropy.units.Quantity`, optional
-            Time of one frame.
         fractional : float, optional
             Part of the flux that is added in quadrature.
-        n_dithers : int, optional
-            Positions over which the time is divided; a residual pattern averages down with them.
-        residual : str, float or None, optional
-            Fraction of the sky that stays as a fixed pattern (`~miricigale.detector.Residual`, of its
-            default correlation), or ``"etc"`` for what the exposure time calculator's limits imply.
-        mosaic : `~astropy.units.Quantity` or None, optional
-            Pixel of the drizzled mosaic (drops of a whole pixel) that is measured; None for the optimal
-            extraction from the exposures themselves.
+        **options
+            ``background``, ``size``, ``psf``, ``n_integrations``, ``frame_time``, ``n_dithers``,
+            ``residual`` and ``mosaic``, as for `~miricigale.depth.fitted_noise`.
 
         Returns
         -------
@@ -234,12 +205,6 @@ class ErrorModel:
 
         Notes
         -----
-        With P the share of light of each pixel and K the smearing of the mosaic, a template that is
-        fitted with equal weights to the mosaic counts each pixel of the detector with W = P * K * K,
-        normalized to sum(W P) = 1: the sky comes in with sum(W^2), the source's own photons with
-        sum(W^2 P), the pattern with sum(W_i W_j rho_ij). Ramps are fitted optimally, as in
-        `sensitivity`.
-
         Scatter of simulated, reduced and fitted point sources over these errors, nine filters at three
         depths: see ``benchmarks/exposure_errors.py`` and the guide. Galaxies have larger errors, by
         ``size`` and by what is not known of their templates (``flux_err_template`` of
@@ -248,18 +213,7 @@ class ErrorModel:
         # loads photutils, which a command that reads depths does without
         from miricigale.depth import fitted_noise
 
-        sky, photon = fitted_noise(
-            filter,
-            time,
-            background=background,
-            size=size,
-            psf=psf,
-            n_integrations=n_integrations,
-            frame_time=frame_time,
-            n_dithers=n_dithers,
-            residual=residual,
-            mosaic=mosaic,
-        )
+        sky, photon = fitted_noise(filter, time, **options)
         curve = Analytic(sky, float(fractional), photon)
         return cls({str(filter): curve}, provenance(source="exposure"))
 

@@ -88,29 +88,6 @@ def draw_photometry(grid, n, seed=1, *, noise=0.1, missing=0.0, mass=(9.5, 11.0)
     return table, truth
 
 
-def _limited(p, q, unit, level):
-    """
-    Scales that minimise chi2 with upper limits, by bisection; their variance and the terms.
-
-    ``unit`` is the model flux over the limits' sigma, shape (..., n), ``level`` the limit over it.
-    """
-
-    def slope(s):
-        u = s[..., None] * unit - level
-        return q * s - p + (np.exp(norm.logpdf(u) - norm.logsf(u)) * unit).sum(-1)
-
-    low, high = np.zeros(p.shape), np.maximum(p, 0.0) / q
-    for _ in range(120):
-        middle = 0.5 * (low + high)
-        above = slope(middle) > 0
-        low, high = np.where(above, low, middle), np.where(above, middle, high)
-    s = np.where(slope(np.zeros(p.shape)) >= 0, 0.0, high)
-    u = s[..., None] * unit - level
-    hazard = np.exp(norm.logpdf(u) - norm.logsf(u))
-    variance = 1.0 / (q + (hazard * (hazard - u) * unit**2).sum(-1))
-    return s, variance, -2.0 * norm.logsf(u).sum(-1)
-
-
 def plain(column):
     """Values of a column, luminosities for a solar mass in W."""
     unit = getattr(column, "unit", None)
