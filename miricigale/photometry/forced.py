@@ -79,7 +79,8 @@ class ForcedPhotometer:
     components : {1, 2}, optional
         With 2, sources whose template without error fits poorly are fitted once more as their template and
         a point on top of it, and stay so where chi-square is less than without the point. Column
-        ``components`` of the catalog (1 or 2) says which those are instead.
+        ``components`` of the catalog (1 or 2) says which those are instead. The point is at the catalog's
+        position, or at the center of the fitted profile if that is more than 3 sigma away.
     second_pass : bool, optional
         Whether peaks of the residual that the catalog lacks are fitted together with it, as
         points; they are listed in ``new_sources`` of the result.

@@ -1,6 +1,7 @@
 """The fits of one image: the catalog, then with what its residual shows to be lacking."""
 
 import numpy as np
+from astropy.wcs.utils import pixel_to_pixel
 
 from miricigale.photometry.arrays import local_maps
 from miricigale.photometry.diagnostics import diagnose
@@ -11,8 +12,9 @@ from miricigale.utils.units import ANGLE
 
 __all__ = ["fit_image"]
 
-#: How often positions of new sources are refined.
-_REFINED = 2
+#: How often positions of new sources are refined, and the errors by which the center of a profile
+#: differs from the catalog's position where it is taken instead.
+_REFINED, _ELSEWHERE = 2, 3.0
 
 
 def fit_image(arrays, bank, settings, catalog, grid_wcs):
@@ -119,7 +121,7 @@ class _More:
         settings, arrays, near = self._settings, self._arrays, self.catalog.near
         n = len(near)
         host = np.concatenate([np.arange(n), double, n + len(double) + np.arange(len(new_xy))])
-        all_xy = np.concatenate([self.catalog.xy[near], self.catalog.xy[near[double]], new_xy])
+        all_xy = np.concatenate([self.catalog.xy[near], self._centers(double), new_xy])
         xy = all_xy[n:]
         half = settings.mean_kernel.target.shape[0] // 2 + 1
         half = half * settings.mean_kernel.pixel_scale.to_value(ANGLE) / self._scale / 2
@@ -132,6 +134,21 @@ class _More:
         )  # fmt: skip
         fit.offset_map = self._map
         return fit
+
+    def _centers(self, double):
+        """Positions of sources: of the catalog, or of their profiles where those are surely elsewhere."""
+        xy, fitted = self.catalog.xy[self.catalog.near[double]], self.catalog.fitted[double]
+        rows = np.flatnonzero(np.isfinite(fitted["parameters"][:, 0]))
+        if len(rows):
+            center = fitted["parameters"][rows, :2]
+            place = pixel_to_pixel(self._arrays.wcs, self._grid_wcs, *xy[rows].T)
+            offset = center - np.stack(place, axis=1)
+            inverse = np.linalg.pinv(fitted["covariance"][rows, 1:3, 1:3])
+            far = np.einsum("ki,kij,kj->k", offset, inverse, offset) > _ELSEWHERE**2
+            if far.any():
+                found = pixel_to_pixel(self._grid_wcs, self._arrays.wcs, *center[far].T)
+                xy[rows[far]] = np.stack(found, axis=1)
+        return xy
 
     def refined(self, double, new_xy):
         """Positions of new sources after some fits of where they are."""

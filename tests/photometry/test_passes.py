@@ -171,6 +171,23 @@ def test_points_on_top_of_galaxies(tools, nuclei):
     assert_array_equal(table["miri.f770w_flux_point_err"], two.flux_point_err)
 
 
+def test_points_are_where_the_galaxies_are(tools, nuclei):
+    # positions of a catalog that are wrong by 30 mas are no positions of nuclei
+    rng = np.random.default_rng(3)
+    east, north = rng.normal(0, 0.03, (2, nuclei.n)) * u.arcsec
+    number = np.where((np.arange(nuclei.n) >= 8) & (np.arange(nuclei.n) < 24), 2, 1)
+    double = number == 2
+    photometer = ForcedPhotometer(tools.kernel, size_scatter=None)
+    for sky in (nuclei.sky, nuclei.sky.spherical_offsets_by(east, north)):
+        catalog = QTable({"sky": sky, "components": number})
+        result = photometer.measure(*nuclei.images, catalog)
+        ratio = result.flux_point.value[double] / nuclei.point[double]
+        assert_allclose(ratio, 1, atol=0.06)
+        assert np.std(ratio) < 0.02
+        total = nuclei.host + nuclei.point
+        assert_allclose(result.flux.value[double], total[double], rtol=0.02)
+
+
 def test_the_catalogue_says_who_has_two_components(tools, nuclei):
     number = np.where(np.arange(nuclei.n) % 2 == 0, 2, 1)
     catalog = QTable({"sky": nuclei.sky, "components": number})
