@@ -1,6 +1,7 @@
 """What photometry keeps in files: results and templates."""
 
 import dataclasses
+import json
 
 import astropy.units as u
 import numpy as np
@@ -64,7 +65,12 @@ def _write_templates(templates, path, *, overwrite=False):
 
 
 def _read_templates(path):
-    with open_parts(path, ("source-templates-2",), wanted="templates of sources") as parts:
+    wanted = "templates of sources"
+    with open_parts(path, ("source-templates-2",), wanted=wanted, earlier="META") as parts:
+        text = parts.text
+        if parts.layout is None:
+            header = parts.header
+            text = {"meta": json.loads(header["META"]), "grid": header.get("GRID")}
         columns, rows = (_columns(parts.table(name)) for name in ("sources", "layers"))
         pixels = parts.array("pixels") if "pixels" in parts else np.empty(0)
         light = [None] * len(columns["id"])
@@ -83,7 +89,7 @@ def _read_templates(path):
         fitted = not_fitted(len(light))
         for name in FITTED.names:
             fitted[name] = columns.pop(f"fitted_{name}")
-        grid = parts.text["grid"]
+        grid = text["grid"]
         return SourceTemplates(
             sky=_sky(columns),
             **columns,
@@ -91,7 +97,7 @@ def _read_templates(path):
             fitted=fitted,
             wcs=None if grid is None else text_grid(grid),
             psf=parts.array("psf") if "psf" in parts else None,
-            meta=parts.text["meta"],
+            meta=text["meta"],
         )
 
 

@@ -117,7 +117,7 @@ def write_parts(path, layout, *, text=None, arrays=None, tables=None, overwrite=
 
 
 @contextlib.contextmanager
-def open_parts(path, layouts, *, wanted, memmap=False):
+def open_parts(path, layouts, *, wanted, memmap=False, earlier=None):
     """
     Open a file that `write_parts` wrote; what is wrong with it in the ``with`` block names it.
 
@@ -131,6 +131,9 @@ def open_parts(path, layouts, *, wanted, memmap=False):
         What the file should hold, for the message, such as ``"fit results"``.
     memmap : bool, optional
         Whether arrays stay on the disk until they are used.
+    earlier : str, optional
+        Keyword of the primary header by which files from before layouts had names are known; their
+        layout is None.
 
     Yields
     ------
@@ -143,8 +146,10 @@ def open_parts(path, layouts, *, wanted, memmap=False):
         (a `KeyError`, `IndexError`, `TypeError` or `ValueError`).
     """
     with open_fits(path, wanted=wanted, memmap=memmap) as hdus:
-        layout = hdus[0].header.get("FORMAT")
-        if layout not in layouts:
+        header = hdus[0].header
+        layout = header.get("FORMAT")
+        known = layout in layouts or (layout is None and earlier is not None and earlier in header)
+        if not known:
             msg = f"{path} holds no {wanted} (no FORMAT = {layouts[0]!r} in its header)"
             raise DataError(msg)
         try:
@@ -162,19 +167,21 @@ class Parts:
     ----------
     hdus : `~astropy.io.fits.HDUList`
         The open file.
-    layout : str
+    layout : str or None
         Its layout.
 
     Attributes
     ----------
-    layout : str
+    layout : str or None
         Name and version of the layout.
+    header : `~astropy.io.fits.Header`
+        The primary header.
     text : dict
         The text, empty if there is none.
     """
 
     def __init__(self, hdus, layout):
-        self._hdus, self.layout = hdus, layout
+        self._hdus, self.layout, self.header = hdus, layout, hdus[0].header
         self._names = {hdu.name for hdu in hdus}
         self.text = {}
         if _TEXT in self._names:

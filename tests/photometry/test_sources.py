@@ -1,9 +1,11 @@
+import json
 import pickle
 
 import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
+from astropy.io import fits
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -86,6 +88,24 @@ def test_templates_come_back_bit_for_bit(scene, tmp_path, way):
         assert_array_equal(
             back.wcs.pixel_to_world_values(x, x[::-1]), high.wcs.pixel_to_world_values(x, x[::-1])
         )
+
+
+def test_files_of_the_first_layout_are_read(scene, tmp_path):
+    # text stood in the primary header, and the layout had no name
+    *_, templates, _, _, _ = scene
+    one = templates[:5]
+    one.write(tmp_path / "new.fits")
+    with fits.open(tmp_path / "new.fits") as hdus:
+        primary = fits.PrimaryHDU()
+        primary.header["META"] = json.dumps(one.meta)
+        primary.header["GRID"] = json.loads(bytes(hdus["TEXT"].data))["grid"]
+        rest = [hdu for hdu in hdus[1:] if hdu.name != "TEXT"]
+        fits.HDUList([primary, *rest]).writeto(tmp_path / "old.fits")
+    back = SourceTemplates.read(tmp_path / "old.fits")
+    assert_same(one, back)
+    assert back.meta == one.meta
+    x = np.array([0.0, 289.0])
+    assert_array_equal(*(t.wcs.pixel_to_world_values(x, x) for t in (one, back)))
 
 
 def test_one_set_of_templates_serves_all_bands(tools, scene):
