@@ -9,11 +9,11 @@ from astropy.table import QTable, Table
 
 from miricigale.cigale.names import band_filters, filter_of_band, is_line
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
-from miricigale.utils.files import unpacked_size
+from miricigale.utils.files import read_table
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
 
-__all__ = ["read_cigale_catalog", "read_table"]
+__all__ = ["read_cigale_catalog", "read_columns"]
 
 #: Values that stand for nothing, besides NaN and all below `THRESHOLD`.
 SENTINELS = (-99.0, -999.0)
@@ -72,7 +72,7 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     """
     path = Path(path)
     bands = None if bands is None else list(bands)
-    table = read_table(path, "a catalog of CIGALE")
+    table = read_columns(path, "a catalog of CIGALE")
     for name in ("id", "redshift"):
         if name not in table.colnames:
             msg = f"{path} has no column {name!r}, only {', '.join(table.colnames)}"
@@ -193,33 +193,13 @@ def _with_unit(path, table, name, default):
         raise DataError(msg) from None
 
 
-def read_table(path, wanted):
+def read_columns(path, wanted):
     """Read a table in any of CIGALE's formats; ``wanted`` says for messages what it should be."""
-    path = Path(path)
-    if not path.is_file():
-        msg = f"{path} cannot be read as {wanted}: no such file"
-        raise DataError(msg)
-    unpacked_size(path)
-    try:
-        table = Table.read(path, **_format(path))
-    except Exception as err:  # readers of different formats raise different exceptions
-        lines = str(err).strip().splitlines() or [type(err).__name__]
-        msg = f"{path} cannot be read as {wanted}: {lines[0]}"
-        raise DataError(msg) from err
-    table.convert_bytestring_to_unicode()
-    return table
-
-
-def _format(path):
-    suffixes = [s.lower() for s in path.suffixes]
-    if {".fits", ".fit"} & set(suffixes[-2:]):
-        return {"format": "fits"}
-    if suffixes and suffixes[-1] in (".xml", ".vot", ".votable"):
-        return {"format": "votable"}
-    with open(path, encoding="utf-8") as handle:
-        first = next((line for line in handle if line.strip()), "")
-    if first.startswith("# %ECSV"):
-        return {"format": "ascii.ecsv"}
-    if first.startswith("#") and "id" in first.strip("# \n").split():
-        return {"format": "ascii.commented_header"}
-    return {"format": "ascii"}
+    form, head = None, b""
+    if Path(path).is_file():
+        with open(path, "rb") as stream:
+            head = stream.read(65536).strip()
+    first = head.partition(b"\n")[0].decode(errors="replace")
+    if first.startswith("#") and "id" in first.strip("# \r").split():
+        form = "ascii.commented_header"
+    return read_table(path, wanted=wanted, cls=Table, form=form)

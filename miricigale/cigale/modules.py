@@ -6,7 +6,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.cigale.catalog import read_table
+from miricigale.cigale.catalog import read_columns
 from miricigale.cigale.ini import parse_values
 from miricigale.cigale.names import cigale_names
 from miricigale.refdata import find_resource
@@ -162,7 +162,7 @@ def _plain(kind, **options):
 
 def _sfhfromfile(m):
     path = m.folder / m.text("filename")
-    table = read_table(path, "a star-formation history")
+    table = read_columns(path, "a star-formation history")
     rates = QTable()
     for i, name in enumerate(table.colnames):
         unit = table[name].unit or (u.Myr if i == 0 else u.Msun / u.yr)

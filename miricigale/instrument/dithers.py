@@ -7,11 +7,10 @@ from pathlib import Path
 
 import astropy.units as u
 import numpy as np
-from astropy.io.registry import IORegistryError
-from astropy.table import QTable, Table
+from astropy.table import Table
 
 from miricigale.utils.exceptions import DataError, argument_error, unknown_name
-from miricigale.utils.files import unpacked_size
+from miricigale.utils.files import read_table, unpacked_size
 from miricigale.utils.tables import require_columns
 from miricigale.utils.units import ANGLE, to_array
 
@@ -183,12 +182,7 @@ def read_dithers(path, *, observation=None):
     unpacked_size(path)
     if path.suffix.lower() == ".pointing":
         return _read_pointings(path, observation)
-    try:
-        table = QTable.read(path, format={".ecsv": "ascii.ecsv"}.get(path.suffix.lower()))
-    except (IORegistryError, OSError, ValueError, TypeError) as err:
-        msg = f"{path} cannot be read as a table: {str(err).splitlines()[0]}"
-        raise DataError(msg) from err
-    return _table_offsets(table, path.name)
+    return _table_offsets(read_table(path, wanted="a table"), path.name)
 
 
 def _read_pointings(path, observation):

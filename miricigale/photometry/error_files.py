@@ -5,7 +5,7 @@ import dataclasses
 from miricigale.photometry.error_calibration import ErrorCalibration
 from miricigale.photometry.error_model import ErrorModel
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import read_ecsv
+from miricigale.utils.files import read_table
 from miricigale.utils.store import replacing
 from miricigale.utils.unified import register
 
@@ -20,7 +20,7 @@ def write_ecsv(table, path, *, overwrite=False):
 
 def _reader(make, wanted):
     def read(path):
-        table = read_ecsv(path, wanted=wanted)
+        table = read_table(path, wanted=wanted, form="ascii.ecsv")
         try:
             return make(table)
         except (TypeError, ValueError) as err:

@@ -1,7 +1,5 @@
 """Forced photometry: all sources of a catalog fitted at once, with templates."""
 
-import concurrent.futures
-import contextlib
 import dataclasses
 import numbers
 import os
@@ -25,7 +23,7 @@ from miricigale.photometry.sky_noise import warn_of_background
 from miricigale.photometry.sources import SourceTemplates
 from miricigale.psf import KernelField
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
-from miricigale.utils.parallel import single_threaded, thread_count
+from miricigale.utils.parallel import single_threaded, thread_count, threads
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
 
 __all__ = ["ForcedPhotometer"]
@@ -276,7 +274,7 @@ class ForcedPhotometer:
         meta = {"template": templates.meta.get("template", self.template)}
         name = image.meta.get("filter", image.meta.get("FILTER"))
         meta |= {} if name is None else {"filter": str(name)}
-        with self._executor() as executor:
+        with threads(self.n_threads) as executor, single_threaded():
             bank = place.bank(rows.near, templates, executor)
             found = fit_image(arrays, bank, self, rows, place.grid(templates))
             result = package(*found, rows, meta)
@@ -315,19 +313,13 @@ class ForcedPhotometer:
         near = templates[place.near]
         self._check_grid(near)
         model = np.zeros(arrays.flux.shape)
-        with self._executor() as executor:
+        with threads(self.n_threads) as executor, single_threaded():
             bank = place.bank(place.near, near, executor)
             values = flux[place.near][bank.order]
             for block in bank.blocks():
                 some = values[block.first : block.last]
                 _core.add_model(model, block.values, block.box, block.start, some)
         return model / arrays.area * SURFACE_BRIGHTNESS
-
-    @contextlib.contextmanager
-    def _executor(self):
-        """Threads to work with, None for one alone; linear algebra keeps to one each."""
-        with concurrent.futures.ThreadPoolExecutor(self.n_threads) as pool, single_threaded():
-            yield pool if self.n_threads > 1 else None
 
     def _rows(self, sources, place, templates):
         """The catalog as the fit takes it, and the templates of its sources that are near."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from miricigale.photometry.grids import open_map
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
-from miricigale.utils.files import open_fits, unpacked_size
+from miricigale.utils.files import read_table
 from miricigale.utils.tables import unique_ids
 
 __all__ = ["check_labels", "labels_at", "read_catalog", "read_prior"]
@@ -149,7 +149,7 @@ def read_catalog(path):
     from astropy.coordinates import SkyCoord
     from astropy.table import QTable
 
-    table = _read_table(path)
+    table = read_table(path, wanted="a catalog (FITS, ECSV, CSV or a plain table)")
     names = {name.lower(): name for name in table.colnames}
 
     def first(choices):
@@ -173,35 +173,6 @@ def read_catalog(path):
     if key is None:
         _log.info("%s has no ids; its rows are counted from 1", path)
     return QTable({"id": unique_ids(ids, f"catalog {path}"), "sky": position})
-
-
-def _read_table(path):
-    from pathlib import Path
-
-    from astropy.table import QTable
-
-    if not Path(path).is_file():
-        msg = f"no catalog {path}"
-        raise DataError(msg)
-    with open(path, "rb") as stream:
-        start = stream.read(9)
-    name = str(path).lower()
-    fits = start.startswith(b"SIMPLE") or name.endswith((".fits", ".fits.gz", ".fit"))
-    try:
-        if fits:
-            with open_fits(path, wanted="a catalog") as hdus:
-                return QTable.read(hdus, format="fits", character_as_bytes=False)
-        unpacked_size(path)
-        if start.startswith(b"# %ECSV"):
-            return QTable.read(path, format="ascii.ecsv")
-        form = "ascii.csv" if name.endswith((".csv", ".csv.gz")) else "ascii"
-        return QTable.read(path, format=form)
-    except DataError:
-        raise
-    except (OSError, TypeError, ValueError) as err:
-        reason = (str(err).strip().splitlines() or [type(err).__name__])[0]
-        msg = f"{path} cannot be read as a catalog (FITS, ECSV, CSV or a plain table): {reason}"
-        raise DataError(msg) from err
 
 
 def _degrees(column, name, path):

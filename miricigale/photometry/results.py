@@ -335,8 +335,6 @@ class ForcedPhotometryResult:
         """
         from miricigale.plotting.images import plot_model_residual
 
-        model = self.model_image.data
-        scale = float(self.meta.get("pixel_scale", 1.0))
-        return plot_model_residual(
-            self.residual_image.data + model, model, ax=ax, pixel_scale=scale, **kwargs
-        )
+        model, residual = self.model_image.data, self.residual_image
+        scale = pixel_scale(residual.wcs)
+        return plot_model_residual(residual.data + model, model, ax=ax, pixel_scale=scale, **kwargs)

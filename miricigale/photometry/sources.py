@@ -1,6 +1,5 @@
 """What sources look like on a high-resolution image: made once, used for every band."""
 
-import concurrent.futures
 import dataclasses
 from typing import ClassVar
 
@@ -20,7 +19,7 @@ from miricigale.photometry.sky_noise import warn_of_sky
 from miricigale.photometry.wcs_text import grid_text, text_grid
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
-from miricigale.utils.parallel import single_threaded, thread_count
+from miricigale.utils.parallel import single_threaded, threads
 from miricigale.utils.tables import unique_ids
 from miricigale.utils.unified import read_write
 from miricigale.utils.units import ANGLE
@@ -177,13 +176,12 @@ class SourceTemplates:
         if known.label is not None:
             check_labels(known.label, labels_at(segments, xy)[0], "catalog['label']")
         label, flags = own_segments(segments, known.label, xy)
-        n_threads = thread_count(n_threads)
-        with concurrent.futures.ThreadPoolExecutor(n_threads) as pool, single_threaded():
+        with threads(n_threads) as executor, single_threaded():
             light, more, snr, fitted = cutouts(
                 FineImage(fine.flux, fine.sigma**2, psf, scale), segments, label, xy,
                 select=template == "auto", wings=wings,
                 min_snr=min_snr if template == "auto" else 0.0,
-                executor=pool if n_threads > 1 else None,
+                executor=executor,
             )  # fmt: skip
         return cls(
             **known.kept(), light=light, flags=flags | more, snr=snr, fitted=fitted, wcs=highres.wcs, psf=psf,

@@ -6,7 +6,6 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
-from astropy.io.registry import IORegistryError
 from astropy.table import QTable, Table
 from astropy.units import UnitsWarning
 
@@ -14,7 +13,7 @@ from miricigale.filters import Filter
 from miricigale.profiles import SERSIC_INDEX_RANGE
 from miricigale.refdata import locate, resources
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import unpacked_size
+from miricigale.utils.files import read_table
 from miricigale.utils.tables import Flags, error_column, require_columns, unique_ids
 from miricigale.utils.units import FNU
 
@@ -226,14 +225,7 @@ def read_catalog(path):
         known = ", ".join(key for key in sorted(resources()) if key.startswith("catalog."))
         msg = f"no catalog {name!r}: neither a file nor one of {known}"
         raise DataError(msg)
-    unpacked_size(path)
-    plain = path.name.removesuffix(".gz")
-    form = {".ecsv": "ascii.ecsv", ".fits": "fits", ".fit": "fits"}.get(Path(plain).suffix.lower())
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", UnitsWarning)
-            table = QTable.read(path, format=form)
-    except (IORegistryError, OSError, ValueError, TypeError, UnitsWarning) as err:
-        msg = f"{path} cannot be read as a table: {str(err).splitlines()[0]}"
-        raise DataError(msg) from err
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UnitsWarning)
+        table = read_table(path, wanted="a table")
     return check_catalog(table, argument=path.name)

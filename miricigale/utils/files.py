@@ -22,7 +22,7 @@ __all__ = [
     "conf",
     "image_unit",
     "open_fits",
-    "read_ecsv",
+    "read_table",
     "split_extension",
     "unpacked_size",
     "write_fits",
@@ -362,11 +362,19 @@ def write_fits(hdus, path, *, overwrite=False):
         hdus.writeto(path, overwrite=overwrite, output_verify="exception")
 
 
-def read_ecsv(path, *, wanted):
+def read_table(path, *, wanted, cls=QTable, form=None):
     """
-    Read an ECSV table, or say which file could not be read as what.
+    Read a table in any of the usual formats, or say which file could not be read as what.
 
-    Parameters are those of `open_fits`.
+    Parameters
+    ----------
+    path, wanted
+        As for `open_fits`.
+    cls : type, optional
+        Class of the table.
+    form : str, optional
+        Format by `astropy.table.Table.read`. By default content and suffix tell: FITS, VOTable,
+        ECSV, CSV or plain text.
 
     Returns
     -------
@@ -375,16 +383,35 @@ def read_ecsv(path, *, wanted):
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
-        If the file is missing or no ECSV table.
+        If the file is missing or no such table.
     """
     # astropy would take text for the table itself
     if not Path(path).is_file():
         raise _unreadable(path, wanted, "no such file")
     unpacked_size(path)
     try:
-        return QTable.read(path, format="ascii.ecsv")
-    except (OSError, TypeError, ValueError) as err:
+        form = _table_format(path) if form is None else form
+        if form == "fits":
+            with open_fits(path, wanted=wanted) as hdus:
+                return cls.read(hdus, format=form, character_as_bytes=False)
+        return cls.read(path, format=form)
+    except DataError:
+        raise
+    except Exception as err:  # readers of different formats raise different exceptions
         raise _unreadable(path, wanted, err) from err
+
+
+def _table_format(path):
+    with open(path, "rb") as stream:
+        start = stream.read(9)
+    suffix = Path(Path(path).name.lower().removesuffix(".gz")).suffix
+    if start.startswith(b"SIMPLE") or suffix in (".fits", ".fit"):
+        return "fits"
+    if suffix in (".xml", ".vot", ".votable"):
+        return "votable"
+    if start.startswith(b"# %ECSV") or suffix == ".ecsv":
+        return "ascii.ecsv"
+    return "ascii.csv" if suffix == ".csv" else "ascii"
 
 
 @contextlib.contextmanager
@@ -418,5 +445,5 @@ def writing(path):
 def _unreadable(path, wanted, err):
     if isinstance(err, FileNotFoundError):
         err = "no such file"
-    lines = str(err).splitlines() or [type(err).__name__]
+    lines = str(err).strip().splitlines() or [type(err).__name__]
     return DataError(f"{path} cannot be read as {wanted}: {lines[0]}")

@@ -117,10 +117,6 @@ def extract(
     filter_type="conv",
     deblend_n_thresholds=32,
     deblend_contrast=0.005,
-    clean=True,
-    clean_param=1.0,
-    segmentation=True,
-    pixel_stack=None,
 ):
     """
     Detect sources as Source Extractor does.
@@ -144,20 +140,13 @@ def extract(
         applies to the signal-to-noise of the filtered image.
     deblend_n_thresholds, deblend_contrast : optional
         Source Extractor's DEBLEND_NTHRESH and DEBLEND_MINCONT (1 turns deblending off).
-    clean, clean_param : optional
-        Source Extractor's CLEAN and CLEAN_PARAM.
-    segmentation : bool, optional
-        Whether the segmentation map is returned.
-    pixel_stack : int, optional
-        Size of sep's buffer of detected pixels; by default the number of pixels of the
-        image or sep's present value, whichever is larger (it never overflows).
 
     Returns
     -------
     objects : `~numpy.ndarray`
         sep's structured array.
     segmentation : `~numpy.ndarray` of int32, shape (ny, nx)
-        Label i + 1 for object i; only if asked for.
+        Label i + 1 for object i.
 
     Raises
     ------
@@ -185,9 +174,8 @@ def extract(
     options = {}
     if not (isinstance(filter_kernel, str) and filter_kernel == "default"):
         options["filter_kernel"] = None if filter_kernel is None else native(filter_kernel)
-    wanted = max(data.size, sep.get_extract_pixstack()) if pixel_stack is None else pixel_stack
-    if sep.get_extract_pixstack() != int(wanted):
-        sep.set_extract_pixstack(int(wanted))
+    # sep's buffer of detected pixels never overflows
+    sep.set_extract_pixstack(max(data.size, sep.get_extract_pixstack()))
     return sep.extract(
         data,
         float(threshold),
@@ -197,8 +185,6 @@ def extract(
         filter_type=filter_type,
         deblend_nthresh=int(deblend_n_thresholds),
         deblend_cont=float(deblend_contrast),
-        clean=bool(clean),
-        clean_param=float(clean_param),
-        segmentation_map=bool(segmentation),
+        segmentation_map=True,
         **options,
     )

@@ -12,13 +12,14 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import QTable
 
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import (
     conf,
     image_unit,
     open_fits,
-    read_ecsv,
+    read_table,
     unpacked_size,
     writing,
 )
@@ -28,6 +29,25 @@ def test_a_good_file_is_open(tmp_path):
     fits.PrimaryHDU(np.arange(6)).writeto(tmp_path / "a.fits")
     with open_fits(tmp_path / "a.fits", wanted="an image", memmap=False) as hdus:
         assert hdus[0].data.tolist() == list(range(6))
+
+
+def read_ecsv(path, wanted):
+    return read_table(path, wanted=wanted, form="ascii.ecsv")
+
+
+@pytest.mark.parametrize("name", ["t.fits", "t.fits.gz", "t.xml", "t.ecsv", "t.csv", "t.txt"])
+def test_tables_are_told_by_content_and_name(tmp_path, name):
+    table = QTable({"id": [1, 2], "name": ["a", "b"], "x": [1.5, 2.5]})
+    kind = {"t.xml": "votable", "t.txt": "ascii"}.get(name)
+    table.write(tmp_path / name, format=kind)
+    if name in ("t.fits", "t.ecsv"):
+        (tmp_path / name).rename(tmp_path / "t.other")
+        name = "t.other"
+    back = read_table(tmp_path / name, wanted="a table")
+    assert isinstance(back, QTable)
+    assert back.colnames == table.colnames
+    for column in table.colnames:
+        assert np.asarray(back[column]).tolist() == np.asarray(table[column]).tolist()
 
 
 @pytest.mark.parametrize("reader", [open_fits, read_ecsv])

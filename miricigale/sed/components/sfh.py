@@ -10,8 +10,8 @@ from astropy.table import QTable, Table
 from miricigale.sed import _core
 from miricigale.sed.component import Component, register
 from miricigale.sed.parameter import Parameter
-from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import unpacked_size
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.files import read_table
 from miricigale.utils.units import to_array
 
 __all__ = [
@@ -225,16 +225,7 @@ def _read(table):
         return QTable(table, copy=False)
     if not isinstance(table, (str, os.PathLike)):
         raise argument_error("table", "an astropy table or a path", type(table).__name__)
-    if not os.path.isfile(table):
-        msg = f"{table} cannot be read as a star-formation history: no such file"
-        raise DataError(msg)
-    unpacked_size(table)
-    try:
-        return QTable.read(table)
-    except Exception as err:  # readers of all formats raise as they like
-        lines = str(err).strip().splitlines() or [type(err).__name__]
-        msg = f"{table} cannot be read as a star-formation history: {lines[0]}"
-        raise DataError(msg) from err
+    return read_table(table, wanted="a star-formation history")
 
 
 def _bins(table):
