@@ -1,7 +1,7 @@
 """Tables on disk, read by pieces of rows: FITS binary tables, ECSV and CSV."""
 
 import abc
-import csv
+import gc
 import hashlib
 import io
 import json
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from astropy.table import QTable
+from astropy.table import QTable, Table
 
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits, unpacked_size
@@ -222,12 +222,17 @@ class _FitsRows(RowFile):
             return QTable.read(part, character_as_bytes=False)
 
 
-class _TextRows(RowFile):
-    """Rows of text; a row may go over several lines within quotes."""
+class _ECSVRows(RowFile):
+    """
+    Rows of ECSV; a row may go over several lines within quotes.
+
+    The pieces that `astropy.io.ascii` makes by itself end anywhere in the text, also within quotes,
+    have rows that nobody counted, and are of formats without a header of types.
+    """
 
     @cached_property
     def _index(self):
-        """Header as lines, where each piece starts (bytes), number of rows."""
+        """Header, where each piece starts (bytes), number of rows."""
         header, starts, n_rows, here = [], [], 0, 0
         n_open, names_read = 0, False
         with open(self.path, "rb") as stream:
@@ -235,60 +240,60 @@ class _TextRows(RowFile):
                 begin, here = here, here + len(line)
                 if n_open == 0 and (not line.strip() or line.startswith(b"#")):
                     if not names_read:
-                        header.append(line.decode())
-                    continue
-                if not names_read:
-                    header.append(line.decode())
+                        header.append(line)
+                elif not names_read:
+                    header.append(line)
                     names_read = True
-                    continue
-                if n_open == 0:
-                    if n_rows % self.chunk_rows == 0:
-                        starts.append(begin)
-                    n_rows += 1
-                n_open = (n_open + line.count(b'"')) % 2
+                else:
+                    if n_open == 0:
+                        if n_rows % self.chunk_rows == 0:
+                            starts.append(begin)
+                        n_rows += 1
+                    n_open = (n_open + line.count(b'"')) % 2
         if not names_read:
             msg = f"{self.path} has no line of column names"
             raise DataError(msg)
-        starts.append(here)
-        return header, starts, n_rows
+        return b"".join(header), [*starts, here], n_rows
 
     @property
     def n_rows(self):
         return self._index[2]
 
-    def _text(self, start):
-        starts = self._index[1]
-        i = start // self.chunk_rows
-        if i + 1 >= len(starts):
-            return ""
-        with open(self.path, "rb") as stream:
-            stream.seek(starts[i])
-            return stream.read(starts[i + 1] - starts[i]).decode()
-
     @property
     def _header(self):
-        return "".join(self._index[0])
+        return self._index[0]
 
     @cached_property
     def colnames(self):
-        *header, names = [line for line in self._index[0] if line.strip()]
-        comma = self.path.suffix.lower() == ".csv" or "# delimiter: ','\n" in header
-        row = next(csv.reader([names], delimiter="," if comma else " "))
-        return tuple(name.strip() for name in row)
+        return tuple(self._parse(b"").colnames)
+
+    def _piece(self, start):
+        """The text of a piece, in bytes."""
+        starts = self._index[1]
+        i = start // self.chunk_rows
+        if i + 1 >= len(starts):
+            return b""
+        with open(self.path, "rb") as stream:
+            stream.seek(starts[i])
+            return stream.read(starts[i + 1] - starts[i])
 
     def _is_foreign(self, name, start, stop):
         del name, stop
-        return not self._text(start).isascii()
+        return not self._piece(start).isascii()
+
+    def _parse(self, rows):
+        # a file, for astropy asks of text whether it is a URL, and urllib keeps what it was asked
+        table = QTable.read(io.BytesIO(self._header + rows), format="ascii.ecsv")
+        # what astropy read with is a cycle that holds the text of every field
+        gc.collect()
+        return table
 
     def _read(self, start, stop):
-        return QTable.read(self._header + self._text(start), format="ascii.ecsv")
+        del stop
+        return self._parse(self._piece(start))
 
 
-class _ECSVRows(_TextRows):
-    """ECSV, whose header says what the columns are."""
-
-
-class _CSVRows(_TextRows):
+class _CSVRows(_ECSVRows):
     """CSV, whose columns are what all of their rows can be read as."""
 
     def __init__(self, path, chunk_rows, units):
@@ -297,36 +302,19 @@ class _CSVRows(_TextRows):
 
     @cached_property
     def _header(self):
-        kinds = ["bool"] * len(self.colnames)
+        """Header of ECSV."""
+        names, kinds = self._index[0], {}
         for i in range(self.n_chunks):
-            rows = list(csv.reader(io.StringIO(self._text(self.span(i)[0]))))
-            for j, column in enumerate(zip(*rows, strict=False)):
-                kinds[j] = _kind(kinds[j], [value for value in column if value.strip()])
+            text = io.BytesIO(names + self._piece(self.span(i)[0]))
+            for column in Table.read(text, format="ascii.csv").itercols():
+                kinds[column.name] = min(kinds.get(column.name, "i"), column.dtype.kind)
         lines = ["# %ECSV 1.0", "# ---", "# delimiter: ','", "# datatype:"]
-        for name, kind in zip(self.colnames, kinds, strict=True):
+        for name, kind in kinds.items():
             unit = self._units(name)
-            about = {"name": name, "datatype": kind} | ({} if unit is None else {"unit": unit})
-            lines.append(f"# - {json.dumps(about)}")
-        names = io.StringIO()
-        csv.writer(names, lineterminator="\n").writerow(self.colnames)
-        return "\n".join([*lines, names.getvalue()])
+            about = {"name": name, "datatype": _KINDS[kind]}
+            lines.append(f"# - {json.dumps(about | ({} if unit is None else {'unit': unit}))}")
+        return "\n".join([*lines, ""]).encode() + names
 
 
-_KINDS = ("bool", "int64", "float64", "string")
-
-
-def _kind(kind, values):
-    """Return the first kind, from ``kind`` on, that all of these texts can be read as."""
-    for name in _KINDS[_KINDS.index(kind) :]:
-        if name == "string":
-            break
-        if name == "bool":
-            if set(values) <= {"True", "False"}:
-                return name
-            continue
-        try:
-            np.array(values, dtype=str).astype(name)
-        except (ValueError, OverflowError):
-            continue
-        return name
-    return "string"
+#: Types of columns, any text first, in the order of the letters.
+_KINDS = {"U": "string", "f": "float64", "i": "int64"}

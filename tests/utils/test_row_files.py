@@ -1,0 +1,62 @@
+"""Tables on disk in pieces of rows: the rows of the whole table, and the memory of one piece."""
+
+import tracemalloc
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable, Table
+
+from miricigale.utils.row_files import open_rows
+
+
+@pytest.fixture
+def table():
+    rng = np.random.default_rng(1)
+    n = 4000
+    columns = {f"c{i}": rng.normal(size=n) * u.uJy for i in range(10)}
+    return QTable({"id": [f'"n"\n{i}' for i in range(n)], **columns})
+
+
+def units(name):
+    return None if name == "id" else "uJy"
+
+
+@pytest.mark.parametrize("suffix", ["fits", "ecsv", "csv"])
+def test_pieces_are_the_rows_of_the_table(table, tmp_path, suffix):
+    path = tmp_path / f"t.{suffix}"
+    Table(table).write(path)
+    rows = open_rows(path, 300, units=units)
+    assert (rows.n_rows, rows.n_chunks, rows.colnames) == (4000, 14, tuple(table.colnames))
+    for i in (13, 0, 6):
+        piece = rows.chunk(i)
+        for name in table.colnames:
+            want = table[name][slice(*rows.span(i))]
+            np.testing.assert_array_equal(np.asarray(piece[name]), np.asarray(want))
+            assert getattr(piece[name], "unit", None) == getattr(want, "unit", None)
+
+
+@pytest.mark.parametrize("suffix", ["fits", "ecsv", "csv"])
+def test_pieces_that_were_read_take_no_memory(table, tmp_path, suffix):
+    path = tmp_path / f"t.{suffix}"
+    Table(table).write(path)
+    rows = open_rows(path, 500, units=units)
+    rows.chunk(0)
+    tracemalloc.start()
+    try:
+        for i in range(rows.n_chunks):
+            rows.chunk(i)
+        # a piece is 100 kB of text; each that is kept would take as much at least
+        assert tracemalloc.get_traced_memory()[0] < 200_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_column_of_csv_is_what_all_of_its_rows_can_be(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("id,a,b,c\n1,1,,2\nn2,2,,2.5\n")
+    pieces = [open_rows(path, 1).chunk(i) for i in range(2)]
+    assert [str(piece["id"][0]) for piece in pieces] == ["1", "n2"]
+    kinds = [[piece[name].dtype.kind for name in piece.colnames] for piece in pieces]
+    assert kinds == [list("Uiif"), list("Uiif")]
+    assert all(np.ma.is_masked(piece["b"][0]) for piece in pieces)
