@@ -22,8 +22,8 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.fitting import BayesFitter, fit_file, open_results
-from miricigale.fitting.streaming import write_rows
 from miricigale.sed import SEDModel
+from miricigale.utils.row_files import write_rows
 
 BANDS = ["megacam.u", "acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1", "irac.ch2"]
 BANDS += ["miri.f770w", "miri.f1000w", "miri.f1500w", "miri.f2100w"]

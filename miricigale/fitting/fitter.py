@@ -337,7 +337,12 @@ class BayesFitter:
         """
         return self._fit_rows(
             photometry,
-            {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs},
+            {
+                "redshift": redshift,
+                "redshift_prior": redshift_prior,
+                "pairs": pairs,
+                "stacklevel": 4,
+            },
             seed=seed,
             chunk_size=chunk_size,
             executor=executor,
@@ -353,7 +358,7 @@ class BayesFitter:
         if not (_is_number(chunk_size, np.integer) and chunk_size >= 1):
             raise argument_error("chunk_size", "an integer >= 1", repr(chunk_size))
         seed = None if self.engine == "grid" else check_seed(seed)
-        pairs = options.pop("pairs", None)
+        pairs = options.pop("pairs")
         data, known, settings = self._prepare(photometry, **options, repeated=repeated)
         task = self.backend.task(pairs, seed, known)
         # the measured errors take no part, and what goes to other processes is kept small
@@ -369,20 +374,24 @@ class BayesFitter:
         settings |= {} if seed is None else {"seed": seed}
         return self._finish(results, data, settings)
 
-    def _prepare(self, photometry, *, redshift=None, redshift_prior=None, repeated=None):
-        """Photometry with flags, what is known of the redshift of every object, and the settings."""
+    def _prepare(self, photometry, *, redshift, redshift_prior, stacklevel, repeated=None):
+        """
+        Photometry with flags, what is known of the redshift of every object, and the settings.
+
+        ``stacklevel`` is that of the warnings; None for none.
+        """
         require_columns(photometry, [], "photometry")
         if redshift is not None and redshift_prior is not None:
             msg = "'redshift' and 'redshift_prior' must not be given both"
             raise ValueError(msg)
         filters = self._fitted_bands(photometry)
         unused = unused_bands(photometry, filters)
-        if unused and self.filters is None:
+        if unused and self.filters is None and stacklevel is not None:
             # who names the bands knows that others are left out
             warnings.warn(
                 f"bands of the photometry that the grid lacks are not fitted: {', '.join(unused)}",
                 MiricigaleWarning,
-                stacklevel=4,
+                stacklevel=stacklevel,
             )
         columns = [self._error_bands.index(name) for name in filters]
         data = read_photometry(
@@ -484,7 +493,7 @@ class BayesFitter:
             raise argument_error("n_draws", "an integer >= 1", repr(n_draws))
         seed = check_seed(seed)
         data, known, settings = self._prepare(
-            photometry, redshift=redshift, redshift_prior=redshift_prior
+            photometry, redshift=redshift, redshift_prior=redshift_prior, stacklevel=3
         )
         samples = self.backend.sample(
             data, known, int(n_draws), seed, executor=executor, progress_bar=progress_bar

@@ -56,10 +56,11 @@ def write_results(results, path, *, overwrite=False):
     write_parts(path, _RESULTS, text=text, tables={"RESULTS": Table(full)}, overwrite=overwrite)
 
 
-def read_results(path):
-    """Read results; see `~miricigale.fitting.FitResults`."""
-    with open_parts(path, (_RESULTS, *_OLD_RESULTS), wanted="fit results") as parts:
-        text, table = parts.text, parts.table("RESULTS")
+def read_results(path, *, rows=None):
+    """Read results, all or these rows (a list or array); see `~miricigale.fitting.FitResults`."""
+    layouts, some = (_RESULTS, *_OLD_RESULTS), rows is not None
+    with open_parts(path, layouts, wanted="fit results", memmap=some) as parts:
+        text, table = parts.text, parts.table("RESULTS", rows=rows)
         n = len(table)
         columns = {
             name: native(table[name]).reshape(n, *shape)

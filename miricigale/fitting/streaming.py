@@ -1,45 +1,30 @@
 """Fits of catalogs larger than memory: from file to file, in pieces that a later call goes on from."""
 
-import functools
+import contextlib
 import importlib.metadata
-import io
 import json
 import logging
 import os
-import warnings
-from pathlib import Path
 
 import astropy.units as u
 import numpy as np
-from astropy.io import fits
-from astropy.table import vstack
 
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.likelihood import read_ids
-from miricigale.fitting.results import FitResults
+from miricigale.fitting.result_files import FORMAT, FitFolder, open_results, part_ids, part_name
 from miricigale.utils.content import content_sha256
-from miricigale.utils.exceptions import (
-    DataError,
-    MiricigaleWarning,
-    OtherResultsError,
-    argument_error,
-    unknown_name,
-)
-from miricigale.utils.files import open_fits
-from miricigale.utils.folder import RecordFolder
+from miricigale.utils.exceptions import OtherResultsError, argument_error
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed
 from miricigale.utils.row_files import open_rows
-from miricigale.utils.store import native, plain_value, replacing
+from miricigale.utils.store import plain_value
 from miricigale.utils.tables import ascii_ids, error_column, require_columns
 from miricigale.utils.units import FNU
 
-__all__ = ["FitResultsFiles", "fit_file", "open_results"]
+__all__ = ["fit_file"]
 
 logger = logging.getLogger(__name__)
 
-_FORMAT = "miricigale-fitparts-2"
-_OLD_FORMAT = "miricigale-fitparts-1"
 _PACKAGES = ("miricigale", "numpy", "numba", "astropy")
 
 
@@ -125,7 +110,7 @@ def fit_file(
     if not isinstance(fitter, BayesFitter):
         raise argument_error("fitter", "a BayesFitter", type(fitter).__name__)
     if not isinstance(path_in, (str, os.PathLike)):
-        raise argument_error("path_in", "the path of a catalogue", type(path_in).__name__)
+        raise argument_error("path_in", "the path of a catalog", type(path_in).__name__)
     if fitter.engine != "grid":
         if seed is None:
             raise argument_error("seed", "given for a sampler, so that it can go on", "None")
@@ -137,32 +122,35 @@ def fit_file(
     if unit is not None and not unit.is_equivalent(FNU):
         msg = f"'flux_unit' must be convertible to {FNU}, got {unit}"
         raise u.UnitsError(msg)
-    fluxes = {c for name in fitter.bands for c in (name, error_column(name))}
-    unit_text = None if unit is None else unit.to_string()
-    rows = open_rows(
-        path_in, chunk_rows, hdu=hdu, units=lambda name: unit_text if name in fluxes else None
-    )
+    rows = open_rows(path_in, chunk_rows, hdu=hdu)
     options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
+    fluxes = {c for name in fitter.bands for c in (name, error_column(name))}
     inputs = _Inputs(rows, options, unit, fluxes)
     _check_ids(rows)
-    job = _job(fitter, rows, options | {"seed": seed}, {"hdu": hdu, "flux_unit": unit_text})
-    with _FitFolder(path_out) as folder:
+    given = {"hdu": hdu, "flux_unit": None if unit is None else unit.to_string()}
+    job = _job(fitter, rows, options | {"seed": seed}, given)
+    with FitFolder(path_out) as folder:
         _begin(folder, job, resume)
         _fit_parts(fitter, inputs, folder, seed, executor, progress_bar)
     return open_results(path_out, model=fitter.model)
 
 
+@contextlib.contextmanager
+def _noted(rows, i):
+    """Tell the rows of a piece with what is wrong in it."""
+    try:
+        yield
+    except ValueError as err:
+        start, stop = rows.span(i)
+        err.add_note(f"in rows {start} to {stop - 1} of {rows.path}")
+        raise
+
+
 def _check_ids(rows):
     """Refuse ids that parts cannot hold before the first is fitted, not when it is written."""
-    if "id" not in rows.colnames:
-        return
-    for i in rows.foreign_chunks("id"):
-        try:
+    for i in rows.foreign_chunks("id") if "id" in rows.colnames else ():
+        with _noted(rows, i):
             ascii_ids(read_ids(rows.chunk(i)), "photometry")
-        except ValueError as err:
-            start, stop = rows.span(i)
-            err.add_note(f"in rows {start} to {stop - 1} of {rows.path}")
-            raise
 
 
 def _fit_parts(fitter, inputs, folder, seed, executor, progress_bar):
@@ -171,38 +159,28 @@ def _fit_parts(fitter, inputs, folder, seed, executor, progress_bar):
     seen, n_new = set(), 0
     with progress(show=progress_bar, total=rows.n_rows, desc="fit", unit="obj") as bar:
         for i in range(rows.n_chunks):
-            start, stop = rows.span(i)
-            name = _part_name(i)
+            name = part_name(i)
             if name in folder.records and folder.is_whole(name):
-                seen.update(_keys(_part_ids(folder.path(name))))
+                keys = _keys(part_ids(folder.path(name)))
             else:
                 if name in folder.records:
                     logger.warning("%s is damaged and is made again", folder.path(name))
-                table, options = inputs.take(i)
-                with warnings.catch_warnings():
-                    if n_new:
-                        # what is true of all pieces was said of the first
-                        text = "bands of the photometry"
-                        warnings.filterwarnings("ignore", text, MiricigaleWarning)
-                    try:
-                        keys = _keys(read_ids(table))
-                        repeated = np.array([key in seen for key in keys], dtype=bool)
-                        results = fitter._fit_rows(
-                            table, options, seed=seed, repeated=repeated, executor=executor
-                        )
-                    except (ValueError, u.UnitsError) as err:
-                        err.add_note(f"in rows {start} to {stop - 1} of {rows.path}")
-                        raise
+                with _noted(rows, i):
+                    table, options = inputs.take(i)
+                    keys = _keys(read_ids(table))
+                    repeated = np.array([key in seen for key in keys], dtype=bool)
+                    # what is true of all pieces is said of the first, to the caller of fit_file
+                    options["stacklevel"] = None if n_new else 5
+                    results = fitter._fit_rows(
+                        table, options, seed=seed, repeated=repeated, executor=executor
+                    )
                 n_new += 1
-                folder.save(name, lambda path, results=results: results.write(path))
-                folder.finish(
-                    name,
-                    "",
-                    {name: folder.describe(name)},
-                    rows=len(results),
-                    fitted=int(np.count_nonzero(results.fitted)),
-                )
-                seen.update(keys)
+                folder.save(name, results.write)
+                n_fitted = int(np.count_nonzero(results.fitted))
+                product = {name: folder.describe(name)}
+                folder.finish(name, "", product, rows=len(results), fitted=n_fitted)
+            seen.update(keys)
+            start, stop = rows.span(i)
             bar.update(stop - start)
     logger.info("%s: %d parts, %d of them new", folder.folder, rows.n_chunks, n_new)
 
@@ -216,86 +194,40 @@ class _Inputs:
     """The pieces of a catalog, and of what was given beside it."""
 
     def __init__(self, rows, options, unit, fluxes):
-        self.rows, self.unit, self.fluxes = rows, unit, fluxes
-        self.options = dict(options)
-        redshift, prior = options["redshift"], options["redshift_prior"]
-        n = rows.n_rows
-        self.by_row = redshift is not None and not isinstance(redshift, str) and np.ndim(redshift)
-        if isinstance(redshift, (list, tuple)):
-            # rows are taken from it by number
-            self.options["redshift"] = np.array(redshift)
-        if self.by_row and np.shape(redshift) != (n,):
-            raise argument_error("redshift", f"{n} values", f"shape {np.shape(redshift)}")
-        self.prior_by_row = False
+        self.rows, self.unit, self.fluxes, self.options = rows, unit, fluxes, options
+        self.redshift = _beside("redshift", options["redshift"], 1, rows.n_rows)
+        prior = options["redshift_prior"]
         if prior is not None:
             if isinstance(prior, str) or len(prior) != 2:
                 raise argument_error("redshift_prior", "redshifts and densities", repr(prior))
-            density = prior[1]
-            self.prior_by_row = not isinstance(density, str) and np.ndim(density) == 2
-            if self.prior_by_row and len(density) != n:
-                raise argument_error("redshift_prior", f"{n} rows", f"{len(density)}")
-            if isinstance(density, (list, tuple)):
-                self.options["redshift_prior"] = (prior[0], np.array(density))
+            self.nodes = prior[0]
+            self.density = _beside("redshift_prior", prior[1], 2, rows.n_rows)
 
     def take(self, i):
         """Piece ``i``: table, and the arguments of `fit` that go with it."""
-        table = self.rows.chunk(i)
-        if self.unit is not None:
-            for name in self.fluxes.intersection(table.colnames):
-                if table[name].unit is None:
-                    table[name] = table[name] * self.unit
-        piece = slice(*self.rows.span(i))
-        options = dict(self.options)
-        if self.by_row:
-            options["redshift"] = options["redshift"][piece]
+        table, piece = self.rows.chunk(i), slice(*self.rows.span(i))
+        for name in self.fluxes.intersection(table.colnames) if self.unit is not None else ():
+            if table[name].unit is None:
+                table[name].unit = self.unit
+        options = self.options | {"redshift": self.redshift(piece)}
         if options["redshift_prior"] is not None:
-            nodes, density = options["redshift_prior"]
+            density = self.density(piece)
             if isinstance(density, str):
                 require_columns(table, [density], "photometry")
                 density = table[density]
-            elif self.prior_by_row:
-                density = density[piece]
-            options["redshift_prior"] = (nodes, density)
+            options["redshift_prior"] = (self.nodes, density)
         return table, options
 
 
-# ------------------------------------------------------------------- folder and manifest
-
-
-class _FitFolder(RecordFolder):
-    """Folder of the parts of a fit: each a record of one file, the fit itself in the facts."""
-
-    purpose = "fit"
-    lock_name = "fit.lock"
-    records_name = "parts"
-    remedy = "results of fit_file need a folder of their own"
-
-    def parse(self, values):
-        """Facts and records; those of the layout before say sizes and checksums by themselves."""
-        facts, parts = super().parse(values)
-        facts["job"]["catalogue"]["rows"], facts["job"]["chunk_rows"]
-        if facts["format"] == _OLD_FORMAT:
-            parts = {
-                name: {
-                    "hash": "",
-                    "rows": part["rows"],
-                    "fitted": part["fitted"],
-                    "products": {name: {key: part[key] for key in ("sha256", "bytes")}},
-                }
-                for name, part in parts.items()
-            }
-        return facts | {"format": _FORMAT}, parts
-
-
-def _part_name(i):
-    """File name of part ``i``."""
-    return f"part-{i:05d}.fits"
-
-
-def _part_ids(path):
-    """Ids of a part, read without the rest."""
-    with open_fits(path, wanted="fit results", memmap=True) as hdus:
-        return native(np.array(hdus["RESULTS"].data["ids"]))
+def _beside(argument, value, ndim, n):
+    """Function of a slice of n rows: what was given for them, or for all (text, fewer dimensions)."""
+    if isinstance(value, str) or np.ndim(value) < ndim:
+        return lambda piece: value
+    if len(value) != n:
+        raise argument_error(argument, f"{n} values", f"shape {np.shape(value)}")
+    # rows are taken from it by number
+    value = np.array(value) if isinstance(value, (list, tuple)) else value
+    return lambda piece: value[piece]
 
 
 def _job(fitter, rows, options, given):
@@ -321,17 +253,24 @@ def _job(fitter, rows, options, given):
 def _begin(folder, job, resume):
     """Keep the parts of this fit, or remove those of another if ``resume`` is not set."""
     job = json.loads(json.dumps(job, default=plain_value))
+    versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
     # a call that failed before its first part leaves nothing to keep
     if resume and folder.records:
         other = _differences(folder.facts["job"], job)
         if other:
             msg = f"{folder.folder} holds results of another fit: {', '.join(other)} differ"
-            raise OtherResultsError(msg, "resume=False to replace them")
+            remedy = "resume=False to replace them"
+            begun = folder.facts["versions"]["miricigale"]
+            if begun != versions["miricigale"]:
+                remedy += (
+                    f" (they are of miricigale {begun}, whose settings may have other names: that "
+                    "version can go on, and open_results(path, partial=True) reads them)"
+                )
+            raise OtherResultsError(msg, remedy)
         return
     for key in list(folder.records):
         folder.drop(key)
-    versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
-    folder.facts = {"format": _FORMAT, "versions": versions, "job": job}
+    folder.facts = {"format": FORMAT, "versions": versions, "job": job}
     folder.write_manifest()
 
 
@@ -347,223 +286,3 @@ def _differences(old, new, prefix=""):
     # checksums say less than settings
     told = [name for name in out if name.split(".")[0] != "fitter"]
     return told or out
-
-
-# ----------------------------------------------------------------------- results in files
-
-
-def open_results(path, *, partial=False, model=None):
-    """
-    Open the results that `fit_file` wrote.
-
-    Parameters
-    ----------
-    path : path-like
-        The folder.
-    partial : bool, optional
-        Whether a folder in which parts are missing is opened too.
-    model : `~miricigale.sed.SEDModel`, optional
-        The model the grid was made from, for spectra of the best fits.
-
-    Returns
-    -------
-    results : `FitResultsFiles`
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If the folder holds no such results, or parts are missing.
-    """
-    results = FitResultsFiles(path, model=model)
-    if not (partial or results.complete):
-        msg = (
-            f"{path} holds {len(results.paths)} of {results.n_parts} parts: fit_file with the "
-            "same arguments goes on; partial=True opens what is there"
-        )
-        raise DataError(msg)
-    return results
-
-
-class FitResultsFiles:
-    """
-    Results of a fit in files, of which one part at a time is in memory.
-
-    Made by `fit_file` and `open_results`. It has as many elements as objects, in the order of
-    the catalog: iterating gives the `FitResults` of each object, ``[id]`` those of an id.
-
-    Parameters
-    ----------
-    path : path-like
-        The folder.
-    model : `~miricigale.sed.SEDModel`, optional
-        The model the grid was made from.
-    """
-
-    def __init__(self, path, *, model=None):
-        self.path = Path(path)
-        self.model = model
-        folder = _FitFolder(path)
-        if not folder.facts:
-            msg = f"{path} holds no results of fit_file (no manifest)"
-            raise DataError(msg)
-        #: What was fitted, and how.
-        self.job = folder.facts["job"]
-        self.n_parts = max(1, -(-self.job["catalogue"]["rows"] // self.job["chunk_rows"]))
-        parts = folder.records
-        names = [_part_name(i) for i in range(self.n_parts)]
-        self.paths = tuple(self.path / name for name in names if name in parts)
-        for item in self.paths:
-            if not item.is_file():
-                msg = f"{self.path} has lost {item.name}, which its manifest names"
-                raise DataError(msg)
-        self._records = tuple(parts[item.name] for item in self.paths)
-        self._kept = functools.lru_cache(maxsize=1)(self._read)
-
-    def __repr__(self):
-        n = sum(record["fitted"] for record in self._records)
-        state = "" if self.complete else f" of {self.n_parts}"
-        return (
-            f"<FitResultsFiles of {len(self)} objects, {n} fitted, "
-            f"{len(self.paths)}{state} parts in {self.path}>"
-        )
-
-    def __len__(self):
-        return sum(record["rows"] for record in self._records)
-
-    @property
-    def complete(self):
-        """Whether all parts are there."""
-        return len(self.paths) == self.n_parts
-
-    def _read(self, path):
-        return FitResults.read(path)._changed(model=self.model)
-
-    def parts(self):
-        """Iterate over the parts: one `FitResults` at a time."""
-        return map(self._read, self.paths)
-
-    def __iter__(self):
-        for part in self.parts():
-            yield from part
-
-    def __getitem__(self, key):
-        """Return the results of the object with this id (the first, if it occurs twice)."""
-        key = key.item() if isinstance(key, np.generic) else key
-        for path in self.paths:
-            # only the ids are read until the part is found
-            if key in _part_ids(path).tolist():
-                return self._kept(path)[key]
-        msg = f"no object with the id {key!r} among {len(self)}"
-        raise KeyError(msg)
-
-    def to_table(self, columns=None):
-        """
-        Results as one table; see `FitResults.to_table`.
-
-        Parameters
-        ----------
-        columns : list of str, optional
-            Columns to keep, all by default; memory is needed for these only.
-
-        Returns
-        -------
-        table : `~astropy.table.QTable`
-        """
-        tables = list(self._tables(columns))
-        meta = tables[0].meta
-        for table in tables:
-            table.meta = {}
-        out = tables[0] if len(tables) == 1 else vstack(tables, join_type="exact")
-        out.meta.update(meta)
-        return out
-
-    def _tables(self, columns):
-        if not self.paths:
-            msg = f"{self.path} holds no part yet"
-            raise DataError(msg)
-        for part in self.parts():
-            table = part.to_table()
-            for name in columns or ():
-                if name not in table.colnames:
-                    raise unknown_name("column", name, table.colnames)
-            yield table if columns is None else table[list(columns)]
-
-    def write_table(self, path, *, columns=None, overwrite=False):
-        """
-        Write the table of all results to one FITS file, a part at a time.
-
-        Parameters
-        ----------
-        path : path-like
-            The file.
-        columns : list of str, optional
-            Columns to write, all by default.
-        overwrite : bool, optional
-            Whether a file that is there is replaced.
-
-        Raises
-        ------
-        OSError
-            If the file is there and ``overwrite`` is not set.
-        """
-        # parts may have ids of different lengths
-        width = max((_part_ids(item).dtype.itemsize for item in self.paths), default=0)
-        write_rows(path, self._tables(columns), len(self), id_width=width, overwrite=overwrite)
-
-
-def write_rows(path, tables, n_rows, *, id_width=0, overwrite=False):
-    """
-    Write tables of the same columns as one FITS table, one at a time.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    tables : iterable of `~astropy.table.Table`
-        At least one.
-    n_rows : int
-        Rows of all.
-    id_width : int, optional
-        Bytes of the longest text in the columns ``id``, four a character.
-    overwrite : bool, optional
-        Whether a file that is there is replaced.
-    """
-    layout, n_bytes = None, 0
-    with replacing(path, overwrite=overwrite) as partial, open(partial, "wb") as stream:
-        for table in tables:
-            header, rows = _fits_rows(table, id_width)
-            columns = [header[f"TFORM{i + 1}"] for i in range(header["TFIELDS"])]
-            if layout is None:
-                layout = columns
-                header["NAXIS2"] = n_rows
-                for part in (fits.PrimaryHDU().header, header):
-                    stream.write(part.tostring().encode("ascii"))
-            elif columns != layout:
-                msg = "the parts have different columns"
-                raise DataError(msg)
-            n_bytes += stream.write(rows)
-        stream.write(bytes(-n_bytes % 2880))
-
-
-def _fits_rows(table, id_width):
-    """Header and rows of a table as astropy writes it, ids that are text as wide as told."""
-    if "id" in table.colnames and table["id"].dtype.kind == "U":
-        about = table["id"].info.description
-        table["id"] = np.asarray(table["id"]).astype(f"U{max(1, id_width // 4)}")
-        table["id"].info.description = about
-    meta, table.meta = dict(table.meta), {}
-    for key, value in meta.items():
-        if key == "citations":
-            key, value = "cite", "; ".join(value)
-        # headers hold no dicts
-        plain = isinstance(value, (str, int, float, bool))
-        table.meta[key] = value if plain else json.dumps(value, default=plain_value)
-    file = io.BytesIO()
-    with warnings.catch_warnings():
-        # FITS does not know dex; astropy does when it reads the table
-        warnings.filterwarnings("ignore", "The unit 'dex' could not be saved in native FITS")
-        table.write(file, format="fits")
-    data = file.getvalue()
-    with fits.open(io.BytesIO(data)) as hdus:
-        header, start = hdus[1].header.copy(), hdus[1].fileinfo()["datLoc"]
-    return header, data[start : start + header["NAXIS1"] * header["NAXIS2"]]

@@ -1,10 +1,11 @@
-"""Tables on disk, read by pieces of rows: FITS binary tables, ECSV and CSV."""
+"""Tables on disk by pieces of rows: FITS binary tables, ECSV and CSV are read, FITS is written."""
 
 import abc
 import gc
 import hashlib
 import io
 import json
+import warnings
 from functools import cached_property
 from pathlib import Path
 
@@ -14,11 +15,12 @@ from astropy.table import QTable, Table
 
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits, unpacked_size
+from miricigale.utils.store import plain_value, replacing
 
-__all__ = ["RowFile", "open_rows"]
+__all__ = ["RowFile", "open_rows", "write_rows"]
 
 
-def open_rows(path, chunk_rows, *, hdu=None, units=None):
+def open_rows(path, chunk_rows, *, hdu=None):
     """
     Open a table that is to be read in pieces.
 
@@ -30,9 +32,6 @@ def open_rows(path, chunk_rows, *, hdu=None, units=None):
         Rows in a piece.
     hdu : int or str, optional
         Extension of a FITS file; the only table by default.
-    units : callable, optional
-        Called with the name of a column of a CSV file, which knows no units; returns the text of
-        its unit, or None.
 
     Returns
     -------
@@ -63,7 +62,7 @@ def open_rows(path, chunk_rows, *, hdu=None, units=None):
     if start.startswith(b"# %ECSV"):
         return _ECSVRows(path, int(chunk_rows))
     if path.suffix.lower() == ".csv" and not packed:
-        return _CSVRows(path, int(chunk_rows), units or (lambda name: None))
+        return _CSVRows(path, int(chunk_rows))
     why = "unpack it first" if packed else "write it as FITS (a binary table) or ECSV"
     msg = f"{path} cannot be read as a table in pieces of rows: {why}"
     raise DataError(msg)
@@ -296,10 +295,6 @@ class _ECSVRows(RowFile):
 class _CSVRows(_ECSVRows):
     """CSV, whose columns are what all of their rows can be read as."""
 
-    def __init__(self, path, chunk_rows, units):
-        super().__init__(path, chunk_rows)
-        self._units = units
-
     @cached_property
     def _header(self):
         """Header of ECSV."""
@@ -310,11 +305,73 @@ class _CSVRows(_ECSVRows):
                 kinds[column.name] = min(kinds.get(column.name, "i"), column.dtype.kind)
         lines = ["# %ECSV 1.0", "# ---", "# delimiter: ','", "# datatype:"]
         for name, kind in kinds.items():
-            unit = self._units(name)
-            about = {"name": name, "datatype": _KINDS[kind]}
-            lines.append(f"# - {json.dumps(about | ({} if unit is None else {'unit': unit}))}")
+            lines.append(f"# - {json.dumps({'name': name, 'datatype': _KINDS[kind]})}")
         return "\n".join([*lines, ""]).encode() + names
 
 
 #: Types of columns, any text first, in the order of the letters.
 _KINDS = {"U": "string", "f": "float64", "i": "int64"}
+
+
+def write_rows(path, tables, n_rows, *, id_width=0, overwrite=False):
+    """
+    Write tables of the same columns as one FITS table, one at a time.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    tables : iterable of `~astropy.table.Table`
+        At least one.
+    n_rows : int
+        Rows of all.
+    id_width : int, optional
+        Bytes of the longest text in the columns ``id``, four a character.
+    overwrite : bool, optional
+        Whether a file that is there is replaced.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the columns of two tables differ.
+    OSError
+        If the file is there and ``overwrite`` is not set.
+    """
+    layout, n_bytes = None, 0
+    with replacing(path, overwrite=overwrite) as partial, open(partial, "wb") as stream:
+        for table in tables:
+            header, rows = _fits_rows(table, id_width)
+            columns = [*header["TFORM*"].values()]
+            if layout is None:
+                layout, header["NAXIS2"] = columns, n_rows
+                for part in (fits.PrimaryHDU().header, header):
+                    stream.write(part.tostring().encode("ascii"))
+            elif columns != layout:
+                msg = "the parts have different columns"
+                raise DataError(msg)
+            n_bytes += stream.write(rows)
+        stream.write(bytes(-n_bytes % 2880))
+
+
+def _fits_rows(table, id_width):
+    """Header and rows of a table as astropy writes it, ids that are text as wide as told."""
+    if "id" in table.colnames and table["id"].dtype.kind == "U":
+        about = table["id"].info.description
+        table["id"] = np.asarray(table["id"]).astype(f"U{max(1, id_width // 4)}")
+        table["id"].info.description = about
+    meta, table.meta = dict(table.meta), {}
+    for key, value in meta.items():
+        if key == "citations":
+            key, value = "cite", "; ".join(value)
+        # headers hold no dicts
+        plain = isinstance(value, (str, int, float, bool))
+        table.meta[key] = value if plain else json.dumps(value, default=plain_value)
+    file = io.BytesIO()
+    with warnings.catch_warnings():
+        # FITS does not know dex; astropy does when it reads the table
+        warnings.filterwarnings("ignore", "The unit 'dex' could not be saved in native FITS")
+        table.write(file, format="fits")
+    data = file.getvalue()
+    with fits.open(io.BytesIO(data)) as hdus:
+        header, start = hdus[1].header.copy(), hdus[1].fileinfo()["datLoc"]
+    return header, data[start : start + header["NAXIS1"] * header["NAXIS2"]]

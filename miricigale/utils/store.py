@@ -200,11 +200,15 @@ class Parts:
         data.flags.writeable = False
         return data
 
-    def table(self, name, cls=None):
-        """Table by name (a `~astropy.table.Table`, or another class of tables), its meta empty."""
+    def table(self, name, cls=None, *, rows=None):
+        """Table by name (a `~astropy.table.Table`, or another class), or these rows; its meta empty."""
+        from astropy.io import fits
         from astropy.table import Table
 
-        table = (cls or Table).read(self._hdus[name], character_as_bytes=False)
+        hdu = self._hdus[name]
+        if rows is not None:
+            hdu = fits.BinTableHDU(hdu.data[rows], header=hdu.header)
+        table = (cls or Table).read(hdu, character_as_bytes=False)
         table.meta.clear()
         return table
 

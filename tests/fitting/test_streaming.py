@@ -18,7 +18,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable
 
-from helpers.results import assert_joined
+from helpers.results import assert_joined, assert_same
 from miricigale.fitting import BayesFitter, FitFlags, FitResults, fit_file, open_results
 from miricigale.utils.exceptions import DataError
 
@@ -277,6 +277,23 @@ def test_parts_of_another_fit_are_refused(fitter, grid, catalogue, tmp_path):
     assert_joined(results.parts(), fitter.fit(catalogue))
 
 
+def test_parts_of_another_version_are_refused_with_what_to_do(fitter, catalogue, tmp_path):
+    path, out = tmp_path / "catalogue.fits", tmp_path / "out"
+    catalogue.write(path)
+    fit_file(fitter, path, out)
+    old_manifest(out)
+    manifest = json.loads((out / "manifest.json").read_text())
+    manifest["versions"]["miricigale"] = "0.1"
+    manifest["job"]["settings"]["former"] = 1
+    (out / "manifest.json").write_text(json.dumps(manifest))
+    match = r"settings.former differ; give another folder, or resume=False .* of miricigale 0.1, "
+    with pytest.raises(
+        ValueError, match=match + r".*open_results\(path, partial=True\) reads them"
+    ):
+        fit_file(fitter, path, out)
+    assert len(open_results(out, partial=True)) == 150
+
+
 def test_a_call_that_failed_at_once_binds_no_other(fitter, catalogue, tmp_path):
     path, out = tmp_path / "catalogue.csv", tmp_path / "out"
     catalogue.write(path)
@@ -297,6 +314,11 @@ def test_results_are_read_as_if_they_were_one(fitter, catalogue, tmp_path):
     assert [item.ids for item in results] == catalogue["id"].tolist()
     key = catalogue["id"][90]
     assert results[key].best["mass"] == whole[key].best["mass"]
+    # across parts, in any order
+    rows = np.array([100, 3, 41, 40, 149, 3])
+    for chosen in (rows, rows.tolist(), slice(10, 95, 7), np.arange(150) % 9 == 0, []):
+        want = whole[chosen]
+        assert_same(results[chosen], want)
     with pytest.raises(KeyError, match="no object with the id 'nobody' among 150"):
         results["nobody"]
     wanted = whole.to_table()

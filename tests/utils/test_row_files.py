@@ -18,29 +18,26 @@ def table():
     return QTable({"id": [f'"n"\n{i}' for i in range(n)], **columns})
 
 
-def units(name):
-    return None if name == "id" else "uJy"
-
-
 @pytest.mark.parametrize("suffix", ["fits", "ecsv", "csv"])
 def test_pieces_are_the_rows_of_the_table(table, tmp_path, suffix):
     path = tmp_path / f"t.{suffix}"
     Table(table).write(path)
-    rows = open_rows(path, 300, units=units)
+    rows = open_rows(path, 300)
     assert (rows.n_rows, rows.n_chunks, rows.colnames) == (4000, 14, tuple(table.colnames))
     for i in (13, 0, 6):
         piece = rows.chunk(i)
         for name in table.colnames:
             want = table[name][slice(*rows.span(i))]
             np.testing.assert_array_equal(np.asarray(piece[name]), np.asarray(want))
-            assert getattr(piece[name], "unit", None) == getattr(want, "unit", None)
+            if suffix != "csv":
+                assert piece[name].unit == want.unit
 
 
 @pytest.mark.parametrize("suffix", ["fits", "ecsv", "csv"])
 def test_pieces_that_were_read_take_no_memory(table, tmp_path, suffix):
     path = tmp_path / f"t.{suffix}"
     Table(table).write(path)
-    rows = open_rows(path, 500, units=units)
+    rows = open_rows(path, 500)
     rows.chunk(0)
     tracemalloc.start()
     try:
