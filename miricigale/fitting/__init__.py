@@ -14,7 +14,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "checks": ("LeaveOutResult", "MockResult", "leave_out", "mock_analysis"),
         "fitter": ("BayesFitter",),
         "flags": ("FitFlags",),
-        "result_files": ("FitResultsFiles", "open_results"),
+        "io": ("FitResultsFiles", "open_results"),
         "results": ("FitResults",),
         "samples": ("Samples",),
         "streaming": ("fit_file",),

@@ -6,13 +6,14 @@ from dataclasses import dataclass, field, replace
 import astropy.units as u
 import numpy as np
 
+from miricigale.fitting import drawing
 from miricigale.fitting.flags import FitFlags
 from miricigale.fitting.posterior import cell_edges, cell_percentiles, check_levels, moments
 from miricigale.fitting.quantities import DERIVED_LEVELS, kept_percentiles
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.object_rows import ObjectRows, PerObject, PerObjectDict
 from miricigale.utils.tables import described_table, error_column
-from miricigale.utils.unified import unified_read, unified_write
+from miricigale.utils.unified import read_write
 from miricigale.utils.units import FNU
 
 __all__ = ["FitResults"]
@@ -152,6 +153,7 @@ class FitResults(ObjectRows):
 
     #: Where the formats of files are registered.
     io_module = "miricigale.fitting.io"
+    read, write = read_write("results (FITS: all but the model; ECSV: their table, not read back)")
 
     def __post_init__(self):
         if self.limit is None:
@@ -225,15 +227,18 @@ class FitResults(ObjectRows):
         return self._moments(name)[1] * self.unit(name)
 
     def _moments(self, name):
-        if name not in self.axes:
-            i = self._quantity(name)
-            mean, std = self.moments[..., i, 0], self.moments[..., i, 1]
-        elif self.axis_moments is None:
+        if name in self.axes and self.axis_moments is None:
             mean, std = moments(self.axes[name].values, self.pdf[name])
         else:
-            i = list(self.axes).index(name)
-            mean, std = self.axis_moments[..., i, 0], self.axis_moments[..., i, 1]
+            kept = self._kept(name, self.axis_moments, self.moments)
+            mean, std = kept[..., 0], kept[..., 1]
         return mean, np.maximum(std, self.least_std * np.abs(mean))
+
+    def _kept(self, name, of_axes, of_quantities):
+        """What a sampler keeps of a parameter, or any fit of a derived quantity."""
+        if name in self.axes:
+            return of_axes[..., list(self.axes).index(name), :]
+        return of_quantities[..., self._quantity(name), :]
 
     def percentile(self, name, levels):
         """
@@ -261,14 +266,12 @@ class FitResults(ObjectRows):
         """
         levels = check_levels(levels)
         some = self._several()
-        if name not in self.axes:
-            out = kept_percentiles(name, levels, some.quantiles[:, self._quantity(name)])
-        elif self.axis_quantiles is not None:
-            i = list(self.axes).index(name)
-            out = kept_percentiles(name, levels, some.axis_quantiles[:, i])
-        else:
+        if name in self.axes and self.axis_quantiles is None:
             axis = self.axes[name]
             out = cell_percentiles(axis.values, some.pdf[name], levels, axis.bounds)
+        else:
+            kept = some._kept(name, some.axis_quantiles, some.quantiles)
+            out = kept_percentiles(name, levels, kept)
         return (out[0] if self.isscalar else out) * self.unit(name)
 
     def distribution(self, name):
@@ -284,10 +287,12 @@ class FitResults(ObjectRows):
             Weight of each cell; of the cells between quantiles the same for all.
         """
         if name in self.axes:
-            axis = self.axes[name]
-            return cell_edges(axis.values, axis.bounds) * self.unit(name), self.pdf[name]
+            return self._edges(name) * self.unit(name), self.pdf[name]
         edges = self.quantiles[..., self._quantity(name), :]
         return edges * self.unit(name), np.diff(DERIVED_LEVELS)
+
+    def _edges(self, name):
+        return cell_edges(self.axes[name].values, self.axes[name].bounds)
 
     def cdf(self, name):
         """
@@ -405,11 +410,9 @@ class FitResults(ObjectRows):
             for (suffix, text), value in zip(_PARTS.items(), parts, strict=True):
                 columns[f"{name}_{suffix}"] = (value, f"{text} of {meaning}")
             if some.extensive(name):
+                log_mean = some.moments[:, some._quantity(name), 2] * u.dex
                 text = f"posterior mean of log10 of {meaning}, in {unit.to_string()}"
-                columns[f"{name}_logmean"] = (
-                    some.moments[:, some._quantity(name), 2] * u.dex,
-                    text,
-                )
+                columns[f"{name}_logmean"] = (log_mean, text)
         return described_table(columns, dict(self.meta))
 
     def predict(self, filters=None):
@@ -436,13 +439,13 @@ class FitResults(ObjectRows):
         for name in self.filters if filters is None else getattr(filters, "names", filters):
             if name not in self.filters:
                 raise unknown_name("filter of the models", name, self.filters)
-            i = self.filters.index(name)
-            texts = ("posterior mean of the model flux", "its posterior standard deviation")
-            columns |= {
-                name: (some.model_flux[:, i] * FNU, texts[0]),
-                error_column(name): (some.model_flux_std[:, i] * FNU, texts[1]),
-                f"{name}_best": (some.best_flux[:, i] * FNU, "flux of the best model"),
-            }
+            mean, std, best = (
+                array[:, self.filters.index(name)] * FNU
+                for array in (some.model_flux, some.model_flux_std, some.best_flux)
+            )
+            columns[name] = (mean, "posterior mean of the model flux")
+            columns[error_column(name)] = (std, "its posterior standard deviation")
+            columns[f"{name}_best"] = (best, "flux of the best model")
         return described_table(columns, dict(self.meta))
 
     # ---------------------------------------------------------------- single objects
@@ -465,153 +468,5 @@ class FitResults(ObjectRows):
             raise argument_error("key", "the id of an object that was fitted", got)
         return self
 
-    def best_sed(self, model=None, **changes):
-        """
-        Spectrum of the best model of a single object.
-
-        Parameters
-        ----------
-        model : `~miricigale.sed.SEDModel`, optional
-            If the results do not know it (those read from a file do not).
-        **changes
-            Parameters to change.
-
-        Returns
-        -------
-        sed : `~miricigale.sed.SED`
-
-        Raises
-        ------
-        ValueError
-            If no model is known or the object was not fitted.
-        """
-        model = self._one("best_sed").model if model is None else model
-        if model is None:
-            raise argument_error("model", "an SEDModel (these results know none)", "None")
-        best = self._fitted_one().best
-        known = dict(self.constants)
-        known |= {name: best[name] for name in self.axes if np.isfinite(best[name].value)}
-        values = {
-            name: u.Quantity(getattr(value, "value", value), model.parameters[name].unit)
-            for name, value in known.items()
-            if name in model.parameters
-        }
-        return model.evaluate(**{**values, "mass": best["mass"], **changes})
-
-    def plot_sed(self, ax=None, *, model=None, filters=None, **kwargs):
-        """
-        Draw photometry, upper limits (as arrows), best model and residuals of a single object.
-
-        Parameters
-        ----------
-        ax : `~matplotlib.axes.Axes` or pair of them, optional
-            Where to draw; a pair also gets the residuals.
-        model : `~miricigale.sed.SEDModel`, optional
-            See `best_sed`; without one only the fluxes of the best model are drawn.
-        filters : `~miricigale.filters.FilterSet`, optional
-            Where the wavelengths of the bands are taken from.
-        **kwargs
-            Passed to `miricigale.plotting.posteriors.plot_sed_fit`.
-
-        Returns
-        -------
-        axes : `~matplotlib.axes.Axes` or pair of them
-        """
-        from miricigale.filters import FilterSet
-        from miricigale.plotting.posteriors import plot_sed_fit
-
-        self._one("plot_sed")
-        filters = FilterSet.from_names(self.filters) if filters is None else filters
-        order = [filters.names.index(name) for name in self.filters]
-        if model is not None or self.model is not None:
-            sed = self.best_sed(model)
-            kwargs.setdefault("spectrum", (sed.wave, sed.fnu))
-        used = np.isfinite(self.sigma)
-        text = f"{self.ids}: z = {self.best['redshift'].value:.3f}"
-        kwargs.setdefault("title", f"{text}, chi2 = {self.chi2:.1f} in {self.n_bands} bands")
-        return plot_sed_fit(
-            u.Quantity(filters.pivots)[order],
-            self.flux * FNU,
-            np.where(used, self.sigma, self.flux_err) * FNU,
-            self.best_flux * FNU,
-            used=used,
-            limit=self.limit,
-            ax=ax,
-            **kwargs,
-        )
-
-    def plot_pdf(self, name, ax=None, **kwargs):
-        """Draw the posterior of a parameter or derived quantity of a single object."""
-        from miricigale.plotting.posteriors import plot_pdf
-
-        edges, weights = self._one("plot_pdf").distribution(name)
-        kwargs.setdefault("label", name)
-        if self.extensive(name):
-            kwargs.setdefault("log", bool(edges.value[0] > 0))
-        return plot_pdf(edges, weights, ax=ax, **kwargs)
-
-    def plot_pdf2d(self, x="redshift", y="frac_agn", ax=None, **kwargs):
-        """
-        Draw the joint posterior of two parameters of a single object.
-
-        Parameters
-        ----------
-        x, y : str, optional
-            Parameters of which the results have it; see `joint_pdf`.
-        ax : `~matplotlib.axes.Axes`, optional
-            Where to draw; the current axes by default.
-        **kwargs
-            Passed to `miricigale.plotting.posteriors.plot_pdf_2d`.
-
-        Returns
-        -------
-        ax : `~matplotlib.axes.Axes`
-        """
-        from miricigale.plotting.posteriors import plot_pdf_2d
-
-        if "frac_agn" in (x, y) and "frac_agn" not in self.axes:
-            raise argument_error("frac_agn", "an axis of the grid", "a grid without AGN")
-        weights = self._one("plot_pdf2d").joint_pdf(x, y)
-        edges = [cell_edges(self.axes[n].values, self.axes[n].bounds) for n in (x, y)]
-        kwargs.setdefault("labels", tuple(labeled(name, self.unit(name)) for name in (x, y)))
-        return plot_pdf_2d(*edges, weights, ax=ax, **kwargs)
-
-    # ----------------------------------------------------------------------- files
-
-    read = unified_read(
-        """
-        Read results that `write` made.
-
-        Parameters
-        ----------
-        path : path-like
-            The file.
-        format : str, optional
-            By default told by the suffix.
-
-        Raises
-        ------
-        `~miricigale.utils.exceptions.DataError`
-            If the file is something else or incomplete.
-        """
-    )
-    write = unified_write(
-        """
-        Write results: FITS holds everything but the model, ECSV the table of `to_table`.
-
-        Parameters
-        ----------
-        path : path-like
-            The file; its suffix tells the format.
-        format : {"fits", "ascii.ecsv"}, optional
-            If the suffix does not tell it.
-        overwrite : bool, optional
-            Whether a file that is there is replaced.
-        """
-    )
-
-
-def labeled(name, unit):
-    """Label of an axis of a plot: a name and its unit."""
-    text = unit.to_string()
-    return f"{name} ({text})" if text else name
+    best_sed, plot_sed = drawing.best_sed, drawing.plot_sed
+    plot_pdf, plot_pdf2d = drawing.plot_pdf, drawing.plot_pdf2d

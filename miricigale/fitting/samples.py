@@ -6,16 +6,16 @@ from functools import cached_property
 import astropy.units as u
 import numpy as np
 
+from miricigale.fitting.drawing import labeled
 from miricigale.fitting.flags import FitFlags
 from miricigale.fitting.posterior import bin_cells, check_levels, node_cells
 from miricigale.fitting.priors import grid_priors
 from miricigale.fitting.quantities import ModelValues, check_draws
-from miricigale.fitting.results import labeled
 from miricigale.sed import grid_spectra as spectra
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.object_rows import ObjectRows, PerObject
 from miricigale.utils.tables import described_table, error_column
-from miricigale.utils.unified import unified_read, unified_write
+from miricigale.utils.unified import read_write
 from miricigale.utils.units import FNU, WAVE
 
 __all__ = ["Samples"]
@@ -74,6 +74,14 @@ class Samples(ObjectRows):
 
     #: Where the formats of files are registered.
     io_module = "miricigale.fitting.io"
+    read, write = read_write(
+        "draws (FITS: all but grid and model; ECSV: their table, not read back)",
+        """grid : `~miricigale.sed.ModelGrid`
+    The grid that was fitted (``fitter.grid``), for draws are indices of it; others are refused.
+model : `~miricigale.sed.SEDModel`, optional
+    The model that it was made from, for other bands and for spectra.
+""",
+    )
 
     def __post_init__(self):
         ids = np.asarray(self.ids)
@@ -102,46 +110,6 @@ class Samples(ObjectRows):
     def with_model(self, model):
         """Return a copy that knows the `~miricigale.sed.SEDModel`."""
         return replace(self, model=model)
-
-    # -------------------------------------------------------------------- files
-
-    read = unified_read(
-        """
-        Read samples that `write` made.
-
-        Parameters
-        ----------
-        path : path-like
-            The file.
-        grid : `~miricigale.sed.ModelGrid`
-            The grid that was fitted (``fitter.grid``): draws are indices of it.
-        model : `~miricigale.sed.SEDModel`, optional
-            The model that it was made from, for other bands and for spectra.
-        format : str, optional
-            By default told by the suffix.
-
-        Raises
-        ------
-        `~miricigale.utils.exceptions.DataError`
-            If the file is missing, something else or incomplete.
-        ValueError
-            If the grid is another.
-        """
-    )
-    write = unified_write(
-        """
-        Write draws: FITS holds them without the grid and the model, ECSV the table of `to_table`.
-
-        Parameters
-        ----------
-        path : path-like
-            The file; its suffix tells the format.
-        format : {"fits", "ascii.ecsv"}, optional
-            If the suffix does not tell it.
-        overwrite : bool, optional
-            Whether a file that is there is replaced.
-        """
-    )
 
     # ------------------------------------------------------------------- values
 

@@ -10,8 +10,8 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.fitting.fitter import BayesFitter
+from miricigale.fitting.io import FORMAT, FitFolder, open_results, part_ids, part_name
 from miricigale.fitting.likelihood import read_ids
-from miricigale.fitting.result_files import FORMAT, FitFolder, open_results, part_ids, part_name
 from miricigale.utils.content import content_sha256
 from miricigale.utils.exceptions import OtherResultsError, argument_error
 from miricigale.utils.progress import progress

@@ -73,14 +73,16 @@ def unified_write(doc):
     return UnifiedReadWriteMethod(type("Write", (_Write,), {"__doc__": doc}))
 
 
-def read_write(what):
+def read_write(what, options=""):
     """
-    Class attributes ``read`` and ``write`` of a class whose files have no options of their own.
+    Class attributes ``read`` and ``write`` of a class.
 
     Parameters
     ----------
     what : str
         What a file holds, such as ``"a PSF"``.
+    options : str, optional
+        Further lines of the docstring of ``read``: its parameters, which `register` knows.
 
     Returns
     -------
@@ -88,10 +90,11 @@ def read_write(what):
         See `unified_read`.
     """
     path = "Parameters\n----------\npath : path-like\n    The file.\n"
+    known = "format : str, optional\n    By default told by the suffix of ``path``.\n"
     read = f"""
 Read {what} from a file that `write` made.
 
-{path}
+{path}{options}{known}
 Raises
 ------
 `~miricigale.utils.exceptions.DataError`
@@ -100,7 +103,7 @@ Raises
     write = f"""
 Write {what} to a file, from which `read` gets it back.
 
-{path}overwrite : bool, optional
+{path}{known}overwrite : bool, optional
     Whether a file that is there is replaced.
 
 Raises

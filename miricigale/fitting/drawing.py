@@ -1,0 +1,114 @@
+"""Spectra and figures of single objects: methods of `~miricigale.fitting.FitResults`."""
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import FNU
+
+__all__ = ["best_sed", "labeled", "plot_pdf", "plot_pdf2d", "plot_sed"]
+
+
+def best_sed(results, model=None, **changes):
+    """
+    Spectrum of the best model of a single object.
+
+    Parameters
+    ----------
+    model : `~miricigale.sed.SEDModel`, optional
+        If the results do not know it (those read from a file do not).
+    **changes
+        Parameters to change.
+
+    Returns
+    -------
+    sed : `~miricigale.sed.SED`
+
+    Raises
+    ------
+    ValueError
+        If no model is known or the object was not fitted.
+    """
+    model = results._one("best_sed").model if model is None else model
+    if model is None:
+        raise argument_error("model", "an SEDModel (these results know none)", "None")
+    best = results._fitted_one().best
+    known = dict(results.constants)
+    known |= {name: best[name] for name in results.axes if np.isfinite(best[name].value)}
+    values = {
+        name: u.Quantity(getattr(value, "value", value), model.parameters[name].unit)
+        for name, value in known.items()
+        if name in model.parameters
+    }
+    return model.evaluate(**{**values, "mass": best["mass"], **changes})
+
+
+def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):
+    """
+    Draw photometry, upper limits (as arrows), best model and residuals of a single object.
+
+    Parameters
+    ----------
+    ax : `~matplotlib.axes.Axes` or pair of them, optional
+        Where to draw; a pair also gets the residuals.
+    model : `~miricigale.sed.SEDModel`, optional
+        See `best_sed`; without one only the fluxes of the best model are drawn.
+    filters : `~miricigale.filters.FilterSet`, optional
+        Where the wavelengths of the bands are taken from.
+    **kwargs
+        Passed to `miricigale.plotting.posteriors.plot_sed_fit`.
+
+    Returns
+    -------
+    axes : `~matplotlib.axes.Axes` or pair of them
+    """
+    from miricigale.filters import FilterSet
+    from miricigale.plotting.posteriors import plot_sed_fit
+
+    results._one("plot_sed")
+    filters = FilterSet.from_names(results.filters) if filters is None else filters
+    order = [filters.names.index(name) for name in results.filters]
+    if model is not None or results.model is not None:
+        sed = results.best_sed(model)
+        kwargs.setdefault("spectrum", (sed.wave, sed.fnu))
+    used = np.isfinite(results.sigma)
+    text = f"{results.ids}: z = {results.best['redshift'].value:.3f}"
+    kwargs.setdefault("title", f"{text}, chi2 = {results.chi2:.1f} in {results.n_bands} bands")
+    return plot_sed_fit(
+        u.Quantity(filters.pivots)[order],
+        results.flux * FNU,
+        np.where(used, results.sigma, results.flux_err) * FNU,
+        results.best_flux * FNU,
+        used=used,
+        limit=results.limit,
+        ax=ax,
+        **kwargs,
+    )
+
+
+def plot_pdf(results, name, ax=None, **kwargs):
+    """Draw the posterior of a parameter or derived quantity of a single object."""
+    from miricigale.plotting.posteriors import plot_pdf
+
+    edges, weights = results._one("plot_pdf").distribution(name)
+    kwargs.setdefault("label", name)
+    if results.extensive(name):
+        kwargs.setdefault("log", bool(edges.value[0] > 0))
+    return plot_pdf(edges, weights, ax=ax, **kwargs)
+
+
+def plot_pdf2d(results, x="redshift", y="frac_agn", ax=None, **kwargs):
+    """Draw `joint_pdf` of a single object; ``kwargs`` go to `plotting.posteriors.plot_pdf_2d`."""
+    from miricigale.plotting.posteriors import plot_pdf_2d
+
+    if "frac_agn" in (x, y) and "frac_agn" not in results.axes:
+        raise argument_error("frac_agn", "an axis of the grid", "a grid without AGN")
+    weights = results._one("plot_pdf2d").joint_pdf(x, y)
+    kwargs.setdefault("labels", tuple(labeled(name, results.unit(name)) for name in (x, y)))
+    return plot_pdf_2d(results._edges(x), results._edges(y), weights, ax=ax, **kwargs)
+
+
+def labeled(name, unit):
+    """Label of an axis of a plot: a name and its unit."""
+    text = unit.to_string()
+    return f"{name} ({text})" if text else name
