@@ -8,10 +8,13 @@ __getattr__, __dir__, __all__ = lazy_names(
         "classes": ("CLASS_NAMES", "class_fractions", "classify"),
         "counts": (
             "PUBLISHED_LIGHT",
+            "dust_obscured_fraction",
             "integrated_light",
+            "main_sequence_dust",
             "main_sequence_sfr",
             "number_counts",
             "sfr_to_infrared_luminosity",
+            "uvj_quiescent",
         ),
         "match": ("AssociationFlags", "associate", "match_truth"),
         "metrics": (

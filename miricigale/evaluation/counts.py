@@ -3,15 +3,21 @@
 import astropy.units as u
 import numpy as np
 
+from miricigale.sed import COSMOLOGY
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import FNU, to_array
+from miricigale.utils.random import check_seed, stream
+from miricigale.utils.tables import described_table, require_columns, unique_ids
+from miricigale.utils.units import FNU, LUMINOSITY, MASS, to_array
 
 __all__ = [
     "PUBLISHED_LIGHT",
+    "dust_obscured_fraction",
     "integrated_light",
+    "main_sequence_dust",
     "main_sequence_sfr",
     "number_counts",
     "sfr_to_infrared_luminosity",
+    "uvj_quiescent",
 ]
 
 #: Light of galaxies together in nW / m2 / sr: band, wavelength (um), least flux (uJy), value,
@@ -67,6 +73,122 @@ def sfr_to_infrared_luminosity(sfr):
     Kennicutt 1998, ARA&A 36, 189, equation 4: SFR = 4.5e-44 L_IR [erg/s].
     """
     return (to_array(sfr, u.Msun / u.yr, "sfr") / 4.5e-44 * u.erg / u.s).to(u.Lsun)
+
+
+def dust_obscured_fraction(stellar_mass):
+    """
+    Share of star formation that is seen in the infrared only.
+
+    Parameters
+    ----------
+    stellar_mass : `~astropy.units.Quantity`
+        Stellar mass (Chabrier IMF).
+
+    Returns
+    -------
+    fraction : float or `~numpy.ndarray`
+        SFR (IR) over SFR (UV + IR), at redshifts to 2.5.
+
+    References
+    ----------
+    Whitaker et al. 2017, ApJ 850, 208, equation 1.
+    """
+    log_mass = np.log10(to_array(stellar_mass, MASS, "stellar_mass"))
+    return 1.0 / (1.0 + 1.96e9 * np.exp(-2.277 * log_mass))
+
+
+def uvj_quiescent(u_v, v_j, redshift):
+    """
+    Whether galaxies are quiescent by their rest-frame colors.
+
+    Parameters
+    ----------
+    u_v, v_j : `~astropy.units.Quantity`
+        Colors U - V and V - J, AB.
+    redshift : float or `~numpy.ndarray`
+        Redshifts.
+
+    Returns
+    -------
+    quiescent : bool or `~numpy.ndarray`
+        False where a color is not finite.
+
+    References
+    ----------
+    Whitaker et al. 2011, ApJ 735, 86, equation 15; used to z = 3.5 there, its last bin beyond.
+    """
+    u_v, v_j = to_array(u_v, u.mag, "u_v"), to_array(v_j, u.mag, "v_j")
+    z = to_array(redshift, u.dimensionless_unscaled, "redshift")
+    red = u_v > np.where(z < 2.0, 1.3, 1.2)
+    old = v_j < np.select([z < 1.5, z < 2.0], [1.6, 1.5], 1.4)
+    return red & old & (u_v > 0.88 * v_j + np.where(z < 0.5, 0.69, 0.59))
+
+
+def main_sequence_dust(table, *, seed, scatter=0.2, least=1.0, cosmology=COSMOLOGY):
+    """
+    Dust luminosities of star-forming galaxies that lie on the main sequence.
+
+    The star-formation rate of Speagle et al. 2014 for the galaxy's mass and redshift, its share that
+    dust hides (`dust_obscured_fraction`) and the luminosity of that (Kennicutt & Evans 2012, log L
+    [erg/s] = log SFR + 43.41). Quiescent galaxies (`uvj_quiescent`) keep their dust luminosity.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        ``id``, ``redshift``, ``stellar_mass``, ``dust_luminosity``, ``u_v`` and ``v_j``, as from
+        `~miricigale.sed.SEDModel.fluxes`. Rows without a positive mass, redshift and dust
+        luminosity (stars) are left as they are.
+    seed : int, `~numpy.random.Generator` or None
+        Each source has its own stream by its id.
+    scatter : float, optional
+        Standard deviation in dex about the sequence; 0.2 is that of Speagle et al. 2014.
+    least : float, optional
+        Least ratio to the dust luminosity of ``table``: with 1 dust emits at least what the fitted
+        attenuation took; 0 puts every star-forming galaxy on the sequence.
+    cosmology : `~astropy.cosmology.Cosmology`, optional
+        For the age of the universe.
+
+    Returns
+    -------
+    dust : `~astropy.table.QTable`
+        A row for each of ``table``: ``id``, ``quiescent``, ``dust_luminosity`` in W and
+        ``dust_excess``, its ratio to that of ``table``: the parameter of that name of
+        `~miricigale.sed.SEDModel`.
+
+    Raises
+    ------
+    ValueError, `~astropy.units.UnitsError`
+        If a column is missing or has a wrong unit, an id is there twice, or ``scatter`` or
+        ``least`` is negative.
+    """
+    units = {"stellar_mass": MASS, "dust_luminosity": LUMINOSITY, "u_v": u.mag, "v_j": u.mag}
+    require_columns(table, ("id", "redshift", *units), "table", units=units)
+    for name, value in (("scatter", scatter), ("least", least)):
+        if not (np.isfinite(value) and value >= 0):
+            raise argument_error(name, "finite and >= 0", value)
+    ids, seed = unique_ids(table["id"], "table"), check_seed(seed)
+    mass = to_array(u.Quantity(table["stellar_mass"]), MASS, "stellar_mass")
+    dust = to_array(u.Quantity(table["dust_luminosity"]), LUMINOSITY, "dust_luminosity")
+    z = np.asarray(table["redshift"], float)
+    galaxy = (mass > 0) & (z > 0) & (dust > 0) & np.isfinite(mass * z * dust)
+    quiescent = galaxy & uvj_quiescent(u.Quantity(table["u_v"]), u.Quantity(table["v_j"]), z)
+    rows = np.flatnonzero(galaxy & ~quiescent)
+    hidden = mass[rows] * u.Msun
+    sfr = main_sequence_sfr(hidden, cosmology.age(z[rows])).value * dust_obscured_fraction(hidden)
+    offset = [stream(seed, "main sequence", str(ids[row])).normal() for row in rows]
+    infrared = (
+        10.0 ** (np.log10(sfr) + 43.41 + scatter * np.array(offset)) * u.erg / u.s
+    ).to_value(LUMINOSITY)
+    excess = np.ones(len(ids))
+    excess[rows] = np.maximum(infrared / dust[rows], least)
+    return described_table(
+        {
+            "id": (ids, None),
+            "quiescent": (quiescent, "whether the colors U - V and V - J are quiescent"),
+            "dust_luminosity": (dust * excess * LUMINOSITY, "dust luminosity by the main sequence"),
+            "dust_excess": (excess, "its ratio to the power that attenuation takes"),
+        }
+    )
 
 
 def number_counts(flux, area, edges):

@@ -21,6 +21,6 @@ __getattr__, __dir__, __all__ = lazy_names(
         "presets": ("COMPONENTS", "yang2021_axes"),
         "spectrum": ("COSMOLOGY", "SED"),
         "tables": ("ModelFlags",),
-        "xray": ("XRay", "band_luminosity", "stern2015", "xray_flux"),
+        "xray": ("XRay", "band_luminosity", "stern2015", "stern2015_6um", "xray_flux"),
     },
 )

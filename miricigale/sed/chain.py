@@ -331,6 +331,7 @@ class Chain:
             young, old, gas = self.factors(dim)
             nebular = stars.nebular_young * (young if gas is None else gas)
             nebular += stars.nebular_old * (old if gas is None else gas)
+        absorbed *= values.get("dust_excess", 1.0)
         dust = absorbed * self.dust(self.key(values, "dust"))
         return Galaxy(stars, light, stars.young + stars.old, nebular, dust, float(absorbed))
 

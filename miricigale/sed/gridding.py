@@ -25,7 +25,7 @@ def check_axes(model, axes):
     if not isinstance(axes, Mapping):
         raise argument_error("axes", "a dict of parameter name to values", type(axes).__name__)
     out = {}
-    skipped = {"mass", *_names(model, ("xray", "igm", "foreground"))}
+    skipped = {"mass", "dust_excess", *_names(model, ("xray", "igm", "foreground"))}
     for name, values in axes.items():
         if name not in model.parameters or name in skipped:
             raise unknown_name("axis", name, [n for n in model.parameters if n not in skipped])

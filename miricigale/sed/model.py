@@ -37,6 +37,11 @@ _MODEL_PARAMETERS = {
     "mass": Parameter(
         default=1e10, bounds=(0.0, 1e16), unit="Msun", doc="Mass of all stars ever formed."
     ),
+    "dust_excess": Parameter(
+        default=1.0,
+        bounds=(0.0, 1e6),
+        doc="Dust luminosity over the power that attenuation takes; 1 is energy balance.",
+    ),
 }
 for _name, _parameter in _MODEL_PARAMETERS.items():
     _parameter.name = _name
@@ -127,7 +132,8 @@ class SEDModel:
             if twice:
                 raise argument_error("components", "without shared parameter names", sorted(twice))
             merged.update(component.parameters)
-        self._parameters = merged | _MODEL_PARAMETERS
+        own = {n: p for n, p in _MODEL_PARAMETERS.items() if n != "dust_excess" or "dust" in roles}
+        self._parameters = merged | own
         self._notes = ()
 
     # ------------------------------------------------------------------ making
@@ -468,9 +474,9 @@ class SEDModel:
         Parameters
         ----------
         axes : dict of str to array
-            Parameter name to its values; ``redshift`` is needed, ``mass`` has no place here, nor
-            have parameters of X-rays and the foreground. Other parameters have their
-            defaults. With no ``frac_agn`` but 0 the grid has no AGN.
+            Parameter name to its values; ``redshift`` is needed, ``mass`` and ``dust_excess``
+            have no place here, nor have parameters of X-rays and the foreground. Other parameters
+            have their defaults. With no ``frac_agn`` but 0 the grid has no AGN.
         filters : `~miricigale.filters.FilterSet` or list of str
             The bands.
         cache : bool, optional

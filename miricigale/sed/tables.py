@@ -121,6 +121,11 @@ class _Blocks:
         stars, dims, dusts = (self._keys(rows, *roles) for roles in GALAXY)
         stars = chain.stars(stars)
         light, absorbed = chain.attenuated(stars, dims, dusts, self._light[: len(rows)])
+        if "dust_excess" in self.values:
+            excess = self.values["dust_excess"][rows]
+            for i in np.flatnonzero(excess != 1.0):
+                light[i] += (excess[i] - 1.0) * absorbed[i] * chain.dust(dusts[i])
+            absorbed *= excess
         return light, galaxy_quantities(stars, absorbed, light @ chain.functionals.T)
 
     def agn(self, rows):

@@ -10,7 +10,15 @@ from miricigale.sed.spectrum import COSMOLOGY, distance
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import LUMINOSITY, to_array
 
-__all__ = ["STERN2015_RANGE", "XRAY_FLUX", "XRay", "band_luminosity", "stern2015", "xray_flux"]
+__all__ = [
+    "STERN2015_RANGE",
+    "XRAY_FLUX",
+    "XRay",
+    "band_luminosity",
+    "stern2015",
+    "stern2015_6um",
+    "xray_flux",
+]
 
 #: nu L_nu at 6 um that the samples of Stern 2015 span, roughly: Seyferts to luminous quasars.
 STERN2015_RANGE = (1e42, 1e47) * u.erg / u.s
@@ -65,6 +73,40 @@ def stern2015(l_6um):
     values = to_array(l_6um, LUMINOSITY, "l_6um")
     _check("l_6um", ">= 0", values, values < 0)
     return _core.stern2015(values) * LUMINOSITY
+
+
+def stern2015_6um(l_x):
+    """
+    Light of an AGN at 6 um from its 2-10 keV luminosity: `stern2015` solved for its argument.
+
+    Parameters
+    ----------
+    l_x : `~astropy.units.Quantity`
+        Rest-frame 2-10 keV luminosity, corrected for absorption, any shape.
+
+    Returns
+    -------
+    l_6um : `~astropy.units.Quantity`
+        nu L_nu at rest 6 um in W; 0 where ``l_x`` is 0, NaN above the relation's maximum of
+        10^46.56 erg/s.
+
+    Raises
+    ------
+    ValueError
+        If a luminosity is negative.
+    `~astropy.units.UnitsError`
+        If it is no luminosity.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.sed.xray import stern2015_6um
+    >>> print(f"{stern2015_6um(1e43 * u.erg / u.s).to(u.erg / u.s):.3g}")
+    1.56e+43 erg / s
+    """
+    values = to_array(l_x, LUMINOSITY, "l_x")
+    _check("l_x", ">= 0", values, values < 0)
+    return _core.stern2015_6um(values) * LUMINOSITY
 
 
 def band_luminosity(l_x, *, from_band, to_band, photon_index=1.8):

@@ -1,13 +1,18 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.table import QTable
 
 from miricigale.evaluation import (
+    dust_obscured_fraction,
     integrated_light,
+    main_sequence_dust,
     main_sequence_sfr,
     number_counts,
     sfr_to_infrared_luminosity,
+    uvj_quiescent,
 )
+from miricigale.sed import COSMOLOGY
 
 
 def test_speagle_main_sequence_at_published_values():
@@ -55,3 +60,68 @@ def test_bare_numbers_are_refused_by_name():
         number_counts([23.0] * u.ABmag, area, [23, 24])
     with pytest.raises(u.UnitsError, match="'wavelength' must be a quantity convertible to Hz"):
         integrated_light(flux, area, 15)
+
+
+def test_hidden_star_formation_at_published_values():
+    # Whitaker et al. 2017, abstract: half at 10^9.4 Msun, more than 90 % above 10^10.5
+    assert dust_obscured_fraction(10**9.4 * u.Msun) == pytest.approx(0.5, abs=0.01)
+    assert dust_obscured_fraction(10**10.5 * u.Msun) > 0.9
+
+
+def test_colors_of_old_and_of_dusty_galaxies():
+    # an old population, a dusty one as red in U - V, a blue one; the lines of Whitaker et al. 2011
+    u_v, v_j = [1.8, 1.8, 0.8] * u.mag, [1.0, 1.9, 0.6] * u.mag
+    assert uvj_quiescent(u_v, v_j, 1.0).tolist() == [True, False, False]
+    assert uvj_quiescent([1.25, 1.25] * u.mag, [0.5, 0.5] * u.mag, [1.0, 2.5]).tolist() == [
+        False,
+        True,
+    ]
+    assert uvj_quiescent([1.52] * u.mag, [1.0] * u.mag, [0.2, 0.6]).tolist() == [False, True]
+    assert not uvj_quiescent(np.nan * u.mag, 0.5 * u.mag, 1.0)
+
+
+@pytest.fixture
+def galaxies():
+    """Star-forming galaxies of one mass, one that is quiescent, and a star."""
+    n = 2000
+    table = QTable({"id": np.arange(n), "redshift": np.full(n, 1.0)})
+    table["stellar_mass"] = np.full(n, 10**10.5) * u.Msun
+    table["dust_luminosity"] = np.full(n, 1e36) * u.W
+    table["u_v"], table["v_j"] = np.full(n, 1.0) * u.mag, np.full(n, 1.0) * u.mag
+    table["u_v"][0] = 1.8 * u.mag
+    table["redshift"][1], table["stellar_mass"][1] = 0.0, np.nan
+    return table
+
+
+def test_dust_on_the_main_sequence(galaxies):
+    dust = main_sequence_dust(galaxies, seed=5)
+    assert dust["quiescent"].tolist() == [True] + [False] * (len(galaxies) - 1)
+    assert dust["dust_excess"][:2].tolist() == [1, 1]
+    assert np.all(dust["dust_luminosity"][:2] == galaxies["dust_luminosity"][:2])
+    # by hand: Speagle et al. 2014, Whitaker et al. 2017, Kennicutt & Evans 2012
+    age = COSMOLOGY.age(1.0).value
+    sfr = (0.84 - 0.026 * age) * 10.5 - (6.51 - 0.11 * age)
+    wanted = sfr + 43.41 + np.log10(1 / (1 + 1.96e9 * np.exp(-2.277 * 10.5)))
+    got = np.log10(dust["dust_luminosity"][2:].to_value(u.erg / u.s))
+    assert got.mean() == pytest.approx(wanted, abs=4 * 0.2 / np.sqrt(got.size))
+    assert got.std() == pytest.approx(0.2, rel=0.07)
+    exact = main_sequence_dust(galaxies, seed=5, scatter=0.0)["dust_luminosity"][-1]
+    assert exact.to_value(u.erg / u.s) == pytest.approx(10**wanted)
+    np.testing.assert_allclose(
+        dust["dust_excess"], dust["dust_luminosity"] / galaxies["dust_luminosity"]
+    )
+    # a source's draw does not depend on the others
+    few = main_sequence_dust(galaxies[100:103], seed=5)
+    assert np.all(few["dust_luminosity"] == dust["dust_luminosity"][100:103])
+
+
+def test_dust_emits_at_least_what_attenuation_took(galaxies):
+    galaxies["dust_luminosity"] = np.full(len(galaxies), 1e40) * u.W
+    assert np.all(main_sequence_dust(galaxies, seed=1)["dust_excess"] == 1)
+    free = main_sequence_dust(galaxies, seed=1, least=0.0)
+    assert np.all(free["dust_excess"][2:] < 0.1)
+    with pytest.raises(ValueError, match="'scatter' must be finite and >= 0, got -1"):
+        main_sequence_dust(galaxies, seed=1, scatter=-1)
+    galaxies.remove_column("u_v")
+    with pytest.raises(ValueError, match=r"'table' must be .* columns \['u_v'\]"):
+        main_sequence_dust(galaxies, seed=1)

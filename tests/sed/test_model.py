@@ -54,6 +54,36 @@ def test_energy_balance(model, ebv):
     assert emitted == pytest.approx(lost, rel=1e-6, abs=1e-12 * seen)
 
 
+def test_dust_excess_changes_the_dust_and_leaves_the_stars(model, filters):
+    values = {"age": 3.0, "ebv": 0.4, "redshift": 0.7, "frac_agn": 0.5}
+    plain, more = model.decompose(**values), model.decompose(**values, dust_excess=3.0)
+    for name, factor in {"stellar": 1, "dust": 3, "agn_torus": 3}.items():
+        wanted = factor * plain.components[name].fnu
+        assert_quantity_allclose(more.components[name].fnu, wanted, atol=1e-300 * u.uJy)
+    assert_quantity_allclose(more.derived["dust_luminosity"], 3 * plain.derived["dust_luminosity"])
+    # many rows: those at 1 keep their bits, the others are those of one model
+    rows = QTable({name: np.full(3, value) for name, value in values.items()})
+    balanced = model.fluxes(rows, filters)
+    rows["dust_excess"] = [1.0, 3.0, 0.0]
+    table = model.fluxes(rows, filters)
+    for name in (*filters.names, "dust_luminosity", "ir_luminosity", "l_6um", "accretion_power"):
+        assert table[name][0] == balanced[name][0]
+    assert_quantity_allclose(
+        u.Quantity([table[name][1] for name in filters.names]),
+        filters.synthetic_fluxes(more.total),
+        rtol=1e-6,
+    )
+    assert_quantity_allclose(table["ir_luminosity"][1], more.derived["ir_luminosity"])
+    assert table["dust_luminosity"][2] == 0
+    assert table["flags"].tolist() == [0, 0, ModelFlags.NO_AGN_POWER]
+
+
+def test_dust_excess_needs_dust():
+    model = SEDModel([DelayedSFH(), BC03(), CalzettiLeitherer()])
+    with pytest.raises(KeyError, match="no parameter 'dust_excess'"):
+        model.evaluate(dust_excess=2.0)
+
+
 def test_dust_luminosity_of_the_observed_spectrum(model):
     """Integrate the dust SED over frequency and scale by 4 pi d^2: L_dust comes back."""
     parts = model.decompose(age=3.0, ebv=0.4, redshift=0.7, mass=3e10 * u.Msun)
@@ -364,6 +394,7 @@ def test_redshift_is_needed(model, filters):
     [
         ({"taus": [1.0], "redshift": [1.0]}, KeyError, "no axis 'taus'"),
         ({"mass": [1.0], "redshift": [1.0]}, KeyError, "no axis 'mass'"),
+        ({"dust_excess": [2.0], "redshift": [1.0]}, KeyError, "no axis 'dust_excess'"),
         ({"tau": [1.0, 0.5], "redshift": [1.0]}, ValueError, "'tau' must be ascending values"),
         ({"tau": [1e4], "redshift": [1.0]}, ValueError, "'tau' must be from"),
     ],

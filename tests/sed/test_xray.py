@@ -11,7 +11,7 @@ from helpers.components import values_of
 from miricigale.sed import COSMOLOGY
 from miricigale.sed.component import COMPONENTS
 from miricigale.sed.components import XRay
-from miricigale.sed.xray import band_luminosity, stern2015, xray_flux
+from miricigale.sed.xray import band_luminosity, stern2015, stern2015_6um, xray_flux
 
 ERG = u.erg / u.s
 CGS = u.erg / u.s / u.cm**2
@@ -53,6 +53,18 @@ def test_stern_takes_any_shape_and_no_light_is_no_x_ray():
     assert got.shape == (2, 2)
     assert got[0, 0] == 0 == got[1, 1]
     assert np.all(np.isfinite(got))
+
+
+def test_stern_there_and_back():
+    l_6um = np.append(0.0, np.geomspace(1e38, 1e49, 34)) * ERG
+    np.testing.assert_allclose(
+        stern2015_6um(stern2015(l_6um)).to_value(ERG), l_6um.value, rtol=1e-9, atol=0
+    )
+    # the relation has its maximum at 40.981 + 1.024^2 / (4 x 0.047)
+    assert np.isnan(stern2015_6um(10**46.56 * ERG))
+    assert np.isfinite(stern2015_6um(10**46.55 * ERG))
+    with pytest.raises(ValueError, match="'l_x' must be >= 0"):
+        stern2015_6um(-1 * ERG)
 
 
 def test_stern_refuses():

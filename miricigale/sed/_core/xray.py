@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.special import exprel
 
-__all__ = ["power_law_energy", "stern2015", "xray_flux"]
+__all__ = ["power_law_energy", "stern2015", "stern2015_6um", "xray_flux"]
 
 _STERN = (40.981, 1.024, -0.047)
 _ERG = 1e-7  # W s
@@ -17,6 +17,17 @@ def stern2015(l_6um):
     none = l_6um == 0.0
     x = np.log10(np.where(none, _UNIT_6UM, l_6um) / _UNIT_6UM)
     return np.where(none, 0.0, 10.0 ** np.polyval(_STERN[::-1], x) * _ERG)
+
+
+def stern2015_6um(l_2_10kev):
+    """Power nu L_nu at 6 um in W for which `stern2015` gives this luminosity in W; NaN above its maximum."""
+    l_2_10kev = np.asarray(l_2_10kev, dtype=float)
+    none = l_2_10kev == 0.0
+    c, b, a = _STERN
+    rest = c - np.log10(np.where(none, 1.0, l_2_10kev) / _ERG)
+    with np.errstate(invalid="ignore"):
+        x = (-b + np.sqrt(b**2 - 4.0 * a * rest)) / (2.0 * a)
+    return np.where(none, 0.0, 10.0**x * _UNIT_6UM)
 
 
 def power_law_energy(low, high, photon_index):
