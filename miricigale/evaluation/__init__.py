@@ -26,6 +26,13 @@ __getattr__, __dir__, __all__ = lazy_names(
             "running_median",
             "sigma_mad",
         ),
+        "population": (
+            "AGNPopulation",
+            "agn_fraction",
+            "galaxy_mass_function",
+            "xray_luminosity_function",
+            "xray_obscured_fraction",
+        ),
         "report": ("Missing", "Report", "number"),
     },
 )
