@@ -1,11 +1,6 @@
 """Typed run configuration: frozen dataclasses from TOML, strict about every key."""
 
 import dataclasses
-import json
-import math
-import tomllib
-import types
-import typing
 import warnings
 from importlib import resources
 from pathlib import Path
@@ -15,19 +10,21 @@ from astropy.utils.exceptions import AstropyDeprecationWarning
 from miricigale.instrument import CEERS_FILTERS
 from miricigale.photometry import YANG2021_DEPTHS
 from miricigale.utils.exceptions import ConfigError, unknown_name
+from miricigale.workflow.options import (
+    from_text,
+    read_text,
+    replace_sections,
+    sections_toml,
+)
+from miricigale.workflow.options import option as _option
+from miricigale.workflow.options import require as _require
 from miricigale.workflow.truths import SETS
 
-__all__ = ["StudyConfig", "load_config", "present_names", "preset_names", "toml_value"]
+__all__ = ["StudyConfig", "load_config", "present_names", "preset_names"]
 
 
 #: Keys that had another name, which files may still have.
 _FORMER = {"photometry.n_pixels": "photometry.min_area"}
-
-
-def _option(default, doc, *, low=None, high=None, choices=None, single=False):
-    """A field with its documentation and limits in the metadata; ``single``: a list may be one value."""
-    limits = {"doc": doc, "low": low, "high": high, "choices": choices, "single": single}
-    return dataclasses.field(default=default, metadata=limits)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,9 +180,7 @@ class FitSection:
     model_error: float = _option(0.1, "Relative model error.", low=0.0, high=1.0)
     min_detected: int = _option(2, "MIRI bands a source must be detected in.", low=0, high=9)
     sets: tuple[str, ...] = _option(
-        ("all", "none"),
-        "Sets of the MIRI bands that are fitted with the existing ones.",
-        choices=SETS,
+        ("all", "none"), "Sets of the MIRI bands that are fitted with the existing ones.", choices=SETS
     )
 
 
@@ -290,18 +285,11 @@ class StudyConfig:
             For an unknown section or key (the message lists the known ones), a wrong
             type, or a value outside its limits.
         """
-        base = base or cls()
-        sections = {field.name: getattr(base, field.name) for field in dataclasses.fields(cls)}
-        unknown = sorted(set(values) - set(sections))
-        if unknown:
-            msg = f"unknown section {unknown}; known: {sorted(sections)}"
-            raise ConfigError(msg)
-        for name, entries in values.items():
-            if not isinstance(entries, dict):
-                msg = f"[{name}] must be a section, got {entries!r}"
-                raise ConfigError(msg)
-            sections[name] = _replace_section(name, sections[name], entries)
-        return cls(**sections)
+        present = {
+            name: _present_entries(name, entries) if isinstance(entries, dict) else entries
+            for name, entries in values.items()
+        }
+        return replace_sections(base or cls(), present)
 
     def values(self, *names):
         """Plain values of sections (``"scene"``) and keys (``"run.name"``), for hashing."""
@@ -323,20 +311,9 @@ class StudyConfig:
         text : str
             Gives the same configuration back through `load_config`.
         """
-        lines = ["# miricigale run configuration; 'miricigale run FILE' takes it back"]
-        for field in dataclasses.fields(self):
-            section = getattr(self, field.name)
-            lines += ["", f"[{field.name}]  # {type(section).__doc__.strip()}"]
-            for entry in dataclasses.fields(section):
-                lines.append(f"# {entry.metadata['doc']}{_limits_text(entry.metadata)}")
-                lines.append(f"{entry.name} = {toml_value(getattr(section, entry.name))}")
-        return "\n".join(lines) + "\n"
-
-
-def _require(good, section, key, wanted, got):
-    if not good:
-        msg = f"[{section}] {key} {wanted}, got {got}"
-        raise ConfigError(msg)
+        return sections_toml(
+            self, "# miricigale run configuration; 'miricigale run FILE' takes it back"
+        )
 
 
 def _is_positive(text):
@@ -346,89 +323,20 @@ def _is_positive(text):
         return False
 
 
-def _limits_text(limits):
-    if limits["choices"] and limits["low"] is not None:
-        return f" ({limits['low']} to {limits['high']} or {', '.join(limits['choices'])})"
-    if limits["choices"]:
-        return f" One of {', '.join(limits['choices'])}."
-    if limits["low"] is not None and limits["high"] is not None:
-        return f" ({limits['low']} to {limits['high']})"
-    if limits["low"] is not None:
-        return f" (at least {limits['low']})"
-    return ""
-
-
-def toml_value(value):
-    """Text of a value (text, a number, a truth value or a tuple of these) as TOML has it."""
-    if isinstance(value, tuple):
-        return "[" + ", ".join(toml_value(v) for v in value) + "]"
-    if isinstance(value, float):
-        # nan, inf and -inf as TOML has them, and a point or an exponent in all others
-        return float.__repr__(value)
-    # JSON's booleans, integers and strings are valid TOML, but for its pairs of escapes beyond
-    # U+FFFF and the delete character, which TOML wants escaped
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
 def present_names(section, entries):
     """Values of a section by key, former names of keys replaced by the present ones."""
     names = {former: name.partition(".")[2] for name, former in _FORMER.items()}
     return {names.get(f"{section}.{key}", key): value for key, value in entries.items()}
 
 
-def _replace_section(name, section, entries):
-    fields = {field.name: field for field in dataclasses.fields(section)}
-    present = present_names(name, entries)
+def _present_entries(section, entries):
+    """As `present_names`, with a warning for each former name."""
+    present = present_names(section, entries)
     for old, new in zip(entries, present, strict=True):
         if old != new:
-            msg = f"[{name}] {old} is called {new} now"
+            msg = f"[{section}] {old} is called {new} now"
             warnings.warn(msg, AstropyDeprecationWarning, stacklevel=2)
-    entries = present
-    unknown = sorted(set(entries) - set(fields))
-    if unknown:
-        msg = f"[{name}] does not know {unknown}; known: {sorted(fields)}"
-        raise ConfigError(msg)
-    hints = typing.get_type_hints(type(section))
-    changes = {
-        key: _checked(f"[{name}] {key}", value, hints[key], fields[key].metadata)
-        for key, value in entries.items()
-    }
-    return dataclasses.replace(section, **changes)
-
-
-def _checked(label, value, hint, limits):
-    if typing.get_origin(hint) is tuple:
-        if limits["single"] and isinstance(value, (int, float)):
-            value = (value,)
-        if not isinstance(value, (list, tuple)):
-            msg = f"{label} must be a list, got {value!r}"
-            raise ConfigError(msg)
-        item = typing.get_args(hint)[0]
-        return tuple(_checked(label, entry, item, limits) for entry in value)
-    if isinstance(hint, types.UnionType):
-        # a number within the limits, or one of the names
-        named = isinstance(value, str)
-        hint = str if named else float
-        limits = {**limits, **({"low": None, "high": None} if named else {"choices": None})}
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
-    if type(value) is not hint:
-        msg = f"{label} must be of type {hint.__name__}, got {value!r}"
-        raise ConfigError(msg)
-    if hint is float and not math.isfinite(value):
-        msg = f"{label} must be a finite number, got {value!r}"
-        raise ConfigError(msg)
-    low, high, choices = limits["low"], limits["high"], limits["choices"]
-    if choices and value not in choices:
-        msg = f"{label} must be one of {list(choices)}, got {value!r}"
-        raise ConfigError(msg)
-    # the negated comparison also refuses NaN
-    if (low is not None and not value >= low) or (high is not None and not value <= high):
-        msg = f"{label} must be between {low} and {high}, got {value!r}"
-        if high is None:
-            msg = f"{label} must be at least {low}, got {value!r}"
-        raise ConfigError(msg)
-    return value
+    return present
 
 
 def preset_names():
@@ -468,15 +376,7 @@ def load_config(source, *, quick=False, overrides=None):
         if quick:
             msg = "--quick belongs to presets; a configuration file already says how long to expose"
             raise ConfigError(msg)
-        path = Path(source).expanduser()
-        if not path.is_file():
-            msg = f"no configuration file {path}"
-            raise ConfigError(msg)
-        try:
-            texts = [(str(path), path.read_text(encoding="utf-8"))]
-        except UnicodeDecodeError as err:
-            msg = f"{path} is not a text file in UTF-8: {err.reason} at byte {err.start}"
-            raise ConfigError(msg) from None
+        texts = [(source, read_text(source))]
     else:
         if source not in preset_names():
             raise unknown_name("preset", source, preset_names())
@@ -485,12 +385,5 @@ def load_config(source, *, quick=False, overrides=None):
         texts = [(name, (folder / name).read_text(encoding="utf-8")) for name in names]
     config = StudyConfig()
     for label, text in texts:
-        try:
-            config = StudyConfig.from_dict(tomllib.loads(text), base=config)
-        except tomllib.TOMLDecodeError as err:
-            msg = f"{label} is not valid TOML: {err}"
-            raise ConfigError(msg) from None
-        except ConfigError as err:
-            msg = f"{label}: {err}"
-            raise ConfigError(msg) from None
+        config = from_text(label, text, config)
     return StudyConfig.from_dict(overrides, base=config) if overrides else config

@@ -6,7 +6,8 @@ import pytest
 from astropy.utils.exceptions import AstropyDeprecationWarning
 
 from miricigale.utils.exceptions import ConfigError
-from miricigale.workflow.config import StudyConfig, load_config, preset_names, toml_value
+from miricigale.workflow.config import StudyConfig, load_config, preset_names
+from miricigale.workflow.options import toml_value
 
 
 @pytest.mark.parametrize("quick", [False, True])

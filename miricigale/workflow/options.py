@@ -1,0 +1,164 @@
+"""Sections of options as frozen dataclasses: read from TOML, checked, written again."""
+
+import dataclasses
+import json
+import math
+import tomllib
+import types
+import typing
+from pathlib import Path
+
+from miricigale.utils.exceptions import ConfigError
+
+__all__ = [
+    "from_text",
+    "option",
+    "read_text",
+    "replace_sections",
+    "require",
+    "sections_toml",
+    "toml_value",
+]
+
+
+def option(default, doc, *, low=None, high=None, choices=None, single=False):
+    """A field with its documentation and limits in the metadata; ``single``: a list may be one value."""
+    limits = {"doc": doc, "low": low, "high": high, "choices": choices, "single": single}
+    return dataclasses.field(default=default, metadata=limits)
+
+
+def require(good, section, key, wanted, got):
+    """Refuse a value that does not go with others: what was wanted, and what came."""
+    if not good:
+        msg = f"[{section}] {key} {wanted}, got {got}"
+        raise ConfigError(msg)
+
+
+def read_text(path):
+    """Text of a configuration file, or a `ConfigError` that names it."""
+    path = Path(path).expanduser()
+    if not path.is_file():
+        msg = f"no configuration file {path}"
+        raise ConfigError(msg)
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as err:
+        msg = f"{path} is not a text file in UTF-8: {err.reason} at byte {err.start}"
+        raise ConfigError(msg) from None
+
+
+def from_text(label, text, base):
+    """The configuration ``base`` with the sections and keys of a text in TOML, called ``label``."""
+    try:
+        return type(base).from_dict(tomllib.loads(text), base=base)
+    except tomllib.TOMLDecodeError as err:
+        msg = f"{label} is not valid TOML: {err}"
+        raise ConfigError(msg) from None
+    except ConfigError as err:
+        msg = f"{label}: {err}"
+        raise ConfigError(msg) from None
+
+
+def replace_sections(base, values):
+    """
+    A configuration with other values of some sections and keys.
+
+    ``base`` is a dataclass of sections, each a dataclass of `option` fields; ``values`` a dict of
+    dict. Errors name section and key, what was wanted and what came.
+    """
+    sections = {field.name: getattr(base, field.name) for field in dataclasses.fields(base)}
+    unknown = sorted(set(values) - set(sections))
+    if unknown:
+        msg = f"unknown section {unknown}; known: {sorted(sections)}"
+        raise ConfigError(msg)
+    for name, entries in values.items():
+        if not isinstance(entries, dict):
+            msg = f"[{name}] must be a section, got {entries!r}"
+            raise ConfigError(msg)
+        sections[name] = _replace_section(name, sections[name], entries)
+    return type(base)(**sections)
+
+
+def _replace_section(name, section, entries):
+    fields = {field.name: field for field in dataclasses.fields(section)}
+    unknown = sorted(set(entries) - set(fields))
+    if unknown:
+        msg = f"[{name}] does not know {unknown}; known: {sorted(fields)}"
+        raise ConfigError(msg)
+    hints = typing.get_type_hints(type(section))
+    changes = {
+        key: _checked(f"[{name}] {key}", value, hints[key], fields[key].metadata)
+        for key, value in entries.items()
+    }
+    return dataclasses.replace(section, **changes)
+
+
+def _checked(label, value, hint, limits):
+    if typing.get_origin(hint) is tuple:
+        if limits["single"] and isinstance(value, (int, float)):
+            value = (value,)
+        if not isinstance(value, (list, tuple)):
+            msg = f"{label} must be a list, got {value!r}"
+            raise ConfigError(msg)
+        item = typing.get_args(hint)[0]
+        return tuple(_checked(label, entry, item, limits) for entry in value)
+    if isinstance(hint, types.UnionType):
+        # a number within the limits, or one of the names
+        named = isinstance(value, str)
+        hint = str if named else float
+        limits = {**limits, **({"low": None, "high": None} if named else {"choices": None})}
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if type(value) is not hint:
+        msg = f"{label} must be of type {hint.__name__}, got {value!r}"
+        raise ConfigError(msg)
+    if hint is float and not math.isfinite(value):
+        msg = f"{label} must be a finite number, got {value!r}"
+        raise ConfigError(msg)
+    low, high, choices = limits["low"], limits["high"], limits["choices"]
+    if choices and value not in choices:
+        msg = f"{label} must be one of {list(choices)}, got {value!r}"
+        raise ConfigError(msg)
+    # the negated comparison also refuses NaN
+    if (low is not None and not value >= low) or (high is not None and not value <= high):
+        msg = f"{label} must be between {low} and {high}, got {value!r}"
+        if high is None:
+            msg = f"{label} must be at least {low}, got {value!r}"
+        raise ConfigError(msg)
+    return value
+
+
+def sections_toml(config, heading):
+    """All sections as TOML, each key with its documentation; ``heading`` is the first line."""
+    lines = [heading]
+    for field in dataclasses.fields(config):
+        section = getattr(config, field.name)
+        lines += ["", f"[{field.name}]  # {type(section).__doc__.strip()}"]
+        for entry in dataclasses.fields(section):
+            lines.append(f"# {entry.metadata['doc']}{_limits_text(entry.metadata)}")
+            lines.append(f"{entry.name} = {toml_value(getattr(section, entry.name))}")
+    return "\n".join(lines) + "\n"
+
+
+def _limits_text(limits):
+    if limits["choices"] and limits["low"] is not None:
+        return f" ({limits['low']} to {limits['high']} or {', '.join(limits['choices'])})"
+    if limits["choices"]:
+        return f" One of {', '.join(limits['choices'])}."
+    if limits["low"] is not None and limits["high"] is not None:
+        return f" ({limits['low']} to {limits['high']})"
+    if limits["low"] is not None:
+        return f" (at least {limits['low']})"
+    return ""
+
+
+def toml_value(value):
+    """Text of a value (text, a number, a truth value or a tuple of these) as TOML has it."""
+    if isinstance(value, tuple):
+        return "[" + ", ".join(toml_value(v) for v in value) + "]"
+    if isinstance(value, float):
+        # nan, inf and -inf as TOML has them, and a point or an exponent in all others
+        return float.__repr__(value)
+    # JSON's booleans, integers and strings are valid TOML, but for its pairs of escapes beyond
+    # U+FFFF and the delete character, which TOML wants escaped
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
