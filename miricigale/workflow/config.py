@@ -18,7 +18,7 @@ from miricigale.workflow.options import (
 )
 from miricigale.workflow.options import option as _option
 from miricigale.workflow.options import require as _require
-from miricigale.workflow.truths import SETS
+from miricigale.workflow.truths import FIELD, SETS
 
 __all__ = ["StudyConfig", "load_config", "present_names", "preset_names"]
 
@@ -75,12 +75,19 @@ class SedSection:
     alpha: tuple[float, ...] = _option(
         (1.5, 2.5), "Range from which the dust's alpha is drawn where no band shows it."
     )
-    frac_agn: tuple[float, ...] = _option(
+    frac_agn: tuple[float | str, ...] = _option(
         (0.0,),
-        "fracAGN of the injected sources, one simulated sky for each; the first gives the error functions.",
+        "fracAGN of the injected sources, one simulated sky for each; the first gives the error "
+        "functions. 'field' draws AGN from a luminosity function.",
         low=0.0,
         high=0.99,
+        choices=(FIELD,),
         single=True,
+    )
+    infrared: str = _option(
+        "fit",
+        "Dust luminosity: by energy balance of the fit, or of the star-forming main sequence.",
+        choices=("fit", "main-sequence"),
     )
 
 
@@ -180,7 +187,9 @@ class FitSection:
     model_error: float = _option(0.1, "Relative model error.", low=0.0, high=1.0)
     min_detected: int = _option(2, "MIRI bands a source must be detected in.", low=0, high=9)
     sets: tuple[str, ...] = _option(
-        ("all", "none"), "Sets of the MIRI bands that are fitted with the existing ones.", choices=SETS
+        ("all", "none"),
+        "Sets of the MIRI bands that are fitted with the existing ones.",
+        choices=SETS,
     )
 
 
@@ -251,6 +260,8 @@ class StudyConfig:
         ):
             _require(values, section, key, "must have at least one value", "none")
             _require(len(set(values)) == len(values), section, key, "must not repeat", values)
+        first = self.sed.frac_agn[0]
+        _require(first != FIELD, "sed", "frac_agn", "must begin with a number", repr(first))
         _require("all" in fit.sets, "fit", "sets", "must have 'all'", list(fit.sets))
         halves = {"blue", "red"}.intersection(fit.sets)
         wanted = "may have 'blue' and 'red' with two filters and more only"

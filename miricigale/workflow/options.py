@@ -95,7 +95,7 @@ def _replace_section(name, section, entries):
 
 def _checked(label, value, hint, limits):
     if typing.get_origin(hint) is tuple:
-        if limits["single"] and isinstance(value, (int, float)):
+        if limits["single"] and isinstance(value, (int, float, str)):
             value = (value,)
         if not isinstance(value, (list, tuple)):
             msg = f"{label} must be a list, got {value!r}"

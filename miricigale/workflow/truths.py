@@ -4,10 +4,21 @@ import dataclasses
 
 from miricigale.filters import Filter
 
-__all__ = ["SETS", "Truth", "band_sets", "of_truth", "reference", "study_truths", "truth_names"]
+__all__ = [
+    "FIELD",
+    "SETS",
+    "Truth",
+    "band_sets",
+    "of_truth",
+    "reference",
+    "study_truths",
+    "truth_names",
+]
 
 #: Sets of MIRI bands that join the existing ones in a fit: Yang et al. 2021, section 4.
 SETS = ("all", "none", "blue", "red")
+#: In place of a fracAGN: AGN as in a real field.
+FIELD = "field"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,12 +30,12 @@ class Truth:
     ----------
     name : str
         Folder of its products and first part of its units, such as ``"agn20"``.
-    frac_agn : float
-        fracAGN of its sources.
+    frac_agn : float or "field"
+        fracAGN of its sources; AGN of a realistic field (`FIELD`) are drawn from a luminosity function.
     """
 
     name: str
-    frac_agn: float
+    frac_agn: float | str
 
     def values(self):
         """Plain values, for hashing."""
@@ -46,7 +57,10 @@ def study_truths(config):
     -------
     truths : dict of str to `Truth`
     """
-    truths = (Truth(f"agn{100 * value:02g}", value) for value in config.sed.frac_agn)
+    truths = (
+        Truth(value if value == FIELD else f"agn{100 * value:02g}", value)
+        for value in config.sed.frac_agn
+    )
     return {truth.name: truth for truth in truths}
 
 

@@ -11,12 +11,12 @@ def study_stages():
     -------
     stages : tuple of `~miricigale.workflow.stage.Stage`
     """
-    from miricigale.workflow.stages import fits, images, inputs, measure, points, report
+    from miricigale.workflow.stages import fits, images, inputs, measure, points, report, truth
 
     return (
         inputs.make_catalog,
         inputs.fit_inputs,
-        inputs.make_truth,
+        truth.make_truth,
         images.make_exposure,
         images.make_mosaic,
         images.make_highres,

@@ -1,36 +1,29 @@
-"""Stages 1 to 3: catalog, input SEDs, model fluxes."""
+"""Stages 1 and 2: catalog, input SEDs."""
 
 import numpy as np
-from astropy.table import QTable, hstack
+from astropy.table import QTable
 
 from miricigale import fitting, sed
 from miricigale.filters import Filter
 from miricigale.refdata import resources
 from miricigale.refdata.locate import fingerprint
 from miricigale.scene import read_catalog
-from miricigale.utils.exceptions import ConfigError, DataError, argument_error
-from miricigale.utils.meta import provenance
-from miricigale.utils.random import stream
+from miricigale.utils.exceptions import ConfigError, argument_error
 from miricigale.utils.tables import error_column
 from miricigale.workflow.stage import stage
-from miricigale.workflow.stages.stars import star_fluxes
-from miricigale.workflow.truths import study_truths, truth_names
 
 __all__ = [
-    "add_agn",
     "catalog_bands",
     "fit_inputs",
     "fit_plan",
     "input_axes",
     "input_bands",
     "make_catalog",
-    "make_truth",
     "sed_resources",
 ]
 
 #: Redshifts closer than this share a node of the grid of the input fit.
 REDSHIFT_STEP = 0.01
-GALAXY_PARAMETERS = ("tau", "age", "ebv", "alpha", "metallicity")
 
 
 def input_axes(kind, *, dust=False):
@@ -160,104 +153,3 @@ def fit_inputs(context, _):
     )
     results = fitter.fit(photometry, redshift="redshift", progress_bar=context.progress_bar)
     context.save_result("input_seds.fits", results)
-
-
-def add_agn(table, frac_agn, seed):
-    """
-    Give each source an AGN drawn from the ranges of Yang et al. 2021 (those of q are inferred).
-
-    Columns are added to ``table``, which has ``id``: each source has its own random stream. See table 3
-    of Yang et al. 2021, ApJ 908, 144.
-    """
-    drawn = {
-        name: np.empty(len(table))
-        for name in (
-            "tau97", "p", "q", "inclination", "ebv_polar", "temperature_polar", "emissivity_polar"
-        )
-    }  # fmt: skip
-    for row, key in enumerate(table["id"]):
-        rng = stream(seed, "truth", str(key))
-        drawn["tau97"][row] = rng.choice([3.0, 5.0, 7.0, 9.0, 11.0])
-        drawn["p"][row] = rng.choice([0.0, 0.5, 1.0, 1.5])
-        drawn["q"][row] = rng.choice([0.0, 0.5, 1.0, 1.5])
-        drawn["inclination"][row] = rng.choice([60.0, 70.0, 80.0, 90.0])
-        drawn["ebv_polar"][row] = rng.uniform(0, 0.3)
-        drawn["temperature_polar"][row] = rng.uniform(100, 300)
-        drawn["emissivity_polar"][row] = rng.uniform(1, 2)
-    table["frac_agn"] = np.full(len(table), frac_agn)
-    for name, values in drawn.items():
-        table[name] = values
-
-
-@stage(
-    "truth",
-    "model fluxes",
-    version=3,
-    needs=("catalog", "seds"),
-    sections=("sed.alpha", "exposures.filters", "fit.bands", "highres.filter"),
-    resources=sed_resources,
-    units=truth_names,
-    plan=lambda config, unit: study_truths(config)[unit].values(),
-    kernels=("fit",),
-)
-def make_truth(context, name):
-    """Stage 3: the best-fit SED (and its AGN) of each source through every band."""
-    config, frac_agn = context.config, context.plan["frac_agn"]
-    catalog = QTable.read(context.path("catalog.ecsv"))
-    best = fitting.FitResults.read(context.path("input_seds.fits")).to_table()
-    parameters = QTable({"id": catalog["id"]})
-    parameters["redshift"] = np.asarray(catalog["redshift"], float)
-    for parameter in (*GALAXY_PARAMETERS, "mass"):
-        if f"{parameter}_best" in best.colnames:
-            parameters[parameter] = best[f"{parameter}_best"]
-    if "alpha" not in parameters.colnames:
-        # the bands of the fit do not show it
-        low, high = config.sed.alpha
-        parameters["alpha"] = [
-            stream(context.seed, "truth", "alpha", str(key)).uniform(low, high)
-            for key in parameters["id"]
-        ]
-    model = sed.SEDModel.yang2021(agn=frac_agn > 0)
-    if frac_agn > 0:
-        add_agn(parameters, frac_agn, context.seed)
-    bands = list(
-        dict.fromkeys([*config.fit.bands, *config.exposures.filters, config.highres.filter])
-    )
-    prior = config.highres.filter
-    if prior in catalog.colnames:
-        # each SED is scaled to the measured flux in the band of the prior image
-        fitted, measured = model.fluxes(parameters, [prior])[prior], catalog[prior]
-        usable = np.isfinite(fitted) & (fitted > 0) & np.isfinite(measured) & (measured > 0)
-        ratio = np.where(usable, (measured / np.where(usable, fitted, 1 * fitted.unit)).value, 1.0)
-        parameters["mass"] = parameters["mass"] * ratio
-        parameters["prior_ratio"] = np.where(usable, ratio, np.nan)
-    light = model.fluxes(parameters, bands)
-    lacking = (light["flags"] & int(sed.ModelFlags.NOT_IN_LIBRARY)) > 0
-    if np.any(lacking):
-        msg = (
-            f"{np.count_nonzero(lacking)} of {len(light)} sources have parameters that the "
-            f"registered libraries lack ({'; '.join(model.meta['libraries'])}): register whole "
-            "libraries with 'miricigale data add', or remove these"
-        )
-        raise DataError(msg)
-    light.rename_column("flags", "sed_flags")
-    star = np.asarray(catalog["star"], bool)
-    if np.any(star):
-        stars = star_fluxes(catalog[star], catalog_bands(catalog), bands)
-        for band in bands:
-            light[band][star] = stars[band]
-    own = {*light.colnames, *parameters.colnames}
-    truth = hstack(
-        [
-            parameters,
-            catalog[[c for c in catalog.colnames if c not in own and "." not in c]],
-            light[[c for c in light.colnames if c not in parameters.colnames]],
-        ],
-        metadata_conflicts="silent",
-    )
-    if "frac_agn" not in truth.colnames:
-        truth["frac_agn"] = np.zeros(len(truth))
-    citations = [*catalog.meta.get("citations", ()), *model.meta["citations"]]
-    truth.meta.clear()
-    truth.meta.update(provenance(citations=citations, stage="truth"))
-    context.save_table(f"{name}/truth.ecsv", truth)

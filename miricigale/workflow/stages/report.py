@@ -85,7 +85,7 @@ def make_report(context, _):
         subtitle=(
             f"{metrics['n_field']} galaxies in a MIRI field at RA {config.pointing.ra:.5f}, "
             f"Dec {config.pointing.dec:.5f}, injected fracAGN "
-            f"{', '.join(f'{value:g}' for value in config.sed.frac_agn)}, seed {context.seed}"
+            f"{', '.join(map(str, config.sed.frac_agn))}, seed {context.seed}"
         ),
         notices=provenance.stand_ins(config, model),
         dpi=config.report.dpi,
@@ -399,7 +399,7 @@ class _Writer:
             for truth in self.metrics["truths"].values()
             for unit, fit in truth["fits"].items()
         ]
-        columns = {"injected fracAGN": lambda x: f"{x[0]['frac_agn']:g}"}
+        columns = {"injected fracAGN": lambda x: f"{x[0]['frac_agn']}"}
         columns |= {name: lambda x, cell=cell: cell(x[1]) for name, cell in FIT_COLUMNS.items()}
         self._table(
             rows,

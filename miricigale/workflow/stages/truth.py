@@ -1,0 +1,160 @@
+"""Stage 3: what the sky holds, by truth: galaxies as fitted, and their AGN."""
+
+import numpy as np
+from astropy.table import QTable, hstack
+
+from miricigale import fitting, sed
+from miricigale.evaluation import AGNPopulation, agn_fraction, main_sequence_dust
+from miricigale.utils.exceptions import DataError
+from miricigale.utils.meta import provenance
+from miricigale.utils.random import stream
+from miricigale.workflow.stage import stage
+from miricigale.workflow.stages.inputs import catalog_bands, sed_resources
+from miricigale.workflow.stages.stars import star_fluxes
+from miricigale.workflow.truths import FIELD, study_truths, truth_names
+
+__all__ = ["add_agn", "add_field_agn", "galaxy_parameters", "make_truth"]
+
+GALAXY_PARAMETERS = ("tau", "age", "ebv", "alpha", "metallicity")
+#: Inclinations (deg) of AGN seen through the torus, after Yang et al. 2021, and of the others.
+EDGE_ON, FACE_ON = (60.0, 70.0, 80.0, 90.0), (0.0, 10.0, 20.0, 30.0, 40.0)
+
+
+def galaxy_parameters(config, catalog, best, *, seed):
+    """
+    Parameters of the galaxies: best fits, scaled to the measured flux in the prior's band.
+
+    ``best`` is the table of the fits of the input SEDs, row by row; ``config`` has
+    ``sed.alpha``, ``sed.infrared`` and ``highres.filter``. ``prior_ratio`` is the factor of the scaling, NaN
+    where there is no measured flux.
+    """
+    table = QTable({"id": catalog["id"]})
+    table["redshift"] = np.asarray(catalog["redshift"], float)
+    for name in (*GALAXY_PARAMETERS, "mass"):
+        if f"{name}_best" in best.colnames:
+            table[name] = best[f"{name}_best"]
+    if "alpha" not in table.colnames:
+        # the bands of the fit do not show it
+        low, high = config.sed.alpha
+        table["alpha"] = [
+            stream(seed, "truth", "alpha", str(key)).uniform(low, high) for key in table["id"]
+        ]
+    model, prior = sed.SEDModel.yang2021(agn=False), config.highres.filter
+    if prior in catalog.colnames:
+        fitted, measured = model.fluxes(table, [prior])[prior], catalog[prior]
+        usable = np.isfinite(fitted) & (fitted > 0) & np.isfinite(measured) & (measured > 0)
+        ratio = np.where(usable, (measured / np.where(usable, fitted, 1 * fitted.unit)).value, 1.0)
+        table["mass"] = table["mass"] * ratio
+        table["prior_ratio"] = np.where(usable, ratio, np.nan)
+    if config.sed.infrared == "main-sequence":
+        light = model.fluxes(table, [prior])
+        light["redshift"] = table["redshift"]
+        table["dust_excess"] = main_sequence_dust(light, seed=seed)["dust_excess"]
+    return table
+
+
+def add_agn(table, frac_agn, seed):
+    """
+    Give each source an AGN drawn from the ranges of Yang et al. 2021 (those of q are inferred).
+
+    Columns are added to ``table``, which has ``id``: each source has its own random stream. See table 3
+    of Yang et al. 2021, ApJ 908, 144.
+    """
+    drawn = {
+        name: np.empty(len(table))
+        for name in (
+            "tau97", "p", "q", "inclination", "ebv_polar", "temperature_polar", "emissivity_polar"
+        )
+    }  # fmt: skip
+    for row, key in enumerate(table["id"]):
+        rng = stream(seed, "truth", str(key))
+        drawn["tau97"][row] = rng.choice([3.0, 5.0, 7.0, 9.0, 11.0])
+        drawn["p"][row] = rng.choice([0.0, 0.5, 1.0, 1.5])
+        drawn["q"][row] = rng.choice([0.0, 0.5, 1.0, 1.5])
+        drawn["inclination"][row] = rng.choice(EDGE_ON)
+        drawn["ebv_polar"][row] = rng.uniform(0, 0.3)
+        drawn["temperature_polar"][row] = rng.uniform(100, 300)
+        drawn["emissivity_polar"][row] = rng.uniform(1, 2)
+    table["frac_agn"] = np.full(len(table), frac_agn)
+    for name, values in drawn.items():
+        table[name] = values
+
+
+def add_field_agn(table, model, band, seed):
+    """
+    Give sources the AGN of a realistic field, of the luminosities of `AGNPopulation`.
+
+    The torus of each is drawn as by `add_agn`; unobscured ones are seen within 40 degrees of its axis.
+    ``model`` is an `~miricigale.sed.SEDModel` with AGN, and ``band`` any filter. Columns of the draw are
+    added too.
+    """
+    add_agn(table, 0.5, seed)
+    light = model.fluxes(table, [band])
+    light["redshift"] = table["redshift"]
+    drawn = AGNPopulation().draw(light, seed=seed)
+    for row in np.flatnonzero(drawn["has_agn"] & ~drawn["obscured"]):
+        rng = stream(seed, "truth", "inclination", str(table["id"][row]))
+        table["inclination"][row] = rng.choice(FACE_ON)
+    # by the luminosity that half of the power gives, with the inclination that was drawn
+    table["frac_agn"] = agn_fraction(drawn["l_6um"], model.fluxes(table, [band])["l_6um"])
+    for name in ("has_agn", "l_2_10kev", "obscured", "compton_thick"):
+        table[name] = drawn[name]
+
+
+@stage(
+    "truth",
+    "model fluxes",
+    version=3,
+    needs=("catalog", "seds"),
+    sections=(
+        "sed.alpha", "sed.infrared", "exposures.filters", "fit.bands", "highres.filter"
+    ),
+    resources=sed_resources,
+    units=truth_names,
+    plan=lambda config, unit: study_truths(config)[unit].values(),
+    kernels=("fit",),
+)  # fmt: skip
+def make_truth(context, name):
+    """Stage 3: the best-fit SED (and its AGN) of each source through every band."""
+    config, frac_agn = context.config, context.plan["frac_agn"]
+    catalog = QTable.read(context.path("catalog.ecsv"))
+    best = fitting.FitResults.read(context.path("input_seds.fits")).to_table()
+    parameters = galaxy_parameters(config, catalog, best, seed=context.seed)
+    bands = list(
+        dict.fromkeys([*config.fit.bands, *config.exposures.filters, config.highres.filter])
+    )
+    model = sed.SEDModel.yang2021(agn=frac_agn != 0)
+    if frac_agn == FIELD:
+        add_field_agn(parameters, model, bands[0], context.seed)
+    elif frac_agn > 0:
+        add_agn(parameters, frac_agn, context.seed)
+    light = model.fluxes(parameters, bands)
+    lacking = (light["flags"] & int(sed.ModelFlags.NOT_IN_LIBRARY)) > 0
+    if np.any(lacking):
+        msg = (
+            f"{np.count_nonzero(lacking)} of {len(light)} sources have parameters that the "
+            f"registered libraries lack ({'; '.join(model.meta['libraries'])}): register whole "
+            "libraries with 'miricigale data add', or remove these"
+        )
+        raise DataError(msg)
+    light.rename_column("flags", "sed_flags")
+    star = np.asarray(catalog["star"], bool)
+    if np.any(star):
+        stars = star_fluxes(catalog[star], catalog_bands(catalog), bands)
+        for band in bands:
+            light[band][star] = stars[band]
+    own = {*light.colnames, *parameters.colnames}
+    truth = hstack(
+        [
+            parameters,
+            catalog[[c for c in catalog.colnames if c not in own and "." not in c]],
+            light[[c for c in light.colnames if c not in parameters.colnames]],
+        ],
+        metadata_conflicts="silent",
+    )
+    if "frac_agn" not in truth.colnames:
+        truth["frac_agn"] = np.zeros(len(truth))
+    citations = [*catalog.meta.get("citations", ()), *model.meta["citations"]]
+    truth.meta.clear()
+    truth.meta.update(provenance(citations=citations, stage="truth"))
+    context.save_table(f"{name}/truth.ecsv", truth)

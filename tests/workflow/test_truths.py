@@ -1,0 +1,147 @@
+"""What the skies of a study hold: galaxies alike in all of them, AGN of the wanted strength."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+
+from miricigale.evaluation import AGNPopulation
+from miricigale.sed import SEDModel
+from miricigale.utils.exceptions import ConfigError
+from miricigale.workflow import Context
+from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.stages import study_stages
+from miricigale.workflow.truths import band_sets, study_truths
+
+STAGES = {stage.name: stage for stage in study_stages()}
+N, PRIOR = 60, "wfc3.f160w"
+FRACTIONS = [0.0, 0.4, 0.99, "field"]
+
+
+def make_truths(folder, **sed):
+    """Truths of a catalog of massive galaxies, of which many have an AGN."""
+    rng = np.random.default_rng(5)
+    parameters = QTable({"redshift": rng.uniform(0.5, 2.5, N), "age": np.full(N, 1.0)})
+    parameters["mass"] = 10 ** rng.uniform(10.8, 11.5, N)
+    parameters["tau"], parameters["ebv"], parameters["alpha"] = 1.0, 0.3, 2.0
+    bands = ["acs.f606w", "acs.f814w", "wfc3.f125w", PRIOR]
+    light = SEDModel.yang2021(agn=False).fluxes(parameters, bands)
+    table = QTable({"id": np.arange(1, N + 1), "redshift": parameters["redshift"]})
+    table["profile"] = "point"
+    table["sky"] = SkyCoord(53.1 + 0.001 * np.arange(N), np.full(N, -27.8), unit="deg")
+    table["half_light_radius"] = np.zeros(N) * u.arcsec
+    table["sersic_index"] = table["axis_ratio"] = 1.0
+    table["position_angle"] = np.zeros(N) * u.deg
+    table["mag_f160w"] = 20.0
+    for name in bands:
+        table[name] = light[name]
+    table.write(folder / "mine.ecsv")
+    config = StudyConfig.from_dict(
+        {
+            "catalog": {"source": str(folder / "mine.ecsv")},
+            "sed": {"frac_agn": FRACTIONS, "axes": "quick", **sed},
+        }
+    )
+    for name in ("catalog", "seds", "truth"):
+        stage = STAGES[name]
+        for unit in stage.unit_names(config):
+            stage.function(Context(config, folder, stage=stage, unit=unit), unit)
+    return {name: QTable.read(folder / name / "truth.ecsv") for name in study_truths(config)}
+
+
+@pytest.fixture(scope="module")
+def truths(tmp_path_factory):
+    return make_truths(tmp_path_factory.mktemp("truths"))
+
+
+def test_galaxies_are_alike_in_all_skies(truths):
+    assert list(truths) == ["agn00", "agn40", "agn99", "field"]
+    for truth in truths.values():
+        for name in ("redshift", "mass", "age", "ebv"):
+            np.testing.assert_array_equal(truth[name], truths["agn00"][name])
+        # integrals on the wavelengths of the torus too
+        for name in ("stellar_mass", "dust_luminosity"):
+            np.testing.assert_allclose(truth[name], truths["agn00"][name], rtol=1e-4)
+    catalog_flux = truths["agn00"][PRIOR]
+    # as measured
+    assert np.all(truths["agn00"]["prior_ratio"] > 0)
+    assert np.all(truths["agn40"][PRIOR] >= catalog_flux)
+
+
+def test_an_agn_has_its_share_of_the_power(truths):
+    # by definition "dust": power of the AGN = dust luminosity f / (1 - f)
+    for name, value in (("agn40", 0.4), ("agn99", 0.99)):
+        truth = truths[name]
+        np.testing.assert_allclose(truth["frac_agn"], value)
+        power = (truth["ir_luminosity"] - truths["agn00"]["ir_luminosity"]).to_value(u.W)
+        wanted = truth["dust_luminosity"].to_value(u.W) * value / (1 - value)
+        # the share within 3-1000 um is close to it
+        np.testing.assert_allclose(power, wanted, rtol=0.2)
+
+
+def test_agn_of_the_field_have_the_luminosities_that_were_drawn(truths):
+    truth = truths["field"]
+    table = QTable({"id": truth["id"], "redshift": truth["redshift"]})
+    table["stellar_mass"] = truth["stellar_mass"]
+    drawn = AGNPopulation().draw(table, seed=StudyConfig().run.seed)
+    has = np.asarray(drawn["has_agn"])
+    assert 3 < has.sum() < N / 2
+    np.testing.assert_array_equal(np.asarray(truth["frac_agn"]) > 0, has)
+    np.testing.assert_allclose(
+        truth["l_6um"].to_value(u.W), drawn["l_6um"].to_value(u.W), rtol=1e-9
+    )
+    # those through whose torus no line of sight goes are seen from above
+    open_ones = has & ~np.asarray(drawn["obscured"])
+    np.testing.assert_array_equal(np.asarray(truth["inclination"])[has] <= 40, open_ones[has])
+    # a galaxy without one has the fluxes of the sky without AGN
+    for name in ("miri.f770w", "miri.f2100w"):
+        np.testing.assert_allclose(truth[name][~has], truths["agn00"][name][~has], rtol=1e-4)
+
+
+def test_dust_of_the_main_sequence_leaves_the_stars(truths, tmp_path):
+    dusty = make_truths(tmp_path, infrared="main-sequence")["agn00"]
+    plain = truths["agn00"]
+    assert np.all(dusty["dust_excess"] >= 1)
+    assert np.any(dusty["dust_excess"] > 1.5)
+    np.testing.assert_allclose(dusty["acs.f606w"], plain["acs.f606w"], rtol=1e-6)
+    ratio = dusty["dust_luminosity"] / plain["dust_luminosity"]
+    np.testing.assert_allclose(ratio, dusty["dust_excess"], rtol=1e-9)
+    # light of the dust alone, far from the stars
+    far = dusty["redshift"] < 1.0
+    np.testing.assert_allclose(
+        (dusty["mips.24"] / plain["mips.24"])[far], dusty["dust_excess"][far], rtol=0.02
+    )
+
+
+def test_names_of_truths_and_sets():
+    config = StudyConfig.from_dict({"sed": {"frac_agn": 0.155}, "fit": {"sets": ["red", "all"]}})
+    assert list(study_truths(config)) == ["agn15.5"]
+    assert band_sets(config) == {
+        "red": ("miri.f1500w", "miri.f1800w", "miri.f2100w"),
+        "all": config.exposures.filters,
+    }
+    shuffled = {"filters": ["miri.f2100w", "miri.f560w", "miri.f1000w"]}
+    config = StudyConfig.from_dict({"exposures": shuffled, "fit": {"sets": ["all", "blue"]}})
+    assert band_sets(config)["blue"] == ("miri.f560w", "miri.f1000w")
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"sed": {"frac_agn": []}}, "must have at least one value"),
+        ({"sed": {"frac_agn": [0.2, 0.2]}}, "must not repeat"),
+        ({"sed": {"frac_agn": ["field", 0.0]}}, "must begin with a number"),
+        ({"sed": {"frac_agn": [0.0, "quasars"]}}, r"must be one of \['field'\]"),
+        ({"sed": {"frac_agn": [1.0]}}, "must be between 0.0 and 0.99"),
+        ({"fit": {"sets": ["none"]}}, "must have 'all'"),
+        (
+            {"fit": {"sets": ["all", "blue"], "min_detected": 1},
+             "exposures": {"filters": ["miri.f770w"]}},
+            "two filters and more",
+        ),
+    ],
+)  # fmt: skip
+def test_truths_and_sets_that_cannot_be(values, message):
+    with pytest.raises(ConfigError, match=message):
+        StudyConfig.from_dict(values)
