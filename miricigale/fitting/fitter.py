@@ -6,43 +6,34 @@ import warnings
 
 import numpy as np
 
-from miricigale.fitting.flags import FitFlags
+from miricigale.fitting.flags import FitFlags, flags_of_fits
 from miricigale.fitting.grid_fit import GridFit
-from miricigale.fitting.likelihood import per_band, read_photometry, unused_bands
+from miricigale.fitting.likelihood import PhotometryReader, per_band, unused_bands
 from miricigale.fitting.results import FitResults
 from miricigale.fitting.samplers import Request, get_sampler
 from miricigale.fitting.samplers.fit import SamplerFit
-from miricigale.sed import ModelGrid, SEDModel
+from miricigale.sed import ModelGrid
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error, unknown_name
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import chunks, parallel_map, single_threaded
 from miricigale.utils.random import check_seed
-from miricigale.utils.tables import require_columns
+from miricigale.utils.units import check_count, is_number
 
 __all__ = ["BayesFitter"]
 
 logger = logging.getLogger(__name__)
 
-#: S/N of the best model in all bands together below which an object is flagged.
-LOW_SIGNAL = 3.0
 #: Options that only one kind of engine has.
 _OF_GRID = ("axes", "prior_f", "redshift_tolerance", "compat", "rtol")
-_OF_SAMPLER = (
-    "predict",
-    "n_live",
-    "n_effective",
-    "max_calls",
-    "n_draws",
-    "n_cells",
-    "sampler_options",
-)
-_COUNTS = {
-    "n_bands_min": 1,
-    "n_live": 10,
-    "n_effective": 1,
-    "max_calls": 1,
-    "n_draws": 1,
-    "n_cells": 2,
+_OF_SAMPLER = ("predict", "n_live", "n_effective", "max_calls", "n_draws", "n_cells")
+_OF_SAMPLER += ("sampler_options",)
+#: Least value of options that are integers, and what others must be.
+_COUNTS = {"n_bands_min": 1, "n_live": 10, "n_effective": 1, "max_calls": 1, "n_draws": 1}
+_COUNTS |= {"n_cells": 2}
+_RANGES = {
+    "rtol": (lambda value: 0 <= value < 0.1, "in [0, 0.1)"),
+    "max_reduced_chi2": (lambda value: value > 0, "positive"),
+    "redshift_tolerance": (lambda value: value >= 0, ">= 0"),
 }
 
 
@@ -190,7 +181,6 @@ class BayesFitter:
     ):
         given = dict(locals())
         _check_options(given)
-        _check_numbers(given)
         if engine != "grid":
             get_sampler(engine)
         names = None if filters is None and engine == "grid" else _names("filters", filters or ())
@@ -198,24 +188,24 @@ class BayesFitter:
         if names is not None and (not names or len(set(asked)) < len(asked)):
             raise argument_error("filters", "different names, at least one", f"{list(asked)}")
         self.engine, self.filters = engine, names
+        self.model = None if isinstance(model, ModelGrid) else model
         scale_error = compat is None if scale_error is None else bool(scale_error)
         if engine == "grid":
-            grid, self.model = _grid_of(model, names, filters, axes)
-            self._error_bands = grid.filters
-            for name in names or ():
-                if name not in grid.filters:
-                    raise unknown_name("filter of the grid", name, grid.filters)
-            self.backend = GridFit.of_grid(
-                grid,
+            self.backend = GridFit.of_model(
+                model,
+                filters,
+                axes,
                 priors,
-                prior_f,
+                prior_f=prior_f,
                 rtol=float(rtol),
                 scale_error=scale_error,
                 redshift_tolerance=redshift_tolerance,
                 compat=compat,
             )
+            for name in names or ():
+                if name not in self.bands:
+                    raise unknown_name("filter of the grid", name, self.bands)
         else:
-            self.model, self._error_bands = model, names
             self.backend = SamplerFit.of_model(
                 model,
                 filters,
@@ -227,9 +217,14 @@ class BayesFitter:
                 n_draws=n_draws,
                 n_cells=n_cells,
             )
-        self._model_error = per_band(model_error, self._error_bands, "model_error")
-        self._error_floor = per_band(error_floor, self._error_bands, "error_floor")
-        self.n_bands_min = int(n_bands_min)
+        of_bands = self.bands if engine == "grid" else names
+        self._reader = PhotometryReader(
+            self.bands,
+            names,
+            per_band(model_error, of_bands, "model_error"),
+            per_band(error_floor, of_bands, "error_floor"),
+            int(n_bands_min),
+        )
         self.max_reduced_chi2 = float(max_reduced_chi2)
 
     def __repr__(self):
@@ -247,6 +242,11 @@ class BayesFitter:
     def bands(self):
         """Bands of the models, in the order of the results: tuple of str."""
         return self.backend.filters
+
+    @property
+    def n_bands_min(self):
+        """Objects with fewer usable bands are not fitted."""
+        return self._reader.n_bands_min
 
     @property
     def grid(self):
@@ -335,14 +335,10 @@ class BayesFitter:
         .. [1] Sawicki 2012, PASP 124, 1208, appendix
         .. [2] Boquien et al. 2019, A&A 622, A103, section 4.3
         """
+        options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
         return self._fit_rows(
             photometry,
-            {
-                "redshift": redshift,
-                "redshift_prior": redshift_prior,
-                "pairs": pairs,
-                "stacklevel": 4,
-            },
+            options | {"stacklevel": 4},
             seed=seed,
             chunk_size=chunk_size,
             executor=executor,
@@ -353,26 +349,33 @@ class BayesFitter:
         self, photometry, options, *, seed=None, chunk_size=None, repeated=None, **parallel
     ):
         """Fit a catalog, or a part of one of which earlier parts had the ``repeated`` rows."""
-        if chunk_size is None:
-            chunk_size = self.backend.chunk_size
-        if not (_is_number(chunk_size, np.integer) and chunk_size >= 1):
-            raise argument_error("chunk_size", "an integer >= 1", repr(chunk_size))
+        size = self.backend.chunk_size if chunk_size is None else chunk_size
+        size = check_count(size, "chunk_size")
         seed = None if self.engine == "grid" else check_seed(seed)
         pairs = options.pop("pairs")
         data, known, settings = self._prepare(photometry, **options, repeated=repeated)
         task = self.backend.task(pairs, seed, known)
         # the measured errors take no part, and what goes to other processes is kept small
         sent = data._changed(flux_err=None)
-        pieces = [
-            (sent[rows], known[rows])
-            for rows in list(chunks(len(data), int(chunk_size))) or [slice(0, 0)]
-        ]
+        rows = list(chunks(len(data), size)) or [slice(0, 0)]
+        pieces = [(sent[some], known[some]) for some in rows]
         # for threads too, which share this setting with their process
         with single_threaded():
             results = FitResults.concatenate(parallel_map(task, pieces, desc="fit", **parallel))
         logger.debug("fitted %d objects", len(data))
         settings |= {} if seed is None else {"seed": seed}
-        return self._finish(results, data, settings)
+        fixed = settings["redshift"] == "fixed"
+        edge = None if fixed else self.backend.edge_weight
+        return results._changed(
+            flags=flags_of_fits(results, data.measured, self.max_reduced_chi2, edge),
+            flux_err=data.flux_err,
+            fitted_filters=tuple(settings["filters"]),
+            redshift_fixed=fixed,
+            model=self.model,
+            meta=provenance(
+                citations=self.backend.citations, fit=settings, **self.backend.provenance()
+            ),
+        )
 
     def _prepare(self, photometry, *, redshift, redshift_prior, stacklevel, repeated=None):
         """
@@ -380,29 +383,16 @@ class BayesFitter:
 
         ``stacklevel`` is that of the warnings; None for none.
         """
-        require_columns(photometry, [], "photometry")
+        filters = self._reader.fitted(photometry)
         if redshift is not None and redshift_prior is not None:
             msg = "'redshift' and 'redshift_prior' must not be given both"
             raise ValueError(msg)
-        filters = self._fitted_bands(photometry)
         unused = unused_bands(photometry, filters)
         if unused and self.filters is None and stacklevel is not None:
             # who names the bands knows that others are left out
-            warnings.warn(
-                f"bands of the photometry that the grid lacks are not fitted: {', '.join(unused)}",
-                MiricigaleWarning,
-                stacklevel=stacklevel,
-            )
-        columns = [self._error_bands.index(name) for name in filters]
-        data = read_photometry(
-            photometry,
-            filters,
-            model_error=self._model_error[columns],
-            error_floor=self._error_floor[columns],
-            n_bands_min=self.n_bands_min,
-            grid_filters=self.bands,
-            repeated=repeated,
-        )
+            text = "bands of the photometry that the grid lacks are not fitted"
+            warnings.warn(f"{text}: {', '.join(unused)}", MiricigaleWarning, stacklevel=stacklevel)
+        data = self._reader.read(photometry, repeated)
         self.backend.check_data(data)
         flags = np.array(data.flags)
         known, n_free, kind = self.backend.redshifts(photometry, redshift, redshift_prior, flags)
@@ -410,45 +400,6 @@ class BayesFitter:
         flags[few] |= int(FitFlags.FEW_FOR_PARAMETERS)
         settings = self.settings(filters) | {"redshift": kind, "unused_bands": unused}
         return data._changed(flags=flags), known, settings
-
-    def _fitted_bands(self, photometry):
-        """Filters to fit: those asked for, or those of the grid that the table has."""
-        if self.filters is not None:
-            return self.filters
-        filters = tuple(name for name in self.bands if name in photometry.colnames)
-        if not filters:
-            wanted = f"a table with at least one of the columns {list(self.bands)}"
-            raise argument_error("photometry", wanted, f"columns {photometry.colnames}")
-        return filters
-
-    def _finish(self, results, data, settings):
-        """Flag what the fits of a catalog show, and say where the results come from."""
-        flags, fitted = np.array(results.flags), results.fitted
-        signal = np.where(data.measured, results.best_flux / results.sigma, 0.0)
-        with np.errstate(invalid="ignore"):
-            flags[fitted & (results.reduced_chi2 > self.max_reduced_chi2)] |= FitFlags.HIGH_CHI2
-            flags[fitted & ~(results.best_scale > 0)] |= FitFlags.NO_SIGNAL
-            faint = np.sqrt(np.sum(signal * signal, axis=1)) < LOW_SIGNAL
-            flags[fitted & faint] |= FitFlags.LOW_SIGNAL
-        unfitted = ~fitted & ((flags & FitFlags.UNFITTED) == 0)
-        flags[unfitted] |= FitFlags.NO_SIGNAL
-        pdf = results.pdf["redshift"]
-        fixed = settings["redshift"] == "fixed"
-        if not fixed and pdf.shape[1] > 2:
-            with np.errstate(invalid="ignore"):
-                edge = np.maximum(pdf[:, 0], pdf[:, -1]) > self.backend.edge_weight
-            flags[fitted & edge] |= FitFlags.REDSHIFT_EDGE
-        meta = provenance(
-            citations=self.backend.citations, fit=settings, **self.backend.provenance()
-        )
-        return results._changed(
-            flags=flags,
-            flux_err=data.flux_err,
-            fitted_filters=tuple(settings["filters"]),
-            redshift_fixed=fixed,
-            model=self.model,
-            meta=meta,
-        )
 
     def sample(
         self,
@@ -489,26 +440,23 @@ class BayesFitter:
         if self.engine != "grid":
             msg = "draws of a sampler are in its results: fitter.fit(photometry).samples(id)"
             raise ValueError(msg)
-        if not (_is_number(n_draws, np.integer) and n_draws >= 1):
-            raise argument_error("n_draws", "an integer >= 1", repr(n_draws))
-        seed = check_seed(seed)
+        n_draws, seed = check_count(n_draws, "n_draws"), check_seed(seed)
         data, known, settings = self._prepare(
             photometry, redshift=redshift, redshift_prior=redshift_prior, stacklevel=3
         )
         samples = self.backend.sample(
-            data, known, int(n_draws), seed, executor=executor, progress_bar=progress_bar
+            data, known, n_draws, seed, executor=executor, progress_bar=progress_bar
         )
         meta = provenance(citations=self.backend.citations, fit=settings, seed=seed)
         return samples._changed(model=self.model, meta=meta)
 
     def settings(self, filters=None):
         """Return what the fit was told, for the meta of results: a dict of plain values."""
-        names = self._error_bands
         return {
             "engine": self._engine_name,
             "filters": list(filters or self.filters or self.bands),
-            "model_error": dict(zip(names, self._model_error.tolist(), strict=True)),
-            "error_floor": dict(zip(names, self._error_floor.tolist(), strict=True)),
+            "model_error": dict(self._reader.model_error),
+            "error_floor": dict(self._reader.error_floor),
             "n_bands_min": self.n_bands_min,
             **self.backend.settings(),
         }
@@ -520,39 +468,21 @@ def _names(argument, filters):
     return tuple(getattr(filters, "names", filters))
 
 
-def _is_number(value, kind=np.number):
-    """Whether a value is one number, and of a kind; True and False are none."""
-    array = np.asarray(value)
-    return array.ndim == 0 and np.issubdtype(array.dtype, kind)
-
-
 def _check_options(given):
-    """Refuse options of another engine than the one that was chosen."""
+    """Refuse options of another engine than the one that was chosen, and numbers out of range."""
     of_grid = isinstance(given["engine"], str) and given["engine"] == "grid"
-    foreign = _OF_SAMPLER if of_grid else _OF_GRID
     declared = inspect.signature(BayesFitter).parameters
-    for name in foreign:
+    for name in _OF_SAMPLER if of_grid else _OF_GRID:
         value, default = given[name], declared[name].default
         if value is not default and not (np.ndim(value) == 0 and value == default):
             wanted = "left out with engine='grid'" if of_grid else "left out with a sampler"
             raise argument_error(name, wanted, repr(value))
-
-
-def _check_numbers(given):
-    """Refuse numbers that are none, or out of range."""
     for name, least in _COUNTS.items():
+        check_count(given[name], name, least)
+    for name, (good, wanted) in _RANGES.items():
         value = given[name]
-        if not (_is_number(value, np.integer) and value >= least):
-            raise argument_error(name, f"an integer >= {least}", repr(value))
-    value = given["rtol"]
-    if not (_is_number(value) and 0 <= value < 0.1):
-        raise argument_error("rtol", "in [0, 0.1)", repr(value))
-    value = given["max_reduced_chi2"]
-    if not (_is_number(value) and value > 0):
-        raise argument_error("max_reduced_chi2", "positive", repr(value))
-    value = given["redshift_tolerance"]
-    if value is not None and not (_is_number(value) and value >= 0):
-        raise argument_error("redshift_tolerance", ">= 0", repr(value))
+        if value is not declared[name].default and not (is_number(value) and good(value)):
+            raise argument_error(name, wanted, repr(value))
     compat, scale_error = given["compat"], given["scale_error"]
     if compat not in (None, "cigale"):
         raise argument_error("compat", "None or 'cigale'", repr(compat))
@@ -560,17 +490,3 @@ def _check_numbers(given):
         raise argument_error("scale_error", "True, False or None", repr(scale_error))
     if compat and scale_error:
         raise argument_error("scale_error", "False with compat='cigale'", repr(scale_error))
-
-
-def _grid_of(model, names, filters, axes):
-    """Return the grid to fit with, and the model that it is made of."""
-    if isinstance(model, SEDModel):
-        if axes is None or names is None:
-            msg = "'axes' and 'filters' must be given when 'model' is an SEDModel"
-            raise ValueError(msg)
-        return model.grid(axes, filters), model
-    if axes is not None:
-        raise argument_error("axes", "None when 'model' is a ModelGrid", "a value")
-    if not isinstance(model, ModelGrid):
-        raise argument_error("model", "a ModelGrid or an SEDModel", type(model).__name__)
-    return model, None

@@ -1,8 +1,13 @@
 """Why an object was not fitted, or what to know of its fit."""
 
+import numpy as np
+
 from miricigale.utils.tables import Flags
 
-__all__ = ["FitFlags"]
+__all__ = ["FitFlags", "flags_of_fits"]
+
+#: S/N of the best model in all bands together below which an object is flagged.
+LOW_SIGNAL = 3.0
 
 
 class FitFlags(Flags):
@@ -58,3 +63,24 @@ class FitFlags(Flags):
     def names(cls, value):
         """Names of the bits set in ``value``, lower case."""
         return [m.name.lower() for m in cls if m is not cls.UNFITTED and m.value & int(value)]
+
+
+def flags_of_fits(results, measured, max_reduced_chi2, edge_weight):
+    """
+    Flags of results, with those that the fits show.
+
+    ``measured`` are the bands with a flux, shape (n, nb); ``edge_weight`` is the weight of the first
+    or last redshift above which an object is flagged, None where redshifts were fixed.
+    """
+    flags, fitted, pdf = np.array(results.flags), results.fitted, results.pdf["redshift"]
+    signal = np.where(measured, results.best_flux / results.sigma, 0.0)
+    with np.errstate(invalid="ignore"):
+        flags[fitted & (results.reduced_chi2 > max_reduced_chi2)] |= FitFlags.HIGH_CHI2
+        flags[fitted & ~(results.best_scale > 0)] |= FitFlags.NO_SIGNAL
+        faint = np.sqrt(np.sum(signal * signal, axis=1)) < LOW_SIGNAL
+        flags[fitted & faint] |= FitFlags.LOW_SIGNAL
+        if edge_weight is not None and pdf.shape[1] > 2:
+            edge = np.maximum(pdf[:, 0], pdf[:, -1]) > edge_weight
+            flags[fitted & edge] |= FitFlags.REDSHIFT_EDGE
+    flags[~fitted & ((flags & FitFlags.UNFITTED) == 0)] |= FitFlags.NO_SIGNAL
+    return flags

@@ -19,6 +19,7 @@ from miricigale.fitting.priors import (
 from miricigale.fitting.quantities import DERIVED_LEVELS, OtherFraction, Quantities
 from miricigale.fitting.results import CIGALE_LEAST_STD, FitResults
 from miricigale.fitting.samples import Samples
+from miricigale.sed import ModelGrid, SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks, parallel_map
 from miricigale.utils.random import stream
@@ -75,8 +76,20 @@ class GridFit:
     edge_weight = 0.01
 
     @classmethod
-    def of_grid(cls, grid, priors, prior_f, *, rtol, scale_error, redshift_tolerance, compat):
-        """Work out priors and derived quantities of a grid, and set the engine up."""
+    def of_model(
+        cls, model, filters, axes, priors, *, prior_f, rtol, scale_error, redshift_tolerance, compat
+    ):
+        """Make a grid if it is none, work out its priors and derived quantities, set the engine up."""
+        grid = model
+        if isinstance(model, SEDModel):
+            if axes is None or filters is None:
+                msg = "'axes' and 'filters' must be given when 'model' is an SEDModel"
+                raise ValueError(msg)
+            grid = model.grid(axes, filters)
+        elif axes is not None:
+            raise argument_error("axes", "None when 'model' is a ModelGrid", "a value")
+        elif not isinstance(model, ModelGrid):
+            raise argument_error("model", "a ModelGrid or an SEDModel", type(model).__name__)
         priors = grid_priors(grid, priors, prior_f=prior_f)
         quantities, fraction = Quantities.of_grid(grid), OtherFraction.of_grid(grid)
         engine = GridEngine(

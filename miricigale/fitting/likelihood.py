@@ -14,11 +14,11 @@ from miricigale.utils.units import FNU, to_array
 
 __all__ = [
     "FitData",
+    "PhotometryReader",
     "flux_column",
     "limits",
     "per_band",
     "read_ids",
-    "read_photometry",
     "unused_bands",
 ]
 
@@ -69,79 +69,102 @@ class FitData(ObjectRows):
         return self.used & ~self.limit
 
 
-def read_photometry(
-    table, filters, *, model_error, error_floor, n_bands_min, grid_filters=None, repeated=None
-):
+@dataclass(frozen=True, eq=False)
+class PhotometryReader:
     """
-    Take fluxes and errors from a table.
+    How a fit takes fluxes and errors from catalogs.
 
     Parameters
     ----------
-    table : `~astropy.table.QTable`
-        Column ``id``, a flux column for each filter and its error ``<name>_err``. NaN (or a
-        masked value) in flux or error is a missing band. Where a boolean column
-        ``<name>_limit`` (see `limits`) is true the flux is an upper limit and the error its
-        1 sigma, to which neither model error nor floor are added. No error, of a limit or with
-        all that is added to it, counts as less than 1e-6 of the flux, and those beyond 1e-60
-        to 1e60 uJy are of no use.
-    filters : tuple of str
-        Bands to use; columns must be there.
-    model_error : `~numpy.ndarray`, shape (n_filters,)
-        Part of the flux that is added to its error in quadrature.
-    error_floor : `~numpy.ndarray`, shape (n_filters,)
-        Least error, as a part of the flux.
+    bands : tuple of str
+        Bands of the models, each a column of the arrays.
+    filters : tuple of str or None
+        Bands to fit; those that a catalog has by default.
+    model_error, error_floor : dict of str to float
+        Part of the flux that is added to its error in quadrature, and least error as a part of the
+        flux, by filter.
     n_bands_min : int
         Objects with fewer usable bands are flagged.
-    grid_filters : tuple of str, optional
-        Order of the bands in the arrays returned, ``filters`` and others, which get no data.
-    repeated : `~numpy.ndarray` of bool, shape (n,), optional
-        Rows whose id is known from earlier parts of the catalog.
-
-    Returns
-    -------
-    data : `FitData`
-
-    Raises
-    ------
-    ValueError
-        If a column is missing or holds no numbers, one of limits holds something else than true
-        and false, or an id is masked.
-    `~astropy.units.UnitsError`
-        If a flux has no unit of flux density.
     """
-    grid_filters = tuple(filters) if grid_filters is None else tuple(grid_filters)
-    columns = [c for name in filters for c in (name, error_column(name))]
-    require_columns(table, ["id", *columns], "photometry", units=dict.fromkeys(columns, FNU))
-    n = len(table)
-    shape = (n, len(grid_filters))
-    flux, err, sigma = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.inf)
-    limit = np.zeros(shape, dtype=bool)
-    flags = np.zeros(n, dtype=int)
-    for name, extra, floor in zip(filters, model_error, error_floor, strict=True):
-        i = grid_filters.index(name)
-        f, e = flux_column(table, name), flux_column(table, error_column(name))
-        has_flux = np.abs(f) < _LARGE
-        known = (e > _SMALL) & (e < _LARGE)
-        flags[~np.isnan(f) & ~has_flux] |= int(FitFlags.BAD_FLUX)
-        # a flux without error is a missing band; an error that cannot be used is flagged
-        flags[has_flux & ~known & ~np.isnan(e)] |= int(FitFlags.BAD_ERROR)
-        good = has_flux & known
-        flux[:, i], err[:, i] = f, e
-        size = np.abs(np.where(good, f, 0.0))
-        own = np.where(good, e, 1.0)
-        total = np.hypot(np.maximum(own, floor * size), extra * size)
-        limit[:, i] = good & limits(table, name)
-        total = np.maximum(np.where(limit[:, i], own, total), _LEAST_ERROR * size)
-        sigma[:, i] = np.where(good, total, np.inf)
-    n_bands = np.isfinite(sigma).sum(axis=1)
-    flags[(n_bands > 0) & (n_bands == limit.sum(axis=1))] |= int(FitFlags.ALL_LIMITS)
-    flags[n_bands == 0] |= int(FitFlags.NO_BAND)
-    flags[(n_bands > 0) & (n_bands < n_bands_min)] |= int(FitFlags.FEW_BANDS)
-    ids = read_ids(table)
-    first = np.zeros(n, dtype=bool)
-    first[np.unique(ids, return_index=True)[1]] = True
-    flags[~first if repeated is None else ~first | repeated] |= int(FitFlags.DUPLICATE_ID)
-    return FitData(ids, flux, err, sigma, limit, flags)
+
+    bands: tuple
+    filters: tuple | None
+    model_error: dict
+    error_floor: dict
+    n_bands_min: int
+
+    def fitted(self, table):
+        """Bands of a catalog that are fitted: tuple of str."""
+        require_columns(table, [], "photometry")
+        if self.filters is not None:
+            return self.filters
+        filters = tuple(name for name in self.bands if name in table.colnames)
+        if not filters:
+            wanted = f"a table with at least one of the columns {list(self.bands)}"
+            raise argument_error("photometry", wanted, f"columns {table.colnames}")
+        return filters
+
+    def read(self, table, repeated=None):
+        """
+        Take fluxes and errors from a table.
+
+        Parameters
+        ----------
+        table : `~astropy.table.QTable`
+            Column ``id``, a flux column for each filter and its error ``<name>_err``. NaN (or a
+            masked value) in flux or error is a missing band. Where a boolean column
+            ``<name>_limit`` (see `limits`) is true the flux is an upper limit and the error its
+            1 sigma, to which neither model error nor floor are added. No error, of a limit or with
+            all that is added to it, counts as less than 1e-6 of the flux, and those beyond 1e-60
+            to 1e60 uJy are of no use.
+        repeated : `~numpy.ndarray` of bool, shape (n,), optional
+            Rows whose id is known from earlier parts of the catalog.
+
+        Returns
+        -------
+        data : `FitData`
+
+        Raises
+        ------
+        ValueError
+            If a column is missing or holds no numbers, one of limits holds something else than true
+            and false, or an id is masked.
+        `~astropy.units.UnitsError`
+            If a flux has no unit of flux density.
+        """
+        filters = self.fitted(table)
+        columns = [c for name in filters for c in (name, error_column(name))]
+        require_columns(table, ["id", *columns], "photometry", units=dict.fromkeys(columns, FNU))
+        n = len(table)
+        shape = (n, len(self.bands))
+        flux, err, sigma = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.inf)
+        limit = np.zeros(shape, dtype=bool)
+        flags = np.zeros(n, dtype=int)
+        for name in filters:
+            i, floor = self.bands.index(name), self.error_floor[name]
+            f, e = flux_column(table, name), flux_column(table, error_column(name))
+            has_flux = np.abs(f) < _LARGE
+            known = (e > _SMALL) & (e < _LARGE)
+            flags[~np.isnan(f) & ~has_flux] |= int(FitFlags.BAD_FLUX)
+            # a flux without error is a missing band; an error that cannot be used is flagged
+            flags[has_flux & ~known & ~np.isnan(e)] |= int(FitFlags.BAD_ERROR)
+            good = has_flux & known
+            flux[:, i], err[:, i] = f, e
+            size = np.abs(np.where(good, f, 0.0))
+            own = np.where(good, e, 1.0)
+            total = np.hypot(np.maximum(own, floor * size), self.model_error[name] * size)
+            limit[:, i] = good & limits(table, name)
+            total = np.maximum(np.where(limit[:, i], own, total), _LEAST_ERROR * size)
+            sigma[:, i] = np.where(good, total, np.inf)
+        n_bands = np.isfinite(sigma).sum(axis=1)
+        flags[(n_bands > 0) & (n_bands == limit.sum(axis=1))] |= int(FitFlags.ALL_LIMITS)
+        flags[n_bands == 0] |= int(FitFlags.NO_BAND)
+        flags[(n_bands > 0) & (n_bands < self.n_bands_min)] |= int(FitFlags.FEW_BANDS)
+        ids = read_ids(table)
+        first = np.zeros(n, dtype=bool)
+        first[np.unique(ids, return_index=True)[1]] = True
+        flags[~first if repeated is None else ~first | repeated] |= int(FitFlags.DUPLICATE_ID)
+        return FitData(ids, flux, err, sigma, limit, flags)
 
 
 def read_ids(table):
@@ -248,7 +271,7 @@ def _some(column):
 
 
 def per_band(value, filters, name):
-    """Return a setting as an array over the filters: a number, or a dict by filter name."""
+    """A setting by filter, dict of str to float: given as a number, by name or in their order."""
     if isinstance(value, dict):
         unknown = sorted(set(value) - set(filters))
         if unknown:
@@ -260,10 +283,9 @@ def per_band(value, filters, name):
     value = to_array(value, u.dimensionless_unscaled, name)
     if value.shape not in ((), (len(filters),)):
         raise argument_error(name, f"a number or {len(filters)} of them", f"shape {value.shape}")
-    array = np.broadcast_to(value, (len(filters),)).copy()
-    if not np.all(np.isfinite(array) & (array >= 0)):
+    if not np.all(np.isfinite(value) & (value >= 0)):
         raise argument_error(name, "finite and not negative", f"{value}")
-    return array
+    return dict(zip(filters, np.broadcast_to(value, (len(filters),)).tolist(), strict=True))
 
 
 def flux_column(table, name):

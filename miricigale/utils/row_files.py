@@ -16,6 +16,7 @@ from astropy.table import QTable, Table
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits, unpacked_size
 from miricigale.utils.store import plain_value, replacing
+from miricigale.utils.units import check_count
 
 __all__ = ["RowFile", "open_rows", "write_rows"]
 
@@ -42,10 +43,7 @@ def open_rows(path, chunk_rows, *, hdu=None):
     `~miricigale.utils.exceptions.DataError`
         If the file is missing, of another kind, or cannot be read by rows.
     """
-    if isinstance(chunk_rows, bool) or not (
-        isinstance(chunk_rows, (int, np.integer)) and chunk_rows >= 1
-    ):
-        raise argument_error("chunk_rows", "an integer >= 1", repr(chunk_rows))
+    chunk_rows = check_count(chunk_rows, "chunk_rows")
     path = Path(path)
     if not path.is_file():
         msg = f"no table {path}"
@@ -53,16 +51,16 @@ def open_rows(path, chunk_rows, *, hdu=None):
     with open(path, "rb") as stream:
         start = stream.read(9)
     if start.startswith(b"SIMPLE"):
-        return _FitsRows(path, int(chunk_rows), hdu)
+        return _FitsRows(path, chunk_rows, hdu)
     if hdu is not None:
         raise argument_error("hdu", f"None, for {path} is no FITS file", repr(hdu))
     packed = start.startswith((b"\x1f\x8b", b"BZh", b"\xfd7zXZ"))
     if not packed:
         unpacked_size(path)
     if start.startswith(b"# %ECSV"):
-        return _ECSVRows(path, int(chunk_rows))
+        return _ECSVRows(path, chunk_rows)
     if path.suffix.lower() == ".csv" and not packed:
-        return _CSVRows(path, int(chunk_rows))
+        return _CSVRows(path, chunk_rows)
     why = "unpack it first" if packed else "write it as FITS (a binary table) or ECSV"
     msg = f"{path} cannot be read as a table in pieces of rows: {why}"
     raise DataError(msg)

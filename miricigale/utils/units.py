@@ -19,8 +19,10 @@ __all__ = [
     "WAVE",
     "Frozen",
     "ab_quantity",
+    "check_count",
     "frozen_array",
     "frozen_quantity",
+    "is_number",
     "positive",
     "to_array",
 ]
@@ -115,6 +117,19 @@ def positive(value, unit, name):
     if not number > 0:
         raise argument_error(name, "positive", value)
     return number
+
+
+def is_number(value, kind=np.number):
+    """Whether a value is one number, and of a kind; True and False are none."""
+    array = np.asarray(value)
+    return array.ndim == 0 and np.issubdtype(array.dtype, kind)
+
+
+def check_count(value, name, least=1):
+    """Return an integer after checking that it is one, not below ``least`` (a `ValueError`)."""
+    if not (is_number(value, np.integer) and value >= least):
+        raise argument_error(name, f"an integer >= {least}", repr(value))
+    return int(value)
 
 
 def ab_quantity(value):
