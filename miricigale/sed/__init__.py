@@ -15,11 +15,11 @@ __getattr__, __dir__, __all__ = lazy_names(
         "derived": ("DERIVED", "Derived"),
         "foreground": ("Foreground", "GalacticExtinction", "band_extinction", "deredden"),
         "grid": ("ModelGrid",),
-        "model": ("ModelSpectra", "SEDModel"),
+        "model": ("SEDModel",),
         "parameter": ("Parameter",),
         # with all components, which make themselves known
         "presets": ("COMPONENTS", "yang2021_axes"),
-        "spectrum": ("COSMOLOGY", "SED"),
+        "spectrum": ("COSMOLOGY", "SED", "ModelSpectra"),
         "tables": ("ModelFlags",),
         "xray": ("XRay", "band_luminosity", "stern2015", "stern2015_6um", "xray_flux"),
     },

@@ -1,13 +1,16 @@
 """The base of all components of a model, and their registry."""
 
 import functools
+from collections.abc import Mapping
+
+import astropy.units as u
 
 from miricigale.refdata import Registry, locate
 from miricigale.refdata.locate import fingerprint_of
 from miricigale.sed.parameter import Parameter
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import ConfigError, argument_error
 
-__all__ = ["COMPONENTS", "ROLES", "Component", "register"]
+__all__ = ["COMPONENTS", "ROLES", "Component", "read_config", "register"]
 
 #: What a component does, in the order in which light meets it.
 ROLES = (
@@ -193,3 +196,27 @@ class Component:
         values = [f"{n}={p.default:g}" for n, p in self.parameters.items()]
         values += [f"{n}={v!r}" for n, v in self.settings.items()]
         return f"{type(self).__name__}({', '.join(values)})"
+
+
+def read_config(config):
+    """Components and other options of a model from plain values; see `SEDModel.from_dict`."""
+    if not isinstance(config, Mapping):
+        msg = f"[sed] must be a table of keys, got {type(config).__name__}"
+        raise ConfigError(msg)
+    unknown = set(config) - {"components", "frac_agn_definition"}
+    if unknown:
+        msg = f"[sed] does not know {sorted(unknown)}; known: components, frac_agn_definition"
+        raise ConfigError(msg)
+    parts = []
+    entries = config.get("components", ())
+    if isinstance(entries, (str, Mapping)) or not all(isinstance(e, Mapping) for e in entries):
+        msg = "[sed] components must be a list of tables with 'name', got " + repr(entries)
+        raise ConfigError(msg)
+    for entry in entries:
+        defaults = dict(entry)
+        try:
+            parts.append(COMPONENTS.get(defaults.pop("name", "(none)"))(**defaults))
+        except (KeyError, TypeError, ValueError, u.UnitsError) as err:
+            msg = f"[sed] component {entry}: {err.args[0]}"
+            raise ConfigError(msg) from err
+    return parts, {name: value for name, value in config.items() if name != "components"}

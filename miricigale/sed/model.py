@@ -1,22 +1,17 @@
 """Models: components in a chain, from parameters to spectra and band fluxes."""
 
-import difflib
 import functools
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable, Table
 
 from miricigale.filters import FilterSet
 from miricigale.refdata import citations
 from miricigale.sed import gridding, presets, tables
 from miricigale.sed.chain import Chain
-from miricigale.sed.component import COMPONENTS, ROLES, Component
+from miricigale.sed.component import ROLES, Component, read_config
 from miricigale.sed.derived import (
-    DERIVED,
     agn_quantities,
     columns,
     galaxy_quantities,
@@ -25,12 +20,12 @@ from miricigale.sed.derived import (
 from miricigale.sed.grid import DEFINITIONS
 from miricigale.sed.grid_cache import cached_grid
 from miricigale.sed.parameter import Parameter
-from miricigale.sed.spectrum import COSMOLOGY, SED, distance
+from miricigale.sed.spectrum import COSMOLOGY, SED, ModelSpectra, distance
 from miricigale.utils.exceptions import ConfigError, MiricigaleWarning, argument_error, unknown_name
 from miricigale.utils.meta import provenance
 from miricigale.utils.units import FNU, WAVE
 
-__all__ = ["DEFINITIONS", "ModelSpectra", "SEDModel"]
+__all__ = ["SEDModel"]
 
 _MODEL_PARAMETERS = {
     "redshift": Parameter(default=1.0, bounds=(0.0, 20.0), doc="Redshift."),
@@ -45,31 +40,6 @@ _MODEL_PARAMETERS = {
 }
 for _name, _parameter in _MODEL_PARAMETERS.items():
     _parameter.name = _name
-
-
-@dataclass(frozen=True, eq=False)
-class ModelSpectra:
-    """
-    Spectra of one model, part by part.
-
-    Parameters
-    ----------
-    total : `SED`
-        The whole, as observed.
-    components : dict of str to `SED`
-        ``stellar`` (attenuated), ``dust``, with gas ``nebular`` (attenuated) and with an AGN
-        ``agn_disk``, ``agn_torus`` and ``agn_polar``: they sum to ``total``.
-        ``stellar_intrinsic`` is the light of stars and gas before dust.
-    derived : dict of str to `~astropy.units.Quantity`
-        See `SEDModel.derived_columns`.
-    parameters : dict of str to `~astropy.units.Quantity`
-        All parameters.
-    """
-
-    total: SED
-    components: dict
-    derived: dict
-    parameters: dict
 
 
 class SEDModel:
@@ -154,27 +124,9 @@ class SEDModel:
         `~miricigale.utils.exceptions.ConfigError`
             If a key, component or parameter is unknown.
         """
-        if not isinstance(config, Mapping):
-            msg = f"[sed] must be a table of keys, got {type(config).__name__}"
-            raise ConfigError(msg)
-        unknown = set(config) - {"components", "frac_agn_definition"}
-        if unknown:
-            msg = f"[sed] does not know {sorted(unknown)}; known: components, frac_agn_definition"
-            raise ConfigError(msg)
-        parts = []
-        entries = config.get("components", ())
-        if isinstance(entries, (str, Mapping)) or not all(isinstance(e, Mapping) for e in entries):
-            msg = "[sed] components must be a list of tables with 'name', got " + repr(entries)
-            raise ConfigError(msg)
-        for entry in entries:
-            defaults = dict(entry)
-            try:
-                parts.append(COMPONENTS.get(defaults.pop("name", "(none)"))(**defaults))
-            except (KeyError, TypeError, ValueError, u.UnitsError) as err:
-                msg = f"[sed] component {entry}: {err.args[0]}"
-                raise ConfigError(msg) from err
+        parts, options = read_config(config)
         try:
-            return cls(parts, frac_agn_definition=config.get("frac_agn_definition", "dust"))
+            return cls(parts, **options)
         except ValueError as err:
             msg = f"[sed] {err}"
             raise ConfigError(msg) from err
@@ -448,24 +400,7 @@ class SEDModel:
         `~miricigale.utils.exceptions.MiricigaleWarning`
             If a column's name is within a letter or two of a parameter's.
         """
-        if not isinstance(table, (Table, dict)):
-            raise argument_error("table", "a table", type(table).__name__)
-        if isinstance(table, dict) and any(np.ndim(column) != 1 for column in table.values()):
-            raise argument_error("table", "columns of one dimension", "a dict of other things")
-        filters = self._bands(filters)
-        table = QTable(table, copy=False)
-        self._warn_of_slips(table.colnames)
-        return tables.flux_table(self, table, filters)
-
-    def _warn_of_slips(self, names):
-        """Warn of columns that are left alone and look like a parameter misspelt."""
-        names = [name for name in names if name not in self._parameters]
-        lower = {name.lower(): name for name in self._parameters}
-        for name in sorted(set(names) - set(DERIVED)):
-            close = difflib.get_close_matches(name.lower(), lower, n=1, cutoff=0.85)
-            if close:
-                msg = f"column {name!r} is no parameter and left alone: is it {lower[close[0]]!r}?"
-                warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+        return tables.flux_table(self, table, self._bands(filters))
 
     def grid(self, axes, filters, *, cache=True):
         """

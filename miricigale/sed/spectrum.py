@@ -1,4 +1,4 @@
-"""A spectrum as observed: wavelengths and flux densities."""
+"""Spectra as observed: wavelengths and flux densities, of a whole and of its parts."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from astropy.cosmology import FlatLambdaCDM
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import FNU, WAVE, Frozen, frozen_quantity, to_array
 
-__all__ = ["COSMOLOGY", "SED", "distance"]
+__all__ = ["COSMOLOGY", "SED", "ModelSpectra", "distance"]
 
 #: WMAP7, as in Yang et al. 2021.
 COSMOLOGY = FlatLambdaCDM(H0=70.4, Om0=0.272, name="yang2021")
@@ -183,3 +183,28 @@ class SED(Frozen):
             f"<SED {self.wave.size} points, {self.wave[0]:.4g} to {self.wave[-1]:.4g}, "
             f"redshift {self.redshift:.4g}>"
         )
+
+
+@dataclass(frozen=True, eq=False)
+class ModelSpectra:
+    """
+    Spectra of one model, part by part.
+
+    Parameters
+    ----------
+    total : `SED`
+        The whole, as observed.
+    components : dict of str to `SED`
+        ``stellar`` (attenuated), ``dust``, with gas ``nebular`` (attenuated) and with an AGN
+        ``agn_disk``, ``agn_torus`` and ``agn_polar``: they sum to ``total``.
+        ``stellar_intrinsic`` is the light of stars and gas before dust.
+    derived : dict of str to `~astropy.units.Quantity`
+        See `SEDModel.derived_columns`.
+    parameters : dict of str to `~astropy.units.Quantity`
+        All parameters.
+    """
+
+    total: SED
+    components: dict
+    derived: dict
+    parameters: dict

@@ -1,17 +1,25 @@
 """Tables of models: rows of parameters to band fluxes and derived quantities."""
 
+import difflib
 import functools
+import warnings
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, Table
 
 from miricigale.filters.filter import UNCOVERED
 from miricigale.sed import _core
 from miricigale.sed.chain import GALAXY, SKY, distinct
-from miricigale.sed.derived import agn_quantities, columns, galaxy_quantities, scaled_quantities
+from miricigale.sed.derived import (
+    DERIVED,
+    agn_quantities,
+    columns,
+    galaxy_quantities,
+    scaled_quantities,
+)
 from miricigale.sed.spectrum import distance
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.tables import Flags
 from miricigale.utils.units import FNU, WAVE
 
@@ -61,6 +69,16 @@ def _columns(model, table):
         else:
             out[name] = np.full(n, parameter.default)
     return out
+
+
+def _warn_of_slips(model, names):
+    """Warn of columns that are left alone and look like a parameter misspelt."""
+    lower = {name.lower(): name for name in model.parameters}
+    for name in sorted(set(names) - set(model.parameters) - set(DERIVED)):
+        close = difflib.get_close_matches(name.lower(), lower, n=1, cutoff=0.85)
+        if close:
+            msg = f"column {name!r} is no parameter and left alone: is it {lower[close[0]]!r}?"
+            warnings.warn(msg, MiricigaleWarning, stacklevel=4)
 
 
 def _keys(columns, names, rows):
@@ -174,6 +192,12 @@ class _Blocks:
 
 def flux_table(model, table, filters):
     """Fluxes and derived quantities of rows of parameters; see `SEDModel.fluxes`."""
+    if not isinstance(table, (Table, dict)):
+        raise argument_error("table", "a table", type(table).__name__)
+    if isinstance(table, dict) and any(np.ndim(column) != 1 for column in table.values()):
+        raise argument_error("table", "columns of one dimension", "a dict of other things")
+    table = QTable(table, copy=False)
+    _warn_of_slips(model, table.colnames)
     n = len(table)
     taken = {"id", "flags", *columns(model)}
     for name in filters.names:
