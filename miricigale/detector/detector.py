@@ -1,7 +1,6 @@
 """The detector: a tuple of effects, applied block by block."""
 
 import dataclasses
-import itertools
 import logging
 import warnings
 from pathlib import Path
@@ -12,17 +11,15 @@ from miricigale.depth.saturation import SKY_FRACTION, SaturationForecast, satura
 from miricigale.detector import level1b
 from miricigale.detector.effects import (
     ORDER,
-    ADConversion,
     Block,
     Effect,
     FirstFrame,
     LastFrame,
     Persistence,
-    Photons,
     ResetAnomaly,
     Residual,
-    stream_key,
 )
+from miricigale.detector.effects.order import check_order, keyed, place_of
 from miricigale.detector.image import checked_light
 from miricigale.detector.latent import Latent
 from miricigale.detector.ramp import Ramp
@@ -78,7 +75,7 @@ class Detector:
         for effect in effects:
             if not isinstance(effect, Effect):
                 raise argument_error("effects", "made of detector effects", repr(effect))
-        _check_order(effects)
+        check_order(effects)
         properties = miri_detector() if properties is None else properties
         if not isinstance(properties, DetectorProperties):
             raise argument_error("properties", "a DetectorProperties", repr(properties))
@@ -132,12 +129,12 @@ class Detector:
         """
         chain = list(self._effects)
         for effect in effects:
-            place = _place(effect)
+            place = place_of(effect)
             if place is None:
                 wanted = "of the package's kinds (make a Detector of a tuple with any other)"
                 raise argument_error("effects", wanted, repr(effect))
-            chain = [e for e in chain if _place(e) != place]
-            after = [i for i, e in enumerate(chain) if (_place(e) or 0) > place]
+            chain = [e for e in chain if place_of(e) != place]
+            after = [i for i, e in enumerate(chain) if (place_of(e) or 0) > place]
             chain.insert(after[0] if after else len(chain), effect)
         return type(self)(chain, properties=self._properties)
 
@@ -359,7 +356,7 @@ class Detector:
             sky_well_fraction=round(fraction, 4),
             previous=[repr(latent) for latent in previous] or None,
         )
-        return _Task(light, exposure, _keyed(effects, seed, exposure), previous, meta)
+        return _Task(light, exposure, keyed(effects, seed, exposure), previous, meta)
 
     def _run(self, task, store, n_threads, progress_bar):
         """Expose all rows, block by block, and hand each block to ``store``."""
@@ -422,25 +419,6 @@ class Detector:
         return fraction
 
 
-def _place(effect):
-    """Place of an effect in the order; None for one of another kind."""
-    return next((i for i, kind in enumerate(ORDER) if isinstance(effect, kind)), None)
-
-
-def _check_order(effects):
-    """Refuse effects that cannot turn light into counts, or that do not act in their order."""
-    names = ", ".join(type(effect).__name__ for effect in effects)
-    if sum(isinstance(effect, Photons) for effect in effects) != 1:
-        raise argument_error("effects", "a tuple with one Photons in it", names or "none")
-    if not isinstance(effects[-1], ADConversion):
-        raise argument_error("effects", "a tuple that ends with ADConversion", names)
-    known = [(place, effect) for effect in effects if (place := _place(effect)) is not None]
-    for (place, effect), (following, other) in itertools.pairwise(known):
-        if place > following:
-            wanted = f"in their order, {type(other).__name__} before {type(effect).__name__}"
-            raise argument_error("effects", wanted, names)
-
-
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class _Task:
     """What all blocks of one exposure share."""
@@ -466,15 +444,3 @@ def _sky_message(exposure, fraction):
         f"the sky in {exposure.filter} fills {100 * fraction:.0f} % of the full well by the "
         f"last of {exposure.n_groups} groups: take fewer groups and more integrations"
     )
-
-
-def _keyed(effects, seed, exposure):
-    """Pair each effect with the key of its streams; a second one of a kind has its own."""
-    seen = {}
-    keyed = []
-    for effect in effects:
-        kind = type(effect).__name__
-        seen[kind] = seen.get(kind, 0) + 1
-        name = kind if seen[kind] == 1 else f"{kind} {seen[kind]}"
-        keyed.append((effect, stream_key(seed, exposure, name)))
-    return tuple(keyed)

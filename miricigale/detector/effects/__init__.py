@@ -13,8 +13,6 @@ Effects act on blocks of full rows. What a row gets does not depend on the block
 threads changes a result, and a detector of any size needs little memory.
 """
 
-import ast
-
 from miricigale.detector.effects.base import Block, Effect, OtherEffect, stream_key
 from miricigale.detector.effects.charge import (
     BadPixels,
@@ -26,6 +24,7 @@ from miricigale.detector.effects.charge import (
     Saturation,
 )
 from miricigale.detector.effects.light import Photons, Residual
+from miricigale.detector.effects.order import ORDER, effect_from_record
 from miricigale.detector.effects.readout import ADConversion, Bias, Nonlinearity, ReadNoise
 from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly
 
@@ -53,49 +52,3 @@ __all__ = [
     "effect_from_record",
     "stream_key",
 ]
-
-#: The order in which the effects act. Others may stand anywhere after `Photons`.
-ORDER = (
-    Residual,
-    Photons,
-    Dark,
-    InterpixelCapacitance,
-    CosmicRays,
-    Persistence,
-    BadPixels,
-    ReferencePixels,
-    Saturation,
-    Nonlinearity,
-    ResetAnomaly,
-    FirstFrame,
-    LastFrame,
-    Bias,
-    ReadNoise,
-    ADConversion,
-)
-
-
-def effect_from_record(record):
-    """
-    Effect that `Effect.record` described.
-
-    Parameters
-    ----------
-    record : dict or str
-        A record; or, in files of earlier versions, the effect's repr.
-
-    Returns
-    -------
-    effect : `Effect`
-        `OtherEffect` where it is none of `ORDER`.
-    """
-    if isinstance(record, str):
-        call = ast.parse(record, mode="eval").body
-        record = {word.arg: ast.literal_eval(word.value) for word in call.keywords}
-        record["effect"] = call.func.id
-    settings = dict(record)
-    name = settings.pop("effect")
-    for kind in ORDER:
-        if kind.__name__ == name:
-            return kind(**settings)
-    return OtherEffect(name, tuple(settings.items()))

@@ -1,0 +1,98 @@
+"""The order in which the effects act, and what it says of a tuple of them."""
+
+import ast
+import itertools
+
+from miricigale.detector.effects.base import OtherEffect, stream_key
+from miricigale.detector.effects.charge import (
+    BadPixels,
+    CosmicRays,
+    Dark,
+    InterpixelCapacitance,
+    Persistence,
+    ReferencePixels,
+    Saturation,
+)
+from miricigale.detector.effects.light import Photons, Residual
+from miricigale.detector.effects.readout import ADConversion, Bias, Nonlinearity, ReadNoise
+from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly
+from miricigale.utils.exceptions import argument_error
+
+__all__ = ["ORDER", "check_order", "effect_from_record", "keyed", "place_of"]
+
+#: The order in which the effects act. Others may stand anywhere after `Photons`.
+ORDER = (
+    Residual,
+    Photons,
+    Dark,
+    InterpixelCapacitance,
+    CosmicRays,
+    Persistence,
+    BadPixels,
+    ReferencePixels,
+    Saturation,
+    Nonlinearity,
+    ResetAnomaly,
+    FirstFrame,
+    LastFrame,
+    Bias,
+    ReadNoise,
+    ADConversion,
+)
+
+
+def effect_from_record(record):
+    """
+    Effect that `Effect.record` described.
+
+    Parameters
+    ----------
+    record : dict or str
+        A record; or, in files of earlier versions, the effect's repr.
+
+    Returns
+    -------
+    effect : `Effect`
+        `OtherEffect` where it is none of `ORDER`.
+    """
+    if isinstance(record, str):
+        call = ast.parse(record, mode="eval").body
+        record = {word.arg: ast.literal_eval(word.value) for word in call.keywords}
+        record["effect"] = call.func.id
+    settings = dict(record)
+    name = settings.pop("effect")
+    for kind in ORDER:
+        if kind.__name__ == name:
+            return kind(**settings)
+    return OtherEffect(name, tuple(settings.items()))
+
+
+def place_of(effect):
+    """Place of an effect in the order; None for one of another kind."""
+    return next((i for i, kind in enumerate(ORDER) if isinstance(effect, kind)), None)
+
+
+def check_order(effects):
+    """Refuse effects that cannot turn light into counts, or that do not act in their order."""
+    names = ", ".join(type(effect).__name__ for effect in effects)
+    if sum(isinstance(effect, Photons) for effect in effects) != 1:
+        raise argument_error("effects", "a tuple with one Photons in it", names or "none")
+    if not isinstance(effects[-1], ADConversion):
+        raise argument_error("effects", "a tuple that ends with ADConversion", names)
+    known = [(place, effect) for effect in effects if (place := place_of(effect)) is not None]
+    for (place, effect), (following, other) in itertools.pairwise(known):
+        if place > following:
+            wanted = f"in their order, {type(other).__name__} before {type(effect).__name__}"
+            raise argument_error("effects", wanted, names)
+
+
+def keyed(effects, seed, exposure):
+    """Pair each effect with the key of its streams; a second one of a kind has its own."""
+    seen = {}
+    keyed = []
+    for effect in effects:
+        kind = type(effect).__name__
+        seen[kind] = seen.get(kind, 0) + 1
+        name = kind if seen[kind] == 1 else f"{kind} {seen[kind]}"
+        keyed.append((effect, stream_key(seed, exposure, name)))
+    return tuple(keyed)
