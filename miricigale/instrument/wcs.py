@@ -71,14 +71,10 @@ def tangent_plane(ra, dec):
     return np.degrees(vector[1] / vector[0]), np.degrees(vector[2] / vector[0])
 
 
-def _powers(order, *, lowest):
-    return [(i, n - i) for n in range(lowest, order + 1) for i in range(n, -1, -1)]
-
-
-def _scaled_fit(x, y, values, order, *, lowest=1):
-    """Least-squares polynomial without the terms below ``lowest``, as a (order+1)^2 table."""
+def _scaled_fit(x, y, values, order):
+    """Least-squares polynomial without a constant, as a (order+1)^2 table."""
     sx, sy = np.abs(x).max(), np.abs(y).max()
-    powers = _powers(order, lowest=lowest)
+    powers = [(i, n - i) for n in range(1, order + 1) for i in range(n, -1, -1)]
     design = np.stack([(x / sx) ** i * (y / sy) ** j for i, j in powers], axis=1)
     solution = np.linalg.lstsq(design, values, rcond=None)[0]
     tables = np.zeros((values.shape[1], order + 1, order + 1))

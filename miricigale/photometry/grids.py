@@ -203,11 +203,11 @@ def grid_angle(wcs, shape):
     return angle
 
 
-def check_same_grid(wcs, reference, shape, path, reference_path, *, tolerance=0.1):
+def check_same_grid(wcs, reference, shape, path, reference_path):
     """
     Refuse a map whose pixels are elsewhere on the sky than those of its image.
 
-    ``tolerance`` is the largest distance in pixels, in the corners and the middle; the paths are for the message.
+    They may be 0.1 pixels apart, in the corners and the middle; the paths are for the message.
 
     Raises
     ------
@@ -221,7 +221,7 @@ def check_same_grid(wcs, reference, shape, path, reference_path, *, tolerance=0.
     y = np.array([0, 0, ny - 1, ny - 1, (ny - 1) / 2])
     there = pixel_to_pixel(reference, wcs, x, y)
     distance = np.hypot(there[0] - x, there[1] - y)
-    if not np.all(distance <= tolerance):
+    if not np.all(distance <= 0.1):
         far = np.nanmax(distance) if np.isfinite(distance).any() else np.inf
         msg = (
             f"{os.fspath(path)} is not on the pixels of {os.fspath(reference_path)}: by their "

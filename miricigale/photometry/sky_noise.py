@@ -18,6 +18,13 @@ __all__ = [
 ]
 
 
+#: Pixels of the smallest area that counts as filled.
+_FILLED = 25
+
+#: Of what is no sky: the Gaussian that smooths, the least significance after it, the rim (pixels).
+_WIDTH, _SIGNIFICANT, _RIM = 2.0, 3.5, 3
+
+
 def weight_scale(data, weight, *, mask=None):
     """
     Measure the factor between the noise of an image and what its weights say.
@@ -51,21 +58,21 @@ def weight_scale(data, weight, *, mask=None):
     return sky_noise(np.where(usable, data * np.sqrt(np.where(usable, weight, 0)), 0.0), usable)[1]
 
 
-def filled_areas(values, usable, *, n_pixels=25):
+def filled_areas(values, usable):
     """
     Areas of pixels that are exactly 0 for want of data, such as the corners of drizzled images.
 
-    ``usable`` are the pixels that count as data so far, ``n_pixels`` is the smallest connected area. Nowhere True
-    if the pixels beside such areas have no noise either (their median is below a tenth of that of all
-    others): then the image is a noiseless one, and 0 is its sky.
+    ``usable`` are the pixels that count as data so far. Nowhere True if the pixels beside such areas have
+    no noise either (their median is below a tenth of that of all others): then the image is a noiseless
+    one, and 0 is its sky.
     """
     import scipy.ndimage
 
     filled = usable & (values == 0)
-    if np.count_nonzero(filled) < n_pixels:
+    if np.count_nonzero(filled) < _FILLED:
         return np.zeros_like(usable)
     labels, n = scipy.ndimage.label(filled)
-    large = np.bincount(labels.ravel(), minlength=n + 1) >= n_pixels
+    large = np.bincount(labels.ravel(), minlength=n + 1) >= _FILLED
     large[0] = False
     filled = large[labels]
     beside = scipy.ndimage.binary_dilation(filled, iterations=2) & usable & (values != 0)
@@ -90,7 +97,7 @@ def mask_filled(values, usable, what):
     return n
 
 
-def sky_noise(values, usable, *, width=2.0, threshold=3.5, grow=3):
+def sky_noise(values, usable):
     """
     Median and robust rms of the source-free pixels, and which they are.
 
@@ -102,12 +109,6 @@ def sky_noise(values, usable, *, width=2.0, threshold=3.5, grow=3):
         The image, best in units of its local noise.
     usable : bool `~numpy.ndarray`, shape (ny, nx)
         Pixels with data; at least one.
-    width : float, optional
-        Of the Gaussian, in pixels.
-    threshold : float, optional
-        In units of the rms of the smoothed image.
-    grow : int, optional
-        Rim in pixels.
 
     Returns
     -------
@@ -118,16 +119,16 @@ def sky_noise(values, usable, *, width=2.0, threshold=3.5, grow=3):
     """
     import scipy.ndimage
 
-    weight = scipy.ndimage.gaussian_filter(usable.astype(np.float32), width)
-    smooth = scipy.ndimage.gaussian_filter(np.where(usable, values, 0).astype(np.float32), width)
+    weight = scipy.ndimage.gaussian_filter(usable.astype(np.float32), _WIDTH)
+    smooth = scipy.ndimage.gaussian_filter(np.where(usable, values, 0).astype(np.float32), _WIDTH)
     # as a mean of the usable pixels
     smooth = smooth / np.maximum(weight, 0.05)
     structure = scipy.ndimage.generate_binary_structure(2, 1)
     free = usable
     for _ in range(12):
         level, rms = _median_rms(smooth[free])
-        bright = usable & (np.abs(smooth - level) > threshold * rms)
-        bright = scipy.ndimage.binary_dilation(bright, structure, iterations=grow)
+        bright = usable & (np.abs(smooth - level) > _SIGNIFICANT * rms)
+        bright = scipy.ndimage.binary_dilation(bright, structure, iterations=_RIM)
         found = usable & ~bright
         # an image that is full of light is measured as it is
         if np.count_nonzero(found) < max(100, 0.02 * np.count_nonzero(usable)):

@@ -110,6 +110,7 @@ def yang2021_axes(kind="fit"):
     return axes | {"redshift": _redshifts(0.03)}
 
 
-def _redshifts(step, first=0.01, last=6.0):
+def _redshifts(step):
+    first, last = 0.01, 6.0
     n = int(np.floor(np.log((1.0 + last) / (1.0 + first)) / step)) + 1
     return (1.0 + first) * np.exp(step * np.arange(n)) - 1.0

@@ -26,7 +26,7 @@ def text_key(text):
     return int.from_bytes(hashlib.sha256(str(text).encode()).digest()[:8], "big")
 
 
-def check_seed(seed, name="seed"):
+def check_seed(seed):
     """
     Return ``seed`` as an int, drawing a fresh one for None.
 
@@ -40,7 +40,7 @@ def check_seed(seed, name="seed"):
     if isinstance(seed, np.random.Generator):
         return int(seed.integers(2**63))
     if isinstance(seed, (bool, float)) or not hasattr(seed, "__index__") or int(seed) < 0:
-        raise argument_error(name, "a non-negative integer, a Generator or None", repr(seed))
+        raise argument_error("seed", "a non-negative integer, a Generator or None", repr(seed))
     return int(seed)
 
 
