@@ -4,9 +4,9 @@ import dataclasses
 
 import astropy.units as u
 import numpy as np
-from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
 
+from miricigale.depth import _core
 from miricigale.depth.published import residual_amplitude
 from miricigale.instrument import (
     DetectorProperties,
@@ -121,11 +121,8 @@ def ramp_variance(rate, *, n_groups, group_time, read_noise):
     """
     if rate == 0 and read_noise == 0:
         return 0.0
-    n = n_groups - 1
-    band = np.zeros((2, n))
-    band[0] = -(read_noise**2)  # above the diagonal; the first is not used
-    band[1] = rate * group_time + 2 * read_noise**2
-    return 1.0 / (np.sum(solveh_banded(band, np.ones(n))) * group_time**2)
+    total, _ = _core.weight_sums(n_groups - 1, float(rate * group_time), float(read_noise) ** 2)
+    return 1.0 / (total * group_time**2)
 
 
 def noise_power(weights, correlation=None):

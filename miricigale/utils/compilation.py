@@ -17,12 +17,13 @@ log = logging.getLogger(__name__)
 
 #: What the kernels of a room do, and about how many seconds all of them take to compile.
 _ROOMS = {
+    "depth": ("depths", 5),
     "detector": ("the detector", 15),
     "fitting": ("the fit", 20),
     "photometry": ("photometry", 10),
     "profiles": ("light profiles", 5),
     "psf": ("PSFs", 10),
-    "reduction": ("the reduction", 10),
+    "reduction": ("the reduction", 15),
     "scene": ("scenes", 15),
     "sed": ("model spectra", 10),
 }
