@@ -1,11 +1,16 @@
-"""Truth against result: matching, metrics, classes and the report; reads tables only."""
+"""Truth against result, from tables: matching, metrics, classes, a study beside its paper, the report."""
 
 from miricigale.utils.lazy import lazy_names
 
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        "classes": ("CLASS_NAMES", "class_fractions", "classify"),
+        "estimates": ("Estimate", "bootstrap"),
+        "classes": (
+            "CLASS_NAMES",
+            "class_fractions",
+            "classify",
+        ),
         "counts": (
             "PUBLISHED_LIGHT",
             "dust_obscured_fraction",
@@ -16,6 +21,7 @@ __getattr__, __dir__, __all__ = lazy_names(
             "sfr_to_infrared_luminosity",
             "uvj_quiescent",
         ),
+        "coverage": ("coverage_table", "posterior_ranks"),
         "match": ("AssociationFlags", "associate", "match_truth"),
         "metrics": (
             "PhotozMetrics",

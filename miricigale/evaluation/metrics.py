@@ -30,7 +30,7 @@ def _pair(first, second, names):
     return first, second
 
 
-def sigma_mad(values):
+def sigma_mad(values, *, axis=None, ignore_nan=False):
     """
     Robust scatter: 1.48 times the median absolute deviation from the median.
 
@@ -38,10 +38,14 @@ def sigma_mad(values):
     ----------
     values : array-like
         Values; those that are not finite are an error of the caller and give NaN.
+    axis : int, optional
+        The axis along which it is taken; all values by default.
+    ignore_nan : bool, optional
+        Whether NaN is left out instead.
 
     Returns
     -------
-    sigma : float
+    sigma : float or `~numpy.ndarray`
         NaN for an empty input.
 
     References
@@ -51,7 +55,10 @@ def sigma_mad(values):
     values = np.asarray(values, float)
     if values.size == 0:
         return np.nan
-    return float(1.48 * np.median(np.abs(values - np.median(values))))
+    median = np.nanmedian if ignore_nan else np.median
+    deviation = np.abs(values - median(values, axis=axis, keepdims=True))
+    sigma = 1.48 * median(deviation, axis=axis)
+    return float(sigma) if axis is None else sigma
 
 
 def fraction_interval(n_success, n_total):

@@ -12,6 +12,7 @@ from miricigale.utils.units import ANGLE, to_array
 __all__ = [
     "Flags",
     "ascii_ids",
+    "described_rows",
     "described_table",
     "error_column",
     "match_sky",
@@ -57,6 +58,27 @@ def described_table(columns, meta=None):
     for name, (_, text) in columns.items():
         table[name].info.description = text
     return table
+
+
+def described_rows(rows, texts):
+    """
+    Make a table from rows, whose columns say what they are.
+
+    Parameters
+    ----------
+    rows : iterable of sequence
+        Values of one row each; there may be none.
+    texts : dict of str to str
+        Description of each column by name, in the order of the values.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+    """
+    rows = list(rows)
+    columns = zip(*rows, strict=True) if rows else [[]] * len(texts)
+    pairs = zip(texts.items(), columns, strict=True)
+    return described_table({name: (np.array(column), text) for (name, text), column in pairs})
 
 
 def error_column(name):

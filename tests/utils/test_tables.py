@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from miricigale.utils.tables import (
     Flags,
     ascii_ids,
+    described_rows,
     error_column,
     match_sky,
     require_columns,
@@ -33,6 +34,15 @@ def test_flags_explain_themselves():
 
 def test_error_column():
     assert error_column("miri.f770w") == "miri.f770w_err"
+
+
+def test_rows_make_a_table_whose_columns_say_what_they_are():
+    table = described_rows([(1, "a"), (2, "b")], {"id": "number", "name": "text"})
+    assert table["id"].tolist() == [1, 2]
+    assert table["name"].info.description == "text"
+    empty = described_rows([], {"id": "number", "name": "text"})
+    assert empty.colnames == ["id", "name"]
+    assert len(empty) == 0
 
 
 def test_require_columns():

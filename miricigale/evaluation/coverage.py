@@ -1,0 +1,118 @@
+"""Whether posteriors are as wide as they should be: ranks of the truth, and coverage of intervals."""
+
+import numpy as np
+from scipy.stats import kstest
+
+from miricigale.evaluation.metrics import fraction_interval
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.random import check_seed, stream
+from miricigale.utils.tables import described_rows
+
+__all__ = ["coverage_table", "posterior_ranks"]
+
+
+def posterior_ranks(true, values, levels, *, seed=None):
+    """
+    Rank of true values in their posteriors (probability integral transform).
+
+    If the posteriors are right, ranks are uniform between 0 and 1.
+
+    Parameters
+    ----------
+    true : array-like, shape (n,)
+        True values; NaN has the rank NaN.
+    values : array-like, shape (k,) or (n, k)
+        Ascending values at which the cumulative distributions are known, in the unit of ``true``.
+    levels : array-like, shape (k,) or (n, k)
+        The distributions there (`~miricigale.fitting.FitResults.cdf` has both); NaN gives NaN.
+    seed : int, optional
+        With it ranks are drawn uniformly from the part of the posterior in the cell of the true
+        value: needed where the truth lies on nodes of a grid (an injected AGN fraction), for the
+        place within the cell then is no random one. Without it the distribution is linear within cells.
+
+    Returns
+    -------
+    ranks : `~numpy.ndarray`, shape (n,)
+        0 and 1 for true values outside of the values.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not agree.
+    """
+    true = np.asarray(true, float)
+    try:
+        shape = np.broadcast_shapes(np.shape(values), np.shape(levels), (true.size, 1))
+        values, levels = (np.broadcast_to(np.asarray(a, float), shape) for a in (values, levels))
+    except ValueError:
+        got = f"{np.shape(values)}, {np.shape(levels)} and {true.shape}"
+        raise argument_error(
+            "values", "of one shape with 'levels', for each of 'true'", got
+        ) from None
+    if true.ndim != 1 or shape[0] != true.size or shape[1] < 2:
+        raise argument_error("values", f"of shape (k,) or ({true.size}, k)", shape)
+    n, k = shape
+    good = np.isfinite(true) & np.isfinite(values).all(axis=1) & np.isfinite(levels).all(axis=1)
+    cell = np.clip(np.sum(values <= true[:, None], axis=1) - 1, 0, k - 2)
+    rows = np.arange(n)
+    left, right = values[rows, cell], values[rows, cell + 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inside = np.where(right > left, (true - left) / (right - left), 0.5)
+    if seed is not None:
+        inside = stream(check_seed(seed), "posterior ranks").uniform(size=n)
+    below, above = levels[rows, cell], levels[rows, cell + 1]
+    ranks = below + inside * (above - below)
+    ranks = np.where(true < values[:, 0], 0.0, np.where(true > values[:, -1], 1.0, ranks))
+    return np.where(good, ranks, np.nan)
+
+
+def coverage_table(ranks, *, levels=(0.68, 0.95)):
+    """
+    Share of true values within the central intervals of their posteriors.
+
+    Parameters
+    ----------
+    ranks : dict of str to array-like, shape (n,)
+        Ranks (`posterior_ranks`) by what they are of: a parameter, a fit with or without model error.
+    levels : tuple of float, optional
+        Parts of the posterior in the intervals.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        A row for each name and level: ``name``, ``n`` (finite ranks), ``level``, ``share`` of the true
+        values in the interval with its 68 % (Wilson) limits ``share_low`` and ``share_high``,
+        ``mean_rank`` (0.5 without bias; below it where the fits are too high), and ``p_uniform``, the
+        probability of ranks as far from uniform as these (Kolmogorov-Smirnov).
+
+    Raises
+    ------
+    ValueError
+        If a level or rank is not between 0 and 1.
+    """
+    levels = np.atleast_1d(np.asarray(levels, float))
+    if not np.all((levels > 0) & (levels < 1)):
+        raise argument_error("levels", "between 0 and 1", levels)
+    rows = []
+    for name, values in ranks.items():
+        values = np.asarray(values, float)
+        values = values[np.isfinite(values)]
+        if np.any((values < 0) | (values > 1)):
+            raise argument_error("ranks", "between 0 and 1", f"{values.min()} to {values.max()}")
+        p_uniform = kstest(values, "uniform").pvalue if values.size else np.nan
+        mean = values.mean() if values.size else np.nan
+        for level in levels:
+            inside = np.count_nonzero(np.abs(values - 0.5) <= 0.5 * level)
+            share = fraction_interval(inside, values.size)
+            rows.append((name, values.size, level, *share, mean, p_uniform))
+    texts = {
+        "name": "What the ranks are of",
+        "n": "Posteriors with a true value",
+        "level": "Part of the posterior in the central interval",
+        "share": "Share of the true values in it",
+        "share_low": "Lower end of its 68 % interval",
+        "share_high": "Upper end of its 68 % interval",
+        "mean_rank": "Mean rank; below 0.5 where the fits are too high",
+        "p_uniform": "Probability of ranks as far from uniform (Kolmogorov-Smirnov)",
+    }
+    return described_rows(rows, texts)

@@ -1,0 +1,122 @@
+"""Numbers of a sample with the error that the sample's size leaves them."""
+
+import dataclasses
+
+import numpy as np
+
+from miricigale.evaluation.metrics import fraction_interval
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.random import check_seed, stream
+
+__all__ = ["Estimate", "bootstrap"]
+
+#: Values that are held at once: draws are made in pieces of this size.
+_PIECE = 4_000_000
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """
+    A number of a sample with its 68 % interval.
+
+    Parameters
+    ----------
+    value : float
+        The number; NaN where there is nothing to take it from.
+    low, high : float
+        Ends of the interval.
+    n : int
+        Sources that it is of.
+    n_all : int, optional
+        Sources that it would be of if all had been found; unknown by default.
+    """
+
+    value: float
+    low: float = np.nan
+    high: float = np.nan
+    n: int = 0
+    n_all: int | None = None
+
+    @property
+    def error(self):
+        """Half the width of the interval."""
+        return 0.5 * (self.high - self.low)
+
+    @property
+    def completeness(self):
+        """Share of all sources that the number is of; NaN where that is unknown."""
+        return self.n / self.n_all if self.n_all else np.nan
+
+    @classmethod
+    def of_fraction(cls, success, total, *, n_all=None):
+        """Share of ``success`` among ``total`` sources, with its Wilson interval."""
+        return cls(*fraction_interval(int(success), int(total)), int(total), n_all)
+
+
+def bootstrap(statistic, *columns, seed, n_draws=1000, n_all=None):
+    """
+    A statistic of a sample, with the scatter that it has in samples drawn with replacement.
+
+    Parameters
+    ----------
+    statistic : callable
+        Takes as many arrays as there are columns, shape (..., k), and returns one number for
+        each row, shape (...).
+    *columns : array-like, shape (n,) or (n, m)
+        Values of the sources. Sources with a value that is not finite in one of the columns of one
+        dimension are left out. Of columns of two dimensions (several values for a source, which
+        are drawn together) those without any finite value are, and the statistic gets the rest in one
+        row of k = n m values, NaN among them.
+    seed : int or `~numpy.random.Generator`
+        Seed of the draws.
+    n_draws : int, optional
+        Samples drawn.
+    n_all : int, optional
+        Passed to `Estimate`.
+
+    Returns
+    -------
+    estimate : `Estimate`
+        The statistic of the sample itself, and the 16th and 84th percentiles of those of the draws.
+
+    Raises
+    ------
+    ValueError
+        If there are no columns, or their lengths differ.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from miricigale.evaluation import bootstrap
+    >>> values = np.random.default_rng(1).normal(size=400)
+    >>> mean = bootstrap(lambda v: v.mean(axis=-1), values, seed=1)
+    >>> print(f"{mean.error:.2f}")
+    0.05
+    """
+    columns = [np.asarray(column, float) for column in columns]
+    if not columns or len({len(column) for column in columns}) != 1:
+        raise argument_error("columns", "of one length", [column.shape for column in columns])
+    known = [
+        np.isfinite(column) if column.ndim == 1 else np.isfinite(column).any(axis=1)
+        for column in columns
+    ]
+    columns = [column[np.all(known, axis=0)] for column in columns]
+    n = len(columns[0])
+    if n == 0:
+        return Estimate(np.nan, n=0, n_all=n_all)
+    rng = stream(check_seed(seed), "bootstrap")
+    size = max(1, _PIECE // sum(column.size for column in columns))
+    draws = []
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = float(statistic(*(column.reshape(-1) for column in columns)))
+        for first in range(0, n_draws, size):
+            rows = rng.integers(n, size=(min(size, n_draws - first), n))
+            drawn = (column[rows].reshape(len(rows), -1) for column in columns)
+            draws.append(np.asarray(statistic(*drawn), float))
+    draws = np.concatenate(draws)
+    draws = draws[~np.isnan(draws)]
+    if not draws.size:
+        return Estimate(value, n=n, n_all=n_all)
+    # one of the draws: between two that are infinite there is nothing
+    low, high = np.percentile(draws, [15.865, 84.135], method="nearest")
+    return Estimate(value, float(low), float(high), n, n_all)
