@@ -8,9 +8,14 @@ __getattr__, __dir__, __all__ = lazy_names(
         "estimates": ("Estimate", "bootstrap"),
         "classes": (
             "CLASS_NAMES",
+            "KIRKPATRICK_LIMITS",
+            "SelectionQuality",
             "class_fractions",
             "classify",
+            "confusion",
+            "selection_quality",
         ),
+        "colors": ("COLOR_WINDOWS", "ColorCircles", "ColorWindow", "color_classes"),
         "counts": (
             "PUBLISHED_LIGHT",
             "dust_obscured_fraction",
@@ -22,6 +27,15 @@ __getattr__, __dir__, __all__ = lazy_names(
             "uvj_quiescent",
         ),
         "coverage": ("coverage_table", "posterior_ranks"),
+        "infrared": (
+            "PAH_FEATURES",
+            "equivalent_width",
+            "feature_magnitude",
+            "feature_redshifts",
+            "feature_residuals",
+            "light_share",
+            "mid_infrared_fractions",
+        ),
         "match": ("AssociationFlags", "associate", "match_truth"),
         "metrics": (
             "PhotozMetrics",
@@ -40,5 +54,13 @@ __getattr__, __dir__, __all__ = lazy_names(
             "xray_obscured_fraction",
         ),
         "report": ("Missing", "Report", "number"),
+        "xray": (
+            "XRAY_LIMITS",
+            "XRayLimit",
+            "completeness",
+            "half_complete",
+            "xray_luminosity_at",
+            "yang2021_xray_flux",
+        ),
     },
 )

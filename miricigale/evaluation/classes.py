@@ -1,14 +1,29 @@
 """Galaxy, composite and AGN by the share of the AGN in the infrared."""
 
+import dataclasses
+
 import numpy as np
 
+from miricigale.evaluation.estimates import Estimate
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.tables import described_table
 
-__all__ = ["CLASS_LIMITS", "CLASS_NAMES", "class_fractions", "classify"]
+__all__ = [
+    "CLASS_LIMITS",
+    "CLASS_NAMES",
+    "KIRKPATRICK_LIMITS",
+    "SelectionQuality",
+    "class_fractions",
+    "classify",
+    "confusion",
+    "selection_quality",
+]
 
 #: Names in order of rising fracAGN, and the limits between them.
 CLASS_NAMES = ("galaxy", "composite", "agn")
 CLASS_LIMITS = (0.1, 0.4)
+#: Limits of the AGN's share of the 5-15 um light: Kirkpatrick et al. 2017, ApJ 849, 111 (second hand).
+KIRKPATRICK_LIMITS = (0.3, 0.7)
 
 
 def classify(frac_agn, *, limits=CLASS_LIMITS):
@@ -53,3 +68,92 @@ def class_fractions(frac_agn, **kwargs):
     classes = classify(frac_agn, **kwargs)
     known = classes[classes != "unknown"]
     return {name: float(np.mean(known == name)) if known.size else np.nan for name in CLASS_NAMES}
+
+
+def confusion(true, found):
+    """
+    How many sources of each true class were found in each class.
+
+    Parameters
+    ----------
+    true, found : array-like of str, shape (n,)
+        Classes as `classify` gives them.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        A row for each of `CLASS_NAMES`: ``class``, ``n``, a column with the number of sources found
+        in each class and as ``unknown``, ``completeness`` (share of the sources of the class that
+        were found in it, unknown ones among them) and ``purity`` (share of those found in the class that are of
+        it), each with its 68 % (Wilson) interval ``_low`` and ``_high``.
+    """
+    true, found = np.asarray(true, str), np.asarray(found, str)
+    if true.shape != found.shape or true.ndim != 1:
+        raise argument_error("found", "as long as 'true'", f"{found.shape} and {true.shape}")
+    counts = {
+        name: np.array([np.sum((true == own) & (found == name)) for own in CLASS_NAMES])
+        for name in (*CLASS_NAMES, "unknown")
+    }
+    columns = {
+        "class": (np.array(CLASS_NAMES), "True class"),
+        "n": (np.array([np.sum(true == own) for own in CLASS_NAMES]), "Sources of the class"),
+    }
+    columns |= {name: (values, f"Of them found as {name}") for name, values in counts.items()}
+    quality = [selection_quality(true == name, found == name) for name in CLASS_NAMES]
+    for kind, text in (
+        ("completeness", "Share of the class that was found in it"),
+        ("purity", "Share of those found in the class that are of it"),
+    ):
+        shares = [getattr(one, kind) for one in quality]
+        columns[kind] = (np.array([one.value for one in shares]), text)
+        columns[f"{kind}_low"] = (np.array([one.low for one in shares]), "Lower end of 68 %")
+        columns[f"{kind}_high"] = (np.array([one.high for one in shares]), "Upper end of 68 %")
+    return described_table(columns)
+
+
+@dataclasses.dataclass(frozen=True)
+class SelectionQuality:
+    """
+    How good a selection is.
+
+    Parameters
+    ----------
+    completeness, purity : `~miricigale.evaluation.Estimate`
+        Share of the wanted sources that are selected, and of the selected that are wanted.
+    """
+
+    completeness: Estimate
+    purity: Estimate
+
+
+def selection_quality(wanted, selected):
+    """
+    Purity and completeness of a selection.
+
+    They mean something only in a sample with the right share of wanted sources: a realistic field, with
+    sources that were not detected as rows that are not selected.
+
+    Parameters
+    ----------
+    wanted, selected : array-like of bool, shape (n,)
+        Whether each source is of the kind, and whether it is selected as such.
+
+    Returns
+    -------
+    quality : `SelectionQuality`
+
+    Examples
+    --------
+    >>> from miricigale.evaluation import selection_quality
+    >>> quality = selection_quality([True, True, False, False], [True, False, False, False])
+    >>> quality.completeness.value, quality.purity.value
+    (0.5, 1.0)
+    """
+    wanted, selected = np.asarray(wanted, bool), np.asarray(selected, bool)
+    if wanted.shape != selected.shape:
+        raise argument_error("selected", "as long as 'wanted'", selected.shape)
+    both = np.count_nonzero(wanted & selected)
+    return SelectionQuality(
+        Estimate.of_fraction(both, np.count_nonzero(wanted)),
+        Estimate.of_fraction(both, np.count_nonzero(selected)),
+    )

@@ -1,0 +1,171 @@
+"""Classes from colors of MIRI bands, as a rival of the fits."""
+
+import dataclasses
+
+import numpy as np
+
+from miricigale.evaluation.classes import CLASS_NAMES
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.random import check_seed, stream
+from miricigale.utils.units import FNU, to_array
+
+__all__ = ["COLOR_WINDOWS", "ColorCircles", "ColorWindow", "color_classes"]
+
+#: Distances from the center that are tried as radii.
+_N_RADII = 60
+
+
+@dataclasses.dataclass(frozen=True)
+class ColorWindow:
+    """
+    Two colors that tell AGN from galaxies in a range of redshifts.
+
+    Parameters
+    ----------
+    z_low, z_high : float
+        The redshifts.
+    x, y : tuple of str
+        Bands of the two colors: log10 of the flux ratio of the first to the second.
+    """
+
+    z_low: float
+    z_high: float
+    x: tuple
+    y: tuple
+
+    @property
+    def bands(self):
+        """Names of the bands, each once."""
+        return tuple(dict.fromkeys([*self.x, *self.y]))
+
+    def colors(self, fluxes):
+        """Colors of a table of fluxes, shape (n, 2); NaN where a flux is not positive."""
+        values = {name: to_array(fluxes[name], FNU, name) for name in self.bands}
+        with np.errstate(divide="ignore", invalid="ignore"):
+            logs = {name: np.log10(np.where(v > 0, v, np.nan)) for name, v in values.items()}
+        return np.stack([logs[a] - logs[b] for a, b in (self.x, self.y)], axis=-1)
+
+
+#: After Kirkpatrick et al. 2017, ApJ 849, 111: a band with a PAH feature over one with continuum or the
+#: stellar minimum. Redshifts and bands of the first are theirs (author's page); how they are paired,
+#: and both of the others, are ours in the same spirit.
+COLOR_WINDOWS = (
+    ColorWindow(0.75, 1.25, ("miri.f1500w", "miri.f770w"), ("miri.f1800w", "miri.f1000w")),
+    ColorWindow(1.25, 1.75, ("miri.f1800w", "miri.f1000w"), ("miri.f2100w", "miri.f1280w")),
+    ColorWindow(1.75, 2.25, ("miri.f1800w", "miri.f1000w"), ("miri.f2100w", "miri.f1500w")),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class ColorCircles:
+    """
+    Regions of a plane of two colors between circles: AGN inside, composites around, galaxies outside.
+
+    The shape is that of Kirkpatrick et al. 2017; `fit` takes center and radii from sources of known class,
+    since their numbers belong to their templates.
+
+    Parameters
+    ----------
+    center : tuple of float
+        Colors of the center.
+    inner, outer : float
+        Radii in dex.
+    """
+
+    center: tuple
+    inner: float
+    outer: float
+
+    @classmethod
+    def fit(cls, colors, classes):
+        """
+        Circles that separate sources of known class best.
+
+        Parameters
+        ----------
+        colors : array-like, shape (n, 2)
+            Colors; rows with NaN are left out.
+        classes : array-like of str, shape (n,)
+            Names of `~miricigale.evaluation.CLASS_NAMES`.
+
+        Returns
+        -------
+        circles : `ColorCircles`
+            About the median color of the AGN, with the radii of the highest mean of the shares of each
+            class that are found in it.
+
+        Raises
+        ------
+        ValueError
+            If there is no AGN with colors.
+        """
+        colors, classes = np.asarray(colors, float), np.asarray(classes, str)
+        good = np.isfinite(colors).all(axis=1)
+        colors, classes = colors[good], classes[good]
+        agn = classes == CLASS_NAMES[2]
+        if not agn.any():
+            raise argument_error("classes", "with an AGN that has colors", "none")
+        center = np.median(colors[agn], axis=0)
+        distance = np.hypot(*(colors - center).T)
+        steps = np.unique(np.quantile(distance, np.linspace(0, 1, _N_RADII)))
+        # share of each class within each radius
+        within = {
+            name: np.mean(distance[classes == name][:, None] <= steps, axis=0)
+            for name in CLASS_NAMES
+            if np.any(classes == name)
+        }
+        zero = np.zeros((steps.size, steps.size))
+        galaxy, composite, inside = (within.get(name, np.zeros(steps.size)) for name in CLASS_NAMES)
+        score = zero + inside[:, None]
+        score += composite - composite[:, None]
+        score += 1 - galaxy if CLASS_NAMES[0] in within else 0
+        score[np.tril_indices(steps.size, -1)] = -np.inf
+        i, j = np.unravel_index(np.argmax(score), score.shape)
+        return cls(tuple(center.tolist()), float(steps[i]), float(steps[j]))
+
+    def classify(self, colors):
+        """Class of each row of colors, shape (n, 2); ``"unknown"`` for those with NaN."""
+        colors = np.asarray(colors, float)
+        distance = np.hypot(*(colors - np.array(self.center)).T)
+        # from the outside inwards
+        index = np.where(distance <= self.inner, 2, np.where(distance <= self.outer, 1, 0))
+        names = np.array([*CLASS_NAMES, "unknown"])
+        return names[np.where(np.isfinite(distance), index, 3)]
+
+
+def color_classes(fluxes, redshift, classes, *, windows=COLOR_WINDOWS, n_folds=2, seed):
+    """
+    Classes of sources by their colors, with circles that were fitted to other sources.
+
+    Parameters
+    ----------
+    fluxes : `~astropy.table.QTable`
+        Fluxes of the bands of the windows.
+    redshift : array-like, shape (n,)
+        Redshifts by which a source is in a window.
+    classes : array-like of str, shape (n,)
+        True classes, to which the circles are fitted.
+    windows : iterable of `ColorWindow`, optional
+        Colors by redshift.
+    n_folds : int, optional
+        Parts of the sample: the sources of each are classified by circles fitted to the others.
+    seed : int
+        Seed of the division.
+
+    Returns
+    -------
+    found : `~numpy.ndarray` of str, shape (n,)
+        ``"unknown"`` for sources in no window or without positive fluxes.
+    """
+    redshift, classes = np.asarray(redshift, float), np.asarray(classes, str)
+    found = np.full(redshift.size, "unknown", dtype="<U9")
+    fold = stream(check_seed(seed), "colors").permutation(redshift.size) % n_folds
+    for window in windows:
+        rows = (redshift >= window.z_low) & (redshift < window.z_high)
+        colors = window.colors(fluxes)
+        known = rows & np.isfinite(colors).all(axis=1)
+        for k in range(n_folds):
+            others, own = known & (fold != k), rows & (fold == k)
+            if np.any(classes[others] == CLASS_NAMES[2]) and own.any():
+                found[own] = ColorCircles.fit(colors[others], classes[others]).classify(colors[own])
+    return found

@@ -1,0 +1,199 @@
+"""X-ray fluxes of AGN from their infrared light, and how complete a sample is along them."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import log_ndtr
+
+from miricigale.evaluation.metrics import fraction_interval
+from miricigale.sed.xray import stern2015, xray_flux
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.tables import described_table
+
+__all__ = [
+    "XRAY_LIMITS",
+    "XRayLimit",
+    "completeness",
+    "half_complete",
+    "xray_luminosity_at",
+    "yang2021_xray_flux",
+]
+
+_CGS = u.erg / u.s / u.cm**2
+#: Share of the X-rays that absorption leaves in Yang et al. 2021.
+_TRANSMISSION = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class XRayLimit:
+    """
+    A flux limit of an X-ray survey in 0.5-7 keV.
+
+    Parameters
+    ----------
+    survey : str
+        Name of the survey.
+    flux : `~astropy.units.Quantity`
+        The limit.
+    kind : str
+        What it is: that of the deepest part, or where half of the sources are found.
+    reference : str
+        Where it is from.
+    checked : bool
+        Whether the number itself was read in the reference; otherwise it is an estimate from what
+        the reference says.
+    """
+
+    survey: str
+    flux: u.Quantity
+    kind: str
+    reference: str
+    checked: bool
+
+
+#: The surveys that Yang et al. 2021 compare with. The two 50 % limits are estimates: the abstract of that
+#: paper calls MIRI (50 % at about 1e-16) "slightly more sensitive" than the deepest survey, and Nandra et
+#: al. call theirs a factor 2-3 shallower than the deep fields.
+XRAY_LIMITS = (
+    XRayLimit("CDF-S 7 Ms", 1.9e-17 * _CGS, "center", "Luo et al. 2017, ApJS 228, 2", True),
+    XRayLimit("CDF-S 7 Ms", 1.2e-16 * _CGS, "50 %", "after Yang et al. 2021, ApJ 908, 144", False),
+    XRayLimit(
+        "EGS 800 ks", 3.0e-16 * _CGS, "50 %", "after Nandra et al. 2015, ApJS 220, 10", False
+    ),
+)
+
+
+def yang2021_xray_flux(l_6um, redshift):
+    """
+    X-ray flux of an AGN as Yang et al. 2021 take it from the infrared.
+
+    2-10 keV luminosity by `~miricigale.sed.stern2015`, a power law of Gamma 1.8, observed in 0.5-7 keV
+    and halved for absorption.
+
+    Parameters
+    ----------
+    l_6um : `~astropy.units.Quantity`
+        nu L_nu of the AGN alone at rest 6 um.
+    redshift : float or `~numpy.ndarray`
+        Redshifts.
+
+    Returns
+    -------
+    flux : `~astropy.units.Quantity`
+        In erg / s / cm2.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from miricigale.evaluation import yang2021_xray_flux
+    >>> flux = yang2021_xray_flux(10**42.6 * u.erg / u.s, 2.0)
+    >>> print(f"{flux:.1e}")
+    9.5e-17 erg / (s cm2)
+    """
+    return xray_flux(stern2015(l_6um), redshift, transmission=_TRANSMISSION)
+
+
+def xray_luminosity_at(flux, redshift):
+    """
+    Rest-frame 2-10 keV luminosity, without absorption, of a source of a flux of `yang2021_xray_flux`.
+
+    Parameters
+    ----------
+    flux : `~astropy.units.Quantity`
+        In 0.5-7 keV.
+    redshift : float or `~numpy.ndarray`
+        Redshifts.
+
+    Returns
+    -------
+    luminosity : `~astropy.units.Quantity`
+        In erg / s.
+    """
+    unit = u.erg / u.s
+    return (flux / xray_flux(1 * unit, redshift, transmission=_TRANSMISSION)).to(u.one) * unit
+
+
+def completeness(values, found, edges):
+    """
+    Share of the sources that were found, in bins of a quantity.
+
+    Parameters
+    ----------
+    values : array-like, shape (n,)
+        The quantity; sources without a finite one are in no bin.
+    found : array-like of bool, shape (n,)
+        Whether each source was found.
+    edges : array-like, shape (m + 1,)
+        Ascending edges of the bins.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        A row for each bin: ``low``, ``high``, ``n``, ``n_found``, ``share`` and its 68 % (Wilson) interval
+        ``share_low``, ``share_high``, NaN in bins without sources.
+    """
+    values, found = _checked(values, found)
+    edges = np.asarray(edges, float)
+    if edges.ndim != 1 or edges.size < 2 or np.any(np.diff(edges) <= 0):
+        raise argument_error("edges", "ascending", edges)
+    n, _ = np.histogram(values, edges)
+    n_found, _ = np.histogram(values[found], edges)
+    shares = np.array([fraction_interval(*pair) for pair in zip(n_found, n, strict=True)])
+    return described_table(
+        {
+            "low": (edges[:-1], "Lower edge of the bin"),
+            "high": (edges[1:], "Upper edge of the bin"),
+            "n": (n, "Sources"),
+            "n_found": (n_found, "Sources found"),
+            "share": (shares[:, 0], "Share of the sources found"),
+            "share_low": (shares[:, 1], "Lower end of its 68 % interval"),
+            "share_high": (shares[:, 2], "Upper end of its 68 % interval"),
+        }
+    )
+
+
+def half_complete(values, found):
+    """
+    Value above which sources are more likely found than not.
+
+    The share found is taken as an error function of the value that rises, with center and width of the highest
+    likelihood.
+
+    Parameters
+    ----------
+    values : array-like, shape (n,)
+        A quantity on a scale on which completeness rises evenly: magnitudes with a minus, or the
+        logarithm of a flux. Sources without a finite one are left out.
+    found : array-like of bool, shape (n,)
+        Whether each source was found.
+
+    Returns
+    -------
+    value : float
+        NaN if all or none were found, or the center is outside of the values.
+    """
+    values, found = _checked(values, found)
+    good = np.isfinite(values)
+    values, found = values[good], found[good]
+    if not found.any() or found.all():
+        return np.nan
+    scale = max(float(values.std()), 1e-6)
+    sign = np.where(found, 1.0, -1.0)
+
+    def unlikely(parameters):
+        center, log_width = parameters
+        # a sharp limit has no finite width of the highest likelihood
+        return -log_ndtr(sign * (values - center) / np.exp(max(log_width, -20.0))).sum()
+
+    start = 0.5 * (np.median(values[found]) + np.median(values[~found]))
+    best = minimize(unlikely, [start, np.log(0.5 * scale)], method="Nelder-Mead").x[0]
+    return float(best) if values.min() <= best <= values.max() else np.nan
+
+
+def _checked(values, found):
+    values, found = np.asarray(values, float), np.asarray(found, bool)
+    if values.shape != found.shape or values.ndim != 1:
+        raise argument_error("found", "as long as 'values'", f"{found.shape} and {values.shape}")
+    return values, found

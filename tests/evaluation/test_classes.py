@@ -1,0 +1,69 @@
+import numpy as np
+import pytest
+
+from miricigale.evaluation import (
+    CLASS_NAMES,
+    KIRKPATRICK_LIMITS,
+    classify,
+    confusion,
+    selection_quality,
+)
+
+TRUE = ["galaxy"] * 4 + ["composite"] * 2 + ["agn"] * 4
+FOUND = [
+    "galaxy",
+    "galaxy",
+    "galaxy",
+    "agn",
+    "composite",
+    "unknown",
+    "agn",
+    "agn",
+    "agn",
+    "composite",
+]
+
+
+def test_confusion_of_a_table_by_hand():
+    table = confusion(TRUE, FOUND)
+    assert table["class"].tolist() == list(CLASS_NAMES)
+    assert table["n"].tolist() == [4, 2, 4]
+    assert [table[name].tolist() for name in (*CLASS_NAMES, "unknown")] == [
+        [3, 0, 0],
+        [0, 1, 1],
+        [1, 0, 3],
+        [0, 1, 0],
+    ]
+    np.testing.assert_allclose(table["completeness"], [3 / 4, 1 / 2, 3 / 4])
+    np.testing.assert_allclose(table["purity"], [1, 1 / 2, 3 / 4])
+    assert np.all(table["completeness_low"] <= table["completeness"])
+    assert np.all(table["completeness_high"] >= table["completeness"])
+
+
+def test_classes_by_the_mid_infrared_share():
+    got = classify([0.2, 0.5, 0.8], limits=KIRKPATRICK_LIMITS)
+    assert got.tolist() == ["galaxy", "composite", "agn"]
+
+
+def test_purity_falls_with_the_share_of_wanted_sources_and_completeness_does_not():
+    """Bayes: 90 % of AGN and 10 % of galaxies selected; AGN are half, or 1 of 10."""
+    for n_agn, purity in ((1000, 0.9), (100, 0.09 / (0.09 + 0.09))):
+        n_galaxies = 1000 if n_agn == 1000 else 900
+        wanted = np.r_[np.ones(n_agn, bool), np.zeros(n_galaxies, bool)]
+        selected = np.r_[np.arange(n_agn) < 0.9 * n_agn, np.arange(n_galaxies) < 0.1 * n_galaxies]
+        quality = selection_quality(wanted, selected)
+        assert quality.completeness.value == pytest.approx(0.9)
+        assert quality.purity.value == pytest.approx(purity)
+
+
+def test_nothing_selected_has_no_purity():
+    quality = selection_quality([True, False], [False, False])
+    assert np.isnan(quality.purity.value)
+    assert quality.completeness.value == 0
+
+
+def test_other_lengths_are_refused():
+    with pytest.raises(ValueError, match="'found' must be as long as 'true'"):
+        confusion(["agn"], [])
+    with pytest.raises(ValueError, match="'selected' must be as long as 'wanted'"):
+        selection_quality([True], [True, False])

@@ -1,0 +1,72 @@
+import itertools
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from miricigale.evaluation import COLOR_WINDOWS, ColorCircles, ColorWindow, color_classes
+
+NAMES = np.array(["agn", "composite", "galaxy"])
+
+
+def rings(n, seed=1):
+    """AGN within 0.1 dex of a point, composites at 0.2-0.3, galaxies at 0.5-0.8."""
+    rng = np.random.default_rng(seed)
+    kind = np.repeat([0, 1, 2], n)
+    low, high = np.array([[0.0, 0.1], [0.2, 0.3], [0.5, 0.8]])[kind].T
+    radius = rng.uniform(low, high)
+    angle = rng.uniform(0, 2 * np.pi, kind.size)
+    center = np.array([0.2, 0.1])
+    return center + radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1), NAMES[kind]
+
+
+def test_circles_find_rings():
+    colors, classes = rings(300)
+    circles = ColorCircles.fit(colors, classes)
+    assert circles.center == pytest.approx((0.2, 0.1), abs=0.02)
+    assert 0.08 < circles.inner < 0.22
+    assert 0.28 < circles.outer < 0.52
+    fresh, truth = rings(300, seed=2)
+    assert np.mean(circles.classify(fresh) == truth) > 0.95
+    assert circles.classify([[np.nan, 0.0]]).tolist() == ["unknown"]
+
+
+def test_circles_by_hand():
+    circles = ColorCircles((0.0, 0.0), 1.0, 2.0)
+    got = circles.classify([[0.6, 0.6], [1.2, 1.2], [2.0, 2.0]])
+    assert got.tolist() == ["agn", "composite", "galaxy"]
+
+
+def test_colors_are_logs_of_ratios():
+    window = ColorWindow(0, 1, ("a", "b"), ("c", "b"))
+    assert window.bands == ("a", "b", "c")
+    fluxes = QTable({"a": [10.0, 1] * u.uJy, "b": [1.0, -1] * u.uJy, "c": [1e-3, 1] * u.mJy})
+    np.testing.assert_allclose(window.colors(fluxes), [[1, 0], [np.nan, np.nan]])
+
+
+def test_sources_are_classified_by_circles_of_others():
+    colors, classes = rings(200)
+    window = ColorWindow(0.75, 1.25, ("a", "b"), ("c", "b"))
+    flux = 10**colors
+    fluxes = QTable({"a": flux[:, 0] * u.uJy, "b": np.ones(600) * u.uJy, "c": flux[:, 1] * u.uJy})
+    z = np.full(600, 1.0)
+    z[:5] = 3.0
+    found = color_classes(fluxes, z, classes, windows=[window], seed=1)
+    assert found[:5].tolist() == ["unknown"] * 5
+    assert np.mean(found[5:] == classes[5:]) > 0.95
+    # classes without relation to colors are not found
+    shuffled = np.random.default_rng(1).permutation(classes)
+    found = color_classes(fluxes, z, shuffled, windows=[window], seed=1)
+    assert np.mean(found[5:] == shuffled[5:]) < 0.5
+
+
+def test_windows_follow_each_other():
+    for one, after in itertools.pairwise(COLOR_WINDOWS):
+        assert one.z_high == after.z_low
+    assert COLOR_WINDOWS[0].bands == ("miri.f1500w", "miri.f770w", "miri.f1800w", "miri.f1000w")
+
+
+def test_circles_need_agn():
+    with pytest.raises(ValueError, match="'classes' must be with an AGN that has colors"):
+        ColorCircles.fit([[0, 0]], ["galaxy"])
