@@ -53,7 +53,18 @@ __getattr__, __dir__, __all__ = lazy_names(
             "xray_luminosity_function",
             "xray_obscured_fraction",
         ),
+        "paper": ("PUBLISHED", "PublishedNumber", "compare_with_paper", "comparison_rows"),
+        "quantities": (
+            "QUANTITIES",
+            "REDSHIFT_BINS",
+            "measure",
+            "selection_table",
+            "study_confusion",
+            "study_numbers",
+            "xray_fluxes",
+        ),
         "report": ("Missing", "Report", "number"),
+        "study": ("StudyResults", "TruthResults"),
         "xray": (
             "XRAY_LIMITS",
             "XRayLimit",

@@ -96,7 +96,7 @@ def test_agn_of_the_field_have_the_luminosities_that_were_drawn(truths):
     np.testing.assert_array_equal(np.asarray(truth["inclination"])[has] <= 40, open_ones[has])
     # a galaxy without one has the fluxes of the sky without AGN
     for name in ("miri.f770w", "miri.f2100w"):
-        np.testing.assert_allclose(truth[name][~has], truths["agn00"][name][~has], rtol=1e-4)
+        np.testing.assert_allclose(truth[name][~has], truths["agn00"][name][~has], rtol=1e-3)
 
 
 def test_dust_of_the_main_sequence_leaves_the_stars(truths, tmp_path):

@@ -1,0 +1,488 @@
+"""Numbers of a study, each with its bootstrap error."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.evaluation.classes import (
+    CLASS_LIMITS,
+    classify,
+    confusion,
+    selection_quality,
+)
+from miricigale.evaluation.estimates import Estimate, bootstrap
+from miricigale.evaluation.infrared import feature_magnitude
+from miricigale.evaluation.metrics import sigma_mad
+from miricigale.evaluation.study import TruthResults
+from miricigale.evaluation.xray import half_complete, yang2021_xray_flux
+from miricigale.filters import Filter
+from miricigale.utils.exceptions import unknown_name
+from miricigale.utils.random import check_seed, stream
+from miricigale.utils.tables import described_rows, error_column
+from miricigale.utils.units import FNU
+
+__all__ = [
+    "QUANTITIES",
+    "REDSHIFT_BINS",
+    "SHARES",
+    "measure",
+    "selection_table",
+    "study_confusion",
+    "study_numbers",
+    "xray_fluxes",
+]
+
+#: Redshifts between which the AGN fraction is told apart.
+REDSHIFT_BINS = ((0.0, 1.0), (1.0, 2.0), (2.0, 3.0), (3.0, np.inf))
+#: Limit of abs(dz)/(1 + z) of outliers.
+_OUTLIER = 0.15
+#: Fewest draws of statistics that are fits themselves.
+_FEW_DRAWS = 100
+
+
+def _median(values):
+    return np.nanmedian(values, axis=-1)
+
+
+def _scatter(values):
+    return sigma_mad(values, axis=-1, ignore_nan=True)
+
+
+def _outliers(delta):
+    return np.mean(np.abs(delta) > _OUTLIER, axis=-1)
+
+
+def _ratio(statistic):
+    """Of a statistic without MIRI to that with it."""
+    return lambda without, within: statistic(without) / statistic(within)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Draws:
+    """Bootstrap with the seed and number of draws of one number."""
+
+    seed: object
+    n_draws: int
+
+    def __call__(self, statistic, *columns, n_all=None, few=False):
+        n = max(_FEW_DRAWS, self.n_draws // 10) if few else self.n_draws
+        return bootstrap(statistic, *columns, seed=self.seed, n_draws=n, n_all=n_all)
+
+
+# Each takes the study, one truth (or None for those of all), the band set, an option and `_Draws`.
+
+
+def _in_bin(one, option):
+    """Rows of the sample in a bin of true redshift (all without), and sources of the field in it."""
+    low, high = option or (0.0, np.inf)
+    z = np.asarray(one.truth["redshift"], float)
+    rows = (z >= low) & (z < high)
+    return rows[one.sample], int(np.count_nonzero(rows & one.field))
+
+
+def _of_sample(values, statistic):
+    """Quantity that is a statistic of values of the sample, by bin of redshift."""
+
+    def measure(_, one, band_set, option, draws):
+        rows, n_all = _in_bin(one, option)
+        columns = values(one, band_set)
+        columns = columns if isinstance(columns, tuple) else (columns,)
+        return draws(statistic, *(column[rows] for column in columns), n_all=n_all)
+
+    return measure
+
+
+def _against_none(values):
+    """The same values without MIRI and with a band set."""
+    return lambda one, band_set: (values(one, "none"), values(one, band_set))
+
+
+def _width(one, band_set):
+    return one.fitted(band_set, "frac_agn_std")
+
+
+def _detected_share(study, one, _, limit, draws):
+    """Share of the field brighter than a magnitude that is detected in two or more bands."""
+    rows = one.field & (study.prior_magnitude(one) < limit)
+    found = rows & (np.asarray(one.matched["n_detected"]) >= min(2, len(study.bands)))
+    n = int(np.count_nonzero(rows))
+    return Estimate.of_fraction(int(np.count_nonzero(found)), n, n_all=n)
+
+
+def _mips_share(study, one, _, option, draws):
+    """Share of the field brighter than a magnitude that is above a limit in another band."""
+    limit, band, depth = option
+    if band not in one.truth.colnames:
+        return Estimate(np.nan)
+    rows = one.field & (study.prior_magnitude(one) < limit)
+    found = rows & (one.truth[band].to_value(FNU) > 10 ** (-0.4 * (depth - 23.9)))
+    n = int(np.count_nonzero(rows))
+    return Estimate.of_fraction(int(np.count_nonzero(found)), n, n_all=n)
+
+
+def _etc_limit(study, one, band_set, band, draws):
+    """Limit of the exposure time calculator."""
+    return Estimate(float(study.etc_limits.get(band, np.nan)))
+
+
+def _limit_offset(study, one, band_set, band, draws):
+    """Limit of the error function minus that of the calculator: negative where it is shallower."""
+    limits = (study.limits.get(band, np.nan), study.etc_limits.get(band, np.nan))
+    return Estimate(float(limits[0] - limits[1]))
+
+
+def _shapes(one):
+    """Which sources are points or of low and of high Sersic index."""
+    index = np.asarray(one.truth["sersic_index"], float)
+    point = np.asarray(one.truth["profile"]) == "point"
+    return {"point": point, "n < 2": ~point & (index < 2), "n >= 2": ~point & (index >= 2)}
+
+
+def _shape_share(study, one, _, option, draws):
+    """Share of the sources of the field by shape."""
+    rows = _shapes(one)[option]
+    n = int(np.count_nonzero(one.field))
+    return Estimate.of_fraction(int(np.count_nonzero(rows & one.field)), n, n_all=n)
+
+
+def _errors_of(study, one, rows):
+    """Magnitude errors of sources whose true flux is above 5 sigma, shape (n, n_bands), NaN of others."""
+    columns = []
+    for band in study.bands:
+        error = one.magnitude_error(band)
+        with np.errstate(invalid="ignore"):
+            # by measured flux it would be those that noise made brighter
+            bright = one.matched[f"{band}_true"] > 5 * one.matched[error_column(band)]
+        use = rows(band) & one.field & bright
+        columns.append(np.where(use, error, np.nan))
+    return np.stack(columns, axis=1)
+
+
+def _shape_offset(study, one, _, option, draws):
+    """Median of measured minus true magnitude by shape, of all bands together."""
+    shape = _shapes(one)[option]
+    n_all = int(np.count_nonzero(shape & one.field))
+    return draws(_median, _errors_of(study, one, lambda band: shape), n_all=n_all)
+
+
+def _crowded(one, band, crowded=True):
+    return one.crowded.get(band, np.zeros(len(one.truth), bool)) == crowded
+
+
+def _crowded_share(study, one, band_set, option, draws):
+    """Share of the sources of the field that are crowded in any band."""
+    if not one.crowded:
+        return Estimate(np.nan)
+    found = np.any([_crowded(one, band)[one.field] for band in study.bands], axis=0)
+    return Estimate.of_fraction(int(np.count_nonzero(found)), found.size, n_all=found.size)
+
+
+def _magnitude_scatter(study, one, _, option, draws):
+    """Scatter of measured minus true magnitude, crowded or isolated, of all bands together."""
+    if not one.crowded:
+        return Estimate(np.nan)
+    values = _errors_of(study, one, lambda band: _crowded(one, band, option == "crowded"))
+    return draws(_scatter, values)
+
+
+def _signal_to_noise(study, one, _, band, draws):
+    """Median ratio of flux to error in a band, of the sample."""
+    ratio = (one.matched[band] / one.matched[error_column(band)]).to_value(u.one)
+    return draws(_median, ratio[one.sample], n_all=int(np.count_nonzero(one.field)))
+
+
+def _outlier_share(study, one, band_set, option, draws):
+    """Share of outliers in redshift, with its Wilson interval."""
+    rows, n_all = _in_bin(one, option)
+    delta = one.redshift_error(band_set)[rows]
+    delta = delta[np.isfinite(delta)]
+    n = int(np.count_nonzero(np.abs(delta) > _OUTLIER))
+    return Estimate.of_fraction(n, delta.size, n_all=n_all)
+
+
+def _class_share(study, one, band_set, option, draws):
+    """Share of the sample that is found in its true class, by the AGN fraction."""
+    rows, n_all = _in_bin(one, option)
+    mean = one.fitted(band_set, "frac_agn_mean")[rows]
+    good = np.isfinite(mean)
+    found = classify(np.clip(mean[good], 0, 1)) == classify(one.true("frac_agn")[rows][good])
+    return Estimate.of_fraction(int(np.count_nonzero(found)), int(good.sum()), n_all=n_all)
+
+
+def _power(statistic):
+    """Of the accretion power of one truth, or of all with an AGN together."""
+
+    def measure(study, one, band_set, option, draws):
+        truths = study.with_agn if one is None else (one,)
+        truths = [t for t in truths if "accretion_power" in t.truth.colnames]
+        if not truths:
+            return Estimate(np.nan)
+        # the truths of a source are drawn together
+        columns = [t.of_catalog(t.power_error(band_set)) for t in truths]
+        n_all = int(np.count_nonzero(truths[0].field))
+        return draws(statistic, np.stack(columns, axis=1), n_all=n_all)
+
+    return measure
+
+
+def xray_fluxes(one):
+    """Log of the X-ray flux (erg/s/cm2) of all sources of a truth; NaN without an AGN."""
+    flux = yang2021_xray_flux(one.truth["l_6um"], np.asarray(one.truth["redshift"], float)).value
+    return np.log10(np.where(flux > 0, flux, np.nan))
+
+
+def _xray_half(study, one, band_set, option, draws):
+    """Log of the X-ray flux above which more than half of the AGN of the field are in the sample."""
+    truths = study.with_agn if one is None else (one,)
+    truths = [t for t in truths if "l_6um" in t.truth.colnames]
+    if not truths:
+        return Estimate(np.nan)
+    columns = [np.where(t.field, xray_fluxes(t), np.nan) for t in truths]
+    found = [np.where(t.field, t.sample, np.nan) for t in truths]
+
+    def statistic(flux, sample):
+        rows = zip(np.atleast_2d(flux), np.atleast_2d(sample), strict=True)
+        out = np.array([half_complete(x, np.nan_to_num(y) > 0) for x, y in rows])
+        return out[0] if np.ndim(flux) == 1 else out
+
+    return draws(statistic, np.stack(columns, axis=1), np.stack(found, axis=1), few=True)
+
+
+def _feature(study, one, band_set, option, draws):
+    """Magnitudes that a feature of given equivalent width (um) adds to a band at a redshift."""
+    band, width, redshift = option
+    value = feature_magnitude(width * u.um, redshift, Filter.from_name(band).width)
+    return Estimate(float(value))
+
+
+#: Quantities by name: what it is, and how it is taken from the tables.
+_MEASURES = {
+    "detected_share": ("share detected in two or more MIRI bands", _detected_share),
+    "mips_share": ("share above the limit of MIPS 24", _mips_share),
+    "etc_limit": ("5-sigma limit of the calculator (AB)", _etc_limit),
+    "limit_offset": ("5-sigma limit minus the calculator's (mag)", _limit_offset),
+    "shape_share": ("share of the sources", _shape_share),
+    "shape_offset": ("median measured - true magnitude", _shape_offset),
+    "crowded_share": ("share of crowded sources", _crowded_share),
+    "magnitude_scatter": ("sigma_MAD of measured - true magnitude", _magnitude_scatter),
+    "signal_to_noise": ("median S/N", _signal_to_noise),
+    "z_outliers": ("photo-z outliers", _outlier_share),
+    "z_bias": ("median dz/(1+z)", _of_sample(TruthResults.redshift_error, _median)),
+    "z_scatter": ("sigma_MAD of dz/(1+z)", _of_sample(TruthResults.redshift_error, _scatter)),
+    "z_outlier_ratio": (
+        "photo-z outliers without over with MIRI",
+        _of_sample(_against_none(TruthResults.redshift_error), _ratio(_outliers)),
+    ),
+    "z_scatter_ratio": (
+        "sigma_MAD of dz/(1+z) without over with MIRI",
+        _of_sample(_against_none(TruthResults.redshift_error), _ratio(_scatter)),
+    ),
+    "frac_offset": (
+        "median fracAGN - true",
+        _of_sample(TruthResults.fraction_error, _median),
+    ),
+    "frac_scatter": (
+        "sigma_MAD of fracAGN",
+        _of_sample(TruthResults.fraction_error, _scatter),
+    ),
+    "width": ("median posterior width of fracAGN", _of_sample(_width, _median)),
+    "width_ratio": (
+        "posterior width of fracAGN without over with MIRI",
+        _of_sample(_against_none(_width), _ratio(_median)),
+    ),
+    "power_offset": ("median log accretion power - true (dex)", _power(_median)),
+    "power_scatter": ("sigma_MAD of log accretion power (dex)", _power(_scatter)),
+    "class_share": ("share found in its true class", _class_share),
+    "feature": ("magnitudes that a feature adds to a band", _feature),
+    "xray_half": ("log X-ray flux of 50 % completeness", _xray_half),
+}
+#: Names of the quantities that are taken from the tables, and what they are.
+QUANTITIES = {name: text for name, (text, _) in _MEASURES.items()}
+#: Those that are shares of sources.
+SHARES = (
+    "detected_share",
+    "mips_share",
+    "shape_share",
+    "crowded_share",
+    "z_outliers",
+    "class_share",
+)
+#: Those that are of several truths together if none is named.
+_OF_ALL = ("power_offset", "power_scatter", "xray_half")
+
+
+def measure(study, quantity, *, truth=0.0, band_set="all", option=None, seed, n_draws=1000):
+    """
+    One quantity of a study.
+
+    Parameters
+    ----------
+    study : `StudyResults`
+        The tables.
+    quantity : str
+        A name of `QUANTITIES`.
+    truth : float, `TruthResults` or None, optional
+        The truth, or its AGN fraction; None for all with an AGN together, of quantities that know that.
+    band_set : str, optional
+        Which fit.
+    option : optional
+        What else it depends on: a band, a magnitude, a bin of redshift (low, high).
+    seed : int or `~numpy.random.Generator`
+        Of the bootstrap.
+    n_draws : int, optional
+        Its draws.
+
+    Returns
+    -------
+    estimate : `Estimate`
+        NaN if the study has no such truth, fit or band.
+
+    Raises
+    ------
+    KeyError
+        If there is no such quantity.
+    """
+    if quantity not in _MEASURES:
+        raise unknown_name("quantity", quantity, _MEASURES)
+    one = study.at(truth) if isinstance(truth, (int, float)) else truth
+    if one is None and not (truth is None and quantity in _OF_ALL):
+        return Estimate(np.nan)
+    lacks_fit = one is not None and quantity in _OF_FITS and band_set not in one.fits
+    if lacks_fit or (quantity in _OF_BANDS and option not in study.bands):
+        return Estimate(np.nan)
+    return _MEASURES[quantity][1](study, one, band_set, option, _Draws(seed, n_draws))
+
+
+#: Quantities of a fit, and those of a band.
+_OF_FITS = (
+    "z_outliers", "z_bias", "z_scatter", "z_outlier_ratio", "z_scatter_ratio", "frac_offset",
+    "frac_scatter", "width", "width_ratio", "power_offset", "power_scatter", "class_share",
+)  # fmt: skip
+_OF_BANDS = ("etc_limit", "limit_offset", "signal_to_noise")
+
+
+def study_numbers(study, *, seed, n_draws=500):
+    """
+    All numbers of the fits: each truth, each band set, whole sample and bins of redshift.
+
+    Parameters
+    ----------
+    study : `StudyResults`
+        The tables.
+    seed : int
+        Of the bootstrap; each number has its own stream.
+    n_draws : int, optional
+        Draws of the bootstrap.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        ``truth``, ``band_set``, ``quantity``, ``z_low``, ``z_high``, ``value``, ``low``, ``high`` (68 %), ``n``
+        and ``completeness``, the share of the sources of the field that the number is of.
+    """
+    seed = check_seed(seed)
+    rows = []
+    names = [name for name in _OF_FITS if not name.endswith("_ratio")]
+    for one in study.truths:
+        for band_set in one.fits:
+            for quantity in names:
+                of_power = quantity.startswith("power")
+                if of_power and "accretion_power" not in one.truth.colnames:
+                    continue
+                for option in (None,) if of_power else (None, *REDSHIFT_BINS):
+                    key = stream(seed, "numbers", one.name, band_set, quantity, str(option))
+                    got = measure(
+                        study, quantity, truth=one, band_set=band_set, option=option, seed=key,
+                        n_draws=n_draws,
+                    )  # fmt: skip
+                    span = option or (0.0, np.inf)
+                    values = (got.value, got.low, got.high, got.n, got.completeness)
+                    rows.append((one.name, band_set, quantity, *span, *values))
+    texts = {
+        "truth": "Name of the truth",
+        "band_set": "Bands of the fit",
+        "quantity": "Name of `QUANTITIES`",
+        "z_low": "Least true redshift",
+        "z_high": "True redshifts are below",
+        "value": "The number",
+        "low": "Lower end of its 68 % interval",
+        "high": "Upper end of its 68 % interval",
+        "n": "Sources",
+        "completeness": "Share of the sources of the field",
+    }
+    return described_rows(rows, texts)
+
+
+def found_classes(one, band_set):
+    """Classes of all sources of the catalog by a fit; ``"unknown"`` for those not in the sample."""
+    mean = one.of_catalog(one.fitted(band_set, "frac_agn_mean"))
+    return classify(np.clip(mean, 0, 1))
+
+
+def study_confusion(study, band_set="all"):
+    """
+    Classes found of the sources of each true class, of all truths with one AGN fraction together.
+
+    Parameters
+    ----------
+    study : `StudyResults`
+        The tables.
+    band_set : str, optional
+        Which fit.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        As `confusion`: sources of the field that were not fitted are ``unknown``.
+    """
+    truths = [one for one in study.truths if one.frac_agn is not None and band_set in one.fits]
+    true = [classify(np.asarray(one.truth["frac_agn"], float))[one.field] for one in truths]
+    found = [found_classes(one, band_set)[one.field] for one in truths]
+    return confusion(np.concatenate([[], *true]), np.concatenate([[], *found]))
+
+
+def selection_table(one, *, limits=CLASS_LIMITS):
+    """
+    Purity and completeness of selections by the fitted AGN fraction in a realistic field.
+
+    Parameters
+    ----------
+    one : `TruthResults`
+        A truth whose AGN have the numbers and luminosities of a real field.
+    limits : tuple of float, optional
+        Sources whose true AGN fraction is at least this are wanted, and those with such a posterior mean are
+        selected. Sources that were not fitted are not selected.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        A row for each band set and limit: ``band_set``, ``limit``, ``n_wanted``, ``n_selected``,
+        ``completeness``, ``purity`` and their 68 % (Wilson) intervals ``_low`` and ``_high``.
+    """
+    rows = []
+    true = np.asarray(one.truth["frac_agn"], float)[one.field]
+    for band_set in one.fits:
+        mean = one.of_catalog(one.fitted(band_set, "frac_agn_mean"))[one.field]
+        for limit in limits:
+            # NaN is below every limit
+            quality = selection_quality(true >= limit, mean >= limit)
+            pair = (quality.completeness, quality.purity)
+            values = [value for got in pair for value in (got.value, got.low, got.high)]
+            rows.append((band_set, limit, pair[0].n, pair[1].n, *values))
+    texts = {
+        "band_set": "Bands of the fit",
+        "limit": "Least AGN fraction",
+        "n_wanted": "Sources of the field whose true fraction is as high",
+        "n_selected": "Sources whose posterior mean is as high",
+    }
+    for name, text in (
+        ("completeness", "Share of the wanted sources that are selected"),
+        ("purity", "Share of the selected sources that are wanted"),
+    ):
+        texts |= {
+            name: text,
+            f"{name}_low": "Lower end of 68 %",
+            f"{name}_high": "Upper end of 68 %",
+        }
+    return described_rows(rows, texts)

@@ -1,0 +1,162 @@
+"""Tables of a study with several truths."""
+
+import dataclasses
+import functools
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.tables import require_columns
+from miricigale.utils.units import FNU
+
+__all__ = ["StudyResults", "TruthResults"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class TruthResults:
+    """
+    What was found of one truth.
+
+    Parameters
+    ----------
+    name : str
+        Its name.
+    frac_agn : float or None
+        AGN fraction that all sources were given; None if it differs from source to source.
+    truth : `~astropy.table.QTable`
+        A row for each source of the catalog: ``id``, ``redshift``, ``frac_agn``, true fluxes by band;
+        where there are, ``accretion_power``, ``l_6um``, ``sersic_index`` and ``profile``.
+    matched : `~astropy.table.QTable`
+        The same rows: measured fluxes, errors (``_err``) and true fluxes (``_true``) of the MIRI bands,
+        ``selection`` (0 for sources of the sample) and ``n_detected``.
+    fits : dict of str to `~astropy.table.QTable`
+        Tables of the fits (`~miricigale.fitting.FitResults.to_table`) by band set (``"none"``, ``"all"``,
+        ``"blue"``, ``"red"``), with the rows of the sample.
+    field : `~numpy.ndarray` of bool, shape (n,)
+        Sources in the field of all bands that could have been found: no stars, with a model.
+    crowded : dict of str to `~numpy.ndarray` of bool, shape (n,), optional
+        Sources with a bright neighbor, by band.
+
+    Raises
+    ------
+    ValueError
+        If the tables do not have the same sources.
+    """
+
+    name: str
+    frac_agn: float | None
+    truth: QTable
+    matched: QTable
+    fits: dict
+    field: np.ndarray
+    crowded: dict = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        require_columns(self.truth, ["id", "redshift", "frac_agn"], "truth")
+        require_columns(self.matched, ["id", "selection", "n_detected"], "matched")
+        ids = np.asarray(self.truth["id"])
+        if not np.array_equal(ids, np.asarray(self.matched["id"])):
+            raise argument_error("matched", "of the sources of 'truth', row by row", "others")
+        if np.shape(self.field) != ids.shape:
+            raise argument_error("field", f"of shape {ids.shape}", np.shape(self.field))
+        for name, table in self.fits.items():
+            if not np.array_equal(ids[self.sample], np.asarray(table["id"])):
+                wanted = "tables of the sample ('selection' 0), row by row"
+                raise argument_error("fits", wanted, f"other sources in {name!r}")
+
+    def __repr__(self):
+        return f"<TruthResults {self.name!r}, {np.count_nonzero(self.sample)} fitted>"
+
+    @functools.cached_property
+    def sample(self):
+        """Which sources were fitted: array of bool, shape (n,)."""
+        return np.asarray(self.matched["selection"]) == 0
+
+    def true(self, name):
+        """True values of the sample."""
+        return np.asarray(getattr(self.truth[name], "value", self.truth[name]), float)[self.sample]
+
+    def fitted(self, band_set, name):
+        """A column of a fit as plain numbers; NaN throughout if the truth has no such fit."""
+        if band_set not in self.fits:
+            return np.full(np.count_nonzero(self.sample), np.nan)
+        column = self.fits[band_set][name]
+        return np.asarray(getattr(column, "value", column), float)
+
+    def redshift_error(self, band_set):
+        """(z_fit - z) / (1 + z) of the sample."""
+        z = self.true("redshift")
+        return (self.fitted(band_set, "redshift_mean") - z) / (1 + z)
+
+    def fraction_error(self, band_set):
+        """Fitted minus true AGN fraction of the sample."""
+        return self.fitted(band_set, "frac_agn_mean") - self.true("frac_agn")
+
+    def power_error(self, band_set):
+        """Log of fitted over true accretion power (dex) of the sample; NaN without an AGN."""
+        if band_set not in self.fits:
+            return np.full(np.count_nonzero(self.sample), np.nan)
+        true = self.truth["accretion_power"][self.sample]
+        ratio = self.fits[band_set]["accretion_power_mean"] / np.where(true > 0, true, np.nan)
+        return np.log10(ratio.to_value(u.one))
+
+    def magnitude_error(self, band):
+        """Measured minus true magnitude of all sources in a band; NaN where not both are positive."""
+        measured = self.matched[band].to_value(FNU)
+        true = self.matched[f"{band}_true"].to_value(FNU)
+        good = (measured > 0) & (true > 0)
+        ratio = np.divide(measured, true, out=np.full(true.size, np.nan), where=good)
+        return -2.5 * np.log10(ratio)
+
+    def of_catalog(self, values):
+        """Values of the sample at the rows of the catalog, NaN elsewhere."""
+        out = np.full(len(self.truth), np.nan)
+        out[self.sample] = values
+        return out
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class StudyResults:
+    """
+    What was found of several truths with the same sources.
+
+    Parameters
+    ----------
+    truths : tuple of `TruthResults`
+        In the order of their AGN fractions.
+    bands : tuple of str
+        MIRI bands.
+    prior_band : str, optional
+        Band of the magnitudes by which sources are counted.
+    limits, etc_limits : dict of str to float, optional
+        5-sigma limits (AB) by band: of the error function, by the statistic of the paper, and of the exposure
+        time calculator for these exposures.
+    extra : dict of str to `Estimate`, optional
+        Numbers by key that are of other products: detection, point sources, Source Extractor.
+    """
+
+    truths: tuple
+    bands: tuple
+    prior_band: str = "wfc3.f160w"
+    limits: dict = dataclasses.field(default_factory=dict)
+    etc_limits: dict = dataclasses.field(default_factory=dict)
+    extra: dict = dataclasses.field(default_factory=dict)
+
+    def at(self, frac_agn):
+        """The truth of an AGN fraction, or None."""
+        for one in self.truths:
+            if one.frac_agn is not None and np.isclose(one.frac_agn, frac_agn, atol=1e-6):
+                return one
+        return None
+
+    @property
+    def with_agn(self):
+        """Truths of one AGN fraction above 0."""
+        return tuple(one for one in self.truths if one.frac_agn)
+
+    def prior_magnitude(self, one):
+        """AB magnitudes of all sources of a truth in the prior's band."""
+        flux = one.truth[self.prior_band].to_value(FNU)
+        return 23.9 - 2.5 * np.log10(np.where(flux > 0, flux, np.nan))

@@ -1,0 +1,258 @@
+"""A mock study whose numbers are known from how it was drawn."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from helpers.studies import BANDS, FITS, LIMITS, mock_study, mock_truth
+from miricigale.evaluation import (
+    PUBLISHED,
+    QUANTITIES,
+    Estimate,
+    StudyResults,
+    TruthResults,
+    compare_with_paper,
+    comparison_rows,
+    measure,
+    photoz_metrics,
+    selection_table,
+    study_confusion,
+    study_numbers,
+    xray_fluxes,
+    yang2021_xray_flux,
+)
+
+
+@pytest.fixture(scope="module")
+def study():
+    return mock_study(n=1200)
+
+
+def got(study, quantity, **kwargs):
+    return measure(study, quantity, seed=1, n_draws=300, **kwargs)
+
+
+@pytest.mark.parametrize("band_set", FITS)
+def test_redshifts_come_out_as_drawn(study, band_set):
+    scatter, outliers, _ = FITS[band_set]
+    one = study.at(0.0)
+    own = photoz_metrics(one.true("redshift"), one.fitted(band_set, "redshift_mean"))
+    share = got(study, "z_outliers", band_set=band_set)
+    assert (share.value, share.low, share.high) == (
+        own.outlier_fraction,
+        own.outlier_low,
+        own.outlier_high,
+    )
+    # a shift by 1 is an outlier below z = 5.7
+    assert share.value == pytest.approx(outliers, abs=4 * share.error)
+    width = got(study, "z_scatter", band_set=band_set)
+    assert width.value == own.sigma_mad
+    assert width.value == pytest.approx(scatter, rel=0.25)
+    assert width.low < width.value < width.high
+
+
+def test_ratios_are_without_miri_over_with_it(study):
+    outliers = {name: got(study, "z_outliers", band_set=name).value for name in ("none", "all")}
+    ratio = got(study, "z_outlier_ratio")
+    assert ratio.value == pytest.approx(outliers["none"] / outliers["all"])
+    assert ratio.low < ratio.value < ratio.high
+    assert got(study, "width_ratio", truth=0.2).value == pytest.approx(3)
+
+
+def test_fractions_and_powers_come_out_as_drawn(study):
+    offset = got(study, "frac_offset", truth=0.6)
+    assert offset.value == pytest.approx(0, abs=4 * offset.error)
+    scatter = got(study, "frac_scatter", truth=0.6)
+    assert scatter.value == pytest.approx(0.05, abs=4 * scatter.error)
+    for truth in (0.2, None):
+        offset = got(study, "power_offset", truth=truth)
+        assert offset.value == pytest.approx(-0.1, abs=4 * offset.error)
+        assert got(study, "power_scatter", truth=truth).value == pytest.approx(0.3, rel=0.1)
+    # no AGN has no power
+    assert got(study, "power_offset", truth=0.0).n == 0
+
+
+def test_bins_of_redshift_hold_their_sources(study):
+    bins = [got(study, "frac_offset", option=span) for span in ((0, 1), (1, 2), (2, 3), (3, 9))]
+    whole = got(study, "frac_offset")
+    assert sum(one.n for one in bins) == whole.n == np.count_nonzero(study.at(0.0).sample)
+    assert sum(one.n_all for one in bins) == whole.n_all == np.count_nonzero(study.at(0.0).field)
+
+
+def test_detections_are_shares_of_the_field(study):
+    one = study.at(0.0)
+    share = got(study, "detected_share", option=25.0)
+    bright = one.field & (study.prior_magnitude(one) < 25)
+    assert share.n == np.count_nonzero(bright)
+    assert share.value == pytest.approx(np.mean(one.matched["n_detected"][bright] >= 2))
+    # three times the flux in the prior's band
+    share = got(study, "mips_share", option=(26.0, "mips.24", 24.0))
+    magnitude = study.prior_magnitude(one)[one.field] - 2.5 * np.log10(3)
+    assert share.value == pytest.approx(np.mean(magnitude[magnitude < 26 - 1.19] < 24), abs=0.01)
+
+
+def test_limits_and_signal_to_noise(study):
+    assert got(study, "limit_offset", option=BANDS[0]).value == pytest.approx(-0.5)
+    assert got(study, "etc_limit", option=BANDS[1]).value == LIMITS[BANDS[1]]
+    one = study.at(0.0)
+    band = BANDS[3]
+    ratio = (one.matched[band] / one.matched[f"{band}_err"])[one.sample]
+    assert got(study, "signal_to_noise", option=band).value == pytest.approx(np.median(ratio))
+    # a band that the study does not have
+    assert np.isnan(got(study, "signal_to_noise", option="miri.f560w").value)
+
+
+def test_magnitudes_by_shape_and_crowding():
+    one = mock_truth(0.0, n=3000)
+    # high Sersic indices lose a fifth of their light, crowded sources scatter by 0.3 mag
+    rng = np.random.default_rng(1)
+    steep = (np.asarray(one.truth["profile"]) == "sersic") & (one.truth["sersic_index"] >= 2)
+    for name in BANDS:
+        flux = one.matched[f"{name}_true"] * np.where(steep, 0.8, 1.0)
+        noise = 10 ** (-0.4 * rng.normal(0, np.where(one.crowded[name], 0.3, 0.1)))
+        one.matched[name] = flux * noise
+    study = StudyResults((one,), BANDS)
+    lost = got(study, "shape_offset", option="n >= 2")
+    assert lost.value == pytest.approx(-2.5 * np.log10(0.8), abs=4 * lost.error)
+    for name in ("n < 2", "point"):
+        kept = got(study, "shape_offset", option=name)
+        assert kept.value == pytest.approx(0, abs=4 * kept.error)
+    crowded, isolated = (
+        got(study, "magnitude_scatter", option=name).value for name in ("crowded", "isolated")
+    )
+    assert crowded > 1.5 * isolated
+    shares = [got(study, "shape_share", option=name).value for name in ("point", "n < 2", "n >= 2")]
+    assert sum(shares) == pytest.approx(1)
+    assert got(study, "crowded_share").value == pytest.approx(1 - 0.85**6, abs=0.03)
+
+
+def test_xray_fluxes_are_those_of_the_relation(study):
+    one = study.at(0.6)
+    flux = yang2021_xray_flux(one.truth["l_6um"][:3], one.truth["redshift"][:3])
+    np.testing.assert_allclose(10 ** xray_fluxes(one)[:3], flux.value)
+    assert np.isnan(xray_fluxes(study.at(0.0))).all()
+    half = got(study, "xray_half", truth=0.6)
+    found = one.sample[one.field]
+    above = xray_fluxes(one)[one.field] > half.value
+    assert found[above].mean() > 0.7
+    assert half.low < half.value < half.high
+
+
+def test_what_a_study_lacks_is_nan(study):
+    assert np.isnan(got(study, "frac_scatter", truth=0.4).value)
+    one = mock_truth(0.0, sets=("all",))
+    alone = StudyResults((one,), BANDS)
+    assert np.isnan(got(alone, "z_outliers", band_set="red").value)
+    assert np.isnan(got(alone, "z_outlier_ratio").value)
+    with pytest.raises(KeyError, match="no quantity 'z_scater'"):
+        got(study, "z_scater")
+
+
+def test_all_numbers_of_all_fits(study):
+    small = dataclasses.replace(study, truths=study.truths[:2])
+    table = study_numbers(small, seed=3, n_draws=50)
+    assert set(table["truth"]) == {"agn00", "agn20"}
+    assert set(table["band_set"]) == set(FITS)
+    assert set(table["quantity"]) <= set(QUANTITIES)
+    row = table[(table["truth"] == "agn20") & (table["band_set"] == "red")]
+    row = row[(row["quantity"] == "z_scatter") & (row["z_high"] == np.inf) & (row["z_low"] == 0)]
+    assert row["value"][0] == got(study, "z_scatter", truth=0.2, band_set="red").value
+    # a number has its own stream: its error does not depend on what else there is
+    alone = study_numbers(dataclasses.replace(study, truths=study.truths[1:2]), seed=3, n_draws=50)
+    both = table[table["truth"] == "agn20"]
+    np.testing.assert_array_equal(both["low"], alone["low"])
+
+
+def test_confusion_of_a_study(study):
+    table = study_confusion(study)
+    one = np.count_nonzero(study.at(0.0).field)
+    # fractions 0; 0.2; 0.6 and 0.99
+    assert table["n"].tolist() == [one, one, 2 * one]
+    lost = [np.count_nonzero(t.field & ~t.sample) for t in study.truths]
+    assert table["unknown"].tolist() == [lost[0], lost[1], lost[2] + lost[3]]
+
+
+def test_selection_in_a_realistic_field():
+    one = mock_truth(0.0, n=1000, sets=("all",))
+    frac = np.zeros(1000)
+    frac[100:200] = 0.7
+    one.truth["frac_agn"] = frac
+    found = np.zeros(1000)
+    found[100:180] = 0.7
+    found[300:320] = 0.6
+    sample = one.sample.copy()
+    one.fits["all"]["frac_agn_mean"] = found[sample]
+    table = selection_table(one, limits=(0.4,))
+    wanted, selected = one.field & (frac > 0.4), sample & one.field & (found > 0.4)
+    assert (table["n_wanted"][0], table["n_selected"][0]) == (wanted.sum(), selected.sum())
+    assert table["completeness"][0] == pytest.approx((wanted & selected).sum() / wanted.sum())
+    assert table["purity"][0] == pytest.approx((wanted & selected).sum() / selected.sum())
+    assert table["completeness"][0] < 0.8
+
+
+# ----------------------------------------------------------------------------------- the paper
+
+
+def test_published_numbers_are_named_once_and_can_be_measured():
+    keys = [one.key for one in PUBLISHED]
+    assert len(set(keys)) == len(keys)
+    assert {one.quantity for one in PUBLISHED} <= {*QUANTITIES, "extra"}
+    assert {one.relation for one in PUBLISHED} <= set("=~<>")
+    by_key = {one.key: one.value for one in PUBLISHED}
+    # of the abstract: accretion power to 0.3 dex, redshifts better by 2, fractions by about 100
+    assert by_key["power_scatter"] == 0.3
+    assert by_key["scatter_ratio"] == 2
+    assert by_key["frac_offset.0.none"] / by_key["frac_offset.0.all"] == pytest.approx(100)
+
+
+def test_a_study_beside_the_paper(study):
+    extra = {"points.scatter": Estimate(0.01), "f_scaling.f770w": Estimate(1.0, 0.99, 1.01, 40)}
+    table = compare_with_paper(
+        dataclasses.replace(study, extra=extra),
+        seed=1,
+        n_draws=100,
+        reasons={"f_scaling.f770w": "no mismatch"},
+    )
+    assert len(table) == len(PUBLISHED)
+    row = {r["key"]: r for r in table}
+    assert row["points.scatter"]["verdict"] == "within the bound"
+    scaling = row["f_scaling.f770w"]
+    assert scaling["sigma"] == pytest.approx(-0.08 / np.hypot(0.01, 0.01))
+    assert scaling["verdict"] == "differs by -5.7 sigma: no mismatch"
+    assert row["frac_scatter.0.4.all"]["verdict"] == "not measured"
+    power = row["power_offset"]
+    assert power["verdict"].startswith("agrees (")
+    right = row["class.0"]
+    assert right["of_all"] == pytest.approx(right["ours"] * right["completeness"])
+    assert right["completeness"] == pytest.approx(
+        np.count_nonzero(study.at(0.0).sample) / np.count_nonzero(study.at(0.0).field)
+    )
+    rows = comparison_rows(table)
+    assert len(rows) == len(table)
+    texts = dict(zip(table["key"], rows, strict=True))
+    assert texts["power_scatter"][2] == "about 0.3"
+    assert texts["outliers.all"][2] == "0.015 [?]"
+    assert str(texts["frac_scatter.0.4.all"][3]) == "–"
+    assert "±" in texts["outliers.all"][3]
+
+
+def test_reasons_are_of_published_numbers(study):
+    with pytest.raises(KeyError, match="no published number 'outliers'"):
+        compare_with_paper(study, seed=1, reasons={"outliers": "?"})
+
+
+def test_tables_of_other_sources_are_refused():
+    one = mock_truth(0.2, n=100)
+    values = {field.name: getattr(one, field.name) for field in dataclasses.fields(one)}
+    with pytest.raises(ValueError, match="'matched' must be of the sources of 'truth'"):
+        TruthResults(**values | {"matched": one.matched[::-1]})
+    fits = {"all": one.fits["all"][1:]}
+    with pytest.raises(ValueError, match="'fits' must be tables of the sample"):
+        TruthResults(**values | {"fits": fits})
+    with pytest.raises(ValueError, match="'field' must be of shape"):
+        TruthResults(**values | {"field": one.field[1:]})
+    assert repr(one) == f"<TruthResults 'agn20', {one.sample.sum()} fitted>"
+    assert one.magnitude_error(BANDS[0]).shape == (100,)
+    assert one.matched[BANDS[0]].unit == u.uJy
