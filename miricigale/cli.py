@@ -34,6 +34,17 @@ def _parser():
         action="store_true",
         help="do again what another configuration or seed made in the folder",
     )
+    run.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="settings",
+        metavar="SECTION.KEY=VALUE",
+        help="another value of a key of the configuration, as in TOML; may be given several times",
+    )
+    what = "do this stage (or units, such as 'fits:agn20/*') and what it needs only"
+    run.add_argument("--until", metavar="STAGE", help=what)
+    run.add_argument("--from", dest="again", metavar="STAGE", help="do this stage or units again")
     run.add_argument("--print-config", action="store_true", help="print the configuration and stop")
     run.add_argument("--no-progress", action="store_true", help="no progress bars")
     run.set_defaults(call=_run, stopped=lambda _: _GOES_ON)
@@ -209,16 +220,19 @@ def _run(args):
     from miricigale.utils.exceptions import OtherResultsError
     from miricigale.utils.parallel import process_pool, thread_count
     from miricigale.workflow import load_config, run_study
+    from miricigale.workflow.options import read_setting
 
     options = _chosen(args, "threads seed") | {"keep_level1b": args.keep_level1b or None}
-    given = {name: value for name, value in options.items() if value is not None}
-    config = load_config(args.config, quick=args.quick, overrides={"run": given})
+    given = {"run": {name: value for name, value in options.items() if value is not None}}
+    for section, key, value in map(read_setting, args.settings):
+        given.setdefault(section, {})[key] = value
+    config = load_config(args.config, quick=args.quick, overrides=given)
     if args.print_config:
         print(config.to_toml(), end="")
         return 0
     folder = args.output or Path(config.run.name)
     begin = time.monotonic()
-    options = {"redo": args.redo, "progress_bar": not args.no_progress}
+    options = _chosen(args, "redo until again") | {"progress_bar": not args.no_progress}
     n_processes = thread_count(config.run.threads or None)
     try:
         with process_pool(n_processes) as executor:
@@ -226,7 +240,8 @@ def _run(args):
     except OtherResultsError as err:
         # name the option of this command instead of the argument
         raise OtherResultsError(err.reason, "--redo to replace it") from err
-    print(f"done in {(time.monotonic() - begin) / 60:.1f} min; report: {report}")
+    made = f"report: {report}" if args.until is None else f"products: {folder}"
+    print(f"done in {(time.monotonic() - begin) / 60:.1f} min; {made}")
     return 0
 
 

@@ -13,6 +13,7 @@ from miricigale.utils.exceptions import ConfigError
 __all__ = [
     "from_text",
     "option",
+    "read_setting",
     "read_text",
     "replace_sections",
     "require",
@@ -57,6 +58,23 @@ def from_text(label, text, base):
     except ConfigError as err:
         msg = f"{label}: {err}"
         raise ConfigError(msg) from None
+
+
+def read_setting(text):
+    """
+    Section, key and value of a text ``section.key=value``.
+
+    The value is as in TOML; what is no TOML is text, so that quotes may be left out.
+    """
+    name, found, value = text.partition("=")
+    section, dot, key = name.strip().partition(".")
+    if not (found and dot and section and key):
+        msg = f"a setting must be section.key=value, got {text!r}"
+        raise ConfigError(msg)
+    try:
+        return section, key, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return section, key, value.strip()
 
 
 def replace_sections(base, values):

@@ -1,6 +1,7 @@
 """Runs the stages, side by side where they can be; what stands already and is current is kept."""
 
 import dataclasses
+import fnmatch
 import hashlib
 import itertools
 import json
@@ -11,7 +12,12 @@ from pathlib import Path
 
 from miricigale.refdata.locate import fingerprint
 from miricigale.utils.content import file_sha256
-from miricigale.utils.exceptions import ConfigError, DataError, OtherResultsError
+from miricigale.utils.exceptions import (
+    ConfigError,
+    DataError,
+    OtherResultsError,
+    argument_error,
+)
 from miricigale.utils.parallel import available_memory, thread_count
 from miricigale.utils.progress import on_terminal, print_line, progress
 from miricigale.workflow.config import load_config
@@ -72,6 +78,12 @@ class StudyRunner:
         threads. The products are the same bytes either way.
     redo : bool, optional
         Whether products of another configuration are replaced; otherwise they are refused.
+    until : str, optional
+        A stage, or a pattern of units such as ``"fits:agn20/*"``: only these and what they need is
+        done; all by default.
+    again : str, optional
+        A stage, or a pattern of units, that is done again; what needs it follows if its products
+        change.
     disk : int, optional
         Bytes that all products take.
     progress_bar : bool, optional
@@ -80,11 +92,21 @@ class StudyRunner:
     Raises
     ------
     `~miricigale.utils.exceptions.ConfigError`
-        If a stage comes before what it needs.
+        If a stage comes before what it needs, or ``until`` or ``again`` match nothing.
     """
 
     def __init__(
-        self, config, folder, stages, *, executor=None, redo=False, disk=0, progress_bar=False
+        self,
+        config,
+        folder,
+        stages,
+        *,
+        executor=None,
+        redo=False,
+        until=None,
+        again=None,
+        disk=0,
+        progress_bar=False,
     ):
         self.config = config
         self.folder = Path(folder)
@@ -96,7 +118,8 @@ class StudyRunner:
         self.progress_bar = progress_bar
         self.n_threads = thread_count(config.run.threads or None)
         self.units = {stage.name: stage.unit_names(config) for stage in self.stages}
-        self.jobs = [_Job(stage, unit) for stage in self.stages for unit in self.units[stage.name]]
+        every = [_Job(stage, unit) for stage in self.stages for unit in self.units[stage.name]]
+        self._keys = [job.key for job in every]
         seen = set()
         for stage in self.stages:
             missing = set(stage.needs) - seen
@@ -104,6 +127,24 @@ class StudyRunner:
                 msg = f"stage {stage.name!r} needs {sorted(missing)}, which do not come before it"
                 raise ConfigError(msg)
             seen.add(stage.name)
+        chosen = set(self._keys) if until is None else self._matching(until, "until")
+        for job in reversed(every):
+            if job.key in chosen:
+                chosen |= job.needed(config, self.units)
+        self.jobs = [job for job in every if job.key in chosen]
+        self._again = set() if again is None else self._matching(again, "again") & chosen
+
+    def _matching(self, pattern, argument):
+        """Keys of units by stage or pattern."""
+        keys = {
+            key
+            for key in self._keys
+            if key.partition(":")[0] == pattern or fnmatch.fnmatchcase(key, pattern)
+        }
+        if not keys:
+            wanted = f"a stage ({', '.join(self.units)}) or a pattern of units such as {self._keys[-2]!r}"
+            raise ConfigError(str(argument_error(argument, wanted, repr(pattern))))
+        return keys
 
     def digest(self, stage, unit, store):
         """
@@ -145,7 +186,8 @@ class StudyRunner:
         Returns
         -------
         states : dict of str to str
-            By key: ``"current"``; ``"new"``; ``"lost"``, if products are missing or damaged;
+            By key: ``"current"``; ``"new"``; ``"again"``, if it was asked for; ``"lost"``, if products are
+            missing or damaged;
             ``"changed"``, if they were made otherwise than this run would make them; or
             ``"surplus"``, if this run has no such unit.
         """
@@ -155,6 +197,8 @@ class StudyRunner:
             record = store.records.get(job.key)
             if record is None:
                 state = "new"
+            elif job.key in self._again:
+                state = "again"
             elif moved.intersection(job.needed(self.config, self.units)) or record[
                 "hash"
             ] != self.digest(job.stage, job.unit, store):
@@ -165,7 +209,7 @@ class StudyRunner:
             states[job.key] = state
             if state in ("new", "changed"):
                 moved.add(job.key)
-        return states | {key: "surplus" for key in store.records if key not in states}
+        return states | {key: "surplus" for key in store.records if key not in self._keys}
 
     def run(self):
         """
@@ -204,7 +248,7 @@ class StudyRunner:
                 )
             self._write_config(store)
             for key, state in states.items():
-                if state == "surplus":
+                if state in ("surplus", "again"):
                     store.drop(key)
             self._execute(store, states)
         return store

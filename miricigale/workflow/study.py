@@ -112,7 +112,9 @@ def check_study(config):
         raise ConfigError(msg) from err
 
 
-def run_study(config, folder, *, executor=None, redo=False, progress_bar=False):
+def run_study(
+    config, folder, *, executor=None, redo=False, until=None, again=None, progress_bar=False
+):
     """
     Run all stages of a study in a folder; what stands there and is current is kept.
 
@@ -127,13 +129,16 @@ def run_study(config, folder, *, executor=None, redo=False, progress_bar=False):
         (`~miricigale.utils.parallel.process_pool`). The products are the same bytes.
     redo : bool, optional
         Whether what another configuration made in this folder is done again.
+    until, again : str, optional
+        A stage or a pattern of units (``"mosaics"``, ``"fits:agn20/*"``): only these and what they need
+        are done; these are done again.
     progress_bar : bool, optional
         Whether progress is shown.
 
     Returns
     -------
     report : `pathlib.Path`
-        The HTML report.
+        The HTML report; with ``until`` it may not be there yet.
 
     Raises
     ------
@@ -151,6 +156,8 @@ def run_study(config, folder, *, executor=None, redo=False, progress_bar=False):
         study_stages,
         executor=executor,
         redo=redo,
+        until=until,
+        again=again,
         disk=disk_use(config),
         progress_bar=progress_bar,
     )

@@ -48,6 +48,29 @@ def test_a_catalog_that_is_none_is_refused(capsys, tmp_path):
     assert "cat.ecsv" in capsys.readouterr().err
 
 
+def test_keys_are_set_on_the_command_line(capsys):
+    command = ["run", "goodss", "--print-config", "--set", "sed.frac_agn=[0.0, 0.4]"]
+    command += [
+        "--set",
+        "exposures.plan=quick",
+        "--set",
+        "catalog.source='my file.ecsv'",
+        "--seed",
+        "4",
+    ]
+    assert main(command) == 0
+    told = capsys.readouterr().out
+    for line in ("frac_agn = [0.0, 0.4]", 'plan = "quick"', 'source = "my file.ecsv"', "seed = 4"):
+        assert f"\n{line}\n" in told
+    for text, reason in (
+        ("frac_agn=0.4", "a setting must be section.key=value"),
+        ("sed.frac_agn=2", "must be between 0.0 and 0.99"),
+        ("sed.fraction=0.4", "does not know"),
+    ):
+        assert main(["run", "goodss", "--print-config", "--set", text]) != 0
+        assert reason in capsys.readouterr().err
+
+
 def test_an_empty_sample_is_refused(capsys, tmp_path):
     config = tmp_path / "my.toml"
     config.write_text("[catalog]\nmag_limit = 12.0\n")

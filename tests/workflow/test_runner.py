@@ -345,6 +345,42 @@ def test_a_unit_depends_on_the_units_that_it_reads_only(tmp_path):
     assert run("ab") == []
 
 
+def test_a_part_of_the_stages_and_units(tmp_path):
+    ran = []
+
+    def make(context, unit):
+        ran.append(unit or "all")
+        context.save(f"{unit or 'all'}.txt", lambda path: path.write_text("same"))
+
+    stages = [
+        Stage("first", make, "first", units=lambda _: ("a/1", "b/1", "b/2")),
+        Stage(
+            "second",
+            make,
+            "second",
+            units=lambda _: ("a", "b"),
+            needs={"first": lambda _, unit: (f"{unit}/1",)},
+        ),
+        Stage("third", make, "third", needs=("second",)),
+    ]
+
+    def run(**options):
+        ran.clear()
+        StudyRunner(StudyConfig(), tmp_path / "run", stages, **options).run()
+        return list(ran)
+
+    assert run(until="second:b") == ["b/1", "b"]
+    # what is left out is not taken for another run's
+    assert run(until="first") == ["a/1", "b/2"]
+    assert run() == ["a", "all"]
+    assert run(until="first:b/*", again="first") == ["b/1", "b/2"]
+    # the same bytes: what follows stands
+    assert run(again="first:a/*") == ["a/1"]
+    assert run() == []
+    with pytest.raises(ConfigError, match=r"'until' must be a stage \(first, second, third\) or"):
+        run(until="fourth")
+
+
 def test_stages_must_come_after_what_they_need(tmp_path):
     stage = Stage("second", print, "second", needs=("first",))
     with pytest.raises(ConfigError, match="stage 'second' needs"):
