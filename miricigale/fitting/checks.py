@@ -9,7 +9,7 @@ from astropy.table import QTable
 
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.flags import FitFlags
-from miricigale.fitting.likelihood import flux_column, limits, read_ids
+from miricigale.fitting.likelihood import PhotometryReader, flux_column, read_ids
 from miricigale.fitting.posterior import randomized_ranks
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.random import check_seed, stream
@@ -174,10 +174,8 @@ class MockResult:
             "scatter": "1.48 times the median absolute deviation of the same",
             "coverage": "part of truths within the 16-84 % interval; 0.68 is right",
         }
-        columns = {"parameter": (np.array(names, dtype=str), "parameter or derived quantity")}
-        for i, (name, text) in enumerate(texts.items()):
-            columns[name] = (np.array([row[i] for row in rows]), text)
-        return described_table(columns, {"mock": dict(self.meta)})
+        first = {"parameter": (np.array(names, dtype=str), "parameter or derived quantity")}
+        return _metrics_table(first, rows, texts, {"mock": dict(self.meta)})
 
     def _metric(self, name):
         true, mean = self.true(name).value, self.recovered.mean(name).value
@@ -266,8 +264,8 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
     for name in bands:
         if name not in fitter.bands:
             raise unknown_name("filter of the models", name, fitter.bands)
-    columns = [c for name in bands for c in (name, error_column(name))]
-    require_columns(photometry, ["id", *columns], "photometry", units=dict.fromkeys(columns, FNU))
+    zero = dict.fromkeys(bands, 0.0)
+    data = PhotometryReader(bands, bands, zero, zero, 1).read(photometry)
     groups = [(name,) for name in bands] if separately else [bands]
     fitted = [f for f in fitter.filters or fitter.bands if f in photometry.colnames]
     for group in groups:
@@ -275,14 +273,9 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
         if len(left) < fitter.n_bands_min:
             wanted = f"such that n_bands_min = {fitter.n_bands_min} or more of {fitted} are left"
             raise argument_error("bands", wanted, f"{list(group)}")
-    flux = np.array([flux_column(photometry, name) for name in bands]).T
-    err = np.array([flux_column(photometry, error_column(name)) for name in bands]).T
-    limit = np.array([limits(photometry, name) for name in bands]).T
-    good = np.isfinite(flux) & np.isfinite(err) & (err > 0)
-    empty = [name for name, any_good in zip(bands, good.any(axis=0), strict=True) if not any_good]
+    empty = [name for name, known in zip(bands, data.used.any(axis=0), strict=True) if not known]
     if empty and len(photometry):
         raise argument_error("bands", "measured for one object at least", f"{empty}")
-    good &= ~limit
     results, predicted, scatter = {}, [], []
     for group in groups:
         blank = QTable(photometry, copy=True)
@@ -298,8 +291,8 @@ def leave_out(fitter, photometry, bands, *, separately=False, **options):
             scatter.append(found.model_flux_std[:, i])
     return LeaveOutResult(
         bands=bands,
-        flux=np.where(good, flux, np.nan),
-        flux_err=np.where(good, err, np.nan),
+        flux=np.where(data.measured, data.flux, np.nan),
+        flux_err=np.where(data.measured, data.flux_err, np.nan),
         predicted=np.array(predicted).T,
         predicted_std=np.array(scatter).T,
         results=results,
@@ -392,10 +385,8 @@ class LeaveOutResult:
             "pull_scatter": "1.48 times their median absolute deviation",
             "within": "part of the pulls within 1",
         }
-        columns = {"band": (np.array(self.bands, dtype=str), "band that was left out")}
-        for i, (name, text) in enumerate(texts.items()):
-            columns[name] = (np.array([row[i] for row in rows]), text)
-        return described_table(columns)
+        first = {"band": (np.array(self.bands, dtype=str), "band that was left out")}
+        return _metrics_table(first, rows, texts)
 
     def _metric(self, i):
         good = np.isfinite(self.pull[:, i])
@@ -416,3 +407,10 @@ class LeaveOutResult:
         pull = self.pull if band is None else self.pull[:, self.bands.index(band)]
         kwargs.setdefault("label", band)
         return plot_pulls(pull.ravel(), ax=ax, **kwargs)
+
+
+def _metrics_table(columns, rows, texts, meta=None):
+    """Table of a first column and a row of numbers for each of its values."""
+    numbers = (np.array([row[i] for row in rows]) for i in range(len(texts)))
+    pairs = zip(numbers, texts.values(), strict=True)
+    return described_table(columns | dict(zip(texts, pairs, strict=True)), meta)

@@ -16,13 +16,14 @@ from miricigale.fitting.priors import (
     grid_priors,
     known_redshifts,
 )
-from miricigale.fitting.quantities import DERIVED_LEVELS, OtherFraction, Quantities
+from miricigale.fitting.quantities import DERIVED_LEVELS, OtherFraction, Quantities, plain
 from miricigale.fitting.results import CIGALE_LEAST_STD, FitResults
 from miricigale.fitting.samples import Samples
 from miricigale.sed import ModelGrid, SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks, parallel_map
 from miricigale.utils.random import stream
+from miricigale.utils.units import is_number
 
 __all__ = ["GridFit"]
 
@@ -41,24 +42,8 @@ class GridFit:
     """
     How `~miricigale.fitting.BayesFitter` fits with every model of a grid; picklable.
 
-    Parameters
-    ----------
-    grid : `~miricigale.sed.ModelGrid`
-        The grid.
-    priors : `~miricigale.fitting.priors.GridPriors`
-        Priors of its parameters.
-    quantities : `~miricigale.fitting.quantities.Quantities`
-        Derived quantities.
-    fraction : `~miricigale.fitting.quantities.OtherFraction` or None
-        The AGN fraction in the definition that the grid does not use.
-    engine : `~miricigale.fitting.grid.GridEngine`
-        What evaluates the models.
-    redshift_tolerance : float or None
-        How far a known redshift may lie from its node.
-    compat : {None, "cigale"}
-        Choices of CIGALE that are not ours.
-    prior_f : str
-        As told to the fitter.
+    Fields that are not objects of the package are as told to the fitter; ``fraction`` is the AGN
+    fraction in the definition that the grid does not use, None if it has none.
     """
 
     grid: object
@@ -80,6 +65,13 @@ class GridFit:
         cls, model, filters, axes, priors, *, prior_f, rtol, scale_error, redshift_tolerance, compat
     ):
         """Make a grid if it is none, work out its priors and derived quantities, set the engine up."""
+        if not (is_number(rtol) and 0 <= rtol < 0.1):
+            raise argument_error("rtol", "in [0, 0.1)", repr(rtol))
+        near = redshift_tolerance
+        if near is not None and not (is_number(near) and near >= 0):
+            raise argument_error("redshift_tolerance", ">= 0", repr(near))
+        if compat not in (None, "cigale"):
+            raise argument_error("compat", "None or 'cigale'", repr(compat))
         grid = model
         if isinstance(model, SEDModel):
             if axes is None or filters is None:
@@ -108,7 +100,7 @@ class GridFit:
             levels=DERIVED_LEVELS,
             share_galaxy=None if fraction is None else fraction.galaxy,
             share_agn=None if fraction is None else fraction.agn,
-            rtol=rtol,
+            rtol=float(rtol),
             scale_error=scale_error,
         )
         return cls(grid, priors, quantities, fraction, engine, redshift_tolerance, compat, prior_f)
@@ -132,7 +124,7 @@ class GridFit:
     def constants(self):
         """Parameters of the grid that have one value, which have no posterior: name to float."""
         return {
-            name: float(_plain(table[name])[0])
+            name: float(plain(table[name])[0])
             for table in (self.grid.galaxy_parameters, self.grid.agn_parameters)
             for name in table.colnames
             if name not in self.priors.axes and len(table)
@@ -250,16 +242,11 @@ class GridFit:
         log_sigma = np.log(np.where(data.measured, data.sigma, 1.0)).sum(axis=1)
         log_sigma += 0.5 * data.measured.sum(axis=1) * np.log(2.0 * np.pi)
         return FitResults(
-            ids=data.ids,
+            **data.columns,
             flags=flags,
-            n_bands=data.used.sum(axis=1),
             chi2=out.chi2,
             log_evidence=out.log_sum - log_sigma,
             filters=self.filters,
-            flux=data.flux,
-            flux_err=data.flux_err,
-            sigma=data.sigma,
-            limit=data.limit,
             axes={name: replace(axis, share=None) for name, axis in axes.items()},
             pdf=pdf,
             pdf_2d=out.zf,
@@ -312,10 +299,10 @@ class GridFit:
             elif axis.kind == "frac_agn":
                 values = frac
             elif axis.kind == "galaxy":
-                values = _plain(grid.galaxy_parameters[name])[g]
+                values = plain(grid.galaxy_parameters[name])[g]
             else:
                 # without AGN light there is no template
-                values = np.where(frac > 0, _plain(grid.agn_parameters[name])[k], np.nan)
+                values = np.where(frac > 0, plain(grid.agn_parameters[name])[k], np.nan)
             best[name] = np.where(ok, values, np.nan)
         scale = np.where(ok, out.best_scale, np.nan)
         derived = self.quantities.best(grid, g, k, frac, scale)
@@ -372,7 +359,3 @@ def _forget(out, rows):
     for array in (*sums, *derived, *out.joint.values()):
         array[rows] = np.nan
     out.index[rows] = -1
-
-
-def _plain(column):
-    return np.asarray(getattr(column, "value", column), dtype=float)

@@ -68,6 +68,12 @@ class FitData(ObjectRows):
         """Which bands are used and no upper limits, shape (n, nb)."""
         return self.used & ~self.limit
 
+    @property
+    def columns(self):
+        """What results take over: keywords of `~miricigale.fitting.FitResults`."""
+        taken = ("ids", "flux", "flux_err", "sigma", "limit")
+        return {name: getattr(self, name) for name in taken} | {"n_bands": self.used.sum(axis=1)}
+
 
 @dataclass(frozen=True, eq=False)
 class PhotometryReader:

@@ -7,6 +7,7 @@ import numpy as np
 
 from miricigale.fitting.flags import FitFlags
 from miricigale.fitting.posterior import cell_edges
+from miricigale.fitting.quantities import plain
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.units import to_array
 
@@ -16,6 +17,8 @@ __all__ = [
     "density_log_prior",
     "fixed_log_prior",
     "grid_priors",
+    "integrals",
+    "integrals_to",
     "known_redshifts",
     "read_density",
 ]
@@ -131,7 +134,7 @@ def grid_priors(grid, priors=None, *, prior_f="grid"):
 def _add_axis(axes, name, column, kind, priors, bounds, rows=None, nodes=None):
     """Add the axis of a table's column; return the prior factor of each model."""
     unit = getattr(column, "unit", None) or 1
-    column = np.asarray(getattr(column, "value", column), dtype=float)
+    column = plain(column)
     if nodes is None:
         # means of equal values may differ in the last digit
         values, rows_of = np.unique(np.float64(np.char.mod("%.12g", column)), return_inverse=True)
@@ -250,6 +253,20 @@ def _unmasked(value, name):
     return np.where(mask, np.nan, array)
 
 
+def integrals(nodes, density):
+    """Integrals from the first node to each of densities (..., n) that straight lines join: (..., n)."""
+    steps = 0.5 * (density[..., 1:] + density[..., :-1]) * np.diff(nodes)
+    return np.concatenate([np.zeros((*density.shape[:-1], 1)), np.cumsum(steps, axis=-1)], axis=-1)
+
+
+def integrals_to(values, nodes, density, total):
+    """Integrals up to values (m,) between the nodes, shape (..., m), from those of `integrals`."""
+    cell = np.clip(np.searchsorted(nodes, values, side="right") - 1, 0, nodes.size - 2)
+    step = values - nodes[cell]
+    slope = (density[..., cell + 1] - density[..., cell]) / (nodes[cell + 1] - nodes[cell])
+    return total[..., cell] + step * (density[..., cell] + 0.5 * slope * step)
+
+
 def density_log_prior(redshift_prior, grid_redshift, allowed, flags):
     """
     ln(prior) of the redshifts of a grid, shape (n, nz), from a density for each object.
@@ -262,17 +279,12 @@ def density_log_prior(redshift_prior, grid_redshift, allowed, flags):
     n = flags.size
     nodes, density = read_density(redshift_prior, n)
     density = np.broadcast_to(density, (n, nodes.size))
-    rise = 0.5 * (density[:, 1:] + density[:, :-1]) * np.diff(nodes)
-    total = np.concatenate([np.zeros((n, 1)), np.cumsum(rise, axis=1)], axis=1)
+    total = integrals(nodes, density)
     if grid_redshift.size == 1:
         edges = np.array([nodes[0], nodes[-1]])
     else:
         edges = np.clip(cell_edges(grid_redshift, (0.0, np.inf)), nodes[0], nodes[-1])
-    cell = np.clip(np.searchsorted(nodes, edges, side="right") - 1, 0, nodes.size - 2)
-    step = edges - nodes[cell]
-    slope = (density[:, cell + 1] - density[:, cell]) / (nodes[cell + 1] - nodes[cell])
-    upto = total[:, cell] + step * (density[:, cell] + 0.5 * slope * step)
-    weights = np.maximum(np.diff(upto, axis=1), 0.0)
+    weights = np.maximum(np.diff(integrals_to(edges, nodes, density, total), axis=1), 0.0)
     whole = total[:, -1:]
     known = np.isfinite(whole[:, 0]) & (whole[:, 0] > 0)
     flags[~known] |= int(FitFlags.NO_REDSHIFT)

@@ -19,6 +19,8 @@ __all__ = [
     "ShapeQuantities",
     "check_draws",
     "kept_percentiles",
+    "plain",
+    "unit_of",
 ]
 
 #: Levels at which the distributions of derived quantities are kept.
@@ -31,18 +33,26 @@ DERIVED_LEVELS.flags.writeable = False
 _SAME = 1e-9
 #: Shape quantities whose outermost cells end at 0.
 _NOT_NEGATIVE = ("a_v", "age_mass", "age_light")
-#: AGN fractions by name, and what they are.
+#: AGN fractions by name, and what they are; the AGN's part in them and the galaxy's.
 FRACTIONS = {
     "frac_agn_ir": "AGN share of 3-1000 um light",
     "frac_agn_dust": "AGN power over the sum with the dust luminosity",
 }
-
-_ALL = 1e30
-#: AGN fractions in both definitions: the AGN's part and the galaxy's.
 _FRACTIONS = {
     "frac_agn_dust": ("agn_power", "dust_luminosity"),
     "frac_agn_ir": ("ir_luminosity_agn", "ir_luminosity_galaxy"),
 }
+_ALL = 1e30
+
+
+def plain(column):
+    """Values of a column as an array of float, without its unit."""
+    return np.asarray(getattr(column, "value", column), dtype=float)
+
+
+def unit_of(column):
+    """Unit of a column; dimensionless if it has none."""
+    return getattr(column, "unit", None) or u.dimensionless_unscaled
 
 
 def kept_percentiles(name, levels, kept):
@@ -63,21 +73,10 @@ def kept_percentiles(name, levels, kept):
 @dataclass(frozen=True, eq=False)
 class ShapeQuantities:
     """
-    What is derived from a galaxy model and does not scale with its mass.
+    What is derived from a galaxy model and does not scale with its mass: attenuation, ages, colors.
 
-    Attenuation, ages, colors: one value for each galaxy model, so that their posterior
-    follows from the marginal weights of the galaxy models.
-
-    Parameters
-    ----------
-    names : tuple of str
-        Names.
-    units : tuple of `~astropy.units.UnitBase`
-        Units of the quantities.
-    descriptions : tuple of str
-        One line each.
-    values : `~numpy.ndarray`, shape (n_quantities, nG)
-        Values of the galaxy models; those that are not finite are left out of the posterior.
+    ``values``, shape (n_quantities, nG), has one for each galaxy model, so that their posterior follows
+    from the marginal weights of the galaxy models; those that are not finite are left out.
     """
 
     names: tuple
@@ -88,16 +87,14 @@ class ShapeQuantities:
     @classmethod
     def of_grid(cls, grid):
         """Take all columns of ``grid.galaxy_shape`` (`~miricigale.sed.ModelGrid`)."""
-        table = getattr(grid, "galaxy_shape", None)
-        names = () if table is None else tuple(table.colnames)
-        units, texts, values = [], [], []
-        for name in names:
-            column = table[name]
-            units.append(getattr(column, "unit", None) or u.dimensionless_unscaled)
-            texts.append(_text(column, ""))
-            values.append(np.asarray(getattr(column, "value", column), float))
-        shape = (len(names), grid.dust_luminosity.size)
-        return cls(names, tuple(units), tuple(texts), np.array(values, float).reshape(shape))
+        columns = tuple(grid.galaxy_shape.itercols())
+        values = [plain(column) for column in columns]
+        return cls(
+            tuple(column.info.name for column in columns),
+            tuple(unit_of(column) for column in columns),
+            tuple(_text(column, "") for column in columns),
+            np.array(values, float).reshape(len(columns), grid.dust_luminosity.size),
+        )
 
     @cached_property
     def _nodes(self):
@@ -157,22 +154,8 @@ class Quantities:
     What is derived from the models of a grid, and how.
 
     The order is: the galaxy's quantities (for each solar mass formed), the AGN's (for each W of
-    AGN power), the one that both have a part in, then those that do not scale with mass.
-
-    Parameters
-    ----------
-    names : tuple of str
-        Names, those of ``shape`` at the end.
-    units : tuple of `~astropy.units.UnitBase`
-        Units of the quantities.
-    descriptions : tuple of str
-        One line each.
-    galaxy_scale, agn_scale : `~numpy.ndarray`, shapes (n_qg, nG) and (n_qa, nA)
-        Values for each solar mass formed and for each W.
-    mixed_galaxy, mixed_agn : `~numpy.ndarray`, shapes (nG,) and (nA,)
-        The two parts of the quantity of both.
-    shape : `ShapeQuantities`
-        What does not scale with mass.
+    AGN power), the one that both have a part in (``mixed``), then those that do not scale with mass
+    (``shape``). Arrays of galaxies have the shape (n_quantities, nG) or (nG,), those of the AGN likewise.
     """
 
     names: tuple
@@ -201,19 +184,19 @@ class Quantities:
         for name in of_galaxy.colnames:
             names.append(f"{name}_galaxy" if name in both else name)
             column = of_galaxy[name]
-            unit = (getattr(column, "unit", None) or u.dimensionless_unscaled) * MASS
+            unit = unit_of(column) * MASS
             in_watt = unit.is_equivalent(LUMINOSITY)
             factor = unit.to(LUMINOSITY) if in_watt else 1.0
             units.append(LUMINOSITY if in_watt else unit)
             texts.append(_text(column, ", for one solar mass formed"))
-            galaxy_scale.append(np.asarray(getattr(column, "value", column), float) * factor)
+            galaxy_scale.append(plain(column) * factor)
         for name in of_agn.colnames if n_agn else ():
             names.append(f"{name}_agn" if name in both else name)
             column = of_agn[name]
-            unit = getattr(column, "unit", None) or u.dimensionless_unscaled
+            unit = unit_of(column)
             units.append(LUMINOSITY if unit == u.dimensionless_unscaled else unit * LUMINOSITY)
             texts.append(_text(column, ", W for each W of AGN power"))
-            agn_scale.append(np.asarray(getattr(column, "value", column), float))
+            agn_scale.append(plain(column))
         if both:
             name = both[0]
             mixed_galaxy = galaxy_scale[1 + of_galaxy.colnames.index(name)]
@@ -283,16 +266,7 @@ class OtherFraction:
 
     c = f / (1 - f) is that of the grid's own fraction f. If the latter refers to the dust
     luminosity the other is the AGN's share of 3-1000 um light, and the other way round. It does
-    not scale with mass.
-
-    Parameters
-    ----------
-    name : str
-        ``frac_agn_ir`` or ``frac_agn_dust``.
-    description : str
-        One line.
-    galaxy, agn : `~numpy.ndarray`, shapes (nG,) and (nA,)
-        The two factors of y.
+    not scale with mass. ``galaxy``, shape (nG,), and ``agn``, shape (nA,), are the factors of y.
     """
 
     name: str
@@ -310,7 +284,7 @@ class OtherFraction:
         tables = (grid.galaxy_properties, of_galaxy), (grid.agn_properties, of_agn)
         if not grid.n_agn or any(column not in table.colnames for table, column in tables):
             return None
-        galaxy, agn = (np.asarray(_in_watt(table[column]), float) for table, column in tables)
+        galaxy, agn = (_in_watt(table[column]) for table, column in tables)
         reference = np.asarray(grid.dust_luminosity, float)
         # where a galaxy has none of it all of it is the AGN's
         ratio = np.where(reference > 0, _ALL, 0.0)
@@ -325,9 +299,9 @@ class OtherFraction:
 
 def _in_watt(column):
     """Values in W for each solar mass, or plain ones."""
-    if hasattr(column, "to_value") and column.unit.is_equivalent("W / solMass"):
-        return column.to_value("W / solMass")
-    return getattr(column, "value", column)
+    if isinstance(column, u.Quantity) and column.unit.is_equivalent(LUMINOSITY / MASS):
+        return column.to_value(LUMINOSITY / MASS)
+    return plain(column)
 
 
 def check_draws(grid, ids, flags, index, scale):

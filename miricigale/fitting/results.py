@@ -345,24 +345,17 @@ class FitResults(ObjectRows):
 
     def samples(self, key):
         """
-        Draws of a sampler from the posterior of one object.
-
-        Parameters
-        ----------
-        key : object
-            Its id.
+        Draws of a sampler from the posterior of the object of this id, all of the same weight.
 
         Returns
         -------
         table : `~astropy.table.QTable`
-            A row for each draw, all of the same weight; a column for each parameter and derived
-            quantity.
+            A row for each draw, a column for each parameter and derived quantity.
 
         Raises
         ------
         ValueError
-            If the object was not fitted, or the fit was no sampler's: `BayesFitter.sample` draws from
-            the posterior of a grid.
+            If the object was not fitted, or the fit was no sampler's (see `BayesFitter.sample`).
         """
         if self.draws is None:
             msg = "results of a grid hold no draws; BayesFitter.sample makes some"
@@ -429,8 +422,8 @@ class FitResults(ObjectRows):
         Returns
         -------
         table : `~astropy.table.QTable`
-            ``id`` and, for each filter, posterior mean (by its name), standard deviation
-            (``<name>_err``) and flux of the best model (``<name>_best``) in uJy.
+            ``id`` and, for each filter, mean (by its name), standard deviation (``<name>_err``)
+            and flux of the best model (``<name>_best``) in uJy.
         """
         if isinstance(filters, str):
             raise argument_error("filters", "a list of names or a FilterSet", repr(filters))

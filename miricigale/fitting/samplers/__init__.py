@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from miricigale.utils.exceptions import unknown_name
+from miricigale.utils.units import check_count
 
 __all__ = [
     "CITATIONS",
@@ -46,6 +47,10 @@ class Request:
     n_effective: int
     max_calls: int
     options: dict
+
+    def __post_init__(self):
+        for name, least in (("n_live", 10), ("n_effective", 1), ("max_calls", 1)):
+            check_count(getattr(self, name), name, least)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,12 +12,12 @@ from miricigale.fitting.priors import GridAxis
 from miricigale.fitting.quantities import DERIVED_LEVELS
 from miricigale.fitting.results import FitResults
 from miricigale.fitting.samplers import CITATIONS
-from miricigale.fitting.samplers.run import ContinuousEngine, FluxModel, Target
+from miricigale.fitting.samplers.run import ContinuousEngine, FluxModel
 from miricigale.fitting.samplers.space import Space, prior_cells, redshift_axis
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import stream
-from miricigale.utils.units import MASS
+from miricigale.utils.units import MASS, check_count
 
 __all__ = ["SamplerFit"]
 
@@ -31,18 +31,8 @@ class SamplerFit:
     """
     How `~miricigale.fitting.BayesFitter` fits with a nested sampler; picklable.
 
-    Parameters
-    ----------
-    engine : `~miricigale.fitting.samplers.run.ContinuousEngine`
-        Model and sampler.
-    space : `~miricigale.fitting.samplers.space.Space`
-        Parameters and priors.
-    redshift_given : bool
-        Whether the priors say something of the redshift.
-    n_draws : int
-        Draws of equal weight that are kept of each object.
-    n_cells : int
-        Cells of each axis.
+    ``redshift_given`` tells whether the priors say something of the redshift; ``n_draws`` of equal
+    weight are kept of each object, and each axis has ``n_cells``.
     """
 
     engine: ContinuousEngine
@@ -61,6 +51,8 @@ class SamplerFit:
             raise argument_error("model", "an SEDModel", type(model).__name__)
         if not isinstance(priors, dict):
             raise argument_error("priors", "a dict of parameters", type(priors).__name__)
+        for name, least in (("n_draws", 1), ("n_cells", 2)):
+            check_count(sizes[name], name, least)
         names = tuple(n for some in (filters, predict) for n in getattr(some, "names", some))
         bands = FilterSet([*filters, *predict]) if isinstance(model, SEDModel) else names
         engine = ContinuousEngine(
@@ -233,15 +225,12 @@ class SamplerFit:
             "best": {name: np.full(n, np.nan) for name in (*axes, *quantities)},
         }
         for row in np.flatnonzero((flags & int(FitFlags.UNFITTED)) == 0):
-            target = Target(
-                str(data.ids[row]), data.flux[row], data.sigma[row], data.limit[row], spaces[row]
-            )
-            found = self.engine.fit(target, seed)
+            found = self.engine.fit(data._take(row), spaces[row], seed)
             if found is None:
                 flags[row] |= int(FitFlags.NO_MODEL)
                 continue
-            draw = stream(seed, "draws", target.key)
-            for name, value in self._reduce(found, target.space.fixed, axes, pairs, draw).items():
+            draw = stream(seed, "draws", str(data.ids[row]))
+            for name, value in self._reduce(found, spaces[row].fixed, axes, pairs, draw).items():
                 if isinstance(value, dict):
                     for key, array in out[name].items():
                         array[row] = value[key]
@@ -250,14 +239,9 @@ class SamplerFit:
         out["n_calls"] = np.nan_to_num(out["n_calls"]).astype(np.int64)
         out["converged"] = np.nan_to_num(out["converged"]).astype(bool)
         return FitResults(
-            ids=data.ids,
+            **data.columns,
             flags=flags,
-            n_bands=data.used.sum(axis=1),
             filters=self.filters,
-            flux=data.flux,
-            flux_err=data.flux_err,
-            sigma=data.sigma,
-            limit=data.limit,
             axes=axes,
             best_index=np.full((n, 4), -1),
             best_scale=out["best"]["mass"],

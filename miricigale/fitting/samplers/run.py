@@ -8,11 +8,10 @@ from astropy.table import QTable
 from scipy.special import erfcx, log_ndtr
 
 from miricigale.fitting.samplers import Request, effective_size, get_sampler
-from miricigale.fitting.samplers.space import Space
 from miricigale.utils.parallel import single_threaded
 from miricigale.utils.random import stream
 
-__all__ = ["ContinuousEngine", "FluxModel", "Posterior", "Target", "best_scale", "chi2_at"]
+__all__ = ["ContinuousEngine", "FluxModel", "Posterior", "best_scale", "chi2_at"]
 
 #: Draws from the prior of which at least one has to be possible.
 _TRIALS = 2048
@@ -36,64 +35,19 @@ class FluxModel(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
-    """
-    What is known of one object.
-
-    Parameters
-    ----------
-    key : str
-        Text of its id, from which its random stream comes.
-    flux, sigma : `~numpy.ndarray`, shape (n_bands,)
-        Fluxes and errors in uJy; infinite errors in bands that are not used.
-    limit : `~numpy.ndarray` of bool, shape (n_bands,)
-        Which of the bands are upper limits.
-    space : `Space`
-        Parameters and priors.
-    """
-
-    key: str
-    flux: np.ndarray
-    sigma: np.ndarray
-    limit: np.ndarray
-    space: Space
-
-
-@dataclass(frozen=True, eq=False)
 class Posterior:
     """
-    Weighted sample of a posterior.
+    Weighted sample of a posterior: n draws, and the model that fits best, at the scale that does.
 
-    Parameters
-    ----------
-    weight : `~numpy.ndarray`, shape (n,)
-        Weights; they sum to 1.
-    parameters, derived : dict of str to `~numpy.ndarray`, shape (n,)
-        Free parameters without mass, and derived quantities, mass among them.
-    flux : `~numpy.ndarray`, shape (n, n_bands)
-        Fluxes in uJy.
-    best : dict of str to float
-        Free parameters, mass and derived quantities of the model that fits best, at the scale
-        that does.
-    best_flux : `~numpy.ndarray`, shape (n_bands,)
-        Its fluxes.
-    chi2 : float
-        Its chi2.
-    log_evidence, log_evidence_err : float
-        ln(evidence) and its error; fluxes in uJy.
-    n_calls : int
-        Models evaluated.
-    n_effective : float
-        Effective size of the sample.
-    converged : bool
-        Whether the sampler finished.
+    Parameters and derived quantities (mass among the latter) are by name; fluxes are in uJy. The
+    numbers at the end are those of `~miricigale.fitting.FitResults`.
     """
 
-    weight: np.ndarray
-    parameters: dict
+    weight: np.ndarray  # (n,); sums to 1
+    parameters: dict  # free ones without mass: arrays (n,)
     derived: dict
-    flux: np.ndarray
-    best: dict
+    flux: np.ndarray  # (n, n_bands)
+    best: dict  # free parameters, mass and derived quantities: float
     best_flux: np.ndarray
     chi2: float
     log_evidence: float
@@ -104,32 +58,29 @@ class Posterior:
 
 
 class _Calls:
-    """All evaluations of one object's likelihood, in order."""
+    """All evaluations of the likelihood of one object, in order."""
 
-    def __init__(self, engine, target):
-        self._engine, self._target = engine, target
+    def __init__(self, engine, data, space):
+        self._engine, self._data, self._space = engine, data, space
         self._parts, self.n = [], 0
-        used = np.isfinite(target.sigma)
-        measured = used & ~target.limit
-        self._used = used
-        self._norm = np.log(target.sigma[measured]).sum()
-        self._norm += 0.5 * np.count_nonzero(measured) * np.log(2.0 * np.pi)
+        sigma = data.sigma[data.measured]
+        self._norm = np.log(sigma).sum() + 0.5 * sigma.size * np.log(2.0 * np.pi)
 
     def __call__(self, points):
-        values = self._target.space.values(np.asarray(points))
+        values = self._space.values(np.asarray(points))
         mass = values.pop("mass")
         flux, derived = self._engine.models(values)
-        used, target = self._used, self._target
-        seen, data = flux[:, used], (target.flux[used], target.sigma[used], target.limit[used])
+        used, data = self._data.used, self._data
         good = np.isfinite(flux).all(axis=1)
-        seen = np.where(good[:, None], seen, 1.0)
+        seen = np.where(good[:, None], flux[:, used], 1.0)
+        measured = (data.flux[used], data.sigma[used], data.limit[used])
         if self._engine.profile:
-            scale, variance = best_scale(seen, *data)
+            scale, variance = best_scale(seen, *measured)
         else:
             scale, variance = mass, np.zeros(len(mass))
-        chi2 = chi2_at(scale, seen, *data)
+        chi2 = chi2_at(scale, seen, *measured)
         chi2[~good] = np.inf
-        part = {name: values[name] for name in target.space.free if name != "mass"}
+        part = {name: values[name] for name in self._space.free if name != "mass"}
         part = {"parameters": part, "derived": derived, "flux": flux}
         self._parts.append(part | {"scale": scale, "variance": variance, "chi2": chi2})
         number = self.n + np.arange(len(chi2))
@@ -138,36 +89,20 @@ class _Calls:
 
     def of(self, name, calls):
         """Arrays of some of the calls; a dict of them where there are several by name."""
-        if isinstance(self._parts[0][name], dict):
-            return {
-                key: np.concatenate([part[name][key] for part in self._parts])[calls]
-                for key in self._parts[0][name]
-            }
-        return np.concatenate([part[name] for part in self._parts])[calls]
+        parts = [part[name] for part in self._parts]
+        if isinstance(parts[0], dict):
+            return {key: np.concatenate([part[key] for part in parts])[calls] for key in parts[0]}
+        return np.concatenate(parts)[calls]
 
 
 @dataclass(frozen=True, eq=False)
 class ContinuousEngine:
     """
-    Posteriors of continuous parameters by a sampler.
+    Posteriors of continuous parameters by a sampler (a name or function, see `get_sampler`).
 
-    Parameters
-    ----------
-    model : `~miricigale.sed.SEDModel`
-        The model.
-    filters : `~miricigale.filters.FilterSet` or tuple of str
-        Bands that are evaluated.
-    names : tuple of str
-        Their names.
-    sampler : str or callable
-        See `~miricigale.fitting.samplers.get_sampler`.
-    request : `~miricigale.fitting.samplers.Request`
-        Settings of the sampler.
-    profile : bool
-        Whether the mass of each model is the one that fits best (with its Gaussian error if
-        ``scale_error``) and not a parameter.
-    scale_error : bool
-        See ``profile``.
+    ``filters`` are the bands that are evaluated: a set of filters, or what the model takes for it.
+    With ``profile`` the mass of each model is the one that fits best, with its Gaussian error if
+    ``scale_error``, and no parameter.
     """
 
     model: object
@@ -203,47 +138,41 @@ class ContinuousEngine:
         }
         return flux, derived
 
-    def possible(self, target, rng):
-        """Whether the prior leaves any model."""
-        calls = _Calls(self, target)
-        for _ in range(0, _TRIALS, 256):
-            log_like, _ = calls(rng.random((256, target.space.n_dim)))
-            if np.isfinite(log_like).any():
-                return True
-        return False
+    def fit(self, data, space, seed):
+        """
+        Sample the posterior of one object; None if its prior leaves no model.
 
-    def fit(self, target, seed):
-        """Sample the posterior of one `Target`; None if its prior leaves no model."""
+        Its photometry is `~miricigale.fitting.likelihood.FitData`, its parameters are a `Space`.
+        """
+        key = str(data.ids)
         with single_threaded():
-            if not self.possible(target, stream(seed, "fit", "prior", target.key)):
+            calls, rng = _Calls(self, data, space), stream(seed, "fit", "prior", key)
+            trials = (calls(rng.random((256, space.n_dim)))[0] for _ in range(_TRIALS // 256))
+            if not any(np.isfinite(log_like).any() for log_like in trials):
                 return None
-            return self._fit(target, seed)
+            return self._fit(_Calls(self, data, space), space, key, seed)
 
-    def _fit(self, target, seed):
-        calls = _Calls(self, target)
-        rng = stream(seed, "fit", target.key)
-        draws = get_sampler(self.sampler)(calls, target.space.n_dim, rng, self.request)
+    def _fit(self, calls, space, key, seed):
+        draws = get_sampler(self.sampler)(
+            calls, space.n_dim, stream(seed, "fit", key), self.request
+        )
         weight = draws.weight
         keep = weight > 0
         weight, call = weight[keep], np.asarray(draws.call)[keep]
-        parameters, derived = calls.of("parameters", call), calls.of("derived", call)
-        flux = calls.of("flux", call)
-        top, variance = calls.of("scale", call), calls.of("variance", call)
-        scale = top
-        if self.profile and self.scale_error:
-            scale = _positive_normal(top, np.sqrt(variance), stream(seed, "scale", target.key))
         # the best of all models that were met, whether or not they are part of the sample
         best = [int(np.argmin(calls.of("chi2", slice(None))))]
-        best_parameters, best_scale = calls.of("parameters", best), calls.of("scale", best)
-        fixed = target.space.fixed
-        best_derived = self._scaled(calls.of("derived", best), best_parameters, best_scale, fixed)
-        best_parameters |= best_derived
+        scale, best_scale = calls.of("scale", call), calls.of("scale", best)
+        if self.profile and self.scale_error:
+            std = np.sqrt(calls.of("variance", call))
+            scale = _positive_normal(scale, std, stream(seed, "scale", key))
+        parameters, found = calls.of("parameters", call), calls.of("parameters", best)
+        found |= self._scaled(calls.of("derived", best), found, best_scale, space.fixed)
         return Posterior(
             weight=weight / weight.sum(),
             parameters=parameters,
-            derived=self._scaled(derived, parameters, scale, fixed),
-            flux=flux * scale[:, None],
-            best={name: float(array[0]) for name, array in best_parameters.items()},
+            derived=self._scaled(calls.of("derived", call), parameters, scale, space.fixed),
+            flux=calls.of("flux", call) * scale[:, None],
+            best={name: float(array[0]) for name, array in found.items()},
             best_flux=calls.of("flux", best)[0] * best_scale[0],
             chi2=float(calls.of("chi2", best)[0]),
             log_evidence=draws.log_evidence,

@@ -6,7 +6,7 @@ import numpy as np
 
 from miricigale.fitting.flags import FitFlags
 from miricigale.fitting.posterior import cell_edges
-from miricigale.fitting.priors import known_redshifts, read_density
+from miricigale.fitting.priors import integrals, integrals_to, known_redshifts, read_density
 from miricigale.utils.exceptions import argument_error, unknown_name
 
 __all__ = [
@@ -131,8 +131,7 @@ class Table:
     _total: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self):
-        area = 0.5 * np.diff(self.value) * (self.density[1:] + self.density[:-1])
-        object.__setattr__(self, "_total", np.concatenate([[0.0], np.cumsum(area)]))
+        object.__setattr__(self, "_total", integrals(self.value, self.density))
 
     @property
     def area(self):
@@ -165,11 +164,7 @@ class Table:
     def cdf(self, value):
         """Cumulative prior."""
         value = np.clip(value, self.value[0], self.value[-1])
-        i = np.clip(np.searchsorted(self.value, value, side="right") - 1, 0, self.value.size - 2)
-        step = value - self.value[i]
-        slope = (self.density[i + 1] - self.density[i]) / (self.value[i + 1] - self.value[i])
-        part = self._total[i] + step * (self.density[i] + 0.5 * slope * step)
-        return part / self.area
+        return integrals_to(value, self.value, self.density, self._total) / self.area
 
 
 def make_prior(name, prior, parameter):
@@ -181,13 +176,7 @@ def make_prior(name, prior, parameter):
     name : str
         Name of the parameter, for messages.
     prior : object
-        - ``(low, high)``: flat; ``(low, high, "log")``: flat in the logarithm;
-        - ``"flat"`` or ``"log"``: the same over the bounds of the parameter;
-        - a list or array: these values only, of equal weight; ``(values, weights)``: of these;
-        - a frozen distribution of `scipy.stats`, cut to the bounds of the parameter;
-        - one number: a fixed value.
-
-        Numbers may be quantities.
+        As for `~miricigale.fitting.BayesFitter`; numbers may be quantities.
     parameter : `~miricigale.sed.Parameter`
         Its declaration.
 
