@@ -5,7 +5,7 @@ from miricigale.utils.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        "catalog": ("read_cigale_catalog",),
+        "catalog": ("cigale_columns", "read_cigale_catalog"),
         "names": ("cigale_band", "filter_of_band"),
         "results": ("read_cigale_results", "write_cigale_results"),
         "setup": ("CigaleSetup", "fit_cigale", "read_pcigale_ini"),

@@ -13,7 +13,7 @@ from miricigale.utils.files import read_table
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
 
-__all__ = ["read_cigale_catalog", "read_columns"]
+__all__ = ["cigale_columns", "read_cigale_catalog"]
 
 #: Values that stand for nothing, besides NaN and all below `THRESHOLD`.
 SENTINELS = (-99.0, -999.0)
@@ -72,7 +72,7 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     """
     path = Path(path)
     bands = None if bands is None else list(bands)
-    table = read_columns(path, "a catalog of CIGALE")
+    table = read_table(path, wanted="a catalog of CIGALE", cls=Table)
     for name in ("id", "redshift"):
         if name not in table.colnames:
             msg = f"{path} has no column {name!r}, only {', '.join(table.colnames)}"
@@ -126,6 +126,35 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     if text:
         warnings.warn(f"{path}: {text}", MiricigaleWarning, stacklevel=2)
     return out
+
+
+def cigale_columns(path):
+    """
+    Columns of a catalog in CIGALE's format by our names, for `~miricigale.scene.read_catalog`.
+
+    Parameters
+    ----------
+    path : path-like
+        As for `read_cigale_catalog`.
+
+    Returns
+    -------
+    columns : dict of str to str
+        Our name of each band that is known, and of its errors, to the file's.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file cannot be read, or two bands are the same filter.
+    """
+    names = read_table(path, wanted="a catalog of CIGALE", cls=Table).colnames
+    try:
+        columns, _ = band_filters([name for name in names if not name.endswith("_err")], {})
+    except ValueError as err:
+        msg = f"{path}: {err}"
+        raise DataError(msg) from None
+    errors = {error_column(ours): error_column(theirs) for ours, theirs in columns.items()}
+    return columns | {ours: theirs for ours, theirs in errors.items() if theirs in names}
 
 
 def _choose(path, table, bands):
@@ -191,15 +220,3 @@ def _with_unit(path, table, name, default):
     except (u.UnitConversionError, TypeError, ValueError):
         msg = f"{path}: the column {name!r} must be convertible to {default}, got {unit}"
         raise DataError(msg) from None
-
-
-def read_columns(path, wanted):
-    """Read a table in any of CIGALE's formats; ``wanted`` says for messages what it should be."""
-    form, head = None, b""
-    if Path(path).is_file():
-        with open(path, "rb") as stream:
-            head = stream.read(65536).strip()
-    first = head.partition(b"\n")[0].decode(errors="replace")
-    if first.startswith("#") and "id" in first.strip("# \r").split():
-        form = "ascii.commented_header"
-    return read_table(path, wanted=wanted, cls=Table, form=form)

@@ -4,14 +4,14 @@ from dataclasses import dataclass, field
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, Table
 
-from miricigale.cigale.catalog import read_columns
 from miricigale.cigale.ini import parse_values
 from miricigale.cigale.names import cigale_names
 from miricigale.refdata import find_resource
 from miricigale.sed import components as c
 from miricigale.utils.exceptions import ConfigError
+from miricigale.utils.files import read_table
 
 __all__ = ["Chain", "read_modules"]
 
@@ -162,7 +162,7 @@ def _plain(kind, **options):
 
 def _sfhfromfile(m):
     path = m.folder / m.text("filename")
-    table = read_columns(path, "a star-formation history")
+    table = read_table(path, wanted="a star-formation history", cls=Table)
     rates = QTable()
     for i, name in enumerate(table.colnames):
         unit = table[name].unit or (u.Myr if i == 0 else u.Msun / u.yr)

@@ -6,9 +6,9 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable, Table
 
-from miricigale.cigale.catalog import read_columns
 from miricigale.cigale.names import cigale_band, cigale_names, filter_of_band, unit_of
 from miricigale.utils.exceptions import DataError, argument_error, unknown_name
+from miricigale.utils.files import read_table
 from miricigale.utils.store import replacing
 from miricigale.utils.tables import error_column
 
@@ -132,7 +132,7 @@ def read_cigale_results(path):
     `~miricigale.utils.exceptions.DataError`
         If the file is missing or something else.
     """
-    table = read_columns(path, "results of CIGALE")
+    table = read_table(path, wanted="results of CIGALE", cls=Table)
     missing = [name for name in ("id", *_CHI2) if name not in table.colnames]
     if missing:
         msg = f"{path} is no table of CIGALE's results: no column {', '.join(missing)}"

@@ -6,7 +6,8 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "background": ("Background",),
-        "catalog": ("CATALOG_COLUMNS", "CatalogFlags", "check_catalog", "read_catalog"),
+        "catalog": ("CATALOG_COLUMNS", "CatalogFlags", "check_catalog"),
+        "catalog_files": ("read_catalog",),
         "cutouts": ("Cutout",),
         "highres": ("depth_to_rms", "highres_image"),
         "render": ("FieldPainter", "Painter"),

@@ -1,23 +1,17 @@
-"""The catalog of sources: its columns, how it is read and what is refused."""
-
-import warnings
-from pathlib import Path
+"""The catalog of sources: its columns, what is refused and what is flagged."""
 
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable, Table
-from astropy.units import UnitsWarning
 
 from miricigale.filters import Filter
 from miricigale.profiles import SERSIC_INDEX_RANGE
-from miricigale.refdata import locate, resources
-from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import read_table
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import Flags, error_column, require_columns, unique_ids
 from miricigale.utils.units import FNU
 
-__all__ = ["CATALOG_COLUMNS", "CatalogFlags", "check_catalog", "read_catalog"]
+__all__ = ["CATALOG_COLUMNS", "CatalogFlags", "check_catalog", "is_flux"]
 
 #: Columns that every catalog has, with their unit (None: dimensionless or not a number).
 CATALOG_COLUMNS = {
@@ -33,6 +27,9 @@ CATALOG_COLUMNS = {
 
 PROFILES = ("sersic", "point", "cutout")
 
+#: Numbers that stand for no value in fluxes, their errors, redshifts and shapes.
+MISSING = np.array([-99.0, -99.9, -99.99, -999.0, -999.9, -9999.0, -9999.9, -99999.0])
+
 
 class CatalogFlags(Flags):
     """What is wrong with a row of a catalog; the row is kept."""
@@ -42,6 +39,7 @@ class CatalogFlags(Flags):
     BAD_AXIS_RATIO = 4  # not in (0, 1]: drawn as a point
     BAD_ANGLE = 8  # not finite: drawn as a point unless it is round
     NO_REDSHIFT = 16  # not finite or not positive (stars)
+    NO_FLUX = 32  # no band has a positive flux (with a positive error, where it has errors)
 
     @classmethod
     def unusable_profile(cls):
@@ -70,14 +68,26 @@ def _refuse_missing(catalog, argument):
 
 
 def _plain(table, name, unit, argument):
+    """A column as numbers in ``unit``, NaN where it has a number that stands for no value."""
     column = unmasked(table[name])
     try:
-        if unit is not None:
-            return u.Quantity(column, unit, dtype=float)
-        values = column.to_value(u.one) if hasattr(column, "to_value") else np.asarray(column)
-        return np.asarray(values, dtype=float)
+        if unit is None:
+            values = column.to_value(u.one) if hasattr(column, "to_value") else np.asarray(column)
+            return _without_codes(values)
+        column = u.Quantity(column, dtype=float)
+        # an angle on the sky may be -99
+        values = column.value if name == "position_angle" else _without_codes(column.value)
+        return u.Quantity(values, column.unit).to(unit)
     except (TypeError, ValueError):
         raise argument_error(argument, f"a table with numbers in {name!r}", column.dtype) from None
+
+
+def _without_codes(values):
+    values = np.array(values, dtype=float)
+    # single precision has seven digits
+    code = np.abs(values[..., None] - MISSING) <= 1e-6 * np.abs(MISSING)
+    values[code.any(axis=-1)] = np.nan
+    return values
 
 
 def check_catalog(table, *, filters=(), argument="catalog"):
@@ -100,7 +110,8 @@ def check_catalog(table, *, filters=(), argument="catalog"):
     catalog : `~astropy.table.QTable`
         A copy with ``sky`` in ICRS, radii in arcsec, angles in deg, fluxes in uJy and a
         column ``flags`` (`CatalogFlags`); ``star`` is False throughout where there was none.
-        Other columns are kept.
+        -99, -999 and the like in fluxes, errors, redshifts and shapes are NaN. Other columns
+        are kept.
 
     Raises
     ------
@@ -121,7 +132,7 @@ def check_catalog(table, *, filters=(), argument="catalog"):
         catalog["sky"] = SkyCoord(*sky)
     units = {name: unit for name, unit in CATALOG_COLUMNS.items() if unit is not None}
     require_columns(catalog, CATALOG_COLUMNS, argument, units=units)
-    fluxes = [*filters, *(name for name in catalog.colnames if _is_flux(name))]
+    fluxes = [*filters, *(name for name in catalog.colnames if is_flux(name))]
     require_columns(catalog, filters, argument, units=dict.fromkeys(fluxes, FNU))
     if len(catalog) == 0:
         raise argument_error(argument, "a table with rows", "none")
@@ -160,7 +171,7 @@ def check_catalog(table, *, filters=(), argument="catalog"):
     return catalog
 
 
-def _is_flux(name):
+def is_flux(name):
     """Whether a column is called by a filter of the library, or is the error of one."""
     band = name.removesuffix(error_column(""))
     return band in Filter.names() or band.startswith("sedpy.")
@@ -185,47 +196,17 @@ def _flags(catalog):
     flags[sersic & ~((ratio > 0) & (ratio <= 1))] |= CatalogFlags.BAD_AXIS_RATIO
     flags[sersic & ~np.isfinite(angle) & (ratio != 1)] |= CatalogFlags.BAD_ANGLE
     flags[~(catalog["redshift"] > 0)] |= CatalogFlags.NO_REDSHIFT
+    bands = [n for n in catalog.colnames if is_flux(n) and not n.endswith(error_column(""))]
+    if bands:
+        usable = np.any([_usable(catalog, name) for name in bands], axis=0)
+        flags[~usable] |= CatalogFlags.NO_FLUX
     return flags
 
 
-def read_catalog(path):
-    """
-    Read a catalog of sources.
-
-    Parameters
-    ----------
-    path : str or path-like
-        Name of a resource (``"catalog.goodss"``) or an ECSV, FITS or other file that
-        `~astropy.table.QTable` reads and that carries units.
-
-    Returns
-    -------
-    catalog : `~astropy.table.QTable`
-        As made by `check_catalog`.
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If there is no such file, or it is no table.
-    ValueError, `~astropy.units.UnitsError`
-        If the table is refused by `check_catalog`.
-
-    Examples
-    --------
-    >>> from miricigale.scene import read_catalog
-    >>> catalog = read_catalog("catalog.goodss")
-    >>> len(catalog)
-    1308
-    """
-    name = str(path)
-    if not isinstance(path, Path) and name in resources():
-        path = locate(name)
-    path = Path(path).expanduser()
-    if not path.is_file():
-        known = ", ".join(key for key in sorted(resources()) if key.startswith("catalog."))
-        msg = f"no catalog {name!r}: neither a file nor one of {known}"
-        raise DataError(msg)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", UnitsWarning)
-        table = read_table(path, wanted="a table")
-    return check_catalog(table, argument=path.name)
+def _usable(catalog, name):
+    """Which sources have a positive flux in a band, with a positive error if it has errors."""
+    good = np.isfinite(catalog[name].value) & (catalog[name].value > 0)
+    if error_column(name) in catalog.colnames:
+        error = catalog[error_column(name)].value
+        good &= np.isfinite(error) & (error > 0)
+    return good

@@ -13,7 +13,8 @@ from miricigale.instrument import aperture, pixel_area_map
 from miricigale.profiles import ellipse_to_pixels
 from miricigale.psf import InstrumentPSF, PSFGrid
 from miricigale.scene.background import Background
-from miricigale.scene.catalog import CatalogFlags, check_catalog, read_catalog, unmasked
+from miricigale.scene.catalog import CatalogFlags, check_catalog, unmasked
+from miricigale.scene.catalog_files import read_catalog
 from miricigale.scene.cutouts import Cutout
 from miricigale.scene.render import FieldPainter, Painter
 from miricigale.scene.sky import local_jacobian, pixel_positions

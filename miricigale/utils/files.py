@@ -374,7 +374,7 @@ def read_table(path, *, wanted, cls=QTable, form=None):
         Class of the table.
     form : str, optional
         Format by `astropy.table.Table.read`. By default content and suffix tell: FITS, VOTable,
-        ECSV, CSV or plain text.
+        ECSV, CSV or plain text, whose names of columns stand behind ``#`` if ``id`` is among them.
 
     Returns
     -------
@@ -403,7 +403,8 @@ def read_table(path, *, wanted, cls=QTable, form=None):
 
 def _table_format(path):
     with open(path, "rb") as stream:
-        start = stream.read(9)
+        start = stream.read(65536)
+    first = start.strip().partition(b"\n")[0].decode(errors="replace")
     suffix = Path(Path(path).name.lower().removesuffix(".gz")).suffix
     if start.startswith(b"SIMPLE") or suffix in (".fits", ".fit"):
         return "fits"
@@ -411,7 +412,10 @@ def _table_format(path):
         return "votable"
     if start.startswith(b"# %ECSV") or suffix == ".ecsv":
         return "ascii.ecsv"
-    return "ascii.csv" if suffix == ".csv" else "ascii"
+    if suffix == ".csv":
+        return "ascii.csv"
+    named = first.startswith("#") and "id" in first.strip("# \r").split()
+    return "ascii.commented_header" if named else "ascii"
 
 
 @contextlib.contextmanager

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from astropy.table import QTable, Table
 
-from miricigale.cigale import cigale_band, filter_of_band, read_cigale_catalog
+from miricigale.cigale import cigale_band, cigale_columns, filter_of_band, read_cigale_catalog
 from miricigale.filters import Filter
+from miricigale.scene import read_catalog
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 
 TEXT = """\
@@ -212,3 +213,23 @@ def test_filters_find_their_way_back():
         assert filter_of_band(cigale_band(name)) == name
     assert cigale_band("miri.f770w") == "jwst.miri.F770W"
     assert cigale_band("acs.f850lp") == "hst.wfc.F850LP"
+
+
+def test_a_catalog_of_sources_in_cigales_names(tmp_path):
+    path = tmp_path / "sources.txt"
+    path.write_text(
+        "# id redshift ra dec IRAC1 IRAC1_err jwst.miri.F770W other\n"
+        "1 0.5 53.1 -27.8 5e-3 1e-3 3e-3 1\n"
+    )
+    columns = cigale_columns(path)
+    assert columns == {
+        "irac.ch1": "IRAC1",
+        "irac.ch1_err": "IRAC1_err",
+        "miri.f770w": "jwst.miri.F770W",
+    }
+    with pytest.warns(MiricigaleWarning, match="points"):
+        catalog = read_catalog(path, columns=columns, units={"flux": "mJy"})
+    np.testing.assert_allclose(catalog["irac.ch1_err"].to_value(u.uJy), [1])
+    path.write_text("id redshift IRAC1 irac_i1\n1 0.5 1 1\n")
+    with pytest.raises(DataError, match=r"are both the filter irac\.ch1"):
+        cigale_columns(path)

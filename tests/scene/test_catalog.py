@@ -191,10 +191,45 @@ def test_masked_values_are_missing_in_either_of_astropys_ways(table, kind):
     table = kind(table, masked=True)
     table["sersic_index"].mask = table["miri.f770w"].mask = [True, False]
     catalog = check_catalog(table, filters=["miri.f770w"])
-    assert catalog["flags"].tolist() == [CatalogFlags.BAD_INDEX, 0]
+    assert catalog["flags"].tolist() == [CatalogFlags.BAD_INDEX | CatalogFlags.NO_FLUX, 0]
     assert np.isnan(catalog["miri.f770w"].value).tolist() == [True, False]
     assert catalog["sersic_index"][1] == 4
     assert not any(hasattr(catalog[name], "mask") for name in ("id", "profile", "axis_ratio"))
     table["id"] = MaskedColumn([1, 2], mask=[False, True])
     with pytest.raises(ValueError, match="without missing values in 'id', got 1, first in row 1"):
         check_catalog(table)
+
+
+@pytest.mark.parametrize("code", [-99.0, -99.99, -999.0, -9999.0])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_numbers_that_stand_for_no_value_are_missing(table, code, dtype):
+    table["miri.f770w"] = np.array([code, 2.0], dtype=dtype) * u.mJy
+    table["miri.f770w_err"] = np.array([code, 0.1], dtype=dtype) * u.mJy
+    table["redshift"] = np.array([code, 2.0], dtype=dtype)
+    table["half_light_radius"][0] = code * u.arcsec
+    table["position_angle"] = [-99, -99.0] * u.deg
+    catalog = check_catalog(table)
+    for name in ("miri.f770w", "miri.f770w_err", "half_light_radius"):
+        assert np.isnan(catalog[name].value).tolist() == [True, False]
+    assert np.isnan(catalog["redshift"]).tolist() == [True, False]
+    f = CatalogFlags
+    assert catalog["flags"].tolist() == [f.NO_FLUX | f.NO_REDSHIFT | f.BAD_RADIUS, 0]
+    assert catalog["position_angle"].value.tolist() == [-99, -99]
+    # what is no code stays, in whatever unit
+    table["miri.f770w"] = [-0.099, -98.0] * u.mJy
+    np.testing.assert_allclose(check_catalog(table)["miri.f770w"].value, [-99, -98000])
+
+
+def test_a_source_without_a_usable_flux_is_flagged(table):
+    table = table[[0] * 5]
+    table["id"] = range(5)
+    # a flux in one band is enough; a flux whose error is not positive is none
+    table["miri.f770w"] = [1.0, np.nan, 0.0, np.nan, 2.0] * u.uJy
+    table["miri.f770w_err"] = [0.1, np.nan, 0.1, np.nan, -1.0] * u.uJy
+    table["wfc3.f160w"] = [np.nan, 3.0, np.nan, -1.0, np.nan] * u.uJy
+    flags = check_catalog(table)["flags"]
+    assert flags.tolist() == [0, 0, *[CatalogFlags.NO_FLUX] * 3]
+    assert "32 no flux" in flags.info.description
+    # without a band there is nothing to judge
+    table.remove_columns(["miri.f770w", "miri.f770w_err", "wfc3.f160w"])
+    assert not np.any(check_catalog(table)["flags"])

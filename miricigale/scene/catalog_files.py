@@ -1,0 +1,324 @@
+"""Catalogs of people: read from common formats, with their own names and units."""
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import Angle
+from astropy.table import QTable
+from astropy.units import UnitsWarning
+
+from miricigale.filters import Filter
+from miricigale.refdata import locate, resources
+from miricigale.scene.catalog import CATALOG_COLUMNS, CatalogFlags, check_catalog, is_flux
+from miricigale.utils.exceptions import (
+    DataError,
+    MiricigaleWarning,
+    argument_error,
+    unknown_name,
+)
+from miricigale.utils.files import read_table
+from miricigale.utils.tables import error_column
+from miricigale.utils.units import FNU
+
+__all__ = ["read_catalog"]
+
+#: Unit that a column without any has.
+_DEFAULT_UNITS = {"ra": u.deg, "dec": u.deg, "position_angle": u.deg}
+#: What makes a Sersic profile.
+_SHAPE = ("half_light_radius", "sersic_index", "axis_ratio", "position_angle")
+
+#: Counts of galaxies in K: AB magnitude and log of the number per magnitude and square degree (Weaver et
+#: al. 2022, ApJS 258, 11, table 2).
+_COUNTS_MAG = np.arange(19.25, 25.5, 0.5)
+_COUNTS = (3.65, 3.86, 4.02, 4.16, 4.29, 4.42, 4.54, 4.66, 4.78, 4.88, 4.97, 5.07, 5.18)
+_COUNTS_SLOPE = 0.6, 0.2  # dex per magnitude beyond the ends: Euclid's at the bright one
+_FAR_OFF = 10.0  # times the counts; overdense fields have a few times as many
+_FAINTEST = 29.5  # AB magnitude that half of the sources of a catalog may be brighter than
+_SPARSE = 27.5, 0.02  # a sample that is fainter, and has fewer times the counts
+_FEW = 20  # sources that counts and colors are not judged by
+#: Median color in dex between bands below and beyond 10 um that tells of another unit.
+_COLOR = 2.2, 2.9
+
+
+def read_catalog(path, *, columns=None, units=None):
+    """
+    Read a catalog of sources.
+
+    Parameters
+    ----------
+    path : str or path-like
+        Name of a resource (``"catalog.goodss"``) or a FITS, ECSV, VOTable, CSV or text file
+        (CIGALE's too).
+    columns : dict of str to str, optional
+        Our name of a column to the file's, such as ``{"wfc3.f160w": "FLUX_H"}``. Ours are those of
+        `CATALOG_COLUMNS`, ``ra``, ``dec``, ``star``, names of filters, those with ``_err`` for errors, and
+        any other without a dot. Columns that are not named keep their names.
+    units : dict of str to str or `~astropy.units.Unit`, optional
+        Units by our name, for columns whose file gives none or a wrong one; ``"flux"`` stands for all
+        fluxes and errors: ``{"flux": "mJy", "ra": "hourangle"}``, ``{"flux": "0.3631 uJy"}`` for a
+        zero point of 25. Without unit ``ra``, ``dec`` and ``position_angle`` are in degrees.
+
+    Returns
+    -------
+    catalog : `~astropy.table.QTable`
+        As made by `check_catalog`. Where there is no column ``profile``, sources whose profile is
+        complete are Sersic profiles and the others points.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If there is no such file, or it is no table.
+    KeyError
+        If ``columns`` or ``units`` name a column or filter that there is not.
+    ValueError, `~astropy.units.UnitsError`
+        If the table is refused by `check_catalog`.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        Of sources without a usable flux (`CatalogFlags`, ``NO_FLUX``), right ascensions that look like
+        hours, fluxes that look like those of another unit by counts or colors, units other than
+        the file's, and missing profiles.
+
+    Examples
+    --------
+    >>> from miricigale.scene import read_catalog
+    >>> catalog = read_catalog("catalog.goodss")
+    >>> len(catalog)
+    1308
+    """
+    name = str(path)
+    if not isinstance(path, Path) and name in resources():
+        path = locate(name)
+    path = Path(path).expanduser()
+    if not path.is_file():
+        known = ", ".join(key for key in sorted(resources()) if key.startswith("catalog."))
+        msg = f"no catalog {name!r}: neither a file nor one of {known}"
+        raise DataError(msg)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UnitsWarning)
+        table = read_table(path, wanted="a table")
+    if not table.colnames:
+        msg = f"{path} cannot be read as a table: it has no columns"
+        raise DataError(msg)
+    table = _rename(table, _checked_map(columns, "columns"), path.name)
+    _set_units(table, _checked_map(units, "units"), path.name)
+    _whole_ids(table)
+    _flags_of_stars(table)
+    told = [*_fill_profiles(table, path.name)]
+    catalog = check_catalog(table, argument=path.name)
+    told += _missing_fluxes(catalog)
+    # counts need an area that is right
+    told += list(_hours(table, catalog)) or _odd_units(catalog)
+    for text in told:
+        warnings.warn(f"{path.name}: {text}", MiricigaleWarning, stacklevel=2)
+    return catalog
+
+
+def _checked_map(names, argument):
+    """A map of our names, each of them known."""
+    if names is None:
+        return {}
+    if not isinstance(names, Mapping):
+        raise argument_error(argument, "a dict by our names of columns", type(names).__name__)
+    for name in names:
+        if "." in str(name) and not is_flux(name):
+            raise unknown_name("filter", str(name).removesuffix(error_column("")), Filter.names())
+    return dict(names)
+
+
+def _rename(table, columns, argument):
+    """Columns by our names; one of the same name that is not meant steps aside."""
+    for ours, theirs in columns.items():
+        if theirs not in table.colnames:
+            kind = f"column of {argument} (for {ours!r})"
+            raise unknown_name(kind, theirs, table.colnames)
+    if len(set(columns.values())) < len(columns):
+        raise argument_error("columns", "a dict whose values differ", columns)
+    ours, out = {theirs: name for name, theirs in columns.items()}, QTable(meta=table.meta)
+    for name in table.colnames:
+        if name in ours or name not in columns:
+            out[ours.get(name, name)] = table[name]
+    return out
+
+
+def _set_units(table, units, argument):
+    """Give columns the units that the caller says, or the usual one where there is none."""
+    for name in units:
+        if name != "flux" and name not in table.colnames:
+            kind = f"column of {argument}"
+            raise unknown_name(kind, name, [*table.colnames, "flux"])
+    for name in table.colnames:
+        of_flux = is_flux(name)
+        asked = units.get(name, units.get("flux") if of_flux else None)
+        column = table[name]
+        has = getattr(column, "unit", None)
+        if asked is None:
+            if name in _DEFAULT_UNITS and has is None and column.dtype.kind in "if":
+                table[name] = u.Quantity(_floats(column, name, argument), _DEFAULT_UNITS[name])
+            elif of_flux and has is None:
+                msg = (
+                    f"'{argument}' column {name!r} must be convertible to {FNU}, got None: "
+                    "say it, such as units={'flux': 'uJy'}"
+                )
+                raise u.UnitsError(msg)
+            continue
+        try:
+            asked = u.Unit(asked)
+        except (TypeError, ValueError) as err:
+            raise argument_error("units", f"a dict of units, also for {name!r}", asked) from err
+        if has is not None and u.Unit(has) != asked:
+            msg = f"{argument}: {name!r} taken in {asked}, the file says {has}"
+            warnings.warn(msg, MiricigaleWarning, stacklevel=3)
+        if column.dtype.kind in "US" and asked.is_equivalent(u.deg):
+            table[name] = _angles(column, asked, name, argument)
+        else:
+            table[name] = u.Quantity(_floats(column, name, argument), asked)
+
+
+def _angles(column, unit, name, argument):
+    """Angles from text such as 3:32:30.1."""
+    try:
+        return u.Quantity(Angle(np.asarray(column).astype(str), unit).to(u.deg))
+    except (ValueError, u.UnitsError) as err:
+        wanted = f"a table with angles in {name!r}"
+        raise argument_error(argument, wanted, repr(str(column[0]))) from err
+
+
+def _floats(column, name, argument):
+    """A column as plain floats, NaN where masked or blank."""
+    mask = np.broadcast_to(np.asarray(getattr(column, "mask", False)), np.shape(column))
+    column = getattr(column, "value", column)
+    values = np.ma.getdata(getattr(column, "unmasked", column))
+    if values.dtype.kind in "OUS":
+        # a column without a single number is text to the reader
+        values = np.where(mask, "nan", values.astype(str))
+    try:
+        return np.where(mask, np.nan, values.astype(float))
+    except (TypeError, ValueError):
+        wanted = f"a table with numbers in {name!r}"
+        raise argument_error(argument, wanted, repr(values[0])) from None
+
+
+def _whole_ids(table):
+    """Ids that are whole numbers as integers, however the file holds them."""
+    if "id" not in table.colnames or np.any(getattr(table["id"], "mask", False)):
+        return
+    ids = np.asarray(table["id"])
+    if ids.dtype.kind == "f" and np.all(ids == np.round(ids)):
+        table["id"] = ids.astype(np.int64)
+
+
+def _flags_of_stars(table):
+    """Stars as bool, where the file has 0 and 1 or words."""
+    if "star" not in table.colnames or np.any(getattr(table["star"], "mask", False)):
+        return
+    star = np.asarray(table["star"])
+    words = {"true": True, "false": False, "1": True, "0": False}
+    values = [str(value).strip().lower() for value in star.tolist()]
+    if star.dtype.kind in "iuUS" and set(values) <= set(words):
+        table["star"] = np.array([words[value] for value in values], dtype=bool)
+
+
+def _fill_profiles(table, argument):
+    """Make the columns of profiles that are not there; what is to be told."""
+    if "profile" in table.colnames:
+        return
+    missing = [name for name in _SHAPE if name not in table.colnames]
+    usable = np.full(len(table), not missing)
+    for name in _SHAPE:
+        if name in missing:
+            table[name] = np.full(len(table), np.nan) * (CATALOG_COLUMNS[name] or u.one)
+        elif not missing:
+            values = _floats(table[name], name, argument)
+            usable &= np.isfinite(values) & ((values > 0) | (name == "position_angle"))
+    table["profile"] = np.where(usable, "sersic", "point")
+    why = f"no column {missing[0]!r}" if missing else "incomplete or not positive shapes"
+    n = int(np.count_nonzero(~usable))
+    if n:
+        yield f"{n} of {len(table)} sources are points ({why})"
+
+
+def _missing_fluxes(catalog):
+    """What is to be told of sources without a flux."""
+    lost = (catalog["flags"] & int(CatalogFlags.NO_FLUX)) > 0
+    if np.any(lost):
+        first = ", ".join(map(str, catalog["id"][lost][:5].tolist()))
+        more = ", ..." if lost.sum() > 5 else ""
+        yield (
+            f"{lost.sum()} of {len(catalog)} sources have no usable flux in any band "
+            f"(flag no_flux): ids {first}{more}"
+        )
+
+
+def _hours(table, catalog):
+    """What is to be told of right ascensions in degrees that look like hours."""
+    if "ra" not in table.colnames or table["ra"].unit != u.deg or len(catalog) < 3:
+        return
+    ra, dec = catalog["sky"].ra.deg, catalog["sky"].dec.deg
+    width = np.ptp(ra) * np.cos(np.radians(dec.mean()))
+    if ra.max() <= 24.0 and np.ptp(dec) > 0 and width < 0.2 * np.ptp(dec):
+        yield (
+            f"right ascensions span {width:.2g} deg on the sky and declinations {np.ptp(dec):.2g}: "
+            "if they are in hours, say units={'ra': 'hourangle'}"
+        )
+
+
+def _odd_units(catalog):
+    """What is to be told of fluxes by their number on the sky and their colors."""
+    pivots = {
+        name: Filter.from_name(name).pivot.value
+        for name in catalog.colnames
+        if is_flux(name) and not name.endswith(error_column(""))
+    }
+    galaxies = ~np.asarray(catalog["star"])
+    logs = {}
+    for name in pivots:
+        flux = catalog[name].value
+        good = galaxies & np.isfinite(flux) & (flux > 0)
+        logs[name] = np.where(good, np.log10(np.where(good, flux, 1.0)), np.nan)
+    known = [n for n, log in logs.items() if np.isfinite(log).sum() >= _FEW]
+    if not known:
+        return
+    reference = min(known, key=lambda name: abs(np.log(pivots[name] / 2.0)))
+    yield from _odd_counts(catalog, logs[reference], reference)
+    for name in known:
+        color = logs[name] - logs[reference]
+        if np.isfinite(color).sum() < _FEW:
+            continue
+        factor = float(np.nanmedian(color))
+        if abs(factor) > _COLOR[int(pivots[name] > 10.0)]:
+            yield (
+                f"the median of {name} over {reference} is {10**factor:.2g}: are these fluxes in "
+                "one unit?"
+            )
+
+
+def _odd_counts(catalog, log_flux, name):
+    """What is to be told of a band by the density of its sources."""
+    median = 23.9 - 2.5 * float(np.nanmedian(log_flux))
+    sky = catalog["sky"][np.isfinite(log_flux)]
+    ra = sky.ra.wrap_at(sky.ra[0] + 180 * u.deg).deg
+    area = np.ptp(ra) * np.cos(sky.dec.rad.mean()) * np.ptp(sky.dec.deg)
+    if not area > 0:
+        return
+    ratio = 0.5 * len(sky) / area / _expected(median)
+    sparse = median > _SPARSE[0] and ratio < _SPARSE[1]
+    if ratio > _FAR_OFF or median > _FAINTEST or sparse:
+        yield (
+            f"half of the sources are brighter than {median:.1f} AB in {name}, {ratio:.2g} times "
+            "as many as counts of galaxies: are the fluxes in the unit that is said?"
+        )
+
+
+def _expected(magnitude):
+    """Galaxies in a square degree that are brighter than a magnitude, in the near infrared."""
+    x = np.arange(5.0, magnitude, 0.02) + 0.01
+    ends = np.minimum(x - _COUNTS_MAG[0], 0.0), np.maximum(x - _COUNTS_MAG[-1], 0.0)
+    log = np.interp(x, _COUNTS_MAG, _COUNTS) + sum(
+        slope * end for slope, end in zip(_COUNTS_SLOPE, ends, strict=True)
+    )
+    return float(np.sum(10.0**log) * 0.02)

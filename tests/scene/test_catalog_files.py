@@ -1,0 +1,247 @@
+"""Catalogs as people have them: formats, names, units, and what is told of them."""
+
+import warnings
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from miricigale.scene import CatalogFlags, read_catalog
+from miricigale.utils.exceptions import DataError, MiricigaleWarning
+
+COLUMNS = {"id": "NUMBER", "ra": "ALPHA", "dec": "DELTA", "redshift": "zbest"}
+COLUMNS |= {"wfc3.f160w": "FLUX_H", "wfc3.f160w_err": "FLUXERR_H", "irac.ch1": "f36"}
+SHAPE = {"half_light_radius": "re", "sersic_index": "n", "axis_ratio": "q", "position_angle": "pa"}
+UNITS = {"flux": "mJy", "half_light_radius": "arcsec"}
+
+
+@pytest.fixture
+def plain():
+    """A table without units by names of its own."""
+    return Table(
+        {
+            "NUMBER": [3.0, 7.0],
+            "ALPHA": [53.1, 53.2],
+            "DELTA": [-27.8, -27.7],
+            "zbest": [0.5, 2.0],
+            "FLUX_H": [1e-3, 2e-3],
+            "FLUXERR_H": [1e-4, 2e-4],
+            "f36": [4e-3, -99.0],
+            "re": [0.3, 0.0],
+            "n": [1.0, 2.0],
+            "q": [0.5, 0.6],
+            "pa": [20.0, 30.0],
+            "note": ["a", "b"],
+        }
+    )
+
+
+def write(table, path):
+    formats = {"csv": "ascii.csv", "txt": "ascii.commented_header", "cat": "ascii.basic"}
+    formats |= {"ecsv": "ascii.ecsv", "fits": "fits", "xml": "votable"}
+    table.write(path, format=formats[path.suffix[1:]])
+    return path
+
+
+def read_silently(*args, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return read_catalog(*args, **options)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "cat", "ecsv", "fits", "xml"])
+def test_any_format_with_names_and_units_of_its_own(plain, tmp_path, suffix):
+    path = write(plain, tmp_path / f"mine.{suffix}")
+    with pytest.warns(MiricigaleWarning, match=r"1 of 2 sources are points \(incomplete"):
+        catalog = read_catalog(path, columns=COLUMNS | SHAPE, units=UNITS)
+    assert catalog["id"].tolist() == [3, 7]
+    assert catalog["sky"].dec.deg.tolist() == [-27.8, -27.7]
+    np.testing.assert_allclose(catalog["wfc3.f160w"].to_value(u.uJy), [1, 2])
+    np.testing.assert_allclose(catalog["wfc3.f160w_err"].to_value(u.uJy), [0.1, 0.2])
+    assert np.isnan(catalog["irac.ch1"].value).tolist() == [False, True]
+    assert catalog["profile"].tolist() == ["sersic", "point"]
+    assert catalog["half_light_radius"][0] == 0.3 * u.arcsec
+    assert catalog["position_angle"][0] == 20 * u.deg
+    assert catalog["note"].tolist() == ["a", "b"]
+    assert not np.any(catalog["flags"])
+
+
+def test_a_catalog_of_cigale(tmp_path):
+    path = tmp_path / "cigale.txt"
+    path.write_text(
+        "# id redshift ra dec IRAC1 IRAC1_err MIPS1 star\n"
+        "1 0.5 53.1 -27.8 5e-3 1e-3 -9999. 0\n"
+        "2 1.5 53.2 -27.8 -9999. -9999. -9999. 1\n"
+    )
+    columns = {"irac.ch1": "IRAC1", "irac.ch1_err": "IRAC1_err", "mips.24": "MIPS1"}
+    with pytest.warns(MiricigaleWarning) as told:
+        catalog = read_catalog(path, columns=columns, units={"flux": "mJy"})
+    texts = sorted(str(one.message) for one in told)
+    assert texts == [
+        "cigale.txt: 1 of 2 sources have no usable flux in any band (flag no_flux): ids 2",
+        "cigale.txt: 2 of 2 sources are points (no column 'half_light_radius')",
+    ]
+    assert catalog["irac.ch1"][0].to_value(u.uJy) == pytest.approx(5)
+    assert catalog["flags"].tolist() == [0, CatalogFlags.NO_FLUX]
+    assert catalog["star"].tolist() == [False, True]
+
+
+def test_columns_may_change_places(plain, tmp_path):
+    plain["ra"], plain["dec"] = [1.0, 1.0], [2.0, 2.0]
+    plain.rename_columns(["FLUX_H", "f36"], ["irac.ch1", "wfc3.f160w"])
+    path = write(plain, tmp_path / "c.csv")
+    columns = COLUMNS | {"wfc3.f160w": "irac.ch1", "irac.ch1": "wfc3.f160w"}
+    with pytest.warns(MiricigaleWarning, match="sources are points"):
+        catalog = read_catalog(path, columns=columns, units={"flux": "mJy"})
+    assert catalog["wfc3.f160w"].to_value(u.uJy) == pytest.approx([1, 2])
+    assert catalog["irac.ch1"][0].to_value(u.uJy) == pytest.approx(4)
+    assert catalog["sky"].ra.deg.tolist() == [53.1, 53.2]
+
+
+def test_wrong_names_are_told_with_the_right_ones(plain, tmp_path):
+    path = write(plain, tmp_path / "c.csv")
+    with pytest.raises(KeyError, match=r"no column of c\.csv .*'FLUX_h'.*did you mean 'FLUX_H'"):
+        read_catalog(path, columns={"wfc3.f160w": "FLUX_h"})
+    with pytest.raises(KeyError, match=r"no filter 'wfc3\.f161w'.*did you mean 'wfc3\.f160w'"):
+        read_catalog(path, columns={"wfc3.f161w": "FLUX_H"})
+    with pytest.raises(KeyError, match=r"no column of c\.csv 'irac\.ch2'"):
+        read_catalog(path, columns=COLUMNS, units={"irac.ch2": "uJy"})
+    with pytest.raises(ValueError, match="'columns' must be a dict whose values differ"):
+        read_catalog(path, columns={"ra": "ALPHA", "dec": "ALPHA"})
+    with pytest.raises(ValueError, match="'columns' must be a dict by our names of columns, got"):
+        read_catalog(path, columns=["ra"])
+    with pytest.raises(ValueError, match=r"columns \['id', 'sky', 'redshift'\], got columns"):
+        read_catalog(path)
+    with pytest.raises(ValueError, match=r"'units' must be a dict of units, also for 'wfc3"):
+        read_catalog(path, columns=COLUMNS, units={"flux": "micro"})
+
+
+def test_units_must_be_said_where_the_file_has_none(plain, tmp_path):
+    path = write(plain, tmp_path / "c.csv")
+    with pytest.raises(
+        u.UnitsError, match=r"'wfc3\.f160w' must be .* uJy, got None: say it, such as units="
+    ):
+        read_catalog(path, columns=COLUMNS)
+    with pytest.raises(u.UnitsError, match="'half_light_radius' must be convertible to arcsec"):
+        read_catalog(path, columns=COLUMNS | SHAPE, units={"flux": "mJy"})
+    plain["FLUX_H"].unit = "uJy"
+    path = write(plain, tmp_path / "c.fits")
+    with pytest.warns(MiricigaleWarning) as told:
+        catalog = read_catalog(path, columns=COLUMNS | SHAPE, units=UNITS)
+    assert "'wfc3.f160w' taken in mJy, the file says uJy" in str(told[0].message)
+    assert catalog["wfc3.f160w"][0].to_value(u.uJy) == pytest.approx(1)
+
+
+def test_zero_point_as_a_unit(plain, tmp_path):
+    path = write(plain, tmp_path / "c.csv")
+    with pytest.warns(MiricigaleWarning):
+        catalog = read_catalog(path, columns=COLUMNS, units={"flux": "0.3631 uJy"})
+    # 25 AB is 0.3631 uJy
+    assert catalog["wfc3.f160w"].to(u.ABmag)[0].value == pytest.approx(25 + 7.5, abs=1e-3)
+
+
+def test_blanks_are_missing(tmp_path):
+    path = tmp_path / "c.csv"
+    path.write_text(
+        "id,ra,dec,redshift,wfc3.f160w,irac.ch1,irac.ch2,half_light_radius,sersic_index,"
+        "axis_ratio,position_angle,star\n"
+        "1,53.1,-27.8,0.5,1.0,,,0.3,1,0.5,10,False\n"
+        "2,53.1,-27.8,,,,,,,,,True\n"
+        "3,53.2,-27.8,1.0,,2.5,,0.2,2,0.4,,False\n"
+    )
+    with pytest.warns(MiricigaleWarning) as told:
+        catalog = read_catalog(path, units={"flux": "uJy", "half_light_radius": "arcsec"})
+    assert len(told) == 2
+    assert np.isnan(catalog["wfc3.f160w"].value).tolist() == [False, True, True]
+    assert np.all(np.isnan(catalog["irac.ch2"].value))
+    assert catalog["profile"].tolist() == ["sersic", "point", "point"]
+    f = CatalogFlags
+    assert catalog["flags"].tolist() == [0, f.NO_FLUX | f.NO_REDSHIFT, 0]
+    assert catalog["star"].tolist() == [False, True, False]
+    path.write_text("id,ra,dec,redshift,wfc3.f160w\n1,53.1,-27.8,0.5,faint\n")
+    with pytest.raises(ValueError, match=r"numbers in 'wfc3\.f160w', got .*faint"):
+        read_catalog(path, units={"flux": "uJy"})
+
+
+def test_positions_in_hours(plain, tmp_path):
+    plain["ALPHA"] = ["3:32:24.0", "3:32:48.0"]
+    path = write(plain, tmp_path / "c.csv")
+    with pytest.warns(MiricigaleWarning, match="points"):
+        catalog = read_catalog(path, columns=COLUMNS, units={"flux": "mJy", "ra": "hourangle"})
+    np.testing.assert_allclose(catalog["sky"].ra.deg, [53.1, 53.2])
+    with pytest.raises((ValueError, u.UnitsError), match="'ra'"):
+        read_catalog(path, columns=COLUMNS, units={"flux": "mJy"})
+    plain["ALPHA"] = ["x", "y"]
+    path = write(plain, tmp_path / "d.csv")
+    with pytest.raises(ValueError, match="angles in 'ra', got 'x'"):
+        read_catalog(path, columns=COLUMNS, units={"flux": "mJy", "ra": "hourangle"})
+
+
+def test_empty_and_repeated(plain, tmp_path):
+    path = write(plain[:0], tmp_path / "empty.fits")
+    with pytest.raises(ValueError, match=r"'empty\.fits' must be a table with rows, got none"):
+        read_catalog(path, columns=COLUMNS | SHAPE, units=UNITS)
+    plain["NUMBER"] = [3, 3]
+    path = write(plain, tmp_path / "twice.csv")
+    with pytest.raises(ValueError, match=r"ids are unique, got duplicates such as \[3\]"):
+        read_catalog(path, columns=COLUMNS | SHAPE, units=UNITS)
+    path = tmp_path / "text.csv"
+    path.write_text("")
+    with pytest.raises(DataError, match=r"text\.csv cannot be read as a table"):
+        read_catalog(path)
+
+
+# -------------------------------------------------------------- what looks wrong is told
+
+
+@pytest.fixture(scope="module")
+def bundled():
+    catalog = read_catalog("catalog.goodss")
+    catalog["ra"], catalog["dec"] = catalog["sky"].ra, catalog["sky"].dec
+    catalog.remove_columns(["sky", "flags"])
+    return catalog
+
+
+def test_a_sound_catalog_is_read_without_a_word(bundled, tmp_path):
+    bundled.write(tmp_path / "c.ecsv")
+    read_silently(tmp_path / "c.ecsv")
+    read_silently("catalog.goodss")
+    # a twentieth of it, the brightest or any, is no other unit
+    bundled[::20].write(tmp_path / "few.ecsv")
+    read_silently(tmp_path / "few.ecsv")
+    bundled[np.argsort(bundled["mag_f160w"])[:65]].write(tmp_path / "bright.ecsv")
+    read_silently(tmp_path / "bright.ecsv")
+
+
+@pytest.mark.parametrize("limit", [22.0, 24.0, 26.6])
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_fluxes_of_another_unit_are_told_by_counts(bundled, tmp_path, factor, limit):
+    table = bundled[bundled["mag_f160w"].value < limit]
+    for name in [n for n in table.colnames if "." in n]:
+        table[name] = factor * table[name]
+    table.write(tmp_path / "c.ecsv")
+    with pytest.warns(
+        MiricigaleWarning, match=r"brighter than .* AB in .* in the unit that is said"
+    ):
+        read_catalog(tmp_path / "c.ecsv")
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_one_band_of_another_unit_is_told_by_color(bundled, tmp_path, factor):
+    table = bundled.copy()
+    table["nircam.f444w"] = factor * table["nircam.f444w"]
+    table.write(tmp_path / "c.ecsv")
+    with pytest.warns(
+        MiricigaleWarning, match=r"median of nircam\.f444w over .* in one unit"
+    ) as told:
+        read_catalog(tmp_path / "c.ecsv")
+    assert len(told) == 1
+
+
+def test_hours_without_a_word_are_told(bundled, tmp_path):
+    table = bundled.copy()
+    table["ra"] = table["ra"].to_value(u.hourangle) * u.deg
+    table.write(tmp_path / "c.ecsv")
+    with pytest.warns(MiricigaleWarning, match="if they are in hours, say units="):
+        read_catalog(tmp_path / "c.ecsv")
