@@ -107,7 +107,9 @@ class ColorCircles:
             raise argument_error("classes", "with an AGN that has colors", "none")
         center = np.median(colors[agn], axis=0)
         distance = np.hypot(*(colors - center).T)
-        steps = np.unique(np.quantile(distance, np.linspace(0, 1, _N_RADII)))
+        tried = np.unique(np.quantile(distance, np.linspace(0, 1, _N_RADII)))
+        # between sources, and one beyond all
+        steps = np.append(0.5 * (tried[1:] + tried[:-1]), tried[-1])
         # share of each class within each radius
         within = {
             name: np.mean(distance[classes == name][:, None] <= steps, axis=0)

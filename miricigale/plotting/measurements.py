@@ -1,0 +1,146 @@
+"""Figures of images and photometry: background, light within radii, offsets by kind of source."""
+
+import numpy as np
+
+from miricigale.plotting.axes import new_figure
+from miricigale.plotting.comparison import MEASURED, SECOND, TRUE, plot_offsets
+from miricigale.plotting.images import plot_image
+from miricigale.plotting.truths import panels
+
+__all__ = ["background_figure", "encircled_energy_figure", "offsets_figure"]
+
+
+def background_figure(before, after, *, pixel_scale=1.0, unit="MJy/sr", mask=None):
+    """
+    An image before and after its background was subtracted, with profiles along both axes.
+
+    Parameters
+    ----------
+    before, after : array-like, shape (ny, nx)
+        The images; NaN is left white.
+    pixel_scale : float, optional
+        Arcsec per pixel.
+    unit : str, optional
+        Unit of the values.
+    mask : array-like of bool, shape (ny, nx), optional
+        Pixels of sources, which the profiles leave out.
+
+    Returns
+    -------
+    figure : `~matplotlib.figure.Figure`
+    """
+    figure, axes = new_figure(1, 3, size=(3.5, 3.5), width_ratios=(1, 1, 0.85))
+    last = axes[0, 2]
+    for ax, image, title, color in zip(
+        axes[0],
+        (before, after),
+        ("before", "after"),
+        (SECOND, MEASURED),
+        strict=False,
+    ):
+        image = np.asarray(image, float)
+        plot_image(
+            image, ax=ax, pixel_scale=pixel_scale, title=title, colorbar=unit, stretch="linear"
+        )
+        sky = image if mask is None else np.where(np.asarray(mask, bool), np.nan, image)
+        level = np.nanmedian(sky)
+        for axis, style in ((0, "-"), (1, "--")):
+            x, y = _profile(sky, axis)
+            place = (x - 0.5 * image.shape[1 - axis]) * pixel_scale
+            label = f"{title} ({level:.2g}), along {'xy'[axis]}"
+            last.plot(place, y - level, style, color=color, lw=1.3, label=label)
+    axes[0, 1].set_ylabel("")
+    last.axhline(0, color=TRUE, lw=0.8)
+    last.set(xlabel="position (arcsec)", ylabel=f"median of strips - that of all ({unit})")
+    low, high = last.get_ylim()
+    # space for the legend
+    last.set_ylim(low, high + 0.45 * (high - low))
+    last.legend(fontsize=7, frameon=False, loc="upper left")
+    return figure
+
+
+def _profile(image, axis, n_bins=24):
+    """Medians of strips of an image across an axis (0: along x), and their middles in pixels."""
+    size = image.shape[1 - axis]
+    edges = np.unique(np.linspace(0, size, min(n_bins, size) + 1).astype(int))
+    strips = np.split(image, edges[1:-1], axis=1 - axis)
+    values = [np.nanmedian(s) if np.isfinite(s).any() else np.nan for s in strips]
+    return 0.5 * (edges[1:] + edges[:-1]), np.array(values)
+
+
+def encircled_energy_figure(radius, before, after, *, limit=0.04):
+    """
+    Difference of encircled energy between the PSFs of two bands, before and after convolution.
+
+    Parameters
+    ----------
+    radius : array-like, shape (n,)
+        Radii in arcsec.
+    before, after : dict of str to array-like, shape (n,)
+        Encircled energy of the sharp PSF minus that of the wide one, as it is and convolved with the
+        kernel, by band.
+    limit : float, optional
+        Half height of the gray area of the right panel.
+
+    Returns
+    -------
+    figure : `~matplotlib.figure.Figure`
+    """
+    from matplotlib import colormaps
+
+    figure, axes = new_figure(1, 2, size=(5.25, 3.4), sharex=True)
+    steps = np.linspace(0.0, 0.82, max(len(before), 2))
+    for ax, curves, title in zip(
+        axes[0], (before, after), ("before convolution", "after convolution"), strict=True
+    ):
+        for k, (name, values) in enumerate(curves.items()):
+            style = {"color": colormaps["viridis"](steps[k]), "ls": ("-", "--")[k % 2]}
+            ax.plot(radius, 100 * np.asarray(values, float), lw=1.6, label=name, **style)
+        ax.axhline(0, color=TRUE, lw=0.8)
+        ax.set_title(title, fontsize="medium")
+        ax.set_xlabel("radius (arcsec)")
+    axes[0, 1].axhspan(-100 * limit, 100 * limit, color="0.92", zorder=0)
+    axes[0, 0].set_ylabel("difference of encircled energy (%)")
+    axes[0, 0].legend(fontsize=8, frameon=False, ncols=2)
+    reach = max([100 * limit, *(100 * np.nanmax(np.abs(v)) for v in after.values())])
+    axes[0, 1].set_ylim(-1.15 * reach, 1.15 * reach)
+    return figure
+
+
+def offsets_figure(groups, *, limit=1.0, labels=None, running=None):
+    """
+    Magnitude differences by kind of source, such as those of two photometries by Sersic index.
+
+    Parameters
+    ----------
+    groups : dict of str to tuple of array-like, shape (n,)
+        Magnitudes and differences by kind.
+    limit : float, optional
+        Half height of the axes.
+    labels : tuple of str, optional
+        Labels of the axes.
+    running : dict of str to tuple, optional
+        Middle, median and scatter of bins (`~miricigale.evaluation.running_median`) by kind.
+
+    Returns
+    -------
+    figure : `~matplotlib.figure.Figure`
+    """
+    figure, axes = panels(groups, height=3.1, sharex=True, sharey=True)
+    for k, (label, ax) in enumerate(axes.items()):
+        mag, offset = (np.asarray(v, float) for v in groups[label])
+        good = np.isfinite(mag) & np.isfinite(offset)
+        bins = (running or {}).get(label)
+        title = f"{label} ({np.count_nonzero(good)})"
+        plot_offsets(
+            mag[good], offset[good], running=bins, ax=ax, limit=limit, labels=labels, title=title
+        )
+        ax.set_title(title, fontsize="medium")
+        if good.any():
+            text = f"median {np.median(offset[good]):+.3f}"
+            ax.text(0.96, 0.95, text, transform=ax.transAxes, ha="right", va="top", fontsize=8)
+        if k % 3:
+            ax.set_ylabel("")
+        if k and ax.get_legend():
+            ax.get_legend().remove()
+    return figure
