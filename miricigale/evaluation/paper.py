@@ -85,7 +85,7 @@ def _detection():
         yield PublishedNumber(
             f"mips.{limit:g}", "mips_share", share, f"H < {limit:g}", "detection",
             option=(limit, "mips.24", 19.3), why=_ONE_FIELD,
-            definition="true flux at 24 um above 19.3 AB, the depth of the mock photometry",
+            definition="true flux at 24 µm above 19.3 AB, the depth of the mock photometry",
         )  # fmt: skip
     own = {"detected_catalog": (545, "detections on the F160W image"),
            "matched_catalog": (388 / 463, "share of the catalog matched within 1 arcsec")}  # fmt: skip
@@ -202,7 +202,7 @@ def _fractions():
             yield PublishedNumber(
                 f"{name}.0.all.z{low}", name, 0.02, f"fracAGN 0, {low} < z < {high}",
                 "AGN fraction", relation="<", option=(float(low), float(high)),
-                why="fewer sources and bands of rest 5-15 um at high redshift",
+                why="fewer sources and bands of rest 5-15 µm at high redshift",
             )  # fmt: skip
     yield PublishedNumber(
         "frac_scatter.0.99.all", "frac_scatter", 0.003, "fracAGN 0.99", "AGN fraction",
@@ -233,7 +233,7 @@ def _agn():
     for name, share in (("galaxy", 0.79), ("composite", 0.76), ("agn", 0.87)):
         yield PublishedNumber(
             f"colors.{name}", "extra", share, f"colors of Kirkpatrick et al. 2017, {name}", "classes",
-            definition="share of the class found by colors, classes by the share of 5-15 um light",
+            definition="share of the class found by colors, classes by the share of 5-15 µm light",
             why="other templates, and circles fitted to them",
         )  # fmt: skip
     yield PublishedNumber(
@@ -252,7 +252,7 @@ def _agn():
         why=f"{_ONE_FIELD}; it follows the luminosities of the injected AGN",
     )  # fmt: skip
     yield PublishedNumber(
-        "pah.f1500w", "feature", 0.4, "6.2 um, equivalent width 0.5 um, F1500W at z = 1.5", "templates",
+        "pah.f1500w", "feature", 0.4, "6.2 µm, equivalent width 0.5 µm, F1500W at z = 1.5", "templates",
         relation="~", error=0.05, option=("miri.f1500w", 0.5, 1.5),
         definition="2.5 log10(1 + W (1 + z) / filter width)",
     )  # fmt: skip

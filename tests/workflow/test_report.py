@@ -94,6 +94,7 @@ def make_run(folder, filters, *, mass=3e10, points=False):
     bands = [*config.fit.bands, *filters]
     truth = SEDModel.yang2021(agn=False).fluxes(parameters, bands)
     truth["redshift"], truth["sky"] = parameters["redshift"], sky
+    truth["profile"], truth["sersic_index"] = "sersic", np.linspace(0.5, 4, count)
     truth["star"], truth["frac_agn"] = np.zeros(count, bool), np.zeros(count)
     truth.meta.clear()
     truth.meta.update(version="1.2", citations=["Somebody 2001", "Somebody 2001, with page"])

@@ -12,7 +12,7 @@ from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.conditions import ConditionFlags, add_conditions, any_condition
 from miricigale.workflow.stages.exposures import bands_of_truth
 from miricigale.workflow.stages.inputs import fit_plan, sed_resources
-from miricigale.workflow.stages.sample import add_selection, in_field
+from miricigale.workflow.stages.sample import add_selection, in_field, matched_errors
 from miricigale.workflow.truths import band_sets, of_truth, reference, truth_names
 
 __all__ = [
@@ -66,11 +66,10 @@ def make_errors(context, _):
     """Stage 12: error function of every band, of the matched sources of the reference truth."""
     config, bands = context.config, context.config.exposures.filters
     field = _Field(context, context.plan)
-    matched, inside = field.matched, field.inside
-    errors = photometry.ErrorModel.from_tables(
-        QTable({"id": matched["id"], **{name: matched[f"{name}_true"] for name in bands}})[inside],
-        matched[inside],
-        filters=bands,
+    errors = matched_errors(
+        field.matched,
+        field.inside,
+        bands,
         statistic=config.errors.statistic,
         bin_size=config.errors.bin_size,
     )

@@ -13,7 +13,7 @@ from miricigale.evaluation import (
     number,
 )
 from miricigale.workflow.stage import stage
-from miricigale.workflow.stages import conditions, figures, pictures, provenance
+from miricigale.workflow.stages import comparison, conditions, figures, pictures, provenance
 from miricigale.workflow.stages.exposures import EXPOSURE_RESOURCES, GRID, exposure_plan
 from miricigale.workflow.stages.figures import SET_LABELS, band_label
 from miricigale.workflow.stages.images import measured_mosaic
@@ -97,7 +97,9 @@ def make_report(context, _):
     writer.photometry()
     writer.errors()
     writer.fits()
-    writer.truths(every)
+    study = comparison.study_results(config, truths, every, metrics)
+    comparison.write_truths(context, report, study, metrics, FIT_COLUMNS)
+    comparison.write_comparison(context, report, study, metrics["as_paper"])
     writer.inputs()
     provenance.write_origin(report, config, model, [tables.truth.meta, tables.matched.meta])
     context.save("report/index.html", lambda path: report.write(path))
@@ -373,6 +375,9 @@ class _Writer:
             "posteriors are wide",
         )
         conditions.write_fits(self.report, self.metrics)
+        comparison.write_coverage(
+            self.report, self.tables, self.config.fit.model_error, self.context.seed
+        )
         results = self.tables.results
         key = typical_source(sample, results["all"].fitted, self.bands[-1])
         if key is None:
@@ -382,30 +387,6 @@ class _Writer:
             figures.example_figure(results, self.tables.truth, key, self.model),
             f"Source {key}: photometry and best models, residuals of the fit with MIRI, and the "
             "posteriors of redshift and AGN fraction with and without MIRI.",
-        )
-
-    def truths(self, every):
-        """Redshifts and AGN fractions of all truths, ``every`` with its tables by name."""
-        if len(every) < 2:
-            return
-        self.report.section(
-            "AGN of different strength",
-            "The same galaxies with an AGN of each fracAGN, drawn from the ranges of Yang et al. 2021, "
-            "each sky exposed, reduced, measured and fitted alike; errors of the fluxes are by the "
-            f"error function of fracAGN = {self.truth.frac_agn:g}.",
-        )
-        rows = [
-            (truth, (unit, fit))
-            for truth in self.metrics["truths"].values()
-            for unit, fit in truth["fits"].items()
-        ]
-        columns = {"injected fracAGN": lambda x: f"{x[0]['frac_agn']}"}
-        columns |= {name: lambda x, cell=cell: cell(x[1]) for name, cell in FIT_COLUMNS.items()}
-        self._table(
-            rows,
-            columns,
-            caption="Sources detected in enough MIRI bands, the same with each set of bands",
-            text=2,
         )
 
     def inputs(self):

@@ -2,8 +2,10 @@
 
 import astropy.units as u
 import numpy as np
+from astropy.table import QTable
 from astropy.wcs.utils import proj_plane_pixel_area
 
+from miricigale.photometry import ErrorModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import Flags, error_column
 
@@ -14,6 +16,7 @@ __all__ = [
     "footprint_area",
     "in_field",
     "magnitude",
+    "matched_errors",
     "typical_source",
 ]
 
@@ -53,6 +56,18 @@ def in_field(sky, images):
         inside &= on
         inside[on] &= usable[y[on], x[on]]
     return inside
+
+
+def matched_errors(matched, inside, bands, *, statistic, bin_size):
+    """
+    Error functions (`~miricigale.photometry.ErrorModel`) of bands, of matched sources.
+
+    ``matched`` is of `~miricigale.evaluation.match_truth`; ``inside`` says which rows are in the field.
+    """
+    truth = QTable({"id": matched["id"], **{name: matched[f"{name}_true"] for name in bands}})
+    return ErrorModel.from_tables(
+        truth[inside], matched[inside], filters=bands, statistic=statistic, bin_size=bin_size
+    )
 
 
 def footprint_area(images):
