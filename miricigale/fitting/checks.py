@@ -32,12 +32,8 @@ def mock_analysis(fitter, results, photometry, *, seed, model_error=False, **opt
 
     Parameters
     ----------
-    fitter : `BayesFitter`
-        What made the results.
-    results : `FitResults`
-        Results of the catalog.
-    photometry : `~astropy.table.QTable`
-        The catalog that was fitted.
+    fitter, results, photometry : `BayesFitter`, `FitResults` and `~astropy.table.QTable`
+        What made the results, these, and the catalog that was fitted.
     seed : int, `~numpy.random.Generator` or None
         Every object has its own stream, by its id.
     model_error : bool, optional
@@ -89,10 +85,8 @@ class MockResult:
 
     Parameters
     ----------
-    truth : `FitResults`
-        Results whose best models are the truth.
-    recovered : `FitResults`
-        Fit of the mock catalog.
+    truth, recovered : `FitResults`
+        Results whose best models are the truth, and the fit of the mock catalog.
     photometry : `~astropy.table.QTable`
         The mock catalog.
     seed : int, optional

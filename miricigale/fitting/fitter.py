@@ -71,10 +71,9 @@ class BayesFitter:
     engine : {"grid", "nautilus", "dynesty"} or callable, optional
         How the posterior is found: on a grid, or by a sampler. A callable is a sampler of the
         user's; see `miricigale.fitting.samplers.get_sampler`.
-    model_error : float or dict of str to float, optional
-        Part of the flux that is added to its error in quadrature, for all or by filter.
-    error_floor : float or dict of str to float, optional
-        Least relative error of a flux, for all or by filter.
+    model_error, error_floor : float or dict of str to float, optional
+        Part of the flux that is added to its error in quadrature, and least relative error of a flux,
+        for all or by filter.
     n_bands_min : int, optional
         Objects with fewer usable bands, upper limits among them, are flagged and not fitted. One
         band at least must be no limit.
@@ -109,10 +108,9 @@ class BayesFitter:
     max_calls : int, optional
         Models that a sampler evaluates for one object at most (dynesty counts the steps of its
         walkers, some of which leave the prior); ``converged`` of the results tells.
-    n_draws : int, optional
-        Draws of equal weight that are kept of a sample; see `FitResults.samples`.
-    n_cells : int, optional
-        Cells of each axis, for PDFs and plots of a sample.
+    n_draws, n_cells : int, optional
+        Draws of equal weight that are kept of a sample (see `FitResults.samples`), and cells of each
+        axis, for PDFs and plots.
     sampler_options : dict, optional
         Passed on to the sampler.
 
@@ -276,8 +274,8 @@ class BayesFitter:
             filter's name, and its error ``<name>_err``. NaN is a missing band. Where a boolean
             column ``<name>_limit`` is true the flux is an upper limit and the error its 1 sigma
             (without model error and floor); its term of chi2 is -2 ln of the probability that a
-            measurement of the model lies below the limit [1]_ [2]_. Objects with limits only are
-            flagged, not fitted.
+            measurement of the model lies below the limit (Sawicki 2012, PASP 124, 1208, appendix).
+            Objects with limits only are flagged, not fitted.
         redshift : str or array_like, optional
             Column of ``photometry``, or values, of known redshifts; on a grid each is taken to the
             nearest redshift. Without it the redshift is free.
@@ -293,9 +291,8 @@ class BayesFitter:
             Of samplers: every object has its own stream, from the seed and its id. The sums over a
             grid have nothing random.
         executor : `concurrent.futures.Executor`, optional
-            Fits pieces of the catalog at the same time; the answer is the same. Threads work
-            well on a grid, whose kernels hold no lock; samplers are Python, for which processes
-            serve better.
+            Fits pieces of the catalog at the same time; the answer is the same. Threads serve well
+            on a grid, whose kernels hold no lock, processes for samplers, which are Python.
         progress_bar : bool, optional
             Whether to show one.
         chunk_size : int, optional
@@ -304,8 +301,7 @@ class BayesFitter:
         Returns
         -------
         results : `FitResults`
-            One row for each object, in the order of the catalog; those that could not be
-            fitted are flagged.
+            A row for each object of the catalog; those that could not be fitted are flagged.
 
         Warns
         -----
@@ -319,17 +315,12 @@ class BayesFitter:
         KeyError
             If a name in ``pairs`` is unknown.
         ValueError
-            If a column is missing, a flux is no number, an id is masked, one of limits is not
-            boolean, there are limits in a band in which a model of the grid has negative flux,
-            ``redshift`` or ``redshift_prior`` has the wrong shape, or both are given, nothing is
-            free, or ``pairs`` has a parameter twice, one with a single value or a derived quantity.
+            If a column is missing or holds something else, an id is masked, there are limits in a
+            band in which a model of the grid has negative flux, ``redshift`` or ``redshift_prior``
+            has the wrong shape, or both are given, nothing is free, or ``pairs`` has a parameter
+            twice, one with a single value or a derived quantity.
         `~astropy.units.UnitsError`
             If a flux column has no unit of flux density.
-
-        References
-        ----------
-        .. [1] Sawicki 2012, PASP 124, 1208, appendix
-        .. [2] Boquien et al. 2019, A&A 622, A103, section 4.3
         """
         options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
         return self._fit_rows(
@@ -418,14 +409,12 @@ class BayesFitter:
         n_draws : int
             Draws for each object, independent and of equal weight.
         seed : int
-            Every object has its own stream, keyed by its id: neither order nor the number of
-            workers changes a draw.
+            Every object has its own stream, by its id: neither order nor workers change a draw.
 
         Returns
         -------
         samples : `~miricigale.fitting.Samples`
-            Parameters, derived quantities, fluxes and spectra of the draws; NaN for objects that
-            could not be fitted, which are flagged as by `fit`.
+            The draws; objects that could not be fitted are flagged as by `fit`.
 
         Raises
         ------

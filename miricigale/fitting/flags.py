@@ -52,18 +52,6 @@ class FitFlags(Flags):
     UNFITTED = 1 | 2 | 8 | 16 | 32 | 512 | 4096 | 8192
     """Bits with which a row has no result."""
 
-    @classmethod
-    def describe(cls):
-        """One line of text that gives each bit its name, for a column's description."""
-        single = (m for m in cls if m.value and m is not cls.UNFITTED)
-        bits = ", ".join(f"{m.value} {m.name.lower().replace('_', ' ')}" for m in single)
-        return f"bit flags (sum): {bits}; 0 good"
-
-    @classmethod
-    def names(cls, value):
-        """Names of the bits set in ``value``, lower case."""
-        return [m.name.lower() for m in cls if m is not cls.UNFITTED and m.value & int(value)]
-
 
 def flags_of_fits(results, measured, max_reduced_chi2, edge_weight):
     """

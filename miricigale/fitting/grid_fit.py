@@ -157,15 +157,8 @@ class GridFit:
         """
         ln(prior) of the grid's redshifts for every object.
 
-        Parameters are those of `~miricigale.fitting.BayesFitter.fit`; ``flags``, of the n objects,
-        are added to in place.
-
-        Returns
-        -------
-        log_prior : `~numpy.ndarray`, shape (n, nz)
-        n_free : int
-            Number of free parameters, the mass among them.
-        kind : {"fixed", "free"}
+        ``flags``, of the n objects, are added to in place. Returned are the priors, shape (n, nz), the
+        number of free parameters (the mass among them) and "fixed" or "free".
         """
         z, prior = self.grid.redshift, self.priors.redshift
         allowed = self.engine.usable.any(axis=1) & (prior > 0)

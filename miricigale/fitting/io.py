@@ -1,5 +1,6 @@
 """Results and draws in FITS files, and results in the files of a folder."""
 
+import itertools
 from pathlib import Path
 
 import astropy.units as u
@@ -46,14 +47,7 @@ _FACTS = ("redshift_fixed", "constants", "least_std", "meta")
 
 
 def write_results(results, path, *, overwrite=False):
-    """
-    Write results: a table extension of all arrays, and a text extension of all else.
-
-    Raises
-    ------
-    ValueError
-        If an id is text that is not ASCII, or ends in a blank.
-    """
+    """Write results: a table extension of all arrays, and a text extension of all else."""
     single, results = results.isscalar, results._several()
     ascii_ids(results.ids, "ids")
     table = {}
@@ -118,14 +112,7 @@ def _old_facts(fit, filters):
 
 
 def write_samples(samples, path, *, overwrite=False):
-    """
-    Write samples: a table extension of the draws, a text extension, and the axes' shares.
-
-    Raises
-    ------
-    ValueError
-        If an id is text that is not ASCII, or ends in a blank.
-    """
+    """Write samples: a table extension of the draws, a text extension, and the axes' shares."""
     single, samples = samples.isscalar, samples._several()
     ascii_ids(samples.ids, "ids")
     text = {
@@ -147,14 +134,7 @@ def write_samples(samples, path, *, overwrite=False):
 
 
 def read_samples(path, grid, *, model=None):
-    """
-    Read samples, with the grid that was fitted and, if it is known, its model.
-
-    Raises
-    ------
-    ValueError
-        If the grid is another.
-    """
+    """Read samples, with the grid that was fitted (another is refused) and, if it is known, its model."""
     if not isinstance(grid, ModelGrid):
         raise argument_error("grid", "the ModelGrid that was fitted", type(grid).__name__)
     with open_parts(path, (_SAMPLES,), wanted="samples") as parts:
@@ -349,8 +329,7 @@ class FitResultsFiles:
         return map(self._read, self.paths)
 
     def __iter__(self):
-        for part in self.parts():
-            yield from part
+        return itertools.chain.from_iterable(self.parts())
 
     def __getitem__(self, key):
         """Return `FitResults`, as these have them by an id or by rows; others are not read."""
@@ -419,12 +398,7 @@ class FitResultsFiles:
         columns : list of str, optional
             Columns to write, all by default.
         overwrite : bool, optional
-            Whether a file that is there is replaced.
-
-        Raises
-        ------
-        OSError
-            If the file is there and ``overwrite`` is not set.
+            Whether a file that is there is replaced (an `OSError` otherwise).
         """
         # parts may have ids of different lengths
         width = max((part_ids(item).dtype.itemsize for item in self.paths), default=0)

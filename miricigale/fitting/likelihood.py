@@ -117,12 +117,9 @@ class PhotometryReader:
         Parameters
         ----------
         table : `~astropy.table.QTable`
-            Column ``id``, a flux column for each filter and its error ``<name>_err``. NaN (or a
-            masked value) in flux or error is a missing band. Where a boolean column
-            ``<name>_limit`` (see `limits`) is true the flux is an upper limit and the error its
-            1 sigma, to which neither model error nor floor are added. No error, of a limit or with
-            all that is added to it, counts as less than 1e-6 of the flux, and those beyond 1e-60
-            to 1e60 uJy are of no use.
+            As for `~miricigale.fitting.BayesFitter.fit`; masked values are missing bands too. No
+            error, of a limit or with all that is added to it, counts as less than 1e-6 of the flux,
+            and those beyond 1e-60 to 1e60 uJy are of no use.
         repeated : `~numpy.ndarray` of bool, shape (n,), optional
             Rows whose id is known from earlier parts of the catalog.
 
@@ -177,11 +174,8 @@ def read_ids(table):
     """
     Ids of a catalog: numbers, or text whether it came as such or as bytes.
 
-    Raises
-    ------
-    ValueError
-        If one is masked or empty text, for nothing would tell its object from others; if some are
-        numbers and some text, several are in a row, or bytes are not UTF-8.
+    A `ValueError` tells those that are masked or empty, for nothing would tell their objects from
+    others, numbers among text, several in a row, and bytes that are not UTF-8.
     """
     require_columns(table, ["id"], "photometry")
     column = table["id"]
@@ -298,12 +292,7 @@ def flux_column(table, name):
     """
     Fluxes of a column in uJy, NaN where masked: a new array, shape (n,).
 
-    Raises
-    ------
-    ValueError
-        If the column holds no real numbers, or several in a row.
-    `~astropy.units.UnitsError`
-        If it has no unit of flux density.
+    A `ValueError` tells one without real numbers, or with several in a row.
     """
     column = table[name]
     column = getattr(column, "unmasked", column)

@@ -50,14 +50,7 @@ def moments(values, pdf):
 
 
 def check_levels(levels):
-    """
-    Levels of percentiles as an array.
-
-    Raises
-    ------
-    ValueError
-        If one is not between 0 and 1, or these are several lists.
-    """
+    """Levels of percentiles as an array; a `ValueError` tells others than between 0 and 1."""
     levels = np.atleast_1d(np.asarray(levels, dtype=float))
     if levels.ndim != 1:
         raise argument_error("levels", "a number or a list of numbers", f"shape {levels.shape}")
@@ -162,15 +155,8 @@ def check_pairs(pairs, axes, constant, derived, wanted):
 
     ``constant`` and ``derived`` are the names of parameters with one value, and of derived quantities,
     in place of which the message wants what ``wanted`` says. Returned is a tuple of pairs, each once,
-    whatever its order, without redshift and AGN fraction, which every fit has.
-
-    Raises
-    ------
-    KeyError
-        If a name is unknown.
-    ValueError
-        If these are no pairs, both are one parameter, or one has a single value or is a derived
-        quantity.
+    whatever its order, without redshift and AGN fraction, which every fit has. Unknown names are a
+    `KeyError`, what is no pair of different parameters with several values a `ValueError`.
     """
     if isinstance(pairs, (str, dict)) or not np.iterable(() if pairs is None else pairs):
         raise argument_error("pairs", "a list of pairs of parameter names", repr(pairs))

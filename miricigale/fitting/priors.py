@@ -70,23 +70,10 @@ class GridPriors:
 
 def grid_priors(grid, priors=None, *, prior_f="grid"):
     """
-    Work out the prior weights of a model grid.
+    Work out the prior weights of a model grid: `GridPriors`.
 
-    Parameters
-    ----------
-    grid : `~miricigale.sed.ModelGrid`
-        The grid.
-    priors : dict, optional
-        Parameter name to its prior: a function of the value or a frozen distribution of
-        `scipy.stats` (a density, taken at the nodes), an array of weights of the nodes, or
-        ``"log"`` (1 / value). Others are flat in the nodes.
-    prior_f : {"grid", "uniform"}, optional
-        Weights of the AGN fractions if ``priors`` does not name them: equal for all values of
-        the grid (as CIGALE counts), or by the width of their cells.
-
-    Returns
-    -------
-    priors : `GridPriors`
+    ``priors`` and ``prior_f`` are given as for `~miricigale.fitting.BayesFitter`; the latter counts if
+    the former do not name the AGN fraction.
 
     Raises
     ------

@@ -34,14 +34,9 @@ _SAME = 1e-9
 #: Shape quantities whose outermost cells end at 0.
 _NOT_NEGATIVE = ("a_v", "age_mass", "age_light")
 #: AGN fractions by name, and what they are; the AGN's part in them and the galaxy's.
-FRACTIONS = {
-    "frac_agn_ir": "AGN share of 3-1000 um light",
-    "frac_agn_dust": "AGN power over the sum with the dust luminosity",
-}
-_FRACTIONS = {
-    "frac_agn_dust": ("agn_power", "dust_luminosity"),
-    "frac_agn_ir": ("ir_luminosity_agn", "ir_luminosity_galaxy"),
-}
+_IR = ("AGN share of 3-1000 um light", "ir_luminosity_agn", "ir_luminosity_galaxy")
+_DUST = ("AGN power over the sum with the dust luminosity", "agn_power", "dust_luminosity")
+_FRACTIONS = {"frac_agn_dust": _DUST, "frac_agn_ir": _IR}
 _ALL = 1e30
 
 
@@ -289,7 +284,7 @@ class OtherFraction:
         # where a galaxy has none of it all of it is the AGN's
         ratio = np.where(reference > 0, _ALL, 0.0)
         np.divide(reference, galaxy, out=ratio, where=galaxy > 0)
-        return cls(name, FRACTIONS[name], ratio, agn)
+        return cls(name, _FRACTIONS[name][0], ratio, agn)
 
     def evaluate(self, g, k, frac):
         """Values for models of galaxies g and AGN models k at fractions of the grid."""
@@ -335,7 +330,7 @@ class ModelValues:
         self.grid, self.axes, self.seed = grid, axes, seed
         self.quantities = Quantities.of_grid(grid)
         have = set(self.quantities.names)
-        self.fractions = tuple(n for n, parts in _FRACTIONS.items() if set(parts) <= have)
+        self.fractions = tuple(n for n, parts in _FRACTIONS.items() if set(parts[1:]) <= have)
 
     @property
     def names(self):
@@ -357,7 +352,7 @@ class ModelValues:
         if name in self.quantities.names:
             return self.quantities.descriptions[self.quantities.names.index(name)]
         if name in self.fractions:
-            return FRACTIONS[name]
+            return _FRACTIONS[name][0]
         for table in (self.grid.galaxy_parameters, self.grid.agn_parameters):
             if name in table.colnames and table[name].info.description:
                 return table[name].info.description
@@ -384,7 +379,7 @@ class ModelValues:
                 return grid.frac_agn[f]
             return self._of_axis(axis, g if axis.kind == "galaxy" else k, ids)
         if name in self.fractions:
-            agn, galaxy = (self.values(part, ids, index, scale) for part in _FRACTIONS[name])
+            agn, galaxy = (self.values(part, ids, index, scale) for part in _FRACTIONS[name][1:])
             whole = agn + galaxy
             return np.divide(agn, whole, out=np.zeros_like(whole), where=whole != 0)
         frac = grid.frac_agn[f]

@@ -249,8 +249,7 @@ class FitResults(ObjectRows):
         name : str
             A parameter or derived quantity.
         levels : array_like
-            Levels in (0, 1); of derived quantities, and of all of a sampler, from 0.001 to 0.999,
-            between which their distribution is kept.
+            Levels in (0, 1); of derived quantities, and of all of a sampler, from 0.001 to 0.999.
 
         Returns
         -------
@@ -316,8 +315,8 @@ class FitResults(ObjectRows):
         Parameters
         ----------
         x, y : str
-            Redshift and AGN fraction, or two that were a pair of ``pairs`` in `BayesFitter.fit`,
-            in any order. `Samples.pdf_2d` has those of any two, from draws.
+            Redshift and AGN fraction, or a pair of ``pairs`` in `BayesFitter.fit`, in any order.
+            `Samples.pdf_2d` has those of any two, from draws.
 
         Returns
         -------
@@ -410,9 +409,7 @@ class FitResults(ObjectRows):
 
     def predict(self, filters=None):
         """
-        Fluxes of the models over the posterior, summed over all models.
-
-        In bands that the grid does not have, `Samples.predict` has them from draws.
+        Fluxes of the models over the posterior; `Samples.predict` has those in other bands.
 
         Parameters
         ----------

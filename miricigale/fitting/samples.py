@@ -196,12 +196,8 @@ model : `~miricigale.sed.SEDModel`, optional
         ----------
         name : str
             A parameter or derived quantity.
-        levels : array_like
-            Levels in (0, 1).
-
-        Returns
-        -------
-        percentiles : `~astropy.units.Quantity`, shape (n, n_levels)
+        levels : array_like, shape (n_levels,)
+            Levels in (0, 1), of percentiles of shape (n, n_levels).
         """
         values = self.values(name)
         levels = check_levels(levels)
@@ -215,10 +211,8 @@ model : `~miricigale.sed.SEDModel`, optional
 
         Parameters
         ----------
-        name : str
-            A parameter or derived quantity.
-        key : object
-            Id of the object.
+        name, key : str and object
+            A parameter or derived quantity, and the id of the object.
         bins : int or array_like, optional
             Number or edges of the bins of derived quantities. Those of parameters of the grid
             are the cells around its nodes.
@@ -242,9 +236,7 @@ model : `~miricigale.sed.SEDModel`, optional
         ----------
         a, b : str
             Parameters or derived quantities.
-        key : object
-            Id of the object.
-        bins : int or array_like, optional
+        key, bins : optional
             See `pdf`.
 
         Returns
@@ -392,12 +384,10 @@ model : `~miricigale.sed.SEDModel`, optional
 
         Parameters
         ----------
-        key : object
-            Id of the object.
+        key, rest : optional
+            See `spectra`.
         levels : tuple of float, optional
             Levels of the percentiles, in (0, 1).
-        rest : bool, optional
-            Whether in the rest frame; see `spectra`.
 
         Returns
         -------

@@ -65,13 +65,9 @@ def fit_file(
     chunk_rows : int, optional
         Rows of a piece and so of a part file. 10000 objects of a grid of 65 redshifts and 11 AGN
         fractions take some 100 MB of results.
-    redshift : str or array_like, optional
-        As for `BayesFitter.fit`: a column, or values for all rows of the catalog.
-    redshift_prior : tuple, optional
-        As for `BayesFitter.fit`: redshifts and densities, of which there may be one row for each
-        row of the catalog, or the name of a column that holds them.
-    pairs : list of tuple of str, optional
-        As for `BayesFitter.fit`: pairs of parameters of which joint posteriors are kept too.
+    redshift, redshift_prior, pairs : optional
+        As for `BayesFitter.fit`, for all rows of the catalog; densities of redshift may be the name
+        of a column that holds them.
     seed : int, optional
         As for `BayesFitter.fit`. A sampler needs one, so that a later call can go on.
     flux_unit : unit-like, optional

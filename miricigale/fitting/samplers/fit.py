@@ -133,17 +133,9 @@ class SamplerFit:
 
     def redshifts(self, photometry, redshift, redshift_prior, flags):
         """
-        Parameters and priors of every object.
+        `Space` of every object, number of free parameters, and "fixed", "prior" or "free".
 
-        Parameters are those of `~miricigale.fitting.BayesFitter.fit`; ``flags``, of the n objects,
-        are added to in place.
-
-        Returns
-        -------
-        spaces : list of `~miricigale.fitting.samplers.space.Space`
-        n_free : int
-            Number of free parameters, the mass among them.
-        kind : {"fixed", "prior", "free"}
+        See `~miricigale.fitting.grid_fit.GridFit.redshifts`.
         """
         space = self.space
         if redshift is not None:

@@ -112,10 +112,7 @@ class Continuous:
         low, high = self.transform(np.array([_TAIL, 1.0 - _TAIL]))
         return (Log if 0 < 30 * low < high else Flat)(low, high).nodes(n)
 
-    @property
-    def bounds(self):
-        """Limits of the outermost cells."""
-        return (self.low, self.high)
+    bounds = Flat.bounds
 
     def __str__(self):
         law = getattr(getattr(self.law, "dist", None), "name", type(self.law).__name__)
@@ -169,26 +166,11 @@ class Table:
 
 def make_prior(name, prior, parameter):
     """
-    Work out the prior of one parameter.
+    Prior of one parameter, or its fixed value.
 
-    Parameters
-    ----------
-    name : str
-        Name of the parameter, for messages.
-    prior : object
-        As for `~miricigale.fitting.BayesFitter`; numbers may be quantities.
-    parameter : `~miricigale.sed.Parameter`
-        Its declaration.
-
-    Returns
-    -------
-    prior : object or float
-        One of the priors of this module, or the fixed value.
-
-    Raises
-    ------
-    ValueError
-        If it is something else or outside the bounds of the parameter.
+    ``prior`` is given as for `~miricigale.fitting.BayesFitter`, its numbers may be quantities;
+    ``parameter`` is the declaration (`~miricigale.sed.Parameter`). A `ValueError` tells something else,
+    or what lies outside the bounds of the parameter.
     """
     argument = f"priors[{name!r}]"
     wanted = "(low, high), (low, high, 'log'), 'flat', 'log', values, a distribution or a number"
@@ -255,16 +237,7 @@ def _choice(argument, values, weights, parameter):
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """
-    The parameters of a fit: some free, with priors, the others fixed.
-
-    Parameters
-    ----------
-    free : dict of str to prior
-        Priors of this module by name.
-    fixed : dict of str to float
-        Values of the others.
-    """
+    """The parameters of a fit by name: some free, with priors of this module, the others fixed."""
 
     free: dict
     fixed: dict
