@@ -29,6 +29,8 @@ def posterior_ranks(true, values, levels, *, seed=None):
         With it ranks are drawn uniformly from the part of the posterior in the cell of the true
         value: needed where the truth lies on nodes of a grid (an injected AGN fraction), for the
         place within the cell then is no random one. Without it the distribution is linear within cells.
+        Where several values are equal to the true one (a power of 0 of a galaxy without an AGN) the
+        rank is drawn from the levels of all of them, or is in their middle.
 
     Returns
     -------
@@ -63,6 +65,13 @@ def posterior_ranks(true, values, levels, *, seed=None):
     below, above = levels[rows, cell], levels[rows, cell + 1]
     ranks = below + inside * (above - below)
     ranks = np.where(true < values[:, 0], 0.0, np.where(true > values[:, -1], 1.0, ranks))
+    # where the distribution steps
+    first, last = (np.sum(values < true[:, None], axis=1), np.sum(values <= true[:, None], axis=1))
+    step = last - first > 1
+    low = np.where(first > 0, levels[rows, np.minimum(first, k - 1)], 0.0)
+    high = np.where(last < k, levels[rows, np.maximum(last - 1, 0)], 1.0)
+    part = inside if seed is not None else 0.5
+    ranks = np.where(step, low + part * (high - low), ranks)
     return np.where(good, ranks, np.nan)
 
 

@@ -98,7 +98,7 @@ def mid_infrared_fractions(model, parameters):
     return out
 
 
-def equivalent_width(wave, light, continuum):
+def equivalent_width(wave, light, continuum=None):
     """
     Equivalent width of features over a continuum.
 
@@ -106,8 +106,11 @@ def equivalent_width(wave, light, continuum):
     ----------
     wave : `~astropy.units.Quantity`, shape (n,)
         Rest wavelengths of the feature's range, ascending.
-    light, continuum : array-like, shape (n,)
-        F_nu or L_nu with and without the feature.
+    light : array-like, shape (n,)
+        F_nu or L_nu.
+    continuum : array-like, shape (n,), optional
+        The same without the feature; by default the power law through the two ends of the range, such as
+        5.95 and 6.55 um for the feature at 6.2 um.
 
     Returns
     -------
@@ -115,8 +118,11 @@ def equivalent_width(wave, light, continuum):
         In um, positive in emission.
     """
     x = to_array(wave, WAVE, "wave", ndim=1)
-    light, continuum = u.Quantity(light), u.Quantity(continuum)
-    excess = (light / continuum).to_value(u.one) - 1.0
+    light = u.Quantity(light)
+    if continuum is None:
+        ends = np.log(light.value[[0, -1]])
+        continuum = np.exp(np.interp(np.log(x), np.log(x[[0, -1]]), ends)) * light.unit
+    excess = (light / u.Quantity(continuum)).to_value(u.one) - 1.0
     return np.trapezoid(excess, x) * WAVE
 
 

@@ -65,6 +65,17 @@ def test_ranks_by_hand():
     np.testing.assert_allclose(got, [0.2, 0.7, 0.0, 1.0, np.nan, 1.0])
 
 
+def test_a_step_of_the_posterior_has_the_ranks_of_its_height():
+    """A third of the posterior is at 0, as of the power of an AGN that may be none."""
+    values, levels = [0.0, 0.0, 1.0, 2.0], [0.001, 1 / 3, 2 / 3, 0.999]
+    np.testing.assert_allclose(posterior_ranks([0.0, 1.0], values, levels), [1 / 6, 2 / 3])
+    drawn = posterior_ranks(np.zeros(3000), values, levels, seed=1)
+    assert (drawn.min(), drawn.max()) == pytest.approx((0, 1 / 3), abs=0.002)
+    assert drawn.mean() == pytest.approx(1 / 6, abs=0.01)
+    # all of it
+    assert posterior_ranks([0.0], np.zeros(4), levels)[0] == 0.5
+
+
 def test_posteriors_that_do_not_exist_have_no_rank():
     levels = np.array([[0.0, 0.5, 1.0], [np.nan] * 3])
     got = posterior_ranks([1.0, 1.0], [0.0, 1.0, 2.0], levels)

@@ -61,6 +61,13 @@ def test_equivalent_width_of_a_box():
     assert got.to_value(u.um) == pytest.approx(1.0, rel=0.01)
 
 
+def test_the_continuum_is_a_power_law_between_the_ends():
+    wave = np.linspace(5.95, 6.55, 601) * u.um
+    line = 1 + 4 * np.exp(-0.5 * ((wave.value - 6.22) / 0.04) ** 2)
+    got = equivalent_width(wave, wave.value**2.5 * line * u.uJy)
+    assert got.to_value(u.um) == pytest.approx(4 * 0.04 * np.sqrt(2 * np.pi), rel=1e-3)
+
+
 def test_feature_in_f1500w_is_that_of_the_paper():
     """Yang et al. 2021: a 6.2 um feature of 0.5 um makes 0.4 mag in F1500W at z = 1.5."""
     width = Filter.from_name("miri.f1500w").width
