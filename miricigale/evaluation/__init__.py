@@ -15,7 +15,13 @@ __getattr__, __dir__, __all__ = lazy_names(
             "confusion",
             "selection_quality",
         ),
-        "colors": ("COLOR_WINDOWS", "ColorCircles", "ColorWindow", "color_classes"),
+        "colors": (
+            "COLOR_WINDOWS",
+            "ColorCircles",
+            "ColorWindow",
+            "color_classes",
+            "color_estimates",
+        ),
         "counts": (
             "PUBLISHED_LIGHT",
             "dust_obscured_fraction",

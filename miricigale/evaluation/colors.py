@@ -3,13 +3,15 @@
 import dataclasses
 
 import numpy as np
+from astropy.table import vstack
 
-from miricigale.evaluation.classes import CLASS_NAMES
+from miricigale.evaluation.classes import CLASS_NAMES, KIRKPATRICK_LIMITS, classify
+from miricigale.evaluation.estimates import Estimate
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import FNU, to_array
 
-__all__ = ["COLOR_WINDOWS", "ColorCircles", "ColorWindow", "color_classes"]
+__all__ = ["COLOR_WINDOWS", "ColorCircles", "ColorWindow", "color_classes", "color_estimates"]
 
 #: Distances from the center that are tried as radii.
 _N_RADII = 60
@@ -135,7 +137,9 @@ class ColorCircles:
         return names[np.where(np.isfinite(distance), index, 3)]
 
 
-def color_classes(fluxes, redshift, classes, *, windows=COLOR_WINDOWS, n_folds=2, seed):
+def color_classes(
+    fluxes, redshift, classes, *, windows=COLOR_WINDOWS, n_folds=2, groups=None, seed
+):
     """
     Classes of sources by their colors, with circles that were fitted to other sources.
 
@@ -151,6 +155,8 @@ def color_classes(fluxes, redshift, classes, *, windows=COLOR_WINDOWS, n_folds=2
         Colors by redshift.
     n_folds : int, optional
         Parts of the sample: the sources of each are classified by circles fitted to the others.
+    groups : array-like, shape (n,), optional
+        Rows of one value stay in one part, such as one galaxy with several AGN; ids of the sources.
     seed : int
         Seed of the division.
 
@@ -161,7 +167,9 @@ def color_classes(fluxes, redshift, classes, *, windows=COLOR_WINDOWS, n_folds=2
     """
     redshift, classes = np.asarray(redshift, float), np.asarray(classes, str)
     found = np.full(redshift.size, "unknown", dtype="<U9")
-    fold = stream(check_seed(seed), "colors").permutation(redshift.size) % n_folds
+    groups = np.arange(redshift.size) if groups is None else np.asarray(groups)
+    names, index = np.unique(groups, return_inverse=True)
+    fold = (stream(check_seed(seed), "colors").permutation(names.size) % n_folds)[index]
     for window in windows:
         rows = (redshift >= window.z_low) & (redshift < window.z_high)
         colors = window.colors(fluxes)
@@ -171,3 +179,48 @@ def color_classes(fluxes, redshift, classes, *, windows=COLOR_WINDOWS, n_folds=2
             if np.any(classes[others] == CLASS_NAMES[2]) and own.any():
                 found[own] = ColorCircles.fit(colors[others], classes[others]).classify(colors[own])
     return found
+
+
+def color_estimates(study, mid_infrared, *, band_set="all", seed):
+    """
+    Shares of galaxies, composites and AGN that are found by colors, of all truths of a study together.
+
+    Parameters
+    ----------
+    study : `~miricigale.evaluation.StudyResults`
+        The tables, with the bands of `COLOR_WINDOWS`.
+    mid_infrared : dict of str to array-like, shape (n,)
+        True AGN shares of the 5-15 um light of all sources (`mid_infrared_fractions`) by name of the truth;
+        others are left out.
+    band_set : str, optional
+        The fit whose redshifts choose the colors.
+    seed : int
+        Of the division into parts.
+
+    Returns
+    -------
+    estimates : dict of str to `~miricigale.evaluation.Estimate`
+        ``"colors.<class>"``, for ``extra`` of the study: of the fitted sources with colors, ``n_all`` those
+        without too.
+    """
+    bands = tuple(dict.fromkeys(band for window in COLOR_WINDOWS for band in window.bands))
+    tables, redshift, share = [], [], []
+    for one in study.truths:
+        if one.name in mid_infrared and band_set in one.fits:
+            tables.append(one.matched["id", *bands][one.sample])
+            redshift.append(one.fitted(band_set, "redshift_mean"))
+            share.append(np.asarray(mid_infrared[one.name], float)[one.sample])
+    if not tables:
+        return {}
+    fluxes = vstack(tables, metadata_conflicts="silent")
+    true = classify(np.concatenate(share), limits=KIRKPATRICK_LIMITS)
+    found = color_classes(fluxes, np.concatenate(redshift), true, groups=fluxes["id"], seed=seed)
+    seen = found != "unknown"
+    return {
+        f"colors.{name}": Estimate.of_fraction(
+            np.count_nonzero((true == name) & (found == name)),
+            np.count_nonzero((true == name) & seen),
+            n_all=int(np.count_nonzero(true == name)),
+        )
+        for name in CLASS_NAMES
+    }

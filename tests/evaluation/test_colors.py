@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
-from miricigale.evaluation import COLOR_WINDOWS, ColorCircles, ColorWindow, color_classes
+from helpers.studies import mock_study
+from miricigale.evaluation import (
+    COLOR_WINDOWS,
+    ColorCircles,
+    ColorWindow,
+    color_classes,
+    color_estimates,
+)
 
 NAMES = np.array(["agn", "composite", "galaxy"])
 
@@ -59,6 +66,42 @@ def test_sources_are_classified_by_circles_of_others():
     shuffled = np.random.default_rng(1).permutation(classes)
     found = color_classes(fluxes, z, shuffled, windows=[window], seed=1)
     assert np.mean(found[5:] == shuffled[5:]) < 0.5
+
+
+def test_rows_of_one_source_stay_together():
+    """Each source twice, with classes that have nothing to do with colors: its copy must not help."""
+    rng = np.random.default_rng(3)
+    flux = 10 ** rng.normal(0, 0.3, (300, 2))
+    flux = np.concatenate([flux, flux])
+    fluxes = QTable({"a": flux[:, 0] * u.uJy, "b": np.ones(600) * u.uJy, "c": flux[:, 1] * u.uJy})
+    classes = np.tile(rng.choice(NAMES, 300), 2)
+    window = ColorWindow(0, 2, ("a", "b"), ("c", "b"))
+    groups = np.tile(np.arange(300), 2)
+    found = color_classes(fluxes, np.ones(600), classes, windows=[window], groups=groups, seed=1)
+    np.testing.assert_array_equal(found[:300], found[300:])
+
+
+def test_colors_of_a_study():
+    study = mock_study((0.0, 0.6), n=900)
+    # the color of the first window tells the truths apart, the second truth is AGN or composite
+    rng = np.random.default_rng(1)
+    shares = {}
+    for one in study.truths:
+        share = np.full(900, one.frac_agn) + 0.3 * (one.frac_agn > 0) * (np.arange(900) % 2)
+        shares[one.name] = share
+        for window in COLOR_WINDOWS:
+            for name in window.bands:
+                one.matched[name] = np.ones(900) * u.uJy
+        for name in ("miri.f1500w", "miri.f1800w", "miri.f2100w"):
+            one.matched[name] = 10 ** (1 - share + rng.normal(0, 0.01, 900)) * u.uJy
+    got = color_estimates(study, shares, seed=1)
+    assert set(got) == {"colors.galaxy", "colors.composite", "colors.agn"}
+    for name in ("galaxy", "composite", "agn"):
+        estimate = got[f"colors.{name}"]
+        assert estimate.value > 0.9
+        # redshifts from 0.75 to 2.25 of 0.1 to 4
+        assert estimate.completeness == pytest.approx(1.5 / 3.9, abs=0.1)
+    assert color_estimates(study, {}, seed=1) == {}
 
 
 def test_windows_follow_each_other():
