@@ -434,7 +434,7 @@ def study_confusion(study, band_set="all"):
     Returns
     -------
     table : `~astropy.table.QTable`
-        As `confusion`: sources of the field that were not fitted are ``unknown``.
+        As `~miricigale.evaluation.confusion`: sources of the field that were not fitted are ``unknown``.
     """
     truths = [one for one in study.truths if one.frac_agn is not None and band_set in one.fits]
     true = [classify(np.asarray(one.truth["frac_agn"], float))[one.field] for one in truths]
