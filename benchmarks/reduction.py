@@ -66,6 +66,12 @@ def main():
         no_jumps = reducer.replace(jump_threshold=None)
         clock(f"{label}: slopes without jumps", no_jumps.fit_ramp, ramp)
         del ramp
+
+        def draw(exposure=exposures[0], sky=sky):
+            return reducer.fit_ramp(detector.collect(sky, exposure, seed=1))
+
+        draw()
+        clock(f"{label}: rates without groups", draw)
         cal = clock(f"{label}: calibrate", reducer.calibrate, rate)
         cal, _ = clock(f"{label}: background", reducer.subtract_background, cal)
     cals = []

@@ -5,6 +5,7 @@ from miricigale.utils.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
+        "collected": ("Charge",),
         "detector": ("Detector",),
         "effects": (
             "ADConversion",

@@ -8,16 +8,25 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.depth.saturation import SKY_FRACTION, SaturationForecast, saturation_forecast
-from miricigale.detector import level1b
+from miricigale.detector import _core, level1b
+from miricigale.detector.collected import Charge
 from miricigale.detector.effects import (
     ORDER,
+    BadPixels,
     Block,
+    CosmicRays,
+    Dark,
     Effect,
     FirstFrame,
+    InterpixelCapacitance,
     LastFrame,
     Persistence,
+    Photons,
+    ReadNoise,
+    ReferencePixels,
     ResetAnomaly,
     Residual,
+    WholeBlock,
 )
 from miricigale.detector.effects.order import check_order, keyed, place_of
 from miricigale.detector.image import checked_light
@@ -40,6 +49,23 @@ _STANDARD = [
     for kind in ORDER
     if kind not in (Residual, Persistence, ResetAnomaly, FirstFrame, LastFrame)
 ]
+
+#: What makes the charge of a pixel, whenever it comes within the exposure; cosmic rays apart.
+_COLLECTING = (
+    Residual,
+    Photons,
+    Dark,
+    InterpixelCapacitance,
+    Persistence,
+    BadPixels,
+    ReferencePixels,
+)
+
+#: Those of them whose electrons are one Poisson number, before neighbors are coupled.
+_LIGHT = (Residual, Photons, Dark)
+
+# rows whose charge is collected at once
+_ROWS = 128
 
 # samples (float32) that one thread has in hand: a few MB, so that they stay in the cache
 _BLOCK_SAMPLES = 2**21
@@ -293,6 +319,82 @@ class Detector:
             finish(pixel_dq, task.effects, task.meta)
         return path
 
+    def collect(
+        self, image, exposure, *, seed=None, previous=None, n_threads=None, progress_bar=False
+    ):
+        """
+        Expose the detector to a scene without following the groups.
+
+        What is collected stands for the ramp of `expose` in
+        `~miricigale.reduction.Reducer.fit_ramp`, which draws from it the slopes that it would
+        fit: for planning, at a small part of the cost. Flat field, residual pattern, bad pixels
+        and hits of cosmic rays are those of the ramp with the same seed; photon and read noise
+        are other draws.
+
+        Parameters
+        ----------
+        image, exposure, seed, previous, n_threads, progress_bar : optional
+            As for `expose`.
+
+        Returns
+        -------
+        charge : `Charge`
+
+        Raises
+        ------
+        `~astropy.units.UnitsError`
+            As `expose`.
+        ValueError
+            As `expose`; or if the detector has 1/f noise or effects of other kinds than the
+            package's.
+
+        Warns
+        -----
+        `~miricigale.utils.exceptions.MiricigaleWarning`
+            As `expose`.
+
+        Notes
+        -----
+        Charge comes at a constant rate within the exposure, that of latent images too, and
+        noise of the level after a reset is left out.
+        """
+        for effect in self._effects:
+            pink = isinstance(effect, ReadNoise) and effect.pink > 0
+            if pink or place_of(effect) is None:
+                wanted = "the package's own, without 1/f noise, to be collected without groups"
+                raise argument_error("effects", wanted, repr(effect))
+        seed = check_seed(seed)
+        task = self._task(image, exposure, seed, previous)
+        shape = exposure.shape
+        mean, electrons = np.empty(shape), np.empty(shape, np.float32)
+        pixel_dq = np.zeros(shape, np.uint32)
+
+        def work(rows):
+            mean[rows], electrons[rows], pixel_dq[rows], *hits = self._collect_rows(task, rows)
+            return hits
+
+        with threads(n_threads) as executor:
+            blocks = chunks(shape[0], _ROWS)
+            hits = parallel_map(
+                work,
+                blocks,
+                executor=executor,
+                progress_bar=progress_bar,
+                desc=f"charge {exposure.filter}",
+            )
+        return Charge(
+            exposure,
+            mean,
+            electrons,
+            np.concatenate([where for where, _ in hits], axis=1),
+            np.concatenate([charge for _, charge in hits]),
+            pixel_dq,
+            task.effects,
+            self._properties,
+            seed,
+            task.meta,
+        )
+
     def forecast(self, image, exposure, *, sources=None):
         """
         Say what an exposure will saturate, without simulating it.
@@ -387,6 +489,36 @@ class Detector:
             array = effect.apply(array, block)
         inner = slice(rows.start - wide.start, rows.stop - wide.start)
         return array[:, :, inner], pixel_dq[inner], group_dq[:, :, inner]
+
+    def _collect_rows(self, task, rows):
+        """Collect the charge of some rows: mean rate, electrons, flags of pixels, hits."""
+        chain = [(effect, key) for effect, key in task.keyed if isinstance(effect, _COLLECTING)]
+        halo = sum(effect.halo for effect, _ in chain)
+        wide = slice(max(rows.start - halo, 0), min(rows.stop + halo, task.light.shape[0]))
+        shape = (wide.stop - wide.start, task.shape[3])
+        pixel_dq = np.zeros(shape, np.uint32)
+        ramp = np.zeros((1, 1, *shape), np.float32)
+        where = (task.exposure, self._properties, wide, pixel_dq, np.zeros(ramp.shape, np.uint8))
+        mean = task.light[wide]
+        n_light = sum(isinstance(effect, _LIGHT) for effect, _ in chain)
+        for effect, key in chain[:n_light]:
+            block = WholeBlock(*where, key)
+            mean = effect.expected(mean, block)
+        # photons and dark current together, as their sum is one Poisson number
+        _core.add_poisson(ramp, mean * block.total_time, key, wide.start)
+        for effect, key in chain[n_light:]:
+            block = WholeBlock(*where, key, task.previous)
+            mean, ramp = effect.expected(mean, block), effect.apply(ramp, block)
+        hits = (np.empty((3, 0), np.int32), np.empty(0))
+        for effect, key in task.keyed:
+            if isinstance(effect, CosmicRays):
+                groups = np.broadcast_to(
+                    np.uint8(0), (*task.shape[:2], rows.stop - rows.start, shape[1])
+                )
+                block = Block(task.exposure, self._properties, rows, pixel_dq, groups, key)
+                hits = effect.hits(block)
+        inner = slice(rows.start - wide.start, rows.stop - wide.start)
+        return mean[inner], ramp[0, 0, inner], pixel_dq[inner], *hits
 
     def _previous(self, previous, exposure):
         """Previous exposures as a tuple, checked."""

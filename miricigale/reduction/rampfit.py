@@ -21,7 +21,7 @@ from miricigale.reduction import _core
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks, parallel_map, threads
 
-__all__ = ["RampFit", "fit_groups", "reference_drift"]
+__all__ = ["RampFit", "fit_groups", "fit_result", "reference_drift", "threshold"]
 
 # rows that one call of the kernel fits; the events come out in this order
 _ROWS = 32
@@ -194,8 +194,8 @@ def fit_groups(
             raise argument_error(name, "positive", value)
     if not (np.isfinite(read_noise) and read_noise >= 0):
         raise argument_error("read_noise", "at least 0", read_noise)
-    jump = _threshold(jump_threshold, "jump_threshold")
-    neighbor = _threshold(neighbor_threshold, "neighbor_threshold")
+    jump = threshold(jump_threshold, "jump_threshold")
+    neighbor = threshold(neighbor_threshold, "neighbor_threshold")
     usable = np.ones((ny, nx), bool) if usable is None else np.ascontiguousarray(usable, bool)
     if usable.shape != (ny, nx):
         raise argument_error("usable", f"of shape {(ny, nx)}", usable.shape)
@@ -239,7 +239,11 @@ def fit_groups(
         parts = list(_neighbors(events, neighbor, usable, n_diff))
         parallel_map(refit_block, parts, executor=executor)
 
-    rate, var_poisson, var_read, n_used, n_jump, flags = out
+    return fit_result(*out, events, first_group)
+
+
+def fit_result(rate, var_poisson, var_read, n_used, n_jump, flags, events, first_group):
+    """Make a `RampFit` of what the kernels give; jumps are counted from ``first_group``."""
     flags[np.isnan(rate)] |= int(DQ.NO_SLOPE | DQ.DO_NOT_USE)
     jumps = np.empty(len(events), _JUMP_TYPE)
     for i, name in enumerate(("y", "x", "integration", "group", "significance")):
@@ -248,7 +252,7 @@ def fit_groups(
     return RampFit(rate, var_poisson, var_read, n_used, n_jump, flags, jumps)
 
 
-def _threshold(value, name):
+def threshold(value, name):
     """Return a threshold as a float, infinite for None."""
     if value is None:
         return np.inf

@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 
 from miricigale.detector import (
+    Charge,
     FirstFrame,
     InterpixelCapacitance,
     LastFrame,
@@ -15,6 +16,7 @@ from miricigale.detector import (
 from miricigale.instrument import DQ, DetectorProperties, ImageFacts, miri_detector, mosaic_wcs
 from miricigale.reduction.background import estimate_background, subtract_background
 from miricigale.reduction.calibration import calibrate
+from miricigale.reduction.drawn import draw_groups
 from miricigale.reduction.images import (
     check_images,
     check_overlap,
@@ -166,8 +168,8 @@ class Reducer:
 
         Parameters
         ----------
-        ramp : `~miricigale.detector.Ramp`
-            Counts in DN.
+        ramp : `~miricigale.detector.Ramp` or `~miricigale.detector.Charge`
+            Counts in DN; or what was collected, whose slopes are drawn.
         progress_bar : bool, optional
             Whether a progress bar is shown.
 
@@ -181,36 +183,39 @@ class Reducer:
         ValueError
             If it is no ramp, or fewer than two groups are left.
         """
-        if not isinstance(ramp, Ramp):
-            raise argument_error("ramp", "a Ramp", type(ramp).__name__)
+        if not isinstance(ramp, (Ramp, Charge)):
+            raise argument_error("ramp", "a Ramp or a Charge", type(ramp).__name__)
         exposure, detector = ramp.exposure, self._detector
         dq = ramp.pixel_dq.astype(np.int64)
         reference = (dq & DQ.REFERENCE_PIXEL) != 0
         usable = (dq & _UNUSABLE) == 0
-        n_group = ramp.data.shape[1]
+        n_group = exposure.n_groups
         skip_first, skip_last = self._skipped(ramp)
         if skip_first + skip_last > n_group - 2:
             msg = f"at most {n_group - 2} groups together for {n_group} groups"
             raise argument_error("skip_first, skip_last", msg, f"{skip_first}, {skip_last}")
-        drift = reference_drift(ramp.data, reference) if self.reference_correction else 0.0
         factor = float(np.sum(detector.ipc_kernel**2)) if self._shares_charge(ramp) else 1.0
-        fit = fit_groups(
-            ramp.data,
-            group_time=float(exposure.group_time.to_value("s")),
-            gain=detector.gain,
-            read_noise=detector.read_noise,
-            bias=detector.bias + drift + self._anomaly(ramp),
-            linearity=detector.nonlinearity,
-            saturation=detector.bias + self.saturation * detector.saturation_dn,
-            usable=usable,
-            first_group=skip_first,
-            last_group=n_group - skip_last,
-            jump_threshold=self.jump_threshold,
-            neighbor_threshold=self.neighbor_threshold,
-            poisson_factor=factor,
-            n_threads=self.n_threads,
-            progress_bar=progress_bar,
-        )
+        bias = detector.bias + self._anomaly(ramp)
+        options = {
+            "group_time": float(exposure.group_time.to_value("s")),
+            "gain": detector.gain,
+            "read_noise": detector.read_noise,
+            "linearity": detector.nonlinearity,
+            "saturation": detector.bias + self.saturation * detector.saturation_dn,
+            "usable": usable,
+            "first_group": skip_first,
+            "last_group": n_group - skip_last,
+            "jump_threshold": self.jump_threshold,
+            "neighbor_threshold": self.neighbor_threshold,
+            "poisson_factor": factor,
+        }
+        if isinstance(ramp, Charge):
+            fit = draw_groups(ramp, bias=bias, **options)
+        else:
+            if self.reference_correction:
+                bias = bias + reference_drift(ramp.data, reference)
+            options |= {"n_threads": self.n_threads, "progress_bar": progress_bar}
+            fit = fit_groups(ramp.data, bias=bias, **options)
         fit.flags[...] |= dq
         fit.flags[~usable] |= int(DQ.DO_NOT_USE)
         return fit
@@ -221,8 +226,8 @@ class Reducer:
 
         Parameters
         ----------
-        ramp : `~miricigale.detector.Ramp`
-            Counts in DN.
+        ramp : `~miricigale.detector.Ramp` or `~miricigale.detector.Charge`
+            Counts in DN; or what was collected, whose slopes are drawn.
         progress_bar : bool, optional
             Whether a progress bar is shown.
 
@@ -375,7 +380,7 @@ class Reducer:
 
         Parameters
         ----------
-        ramps : iterable of `~miricigale.detector.Ramp`
+        ramps : iterable of `~miricigale.detector.Ramp` or `~miricigale.detector.Charge`
             One at a time is held if this is a generator.
         wcs : `~astropy.wcs.WCS`, optional
             Of the mosaic; by default the smallest north-up grid that holds
@@ -442,7 +447,7 @@ class Reducer:
 
     def _skipped(self, ramp):
         """Groups left out at the start and the end of the integrations of a ramp."""
-        n_group = ramp.data.shape[1]
+        n_group = ramp.exposure.n_groups
         first, last = self.skip_first, self.skip_last
         if first is None:
             first = int(bool(ramp.shows(FirstFrame)) and n_group > 3)
@@ -453,7 +458,8 @@ class Reducer:
     def _anomaly(self, ramp):
         """Offset of each group after a reset, DN."""
         if self.reset_anomaly is not None:
-            return self.reset_anomaly.offsets(*ramp.data.shape[:2])
+            exposure = ramp.exposure
+            return self.reset_anomaly.offsets(exposure.n_integrations, exposure.n_groups)
         if self.skip_first is None and ramp.shows(ResetAnomaly):
             msg = (
                 "the ramp shows a reset anomaly that this Reducer leaves in: give it "

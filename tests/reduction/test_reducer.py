@@ -268,7 +268,7 @@ def test_refuses_what_does_not_belong_together():
 
 def test_what_is_no_ramp_or_grid_is_named():
     image = CCDData(np.zeros((8, 8)), unit="MJy/sr", uncertainty=StdDevUncertainty(np.ones((8, 8))))
-    with pytest.raises(ValueError, match="'ramp' must be a Ramp, got ndarray"):
+    with pytest.raises(ValueError, match="'ramp' must be a Ramp or a Charge, got ndarray"):
         Reducer().fit_ramp(np.zeros((1, 5, 8, 8)))
     with pytest.raises(ValueError, match="'wcs' must be an astropy WCS, got NoneType"):
         Reducer().mosaic([image], None)

@@ -14,6 +14,7 @@ from miricigale.detector._core.charge import (
     add_cosmic_rays,
     add_latent,
     add_poisson,
+    cosmic_ray_deposits,
     couple_neighbors,
 )
 from miricigale.detector._core.random import standard_normals
@@ -33,6 +34,7 @@ __all__ = [
     "add_pink_noise",
     "add_poisson",
     "clip_well",
+    "cosmic_ray_deposits",
     "couple_neighbors",
     "digitize",
     "interpolate_response",

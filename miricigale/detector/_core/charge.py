@@ -20,7 +20,13 @@ from miricigale.detector._core.random import (
 )
 from miricigale.utils.compilation import njit
 
-__all__ = ["add_cosmic_rays", "add_latent", "add_poisson", "couple_neighbors"]
+__all__ = [
+    "add_cosmic_rays",
+    "add_latent",
+    "add_poisson",
+    "cosmic_ray_deposits",
+    "couple_neighbors",
+]
 
 #: Greatest mean for which a draw is done; beyond it a pixel is saturated a thousandfold.
 _MEAN_MAX = 1e9
@@ -142,11 +148,13 @@ def _push(deposits, n, slot, head, row, col, charge):
 
 
 @njit(cache=True, nogil=True)
-def add_cosmic_rays(
-    ramp,
+def _deposits(
     key,
     first_row,
     n_detector_rows,
+    n_row,
+    n_col,
+    n_slot,
     hits_per_row,
     thickness,
     yield_median,
@@ -158,19 +166,21 @@ def add_cosmic_rays(
     shower_sigma,
 ):
     """
-    Add the charge of cosmic-ray hits, of which ``hits_per_row`` are expected in all integrations.
+    Draw cosmic-ray hits, of which ``hits_per_row`` are expected in all ``n_slot`` groups.
 
     ``thickness`` of the layer and ``track_max`` are in pixels; ``yield_median`` is in electrons per
     pixel of path and ``yield_sigma`` the scatter of its natural logarithm. ``leakage`` is the share
     of a deposit that goes to each of the four neighbors. A ``shower_fraction`` of the hits make a
     shower of ``shower_charge`` electrons and a Gaussian width of ``shower_sigma`` pixels.
+
+    Returns the deposits (next of the same group, row, column, electrons), their number, and the
+    first of each group; -1 ends a list.
     """
-    n_int, n_group, n_row, n_col = ramp.shape
     reach = math.ceil(track_max) + 2
     if shower_fraction > 0.0:
         reach = max(reach, math.ceil(3.0 * shower_sigma) + 1)
     deposits = np.empty((1024, 4))
-    head = np.full(n_int * n_group, -1, np.int64)
+    head = np.full(n_slot, -1, np.int64)
     n = 0
     state = np.empty(4, np.uint64)
     normal = np.empty(1)
@@ -179,7 +189,7 @@ def add_cosmic_rays(
         seed_stream(state, key, 0, row)
         for _hit in range(int(poisson(state, hits_per_row))):
             # every hit uses the same draws up to here, shower or not
-            slot = min(int(uniform(state) * (n_int * n_group)), n_int * n_group - 1)
+            slot = min(int(uniform(state) * n_slot), n_slot - 1)
             x = uniform(state) * n_col
             y = row + uniform(state)
             # isotropic flux through a plane: p(cos) = 2 cos
@@ -227,6 +237,16 @@ def add_cosmic_rays(
                         d2 = (cy + 0.5 - y) ** 2 + (cx + 0.5 - x) ** 2
                         q = peak * math.exp(-0.5 * d2 / shower_sigma**2)
                         deposits, n = _push(deposits, n, slot, head, cy - first_row, cx, q)
+    return deposits, n, head
+
+
+@njit(cache=True, nogil=True)
+def add_cosmic_rays(ramp, key, first_row, n_detector_rows, settings):
+    """Add the charge of cosmic-ray hits; ``settings`` are the last eight parameters of `_deposits`."""
+    n_int, n_group, n_row, n_col = ramp.shape
+    deposits, _, head = _deposits(
+        key, first_row, n_detector_rows, n_row, n_col, n_int * n_group, *settings
+    )
     plane = np.zeros((n_row, n_col), np.float32)
     for i in range(n_int):
         plane[:] = 0.0
@@ -238,6 +258,33 @@ def add_cosmic_rays(
             for r in range(n_row):
                 for x in range(n_col):
                     ramp[i, g, r, x] += plane[r, x]
+
+
+@njit(cache=True, nogil=True)
+def cosmic_ray_deposits(key, first_row, n_detector_rows, shape, settings):
+    """
+    List what `add_cosmic_rays` would add to a ramp of a ``shape``.
+
+    Returns the group (counted through all integrations), the row of the block and the column of
+    each deposit, (3, n), and its electrons (n,), in the order of the groups.
+    """
+    n_int, n_group, n_row, n_col = shape
+    deposits, n, head = _deposits(
+        key, first_row, n_detector_rows, n_row, n_col, n_int * n_group, *settings
+    )
+    where = np.empty((3, n), np.int32)
+    charge = np.empty(n)
+    m = 0
+    for slot in range(head.size):
+        k = head[slot]
+        while k >= 0:
+            where[0, m] = slot
+            where[1, m] = int(deposits[k, 1])
+            where[2, m] = int(deposits[k, 2])
+            charge[m] = deposits[k, 3]
+            m += 1
+            k = int(deposits[k, 0])
+    return where, charge
 
 
 @njit(cache=True, nogil=True)

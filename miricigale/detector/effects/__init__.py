@@ -13,7 +13,7 @@ Effects act on blocks of full rows. What a row gets does not depend on the block
 threads changes a result, and a detector of any size needs little memory.
 """
 
-from miricigale.detector.effects.base import Block, Effect, OtherEffect, stream_key
+from miricigale.detector.effects.base import Block, Effect, OtherEffect, WholeBlock, stream_key
 from miricigale.detector.effects.charge import (
     BadPixels,
     CosmicRays,
@@ -49,6 +49,7 @@ __all__ = [
     "ResetAnomaly",
     "Residual",
     "Saturation",
+    "WholeBlock",
     "effect_from_record",
     "stream_key",
 ]

@@ -12,6 +12,7 @@ __all__ = [
     "Block",
     "Effect",
     "OtherEffect",
+    "WholeBlock",
     "check_amounts",
     "check_finite",
     "check_ramp",
@@ -59,12 +60,23 @@ class Block:
     @property
     def total_time(self):
         """Time during which charge is collected in all integrations in s."""
-        return self.exposure.n_integrations * self.exposure.n_groups * self.group_time
+        exposure = self.exposure
+        group_time = exposure.group_time.to_value("s")
+        return exposure.n_integrations * exposure.n_groups * group_time
 
     @property
     def ramp_shape(self):
         """Shape of a ramp of this block."""
         return self.group_dq.shape
+
+
+class WholeBlock(Block):
+    """A block whose ramp is one group, as long as all groups of the exposure together."""
+
+    @property
+    def group_time(self):
+        """Time of the one group in s."""
+        return self.total_time
 
 
 def key_words(*key):

@@ -140,15 +140,38 @@ class CosmicRays(Effect):
     def apply(self, array, block):
         """Add the charge of the hits."""
         ramp = check_ramp(array, block, self)
+        _core.add_cosmic_rays(ramp, *self._arguments(block))
+        return ramp
+
+    def hits(self, block):
+        """
+        List the charge of the hits that `apply` adds.
+
+        Parameters
+        ----------
+        block : `Block`
+            Where and when; its flags give the shape alone.
+
+        Returns
+        -------
+        where : `~numpy.ndarray` of int32, shape (3, n)
+            Group, counted through all integrations, row of the detector and column of each
+            deposit, in the order of the groups.
+        electrons : `~numpy.ndarray`, shape (n,)
+            A pixel may have several in one group.
+        """
+        key, first, n_rows, settings = self._arguments(block)
+        where, electrons = _core.cosmic_ray_deposits(key, first, n_rows, block.ramp_shape, settings)
+        where[1] += first
+        return where, electrons
+
+    def _arguments(self, block):
+        """Arguments of the kernels."""
         properties = block.properties
         flux = properties.cosmic_ray_flux if self.flux is None else self.flux
         pitch = properties.pixel_pitch
-        hits_per_row = flux * pitch**2 * ramp.shape[3] * block.total_time
-        _core.add_cosmic_rays(
-            ramp,
-            block.key,
-            block.rows.start,
-            block.exposure.shape[0],
+        hits_per_row = flux * pitch**2 * block.ramp_shape[3] * block.total_time
+        settings = (
             float(hits_per_row),
             float(self.thickness / pitch),
             float(self.yield_median * pitch),
@@ -159,7 +182,7 @@ class CosmicRays(Effect):
             float(self.shower_charge),
             float(self.shower_sigma),
         )
-        return ramp
+        return block.key, block.rows.start, block.exposure.shape[0], settings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -238,11 +261,23 @@ class Persistence(Effect):
         if not block.previous:
             return ramp
         rates = np.stack([latent.rate.value[block.rows] for latent in block.previous])
-        released = np.stack(
-            [self.released(block.exposure, latent.gap) for latent in block.previous]
-        )
+        released = self._released(block)
+        if released.shape[1:] != block.ramp_shape[:2]:
+            # all groups as one
+            released = released.sum(axis=(1, 2), keepdims=True)
         _core.add_latent(ramp, rates, released, block.key, block.rows.start)
         return ramp
+
+    def expected(self, array, block):
+        """Add the mean rate over all groups, where previous exposures are told."""
+        if not block.previous:
+            return array
+        rates = [latent.rate.value[block.rows] for latent in block.previous]
+        released = self._released(block).sum(axis=(1, 2))
+        return array + np.tensordot(released, rates, 1) / block.total_time
+
+    def _released(self, block):
+        return np.stack([self.released(block.exposure, latent.gap) for latent in block.previous])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -282,8 +317,9 @@ class BadPixels(Effect):
 
     def _pixels(self, block):
         bad = bad_pixel_mask(subarray=block.exposure.subarray)[block.rows]
-        y, x = np.indices(bad.shape)
-        dead = bad & ((y + block.rows.start + x) % 2 == 0)
+        dead = np.zeros_like(bad)
+        y, x = np.nonzero(bad)
+        dead[y, x] = (y + block.rows.start + x) % 2 == 0
         return dead, bad & ~dead
 
 

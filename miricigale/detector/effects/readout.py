@@ -36,10 +36,18 @@ class Nonlinearity(Effect):
         nodes = step * np.arange(
             int(np.ceil(1.05 * properties.full_well / properties.gain / step)) + 2
         )
-        response = nodes if self.linear else properties.delinearize(nodes)
+        response = self.response(nodes, properties)
         response = np.ascontiguousarray(response, np.float32)
         _core.interpolate_response(ramp, float(properties.gain), response, step)
         return ramp
+
+    def response(self, dn, properties):
+        """Measured DN of linear ones."""
+        return dn if self.linear else properties.delinearize(dn)
+
+    def linear_dn(self, dn, properties):
+        """Linear DN of measured ones."""
+        return dn if self.linear else properties.linearize(dn)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +75,7 @@ class Bias(Effect):
     def apply(self, array, block):
         """Add the level."""
         ramp = check_ramp(array, block, self)
-        level = block.properties.bias if self.level is None else self.level
+        level = self.mean(block.properties)
         ramp += np.float32(level)
         if self.reset_noise:
             offset = np.empty(ramp.shape[2:])
@@ -77,6 +85,10 @@ class Bias(Effect):
                 _core.standard_normals(block.key, first, offset)
                 ramp[i] += np.asarray(self.reset_noise * offset, np.float32)
         return ramp
+
+    def mean(self, properties):
+        """Mean level in DN."""
+        return properties.bias if self.level is None else self.level
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,7 +120,7 @@ class ReadNoise(Effect):
     def apply(self, array, block):
         """Add the noise."""
         ramp = check_ramp(array, block, self)
-        sigma = block.properties.read_noise if self.sigma is None else self.sigma
+        sigma = self.deviation(block.properties)
         first = block.rows.start
         _core.add_noise(ramp, float(sigma), block.key, first)
         if self.pink:
@@ -117,6 +129,10 @@ class ReadNoise(Effect):
             n_rows = block.exposure.shape[0]
             _core.add_pink_noise(ramp, float(self.pink), int(self.octaves), 4, key, first, n_rows)
         return ramp
+
+    def deviation(self, properties):
+        """Standard deviation of one read in DN, without the 1/f part."""
+        return properties.read_noise if self.sigma is None else self.sigma
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,6 +19,7 @@ squared that a free difference j brings.
 All integrations of a pixel share one slope and one Poisson variance.
 """
 
+from miricigale.reduction._core.drawing import draw_slopes, hit_slopes, tabulate, variances
 from miricigale.reduction._core.pixel import (
     JUMP,
     JUMP_NEIGHBOR,
@@ -27,4 +28,15 @@ from miricigale.reduction._core.pixel import (
 )
 from miricigale.reduction._core.rows import BLOCK, fit_rows
 
-__all__ = ["BLOCK", "JUMP", "JUMP_NEIGHBOR", "SATURATED", "fit_rows", "refit"]
+__all__ = [
+    "BLOCK",
+    "JUMP",
+    "JUMP_NEIGHBOR",
+    "SATURATED",
+    "draw_slopes",
+    "fit_rows",
+    "hit_slopes",
+    "refit",
+    "tabulate",
+    "variances",
+]

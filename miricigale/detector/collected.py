@@ -1,0 +1,117 @@
+"""What the pixels of an exposure collect in its whole time: what rates are drawn from."""
+
+import dataclasses
+
+import numpy as np
+
+from miricigale.detector.effects import (
+    Bias,
+    FirstFrame,
+    LastFrame,
+    Nonlinearity,
+    ReadNoise,
+    ResetAnomaly,
+)
+from miricigale.instrument import DetectorProperties, Exposure
+
+__all__ = ["Charge"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Charge:
+    """
+    What the pixels of one exposure collect, and how it is read.
+
+    It stands for a `Ramp` where no group is needed: `~miricigale.reduction.Reducer.fit_ramp`
+    draws from it the slopes that it would fit to the ramp. `Detector.collect` makes it.
+
+    Parameters
+    ----------
+    exposure : `~miricigale.instrument.Exposure`
+        What was exposed.
+    mean : `~numpy.ndarray`, shape (ny, nx)
+        Expected electrons per second, without hits; NaN where a pixel sees no light.
+    electrons : `~numpy.ndarray`, shape (ny, nx)
+        Electrons collected in all groups of all integrations, without hits.
+    hits : `~numpy.ndarray` of int32, shape (3, n)
+        Group (counted through all integrations), row and column of each deposit of a cosmic
+        ray; those of a pixel are in the order of the groups, and may be several in one.
+    hit_electrons : `~numpy.ndarray`, shape (n,)
+        Their charge in electrons.
+    pixel_dq : `~numpy.ndarray` of uint32, shape (ny, nx)
+        Flags of pixels, bits as in `~miricigale.instrument.DQ`.
+    effects : tuple of `Effect`
+        What acted on the light, acts on the charge and on its read-out, in order.
+    properties : `~miricigale.instrument.DetectorProperties`
+        Of the detector.
+    seed : int
+        Of what the read-out draws.
+    meta : dict
+        Where it came from.
+    """
+
+    exposure: Exposure
+    mean: np.ndarray
+    electrons: np.ndarray
+    hits: np.ndarray
+    hit_electrons: np.ndarray
+    pixel_dq: np.ndarray
+    effects: tuple
+    properties: DetectorProperties
+    seed: int
+    meta: dict
+
+    def shows(self, kind):
+        """Whether an effect acted, as `Ramp.shows` tells it."""
+        return self._effect(kind) is not None
+
+    @property
+    def total_time(self):
+        """Time in s in which ``electrons`` were collected."""
+        e = self.exposure
+        return e.n_integrations * e.n_groups * e.group_time.to_value("s")
+
+    @property
+    def read_variance(self):
+        """Variance of one read in DN squared: read noise and rounding."""
+        effect = self._effect(ReadNoise)
+        sigma = 0.0 if effect is None else effect.deviation(self.properties)
+        return sigma**2 + 1 / 12
+
+    @property
+    def level(self):
+        """Level of an empty pixel in each group, DN, the mean over the integrations, (n_group,)."""
+        shape = (self.exposure.n_integrations, self.exposure.n_groups)
+        level = np.zeros(shape)
+        if (bias := self._effect(Bias)) is not None:
+            level += bias.mean(self.properties)
+        if (anomaly := self._effect(ResetAnomaly)) is not None:
+            level += anomaly.offsets(*shape)
+        if (first := self._effect(FirstFrame)) is not None:
+            level[:, 0] += first.offset
+        if (last := self._effect(LastFrame)) is not None:
+            level[:, -1] += last.offset
+        return level.mean(axis=0)
+
+    def measured(self, electrons):
+        """DN above the level that charges read."""
+        dn = np.asarray(electrons, float) / self.properties.gain
+        effect = self._effect(Nonlinearity)
+        return dn if effect is None else effect.response(dn, self.properties)
+
+    def limit(self, dn):
+        """Charge in electrons that reads ``dn`` above the level, or at which the pixel is full."""
+        effect = self._effect(Nonlinearity)
+        linear = dn if effect is None else float(effect.linear_dn(dn, self.properties))
+        full = min(effect.limit(self.properties) for effect in self.effects)
+        return min(self.properties.gain * linear, full)
+
+    def _effect(self, kind):
+        return next((effect for effect in self.effects if isinstance(effect, kind)), None)
+
+    def __repr__(self):
+        e, (ny, nx) = self.exposure, self.mean.shape
+        return (
+            f"<Charge {e.filter}: {e.n_integrations} integration(s) x {e.n_groups} groups, "
+            f"{ny} x {nx} pixels, {len(self.hit_electrons)} deposits of cosmic rays>"
+        )

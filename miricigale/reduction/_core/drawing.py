@@ -1,0 +1,341 @@
+"""
+Slopes drawn instead of fitted: what the fit makes of a rate, of its noise and of hits.
+
+Units are those of the fit: DN for the variances ``s`` of a read and v of a difference, whose ratio
+sets the weights (see `miricigale.depth._core`); images are in DN/s, ``mean`` and ``limit`` in
+electrons per second and electrons.
+"""
+
+import math
+
+import numpy as np
+
+from miricigale.depth._core import difference_weight, weight_sums
+from miricigale.reduction._core.pixel import JUMP, JUMP_NEIGHBOR, SATURATED
+from miricigale.utils.compilation import njit
+
+__all__ = ["draw_slopes", "hit_slopes", "tabulate", "variances"]
+
+# what is done to an entry of a pixel
+_OWN = 1
+_NEIGHBOR = 2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def tabulate(levels, slopes, n_int, s, true_s, inv_gain, step):
+    """
+    What the fit makes of ramps without hits: its slope, and how noise enters it.
+
+    ``levels`` (n, n_group) are linear DN of the groups of n ramps, ``slopes`` (n, n_group) the
+    derivative of linear by read DN there. Returns the slopes in DN/s, the time in s over which
+    photons are counted in all integrations, and the standard deviation that reads of variance
+    ``true_s`` give the slope, (3, n).
+    """
+    n, n_group = levels.shape
+    out = np.empty((3, n))
+    n_diff = n_group - 1
+    w = np.empty(n_diff + 2)
+    for k in range(n):
+        slope = (levels[k, n_diff] - levels[k, 0]) / n_diff
+        total, squares = 1.0, 1.0
+        for _ in range(2):
+            v = slope * inv_gain
+            total, squares = weight_sums(n_diff, v, s)
+            w[0] = w[n_diff + 1] = 0.0
+            num = 0.0
+            for i in range(1, n_diff + 1):
+                w[i], _ = difference_weight(i, n_diff, v, s)
+                num += w[i] * (levels[k, i] - levels[k, i - 1])
+            slope = num / total
+        noise = 0.0
+        for g in range(n_group):
+            noise += ((w[g] - w[g + 1]) * slopes[k, g]) ** 2
+        out[0, k] = slope / step
+        out[1, k] = total * total / squares * step * n_int
+        out[2, k] = math.sqrt(true_s * noise / n_int) / (total * step)
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def variances(values, n_int, n_diff, s, inv_gain, step):
+    """Poisson and read variance, (DN/s)^2, that the fit quotes for slopes in DN/s, (2, n)."""
+    out = np.empty((2, values.size))
+    for k in range(values.size):
+        v = max(values[k] * step * inv_gain, 1e-8 * s)
+        total, squares = weight_sums(n_diff, v, s)
+        out[0, k] = v * squares / (total * total * n_int * step * step)
+        out[1, k] = max(1.0 / (total * n_int * step * step) - out[0, k], 0.0)
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _place(value, scale, last):
+    """Node of a table, even in the fourth root of the value, and the place behind it."""
+    place = math.sqrt(math.sqrt(max(value, 0.0))) * scale
+    k = min(int(place), last)
+    return k, min(place - k, 1.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def draw_slopes(mean, electrons, time, normals, table, offset, scale, quoted, quoted_scale, out):
+    """
+    Slopes of pixels without hits, and their quoted variances.
+
+    ``table`` (3, n) has DN/s per electron per second, the time of `tabulate` and the deviation by
+    reads at rates (k / ``scale``)^4; ``quoted`` (2, n) the variances at slopes
+    (k / ``quoted_scale``)^4. ``out`` are three images to be filled.
+    """
+    rate, var_poisson, var_read = out
+    n_row, n_col = mean.shape
+    last, end = table.shape[1] - 2, quoted.shape[1] - 2
+    for y in range(n_row):
+        for x in range(n_col):
+            m = mean[y, x]
+            if m != m:
+                rate[y, x] = var_poisson[y, x] = var_read[y, x] = np.nan
+                continue
+            k, part = _place(m, scale, last)
+            response = table[0, k] + part * (table[0, k + 1] - table[0, k])
+            counted = table[1, k] + part * (table[1, k + 1] - table[1, k])
+            read = table[2, k] + part * (table[2, k + 1] - table[2, k])
+            noise = (electrons[y, x] / time - m) * math.sqrt(time / counted)
+            slope = offset + response * (m + noise) + read * normals[y, x]
+            k, part = _place(slope, quoted_scale, end)
+            rate[y, x] = slope
+            var_poisson[y, x] = quoted[0, k] + part * (quoted[0, k + 1] - quoted[0, k])
+            var_read[y, x] = quoted[1, k] + part * (quoted[1, k + 1] - quoted[1, k])
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _usable(charge, extra, first, limit, g0, g1):
+    """
+    Differences before the group in which a pixel is full.
+
+    ``charge`` comes in each group; ``extra`` came in group ``first``, before which it was not full.
+    """
+    group = g1
+    if extra >= limit:
+        group = first
+    elif charge * g1 + extra >= limit:
+        group = max(math.ceil((limit - extra) / charge) - 1, first)
+    return g1 - g0 - 1 if group >= g1 else max(group - g0 - 1, 0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _list(rate, hits, electrons):
+    """
+    Lists of what comes into each pixel, one entry for a group.
+
+    Returns the first entry of each pixel (-1: none), and of the entries (n,) the next one, the
+    group and the electrons; in arrays with room for 64 more.
+    """
+    ny, nx = rate.shape
+    head, tail = np.full((ny, nx), -1, np.int32), np.empty((ny, nx), np.int32)
+    size = electrons.size + 64
+    link, slot, charge = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size)
+    n = 0
+    for i in range(electrons.size):
+        when, y, x = hits[0, i], hits[1, i], hits[2, i]
+        if rate[y, x] != rate[y, x]:
+            continue
+        if head[y, x] >= 0 and slot[tail[y, x]] == when:
+            charge[tail[y, x]] += electrons[i]
+            continue
+        if head[y, x] < 0:
+            head[y, x] = n
+        else:
+            link[tail[y, x]] = n
+        tail[y, x] = n
+        link[n], slot[n], charge[n] = -1, when, electrons[i]
+        n += 1
+    return head, link, slot, charge, n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _find(rate, variance, mean, head, link, slot, charge, n, n_group, g0, g1, step, limit, s,
+          inv_gain, dn, jump, rng):  # fmt: skip
+    """
+    Jumps that the fit finds, (n_jump, 5) as from `fit_rows`, and which entries are cut by it.
+
+    The statistic of a jump is its expected value plus a standard normal number, which is
+    independent of the slope: the fit is the best linear one.
+    """
+    ny, nx = rate.shape
+    n_diff = g1 - g0 - 1
+    cut = np.zeros(link.size, np.uint8)
+    jumps = np.empty((n, 5))
+    n_jump = 0
+    for y in range(ny):
+        for x in range(nx):
+            i = head[y, x]
+            while i >= 0:
+                g = slot[i] % n_group
+                j = g - g0
+                full = mean[y, x] * step * (g + 1) + charge[i] >= limit
+                if 1 <= j <= n_diff and not full:
+                    slope, share = rate[y, x] * step, variance[y, x] * step * step
+                    q = charge[i] * dn
+                    weight, leverage = difference_weight(j, n_diff, slope * inv_gain, s)
+                    t = q * math.sqrt(max(leverage - weight * weight * share, 0.0))
+                    if 0.5 * jump < t < 2.0 * jump:
+                        # the fit takes its weights from a slope that the hit has raised
+                        v = (slope + weight * share * q) * inv_gain
+                        weight, leverage = difference_weight(j, n_diff, v, s)
+                        t = q * math.sqrt(max(leverage - weight * weight * share, 0.0))
+                    t += rng.standard_normal()
+                    if abs(t) > jump:
+                        cut[i] = _OWN
+                        jumps[n_jump, 0], jumps[n_jump, 1] = y, x
+                        jumps[n_jump, 2], jumps[n_jump, 3] = slot[i] // n_group, j - 1
+                        jumps[n_jump, 4] = t
+                        n_jump += 1
+                i = link[i]
+    return jumps[:n_jump].copy(), cut
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cut_neighbors(rate, head, link, slot, charge, cut, n, jumps, n_group, g0, neighbor):
+    """Cut the entries beside large jumps, or new ones without charge; returns what may grow."""
+    ny, nx = rate.shape
+    for m in range(jumps.shape[0]):
+        if abs(jumps[m, 4]) < neighbor:
+            continue
+        when = int(jumps[m, 2]) * n_group + g0 + 1 + int(jumps[m, 3])
+        for side in range(4):
+            y = int(jumps[m, 0]) + (side == 0) - (side == 1)
+            x = int(jumps[m, 1]) + (side == 2) - (side == 3)
+            if not (0 <= y < ny and 0 <= x < nx and rate[y, x] == rate[y, x]):
+                continue
+            before, i = -1, head[y, x]
+            while i >= 0 and slot[i] < when:
+                before, i = i, link[i]
+            if i < 0 or slot[i] != when:
+                if n == link.size:
+                    link, slot = np.append(link, link), np.append(slot, slot)
+                    charge, cut = np.append(charge, charge), np.append(cut, cut)
+                link[n], slot[n], charge[n], cut[n] = i, when, 0.0, 0
+                i, n = n, n + 1
+                if before < 0:
+                    head[y, x] = i
+                else:
+                    link[before] = i
+            cut[i] |= _NEIGHBOR
+    return link, slot, charge, cut
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sums(lengths, n, v, s, whole, n_whole):
+    """Sums of the weights and of their squares over the segments of a pixel."""
+    total, squares = weight_sums(whole, v, s)
+    total *= n_whole
+    squares *= n_whole
+    for i in range(n):
+        one, square = weight_sums(lengths[i], v, s)
+        total += one
+        squares += square
+    return total, squares
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def hit_slopes(
+    mean,
+    hits,
+    electrons,
+    n_int,
+    n_group,
+    g0,
+    g1,
+    step,
+    limit,
+    s,
+    inv_gain,
+    dn,
+    jump,
+    neighbor,
+    rng,
+    rate,
+    var_poisson,
+    var_read,
+    n_used,
+    n_jump,
+    dq,
+):
+    """
+    Change the slopes of pixels that lose groups to hits or saturation, or keep a hit.
+
+    ``hits`` (3, n) are group, row and column of deposits of ``electrons``, those of a pixel in the
+    order of the groups; ``dn`` is the inverse of the true gain. The fit to fewer groups is that
+    to all of them plus independent noise of the difference of the variances. Returns the jumps that
+    are found, as `fit_rows`.
+    """
+    ny, nx = rate.shape
+    n_diff = g1 - g0 - 1
+    head, link, slot, charge, n = _list(rate, hits, electrons)
+    jumps, cut = _find(
+        rate, var_poisson + var_read, mean, head, link, slot, charge, n, n_group, g0, g1, step,
+        limit, s, inv_gain, dn, jump, rng,
+    )  # fmt: skip
+    link, slot, charge, cut = _cut_neighbors(
+        rate, head, link, slot, charge, cut, n, jumps, n_group, g0, neighbor
+    )
+    # segments that are not whole integrations; hits that stay: segment, difference, charge
+    lengths = np.empty(n_int * (n_diff + 1) + 1, np.int64)
+    kept = np.empty((n_int * n_group, 3))
+    for y in range(ny):
+        for x in range(nx):
+            i = head[y, x]
+            each = mean[y, x] * step
+            whole = _usable(each, 0.0, 0, limit, g0, g1)
+            if rate[y, x] != rate[y, x] or (i < 0 and whole == n_diff):
+                continue
+            n_whole, n_seg, n_kept = n_int, 0, 0
+            own, beside, full = 0, False, whole < n_diff
+            while i >= 0:
+                k = slot[i] // n_group
+                n_whole -= 1
+                begin, last, extra = 1, whole, 0.0
+                while i >= 0 and slot[i] // n_group == k:
+                    g = slot[i] % n_group
+                    j = g - g0
+                    beside = beside or (cut[i] & _NEIGHBOR) > 0
+                    if j <= last:
+                        extra += charge[i]
+                        last = min(last, _usable(each, extra, g, limit, g0, g1))
+                        if 1 <= j <= last and cut[i]:
+                            own += cut[i] & _OWN
+                            if j > begin:
+                                lengths[n_seg] = j - begin
+                                n_seg += 1
+                            begin = j + 1
+                        elif 1 <= j <= last:
+                            kept[n_kept, 0], kept[n_kept, 1] = n_seg, j - begin + 1
+                            kept[n_kept, 2] = charge[i]
+                            n_kept += 1
+                    i = link[i]
+                full = full or last < n_diff
+                if last >= begin:
+                    lengths[n_seg] = last - begin + 1
+                    n_seg += 1
+            used = n_whole * whole
+            for m in range(n_seg):
+                used += lengths[m]
+            n_used[y, x] = used
+            n_jump[y, x] = own
+            dq[y, x] |= SATURATED * full + JUMP * (own > 0 or beside) + JUMP_NEIGHBOR * beside
+            if used == 0:
+                rate[y, x] = var_poisson[y, x] = var_read[y, x] = np.nan
+                continue
+            shift = 0.0
+            # the fit's weights know the slope with the hits that it keeps
+            for _ in range(1 if n_kept == 0 else 3):
+                v = (rate[y, x] * step + shift) * inv_gain
+                total, squares = _sums(lengths, n_seg, v, s, whole, n_whole)
+                shift = 0.0
+                for m in range(n_kept):
+                    weight, _ = difference_weight(kept[m, 1], lengths[int(kept[m, 0])], v, s)
+                    shift += weight * kept[m, 2] * dn / total
+            more = max(1.0 / total - (var_poisson[y, x] + var_read[y, x]) * step * step, 0.0)
+            rate[y, x] += (shift + math.sqrt(more) * rng.standard_normal()) / step
+            var_poisson[y, x] = max(v, 0.0) * squares / (total * step) ** 2
+            var_read[y, x] = max(1.0 / (total * step * step) - var_poisson[y, x], 0.0)
+    return jumps

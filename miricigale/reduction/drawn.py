@@ -1,0 +1,102 @@
+"""
+Slopes of an exposure whose groups were not followed, with the noise of the fit.
+
+A slope is the best linear combination of differences, so that little is needed to draw it: its
+mean, which is the fit to the expected ramp; photon noise, which is that of the collected electrons
+but counted over a shorter time; read noise; and for pixels that lose groups an independent amount
+more, since the covariance of the best estimate with one from fewer data is its own variance. Hits
+come one by one: each is found or kept by the statistic that the fit would compute, and what is
+kept shifts the slope by the weight of its difference.
+"""
+
+import numpy as np
+from numpy.polynomial import polynomial
+
+from miricigale.reduction import _core
+from miricigale.reduction.rampfit import fit_result, threshold
+from miricigale.utils.random import stream
+
+__all__ = ["draw_groups"]
+
+# nodes of the tables by rate and by slope; they are even in its fourth root
+_NODES = 1024
+_SLOPES = 4096
+
+
+def draw_groups(
+    charge,
+    *,
+    group_time,
+    gain,
+    read_noise,
+    bias,
+    linearity,
+    saturation,
+    usable,
+    first_group,
+    last_group,
+    jump_threshold,
+    neighbor_threshold,
+    poisson_factor,
+):
+    """
+    Draw the slopes that `fit_groups` would fit to the ramps of an exposure.
+
+    Parameters
+    ----------
+    charge : `~miricigale.detector.Charge`
+        What is collected, and how it is read.
+    bias : float or array_like, shape (n_int, n_group)
+        As for `fit_groups`; its mean over the integrations counts.
+    group_time, gain, read_noise, linearity, saturation, usable, first_group, last_group : optional
+        As for `fit_groups`: what the fit knows of the detector, which need not be the truth.
+    jump_threshold, neighbor_threshold, poisson_factor : optional
+        As for `fit_groups`.
+
+    Returns
+    -------
+    fit : `RampFit`
+    """
+    exposure, truth = charge.exposure, charge.properties
+    n_int, n_group = exposure.n_integrations, exposure.n_groups
+    n_diff = last_group - first_group - 1
+    offset = np.broadcast_to(np.asarray(bias, float), (n_int, n_group)).mean(axis=0)
+    level = charge.level
+    limit = charge.limit(saturation - level.mean())
+    s, inv_gain = max(read_noise**2 + 1 / 12, 1e-6), poisson_factor / gain
+    rng = stream(charge.seed, "slopes", exposure.filter, exposure.dither)
+
+    # rates that fill a pixel by the last group, and below
+    scale = (_NODES - 1) / (limit / (n_group * group_time)) ** 0.25
+    rates = (np.arange(_NODES) / scale) ** 4
+    groups = np.arange(first_group, last_group)
+    read = charge.measured(rates[:, None] * group_time * (groups + 1)) + (level - offset)[groups]
+    linear = polynomial.polyval(read, linearity)
+    derivative = polynomial.polyval(read, polynomial.polyder(linearity))
+    table = _core.tabulate(linear, derivative, n_int, s, charge.read_variance, inv_gain, group_time)
+    zero = table[0, 0]
+    table[0, 1:] = (table[0, 1:] - zero) / rates[1:]
+    # where rates are too low to be told from none
+    table[0, :9] = table[0, 9]
+    # pixels that are full in the first group have no slope
+    quoted_scale = (_SLOPES - 1) / (limit / (group_time * truth.gain)) ** 0.25
+    quoted = _core.variances(
+        (np.arange(_SLOPES) / quoted_scale) ** 4, n_int, n_diff, s, inv_gain, group_time
+    )
+
+    shape = exposure.shape
+    images = tuple(np.empty(shape, np.float32) for _ in range(3))
+    mean = np.where(usable, charge.mean, np.nan)
+    normals = rng.standard_normal(shape, np.float32)
+    _core.draw_slopes(
+        mean, charge.electrons, charge.total_time, normals, table, zero, scale, quoted,
+        quoted_scale, images,
+    )  # fmt: skip
+    n_used = np.where(usable, np.int16(n_int * n_diff), np.int16(0))
+    n_jump, flags = np.zeros(shape, np.int16), np.zeros(shape, np.int64)
+    jumps = _core.hit_slopes(
+        mean, charge.hits, charge.hit_electrons, n_int, n_group, first_group, last_group,
+        group_time, limit, s, inv_gain, 1 / truth.gain, threshold(jump_threshold, "jump_threshold"),
+        threshold(neighbor_threshold, "neighbor_threshold"), rng, *images, n_used, n_jump, flags,
+    )  # fmt: skip
+    return fit_result(*images, n_used, n_jump, flags, jumps, first_group)

@@ -1,0 +1,298 @@
+"""Drawn slopes against those that are fitted to the ramps of the same exposures."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData
+from numpy.testing import assert_allclose, assert_array_equal
+from photutils.aperture import CircularAnnulus, CircularAperture, aperture_photometry
+
+from miricigale.detector import (
+    CosmicRays,
+    Detector,
+    FirstFrame,
+    LastFrame,
+    ResetAnomaly,
+    Residual,
+)
+from miricigale.instrument import (
+    DQ,
+    Exposure,
+    background_level,
+    miri_detector,
+    mosaic_wcs,
+    pixel_area_map,
+)
+from miricigale.reduction import Reducer
+
+CENTER = SkyCoord(53.1344, -27.8344, unit="deg")
+STORM = CosmicRays(flux=8e-7)  # ten times as many as there are
+F770W = ("miri.f770w", 200, 1)
+F2100W = ("miri.f2100w", 10, 28)
+
+
+def exposure_of(band, n_groups, n_integrations, *, dither=0, subarray="SUB256"):
+    return Exposure(
+        band,
+        n_groups=n_groups,
+        n_integrations=n_integrations,
+        subarray=subarray,
+        pointing=CENTER.directional_offset_by(1 * u.rad, dither * 1.37 * u.arcsec),
+        roll=30 * u.deg,
+        dither=dither,
+    )
+
+
+def both(exposure, light, *effects, seed=1, without=(), reducer=None, properties=None):
+    """Fits to the ramp, and to what was collected, of one exposure; and the true slope."""
+    reducer = Reducer() if reducer is None else reducer
+    detector = Detector.miri_imager(*effects, properties=properties).without(*without)
+    image = CCDData(np.broadcast_to(light, exposure.shape).copy(), unit="MJy/sr")
+    charge = detector.collect(image, exposure, seed=seed)
+    fits = [
+        reducer.fit_groups(exposed)
+        for exposed in (detector.expose(image, exposure, seed=seed), charge)
+    ]
+    return fits, charge.mean / miri_detector().gain
+
+
+def inside(array):
+    """Without the rim, whose neighbors are not on the image, and without unusable pixels."""
+    return array[1:-1, 1:-1]
+
+
+def pulls(fit, truth):
+    return inside((fit.rate - truth) / fit.error)
+
+
+@pytest.mark.parametrize(
+    ("mode", "effects", "without"),
+    [
+        (F770W, (), ()),
+        (F770W, (STORM, Residual("etc")), ()),
+        (F770W, (), (CosmicRays,)),
+        (F2100W, (STORM,), ()),
+        (F2100W, (Residual("etc"),), (CosmicRays,)),
+        (("miri.f560w", 6, 2), (CosmicRays(flux=1e-5),), ()),
+        (("miri.f1000w", 3, 1), (STORM,), ()),
+    ],
+)
+def test_slopes_have_the_noise_of_the_fit(mode, effects, without):
+    exposure = exposure_of(*mode)
+    (fitted, drawn), truth = both(
+        exposure, background_level(mode[0]).value, *effects, without=without
+    )
+    assert_array_equal(np.isnan(inside(drawn.rate)), np.isnan(inside(fitted.rate)))
+    good = np.isfinite(inside(drawn.rate))
+    n = good.sum()
+    for fit in (fitted, drawn):
+        pull = pulls(fit, truth)[good]
+        assert 0.98 < pull.std() < 1.03
+        # errors follow the slopes, which lowers the mean pull of short exposures
+        assert abs(pull.mean()) < 0.02
+        assert abs(inside(fit.rate - truth)[good].mean()) < max(
+            5 * inside(fit.error)[good].mean() / np.sqrt(n), 1e-3 * np.nanmedian(truth)
+        )
+        assert np.mean(np.abs(pull) > 5) < 1e-3
+    ratio = inside(drawn.error)[good] / inside(fitted.error)[good]
+    assert_allclose(np.median(ratio), 1, atol=2e-3)
+    assert_allclose(np.mean(ratio), 1, atol=2e-3)
+    clean = inside((fitted.flags | drawn.flags) == 0)
+    for part in ("var_poisson", "var_read"):
+        a, b = (inside(getattr(fit, part))[clean] for fit in (fitted, drawn))
+        noise = np.hypot(a.std(), b.std()) / np.sqrt(clean.sum())
+        assert_allclose(b.mean(), a.mean(), rtol=1e-3, atol=5 * noise)
+    assert_allclose(
+        inside(drawn.n_used)[good].mean(), inside(fitted.n_used)[good].mean(), rtol=1e-3
+    )
+
+
+@pytest.mark.parametrize("mode", [F770W, F2100W])
+def test_the_same_hits_are_found_and_cost_the_same(mode):
+    (fitted, drawn), truth = both(exposure_of(*mode), background_level(mode[0]).value, STORM)
+    hit = (fitted.flags & DQ.JUMP_DET) != 0
+    assert 0.2 < hit.mean() < 0.6
+    assert len(drawn.jumps) == pytest.approx(len(fitted.jumps), rel=0.02)
+    for flag in (DQ.JUMP_DET, DQ.JUMP_NEIGHBOR, DQ.SATURATED):
+        a, b = ((fit.flags & flag) != 0 for fit in (fitted, drawn))
+        assert b.sum() == pytest.approx(a.sum(), rel=0.02, abs=3 * np.sqrt(a.sum()))
+        # those about the threshold are told by the noise
+        assert np.mean(a != b) < 0.02 + 0.03 * a.mean()
+    hit &= (drawn.flags & DQ.JUMP_DET) != 0
+    assert_allclose(np.nanmean(drawn.error[hit] / fitted.error[hit]), 1, atol=2e-3)
+    widths = [np.nanstd(((fit.rate - truth) / fit.error)[hit]) for fit in (fitted, drawn)]
+    assert_allclose(widths, 1, atol=0.03)
+    # significances of jumps that both know
+    sure = [np.abs(fit.jumps["significance"]) > 20 for fit in (fitted, drawn)]
+    assert np.sum(sure[1]) == pytest.approx(np.sum(sure[0]), rel=0.02)
+
+
+def test_hits_that_are_not_cut_stay_where_they_are():
+    reducer = Reducer(jump_threshold=None)
+    (fitted, drawn), truth = both(
+        exposure_of(*F770W), background_level("miri.f770w").value, STORM, reducer=reducer
+    )
+    assert len(drawn.jumps) == 0
+    one, other = pulls(fitted, truth), pulls(drawn, truth)
+    assert np.nanmean(one > 5) > 0.1
+    # pixel by pixel the same shift, so that the difference has the noise of two fits
+    usual = np.abs(one) < 100
+    assert np.nanstd((other - one)[usual]) == pytest.approx(np.sqrt(2), rel=0.03)
+    assert np.nanmean((other - one)[usual]) == pytest.approx(0, abs=0.03)
+
+
+def test_hits_below_the_threshold_make_the_same_tails():
+    reducer = Reducer(jump_threshold=20, neighbor_threshold=None)
+    level = background_level("miri.f770w").value
+    tails = []
+    for seed in range(5):
+        fits, truth = both(exposure_of(*F770W), level, STORM, reducer=reducer, seed=seed)
+        tails.append([np.sum(pulls(fit, truth) > 5) for fit in fits])
+    fitted, drawn = np.sum(tails, axis=0)
+    assert fitted > 1500
+    assert drawn == pytest.approx(fitted, rel=0.05)
+
+
+def test_errors_follow_the_light_up_to_saturation():
+    exposure = exposure_of("miri.f770w", 40, 2)
+    light = np.broadcast_to(np.geomspace(1, 2e6, exposure.shape[1]), exposure.shape)
+    (fitted, drawn), truth = both(exposure, light, STORM)
+    first = np.isnan(fitted.rate).mean(axis=0)
+    assert 0.05 < np.mean(first > 0.9) < 0.9
+    assert_allclose(np.isnan(drawn.rate).mean(axis=0), first, atol=0.03)
+    for flag in (DQ.SATURATED, DQ.NO_SLOPE | DQ.DO_NOT_USE):
+        a, b = ((fit.flags & flag) != 0 for fit in (fitted, drawn))
+        assert np.mean(a != b) < 2e-3
+    bins = np.array_split(np.arange(1, exposure.shape[1] - 1), 16)
+    for columns in bins:
+        ratio = (drawn.error / fitted.error)[1:-1, columns]
+        if np.isfinite(ratio).mean() < 0.5:
+            continue
+        assert_allclose(np.nanmedian(ratio), 1, atol=0.01)
+        assert_allclose(np.nanmean(ratio), 1, atol=0.02)
+        # slopes that stand on one or two groups judge their own error
+        widths = [np.nanstd(((f.rate - truth) / f.error)[1:-1, columns]) for f in (fitted, drawn)]
+        assert_allclose(widths[1], widths[0], rtol=0.05)
+        assert_allclose(widths[1], 1, atol=0.05)
+
+
+def test_what_the_reduction_assumes_need_not_be_true():
+    known = miri_detector()
+    true = known.replace(
+        gain=1.01 * known.gain,
+        read_noise=1.3 * known.read_noise,
+        nonlinearity=(0.0, 1.0, *(1.3 * c for c in known.nonlinearity[2:])),
+    )
+    exposure = exposure_of("miri.f770w", 60, 1)
+    light = np.broadcast_to(np.geomspace(1, 200, exposure.shape[1]), exposure.shape)
+    (fitted, drawn), truth = both(exposure, light, properties=true, without=(CosmicRays,))
+    for columns in np.array_split(np.arange(1, exposure.shape[1] - 1), 8):
+        off = [(fit.rate - truth)[1:-1, columns] for fit in (fitted, drawn)]
+        mean = [np.nanmean(o / truth[1:-1, columns]) for o in off]
+        error = np.nanstd(off[0] / truth[1:-1, columns]) / np.sqrt(off[0].size)
+        assert_allclose(mean[1], mean[0], atol=6 * error)
+        scatter = [np.nanstd(o / fitted.error[1:-1, columns]) for o in off]
+        assert_allclose(scatter[1], scatter[0], rtol=0.05)
+    assert abs(mean[0] + 0.01) > 5 * error
+
+
+def test_what_resets_do_is_undone_or_stays_as_in_the_ramps():
+    exposure = exposure_of("miri.f1500w", 12, 3)
+    resets = (ResetAnomaly(), FirstFrame(), LastFrame())
+    level = background_level("miri.f1500w").value
+    for reducer, low in (
+        (Reducer(reset_anomaly=ResetAnomaly()), False),
+        (Reducer(skip_first=2, skip_last=1), True),
+    ):
+        (fitted, drawn), truth = both(
+            exposure, level, *resets, without=(CosmicRays,), reducer=reducer
+        )
+        means = [np.nanmean(inside(fit.rate - truth)) for fit in (fitted, drawn)]
+        sigma = np.nanmean(inside(fitted.error)) / 256
+        assert_allclose(means[1], means[0], atol=6 * sigma)
+        assert (means[1] > 5 * sigma) == low
+        assert_allclose(np.nanmedian(drawn.error), np.nanmedian(fitted.error), rtol=2e-3)
+
+
+def test_images_of_both_go_on_alike():
+    exposure = exposure_of("miri.f1000w", 20, 1)
+    detector, reducer = Detector.miri_imager(), Reducer()
+    image = CCDData(np.full(exposure.shape, 11.5), unit="MJy/sr")
+    fitted, drawn = (
+        reducer.fit_ramp(exposed)
+        for exposed in (
+            detector.expose(image, exposure, seed=1),
+            detector.collect(image, exposure, seed=1),
+        )
+    )
+    assert drawn.unit == fitted.unit
+    assert set(drawn.meta) == set(fitted.meta)
+    changing = {"created", "n_jumps", "noise_correction"}
+    for key in set(drawn.meta) - changing:
+        assert drawn.meta[key] == fitted.meta[key]
+    assert drawn.meta["noise_correction"] == pytest.approx(
+        fitted.meta["noise_correction"], rel=1e-3
+    )
+    assert drawn.data.dtype == fitted.data.dtype
+    assert drawn.flags.dtype == fitted.flags.dtype
+    assert_array_equal(drawn.mask, (drawn.flags & DQ.DO_NOT_USE) != 0)
+    cal, background = reducer.subtract_background(reducer.calibrate(drawn))
+    assert cal.unit == "MJy / sr"
+    assert np.median(background.level) == pytest.approx(11.5, rel=0.01)
+
+
+def test_same_seed_same_slopes_on_any_number_of_threads():
+    exposure = exposure_of("miri.f1000w", 20, 1)
+    image = CCDData(np.full(exposure.shape, 11.5), unit="MJy/sr")
+    detector, reducer = Detector.miri_imager(STORM), Reducer()
+    one, two, other = (
+        reducer.replace(n_threads=n).fit_groups(
+            detector.collect(image, exposure, seed=seed, n_threads=n)
+        )
+        for seed, n in ((3, 1), (3, 3), (4, 2))
+    )
+    for name in ("rate", "var_poisson", "var_read", "n_used", "n_jump", "flags", "jumps"):
+        assert_array_equal(getattr(one, name), getattr(two, name))
+    assert np.nanmean(one.rate == other.rate) < 0.01
+
+
+def limits(detector, mode, make, *, seed, reducer):
+    """Standard deviation of empty apertures on the mosaic of three dithers, and their errors."""
+    exposures = [exposure_of(*mode, dither=d) for d in range(3)]
+    level = background_level(mode[0]).value
+    ramps = (
+        getattr(detector, make)(CCDData(np.full(e.shape, level), unit="MJy/sr"), e, seed=seed)
+        for e in exposures
+    )
+    wcs = mosaic_wcs(exposures, 0.11 * u.arcsec)
+    mosaic = reducer.run(ramps, wcs=wcs).mosaic
+    ny, nx = mosaic.shape
+    y, x = np.mgrid[20 : ny - 20 : 8, 20 : nx - 20 : 8].reshape(2, -1)
+    at = np.column_stack([x, y])
+    data = mosaic.data * pixel_area_map(wcs, mosaic.shape) * 1e12
+    area = CircularAperture(at, 3.0), CircularAnnulus(at, 5.0, 9.0)
+    inner, ring, lost = (
+        np.asarray(aperture_photometry(values, a)["aperture_sum"])
+        for values, a in (
+            (np.where(mosaic.mask, 0, data), area[0]),
+            (np.where(mosaic.mask, 0, data), area[1]),
+            (np.asarray(mosaic.mask, float), area[1]),
+        )
+    )
+    flux = inner - ring * area[0].area / area[1].area
+    return flux[lost == 0], float(np.mean(mosaic.mask))
+
+
+@pytest.mark.parametrize("mode", [("miri.f770w", 60, 1), ("miri.f2100w", 10, 4)])
+def test_apertures_on_mosaics_reach_the_same_limits(mode):
+    detector, reducer = Detector.miri_imager(Residual("etc")), Reducer()
+    fitted, drawn = (
+        [limits(detector, mode, make, seed=seed, reducer=reducer) for seed in range(4)]
+        for make in ("expose", "collect")
+    )
+    noise = [np.std(np.concatenate([flux for flux, _ in runs])) for runs in (fitted, drawn)]
+    assert len(np.concatenate([flux for flux, _ in drawn])) > 2000
+    assert_allclose(noise[1], noise[0], rtol=0.05)
+    masked = [np.mean([share for _, share in runs]) for runs in (fitted, drawn)]
+    assert_allclose(masked[1], masked[0], atol=1e-3)
