@@ -20,8 +20,10 @@ __getattr__, __dir__, __all__ = lazy_names(
         "saturation": (
             "SaturationForecast",
             "forecast_table",
+            "saturation_flux",
             "saturation_forecast",
             "saturation_time",
         ),
+        "zodiacal": ("zodiacal_factor", "zodiacal_levels"),
     },
 )

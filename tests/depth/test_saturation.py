@@ -2,12 +2,14 @@
 
 import astropy.units as u
 import numpy as np
+import pytest
 from astropy.coordinates import SkyCoord
 from astropy.tests.helper import assert_quantity_allclose
 from numpy.testing import assert_allclose
 
-from miricigale.depth import saturation_forecast, saturation_time
-from miricigale.instrument import DetectorProperties, Exposure
+from miricigale.depth import saturation_flux, saturation_forecast, saturation_time
+from miricigale.instrument import DetectorProperties, Exposure, background_level
+from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
 
 
 def test_sky_fills_the_wells_in_the_known_times():
@@ -25,3 +27,22 @@ def test_forecast_counts_photons():
     assert_allclose(forecast, 10 / (0.272 / 3.1) * 277.5 / 1e5)
     image = np.full((3, 4), 10.0) * u.MJy / u.sr
     assert saturation_forecast(exposure, background=image, detector=detector).shape == (3, 4)
+
+
+def test_a_point_source_of_the_saturation_flux_fills_the_well_by_the_last_group():
+    exposure = Exposure(
+        "miri.f1000w", n_groups=200, pointing=SkyCoord(1, 2, unit="deg"), roll=0 * u.deg
+    )
+    flux = saturation_flux(exposure)
+    # the light of the source as a surface brightness of its brightest pixel
+    share = psf_image(miri_psf("miri.f1000w"), pixel_scale=MIRI_PIXEL_SCALE, shape=(5, 5)).max()
+    brightness = (flux * share / MIRI_PIXEL_SCALE**2).to(u.MJy / u.sr)
+    sky = background_level("miri.f1000w")
+    assert saturation_forecast(exposure, background=sky + brightness) == pytest.approx(
+        1.0, rel=1e-6
+    )
+    # where the sky alone fills the well there is no room
+    assert saturation_flux(exposure, background=1e4 * u.MJy / u.sr) == 0 * u.uJy
+    # half the integration: more than twice the flux, as the sky takes its part of the well
+    shorter = exposure.replace(n_groups=exposure.n_groups // 2)
+    assert saturation_flux(shorter) > 2 * flux

@@ -1,0 +1,117 @@
+"""How bright the zodiacal light is: by level, by ecliptic latitude, by position and date."""
+
+import functools
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import BarycentricMeanEcliptic, SkyCoord, get_sun
+from astropy.table import QTable
+from astropy.time import Time
+
+from miricigale.filters import Filter
+from miricigale.instrument import background_level
+from miricigale.instrument.figures import filter_row
+from miricigale.instrument.wcs import scalar_position
+from miricigale.refdata import locate
+from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.optional import require
+
+__all__ = ["zodiacal_factor", "zodiacal_levels"]
+
+#: Angles from the Sun, deg, between which the telescope may look.
+_FIELD_OF_REGARD = (85.0, 135.0)
+
+
+@functools.cache
+def _table():
+    return QTable.read(locate("instrument.zodiacal"), format="ascii.ecsv")
+
+
+def zodiacal_levels():
+    """Names of the levels of `zodiacal_factor`, from dark to bright."""
+    return tuple(dict.fromkeys(str(level) for level in _table()["level"]))
+
+
+def zodiacal_factor(filter, level="medium", *, position=None, date=None):
+    """
+    Zodiacal light over the low one, which `~miricigale.instrument.background_level` takes as its ``zodi``.
+
+    Parameters
+    ----------
+    filter : str
+        One of `~miricigale.instrument.imager_filters`.
+    level : str, optional
+        ``"low"``, ``"medium"`` or ``"high"``: the 10th, 50th and 90th percentile over the days on
+        which the position can be seen, or, without a position, over the whole sky.
+    position : `~astropy.coordinates.SkyCoord`, optional
+        Where the telescope looks; its ecliptic latitude counts.
+    date : `~astropy.time.Time` or str, optional
+        With a position: the light of that day, in place of a level. Needs the package zodipy.
+
+    Returns
+    -------
+    factor : float
+
+    Raises
+    ------
+    ImportError
+        If a date is given and zodipy is not installed.
+    KeyError
+        If there is no such filter or level.
+    ValueError
+        If a date comes without a position, or the position is too near to the Sun, or too far from
+        it, to be seen on that day.
+
+    Notes
+    -----
+    After the model of Kelsall et al. 1998 [1]_ as ZodiPy [2]_ evaluates it at the pivot wavelengths,
+    from L2 and between 85 and 135 degrees from the Sun: ``tools/make_zodiacal.py``. Approximations:
+    percentiles are over four ecliptic longitudes, latitudes between those of the table are
+    interpolated, north and south are alike, and light of the Galaxy and stray light are not in it.
+
+    References
+    ----------
+    .. [1] Kelsall et al. 1998, ApJ 508, 44
+    .. [2] San 2024, JOSS 9, 6648
+
+    Examples
+    --------
+    >>> from astropy.coordinates import SkyCoord
+    >>> from miricigale.depth import zodiacal_factor
+    >>> cosmos = SkyCoord("10h00m29s +02d12m21s")
+    >>> print(f"{zodiacal_factor('miri.f1000w', 'medium', position=cosmos):.1f}")
+    1.9
+    """
+    name = f"miri.{str(filter).removeprefix('miri.')}"
+    filter_row(name)
+    if position is not None:
+        ra, dec = scalar_position(position, "position")
+        position = SkyCoord(ra * u.deg, dec * u.deg)
+    if date is not None:
+        if position is None:
+            raise argument_error("date", "given with a position", date)
+        return _factor_on(name, position, Time(date))
+    if level not in zodiacal_levels():
+        raise unknown_name("level of the zodiacal light", level, zodiacal_levels())
+    rows = _table()[_table()["level"] == level]
+    latitude = rows["latitude"].to_value(u.deg)
+    if position is None:
+        return float(rows[name][np.isnan(latitude)][0])
+    ecliptic = position.transform_to(BarycentricMeanEcliptic)
+    known = np.isfinite(latitude)
+    return float(np.interp(abs(ecliptic.lat.deg), latitude[known], rows[name][known]))
+
+
+def _factor_on(name, position, date):
+    """Light of the model of Kelsall et al. 1998 on a day, over the low one."""
+    sun = get_sun(date)
+    angle = position.separation(SkyCoord(sun.ra, sun.dec)).deg
+    near, far = _FIELD_OF_REGARD
+    if not near <= angle <= far:
+        wanted = f"a day on which the position is {near:g} to {far:g} deg from the Sun"
+        raise argument_error("date", wanted, f"{date.isot[:10]} ({angle:.0f} deg)")
+    zodipy = require("zodipy", extra="background")
+    place = SkyCoord(position.ra, position.dec, obstime=date)
+    light = zodipy.Model(Filter.from_name(name).pivot).evaluate(place, obspos="semb-l2")
+    low = background_level(name) - background_level(name, zodi="none")
+    return float(light.squeeze() / low)

@@ -1,0 +1,66 @@
+"""Zodiacal light by level, latitude and day."""
+
+import sys
+
+import numpy as np
+import pytest
+from astropy.coordinates import BarycentricMeanEcliptic, SkyCoord
+
+from miricigale.depth import zodiacal_factor, zodiacal_levels
+from miricigale.instrument import imager_filters
+
+
+def at(latitude):
+    return SkyCoord(40.0, latitude, unit="deg", frame=BarycentricMeanEcliptic)
+
+
+@pytest.mark.parametrize("name", imager_filters())
+def test_the_low_level_is_the_darkest_tenth_of_the_sky(name):
+    # two sources that know nothing of each other: the dust model of Kelsall et al. 1998, and the
+    # low background that the package takes from published figures
+    assert zodiacal_factor(name, "low") == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("name", ["miri.f770w", "miri.f2100w"])
+def test_the_light_rises_to_the_ecliptic_and_with_the_level(name):
+    latitudes = (90, 60, 45, 30, 15, 0)
+    medium = [zodiacal_factor(name, "medium", position=at(b)) for b in latitudes]
+    # poleward of 45 degrees the differences are those between days
+    assert np.all(np.diff(medium[2:]) > 0)
+    assert medium[-1] > 1.7
+    for b in latitudes:
+        low, middle, high = (zodiacal_factor(name, k, position=at(b)) for k in zodiacal_levels())
+        assert low < middle < high
+        assert zodiacal_factor(name, "high", position=at(-b)) == pytest.approx(high, rel=1e-6)
+
+
+def test_a_day_needs_a_position_that_can_be_seen_on_it():
+    with pytest.raises(ValueError, match="'date' must be given with a position"):
+        zodiacal_factor("miri.f770w", date="2027-03-01")
+    # the Sun is at longitude 340 then
+    sun = SkyCoord(340.0, 0.0, unit="deg", frame=BarycentricMeanEcliptic)
+    with pytest.raises(ValueError, match="85 to 135 deg from the Sun, got 2027-03-01"):
+        zodiacal_factor("miri.f770w", position=sun, date="2027-03-01")
+
+
+def test_the_light_of_a_day_lies_within_its_levels():
+    pytest.importorskip("zodipy")
+    # 100 degrees from the Sun
+    position = SkyCoord(80.0, 10.0, unit="deg", frame=BarycentricMeanEcliptic)
+    day = zodiacal_factor("miri.f1000w", position=position, date="2027-03-01")
+    low, high = (zodiacal_factor("miri.f1000w", k, position=position) for k in ("low", "high"))
+    assert 0.9 * low < day < 1.1 * high
+
+
+def test_without_the_package_the_command_to_install_it_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "zodipy", None)
+    position = SkyCoord(80.0, 10.0, unit="deg", frame=BarycentricMeanEcliptic)
+    with pytest.raises(ImportError, match=r"miricigale\[background\]"):
+        zodiacal_factor("miri.f1000w", position=position, date="2027-03-01")
+
+
+def test_unknown_names_are_told():
+    with pytest.raises(KeyError, match="no level of the zodiacal light 'mid'; known: high, low"):
+        zodiacal_factor("miri.f770w", "mid")
+    with pytest.raises(KeyError, match=r"no imaging filter 'miri\.f707w'"):
+        zodiacal_factor("f707w")
