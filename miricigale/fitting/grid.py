@@ -134,9 +134,12 @@ class GridEngine:
         n_padded = -(-n_galaxy // block) * block
         padded = np.ones((n_z, n_padded, n_bands))
         padded[:, :n_galaxy] = self.galaxy
-        tiles = padded.reshape(n_z, -1, block, n_bands).transpose(0, 1, 3, 2).copy()
+        tiles = _core.aligned(n_z, n_padded // block, n_bands, block)
+        tiles[:] = padded.reshape(n_z, -1, block, n_bands).transpose(0, 1, 3, 2)
         unit, agn_unit = _unit(self.galaxy), _unit(self.agn)
         padded[:, :n_galaxy] /= unit
+        galaxy32 = _core.aligned(n_z, n_bands, n_padded, dtype=np.float32)
+        galaxy32[:] = padded.transpose(0, 2, 1)
         log_galaxy = _two_log(self.prior_galaxy / self.prior_galaxy.sum())
         log_usable = np.full((n_z, n_padded), -1e300)
         log_usable[:, :n_galaxy] = np.where(self.usable, log_galaxy, -1e300)
@@ -159,7 +162,7 @@ class GridEngine:
             galaxy=np.array(self.galaxy, order="C"),
             agn=np.array(self.agn, order="C"),
             tiles=tiles,
-            galaxy32=padded.transpose(0, 2, 1).astype(np.float32, order="C"),
+            galaxy32=galaxy32,
             agn32=(self.agn / agn_unit).astype(np.float32, order="C"),
             galaxy_unit=np.array(unit[:, :, 0], order="C"),
             log_usable=log_usable,
@@ -316,16 +319,8 @@ class GridEngine:
             out.agn[i] = agn / agn.sum()
         mean, square = sums.band / total
         out.band[i] = mean, np.sqrt(np.maximum(square - mean * mean, 0.0))
-        _core.summarize(
-            self._scales,
-            sums,
-            float(self.scale_error),
-            self.levels,
-            out.moments[i],
-            out.quantiles[i],
-            out.share[i],
-            out.share_quantiles[i],
-        )
+        derived = out.moments[i], out.quantiles[i], out.share[i], out.share_quantiles[i]
+        _core.summarize(self._scales, sums, float(self.scale_error), self.levels, *derived)
         out.draw_index[i] = sums.draws.index
         out.draw_scale[i] = sums.draws.scale
         for name, table in out.joint.items():
@@ -427,15 +422,7 @@ def _target(flux, weight, log_prior):
     with np.errstate(divide="ignore", invalid="ignore"):
         root32 = np.sqrt(used / used.max(initial=0.0)).astype(np.float32)
         data32 = (flux[bands] * np.sqrt(used / norm)).astype(np.float32)
-    return _core.Target(
-        flux=flux,
-        weight=weight,
-        log_prior=log_prior,
-        bands=bands,
-        root32=root32,
-        data32=data32,
-        norm=norm,
-    )
+    return _core.Target(flux, weight, log_prior, bands, root32, data32, norm)
 
 
 def _limits(limit, inverse):
@@ -444,10 +431,5 @@ def _limits(limit, inverse):
     if bands.size == 0:
         return None
     level = limit[bands] * inverse[bands]
-    return _core.Limits(
-        bands=bands,
-        level=level,
-        inverse=inverse[bands],
-        slope=np.empty(bands.size),
-        dark=float(-2.0 * log_ndtr(level).sum()),
-    )
+    dark = float(-2.0 * log_ndtr(level).sum())
+    return _core.Limits(bands, level, inverse[bands], np.empty(bands.size), dark)

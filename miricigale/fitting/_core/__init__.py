@@ -1,12 +1,13 @@
 """
 Kernels of the grid fit: arrays in, arrays out.
 
-`sum_up` (`evaluate`) does one object. The pairs of galaxy and AGN model that can matter are listed by
-their bounds (`pairs`), evaluated side by side (`lanes`, `single` in single precision, `limits` with
-upper limits) and summed up (`sums`, `histogram`); `summarize` turns the sums into moments and
-quantiles. `structs` says what the kernels take, `workspace` makes it. numba's cache of a function
-holds the compiled code of those it calls, and does not see when they change: who edits one empties
-``__pycache__``.
+`sum_up` (`evaluate`) does one object. Models without AGN are evaluated one by one (`alone`). The
+pairs of galaxy and AGN model that can matter are listed by their bounds (`pairs`, down to those of
+`floors`), evaluated side by side (`lanes`, `single` in single precision, `limits` with upper
+limits) and summed up (`sums`, `histogram`); `summarize` turns the sums into moments and quantiles.
+`structs` says what the kernels take, `rows` where it stands there, `workspace` makes it. numba's
+cache of a function holds the compiled code of those it calls, and does not see when they change:
+who edits one empties ``__pycache__``.
 """
 
 from miricigale.fitting._core.evaluate import sum_up
@@ -18,7 +19,7 @@ from miricigale.fitting._core.structs import (
     Tables,
     Target,
 )
-from miricigale.fitting._core.workspace import JOINT, clear, make_sums, make_workspace
+from miricigale.fitting._core.workspace import JOINT, aligned, clear, make_sums, make_workspace
 
 __all__ = [
     "BLOCK",
@@ -28,6 +29,7 @@ __all__ = [
     "Request",
     "Tables",
     "Target",
+    "aligned",
     "clear",
     "make_scales",
     "make_sums",

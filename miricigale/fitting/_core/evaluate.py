@@ -10,43 +10,29 @@ import math
 
 import numpy as np
 
-from miricigale.fitting._core.histogram import add_alone, widest
+from miricigale.fitting._core import rows as at
+from miricigale.fitting._core.alone import evaluate_alone
+from miricigale.fitting._core.floors import first_floor, raise_bounds, second_floor
+from miricigale.fitting._core.histogram import widest
 from miricigale.fitting._core.lanes import (
-    N_INPUT,
-    fill_block,
-    fill_dead,
     galaxy_products,
-    gather,
     likelihoods,
+    place,
     run_products,
+    take_gathered,
 )
-from miricigale.fitting._core.limits import limited_likelihoods, limited_scale
+from miricigale.fitting._core.limits import limited_likelihoods
 from miricigale.fitting._core.pairs import (
     DONE,
     KEY_BITS,
     agn_products,
     best_of_galaxy,
-    first_floor,
     list_runs,
     project,
-    raise_bounds,
-    second_floor,
 )
 from miricigale.fitting._core.single import single_likelihoods
-from miricigale.fitting._core.structs import (
-    BLOCK,
-    DUST,
-    KERNEL,
-    LOG_AGN,
-    LOG_FRAC,
-    LOG_GALAXY,
-    MIXED_GALAXY,
-    NO_LIGHT,
-    PART,
-    PRIOR_FRAC,
-)
+from miricigale.fitting._core.structs import BLOCK, KERNEL, PART
 from miricigale.fitting._core.sums import (
-    PARTS,
     add_all,
     add_block,
     add_gathered,
@@ -55,8 +41,6 @@ from miricigale.fitting._core.sums import (
     draw,
     find_best,
     finish_redshift,
-    keep_best,
-    take_draw,
 )
 from miricigale.utils.compilation import njit
 
@@ -65,94 +49,10 @@ __all__ = ["sum_up"]
 _MASK = (1 << KEY_BITS) - 1
 _LOG10_E = 0.43429448190325183
 # Runs with at least so many pairs are evaluated as a block.
-_DENSE = 20
-# Models without AGN so far below the best are not looked at for a reference.
-_NEAR = 50.0
+_DENSE = 44
 # Largest chi2 of a good model, and square of a limit over its error, for single precision with
 # limits.
 _MODEST = 1000.0
-
-
-@njit(**PART)
-def _alone(tables, limits, lanes, z, g):
-    """Scale, R and variance of the scale of a galaxy without AGN."""
-    p, q = lanes.pq[0, g], lanes.pq[1, g]
-    # without light the scale is 0, and nothing is known of its error
-    q = q if q > NO_LIGHT else 1.0 / NO_LIGHT
-    s = max(p, 0.0) / q
-    r = max(p, 0.0) * s
-    inverse = 1.0 / q
-    if limits is not None:
-        for m in range(limits.bands.size):
-            limits.slope[m] = tables.galaxy[z, g, limits.bands[m]] * limits.inverse[m]
-        s, r, inverse = limited_scale(p, q, limits)
-    return s, r, inverse
-
-
-@njit(**KERNEL)
-def _evaluate_singles(tables, target, limits, pairs, lanes, sums, delta, scale_error):
-    """
-    Add the models without AGN (f = 0), one for each galaxy and redshift, to the sums.
-
-    In a first pass the best of them becomes the reference, for nothing has been summed up yet, and
-    what their weights sum up to is estimated, for the histograms.
-    """
-    best, total, draws = sums.best, sums.total, sums.draws
-    about = 0.0
-    carry = 0.0
-    for sums_up in (False, True):
-        floor = best[2] - tables.log_zero - (delta if sums_up else _NEAR)
-        for z in range(target.log_prior.size):
-            log_prior = target.log_prior[z]
-            if log_prior < -1e200:
-                continue
-            # what no galaxy of this redshift exceeds, priors being at most 1
-            if pairs.promise[z] + 1e-5 * target.norm < floor:
-                continue
-            some = False
-            for block in range(tables.tiles.shape[1]):
-                known = False
-                for g in range(block * BLOCK, min((block + 1) * BLOCK, tables.galaxy.shape[1])):
-                    p32 = max(pairs.p32[z, g], np.float32(0)) + 3e-6
-                    prior = log_prior + tables.log_usable[z, g]
-                    if p32 * p32 * target.norm + prior < floor:
-                        continue
-                    if not known:
-                        known = True
-                        galaxy_products(tables, target, z, block, lanes.pq)
-                    s, r, inverse = _alone(tables, limits, lanes, z, g)
-                    value = r + prior + tables.log_zero
-                    if not sums_up:
-                        if value > best[2]:
-                            about *= math.exp(0.5 * (best[2] - value))
-                            best[2] = value
-                            floor = value - tables.log_zero - _NEAR
-                        about += math.exp(max(0.5 * (value - best[2]), -700.0))
-                        continue
-                    some = True
-                    keep_best(sums, r, s, z, g, np.int64(0), np.int64(0))
-                    t = math.exp(max(0.5 * (value - best[2]), -700.0))
-                    lanes.galaxy_z[0, g] += t
-                    lanes.galaxy_z[1, g] += t * s
-                    lanes.galaxy_z[2, g] += t * (s * s + scale_error * inverse)
-                    sums.zf[z, 0] += t
-                    sums.alone[g] += t
-                    if sums.joint.fg.size > 0:
-                        sums.joint.fg[0, g] += t
-                    total[0] += t
-                    total[1] += t * s * s / inverse
-                    total[2] += t if s == 0.0 else 0.0
-                    best[3] += 1.0
-                    for d in range(draws.next.size):
-                        while draws.next[d] <= total[0]:
-                            now = max(total[0], draws.next[d])
-                            take_draw(draws, d, now, z, g, np.int64(-1), np.int64(0), s, inverse)
-                    carry += t
-                    if carry >= max(total[0], about) / PARTS:
-                        add_alone(tables, sums.hist, g, s, carry)
-                        carry = 0.0
-            if some:
-                finish_redshift(tables, lanes, sums, z)
 
 
 @njit(**PART)
@@ -185,7 +85,7 @@ def _drop(tables, pairs, lanes, r, z, block, n_run, rest, sure):
         i = run[j]
         g = block * BLOCK + i
         value = lanes.cross[1, i]
-        other = rest + tables.of_galaxy[LOG_GALAXY, g] + pairs.tail_galaxy[z, g]
+        other = rest + tables.of_galaxy[at.LOG_GALAXY, g] + pairs.tail_galaxy[z, g]
         if value * (1.0 + 1e-9) < sure - other:
             row[i] = np.float32(value + 1e-6 * (1.0 + abs(value)) + other)
         else:
@@ -196,68 +96,42 @@ def _drop(tables, pairs, lanes, r, z, block, n_run, rest, sure):
 
 
 @njit(**PART)
-def _fill_limits(tables, limits, lane_limit, z, g, k, lane):
-    """Fill a lane with the fluxes of galaxy and AGN model (for c = 1) in bands with limits."""
-    n = limits.bands.size
-    for m in range(n):
-        band = limits.bands[m]
-        t = limits.inverse[m]
-        lane_limit[m, lane] = tables.galaxy[z, g, band] * t
-        lane_limit[n + m, lane] = tables.agn[z, k, band] * t * tables.of_galaxy[DUST, g]
-
-
 def _rescale(sums, lanes, factor):
     """Multiply all weights, when a better model becomes the reference."""
-    hist = sums.hist
-    # columns in use; all others are 0
-    table = hist.table[:, hist.used[:, 0].min() : hist.used[:, 1].max() + 1]
-    for array in (sums.flat, table, hist.share, sums.draws.next, lanes.galaxy_z, lanes.agn_z):
-        array *= factor
-
-
-@njit(**PART)
-def _rescale_within(sums, lanes, factor):
-    """Do what `_rescale` does, within a kernel."""
-    for array in (sums.flat, sums.hist.flat, sums.draws.next):
+    table, used = sums.hist.table, sums.hist.used
+    for array in (sums.flat, sums.hist.share, sums.draws.next):
         for i in range(array.size):
             array[i] *= factor
-    for table in (lanes.galaxy_z, lanes.agn_z):
-        for m in range(table.shape[0]):
-            for i in range(table.shape[1]):
-                table[m, i] *= factor
-
-
-@njit(**PART)
-def _take_gathered(limits, lanes, filled):
-    """Move the gathered pairs to the lanes."""
-    buffer, index = lanes.buffer, lanes.index
-    for i in range(N_INPUT * BLOCK):
-        buffer[i] = lanes.pending[i]
-    for i in range(BLOCK):
-        index[0, i] = index[2, i]
-        index[1, i] = index[3, i]
-    if limits is not None:
-        for m in range(2 * limits.bands.size):
-            for i in range(BLOCK):
-                lanes.limit[m, i] = lanes.pending_limit[m, i]
-    fill_dead(buffer, index, filled)
+    for row in range(used.shape[0]):
+        for i in range(used[row, 0], used[row, 1] + 1):
+            table[row, i] *= factor
+    for array in (lanes.galaxy_z, lanes.agn_z):
+        for m in range(array.shape[0]):
+            for i in range(array.shape[1]):
+                array[m, i] *= factor
 
 
 @njit(**KERNEL)
-def _evaluate_runs(tables, target, limits, pairs, lanes, sums, request, n, floor, sure, single):
+def _evaluate_runs(
+    tables, target, limits, pairs, lanes, sums, request, n, reference, floor, sure, single
+):
     """
     Add the pairs of the n listed runs to the sums.
 
     Those whose bound of R + 2 ln(prior), raised by ``pairs.tail_galaxy`` and ``tail_agn``, is at least
     ``floor`` are evaluated and marked as done in the list; of these, pairs whose exact bound turns out
-    lower than ``sure`` get that bound there and are not evaluated. ``single``: whether single
-    precision will do.
+    lower than ``sure`` get that bound there and are not evaluated. The best model met so far, of
+    R + 2 ln(prior) = ``reference``, gets weight 1. ``single``: whether single precision will do.
     """
     best, total, of_frac, first = sums.best, sums.total, tables.of_frac, tables.zero_frac
+    if reference > best[2]:
+        if total[0] > 0.0:
+            _rescale(sums, lanes, math.exp(0.5 * (best[2] - reference)))
+        best[2] = reference
     light = single and limits is None
     top_frac = -1e300
     for j in range(of_frac.shape[1]):
-        top_frac = max(top_frac, of_frac[LOG_FRAC, j])
+        top_frac = max(top_frac, of_frac[at.LOG_FRAC, j])
     for i in range(lanes.left.size):
         lanes.left[i] = 1.0
     n_listed = 1.0
@@ -271,72 +145,69 @@ def _evaluate_runs(tables, target, limits, pairs, lanes, sums, request, n, floor
     filled = np.int64(0)
     block = np.int64(0)
     k = np.int64(0)
-    n_run = np.int64(0)
     r = np.int64(0)
+    # pairs of the run, and how many of them have been taken
+    n_run = np.int64(0)
+    taken = np.int64(0)
     while True:
-        while n_run == 0 and r < n:
-            n_run = _next_run(pairs.bound[r], floor, lanes.run)
-            if n_run == 0:
+        if taken == n_run:
+            n_run = np.int64(0)
+            taken = np.int64(0)
+            while n_run == 0 and r < n:
+                n_run = _next_run(pairs.bound[r], floor, lanes.run)
                 r += 1
-        # after the last run z is -1
-        z = pairs.run_key[r] >> (2 * KEY_BITS) if r < n else np.int64(-1)
-        # gathered pairs are evaluated when there is no room for more of the same redshift
-        if filled > 0 and (z != z_now or (filled + n_run > BLOCK and n_run < _DENSE)):
-            _take_gathered(limits, lanes, filled)
-            filled = np.int64(0)
-            k = np.int64(-1)
-        else:
-            if z != z_now:
+            # after the last run z is -1
+            z = pairs.run_key[r - 1] >> (2 * KEY_BITS) if n_run > 0 else np.int64(-1)
+        whole = False
+        if n_run > 0 and z == z_now:
+            key = pairs.run_key[r - 1]
+            k = key & _MASK
+            block = (key >> KEY_BITS) & _MASK
+            log_agn = target.log_prior[z] + tables.of_agn[at.LOG_AGN, k]
+            if taken == 0:
+                if lanes.known[block] != z + 1:
+                    lanes.known[block] = z + 1
+                    galaxy_products(tables, target, z, block, lanes.pq)
+                run_products(tables, target.bands, pairs, lanes, z, block, k, n_run)
+                rest = log_agn + top_frac + pairs.tail_agn[z, k]
+                n_run = _drop(tables, pairs, lanes, r - 1, z, block, n_run, rest, sure)
+                whole = n_run >= _DENSE
+            to = n_run if whole else min(n_run, taken + BLOCK - filled)
+            filled = place(
+                tables, limits, pairs, lanes, z, block, k, taken, to, log_agn, filled, whole
+            )
+            taken = to
+            if not whole and filled < BLOCK:
+                continue
+        if not whole:
+            if filled == 0:
                 if z_now >= 0:
                     finish_redshift(tables, lanes, sums, z_now)
+                if z < 0:
+                    break
                 z_now = z
-                if r < n:
-                    agn_products(tables.agn[z], target, pairs.agn_pq, pairs.agn_weighted)
-            if r >= n:
-                break
-            k = pairs.run_key[r] & _MASK
-            block = (pairs.run_key[r] >> KEY_BITS) & _MASK
-            start = block * BLOCK
-            if lanes.known[block] != z + 1:
-                lanes.known[block] = z + 1
-                galaxy_products(tables, target, z, block, lanes.pq)
-            run_products(tables, target.bands, pairs, lanes, z, block, k, n_run)
-            log_torus = target.log_prior[z] + tables.of_agn[LOG_AGN, k]
-            rest = log_torus + top_frac + pairs.tail_agn[z, k]
-            n_run = _drop(tables, pairs, lanes, r, z, block, n_run, rest, sure)
-            whole = n_run >= _DENSE or filled + n_run > BLOCK
-            if whole:
-                fill_block(tables, pairs, lanes, block, k, n_run, log_torus)
-                if limits is not None:
-                    for j in range(n_run):
-                        i = lanes.run[j]
-                        _fill_limits(tables, limits, lanes.limit, z, start + i, k, i)
-            else:
-                before = filled
-                filled = gather(tables, pairs, lanes, block, k, n_run, log_torus, filled)
-                if limits is not None:
-                    for i in range(before, filled):
-                        g = lanes.index[2, i]
-                        _fill_limits(tables, limits, lanes.pending_limit, z, g, k, i)
-            r += 1
-            n_run = np.int64(0)
-            if not whole:
+                agn_products(tables.agn[z], target, pairs.agn_pq, pairs.agn_weighted)
                 continue
+            # gathered pairs are evaluated when there is no room for more, or none of the redshift
+            take_gathered(limits, lanes, filled)
+            filled = np.int64(0)
+            k = np.int64(-1)
         if limits is not None:
             over = 1e300
             while over >= 200.0:
-                top, over = limited_likelihoods(
-                    of_frac, lanes, limits, best[2], request.scale_error, request.delta, single
-                )
+                reached, over = limited_likelihoods(
+                    of_frac, lanes, limits, best[2], request.scale_error, best[0],
+                    request.delta, single,
+                )  # fmt: skip
                 if over >= 200.0:
                     # far better than the reference, which is found without regard to most limits
                     best[2] += 2.0 * over
-                    _rescale_within(sums, lanes, math.exp(-min(over, 700.0)))
+                    _rescale(sums, lanes, math.exp(-min(over, 700.0)))
         elif light:
-            top = single_likelihoods(of_frac, lanes, best[2], request.scale_error)
+            reached = single_likelihoods(of_frac, lanes, best[2], request.scale_error, best[0])
         else:
-            top = likelihoods(of_frac, lanes, best[2], request.scale_error)
-        if top >= best[0]:
+            reached = likelihoods(of_frac, lanes, best[2], request.scale_error, best[0])
+        if reached > 0.0:
             find_best(tables, limits, lanes, sums, z_now)
         before_all = total[0]
         added = add_all(lanes, sums, z_now, first)
@@ -378,7 +249,7 @@ def _begin(tables, target, limits, pairs, origin):
     if reference < -1e299:
         return None
     origin[:] = _LOG10_E * math.log(scale)
-    for i, row in ((1, DUST), (2, MIXED_GALAXY)):
+    for i, row in ((1, at.DUST), (2, at.MIXED_GALAXY)):
         origin[i] += _LOG10_E * math.log(max(tables.of_galaxy[row].max(), 1e-300))
     return reference
 
@@ -406,11 +277,11 @@ def sum_up(tables, scales, request, target, limits, sums, pairs, lanes, *, singl
     best, total = sums.best, sums.total
     best[2] = reference
     if tables.zero_frac == 1 and tables.prior_zero > 0.0:
-        _evaluate_singles(
+        evaluate_alone(
             tables, target, limits, pairs, lanes, sums, request.delta, request.scale_error
         )
     # a bound holds the largest prior of the fractions above 0, a weight those of all
-    prior = tables.of_frac[PRIOR_FRAC]
+    prior = tables.of_frac[at.PRIOR_FRAC]
     prior_sum, prior_top = prior.sum(), prior.max(initial=0.0)
     n_agn = tables.agn.shape[1]
     end = tables.tiles.shape[0] * tables.tiles.shape[1] if n_agn > 0 and prior_top > 0.0 else 0
@@ -423,11 +294,6 @@ def sum_up(tables, scales, request, target, limits, sums, pairs, lanes, *, singl
             tables, target, limits, pairs, request.delta, reference, position
         )
         share *= 0.5
-        # the best model met so far gets weight 1
-        if reference > best[2]:
-            if total[0] > 0.0:
-                _rescale(sums, lanes, math.exp(0.5 * (best[2] - reference)))
-            best[2] = reference
         # bounds are raised for second moments only after a first look
         pairs.tail_galaxy.fill(0.0)
         pairs.tail_agn.fill(0.0)
@@ -436,7 +302,7 @@ def sum_up(tables, scales, request, target, limits, sums, pairs, lanes, *, singl
             single = single and max(target.norm + limits.dark - reference, highest) < _MODEST
         floor, few = first_floor(pairs.bound, n, reference)
         _evaluate_runs(
-            tables, target, limits, pairs, lanes, sums, request, n, floor, floor,
+            tables, target, limits, pairs, lanes, sums, request, n, reference, floor, floor,
             single and not few,
         )  # fmt: skip
         room = share * request.rtol * total[0]
@@ -447,5 +313,7 @@ def sum_up(tables, scales, request, target, limits, sums, pairs, lanes, *, singl
             math.exp(min(0.5 * (reference - best[2]), 600.0)) * prior_sum / max(prior_top, 1e-300)
         )
         floor, sure = second_floor(pairs.bound, n, reference, room, unit, request.delta)
-        _evaluate_runs(tables, target, limits, pairs, lanes, sums, request, n, floor, sure, single)
+        _evaluate_runs(
+            tables, target, limits, pairs, lanes, sums, request, n, reference, floor, sure, single
+        )
     return total[0] > 0.0

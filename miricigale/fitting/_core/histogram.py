@@ -10,22 +10,9 @@ import math
 
 import numpy as np
 
+from miricigale.fitting._core import rows as at
 from miricigale.fitting._core.lanes import as_type
-from miricigale.fitting._core.structs import (
-    DUST,
-    EDGE_HIGH,
-    EDGE_LOW,
-    KERNEL,
-    LOG_DUST,
-    LOG_RATIO,
-    MIXED_AGN,
-    MIXED_GALAXY,
-    PART,
-    RATIO,
-    SHARE_AGN,
-    SHARE_GALAXY,
-    Scales,
-)
+from miricigale.fitting._core.structs import KERNEL, PART, Scales
 from miricigale.utils.compilation import njit
 
 __all__ = [
@@ -113,21 +100,21 @@ def _add_share(change, low, high, weight):
 def add_model(tables, hist, g, k, j, s, t):
     """Add a model of scale s and weight t."""
     of_galaxy, of_agn, of_frac = tables.of_galaxy, tables.of_agn, tables.of_frac
-    y = of_galaxy[SHARE_GALAXY, g] * of_agn[SHARE_AGN, k]
-    low, high = y * of_frac[EDGE_LOW, j], y * of_frac[EDGE_HIGH, j]
+    y = of_galaxy[at.SHARE_GALAXY, g] * of_agn[at.SHARE_AGN, k]
+    low, high = y * of_frac[at.EDGE_LOW, j], y * of_frac[at.EDGE_HIGH, j]
     _add_share(hist.share, low / (1.0 + low), high / (1.0 + high), t)
     if s == 0.0:
         return
     n_galaxy = tables.galaxy.shape[1]
     y = PER_DEX * (_log10(s) - hist.origin[0]) + _HALF
     _add_bin(hist, g, y, t)
-    if of_galaxy[DUST, g] > 0.0:
-        y += of_frac[LOG_RATIO, j] + PER_DEX * (
-            of_galaxy[LOG_DUST, g] + hist.origin[0] - hist.origin[1]
+    if of_galaxy[at.DUST, g] > 0.0:
+        y += of_frac[at.LOG_RATIO, j] + PER_DEX * (
+            of_galaxy[at.LOG_DUST, g] + hist.origin[0] - hist.origin[1]
         )
         _add_bin(hist, n_galaxy + k, y, t)
-    power = of_frac[RATIO, j] * of_galaxy[DUST, g] * of_agn[MIXED_AGN, k]
-    mixed = s * (of_galaxy[MIXED_GALAXY, g] + power)
+    power = of_frac[at.RATIO, j] * of_galaxy[at.DUST, g] * of_agn[at.MIXED_AGN, k]
+    mixed = s * (of_galaxy[at.MIXED_GALAXY, g] + power)
     if mixed > 0.0:
         y = PER_DEX * (_log10(mixed) - hist.origin[2]) + _HALF
         _add_bin(hist, n_galaxy + of_agn.shape[1], y, t)
@@ -137,12 +124,12 @@ def add_model(tables, hist, g, k, j, s, t):
 def add_alone(tables, hist, g, s, t):
     """Add a model without AGN."""
     # what is spread over the cell of f = 0 need not be as many pieces as there are AGN models
-    y = tables.edge_zero * tables.share_mean * tables.of_galaxy[SHARE_GALAXY, g]
+    y = tables.edge_zero * tables.share_mean * tables.of_galaxy[at.SHARE_GALAXY, g]
     _add_share(hist.share, 0.0, y / (1.0 + y), t)
     if s > 0.0:
         y = _LOG10_E * math.log(s)
         _add_bin(hist, g, (y - hist.origin[0]) * PER_DEX + _HALF, t)
-        mixed = tables.of_galaxy[MIXED_GALAXY, g]
+        mixed = tables.of_galaxy[at.MIXED_GALAXY, g]
         if mixed > 0.0:
             y += _LOG10_E * math.log(mixed) - hist.origin[2]
             last = tables.galaxy.shape[1] + tables.of_agn.shape[1]

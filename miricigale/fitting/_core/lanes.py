@@ -10,43 +10,21 @@ negative the best scale that is not negative is 0 and R = 0.
 import numpy as np
 from numba.extending import intrinsic
 
-from miricigale.fitting._core.structs import (
-    BLOCK,
-    DUST,
-    LOG_GALAXY,
-    NO_LIGHT,
-    PART,
-    PRIOR_FRAC,
-    RATIO,
-    SHARE_AGN,
-    SHARE_GALAXY,
-)
+from miricigale.fitting._core import rows as at
+from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART
 from miricigale.utils.compilation import njit
 
 __all__ = [
-    "N_INPUT",
-    "SIZE",
     "as_type",
     "best_mixture",
     "exponential",
     "exponential32",
-    "fill_block",
-    "fill_dead",
     "galaxy_products",
-    "gather",
     "likelihoods",
+    "place",
     "run_products",
+    "take_gathered",
 ]
-
-# Offsets of the vectors in Lanes.buffer, which lets the compiler see that they do not overlap. What
-# the pairs are, with A, X and B for x = c ...
-P, Q, X2, A, B, PRIOR, SHARE, POWER = (i * BLOCK for i in range(8))
-# ... sums over the fractions of prior * likelihood l, l s, l s^2, l c s, l c s^2, l c^2 s^2, the
-# other fraction phi and its square, l of s = 0 and l (s / sigma_s)^2; the largest R, work space.
-W0, W1, W2, V1, U2, V2, F1, F2, WZ, WR, TOP, _T = (i * BLOCK for i in range(8, 20))
-#: Number of vectors that say what the pairs are, and length of the whole buffer.
-N_INPUT = 8
-SIZE = 20 * BLOCK
 
 # Products of fewer than so many pairs are worked out one by one.
 _FEW = 8
@@ -142,7 +120,7 @@ def run_products(tables, bands, pairs, lanes, z, block, k, n_run):
     """Fill ``lanes.cross`` with <G, wA> and the best R of the galaxies of a run with its AGN model."""
     cross, pq, run, weighted = lanes.cross, lanes.pq, lanes.run, pairs.agn_weighted
     a, b = pairs.agn_pq[k, 0], pairs.agn_pq[k, 1]
-    low, high = tables.of_frac[RATIO, 0], tables.of_frac[RATIO, -1]
+    low, high = tables.of_frac[at.RATIO, 0], tables.of_frac[at.RATIO, -1]
     start = block * BLOCK
     if n_run < _FEW:
         for j in range(n_run):
@@ -150,7 +128,7 @@ def run_products(tables, bands, pairs, lanes, z, block, k, n_run):
             t = 0.0
             for m in bands:
                 t += tables.tiles[z, block, m, i] * weighted[k, m]
-            d = tables.of_galaxy[DUST, start + i]
+            d = tables.of_galaxy[at.DUST, start + i]
             cross[0, i] = t
             cross[1, i] = best_mixture(
                 pq[0, start + i], pq[1, start + i], t, a, b, low * d, high * d
@@ -173,140 +151,148 @@ def run_products(tables, bands, pairs, lanes, z, block, k, n_run):
             x[i] += t0[i] * u0
         m += 1
     p, q = pq[0, start : start + BLOCK], pq[1, start : start + BLOCK]
-    dust = tables.of_galaxy[DUST, start : start + BLOCK]
+    dust = tables.of_galaxy[at.DUST, start : start + BLOCK]
     for i in range(BLOCK):
         best[i] = best_mixture(p[i], q[i], x[i], a, b, low * dust[i], high * dust[i])
 
 
 @njit(**PART)
-def fill_dead(buffer, index, start):
+def _fill_dead(buffer, index, start):
     """Fill the lanes from ``start`` on with pairs of no weight."""
-    for i in range(max(start, 0), BLOCK):
-        for v in range(N_INPUT):
+    for i in range(start, BLOCK):
+        for v in range(at.N_INPUT):
             buffer[v * BLOCK + i] = 0.0
-        buffer[P + i] = -1e300
-        buffer[Q + i] = 1.0
-        buffer[PRIOR + i] = -1e300
+        buffer[at.P + i] = -1e300
+        buffer[at.Q + i] = 1.0
+        buffer[at.PRIOR + i] = -1e300
         index[0, i] = 0
         index[1, i] = 0
 
 
 @njit(**PART)
-def fill_block(tables, pairs, lanes, block, k, n_run, log_torus):
-    """Fill the lanes with a block of galaxies and one AGN model; those not in the run are dead."""
-    buffer, index, run, pq, of_galaxy = (
-        lanes.buffer, lanes.index, lanes.run, lanes.pq, tables.of_galaxy,
-    )  # fmt: skip
-    a, b, share = pairs.agn_pq[k, 0], pairs.agn_pq[k, 1], tables.of_agn[SHARE_AGN, k]
-    start = block * BLOCK
-    last = run[n_run - 1]
-    for i in range(BLOCK):
-        d = of_galaxy[DUST, start + i]
-        buffer[P + i] = -1e300
-        buffer[Q + i] = pq[1, start + i]
-        buffer[X2 + i] = 2.0 * lanes.cross[0, i] * d
-        buffer[A + i] = a * d
-        buffer[B + i] = b * d * d
-        buffer[PRIOR + i] = -1e300
-        buffer[SHARE + i] = of_galaxy[SHARE_GALAXY, start + i] * share
-        buffer[POWER + i] = d
-    for i in range(BLOCK):
-        index[0, i] = start + min(i, last)
-        index[1, i] = k
-    for j in range(n_run):
-        i = run[j]
-        buffer[P + i] = pq[0, start + i]
-        buffer[PRIOR + i] = log_torus + of_galaxy[LOG_GALAXY, start + i]
+def place(tables, limits, pairs, lanes, z, block, k, first, last, log_agn, filled, whole):
+    """
+    Put pairs of a run, from first to last, in lanes; returns how many are gathered then.
 
-
-@njit(**PART)
-def gather(tables, pairs, lanes, block, k, n_run, log_torus, filled):
-    """Add the pairs of a short run to those gathered; returns how many there are now."""
-    pending, index, run, pq, of_galaxy = (
-        lanes.pending, lanes.index, lanes.run, lanes.pq, tables.of_galaxy,
-    )  # fmt: skip
-    a, b, share = pairs.agn_pq[k, 0], pairs.agn_pq[k, 1], tables.of_agn[SHARE_AGN, k]
-    for j in range(n_run):
+    Those of a ``whole`` block go where their galaxies are in the block, others to those gathered, of
+    which there are ``filled``.
+    """
+    index, run, pq, of_galaxy = lanes.index, lanes.run, lanes.pq, tables.of_galaxy
+    buffer, limit = lanes.pending, lanes.pending_limit
+    if whole:
+        buffer, limit = lanes.buffer, lanes.limit
+        _fill_dead(buffer, index, 0)
+    to = 0 if whole else 2
+    a, b, share = pairs.agn_pq[k, 0], pairs.agn_pq[k, 1], tables.of_agn[at.SHARE_AGN, k]
+    for j in range(first, last):
+        i = run[j] if whole else filled + j - first
         g = block * BLOCK + run[j]
-        d = of_galaxy[DUST, g]
-        pending[P + filled] = pq[0, g]
-        pending[Q + filled] = pq[1, g]
-        pending[X2 + filled] = 2.0 * lanes.cross[0, run[j]] * d
-        pending[A + filled] = a * d
-        pending[B + filled] = b * d * d
-        pending[PRIOR + filled] = log_torus + of_galaxy[LOG_GALAXY, g]
-        pending[SHARE + filled] = of_galaxy[SHARE_GALAXY, g] * share
-        pending[POWER + filled] = d
-        index[2, filled] = g
-        index[3, filled] = k
-        filled += 1
-    return filled
+        d = of_galaxy[at.DUST, g]
+        buffer[at.P + i] = pq[0, g]
+        buffer[at.Q + i] = pq[1, g]
+        buffer[at.X2 + i] = 2.0 * lanes.cross[0, run[j]] * d
+        buffer[at.A + i] = a * d
+        buffer[at.B + i] = b * d * d
+        buffer[at.PRIOR + i] = log_agn + of_galaxy[at.LOG_GALAXY, g]
+        buffer[at.SHARE + i] = of_galaxy[at.SHARE_GALAXY, g] * share
+        buffer[at.POWER + i] = d
+        index[to, i] = g
+        index[to + 1, i] = k
+        if limits is not None:
+            # fluxes of galaxy and AGN model (for c = 1) in bands with limits
+            n = limits.bands.size
+            for m in range(n):
+                band = limits.bands[m]
+                t = limits.inverse[m]
+                limit[m, i] = tables.galaxy[z, g, band] * t
+                limit[n + m, i] = tables.agn[z, k, band] * t * d
+    return filled if whole else filled + last - first
 
 
 @njit(**PART)
-def likelihoods(of_frac, lanes, reference, scale_error):
+def take_gathered(limits, lanes, filled):
+    """Move the gathered pairs to the lanes."""
+    buffer, index = lanes.buffer, lanes.index
+    for i in range(at.N_INPUT * BLOCK):
+        buffer[i] = lanes.pending[i]
+    for i in range(BLOCK):
+        index[0, i] = index[2, i]
+        index[1, i] = index[3, i]
+    if limits is not None:
+        for m in range(2 * limits.bands.size):
+            for i in range(BLOCK):
+                lanes.limit[m, i] = lanes.pending_limit[m, i]
+    _fill_dead(buffer, index, filled)
+
+
+@njit(**PART)
+def likelihoods(of_frac, lanes, reference, scale_error, record):
     """
     Evaluate the pairs in the lanes at every AGN fraction and sum over the fractions.
 
     ``lanes.weight`` is filled with prior * likelihood, ``frac_sum`` with the sums of it over the pairs.
     ``reference`` is R + 2 ln(prior) that has weight 1, ``scale_error`` whether the scale's variance
-    counts. Returned is the largest R.
+    counts. Returned is the number of pairs whose largest R reaches ``record`` (counted, for the largest
+    of all would not be found side by side).
     """
     buffer, weight = lanes.buffer, lanes.weight
-    low = 1e300
-    c_0, c_1 = of_frac[RATIO, 0], of_frac[RATIO, -1]
+    n_dark = 0.0
+    c_0, c_1 = of_frac[at.RATIO, 0], of_frac[at.RATIO, -1]
     for i in range(BLOCK):
         # the numerator of the scale is linear in c
-        p, a = buffer[P + i], buffer[A + i]
-        low = min(low, min(p + c_0 * a, p + c_1 * a) if p > -1e29 else 1e300)
-    for i in range(W0, _T):
+        p, a = buffer[at.P + i], buffer[at.A + i]
+        n_dark += 1.0 if p > -1e29 and min(p + c_0 * a, p + c_1 * a) <= 0.0 else 0.0
+    for i in range(at.W0, at.T):
         buffer[i] = 0.0
     for j in range(of_frac.shape[1]):
-        c = of_frac[RATIO, j]
-        f = of_frac[PRIOR_FRAC, j]
+        c = of_frac[at.RATIO, j]
+        f = of_frac[at.PRIOR_FRAC, j]
         now = weight[j * BLOCK : (j + 1) * BLOCK]
         for i in range(BLOCK):
-            p = max(buffer[P + i] + c * buffer[A + i], 0.0)
-            q = buffer[Q + i] + c * (buffer[X2 + i] + c * buffer[B + i])
+            p = max(buffer[at.P + i] + c * buffer[at.A + i], 0.0)
+            q = buffer[at.Q + i] + c * (buffer[at.X2 + i] + c * buffer[at.B + i])
             # without light in the used bands there is no scale to speak of
             q = q if q > NO_LIGHT else 1.0 / NO_LIGHT
             # one division for both 1 / q and y / (1 + y)
-            y = c * buffer[SHARE + i]
+            y = c * buffer[at.SHARE + i]
             both = 1.0 / (q * (1.0 + y))
             inverse = both * (1.0 + y)
             phi = y * both * q
             s = p * inverse
             r = p * s
-            e = 0.5 * (r + buffer[PRIOR + i] - reference)
+            e = 0.5 * (r + buffer[at.PRIOR + i] - reference)
             t = exponential(min(max(e, -700.0), 700.0)) * f
             t1 = t * s
             t2 = t * (s * s + scale_error * inverse)
             tp = t * phi
-            buffer[_T + i] = t
-            buffer[TOP + i] = max(buffer[TOP + i], r)
-            buffer[W0 + i] += t
-            buffer[W1 + i] += t1
-            buffer[V1 + i] += t1 * c
-            buffer[W2 + i] += t2
-            buffer[U2 + i] += t2 * c
-            buffer[V2 + i] += t2 * (c * c)
-            buffer[F1 + i] += tp
-            buffer[F2 + i] += tp * phi
+            buffer[at.T + i] = t
+            buffer[at.TOP + i] = max(buffer[at.TOP + i], r)
+            buffer[at.W0 + i] += t
+            buffer[at.W1 + i] += t1
+            buffer[at.V1 + i] += t1 * c
+            buffer[at.W2 + i] += t2
+            buffer[at.U2 + i] += t2 * c
+            buffer[at.V2 + i] += t2 * (c * c)
+            buffer[at.F1 + i] += tp
+            buffer[at.F2 + i] += tp * phi
         # sums apart from stores: see `agn_products`
         f_sum = 0.0
         for i in range(BLOCK):
-            f_sum += buffer[_T + i]
+            f_sum += buffer[at.T + i]
         lanes.frac_sum[j] = f_sum
         for i in range(BLOCK):
-            now[i] = buffer[_T + i]
-    top = 0.0
+            now[i] = buffer[at.T + i]
+    reached = 0.0
     for i in range(BLOCK):
         # sum of l R, with R = (p + c a) s; lanes without weight have no p either
-        buffer[WR + i] = buffer[P + i] * buffer[W1 + i] + buffer[A + i] * buffer[V1 + i]
-        top = max(top, buffer[TOP + i])
-    if low <= 0.0:
+        buffer[at.WR + i] = (
+            buffer[at.P + i] * buffer[at.W1 + i] + buffer[at.A + i] * buffer[at.V1 + i]
+        )
+    for i in range(BLOCK):
+        reached += 1.0 if buffer[at.TOP + i] >= record else 0.0
+    if n_dark > 0.0:
         for j in range(of_frac.shape[1]):
             for i in range(BLOCK):
-                dark = buffer[P + i] + of_frac[RATIO, j] * buffer[A + i] <= 0.0
-                buffer[WZ + i] += weight[j * BLOCK + i] if dark else 0.0
-    return top
+                dark = buffer[at.P + i] + of_frac[at.RATIO, j] * buffer[at.A + i] <= 0.0
+                buffer[at.WZ + i] += weight[j * BLOCK + i] if dark else 0.0
+    return reached

@@ -20,28 +20,9 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
-from miricigale.fitting._core.lanes import (
-    F1,
-    F2,
-    PRIOR,
-    SHARE,
-    U2,
-    V1,
-    V2,
-    W0,
-    W1,
-    W2,
-    WR,
-    WZ,
-    X2,
-    A,
-    B,
-    P,
-    Q,
-    exponential,
-    exponential32,
-)
-from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART, PRIOR_FRAC, RATIO
+from miricigale.fitting._core import rows as at
+from miricigale.fitting._core.lanes import exponential, exponential32
+from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART
 from miricigale.utils.compilation import njit
 
 __all__ = ["LIMITED_SIZE", "limited_likelihoods", "limited_scale"]
@@ -277,10 +258,10 @@ def _best_scales(buffer, work, terms, limit, c, level, reference, close):
                     work[_FACTOR + i] *= terms[_PRODUCT + i]
                     terms[_PRODUCT + i] = real(1.0)
         for i in range(BLOCK):
-            q = buffer[Q + i] + c * (buffer[X2 + i] + c * buffer[B + i])
+            q = buffer[at.Q + i] + c * (buffer[at.X2 + i] + c * buffer[at.B + i])
             q = q if q > NO_LIGHT else 1.0 / NO_LIGHT
             # a pair that is not there has no p either
-            p = max(buffer[P + i], -1e200) + c * buffer[A + i]
+            p = max(buffer[at.P + i], -1e200) + c * buffer[at.A + i]
             s = work[_SCALE + i]
             t = work[_UNIT + i]
             g = q * s - p + terms[_G + i] * t
@@ -294,17 +275,17 @@ def _best_scales(buffer, work, terms, limit, c, level, reference, close):
             work[_CURVATURE + i] = d + step * h
             work[_EXPONENT + i] = terms[_SUM + i]
             # what the series misses goes with the fourth power of the step
-            e = chi2 - terms[_SUM + i] - 0.5 * max(buffer[PRIOR + i], -1e200)
+            e = chi2 - terms[_SUM + i] - 0.5 * max(buffer[at.PRIOR + i], -1e200)
             e = min(max(e - reference, 0.0), _SLIGHT)
             near = close * (1.0 + e * (0.25 + 0.03125 * e))
             work[_V + i] = step * step - near * near * max(s * s, 1.0 / d)
         far = 0.0
         for i in range(BLOCK):
-            far = max(far, work[_V + i] if work[_DETECTED + i] > 0.0 else 0.0)
+            far += 1.0 if work[_V + i] > 0.0 and work[_DETECTED + i] > 0.0 else 0.0
 
 
 @njit(**PART)
-def limited_likelihoods(of_frac, lanes, limits, reference, scale_error, delta, single):
+def limited_likelihoods(of_frac, lanes, limits, reference, scale_error, record, delta, single):
     """
     Do what `lanes.likelihoods` does, for objects with upper limits.
 
@@ -313,40 +294,41 @@ def limited_likelihoods(of_frac, lanes, limits, reference, scale_error, delta, s
 
     Returns
     -------
-    top : float
-        Largest R, to rounding; in single precision somewhat more.
+    reached : float
+        Number of models whose R reaches ``record``, to rounding; in single precision somewhat more.
     over : float
         Largest exponent of a weight; where it is large the reference must be raised.
     """
     buffer, work, level, n = lanes.buffer, lanes.limited, limits.level, limits.level.size
     for i in range(BLOCK):
         # of the order of the signal-to-noise ratio of a scale of 1
-        unit = np.sqrt(max(buffer[Q + i] + buffer[B + i], NO_LIGHT))
+        unit = np.sqrt(max(buffer[at.Q + i] + buffer[at.B + i], NO_LIGHT))
         work[_UNIT + i] = unit if single else 1.0
     if single:
         for m in range(2 * n):
             for i in range(BLOCK):
                 lanes.limit32[m, i] = min(lanes.limit[m, i] / work[_UNIT + i], _LARGEST)
-    for i in range(W0, WR + BLOCK):
+    for i in range(at.W0, at.WR + BLOCK):
         buffer[i] = 0.0
-    top = 0.0
+    reached = 0.0
+    record -= _ROUNDING if single else 0.0
     over = 0.0
     warm = False
     zero_level = 0.5 * (limits.dark - reference)
     least = max(reference - delta, -1e200)
     for j in range(of_frac.shape[1]):
-        c = of_frac[RATIO, j]
-        f = of_frac[PRIOR_FRAC, j]
+        c = of_frac[at.RATIO, j]
+        f = of_frac[at.PRIOR_FRAC, j]
         lanes.frac_sum[j] = 0.0
         now = lanes.left[j * BLOCK : (j + 1) * BLOCK]
         weight = lanes.weight[j * BLOCK : (j + 1) * BLOCK]
         for i in range(BLOCK):
-            q = buffer[Q + i] + c * (buffer[X2 + i] + c * buffer[B + i])
+            q = buffer[at.Q + i] + c * (buffer[at.X2 + i] + c * buffer[at.B + i])
             q = q if q > NO_LIGHT else 1.0 / NO_LIGHT
-            p = max(max(buffer[P + i], -1e200) + c * buffer[A + i], 0.0)
+            p = max(max(buffer[at.P + i], -1e200) + c * buffer[at.A + i], 0.0)
             s = p / q
             # limits only lower R: what has no weight without them has none with them
-            value = max(p * s, 0.0) + buffer[PRIOR + i]
+            value = max(p * s, 0.0) + buffer[at.PRIOR + i]
             work[_ALIVE + i] = 1.0 if value >= least else 0.0
             work[_DETECTED + i] = s if value >= least else 0.0
             # begin where limits leave as much of the scale as of the last pair's at this fraction,
@@ -373,20 +355,21 @@ def limited_likelihoods(of_frac, lanes, limits, reference, scale_error, delta, s
             part = min(max(work[_SCALE + i] / whole, 1e-3), 1.0)
             work[_CHANGE + i] = min(part / now[i], 4.0)
             now[i] = part
-        most = -1e300
+        some = 0.0
         for i in range(BLOCK):
             # half of R but for the product of probabilities
             e = 0.5 * limits.dark - work[_CHI2 + i] + work[_EXPONENT + i]
             e = e if work[_ALIVE + i] > 0.0 else -1e4
             work[_EXPONENT + i] = e
-            most = max(most, e)
-        for i in range(BLOCK if 2.0 * most > top else 0):
+            some += 1.0 if 2.0 * e >= record else 0.0
+        for i in range(BLOCK if some > 0.0 else 0):
             e = work[_EXPONENT + i]
-            if 2.0 * e > top:
-                top = max(top, 2.0 * e + 2.0 * math.log(max(work[_FACTOR + i], 1e-300)))
+            if 2.0 * e >= record:
+                value = 2.0 * e + 2.0 * math.log(max(work[_FACTOR + i], 1e-300))
+                reached += 1.0 if value >= record else 0.0
         for i in range(BLOCK):
             alive = work[_ALIVE + i]
-            e = work[_EXPONENT + i] + 0.5 * (max(buffer[PRIOR + i], -1e200) - reference)
+            e = work[_EXPONENT + i] + 0.5 * (max(buffer[at.PRIOR + i], -1e200) - reference)
             over = max(over, e if alive > 0.0 else 0.0)
             t = exponential(min(max(e, -700.0), 700.0)) * f * work[_FACTOR + i] * alive
             work[_V + i] = t
@@ -394,19 +377,19 @@ def limited_likelihoods(of_frac, lanes, limits, reference, scale_error, delta, s
             t = work[_V + i]
             s = work[_SCALE + i]
             inverse = 1.0 / work[_CURVATURE + i]
-            y = c * buffer[SHARE + i]
+            y = c * buffer[at.SHARE + i]
             phi = y / (1.0 + y)
             s2 = s * s + scale_error * inverse
-            buffer[W0 + i] += t
-            buffer[W1 + i] += t * s
-            buffer[V1 + i] += t * s * c
-            buffer[W2 + i] += t * s2
-            buffer[U2 + i] += t * s2 * c
-            buffer[V2 + i] += t * s2 * c * c
-            buffer[F1 + i] += t * phi
-            buffer[F2 + i] += t * phi * phi
-            buffer[WR + i] += t * s * s * work[_CURVATURE + i]
-            buffer[WZ + i] += t if s == 0.0 else 0.0
+            buffer[at.W0 + i] += t
+            buffer[at.W1 + i] += t * s
+            buffer[at.V1 + i] += t * s * c
+            buffer[at.W2 + i] += t * s2
+            buffer[at.U2 + i] += t * s2 * c
+            buffer[at.V2 + i] += t * s2 * c * c
+            buffer[at.F1 + i] += t * phi
+            buffer[at.F2 + i] += t * phi * phi
+            buffer[at.WR + i] += t * s * s * work[_CURVATURE + i]
+            buffer[at.WZ + i] += t if s == 0.0 else 0.0
         # sums apart from stores: see `agn_products`
         total = 0.0
         for i in range(BLOCK):
@@ -414,4 +397,4 @@ def limited_likelihoods(of_frac, lanes, limits, reference, scale_error, delta, s
         lanes.frac_sum[j] = total
         for i in range(BLOCK):
             weight[i] = work[_V + i]
-    return top + _ROUNDING if single else top, over
+    return reached, over

@@ -1,5 +1,5 @@
 """
-Which (galaxy, AGN model) pairs can matter at all: bounds in single precision, and how deep to go.
+Which (galaxy, AGN model) pairs can matter at all: bounds in single precision.
 
 With whitened data d = F sqrt(w) and unit vectors g, t of a galaxy and an AGN model in the used
 bands, p = <g, d>, a = <t, d>, X = <g, t>, the best chi2 of any non-negative mixture of the
@@ -17,32 +17,20 @@ import math
 
 import numpy as np
 
+from miricigale.fitting._core import rows as at
 from miricigale.fitting._core.limits import limited_scale
-from miricigale.fitting._core.structs import (
-    BLOCK,
-    DUST,
-    KERNEL,
-    LOG_AGN,
-    LOG_FRAC,
-    PART,
-    PRIOR_FRAC,
-    RATIO,
-)
+from miricigale.fitting._core.structs import BLOCK, KERNEL, PART
 from miricigale.utils.compilation import njit
 
 __all__ = [
     "DONE",
     "GROUP",
     "KEY_BITS",
-    "N_LEVELS",
     "ROWS",
     "agn_products",
     "best_of_galaxy",
-    "first_floor",
     "list_runs",
     "project",
-    "raise_bounds",
-    "second_floor",
 ]
 
 #: Tori handled side by side; arrays of unit vectors are padded with zeros to a multiple.
@@ -52,8 +40,6 @@ GROUP = 4
 KEY_BITS = 20
 #: Bound of a pair that is not listed, or is no more.
 DONE = np.float32(-3e38)
-#: Steps of the histogram of bounds.
-N_LEVELS = 1024
 
 # Rounding of 64 products of unit vectors in float32, generously.
 _ETA = np.float32(3e-6)
@@ -68,18 +54,6 @@ _MASK = (1 << KEY_BITS) - 1
 # with that of their best partner, <g, d>, their largest bound, and work space.
 _LEAST, _BASE, _P, _TOP, _ALONE, _REST, _PASS, _SCORE = (i * BLOCK for i in range(GROUP, GROUP + 8))
 ROWS = GROUP + 8
-
-# Steps of the histogram of bounds for each unit of chi2.
-_PER_UNIT = 4.0
-# Pairs whose bound is within this of the best are evaluated first ...
-_FIRST = 10.0
-# ... but not many more than so many of them.
-_MOST = 8192
-# ... and in double precision if there are fewer than so many times as many.
-_FEW = 4
-# Below every bound, above `DONE`.
-_ALL = -1e37
-_DECAY = np.exp(-0.5 / _PER_UNIT * np.arange(N_LEVELS))
 
 
 @njit(**KERNEL)
@@ -182,7 +156,7 @@ def best_of_galaxy(tables, target, limits, pairs, z, g):
             best_s, r, _ = limited_scale(p, q, limits)
         best_value = r + tables.log_zero
     for k in range(agn_pq.shape[0]):
-        if tables.of_agn[LOG_AGN, k] < -1e200:
+        if tables.of_agn[at.LOG_AGN, k] < -1e200:
             continue
         cross = 0.0
         for b in bands:
@@ -190,13 +164,13 @@ def best_of_galaxy(tables, target, limits, pairs, z, g):
         a = agn_pq[k, 0]
         b2 = agn_pq[k, 1]
         for j in range(of_frac.shape[1]):
-            x = of_frac[RATIO, j] * tables.of_galaxy[DUST, g]
+            x = of_frac[at.RATIO, j] * tables.of_galaxy[at.DUST, g]
             num = max(p + x * a, 0.0)
             den = q + x * (2.0 * cross + x * b2)
             if not den > 0.0:
                 continue
             s = num / den
-            log_pair = tables.of_agn[LOG_AGN, k] + of_frac[LOG_FRAC, j]
+            log_pair = tables.of_agn[at.LOG_AGN, k] + of_frac[at.LOG_FRAC, j]
             value = num * s + log_pair
             # with limits, only at what would be better without them than all before
             if limits is not None:
@@ -295,10 +269,11 @@ def _list_block(pairs, norm, n_used, key, n):
             n2 = rows[_P + i] - a * cross + _ETA
             r = n1 * n1 - rows[_REST + i] * (one - cross * cross - _EPS)
             rows[_SCORE + i] = max(min(r, min(n1, n2)), a2 - rows[_PASS + i])
-        most = rows[_SCORE]
+        # counted, for the largest of them would not be found side by side
+        some = zero
         for i in range(BLOCK):
-            most = max(most, rows[_SCORE + i])
-        if most < zero:
+            some += one if rows[_SCORE + i] >= zero else zero
+        if some == zero:
             continue
         pairs.run_key[n] = key + k
         bound = pairs.bound[n]
@@ -341,10 +316,10 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
     # the largest prior a pair can have from AGN model and fraction
     log_pair = -1e300
     for k in range(n_agn):
-        log_pair = max(log_pair, tables.of_agn[LOG_AGN, k])
+        log_pair = max(log_pair, tables.of_agn[at.LOG_AGN, k])
     top_frac = 0.0
     for j in range(tables.of_frac.shape[1]):
-        top_frac = max(top_frac, tables.of_frac[PRIOR_FRAC, j])
+        top_frac = max(top_frac, tables.of_frac[at.PRIOR_FRAC, j])
     log_pair += 2.0 * math.log(max(top_frac, 1e-300))
     # `_products` takes three bands at a time
     for j in range(bands.size, bands.size + 2):
@@ -404,94 +379,3 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
                     # exponents of models that are not looked at stay in range
                     margin = min(1.5 * margin, 400.0)
     return n, position, reference
-
-
-@njit(**KERNEL)
-def _count(bound, n, reference, lowest, count):
-    """Fill the histogram of the bounds of n runs above the lowest, of shape (2, N_LEVELS + 1)."""
-    for m in range(2):
-        for j in range(N_LEVELS + 1):
-            count[m, j] = 0
-    for r in range(n):
-        row = bound[r]
-        for i in range(BLOCK):
-            if row[i] > lowest:
-                column = (reference - row[i]) * _PER_UNIT
-                # neighbors, which are often in the same bin, are counted apart
-                count[i & 1, np.int64(min(max(column, 0.0), N_LEVELS))] += 1
-
-
-def first_floor(bound, n, reference):
-    """
-    Least bound to evaluate first, and whether in double precision.
-
-    That is where these pairs are few; where many could be as good as the best (``reference``), none
-    has much weight.
-    """
-    count = np.empty((2, N_LEVELS + 1), np.int64)
-    # a bin more than are looked at, for rounding
-    _count(bound, n, reference, np.float32(reference - _FIRST - 1.0), count)
-    total = np.cumsum(count[:, : int(_FIRST * _PER_UNIT)].sum(axis=0))
-    many = np.flatnonzero(total > _MOST)
-    if many.size == 0:
-        return reference - _FIRST, True
-    return reference - (many[0] + 1) / _PER_UNIT, bool(total[many[0]] < _FEW * _MOST)
-
-
-@njit(**KERNEL)
-def raise_bounds(tables, target, pairs, n, room, tail_galaxy, tail_agn):
-    """
-    Raise the bounds of the n listed runs by what second moments ask for.
-
-    A model has s^2 <= R / <G, wG> and power^2 <= R / <A, wA>, R <= |F|^2_w. Their product with
-    the quantities' squares is compared with the variances: ``tail_galaxy`` and ``tail_agn`` are from
-    `widest`, ``room`` is |F|^2_w over how much more second moments may miss than weights. A bound is
-    raised by 2 ln of how much more than its weight a pair can add to second moments.
-    """
-    weight = target.weight
-    top = 0.0
-    for b in range(weight.size):
-        top = max(top, weight[b])
-    z_now = np.int64(-1)
-    for r in range(n):
-        key = pairs.run_key[r]
-        z = key >> (2 * KEY_BITS)
-        if z != z_now:
-            z_now = z
-            for g in range(tail_galaxy.size):
-                unit = tables.galaxy_unit[z, g]
-                inverse = np.float64(pairs.inverse_norm[z, g])
-                amp = tail_galaxy[g] * room * inverse * inverse / max(unit * unit * top, 1e-300)
-                pairs.tail_galaxy[z, g] = 2.0 * math.log(amp) if amp > 1.0 else 0.0
-            for k in range(tail_agn.size):
-                b2 = 0.0
-                for b in range(weight.size):
-                    b2 += tables.agn[z, k, b] * tables.agn[z, k, b] * weight[b]
-                amp = tail_agn[k] * room / b2 if b2 > 0.0 else 0.0
-                pairs.tail_agn[z, k] = 2.0 * math.log(amp) if amp > 1.0 else 0.0
-        start = ((key >> KEY_BITS) & _MASK) * BLOCK
-        more = pairs.tail_agn[z, key & _MASK]
-        for i in range(BLOCK):
-            value = pairs.bound[r, i] + (pairs.tail_galaxy[z, start + i] + more)
-            pairs.bound[r, i] = value if pairs.bound[r, i] > DONE else DONE
-
-
-def second_floor(bound, n, reference, room, unit, delta):
-    """
-    Least bound to evaluate, once the weight of the best pairs is known.
-
-    The weight of a pair is at most ``unit`` times exp((bound - reference) / 2), and ``room`` is what
-    may be left out: the pairs below ``floor`` sum up to no more, and neither would all pairs if they
-    were at ``sure``. A floor is at most ``delta`` below the reference.
-    """
-    if not room > 0.0:
-        return _ALL, _ALL
-    count = np.empty((2, N_LEVELS + 1), np.int64)
-    _count(bound, n, reference, DONE, count)
-    count = count.sum(axis=0)
-    # from the lowest up
-    left = np.cumsum((count[:-1] * _DECAY * unit)[::-1])
-    last = N_LEVELS - np.searchsorted(left, room, side="right")
-    floor = reference - min(last / _PER_UNIT, delta)
-    whole = math.log(max(count.sum() * unit, 1e-300)) - math.log(room)
-    return floor, min(floor, reference - 2.0 * whole)

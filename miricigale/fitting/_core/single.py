@@ -13,29 +13,9 @@ rounding changes a weight by some 1e-7.
 
 import numpy as np
 
-from miricigale.fitting._core.lanes import (
-    F1,
-    F2,
-    PRIOR,
-    SHARE,
-    TOP,
-    U2,
-    V1,
-    V2,
-    W0,
-    W1,
-    W2,
-    WR,
-    WZ,
-    X2,
-    A,
-    B,
-    P,
-    Q,
-    exponential,
-    exponential32,
-)
-from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART, PRIOR_FRAC, RATIO
+from miricigale.fitting._core import rows as at
+from miricigale.fitting._core.lanes import exponential, exponential32
+from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART
 from miricigale.utils.compilation import njit
 
 __all__ = ["pair_weight", "single_likelihoods", "single_size"]
@@ -64,7 +44,7 @@ def single_size(n_ratio):
 def pair_weight(lanes, single, j, i):
     """Prior * likelihood of the pair in lane i at a fraction."""
     if single:
-        return lanes.buffer[TOP + i] * lanes.single[_T + j * BLOCK + i]
+        return lanes.buffer[at.TOP + i] * lanes.single[_T + j * BLOCK + i]
     return lanes.weight[j * BLOCK + i]
 
 
@@ -74,11 +54,11 @@ def _prepare(buffer, light, low, high, reference, scale_error):
     Fill the vectors of ``light`` that say what the pairs are.
 
     Weights at x* go to buffer[W0], units of the scales to buffer[W1], R* to buffer[W2], x* to
-    buffer[WR], which are not needed before the sums. Returned is the largest R*.
+    buffer[WR], which are not needed before the sums.
     """
     for i in range(BLOCK):
-        p, a = buffer[P + i], buffer[A + i]
-        q, x2, b = buffer[Q + i], buffer[X2 + i], buffer[B + i]
+        p, a = buffer[at.P + i], buffer[at.A + i]
+        q, x2, b = buffer[at.Q + i], buffer[at.X2 + i], buffer[at.B + i]
         t = 0.5 * x2
         rise = a * q - p * t
         fall = p * b - a * t
@@ -94,12 +74,12 @@ def _prepare(buffer, light, low, high, reference, scale_error):
         m = -one * ((r * b - a * a) * best + r * t - p * a)
         unit = max(each, np.sqrt(one))
         each = one / unit
-        e = 0.5 * (r + buffer[PRIOR + i] - reference)
+        e = 0.5 * (r + buffer[at.PRIOR + i] - reference)
         e = exponential(min(max(e, -700.0), 700.0))
-        buffer[W0 + i] = e if buffer[PRIOR + i] > -1e200 else 0.0
-        buffer[W1 + i] = unit
-        buffer[W2 + i] = r
-        buffer[WR + i] = best
+        buffer[at.W0 + i] = e if buffer[at.PRIOR + i] > -1e200 else 0.0
+        buffer[at.W1 + i] = unit
+        buffer[at.W2 + i] = r
+        buffer[at.WR + i] = best
         light[_P + i] = max(p * each, -1e30)
         light[_A + i] = a * each
         light[_Q + i] = q * one if not dark else 1.0
@@ -108,44 +88,42 @@ def _prepare(buffer, light, low, high, reference, scale_error):
         light[_K + i] = k if num > 0.0 else 0.0
         light[_M + i] = m if num > 0.0 and best != inner else 0.0
         light[_VAR + i] = scale_error * each / unit
-        light[_SHARE + i] = min(buffer[SHARE + i], _MOST)
+        light[_SHARE + i] = min(buffer[at.SHARE + i], _MOST)
         light[_BEST + i] = best
-        y = best * buffer[SHARE + i]
+        y = best * buffer[at.SHARE + i]
         light[_OTHER + i] = y / (1.0 + y)
-    top = 0.0
-    for i in range(BLOCK):
-        top = max(top, buffer[W2 + i])
-    return top
 
 
 @njit(**PART)
-def single_likelihoods(of_frac, lanes, reference, scale_error):
+def single_likelihoods(of_frac, lanes, reference, scale_error, record):
     """
     Do what `lanes.likelihoods` does, in single precision.
 
-    Weights at every fraction are those of `pair_weight`; returned is the largest R*, which no R
-    exceeds.
+    Weights at every fraction are those of `pair_weight`. What is counted is pairs whose R*, which no
+    R exceeds, reaches ``record``.
     """
     buffer, light = lanes.buffer, lanes.single
     zero = np.float32(0)
     one = np.float32(1)
-    c_0, c_1 = of_frac[RATIO, 0], of_frac[RATIO, -1]
-    top = _prepare(buffer, light, c_0, c_1, reference, scale_error)
+    c_0, c_1 = of_frac[at.RATIO, 0], of_frac[at.RATIO, -1]
+    _prepare(buffer, light, c_0, c_1, reference, scale_error)
     for i in range(_S0, _SZ + BLOCK):
         light[i] = zero
-    least = 1e300
+    reached = 0.0
+    n_dark = 0.0
     for i in range(BLOCK):
-        p, a = buffer[P + i], buffer[A + i]
-        least = min(least, min(p + c_0 * a, p + c_1 * a) if p > -1e29 else 1e300)
+        reached += 1.0 if buffer[at.W2 + i] >= record else 0.0
+        p, a = buffer[at.P + i], buffer[at.A + i]
+        n_dark += 1.0 if p > -1e29 and min(p + c_0 * a, p + c_1 * a) <= 0.0 else 0.0
     # where a fraction has R = 0 the difference to R* is not that of the formula
-    some_dark = least <= 0.0
+    some_dark = n_dark > 0.0
     for j in range(of_frac.shape[1]):
-        at = _T + j * BLOCK
-        c_64 = of_frac[RATIO, j]
+        now = _T + j * BLOCK
+        c_64 = of_frac[at.RATIO, j]
         c = np.float32(c_64)
-        f = np.float32(of_frac[PRIOR_FRAC, j])
+        f = np.float32(of_frac[at.PRIOR_FRAC, j])
         for i in range(BLOCK):
-            d = np.float32(c_64 - buffer[WR + i])
+            d = np.float32(c_64 - buffer[at.WR + i])
             y = c * light[_SHARE + i]
             den = light[_Q + i] + c * (light[_X + i] + c * light[_B + i])
             # one division for both 1 / D and y / (1 + y)
@@ -157,11 +135,11 @@ def single_likelihoods(of_frac, lanes, reference, scale_error):
         if some_dark:
             for i in range(BLOCK):
                 # R* - R is R* there
-                num = buffer[P + i] + c_64 * buffer[A + i]
-                light[_D + i] = light[_D + i] if num > 0.0 else -0.5 * buffer[W2 + i]
+                num = buffer[at.P + i] + c_64 * buffer[at.A + i]
+                light[_D + i] = light[_D + i] if num > 0.0 else -0.5 * buffer[at.W2 + i]
         for i in range(BLOCK):
             t = exponential32(max(light[_D + i], _LOWEST)) * f
-            light[at + i] = t
+            light[now + i] = t
             s = max(light[_P + i] + c * light[_A + i], zero) * light[_I + i]
             # about the values at x*, so that means and squares keep their digits
             ds = s - one
@@ -183,15 +161,15 @@ def single_likelihoods(of_frac, lanes, reference, scale_error):
         if some_dark:
             for i in range(BLOCK):
                 dark = light[_P + i] + c * light[_A + i] <= zero
-                light[_SZ + i] += light[at + i] if dark else zero
+                light[_SZ + i] += light[now + i] if dark else zero
     for j in range(of_frac.shape[1]):
         total = 0.0
         for i in range(BLOCK):
-            total += buffer[W0 + i] * light[_T + j * BLOCK + i]
+            total += buffer[at.W0 + i] * light[_T + j * BLOCK + i]
         lanes.frac_sum[j] = total
     for i in range(BLOCK):
-        w0 = buffer[W0 + i]
-        unit = buffer[W1 + i]
+        w0 = buffer[at.W0 + i]
+        unit = buffer[at.W1 + i]
         first = w0 * unit
         second = first * unit
         s0 = np.float64(light[_S0 + i])
@@ -202,17 +180,17 @@ def single_likelihoods(of_frac, lanes, reference, scale_error):
         other = np.float64(light[_OTHER + i])
         w1 = first * (s0 + s1)
         v1 = first * (best * s0 + y1)
-        buffer[W0 + i] = w0 * s0
-        buffer[TOP + i] = w0
-        buffer[W1 + i] = w1
-        buffer[W2 + i] = second * (s0 + 2.0 * s1 + light[_S2 + i])
-        buffer[V1 + i] = v1
-        buffer[U2 + i] = second * (best * (s0 + s1) + y1 + light[_SY + i])
-        buffer[V2 + i] = second * (best * (best * s0 + 2.0 * y1) + light[_Y2 + i])
-        buffer[F1 + i] = w0 * (other * s0 + f1)
-        buffer[F2 + i] = w0 * (other * (other * s0 + 2.0 * f1) + light[_F2 + i])
-        buffer[WZ + i] = w0 * light[_SZ + i]
+        buffer[at.W0 + i] = w0 * s0
+        buffer[at.TOP + i] = w0
+        buffer[at.W1 + i] = w1
+        buffer[at.W2 + i] = second * (s0 + 2.0 * s1 + light[_S2 + i])
+        buffer[at.V1 + i] = v1
+        buffer[at.U2 + i] = second * (best * (s0 + s1) + y1 + light[_SY + i])
+        buffer[at.V2 + i] = second * (best * (best * s0 + 2.0 * y1) + light[_Y2 + i])
+        buffer[at.F1 + i] = w0 * (other * s0 + f1)
+        buffer[at.F2 + i] = w0 * (other * (other * s0 + 2.0 * f1) + light[_F2 + i])
+        buffer[at.WZ + i] = w0 * light[_SZ + i]
         # sum of l R, with R = (p + c a) s; lanes without weight have no p either
-        p = buffer[P + i]
-        buffer[WR + i] = (p if p > -1e200 else 0.0) * w1 + buffer[A + i] * v1
-    return top
+        p = buffer[at.P + i]
+        buffer[at.WR + i] = (p if p > -1e200 else 0.0) * w1 + buffer[at.A + i] * v1
+    return reached

@@ -34,14 +34,6 @@ __all__ = [
 BLOCK = 64
 #: A model with <m, wm> below this has no light in the used bands.
 NO_LIGHT = 1e-290
-#: Rows of ``Tables.of_galaxy``: dust luminosity in W for each solar mass formed and its log10 (-400
-#: where it is 0), 2 ln(prior), the galaxy's parts of the other fraction and of the quantity of both.
-DUST, LOG_DUST, LOG_GALAXY, SHARE_GALAXY, MIXED_GALAXY = range(5)
-#: Rows of ``Tables.of_agn``: 2 ln(prior), the AGN model's parts of these.
-LOG_AGN, SHARE_AGN, MIXED_AGN = range(3)
-#: Rows of ``Tables.of_frac``, fractions above 0: c = f / (1 - f), its log10 in bins, prior,
-#: 2 ln(prior), c at the edges of the fractions' cells.
-RATIO, LOG_RATIO, PRIOR_FRAC, LOG_FRAC, EDGE_LOW, EDGE_HIGH = range(6)
 
 #: Kernels called from Python.
 KERNEL = {
@@ -130,7 +122,6 @@ class Limits(NamedTuple):
 class Histograms(NamedTuple):
     """Weights in bins of derived quantities, from which percentiles are read."""
 
-    flat: np.ndarray  # (n,): what the next two are parts of
     table: np.ndarray  # (nG + nA + 1, N_BINS): l in bins of log s of every galaxy, of
     #     log(s c L_dust) of every AGN model, of the log of the mixed quantity
     share: np.ndarray  # (N_SHARE + 2,): changes of slope of the other fraction's distribution

@@ -4,38 +4,12 @@ import math
 
 import numpy as np
 
+from miricigale.fitting._core import rows as at
 from miricigale.fitting._core.histogram import add_model
-from miricigale.fitting._core.lanes import (
-    F1,
-    F2,
-    POWER,
-    PRIOR,
-    U2,
-    V1,
-    V2,
-    W0,
-    W1,
-    W2,
-    WR,
-    WZ,
-    X2,
-    A,
-    B,
-    P,
-    Q,
-    best_mixture,
-)
+from miricigale.fitting._core.lanes import best_mixture
 from miricigale.fitting._core.limits import limited_scale
 from miricigale.fitting._core.single import pair_weight
-from miricigale.fitting._core.structs import (
-    BLOCK,
-    MIXED_AGN,
-    MIXED_GALAXY,
-    NO_LIGHT,
-    PART,
-    PRIOR_FRAC,
-    RATIO,
-)
+from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART
 from miricigale.utils.compilation import njit
 
 __all__ = [
@@ -53,7 +27,7 @@ __all__ = [
 ]
 
 #: Parts of the weight so far by which light models are sampled for the histograms ...
-PARTS = 10_000.0
+PARTS = 16_000.0
 # ... and how many of them a pair must have to go there with all its fractions.
 _HEAVY = 8.0
 
@@ -66,8 +40,8 @@ def _model(lanes, limits, c, i, floor):
     With limits, those whose R is below ``floor`` without them are left as they are then.
     """
     buffer = lanes.buffer
-    p = buffer[P + i] + c * buffer[A + i]
-    q = buffer[Q + i] + c * (buffer[X2 + i] + c * buffer[B + i])
+    p = buffer[at.P + i] + c * buffer[at.A + i]
+    q = buffer[at.Q + i] + c * (buffer[at.X2 + i] + c * buffer[at.B + i])
     q = q if q > NO_LIGHT else 1.0 / NO_LIGHT
     inverse = 1.0 / q
     s = max(p, 0.0) * inverse
@@ -112,18 +86,18 @@ def find_best(tables, limits, lanes, sums, z):
     """Look for the best model among the lanes."""
     buffer, of_frac, best = lanes.buffer, tables.of_frac, sums.best
     for i in range(BLOCK):
-        if buffer[PRIOR + i] < -1e200:
+        if buffer[at.PRIOR + i] < -1e200:
             continue
         r = best_mixture(
-            buffer[P + i], buffer[Q + i], 0.5 * buffer[X2 + i], buffer[A + i], buffer[B + i],
-            of_frac[RATIO, 0], of_frac[RATIO, -1],
+            buffer[at.P + i], buffer[at.Q + i], 0.5 * buffer[at.X2 + i], buffer[at.A + i], buffer[at.B + i],
+            of_frac[at.RATIO, 0], of_frac[at.RATIO, -1],
         )  # fmt: skip
         if r * (1.0 + 1e-12) < best[0]:
             continue
         for j in range(of_frac.shape[1]):
-            if not of_frac[PRIOR_FRAC, j] > 0.0:
+            if not of_frac[at.PRIOR_FRAC, j] > 0.0:
                 continue
-            s, r, _ = _model(lanes, limits, of_frac[RATIO, j], i, best[0])
+            s, r, _ = _model(lanes, limits, of_frac[at.RATIO, j], i, best[0])
             keep_best(sums, r, s, z, lanes.index[0, i], lanes.index[1, i], j + tables.zero_frac)
 
 
@@ -184,12 +158,12 @@ def add_all(lanes, sums, z, first):
     share_2 = 0.0
     n_alive = 0.0
     for i in range(BLOCK):
-        weight += buffer[W0 + i]
-        total_r += buffer[WR + i]
-        total_zero += buffer[WZ + i]
-        share_1 += buffer[F1 + i]
-        share_2 += buffer[F2 + i]
-        n_alive += 1.0 if buffer[PRIOR + i] > -1e200 else 0.0
+        weight += buffer[at.W0 + i]
+        total_r += buffer[at.WR + i]
+        total_zero += buffer[at.WZ + i]
+        share_1 += buffer[at.F1 + i]
+        share_2 += buffer[at.F2 + i]
+        n_alive += 1.0 if buffer[at.PRIOR + i] > -1e200 else 0.0
     total[0] += weight
     total[1] += total_r
     total[2] += total_zero
@@ -205,23 +179,23 @@ def add_block(tables, lanes, sums, z, block, k):
     buffer, agn_z, band = lanes.buffer, lanes.agn_z, sums.band
     start = block * BLOCK
     for i in range(BLOCK):
-        lanes.galaxy_z[0, start + i] += buffer[W0 + i]
-        lanes.galaxy_z[1, start + i] += buffer[W1 + i]
-        lanes.galaxy_z[2, start + i] += buffer[W2 + i]
+        lanes.galaxy_z[0, start + i] += buffer[at.W0 + i]
+        lanes.galaxy_z[1, start + i] += buffer[at.W1 + i]
+        lanes.galaxy_z[2, start + i] += buffer[at.W2 + i]
         # from here on the correlation of galaxy and AGN
-        buffer[U2 + i] *= buffer[POWER + i]
+        buffer[at.U2 + i] *= buffer[at.POWER + i]
     # sums apart from stores: see `agn_products`
     y0 = 0.0
     y1 = 0.0
     y2 = 0.0
     cross = 0.0
     for i in range(BLOCK):
-        power = buffer[POWER + i]
-        y0 += buffer[W0 + i]
-        y1 += buffer[V1 + i] * power
-        y2 += buffer[V2 + i] * power * power
-        cross += buffer[U2 + i] * tables.of_galaxy[MIXED_GALAXY, start + i]
-    sums.total[3] += cross * tables.of_agn[MIXED_AGN, k]
+        power = buffer[at.POWER + i]
+        y0 += buffer[at.W0 + i]
+        y1 += buffer[at.V1 + i] * power
+        y2 += buffer[at.V2 + i] * power * power
+        cross += buffer[at.U2 + i] * tables.of_galaxy[at.MIXED_GALAXY, start + i]
+    sums.total[3] += cross * tables.of_agn[at.MIXED_AGN, k]
     agn_z[0, k] += y0
     agn_z[1, k] += y1
     agn_z[2, k] += y2
@@ -234,7 +208,7 @@ def add_block(tables, lanes, sums, z, block, k):
         t1 = 0.0
         t2 = 0.0
         for i in range(BLOCK):
-            u = buffer[U2 + i]
+            u = buffer[at.U2 + i]
             t0 += u * row0[i]
             t1 += u * row1[i]
             t2 += u * row2[i]
@@ -256,19 +230,19 @@ def add_gathered(tables, lanes, sums, z, least):
     buffer, galaxy_z, agn_z, band = lanes.buffer, lanes.galaxy_z, lanes.agn_z, sums.band
     total_cross = 0.0
     for i in range(BLOCK):
-        w = buffer[W0 + i]
-        if not w > 0.0 or buffer[PRIOR + i] < -1e200:
+        w = buffer[at.W0 + i]
+        if not w > 0.0 or buffer[at.PRIOR + i] < -1e200:
             continue
         g, k = lanes.index[0, i], lanes.index[1, i]
-        power = buffer[POWER + i]
-        cross = buffer[U2 + i] * power
-        total_cross += cross * tables.of_galaxy[MIXED_GALAXY, g] * tables.of_agn[MIXED_AGN, k]
+        power = buffer[at.POWER + i]
+        cross = buffer[at.U2 + i] * power
+        total_cross += cross * tables.of_galaxy[at.MIXED_GALAXY, g] * tables.of_agn[at.MIXED_AGN, k]
         galaxy_z[0, g] += w
-        galaxy_z[1, g] += buffer[W1 + i]
-        galaxy_z[2, g] += buffer[W2 + i]
+        galaxy_z[1, g] += buffer[at.W1 + i]
+        galaxy_z[2, g] += buffer[at.W2 + i]
         agn_z[0, k] += w
-        agn_z[1, k] += buffer[V1 + i] * power
-        agn_z[2, k] += buffer[V2 + i] * power * power
+        agn_z[1, k] += buffer[at.V1 + i] * power
+        agn_z[2, k] += buffer[at.V2 + i] * power * power
         if w > least:
             cross *= 2.0
             for m in range(band.shape[1]):
@@ -281,8 +255,8 @@ def add_joint(joint, lanes, single, first, n_ratio):
     """Add to the joint sums that were asked for."""
     gk, fg, fk = joint.gk, joint.fg, joint.fk
     for i in range(BLOCK):
-        w = lanes.buffer[W0 + i]
-        if not w > 0.0 or lanes.buffer[PRIOR + i] < -1e200:
+        w = lanes.buffer[at.W0 + i]
+        if not w > 0.0 or lanes.buffer[at.PRIOR + i] < -1e200:
             continue
         g, k = lanes.index[0, i], lanes.index[1, i]
         if gk.size > 0:
@@ -310,8 +284,8 @@ def deposit(tables, limits, lanes, sums, single, added):
         sums.total[6] += added
         return
     for i in range(BLOCK):
-        w = buffer[W0 + i]
-        if not w > 0.0 or buffer[PRIOR + i] < -1e200:
+        w = buffer[at.W0 + i]
+        if not w > 0.0 or buffer[at.PRIOR + i] < -1e200:
             continue
         whole = w >= _HEAVY * part
         if not whole and carry + w < part:
@@ -327,7 +301,7 @@ def deposit(tables, limits, lanes, sums, single, added):
                 t = part * math.floor(carry / part)
                 carry -= t
             if t > 0.0:
-                s, _, _ = _model(lanes, limits, of_frac[RATIO, j], i, 0.0)
+                s, _, _ = _model(lanes, limits, of_frac[at.RATIO, j], i, 0.0)
                 add_model(tables, sums.hist, index[0, i], index[1, i], j, s, t)
     sums.total[6] = carry
 
@@ -369,8 +343,8 @@ def draw(tables, limits, lanes, sums, single, z, before):
             total = before
             lane = -1
             for i in range(BLOCK):
-                w = buffer[W0 + i]
-                if not w > 0.0 or buffer[PRIOR + i] < -1e200:
+                w = buffer[at.W0 + i]
+                if not w > 0.0 or buffer[at.PRIOR + i] < -1e200:
                     continue
                 # rounding may leave the last one short
                 lane = i
@@ -391,6 +365,6 @@ def draw(tables, limits, lanes, sums, single, z, before):
             if f < 0:
                 break
             g, k = lanes.index[0, lane], lanes.index[1, lane]
-            s, _, variance = _model(lanes, limits, of_frac[RATIO, f], lane, 0.0)
+            s, _, variance = _model(lanes, limits, of_frac[at.RATIO, f], lane, 0.0)
             now = max(total, draws.next[d])
             take_draw(draws, d, now, z, g, k, f + tables.zero_frac, s, variance)

@@ -4,17 +4,20 @@ import math
 
 import numpy as np
 
+from miricigale.fitting._core import rows as at
 from miricigale.fitting._core.histogram import N_BINS, N_SHARE, clear_rows
-from miricigale.fitting._core.lanes import N_INPUT, SIZE
 from miricigale.fitting._core.limits import LIMITED_SIZE
 from miricigale.fitting._core.pairs import GROUP, ROWS
 from miricigale.fitting._core.single import single_size
 from miricigale.fitting._core.structs import BLOCK, Draws, Histograms, Joint, Lanes, Pairs, Sums
 
-__all__ = ["JOINT", "clear", "make_sums", "make_workspace"]
+__all__ = ["JOINT", "aligned", "clear", "make_sums", "make_workspace"]
 
 #: Joint sums that can be asked for: of redshift, galaxy, AGN model and fraction.
 JOINT = Joint._fields
+# Bytes of a cache line, and numbers in it.
+_LINE = 64
+_PER_LINE = 8
 
 
 def make_sums(n_z, n_galaxy, n_agn, n_frac, n_bands, n_draws=0, joint=()):
@@ -30,7 +33,7 @@ def make_sums(n_z, n_galaxy, n_agn, n_frac, n_bands, n_draws=0, joint=()):
         total=(7,),
         **{name: (size[name[0]], size[name[1]]) if name in joint else (0, 0) for name in JOINT},
     )
-    flat_hist, hist = _cut(table=(rows, N_BINS), share=(N_SHARE + 2,))
+    _, hist = _cut(table=(rows, N_BINS), share=(N_SHARE + 2,))
     return Sums(
         flat=flat,
         joint=Joint(**{name: parts.pop(name) for name in JOINT}),
@@ -38,7 +41,6 @@ def make_sums(n_z, n_galaxy, n_agn, n_frac, n_bands, n_draws=0, joint=()):
         best=np.zeros(4),
         index=np.full(4, -1),
         hist=Histograms(
-            flat=flat_hist,
             **hist,
             used=np.tile(np.array([[N_BINS, -1]]), (rows, 1)),
             origin=np.zeros(3),
@@ -55,10 +57,20 @@ def make_sums(n_z, n_galaxy, n_agn, n_frac, n_bands, n_draws=0, joint=()):
 def _cut(**shapes):
     """Make an array of zeros and name parts of it."""
     sizes = [math.prod(shape) for shape in shapes.values()]
-    flat = np.zeros(sum(sizes))
-    pieces = np.split(flat, np.cumsum(sizes)[:-1])
-    named = zip(shapes.items(), pieces, strict=True)
-    return flat, {name: piece.reshape(shape) for (name, shape), piece in named}
+    # each begins at a cache line
+    ends = np.cumsum([-(-size // _PER_LINE) * _PER_LINE for size in sizes])
+    flat = aligned(ends[-1])
+    pieces = np.split(flat, ends[:-1])
+    named = zip(shapes.items(), sizes, pieces, strict=True)
+    return flat, {name: piece[:size].reshape(shape) for (name, shape), size, piece in named}
+
+
+def aligned(*shape, dtype=np.float64):
+    """Make an array of zeros that begins at a cache line, which doubles the speed of some loops."""
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    flat = np.zeros(size + _LINE, np.uint8)
+    start = -flat.ctypes.data % _LINE
+    return flat[start : start + size].view(dtype).reshape(shape)
 
 
 def make_workspace(n_z, n_galaxy, n_agn, n_frac, n_bands, zero_frac, capacity):
@@ -70,39 +82,39 @@ def make_workspace(n_z, n_galaxy, n_agn, n_frac, n_bands, zero_frac, capacity):
     single = np.float32
     return Pairs(
         run_key=np.empty(capacity, np.int64),
-        bound=np.empty((capacity, BLOCK), single),
-        promise=np.zeros(n_z),
+        bound=aligned(capacity, BLOCK, dtype=single),
+        promise=aligned(n_z),
         order=np.zeros(n_z, np.int64),
         galaxy_of=np.zeros(n_z, np.int64),
-        p32=np.empty((n_z, n_padded), single),
-        inverse_norm=np.empty((n_z, n_padded), single),
-        tail_galaxy=np.zeros((n_z, n_padded), single),
-        tail_agn=np.zeros((n_z, n_agn), single),
-        agn_pq=np.zeros((n_agn, 2)),
-        agn_weighted=np.zeros((n_agn, n_bands)),
-        unit_agn=np.zeros((-(-n_agn // GROUP) * GROUP, n_bands + 2), single),
-        agn32=np.zeros((2, n_agn), single),
-        unit_galaxy=np.zeros((n_bands + 2, BLOCK), single),
-        rows=np.zeros(ROWS * BLOCK, single),
+        p32=aligned(n_z, n_padded, dtype=single),
+        inverse_norm=aligned(n_z, n_padded, dtype=single),
+        tail_galaxy=aligned(n_z, n_padded, dtype=single),
+        tail_agn=aligned(n_z, n_agn, dtype=single),
+        agn_pq=aligned(n_agn, 2),
+        agn_weighted=aligned(n_agn, n_bands),
+        unit_agn=aligned(-(-n_agn // GROUP) * GROUP, n_bands + 2, dtype=single),
+        agn32=aligned(2, n_agn, dtype=single),
+        unit_galaxy=aligned(n_bands + 2, BLOCK, dtype=single),
+        rows=aligned(ROWS * BLOCK, dtype=single),
     ), Lanes(
-        buffer=np.zeros(SIZE),
-        single=np.zeros(single_size(n_frac), single),
-        pending=np.zeros(N_INPUT * BLOCK),
+        buffer=aligned(at.SIZE),
+        single=aligned(single_size(n_frac), dtype=single),
+        pending=aligned(at.N_INPUT * BLOCK),
         index=np.zeros((4, BLOCK), np.int64),
         run=np.zeros(BLOCK, np.int64),
-        weight=np.zeros(n_frac * BLOCK),
-        frac_sum=np.zeros(n_frac - zero_frac),
-        pq=np.zeros((2, n_padded)),
+        weight=aligned(n_frac * BLOCK),
+        frac_sum=aligned(n_frac - zero_frac),
+        pq=aligned(2, n_padded),
         known=np.zeros(n_blocks, np.int64),
-        cross=np.zeros((2, BLOCK)),
-        galaxy_z=np.zeros((3, n_padded)),
-        agn_z=np.zeros((3, n_agn)),
-        limited=np.zeros(LIMITED_SIZE),
-        limited32=np.zeros(LIMITED_SIZE, single),
-        left=np.ones(n_frac * BLOCK),
-        limit=np.zeros((2 * n_bands, BLOCK)),
-        limit32=np.zeros((2 * n_bands, BLOCK), single),
-        pending_limit=np.zeros((2 * n_bands, BLOCK)),
+        cross=aligned(2, BLOCK),
+        galaxy_z=aligned(3, n_padded),
+        agn_z=aligned(3, n_agn),
+        limited=aligned(LIMITED_SIZE),
+        limited32=aligned(LIMITED_SIZE, dtype=single),
+        left=aligned(n_frac * BLOCK),
+        limit=aligned(2 * n_bands, BLOCK),
+        limit32=aligned(2 * n_bands, BLOCK, dtype=single),
+        pending_limit=aligned(2 * n_bands, BLOCK),
     )
 
 
