@@ -43,8 +43,17 @@ class CatalogSection:
     """The real sources that are simulated."""
 
     source: str = _option("catalog.goodss", "Resource name or path of the catalog.")
+    columns: tuple[str, ...] = _option(
+        (), 'Our names of its columns and the file\'s: "redshift=z_best", "wfc3.f160w=FLUX_H".'
+    )
+    units: tuple[str, ...] = _option(
+        (), 'Units where the file gives none: "flux=mJy" for all fluxes, "ra=hourangle".'
+    )
     mag_limit: float = _option(26.6, "Faint limit in the magnitude column.", low=10.0, high=40.0)
-    mag_column: str = _option("mag_f160w", "Column that the limit applies to.")
+    mag_column: str = _option(
+        "mag_f160w",
+        "Column that the limit applies to; without it the flux of the high-resolution band counts.",
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,6 +106,11 @@ class ExposureSection:
 
     filters: tuple[str, ...] = _option(CEERS_FILTERS, "MIRI filters.")
     plan: str = _option("ceers", "Exposure plan.", choices=("ceers", "quick"))
+    kind: str = _option(
+        "ramps",
+        "ramps: every group is simulated; rates: slopes with the noise of the ramps, 30 times faster.",
+        choices=("ramps", "rates"),
+    )
     n_groups: tuple[int, ...] = _option((), "Groups of each filter instead of the plan's.")
     n_integrations: tuple[int, ...] = _option((), "Integrations of each filter, likewise.")
     n_dithers: tuple[int, ...] = _option((), "Dithers of each filter, likewise.")
@@ -266,6 +280,13 @@ class StudyConfig:
         halves = {"blue", "red"}.intersection(fit.sets)
         wanted = "may have 'blue' and 'red' with two filters and more only"
         _require(n > 1 or not halves, "fit", "sets", wanted, list(fit.sets))
+        for key in ("columns", "units"):
+            pairs = getattr(self.catalog, key)
+            good = all(len(pair.split("=")) == 2 and all(pair.split("=")) for pair in pairs)
+            _require(good, "catalog", key, "must have the form 'name=value'", list(pairs))
+        ramps = exposures.kind == "ramps"
+        wanted = "must be false with [exposures] kind = 'rates', which have no ramps"
+        _require(ramps or not self.run.keep_level1b, "run", "keep_level1b", wanted, "true")
         good = len(alpha) == 2 and 0 < alpha[0] <= alpha[1] <= 4
         _require(good, "sed", "alpha", "must be two numbers in order, above 0 to 4", list(alpha))
         wanted = f"must be at most the number of MIRI filters ({n})"

@@ -8,12 +8,12 @@ import numpy as np
 from miricigale.depth import saturation_forecast
 from miricigale.filters import Filter
 from miricigale.instrument import background_level, imager_filters
-from miricigale.scene import read_catalog
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.config import HighresSection
 from miricigale.workflow.runner import StudyRunner
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.exposures import grid_of, study_exposures
+from miricigale.workflow.stages.inputs import study_catalog
 from miricigale.workflow.truths import study_truths
 
 __all__ = ["MIN_SOURCES", "check_study", "disk_use", "run_study"]
@@ -90,7 +90,7 @@ def check_study(config):
                 f"{exposure.n_groups} groups; take fewer groups and more integrations"
             )
             raise ConfigError(msg)
-    catalog = read_catalog(config.catalog.source)
+    catalog = study_catalog(config.catalog)
     wcs = grid_of(config, config.reduction.pixel_scale)
     n_inside = int(np.count_nonzero(wcs.footprint_contains(catalog["sky"])))
     if n_inside < MIN_SOURCES:

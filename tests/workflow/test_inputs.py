@@ -9,7 +9,7 @@ from astropy.table import QTable
 from miricigale.fitting import FitResults
 from miricigale.scene import check_catalog
 from miricigale.sed import SEDModel
-from miricigale.utils.exceptions import ConfigError
+from miricigale.utils.exceptions import ConfigError, MiricigaleWarning
 from miricigale.workflow import Context, StudyRunner
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.stages import study_stages
@@ -103,3 +103,44 @@ def test_new_errors_make_other_inputs(galaxies, tmp_path):
 def test_no_band_is_refused(galaxies, tmp_path):
     with pytest.raises(ConfigError, match="leaves none of the catalog's bands"):
         run(tmp_path, galaxies.copy(), max_wavelength=0.5)
+
+
+def test_a_catalog_of_ones_own_by_a_map_of_columns(galaxies, tmp_path):
+    # the prior's band alone, in mJy and under other names; -99 stands for what is missing
+    rows = ["ID,ra,dec,zphot,F_H,profile,half_light_radius,sersic_index,axis_ratio,position_angle"]
+    flux = [0.01, 0.02, 0.03, -99.0]
+    rows += [
+        f"{k},53.1{k},-27.8,0.8,{value},point,0,1,1,0" for k, value in enumerate(flux, start=1)
+    ]
+    path = tmp_path / "mine.csv"
+    path.write_text("\n".join(rows) + "\n")
+    columns = ["id=ID", "redshift=zphot", "wfc3.f160w=F_H"]
+    config = StudyConfig.from_dict(
+        {
+            "catalog": {
+                "source": str(path),
+                "columns": columns,
+                "units": ["flux=mJy", "half_light_radius=arcsec"],
+                "mag_limit": 21.0,
+            },
+            "sed": {"axes": "quick"},
+        }
+    )
+    with pytest.warns(MiricigaleWarning, match="1 of 4 sources"):
+        STAGES["catalog"].function(Context(config, tmp_path, stage=STAGES["catalog"]), "")
+    for name, unit in (("seds", ""), ("truth", "agn00")):
+        STAGES[name].function(Context(config, tmp_path, stage=STAGES[name], unit=unit), unit)
+    truth = QTable.read(tmp_path / "agn00" / "truth.ecsv")
+    # 23.9 - 2.5 log(10) = 21.4 is below the limit; the source without a flux stays, and has none
+    assert list(truth["id"]) == [2, 3, 4]
+    np.testing.assert_allclose(truth["wfc3.f160w"].value[:2], [20, 30], rtol=1e-6)
+    assert np.isnan(truth["wfc3.f160w"][2])
+    assert np.isnan(truth["miri.f770w"][2])
+    # one band gives every galaxy light in all others
+    assert np.all(truth["miri.f770w"][:2] > 0)
+
+
+@pytest.mark.parametrize("key", ["columns", "units"])
+def test_a_map_without_pairs_is_refused(key):
+    with pytest.raises(ConfigError, match=rf"\[catalog\] {key} must have the form 'name=value'"):
+        StudyConfig.from_dict({"catalog": {key: ["redshift"]}})

@@ -139,6 +139,8 @@ def exposure_memory(config, unit):
 
     Measured: 0.5 GB, and counts and flags of each group.
     """
+    if config.exposures.kind == "rates":
+        return 600_000_000
     name = unit.rpartition("/")[2]
     chosen = [e for own, e in study_exposures(config).items() if name in (own, e.filter)]
     groups = max(math.prod(e.shape) * e.n_groups * e.n_integrations for e in chosen)

@@ -104,7 +104,8 @@ def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, tell=N
     image = sky.render()
     if tell is not None:
         tell(imager.forecast(image, exposure, sources=sky.truth))
-    ramp = imager.expose(image, exposure, seed=seed, n_threads=n_threads)
+    collect = imager.expose if config.exposures.kind == "ramps" else imager.collect
+    ramp = collect(image, exposure, seed=seed, n_threads=n_threads)
     del image
     if keep is not None:
         keep(ramp)

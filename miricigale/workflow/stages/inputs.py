@@ -11,6 +11,7 @@ from miricigale.scene import read_catalog
 from miricigale.utils.exceptions import ConfigError, argument_error
 from miricigale.utils.tables import error_column
 from miricigale.workflow.stage import stage
+from miricigale.workflow.stages.sample import magnitude
 
 __all__ = [
     "catalog_bands",
@@ -20,6 +21,7 @@ __all__ = [
     "input_bands",
     "make_catalog",
     "sed_resources",
+    "study_catalog",
 ]
 
 #: Redshifts closer than this share a node of the grid of the input fit.
@@ -74,11 +76,19 @@ def input_bands(catalog, max_wavelength):
     return bands, longest
 
 
+def study_catalog(options):
+    """The catalog of the section ``catalog`` of a configuration."""
+    columns, units = (
+        dict(pair.split("=") for pair in pairs) for pairs in (options.columns, options.units)
+    )
+    return read_catalog(options.source, columns=columns or None, units=units or None)
+
+
 def _input_plan(config, _):
     """Axes of the input fit, and the bands whose errors a user's catalog has, for hashing."""
     plan = _plain_axes(input_axes(config.sed.axes))
     if config.catalog.source not in resources():
-        catalog = read_catalog(config.catalog.source)
+        catalog = study_catalog(config.catalog)
         bands, _ = input_bands(catalog, config.sed.max_wavelength)
         own = [name for name, errors in bands.items() if errors]
         plan |= {"own errors": own} if own else {}
@@ -88,7 +98,7 @@ def _input_plan(config, _):
 @stage(
     "catalog",
     "catalog",
-    sections=("catalog",),
+    sections=("catalog", "highres.filter"),
     plan=lambda config, _: (
         fingerprint(config.catalog.source) if config.catalog.source in resources() else ""
     ),
@@ -96,16 +106,25 @@ def _input_plan(config, _):
 def make_catalog(context, _):
     """Stage 1: read the catalog and cut it at the faint limit."""
     options = context.config.catalog
-    catalog = read_catalog(options.source)
-    if options.mag_column not in catalog.colnames:
-        raise argument_error("mag_column", f"one of {catalog.colnames}", repr(options.mag_column))
-    column = catalog[options.mag_column]
-    magnitude = np.asarray(getattr(column, "value", column), float)
-    chosen = catalog[magnitude <= options.mag_limit]
-    if len(chosen) == 0:
+    catalog, column, prior = (
+        study_catalog(options),
+        options.mag_column,
+        context.config.highres.filter,
+    )
+    if column in catalog.colnames:
+        magnitudes = catalog[column]
+        magnitudes = np.asarray(getattr(magnitudes, "value", magnitudes), float)
+    elif prior in catalog.colnames:
+        column, magnitudes = prior, magnitude(catalog[prior])
+    else:
+        wanted = f"one of {catalog.colnames}, or the catalog must have fluxes in {prior}"
+        raise argument_error("mag_column", wanted, repr(column))
+    # a source of which nothing is known is no faint one: it stays, and the report says why it is not fitted
+    chosen = catalog[~(magnitudes > options.mag_limit)]
+    if not np.any(magnitudes <= options.mag_limit):
         msg = (
             f"[catalog] mag_limit = {options.mag_limit} leaves none of the {len(catalog)} sources, "
-            f"whose {options.mag_column} begins at {np.nanmin(magnitude):.2f}"
+            f"whose {column} begins at {np.nanmin(magnitudes):.2f}"
         )
         raise ConfigError(msg)
     context.save_table("catalog.ecsv", chosen)
@@ -150,6 +169,8 @@ def fit_inputs(context, _):
         axes=axes,
         model_error=context.config.fit.model_error,
         redshift_tolerance=REDSHIFT_STEP,
+        # a single band tells the light, if not its colors
+        n_bands_min=1,
     )
     results = fitter.fit(photometry, redshift="redshift", progress_bar=context.progress_bar)
     context.save_result("input_seds.fits", results)

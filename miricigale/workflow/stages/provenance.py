@@ -105,6 +105,11 @@ def stand_ins(config, model):
     else:
         noise += f"; residual of flat field and sky: {config.detector.residual}"
     found.append(f"{noise}.")
+    if config.exposures.kind == "rates":
+        found.append(
+            "Exposures: slopes with the noise that fits to ramps have; no groups were simulated, and "
+            "what ramps show beyond noise, cosmic rays and saturation is left out."
+        )
     found.append(
         "Existing bands of the fit: true fluxes with Gaussian noise of the depths in [fit], and 3 % of "
         "the flux (10 % in IRAC and MIPS bands), fractions of our own. Stars: black bodies."
