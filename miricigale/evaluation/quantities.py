@@ -227,9 +227,12 @@ def _power(statistic):
 
 
 def xray_fluxes(one):
-    """Log of the X-ray flux (erg/s/cm2) of all sources of a truth; NaN without an AGN."""
-    flux = yang2021_xray_flux(one.truth["l_6um"], np.asarray(one.truth["redshift"], float)).value
-    return np.log10(np.where(flux > 0, flux, np.nan))
+    """Log of the X-ray flux (erg/s/cm2) of all sources of a truth; NaN without an AGN, and of stars."""
+    redshift, power = np.asarray(one.truth["redshift"], float), one.truth["l_6um"]
+    flux = np.full(redshift.size, np.nan)
+    good = np.isfinite(redshift) & (power > 0)
+    flux[good] = yang2021_xray_flux(power[good], redshift[good]).value
+    return np.log10(flux)
 
 
 def _xray_half(study, one, band_set, option, draws):

@@ -1,5 +1,8 @@
 """Stages 1 and 2: catalog, input SEDs."""
 
+import functools
+from pathlib import Path
+
 import numpy as np
 from astropy.table import QTable
 
@@ -78,6 +81,14 @@ def input_bands(catalog, max_wavelength):
 
 def study_catalog(options):
     """The catalog of the section ``catalog`` of a configuration."""
+    path = Path(options.source).expanduser()
+    state = path.stat() if path.is_file() else None
+    return _catalog(options, state and (state.st_mtime_ns, state.st_size)).copy()
+
+
+@functools.lru_cache(maxsize=2)
+def _catalog(options, state):
+    """The catalog, read and warned of once; ``state`` tells whether a file has changed."""
     columns, units = (
         dict(pair.split("=") for pair in pairs) for pairs in (options.columns, options.units)
     )
