@@ -90,9 +90,7 @@ def _parser():
 
     _photometry_parser(commands)
 
-    plan = commands.add_parser("plan", help="saturation and depth of the CEERS exposures")
-    plan.add_argument("--quick", action="store_true", help="of the quick exposures instead")
-    plan.set_defaults(call=_plan)
+    _plan_parser(commands)
 
     filters = commands.add_parser("filters", help="list the filters")
     filters.add_argument("pattern", nargs="?", default="", help="part of the name")
@@ -114,6 +112,49 @@ def _parser():
     add.add_argument("path", type=Path, help="file, folder or archive as distributed")
     add.set_defaults(call=_data_add, stopped=lambda _: "stopped; nothing was changed")
     return parser
+
+
+def _plan_parser(commands):
+    plan = commands.add_parser(
+        "plan",
+        help="what MIRI exposures would yield; without options, the CEERS exposures",
+        description="Without options: saturation and depth of the CEERS exposures. With any of them "
+        "but --quick: accuracy of redshift and AGN fraction, AGN selection and times, as a page.",
+    )
+    add = plan.add_argument
+    add("--quick", action="store_true", help="the table of the quick exposures")
+    add("--config", metavar="TOML", help="configuration; options replace its keys")
+    add("--bands", nargs="+", metavar="BAND", help="MIRI bands, such as f770w f1500w")
+    add("--time", nargs="+", type=float, metavar="S", help="time of each, all dithers; one for all")
+    add(
+        "--depth",
+        nargs="+",
+        type=float,
+        metavar="AB",
+        help="5-sigma depth of each in place of times",
+    )
+    add("--dithers", nargs="+", type=int, metavar="N", help="dithers of each (4); one for all")
+    add("--readout", metavar="PATTERN", help="readout pattern (FASTR1)")
+    add(
+        "--sets",
+        nargs="+",
+        metavar="BAND,BAND",
+        help="sets of the bands to compare; all: every band",
+    )
+    add("--areas", nargs="+", type=int, metavar="N", help="pointings that share the times")
+    add("--pointings", type=int, metavar="N", help="pointings side by side, each with the times")
+    add("--background", metavar="LEVEL", help="zodiacal light: low, medium or high")
+    add(
+        "--position", nargs=2, type=float, metavar=("RA", "DEC"), help="degrees, for the background"
+    )
+    add("--date", metavar="DAY", help="such as 2027-03-01, for the background (needs zodipy)")
+    add("--sources", type=int, metavar="N", help="sources of the sample")
+    add("--rank", metavar="WHAT", help="ranked for each hour: agn, frac_agn or redshift")
+    add("-o", "--output", type=Path, help="folder (default: the name of the plan)")
+    add("--seed", type=int, help="seed of every random draw")
+    add("--threads", type=int, help="threads (default: all cores)")
+    add("--print-config", action="store_true", help="print the configuration and stop")
+    plan.set_defaults(call=_plan)
 
 
 def _photometry_parser(commands):
@@ -305,11 +346,79 @@ def _photometry(args):
     return 0
 
 
-def _plan(args):
-    from miricigale.workflow.commands import plan_table
+#: Sections and keys of a plan by the options of the command that replace them.
+_PLAN_KEYS = {
+    "time": "exposures.time",
+    "depth": "exposures.depth",
+    "dithers": "exposures.dithers",
+    "readout": "exposures.readout",
+    "sets": "exposures.sets",
+    "pointings": "exposures.pointings",
+    "areas": "survey.areas",
+    "rank": "survey.rank",
+    "background": "background.level",
+    "date": "background.date",
+    "sources": "sample.n_sources",
+    "seed": "plan.seed",
+    "threads": "plan.threads",
+}
 
-    plan_table(quick=args.quick).pprint_all()
+
+def _plan(args):
+    given = {name for name in _PLAN_KEYS if getattr(args, name) is not None}
+    options = ("config", "bands", "position", "output")
+    given |= {name for name in options if getattr(args, name) is not None}
+    if not given and not args.print_config:
+        from miricigale.workflow.commands import plan_table
+
+        plan_table(quick=args.quick).pprint_all()
+        return 0
+    if args.quick:
+        msg = "--quick is of the table of the CEERS exposures, which has no other option"
+        raise ValueError(msg)
+    if args.time is not None and args.depth is not None:
+        msg = "wanted are --time or --depth, not both"
+        raise ValueError(msg)
+    from miricigale.utils.parallel import thread_count, thread_pool
+    from miricigale.workflow.commands import write_plan
+    from miricigale.workflow.planning import load_plan
+
+    config = load_plan(args.config, overrides=_plan_overrides(args))
+    if args.print_config:
+        print(config.to_toml(), end="")
+        return 0
+    folder = args.output or Path(config.plan.name)
+    begin = time.monotonic()
+    with thread_pool(thread_count(config.plan.threads or None)) as executor:
+        comparison = write_plan(config, folder, executor=executor)
+    wanted = ["plan", "time", "z_scatter", "z_outliers", "frac_scatter", "completeness", "purity"]
+    table = comparison[[*wanted, "n_agn", "merit"]]
+    for name in table.colnames[1:]:
+        table[name].info.format = ".3g"
+    table.pprint_all()
+    print(f"done in {time.monotonic() - begin:.0f} s; page: {folder / 'plan.html'}")
     return 0
+
+
+def _plan_overrides(args):
+    """Sections and keys that the options of the command replace."""
+    values = {}
+    for name, key in _PLAN_KEYS.items():
+        value = getattr(args, name)
+        if value is not None:
+            section, _, key = key.partition(".")
+            values.setdefault(section, {})[key] = value
+    if args.time is not None and args.depth is None:
+        # depths of the file would count in place of times
+        values["exposures"]["depth"] = []
+    if args.bands is not None:
+        exposures = values.setdefault("exposures", {})
+        exposures["bands"] = [f"miri.{name.removeprefix('miri.')}" for name in args.bands]
+        exposures.setdefault("dithers", [4])
+    if args.position is not None:
+        ra, dec = args.position
+        values.setdefault("background", {}).update(ra=ra, dec=dec)
+    return values
 
 
 def _compile(args):

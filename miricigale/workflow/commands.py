@@ -1,6 +1,7 @@
 """What the smaller commands of the command line do, for use in code too."""
 
 import warnings
+from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -11,7 +12,7 @@ from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column
 
-__all__ = ["filter_table", "fit_catalog", "plan_table"]
+__all__ = ["filter_table", "fit_catalog", "plan_table", "write_plan"]
 
 
 def filter_table(pattern=""):
@@ -91,6 +92,47 @@ def plan_table(*, quick=False):
             }
         )
     return QTable(rows)
+
+
+def write_plan(config, folder, *, executor=None):
+    """
+    Work out a plan and write it.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.planning.PlanConfig`
+        The plan.
+    folder : path-like
+        Gets ``plan.html``, ``plan.toml``, ``comparison.ecsv``, ``areas.ecsv`` (with ``[survey] areas``),
+        and ``bands-<n>.ecsv`` and ``sources-<n>.ecsv`` of each set of bands, in the order of the
+        configuration (0: the existing ones). Files of these names are replaced.
+    executor : `concurrent.futures.Executor`, optional
+        Threads to fit with; the answer is the same.
+
+    Returns
+    -------
+    comparison : `~astropy.table.QTable`
+        See `~miricigale.workflow.planning.comparison_table`.
+    """
+    from miricigale.workflow.planning import Planner, area_table, comparison_table, write_page
+
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise argument_error("folder", "a folder, or nothing yet", f"the file {folder}")
+    planner = Planner(config, executor=executor)
+    plans = planner.compare()
+    comparison = comparison_table(planner, plans)
+    areas = area_table(planner, planner.divide()) if config.survey.areas else None
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "plan.toml").write_text(config.to_toml(), encoding="utf-8")
+    tables = {"comparison": comparison}
+    tables |= {} if areas is None else {"areas": areas}
+    tables |= {f"sources-{k}": plan.sources for k, plan in enumerate(plans)}
+    tables |= {f"bands-{k}": plan.band_table() for k, plan in enumerate(plans) if plan.bands}
+    for name, table in tables.items():
+        table.write(folder / f"{name}.ecsv", overwrite=True)
+    write_page(folder / "plan.html", planner, plans, comparison, areas)
+    return comparison
 
 
 def fit_catalog(

@@ -17,9 +17,11 @@ from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.sample import magnitude
 
 __all__ = [
+    "bright_sources",
     "catalog_bands",
     "fit_inputs",
     "fit_plan",
+    "fit_seds",
     "input_axes",
     "input_bands",
     "make_catalog",
@@ -117,11 +119,13 @@ def _input_plan(config, _):
 def make_catalog(context, _):
     """Stage 1: read the catalog and cut it at the faint limit."""
     options = context.config.catalog
-    catalog, column, prior = (
-        study_catalog(options),
-        options.mag_column,
-        context.config.highres.filter,
-    )
+    prior = context.config.highres.filter
+    context.save_table("catalog.ecsv", bright_sources(study_catalog(options), options, prior))
+
+
+def bright_sources(catalog, options, prior):
+    """Sources up to ``mag_limit`` in the column ``mag_column`` of the options, or in the flux of ``prior``."""
+    column = options.mag_column
     if column in catalog.colnames:
         magnitudes = catalog[column]
         magnitudes = np.asarray(getattr(magnitudes, "value", magnitudes), float)
@@ -138,7 +142,7 @@ def make_catalog(context, _):
             f"whose {column} begins at {np.nanmin(magnitudes):.2f}"
         )
         raise ConfigError(msg)
-    context.save_table("catalog.ecsv", chosen)
+    return chosen
 
 
 @stage(
@@ -153,8 +157,22 @@ def make_catalog(context, _):
 )
 def fit_inputs(context, _):
     """Stage 2: fit a galaxy grid to the catalog's fluxes at the known redshifts."""
-    options = context.config.sed
-    catalog = QTable.read(context.path("catalog.ecsv"))
+    results = fit_seds(
+        QTable.read(context.path("catalog.ecsv")),
+        context.config.sed,
+        model_error=context.config.fit.model_error,
+        progress_bar=context.progress_bar,
+    )
+    context.save_result("input_seds.fits", results)
+
+
+def fit_seds(catalog, options, *, model_error, executor=None, progress_bar=False):
+    """
+    Fit a galaxy grid to the fluxes of a catalog at its redshifts.
+
+    ``options`` has ``axes`` (as `input_axes`), ``catalog_error``, the relative error of the bands without a
+    column of errors, and ``max_wavelength`` (um), up to which these are fitted.
+    """
     bands, longest = input_bands(catalog, options.max_wavelength)
     if not bands:
         msg = f"[sed] max_wavelength = {options.max_wavelength} leaves none of the catalog's bands"
@@ -171,17 +189,14 @@ def fit_inputs(context, _):
             error = np.abs(catalog[name]) * options.catalog_error
         photometry[error_column(name)] = error
     nodes = np.unique(np.round(photometry["redshift"] / REDSHIFT_STEP) * REDSHIFT_STEP)
-    model = sed.SEDModel.yang2021(agn=False)
     axes = input_axes(options.axes, dust=longest > options.max_wavelength)
-    axes |= {"redshift": nodes[nodes > 0]}
     fitter = fitting.BayesFitter(
-        model,
+        sed.SEDModel.yang2021(agn=False),
         list(bands),
-        axes=axes,
-        model_error=context.config.fit.model_error,
+        axes=axes | {"redshift": nodes[nodes > 0]},
+        model_error=model_error,
         redshift_tolerance=REDSHIFT_STEP,
         # a single band tells the light, if not its colors
         n_bands_min=1,
     )
-    results = fitter.fit(photometry, redshift="redshift", progress_bar=context.progress_bar)
-    context.save_result("input_seds.fits", results)
+    return fitter.fit(photometry, redshift="redshift", executor=executor, progress_bar=progress_bar)

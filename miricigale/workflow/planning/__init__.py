@@ -1,0 +1,15 @@
+"""What exposures would yield, without images: noise, fits of mock photometry, times."""
+
+from miricigale.utils.lazy import lazy_names
+
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "config": ("PlanConfig", "load_plan"),
+        "exposures": ("BandPlan", "wall_clock"),
+        "page": ("write_page",),
+        "planner": ("Plan", "Planner"),
+        "compare": ("area_table", "comparison_table"),
+        "sample": ("make_sample",),
+    },
+)

@@ -1,0 +1,96 @@
+"""Plans side by side: ranked for each hour, and depth against area."""
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+__all__ = ["area_table", "comparison_table"]
+
+
+def _row(planner, plan, numbers):
+    """One row of both tables."""
+    row = {"plan": plan.name, "time": plan.time.to(u.h), "area": plan.area}
+    row["n"] = numbers["z_scatter"].n
+    for name, number in numbers.items():
+        row |= {name: number.value, f"{name}_err": number.error}
+    row |= {"n_detected": np.nan, "n_agn": np.nan}
+    if not plan.bands:
+        return row
+    # of all sources of the sample
+    agn = np.asarray(plan.sources["frac_agn"]) >= planner.config.agn.limit
+    found = agn & np.asarray(plan.sources["selected"], bool)
+    least = max(1, min(planner.config.fit.min_detected, len(plan.bands)))
+    detected = np.asarray(plan.sources["n_detected"]) >= least
+    sources = planner.density * plan.area.to_value(u.arcmin**2)
+    row["n_detected"] = sources * np.mean(detected)
+    row["n_agn"] = sources * np.mean(found & detected)
+    return row
+
+
+def comparison_table(planner, plans):
+    """
+    Plans with MIRI, the best for each hour first, after the existing bands alone.
+
+    All are compared on the same sources: those that one of them detects.
+
+    Parameters
+    ----------
+    planner : `~miricigale.workflow.planning.Planner`
+        That made them.
+    plans : list of `~miricigale.workflow.planning.Plan`
+        Of `Planner.compare`.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        ``plan``, ``time`` (h), ``area``, ``n`` (sources compared), the numbers of
+        `~miricigale.workflow.planning.planner.accuracy` with their errors, ``n_detected`` and ``n_agn`` (expected
+        in the area: sources detected, AGN detected and selected), and ``merit``, by which the rows are
+        ranked. Of ``[survey] rank = "agn"`` that is ``n_agn`` times the purity for each hour; of ``"frac_agn"``
+        and ``"redshift"`` the inverse variance of the means that is gained over the existing bands,
+        relative to these and for each hour: ((scatter without / scatter with)^2 - 1) / hours.
+    """
+    chosen = planner.common(plans)
+    rows = [_row(planner, plan, planner.accuracy(plan, chosen)) for plan in plans]
+    rank = planner.config.survey.rank
+    without = next((row for row, plan in zip(rows, plans, strict=True) if not plan.bands), None)
+    for row in rows:
+        hours = row["time"].to_value(u.h)
+        row["merit"] = np.nan
+        if hours > 0 and rank == "agn":
+            row["merit"] = row["n_agn"] * row["purity"] / hours
+        elif hours > 0 and without is not None:
+            name = {"frac_agn": "frac_scatter", "redshift": "z_scatter"}[rank]
+            row["merit"] = ((without[name] / row[name]) ** 2 - 1) / hours
+    # those without a number last, the existing bands first
+    order = sorted(
+        range(len(rows)),
+        key=lambda k: (bool(plans[k].bands), -np.nan_to_num(rows[k]["merit"], nan=-np.inf)),
+    )
+    table = QTable([rows[k] for k in order])
+    table["merit"].info.description = f"for each hour, ranked by {rank}"
+    return table
+
+
+def area_table(planner, plans):
+    """
+    Depth against area.
+
+    Parameters
+    ----------
+    planner : `~miricigale.workflow.planning.Planner`
+        That made them.
+    plans : list of `~miricigale.workflow.planning.Plan`
+        Of `Planner.divide`.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        As `comparison_table`, with ``pointings`` for the name and without a merit; the numbers are of the
+        sources that each plan detects itself.
+    """
+    rows = [_row(planner, plan, planner.accuracy(plan)) for plan in plans]
+    for row in rows:
+        row["pointings"] = int(row.pop("plan"))
+    table = QTable(rows)
+    return table[["pointings", *(name for name in table.colnames if name != "pointings")]]

@@ -1,0 +1,302 @@
+"""Options of a plan: frozen dataclasses from TOML, like those of a run."""
+
+import dataclasses
+
+from miricigale.instrument import CEERS_FILTERS, imager_filters, readout_patterns
+from miricigale.photometry import YANG2021_DEPTHS
+from miricigale.utils.exceptions import unknown_name
+from miricigale.workflow.config import SedSection
+from miricigale.workflow.options import (
+    from_text,
+    option,
+    read_text,
+    replace_sections,
+    require,
+    sections_toml,
+)
+
+__all__ = ["PlanConfig", "load_plan"]
+
+
+@dataclasses.dataclass(frozen=True)
+class PlanSection:
+    """What the plan is called and how it goes."""
+
+    name: str = option("plan", "Name of the plan; its folder unless --output is given.")
+    seed: int = option(20210211, "Seed of every random draw.", low=0)
+    threads: int = option(0, "Threads; 0 for as many as there are cores.", low=0)
+
+
+@dataclasses.dataclass(frozen=True)
+class SampleSection:
+    """The galaxies of the mock photometry."""
+
+    source: str = option("catalog.goodss", "Resource name or path of the catalog.")
+    n_sources: int = option(500, "Sources drawn from it; 0 for all.", low=0, high=100000)
+    mag_limit: float = option(26.6, "Faint limit in the magnitude column.", low=10.0, high=40.0)
+    mag_column: str = option("mag_f160w", "Column that the limit applies to.")
+    redshift: tuple[float, ...] = option((0.01, 6.0), "Range of redshifts.", low=0.0, high=20.0)
+    luminosity: tuple[float, ...] = option(
+        (0.0, 16.0), "Range of log10 of the dust's luminosity (Lsun).", low=0.0, high=20.0
+    )
+    area: float = option(
+        0.0, "Area of the catalog (square arcmin); 0 for the bundled one's.", low=0.0
+    )
+    luminosity_function: str = option(
+        "",
+        "Table of log_luminosity, redshift, phi (per Mpc3 and dex) that the sample is drawn after.",
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class AgnSection:
+    """The mix of AGN, and how they are selected."""
+
+    field: bool = option(
+        False, "Whether AGN are those of a real field, after an X-ray luminosity function."
+    )
+    frac_agn: tuple[float, ...] = option(
+        (0.0, 0.2, 0.4, 0.6, 0.8, 0.99),
+        "fracAGN of the sources, unless of a field or in a column frac_agn of the catalog.",
+        low=0.0,
+        high=0.99,
+        single=True,
+    )
+    shares: tuple[float, ...] = option(
+        (0.5, 0.1, 0.1, 0.1, 0.1, 0.1), "Share of the sources of each.", low=0.0, single=True
+    )
+    limit: float = option(0.4, "fracAGN from which a source is an AGN.", low=0.01, high=0.99)
+    select: str = option(
+        "probability",
+        "Selected by the probability of a fracAGN above the limit, or by the mean.",
+        choices=("probability", "mean"),
+    )
+    threshold: float = option(0.5, "Least probability of a selected source.", low=0.0, high=1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class ExposureSection:
+    """The MIRI bands, and how long each is exposed."""
+
+    bands: tuple[str, ...] = option(CEERS_FILTERS, "MIRI filters.")
+    time: tuple[float, ...] = option(
+        (1665.0, 1665.0, 1665.0, 1665.0, 1665.0, 4662.0),
+        "Exposure time (s) of each band in a pointing, all dithers; one for all.",
+        low=0.0,
+        single=True,
+    )
+    depth: tuple[float, ...] = option(
+        (), "5-sigma AB depth of each band instead of a time.", low=10.0, high=40.0, single=True
+    )
+    dithers: tuple[int, ...] = option(
+        (3, 3, 3, 3, 3, 6), "Dithers of each band.", low=1, high=500, single=True
+    )
+    readout: str = option("FASTR1", "Readout pattern.", choices=readout_patterns())
+    max_fill: float = option(
+        0.6, "Largest share of the well that the sky fills.", low=0.05, high=0.95
+    )
+    sets: tuple[str, ...] = option(
+        ("all",), "Sets of bands that are compared: all, or names joined by commas."
+    )
+    pointings: int = option(1, "Pointings side by side.", low=1, high=10000)
+
+
+@dataclasses.dataclass(frozen=True)
+class BackgroundSection:
+    """The sky."""
+
+    level: str = option("low", "Zodiacal light.", choices=("low", "medium", "high"))
+    ra: float = option(-1.0, "Right ascension in degrees; -1: no position.", low=-1, high=360)
+    dec: float = option(0.0, "Declination in degrees.", low=-90, high=90)
+    date: str = option("", "Day, such as 2027-03-01, instead of a level (needs zodipy).")
+
+
+@dataclasses.dataclass(frozen=True)
+class NoiseSection:
+    """Where the errors of MIRI fluxes come from."""
+
+    kind: str = option(
+        "fitted",
+        "Fit on the mosaic, aperture photometry, or the error function of a run.",
+        choices=("fitted", "aperture", "run"),
+    )
+    run: str = option("", "Folder of the run whose errors.ecsv is scaled, with kind = 'run'.")
+    residual: float | str = option(
+        0.0,
+        "Fraction of the sky that stays as a fixed pattern, or the calculator's.",
+        low=0.0,
+        high=0.1,
+        choices=("etc",),
+    )
+    fractional: float = option(
+        0.03, "Part of the flux added in quadrature (templates, blends).", low=0.0, high=1.0
+    )
+    sizes: bool = option(True, "Whether errors grow with the half-light radii of the sources.")
+
+
+@dataclasses.dataclass(frozen=True)
+class FitSection:
+    """The fits."""
+
+    bands: tuple[str, ...] = option(tuple(YANG2021_DEPTHS), "Existing bands.")
+    depths: tuple[float, ...] = option(tuple(YANG2021_DEPTHS.values()), "Their 5-sigma AB depths.")
+    axes: str = option("fit", "Grid of the fit.", choices=("fit", "quick"))
+    model_error: float = option(0.1, "Relative model error.", low=0.0, high=1.0)
+    min_detected: int = option(
+        2, "MIRI bands in which a source must be detected to count.", low=0, high=9
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class SurveySection:
+    """Depth against area."""
+
+    areas: tuple[int, ...] = option(
+        (), "Numbers of pointings that the exposure times are divided among.", low=1, high=1000
+    )
+    rank: str = option(
+        "agn",
+        "What is ranked for each hour: AGN found, or precision of fracAGN or redshift.",
+        choices=("agn", "frac_agn", "redshift"),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class OverheadSection:
+    """What the observatory charges besides the exposures, in s: approximations to APT."""
+
+    # JWST user documentation: "JWST Instrument Overheads" (APT 2023.3.4: script, exposure, filter and
+    # visit of MIRI imaging), "Visit Timing" (guide star), "JWST Observing Overheads Summary"
+    # (observatory). Slews and dither are from memory: APT takes them from the distances.
+    slew: float = option(1800.0, "Slew to the first pointing.", low=0.0)
+    next_slew: float = option(150.0, "Slew to a neighboring pointing.", low=0.0)
+    guide_star: float = option(284.0, "Acquisition of the guide star of each pointing.", low=0.0)
+    visit: float = option(90.0, "Scripts and cleanup of each pointing.", low=0.0)
+    filter: float = option(50.0, "Move of the filter wheel, each band.", low=0.0)
+    script: float = option(22.0, "Compilation of scripts, each band.", low=0.0)
+    exposure: float = option(44.0, "Set-up and cleanup of each exposure.", low=0.0)
+    dither: float = option(60.0, "Small angle maneuver between dithers.", low=0.0)
+    observatory: float = option(0.16, "Part added to all of it.", low=0.0, high=1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class PlanConfig:
+    """
+    Everything that a plan depends on; each attribute is a section of the TOML file.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.ConfigError`
+        If lists that belong together have different lengths, or values contradict each other.
+    KeyError
+        If a band is none of MIRI's imager.
+    """
+
+    plan: PlanSection = dataclasses.field(default_factory=PlanSection)
+    sample: SampleSection = dataclasses.field(default_factory=SampleSection)
+    sed: SedSection = dataclasses.field(default_factory=SedSection)
+    agn: AgnSection = dataclasses.field(default_factory=AgnSection)
+    exposures: ExposureSection = dataclasses.field(default_factory=ExposureSection)
+    background: BackgroundSection = dataclasses.field(default_factory=BackgroundSection)
+    noise: NoiseSection = dataclasses.field(default_factory=NoiseSection)
+    fit: FitSection = dataclasses.field(default_factory=FitSection)
+    survey: SurveySection = dataclasses.field(default_factory=SurveySection)
+    overheads: OverheadSection = dataclasses.field(default_factory=OverheadSection)
+
+    def __post_init__(self):
+        exposures, fit, agn, n = self.exposures, self.fit, self.agn, len(self.exposures.bands)
+        require(n, "exposures", "bands", "must name at least one filter", "none")
+        bands = list(exposures.bands)
+        require(len(set(bands)) == n, "exposures", "bands", "must not repeat", bands)
+        for name in bands:
+            if name not in imager_filters():
+                raise unknown_name("imaging filter", name, imager_filters())
+        key = "depth" if exposures.depth else "time"
+        wanted = f"must have one number, or one per band ({n})"
+        for name in (key, "dithers"):
+            values = getattr(exposures, name)
+            require(len(values) in (1, n), "exposures", name, wanted, len(values))
+        if not exposures.depth:
+            least = min(exposures.time)
+            require(least > 0, "exposures", "time", "must be positive", least)
+        wanted = f"must have one number per band ({len(fit.bands)})"
+        require(len(fit.bands) == len(fit.depths), "fit", "depths", wanted, len(fit.depths))
+        wanted = f"must have one number per fracAGN ({len(agn.frac_agn)})"
+        require(len(agn.shares) == len(agn.frac_agn), "agn", "shares", wanted, len(agn.shares))
+        require(sum(agn.shares) > 0, "agn", "shares", "must not all be 0", list(agn.shares))
+        plain = SedSection().frac_agn
+        wanted = "must be left out: [agn] has the mix"
+        require(self.sed.frac_agn == plain, "sed", "frac_agn", wanted, list(self.sed.frac_agn))
+        for name in ("redshift", "luminosity"):
+            span = getattr(self.sample, name)
+            good = len(span) == 2 and span[0] < span[1]
+            require(good, "sample", name, "must be two numbers in order", list(span))
+        background = self.background
+        good = not background.date or background.ra >= 0
+        wanted = "must come with a position (ra, dec)"
+        require(good, "background", "date", wanted, repr(background.date))
+        good = self.noise.kind != "run" or self.noise.run
+        require(good, "noise", "run", "must be a folder with kind = 'run'", "none")
+        for name in exposures.sets:
+            unknown = [band for band in self.set_bands(name) if band not in bands]
+            wanted = f"must be 'all' or bands of {bands}"
+            require(not unknown, "exposures", "sets", wanted, repr(name))
+
+    def set_bands(self, name):
+        """Bands of one of the ``sets``, in order of wavelength."""
+        if name == "all":
+            return self.exposures.bands
+        found = [one.strip() for one in name.split(",") if one.strip()]
+        found = [one if one.startswith("miri.") else f"miri.{one}" for one in found]
+        order = imager_filters()
+        return tuple(sorted(found, key=lambda one: order.index(one) if one in order else -1))
+
+    @classmethod
+    def from_dict(cls, values, *, base=None):
+        """
+        Make a configuration from nested dictionaries.
+
+        Parameters
+        ----------
+        values : dict of dict
+            Sections and their keys; what is absent keeps the value of ``base``.
+        base : `PlanConfig`, optional
+            Where absent keys come from; the defaults if not given.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.ConfigError`
+            For an unknown section or key, a wrong type, or a value outside its limits.
+        """
+        return replace_sections(base or cls(), values)
+
+    def to_toml(self):
+        """The whole configuration as TOML, each key with its documentation."""
+        heading = "# miricigale plan configuration; 'miricigale plan --config FILE' takes it back"
+        return sections_toml(self, heading)
+
+
+def load_plan(path=None, *, overrides=None):
+    """
+    Read the configuration of a plan.
+
+    Parameters
+    ----------
+    path : path-like, optional
+        TOML file; the defaults, the exposures of CEERS, if not given.
+    overrides : dict of dict, optional
+        Sections and keys that replace those of the file.
+
+    Returns
+    -------
+    config : `PlanConfig`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.ConfigError`
+        If the file is missing, not TOML, or holds an unknown or wrong key.
+    """
+    config = PlanConfig()
+    if path is not None:
+        config = from_text(str(path), read_text(path), config)
+    return PlanConfig.from_dict(overrides, base=config) if overrides else config

@@ -1,0 +1,281 @@
+"""What is exposed in each band: times, depths, noise, saturation, and the clock on the wall."""
+
+import dataclasses
+import functools
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+from scipy.optimize import brentq
+
+from miricigale.depth import (
+    saturation_flux,
+    saturation_forecast,
+    saturation_time,
+    scaled_limit,
+    sensitivity,
+    zodiacal_factor,
+)
+from miricigale.instrument import Exposure, background_level, frame_time
+from miricigale.photometry import ErrorModel
+from miricigale.utils.exceptions import ConfigError, DataError
+
+__all__ = ["BandPlan", "RunErrors", "band_plans", "wall_clock"]
+
+#: The plan needs no direction; an `Exposure` has one.
+_ANYWHERE = {"pointing": SkyCoord(0 * u.deg, 0 * u.deg), "roll": 0 * u.deg}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class BandPlan:
+    """
+    The exposures of one band, and the errors that they give.
+
+    Parameters
+    ----------
+    exposure : `~miricigale.instrument.Exposure`
+        One dither; its direction does not count.
+    n_dithers : int
+        Their number.
+    background : `~astropy.units.Quantity`
+        Of sky and telescope, MJy/sr.
+    noise : `~miricigale.workflow.planning.config.NoiseSection`
+        Kind of the errors.
+    run : `RunErrors`, optional
+        With ``noise.kind = "run"``.
+    """
+
+    exposure: Exposure
+    n_dithers: int
+    background: u.Quantity
+    noise: object
+    run: object = None
+
+    @property
+    def filter(self):
+        """Name of the band."""
+        return self.exposure.filter
+
+    @property
+    def time(self):
+        """Time in which light is gathered, all dithers, s."""
+        return self.n_dithers * self.exposure.exposure_time
+
+    @property
+    def sky_fraction(self):
+        """Share of the well that the sky fills by the end of an integration."""
+        return saturation_forecast(self.exposure, background=self.background)
+
+    @functools.cached_property
+    def limit(self):
+        """5-sigma AB limit of point sources in the calculator's aperture, by `~miricigale.depth.sensitivity`."""
+        e, residual = self.exposure, self.noise.residual
+        flux = sensitivity(
+            self.filter,
+            self.time,
+            n_sigma=5,
+            background=self.background,
+            residual=residual or None,
+            n_dithers=self.n_dithers,
+            n_groups=e.n_groups,
+            readout=e.readout,
+        )
+        return flux.to(u.ABmag)
+
+    @property
+    def calculator(self):
+        """The exposure time calculator's limit (low background), scaled by the root of the time."""
+        return scaled_limit(self.filter, self.time).to(u.ABmag)
+
+    @functools.cached_property
+    def saturation(self):
+        """AB magnitude at which a point source saturates."""
+        return saturation_flux(self.exposure, background=self.background).to(u.ABmag)
+
+    def errors(self, size=0.0 * u.arcsec):
+        """
+        Errors of the fluxes.
+
+        Parameters
+        ----------
+        size : `~astropy.units.Quantity`, optional
+            Full width at half maximum of the sources before the PSF; only with ``"fitted"`` errors.
+
+        Returns
+        -------
+        errors : `~miricigale.photometry.ErrorModel`
+        """
+        if self.noise.kind == "run":
+            return self.run.scaled(self)
+        if self.noise.kind == "aperture":
+            return ErrorModel.from_depths(
+                {self.filter: self.limit}, fractional=self.noise.fractional
+            )
+        return ErrorModel.from_exposure(
+            self.filter,
+            self.time,
+            background=self.background,
+            size=size,
+            n_integrations=self.n_dithers * self.exposure.n_integrations,
+            frame_time=self.exposure.frame_time,
+            fractional=self.noise.fractional,
+            n_dithers=self.n_dithers,
+            residual=self.noise.residual or None,
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RunErrors:
+    """
+    Error functions measured in a run, for other exposures.
+
+    The part of an error that the faintest sources have is scaled as the limit of
+    `~miricigale.depth.sensitivity`; what is beyond it (templates, blends) stays.
+    """
+
+    errors: ErrorModel
+    exposures: dict
+
+    @classmethod
+    def read(cls, folder):
+        """Read ``errors.ecsv`` and ``config.toml`` of a run."""
+        from pathlib import Path
+
+        from miricigale.workflow.config import load_config
+        from miricigale.workflow.stages.exposures import band_exposures
+
+        folder = Path(folder).expanduser()
+        for name in ("errors.ecsv", "config.toml"):
+            if not (folder / name).is_file():
+                msg = f"[noise] run = {str(folder)!r} has no {name}"
+                raise DataError(msg)
+        config = load_config(folder / "config.toml")
+        exposures = {name: band_exposures(config, name) for name in config.exposures.filters}
+        return cls(ErrorModel.read(folder / "errors.ecsv"), exposures)
+
+    def scaled(self, plan):
+        """`~miricigale.photometry.ErrorModel` of a `BandPlan`."""
+        if plan.filter not in self.exposures:
+            msg = f"the run of [noise] has no band {plan.filter}; it has {list(self.exposures)}"
+            raise ConfigError(msg)
+        first, n = self.exposures[plan.filter][0], len(self.exposures[plan.filter])
+        own = sensitivity(
+            plan.filter,
+            n * first.exposure_time,
+            n_sigma=5,
+            n_dithers=n,
+            n_groups=first.n_groups,
+            readout=first.readout,
+            subarray=first.subarray,
+        )
+        ratio = float((plan.limit.to(u.uJy) / own).decompose())
+        table = self.errors.to_table()
+        table = table[table["filter"] == plan.filter]
+        sigma = table["sigma"]
+        faint = np.min(sigma)
+        table["sigma"] = np.sqrt(sigma**2 + (ratio**2 - 1) * faint**2)
+        return ErrorModel.from_table(table)
+
+
+def background_of(filter, options):
+    """Background of a filter by the section ``background``."""
+    position = None
+    if options.ra >= 0:
+        position = SkyCoord(options.ra * u.deg, options.dec * u.deg)
+    if position is None and options.level == "low":
+        # the low background of the package
+        return background_level(filter)
+    date = options.date or None
+    factor = zodiacal_factor(filter, options.level, position=position, date=date)
+    return background_level(filter, zodi=factor)
+
+
+def _band_plan(filter, time, n_dithers, config, run):
+    """The exposures of one band that last a time."""
+    options, background = config.exposures, background_of(filter, config.background)
+    # the time for which Exposure.from_time allows is of the low background
+    brighter = saturation_time(filter) / saturation_time(filter, background=background)
+    exposure = Exposure.from_time(
+        filter,
+        time / n_dithers,
+        readout=options.readout,
+        max_fill=options.max_fill / float(brighter),
+        **_ANYWHERE,
+    )
+    return BandPlan(exposure, n_dithers, background, config.noise, run)
+
+
+def _time_to(depth, filter, n_dithers, config, run):
+    """Time in which the errors of point sources reach a 5-sigma depth."""
+
+    def excess(log_time):
+        plan = _band_plan(filter, 10**log_time * u.s, n_dithers, config, run)
+        return plan.errors().limiting_magnitude(filter).value - depth
+
+    # two frames in each dither at least
+    low = np.log10(2.5 * n_dithers * frame_time(config.exposures.readout).value)
+    if excess(low) >= 0:
+        return 10**low * u.s
+    if not excess(7.0) > 0:
+        msg = f"[exposures] depth = {depth} is not reached in {filter} in 10 million seconds"
+        raise ConfigError(msg)
+    return 10 ** brentq(excess, low, 7.0, xtol=2e-3) * u.s
+
+
+def band_plans(config, *, share=1.0, run=None):
+    """
+    The exposures of all bands of a configuration.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.planning.PlanConfig`
+        The configuration.
+    share : float, optional
+        Factor on all times.
+    run : `RunErrors`, optional
+        Errors of a run.
+
+    Returns
+    -------
+    plans : dict of str to `BandPlan`
+    """
+    options, n = config.exposures, len(config.exposures.bands)
+    times = options.depth or options.time
+    plans = {}
+    for name, value, dithers in zip(
+        options.bands,
+        times * (n // len(times)),
+        options.dithers * (n // len(options.dithers)),
+        strict=True,
+    ):
+        time = _time_to(value, name, dithers, config, run) if options.depth else value * u.s
+        plans[name] = _band_plan(name, share * time, dithers, config, run)
+    return plans
+
+
+def wall_clock(plans, options, *, pointings=1):
+    """
+    Time that the observatory charges.
+
+    Parameters
+    ----------
+    plans : iterable of `BandPlan`
+        The bands of a pointing.
+    options : `~miricigale.workflow.planning.config.OverheadSection`
+        Times of the overheads.
+    pointings : int, optional
+        Pointings, each a visit.
+
+    Returns
+    -------
+    time : `~astropy.units.Quantity`
+        In hours.
+    """
+    seconds = 0.0
+    for plan in plans:
+        seconds += options.filter + options.script
+        seconds += plan.n_dithers * (plan.exposure.duration.to_value(u.s) + options.exposure)
+        seconds += (plan.n_dithers - 1) * options.dither
+    seconds += options.guide_star + options.visit
+    seconds = pointings * seconds + options.slew + (pointings - 1) * options.next_slew
+    return (1 + options.observatory) * seconds / 3600 * u.h

@@ -1,0 +1,381 @@
+"""From exposures to accuracy: mock photometry of a sample, fitted, beside its truth."""
+
+import dataclasses
+import functools
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable, vstack
+
+from miricigale.evaluation import Estimate, bootstrap, selection_quality, sigma_mad
+from miricigale.fitting import BayesFitter
+from miricigale.photometry import ErrorModel
+from miricigale.photometry.surveys import fractional_error
+from miricigale.sed import SEDModel
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.tables import error_column, require_columns
+from miricigale.workflow.planning.config import PlanConfig
+from miricigale.workflow.planning.exposures import RunErrors, band_plans, wall_clock
+from miricigale.workflow.planning.sample import make_sample
+from miricigale.workflow.stages.sample import detected_bands
+
+__all__ = ["EXISTING", "Plan", "Planner", "accuracy"]
+
+#: Name of the fit without MIRI.
+EXISTING = "existing bands"
+#: Sizes (arcsec) of sources for which errors are computed; each source takes the nearest.
+_SIZES = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.2, 1.6])
+#: Field of the imager.
+_FIELD = 74 * 113 * u.arcsec**2
+#: abs(dz) / (1 + z) above which a redshift is an outlier.
+_OUTLIER = 0.15
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Plan:
+    """
+    What one set of exposures yields; made by `Planner`.
+
+    Parameters
+    ----------
+    name : str
+        Name of the set of bands.
+    bands : dict of str to `~miricigale.workflow.planning.BandPlan`
+        The MIRI bands; empty for the existing ones alone.
+    sources : `~astropy.table.QTable`
+        A row for each source: ``id``, true ``redshift`` and ``frac_agn``, ``n_detected`` bands above 5
+        sigma, posterior means and standard deviations (``redshift_mean``, ``redshift_std``,
+        ``frac_agn_mean``, ``frac_agn_std``), ``agn_probability`` of a fracAGN above the limit, and
+        ``selected``.
+    time : `~astropy.units.Quantity`
+        Time that the observatory charges for all pointings, h.
+    area : `~astropy.units.Quantity`
+        Of all pointings, square arcmin.
+    """
+
+    name: str
+    bands: dict
+    sources: QTable
+    time: u.Quantity
+    area: u.Quantity
+
+    def __repr__(self):
+        return f"<Plan {self.name}: {len(self.sources)} sources, {self.time:.1f}>"
+
+    def band_table(self):
+        """
+        The exposures, band by band.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            ``filter``, ``time`` of all dithers, ``groups``, ``integrations``, ``dithers``,
+            ``background``, ``sky_in_well`` (share), the 5-sigma limits ``limit_etc`` (calculator), ``limit``
+            (`~miricigale.depth.sensitivity`) and ``limit_used`` (the errors that are drawn, points), and
+            ``saturates``, the magnitude at which a point does.
+        """
+        rows = [
+            {
+                "filter": name,
+                "time": np.round(plan.time.to(u.s), 1),
+                "groups": plan.exposure.n_groups,
+                "integrations": plan.exposure.n_integrations,
+                "dithers": plan.n_dithers,
+                "background": np.round(plan.background, 2),
+                "sky_in_well": round(float(plan.sky_fraction), 3),
+                "limit_etc": np.round(plan.calculator, 2),
+                "limit": np.round(plan.limit, 2),
+                "limit_used": np.round(plan.errors().limiting_magnitude(name), 2),
+                "saturates": np.round(plan.saturation, 1),
+                "n_saturated": int(np.count_nonzero(self.sources[f"{name}_saturated"])),
+            }
+            for name, plan in self.bands.items()
+        ]
+        return QTable(rows)
+
+
+class Planner:
+    """
+    What exposures would yield, from noise and fits, without images.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.planning.PlanConfig`, optional
+        The plan; the exposures of CEERS by default.
+    sources : `~astropy.table.QTable`, optional
+        In place of the section ``sample``: a row for each source with ``id``, ``redshift``, ``frac_agn``
+        and its fluxes in all bands (existing and MIRI), and if wanted ``size``. ``meta["density"]`` is
+        their number per square arcmin.
+    executor : `concurrent.futures.Executor`, optional
+        Threads to fit with; the answer is the same.
+
+    Raises
+    ------
+    ValueError
+        If ``sources`` lacks a column.
+
+    Examples
+    --------
+    >>> from miricigale.workflow.planning import Planner, load_plan
+    >>> config = load_plan(overrides={"sample": {"n_sources": 100}})
+    >>> planner = Planner(config)  # doctest: +SKIP
+    >>> for plan in planner.compare():  # doctest: +SKIP
+    ...     print(plan.name, planner.accuracy(plan))
+    """
+
+    def __init__(self, config=None, *, sources=None, executor=None):
+        self.config = PlanConfig() if config is None else config
+        self.executor = executor
+        #: Sources of the caller, if there are any.
+        self.given = sources
+        if sources is not None:
+            wanted = ("id", "redshift", "frac_agn", *self.bands)
+            require_columns(sources, wanted, "sources", units=dict.fromkeys(self.bands, u.uJy))
+
+    @property
+    def bands(self):
+        """Existing bands and those of MIRI."""
+        return (*self.config.fit.bands, *self.config.exposures.bands)
+
+    @functools.cached_property
+    def sources(self):
+        """The sample with its true fluxes, `~astropy.table.QTable`."""
+        if self.given is not None:
+            return self.given
+        return make_sample(self.config, self.bands, executor=self.executor)
+
+    @property
+    def density(self):
+        """Sources per square arcmin of which the sample is a part; NaN if not known."""
+        return float(self.sources.meta.get("density", np.nan))
+
+    @functools.cached_property
+    def _run(self):
+        noise = self.config.noise
+        return RunErrors.read(noise.run) if noise.kind == "run" else None
+
+    def band_plans(self, share=1.0):
+        """The exposures of all bands, each time multiplied by ``share``: dict of `BandPlan`."""
+        return band_plans(self.config, share=share, run=self._run)
+
+    @functools.cached_property
+    def _existing(self):
+        """Mock photometry in the existing bands, the same for every plan."""
+        fit = self.config.fit
+        errors = ErrorModel.from_depths(
+            dict(zip(fit.bands, fit.depths, strict=True)),
+            fractional={name: fractional_error(name) for name in fit.bands},
+        )
+        return errors.perturb(self.sources[["id", *fit.bands]], seed=self.config.plan.seed)
+
+    def photometry(self, plans):
+        """
+        Mock photometry of the sample.
+
+        Parameters
+        ----------
+        plans : iterable of `BandPlan`
+            MIRI bands.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            ``id``, and flux and error in the existing bands and those of ``plans``. Draws depend on
+            seed, source and band alone.
+        """
+        table = QTable(self._existing, copy=True)
+        for plan in plans:
+            measured = self._measured(plan)
+            for column in (plan.filter, error_column(plan.filter)):
+                table[column] = measured[column]
+        return table
+
+    def _measured(self, plan):
+        """Fluxes of one band with the errors of each source's size, in the order of the sample."""
+        columns, seed = self.sources[["id", plan.filter]], self.config.plan.seed
+        noise = self.config.noise
+        if noise.kind != "fitted" or not noise.sizes or "size" not in self.sources.colnames:
+            return plan.errors().perturb(columns, seed=seed)
+        size = self.sources["size"].to_value(u.arcsec)
+        node = np.argmin(np.abs(size[:, None] - _SIZES), axis=1)
+        parts, rows = [], []
+        for k in np.unique(node):
+            here = np.flatnonzero(node == k)
+            parts.append(plan.errors(_SIZES[k] * u.arcsec).perturb(columns[here], seed=seed))
+            rows.append(here)
+        joined = vstack(parts, metadata_conflicts="silent")
+        return joined[np.argsort(np.concatenate(rows), kind="stable")]
+
+    def evaluate(self, bands=None, *, name=None, share=1.0, pointings=None):
+        """
+        Fit the sample as one set of bands would measure it.
+
+        Parameters
+        ----------
+        bands : iterable of str, optional
+            MIRI bands of the configuration; all by default, none for the existing bands alone.
+        name : str, optional
+            Name of the plan.
+        share : float, optional
+            Factor on all exposure times.
+        pointings : int, optional
+            Pointings side by side; those of the configuration by default.
+
+        Returns
+        -------
+        plan : `Plan`
+        """
+        config = self.config
+        bands = config.exposures.bands if bands is None else tuple(bands)
+        for band in bands:
+            if band not in config.exposures.bands:
+                raise argument_error("bands", f"some of {list(config.exposures.bands)}", repr(band))
+        known = self.band_plans(share)
+        plans = {band: known[band] for band in bands}
+        photometry = self.photometry(plans.values())
+        fitter = BayesFitter(
+            SEDModel.yang2021(),
+            [*config.fit.bands, *bands],
+            axes=SEDModel.yang2021_axes(config.fit.axes),
+            model_error=config.fit.model_error,
+        )
+        results = fitter.fit(photometry, executor=self.executor)
+        table = self._results(results, photometry, plans)
+        pointings = config.exposures.pointings if pointings is None else pointings
+        time = (
+            wall_clock(plans.values(), config.overheads, pointings=pointings) if plans else 0 * u.h
+        )
+        area = pointings * _FIELD
+        name = name or ", ".join(b.removeprefix("miri.") for b in bands) or EXISTING
+        return Plan(name, plans, table, time, area.to(u.arcmin**2))
+
+    def _results(self, results, photometry, plans):
+        """The table of sources of a `Plan`."""
+        agn = self.config.agn
+        table = self.sources[["id", "redshift", "frac_agn"]]
+        detected = detected_bands(photometry, list(plans)) if plans else np.zeros(len(table), int)
+        table["n_detected"] = detected
+        for name in ("redshift", "frac_agn"):
+            table[f"{name}_mean"] = u.Quantity(results.mean(name)).value
+            table[f"{name}_std"] = u.Quantity(results.std(name)).value
+        nodes = np.asarray(u.Quantity(results.axes["frac_agn"].values).value)
+        # the posterior's weight on the fractions of the grid from the limit on
+        table["agn_probability"] = results.pdf["frac_agn"][:, nodes >= agn.limit - 1e-9].sum(axis=1)
+        selected = table["agn_probability"] >= agn.threshold
+        if agn.select == "mean":
+            selected = table["frac_agn_mean"] >= agn.limit
+        table["selected"] = selected
+        for name, plan in plans.items():
+            limit = plan.saturation.to(u.uJy)
+            table[f"{name}_saturated"] = self.sources[name] >= limit
+        return table
+
+    def compare(self, sets=None):
+        """
+        Evaluate the existing bands alone and each set of bands.
+
+        Parameters
+        ----------
+        sets : iterable of str, optional
+            Sets as in ``[exposures] sets``; those of the configuration by default.
+
+        Returns
+        -------
+        plans : list of `Plan`
+            The existing bands first.
+        """
+        plans = [self.evaluate((), name=EXISTING)]
+        for name in self.config.exposures.sets if sets is None else sets:
+            short = name.replace("miri.", "").replace(" ", "")
+            plans.append(self.evaluate(self.config.set_bands(name), name=short))
+        return plans
+
+    def divide(self, bands=None):
+        """
+        Divide the exposure times among more pointings: depth against area.
+
+        Parameters
+        ----------
+        bands : iterable of str, optional
+            As in `evaluate`.
+
+        Returns
+        -------
+        plans : list of `Plan`
+            One for each number of ``[survey] areas``.
+        """
+        return [
+            self.evaluate(bands, name=str(n), share=1.0 / n, pointings=n)
+            for n in self.config.survey.areas
+        ]
+
+    def common(self, plans):
+        """Which sources are detected by one of the plans in as many bands as the fit wants."""
+        least = self.config.fit.min_detected
+        chosen = np.zeros(len(self.sources), bool)
+        for plan in plans:
+            if plan.bands:
+                chosen |= np.asarray(plan.sources["n_detected"]) >= min(least, len(plan.bands))
+        return chosen
+
+    def accuracy(self, plan, chosen=None):
+        """
+        Numbers of one plan; see `accuracy`.
+
+        Parameters
+        ----------
+        plan : `Plan`
+            The plan.
+        chosen : bool array-like, optional
+            Sources that count; those of `common` by default.
+        """
+        chosen = self.common([plan]) if chosen is None else np.asarray(chosen, bool)
+        return accuracy(
+            plan.sources[chosen], agn_limit=self.config.agn.limit, seed=self.config.plan.seed
+        )
+
+
+def accuracy(sources, *, agn_limit=0.4, seed=0):
+    """
+    How well redshift, fracAGN and AGN are recovered.
+
+    Parameters
+    ----------
+    sources : `~astropy.table.QTable`
+        Of a `Plan`.
+    agn_limit : float, optional
+        True fracAGN from which a source is an AGN.
+    seed : int, optional
+        Of the bootstrap.
+
+    Returns
+    -------
+    numbers : dict of str to `~miricigale.evaluation.Estimate`
+        Of the posterior means ``z_scatter`` (sigma_MAD of dz/(1+z)), ``z_outliers`` (share with abs(dz)/(1+z)
+        above 0.15), ``frac_bias`` and ``frac_scatter`` (median and sigma_MAD of the difference);
+        ``z_width`` and ``frac_width``, median posterior standard deviations (of z over 1+z);
+        ``completeness`` and ``purity`` of the selected AGN.
+    """
+    z, f = (np.asarray(sources[name], float) for name in ("redshift", "frac_agn"))
+    dz = (np.asarray(sources["redshift_mean"], float) - z) / (1 + z)
+    df = np.asarray(sources["frac_agn_mean"], float) - f
+    known = np.isfinite(dz)
+    quality = selection_quality(f >= agn_limit, sources["selected"])
+    return {
+        "z_scatter": bootstrap(_scatter, dz, seed=seed),
+        "z_outliers": Estimate.of_fraction(np.sum(np.abs(dz[known]) > _OUTLIER), np.sum(known)),
+        "z_width": bootstrap(_median, np.asarray(sources["redshift_std"]) / (1 + z), seed=seed),
+        "frac_bias": bootstrap(_median, df, seed=seed),
+        "frac_scatter": bootstrap(_scatter, df, seed=seed),
+        "frac_width": bootstrap(_median, sources["frac_agn_std"], seed=seed),
+        "completeness": quality.completeness,
+        "purity": quality.purity,
+    }
+
+
+def _median(values):
+    return np.median(values, axis=-1)
+
+
+def _scatter(values):
+    return sigma_mad(values, axis=-1)

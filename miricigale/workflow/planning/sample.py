@@ -1,0 +1,184 @@
+"""The galaxies of a plan: from a catalog, or drawn after a luminosity function."""
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.refdata import resources
+from miricigale.scene import read_catalog
+from miricigale.sed import ModelFlags, SEDModel
+from miricigale.utils.exceptions import ConfigError, DataError, argument_error
+from miricigale.utils.random import stream
+from miricigale.utils.tables import require_columns
+from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.stages.inputs import bright_sources, fit_seds
+from miricigale.workflow.stages.truth import add_agn, add_field_agn, galaxy_parameters
+
+__all__ = ["catalog_area", "make_sample"]
+
+#: Stellar populations may not be older than the universe: the fit's ages, Gyr, are cut to this share.
+_AGE_SHARE = 0.95
+
+
+def catalog_area(options, catalog):
+    """Area of the catalog in square arcmin; None where neither it nor the configuration tells."""
+    if options.area:
+        return options.area * u.arcmin**2
+    if options.source in resources() and "radius_arcsec" in catalog.meta:
+        radius = catalog.meta["radius_arcsec"] * u.arcsec
+        return (np.pi * radius**2).to(u.arcmin**2)
+    return None
+
+
+def make_sample(config, bands, *, executor=None):
+    """
+    Sources with their true parameters and fluxes.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.planning.PlanConfig`
+        Sections ``sample`` and ``agn`` are used. The catalog may have a column ``frac_agn``, which
+        takes the place of the mix of ``agn``.
+    bands : iterable of str
+        Bands of the fluxes.
+    executor : `concurrent.futures.Executor`, optional
+        Threads to fit the catalog with.
+
+    Returns
+    -------
+    sources : `~astropy.table.QTable`
+        A row for each: ``id``, ``redshift``, ``frac_agn``, the other parameters, ``size`` (full width at
+        half maximum) and the fluxes; ``meta["density"]`` is the number of all that the cuts leave
+        per square arcmin (NaN if the area is not known).
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.ConfigError`
+        If the cuts leave no source.
+    """
+    options, seed = config.sample, config.plan.seed
+    prior = StudyConfig().highres.filter
+    catalog = bright_sources(read_catalog(options.source), options, prior)
+    redshift = np.asarray(catalog["redshift"], float)
+    chosen = (redshift >= options.redshift[0]) & (redshift <= options.redshift[1])
+    area = catalog_area(options, catalog)
+    catalog = _cut(catalog, chosen & ~np.asarray(catalog["star"], bool), "[sample] redshift")
+    results = fit_seds(
+        catalog, config.sed, model_error=config.fit.model_error, executor=executor
+    ).to_table()
+    study = StudyConfig(sed=config.sed)
+    sources = galaxy_parameters(study, catalog, results, seed=seed)
+    sources["luminosity"] = results["dust_luminosity_best"].to(u.Lsun)
+    sources["size"] = _sizes(catalog)
+    if "frac_agn" in catalog.colnames:
+        sources["frac_agn"] = np.asarray(catalog["frac_agn"], float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        luminosity = np.log10(sources["luminosity"].value)
+        known = np.isfinite(sources["mass"].value) & np.isfinite(luminosity)
+        inside = (luminosity >= options.luminosity[0]) & (luminosity <= options.luminosity[1])
+    sources = _cut(sources, known & inside, "[sample] luminosity")
+    density = np.nan if area is None else len(sources) / area.to_value(u.arcmin**2)
+    rng = stream(seed, "plan", "sample")
+    if options.luminosity_function:
+        sources, density = _by_luminosity(sources, options, rng)
+    elif 0 < options.n_sources < len(sources):
+        rows = rng.choice(len(sources), options.n_sources, replace=False)
+        sources = sources[np.sort(rows)]
+    given = sources["frac_agn"] if "frac_agn" in sources.colnames else None
+    model = SEDModel.yang2021()
+    if config.agn.field and given is None:
+        add_field_agn(sources, model, next(iter(bands)), seed)
+    else:
+        add_agn(sources, 0.0, seed)
+        sources["frac_agn"] = _mix(config.agn, len(sources), rng) if given is None else given
+    light = model.fluxes(sources, list(bands))
+    lacking = (np.asarray(light["flags"]) & int(ModelFlags.NOT_IN_LIBRARY)) > 0
+    if np.any(lacking):
+        msg = (
+            f"{np.count_nonzero(lacking)} of {len(light)} sources have parameters that the registered "
+            f"libraries lack ({'; '.join(model.meta['libraries'])})"
+        )
+        raise DataError(msg)
+    for name in bands:
+        sources[name] = light[name]
+    usable = np.all([np.isfinite(sources[name].value) for name in bands], axis=0)
+    sources = _cut(sources, usable, "the models")
+    sources.meta = {"density": density, "libraries": list(model.meta["libraries"])}
+    return sources
+
+
+def _cut(table, chosen, what):
+    if not np.any(chosen):
+        msg = f"{what} leaves none of the {len(table)} sources"
+        raise ConfigError(msg)
+    return table[chosen]
+
+
+def _sizes(catalog):
+    """Full width at half maximum of a Gaussian with the half-light radius; 0 for points."""
+    size = 2 * u.Quantity(catalog["half_light_radius"]).to_value(u.arcsec)
+    return np.where(np.isfinite(size) & (size > 0), size, 0.0) * u.arcsec
+
+
+def _mix(options, n, rng):
+    """AGN fractions in the shares of the configuration, in random order."""
+    shares = np.asarray(options.shares, float) / np.sum(options.shares)
+    edges = np.round(np.cumsum(shares) * n).astype(int)
+    counts = np.diff(np.concatenate([[0], edges]))
+    return rng.permutation(np.repeat(options.frac_agn, counts))
+
+
+def _by_luminosity(sources, options, rng):
+    """
+    Sources drawn after a luminosity function, and their number per square arcmin.
+
+    Each cell of the function is taken by draws of redshift and luminosity in proportion to phi and the
+    comoving volume; a draw has the SED of the nearest source of the catalog, scaled to its luminosity
+    and moved to its redshift.
+    """
+    model = SEDModel.yang2021()
+    try:
+        table = QTable.read(options.luminosity_function)
+    except OSError as err:
+        msg = (
+            f"[sample] luminosity_function = {options.luminosity_function!r} cannot be read: {err}"
+        )
+        raise ConfigError(msg) from err
+    names = ("log_luminosity", "redshift", "phi")
+    require_columns(table, names, "luminosity_function")
+    log_luminosity, redshift, phi = (np.asarray(u.Quantity(table[n]).value, float) for n in names)
+    levels, steps = np.unique(log_luminosity), np.unique(redshift)
+    if len(levels) < 2 or len(steps) < 2 or len(table) != len(levels) * len(steps):
+        wanted = "a grid of at least two luminosities and two redshifts, a row for each pair"
+        raise argument_error("luminosity_function", wanted, f"{len(table)} rows")
+    values = np.empty((len(steps), len(levels)))
+    values[np.searchsorted(steps, redshift), np.searchsorted(levels, log_luminosity)] = phi
+    # a fine grid within the ranges asked for, phi interpolated linearly
+    low = np.maximum(options.redshift[0], steps[0]), np.maximum(options.luminosity[0], levels[0])
+    high = np.minimum(options.redshift[1], steps[-1]), np.minimum(options.luminosity[1], levels[-1])
+    z, logs = (np.linspace(a, b, 201) for a, b in zip(low, high, strict=True))
+    z, logs = (0.5 * (v[1:] + v[:-1]) for v in (z, logs))
+    at_levels = np.array([np.interp(logs, levels, row) for row in values])
+    fine = np.array([np.interp(z, steps, column) for column in at_levels.T]).T
+    volume = model.cosmology.differential_comoving_volume(z).to_value(u.Mpc**3 / u.arcmin**2)
+    cells = fine * volume[:, None] * (high[0] - low[0]) / 200 * (high[1] - low[1]) / 200
+    if not (np.all(cells >= 0) and cells.sum() > 0):
+        raise argument_error(
+            "luminosity_function", "phi of at least 0, and not 0 everywhere", "none"
+        )
+    n = options.n_sources or 500
+    drawn = rng.choice(cells.size, n, p=(cells / cells.sum()).ravel())
+    z, logs = z[drawn // 200], logs[drawn % 200]
+    own_z, own_log = np.asarray(sources["redshift"]), np.log10(sources["luminosity"].value)
+    distance = (np.log1p(own_z) - np.log1p(z)[:, None]) ** 2 / 0.01
+    distance += (own_log - logs[:, None]) ** 2 / 0.04
+    nearest = np.argmin(distance, axis=1)
+    out = sources[nearest]
+    out["template"] = out["id"]
+    out["id"] = np.arange(1, n + 1)
+    out["mass"] = out["mass"] * 10 ** (logs - own_log[nearest])
+    out["luminosity"] = 10**logs * u.Lsun
+    out["redshift"] = z
+    oldest = _AGE_SHARE * model.cosmology.age(z).to_value(u.Gyr)
+    out["age"] = np.minimum(out["age"].to_value(u.Gyr), oldest) * u.Gyr
+    return out, float(cells.sum())

@@ -1,0 +1,57 @@
+"""The configuration of a plan: given back by its own text, and strict."""
+
+import pytest
+
+from miricigale.utils.exceptions import ConfigError
+from miricigale.workflow.planning import PlanConfig, load_plan
+
+
+def test_the_text_gives_the_configuration_back(tmp_path):
+    config = load_plan(
+        overrides={"exposures": {"bands": ["miri.f770w"], "time": 900, "dithers": 2}}
+    )
+    path = tmp_path / "plan.toml"
+    path.write_text(config.to_toml())
+    assert load_plan(path) == config
+    assert config.exposures.time == (900.0,)
+    assert load_plan() == PlanConfig()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"exposures": {"bands": []}}, r"\[exposures\] bands must name at least one"),
+        ({"exposures": {"time": [1.0, 2.0]}}, r"time must have one number, or one per band \(6\)"),
+        ({"exposures": {"time": 0.0}}, r"time must be positive, got 0"),
+        ({"exposures": {"dithers": [3, 3]}}, r"dithers must have one number"),
+        ({"exposures": {"sets": ["f560w"]}}, r"sets must be 'all' or bands of"),
+        ({"exposures": {"colour": 1}}, r"\[exposures\] does not know \['colour'\]"),
+        ({"agn": {"shares": [1.0]}}, r"shares must have one number per fracAGN \(6\)"),
+        ({"agn": {"frac_agn": 0.2, "shares": 0.0}}, r"shares must not all be 0"),
+        ({"sample": {"redshift": [2.0, 1.0]}}, r"redshift must be two numbers in order"),
+        ({"background": {"date": "2027-03-01"}}, r"date must come with a position"),
+        ({"background": {"level": "dark"}}, r"level must be one of \['low', 'medium', 'high'\]"),
+        ({"noise": {"kind": "run"}}, r"run must be a folder"),
+        ({"sed": {"frac_agn": 0.5}}, r"\[agn\] has the mix"),
+        ({"survey": {"rank": "price"}}, r"rank must be one of"),
+    ],
+)
+def test_what_cannot_be_planned_is_named(values, message):
+    with pytest.raises(ConfigError, match=message):
+        PlanConfig.from_dict(values)
+
+
+def test_a_band_that_miri_lacks_is_named_with_the_others():
+    with pytest.raises(KeyError, match=r"no imaging filter 'miri\.f707w'.*miri\.f770w"):
+        PlanConfig.from_dict({"exposures": {"bands": ["miri.f707w"], "time": 1.0, "dithers": 4}})
+
+
+def test_sets_are_in_order_of_wavelength_by_any_name():
+    config = PlanConfig()
+    assert config.set_bands("f1500w, miri.f770w") == ("miri.f770w", "miri.f1500w")
+    assert config.set_bands("all") == config.exposures.bands
+
+
+def test_a_file_that_is_not_there_is_named():
+    with pytest.raises(ConfigError, match=r"no configuration file .*absent\.toml"):
+        load_plan("absent.toml")

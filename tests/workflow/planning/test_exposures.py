@@ -1,0 +1,127 @@
+"""Exposures of a plan: times, depths, noise, the clock, against closed forms and other rooms."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from miricigale.depth import etc_limit, saturation_forecast, sensitivity
+from miricigale.instrument import background_level
+from miricigale.photometry import ErrorModel
+from miricigale.utils.exceptions import ConfigError, DataError
+from miricigale.workflow.planning import load_plan, wall_clock
+from miricigale.workflow.planning.config import OverheadSection
+from miricigale.workflow.planning.exposures import RunErrors, band_plans
+
+BAND = "miri.f1000w"
+
+
+def plan_of(time=2000.0, **sections):
+    exposures = {"bands": [BAND], "time": time, "dithers": 4} | sections.pop("exposures", {})
+    return band_plans(load_plan(overrides={"exposures": exposures, **sections}))[BAND]
+
+
+def test_the_depth_quoted_is_that_of_the_sensitivity():
+    plan = plan_of()
+    own = sensitivity(BAND, plan.time, n_sigma=5, n_groups=plan.exposure.n_groups, n_dithers=4)
+    assert plan.limit.value == pytest.approx(own.to_value(u.ABmag), abs=1e-9)
+    # and the calculator's is the published 10 sigma in 10 ks, as the root of the time
+    scaled = etc_limit(BAND) / 2 * np.sqrt(1e4 * u.s / plan.time)
+    assert plan.calculator.value == pytest.approx(scaled.to(u.uJy).to_value(u.ABmag), abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["fitted", "aperture"])
+def test_noise_falls_as_the_root_of_the_time(kind):
+    noise = {"noise": {"kind": kind, "fractional": 0.0}}
+    # the same integrations, four times as many: only photons and read noise count
+    short, long = (
+        plan_of(time, exposures={"dithers": n}, **noise) for time, n in ((1000.0, 2), (4000.0, 8))
+    )
+    assert long.exposure.n_groups == short.exposure.n_groups
+    first, second = (plan.errors().sigma(0 * u.uJy, BAND).value for plan in (short, long))
+    # the limit of an aperture has the photons of the source in it too
+    assert first / second == pytest.approx(2.0, rel=1e-6 if kind == "fitted" else 0.02)
+
+
+def test_a_depth_gives_the_time_that_reaches_it():
+    times = plan_of()
+    depth = float(times.errors().limiting_magnitude(BAND).value)
+    config = load_plan(overrides={"exposures": {"bands": [BAND], "depth": depth, "dithers": 4}})
+    found = band_plans(config)[BAND]
+    assert found.time.value == pytest.approx(times.time.value, rel=0.02)
+    too_deep = {"bands": [BAND], "depth": 35.0, "dithers": 4}
+    with pytest.raises(ConfigError, match=r"35\.0 is not reached in miri\.f1000w"):
+        band_plans(load_plan(overrides={"exposures": too_deep}))
+
+
+def test_integrations_are_short_enough_for_the_sky():
+    for level in ("low", "high"):
+        plan = plan_of(8000.0, background={"level": level}, exposures={"max_fill": 0.5})
+        own = saturation_forecast(plan.exposure, background=plan.background)
+        assert plan.sky_fraction == own
+        assert own < 0.52
+    # a brighter sky is shorter integrations and more noise
+    assert plan.exposure.n_integrations > plan_of(8000.0).exposure.n_integrations
+    assert plan.limit < plan_of(8000.0).limit
+
+
+def test_the_low_background_is_the_packages():
+    assert plan_of().background == background_level(BAND)
+
+
+def test_the_clock_counts_every_overhead_once():
+    names = ("slew", "next_slew", "guide_star", "visit", "filter", "script", "exposure", "dither")
+    free = OverheadSection(**dict.fromkeys(names, 0.0), observatory=0.0)
+    plan = plan_of(2000.0, exposures={"dithers": 4})
+    light = 4 * plan.exposure.duration
+    assert wall_clock([plan], free).to_value(u.s) == pytest.approx(light.value)
+    # two bands, four dithers each, three pointings
+    counts = {
+        "slew": 1,
+        "next_slew": 2,
+        "guide_star": 3,
+        "visit": 3,
+        "filter": 6,
+        "script": 6,
+        "exposure": 24,
+        "dither": 18,
+    }
+    for name, count in counts.items():
+        options = OverheadSection(**{**dict.fromkeys(names, 0.0), name: 10.0}, observatory=0.0)
+        time = wall_clock([plan, plan], options, pointings=3).to_value(u.s)
+        assert time - 6 * light.value == pytest.approx(10 * count), name
+    assert wall_clock([plan], OverheadSection()) > 1.16 * light
+
+
+def test_errors_of_a_run_are_its_own_for_its_exposures(tmp_path):
+    config = """
+    [exposures]
+    filters = ["miri.f1000w"]
+    n_groups = [100]
+    n_integrations = [1]
+    n_dithers = [4]
+    [fit]
+    min_detected = 1
+    """
+    (tmp_path / "config.toml").write_text(config)
+    errors = ErrorModel.from_depths({BAND: 0.5 * u.uJy}, fractional=0.05)
+    errors.write(tmp_path / "errors.ecsv")
+    run = RunErrors.read(tmp_path)
+
+    def scaled(time, dithers):
+        exposures = {"bands": [BAND], "time": time, "dithers": dithers}
+        noise = {"kind": "run", "run": str(tmp_path)}
+        config = load_plan(overrides={"exposures": exposures, "noise": noise})
+        return band_plans(config, run=run)[BAND].errors()
+
+    own, longer = scaled(4 * 277.5, 4), scaled(16 * 277.5, 16)
+    for value in (0.1, 1.0, 30.0):
+        one = errors.sigma(value * u.uJy, BAND).value
+        assert own.sigma(value * u.uJy, BAND).value == pytest.approx(one, rel=1e-6)
+    # four times the time: half the noise of the sky, the same part of the flux
+    assert longer.sigma(0 * u.uJy, BAND).value == pytest.approx(0.05, rel=0.02)
+    assert longer.sigma(40 * u.uJy, BAND).value == pytest.approx(2.0, rel=1e-3)
+
+
+def test_a_run_that_is_none_is_named(tmp_path):
+    with pytest.raises(DataError, match=r"has no errors\.ecsv"):
+        RunErrors.read(tmp_path)

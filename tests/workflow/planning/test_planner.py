@@ -1,0 +1,214 @@
+"""Plans of a small sample: mock photometry, fits, ranks and the page."""
+
+import re
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from miricigale.cli import main
+from miricigale.filters import Filter
+from miricigale.utils.exceptions import ConfigError
+from miricigale.utils.parallel import thread_pool
+from miricigale.utils.tables import error_column
+from miricigale.workflow.planning import Planner, area_table, comparison_table, load_plan
+from miricigale.workflow.planning.planner import EXISTING, accuracy
+
+BANDS = ["miri.f770w", "miri.f1500w"]
+SETTINGS = {
+    "sample": {"n_sources": 60},
+    "exposures": {"bands": BANDS, "time": 1665.0, "dithers": 3, "sets": ["all", "f770w"]},
+    "survey": {"areas": [1, 4]},
+    "fit": {"axes": "quick"},
+}
+
+
+@pytest.fixture(scope="module")
+def planner():
+    return Planner(load_plan(overrides=SETTINGS))
+
+
+@pytest.fixture(scope="module")
+def plans(planner):
+    return planner.compare()
+
+
+def test_the_sample_has_the_mix_of_the_configuration(planner):
+    sources = planner.sources
+    assert len(sources) == 60
+    values, counts = np.unique(sources["frac_agn"], return_counts=True)
+    assert dict(zip(values, counts, strict=True)) == {
+        0.0: 30, 0.2: 6, 0.4: 6, 0.6: 6, 0.8: 6, 0.99: 6
+    }  # fmt: skip
+    # 1308 sources in a circle of 95 arcsec, some of which are stars
+    assert 150 < planner.density < 1308 / (np.pi * (95 / 60) ** 2)
+
+
+def test_noise_is_that_of_the_errors(planner):
+    """Pulls of the mock fluxes are those of a normal distribution, in each band and of each size."""
+    table = planner.photometry(planner.band_plans().values())
+    pulls = np.array(
+        [
+            ((table[name] - planner.sources[name]) / table[error_column(name)]).value
+            for name in planner.bands
+        ]
+    )
+    assert np.mean(pulls) == pytest.approx(0, abs=5 / np.sqrt(pulls.size))
+    assert np.std(pulls) == pytest.approx(1, abs=5 / np.sqrt(2 * pulls.size))
+    # extended sources have larger errors than points of the same flux
+    errors = planner.band_plans()["miri.f770w"].errors()
+    own = table["miri.f770w_err"]
+    point = errors.sigma(planner.sources["miri.f770w"], "miri.f770w")
+    extended = planner.sources["size"] > 0.3 * u.arcsec
+    assert np.all(own[extended] > point[extended])
+    np.testing.assert_allclose(
+        own[planner.sources["size"] == 0], point[planner.sources["size"] == 0]
+    )
+
+
+def test_draws_belong_to_source_and_band_and_no_thread_changes_them(planner, plans):
+    with thread_pool(2) as executor:
+        other = Planner(planner.config, executor=executor)
+        again = other.evaluate(["miri.f770w"])
+    mine = plans[2].sources
+    assert list(again.bands) == ["miri.f770w"]
+    for name in mine.colnames:
+        np.testing.assert_array_equal(mine[name], again.sources[name])
+    seeded = Planner(load_plan(overrides=SETTINGS | {"plan": {"seed": 5}}))
+    assert list(seeded.sources["id"]) != list(planner.sources["id"])
+
+
+def test_more_bands_make_better_fits(planner, plans):
+    assert [plan.name for plan in plans] == [EXISTING, "all", "f770w"]
+    chosen = planner.common(plans)
+    numbers = {plan.name: planner.accuracy(plan, chosen) for plan in plans}
+    for name in ("z_width", "frac_width", "frac_scatter"):
+        assert numbers["all"][name].value < numbers[EXISTING][name].value
+    assert numbers["all"]["completeness"].value > 0.5
+
+
+def test_the_tables_rank_by_the_hour(planner, plans):
+    table = comparison_table(planner, plans)
+    assert table["plan"][0] == EXISTING
+    assert np.isnan(table["merit"][0])
+    assert table["merit"][1] >= table["merit"][2]
+    row = table[1]
+    expected = row["n_agn"] * row["purity"] / row["time"].to_value(u.h)
+    assert row["merit"] == pytest.approx(expected)
+    # the same sources in every row
+    assert len(set(table["n"])) == 1
+
+
+def test_more_pointings_are_more_sources_and_shallower(planner):
+    one, four = planner.divide()
+    table = area_table(planner, [one, four])
+    assert list(table["pointings"]) == [1, 4]
+    assert table["area"][1] == 4 * table["area"][0]
+    assert table["n_detected"][0] < table["n_detected"][1] < 4 * table["n_detected"][0]
+    for name in BANDS:
+        light = four.bands[name].time.value / one.bands[name].time.value
+        assert light == pytest.approx(0.25, rel=0.02)
+    # a quarter of the light each: overheads are what the area costs
+    assert one.time < four.time < 4 * one.time
+
+
+def test_accuracy_counts_what_it_says():
+    z = np.array([0.0, 1.0, 2.0, 3.0])
+    table = QTable(
+        {
+            "redshift": z,
+            "redshift_mean": z + np.array([0.0, 0.4, 0.0, np.nan]),
+            "redshift_std": 0.1 * (1 + z),
+            "frac_agn": [0.0, 0.5, 0.5, 0.9],
+            "frac_agn_mean": [0.1, 0.6, 0.6, 0.9],
+            "frac_agn_std": [0.1, 0.1, 0.1, 0.1],
+            "selected": [True, True, False, True],
+        }
+    )
+    numbers = accuracy(table, seed=1)
+    assert numbers["z_outliers"].value == pytest.approx(1 / 3)
+    assert numbers["z_width"].value == pytest.approx(0.1)
+    assert numbers["frac_bias"].value == pytest.approx(0.1)
+    assert numbers["completeness"].value == pytest.approx(2 / 3)
+    assert numbers["purity"].value == pytest.approx(2 / 3)
+
+
+def test_sources_of_the_caller_are_taken_as_they_are(planner):
+    own = planner.sources[:8]
+    given = Planner(planner.config, sources=own)
+    assert given.sources is own
+    with pytest.raises(ValueError, match="'sources' must be a table with the columns"):
+        Planner(planner.config, sources=own["id", "redshift"])
+
+
+def test_a_luminosity_function_gives_the_sample(tmp_path):
+    """One cell holds nearly all galaxies: they are drawn there, as many as the volume holds."""
+    from astropy.cosmology import FlatLambdaCDM
+
+    table = QTable(
+        {
+            "log_luminosity": np.tile([11.0, 11.2], 2),
+            "redshift": np.repeat([1.0, 1.1], 2),
+            "phi": np.full(4, 1e-3),
+        }
+    )
+    path = tmp_path / "lf.ecsv"
+    table.write(path)
+    sample = {"n_sources": 40, "luminosity_function": str(path)}
+    planner = Planner(load_plan(overrides=SETTINGS | {"sample": sample}))
+    sources = planner.sources
+    assert np.all((sources["redshift"] >= 1.0) & (sources["redshift"] <= 1.1))
+    log_luminosity = np.log10(sources["luminosity"].value)
+    assert np.all((log_luminosity >= 11.0) & (log_luminosity <= 11.2))
+    # phi times the dex times the comoving volume of a square arcmin, WMAP7
+    cosmology = FlatLambdaCDM(70.4, 0.272)
+    volume = cosmology.comoving_volume(1.1) - cosmology.comoving_volume(1.0)
+    sky = (4 * np.pi * u.sr).to_value(u.arcmin**2)
+    assert planner.density == pytest.approx(1e-3 * 0.2 * volume.to_value(u.Mpc**3) / sky, rel=1e-3)
+
+
+def test_a_field_has_few_agn():
+    config = load_plan(overrides=SETTINGS | {"agn": {"field": True}, "sample": {"n_sources": 300}})
+    fractions = np.asarray(Planner(config).sources["frac_agn"])
+    assert 0 < np.mean(fractions > 0.1) < 0.15
+
+
+def test_cuts_that_leave_nothing_are_named():
+    sample = {"sample": {"redshift": [11.0, 12.0]}}
+    with pytest.raises(ConfigError, match=r"\[sample\] redshift leaves none of the"):
+        _ = Planner(load_plan(overrides=sample)).sources
+
+
+def test_the_command_writes_a_page(tmp_path, capsys):
+    path = tmp_path / "plan.toml"
+    path.write_text(load_plan(overrides=SETTINGS).to_toml())
+    folder = tmp_path / "out"
+    assert main(["plan", "--config", str(path), "--sources", "30", "-o", str(folder)]) == 0
+    out = capsys.readouterr().out
+    assert "existing bands" in out
+    page = (folder / "plan.html").read_text()
+    assert len(re.findall("<img ", page)) == 4
+    assert "nan" not in re.sub(r"base64,[^']*", "", page)
+    table = QTable.read(folder / "comparison.ecsv")
+    assert set(table["plan"]) == {EXISTING, "all", "f770w"}
+    assert len(QTable.read(folder / "sources-1.ecsv")) == 30
+    assert load_plan(folder / "plan.toml").sample.n_sources == 30
+    assert Filter.from_name("miri.f770w").pivot > 7 * u.um
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--bands", "f707w", "--time", "100"], "no imaging filter 'miri.f707w'"),
+        (["--bands", "f770w", "--time", "100", "200"], "[exposures] time must have one number"),
+        (["--bands", "f770w", "--time", "9", "--depth", "25"], "wanted are --time or --depth"),
+        (["--quick", "--bands", "f770w"], "--quick is of the table"),
+        (["--config", "absent.toml"], "no configuration file absent.toml"),
+    ],
+)
+def test_what_cannot_be_planned_is_one_sentence(capsys, arguments, message):
+    assert main(["plan", *arguments]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"miricigale: {message}")
+    assert err.count("\n") == 1
