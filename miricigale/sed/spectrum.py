@@ -73,7 +73,9 @@ class SED(Frozen):
     def __post_init__(self):
         if not hasattr(self.fnu, "unit"):
             to_array(self.fnu, FNU, "fnu")
-        spectral = u.spectral_density(u.Quantity(self.wave, copy=False))
+        # slow to make, and needed by other units than F_nu's own only
+        plain = self.fnu.unit == FNU
+        spectral = [] if plain else u.spectral_density(u.Quantity(self.wave, copy=False))
         wave = frozen_quantity(self.wave, WAVE, "wave", ndim=1, finite=True)
         fnu = to_array(self.fnu, FNU, "fnu", ndim=1, finite=True, equivalencies=spectral)
         fnu = frozen_quantity(fnu * FNU, FNU, "fnu")
