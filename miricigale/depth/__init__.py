@@ -5,6 +5,7 @@ from miricigale.utils.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
+        "brightest": ("saturation_flux",),
         "fitted": ("fitted_noise",),
         "limits": ("aperture_noise", "sensitivity", "sensitivity_table"),
         "noise": ("ExposureNoise",),
@@ -20,7 +21,6 @@ __getattr__, __dir__, __all__ = lazy_names(
         "saturation": (
             "SaturationForecast",
             "forecast_table",
-            "saturation_flux",
             "saturation_forecast",
             "saturation_time",
         ),

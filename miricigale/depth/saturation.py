@@ -6,9 +6,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.depth.noise import ExposureNoise
 from miricigale.instrument import Exposure, electron_rate, miri_detector
-from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import require_columns
 
@@ -17,7 +15,6 @@ __all__ = [
     "SKY_FRACTION",
     "SaturationForecast",
     "forecast_table",
-    "saturation_flux",
     "saturation_forecast",
     "saturation_group",
     "saturation_time",
@@ -170,41 +167,6 @@ def saturation_time(filter, *, background=None, detector=None):
     """
     detector = miri_detector() if detector is None else detector
     return detector.full_well / electron_rate(filter, background, detector=detector) * u.s
-
-
-def saturation_flux(exposure, *, background=None, psf=None, detector=None):
-    """
-    Flux of the point source whose brightest pixel is full at the end of an integration.
-
-    Parameters
-    ----------
-    exposure : `~miricigale.instrument.Exposure`
-        What is exposed.
-    background : `~astropy.units.Quantity`, optional
-        Surface brightness; the low background of the filter if not given.
-    psf : `~photutils.psf.ImagePSF`, optional
-        With the pixel in it; `~miricigale.psf.miri_psf` if not given. The source is in the middle of
-        a pixel.
-    detector : `~miricigale.instrument.DetectorProperties`, optional
-        `~miricigale.instrument.miri_detector` if not given.
-
-    Returns
-    -------
-    flux : `~astropy.units.Quantity`
-        In uJy; 0 if the sky alone fills the well.
-    """
-    noise = ExposureNoise(
-        filter=exposure.filter,
-        background=background,
-        n_groups=exposure.n_groups,
-        group_time=exposure.group_time.to_value(u.s),
-        n_ramps=1,
-        detector=detector,
-    )
-    psf = miri_psf(exposure.filter) if psf is None else psf
-    peak = float(psf_image(psf, pixel_scale=MIRI_PIXEL_SCALE, shape=(3, 3))[1, 1])
-    room = noise.detector.full_well / exposure.integration_time.to_value(u.s) - noise.rate
-    return max(room, 0.0) / (noise.electrons * peak) * u.uJy
 
 
 def _filled(rate, exposure, limit):

@@ -1,0 +1,43 @@
+"""How bright a point source may be: the one that fills a well."""
+
+import astropy.units as u
+
+from miricigale.depth.noise import ExposureNoise
+from miricigale.psf import MIRI_PIXEL_SCALE, miri_psf, psf_image
+
+__all__ = ["saturation_flux"]
+
+
+def saturation_flux(exposure, *, background=None, psf=None, detector=None):
+    """
+    Flux of the point source whose brightest pixel is full at the end of an integration.
+
+    Parameters
+    ----------
+    exposure : `~miricigale.instrument.Exposure`
+        What is exposed.
+    background : `~astropy.units.Quantity`, optional
+        Surface brightness; the low background of the filter if not given.
+    psf : `~photutils.psf.ImagePSF`, optional
+        With the pixel in it; `~miricigale.psf.miri_psf` if not given. The source is in the middle of
+        a pixel.
+    detector : `~miricigale.instrument.DetectorProperties`, optional
+        `~miricigale.instrument.miri_detector` if not given.
+
+    Returns
+    -------
+    flux : `~astropy.units.Quantity`
+        In uJy; 0 if the sky alone fills the well.
+    """
+    noise = ExposureNoise(
+        filter=exposure.filter,
+        background=background,
+        n_groups=exposure.n_groups,
+        group_time=exposure.group_time.to_value(u.s),
+        n_ramps=1,
+        detector=detector,
+    )
+    psf = miri_psf(exposure.filter) if psf is None else psf
+    peak = float(psf_image(psf, pixel_scale=MIRI_PIXEL_SCALE, shape=(3, 3))[1, 1])
+    room = noise.detector.full_well / exposure.integration_time.to_value(u.s) - noise.rate
+    return max(room, 0.0) / (noise.electrons * peak) * u.uJy
