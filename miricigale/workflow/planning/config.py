@@ -5,7 +5,7 @@ import dataclasses
 from miricigale.instrument import CEERS_FILTERS, imager_filters, readout_patterns
 from miricigale.photometry import YANG2021_DEPTHS
 from miricigale.utils.exceptions import unknown_name
-from miricigale.workflow.config import SedSection
+from miricigale.workflow.config import CatalogSection, SedSection
 from miricigale.workflow.options import (
     from_text,
     option,
@@ -31,10 +31,7 @@ class PlanSection:
 class SampleSection:
     """The galaxies of the mock photometry."""
 
-    source: str = option("catalog.goodss", "Resource name or path of the catalog.")
     n_sources: int = option(500, "Sources drawn from it; 0 for all.", low=0, high=100000)
-    mag_limit: float = option(26.6, "Faint limit in the magnitude column.", low=10.0, high=40.0)
-    mag_column: str = option("mag_f160w", "Column that the limit applies to.")
     redshift: tuple[float, ...] = option((0.01, 6.0), "Range of redshifts.", low=0.0, high=20.0)
     luminosity: tuple[float, ...] = option(
         (0.0, 16.0), "Range of log10 of the dust's luminosity (Lsun).", low=0.0, high=20.0
@@ -193,6 +190,7 @@ class PlanConfig:
     """
 
     plan: PlanSection = dataclasses.field(default_factory=PlanSection)
+    catalog: CatalogSection = dataclasses.field(default_factory=CatalogSection)
     sample: SampleSection = dataclasses.field(default_factory=SampleSection)
     sed: SedSection = dataclasses.field(default_factory=SedSection)
     agn: AgnSection = dataclasses.field(default_factory=AgnSection)

@@ -193,9 +193,9 @@ def _numbers(row, first, *, rank=False):
 def _exposure_text(planner, plan):
     n = planner.config.exposures.pointings
     own = sum(band.time.to_value(u.h) for band in plan.bands.values())
-    where = "one pointing" if n == 1 else f"{n} pointings"
+    where = "one pointing" if n == 1 else f"each of {n} pointings"
     return (
-        f"{plan.name}: {own:.1f} h of light in each of {where}, {plan.area.value:.1f} square arcmin; "
+        f"{plan.name}: {own:.1f} h of light in {where}, {plan.area.value:.1f} square arcmin; "
         f"{plan.time.to_value(u.h):.1f} h with overheads."
     )
 

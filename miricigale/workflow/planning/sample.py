@@ -5,13 +5,12 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.refdata import resources
-from miricigale.scene import read_catalog
 from miricigale.sed import ModelFlags, SEDModel
 from miricigale.utils.exceptions import ConfigError, DataError, argument_error
 from miricigale.utils.random import stream
 from miricigale.utils.tables import require_columns
 from miricigale.workflow.config import StudyConfig
-from miricigale.workflow.stages.inputs import bright_sources, fit_seds
+from miricigale.workflow.stages.inputs import bright_sources, fit_seds, study_catalog
 from miricigale.workflow.stages.truth import add_agn, add_field_agn, galaxy_parameters
 
 __all__ = ["catalog_area", "make_sample"]
@@ -20,11 +19,11 @@ __all__ = ["catalog_area", "make_sample"]
 _AGE_SHARE = 0.95
 
 
-def catalog_area(options, catalog):
+def catalog_area(config, catalog):
     """Area of the catalog in square arcmin; None where neither it nor the configuration tells."""
-    if options.area:
-        return options.area * u.arcmin**2
-    if options.source in resources() and "radius_arcsec" in catalog.meta:
+    if config.sample.area:
+        return config.sample.area * u.arcmin**2
+    if config.catalog.source in resources() and "radius_arcsec" in catalog.meta:
         radius = catalog.meta["radius_arcsec"] * u.arcsec
         return (np.pi * radius**2).to(u.arcmin**2)
     return None
@@ -37,8 +36,8 @@ def make_sample(config, bands, *, executor=None):
     Parameters
     ----------
     config : `~miricigale.workflow.planning.PlanConfig`
-        Sections ``sample`` and ``agn`` are used. The catalog may have a column ``frac_agn``, which
-        takes the place of the mix of ``agn``.
+        Sections ``catalog``, ``sample``, ``sed`` and ``agn`` are used. The catalog may have a column
+        ``frac_agn``, which takes the place of the mix of ``agn``.
     bands : iterable of str
         Bands of the fluxes.
     executor : `concurrent.futures.Executor`, optional
@@ -57,16 +56,16 @@ def make_sample(config, bands, *, executor=None):
         If the cuts leave no source.
     """
     options, seed = config.sample, config.plan.seed
-    prior = StudyConfig().highres.filter
-    catalog = bright_sources(read_catalog(options.source), options, prior)
+    study = StudyConfig(catalog=config.catalog, sed=config.sed)
+    catalog = study_catalog(config.catalog)
+    catalog = bright_sources(catalog, config.catalog, study.highres.filter)
     redshift = np.asarray(catalog["redshift"], float)
     chosen = (redshift >= options.redshift[0]) & (redshift <= options.redshift[1])
-    area = catalog_area(options, catalog)
+    area = catalog_area(config, catalog)
     catalog = _cut(catalog, chosen & ~np.asarray(catalog["star"], bool), "[sample] redshift")
     results = fit_seds(
         catalog, config.sed, model_error=config.fit.model_error, executor=executor
     ).to_table()
-    study = StudyConfig(sed=config.sed)
     sources = galaxy_parameters(study, catalog, results, seed=seed)
     sources["luminosity"] = results["dust_luminosity_best"].to(u.Lsun)
     sources["size"] = _sizes(catalog)
