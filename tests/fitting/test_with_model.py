@@ -1,5 +1,7 @@
 """The fitter with real spectra and filters."""
 
+import itertools
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -52,6 +54,36 @@ def test_polar_temperature_keeps_its_prior_where_there_is_no_polar_dust(fitter, 
     np.testing.assert_allclose(fitter.priors.agn, [2, 1, 1])
     weighted = BayesFitter(fitter.grid, priors={"temperature_polar": [1.0, 3.0]})
     np.testing.assert_allclose(weighted.priors.agn, [2.0, 0.5, 1.5])
+
+
+def test_every_combination_of_values_counts_as_one_model(draw_photometry):
+    # as in CIGALE: without AGN light, each torus and each polar dust is a model of its own
+    axes = {
+        "redshift": np.array([0.8, 1.0]),
+        "ebv": np.array([0.1, 0.4]),
+        "alpha": np.array([1.0, 2.5]),
+        "frac_agn": np.array([0.0, 0.1, 0.4]),
+        "tau97": np.array([3.0, 7.0, 11.0]),
+        "ebv_polar": np.array([0.0, 0.2]),
+        "temperature_polar": np.array([100.0, 300.0]),
+    }
+    model = SEDModel.yang2021(libraries="bundled")
+    fitter = BayesFitter(model, NAMES, axes=axes)
+    table, _ = draw_photometry(fitter.grid, 4, noise=0.3)
+    results = fitter.fit(table)
+    models = QTable(rows=list(itertools.product(*axes.values())), names=list(axes))
+    light = model.fluxes(models, NAMES)
+    light = np.stack([light[name].to_value("uJy") for name in NAMES], axis=1)
+    assert np.mean(np.asarray(models["frac_agn"]) == 0) == pytest.approx(1 / 3)
+    names = ["frac_agn", "redshift", "alpha", "tau97"]
+    found = np.array([results.to_table()[f"{name}_mean"] for name in names], float)
+    for i, (flux, sigma) in enumerate(zip(results.flux, results.sigma, strict=True)):
+        scale = light @ (flux / sigma**2) / (light**2 @ sigma**-2)
+        chi2 = np.sum(((flux - scale[:, None] * light) / sigma) ** 2, axis=1)
+        weight = np.exp(-0.5 * (chi2 - chi2.min()))
+        means = [np.average(np.asarray(models[name], float), weights=weight) for name in names]
+        np.testing.assert_allclose(found[:, i], means, rtol=1e-3)
+    assert np.any((found[0] > 0.01) & (found[0] < 0.3))
 
 
 @pytest.mark.filterwarnings("ignore:frac_agn has no effect")
