@@ -1,6 +1,8 @@
 """Checks and joins of tables, and integer flags that explain themselves."""
 
 import enum
+import inspect
+import re
 
 import astropy.units as u
 import numpy as np
@@ -34,6 +36,25 @@ class Flags(enum.IntFlag):
     def names(cls, value):
         """Names of the bits set in ``value``, lower case."""
         return [m.name.lower() for m in cls if m.value and int(value) & m.value]
+
+    @classmethod
+    def meanings(cls):
+        """
+        What each bit means, by what is written beside its member.
+
+        Returns
+        -------
+        meanings : dict of int to tuple of str
+            By value: its name in words, and a sentence.
+        """
+        source, found = inspect.getsource(cls), {}
+        for member in cls:
+            before = re.search(rf"((?: *#: .*\n)+) *{member.name} = ", source)
+            after = re.search(rf'\b{member.name} = .*\n *"""(.*?)"""', source, flags=re.DOTALL)
+            text = (before or after)[1] if before or after else ""
+            plain = text.replace("#:", "").replace("``", "")
+            found[member.value] = member.name.lower().replace("_", " "), " ".join(plain.split())
+        return found
 
 
 def described_table(columns, meta=None):

@@ -11,7 +11,16 @@ def study_stages():
     -------
     stages : tuple of `~miricigale.workflow.stage.Stage`
     """
-    from miricigale.workflow.stages import fits, images, inputs, measure, points, report, truth
+    from miricigale.workflow.stages import (
+        fits,
+        images,
+        inputs,
+        measure,
+        points,
+        report,
+        sources,
+        truth,
+    )
 
     return (
         inputs.make_catalog,
@@ -27,5 +36,6 @@ def study_stages():
         fits.make_errors,
         fits.match_sources,
         fits.fit_photometry,
+        sources.make_sources,
         report.make_report,
     )

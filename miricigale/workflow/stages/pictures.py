@@ -8,10 +8,10 @@ from miricigale.plotting.axes import new_figure
 from miricigale.plotting.images import mark_sky, plot_color, plot_image, plot_model_residual
 from miricigale.workflow.stages.figures import WIDTH, band_label
 
-__all__ = ["field_figure", "residual_figure"]
+__all__ = ["binned", "field_figure", "filled", "residual_figure"]
 
 
-def _filled(image):
+def filled(image):
     """Values of an image with NaN where it is masked."""
     data = np.array(image.data, float)
     if image.mask is not None:
@@ -19,7 +19,7 @@ def _filled(image):
     return data
 
 
-def _binned(data, factor):
+def binned(data, factor):
     """Means of squares of pixels; NaN where one of them is."""
     ny, nx = (n // factor * factor for n in data.shape)
     blocks = data[:ny, :nx].reshape(ny // factor, factor, nx // factor, factor)
@@ -49,7 +49,7 @@ def field_figure(images, prior, names):
     ``images`` are mosaics on one grid, the shortest wavelength first (other numbers than three are drawn
     in gray); ``names`` are their bands and that of the prior.
     """
-    planes = [_filled(image) for image in images]
+    planes = [filled(image) for image in images]
     used = np.argwhere(np.any([np.isfinite(plane) for plane in planes], axis=0))
     (y0, x0), (y1, x1) = used.min(axis=0), used.max(axis=0) + 1
     planes = [plane[y0:y1, x0:x1] for plane in planes]
@@ -57,7 +57,7 @@ def field_figure(images, prior, names):
     corners = images[0].wcs.pixel_to_world([x0 - 0.5, x1 - 0.5], [y0 - 0.5, y1 - 0.5])
     x, y = (np.round(v + 0.5).astype(int).clip(0) for v in prior.wcs.world_to_pixel(corners))
     factor = max(1, round(_scale(images[0]) / _scale(prior)))
-    field = _binned(_filled(prior)[y[0] : y[1], x[0] : x[1]], factor)
+    field = binned(filled(prior)[y[0] : y[1], x[0] : x[1]], factor)
     labels = [band_label(name) for name in names]
     color = len(planes) == 3
     n = 2 if color else 1 + len(planes)
@@ -73,7 +73,7 @@ def field_figure(images, prior, names):
         parts = zip(("blue", "green", "red"), labels, strict=False)
         title = ", ".join(f"{label} {color}" for color, label in parts)
         # binned, to reduce the noise of single pixels in the color image
-        planes = [_binned(plane, 2) for plane in planes]
+        planes = [binned(plane, 2) for plane in planes]
         options = {"stretch": 4.0, "softening": 7.0, "title": title}
         plot_color(*planes[::-1], ax=axes[1], pixel_scale=2 * _scale(images[0]), **options)
     else:
@@ -93,7 +93,7 @@ def residual_figure(images, names, *, size=220):
     panel = WIDTH / 3
     figure, axes = new_figure(len(images), 3, size=(panel, 0.8 * panel))
     # the model also covers pixels that were not exposed
-    model = np.where(np.isfinite(_filled(images[0][0])), _filled(images[0][1]), 0.0)
+    model = np.where(np.isfinite(filled(images[0][0])), filled(images[0][1]), 0.0)
     # the brightest part of the model, where deblending matters most
     rows, columns = np.arange(0, model.shape[0], 60), np.arange(0, model.shape[1], 60)
     light = np.sqrt(np.clip(model, 0, None))
@@ -104,7 +104,7 @@ def residual_figure(images, names, *, size=220):
     part = (slice(y0, y0 + size), slice(x0, x0 + size))
     for row, (name, pair) in enumerate(zip(names, images, strict=True)):
         titles = ("mosaic", "model", "mosaic - model") if row == 0 else (None, None, None)
-        image, model = (_filled(plane)[part] for plane in pair)
+        image, model = (filled(plane)[part] for plane in pair)
         plot_model_residual(
             image,
             model,

@@ -1,0 +1,186 @@
+"""Small pictures of sources: the prior, and mosaic, model and residual of each band, many in one file."""
+
+import dataclasses
+
+import numpy as np
+from astropy.wcs.utils import proj_plane_pixel_scales
+from PIL import Image
+
+from miricigale.evaluation import sigma_mad
+from miricigale.workflow.stages.images import measured_mosaic
+from miricigale.workflow.stages.pictures import binned, filled
+
+__all__ = ["Cutouts"]
+
+#: Side of the pictures, and the finest pixels of those of the bands, in arcsec.
+BOX, FINEST = 5.3, 0.1
+#: Shades of gray, and the color of pixels without data.
+N_GRAY, NO_DATA = 48, (242, 226, 208)
+#: Stretch: asinh of the value over twice the noise, from -3 to at least 10 times the noise.
+SOFTENING, LOWEST, HIGHEST = 2.0, -3.0, 10.0
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class _Panels:
+    """
+    Images on one grid that are shown with one stretch.
+
+    ``planes`` are padded by ``n``, the side of the pictures in pixels, with NaN; ``sigma`` is the noise of
+    a pixel, and ``ruler`` the plane whose brightest pixel ends the stretch.
+    """
+
+    planes: tuple
+    wcs: object
+    shape: tuple
+    n: int
+    sigma: float
+    ruler: int
+
+    @classmethod
+    def of_images(cls, images, *, finest=0.0, noise=0, ruler=0):
+        """
+        Of images with the mask of the first, averaged to pixels of about ``finest`` arcsec or larger.
+
+        ``noise`` is the image whose noise is measured.
+        """
+        first = images[0]
+        scale = float(proj_plane_pixel_scales(first.wcs)[0] * 3600)
+        factor = max(1, round(finest / scale))
+        bad = ~np.isfinite(filled(first))
+        planes = [binned(np.where(bad, np.nan, filled(image)), factor) for image in images]
+        n = 2 * int(0.5 * BOX / (factor * scale)) + 1
+        return cls(
+            tuple(np.pad(p.astype(np.float32), n, constant_values=np.nan) for p in planes),
+            first.wcs[::factor, ::factor],
+            planes[0].shape,
+            n,
+            float(sigma_mad(planes[noise][np.isfinite(planes[noise])])),
+            ruler,
+        )
+
+    def squares(self, sky):
+        """Pictures about positions, north up: array of shape (n_positions, n_planes, n, n)."""
+        half, parts = self.n // 2, []
+        for value, size in zip(self.wcs.world_to_pixel(sky), self.shape[::-1], strict=True):
+            # positions far off give pictures of the padding alone
+            middle = np.clip(np.nan_to_num(value, nan=-np.inf), -half - 1, size + half)
+            parts.append(np.round(middle).astype(int)[:, None] + np.arange(self.n) + self.n - half)
+        columns, rows = parts
+        found = [plane[rows[:, :, None], columns[:, None, :]] for plane in self.planes]
+        return np.stack(found, axis=1)[:, :, ::-1]
+
+    def shades(self, sky):
+        """
+        Pictures as shades of gray, dark where bright, and where their stretch ends.
+
+        Returns
+        -------
+        shades : `~numpy.ndarray` of uint8, shape (n_positions, n_planes, n, n)
+            0 (white) to ``N_GRAY`` - 1, and ``N_GRAY`` where there are no data.
+        tops : `~numpy.ndarray`, shape (n_positions,)
+            Value of the darkest shade.
+        """
+        squares = self.squares(sky)
+        brightest = np.nan_to_num(squares[:, self.ruler], nan=-np.inf).max(axis=(1, 2))
+        tops = np.maximum(HIGHEST * self.sigma, brightest)
+        soft = SOFTENING * self.sigma
+        low, high = np.arcsinh(LOWEST / SOFTENING), np.arcsinh(tops / soft)[:, None, None, None]
+        level = (np.arcsinh(squares / soft) - low) / (high - low)
+        shades = np.clip(np.nan_to_num(level) * N_GRAY, 0, N_GRAY - 1).astype(np.uint8)
+        return np.where(np.isfinite(squares), shades, np.uint8(N_GRAY)), tops
+
+
+class Cutouts:
+    """
+    Pictures of the sources of a truth.
+
+    Parameters
+    ----------
+    prior : `~astropy.nddata.CCDData`
+        The high-resolution image.
+    bands : dict of str to sequence of `~astropy.nddata.CCDData`
+        Mosaic, model and residual of each band, on one grid.
+    """
+
+    def __init__(self, prior, bands):
+        self.prior = _Panels.of_images([prior])
+        self.bands = {
+            name: _Panels.of_images(images, finest=FINEST, noise=2, ruler=1)
+            for name, images in bands.items()
+        }
+
+    @classmethod
+    def read(cls, context, truth):
+        """Of the images of a truth, those that were measured."""
+        suffix, _ = measured_mosaic(context.config)
+        return cls(
+            context.image("f160w.fits"),
+            {
+                name: [
+                    context.image(f"{truth}/mosaic_{name}{suffix}.fits"),
+                    context.image(f"{truth}/photometry/{name}_model.fits"),
+                    context.image(f"{truth}/photometry/{name}_residual.fits"),
+                ]
+                for name in context.config.exposures.filters
+            },
+        )
+
+    @property
+    def _side(self):
+        """Pixels of the pictures of the bands."""
+        return max(panels.n for panels in self.bands.values())
+
+    def describe(self):
+        """Where the pictures are in a sheet, in pixels, and their stretch: plain values."""
+        return {
+            "box": BOX,
+            "prior": self.prior.n,
+            "side": self._side,
+            "height": max(self.prior.n, 3 * self._side),
+            "unit": "MJy/sr",
+            "sigma": [float(f"{p.sigma:.3g}") for p in (self.prior, *self.bands.values())],
+            "softening": SOFTENING,
+            "lowest": LOWEST,
+        }
+
+    def on_image(self, sky):
+        """Whether a picture about each position has data in any band: bool, shape (n,)."""
+        seen = [np.isfinite(p.squares(sky)[:, 0]).any(axis=(1, 2)) for p in self.bands.values()]
+        return np.any(seen, axis=0)
+
+    def sheet(self, sky):
+        """
+        One picture of all positions: a strip for each, with the prior at its left.
+
+        At the right of it each band has a column of mosaic, model and residual, north up, east left.
+
+        Parameters
+        ----------
+        sky : `~astropy.coordinates.SkyCoord`, shape (n,)
+            The positions.
+
+        Returns
+        -------
+        sheet : `PIL.Image.Image`
+            In shades of gray.
+        tops : `~numpy.ndarray`, shape (n, n_bands + 1)
+            Values at which the stretches of the prior and of each band end, in the unit of the images.
+        """
+        layout, side = self.describe(), self._side
+        strips = np.full(
+            (len(sky), layout["height"], self.prior.n + side * len(self.bands)), N_GRAY, np.uint8
+        )
+        shades, tops = self.prior.shades(sky)
+        strips[:, : self.prior.n, : self.prior.n] = shades[:, 0]
+        limits = [tops]
+        for k, panels in enumerate(self.bands.values()):
+            shades, tops = panels.shades(sky)
+            limits.append(tops)
+            left = self.prior.n + k * side
+            for row in range(3):
+                top = row * side
+                strips[:, top : top + panels.n, left : left + panels.n] = shades[:, row]
+        sheet = Image.fromarray(strips.reshape(-1, strips.shape[2]))
+        gray = np.repeat(255 - np.round(255 * np.arange(N_GRAY) / (N_GRAY - 1)).astype(int), 3)
+        sheet.putpalette([*gray.tolist(), *NO_DATA])
+        return sheet, np.transpose(limits)
