@@ -84,6 +84,12 @@ class SedSection:
     alpha: tuple[float, ...] = _option(
         (1.5, 2.5), "Range from which the dust's alpha is drawn where no band shows it."
     )
+    alpha_draw: str = _option(
+        "uniform",
+        "How it is drawn: uniform, or nodes: from those of the fit's grid within the range, where "
+        "best fits on that grid lie.",
+        choices=("uniform", "nodes"),
+    )
     frac_agn: tuple[float | str, ...] = _option(
         (0.0,),
         "fracAGN of the injected sources, one simulated sky for each; the first gives the error "

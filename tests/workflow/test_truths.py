@@ -36,7 +36,7 @@ def make_truths(folder, **sed):
     table["mag_f160w"] = 20.0
     for name in bands:
         table[name] = light[name]
-    table.write(folder / "mine.ecsv")
+    table.write(folder / "mine.ecsv", overwrite=True)
     config = StudyConfig.from_dict(
         {
             "catalog": {"source": str(folder / "mine.ecsv")},
@@ -112,6 +112,13 @@ def test_dust_of_the_main_sequence_leaves_the_stars(truths, tmp_path):
     np.testing.assert_allclose(
         (dusty["mips.24"] / plain["mips.24"])[far], dusty["dust_excess"][far], rtol=0.02
     )
+
+
+def test_the_dusts_alpha_is_drawn_from_nodes(tmp_path):
+    nodes = {"alpha": [1.5, 2.5], "alpha_draw": "nodes", "frac_agn": 0.0}
+    assert set(make_truths(tmp_path, **nodes)["agn00"]["alpha"]) == {1.5, 2.0, 2.5}
+    with pytest.raises(ConfigError, match="holds no node"):
+        make_truths(tmp_path, **{**nodes, "alpha": [1.6, 1.7]})
 
 
 def test_names_of_truths_and_sets():

@@ -5,7 +5,7 @@ from astropy.table import QTable, hstack
 
 from miricigale import fitting, sed
 from miricigale.evaluation import AGNPopulation, agn_fraction, main_sequence_dust
-from miricigale.utils.exceptions import DataError
+from miricigale.utils.exceptions import ConfigError, DataError
 from miricigale.utils.meta import provenance
 from miricigale.utils.random import stream
 from miricigale.workflow.stage import stage
@@ -36,9 +36,16 @@ def galaxy_parameters(config, catalog, best, *, seed):
     if "alpha" not in table.colnames:
         # the bands of the fit do not show it
         low, high = config.sed.alpha
-        table["alpha"] = [
-            stream(seed, "truth", "alpha", str(key)).uniform(low, high) for key in table["id"]
-        ]
+        streams = (stream(seed, "truth", "alpha", str(key)) for key in table["id"])
+        if config.sed.alpha_draw == "nodes":
+            nodes = sed.SEDModel.yang2021_axes("fit")["alpha"]
+            nodes = nodes[(nodes >= low) & (nodes <= high)]
+            if len(nodes) == 0:
+                msg = f"[sed] alpha = {[low, high]} holds no node of the fit's grid"
+                raise ConfigError(msg)
+            table["alpha"] = [rng.choice(nodes) for rng in streams]
+        else:
+            table["alpha"] = [rng.uniform(low, high) for rng in streams]
     model, prior = sed.SEDModel.yang2021(agn=False), config.highres.filter
     if prior in catalog.colnames:
         fitted, measured = model.fluxes(table, [prior])[prior], catalog[prior]
@@ -107,13 +114,18 @@ def add_field_agn(table, model, band, seed):
     version=3,
     needs=("catalog", "seds"),
     sections=(
-        "sed.alpha", "sed.infrared", "exposures.filters", "fit.bands", "highres.filter"
+        "sed.alpha",
+        "sed.alpha_draw",
+        "sed.infrared",
+        "exposures.filters",
+        "fit.bands",
+        "highres.filter",
     ),
     resources=sed_resources,
     units=truth_names,
     plan=lambda config, unit: study_truths(config)[unit].values(),
     kernels=("fit",),
-)  # fmt: skip
+)
 def make_truth(context, name):
     """Stage 3: the best-fit SED (and its AGN) of each source through every band."""
     config, frac_agn = context.config, context.plan["frac_agn"]
