@@ -187,6 +187,10 @@ class PhotometrySection:
     match_radius: float = _option(
         0.5, "Radius of the match to the truth in arcsec.", low=0.05, high=3.0
     )
+    rivals: bool = _option(
+        False,
+        "Whether the first sky is measured by the other method and as by Source Extractor too.",
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -301,6 +305,8 @@ class StudyConfig:
         _require(len(fit.bands) == len(fit.depths), "fit", "depths", wanted, len(fit.depths))
         good = self.photometry.method != "yang2021" or pixel == 0.06
         _require(good, "highres", "pixel_scale", "must be 0.06 with method = 'yang2021'", pixel)
+        good = not self.photometry.rivals or pixel == 0.06
+        _require(good, "highres", "pixel_scale", "must be 0.06 with [photometry] rivals", pixel)
         good = kernels in ("auto", "yang2021") or _is_positive(kernels)
         wanted = "must be 'auto', 'yang2021' or a positive number as text"
         _require(good, "photometry", "regularization", wanted, repr(kernels))

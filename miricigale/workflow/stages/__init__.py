@@ -19,6 +19,7 @@ def study_stages():
         points,
         report,
         sources,
+        rivals,
         truth,
     )
 
@@ -35,6 +36,7 @@ def study_stages():
         points.measure_point_sources,
         fits.make_errors,
         fits.match_sources,
+        rivals.measure_rivals,
         fits.fit_photometry,
         sources.make_sources,
         report.make_report,

@@ -12,9 +12,9 @@ from miricigale.workflow.stages.exposures import (
     exposure_plan,
     truth_bands,
 )
-from miricigale.workflow.stages.images import measured_mosaic, mosaic_psf
+from miricigale.workflow.stages.images import mosaic_psf
 
-__all__ = ["make_templates", "measure_photometry", "yang2021_photometer"]
+__all__ = ["make_templates", "measure_band", "measure_photometry", "yang2021_photometer"]
 
 
 @stage(
@@ -58,40 +58,42 @@ def make_templates(context, _):
 def measure_photometry(context, unit):
     """Stage 11: forced photometry of one band, on its own grid or by the steps of Yang et al. 2021."""
     truth, name = unit.split("/")
-    if context.config.photometry.method == "yang2021":
-        result = _as_yang2021(context, truth, name)
-    else:
-        kernel = psf.MatchingKernel.read(context.path(f"kernel_{name}.fits"))
-        # the constant absorbs the light of faint sources and of wings in the background
-        result = photometry.ForcedPhotometer(
-            kernel, fit_background=True, n_threads=context.n_threads
-        ).measure(
-            context.image(f"{truth}/mosaic_{name}.fits"),
-            templates=photometry.SourceTemplates.read(context.path("templates.fits")),
-        )
+    result = measure_band(context, truth, name, context.config.photometry.method)
     table = result.to_table()
     context.save_table(f"{truth}/photometry/{name}.ecsv", table)
     context.save_image(f"{truth}/photometry/{name}_model.fits", result.model_image)
     context.save_image(f"{truth}/photometry/{name}_residual.fits", result.residual_image)
 
 
+def measure_band(context, truth, name, method):
+    """Result of the forced photometry of one band of a truth, ``"package"`` or ``"yang2021"``."""
+    if method == "yang2021":
+        return _as_yang2021(context, truth, name)
+    kernel = psf.MatchingKernel.read(context.path(f"kernel_{name}.fits"))
+    # the constant absorbs the light of faint sources and of wings in the background
+    return photometry.ForcedPhotometer(
+        kernel, fit_background=True, n_threads=context.n_threads
+    ).measure(
+        context.image(f"{truth}/mosaic_{name}.fits"),
+        templates=photometry.SourceTemplates.read(context.path("templates.fits")),
+    )
+
+
 def yang2021_photometer(config, name, n_threads):
     """Photometer of one band by the steps of Yang et al. 2021, without a scaling of the image."""
     options = config.highres
-    _, scale = measured_mosaic(config)
     return photometry.Yang2021Photometer(
         psf.hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec),
-        mosaic_psf(config, name, scale),
+        mosaic_psf(config, name, options.pixel_scale),
         n_threads=n_threads,
     )
 
 
 def _as_yang2021(context, truth, name):
-    """Forced photometry of one band by the steps of Yang et al. 2021."""
-    suffix, _ = measured_mosaic(context.config)
+    """Forced photometry of one band by the steps of Yang et al. 2021, on the grid of the prior."""
     _, labels = context.image("segm.fits", "segmentation")
     return yang2021_photometer(context.config, name, context.n_threads).measure(
-        context.image(f"{truth}/mosaic_{name}{suffix}.fits"),
+        context.image(f"{truth}/mosaic_{name}_fine.fits"),
         context.image("f160w.fits"),
         labels.astype(np.int32),
         QTable.read(context.path("detections.ecsv")),

@@ -13,7 +13,7 @@ from miricigale.evaluation import (
     number,
 )
 from miricigale.workflow.stage import stage
-from miricigale.workflow.stages import comparison, conditions, figures, pictures, provenance
+from miricigale.workflow.stages import comparison, conditions, figures, pictures, provenance, rivals
 from miricigale.workflow.stages.exposures import EXPOSURE_RESOURCES, GRID, exposure_plan
 from miricigale.workflow.stages.figures import SET_LABELS, band_label
 from miricigale.workflow.stages.images import measured_mosaic
@@ -41,6 +41,7 @@ log = logging.getLogger(__name__)
         "points",
         "errors",
         "matches",
+        "rivals",
         "fits",
     ),
     sections=(
@@ -52,6 +53,7 @@ log = logging.getLogger(__name__)
         "highres.filter",
         "highres.pixel_scale",
         "photometry.method",
+        "photometry.rivals",
         "reduction.pixel_scale",
         "fit",
         "errors",
@@ -95,9 +97,12 @@ def make_report(context, _):
     provenance.write_exposures(context, report, metrics, shown)
     writer.images()
     writer.photometry()
+    others = rivals.read_rivals(context)
+    rivals.write_rivals(context, report, others)
     writer.errors()
     writer.fits()
     study = comparison.study_results(config, truths, every, metrics)
+    study.extra.update(rivals.source_extractor_numbers(others, context.seed))
     comparison.write_truths(context, report, study, metrics, FIT_COLUMNS)
     comparison.write_comparison(context, report, study, metrics["as_paper"])
     writer.inputs()

@@ -1,0 +1,328 @@
+"""Rival photometry of the first sky: the other forced photometry, and Source Extractor's."""
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale import photometry
+from miricigale.evaluation import Estimate, bootstrap, match_truth, number, recovery_metrics
+from miricigale.utils.tables import described_rows, error_column
+from miricigale.workflow.stage import stage
+from miricigale.workflow.stages.conditions import ConditionFlags
+from miricigale.workflow.stages.exposures import (
+    IMAGE_RESOURCES,
+    KERNEL,
+    band_names,
+    exposure_plan,
+)
+from miricigale.workflow.stages.figures import band_label
+from miricigale.workflow.stages.measure import measure_band
+from miricigale.workflow.stages.sample import SampleFlags, in_field
+from miricigale.workflow.truths import reference
+
+__all__ = [
+    "RIVALS",
+    "measure_rivals",
+    "read_rivals",
+    "rival_counts",
+    "rival_numbers",
+    "source_extractor_numbers",
+    "write_rivals",
+]
+
+#: Methods that are compared: name of the columns, and what the page calls them.
+RIVALS = {
+    "package": "package",
+    "yang2021": "steps of Yang et al.",
+    "source_extractor": "Source Extractor",
+}
+#: The band in which Yang et al. 2021 compare with Source Extractor.
+SE_BAND = "miri.f1500w"
+#: Ranges of the true signal-to-noise ratio.
+SNR_RANGES = ((3.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20.0, 50.0), (50.0, np.inf))
+
+
+def _one_band(select):
+    """Units of a stage that a rival of a band reads, of the reference truth."""
+    return lambda config, unit: (select.format(truth=reference(config), band=unit),)
+
+
+@stage(
+    "rivals",
+    "rival photometry",
+    needs={
+        "truth": _one_band("{truth}"),
+        "mosaics": _one_band("{truth}/{band}"),
+        "highres": None,
+        "kernels": _one_band("{band}"),
+        "templates": None,
+        "matches": _one_band("{truth}"),
+    },
+    sections=(*KERNEL, "photometry.method", "photometry.match_radius"),
+    resources=IMAGE_RESOURCES,
+    units=lambda config: band_names(config) if config.photometry.rivals else (),
+    plan=lambda config, unit: {
+        "truth": reference(config),
+        "exposures": exposure_plan(config, unit),
+    },
+    kernels=("photometry",),
+)
+def measure_rivals(context, name):
+    """Measure a band of the reference truth by the other method and as Source Extractor does."""
+    config, of_truth = context.config, context.plan["truth"]
+    radius = config.photometry.match_radius * u.arcsec
+    truth = QTable.read(context.path(f"{of_truth}/truth.ecsv"))
+    matched = QTable.read(context.path(f"{of_truth}/matched.ecsv"))
+    own = config.photometry.method
+    other = "package" if own == "yang2021" else "yang2021"
+    forced = measure_band(context, of_truth, name, other).to_table()
+    mosaic = context.image(f"{of_truth}/mosaic_{name}_fine.fits")
+    blind = photometry.source_extractor_photometry(mosaic)
+    inside = in_field(truth["sky"], [mosaic])
+    blind["inside"] = in_field(blind["sky"], [mosaic]) if len(blind) else np.zeros(0, bool)
+    table = rival_table(truth, matched, name, own=own, inside=inside)
+    for method, measured, column in (
+        (other, forced, "flux"),
+        ("source_extractor", blind, "flux_best"),
+    ):
+        rows = QTable({"id": np.arange(len(measured)), "sky": measured["sky"]})
+        rows[name], rows[error_column(name)] = measured[column], measured[error_column(column)]
+        rows["flags"] = np.zeros(len(rows), int)
+        found = match_truth(truth, rows, [name], radius=radius)
+        table[method], table[error_column(method)] = found[name], found[error_column(name)]
+    table.meta.update(method=own, n_source_extractor=int(np.count_nonzero(blind["inside"])))
+    context.save_table(f"rivals/{name}.ecsv", table)
+
+
+def rival_table(truth, matched, name, *, own, inside):
+    """
+    The sources of a truth in a band, with the fluxes of the study's ``own`` method.
+
+    ``shape`` is ``"point"``, ``"n < 2"`` or ``"n >= 2"``; ``snr`` the true flux over the study's formal
+    error; ``field`` tells the sources that were exposed (``inside``) and have a model.
+    """
+    index = np.asarray(truth["sersic_index"], float)
+    table = QTable({"id": truth["id"], "sky": truth["sky"]})
+    table["flux_true"] = matched[f"{name}_true"]
+    formal = matched[f"{name}_formal_err"]
+    table["snr"] = (table["flux_true"] / formal).to_value(u.one)
+    shapes = np.where(index < 2, "n < 2", "n >= 2")
+    table["shape"] = np.where(np.asarray(truth["profile"]) == "point", "point", shapes)
+    near = (np.asarray(matched[f"{name}_condition"]) & ConditionFlags.CROWDED) > 0
+    edge = (np.asarray(matched[f"{name}_condition"]) & ConditionFlags.EDGE) > 0
+    table["crowded"], table["edge"] = near, edge
+    modeled = (np.asarray(matched["selection"]) & SampleFlags.NO_MODEL) == 0
+    table["field"] = inside & modeled
+    table[own], table[error_column(own)] = matched[name], formal
+    return table
+
+
+def read_rivals(context):
+    """Tables of the stage by band; none where it was not asked for."""
+    config = context.config
+    names = band_names(config) if config.photometry.rivals else ()
+    return {name: QTable.read(context.path(f"rivals/{name}.ecsv")) for name in names}
+
+
+def _groups(table):
+    """Rows of a table of a band by group: kind and name of the group, and which rows."""
+    usable = np.asarray(table["field"]) & ~np.asarray(table["edge"])
+    snr, crowded = np.asarray(table["snr"], float), np.asarray(table["crowded"])
+    with np.errstate(invalid="ignore"):
+        bright = usable & (snr > 5)
+        yield "all", "above 5 sigma", bright
+        for low, high in SNR_RANGES:
+            name = f"{low:g} to {high:g}" if np.isfinite(high) else f"above {low:g}"
+            yield "true S/N", name, usable & (snr > low) & (snr <= high)
+    for name in ("point", "n < 2", "n >= 2"):
+        yield "shape", name, bright & (np.asarray(table["shape"]) == name)
+    yield "neighbors", "isolated", bright & ~crowded
+    yield "neighbors", "crowded", bright & crowded
+
+
+def rival_numbers(tables):
+    """
+    Fluxes of each method against the truth, by signal-to-noise, shape and crowding.
+
+    Parameters
+    ----------
+    tables : dict of str to `~astropy.table.QTable`
+        Of `read_rivals`.
+
+    Returns
+    -------
+    numbers : `~astropy.table.QTable`
+        A row for each band (and ``"all"`` of them together), group and method: ``n_group`` sources, of
+        which ``n`` have a flux; ``median`` and ``scatter`` of measured over true flux minus one, and of
+        the differences in units of the error (``pull_median``, ``pull_scatter``).
+    """
+    values = {}
+    for name, table in tables.items():
+        true = table["flux_true"].value
+        for kind, group, rows in _groups(table):
+            for method in RIVALS:
+                flux = table[method].value[rows]
+                error = table[error_column(method)].value[rows]
+                for key in (name, "all"):
+                    parts = values.setdefault((key, kind, group, method), [])
+                    parts.append((true[rows], flux, error))
+    found = []
+    for key, parts in values.items():
+        true, flux, error = (np.concatenate(part) for part in zip(*parts, strict=True))
+        ratio = recovery_metrics(true, flux, relative=True)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            pulls = recovery_metrics(np.zeros(true.size), (flux - true) / error)
+        found.append(
+            (*key, true.size, ratio.n, ratio.median, ratio.median_err, ratio.sigma_mad,
+             pulls.median, pulls.sigma_mad)
+        )  # fmt: skip
+    found.sort(key=lambda row: row[0] == "all")
+    texts = {
+        "band": "Band, or all together",
+        "kind": "By what sources are grouped",
+        "group": "Sources of the field that are not at an edge",
+        "method": "How they are measured",
+        "n_group": "Sources of the group",
+        "n": "Sources with a flux",
+        "median": "Median of measured over true flux minus one",
+        "median_err": "Its error",
+        "scatter": "sigma_MAD of the same",
+        "pull_median": "Median of (measured - true) / error",
+        "pull_scatter": "sigma_MAD of the same",
+    }
+    return described_rows(found, texts)
+
+
+def rival_counts(table):
+    """
+    What Source Extractor finds of a band.
+
+    ``detected`` sources in the field, ``matched`` ones of the catalog, and ``missed`` of the
+    ``template`` sources of the field that the template fit has measured.
+    """
+    field = np.asarray(table["field"])
+    forced = field & np.isfinite(table[table.meta["method"]].value)
+    blind = np.isfinite(table["source_extractor"].value)
+    return {
+        "detected": int(table.meta["n_source_extractor"]),
+        "matched": int(np.count_nonzero(field & blind)),
+        "template": int(np.count_nonzero(forced)),
+        "missed": int(np.count_nonzero(forced & ~blind)),
+    }
+
+
+def _se_offset(table, seed, method="yang2021"):
+    """Source Extractor minus template fit (mag) of sources above 5 sigma: an `Estimate`."""
+    blind, forced = table["source_extractor"].value, table[method].value
+    with np.errstate(invalid="ignore"):
+        good = np.asarray(table["field"]) & (np.asarray(table["snr"], float) > 5)
+        good &= (blind > 0) & (forced > 0)
+    delta = -2.5 * np.log10(blind[good] / forced[good])
+    return bootstrap(lambda v: np.median(v, axis=-1), delta, seed=seed)
+
+
+def source_extractor_numbers(tables, seed):
+    """
+    Numbers of the comparison of Yang et al. 2021 with Source Extractor, in F1500W.
+
+    Parameters
+    ----------
+    tables : dict of str to `~astropy.table.QTable`
+        Of `read_rivals`.
+    seed : int
+        Of the bootstrap.
+
+    Returns
+    -------
+    numbers : dict of str to `~miricigale.evaluation.Estimate`
+        By key of `~miricigale.evaluation.PUBLISHED`, for ``StudyResults.extra``; empty without
+        the band. Intervals of the counts are Poisson's.
+    """
+    if SE_BAND not in tables:
+        return {}
+    table = tables[SE_BAND]
+    counts = rival_counts(table)
+
+    def count(name):
+        n = counts[name]
+        return Estimate(float(n), n - np.sqrt(n), n + np.sqrt(n), n)
+
+    return {
+        "source_extractor.detected": count("detected"),
+        "source_extractor.matched": count("matched"),
+        "source_extractor.missed": Estimate.of_fraction(counts["missed"], counts["template"]),
+        "source_extractor.offset": _se_offset(table, seed),
+    }
+
+
+def write_rivals(context, report, tables):
+    """The section on rival photometry; without tables there is none."""
+    if not tables:
+        return
+    numbers = rival_numbers(tables)
+    context.save_table("report/rivals.ecsv", numbers)
+    report.section(
+        "Rival photometry",
+        "The same images measured by three methods: the package's forced photometry (templates with "
+        "wings, on the mosaics' own pixels), the steps of Yang et al. 2021 after T-PHOT (bare segments, "
+        "on pixels of 0.06 arcsec, errors for white noise), and blind as by Source Extractor with the "
+        "settings of the paper (the brighter of AUTO/0.94 and the 1.86 arcsec aperture/0.8). Errors are "
+        "the formal ones of each.",
+    )
+    none = "no such source"
+    cells = {}
+    for row in numbers:
+        group = (row["band"], row["kind"], row["group"])
+        cells.setdefault(group, [row["n_group"]])
+        told = number(row["median"], "+.1f", none, scale=100)
+        if np.isfinite(row["median"]):
+            scatter = number(row["scatter"], ".1f", none, scale=100)
+            told = f"{told} ± {scatter} % ({row['n']})"
+        cells[group].append(told)
+        if row["kind"] == "all":
+            cells[group].append(number(row["pull_scatter"], ".1f", none))
+    header = [RIVALS[method] for method in RIVALS]
+    report.table(
+        [
+            (kind, group, *found)
+            for (band, kind, group), found in cells.items()
+            if band == "all" and kind != "all"
+        ],
+        header=("by", "sources", "in the group", *header),
+        caption="Measured over true flux minus one, median ± scatter (number measured), of all bands "
+        "together: by the true flux over the study's formal error, and, of those above 5, by shape "
+        "and neighbors; sources at the edge are left out",
+        text=2,
+    )
+    report.table(
+        [
+            (band_label(band), *found)
+            for (band, kind, _), found in cells.items()
+            if kind == "all" and band != "all"
+        ],
+        header=("band", "above 5 sigma", *(x for h in header for x in (h, "scatter of pulls"))),
+        caption="The same by band, with the scatter of (measured - true) / formal error",
+    )
+    rows = []
+    for name, table in tables.items():
+        counts, offset = rival_counts(table), _se_offset(table, context.seed)
+        share = counts["missed"] / counts["template"] if counts["template"] else np.nan
+        rows.append(
+            (
+                band_label(name),
+                counts["detected"],
+                counts["matched"],
+                counts["template"],
+                number(share, ".0f", none, scale=100),
+                number(offset.value, "+.3f", none),
+                number(offset.error, ".3f", none),
+            )
+        )
+    report.table(
+        rows,
+        header=("band", "detected", "in the catalog", "measured by templates", "missed (%)",
+                "offset (mag)", "its error"),
+        caption="Source Extractor on the mosaics of 0.06 arcsec: detections in the field, those of them that are "
+        "sources of the catalog; the share of the sources with a forced flux that it misses, and its "
+        "magnitudes minus those of the steps of Yang et al. above 5 sigma",
+    )  # fmt: skip

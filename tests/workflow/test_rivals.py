@@ -1,0 +1,187 @@
+"""Rival photometry of the first sky: the other method, and Source Extractor's."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData, StdDevUncertainty
+from astropy.table import QTable
+
+from miricigale.evaluation import PUBLISHED, Report
+from miricigale.instrument import north_up_wcs
+from miricigale.photometry import detect_sources
+from miricigale.psf import hst_psf
+from miricigale.scene import Scene, highres_image
+from miricigale.utils.exceptions import ConfigError
+from miricigale.workflow import Context
+from miricigale.workflow.config import StudyConfig, load_config
+from miricigale.workflow.stages import rivals, study_stages
+from miricigale.workflow.stages.images import mosaic_psf
+
+STAGES = {stage.name: stage for stage in study_stages()}
+BAND, PRIOR = "miri.f1500w", "wfc3.f160w"
+CENTER = SkyCoord(53.13440 * u.deg, -27.83444 * u.deg)
+#: The last two are far too faint for a blind detection.
+N, N_FAINT = 14, 2
+
+
+def config_of(method, **photometry):
+    return StudyConfig.from_dict(
+        {
+            "exposures": {
+                "filters": [BAND], "n_groups": [7], "n_integrations": [1], "n_dithers": [1],
+            },
+            "fit": {"min_detected": 1},
+            "photometry": {"method": method, "rivals": True, **photometry},
+        }
+    )  # fmt: skip
+
+
+def made_truth():
+    """Points 5 arcsec apart, of which the study's own method is made to measure the true fluxes."""
+    rng = np.random.default_rng(3)
+    grid = np.meshgrid(np.linspace(-12.5, 12.5, 6), np.linspace(-7, 7, 3))
+    dx, dy = (a.ravel()[:N] + rng.uniform(-0.1, 0.1, N) for a in grid)
+    truth = QTable({"id": np.arange(1, N + 1)})
+    truth["sky"] = CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
+    truth["redshift"] = np.ones(N)
+    truth["profile"] = np.full(N, "point")
+    truth["half_light_radius"] = np.zeros(N) * u.arcsec
+    truth["sersic_index"] = truth["axis_ratio"] = np.ones(N)
+    truth["position_angle"] = np.zeros(N) * u.deg
+    flux = np.append(np.geomspace(30, 300, N - N_FAINT), np.full(N_FAINT, 0.3))
+    truth[BAND] = flux * u.uJy
+    truth[PRIOR] = np.full(N, 30.0) * u.uJy
+    return truth
+
+
+def made_matched(truth):
+    matched = truth["id", "sky"]
+    matched[f"{BAND}_true"] = matched[BAND] = truth[BAND]
+    matched[f"{BAND}_formal_err"] = np.full(N, 0.5) * u.uJy
+    matched[f"{BAND}_condition"] = np.where(np.arange(N) < 5, 2, 0)
+    matched["selection"] = np.zeros(N, int)
+    return matched
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rivals")
+    config, truth = config_of("package"), made_truth()
+    rng = np.random.default_rng(3)
+    made = Context(config, folder)
+    made.save_table("agn00/truth.ecsv", truth)
+    made.save_table("agn00/matched.ecsv", made_matched(truth))
+    for suffix, scale, size in (("", 0.11, 330), ("_fine", 0.06, 605)):
+        wcs = north_up_wcs(CENTER, scale * u.arcsec, (size, size))
+        wcs.pixel_shape = size, size
+        image = Scene(truth, filter=BAND, wcs=wcs, psf=mosaic_psf(config, BAND, scale)).render()
+        noise = np.full(image.shape, 0.1 * 0.06 / scale)
+        made.save_image(
+            f"agn00/mosaic_{BAND}{suffix}.fits",
+            CCDData(image.data + rng.normal(0, noise), unit="MJy/sr", wcs=wcs,
+                    uncertainty=StdDevUncertainty(noise), mask=np.zeros(image.shape, bool)),
+        )  # fmt: skip
+    psf = hst_psf(PRIOR, pixel_scale=0.06 * u.arcsec)
+    prior = highres_image(truth, filter=PRIOR, wcs=wcs, psf=psf, seed=1)
+    segmentation, detected = detect_sources(prior)
+    made.save_image("f160w.fits", prior)
+    made.save_image("segm.fits", prior, segmentation=np.asarray(segmentation.data, np.int32))
+    made.save_table("detections.ecsv", detected)
+    for name, unit in (("kernels", BAND), ("templates", ""), ("rivals", BAND)):
+        STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def tables(folder):
+    return rivals.read_rivals(Context(config_of("package"), folder))
+
+
+def test_points_come_back_by_the_other_method_and_as_by_source_extractor(tables):
+    table = tables[BAND]
+    bright = table[:-N_FAINT]
+    ratio = (bright["yang2021"] / bright["flux_true"]).to_value(u.one)
+    # the paper's factor for stamps cut to a square is that of a circle
+    assert abs(np.median(ratio) - 1) < 0.03
+    assert np.ptp(ratio) < 0.03
+    ratio = (bright["source_extractor"] / bright["flux_true"]).to_value(u.one)
+    # fixed fractions for the light outside, and sky from a mesh of 4 arcsec
+    assert abs(np.median(ratio) - 1) < 0.06
+    assert np.ptp(ratio) < 0.15
+    assert np.all(table["package"] == table["flux_true"])
+    assert table.meta["method"] == "package"
+
+
+def test_blind_detection_misses_the_faint_ones_only(tables):
+    counts = rivals.rival_counts(tables[BAND])
+    assert counts == {
+        "detected": N - N_FAINT,
+        "matched": N - N_FAINT,
+        "template": N,
+        "missed": N_FAINT,
+    }
+    found = rivals.source_extractor_numbers(tables, 1)
+    assert set(found) <= {one.key for one in PUBLISHED if one.quantity == "extra"}
+    assert found["source_extractor.detected"].value == N - N_FAINT
+    assert found["source_extractor.missed"].value == pytest.approx(N_FAINT / N)
+    offset = found["source_extractor.offset"]
+    assert abs(offset.value) < 0.08
+    assert offset.low <= offset.value <= offset.high
+    assert offset.n == N - N_FAINT
+    assert rivals.source_extractor_numbers({"miri.f770w": tables[BAND]}, 1) == {}
+
+
+def test_numbers_by_group_count_every_source_once(tables):
+    numbers = rivals.rival_numbers(tables)
+    one = numbers[(numbers["band"] == "all") & (numbers["method"] == "package")]
+    size = {(row["kind"], row["group"]): row["n_group"] for row in one}
+    assert size["all", "above 5 sigma"] == size["shape", "point"] == N - N_FAINT
+    assert size["neighbors", "crowded"] == 5
+    assert size["neighbors", "isolated"] == N - N_FAINT - 5
+    of_snr = [n for (kind, _), n in size.items() if kind == "true S/N"]
+    assert sum(of_snr) == N - N_FAINT
+    # the made-up fluxes are the true ones
+    assert np.all(one["median"][one["n"] > 0] == 0)
+    # one band: all together are the same
+    for column in ("n", "median", "scatter", "pull_median", "pull_scatter"):
+        halves = (numbers[column][numbers["band"] == band] for band in ("all", BAND))
+        assert np.array_equal(*halves, equal_nan=True)
+
+
+def test_the_section_of_the_page(folder, tables):
+    report = Report("made up")
+    rivals.write_rivals(Context(config_of("package"), folder), report, tables)
+    report.write(folder / "page.html")
+    page = (folder / "page.html").read_text()
+    assert "Rival photometry" in page
+    assert "F1500W" in page
+    report = Report("made up")
+    rivals.write_rivals(Context(config_of("package"), folder), report, {})
+    report.write(folder / "none.html")
+    assert "Rival photometry" not in (folder / "none.html").read_text()
+
+
+def test_the_rival_of_the_papers_method_is_the_packages(folder, tmp_path):
+    import shutil
+
+    shutil.copytree(folder, tmp_path / "run")
+    config = config_of("yang2021")
+    stage = STAGES["rivals"]
+    stage.function(Context(config, tmp_path / "run", stage=stage, unit=BAND), BAND)
+    table = QTable.read(tmp_path / "run" / "rivals" / f"{BAND}.ecsv")
+    bright = table[:-N_FAINT]
+    ratio = (bright["package"] / bright["flux_true"]).to_value(u.one)
+    assert abs(np.median(ratio) - 1) < 0.005
+    assert table.meta["method"] == "yang2021"
+
+
+def test_rivals_are_asked_for():
+    stage, config = STAGES["rivals"], config_of("package")
+    assert stage.unit_names(config) == (BAND,)
+    assert stage.unit_names(config_of("package", rivals=False)) == ()
+    units = {name: one.unit_names(config) for name, one in STAGES.items()}
+    assert stage.needed(config, BAND, units)["mosaics"] == [f"mosaics:agn00/{BAND}"]
+    with pytest.raises(ConfigError, match=r"0\.06 with \[photometry\] rivals, got 0\.05"):
+        load_config("goodss", overrides={"photometry": {"rivals": True},
+                                         "highres": {"pixel_scale": 0.05}})  # fmt: skip
