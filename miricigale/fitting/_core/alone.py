@@ -4,10 +4,9 @@ import math
 
 import numpy as np
 
-from miricigale.fitting._core.histogram import add_alone
-from miricigale.fitting._core.lanes import galaxy_products
-from miricigale.fitting._core.limits import limited_scale
-from miricigale.fitting._core.structs import BLOCK, KERNEL, NO_LIGHT, PART
+from miricigale.fitting._core.histogram import add_model
+from miricigale.fitting._core.lanes import best_scale, galaxy_products
+from miricigale.fitting._core.structs import BLOCK, KERNEL
 from miricigale.fitting._core.sums import PARTS, finish_redshift, keep_best, take_draw
 from miricigale.utils.compilation import njit
 
@@ -15,22 +14,6 @@ __all__ = ["evaluate_alone"]
 
 # Models so far below the best are not looked at for a reference.
 _NEAR = 50.0
-
-
-@njit(**PART)
-def _alone(tables, limits, lanes, z, g):
-    """Scale, R and variance of the scale of a galaxy without AGN."""
-    p, q = lanes.pq[0, g], lanes.pq[1, g]
-    # without light the scale is 0, and nothing is known of its error
-    q = q if q > NO_LIGHT else 1.0 / NO_LIGHT
-    s = max(p, 0.0) / q
-    r = max(p, 0.0) * s
-    inverse = 1.0 / q
-    if limits is not None:
-        for m in range(limits.bands.size):
-            limits.slope[m] = tables.galaxy[z, g, limits.bands[m]] * limits.inverse[m]
-        s, r, inverse = limited_scale(p, q, limits)
-    return s, r, inverse
 
 
 @njit(**KERNEL)
@@ -64,7 +47,9 @@ def evaluate_alone(tables, target, limits, pairs, lanes, sums, delta, scale_erro
                     if not known:
                         known = True
                         galaxy_products(tables, target, z, block, lanes.pq)
-                    s, r, inverse = _alone(tables, limits, lanes, z, g)
+                    galaxy = tables.galaxy[z, g]
+                    p, q = lanes.pq[0, g], lanes.pq[1, g]
+                    s, r, inverse = best_scale(limits, p, q, galaxy, galaxy, 0.0, 0.0)
                     value = r + prior + tables.log_zero
                     if not sums_up:
                         if value > best[2]:
@@ -93,7 +78,7 @@ def evaluate_alone(tables, target, limits, pairs, lanes, sums, delta, scale_erro
                             take_draw(draws, d, now, z, g, np.int64(-1), np.int64(0), s, inverse)
                     carry += t
                     if carry >= max(total[0], about) / PARTS:
-                        add_alone(tables, sums.hist, g, s, carry)
+                        add_model(tables, sums.hist, g, np.int64(-1), np.int64(0), s, carry)
                         carry = 0.0
             if some:
                 finish_redshift(tables, lanes, sums, z)

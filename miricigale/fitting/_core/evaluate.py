@@ -129,9 +129,6 @@ def _evaluate_runs(
             _rescale(sums, lanes, math.exp(0.5 * (best[2] - reference)))
         best[2] = reference
     light = single and limits is None
-    top_frac = -1e300
-    for j in range(of_frac.shape[1]):
-        top_frac = max(top_frac, of_frac[at.LOG_FRAC, j])
     for i in range(lanes.left.size):
         lanes.left[i] = 1.0
     n_listed = 1.0
@@ -169,7 +166,7 @@ def _evaluate_runs(
                     lanes.known[block] = z + 1
                     galaxy_products(tables, target, z, block, lanes.pq)
                 run_products(tables, target.bands, pairs, lanes, z, block, k, n_run)
-                rest = log_agn + top_frac + pairs.tail_agn[z, k]
+                rest = log_agn + tables.log_top_frac + pairs.tail_agn[z, k]
                 n_run = _drop(tables, pairs, lanes, r - 1, z, block, n_run, rest, sure)
                 whole = n_run >= _DENSE
             to = n_run if whole else min(n_run, taken + BLOCK - filled)
@@ -219,7 +216,7 @@ def _evaluate_runs(
             add_joint(sums.joint, lanes, light, first, of_frac.shape[1])
         if sums.draws.next.size > 0:
             draw(tables, limits, lanes, sums, light, z_now, before_all)
-        deposit(tables, limits, lanes, sums, light, added)
+        deposit(tables, limits, lanes, sums, light, z_now, added)
 
 
 def _begin(tables, target, limits, pairs, origin):

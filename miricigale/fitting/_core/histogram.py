@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from miricigale.fitting._core import rows as at
-from miricigale.fitting._core.lanes import as_type
+from miricigale.fitting._core.functions import log10
 from miricigale.fitting._core.structs import KERNEL, PART, Scales
 from miricigale.utils.compilation import njit
 
@@ -19,7 +19,6 @@ __all__ = [
     "N_BINS",
     "N_SHARE",
     "PER_DEX",
-    "add_alone",
     "add_model",
     "clear_rows",
     "make_scales",
@@ -36,29 +35,11 @@ _HALF = N_BINS // 2
 # Variance in bins: 1/12 of a bin, and 1/6 of the sharing between neighbors.
 _BINNED = 0.25
 _LOG10_E = 0.43429448190325183
-_LOG10_2 = 0.30102999566398120
-_LOG10_E2 = 0.86858896380650366  # 2 log10(e)
-_MANTISSA = np.int64(0x000FFFFFFFFFFFFF)
-_HALF_ONE = np.int64(0x3FE0000000000000)
-_ROOT_HALF = 0.70710678118654752
 #: Logarithm of a scale of 0.
 NO_SCALE = -1e9
 # Standard deviations of AGN quantities below this part of the mean total luminosity need not hold
 # their relative accuracy.
 _FAINT = 1e-3
-
-
-@njit(**PART)
-def _log10(x):
-    """log10(x) to 1e-7 for positive normal numbers (x = 0: about -308)."""
-    # x = m 2^e with m in [0.5, 1)
-    bits = as_type(x, np.int64)
-    e = np.float64(np.int32((bits >> np.int64(52)) - np.int64(1022)))
-    m = as_type((bits & _MANTISSA) | _HALF_ONE, np.float64) / _ROOT_HALF
-    t = (m - 1.0) / (m + 1.0)
-    t2 = t * t
-    s = t * (1.0 + t2 * (1.0 / 3.0 + t2 * (0.2 + t2 * (1.0 / 7.0))))
-    return (e - 0.5) * _LOG10_2 + _LOG10_E2 * s
 
 
 @njit(**PART)
@@ -84,56 +65,39 @@ def _add_share(change, low, high, weight):
     low = min(low, 1.0 - 1.0 / N_SHARE)
     high = max(high, low + 1.0 / N_SHARE)
     v = weight / (N_SHARE * (high - low))
-    x = low * N_SHARE
-    i = min(np.int64(x), N_SHARE)
-    part = x - i
-    change[i] += (1.0 - part) * v
-    change[i + 1] += part * v
-    x = min(high * N_SHARE, N_SHARE + 1.0)
-    i = min(np.int64(x), N_SHARE)
-    part = x - i
-    change[i] -= (1.0 - part) * v
-    change[i + 1] -= part * v
+    for edge, slope in ((low, v), (min(high, 1.0 + 1.0 / N_SHARE), -v)):
+        x = edge * N_SHARE
+        i = min(np.int64(x), N_SHARE)
+        change[i] += (1.0 - (x - i)) * slope
+        change[i + 1] += (x - i) * slope
 
 
 @njit(**PART)
 def add_model(tables, hist, g, k, j, s, t):
-    """Add a model of scale s and weight t."""
+    """Add a model of scale s and weight t; without AGN its k is -1."""
     of_galaxy, of_agn, of_frac = tables.of_galaxy, tables.of_agn, tables.of_frac
-    y = of_galaxy[at.SHARE_GALAXY, g] * of_agn[at.SHARE_AGN, k]
-    low, high = y * of_frac[at.EDGE_LOW, j], y * of_frac[at.EDGE_HIGH, j]
-    _add_share(hist.share, low / (1.0 + low), high / (1.0 + high), t)
+    # what is spread over the cell of f = 0 need not be as many pieces as there are AGN models
+    y, low, high, power = tables.share_mean, 0.0, tables.edge_zero, 0.0
+    if k >= 0:
+        y, low, high = of_agn[at.SHARE_AGN, k], of_frac[at.EDGE_LOW, j], of_frac[at.EDGE_HIGH, j]
+        power = of_frac[at.RATIO, j] * of_galaxy[at.DUST, g]
+    y *= of_galaxy[at.SHARE_GALAXY, g]
+    _add_share(hist.share, y * low / (1.0 + y * low), y * high / (1.0 + y * high), t)
     if s == 0.0:
         return
     n_galaxy = tables.galaxy.shape[1]
-    y = PER_DEX * (_log10(s) - hist.origin[0]) + _HALF
+    y = PER_DEX * (log10(s) - hist.origin[0]) + _HALF
     _add_bin(hist, g, y, t)
-    if of_galaxy[at.DUST, g] > 0.0:
+    mixed = of_galaxy[at.MIXED_GALAXY, g]
+    if power > 0.0:
+        mixed += power * of_agn[at.MIXED_AGN, k]
         y += of_frac[at.LOG_RATIO, j] + PER_DEX * (
             of_galaxy[at.LOG_DUST, g] + hist.origin[0] - hist.origin[1]
         )
         _add_bin(hist, n_galaxy + k, y, t)
-    power = of_frac[at.RATIO, j] * of_galaxy[at.DUST, g] * of_agn[at.MIXED_AGN, k]
-    mixed = s * (of_galaxy[at.MIXED_GALAXY, g] + power)
     if mixed > 0.0:
-        y = PER_DEX * (_log10(mixed) - hist.origin[2]) + _HALF
+        y = PER_DEX * (log10(s * mixed) - hist.origin[2]) + _HALF
         _add_bin(hist, n_galaxy + of_agn.shape[1], y, t)
-
-
-@njit(**PART)
-def add_alone(tables, hist, g, s, t):
-    """Add a model without AGN."""
-    # what is spread over the cell of f = 0 need not be as many pieces as there are AGN models
-    y = tables.edge_zero * tables.share_mean * tables.of_galaxy[at.SHARE_GALAXY, g]
-    _add_share(hist.share, 0.0, y / (1.0 + y), t)
-    if s > 0.0:
-        y = _LOG10_E * math.log(s)
-        _add_bin(hist, g, (y - hist.origin[0]) * PER_DEX + _HALF, t)
-        mixed = tables.of_galaxy[at.MIXED_GALAXY, g]
-        if mixed > 0.0:
-            y += _LOG10_E * math.log(mixed) - hist.origin[2]
-            last = tables.galaxy.shape[1] + tables.of_agn.shape[1]
-            _add_bin(hist, last, y * PER_DEX + _HALF, t)
 
 
 @njit(**KERNEL)

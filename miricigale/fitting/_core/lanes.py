@@ -7,18 +7,15 @@ s = (p + x a) / (q + 2 x X + x^2 b) and |F|^2_w - chi2 = R = (p + x a) s. Where 
 negative the best scale that is not negative is 0 and R = 0.
 """
 
-import numpy as np
-from numba.extending import intrinsic
-
 from miricigale.fitting._core import rows as at
+from miricigale.fitting._core.functions import exponential
+from miricigale.fitting._core.limits import limited_scale
 from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART
 from miricigale.utils.compilation import njit
 
 __all__ = [
-    "as_type",
     "best_mixture",
-    "exponential",
-    "exponential32",
+    "best_scale",
     "galaxy_products",
     "likelihoods",
     "place",
@@ -28,59 +25,6 @@ __all__ = [
 
 # Products of fewer than so many pairs are worked out one by one.
 _FEW = 8
-
-_LOG2E = 1.4426950408889634
-_LN2_HIGH = 0.6931471803691238
-_LN2_LOW = 1.9082149292705877e-10
-_LOG2E_32 = np.float32(1.4426950408889634)
-_LN2_HIGH_32 = np.float32(0.693359375)
-_LN2_LOW_32 = np.float32(-2.12194440e-4)
-
-
-@intrinsic
-def as_type(_, x, to):
-    """Bits of a number as a number of another type of the same size."""
-    out = to.instance_type
-
-    def generate(context, builder, signature, args):
-        return builder.bitcast(args[0], context.get_value_type(signature.return_type))
-
-    return out(x, to), generate
-
-
-@njit(**PART)
-def exponential(e):
-    """exp(e) for e from -700 to 700, to 1e-11 (after Cody & Waite)."""
-    m = np.floor(e * _LOG2E + 0.5)
-    r = e - m * _LN2_HIGH
-    r = r - m * _LN2_LOW
-    v = 1.0 / 362880.0
-    v = v * r + 1.0 / 40320.0
-    v = v * r + 1.0 / 5040.0
-    v = v * r + 1.0 / 720.0
-    v = v * r + 1.0 / 120.0
-    v = v * r + 1.0 / 24.0
-    v = v * r + 1.0 / 6.0
-    v = v * r + 0.5
-    v = v * r + 1.0
-    v = v * r + 1.0
-    return v * as_type(np.int64(np.int32(m) + 1023) << np.int64(52), np.float64)
-
-
-@njit(**PART)
-def exponential32(e):
-    """exp(e) for e from -80 to 80, in single precision."""
-    m = np.floor(e * _LOG2E_32 + np.float32(0.5))
-    r = e - m * _LN2_HIGH_32
-    r = r - m * _LN2_LOW_32
-    v = np.float32(1.9875691500e-4)
-    v = v * r + np.float32(1.3981999507e-3)
-    v = v * r + np.float32(8.3334519073e-3)
-    v = v * r + np.float32(4.1665795894e-2)
-    v = v * r + np.float32(1.6666665459e-1)
-    v = v * r + np.float32(5.0000001201e-1)
-    v = v * (r * r) + r + np.float32(1)
-    return v * as_type(np.int32((np.int32(m) + 127) << 23), np.float32)
 
 
 @njit(**PART)
@@ -113,6 +57,27 @@ def best_mixture(p, q, t, a, b, low, high):
     x = min(max(x, low), high) if rise > 0.0 else low
     num = max(p + x * a, 0.0)
     return num * num / max(q + x * (2.0 * t + x * b), 1e-300)
+
+
+@njit(**PART)
+def best_scale(limits, p, q, galaxy, agn, x, floor):
+    """
+    Best scale, R and variance of the scale of a model, p = <m, wF> and q = <m, wm>.
+
+    With limits, those whose R is below ``floor`` without them are left as they are then; ``galaxy``
+    and ``agn`` are fluxes at the redshift, the model is the sum of the first and x times the second.
+    """
+    # without light in the used bands there is no scale to speak of
+    q = q if q > NO_LIGHT else 1.0 / NO_LIGHT
+    inverse = 1.0 / q
+    s = max(p, 0.0) * inverse
+    r = max(p, 0.0) * s
+    if limits is not None and r >= floor:
+        for m in range(limits.bands.size):
+            b = limits.bands[m]
+            limits.slope[m] = (galaxy[b] + x * agn[b]) * limits.inverse[m]
+        s, r, inverse = limited_scale(p, q, limits)
+    return s, r, inverse
 
 
 @njit(**PART)

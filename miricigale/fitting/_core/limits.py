@@ -17,11 +17,9 @@ part is of order 1, and rounding changes a weight by some 1e-6.
 import math
 
 import numpy as np
-from numba import types
-from numba.extending import overload
 
 from miricigale.fitting._core import rows as at
-from miricigale.fitting._core.lanes import exponential, exponential32
+from miricigale.fitting._core.functions import exponential, polynomial
 from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART
 from miricigale.utils.compilation import njit
 
@@ -59,77 +57,26 @@ _LARGEST = 1e15
 _ROUNDING = 1e-3
 
 
-@njit(**PART)
-def _scaled_erfc(z):
-    """
-    exp(z^2) erfc(z) for z >= 0, to 2e-12.
-
-    t = 3 / (3 + z) times a polynomial in 2 t - 1, the Chebyshev interpolation of degree 16 (of
-    scipy.special.erfcx).
-    """
-    t = 3.0 / (3.0 + z)
-    x = 2.0 * t - 1.0
-    v = -7.909679668678854e-08
-    v = v * x - 1.327470214572296e-07
-    v = v * x + 8.281839527992843e-07
-    v = v * x + 1.295421122182736e-06
-    v = v * x - 5.739579827718830e-06
-    v = v * x - 9.890937187676496e-06
-    v = v * x + 3.581041826229913e-05
-    v = v * x + 9.213853674066139e-05
-    v = v * x - 1.827570762553639e-04
-    v = v * x - 1.011319029730867e-03
-    v = v * x - 4.041408907881644e-04
-    v = v * x + 8.942406098304561e-03
-    v = v * x + 3.984258723799971e-02
-    v = v * x + 1.034890876840956e-01
-    v = v * x + 1.967427856984673e-01
-    v = v * x + 2.944648177153389e-01
-    v = v * x + 3.580023023627791e-01
-    return v * t
+# exp(z^2) erfc(z) / t for z >= 0 in 2 t - 1, with t = 3 / (3 + z): the Chebyshev interpolations (of
+# scipy.special.erfcx) of degree 16, to 2e-12, and 10, to 3e-7.
+_SCALED_ERFC = polynomial(
+    (-7.909679668678854e-08, -1.327470214572296e-07, 8.281839527992843e-07, 1.295421122182736e-06,
+     -5.739579827718830e-06, -9.890937187676496e-06, 3.581041826229913e-05, 9.213853674066139e-05,
+     -1.827570762553639e-04, -1.011319029730867e-03, -4.041408907881644e-04, 8.942406098304561e-03,
+     3.984258723799971e-02, 1.034890876840956e-01, 1.967427856984673e-01, 2.944648177153389e-01,
+     3.580023023627791e-01),
+    (2.346841757e-5, 7.026003732e-5, -1.714378741e-4, -9.910109220e-4, -4.088962160e-4,
+     8.933821693e-3, 3.984341770e-2, 1.034905910e-1, 1.967427433e-1, 2.944647372e-1,
+     3.580023050e-1),
+)  # fmt: skip
 
 
 @njit(**PART)
-def _scaled_erfc32(z):
-    """Do what `_scaled_erfc` does in single precision: of degree 10, to 3e-7."""
-    t = np.float32(3) / (np.float32(3) + z)
-    x = t + t - np.float32(1)
-    v = np.float32(2.346841757e-5)
-    v = v * x + np.float32(7.026003732e-5)
-    v = v * x - np.float32(1.714378741e-4)
-    v = v * x - np.float32(9.910109220e-4)
-    v = v * x - np.float32(4.088962160e-4)
-    v = v * x + np.float32(8.933821693e-3)
-    v = v * x + np.float32(3.984341770e-2)
-    v = v * x + np.float32(1.034905910e-1)
-    v = v * x + np.float32(1.967427433e-1)
-    v = v * x + np.float32(2.944647372e-1)
-    v = v * x + np.float32(3.580023050e-1)
-    return v * t
-
-
-def _of_type(u):
-    """What depends on the precision of u: a converter of numbers."""
-
-
-def _bell_and_mills(u):
-    """exp(-u^2 / 2), Mills' ratio of the normal distribution at abs(u) over sqrt(pi / 2)."""
-
-
-@overload(_bell_and_mills, jit_options=PART)
-def _bell_and_mills_of_type(u):
-    if u == types.float32:
-        root, half, low = np.float32(_ROOT_HALF), np.float32(-0.5), np.float32(-80.0)
-        return lambda u: (
-            exponential32(max(half * u * u, low)),
-            _scaled_erfc32(abs(u) * root),
-        )
-    return lambda u: (exponential(max(-0.5 * u * u, -700.0)), _scaled_erfc(abs(u) * _ROOT_HALF))
-
-
-@overload(_of_type, jit_options=PART)
-def _of_type_(u):
-    return (lambda u: np.float32) if u == types.float32 else (lambda u: np.float64)
+def _mills(u):
+    """Mills' ratio of the normal distribution at abs(u), over sqrt(pi / 2)."""
+    real = type(u)
+    t = real(3.0) / (real(3.0) + abs(u) * real(_ROOT_HALF))
+    return _SCALED_ERFC(t + t - real(1.0)) * t
 
 
 @njit(**PART)
@@ -144,9 +91,11 @@ def _limit(u):
     factor, exponent : float
         The probability is factor exp(exponent).
     """
-    real = _of_type(u)
+    real = type(u)
     zero, one, half = real(0.0), real(1.0), real(0.5)
-    bell, mills = _bell_and_mills(u)
+    mills = _mills(u)
+    # of what is smaller than exp(-80) nothing is left beside 1
+    bell = exponential(max(-half * u * u, real(-80.0)))
     above = mills if u > zero else real(2.0) - mills * bell
     hazard = real(_ROOT_TWO_OVER_PI) * (one if u > zero else bell) / above
     first = hazard * (hazard - u)

@@ -13,12 +13,10 @@ test is done without division, and leans to keeping a pair by more than the roun
 single precision can amount to.
 """
 
-import math
-
 import numpy as np
 
 from miricigale.fitting._core import rows as at
-from miricigale.fitting._core.limits import limited_scale
+from miricigale.fitting._core.lanes import best_scale
 from miricigale.fitting._core.structs import BLOCK, KERNEL, PART
 from miricigale.utils.compilation import njit
 
@@ -148,12 +146,7 @@ def best_of_galaxy(tables, target, limits, pairs, z, g):
     best_s = 0.0
     without = -1e300
     if tables.zero_frac == 1 and q > 0.0 and tables.log_zero > -1e200:
-        best_s = max(p, 0.0) / q
-        r = max(p, 0.0) * best_s
-        if limits is not None:
-            for m in range(limits.bands.size):
-                limits.slope[m] = galaxy[limits.bands[m]] * limits.inverse[m]
-            best_s, r, _ = limited_scale(p, q, limits)
+        best_s, r, _ = best_scale(limits, p, q, galaxy, galaxy, 0.0, 0.0)
         best_value = r + tables.log_zero
     for k in range(agn_pq.shape[0]):
         if tables.of_agn[at.LOG_AGN, k] < -1e200:
@@ -177,10 +170,7 @@ def best_of_galaxy(tables, target, limits, pairs, z, g):
                 if value <= without:
                     continue
                 without = value
-                for m in range(limits.bands.size):
-                    band = limits.bands[m]
-                    limits.slope[m] = (galaxy[band] + x * agn[k, band]) * limits.inverse[m]
-                s, r, _ = limited_scale(num, den, limits)
+                s, r, _ = best_scale(limits, num, den, galaxy, agn[k], x, 0.0)
                 value = r + log_pair
             if value > best_value:
                 best_value = value
@@ -314,13 +304,7 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
     n_agn = tables.agn.shape[1]
     rows, bands, norm = pairs.rows, target.bands, target.norm
     # the largest prior a pair can have from AGN model and fraction
-    log_pair = -1e300
-    for k in range(n_agn):
-        log_pair = max(log_pair, tables.of_agn[at.LOG_AGN, k])
-    top_frac = 0.0
-    for j in range(tables.of_frac.shape[1]):
-        top_frac = max(top_frac, tables.of_frac[at.PRIOR_FRAC, j])
-    log_pair += 2.0 * math.log(max(top_frac, 1e-300))
+    log_pair = tables.log_top_agn + tables.log_top_frac
     # `_products` takes three bands at a time
     for j in range(bands.size, bands.size + 2):
         for i in range(BLOCK):

@@ -14,7 +14,7 @@ rounding changes a weight by some 1e-7.
 import numpy as np
 
 from miricigale.fitting._core import rows as at
-from miricigale.fitting._core.lanes import exponential, exponential32
+from miricigale.fitting._core.functions import exponential
 from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART
 from miricigale.utils.compilation import njit
 
@@ -138,7 +138,7 @@ def single_likelihoods(of_frac, lanes, reference, scale_error, record):
                 num = buffer[at.P + i] + c_64 * buffer[at.A + i]
                 light[_D + i] = light[_D + i] if num > 0.0 else -0.5 * buffer[at.W2 + i]
         for i in range(BLOCK):
-            t = exponential32(max(light[_D + i], _LOWEST)) * f
+            t = exponential(max(light[_D + i], _LOWEST)) * f
             light[now + i] = t
             s = max(light[_P + i] + c * light[_A + i], zero) * light[_I + i]
             # about the values at x*, so that means and squares keep their digits

@@ -6,10 +6,9 @@ import numpy as np
 
 from miricigale.fitting._core import rows as at
 from miricigale.fitting._core.histogram import add_model
-from miricigale.fitting._core.lanes import best_mixture
-from miricigale.fitting._core.limits import limited_scale
+from miricigale.fitting._core.lanes import best_mixture, best_scale
 from miricigale.fitting._core.single import pair_weight
-from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART
+from miricigale.fitting._core.structs import BLOCK, PART
 from miricigale.utils.compilation import njit
 
 __all__ = [
@@ -33,52 +32,25 @@ _HEAVY = 8.0
 
 
 @njit(**PART)
-def _model(lanes, limits, c, i, floor):
-    """
-    Scale, R and variance of the scale of the pair in lane i at one fraction, c = f / (1 - f).
-
-    With limits, those whose R is below ``floor`` without them are left as they are then.
-    """
-    buffer = lanes.buffer
+def _model(tables, limits, lanes, z, i, j, floor):
+    """Do what `best_scale` does for the pair in lane i at fraction j."""
+    buffer, c = lanes.buffer, tables.of_frac[at.RATIO, j]
     p = buffer[at.P + i] + c * buffer[at.A + i]
     q = buffer[at.Q + i] + c * (buffer[at.X2 + i] + c * buffer[at.B + i])
-    q = q if q > NO_LIGHT else 1.0 / NO_LIGHT
-    inverse = 1.0 / q
-    s = max(p, 0.0) * inverse
-    r = max(p, 0.0) * s
-    if limits is not None and r >= floor:
-        n = limits.bands.size
-        for m in range(n):
-            limits.slope[m] = lanes.limit[m, i] + c * lanes.limit[n + m, i]
-        s, r, inverse = limited_scale(p, q, limits)
-    return s, r, inverse
+    galaxy, agn = tables.galaxy[z, lanes.index[0, i]], tables.agn[z, lanes.index[1, i]]
+    return best_scale(limits, p, q, galaxy, agn, c * buffer[at.POWER + i], floor)
 
 
 @njit(**PART)
 def keep_best(sums, r, s, z, g, k, f):
     """Keep the best model; of equals the one with the lowest indices."""
     best, index = sums.best, sums.index
-    if r < best[0]:
+    # the order is that of (z, g, f, k), so that f = 0 comes before its copies
+    last = (index[0], index[1], index[3], index[2])
+    if r < best[0] or (r == best[0] and index[0] >= 0 and (z, g, f, k) >= last):
         return
-    if r == best[0] and index[0] >= 0:
-        # compare (z, g, f, k), so that f = 0 comes before its copies
-        if z != index[0]:
-            if z > index[0]:
-                return
-        elif g != index[1]:
-            if g > index[1]:
-                return
-        elif f != index[3]:
-            if f > index[3]:
-                return
-        elif k >= index[2]:
-            return
-    best[0] = r
-    best[1] = s
-    index[0] = z
-    index[1] = g
-    index[2] = k
-    index[3] = f
+    best[0], best[1] = r, s
+    index[0], index[1], index[2], index[3] = z, g, k, f
 
 
 @njit(**PART)
@@ -97,7 +69,7 @@ def find_best(tables, limits, lanes, sums, z):
         for j in range(of_frac.shape[1]):
             if not of_frac[at.PRIOR_FRAC, j] > 0.0:
                 continue
-            s, r, _ = _model(lanes, limits, of_frac[at.RATIO, j], i, best[0])
+            s, r, _ = _model(tables, limits, lanes, z, i, j, best[0])
             keep_best(sums, r, s, z, lanes.index[0, i], lanes.index[1, i], j + tables.zero_frac)
 
 
@@ -269,7 +241,7 @@ def add_joint(joint, lanes, single, first, n_ratio):
 
 
 @njit(**PART)
-def deposit(tables, limits, lanes, sums, single, added):
+def deposit(tables, limits, lanes, sums, single, z, added):
     """
     Put models in the lanes into the histograms.
 
@@ -301,7 +273,7 @@ def deposit(tables, limits, lanes, sums, single, added):
                 t = part * math.floor(carry / part)
                 carry -= t
             if t > 0.0:
-                s, _, _ = _model(lanes, limits, of_frac[at.RATIO, j], i, 0.0)
+                s, _, _ = _model(tables, limits, lanes, z, i, j, 0.0)
                 add_model(tables, sums.hist, index[0, i], index[1, i], j, s, t)
     sums.total[6] = carry
 
@@ -325,12 +297,9 @@ def take_draw(draws, d, total, z, g, k, f, s, variance):
     A sample of one that gives way to model i with the probability of its weight over the sum so
     far is a draw from all of them; it stays until the sum has grown by 1 / u, u uniform.
     """
-    draws.index[d, 0] = z
-    draws.index[d, 1] = g
-    draws.index[d, 2] = k
-    draws.index[d, 3] = f
-    draws.scale[d, 0] = s
-    draws.scale[d, 1] = variance
+    index = draws.index[d]
+    index[0], index[1], index[2], index[3] = z, g, k, f
+    draws.scale[d, 0], draws.scale[d, 1] = s, variance
     draws.next[d] = total / _uniform(draws.state)
 
 
@@ -365,6 +334,6 @@ def draw(tables, limits, lanes, sums, single, z, before):
             if f < 0:
                 break
             g, k = lanes.index[0, lane], lanes.index[1, lane]
-            s, _, variance = _model(lanes, limits, of_frac[at.RATIO, f], lane, 0.0)
+            s, _, variance = _model(tables, limits, lanes, z, lane, f, 0.0)
             now = max(total, draws.next[d])
             take_draw(draws, d, now, z, g, k, f + tables.zero_frac, s, variance)
