@@ -9,7 +9,7 @@ from numpy.polynomial import polynomial as poly
 from miricigale.instrument.figures import filter_row, table
 from miricigale.instrument.siaf import aperture, imager_columns, shape_aperture
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.random import stream
+from miricigale.utils.random import check_seed, stream
 from miricigale.utils.units import frozen_array
 
 __all__ = [
@@ -197,22 +197,22 @@ def _cut(full, shape, subarray):
     return full[:ny, :nx]
 
 
-@functools.cache
-def _flat_pixels():
-    return stream(_SEED, "flat", "pixels").standard_normal(aperture("FULL").shape, np.float32)
+@functools.lru_cache(maxsize=2)
+def _flat_pixels(seed):
+    return stream(seed, "flat", "pixels").standard_normal(aperture("FULL").shape, np.float32)
 
 
-@functools.cache
-def _full_flat(filter):
+@functools.lru_cache(maxsize=18)
+def _full_flat(filter, seed):
     from scipy.interpolate import RectBivariateSpline
 
     # pixels are the detector's own; what is smooth belongs to the filter as well
-    pixels = _flat_pixels()
+    pixels = _flat_pixels(seed)
     n = miri_detector().reference_columns
     x, y = (np.linspace(-1, 1, size) for size in pixels.shape[::-1])
     # a spline through random values 150 pixels apart
     knots = np.linspace(-1, 1, 8)
-    values = stream(_SEED, "flat", filter).standard_normal((8, 8))
+    values = stream(seed, "flat", filter).standard_normal((8, 8))
     smooth = RectBivariateSpline(knots, knots, values)(y, x)
     smooth /= smooth.std()
     flat = 1 + 0.01 * pixels + 0.004 * smooth - 0.01 * (x**2 + y[:, None] ** 2 - 2 / 3)
@@ -221,7 +221,7 @@ def _full_flat(filter):
     return frozen_array(flat, np.float32)
 
 
-def flat_field(filter, shape=None, *, subarray=None):
+def flat_field(filter, shape=None, *, subarray=None, seed=_SEED):
     """
     Relative response of the pixels: the same for the simulated detector and the reduction.
 
@@ -234,6 +234,8 @@ def flat_field(filter, shape=None, *, subarray=None):
         the full frame, which is the default.
     subarray : str, optional
         Name of the sub-array.
+    seed : int, optional
+        Seed of another realization, of another detector of the kind.
 
     Returns
     -------
@@ -243,7 +245,7 @@ def flat_field(filter, shape=None, *, subarray=None):
         drawn once, and no measurement.
     """
     filter_row(filter)
-    return _cut(_full_flat(str(filter)), shape, subarray)
+    return _cut(_full_flat(str(filter), check_seed(seed)), shape, subarray)
 
 
 @functools.cache

@@ -18,7 +18,7 @@ from miricigale.workflow.options import (
 )
 from miricigale.workflow.options import option as _option
 from miricigale.workflow.options import require as _require
-from miricigale.workflow.truths import FIELD, SETS
+from miricigale.workflow.truths import ALL, EFFECTS, FIELD, NEEDS_AGN, SETS, perturbed_values
 
 __all__ = ["StudyConfig", "load_config", "present_names", "preset_names"]
 
@@ -227,6 +227,33 @@ class PointSourceSection:
 
 
 @dataclasses.dataclass(frozen=True)
+class PerturbSection:
+    """In what the sky differs from what the analysis takes it for: one more sky for each effect."""
+
+    effects: tuple[str, ...] = _option(
+        (), "Effects; 'all' are those that the skies allow.", choices=(*EFFECTS, ALL), single=True
+    )
+    together: bool = _option(True, "Whether one more sky has all of them.")
+    of: tuple[float | str, ...] = _option(
+        (),
+        "fracAGN of the skies that are perturbed, out of [sed] frac_agn; without any the first.",
+        low=0.0,
+        high=0.99,
+        choices=(FIELD,),
+        single=True,
+    )
+    psf_width: float = _option(
+        0.02, "Relative width of the PSF, + or - by band.", low=0.0, high=0.2
+    )
+    gain: float = _option(0.01, "Relative gain.", low=-0.2, high=0.2)
+    linearity: float = _option(0.01, "Relative signal near a full well.", low=-0.1, high=0.1)
+    zero_point: float = _option(0.02, "Relative flux, + or - by band.", low=0.0, high=0.5)
+    astrometry: float = _option(
+        0.03, "Shift against the prior in arcsec, in a direction of each band.", low=0.0, high=1.0
+    )
+
+
+@dataclasses.dataclass(frozen=True)
 class ReportSection:
     """The page at the end."""
 
@@ -260,6 +287,7 @@ class StudyConfig:
     errors: ErrorSection = dataclasses.field(default_factory=ErrorSection)
     fit: FitSection = dataclasses.field(default_factory=FitSection)
     point_sources: PointSourceSection = dataclasses.field(default_factory=PointSourceSection)
+    perturb: PerturbSection = dataclasses.field(default_factory=PerturbSection)
     report: ReportSection = dataclasses.field(default_factory=ReportSection)
 
     def __post_init__(self):
@@ -283,6 +311,12 @@ class StudyConfig:
             ("fit", "sets", list(fit.sets)),
         ):
             _require(values, section, key, "must have at least one value", "none")
+        for section, key, values in (
+            ("sed", "frac_agn", list(self.sed.frac_agn)),
+            ("fit", "sets", list(fit.sets)),
+            ("perturb", "effects", list(self.perturb.effects)),
+            ("perturb", "of", list(self.perturb.of)),
+        ):
             _require(len(set(values)) == len(values), section, key, "must not repeat", values)
         first = self.sed.frac_agn[0]
         _require(first != FIELD, "sed", "frac_agn", "must begin with a number", repr(first))
@@ -290,6 +324,13 @@ class StudyConfig:
         halves = {"blue", "red"}.intersection(fit.sets)
         wanted = "may have 'blue' and 'red' with two filters and more only"
         _require(n > 1 or not halves, "fit", "sets", wanted, list(fit.sets))
+        foreign = sorted(set(self.perturb.of) - set(self.sed.frac_agn), key=str)
+        wanted = f"must be out of [sed] frac_agn, {list(self.sed.frac_agn)}"
+        _require(not foreign, "perturb", "of", wanted, foreign)
+        lacking = sorted(set(NEEDS_AGN).intersection(self.perturb.effects))
+        with_agn = any(value != 0 for value in perturbed_values(self))
+        wanted = f"must have a value above 0 for {lacking}"
+        _require(with_agn or not lacking, "perturb", "of", wanted, list(self.perturb.of))
         for key in ("columns", "units"):
             pairs = getattr(self.catalog, key)
             good = all(len(pair.split("=")) == 2 and all(pair.split("=")) for pair in pairs)

@@ -5,11 +5,15 @@ import dataclasses
 from miricigale.filters import Filter
 
 __all__ = [
+    "ALL",
+    "EFFECTS",
     "FIELD",
+    "NEEDS_AGN",
     "SETS",
     "Truth",
     "band_sets",
     "of_truth",
+    "perturbed_values",
     "reference",
     "study_truths",
     "truth_names",
@@ -19,6 +23,15 @@ __all__ = [
 SETS = ("all", "none", "blue", "red")
 #: In place of a fracAGN: AGN as in a real field.
 FIELD = "field"
+#: In what the sky may differ from what the analysis takes it for: see the section [perturb].
+EFFECTS = (
+    "psf", "psf_width", "flat", "gain", "linearity", "zero_point", "astrometry", "stars", "dust",
+    "torus", "point_agn",
+)  # fmt: skip
+#: Those that there are with AGN only.
+NEEDS_AGN = ("torus", "point_agn")
+#: All effects, or the sky that has all of them.
+ALL = "all"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,14 +45,23 @@ class Truth:
         Folder of its products and first part of its units, such as ``"agn20"``.
     frac_agn : float or "field"
         fracAGN of its sources; AGN of a realistic field (`FIELD`) are drawn from a luminosity function.
+    perturbations : tuple of (str, float or None), optional
+        Names out of `EFFECTS` and their sizes, None for those that have no size.
+    base : str, optional
+        Name of the truth without the perturbations, where there are any.
     """
 
     name: str
     frac_agn: float | str
+    perturbations: tuple = ()
+    base: str = ""
 
     def values(self):
-        """Plain values, for hashing."""
-        return dataclasses.asdict(self)
+        """Plain values, for hashing; without perturbations there is no word of any."""
+        values = {"name": self.name, "frac_agn": self.frac_agn}
+        if self.perturbations:
+            values["perturbations"] = dict(self.perturbations)
+        return values
 
 
 def study_truths(config):
@@ -47,6 +69,7 @@ def study_truths(config):
     The truths of a configuration by name.
 
     The first is the reference: of it the prior image is made and the error functions are measured.
+    Perturbed ones follow, of those of ``perturb.of`` one for each effect and one for all of them.
 
     Parameters
     ----------
@@ -57,11 +80,36 @@ def study_truths(config):
     -------
     truths : dict of str to `Truth`
     """
-    truths = (
-        Truth(value if value == FIELD else f"agn{100 * value:02g}", value)
-        for value in config.sed.frac_agn
-    )
+    truths = [Truth(_name(value), value) for value in config.sed.frac_agn]
+    for value in perturbed_values(config):
+        effects = _effects(config.perturb, value)
+        truths += [_perturbed(value, effect[0], (effect,)) for effect in effects]
+        if config.perturb.together and len(effects) > 1:
+            truths.append(_perturbed(value, ALL, effects))
     return {truth.name: truth for truth in truths}
+
+
+def perturbed_values(config):
+    """Values of fracAGN whose truths are perturbed."""
+    if not config.perturb.effects:
+        return ()
+    return config.perturb.of or config.sed.frac_agn[:1]
+
+
+def _name(frac_agn):
+    return frac_agn if frac_agn == FIELD else f"agn{100 * frac_agn:02g}"
+
+
+def _effects(options, frac_agn):
+    """Effects on a truth and their sizes, in the order of `EFFECTS`."""
+    sizes = dataclasses.asdict(options)
+    chosen = [n for n in EFFECTS if n in options.effects or ALL in options.effects]
+    return tuple((n, sizes.get(n)) for n in chosen if frac_agn != 0 or n not in NEEDS_AGN)
+
+
+def _perturbed(frac_agn, label, effects):
+    base = _name(frac_agn)
+    return Truth(f"{base}+{label}", frac_agn, effects, base)
 
 
 def truth_names(config):

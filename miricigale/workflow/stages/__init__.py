@@ -18,8 +18,8 @@ def study_stages():
         measure,
         points,
         report,
-        sources,
         rivals,
+        sources,
         truth,
     )
 

@@ -9,6 +9,7 @@ from astropy.table import QTable
 
 from miricigale import depth, detector, photometry, psf, reduction, scene
 from miricigale.instrument import background_level
+from miricigale.workflow.perturbation import Perturbation
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.exposures import (
     EXPOSURE_RESOURCES,
@@ -26,7 +27,7 @@ from miricigale.workflow.stages.exposures import (
     study_exposures,
     truth_bands,
 )
-from miricigale.workflow.truths import of_truth, reference
+from miricigale.workflow.truths import of_truth, reference, study_truths
 
 __all__ = [
     "expose_and_reduce",
@@ -55,7 +56,9 @@ def reducer_of(config, n_threads=None):
     )
 
 
-def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, tell=None, keep=None):
+def expose_and_reduce(
+    config, exposure, catalog, *, seed, perturbation=None, n_threads=None, tell=None, keep=None
+):
     """
     Take one exposure of a catalog from the scene to the calibrated image.
 
@@ -69,6 +72,8 @@ def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, tell=N
         Sources with fluxes in the exposure's filter.
     seed : int
         Seed of the detector.
+    perturbation : `~miricigale.workflow.perturbation.Perturbation`, optional
+        In what sky and detector differ from what the reduction takes them for; nothing by default.
     n_threads : int, optional
         Threads; it changes nothing in the result.
     tell : callable, optional
@@ -81,7 +86,7 @@ def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, tell=N
     rate, cal : `~astropy.nddata.CCDData`
         In DN/s and, background subtracted, in MJy/sr.
     """
-    options = config.scene
+    options, differ = config.scene, perturbation or Perturbation({}, seed)
     background = scene.Background(
         background_level(exposure.filter) * options.background_scale,
         gradient=options.background_gradient / u.arcmin,
@@ -89,19 +94,20 @@ def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, tell=N
         center=SkyCoord(config.pointing.ra * u.deg, config.pointing.dec * u.deg),
     )
     sky = scene.Scene(
-        catalog,
+        differ.catalog(catalog, exposure.filter),
         filter=exposure.filter,
         wcs=exposure.wcs,
-        psf=psf.miri_psf(exposure.filter),
+        psf=differ.psf(exposure.filter),
         background=background,
         n_threads=n_threads,
+        agn=differ.point_column(exposure.filter),
     )
-    imager = detector.Detector.miri_imager()
+    imager = detector.Detector.miri_imager(properties=differ.detector)
     if config.detector.residual:
         imager = imager.replaced(detector.Residual(config.detector.residual))
     if not config.detector.cosmic_rays:
         imager = imager.without(detector.CosmicRays)
-    image = sky.render()
+    image = differ.with_flat(sky.render(), exposure)
     if tell is not None:
         tell(imager.forecast(image, exposure, sources=sky.truth))
     collect = imager.expose if config.exposures.kind == "ramps" else imager.collect
@@ -116,6 +122,13 @@ def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, tell=N
     return rate, cal
 
 
+def _sky_plan(config, unit):
+    """The plan of an exposure, and the perturbations of its truth if it has any."""
+    values = study_truths(config)[unit.partition("/")[0]].values()
+    differ = {"perturbations": values["perturbations"]} if "perturbations" in values else {}
+    return exposure_plan(config, unit) | differ
+
+
 @stage(
     "exposures",
     "exposure",
@@ -124,7 +137,7 @@ def expose_and_reduce(config, exposure, catalog, *, seed, n_threads=None, tell=N
     sections=(*IMAGES, "run.keep_level1b"),
     resources=EXPOSURE_RESOURCES,
     units=exposure_units,
-    plan=exposure_plan,
+    plan=_sky_plan,
     memory=exposure_memory,
     kernels=("images",),
 )
@@ -148,6 +161,7 @@ def make_exposure(context, unit):
         exposure,
         QTable.read(context.path(f"{truth}/truth.ecsv")),
         seed=context.seed,
+        perturbation=Perturbation(context.plan.get("perturbations", {}), context.seed),
         n_threads=context.n_threads,
         tell=tell,
         keep=keep if config.run.keep_level1b else None,

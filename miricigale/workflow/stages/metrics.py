@@ -29,7 +29,15 @@ from miricigale.workflow.stages.conditions import (
 from miricigale.workflow.stages.exposures import band_exposures
 from miricigale.workflow.stages.sample import SampleFlags, magnitude
 
-__all__ = ["StudyTables", "as_ceers", "as_paper", "fit_metrics", "study_metrics", "truth_metrics"]
+__all__ = [
+    "StudyTables",
+    "as_ceers",
+    "as_paper",
+    "bright_isolated",
+    "fit_metrics",
+    "study_metrics",
+    "truth_metrics",
+]
 
 #: Shares of sources detected in two or more bands, by F160W limit: Yang et al. 2021.
 PAPER_DETECTED = ((26.0, 0.53), (25.0, 0.75))
@@ -131,17 +139,30 @@ def _point_metrics(table):
     )
 
 
-def _band_metrics(matched, name):
-    """Recovery of the isolated sources above 20 sigma, and pulls, in one band."""
+def _usable(matched, name):
+    """Sources that are measured in one band: in the field at all, and whole in the band."""
     selection = np.asarray(matched["selection"])
     usable = (selection & (SampleFlags.OUTSIDE_FIELD | SampleFlags.NOT_MATCHED)) == 0
+    off = photometry.ForcedFlags.EDGE | photometry.ForcedFlags.MASKED
+    return usable, (np.asarray(matched[f"{name}_flags"]) & off) == 0
+
+
+def bright_isolated(matched, name):
+    """Which sources are isolated and above 20 sigma in one band, whole and in the field."""
+    usable, whole = _usable(matched, name)
+    near = (np.asarray(matched[f"{name}_condition"]) & ConditionFlags.CROWDED) > 0
+    formal = matched[f"{name}_formal_err"].value
+    with np.errstate(invalid="ignore"):
+        return usable & whole & (matched[f"{name}_true"].value > 20 * formal) & ~near
+
+
+def _band_metrics(matched, name):
+    """Recovery of the isolated sources above 20 sigma, and pulls, in one band."""
+    usable, whole = _usable(matched, name)
     flux, true = matched[name].value, matched[f"{name}_true"].value
     formal = matched[f"{name}_formal_err"].value
-    off = photometry.ForcedFlags.EDGE | photometry.ForcedFlags.MASKED
-    whole = (np.asarray(matched[f"{name}_flags"]) & off) == 0
-    near = (np.asarray(matched[f"{name}_condition"]) & ConditionFlags.CROWDED) > 0
+    bright = bright_isolated(matched, name)
     with np.errstate(invalid="ignore"):
-        bright = usable & whole & (true > 20 * formal) & ~near
         faint = usable & whole & (true < 20 * formal) & np.isfinite(flux)
     pulls = (flux[faint] - true[faint]) / formal[faint]
     return {

@@ -13,7 +13,15 @@ from miricigale.evaluation import (
     number,
 )
 from miricigale.workflow.stage import stage
-from miricigale.workflow.stages import comparison, conditions, figures, pictures, provenance, rivals
+from miricigale.workflow.stages import (
+    comparison,
+    conditions,
+    figures,
+    perturbed,
+    pictures,
+    provenance,
+    rivals,
+)
 from miricigale.workflow.stages.exposures import EXPOSURE_RESOURCES, GRID, exposure_plan
 from miricigale.workflow.stages.figures import SET_LABELS, band_label
 from miricigale.workflow.stages.images import measured_mosaic
@@ -58,6 +66,7 @@ log = logging.getLogger(__name__)
         "fit",
         "errors",
         "point_sources",
+        "perturb",
         "report",
     ),
     resources=lambda: (*sed_resources(), *EXPOSURE_RESOURCES),
@@ -74,8 +83,10 @@ def make_report(context, _):
     mosaics = {name: context.image(f"{shown}/mosaic_{name}.fits") for name in bands}
     area = footprint_area(mosaics.values())
     metrics = study_metrics(config, tables, area)
+    # those of whose sky the analysis knows all
+    known = {name: truth for name, truth in truths.items() if not truth.perturbations}
     metrics["truths"] = {
-        name: truth_metrics(truth, every[name], bands) for name, truth in truths.items()
+        name: truth_metrics(truth, every[name], bands) for name, truth in known.items()
     }
     if metrics["n_sample"] == 0:
         log.warning("no source is left to fit: %s", metrics["n_left_out"])
@@ -101,10 +112,11 @@ def make_report(context, _):
     rivals.write_rivals(context, report, others)
     writer.errors()
     writer.fits()
-    study = comparison.study_results(config, truths, every, metrics)
+    study = comparison.study_results(config, known, {name: every[name] for name in known}, metrics)
     study.extra.update(rivals.source_extractor_numbers(others, context.seed))
     comparison.write_truths(context, report, study, metrics, FIT_COLUMNS)
     comparison.write_comparison(context, report, study, metrics["as_paper"])
+    perturbed.write_perturbed(context, report, truths, every)
     writer.inputs()
     provenance.write_origin(report, config, model, [tables.truth.meta, tables.matched.meta])
     context.save("report/index.html", lambda path: report.write(path))

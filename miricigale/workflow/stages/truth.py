@@ -5,9 +5,11 @@ from astropy.table import QTable, hstack
 
 from miricigale import fitting, sed
 from miricigale.evaluation import AGNPopulation, agn_fraction, main_sequence_dust
+from miricigale.refdata.locate import fingerprint
 from miricigale.utils.exceptions import ConfigError, DataError
 from miricigale.utils.meta import provenance
 from miricigale.utils.random import stream
+from miricigale.workflow.perturbation import perturbed_model, perturbed_parameters, point_columns
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.inputs import catalog_bands, sed_resources
 from miricigale.workflow.stages.stars import star_fluxes
@@ -108,6 +110,15 @@ def add_field_agn(table, model, band, seed):
         table[name] = drawn[name]
 
 
+def _truth_plan(config, unit):
+    """The truth, and the libraries of its models where they are others than those of the fits."""
+    values = study_truths(config)[unit].values()
+    model = perturbed_model(values.get("perturbations", {}), agn=values["frac_agn"] != 0)
+    if model is None:
+        return values
+    return values | {"libraries": {name: fingerprint(name) for name in model.resources}}
+
+
 @stage(
     "truth",
     "model fluxes",
@@ -123,12 +134,13 @@ def add_field_agn(table, model, band, seed):
     ),
     resources=sed_resources,
     units=truth_names,
-    plan=lambda config, unit: study_truths(config)[unit].values(),
+    plan=_truth_plan,
     kernels=("fit",),
 )
 def make_truth(context, name):
     """Stage 3: the best-fit SED (and its AGN) of each source through every band."""
     config, frac_agn = context.config, context.plan["frac_agn"]
+    effects = context.plan.get("perturbations", {})
     catalog = QTable.read(context.path("catalog.ecsv"))
     best = fitting.FitResults.read(context.path("input_seds.fits")).to_table()
     parameters = galaxy_parameters(config, catalog, best, seed=context.seed)
@@ -140,6 +152,13 @@ def make_truth(context, name):
         add_field_agn(parameters, model, bands[0], context.seed)
     elif frac_agn > 0:
         add_agn(parameters, frac_agn, context.seed)
+    other = perturbed_model(effects, agn=model.has_agn)
+    if other is not None:
+        prior = config.highres.filter
+        parameters = perturbed_parameters(
+            effects, parameters, (model, other), prior, seed=context.seed
+        )
+        model = other
     light = model.fluxes(parameters, bands)
     lacking = (light["flags"] & int(sed.ModelFlags.NOT_IN_LIBRARY)) > 0
     if np.any(lacking):
@@ -164,6 +183,10 @@ def make_truth(context, name):
         ],
         metadata_conflicts="silent",
     )
+    if "point_agn" in effects:
+        for column, share in point_columns(model, parameters, config.exposures.filters).items():
+            # the light of a star is not that of the model
+            truth[column] = np.where(star, 0.0, share)
     if "frac_agn" not in truth.colnames:
         truth["frac_agn"] = np.zeros(len(truth))
     citations = [*catalog.meta.get("citations", ()), *model.meta["citations"]]

@@ -1,0 +1,252 @@
+"""In what the sky of a study differs from what its analysis takes it for."""
+
+import dataclasses
+import functools
+
+import astropy.units as u
+import numpy as np
+
+from miricigale import psf, sed
+from miricigale.instrument import flat_field, miri_detector
+from miricigale.sed import components
+from miricigale.utils.random import stream
+
+__all__ = ["Perturbation", "perturbed_model", "perturbed_parameters", "point_columns"]
+
+#: Mass fraction and time since the beginning (Gyr) of recent bursts, ends of their ranges.
+BURST = {"f_burst": (0.001, 0.05), "age_burst": (0.02, 0.2)}
+#: Ranges of the parameters of Draine & Li 2007.
+DUST = {"u_min": (1.0, 20.0), "gamma": (0.005, 0.05), "q_pah": (1.1, 4.58)}
+#: What is neither drawn nor fitted of the torus: another opening angle (deg) and extent.
+TORUS = {"opening_angle": 50.0, "radius_ratio": 10.0}
+
+
+@dataclasses.dataclass(frozen=True)
+class Perturbation:
+    """
+    Sky and detector of a truth where they differ from what the reduction takes them for.
+
+    Parameters
+    ----------
+    effects : dict of str to float or None
+        Size by name, out of `~miricigale.workflow.truths.EFFECTS`; those that concern the models
+        of the sources change nothing here.
+    seed : int
+        Seed of what is drawn.
+    """
+
+    effects: dict
+    seed: int
+
+    def _random(self, name, *key):
+        return stream(self.seed, "perturb", name, *key)
+
+    def _signed(self, name, filter):
+        """Size of an effect with a random sign in each band; 0 without it."""
+        return self.effects.get(name, 0.0) * self._random(name, filter).choice([-1.0, 1.0])
+
+    def psf(self, filter):
+        """
+        The PSF of a band: of a telescope with another wavefront, wider or narrower.
+
+        Parameters
+        ----------
+        filter : str
+            Name of the band.
+
+        Returns
+        -------
+        psf : `~miricigale.psf.InstrumentPSF`
+        """
+        options = {}
+        if "psf" in self.effects:
+            # the same telescope in all bands
+            options["seed"] = int(self._random("psf").integers(2, 2**31))
+        own = psf.miri_psf(filter, **options)
+        factor = 1.0 + self._signed("psf_width", filter)
+        if factor == 1.0:
+            return own
+        # its values at offsets that are smaller by the factor, with the same light
+        cell = own.pixel_scale / own.n_cells
+        data = psf.psf_image(own, pixel_scale=cell / factor, shape=own.data.shape)
+        return own.replaced(data * own.n_cells**2, meta={"width_factor": factor})
+
+    def catalog(self, catalog, filter):
+        """
+        The sources as a band shows them: fluxes by its zero point, shifted by its astrometry.
+
+        Parameters
+        ----------
+        catalog : `~astropy.table.QTable`
+            With ``sky`` and the column ``filter``; it is not changed.
+        filter : str
+            Name of the band.
+
+        Returns
+        -------
+        catalog : `~astropy.table.QTable`
+        """
+        if not {"zero_point", "astrometry"}.intersection(self.effects):
+            return catalog
+        catalog = catalog.copy()
+        catalog[filter] = catalog[filter] * (1.0 + self._signed("zero_point", filter))
+        shift = self.effects.get("astrometry", 0.0) * u.arcsec
+        angle = self._random("astrometry", filter).uniform(0, 360) * u.deg
+        catalog["sky"] = catalog["sky"].directional_offset_by(angle, shift)
+        return catalog
+
+    def point_column(self, filter):
+        """Column of a catalog with the share of the light that is in a point, or None."""
+        return point_column(filter) if "point_agn" in self.effects else None
+
+    @functools.cached_property
+    def detector(self):
+        """`~miricigale.instrument.DetectorProperties` with another gain and non-linearity."""
+        known = miri_detector()
+        own = known.replace(gain=known.gain * (1.0 + self.effects.get("gain", 0.0)))
+        if "linearity" in self.effects:
+            # at the full well the linear signal is other by the size, at lower ones in proportion
+            terms = np.zeros(max(3, len(known.nonlinearity)))
+            terms[: len(known.nonlinearity)] = known.nonlinearity
+            terms[2] += self.effects["linearity"] / known.saturation_dn
+            own = own.replace(nonlinearity=tuple(terms))
+        return own
+
+    def with_flat(self, image, exposure):
+        """
+        Light that makes of the known flat field another one, of another detector of the kind.
+
+        Parameters
+        ----------
+        image : `~astropy.nddata.CCDData`
+            The noiseless sky; changed in place.
+        exposure : `~miricigale.instrument.Exposure`
+            How it is exposed.
+
+        Returns
+        -------
+        image : `~astropy.nddata.CCDData`
+        """
+        if "flat" in self.effects:
+            seed = int(self._random("flat").integers(2**31))
+            flat = functools.partial(flat_field, exposure.filter, subarray=exposure.subarray)
+            image.data *= flat(seed=seed) / flat()
+        return image
+
+
+def point_column(filter):
+    """Name of the column with the share of a band's light that is in a point."""
+    return f"{filter}_point"
+
+
+def perturbed_model(effects, *, agn):
+    """
+    The model of the sources of a truth where it is another than that of the fits.
+
+    With ``"stars"`` the history ends in a burst, and gas shines; with ``"dust"`` dust is that of
+    Draine & Li 2007 with its own parameters; with ``"torus"`` the torus is our own parametric one,
+    of another opening angle and extent.
+
+    Parameters
+    ----------
+    effects : iterable of str
+        Names out of `~miricigale.workflow.truths.EFFECTS`.
+    agn : bool
+        Whether there is an AGN.
+
+    Returns
+    -------
+    model : `~miricigale.sed.SEDModel` or None
+        None where it is the model of the fits.
+    """
+    others = {}
+    if "stars" in effects:
+        others |= {"sfh": components.DelayedSFH(), "nebular": components.Nebular()}
+    if "dust" in effects:
+        others["dust"] = components.DraineLi2007()
+    if "torus" in effects and agn:
+        others["agn"] = components.ParametricTorus(**TORUS)
+    if not others:
+        return None
+    known = {part.role: part for part in sed.SEDModel.yang2021(agn=agn).components}
+    return sed.SEDModel((known | others).values())
+
+
+def perturbed_parameters(effects, table, models, prior, *, seed):
+    """
+    Parameters of sources for the model of `perturbed_model`.
+
+    Bursts and dust are drawn for each source from its own random stream, evenly in the logarithm
+    of `BURST` and `DUST`; masses are such that the galaxies, without AGN, are as bright in the prior's
+    band as before, and the dust's luminosity follows by energy balance.
+
+    Parameters
+    ----------
+    effects : iterable of str
+        Names out of `~miricigale.workflow.truths.EFFECTS`.
+    table : `~astropy.table.QTable`
+        With ``id`` and the parameters of the model of the fits; it is not changed.
+    models : tuple of `~miricigale.sed.SEDModel`
+        That of the fits, and that of the truth.
+    prior : str
+        The prior's band.
+    seed : int
+        Seed of the draws.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+    """
+    changed = table.copy()
+    for effect, ranges in (("stars", BURST), ("dust", DUST)):
+        if effect in effects:
+            drawn = [
+                {
+                    name: np.exp(rng.uniform(*np.log(ends))) for name, ends in ranges.items()
+                }
+                for rng in (stream(seed, "perturb", effect, str(key)) for key in table["id"])
+            ]  # fmt: skip
+            for name in ranges:
+                changed[name] = np.array([row[name] for row in drawn])
+    known, own = (
+        galaxy_light(model, parameters, [prior])[prior].value
+        for model, parameters in zip(models, (table, changed), strict=True)
+    )
+    usable = np.isfinite(known) & np.isfinite(own) & (own > 0)
+    changed["mass"] = changed["mass"] * np.where(usable, known / np.where(usable, own, 1.0), 1.0)
+    return changed
+
+
+def galaxy_light(model, parameters, bands):
+    """Fluxes of a model without its AGN; as `~miricigale.sed.SEDModel.fluxes`."""
+    alone = parameters.copy()
+    if model.has_agn:
+        alone["frac_agn"] = np.zeros(len(alone))
+    return model.fluxes(alone, bands)
+
+
+def point_columns(model, parameters, bands):
+    """
+    Shares of the light that the AGN have, where they are points at the centers of their galaxies.
+
+    Parameters
+    ----------
+    model : `~miricigale.sed.SEDModel`
+        With AGN.
+    parameters : `~astropy.table.QTable`
+        Its parameters.
+    bands : iterable of str
+        Names of the bands.
+
+    Returns
+    -------
+    columns : dict of str to `~numpy.ndarray`
+        By `point_column`, 0 to 1; 0 where the source has no model.
+    """
+    alone, both = galaxy_light(model, parameters, bands), model.fluxes(parameters, bands)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shares = {band: 1.0 - alone[band].value / both[band].value for band in bands}
+    return {
+        point_column(band): np.clip(np.nan_to_num(share), 0.0, 1.0)
+        for band, share in shares.items()
+    }

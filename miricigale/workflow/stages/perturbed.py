@@ -1,0 +1,186 @@
+"""What it costs that the analysis does not know the sky: a section of the report."""
+
+import numpy as np
+from astropy.table import Table
+
+from miricigale.evaluation import Missing, bootstrap, sigma_mad
+from miricigale.filters import Filter
+from miricigale.workflow.stages.figures import band_label
+from miricigale.workflow.stages.metrics import bright_isolated
+
+__all__ = ["perturbation_costs", "write_perturbed"]
+
+#: Redshifts beyond it, in (1 + z), are outliers.
+OUTLIER = 0.15
+#: Samples drawn for an error.
+N_DRAWS = 1000
+
+_LABELS = {
+    "": "none",
+    "psf": "PSF, another wavefront",
+    "psf_width": "PSF, width",
+    "flat": "flat field",
+    "gain": "gain",
+    "linearity": "linearity",
+    "zero_point": "zero point",
+    "astrometry": "astrometry",
+    "stars": "stars: bursts and gas",
+    "dust": "dust: Draine & Li",
+    "torus": "another torus",
+    "point_agn": "AGN as a point",
+    "all": "all together",
+}
+
+
+def _median(values):
+    return np.median(values, axis=-1)
+
+
+def _scatter(values):
+    return sigma_mad(values, axis=-1)
+
+
+def _outliers(values):
+    return np.mean(np.abs(values) > OUTLIER, axis=-1)
+
+
+def _quantities(bands):
+    """Columns of the table: name to the kind of the values, the band, and their statistic."""
+    by_wave = sorted(bands, key=lambda name: Filter.from_name(name).pivot)
+    ends = dict.fromkeys((by_wave[0], by_wave[-1]))
+    return {
+        **{
+            f"{band} {name}": ("flux", band, statistic)
+            for band in ends
+            for name, statistic in (("offset", _median), ("scatter", _scatter))
+        },
+        "photo-z sigma_MAD": ("redshift", None, _scatter),
+        "photo-z outliers": ("redshift", None, _outliers),
+        "fracAGN offset": ("frac_agn", None, _median),
+        "fracAGN scatter": ("frac_agn", None, _scatter),
+    }
+
+
+def _errors(tables, kind, band):
+    """
+    Ids of sources, and measured minus true values; ``tables`` are ``StudyTables`` of a truth.
+
+    Relative to the true ones for the fluxes, of bright isolated sources; of redshifts relative to
+    1 + z.
+    """
+    if kind == "flux":
+        table = tables.matched[bright_isolated(tables.matched, band)]
+        true, found = table[f"{band}_true"].value, table[band].value
+        scale = true
+    else:
+        table, results = tables.sample, tables.fits["all"]
+        true, found = np.asarray(table[kind]), np.asarray(results[f"{kind}_mean"])
+        scale = 1 + true if kind == "redshift" else 1.0
+    errors = (found - true) / scale
+    good = np.isfinite(errors)
+    return np.asarray(table["id"])[good], errors[good]
+
+
+def perturbation_costs(truths, every, bands, *, seed):
+    """
+    Accuracy of perturbed truths, and its change against those without perturbations.
+
+    Parameters
+    ----------
+    truths : dict of str to `~miricigale.workflow.truths.Truth`
+        All truths.
+    every : dict of str to `~miricigale.workflow.stages.metrics.StudyTables`
+        Their tables.
+    bands : iterable of str
+        MIRI bands; fluxes are those of the shortest and the longest.
+    seed : int
+        Seed of the bootstrap.
+
+    Returns
+    -------
+    costs : `~astropy.table.Table`
+        A row for each truth and quantity: ``truth`` (without perturbations), ``perturbation`` (empty
+        for that truth itself), ``quantity``, ``n`` sources, ``value``, ``value_err``, ``change`` and
+        ``change_err``. Values are of the sources that both truths have, and the errors of the changes of
+        draws of these sources, so that what both skies share (noise, blends) does not count.
+    """
+    rows = []
+    perturbed = [truth for truth in truths.values() if truth.perturbations]
+    for base in dict.fromkeys(truth.base for truth in perturbed):
+        for name, (kind, band, statistic) in _quantities(bands).items():
+            ids, known = _errors(every[base], kind, band)
+            plain = bootstrap(statistic, known, seed=seed, n_draws=N_DRAWS)
+            rows.append((base, "", name, plain.n, plain.value, plain.error, np.nan, np.nan))
+            for truth in perturbed:
+                if truth.base == base:
+                    own_ids, own = _errors(every[truth.name], kind, band)
+                    _, first, second = np.intersect1d(ids, own_ids, return_indices=True)
+                    pairs = known[first], own[second]
+                    rows.append((*_named(truth), name, *_cost(statistic, pairs, seed)))
+    names = ["truth", "perturbation", "quantity", "n", "value", "value_err", "change", "change_err"]
+    return Table(rows=rows, names=names) if rows else Table(names=names)
+
+
+def _named(truth):
+    return truth.base, truth.name.removeprefix(f"{truth.base}+")
+
+
+def _cost(statistic, pairs, seed):
+    """Number of pairs, statistic of the second, its error, its change and the change's error."""
+    value = bootstrap(statistic, pairs[1], seed=seed, n_draws=N_DRAWS)
+    change = bootstrap(
+        lambda known, own: statistic(own) - statistic(known), *pairs, seed=seed, n_draws=N_DRAWS
+    )
+    return value.n, value.value, value.error, change.value, change.error
+
+
+def write_perturbed(context, report, truths, every):
+    """The section with one table; without perturbed truths there is none."""
+    config = context.config
+    table = perturbation_costs(truths, every, config.exposures.filters, seed=context.seed)
+    if len(table) == 0:
+        return
+    context.save_table("report/perturbations.ecsv", table)
+    options = config.perturb
+    report.section(
+        "What the analysis does not know",
+        "Skies that differ from what reduction, photometry and fits take them for, one effect at a time "
+        f"and together: a PSF of another wavefront, or {100 * options.psf_width:g} % wider or narrower; "
+        f"another flat field; a gain other by {100 * options.gain:g} % (which the conversion to fluxes "
+        f"does not know either); a signal other by {100 * options.linearity:g} % at the full well; fluxes "
+        f"{100 * options.zero_point:g} % higher or lower, and positions {1000 * options.astrometry:g} mas "
+        "off, by band; and sources of other models. Kernels, error functions, templates and grids "
+        "stay as they are.",
+    )
+    quantities = list(dict.fromkeys(table["quantity"]))
+    cells = {(row["truth"], row["perturbation"], row["quantity"]): row for row in table}
+    report.table(
+        [
+            (base, _LABELS[name], *(_cell(cells[base, name, q]) for q in quantities))
+            for base, name in dict.fromkeys((row["truth"], row["perturbation"]) for row in table)
+        ],
+        header=("sky", "perturbation", *(_header(quantity) for quantity in quantities)),
+        caption="Fluxes of bright isolated sources (above 20 sigma), redshifts and AGN fractions of "
+        "the fits with all MIRI bands. In brackets the change against the same sources without the perturbation, "
+        "and its error by bootstrap of these sources",
+        text=2,
+    )
+
+
+def _header(quantity):
+    first, _, rest = quantity.partition(" ")
+    return f"{band_label(first)} {rest}" if "." in first else quantity
+
+
+def _cell(row):
+    """Text of a value and its change; per cent but for scatter of redshifts and fracAGN."""
+    if not np.isfinite(row["value"]):
+        return Missing("no source")
+    share = "." in row["quantity"] or row["quantity"].endswith("outliers")
+    scale, digits, unit = (100, 1, " %") if share else (1, 4, "")
+    signed = "+" if row["quantity"].endswith("offset") else ""
+    text = f"{scale * row['value']:{signed}.{digits}f}"
+    if not row["perturbation"]:
+        return f"{text} ± {scale * row['value_err']:.{digits}f}{unit}"
+    change = f"{scale * row['change']:+.{digits}f} ± {scale * row['change_err']:.{digits}f}"
+    return f"{text} ({change}){unit}"

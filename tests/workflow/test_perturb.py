@@ -1,0 +1,318 @@
+"""Skies that differ from what the analysis takes them for: each in what it says, and in nothing else."""
+
+from types import SimpleNamespace
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData
+from astropy.table import QTable
+
+from miricigale.evaluation import Report
+from miricigale.instrument import Exposure, flat_field, miri_detector
+from miricigale.psf import miri_psf
+from miricigale.scene import Scene
+from miricigale.sed import SEDModel
+from miricigale.utils.exceptions import ConfigError
+from miricigale.workflow import Context
+from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.perturbation import (
+    Perturbation,
+    perturbed_model,
+    perturbed_parameters,
+    point_columns,
+)
+from miricigale.workflow.stages import study_stages
+from miricigale.workflow.stages.perturbed import perturbation_costs, write_perturbed
+from miricigale.workflow.truths import EFFECTS, study_truths
+
+STAGES = {stage.name: stage for stage in study_stages()}
+SEED, BAND, PRIOR = 7, "miri.f770w", "wfc3.f160w"
+BANDS = [BAND, "miri.f1500w"]
+
+
+def config_of(effects="all", **perturb):
+    return StudyConfig.from_dict(
+        {
+            "exposures": {"filters": BANDS},
+            "sed": {"frac_agn": [0.0, 0.4]},
+            "perturb": {"effects": effects, **perturb},
+        }
+    )
+
+
+def sources():
+    table = QTable({"id": [1, 2, 3], "redshift": [0.5, 1.0, 2.0], "profile": ["sersic"] * 3})
+    table["sky"] = SkyCoord([53.134, 53.136, 53.133], [-27.834, -27.835, -27.836], unit="deg")
+    table["half_light_radius"] = [0.5, 0.3, 0.4] * u.arcsec
+    table["sersic_index"], table["axis_ratio"] = [1.0, 2.0, 4.0], [0.8, 0.6, 1.0]
+    table["position_angle"] = [0.0, 30.0, 60.0] * u.deg
+    for k, name in enumerate(BANDS, start=1):
+        table[name] = k * np.array([10.0, 20.0, 30.0]) * u.uJy
+    return table
+
+
+def test_each_effect_is_one_more_truth():
+    truths = study_truths(config_of(of=[0.0, 0.4]))
+    without_agn = [name for name in EFFECTS if name not in ("torus", "point_agn")]
+    assert list(truths) == [
+        "agn00",
+        "agn40",
+        *(f"agn00+{name}" for name in (*without_agn, "all")),
+        *(f"agn40+{name}" for name in (*EFFECTS, "all")),
+    ]
+    assert truths["agn40+zero_point"].values() == {
+        "name": "agn40+zero_point", "frac_agn": 0.4, "perturbations": {"zero_point": 0.02}
+    }  # fmt: skip
+    assert list(truths["agn40+all"].values()["perturbations"]) == list(EFFECTS)
+    # of the reference unless it is said; alone it is all that there is
+    assert list(study_truths(config_of("gain"))) == ["agn00", "agn40", "agn00+gain"]
+    assert list(study_truths(config_of(["psf", "gain"], together=False)))[2:] == [
+        "agn00+psf", "agn00+gain"
+    ]  # fmt: skip
+    assert list(study_truths(config_of([]))) == ["agn00", "agn40"]
+
+
+@pytest.mark.parametrize(
+    ("perturb", "message"),
+    [
+        ({"effects": ["smear"]}, "must be one of"),
+        ({"effects": ["psf", "psf"]}, "must not repeat"),
+        ({"of": [0.2]}, r"must be out of \[sed\] frac_agn"),
+        ({"effects": ["torus"]}, r"must have a value above 0 for \['torus'\]"),
+        ({"psf_width": 0.5}, "must be between 0.0 and 0.2"),
+    ],
+)
+def test_perturbations_that_cannot_be(perturb, message):
+    with pytest.raises(ConfigError, match=message):
+        config_of(**perturb)
+
+
+def test_no_stage_of_the_analysis_knows_of_them():
+    """Stages of truth and sky have them in their plans, those of a perturbed truth only."""
+    plain, config = config_of([]), config_of(of=[0.0, 0.4])
+    for name, stage in STAGES.items():
+        assert ("perturb" in stage.sections) == (name == "report")
+        assert not [key for key in stage.sections if key.startswith("perturb.")]
+        for unit in stage.unit_names(plain):
+            if stage.plan:
+                assert stage.plan(config, unit) == stage.plan(plain, unit)
+    for unit in STAGES["exposures"].unit_names(config):
+        seen = STAGES["exposures"].plan(config, unit).get("perturbations", {})
+        assert seen == dict(study_truths(config)[unit.partition("/")[0]].perturbations)
+    # sizes count where they act
+    other = config_of(of=[0.0, 0.4], zero_point=0.03)
+    changed = {
+        unit
+        for unit in STAGES["exposures"].unit_names(config)
+        if STAGES["exposures"].plan(config, unit) != STAGES["exposures"].plan(other, unit)
+    }
+    assert {unit.partition("/")[0] for unit in changed} == {
+        "agn00+zero_point", "agn00+all", "agn40+zero_point", "agn40+all"
+    }  # fmt: skip
+    assert STAGES["kernels"].plan(other, BAND) == STAGES["kernels"].plan(plain, BAND)
+
+
+def test_zero_point_scales_the_fluxes_of_one_band():
+    table = sources()
+    signs = set()
+    for seed in range(8):
+        changed = Perturbation({"zero_point": 0.02}, seed).catalog(table, BAND)
+        ratio = (changed[BAND] / table[BAND]).value
+        np.testing.assert_allclose(np.abs(ratio - 1), 0.02, rtol=1e-9)
+        assert np.ptp(ratio) < 1e-12
+        signs.add(ratio[0] > 1)
+        for name in set(table.colnames) - {BAND, "sky"}:
+            assert np.all(changed[name] == table[name])
+        assert np.all(changed["sky"].separation(table["sky"]) < 1e-9 * u.arcsec)
+    assert signs == {True, False}
+
+
+def test_astrometry_shifts_a_band_as_a_whole():
+    table = sources()
+    shift = Perturbation({"astrometry": 0.03}, SEED)
+    changed = {name: shift.catalog(table, name) for name in BANDS}
+    angles = {}
+    for name, moved in changed.items():
+        np.testing.assert_allclose(
+            moved["sky"].separation(table["sky"]).to_value(u.mas), 30, rtol=1e-4
+        )
+        angle = table["sky"].position_angle(moved["sky"]).to_value(u.deg)
+        assert np.ptp(angle) < 0.1
+        angles[name] = angle[0]
+        assert np.all(moved[name] == table[name])
+    assert abs(angles[BANDS[0]] - angles[BANDS[1]]) > 1
+
+
+def test_nothing_changes_without_effects():
+    nothing, table = Perturbation({}, SEED), sources()
+    assert nothing.catalog(table, BAND) is table
+    np.testing.assert_array_equal(nothing.psf(BAND).data, miri_psf(BAND).data)
+    assert nothing.detector == miri_detector()
+    assert nothing.point_column(BAND) is None
+    image = CCDData(np.ones((1024, 1032)), unit="MJy/sr")
+    exposure = Exposure(BAND, pointing=table["sky"][0], roll=0 * u.deg, n_groups=10)
+    assert np.all(nothing.with_flat(image, exposure).data == 1)
+
+
+def test_psf_of_another_telescope_and_of_another_width():
+    own = miri_psf(BAND)
+    other = Perturbation({"psf": None}, SEED).psf(BAND)
+    assert np.abs(other.data - own.data).max() > 0.005 * own.data.max()
+    assert other.fwhm.value == pytest.approx(own.fwhm.value, rel=0.02)
+    assert other.enclosed == pytest.approx(own.enclosed, rel=2e-3)
+    factors = set()
+    for seed in range(8):
+        wide = Perturbation({"psf_width": 0.02}, seed).psf(BAND)
+        factor = wide.meta["width_factor"]
+        assert abs(factor - 1) == pytest.approx(0.02)
+        assert wide.fwhm.value == pytest.approx(factor * own.fwhm.value, rel=1e-3)
+        assert wide.enclosed == pytest.approx(own.enclosed, rel=2e-3)
+        factors.add(factor)
+    assert len(factors) == 2
+
+
+def test_gain_and_linearity_are_those_of_the_detector_only():
+    known = miri_detector()
+    assert Perturbation({"gain": 0.01}, SEED).detector == known.replace(gain=1.01 * known.gain)
+    other = Perturbation({"linearity": 0.01}, SEED).detector
+    full = known.saturation_dn
+    for share in (0.25, 1.0):
+        difference = other.linearize(share * full) - known.linearize(share * full)
+        assert difference == pytest.approx(0.01 * share**2 * full)
+    assert other.replace(nonlinearity=known.nonlinearity) == known
+
+
+def test_flat_is_that_of_another_detector():
+    exposure = Exposure(BAND, pointing=sources()["sky"][0], roll=0 * u.deg, n_groups=10)
+    image = CCDData(np.full(exposure.shape, 5.0), unit="MJy/sr")
+    known = flat_field(BAND)
+    seen = Perturbation({"flat": None}, SEED).with_flat(image, exposure).data * known / 5
+    # pixels by 1 %, independent of those that the reduction divides by
+    inner = np.s_[:, 4:-4]
+    pixels = [np.diff(flat[inner]).ravel() for flat in (seen, known)]
+    assert np.std(pixels[0]) == pytest.approx(np.std(pixels[1]), rel=0.02)
+    assert abs(np.corrcoef(*pixels)[0, 1]) < 0.01
+    assert seen[inner].mean() == pytest.approx(1, abs=1e-5)
+    assert flat_field(BAND) is known or np.array_equal(flat_field(BAND), known)
+
+
+def parameters():
+    rng = np.random.default_rng(1)
+    n = 20
+    table = QTable({"id": np.arange(n), "redshift": rng.uniform(0.3, 2.5, n)})
+    table["mass"] = 10 ** rng.uniform(10, 11, n)
+    table["tau"], table["age"], table["ebv"], table["alpha"] = 1.0, 2.0, 0.3, 2.0
+    table["frac_agn"], table["tau97"], table["inclination"] = 0.4, 5.0, 70.0
+    return table
+
+
+@pytest.mark.parametrize("effect", ["stars", "dust", "torus"])
+def test_models_of_sources_change_in_one_part(effect):
+    known, table = SEDModel.yang2021(), parameters()
+    assert perturbed_model(["psf", "point_agn"], agn=True) is None
+    other = perturbed_model([effect], agn=True)
+    changed = perturbed_parameters([effect], table, (known, other), PRIOR, seed=SEED)
+    bands = [PRIOR, "acs.f435w", "miri.f770w", "miri.f2100w"]
+    plain, own = (model.fluxes(rows, bands) for model, rows in ((known, table), (other, changed)))
+    ratio = {name: (own[name] / plain[name]).value for name in bands}
+    # the prior's light is that of before; the AGN takes little part in it
+    np.testing.assert_allclose(ratio[PRIOR], 1, atol=0.02)
+    np.testing.assert_allclose(own["frac_agn_dust"], 0.4)
+    power = (own["dust_luminosity"] / plain["dust_luminosity"]).value
+    if effect == "stars":
+        assert np.std(ratio["acs.f435w"]) > 0.02
+        assert np.all((power > 0.5) & (power < 5))
+    else:
+        np.testing.assert_allclose(ratio["acs.f435w"], 1, atol=0.02)
+        # dust of near galaxies shows in the prior too
+        np.testing.assert_allclose(power, 1, rtol=0.01)
+        assert np.abs(ratio["miri.f2100w"] - 1).max() > 0.05
+    # drawn for each source, by its id
+    part = perturbed_parameters([effect], table[5:], (known, other), PRIOR, seed=SEED)
+    for name in part.colnames:
+        np.testing.assert_allclose(part[name], changed[name][5:], rtol=1e-9)
+
+
+def test_an_agn_as_a_point_keeps_the_light():
+    model, table = SEDModel.yang2021(), parameters()[:3]
+    shares = point_columns(model, table, BANDS)
+    alone = table.copy()
+    alone["frac_agn"] = 0.0
+    for band in BANDS:
+        galaxy, both = (model.fluxes(rows, [band])[band].value for rows in (alone, table))
+        np.testing.assert_allclose((1 - shares[f"{band}_point"]) * both, galaxy, rtol=1e-9)
+    assert np.all(shares[f"{BAND}_point"] > 0.05)
+    catalog = sources()
+    for name, share in shares.items():
+        catalog[name] = share
+    exposure = Exposure(BAND, pointing=catalog["sky"][0], roll=0 * u.deg, n_groups=10)
+    images, truths = {}, {}
+    for effects in ({}, {"point_agn": None}):
+        differ = Perturbation(effects, SEED)
+        sky = Scene(
+            catalog,
+            filter=BAND,
+            wcs=exposure.wcs,
+            psf=miri_psf(BAND, fov=8 * u.arcsec),
+            agn=differ.point_column(BAND),
+        )
+        images[bool(effects)], truths[bool(effects)] = sky.render().data, sky.truth
+    np.testing.assert_array_equal(truths[True]["id"], catalog["id"])
+    np.testing.assert_allclose(truths[True]["flux_total"], catalog[BAND])
+    np.testing.assert_allclose(
+        truths[True]["flux_in_image"], truths[False]["flux_in_image"], rtol=0.02
+    )
+    assert images[True].sum() == pytest.approx(images[False].sum(), rel=0.01)
+    assert images[True].max() > 1.2 * images[False].max()
+
+
+def study_tables(seed, *, flux=1.0, shift=0.0):
+    """Tables of a truth as `StudyTables` has them: 200 sources with the noise of a seed."""
+    rng, n = np.random.default_rng(seed), 200
+    true, noise = rng.uniform(10, 100, n), rng.normal(size=(2, n))
+    matched = QTable({"id": np.arange(n), "selection": np.zeros(n, int)})
+    for band in BANDS:
+        matched[f"{band}_true"] = true * u.uJy
+        matched[band] = true * flux * (1 + 0.01 * noise[0]) * u.uJy
+        matched[f"{band}_formal_err"] = np.full(n, 0.1) * u.uJy
+        matched[f"{band}_flags"] = matched[f"{band}_condition"] = np.zeros(n, int)
+    sample = QTable({"id": np.arange(n), "redshift": np.ones(n), "frac_agn": np.full(n, 0.4)})
+    fit = QTable({"redshift_mean": 1 + 2 * (0.03 * noise[1] + shift)})
+    fit["frac_agn_mean"] = 0.4 + 0.1 * noise[0] + shift
+    return SimpleNamespace(matched=matched, sample=sample, fits={"all": fit})
+
+
+def test_costs_are_changes_of_the_same_sources(tmp_path):
+    config = config_of(["gain", "zero_point"], of=0.4)
+    truths = study_truths(config)
+    every = dict.fromkeys(truths, study_tables(3))
+    every["agn40+zero_point"] = study_tables(3, flux=1.02)
+    every["agn40+all"] = study_tables(3, flux=1.02, shift=0.2)
+    table = perturbation_costs(truths, every, BANDS, seed=SEED)
+    cost = {(row["perturbation"], row["quantity"]): row for row in table}
+    assert set(table["truth"]) == {"agn40"}
+    assert list(dict.fromkeys(table["perturbation"])) == ["", "gain", "zero_point", "all"]
+    for band in BANDS:
+        offset = cost["zero_point", f"{band} offset"]
+        assert offset["n"] == 200
+        # noise is that of the other sky and takes no part in the change
+        assert offset["change"] == pytest.approx(0.02, rel=0.02)
+        assert offset["change_err"] < 2e-4 < 5e-4 < offset["value_err"]
+        assert cost["gain", f"{band} offset"]["change"] == 0
+    assert cost["zero_point", "photo-z outliers"]["change"] == 0
+    assert cost["all", "photo-z outliers"]["value"] > 0.9
+    assert cost["all", "fracAGN offset"]["change"] == pytest.approx(0.2)
+    assert cost["all", "fracAGN scatter"]["change"] == pytest.approx(0)
+    assert len(perturbation_costs(study_truths(config_of([])), every, BANDS, seed=SEED)) == 0
+    report = Report("made up")
+    context = Context(config, tmp_path)
+    write_perturbed(context, report, study_truths(config_of([])), every)
+    assert "does not know" not in report.to_html()
+    write_perturbed(context, report, truths, every)
+    page = report.to_html()
+    assert "<th class=n>F770W offset</th>" in page
+    assert "<td>agn40</td><td>zero point</td><td class=n>+2.0 (+2.0 ± 0.0) %</td>" in page
+    written = QTable.read(tmp_path / "report" / "perturbations.ecsv")
+    np.testing.assert_array_equal(written["change"], table["change"])
