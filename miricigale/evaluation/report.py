@@ -103,6 +103,14 @@ class Report:
         """Add a paragraph of plain text."""
         self._add(f"<p>{html.escape(text)}</p>")
 
+    def links(self, text, pairs):
+        """Add a sentence and links to what lies beside the page: (label, address) pairs of text."""
+        links = ", ".join(
+            f"<a href='{html.escape(address, quote=True)}'>{html.escape(label)}</a>"
+            for label, address in pairs
+        )
+        self._add(f"<p>{html.escape(text)} {links}</p>")
+
     def bullets(self, entries):
         """Add a list of lines of plain text."""
         self._add(_bullets(entries))

@@ -47,6 +47,8 @@ def disk_use(config):
             total += 2 * pixels * exposure.n_groups * exposure.n_integrations + 8 * pixels
     native = math.prod(grid_of(config, config.reduction.pixel_scale).pixel_shape)
     fine = math.prod(grid_of(config, config.highres.pixel_scale).pixel_shape)
+    # pictures of the sources in every band
+    total += len(config.exposures.filters) * 2 * native
     # mosaic, model and residual; mosaic on the fine grid
     total += len(config.exposures.filters) * 9 * (3 * native + fine)
     return n_truths * total + 9 * fine + 13 * fine

@@ -7,132 +7,25 @@ import re
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
-from astropy.nddata import CCDData
 from astropy.table import QTable
-from astropy.wcs import WCS
 
+from helpers.runs import (
+    AREA,
+    SCALE,
+    SHAPE,
+    do_stage,
+    make_run,
+    noise_image,
+    sky_image,
+    small_config,
+)
 from miricigale.sed import SEDModel
-from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
-from miricigale.workflow.stages import study_stages
-from miricigale.workflow.stages.exposures import study_exposures
 from miricigale.workflow.stages.figures import three_bands
 from miricigale.workflow.stages.metrics import as_ceers, as_paper
 from miricigale.workflow.stages.pictures import field_figure, residual_figure
 from miricigale.workflow.stages.provenance import sources_to_cite, stand_ins
 from miricigale.workflow.stages.sample import footprint_area, in_field
-
-STAGES = {stage.name: stage for stage in study_stages()}
-SCALE = 0.11
-#: Pixels of the made-up images, and the rim that is masked.
-SHAPE, RIM = (130, 170), 15
-AREA = 100 * 140 * SCALE**2 / 3600
-
-
-def sky_image(scale, shape, data, *, rim=0):
-    """A north-up image about the pointing of the default configuration."""
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = "RA---TAN", "DEC--TAN"
-    wcs.wcs.crval = 53.13440, -27.83444
-    wcs.wcs.crpix = (shape[1] + 1) / 2, (shape[0] + 1) / 2
-    wcs.wcs.cdelt = -scale / 3600, scale / 3600
-    mask = np.zeros(shape, bool)
-    if rim:
-        mask = np.ones(shape, bool)
-        mask[rim:-rim, rim:-rim] = False
-    return CCDData(data, wcs=wcs, mask=mask, unit="MJy/sr")
-
-
-def noise_image(seed=0, *, rim=RIM, scale=SCALE, shape=SHAPE):
-    rng = np.random.default_rng(seed)
-    y, x = np.indices(shape)
-    light = 20 * np.exp(-((x - shape[1] / 2) ** 2 + (y - shape[0] / 2) ** 2) / 30)
-    return sky_image(scale, shape, light + rng.normal(size=shape), rim=rim), light
-
-
-def small_config(filters, *, points=False):
-    n = len(filters)
-    return StudyConfig.from_dict(
-        {
-            "run": {"name": "made up"},
-            "exposures": {
-                "filters": filters,
-                "n_groups": [7] * n,
-                "n_integrations": [1] * n,
-                "n_dithers": [1] * n,
-            },
-            "sed": {"axes": "quick"},
-            "errors": {"bin_size": 8},
-            "fit": {
-                "bands": ["megacam.r", "wfc3.f160w", "irac.ch1"],
-                "depths": [27.0, 27.0, 24.0],
-                "axes": "quick",
-                "min_detected": 1,
-            },
-            "point_sources": {"enabled": points},
-            "report": {"dpi": 40},
-        }
-    )
-
-
-def do_stage(config, folder, name, unit=""):
-    STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
-
-
-def make_run(folder, filters, *, mass=3e10, points=False):
-    """Make up what the stage ``report`` reads, and run it."""
-    config = small_config(filters, points=points)
-    made = Context(config, folder)
-    rng = np.random.default_rng(1)
-    count = 24
-    center = SkyCoord(53.13440 * u.deg, -27.83444 * u.deg)
-    step = rng.uniform([[-7.0], [-5.0]], [[7.0], [5.0]], size=(2, count)) * u.arcsec
-    sky = center.spherical_offsets_by(*step)
-    parameters = QTable({"id": np.arange(1, count + 1), "redshift": np.linspace(0.3, 2.5, count)})
-    parameters["mass"] = np.geomspace(mass, 10 * mass, count) * u.Msun
-    bands = [*config.fit.bands, *filters]
-    truth = SEDModel.yang2021(agn=False).fluxes(parameters, bands)
-    truth["redshift"], truth["sky"] = parameters["redshift"], sky
-    truth["profile"], truth["sersic_index"] = "sersic", np.linspace(0.5, 4, count)
-    truth["star"], truth["frac_agn"] = np.zeros(count, bool), np.zeros(count)
-    truth.meta.clear()
-    truth.meta.update(version="1.2", citations=["Somebody 2001", "Somebody 2001, with page"])
-    made.save_table("agn00/truth.ecsv", truth)
-    catalog = QTable({"id": truth["id"], "sky": sky, "star": truth["star"]})
-    catalog["wfc3.f160w"] = truth["wfc3.f160w"]
-    made.save_table("catalog.ecsv", catalog)
-    for unit in study_exposures(config):
-        table = QTable({"sky_fraction": [0.31], "n_pixels": [4]})
-        made.save_table(f"agn00/exposures/{unit}_forecast.ecsv", table)
-    made.save_image("f160w.fits", noise_image(9, rim=0)[0])
-    for k, name in enumerate(filters):
-        image, light = noise_image(k)
-        made.save_image(f"agn00/mosaic_{name}.fits", image)
-        made.save_image(f"agn00/photometry/{name}_model.fits", sky_image(SCALE, SHAPE, light))
-        # one more than there are sources, which no source is near; the first is at the edge
-        table = QTable({"id": np.arange(1, count + 2), "sky": _with_one_more(sky, center)})
-        flux = np.append(truth[name].value + rng.normal(0, 0.2, count), 5.0)
-        table["flux"] = flux * u.uJy
-        table["flux_err"] = np.full(count + 1, 0.2) * u.uJy
-        table["flags"] = np.append(1, np.zeros(count, int))
-        made.save_table(f"agn00/photometry/{name}.ecsv", table)
-        bright = QTable({"flux_true": np.full(5, 100.0) * u.uJy})
-        bright["flux"] = bright["flux_true"] * np.array([0.98, 0.99, 1.0, 1.01, 5.0])
-        bright["in_field"] = np.ones(5, bool)
-        bright.meta.update(f_scaling=0.9987, f_scaling_err=0.001, f_aper=1.14)
-        made.save_table(f"points/{name}.ecsv", bright)
-    do_stage(config, folder, "errors")
-    do_stage(config, folder, "matches", "agn00")
-    do_stage(config, folder, "fits", "agn00/all")
-    do_stage(config, folder, "fits", "agn00/none")
-    do_stage(config, folder, "report")
-    return folder / "report"
-
-
-def _with_one_more(sky, center):
-    far = center.spherical_offsets_by(0 * u.arcsec, 5.4 * u.arcsec)
-    return SkyCoord([*sky.ra.deg, far.ra.deg] * u.deg, [*sky.dec.deg, far.dec.deg] * u.deg)
 
 
 def page_of(report):

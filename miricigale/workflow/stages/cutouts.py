@@ -48,7 +48,7 @@ class _Panels:
         factor = max(1, round(finest / scale))
         bad = ~np.isfinite(filled(first))
         planes = [binned(np.where(bad, np.nan, filled(image)), factor) for image in images]
-        n = 2 * int(0.5 * BOX / (factor * scale)) + 1
+        n = 2 * round(0.5 * BOX / (factor * scale)) + 1
         return cls(
             tuple(np.pad(p.astype(np.float32), n, constant_values=np.nan) for p in planes),
             first.wcs[::factor, ::factor],

@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 @stage(
     "report",
     "report",
-    version=4,
+    version=5,
     needs=(
         "catalog",
         "truth",
@@ -105,6 +105,7 @@ def make_report(context, _):
     )
     writer = _Writer(context, report, tables, metrics, model, mosaics, area, truths[shown])
     writer.summary()
+    report.links("The sources one by one:", [(name, f"sources-{name}.html") for name in truths])
     provenance.write_exposures(context, report, metrics, shown)
     writer.images()
     writer.photometry()

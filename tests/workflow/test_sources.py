@@ -1,0 +1,251 @@
+"""The pages of single sources: what they hold is what the tables hold, and nothing is from outside."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+from PIL import Image
+
+from helpers.runs import SCALE, SHAPE, do_stage, make_run, noise_image, sky_image, small_config
+from miricigale.evaluation import photoz_metrics
+from miricigale.fitting import FitResults
+from miricigale.sed import SEDModel
+from miricigale.workflow.stages.cutouts import N_GRAY, Cutouts
+from miricigale.workflow.stages.sources import CHUNK, FLAGS, OUTLIER
+
+BANDS = ["miri.f770w", "miri.f2100w"]
+
+
+def read_page(folder):
+    """Facts of the page, and the details of all sources in its order."""
+    text = (folder / "report" / "sources-agn00.html").read_text("utf-8")
+    facts = json.loads(re.search(r'id="facts">(.*?)</script>', text, flags=re.DOTALL)[1])
+    entries = []
+    for k, path in enumerate(sorted((folder / "report/sources/agn00").glob("*.js"))):
+        call = re.fullmatch(rf"loaded\({k}, (.*)\);\n", path.read_text("utf-8"))
+        entries += json.loads(call[1])
+    return facts, entries
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run with a sample, and what its page holds."""
+    folder = tmp_path_factory.mktemp("sources") / "run"
+    make_run(folder, BANDS)
+    do_stage(small_config(BANDS), folder, "sources", "agn00")
+    return folder, *read_page(folder)
+
+
+def close(values, wanted, rtol=6e-4):
+    """Whether plain values, None for NaN, are those wanted."""
+    values = np.array([np.nan if v is None else v for v in values], float)
+    return np.allclose(values, np.asarray(wanted, float), rtol=rtol, equal_nan=True)
+
+
+def test_the_table_holds_what_the_tables_hold(run):
+    folder, facts, entries = run
+    table = facts["table"]
+    truth = QTable.read(folder / "agn00/truth.ecsv")
+    matched = QTable.read(folder / "agn00/matched.ecsv")
+    assert {len(column) for column in table.values()} == {len(truth)}
+    assert sorted(table["id"]) == sorted(truth["id"])
+    assert [entry["id"] for entry in entries] == table["id"]
+    rows = np.searchsorted(truth["id"], table["id"])
+    assert close(table["redshift"], truth["redshift"][rows])
+    assert close(table["mag"], truth["wfc3.f160w"].to_value(u.ABmag)[rows])
+    for name in ("selection", "n_detected", "association"):
+        assert table[name] == matched[name][rows].tolist()
+    conditions = [np.asarray(matched[f"{name}_condition"]) for name in BANDS]
+    assert table["condition"] == (conditions[0] | conditions[1])[rows].tolist()
+    for name in BANDS:
+        ratio = (matched[name] / matched[f"{name}_err"]).value[rows]
+        assert close(table[f"sn_{name}"], ratio, rtol=6e-3)
+    for chosen in ("all", "none"):
+        fits = QTable.read(folder / f"agn00/fits_{chosen}.ecsv")
+        at = {key: k for k, key in enumerate(fits["id"])}
+        for k, key in enumerate(table["id"]):
+            if key not in at:
+                assert table[f"redshift_{chosen}"][k] is None
+                continue
+            row = fits[at[key]]
+            assert close([table[f"redshift_{chosen}"][k]], [row["redshift_mean"]])
+            assert close([table[f"frac_agn_{chosen}"][k]], [row["frac_agn_mean"]])
+            assert close([table[f"chi2_{chosen}"][k]], [row["reduced_chi2"]])
+            assert table[f"fit_{chosen}"][k] == row["flags"]
+
+
+def test_details_are_those_of_the_fits(run):
+    folder, facts, entries = run
+    truth = QTable.read(folder / "agn00/truth.ecsv")
+    matched = QTable.read(folder / "agn00/matched.ecsv")
+    model, bands = SEDModel.yang2021(), [band["name"] for band in facts["bands"]]
+    assert bands == ["megacam.r", "wfc3.f160w", "irac.ch1", *BANDS]
+    results = {n: FitResults.read(folder / f"agn00/fits_{n}.fits") for n in ("all", "none")}
+    fitted = [entry for entry in entries if "fits" in entry]
+    assert len(fitted) == np.count_nonzero(matched["selection"] == 0) > 5
+    names = [parameter["name"] for parameter in facts["parameters"]]
+    assert {"redshift", "frac_agn", "stellar_mass", "sfr"} < set(names)
+    for entry in fitted[:6]:
+        row = int(np.flatnonzero(truth["id"] == entry["id"])[0])
+        assert close(entry["true"], [truth[name][row].value for name in bands])
+        assert close(entry["flux"][3:], [matched[name][row].value for name in BANDS])
+        assert entry["flags"] == [matched[f"{name}_flags"][row] for name in BANDS]
+        one = results["all"][entry["id"]]
+        assert [*one.filters] == bands
+        assert close(entry["flux"], one.flux)
+        assert close(entry["error"], one.flux_err, rtol=6e-3)
+        assert close([entry["parameters"][names.index("sfr")]], [truth["sfr"][row].value])
+        for name, found in results.items():
+            one, fit = found[entry["id"]], entry["fits"][name]
+            assert (fit["n_bands"], True) == (one.n_bands, close([fit["chi2"]], [one.chi2]))
+            mean, std = fit["moments"][names.index("stellar_mass")]
+            assert close(
+                [mean, std], [v.value for v in (one.mean("stellar_mass"), one.std("stellar_mass"))]
+            )
+            for parameter, (first, weights) in fit["pdf"].items():
+                whole = np.zeros(len(one.pdf[parameter]))
+                whole[first : first + len(weights)] = weights
+                assert np.allclose(whole, 1000 * one.pdf[parameter], atol=0.5)
+                assert len(facts["pdf_edges"][name][parameter]) == len(whole) + 1
+            # the cells conserve the light: their sum is that of the spectrum
+            wave = np.array(facts["wave"])
+            half = np.sqrt((wave[-1] / wave[0]) ** (1 / (len(wave) - 1)))
+            flux = np.array([0.0 if v is None else 10 ** (v / 1000) for v in fit["spectrum"]])
+            fine = np.geomspace(wave[0] / half, wave[-1] * half, 200_000)
+            light = np.trapezoid(one.best_sed(model).fnu_at(fine * u.um).value, fine)
+            assert np.sum(flux * wave * (half - 1 / half)) == pytest.approx(light, rel=2e-3)
+
+
+def test_a_source_without_a_fit_says_why(tmp_path):
+    make_run(tmp_path, BANDS[:1], mass=1e4, report=False)
+    do_stage(small_config(BANDS[:1]), tmp_path, "sources", "agn00")
+    facts, entries = read_page(tmp_path)
+    assert not any("fits" in entry for entry in entries)
+    words = {word for word, _ in facts["flags"]["selection"].values()}
+    assert "few bands" in words
+    assert all(value & 16 for value in facts["table"]["selection"])
+    assert facts["flags"]["selection"]["16"] == ["few bands", "Detected in too few MIRI bands."]
+
+
+def test_every_flag_has_its_meaning():
+    for flags in FLAGS.values():
+        meanings = flags.meanings()
+        assert list(meanings) == [member.value for member in flags]
+        for word, text in meanings.values():
+            assert word.replace(" ", "_").upper() in flags.__members__
+            assert text.endswith("."), (word, text)
+
+
+def test_outliers_are_those_of_the_metrics():
+    z = np.array([1.0, 1.0])
+    far = z * [1.3, 1.3] + np.array([-1e-9, 1e-9])
+    assert [photoz_metrics(z[k : k + 1], far[k : k + 1]).n_outliers for k in (0, 1)] == [0, 1]
+    assert pytest.approx(0.3 / 2) == OUTLIER
+
+
+def test_the_page_needs_nothing_from_outside(run):
+    folder = run[0]
+    report = folder / "report"
+    text = (report / "sources-agn00.html").read_text("utf-8")
+    assert set(re.findall(r"\w+://[^\"'\s)]*", text)) <= {"http://www.w3.org/2000/svg"}
+    assert not re.search(r"\b(fetch|XMLHttpRequest|import)\b", text)
+    assert not re.findall(r"<(?:script|link|img)[^>]*\b(?:src|href)=", text)
+    assert "href='sources-agn00.html'" in (report / "index.html").read_text("utf-8")
+    assert len(list((report / "sources/agn00").glob("*.js"))) == -(-24 // CHUNK)
+
+
+def test_the_same_products_give_the_same_bytes(run):
+    folder = run[0]
+    paths = [
+        *(folder / "report").glob("sources-*.html"),
+        *(folder / "report/sources/agn00").iterdir(),
+    ]
+    before = {path: path.read_bytes() for path in paths}
+    do_stage(small_config(BANDS), folder, "sources", "agn00")
+    assert before == {path: path.read_bytes() for path in paths}
+    assert len(before) == 3
+
+
+def test_pictures_show_the_sky_about_the_source():
+    data = np.random.default_rng(3).normal(size=SHAPE)
+    # 10 pixels east and 15 north of the source
+    data[65 + 15, 85 - 10] = 400.0
+    image = sky_image(SCALE, SHAPE, data)
+    model = sky_image(SCALE, SHAPE, np.where(data > 100, data, 0.0))
+    residual = sky_image(SCALE, SHAPE, np.where(data > 100, 0.0, data))
+    cutouts = Cutouts(image, {"miri.f770w": [image, model, residual]})
+    layout = cutouts.describe()
+    assert layout["prior"] == layout["side"] == 49
+    assert layout["sigma"] == pytest.approx([1.0, 1.0], rel=0.03)
+    here = image.wcs.pixel_to_world(85, 65)
+    sky = SkyCoord([here, here.directional_offset_by(0 * u.deg, 30 * u.arcsec)])
+    assert cutouts.on_image(sky).tolist() == [True, False]
+    sheet, tops = cutouts.sheet(sky)
+    pixels = np.asarray(sheet).reshape(2, layout["height"], 2 * 49)
+    for top, left in ((0, 0), (0, 49), (49, 49)):
+        picture = np.where(pixels[0] == N_GRAY, 0, pixels[0])[top : top + 49, left : left + 49]
+        assert np.unravel_index(np.argmax(picture), (49, 49)) == (24 - 15, 24 - 10)
+        assert picture.max() == N_GRAY - 1
+    assert tops[0] == pytest.approx([400.0, 400.0])
+    # nothing is there: no data, and the least range of the stretch
+    assert np.all(pixels[1] == N_GRAY)
+    assert tops[1] == pytest.approx(10 * np.array(layout["sigma"]), rel=1e-2)
+    # one stretch: noise has the same shades in mosaic and residual
+    mosaic, model, rest = (pixels[0, 49 * k : 49 * (k + 1), 49:] for k in range(3))
+    dark = mosaic == N_GRAY - 1
+    assert np.array_equal(mosaic[~dark], rest[~dark])
+    assert len(np.unique(model)) == 2
+
+
+def test_pictures_of_fine_mosaics_are_no_larger():
+    image, _ = noise_image(rim=0, scale=0.051, shape=(300, 300))
+    cutouts = Cutouts(image, {"miri.f770w": [image] * 3})
+    assert (cutouts.describe()["prior"], cutouts.describe()["side"]) == (105, 53)
+    # the light of `noise_image` is in the middle of the image
+    sheet, _ = cutouts.sheet(SkyCoord([image.wcs.pixel_to_world(150, 150)]))
+    picture = np.asarray(sheet)[:53, 105:]
+    y, x = np.nonzero(picture == picture.max())
+    assert (np.mean(y), np.mean(x)) == pytest.approx((26, 26), abs=1.5)
+
+
+def test_a_sheet_has_a_strip_for_each_source(run):
+    folder, facts, entries = run
+    with Image.open(folder / "report/sources/agn00/000.png") as sheet:
+        mode, size = sheet.mode, sheet.size
+    layout = facts["cutouts"]
+    shown = [entry for entry in entries[:CHUNK] if entry["top"]]
+    assert mode == "P"
+    assert size == (
+        layout["prior"] + len(BANDS) * layout["side"], len(shown) * layout["height"]
+    )  # fmt: skip
+    # those with pictures come first, so that the strip is the place in the file
+    assert entries[: len(shown)] == shown
+
+
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs a headless browser")
+def test_the_page_opens_in_a_browser(run, tmp_path):
+    folder, _, entries = run
+    key = next(entry["id"] for entry in entries if "fits" in entry)
+    page = (folder / "report/sources-agn00.html").as_uri()
+    command = [
+        BROWSER, "--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}",
+        "--virtual-time-budget=4000", "--dump-dom", f"{page}#{key}?show=all&redshift=0..9",
+    ]  # fmt: skip
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=120, check=True, env=dict(os.environ)
+    )
+    assert f"<h2>Source {key}</h2>" in done.stdout
+    assert f"{len(entries)} of {len(entries)} sources" in done.stdout
+    # two posteriors and the spectra of two fits, each with its truth or its fluxes
+    assert done.stdout.count('class="truth"') == 2
+    assert done.stdout.count("<canvas") == 1 + 3 * len(BANDS)
