@@ -15,8 +15,10 @@ OUTLIER = 0.15
 #: Samples drawn for an error.
 N_DRAWS = 1000
 
+#: Name of what no effect has changed.
+NONE = "none"
 _LABELS = {
-    "": "none",
+    NONE: "none",
     "psf": "PSF, another wavefront",
     "psf_width": "PSF, width",
     "flat": "flat field",
@@ -99,10 +101,10 @@ def perturbation_costs(truths, every, bands, *, seed):
     Returns
     -------
     costs : `~astropy.table.Table`
-        A row for each truth and quantity: ``truth`` (without perturbations), ``perturbation`` (empty
-        for that truth itself), ``quantity``, ``n`` sources, ``value``, ``value_err``, ``change`` and
+        A row for each truth and quantity: ``truth`` (without perturbations), ``perturbation``
+        (``"none"`` for that truth itself), ``quantity``, ``n`` sources, ``value``, ``value_err``, ``change`` and
         ``change_err``. Values are of the sources that both truths have, and the errors of the changes of
-        draws of these sources, so that what both skies share (noise, blends) does not count.
+        draws of these sources, so that what both skies share does not count.
     """
     rows = []
     perturbed = [truth for truth in truths.values() if truth.perturbations]
@@ -110,7 +112,7 @@ def perturbation_costs(truths, every, bands, *, seed):
         for name, (kind, band, statistic) in _quantities(bands).items():
             ids, known = _errors(every[base], kind, band)
             plain = bootstrap(statistic, known, seed=seed, n_draws=N_DRAWS)
-            rows.append((base, "", name, plain.n, plain.value, plain.error, np.nan, np.nan))
+            rows.append((base, NONE, name, plain.n, plain.value, plain.error, np.nan, np.nan))
             for truth in perturbed:
                 if truth.base == base:
                     own_ids, own = _errors(every[truth.name], kind, band)
@@ -180,7 +182,7 @@ def _cell(row):
     scale, digits, unit = (100, 1, " %") if share else (1, 4, "")
     signed = "+" if row["quantity"].endswith("offset") else ""
     text = f"{scale * row['value']:{signed}.{digits}f}"
-    if not row["perturbation"]:
+    if row["perturbation"] == NONE:
         return f"{text} ± {scale * row['value_err']:.{digits}f}{unit}"
     change = f"{scale * row['change']:+.{digits}f} ± {scale * row['change_err']:.{digits}f}"
     return f"{text} ({change}){unit}"

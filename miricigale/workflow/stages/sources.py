@@ -69,6 +69,7 @@ FLAGS = {
     ),
     resources=sed_resources,
     units=truth_names,
+    plan=lambda config, _: list(truth_names(config)),
     kernels=("fit",),
 )
 def make_sources(context, name):
@@ -96,7 +97,7 @@ def make_sources(context, name):
         context.save(f"{folder}/{k:03d}.js", lambda path, text=text: path.write_text(text, "utf-8"))
     facts = {
         "truth": name,
-        "truths": list(truth_names(context.config)),
+        "truths": context.plan,
         "chunk": CHUNK,
         "outlier": OUTLIER,
         "prior": band_label(context.config.highres.filter),
