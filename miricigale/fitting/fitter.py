@@ -8,7 +8,7 @@ import numpy as np
 
 from miricigale.fitting.flags import FitFlags, flags_of_fits
 from miricigale.fitting.grid_fit import GridFit
-from miricigale.fitting.likelihood import PhotometryReader, per_band, unused_bands
+from miricigale.fitting.likelihood import PhotometryReader, filter_names, per_band, unused_bands
 from miricigale.fitting.results import FitResults
 from miricigale.fitting.samplers import Request, get_sampler
 from miricigale.fitting.samplers.fit import SamplerFit
@@ -172,8 +172,10 @@ class BayesFitter:
         _check_options(given)
         if engine != "grid":
             get_sampler(engine)
-        names = None if filters is None and engine == "grid" else _names("filters", filters or ())
-        asked = (*(names or ()), *_names("predict", predict))
+        names = (
+            None if filters is None and engine == "grid" else filter_names("filters", filters or ())
+        )
+        asked = (*(names or ()), *filter_names("predict", predict))
         if names is not None and (not names or len(set(asked)) < len(asked)):
             raise argument_error("filters", "different names, at least one", f"{list(asked)}")
         if scale_error not in (None, True, False) or (compat and scale_error):
@@ -323,14 +325,9 @@ class BayesFitter:
             If a flux column has no unit of flux density.
         """
         options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
-        return self._fit_rows(
-            photometry,
-            options | {"stacklevel": 4},
-            seed=seed,
-            chunk_size=chunk_size,
-            executor=executor,
-            progress_bar=progress_bar,
-        )
+        parallel = {"executor": executor, "progress_bar": progress_bar}
+        options["stacklevel"] = 4
+        return self._fit_rows(photometry, options, seed=seed, chunk_size=chunk_size, **parallel)
 
     def _fit_rows(
         self, photometry, options, *, seed=None, chunk_size=None, repeated=None, **parallel
@@ -444,12 +441,6 @@ class BayesFitter:
             "n_bands_min": self.n_bands_min,
             **self.backend.settings(),
         }
-
-
-def _names(argument, filters):
-    if isinstance(filters, str):
-        raise argument_error(argument, "a list of names or a FilterSet", repr(filters))
-    return tuple(getattr(filters, "names", filters))
 
 
 def _check_options(given):

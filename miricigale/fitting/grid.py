@@ -111,9 +111,10 @@ class GridEngine:
         return n_row * (n_zero + self.agn.shape[1] * (self.frac.size - n_zero))
 
     @property
-    def n_quantities(self):
-        """Number of derived quantities: the galaxy's, the AGN model's and the sum of both."""
-        return self.galaxy_scale.shape[0] + self.agn_scale.shape[0] + 1
+    def size(self):
+        """Numbers of redshifts, galaxies, AGN models and fractions, by the letters of joint sums."""
+        n_z, n_galaxy, _ = self.galaxy.shape
+        return {"z": n_z, "g": n_galaxy, "k": self.agn.shape[1], "f": self.frac.size}
 
     @property
     def delta(self):
@@ -194,8 +195,7 @@ class GridEngine:
 
     def workspace(self, n_draws=0, joint=()):
         """Make the accumulators and work space of one worker (some tens of MB)."""
-        n_z, n_galaxy, n_bands = self.galaxy.shape
-        size = (n_z, n_galaxy, self.agn.shape[1], self.frac.size, n_bands)
+        size = (*self.size.values(), self.galaxy.shape[2])
         return _core.make_sums(*size, n_draws, joint), *_core.make_workspace(
             *size, int(self._zero_frac), _CAPACITY
         )
@@ -245,9 +245,9 @@ class GridEngine:
         ValueError
             If there are limits in a band in which a model has negative flux.
         """
-        n_z, n_galaxy, n_bands = self.galaxy.shape
-        n_agn, n_frac = self.agn.shape[1], self.frac.size
-        n = flux.shape[0]
+        size = self.size
+        n_z, n_galaxy, n_agn, n_frac = size.values()
+        n, n_bands = flux.shape
         weight = 1.0 / np.square(sigma)
         data = np.where(weight > 0, flux, 0.0)
         inverse = np.zeros((n, n_bands)) if limit_sigma is None else 1.0 / limit_sigma
@@ -258,8 +258,9 @@ class GridEngine:
             raise argument_error("limit", wanted, f"limits in band {int(negative[0])}")
         log_prior = np.where(np.isfinite(log_prior), 2.0 * log_prior, -1e300)
         seeds = np.zeros(n, np.uint64) if seeds is None else np.array(seeds, np.uint64)
-        n_quantities, n_levels = self.n_quantities, self.levels.size
-        size = {"z": n_z, "g": n_galaxy, "k": n_agn, "f": n_frac}
+        # the galaxy's, the AGN model's and the sum of both
+        n_quantities = len(self.galaxy_scale) + len(self.agn_scale) + 1
+        n_levels = self.levels.size
         out = GridOutput(
             chi2=np.full(n, np.nan),
             log_sum=np.full(n, np.nan),
@@ -335,18 +336,9 @@ class GridEngine:
                 table[i, 0] += sums.alone.sum() * prior
             table[i] /= table[i].sum()
 
-    def draw(self, flux, sigma, log_prior, n_draws, seeds, *, limit=None, limit_sigma=None):
+    def draw(self, flux, sigma, log_prior, n_draws, seeds, **limits):
         """
-        Draw models from the posteriors, exactly and independently.
-
-        Parameters
-        ----------
-        flux, sigma, log_prior, limit, limit_sigma : `~numpy.ndarray`
-            As in `fit`.
-        n_draws : int
-            Number of draws for each object.
-        seeds : `~numpy.ndarray` of int, shape (n,)
-            Each object's seed: its draws depend on nothing else but its data.
+        Draw models from the posteriors, exactly and independently; other arguments are those of `fit`.
 
         Returns
         -------
@@ -357,17 +349,9 @@ class GridEngine:
             Solar masses formed: with ``scale_error`` drawn from the Gaussian about the model's
             best scale, as far as it is positive.
         """
-        out = self.fit(
-            flux,
-            sigma,
-            log_prior,
-            limit=limit,
-            limit_sigma=limit_sigma,
-            n_draws=n_draws,
-            seeds=seeds,
-        )
+        out = self.fit(flux, sigma, log_prior, n_draws=n_draws, seeds=seeds, **limits)
         index, scale = out.draw_index, out.draw_scale[:, :, 0]
-        prior = self.prior_agn / self.prior_agn.sum() if self.agn.shape[1] else np.ones(1)
+        prior = self._agn_prior if self.agn.shape[1] else np.ones(1)
         for i in np.flatnonzero(np.isfinite(out.chi2)):
             rng = np.random.default_rng(int(seeds[i]))
             drawn = rng.choice(prior.size, size=n_draws, p=prior)

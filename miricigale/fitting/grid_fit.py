@@ -197,9 +197,7 @@ class GridFit:
         options, step = {}, max(len(data), 1)
         if joint:
             # joint sums are large: those of a few objects are reduced before the next are made
-            n_z, n_galaxy, _ = self.engine.galaxy.shape
-            size = dict(zip("zgkf", (n_z, n_galaxy, self.engine.agn.shape[1], 0), strict=True))
-            size["f"] = self.engine.frac.size
+            size = self.engine.size
             step = max(1, _JOINT_SIZE // sum(size[name[0]] * size[name[1]] for name in joint))
             options = {"joint": joint, "workspace": self.engine.workspace(joint=joint)}
         parts = []

@@ -15,6 +15,7 @@ from miricigale.utils.units import FNU, to_array
 __all__ = [
     "FitData",
     "PhotometryReader",
+    "filter_names",
     "flux_column",
     "limits",
     "per_band",
@@ -268,6 +269,13 @@ def limits(table, name):
 def _some(column):
     """First values of a column, for a message."""
     return f"{', '.join(str(value) for value in column[:3])}, ..."
+
+
+def filter_names(argument, filters):
+    """Names of a `~miricigale.filters.FilterSet` or list of names: tuple of str."""
+    if isinstance(filters, str):
+        raise argument_error(argument, "a list of names or a FilterSet", repr(filters))
+    return tuple(getattr(filters, "names", filters))
 
 
 def per_band(value, filters, name):

@@ -8,6 +8,7 @@ import numpy as np
 
 from miricigale.fitting import drawing
 from miricigale.fitting.flags import FitFlags
+from miricigale.fitting.likelihood import filter_names
 from miricigale.fitting.posterior import cell_edges, cell_percentiles, check_levels, moments
 from miricigale.fitting.quantities import DERIVED_LEVELS, kept_percentiles
 from miricigale.utils.exceptions import argument_error, unknown_name
@@ -422,11 +423,9 @@ class FitResults(ObjectRows):
             ``id`` and, for each filter, mean (by its name), standard deviation (``<name>_err``)
             and flux of the best model (``<name>_best``) in uJy.
         """
-        if isinstance(filters, str):
-            raise argument_error("filters", "a list of names or a FilterSet", repr(filters))
         some = self._several()
         columns = {"id": (some.ids, "identifier")}
-        for name in self.filters if filters is None else getattr(filters, "names", filters):
+        for name in filter_names("filters", self.filters if filters is None else filters):
             if name not in self.filters:
                 raise unknown_name("filter of the models", name, self.filters)
             mean, std, best = (
