@@ -234,21 +234,10 @@ def widest(scales, sums):
 
 def summarize(scales, sums, scale_error, levels, out, quantiles, share, share_quantiles):
     """
-    Moments and quantiles of all derived quantities of one object.
+    Fill moments and quantiles of all derived quantities of one object, and of the other fraction.
 
-    Parameters
-    ----------
-    scales, sums
-        See `miricigale.fitting._core.structs`.
-    scale_error : float
-        Whether the variances of the models' scales count.
-    levels : `~numpy.ndarray`, shape (n_levels,)
-        Of the quantiles, ascending.
-    out, quantiles : `~numpy.ndarray`, shapes (n_quantities, 3) and (n_quantities, n_levels)
-        Filled: mean, standard deviation and mean of log10; quantiles. The order is the galaxy's
-        quantities, the AGN model's, then the one of both.
-    share, share_quantiles : `~numpy.ndarray`, shapes (2,) and (n_levels,)
-        Filled: mean and standard deviation, and quantiles of the other fraction.
+    The order is the galaxy's quantities, the AGN model's, then the one of both; ``out`` has means,
+    standard deviations and means of log10 in its rows, ``share`` mean and standard deviation.
     """
     total, hist = sums.total[0], sums.hist
     sigma = scale_error / np.sqrt(max(sums.total[1] / total, 1.0))

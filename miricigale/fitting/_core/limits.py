@@ -84,12 +84,8 @@ def _limit(u):
     """
     What one limit adds at u, in the precision of u.
 
-    Returns
-    -------
-    first, second, third : float
-        Derivatives of half of T: the hazard h, h (h - u) and so on.
-    factor, exponent : float
-        The probability is factor exp(exponent).
+    Returned are the derivatives of half of T (the hazard h, h (h - u) and so on), and factor and
+    exponent of the probability factor exp(exponent).
     """
     real = type(u)
     zero, one, half = real(0.0), real(1.0), real(0.5)
@@ -241,12 +237,8 @@ def limited_likelihoods(of_frac, lanes, limits, reference, scale_error, record, 
     Scales are sought where pairs evaluated before have theirs; models that are more than ``delta``
     below the reference without the limits get no weight.
 
-    Returns
-    -------
-    reached : float
-        Number of models whose R reaches ``record``, to rounding; in single precision somewhat more.
-    over : float
-        Largest exponent of a weight; where it is large the reference must be raised.
+    Returned are the number of models whose R reaches ``record``, to rounding (in single precision
+    somewhat more), and the largest exponent of a weight; where it is large the reference must be raised.
     """
     buffer, work, level, n = lanes.buffer, lanes.limited, limits.level, limits.level.size
     for i in range(BLOCK):

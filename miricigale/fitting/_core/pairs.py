@@ -126,12 +126,8 @@ def best_of_galaxy(tables, target, limits, pairs, z, g):
     """
     Best model of one galaxy at one redshift, f = 0 included; with limits, a good one.
 
-    ``pairs.agn_pq`` must hold that redshift's.
-
-    Returns
-    -------
-    value, s : float
-        Largest R + 2 ln(prior), and the scale of the model that has it.
+    ``pairs.agn_pq`` must hold that redshift's. Returned are the largest R + 2 ln(prior) and the scale
+    of the model that has it.
     """
     galaxy, agn, of_frac = tables.galaxy[z, g], tables.agn[z], tables.of_frac
     weight, bands, agn_pq = target.weight, target.bands, pairs.agn_pq
@@ -293,12 +289,8 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
     blocks, plus the block. ``reference`` is R + 2 ln(prior) that some model reaches, pairs that are
     more than ``delta`` below it are left out.
 
-    Returns
-    -------
-    n, position : int
-        Number of runs in the list, and where to go on.
-    reference : float
-        Raised when a better model is met.
+    Returned are the number of runs in the list, where to go on, and the reference, raised when a better
+    model is met.
     """
     n_z, n_blocks = tables.tiles.shape[0], tables.tiles.shape[1]
     n_agn = tables.agn.shape[1]
