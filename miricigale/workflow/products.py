@@ -20,7 +20,52 @@ def _plain(value):
     return f"{value}" if isinstance(value, u.Quantity) else plain_value(value)
 
 
-def write_image(image, path, *, planes=None):
+#: Steps of rounded values in the median error of an image: with its dither that adds less than 1e-3
+#: of its error to a flux.
+_STEPS = 2048
+
+
+def _packed(values, name, header=None, *, step=None):
+    """
+    An image extension: compressed tiles (Rice), which FITS readers open as an image, where they can be.
+
+    Integers of up to 32 bits keep every bit; floats are rounded to ``step`` (SCI with subtractive
+    dither of a fixed seed), but for NaN and 0, and stay as they are without one. Never gzip, whose
+    streams are dated.
+    """
+    options = {}
+    if values.dtype.kind == "f" and step is not None:
+        # integers of 32 bits hold the steps
+        largest, least = (f.reduce(values, axis=None) for f in (np.fmax, np.fmin))
+        packs = largest - least < 1e9 * step
+        # a negative level is the step itself
+        options = {"quantize_level": -step, "quantize_method": 2 if name == "SCI" else -1}
+    else:
+        packs = values.dtype.kind in "iu" and values.dtype.itemsize <= 4
+    if not packs:
+        return fits.ImageHDU(values, header, name=name)
+    return fits.CompImageHDU(
+        values, header, name=name, compression_type="RICE_1", dither_seed=1, **options
+    )
+
+
+def _step(error):
+    """What values of an image are rounded to; None without errors."""
+    if error is None or not np.any(good := np.isfinite(error) & (error > 0)):
+        return None
+    return float(np.median(error[good])) / _STEPS
+
+
+def _flag_planes(flags):
+    """Flags as the 32 bits that JWST has, DQ, and the bits above, DQ_OWN, if any is set."""
+    flags = np.asarray(flags).astype(np.int64)
+    yield _packed((flags & 0xFFFFFFFF).astype(np.uint32), "DQ", dq_legend())
+    if np.any(flags >> 32):
+        header = fits.Header([("DQSHIFT", 32, "bit n of this plane is bit n + 32 of the legend")])
+        yield _packed((flags >> 32).astype(np.uint8), "DQ_OWN", header)
+
+
+def write_image(image, path, *, planes=None, rounded=False):
     """
     Write an image as FITS: SCI, ERR, MASK and further planes.
 
@@ -33,22 +78,34 @@ def write_image(image, path, *, planes=None):
         Where to; an existing file is replaced.
     planes : dict of str to `~numpy.ndarray`, optional
         Further image extensions by name; ``dq`` holds flags (`~miricigale.instrument.DQ`).
+    rounded : bool, optional
+        Whether SCI and ERR are rounded to 1/2048 of the median of ERR, for a third of the size;
+        otherwise every bit is kept.
     """
     header = image.wcs.to_header(relax=True) if image.wcs is not None else fits.Header()
     header["BUNIT"] = image.unit.to_string("fits")
     header["META"] = json.dumps(undated(image.meta), default=_plain, allow_nan=True)
-    hdus = [
-        fits.PrimaryHDU(),
-        fits.ImageHDU(np.asarray(image.data, np.float32), header, name="SCI"),
-    ]
+    data, error = np.asarray(image.data, np.float32), None
     if image.uncertainty is not None:
-        hdus.append(fits.ImageHDU(np.asarray(image.uncertainty.array, np.float32), name="ERR"))
+        error = np.asarray(image.uncertainty.array, np.float32)
+    step = _step(error) if rounded else None
+    hdus = [fits.PrimaryHDU(), _packed(data, "SCI", header, step=step)]
+    if error is not None:
+        hdus.append(_packed(error, "ERR", step=step))
     if image.mask is not None:
-        hdus.append(fits.ImageHDU(np.asarray(image.mask, np.uint8), name="MASK"))
+        hdus.append(_packed(np.asarray(image.mask, np.uint8), "MASK"))
     for name, plane in (planes or {}).items():
-        header = dq_legend() if name.lower() == "dq" else None
-        hdus.append(fits.ImageHDU(np.asarray(plane), header, name=name.upper()))
+        if name.lower() == "dq":
+            hdus.extend(_flag_planes(plane))
+        else:
+            hdus.append(_packed(np.asarray(plane), name.upper()))
     write_fits(hdus, path, overwrite=True)
+
+
+def _read_flags(hdus):
+    """Flags of `_flag_planes`, or of a file of an earlier version, whose DQ has all bits."""
+    flags = read_dq(hdus["DQ"])
+    return flags | (hdus["DQ_OWN"].data.astype(np.int64) << 32) if "DQ_OWN" in hdus else flags
 
 
 def read_image(path, *, planes=()):
@@ -92,6 +149,6 @@ def read_image(path, *, planes=()):
         )
         extra = []
         for name in planes:
-            hdu = hdus[name.upper()]
-            extra.append(read_dq(hdu) if name.lower() == "dq" else np.array(hdu.data))
+            is_dq = name.lower() == "dq"
+            extra.append(_read_flags(hdus) if is_dq else np.array(hdus[name.upper()].data))
     return (image, *extra) if extra else image

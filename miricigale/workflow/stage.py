@@ -1,10 +1,12 @@
 """A stage of the study, and what it sees of the run."""
 
 import dataclasses
+import socket
 import time
 import types
 from collections.abc import Callable
 
+from miricigale.utils.exceptions import DataError
 from miricigale.utils.folder import FileFolder
 from miricigale.utils.meta import undated
 from miricigale.utils.parallel import single_threaded
@@ -209,8 +211,8 @@ class Context:
         return self.save(name, lambda path: result.write(path, overwrite=True, **options))
 
     def save_image(self, name, image, **planes):
-        """Write an image and further planes."""
-        return self.save(name, lambda path: write_image(image, path, planes=planes))
+        """Write an image, rounded far below its noise, and further planes."""
+        return self.save(name, lambda path: write_image(image, path, planes=planes, rounded=True))
 
     def image(self, name, *planes):
         """Read an image (and planes) that an earlier stage wrote."""
@@ -225,7 +227,7 @@ def run_unit(config, folder, stages, name, unit, **options):
     ----------
     config : `~miricigale.workflow.config.StudyConfig`
         The configuration.
-    folder : path-like
+    folder : `pathlib.Path`
         The folder of the run.
     stages : callable or tuple of `Stage`
         The stages, or a function that makes them.
@@ -240,7 +242,17 @@ def run_unit(config, folder, stages, name, unit, **options):
         Checksum and size of what was written, by name.
     seconds : float
         Time that it took.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If this machine does not see the folder.
     """
+    if not folder.is_dir():
+        msg = (
+            f"{folder} is not on {socket.gethostname()}: all workers must see the folder of the run"
+        )
+        raise DataError(msg)
     (stage,) = (s for s in (stages() if callable(stages) else stages) if s.name == name)
     context = Context(config, folder, stage=stage, unit=unit, **options)
     begin = time.perf_counter()

@@ -21,6 +21,20 @@ __all__ = ["MIN_SOURCES", "check_study", "disk_use", "run_study"]
 #: Sources that a field must have for an error function to be measured.
 MIN_SOURCES = 3
 
+#: Bytes of products, measured: of a calibrated image and a mosaic for each pixel of their grids, of
+#: a model (not compressed); tables of a truth and a fit for each source of the catalog; the prior's
+#: images and templates for each of its pixels; a kernel; the fits of the input for each source.
+_BYTES = {
+    "image": 3.5,
+    "mosaic": 1.9,
+    "model": 4.0,
+    "truth": 2400.0,
+    "fit": 4000.0,
+    "prior": 7.8,
+    "kernel": 2.9e6,
+    "seds": 9600.0,
+}
+
 
 def disk_use(config):
     """
@@ -36,22 +50,27 @@ def disk_use(config):
     n_bytes : int
     """
     exposures = study_exposures(config)
-    n_truths = len(study_truths(config))
-    total = 20_000_000  # tables, fits, report
+    total = 0
     for exposure in exposures.values():
         pixels = math.prod(exposure.shape)
-        # rate and cal: data, error, flags (32 bits each) and mask
-        total += 2 * 13 * pixels
+        total += _BYTES["image"] * pixels
         if config.run.keep_level1b:
-            # counts, and the planes that only a simulation knows
-            total += 2 * pixels * exposure.n_groups * exposure.n_integrations + 8 * pixels
+            # counts, the planes that only a simulation knows, and the rates
+            counts = exposure.n_groups * exposure.n_integrations
+            total += (2 * counts + 8 + _BYTES["image"]) * pixels
     native = math.prod(grid_of(config, config.reduction.pixel_scale).pixel_shape)
     fine = math.prod(grid_of(config, config.highres.pixel_scale).pixel_shape)
+    measured = fine if config.photometry.method == "yang2021" else native
+    # mosaics on both grids; model and residual
+    planes = native + fine + measured
+    n_bands, n_sets = len(config.exposures.filters), len(config.fit.sets)
+    total += n_bands * (_BYTES["mosaic"] * planes + _BYTES["model"] * measured)
     # pictures of the sources in every band
-    total += len(config.exposures.filters) * 2 * native
-    # mosaic, model and residual; mosaic on the fine grid
-    total += len(config.exposures.filters) * 9 * (3 * native + fine)
-    return n_truths * total + 9 * fine + 13 * fine
+    total += n_bands * 2 * native
+    n_sources = len(study_catalog(config.catalog))
+    total += n_sources * (_BYTES["truth"] + _BYTES["fit"] * n_sets)
+    shared = _BYTES["prior"] * fine + _BYTES["kernel"] * n_bands + _BYTES["seds"] * n_sources
+    return int(len(study_truths(config)) * total + shared)
 
 
 def check_study(config):

@@ -88,3 +88,69 @@ def test_flags_have_the_bits_of_jwst_and_say_so(tmp_path):
     fits.HDUList([fits.PrimaryHDU(), science, old]).writeto(tmp_path / "old.fits")
     _, flags = read_image(tmp_path / "old.fits", planes=["dq"])
     np.testing.assert_array_equal(flags, [[0, 2], [0, 0]])
+
+
+def noise_image():
+    """An image with sources, a ramp of errors, areas of 0 and pixels without data."""
+    rng = np.random.default_rng(5)
+    shape = (120, 90)
+    error = np.linspace(0.5, 2.0, shape[0], dtype=np.float32)[:, None] * np.ones(shape, np.float32)
+    data = rng.normal(0, error).astype(np.float32)
+    data[40:44, 40:44] += 3000
+    data[70:75] = 0
+    data[3:8, 20:30] = error[5:9, 60:70] = np.nan
+    return CCDData(
+        data,
+        unit=u.MJy / u.sr,
+        mask=~np.isfinite(data + error),
+        uncertainty=StdDevUncertainty(error),
+    )
+
+
+def test_rounding_is_far_below_the_errors_and_the_same_each_time(tmp_path):
+    image = noise_image()
+    flags = image.mask * np.int64(2**33 + 1)
+    write_image(image, tmp_path / "whole.fits")
+    for name in ("first.fits", "second.fits"):
+        write_image(image, tmp_path / name, planes={"dq": flags}, rounded=True)
+        # gzip would date its tiles to the second
+        time.sleep(1.1)
+    first = (tmp_path / "first.fits").read_bytes()
+    assert first == (tmp_path / "second.fits").read_bytes()
+    np.testing.assert_array_equal(read_image(tmp_path / "whole.fits").data, image.data)
+    back, again = read_image(tmp_path / "first.fits", planes=["dq"])
+    np.testing.assert_array_equal(again, flags)
+    # 32 bits as JWST has them, our own beside
+    with fits.open(tmp_path / "first.fits") as hdus:
+        assert [hdu.name for hdu in hdus[1:]] == ["SCI", "ERR", "MASK", "DQ", "DQ_OWN"]
+        assert hdus["DQ"].data.dtype.newbyteorder("=") == np.uint32
+    np.testing.assert_array_equal(back.mask, image.mask)
+    np.testing.assert_array_equal(np.isnan(back.data), np.isnan(image.data))
+    assert np.all(back.data[70:75] == 0)
+    error, good = image.uncertainty.array, ~image.mask
+    change = (back.data - image.data)[good]
+    assert np.max(np.abs(change)) <= 1.001 * np.median(error[good]) / 2048
+    # an aperture of any size and place: below 1e-3 of its error
+    sums = np.where(good, back.data - image.data, 0).reshape(12, 10, 9, 10).sum(axis=(1, 3))
+    assert np.all(np.abs(sums) < 1e-3 * np.median(error[good]) * 10)
+    np.testing.assert_allclose(back.uncertainty.array[good], error[good], rtol=7e-4)
+
+
+@pytest.mark.parametrize("odd", [np.inf, 1e12, None])
+def test_what_steps_cannot_hold_keeps_every_bit(tmp_path, odd):
+    image = noise_image()
+    if odd is None:
+        image.uncertainty = None
+    else:
+        image.data[1, 1] = odd
+    write_image(image, tmp_path / "image.fits", rounded=True)
+    np.testing.assert_array_equal(read_image(tmp_path / "image.fits").data, image.data)
+
+
+def test_compressed_images_are_read_by_astropy(tmp_path):
+    image = noise_image()
+    write_image(image, tmp_path / "image.fits", rounded=True)
+    back = CCDData.read(tmp_path / "image.fits", hdu="SCI", hdu_uncertainty="ERR", hdu_mask="MASK")
+    np.testing.assert_array_equal(back.mask, image.mask)
+    np.testing.assert_array_equal(back.data, read_image(tmp_path / "image.fits").data)
+    assert back.unit == image.unit

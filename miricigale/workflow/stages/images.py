@@ -132,7 +132,7 @@ def _sky_plan(config, unit):
 @stage(
     "exposures",
     "exposure",
-    version=5,
+    version=6,
     needs={"truth": of_truth},
     sections=(*IMAGES, "run.keep_level1b"),
     resources=EXPOSURE_RESOURCES,
@@ -166,8 +166,9 @@ def make_exposure(context, unit):
         tell=tell,
         keep=keep if config.run.keep_level1b else None,
     )
-    for label, image in (("rate", rate), ("cal", cal)):
-        context.save_image(f"{truth}/exposures/{name}_{label}.fits", image, dq=image.flags)
+    context.save_image(f"{truth}/exposures/{name}_cal.fits", cal, dq=cal.flags)
+    if config.run.keep_level1b:
+        context.save_image(f"{truth}/exposures/{name}_rate.fits", rate, dq=rate.flags)
 
 
 @stage(
