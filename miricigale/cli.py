@@ -1,6 +1,7 @@
 """The command line: a thin layer over the workflow and the classes."""
 
 import argparse
+import dataclasses
 import logging
 import os
 import shutil
@@ -28,6 +29,11 @@ def _parser():
     run.add_argument("-o", "--output", type=Path, help="folder (default: the name of the run)")
     run.add_argument("--keep-level1b", action="store_true", help="keep the level-1b files")
     run.add_argument("--threads", type=int, help="threads (default: all cores)")
+    run.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="work on the workers of this dask scheduler, such as tcp://host:8786, on a shared folder",
+    )
     run.add_argument("--seed", type=int, help="seed of every random draw")
     run.add_argument(
         "--redo",
@@ -261,6 +267,7 @@ def _run(args):
     from miricigale.utils.exceptions import OtherResultsError
     from miricigale.utils.parallel import process_pool, thread_count
     from miricigale.workflow import load_config, run_study
+    from miricigale.workflow.cluster import cluster_executor
     from miricigale.workflow.options import read_setting
 
     options = _chosen(args, "threads seed") | {"keep_level1b": args.keep_level1b or None}
@@ -274,10 +281,19 @@ def _run(args):
     folder = args.output or Path(config.run.name)
     begin = time.monotonic()
     options = _chosen(args, "redo until again") | {"progress_bar": not args.no_progress}
-    n_processes = thread_count(config.run.threads or None)
     try:
-        with process_pool(n_processes) as executor:
-            report = run_study(config, folder, executor=executor, **options)
+        if args.scheduler is None:
+            with process_pool(thread_count(config.run.threads or None)) as executor:
+                report = run_study(config, folder, executor=executor, **options)
+        else:
+            with cluster_executor(args.scheduler) as (executor, n_threads, memory):
+                limits = dataclasses.replace(
+                    config.run,
+                    threads=config.run.threads or n_threads,
+                    memory=config.run.memory or 0.5 * memory,
+                )
+                config = dataclasses.replace(config, run=limits)
+                report = run_study(config, folder, executor=executor, **options)
     except OtherResultsError as err:
         # name the option of this command instead of the argument
         raise OtherResultsError(err.reason, "--redo to replace it") from err

@@ -350,7 +350,8 @@ class StudyRunner:
             return submit(
                 run_unit,
                 self.config,
-                self.folder,
+                # workers elsewhere have another working directory
+                self.folder.absolute(),
                 self._source,
                 stage.name,
                 job.unit,

@@ -1,9 +1,14 @@
 """A study of small stages, run as a script: what is killed and compared in the tests."""
 
+import contextlib
+import os
+import signal
 import sys
 import time
+from pathlib import Path
 
 from miricigale.utils.parallel import process_pool
+from miricigale.workflow.cluster import cluster_executor
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.runner import StudyRunner
 from miricigale.workflow.stage import Stage
@@ -11,6 +16,11 @@ from miricigale.workflow.stage import Stage
 
 def first(context, unit):
     time.sleep(0.05)
+    # deaths of the process that does unit c, as many as the file beside the folder says
+    deaths = Path(f"{context.products.folder}.deaths")
+    if unit == "c" and deaths.is_file() and (left := int(deaths.read_text())):
+        deaths.write_text(str(left - 1))
+        context.save("c/0.txt", lambda path: os.kill(os.getpid(), signal.SIGKILL))
     for k in range(3):
         context.save(f"{unit}/{k}.txt", lambda path, k=k: path.write_text(f"{unit} {k}" * 1000))
 
@@ -28,11 +38,26 @@ def stages():
     )
 
 
-def main(folder, n_processes):
+def main(folder, n_processes, *, cluster=False):
     config = StudyConfig.from_dict({"run": {"threads": n_processes}})
-    with process_pool(n_processes) as executor:
+    with on_cluster(n_processes) if cluster else process_pool(n_processes) as executor:
         StudyRunner(config, folder, stages, executor=executor).run()
 
 
+@contextlib.contextmanager
+def on_cluster(n_workers):
+    from distributed import LocalCluster
+
+    with (
+        LocalCluster(
+            n_workers=n_workers, threads_per_worker=1, dashboard_address=None, memory_limit="1GB"
+        ) as cluster,
+        cluster_executor(cluster.scheduler_address) as (executor, n_threads, memory),
+    ):
+        assert n_threads == n_workers
+        assert abs(memory - n_workers) < 1e-3
+        yield executor
+
+
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]))
+    main(sys.argv[1], int(sys.argv[2]), cluster=len(sys.argv) > 3)

@@ -1,0 +1,60 @@
+"""Units on the workers of dask: the same bytes, also where workers die."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from miricigale.cli import main
+
+TOY = Path(__file__).with_name("toy_study.py")
+
+
+def run(folder, *arguments):
+    """Status, messages and products of a toy study."""
+    pytest.importorskip("distributed", reason="dask.distributed is not installed")
+    done = subprocess.run(
+        [sys.executable, TOY, folder, "2", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    products = {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*.txt")
+        if ".partial-" not in path.name
+    }
+    return done.returncode, done.stderr, products
+
+
+def test_workers_that_die_are_replaced_or_named_and_the_run_goes_on(tmp_path):
+    status, message, whole = run(tmp_path / "processes")
+    assert status == 0, message
+    # one worker dies
+    (tmp_path / "one.deaths").write_text("1")
+    status, message, products = run(tmp_path / "one", "cluster")
+    assert status == 0, message
+    assert (tmp_path / "one.deaths").read_text() == "0"
+    assert products == whole
+    # every worker that does the unit dies
+    (tmp_path / "all.deaths").write_text("4")
+    status, message, products = run(tmp_path / "all", "cluster")
+    assert status != 0
+    assert (tmp_path / "all.deaths").read_text() == "0"
+    assert "4 workers of tcp://" in message
+    assert "died over one unit" in message
+    assert "the same command goes on" in message
+    assert products.items() < whole.items()
+    assert "c/0.txt" not in products
+    status, message, products = run(tmp_path / "all", "cluster")
+    assert status == 0, message
+    assert products == whole
+
+
+def test_a_scheduler_that_is_none_is_named(tmp_path, capsys):
+    pytest.importorskip("distributed", reason="dask.distributed is not installed")
+    command = ["run", "goodss", "--quick", "-o", str(tmp_path / "run"), "--scheduler", "nowhere"]
+    assert main([*command, "--no-progress"]) == 2
+    assert "there is no dask scheduler at 'nowhere'" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
