@@ -58,7 +58,6 @@ FLAGS = {
     },
     sections=(
         "run.name",
-        "sed.frac_agn",
         "exposures.filters",
         "highres.filter",
         "highres.pixel_scale",
