@@ -1,8 +1,9 @@
 """Depths and errors of bands that surveys have beside MIRI's."""
 
+import math
 import types
 
-__all__ = ["YANG2021_DEPTHS", "fractional_error"]
+__all__ = ["HERSCHEL_DEPTHS", "YANG2021_DEPTHS", "fractional_error"]
 
 #: 5-sigma AB depths of 15 bands of CANDELS/EGS like the paper's (after Stefanon 2017 and FIDEL): the
 #: paper states none.
@@ -13,6 +14,22 @@ YANG2021_DEPTHS = types.MappingProxyType(
         "irac.ch1": 23.9, "irac.ch2": 24.2, "irac.ch3": 22.5, "irac.ch4": 22.8, "mips.24": 19.3,
     }
 )  # fmt: skip
+
+#: 5-sigma AB depths of deep surveys of GOODS fields by Herschel, from 3-sigma depths in mJy: 0.6 and 1.3 with PACS
+#: (Magnelli et al. 2013, A&A 553, A132, abstract); 5.7, 7.2 and 9.0 with SPIRE (Elbaz et al. 2011,
+#: A&A 533, A119 [?], quoted from memory), at which confusion counts.
+HERSCHEL_DEPTHS = types.MappingProxyType(
+    {
+        name: round(16.4 - 2.5 * math.log10(depth * 5 / 3), 2)
+        for name, depth in (
+            ("sedpy.herschel_pacs_100", 0.6),
+            ("sedpy.herschel_pacs_160", 1.3),
+            ("sedpy.herschel_spire_250", 5.7),
+            ("sedpy.herschel_spire_350", 7.2),
+            ("sedpy.herschel_spire_500", 9.0),
+        )
+    }
+)
 
 
 def fractional_error(name):

@@ -18,7 +18,15 @@ from miricigale.workflow.options import (
 )
 from miricigale.workflow.options import option as _option
 from miricigale.workflow.options import require as _require
-from miricigale.workflow.truths import ALL, EFFECTS, FIELD, NEEDS_AGN, SETS, perturbed_values
+from miricigale.workflow.truths import (
+    ALL,
+    EFFECTS,
+    EXPERIMENTS,
+    FIELD,
+    NEEDS_AGN,
+    SETS,
+    perturbed_values,
+)
 
 __all__ = ["StudyConfig", "load_config", "present_names", "preset_names"]
 
@@ -215,6 +223,9 @@ class FitSection:
         "Sets of the MIRI bands that are fitted with the existing ones.",
         choices=SETS,
     )
+    experiments: tuple[str, ...] = _option(
+        (), "Further fits of each sample with all MIRI bands.", choices=EXPERIMENTS
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -314,6 +325,7 @@ class StudyConfig:
         for section, key, values in (
             ("sed", "frac_agn", list(self.sed.frac_agn)),
             ("fit", "sets", list(fit.sets)),
+            ("fit", "experiments", list(fit.experiments)),
             ("perturb", "effects", list(self.perturb.effects)),
             ("perturb", "of", list(self.perturb.of)),
         ):

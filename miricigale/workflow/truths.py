@@ -7,6 +7,7 @@ from miricigale.filters import Filter
 __all__ = [
     "ALL",
     "EFFECTS",
+    "EXPERIMENTS",
     "FIELD",
     "NEEDS_AGN",
     "SETS",
@@ -21,6 +22,8 @@ __all__ = [
 
 #: Sets of MIRI bands that join the existing ones in a fit: Yang et al. 2021, section 4.
 SETS = ("all", "none", "blue", "red")
+#: Further fits of each sample.
+EXPERIMENTS = ("free_agn", "far_infrared", "no_model_error", "known_redshift", "samplers")
 #: In place of a fracAGN: AGN as in a real field.
 FIELD = "field"
 #: In what the sky may differ from what the analysis takes it for: see the section [perturb].

@@ -304,7 +304,7 @@ def test_a_stage_is_declared_beside_its_function():
     assert make.function(1, 2) == (1, 2)
     names = [one.name for one in study_stages()]
     assert names[:3] == ["catalog", "seds", "truth"]
-    assert len(set(names)) == len(names) == 16
+    assert len(set(names)) == len(names) == 17
 
 
 def test_a_unit_depends_on_the_units_that_it_reads_only(tmp_path):

@@ -12,6 +12,7 @@ def study_stages():
     stages : tuple of `~miricigale.workflow.stage.Stage`
     """
     from miricigale.workflow.stages import (
+        experiments,
         fits,
         images,
         inputs,
@@ -38,6 +39,7 @@ def study_stages():
         fits.match_sources,
         rivals.measure_rivals,
         fits.fit_photometry,
+        experiments.fit_experiment,
         sources.make_sources,
         report.make_report,
     )

@@ -16,6 +16,7 @@ from miricigale.workflow.stage import stage
 from miricigale.workflow.stages import (
     comparison,
     conditions,
+    experiments,
     figures,
     perturbed,
     pictures,
@@ -51,6 +52,7 @@ log = logging.getLogger(__name__)
         "matches",
         "rivals",
         "fits",
+        "experiments",
     ),
     sections=(
         *GRID,
@@ -116,6 +118,7 @@ def make_report(context, _):
     study = comparison.study_results(config, known, {name: every[name] for name in known}, metrics)
     study.extra.update(rivals.source_extractor_numbers(others, context.seed))
     comparison.write_truths(context, report, study, metrics, FIT_COLUMNS)
+    experiments.write_experiments(context, report, {name: every[name] for name in known})
     comparison.write_comparison(context, report, study, metrics["as_paper"])
     perturbed.write_perturbed(context, report, truths, every)
     writer.inputs()

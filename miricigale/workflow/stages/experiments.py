@@ -1,0 +1,374 @@
+"""Further fits of the samples of a study: freed AGN, far infrared, samplers, without model error."""
+
+import importlib.util
+from concurrent.futures import ThreadPoolExecutor
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+from scipy import stats
+
+from miricigale import fitting, photometry, sed
+from miricigale.evaluation import (
+    fraction_interval,
+    number,
+    photoz_metrics,
+    posterior_ranks,
+    recovery_metrics,
+)
+from miricigale.photometry.surveys import HERSCHEL_DEPTHS
+from miricigale.utils.tables import described_rows
+from miricigale.workflow.stage import stage
+from miricigale.workflow.stages.fits import mock_photometry
+from miricigale.workflow.stages.inputs import sed_resources
+from miricigale.workflow.truths import of_truth, study_truths
+
+__all__ = [
+    "experiment_axes",
+    "experiment_numbers",
+    "experiment_units",
+    "far_infrared_photometry",
+    "fit_experiment",
+    "read_experiments",
+    "write_experiments",
+]
+
+#: Names on the page.
+LABELS = {
+    "study": "as in the study",
+    "free_agn": "torus freed",
+    "far_infrared": "with far infrared",
+    "no_model_error": "without model error",
+    "known_redshift": "redshifts known",
+    "samplers": "nested sampler",
+}
+#: Most sources of each truth that are fitted with a freed torus.
+N_FREE = 100
+#: Sources of all truths together that are fitted by a sampler, and its settings.
+N_SAMPLED = 20
+SAMPLER_OPTIONS = {"n_live": 200, "n_effective": 1000, "max_calls": 60_000}
+#: Samplers in the order of preference.
+SAMPLERS = ("nautilus", "dynesty")
+#: Parameters whose posteriors are ranked, and compared between a sampler and the grid.
+RANKED = ("redshift", "frac_agn")
+#: What Yang et al. 2021 fix, freed; the fixed values (70 deg, 1, 1) are nodes or within. To stay below
+#: a hundred million models the other axes of the AGN are thinner than in the study.
+_FREED = {"inclination": (60.0, 70.0, 90.0), "p": (0.0, 1.0), "q": (0.0, 1.0)}
+_THINNER = {
+    "tau97": (3.0, 7.0, 11.0),
+    "ebv_polar": (0.0, 0.1, 0.3),
+    "temperature_polar": (100.0, 300.0),
+}
+
+
+def experiment_units(config):
+    """Names of the experiments, ``<truth>/<experiment>``, of the truths without perturbations."""
+    return tuple(f"{of}/{name}" for of in _truths(config) for name in config.fit.experiments)
+
+
+def _truths(config):
+    return [name for name, truth in study_truths(config).items() if not truth.perturbations]
+
+
+def experiment_axes(name, kind):
+    """Axes of the grid of an experiment; ``kind`` is that of the fits of the study."""
+    axes = sed.SEDModel.yang2021_axes(kind)
+    if name != "free_agn":
+        return axes
+    thinner = _THINNER if kind == "fit" else {}
+    return axes | {key: np.array(values) for key, values in {**thinner, **_FREED}.items()}
+
+
+def _experiment_plan(config, unit):
+    """What an experiment takes from the package, for hashing."""
+    name = unit.partition("/")[2]
+    axes = experiment_axes(name, config.fit.axes)
+    plan = {"axes": {key: list(values) for key, values in axes.items()}}
+    if name == "free_agn":
+        plan["n"] = N_FREE
+    elif name == "samplers":
+        plan |= {"n": -(-N_SAMPLED // len(_truths(config))), "options": dict(SAMPLER_OPTIONS)}
+        plan["sampler"] = _sampler()
+    elif name == "far_infrared":
+        plan["depths"] = dict(HERSCHEL_DEPTHS)
+    return plan
+
+
+def _sampler():
+    """The sampler that is installed; None without one."""
+    return next((name for name in SAMPLERS if importlib.util.find_spec(name)), None)
+
+
+def far_infrared_photometry(sample, *, seed):
+    """
+    Mock photometry of sources in the bands of Herschel, with the depths of `HERSCHEL_DEPTHS`.
+
+    ``sample`` has the parameters of the model and ``id``; errors are depth / 5 and 10 % of the flux.
+    """
+    model, bands = sed.SEDModel.yang2021(), list(HERSCHEL_DEPTHS)
+    known = [name for name in sample.colnames if name in model.parameters]
+    light = model.fluxes(sample["id", *known], bands)
+    errors = photometry.ErrorModel.from_depths(
+        dict(HERSCHEL_DEPTHS), fractional=dict.fromkeys(bands, 0.1)
+    )
+    light["id"] = sample["id"]
+    return errors.perturb(light["id", *bands], seed=seed)
+
+
+@stage(
+    "experiments",
+    "further fit",
+    needs={"truth": of_truth, "matches": of_truth},
+    sections=(
+        "fit.bands",
+        "fit.depths",
+        "fit.axes",
+        "fit.model_error",
+        "exposures.filters",
+    ),
+    resources=sed_resources,
+    plan=_experiment_plan,
+    units=experiment_units,
+    kernels=("fit",),
+)
+def fit_experiment(context, unit):
+    """Fit the sample of a truth, with all MIRI bands, in another way than the study does."""
+    config, plan = context.config, context.plan
+    of, name = unit.split("/")
+    truth = QTable.read(context.path(f"{of}/truth.ecsv"))
+    matched = QTable.read(context.path(f"{of}/matched.ecsv"))
+    sample = truth[np.asarray(matched["selection"]) == 0]
+    mock = mock_photometry(config, truth, matched, seed=context.seed)
+    bands = [*config.fit.bands, *config.exposures.filters]
+    options = {"axes": {key: np.array(values) for key, values in plan["axes"].items()}}
+    given = {}
+    if "n" in plan and len(mock) > plan["n"]:
+        rows = np.linspace(0, len(mock) - 1, plan["n"]).round().astype(int)
+        mock, sample = mock[rows], sample[rows]
+    if name == "far_infrared":
+        light = far_infrared_photometry(sample, seed=context.seed)
+        bands += list(HERSCHEL_DEPTHS)
+        for column in light.colnames:
+            mock[column] = light[column]
+    elif name == "known_redshift":
+        given["redshift"] = np.asarray(sample["redshift"], float)
+    elif name == "samplers":
+        if plan["sampler"] is None:
+            left = QTable({"id": sample["id"][:0]}, meta={"left_out": _NO_SAMPLER})
+            context.save_table(f"{of}/experiments/{name}.ecsv", left)
+            return
+        options = {
+            "engine": plan["sampler"],
+            "priors": sampler_priors(options["axes"]),
+            **plan["options"],
+        }
+        given["seed"] = context.seed
+    model_error = 0.0 if name == "no_model_error" else config.fit.model_error
+    fitter = fitting.BayesFitter(sed.SEDModel.yang2021(), bands, model_error=model_error, **options)
+    with ThreadPoolExecutor(context.n_threads) as executor:
+        # samplers are Python: threads gain nothing
+        given["executor"] = None if name == "samplers" else executor
+        results = fitter.fit(mock, progress_bar=context.progress_bar, **given)
+    context.save_result(f"{of}/experiments/{name}.fits", results)
+    table = _ranked(results, sample, context.seed)
+    context.save_table(f"{of}/experiments/{name}.ecsv", table)
+
+
+_NO_SAMPLER = "Neither nautilus nor dynesty is installed (pip install nautilus-sampler)."
+
+
+def sampler_priors(axes):
+    """
+    Continuous priors over the axes of a grid, as flat as its nodes are dense.
+
+    In ln(1 + z), and in the logarithm of tau; flat in all others.
+    """
+    priors = {name: (values[0], values[-1]) for name, values in axes.items()}
+    priors["tau"] = (*priors["tau"], "log")
+    low, high = priors["redshift"]
+    priors["redshift"] = stats.loguniform(1 + low, 1 + high, loc=-1)
+    return priors
+
+
+def _ranked(results, sample, seed):
+    """The table of results with the ranks of the true values (``<name>_rank``), for coverage."""
+    table = results.to_table()
+    for name in RANKED:
+        rank = np.full(len(table), np.nan)
+        if len(table) and not (name == "redshift" and results.redshift_fixed):
+            values, levels = results.cdf(name)
+            true = u.Quantity(sample[name]).to_value(values.unit)
+            rank = posterior_ranks(true, values.value, levels, seed=seed)
+        table[f"{name}_rank"] = rank
+        table[f"{name}_rank"].info.description = "Rank of the true value in the posterior"
+    return table
+
+
+def read_experiments(context, truths):
+    """Tables of the stage, by truth and name."""
+    return {
+        (of, name): QTable.read(context.path(f"{of}/experiments/{name}.ecsv"))
+        for of in truths
+        for name in context.config.fit.experiments
+    }
+
+
+def experiment_numbers(sample, table):
+    """
+    How well the sources of a table of fits are recovered.
+
+    Parameters
+    ----------
+    sample : `~astropy.table.QTable`
+        The truth, with at least the sources of the table.
+    table : `~astropy.table.QTable`
+        Of the stage, or of the fits of the study with ranks.
+
+    Returns
+    -------
+    numbers : dict of str to float
+        ``n``; ``photoz_sigma_mad`` and ``photoz_outliers`` (NaN where redshifts were known);
+        ``frac_agn_bias``, ``frac_agn_sigma_mad`` and ``frac_agn_width`` (median posterior width);
+        ``power_bias`` and ``power_sigma_mad`` in dex of sources with an AGN; ``redshift_coverage`` and
+        ``frac_agn_coverage``, shares of true values in the central 68 %.
+    """
+    place = {key: row for row, key in enumerate(np.asarray(sample["id"]))}
+    true = sample[[place[key] for key in np.asarray(table["id"])]]
+    photoz = photoz_metrics(true["redshift"], table["redshift_mean"])
+    known = not np.isfinite(table["redshift_rank"]).any()
+    fraction = recovery_metrics(true["frac_agn"], table["frac_agn_mean"])
+    width = np.asarray(table["frac_agn_std"], float)
+    power = np.full(len(true), np.nan)
+    if "accretion_power" in true.colnames and "accretion_power_mean" in table.colnames:
+        unit = table["accretion_power_mean"].unit
+        truth = true["accretion_power"].to_value(unit)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            power = np.log10(
+                table["accretion_power_mean"].value / np.where(truth > 0, truth, np.nan)
+            )
+    power = recovery_metrics(np.zeros(power.size), np.where(np.isfinite(power), power, np.nan))
+    found = {
+        "n": photoz.n,
+        "photoz_sigma_mad": np.nan if known else photoz.sigma_mad,
+        "photoz_outliers": np.nan if known else photoz.outlier_fraction,
+        "frac_agn_bias": fraction.median,
+        "frac_agn_sigma_mad": fraction.sigma_mad,
+        "frac_agn_width": float(np.nanmedian(width)) if np.isfinite(width).any() else np.nan,
+        "power_bias": power.median,
+        "power_sigma_mad": power.sigma_mad,
+    }
+    for name in RANKED:
+        rank = np.asarray(table[f"{name}_rank"], float)
+        rank = rank[np.isfinite(rank)]
+        inside = np.count_nonzero(np.abs(rank - 0.5) <= 0.34)
+        found[f"{name}_coverage"] = fraction_interval(inside, rank.size)[0]
+    return found
+
+
+def _sampler_numbers(grid, sampled):
+    """Means of a sampler minus those of the grid in units of its widths, and widths over widths."""
+    found = []
+    for name in RANKED:
+        width = np.asarray(grid[f"{name}_std"], float)
+        shift = np.asarray(sampled[f"{name}_mean"] - grid[f"{name}_mean"], float) / width
+        ratio = np.asarray(sampled[f"{name}_std"], float) / width
+        found += [np.nanmedian(np.abs(shift)), np.nanmax(np.abs(shift)), np.nanmedian(ratio)]
+    return found
+
+
+def write_experiments(context, report, every):
+    """
+    The section on the further fits; ``every`` are the ``StudyTables`` of all truths by name.
+
+    Each is held against the fit of the study with all bands of the same sources.
+    """
+    names = context.config.fit.experiments
+    if not names:
+        return
+    tables, rows, pairs, left = read_experiments(context, every), [], [], {}
+    for of, study in every.items():
+        own = _ranked(study.results["all"], study.sample, context.seed)
+        place = {key: row for row, key in enumerate(np.asarray(own["id"]))}
+        rows.append((of, "study", len(own), experiment_numbers(study.sample, own)))
+        for name in names:
+            table = tables[of, name]
+            if "left_out" in table.meta:
+                left[name] = table.meta["left_out"]
+                continue
+            if 0 < len(table) < len(own):
+                same = own[[place[key] for key in np.asarray(table["id"])]]
+                found = experiment_numbers(study.sample, same)
+                rows.append((of, "study", len(table), found))
+            found = experiment_numbers(study.sample, table)
+            rows.append((of, name, len(table), found))
+            if name == "samplers" and len(table):
+                same = own[[place[key] for key in np.asarray(table["id"])]]
+                pairs.append((of, len(table), *_sampler_numbers(same, table)))
+    _save_numbers(context, rows)
+    report.section(
+        "Further fits",
+        "The same photometry with all MIRI bands fitted in other ways, beside the fit of the study. "
+        f"{_told(names)}",
+    )
+    none, fixed = "no such source", "redshifts were given"
+    report.table(
+        [
+            (
+                of,
+                LABELS[name],
+                n,
+                number(x["photoz_sigma_mad"], ".4f", fixed if n else none),
+                number(x["photoz_outliers"], "{:.1f} %", fixed if n else none, scale=100),
+                number(x["frac_agn_bias"], "+.3f", none),
+                number(x["frac_agn_sigma_mad"], ".3f", none),
+                number(x["frac_agn_width"], ".3f", none),
+                number(x["power_bias"], "+.2f", "no source with an AGN"),
+                number(x["power_sigma_mad"], ".2f", "no source with an AGN"),
+                number(x["redshift_coverage"], "{:.0f} %", fixed if n else none, scale=100),
+                number(x["frac_agn_coverage"], "{:.0f} %", none, scale=100),
+            )
+            for of, name, n, x in rows
+        ],
+        header=("sky", "fit", "sources", "z sigma_MAD", "outliers", "fracAGN offset", "scatter",
+                "width", "accretion power offset (dex)", "scatter", "z in 68 %", "fracAGN in 68 %"),
+        caption="Redshift, AGN fraction and accretion power against truth, and shares of the true values in the "
+        "central 68 % of their posteriors; where an experiment has a part of the sample, the fit of the "
+        "study of the same sources stands above it",
+        text=2,
+    )  # fmt: skip
+    if pairs:
+        report.table(
+            [(of, n, *(f"{value:.2f}" for value in values)) for of, n, *values in pairs],
+            header=("sky", "sources", "z: median", "largest", "widths",
+                    "fracAGN: median", "largest", "widths"),
+            caption="Nested sampler with continuous parameters against the grid: absolute difference of the "
+            "means in units of the grid's posterior width, median and largest, and median ratio of the widths",
+        )  # fmt: skip
+    for name, why in left.items():
+        report.text(f"Left out: {LABELS[name]}. {why}")
+
+
+def _told(names):
+    """What the experiments are, in sentences."""
+    sentences = {
+        "free_agn": (
+            "Torus freed: inclination, p and q, which Yang et al. fix, have axes of their own (the other axes "
+            f"of the AGN are thinner), for up to {N_FREE} sources of each sky."
+        ),
+        "far_infrared": (
+            "With far infrared: mock fluxes at 100, 160, 250, 350 and 500 µm, to the depths of deep "
+            "Herschel surveys."
+        ),
+        "no_model_error": "Without model error: no relative error is added to the fluxes.",
+        "known_redshift": "Redshifts known: those of the truth are given to the fit.",
+        "samplers": "Nested sampler: parameters are continuous, in place of the nodes of the grid.",
+    }
+    return " ".join(sentences[name] for name in names)
+
+
+def _save_numbers(context, rows):
+    """All numbers as a table of the report."""
+    texts = {"truth": "Sky", "experiment": "Fit", "n_sources": "Sources"}
+    texts |= {key: key.replace("_", " ") for key in rows[0][3]}
+    table = described_rows([(*row[:3], *row[3].values()) for row in rows], texts)
+    context.save_table("report/experiments.ecsv", table)

@@ -1,0 +1,251 @@
+"""Further fits of a sample: each does what it says, on the same sources as the study."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+from numpy.testing import assert_allclose
+
+from miricigale.evaluation import Report
+from miricigale.fitting import FitResults
+from miricigale.sed import SEDModel
+from miricigale.utils.exceptions import ConfigError
+from miricigale.workflow import Context
+from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.stages import experiments, study_stages
+from miricigale.workflow.stages.metrics import StudyTables
+from miricigale.workflow.truths import EXPERIMENTS
+
+STAGES = {stage.name: stage for stage in study_stages()}
+FILTERS = ["miri.f770w", "miri.f1500w", "miri.f2100w"]
+FAST = ("far_infrared", "no_model_error", "known_redshift", "free_agn")
+#: Sources, one of which is not in the sample.
+N = 13
+
+
+def config_of(*names, frac_agn=(0.4,)):
+    return StudyConfig.from_dict(
+        {
+            "exposures": {"filters": FILTERS},
+            "sed": {"frac_agn": list(frac_agn)},
+            "fit": {
+                "bands": [
+                    "megacam.r",
+                    "acs.f814w",
+                    "wfc3.f160w",
+                    "irac.ch1",
+                    "irac.ch2",
+                    "mips.24",
+                ],
+                "depths": [27.2, 28.2, 27.6, 23.9, 24.2, 19.3],
+                "axes": "quick",
+                "experiments": list(names),
+            },
+        }
+    )
+
+
+def do(config, folder, name, unit):
+    STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    rng = np.random.default_rng(2)
+    table = QTable({"id": np.arange(1, N + 1), "redshift": np.linspace(0.5, 2.3, N)})
+    table["mass"] = np.geomspace(5e10, 2e11, N) * u.Msun
+    table["tau"], table["age"], table["ebv"], table["alpha"] = 1.0, 1.0, 0.3, 1.5
+    table["frac_agn"] = 0.4
+    table["p"], table["q"] = rng.choice([0.0, 0.5, 1.0], (2, N))
+    config = config_of()
+    light = SEDModel.yang2021().fluxes(table, [*config.fit.bands, *FILTERS])
+    for name in light.colnames:
+        if name not in table.colnames:
+            table[name] = light[name]
+    return table
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, truth):
+    folder = tmp_path_factory.mktemp("experiments")
+    config, rng = config_of(*FAST), np.random.default_rng(1)
+    made = Context(config, folder)
+    matched = truth["id",]
+    matched["selection"] = np.where(np.arange(N) == 5, 16, 0)
+    for name in FILTERS:
+        error = 0.03 * truth[name] + 0.2 * u.uJy
+        matched[f"{name}_err"], matched[f"{name}_condition"] = error, 0
+        matched[name] = truth[name] + rng.normal(size=N) * error
+    made.save_table("agn40/truth.ecsv", truth)
+    made.save_table("agn40/matched.ecsv", matched)
+    do(config, folder, "fits", "agn40/all")
+    for unit in STAGES["experiments"].unit_names(config):
+        do(config, folder, "experiments", unit)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(folder):
+    """Tables of the experiments, and of the fit of the study."""
+    tables = {name: read(folder, name) for name in FAST}
+    return tables | {"study": QTable.read(folder / "agn40" / "fits_all.ecsv")}
+
+
+def read(folder, name):
+    return QTable.read(folder / "agn40" / "experiments" / f"{name}.ecsv")
+
+
+def tables_of(folder):
+    results = FitResults.read(folder / "agn40" / "fits_all.fits")
+    truth, matched = (
+        QTable.read(folder / "agn40" / f"{name}.ecsv") for name in ("truth", "matched")
+    )
+    return {"agn40": StudyTables(truth, matched, None, None, {"all": results}, {})}
+
+
+def test_all_fit_the_sample_of_the_study(found):
+    for table in found.values():
+        assert list(table["id"]) == [1, 2, 3, 4, 5, *range(7, N + 1)]
+
+
+@pytest.mark.parametrize("kind", ["fit", "quick"])
+def test_freed_axes_hold_the_fixed_values(kind):
+    study, freed = (experiments.experiment_axes(n, kind) for n in ("no_model_error", "free_agn"))
+    defaults = SEDModel.yang2021().defaults
+    for name in set(freed) - set(study):
+        assert defaults[name] in freed[name]
+        assert len(freed[name]) > 1
+    assert set(freed) - set(study) == {"inclination", "p", "q"}
+    for name in study:
+        assert set(freed[name]) <= set(study[name])
+    assert np.prod([len(values) for values in freed.values()]) < 1e8
+
+
+def test_a_freed_torus_has_posteriors_of_its_own(found):
+    table = found["free_agn"]
+    for name, low, high in (("inclination", 60, 90), ("p", 0, 1), ("q", 0, 1)):
+        mean = u.Quantity(table[f"{name}_mean"]).value
+        assert np.all((mean >= low) & (mean <= high))
+        assert np.all(u.Quantity(table[f"{name}_std"]).value > 0)
+        assert f"{name}_mean" not in found["study"].colnames
+
+
+def test_far_infrared_fluxes_are_of_the_truth_and_tell_the_dust(truth, found):
+    many = truth[np.zeros(2000, int)]
+    many["id"] = np.arange(2000)
+    mock = experiments.far_infrared_photometry(many, seed=1)
+    model = SEDModel.yang2021()
+    names = ["id", *(n for n in truth.colnames if n in model.parameters)]
+    for band, depth in experiments.HERSCHEL_DEPTHS.items():
+        light = model.fluxes(truth[names][:1], [band])[band][0].to_value(u.uJy)
+        sigma = np.hypot(10 ** (-0.4 * (depth - 23.9)) / 5, 0.1 * light)
+        assert_allclose(np.mean(mock[band].value), light, atol=5 * sigma / np.sqrt(2000))
+        assert_allclose(np.std(mock[band].value), sigma, rtol=0.1)
+    # 3 sigma of Magnelli et al. 2013 are 0.6 mJy
+    limit = 10 ** (-0.4 * (experiments.HERSCHEL_DEPTHS["sedpy.herschel_pacs_100"] - 23.9))
+    assert_allclose(limit * 3 / 5, 600, rtol=0.01)
+    width = [
+        np.median(found[n]["dust_luminosity_std"] / found[n]["dust_luminosity_mean"])
+        for n in ("far_infrared", "study")
+    ]
+    assert width[0] < width[1]
+
+
+def test_without_model_error_posteriors_are_narrower(found):
+    for name in ("redshift_std", "frac_agn_std"):
+        assert np.median(found["no_model_error"][name]) < np.median(found["study"][name])
+
+
+def test_known_redshifts_are_those_of_the_truth(truth, found):
+    table = found["known_redshift"]
+    true = np.asarray(truth["redshift"])[np.asarray(table["id"]) - 1]
+    # nodes of the quick grid are 0.06 in ln(1 + z) apart
+    assert np.all(np.abs(np.log((1 + table["redshift_mean"]) / (1 + true))) <= 0.0301)
+    assert np.all(np.isnan(table["redshift_rank"]))
+    numbers = experiments.experiment_numbers(truth, table)
+    assert np.isnan(numbers["photoz_sigma_mad"])
+    assert np.isfinite(numbers["frac_agn_sigma_mad"])
+
+
+def test_numbers_of_perfect_fits(truth):
+    table = truth["id", "redshift"]
+    table["redshift_mean"], table["frac_agn_mean"] = truth["redshift"], truth["frac_agn"] + 0.1
+    table["frac_agn_std"] = 0.05
+    table["accretion_power_mean"] = truth["accretion_power"] * 10**0.2
+    table["redshift_rank"], table["frac_agn_rank"] = 0.5, 0.9
+    # the order of the sources does not matter
+    numbers = experiments.experiment_numbers(truth[::-1], table)
+    wanted = {"n": N, "photoz_sigma_mad": 0, "photoz_outliers": 0, "frac_agn_bias": 0.1,
+              "frac_agn_sigma_mad": 0, "frac_agn_width": 0.05, "power_bias": 0.2,
+              "power_sigma_mad": 0, "redshift_coverage": 1, "frac_agn_coverage": 0}  # fmt: skip
+    assert set(numbers) == set(wanted)
+    for name, value in wanted.items():
+        assert_allclose(numbers[name], value, atol=1e-9, err_msg=name)
+
+
+def test_the_section_of_the_page(folder):
+    context, report = Context(config_of(*FAST), folder), Report("made up")
+    experiments.write_experiments(context, report, tables_of(folder))
+    report.write(folder / "page.html")
+    page = (folder / "page.html").read_text()
+    for name in ("study", *FAST):
+        assert experiments.LABELS[name] in page
+    numbers = QTable.read(folder / "report" / "experiments.ecsv")
+    assert list(numbers["experiment"]) == ["study", *FAST]
+    assert np.all(numbers["n"] == N - 1)
+    report = Report("made up")
+    experiments.write_experiments(Context(config_of(), folder), report, tables_of(folder))
+    report.write(folder / "none.html")
+    assert "Further fits" not in (folder / "none.html").read_text()
+
+
+def test_without_a_sampler_there_is_a_sentence(folder, monkeypatch):
+    monkeypatch.setattr(experiments, "SAMPLERS", ("no_such_sampler",))
+    config = config_of("samplers")
+    do(config, folder, "experiments", "agn40/samplers")
+    assert len(read(folder, "samplers")) == 0
+    report = Report("made up")
+    experiments.write_experiments(Context(config, folder), report, tables_of(folder))
+    report.write(folder / "left.html")
+    assert "Neither nautilus nor dynesty is installed" in (folder / "left.html").read_text()
+
+
+def test_a_subset_is_spread_over_the_sample(folder, monkeypatch):
+    monkeypatch.setattr(experiments, "N_FREE", 3)
+    config = config_of("free_agn")
+    kept = read(folder, "free_agn")
+    do(config, folder, "experiments", "agn40/free_agn")
+    few = read(folder, "free_agn")
+    assert len(few) == 3
+    assert list(few["id"][[0, -1]]) == [1, N]
+    same = kept[np.isin(kept["id"], few["id"])]
+    assert_allclose(few["frac_agn_mean"], same["frac_agn_mean"], rtol=1e-6)
+    report = Report("made up")
+    experiments.write_experiments(Context(config, folder), report, tables_of(folder))
+    numbers = QTable.read(folder / "report" / "experiments.ecsv")
+    assert list(numbers["n_sources"]) == [N - 1, 3, 3]
+
+
+@pytest.mark.slow
+def test_a_sampler_agrees_with_the_grid(folder, monkeypatch):
+    pytest.importorskip("nautilus")
+    monkeypatch.setattr(experiments, "N_SAMPLED", 1)
+    options = {"n_live": 150, "n_effective": 300, "max_calls": 20_000}
+    monkeypatch.setattr(experiments, "SAMPLER_OPTIONS", options)
+    do(config_of("samplers"), folder, "experiments", "agn40/samplers")
+    (row,) = read(folder, "samplers")
+    (grid,) = QTable.read(folder / "agn40" / "fits_all.ecsv")[:1]
+    for name in ("redshift", "frac_agn"):
+        width = np.hypot(row[f"{name}_std"], grid[f"{name}_std"])
+        assert abs(row[f"{name}_mean"] - grid[f"{name}_mean"]) < width
+
+
+def test_experiments_are_chosen_by_name():
+    units = STAGES["experiments"].unit_names(config_of("samplers", "free_agn", frac_agn=(0.0, 0.4)))
+    assert units == ("agn00/samplers", "agn00/free_agn", "agn40/samplers", "agn40/free_agn")
+    assert STAGES["experiments"].unit_names(config_of()) == ()
+    with pytest.raises(ConfigError, match="experiments"):
+        config_of("free")
+    with pytest.raises(ConfigError, match="must not repeat"):
+        config_of("samplers", "samplers")
+    assert set(experiments.LABELS) == {"study", *EXPERIMENTS}
