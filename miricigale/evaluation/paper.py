@@ -67,10 +67,8 @@ class PublishedNumber:
     why: str = ""
 
 
-_ONE_FIELD = "another field and another random draw"
-_STATISTIC = (
-    "the paper's 5 sigma are 5 medians of absolute differences, 3.4 sigma of Gaussian errors"
-)
+#: Reason for which any number of a sample differs.
+ONE_FIELD = "another field and another random draw"
 _PRIOR = "an empty posterior centers on the mean of the prior"
 
 
@@ -78,19 +76,19 @@ def _detection():
     for limit, share in ((26.0, 0.53), (25.0, 0.75)):
         yield PublishedNumber(
             f"detected.{limit:g}", "detected_share", share, f"H < {limit:g}", "detection",
-            option=limit, why=f"{_ONE_FIELD}; {_STATISTIC}",
+            option=limit, why=ONE_FIELD,
             definition="sources of the field above 5 sigma of the error function in two or more bands",
         )  # fmt: skip
     for limit, share in ((26.0, 0.05), (25.0, 0.09)):
         yield PublishedNumber(
             f"mips.{limit:g}", "mips_share", share, f"H < {limit:g}", "detection",
-            option=(limit, "mips.24", 19.3), why=_ONE_FIELD,
+            option=(limit, "mips.24", 19.3), why=ONE_FIELD,
             definition="true flux at 24 µm above 19.3 AB, the depth of the mock photometry",
         )  # fmt: skip
     own = {"detected_catalog": (545, "detections on the F160W image"),
            "matched_catalog": (388 / 463, "share of the catalog matched within 1 arcsec")}  # fmt: skip
     for key, (value, text) in own.items():
-        yield PublishedNumber(key, "extra", value, text, "detection", why=_ONE_FIELD)
+        yield PublishedNumber(key, "extra", value, text, "detection", why=ONE_FIELD)
 
 
 def _limits():
@@ -107,7 +105,7 @@ def _limits():
             f"limit.{name}", "limit_offset", -0.95 if last else -1.0, name.upper(), "limits",
             relation="=" if last else ">", option=band,
             definition="limit where the error function, of the paper's statistic, is 0.217 mag",
-            why="the calculator has no residual of flat and sky; " + _STATISTIC,
+            why="the calculator allows for residuals of flat field and sky in its own way",
         )  # fmt: skip
 
 
@@ -125,22 +123,22 @@ def _photometry():
     )  # fmt: skip
     yield PublishedNumber(
         "share.n >= 2", "shape_share", 0.21, "n >= 2", "photometry", option="n >= 2",
-        why=_ONE_FIELD,
+        why=ONE_FIELD,
     )  # fmt: skip
     yield PublishedNumber(
         "share.crowded", "crowded_share", 0.15, "a neighbor within 2 arcsec brighter than m + 1",
-        "photometry", why=f"{_ONE_FIELD}; here crowded in any band",
+        "photometry", why=f"{ONE_FIELD}; here crowded in any band",
     )  # fmt: skip
     for name, scatter in (("crowded", 0.23), ("isolated", 0.17)):
         yield PublishedNumber(
             f"scatter.{name}", "magnitude_scatter", scatter, name, "photometry", option=name,
-            definition=shape, why=_ONE_FIELD,
+            definition=shape, why=ONE_FIELD,
         )  # fmt: skip
     for name, ratio in (("f1000w", 6.6), ("f1800w", 3.9)):
         yield PublishedNumber(
             f"snr.{name}", "signal_to_noise", ratio, name.upper(), "photometry",
             option=f"miri.{name}", definition="measured flux over the error function, fitted sample",
-            why=_STATISTIC,
+            why=ONE_FIELD,
         )  # fmt: skip
     rows = (
         ("f_scaling.f770w", 1.08, "=", "image scaling F770W",
@@ -153,9 +151,9 @@ def _photometry():
          "the paper's stamps are cut to 3 arcsec: 1.00 with whole ones"),
         ("points.offset", 0.02, "<", "largest median offset of bright points (mag)", ""),
         ("points.scatter", 0.02, "<", "largest scatter of bright points (mag)", ""),
-        ("source_extractor.detected", 379, "=", "Source Extractor, detections in F1500W", _ONE_FIELD),
-        ("source_extractor.matched", 177, "=", "Source Extractor, matched in F1500W", _ONE_FIELD),
-        ("source_extractor.missed", 0.53, "=", "Source Extractor, share missed in F1500W", _ONE_FIELD),
+        ("source_extractor.detected", 379, "=", "Source Extractor, detections in F1500W", ONE_FIELD),
+        ("source_extractor.matched", 177, "=", "Source Extractor, matched in F1500W", ONE_FIELD),
+        ("source_extractor.missed", 0.53, "=", "Source Extractor, share missed in F1500W", ONE_FIELD),
         ("source_extractor.offset", 0.05, "<", "Source Extractor - template fit (mag)", ""),
     )  # fmt: skip
     for key, value, relation, text, why in rows:
@@ -167,12 +165,12 @@ def _redshifts():
     for band_set, share in (("all", 0.015), ("none", 0.10), ("blue", 0.037), ("red", 0.059)):
         yield PublishedNumber(
             f"outliers.{band_set}", "z_outliers", share, _SETS[band_set], "redshifts",
-            band_set=band_set, definition=outliers, why=_ONE_FIELD,
+            band_set=band_set, definition=outliers, why=ONE_FIELD,
         )  # fmt: skip
     for band_set, scatter in (("blue", 0.029), ("red", 0.042)):
         yield PublishedNumber(
             f"z_scatter.{band_set}", "z_scatter", scatter, _SETS[band_set], "redshifts",
-            band_set=band_set, why=_ONE_FIELD,
+            band_set=band_set, why=ONE_FIELD,
         )  # fmt: skip
     yield PublishedNumber(
         "outlier_ratio", "z_outlier_ratio", 7.0, "six MIRI bands", "redshifts", relation="~",
@@ -180,7 +178,7 @@ def _redshifts():
     )  # fmt: skip
     yield PublishedNumber(
         "scatter_ratio", "z_scatter_ratio", 2.0, "six MIRI bands", "redshifts", relation="~",
-        error=0.5, checked=True, why=_ONE_FIELD, definition="abstract: 'generally ... factors of 2 or more'",
+        error=0.5, checked=True, why=ONE_FIELD, definition="abstract: 'generally ... factors of 2 or more'",
     )  # fmt: skip
 
 
@@ -194,7 +192,7 @@ def _fractions():
         for name, value in (("frac_offset", offset), ("frac_scatter", scatter)):
             yield PublishedNumber(
                 f"{name}.{truth:g}.{band_set}", name, value, text, "AGN fraction", truth=truth,
-                band_set=band_set, why=_PRIOR if band_set == "none" else _ONE_FIELD,
+                band_set=band_set, why=_PRIOR if band_set == "none" else ONE_FIELD,
                 definition="of posterior means",
             )  # fmt: skip
     for low, high in ((0, 1), (1, 2), (2, 3)):
@@ -228,7 +226,7 @@ def _agn():
         yield PublishedNumber(
             f"class.{truth:g}", "class_share", share, f"fracAGN {truth:g}", "classes", truth=truth,
             definition="galaxy below 0.1, composite below 0.4, AGN above, of posterior means",
-            why=_ONE_FIELD,
+            why=ONE_FIELD,
         )  # fmt: skip
     for name, share in (("galaxy", 0.79), ("composite", 0.76), ("agn", 0.87)):
         yield PublishedNumber(
@@ -238,7 +236,7 @@ def _agn():
         )  # fmt: skip
     yield PublishedNumber(
         "power_offset", "power_offset", -0.1, "all fracAGN above 0", "accretion power", truth=None,
-        why=_ONE_FIELD, definition="log10 of the posterior mean over the truth",
+        why=ONE_FIELD, definition="log10 of the posterior mean over the truth",
     )  # fmt: skip
     yield PublishedNumber(
         "power_scatter", "power_scatter", 0.3, "all fracAGN above 0", "accretion power",
@@ -249,7 +247,7 @@ def _agn():
     yield PublishedNumber(
         "xray_half", "xray_half", -16.0, "all fracAGN above 0", "X-rays", relation="~", error=0.2,
         truth=None, definition="AGN of the field that are in the fitted sample, by 0.5-7 keV flux",
-        why=f"{_ONE_FIELD}; it follows the luminosities of the injected AGN",
+        why=f"{ONE_FIELD}; it follows the luminosities of the injected AGN",
     )  # fmt: skip
     yield PublishedNumber(
         "pah.f1500w", "feature", 0.4, "6.2 µm, equivalent width 0.5 µm, F1500W at z = 1.5", "templates",
@@ -406,7 +404,8 @@ def comparison_rows(table):
     for row in table:
         mark = {"=": "", "~": "about "}.get(row["relation"], f"{row['relation']} ")
         paper = f"{mark}{row['paper']:.3g}{'' if row['checked'] else ' [?]'}"
-        ours, error = row["ours"], 0.5 * (row["high"] - row["low"])
+        ours, ends = row["ours"], (row["low"], row["high"])
+        error = 0.5 * (ends[1] - ends[0]) if np.isfinite(ends).all() else np.nan
         if not np.isfinite(ours):
             ours = Missing("not measured in this study")
         elif np.isfinite(error):

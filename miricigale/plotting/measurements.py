@@ -7,7 +7,12 @@ from miricigale.plotting.comparison import MEASURED, SECOND, TRUE, plot_offsets
 from miricigale.plotting.images import plot_image
 from miricigale.plotting.truths import panels
 
-__all__ = ["background_figure", "encircled_energy_figure", "offsets_figure"]
+__all__ = [
+    "background_figure",
+    "encircled_energy_figure",
+    "features_figure",
+    "offsets_figure",
+]
 
 
 def background_figure(before, after, *, pixel_scale=1.0, unit="MJy/sr", mask=None):
@@ -44,10 +49,11 @@ def background_figure(before, after, *, pixel_scale=1.0, unit="MJy/sr", mask=Non
         )
         sky = image if mask is None else np.where(np.asarray(mask, bool), np.nan, image)
         level = np.nanmedian(sky)
+        told = f"{level:.0f}" if abs(level) >= 10 else f"{level:.2g}"
         for axis, style in ((0, "-"), (1, "--")):
             x, y = _profile(sky, axis)
             place = (x - 0.5 * image.shape[1 - axis]) * pixel_scale
-            label = f"{title} ({level:.2g}), along {'xy'[axis]}"
+            label = f"{title} ({told}), along {'xy'[axis]}"
             last.plot(place, y - level, style, color=color, lw=1.3, label=label)
     axes[0, 1].set_ylabel("")
     last.axhline(0, color=TRUE, lw=0.8)
@@ -107,7 +113,7 @@ def encircled_energy_figure(radius, before, after, *, limit=0.04):
     return figure
 
 
-def offsets_figure(groups, *, limit=1.0, labels=None, running=None):
+def offsets_figure(groups, *, limit=1.0, labels=None, running=None, marked=None):
     """
     Magnitude differences by kind of source, such as those of two photometries by Sersic index.
 
@@ -121,6 +127,8 @@ def offsets_figure(groups, *, limit=1.0, labels=None, running=None):
         Labels of the axes.
     running : dict of str to tuple, optional
         Middle, median and scatter of bins (`~miricigale.evaluation.running_median`) by kind.
+    marked : dict of str to array-like of bool, shape (n,), optional
+        Sources that get a circle, such as crowded ones, by kind.
 
     Returns
     -------
@@ -136,11 +144,57 @@ def offsets_figure(groups, *, limit=1.0, labels=None, running=None):
             mag[good], offset[good], running=bins, ax=ax, limit=limit, labels=labels, title=title
         )
         ax.set_title(title, fontsize="medium")
+        if marked is not None:
+            rows = good & np.asarray(marked[label], bool)
+            place = np.clip(offset[rows], -0.97 * limit, 0.97 * limit)
+            ax.plot(mag[rows], place, "o", ms=6, mfc="none", mec="0.35", mew=0.7)
         if good.any():
             text = f"median {np.median(offset[good]):+.3f}"
             ax.text(0.96, 0.95, text, transform=ax.transAxes, ha="right", va="top", fontsize=8)
         if k % 3:
             ax.set_ylabel("")
+        if k + 3 < len(axes):
+            ax.set_xlabel("")
         if k and ax.get_legend():
             ax.get_legend().remove()
+    return figure
+
+
+def features_figure(values, ranges, *, limit=0.6):
+    """
+    Residuals of fits in each band against redshift, and where features are within the band.
+
+    Parameters
+    ----------
+    values : dict of str to tuple of array-like, shape (n,)
+        Redshifts and measured minus model magnitudes by band; NaN is left out.
+    ranges : dict of str to dict of str to tuple of float
+        By band and feature: redshifts between which it is within the band.
+    limit : float, optional
+        Half height of the axes; points beyond stand as triangles on the edge.
+
+    Returns
+    -------
+    figure : `~matplotlib.figure.Figure`
+    """
+    figure, axes = panels(values, height=2.9, sharex=True, sharey=True)
+    labels = ("redshift", "measured - model (mag)")
+    for k, (label, ax) in enumerate(axes.items()):
+        z, residual = (np.asarray(v, float) for v in values[label])
+        good = np.isfinite(z) & np.isfinite(residual)
+        plot_offsets(z[good], residual[good], ax=ax, limit=limit, labels=labels, title=label)
+        ax.set_title(label, fontsize="medium")
+        for i, (name, (low, high)) in enumerate(ranges[label].items()):
+            if high > low:
+                color = (SECOND, "#15803d")[i % 2]
+                ax.axvspan(low, high, color=color, alpha=0.12, lw=0, label=name)
+                inside = good & (z >= low) & (z < high)
+                if np.count_nonzero(inside) > 2:
+                    ax.plot([low, high], [np.median(residual[inside])] * 2, color=color, lw=2)
+        if k == 0:
+            ax.legend(fontsize=8, frameon=False, loc="upper right", ncols=2)
+        if k % 3:
+            ax.set_ylabel("")
+        if k + 3 < len(axes):
+            ax.set_xlabel("")
     return figure

@@ -207,7 +207,8 @@ def completeness_figure(table, *, xlabel, limits=(), half=None):
             label = name if ax is upper else None
             style = {"color": shades[k % len(shades)], "ls": "-" if known else ":"}
             ax.axvline(value, lw=1.6, label=label, **style)
-    upper.legend(fontsize=8, frameon=False, loc="upper left")
+    # above the axes, which are full of lines
+    upper.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=3)
     upper.set(ylabel="sources", xlim=(bins[0], bins[-1]))
     lower.set(ylabel="share found", xlabel=xlabel, ylim=(-0.05, 1.08))
     return figure
@@ -331,7 +332,8 @@ def colors_figure(planes, *, labels):
             rows = classes == name
             ax.plot(*colors[rows].T, marker, ms=3.5, color=shade, alpha=0.55, label=name)
         for radius, style in zip(radii, ("-", "--"), strict=False):
-            ax.add_patch(Circle(center, radius, fill=False, color="black", lw=1.3, ls=style))
+            circle = {"fill": False, "color": "black", "lw": 1.3, "ls": style, "zorder": 5}
+            ax.add_patch(Circle(center, radius, **circle))
         ax.set(
             xlabel=labels[title][0], ylabel=labels[title][1], aspect="equal", adjustable="datalim"
         )

@@ -7,11 +7,14 @@ from astropy.nddata import CCDData
 from astropy.table import QTable
 from astropy.wcs import WCS
 
+from miricigale.psf import MatchingKernel
 from miricigale.sed import SEDModel
 from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.exposures import study_exposures
+from miricigale.workflow.stages.truth import add_agn, add_field_agn
+from miricigale.workflow.truths import FIELD, study_truths
 
 STAGES = {stage.name: stage for stage in study_stages()}
 SCALE = 0.11
@@ -41,7 +44,28 @@ def noise_image(seed=0, *, rim=RIM, scale=SCALE, shape=SHAPE):
     return sky_image(scale, shape, light + rng.normal(size=shape), rim=rim), light
 
 
-def small_config(filters, *, points=False):
+def made_up_kernel(pixels=31):
+    """A kernel between two Gaussians."""
+    place = np.arange(pixels) - pixels // 2
+    wide, sharp, kernel = (
+        np.exp(-0.5 * (place[:, None] ** 2 + place**2) / width**2) / (2 * np.pi * width**2)
+        for width in (3.0, 1.8, 2.4)
+    )
+    return MatchingKernel(kernel, 0.06 * u.arcsec, source=sharp, target=wide)
+
+
+def save_exposure(made, name, unit):
+    """Slopes and calibrated image of a small sub-array."""
+    rng = np.random.default_rng(3)
+    shape = (64, 72)
+    rate = sky_image(SCALE, shape, 30 + rng.normal(size=shape))
+    rate.unit = "adu / s"
+    rate.meta.update(filter=name, subarray="SUB64")
+    made.save_image(f"{unit}_rate.fits", rate)
+    made.save_image(f"{unit}_cal.fits", sky_image(SCALE, shape, rng.normal(size=shape), rim=4))
+
+
+def small_config(filters, *, points=False, frac_agn=(0.0,), sets=("all", "none")):
     n = len(filters)
     return StudyConfig.from_dict(
         {
@@ -52,13 +76,14 @@ def small_config(filters, *, points=False):
                 "n_integrations": [1] * n,
                 "n_dithers": [1] * n,
             },
-            "sed": {"axes": "quick"},
+            "sed": {"axes": "quick", "frac_agn": frac_agn},
             "errors": {"bin_size": 8},
             "fit": {
                 "bands": ["megacam.r", "wfc3.f160w", "irac.ch1"],
                 "depths": [27.0, 27.0, 24.0],
                 "axes": "quick",
                 "min_detected": 1,
+                "sets": sets,
             },
             "point_sources": {"enabled": points},
             "report": {"dpi": 40},
@@ -70,9 +95,9 @@ def do_stage(config, folder, name, unit=""):
     STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
 
 
-def make_run(folder, filters, *, mass=3e10, points=False, report=True):
+def make_run(folder, filters, *, mass=3e10, points=False, report=True, **options):
     """Make up what the stage ``report`` reads, and run it unless it is not wanted."""
-    config = small_config(filters, points=points)
+    config = small_config(filters, points=points, **options)
     made = Context(config, folder)
     rng = np.random.default_rng(1)
     count = 24
@@ -81,46 +106,66 @@ def make_run(folder, filters, *, mass=3e10, points=False, report=True):
     sky = center.spherical_offsets_by(*step)
     parameters = QTable({"id": np.arange(1, count + 1), "redshift": np.linspace(0.3, 2.5, count)})
     parameters["mass"] = np.geomspace(mass, 10 * mass, count) * u.Msun
+    made.save_image("f160w.fits", noise_image(9, rim=0)[0])
+    catalog = QTable({"id": parameters["id"], "sky": sky, "star": np.zeros(count, bool)})
+    light = SEDModel.yang2021(agn=False).fluxes(parameters, ["wfc3.f160w"])
+    catalog["wfc3.f160w"] = light["wfc3.f160w"]
+    made.save_table("catalog.ecsv", catalog)
+    for name in filters:
+        made.save_result(f"kernel_{name}.fits", made_up_kernel())
+        bright = QTable({"flux_true": np.full(5, 100.0) * u.uJy})
+        bright["flux"] = bright["flux_true"] * np.array([0.98, 0.99, 1.0, 1.01, 5.0])
+        bright["in_field"] = np.ones(5, bool)
+        bright.meta.update(f_scaling=0.9987, f_scaling_err=0.001, f_aper=1.14)
+        made.save_table(f"points/{name}.ecsv", bright)
+    for one in study_truths(config).values():
+        _save_truth(made, one, parameters, sky, center, rng)
+    do_stage(config, folder, "errors")
+    for name in study_truths(config):
+        do_stage(config, folder, "matches", name)
+        for unit in config.fit.sets:
+            do_stage(config, folder, "fits", f"{name}/{unit}")
+    if report:
+        do_stage(config, folder, "report")
+    return folder / "report"
+
+
+def _save_truth(made, one, parameters, sky, center, rng):
+    """The products of one truth: its sources, exposures, mosaics and photometry."""
+    config, filters, count = made.config, made.config.exposures.filters, len(parameters)
+    parameters = parameters.copy()
+    if one.frac_agn == FIELD:
+        add_field_agn(parameters, SEDModel.yang2021(), filters[0], 1)
+    elif one.frac_agn > 0:
+        add_agn(parameters, one.frac_agn, 1)
     bands = [*config.fit.bands, *filters]
-    truth = SEDModel.yang2021(agn=False).fluxes(parameters, bands)
-    truth["redshift"], truth["sky"] = parameters["redshift"], sky
+    truth = SEDModel.yang2021(agn=one.frac_agn != 0).fluxes(parameters, bands)
+    truth["sky"], truth["star"] = sky, np.zeros(count, bool)
     truth["profile"], truth["sersic_index"] = "sersic", np.linspace(0.5, 4, count)
-    truth["star"], truth["frac_agn"] = np.zeros(count, bool), np.zeros(count)
+    truth["frac_agn"] = np.zeros(count)
+    for name in parameters.colnames:
+        truth[name] = parameters[name]
     truth.meta.clear()
     truth.meta.update(version="1.2", citations=["Somebody 2001", "Somebody 2001, with page"])
-    made.save_table("agn00/truth.ecsv", truth)
-    catalog = QTable({"id": truth["id"], "sky": sky, "star": truth["star"]})
-    catalog["wfc3.f160w"] = truth["wfc3.f160w"]
-    made.save_table("catalog.ecsv", catalog)
-    for unit in study_exposures(config):
+    made.save_table(f"{one.name}/truth.ecsv", truth)
+    for unit, exposure in study_exposures(config).items():
         table = QTable({"sky_fraction": [0.31], "n_pixels": [4]})
-        made.save_table(f"agn00/exposures/{unit}_forecast.ecsv", table)
-    made.save_image("f160w.fits", noise_image(9, rim=0)[0])
+        made.save_table(f"{one.name}/exposures/{unit}_forecast.ecsv", table)
+        save_exposure(made, exposure.filter, f"{one.name}/exposures/{unit}")
     for k, name in enumerate(filters):
         image, light = noise_image(k)
-        made.save_image(f"agn00/mosaic_{name}.fits", image)
-        made.save_image(f"agn00/photometry/{name}_model.fits", sky_image(SCALE, SHAPE, light))
+        model = sky_image(SCALE, SHAPE, light)
+        made.save_image(f"{one.name}/mosaic_{name}.fits", image)
+        made.save_image(f"{one.name}/photometry/{name}_model.fits", model)
         residual = sky_image(SCALE, SHAPE, image.data - light, rim=RIM)
-        made.save_image(f"agn00/photometry/{name}_residual.fits", residual)
+        made.save_image(f"{one.name}/photometry/{name}_residual.fits", residual)
         # one more than there are sources, which no source is near; the first is at the edge
         table = QTable({"id": np.arange(1, count + 2), "sky": _with_one_more(sky, center)})
         flux = np.append(truth[name].value + rng.normal(0, 0.2, count), 5.0)
         table["flux"] = flux * u.uJy
         table["flux_err"] = np.full(count + 1, 0.2) * u.uJy
         table["flags"] = np.append(1, np.zeros(count, int))
-        made.save_table(f"agn00/photometry/{name}.ecsv", table)
-        bright = QTable({"flux_true": np.full(5, 100.0) * u.uJy})
-        bright["flux"] = bright["flux_true"] * np.array([0.98, 0.99, 1.0, 1.01, 5.0])
-        bright["in_field"] = np.ones(5, bool)
-        bright.meta.update(f_scaling=0.9987, f_scaling_err=0.001, f_aper=1.14)
-        made.save_table(f"points/{name}.ecsv", bright)
-    do_stage(config, folder, "errors")
-    do_stage(config, folder, "matches", "agn00")
-    do_stage(config, folder, "fits", "agn00/all")
-    do_stage(config, folder, "fits", "agn00/none")
-    if report:
-        do_stage(config, folder, "report")
-    return folder / "report"
+        made.save_table(f"{one.name}/photometry/{name}.ecsv", table)
 
 
 def _with_one_more(sky, center):

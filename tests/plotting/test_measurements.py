@@ -5,6 +5,7 @@ from helpers.figures import legend_texts, line_data
 from miricigale.plotting.measurements import (
     background_figure,
     encircled_energy_figure,
+    features_figure,
     offsets_figure,
 )
 
@@ -48,3 +49,23 @@ def test_offsets_have_a_panel_for_each_kind():
     assert (first.get_title(), second.get_title()) == ("n < 2 (2)", "n >= 2 (1)")
     assert first.texts[0].get_text() == "median +0.200"
     assert (first.get_ylabel(), second.get_ylabel()) == ("SE - TPHOT", "")
+
+
+def test_features_are_shaded_with_the_median_inside():
+    z = np.linspace(0.1, 2.9, 29)
+    residual = np.where((z > 1) & (z < 2), 0.2, 0.0)
+    figure = features_figure({"F1500W": (z, residual)}, {"F1500W": {"6.2 µm": (1.0, 2.0)}})
+    (ax,) = figure.axes
+    (median,) = [line for line in ax.lines if line.get_linewidth() == 2]
+    assert list(median.get_xdata()) == [1.0, 2.0]
+    assert list(median.get_ydata()) == [0.2, 0.2]
+    assert "6.2 µm" in ax.get_legend_handles_labels()[1]
+
+
+def test_marked_sources_have_a_circle():
+    mag, offset = np.array([20.0, 21.0, 22.0]), np.array([0.0, 0.1, 3.0])
+    figure = offsets_figure({"all": (mag, offset)}, marked={"all": [False, True, True]})
+    (circles,) = [line for line in figure.axes[0].lines if line.get_marker() == "o"]
+    assert list(circles.get_xdata()) == [21.0, 22.0]
+    # that beyond the axis at its edge
+    assert circles.get_ydata()[1] == pytest.approx(0.97)

@@ -19,6 +19,7 @@ from helpers.runs import (
     sky_image,
     small_config,
 )
+from miricigale.evaluation import PUBLISHED
 from miricigale.sed import SEDModel
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.stages.figures import three_bands
@@ -26,6 +27,9 @@ from miricigale.workflow.stages.metrics import as_ceers, as_paper
 from miricigale.workflow.stages.pictures import field_figure, residual_figure
 from miricigale.workflow.stages.provenance import sources_to_cite, stand_ins
 from miricigale.workflow.stages.sample import footprint_area, in_field
+from miricigale.workflow.truths import FIELD
+
+CEERS = [f"miri.f{n}w" for n in (770, 1000, 1280, 1500, 1800, 2100)]
 
 
 def page_of(report):
@@ -40,7 +44,7 @@ def rows_of(page):
 
 @pytest.fixture(scope="module")
 def reports(tmp_path_factory):
-    """Reports of four kinds of run."""
+    """Reports of several kinds of run."""
     folder = tmp_path_factory.mktemp("reports")
     return {
         "one": make_run(folder / "one", ["miri.f1000w"], mass=1e4),
@@ -48,10 +52,17 @@ def reports(tmp_path_factory):
         "four": make_run(
             folder / "four", ["miri.f1800w", "miri.f560w", "miri.f1000w", "miri.f2550w"]
         ),
+        "truths": make_run(
+            folder / "truths",
+            CEERS,
+            points=True,
+            frac_agn=(0.0, 0.4, 0.99, FIELD),
+            sets=("all", "none", "blue", "red"),
+        ),
     }
 
 
-@pytest.mark.parametrize("kind", ["one", "two", "four"])
+@pytest.mark.parametrize("kind", ["one", "two", "four", "truths"])
 def test_each_row_stands_once_and_nothing_is_nan(reports, kind):
     page = page_of(reports[kind])
     rows = rows_of(page)
@@ -113,6 +124,82 @@ def test_edge_crowded_and_spurious_are_counted(reports):
     assert sorted(table["first"]) == [-1, *range(24)]
     assert sorted(table["second"]) == list(range(25))
     assert list(table["status"]).count("unmatched") == 1
+
+
+def sections_of(report):
+    return re.findall(r"<h2>(.*?)</h2>", page_of(report))
+
+
+def test_sections_of_what_there_is_stand_in_the_order_of_the_paper(reports):
+    titles = [html.unescape(title) for title in sections_of(reports["truths"])]
+    assert titles == [
+        "At a glance",
+        "Exposures and catalog",
+        "Images",
+        "Detections",
+        "Forced photometry",
+        "Error function and limits",
+        "Example sources",
+        "Redshifts",
+        "AGN fraction",
+        "Luminosity of the accretion disk",
+        "X-rays",
+        "Classes",
+        "PAH features against residuals",
+        "Coverage of the posteriors",
+        "Beside Yang et al. 2021",
+        "The inputs beside published relations",
+        "How it was made",
+    ]
+    # without an AGN there is nothing to tell of disks, X-rays and classes
+    single = [html.unescape(title) for title in sections_of(reports["four"])]
+    lacking = {"Luminosity of the accretion disk", "X-rays", "Classes"}
+    assert single == [title for title in titles if title not in lacking]
+    assert "Redshifts" not in sections_of(reports["one"])
+
+
+def test_every_figure_says_what_it_shows(reports):
+    for kind in ("one", "two", "four", "truths"):
+        captions = re.findall(r"<figcaption>(.*?)</figcaption>", page_of(reports[kind]))
+        assert len(captions) == len(set(captions))
+        assert all(caption.endswith(".") for caption in captions)
+    text = html.unescape(" ".join(captions))
+    for told in (
+        "Injected fracAGN 0, source",
+        "Injected fracAGN 0.4, source",
+        "Spectra of source",
+        "Redshift errors by injected fracAGN",
+        "by bin of true redshift",
+        "luminosity of the accretion disk",
+        "X-ray fluxes of the AGN of the field",
+        "of each true class",
+        "background was subtracted",
+        "matching kernel",
+    ):
+        assert told in text, told
+
+
+def test_numbers_beside_the_paper_are_measured_where_the_run_has_them(reports):
+    folder = reports["truths"].parent
+    table = QTable.read(folder / "report" / "paper.ecsv")
+    assert list(table["key"]) == [one.key for one in PUBLISHED]
+    ours = dict(zip(table["key"], table["ours"], strict=True))
+    # 25 detections, 24 of them sources; scaling and offsets of the made-up points
+    assert ours["detected_catalog"] == 25
+    assert ours["matched_catalog"] == 1
+    assert ours["f_scaling.f770w"] == ours["f_scaling.f1800w"] == pytest.approx(0.9987)
+    assert ours["f_aper.f2100w"] == pytest.approx(1.14)
+    assert ours["points.offset"] == pytest.approx(0.0)
+    shares = [ours[f"colors.{name}"] for name in ("galaxy", "composite", "agn")]
+    assert all(np.isnan(share) or 0 <= share <= 1 for share in shares)
+    assert np.isfinite(shares).any()
+    verdict = dict(zip(table["key"], table["verdict"], strict=True))
+    assert "another field" in verdict["detected_catalog"]
+    assert "mismatch between simulator and pipeline" in verdict["f_scaling.f770w"]
+    page = html.unescape(page_of(reports["truths"]))
+    assert "another field: the field is another one: 24 galaxies; theirs has 463." in page
+    # with another statistic the reason is another one
+    assert "3.4 of Gaussian errors" in page
 
 
 def test_colors_need_three_bands(reports):

@@ -1,37 +1,29 @@
-"""What all truths of a run say together, and beside Yang et al. 2021: sections of the report."""
+"""All truths of a run beside Yang et al. 2021: tables, numbers of other products, reasons."""
 
-import astropy.units as u
 import numpy as np
 
 from miricigale.evaluation import (
-    Missing,
+    COLOR_WINDOWS,
+    PUBLISHED,
+    Estimate,
     StudyResults,
     TruthResults,
+    color_estimates,
     compare_with_paper,
     comparison_rows,
-    coverage_table,
-    number,
-    posterior_ranks,
-    selection_table,
-    study_confusion,
-    study_numbers,
+    mid_infrared_fractions,
 )
+from miricigale.evaluation.paper import ONE_FIELD
 from miricigale.workflow.stages.conditions import ConditionFlags
-from miricigale.workflow.stages.figures import SET_LABELS
+from miricigale.workflow.stages.provenance import STAND_INS
 from miricigale.workflow.stages.sample import SampleFlags, matched_errors
 from miricigale.workflow.truths import FIELD
 
-__all__ = [
-    "coverage_of",
-    "study_results",
-    "write_comparison",
-    "write_coverage",
-    "write_truths",
-]
+__all__ = ["agn_shares", "extra_numbers", "reasons_of", "study_results", "write_comparison"]
 
-#: Parameters whose posteriors are held against the truth: of the fit, and in the table of the truth.
-COVERED = ("redshift", "frac_agn", "stellar_mass", "sfr_100myr", "dust_luminosity")
 _OUT = SampleFlags.OUTSIDE_FIELD | SampleFlags.STAR | SampleFlags.NO_MODEL
+#: Magnitudes of a small relative change of the flux.
+_MAG = 2.5 / np.log(10)
 
 
 def _truth_results(truth, tables, bands):
@@ -75,156 +67,153 @@ def study_results(config, truths, every, metrics):
     )
 
 
-def coverage_of(tables, seed):
+def agn_shares(study, model):
     """
-    Coverage of the posteriors of a truth, as `~miricigale.evaluation.coverage_table`.
+    True AGN shares of the 5-15 um light of the fitted sources, by truth; NaN of all others.
 
-    Names are ``<set> <parameter>``. Ranks are randomized within cells of the grid, for injected
-    fractions lie on its nodes.
+    Empty without the bands of the colors that they are for, or without an AGN.
     """
-    ranks = {}
-    for unit, results in tables.results.items():
-        for name in COVERED:
-            if name in tables.truth.colnames and len(results):
-                values, levels = results.cdf(name)
-                true = u.Quantity(tables.sample[name]).to_value(values.unit)
-                found = posterior_ranks(true, values.value, levels, seed=seed)
-                ranks[f"{unit} {name}"] = found
-    return coverage_table(ranks)
-
-
-def write_truths(context, report, study, metrics, columns):
-    """
-    Sections on all truths together; without a second one there are none.
-
-    ``columns`` are those of a table of fits, header to the cell of a set of bands and its metrics.
-    """
-    context.save_table("report/numbers.ecsv", study_numbers(study, seed=context.seed, n_draws=300))
-    if len(study.truths) < 2:
-        return
-    report.section(
-        "AGN of different strength",
-        "The same galaxies with AGN of other strength, each sky exposed, reduced, measured and fitted "
-        "alike. Every source has an AGN drawn from the ranges of Yang et al. 2021, or, in the realistic "
-        "field, one of the luminosity that the luminosity function of Ueda et al. 2014 gives to galaxies of "
-        "its mass and redshift; errors of the fluxes are by the error function of the first truth.",
-    )
-    rows = [
-        (_told(truth["frac_agn"]), *(cell(entry) for cell in columns.values()))
-        for truth in metrics["truths"].values()
-        for entry in truth["fits"].items()
-    ]
-    report.table(
-        rows,
-        header=("injected fracAGN", *columns),
-        caption="Sources detected in enough MIRI bands, the same with each set of bands",
-        text=2,
-    )
-    for unit in ("all", "none"):
-        if unit in study.truths[0].fits:
-            _write_confusion(report, study, unit)
+    needed = {band for window in COLOR_WINDOWS for band in window.bands}
+    if not needed <= set(study.bands) or len(study.truths) < 2:
+        return {}
+    shares = {}
     for one in study.truths:
-        if one.frac_agn is None:
-            _write_selection(report, one)
+        values = np.full(len(one.truth), np.nan)
+        agn = np.asarray(one.truth["frac_agn"], float) > 0
+        values[one.sample & ~agn] = 0.0
+        rows = one.sample & agn
+        if rows.any():
+            values[rows] = mid_infrared_fractions(model, one.truth[rows])
+        shares[one.name] = values
+    return shares
 
 
-def write_coverage(report, tables, model_error, seed):
-    """Table of the coverage of the posteriors of a truth."""
-    table = coverage_of(tables, seed)
-    if len(table) == 0:
-        return
-    rows = {}
-    for row in table:
-        rows.setdefault(row["name"], []).append(row)
-    report.table(
-        [
-            (
-                SET_LABELS[name.partition(" ")[0]],
-                name.partition(" ")[2].replace("_", " "),
-                parts[0]["n"],
-                *(_share(part, "share") for part in parts),
-                f"{parts[0]['mean_rank']:.2f}",
-            )
-            for name, parts in rows.items()
-        ],
-        header=("fit", "parameter", "sources", "in 68 %", "in 95 %", "mean rank"),
-        caption="Share of the true values in the central intervals of their posteriors, with its own "
-        f"68 % interval; the fits allow for {100 * model_error:g} % of model error that the truth "
-        "does not have, so that more than 68 % is to be expected. Mean rank: 0.5 without bias, lower "
-        "where the fits are too high",
-        text=2,
-    )
+def extra_numbers(study, metrics, shares, seed):
+    """
+    Numbers by key of `~miricigale.evaluation.PUBLISHED` that are not of the tables of the truths.
+
+    Of detection, bright point sources and colors; ``shares`` are those of `agn_shares`.
+    """
+    n, one = metrics["detections"]["n_field"], study.truths[0]
+    found = np.asarray(one.matched["matched"], bool)[one.field]
+    extra = {
+        "detected_catalog": Estimate(n, n - np.sqrt(n), n + np.sqrt(n), n),
+        "matched_catalog": Estimate.of_fraction(np.count_nonzero(found), found.size),
+    }
+    offsets, scatters = [], []
+    for band, entry in metrics["bands"].items():
+        if "points_n" not in entry:
+            continue
+        label = band.rpartition(".")[2]
+        scaling, error = entry["f_scaling"], entry["f_scaling_err"]
+        count = entry["points_n"]
+        extra[f"f_scaling.{label}"] = Estimate(scaling, scaling - error, scaling + error, count)
+        extra[f"f_aper.{label}"] = Estimate(entry["f_aper"])
+        offsets.append((abs(_MAG * entry["points_median"]), count))
+        scatters.append((_MAG * entry["points_scatter"], count))
+    for key, values in (("points.offset", offsets), ("points.scatter", scatters)):
+        values = [(value, count) for value, count in values if np.isfinite(value)]
+        if values:
+            value, count = max(values)
+            extra[key] = Estimate(value, n=count)
+    if shares:
+        extra |= color_estimates(study, shares, seed=seed)
+    return extra
 
 
-def _told(frac_agn):
-    return "realistic field" if frac_agn == FIELD else f"{frac_agn:g}"
+def _facts(config, metrics, model):
+    """What the run does otherwise than Yang et al. 2021: by topic, in a few words and in a sentence."""
+    n = metrics["n_field"]
+    facts = {
+        "field": ("another field", f"the field is another one: {n} galaxies; theirs has 463."),
+    }
+    if not metrics["as_paper"]:
+        facts["exposures"] = ("other exposures", "exposures or bands are not theirs.")
+    if config.errors.statistic == "mad":
+        sentence = (
+            "errors are 1.48 times the median absolute difference; theirs are the median itself, so that "
+            "their 5 sigma are 3.4 of Gaussian errors."
+        )
+        facts["statistic"] = ("5 sigma of a wider error", sentence)
+    if config.detector.residual == 0.0:
+        facts["residual"] = (
+            "no residual of the flat field",
+            "images have no residual of flat field and sky beyond photon and read noise.",
+        )
+    if config.photometry.method != "yang2021":
+        facts["method"] = (
+            "other templates",
+            "templates of the photometry have wings, where theirs end at the segments.",
+        )
+    if config.fit.axes != "fit":
+        facts["grid"] = ("a coarse grid", "the grid of the fit is coarser than theirs.")
+    names = [name for name in model.resources if name in STAND_INS]
+    if names:
+        facts["libraries"] = (
+            "stand-in libraries",
+            f"{', '.join(names)} stand in for their libraries.",
+        )
+    return facts
 
 
-def _share(row, name):
-    none = "no such source"
-    low, high = (number(row[f"{name}_{end}"], ".0f", none, scale=100) for end in ("low", "high"))
-    if isinstance(low, Missing):
-        return low
-    return f"{100 * row[name]:.0f} % ({low} to {high})"
+#: Topics of `_facts` that bear on a quantity; on numbers of other products by the beginning of the key.
+_TOPICS = {
+    "detected_share": ("field", "exposures", "statistic", "residual"),
+    "mips_share": ("field",),
+    "detected_catalog": ("field",),
+    "matched_catalog": ("field",),
+    "etc_limit": ("exposures",),
+    "limit_offset": ("residual", "exposures", "method"),
+    "shape_offset": ("method", "field"),
+    "magnitude_scatter": ("method", "residual", "field"),
+    "shape_share": ("field",),
+    "crowded_share": ("field",),
+    "signal_to_noise": ("statistic", "exposures", "residual", "field"),
+    "points": ("exposures", "residual"),
+    "colors": ("exposures", "libraries"),
+    "power_offset": ("exposures", "grid", "libraries"),
+    "power_scatter": ("exposures", "grid", "libraries"),
+    "xray_half": ("exposures", "residual", "field", "libraries"),
+}
+_OF_FITS = ("exposures", "residual", "grid", "libraries", "field")
 
 
-def _write_confusion(report, study, unit):
-    table = study_confusion(study, unit)
-    names = [name for name in table.colnames if name in (*table["class"], "unknown")]
-    report.table(
-        [
-            (
-                row["class"],
-                row["n"],
-                *(row[name] for name in names),
-                _share(row, "completeness"),
-                _share(row, "purity"),
-            )
-            for row in table
-        ],
-        header=(
-            "true class",
-            "sources",
-            *(f"found {name}" for name in names),
-            "completeness",
-            "purity",
-        ),
-        caption=f"Classes by fracAGN (galaxy below 0.1, composite below 0.4) {SET_LABELS[unit]}, of all "
-        "truths of one fracAGN together; unknown: in the field, but not in the fit",
-    )
+def reasons_of(config, metrics, model):
+    """
+    Why numbers of a run may differ from the paper's: reasons by key, and what they mean.
+
+    Returns
+    -------
+    reasons : dict of str to str
+        General reasons, and the run's own in a few words, by key of `~miricigale.evaluation.PUBLISHED`.
+    sentences : list of str
+        What each of the run's own means.
+    """
+    facts, reasons = _facts(config, metrics, model), {}
+    for one in PUBLISHED:
+        topic = one.quantity if one.quantity != "extra" else one.key.partition(".")[0]
+        if topic == "f_aper":
+            reasons[one.key] = "a PSF with other wings; the factor is not applied"
+        if topic in ("feature", "f_scaling", "f_aper", "source_extractor"):
+            continue
+        # that the field is another one is among the facts
+        general = [part for part in one.why.split("; ") if part and part != ONE_FIELD]
+        told = [facts[name][0] for name in _TOPICS.get(topic, _OF_FITS) if name in facts]
+        reasons[one.key] = "; ".join([*general, *told])
+    return reasons, [f"{short}: {sentence}" for short, sentence in facts.values()]
 
 
-def _write_selection(report, one):
-    table = selection_table(one)
-    report.table(
-        [
-            (
-                SET_LABELS[row["band_set"]],
-                f"{row['limit']:g}",
-                row["n_wanted"],
-                row["n_selected"],
-                _share(row, "completeness"),
-                _share(row, "purity"),
-            )
-            for row in table
-        ],
-        header=("fit", "fracAGN at least", "AGN", "selected", "completeness", "purity"),
-        caption="Selections of AGN by the posterior mean of fracAGN, among all galaxies of the "
-        "realistic field",
-    )
-
-
-def write_comparison(context, report, study, as_paper):
+def write_comparison(context, report, study, reasons, sentences):
     """The section that holds all numbers of Yang et al. 2021 against those of the run."""
-    table = compare_with_paper(study, seed=context.seed)
+    table = compare_with_paper(study, seed=context.seed, reasons=reasons)
     context.save_table("report/paper.ecsv", table)
-    note = "" if as_paper else " This run has other exposures or bands than the paper's."
     report.section(
         "Beside Yang et al. 2021",
-        "Every number of the paper's results, and this run's with its bootstrap error. It is another field, with "
-        "its own noise: conclusions are to be compared, not digits. [?] marks numbers that were not read "
-        f"in the paper itself; completeness is the share of the field's galaxies that a number is of.{note}",
+        "Every number of the paper's results, and this run's with its bootstrap error: conclusions are to be "
+        "compared, not digits. [?] marks numbers that were not read in the paper itself; completeness is the "
+        "share of the field's galaxies that a number is of. What this run does otherwise:",
     )
+    report.bullets(sentences)
     report.table(
         comparison_rows(table),
         header=("part", "number", "paper", "here", "completeness", "verdict"),

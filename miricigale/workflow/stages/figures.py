@@ -17,7 +17,6 @@ from miricigale.plotting.comparison import (
     SECOND,
     plot_counts,
     plot_error_function,
-    plot_histogram,
     plot_magnitudes,
     plot_offsets,
     plot_redshifts,
@@ -32,8 +31,6 @@ __all__ = [
     "band_label",
     "counts_figure",
     "error_figure",
-    "example_figure",
-    "fraction_figure",
     "input_figure",
     "limit_figure",
     "magnitude_figure",
@@ -206,8 +203,12 @@ def limit_figure(entries):
 
 def redshift_figure(truth, fits):
     """Fitted against true redshifts, by set of bands."""
-    figure, axes = new_figure(1, len(fits), size=(WIDTH / len(fits), 4.7))
-    for ax, (unit, table) in zip(axes.flat, fits.items(), strict=True):
+    rows = -(-len(fits) // 2)
+    # a single one is half a page wide
+    figure, axes = new_figure(rows, min(2, len(fits)), size=(WIDTH / 2, 4.7))
+    for ax in axes.ravel()[len(fits) :]:
+        ax.remove()
+    for ax, (unit, table) in zip(axes.flat, fits.items(), strict=False):
         plot_redshifts(
             truth["redshift"],
             table["redshift_mean"],
@@ -215,28 +216,10 @@ def redshift_figure(truth, fits):
             ax=ax,
             title=SET_LABELS[unit],
         )
-    for ax in axes[0, 1:]:
+    for ax in axes[:, 1:].flat:
         ax.set_ylabel("")
-    return figure
-
-
-def fraction_figure(fits, frac_true):
-    """Posterior means and widths of fracAGN, by set of bands."""
-    figure, axes = new_figure(1, 2, size=(WIDTH / 2, 3.6))
-    means = {SET_LABELS[unit]: table["frac_agn_mean"] for unit, table in fits.items()}
-    widths = {SET_LABELS[unit]: table["frac_agn_std"] for unit, table in fits.items()}
-    plot_histogram(
-        means,
-        np.linspace(0, 1, 26),
-        ax=axes[0, 0],
-        xlabel="fracAGN (posterior mean)",
-        truth=frac_true,
-    )
-    axes[0, 0].set_xlim(-0.03, 1.03)
-    plot_histogram(
-        widths, np.linspace(0, 0.5, 26), ax=axes[0, 1], xlabel="width of the posterior (std)"
-    )
-    axes[0, 1].set_ylabel("")
+    for ax in axes[:-1].flat:
+        ax.set_xlabel("")
     return figure
 
 
@@ -327,74 +310,4 @@ def counts_figure(galaxies, bands, area):
         counts, error = (v.to_value(u.deg**-2) for v in number_counts(galaxies[name], area, edges))
         plot_counts(edges, counts, error, ax=ax, title=band_label(name))
     tidy()
-    return figure
-
-
-def example_figure(results, truth, key, model):
-    """
-    One source: photometry with the best fit, and posteriors of redshift and AGN fraction.
-
-    ``results`` has a `~miricigale.fitting.FitResults` for each set of bands, "all" among them; "none" is
-    drawn too if it is there. ``truth`` has the columns ``id``,
-    ``redshift`` and ``frac_agn``; ``model`` is that of the fits.
-    """
-    from matplotlib.figure import Figure
-
-    row = truth[np.asarray(truth["id"]) == key][0]
-    figure = Figure(figsize=(WIDTH, 4.8), layout="constrained")
-    grid = figure.add_gridspec(2, 3, height_ratios=(3, 1), width_ratios=(1.9, 1, 1))
-    upper = figure.add_subplot(grid[0, 0])
-    lower = figure.add_subplot(grid[1, 0], sharex=upper)
-    best = results["all"][key]
-    total = best.best_sed(model)
-    parts = {}
-    other = results["none"][key] if "none" in results else None
-    if other is not None and np.isfinite(other.chi2):
-        sed = other.best_sed(model)
-        parts["best model without MIRI"] = (sed.wave, sed.fnu)
-    fraction = best.best["frac_agn"].value
-    if fraction > 0:
-        # the same model without its AGN
-        galaxy = best.best_sed(model, frac_agn=0.0)
-        parts["its galaxy"] = (galaxy.wave, galaxy.fnu)
-        parts["its AGN"] = (total.wave, total.fnu - galaxy.fnu)
-    bands = results["all"].filters
-    best.plot_sed(
-        ax=(upper, lower),
-        spectrum=(total.wave, total.fnu),
-        parts=parts,
-        groups=["MIRI" if name.startswith("miri.") else "existing bands" for name in bands],
-        title=f"source {key}: best z = {best.best['redshift'].value:.3f}, "
-        f"fracAGN = {fraction:g}, chi2 = {best.chi2:.1f}",
-    )
-    upper.set_xlabel("")
-    upper.tick_params(labelbottom=False)
-    handles, names = upper.get_legend_handles_labels()
-    names = ["best model with MIRI" if name == "best model" else name for name in names]
-    upper.legend(handles, names, fontsize=7, frameon=False, loc="upper left", ncols=2)
-    low, high = upper.get_ylim()
-    # space for the legend above the spectrum
-    upper.set_ylim(low, high * (high / low) ** 0.35)
-    for column, (name, label) in enumerate(
-        (("redshift", "redshift"), ("frac_agn", "fracAGN")), start=1
-    ):
-        ax = figure.add_subplot(grid[:, column])
-        for unit in (name for name in ("all", "none") if name in results):
-            color = SET_COLORS[unit]
-            edges, weights = results[unit][key].distribution(name)
-            density = weights / np.diff(edges.value)
-            if density.max() > 0:
-                density = density / density.max()
-            style = {"color": color, "lw": 1.6, "label": SET_LABELS[unit]}
-            if unit == "all":
-                ax.stairs(density, edges.value, fill=True, alpha=0.2, color=color)
-            ax.stairs(density, edges.value, ls="-" if unit == "all" else "--", **style)
-        ax.axvline(row[name], color="0.2", ls=":", lw=1.4, label="truth")
-        ax.set(xlabel=label, ylim=(0, 1.25))
-        if name == "redshift":
-            ax.set_xlim(max(0, row[name] - 1.2), row[name] + 1.2)
-            ax.set_ylabel("posterior density (peak 1)")
-        else:
-            ax.set_xlim(-0.04, 1.04)
-            ax.legend(fontsize=8, frameon=False)
     return figure

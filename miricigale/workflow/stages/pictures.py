@@ -4,11 +4,21 @@ import astropy.units as u
 import numpy as np
 from astropy.wcs.utils import proj_plane_pixel_scales
 
+from miricigale.evaluation import sigma_mad
 from miricigale.plotting.axes import new_figure
 from miricigale.plotting.images import mark_sky, plot_color, plot_image, plot_model_residual
+from miricigale.plotting.measurements import background_figure, encircled_energy_figure
+from miricigale.psf.wiener import energy_error
 from miricigale.workflow.stages.figures import WIDTH, band_label
 
-__all__ = ["binned", "field_figure", "filled", "residual_figure"]
+__all__ = [
+    "binned",
+    "convolution_figure",
+    "field_figure",
+    "filled",
+    "residual_figure",
+    "subtraction_figure",
+]
 
 
 def filled(image):
@@ -117,3 +127,37 @@ def residual_figure(images, names, *, size=220):
             mark_sky(ax, 5, **_directions(pair[0]))
         axes[row, 0].set_ylabel(band_label(name))
     return figure
+
+
+def subtraction_figure(rate, cal, reducer):
+    """
+    An exposure before and after its background was subtracted.
+
+    ``rate`` and ``cal`` are the slopes and the calibrated image, ``reducer`` that of the run.
+    """
+    after = filled(cal)
+    # cosmic rays are among the pixels that the calibrated image masks
+    before = reducer.replace(cosmic_rays=False).calibrate(rate)
+    before = np.where(np.isfinite(after), filled(before), np.nan)
+    # the part of the detector that sees the sky
+    used = np.argwhere(np.isfinite(after))
+    (y0, x0), (y1, x1) = used.min(axis=0), used.max(axis=0) + 1
+    before, after = before[y0:y1, x0:x1], after[y0:y1, x0:x1]
+    sources = after > 3 * sigma_mad(after[np.isfinite(after)])
+    return background_figure(before, after, pixel_scale=_scale(cal), mask=sources)
+
+
+def convolution_figure(kernels):
+    """
+    Encircled energy of the prior's PSF minus that of each band, before and after convolution.
+
+    ``kernels`` are `~miricigale.psf.MatchingKernel` with their PSFs, by band.
+    """
+    reach = min(k.target.shape[0] // 2 * k.pixel_scale.to_value(u.arcsec) for k in kernels.values())
+    radius = np.linspace(0.03, min(2.5, reach), 60)
+    before, after = {}, {}
+    for name, kernel in kernels.items():
+        pixels = radius / kernel.pixel_scale.to_value(u.arcsec)
+        before[band_label(name)] = energy_error(kernel.source, kernel.target, pixels)
+        after[band_label(name)] = kernel.encircled_energy_error(radius * u.arcsec)
+    return encircled_energy_figure(radius, before, after)

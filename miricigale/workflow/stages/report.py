@@ -1,5 +1,6 @@
 """Stage 14: truth and results to numbers, figures and one page."""
 
+import dataclasses
 import json
 import logging
 
@@ -11,7 +12,9 @@ from miricigale.evaluation import (
     Missing,
     Report,
     number,
+    study_numbers,
 )
+from miricigale.psf import MatchingKernel
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages import (
     comparison,
@@ -22,13 +25,21 @@ from miricigale.workflow.stages import (
     pictures,
     provenance,
     rivals,
+    truth_figures,
 )
-from miricigale.workflow.stages.exposures import EXPOSURE_RESOURCES, GRID, exposure_plan
+from miricigale.workflow.stages.exposures import (
+    EXPOSURE_RESOURCES,
+    GRID,
+    exposure_plan,
+    study_exposures,
+)
 from miricigale.workflow.stages.figures import SET_LABELS, band_label
-from miricigale.workflow.stages.images import measured_mosaic
+from miricigale.workflow.stages.images import measured_mosaic, reducer_of
+from miricigale.workflow.stages.input_sections import write_inputs
 from miricigale.workflow.stages.inputs import sed_resources
 from miricigale.workflow.stages.metrics import StudyTables, study_metrics, truth_metrics
-from miricigale.workflow.stages.sample import SampleFlags, footprint_area, typical_source
+from miricigale.workflow.stages.sample import SampleFlags, footprint_area
+from miricigale.workflow.stages.truth_sections import Page, percent, write_results
 from miricigale.workflow.truths import reference, study_truths
 
 __all__ = ["make_report"]
@@ -39,13 +50,14 @@ log = logging.getLogger(__name__)
 @stage(
     "report",
     "report",
-    version=5,
+    version=6,
     needs=(
         "catalog",
         "truth",
         "exposures",
         "mosaics",
         "highres",
+        "kernels",
         "photometry",
         "points",
         "errors",
@@ -64,7 +76,7 @@ log = logging.getLogger(__name__)
         "highres.pixel_scale",
         "photometry.method",
         "photometry.rivals",
-        "reduction.pixel_scale",
+        "reduction",
         "fit",
         "errors",
         "point_sources",
@@ -105,23 +117,40 @@ def make_report(context, _):
         notices=provenance.stand_ins(config, model),
         dpi=config.report.dpi,
     )
-    writer = _Writer(context, report, tables, metrics, model, mosaics, area, truths[shown])
+    others = rivals.read_rivals(context)
+    known_tables = {name: every[name] for name in known}
+    study = comparison.study_results(config, known, known_tables, metrics)
+    shares = comparison.agn_shares(study, model)
+    extra = comparison.extra_numbers(study, metrics, shares, context.seed)
+    extra |= rivals.source_extractor_numbers(others, context.seed)
+    study = dataclasses.replace(study, extra=extra)
+    context.save_table("report/numbers.ecsv", study_numbers(study, seed=context.seed, n_draws=300))
+    writer = _Writer(context, report, tables, metrics, study, mosaics, truths[shown])
     writer.summary()
     report.links("The sources one by one:", [(name, f"sources-{name}.html") for name in truths])
     provenance.write_exposures(context, report, metrics, shown)
     writer.images()
+    writer.detections()
     writer.photometry()
-    others = rivals.read_rivals(context)
     rivals.write_rivals(context, report, others)
     writer.errors()
-    writer.fits()
-    study = comparison.study_results(config, known, {name: every[name] for name in known}, metrics)
-    study.extra.update(rivals.source_extractor_numbers(others, context.seed))
-    comparison.write_truths(context, report, study, metrics, FIT_COLUMNS)
-    experiments.write_experiments(context, report, {name: every[name] for name in known})
-    comparison.write_comparison(context, report, study, metrics["as_paper"])
+    write_results(
+        Page(
+            report,
+            study,
+            known_tables,
+            metrics,
+            shares,
+            model,
+            config.fit.model_error,
+            context.seed,
+        )
+    )
+    experiments.write_experiments(context, report, known_tables)
+    reasons, sentences = comparison.reasons_of(config, metrics, model)
+    comparison.write_comparison(context, report, study, reasons, sentences)
     perturbed.write_perturbed(context, report, truths, every)
-    writer.inputs()
+    write_inputs(report, tables, truths[shown], metrics, config, area)
     provenance.write_origin(report, config, model, [tables.truth.meta, tables.matched.meta])
     context.save("report/index.html", lambda path: report.write(path))
 
@@ -142,11 +171,11 @@ NO_SAMPLE = "no source in the fit"
 class _Writer:
     """The sections of the page; each reads the products that it shows, of the reference truth."""
 
-    def __init__(self, context, report, tables, metrics, model, mosaics, area, truth):
+    def __init__(self, context, report, tables, metrics, study, mosaics, truth):
         self.context, self.report, self.metrics, self.truth = context, report, metrics, truth
-        self.tables, self.model, self.config = tables, model, context.config
+        self.tables, self.study, self.config = tables, study, context.config
         self.bands = context.config.exposures.filters
-        self.mosaics, self.area = mosaics, area
+        self.mosaics = mosaics
         self.selection = np.asarray(tables.matched["selection"])
 
     def _table(self, entries, columns, **options):
@@ -176,7 +205,7 @@ class _Writer:
                 *(
                     (
                         f"photo-z outliers {SET_LABELS[unit]}",
-                        _percent(fits[unit]["photoz_outliers"], NO_SAMPLE),
+                        percent(fits[unit]["photoz_outliers"], NO_SAMPLE),
                     )
                     for unit in compared
                 ),
@@ -186,39 +215,6 @@ class _Writer:
                 ),
             ]
         )
-        least = m["n_bands_detected"]
-        paper = "Yang et al. 2021"
-        if not m["as_paper"]:
-            paper += ", six bands, other exposures"
-        # of Gaussian errors it is 0.67 sigma
-        if self.config.errors.statistic == "mad":
-            note = "; 5 sigma in Yang et al. are of the median absolute difference, 3.4 of these"
-        else:
-            note = ""
-        name, prior = self.config.catalog.mag_column, band_label(self.config.highres.filter)
-        limit = self.config.catalog.mag_limit
-        none = "no galaxy"
-        columns = {
-            "sample": lambda row: f"{prior} < {row['limit']:g}",
-            "galaxies": lambda row: row["n"],
-            f"detected in {least}+ bands": lambda row: _percent(row["fraction"], none),
-            "68 % interval": lambda row: (
-                f"{_percent(row['low'], none)} to {_percent(row['high'], none)}"
-                if row["n"]
-                else Missing(none)
-            ),
-            paper: lambda row: _percent(row["paper"], ""),
-        }
-        self._table(
-            m["detected"],
-            columns,
-            caption="Galaxies of the field detected (5 sigma by the error function) in "
-            f"{'two or more bands' if least == 2 else 'the one band'}; the catalog ends at "
-            f"{name} = {limit:g}{note}",
-            empty=f"The catalog ends at {name} = {limit:g}: too bright for the shares of detected "
-            f"galaxies that are published, to {prior} = 25 and 26.",
-        )
-        conditions.write_left_out(self.report, m)
 
     def images(self):
         """The field in color or gray; mosaic, model and residual."""
@@ -241,6 +237,16 @@ class _Writer:
             ),
             f"{told} The bar is 20 arcsec long.",
         )
+        unit = next(n for n, e in study_exposures(self.config).items() if e.filter == chosen[-1])
+        rate, cal = (
+            self.context.image(f"{self.truth.name}/exposures/{unit}_{kind}.fits")
+            for kind in ("rate", "cal")
+        )
+        self.report.figure(
+            pictures.subtraction_figure(rate, cal, reducer_of(self.config)),
+            f"An exposure in {band_label(chosen[-1])} before and after its background was subtracted, and medians "
+            "of strips along both axes without the pixels of sources.",
+        )
         suffix, _ = measured_mosaic(self.config)
         pairs = [
             (
@@ -255,6 +261,55 @@ class _Writer:
             "-5 to +5 sigma of their own noise. The bar is 5 arcsec long.",
         )
 
+    def detections(self):
+        """Which galaxies are detected, and why the others are not in the fit."""
+        m = self.metrics
+        self.report.section(
+            "Detections",
+            "Galaxies of the field by their brightness on the high-resolution image, and by their infrared "
+            "luminosity.",
+        )
+        least = m["n_bands_detected"]
+        paper = "Yang et al. 2021"
+        if not m["as_paper"]:
+            paper += ", six bands, other exposures"
+        # of Gaussian errors it is 0.67 sigma
+        if self.config.errors.statistic == "mad":
+            note = "; 5 sigma in Yang et al. are of the median absolute difference, 3.4 of these"
+        else:
+            note = ""
+        name, prior = self.config.catalog.mag_column, band_label(self.config.highres.filter)
+        limit = self.config.catalog.mag_limit
+        none = "no galaxy"
+        columns = {
+            "sample": lambda row: f"{prior} < {row['limit']:g}",
+            "galaxies": lambda row: row["n"],
+            f"detected in {least}+ bands": lambda row: percent(row["fraction"], none),
+            "68 % interval": lambda row: (
+                f"{percent(row['low'], none)} to {percent(row['high'], none)}"
+                if row["n"]
+                else Missing(none)
+            ),
+            paper: lambda row: percent(row["paper"], ""),
+        }
+        self._table(
+            m["detected"],
+            columns,
+            caption="Galaxies of the field detected (5 sigma by the error function) in "
+            f"{'two or more bands' if least == 2 else 'the one band'}; the catalog ends at "
+            f"{name} = {limit:g}{note}",
+            empty=f"The catalog ends at {name} = {limit:g}: too bright for the shares of detected "
+            f"galaxies that are published, to {prior} = 25 and 26.",
+        )
+        conditions.write_left_out(self.report, m)
+        if self.study.truths[0].field.any():
+            self.report.figure(
+                truth_figures.detection_figure(self.study),
+                "Luminosity of 3-1000 µm against redshift of the galaxies of the field, injected "
+                f"{truth_figures.truth_label(self.study.truths[0])}. MIPS: the true flux at 24 µm is above "
+                f"{truth_figures.MIPS_LIMIT:g} AB.",
+            )
+
     def photometry(self):
         """Measured against true fluxes, and the point sources."""
         how = ""
@@ -264,6 +319,14 @@ class _Writer:
             "Forced photometry",
             f"Every detection of the high-resolution image is fitted in each MIRI mosaic{how}; matched "
             "sources inside the field are shown.",
+        )
+        kernels = {
+            n: MatchingKernel.read(self.context.path(f"kernel_{n}.fits")) for n in self.bands
+        }
+        self.report.figure(
+            pictures.convolution_figure(kernels),
+            "Encircled energy of the PSF of the high-resolution image minus that of each band, as it is and "
+            "convolved with the matching kernel; gray: 4 %.",
         )
         matched = self.tables.matched
         inside = (self.selection & SampleFlags.OUTSIDE_FIELD) == 0
@@ -283,22 +346,27 @@ class _Writer:
                 "median of 20 sources and its scatter; triangles lie beyond the axis, circles mark "
                 "crowded sources, squares those at the edge.",
             )
+            self.report.figure(
+                truth_figures.shape_figure(self.study),
+                "The same of galaxies whose true flux is above 5 sigma, by Sersic index; circles mark crowded "
+                "ones.",
+            )
         points = self.tables.points
         entries = self.metrics["bands"].items()
         reason, lost = "no isolated source above 20 sigma", "no point source measured"
         columns = {
             "band": lambda x: band_label(x[0]),
             "isolated > 20 sigma": lambda x: x[1]["bright_n"],
-            "median offset": lambda x: _percent(x[1]["bright_median"], reason, "+.2f"),
-            "its error": lambda x: _percent(x[1]["bright_median_err"], reason),
+            "median offset": lambda x: percent(x[1]["bright_median"], reason, "+.2f"),
+            "its error": lambda x: percent(x[1]["bright_median_err"], reason),
         }
         caption = "Measured over true flux minus one"
         if points:
             whole = "no whole point source in the field"
             columns |= {
                 "point sources": lambda x: x[1]["points_n"],
-                "their median offset": lambda x: _percent(x[1]["points_median"], lost, "+.2f"),
-                "scatter": lambda x: _percent(x[1]["points_scatter"], lost),
+                "their median offset": lambda x: percent(x[1]["points_median"], lost, "+.2f"),
+                "scatter": lambda x: percent(x[1]["points_scatter"], lost),
                 "f_scaling": lambda x: number(x[1]["f_scaling"], ".4f", whole),
             }
             caption += (
@@ -361,128 +429,6 @@ class _Writer:
             ),
         )
 
-    def fits(self):
-        """Redshifts, AGN fractions, and one source in detail."""
-        self.report.section(
-            "Redshift and AGN fraction",
-            "Posterior means of the same sources, fitted with the existing bands alone and with MIRI.",
-        )
-        sample = self.tables.truth[self.selection == 0]
-        if len(sample) == 0:
-            left = ", ".join(
-                f"{name.replace('_', ' ')} {n}"
-                for name, n in self.metrics["n_left_out"].items()
-                if n
-            )
-            self.report.text(
-                f"No source is left to fit. Why the {self.metrics['n_catalog']} sources of the "
-                f"catalog were left out, each for one reason or more: {left}."
-            )
-            return
-        fits = self.tables.fits
-        self.report.figure(
-            figures.redshift_figure(sample, fits),
-            "Fitted against true redshift; dashed: the limits beyond which a source is an outlier.",
-        )
-        self.report.figure(
-            figures.fraction_figure(fits, self.truth.frac_agn),
-            "Posterior means and widths of the AGN fraction.",
-        )
-        self._table(
-            self.metrics["fits"].items(),
-            FIT_COLUMNS,
-            caption="Redshift and AGN fraction against truth; truths lie within the models of the "
-            f"fit, whose {100 * self.config.fit.model_error:g} % model error they do not have, so "
-            "posteriors are wide",
-        )
-        conditions.write_fits(self.report, self.metrics)
-        comparison.write_coverage(
-            self.report, self.tables, self.config.fit.model_error, self.context.seed
-        )
-        results = self.tables.results
-        key = typical_source(sample, results["all"].fitted, self.bands[-1])
-        if key is None:
-            self.report.text("No source of the sample could be fitted.")
-            return
-        self.report.figure(
-            figures.example_figure(results, self.tables.truth, key, self.model),
-            f"Source {key}: photometry and best models, residuals of the fit with MIRI, and the "
-            "posteriors of redshift and AGN fraction with and without MIRI.",
-        )
-
-    def inputs(self):
-        """The inputs beside published relations."""
-        self.report.section(
-            "The inputs beside published relations",
-            "What was injected follows from fits to real galaxies; these are checks that it is sane.",
-        )
-        galaxies = self.tables.galaxies()
-        if len(galaxies) == 0:
-            self.report.text("No galaxy of the catalog has a model.")
-            return
-        figure, (faint, passive) = figures.input_figure(galaxies)
-        agn = ", AGN included," if self.truth.frac_agn > 0 else ""
-        self.report.figure(
-            figure,
-            f"Galaxies of the catalog. Left: luminosity of 3-1000 µm{agn} against redshift, with "
-            "the 8-1000 µm luminosities of three star-formation rates after Kennicutt 1998 (Salpeter IMF). Right: "
-            "star-formation rate (100 Myr) against stellar mass, with the main sequence of Speagle et "
-            f"al. 2014 (Kroupa IMF). {faint} and {passive} galaxies lie below the axes.",
-        )
-        self._counts(self.tables.galaxies(field=True))
-
-    def _counts(self, galaxies):
-        """Number counts and the light of all galaxies, over the imaged area."""
-        options = self.config.catalog
-        if len(galaxies) == 0:
-            self.report.text("No galaxy with a model lies in the imaged area.")
-            return
-        self.report.figure(
-            figures.counts_figure(galaxies, self.bands, self.area),
-            f"Number counts of the injected fluxes: {len(galaxies)} galaxies in the "
-            f"{self.metrics['area']:.2f} square arcmin that all bands have imaged, to "
-            f"{options.mag_column} = {options.mag_limit:g}; Poisson errors.",
-        )
-        none = "no source above the limit in the imaged area"
-        columns = {
-            "band": lambda row: f"{band_label(row['band'])}, {row['wavelength']:g} µm",
-            "faint limit": lambda row: f"{row['least']:g} µJy" if row["least"] else "none",
-            "sources": lambda row: row["n"],
-            "here": lambda row: (
-                f"{row['light']:.2f} ± {row['light_err']:.2f}" if row["n"] else Missing(none)
-            ),
-            "published": lambda row: f"{row['published']:.2f} -{row['down']:.2f} +{row['up']:.2f}",
-            "reference": lambda row: row["reference"],
-        }
-        self._table(
-            self.metrics["light"],
-            columns,
-            caption="Light of all galaxies above a flux, nu I_nu in nW / m2 / sr; Poisson errors, without "
-            "cosmic variance",
-            empty="The light of all galaxies together is published near 15 and 24 µm; no band of "
-            "this run (F1500W, F2100W) is there.",
-        )
-
-
-def _fit_columns():
-    """Columns of a table of fits: header to the cell of a set of bands and its metrics."""
-    none = "no source fitted"
-    return {
-        "fit": lambda x: SET_LABELS[x[0]],
-        "sources": lambda x: x[1]["n"],
-        "dz/(1+z) median": lambda x: number(x[1]["photoz_bias"], "+.4f", none),
-        "sigma_MAD": lambda x: number(x[1]["photoz_sigma_mad"], ".4f", none),
-        "outliers": lambda x: x[1]["photoz_n_outliers"],
-        "share": lambda x: _percent(x[1]["photoz_outliers"], none),
-        "fracAGN offset": lambda x: number(x[1]["frac_agn_bias"], "+.3f", none),
-        "scatter": lambda x: number(x[1]["frac_agn_sigma_mad"], ".3f", none),
-        "width": lambda x: number(x[1]["frac_agn_width"], ".3f", none),
-        "z in 16-84 %": lambda x: _percent(x[1]["redshift_coverage"], none),
-    }
-
-
-FIT_COLUMNS = _fit_columns()
-
 
 def _proposal(entry):
     """The limit of CEERS' proposal, and the time that it is for where that is another."""
@@ -495,7 +441,3 @@ def _plus_minus(fit):
     if not np.isfinite(fit["frac_agn_bias"]):
         return Missing(NO_SAMPLE)
     return f"{fit['frac_agn_bias']:+.2f} ± {fit['frac_agn_sigma_mad']:.2f}"
-
-
-def _percent(value, reason, spec=".1f"):
-    return number(value, f"{{:{spec}}} %", reason, scale=100)

@@ -1,0 +1,382 @@
+"""Figures of the report on what was found of the truths, from their tables."""
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.evaluation import (
+    CLASS_NAMES,
+    COLOR_WINDOWS,
+    KIRKPATRICK_LIMITS,
+    PAH_FEATURES,
+    REDSHIFT_BINS,
+    XRAY_LIMITS,
+    ColorCircles,
+    classify,
+    completeness,
+    feature_redshifts,
+    measure,
+    sfr_to_infrared_luminosity,
+    sigma_mad,
+    xray_fluxes,
+)
+from miricigale.filters import Filter, FilterSet
+from miricigale.plotting.examples import fit_figure, sequence_figure
+from miricigale.plotting.measurements import features_figure, offsets_figure
+from miricigale.plotting.truths import (
+    classes_figure,
+    colors_figure,
+    completeness_figure,
+    fractions_figure,
+    histograms_figure,
+    luminosity_figure,
+    ranks_figure,
+    recovery_figure,
+)
+from miricigale.utils.tables import error_column
+from miricigale.utils.units import FNU
+from miricigale.workflow.stages.figures import SET_LABELS, band_label
+from miricigale.workflow.stages.sample import magnitude
+from miricigale.workflow.truths import SETS
+
+__all__ = [
+    "band_residuals",
+    "class_figure",
+    "color_figure",
+    "detection_figure",
+    "disk_figure",
+    "example_figure",
+    "fraction_bins_figure",
+    "fraction_figure",
+    "rank_figure",
+    "redshift_figure",
+    "residual_figure",
+    "shape_figure",
+    "spectra_figure",
+    "truth_label",
+    "width_figure",
+    "xray_figure",
+]
+
+#: fracAGN of the spectra that are drawn over each other.
+SEQUENCE = (0.0, 0.2, 0.4, 0.6, 0.8, 0.99)
+#: AB magnitude of the limit of the mock photometry at 24 um.
+MIPS_LIMIT = 19.3
+#: PAH features that are looked for in the residuals.
+FEATURES = PAH_FEATURES[1:3]
+
+
+def truth_label(one):
+    """What a truth (`~miricigale.evaluation.TruthResults`) is called on the page."""
+    return "realistic field" if one.frac_agn is None else f"fracAGN {one.frac_agn:g}"
+
+
+def _sets(one, sets=SETS):
+    """The sets of bands that a truth was fitted with, of those given: name and label."""
+    return {name: SET_LABELS[name] for name in sets if name in one.fits}
+
+
+def _by_truth(study, values):
+    """Values of each truth and set, with and without MIRI: function of truth and set to arrays."""
+    return {
+        truth_label(one): {
+            label: values(one, name) for name, label in _sets(one, ("all", "none")).items()
+        }
+        for one in study.truths
+        if one.sample.any()
+    }
+
+
+def redshift_figure(study):
+    """Histograms of the redshift errors of each truth."""
+    return histograms_figure(
+        _by_truth(study, lambda one, name: one.redshift_error(name)),
+        np.linspace(-0.3, 0.3, 31),
+        xlabel=r"(z$_{\rm fit}$ - z) / (1 + z)",
+        truth={truth_label(one): 0.0 for one in study.truths},
+    )
+
+
+def fraction_figure(study):
+    """Histograms of the posterior means of fracAGN of each truth."""
+    return histograms_figure(
+        _by_truth(study, lambda one, name: one.fitted(name, "frac_agn_mean")),
+        np.linspace(0, 1, 26),
+        xlabel="fracAGN (posterior mean)",
+        truth={truth_label(one): one.frac_agn for one in study.truths},
+    )
+
+
+def width_figure(study):
+    """Histograms of the posterior widths of fracAGN of each truth."""
+    return histograms_figure(
+        _by_truth(study, lambda one, name: one.fitted(name, "frac_agn_std")),
+        np.linspace(0, 0.4, 26),
+        xlabel="posterior width of fracAGN (std)",
+    )
+
+
+def fraction_bins_figure(study):
+    """Median and scatter of fitted against injected fracAGN, by bin of redshift."""
+    truths = [one for one in study.truths if one.frac_agn is not None and one.sample.any()]
+    values = {}
+    for low, high in REDSHIFT_BINS:
+        own = {}
+        for name, label in (_sets(truths[0], ("all", "none")) if truths else {}).items():
+            rows = []
+            for one in truths:
+                z = one.true("redshift")
+                found = one.fitted(name, "frac_agn_mean")[(z >= low) & (z < high)]
+                found = found[np.isfinite(found)]
+                # a scatter of fewer says nothing
+                if found.size >= 5:
+                    rows.append((one.frac_agn, np.median(found), sigma_mad(found)))
+            if rows:
+                own[label] = tuple(np.array(rows).T)
+        if own:
+            values[f"{low:g} < z < {high:g}" if np.isfinite(high) else f"z > {low:g}"] = own
+    return fractions_figure(values)
+
+
+def disk_figure(study, band_set="all"):
+    """Fitted against true accretion power of each truth with AGN; None if there is no such."""
+    values, notes = {}, {}
+    unit = u.erg / u.s
+    for one in study.truths:
+        if band_set not in one.fits or "accretion_power" not in one.truth.colnames:
+            continue
+        error = one.power_error(band_set)
+        error = error[np.isfinite(error)]
+        if error.size:
+            fitted = one.fits[band_set]["accretion_power_mean"]
+            true = one.truth["accretion_power"][one.sample]
+            label = truth_label(one)
+            values[label] = (true.to_value(unit), fitted.to_value(unit))
+            notes[label] = f"median {np.median(error):+.2f} dex, scatter {sigma_mad(error):.2f} dex"
+    if not values:
+        return None
+    return recovery_figure(values, label="disk luminosity (erg/s)", notes=notes)
+
+
+def xray_figure(study, seed):
+    """X-ray fluxes of the injected AGN of the field and of those in the sample; None without any."""
+    truths = study.with_agn or study.truths
+    truths = [one for one in truths if "l_6um" in one.truth.colnames]
+    fluxes = [xray_fluxes(one)[one.field] for one in truths]
+    values = np.concatenate([[], *fluxes])
+    found = np.concatenate([np.zeros(0, bool), *(one.sample[one.field] for one in truths)])
+    good = np.isfinite(values)
+    if not found[good].any():
+        return None
+    ends = np.percentile(values[good], [0.5, 99.5])
+    edges = np.arange(np.floor(4 * ends[0]) / 4, np.ceil(4 * ends[1]) / 4 + 0.01, 0.25)
+    half = None
+    if study.with_agn:
+        half = measure(study, "xray_half", truth=None, seed=seed)
+        half = (half.value, half.low, half.high)
+    return completeness_figure(
+        completeness(values, found, edges),
+        xlabel=r"log X-ray flux, 0.5-7 keV (erg s$^{-1}$ cm$^{-2}$)",
+        limits=[
+            (np.log10(limit.flux.value), f"{limit.survey}, {limit.kind}", limit.checked)
+            for limit in XRAY_LIMITS
+        ],
+        half=half,
+    )
+
+
+def detection_figure(study):
+    """Infrared luminosities of the reference truth against redshift, and which are detected."""
+    one = study.truths[0]
+    table = one.truth
+    least = min(2, len(study.bands))
+    named = "two or more MIRI bands" if least == 2 else "the MIRI band"
+    groups = {
+        f"detected in {named}": one.field & (np.asarray(one.matched["n_detected"]) >= least),
+    }
+    if "mips.24" in table.colnames:
+        with np.errstate(invalid="ignore"):
+            groups["MIPS 24 µm above its limit"] = one.field & (
+                magnitude(table["mips.24"]) < MIPS_LIMIT
+            )
+    power = np.where(one.field, table["ir_luminosity"].to_value(u.Lsun), np.nan)
+    rate = 1 / sfr_to_infrared_luminosity(1 * u.Msun / u.yr).to_value(u.Lsun)
+    # of light of AGN it is no star-formation rate
+    sfr = (rate, r"SFR (M$_\odot$/yr), Kennicutt 1998") if one.frac_agn == 0 else None
+    return luminosity_figure(np.asarray(table["redshift"], float), power, groups, sfr=sfr)
+
+
+def shape_figure(study):
+    """Magnitude errors of sources above 5 sigma by band and shape, crowded ones marked."""
+    one = study.truths[0]
+    index = np.asarray(one.truth["sersic_index"], float)
+    point = np.asarray(one.truth["profile"]) == "point"
+    shapes = {"points": point, "n < 2": ~point & (index < 2), "n ≥ 2": ~point & (index >= 2)}
+    groups, marked = {}, {}
+    for band in study.bands:
+        true, error = one.matched[f"{band}_true"], one.magnitude_error(band)
+        with np.errstate(invalid="ignore"):
+            # by measured flux it would be those that noise made brighter
+            bright = one.field & (true > 5 * one.matched[error_column(band)])
+        for label, shape in shapes.items():
+            rows = bright & shape
+            name = f"{band_label(band)}, {label}"
+            groups[name] = (magnitude(true[rows]), error[rows])
+            marked[name] = one.crowded[band][rows]
+    return offsets_figure(groups, marked=marked)
+
+
+def spectra_figure(study, key, model):
+    """Spectra of one source with AGN of several fractions; ``model`` is one with AGN."""
+    values = {}
+    for one in (*study.with_agn[:1], study.truths[0]):
+        row = one.truth[np.asarray(one.truth["id"]) == key][0]
+        values |= {name: row[name] for name in row.colnames if name in model.parameters}
+    redshift = float(values["redshift"])
+    spectra = {}
+    for fraction in SEQUENCE:
+        sed = model.evaluate(**{**values, "frac_agn": fraction})
+        wave = sed.wave.to_value(u.um)
+        # the whole range of the bands, and of the features that are marked
+        shown = (wave > 0.3) & (wave < 40)
+        spectra[fraction] = sed.fnu.to_value(FNU)[shown]
+    bands = {}
+    for name in study.bands:
+        band = Filter.from_name(name)
+        middle, half = band.pivot.to_value(u.um), 0.5 * band.width.to_value(u.um)
+        bands[band_label(name)] = (middle - half, middle + half)
+    return sequence_figure(
+        wave[shown],
+        spectra,
+        bands=dict(sorted(bands.items(), key=lambda item: item[1])),
+        features=PAH_FEATURES.value,
+        redshift=redshift,
+    )
+
+
+def example_figure(results, row, key, model):
+    """
+    One source: photometry with the best model and residuals, and posteriors of redshift and fracAGN.
+
+    ``results`` has a `~miricigale.fitting.FitResults` for each set of bands, "all" among them; "none" is
+    drawn too if it is there. ``row`` of the truth has ``redshift`` and ``frac_agn``; ``model`` is that of
+    the fits.
+    """
+    best = results["all"][key]
+    total = best.best_sed(model)
+    parts, posteriors, joint = {}, {}, {}
+    for name in ("all", "none"):
+        one = results[name][key] if name in results else None
+        if one is None or not np.isfinite(one.chi2):
+            continue
+        label = SET_LABELS[name]
+        posteriors[label] = tuple(one.distribution(axis) for axis in ("redshift", "frac_agn"))
+        joint[label] = one.joint_pdf("redshift", "frac_agn")
+        if name == "none":
+            other = one.best_sed(model)
+            parts["best model without MIRI"] = (other.wave, other.fnu)
+    fraction = best.best["frac_agn"].value
+    if fraction > 0:
+        galaxy = best.best_sed(model, frac_agn=0.0)
+        parts["galaxy of the best model"] = (galaxy.wave, galaxy.fnu)
+        parts["AGN of the best model"] = (total.wave, total.fnu - galaxy.fnu)
+    filters = FilterSet.from_names(best.filters)
+    order = [filters.names.index(name) for name in best.filters]
+    used = np.isfinite(best.sigma)
+    photometry = {
+        "wave": u.Quantity(filters.pivots)[order],
+        "flux": best.flux * FNU,
+        "flux_err": np.where(used, best.sigma, best.flux_err) * FNU,
+        "model_flux": best.best_flux * FNU,
+        "used": used,
+        "limit": best.limit,
+        "spectrum": (total.wave, total.fnu),
+        "parts": parts,
+        "groups": ["MIRI" if n.startswith("miri.") else "existing bands" for n in best.filters],
+    }
+    return fit_figure(
+        photometry,
+        posteriors,
+        joint,
+        truth=(float(row["redshift"]), float(row["frac_agn"])),
+        title=f"source {key}: injected z = {row['redshift']:.3f}, fracAGN = {row['frac_agn']:.2g}; "
+        f"best model with MIRI: z = {best.best['redshift'].value:.3f}, fracAGN = {fraction:g}, "
+        f"chi2 = {best.chi2:.1f} in {best.n_bands} bands",
+    )
+
+
+def class_figure(table):
+    """Shares found of each class, of a table of `~miricigale.evaluation.study_confusion`."""
+    names = [str(row["class"]) for row in table if row["n"]]
+    found = [name for name in (*CLASS_NAMES, "unknown") if name in table.colnames]
+    counts = np.array([[row[name] for name in found] for row in table if row["n"]], float)
+    told = {"agn": "AGN", "unknown": "not in the fit"}
+    labels = [[told.get(name, name) for name in some] for some in (names, found)]
+    return classes_figure(counts, labels[0], found=labels[1])
+
+
+def color_figure(study, shares):
+    """
+    Two colors of the fitted sources in each range of redshifts, with circles about the AGN.
+
+    ``shares`` are true AGN shares of the 5-15 um light by name of the truth, of all sources; None if no
+    range has an AGN.
+    """
+    planes, labels = {}, {}
+    for window in COLOR_WINDOWS:
+        colors, classes = [np.empty((0, 2))], []
+        for one in study.truths:
+            rows = one.sample & np.isfinite(shares[one.name])
+            z = np.asarray(one.truth["redshift"], float)
+            rows &= (z >= window.z_low) & (z < window.z_high)
+            colors.append(window.colors(one.matched[rows]))
+            classes.append(classify(shares[one.name][rows], limits=KIRKPATRICK_LIMITS))
+        colors, classes = np.concatenate(colors), np.concatenate([np.zeros(0, "<U9"), *classes])
+        good = np.isfinite(colors).all(axis=1)
+        if not np.any(classes[good] == CLASS_NAMES[2]):
+            continue
+        circles = ColorCircles.fit(colors, classes)
+        title = f"{window.z_low:g} < z < {window.z_high:g}"
+        shown = np.where(classes[good] == CLASS_NAMES[2], "AGN", classes[good])
+        planes[title] = (colors[good], shown, circles.center, (circles.inner, circles.outer))
+        labels[title] = tuple(
+            f"log {band_label(a)} / {band_label(b)}" for a, b in (window.x, window.y)
+        )
+    return colors_figure(planes, labels=labels) if planes else None
+
+
+def band_residuals(results, bands):
+    """
+    Measured minus best-model magnitudes of the MIRI bands, of sources above 5 sigma in them.
+
+    ``results`` is a `~miricigale.fitting.FitResults`; dict of str to `~numpy.ndarray`, NaN where fainter.
+    """
+    out = {}
+    for band in bands:
+        k = results.filters.index(band)
+        flux, error, model = (v[:, k] for v in (results.flux, results.flux_err, results.best_flux))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            good = (flux > 5 * error) & (model > 0)
+            out[band] = np.where(good, -2.5 * np.log10(np.where(good, flux / model, 1.0)), np.nan)
+    return out
+
+
+def residual_figure(redshift, residuals):
+    """Residuals of the fit in each band (`band_residuals`) against redshift, with PAH features."""
+    ranges = {}
+    for band in residuals:
+        own = Filter.from_name(band)
+        ranges[band_label(band)] = {
+            f"{rest.value:g} µm": feature_redshifts(rest, own.pivot, own.width) for rest in FEATURES
+        }
+    values = {band_label(band): (redshift, values) for band, values in residuals.items()}
+    return features_figure(values, ranges)
+
+
+def rank_figure(ranks):
+    """Ranks of the truth in the posteriors: dict of (set, parameter) to arrays."""
+    by_name = {}
+    for (unit, name), values in ranks.items():
+        if unit in ("all", "none"):
+            label = "fracAGN" if name == "frac_agn" else name.replace("_", " ")
+            by_name.setdefault(label, {})[SET_LABELS[unit]] = values
+    return ranks_figure(by_name)
