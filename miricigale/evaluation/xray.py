@@ -5,7 +5,7 @@ import dataclasses
 import astropy.units as u
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import log_ndtr
+from scipy.special import expit, ndtr, ndtri
 
 from miricigale.evaluation.metrics import fraction_interval
 from miricigale.sed.xray import stern2015, xray_flux
@@ -158,8 +158,8 @@ def half_complete(values, found):
     """
     Value above which sources are more likely found than not.
 
-    The share found is taken as an error function of the value that rises, with center and width of the highest
-    likelihood.
+    The share found is taken as an error function of the value that rises to a share of the bright ones (some
+    are lost whatever their value), with center, width and share of the highest likelihood.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def half_complete(values, found):
     Returns
     -------
     value : float
-        NaN if all or none were found, or the center is outside of the values.
+        NaN if all or none were found, or the curve passes one half nowhere within the values.
     """
     values, found = _checked(values, found)
     good = np.isfinite(values)
@@ -180,16 +180,25 @@ def half_complete(values, found):
     if not found.any() or found.all():
         return np.nan
     scale = max(float(values.std()), 1e-6)
-    sign = np.where(found, 1.0, -1.0)
+
+    def curve(parameters):
+        center, log_width, log_odds = parameters
+        # a sharp limit has no finite width of the highest likelihood
+        return center, np.exp(max(log_width, -20.0)), expit(log_odds)
 
     def unlikely(parameters):
-        center, log_width = parameters
-        # a sharp limit has no finite width of the highest likelihood
-        return -log_ndtr(sign * (values - center) / np.exp(max(log_width, -20.0))).sum()
+        center, width, top = curve(parameters)
+        chance = top * ndtr((values - center) / width)
+        return -np.log(np.clip(np.where(found, chance, 1.0 - chance), 1e-300, 1.0)).sum()
 
     start = 0.5 * (np.median(values[found]) + np.median(values[~found]))
-    best = minimize(unlikely, [start, np.log(0.5 * scale)], method="Nelder-Mead").x[0]
-    return float(best) if values.min() <= best <= values.max() else np.nan
+    begin = [start, np.log(0.5 * scale), 3.0]
+    best = minimize(unlikely, begin, method="Nelder-Mead", options={"maxiter": 1000}).x
+    center, width, top = curve(best)
+    if top <= 0.5:
+        return np.nan
+    half = center + width * ndtri(0.5 / top)
+    return float(half) if values.min() <= half <= values.max() else np.nan
 
 
 def _checked(values, found):

@@ -1,6 +1,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from scipy.special import ndtr, ndtri
 from scipy.stats import norm
 
 from miricigale.evaluation import (
@@ -70,3 +71,12 @@ def test_refuses():
         half_complete([1.0], [True, False])
     with pytest.raises(ValueError, match="'edges' must be ascending"):
         completeness([1.0], [True], [1.0, 0.0])
+
+
+def test_half_of_the_sources_is_half_where_some_bright_ones_are_lost():
+    rng = np.random.default_rng(2)
+    x = rng.uniform(-18, -13, 4000)
+    chance = 0.88 * ndtr((x + 16.5) / 0.3)
+    # where the share itself is one half, not half of that of the bright ones
+    wanted = -16.5 + 0.3 * ndtri(0.5 / 0.88)
+    assert half_complete(x, rng.random(x.size) < chance) == pytest.approx(wanted, abs=0.05)
