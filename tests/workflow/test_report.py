@@ -198,7 +198,7 @@ def test_numbers_beside_the_paper_are_measured_where_the_run_has_them(reports):
     assert "mismatch between simulator and pipeline" in verdict["f_scaling.f770w"]
     page = html.unescape(page_of(reports["truths"]))
     assert "another field: the field is another one: 24 galaxies; theirs has 463." in page
-    # with another statistic the reason is another one
+    # what the run does otherwise
     assert "3.4 of Gaussian errors" in page
 
 

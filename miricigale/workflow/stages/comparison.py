@@ -134,7 +134,7 @@ def _facts(config, metrics, model):
             "errors are 1.48 times the median absolute difference; theirs are the median itself, so that "
             "their 5 sigma are 3.4 of Gaussian errors."
         )
-        facts["statistic"] = ("5 sigma of a wider error", sentence)
+        facts["statistic"] = ("errors 1.48 times theirs, which lowers it", sentence)
     if config.detector.residual == 0.0:
         facts["residual"] = (
             "no residual of the flat field",
