@@ -123,16 +123,17 @@ def expose_and_reduce(
 
 
 def _sky_plan(config, unit):
-    """The plan of an exposure, and the perturbations of its truth if it has any."""
-    values = study_truths(config)[unit.partition("/")[0]].values()
+    """The plan of an exposure, the perturbations of its truth, and whether that is the reference."""
+    name = unit.partition("/")[0]
+    values = study_truths(config)[name].values()
     differ = {"perturbations": values["perturbations"]} if "perturbations" in values else {}
-    return exposure_plan(config, unit) | differ
+    return exposure_plan(config, unit) | differ | {"is_reference": name == reference(config)}
 
 
 @stage(
     "exposures",
     "exposure",
-    version=6,
+    version=7,
     needs={"truth": of_truth},
     sections=(*IMAGES, "run.keep_level1b"),
     resources=EXPOSURE_RESOURCES,
@@ -167,7 +168,8 @@ def make_exposure(context, unit):
         keep=keep if config.run.keep_level1b else None,
     )
     context.save_image(f"{truth}/exposures/{name}_cal.fits", cal, dq=cal.flags)
-    if config.run.keep_level1b:
+    # the report shows what the subtraction of the background did to one exposure of a band
+    if config.run.keep_level1b or (context.plan["is_reference"] and exposure.dither == 0):
         context.save_image(f"{truth}/exposures/{name}_rate.fits", rate, dq=rate.flags)
 
 
