@@ -71,7 +71,7 @@ class Case:
     nodes: tuple = ()  # or the values that it is drawn from
     refitted: bool = False  # or truths are best fits to the existing bands, alpha too
     redshift_nodes: bool = False  # whether true redshifts are nodes of the grid
-    agn_nodes: bool = False  # whether true AGN are templates of the grid
+    agn_nodes: tuple = ()  # parameters of true AGN that are those of the grid's templates
     main_sequence: bool = False  # whether dust luminosities are those of the main sequence
     dust: str = "bundled"  # of truth and fit: bundled or library
     torus: str = "bundled"
@@ -86,6 +86,23 @@ class Case:
     fixed_redshift: bool = False
 
 
+#: Parameters of the AGN: the value that the fit fixes, or None for its nodes.
+AGN_FIXED = {
+    "inclination": 70.0,
+    "p": 1.0,
+    "q": 1.0,
+    "emissivity_polar": 1.6,
+    "ebv_polar": None,
+    "temperature_polar": None,
+}
+POLAR = tuple(name for name in AGN_FIXED if name.endswith("polar"))
+
+
+def all_but(*names):
+    """Parameters of the AGN without some."""
+    return tuple(name for name in AGN_FIXED if name not in names)
+
+
 LIBRARIES = {"dust": "library", "torus": "library"}
 CASES = {
     "run": Case(),
@@ -96,7 +113,13 @@ CASES = {
     # truths on the nodes of the grid
     "redshift-nodes": Case(redshift_nodes=True),
     "alpha-nodes": Case(nodes=ALPHAS),
-    "all-nodes": Case(nodes=ALPHAS, redshift_nodes=True, agn_nodes=True),
+    "all-nodes": Case(nodes=ALPHAS, redshift_nodes=True, agn_nodes=all_but()),
+    "agn-nodes": Case(agn_nodes=all_but()),
+    # one property of the true AGN drawn, the others on the nodes
+    "agn-inclination": Case(agn_nodes=all_but("inclination")),
+    "agn-p": Case(agn_nodes=all_but("p")),
+    "agn-q": Case(agn_nodes=all_but("q")),
+    "agn-polar": Case(agn_nodes=all_but(*POLAR)),
     "refitted": Case(refitted=True),
     # libraries, and others in the truth than in the fit
     "dale": Case(dust="library"),
@@ -111,6 +134,10 @@ CASES = {
     "proposal-limits": Case(limits="proposal"),
     "proposal-refitted": Case(limits="proposal", refitted=True),
     "proposal-alpha-1.0": Case(limits="proposal", nodes=(1.0,)),
+    "proposal-alpha-nodes": Case(limits="proposal", nodes=ALPHAS),
+    # limits of the paper are up to a magnitude shallower than these
+    "half-mag-shallower": Case(limits="proposal", nodes=ALPHAS, deeper=-0.5),
+    "one-mag-shallower": Case(limits="proposal", nodes=ALPHAS, deeper=-1.0),
     "proposal-libraries-alpha-1.0": Case(limits="proposal", nodes=(1.0,), **LIBRARIES),
     "proposal-sample": Case(sample="proposal"),
     "one-mag-deeper": Case(deeper=1.0, sample="run"),
@@ -212,12 +239,11 @@ def make_truth(case, frac_agn, seed):
         table["dust_excess"] = main_sequence_dust(light, seed=seed)["dust_excess"]
     if frac_agn > 0:
         add_agn(table, frac_agn, seed)
-        if case.torus == "library" or case.agn_nodes:
-            table["p"], table["q"] = 1.0, 0.0 if case.torus == "library" else 1.0
-        if case.agn_nodes:
-            table["inclination"], table["emissivity_polar"] = 70.0, 1.6
-            for name in ("ebv_polar", "temperature_polar"):
-                table[name] = nearest(table[name], AXES[name])
+        for name in case.agn_nodes:
+            fixed = AGN_FIXED[name]
+            table[name] = nearest(table[name], AXES[name]) if fixed is None else fixed
+        if case.torus == "library":
+            table["p"], table["q"] = 1.0, 0.0
     light = model.fluxes(table, BANDS)
     for name in (*BANDS, "accretion_power"):
         table[name] = light[name]

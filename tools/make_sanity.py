@@ -13,6 +13,7 @@ from pathlib import Path
 
 import astropy.units as u
 import numpy as np
+from astropy.table import QTable
 
 from miricigale.evaluation import number
 from miricigale.sed import SEDModel
@@ -21,7 +22,8 @@ from miricigale.workflow.products import read_image
 from miricigale.workflow.stages import figures, pictures, provenance
 from miricigale.workflow.stages.metrics import StudyTables
 from miricigale.workflow.stages.sample import SampleFlags, typical_source
-from miricigale.workflow.truths import reference
+from miricigale.workflow.stages.variants import HEADER, variant_rows
+from miricigale.workflow.truths import reference, variant_changes
 
 
 def rst_table(header, rows):
@@ -147,7 +149,10 @@ def main():
         for unit, m in metrics["fits"].items()
     ]
     header = ("fit", "n", "dz/(1+z)", "sigma_MAD", "outliers", "fracAGN", "scatter", "width")
-    print(rst_table(header, rows))
+    print(rst_table(header, rows), "\n")
+    if config.variants.images:
+        rows = variant_rows(QTable.read(run / "report" / "variants.ecsv"), variant_changes(config))
+        print(rst_table(HEADER, rows))
 
 
 if __name__ == "__main__":

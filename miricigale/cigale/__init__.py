@@ -6,8 +6,8 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "catalog": ("cigale_columns", "read_cigale_catalog"),
-        "names": ("cigale_band", "filter_of_band"),
         "results": ("read_cigale_results", "write_cigale_results"),
         "setup": ("CigaleSetup", "fit_cigale", "read_pcigale_ini"),
     },
+    moved={"miricigale.filters": ("cigale_band", "filter_of_band")},
 )

@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable, Table
 
-from miricigale.cigale.names import band_filters, filter_of_band, is_line
+from miricigale.filters.band_names import band_filters, filter_of_band, is_line
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 from miricigale.utils.files import read_table
 from miricigale.utils.tables import error_column

@@ -6,7 +6,8 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable, Table
 
-from miricigale.cigale.names import cigale_band, cigale_names, filter_of_band, unit_of
+from miricigale.cigale.names import cigale_names, unit_of
+from miricigale.filters.band_names import cigale_band, filter_of_band
 from miricigale.utils.exceptions import DataError, argument_error, unknown_name
 from miricigale.utils.files import read_table
 from miricigale.utils.store import replacing

@@ -10,8 +10,9 @@ import numpy as np
 from miricigale.cigale.catalog import read_cigale_catalog
 from miricigale.cigale.ini import LIMIT_FLAGS, parse_ini
 from miricigale.cigale.modules import read_modules
-from miricigale.cigale.names import band_filters, cigale_names
+from miricigale.cigale.names import cigale_names
 from miricigale.cigale.results import write_cigale_results
+from miricigale.filters.band_names import band_filters
 from miricigale.fitting import BayesFitter, FitResults
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError, MiricigaleWarning, argument_error

@@ -24,6 +24,6 @@ __getattr__, __dir__, __all__ = lazy_names(
             "saturation_forecast",
             "saturation_time",
         ),
-        "zodiacal": ("zodiacal_factor", "zodiacal_levels"),
+        "zodiacal": ("sky_background", "zodiacal_factor", "zodiacal_levels"),
     },
 )

@@ -1,4 +1,4 @@
-"""How bright the zodiacal light is: by level, by ecliptic latitude, by position and date."""
+"""How bright zodiacal light and background are: by level, by ecliptic latitude, by position and date."""
 
 import functools
 
@@ -15,8 +15,9 @@ from miricigale.instrument.wcs import scalar_position
 from miricigale.refdata import locate
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.optional import require
+from miricigale.utils.units import SURFACE_BRIGHTNESS, to_array
 
-__all__ = ["zodiacal_factor", "zodiacal_levels"]
+__all__ = ["sky_background", "zodiacal_factor", "zodiacal_levels"]
 
 #: Angles from the Sun, deg, between which the telescope may look.
 _FIELD_OF_REGARD = (85.0, 135.0)
@@ -100,6 +101,55 @@ def zodiacal_factor(filter, level="medium", *, position=None, date=None):
     ecliptic = position.transform_to(BarycentricMeanEcliptic)
     known = np.isfinite(latitude)
     return float(np.interp(abs(ecliptic.lat.deg), latitude[known], rows[name][known]))
+
+
+def sky_background(filter, level="low", *, position=None, date=None):
+    """
+    Background of sky and telescope by level, position or day.
+
+    Parameters
+    ----------
+    filter : str
+        One of `~miricigale.instrument.imager_filters`.
+    level : str or `~astropy.units.Quantity`, optional
+        ``"low"``, ``"medium"`` or ``"high"`` zodiacal light as in `zodiacal_factor`, or the surface
+        brightness itself. ``"low"`` without a position is the low background of the package
+        (`~miricigale.instrument.background_level`).
+    position, date : optional
+        As in `zodiacal_factor`.
+
+    Returns
+    -------
+    background : `~astropy.units.Quantity`
+        In MJy/sr.
+
+    Raises
+    ------
+    ImportError, KeyError, ValueError
+        As `zodiacal_factor`; or if a surface brightness is negative, or comes with a position or a
+        date.
+    `~astropy.units.UnitsError`
+        If a quantity is no surface brightness.
+
+    Examples
+    --------
+    >>> from miricigale.depth import sky_background
+    >>> print(", ".join(f"{sky_background('miri.f1000w', k):.1f}" for k in ("low", "medium", "high")))
+    11.5 MJy / sr, 14.7 MJy / sr, 21.7 MJy / sr
+    """
+    if isinstance(level, u.Quantity):
+        filter_row(filter)
+        value = float(to_array(level, SURFACE_BRIGHTNESS, "level", ndim=0, finite=True))
+        if value < 0:
+            raise argument_error("level", "at least 0", level)
+        for name, given in (("position", position), ("date", date)):
+            if given is not None:
+                raise argument_error(name, "left out with a surface brightness", given)
+        return value * SURFACE_BRIGHTNESS
+    if level == "low" and position is None and date is None:
+        return background_level(filter)
+    zodi = zodiacal_factor(filter, level, position=position, date=date)
+    return background_level(filter, zodi=zodi)
 
 
 def _factor_on(name, position, date):

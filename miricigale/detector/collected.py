@@ -66,6 +66,11 @@ class Charge:
         return self._effect(kind) is not None
 
     @property
+    def group_time(self):
+        """Time between groups in s."""
+        return float(self.exposure.group_time.to_value("s"))
+
+    @property
     def total_time(self):
         """Time in s in which ``electrons`` were collected."""
         e = self.exposure

@@ -1,41 +1,35 @@
 """The detector: a tuple of effects, applied block by block."""
 
-import dataclasses
 import logging
+import math
 import warnings
 from pathlib import Path
 
 import numpy as np
 
 from miricigale.depth.saturation import SKY_FRACTION, SaturationForecast, saturation_forecast
-from miricigale.detector import _core, level1b
+from miricigale.detector import level1b
 from miricigale.detector.collected import Charge
 from miricigale.detector.effects import (
     ORDER,
-    BadPixels,
     Block,
-    CosmicRays,
-    Dark,
     Effect,
     FirstFrame,
-    InterpixelCapacitance,
     LastFrame,
     Persistence,
-    Photons,
     ReadNoise,
-    ReferencePixels,
     ResetAnomaly,
     Residual,
-    WholeBlock,
 )
 from miricigale.detector.effects.order import check_order, keyed, place_of
 from miricigale.detector.image import checked_light
 from miricigale.detector.latent import Latent
 from miricigale.detector.ramp import Ramp
-from miricigale.instrument import DetectorProperties, Exposure, ImageFacts, miri_detector
+from miricigale.detector.work import Work
+from miricigale.instrument import DetectorProperties, ImageFacts, miri_detector
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.meta import provenance
-from miricigale.utils.parallel import chunks, parallel_map, threads
+from miricigale.utils.parallel import check_memory
 from miricigale.utils.random import check_seed
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 
@@ -50,25 +44,7 @@ _STANDARD = [
     if kind not in (Residual, Persistence, ResetAnomaly, FirstFrame, LastFrame)
 ]
 
-#: What makes the charge of a pixel, whenever it comes within the exposure; cosmic rays apart.
-_COLLECTING = (
-    Residual,
-    Photons,
-    Dark,
-    InterpixelCapacitance,
-    Persistence,
-    BadPixels,
-    ReferencePixels,
-)
-
-#: Those of them whose electrons are one Poisson number, before neighbors are coupled.
-_LIGHT = (Residual, Photons, Dark)
-
-# rows whose charge is collected at once
-_ROWS = 128
-
-# samples (float32) that one thread has in hand: a few MB, so that they stay in the cache
-_BLOCK_SAMPLES = 2**21
+_EXPOSE_TO = "expose fewer groups, or write it by 'expose_to'"
 
 
 class Detector:
@@ -244,6 +220,8 @@ class Detector:
         """
         task = self._task(image, exposure, seed, previous)
         shape = task.shape
+        # counts, and flags of groups where all have some
+        check_memory(3 * math.prod(shape), f"a ramp of shape {shape}", advice=_EXPOSE_TO)
         data = np.empty(shape, np.uint16)
         pixel_dq = np.zeros(shape[2:], np.uint32)
         # only flagged rows are ever written, so that the rest takes no memory
@@ -255,13 +233,14 @@ class Detector:
             for i, g, r in np.argwhere(group_flags.any(axis=3)):
                 group_dq[i, g, rows.start + r] = group_flags[i, g, r]
 
-        self._run(task, store, n_threads, progress_bar)
+        task.run(store, n_threads, progress_bar)
         return Ramp(
             data,
             exposure,
             pixel_dq=pixel_dq,
             group_dq=group_dq,
             effects=task.effects,
+            properties=self._properties,
             meta=task.meta,
         )
 
@@ -315,8 +294,8 @@ class Detector:
                 write_rows(rows, counts)
                 pixel_dq[rows] = pixel_flags
 
-            self._run(task, store, n_threads, progress_bar)
-            finish(pixel_dq, task.effects, task.meta)
+            task.run(store, n_threads, progress_bar)
+            finish(pixel_dq, task.effects, task.meta, self._properties)
         return path
 
     def collect(
@@ -365,35 +344,8 @@ class Detector:
                 raise argument_error("effects", wanted, repr(effect))
         seed = check_seed(seed)
         task = self._task(image, exposure, seed, previous)
-        shape = exposure.shape
-        mean, electrons = np.empty(shape), np.empty(shape, np.float32)
-        pixel_dq = np.zeros(shape, np.uint32)
-
-        def work(rows):
-            mean[rows], electrons[rows], pixel_dq[rows], *hits = self._collect_rows(task, rows)
-            return hits
-
-        with threads(n_threads) as executor:
-            blocks = chunks(shape[0], _ROWS)
-            hits = parallel_map(
-                work,
-                blocks,
-                executor=executor,
-                progress_bar=progress_bar,
-                desc=f"charge {exposure.filter}",
-            )
-        return Charge(
-            exposure,
-            mean,
-            electrons,
-            np.concatenate([where for where, _ in hits], axis=1),
-            np.concatenate([charge for _, charge in hits]),
-            pixel_dq,
-            task.effects,
-            self._properties,
-            seed,
-            task.meta,
-        )
+        *planes, pixel_dq = task.collect(n_threads, progress_bar)
+        return Charge(exposure, *planes, pixel_dq, task.effects, self._properties, seed, task.meta)
 
     def forecast(self, image, exposure, *, sources=None):
         """
@@ -448,6 +400,7 @@ class Detector:
     def _task(self, image, exposure, seed, previous):
         """Check what is exposed and gather what all its blocks share."""
         light = checked_light(image, exposure)
+        exposure.check_sky()
         seed = check_seed(seed)
         effects, included = self._acting(image)
         previous = self._previous(previous, exposure)
@@ -458,67 +411,9 @@ class Detector:
             sky_well_fraction=round(fraction, 4),
             previous=[repr(latent) for latent in previous] or None,
         )
-        return _Task(light, exposure, keyed(effects, seed, exposure), previous, meta)
-
-    def _run(self, task, store, n_threads, progress_bar):
-        """Expose all rows, block by block, and hand each block to ``store``."""
-        n_int, n_group, ny, nx = task.shape
-        height = max(1, _BLOCK_SAMPLES // (n_int * n_group * nx))
-
-        def work(rows):
-            store(rows, *self._expose_rows(task, rows))
-
-        desc = f"ramp {task.exposure.filter}"
-        with threads(n_threads) as executor:
-            parallel_map(
-                work, chunks(ny, height), executor=executor, progress_bar=progress_bar, desc=desc
-            )
-
-    def _expose_rows(self, task, rows):
-        """Apply the effects to some rows: counts, flags of pixels, flags of groups."""
-        halo = sum(effect.halo for effect, _ in task.keyed)
-        wide = slice(max(rows.start - halo, 0), min(rows.stop + halo, task.light.shape[0]))
-        shape = (*task.shape[:2], wide.stop - wide.start, task.shape[3])
-        pixel_dq = np.zeros(shape[2:], np.uint32)
-        group_dq = np.zeros(shape, np.uint8)
-        array = task.light[wide]
-        for effect, key in task.keyed:
-            block = Block(
-                task.exposure, self._properties, wide, pixel_dq, group_dq, key, task.previous
-            )
-            array = effect.apply(array, block)
-        inner = slice(rows.start - wide.start, rows.stop - wide.start)
-        return array[:, :, inner], pixel_dq[inner], group_dq[:, :, inner]
-
-    def _collect_rows(self, task, rows):
-        """Collect the charge of some rows: mean rate, electrons, flags of pixels, hits."""
-        chain = [(effect, key) for effect, key in task.keyed if isinstance(effect, _COLLECTING)]
-        halo = sum(effect.halo for effect, _ in chain)
-        wide = slice(max(rows.start - halo, 0), min(rows.stop + halo, task.light.shape[0]))
-        shape = (wide.stop - wide.start, task.shape[3])
-        pixel_dq = np.zeros(shape, np.uint32)
-        ramp = np.zeros((1, 1, *shape), np.float32)
-        where = (task.exposure, self._properties, wide, pixel_dq, np.zeros(ramp.shape, np.uint8))
-        mean = task.light[wide]
-        n_light = sum(isinstance(effect, _LIGHT) for effect, _ in chain)
-        for effect, key in chain[:n_light]:
-            block = WholeBlock(*where, key)
-            mean = effect.expected(mean, block)
-        # photons and dark current together, as their sum is one Poisson number
-        _core.add_poisson(ramp, mean * block.total_time, key, wide.start)
-        for effect, key in chain[n_light:]:
-            block = WholeBlock(*where, key, task.previous)
-            mean, ramp = effect.expected(mean, block), effect.apply(ramp, block)
-        hits = (np.empty((3, 0), np.int32), np.empty(0))
-        for effect, key in task.keyed:
-            if isinstance(effect, CosmicRays):
-                groups = np.broadcast_to(
-                    np.uint8(0), (*task.shape[:2], rows.stop - rows.start, shape[1])
-                )
-                block = Block(task.exposure, self._properties, rows, pixel_dq, groups, key)
-                hits = effect.hits(block)
-        inner = slice(rows.start - wide.start, rows.stop - wide.start)
-        return mean[inner], ramp[0, 0, inner], pixel_dq[inner], *hits
+        return Work(
+            light, exposure, self._properties, keyed(effects, seed, exposure), previous, meta
+        )
 
     def _previous(self, previous, exposure):
         """Previous exposures as a tuple, checked."""
@@ -549,26 +444,6 @@ class Detector:
         elif fraction > SKY_FRACTION:
             logger.warning(message)
         return fraction
-
-
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class _Task:
-    """What all blocks of one exposure share."""
-
-    light: np.ndarray
-    exposure: Exposure
-    keyed: tuple
-    previous: tuple
-    meta: dict
-
-    @property
-    def effects(self):
-        return tuple(effect for effect, _ in self.keyed)
-
-    @property
-    def shape(self):
-        e = self.exposure
-        return (e.n_integrations, e.n_groups, *e.shape)
 
 
 def _sky_message(exposure, fraction):

@@ -1,5 +1,5 @@
 """
-Files of JWST level 1b (``*_uncal.fits``), written and read with astropy alone.
+Files of JWST level 1b (``*_uncal.fits``), written with astropy alone.
 
 The counts stand in ``SCI`` as unsigned 16-bit numbers (BZERO 32768). A constant ASDF stub
 of a hundred bytes is what the official pipeline needs to recognize the file. Keywords
@@ -7,36 +7,28 @@ follow the JWST keyword dictionary; those that the pipeline asks for are all the
 """
 
 import contextlib
+import dataclasses
 import functools
 import json
 import os
 import threading
 from pathlib import Path
 
-import astropy.units as u
 import numpy as np
-from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.time import Time, TimeDelta
 
-from miricigale.detector.effects import effect_from_record
-from miricigale.instrument import DQ, Exposure, reference_pixel_mask
-from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import open_fits
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.store import plain_value, replacing
 
-__all__ = ["header", "read", "row_writer", "write"]
+__all__ = ["header", "row_writer", "write"]
 
 _ASDF = (
     b"#ASDF 1.0.0\n#ASDF_STANDARD 1.6.0\n%YAML 1.1\n%TAG ! tag:stsci.edu:asdf/\n"
     b"--- !core/asdf-1.1.0\nmeta: {}\n...\n"
 )
 
-# bytes converted at a time
-_CHUNK = 2**26
-
 _START = "2022-06-21T00:00:00"
-_REFERENCE = np.uint32(DQ.REFERENCE_PIXEL | DQ.NON_SCIENCE)
 
 
 def header(exposure, *, filename="", start=None):
@@ -162,14 +154,34 @@ def write(path, ramp, *, start=None, filename=None, overwrite=False):
     if ramp.data.dtype != np.uint16:
         raise argument_error("data", "counts (uint16) to be written", ramp.data.dtype)
     options = {"start": start, "filename": filename, "overwrite": overwrite}
+    if not ramp.simulated and ramp.observed:
+        # the keywords of the observation, and none of a simulation
+        options["observation"] = ramp.header
     with row_writer(path, ramp.exposure, **options) as (write_rows, finish):
         write_rows(slice(0, ramp.shape[2]), ramp.data)
-        finish(ramp.pixel_dq, ramp.effects, ramp.meta)
+        extra = {"reference_output": ramp.reference_output}
+        finish(ramp.pixel_dq, ramp.effects, ramp.meta, ramp.properties, **extra)
     return Path(path)
 
 
+def _int_times(exposure, start):
+    """Table INT_TIMES of JWST: begin, middle and end of each integration; barycentric times are unknown."""
+    n_int = exposure.n_integrations
+    length = exposure.integration_time.to_value("day")
+    step = length + exposure.frame_time.to_value("day")
+    begin = start + step * np.arange(n_int)
+    fields = [fits.Column(name="integration_number", format="J", array=np.arange(1, n_int + 1))]
+    for name, shift in (("start", 0.0), ("mid", length / 2), ("end", length)):
+        column = f"int_{name}_MJD_UTC"
+        fields.append(fits.Column(name=column, format="D", array=begin + shift))
+    for name in ("start", "mid", "end"):
+        column = f"int_{name}_BJD_TDB"
+        fields.append(fits.Column(name=column, format="D", array=np.full(n_int, np.nan)))
+    return fits.BinTableHDU.from_columns(fields, name="INT_TIMES")
+
+
 @contextlib.contextmanager
-def row_writer(path, exposure, *, start=None, filename=None, overwrite=False):
+def row_writer(path, exposure, *, start=None, filename=None, overwrite=False, observation=None):
     """
     Write a level-1b file block by block.
 
@@ -181,6 +193,8 @@ def row_writer(path, exposure, *, start=None, filename=None, overwrite=False):
         What is exposed.
     start, filename, overwrite : optional
         As for `write`.
+    observation : `~astropy.io.fits.Header`, optional
+        Keywords of an observation, in place of those of a simulation.
 
     Yields
     ------
@@ -188,7 +202,8 @@ def row_writer(path, exposure, *, start=None, filename=None, overwrite=False):
         Takes a slice of detector rows and their counts (uint16, shape (n_int, n_group, n_row,
         nx)), in any order and from any thread.
     finish : callable
-        To be called last, with the pixel_dq, effects and meta of a `~miricigale.detector.Ramp`.
+        To be called last, with the pixel_dq, effects, meta, properties and (by keyword)
+        reference_output of a `~miricigale.detector.Ramp`.
 
     Raises
     ------
@@ -196,7 +211,14 @@ def row_writer(path, exposure, *, start=None, filename=None, overwrite=False):
         If the file exists and ``overwrite`` is False.
     """
     path = Path(path)
-    primary, science = header(exposure, filename=filename or path.name, start=start)
+    filename = filename or path.name
+    if observation is None:
+        primary, science = header(exposure, filename=filename, start=start)
+    else:
+        primary, science = observation.copy(), fits.Header({"BUNIT": "DN"})
+        primary["FILENAME"] = filename
+    begun = primary.get("EXPSTART")
+    times = None if begun is None else _int_times(exposure, begun)
     shape = (exposure.n_integrations, exposure.n_groups, *exposure.shape)
     axes = [("NAXIS", len(shape))] + [(f"NAXIS{i + 1}", n) for i, n in enumerate(shape[::-1])]
     structure = [("XTENSION", "IMAGE"), ("BITPIX", 16), *axes, ("PCOUNT", 0), ("GCOUNT", 1)]
@@ -223,16 +245,22 @@ def row_writer(path, exposure, *, start=None, filename=None, overwrite=False):
                             msg = f"{path} could not be written: is the disk full?"
                             raise OSError(msg)
 
-            yield write_rows, functools.partial(_append, partial)
+            yield write_rows, functools.partial(_append, partial, times)
 
 
-def _append(partial, pixel_dq, effects, meta):
+def _append(partial, times, pixel_dq, effects, meta, properties=None, *, reference_output=None):
     """Add what level 1b does not know: flags, effects and provenance."""
     meta = dict(meta)
     if effects is not None:
         meta["effects"] = [effect.record() for effect in effects]
+    if properties is not None:
+        meta["properties"] = dataclasses.asdict(properties)
     text = json.dumps(meta, default=plain_value).encode()
     with fits.open(partial, mode="append") as hdus:
+        if reference_output is not None:
+            hdus.append(fits.ImageHDU(np.asarray(reference_output), name="REFOUT"))
+        if times is not None:
+            hdus.append(times)
         hdus.append(fits.ImageHDU(np.asarray(pixel_dq), name="SIM_PIXELDQ"))
         if meta:
             hdus.append(_bytes_table(text, "JSON", "SIM_META"))
@@ -240,102 +268,7 @@ def _append(partial, pixel_dq, effects, meta):
         hdus.append(_bytes_table(_ASDF, "ASDF_METADATA", "ASDF"))
 
 
-def _chunks(flat):
-    step = _CHUNK // flat.itemsize
-    for start in range(0, flat.size, step):
-        yield flat[start : start + step]
-
-
 def _bytes_table(text, column, name):
     array = np.frombuffer(text, np.uint8)[None]
     fields = [fits.Column(name=column, format=f"{array.size}B", array=array)]
     return fits.BinTableHDU.from_columns(fields, name=name)
-
-
-def read(path):
-    """
-    Read a level-1b file of the MIRI imager, our own or real.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-
-    Returns
-    -------
-    values : dict
-        Arguments of `~miricigale.detector.Ramp`. The exposure is made from the keywords, its
-        counts from the data; a dither is the position number in the pattern, from 0. In a file
-        that is not ours the reference pixels alone are flagged, and it is not known what acted.
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If the file is missing, truncated or not of that kind.
-    """
-    path, wanted = Path(path), "a level-1b file of the MIRI imager"
-    try:
-        with open_fits(path, wanted=wanted, memmap=True, do_not_scale_image_data=True) as hdus:
-            return _read(path, hdus)
-    except (AttributeError, KeyError, SyntaxError, TypeError, ValueError, OSError) as err:
-        if isinstance(err, DataError):
-            raise
-        msg = f"{path} cannot be read as {wanted}: {err}"
-        raise DataError(msg) from err
-
-
-def _read(path, hdus):
-    if "SCI" not in hdus:
-        msg = f"{path} is no level-1b file: it has no SCI extension"
-        raise DataError(msg)
-    science, primary = hdus["SCI"], hdus[0].header
-    if primary.get("INSTRUME") != "MIRI" or primary.get("EXP_TYPE") != "MIR_IMAGE":
-        kind = f"{primary.get('INSTRUME')} {primary.get('EXP_TYPE')}"
-        msg = f"{path} must be a MIRI MIR_IMAGE exposure, got {kind}"
-        raise DataError(msg)
-    head = science.header
-    scaling = (head.get("BITPIX"), head.get("BZERO", 0), head.get("BSCALE", 1), head["NAXIS"])
-    if scaling != (16, 32768, 1, 4):
-        msg = f"{path} must hold unsigned 16-bit counts on four axes (level 1b) in SCI"
-        raise DataError(msg)
-    raw = science.data
-    data = np.empty(raw.shape, np.uint16)
-    for into, part in zip(_chunks(data.reshape(-1)), _chunks(raw.reshape(-1)), strict=True):
-        np.bitwise_xor(part.astype(np.int16).view(np.uint16), np.uint16(0x8000), out=into)
-
-    def keyword(name, default=None):
-        value = head.get(name, primary.get(name, default))
-        if value is None:
-            msg = f"{path} has no keyword {name}"
-            raise DataError(msg)
-        return value
-
-    exposure = Exposure(
-        f"miri.{keyword('FILTER').lower()}",
-        readout=keyword("READPATT"),
-        n_groups=data.shape[1],
-        n_integrations=data.shape[0],
-        subarray=keyword("SUBARRAY"),
-        pointing=SkyCoord(keyword("RA_REF") * u.deg, keyword("DEC_REF") * u.deg),
-        roll=keyword("ROLL_REF") * u.deg,
-        dither=int(keyword("PATT_NUM", 1)) - 1,
-    )
-    if data.shape[2:] != exposure.shape:
-        wanted = f"{exposure.shape} pixels for {exposure.subarray}"
-        msg = f"{path} must have {wanted}, got {data.shape[2:]}"
-        raise DataError(msg)
-    values = {"data": data, "exposure": exposure}
-    values["meta"] = {"origin": primary.get("ORIGIN", "unknown"), "filename": path.name}
-    if "SIM_META" in hdus:
-        values["meta"] = json.loads(hdus["SIM_META"].data["JSON"][0].tobytes())
-        records = values["meta"].pop("effects", None)
-        if records is not None:
-            values["effects"] = [effect_from_record(record) for record in records]
-    if "SIM_PIXELDQ" in hdus:
-        # unsigned 32 bits as FITS keeps them: BZERO 2^31
-        stored = hdus["SIM_PIXELDQ"].data.astype(np.int32).view(np.uint32)
-        values["pixel_dq"] = stored ^ np.uint32(2**31)
-    else:
-        mask = reference_pixel_mask(subarray=exposure.subarray)
-        values["pixel_dq"] = np.where(mask, _REFERENCE, np.uint32(0))
-    return values

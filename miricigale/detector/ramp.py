@@ -3,8 +3,9 @@
 import numpy as np
 from astropy.nddata import NDData
 
-from miricigale.detector import level1b
+from miricigale.detector import level1b, ramp_reader
 from miricigale.detector.effects import Effect
+from miricigale.instrument import STEPS, DetectorProperties
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import DN
 
@@ -42,16 +43,39 @@ class Ramp(NDData):
     effects : tuple of `Effect`, optional
         What acted on the light and the charge, in order; None where it is not known, as for
         ramps of the observatory.
+    properties : `~miricigale.instrument.DetectorProperties`, optional
+        Of the simulated detector that made the counts; None where they are not known.
+    steps : iterable of str, optional
+        What the pipeline has done to the counts (`~miricigale.instrument.STEPS`); nothing if
+        not given.
+    header : `~astropy.io.fits.Header`, optional
+        Keywords of the observation, by which reference files are chosen; those that `write`
+        would write if not given.
+    reference_output : `~numpy.ndarray` of uint16 or float32, optional
+        Counts of the fifth output, (n_int, n_group, ny, nx / 4).
     meta : dict, optional
         Where it came from.
 
     Raises
     ------
     ValueError
-        If a shape is not that of the exposure or a dtype is another.
+        If a shape is not that of the exposure, a dtype is another or a step is not known.
     """
 
-    def __init__(self, data, exposure, *, pixel_dq=None, group_dq=None, effects=None, meta=None):
+    def __init__(
+        self,
+        data,
+        exposure,
+        *,
+        pixel_dq=None,
+        group_dq=None,
+        effects=None,
+        properties=None,
+        steps=(),
+        header=None,
+        reference_output=None,
+        meta=None,
+    ):
         data = np.asarray(data)
         shape = (exposure.n_integrations, exposure.n_groups, *exposure.shape)
         if data.shape != shape:
@@ -75,7 +99,22 @@ class Ramp(NDData):
             for effect in effects:
                 if not isinstance(effect, Effect):
                     raise argument_error("effects", "made of detector effects", repr(effect))
+        if properties is not None and not isinstance(properties, DetectorProperties):
+            raise argument_error("properties", "a DetectorProperties", repr(properties))
+        steps = frozenset(steps)
+        if unknown := steps - set(STEPS.values()):
+            raise argument_error("steps", f"of {sorted(STEPS.values())}", sorted(unknown))
+        if reference_output is not None:
+            reference_output = np.asarray(reference_output)
+            if reference_output.shape[:2] != shape[:2] or reference_output.ndim != 4:
+                wanted = f"of four axes, the first {shape[:2]}"
+                raise argument_error("reference_output", wanted, reference_output.shape)
+            reference_output = _read_only(reference_output)
         super().__init__(_read_only(data), unit=DN, meta=dict(meta or {}))
+        self._properties = properties
+        self._steps = steps
+        self._header = None if header is None else header.copy()
+        self._reference_output = reference_output
         self._exposure = exposure
         self._pixel_dq = _read_only(pixel_dq)
         self._group_dq = group_dq
@@ -90,8 +129,11 @@ class Ramp(NDData):
 
     def __reduce__(self):
         # made anew, for arrays to be read-only again
-        planes = {"pixel_dq": self.pixel_dq, "group_dq": self.group_dq}
-        values = {**planes, "effects": self.effects, "meta": dict(self.meta)}
+        names = (
+            "pixel_dq", "group_dq", "effects", "properties", "steps", "reference_output"
+        )  # fmt: skip
+        values = {name: getattr(self, name) for name in names}
+        values |= {"header": self._header, "meta": dict(self.meta)}
         return _remade, (self.data, self.exposure, values)
 
     @property
@@ -113,6 +155,81 @@ class Ramp(NDData):
     def effects(self):
         """What acted, a tuple of `Effect` in their order; None where it is not known."""
         return self._effects
+
+    @property
+    def simulated(self):
+        """Whether the package's `Detector` made the counts: it is known what acted."""
+        return self._effects is not None
+
+    @property
+    def properties(self):
+        """The `~miricigale.instrument.DetectorProperties` of a simulated ramp; None if not known."""
+        return self._properties
+
+    @property
+    def steps(self):
+        """What the pipeline has done to the counts, a frozenset of names."""
+        return self._steps
+
+    @property
+    def reference_output(self):
+        """Counts of the fifth output, or None."""
+        return self._reference_output
+
+    @property
+    def observed(self):
+        """Whether the ramp has keywords of an observation, from its file."""
+        return self._header is not None
+
+    @property
+    def header(self):
+        """A copy of the keywords of the observation, `~astropy.io.fits.Header`."""
+        if self._header is not None:
+            return self._header.copy()
+        primary, science = level1b.header(self._exposure)
+        primary.update(science)
+        return primary
+
+    @property
+    def group_time(self):
+        """Time between groups in s: that of the header, or of the exposure."""
+        stated = None if self._header is None else self._header.get("TGROUP")
+        return self._exposure.group_time.to_value("s") if stated is None else float(stated)
+
+    def integration(self, number):
+        """
+        One integration as a ramp of its own.
+
+        Parameters
+        ----------
+        number : int
+            From 0.
+
+        Returns
+        -------
+        ramp : `Ramp`
+
+        Raises
+        ------
+        ValueError
+            If there is no such integration.
+        """
+        if not 0 <= number < self.shape[0]:
+            raise argument_error("number", f"from 0 to {self.shape[0] - 1}", number)
+        part = slice(number, number + 1)
+        cut = lambda plane: None if plane is None else plane[part]  # noqa: E731
+        return Ramp(
+            self.data[part],
+            self._exposure.replace(n_integrations=1),
+            pixel_dq=self._pixel_dq,
+            group_dq=cut(self._group_dq),
+            effects=self._effects,
+            properties=self._properties,
+            steps=self._steps,
+            header=self._header,
+            reference_output=cut(self._reference_output),
+            meta=dict(self.meta),
+        )
 
     def shows(self, kind):
         """
@@ -185,6 +302,10 @@ class Ramp(NDData):
 
         Notes
         -----
+        A ramp that was read and not simulated keeps the keywords of its file, and its fifth output
+        (``REFOUT``). ``INT_TIMES`` has the times of the integrations (UTC; barycentric ones are
+        not known).
+
         Level 1b holds no flags. Those of pixels, and the effects with the meta dictionary, stand
         in two extensions of our own (``SIM_PIXELDQ``, ``SIM_META``) that the official pipeline
         passes over; those of groups are not written.
@@ -194,21 +315,27 @@ class Ramp(NDData):
     @classmethod
     def read(cls, path):
         """
-        Read a level-1b file, our own or one of JWST.
+        Read the ramp of an exposure, our own or one of JWST, as the pipeline has it at any stage.
 
         Parameters
         ----------
         path : path-like
-            An ``*_uncal.fits`` of the MIRI imager.
+            An ``*_uncal.fits`` of the MIRI imager, an ``*_ramp.fits``, or what one of the steps
+            between them saved; of ground tests too, whose headers tell no filter or pointing.
 
         Returns
         -------
         ramp : `Ramp`
-            In a file that is not ours reference columns are the only flags.
+            ``steps`` has what the header says was done. In level 1b that is not ours reference
+            columns are the only flags.
 
         Raises
         ------
         `~miricigale.utils.exceptions.DataError`
-            If the file is missing, truncated or not of that kind.
+            If the file is missing, truncated or not of that kind, or its header contradicts its
+            data (NGROUPS, NINTS, INTSTART, INTEND, SUBSIZE1, SUBSIZE2) or the read-out pattern
+            (TGROUP, TFRAME, NFRAMES, GROUPGAP).
+        MemoryError
+            If the ramp is larger than the memory.
         """
-        return cls(**level1b.read(path))
+        return cls(**ramp_reader.read(path))

@@ -44,6 +44,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         ),
         "match": ("AssociationFlags", "associate", "match_truth"),
         "metrics": (
+            "OUTLIER",
             "PhotozMetrics",
             "RecoveryMetrics",
             "fraction_interval",
@@ -59,16 +60,9 @@ __getattr__, __dir__, __all__ = lazy_names(
             "xray_luminosity_function",
             "xray_obscured_fraction",
         ),
+        "numbers": ("selection_table", "study_confusion", "study_numbers"),
         "paper": ("PUBLISHED", "PublishedNumber", "compare_with_paper", "comparison_rows"),
-        "quantities": (
-            "QUANTITIES",
-            "REDSHIFT_BINS",
-            "measure",
-            "selection_table",
-            "study_confusion",
-            "study_numbers",
-            "xray_fluxes",
-        ),
+        "quantities": ("QUANTITIES", "REDSHIFT_BINS", "measure", "xray_fluxes"),
         "report": ("Missing", "Report", "number"),
         "study": ("StudyResults", "TruthResults"),
         "xray": (

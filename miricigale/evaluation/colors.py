@@ -1,6 +1,7 @@
 """Classes from colors of MIRI bands, as a rival of the fits."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 from astropy.table import vstack
@@ -13,8 +14,8 @@ from miricigale.utils.units import FNU, to_array
 
 __all__ = ["COLOR_WINDOWS", "ColorCircles", "ColorWindow", "color_classes", "color_estimates"]
 
-#: Distances from the center that are tried as radii.
-_N_RADII = 60
+#: Distances from a center that are tried as radii, and places along each color that are tried as centers.
+_N_RADII, _N_CENTERS = 40, 17
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,13 +49,15 @@ class ColorWindow:
         return np.stack([logs[a] - logs[b] for a, b in (self.x, self.y)], axis=-1)
 
 
-#: After Kirkpatrick et al. 2017, ApJ 849, 111: a band with a PAH feature over one with continuum or the
-#: stellar minimum. Redshifts and bands of the first are theirs (author's page); how they are paired,
-#: and both of the others, are ours in the same spirit.
+#: After Kirkpatrick et al. 2017, ApJ 849, 111: the slope from starlight to hot dust, and a band with a PAH
+#: feature over one beside it. Redshifts and bands of the first are theirs
+#: (https://kirkpatrick.ku.edu/JWST, which has the colors as pictures); of the three ways to pair them
+#: this one, chosen for it, comes nearest to the shares that theirs find. Both of the others are ours in
+#: the same spirit.
 COLOR_WINDOWS = (
-    ColorWindow(0.75, 1.25, ("miri.f1500w", "miri.f770w"), ("miri.f1800w", "miri.f1000w")),
-    ColorWindow(1.25, 1.75, ("miri.f1800w", "miri.f1000w"), ("miri.f2100w", "miri.f1280w")),
-    ColorWindow(1.75, 2.25, ("miri.f1800w", "miri.f1000w"), ("miri.f2100w", "miri.f1500w")),
+    ColorWindow(0.75, 1.25, ("miri.f1000w", "miri.f770w"), ("miri.f1500w", "miri.f1800w")),
+    ColorWindow(1.25, 1.75, ("miri.f1280w", "miri.f770w"), ("miri.f1800w", "miri.f2100w")),
+    ColorWindow(1.75, 2.25, ("miri.f1280w", "miri.f1000w"), ("miri.f1800w", "miri.f2100w")),
 )
 
 
@@ -93,8 +96,9 @@ class ColorCircles:
         Returns
         -------
         circles : `ColorCircles`
-            About the median color of the AGN, with the radii of the highest mean of the shares of each
-            class that are found in it.
+            With the center and radii of the highest mean of the shares of each class that are found in it.
+            Centers are tried from the median color of the AGN to half a range of the colors beyond all:
+            AGN with silicate absorption do not lie around their median.
 
         Raises
         ------
@@ -107,25 +111,17 @@ class ColorCircles:
         agn = classes == CLASS_NAMES[2]
         if not agn.any():
             raise argument_error("classes", "with an AGN that has colors", "none")
-        center = np.median(colors[agn], axis=0)
-        distance = np.hypot(*(colors - center).T)
-        tried = np.unique(np.quantile(distance, np.linspace(0, 1, _N_RADII)))
-        # between sources, and one beyond all
-        steps = np.append(0.5 * (tried[1:] + tried[:-1]), tried[-1])
-        # share of each class within each radius
-        within = {
-            name: np.mean(distance[classes == name][:, None] <= steps, axis=0)
-            for name in CLASS_NAMES
-            if np.any(classes == name)
-        }
-        zero = np.zeros((steps.size, steps.size))
-        galaxy, composite, inside = (within.get(name, np.zeros(steps.size)) for name in CLASS_NAMES)
-        score = zero + inside[:, None]
-        score += composite - composite[:, None]
-        score += 1 - galaxy if CLASS_NAMES[0] in within else 0
-        score[np.tril_indices(steps.size, -1)] = -np.inf
-        i, j = np.unravel_index(np.argmax(score), score.shape)
-        return cls(tuple(center.tolist()), float(steps[i]), float(steps[j]))
+        low, high = np.percentile(colors, [2, 98], axis=0)
+        reach = 0.5 * (high - low)
+        places = np.linspace(low - reach, high + reach, _N_CENTERS)
+        centers = [np.median(colors[agn], axis=0), *itertools.product(*places.T)]
+        best = -np.inf
+        for center in centers:
+            score, radii = _best_radii(np.hypot(*(colors - center).T), classes)
+            # of equal ones the first
+            if score > best + 1e-12:
+                best, found = score, (tuple(float(x) for x in center), *radii)
+        return cls(*found)
 
     def classify(self, colors):
         """Class of each row of colors, shape (n, 2); ``"unknown"`` for those with NaN."""
@@ -135,6 +131,26 @@ class ColorCircles:
         index = np.where(distance <= self.inner, 2, np.where(distance <= self.outer, 1, 0))
         names = np.array([*CLASS_NAMES, "unknown"])
         return names[np.where(np.isfinite(distance), index, 3)]
+
+
+def _best_radii(distance, classes):
+    """Highest sum of the shares of each class found within its radii about a center, and the radii."""
+    tried = np.unique(np.quantile(distance, np.linspace(0, 1, _N_RADII)))
+    # between sources, and one beyond all
+    steps = np.append(0.5 * (tried[1:] + tried[:-1]), tried[-1])
+    # share of each class within each radius
+    within = {
+        name: np.searchsorted(np.sort(distance[classes == name]), steps, side="right")
+        / np.count_nonzero(classes == name)
+        for name in CLASS_NAMES
+        if np.any(classes == name)
+    }
+    galaxy, composite, inside = (within.get(name, np.zeros(steps.size)) for name in CLASS_NAMES)
+    score = inside[:, None] + composite - composite[:, None]
+    score += 1 - galaxy if CLASS_NAMES[0] in within else 0
+    score[np.tril_indices(steps.size, -1)] = -np.inf
+    i, j = np.unravel_index(np.argmax(score), score.shape)
+    return score[i, j], (float(steps[i]), float(steps[j]))
 
 
 def color_classes(

@@ -7,7 +7,7 @@ from miricigale.sed import COSMOLOGY
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_table, require_columns, unique_ids
-from miricigale.utils.units import FNU, LUMINOSITY, MASS, to_array
+from miricigale.utils.units import FNU, LUMINOSITY, MASS, ab_magnitude, to_array
 
 __all__ = [
     "PUBLISHED_LIGHT",
@@ -213,7 +213,7 @@ def number_counts(flux, area, edges):
     if edges.ndim != 1 or np.any(np.diff(edges) <= 0):
         raise argument_error("edges", "ascending magnitudes", edges)
     flux = to_array(flux, FNU, "flux", ndim=1)
-    mag = 23.9 - 2.5 * np.log10(flux[flux > 0])
+    mag = ab_magnitude(flux[flux > 0] * FNU)
     n, _ = np.histogram(mag, edges)
     unit = 1 / (np.diff(edges) * _solid_angle(area)) / u.deg**2
     return n * unit, np.sqrt(n) * unit

@@ -4,11 +4,11 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.evaluation.metrics import fraction_interval
+from miricigale.evaluation.metrics import fraction_interval, sigma_mad
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import check_seed, stream
 
-__all__ = ["Estimate", "bootstrap"]
+__all__ = ["Estimate", "bootstrap", "median", "scatter"]
 
 #: Values that are held at once: draws are made in pieces of this size.
 _PIECE = 4_000_000
@@ -51,6 +51,16 @@ class Estimate:
     def of_fraction(cls, success, total, *, n_all=None):
         """Share of ``success`` among ``total`` sources, with its Wilson interval."""
         return cls(*fraction_interval(int(success), int(total)), int(total), n_all)
+
+
+def median(values):
+    """Median along the last axis without NaN: a statistic for `bootstrap`."""
+    return np.nanmedian(values, axis=-1)
+
+
+def scatter(values):
+    """`sigma_mad` along the last axis without NaN: a statistic for `bootstrap`."""
+    return sigma_mad(values, axis=-1, ignore_nan=True)
 
 
 def bootstrap(statistic, *columns, seed, n_draws=1000, n_all=None):

@@ -3,7 +3,7 @@
 import astropy.units as u
 import numpy as np
 
-from miricigale.evaluation.estimates import bootstrap
+from miricigale.evaluation.estimates import bootstrap, median
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import WAVE, positive, to_array
 
@@ -206,8 +206,4 @@ def feature_residuals(residual, redshift, *, feature, pivot, filter_width, seed)
     residual, redshift = np.asarray(residual, float), np.asarray(redshift, float)
     low, high = feature_redshifts(feature, pivot, filter_width)
     rows = (redshift >= low) & (redshift < high)
-
-    def median(values):
-        return np.median(values, axis=-1)
-
     return tuple(bootstrap(median, residual[keep], seed=seed) for keep in (rows, ~rows))

@@ -9,6 +9,7 @@ from astropy.stats import binom_conf_interval
 from miricigale.utils.exceptions import argument_error
 
 __all__ = [
+    "OUTLIER",
     "PhotozMetrics",
     "RecoveryMetrics",
     "fraction_interval",
@@ -17,6 +18,9 @@ __all__ = [
     "running_median",
     "sigma_mad",
 ]
+
+#: abs(dz) / (1 + z) above which a redshift is an outlier.
+OUTLIER = 0.15
 
 
 def _pair(first, second, names):
@@ -112,7 +116,7 @@ class PhotozMetrics:
     n_outliers: int
 
 
-def photoz_metrics(z_true, z_fit, *, outlier=0.15):
+def photoz_metrics(z_true, z_fit, *, outlier=OUTLIER):
     """
     Compare photometric with true redshifts.
 

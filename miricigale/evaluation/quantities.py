@@ -5,52 +5,33 @@ import dataclasses
 import astropy.units as u
 import numpy as np
 
-from miricigale.evaluation.classes import (
-    CLASS_LIMITS,
-    classify,
-    confusion,
-    selection_quality,
-)
+from miricigale.evaluation.classes import classify
 from miricigale.evaluation.estimates import Estimate, bootstrap
+from miricigale.evaluation.estimates import median as _median
+from miricigale.evaluation.estimates import scatter as _scatter
 from miricigale.evaluation.infrared import feature_magnitude
-from miricigale.evaluation.metrics import sigma_mad
+from miricigale.evaluation.metrics import OUTLIER
 from miricigale.evaluation.study import TruthResults
 from miricigale.evaluation.xray import half_complete, yang2021_xray_flux
 from miricigale.filters import Filter
 from miricigale.utils.exceptions import unknown_name
-from miricigale.utils.random import check_seed, stream
-from miricigale.utils.tables import described_rows, error_column
-from miricigale.utils.units import FNU
+from miricigale.utils.tables import error_column
+from miricigale.utils.units import ab_magnitude
 
-__all__ = [
-    "QUANTITIES",
-    "REDSHIFT_BINS",
-    "SHARES",
-    "measure",
-    "selection_table",
-    "study_confusion",
-    "study_numbers",
-    "xray_fluxes",
-]
+__all__ = ["OF_FITS", "QUANTITIES", "REDSHIFT_BINS", "SHARES", "measure", "xray_fluxes"]
 
 #: Redshifts between which the AGN fraction is told apart.
 REDSHIFT_BINS = ((0.0, 1.0), (1.0, 2.0), (2.0, 3.0), (3.0, np.inf))
-#: Limit of abs(dz)/(1 + z) of outliers.
-_OUTLIER = 0.15
 #: Fewest draws of statistics that are fits themselves.
 _FEW_DRAWS = 100
 
 
-def _median(values):
-    return np.nanmedian(values, axis=-1)
-
-
-def _scatter(values):
-    return sigma_mad(values, axis=-1, ignore_nan=True)
+def _size(values):
+    return np.abs(_median(values))
 
 
 def _outliers(delta):
-    return np.mean(np.abs(delta) > _OUTLIER, axis=-1)
+    return np.mean(np.abs(delta) > OUTLIER, axis=-1)
 
 
 def _ratio(statistic):
@@ -116,7 +97,7 @@ def _mips_share(study, one, _, option, draws):
     if band not in one.truth.colnames:
         return Estimate(np.nan)
     rows = one.field & (study.prior_magnitude(one) < limit)
-    found = rows & (one.truth[band].to_value(FNU) > 10 ** (-0.4 * (depth - 23.9)))
+    found = rows & (ab_magnitude(one.truth[band]) < depth)
     n = int(np.count_nonzero(rows))
     return Estimate.of_fraction(int(np.count_nonzero(found)), n, n_all=n)
 
@@ -132,36 +113,25 @@ def _limit_offset(study, one, band_set, band, draws):
     return Estimate(float(limits[0] - limits[1]))
 
 
-def _shapes(one):
-    """Which sources are points or of low and of high Sersic index."""
-    index = np.asarray(one.truth["sersic_index"], float)
-    point = np.asarray(one.truth["profile"]) == "point"
-    return {"point": point, "n < 2": ~point & (index < 2), "n >= 2": ~point & (index >= 2)}
-
-
 def _shape_share(study, one, _, option, draws):
     """Share of the sources of the field by shape."""
-    rows = _shapes(one)[option]
+    rows = one.shapes[option]
     n = int(np.count_nonzero(one.field))
     return Estimate.of_fraction(int(np.count_nonzero(rows & one.field)), n, n_all=n)
 
 
 def _errors_of(study, one, rows):
     """Magnitude errors of sources whose true flux is above 5 sigma, shape (n, n_bands), NaN of others."""
-    columns = []
-    for band in study.bands:
-        error = one.magnitude_error(band)
-        with np.errstate(invalid="ignore"):
-            # by measured flux it would be those that noise made brighter
-            bright = one.matched[f"{band}_true"] > 5 * one.matched[error_column(band)]
-        use = rows(band) & one.field & bright
-        columns.append(np.where(use, error, np.nan))
+    columns = [
+        np.where(rows(band) & one.field & one.is_bright(band), one.magnitude_error(band), np.nan)
+        for band in study.bands
+    ]
     return np.stack(columns, axis=1)
 
 
 def _shape_offset(study, one, _, option, draws):
     """Median of measured minus true magnitude by shape, of all bands together."""
-    shape = _shapes(one)[option]
+    shape = one.shapes[option]
     n_all = int(np.count_nonzero(shape & one.field))
     return draws(_median, _errors_of(study, one, lambda band: shape), n_all=n_all)
 
@@ -197,7 +167,7 @@ def _outlier_share(study, one, band_set, option, draws):
     rows, n_all = _in_bin(one, option)
     delta = one.redshift_error(band_set)[rows]
     delta = delta[np.isfinite(delta)]
-    n = int(np.count_nonzero(np.abs(delta) > _OUTLIER))
+    n = int(np.count_nonzero(np.abs(delta) > OUTLIER))
     return Estimate.of_fraction(n, delta.size, n_all=n_all)
 
 
@@ -289,6 +259,14 @@ _MEASURES = {
         "sigma_MAD of fracAGN",
         _of_sample(TruthResults.fraction_error, _scatter),
     ),
+    "frac_offset_ratio": (
+        "median fracAGN - true without over with MIRI",
+        _of_sample(_against_none(TruthResults.fraction_error), _ratio(_size)),
+    ),
+    "frac_scatter_ratio": (
+        "sigma_MAD of fracAGN without over with MIRI",
+        _of_sample(_against_none(TruthResults.fraction_error), _ratio(_scatter)),
+    ),
     "width": ("median posterior width of fracAGN", _of_sample(_width, _median)),
     "width_ratio": (
         "posterior width of fracAGN without over with MIRI",
@@ -313,6 +291,13 @@ SHARES = (
 )
 #: Those that are of several truths together if none is named.
 _OF_ALL = ("power_offset", "power_scatter", "xray_half")
+#: Those of a fit, and those of a band.
+OF_FITS = (
+    "z_outliers", "z_bias", "z_scatter", "z_outlier_ratio", "z_scatter_ratio", "frac_offset",
+    "frac_offset_ratio", "frac_scatter", "frac_scatter_ratio", "width", "width_ratio", "power_offset",
+    "power_scatter", "class_share",
+)  # fmt: skip
+_OF_BANDS = ("etc_limit", "limit_offset", "signal_to_noise")
 
 
 def measure(study, quantity, *, truth=0.0, band_set="all", option=None, seed, n_draws=1000):
@@ -351,141 +336,7 @@ def measure(study, quantity, *, truth=0.0, band_set="all", option=None, seed, n_
     one = study.at(truth) if isinstance(truth, (int, float)) else truth
     if one is None and not (truth is None and quantity in _OF_ALL):
         return Estimate(np.nan)
-    lacks_fit = one is not None and quantity in _OF_FITS and band_set not in one.fits
+    lacks_fit = one is not None and quantity in OF_FITS and band_set not in one.fits
     if lacks_fit or (quantity in _OF_BANDS and option not in study.bands):
         return Estimate(np.nan)
     return _MEASURES[quantity][1](study, one, band_set, option, _Draws(seed, n_draws))
-
-
-#: Quantities of a fit, and those of a band.
-_OF_FITS = (
-    "z_outliers", "z_bias", "z_scatter", "z_outlier_ratio", "z_scatter_ratio", "frac_offset",
-    "frac_scatter", "width", "width_ratio", "power_offset", "power_scatter", "class_share",
-)  # fmt: skip
-_OF_BANDS = ("etc_limit", "limit_offset", "signal_to_noise")
-
-
-def study_numbers(study, *, seed, n_draws=500):
-    """
-    All numbers of the fits: each truth, each band set, whole sample and bins of redshift.
-
-    Parameters
-    ----------
-    study : `StudyResults`
-        The tables.
-    seed : int
-        Of the bootstrap; each number has its own stream.
-    n_draws : int, optional
-        Draws of the bootstrap.
-
-    Returns
-    -------
-    table : `~astropy.table.QTable`
-        ``truth``, ``band_set``, ``quantity``, ``z_low``, ``z_high``, ``value``, ``low``, ``high`` (68 %), ``n``
-        and ``completeness``, the share of the sources of the field that the number is of.
-    """
-    seed = check_seed(seed)
-    rows = []
-    names = [name for name in _OF_FITS if not name.endswith("_ratio")]
-    for one in study.truths:
-        for band_set in one.fits:
-            for quantity in names:
-                of_power = quantity.startswith("power")
-                if of_power and "accretion_power" not in one.truth.colnames:
-                    continue
-                for option in (None,) if of_power else (None, *REDSHIFT_BINS):
-                    key = stream(seed, "numbers", one.name, band_set, quantity, str(option))
-                    got = measure(
-                        study, quantity, truth=one, band_set=band_set, option=option, seed=key,
-                        n_draws=n_draws,
-                    )  # fmt: skip
-                    span = option or (0.0, np.inf)
-                    values = (got.value, got.low, got.high, got.n, got.completeness)
-                    rows.append((one.name, band_set, quantity, *span, *values))
-    texts = {
-        "truth": "Name of the truth",
-        "band_set": "Bands of the fit",
-        "quantity": "Name of `QUANTITIES`",
-        "z_low": "Least true redshift",
-        "z_high": "True redshifts are below",
-        "value": "The number",
-        "low": "Lower end of its 68 % interval",
-        "high": "Upper end of its 68 % interval",
-        "n": "Sources",
-        "completeness": "Share of the sources of the field",
-    }
-    return described_rows(rows, texts)
-
-
-def found_classes(one, band_set):
-    """Classes of all sources of the catalog by a fit; ``"unknown"`` for those not in the sample."""
-    mean = one.of_catalog(one.fitted(band_set, "frac_agn_mean"))
-    return classify(np.clip(mean, 0, 1))
-
-
-def study_confusion(study, band_set="all"):
-    """
-    Classes found of the sources of each true class, of all truths with one AGN fraction together.
-
-    Parameters
-    ----------
-    study : `StudyResults`
-        The tables.
-    band_set : str, optional
-        Which fit.
-
-    Returns
-    -------
-    table : `~astropy.table.QTable`
-        As `~miricigale.evaluation.confusion`: sources of the field that were not fitted are ``unknown``.
-    """
-    truths = [one for one in study.truths if one.frac_agn is not None and band_set in one.fits]
-    true = [classify(np.asarray(one.truth["frac_agn"], float))[one.field] for one in truths]
-    found = [found_classes(one, band_set)[one.field] for one in truths]
-    return confusion(np.concatenate([[], *true]), np.concatenate([[], *found]))
-
-
-def selection_table(one, *, limits=CLASS_LIMITS):
-    """
-    Purity and completeness of selections by the fitted AGN fraction in a realistic field.
-
-    Parameters
-    ----------
-    one : `TruthResults`
-        A truth whose AGN have the numbers and luminosities of a real field.
-    limits : tuple of float, optional
-        Sources whose true AGN fraction is at least this are wanted, and those with such a posterior mean are
-        selected. Sources that were not fitted are not selected.
-
-    Returns
-    -------
-    table : `~astropy.table.QTable`
-        A row for each band set and limit: ``band_set``, ``limit``, ``n_wanted``, ``n_selected``,
-        ``completeness``, ``purity`` and their 68 % (Wilson) intervals ``_low`` and ``_high``.
-    """
-    rows = []
-    true = np.asarray(one.truth["frac_agn"], float)[one.field]
-    for band_set in one.fits:
-        mean = one.of_catalog(one.fitted(band_set, "frac_agn_mean"))[one.field]
-        for limit in limits:
-            # NaN is below every limit
-            quality = selection_quality(true >= limit, mean >= limit)
-            pair = (quality.completeness, quality.purity)
-            values = [value for got in pair for value in (got.value, got.low, got.high)]
-            rows.append((band_set, limit, pair[0].n, pair[1].n, *values))
-    texts = {
-        "band_set": "Bands of the fit",
-        "limit": "Least AGN fraction",
-        "n_wanted": "Sources of the field whose true fraction is as high",
-        "n_selected": "Sources whose posterior mean is as high",
-    }
-    for name, text in (
-        ("completeness", "Share of the wanted sources that are selected"),
-        ("purity", "Share of the selected sources that are wanted"),
-    ):
-        texts |= {
-            name: text,
-            f"{name}_low": "Lower end of 68 %",
-            f"{name}_high": "Upper end of 68 %",
-        }
-    return described_rows(rows, texts)

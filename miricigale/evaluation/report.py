@@ -141,8 +141,8 @@ class Report:
             What stands in it.
         empty : str, optional
             Sentence that takes the place of a table without rows.
-        text : int, optional
-            Columns of text at the left; the others are numbers.
+        text : int or iterable of int, optional
+            How many columns at the left are text, or which ones are; the others are numbers.
 
         Raises
         ------
@@ -158,6 +158,7 @@ class Report:
             if not empty:
                 raise argument_error("rows", "at least one, or 'empty' for the sentence", "none")
             return self.text(empty)
+        words = set(range(text)) if isinstance(text, int) else set(text)
         reasons = list(
             dict.fromkeys(cell.reason for row in rows for cell in row if isinstance(cell, Missing))
         )
@@ -170,7 +171,7 @@ class Report:
 
         def cells(row, tag):
             return "".join(
-                f"<{tag}{' class=n' if k >= text else ''}>{shown(cell)}</{tag}>"
+                f"<{tag}{'' if k in words else ' class=n'}>{shown(cell)}</{tag}>"
                 for k, cell in enumerate(row)
             )
 

@@ -8,8 +8,8 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.tables import require_columns
-from miricigale.utils.units import FNU
+from miricigale.utils.tables import error_column, require_columns
+from miricigale.utils.units import FNU, ab_magnitude
 
 __all__ = ["StudyResults", "TruthResults"]
 
@@ -110,6 +110,19 @@ class TruthResults:
         ratio = np.divide(measured, true, out=np.full(true.size, np.nan), where=good)
         return -2.5 * np.log10(ratio)
 
+    def is_bright(self, band):
+        """Whether the true flux of all sources is above 5 sigma of the measured one in a band."""
+        # by measured flux it would be those that noise made brighter
+        with np.errstate(invalid="ignore"):
+            return self.matched[f"{band}_true"] > 5 * self.matched[error_column(band)]
+
+    @functools.cached_property
+    def shapes(self):
+        """Which sources are points and which of low and of high Sersic index: dict of arrays of bool."""
+        index = np.asarray(self.truth["sersic_index"], float)
+        point = np.asarray(self.truth["profile"]) == "point"
+        return {"point": point, "n < 2": ~point & (index < 2), "n >= 2": ~point & (index >= 2)}
+
     def of_catalog(self, values):
         """Values of the sample at the rows of the catalog, NaN elsewhere."""
         out = np.full(len(self.truth), np.nan)
@@ -158,5 +171,4 @@ class StudyResults:
 
     def prior_magnitude(self, one):
         """AB magnitudes of all sources of a truth in the prior's band."""
-        flux = one.truth[self.prior_band].to_value(FNU)
-        return 23.9 - 2.5 * np.log10(np.where(flux > 0, flux, np.nan))
+        return ab_magnitude(one.truth[self.prior_band])

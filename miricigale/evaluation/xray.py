@@ -53,7 +53,8 @@ class XRayLimit:
     checked: bool
 
 
-#: The surveys that Yang et al. 2021 compare with. The two 50 % limits are estimates: the abstract of that
+#: The surveys that Yang et al. 2021 compare with. The two 50 % limits are estimates, for the abstracts of
+#: Luo et al. 2017 (1.9e-17 in the central square arcmin) and of Nandra et al. 2015 have none: that of the
 #: paper calls MIRI (50 % at about 1e-16) "slightly more sensitive" than the deepest survey, and Nandra et
 #: al. call theirs a factor 2-3 shallower than the deep fields.
 XRAY_LIMITS = (

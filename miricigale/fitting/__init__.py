@@ -13,8 +13,8 @@ __getattr__, __dir__, __all__ = lazy_names(
     {
         "checks": ("LeaveOutResult", "MockResult", "leave_out", "mock_analysis"),
         "fitter": ("BayesFitter",),
-        "flags": ("FitFlags",),
         "io": ("FitResultsFiles", "open_results"),
+        "likelihood": ("FitFlags",),
         "results": ("FitResults",),
         "samples": ("Samples",),
         "streaming": ("fit_file",),

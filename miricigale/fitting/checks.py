@@ -8,12 +8,11 @@ from astropy.stats import mad_std
 from astropy.table import QTable
 
 from miricigale.fitting.fitter import BayesFitter
-from miricigale.fitting.flags import FitFlags
-from miricigale.fitting.likelihood import PhotometryReader, flux_column, read_ids
+from miricigale.fitting.likelihood import FitFlags, PhotometryReader, flux_column
 from miricigale.fitting.posterior import randomized_ranks
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.random import check_seed, stream
-from miricigale.utils.tables import described_table, error_column, require_columns
+from miricigale.utils.tables import described_table, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, frozen_array
 
 __all__ = ["LeaveOutResult", "MockResult", "leave_out", "mock_analysis"]

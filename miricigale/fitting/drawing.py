@@ -1,12 +1,36 @@
-"""Spectra and figures of single objects: methods of `~miricigale.fitting.FitResults`."""
+"""Draws, spectra and figures of single objects: methods of `~miricigale.fitting.FitResults`."""
 
 import astropy.units as u
 import numpy as np
 
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.tables import described_table
 from miricigale.utils.units import FNU
 
-__all__ = ["best_sed", "labeled", "plot_pdf", "plot_pdf2d", "plot_sed"]
+__all__ = ["best_sed", "labeled", "plot_pdf", "plot_pdf2d", "plot_sed", "samples"]
+
+
+def samples(results, key):
+    """
+    Draws of a sampler from the posterior of the object of this id, all of the same weight.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        A row for each draw, a column for each parameter and derived quantity.
+
+    Raises
+    ------
+    ValueError
+        If the object was not fitted, or the fit was no sampler's (see `BayesFitter.sample`).
+    """
+    if results.draws is None:
+        msg = "results of a grid hold no draws; BayesFitter.sample makes some"
+        raise ValueError(msg)
+    one = results[key]._fitted_one()
+    values = zip(results.parameters, one.draws.T, strict=True)
+    columns = {n: (u.Quantity(v, results.unit(n)), results._meaning(n)) for n, v in values}
+    return described_table(columns, dict(results.meta) | {"id": str(key)})
 
 
 def best_sed(results, model=None, **changes):

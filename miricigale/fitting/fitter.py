@@ -1,19 +1,23 @@
 """BayesFitter: posteriors of galaxy and AGN parameters from broad-band photometry."""
 
-import inspect
 import logging
-import warnings
 
 import numpy as np
 
-from miricigale.fitting.flags import FitFlags, flags_of_fits
 from miricigale.fitting.grid_fit import GridFit
-from miricigale.fitting.likelihood import PhotometryReader, filter_names, per_band, unused_bands
+from miricigale.fitting.likelihood import (
+    FitFlags,
+    PhotometryReader,
+    filter_names,
+    flags_of_fits,
+    per_band,
+    unused_bands,
+)
 from miricigale.fitting.results import FitResults
 from miricigale.fitting.samplers import Request, get_sampler
 from miricigale.fitting.samplers.fit import SamplerFit
 from miricigale.sed import ModelGrid
-from miricigale.utils.exceptions import MiricigaleWarning, argument_error, unknown_name
+from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import chunks, parallel_map, single_threaded
 from miricigale.utils.random import check_seed
@@ -168,8 +172,7 @@ class BayesFitter:
         n_cells=100,
         sampler_options=None,
     ):
-        given = dict(locals())
-        _check_options(given)
+        _check_options(locals())
         if engine != "grid":
             get_sampler(engine)
         names = (
@@ -184,6 +187,7 @@ class BayesFitter:
         if not (is_number(max_reduced_chi2) and max_reduced_chi2 > 0):
             raise argument_error("max_reduced_chi2", "positive", repr(max_reduced_chi2))
         self.engine, self.filters = engine, names
+        self._engine_name = engine if isinstance(engine, str) else repr(engine)
         self.model = None if isinstance(model, ModelGrid) else model
         scale_error = compat is None if scale_error is None else bool(scale_error)
         if engine == "grid":
@@ -229,10 +233,6 @@ class BayesFitter:
             return f"<BayesFitter of {self.grid!r}, {bands}>"
         free = ", ".join(self.backend.space.free)
         return f"<BayesFitter of {self.model!r}, {bands}, {self._engine_name}, free: {free}>"
-
-    @property
-    def _engine_name(self):
-        return self.engine if isinstance(self.engine, str) else repr(self.engine)
 
     @property
     def bands(self):
@@ -325,8 +325,8 @@ class BayesFitter:
             If a flux column has no unit of flux density.
         """
         options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
-        parallel = {"executor": executor, "progress_bar": progress_bar}
         options["stacklevel"] = 4
+        parallel = {"executor": executor, "progress_bar": progress_bar}
         return self._fit_rows(photometry, options, seed=seed, chunk_size=chunk_size, **parallel)
 
     def _fit_rows(
@@ -371,11 +371,8 @@ class BayesFitter:
         if redshift is not None and redshift_prior is not None:
             msg = "'redshift' and 'redshift_prior' must not be given both"
             raise ValueError(msg)
-        unused = unused_bands(photometry, filters)
-        if unused and self.filters is None and stacklevel is not None:
-            # who names the bands knows that others are left out
-            text = "bands of the photometry that the grid lacks are not fitted"
-            warnings.warn(f"{text}: {', '.join(unused)}", MiricigaleWarning, stacklevel=stacklevel)
+        # who names the bands knows that others are left out
+        unused = unused_bands(photometry, filters, stacklevel if self.filters is None else None)
         data = self._reader.read(photometry, repeated)
         self.backend.check_data(data)
         flags = np.array(data.flags)
@@ -445,10 +442,9 @@ class BayesFitter:
 
 def _check_options(given):
     """Refuse options of another engine than the one that was chosen."""
-    of_grid = isinstance(given["engine"], str) and given["engine"] == "grid"
-    declared = inspect.signature(BayesFitter).parameters
+    of_grid = given["engine"] == "grid"
     for name in _OF_SAMPLER if of_grid else _OF_GRID:
-        value, default = given[name], declared[name].default
+        value, default = given[name], BayesFitter.__init__.__kwdefaults__[name]
         if value is not default and not (np.ndim(value) == 0 and value == default):
             wanted = "left out with engine='grid'" if of_grid else "left out with a sampler"
             raise argument_error(name, wanted, repr(value))

@@ -6,8 +6,8 @@ from functools import partial
 import astropy.units as u
 import numpy as np
 
-from miricigale.fitting.flags import FitFlags
 from miricigale.fitting.grid import GridEngine
+from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import check_pairs, joint_names, joint_tables
 from miricigale.fitting.priors import (
     GridPriors,

@@ -1,28 +1,31 @@
-"""From a catalog of photometry to fluxes, errors and flags that a fit can use."""
+"""From a catalog of photometry to fluxes, errors and flags that a fit can use, and the flags of fits."""
 
+import warnings
 from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
 
 from miricigale.filters import Filter
-from miricigale.fitting.flags import FitFlags
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.object_rows import ObjectRows, PerObject
-from miricigale.utils.tables import error_column, require_columns
+from miricigale.utils.tables import Flags, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU, to_array
 
 __all__ = [
     "FitData",
+    "FitFlags",
     "PhotometryReader",
     "filter_names",
+    "flags_of_fits",
     "flux_column",
     "limits",
     "per_band",
-    "read_ids",
     "unused_bands",
 ]
 
+#: S/N of the best model in all bands together below which an object is flagged.
+LOW_SIGNAL = 3.0
 #: Least error in units of the flux: below it chi2 in double precision has no digits left.
 _LEAST_ERROR = 1e-6
 #: Least and largest error, and largest flux, in uJy; beyond, their squares are no numbers.
@@ -30,6 +33,49 @@ _SMALL, _LARGE = 1e-60, 1e60
 _TRUE = ("true", "t", "1")
 _FALSE = ("false", "f", "0", "")
 _KINDS = {"U": "text", "S": "text", "b": "true and false", "c": "complex numbers"}
+
+
+class FitFlags(Flags):
+    """Flags of a fitted catalog; `FitFlags.UNFITTED` is the sum of those that prevent a fit."""
+
+    NO_BAND = 1
+    """No usable band."""
+    FEW_BANDS = 2
+    """Fewer usable bands, upper limits among them, than asked for."""
+    BAD_ERROR = 4
+    """A flux whose error is zero, negative, not finite or beyond 1e-60 to 1e60 uJy; the band is left
+    out."""
+    NO_REDSHIFT = 8
+    """A fixed redshift was asked for and is missing, not finite or not positive."""
+    REDSHIFT_OUTSIDE = 16
+    """The fixed redshift has no redshift of the grid within the tolerance."""
+    DUPLICATE_ID = 32
+    """The id occurred before; only its first row is fitted."""
+    HIGH_CHI2 = 64
+    """No model fits: the reduced chi2 of the best is above the limit."""
+    NO_SIGNAL = 128
+    """No model has a positive scale, the fluxes being zero or negative: the posterior is the prior."""
+    REDSHIFT_EDGE = 256
+    """More than one per cent of the posterior lies on the first or last redshift."""
+    NO_MODEL = 512
+    """No model is left by the age of the universe and the priors."""
+
+    BAD_FLUX = 1024
+    """A flux that is infinite or beyond 1e60 uJy; the band is left out."""
+
+    FEW_FOR_PARAMETERS = 2048
+    """Fewer fluxes than free parameters, the mass among them; limits are not counted."""
+    ALL_LIMITS = 4096
+    """Upper limits and no flux: any model that is faint enough fits."""
+
+    NO_LIKELIHOOD = 8192
+    """With ``compat="cigale"``: the best chi2 is so high that every likelihood vanishes."""
+
+    LOW_SIGNAL = 16384
+    """The best model has S/N below 3 over all bands: take masses and luminosities from samples."""
+
+    UNFITTED = 1 | 2 | 8 | 16 | 32 | 512 | 4096 | 8192
+    """Bits with which a row has no result."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,51 +217,13 @@ class PhotometryReader:
         return FitData(ids, flux, err, sigma, limit, flags)
 
 
-def read_ids(table):
-    """
-    Ids of a catalog: numbers, or text whether it came as such or as bytes.
-
-    A `ValueError` tells those that are masked or empty, for nothing would tell their objects from
-    others, numbers among text, several in a row, and bytes that are not UTF-8.
-    """
-    require_columns(table, ["id"], "photometry")
-    column = table["id"]
-    ids = np.asarray(getattr(column, "unmasked", column))
-    if ids.ndim != 1:
-        raise argument_error("photometry", "a table with one id in a row", f"{ids.shape}")
-    missing = np.broadcast_to(np.asarray(getattr(column, "mask", False)), ids.shape)
-    if ids.dtype.kind == "O":
-        missing = missing | np.array([value is None for value in ids], dtype=bool)
-    elif ids.dtype.kind in "US":
-        missing = missing | (ids == ids.dtype.type())
-    if missing.any():
-        rows = np.flatnonzero(missing)
-        got = f"{rows.size} masked or empty, the first in row {rows[0]} (from 0)"
-        raise argument_error("photometry", "a table with an id in every row", got)
-    if ids.dtype.kind == "S":
-        # as astropy reads text of FITS files
-        try:
-            return np.char.decode(ids, "utf-8")
-        except UnicodeDecodeError as err:
-            wanted = "a table with ids that are text, or bytes of text in UTF-8"
-            raise argument_error("photometry", wanted, f"{err.object!r}") from None
-    if ids.dtype.kind == "O":
-        kinds = {type(value) for value in ids.tolist()}
-        if len(kinds) > 1:
-            names = sorted(kind.__name__ for kind in kinds)
-            raise argument_error("photometry", "a table with ids of one kind", f"{names}")
-        return np.array(ids.tolist()) if ids.size else ids.astype(str)
-    # FITS takes numbers of one byte for true and false
-    dtype = np.dtype(np.int16) if ids.dtype == np.int8 else ids.dtype
-    return ids.astype(dtype.newbyteorder("="))
-
-
-def unused_bands(table, filters):
+def unused_bands(table, filters, stacklevel=None):
     """
     Names of the bands of a catalog that are not fitted (``filters``), in the order of the columns.
 
     A column is a band if it has an error ``<name>_err`` beside it and both are in a unit of flux
-    density, or if its name is that of a filter.
+    density, or if its name is that of a filter. With a ``stacklevel``, that of the caller of this
+    function, a `~miricigale.utils.exceptions.MiricigaleWarning` tells them.
     """
     known, columns = set(Filter.names()), set(table.colnames)
     out = []
@@ -226,6 +234,9 @@ def unused_bands(table, filters):
         measured = pair[1] in columns and all(_is_flux(table[c]) for c in pair)
         if measured or name in known or name.startswith("sedpy."):
             out.append(name)
+    if out and stacklevel is not None:
+        text = "bands of the photometry that the grid lacks are not fitted"
+        warnings.warn(f"{text}: {', '.join(out)}", MiricigaleWarning, stacklevel=stacklevel + 1)
     return out
 
 
@@ -311,3 +322,24 @@ def flux_column(table, name):
     array = to_array(column, FNU, name, ndim=1).copy()
     array[np.broadcast_to(np.asarray(getattr(table[name], "mask", False)), array.shape)] = np.nan
     return array
+
+
+def flags_of_fits(results, measured, max_reduced_chi2, edge_weight):
+    """
+    Flags of results, with those that the fits show.
+
+    ``measured`` are the bands with a flux, shape (n, nb); ``edge_weight`` is the weight of the first
+    or last redshift above which an object is flagged, None where redshifts were fixed.
+    """
+    flags, fitted, pdf = np.array(results.flags), results.fitted, results.pdf["redshift"]
+    signal = np.where(measured, results.best_flux / results.sigma, 0.0)
+    with np.errstate(invalid="ignore"):
+        flags[fitted & (results.reduced_chi2 > max_reduced_chi2)] |= FitFlags.HIGH_CHI2
+        flags[fitted & ~(results.best_scale > 0)] |= FitFlags.NO_SIGNAL
+        faint = np.sqrt(np.sum(signal * signal, axis=1)) < LOW_SIGNAL
+        flags[fitted & faint] |= FitFlags.LOW_SIGNAL
+        if edge_weight is not None and pdf.shape[1] > 2:
+            edge = np.maximum(pdf[:, 0], pdf[:, -1]) > edge_weight
+            flags[fitted & edge] |= FitFlags.REDSHIFT_EDGE
+    flags[~fitted & ((flags & FitFlags.UNFITTED) == 0)] |= FitFlags.NO_SIGNAL
+    return flags

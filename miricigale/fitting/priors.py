@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import astropy.units as u
 import numpy as np
 
-from miricigale.fitting.flags import FitFlags
+from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.quantities import plain
 from miricigale.utils.exceptions import argument_error, unknown_name

@@ -7,8 +7,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.fitting import drawing
-from miricigale.fitting.flags import FitFlags
-from miricigale.fitting.likelihood import filter_names
+from miricigale.fitting.likelihood import FitFlags, filter_names
 from miricigale.fitting.posterior import cell_edges, cell_percentiles, check_levels, moments
 from miricigale.fitting.quantities import DERIVED_LEVELS, kept_percentiles
 from miricigale.utils.exceptions import argument_error, unknown_name
@@ -343,28 +342,6 @@ class FitResults(ObjectRows):
         msg = f"no joint posterior of {x} and {y}; known: {have} ('pairs' of BayesFitter.fit)"
         raise KeyError(msg)
 
-    def samples(self, key):
-        """
-        Draws of a sampler from the posterior of the object of this id, all of the same weight.
-
-        Returns
-        -------
-        table : `~astropy.table.QTable`
-            A row for each draw, a column for each parameter and derived quantity.
-
-        Raises
-        ------
-        ValueError
-            If the object was not fitted, or the fit was no sampler's (see `BayesFitter.sample`).
-        """
-        if self.draws is None:
-            msg = "results of a grid hold no draws; BayesFitter.sample makes some"
-            raise ValueError(msg)
-        one = self[key]._fitted_one()
-        values = zip(self.parameters, one.draws.T, strict=True)
-        columns = {n: (u.Quantity(v, self.unit(n)), self._meaning(n)) for n, v in values}
-        return described_table(columns, dict(self.meta) | {"id": str(key)})
-
     # ---------------------------------------------------------------------- tables
 
     def to_table(self):
@@ -457,5 +434,5 @@ class FitResults(ObjectRows):
             raise argument_error("key", "the id of an object that was fitted", got)
         return self
 
-    best_sed, plot_sed = drawing.best_sed, drawing.plot_sed
+    samples, best_sed, plot_sed = drawing.samples, drawing.best_sed, drawing.plot_sed
     plot_pdf, plot_pdf2d = drawing.plot_pdf, drawing.plot_pdf2d

@@ -7,7 +7,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.fitting.drawing import labeled
-from miricigale.fitting.flags import FitFlags
+from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import bin_cells, check_levels, node_cells
 from miricigale.fitting.priors import grid_priors
 from miricigale.fitting.quantities import ModelValues, check_draws

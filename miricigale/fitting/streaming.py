@@ -5,20 +5,21 @@ import importlib.metadata
 import json
 import logging
 import os
+import warnings
 
 import astropy.units as u
 import numpy as np
 
+from miricigale.filters.catalog_files import MappedRows, as_catalog_map
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.io import FORMAT, FitFolder, open_results, part_ids, part_name
-from miricigale.fitting.likelihood import read_ids
 from miricigale.utils.content import content_sha256
-from miricigale.utils.exceptions import OtherResultsError, argument_error
+from miricigale.utils.exceptions import MiricigaleWarning, OtherResultsError, argument_error
 from miricigale.utils.progress import progress
 from miricigale.utils.random import check_seed
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.store import plain_value
-from miricigale.utils.tables import ascii_ids, error_column, require_columns
+from miricigale.utils.tables import ascii_ids, error_column, read_ids, require_columns
 from miricigale.utils.units import FNU
 
 __all__ = ["fit_file"]
@@ -39,6 +40,7 @@ def fit_file(
     pairs=None,
     seed=None,
     flux_unit=None,
+    catalog_map=None,
     hdu=None,
     executor=None,
     progress_bar=False,
@@ -58,8 +60,9 @@ def fit_file(
         The fitter. (Of a sampler, the cells of a redshift axis that is not the same for all objects
         are those of each part.)
     path_in : path-like
-        The catalog: FITS with a binary table, ECSV, or CSV with a line of names (``.csv``),
-        with columns as `BayesFitter.fit` wants them.
+        The catalog: FITS with a binary table, ECSV, or CSV with a line of names (``.csv``), by pieces;
+        VOTable and plain text, which are in memory as a whole. Its columns are as `BayesFitter.fit`
+        wants them, or become so by ``catalog_map``.
     path_out : path-like
         The folder; made if it is not there.
     chunk_rows : int, optional
@@ -72,6 +75,9 @@ def fit_file(
         As for `BayesFitter.fit`. A sampler needs one, so that a later call can go on.
     flux_unit : unit-like, optional
         Unit of flux columns and their errors where the file gives none, as CSV does.
+    catalog_map : `~miricigale.filters.CatalogMap`, str or path-like, optional
+        Names, units and missing values of the catalog, as for
+        `~miricigale.filters.read_catalog_photometry`.
     hdu : int or str, optional
         Extension of a FITS file; the only table by default.
     executor : `concurrent.futures.Executor`, optional
@@ -90,7 +96,8 @@ def fit_file(
     Warns
     -----
     `~miricigale.utils.exceptions.MiricigaleWarning`
-        What `BayesFitter.fit` warns of, once.
+        What `BayesFitter.fit` warns of, once. With ``catalog_map`` what it takes as missing is counted and told
+        before anything is fitted.
 
     Raises
     ------
@@ -119,11 +126,17 @@ def fit_file(
         msg = f"'flux_unit' must be convertible to {FNU}, got {unit}"
         raise u.UnitsError(msg)
     rows = open_rows(path_in, chunk_rows, hdu=hdu)
+    if catalog_map is not None:
+        rows = MappedRows(rows, as_catalog_map(catalog_map))
     options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
+    for text in rows.told() if catalog_map is not None else ():
+        warnings.warn(f"{rows.path.name}: {text}", MiricigaleWarning, stacklevel=2)
     fluxes = {c for name in fitter.bands for c in (name, error_column(name))}
     inputs = _Inputs(rows, options, unit, fluxes)
     _check_ids(rows)
     given = {"hdu": hdu, "flux_unit": None if unit is None else unit.to_string()}
+    if catalog_map is not None:
+        given["map"] = rows.map.settings()
     job = _job(fitter, rows, options | {"seed": seed}, given)
     with FitFolder(path_out) as folder:
         _begin(folder, job, resume)

@@ -13,7 +13,7 @@ __getattr__, __dir__, __all__ = lazy_names(
             "miri_detector",
             "reference_pixel_mask",
         ),
-        "dithers": ("dither_offsets", "dither_patterns", "read_dithers"),
+        "dithers": ("dither_offsets", "dither_patterns", "read_dithers", "tile_offsets"),
         "dq": ("DQ", "dq_legend", "read_dq"),
         "exposure": (
             "CEERS_FILTERS",
@@ -41,6 +41,7 @@ __getattr__, __dir__, __all__ = lazy_names(
             "subarrays",
             "v2v3_to_sky",
         ),
+        "steps": ("STEPS", "steps_done"),
         "wcs": (
             "imager_wcs",
             "mosaic_wcs",

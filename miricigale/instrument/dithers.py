@@ -9,12 +9,13 @@ import astropy.units as u
 import numpy as np
 from astropy.table import Table
 
+from miricigale.instrument.siaf import aperture, imager_columns
 from miricigale.utils.exceptions import DataError, argument_error, unknown_name
 from miricigale.utils.files import read_table, unpacked_size
 from miricigale.utils.tables import require_columns
 from miricigale.utils.units import ANGLE, to_array
 
-__all__ = ["dither_offsets", "dither_patterns", "read_dithers"]
+__all__ = ["dither_offsets", "dither_patterns", "read_dithers", "tile_offsets"]
 
 # sides of the pixel at the reference, arcsec (SIAF)
 _PIXEL = (0.110497, 0.111336)
@@ -142,6 +143,41 @@ def dither_offsets(pattern, n=None, *, start=0):
     return offsets[int(start) : last] * ANGLE
 
 
+def tile_offsets(n_x, n_y, *, overlap=0.1):
+    """
+    Offsets of the pointings of a mosaic of fields side by side.
+
+    Parameters
+    ----------
+    n_x, n_y : int
+        Fields along the axes of the imager.
+    overlap : float, optional
+        Share of its side that a field has in common with the next one, 0 to less than 1.
+
+    Returns
+    -------
+    offsets : `~astropy.units.Quantity`, shape (n_x * n_y, 2)
+        Along the ideal +x and +y axes, arcsec, with mean 0, row by row (x first), for
+        `~miricigale.instrument.Exposure.dithered`. The field is the part of the full frame that sees
+        the sky through the imaging filters.
+
+    Raises
+    ------
+    ValueError
+        If a number is smaller than 1, or ``overlap`` is out of its range.
+    """
+    for name, value in (("n_x", n_x), ("n_y", n_y)):
+        if isinstance(value, bool) or int(value) != value or value < 1:
+            raise argument_error(name, "a positive integer", value)
+    if not 0 <= overlap < 1:
+        raise argument_error("overlap", "at least 0 and less than 1", overlap)
+    first, last = imager_columns()
+    sides = np.array([last - first, aperture("FULL").shape[0]]) * _PIXEL
+    row, column = np.divmod(np.arange(n_x * n_y), n_x)
+    steps = np.stack([column - (n_x - 1) / 2, row - (n_y - 1) / 2], axis=1)
+    return steps * sides * (1 - overlap) * ANGLE
+
+
 def _table_offsets(table, argument):
     names = ("x_offset", "y_offset")
     require_columns(table, names, argument, units=dict.fromkeys(names, ANGLE))
@@ -149,9 +185,9 @@ def _table_offsets(table, argument):
     return np.stack(columns, axis=1) * ANGLE
 
 
-def read_dithers(path, *, observation=None):
+def read_dithers(path, *, observation=None, exposure=None):
     """
-    Read offsets from a table or from APT's list of pointings.
+    Read the offsets of one dither pattern from a table or from APT's list of pointings.
 
     Parameters
     ----------
@@ -162,6 +198,9 @@ def read_dithers(path, *, observation=None):
         dither, and their ``DithX`` and ``DithY``.
     observation : int, optional
         Number of the observation, for a list of several.
+    exposure : int, optional
+        Number of the exposure in the observation (column ``Exp``; each filter has one of its own), for
+        exposures whose dithers differ.
 
     Returns
     -------
@@ -173,7 +212,9 @@ def read_dithers(path, *, observation=None):
     `~miricigale.utils.exceptions.DataError`
         If there is no such file, or no offsets in it.
     ValueError
-        If a list has several observations with such rows and none, or another, is asked for.
+        If a list has several observations with such rows, or exposures with other dithers, and none,
+        or another, is asked for; if tiles of a mosaic have other dithers than one another; or if a table
+        comes with an observation or an exposure, which it has not.
     """
     path = Path(path).expanduser()
     if not path.is_file():
@@ -181,12 +222,15 @@ def read_dithers(path, *, observation=None):
         raise DataError(msg)
     unpacked_size(path)
     if path.suffix.lower() == ".pointing":
-        return _read_pointings(path, observation)
+        return _read_pointings(path, observation, exposure)
+    for name, given in (("observation", observation), ("exposure", exposure)):
+        if given is not None:
+            raise argument_error(name, "left out, but for a .pointing file", given)
     return _table_offsets(read_table(path, wanted="a table"), path.name)
 
 
-def _read_pointings(path, observation):
-    """Rows by observation; the columns are those of APT's header line."""
+def _read_pointings(path, observation, exposure):
+    """Rows by observation and exposure; the columns are those of APT's header line."""
     found, apertures, current = {}, set(), 0
     for line in path.read_text(errors="replace").splitlines():
         words = line.split()
@@ -198,15 +242,32 @@ def _read_pointings(path, observation):
         apertures.add(words[4])
         if not words[4].startswith("MIRIM") or words[18] not in ("SCIENCE", "PARALLEL"):
             continue
-        # target and tile, dither: several exposures of one place stand in rows of their own
-        key = (words[0], words[1], words[3])
-        rows = found.setdefault(current, {})
-        rows.setdefault(key, (float(words[11]), float(words[12])))
+        target, tile, number, dither = (int(word) for word in words[:4])
+        places = found.setdefault(current, {}).setdefault(number, {})
+        offset = float(words[11]), float(words[12])
+        places.setdefault((target, tile), {}).setdefault(dither, offset)
     if not found:
         msg = f"{path} has no exposures of MIRIM apertures; it has {sorted(apertures)}"
         raise DataError(msg)
-    if observation is None and len(found) == 1:
-        observation = next(iter(found))
-    if observation not in found:
-        raise argument_error("observation", f"one of {sorted(found)}", observation)
-    return np.array(list(found[observation].values())) * ANGLE
+    exposures = found[_chosen("observation", observation, found)]
+    patterns = {
+        number: {tuple(offsets.values()) for offsets in places.values()}
+        for number, places in exposures.items()
+    }
+    differ = len(set().union(*patterns.values())) > 1
+    if exposure is not None or differ:
+        patterns = {0: patterns[_chosen("exposure", exposure, patterns)]}
+    offsets = next(iter(patterns.values()))
+    if len(offsets) > 1:
+        msg = f"{path.name}: tiles of the observation have dithers that differ from one another"
+        raise ValueError(msg)
+    return np.array(next(iter(offsets))) * ANGLE
+
+
+def _chosen(name, value, known):
+    """The key that is asked for, or the only one."""
+    if value is None and len(known) == 1:
+        return next(iter(known))
+    if value not in known:
+        raise argument_error(name, f"one of {sorted(known)}", value)
+    return value

@@ -78,8 +78,8 @@ class Exposure:
 
     Parameters
     ----------
-    filter : str
-        Such as ``"miri.f770w"``.
+    filter : str or None
+        Such as ``"miri.f770w"``; None where it is not known, as in ground tests.
     readout : str, optional
         Readout pattern, ``"FASTR1"`` or ``"SLOWR1"``.
     n_groups : int
@@ -88,9 +88,10 @@ class Exposure:
         Integrations.
     subarray : str, optional
         One of `~miricigale.instrument.subarrays`.
-    pointing : `~astropy.coordinates.SkyCoord`
-        Where the reference pixel of the sub-array looks.
-    roll : `~astropy.units.Quantity`
+    pointing : `~astropy.coordinates.SkyCoord` or None
+        Where the reference pixel of the sub-array looks; None, as ``roll``, where nothing is
+        pointed at: such an exposure has no world coordinates.
+    roll : `~astropy.units.Quantity` or None
         Position angle of +V3 at the reference pixel, east of north.
     dither : int, optional
         Number of the dither, from 0: a label, and part of the random key.
@@ -103,20 +104,21 @@ class Exposure:
         If a count is too small or the pointing is not one position.
     """
 
-    filter: str
+    filter: str | None
     _: dataclasses.KW_ONLY
     readout: str = "FASTR1"
     n_groups: int
     n_integrations: int = 1
     subarray: str = "FULL"
-    pointing: SkyCoord
-    roll: u.Quantity
+    pointing: SkyCoord | None
+    roll: u.Quantity | None
     dither: int = 0
 
     def __post_init__(self):
-        filter_row(self.filter)
-        short = str(self.filter).removeprefix("miri.")
-        object.__setattr__(self, "filter", f"miri.{short}")
+        if self.filter is not None:
+            filter_row(self.filter)
+            short = str(self.filter).removeprefix("miri.")
+            object.__setattr__(self, "filter", f"miri.{short}")
         aperture(self.subarray)
         frame_time(self.readout, self.subarray)
         for name, least in (("n_groups", 2), ("n_integrations", 1), ("dither", 0)):
@@ -124,6 +126,10 @@ class Exposure:
             if isinstance(value, bool) or int(value) != value or value < least:
                 raise argument_error(name, f"an integer of at least {least}", value)
             object.__setattr__(self, name, int(value))
+        if (self.pointing is None) != (self.roll is None):
+            raise argument_error("pointing, roll", "both given or both None", "one of them")
+        if self.pointing is None:
+            return
         scalar_position(self.pointing, "pointing")
         object.__setattr__(
             self, "pointing", SkyCoord(self.pointing.icrs.ra, self.pointing.icrs.dec)
@@ -200,14 +206,31 @@ class Exposure:
         """Time with the reset frame between integrations, s."""
         return self.exposure_time + (self.n_integrations - 1) * self.frame_time
 
+    def check_sky(self):
+        """
+        Refuse an exposure that does not tell its filter, or where it looks.
+
+        Raises
+        ------
+        ValueError
+            If ``filter`` or ``pointing`` is None.
+        """
+        for name in ("filter", "pointing"):
+            if getattr(self, name) is None:
+                raise argument_error("exposure", f"one with a {name}", "None")
+
     @property
     def pa_aper(self):
         """Position angle of the ideal +y axis, deg; detector columns follow it to 0.2 deg."""
+        if self.roll is None:
+            return None
         return (self.roll + self.aperture.v3_ideal_y_angle * u.deg) % (360 * u.deg)
 
     @functools.cached_property
     def wcs(self):
-        """World coordinates, a TAN-SIP `~astropy.wcs.WCS` (see `imager_wcs`)."""
+        """World coordinates, a TAN-SIP `~astropy.wcs.WCS` (see `imager_wcs`); None without pointing."""
+        if self.pointing is None:
+            return None
         return imager_wcs(self.pointing, self.roll, subarray=self.subarray)
 
     def pointing_keywords(self):
@@ -219,7 +242,13 @@ class Exposure:
         keywords : dict
             RA_REF, DEC_REF, ROLL_REF, V2_REF, V3_REF, VPARITY, V3I_YANG, PA_APER, RA_V1,
             DEC_V1, PA_V3 (at V1), SUBARRAY, SUBSTRT1/2, SUBSIZE1/2 (1-based).
+
+        Raises
+        ------
+        ValueError
+            If the exposure has no filter or no pointing.
         """
+        self.check_sky()
         part = self.aperture
         ra, dec = self.pointing.ra.deg, self.pointing.dec.deg
         v2, v3 = (float(v) for v in pixel_to_v2v3(*part.reference, subarray=self.subarray))

@@ -84,7 +84,9 @@ class ErrorModel:
             raise unknown_name("band of this error model", name, self.curves) from None
 
     @classmethod
-    def from_tables(cls, truth, measured, *, filters=None, statistic="mad", bin_size=30):
+    def from_tables(
+        cls, truth, measured, *, filters=None, statistic="mad", bin_size=30, noise=None
+    ):
         """
         Measure errors on simulated photometry.
 
@@ -101,6 +103,10 @@ class ErrorModel:
             of it, bin by bin as in the paper.
         bin_size : int, optional
             Sources per bin, in order of true flux; a remainder joins the faintest bin.
+        noise : dict of str to `~numpy.ndarray`, optional
+            By filter name: noise at the place of each row of ``measured`` in units of that which the
+            model describes, such as the root of a reference time over the exposure time there. Sources
+            where it is not positive and finite do not count.
 
         Returns
         -------
@@ -113,7 +119,7 @@ class ErrorModel:
         Raises
         ------
         ValueError
-            If there are fewer than three sources in a band.
+            If there are fewer than three sources in a band, or the noise has another number of rows.
 
         References
         ----------
@@ -133,8 +139,10 @@ class ErrorModel:
         for name in filters:
             true = to_array(truth[name], FNU, name)[rows_true]
             seen = to_array(measured[name], FNU, name)[rows_measured]
-            good = np.isfinite(true) & np.isfinite(seen)
-            curves[name] = measured_curve(name, true[good], seen[good], int(bin_size), statistic)
+            relative = _relative_noise(noise, name, len(measured))[rows_measured]
+            good = np.isfinite(true) & np.isfinite(seen) & np.isfinite(relative)
+            true, off = true[good], (seen - true)[good] / relative[good]
+            curves[name] = measured_curve(name, true, true + off, int(bin_size), statistic)
         return cls(curves, provenance(source="tables", statistic=statistic, bin_size=bin_size))
 
     @classmethod
@@ -294,7 +302,7 @@ class ErrorModel:
             n_sigma = 2.5 / np.log(10) / magnitude_error
         return self.limiting_flux(filter, n_sigma).to(u.ABmag)
 
-    def assign(self, photometry, *, filters=None):
+    def assign(self, photometry, *, filters=None, noise=None):
         """
         Give fluxes the errors of this model.
 
@@ -304,6 +312,9 @@ class ErrorModel:
             With flux columns by filter name.
         filters : iterable of str, optional
             Bands; those of the model that the table has by default.
+        noise : dict of str to `~numpy.ndarray`, optional
+            As in `from_tables`: by filter name, a factor for each row. Where it is not positive and
+            finite there is no error (NaN).
 
         Returns
         -------
@@ -313,11 +324,13 @@ class ErrorModel:
         Raises
         ------
         ValueError
-            If the table has no band that the model knows, or lacks one of ``filters``.
+            If the table has no band that the model knows, or lacks one of ``filters``, or the noise has
+            another number of rows.
         """
         table, filters = flux_table(photometry, filters, self.filters)
         for name in filters:
-            table[error_column(name)] = self.sigma(table[name], name)
+            relative = _relative_noise(noise, name, len(table))
+            table[error_column(name)] = relative * self.sigma(table[name], name)
         return table
 
     def perturb(self, photometry, *, seed, filters=None):
@@ -395,3 +408,13 @@ class ErrorModel:
             fluxes[name] = middle * np.geomspace(0.03, 300, 200)
             sigmas[name] = self._curve(name).sigma(fluxes[name])
         return plot_error_function(fluxes, sigmas, limits=limits, ax=ax)
+
+
+def _relative_noise(noise, name, n):
+    """Factors of the noise of ``n`` rows in a band: 1 without any, NaN where not positive and finite."""
+    if noise is None:
+        return np.ones(n)
+    values = to_array(noise[name], u.one, "noise", ndim=1)
+    if len(values) != n:
+        raise argument_error("noise", f"a factor for each of {n} rows in {name!r}", len(values))
+    return np.where(np.isfinite(values) & (values > 0), values, np.nan)

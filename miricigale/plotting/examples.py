@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from miricigale.plotting.axes import new_figure
+from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.plotting.comparison import MEASURED, SECOND, TRUE
 from miricigale.plotting.posteriors import plot_pdf_2d, plot_sed_fit
 from miricigale.plotting.spectra import plot_spectrum
@@ -40,7 +40,7 @@ def fit_figure(
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10.5, 7.2), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 7.2), layout="constrained")
     grid = figure.add_gridspec(3, 4, height_ratios=(2.6, 0.9, 2.6))
     upper = figure.add_subplot(grid[0, :])
     lower = figure.add_subplot(grid[1, :], sharex=upper)

@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from miricigale.plotting.axes import new_figure
+from miricigale.plotting.axes import new_figure, panel_columns, panels
 from miricigale.plotting.comparison import MEASURED, SECOND, TRUE, plot_offsets
 from miricigale.plotting.images import plot_image
-from miricigale.plotting.truths import panels
 
 __all__ = [
     "background_figure",
@@ -135,6 +134,7 @@ def offsets_figure(groups, *, limit=1.0, labels=None, running=None, marked=None)
     figure : `~matplotlib.figure.Figure`
     """
     figure, axes = panels(groups, height=3.1, sharex=True, sharey=True)
+    columns = panel_columns(len(axes))
     for k, (label, ax) in enumerate(axes.items()):
         mag, offset = (np.asarray(v, float) for v in groups[label])
         good = np.isfinite(mag) & np.isfinite(offset)
@@ -151,9 +151,9 @@ def offsets_figure(groups, *, limit=1.0, labels=None, running=None, marked=None)
         if good.any():
             text = f"median {np.median(offset[good]):+.3f}"
             ax.text(0.96, 0.95, text, transform=ax.transAxes, ha="right", va="top", fontsize=8)
-        if k % 3:
+        if k % columns:
             ax.set_ylabel("")
-        if k + 3 < len(axes):
+        if k + columns < len(axes):
             ax.set_xlabel("")
         if k and ax.get_legend():
             ax.get_legend().remove()
@@ -178,6 +178,7 @@ def features_figure(values, ranges, *, limit=0.6):
     figure : `~matplotlib.figure.Figure`
     """
     figure, axes = panels(values, height=2.9, sharex=True, sharey=True)
+    columns = panel_columns(len(axes))
     labels = ("redshift", "measured - model (mag)")
     for k, (label, ax) in enumerate(axes.items()):
         z, residual = (np.asarray(v, float) for v in values[label])
@@ -193,8 +194,8 @@ def features_figure(values, ranges, *, limit=0.6):
                     ax.plot([low, high], [np.median(residual[inside])] * 2, color=color, lw=2)
         if k == 0:
             ax.legend(fontsize=8, frameon=False, loc="upper right", ncols=2)
-        if k % 3:
+        if k % columns:
             ax.set_ylabel("")
-        if k + 3 < len(axes):
+        if k + columns < len(axes):
             ax.set_xlabel("")
     return figure

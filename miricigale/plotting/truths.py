@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from miricigale.plotting.axes import new_figure
+from miricigale.plotting.axes import new_figure, panel_columns, panels
 from miricigale.plotting.comparison import MEASURED, SECOND, TRUE, plot_histogram
 
 __all__ = [
@@ -16,47 +16,14 @@ __all__ = [
     "recovery_figure",
 ]
 
-#: Inches across a figure of three columns, as the pages of reports show them.
-WIDTH = 10.5
 #: Colors and markers of band sets, in their order.
 _SETS = ((MEASURED, "o"), (SECOND, "s"), ("0.4", "^"), ("#15803d", "D"))
 
 
-def panels(labels, *, height=2.7, **share):
-    """
-    A figure with a panel for each label, three in a row.
-
-    Parameters
-    ----------
-    labels : iterable of str
-        Titles of the panels.
-    height : float, optional
-        Inches of a row.
-    **share
-        ``sharex`` and ``sharey``, as in `miricigale.plotting.axes.new_figure`.
-
-    Returns
-    -------
-    figure : `~matplotlib.figure.Figure`
-    axes : dict of str to `~matplotlib.axes.Axes`
-        By label.
-    """
-    labels = list(labels)
-    columns = min(3, max(len(labels), 1))
-    rows = max(-(-len(labels) // columns), 1)
-    figure, axes = new_figure(rows, columns, size=(WIDTH / max(2, columns), height), **share)
-    for ax in axes.ravel()[len(labels) :]:
-        ax.remove()
-    out = dict(zip(labels, axes.ravel(), strict=False))
-    for label, ax in out.items():
-        ax.set_title(label, fontsize="medium")
-    return figure, out
-
-
 def _outer_labels(axes, xlabel, ylabel):
-    """Label the outer axes of panels that stand three in a row, and keep one legend."""
+    """Label the outer axes of `panels`, and keep one legend."""
     axes = list(axes.values())
-    columns = min(3, len(axes))
+    columns = panel_columns(len(axes))
     for k, ax in enumerate(axes):
         last = k + columns >= len(axes)
         ax.set_xlabel(xlabel if last else "")

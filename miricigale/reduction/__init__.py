@@ -7,6 +7,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     {
         "background": ("Background", "estimate_background", "subtract_background"),
         "calibration": ("calibrate", "find_cosmic_rays"),
+        "files": ("ImageFile", "open_exposure", "read_images", "write_image"),
         "mosaic": (
             "Mosaic",
             "drizzle_images",
@@ -15,8 +16,12 @@ __getattr__, __dir__, __all__ = lazy_names(
             "reject_outliers",
             "weight_map",
         ),
-        "rampfit": ("RampFit", "fit_groups", "reference_drift"),
+        "rampfit": ("RampFit", "fit_groups"),
+        "measured_noise": ("MeasuredNoise", "measure_noise"),
+        "reference_cache": ("ReferenceCache",),
+        "reference_pixels": ("reference_channels", "reference_drift"),
         "reducer": ("BACKENDS", "Reducer"),
+        "references": ("DetectorMaps", "ReferenceFiles"),
         "results": ("ReductionResult",),
     },
 )

@@ -47,7 +47,9 @@ class Background:
         )
 
 
-def estimate_background(image, *, box=32, filter_size=3, threshold=3.0, grow=3, iterations=3):
+def estimate_background(
+    image, *, box=32, filter_size=3, plane=True, threshold=3.0, grow=3, iterations=3
+):
     """
     Estimate the background of an image, masking what stands above it.
 
@@ -57,6 +59,8 @@ def estimate_background(image, *, box=32, filter_size=3, threshold=3.0, grow=3, 
         Any unit.
     box, filter_size : int, optional
         Size of the boxes in pixels, and of the median filter in boxes.
+    plane : bool, optional
+        Whether a plane is taken off before the mesh of boxes.
     threshold : float, optional
         Sources are at least five connected pixels that rise by this many sigma above the
         background after a Gaussian smoothing, once of 0.85 pixels and once, for the wings
@@ -77,8 +81,10 @@ def estimate_background(image, *, box=32, filter_size=3, threshold=3.0, grow=3, 
 
     Notes
     -----
-    A plane, fitted to the medians of the boxes, is taken off first and given back: the
-    median filter of boxes would flatten a gradient at the edges of the image.
+    A plane, fitted to the medians of the boxes, is taken off first and given back. A box of which
+    a mask or the edge leaves a part stands for its center all the same, and is off by what a
+    gradient changes from there to the part; with ``plane=False`` (the mesh alone, as in Yang et al.
+    2021) that stays.
 
     Boxes that sources fill are filled from their neighbors. What is fainter than the
     threshold stays in the background: its mean is the mean of the unmasked pixels,
@@ -99,9 +105,9 @@ def estimate_background(image, *, box=32, filter_size=3, threshold=3.0, grow=3, 
     data = np.where(mask, 0, data if data.dtype.kind == "f" else data.astype(float))
     sources = np.zeros(data.shape, bool)
     for step in range(iterations + 1):
-        plane = _plane(data, mask | sources, box)
-        level, rms = sep_tools.background(data - plane, mask | sources, box, filter_size)
-        level += plane
+        tilted = _plane(data, mask | sources, box) if plane else np.zeros_like(data)
+        level, rms = sep_tools.background(data - tilted, mask | sources, box, filter_size)
+        level += tilted
         if step == iterations:
             break
         found = _detect(data - level, rms, mask, sources, threshold)

@@ -158,6 +158,9 @@ def calibrate(
     dark,
     gain,
     ipc_kernel=None,
+    flat=None,
+    conversion=None,
+    flags=None,
     field_only=True,
     cosmic_rays=None,
 ):
@@ -172,11 +175,17 @@ def calibrate(
         Whose flat field and conversion.
     dark : float
         Dark rate, DN/s.
-    gain : float
-        Electrons per DN.
+    gain : float or None
+        Electrons per DN; None if ``conversion`` is given.
     ipc_kernel : `~numpy.ndarray`, shape (3, 3), optional
         Coupling of neighbors that blurs the flat field as it blurs the image: a uniform
-        sky comes out uniform.
+        sky comes out uniform. A flat field that is given is not blurred.
+    flat : `~numpy.ndarray`, shape (ny, nx), or float, optional
+        Relative response; that of the simulated detector if not given.
+    conversion : float, optional
+        MJy/sr per DN/s; that of the simulated detector and ``gain`` if not given.
+    flags : `~numpy.ndarray` of int64, shape (ny, nx), optional
+        Flags of the flat field.
     field_only : bool, optional
         Whether pixels behind the coronagraph masks are masked; sub-arrays that lie wholly
         outside the imager's field are left alone.
@@ -195,10 +204,12 @@ def calibrate(
     """
     if rate.unit is None or not rate.unit.is_equivalent(RATE):
         raise argument_error("rate", f"in {RATE}", f"unit {rate.unit}")
-    flat = flat_field(filter, rate.shape, subarray=subarray)
-    if ipc_kernel is not None:
-        flat = convolve(flat, np.asarray(ipc_kernel, np.float32), mode="nearest")
-    conversion = photmjsr(filter, gain=gain)
+    if flat is None:
+        flat = flat_field(filter, rate.shape, subarray=subarray)
+        if ipc_kernel is not None:
+            flat = convolve(flat, np.asarray(ipc_kernel, np.float32), mode="nearest")
+    flat = np.broadcast_to(np.asarray(flat, np.float32), rate.shape)
+    conversion = photmjsr(filter, gain=gain) if conversion is None else conversion
     scale = np.float32(rate.unit.to(RATE) * conversion) / flat
     dark = np.float32(dark / rate.unit.to(RATE))
     out = with_data(
@@ -208,6 +219,9 @@ def calibrate(
         unit=SURFACE_BRIGHTNESS,
         photmjsr=float(conversion),
     )
+    if flags is not None:
+        out.flags |= flags
+        out.mask |= (flags & DQ.DO_NOT_USE) != 0
     if field_only:
         inside = field_mask(rate.shape, subarray=subarray)
         outside = ~inside if inside.any() else np.zeros_like(inside)

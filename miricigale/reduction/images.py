@@ -96,20 +96,24 @@ def flag_pixels(source, where, flag):
 
 def exposure_values(exposure):
     """Fields of an exposure in values that fit a header."""
-    return {
+    values = {
         "filter": exposure.filter,
         "readout": exposure.readout,
         "subarray": exposure.subarray,
         "n_groups": exposure.n_groups,
         "n_integrations": exposure.n_integrations,
         "dither": exposure.dither,
-        "ra": float(exposure.pointing.ra.deg),
-        "dec": float(exposure.pointing.dec.deg),
-        "roll": float(exposure.roll.to_value("deg")),
-        "pa_aper": float(exposure.pa_aper.to_value("deg")),
         "group_time": float(exposure.group_time.to_value("s")),
         "exposure_time": float(exposure.exposure_time.to_value("s")),
     }
+    if exposure.pointing is not None:
+        values |= {
+            "ra": float(exposure.pointing.ra.deg),
+            "dec": float(exposure.pointing.dec.deg),
+            "roll": float(exposure.roll.to_value("deg")),
+            "pa_aper": float(exposure.pa_aper.to_value("deg")),
+        }
+    return {key: value for key, value in values.items() if value is not None}
 
 
 def seen_wcs(im):

@@ -22,6 +22,7 @@ from miricigale.reduction.images import (
 )
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.parallel import chunks
 
 __all__ = [
     "Mosaic",
@@ -32,6 +33,8 @@ __all__ = [
     "weight_map",
 ]
 
+# rows of a grid of which the median of many images is taken together
+_ROWS = 256
 # nodes of the grid on which a distorted WCS is evaluated; between them bicubic splines
 _NODES = 49
 
@@ -248,8 +251,10 @@ def _drizzle(images, wcs, shape, pixfrac, weights, pixel_maps):
             pixel_scale_ratio=_scale(wcs) / _scale(im.wcs),
             in_units="cps",
         )
-        n_images += sink.out_wht > before
-        before = sink.out_wht.copy()
+        # an image of many may reach a small part of the grid
+        part = _extent((x, y), shape)
+        n_images[part] += sink.out_wht[part] > before[part]
+        before[part] = sink.out_wht[part]
 
     if n_images.any():
         data, variance = sink.out_img, sink.out_img2
@@ -325,17 +330,10 @@ def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None,
     weights = [weight_map(im) for im in images] if weights is None else weights
     if pixel_maps is None:
         pixel_maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
-    stack = np.stack(
-        [
-            _drizzle([im], wcs, wcs.pixel_shape[::-1], 1.0, [w], [p]).image.data
-            for im, w, p in zip(images, weights, pixel_maps, strict=True)
-        ]
-    )
-    count = np.isfinite(stack).sum(axis=0)
-    median = _nan_median(stack, count)
-    del stack
+    median, count = _median_of(images, wcs, weights, pixel_maps)
     # where too few images overlap there is nothing to compare with
     judged = count >= 3
+    share = np.where(judged, 1.5 / np.maximum(count, 1), 0.0).astype(np.float32)
     steep = np.zeros_like(median)
     for axis in (0, 1):
         step = np.abs(np.diff(median, axis=axis))
@@ -352,7 +350,8 @@ def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None,
         expected = map_coordinates(median, coords, **options)
         slope = map_coordinates(np.nan_to_num(steep), coords, **options)
         known = map_coordinates(judged, coords, **options) > 0.999
-        noise = sigma(im) * np.sqrt(1 + 1.5 / len(images))
+        # that of the median too, of as many images as there are at this place
+        noise = sigma(im) * np.sqrt(1 + map_coordinates(share, coords, **options))
         with np.errstate(invalid="ignore"):
             far = np.abs(im.data - expected) > threshold * noise + derivative * slope
         outlier = far & known & ~plain_mask(im)
@@ -360,6 +359,50 @@ def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None,
         flagged.meta["n_outliers"] = int(np.count_nonzero(outlier))
         out.append(flagged)
     return out
+
+
+def _extent(pixel_map, shape):
+    """Rows and columns of a grid that an image reaches, or None: it lies beside the grid."""
+    if not overlaps(pixel_map, shape):
+        return None
+    x, y = pixel_map
+    ends = [(np.nanmin(values) - 2, np.nanmax(values) + 3) for values in (y, x)]
+    return tuple(
+        slice(max(0, int(low)), min(n, int(high) + 1))
+        for (low, high), n in zip(ends, shape, strict=True)
+    )
+
+
+def _median_of(images, wcs, weights, pixel_maps):
+    """
+    Median and number of images on each pixel of a grid, each image drizzled alone.
+
+    Each is kept where it lies and some rows are looked at together, for a field of many pointings
+    has many images, few of which overlap.
+    """
+    shape = wcs.pixel_shape[::-1]
+    parts = []
+    for im, weight, (x, y) in zip(images, weights, pixel_maps, strict=True):
+        extent = _extent((x, y), shape)
+        if extent is not None:
+            rows, columns = extent
+            size = rows.stop - rows.start, columns.stop - columns.start
+            moved = [(x - columns.start, y - rows.start)]
+            alone = _drizzle([im], wcs, size, 1.0, [weight], moved).image.data
+            parts.append((rows, columns, alone))
+    median, count = np.full(shape, np.nan, np.float32), np.zeros(shape, np.int16)
+    for strip in chunks(shape[0], _ROWS):
+        here = [part for part in parts if part[0].start < strip.stop and part[0].stop > strip.start]
+        if not here:
+            continue
+        stack = np.full((len(here), strip.stop - strip.start, shape[1]), np.nan, np.float32)
+        for plane, (rows, columns, alone) in zip(stack, here, strict=True):
+            first, last = max(rows.start, strip.start), min(rows.stop, strip.stop)
+            own = slice(first - rows.start, last - rows.start)
+            plane[first - strip.start : last - strip.start, columns] = alone[own]
+        count[strip] = np.isfinite(stack).sum(axis=0)
+        median[strip] = _nan_median(stack, count[strip])
+    return median, count
 
 
 def _nan_median(stack, count):

@@ -21,10 +21,13 @@ from miricigale.reduction import _core
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks, parallel_map, threads
 
-__all__ = ["RampFit", "fit_groups", "fit_result", "reference_drift", "threshold"]
+__all__ = ["RampFit", "fit_groups", "fit_result", "threshold"]
 
 # rows that one call of the kernel fits; the events come out in this order
 _ROWS = 32
+
+# pixels that are fitted again in one call
+_PIXELS = 4096
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -62,6 +65,27 @@ class RampFit:
         """Standard deviation of the slope, DN/s."""
         return np.sqrt(self.var_poisson + self.var_read)
 
+    def noise_correction(self, kernel):
+        """
+        Noise of large areas over that of single pixels in quadrature.
+
+        Parameters
+        ----------
+        kernel : `~numpy.ndarray`
+            How pixels share their charge; its sum is 1.
+
+        Returns
+        -------
+        factor : float
+            Of the medians of the two parts of the variance; 1 without any slope.
+        """
+        good = np.isfinite(self.rate)
+        if not good.any():
+            return 1.0
+        photon, read = (float(np.median(v[good])) for v in (self.var_poisson, self.var_read))
+        shared = float(np.sum(kernel**2))
+        return float(np.sqrt((photon / shared + read) / (photon + read)))
+
     def __repr__(self):
         ny, nx = self.rate.shape
         return f"<RampFit {ny} x {nx} pixels, {len(self.jumps)} jumps>"
@@ -72,33 +96,6 @@ _JUMP_TYPE = np.dtype(
 )
 
 
-def reference_drift(data, reference):
-    """
-    Mean level of the reference pixels in each group.
-
-    Parameters
-    ----------
-    data : `~numpy.ndarray`, shape (n_int, n_group, ny, nx)
-        Groups in DN.
-    reference : `~numpy.ndarray` of bool, shape (ny, nx)
-        Which pixels see no light.
-
-    Returns
-    -------
-    drift : `~numpy.ndarray`, shape (n_int, n_group)
-        Mean of each group's reference pixels minus the mean over all groups, DN; zeros if
-        there is no reference pixel.
-    """
-    drift = np.zeros(data.shape[:2])
-    columns = np.flatnonzero(reference.any(axis=0))
-    if columns.size == 0:
-        return drift
-    chosen = reference[:, columns]
-    for k, g in np.ndindex(*drift.shape):
-        drift[k, g] = data[k, g][:, columns][chosen].mean(dtype=float)
-    return drift - drift.mean()
-
-
 def fit_groups(
     data,
     *,
@@ -106,9 +103,13 @@ def fit_groups(
     gain,
     read_noise,
     bias=0.0,
+    drift=0.0,
+    reset=None,
     linearity=(0.0, 1.0),
     saturation=np.inf,
+    dark=None,
     usable=None,
+    group_dq=None,
     first_group=0,
     last_group=None,
     jump_threshold=5.0,
@@ -126,19 +127,31 @@ def fit_groups(
         Groups in DN (one read each). It is read row by row and never copied as a whole.
     group_time : float
         Time between groups, s.
-    gain : float
-        Electrons per DN.
-    read_noise : float
+    gain : float or `~numpy.ndarray`, shape (ny, nx)
+        Electrons per DN; infinite where photons make no noise.
+    read_noise : float or `~numpy.ndarray`, shape (ny, nx)
         Standard deviation of one read, DN. The variance of rounding, 1/12, is added for
         integer data.
-    bias : float or array_like, shape (n_int, n_group), optional
-        Level of an empty pixel in each group, DN.
-    linearity : sequence of float, optional
+    bias : float or `~numpy.ndarray`, shape (ny, nx), optional
+        Level of an empty pixel, DN.
+    drift : array_like, shape (n_int, n_group) or (n_int, n_group, 1 or ny, 4), optional
+        What is added to it in each group, DN; of the four channels of the read-out, to which
+        columns belong in turn, and of rows.
+    reset : `~numpy.ndarray`, shape (n, m, ny, nx), optional
+        What is added in the first m groups after a reset, DN; the last of the n integrations
+        stands for all further ones.
+    linearity : sequence of float or `~numpy.ndarray`, shape (n, ny, nx), optional
         Polynomial (lowest power first) from measured to linear DN above the bias.
-    saturation : float, optional
+    saturation : float or `~numpy.ndarray`, shape (ny, nx), optional
         Raw DN from which a group and all later ones of the integration are left out.
+    dark : `~numpy.ndarray`, shape (n, m, ny, nx), optional
+        Dark signal of m groups at least, linear DN, subtracted from them; integrations as for
+        ``reset``.
     usable : `~numpy.ndarray` of bool, shape (ny, nx), optional
         Pixels to fit; the others get NaN.
+    group_dq : `~numpy.ndarray` of uint8, shape of the data, optional
+        Flags of groups (lower bits of `~miricigale.instrument.DQ`): of one that is not to be used
+        both differences are cut, of a jump that before it, and a saturated one ends its integration.
     first_group, last_group : int, optional
         Range of groups that take part (``last_group`` is not included).
     jump_threshold : float or None, optional
@@ -180,32 +193,36 @@ def fit_groups(
     data = np.asarray(data)
     if data.ndim != 4:
         raise argument_error("data", "of four dimensions", f"shape {data.shape}")
-    n_int, n_group, ny, nx = data.shape
+    _n_int, n_group, ny, nx = data.shape
     last_group = n_group if last_group is None else last_group
     if not 0 <= first_group <= last_group - 2 <= n_group - 2:
         wanted = f"a range of at least two of the {n_group} groups"
         raise argument_error("first_group, last_group", wanted, f"{first_group}, {last_group}")
-    for name, value in (
-        ("group_time", group_time),
-        ("gain", gain),
-        ("poisson_factor", poisson_factor),
-    ):
+    for name, value in (("group_time", group_time), ("poisson_factor", poisson_factor)):
         if not (np.isfinite(value) and value > 0):
             raise argument_error(name, "positive", value)
-    if not (np.isfinite(read_noise) and read_noise >= 0):
-        raise argument_error("read_noise", "at least 0", read_noise)
     jump = threshold(jump_threshold, "jump_threshold")
     neighbor = threshold(neighbor_threshold, "neighbor_threshold")
     usable = np.ones((ny, nx), bool) if usable is None else np.ascontiguousarray(usable, bool)
     if usable.shape != (ny, nx):
         raise argument_error("usable", f"of shape {(ny, nx)}", usable.shape)
 
-    # one type of array for the compiled kernels, also of arrays that own no memory
-    data = data.view()
-    data.flags.writeable = False
-    offset = np.array(np.broadcast_to(np.asarray(bias, float), (n_int, n_group)), order="C")
-    coef = np.array(linearity, float)
-    variance = read_noise**2 + (1 / 12 if data.dtype.kind in "iu" else 0.0)
+    gain = _map(gain, "gain", usable, above=0.0, infinite=True)
+    read_noise = _map(read_noise, "read_noise", usable, least=0.0)
+    bias = _map(bias, "bias", usable)
+    saturation = _map(saturation, "saturation", usable, infinite=True)
+    coef = _coefficients(linearity, usable)
+    drift = _drift(drift, data.shape)
+    if bias.size == 1:
+        # one sum for all pixels
+        drift, bias = bias[0, 0] + drift, np.zeros((1, 1))
+    reset = _groups(reset, "reset", data.shape)
+    dark = _groups(dark, "dark", data.shape, least=last_group)
+    flagged = _flagged(group_dq, data.shape, last_group, usable)
+    group_dq = np.zeros((1, 0, 1, 1), np.uint8) if flagged is None else _plain(group_dq)
+
+    data = _plain(data)
+    variance = np.square(read_noise) + (1 / 12 if data.dtype.kind in "iu" else 0.0)
     out = (
         np.zeros((ny, nx), np.float32),
         np.zeros((ny, nx), np.float32),
@@ -214,17 +231,20 @@ def fit_groups(
         np.zeros((ny, nx), np.int16),
         np.zeros((ny, nx), np.int64),
     )
-    ramp = (data, offset, coef, float(saturation))
+    ramp = (data, (drift, bias, reset), (coef, saturation, dark))
     groups = (first_group, last_group)
     # a trace of read noise keeps the closed forms finite
-    noise = (max(variance, 1e-6), poisson_factor / gain, 1 / group_time, jump)
+    noise = (np.maximum(variance, 1e-6), poisson_factor / gain)
+    last = (noise, 1 / group_time, jump)
+    # pixels whose groups have flags are fitted one by one
+    plain = usable if flagged is None else usable & ~flagged
 
     def fit_block(rows):
-        return _core.fit_rows(*ramp, usable, rows.start, rows.stop, *groups, *noise, *out)
+        return _core.fit_rows(*ramp, plain, rows.start, rows.stop, *groups, *last, *out)
 
     def refit_block(part):
         ys, xs, start, cuts = part
-        _core.refit(*ramp, ys, xs, start, cuts, *groups, *noise, *out)
+        _core.refit(*ramp, group_dq, ys, xs, start, cuts, *groups, *last, *out)
 
     with threads(n_threads) as executor:
         events = parallel_map(
@@ -237,9 +257,85 @@ def fit_groups(
         events = np.concatenate(events)
         n_diff = last_group - first_group - 1
         parts = list(_neighbors(events, neighbor, usable, n_diff))
+        if flagged is not None:
+            parts += list(_uncut(flagged & usable, parts))
         parallel_map(refit_block, parts, executor=executor)
 
     return fit_result(*out, events, first_group)
+
+
+def _plain(array):
+    """One type of array for the compiled kernels, also of arrays that own no memory."""
+    array = np.ascontiguousarray(array).view()
+    array.flags.writeable = False
+    return array
+
+
+def _map(values, name, usable, *, above=-np.inf, least=-np.inf, infinite=False):
+    """One value (1, 1), or one for each pixel, that is in range wherever it is used."""
+    values = np.array(values, float, ndmin=2, order="C")
+    if values.shape not in ((1, 1), usable.shape):
+        raise argument_error(name, f"one number or of shape {usable.shape}", values.shape)
+    good = (values > above) & (values >= least) & (np.isfinite(values) | infinite)
+    bad = ~good if values.size == 1 else ~good & usable
+    if bad.any():
+        wanted = "positive" if above == 0 else "at least 0" if least == 0 else "finite"
+        got = values[0, 0] if values.size == 1 else f"{np.count_nonzero(bad)} pixels with others"
+        raise argument_error(name, wanted, got)
+    # the value of pixels that are not used must not stop the others beside them
+    return np.where(good, values, 1.0)
+
+
+def _coefficients(values, usable):
+    """Coefficients (n, 1, 1) or (n, ny, nx) that are finite wherever they are used."""
+    values = np.array(values, float, order="C")
+    values = values[:, None, None] if values.ndim == 1 else values
+    if values.ndim != 3 or not values.size or values.shape[1:] not in ((1, 1), usable.shape):
+        wanted = (
+            f"coefficients of one polynomial or of shape (n, {usable.shape[0]}, {usable.shape[1]})"
+        )
+        raise argument_error("linearity", wanted, f"shape {values.shape}")
+    return np.concatenate([_map(plane, "linearity", usable)[None] for plane in values])
+
+
+def _drift(values, shape):
+    """Drift of the read-out as (n_int, n_group, rows, channels)."""
+    values = np.asarray(values, float)
+    if values.ndim <= 2:
+        values = np.broadcast_to(values, shape[:2])[:, :, None, None]
+    fits = values.ndim == 4 and values.shape[:2] == shape[:2] and values.shape[2] in (1, shape[2])
+    if not fits or values.shape[3] not in (1, 4) or not np.isfinite(values).all():
+        wanted = f"finite, of shape {shape[:2]} or {(*shape[:2], '1 or ' + str(shape[2]), 4)}"
+        raise argument_error("drift", wanted, f"shape {values.shape}")
+    return np.array(values, order="C")
+
+
+def _groups(values, name, shape, *, least=0):
+    """Maps of groups and integrations, float32; what is not finite there is taken as zero."""
+    if values is None:
+        return _plain(np.zeros((1, 0, 1, 1), np.float32))
+    values = np.asarray(values, np.float32)
+    if values.ndim != 4 or values.shape[2:] != shape[2:] or values.shape[1] < least:
+        wanted = f"of shape (n, {least} or more, {shape[2]}, {shape[3]})"
+        raise argument_error(name, wanted, f"shape {values.shape}")
+    if not np.isfinite(values).all():
+        values = np.nan_to_num(values, posinf=0.0, neginf=0.0)
+    return _plain(values)
+
+
+def _flagged(group_dq, shape, last_group, usable):
+    """Pixels of which a group has a flag that forbids its use; None if there is none."""
+    if group_dq is None:
+        return None
+    group_dq = np.asarray(group_dq)
+    if group_dq.shape != shape or group_dq.dtype != np.uint8:
+        got = f"{group_dq.dtype}, shape {group_dq.shape}"
+        raise argument_error("group_dq", f"uint8, of shape {shape}", got)
+    seen = np.zeros(shape[2:], bool)
+    wanted = np.uint8(_core.DO_NOT_USE | _core.SATURATED | _core.JUMP)
+    for k, g in np.ndindex(shape[0], last_group):
+        seen |= (group_dq[k, g] & wanted) != 0
+    return seen if (seen & usable).any() else None
 
 
 def fit_result(rate, var_poisson, var_read, n_used, n_jump, flags, events, first_group):
@@ -290,7 +386,7 @@ def _neighbors(events, threshold, usable, n_diff):
     pixels, cuts = pixels[order], cuts[order]
     unique, start = np.unique(pixels, return_index=True)
     start = np.append(start, len(pixels))
-    for part in chunks(len(unique), 4096):
+    for part in chunks(len(unique), _PIXELS):
         first = start[part.start]
         yield (
             unique[part] // nx,
@@ -298,3 +394,14 @@ def _neighbors(events, threshold, usable, n_diff):
             start[part.start : part.stop + 1] - first,
             cuts[first : start[part.stop]],
         )
+
+
+def _uncut(mask, parts):
+    """Yield the pixels of a mask that no part has, without cuts, as `_neighbors` does."""
+    rest = mask.copy()
+    for ys, xs, _, _ in parts:
+        rest[ys, xs] = False
+    ys, xs = np.nonzero(rest)
+    for part in chunks(ys.size, _PIXELS):
+        start = np.zeros(part.stop - part.start + 1, np.int64)
+        yield ys[part], xs[part], start, np.zeros(0, np.int64)

@@ -1,22 +1,17 @@
 """The `Reducer`: ramps in, calibrated images and mosaics out."""
 
 import dataclasses
-import warnings
+import os
 
 import numpy as np
+from astropy.nddata import CCDData
 
-from miricigale.detector import (
-    Charge,
-    FirstFrame,
-    InterpixelCapacitance,
-    LastFrame,
-    Ramp,
-    ResetAnomaly,
-)
-from miricigale.instrument import DQ, DetectorProperties, ImageFacts, miri_detector, mosaic_wcs
+from miricigale.detector import Charge, Ramp, ResetAnomaly
+from miricigale.instrument import DetectorProperties, ImageFacts, miri_detector, mosaic_wcs
+from miricigale.reduction.assumed import brightness_of, history_of, maps_of
 from miricigale.reduction.background import estimate_background, subtract_background
 from miricigale.reduction.calibration import calibrate
-from miricigale.reduction.drawn import draw_groups
+from miricigale.reduction.files import open_exposure
 from miricigale.reduction.images import (
     check_images,
     check_overlap,
@@ -30,21 +25,20 @@ from miricigale.reduction.mosaic import (
     reject_outliers,
     weight_map,
 )
-from miricigale.reduction.rampfit import fit_groups, reference_drift
+from miricigale.reduction.reference_cache import ReferenceCache
+from miricigale.reduction.references import ReferenceFiles
 from miricigale.reduction.results import ReductionResult
-from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.reduction.slopes import fit_slopes, shares_charge
+from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.parallel import thread_count
 from miricigale.utils.progress import progress
-from miricigale.utils.units import ANGLE, RATE, to_array
+from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
 
 __all__ = ["BACKENDS", "Reducer"]
 
 #: Known backends.
 BACKENDS = ("native",)
-
-# flags of a ramp's pixels that forbid a slope
-_UNUSABLE = DQ.DO_NOT_USE | DQ.NON_SCIENCE | DQ.REFERENCE_PIXEL | DQ.DEAD
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,20 +55,26 @@ class Reducer:
     neighbor_threshold : float or None, optional
         Sigma above which a jump is cut in the four neighbors too.
     skip_first, skip_last : int or None, optional
-        Groups left out at the start and end of each integration. None: one each where the
-        ramp says that `~miricigale.detector.FirstFrame` or
-        `~miricigale.detector.LastFrame` acted (and more than three or two groups are there,
-        as in the official pipeline), else none. Give 1 and 1 for ramps of the observatory.
+        Groups left out at the start and end of each integration. None: one each (if more than
+        three or two groups are there, as in the official pipeline) in ramps of the observatory, but
+        for those of which flags of groups tell it, and in simulated ones that say that
+        `~miricigale.detector.FirstFrame` or `~miricigale.detector.LastFrame` acted; else none.
     reset_anomaly : `~miricigale.detector.ResetAnomaly`, optional
         The settling after a reset, which is taken off the groups; none if not given.
     saturation : float, optional
         Fraction of the detector's saturation from which groups are left out.
-    reference_correction : bool, optional
-        Whether the mean of the reference columns is taken off, group by group.
+    reference_correction : bool, "channels" or None, optional
+        Whether the mean of the reference columns is taken off, group by group; ``"channels"``
+        for means of the four channels and of odd and even rows, as the official pipeline has
+        them (`reference_channels`), which come out without a change in the first group. None: the
+        mean in simulated ramps, and in others what the pipeline does, ``"channels"`` in full frames
+        and nothing in sub-arrays.
+    reference_window : int or None, optional
+        Odd number of groups over which the drift of the channels is smoothed.
     ipc : bool or None, optional
         Whether neighbors share their charge, which lowers the photon noise of a pixel
-        (and correlates it) and blurs the flat field. None: as the ramp says, True where
-        it does not.
+        (and correlates it) and blurs the flat field. None: as the ramp says, False where
+        it does not: a measured gain and flat field have it in them.
     field_only : bool, optional
         Whether pixels behind the coronagraph masks are masked.
     cosmic_rays : bool, optional
@@ -83,14 +83,23 @@ class Reducer:
         ``sigma_clip`` and ``object_limit`` of `find_cosmic_rays`.
     box, filter_size : int, optional
         Of the background: boxes in pixels, median filter in boxes.
+    plane : bool, optional
+        Whether a plane is taken off before the boxes are measured.
     negative_threshold : float or None, optional
         Pixels so many sigma below the background are masked.
     outlier_threshold : float or None, optional
         Sigma for the comparison of three or more dithers; None for none.
     pixfrac : float, optional
         Side of the drizzle's drops in input pixels.
+    references : ReferenceFiles, ReferenceCache, "none" or "simulated", optional
+        What the detector is taken for. `ReferenceFiles` names the files, `ReferenceCache` finds
+        them for each exposure by its header, ``"none"`` does without: slopes in DN/s with
+        measured noise. None, or ``"simulated"`` for whatever a ramp says of itself: the constants of
+        the package's own detector, which hold for ramps that its `~miricigale.detector.Detector`
+        made. Other ramps are refused without references.
     properties : `~miricigale.instrument.DetectorProperties`, optional
-        The detector; `~miricigale.instrument.miri_detector` if not given.
+        The simulated detector; `~miricigale.instrument.miri_detector` if not given, and
+        ramps of any other are refused then.
     n_threads : int, optional
         Threads of the ramp fit; as many as there are processors if not given. It changes
         nothing in the result.
@@ -114,7 +123,8 @@ class Reducer:
     skip_last: int | None = None
     reset_anomaly: ResetAnomaly | None = None
     saturation: float = 0.98
-    reference_correction: bool = True
+    reference_correction: bool | str | None = None
+    reference_window: int | None = None
     ipc: bool | None = None
     field_only: bool = True
     cosmic_rays: bool = True
@@ -122,9 +132,11 @@ class Reducer:
     cosmic_ray_contrast: float = 3.0
     box: int = 32
     filter_size: int = 3
+    plane: bool = True
     negative_threshold: float | None = 10.0
     outlier_threshold: float | None = 5.0
     pixfrac: float = 1.0
+    references: object = None
     properties: DetectorProperties | None = None
     n_threads: int | None = None
 
@@ -152,14 +164,28 @@ class Reducer:
         for name in ("saturation", "pixfrac"):
             if not 0 < getattr(self, name) <= 1:
                 raise argument_error(name, "above 0 and at most 1", getattr(self, name))
+        if self.reference_correction not in (True, False, "channels", None):
+            wanted = "True, False, 'channels' or None"
+            raise argument_error("reference_correction", wanted, repr(self.reference_correction))
+        if self.reference_window is not None and self.reference_correction != "channels":
+            wanted = "None without reference_correction='channels'"
+            raise argument_error("reference_window", wanted, self.reference_window)
         thread_count(self.n_threads)
         if self.properties is not None and not isinstance(self.properties, DetectorProperties):
             raise argument_error("properties", "a DetectorProperties", repr(self.properties))
 
+        known = (None, "none", "simulated")
+        if not isinstance(self.references, (ReferenceFiles, ReferenceCache)) and (
+            self.references not in known
+        ):
+            wanted = "ReferenceFiles, a ReferenceCache, 'none', 'simulated' or None"
+            raise argument_error("references", wanted, repr(self.references))
+
     replace = dataclasses.replace
 
     @property
-    def _detector(self):
+    def detector(self):
+        """The simulated detector, whose constants its ramps are reduced with."""
         return miri_detector() if self.properties is None else self.properties
 
     def fit_groups(self, ramp, *, progress_bar=False):
@@ -185,51 +211,13 @@ class Reducer:
         """
         if not isinstance(ramp, (Ramp, Charge)):
             raise argument_error("ramp", "a Ramp or a Charge", type(ramp).__name__)
-        exposure, detector = ramp.exposure, self._detector
-        dq = ramp.pixel_dq.astype(np.int64)
-        reference = (dq & DQ.REFERENCE_PIXEL) != 0
-        usable = (dq & _UNUSABLE) == 0
-        n_group = exposure.n_groups
-        skip_first, skip_last = self._skipped(ramp)
-        if skip_first + skip_last > n_group - 2:
-            msg = f"at most {n_group - 2} groups together for {n_group} groups"
-            raise argument_error("skip_first, skip_last", msg, f"{skip_first}, {skip_last}")
-        factor = float(np.sum(detector.ipc_kernel**2)) if self._shares_charge(ramp) else 1.0
-        bias = detector.bias + self._anomaly(ramp)
-        options = {
-            "group_time": float(exposure.group_time.to_value("s")),
-            "gain": detector.gain,
-            "read_noise": detector.read_noise,
-            "linearity": detector.nonlinearity,
-            "saturation": detector.bias + self.saturation * detector.saturation_dn,
-            "usable": usable,
-            "first_group": skip_first,
-            "last_group": n_group - skip_last,
-            "jump_threshold": self.jump_threshold,
-            "neighbor_threshold": self.neighbor_threshold,
-            "poisson_factor": factor,
-        }
-        if isinstance(ramp, Charge):
-            fit = draw_groups(ramp, bias=bias, **options)
-        else:
-            if self.reference_correction:
-                bias = bias + reference_drift(ramp.data, reference)
-            options |= {"n_threads": self.n_threads, "progress_bar": progress_bar}
-            fit = fit_groups(ramp.data, bias=bias, **options)
-        fit.flags[...] |= dq
-        fit.flags[~usable] |= int(DQ.DO_NOT_USE)
-        return fit
+        return fit_slopes(self, ramp, maps_of(self, ramp), progress_bar)
 
     def fit_ramp(self, ramp, *, progress_bar=False):
         """
         Fit the ramps of an exposure.
 
-        Parameters
-        ----------
-        ramp : `~miricigale.detector.Ramp` or `~miricigale.detector.Charge`
-            Counts in DN; or what was collected, whose slopes are drawn.
-        progress_bar : bool, optional
-            Whether a progress bar is shown.
+        Parameters are those of `fit_groups`.
 
         Returns
         -------
@@ -239,14 +227,49 @@ class Reducer:
             plain values, and ``noise_correction``: by how much the sum over many pixels is
             noisier than their errors in quadrature, because neighbors share charge.
         """
-        fit = self.fit_groups(ramp, progress_bar=progress_bar)
-        ipc = self._shares_charge(ramp)
+        if not isinstance(ramp, (Ramp, Charge)):
+            raise argument_error("ramp", "a Ramp or a Charge", type(ramp).__name__)
+        maps = maps_of(self, ramp)
+        fit = fit_slopes(self, ramp, maps, progress_bar)
+        return self._image(ramp, maps, fit)
+
+    def fit_integrations(self, ramp, *, progress_bar=False):
+        """
+        Fit the ramps of each integration alone.
+
+        Parameters
+        ----------
+        ramp : `~miricigale.detector.Ramp`
+            Counts in DN.
+        progress_bar : bool, optional
+            Whether a progress bar is shown.
+
+        Returns
+        -------
+        rates : list of `~astropy.nddata.CCDData`
+            As `fit_ramp` returns them, one for each integration; the references are those of
+            the exposure.
+        """
+        if not isinstance(ramp, Ramp):
+            raise argument_error("ramp", "a Ramp", type(ramp).__name__)
+        maps = maps_of(self, ramp)
+        rates = []
+        for number in progress(range(ramp.shape[0]), show=progress_bar, desc="integrations"):
+            part, own = ramp.integration(number), maps.integration(number)
+            rates.append(self._image(part, own, fit_slopes(self, part, own)))
+            rates[-1].meta["integration"] = number
+        return rates
+
+    def _image(self, ramp, maps, fit):
+        """What `fit_ramp` returns."""
+        ipc = shares_charge(self, ramp)
         meta = provenance(
             **exposure_values(ramp.exposure),
             n_jumps=len(fit.jumps),
             ipc=ipc,
-            noise_correction=self._noise_correction(fit) if ipc else 1.0,
-            gain=self._detector.gain,
+            noise_correction=fit.noise_correction(self.detector.ipc_kernel) if ipc else 1.0,
+            gain=float(np.median(maps.gain)),
+            **history_of(self, ramp, maps),
         )
         return image(
             fit.rate, RATE, error=fit.error, flags=fit.flags, wcs=ramp.exposure.wcs, meta=meta
@@ -273,28 +296,23 @@ class Reducer:
         for key in ("filter", "subarray"):
             if getattr(facts, key) is None:
                 raise argument_error("rate", f"an image whose meta has {key!r}", "none")
-        detector = self._detector
-        options = {
-            "sigma_clip": self.cosmic_ray_sigma,
-            "object_limit": self.cosmic_ray_contrast,
-        }
-        return calibrate(
+        options = {"sigma_clip": self.cosmic_ray_sigma, "object_limit": self.cosmic_ray_contrast}
+        brightness, used = brightness_of(self, rate)
+        cal = calibrate(
             rate,
             filter=facts.filter,
             subarray=facts.subarray,
-            dark=detector.dark_current / detector.gain,
-            gain=detector.gain,
-            ipc_kernel=detector.ipc_kernel if facts.ipc else None,
+            **brightness,
             field_only=self.field_only,
             cosmic_rays=options if self.cosmic_rays else None,
         )
+        cal.meta.update(used)
+        return cal
 
     def estimate_background(self, image):
         """Estimate the background of an image: a `Background`."""
         return estimate_background(
-            image,
-            box=self.box,
-            filter_size=self.filter_size,
+            image, box=self.box, filter_size=self.filter_size, plane=self.plane
         )
 
     def subtract_background(self, image):
@@ -315,6 +333,7 @@ class Reducer:
             image,
             box=self.box,
             filter_size=self.filter_size,
+            plane=self.plane,
             negative_threshold=self.negative_threshold,
         )
 
@@ -374,14 +393,47 @@ class Reducer:
         result = drizzle_images(images, wcs, pixfrac=pixfrac, weights=weights, pixel_maps=maps)
         return result, images
 
+    def reduce(self, exposure):
+        """
+        Reduce one exposure, from whatever stage it has.
+
+        Parameters
+        ----------
+        exposure : Ramp, Charge, `~astropy.nddata.CCDData` or path-like
+            A ramp, a rate, an image in MJy/sr, or a file with one of them (`open_exposure`).
+
+        Returns
+        -------
+        rate : `~astropy.nddata.CCDData` or None
+            None if the exposure was calibrated before.
+        image : `~astropy.nddata.CCDData`
+            MJy/sr, background subtracted.
+        background : `Background`
+        """
+        if isinstance(exposure, (str, os.PathLike)):
+            exposure = open_exposure(exposure)
+        if isinstance(exposure, (Ramp, Charge)):
+            exposure = self.fit_ramp(exposure)
+        if not isinstance(exposure, CCDData):
+            wanted = "a Ramp, a Charge, CCDData or a path"
+            raise argument_error("exposure", wanted, type(exposure).__name__)
+        if exposure.unit.is_equivalent(RATE):
+            return exposure, *self.subtract_background(self.calibrate(exposure))
+        if not exposure.unit.is_equivalent(SURFACE_BRIGHTNESS):
+            wanted = f"in {RATE} or {SURFACE_BRIGHTNESS}"
+            raise argument_error("exposure", wanted, exposure.unit)
+        return None, *self.subtract_background(exposure)
+
     def run(self, ramps, *, wcs=None, pixel_scale=0.11 * ANGLE, progress_bar=False):
         """
         Reduce the dithers of one filter.
 
         Parameters
         ----------
-        ramps : iterable of `~miricigale.detector.Ramp` or `~miricigale.detector.Charge`
-            One at a time is held if this is a generator.
+        ramps : iterable of Ramp, Charge, `~astropy.nddata.CCDData` or path-like
+            Exposures at any stage, as `reduce` takes them. One at a time is held if this is
+            a generator, or paths. For files of several filters see
+            `miricigale.workflow.reduce_files`.
         wcs : `~astropy.wcs.WCS`, optional
             Of the mosaic; by default the smallest north-up grid that holds
             every unmasked pixel of the dithers.
@@ -393,6 +445,8 @@ class Reducer:
         Returns
         -------
         result : `ReductionResult`
+            ``notes`` says what could not be done, such as the rejection of outliers in a single
+            dither.
 
         Raises
         ------
@@ -402,18 +456,45 @@ class Reducer:
         to_array(pixel_scale, ANGLE, "pixel_scale", ndim=0, finite=True)
         rates, images, backgrounds, name = [], [], [], None
         for ramp in progress(ramps, show=progress_bar, desc="reduce"):
-            name = ramp.exposure.filter if name is None else name
-            if ramp.exposure.filter != name:
-                raise argument_error("ramps", f"of one filter ({name})", ramp.exposure.filter)
-            rates.append(self.fit_ramp(ramp))
+            rate, subtracted, background = self.reduce(ramp)
             del ramp
-            subtracted, background = self.subtract_background(self.calibrate(rates[-1]))
+            band = ImageFacts.of(subtracted).filter
+            name = band if name is None else name
+            if band != name:
+                raise argument_error("ramps", f"of one filter ({name})", band)
+            if rate is not None:
+                rates.append(rate)
             images.append(subtracted)
             backgrounds.append(background)
-        if not rates:
+        return self.combine(images, backgrounds, rates=rates, wcs=wcs, pixel_scale=pixel_scale)
+
+    def combine(self, images, backgrounds, *, rates=(), wcs=None, pixel_scale=0.11 * ANGLE):
+        """
+        Put the images of one filter together.
+
+        Parameters
+        ----------
+        images : list of `~astropy.nddata.CCDData`
+            Calibrated, background subtracted.
+        backgrounds : list of `Background`
+            What was subtracted.
+        rates : list of `~astropy.nddata.CCDData`, optional
+            What they come from, for the result.
+        wcs, pixel_scale : optional
+            As for `run`.
+
+        Returns
+        -------
+        result : `ReductionResult`
+        """
+        if not images:
             raise argument_error("ramps", "at least one ramp", "none")
         if wcs is None:
             wcs = mosaic_wcs([seen_wcs(im) for im in images], pixel_scale)
+        notes = []
+        if self.outlier_threshold is not None and len(images) < 3:
+            number = "a single dither" if len(images) == 1 else "two dithers"
+            notes.append(f"{number}: outliers cannot be rejected, hits that ramps kept stay in")
         drizzled, images = self.drizzle(images, wcs)
         mosaic, mosaic_background = self.subtract_background(drizzled.image)
         # the mosaic's own level would hide those of the dithers
@@ -428,42 +509,5 @@ class Reducer:
             drizzled.weight,
             drizzled.n_images,
             mosaic_background,
+            tuple(notes),
         )
-
-    def _noise_correction(self, fit):
-        """Noise of large areas over that of pixels that share their charge."""
-        good = np.isfinite(fit.rate)
-        if not good.any():
-            return 1.0
-        photon, read = (float(np.median(v[good])) for v in (fit.var_poisson, fit.var_read))
-        shared = float(np.sum(self._detector.ipc_kernel**2))
-        return float(np.sqrt((photon / shared + read) / (photon + read)))
-
-    def _shares_charge(self, ramp):
-        """Whether the charge of this ramp was coupled between neighbors."""
-        if self.ipc is not None:
-            return bool(self.ipc)
-        return ramp.shows(InterpixelCapacitance) is not False
-
-    def _skipped(self, ramp):
-        """Groups left out at the start and the end of the integrations of a ramp."""
-        n_group = ramp.exposure.n_groups
-        first, last = self.skip_first, self.skip_last
-        if first is None:
-            first = int(bool(ramp.shows(FirstFrame)) and n_group > 3)
-        if last is None:
-            last = int(bool(ramp.shows(LastFrame)) and n_group > 2)
-        return first, last
-
-    def _anomaly(self, ramp):
-        """Offset of each group after a reset, DN."""
-        if self.reset_anomaly is not None:
-            exposure = ramp.exposure
-            return self.reset_anomaly.offsets(exposure.n_integrations, exposure.n_groups)
-        if self.skip_first is None and ramp.shows(ResetAnomaly):
-            msg = (
-                "the ramp shows a reset anomaly that this Reducer leaves in: give it "
-                "'reset_anomaly', or 'skip_first' groups to be left out"
-            )
-            warnings.warn(msg, MiricigaleWarning, stacklevel=4)
-        return 0.0

@@ -19,7 +19,7 @@ class ReductionResult:
     Parameters
     ----------
     rates : tuple of `~astropy.nddata.CCDData`
-        Slopes, DN/s.
+        Slopes, DN/s; of the exposures that were not calibrated before.
     images : tuple of `~astropy.nddata.CCDData`
         Calibrated, background subtracted, outliers masked; MJy/sr.
     backgrounds : tuple of `Background`
@@ -32,6 +32,8 @@ class ReductionResult:
         Number of dithers at each pixel of the mosaic.
     mosaic_background : `Background`
         What was subtracted from the mosaic in the second pass.
+    notes : tuple of str
+        What could not be done.
     """
 
     rates: tuple
@@ -41,6 +43,7 @@ class ReductionResult:
     weight: np.ndarray
     n_images: np.ndarray
     mosaic_background: Background
+    notes: tuple = ()
 
     @property
     def filter(self):

@@ -9,6 +9,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "catalog": ("CATALOG_COLUMNS", "CatalogFlags", "check_catalog"),
         "catalog_files": ("read_catalog",),
         "cutouts": ("Cutout",),
+        "deconvolution": ("deconvolve",),
         "highres": ("depth_to_rms", "highres_image"),
         "render": ("FieldPainter", "Painter"),
         "scene": ("Scene", "SceneFlags"),

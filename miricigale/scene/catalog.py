@@ -5,13 +5,21 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable, Table
 
-from miricigale.filters import Filter
+from miricigale.filters.surveys import is_band
 from miricigale.profiles import SERSIC_INDEX_RANGE
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.tables import Flags, error_column, require_columns, unique_ids
+from miricigale.utils.missing import without_codes
+from miricigale.utils.tables import (
+    Flags,
+    ascii_ids,
+    error_column,
+    read_ids,
+    require_columns,
+    unique_ids,
+)
 from miricigale.utils.units import FNU
 
-__all__ = ["CATALOG_COLUMNS", "CatalogFlags", "check_catalog", "is_flux"]
+__all__ = ["CATALOG_COLUMNS", "CatalogFlags", "check_catalog"]
 
 #: Columns that every catalog has, with their unit (None: dimensionless or not a number).
 CATALOG_COLUMNS = {
@@ -27,9 +35,6 @@ CATALOG_COLUMNS = {
 
 PROFILES = ("sersic", "point", "cutout")
 
-#: Numbers that stand for no value in fluxes, their errors, redshifts and shapes.
-MISSING = np.array([-99.0, -99.9, -99.99, -999.0, -999.9, -9999.0, -9999.9, -99999.0])
-
 
 class CatalogFlags(Flags):
     """What is wrong with a row of a catalog; the row is kept."""
@@ -40,6 +45,7 @@ class CatalogFlags(Flags):
     BAD_ANGLE = 8  # not finite: drawn as a point unless it is round
     NO_REDSHIFT = 16  # not finite or not positive (stars)
     NO_FLUX = 32  # no band has a positive flux (with a positive error, where it has errors)
+    MISSING_CODE = 64  # a flux or error was a number that stands for no value, such as -99
 
     @classmethod
     def unusable_profile(cls):
@@ -84,9 +90,7 @@ def _plain(table, name, unit, argument):
 
 def _without_codes(values):
     values = np.array(values, dtype=float)
-    # single precision has seven digits
-    code = np.abs(values[..., None] - MISSING) <= 1e-6 * np.abs(MISSING)
-    values[code.any(axis=-1)] = np.nan
+    values[without_codes(values)[0]] = np.nan
     return values
 
 
@@ -116,8 +120,8 @@ def check_catalog(table, *, filters=(), argument="catalog"):
     Raises
     ------
     ValueError
-        If a column is missing, ``star`` is not bool, an id is there twice, a position is not
-        finite, a profile has an unknown name or there are no rows.
+        If a column is missing, ``star`` is not bool, an id is there twice or is no integer nor ASCII text,
+        a position is not finite, a profile has an unknown name or there are no rows.
     `~astropy.units.UnitsError`
         If a column has no unit or a wrong one; a column called by a filter must be a flux.
     """
@@ -132,7 +136,7 @@ def check_catalog(table, *, filters=(), argument="catalog"):
         catalog["sky"] = SkyCoord(*sky)
     units = {name: unit for name, unit in CATALOG_COLUMNS.items() if unit is not None}
     require_columns(catalog, CATALOG_COLUMNS, argument, units=units)
-    fluxes = [*filters, *(name for name in catalog.colnames if is_flux(name))]
+    fluxes = [*filters, *(name for name in catalog.colnames if is_band(name))]
     require_columns(catalog, filters, argument, units=dict.fromkeys(fluxes, FNU))
     if len(catalog) == 0:
         raise argument_error(argument, "a table with rows", "none")
@@ -141,9 +145,11 @@ def check_catalog(table, *, filters=(), argument="catalog"):
             argument, "a table with SkyCoord in 'sky'", type(catalog["sky"]).__name__
         )
     _refuse_missing(catalog, argument)
-    if not np.issubdtype(np.asarray(catalog["id"]).dtype, np.integer):
-        raise argument_error(argument, "a table with integers in 'id'", catalog["id"].dtype)
-    unique_ids(catalog["id"], argument)
+    ids = read_ids(catalog, argument)
+    if ids.dtype.kind not in "iuU":
+        wanted = "a table with integers or text in 'id'"
+        raise argument_error(argument, wanted, catalog["id"].dtype)
+    catalog["id"] = unique_ids(ascii_ids(ids, argument), argument)
     sky = catalog["sky"].icrs
     _refuse_positions(~(np.isfinite(sky.ra.deg) & np.isfinite(sky.dec.deg)), argument)
     catalog["sky"] = SkyCoord(sky.ra, sky.dec)
@@ -171,12 +177,6 @@ def check_catalog(table, *, filters=(), argument="catalog"):
     return catalog
 
 
-def is_flux(name):
-    """Whether a column is called by a filter of the library, or is the error of one."""
-    band = name.removesuffix(error_column(""))
-    return band in Filter.names() or band.startswith("sedpy.")
-
-
 def _refuse_positions(bad, argument):
     if np.any(bad):
         rows = np.flatnonzero(bad)
@@ -196,7 +196,7 @@ def _flags(catalog):
     flags[sersic & ~((ratio > 0) & (ratio <= 1))] |= CatalogFlags.BAD_AXIS_RATIO
     flags[sersic & ~np.isfinite(angle) & (ratio != 1)] |= CatalogFlags.BAD_ANGLE
     flags[~(catalog["redshift"] > 0)] |= CatalogFlags.NO_REDSHIFT
-    bands = [n for n in catalog.colnames if is_flux(n) and not n.endswith(error_column(""))]
+    bands = [n for n in catalog.colnames if is_band(n) and not n.endswith(error_column(""))]
     if bands:
         usable = np.any([_usable(catalog, name) for name in bands], axis=0)
         flags[~usable] |= CatalogFlags.NO_FLUX

@@ -1,32 +1,24 @@
 """Catalogs of people: read from common formats, with their own names and units."""
 
 import warnings
-from collections.abc import Mapping
 from pathlib import Path
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import Angle
-from astropy.table import QTable
 from astropy.units import UnitsWarning
 
 from miricigale.filters import Filter
+from miricigale.filters.catalog_files import as_catalog_map, told_of
+from miricigale.filters.surveys import is_band
 from miricigale.refdata import locate, resources
-from miricigale.scene.catalog import CATALOG_COLUMNS, CatalogFlags, check_catalog, is_flux
-from miricigale.utils.exceptions import (
-    DataError,
-    MiricigaleWarning,
-    argument_error,
-    unknown_name,
-)
+from miricigale.scene.catalog import CATALOG_COLUMNS, CatalogFlags, check_catalog
+from miricigale.utils.exceptions import DataError, MiricigaleWarning
 from miricigale.utils.files import read_table
+from miricigale.utils.missing import plain_floats
 from miricigale.utils.tables import error_column
-from miricigale.utils.units import FNU
 
 __all__ = ["read_catalog"]
 
-#: Unit that a column without any has.
-_DEFAULT_UNITS = {"ra": u.deg, "dec": u.deg, "position_angle": u.deg}
 #: What makes a Sersic profile.
 _SHAPE = ("half_light_radius", "sersic_index", "axis_ratio", "position_angle")
 
@@ -43,7 +35,7 @@ _FEW = 20  # sources that counts and colors are not judged by
 _COLOR = 2.2, 2.9
 
 
-def read_catalog(path, *, columns=None, units=None):
+def read_catalog(path, catalog_map=None, **options):
     """
     Read a catalog of sources.
 
@@ -52,14 +44,13 @@ def read_catalog(path, *, columns=None, units=None):
     path : str or path-like
         Name of a resource (``"catalog.goodss"``) or a FITS, ECSV, VOTable, CSV or text file
         (CIGALE's too).
-    columns : dict of str to str, optional
-        Our name of a column to the file's, such as ``{"wfc3.f160w": "FLUX_H"}``. Ours are those of
-        `CATALOG_COLUMNS`, ``ra``, ``dec``, ``star``, names of filters, those with ``_err`` for errors, and
-        any other without a dot. Columns that are not named keep their names.
-    units : dict of str to str or `~astropy.units.Unit`, optional
-        Units by our name, for columns whose file gives none or a wrong one; ``"flux"`` stands for all
-        fluxes and errors: ``{"flux": "mJy", "ra": "hourangle"}``, ``{"flux": "0.3631 uJy"}`` for a
-        zero point of 25. Without unit ``ra``, ``dec`` and ``position_angle`` are in degrees.
+    catalog_map : `~miricigale.filters.CatalogMap`, str or path-like, optional
+        Names and units of the file, the name of a survey or a TOML file, as for
+        `~miricigale.filters.read_catalog_photometry`. Our names are those of `CATALOG_COLUMNS`, ``ra``,
+        ``dec``, ``star``, names of filters, those with ``_err`` for errors, and any other without a dot.
+    **options
+        As for `~miricigale.filters.CatalogMap`, in place of it: ``columns``, ``units``, ``survey``,
+        ``missing``, ``factor``.
 
     Returns
     -------
@@ -72,16 +63,16 @@ def read_catalog(path, *, columns=None, units=None):
     `~miricigale.utils.exceptions.DataError`
         If there is no such file, or it is no table.
     KeyError
-        If ``columns`` or ``units`` name a column or filter that there is not.
+        If the map names a column or filter that there is not.
     ValueError, `~astropy.units.UnitsError`
         If the table is refused by `check_catalog`.
 
     Warns
     -----
     `~miricigale.utils.exceptions.MiricigaleWarning`
-        Of sources without a usable flux (`CatalogFlags`, ``NO_FLUX``), right ascensions that look like
-        hours, fluxes that look like those of another unit by counts or colors, units other than
-        the file's, and missing profiles.
+        Of numbers that stand for no value (`CatalogFlags`, ``MISSING_CODE``), sources without a usable
+        flux (``NO_FLUX``), right ascensions that look like hours, fluxes that look like those of another
+        unit by counts or colors, units other than the file's, bands without a filter, and missing profiles.
 
     Examples
     --------
@@ -98,118 +89,26 @@ def read_catalog(path, *, columns=None, units=None):
         known = ", ".join(key for key in sorted(resources()) if key.startswith("catalog."))
         msg = f"no catalog {name!r}: neither a file nor one of {known}"
         raise DataError(msg)
+    catalog_map = as_catalog_map(catalog_map, options)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UnitsWarning)
         table = read_table(path, wanted="a table")
     if not table.colnames:
         msg = f"{path} cannot be read as a table: it has no columns"
         raise DataError(msg)
-    table = _rename(table, _checked_map(columns, "columns"), path.name)
-    _set_units(table, _checked_map(units, "units"), path.name)
-    _whole_ids(table)
+    _, lost = catalog_map.names(table.colnames, path.name)
+    table, coded = catalog_map.convert(table, path.name)
     _flags_of_stars(table)
-    told = [*_fill_profiles(table, path.name)]
+    told = [*told_of(lost, coded), *_fill_profiles(table, path.name)]
     catalog = check_catalog(table, argument=path.name)
+    for codes in coded.values():
+        catalog["flags"][~np.isnan(codes)] |= int(CatalogFlags.MISSING_CODE)
     told += _missing_fluxes(catalog)
     # counts need an area that is right
     told += list(_hours(table, catalog)) or _odd_units(catalog)
     for text in told:
         warnings.warn(f"{path.name}: {text}", MiricigaleWarning, stacklevel=2)
     return catalog
-
-
-def _checked_map(names, argument):
-    """A map of our names, each of them known."""
-    if names is None:
-        return {}
-    if not isinstance(names, Mapping):
-        raise argument_error(argument, "a dict by our names of columns", type(names).__name__)
-    for name in names:
-        if "." in str(name) and not is_flux(name):
-            raise unknown_name("filter", str(name).removesuffix(error_column("")), Filter.names())
-    return dict(names)
-
-
-def _rename(table, columns, argument):
-    """Columns by our names; one of the same name that is not meant steps aside."""
-    for ours, theirs in columns.items():
-        if theirs not in table.colnames:
-            kind = f"column of {argument} (for {ours!r})"
-            raise unknown_name(kind, theirs, table.colnames)
-    if len(set(columns.values())) < len(columns):
-        raise argument_error("columns", "a dict whose values differ", columns)
-    ours, out = {theirs: name for name, theirs in columns.items()}, QTable(meta=table.meta)
-    for name in table.colnames:
-        if name in ours or name not in columns:
-            out[ours.get(name, name)] = table[name]
-    return out
-
-
-def _set_units(table, units, argument):
-    """Give columns the units that the caller says, or the usual one where there is none."""
-    for name in units:
-        if name != "flux" and name not in table.colnames:
-            kind = f"column of {argument}"
-            raise unknown_name(kind, name, [*table.colnames, "flux"])
-    for name in table.colnames:
-        of_flux = is_flux(name)
-        asked = units.get(name, units.get("flux") if of_flux else None)
-        column = table[name]
-        has = getattr(column, "unit", None)
-        if asked is None:
-            if name in _DEFAULT_UNITS and has is None and column.dtype.kind in "if":
-                table[name] = u.Quantity(_floats(column, name, argument), _DEFAULT_UNITS[name])
-            elif of_flux and has is None:
-                msg = (
-                    f"'{argument}' column {name!r} must be convertible to {FNU}, got None: "
-                    "say it, such as units={'flux': 'uJy'}"
-                )
-                raise u.UnitsError(msg)
-            continue
-        try:
-            asked = u.Unit(asked)
-        except (TypeError, ValueError) as err:
-            raise argument_error("units", f"a dict of units, also for {name!r}", asked) from err
-        if has is not None and u.Unit(has) != asked:
-            msg = f"{argument}: {name!r} taken in {asked}, the file says {has}"
-            warnings.warn(msg, MiricigaleWarning, stacklevel=3)
-        if column.dtype.kind in "US" and asked.is_equivalent(u.deg):
-            table[name] = _angles(column, asked, name, argument)
-        else:
-            table[name] = u.Quantity(_floats(column, name, argument), asked)
-
-
-def _angles(column, unit, name, argument):
-    """Angles from text such as 3:32:30.1."""
-    try:
-        return u.Quantity(Angle(np.asarray(column).astype(str), unit).to(u.deg))
-    except (ValueError, u.UnitsError) as err:
-        wanted = f"a table with angles in {name!r}"
-        raise argument_error(argument, wanted, repr(str(column[0]))) from err
-
-
-def _floats(column, name, argument):
-    """A column as plain floats, NaN where masked or blank."""
-    mask = np.broadcast_to(np.asarray(getattr(column, "mask", False)), np.shape(column))
-    column = getattr(column, "value", column)
-    values = np.ma.getdata(getattr(column, "unmasked", column))
-    if values.dtype.kind in "OUS":
-        # a column without a single number is text to the reader
-        values = np.where(mask, "nan", values.astype(str))
-    try:
-        return np.where(mask, np.nan, values.astype(float))
-    except (TypeError, ValueError):
-        wanted = f"a table with numbers in {name!r}"
-        raise argument_error(argument, wanted, repr(values[0])) from None
-
-
-def _whole_ids(table):
-    """Ids that are whole numbers as integers, however the file holds them."""
-    if "id" not in table.colnames or np.any(getattr(table["id"], "mask", False)):
-        return
-    ids = np.asarray(table["id"])
-    if ids.dtype.kind == "f" and np.all(ids == np.round(ids)):
-        table["id"] = ids.astype(np.int64)
 
 
 def _flags_of_stars(table):
@@ -233,7 +132,7 @@ def _fill_profiles(table, argument):
         if name in missing:
             table[name] = np.full(len(table), np.nan) * (CATALOG_COLUMNS[name] or u.one)
         elif not missing:
-            values = _floats(table[name], name, argument)
+            values = plain_floats(table[name], name, argument)
             usable &= np.isfinite(values) & ((values > 0) | (name == "position_angle"))
     table["profile"] = np.where(usable, "sersic", "point")
     why = f"no column {missing[0]!r}" if missing else "incomplete or not positive shapes"
@@ -272,7 +171,7 @@ def _odd_units(catalog):
     pivots = {
         name: Filter.from_name(name).pivot.value
         for name in catalog.colnames
-        if is_flux(name) and not name.endswith(error_column(""))
+        if is_band(name) and not name.endswith(error_column(""))
     }
     galaxies = ~np.asarray(catalog["star"])
     logs = {}

@@ -168,6 +168,20 @@ class Cutout(Frozen):
         a, s = self.angle.to_value(u.rad), self.pixel_scale.value
         return s * np.array([[-math.cos(a), math.sin(a)], [math.sin(a), math.cos(a)]])
 
+    @functools.cached_property
+    def half_light_radius(self):
+        """Radius of the circle around the center that holds half of the light."""
+        y, x = np.indices(self.data.shape)
+        radius = np.hypot(x - self.center[0], y - self.center[1]).ravel()
+        order = np.argsort(radius, kind="stable")
+        share = np.cumsum(self.data.ravel()[order]) / self.data.sum()
+        # noise may take the sum up and down: where it first has the half
+        k = int(np.argmax(share >= 0.5))
+        inner = share[k - 1] if k else 0.0
+        low = radius[order[k - 1]] if k else 0.0
+        step = (0.5 - inner) / (share[k] - inner)
+        return (low + step * (radius[order[k]] - low)) * self.pixel_scale
+
     def pieces(self, jacobian):
         """
         The stamp as many small points on the pixels of an image.

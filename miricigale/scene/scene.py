@@ -161,8 +161,10 @@ class Scene:
             if not isinstance(value, Cutout):
                 raise argument_error("cutouts", f"a Cutout for {key!r}", type(value).__name__)
         rows = np.flatnonzero(self._catalog["profile"] == "cutout")
-        ids = {int(self._catalog["id"][row]): int(row) for row in rows}
-        lacking, foreign = sorted(set(ids) - set(cutouts)), sorted(set(cutouts) - set(ids))
+        ids = {self._catalog["id"][row].item(): int(row) for row in rows}
+        lacking, foreign = (
+            sorted(one, key=str) for one in (set(ids) - set(cutouts), set(cutouts) - set(ids))
+        )
         if lacking:
             raise argument_error("cutouts", "one for each profile 'cutout'", f"none for {lacking}")
         if foreign:
@@ -313,7 +315,7 @@ class Scene:
             meta=provenance(filter=self._filter),
         )
         filled = {
-            int(catalog["id"][row]): stamp.n_filled
+            catalog["id"][row].item(): stamp.n_filled
             for row, stamp in self._cutouts.items()
             if stamp.n_filled
         }

@@ -9,7 +9,6 @@ import warnings
 import zipfile
 from pathlib import Path
 
-import astropy.units as u
 from astropy.config import ConfigItem, ConfigNamespace
 from astropy.io import fits
 from astropy.table import QTable
@@ -20,7 +19,6 @@ __all__ = [
     "cached_by_file",
     "check_unpacked",
     "conf",
-    "image_unit",
     "open_fits",
     "read_table",
     "split_extension",
@@ -296,41 +294,6 @@ def _allocated(path):
     return n_bytes
 
 
-def image_unit(header, path, *, like):
-    """
-    Unit of an image, as its header states it.
-
-    Parameters
-    ----------
-    header : `~astropy.io.fits.Header`
-        Of the image.
-    path : path-like
-        The file, for the message.
-    like : unit-like or None
-        Unit that it must be convertible to, such as ``"MJy/sr"``; any if None.
-
-    Returns
-    -------
-    unit : `~astropy.units.Unit`
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If the keyword ``BUNIT`` is missing, no unit or one of another kind.
-    """
-    text = header.get("BUNIT", "")
-    try:
-        unit = u.Unit(text) if str(text).strip() else None
-        if unit is not None and (like is None or unit.is_equivalent(like)):
-            return unit
-    except (TypeError, ValueError):
-        pass
-    got = f"BUNIT = {text!r}" if text else "none"
-    wanted = "such as MJy/sr" if like is None else f"one that converts to {u.Unit(like)}"
-    msg = f"{path} must state the unit of its pixels in the keyword BUNIT, {wanted}, got {got}"
-    raise DataError(msg)
-
-
 def _refuse_stump(path):
     """Refuse what is shorter than one block of FITS; astropy would leave the file open."""
     if path.is_file() and path.stat().st_size < 2880:
@@ -362,7 +325,7 @@ def write_fits(hdus, path, *, overwrite=False):
         hdus.writeto(path, overwrite=overwrite, output_verify="exception")
 
 
-def read_table(path, *, wanted, cls=QTable, form=None):
+def read_table(path, *, wanted, cls=QTable, form=None, hdu=None):
     """
     Read a table in any of the usual formats, or say which file could not be read as what.
 
@@ -375,6 +338,8 @@ def read_table(path, *, wanted, cls=QTable, form=None):
     form : str, optional
         Format by `astropy.table.Table.read`. By default content and suffix tell: FITS, VOTable,
         ECSV, CSV or plain text, whose names of columns stand behind ``#`` if ``id`` is among them.
+    hdu : int or str, optional
+        Extension of a FITS file, the first table by default.
 
     Returns
     -------
@@ -393,7 +358,9 @@ def read_table(path, *, wanted, cls=QTable, form=None):
         form = _table_format(path) if form is None else form
         if form == "fits":
             with open_fits(path, wanted=wanted) as hdus:
-                return cls.read(hdus, format=form, character_as_bytes=False)
+                return cls.read(hdus, format=form, character_as_bytes=False, hdu=hdu)
+        if hdu is not None:
+            raise _unreadable(path, wanted, f"'hdu' is {hdu!r}, and it is no FITS file")
         return cls.read(path, format=form)
     except DataError:
         raise

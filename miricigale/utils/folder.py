@@ -240,21 +240,30 @@ class RecordFolder(FileFolder):
 
     def is_whole(self, key):
         """Whether all files of a record stand with the right checksums."""
-        return all(
-            self._is_whole(name, product) for name, product in self.records[key]["products"].items()
-        )
+        return not any(self._fault(*item) for item in self.records[key]["products"].items())
 
-    def _is_whole(self, name, product):
-        path = self.path(name)
-        if not path.is_file() or path.stat().st_size != product["bytes"]:
-            return False
+    def faults(self, key):
+        """What is wrong with the files of a record: dict of name to ``"missing"`` or what else, in words."""
+        found = {
+            name: self._fault(name, one) for name, one in self.records[key]["products"].items()
+        }
+        return {name: fault for name, fault in found.items() if fault}
+
+    def _fault(self, name, product):
+        """What is wrong with a file, in words; empty if nothing is."""
+        path, size = self.path(name), product["bytes"]
+        if not path.is_file():
+            return "missing"
+        status = path.stat()
+        if status.st_size != size:
+            return f"{status.st_size} bytes in place of {size}"
         # a file of many megabytes is read once
-        state = (path.stat().st_mtime_ns, product["sha256"])
+        state = (status.st_mtime_ns, product["sha256"])
         if self._whole.get(name) != state:
             if file_sha256(path) != product["sha256"]:
-                return False
+                return "another content than was written"
             self._whole[name] = state
-        return True
+        return ""
 
     def is_current(self, key, digest):
         """

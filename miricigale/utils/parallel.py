@@ -20,6 +20,7 @@ from miricigale.utils.progress import progress
 
 __all__ = [
     "available_memory",
+    "check_memory",
     "chunks",
     "parallel_map",
     "process_pool",
@@ -51,6 +52,33 @@ def available_memory():
     except OSError:
         return total
     return min(total, int(limit)) if limit.isdigit() else total
+
+
+def check_memory(n_bytes, what, *, advice):
+    """
+    Refuse what does not fit into the memory, before it is begun.
+
+    Parameters
+    ----------
+    n_bytes : int
+        What would be allocated.
+    what : str
+        What it is, for the message.
+    advice : str
+        What can be done instead.
+
+    Raises
+    ------
+    MemoryError
+        If it is more than nine tenths of the memory (`available_memory`).
+    """
+    most = 0.9 * available_memory()
+    if n_bytes > most:
+        msg = (
+            f"{what} would take {n_bytes / 1e9:.3g} GB of memory, and {most / 1e9:.3g} GB can be "
+            f"had: {advice}"
+        )
+        raise MemoryError(msg)
 
 
 @contextlib.contextmanager
@@ -222,7 +250,8 @@ class _FromFile:
 
 @functools.lru_cache(maxsize=1)
 def _unpickled(path):
-    # written by this program a moment ago, in a file that only its user can write
+    # a pickle can run any code; this one is of the process that asks for the work, which wrote it to a
+    # temporary file that its user alone can read and write (mkstemp), and nothing else is read here
     with open(path, "rb") as stream:
         return pickle.load(stream)
 

@@ -2,7 +2,6 @@
 
 import abc
 import gc
-import hashlib
 import io
 import json
 import warnings
@@ -13,8 +12,9 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import QTable, Table
 
+from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import DataError, argument_error
-from miricigale.utils.files import open_fits, unpacked_size
+from miricigale.utils.files import open_fits, read_table, unpacked_size
 from miricigale.utils.store import plain_value, replacing
 from miricigale.utils.units import check_count
 
@@ -28,7 +28,8 @@ def open_rows(path, chunk_rows, *, hdu=None):
     Parameters
     ----------
     path : path-like
-        FITS with a binary table, ECSV, or CSV with a line of column names (``.csv``).
+        FITS with a binary table, ECSV, or CSV with a line of column names (``.csv``); VOTable and plain text,
+        which are in memory as a whole.
     chunk_rows : int
         Rows in a piece.
     hdu : int or str, optional
@@ -61,6 +62,8 @@ def open_rows(path, chunk_rows, *, hdu=None):
         return _ECSVRows(path, chunk_rows)
     if path.suffix.lower() == ".csv" and not packed:
         return _CSVRows(path, chunk_rows)
+    if not packed and path.suffix.lower() in _WHOLE:
+        return _WholeRows(path, chunk_rows)
     why = "unpack it first" if packed else "write it as FITS (a binary table) or ECSV"
     msg = f"{path} cannot be read as a table in pieces of rows: {why}"
     raise DataError(msg)
@@ -86,8 +89,7 @@ class RowFile(abc.ABC):
     @cached_property
     def sha256(self):
         """Checksum of the file."""
-        with open(self.path, "rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
+        return file_sha256(self.path)
 
     @property
     def n_chunks(self):
@@ -145,6 +147,32 @@ class RowFile(abc.ABC):
     @abc.abstractmethod
     def _read(self, start, stop):
         """Read rows; ``start`` is the first of a piece."""
+
+
+#: Suffixes of files that are read as a whole: VOTable and plain text.
+_WHOLE = (".xml", ".vot", ".votable", ".txt", ".cat", ".dat")
+
+
+class _WholeRows(RowFile):
+    """Rows of a table that can be read as a whole only."""
+
+    @cached_property
+    def _table(self):
+        return read_table(self.path, wanted="a catalog")
+
+    @property
+    def colnames(self):
+        return tuple(self._table.colnames)
+
+    @property
+    def n_rows(self):
+        return len(self._table)
+
+    def _is_foreign(self, name, start, stop):
+        return self._table[name].dtype.kind in "OUS"
+
+    def _read(self, start, stop):
+        return self._table[start:stop]
 
 
 class _FitsRows(RowFile):
@@ -223,8 +251,8 @@ class _ECSVRows(RowFile):
     """
     Rows of ECSV; a row may go over several lines within quotes.
 
-    The pieces that `astropy.io.ascii` makes by itself end anywhere in the text, also within quotes,
-    have rows that nobody counted, and are of formats without a header of types.
+    `astropy.io.ascii` reads in pieces of its own (``fast_reader={"chunk_size": ...}``), but these are of a number
+    of characters, not of rows, may end within quotes, and are not there for ECSV, whose header has the types.
     """
 
     @cached_property

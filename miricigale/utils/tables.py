@@ -18,6 +18,7 @@ __all__ = [
     "described_table",
     "error_column",
     "match_sky",
+    "read_ids",
     "require_columns",
     "unique_ids",
 ]
@@ -160,6 +161,46 @@ def unique_ids(ids, argument):
             argument, "a table whose ids are unique", f"duplicates such as {twice}"
         )
     return ids
+
+
+def read_ids(table, argument="photometry"):
+    """
+    Ids of a catalog: numbers, or text whether it came as such or as bytes.
+
+    ``argument`` is what the table is called in messages. A `ValueError` tells ids that are masked or
+    empty, for nothing would tell their objects from others, numbers among text, several in a row, and
+    bytes that are not UTF-8.
+    """
+    require_columns(table, ["id"], argument)
+    column = table["id"]
+    ids = np.asarray(getattr(column, "unmasked", column))
+    if ids.ndim != 1:
+        raise argument_error(argument, "a table with one id in a row", f"{ids.shape}")
+    missing = np.broadcast_to(np.asarray(getattr(column, "mask", False)), ids.shape)
+    if ids.dtype.kind == "O":
+        missing = missing | np.array([value is None for value in ids], dtype=bool)
+    elif ids.dtype.kind in "US":
+        missing = missing | (ids == ids.dtype.type())
+    if missing.any():
+        rows = np.flatnonzero(missing)
+        got = f"{rows.size} masked or empty, the first in row {rows[0]} (from 0)"
+        raise argument_error(argument, "a table with an id in every row", got)
+    if ids.dtype.kind == "S":
+        # as astropy reads text of FITS files
+        try:
+            return np.char.decode(ids, "utf-8")
+        except UnicodeDecodeError as err:
+            wanted = "a table with ids that are text, or bytes of text in UTF-8"
+            raise argument_error(argument, wanted, f"{err.object!r}") from None
+    if ids.dtype.kind == "O":
+        kinds = {type(value) for value in ids.tolist()}
+        if len(kinds) > 1:
+            names = sorted(kind.__name__ for kind in kinds)
+            raise argument_error(argument, "a table with ids of one kind", f"{names}")
+        return np.array(ids.tolist()) if ids.size else ids.astype(str)
+    # FITS takes numbers of one byte for true and false
+    dtype = np.dtype(np.int16) if ids.dtype == np.int8 else ids.dtype
+    return ids.astype(dtype.newbyteorder("="))
 
 
 def ascii_ids(ids, argument):

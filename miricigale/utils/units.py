@@ -18,6 +18,7 @@ __all__ = [
     "TIME",
     "WAVE",
     "Frozen",
+    "ab_magnitude",
     "ab_quantity",
     "check_count",
     "frozen_array",
@@ -130,6 +131,13 @@ def check_count(value, name, least=1):
     if not (is_number(value, np.integer) and value >= least):
         raise argument_error(name, f"an integer >= {least}", repr(value))
     return int(value)
+
+
+def ab_magnitude(flux):
+    """AB magnitudes of flux densities, as plain numbers; NaN where they are not positive."""
+    value = u.Quantity(flux).to_value(FNU)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(value > 0, 23.9 - 2.5 * np.log10(value), np.nan)
 
 
 def ab_quantity(value):

@@ -7,10 +7,12 @@ __getattr__, __dir__, __all__ = lazy_names(
     {
         "config": ("StudyConfig", "load_config", "preset_names"),
         "products": ("write_image",),
+        "reduce": ("reduce_files",),
         "runner": ("StudyRunner",),
         "stage": ("Context", "Stage"),
         "stages": ("study_stages",),
         "store": ("ProductStore",),
-        "study": ("check_study", "disk_use", "run_study"),
+        "disk": ("disk_use",),
+        "study": ("check_study", "run_study"),
     },
 )

@@ -8,6 +8,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale.filters import Filter
+from miricigale.filters.catalog_files import MappedRows, as_catalog_map
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column
@@ -94,7 +95,7 @@ def plan_table(*, quick=False):
     return QTable(rows)
 
 
-def write_plan(config, folder, *, executor=None):
+def write_plan(config, folder, *, executor=None, progress_bar=False):
     """
     Work out a plan and write it.
 
@@ -105,9 +106,12 @@ def write_plan(config, folder, *, executor=None):
     folder : path-like
         Gets ``plan.html``, ``plan.toml``, ``comparison.ecsv``, ``areas.ecsv`` (with ``[survey] areas``),
         and ``bands-<n>.ecsv`` and ``sources-<n>.ecsv`` of each set of bands, in the order of the
-        configuration (0: the existing ones). Files of these names are replaced.
+        configuration (0: the existing ones); with ``[images] enabled`` the run in ``images``, its catalog
+        ``images.ecsv``, ``images-numbers.ecsv`` and ``images-bands.ecsv``. Files of these names are replaced.
     executor : `concurrent.futures.Executor`, optional
         Threads to fit with; the answer is the same.
+    progress_bar : bool, optional
+        Whether the progress of the images is shown.
 
     Returns
     -------
@@ -131,12 +135,38 @@ def write_plan(config, folder, *, executor=None):
     tables |= {f"bands-{k}": plan.band_table() for k, plan in enumerate(plans) if plan.bands}
     for name, table in tables.items():
         table.write(folder / f"{name}.ecsv", overwrite=True)
-    write_page(folder / "plan.html", planner, plans, comparison, areas)
+    pair = _write_images(planner, plans, folder, progress_bar) if config.images.enabled else None
+    write_page(folder / "plan.html", planner, plans, comparison, areas, pair)
     return comparison
 
 
+def _write_images(planner, plans, folder, progress_bar):
+    """Image a plan, and write its numbers beside those of the noise: tables by band and of all."""
+    from miricigale.utils.parallel import process_pool, thread_count
+    from miricigale.workflow.planning import image_sample, paired_bands, paired_numbers
+
+    n_processes = thread_count(planner.config.plan.threads or None)
+    with process_pool(n_processes) as pool:
+        imaged = image_sample(planner, folder / "images", executor=pool, progress_bar=progress_bar)
+    pair = (
+        paired_bands(planner, imaged),
+        paired_numbers(planner, plans, planner.compare(measured=imaged.measured), imaged),
+    )
+    for name, table in zip(("bands", "numbers"), pair, strict=True):
+        table.write(folder / f"images-{name}.ecsv", overwrite=True)
+    return pair
+
+
 def fit_catalog(
-    path, output, *, axes="fit", model_error=0.1, hdu=None, chunk_rows=10000, **options
+    path,
+    output,
+    *,
+    axes="fit",
+    model_error=0.1,
+    catalog_map=None,
+    hdu=None,
+    chunk_rows=10000,
+    **options,
 ):
     """
     Fit a catalog of photometry of any length with the chain of Yang et al. 2021.
@@ -144,13 +174,16 @@ def fit_catalog(
     Parameters
     ----------
     path : path-like
-        FITS, ECSV or CSV with ``id`` and, for each band, ``<filter>`` and ``<filter>_err``.
+        FITS, ECSV, CSV, VOTable or plain text with ``id`` and, for each band, ``<filter>`` and
+        ``<filter>_err``, or with columns that ``catalog_map`` gives these names.
     output : path-like
         Folder of the results.
     axes : {"fit", "quick"}, optional
         Model grid; see `miricigale.sed.yang2021_axes`.
     model_error : float, optional
         Relative model error.
+    catalog_map : `~miricigale.filters.CatalogMap`, str or path-like, optional
+        Names and units of the catalog; the name of a survey, or a TOML file.
     hdu, chunk_rows, **options
         As for `miricigale.fitting.fit_file`, such as ``redshift``, a column of known redshifts, and
         ``resume``.
@@ -172,6 +205,9 @@ def fit_catalog(
         If no column is a flux in a known filter with an error beside it.
     """
     rows = open_rows(path, chunk_rows, hdu=hdu)
+    if catalog_map is not None:
+        catalog_map = as_catalog_map(catalog_map)
+        rows = MappedRows(rows, catalog_map)
     names = rows.colnames
     known = set(Filter.names())
     bands = [
@@ -200,4 +236,5 @@ def fit_catalog(
     fitter = BayesFitter(
         SEDModel.yang2021(), bands, axes=SEDModel.yang2021_axes(axes), model_error=model_error
     )
-    return fit_file(fitter, path, output, hdu=hdu, chunk_rows=chunk_rows, **options)
+    options |= {"catalog_map": catalog_map, "hdu": hdu, "chunk_rows": chunk_rows}
+    return fit_file(fitter, path, output, **options)

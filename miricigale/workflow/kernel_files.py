@@ -10,7 +10,14 @@ from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits, split_extension
 from miricigale.utils.units import ANGLE, to_array
 
-__all__ = ["can_be_modeled", "file_place", "is_own_kernel", "matching_kernel", "read_kernel"]
+__all__ = [
+    "can_be_modeled",
+    "file_place",
+    "image_psf",
+    "is_own_kernel",
+    "matching_kernel",
+    "read_kernel",
+]
 
 _log = logging.getLogger(__name__)
 
@@ -218,6 +225,53 @@ def can_be_modeled(header):
     return name in MODEL_FILTERS and (name.startswith("wfc3.") or header.pa_aper is not None)
 
 
+def image_psf(header, path=None, *, argument="psf", scale=None, angle=None):
+    """
+    The PSF of an image: that of a file, or the model of its filter.
+
+    Parameters
+    ----------
+    header : `~miricigale.photometry.MosaicHeader`
+        Of the image.
+    path : path-like, optional
+        What has the PSF; the model without it.
+    argument : str, optional
+        What ``path`` is called in messages.
+    scale, angle : `~astropy.units.Quantity`, optional
+        Pixel and position angle of +y of the file, if its header does not say them; those of the image by
+        default.
+
+    Returns
+    -------
+    psf : `~photutils.psf.ImagePSF` or None
+        In the frame of the sky. None without a file if there is no model (`can_be_modeled`).
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file is missing or holds no PSF.
+    """
+    if path is not None:
+        return _read_psf(path, argument, header, scale=scale, angle=angle)
+    return _model_psf(header, argument) if can_be_modeled(header) else None
+
+
+def _model_psf(header, argument):
+    """The model of the PSF of an image by its filter."""
+    from miricigale.psf import filter_psf
+
+    scale, angle = _grid(header)
+    psf = filter_psf(
+        header.filter,
+        pixel_scale=scale * ANGLE,
+        pa=header.pa_aper,
+        grid_angle=angle * u.deg,
+        resampling=None if header.exposure else "drizzle",
+    )
+    _log.info("%s: the model of %s", argument, header.filter)
+    return psf
+
+
 def matching_kernel(image, highres, *, kernel=None, psf=None, highres_psf=None, **options):
     """
     The kernel from the prior to the image.
@@ -243,7 +297,7 @@ def matching_kernel(image, highres, *, kernel=None, psf=None, highres_psf=None, 
     ValueError
         If the prior's PSF is not the narrower one, or a PSF is not that of its filter.
     """
-    from miricigale.psf import MODEL_FILTERS, MatchingKernel, filter_psf, make_psf, rotate_psf
+    from miricigale.psf import MODEL_FILTERS, MatchingKernel, make_psf, rotate_psf
 
     scale, angle = _grid(highres)
     psfs, fine, turn = {}, scale * ANGLE, angle * u.deg
@@ -252,15 +306,7 @@ def matching_kernel(image, highres, *, kernel=None, psf=None, highres_psf=None, 
             form = {name: options.get(f"{what}_{name}") for name in ("scale", "angle")}
             psfs[what] = _read_psf(path, what, header, **form)
         elif kernel is None or (what == "highres_psf" and can_be_modeled(header)):
-            scale, angle = _grid(header)
-            psfs[what] = filter_psf(
-                header.filter,
-                pixel_scale=scale * ANGLE,
-                pa=header.pa_aper,
-                grid_angle=angle * u.deg,
-                resampling=None if header.exposure else "drizzle",
-            )
-            _log.info("%s: the model of %s", what, header.filter)
+            psfs[what] = _model_psf(header, what)
     sharp, wide = psfs.get("highres_psf"), psfs.get("psf")
     if kernel is not None:
         if sharp is not None:

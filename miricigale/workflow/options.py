@@ -10,16 +10,7 @@ from pathlib import Path
 
 from miricigale.utils.exceptions import ConfigError
 
-__all__ = [
-    "from_text",
-    "option",
-    "read_setting",
-    "read_text",
-    "replace_sections",
-    "require",
-    "sections_toml",
-    "toml_value",
-]
+__all__ = ["Configuration", "option", "read_setting", "read_text", "require", "toml_value"]
 
 
 def option(default, doc, *, low=None, high=None, choices=None, single=False):
@@ -48,18 +39,6 @@ def read_text(path):
         raise ConfigError(msg) from None
 
 
-def from_text(label, text, base):
-    """The configuration ``base`` with the sections and keys of a text in TOML, called ``label``."""
-    try:
-        return type(base).from_dict(tomllib.loads(text), base=base)
-    except tomllib.TOMLDecodeError as err:
-        msg = f"{label} is not valid TOML: {err}"
-        raise ConfigError(msg) from None
-    except ConfigError as err:
-        msg = f"{label}: {err}"
-        raise ConfigError(msg) from None
-
-
 def read_setting(text):
     """
     Section, key and value of a text ``section.key=value``.
@@ -77,24 +56,74 @@ def read_setting(text):
         return section, key, value.strip()
 
 
-def replace_sections(base, values):
+class Configuration:
     """
-    A configuration with other values of some sections and keys.
+    Base of a configuration: a frozen dataclass whose fields are sections, dataclasses of `option` fields.
 
-    ``base`` is a dataclass of sections, each a dataclass of `option` fields; ``values`` a dict of
-    dict. Errors name section and key, what was wanted and what came.
+    Attributes
+    ----------
+    heading : str
+        First line of its file, a comment.
     """
-    sections = {field.name: getattr(base, field.name) for field in dataclasses.fields(base)}
-    unknown = sorted(set(values) - set(sections))
-    if unknown:
-        msg = f"unknown section {unknown}; known: {sorted(sections)}"
-        raise ConfigError(msg)
-    for name, entries in values.items():
-        if not isinstance(entries, dict):
-            msg = f"[{name}] must be a section, got {entries!r}"
+
+    heading: typing.ClassVar[str]
+
+    @classmethod
+    def from_dict(cls, values, *, base=None):
+        """
+        Make a configuration from nested dictionaries.
+
+        Parameters
+        ----------
+        values : dict of dict
+            Sections and their keys; what is absent keeps the value of ``base``.
+        base : `Configuration`, optional
+            Where absent keys come from; the defaults if not given.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.ConfigError`
+            For an unknown section or key (the message lists the known ones), a wrong
+            type, or a value outside its limits.
+        """
+        base = base or cls()
+        sections = {field.name: getattr(base, field.name) for field in dataclasses.fields(base)}
+        unknown = sorted(set(values) - set(sections))
+        if unknown:
+            msg = f"unknown section {unknown}; known: {sorted(sections)}"
             raise ConfigError(msg)
-        sections[name] = _replace_section(name, sections[name], entries)
-    return type(base)(**sections)
+        for name, entries in values.items():
+            if not isinstance(entries, dict):
+                msg = f"[{name}] must be a section, got {entries!r}"
+                raise ConfigError(msg)
+            sections[name] = _replace_section(name, sections[name], entries)
+        return cls(**sections)
+
+    @classmethod
+    def from_texts(cls, texts, overrides=None):
+        """Of pairs of a label for errors and a text in TOML, and of values in their place, in this order."""
+        config = cls()
+        for label, text in texts:
+            try:
+                config = cls.from_dict(tomllib.loads(text), base=config)
+            except tomllib.TOMLDecodeError as err:
+                msg = f"{label} is not valid TOML: {err}"
+                raise ConfigError(msg) from None
+            except ConfigError as err:
+                msg = f"{label}: {err}"
+                raise ConfigError(msg) from None
+        return cls.from_dict(overrides, base=config) if overrides else config
+
+    def to_toml(self):
+        """The whole configuration as TOML, each key with its documentation."""
+        lines = [self.heading]
+        for field in dataclasses.fields(self):
+            section = getattr(self, field.name)
+            lines += ["", f"[{field.name}]  # {type(section).__doc__.strip()}"]
+            for entry in dataclasses.fields(section):
+                lines.append(f"# {entry.metadata['doc']}{_limits_text(entry.metadata)}")
+                lines.append(f"{entry.name} = {toml_value(getattr(section, entry.name))}")
+        return "\n".join(lines) + "\n"
 
 
 def _replace_section(name, section, entries):
@@ -144,18 +173,6 @@ def _checked(label, value, hint, limits):
             msg = f"{label} must be at least {low}, got {value!r}"
         raise ConfigError(msg)
     return value
-
-
-def sections_toml(config, heading):
-    """All sections as TOML, each key with its documentation; ``heading`` is the first line."""
-    lines = [heading]
-    for field in dataclasses.fields(config):
-        section = getattr(config, field.name)
-        lines += ["", f"[{field.name}]  # {type(section).__doc__.strip()}"]
-        for entry in dataclasses.fields(section):
-            lines.append(f"# {entry.metadata['doc']}{_limits_text(entry.metadata)}")
-            lines.append(f"{entry.name} = {toml_value(getattr(section, entry.name))}")
-    return "\n".join(lines) + "\n"
 
 
 def _limits_text(limits):

@@ -10,6 +10,7 @@ from miricigale import psf, sed
 from miricigale.instrument import flat_field, miri_detector
 from miricigale.sed import components
 from miricigale.utils.random import stream
+from miricigale.workflow.morphology import add_clumps
 
 __all__ = ["Perturbation", "perturbed_model", "perturbed_parameters", "point_columns"]
 
@@ -28,15 +29,18 @@ class Perturbation:
 
     Parameters
     ----------
-    effects : dict of str to float or None
+    effects : dict of str to float or dict or None
         Size by name, out of `~miricigale.workflow.truths.EFFECTS`; those that concern the models
         of the sources change nothing here.
     seed : int
         Seed of what is drawn.
+    stamps : dict of int or str to `~miricigale.scene.Cutout`, optional
+        By id, of the sources that have the light of real galaxies.
     """
 
     effects: dict
     seed: int
+    stamps: dict = dataclasses.field(default_factory=dict)
 
     def _random(self, name, *key):
         return stream(self.seed, "perturb", name, *key)
@@ -71,9 +75,33 @@ class Perturbation:
         data = psf.psf_image(own, pixel_scale=cell / factor, shape=own.data.shape)
         return own.replaced(data * own.n_cells**2, meta={"width_factor": factor})
 
+    def fluxes(self, name, table, bands):
+        """
+        A table whose fluxes are higher or lower by the error of a zero point, with a sign of each band.
+
+        Parameters
+        ----------
+        name : {"zero_point", "zero_point_existing"}
+            The effect.
+        table : `~astropy.table.QTable`
+            With the columns ``bands``; it is not changed.
+        bands : iterable of str
+            Names of the bands.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+        """
+        if not self.effects.get(name):
+            return table
+        table = table.copy()
+        for band in bands:
+            table[band] = table[band] * (1.0 + self._signed(name, band))
+        return table
+
     def catalog(self, catalog, filter):
         """
-        The sources as a band shows them: fluxes by its zero point, shifted by its astrometry.
+        The sources as a band shows them: fluxes by its zero point, shifted by its astrometry, clumpy.
 
         Parameters
         ----------
@@ -85,14 +113,26 @@ class Perturbation:
         Returns
         -------
         catalog : `~astropy.table.QTable`
+            Sources that have `stamps` have the profile ``"cutout"``; clumps are further rows.
         """
-        if not {"zero_point", "astrometry"}.intersection(self.effects):
-            return catalog
-        catalog = catalog.copy()
-        catalog[filter] = catalog[filter] * (1.0 + self._signed("zero_point", filter))
-        shift = self.effects.get("astrometry", 0.0) * u.arcsec
-        angle = self._random("astrometry", filter).uniform(0, 360) * u.deg
-        catalog["sky"] = catalog["sky"].directional_offset_by(angle, shift)
+        catalog = self.fluxes("zero_point", catalog, [filter])
+        if self.stamps:
+            catalog = catalog.copy()
+            real = np.isin(catalog["id"], list(self.stamps))
+            catalog["profile"] = np.where(real, "cutout", np.asarray(catalog["profile"]))
+        if self.effects.get("clumps"):
+            catalog = add_clumps(
+                catalog,
+                filter,
+                share=self.effects["clumps"],
+                seed=self.seed,
+                point=self.point_column(filter),
+            )
+        if self.effects.get("astrometry"):
+            catalog = catalog.copy()
+            shift = self.effects["astrometry"] * u.arcsec
+            angle = self._random("astrometry", filter).uniform(0, 360) * u.deg
+            catalog["sky"] = catalog["sky"].directional_offset_by(angle, shift)
         return catalog
 
     def point_column(self, filter):
@@ -104,7 +144,7 @@ class Perturbation:
         """`~miricigale.instrument.DetectorProperties` with another gain and non-linearity."""
         known = miri_detector()
         own = known.replace(gain=known.gain * (1.0 + self.effects.get("gain", 0.0)))
-        if "linearity" in self.effects:
+        if self.effects.get("linearity"):
             # at the full well the linear signal is other by the size, at lower ones in proportion
             terms = np.zeros(max(3, len(known.nonlinearity)))
             terms[: len(known.nonlinearity)] = known.nonlinearity

@@ -11,7 +11,7 @@ from miricigale.photometry import ForcedFlags
 from miricigale.photometry.arrays import pixel_scale
 from miricigale.plotting.axes import new_figure
 from miricigale.plotting.images import plot_image, plot_model_residual, plot_segmentation
-from miricigale.workflow.stages.sample import magnitude
+from miricigale.utils.units import ab_magnitude
 
 __all__ = ["photometry_page"]
 
@@ -19,20 +19,6 @@ __all__ = ["photometry_page"]
 _ACROSS, _ROWS = 1500, 40
 #: Signal-to-noise above which a poor fit tells of the PSF.
 _BRIGHT = 20.0
-
-#: What the flags mean, in a line.
-_MEANING = {
-    ForcedFlags.EDGE: "more than a tenth of the light is off the image",
-    ForcedFlags.MASKED: "more than a tenth of the light is on pixels without data",
-    ForcedFlags.NO_DATA: "too little light on usable pixels",
-    ForcedFlags.BLENDED: "neighbors make the error more than twice as large",
-    ForcedFlags.DEGENERATE: "the template is that of another source, which has the light",
-    ForcedFlags.NO_SEGMENT: "no segment at the position",
-    ForcedFlags.NOISY_SEGMENT: "a point source, for the segment is too noisy",
-    ForcedFlags.SHARED_SEGMENT: "a point source, for the segment is another one's",
-    ForcedFlags.POOR_FIT: "residuals above the noise: another shape, another PSF, a neighbor",
-    ForcedFlags.UNEXPLAINED_NEIGHBOR: "light nearby that no source explains",
-}
 
 
 def photometry_page(result, filter_, image, highres, kernel, pulls=None, segments=None):
@@ -213,7 +199,7 @@ def _cutout(shape, x, y, size):
 def _magnitudes(result, filter_):
     figure, axes = new_figure(1, 2, size=(5.2, 3.6))
     detected = result.snr > 3
-    mag = magnitude(result.flux)
+    mag = ab_magnitude(result.flux)
     error = 1.0857 / np.where(detected, result.snr, np.nan)
     clean = detected & (result.flags == 0)
     ax = axes[0, 0]
@@ -256,12 +242,10 @@ def _pull_figure(pulls):
 def _flag_table(page, result):
     page.section("Flags", "Nothing is dropped: a source may have several flags, or none.")
     rows = [("none", "", "usable", int(np.count_nonzero(result.flags == 0)))]
-    for flag in ForcedFlags:
-        count = int(np.count_nonzero(result.flags & int(flag)))
-        lost = flag in (ForcedFlags.NO_DATA, ForcedFlags.DEGENERATE)
-        name = flag.name.lower().replace("_", " ")
-        meaning = _MEANING.get(flag, "see ForcedFlags")
-        rows.append((f"{int(flag)} {name}", meaning, "not measured" if lost else "usable", count))
+    for value, (name, meaning) in ForcedFlags.meanings().items():
+        count = int(np.count_nonzero(result.flags & value))
+        lost = value in (ForcedFlags.NO_DATA, ForcedFlags.DEGENERATE)
+        rows.append((f"{value} {name}", meaning, "not measured" if lost else "usable", count))
     crowded = "a neighbor within 2 arcsec brighter than the magnitude + 1 (a column of its own)"
     rows.append(("crowded", crowded, "usable", int(np.count_nonzero(result.crowded))))
     page.table(rows, header=("flag", "meaning", "flux", "sources"), text=3)
@@ -272,7 +256,7 @@ def _source_table(page, result):
     text = f"The {len(order)} brightest of {len(result)}; all are in the table that was written. "
     text += "Residual is what the fit left in the core over what it took there."
     page.section("Brightest sources", text)
-    mag = magnitude(result.flux)
+    mag = ab_magnitude(result.flux)
     none = "no positive flux"
     rows = [
         (

@@ -8,7 +8,7 @@ from astropy.io import fits
 
 from miricigale.instrument import dq_legend, read_dq
 from miricigale.utils.exceptions import DataError
-from miricigale.utils.files import image_unit, open_fits, write_fits
+from miricigale.utils.files import open_fits, write_fits
 from miricigale.utils.meta import undated
 from miricigale.utils.store import plain_value
 
@@ -108,6 +108,21 @@ def _read_flags(hdus):
     return flags | (hdus["DQ_OWN"].data.astype(np.int64) << 32) if "DQ_OWN" in hdus else flags
 
 
+def _unit(header, path):
+    """Unit of the pixels, as a header states it."""
+    text = str(header.get("BUNIT", "")).strip()
+    try:
+        if text:
+            return u.Unit(text)
+    except ValueError:
+        pass
+    got = f"BUNIT = {text!r}" if text else "none"
+    msg = (
+        f"{path} must state the unit of its pixels, such as MJy/sr, in the keyword BUNIT, got {got}"
+    )
+    raise DataError(msg)
+
+
 def read_image(path, *, planes=()):
     """
     Read what `write_image` wrote, in the byte order of the machine and with its own meta.
@@ -141,7 +156,7 @@ def read_image(path, *, planes=()):
         error = np.array(hdus["ERR"].data, np.float32) if "ERR" in hdus else None
         image = CCDData(
             np.array(hdus["SCI"].data, np.float32),
-            unit=image_unit(header, path, like=None),
+            unit=_unit(header, path),
             wcs=wcs if wcs.has_celestial else None,
             uncertainty=None if error is None else StdDevUncertainty(error),
             mask=np.array(hdus["MASK"].data, bool) if "MASK" in hdus else None,

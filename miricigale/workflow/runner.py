@@ -7,35 +7,33 @@ import itertools
 import json
 import logging
 import os
-import shutil
 from pathlib import Path
 
 from miricigale.refdata.locate import fingerprint
 from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import (
     ConfigError,
-    DataError,
     OtherResultsError,
-    argument_error,
 )
 from miricigale.utils.parallel import available_memory, thread_count
-from miricigale.utils.progress import on_terminal, print_line, progress
+from miricigale.utils.progress import print_line
 from miricigale.workflow.config import load_config
+from miricigale.workflow.display import Display
 from miricigale.workflow.schedule import Task, run_tasks
 from miricigale.workflow.stage import run_unit
-from miricigale.workflow.store import CONFIG, ProductStore
+from miricigale.workflow.store import CONFIG, ProductStore, check_disk
 from miricigale.workflow.warmup import JOBS, compile_apart, describe_job, is_compiled
 
 __all__ = ["StudyRunner"]
 
 log = logging.getLogger(__name__)
-# shown by the command line at any verbosity
-_compilation_log = logging.getLogger("miricigale.utils.compilation")
 
 #: Bytes that a process takes for a unit whose stage does not say how many: measured, of a field
 #: of one pointing.
 _MEMORY = 1_200_000_000
 _REMEDY = "redo=True to replace it"
+#: Damaged products that are named in a message.
+_NAMED = 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,17 +80,18 @@ class StudyRunner:
         A stage, or a pattern of units such as ``"fits:agn20/*"``: only these and what they need is
         done; all by default.
     again : str, optional
-        A stage, or a pattern of units, that is done again; what needs it follows if its products
-        change.
-    disk : int, optional
-        Bytes that all products take.
+        A stage, or a pattern of units, that is done again (or for the first time, what is not done
+        yet); what needs it follows if its products change.
+    disk : dict of str to int, optional
+        By stage: bytes that its products take, all units together.
     progress_bar : bool, optional
         Whether progress is shown: a bar on a terminal, otherwise a line for each stage.
 
     Raises
     ------
     `~miricigale.utils.exceptions.ConfigError`
-        If a stage comes before what it needs, or ``until`` or ``again`` match nothing.
+        If a stage comes before what it needs, ``until`` or ``again`` match nothing, or nothing that is
+        asked for again is among what is done.
     """
 
     def __init__(
@@ -105,7 +104,7 @@ class StudyRunner:
         redo=False,
         until=None,
         again=None,
-        disk=0,
+        disk=None,
         progress_bar=False,
     ):
         self.config = config
@@ -114,7 +113,7 @@ class StudyRunner:
         self.stages = tuple(stages() if callable(stages) else stages)
         self.executor = executor
         self.redo = redo
-        self.disk = disk
+        self.disk = dict(disk or {})
         self.progress_bar = progress_bar
         self.n_threads = thread_count(config.run.threads or None)
         self.units = {stage.name: stage.unit_names(config) for stage in self.stages}
@@ -133,6 +132,9 @@ class StudyRunner:
                 chosen |= job.needed(config, self.units)
         self.jobs = [job for job in every if job.key in chosen]
         self._again = set() if again is None else self._matching(again, "again") & chosen
+        if again is not None and not self._again:
+            msg = f"nothing of 'again', {again!r}, is among what 'until', {until!r}, needs"
+            raise ConfigError(msg)
 
     def _matching(self, pattern, argument):
         """Keys of units by stage or pattern."""
@@ -142,8 +144,11 @@ class StudyRunner:
             if key.partition(":")[0] == pattern or fnmatch.fnmatchcase(key, pattern)
         }
         if not keys:
-            wanted = f"a stage ({', '.join(self.units)}) or a pattern of units such as {self._keys[-2]!r}"
-            raise ConfigError(str(argument_error(argument, wanted, repr(pattern))))
+            msg = (
+                f"'{argument}' is {pattern!r}, which is no stage and matches no unit of this configuration; "
+                f"stages: {', '.join(self.units)}; a unit: {self._keys[-1]}"
+            )
+            raise ConfigError(msg)
         return keys
 
     def digest(self, stage, unit, store):
@@ -238,13 +243,14 @@ class StudyRunner:
         with store:
             states = self.forecast(store)
             self._refuse_replacing(store, states)
+            self._warn_of_faults(store, states)
             n_left = sum(states[job.key] != "current" for job in self.jobs)
             if n_left:
-                needed = max(0, self.disk - store.standing_bytes())
-                check_disk(self.folder, needed)
+                needed = max(0, self._products_bytes() - store.standing_bytes())
+                free = check_disk(self.folder, needed)
                 self._tell(
                     f"{self.config.run.name}: {n_left} of {len(self.jobs)} steps to do, which take "
-                    f"about {needed / 1e9:.2f} GB in {self.folder}/"
+                    f"about {needed / 1e9:.2f} GB in {self.folder}/ ({free / 1e9:.1f} GB are free)"
                 )
             self._write_config(store)
             for key, state in states.items():
@@ -252,6 +258,14 @@ class StudyRunner:
                     store.drop(key)
             self._execute(store, states)
         return store
+
+    def _products_bytes(self):
+        """Bytes that the products of the units take that are wanted."""
+        total = 0
+        for name, units in self.units.items():
+            wanted = sum(job.stage.name == name for job in self.jobs)
+            total += self.disk.get(name, 0) * wanted / max(1, len(units))
+        return int(total)
 
     def _config_stands(self, store):
         """Whether manifest and ``config.toml`` say what this run does."""
@@ -284,6 +298,23 @@ class StudyRunner:
             )
         if reasons:
             raise OtherResultsError("; ".join(reasons), _REMEDY)
+
+    def _warn_of_faults(self, store, states):
+        """Name products that are missing or damaged, and are made again."""
+        faults = {}
+        for key, state in states.items():
+            if state == "lost":
+                faults |= store.faults(key)
+        if faults:
+            some = [f"{name} ({fault})" for name, fault in itertools.islice(faults.items(), _NAMED)]
+            more = f" and {len(faults) - _NAMED} more" if len(faults) > _NAMED else ""
+            log.warning(
+                "%s: %s%s; what made them is done again, with the same bytes (keep copies of what "
+                "you edit elsewhere)",
+                self.folder,
+                ", ".join(some),
+                more,
+            )
 
     def _differences(self, store):
         """What is other in the configuration, in words."""
@@ -319,7 +350,7 @@ class StudyRunner:
 
     def _execute(self, store, states):
         """Do all units, each when what it needs is done."""
-        with _Display(self.progress_bar, len(self.jobs)) as display:
+        with Display(self.progress_bar, len(self.jobs)) as display:
             begun = [job.stage for job in self.jobs if states[job.key] != "current"]
             kernels = {name for stage in begun for name in stage.kernels}
             run_tasks(
@@ -388,41 +419,6 @@ def _compilation(name, display):
     return Task(f"compile {name}", "compilation", begin, memory=_MEMORY, is_optional=True)
 
 
-class _Display:
-    """A bar on a terminal, otherwise a line for each stage, or nothing."""
-
-    def __init__(self, show, total):
-        self.is_bar = show and on_terminal()
-        self._lines = show and not self.is_bar
-        self._bar = progress(total=total, show=self.is_bar, desc="study", unit="step")
-        self._spent = {}
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exc):
-        self._bar.close()
-
-    def compilation(self, text):
-        """Say what is compiled, also where no progress is shown."""
-        if self._lines or self.is_bar:
-            print_line(text)
-        else:
-            _compilation_log.info(text)
-
-    def begin(self, titles):
-        self._bar.set_description(", ".join(titles))
-
-    def finish(self, stage, config, seconds):
-        """A unit of a stage is done."""
-        self._bar.update()
-        spent = self._spent.setdefault(stage.name, [])
-        spent.append(seconds)
-        if self._lines and len(spent) == len(stage.unit_names(config)) and any(spent):
-            units = f" ({len(spent)})" if len(spent) > 1 else ""
-            print_line(f"{stage.title}{units}: {sum(spent):.1f} s")
-
-
 def _values(config):
     """Plain values of what products may depend on."""
     values = json.loads(json.dumps(dataclasses.asdict(config)))
@@ -443,28 +439,3 @@ def _summary(keys):
 def _short(value):
     text = json.dumps(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def check_disk(folder, needed):
-    """
-    Refuse to begin where the products would not fit.
-
-    Parameters
-    ----------
-    folder : path-like
-        Where they will go.
-    needed : int
-        Bytes beside what stands there.
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If less than that is free.
-    """
-    place = Path(folder).absolute()
-    while not place.exists():
-        place = place.parent
-    free = shutil.disk_usage(place).free
-    if needed > free:
-        msg = f"the run needs about {needed / 1e9:.2f} GB in {folder}, only {free / 1e9:.2f} GB are free"
-        raise DataError(msg)

@@ -1,12 +1,15 @@
 """The folder of a run: its products, the record of what stands, and the configuration."""
 
 import hashlib
+import shutil
+from pathlib import Path
 
 from miricigale.utils.content import file_sha256
+from miricigale.utils.exceptions import DataError
 from miricigale.utils.folder import RecordFolder
 from miricigale.workflow.config import present_names
 
-__all__ = ["ProductStore"]
+__all__ = ["ProductStore", "check_disk"]
 
 CONFIG = "config.toml"
 
@@ -83,3 +86,37 @@ class ProductStore(RecordFolder):
             for key in sorted(set(keys).intersection(self.records))
             for name, product in self.records[key]["products"].items()
         }
+
+
+def check_disk(folder, needed):
+    """
+    Refuse to begin where the products would not fit.
+
+    Parameters
+    ----------
+    folder : path-like
+        Where they will go.
+    needed : int
+        Bytes beside what stands there.
+
+    Returns
+    -------
+    free : int
+        Bytes that are free.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If less than that is free.
+    """
+    place = Path(folder).absolute()
+    while not place.exists():
+        place = place.parent
+    free = shutil.disk_usage(place).free
+    if needed > free:
+        msg = (
+            f"the run needs about {needed / 1e9:.2f} GB in {folder}, only {free / 1e9:.2f} GB are "
+            "free; make room, choose another folder, or simulate fewer exposures or skies"
+        )
+        raise DataError(msg)
+    return free

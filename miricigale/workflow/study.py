@@ -1,76 +1,27 @@
 """The study as one call."""
 
-import math
+from pathlib import Path
 
 import astropy.units as u
 import numpy as np
 
 from miricigale.depth import saturation_forecast
 from miricigale.filters import Filter
-from miricigale.instrument import background_level, imager_filters
+from miricigale.instrument import imager_filters
 from miricigale.utils.exceptions import ConfigError
-from miricigale.workflow.config import HighresSection
+from miricigale.workflow.disk import disk_use
+from miricigale.workflow.kernel_files import file_place
 from miricigale.workflow.runner import StudyRunner
+from miricigale.workflow.sections import HighresSection
 from miricigale.workflow.stages import study_stages
-from miricigale.workflow.stages.exposures import grid_of, study_exposures
+from miricigale.workflow.stages.exposures import grid_of, study_background, study_exposures
 from miricigale.workflow.stages.inputs import study_catalog
-from miricigale.workflow.truths import study_truths
+from miricigale.workflow.truths import CATALOG
 
-__all__ = ["MIN_SOURCES", "check_study", "disk_use", "run_study"]
+__all__ = ["MIN_SOURCES", "check_study", "run_study"]
 
 #: Sources that a field must have for an error function to be measured.
 MIN_SOURCES = 3
-
-#: Bytes of products, measured: of a calibrated image and a mosaic for each pixel of their grids, of
-#: a model (not compressed); tables of a truth and a fit for each source of the catalog; the prior's
-#: images and templates for each of its pixels; a kernel; the fits of the input for each source.
-_BYTES = {
-    "image": 3.5,
-    "mosaic": 1.9,
-    "model": 4.0,
-    "truth": 2400.0,
-    "fit": 4000.0,
-    "prior": 7.8,
-    "kernel": 2.9e6,
-    "seds": 9600.0,
-}
-
-
-def disk_use(config):
-    """
-    About how many bytes the products of a run take.
-
-    Parameters
-    ----------
-    config : `~miricigale.workflow.StudyConfig`
-        The configuration.
-
-    Returns
-    -------
-    n_bytes : int
-    """
-    exposures = study_exposures(config)
-    total = 0
-    for exposure in exposures.values():
-        pixels = math.prod(exposure.shape)
-        total += _BYTES["image"] * pixels
-        if config.run.keep_level1b:
-            # counts, the planes that only a simulation knows, and the rates
-            counts = exposure.n_groups * exposure.n_integrations
-            total += (2 * counts + 8 + _BYTES["image"]) * pixels
-    native = math.prod(grid_of(config, config.reduction.pixel_scale).pixel_shape)
-    fine = math.prod(grid_of(config, config.highres.pixel_scale).pixel_shape)
-    measured = fine if config.photometry.method == "yang2021" else native
-    # mosaics on both grids; model and residual
-    planes = native + fine + measured
-    n_bands, n_sets = len(config.exposures.filters), len(config.fit.sets)
-    total += n_bands * (_BYTES["mosaic"] * planes + _BYTES["model"] * measured)
-    # pictures of the sources in every band
-    total += n_bands * 2 * native
-    n_sources = len(study_catalog(config.catalog))
-    total += n_sources * (_BYTES["truth"] + _BYTES["fit"] * n_sets)
-    shared = _BYTES["prior"] * fine + _BYTES["kernel"] * n_bands + _BYTES["seds"] * n_sources
-    return int(len(study_truths(config)) * total + shared)
 
 
 def check_study(config):
@@ -85,9 +36,14 @@ def check_study(config):
     Raises
     ------
     `~miricigale.utils.exceptions.ConfigError`
-        If a filter is unknown, the high-resolution image has no PSF, the sky fills the well, or
-        fewer than `MIN_SOURCES` sources of the catalog fall in the field.
+        If a filter is unknown, a file is missing, the high-resolution image has no PSF, the sky fills the
+        well, or fewer than `MIN_SOURCES` sources of the catalog fall in the field.
     """
+    for key in ("cutouts", "cutouts_psf"):
+        path = getattr(config.perturb, key)
+        if path and not Path(file_place(path)[0]).expanduser().is_file():
+            msg = f"[perturb] {key} = {path!r} is no file"
+            raise ConfigError(msg)
     known = set(Filter.names())
     unknown = [name for name in config.fit.bands if name not in known]
     if unknown:
@@ -99,11 +55,17 @@ def check_study(config):
         raise ConfigError(msg)
     try:
         exposures = study_exposures(config)
+    except ConfigError:
+        raise
     except (KeyError, ValueError) as err:
         msg = f"[exposures] {err.args[0]}"
         raise ConfigError(msg) from err
     for exposure in exposures.values():
-        level = background_level(exposure.filter) * config.scene.background_scale
+        try:
+            level = study_background(config, exposure.filter)
+        except (KeyError, ValueError, ImportError) as err:
+            msg = f"[scene] background: {err.args[0]}"
+            raise ConfigError(msg) from err
         fill = float(saturation_forecast(exposure, background=level))
         if fill >= 1:
             msg = (
@@ -112,6 +74,10 @@ def check_study(config):
             )
             raise ConfigError(msg)
     catalog = study_catalog(config.catalog)
+    if CATALOG in config.sed.frac_agn:
+        from miricigale.workflow.stages.truth import catalog_fractions
+
+        catalog_fractions(catalog)
     wcs = grid_of(config, config.reduction.pixel_scale)
     n_inside = int(np.count_nonzero(wcs.footprint_contains(catalog["sky"])))
     if n_inside < MIN_SOURCES:

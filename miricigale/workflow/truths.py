@@ -6,11 +6,14 @@ from miricigale.filters import Filter
 
 __all__ = [
     "ALL",
+    "CATALOG",
+    "CUTOUTS",
     "EFFECTS",
     "EXPERIMENTS",
     "FIELD",
     "NEEDS_AGN",
     "SETS",
+    "VARIANTS",
     "Truth",
     "band_sets",
     "of_truth",
@@ -18,6 +21,7 @@ __all__ = [
     "reference",
     "study_truths",
     "truth_names",
+    "variant_changes",
 ]
 
 #: Sets of MIRI bands that join the existing ones in a fit: Yang et al. 2021, section 4.
@@ -26,13 +30,23 @@ SETS = ("all", "none", "blue", "red")
 EXPERIMENTS = ("free_agn", "far_infrared", "no_model_error", "known_redshift", "samplers")
 #: In place of a fracAGN: AGN as in a real field.
 FIELD = "field"
+#: In place of a fracAGN: that of each source, in the column ``frac_agn`` of the catalog.
+CATALOG = "catalog"
 #: In what the sky may differ from what the analysis takes it for: see the section [perturb].
 EFFECTS = (
-    "psf", "psf_width", "flat", "gain", "linearity", "zero_point", "astrometry", "stars", "dust",
-    "torus", "point_agn",
+    "psf", "psf_width", "flat", "gain", "linearity", "zero_point", "zero_point_existing", "astrometry",
+    "stars", "dust", "torus", "point_agn", "clumps", "cutouts",
 )  # fmt: skip
 #: Those that there are with AGN only.
 NEEDS_AGN = ("torus", "point_agn")
+#: What further images of the first sky have otherwise: section, key, and its two values.
+VARIANTS = {
+    "residual": ("detector", "residual", ("etc", 0.0)),
+    "gradient": ("scene", "background_gradient", (0.05, 0.0)),
+    "plane": ("reduction", "background_plane", (True, False)),
+}
+#: That which there is with an image only.
+CUTOUTS = "cutouts"
 #: All effects, or the sky that has all of them.
 ALL = "all"
 
@@ -46,10 +60,12 @@ class Truth:
     ----------
     name : str
         Folder of its products and first part of its units, such as ``"agn20"``.
-    frac_agn : float or "field"
-        fracAGN of its sources; AGN of a realistic field (`FIELD`) are drawn from a luminosity function.
-    perturbations : tuple of (str, float or None), optional
-        Names out of `EFFECTS` and their sizes, None for those that have no size.
+    frac_agn : float, "field" or "catalog"
+        fracAGN of its sources; AGN of a realistic field (`FIELD`) are drawn from a luminosity function, those of
+        the catalog (`CATALOG`) have a column.
+    perturbations : tuple of (str, float or dict or None), optional
+        Names out of `EFFECTS` and their sizes, None for those that have no size; of `CUTOUTS` the keys
+        ``image``, ``psf`` (empty without one) and ``of``.
     base : str, optional
         Name of the truth without the perturbations, where there are any.
     """
@@ -100,13 +116,18 @@ def perturbed_values(config):
 
 
 def _name(frac_agn):
-    return frac_agn if frac_agn == FIELD else f"agn{100 * frac_agn:02g}"
+    return frac_agn if isinstance(frac_agn, str) else f"agn{100 * frac_agn:02.9g}"
 
 
 def _effects(options, frac_agn):
     """Effects on a truth and their sizes, in the order of `EFFECTS`."""
     sizes = dataclasses.asdict(options)
+    sizes[CUTOUTS] = {
+        "image": options.cutouts, "psf": options.cutouts_psf, "of": options.cutouts_of
+    }  # fmt: skip
     chosen = [n for n in EFFECTS if n in options.effects or ALL in options.effects]
+    if not options.cutouts:
+        chosen = [name for name in chosen if name != CUTOUTS]
     return tuple((n, sizes.get(n)) for n in chosen if frac_agn != 0 or n not in NEEDS_AGN)
 
 
@@ -150,3 +171,29 @@ def band_sets(config):
     half = (len(by_wave) + 1) // 2
     chosen = {"all": bands, "none": (), "blue": by_wave[:half], "red": by_wave[half:]}
     return {name: tuple(b for b in bands if b in chosen[name]) for name in config.fit.sets}
+
+
+def variant_changes(config):
+    """
+    What each of the variant images of the first sky has otherwise than the study's.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.StudyConfig`
+        The configuration.
+
+    Returns
+    -------
+    changes : dict of str to dict
+        By name out of ``variants.images``, in the order of `VARIANTS`: section, key and value of what is
+        switched, off where the study has it on and on where it has it off. With ramps there is one
+        more, ``"rates"``, first: the study's own images by rates, which all others are drawn as.
+    """
+    chosen, changes = config.variants.images, {}
+    if chosen and config.exposures.kind == "ramps":
+        changes["rates"] = {}
+    for name, (section, key, (on, off)) in VARIANTS.items():
+        if name in chosen or ALL in chosen:
+            value = getattr(getattr(config, section), key)
+            changes[name] = {section: {key: off if value else on}}
+    return changes

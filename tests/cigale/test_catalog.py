@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from astropy.table import QTable, Table
 
-from miricigale.cigale import cigale_band, cigale_columns, filter_of_band, read_cigale_catalog
-from miricigale.filters import Filter
+from miricigale.cigale import cigale_columns, read_cigale_catalog
+from miricigale.filters import Filter, cigale_band, filter_of_band
 from miricigale.scene import read_catalog
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 

@@ -2,12 +2,13 @@
 
 import sys
 
+import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import BarycentricMeanEcliptic, SkyCoord
 
-from miricigale.depth import zodiacal_factor, zodiacal_levels
-from miricigale.instrument import imager_filters
+from miricigale.depth import sky_background, zodiacal_factor, zodiacal_levels
+from miricigale.instrument import background_level, imager_filters
 
 
 def at(latitude):
@@ -64,3 +65,27 @@ def test_unknown_names_are_told():
         zodiacal_factor("miri.f770w", "mid")
     with pytest.raises(KeyError, match=r"no imaging filter 'miri\.f707w'"):
         zodiacal_factor("f707w")
+
+
+def test_the_background_is_that_of_the_telescope_and_of_the_light():
+    position = at(10)
+    for name in ("miri.f770w", "miri.f2100w"):
+        assert sky_background(name) == background_level(name)
+        for level in zodiacal_levels():
+            for where in (None, position) if level != "low" else (position,):
+                factor = zodiacal_factor(name, level, position=where)
+                own = sky_background(name, level, position=where)
+                assert own == background_level(name, zodi=factor)
+        assert sky_background(name, 3e-3 * u.GJy / u.sr).to_value(u.MJy / u.sr) == pytest.approx(3)
+
+
+def test_a_surface_brightness_needs_no_place_and_no_day():
+    level = 3 * u.MJy / u.sr
+    with pytest.raises(ValueError, match="'position' must be left out with a surface brightness"):
+        sky_background("miri.f770w", level, position=at(0))
+    with pytest.raises(ValueError, match="'level' must be at least 0"):
+        sky_background("miri.f770w", -level)
+    with pytest.raises(u.UnitsError, match="'level' must be convertible"):
+        sky_background("miri.f770w", 3 * u.uJy)
+    with pytest.raises(KeyError, match="no imaging filter"):
+        sky_background("miri.f700w", level)

@@ -42,7 +42,7 @@ def set_block_size(monkeypatch):
     """Let a detector work on blocks of some number of samples, which changes no count."""
 
     def set_size(n_samples):
-        monkeypatch.setattr("miricigale.detector.detector._BLOCK_SAMPLES", n_samples)
+        monkeypatch.setattr("miricigale.detector.work._BLOCK_SAMPLES", n_samples)
 
     return set_size
 

@@ -92,7 +92,7 @@ def test_hits_are_those_of_the_ramp(make_block):
 def test_hits_of_the_detector_do_not_depend_on_its_blocks(collect, monkeypatch):
     detector = Detector.miri_imager(CosmicRays(flux=2e-6))
     charge = collect(detector)
-    monkeypatch.setattr("miricigale.detector.detector._ROWS", 7)
+    monkeypatch.setattr("miricigale.detector.work._ROWS", 7)
     other = collect(detector)
     assert_array_equal(charge.electrons, other.electrons)
     assert_array_equal(charge.mean, other.mean)

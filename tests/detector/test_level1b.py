@@ -140,11 +140,20 @@ def test_reads_files_of_others(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"drop": ["RA_REF"]}, "has no keyword RA_REF"),
-        ({"primary": {"EXP_TYPE": "MIR_MRS"}}, "must be a MIRI MIR_IMAGE exposure"),
+        ({"drop": ["RA_REF"]}, "must have all of RA_REF, DEC_REF, ROLL_REF or none"),
+        ({"drop": ["READPATT"]}, "has no keyword READPATT"),
+        ({"primary": {"EXP_TYPE": "MIR_MRS"}}, "must be an exposure of the MIRI imager"),
+        ({"primary": {"DETECTOR": "MIRIFULONG"}}, "must be an exposure of the MIRI imager"),
         ({"primary": {"SUBARRAY": "SUB256"}}, "must have"),
-        ({"primary": {"FILTER": "F777W"}}, "cannot be read as a level-1b file"),
-        ({"data": np.zeros((4, 64, 72), np.float32)}, "must hold unsigned 16-bit counts"),
+        ({"primary": {"FILTER": "F777W"}}, "cannot be read as a ramp of the MIRI imager"),
+        ({"data": np.zeros((4, 64, 72), np.float32)}, "must hold a ramp in SCI: four axes"),
+        ({"primary": {"NGROUPS": 5}}, "contradicts itself: NGROUPS is 5 in the header and 4 in"),
+        ({"primary": {"NINTS": 2}}, "NINTS is 2 in the header and 1 in SCI"),
+        ({"primary": {"INTSTART": 3, "INTEND": 4}}, "NINTS is 2 in the header and 1 in SCI"),
+        ({"primary": {"NFRAMES": 8}}, "NFRAMES is 8 in the header and 1 of FASTR1"),
+        ({"primary": {"GROUPGAP": 1}}, "GROUPGAP is 1 in the header and 0 of FASTR1"),
+        ({"primary": {"SUBSTRT2": 5}}, "SUBSTRT2 is 5 in the header and 779 of SUB64"),
+        ({"primary": {"TGROUP": 0.34}}, "TGROUP = 0.34 s, but the frame of FASTR1 SUB64"),
     ],
 )
 def test_refuses_other_files(tmp_path, options, message):
@@ -213,9 +222,11 @@ def test_effects_of_earlier_files_and_of_other_packages_are_read(ramp, tmp_path)
     assert old.effects == (Photons(), ResetAnomaly((-3.0,)), other)
     assert old.meta == {"seed": 9}
     assert Ramp.read(old.write(tmp_path / "new.fits")).effects == old.effects
-    with pytest.raises(DataError, match=r"broken\.fits cannot be read as a level-1b file"):
+    with pytest.raises(
+        DataError, match=r"broken\.fits cannot be read as a ramp of the MIRI imager"
+    ):
         Ramp.read(with_meta(first, tmp_path / "broken.fits", {"effects": ["Dark("]}))
-    with pytest.raises(DataError, match=r"wrong\.fits cannot be read as a level-1b file"):
+    with pytest.raises(DataError, match=r"wrong\.fits cannot be read as a ramp of the MIRI imager"):
         Ramp.read(
             with_meta(first, tmp_path / "wrong.fits", {"effects": [{"effect": "Dark", "x": 1}]})
         )

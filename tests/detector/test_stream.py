@@ -85,12 +85,12 @@ def test_nothing_is_left_of_a_failure(make_exposure, make_sky, tmp_path, monkeyp
     detector, sky = Detector.miri_imager(), make_sky(exposure, 1.0)
     path = tmp_path / "a_uncal.fits"
 
-    def fail(self, task, rows):
+    def fail(self, array, block):
         msg = "no"
         raise RuntimeError(msg)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Detector, "_expose_rows", fail)
+        patch.setattr(ReadNoise, "apply", fail)
         with pytest.raises(RuntimeError):
             detector.expose_to(path, sky, exposure, seed=0)
     assert not list(tmp_path.iterdir())

@@ -47,6 +47,16 @@ def test_what_is_missing_is_a_dash_with_its_reason(tmp_path):
     assert "nan" not in page.split("</style>")[1]
 
 
+def test_columns_of_text_are_named_by_number_or_place(tmp_path):
+    report = Report("made up")
+    rows = [("band", 3, "a long verdict")]
+    report.table(rows, header=("a", "b", "c"), text=2)
+    report.table(rows, header=("a", "b", "c"), text=(0, 2))
+    page = report.write(tmp_path / "page.html").read_text()
+    assert "<td>band</td><td>3</td><td class=n>a long verdict</td>" in page
+    assert "<td>band</td><td class=n>3</td><td>a long verdict</td>" in page
+
+
 def test_tables_without_rows_are_sentences():
     report = Report("title")
     report.table([], header=("band",), empty="There is no band.")

@@ -19,8 +19,7 @@ from miricigale.fitting import (
     leave_out,
     samplers,
 )
-from miricigale.fitting.samplers import space
-from miricigale.fitting.samplers.packages import Lockstep
+from miricigale.fitting.samplers import Lockstep, space
 from miricigale.fitting.samplers.run import best_scale, chi2_at
 from miricigale.sed import Parameter, SEDModel
 

@@ -500,8 +500,8 @@ def test_what_cannot_be_read_by_rows_is_refused(fitter, catalogue, tmp_path):
     good = tmp_path / "good.fits"
     catalogue.write(good)
     refused("absent.fits", "no table .*absent.fits")
-    (tmp_path / "text.dat").write_text("id flux\n1 2\n")
-    refused("text.dat", "write it as FITS .* or ECSV")
+    (tmp_path / "text.md").write_text("id flux\n1 2\n")
+    refused("text.md", "write it as FITS .* or ECSV")
     with gzip.open(tmp_path / "packed.fits.gz", "wb") as stream:
         stream.write(good.read_bytes())
     refused("packed.fits.gz", "unpack it first")

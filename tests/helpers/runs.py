@@ -14,7 +14,7 @@ from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.exposures import study_exposures
 from miricigale.workflow.stages.truth import add_agn, add_field_agn
-from miricigale.workflow.truths import FIELD, study_truths
+from miricigale.workflow.truths import CATALOG, FIELD, study_truths
 
 STAGES = {stage.name: stage for stage in study_stages()}
 SCALE = 0.11
@@ -95,7 +95,7 @@ def do_stage(config, folder, name, unit=""):
     STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
 
 
-def make_run(folder, filters, *, mass=3e10, points=False, report=True, **options):
+def make_run(folder, filters, *, mass=3e10, points=False, report=True, text_ids=False, **options):
     """Make up what the stage ``report`` reads, and run it unless it is not wanted."""
     config = small_config(filters, points=points, **options)
     made = Context(config, folder)
@@ -105,6 +105,8 @@ def make_run(folder, filters, *, mass=3e10, points=False, report=True, **options
     step = rng.uniform([[-7.0], [-5.0]], [[7.0], [5.0]], size=(2, count)) * u.arcsec
     sky = center.spherical_offsets_by(*step)
     parameters = QTable({"id": np.arange(1, count + 1), "redshift": np.linspace(0.3, 2.5, count)})
+    if text_ids:
+        parameters["id"] = [f"src-{key}" for key in parameters["id"]]
     parameters["mass"] = np.geomspace(mass, 10 * mass, count) * u.Msun
     made.save_image("f160w.fits", noise_image(9, rim=0)[0])
     catalog = QTable({"id": parameters["id"], "sky": sky, "star": np.zeros(count, bool)})
@@ -136,6 +138,8 @@ def _save_truth(made, one, parameters, sky, center, rng):
     parameters = parameters.copy()
     if one.frac_agn == FIELD:
         add_field_agn(parameters, SEDModel.yang2021(), filters[0], 1)
+    elif one.frac_agn == CATALOG:
+        add_agn(parameters, np.linspace(0, 0.9, count), 1)
     elif one.frac_agn > 0:
         add_agn(parameters, one.frac_agn, 1)
     bands = [*config.fit.bands, *filters]
@@ -155,7 +159,8 @@ def _save_truth(made, one, parameters, sky, center, rng):
     for k, name in enumerate(filters):
         image, light = noise_image(k)
         model = sky_image(SCALE, SHAPE, light)
-        made.save_image(f"{one.name}/mosaic_{name}.fits", image)
+        seen = np.ones(image.shape, np.uint8)
+        made.save_image(f"{one.name}/mosaic_{name}.fits", image, n_images=seen)
         made.save_image(f"{one.name}/photometry/{name}_model.fits", model)
         residual = sky_image(SCALE, SHAPE, image.data - light, rim=RIM)
         made.save_image(f"{one.name}/photometry/{name}_residual.fits", residual)
@@ -166,6 +171,16 @@ def _save_truth(made, one, parameters, sky, center, rng):
         table["flux_err"] = np.full(count + 1, 0.2) * u.uJy
         table["flags"] = np.append(1, np.zeros(count, int))
         made.save_table(f"{one.name}/photometry/{name}.ecsv", table)
+
+
+def thicker_half(folder, name, n):
+    """Let the left half of a mosaic of `make_run` have ``n`` exposures; the numbers of all pixels."""
+    made = Context(small_config([name]), folder)
+    image = made.image(f"agn00/mosaic_{name}.fits")
+    n_images = np.ones(image.shape, np.uint8)
+    n_images[:, : image.shape[1] // 2] = n
+    made.save_image(f"agn00/mosaic_{name}.fits", image, n_images=n_images)
+    return n_images
 
 
 def _with_one_more(sky, center):

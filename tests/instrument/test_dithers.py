@@ -7,7 +7,13 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 
-from miricigale.instrument import Exposure, dither_offsets, read_dithers
+from miricigale.instrument import (
+    Exposure,
+    dither_offsets,
+    imager_columns,
+    read_dithers,
+    tile_offsets,
+)
 from miricigale.utils.exceptions import DataError
 
 PIXEL = np.array([0.110497, 0.111336])
@@ -100,6 +106,9 @@ def test_a_list_of_pointings(tmp_path):
         row(2, -1.2, 3.5),
         row(2, 9.0, 9.0, aperture="NRCALL_FULL"),
         row(3, 0.5, -2.75, kind="PARALLEL"),
+        # another filter at the same places
+        row(2, -1.2, 3.5, exp=2),
+        row(3, 0.5, -2.75, exp=2),
     ]
     path = pointing_list(tmp_path / "plan.pointing", {4: rows})
     truth = [[1.101, -0.25], [-1.2, 3.5], [0.5, -2.75]]
@@ -107,6 +116,8 @@ def test_a_list_of_pointings(tmp_path):
     assert_allclose(dither_offsets(path).value, truth)
     several = pointing_list(tmp_path / "two.pointing", {4: rows, 7: rows[:3]})
     assert_allclose(read_dithers(several, observation=7).value, truth[:1])
+    # all exposures have these
+    assert_allclose(read_dithers(path, exposure=1).value, truth)
     with pytest.raises(ValueError, match=r"'observation' must be one of \[4, 7\], got None"):
         read_dithers(several)
     other = pointing_list(tmp_path / "nircam.pointing", {1: rows[4:5]})
@@ -114,6 +125,78 @@ def test_a_list_of_pointings(tmp_path):
         DataError, match=r"no exposures of MIRIM apertures; it has \['NRCALL_FULL'\]"
     ):
         read_dithers(other)
+
+
+@pytest.mark.parametrize("overlap", [0.0, 0.2])
+def test_tiles_meet_on_the_sky(overlap):
+    """Edges of the imager's field, by the distorted WCS of each tile, about which the offsets know nothing."""
+    center = SkyCoord(0.01, -60.0, unit="deg")
+    base = Exposure("miri.f770w", n_groups=5, pointing=center, roll=40 * u.deg)
+    tiles = base.dithered(tile_offsets(2, 3, overlap=overlap))
+    assert [tile.dither for tile in tiles] == [0, 1, 2, 3, 4, 5]
+    first, last = imager_columns()
+    ny, middle = base.shape[0], 0.5 * (first + last - 1)
+    # the columns (rows) of two neighbors that share the same sky in the middle of the edge
+    for one, two, here, there in (
+        (0, 1, (last - 0.5 - overlap * (last - first), 510), (first - 0.5, 510)),
+        (0, 2, (middle, ny - 0.5 - overlap * ny), (middle, -0.5)),
+    ):
+        places = [tiles[k].wcs.pixel_to_world(*xy) for k, xy in ((one, here), (two, there))]
+        apart = places[0].separation(places[1])
+        # edges bend by a per cent of the field, and +x of the sky may be either way of the columns
+        assert apart < 1.5 * u.arcsec
+    mean = np.mean([tile.pointing.cartesian.xyz.value for tile in tiles], axis=0)
+    where = SkyCoord(*mean, representation_type="cartesian").spherical
+    found = SkyCoord(where.lon, where.lat)
+    assert found.separation(center) < 0.01 * u.arcsec
+
+
+def test_refuses_tiles():
+    with pytest.raises(ValueError, match="'n_y' must be a positive integer, got 0"):
+        tile_offsets(2, 0)
+    with pytest.raises(ValueError, match="'overlap' must be at least 0 and less than 1, got 1"):
+        tile_offsets(2, 2, overlap=1)
+
+
+def test_exposures_of_a_list_with_dithers_of_their_own(tmp_path):
+    patterns = {
+        1: [(-1.446, 3.956), (3.771, -5.358), (1.035, 4.889)],
+        2: [(2.983, -21.46), (1.08, -11.849)],
+    }
+    rows = [
+        row(dith, x, y, exp=exp, aperture="MIRIM_ILLUM")
+        for exp, offsets in patterns.items()
+        for dith, (x, y) in enumerate(offsets, start=1)
+    ]
+    path = pointing_list(tmp_path / "plan.pointing", {1: rows})
+    for exp, offsets in patterns.items():
+        assert_allclose(read_dithers(path, exposure=exp).value, offsets)
+    for exposure in (None, 3):
+        with pytest.raises(
+            ValueError, match=rf"'exposure' must be one of \[1, 2\], got {exposure}"
+        ):
+            read_dithers(path, exposure=exposure)
+
+
+def test_tiles_have_one_pattern_or_none(tmp_path):
+    def tile(number, x):
+        text = ROW.format(**row(1, x, 1.0))
+        return f"  1    {number}" + text[8:]
+
+    for name, x in (("same", 0.5), ("other", 0.7)):
+        lines = ["* Deep field (Obs 1)", HEADER, tile(1, 0.5), tile(2, x)]
+        (tmp_path / f"{name}.pointing").write_text("\n".join(lines))
+    assert_allclose(read_dithers(tmp_path / "same.pointing").value, [[0.5, 1.0]])
+    with pytest.raises(ValueError, match=r"other\.pointing: tiles of the observation have dithers"):
+        read_dithers(tmp_path / "other.pointing")
+
+
+def test_a_table_has_no_observations(tmp_path):
+    path = tmp_path / "dithers.ecsv"
+    QTable({"x_offset": [1] * u.arcsec, "y_offset": [2] * u.arcsec}).write(path)
+    for name in ("observation", "exposure"):
+        with pytest.raises(ValueError, match=f"'{name}' must be left out, but for a .pointing"):
+            read_dithers(path, **{name: 1})
 
 
 def test_refuses(tmp_path):

@@ -1,6 +1,7 @@
 """The whole study at a small size: every stage, resume after a stop, the command line."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from astropy.table import QTable
 
 from miricigale.depth import saturation_forecast
 from miricigale.instrument import DQ
-from miricigale.workflow import load_config
+from miricigale.workflow import disk_use, load_config, study_stages
 from miricigale.workflow.products import read_image
 from miricigale.workflow.stages.exposures import study_exposures
 
@@ -22,7 +23,6 @@ SMALL = """
 [run]
 name = "small"
 seed = 3
-keep_level1b = true
 
 [catalog]
 mag_limit = 22.5
@@ -48,8 +48,14 @@ axes = "quick"
 """
 
 
-def stopped(command, folder, product, how):
-    """Start a run, stop it by a signal once a product stands; exit status and messages."""
+def recorded(folder, name):
+    """Whether a product is in the manifest: it is whole, and so is all that was made with it."""
+    manifest = folder / "small" / "manifest.json"
+    return manifest.is_file() and f'"{name}"' in manifest.read_text()
+
+
+def stopped(command, folder, name, how):
+    """Start a run, stop it by a signal once a product is recorded; exit status and messages."""
     process = subprocess.Popen(
         command,
         cwd=folder,
@@ -58,11 +64,9 @@ def stopped(command, folder, product, how):
         # whoever runs the tests in the background hands down an ignored SIGINT
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    deadline = time.monotonic() + 300
-    while not product.exists() and process.poll() is None and time.monotonic() < deadline:
+    deadline = time.monotonic() + 1200
+    while not recorded(folder, name) and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.1)
-    # let the manifest be written
-    time.sleep(1.0)
     process.send_signal(how)
     _, message = process.communicate(timeout=120)
     return process.returncode, message
@@ -74,10 +78,11 @@ def study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("study")
     (folder / "small.toml").write_text(SMALL)
     command = [sys.executable, "-m", "miricigale", "run", "small.toml", "--no-progress"]
-    product = folder / "small" / "agn00" / "exposures" / "miri.f770w-0_cal.fits"
-    killed = stopped(command, folder, product, signal.SIGKILL)
+    name = "agn00/exposures/miri.f770w-0_cal.fits"
+    product = folder / "small" / name
+    killed = stopped(command, folder, name, signal.SIGKILL)
     before = product.stat().st_mtime_ns
-    later = folder / "small" / "agn00" / "exposures" / "miri.f1500w-0_cal.fits"
+    later = "agn00/exposures/miri.f1500w-0_cal.fits"
     interrupted = stopped(command, folder, later, signal.SIGINT)
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     return {
@@ -154,13 +159,6 @@ def test_deleted_products_make_only_themselves_anew_with_the_same_bytes(study):
     assert changed == set().union(*units)
 
 
-def test_level1b_files_name_themselves(study):
-    paths = list((study["folder"] / "agn00" / "level1b").iterdir())
-    assert len(paths) == 3
-    for path in paths:
-        assert fits.getheader(path)["FILENAME"] == path.name
-
-
 def test_no_source_is_lost_between_catalogue_and_result(study):
     catalog = QTable.read(study["folder"] / "catalog.ecsv")
     truth = QTable.read(study["folder"] / "agn00" / "truth.ecsv")
@@ -209,7 +207,7 @@ def test_saturation_is_told_before_each_exposure(study):
         # the closed form of the low background; gradient and flat field are a few per cent
         assert told["sky_fraction"] == pytest.approx(saturation_forecast(exposure), rel=0.06)
         # and the image has no slope where the well was full from the start
-        _, flags = read_image(study["folder"] / f"agn00/exposures/{unit}_rate.fits", planes=["dq"])
+        _, flags = read_image(study["folder"] / f"agn00/exposures/{unit}_cal.fits", planes=["dq"])
         full = np.count_nonzero(flags & DQ.SATURATED)
         assert abs(full - told["n_pixels"]) <= 3 + 0.3 * told["n_pixels"]
 
@@ -228,7 +226,12 @@ def test_images_are_what_they_say(study):
 
 
 def test_the_report_has_its_sections_and_numbers(study):
+    # of slopes those that the page shows are kept, and no level 1b
+    rates = {path.name for path in study["folder"].rglob("*_rate.fits")}
+    assert rates == {"miri.f770w-0_rate.fits", "miri.f1500w-0_rate.fits"}
+    assert not list(study["folder"].rglob("*_uncal.fits"))
     page = (study["folder"] / "report" / "index.html").read_text()
+    assert "An exposure in F1500W before and after its background was subtracted" in page
     for title in ("Images", "Forced photometry", "Error function", "Redshifts", "AGN fraction"):
         assert title in page
     metrics = json.loads((study["folder"] / "report" / "metrics.json").read_text())
@@ -236,7 +239,7 @@ def test_the_report_has_its_sections_and_numbers(study):
     assert metrics["fits"]["all"]["n"] == metrics["n_sample"]
 
 
-def test_the_same_seed_gives_the_same_numbers_on_one_thread(study, tmp_path):
+def test_the_same_seed_gives_the_same_numbers_on_one_thread_and_with_level1b(study, tmp_path):
     # in a process of its own, which loads compiled code as those of the study did: what this one
     # compiled for other tests differs in the last digit
     code = """
@@ -244,7 +247,7 @@ import sys
 from miricigale.workflow import StudyRunner, load_config, study_stages
 wanted = "catalog seds truth exposures mosaics highres kernels templates photometry".split()
 stages = [stage for stage in study_stages() if stage.name in wanted]
-config = load_config(sys.argv[1], overrides={"run": {"threads": 1}})
+config = load_config(sys.argv[1], overrides={"run": {"threads": 1, "keep_level1b": True}})
 StudyRunner(config, sys.argv[2], stages).run()
 """
     again = tmp_path / "again"
@@ -258,3 +261,84 @@ StudyRunner(config, sys.argv[2], stages).run()
         for folder in (study["folder"], again)
     )
     np.testing.assert_array_equal(first["flux"].value, second["flux"].value)
+    # every exposure has its files, which name themselves
+    paths = list((again / "agn00" / "level1b").iterdir())
+    assert len(paths) == len(list(again.rglob("*_rate.fits"))) == 3
+    for path in paths:
+        assert fits.getheader(path)["FILENAME"] == path.name
+
+
+#: Forks a run for each stage: the process kills itself in the middle of the first file that this stage
+#: writes. What it does not find standing it makes first.
+KILLER = """
+import json, os, signal, sys
+from miricigale.workflow import StudyRunner, load_config, study_stages
+from miricigale.workflow.stage import Context
+
+save = Context.save
+
+
+def run(stage):
+    def stopped(context, name, writer):
+        def half(path):
+            path.write_bytes(b"half of a file")
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        return save(context, name, half if context._name == stage else writer)
+
+    Context.save = stopped
+    StudyRunner(load_config(sys.argv[1] + "/config.toml"), sys.argv[1], study_stages).run()
+
+
+ends = {}
+for stage in [*sys.argv[2:], ""]:
+    child = os.fork()
+    if child == 0:
+        run(stage)
+        os._exit(0)
+    ends[stage] = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+print(json.dumps(ends))
+"""
+
+
+def test_a_run_that_is_killed_in_each_stage_ends_with_the_same_bytes(study, tmp_path):
+    folder = tmp_path / "again"
+    shutil.copytree(study["folder"], folder)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    lost = {}
+    for key, record in manifest["stages"].items():
+        # of each stage one unit, the last of its files
+        if record["products"]:
+            lost.setdefault(key.partition(":")[0], list(record["products"])[-1])
+    assert set(lost) >= {
+        "catalog", "seds", "truth", "exposures", "mosaics", "highres", "kernels", "templates",
+        "photometry", "points", "errors", "matches", "fits", "sources", "report",
+    }  # fmt: skip
+    for name in lost.values():
+        (folder / name).unlink()
+    order = [stage.name for stage in study_stages() if stage.name in lost]
+    command = [sys.executable, "-c", KILLER, str(folder), *order]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=900)
+    ends = json.loads(done.stdout)
+    assert ends == dict.fromkeys(order, -signal.SIGKILL) | {"": 0}, done.stderr
+    after = json.loads((folder / "manifest.json").read_text())
+    assert set(after["stages"]) == set(manifest["stages"])
+    for key, record in manifest["stages"].items():
+        assert after["stages"][key]["products"] == record["products"]
+        for name in record["products"]:
+            assert (folder / name).read_bytes() == (study["folder"] / name).read_bytes(), name
+    assert not list(folder.rglob(".partial-*"))
+
+
+def test_the_forecast_of_the_disk_is_right(study):
+    forecast = disk_use(load_config(study["folder"] / "config.toml"))
+    taken = sum(path.stat().st_size for path in study["folder"].rglob("*") if path.is_file())
+    assert abs(sum(forecast.values()) / taken - 1) < 0.3
+    manifest = json.loads((study["folder"] / "manifest.json").read_text())
+    large = {}
+    for key, record in manifest["stages"].items():
+        size = sum(product["bytes"] for product in record["products"].values())
+        large[key.partition(":")[0]] = large.get(key.partition(":")[0], 0) + size
+    for name, size in large.items():
+        if size > 0.1 * taken:
+            assert abs(forecast[name] / size - 1) < 0.3, name

@@ -47,6 +47,31 @@ def test_circles_hold_the_light_of_a_gaussian(tools, stars):
     assert off["coverage"][0] == 0
 
 
+def test_local_background_is_the_mode_of_source_extractor(tools):
+    """2.5 median - 1.5 mean of the clipped pixels (Bertin & Arnouts 1996): faint sources raise it less."""
+    rng = np.random.default_rng(8)
+    shape, sky_level = (300, 300), 5.0
+    wcs = north_up_wcs(tools.CENTER, 0.06 * u.arcsec, shape)
+    pixels = sky_level + rng.normal(0, 1, shape)
+    pixels += np.where(rng.uniform(size=shape) < 0.3, rng.exponential(2.0, shape), 0.0)
+    image = tools.as_ccd(pixels, wcs, 1.0)
+    bare, local = (
+        aperture_photometry(image, tools.CENTER, 1.2 * u.arcsec, local_background=ring)[
+            "flux"
+        ].value
+        for ring in (None, 3.0 * u.arcsec)
+    )
+    per_pixel = (tools.FINE**2 * tools.SR * 1e12) * np.pi * 10**2
+    found = ((bare - local) / per_pixel).item()
+    clipped = pixels.ravel()
+    for _ in range(20):
+        center, width = np.median(clipped), clipped.std()
+        clipped = clipped[np.abs(clipped - center) <= 3 * width]
+    mode = 2.5 * np.median(clipped) - 1.5 * clipped.mean()
+    assert found == pytest.approx(mode, abs=0.06)
+    assert abs(found - sky_level) < 0.7 * abs(np.median(pixels) - sky_level)
+
+
 def test_source_extractor_like_fluxes(stars):
     sky, flux, image = stars
     table = source_extractor_photometry(

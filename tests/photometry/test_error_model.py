@@ -293,3 +293,34 @@ def test_wide_bins_follow_errors_of_known_form():
     # 5 sigma where flux = 5 hypot(0.3, 0.1 flux), in closed form: one draw knows it to 20 %,
     # six to 8 %; chords between bins half an octave apart lie up to 15 % above the curve
     assert np.mean(limits) == pytest.approx(1.5 / np.sqrt(0.75), rel=0.25)
+
+
+def test_errors_where_the_exposure_is_longer(simulated):
+    """Half of the sources exposed four times as long: one curve, and half of it there."""
+    truth, _ = simulated
+    rng = np.random.default_rng(7)
+    true = truth[BAND].value
+    noise = np.where(np.arange(len(true)) % 2, 0.5, 1.0)
+    seen = true + rng.normal(0, noise * np.hypot(0.1, 0.05 * true))
+    measured = QTable({"id": truth["id"], BAND: seen * u.uJy})
+    model = ErrorModel.from_tables(truth, measured, bin_size=600, noise={BAND: noise})
+    flux = np.array([0.3, 2.0, 30.0])
+    expected = np.hypot(0.1, 0.05 * flux)
+    assert_allclose(model.sigma(flux * u.uJy, BAND).value, expected, rtol=0.08)
+    # without it: the mean of both, which is right for neither
+    mean = ErrorModel.from_tables(truth, measured, bin_size=600).sigma(flux * u.uJy, BAND).value
+    assert np.all(mean < 0.85 * expected)
+    table = QTable({BAND: np.repeat(2.0, 4) * u.uJy})
+    factors = {BAND: np.array([1.0, 0.5, np.inf, 0.0])}
+    errors = model.assign(table, noise=factors)[f"{BAND}_err"].value
+    one = model.sigma(2.0 * u.uJy, BAND).value
+    assert_allclose(errors, [one, 0.5 * one, np.nan, np.nan])
+    # rows of no known noise do not count
+    some = {BAND: np.where(np.arange(len(true)) < 3000, noise, np.nan)}
+    first = ErrorModel.from_tables(truth, measured, bin_size=600, noise=some).curves[BAND]
+    own = ErrorModel.from_tables(
+        truth[:3000], measured[:3000], bin_size=600, noise={BAND: noise[:3000]}
+    ).curves[BAND]
+    assert_allclose(first.error, own.error)
+    with pytest.raises(ValueError, match="'noise' must be a factor for each of 4 rows"):
+        model.assign(table, noise={BAND: np.ones(3)})

@@ -1,6 +1,7 @@
 import matplotlib.pyplot as plt
+import pytest
 
-from miricigale.plotting.axes import new_figure, resolve_axes
+from miricigale.plotting.axes import new_figure, panel_columns, resolve_axes
 
 
 def test_a_new_figure_has_a_grid_of_axes_and_no_window():
@@ -23,3 +24,11 @@ def test_axes_that_are_not_given_are_the_current_ones(ax):
         assert resolve_axes(None) is current
     finally:
         plt.close(current.figure)
+
+
+@pytest.mark.parametrize("n", range(1, 25))
+def test_rows_of_panels_are_of_three_or_leave_fewer_places_empty(n):
+    columns = panel_columns(n)
+    assert columns == min(n, 3) or (columns in (2, 4) and -n % columns < -n % 3)
+    # seven skies, four ranges of redshift
+    assert (panel_columns(7), panel_columns(4), panel_columns(18)) == (4, 2, 3)

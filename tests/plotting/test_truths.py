@@ -29,7 +29,7 @@ def test_every_truth_has_a_panel_with_every_band_set():
     assert [bool(ax.get_legend()) for ax in figure.axes] == [True, False, False, False]
     assert line_data(figure.axes[1], "--")[0][:, 0].tolist() == [0.3, 0.3]
     assert line_data(figure.axes[0], "--") == []
-    assert [ax.get_xlabel() for ax in figure.axes] == ["", "fracAGN", "fracAGN", "fracAGN"]
+    assert [ax.get_xlabel() for ax in figure.axes] == ["", "", "fracAGN", "fracAGN"]
 
 
 def test_values_beyond_the_bins_are_counted_at_their_ends():

@@ -37,6 +37,18 @@ def test_recovers_a_gradient(noise, gradient):
     assert background.source_mask.mean() < 0.01
 
 
+def test_the_mesh_alone_is_off_where_a_box_is_seen_in_part():
+    x = np.mgrid[:384, :384][1]
+    # 3 sigma from box to box, and half of the first boxes masked
+    gradient, mask = 3 * x / 32, x < 16
+    image = make(gradient + np.random.default_rng(1).normal(size=x.shape), mask=mask)
+    for plane, wanted in ((True, 0.0), (False, 0.75)):
+        off = (estimate_background(image, plane=plane).level - gradient).mean(axis=0)
+        # the middle of what is seen is 8 of 32 pixels from the center of the box
+        assert off[15:17].mean() == pytest.approx(wanted, abs=0.1)
+        assert np.abs(off[48:320]).max() < 0.1
+
+
 def test_sources_do_not_lift_it(noise, gradient):
     rng = np.random.default_rng(0)
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]

@@ -186,7 +186,13 @@ def test_what_the_reduction_assumes_need_not_be_true():
     )
     exposure = exposure_of("miri.f770w", 60, 1)
     light = np.broadcast_to(np.geomspace(1, 200, exposure.shape[1]), exposure.shape)
-    (fitted, drawn), truth = both(exposure, light, properties=true, without=(CosmicRays,))
+    (fitted, drawn), truth = both(
+        exposure,
+        light,
+        properties=true,
+        without=(CosmicRays,),
+        reducer=Reducer(references="simulated"),
+    )
     for columns in np.array_split(np.arange(1, exposure.shape[1] - 1), 8):
         off = [(fit.rate - truth)[1:-1, columns] for fit in (fitted, drawn)]
         mean = [np.nanmean(o / truth[1:-1, columns]) for o in off]

@@ -220,6 +220,32 @@ def test_outliers_are_masked_and_stars_are_not():
     assert reject_outliers(images[:2], images[0].wcs) == images[:2]
 
 
+def test_outliers_of_fields_side_by_side_are_those_of_each_field():
+    """Two pointings of three dithers that do not touch: together each is judged as alone."""
+    rng = np.random.default_rng(11)
+    fields, places = [], [(60, 60), (75, 62), (90, 64)]
+    for east in (0.0, 400.0):
+        shifts = ((east, 0.0), (east + 8.4, 3.3), (east - 5.7, 6.1))
+        images = [make(rng.normal(size=(150, 160)), small_wcs(*shift)) for shift in shifts]
+        for im, place in zip(images, places, strict=True):
+            im.data[place] = 12.0
+        fields.append(images)
+    every = [im for images in fields for im in images]
+    grid = mosaic_wcs([im.wcs for im in every], 0.11 * u.arcsec)
+    together = reject_outliers(every, grid)
+    alone = [im for images in fields for im in reject_outliers(images, grid)]
+    for one, two, place in zip(together, alone, places + places, strict=True):
+        np.testing.assert_array_equal(one.mask, two.mask)
+        assert one.mask[place]
+    mosaic = drizzle_images(every, grid)
+    # each pixel has the images of its own field
+    assert mosaic.n_images.max() == 3
+    single = drizzle_images(fields[1], grid)
+    inside = single.n_images > 0
+    np.testing.assert_array_equal(mosaic.n_images[inside], single.n_images[inside])
+    np.testing.assert_allclose(mosaic.image.data[inside], single.image.data[inside], atol=1e-5)
+
+
 def test_meta_tells_of_the_inputs():
     wcs = small_wcs()
     images = [

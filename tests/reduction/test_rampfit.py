@@ -3,7 +3,7 @@ import pytest
 from scipy.stats import norm
 
 from miricigale.instrument import DQ, miri_detector
-from miricigale.reduction import fit_groups, reference_drift
+from miricigale.reduction import fit_groups, reference_channels, reference_drift
 
 DT, GAIN, READ, BIAS = 2.775, 4.0, 6.0, 11000.0
 OPTIONS = {"group_time": DT, "gain": GAIN, "read_noise": READ, "bias": BIAS}
@@ -271,6 +271,125 @@ def test_reference_columns_follow_the_drift():
     found = reference_drift(data, mask)
     np.testing.assert_allclose(found, drift - drift.mean(), atol=5 * READ / np.sqrt(512))
     assert np.all(reference_drift(data, np.zeros_like(mask)) == 0)
+
+
+def test_maps_give_each_pixel_what_its_own_constants_give():
+    rng = np.random.default_rng(5)
+    shape = (6, 70)
+    data = simulate(rng.gamma(2, 30, shape), 2, 15, seed=2)
+    data[1, 6:, 2, 5] += 900
+    options = {**OPTIONS, "neighbor_threshold": None, "saturation": 14000.0}
+    linear = np.array([0, 1, 2e-6, 1e-11])
+    maps = {
+        "gain": rng.choice([3.0, 5.5], shape),
+        "read_noise": rng.choice([4.0, 9.0], shape),
+        "bias": rng.choice([10900.0, 11050.0], shape),
+        "saturation": rng.choice([12500.0, 15000.0], shape),
+        "linearity": linear[:, None, None] * rng.choice([0.5, 1.0], shape),
+    }
+    maps["linearity"][1] = 1
+    fit = fit_groups(data, **{**options, **maps})
+    for y, x in [(0, 0), (2, 5), (3, 33), (5, 63), (5, 64), (4, 69)]:
+        one = {name: values[..., y, x] for name, values in maps.items()}
+        alone = fit_groups(data[:, :, y : y + 1, x : x + 1], **{**options, **one})
+        for name in ("rate", "var_poisson", "var_read", "n_used", "flags"):
+            assert getattr(fit, name)[y, x] == getattr(alone, name)[0, 0]
+    # values of pixels that are not used do not matter
+    usable = np.ones(shape, bool)
+    usable[1, 1] = False
+    maps["gain"][1, 1] = np.nan
+    np.testing.assert_array_equal(
+        fit_groups(data, usable=usable, **{**options, **maps}).rate[usable], fit.rate[usable]
+    )
+    with pytest.raises(ValueError, match="'gain' must be positive, got 1 pixels"):
+        fit_groups(data, **{**options, **maps})
+
+
+def test_reset_anomaly_and_dark_are_taken_off_by_group_and_integration():
+    rng = np.random.default_rng(6)
+    truth = rng.gamma(2, 30, (6, 70))
+    plain = np.stack([truth * DT * np.arange(1, 11)[:, None, None]] * 3) + BIAS
+    reset = rng.normal(0, 30, (2, 4, 6, 70)).astype(np.float32)
+    dark = np.cumsum(rng.gamma(2, 2, (1, 12, 6, 70)), axis=1).astype(np.float32)
+    spoilt = plain + dark[:, :10]
+    spoilt[:, :4] += reset[[0, 1, 1]]
+    options = {**OPTIONS, "jump_threshold": None}
+    fit = fit_groups(spoilt.astype(np.float32), reset=reset, dark=dark, **options)
+    np.testing.assert_allclose(fit.rate, truth, rtol=2e-4, atol=2e-4)
+    with pytest.raises(ValueError, match="'dark' must be of shape"):
+        fit_groups(spoilt.astype(np.float32), dark=dark[:, :9], **options)
+
+
+def test_flags_of_groups_are_cuts():
+    data = simulate(np.full((3, 50), 30.0), 2, 20, seed=11)
+    flags = np.zeros(data.shape, np.uint8)
+    spoilt = data.copy()
+    # a hit, a bad group, the end of an integration, and the first group of all
+    flags[0, 7, 1, 10] = DQ.JUMP_DET
+    spoilt[0, 7:, 1, 10] += 700
+    flags[1, 5, 1, 20] = DQ.DO_NOT_USE
+    spoilt[1, 5, 1, 20] += 500
+    flags[0, 12:, 2, 49] = DQ.SATURATED
+    spoilt[0, 12:, 2, 49] = 13000
+    flags[:, 0] |= np.uint8(DQ.DO_NOT_USE)
+    spoilt[:, 0] += 99
+    options = {**OPTIONS, "jump_threshold": None}
+    fit = fit_groups(spoilt, group_dq=flags, **options)
+    # the same cuts by dense linear algebra
+    differences = np.diff(data.astype(float), axis=1)[:, 1:]
+    kept = {
+        (0, 0): [(0, 0, 18), (1, 0, 18)],
+        (1, 10): [(0, 0, 5), (0, 6, 18), (1, 0, 18)],
+        (1, 20): [(0, 0, 18), (1, 0, 3), (1, 5, 18)],
+        (2, 49): [(0, 0, 10), (1, 0, 18)],
+    }
+    for (y, x), runs in kept.items():
+        segments = [differences[k, a:b, y, x] for k, a, b in runs]
+        slope = np.concatenate(segments).mean()
+        for _ in range(2):
+            slope, variance = gls(segments, slope / GAIN, READ**2 + 1 / 12)
+        assert fit.rate[y, x] * DT == pytest.approx(slope, rel=1e-5)
+        assert fit.error[y, x] * DT == pytest.approx(np.sqrt(variance), rel=1e-4)
+        assert fit.n_used[y, x] == sum(b - a for _, a, b in runs)
+    assert fit.flags[1, 10] == DQ.JUMP_DET
+    assert fit.flags[2, 49] == DQ.SATURATED
+
+
+def test_drift_of_channels_and_rows_is_taken_off_as_in_the_official_pipeline():
+    # what jwst.refpix (MIRIDataset.do_fullframe_corrections) subtracts, written out
+    rng = np.random.default_rng(3)
+    data = rng.normal(11000, 5, (2, 4, 40, 24))
+    data[0, 2, 7, 1] += 300
+    expected = data.copy()
+    for k, g in np.ndindex(2, 4):
+        for channel in range(4) if g else ():
+            for start in (0, 1):
+                means = []
+                for column in (channel, 20 + channel):
+                    values = (data[k, g] - data[k, 0])[start::2, column]
+                    while True:
+                        inside = np.abs(values - values.mean()) <= 3 * values.std()
+                        if inside.all():
+                            break
+                        values = values[inside]
+                    means.append(values.mean())
+                expected[k, g, start::2, channel::4] -= np.mean(means)
+    mask = np.zeros((40, 24), bool)
+    mask[:, :4] = mask[:, -4:] = True
+    drift = reference_channels(data, mask)
+    np.testing.assert_allclose(data - np.tile(drift, 6), expected, atol=1e-9)
+    # a part of the frame, with the first row odd and columns on one side
+    half = reference_channels(data[:, :, 1:, :12], mask[1:, :12], origin=(0, 1))
+    assert half.shape == (2, 4, 39, 4)
+    # a straight drift is its own smooth drift, and noise of the pixels is averaged away
+    line = data * 0 + np.array([0, 3.0, 6, 9])[:, None, None]
+    smooth = reference_channels(line, mask, window=3)
+    np.testing.assert_allclose(smooth, reference_channels(line, mask), atol=1e-9)
+    noisy = rng.normal(0, 5, (1, 60, 40, 24))
+    rough, smooth = (reference_channels(noisy, mask, window=w) for w in (None, 21))
+    assert np.diff(smooth[0], axis=0).std() < 0.2 * np.diff(rough[0], axis=0).std()
+    with pytest.raises(ValueError, match="'reference' must be reference pixels of every channel"):
+        reference_channels(data, np.zeros_like(mask))
 
 
 @pytest.mark.parametrize(

@@ -102,8 +102,10 @@ def test_refuses(table):
         check_catalog(broken(**{"miri.f770w": [1, 2] * u.s}), filters=["miri.f770w"])
     with pytest.raises(ValueError, match=r"ids are unique, got duplicates such as \[3\]"):
         check_catalog(broken(id=[3, 3]))
-    with pytest.raises(ValueError, match="integers in 'id'"):
-        check_catalog(broken(id=["a", "b"]))
+    with pytest.raises(ValueError, match="integers or text in 'id'"):
+        check_catalog(broken(id=[1.5, 2.5]))
+    with pytest.raises(ValueError, match="ASCII"):
+        check_catalog(broken(id=["a", "\xe4"]))
     with pytest.raises(ValueError, match="finite positions, got 1 that are not, first in row 1"):
         check_catalog(broken(sky=SkyCoord([53, np.nan], [-27, -27], unit="deg")))
     with pytest.raises(ValueError, match=r"'profile' among .*, got \['disk'\]"):

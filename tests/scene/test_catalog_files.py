@@ -53,7 +53,10 @@ def read_silently(*args, **options):
 @pytest.mark.parametrize("suffix", ["csv", "cat", "ecsv", "fits", "xml"])
 def test_any_format_with_names_and_units_of_its_own(plain, tmp_path, suffix):
     path = write(plain, tmp_path / f"mine.{suffix}")
-    with pytest.warns(MiricigaleWarning, match=r"1 of 2 sources are points \(incomplete"):
+    with (
+        pytest.warns(MiricigaleWarning, match=r"1 of 2 sources are points \(incomplete"),
+        pytest.warns(MiricigaleWarning, match=r"missing, by .*: irac\.ch1 1 of 2 \(-99\)$"),
+    ):
         catalog = read_catalog(path, columns=COLUMNS | SHAPE, units=UNITS)
     assert catalog["id"].tolist() == [3, 7]
     assert catalog["sky"].dec.deg.tolist() == [-27.8, -27.7]
@@ -64,7 +67,7 @@ def test_any_format_with_names_and_units_of_its_own(plain, tmp_path, suffix):
     assert catalog["half_light_radius"][0] == 0.3 * u.arcsec
     assert catalog["position_angle"][0] == 20 * u.deg
     assert catalog["note"].tolist() == ["a", "b"]
-    assert not np.any(catalog["flags"])
+    assert catalog["flags"].tolist() == [0, CatalogFlags.MISSING_CODE]
 
 
 def test_a_catalog_of_cigale(tmp_path):
@@ -81,9 +84,14 @@ def test_a_catalog_of_cigale(tmp_path):
     assert texts == [
         "cigale.txt: 1 of 2 sources have no usable flux in any band (flag no_flux): ids 2",
         "cigale.txt: 2 of 2 sources are points (no column 'half_light_radius')",
+        (
+            "cigale.txt: taken as missing, by the number that stands there: "
+            "irac.ch1 1 of 2 (-9999); mips.24 2 of 2 (-9999)"
+        ),
     ]
     assert catalog["irac.ch1"][0].to_value(u.uJy) == pytest.approx(5)
-    assert catalog["flags"].tolist() == [0, CatalogFlags.NO_FLUX]
+    coded = CatalogFlags.MISSING_CODE
+    assert catalog["flags"].tolist() == [coded, coded | CatalogFlags.NO_FLUX]
     assert catalog["star"].tolist() == [False, True]
 
 
@@ -92,7 +100,10 @@ def test_columns_may_change_places(plain, tmp_path):
     plain.rename_columns(["FLUX_H", "f36"], ["irac.ch1", "wfc3.f160w"])
     path = write(plain, tmp_path / "c.csv")
     columns = COLUMNS | {"wfc3.f160w": "irac.ch1", "irac.ch1": "wfc3.f160w"}
-    with pytest.warns(MiricigaleWarning, match="sources are points"):
+    with (
+        pytest.warns(MiricigaleWarning, match="sources are points"),
+        pytest.warns(MiricigaleWarning, match="taken as missing"),
+    ):
         catalog = read_catalog(path, columns=columns, units={"flux": "mJy"})
     assert catalog["wfc3.f160w"].to_value(u.uJy) == pytest.approx([1, 2])
     assert catalog["irac.ch1"][0].to_value(u.uJy) == pytest.approx(4)
@@ -167,7 +178,10 @@ def test_blanks_are_missing(tmp_path):
 def test_positions_in_hours(plain, tmp_path):
     plain["ALPHA"] = ["3:32:24.0", "3:32:48.0"]
     path = write(plain, tmp_path / "c.csv")
-    with pytest.warns(MiricigaleWarning, match="points"):
+    with (
+        pytest.warns(MiricigaleWarning, match="points"),
+        pytest.warns(MiricigaleWarning, match="taken as missing"),
+    ):
         catalog = read_catalog(path, columns=COLUMNS, units={"flux": "mJy", "ra": "hourangle"})
     np.testing.assert_allclose(catalog["sky"].ra.deg, [53.1, 53.2])
     with pytest.raises((ValueError, u.UnitsError), match="'ra'"):

@@ -8,7 +8,6 @@ import sys
 import textwrap
 import zipfile
 
-import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -17,7 +16,6 @@ from astropy.table import QTable
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import (
     conf,
-    image_unit,
     open_fits,
     read_table,
     unpacked_size,
@@ -221,26 +219,3 @@ def test_large_files_without_holes_are_not_bound(tmp_path):
     fits.PrimaryHDU(np.random.default_rng(1).normal(size=(500, 500))).writeto(path)
     with conf.set_temp("unpacked_size", 1), open_fits(path, wanted="an image") as hdus:
         assert hdus[0].shape == (500, 500)
-
-
-@pytest.mark.parametrize("text", ["MJy/sr", "uJy/arcsec2", "W m-2 Hz-1 sr-1", " MJy / sr "])
-def test_units_of_images(text):
-    unit = image_unit(fits.Header({"BUNIT": text}), "a.fits", like="MJy/sr")
-    assert unit.is_equivalent("Jy/sr")
-    assert unit == u.Unit(text)
-
-
-@pytest.mark.parametrize(
-    ("cards", "got"),
-    [
-        ({}, "none"),
-        ({"BUNIT": "  "}, "BUNIT = ''|none"),
-        ({"BUNIT": "cows"}, "BUNIT = 'cows'"),
-        ({"BUNIT": "DN/s"}, "BUNIT = 'DN/s'"),
-        ({"BUNIT": 3.5}, "BUNIT = 3.5"),
-        ({"BUNIT": "mag"}, "BUNIT = 'mag'"),
-    ],
-)
-def test_images_without_a_unit_are_named_with_what_is_accepted(cards, got):
-    with pytest.raises(DataError, match=rf"a\.fits must state .* BUNIT, .* MJy / sr, got ({got})"):
-        image_unit(fits.Header(cards), "a.fits", like="MJy/sr")

@@ -3,7 +3,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.table import QTable
+from astropy.table import QTable, Table
 
 from miricigale.cli import main
 from miricigale.fitting import open_results
@@ -54,6 +54,38 @@ def test_a_catalog_becomes_a_folder_of_results(catalog, tmp_path, capsys):
     assert "resume=" not in err
     assert main([*command, "--chunk-rows", "3", "--no-resume"]) == 0
     assert open_results(out).n_parts == 2
+
+
+def test_a_votable_in_magnitudes_by_a_map(catalog, tmp_path, capsys):
+    """Names of a survey, AB magnitudes and text ids give the fits of the same fluxes."""
+    table = Table({"ID": [f"obj-{k}" for k in catalog["id"]], "zspec": catalog["z_spec"]})
+    lines = ["[columns]", 'id = "ID"']
+    for k, name in enumerate(BANDS):
+        table[f"m{k}"] = catalog[name].to_value(u.ABmag)
+        table[f"dm{k}"] = np.full(5, 0.05 * 2.5 / np.log(10))
+        lines += [f'"{name}" = "m{k}"', f'"{name}_err" = "dm{k}"']
+    # 99 for a band of the second
+    catalog = catalog.copy()
+    table["m4"][1] = 99.0
+    catalog["miri.f770w"][1] = np.nan * u.uJy
+    table.write(tmp_path / "cat.xml", format="votable")
+    (tmp_path / "map.toml").write_text("\n".join([*lines, "[units]", 'flux = "ABmag"']))
+    catalog.write(tmp_path / "cat.fits")
+    options = ["--axes", "quick", "--no-progress", "--chunk-rows", "3", "--redshift"]
+    command = ["fit", str(tmp_path / "cat.xml"), "-o", str(tmp_path / "one"), *options, "zspec"]
+    with pytest.warns(MiricigaleWarning, match=r"cat\.xml: .*miri\.f770w 1 of 5 \(99\)"):
+        assert main([*command, "--map", str(tmp_path / "map.toml")]) == 0
+    assert "5 objects, 5 fitted, 2 parts" in capsys.readouterr().out
+    command = ["fit", str(tmp_path / "cat.fits"), "-o", str(tmp_path / "two"), *options, "z_spec"]
+    assert main(command) == 0
+    mine, theirs = (QTable.read(tmp_path / one / "table.fits") for one in ("one", "two"))
+    assert mine["id"].tolist() == [f"obj-{k}" for k in range(1, 6)]
+    for name in ("redshift_mean", "frac_agn_mean", "mass_best", "reduced_chi2"):
+        np.testing.assert_allclose(mine[name], theirs[name], rtol=1e-9)
+    assert mine["n_bands"].tolist() == [6, 5, 6, 6, 6]
+    command = ["fit", str(tmp_path / "cat.xml"), "-o", str(tmp_path / "one"), *options, "zspec"]
+    assert main([*command, "--map", "candels"]) == 2
+    assert "a table with columns of 'candels'" in capsys.readouterr().err
 
 
 def test_a_number_of_threads_that_cannot_be_is_refused(catalog, tmp_path, capsys):

@@ -4,10 +4,10 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
-from astropy.table import QTable
+from astropy.table import QTable, Table
 
 from miricigale.fitting import FitResults
-from miricigale.scene import check_catalog
+from miricigale.scene import CatalogFlags, check_catalog
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError, MiricigaleWarning
 from miricigale.workflow import Context, StudyRunner
@@ -126,7 +126,10 @@ def test_a_catalog_of_ones_own_by_a_map_of_columns(galaxies, tmp_path):
             "sed": {"axes": "quick"},
         }
     )
-    with pytest.warns(MiricigaleWarning, match="1 of 4 sources"):
+    with (
+        pytest.warns(MiricigaleWarning, match="1 of 4 sources have no usable flux"),
+        pytest.warns(MiricigaleWarning, match=r"taken as missing, .* 1 of 4 \(-99\)"),
+    ):
         STAGES["catalog"].function(Context(config, tmp_path, stage=STAGES["catalog"]), "")
     for name, unit in (("seds", ""), ("truth", "agn00")):
         STAGES[name].function(Context(config, tmp_path, stage=STAGES[name], unit=unit), unit)
@@ -138,6 +141,39 @@ def test_a_catalog_of_ones_own_by_a_map_of_columns(galaxies, tmp_path):
     assert np.isnan(truth["miri.f770w"][2])
     # one band gives every galaxy light in all others
     assert np.all(truth["miri.f770w"][:2] > 0)
+
+
+def test_magnitudes_and_text_ids_give_the_inputs_of_the_fluxes(galaxies, tmp_path):
+    """A VOTable in AB magnitudes with ids of text: the same truth, and 99 is missing and flagged."""
+    table = Table({"name": ["a-1", "a-2"], "z": galaxies["redshift"]})
+    table["RA"], table["DEC"] = galaxies["sky"].ra.deg, galaxies["sky"].dec.deg
+    columns = ["id=name", "redshift=z", "ra=RA", "dec=DEC"]
+    for k, name in enumerate(SHORT):
+        table[f"m{k}"] = galaxies[name].to_value(u.ABmag)
+        table[f"dm{k}"] = np.full(2, 0.05)
+        columns += [f"{name}=m{k}", f"{name}_err=dm{k}"]
+    table["m2"][1], table["mag_f160w"] = 99.0, galaxies["mag_f160w"]
+    table.write(tmp_path / "mine.xml", format="votable")
+    options = {"source": str(tmp_path / "mine.xml"), "columns": columns, "units": ["flux=ABmag"]}
+    config = StudyConfig.from_dict({"catalog": options, "sed": {"axes": "quick"}})
+    with (
+        pytest.warns(MiricigaleWarning, match=r"nircam\.f200w 1 of 2 \(99\)"),
+        pytest.warns(MiricigaleWarning, match="2 of 2 sources are points"),
+    ):
+        STAGES["catalog"].function(Context(config, tmp_path, stage=STAGES["catalog"]), "")
+    for name, unit in (("seds", ""), ("truth", "agn00")):
+        STAGES[name].function(Context(config, tmp_path, stage=STAGES[name], unit=unit), unit)
+    catalog = QTable.read(tmp_path / "catalog.ecsv")
+    assert catalog["flags"].tolist() == [0, CatalogFlags.MISSING_CODE]
+    np.testing.assert_allclose(catalog[SHORT[0]].value, galaxies[SHORT[0]].value)
+    results = FitResults.read(tmp_path / "input_seds.fits")
+    assert results.ids.tolist() == ["a-1", "a-2"]
+    assert results.n_bands.tolist() == [3, 2]
+    np.testing.assert_allclose(
+        results.flux_err / results.flux,
+        0.05 * np.log(10) / 2.5 * np.where(np.isnan(results.flux), np.nan, 1),
+    )
+    assert QTable.read(tmp_path / "agn00" / "truth.ecsv")["id"].tolist() == ["a-1", "a-2"]
 
 
 @pytest.mark.parametrize("key", ["columns", "units"])

@@ -3,22 +3,15 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
-from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.table import QTable
 
-from miricigale.instrument import north_up_wcs
-from miricigale.photometry import detect_sources
-from miricigale.psf import hst_psf
-from miricigale.scene import Scene, highres_image
+from helpers.points import PRIOR, point_catalog, save_points
 from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.stages import study_stages
-from miricigale.workflow.stages.images import mosaic_psf
 
 STAGES = {stage.name: stage for stage in study_stages()}
-BAND, PRIOR = "miri.f1000w", "wfc3.f160w"
-CENTER = SkyCoord(53.13440 * u.deg, -27.83444 * u.deg)
+BAND = "miri.f1000w"
 
 
 def config_of(method):
@@ -39,37 +32,9 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("method")
     config = config_of("package")
     rng = np.random.default_rng(3)
-    grid = np.meshgrid(np.linspace(-9, 9, 4), np.linspace(-7, 7, 3))
-    dx, dy = (a.ravel() + rng.uniform(-0.1, 0.1, 12) for a in grid)
-    n = len(dx)
-    catalog = QTable({"id": np.arange(1, n + 1)})
-    catalog["sky"] = CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
-    catalog["redshift"] = np.ones(n)
-    catalog["profile"] = np.full(n, "point")
-    catalog["half_light_radius"] = np.zeros(n) * u.arcsec
-    catalog["sersic_index"] = catalog["axis_ratio"] = np.ones(n)
-    catalog["position_angle"] = np.zeros(n) * u.deg
-    catalog[BAND] = np.geomspace(20, 200, n) * u.uJy
-    catalog[PRIOR] = np.full(n, 30.0) * u.uJy
-    made = Context(config, folder)
-    made.save_table("agn00/truth.ecsv", catalog)
-    for suffix, scale, size in (("", 0.11, 280), ("_fine", 0.06, 514)):
-        wcs = north_up_wcs(CENTER, scale * u.arcsec, (size, size))
-        wcs.pixel_shape = size, size
-        image = Scene(catalog, filter=BAND, wcs=wcs, psf=mosaic_psf(config, BAND, scale)).render()
-        noise = np.full(image.shape, 0.1 * 0.06 / scale)
-        data = image.data + rng.normal(0, noise)
-        made.save_image(
-            f"agn00/mosaic_{BAND}{suffix}.fits",
-            CCDData(data, unit="MJy/sr", wcs=wcs, uncertainty=StdDevUncertainty(noise),
-                    mask=np.zeros(image.shape, bool)),
-        )  # fmt: skip
-    psf = hst_psf(PRIOR, pixel_scale=0.06 * u.arcsec)
-    prior = highres_image(catalog, filter=PRIOR, wcs=wcs, psf=psf, seed=1)
-    segmentation, detected = detect_sources(prior)
-    made.save_image("f160w.fits", prior)
-    made.save_image("segm.fits", prior, segmentation=np.asarray(segmentation.data, np.int32))
-    made.save_table("detections.ecsv", detected)
+    places = np.meshgrid(np.linspace(-9, 9, 4), np.linspace(-7, 7, 3))
+    catalog = point_catalog(*places, rng, {BAND: np.geomspace(20, 200, 12), PRIOR: 30.0})
+    save_points(Context(config, folder), catalog, BAND, rng, width=30.84)
     return folder
 
 

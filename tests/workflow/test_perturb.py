@@ -15,7 +15,7 @@ from miricigale.psf import miri_psf
 from miricigale.scene import Scene
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError
-from miricigale.workflow import Context
+from miricigale.workflow import Context, load_config
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.perturbation import (
     Perturbation,
@@ -24,6 +24,8 @@ from miricigale.workflow.perturbation import (
     point_columns,
 )
 from miricigale.workflow.stages import study_stages
+from miricigale.workflow.stages.fits import mock_photometry
+from miricigale.workflow.stages.images import expose_and_reduce
 from miricigale.workflow.stages.perturbed import perturbation_costs, write_perturbed
 from miricigale.workflow.truths import EFFECTS, study_truths
 
@@ -54,7 +56,7 @@ def sources():
 
 
 def test_each_effect_is_one_more_truth():
-    truths = study_truths(config_of(of=[0.0, 0.4]))
+    truths = study_truths(config_of(of=[0.0, 0.4], cutouts="mine.fits"))
     without_agn = [name for name in EFFECTS if name not in ("torus", "point_agn")]
     assert list(truths) == [
         "agn00",
@@ -66,6 +68,11 @@ def test_each_effect_is_one_more_truth():
         "name": "agn40+zero_point", "frac_agn": 0.4, "perturbations": {"zero_point": 0.02}
     }  # fmt: skip
     assert list(truths["agn40+all"].values()["perturbations"]) == list(EFFECTS)
+    assert dict(truths["agn40+cutouts"].perturbations) == {
+        "cutouts": {"image": "mine.fits", "psf": "", "of": "own"}
+    }
+    # without an image there is no such sky
+    assert "agn00+cutouts" not in study_truths(config_of())
     # of the reference unless it is said; alone it is all that there is
     assert list(study_truths(config_of("gain"))) == ["agn00", "agn40", "agn00+gain"]
     assert list(study_truths(config_of(["psf", "gain"], together=False)))[2:] == [
@@ -82,6 +89,10 @@ def test_each_effect_is_one_more_truth():
         ({"of": [0.2]}, r"must be out of \[sed\] frac_agn"),
         ({"effects": ["torus"]}, r"must have a value above 0 for \['torus'\]"),
         ({"psf_width": 0.5}, "must be between 0.0 and 0.2"),
+        ({"effects": ["cutouts"]}, "cutouts must name an image for the effect 'cutouts', got ''"),
+        ({"effects": ["psf"], "cutouts": "mine.fits"}, "cutouts must be empty without the effect"),
+        ({"cutouts_psf": "psf.fits"}, "cutouts_psf must be empty without an image in cutouts"),
+        ({"cutouts_of": "all"}, "must be one of"),
     ],
 )
 def test_perturbations_that_cannot_be(perturb, message):
@@ -92,6 +103,7 @@ def test_perturbations_that_cannot_be(perturb, message):
 def test_no_stage_of_the_analysis_knows_of_them():
     """Stages of truth and sky have them in their plans, those of a perturbed truth only."""
     plain, config = config_of([]), config_of(of=[0.0, 0.4])
+    parts = {one: {n: s.unit_names(one) for n, s in STAGES.items()} for one in (plain, config)}
     for name, stage in STAGES.items():
         assert ("perturb" in stage.sections) == (name == "report")
         assert not [key for key in stage.sections if key.startswith("perturb.")]
@@ -99,6 +111,10 @@ def test_no_stage_of_the_analysis_knows_of_them():
             # the page of sources has links to those of all truths
             if stage.plan and name != "sources":
                 assert stage.plan(config, unit) == stage.plan(plain, unit)
+            # nor do its inputs change; the report and the page of sources are of all skies
+            if name not in ("sources", "report"):
+                read = [stage.needed(one, unit, parts[one]) for one in (plain, config)]
+                assert read[0] == read[1]
     for unit in STAGES["exposures"].unit_names(config):
         seen = STAGES["exposures"].plan(config, unit).get("perturbations", {})
         assert seen == dict(study_truths(config)[unit.partition("/")[0]].perturbations)
@@ -144,6 +160,41 @@ def test_astrometry_shifts_a_band_as_a_whole():
         angles[name] = angle[0]
         assert np.all(moved[name] == table[name])
     assert abs(angles[BANDS[0]] - angles[BANDS[1]]) > 1
+
+
+def test_zero_points_of_existing_bands_are_in_the_fluxes_that_are_fitted():
+    """Without the noise of depths a flux is 1.02 or 0.98 of what it was, and its band's for all sources."""
+    n = 50
+    truth = QTable({"id": np.arange(n)})
+    bands = ["acs.f606w", "acs.f814w", "wfc3.f125w", PRIOR, "irac.ch1"]
+    for band in bands:
+        truth[band] = np.linspace(10, 20, n) * u.uJy
+    matched = QTable({"id": truth["id"], "selection": np.zeros(n, int)})
+    for band in BANDS:
+        matched[band], matched[f"{band}_err"] = truth[PRIOR], 0.1 * truth[PRIOR]
+    config = StudyConfig.from_dict(
+        {"fit": {"bands": bands, "depths": [40.0] * len(bands)}}, base=config_of([])
+    )
+    mock = {
+        size: mock_photometry(config, truth, matched, seed=SEED, zero_point=size)
+        for size in (0, 0.02)
+    }
+    ratios = {band: (mock[0.02][band] / mock[0][band]).value for band in bands}
+    for band, ratio in ratios.items():
+        np.testing.assert_allclose(np.abs(ratio - 1), 0.02, rtol=1e-6)
+        assert np.ptp(ratio) < 1e-9, band
+    assert len({ratio[0] > 1 for ratio in ratios.values()}) == 2
+    for band in BANDS:
+        np.testing.assert_array_equal(mock[0.02][band], mock[0][band])
+    same = mock_photometry(config, truth, matched, seed=SEED)
+    for name in same.colnames:
+        np.testing.assert_array_equal(same[name], mock[0][name])
+    # of the skies that have it only; it is no part of the images
+    config = config_of(["psf", "zero_point_existing"], of=0.4)
+    plans = {unit: STAGES["fits"].plan(config, unit) for unit in STAGES["fits"].unit_names(config)}
+    assert {unit for unit, plan in plans.items() if "zero_point" in plan} == {
+        f"agn40+{name}/{chosen}" for name in ("zero_point_existing", "all") for chosen in ("all", "none")
+    }  # fmt: skip
 
 
 def test_nothing_changes_without_effects():
@@ -269,6 +320,141 @@ def test_an_agn_as_a_point_keeps_the_light():
     assert images[True].max() > 1.2 * images[False].max()
 
 
+@pytest.fixture(scope="module")
+def chain():
+    """What comes out of the whole chain, from the scene to the calibrated image, of a band and effects."""
+    config = load_config(
+        "goodss",
+        overrides={"exposures": {"kind": "rates"}, "detector": {"cosmic_rays": False}},
+    )
+    exposure = Exposure(
+        BAND,
+        pointing=SkyCoord(config.pointing.ra, config.pointing.dec, unit="deg"),
+        roll=0 * u.deg,
+        n_groups=20,
+        subarray="SUB256",
+    )
+    n = 6
+    x, y = (v.ravel() + 40.0 for v in np.meshgrid([10.0, 90.0, 170.0], [30.0, 130.0]))
+    table = QTable({"id": np.arange(1, n + 1), "redshift": np.ones(n), "profile": ["point"] * n})
+    table["sky"] = exposure.wcs.pixel_to_world(x, y)
+    table["half_light_radius"], table["position_angle"] = (
+        np.zeros(n) * u.arcsec,
+        np.zeros(n) * u.deg,
+    )
+    table["sersic_index"] = table["axis_ratio"] = np.ones(n)
+    table[BAND] = np.full(n, 2000.0) * u.uJy
+    known = {}
+
+    def run(effects, flux=1.0):
+        key = (tuple(effects.items()), flux)
+        if key not in known:
+            catalog = table.copy()
+            catalog[BAND] = flux * catalog[BAND]
+            differ = None if effects is None else Perturbation(effects, SEED)
+            rate, cal = expose_and_reduce(config, exposure, catalog, seed=1, perturbation=differ)
+            known[key] = rate, cal, (x, y)
+        return known[key]
+
+    return run
+
+
+def stars(cal, places, radius=12):
+    """Light, center and width of stars: sums in a circle, and moments by a Gaussian of 1.5 pixels."""
+    data = np.nan_to_num(cal.data)
+    rows, columns = np.indices(data.shape)
+    found = []
+    for x, y in zip(*places, strict=True):
+        near = np.hypot(columns - x, rows - y) < radius
+        light = data[near] - np.median(data)
+        weight = light * np.exp(-0.5 * ((columns - x) ** 2 + (rows - y) ** 2)[near] / 1.5**2)
+        cx, cy = (np.sum(weight * at[near]) / weight.sum() for at in (columns, rows))
+        second = np.sum(weight * ((columns - cx) ** 2 + (rows - cy) ** 2)[near]) / weight.sum()
+        found.append((light.sum(), cx, cy, second))
+    return np.transpose(found)
+
+
+NO_SIZE = {
+    "psf_width": 0.0, "gain": 0.0, "linearity": 0.0, "zero_point": 0.0, "zero_point_existing": 0.0,
+    "astrometry": 0.0, "clumps": 0.0,
+}  # fmt: skip
+
+
+def test_effects_without_size_leave_every_bit(chain):
+    plain, none = chain({}), chain(NO_SIZE)
+    for first, second in zip(plain[:2], none[:2], strict=True):
+        np.testing.assert_array_equal(first.data, second.data)
+        np.testing.assert_array_equal(first.uncertainty.array, second.uncertainty.array)
+        np.testing.assert_array_equal(first.mask, second.mask)
+    config = config_of(["zero_point_existing"], zero_point_existing=0.0)
+    assert STAGES["fits"].plan(config, "agn00+zero_point_existing/all") == STAGES["fits"].plan(
+        config, "agn00/all"
+    )
+
+
+def test_each_effect_reaches_the_calibrated_image_in_its_size(chain):
+    _, cal, places = chain({})
+    light, x, y, width = stars(cal, places)
+
+    def changed(effects):
+        return stars(chain(effects)[1], places)
+
+    # fluxes as of stars that are by 2 % brighter, and nothing else
+    zero = changed({"zero_point": 0.02})
+    sign = np.sign(zero[0][0] / light[0] - 1)
+    np.testing.assert_allclose(zero[0] / light, 1 + 0.02 * sign, atol=0.002)
+    np.testing.assert_allclose(stars(chain({}, 1 + 0.02 * sign)[1], places)[0], zero[0], rtol=1e-6)
+    np.testing.assert_allclose(zero[1:3], [x, y], atol=0.005)
+    # the conversion takes DN for as many electrons as before
+    np.testing.assert_allclose(changed({"gain": 0.01})[0] / light, 1 / 1.01, atol=0.002)
+    # 30 mas of 110 mas pixels, all in one direction
+    moved = changed({"astrometry": 0.03})
+    step = np.array([moved[1] - x, moved[2] - y]) * 0.11
+    # the weight pulls the center back to the old place: by the share of its width in both
+    pull = 1.0 / (1.0 - width / (2 * 1.5**2))
+    length = np.hypot(*step) * pull
+    np.testing.assert_allclose(length, 0.03, rtol=0.25)
+    assert np.ptp(np.arctan2(step[1], step[0])) < 0.2
+    np.testing.assert_allclose(moved[0] / light, 1, atol=0.003)
+    # wider or narrower, with the same light
+    wide = changed({"psf_width": 0.1})
+    assert len(set(np.sign(wide[3] - width))) == 1
+    assert np.all(np.abs(wide[3] / width - 1) > 0.03)
+    np.testing.assert_allclose(wide[0] / light, 1, atol=0.02)
+    # another wavefront: other shapes, the same light
+    other = changed({"psf": None})
+    assert np.any(np.abs(other[3] / width - 1) > 1e-4)
+    np.testing.assert_allclose(other[0] / light, 1, atol=0.01)
+
+
+def test_another_flat_takes_the_place_of_the_known_one(chain):
+    """Slopes have the known flat field from pixel to pixel, or nothing of it; large scales are common to all."""
+    inner = np.s_[8:-8, 8:-8]
+    own = np.diff(np.log(flat_field(BAND, subarray="SUB256")[inner]), axis=1)
+
+    def imprint(rate):
+        steps = np.diff(np.log(np.where(rate.mask, np.nan, rate.data)[inner]), axis=1)
+        near = np.abs(steps) < 1.0
+        covariance = np.cov(steps[near], own[near])
+        return covariance[0, 1] / covariance[1, 1]
+
+    # pixels share some of their charge with their neighbors
+    assert imprint(chain({})[0]) == pytest.approx(0.9, abs=0.12)
+    # 57,000 pixels of 1 %, whose slopes have errors of 6 %
+    assert imprint(chain({"flat": None})[0]) == pytest.approx(0, abs=0.12)
+
+
+def test_another_linearity_shows_where_wells_are_full(chain):
+    faint, bright = (
+        [stars(chain(effects, flux)[1], chain({}, flux)[2])[0] for effects in ({}, {"linearity": 0.05})]
+        for flux in (0.1, 2.0)
+    )  # fmt: skip
+    faint, bright = (np.median(second / first) - 1 for first, second in (faint, bright))
+    # signals are larger than they are taken for where wells are full
+    assert bright < -0.005
+    assert abs(faint) < 0.15 * abs(bright)
+
+
 def study_tables(seed, *, flux=1.0, shift=0.0):
     """Tables of a truth as `StudyTables` has them: 200 sources with the noise of a seed."""
     rng, n = np.random.default_rng(seed), 200
@@ -314,6 +500,6 @@ def test_costs_are_changes_of_the_same_sources(tmp_path):
     write_perturbed(context, report, truths, every)
     page = report.to_html()
     assert "<th class=n>F770W offset</th>" in page
-    assert "<td>agn40</td><td>zero point</td><td class=n>+2.0 (+2.0 ± 0.0) %</td>" in page
+    assert "<td>agn40</td><td>zero point, MIRI</td><td class=n>+2.0 (+2.0 ± 0.0) %</td>" in page
     written = QTable.read(tmp_path / "report" / "perturbations.ecsv")
     np.testing.assert_array_equal(written["change"], table["change"])

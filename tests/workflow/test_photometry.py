@@ -1,5 +1,6 @@
 """The command `miricigale photometry` on files of a small field whose fluxes are known."""
 
+import html
 import types
 from pathlib import Path
 
@@ -104,6 +105,10 @@ def test_files_become_a_catalog_that_can_be_fitted_and_a_page(files, tmp_path, f
     for text in (f"Forced photometry: {BAND}", "Image, model and residual", "Magnitudes",
                  "pulls at empty positions", "Brightest sources", "10*nanoJansky", "150037"):  # fmt: skip
         assert text in page
+    # every flag with what it means
+    told = html.unescape(page)
+    for value, (name, meaning) in ForcedFlags.meanings().items():
+        assert f"<td>{value} {name}</td><td>{meaning}</td>" in told
     # the whole, the brightest source without a flag and the poorest fit, magnitudes, pulls
     assert page.count("<img") == 5
     assert "the poorest fit: signal-to-noise" in page

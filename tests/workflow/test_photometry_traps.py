@@ -176,7 +176,7 @@ def test_kernels_of_other_pixels_filters_or_sums(field, tmp_path):
     assert np.isnan(found[-1])
     page = (tmp_path / "page.html").read_text()
     assert "The kernel has no PSFs: sources are their segments as they are" in page
-    assert "no segment at the position" in page
+    assert "the catalog position has no segment" in page
 
 
 def test_a_background_is_fitted_or_said(field, tmp_path):

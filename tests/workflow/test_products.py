@@ -64,12 +64,21 @@ def test_the_same_image_makes_the_same_bytes(tmp_path):
         np.testing.assert_array_equal(hdus["DQ"].data, 1)
 
 
-@pytest.mark.parametrize("header", [{}, {"BUNIT": "cows"}])
-def test_images_without_a_unit_are_named(tmp_path, header):
+@pytest.mark.parametrize(
+    ("header", "got"),
+    [
+        ({}, "none"),
+        ({"BUNIT": "  "}, "none"),
+        ({"BUNIT": "cows"}, "BUNIT = 'cows'"),
+    ],
+)
+def test_images_without_a_unit_are_named(tmp_path, header, got):
     path = tmp_path / "bare.fits"
     sci = fits.ImageHDU(np.zeros((3, 4)), fits.Header(header), name="SCI")
     fits.HDUList([fits.PrimaryHDU(), sci]).writeto(path)
-    with pytest.raises(DataError, match=r"bare\.fits must state the unit of its pixels"):
+    with pytest.raises(
+        DataError, match=rf"bare\.fits must state the unit of its pixels, .*, got {got}"
+    ):
         read_image(path)
 
 

@@ -23,7 +23,7 @@ from miricigale.evaluation import PUBLISHED
 from miricigale.sed import SEDModel
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.stages.figures import three_bands
-from miricigale.workflow.stages.metrics import as_ceers, as_paper
+from miricigale.workflow.stages.metrics import above_proposal, as_ceers, as_paper
 from miricigale.workflow.stages.pictures import field_figure, residual_figure
 from miricigale.workflow.stages.provenance import sources_to_cite, stand_ins
 from miricigale.workflow.stages.sample import footprint_area, in_field
@@ -124,6 +124,28 @@ def test_edge_crowded_and_spurious_are_counted(reports):
     assert sorted(table["first"]) == [-1, *range(24)]
     assert sorted(table["second"]) == list(range(25))
     assert list(table["status"]).count("unmatched") == 1
+
+
+def test_numbers_of_the_fits_are_those_of_the_tables(reports):
+    folder = reports["four"].parent
+    metrics = json.loads((reports["four"] / "metrics.json").read_text())
+    truth, matched = (QTable.read(folder / f"agn00/{name}.ecsv") for name in ("truth", "matched"))
+    sample = truth[np.asarray(matched["selection"]) == 0]
+    for unit, found in metrics["fits"].items():
+        table = QTable.read(folder / f"agn00/fits_{unit}.ecsv")
+        dz = np.asarray((table["redshift_mean"] - sample["redshift"]) / (1 + sample["redshift"]))
+        assert found["n"] == len(sample) > 10
+        assert found["photoz_bias"] == pytest.approx(np.median(dz))
+        assert found["photoz_sigma_mad"] == pytest.approx(1.48 * np.median(abs(dz - np.median(dz))))
+        assert found["photoz_n_outliers"] == np.count_nonzero(abs(dz) > 0.15)
+        assert found["photoz_outliers"] == pytest.approx(np.mean(abs(dz) > 0.15))
+        off = np.asarray(table["frac_agn_mean"] - sample["frac_agn"])
+        assert found["frac_agn_bias"] == pytest.approx(np.median(off))
+        assert found["frac_agn_width"] == pytest.approx(
+            np.median(np.asarray(table["frac_agn_std"]))
+        )
+    assert metrics["truths"]["agn00"]["fits"] == metrics["fits"]
+    assert set(metrics["fits"]) == {"all", "none"}
 
 
 def sections_of(report):
@@ -258,6 +280,15 @@ def test_the_same_products_give_the_same_bytes(reports):
     assert before == {path.name: path.read_bytes() for path in reports["one"].iterdir()}
     # nor does a picture say what drew it
     assert b"Software" not in before["index.html"]
+
+
+def test_bands_above_the_limits_of_the_proposal_are_counted():
+    """25.5 AB in F770W and 24.8 in F1000W, of the CEERS proposal as Yang et al. 2021 quote it."""
+    truth = QTable()
+    for name, values in {"f770w": [25.4, 25.4, 25.6], "f1000w": [24.7, 24.9, 24.9]}.items():
+        truth[f"miri.{name}"] = (values * u.ABmag).to(u.uJy)
+    assert above_proposal(truth, truth.colnames).tolist() == [2, 1, 0]
+    assert above_proposal(truth, ["miri.f560w"]) is None
 
 
 def test_bands_of_a_picture():

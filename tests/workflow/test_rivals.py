@@ -3,24 +3,17 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
-from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.table import QTable
 
+from helpers.points import PRIOR, point_catalog, save_points
 from miricigale.evaluation import PUBLISHED, Report
-from miricigale.instrument import north_up_wcs
-from miricigale.photometry import detect_sources
-from miricigale.psf import hst_psf
-from miricigale.scene import Scene, highres_image
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig, load_config
 from miricigale.workflow.stages import rivals, study_stages
-from miricigale.workflow.stages.images import mosaic_psf
 
 STAGES = {stage.name: stage for stage in study_stages()}
-BAND, PRIOR = "miri.f1500w", "wfc3.f160w"
-CENTER = SkyCoord(53.13440 * u.deg, -27.83444 * u.deg)
+BAND = "miri.f1500w"
 #: The last two are far too faint for a blind detection.
 N, N_FAINT = 14, 2
 
@@ -37,24 +30,6 @@ def config_of(method, **photometry):
     )  # fmt: skip
 
 
-def made_truth():
-    """Points 5 arcsec apart, of which the study's own method is made to measure the true fluxes."""
-    rng = np.random.default_rng(3)
-    grid = np.meshgrid(np.linspace(-12.5, 12.5, 6), np.linspace(-7, 7, 3))
-    dx, dy = (a.ravel()[:N] + rng.uniform(-0.1, 0.1, N) for a in grid)
-    truth = QTable({"id": np.arange(1, N + 1)})
-    truth["sky"] = CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
-    truth["redshift"] = np.ones(N)
-    truth["profile"] = np.full(N, "point")
-    truth["half_light_radius"] = np.zeros(N) * u.arcsec
-    truth["sersic_index"] = truth["axis_ratio"] = np.ones(N)
-    truth["position_angle"] = np.zeros(N) * u.deg
-    flux = np.append(np.geomspace(30, 300, N - N_FAINT), np.full(N_FAINT, 0.3))
-    truth[BAND] = flux * u.uJy
-    truth[PRIOR] = np.full(N, 30.0) * u.uJy
-    return truth
-
-
 def made_matched(truth):
     matched = truth["id", "sky"]
     matched[f"{BAND}_true"] = matched[BAND] = truth[BAND]
@@ -67,27 +42,14 @@ def made_matched(truth):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rivals")
-    config, truth = config_of("package"), made_truth()
-    rng = np.random.default_rng(3)
+    config, rng = config_of("package"), np.random.default_rng(3)
+    x, y = (a.ravel()[:N] for a in np.meshgrid(np.linspace(-12.5, 12.5, 6), np.linspace(-7, 7, 3)))
+    flux = np.append(np.geomspace(30, 300, N - N_FAINT), np.full(N_FAINT, 0.3))
+    # the study's own method is made to measure the true fluxes
+    truth = point_catalog(x, y, rng, {BAND: flux, PRIOR: 30.0})
     made = Context(config, folder)
-    made.save_table("agn00/truth.ecsv", truth)
     made.save_table("agn00/matched.ecsv", made_matched(truth))
-    for suffix, scale, size in (("", 0.11, 330), ("_fine", 0.06, 605)):
-        wcs = north_up_wcs(CENTER, scale * u.arcsec, (size, size))
-        wcs.pixel_shape = size, size
-        image = Scene(truth, filter=BAND, wcs=wcs, psf=mosaic_psf(config, BAND, scale)).render()
-        noise = np.full(image.shape, 0.1 * 0.06 / scale)
-        made.save_image(
-            f"agn00/mosaic_{BAND}{suffix}.fits",
-            CCDData(image.data + rng.normal(0, noise), unit="MJy/sr", wcs=wcs,
-                    uncertainty=StdDevUncertainty(noise), mask=np.zeros(image.shape, bool)),
-        )  # fmt: skip
-    psf = hst_psf(PRIOR, pixel_scale=0.06 * u.arcsec)
-    prior = highres_image(truth, filter=PRIOR, wcs=wcs, psf=psf, seed=1)
-    segmentation, detected = detect_sources(prior)
-    made.save_image("f160w.fits", prior)
-    made.save_image("segm.fits", prior, segmentation=np.asarray(segmentation.data, np.int32))
-    made.save_table("detections.ecsv", detected)
+    save_points(made, truth, BAND, np.random.default_rng(3), width=36.3)
     for name, unit in (("kernels", BAND), ("templates", ""), ("rivals", BAND)):
         STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
     return folder
@@ -147,6 +109,21 @@ def test_numbers_by_group_count_every_source_once(tables):
     for column in ("n", "median", "scatter", "pull_median", "pull_scatter"):
         halves = (numbers[column][numbers["band"] == band] for band in ("all", BAND))
         assert np.array_equal(*halves, equal_nan=True)
+
+
+def test_galaxies_are_told_apart_by_size(tables):
+    table = tables[BAND].copy()
+    table["shape"][2:] = "n < 2"
+    size = np.linspace(0.0, 1.2, N)
+    table["half_light_radius"] = size * u.arcsec
+    numbers = rivals.rival_numbers({BAND: table})
+    one = numbers[(numbers["kind"] == "half-light radius") & (numbers["method"] == "package")]
+    found = {row["group"]: row["n_group"] for row in one if row["band"] == BAND}
+    # points have no size, and the faint ones are in no group
+    assert sum(found.values()) == N - N_FAINT - 2
+    inner = size[2:-N_FAINT]
+    assert found["0.2 to 0.4 arcsec"] == np.count_nonzero((inner >= 0.2) & (inner < 0.4))
+    assert found["above 0.8 arcsec"] == np.count_nonzero(inner >= 0.8)
 
 
 def test_the_section_of_the_page(folder, tables):

@@ -1,17 +1,21 @@
 """Runs that are killed, damaged or out of disk: nothing is lost, nothing is taken for whole."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+from astropy.nddata import CCDData
+from astropy.table import QTable
 
 from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.runner import StudyRunner
-from miricigale.workflow.stage import Stage
+from miricigale.workflow.stage import Context, Stage
 
 TOY = Path(__file__).with_name("toy_study.py")
 
@@ -25,9 +29,9 @@ def contents(folder):
     }
 
 
-def start(folder, **options):
+def start(folder, *words, **options):
     return subprocess.Popen(
-        [sys.executable, TOY, str(folder), "2"],
+        [sys.executable, TOY, str(folder), "2", *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -37,9 +41,12 @@ def start(folder, **options):
     )
 
 
-def wait_for(path, process):
+def wait_for(path, process, text=""):
+    """Wait until a file stands (and has a text), or the process has ended."""
     deadline = time.monotonic() + 60
-    while not path.exists() and process.poll() is None and time.monotonic() < deadline:
+    while process.poll() is None and time.monotonic() < deadline:
+        if path.exists() and text in path.read_text():
+            return
         time.sleep(0.002)
 
 
@@ -82,6 +89,83 @@ def test_a_run_that_is_killed_thirteen_times_ends_with_the_same_bytes(tmp_path, 
     _, message = process.communicate(timeout=120)
     assert process.returncode == 0, message
     assert contents(folder) == undisturbed
+
+
+def test_a_second_run_in_the_folder_is_refused_and_the_first_one_goes_on(tmp_path, undisturbed):
+    folder = tmp_path / "run"
+    first = start(folder)
+    wait_for(folder / "a" / "0.txt", first)
+    # however slow the second one starts
+    first.send_signal(signal.SIGSTOP)
+    try:
+        second = start(folder)
+        _, message = second.communicate(timeout=120)
+    finally:
+        first.send_signal(signal.SIGCONT)
+    assert second.returncode == 1
+    assert f"{folder} is in use by a run: process {first.pid} on" in message
+    _, message = first.communicate(timeout=120)
+    assert first.returncode == 0, message
+    assert contents(folder) == undisturbed
+
+
+def test_a_configuration_that_changes_before_a_killed_run_goes_on(tmp_path, undisturbed):
+    folder = tmp_path / "run"
+    process = start(folder)
+    wait_for(folder / "manifest.json", process, '"first:c"')
+    process.kill()
+    process.communicate(timeout=60)
+    before = contents(folder)
+    # what units c and d depend on is refused, and nothing is touched
+    process = start(folder, "2.0")
+    _, message = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "[scene] background_scale: 1.0 -> 2.0" in message
+    assert "redo=True to replace it" in message
+    assert contents(folder) == before
+    times = {name: (folder / name).stat().st_mtime_ns for name in before if name[0] in "ab"}
+    assert len(times) == 6
+    process = start(folder, "2.0", "redo")
+    _, message = process.communicate(timeout=120)
+    assert process.returncode == 0, message
+    # units a and b stand as they were made; all that depends is that of a new run
+    assert {name: (folder / name).stat().st_mtime_ns for name in times} == times
+    process = start(tmp_path / "new", "2.0")
+    process.communicate(timeout=120)
+    assert contents(folder) == contents(tmp_path / "new")
+    changed = {name for name, data in contents(folder).items() if data != undisturbed[name]}
+    assert changed == {f"{unit}/{k}.txt" for unit in "cd" for k in range(3)} | {"second.txt"}
+
+
+def products(context):
+    """What writes each kind of product of a study, larger than the limit below, by name."""
+    image = CCDData(np.random.default_rng(1).normal(size=(300, 300)), unit="MJy/sr")
+    table = QTable({"id": np.arange(20_000), "flux": np.linspace(0, 1, 20_000)})
+    return {
+        "image.fits": lambda name: context.save_image(name, image),
+        "table.ecsv": lambda name: context.save_table(name, table),
+        "table.fits": lambda name: context.save_table(name, table),
+        "page.html": lambda name: context.save(name, lambda path: path.write_text("x" * 200_000)),
+    }
+
+
+@pytest.mark.parametrize("name", ["image.fits", "table.ecsv", "table.fits", "page.html"])
+def test_a_write_that_the_system_cuts_off_is_named_and_leaves_what_stood(tmp_path, name):
+    """Files that may not grow beyond 100 kB, as on a disk that fills while they are written."""
+    context = Context(StudyConfig(), tmp_path)
+    (tmp_path / name).write_text("what stood")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match=rf"{tmp_path}/{name}"):
+            products(context)[name](name)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert (tmp_path / name).read_text() == "what stood"
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert context.saved == []
+    products(context)[name](name)
+    assert (tmp_path / name).stat().st_size > 100_000
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])

@@ -159,7 +159,7 @@ def test_a_finished_run_writes_nothing(tmp_path, monkeypatch, values):
     monkeypatch.setattr(shutil, "disk_usage", lambda _: types.SimpleNamespace(free=0))
     monkeypatch.setattr(ProductStore, "__enter__", None)
     config = StudyConfig.from_dict({"run": values})
-    StudyRunner(config, folder, recorder.stages(), disk=10**12).run()
+    StudyRunner(config, folder, recorder.stages(), disk={"first": 10**12}).run()
     assert {p.name: p.stat().st_mtime_ns for p in folder.iterdir()} == before
 
 
@@ -174,9 +174,30 @@ def test_what_stands_needs_no_disk_again(tmp_path, monkeypatch):
     assert size > 20_000
     monkeypatch.setattr(shutil, "disk_usage", lambda _: types.SimpleNamespace(free=9_000))
     with pytest.raises(DataError, match="the run needs about"):
-        StudyRunner(StudyConfig(), folder, recorder.stages(), disk=size + 10_000).run()
-    StudyRunner(StudyConfig(), folder, recorder.stages(), disk=size + 9_000).run()
+        StudyRunner(
+            StudyConfig(), folder, recorder.stages(), disk={"first": size, "second": 10_000}
+        ).run()
+    StudyRunner(
+        StudyConfig(), folder, recorder.stages(), disk={"first": size, "second": 9_000}
+    ).run()
     assert recorder.ran[-1] == "second"
+
+
+def test_of_a_part_of_the_steps_the_disk_of_that_part_counts(tmp_path, monkeypatch, capsys):
+    recorder, folder = Recorder(), tmp_path / "run"
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: types.SimpleNamespace(free=15_000_000))
+    options = {"disk": {"first": 20_000_000, "second": 5_000_000, "no stage": 10**12}}
+    runner = StudyRunner(
+        StudyConfig(), folder, recorder.stages(), until="first:a", progress_bar=True, **options
+    )
+    runner.run()
+    told = capsys.readouterr().err
+    assert "1 of 1 steps to do, which take about 0.01 GB" in told
+    assert "(0.0 GB are free)" in told
+    message = r"needs about 0.02 GB in .*, only 0.0\d GB are free; make room, choose another folder"
+    with pytest.raises(DataError, match=message):
+        StudyRunner(StudyConfig(), folder, recorder.stages(), **options).run()
+    assert recorder.ran == ["first:a"]
 
 
 @pytest.mark.parametrize("name", ["first_a.txt", "first_b.txt", "second.txt"])
@@ -240,12 +261,41 @@ def test_other_reference_data_make_other_exposures(tmp_path, monkeypatch):
     assert changed == {"exposures", "points"}
 
 
-def test_a_damaged_product_is_made_again(tmp_path):
-    recorder = Recorder()
-    recorder.run(tmp_path / "run")
-    path = tmp_path / "run" / "first_a.txt"
-    path.write_text(path.read_text().replace("a", "x"))
-    assert recorder.run(tmp_path / "run") == ["first:a"]
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [
+        (None, "missing"),
+        (lambda data: data[:-3], "7 bytes in place of 10"),
+        (lambda data: bytes([data[0] ^ 4]) + data[1:], "another content than was written"),
+        (lambda data: b"my own note", "11 bytes in place of 10"),
+    ],
+    ids=["removed", "truncated", "flipped", "edited"],
+)
+def test_a_damaged_product_is_named_and_made_again(tmp_path, caplog, damage, told):
+    recorder, folder = Recorder(), tmp_path / "run"
+    recorder.run(folder)
+    path = folder / "first_a.txt"
+    whole = path.read_bytes()
+    assert len(whole) == 10
+    path.unlink() if damage is None else path.write_bytes(damage(whole))
+    assert recorder.run(folder) == ["first:a"]
+    assert path.read_bytes() == whole
+    (message,) = [line for line in caplog.messages if "first_a.txt" in line]
+    assert f"first_a.txt ({told})" in message
+    assert "is done again, with the same bytes" in message
+    # of many products some are named
+    caplog.clear()
+    with ProductStore(folder) as store:
+        for k in range(9):
+            store.save(f"{k}.txt", lambda path: path.write_text("x"))
+        names = [f"{k}.txt" for k in range(9)]
+        record = store.records["second"]
+        record["products"] |= {name: store.describe(name) for name in names}
+        store.write_manifest()
+    for name in names:
+        (folder / name).unlink()
+    recorder.run(folder)
+    assert any("4.txt (missing) and 4 more" in line for line in caplog.messages)
 
 
 def test_products_that_no_longer_belong_are_removed(tmp_path):
@@ -304,7 +354,7 @@ def test_a_stage_is_declared_beside_its_function():
     assert make.function(1, 2) == (1, 2)
     names = [one.name for one in study_stages()]
     assert names[:3] == ["catalog", "seds", "truth"]
-    assert len(set(names)) == len(names) == 17
+    assert len(set(names)) == len(names) == 18
 
 
 def test_a_unit_depends_on_the_units_that_it_reads_only(tmp_path):
@@ -377,8 +427,13 @@ def test_a_part_of_the_stages_and_units(tmp_path):
     # the same bytes: what follows stands
     assert run(again="first:a/*") == ["a/1"]
     assert run() == []
-    with pytest.raises(ConfigError, match=r"'until' must be a stage \(first, second, third\) or"):
+    wanted = "'until' is 'fourth', which is no stage and matches no unit .*; stages: first, second, third;"
+    with pytest.raises(ConfigError, match=wanted):
         run(until="fourth")
+    with pytest.raises(
+        ConfigError, match="nothing of 'again', 'second', is among what 'until', 'first', needs"
+    ):
+        run(until="first", again="second")
 
 
 def test_stages_must_come_after_what_they_need(tmp_path):

@@ -14,21 +14,23 @@ from astropy.table import QTable
 from PIL import Image
 
 from helpers.runs import SCALE, SHAPE, do_stage, make_run, noise_image, sky_image, small_config
-from miricigale.evaluation import photoz_metrics
 from miricigale.fitting import FitResults
 from miricigale.sed import SEDModel
+from miricigale.workflow import Context
+from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.stages import cutouts
 from miricigale.workflow.stages.cutouts import N_GRAY, Cutouts
-from miricigale.workflow.stages.sources import CHUNK, FLAGS, OUTLIER
+from miricigale.workflow.stages.sources import CHUNK, FLAGS
 
 BANDS = ["miri.f770w", "miri.f2100w"]
 
 
-def read_page(folder):
+def read_page(folder, name="agn00"):
     """Facts of the page, and the details of all sources in its order."""
-    text = (folder / "report" / "sources-agn00.html").read_text("utf-8")
+    text = (folder / "report" / f"sources-{name}.html").read_text("utf-8")
     facts = json.loads(re.search(r'id="facts">(.*?)</script>', text, flags=re.DOTALL)[1])
     entries = []
-    for k, path in enumerate(sorted((folder / "report/sources/agn00").glob("*.js"))):
+    for k, path in enumerate(sorted((folder / f"report/sources/{name}").glob("*.js"))):
         call = re.fullmatch(rf"loaded\({k}, (.*)\);\n", path.read_text("utf-8"))
         entries += json.loads(call[1])
     return facts, entries
@@ -79,6 +81,24 @@ def test_the_table_holds_what_the_tables_hold(run):
             assert close([table[f"frac_agn_{chosen}"][k]], [row["frac_agn_mean"]])
             assert close([table[f"chi2_{chosen}"][k]], [row["reduced_chi2"]])
             assert table[f"fit_{chosen}"][k] == row["flags"]
+
+
+def test_ids_that_are_text_and_fractions_of_the_catalog(tmp_path):
+    page = make_run(tmp_path, BANDS, text_ids=True, frac_agn=(0.0, "catalog"))
+    text = (page / "index.html").read_text("utf-8")
+    assert "AGN of the catalog" in text
+    assert "source src-" in text
+    do_stage(small_config(BANDS, frac_agn=(0.0, "catalog")), tmp_path, "sources", "catalog")
+    facts, entries = read_page(tmp_path, "catalog")
+    truth = QTable.read(tmp_path / "catalog/truth.ecsv")
+    assert (
+        sorted(facts["table"]["id"])
+        == sorted(truth["id"])
+        == sorted(f"src-{k}" for k in range(1, 25))
+    )
+    assert [entry["id"] for entry in entries] == facts["table"]["id"]
+    own = dict(zip(truth["id"].tolist(), truth["frac_agn"], strict=True))
+    assert close(facts["table"]["frac_agn"], [own[key] for key in facts["table"]["id"]])
 
 
 def test_details_are_those_of_the_fits(run):
@@ -134,6 +154,40 @@ def test_a_source_without_a_fit_says_why(tmp_path):
     assert facts["flags"]["selection"]["16"] == ["few bands", "Detected in too few MIRI bands."]
 
 
+def test_pictures_are_of_so_many_sources_the_fitted_and_the_brightest_first(run, tmp_path):
+    folder, facts, every = run
+    assert facts["pictured"] == sum(entry["top"] is not None for entry in every)
+    assert all(entry["imaged"] == (entry["top"] is not None) for entry in every)
+    shutil.copytree(folder, tmp_path / "run")
+    config = StudyConfig.from_dict({"report": {"pictures": 5}}, base=small_config(BANDS))
+    do_stage(config, tmp_path / "run", "sources", "agn00")
+    facts, entries = read_page(tmp_path / "run")
+    shown = [entry["id"] for entry in entries if entry["top"] is not None]
+    assert len(shown) == facts["pictured"] == 5
+    # nothing else is left out
+    assert {entry["id"]: entry["imaged"] for entry in entries} == {
+        entry["id"]: entry["imaged"] for entry in every
+    }
+    assert sorted(facts["table"]["id"]) == sorted(entry["id"] for entry in every)
+    assert sum("fits" in entry for entry in entries) == sum("fits" in entry for entry in every)
+    magnitude = dict(zip(facts["table"]["id"], facts["table"]["mag"], strict=True))
+    fitted = [entry["id"] for entry in every if "fits" in entry and entry["imaged"]]
+    assert len(fitted) > 5
+    assert sorted(shown) == sorted(sorted(fitted, key=magnitude.get)[:5])
+    with Image.open(tmp_path / "run/report/sources/agn00/000.png") as sheet:
+        assert sheet.size[1] == 5 * facts["cutouts"]["height"]
+
+
+def test_pictures_of_many_sources_are_looked_at_in_parts(run, monkeypatch):
+    folder, _, every = run
+    cut = Cutouts.read(Context(small_config(BANDS), folder), "agn00")
+    sky = QTable.read(folder / "agn00/truth.ecsv")["sky"]
+    whole = cut.on_image(sky)
+    monkeypatch.setattr(cutouts, "_AT_ONCE", 5)
+    np.testing.assert_array_equal(cut.on_image(sky), whole)
+    assert sum(whole) == sum(entry["imaged"] for entry in every)
+
+
 def test_every_flag_has_its_meaning():
     for flags in FLAGS.values():
         meanings = flags.meanings()
@@ -141,13 +195,6 @@ def test_every_flag_has_its_meaning():
         for word, text in meanings.values():
             assert word.replace(" ", "_").upper() in flags.__members__
             assert text.endswith("."), (word, text)
-
-
-def test_outliers_are_those_of_the_metrics():
-    z = np.array([1.0, 1.0])
-    far = z * [1.3, 1.3] + np.array([-1e-9, 1e-9])
-    assert [photoz_metrics(z[k : k + 1], far[k : k + 1]).n_outliers for k in (0, 1)] == [0, 1]
-    assert pytest.approx(0.3 / 2) == OUTLIER
 
 
 def test_the_page_needs_nothing_from_outside(run):
@@ -180,14 +227,14 @@ def test_pictures_show_the_sky_about_the_source():
     image = sky_image(SCALE, SHAPE, data)
     model = sky_image(SCALE, SHAPE, np.where(data > 100, data, 0.0))
     residual = sky_image(SCALE, SHAPE, np.where(data > 100, 0.0, data))
-    cutouts = Cutouts(image, {"miri.f770w": [image, model, residual]})
-    layout = cutouts.describe()
+    pictures = Cutouts(image, {"miri.f770w": [image, model, residual]})
+    layout = pictures.describe()
     assert layout["prior"] == layout["side"] == 49
     assert layout["sigma"] == pytest.approx([1.0, 1.0], rel=0.03)
     here = image.wcs.pixel_to_world(85, 65)
     sky = SkyCoord([here, here.directional_offset_by(0 * u.deg, 30 * u.arcsec)])
-    assert cutouts.on_image(sky).tolist() == [True, False]
-    sheet, tops = cutouts.sheet(sky)
+    assert pictures.on_image(sky).tolist() == [True, False]
+    sheet, tops = pictures.sheet(sky)
     pixels = np.asarray(sheet).reshape(2, layout["height"], 2 * 49)
     for top, left in ((0, 0), (0, 49), (49, 49)):
         picture = np.where(pixels[0] == N_GRAY, 0, pixels[0])[top : top + 49, left : left + 49]
@@ -206,10 +253,10 @@ def test_pictures_show_the_sky_about_the_source():
 
 def test_pictures_of_fine_mosaics_are_no_larger():
     image, _ = noise_image(rim=0, scale=0.051, shape=(300, 300))
-    cutouts = Cutouts(image, {"miri.f770w": [image] * 3})
-    assert (cutouts.describe()["prior"], cutouts.describe()["side"]) == (105, 53)
+    pictures = Cutouts(image, {"miri.f770w": [image] * 3})
+    assert (pictures.describe()["prior"], pictures.describe()["side"]) == (105, 53)
     # the light of `noise_image` is in the middle of the image
-    sheet, _ = cutouts.sheet(SkyCoord([image.wcs.pixel_to_world(150, 150)]))
+    sheet, _ = pictures.sheet(SkyCoord([image.wcs.pixel_to_world(150, 150)]))
     picture = np.asarray(sheet)[:53, 105:]
     y, x = np.nonzero(picture == picture.max())
     assert (np.mean(y), np.mean(x)) == pytest.approx((26, 26), abs=1.5)

@@ -139,7 +139,7 @@ def test_names_of_truths_and_sets():
         ({"sed": {"frac_agn": []}}, "must have at least one value"),
         ({"sed": {"frac_agn": [0.2, 0.2]}}, "must not repeat"),
         ({"sed": {"frac_agn": ["field", 0.0]}}, "must begin with a number"),
-        ({"sed": {"frac_agn": [0.0, "quasars"]}}, r"must be one of \['field'\]"),
+        ({"sed": {"frac_agn": [0.0, "quasars"]}}, r"must be one of \['field', 'catalog'\]"),
         ({"sed": {"frac_agn": [1.0]}}, "must be between 0.0 and 0.99"),
         ({"fit": {"sets": ["none"]}}, "must have 'all'"),
         (

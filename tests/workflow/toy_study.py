@@ -21,8 +21,9 @@ def first(context, unit):
     if unit == "c" and deaths.is_file() and (left := int(deaths.read_text())):
         deaths.write_text(str(left - 1))
         context.save("c/0.txt", lambda path: os.kill(os.getpid(), signal.SIGKILL))
+    text = f"{unit} {context.plan}"
     for k in range(3):
-        context.save(f"{unit}/{k}.txt", lambda path, k=k: path.write_text(f"{unit} {k}" * 1000))
+        context.save(f"{unit}/{k}.txt", lambda path, k=k: path.write_text(f"{text} {k}" * 1000))
 
 
 def second(context, _):
@@ -31,17 +32,26 @@ def second(context, _):
     context.save("second.txt", lambda path: path.write_text(text))
 
 
+def brightness(config, unit):
+    """What units c and d take from the configuration."""
+    return config.scene.background_scale if unit in "cd" else "nothing"
+
+
 def stages():
     return (
-        Stage("first", first, "first", units=lambda _: "abcd"),
+        Stage("first", first, "first", units=lambda _: "abcd", plan=brightness),
         Stage("second", second, "second", needs=("first",)),
     )
 
 
-def main(folder, n_processes, *, cluster=False):
-    config = StudyConfig.from_dict({"run": {"threads": n_processes}})
-    with on_cluster(n_processes) if cluster else process_pool(n_processes) as executor:
-        StudyRunner(config, folder, stages, executor=executor).run()
+def main(folder, n_processes, *options):
+    """Options are ``cluster``, ``redo``, and a number for units c and d."""
+    numbers = [float(one) for one in options if one not in ("cluster", "redo")]
+    scene = {"background_scale": numbers[0]} if numbers else {}
+    config = StudyConfig.from_dict({"run": {"threads": n_processes}, "scene": scene})
+    pool = on_cluster if "cluster" in options else process_pool
+    with pool(n_processes) as executor:
+        StudyRunner(config, folder, stages, executor=executor, redo="redo" in options).run()
 
 
 @contextlib.contextmanager
@@ -60,4 +70,4 @@ def on_cluster(n_workers):
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), cluster=len(sys.argv) > 3)
+    main(sys.argv[1], int(sys.argv[2]), *sys.argv[3:])

@@ -7,6 +7,7 @@
   const miri = bands.filter((band) => band.miri);
   const setOf = Object.fromEntries(sets.map((set) => [set.name, set]));
   const ROW = 24;
+  const KEPT = 40;
   const $ = (id) => document.getElementById(id);
 
   // ------------------------------------------------------------------ small helpers
@@ -263,12 +264,19 @@
   const files = new Map();
   const stem = (k) => "sources/" + facts.truth + "/" + String(k).padStart(3, "0");
 
-  window.loaded = (k, entries) => { const file = files.get(k); file.entries = entries; file.then.forEach((go) => go()); };
+  window.loaded = (k, entries) => {
+    const file = files.get(k);
+    if (!file) return;
+    file.entries = entries;
+    file.then.forEach((go) => go());
+  };
 
   function withFile(k, go) {
     let file = files.get(k);
     if (!file) {
       file = { entries: null, then: [], image: new Image() };
+      // pictures of a large field would fill the memory: those that were looked at long ago are loaded again
+      if (files.size >= KEPT) files.delete(files.keys().next().value);
       files.set(k, file);
       file.image.src = stem(k) + ".png";
       document.head.append(make("script", { src: stem(k) + ".js", onerror: () => missing(k) }));
@@ -314,7 +322,10 @@
 
   function cutouts(row, entry, image) {
     const c = facts.cutouts;
-    if (!entry.top) return make("p", {}, "No band has data at this position.");
+    if (!entry.top) {
+      return make("p", {}, !entry.imaged ? "No band has data at this position."
+        : "Without pictures: " + facts.pictured + " sources have some, those that were fitted first, then the brightest ([report] pictures).");
+    }
     const y0 = (row.i % facts.chunk) * c.height;
     const ring = 100 * 2 / c.box;
     function cut(x, y, n) {

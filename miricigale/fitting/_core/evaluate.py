@@ -1,98 +1,123 @@
 """
 The posterior of one object: the search for the models that matter, and their exact evaluation.
 
-Pairs come in runs: an AGN model with galaxies of one block. A run of many is evaluated as a block, so
-that everything stands side by side in memory; those of short runs are gathered. Sums over one
-redshift are kept apart, and model fluxes are summed up when a redshift is finished.
+Pairs are listed in runs, an AGN model with galaxies of one block, and gathered from these to be
+evaluated side by side. Sums over one redshift are kept apart, and model fluxes are summed up when a
+redshift is finished.
 """
 
 import math
 
 import numpy as np
 
-from miricigale.fitting._core import rows as at
-from miricigale.fitting._core.alone import evaluate_alone
-from miricigale.fitting._core.floors import first_floor, raise_bounds, second_floor
-from miricigale.fitting._core.histogram import widest
+from miricigale.fitting._core import structs as at
+from miricigale.fitting._core.floors import first_floor, second_floor
+from miricigale.fitting._core.histogram import add_model, widest
 from miricigale.fitting._core.lanes import (
+    best_scale,
+    fill_up,
     galaxy_products,
+    gather,
     likelihoods,
-    place,
-    run_products,
-    take_gathered,
 )
 from miricigale.fitting._core.limits import limited_likelihoods
 from miricigale.fitting._core.pairs import (
-    DONE,
-    KEY_BITS,
     agn_products,
     best_of_galaxy,
     list_runs,
     project,
 )
 from miricigale.fitting._core.single import single_likelihoods
-from miricigale.fitting._core.structs import BLOCK, KERNEL, PART
+from miricigale.fitting._core.structs import BLOCK, KERNEL, KEY_BITS, PART
 from miricigale.fitting._core.sums import (
-    add_all,
-    add_block,
-    add_gathered,
+    PARTS,
     add_joint,
+    add_pairs,
     deposit,
     draw,
     find_best,
     finish_redshift,
+    keep_best,
+    take_draw,
 )
 from miricigale.utils.compilation import njit
 
 __all__ = ["sum_up"]
 
-_MASK = (1 << KEY_BITS) - 1
 _LOG10_E = 0.43429448190325183
-# Runs with at least so many pairs are evaluated as a block.
-_DENSE = 44
+# Models without AGN so far below the best are not looked at for a reference.
+_NEAR = 50.0
 # Largest chi2 of a good model, and square of a limit over its error, for single precision with
 # limits.
 _MODEST = 1000.0
 
 
-@njit(**PART)
-def _next_run(row, floor, run):
-    """Fill ``run`` with the pairs of a run whose bound reaches the floor; returns their number."""
-    n = np.int64(0)
-    for i in range(BLOCK):
-        n += row[i] >= floor
-    if n == 0:
-        return n
-    n = np.int64(0)
-    for i in range(BLOCK):
-        if row[i] >= floor:
-            run[n] = i
-            n += 1
-    return n
-
-
-@njit(**PART)
-def _drop(tables, pairs, lanes, r, z, block, n_run, rest, sure):
+@njit(**KERNEL)
+def _evaluate_alone(tables, target, limits, pairs, lanes, sums, delta, scale_error):
     """
-    Note better bounds of what is not worth evaluating, mark the others as done.
+    Add the models without AGN (f = 0), one for each galaxy and redshift, to the sums.
 
-    ``rest`` is what is in a bound besides R and what goes with the galaxy. Returned is how many
-    pairs of the run are left.
+    In a first pass the best of them becomes the reference, for nothing has been summed up yet, and
+    what their weights sum up to is estimated, for the histograms.
     """
-    run, row = lanes.run, pairs.bound[r]
-    n_left = np.int64(0)
-    for j in range(n_run):
-        i = run[j]
-        g = block * BLOCK + i
-        value = lanes.cross[1, i]
-        other = rest + tables.of_galaxy[at.LOG_GALAXY, g] + pairs.tail_galaxy[z, g]
-        if value * (1.0 + 1e-9) < sure - other:
-            row[i] = np.float32(value + 1e-6 * (1.0 + abs(value)) + other)
-        else:
-            row[i] = DONE
-            run[n_left] = i
-            n_left += 1
-    return n_left
+    best, total, draws = sums.best, sums.total, sums.draws
+    about = 0.0
+    carry = 0.0
+    for sums_up in (False, True):
+        floor = best[2] - tables.log_zero - (delta if sums_up else _NEAR)
+        for z in range(target.log_prior.size):
+            log_prior = target.log_prior[z]
+            if log_prior < -1e200:
+                continue
+            # what no galaxy of this redshift exceeds, priors being at most 1
+            if pairs.promise[z] + 1e-5 * target.norm < floor:
+                continue
+            some = False
+            for block in range(tables.tiles.shape[1]):
+                known = False
+                for g in range(block * BLOCK, min((block + 1) * BLOCK, tables.galaxy.shape[1])):
+                    p32 = max(pairs.p32[z, g], np.float32(0)) + 3e-6
+                    prior = log_prior + tables.log_usable[z, g]
+                    if p32 * p32 * target.norm + prior < floor:
+                        continue
+                    if not known:
+                        known = True
+                        galaxy_products(tables, target, z, block, lanes.pq)
+                    galaxy = tables.galaxy[z, g]
+                    p, q = lanes.pq[0, g], lanes.pq[1, g]
+                    s, r, inverse = best_scale(limits, p, q, galaxy, galaxy, 0.0, 0.0)
+                    value = r + prior + tables.log_zero
+                    if not sums_up:
+                        if value > best[2]:
+                            about *= math.exp(0.5 * (best[2] - value))
+                            best[2] = value
+                            floor = value - tables.log_zero - _NEAR
+                        about += math.exp(max(0.5 * (value - best[2]), -700.0))
+                        continue
+                    some = True
+                    keep_best(sums, r, s, z, g, np.int64(0), np.int64(0))
+                    t = math.exp(max(0.5 * (value - best[2]), -700.0))
+                    lanes.galaxy_z[0, g] += t
+                    lanes.galaxy_z[1, g] += t * s
+                    lanes.galaxy_z[2, g] += t * (s * s + scale_error * inverse)
+                    sums.zf[z, 0] += t
+                    sums.alone[g] += t
+                    if sums.joint.fg.size > 0:
+                        sums.joint.fg[0, g] += t
+                    total[0] += t
+                    total[1] += t * s * s / inverse
+                    total[2] += t if s == 0.0 else 0.0
+                    best[3] += 1.0
+                    for d in range(draws.next.size):
+                        while draws.next[d] <= total[0]:
+                            now = max(total[0], draws.next[d])
+                            take_draw(draws, d, now, z, g, np.int64(-1), np.int64(0), s, inverse)
+                    carry += t
+                    if carry >= max(total[0], about) / PARTS:
+                        add_model(tables, sums.hist, g, np.int64(-1), np.int64(0), s, carry)
+                        carry = 0.0
+            if some:
+                finish_redshift(tables, lanes, sums, z)
 
 
 @njit(**PART)
@@ -113,17 +138,15 @@ def _rescale(sums, lanes, factor):
 
 @njit(**KERNEL)
 def _evaluate_runs(
-    tables, target, limits, pairs, lanes, sums, request, n, reference, floor, sure, single
+    tables, target, limits, pairs, lanes, sums, request, n, reference, floor, single
 ):
     """
-    Add the pairs of the n listed runs to the sums.
+    Add the pairs of the n listed runs whose bound of R + 2 ln(prior) reaches the floor to the sums.
 
-    Those whose bound of R + 2 ln(prior), raised by ``pairs.tail_galaxy`` and ``tail_agn``, is at least
-    ``floor`` are evaluated and marked as done in the list; of these, pairs whose exact bound turns out
-    lower than ``sure`` get that bound there and are not evaluated. The best model met so far, of
-    R + 2 ln(prior) = ``reference``, gets weight 1. ``single``: whether single precision will do.
+    They are marked as done in the list. The best model met so far, of R + 2 ln(prior) = ``reference``,
+    gets weight 1. ``single``: whether single precision will do.
     """
-    best, total, of_frac, first = sums.best, sums.total, tables.of_frac, tables.zero_frac
+    best, total, of_frac = sums.best, sums.total, tables.of_frac
     if reference > best[2]:
         if total[0] > 0.0:
             _rescale(sums, lanes, math.exp(0.5 * (best[2] - reference)))
@@ -131,92 +154,59 @@ def _evaluate_runs(
     light = single and limits is None
     for i in range(lanes.left.size):
         lanes.left[i] = 1.0
-    n_listed = 1.0
-    for r in range(n):
-        for i in range(BLOCK):
-            n_listed += pairs.bound[r, i] >= floor
     for i in range(lanes.known.size):
         lanes.known[i] = 0
+    n_listed = 1.0
+    for r in range(n):
+        if pairs.top[r] >= floor:
+            for i in range(BLOCK):
+                n_listed += pairs.bound[r, i] >= floor
     # typed, for a literal 0 would have kernels compiled once more
-    z_now = np.int64(-1)
-    filled = np.int64(0)
-    block = np.int64(0)
-    k = np.int64(0)
     r = np.int64(0)
-    # pairs of the run, and how many of them have been taken
-    n_run = np.int64(0)
-    taken = np.int64(0)
-    while True:
-        if taken == n_run:
-            n_run = np.int64(0)
-            taken = np.int64(0)
-            while n_run == 0 and r < n:
-                n_run = _next_run(pairs.bound[r], floor, lanes.run)
+    start = np.int64(0)
+    z_now = np.int64(-1)
+    while r < n:
+        z = pairs.run_key[r] >> (2 * KEY_BITS)
+        if z != z_now:
+            z_now = z
+            agn_products(tables.agn[z], target, pairs.agn_pq, pairs.agn_weighted)
+        filled = np.int64(0)
+        while filled < BLOCK and r < n and pairs.run_key[r] >> (2 * KEY_BITS) == z:
+            if pairs.top[r] >= floor:
+                filled, start = gather(
+                    tables, target, limits, pairs, lanes, r, start, floor, filled
+                )
+            if pairs.top[r] < floor or start == BLOCK:
+                start = np.int64(0)
                 r += 1
-            # after the last run z is -1
-            z = pairs.run_key[r - 1] >> (2 * KEY_BITS) if n_run > 0 else np.int64(-1)
-        whole = False
-        if n_run > 0 and z == z_now:
-            key = pairs.run_key[r - 1]
-            k = key & _MASK
-            block = (key >> KEY_BITS) & _MASK
-            log_agn = target.log_prior[z] + tables.of_agn[at.LOG_AGN, k]
-            if taken == 0:
-                if lanes.known[block] != z + 1:
-                    lanes.known[block] = z + 1
-                    galaxy_products(tables, target, z, block, lanes.pq)
-                run_products(tables, target.bands, pairs, lanes, z, block, k, n_run)
-                rest = log_agn + tables.log_top_frac + pairs.tail_agn[z, k]
-                n_run = _drop(tables, pairs, lanes, r - 1, z, block, n_run, rest, sure)
-                whole = n_run >= _DENSE
-            to = n_run if whole else min(n_run, taken + BLOCK - filled)
-            filled = place(
-                tables, limits, pairs, lanes, z, block, k, taken, to, log_agn, filled, whole
-            )
-            taken = to
-            if not whole and filled < BLOCK:
-                continue
-        if not whole:
-            if filled == 0:
-                if z_now >= 0:
-                    finish_redshift(tables, lanes, sums, z_now)
-                if z < 0:
-                    break
-                z_now = z
-                agn_products(tables.agn[z], target, pairs.agn_pq, pairs.agn_weighted)
-                continue
-            # gathered pairs are evaluated when there is no room for more, or none of the redshift
-            take_gathered(limits, lanes, filled)
-            filled = np.int64(0)
-            k = np.int64(-1)
-        if limits is not None:
-            over = 1e300
-            while over >= 200.0:
-                reached, over = limited_likelihoods(
-                    of_frac, lanes, limits, best[2], request.scale_error, best[0],
-                    request.delta, single,
-                )  # fmt: skip
-                if over >= 200.0:
-                    # far better than the reference, which is found without regard to most limits
-                    best[2] += 2.0 * over
-                    _rescale(sums, lanes, math.exp(-min(over, 700.0)))
-        elif light:
-            reached = single_likelihoods(of_frac, lanes, best[2], request.scale_error, best[0])
-        else:
-            reached = likelihoods(of_frac, lanes, best[2], request.scale_error, best[0])
-        if reached > 0.0:
-            find_best(tables, limits, lanes, sums, z_now)
-        before_all = total[0]
-        added = add_all(lanes, sums, z_now, first)
-        if k >= 0:
-            add_block(tables, lanes, sums, z_now, block, k)
-        else:
-            add_gathered(tables, lanes, sums, z_now, request.thin * (before_all + added) / n_listed)
-        if sums.joint.gk.size + sums.joint.fg.size + sums.joint.fk.size > 0:
-            add_joint(sums.joint, lanes, light, first, of_frac.shape[1])
-        if sums.draws.next.size > 0:
-            draw(tables, limits, lanes, sums, light, z_now, before_all)
-        deposit(tables, limits, lanes, sums, light, z_now, added)
+        if filled > 0:
+            fill_up(lanes, filled)
+            if limits is not None:
+                over = 1e300
+                while over >= 200.0:
+                    reached, over = limited_likelihoods(
+                        of_frac, lanes, limits, best[2], request.scale_error, best[0],
+                        request.delta, single,
+                    )  # fmt: skip
+                    if over >= 200.0:
+                        # far better than the reference, which is found without regard to most limits
+                        best[2] += 2.0 * over
+                        _rescale(sums, lanes, math.exp(-min(over, 700.0)))
+            elif light:
+                reached = single_likelihoods(of_frac, lanes, best[2], request.scale_error, best[0])
+            else:
+                reached = likelihoods(of_frac, lanes, best[2], request.scale_error, best[0])
+            if reached > 0.0:
+                find_best(tables, limits, lanes, sums, z)
+            before = total[0]
+            added = add_pairs(tables, lanes, sums, z, request.thin / n_listed)
+            if sums.joint.gk.size + sums.joint.fg.size + sums.joint.fk.size > 0:
+                add_joint(sums.joint, lanes, light, tables.zero_frac, of_frac.shape[1])
+            if sums.draws.next.size > 0:
+                draw(tables, limits, lanes, sums, light, z, before)
+            deposit(tables, limits, lanes, sums, light, z, added)
+        if r == n or pairs.run_key[r] >> (2 * KEY_BITS) != z:
+            finish_redshift(tables, lanes, sums, z)
 
 
 def _begin(tables, target, limits, pairs, origin):
@@ -274,7 +264,7 @@ def sum_up(tables, scales, request, target, limits, sums, pairs, lanes, *, singl
     best, total = sums.best, sums.total
     best[2] = reference
     if tables.zero_frac == 1 and tables.prior_zero > 0.0:
-        evaluate_alone(
+        _evaluate_alone(
             tables, target, limits, pairs, lanes, sums, request.delta, request.scale_error
         )
     # a bound holds the largest prior of the fractions above 0, a weight those of all
@@ -291,26 +281,24 @@ def sum_up(tables, scales, request, target, limits, sums, pairs, lanes, *, singl
             tables, target, limits, pairs, request.delta, reference, position
         )
         share *= 0.5
-        # bounds are raised for second moments only after a first look
-        pairs.tail_galaxy.fill(0.0)
-        pairs.tail_agn.fill(0.0)
         if limits is not None:
             # a probability many sigma out is not one for single precision
             single = single and max(target.norm + limits.dark - reference, highest) < _MODEST
-        floor, few = first_floor(pairs.bound, n, reference)
+        floor, few = first_floor(pairs, n, reference)
         _evaluate_runs(
-            tables, target, limits, pairs, lanes, sums, request, n, reference, floor, floor,
+            tables, target, limits, pairs, lanes, sums, request, n, reference, floor,
             single and not few,
         )  # fmt: skip
         room = share * request.rtol * total[0]
-        if room > 0.0:
-            tail = (target.norm + 1.0) / request.tail
-            raise_bounds(tables, target, pairs, n, tail, *widest(scales, sums))
+        tail = (target.norm + 1.0) / request.tail
         unit = (
             math.exp(min(0.5 * (reference - best[2]), 600.0)) * prior_sum / max(prior_top, 1e-300)
         )
-        floor, sure = second_floor(pairs.bound, n, reference, room, unit, request.delta)
+        floor = second_floor(
+            tables, target, pairs, n, reference, room, unit, request.delta, tail,
+            widest(scales, sums) if room > 0.0 else None,
+        )  # fmt: skip
         _evaluate_runs(
-            tables, target, limits, pairs, lanes, sums, request, n, reference, floor, sure, single
+            tables, target, limits, pairs, lanes, sums, request, n, reference, floor, single
         )
     return total[0] > 0.0

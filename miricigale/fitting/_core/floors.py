@@ -4,13 +4,12 @@ import math
 
 import numpy as np
 
-from miricigale.fitting._core.pairs import DONE, KEY_BITS
-from miricigale.fitting._core.structs import BLOCK, KERNEL
+from miricigale.fitting._core.functions import log10
+from miricigale.fitting._core.structs import BLOCK, DONE, KERNEL, KEY_BITS, KEY_MASK, PART
 from miricigale.utils.compilation import njit
 
-__all__ = ["first_floor", "raise_bounds", "second_floor"]
+__all__ = ["first_floor", "second_floor"]
 
-_MASK = (1 << KEY_BITS) - 1
 # Steps of the histogram of bounds ...
 _N_LEVELS = 1024
 # ... and how many for each unit of chi2.
@@ -24,34 +23,46 @@ _FEW = 4
 # Below every bound, above `DONE`.
 _ALL = -1e37
 _DECAY = np.exp(-0.5 / _PER_UNIT * np.arange(_N_LEVELS))
+_TWO_LN_10 = 2.0 * math.log(10.0)
 
 
 @njit(**KERNEL)
-def _count(bound, n, reference, lowest, count):
-    """Fill the histogram of the bounds of n runs above the lowest, of shape (2, _N_LEVELS + 1)."""
-    for m in range(2):
-        for j in range(_N_LEVELS + 1):
-            count[m, j] = 0
+def _count(pairs, n, reference, lowest, count):
+    """Add the bounds of n runs that are above the lowest to a histogram."""
     for r in range(n):
-        row = bound[r]
-        for i in range(BLOCK):
-            if row[i] > lowest:
-                column = (reference - row[i]) * _PER_UNIT
-                # neighbors, which are often in the same bin, are counted apart
-                count[i & 1, np.int64(min(max(column, 0.0), _N_LEVELS))] += 1
+        if pairs.top[r] > lowest:
+            _count_run(pairs.bound[r], reference, lowest, count)
 
 
-def first_floor(bound, n, reference):
+@njit(**PART)
+def _count_run(row, reference, lowest, count):
+    """Add the bounds of a run to the histogram."""
+    columns = count[2]
+    for i in range(BLOCK):
+        column = np.int32(min(max((reference - row[i]) * _PER_UNIT, 0.0), _N_LEVELS))
+        # what is not counted goes to columns of no meaning, for a branch would take longer
+        columns[i] = column if row[i] > lowest else np.int32(_N_LEVELS + 1 + i)
+    for i in range(BLOCK):
+        # neighbors, which are often in the same bin, are counted apart
+        count[i & 1, columns[i]] += 1
+
+
+def _make_count():
+    """Make an empty histogram of bounds: twice the bins, and scratch."""
+    return np.zeros((3, _N_LEVELS + 1 + BLOCK), np.int32)
+
+
+def first_floor(pairs, n, reference):
     """
     Least bound to evaluate first, and whether in double precision.
 
     That is where these pairs are few; where many could be as good as the best (``reference``), none
     has much weight.
     """
-    count = np.empty((2, _N_LEVELS + 1), np.int64)
+    count = _make_count()
     # a bin more than are looked at, for rounding
-    _count(bound, n, reference, np.float32(reference - _FIRST - 1.0), count)
-    total = np.cumsum(count[:, : int(_FIRST * _PER_UNIT)].sum(axis=0))
+    _count(pairs, n, reference, np.float32(reference - _FIRST - 1.0), count)
+    total = np.cumsum(count[:2, : int(_FIRST * _PER_UNIT)].sum(axis=0))
     many = np.flatnonzero(total > _MOST)
     if many.size == 0:
         return reference - _FIRST, True
@@ -59,9 +70,9 @@ def first_floor(bound, n, reference):
 
 
 @njit(**KERNEL)
-def raise_bounds(tables, target, pairs, n, room, tail_galaxy, tail_agn):
+def _raise_bounds(tables, target, pairs, n, room, tail_galaxy, tail_agn, reference, count):
     """
-    Raise the bounds of the n listed runs by what second moments ask for.
+    Raise the bounds of the n listed runs by what second moments ask for, and fill their histogram.
 
     A model has s^2 <= R / <G, wG> and power^2 <= R / <A, wA>, R <= |F|^2_w. Their product with
     the quantities' squares is compared with the variances: ``tail_galaxy`` and ``tail_agn`` are from
@@ -74,7 +85,7 @@ def raise_bounds(tables, target, pairs, n, room, tail_galaxy, tail_agn):
         top = max(top, weight[b])
     z_now = np.int64(-1)
     for r in range(n):
-        key = pairs.run_key[r]
+        key, row = pairs.run_key[r], pairs.bound[r]
         z = key >> (2 * KEY_BITS)
         if z != z_now:
             z_now = z
@@ -82,36 +93,38 @@ def raise_bounds(tables, target, pairs, n, room, tail_galaxy, tail_agn):
                 unit = tables.galaxy_unit[z, g]
                 inverse = np.float64(pairs.inverse_norm[z, g])
                 amp = tail_galaxy[g] * room * inverse * inverse / max(unit * unit * top, 1e-300)
-                pairs.tail_galaxy[z, g] = 2.0 * math.log(amp) if amp > 1.0 else 0.0
+                pairs.tail_galaxy[g] = _TWO_LN_10 * log10(amp) if amp > 1.0 else 0.0
             for k in range(tail_agn.size):
                 b2 = 0.0
                 for b in range(weight.size):
                     b2 += tables.agn[z, k, b] * tables.agn[z, k, b] * weight[b]
                 amp = tail_agn[k] * room / b2 if b2 > 0.0 else 0.0
-                pairs.tail_agn[z, k] = 2.0 * math.log(amp) if amp > 1.0 else 0.0
-        start = ((key >> KEY_BITS) & _MASK) * BLOCK
-        more = pairs.tail_agn[z, key & _MASK]
+                pairs.tail_agn[k] = _TWO_LN_10 * log10(amp) if amp > 1.0 else 0.0
+        start = ((key >> KEY_BITS) & KEY_MASK) * BLOCK
+        more = pairs.tail_agn[key & KEY_MASK]
+        highest = DONE
         for i in range(BLOCK):
-            value = pairs.bound[r, i] + (pairs.tail_galaxy[z, start + i] + more)
-            pairs.bound[r, i] = value if pairs.bound[r, i] > DONE else DONE
+            value = row[i] + (pairs.tail_galaxy[start + i] + more)
+            row[i] = value if row[i] > DONE else DONE
+            highest = max(highest, row[i])
+        pairs.top[r] = highest
+        _count_run(row, reference, DONE, count)
 
 
-def second_floor(bound, n, reference, room, unit, delta):
+def second_floor(tables, target, pairs, n, reference, room, unit, delta, tail, widest):
     """
     Least bound to evaluate, once the weight of the best pairs is known.
 
     The weight of a pair is at most ``unit`` times exp((bound - reference) / 2), and ``room`` is what
-    may be left out: the pairs below ``floor`` sum up to no more, and neither would all pairs if they
-    were at ``sure``. A floor is at most ``delta`` below the reference.
+    may be left out: the pairs below the floor sum up to no more. It is at most ``delta`` below the
+    reference. Bounds are raised by what second moments ask for: ``tail`` and ``widest`` are ``room``
+    and both tails of `_raise_bounds`.
     """
     if not room > 0.0:
-        return _ALL, _ALL
-    count = np.empty((2, _N_LEVELS + 1), np.int64)
-    _count(bound, n, reference, DONE, count)
-    count = count.sum(axis=0)
+        return _ALL
+    count = _make_count()
+    _raise_bounds(tables, target, pairs, n, tail, *widest, reference, count)
     # from the lowest up
-    left = np.cumsum((count[:-1] * _DECAY * unit)[::-1])
+    left = np.cumsum((count[:2, :_N_LEVELS].sum(axis=0) * _DECAY * unit)[::-1])
     last = _N_LEVELS - np.searchsorted(left, room, side="right")
-    floor = reference - min(last / _PER_UNIT, delta)
-    whole = math.log(max(count.sum() * unit, 1e-300)) - math.log(room)
-    return floor, min(floor, reference - 2.0 * whole)
+    return reference - min(last / _PER_UNIT, delta)

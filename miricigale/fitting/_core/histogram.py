@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from miricigale.fitting._core import rows as at
+from miricigale.fitting._core import structs as at
 from miricigale.fitting._core.functions import log10
 from miricigale.fitting._core.structs import KERNEL, PART, Scales
 from miricigale.utils.compilation import njit

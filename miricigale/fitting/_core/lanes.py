@@ -7,24 +7,20 @@ s = (p + x a) / (q + 2 x X + x^2 b) and |F|^2_w - chi2 = R = (p + x a) s. Where 
 negative the best scale that is not negative is 0 and R = 0.
 """
 
-from miricigale.fitting._core import rows as at
+from miricigale.fitting._core import structs as at
 from miricigale.fitting._core.functions import exponential
 from miricigale.fitting._core.limits import limited_scale
-from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART
+from miricigale.fitting._core.structs import BLOCK, DONE, KEY_BITS, KEY_MASK, NO_LIGHT, PART
 from miricigale.utils.compilation import njit
 
 __all__ = [
     "best_mixture",
     "best_scale",
+    "fill_up",
     "galaxy_products",
+    "gather",
     "likelihoods",
-    "place",
-    "run_products",
-    "take_gathered",
 ]
-
-# Products of fewer than so many pairs are worked out one by one.
-_FEW = 8
 
 
 @njit(**PART)
@@ -81,113 +77,65 @@ def best_scale(limits, p, q, galaxy, agn, x, floor):
 
 
 @njit(**PART)
-def run_products(tables, bands, pairs, lanes, z, block, k, n_run):
-    """Fill ``lanes.cross`` with <G, wA> and the best R of the galaxies of a run with its AGN model."""
-    cross, pq, run, weighted = lanes.cross, lanes.pq, lanes.run, pairs.agn_weighted
-    a, b = pairs.agn_pq[k, 0], pairs.agn_pq[k, 1]
-    low, high = tables.of_frac[at.RATIO, 0], tables.of_frac[at.RATIO, -1]
-    start = block * BLOCK
-    if n_run < _FEW:
-        for j in range(n_run):
-            i = run[j]
-            t = 0.0
-            for m in bands:
-                t += tables.tiles[z, block, m, i] * weighted[k, m]
-            d = tables.of_galaxy[at.DUST, start + i]
-            cross[0, i] = t
-            cross[1, i] = best_mixture(
-                pq[0, start + i], pq[1, start + i], t, a, b, low * d, high * d
-            )
-        return
-    x, best, tiles = cross[0], cross[1], tables.tiles[z, block]
-    for i in range(BLOCK):
-        x[i] = 0.0
-    m = 0
-    while m + 4 <= bands.size:
-        b0, b1, b2, b3 = bands[m], bands[m + 1], bands[m + 2], bands[m + 3]
-        u0, u1, u2, u3 = weighted[k, b0], weighted[k, b1], weighted[k, b2], weighted[k, b3]
-        t0, t1, t2, t3 = tiles[b0], tiles[b1], tiles[b2], tiles[b3]
-        for i in range(BLOCK):
-            x[i] += t0[i] * u0 + t1[i] * u1 + t2[i] * u2 + t3[i] * u3
-        m += 4
-    while m < bands.size:
-        u0, t0 = weighted[k, bands[m]], tiles[bands[m]]
-        for i in range(BLOCK):
-            x[i] += t0[i] * u0
-        m += 1
-    p, q = pq[0, start : start + BLOCK], pq[1, start : start + BLOCK]
-    dust = tables.of_galaxy[at.DUST, start : start + BLOCK]
-    for i in range(BLOCK):
-        best[i] = best_mixture(p[i], q[i], x[i], a, b, low * dust[i], high * dust[i])
+def gather(tables, target, limits, pairs, lanes, r, start, floor, filled):
+    """
+    Put pairs of run r, from galaxy ``start`` of its block on, whose bound reaches the floor, in lanes.
+
+    They are marked as done. Returned are how many lanes are filled then, and the galaxy to go on with,
+    `BLOCK` if none is left.
+    """
+    key, row = pairs.run_key[r], pairs.bound[r]
+    z, block, k = key >> (2 * KEY_BITS), (key >> KEY_BITS) & KEY_MASK, key & KEY_MASK
+    if lanes.known[block] != z + 1:
+        lanes.known[block] = z + 1
+        galaxy_products(tables, target, z, block, lanes.pq)
+    buffer, of_galaxy, weighted = lanes.buffer, tables.of_galaxy, pairs.agn_weighted[k]
+    a, b, share = pairs.agn_pq[k, 0], pairs.agn_pq[k, 1], tables.of_agn[at.SHARE_AGN, k]
+    log_prior = target.log_prior[z] + tables.of_agn[at.LOG_AGN, k]
+    i = start
+    while i < BLOCK and filled < BLOCK:
+        if row[i] >= floor:
+            row[i] = DONE
+            g = block * BLOCK + i
+            galaxy = tables.galaxy[z, g]
+            x = 0.0
+            for m in range(weighted.size):
+                x += galaxy[m] * weighted[m]
+            d = of_galaxy[at.DUST, g]
+            buffer[at.P + filled] = lanes.pq[0, g]
+            buffer[at.Q + filled] = lanes.pq[1, g]
+            buffer[at.X2 + filled] = 2.0 * x * d
+            buffer[at.A + filled] = a * d
+            buffer[at.B + filled] = b * d * d
+            buffer[at.PRIOR + filled] = log_prior + of_galaxy[at.LOG_GALAXY, g]
+            buffer[at.SHARE + filled] = of_galaxy[at.SHARE_GALAXY, g] * share
+            buffer[at.POWER + filled] = d
+            lanes.index[0, filled] = g
+            lanes.index[1, filled] = k
+            if limits is not None:
+                # fluxes of galaxy and AGN model (for c = 1) in bands with limits
+                n = limits.bands.size
+                for m in range(n):
+                    band, t = limits.bands[m], limits.inverse[m]
+                    lanes.limit[m, filled] = galaxy[band] * t
+                    lanes.limit[n + m, filled] = tables.agn[z, k, band] * t * d
+            filled += 1
+        i += 1
+    return filled, i
 
 
 @njit(**PART)
-def _fill_dead(buffer, index, start):
-    """Fill the lanes from ``start`` on with pairs of no weight."""
-    for i in range(start, BLOCK):
-        for v in range(at.N_INPUT):
-            buffer[v * BLOCK + i] = 0.0
+def fill_up(lanes, filled):
+    """Fill the lanes from ``filled`` on with pairs of no weight."""
+    buffer = lanes.buffer
+    for i in range(filled, BLOCK):
+        for v in (at.A, at.B, at.X2, at.SHARE, at.POWER):
+            buffer[v + i] = 0.0
         buffer[at.P + i] = -1e300
         buffer[at.Q + i] = 1.0
         buffer[at.PRIOR + i] = -1e300
-        index[0, i] = 0
-        index[1, i] = 0
-
-
-@njit(**PART)
-def place(tables, limits, pairs, lanes, z, block, k, first, last, log_agn, filled, whole):
-    """
-    Put pairs of a run, from first to last, in lanes; returns how many are gathered then.
-
-    Those of a ``whole`` block go where their galaxies are in the block, others to those gathered, of
-    which there are ``filled``.
-    """
-    index, run, pq, of_galaxy = lanes.index, lanes.run, lanes.pq, tables.of_galaxy
-    buffer, limit = lanes.pending, lanes.pending_limit
-    if whole:
-        buffer, limit = lanes.buffer, lanes.limit
-        _fill_dead(buffer, index, 0)
-    to = 0 if whole else 2
-    a, b, share = pairs.agn_pq[k, 0], pairs.agn_pq[k, 1], tables.of_agn[at.SHARE_AGN, k]
-    for j in range(first, last):
-        i = run[j] if whole else filled + j - first
-        g = block * BLOCK + run[j]
-        d = of_galaxy[at.DUST, g]
-        buffer[at.P + i] = pq[0, g]
-        buffer[at.Q + i] = pq[1, g]
-        buffer[at.X2 + i] = 2.0 * lanes.cross[0, run[j]] * d
-        buffer[at.A + i] = a * d
-        buffer[at.B + i] = b * d * d
-        buffer[at.PRIOR + i] = log_agn + of_galaxy[at.LOG_GALAXY, g]
-        buffer[at.SHARE + i] = of_galaxy[at.SHARE_GALAXY, g] * share
-        buffer[at.POWER + i] = d
-        index[to, i] = g
-        index[to + 1, i] = k
-        if limits is not None:
-            # fluxes of galaxy and AGN model (for c = 1) in bands with limits
-            n = limits.bands.size
-            for m in range(n):
-                band = limits.bands[m]
-                t = limits.inverse[m]
-                limit[m, i] = tables.galaxy[z, g, band] * t
-                limit[n + m, i] = tables.agn[z, k, band] * t * d
-    return filled if whole else filled + last - first
-
-
-@njit(**PART)
-def take_gathered(limits, lanes, filled):
-    """Move the gathered pairs to the lanes."""
-    buffer, index = lanes.buffer, lanes.index
-    for i in range(at.N_INPUT * BLOCK):
-        buffer[i] = lanes.pending[i]
-    for i in range(BLOCK):
-        index[0, i] = index[2, i]
-        index[1, i] = index[3, i]
-    if limits is not None:
-        for m in range(2 * limits.bands.size):
-            for i in range(BLOCK):
-                lanes.limit[m, i] = lanes.pending_limit[m, i]
-    _fill_dead(buffer, index, filled)
+        lanes.index[0, i] = 0
+        lanes.index[1, i] = 0
 
 
 @njit(**PART)

@@ -18,7 +18,7 @@ import math
 
 import numpy as np
 
-from miricigale.fitting._core import rows as at
+from miricigale.fitting._core import structs as at
 from miricigale.fitting._core.functions import exponential, polynomial
 from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART
 from miricigale.utils.compilation import njit

@@ -15,15 +15,13 @@ single precision can amount to.
 
 import numpy as np
 
-from miricigale.fitting._core import rows as at
+from miricigale.fitting._core import structs as at
 from miricigale.fitting._core.lanes import best_scale
-from miricigale.fitting._core.structs import BLOCK, KERNEL, PART
+from miricigale.fitting._core.structs import BLOCK, DONE, KERNEL, KEY_BITS, PART
 from miricigale.utils.compilation import njit
 
 __all__ = [
-    "DONE",
     "GROUP",
-    "KEY_BITS",
     "ROWS",
     "agn_products",
     "best_of_galaxy",
@@ -33,11 +31,6 @@ __all__ = [
 
 #: Tori handled side by side; arrays of unit vectors are padded with zeros to a multiple.
 GROUP = 4
-#: A run is an AGN model with a block of galaxies at one redshift; its key has so many bits for the
-#: AGN model, as many for the block, and the redshift above.
-KEY_BITS = 20
-#: Bound of a pair that is not listed, or is no more.
-DONE = np.float32(-3e38)
 
 # Rounding of 64 products of unit vectors in float32, generously.
 _ETA = np.float32(3e-6)
@@ -47,7 +40,6 @@ _ALWAYS = np.float32(4.0)
 _NEVER = np.float32(1e30)
 _NOWHERE = np.float32(-1e3)
 _SLACK = np.float32(1e-6)
-_MASK = (1 << KEY_BITS) - 1
 # Vectors of Pairs.rows: <g, t> of GROUP AGN models; of the galaxies the least R / |d|^2 to keep, 2 ln(prior)
 # with that of their best partner, <g, d>, their largest bound, and work space.
 _LEAST, _BASE, _P, _TOP, _ALONE, _REST, _PASS, _SCORE = (i * BLOCK for i in range(GROUP, GROUP + 8))
@@ -276,6 +268,10 @@ def _list_block(pairs, norm, n_used, key, n):
             value = value if rows[_SCORE + i] >= zero else DONE
             bound[i] = value
             rows[_TOP + i] = max(rows[_TOP + i], value)
+        top = DONE
+        for i in range(BLOCK):
+            top = max(top, bound[i])
+        pairs.top[n] = top
         n += 1
     return n
 

@@ -13,7 +13,7 @@ rounding changes a weight by some 1e-7.
 
 import numpy as np
 
-from miricigale.fitting._core import rows as at
+from miricigale.fitting._core import structs as at
 from miricigale.fitting._core.functions import exponential
 from miricigale.fitting._core.structs import BLOCK, NO_LIGHT, PART
 from miricigale.utils.compilation import njit

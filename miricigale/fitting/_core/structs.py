@@ -6,6 +6,9 @@ bundles hold what one kind of work needs. Parts of kernels become part of these,
 passes on bundles costs more than many of them do. Nothing is allocated within kernels, so that
 arrays need no counting of references, which takes as long to compile as all else. Sums may be taken
 in any order, except where digits would be lost.
+
+The names of rows of tables, and of vectors of pairs, are not in ``__all__``: kernels call them
+``at.DUST``, with this module as ``at``.
 """
 
 from typing import NamedTuple
@@ -30,10 +33,34 @@ __all__ = [
     "Target",
 ]
 
-#: Galaxies handled side by side; the tables are padded to a multiple of it.
+#: Galaxies, or pairs, handled side by side; the tables of galaxies are padded to a multiple of it.
 BLOCK = 64
+#: A run is an AGN model with a block of galaxies at one redshift; its key has so many bits for the
+#: AGN model, as many for the block, and the redshift above.
+KEY_BITS = 20
+KEY_MASK = (1 << KEY_BITS) - 1
+#: Bound of a pair that is not listed, or is no more.
+DONE = np.float32(-3e38)
 #: A model with <m, wm> below this has no light in the used bands.
 NO_LIGHT = 1e-290
+
+#: Rows of ``Tables.of_galaxy``: dust luminosity in W for each solar mass formed and its log10 (-400
+#: where it is 0), 2 ln(prior), the galaxy's parts of the other fraction and of the quantity of both.
+DUST, LOG_DUST, LOG_GALAXY, SHARE_GALAXY, MIXED_GALAXY = range(5)
+#: Rows of ``Tables.of_agn``: 2 ln(prior), the AGN model's parts of these.
+LOG_AGN, SHARE_AGN, MIXED_AGN = range(3)
+#: Rows of ``Tables.of_frac``, fractions above 0: c = f / (1 - f), its log10 in bins, prior,
+#: 2 ln(prior), c at the edges of the fractions' cells.
+RATIO, LOG_RATIO, PRIOR_FRAC, LOG_FRAC, EDGE_LOW, EDGE_HIGH = range(6)
+
+#: Offsets of the vectors in Lanes.buffer, which lets the compiler see that they do not overlap. What
+# the pairs are, with A, X and B for x = c ...
+P, Q, X2, A, B, PRIOR, SHARE, POWER = (i * BLOCK for i in range(8))
+# ... sums over the fractions of prior * likelihood l, l s, l s^2, l c s, l c s^2, l c^2 s^2, the
+# other fraction phi and its square, l of s = 0 and l (s / sigma_s)^2; the largest R, work space.
+W0, W1, W2, V1, U2, V2, F1, F2, WZ, WR, TOP, T = (i * BLOCK for i in range(8, 20))
+#: Length of the whole buffer.
+SIZE = 20 * BLOCK
 
 #: Kernels called from Python.
 KERNEL = {
@@ -175,13 +202,14 @@ class Pairs(NamedTuple):
 
     run_key: np.ndarray  # int64 (capacity,): redshift, block of galaxies and AGN model of a run
     bound: np.ndarray  # float32 (capacity, BLOCK): bounds of its pairs, DONE where none
+    top: np.ndarray  # float32 (capacity,): at least the largest of them
     promise: np.ndarray  # float64 (nz,): what galaxies alone reach there
     order: np.ndarray  # int64 (nz,): redshifts, the most promising first
     galaxy_of: np.ndarray  # int64 (nz,): the galaxy that does; -1 where none is usable
     p32: np.ndarray  # float32 (nz, n_padded): <g, d>
     inverse_norm: np.ndarray  # float32 (nz, n_padded): 1 / |g|
-    tail_galaxy: np.ndarray  # float32 (nz, n_padded): what a pair's bound is raised by for
-    tail_agn: np.ndarray  # float32 (nz, nA): second moments
+    tail_galaxy: np.ndarray  # float32 (n_padded,): what bounds of one redshift are raised by for
+    tail_agn: np.ndarray  # float32 (nA,): second moments
     agn_pq: np.ndarray  # float64 (nA, 2): <A, wF>, <A, wA> of one redshift
     agn_weighted: np.ndarray  # float64 (nA, nb): w A
     unit_agn: np.ndarray  # float32 (n, nb + 2): unit vectors t of AGN models
@@ -195,14 +223,11 @@ class Lanes(NamedTuple):
 
     buffer: np.ndarray  # float64 (SIZE,): vectors of the pairs being evaluated
     single: np.ndarray  # float32 (single_size(nf),): the same in single precision
-    pending: np.ndarray  # float64 (N_INPUT * BLOCK,): the first of them, of gathered pairs
-    index: np.ndarray  # int64 (4, BLOCK): galaxies and AGN models of the pairs; of gathered ones
-    run: np.ndarray  # int64 (BLOCK,): galaxies of a block that a run is about
+    index: np.ndarray  # int64 (2, BLOCK): galaxies and AGN models of the pairs
     weight: np.ndarray  # float64 (nf * BLOCK,): prior * likelihood
     frac_sum: np.ndarray  # float64 (nf > 0,)
     pq: np.ndarray  # float64 (2, n_padded): <G, wF> and <G, wG> of one redshift
     known: np.ndarray  # int64 (n_blocks,): redshift + 1 for which they hold
-    cross: np.ndarray  # float64 (2, BLOCK): products of a block with an AGN model, best R
     galaxy_z: np.ndarray  # float64 (3, n_padded): sums over one redshift
     agn_z: np.ndarray  # float64 (3, nA)
     limited: np.ndarray  # float64 (LIMITED_SIZE,): vectors of scales with limits
@@ -210,4 +235,3 @@ class Lanes(NamedTuple):
     left: np.ndarray  # float64 (nf * BLOCK,): what limits left of the scales of earlier pairs
     limit: np.ndarray  # float64 (2 nb, BLOCK): fluxes in bands with limits
     limit32: np.ndarray  # float32 (2 nb, BLOCK): the same over the unit of the scale
-    pending_limit: np.ndarray  # float64 (2 nb, BLOCK): those of gathered pairs

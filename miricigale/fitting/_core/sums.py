@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from miricigale.fitting._core import rows as at
+from miricigale.fitting._core import structs as at
 from miricigale.fitting._core.histogram import add_model
 from miricigale.fitting._core.lanes import best_mixture, best_scale
 from miricigale.fitting._core.single import pair_weight
@@ -13,10 +13,8 @@ from miricigale.utils.compilation import njit
 
 __all__ = [
     "PARTS",
-    "add_all",
-    "add_block",
-    "add_gathered",
     "add_joint",
+    "add_pairs",
     "deposit",
     "draw",
     "find_best",
@@ -77,32 +75,19 @@ def find_best(tables, limits, lanes, sums, z):
 def finish_redshift(tables, lanes, sums, z):
     """Add what was summed up over one redshift to the sums over all, and begin anew."""
     galaxy_z, agn_z, band = lanes.galaxy_z, lanes.agn_z, sums.band
-    zg, zk = sums.joint.zg, sums.joint.zk
-    n_galaxy, n_bands = tables.galaxy.shape[1], band.shape[1]
-    for block in range(tables.tiles.shape[1]):
-        start = block * BLOCK
-        used = 0.0
-        for i in range(BLOCK):
-            used = max(used, galaxy_z[0, start + i])
-        if not used > 0.0:
+    zg, zk, n_bands = sums.joint.zg, sums.joint.zk, band.shape[1]
+    for g in range(tables.galaxy.shape[1]):
+        if not galaxy_z[0, g] > 0.0:
             continue
-        for g in range(start, min(start + BLOCK, n_galaxy)):
-            for m in range(3):
-                sums.galaxy[g, m] += galaxy_z[m, g]
-            if zg.size > 0:
-                zg[z, g] += galaxy_z[0, g]
+        if zg.size > 0:
+            zg[z, g] += galaxy_z[0, g]
         for b in range(n_bands):
-            first = 0.0
-            second = 0.0
-            for i in range(BLOCK):
-                t = tables.tiles[z, block, b, i]
-                first += galaxy_z[1, start + i] * t
-                second += galaxy_z[2, start + i] * t * t
-            band[0, b] += first
-            band[1, b] += second
+            t = tables.galaxy[z, g, b]
+            band[0, b] += galaxy_z[1, g] * t
+            band[1, b] += galaxy_z[2, g] * t * t
         for m in range(3):
-            for i in range(BLOCK):
-                galaxy_z[m, start + i] = 0.0
+            sums.galaxy[g, m] += galaxy_z[m, g]
+            galaxy_z[m, g] = 0.0
     for k in range(agn_z.shape[1]):
         if not agn_z[0, k] > 0.0:
             continue
@@ -118,11 +103,17 @@ def finish_redshift(tables, lanes, sums, z):
 
 
 @njit(**PART)
-def add_all(lanes, sums, z, first):
-    """Add what needs no index; returns the weight of all pairs in the lanes."""
+def add_pairs(tables, lanes, sums, z, thin):
+    """
+    Add the pairs in the lanes; returns their weight.
+
+    Those of a weight below ``thin`` times that of all pairs so far are left out of the correlation of
+    galaxy and AGN in model fluxes, and of nothing else.
+    """
     buffer, frac_sum, total = lanes.buffer, lanes.frac_sum, sums.total
+    galaxy_z, agn_z, band = lanes.galaxy_z, lanes.agn_z, sums.band
     for j in range(frac_sum.size):
-        sums.zf[z, j + first] += frac_sum[j]
+        sums.zf[z, j + tables.zero_frac] += frac_sum[j]
     weight = 0.0
     total_r = 0.0
     total_zero = 0.0
@@ -142,64 +133,7 @@ def add_all(lanes, sums, z, first):
     total[4] += share_1
     total[5] += share_2
     sums.best[3] += n_alive * frac_sum.size
-    return weight
-
-
-@njit(**PART)
-def add_block(tables, lanes, sums, z, block, k):
-    """Add a block of galaxies with one AGN model."""
-    buffer, agn_z, band = lanes.buffer, lanes.agn_z, sums.band
-    start = block * BLOCK
-    for i in range(BLOCK):
-        lanes.galaxy_z[0, start + i] += buffer[at.W0 + i]
-        lanes.galaxy_z[1, start + i] += buffer[at.W1 + i]
-        lanes.galaxy_z[2, start + i] += buffer[at.W2 + i]
-        # from here on the correlation of galaxy and AGN
-        buffer[at.U2 + i] *= buffer[at.POWER + i]
-    # sums apart from stores: see `agn_products`
-    y0 = 0.0
-    y1 = 0.0
-    y2 = 0.0
-    cross = 0.0
-    for i in range(BLOCK):
-        power = buffer[at.POWER + i]
-        y0 += buffer[at.W0 + i]
-        y1 += buffer[at.V1 + i] * power
-        y2 += buffer[at.V2 + i] * power * power
-        cross += buffer[at.U2 + i] * tables.of_galaxy[at.MIXED_GALAXY, start + i]
-    sums.total[3] += cross * tables.of_agn[at.MIXED_AGN, k]
-    agn_z[0, k] += y0
-    agn_z[1, k] += y1
-    agn_z[2, k] += y2
-    tiles, n = tables.tiles[z, block], band.shape[1]
-    for m in range(0, n, 3):
-        # three at a time; a last one or two go with the last again
-        m1, m2 = min(m + 1, n - 1), min(m + 2, n - 1)
-        row0, row1, row2 = tiles[m], tiles[m1], tiles[m2]
-        t0 = 0.0
-        t1 = 0.0
-        t2 = 0.0
-        for i in range(BLOCK):
-            u = buffer[at.U2 + i]
-            t0 += u * row0[i]
-            t1 += u * row1[i]
-            t2 += u * row2[i]
-        band[1, m] += 2.0 * t0 * tables.agn[z, k, m]
-        if m1 > m:
-            band[1, m1] += 2.0 * t1 * tables.agn[z, k, m1]
-        if m2 > m1:
-            band[1, m2] += 2.0 * t2 * tables.agn[z, k, m2]
-
-
-@njit(**PART)
-def add_gathered(tables, lanes, sums, z, least):
-    """
-    Add gathered pairs.
-
-    Those of a weight below ``least`` are left out of the correlation of galaxy and AGN in model
-    fluxes, and of nothing else.
-    """
-    buffer, galaxy_z, agn_z, band = lanes.buffer, lanes.galaxy_z, lanes.agn_z, sums.band
+    least = thin * total[0]
     total_cross = 0.0
     for i in range(BLOCK):
         w = buffer[at.W0 + i]
@@ -219,7 +153,8 @@ def add_gathered(tables, lanes, sums, z, least):
             cross *= 2.0
             for m in range(band.shape[1]):
                 band[1, m] += cross * tables.galaxy[z, g, m] * tables.agn[z, k, m]
-    sums.total[3] += total_cross
+    total[3] += total_cross
+    return weight
 
 
 @njit(**PART)

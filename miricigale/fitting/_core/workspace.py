@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from miricigale.fitting._core import rows as at
+from miricigale.fitting._core import structs as at
 from miricigale.fitting._core.histogram import N_BINS, N_SHARE, clear_rows
 from miricigale.fitting._core.limits import LIMITED_SIZE
 from miricigale.fitting._core.pairs import GROUP, ROWS
@@ -83,13 +83,14 @@ def make_workspace(n_z, n_galaxy, n_agn, n_frac, n_bands, zero_frac, capacity):
     return Pairs(
         run_key=np.empty(capacity, np.int64),
         bound=aligned(capacity, BLOCK, dtype=single),
+        top=aligned(capacity, dtype=single),
         promise=aligned(n_z),
         order=np.zeros(n_z, np.int64),
         galaxy_of=np.zeros(n_z, np.int64),
         p32=aligned(n_z, n_padded, dtype=single),
         inverse_norm=aligned(n_z, n_padded, dtype=single),
-        tail_galaxy=aligned(n_z, n_padded, dtype=single),
-        tail_agn=aligned(n_z, n_agn, dtype=single),
+        tail_galaxy=aligned(n_padded, dtype=single),
+        tail_agn=aligned(n_agn, dtype=single),
         agn_pq=aligned(n_agn, 2),
         agn_weighted=aligned(n_agn, n_bands),
         unit_agn=aligned(-(-n_agn // GROUP) * GROUP, n_bands + 2, dtype=single),
@@ -99,14 +100,11 @@ def make_workspace(n_z, n_galaxy, n_agn, n_frac, n_bands, zero_frac, capacity):
     ), Lanes(
         buffer=aligned(at.SIZE),
         single=aligned(single_size(n_frac), dtype=single),
-        pending=aligned(at.N_INPUT * BLOCK),
-        index=np.zeros((4, BLOCK), np.int64),
-        run=np.zeros(BLOCK, np.int64),
+        index=np.zeros((2, BLOCK), np.int64),
         weight=aligned(n_frac * BLOCK),
         frac_sum=aligned(n_frac - zero_frac),
         pq=aligned(2, n_padded),
         known=np.zeros(n_blocks, np.int64),
-        cross=aligned(2, BLOCK),
         galaxy_z=aligned(3, n_padded),
         agn_z=aligned(3, n_agn),
         limited=aligned(LIMITED_SIZE),
@@ -114,7 +112,6 @@ def make_workspace(n_z, n_galaxy, n_agn, n_frac, n_bands, zero_frac, capacity):
         left=aligned(n_frac * BLOCK),
         limit=aligned(2 * n_bands, BLOCK),
         limit32=aligned(2 * n_bands, BLOCK, dtype=single),
-        pending_limit=aligned(2 * n_bands, BLOCK),
     )
 
 

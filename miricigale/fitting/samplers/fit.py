@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from miricigale.filters import FilterSet
-from miricigale.fitting.flags import FitFlags
+from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import cell_edges, check_pairs
 from miricigale.fitting.priors import GridAxis
 from miricigale.fitting.quantities import DERIVED_LEVELS

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from miricigale.fitting.flags import FitFlags
+from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.priors import integrals, integrals_to, known_redshifts, read_density
 from miricigale.utils.exceptions import argument_error, unknown_name

@@ -21,6 +21,7 @@ All integrations of a pixel share one slope and one Poisson variance.
 
 from miricigale.reduction._core.drawing import draw_slopes, hit_slopes, tabulate, variances
 from miricigale.reduction._core.pixel import (
+    DO_NOT_USE,
     JUMP,
     JUMP_NEIGHBOR,
     SATURATED,
@@ -30,6 +31,7 @@ from miricigale.reduction._core.rows import BLOCK, fit_rows
 
 __all__ = [
     "BLOCK",
+    "DO_NOT_USE",
     "JUMP",
     "JUMP_NEIGHBOR",
     "SATURATED",

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from miricigale.reduction._core.pixel import X_MIN, fit_pixel, gather, linear, store
+from miricigale.reduction._core.pixel import X_MIN, at, fit_pixel, gather, store
 from miricigale.utils.compilation import njit
 
 __all__ = ["BLOCK", "fit_rows"]
@@ -14,16 +14,14 @@ BLOCK = 64
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def fit_rows(
     data,
-    offset,
-    coef,
-    saturation,
+    levels,
+    response,
     usable,
     y0,
     y1,
     g0,
     g1,
-    s,
-    inv_gain,
+    noise,
     scale,
     threshold,
     rate,
@@ -36,17 +34,32 @@ def fit_rows(
     """
     Fit the ramps of rows ``y0`` to ``y1``, groups ``g0`` to ``g1``, and find their jumps.
 
-    ``data`` are DN as read, (n_int, n_group, ny, nx); ``offset`` (n_int, n_group) is subtracted
-    before the polynomial ``coef`` (ascending) makes them linear. A group from ``saturation`` (raw
-    DN) and all after it are dropped, and pixels that are not ``usable`` get NaN. ``s`` is the
-    variance of one read in DN^2, ``inv_gain`` times the slope the Poisson variance of a
-    difference, ``scale`` the inverse group time, and jumps are cut above ``threshold`` sigma. The
-    images ``rate`` to ``dq`` are filled in place.
+    ``data`` are DN as read, (n_int, n_group, ny, nx). Maps of pixels are (ny, nx) or, where all
+    are alike, (1, 1), also within larger arrays:
+
+    ``levels``: drift (n_int, n_group, 1 or ny, 1 or 4: the channels that columns belong to in
+    turn), bias (map) and reset anomaly (integrations, groups, ny, nx), which are subtracted. The
+    last integration of the anomaly stands for all further ones, and groups beyond it have none.
+
+    ``response``: coefficients (ascending, each a map) of the polynomial that makes them linear;
+    saturation (map): a group from it (raw DN) and all after it are dropped; dark signal
+    (integrations, groups, ny, nx), subtracted last. Anomaly and dark of no groups are none.
+
+    ``noise``: variance of one read in DN^2, and what times the slope is the Poisson variance of a
+    difference (maps).
+
+    Pixels that are not ``usable`` get NaN. ``scale`` is the inverse group time, and jumps are cut
+    above ``threshold`` sigma. The images ``rate`` to ``dq`` are filled in place.
 
     Returns an array (n_event, 5): y, x, integration, difference (counted from ``g0``) and signed
     significance of each jump.
     """
+    drift, bias, reset = levels
+    coefficients, limits, dark = response
+    variances, poisson = noise
     n_int, _, _, nx = data.shape
+    n_coef = coefficients.shape[0]
+    n_channel = drift.shape[3]
     n_diff = g1 - g0 - 1
     n_all = n_int * n_diff
     thr2 = threshold * threshold
@@ -56,7 +69,14 @@ def fit_rows(
     f = np.empty((n_diff + 2, BLOCK))
     h = np.empty((n_diff + 2, BLOCK))
     tmp = np.empty((n_diff + 1, BLOCK))
+    coef = np.empty((n_coef, BLOCK))
+    start = np.empty(BLOCK)
+    level = np.empty(BLOCK)
+    value = np.empty(BLOCK)
     before = np.empty(BLOCK)
+    saturation = np.empty(BLOCK)
+    s = np.empty(BLOCK)
+    inv_gain = np.empty(BLOCK)
     top = np.empty(BLOCK)
     slope = np.empty(BLOCK)
     v = np.empty(BLOCK)
@@ -87,24 +107,50 @@ def fit_rows(
             nb = min(BLOCK, nx - x0)
             top[:] = 0.0
             mean[:, :] = 0.0
+            # of these pixels, and of the last one again behind the edge
+            for b in range(BLOCK):
+                x = min(x0 + b, nx - 1)
+                start[b] = at(bias, y, x)
+                saturation[b] = at(limits, y, x)
+                s[b] = at(variances, y, x)
+                inv_gain[b] = at(poisson, y, x)
+                for j in range(n_coef):
+                    coef[j, b] = at(coefficients[j], y, x)
             for k in range(n_int):
                 for g in range(g0, g1):
-                    off = offset[k, g]
-                    row = data[k, g, y]
-                    if g == g0:
-                        for b in range(nb):
-                            raw = float(row[x0 + b])
-                            top[b] = raw if raw > top[b] else top[b]
-                            before[b] = linear(raw - off, coef)
+                    shift = drift[k, g, y if drift.shape[2] > 1 else 0]
+                    if n_channel == 1:
+                        off = shift[0]
+                        for b in range(BLOCK):
+                            level[b] = off + start[b]
                     else:
+                        for b in range(BLOCK):
+                            level[b] = shift[b % n_channel] + start[b]
+                    if g < reset.shape[1]:
+                        row = reset[min(k, reset.shape[0] - 1), g, y]
+                        for b in range(nb):
+                            level[b] += row[x0 + b]
+                    row = data[k, g, y]
+                    for b in range(nb):
+                        raw = float(row[x0 + b])
+                        top[b] = raw if raw > top[b] else top[b]
+                        level[b] = raw - level[b]
+                    for b in range(BLOCK):
+                        value[b] = coef[n_coef - 1, b]
+                    for j in range(n_coef - 2, -1, -1):
+                        for b in range(BLOCK):
+                            value[b] = value[b] * level[b] + coef[j, b]
+                    if dark.shape[1] > 0:
+                        row = dark[min(k, dark.shape[0] - 1), g, y]
+                        for b in range(nb):
+                            value[b] -= row[x0 + b]
+                    if g > g0:
                         i = k * n_diff + g - g0 - 1
                         for b in range(nb):
-                            raw = float(row[x0 + b])
-                            top[b] = raw if raw > top[b] else top[b]
-                            value = linear(raw - off, coef)
-                            d[i, b] = value - before[b]
-                            mean[i - k * n_diff, b] += value - before[b]
-                            before[b] = value
+                            d[i, b] = value[b] - before[b]
+                            mean[i - k * n_diff, b] += value[b] - before[b]
+                    for b in range(nb):
+                        before[b] = value[b]
             for b in range(nb, BLOCK):
                 d[:, b] = 0.0
             # start with the plain mean, then twice the weights of the last slope
@@ -116,15 +162,15 @@ def fit_rows(
                 slope[b] = sw[b] / n_all
             for _ in range(2):
                 for b in range(BLOCK):
-                    vv = slope[b] * inv_gain
-                    low = X_MIN * s
+                    vv = slope[b] * inv_gain[b]
+                    low = X_MIN * s[b]
                     vv = vv if vv > low else low
                     v[b] = vv
-                    xx = vv / s
+                    xx = vv / s[b]
                     q = 0.5 * xx + np.sqrt(xx + 0.25 * xx * xx)
                     lam[b] = 1.0 / (1.0 + q)
                     eps[b] = q / (1.0 + q)
-                    inv_d[b] = (1.0 + q) / (s * q * (2.0 + q))
+                    inv_d[b] = (1.0 + q) / (s[b] * q * (2.0 + q))
                     f[0, b] = 0.0
                     sw[b] = 0.0
                     sw2[b] = 0.0
@@ -177,7 +223,7 @@ def fit_rows(
                     var_poisson[y, x] = np.nan
                     var_read[y, x] = np.nan
                     continue
-                if top[b] < saturation and crit[b] <= 0.0:
+                if top[b] < saturation[b] and crit[b] <= 0.0:
                     var = 1.0 / (sw[b] * norm[b] * n_int)
                     vp = v[b] * sw2[b] * norm[b] * norm[b] * n_int * var * var
                     rate[y, x] = slope[b] * scale
@@ -185,17 +231,17 @@ def fit_rows(
                     var_read[y, x] = max(var - vp, 0.0) * scale * scale
                     n_used[y, x] = n_all
                     continue
-                if top[b] < saturation:
+                if top[b] < saturation[b]:
                     saturated = False
                     valid[:] = n_diff
                     for i in range(n_all):
                         d1[i] = d[i, b]
                 else:
-                    saturated = gather(data, offset, coef, saturation, y, x, g0, g1, d1, valid)
+                    saturated = gather(data, levels, response, y, x, g0, g1, d1, valid)
                 cut[:] = False
                 result = fit_pixel(
-                    d1, cut, valid, n_diff, s, inv_gain, threshold, f1, tmp1, first, last, found
-                )
+                    d1, cut, valid, n_diff, s[b], inv_gain[b], threshold, f1, tmp1, first, last, found,
+                )  # fmt: skip
                 store(
                     y, x, scale, result, saturated, False,
                     rate, var_poisson, var_read, n_used, n_jump, dq,

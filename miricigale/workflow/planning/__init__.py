@@ -1,4 +1,4 @@
-"""What exposures would yield, without images: noise, fits of mock photometry, times."""
+"""What exposures would yield: noise or images, fits of mock photometry, times."""
 
 from miricigale.utils.lazy import lazy_names
 
@@ -7,6 +7,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     {
         "config": ("PlanConfig", "load_plan"),
         "exposures": ("BandPlan", "wall_clock"),
+        "images": ("image_sample", "images_study", "paired_bands", "paired_numbers"),
         "page": ("write_page",),
         "planner": ("Plan", "Planner"),
         "compare": ("area_table", "comparison_table"),

@@ -1,19 +1,14 @@
 """Options of a plan: frozen dataclasses from TOML, like those of a run."""
 
 import dataclasses
+from typing import ClassVar
 
 from miricigale.instrument import CEERS_FILTERS, imager_filters, readout_patterns
 from miricigale.photometry import YANG2021_DEPTHS
 from miricigale.utils.exceptions import unknown_name
-from miricigale.workflow.config import CatalogSection, SedSection
-from miricigale.workflow.options import (
-    from_text,
-    option,
-    read_text,
-    replace_sections,
-    require,
-    sections_toml,
-)
+from miricigale.workflow.background import LEVELS_DOC, check_levels
+from miricigale.workflow.options import Configuration, option, read_text, require
+from miricigale.workflow.sections import CatalogSection, SedSection
 
 __all__ = ["PlanConfig", "load_plan"]
 
@@ -102,7 +97,7 @@ class ExposureSection:
 class BackgroundSection:
     """The sky."""
 
-    level: str = option("low", "Zodiacal light.", choices=("low", "medium", "high"))
+    level: tuple[str, ...] = option(("low",), LEVELS_DOC, single=True)
     ra: float = option(-1.0, "Right ascension in degrees; -1: no position.", low=-1, high=360)
     dec: float = option(0.0, "Declination in degrees.", low=-90, high=90)
     date: str = option("", "Day, such as 2027-03-01, instead of a level (needs zodipy).")
@@ -129,6 +124,22 @@ class NoiseSection:
         0.03, "Part of the flux added in quadrature (templates, blends).", low=0.0, high=1.0
     )
     sizes: bool = option(True, "Whether errors grow with the half-light radii of the sources.")
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageSection:
+    """Images of the planned exposures, measured as in a run, beside the noise of the section above."""
+
+    enabled: bool = option(False, "Whether the exposures are imaged and measured too.")
+    kind: str = option("rates", "As of the exposures of a run.", choices=("rates", "ramps"))
+    ra: float = option(
+        -1.0,
+        "Right ascension of the pointing in degrees; -1: the middle of the catalog.",
+        low=-1,
+        high=360,
+    )
+    dec: float = option(0.0, "Declination in degrees.", low=-90, high=90)
+    roll: float = option(0.0, "Position angle of V3 in degrees.", low=-360, high=360)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,22 +173,47 @@ class SurveySection:
 class OverheadSection:
     """What the observatory charges besides the exposures, in s: approximations to APT."""
 
-    # JWST user documentation: "JWST Instrument Overheads" (APT 2023.3.4: script, exposure, filter and
-    # visit of MIRI imaging), "Visit Timing" (guide star), "JWST Observing Overheads Summary"
-    # (observatory). Slews and dither are from memory: APT takes them from the distances.
-    slew: float = option(1800.0, "Slew to the first pointing.", low=0.0)
-    next_slew: float = option(150.0, "Slew to a neighboring pointing.", low=0.0)
-    guide_star: float = option(284.0, "Acquisition of the guide star of each pointing.", low=0.0)
-    visit: float = option(90.0, "Scripts and cleanup of each pointing.", low=0.0)
-    filter: float = option(50.0, "Move of the filter wheel, each band.", low=0.0)
-    script: float = option(22.0, "Compilation of scripts, each band.", low=0.0)
-    exposure: float = option(44.0, "Set-up and cleanup of each exposure.", low=0.0)
-    dither: float = option(60.0, "Small angle maneuver between dithers.", low=0.0)
-    observatory: float = option(0.16, "Part added to all of it.", low=0.0, high=1.0)
+    # JDox is the JWST user documentation; its "JWST Instrument Overheads" are of APT 2023.3.4
+    slew: float = option(
+        1800.0, "Slew to the first pointing (as in reports of APT's Smart Accounting).", low=0.0
+    )
+    next_slew: float = option(
+        150.0,
+        "Slew to a neighboring pointing; of our own: such reports have 51 s to the next visit of a "
+        "target, and 169 s with another roll.",
+        low=0.0,
+    )
+    guide_star: float = option(
+        284.0, "Acquisition of the guide star of each pointing (JDox, Visit Timing).", low=0.0
+    )
+    visit: float = option(
+        90.0, "Scripts and cleanup of each pointing (JDox, JWST Instrument Overheads).", low=0.0
+    )
+    filter: float = option(
+        50.0, "Move of the filter wheel, each band (JDox, JWST Instrument Overheads).", low=0.0
+    )
+    script: float = option(
+        22.0, "Compilation of scripts, each band (JDox, JWST Instrument Overheads).", low=0.0
+    )
+    exposure: float = option(
+        44.0,
+        "Set-up and cleanup of each exposure (JDox, JWST Instrument Overheads: of the first of several "
+        "dithers; APT charges less for the others).",
+        low=0.0,
+    )
+    dither: float = option(
+        60.0,
+        "Small angle maneuver between dithers; of our own: APT takes it from the distance (JDox, JWST "
+        "Slew Times and Overheads).",
+        low=0.0,
+    )
+    observatory: float = option(
+        0.16, "Part added to all of it (JDox, JWST Observing Overheads Summary).", low=0.0, high=1.0
+    )
 
 
 @dataclasses.dataclass(frozen=True)
-class PlanConfig:
+class PlanConfig(Configuration):
     """
     Everything that a plan depends on; each attribute is a section of the TOML file.
 
@@ -189,6 +225,10 @@ class PlanConfig:
         If a band is none of MIRI's imager.
     """
 
+    heading: ClassVar = (
+        "# miricigale plan configuration; 'miricigale plan --config FILE' takes it back"
+    )
+
     plan: PlanSection = dataclasses.field(default_factory=PlanSection)
     catalog: CatalogSection = dataclasses.field(default_factory=CatalogSection)
     sample: SampleSection = dataclasses.field(default_factory=SampleSection)
@@ -197,6 +237,7 @@ class PlanConfig:
     exposures: ExposureSection = dataclasses.field(default_factory=ExposureSection)
     background: BackgroundSection = dataclasses.field(default_factory=BackgroundSection)
     noise: NoiseSection = dataclasses.field(default_factory=NoiseSection)
+    images: ImageSection = dataclasses.field(default_factory=ImageSection)
     fit: FitSection = dataclasses.field(default_factory=FitSection)
     survey: SurveySection = dataclasses.field(default_factory=SurveySection)
     overheads: OverheadSection = dataclasses.field(default_factory=OverheadSection)
@@ -230,15 +271,27 @@ class PlanConfig:
             good = len(span) == 2 and span[0] < span[1]
             require(good, "sample", name, "must be two numbers in order", list(span))
         background = self.background
+        check_levels("background", "level", background.level, n, background.date)
         good = not background.date or background.ra >= 0
         wanted = "must come with a position (ra, dec)"
         require(good, "background", "date", wanted, repr(background.date))
         good = self.noise.kind != "run" or self.noise.run
         require(good, "noise", "run", "must be a folder with kind = 'run'", "none")
+        if self.images.enabled:
+            self._check_images()
         for name in exposures.sets:
             unknown = [band for band in self.set_bands(name) if band not in bands]
             wanted = f"must be 'all' or bands of {bands}"
             require(not unknown, "exposures", "sets", wanted, repr(name))
+
+    def _check_images(self):
+        """What images cannot do."""
+        wanted = "must be left out with [images], which need positions"
+        named = self.sample.luminosity_function
+        require(not named, "sample", "luminosity_function", wanted, repr(named))
+        readout = self.exposures.readout
+        wanted = "must be FASTR1 with [images], as of a run"
+        require(readout == "FASTR1", "exposures", "readout", wanted, repr(readout))
 
     def set_bands(self, name):
         """Bands of one of the ``sets``, in order of wavelength."""
@@ -248,30 +301,6 @@ class PlanConfig:
         found = [one if one.startswith("miri.") else f"miri.{one}" for one in found]
         order = imager_filters()
         return tuple(sorted(found, key=lambda one: order.index(one) if one in order else -1))
-
-    @classmethod
-    def from_dict(cls, values, *, base=None):
-        """
-        Make a configuration from nested dictionaries.
-
-        Parameters
-        ----------
-        values : dict of dict
-            Sections and their keys; what is absent keeps the value of ``base``.
-        base : `PlanConfig`, optional
-            Where absent keys come from; the defaults if not given.
-
-        Raises
-        ------
-        `~miricigale.utils.exceptions.ConfigError`
-            For an unknown section or key, a wrong type, or a value outside its limits.
-        """
-        return replace_sections(base or cls(), values)
-
-    def to_toml(self):
-        """The whole configuration as TOML, each key with its documentation."""
-        heading = "# miricigale plan configuration; 'miricigale plan --config FILE' takes it back"
-        return sections_toml(self, heading)
 
 
 def load_plan(path=None, *, overrides=None):
@@ -294,7 +323,5 @@ def load_plan(path=None, *, overrides=None):
     `~miricigale.utils.exceptions.ConfigError`
         If the file is missing, not TOML, or holds an unknown or wrong key.
     """
-    config = PlanConfig()
-    if path is not None:
-        config = from_text(str(path), read_text(path), config)
-    return PlanConfig.from_dict(overrides, base=config) if overrides else config
+    texts = [] if path is None else [(str(path), read_text(path))]
+    return PlanConfig.from_texts(texts, overrides)

@@ -14,13 +14,13 @@ from miricigale.depth import (
     saturation_time,
     scaled_limit,
     sensitivity,
-    zodiacal_factor,
 )
-from miricigale.instrument import Exposure, background_level, frame_time
+from miricigale.instrument import Exposure, frame_time
 from miricigale.photometry import ErrorModel
 from miricigale.utils.exceptions import ConfigError, DataError
+from miricigale.workflow.background import band_background
 
-__all__ = ["BandPlan", "RunErrors", "band_plans", "wall_clock"]
+__all__ = ["BandPlan", "RunErrors", "background_options", "band_plans", "wall_clock"]
 
 #: The plan needs no direction; an `Exposure` has one.
 _ANYWHERE = {"pointing": SkyCoord(0 * u.deg, 0 * u.deg), "roll": 0 * u.deg}
@@ -134,7 +134,7 @@ class RunErrors:
     """
 
     errors: ErrorModel
-    exposures: dict
+    config: object
 
     @classmethod
     def read(cls, folder):
@@ -142,27 +142,30 @@ class RunErrors:
         from pathlib import Path
 
         from miricigale.workflow.config import load_config
-        from miricigale.workflow.stages.exposures import band_exposures
 
         folder = Path(folder).expanduser()
         for name in ("errors.ecsv", "config.toml"):
             if not (folder / name).is_file():
                 msg = f"[noise] run = {str(folder)!r} has no {name}"
                 raise DataError(msg)
-        config = load_config(folder / "config.toml")
-        exposures = {name: band_exposures(config, name) for name in config.exposures.filters}
-        return cls(ErrorModel.read(folder / "errors.ecsv"), exposures)
+        return cls(ErrorModel.read(folder / "errors.ecsv"), load_config(folder / "config.toml"))
 
     def scaled(self, plan):
         """`~miricigale.photometry.ErrorModel` of a `BandPlan`."""
-        if plan.filter not in self.exposures:
-            msg = f"the run of [noise] has no band {plan.filter}; it has {list(self.exposures)}"
+        from miricigale.workflow.stages.exposures import band_exposures, study_background
+
+        exposures = band_exposures(self.config, plan.filter)
+        if not exposures:
+            known = list(self.config.exposures.filters)
+            msg = f"the run of [noise] has no band {plan.filter}; it has {known}"
             raise ConfigError(msg)
-        first, n = self.exposures[plan.filter][0], len(self.exposures[plan.filter])
+        first, n = exposures[0], len(exposures)
         own = sensitivity(
             plan.filter,
             n * first.exposure_time,
             n_sigma=5,
+            background=study_background(self.config, plan.filter),
+            residual=self.config.detector.residual or None,
             n_dithers=n,
             n_groups=first.n_groups,
             readout=first.readout,
@@ -177,22 +180,22 @@ class RunErrors:
         return ErrorModel.from_table(table)
 
 
-def background_of(filter, options):
-    """Background of a filter by the section ``background``."""
-    position = None
+def background_options(config):
+    """Arguments of `band_background`, but for the filter, and of `background_text`."""
+    options, position = config.background, None
     if options.ra >= 0:
         position = SkyCoord(options.ra * u.deg, options.dec * u.deg)
-    if position is None and options.level == "low":
-        # the low background of the package
-        return background_level(filter)
-    date = options.date or None
-    factor = zodiacal_factor(filter, options.level, position=position, date=date)
-    return background_level(filter, zodi=factor)
+    return {
+        "filters": config.exposures.bands,
+        "levels": options.level,
+        "position": position,
+        "date": options.date,
+    }
 
 
 def _band_plan(filter, time, n_dithers, config, run):
     """The exposures of one band that last a time."""
-    options, background = config.exposures, background_of(filter, config.background)
+    options, background = config.exposures, band_background(filter, **background_options(config))
     # the time for which Exposure.from_time allows is of the low background
     brighter = saturation_time(filter) / saturation_time(filter, background=background)
     exposure = Exposure.from_time(

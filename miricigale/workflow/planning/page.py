@@ -6,6 +6,8 @@ import numpy as np
 from miricigale.evaluation import Report, number
 from miricigale.plotting.axes import new_figure
 from miricigale.plotting.comparison import MEASURED, SECOND, plot_redshifts
+from miricigale.workflow.background import background_text
+from miricigale.workflow.planning.exposures import background_options
 
 __all__ = ["write_page"]
 
@@ -16,14 +18,14 @@ _NUMBERS = (
     ("z_outliers", "outliers (%)", ".1f", 100),
     ("z_width", "width of z", ".4f", 1),
     ("frac_bias", "offset of fracAGN", "+.3f", 1),
-    ("frac_scatter", "scatter", ".3f", 1),
-    ("frac_width", "width", ".3f", 1),
+    ("frac_scatter", "scatter of fracAGN", ".3f", 1),
+    ("frac_width", "width of fracAGN", ".3f", 1),
     ("completeness", "completeness (%)", ".0f", 100),
     ("purity", "purity (%)", ".0f", 100),
 )
 
 
-def write_page(path, planner, plans, comparison, areas=None):
+def write_page(path, planner, plans, comparison, areas=None, images=None):
     """
     Write the page of a plan.
 
@@ -37,6 +39,8 @@ def write_page(path, planner, plans, comparison, areas=None):
         Of `Planner.compare`.
     comparison, areas : `~astropy.table.QTable`
         Of `comparison_table` and, if there is one, `area_table`.
+    images : tuple of `~astropy.table.QTable`, optional
+        Of `paired_bands` and `paired_numbers`.
 
     Returns
     -------
@@ -64,8 +68,9 @@ def write_page(path, planner, plans, comparison, areas=None):
         caption=(
             f"{comparison['n'][0]} sources that one of the sets detects, the same in each row, with "
             "and without MIRI. Scatter (sigma_MAD) and offsets are of posterior means, z over 1+z; "
-            "widths are median posterior standard deviations. 'detected' and 'AGN' are sources "
-            "detected, and AGN detected and selected, expected in the area. Ranked by merit for each "
+            "widths are median posterior standard deviations. 'detected' and 'AGN' are sources above 5 sigma in "
+            f"{config.fit.min_detected} MIRI bands, or in all of a set with fewer, and AGN detected so and "
+            "selected, expected in the area. Ranked by merit for each "
             f"hour: {_MERITS[config.survey.rank]}."
         ),
         text=2,
@@ -108,6 +113,8 @@ def write_page(path, planner, plans, comparison, areas=None):
         "Posterior means of fracAGN by true value: median, and 16th to 84th percentile of the sources. "
         "The dashed line is the limit from which a source is an AGN.",
     )
+    if images is not None:
+        _write_images(page, *images)
     if areas is not None and len(areas):
         page.section(
             "Depth against area",
@@ -122,6 +129,56 @@ def write_page(path, planner, plans, comparison, areas=None):
             _area_figure(areas), "Sources detected, AGN found, and the scatter of their fits."
         )
     return page.write(path)
+
+
+def _write_images(page, bands, numbers):
+    """The section on the images of the exposures."""
+    n, n_field = numbers["n"][0], bands["n"][0]
+    page.section(
+        "Images of the exposures",
+        f"The same exposures imaged and measured as in a run of the study. Of the sample {n_field} sources "
+        f"are in the field; {n} of them are found on the high-resolution image, detected by one of the sets, and "
+        "compared here, with the same fluxes in the existing bands. Neighbors, edges and what photometry makes "
+        "of them are in the images only.",
+    )
+    page.table(
+        [
+            (
+                row["filter"].removeprefix("miri."),
+                f"{row['limit'].value:.2f}",
+                f"{row['limit_images'].value:.2f}",
+                _with_error(row, "scatter", ".2f", 1),
+                _with_error(row, "offset", "+.1f", 100),
+                row["n_detected"],
+                row["n_detected_images"],
+            )
+            for row in bands
+        ],
+        header=[
+            "band", "limit, plan", "limit, images", "scatter", "offset (%)", "detected, plan",
+            "detected, images",
+        ],
+        caption=(
+            "5-sigma limits of points (AB) by the plan and by the error functions that the images gave; scatter "
+            "of measured less true flux, over the error that the plan gives the source (1 if the images have "
+            "no other noise); median offset of sources above 10 sigma; sources of the field above 5 sigma."
+        ),
+    )  # fmt: skip
+    formats = {name: (text, spec, scale) for name, text, spec, scale in _NUMBERS}
+    for name in dict.fromkeys(numbers["plan"]):
+        rows = []
+        for row in numbers[numbers["plan"] == name]:
+            text, spec, scale = formats[row["number"]]
+            signed = "+" + spec.removeprefix("+")
+            cells = [_with_error(row, key, spec, scale) for key in ("noise", "images")]
+            cells += [_with_error(row, "difference", signed, scale)]
+            cells += [number(row["sigma"], "+.1f", "all sources agree")]
+            rows.append((text, *cells))
+        page.table(
+            rows,
+            header=[f"bands: {name}", "noise", "images", "difference", "sigma"],
+            caption="The difference has the error of the same sources drawn together.",
+        )
 
 
 _MERITS = {
@@ -144,7 +201,8 @@ def _notices(planner):
         "run": f"of the run {config.noise.run}, scaled",
     }[config.noise.kind]
     notices = [
-        "No images: a source is measured with Gaussian noise, without blends or cosmic rays.",
+        "A source is measured with Gaussian noise, without blends or cosmic rays"
+        + ("; a section compares it with images." if config.images.enabled else ": no images."),
         f"MIRI errors are those {noise}, and {100 * config.noise.fractional:g} % of the flux.",
         f"Truth and fit share models; the fit allows for {100 * config.fit.model_error:g} % of error.",
         "Hours are approximations to what APT charges, a visit for each pointing; APT decides.",
@@ -156,11 +214,8 @@ def _notices(planner):
         mix = "those of a real field, after an X-ray luminosity function"
     if planner.given is None:
         notices.append(f"AGN, on which completeness, purity and counts depend: {mix}.")
-    background = config.background
-    if background.date or background.ra >= 0 or background.level != "low":
-        where = f" at ra {background.ra:g}, dec {background.dec:g}" if background.ra >= 0 else ""
-        when = background.date or background.level
-        notices.append(f"Zodiacal light: {when}{where}, after Kelsall et al. 1998.")
+    options = background_options(config)
+    notices.append(f"Background: {background_text(**options)}.")
     return [*notices, *(f"Models: {text}" for text in libraries)]
 
 
@@ -219,8 +274,8 @@ def _comparison_figure(table):
         for k, place in enumerate(zip(hours, scatter, strict=True)):
             ax.annotate(str(k), place, (7, 3), textcoords="offset points", fontsize=9)
         ax.set(xlabel="hours", ylabel=label)
+        ax.margins(x=0.12, y=0.12)
         ax.set_ylim(0, None)
-        ax.margins(x=0.12)
         ax.legend(fontsize=8, frameon=False)
     return figure
 

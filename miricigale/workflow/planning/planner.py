@@ -7,7 +7,8 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable, vstack
 
-from miricigale.evaluation import Estimate, bootstrap, selection_quality, sigma_mad
+from miricigale.evaluation import OUTLIER, Estimate, bootstrap, selection_quality
+from miricigale.evaluation.estimates import median, scatter
 from miricigale.fitting import BayesFitter
 from miricigale.photometry import ErrorModel
 from miricigale.photometry.surveys import fractional_error
@@ -27,8 +28,6 @@ EXISTING = "existing bands"
 _SIZES = np.array([0.0, 0.2, 0.4, 0.6, 0.8, 1.2, 1.6])
 #: Field of the imager.
 _FIELD = 74 * 113 * u.arcsec**2
-#: abs(dz) / (1 + z) above which a redshift is an outlier.
-_OUTLIER = 0.15
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -168,7 +167,7 @@ class Planner:
         )
         return errors.perturb(self.sources[["id", *fit.bands]], seed=self.config.plan.seed)
 
-    def photometry(self, plans):
+    def photometry(self, plans, measured=None):
         """
         Mock photometry of the sample.
 
@@ -176,6 +175,8 @@ class Planner:
         ----------
         plans : iterable of `BandPlan`
             MIRI bands.
+        measured : `~astropy.table.QTable`, optional
+            Fluxes and errors in these bands, in the order of the sample, in place of mock ones.
 
         Returns
         -------
@@ -185,12 +186,12 @@ class Planner:
         """
         table = QTable(self._existing, copy=True)
         for plan in plans:
-            measured = self._measured(plan)
+            found = self._mock(plan) if measured is None else measured
             for column in (plan.filter, error_column(plan.filter)):
-                table[column] = measured[column]
+                table[column] = found[column]
         return table
 
-    def _measured(self, plan):
+    def _mock(self, plan):
         """Fluxes of one band with the errors of each source's size, in the order of the sample."""
         columns, seed = self.sources[["id", plan.filter]], self.config.plan.seed
         noise = self.config.noise
@@ -206,7 +207,7 @@ class Planner:
         joined = vstack(parts, metadata_conflicts="silent")
         return joined[np.argsort(np.concatenate(rows), kind="stable")]
 
-    def evaluate(self, bands=None, *, name=None, share=1.0, pointings=None):
+    def evaluate(self, bands=None, *, name=None, share=1.0, pointings=None, measured=None):
         """
         Fit the sample as one set of bands would measure it.
 
@@ -220,6 +221,8 @@ class Planner:
             Factor on all exposure times.
         pointings : int, optional
             Pointings side by side; those of the configuration by default.
+        measured : `~astropy.table.QTable`, optional
+            As for `photometry`.
 
         Returns
         -------
@@ -232,7 +235,7 @@ class Planner:
                 raise argument_error("bands", f"some of {list(config.exposures.bands)}", repr(band))
         known = self.band_plans(share)
         plans = {band: known[band] for band in bands}
-        photometry = self.photometry(plans.values())
+        photometry = self.photometry(plans.values(), measured)
         fitter = BayesFitter(
             SEDModel.yang2021(),
             [*config.fit.bands, *bands],
@@ -270,7 +273,7 @@ class Planner:
             table[f"{name}_saturated"] = self.sources[name] >= limit
         return table
 
-    def compare(self, sets=None):
+    def compare(self, sets=None, *, measured=None):
         """
         Evaluate the existing bands alone and each set of bands.
 
@@ -278,6 +281,8 @@ class Planner:
         ----------
         sets : iterable of str, optional
             Sets as in ``[exposures] sets``; those of the configuration by default.
+        measured : `~astropy.table.QTable`, optional
+            As for `photometry`.
 
         Returns
         -------
@@ -287,7 +292,8 @@ class Planner:
         plans = [self.evaluate((), name=EXISTING)]
         for name in self.config.exposures.sets if sets is None else sets:
             short = name.replace("miri.", "").replace(" ", "")
-            plans.append(self.evaluate(self.config.set_bands(name), name=short))
+            bands = self.config.set_bands(name)
+            plans.append(self.evaluate(bands, name=short, measured=measured))
         return plans
 
     def divide(self, bands=None):
@@ -362,20 +368,12 @@ def accuracy(sources, *, agn_limit=0.4, seed=0):
     known = np.isfinite(dz)
     quality = selection_quality(f >= agn_limit, sources["selected"])
     return {
-        "z_scatter": bootstrap(_scatter, dz, seed=seed),
-        "z_outliers": Estimate.of_fraction(np.sum(np.abs(dz[known]) > _OUTLIER), np.sum(known)),
-        "z_width": bootstrap(_median, np.asarray(sources["redshift_std"]) / (1 + z), seed=seed),
-        "frac_bias": bootstrap(_median, df, seed=seed),
-        "frac_scatter": bootstrap(_scatter, df, seed=seed),
-        "frac_width": bootstrap(_median, sources["frac_agn_std"], seed=seed),
+        "z_scatter": bootstrap(scatter, dz, seed=seed),
+        "z_outliers": Estimate.of_fraction(np.sum(np.abs(dz[known]) > OUTLIER), np.sum(known)),
+        "z_width": bootstrap(median, np.asarray(sources["redshift_std"]) / (1 + z), seed=seed),
+        "frac_bias": bootstrap(median, df, seed=seed),
+        "frac_scatter": bootstrap(scatter, df, seed=seed),
+        "frac_width": bootstrap(median, sources["frac_agn_std"], seed=seed),
         "completeness": quality.completeness,
         "purity": quality.purity,
     }
-
-
-def _median(values):
-    return np.median(values, axis=-1)
-
-
-def _scatter(values):
-    return sigma_mad(values, axis=-1)

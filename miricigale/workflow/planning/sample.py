@@ -13,7 +13,7 @@ from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.stages.inputs import bright_sources, fit_seds, study_catalog
 from miricigale.workflow.stages.truth import add_agn, add_field_agn, galaxy_parameters
 
-__all__ = ["catalog_area", "make_sample"]
+__all__ = ["agn_mix", "catalog_area", "make_sample"]
 
 #: Stellar populations may not be older than the universe: the fit's ages, Gyr, are cut to this share.
 _AGE_SHARE = 0.95
@@ -89,7 +89,7 @@ def make_sample(config, bands, *, executor=None):
         add_field_agn(sources, model, next(iter(bands)), seed)
     else:
         add_agn(sources, 0.0, seed)
-        sources["frac_agn"] = _mix(config.agn, len(sources), rng) if given is None else given
+        sources["frac_agn"] = agn_mix(config.agn, len(sources), rng) if given is None else given
     light = model.fluxes(sources, list(bands))
     lacking = (np.asarray(light["flags"]) & int(ModelFlags.NOT_IN_LIBRARY)) > 0
     if np.any(lacking):
@@ -119,7 +119,7 @@ def _sizes(catalog):
     return np.where(np.isfinite(size) & (size > 0), size, 0.0) * u.arcsec
 
 
-def _mix(options, n, rng):
+def agn_mix(options, n, rng):
     """AGN fractions in the shares of the configuration, in random order."""
     shares = np.asarray(options.shares, float) / np.sum(options.shares)
     edges = np.round(np.cumsum(shares) * n).astype(int)

@@ -22,6 +22,7 @@ def study_stages():
         rivals,
         sources,
         truth,
+        variants,
     )
 
     return (
@@ -38,6 +39,7 @@ def study_stages():
         fits.make_errors,
         fits.match_sources,
         rivals.measure_rivals,
+        variants.measure_variants,
         fits.fit_photometry,
         experiments.fit_experiment,
         sources.make_sources,

@@ -198,7 +198,8 @@ def write_conditions(report, metrics):
         "over true flux minus one of those above 5 sigma. Crowded: a neighbor within 2 arcsec is "
         "brighter than the magnitude plus one; edge: more than a tenth of the light falls off the "
         "image; ambiguous: the match to the detections is not the only one possible; isolated: "
-        "none of these. A source may be in several of the three",
+        f"none of these. A source may be in several of the three; fewer than {_FEWEST} above 5 sigma are "
+        "counted only",
     )
     found = metrics["detections"]
     bright = found["n_spurious_bright"]
@@ -217,9 +218,14 @@ def write_conditions(report, metrics):
     )
 
 
+#: Fewest sources whose offset and scatter are told.
+_FEWEST = 5
+
+
 def _told(found):
-    """Number, offset and scatter of a group in one cell."""
-    if not np.isfinite(found["median"]):
+    """Number of a group, and offset and scatter of its bright ones, in one cell."""
+    # a scatter of fewer says nothing
+    if not np.isfinite(found["median"]) or found["n_bright"] < _FEWEST:
         return f"{found['n']}"
     return f"{found['n']}: {100 * found['median']:+.1f} ± {100 * found['scatter']:.1f} %"
 
@@ -241,4 +247,5 @@ def write_fits(report, metrics):
         ],
         header=("fit", "condition in any band", "sources", "sigma_MAD", "outliers"),
         caption="Photometric redshifts by condition",
+        text=2,
     )

@@ -5,7 +5,7 @@ import astropy.units as u
 from miricigale.evaluation import Missing, coverage_table, number, posterior_ranks
 from miricigale.workflow.stages import truth_figures
 from miricigale.workflow.stages.figures import SET_LABELS
-from miricigale.workflow.stages.truth_figures import truth_label
+from miricigale.workflow.stages.truth_figures import parameter_label, truth_label
 
 __all__ = ["coverage_of", "posterior_ranks_of", "share_cell", "write_coverage"]
 
@@ -70,7 +70,7 @@ def write_coverage(page):
         [
             (
                 SET_LABELS[name.partition(" ")[0]],
-                name.partition(" ")[2].replace("_", " "),
+                parameter_label(name.partition(" ")[2]),
                 parts[0]["n"],
                 *(share_cell(part, "share") for part in parts),
                 f"{parts[0]['mean_rank']:.2f}",

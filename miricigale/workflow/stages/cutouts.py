@@ -7,6 +7,7 @@ from astropy.wcs.utils import proj_plane_pixel_scales
 from PIL import Image
 
 from miricigale.evaluation import sigma_mad
+from miricigale.utils.parallel import chunks
 from miricigale.workflow.stages.images import measured_mosaic
 from miricigale.workflow.stages.pictures import binned, filled
 
@@ -14,6 +15,8 @@ __all__ = ["Cutouts"]
 
 #: Side of the pictures, and the finest pixels of those of the bands, in arcsec.
 BOX, FINEST = 5.3, 0.1
+#: Pictures that are looked at together.
+_AT_ONCE = 1000
 #: Shades of gray, and the color of pixels without data.
 N_GRAY, NO_DATA = 48, (242, 226, 208)
 #: Stretch: asinh of the value over twice the noise, from -3 to at least 10 times the noise.
@@ -145,8 +148,12 @@ class Cutouts:
 
     def on_image(self, sky):
         """Whether a picture about each position has data in any band: bool, shape (n,)."""
-        seen = [np.isfinite(p.squares(sky)[:, 0]).any(axis=(1, 2)) for p in self.bands.values()]
-        return np.any(seen, axis=0)
+        seen = np.zeros(len(sky), bool)
+        # pictures of all sources of a large catalog would not fit in memory
+        for part in chunks(len(sky), _AT_ONCE):
+            for panels in self.bands.values():
+                seen[part] |= np.isfinite(panels.squares(sky[part])[:, 0]).any(axis=(1, 2))
+        return seen
 
     def sheet(self, sky):
         """

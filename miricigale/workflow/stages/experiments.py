@@ -19,7 +19,7 @@ from miricigale.evaluation import (
 from miricigale.photometry.surveys import HERSCHEL_DEPTHS
 from miricigale.utils.tables import described_rows
 from miricigale.workflow.stage import stage
-from miricigale.workflow.stages.fits import mock_photometry
+from miricigale.workflow.stages.fits import FIT_SECTIONS, mock_photometry
 from miricigale.workflow.stages.inputs import sed_resources
 from miricigale.workflow.truths import of_truth, study_truths
 
@@ -119,13 +119,7 @@ def far_infrared_photometry(sample, *, seed):
     "experiments",
     "further fit",
     needs={"truth": of_truth, "matches": of_truth},
-    sections=(
-        "fit.bands",
-        "fit.depths",
-        "fit.axes",
-        "fit.model_error",
-        "exposures.filters",
-    ),
+    sections=FIT_SECTIONS,
     resources=sed_resources,
     plan=_experiment_plan,
     units=experiment_units,

@@ -1,13 +1,23 @@
 """What is exposed, and the grids that cover it, from the configuration alone."""
 
-import dataclasses
 import functools
 import math
+from pathlib import Path
 
 import astropy.units as u
 from astropy.coordinates import SkyCoord
 
-from miricigale.instrument import Exposure, ceers_exposures, mosaic_wcs
+from miricigale.instrument import (
+    Exposure,
+    ceers_exposures,
+    dither_patterns,
+    mosaic_wcs,
+    read_dithers,
+    tangent_offset,
+    tile_offsets,
+)
+from miricigale.utils.exceptions import ConfigError
+from miricigale.workflow.background import band_background
 from miricigale.workflow.truths import truth_names
 
 __all__ = [
@@ -16,15 +26,23 @@ __all__ = [
     "IMAGES",
     "IMAGE_RESOURCES",
     "KERNEL",
+    "background_options",
     "band_exposures",
     "band_names",
     "bands_of_truth",
     "dithers_of_band",
+    "dithers_text",
     "exposure_memory",
     "exposure_plan",
     "exposure_units",
     "grid_of",
+    "mosaic_memory",
+    "pointing_exposures",
+    "pointing_of",
+    "pointing_time",
+    "study_background",
     "study_exposures",
+    "study_pointings",
     "truth_bands",
 ]
 
@@ -41,21 +59,80 @@ IMAGE_RESOURCES = (
     "psf.jwst_pupil",
     "filters.sedpy",
 )
-# residual = "etc" says whose pattern it is, not how strong
-EXPOSURE_RESOURCES = (*IMAGE_RESOURCES, "instrument.etc")
+# residual = "etc" says whose pattern it is, not how strong, and a level whose sky
+EXPOSURE_RESOURCES = (*IMAGE_RESOURCES, "instrument.etc", "instrument.zodiacal")
 
 
 def study_exposures(config):
-    """The exposures of each truth: name, ``<filter>-<dither>``, to `Exposure`."""
-    return dict(_exposures(config.pointing, config.exposures))
+    """
+    The exposures of each truth: name, ``<filter>-<dither>``, to `Exposure`.
+
+    Dithers are counted through all pointings, so that each exposure has random numbers of its own.
+    """
+    options = config.exposures
+    patterns = tuple(_pattern(options, k) for k in range(len(options.filters)))
+    return dict(_exposures(config.pointing, options, patterns))
+
+
+def _pattern(options, k):
+    """Dithers of a filter: the name of a pattern, or offsets in arcsec as pairs."""
+    if not options.dithers:
+        return "ceers"
+    name = options.dithers[k if len(options.dithers) > 1 else 0]
+    if name in dither_patterns():
+        return name
+    path = Path(name).expanduser()
+    if not path.is_file():
+        msg = (
+            f"[exposures] dithers must be a file or one of {list(dither_patterns())}, got {name!r}"
+        )
+        raise ConfigError(msg)
+    observation = exposure = None
+    if path.suffix.lower() == ".pointing":
+        observation = options.dither_observation or None
+        exposure = options.dither_exposures[k] if options.dither_exposures else None
+    stat = path.stat()
+    return _file_pattern(path, observation, exposure, stat.st_mtime_ns, stat.st_size)
+
+
+@functools.lru_cache(maxsize=64)
+def _file_pattern(path, observation, exposure, *_):
+    """Offsets in a file, which is read again when it has changed."""
+    try:
+        offsets = read_dithers(path, observation=observation, exposure=exposure)
+    except (ValueError, u.UnitsError) as err:
+        msg = f"[exposures] dithers: {path.name}: {err}"
+        raise ConfigError(msg) from err
+    return tuple(map(tuple, offsets.to_value(u.arcsec).tolist()))
+
+
+def study_pointings(config):
+    """Centers of the pointings."""
+    return _centers(config.pointing)
+
+
+def pointing_of(config, exposure):
+    """Center of the pointing that an exposure is a dither of: the nearest one."""
+    return min(study_pointings(config), key=exposure.pointing.separation)
 
 
 @functools.lru_cache(maxsize=8)
-def _exposures(field, options):
-    """Names and exposures of two sections of a configuration."""
-    pointing = SkyCoord(field.ra * u.deg, field.dec * u.deg)
-    roll = field.roll * u.deg
-    quick = options.plan == "quick"
+def _centers(field):
+    """Centers of the pointings of a section of a configuration."""
+    if field.centers:
+        return tuple(SkyCoord(*map(float, text.split()), unit="deg") for text in field.centers)
+    center = SkyCoord(field.ra * u.deg, field.dec * u.deg)
+    if field.tiles == (1, 1):
+        return (center,)
+    # as dithers are, along the axes of the imager
+    pa = Exposure("miri.f770w", n_groups=2, pointing=center, roll=field.roll * u.deg).pa_aper
+    offsets = tile_offsets(*field.tiles, overlap=field.overlap)
+    return tuple(tangent_offset(center, dx, dy, pa) for dx, dy in offsets)
+
+
+@functools.lru_cache(maxsize=8)
+def _exposures(field, options, patterns):
+    """Names and exposures of two sections of a configuration, and of the dithers of each filter."""
     units = {}
     for k, name in enumerate(options.filters):
         own = {
@@ -63,18 +140,68 @@ def _exposures(field, options):
             for key in ("n_groups", "n_integrations")
             if getattr(options, key)
         }
+        pattern, named = patterns[k], isinstance(patterns[k], str)
         n_dithers = options.n_dithers[k] if options.n_dithers else None
-        if "n_groups" in own and n_dithers:
-            exposure = Exposure(name, pointing=pointing, roll=roll, **own)
-            exposures = exposure.dithered("ceers", n_dithers)
-        else:
-            exposures = ceers_exposures(pointing, roll, filters=[name], quick=quick)
-            if n_dithers:
-                exposures = exposures[0].replace(pointing=pointing).dithered("ceers", n_dithers)
-            exposures = [dataclasses.replace(exposure, **own) for exposure in exposures]
-        for exposure in exposures:
-            units[f"{name}-{exposure.dither}"] = exposure
+        if not named:
+            n_dithers = n_dithers or len(pattern)
+            if n_dithers > len(pattern):
+                msg = f"[exposures] n_dithers is {n_dithers} for {name}, whose file of dithers has {len(pattern)}"
+                raise ConfigError(msg)
+        offsets = pattern if named else pattern * u.arcsec
+        number = 0
+        for center in _centers(field):
+            exposure, n = _planned(name, own, n_dithers, center, field.roll * u.deg, options)
+            for dither in exposure.dithered(offsets, n):
+                units[f"{name}-{number}"] = dither.replace(dither=number)
+                number += 1
     return tuple(units.items())
+
+
+def _planned(name, own, n_dithers, pointing, roll, options):
+    """The exposure of a band at a pointing and the number of its dithers, where not given those of the plan."""
+    if "n_groups" in own and n_dithers:
+        return Exposure(name, pointing=pointing, roll=roll, **own), n_dithers
+    planned = ceers_exposures(pointing, roll, filters=[name], quick=options.plan == "quick")
+    return planned[0].replace(pointing=pointing, **own), n_dithers or len(planned)
+
+
+def dithers_text(config):
+    """Where the dithers of the study are from, in words."""
+    options = config.exposures
+    names = options.dithers or ("ceers",)
+    if len(names) == 1:
+        names = names * len(options.filters)
+    texts = {}
+    for k, (filter, name) in enumerate(zip(options.filters, names, strict=True)):
+        if name in dither_patterns():
+            text = f"the package's pattern {name!r}, of the form of the observatory's but not its digits"
+        else:
+            text = f"offsets in the file {Path(name).name}"
+            if options.dither_observation and name.lower().endswith(".pointing"):
+                text += f", observation {options.dither_observation}"
+            if options.dither_exposures and name.lower().endswith(".pointing"):
+                text += f", exposure {options.dither_exposures[k]}"
+        texts.setdefault(text, []).append(filter.removeprefix("miri.").upper())
+    if len(texts) == 1:
+        return next(iter(texts))
+    return "; ".join(f"{', '.join(filters)}: {text}" for text, filters in texts.items())
+
+
+def background_options(config):
+    """Arguments of `~miricigale.workflow.background.band_background`, but for the filter."""
+    options = config.scene
+    at_pointing = options.background_date or options.background_of == "pointing"
+    return {
+        "filters": config.exposures.filters,
+        "levels": options.background,
+        "position": study_pointings(config)[0] if at_pointing else None,
+        "date": options.background_date,
+    }
+
+
+def study_background(config, filter):
+    """Surface brightness of sky and telescope at the center of the field in a filter."""
+    return config.scene.background_scale * band_background(filter, **background_options(config))
 
 
 def band_names(config):
@@ -128,6 +255,17 @@ def band_exposures(config, name):
     return [e for e in study_exposures(config).values() if e.filter == name]
 
 
+def pointing_exposures(config, name):
+    """The exposures of one band at the first pointing; those at the others are the same elsewhere."""
+    own = band_exposures(config, name)
+    return own[: len(own) // len(study_pointings(config))]
+
+
+def pointing_time(config, name):
+    """Exposure time of one band at one pointing; where pointings overlap it is longer."""
+    return sum(exposure.exposure_time for exposure in pointing_exposures(config, name))
+
+
 def grid_of(config, pixel_scale):
     """North-up WCS that covers every exposure of the study."""
     return mosaic_wcs(list(study_exposures(config).values()), pixel_scale * u.arcsec)
@@ -145,3 +283,15 @@ def exposure_memory(config, unit):
     chosen = [e for own, e in study_exposures(config).items() if name in (own, e.filter)]
     groups = max(math.prod(e.shape) * e.n_groups * e.n_integrations for e in chosen)
     return 500_000_000 + int(3.3 * groups)
+
+
+def mosaic_memory(config, unit):
+    """
+    About how many bytes a process takes for a mosaic of a band, the prior, or what is measured on them.
+
+    Measured, of one to four pointings: 0.5 GB, 60 MB for each exposure, and 120 bytes for each pixel of the
+    prior's grid.
+    """
+    name = unit.rpartition("/")[2]
+    pixels = math.prod(grid_of(config, config.highres.pixel_scale).pixel_shape)
+    return 500_000_000 + 60_000_000 * len(band_exposures(config, name)) + 120 * pixels

@@ -8,10 +8,9 @@ from miricigale.evaluation import (
     main_sequence_sfr,
     number_counts,
     running_median,
-    sfr_to_infrared_luminosity,
 )
 from miricigale.filters import Filter
-from miricigale.plotting.axes import new_figure
+from miricigale.plotting.axes import WIDTH, new_figure, panel_columns, panels
 from miricigale.plotting.comparison import (
     MEASURED,
     SECOND,
@@ -22,12 +21,11 @@ from miricigale.plotting.comparison import (
     plot_redshifts,
     plot_relation,
 )
-from miricigale.workflow.stages.sample import magnitude
+from miricigale.utils.units import ab_magnitude
 
 __all__ = [
     "SET_COLORS",
     "SET_LABELS",
-    "WIDTH",
     "band_label",
     "counts_figure",
     "error_figure",
@@ -38,10 +36,9 @@ __all__ = [
     "point_figure",
     "redshift_figure",
     "three_bands",
+    "variant_figure",
 ]
 
-#: Inches across: all figures of the page are shown at one width, so that letters have one size.
-WIDTH = 10.5
 #: Sets of bands: what they are called, and their colors.
 SET_LABELS = {
     "all": "with MIRI",
@@ -66,18 +63,12 @@ def three_bands(names):
 
 
 def _panels(bands, height, **share):
-    """A panel for each band, three in a row, with labels on the outer axes only."""
-    columns = min(3, len(bands))
-    rows = -(-len(bands) // columns)
-    # panels of one or two bands are half a page wide
-    width = WIDTH / max(2, columns)
-    figure, axes = new_figure(rows, columns, size=(width, height), **share)
-    panels = axes.ravel()
-    for ax in panels[len(bands) :]:
-        ax.remove()
+    """A panel for each band, with labels on the outer axes only."""
+    figure, axes = panels(bands, height=height, **share)
+    axes, columns = list(axes.values()), panel_columns(len(bands))
 
     def tidy():
-        for k, ax in enumerate(panels[: len(bands)]):
+        for k, ax in enumerate(axes):
             if k + columns < len(bands):
                 ax.set_xlabel("")
             else:
@@ -85,14 +76,14 @@ def _panels(bands, height, **share):
             if k % columns:
                 ax.set_ylabel("")
 
-    return figure, panels[: len(bands)], tidy
+    return figure, axes, tidy
 
 
 def magnitude_figure(table, bands):
     """Measured against true magnitude; ticks are sources without positive flux or off the axis."""
     figure, axes, tidy = _panels(bands, 3.3, sharex=True, sharey=True)
-    true = {name: magnitude(table[f"{name}_true"]) for name in bands}
-    measured = {name: magnitude(table[name]) for name in bands}
+    true = {name: ab_magnitude(table[f"{name}_true"]) for name in bands}
+    measured = {name: ab_magnitude(table[name]) for name in bands}
     known = np.concatenate([values[np.isfinite(values)] for values in true.values()])
     high = known.max(initial=20) + 1.5
     for ax, name in zip(axes, bands, strict=True):
@@ -116,7 +107,7 @@ def offset_figure(table, bands, limits=None, marks=()):
     """
     figure, axes, tidy = _panels(bands, 2.9, sharex=True, sharey=True)
     for ax, name in zip(axes, bands, strict=True):
-        true, measured = magnitude(table[f"{name}_true"]), magnitude(table[name])
+        true, measured = ab_magnitude(table[f"{name}_true"]), ab_magnitude(table[name])
         offset = measured - true
         good = np.isfinite(offset)
         running = running_median(true[good], offset[good], size=20)
@@ -201,6 +192,32 @@ def limit_figure(entries):
     return figure
 
 
+def variant_figure(numbers, labels):
+    """
+    Limits of several images against the calculator's.
+
+    ``numbers`` are those of `~miricigale.workflow.stages.variants.variant_numbers`, ``labels`` the names of
+    images to what they are called.
+    """
+    figure, axes = new_figure(size=(WIDTH, 3.4))
+    ax = axes[0, 0]
+    bands = sorted(set(numbers["band"]), key=lambda name: Filter.from_name(name).pivot)
+    for k, (name, label) in enumerate(labels.items()):
+        rows = {row["band"]: row for row in numbers[numbers["images"] == name]}
+        offsets = [rows[band]["limit"] - rows[band]["calculator"] for band in bands]
+        place = np.arange(len(bands)) + 0.12 * (k - 0.5 * (len(labels) - 1))
+        errors = [rows[band]["limit_err"] for band in bands]
+        ax.errorbar(place, offsets, errors, fmt="o", ms=5, capsize=2, label=label)
+    ax.axhline(0, color="0.6", lw=1, zorder=0)
+    ax.set(xlim=(-0.6, len(bands) - 0.4), ylabel="limit minus calculator (mag)")
+    ax.set_xticks(range(len(bands)), [band_label(name) for name in bands])
+    # room for the legend
+    low, high = ax.get_ylim()
+    ax.set_ylim(low - 0.35 * (high - low), high)
+    ax.legend(fontsize=8, frameon=False, loc="lower left", ncols=2)
+    return figure
+
+
 def redshift_figure(truth, fits):
     """Fitted against true redshifts, by set of bands."""
     rows = -(-len(fits) // 2)
@@ -254,52 +271,44 @@ def point_figure(points, bands):
     return figure
 
 
-#: Least values that the figure of the inputs shows.
-LEAST_LUMINOSITY, LEAST_RATE, LEAST_MASS = 1e7 * u.Lsun, 1e-3 * u.Msun / u.yr, 1e7 * u.Msun
+#: Least values that the figure of the inputs shows, and redshifts of its panels.
+LEAST_RATE, LEAST_MASS = 1e-3 * u.Msun / u.yr, 1e7 * u.Msun
+INPUT_REDSHIFTS = ((0.0, 1.0), (1.0, 2.0), (2.0, 3.0))
 
 
 def input_figure(galaxies):
     """
-    Infrared luminosity against redshift, and star-formation rate against mass.
+    Star-formation rate against mass in ranges of redshift, with the main sequence at their middle.
 
-    Of a table with ``redshift``, ``ir_luminosity``, ``stellar_mass`` and ``sfr_100myr``. Returns the
-    figure and the numbers of galaxies below the axes, left and right.
+    Of a table with ``redshift``, ``stellar_mass`` and ``sfr_100myr``. Returns the figure and the number of
+    galaxies that it does not show: beyond its redshifts, or below the axes.
     """
-    figure, axes = new_figure(1, 2, size=(WIDTH / 2, 4.0))
+    figure, axes = new_figure(
+        1, len(INPUT_REDSHIFTS), size=(WIDTH / len(INPUT_REDSHIFTS), 3.4), sharex=True, sharey=True
+    )
     redshift = np.asarray(galaxies["redshift"])
-    infrared, mass = galaxies["ir_luminosity"], galaxies["stellar_mass"]
-    rate = galaxies["sfr_100myr"]
-    end = max(6.0, 1.03 * redshift.max(initial=0))
-    rates = [1, 10, 100] * u.Msun / u.yr
-    lines = [
-        ([0, end], [value.value] * 2, rf"{rate.value:g} M$_\odot$/yr")
-        for rate, value in zip(rates, sfr_to_infrared_luminosity(rates), strict=True)
-    ]
-    plot_relation(
-        redshift,
-        infrared.to_value(u.Lsun),
-        lines=lines,
-        ax=axes[0, 0],
-        labels=("redshift", r"L(3-1000 µm) / L$_\odot$"),
-    )
-    axes[0, 0].set(xlim=(0, end), ylim=(LEAST_LUMINOSITY.value, None))
-    line_mass = np.geomspace(1e8, 2e11, 30) * u.Msun
-    lines = [
-        (line_mass.value, main_sequence_sfr(line_mass, sed.COSMOLOGY.age(z)).value, f"z = {z:g}")
-        for z in (0.5, 1, 2)
-    ]
-    plot_relation(
-        mass.to_value(u.Msun),
-        rate.to_value(u.Msun / u.yr),
-        lines=lines,
-        ax=axes[0, 1],
-        labels=(r"stellar mass / M$_\odot$", r"SFR (100 Myr) / (M$_\odot$/yr)"),
-        color=redshift,
-        log=(True, True),
-    )
-    axes[0, 1].set(xlim=(LEAST_MASS.value, None), ylim=(LEAST_RATE.value, None))
-    below = (infrared < LEAST_LUMINOSITY, (rate < LEAST_RATE) | (mass < LEAST_MASS))
-    return figure, tuple(int(np.count_nonzero(rows)) for rows in below)
+    mass, rate = galaxies["stellar_mass"], galaxies["sfr_100myr"]
+    seen = (rate >= LEAST_RATE) & (mass >= LEAST_MASS)
+    line = np.geomspace(1e8, 2e11, 30) * u.Msun
+    shown = 0
+    for ax, (low, high) in zip(axes[0], INPUT_REDSHIFTS, strict=True):
+        rows = seen & (redshift >= low) & (redshift < high)
+        shown += int(np.count_nonzero(rows))
+        middle = 0.5 * (low + high)
+        sequence = main_sequence_sfr(line, sed.COSMOLOGY.age(middle))
+        plot_relation(
+            mass[rows].to_value(u.Msun),
+            rate[rows].to_value(u.Msun / u.yr),
+            lines=[(line.value, sequence.value, f"main sequence, z = {middle:g}")],
+            ax=ax,
+            labels=(r"stellar mass / M$_\odot$", r"SFR (100 Myr) / (M$_\odot$/yr)"),
+            log=(True, True),
+        )
+        ax.set_title(f"{low:g} < z < {high:g} ({np.count_nonzero(rows)})", fontsize="medium")
+        if ax is not axes[0, 0]:
+            ax.set_ylabel("")
+    axes[0, 0].set(xlim=(LEAST_MASS.value, None), ylim=(LEAST_RATE.value, None))
+    return figure, len(galaxies) - shown
 
 
 def counts_figure(galaxies, bands, area):

@@ -8,14 +8,32 @@ from astropy.table import QTable
 
 from miricigale import evaluation, fitting, photometry, sed
 from miricigale.utils.tables import error_column
+from miricigale.workflow.perturbation import Perturbation
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.conditions import ConditionFlags, add_conditions, any_condition
-from miricigale.workflow.stages.exposures import bands_of_truth
+from miricigale.workflow.stages.exposures import (
+    GRID,
+    bands_of_truth,
+    pointing_exposures,
+    pointing_time,
+)
 from miricigale.workflow.stages.inputs import fit_plan, sed_resources
-from miricigale.workflow.stages.sample import add_selection, in_field, matched_errors
-from miricigale.workflow.truths import band_sets, of_truth, reference, truth_names
+from miricigale.workflow.stages.sample import (
+    add_selection,
+    in_field,
+    matched_errors,
+    mean_coverage,
+)
+from miricigale.workflow.truths import (
+    band_sets,
+    of_truth,
+    reference,
+    study_truths,
+    truth_names,
+)
 
 __all__ = [
+    "FIT_SECTIONS",
     "band_photometry",
     "fit_photometry",
     "fit_units",
@@ -43,9 +61,31 @@ class _Field:
         self.detections = band_photometry(context, name, bands)
         self.matched = evaluation.match_truth(self.truth, self.detections, bands, radius=radius)
         self.association = evaluation.associate(self.truth, self.detections, radius=radius)
-        mosaics = [context.image(f"{name}/mosaic_{band}.fits") for band in bands]
-        self.inside = in_field(self.truth["sky"], mosaics)
-        self.detections["in_field"] = in_field(self.detections["sky"], mosaics)
+        mosaics = {}
+        for band in bands:
+            path = f"{name}/mosaic_{band}.fits"
+            mosaics[band], n_images = context.image(path, "n_images")
+            exposure = pointing_exposures(config, band)[0]
+            seen = mean_coverage(self.truth["sky"], mosaics[band], n_images)
+            self.matched[f"{band}_time"] = seen * exposure.exposure_time
+        self.inside = in_field(self.truth["sky"], mosaics.values())
+        self.detections["in_field"] = in_field(self.detections["sky"], mosaics.values())
+
+    def noise(self, config):
+        """
+        Noise at each source by band, in units of that at the exposure time of one pointing.
+
+        None where errors follow the flux alone. That of the sky and of a source's photons goes with the
+        root of the time; what does not, as errors of templates, is small where noise counts.
+        """
+        if not config.errors.coverage:
+            return None
+        noise = {}
+        for name in config.exposures.filters:
+            time = self.matched[f"{name}_time"]
+            with np.errstate(divide="ignore"):
+                noise[name] = np.sqrt(pointing_time(config, name) / time).to_value(u.one)
+        return noise
 
 
 _MATCHED = {"truth": of_truth, "mosaics": bands_of_truth, "photometry": bands_of_truth}
@@ -54,12 +94,12 @@ _MATCHED = {"truth": of_truth, "mosaics": bands_of_truth, "photometry": bands_of
 @stage(
     "errors",
     "error function",
-    version=3,
+    version=4,
     needs={
         name: lambda config, _, select=select: select(config, reference(config))
         for name, select in _MATCHED.items()
     },
-    sections=("errors", "exposures.filters", "photometry.match_radius"),
+    sections=(*GRID, "errors", "photometry.match_radius"),
     plan=lambda config, _: reference(config),
 )
 def make_errors(context, _):
@@ -72,6 +112,7 @@ def make_errors(context, _):
         bands,
         statistic=config.errors.statistic,
         bin_size=config.errors.bin_size,
+        noise=field.noise(config),
     )
     context.save_result("errors.ecsv", errors)
 
@@ -79,8 +120,15 @@ def make_errors(context, _):
 @stage(
     "matches",
     "match to the truth",
+    version=2,
     needs={**_MATCHED, "errors": None},
-    sections=("exposures.filters", "photometry.match_radius", "fit.min_detected", "fit.axes"),
+    sections=(
+        *GRID,
+        "errors.coverage",
+        "photometry.match_radius",
+        "fit.min_detected",
+        "fit.axes",
+    ),
     units=truth_names,
     plan=fit_plan,
 )
@@ -93,7 +141,7 @@ def match_sources(context, unit):
     for name in bands:
         matched[f"{name}_formal_err"] = matched[error_column(name)]
         matched[f"{name}_extrapolated"] = errors.extrapolated(matched[name], name)
-    matched = errors.assign(matched, filters=bands)
+    matched = errors.assign(matched, filters=bands, noise=field.noise(config))
     nodes = sed.SEDModel.yang2021_axes(config.fit.axes)["redshift"]
     add_selection(
         matched,
@@ -114,12 +162,13 @@ def match_sources(context, unit):
     context.save_table(f"{unit}/matched.ecsv", matched)
 
 
-def mock_photometry(config, truth, matched, *, seed):
+def mock_photometry(config, truth, matched, *, seed, zero_point=0.0):
     """
     Photometry of the fitted sample (``selection`` 0): mock existing bands, measured MIRI bands.
 
     ``truth`` and ``matched`` have the same sources row by row; the noise of a source in a band depends
-    on ``seed``, its id and the band only.
+    on ``seed``, its id and the band only. The light of existing bands is higher or lower by the share
+    ``zero_point``, of which the fits do not know.
     """
     from miricigale.photometry.surveys import fractional_error
 
@@ -129,7 +178,9 @@ def mock_photometry(config, truth, matched, *, seed):
         fractional={name: fractional_error(name) for name in bands},
     )
     sample = np.asarray(matched["selection"]) == 0
-    table = errors.perturb(truth[["id", *bands]][sample], seed=seed)
+    name = "zero_point_existing"
+    light = Perturbation({name: zero_point}, seed).fluxes(name, truth[["id", *bands]], bands)
+    table = errors.perturb(light[sample], seed=seed)
     for name in config.exposures.filters:
         for column in (name, error_column(name)):
             table[column] = matched[column][sample]
@@ -141,23 +192,26 @@ def fit_units(config):
     return tuple(f"{truth}/{name}" for truth in truth_names(config) for name in config.fit.sets)
 
 
+#: What fits of mock photometry read of the configuration.
+FIT_SECTIONS = ("fit.bands", "fit.depths", "fit.axes", "fit.model_error", "exposures.filters")
+
+
+def _fit_plan(config, unit):
+    """Axes and MIRI bands of a fit, and the zero points of its existing bands where they are others."""
+    truth, _, chosen = unit.partition("/")
+    plan = {"axes": fit_plan(config, unit), "bands": band_sets(config)[chosen]}
+    size = dict(study_truths(config)[truth].perturbations).get("zero_point_existing")
+    return plan | ({"zero_point": size} if size else {})
+
+
 @stage(
     "fits",
     "fit",
     version=5,
     needs={"truth": of_truth, "matches": of_truth},
-    sections=(
-        "fit.bands",
-        "fit.depths",
-        "fit.axes",
-        "fit.model_error",
-        "exposures.filters",
-    ),
+    sections=FIT_SECTIONS,
     resources=sed_resources,
-    plan=lambda config, unit: {
-        "axes": fit_plan(config, unit),
-        "bands": band_sets(config)[unit.partition("/")[2]],
-    },
+    plan=_fit_plan,
     units=fit_units,
     kernels=("fit",),
 )
@@ -167,7 +221,8 @@ def fit_photometry(context, unit):
     name, chosen = unit.split("/")
     truth = QTable.read(context.path(f"{name}/truth.ecsv"))
     matched = QTable.read(context.path(f"{name}/matched.ecsv"))
-    mock = mock_photometry(config, truth, matched, seed=context.seed)
+    zero_point = context.plan.get("zero_point", 0.0)
+    mock = mock_photometry(config, truth, matched, seed=context.seed, zero_point=zero_point)
     fitter = fitting.BayesFitter(
         sed.SEDModel.yang2021(),
         [*config.fit.bands, *context.plan["bands"]],

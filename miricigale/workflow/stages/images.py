@@ -4,11 +4,10 @@ import logging
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
 from miricigale import depth, detector, photometry, psf, reduction, scene
-from miricigale.instrument import background_level
+from miricigale.workflow.morphology import read_stamps
 from miricigale.workflow.perturbation import Perturbation
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.exposures import (
@@ -24,13 +23,19 @@ from miricigale.workflow.stages.exposures import (
     exposure_plan,
     exposure_units,
     grid_of,
+    mosaic_memory,
+    pointing_of,
+    study_background,
     study_exposures,
     truth_bands,
 )
-from miricigale.workflow.truths import of_truth, reference, study_truths
+from miricigale.workflow.truths import CUTOUTS, of_truth, reference, study_truths
 
 __all__ = [
+    "background_of",
     "expose_and_reduce",
+    "expose_image",
+    "imager_of",
     "kernel_of",
     "make_exposure",
     "make_highres",
@@ -38,6 +43,7 @@ __all__ = [
     "make_mosaic",
     "measured_mosaic",
     "mosaic_psf",
+    "mosaics_of",
     "reducer_of",
 ]
 
@@ -51,9 +57,34 @@ def reducer_of(config, n_threads=None):
         jump_threshold=options.jump_threshold,
         box=options.background_box,
         filter_size=options.background_filter,
+        plane=options.background_plane,
         pixfrac=options.pixfrac,
+        # what the analysis knows of the detector, also where a truth has another one
+        references="simulated",
         n_threads=n_threads,
     )
+
+
+def background_of(config, exposure):
+    """The background of an exposure, which those of a pointing share."""
+    options = config.scene
+    return scene.Background(
+        study_background(config, exposure.filter),
+        gradient=options.background_gradient / u.arcmin,
+        position_angle=options.gradient_angle * u.deg,
+        # it moves with the telescope
+        center=pointing_of(config, exposure),
+    )
+
+
+def imager_of(config, properties=None):
+    """The detector that a configuration describes."""
+    imager = detector.Detector.miri_imager(properties=properties)
+    if config.detector.residual:
+        imager = imager.replaced(detector.Residual(config.detector.residual))
+    if not config.detector.cosmic_rays:
+        imager = imager.without(detector.CosmicRays)
+    return imager
 
 
 def expose_and_reduce(
@@ -86,33 +117,28 @@ def expose_and_reduce(
     rate, cal : `~astropy.nddata.CCDData`
         In DN/s and, background subtracted, in MJy/sr.
     """
-    options, differ = config.scene, perturbation or Perturbation({}, seed)
-    background = scene.Background(
-        background_level(exposure.filter) * options.background_scale,
-        gradient=options.background_gradient / u.arcmin,
-        position_angle=options.gradient_angle * u.deg,
-        center=SkyCoord(config.pointing.ra * u.deg, config.pointing.dec * u.deg),
-    )
+    differ = perturbation or Perturbation({}, seed)
     sky = scene.Scene(
         differ.catalog(catalog, exposure.filter),
         filter=exposure.filter,
         wcs=exposure.wcs,
         psf=differ.psf(exposure.filter),
-        background=background,
+        cutouts=differ.stamps,
+        background=background_of(config, exposure),
         n_threads=n_threads,
         agn=differ.point_column(exposure.filter),
     )
-    imager = detector.Detector.miri_imager(properties=differ.detector)
-    if config.detector.residual:
-        imager = imager.replaced(detector.Residual(config.detector.residual))
-    if not config.detector.cosmic_rays:
-        imager = imager.without(detector.CosmicRays)
+    imager = imager_of(config, differ.detector)
     image = differ.with_flat(sky.render(), exposure)
     if tell is not None:
         tell(imager.forecast(image, exposure, sources=sky.truth))
+    return expose_image(config, imager, image, exposure, seed=seed, n_threads=n_threads, keep=keep)
+
+
+def expose_image(config, imager, image, exposure, *, seed, n_threads=None, keep=None):
+    """Rate and calibrated image, as of `expose_and_reduce`, of a noiseless image on a detector."""
     collect = imager.expose if config.exposures.kind == "ramps" else imager.collect
     ramp = collect(image, exposure, seed=seed, n_threads=n_threads)
-    del image
     if keep is not None:
         keep(ramp)
     reducer = reducer_of(config, n_threads)
@@ -157,12 +183,14 @@ def make_exposure(context, unit):
         filename = f"{name}_uncal.fits"
         context.save_result(f"{truth}/level1b/{filename}", ramp, filename=filename)
 
+    effects = context.plan.get("perturbations", {})
+    stamps = read_stamps(context.path(f"{truth}/stamps.fits")) if CUTOUTS in effects else {}
     rate, cal = expose_and_reduce(
         config,
         exposure,
         QTable.read(context.path(f"{truth}/truth.ecsv")),
         seed=context.seed,
-        perturbation=Perturbation(context.plan.get("perturbations", {}), context.seed),
+        perturbation=Perturbation(effects, context.seed, stamps),
         n_threads=context.n_threads,
         tell=tell,
         keep=keep if config.run.keep_level1b else None,
@@ -176,26 +204,35 @@ def make_exposure(context, unit):
 @stage(
     "mosaics",
     "mosaic",
-    version=3,
+    version=4,
     needs={"exposures": dithers_of_band},
     sections=(*GRID, "reduction", "highres.pixel_scale"),
     units=truth_bands,
     plan=exposure_plan,
+    memory=mosaic_memory,
     kernels=("images",),
 )
 def make_mosaic(context, unit):
     """Stage 8: drizzle the dithers of one band, on its own grid and on the prior's."""
     config = context.config
-    reducer = reducer_of(config)
     truth, band = unit.split("/")
     names = [name for name, e in study_exposures(config).items() if e.filter == band]
     images = [context.image(f"{truth}/exposures/{name}_cal.fits") for name in names]
+    for label, mosaic, planes in mosaics_of(config, images):
+        context.save_image(f"{truth}/mosaic_{band}{label}.fits", mosaic, dq=mosaic.flags, **planes)
+
+
+def mosaics_of(config, images):
+    """Mosaics of a band, on its own grid (``""``) and on the prior's (``"_fine"``), with further planes."""
+    reducer = reducer_of(config)
     for label, scale in (("", config.reduction.pixel_scale), ("_fine", config.highres.pixel_scale)):
         # outliers are found in the first pass, which returns the images with them masked
         drizzled, images = reducer.drizzle(images, grid_of(config, scale))
         # second pass: background that remained after subtraction from single dithers
         mosaic, _ = reducer.subtract_background(drizzled.image)
-        context.save_image(f"{truth}/mosaic_{band}{label}.fits", mosaic, dq=mosaic.flags)
+        # how many exposures each pixel has: what errors follow
+        planes = {} if label else {"n_images": drizzled.n_images}
+        yield label, mosaic, planes
 
 
 @stage(
@@ -206,6 +243,7 @@ def make_mosaic(context, unit):
     sections=(*GRID, "highres", "photometry.threshold", "photometry.n_pixels"),
     resources=("filters.sedpy",),
     plan=lambda config, _: {"exposures": exposure_plan(config), "truth": reference(config)},
+    memory=mosaic_memory,
     kernels=("images",),
 )
 def make_highres(context, _):

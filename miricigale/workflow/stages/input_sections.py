@@ -7,7 +7,7 @@ from miricigale.workflow.stages.figures import band_label
 __all__ = ["write_inputs"]
 
 
-def write_inputs(report, tables, truth, metrics, config, area):
+def write_inputs(report, tables, metrics, config, area):
     """
     Luminosities, star formation, counts and light of the galaxies of a truth.
 
@@ -22,14 +22,12 @@ def write_inputs(report, tables, truth, metrics, config, area):
     if len(galaxies) == 0:
         report.text("No galaxy of the catalog has a model.")
         return
-    figure, (faint, passive) = figures.input_figure(galaxies)
-    agn = "" if truth.frac_agn == 0 else ", AGN included,"
+    figure, left_out = figures.input_figure(galaxies)
     report.figure(
         figure,
-        f"Galaxies of the catalog. Left: luminosity of 3-1000 µm{agn} against redshift, with "
-        "the 8-1000 µm luminosities of three star-formation rates after Kennicutt 1998 (Salpeter IMF). Right: "
-        "star-formation rate (100 Myr) against stellar mass, with the main sequence of Speagle et "
-        f"al. 2014 (Kroupa IMF). {faint} and {passive} galaxies lie below the axes.",
+        "Star-formation rate (100 Myr) against stellar mass of the galaxies of the catalog by redshift, with the "
+        f"main sequence of Speagle et al. 2014 (Kroupa IMF) in the middle of each range; {left_out} of "
+        f"{len(galaxies)} lie at other redshifts or below the axes.",
     )
     _write_counts(report, tables.galaxies(field=True), metrics, config, area)
 
@@ -60,6 +58,7 @@ def _write_counts(report, galaxies, metrics, config, area):
     report.table(
         [[cell(row) for cell in columns.values()] for row in metrics["light"]],
         header=tuple(columns),
+        text=(0, len(columns) - 1),
         caption="Light of all galaxies above a flux, nu I_nu in nW / m2 / sr; Poisson errors, without "
         "cosmic variance",
         empty="The light of all galaxies together is published near 15 and 24 µm; no band of "

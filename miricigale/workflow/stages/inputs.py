@@ -13,10 +13,11 @@ from miricigale.refdata.locate import fingerprint
 from miricigale.scene import read_catalog
 from miricigale.utils.exceptions import ConfigError, argument_error
 from miricigale.utils.tables import error_column
+from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.stage import stage
-from miricigale.workflow.stages.sample import magnitude
 
 __all__ = [
+    "REDSHIFT_STEP",
     "bright_sources",
     "catalog_bands",
     "fit_inputs",
@@ -94,7 +95,14 @@ def _catalog(options, state):
     columns, units = (
         dict(pair.split("=") for pair in pairs) for pairs in (options.columns, options.units)
     )
-    return read_catalog(options.source, columns=columns or None, units=units or None)
+    return read_catalog(
+        options.source,
+        columns=columns,
+        units=units,
+        survey=options.survey or None,
+        missing=options.missing,
+        factor=options.factor or None,
+    )
 
 
 def _input_plan(config, _):
@@ -130,7 +138,7 @@ def bright_sources(catalog, options, prior):
         magnitudes = catalog[column]
         magnitudes = np.asarray(getattr(magnitudes, "value", magnitudes), float)
     elif prior in catalog.colnames:
-        column, magnitudes = prior, magnitude(catalog[prior])
+        column, magnitudes = prior, ab_magnitude(catalog[prior])
     else:
         wanted = f"one of {catalog.colnames}, or the catalog must have fluxes in {prior}"
         raise argument_error("mag_column", wanted, repr(column))

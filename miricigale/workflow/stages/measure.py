@@ -10,9 +10,10 @@ from miricigale.workflow.stages.exposures import (
     IMAGE_RESOURCES,
     KERNEL,
     exposure_plan,
+    mosaic_memory,
     truth_bands,
 )
-from miricigale.workflow.stages.images import mosaic_psf
+from miricigale.workflow.stages.images import measured_mosaic, mosaic_psf
 
 __all__ = ["make_templates", "measure_band", "measure_photometry", "yang2021_photometer"]
 
@@ -23,6 +24,7 @@ __all__ = ["make_templates", "measure_band", "measure_photometry", "yang2021_pho
     version=2,
     needs=("highres",),
     sections=("highres.filter", "highres.pixel_scale"),
+    memory=mosaic_memory,
     kernels=("photometry",),
 )
 def make_templates(context, _):
@@ -53,28 +55,31 @@ def make_templates(context, _):
     resources=IMAGE_RESOURCES,
     units=truth_bands,
     plan=exposure_plan,
+    memory=mosaic_memory,
     kernels=("photometry",),
 )
 def measure_photometry(context, unit):
     """Stage 11: forced photometry of one band, on its own grid or by the steps of Yang et al. 2021."""
     truth, name = unit.split("/")
-    result = measure_band(context, truth, name, context.config.photometry.method)
+    suffix, _ = measured_mosaic(context.config)
+    mosaic = context.image(f"{truth}/mosaic_{name}{suffix}.fits")
+    result = measure_band(context, mosaic, name, context.config.photometry.method)
     table = result.to_table()
     context.save_table(f"{truth}/photometry/{name}.ecsv", table)
     context.save_image(f"{truth}/photometry/{name}_model.fits", result.model_image)
     context.save_image(f"{truth}/photometry/{name}_residual.fits", result.residual_image)
 
 
-def measure_band(context, truth, name, method):
-    """Result of the forced photometry of one band of a truth, ``"package"`` or ``"yang2021"``."""
+def measure_band(context, mosaic, name, method):
+    """Result of the forced photometry of a mosaic of one band, ``"package"`` or ``"yang2021"``."""
     if method == "yang2021":
-        return _as_yang2021(context, truth, name)
+        return _as_yang2021(context, mosaic, name)
     kernel = psf.MatchingKernel.read(context.path(f"kernel_{name}.fits"))
     # the constant absorbs the light of faint sources and of wings in the background
     return photometry.ForcedPhotometer(
         kernel, fit_background=True, n_threads=context.n_threads
     ).measure(
-        context.image(f"{truth}/mosaic_{name}.fits"),
+        mosaic,
         templates=photometry.SourceTemplates.read(context.path("templates.fits")),
     )
 
@@ -89,11 +94,11 @@ def yang2021_photometer(config, name, n_threads):
     )
 
 
-def _as_yang2021(context, truth, name):
+def _as_yang2021(context, mosaic, name):
     """Forced photometry of one band by the steps of Yang et al. 2021, on the grid of the prior."""
     _, labels = context.image("segm.fits", "segmentation")
     return yang2021_photometer(context.config, name, context.n_threads).measure(
-        context.image(f"{truth}/mosaic_{name}_fine.fits"),
+        mosaic,
         context.image("f160w.fits"),
         labels.astype(np.int32),
         QTable.read(context.path("detections.ecsv")),

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 
 import astropy.units as u
 import numpy as np
@@ -12,7 +13,6 @@ from miricigale.evaluation import (
     PUBLISHED_LIGHT,
     fraction_interval,
     integrated_light,
-    photoz_metrics,
     recovery_metrics,
     sigma_mad,
 )
@@ -20,21 +20,22 @@ from miricigale.instrument import (
     CEERS_FILTERS,
     ceers_exposures,
 )
+from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.stages.conditions import (
     ConditionFlags,
     band_conditions,
     detection_counts,
     fit_conditions,
 )
-from miricigale.workflow.stages.exposures import band_exposures
-from miricigale.workflow.stages.sample import SampleFlags, magnitude
+from miricigale.workflow.stages.exposures import pointing_exposures, pointing_time
+from miricigale.workflow.stages.sample import SampleFlags
 
 __all__ = [
     "StudyTables",
+    "above_proposal",
     "as_ceers",
     "as_paper",
     "bright_isolated",
-    "fit_metrics",
     "study_metrics",
     "truth_metrics",
 ]
@@ -106,7 +107,7 @@ def as_ceers(config, name):
     def seen(exposures):
         return [(e.readout, e.subarray, e.n_groups * e.n_integrations) for e in exposures]
 
-    own = band_exposures(config, name)
+    own = pointing_exposures(config, name)
     # the split of the frames into groups and integrations is not the survey's
     return seen(own) == seen(ceers_exposures(own[0].pointing, own[0].roll, filters=[name]))
 
@@ -121,6 +122,14 @@ def _proposal(name, exposure):
         "proposal": float(depth.proposal_limit(name).value),
         "proposal_time": time.to_value(u.s),
     }
+
+
+def above_proposal(truth, bands):
+    """Bands in which each true flux is above the limit of the CEERS proposal; None if a band has none."""
+    if not set(bands) <= set(CEERS_FILTERS):
+        return None
+    limits = {name: depth.proposal_limit(name).value for name in bands}
+    return sum((ab_magnitude(truth[name]) < limit).astype(int) for name, limit in limits.items())
 
 
 def as_paper(config):
@@ -168,13 +177,31 @@ def _band_metrics(matched, name):
     return {
         "bright_isolated": recovery_metrics(true[bright], flux[bright], relative=True),
         "n_measured": int(np.count_nonzero(usable & np.isfinite(flux))),
-        "formal_limit": float(magnitude(5 * np.nanmedian(formal[usable]) * u.uJy))
+        "formal_limit": float(ab_magnitude(5 * np.nanmedian(formal[usable]) * u.uJy))
         if usable.any()
         else np.nan,
         "pull_n": int(pulls.size),
         "pull_median": float(np.median(pulls)) if pulls.size else np.nan,
         "pull_scatter": sigma_mad(pulls),
     }
+
+
+#: Exposure times, in units of that of one pointing, at which depths are told apart.
+_TIMES = (0.0, 0.8, 1.5, np.inf)
+
+
+def _depth_by_time(tables, field, name, time):
+    """Galaxies of the field (``field``) by exposure time in a band, with its median and the limit there."""
+    seen = (tables.matched[f"{name}_time"] / time).to_value(u.one)
+    rows = []
+    for low, high in itertools.pairwise(_TIMES):
+        chosen = field & (seen >= low) & (seen < high)
+        if np.any(chosen):
+            share = float(np.median(seen[chosen]))
+            # the error at a flux is that of one pointing, over the root of the share
+            limit = tables.errors.limiting_magnitude(name, 5.0 / np.sqrt(share))
+            rows.append({"n": int(chosen.sum()), "share": share, "limit": float(limit.value)})
+    return rows
 
 
 def _coverage(truth, table, name):
@@ -202,7 +229,7 @@ def _light(galaxies, bands, area):
 
 def study_metrics(config, tables, area):
     """
-    All numbers of the report, as plain values for ``report/metrics.json``.
+    Numbers of the field and of its bands, as plain values for ``report/metrics.json``.
 
     ``tables`` are those of the reference truth, ``area`` is the solid angle of the imaged
     field; NaN where there is nothing to count.
@@ -227,15 +254,18 @@ def study_metrics(config, tables, area):
         "bands": {},
         "detected": [],
         "light": _light(tables.galaxies(field=True), bands, area),
-        "fits": fit_metrics(tables, bands),
     }
-    prior = magnitude(truth[config.highres.filter])
+    prior = ab_magnitude(truth[config.highres.filter])
+    proposal = above_proposal(truth, bands)
     for limit, paper in PAPER_DETECTED:
         if limit > config.catalog.mag_limit:
             continue
         chosen = field & (prior < limit)
         n = int(np.count_nonzero(chosen & (matched["n_detected"] >= metrics["n_bands_detected"])))
         fraction, low, high = fraction_interval(n, int(chosen.sum()))
+        to_proposal = np.nan
+        if proposal is not None and chosen.any():
+            to_proposal = float(np.mean(proposal[chosen] >= metrics["n_bands_detected"]))
         metrics["detected"].append(
             {
                 "limit": limit,
@@ -243,18 +273,19 @@ def study_metrics(config, tables, area):
                 "fraction": fraction,
                 "low": low,
                 "high": high,
+                "to_proposal": to_proposal,
                 "paper": paper,
             }
         )
     for name in bands:
-        exposures = band_exposures(config, name)
-        time = sum(e.exposure_time for e in exposures)
+        time = pointing_time(config, name)
         entry = _band_metrics(matched, name)
         bright = entry.pop("bright_isolated")
         entry |= {
             "limit": float(errors.limiting_magnitude(name).value),
             "etc_limit": float(depth.scaled_limit(name, time).to_value(u.ABmag)),
-            **_proposal(name, exposures[0]),
+            "coverage": _depth_by_time(tables, field, name, time) if config.errors.coverage else [],
+            **_proposal(name, pointing_exposures(config, name)[0]),
             "ceers": as_ceers(config, name),
             "bright_n": bright.n,
             "bright_median": bright.median,
@@ -275,31 +306,39 @@ def study_metrics(config, tables, area):
     return metrics
 
 
-def fit_metrics(tables, bands):
-    """How well redshift and fracAGN are recovered, by set of bands; ``tables`` are `StudyTables`."""
-    sample, found = tables.sample, {}
+#: Numbers of a fit by the quantities of `~miricigale.evaluation.study_numbers` that they are.
+_OF_FIT = {
+    "photoz_bias": "z_bias",
+    "photoz_sigma_mad": "z_scatter",
+    "photoz_outliers": "z_outliers",
+    "frac_agn_bias": "frac_offset",
+    "frac_agn_sigma_mad": "frac_scatter",
+    "frac_agn_width": "width",
+}
+
+
+def truth_metrics(truth, tables, numbers, bands):
+    """
+    Numbers of one truth as plain values: how well redshift and fracAGN are recovered, by set of bands.
+
+    ``truth`` is a `~miricigale.workflow.truths.Truth`, ``tables`` are its `StudyTables`, and ``numbers`` is
+    the table of `~miricigale.evaluation.study_numbers`.
+    """
+    whole = (numbers["z_low"] == 0) & np.isinf(numbers["z_high"])
+    own = numbers[whole & (numbers["truth"] == truth.name)]
+    sample, fits = tables.sample, {}
     matched = tables.matched[np.asarray(tables.matched["selection"]) == 0]
     for unit, table in tables.fits.items():
-        photoz = photoz_metrics(sample["redshift"], table["redshift_mean"])
-        fraction = recovery_metrics(sample["frac_agn"], table["frac_agn_mean"])
-        found[unit] = {
-            "n": photoz.n,
-            "photoz_bias": photoz.bias,
-            "photoz_sigma_mad": photoz.sigma_mad,
-            "photoz_n_outliers": photoz.n_outliers,
-            "photoz_outliers": photoz.outlier_fraction,
-            "photoz_outliers_low": photoz.outlier_low,
-            "photoz_outliers_high": photoz.outlier_high,
-            "frac_agn_bias": fraction.median,
-            "frac_agn_sigma_mad": fraction.sigma_mad,
-            "frac_agn_width": float(np.nanmedian(table["frac_agn_std"])) if len(table) else np.nan,
+        rows = {row["quantity"]: row for row in own[own["band_set"] == unit]}
+        values = {key: float(rows[name]["value"]) for key, name in _OF_FIT.items()}
+        outliers, n = rows["z_outliers"], int(rows["z_outliers"]["n"])
+        fits[unit] = {
+            "n": n,
+            **values,
+            "photoz_n_outliers": round(n * values["photoz_outliers"]) if n else 0,
+            "photoz_outliers_low": float(outliers["low"]),
+            "photoz_outliers_high": float(outliers["high"]),
             "redshift_coverage": _coverage(sample["redshift"], table, "redshift"),
             "conditions": fit_conditions(matched, sample["redshift"], table, bands),
         }
-    return found
-
-
-def truth_metrics(truth, tables, bands):
-    """Numbers of one truth (`~miricigale.workflow.truths.Truth`) as plain values."""
-    fits = fit_metrics(tables, bands)
-    return {**truth.values(), "n_sample": len(tables.sample), "fits": fits}
+    return {**truth.values(), "n_sample": len(sample), "fits": fits}

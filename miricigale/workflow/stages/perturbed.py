@@ -1,5 +1,7 @@
 """What it costs that the analysis does not know the sky: a section of the report."""
 
+from pathlib import Path
+
 import numpy as np
 from astropy.table import Table
 
@@ -7,6 +9,7 @@ from miricigale.evaluation import Missing, bootstrap, sigma_mad
 from miricigale.filters import Filter
 from miricigale.workflow.stages.figures import band_label
 from miricigale.workflow.stages.metrics import bright_isolated
+from miricigale.workflow.truths import CUTOUTS
 
 __all__ = ["perturbation_costs", "write_perturbed"]
 
@@ -24,12 +27,15 @@ _LABELS = {
     "flat": "flat field",
     "gain": "gain",
     "linearity": "linearity",
-    "zero_point": "zero point",
+    "zero_point": "zero point, MIRI",
+    "zero_point_existing": "zero point, existing bands",
     "astrometry": "astrometry",
     "stars": "stars: bursts and gas",
     "dust": "dust: Draine & Li",
     "torus": "another torus",
     "point_agn": "AGN as a point",
+    "clumps": "made-up clumps",
+    "cutouts": "light of real galaxies",
     "all": "all together",
 }
 
@@ -150,9 +156,10 @@ def write_perturbed(context, report, truths, every):
         f"and together: a PSF of another wavefront, or {100 * options.psf_width:g} % wider or narrower; "
         f"another flat field; a gain other by {100 * options.gain:g} % (which the conversion to fluxes "
         f"does not know either); a signal other by {100 * options.linearity:g} % at the full well; fluxes "
-        f"{100 * options.zero_point:g} % higher or lower, and positions {1000 * options.astrometry:g} mas "
-        "off, by band; and sources of other models. Kernels, error functions, templates and grids "
-        "stay as they are.",
+        f"{100 * options.zero_point:g} % (MIRI) and {100 * options.zero_point_existing:g} % (existing bands) "
+        f"higher or lower, and positions {1000 * options.astrometry:g} mas off, by band; sources of other "
+        f"models, and of other shapes than the prior shows{_shapes(config, truths)}. Kernels, error "
+        "functions, templates and grids stay as they are.",
     )
     quantities = list(dict.fromkeys(table["quantity"]))
     cells = {(row["truth"], row["perturbation"], row["quantity"]): row for row in table}
@@ -167,6 +174,21 @@ def write_perturbed(context, report, truths, every):
         "and its error by bootstrap of these sources",
         text=2,
     )
+
+
+def _shapes(config, truths):
+    """Which shapes: clumps are made up, and stamps are those of an image."""
+    effects = {name for truth in truths.values() for name, _ in truth.perturbations}
+    options, parts = config.perturb, []
+    if "clumps" in effects:
+        parts.append(f"{100 * options.clumps:g} % of the light of disks in made-up clumps")
+    if CUTOUTS in effects:
+        name = Path(options.cutouts).name
+        whose = (
+            "their own light" if options.cutouts_of == "own" else "light of galaxies of their size"
+        )
+        parts.append(f"{whose} on {name} in place of Sersic profiles")
+    return f" ({'; '.join(parts)})" if parts else ""
 
 
 def _header(quantity):

@@ -10,7 +10,15 @@ from astropy.table import QTable
 from miricigale.evaluation import number
 from miricigale.refdata import citations, resource, resources
 from miricigale.utils.meta import provenance
-from miricigale.workflow.stages.exposures import IMAGE_RESOURCES, study_exposures
+from miricigale.workflow.background import background_text
+from miricigale.workflow.stages.exposures import (
+    IMAGE_RESOURCES,
+    background_options,
+    dithers_text,
+    study_background,
+    study_exposures,
+    study_pointings,
+)
 from miricigale.workflow.stages.figures import band_label
 from miricigale.workflow.stages.inputs import catalog_bands, input_bands
 
@@ -49,8 +57,9 @@ EXPOSURE_HEADER = (
     "band",
     "readout",
     "groups x integrations",
-    "dithers",
+    "pointings x dithers",
     "time (s)",
+    "background (MJy/sr)",
     "sky fills of the well",
     "saturated pixels",
     "as CEERS",
@@ -64,13 +73,13 @@ def exposure_rows(config, forecasts, ceers):
     ``forecasts`` are tables by unit, ``ceers`` says of each band whether it is exposed as CEERS did;
     filling and saturation are the highest of the dithers.
     """
-    kinds = {}
+    kinds, n_pointings = {}, len(study_pointings(config))
     for unit, e in study_exposures(config).items():
         key = (e.filter, f"{e.readout} {e.subarray}", e.n_groups, e.n_integrations)
         kinds.setdefault(key, []).append((e, forecasts[unit]))
     rows = []
     for (name, readout, n_groups, n_integrations), group in kinds.items():
-        time = sum(e.exposure_time for e, _ in group).to_value(u.s)
+        time = sum(e.exposure_time for e, _ in group).to_value(u.s) / n_pointings
         fill = max(float(table["sky_fraction"][0]) for _, table in group)
         full = max(int(table["n_pixels"][0]) for _, table in group)
         rows.append(
@@ -78,8 +87,9 @@ def exposure_rows(config, forecasts, ceers):
                 band_label(name),
                 readout,
                 f"{n_groups} x {n_integrations}",
-                len(group),
+                f"{n_pointings} x {len(group) // n_pointings}",
                 f"{time:.0f}",
+                f"{study_background(config, name).value:.4g}",
                 number(fill, "{:.0f} %", "no usable pixel", scale=100),
                 full,
                 "yes" if ceers[name] else "no",
@@ -211,13 +221,28 @@ def write_exposures(context, report, metrics, truth):
     report.table(
         exposure_rows(config, forecasts, ceers),
         header=EXPOSURE_HEADER,
-        caption="Exposures; time is that of all dithers, filling (by the last group) and saturated "
+        caption="Exposures; time is that of all dithers of a pointing, filling (by the last group) and saturated "
         "pixels are the highest of a dither; 'as CEERS' holds for read-out, frames and dithers, not for "
         "the split of the frames into groups and integrations, which is our own",
         text=2,
     )
+    report.text(f"Dithers: {dithers_text(config)}. {_background_sentence(config)}.")
     catalog = QTable.read(context.path("catalog.ecsv"))
     report.table(catalog_facts(config, catalog), header=("catalog", ""), text=2)
+
+
+def _background_sentence(config):
+    """Which background the images have, where it is from and how it varies."""
+    options = config.scene
+    text = f"Background at the center of the field: {background_text(**background_options(config))}"
+    if options.background_scale != 1:
+        text += f", times {options.background_scale:g}"
+    if options.background_gradient == 0:
+        return f"{text}; it is the same everywhere"
+    return (
+        f"{text}; it grows by {100 * options.background_gradient:g} % of that for each arcmin towards position "
+        f"angle {options.gradient_angle:g} deg"
+    )
 
 
 def write_origin(report, config, model, metas):

@@ -26,12 +26,14 @@ from miricigale.workflow.stages import (
     provenance,
     rivals,
     truth_figures,
+    variants,
 )
 from miricigale.workflow.stages.exposures import (
     EXPOSURE_RESOURCES,
     GRID,
     exposure_plan,
     study_exposures,
+    study_pointings,
 )
 from miricigale.workflow.stages.figures import SET_LABELS, band_label
 from miricigale.workflow.stages.images import measured_mosaic, reducer_of
@@ -50,7 +52,7 @@ log = logging.getLogger(__name__)
 @stage(
     "report",
     "report",
-    version=6,
+    version=7,
     needs=(
         "catalog",
         "truth",
@@ -63,6 +65,7 @@ log = logging.getLogger(__name__)
         "errors",
         "matches",
         "rivals",
+        "variants",
         "fits",
         "experiments",
     ),
@@ -71,6 +74,7 @@ log = logging.getLogger(__name__)
         "run.name",
         "catalog",
         "sed",
+        "scene",
         "detector",
         "highres.filter",
         "highres.pixel_scale",
@@ -81,6 +85,7 @@ log = logging.getLogger(__name__)
         "errors",
         "point_sources",
         "perturb",
+        "variants",
         "report",
     ),
     resources=lambda: (*sed_resources(), *EXPOSURE_RESOURCES),
@@ -97,26 +102,9 @@ def make_report(context, _):
     mosaics = {name: context.image(f"{shown}/mosaic_{name}.fits") for name in bands}
     area = footprint_area(mosaics.values())
     metrics = study_metrics(config, tables, area)
+    model = sed.SEDModel.yang2021()
     # those of whose sky the analysis knows all
     known = {name: truth for name, truth in truths.items() if not truth.perturbations}
-    metrics["truths"] = {
-        name: truth_metrics(truth, every[name], bands) for name, truth in known.items()
-    }
-    if metrics["n_sample"] == 0:
-        log.warning("no source is left to fit: %s", metrics["n_left_out"])
-    text = json.dumps(_without_nan(metrics), indent=1, allow_nan=False)
-    context.save("report/metrics.json", lambda path: path.write_text(text, encoding="utf-8"))
-    model = sed.SEDModel.yang2021()
-    report = Report(
-        f"miricigale: {config.run.name}",
-        subtitle=(
-            f"{metrics['n_field']} galaxies in a MIRI field at RA {config.pointing.ra:.5f}, "
-            f"Dec {config.pointing.dec:.5f}, injected fracAGN "
-            f"{', '.join(map(str, config.sed.frac_agn))}, seed {context.seed}"
-        ),
-        notices=provenance.stand_ins(config, model),
-        dpi=config.report.dpi,
-    )
     others = rivals.read_rivals(context)
     known_tables = {name: every[name] for name in known}
     study = comparison.study_results(config, known, known_tables, metrics)
@@ -124,7 +112,25 @@ def make_report(context, _):
     extra = comparison.extra_numbers(study, metrics, shares, context.seed)
     extra |= rivals.source_extractor_numbers(others, context.seed)
     study = dataclasses.replace(study, extra=extra)
-    context.save_table("report/numbers.ecsv", study_numbers(study, seed=context.seed, n_draws=300))
+    numbers = study_numbers(study, seed=context.seed, n_draws=300)
+    context.save_table("report/numbers.ecsv", numbers)
+    metrics["truths"] = {
+        name: truth_metrics(truth, every[name], numbers, bands) for name, truth in known.items()
+    }
+    metrics["fits"] = metrics["truths"][shown]["fits"]
+    if metrics["n_sample"] == 0:
+        log.warning("no source is left to fit: %s", metrics["n_left_out"])
+    text = json.dumps(_without_nan(metrics), indent=1, allow_nan=False)
+    context.save("report/metrics.json", lambda path: path.write_text(text, encoding="utf-8"))
+    report = Report(
+        f"miricigale: {config.run.name}",
+        subtitle=(
+            f"{metrics['n_field']} galaxies in {_field_text(config)}, injected fracAGN "
+            f"{', '.join(map(str, config.sed.frac_agn))}, seed {context.seed}"
+        ),
+        notices=provenance.stand_ins(config, model),
+        dpi=config.report.dpi,
+    )
     writer = _Writer(context, report, tables, metrics, study, mosaics, truths[shown])
     writer.summary()
     report.links("The sources one by one:", [(name, f"sources-{name}.html") for name in truths])
@@ -134,12 +140,15 @@ def make_report(context, _):
     writer.photometry()
     rivals.write_rivals(context, report, others)
     writer.errors()
+    calculator = {name: entry["etc_limit"] for name, entry in metrics["bands"].items()}
+    switched = variants.write_variants(context, report, tables.matched, calculator)
     write_results(
         Page(
             report,
             study,
             known_tables,
             metrics,
+            numbers,
             shares,
             model,
             config.fit.model_error,
@@ -148,9 +157,10 @@ def make_report(context, _):
     )
     experiments.write_experiments(context, report, known_tables)
     reasons, sentences = comparison.reasons_of(config, metrics, model)
+    variants.add_reasons(reasons, switched, config)
     comparison.write_comparison(context, report, study, reasons, sentences)
     perturbed.write_perturbed(context, report, truths, every)
-    write_inputs(report, tables, truths[shown], metrics, config, area)
+    write_inputs(report, tables, metrics, config, area)
     provenance.write_origin(report, config, model, [tables.truth.meta, tables.matched.meta])
     context.save("report/index.html", lambda path: report.write(path))
 
@@ -292,6 +302,10 @@ class _Writer:
             ),
             paper: lambda row: percent(row["paper"], ""),
         }
+        if any(np.isfinite(row["to_proposal"]) for row in m["detected"]):
+            columns["by true flux, to the limits of the CEERS proposal"] = lambda row: percent(
+                row["to_proposal"], none
+            )
         self._table(
             m["detected"],
             columns,
@@ -415,7 +429,9 @@ class _Writer:
             "5 sigma, error function": lambda x: number(x[1]["limit"], ".2f", none),
             "formal": lambda x: number(x[1]["formal_limit"], ".2f", "no source measured"),
             "calculator, scaled": lambda x: f"{x[1]['etc_limit']:.2f}",
-            "minus calculator": lambda x: number(x[1]["limit"] - x[1]["etc_limit"], "+.2f", none),
+            "fainter than calculator": lambda x: number(
+                x[1]["limit"] - x[1]["etc_limit"], "+.2f", none
+            ),
             proposal: lambda x: _proposal(x[1]),
             "pull median": lambda x: number(x[1]["pull_median"], "+.2f", few),
             "pull scatter": lambda x: number(x[1]["pull_scatter"], ".2f", few),
@@ -424,10 +440,37 @@ class _Writer:
             bands.items(),
             columns,
             caption=(
-                "5-sigma limits (AB magnitudes), and (measured - true) / formal error of the sources "
-                "below 20 sigma, blends and template errors included"
+                "5-sigma limits (AB magnitudes; the calculator's are of its own low background), and "
+                "(measured - true) / formal error of the sources below 20 sigma, blends and template "
+                "errors included"
             ),
         )
+        if rows := _coverage_rows(bands):
+            self.report.table(
+                rows,
+                header=("band", "exposure time", "galaxies", "5 sigma"),
+                caption="Limits by the exposure time at a source, in units of that of one pointing: "
+                "medians of the galaxies with less than 0.8, 0.8 to 1.5, and more",
+            )
+
+
+def _field_text(config):
+    """Where the telescope looks, in words."""
+    centers = study_pointings(config)
+    field = "a MIRI field" if len(centers) == 1 else f"{len(centers)} MIRI pointings"
+    if config.pointing.centers:
+        return f"{field}, the first at RA {centers[0].ra.deg:.5f}, Dec {centers[0].dec.deg:.5f}"
+    return f"{field} at RA {config.pointing.ra:.5f}, Dec {config.pointing.dec:.5f}"
+
+
+def _coverage_rows(bands):
+    """Rows of the table of depths by exposure time; none where all sources have the same."""
+    return [
+        (band_label(name), f"{entry['share']:.2f}", entry["n"], number(entry["limit"], ".2f", "-"))
+        for name, metrics in bands.items()
+        for entry in metrics["coverage"]
+        if len(metrics["coverage"]) > 1
+    ]
 
 
 def _proposal(entry):
@@ -440,4 +483,4 @@ def _proposal(entry):
 def _plus_minus(fit):
     if not np.isfinite(fit["frac_agn_bias"]):
         return Missing(NO_SAMPLE)
-    return f"{fit['frac_agn_bias']:+.2f} ± {fit['frac_agn_sigma_mad']:.2f}"
+    return f"{fit['frac_agn_bias']:+.3f} ± {fit['frac_agn_sigma_mad']:.3f}"

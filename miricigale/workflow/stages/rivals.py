@@ -6,6 +6,7 @@ from astropy.table import QTable
 
 from miricigale import photometry
 from miricigale.evaluation import Estimate, bootstrap, match_truth, number, recovery_metrics
+from miricigale.evaluation.estimates import median
 from miricigale.utils.tables import described_rows, error_column
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.conditions import ConditionFlags
@@ -40,6 +41,8 @@ RIVALS = {
 SE_BAND = "miri.f1500w"
 #: Ranges of the true signal-to-noise ratio.
 SNR_RANGES = ((3.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20.0, 50.0), (50.0, np.inf))
+#: Ranges of the half-light radius (arcsec) of sources that are no points.
+SIZE_RANGES = ((0.0, 0.2), (0.2, 0.4), (0.4, 0.8), (0.8, np.inf))
 
 
 def _one_band(select):
@@ -50,6 +53,7 @@ def _one_band(select):
 @stage(
     "rivals",
     "rival photometry",
+    version=2,
     needs={
         "truth": _one_band("{truth}"),
         "mosaics": _one_band("{truth}/{band}"),
@@ -75,8 +79,9 @@ def measure_rivals(context, name):
     matched = QTable.read(context.path(f"{of_truth}/matched.ecsv"))
     own = config.photometry.method
     other = "package" if own == "yang2021" else "yang2021"
-    forced = measure_band(context, of_truth, name, other).to_table()
     mosaic = context.image(f"{of_truth}/mosaic_{name}_fine.fits")
+    measured = mosaic if other == "yang2021" else context.image(f"{of_truth}/mosaic_{name}.fits")
+    forced = measure_band(context, measured, name, other).to_table()
     blind = photometry.source_extractor_photometry(mosaic)
     inside = in_field(truth["sky"], [mosaic])
     blind["inside"] = in_field(blind["sky"], [mosaic]) if len(blind) else np.zeros(0, bool)
@@ -98,8 +103,9 @@ def rival_table(truth, matched, name, *, own, inside):
     """
     The sources of a truth in a band, with the fluxes of the study's ``own`` method.
 
-    ``shape`` is ``"point"``, ``"n < 2"`` or ``"n >= 2"``; ``snr`` the true flux over the study's formal
-    error; ``field`` tells the sources that were exposed (``inside``) and have a model.
+    ``shape`` is ``"point"``, ``"n < 2"`` or ``"n >= 2"``, ``half_light_radius`` that of the truth; ``snr`` the
+    true flux over the study's formal error; ``field`` tells the sources that were exposed (``inside``) and have
+    a model.
     """
     index = np.asarray(truth["sersic_index"], float)
     table = QTable({"id": truth["id"], "sky": truth["sky"]})
@@ -108,6 +114,7 @@ def rival_table(truth, matched, name, *, own, inside):
     table["snr"] = (table["flux_true"] / formal).to_value(u.one)
     shapes = np.where(index < 2, "n < 2", "n >= 2")
     table["shape"] = np.where(np.asarray(truth["profile"]) == "point", "point", shapes)
+    table["half_light_radius"] = truth["half_light_radius"].to(u.arcsec)
     near = (np.asarray(matched[f"{name}_condition"]) & ConditionFlags.CROWDED) > 0
     edge = (np.asarray(matched[f"{name}_condition"]) & ConditionFlags.EDGE) > 0
     table["crowded"], table["edge"] = near, edge
@@ -136,6 +143,10 @@ def _groups(table):
             yield "true S/N", name, usable & (snr > low) & (snr <= high)
     for name in ("point", "n < 2", "n >= 2"):
         yield "shape", name, bright & (np.asarray(table["shape"]) == name)
+    size, point = table["half_light_radius"].value, np.asarray(table["shape"]) == "point"
+    for low, high in SIZE_RANGES:
+        name = f"{low:g} to {high:g} arcsec" if np.isfinite(high) else f"above {low:g} arcsec"
+        yield "half-light radius", name, bright & ~point & (size >= low) & (size < high)
     yield "neighbors", "isolated", bright & ~crowded
     yield "neighbors", "crowded", bright & crowded
 
@@ -218,7 +229,7 @@ def _se_offset(table, seed, method="yang2021"):
         good = np.asarray(table["field"]) & (np.asarray(table["snr"], float) > 5)
         good &= (blind > 0) & (forced > 0)
     delta = -2.5 * np.log10(blind[good] / forced[good])
-    return bootstrap(lambda v: np.median(v, axis=-1), delta, seed=seed)
+    return bootstrap(median, delta, seed=seed)
 
 
 def source_extractor_numbers(tables, seed):
@@ -290,8 +301,8 @@ def write_rivals(context, report, tables):
         ],
         header=("by", "sources", "in the group", *header),
         caption="Measured over true flux minus one, median ± scatter (number measured), of all bands "
-        "together: by the true flux over the study's formal error, and, of those above 5, by shape "
-        "and neighbors; sources at the edge are left out",
+        "together: by the true flux over the study's formal error, and, of those above 5, by shape, "
+        "size and neighbors; sources at the edge are left out",
         text=2,
     )
     report.table(

@@ -3,7 +3,8 @@
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
-from astropy.wcs.utils import proj_plane_pixel_area
+from astropy.wcs.utils import proj_plane_pixel_area, proj_plane_pixel_scales
+from scipy.ndimage import uniform_filter
 
 from miricigale.photometry import ErrorModel
 from miricigale.utils.exceptions import argument_error
@@ -15,8 +16,8 @@ __all__ = [
     "detected_bands",
     "footprint_area",
     "in_field",
-    "magnitude",
     "matched_errors",
+    "mean_coverage",
     "typical_source",
 ]
 
@@ -38,13 +39,6 @@ class SampleFlags(Flags):
     OUTSIDE_GRID = 32
 
 
-def magnitude(flux):
-    """AB magnitudes of fluxes; NaN where not positive."""
-    value = u.Quantity(flux).to_value(u.uJy)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(value > 0, 23.9 - 2.5 * np.log10(value), np.nan)
-
-
 def in_field(sky, images):
     """Whether positions, shape (n,), fall on a usable pixel of every image (with WCS and mask)."""
     inside = np.ones(len(sky), bool)
@@ -58,15 +52,38 @@ def in_field(sky, images):
     return inside
 
 
-def matched_errors(matched, inside, bands, *, statistic, bin_size):
+def mean_coverage(sky, image, n_images):
+    """
+    Number of exposures about each position, shape (n,), of the image (with WCS) that they were drizzled to.
+
+    It is the mean of the plane ``n_images`` over 1 arcsec, for bad pixels and cosmic rays leave
+    single pixels with fewer; 0 off the image.
+    """
+    pixel = float(proj_plane_pixel_scales(image.wcs)[0] * 3600)
+    mean = uniform_filter(n_images.astype(np.float32), max(1, round(1.0 / pixel)), mode="constant")
+    x, y = (np.round(v).astype(int) for v in image.wcs.world_to_pixel(sky))
+    on = (x >= 0) & (x < mean.shape[1]) & (y >= 0) & (y < mean.shape[0])
+    found = np.zeros(len(sky))
+    found[on] = mean[y[on], x[on]]
+    return found
+
+
+def matched_errors(matched, inside, bands, *, statistic, bin_size, noise=None):
     """
     Error functions (`~miricigale.photometry.ErrorModel`) of bands, of matched sources.
 
-    ``matched`` is of `~miricigale.evaluation.match_truth`; ``inside`` says which rows are in the field.
+    ``matched`` is of `~miricigale.evaluation.match_truth`; ``inside`` says which rows are in the field,
+    and ``noise`` is that of `~miricigale.photometry.ErrorModel.from_tables` for all rows.
     """
     truth = QTable({"id": matched["id"], **{name: matched[f"{name}_true"] for name in bands}})
+    own = None if noise is None else {name: values[inside] for name, values in noise.items()}
     return ErrorModel.from_tables(
-        truth[inside], matched[inside], filters=bands, statistic=statistic, bin_size=bin_size
+        truth[inside],
+        matched[inside],
+        filters=bands,
+        statistic=statistic,
+        bin_size=bin_size,
+        noise=own,
     )
 
 

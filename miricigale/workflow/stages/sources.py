@@ -12,25 +12,23 @@ from astropy.table import QTable
 from matplotlib.colors import to_hex
 
 from miricigale import fitting, photometry, sed
-from miricigale.evaluation import AssociationFlags
+from miricigale.evaluation import OUTLIER, AssociationFlags
 from miricigale.filters import Filter
 from miricigale.utils.tables import error_column
-from miricigale.utils.units import FNU, WAVE
+from miricigale.utils.units import FNU, WAVE, ab_magnitude
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.conditions import ConditionFlags, any_condition
 from miricigale.workflow.stages.cutouts import Cutouts
 from miricigale.workflow.stages.exposures import bands_of_truth
 from miricigale.workflow.stages.figures import SET_COLORS, SET_LABELS, band_label
 from miricigale.workflow.stages.inputs import sed_resources
-from miricigale.workflow.stages.sample import SampleFlags, magnitude
+from miricigale.workflow.stages.sample import SampleFlags
 from miricigale.workflow.truths import of_truth, truth_names
 
 __all__ = ["CHUNK", "make_sources"]
 
 #: Sources whose details and pictures are in one file.
 CHUNK = 32
-#: abs(dz) / (1 + z) above which a redshift is an outlier, as in `~miricigale.evaluation.photoz_metrics`.
-OUTLIER = 0.15
 #: Cells of the spectra, evenly spaced in the logarithm of wavelength.
 N_WAVE = 240
 #: Parameters whose posteriors are drawn.
@@ -65,6 +63,7 @@ FLAGS = {
         "reduction.pixel_scale",
         "fit.bands",
         "fit.sets",
+        "report.pictures",
     ),
     resources=sed_resources,
     units=truth_names,
@@ -75,7 +74,8 @@ def make_sources(context, name):
     """Beside stage 14: the page of a truth, and what it shows of its sources, `CHUNK` in a file."""
     tables = _Tables.read(context, name)
     cutouts = Cutouts.read(context, name)
-    shown = cutouts.on_image(tables.truth["sky"])
+    imaged = cutouts.on_image(tables.truth["sky"])
+    shown = tables.first_of(imaged, context.config.report.pictures)
     # those of a file are near to each other in the page, and those without pictures come last
     order = np.argsort(~shown, kind="stable")
     folder = f"report/sources/{name}"
@@ -89,7 +89,8 @@ def make_sources(context, name):
             tops = dict(zip(pictured, limits, strict=True))
             context.save(f"{folder}/{k:03d}.png", lambda path, sheet=sheet: sheet.save(path))
         entries = [
-            details.entry(row) | {"top": _rounded(tops[row]) if row in tops else None}
+            details.entry(row)
+            | {"top": _rounded(tops[row]) if row in tops else None, "imaged": bool(imaged[row])}
             for row in rows
         ]
         text = f"loaded({k}, {_json(entries)});\n"
@@ -99,6 +100,7 @@ def make_sources(context, name):
         "truths": context.plan,
         "chunk": CHUNK,
         "outlier": OUTLIER,
+        "pictured": int(shown.sum()),
         "prior": band_label(context.config.highres.filter),
         "cutouts": cutouts.describe(),
         "flags": {kind: flags.meanings() for kind, flags in FLAGS.items()},
@@ -156,6 +158,14 @@ class _Tables:
         pair = [name for name in ("all", "none") if name in self.results]
         return pair or list(self.results)[:2]
 
+    def first_of(self, rows, n):
+        """Which of some rows (bool) are shown if at most ``n`` can be: fitted ones, then the brightest."""
+        bright = np.nan_to_num(self.truth[self.prior].value, nan=-np.inf)
+        order = np.lexsort((-bright, self.fitted_row < 0, ~rows))
+        first = np.zeros(len(rows), bool)
+        first[order[:n]] = True
+        return first & rows
+
     def of_sources(self, values):
         """Values of the rows of the fits as values of the sources, NaN without a fit."""
         values, out = np.asarray(values, float), np.full(len(self.truth), np.nan)
@@ -169,7 +179,7 @@ def _table(tables, order):
     truth, matched = tables.truth, tables.matched
     columns = {
         "id": truth["id"],
-        "mag": magnitude(truth[tables.prior]),
+        "mag": ab_magnitude(truth[tables.prior]),
         "ra": truth["sky"].ra.deg,
         "dec": truth["sky"].dec.deg,
         "redshift": truth["redshift"],
@@ -349,7 +359,8 @@ def _rounded(values, digits=4):
 def _json(values):
     """JSON that may stand in a script of a page."""
     text = json.dumps(values, separators=(",", ":"), allow_nan=False)
-    return text.replace("</", "<\\/")
+    # no tag and no comment of HTML can begin in it
+    return text.replace("<", "\\u003c")
 
 
 def _page(config, name, facts):

@@ -1,21 +1,26 @@
 """Stage 3: what the sky holds, by truth: galaxies as fitted, and their AGN."""
 
+from pathlib import Path
+
 import numpy as np
 from astropy.table import QTable, hstack
 
 from miricigale import fitting, sed
 from miricigale.evaluation import AGNPopulation, agn_fraction, main_sequence_dust
 from miricigale.refdata.locate import fingerprint
+from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import ConfigError, DataError
 from miricigale.utils.meta import provenance
 from miricigale.utils.random import stream
+from miricigale.workflow.kernel_files import file_place
+from miricigale.workflow.morphology import RealGalaxies, stamps_of_sources, write_stamps
 from miricigale.workflow.perturbation import perturbed_model, perturbed_parameters, point_columns
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.inputs import catalog_bands, sed_resources
 from miricigale.workflow.stages.stars import star_fluxes
-from miricigale.workflow.truths import FIELD, study_truths, truth_names
+from miricigale.workflow.truths import CATALOG, CUTOUTS, FIELD, study_truths, truth_names
 
-__all__ = ["add_agn", "add_field_agn", "galaxy_parameters", "make_truth"]
+__all__ = ["add_agn", "add_field_agn", "catalog_fractions", "galaxy_parameters", "make_truth"]
 
 GALAXY_PARAMETERS = ("tau", "age", "ebv", "alpha", "metallicity")
 #: Inclinations (deg) of AGN seen through the torus, after Yang et al. 2021, and of the others.
@@ -66,7 +71,8 @@ def add_agn(table, frac_agn, seed):
     """
     Give each source an AGN drawn from the ranges of Yang et al. 2021 (those of q are inferred).
 
-    Columns are added to ``table``, which has ``id``: each source has its own random stream. See table 3
+    ``frac_agn`` is one number, or one for each source. Columns are added to ``table``, which has ``id``: each
+    source has its own random stream. See table 3
     of Yang et al. 2021, ApJ 908, 144.
     """
     drawn = {
@@ -84,9 +90,25 @@ def add_agn(table, frac_agn, seed):
         drawn["ebv_polar"][row] = rng.uniform(0, 0.3)
         drawn["temperature_polar"][row] = rng.uniform(100, 300)
         drawn["emissivity_polar"][row] = rng.uniform(1, 2)
-    table["frac_agn"] = np.full(len(table), frac_agn)
+    table["frac_agn"] = np.broadcast_to(np.asarray(frac_agn, float), len(table)).copy()
     for name, values in drawn.items():
         table[name] = values
+
+
+def catalog_fractions(catalog):
+    """The column ``frac_agn`` of a catalog, or a `ConfigError` that says what is wrong with it."""
+    if "frac_agn" not in catalog.colnames:
+        msg = "[sed] frac_agn = 'catalog' needs a column frac_agn in the catalog"
+        raise ConfigError(msg)
+    values = np.asarray(catalog["frac_agn"], float)
+    bad = ~((values >= 0) & (values <= 0.99))
+    if np.any(bad):
+        msg = (
+            f"the column frac_agn of the catalog must be between 0 and 0.99; {np.count_nonzero(bad)} of "
+            f"{len(values)} are not, such as {values[bad][0]:g}"
+        )
+        raise ConfigError(msg)
+    return values
 
 
 def add_field_agn(table, model, band, seed):
@@ -111,8 +133,12 @@ def add_field_agn(table, model, band, seed):
 
 
 def _truth_plan(config, unit):
-    """The truth, and the libraries of its models where they are others than those of the fits."""
+    """The truth; libraries of its models where they are others than those of the fits; content of its files."""
     values = study_truths(config)[unit].values()
+    if CUTOUTS in values.get("perturbations", {}):
+        files = values["perturbations"][CUTOUTS]
+        paths = [file_place(files[key])[0] for key in ("image", "psf") if files[key]]
+        values["files"] = [file_sha256(Path(path).expanduser()) for path in paths]
     model = perturbed_model(values.get("perturbations", {}), agn=values["frac_agn"] != 0)
     if model is None:
         return values
@@ -150,6 +176,8 @@ def make_truth(context, name):
     model = sed.SEDModel.yang2021(agn=frac_agn != 0)
     if frac_agn == FIELD:
         add_field_agn(parameters, model, bands[0], context.seed)
+    elif frac_agn == CATALOG:
+        add_agn(parameters, catalog_fractions(catalog), context.seed)
     elif frac_agn > 0:
         add_agn(parameters, frac_agn, context.seed)
     other = perturbed_model(effects, agn=model.has_agn)
@@ -174,7 +202,8 @@ def make_truth(context, name):
         stars = star_fluxes(catalog[star], catalog_bands(catalog), bands)
         for band in bands:
             light[band][star] = stars[band]
-    own = {*light.colnames, *parameters.colnames}
+    # what a column frac_agn of the catalog says is of the truth of that name only
+    own = {"frac_agn", *light.colnames, *parameters.colnames}
     truth = hstack(
         [
             parameters,
@@ -187,6 +216,11 @@ def make_truth(context, name):
         for column, share in point_columns(model, parameters, config.exposures.filters).items():
             # the light of a star is not that of the model
             truth[column] = np.where(star, 0.0, share)
+    if CUTOUTS in effects:
+        files = effects[CUTOUTS]
+        galaxies = RealGalaxies.read(files["image"], psf=files["psf"] or None)
+        stamps = stamps_of_sources(truth, galaxies, of=files["of"], seed=context.seed)
+        context.save(f"{name}/stamps.fits", lambda path: write_stamps(stamps, path))
     if "frac_agn" not in truth.colnames:
         truth["frac_agn"] = np.zeros(len(truth))
     citations = [*catalog.meta.get("citations", ()), *model.meta["citations"]]

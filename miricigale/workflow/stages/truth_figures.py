@@ -32,11 +32,9 @@ from miricigale.plotting.truths import (
     ranks_figure,
     recovery_figure,
 )
-from miricigale.utils.tables import error_column
-from miricigale.utils.units import FNU
+from miricigale.utils.units import FNU, ab_magnitude
 from miricigale.workflow.stages.figures import SET_LABELS, band_label
-from miricigale.workflow.stages.sample import magnitude
-from miricigale.workflow.truths import SETS
+from miricigale.workflow.truths import CATALOG, SETS
 
 __all__ = [
     "band_residuals",
@@ -47,6 +45,7 @@ __all__ = [
     "example_figure",
     "fraction_bins_figure",
     "fraction_figure",
+    "parameter_label",
     "rank_figure",
     "redshift_figure",
     "residual_figure",
@@ -61,13 +60,23 @@ __all__ = [
 SEQUENCE = (0.0, 0.2, 0.4, 0.6, 0.8, 0.99)
 #: AB magnitude of the limit of the mock photometry at 24 um.
 MIPS_LIMIT = 19.3
+#: What classes are called on the page, where that is not their name.
+CLASS_LABELS = {"agn": "AGN", "unknown": "not in the fit"}
 #: PAH features that are looked for in the residuals.
 FEATURES = PAH_FEATURES[1:3]
 
 
 def truth_label(one):
     """What a truth (`~miricigale.evaluation.TruthResults`) is called on the page."""
-    return "realistic field" if one.frac_agn is None else f"fracAGN {one.frac_agn:g}"
+    if one.frac_agn is None:
+        return "AGN of the catalog" if one.name.startswith(CATALOG) else "realistic field"
+    return f"fracAGN {one.frac_agn:g}"
+
+
+def parameter_label(name):
+    """What a parameter of the fits is called on the page."""
+    told = {"frac_agn": "fracAGN", "sfr_100myr": "SFR (100 Myr)"}
+    return told.get(name, name.replace("_", " "))
 
 
 def _sets(one, sets=SETS):
@@ -151,7 +160,9 @@ def disk_figure(study, band_set="all"):
             true = one.truth["accretion_power"][one.sample]
             label = truth_label(one)
             values[label] = (true.to_value(unit), fitted.to_value(unit))
-            notes[label] = f"median {np.median(error):+.2f} dex, scatter {sigma_mad(error):.2f} dex"
+            notes[label] = (
+                f"median {np.median(error):+.2f} dex, scatter {sigma_mad(error):.2f} dex ({error.size})"
+            )
     if not values:
         return None
     return recovery_figure(values, label="disk luminosity (erg/s)", notes=notes)
@@ -196,7 +207,7 @@ def detection_figure(study):
     if "mips.24" in table.colnames:
         with np.errstate(invalid="ignore"):
             groups["MIPS 24 µm above its limit"] = one.field & (
-                magnitude(table["mips.24"]) < MIPS_LIMIT
+                ab_magnitude(table["mips.24"]) < MIPS_LIMIT
             )
     power = np.where(one.field, table["ir_luminosity"].to_value(u.Lsun), np.nan)
     rate = 1 / sfr_to_infrared_luminosity(1 * u.Msun / u.yr).to_value(u.Lsun)
@@ -208,19 +219,14 @@ def detection_figure(study):
 def shape_figure(study):
     """Magnitude errors of sources above 5 sigma by band and shape, crowded ones marked."""
     one = study.truths[0]
-    index = np.asarray(one.truth["sersic_index"], float)
-    point = np.asarray(one.truth["profile"]) == "point"
-    shapes = {"points": point, "n < 2": ~point & (index < 2), "n ≥ 2": ~point & (index >= 2)}
+    labels = {"point": "points", "n < 2": "n < 2", "n >= 2": "n ≥ 2"}
     groups, marked = {}, {}
     for band in study.bands:
         true, error = one.matched[f"{band}_true"], one.magnitude_error(band)
-        with np.errstate(invalid="ignore"):
-            # by measured flux it would be those that noise made brighter
-            bright = one.field & (true > 5 * one.matched[error_column(band)])
-        for label, shape in shapes.items():
-            rows = bright & shape
-            name = f"{band_label(band)}, {label}"
-            groups[name] = (magnitude(true[rows]), error[rows])
+        bright = one.field & one.is_bright(band)
+        for shape, rows in one.shapes.items():
+            name, rows = f"{band_label(band)}, {labels[shape]}", bright & rows
+            groups[name] = (ab_magnitude(true[rows]), error[rows])
             marked[name] = one.crowded[band][rows]
     return offsets_figure(groups, marked=marked)
 
@@ -309,8 +315,7 @@ def class_figure(table):
     names = [str(row["class"]) for row in table if row["n"]]
     found = [name for name in (*CLASS_NAMES, "unknown") if name in table.colnames]
     counts = np.array([[row[name] for name in found] for row in table if row["n"]], float)
-    told = {"agn": "AGN", "unknown": "not in the fit"}
-    labels = [[told.get(name, name) for name in some] for some in (names, found)]
+    labels = [[CLASS_LABELS.get(name, name) for name in some] for some in (names, found)]
     return classes_figure(counts, labels[0], found=labels[1])
 
 
@@ -336,7 +341,7 @@ def color_figure(study, shares):
             continue
         circles = ColorCircles.fit(colors, classes)
         title = f"{window.z_low:g} < z < {window.z_high:g}"
-        shown = np.where(classes[good] == CLASS_NAMES[2], "AGN", classes[good])
+        shown = [CLASS_LABELS.get(name, name) for name in classes[good].tolist()]
         planes[title] = (colors[good], shown, circles.center, (circles.inner, circles.outer))
         labels[title] = tuple(
             f"log {band_label(a)} / {band_label(b)}" for a, b in (window.x, window.y)
@@ -377,6 +382,5 @@ def rank_figure(ranks):
     by_name = {}
     for (unit, name), values in ranks.items():
         if unit in ("all", "none"):
-            label = "fracAGN" if name == "frac_agn" else name.replace("_", " ")
-            by_name.setdefault(label, {})[SET_LABELS[unit]] = values
+            by_name.setdefault(parameter_label(name), {})[SET_LABELS[unit]] = values
     return ranks_figure(by_name)

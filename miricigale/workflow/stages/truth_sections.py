@@ -3,9 +3,11 @@
 import dataclasses
 
 import numpy as np
+from astropy.table import QTable
 
 from miricigale.evaluation import (
     CLASS_NAMES,
+    Missing,
     Report,
     StudyResults,
     feature_residuals,
@@ -32,15 +34,17 @@ class Page:
     """
     What the sections of a page read, and the report that they fill.
 
-    ``every`` are `~miricigale.workflow.stages.metrics.StudyTables` by truth, the reference first; ``shares``
-    true AGN shares of the 5-15 um light of all sources by truth, empty without AGN; ``model`` is that of the
-    fits and ``model_error`` their relative error.
+    ``every`` are `~miricigale.workflow.stages.metrics.StudyTables` by truth, the reference first; ``numbers``
+    those of the fits with their errors (`~miricigale.evaluation.study_numbers`), ``shares`` true AGN shares of
+    the 5-15 um light of all sources by truth, empty without AGN; ``model`` is that of the fits and
+    ``model_error`` their relative error.
     """
 
     report: Report
     study: StudyResults
     every: dict
     metrics: dict
+    numbers: QTable
     shares: dict
     model: SEDModel
     model_error: float
@@ -50,6 +54,21 @@ class Page:
         """Add a figure to the page, unless there is none."""
         if figure is not None:
             self.report.figure(figure, caption)
+
+    def of_fit(self, truth, unit, quantity, spec, *, scale=1):
+        """A number of a fit of the whole sample with its bootstrap error, or why there is none."""
+        table, none = self.numbers, "no source fitted"
+        rows = (table["truth"] == truth) & (table["band_set"] == unit)
+        rows &= (table["quantity"] == quantity) & (table["z_low"] == 0) & np.isinf(table["z_high"])
+        if not np.any(rows) or not np.isfinite(table["value"][rows][0]):
+            return number(np.nan, spec, none)
+        row = table[rows][0]
+        value, error = (scale * x for x in (row["value"], 0.5 * (row["high"] - row["low"])))
+        return (
+            f"{value:{spec}} ± {error:{spec.lstrip('+')}}"
+            if np.isfinite(error)
+            else f"{value:{spec}}"
+        )
 
     @property
     def fitted(self):
@@ -132,10 +151,10 @@ def write_examples(page):
 
 
 def _table_of_fits(page, columns, caption):
-    """A table with a row for each truth and set of bands: columns are header to the cell of a fit."""
+    """A table with a row for each truth and set of bands: columns are header to the cell of a fit (by names)."""
     names = {one.name: truth_label(one) for one in page.study.truths}
     rows = [
-        (names[name], SET_LABELS[unit], *(cell(entry) for cell in columns.values()))
+        (names[name], SET_LABELS[unit], *(cell(name, unit, entry) for cell in columns.values()))
         for name, truth in page.metrics["truths"].items()
         for unit, entry in truth["fits"].items()
     ]
@@ -162,20 +181,27 @@ def write_redshifts(page):
     )
     none = "no source fitted"
     columns = {
-        "sources": lambda fit: fit["n"],
-        "dz/(1+z) median": lambda fit: number(fit["photoz_bias"], "+.4f", none),
-        "sigma_MAD": lambda fit: number(fit["photoz_sigma_mad"], ".4f", none),
-        "outliers": lambda fit: fit["photoz_n_outliers"],
-        "share": lambda fit: percent(fit["photoz_outliers"], none),
-        "z in 16-84 %": lambda fit: percent(fit["redshift_coverage"], none),
+        "sources": lambda name, unit, fit: fit["n"],
+        "dz/(1+z) median": lambda name, unit, _: page.of_fit(name, unit, "z_bias", "+.4f"),
+        "sigma_MAD": lambda name, unit, _: page.of_fit(name, unit, "z_scatter", ".4f"),
+        "outliers": lambda name, unit, fit: fit["photoz_n_outliers"],
+        "share (%)": lambda name, unit, _: page.of_fit(name, unit, "z_outliers", ".1f", scale=100),
+        "z in 16-84 %": lambda name, unit, fit: percent(fit["redshift_coverage"], none, ".0f"),
     }
     _table_of_fits(
         page,
         columns,
-        "Redshift against truth. Truths lie within the models of the fit, whose "
+        "Redshift against truth. Galaxies lie within the models of the fit, whose "
         f"{100 * page.model_error:g} % model error they do not have, so posteriors are wide. Sources are "
-        "those detected in enough MIRI bands, the same with each set of bands",
+        "those detected in enough MIRI bands, the same with each set of bands; errors are of the bootstrap, of "
+        "shares binomial",
     )
+    if study.with_agn:
+        report.text(
+            "AGN of the sky have inclinations, dust distributions and polar dust that the templates of the fit "
+            "have not, as in Yang et al. 2021: where the AGN outshines the galaxy, the redshift makes up for the "
+            "difference. It is no matter of noise: AGN that are templates of the fit have no such outliers."
+        )
     conditions.write_fits(report, page.metrics)
 
 
@@ -205,16 +231,16 @@ def write_fractions(page):
         "Standard deviations of the posteriors of fracAGN by injected fracAGN; those of a posterior "
         "without information are about 0.3.",
     )
-    none = "no source fitted"
     columns = {
-        "fracAGN offset": lambda fit: number(fit["frac_agn_bias"], "+.3f", none),
-        "scatter": lambda fit: number(fit["frac_agn_sigma_mad"], ".3f", none),
-        "width": lambda fit: number(fit["frac_agn_width"], ".3f", none),
+        "fracAGN offset": lambda name, unit, _: page.of_fit(name, unit, "frac_offset", "+.3f"),
+        "scatter": lambda name, unit, _: page.of_fit(name, unit, "frac_scatter", ".3f"),
+        "width": lambda name, unit, _: page.of_fit(name, unit, "width", ".3f"),
     }
     _table_of_fits(
         page,
         columns,
-        "Median and scatter of fitted minus true fracAGN, and median width of the posteriors",
+        "Median and scatter of fitted minus true fracAGN, and median width of the posteriors, with their "
+        "bootstrap errors",
     )
 
 
@@ -243,7 +269,8 @@ def write_xrays(page):
             figure,
             f"X-ray fluxes of the AGN of the field{several}, from their light at 6 µm (Stern 2015), halved for "
             "absorption, and of those detected in enough MIRI bands to be fitted (found). Vertical lines: where "
-            "half of these are, with its 68 % interval, and limits of X-ray surveys (dotted: estimates).",
+            "half of these are, with its 68 % interval, and limits of X-ray surveys (dotted: estimates "
+            "from abstracts, not published limits).",
         )
 
 
@@ -285,7 +312,7 @@ def _write_confusion(page, sets):
         [
             (
                 SET_LABELS[unit],
-                row["class"],
+                truth_figures.CLASS_LABELS.get(row["class"], row["class"]),
                 row["n"],
                 *(row[name] for name in names),
                 share_cell(row, "completeness"),
@@ -298,12 +325,12 @@ def _write_confusion(page, sets):
             "fit",
             "true class",
             "sources",
-            *(f"found {name}" for name in names),
+            *(f"found {truth_figures.CLASS_LABELS.get(name, name)}" for name in names),
             "completeness",
             "purity",
         ),
-        caption=f"{told}, of all truths of one fracAGN together; unknown: in the field, but not in the "
-        "fit. Purity is that of this mix of truths, not of a real field",
+        caption=f"{told}, of all truths of one fracAGN together, of the galaxies of the field. "
+        "Purity is that of this mix of truths, not of a real field",
         text=2,
     )
 
@@ -323,8 +350,8 @@ def _write_selection(report, one):
             for row in table
         ],
         header=("fit", "fracAGN at least", "AGN", "selected", "completeness", "purity"),
-        caption="Selections of AGN by the posterior mean of fracAGN, among all galaxies of the "
-        "realistic field",
+        caption="Selections of AGN by the posterior mean of fracAGN, among all galaxies of: "
+        f"{truth_figures.truth_label(one)}",
     )
 
 
@@ -373,7 +400,12 @@ def write_features(page):
     )
 
 
+#: Fewest sources whose median residual is told.
+_FEWEST = 5
+
+
 def _plus_minus(estimate):
-    if not np.isfinite(estimate.error):
-        return number(estimate.value, "+.3f", "no such source above 5 sigma")
+    # a median of fewer, and its error, say nothing
+    if estimate.n < _FEWEST or not np.isfinite(estimate.error):
+        return Missing(f"fewer than {_FEWEST} sources above 5 sigma")
     return f"{estimate.value:+.3f} ± {estimate.error:.3f}"

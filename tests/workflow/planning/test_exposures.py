@@ -92,7 +92,15 @@ def test_the_clock_counts_every_overhead_once():
     assert wall_clock([plan], OverheadSection()) > 1.16 * light
 
 
-def test_errors_of_a_run_are_its_own_for_its_exposures(tmp_path):
+@pytest.mark.parametrize(
+    ("own", "same"),
+    [
+        ("", {}),
+        ('[scene]\nbackground = "high"\n', {"background": {"level": "high"}}),
+        ('[detector]\nresidual = "etc"\n', {"noise": {"residual": "etc"}}),
+    ],
+)
+def test_errors_of_a_run_are_its_own_for_its_exposures(tmp_path, own, same):
     config = """
     [exposures]
     filters = ["miri.f1000w"]
@@ -102,22 +110,22 @@ def test_errors_of_a_run_are_its_own_for_its_exposures(tmp_path):
     [fit]
     min_detected = 1
     """
-    (tmp_path / "config.toml").write_text(config)
+    (tmp_path / "config.toml").write_text(config + own)
     errors = ErrorModel.from_depths({BAND: 0.5 * u.uJy}, fractional=0.05)
     errors.write(tmp_path / "errors.ecsv")
     run = RunErrors.read(tmp_path)
 
     def scaled(time, dithers):
         exposures = {"bands": [BAND], "time": time, "dithers": dithers}
-        noise = {"kind": "run", "run": str(tmp_path)}
-        config = load_plan(overrides={"exposures": exposures, "noise": noise})
+        noise = {"kind": "run", "run": str(tmp_path)} | same.get("noise", {})
+        config = load_plan(overrides={**same, "exposures": exposures, "noise": noise})
         return band_plans(config, run=run)[BAND].errors()
 
     own, longer = scaled(4 * 277.5, 4), scaled(16 * 277.5, 16)
     for value in (0.1, 1.0, 30.0):
         one = errors.sigma(value * u.uJy, BAND).value
         assert own.sigma(value * u.uJy, BAND).value == pytest.approx(one, rel=1e-6)
-    # four times the time: half the noise of the sky, the same part of the flux
+    # four times the time and dithers: half the noise of the sky, the same part of the flux
     assert longer.sigma(0 * u.uJy, BAND).value == pytest.approx(0.05, rel=0.02)
     assert longer.sigma(40 * u.uJy, BAND).value == pytest.approx(2.0, rel=1e-3)
 

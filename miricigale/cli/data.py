@@ -1,0 +1,94 @@
+"""Commands of what comes with the package and what is added: filters, data."""
+
+import shutil
+import sys
+import textwrap
+from pathlib import Path
+
+__all__ = ["add_data", "add_filters"]
+
+
+def add_filters(commands):
+    """Declare ``filters``."""
+    filters = commands.add_parser("filters", help="list the filters")
+    filters.add_argument("pattern", nargs="?", default="", help="part of the name")
+    filters.set_defaults(call=_filters)
+
+
+def _filters(args):
+    from miricigale.workflow.commands import filter_table
+
+    table = filter_table(args.pattern)
+    if len(table) == 0:
+        print(f"no filter has {args.pattern!r} in its name", file=sys.stderr)
+        return 1
+    table.pprint_all()
+    return 0
+
+
+def add_data(commands):
+    """Declare ``data``."""
+    data = commands.add_parser("data", help="reference data: list, check or add")
+    actions = data.add_subparsers(dest="action", metavar="ACTION", required=True)
+    listing = actions.add_parser("list", help="what there is, where, its license, what to cite")
+    listing.add_argument("pattern", nargs="?", default="", help="part of the name")
+    listing.set_defaults(call=_data_list)
+    check = actions.add_parser("check", help="whether each file is there and whole")
+    check.set_defaults(call=_data_check)
+    add = actions.add_parser("add", help="bring a file into the data folder; convert a library")
+    add.add_argument("name", help="resource name, as 'miricigale data list' has it")
+    add.add_argument("path", type=Path, help="file, folder or archive as distributed")
+    add.set_defaults(call=_data_add, stopped=lambda _: "stopped; nothing was changed")
+
+
+def _data_list(args):
+    from miricigale.refdata import find_resource, resources
+
+    records = {name: record for name, record in resources().items() if args.pattern in name}
+    if not records:
+        print(f"no resource has {args.pattern!r} in its name", file=sys.stderr)
+        return 1
+    width = min(shutil.get_terminal_size((100, 24)).columns, 120)
+    for name, record in records.items():
+        path = find_resource(name) if record.file else None
+        if path is not None:
+            state = str(path)
+        elif not record.file:
+            state = f"read from {record.source}"
+        else:
+            state = f"absent; miricigale data add {name} PATH"
+        print(f"{name} ({record.kind}): {state}")
+        lines = [record.title, f"license: {record.licence}", f"cite: {record.citation}"]
+        if record.file and path is None:
+            lines.append(f"source: {record.source}")
+        for line in lines:
+            # do not break URLs
+            wrapped = textwrap.wrap(line, width - 4, break_long_words=False, break_on_hyphens=False)
+            print(textwrap.indent("\n  ".join(wrapped), "    "))
+    return 0
+
+
+def _data_check(args):
+    from miricigale.refdata import check_resources
+
+    rows = check_resources()
+    length = max(len(row.name) for row in rows)
+    for row in rows:
+        print(f"{row.name:{length}s}  {row.state:14s}  {row.where}")
+        if row.message:
+            print(f"{'':{length}s}  {row.message}")
+    bad = [row.name for row in rows if row.bad]
+    if bad:
+        print(f"miricigale: not as they should be: {', '.join(bad)}", file=sys.stderr)
+    return int(bool(bad))
+
+
+def _data_add(args):
+    from miricigale.refdata import add_resource
+    from miricigale.refdata.libraries import READERS, add_library
+
+    if args.name in READERS:
+        print(add_library(args.name, args.path, progress_bar=sys.stderr.isatty()))
+    else:
+        print(add_resource(args.name, args.path))
+    return 0

@@ -1,0 +1,276 @@
+"""Ramps from files of the JWST pipeline, of level 1b or with some of its steps done."""
+
+import json
+import math
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+
+from miricigale.detector.effects import effect_from_record
+from miricigale.instrument import (
+    DQ,
+    DetectorProperties,
+    Exposure,
+    reference_pixel_mask,
+    steps_done,
+)
+from miricigale.utils.exceptions import DataError
+from miricigale.utils.files import open_fits
+from miricigale.utils.parallel import check_memory
+
+__all__ = ["read"]
+
+_WANTED = "a ramp of the MIRI imager"
+
+# bytes converted at a time
+_CHUNK = 2**26
+
+_REFERENCE = np.uint32(DQ.REFERENCE_PIXEL | DQ.NON_SCIENCE)
+
+#: Kinds of exposures that are imager ramps; ground tests state none.
+_KINDS = ("MIR_IMAGE", "MIR_DARKIMG", "MIR_FLATIMAGE", "ANY", "N/A", "")
+
+#: Names of the read-out patterns before the launch, for those of today.
+_PATTERNS = {"FAST": "FASTR1", "SLOW": "SLOWR1"}
+
+#: Where the light is blocked there is no filter.
+_NO_FILTER = ("", "OPAQUE", "N/A", "ANY")
+
+
+def read(path):
+    """
+    Read the ramp of an exposure of the MIRI imager, our own or real.
+
+    Parameters
+    ----------
+    path : path-like
+        The file: level 1b, or what a step of calwebb_detector1 before the ramp fit saved.
+
+    Returns
+    -------
+    values : dict
+        Arguments of `~miricigale.detector.Ramp`. The exposure is made from the keywords; a dither
+        is the position number in the pattern, from 0. In level 1b that is not ours the reference
+        pixels alone are flagged, and it is not known what acted.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file is missing, truncated or not of that kind, or its header contradicts its data.
+    MemoryError
+        If the ramp is larger than the memory.
+    """
+    path = Path(path)
+    try:
+        with open_fits(path, wanted=_WANTED, memmap=True, do_not_scale_image_data=True) as hdus:
+            return _read(path, hdus)
+    except (AttributeError, KeyError, SyntaxError, TypeError, ValueError, OSError) as err:
+        if isinstance(err, DataError):
+            raise
+        msg = f"{path} cannot be read as {_WANTED}: {err}"
+        raise DataError(msg) from err
+
+
+def _read(path, hdus):
+    if "SCI" not in hdus:
+        msg = f"{path} is no ramp: it has no SCI extension"
+        raise DataError(msg)
+    header = _observation(hdus)
+    _check_kind(path, header)
+    shape = _ramp_shape(path, hdus["SCI"].header)
+    exposure = _exposure(path, header, shape)
+    _check_header(path, header, exposure)
+    # counts, flags of groups and the fifth output
+    n_bytes = math.prod(shape) * (abs(hdus["SCI"].header["BITPIX"]) // 8)
+    check_memory(
+        n_bytes + sum(_size(hdus[name]) for name in ("GROUPDQ", "REFOUT") if name in hdus),
+        f"the ramp of {path}, shape {shape},",
+        advice="split the file by integrations",
+    )
+    values = {
+        "data": _counts(path, hdus["SCI"]),
+        "exposure": exposure,
+        "steps": steps_done(header),
+        "header": header,
+        "meta": {"origin": header.get("ORIGIN", "unknown"), "filename": path.name},
+    }
+    if "REFOUT" in hdus and hdus["REFOUT"].header.get("NAXIS") == 4:
+        values["reference_output"] = _counts(path, hdus["REFOUT"])
+    if "SIM_META" in hdus:
+        values["meta"] = json.loads(hdus["SIM_META"].data["JSON"][0].tobytes())
+        records = values["meta"].pop("effects", None)
+        if records is not None:
+            values["effects"] = [effect_from_record(record) for record in records]
+        properties = values["meta"].pop("properties", None)
+        if properties is not None:
+            values["properties"] = DetectorProperties(**properties)
+    values |= _flags(path, hdus, exposure, shape)
+    return values
+
+
+def _observation(hdus):
+    """Keywords of the observation: those of the primary header, and of SCI what it lacks."""
+    header = hdus[0].header.copy(strip=True)
+    science = hdus["SCI"].header.copy(strip=True)
+    for name in ("BSCALE", "BZERO", "EXTNAME", "EXTVER", "EXTEND", "NEXTEND"):
+        header.remove(name, ignore_missing=True)
+        science.remove(name, ignore_missing=True)
+    for card in science.cards:
+        if (
+            card.keyword
+            and card.keyword not in header
+            and card.keyword not in ("COMMENT", "HISTORY")
+        ):
+            header.append(card)
+    return header
+
+
+def _check_kind(path, header):
+    """Refuse files of other instruments, detectors and kinds of exposures."""
+    instrument = header.get("INSTRUME", "MIRI" if "DETECTOR" in header else None)
+    kind = str(header.get("EXP_TYPE", "")).strip()
+    detector = header.get("DETECTOR", "MIRIMAGE")
+    if instrument != "MIRI" or detector != "MIRIMAGE" or kind not in _KINDS:
+        msg = (
+            f"{path} must be an exposure of the MIRI imager (INSTRUME MIRI, DETECTOR MIRIMAGE, "
+            f"EXP_TYPE {' or '.join(_KINDS[:3])}), got {instrument} {detector} {kind}"
+        )
+        raise DataError(msg)
+
+
+def _ramp_shape(path, head):
+    scaling = (head.get("BITPIX"), head.get("BZERO", 0), head.get("BSCALE", 1))
+    if head["NAXIS"] != 4 or scaling not in ((16, 32768, 1), (-32, 0, 1), (-64, 0, 1)):
+        msg = (
+            f"{path} must hold a ramp in SCI: four axes (integration, group, y, x) of unsigned "
+            f"16-bit counts or of floats, got {head['NAXIS']} axes of BITPIX {scaling[0]} with "
+            f"BZERO {scaling[1]}"
+        )
+        raise DataError(msg)
+    return tuple(int(head[f"NAXIS{axis}"]) for axis in (4, 3, 2, 1))
+
+
+def _exposure(path, header, shape):
+    """The exposure that the keywords and the shape tell."""
+    n_int, n_group, *size = shape
+
+    def keyword(name):
+        if name not in header:
+            msg = f"{path} has no keyword {name}"
+            raise DataError(msg)
+        return header[name]
+
+    name = str(header.get("FILTER", "")).strip()
+    pattern = str(keyword("READPATT")).strip()
+    pointed = [header.get(key) for key in ("RA_REF", "DEC_REF", "ROLL_REF")]
+    stated = [value is not None for value in pointed]
+    if any(stated) and not all(stated):
+        msg = f"{path} must have all of RA_REF, DEC_REF, ROLL_REF or none, got {pointed}"
+        raise DataError(msg)
+    sky = {"pointing": None, "roll": None}
+    if all(stated):
+        sky = {
+            "pointing": SkyCoord(pointed[0] * u.deg, pointed[1] * u.deg),
+            "roll": pointed[2] * u.deg,
+        }
+    exposure = Exposure(
+        None if name in _NO_FILTER else f"miri.{name.lower()}",
+        readout=_PATTERNS.get(pattern, pattern),
+        n_groups=n_group,
+        n_integrations=n_int,
+        subarray=str(keyword("SUBARRAY")).strip(),
+        dither=max(int(header.get("PATT_NUM", 1)), 1) - 1,
+        **sky,
+    )
+    if tuple(size) != exposure.shape:
+        wanted = f"{exposure.shape} pixels for {exposure.subarray}"
+        msg = f"{path} must have {wanted}, got {tuple(size)}"
+        raise DataError(msg)
+    return exposure
+
+
+def _check_header(path, header, exposure):
+    """Refuse a header that contradicts its data or its read-out pattern."""
+    part = exposure.aperture
+    frame = exposure.frame_time.to_value("s")
+    n_int = exposure.n_integrations
+    if "INTSTART" in header and "INTEND" in header:
+        n_int = header["INTEND"] - header["INTSTART"] + 1
+    elif "NINTS" in header:
+        n_int = header["NINTS"]
+    part_name, pattern = f"of {part.name}", f"of {exposure.readout}"
+    wanted = {
+        "NGROUPS": (header.get("NGROUPS"), exposure.n_groups, "in SCI"),
+        "NINTS": (n_int, exposure.n_integrations, "in SCI"),
+        "NFRAMES": (header.get("NFRAMES"), 1, pattern),
+        "GROUPGAP": (header.get("GROUPGAP"), 0, pattern),
+        "SUBSIZE1": (header.get("SUBSIZE1"), part.shape[1], part_name),
+        "SUBSIZE2": (header.get("SUBSIZE2"), part.shape[0], part_name),
+        "SUBSTRT1": (header.get("SUBSTRT1"), part.origin[0] + 1, part_name),
+        "SUBSTRT2": (header.get("SUBSTRT2"), part.origin[1] + 1, part_name),
+    }
+    for name, (stated, true, where) in wanted.items():
+        if stated is not None and stated != true:
+            msg = f"{path} contradicts itself: {name} is {stated} in the header and {true} {where}"
+            raise DataError(msg)
+    for name in ("TGROUP", "TFRAME"):
+        stated = header.get(name)
+        # the table of the read-out patterns is rounded to a millisecond or three digits
+        if stated is not None and not abs(stated - frame) < 5e-3 * frame:
+            msg = (
+                f"{path} contradicts itself: {name} = {stated} s, but the frame of "
+                f"{exposure.readout} {exposure.subarray} takes {frame} s, and is one group"
+            )
+            raise DataError(msg)
+
+
+def _size(hdu):
+    head = hdu.header
+    return math.prod(head[f"NAXIS{i + 1}"] for i in range(head["NAXIS"])) * abs(head["BITPIX"]) // 8
+
+
+def _chunks(flat):
+    step = _CHUNK // flat.itemsize
+    for start in range(0, flat.size, step):
+        yield flat[start : start + step]
+
+
+def _counts(path, hdu):
+    """Counts as they are kept, in the byte order of the machine."""
+    _ramp_shape(path, hdu.header)
+    raw = hdu.data
+    if raw.dtype.kind == "f":
+        return np.asarray(raw, np.float32)
+    data = np.empty(raw.shape, np.uint16)
+    for into, part in zip(_chunks(data.reshape(-1)), _chunks(raw.reshape(-1)), strict=True):
+        # BZERO 32768: the top bit is turned
+        np.bitwise_xor(part.astype(np.int16).view(np.uint16), np.uint16(0x8000), out=into)
+    return data
+
+
+def _flags(path, hdus, exposure, shape):
+    """Flags of pixels and groups, as far as the file has them; reference pixels are always known."""
+    values = {}
+    name = next((name for name in ("SIM_PIXELDQ", "PIXELDQ") if name in hdus), None)
+    if name is None:
+        pixel_dq = np.zeros(shape[2:], np.uint32)
+    else:
+        # unsigned 32 bits as FITS keeps them: BZERO 2^31
+        stored = np.asarray(hdus[name].data).astype(np.int32).view(np.uint32)
+        pixel_dq = stored ^ np.uint32(2**31)
+    if pixel_dq.shape != shape[2:]:
+        msg = f"{path} must have flags of {shape[2:]} pixels in {name}, got {pixel_dq.shape}"
+        raise DataError(msg)
+    if name != "SIM_PIXELDQ":
+        mask = reference_pixel_mask(subarray=exposure.subarray)
+        pixel_dq = np.where(mask, pixel_dq | _REFERENCE, pixel_dq)
+    values["pixel_dq"] = pixel_dq
+    if "GROUPDQ" in hdus:
+        group_dq = np.asarray(hdus["GROUPDQ"].data).astype(np.uint8)
+        if group_dq.shape != shape:
+            msg = f"{path} must have flags of shape {shape} in GROUPDQ, got {group_dq.shape}"
+            raise DataError(msg)
+        values["group_dq"] = group_dq
+    return values

@@ -1,0 +1,163 @@
+"""The work of an exposure: effects that act on blocks of rows, side by side."""
+
+import dataclasses
+
+import numpy as np
+
+from miricigale.detector import _core
+from miricigale.detector.effects import (
+    BadPixels,
+    Block,
+    CosmicRays,
+    Dark,
+    InterpixelCapacitance,
+    Persistence,
+    Photons,
+    ReferencePixels,
+    Residual,
+    WholeBlock,
+)
+from miricigale.instrument import DetectorProperties, Exposure
+from miricigale.utils.parallel import chunks, parallel_map, threads
+
+__all__ = ["Work"]
+
+#: What makes the charge of a pixel, whenever it comes within the exposure; cosmic rays apart.
+_COLLECTING = (
+    Residual,
+    Photons,
+    Dark,
+    InterpixelCapacitance,
+    Persistence,
+    BadPixels,
+    ReferencePixels,
+)
+
+#: Those of them whose electrons are one Poisson number, before neighbors are coupled.
+_LIGHT = (Residual, Photons, Dark)
+
+# rows whose charge is collected at once
+_ROWS = 128
+
+# samples (float32) that one thread has in hand: a few MB, so that they stay in the cache
+_BLOCK_SAMPLES = 2**21
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Work:
+    """
+    One exposure: its effects act on blocks of rows, side by side.
+
+    Parameters
+    ----------
+    light : `~numpy.ndarray`, shape (ny, nx)
+        Surface brightness (MJy/sr).
+    exposure : `~miricigale.instrument.Exposure`
+        How it is exposed.
+    properties : `~miricigale.instrument.DetectorProperties`
+        Of the detector.
+    keyed : tuple of (effect, key)
+        The effects that act, in order, with the keys of their random numbers.
+    previous : tuple of `~miricigale.detector.Latent`
+        Exposures before.
+    meta : dict
+        Provenance.
+    """
+
+    light: np.ndarray
+    exposure: Exposure
+    properties: DetectorProperties
+    keyed: tuple
+    previous: tuple
+    meta: dict
+
+    @property
+    def effects(self):
+        return tuple(effect for effect, _ in self.keyed)
+
+    @property
+    def shape(self):
+        e = self.exposure
+        return (e.n_integrations, e.n_groups, *e.shape)
+
+    def run(self, store, n_threads, progress_bar):
+        """Expose all rows, block by block; each block is handed to ``store``."""
+        n_int, n_group, ny, nx = self.shape
+        height = max(1, _BLOCK_SAMPLES // (n_int * n_group * nx))
+
+        def work(rows):
+            store(rows, *self._exposed(rows))
+
+        desc = f"ramp {self.exposure.filter}"
+        with threads(n_threads) as executor:
+            parallel_map(
+                work, chunks(ny, height), executor=executor, progress_bar=progress_bar, desc=desc
+            )
+
+    def collect(self, n_threads, progress_bar):
+        """Collect the charge of all rows: mean rate, electrons, places and charge of hits, flags of pixels."""
+        shape = self.shape[2:]
+        mean, electrons = np.empty(shape), np.empty(shape, np.float32)
+        pixel_dq = np.zeros(shape, np.uint32)
+
+        def work(rows):
+            mean[rows], electrons[rows], pixel_dq[rows], *hits = self._collected(rows)
+            return hits
+
+        desc = f"charge {self.exposure.filter}"
+        with threads(n_threads) as executor:
+            hits = parallel_map(
+                work,
+                chunks(shape[0], _ROWS),
+                executor=executor,
+                progress_bar=progress_bar,
+                desc=desc,
+            )
+        places = np.concatenate([where for where, _ in hits], axis=1)
+        return mean, electrons, places, np.concatenate([charge for _, charge in hits]), pixel_dq
+
+    def _exposed(self, rows):
+        """Apply the effects to some rows: counts, flags of pixels, flags of groups."""
+        halo = sum(effect.halo for effect, _ in self.keyed)
+        wide = slice(max(rows.start - halo, 0), min(rows.stop + halo, self.light.shape[0]))
+        shape = (*self.shape[:2], wide.stop - wide.start, self.shape[3])
+        pixel_dq = np.zeros(shape[2:], np.uint32)
+        group_dq = np.zeros(shape, np.uint8)
+        array = self.light[wide]
+        for effect, key in self.keyed:
+            block = Block(
+                self.exposure, self.properties, wide, pixel_dq, group_dq, key, self.previous
+            )
+            array = effect.apply(array, block)
+        inner = slice(rows.start - wide.start, rows.stop - wide.start)
+        return array[:, :, inner], pixel_dq[inner], group_dq[:, :, inner]
+
+    def _collected(self, rows):
+        """Collect the charge of some rows: mean rate, electrons, flags of pixels, hits."""
+        chain = [(effect, key) for effect, key in self.keyed if isinstance(effect, _COLLECTING)]
+        halo = sum(effect.halo for effect, _ in chain)
+        wide = slice(max(rows.start - halo, 0), min(rows.stop + halo, self.light.shape[0]))
+        shape = (wide.stop - wide.start, self.shape[3])
+        pixel_dq = np.zeros(shape, np.uint32)
+        ramp = np.zeros((1, 1, *shape), np.float32)
+        where = (self.exposure, self.properties, wide, pixel_dq, np.zeros(ramp.shape, np.uint8))
+        mean = self.light[wide]
+        n_light = sum(isinstance(effect, _LIGHT) for effect, _ in chain)
+        for effect, key in chain[:n_light]:
+            block = WholeBlock(*where, key)
+            mean = effect.expected(mean, block)
+        # photons and dark current together, as their sum is one Poisson number
+        _core.add_poisson(ramp, mean * block.total_time, key, wide.start)
+        for effect, key in chain[n_light:]:
+            block = WholeBlock(*where, key, self.previous)
+            mean, ramp = effect.expected(mean, block), effect.apply(ramp, block)
+        hits = (np.empty((3, 0), np.int32), np.empty(0))
+        for effect, key in self.keyed:
+            if isinstance(effect, CosmicRays):
+                groups = np.broadcast_to(
+                    np.uint8(0), (*self.shape[:2], rows.stop - rows.start, shape[1])
+                )
+                block = Block(self.exposure, self.properties, rows, pixel_dq, groups, key)
+                hits = effect.hits(block)
+        inner = slice(rows.start - wide.start, rows.stop - wide.start)
+        return mean[inner], ramp[0, 0, inner], pixel_dq[inner], *hits

@@ -1,0 +1,136 @@
+"""Tables of a study: its numbers, the classes that are found, selections."""
+
+import numpy as np
+
+from miricigale.evaluation.classes import CLASS_LIMITS, classify, confusion, selection_quality
+from miricigale.evaluation.quantities import OF_FITS, REDSHIFT_BINS, measure
+from miricigale.utils.random import check_seed, stream
+from miricigale.utils.tables import described_rows
+
+__all__ = ["found_classes", "selection_table", "study_confusion", "study_numbers"]
+
+
+def study_numbers(study, *, seed, n_draws=500):
+    """
+    All numbers of the fits: each truth, each band set, whole sample and bins of redshift.
+
+    Parameters
+    ----------
+    study : `StudyResults`
+        The tables.
+    seed : int
+        Of the bootstrap; each number has its own stream.
+    n_draws : int, optional
+        Draws of the bootstrap.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        ``truth``, ``band_set``, ``quantity``, ``z_low``, ``z_high``, ``value``, ``low``, ``high`` (68 %), ``n``
+        and ``completeness``, the share of the sources of the field that the number is of.
+    """
+    seed = check_seed(seed)
+    rows = []
+    names = [name for name in OF_FITS if not name.endswith("_ratio")]
+    for one in study.truths:
+        for band_set in one.fits:
+            for quantity in names:
+                of_power = quantity.startswith("power")
+                if of_power and "accretion_power" not in one.truth.colnames:
+                    continue
+                for option in (None,) if of_power else (None, *REDSHIFT_BINS):
+                    key = stream(seed, "numbers", one.name, band_set, quantity, str(option))
+                    got = measure(
+                        study, quantity, truth=one, band_set=band_set, option=option, seed=key,
+                        n_draws=n_draws,
+                    )  # fmt: skip
+                    span = option or (0.0, np.inf)
+                    values = (got.value, got.low, got.high, got.n, got.completeness)
+                    rows.append((one.name, band_set, quantity, *span, *values))
+    texts = {
+        "truth": "Name of the truth",
+        "band_set": "Bands of the fit",
+        "quantity": "Name of `QUANTITIES`",
+        "z_low": "Least true redshift",
+        "z_high": "True redshifts are below",
+        "value": "The number",
+        "low": "Lower end of its 68 % interval",
+        "high": "Upper end of its 68 % interval",
+        "n": "Sources",
+        "completeness": "Share of the sources of the field",
+    }
+    return described_rows(rows, texts)
+
+
+def found_classes(one, band_set):
+    """Classes of all sources of the catalog by a fit; ``"unknown"`` for those not in the sample."""
+    mean = one.of_catalog(one.fitted(band_set, "frac_agn_mean"))
+    return classify(np.clip(mean, 0, 1))
+
+
+def study_confusion(study, band_set="all"):
+    """
+    Classes found of the sources of each true class, of all truths with one AGN fraction together.
+
+    Parameters
+    ----------
+    study : `StudyResults`
+        The tables.
+    band_set : str, optional
+        Which fit.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        As `~miricigale.evaluation.confusion`: sources of the field that were not fitted are ``unknown``.
+    """
+    truths = [one for one in study.truths if one.frac_agn is not None and band_set in one.fits]
+    true = [classify(np.asarray(one.truth["frac_agn"], float))[one.field] for one in truths]
+    found = [found_classes(one, band_set)[one.field] for one in truths]
+    return confusion(np.concatenate([[], *true]), np.concatenate([[], *found]))
+
+
+def selection_table(one, *, limits=CLASS_LIMITS):
+    """
+    Purity and completeness of selections by the fitted AGN fraction in a realistic field.
+
+    Parameters
+    ----------
+    one : `TruthResults`
+        A truth whose AGN have the numbers and luminosities of a real field.
+    limits : tuple of float, optional
+        Sources whose true AGN fraction is at least this are wanted, and those with such a posterior mean are
+        selected. Sources that were not fitted are not selected.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        A row for each band set and limit: ``band_set``, ``limit``, ``n_wanted``, ``n_selected``,
+        ``completeness``, ``purity`` and their 68 % (Wilson) intervals ``_low`` and ``_high``.
+    """
+    rows = []
+    true = np.asarray(one.truth["frac_agn"], float)[one.field]
+    for band_set in one.fits:
+        mean = one.of_catalog(one.fitted(band_set, "frac_agn_mean"))[one.field]
+        for limit in limits:
+            # NaN is below every limit
+            quality = selection_quality(true >= limit, mean >= limit)
+            pair = (quality.completeness, quality.purity)
+            values = [value for got in pair for value in (got.value, got.low, got.high)]
+            rows.append((band_set, limit, pair[0].n, pair[1].n, *values))
+    texts = {
+        "band_set": "Bands of the fit",
+        "limit": "Least AGN fraction",
+        "n_wanted": "Sources of the field whose true fraction is as high",
+        "n_selected": "Sources whose posterior mean is as high",
+    }
+    for name, text in (
+        ("completeness", "Share of the wanted sources that are selected"),
+        ("purity", "Share of the selected sources that are wanted"),
+    ):
+        texts |= {
+            name: text,
+            f"{name}_low": "Lower end of 68 %",
+            f"{name}_high": "Upper end of 68 %",
+        }
+    return described_rows(rows, texts)

@@ -1,0 +1,150 @@
+"""Catalogs of other people, read from files, whole or by pieces."""
+
+import os
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from miricigale.filters.catalog_map import CatalogMap
+from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
+from miricigale.utils.files import read_table
+
+__all__ = ["MappedRows", "as_catalog_map", "read_catalog_photometry", "told_of"]
+
+#: Bands whose missing values are counted one by one in a message.
+_FEW = 8
+
+
+def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
+    """
+    Read the photometry of a catalog of other people.
+
+    Parameters
+    ----------
+    path : path-like
+        FITS, ECSV, VOTable, CSV or text.
+    catalog_map : `CatalogMap`, str or path-like, optional
+        Names and units; the name of a survey (`SURVEYS`), or a TOML file (`CatalogMap.read`).
+    hdu : int or str, optional
+        Extension of a FITS file with several tables.
+    **options
+        As for `CatalogMap`, in place of it: ``columns``, ``units``, ``survey``, ``missing``, ``factor``.
+
+    Returns
+    -------
+    photometry : `~astropy.table.QTable`
+        Of our names: ``id``, fluxes by filter and ``<filter>_err`` in uJy, NaN where missing, and the other
+        columns of the file. `~miricigale.fitting.BayesFitter.fit` and
+        `~miricigale.photometry.ErrorModel.from_tables` take it as it is.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If there is no such file, or it is no table.
+    KeyError, ValueError, `~astropy.units.UnitsError`
+        As `CatalogMap` and `CatalogMap.convert`.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        Of numbers that stand for no value, and of bands without a filter.
+
+    Examples
+    --------
+    >>> from miricigale.filters import read_catalog_photometry
+    >>> table = read_catalog_photometry("egs.fits", "candels")  # doctest: +SKIP
+    >>> table = read_catalog_photometry("mine.csv", units={"flux": "ABmag"})  # doctest: +SKIP
+    """
+    catalog_map = as_catalog_map(catalog_map, options)
+    path = Path(path)
+    table = read_table(path, wanted="a table", hdu=hdu)
+    if not table.colnames:
+        msg = f"{path} cannot be read as a table: it has no columns"
+        raise DataError(msg)
+    _, lost = catalog_map.names(table.colnames, path.name)
+    table, coded = catalog_map.convert(table, path.name)
+    for text in told_of(lost, coded):
+        warnings.warn(f"{path.name}: {text}", MiricigaleWarning, stacklevel=2)
+    return table
+
+
+def as_catalog_map(catalog_map, options=None):
+    """A `CatalogMap` of what a caller gave: one, the name of a survey, a file, or keyword arguments."""
+    options = options or {}
+    if catalog_map is None:
+        return CatalogMap(**options)
+    if options:
+        raise argument_error("catalog_map", f"None beside {sorted(options)}", repr(catalog_map))
+    if isinstance(catalog_map, CatalogMap):
+        return catalog_map
+    if not isinstance(catalog_map, (str, os.PathLike)):
+        wanted = "a CatalogMap, the name of a survey or a file"
+        raise argument_error("catalog_map", wanted, type(catalog_map).__name__)
+    if isinstance(catalog_map, str) and not catalog_map.endswith(".toml"):
+        return CatalogMap(survey=catalog_map)
+    return CatalogMap.read(catalog_map)
+
+
+def told_of(lost, coded):
+    """What is to be told of bands without a filter, and of numbers that stand for no value."""
+    if lost:
+        yield f"left out, no filter here: {', '.join(lost)}"
+    parts = []
+    for name, values in coded.items():
+        there = values[~np.isnan(values)]
+        if there.size:
+            codes = ", ".join(f"{value:g}" for value in np.unique(np.round(there, 4))[:3])
+            parts.append(f"{name} {there.size} of {values.size} ({codes})")
+    if len(parts) > _FEW:
+        parts = [*parts[:_FEW], f"and {len(parts) - _FEW} more bands"]
+    if parts:
+        yield f"taken as missing, by the number that stands there: {'; '.join(parts)}"
+
+
+class MappedRows:
+    """
+    A table on disk by pieces (`~miricigale.utils.row_files.RowFile`), with our names and units.
+
+    Parameters
+    ----------
+    rows : `~miricigale.utils.row_files.RowFile`
+        The file.
+    catalog_map : `CatalogMap`
+        The map.
+    """
+
+    def __init__(self, rows, catalog_map):
+        self._rows, self.map = rows, catalog_map
+        names, self._lost = catalog_map.names(rows.colnames, rows.path.name)
+        self._theirs = {ours: theirs for theirs, ours in names.items()}
+
+    def __getattr__(self, name):
+        return getattr(self._rows, name)
+
+    @property
+    def colnames(self):
+        """Our names of the columns."""
+        return tuple(self._theirs)
+
+    def chunk(self, i):
+        """A piece; what is to be told of it is told by `told`."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MiricigaleWarning)
+            return self.map.convert(self._rows.chunk(i), self._rows.path.name)[0]
+
+    def foreign_chunks(self, name):
+        """As `RowFile.foreign_chunks`, by our name."""
+        return self._rows.foreign_chunks(self._theirs.get(name, name))
+
+    def told(self):
+        """What is to be told of the whole file; reads all of it."""
+        parts = {}
+        for i in range(self._rows.n_chunks):
+            table = self._rows.chunk(i)
+            with warnings.catch_warnings():
+                if i:
+                    warnings.simplefilter("ignore", MiricigaleWarning)
+                for name, codes in self.map.convert(table, self._rows.path.name)[1].items():
+                    parts.setdefault(name, []).append(codes)
+        return list(told_of(self._lost, {name: np.concatenate(v) for name, v in parts.items()}))

@@ -1,0 +1,318 @@
+"""A map from the columns of a catalog of other people to ours: names, units, magnitudes, missing values."""
+
+import dataclasses
+import tomllib
+import types
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import Angle
+from astropy.table import QTable
+
+from miricigale.filters.filter import Filter
+from miricigale.filters.surveys import SURVEYS, is_band
+from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error, unknown_name
+from miricigale.utils.missing import plain_floats, without_codes
+from miricigale.utils.tables import error_column
+from miricigale.utils.units import FNU
+
+__all__ = ["CatalogMap"]
+
+#: Unit that a column without any has.
+_DEFAULT_UNITS = {"ra": u.deg, "dec": u.deg, "position_angle": u.deg}
+#: Names of AB magnitudes as a unit.
+_AB = ("abmag", "mag(ab)", "ab", "mag_ab")
+#: Error in magnitudes times flux is an error of the flux.
+_PER_MAGNITUDE = 0.4 * np.log(10)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CatalogMap:
+    """
+    Names, units and missing values of a catalog.
+
+    Parameters
+    ----------
+    columns : dict of str to str, optional
+        Our name of a column to the file's, such as ``{"wfc3.f160w": "FLUX_H"}``. Ours are ``id``, ``ra``,
+        ``dec``, ``redshift``, names of filters, those with ``_err`` for errors, and any other without a dot.
+        Columns that are not named keep their names.
+    units : dict of str to str or `~astropy.units.Unit`, optional
+        Units by our name, for columns whose file gives none or a wrong one; ``"flux"`` stands for all
+        fluxes and errors: ``{"flux": "mJy", "ra": "hourangle"}``, ``{"flux": "0.3631 uJy"}`` for a
+        zero point of 25, ``{"flux": "ABmag"}`` for AB magnitudes, whose errors are in magnitudes too.
+        Without unit ``ra``, ``dec`` and ``position_angle`` are in degrees.
+    survey : str, optional
+        Name in `SURVEYS`, whose names of columns and units are taken where ``columns`` and ``units``
+        have no other.
+    missing : iterable of float, optional
+        Further numbers that stand for no value in fluxes and errors, in the file's unit.
+    factor : str, optional
+        The file's name of a column of factors on all fluxes and errors of a source, as from an aperture to
+        the total; if it is in mag it is added to the magnitudes.
+
+    Raises
+    ------
+    KeyError
+        If ``columns`` or ``units`` name a filter that there is not, or ``survey`` is unknown.
+    ValueError
+        If two columns are one of the file, or something is no dict.
+    """
+
+    columns: Mapping = dataclasses.field(default_factory=dict)
+    units: Mapping = dataclasses.field(default_factory=dict)
+    survey: str | None = None
+    missing: tuple = ()
+    factor: str | None = None
+
+    def __post_init__(self):
+        for argument in ("columns", "units"):
+            names = getattr(self, argument)
+            names = {} if names is None else names
+            if not isinstance(names, Mapping):
+                wanted = "a dict by our names of columns"
+                raise argument_error(argument, wanted, type(names).__name__)
+            for name in names:
+                if "." in str(name) and not is_band(name):
+                    band = str(name).removesuffix(error_column(""))
+                    raise unknown_name("filter", band, Filter.names())
+            object.__setattr__(self, argument, types.MappingProxyType(dict(names)))
+        if len(set(self.columns.values())) < len(self.columns):
+            raise argument_error("columns", "a dict whose values differ", dict(self.columns))
+        if self.survey is not None and self.survey not in SURVEYS:
+            raise unknown_name("survey", self.survey, SURVEYS)
+        object.__setattr__(self, "missing", tuple(float(value) for value in self.missing))
+
+    @classmethod
+    def read(cls, path):
+        """
+        Read a map in TOML: tables ``columns`` and ``units``, keys ``survey``, ``missing`` and ``factor``.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If the file is missing, not TOML, or has another key.
+        """
+        path = Path(path).expanduser()
+        try:
+            values = tomllib.loads(path.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as err:
+            msg = f"{path} cannot be read as a map of columns: {err}"
+            raise DataError(msg) from err
+        known = [field.name for field in dataclasses.fields(cls)]
+        unknown = sorted(set(values) - set(known))
+        if unknown:
+            msg = f"{path} is no map of columns: it has {unknown}; known: {known}"
+            raise DataError(msg)
+        return cls(**values)
+
+    def settings(self):
+        """What the map says, in plain values."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        values["columns"] = dict(self.columns)
+        values["units"] = {name: str(unit) for name, unit in self.units.items()}
+        return values
+
+    def names(self, colnames, argument="catalog"):
+        """
+        Our names of the columns of a file.
+
+        Parameters
+        ----------
+        colnames : iterable of str
+            The file's.
+        argument : str, optional
+            What the file is called in messages.
+
+        Returns
+        -------
+        names : dict of str to str
+            The file's names to ours, in the order of the file; a column whose name is ours but is not meant
+            is left out.
+        lost : list of str
+            Fluxes by the survey's names that no filter here belongs to.
+        """
+        colnames = list(colnames)
+        columns, lost = {}, []
+        if self.survey is not None:
+            columns, lost = SURVEYS[self.survey].columns(colnames)
+            if not any(is_band(name) for name in {**columns, **self.columns}):
+                wanted = f"a table with columns of {self.survey!r}"
+                raise argument_error(argument, wanted, f"columns {colnames}")
+        taken = set(self.columns.values())
+        columns = {ours: theirs for ours, theirs in columns.items() if theirs not in taken}
+        columns |= self.columns
+        for ours, theirs in columns.items():
+            if theirs not in colnames:
+                kind = f"column of {argument} (for {ours!r})"
+                raise unknown_name(kind, theirs, colnames)
+        ours = {theirs: name for name, theirs in columns.items()}
+        kept = (name for name in colnames if name in ours or name not in columns)
+        return {name: ours.get(name, name) for name in kept}, [n for n in lost if n not in ours]
+
+    def convert(self, table, argument="catalog"):
+        """
+        Bring a table to our names and units.
+
+        Parameters
+        ----------
+        table : `~astropy.table.Table`
+            As the file has it.
+        argument : str, optional
+            What it is called in messages.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            Fluxes and errors in uJy, NaN where they are missing; ids that are whole numbers as integers, and
+            other numbers as text.
+        coded : dict of str to `~numpy.ndarray` of float, shape (n,)
+            By band the number that stands for no value, NaN in rows that have none.
+
+        Raises
+        ------
+        KeyError
+            If a column is not there.
+        ValueError, `~astropy.units.UnitsError`
+            If a column holds no numbers, or has no unit or a wrong one.
+
+        Warns
+        -----
+        `~miricigale.utils.exceptions.MiricigaleWarning`
+            Of units other than the file's.
+        """
+        names, _ = self.names(table.colnames, argument)
+        out = QTable(meta=table.meta)
+        for theirs, ours in names.items():
+            out[ours] = table[theirs]
+        for name in self.units:
+            if name != "flux" and name not in out.colnames:
+                kind = f"column of {argument}"
+                raise unknown_name(kind, name, [*out.colnames, "flux"])
+        _plain_ids(out)
+        factor = self._factor(table, argument)
+        coded = {}
+        for name in out.colnames:
+            if is_band(name):
+                if not name.endswith(error_column("")):
+                    coded[name] = self._set_band(out, name, factor, argument)
+                elif name.removesuffix(error_column("")) not in out.colnames:
+                    self._set_band(out, name, factor, argument)
+            else:
+                self._set_unit(out, name, argument)
+        return out, coded
+
+    def _factor(self, table, argument):
+        if self.factor is None:
+            return 1.0
+        if self.factor not in table.colnames:
+            kind = f"column of {argument}"
+            raise unknown_name(kind, self.factor, table.colnames)
+        column = table[self.factor]
+        values = plain_floats(column, self.factor, argument)
+        return 10 ** (-0.4 * values) if column.unit == u.mag else values
+
+    def _asked(self, name, column, of_flux, argument):
+        """Unit that the caller says a column has, or the file's; a warning where these differ."""
+        asked = self.units.get(name, self.units.get("flux") if of_flux else None)
+        has = getattr(column, "unit", None)
+        has = None if has is None else u.Unit(has)
+        if asked is None:
+            if has is None and of_flux and self.survey is not None:
+                return u.Unit(SURVEYS[self.survey].unit)
+            return _DEFAULT_UNITS.get(name) if has is None else has
+        asked = _unit(asked, name)
+        if has is not None and has != asked and not (has == u.mag and _is_ab(asked)):
+            msg = f"{argument}: {name!r} taken in {asked}, the file says {has}"
+            warnings.warn(msg, MiricigaleWarning, stacklevel=5)
+        return asked
+
+    def _set_unit(self, table, name, argument):
+        """Give a column that is no flux the unit that the caller says, or the usual one."""
+        column = table[name]
+        unit = self._asked(name, column, False, argument)
+        asked = name in self.units
+        if unit is None or not (asked or getattr(column, "unit", None) is None):
+            return
+        if asked and column.dtype.kind in "USO" and unit.is_equivalent(u.deg):
+            table[name] = _angles(column, unit, name, argument)
+        elif asked or column.dtype.kind in "if":
+            table[name] = u.Quantity(plain_floats(column, name, argument), unit)
+
+    def _set_band(self, table, name, factor, argument):
+        """Fluxes and errors of a band in uJy; the numbers that stand for no value."""
+        error = error_column(name)
+        unit = self._asked(name, table[name], True, argument)
+        if unit is None or unit == u.mag or not (_is_ab(unit) or unit.is_equivalent(FNU)):
+            say = "AB magnitudes are units={'flux': 'ABmag'}"
+            say = "say it, such as units={'flux': 'uJy'}" if unit is None else say
+            msg = f"'{argument}' column {name!r} must be convertible to {FNU}, got {unit}: {say}"
+            raise u.UnitsError(msg)
+        values = plain_floats(table[name], name, argument)
+        errors = None
+        if error in table.colnames:
+            errors = plain_floats(table[error], error, argument)
+        ab = _is_ab(unit)
+        missing, no_error = without_codes(values, errors, magnitudes=ab, further=self.missing)
+        code = np.where(missing, values, np.nan)
+        if ab:
+            flux = 10 ** (-0.4 * (np.where(missing, np.nan, values) - 23.9))
+        else:
+            flux = u.Quantity(np.where(missing, np.nan, values), unit).to_value(FNU)
+        table[name] = flux * factor * FNU
+        if errors is None:
+            return code
+        code = np.where(no_error & ~missing, errors, code)
+        errors = np.where(missing | no_error, np.nan, errors)
+        table[error] = self._errors(table[error], error, errors, flux, ab, argument) * factor * FNU
+        return code
+
+    def _errors(self, column, name, errors, flux, ab, argument):
+        """Errors of fluxes in uJy, from those in the file's unit."""
+        if ab and "flux" in self.units and name not in self.units:
+            return _PER_MAGNITUDE * flux * errors
+        unit = self._asked(name, column, not ab, argument)
+        if ab and (unit is None or unit == u.mag or _is_ab(unit)):
+            return _PER_MAGNITUDE * flux * errors
+        if unit is None or not unit.is_equivalent(FNU):
+            msg = f"'{argument}' column {name!r} must be convertible to {FNU}, got {unit}"
+            raise u.UnitsError(msg)
+        return u.Quantity(errors, unit).to_value(FNU)
+
+
+def _plain_ids(table):
+    """Ids as integers where they are whole, and as text where they are other numbers or objects."""
+    if "id" not in table.colnames or np.any(getattr(table["id"], "mask", False)):
+        return
+    ids = np.asarray(getattr(table["id"], "unmasked", table["id"]))
+    if ids.dtype.kind == "f" and np.all(np.isfinite(ids)):
+        whole = np.all(ids == np.round(ids)) and np.all(np.abs(ids) < 2**53)
+        table["id"] = ids.astype(np.int64) if whole else np.array([repr(v) for v in ids.tolist()])
+    elif ids.dtype.kind == "O" and ids.size and all(isinstance(v, str) for v in ids.tolist()):
+        table["id"] = ids.astype(str)
+
+
+def _angles(column, unit, name, argument):
+    """Angles from text such as 3:32:30.1."""
+    try:
+        return u.Quantity(Angle(np.asarray(column).astype(str), unit).to(u.deg))
+    except (ValueError, u.UnitsError) as err:
+        wanted = f"a table with angles in {name!r}"
+        raise argument_error(argument, wanted, repr(str(column[0]))) from err
+
+
+def _unit(asked, name):
+    """A unit that the caller gave; AB magnitudes by any of their names."""
+    if isinstance(asked, str) and asked.strip().lower() in _AB:
+        return u.ABmag
+    try:
+        return u.Unit(asked)
+    except (TypeError, ValueError) as err:
+        raise argument_error("units", f"a dict of units, also for {name!r}", asked) from err
+
+
+def _is_ab(unit):
+    return isinstance(unit, u.function.FunctionUnitBase) and unit == u.ABmag

@@ -1,0 +1,411 @@
+"""Images of the pipeline's later stages as files: rates, calibrated images, mosaics."""
+
+import dataclasses
+import io
+import json
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.nddata import CCDData, StdDevUncertainty
+from astropy.wcs import WCS, FITSFixedWarning
+
+from miricigale.detector import Ramp
+from miricigale.instrument import DQ, STEPS, dq_legend, imager_wcs, read_dq, steps_done, subarrays
+from miricigale.reduction.assumed import middle_of
+from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.files import open_fits, write_fits
+from miricigale.utils.meta import undated
+from miricigale.utils.optional import require
+from miricigale.utils.parallel import check_memory
+from miricigale.utils.store import plain_value
+from miricigale.utils.units import RATE, SURFACE_BRIGHTNESS
+
+__all__ = ["ImageFile", "open_exposure", "read_images", "write_image"]
+
+_WANTED = "an image of JWST (FITS with SCI)"
+
+#: Planes beside the image, its errors and its flags.
+PLANES = ("VAR_POISSON", "VAR_RNOISE", "VAR_FLAT", "WHT", "CON", "BKG")
+
+_VARIANCES = PLANES[:3]
+
+#: Keywords that become entries of the meta dictionary.
+_META = {
+    "NGROUPS": "n_groups", "NINTS": "n_integrations", "TGROUP": "group_time",
+    "PHOTMJSR": "photmjsr", "PA_APER": "pa_aper", "XPOSURE": "exposure_time",
+    "EFFEXPTM": "exposure_time", "RA_REF": "ra", "DEC_REF": "dec", "ROLL_REF": "roll",
+}  # fmt: skip
+
+
+#: Keywords that name the references of the pipeline.
+_REFERENCES = {
+    "R_MASK": "mask", "R_SATURA": "saturation", "R_SUPERB": "bias", "R_RESET": "reset",
+    "R_LINEAR": "linearity", "R_DARK": "dark", "R_GAIN": "gain", "R_READNO": "read_noise",
+    "R_FLAT": "flat", "R_PHOTOM": "photom",
+}  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class ImageFile:
+    """
+    An image from a file, with all of its planes.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        With standard deviation, ``flags`` (`~miricigale.instrument.DQ`), mask (not to be used, or
+        not finite), WCS, and what `~miricigale.instrument.ImageFacts` reads in its meta dictionary.
+        Slopes are in adu / s, also of files that say DN/s.
+    planes : dict of str to `~numpy.ndarray`
+        Further planes of the file that are there: ``VAR_POISSON``, ``VAR_RNOISE``, ``VAR_FLAT``,
+        ``WHT``, ``CON`` and ``BKG``.
+    header : `~astropy.io.fits.Header`
+        Keywords of the primary header and of SCI.
+    """
+
+    image: CCDData
+    planes: Mapping
+    header: fits.Header
+
+    def __repr__(self):
+        ny, nx = self.image.shape
+        return f"<ImageFile {ny} x {nx} pixels, {self.image.unit}, {', '.join(self.planes)}>"
+
+
+def read_images(path):
+    """
+    Read an image file of the JWST pipeline, or one of our own.
+
+    Parameters
+    ----------
+    path : path-like
+        A ``_rate``, ``_rateints``, ``_cal``, ``_calints``, ``_crf`` or ``_i2d`` file of the MIRI imager.
+
+    Returns
+    -------
+    files : list of `ImageFile`
+        One; or one for each integration.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file is missing, truncated or no such image, or its planes do not fit together.
+    MemoryError
+        If it is larger than the memory.
+
+    Notes
+    -----
+    The errors are those of ERR, or, without it, of the variances. The world coordinates are
+    those of the FITS header; of a file without them, that of the gwcs in its ASDF extension (with
+    the package ``gwcs``); of a rate, whose header has their linear part only, those of the
+    imager at its pointing.
+    """
+    path = Path(path)
+    with open_fits(path, wanted=_WANTED) as hdus:
+        if "SCI" not in hdus or hdus["SCI"].header.get("NAXIS") not in (2, 3):
+            msg = f"{path} cannot be read as {_WANTED}: it has no image in SCI"
+            raise DataError(msg)
+        header = hdus[0].header.copy(strip=True)
+        science = hdus["SCI"].header
+        header.extend(science.copy(strip=True), unique=True)
+        if (
+            header.get("INSTRUME", "MIRI") != "MIRI"
+            or header.get("DETECTOR", "MIRIMAGE") != "MIRIMAGE"
+        ):
+            got = f"{header.get('INSTRUME')} {header.get('DETECTOR')}"
+            msg = f"{path} must be of the MIRI imager, got {got}"
+            raise DataError(msg)
+        shape = hdus["SCI"].shape
+        check_memory(24 * np.prod(shape, dtype=float), f"the image {path}", advice="cut it")
+        unit = _unit(science, path)
+        meta = _meta(header, path)
+        wcs = _wcs(hdus, header, meta)
+        data = _plane(hdus, "SCI", shape, path)
+        error = _plane(hdus, "ERR", shape, path)
+        planes = {name: _plane(hdus, name, shape, path) for name in PLANES if name in hdus}
+        flags = _flags(hdus, shape, path)
+    if error is None and (parts := [planes[name] for name in _VARIANCES if name in planes]):
+        error = np.sqrt(np.sum([np.nan_to_num(part) for part in parts], axis=0))
+    out = []
+    for number in range(shape[0] if len(shape) == 3 else 1):
+        cut = (lambda array, k=number: array[k]) if len(shape) == 3 else (lambda array: array)
+        values, own = cut(data), dict(meta)
+        if len(shape) == 3:
+            own["integration"] = number
+        flag = cut(flags)
+        bad = ~np.isfinite(values) | ((flag & DQ.DO_NOT_USE) != 0)
+        sigma = None
+        if error is not None:
+            sigma = cut(error)
+            bad |= ~np.isfinite(sigma)
+        if "WHT" in planes:
+            bad |= ~(cut(planes["WHT"]) > 0)
+        image = CCDData(
+            values,
+            unit=unit,
+            uncertainty=None if sigma is None else StdDevUncertainty(sigma),
+            mask=bad,
+            flags=flag,
+            wcs=wcs,
+            meta=own,
+        )
+        part = {
+            name: plane if name == "CON" or plane.shape != shape else cut(plane)
+            for name, plane in planes.items()
+        }
+        out.append(ImageFile(image, part, header))
+    return out
+
+
+def open_exposure(path):
+    """
+    Open a file of the pipeline at any stage.
+
+    Parameters
+    ----------
+    path : path-like
+        A ramp, as `~miricigale.detector.Ramp.read` takes it, or an image, as `read_images` does.
+
+    Returns
+    -------
+    exposure : `~miricigale.detector.Ramp` or `~astropy.nddata.CCDData`
+        Of a file with an image of each integration their mean, with its error.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If it is neither.
+    """
+    with open_fits(path, wanted=_WANTED) as hdus:
+        ramp = "SCI" in hdus and hdus["SCI"].header.get("NAXIS") == 4
+    if ramp:
+        return Ramp.read(path)
+    images = [file.image for file in read_images(path)]
+    return images[0] if len(images) == 1 else _mean(images)
+
+
+def _mean(images):
+    """Mean of the integrations of an exposure; flags are those that all have, or that tell of any."""
+    weight = np.array([~image.mask for image in images], float)
+    count = weight.sum(axis=0)
+    data = np.array([np.nan_to_num(image.data) for image in images])
+    first, sigma = images[0], None
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.where(count > 0, (weight * data).sum(axis=0) / count, np.nan)
+        if all(image.uncertainty is not None for image in images):
+            error = np.array([np.nan_to_num(image.uncertainty.array) for image in images])
+            sigma = np.where(count > 0, np.sqrt((weight * error**2).sum(axis=0)) / count, np.nan)
+    flags = np.bitwise_or.reduce([image.flags for image in images]) & ~int(DQ.DO_NOT_USE)
+    flags |= np.where(count == 0, int(DQ.DO_NOT_USE), 0)
+    meta = {key: value for key, value in first.meta.items() if key != "integration"}
+    return CCDData(
+        mean.astype(np.float32),
+        unit=first.unit,
+        uncertainty=None if sigma is None else StdDevUncertainty(sigma.astype(np.float32)),
+        mask=count == 0,
+        flags=flags,
+        wcs=first.wcs,
+        meta=meta,
+    )
+
+
+def _unit(header, path):
+    """Unit of an image; DN is what astropy's CCDData and this package call adu."""
+    text = str(header.get("BUNIT", "")).strip()
+    try:
+        unit = u.Unit(text.replace("counts", "DN")) if text else None
+    except ValueError:
+        unit = None
+    for known, own in (
+        (u.Unit("DN/s"), RATE),
+        (RATE, RATE),
+        (SURFACE_BRIGHTNESS, SURFACE_BRIGHTNESS),
+    ):
+        if unit is not None and unit.is_equivalent(known):
+            factor = unit.to(known)
+            return own if factor == 1 else u.Unit(factor * own)
+    msg = (
+        f"{path} must state in BUNIT that it is a rate (DN/s, adu/s) or a surface brightness (MJy/sr), "
+        f"got {text!r}"
+    )
+    raise DataError(msg)
+
+
+def _plane(hdus, name, shape, path):
+    if name not in hdus:
+        return None
+    data = hdus[name].data
+    if data is None or data.shape[-2:] != shape[-2:] or (name != "CON" and data.shape != shape):
+        got = None if data is None else data.shape
+        msg = f"{path} must have {shape} pixels in {name}, as in SCI, got {got}"
+        raise DataError(msg)
+    kind = data.dtype.newbyteorder("=") if data.dtype.kind in "iu" else np.float32
+    return np.array(data, kind)
+
+
+def _flags(hdus, shape, path):
+    if "DQ" not in hdus:
+        return np.zeros(shape, np.int64)
+    hdu = hdus["DQ"]
+    # planes without our legend are JWST's own
+    flags = read_dq(hdu) if "DQSCHEME" in hdu.header else np.asarray(hdu.data).astype(np.int64)
+    if flags.shape != shape:
+        msg = f"{path} must have {shape} pixels in DQ, as in SCI, got {flags.shape}"
+        raise DataError(msg)
+    if "DQ_OWN" in hdus:
+        flags = flags | (np.asarray(hdus["DQ_OWN"].data).astype(np.int64) << 32)
+    return flags
+
+
+def _meta(header, path):
+    """Facts of an image, from our own record or from the keywords of JWST."""
+    own = header.get("META")
+    if own is not None:
+        return json.loads(own)
+    meta = {name: header[key] for key, name in _META.items() if header.get(key) is not None}
+    name = str(header.get("FILTER", "")).strip().lower()
+    if name:
+        meta["filter"] = f"miri.{name}"
+    part = str(header.get("SUBARRAY", "")).strip()
+    if part in subarrays():
+        meta["subarray"] = part
+    if "READPATT" in header:
+        pattern = str(header["READPATT"]).strip()
+        meta["readout"] = {"FAST": "FASTR1", "SLOW": "SLOWR1"}.get(pattern, pattern)
+    meta["dither"] = max(int(header.get("PATT_NUM", 1)), 1) - 1
+    meta["steps"] = sorted(steps_done(header))
+    if (day := middle_of(header)) is not None:
+        meta["day"] = day
+    for keyword, name in _REFERENCES.items():
+        if keyword in header:
+            meta[f"reference_{name}"] = str(header[keyword]).removeprefix("crds://")
+    meta["source"] = path.name
+    return meta
+
+
+def _wcs(hdus, header, meta):
+    """World coordinates of an image; None without any."""
+    pointed = all(name in meta for name in ("ra", "dec", "roll", "subarray"))
+    done = str(header.get("S_WCS", "")).strip().upper() == "COMPLETE"
+    if pointed and not done and "META" not in header:
+        # a rate: the header has the linear part
+        pointing = SkyCoord(meta["ra"] * u.deg, meta["dec"] * u.deg)
+        return imager_wcs(pointing, meta["roll"] * u.deg, subarray=meta["subarray"])
+    science = hdus["SCI"].header
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FITSFixedWarning)
+        wcs = WCS(science, naxis=2)
+    if wcs.has_celestial:
+        wcs.pixel_shape = (science["NAXIS1"], science["NAXIS2"])
+        return wcs
+    if "ASDF" not in hdus or not done:
+        return None
+    require("gwcs", extra="jwst")
+    asdf = require("asdf", extra="jwst")
+    stored = io.BytesIO(hdus["ASDF"].data.field(0)[0].tobytes())
+    with asdf.open(stored) as tree:
+        shape = (science["NAXIS1"], science["NAXIS2"])
+        box = ((-0.5, shape[0] - 0.5), (-0.5, shape[1] - 0.5))
+        wcs = WCS(tree["meta"]["wcs"].to_fits_sip(bounding_box=box))
+    wcs.pixel_shape = shape
+    return wcs
+
+
+def write_image(image, path, *, planes=None, header=None, overwrite=False):
+    """
+    Write an image as a FITS file that JWST's tools, photutils and DS9 open.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        Rate, calibrated image or mosaic. Its WCS, with distortion, goes to the header of SCI; its
+        meta dictionary, as JSON, to the keyword META, by which `read_images` restores it.
+    path : path-like
+        The file.
+    planes : dict of str to `~numpy.ndarray`, optional
+        Further planes by name (`ImageFile`), such as ``WHT``, ``CON`` (numbers of images)
+        and ``BKG`` (what was subtracted).
+    header : `~astropy.io.fits.Header`, optional
+        Keywords of the observation.
+    overwrite : bool, optional
+        Whether an existing file is replaced.
+
+    Returns
+    -------
+    path : `pathlib.Path`
+
+    Raises
+    ------
+    OSError
+        If the file exists and ``overwrite`` is False.
+    ValueError
+        If a plane has another name or shape.
+    """
+    path = Path(path)
+    primary = fits.PrimaryHDU()
+    meta = undated(image.meta)
+    keywords = {
+        "TELESCOP": "JWST", "INSTRUME": "MIRI", "DETECTOR": "MIRIMAGE", "EXP_TYPE": "MIR_IMAGE",
+        "FILTER": str(meta.get("filter", "")).rpartition(".")[2].upper() or None,
+        "SUBARRAY": meta.get("subarray"), "READPATT": meta.get("readout"),
+        "DATAMODL": "ImageModel", "FILENAME": path.name,
+    }  # fmt: skip
+    if header is not None:
+        primary.header.extend(header.copy(strip=True), unique=True, strip=True)
+    primary.header.update({key: value for key, value in keywords.items() if value is not None})
+    for step in STEPS if isinstance(meta.get("steps"), list) else ():
+        if STEPS[step] in meta["steps"]:
+            primary.header[step] = "COMPLETE"
+    science = fits.Header()
+    if image.wcs is not None:
+        science = image.wcs.to_header(relax=True)
+        # what is no WCS keyword of this image, and confuses
+        for name in ("DATE-OBS", "MJD-OBS", "TIMESYS"):
+            science.remove(name, ignore_missing=True)
+        primary.header["S_WCS"] = "COMPLETE"
+    # as the pipeline writes them; astropy takes DN/s for another unit than adu/s
+    names = {RATE: "DN/s", SURFACE_BRIGHTNESS: "MJy/sr"}
+    unit = next((n for own, n in names.items() if image.unit == own), image.unit.to_string("fits"))
+    science["BUNIT"] = unit
+    science["META"] = json.dumps(meta, default=_plain, allow_nan=True)
+    for key, name in (
+        ("PHOTMJSR", "photmjsr"),
+        ("PA_APER", "pa_aper"),
+        ("XPOSURE", "exposure_time"),
+    ):
+        if isinstance(meta.get(name), (int, float)):
+            science[key] = meta[name]
+    hdus = [primary, fits.ImageHDU(np.asarray(image.data, np.float32), science, name="SCI")]
+    if image.uncertainty is not None:
+        error = image.uncertainty.represent_as(StdDevUncertainty).array
+        hdus.append(fits.ImageHDU(np.asarray(error, np.float32), name="ERR"))
+        hdus[-1].header["BUNIT"] = unit
+    flags = np.zeros(image.shape, np.int64) if image.flags is None else np.asarray(image.flags)
+    if image.mask is not None:
+        flags = flags | np.where(image.mask, int(DQ.DO_NOT_USE), 0)
+    hdus.append(fits.ImageHDU((flags & 0xFFFFFFFF).astype(np.uint32), dq_legend(), name="DQ"))
+    if np.any(flags >> 32):
+        own = fits.Header([("DQSHIFT", 32, "bit n of this plane is bit n + 32 of the legend")])
+        hdus.append(fits.ImageHDU((flags >> 32).astype(np.uint8), own, name="DQ_OWN"))
+    for name, plane in (planes or {}).items():
+        plane = np.asarray(plane)
+        if name not in PLANES or plane.shape[-2:] != image.shape:
+            wanted = f"of {image.shape} pixels, named {', '.join(PLANES)}"
+            raise argument_error("planes", wanted, f"{name} of {plane.shape}")
+        plane = plane.astype(np.int32 if name == "CON" else np.float32)
+        hdus.append(
+            fits.ImageHDU(plane[None] if name == "CON" and plane.ndim == 2 else plane, name=name)
+        )
+        if name == "BKG":
+            hdus[-1].header["BUNIT"] = unit
+    write_fits(hdus, path, overwrite=overwrite)
+    return path
+
+
+def _plain(value):
+    return f"{value}" if isinstance(value, u.Quantity) else plain_value(value)

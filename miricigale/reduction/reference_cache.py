@@ -1,0 +1,256 @@
+"""Reference files of a local CRDS cache, chosen by the header of an exposure."""
+
+import ast
+import dataclasses
+import fnmatch
+import os
+import re
+from pathlib import Path
+
+from miricigale.reduction.references import ReferenceFiles
+from miricigale.utils.exceptions import DataError, argument_error
+
+__all__ = ["ReferenceCache"]
+
+#: Reference types of CRDS by the names of `ReferenceFiles`.
+_TYPES = {
+    "mask": "mask",
+    "saturation": "saturation",
+    "bias": "superbias",
+    "reset": "reset",
+    "linearity": "linearity",
+    "dark": "dark",
+    "gain": "gain",
+    "read_noise": "readnoise",
+    "flat": "flat",
+    "photom": "photom",
+}
+
+#: Keywords of files by the parameters of rules.
+_KEYWORDS = {
+    "META.INSTRUMENT.NAME": "INSTRUME",
+    "META.INSTRUMENT.DETECTOR": "DETECTOR",
+    "META.INSTRUMENT.FILTER": "FILTER",
+    "META.INSTRUMENT.BAND": "BAND",
+    "META.INSTRUMENT.CHANNEL": "CHANNEL",
+    "META.INSTRUMENT.CORONAGRAPH": "CORONMSK",
+    "META.INSTRUMENT.LAMP_STATE": "LAMP",
+    "META.EXPOSURE.READPATT": "READPATT",
+    "META.EXPOSURE.TYPE": "EXP_TYPE",
+    "META.EXPOSURE.NGROUPS": "NGROUPS",
+    "META.EXPOSURE.NFRAMES": "NFRAMES",
+    "META.SUBARRAY.NAME": "SUBARRAY",
+    "META.VISIT.TSOVISIT": "TSOVISIT",
+    "META.OBSERVATION.DATE": "DATE-OBS",
+    "META.OBSERVATION.TIME": "TIME-OBS",
+}
+
+_NOT_APPLICABLE = "N/A"
+
+
+@dataclasses.dataclass(frozen=True)
+class ReferenceCache:
+    """
+    A CRDS cache on the disk.
+
+    Parameters
+    ----------
+    folder : path-like, optional
+        With ``mappings/jwst`` and ``references/jwst``; that of the variable CRDS_PATH if not given.
+    context : str, optional
+        Such as ``"jwst_1364.pmap"``; that of the variable CRDS_CONTEXT, or else the last one
+        in the cache, if not given.
+
+    Raises
+    ------
+    ValueError
+        If no folder is given and CRDS_PATH is not set.
+    `~miricigale.utils.exceptions.DataError`
+        If the folder has no such context.
+
+    Notes
+    -----
+    Nothing is downloaded: what the rules choose must be there. Rules (``.rmap``) of the kinds
+    that MIRI has are understood, ``Match`` and ``UseAfter``; others are refused.
+
+    References
+    ----------
+    CRDS user's guide, https://jwst-crds.stsci.edu/static/users_guide.
+    """
+
+    folder: object = None
+    context: str | None = None
+
+    def __post_init__(self):
+        folder = self.folder if self.folder is not None else os.environ.get("CRDS_PATH")
+        if not folder:
+            raise argument_error("folder", "given, or the variable CRDS_PATH set", "neither")
+        object.__setattr__(self, "folder", Path(folder))
+        context = self.context or os.environ.get("CRDS_CONTEXT")
+        if context is None:
+            found = sorted(self._mappings.glob("jwst_*.pmap"))
+            if not found:
+                msg = f"{self.folder} is no CRDS cache of JWST: it has no mappings/jwst/jwst_*.pmap"
+                raise DataError(msg)
+            context = found[-1].name
+        object.__setattr__(self, "context", str(context))
+        self._mapping(self.context)
+
+    @property
+    def _mappings(self):
+        return self.folder / "mappings" / "jwst"
+
+    def find(self, header, *, incomplete=False):
+        """
+        Choose the reference files of an exposure.
+
+        Parameters
+        ----------
+        header : mapping
+            Keywords of the exposure, such as `~miricigale.detector.Ramp.header`.
+        incomplete : bool, optional
+            As for `ReferenceFiles`.
+
+        Returns
+        -------
+        references : `ReferenceFiles`
+            Those for which the rules have a file; others are None.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.DataError`
+            If a rule cannot be read, or a file that it chooses is not in the cache.
+        """
+        values = {
+            key: str(header.get(word, "UNDEFINED")).strip() for key, word in _KEYWORDS.items()
+        }
+        values["META.INSTRUMENT.NAME"] = "MIRI"
+        instruments = self._mapping(self.context)[1]
+        rules = self._mapping(_name(instruments, "MIRI", self.context))[1]
+        chosen = {}
+        for name, kind in _TYPES.items():
+            rule = rules.get(kind, rules.get(kind.upper(), _NOT_APPLICABLE))
+            if rule == _NOT_APPLICABLE:
+                continue
+            chosen[name] = self._file(self._choose(rule, values))
+        return ReferenceFiles(**chosen, incomplete=incomplete, origin=self.context)
+
+    def _choose(self, rule, values):
+        """Name of the file that a rule chooses, or None."""
+        header, selector = self._mapping(rule)
+        parameters = header["parkey"]
+        if isinstance(parameters[0], str):
+            parameters = (parameters,)
+        substitutions = header.get("substitutions", {})
+        for names in parameters:
+            if not isinstance(selector, _Selector):
+                break
+            selector = selector.choose(names, values, substitutions)
+        if isinstance(selector, _Selector):
+            msg = f"{rule} has more selectors than parameters"
+            raise DataError(msg)
+        return None if selector in (None, _NOT_APPLICABLE) else selector
+
+    def _file(self, name):
+        if name is None:
+            return None
+        folder = self.folder / "references" / "jwst"
+        for path in (folder / "miri" / name, folder / name):
+            if path.is_file():
+                return path
+        msg = f"{self.folder} lacks the reference file {name}, which {self.context} chooses"
+        raise DataError(msg)
+
+    def _mapping(self, name):
+        """Header and selector of a mapping."""
+        path = self._mappings / name
+        try:
+            tree = ast.parse(path.read_text())
+            parts = {
+                node.targets[0].id: _value(node.value)
+                for node in tree.body
+                if isinstance(node, ast.Assign)
+            }
+            return parts["header"], parts["selector"]
+        except FileNotFoundError:
+            msg = f"{self.folder} is no CRDS cache with {name}: there is no {path}"
+            raise DataError(msg) from None
+        except (AttributeError, KeyError, SyntaxError, ValueError) as err:
+            msg = f"{path} cannot be read as a CRDS mapping: {err}"
+            raise DataError(msg) from err
+
+
+def _name(instruments, name, context):
+    try:
+        return instruments[name] if name in instruments else instruments[name.lower()]
+    except KeyError:
+        msg = f"{context} has no mapping for {name}"
+        raise DataError(msg) from None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Selector:
+    """One level of a rule."""
+
+    kind: str
+    cases: dict
+
+    def choose(self, names, values, substitutions):
+        """What the parameters choose of the cases; None if nothing matches."""
+        if self.kind == "UseAfter":
+            # dates and times in one order of digits
+            when = " ".join(values.get(name, "UNDEFINED") for name in names)
+            before = [date for date in self.cases if date <= when.split(".")[0]]
+            return self.cases[max(before)] if before else None
+        best, chosen = 0, None
+        for key, case in self.cases.items():
+            patterns = key if isinstance(key, tuple) else (key,)
+            found = [
+                _match(
+                    substitutions.get(name, {}).get(pattern, pattern), values.get(name, "UNDEFINED")
+                )
+                for name, pattern in zip(names, patterns, strict=True)
+            ]
+            if min(found) < 0:
+                continue
+            if chosen is None or sum(found) > best:
+                best, chosen = sum(found), case
+            elif sum(found) == best and isinstance(chosen, _Selector):
+                # equally good: the dates of both
+                chosen = _Selector(chosen.kind, {**case.cases, **chosen.cases})
+        return chosen
+
+
+def _match(pattern, value):
+    """Whether a value fits: 1 yes, 0 it does not matter, -1 no."""
+    if isinstance(pattern, tuple):
+        pattern = "|".join(pattern)
+    if pattern == _NOT_APPLICABLE:
+        return 0
+    if value == pattern:
+        return 1
+    if value in ("*", _NOT_APPLICABLE):
+        return 1 if value == "*" else 0
+    if pattern.upper().startswith("NOT "):
+        return -_match(pattern[4:].strip(), value)
+    if pattern.startswith("{") and pattern.endswith("}"):
+        return 1 if value == pattern[1:-1] else -1
+    if pattern.startswith("(") and pattern.endswith(")"):
+        return 1 if re.match(pattern[1:-1], value) else -1
+    if pattern.startswith(("#", ">", "<", "=")) or pattern.upper().startswith("BETWEEN"):
+        msg = f"relation {pattern!r} is not understood"
+        raise DataError(msg)
+    return 1 if any(fnmatch.fnmatchcase(value, one) for one in pattern.split("|")) else -1
+
+
+def _value(node):
+    """Value of a literal in which selectors stand as calls."""
+    if isinstance(node, ast.Call):
+        kind = node.func.id
+        if kind not in ("Match", "UseAfter"):
+            msg = f"selector {kind} is not understood"
+            raise ValueError(msg)
+        return _Selector(kind, _value(node.args[0]))
+    if isinstance(node, ast.Dict):
+        return {_value(k): _value(v) for k, v in zip(node.keys, node.values, strict=True)}
+    return ast.literal_eval(node)

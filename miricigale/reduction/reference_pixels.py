@@ -1,0 +1,130 @@
+"""Drift of the read-out, as the pixels without light show it."""
+
+import numpy as np
+from scipy.signal import savgol_filter
+
+from miricigale.utils.exceptions import argument_error
+
+__all__ = ["reference_channels", "reference_drift"]
+
+#: Channels of the read-out, to which columns belong in turn.
+_CHANNELS = 4
+
+
+def reference_drift(data, reference):
+    """
+    Mean level of the reference pixels in each group.
+
+    Parameters
+    ----------
+    data : `~numpy.ndarray`, shape (n_int, n_group, ny, nx)
+        Groups in DN.
+    reference : `~numpy.ndarray` of bool, shape (ny, nx)
+        Which pixels see no light.
+
+    Returns
+    -------
+    drift : `~numpy.ndarray`, shape (n_int, n_group)
+        Mean of each group's reference pixels minus the mean over all groups, DN; zeros if
+        there is no reference pixel.
+    """
+    drift = np.zeros(data.shape[:2])
+    columns = np.flatnonzero(reference.any(axis=0))
+    if columns.size == 0:
+        return drift
+    chosen = reference[:, columns]
+    for k, g in np.ndindex(*drift.shape):
+        drift[k, g] = data[k, g][:, columns][chosen].mean(dtype=float)
+    return drift - drift.mean()
+
+
+def reference_channels(
+    data, reference, *, origin=(0, 0), odd_even_rows=True, clip=3.0, window=None
+):
+    """
+    Drift of each channel of the read-out, of odd and even rows apart.
+
+    Parameters
+    ----------
+    data : `~numpy.ndarray`, shape (n_int, n_group, ny, nx)
+        Groups in DN.
+    reference : `~numpy.ndarray` of bool, shape (ny, nx)
+        Which pixels see no light.
+    origin : tuple of int, optional
+        Column and row of the first pixel in the full frame: they tell its channel and parity.
+    odd_even_rows : bool, optional
+        Whether odd and even rows have levels of their own.
+    clip : float, optional
+        Sigma at which the means are clipped.
+    window : int or None, optional
+        Odd number of groups over which the drift is smoothed in each integration (local straight
+        lines), so that less of the noise of few reference pixels comes in; None for none.
+
+    Returns
+    -------
+    drift : `~numpy.ndarray`, shape (n_int, n_group, ny, 4)
+        DN of the channels, the first that of column 0; zero in the first group of each
+        integration, or where the smooth drift begins.
+
+    Raises
+    ------
+    ValueError
+        If there is no reference pixel of a channel, or an option is out of range.
+
+    Notes
+    -----
+    It is what the official pipeline does to full frames (step ``refpix``): the first group of an
+    integration is taken off all; of what is left, the clipped means of the reference pixels on
+    the left and on the right are averaged and subtracted from the pixels of the same channel. A
+    sub-array with reference pixels on one side, which that step leaves alone, has theirs.
+
+    References
+    ----------
+    JWST pipeline documentation, reference pixel correction (MIRI).
+    """
+    n_int, n_group, ny, nx = data.shape
+    if not clip > 0:
+        raise argument_error("clip", "positive", clip)
+    if window is not None and not (window >= 3 and window % 2 == 1 and int(window) == window):
+        raise argument_error("window", "an odd number of at least 3, or None", window)
+    columns = np.flatnonzero(reference.any(axis=0))
+    # a small part of the data
+    pixels, known = data[..., columns], reference[:, columns]
+    # left and right of the middle
+    sides = [np.flatnonzero(columns < nx / 2), np.flatnonzero(columns >= nx / 2)]
+    parity = (np.arange(ny) + origin[1]) % 2 if odd_even_rows else np.zeros(ny, int)
+    values = np.zeros((n_int, n_group, 2, _CHANNELS))
+    for channel in range(_CHANNELS):
+        mine = [side[columns[side] % _CHANNELS == channel] for side in sides]
+        mine = [side for side in mine if side.size]
+        if not mine:
+            wanted = "reference pixels of every channel"
+            raise argument_error("reference", wanted, f"none in columns {channel} + 4 n")
+        for odd in np.unique(parity):
+            rows = np.flatnonzero(parity == odd)
+            for side in mine:
+                good = known[np.ix_(rows, side)].ravel()
+                part = pixels[:, :, rows][..., side].reshape(n_int, n_group, -1)[..., good]
+                change = part.astype(float) - part[:, :1]
+                values[:, :, odd, channel] += _clipped_mean(change, clip) / len(mine)
+    if not odd_even_rows:
+        values[:, :, 1] = values[:, :, 0]
+    if window is not None:
+        length = min(int(window), n_group - 1 + n_group % 2)
+        if length >= 3:
+            values[:, 1:] = savgol_filter(values, length, 1, axis=1)[:, 1:]
+    return values[:, :, parity if odd_even_rows else np.zeros(ny, int)]
+
+
+def _clipped_mean(values, clip):
+    """Mean along the last axis, of what lies within ``clip`` standard deviations of it."""
+    keep = np.ones(values.shape, bool)
+    while True:
+        count = np.maximum(keep.sum(axis=-1), 1)
+        mean = np.where(keep, values, 0).sum(axis=-1) / count
+        residual = values - mean[..., None]
+        spread = np.sqrt(np.where(keep, np.square(residual), 0).sum(axis=-1) / count)
+        new = keep & (np.abs(residual) <= clip * spread[..., None] + 1e-12)
+        if np.array_equal(new, keep):
+            return mean
+        keep = new

@@ -1,0 +1,159 @@
+"""Slopes of the ramps of an exposure: which groups take part, and what is taken off them."""
+
+import warnings
+
+import numpy as np
+
+from miricigale.detector import (
+    Charge,
+    FirstFrame,
+    InterpixelCapacitance,
+    LastFrame,
+    ResetAnomaly,
+)
+from miricigale.instrument import DQ
+from miricigale.reduction.assumed import is_own
+from miricigale.reduction.drawn import draw_groups
+from miricigale.reduction.rampfit import fit_groups
+from miricigale.reduction.reference_pixels import reference_channels, reference_drift
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+
+__all__ = ["fit_slopes", "shares_charge"]
+
+# flags of a ramp's pixels that forbid a slope
+_UNUSABLE = DQ.DO_NOT_USE | DQ.NON_SCIENCE | DQ.REFERENCE_PIXEL | DQ.DEAD
+
+
+def fit_slopes(reducer, ramp, maps, progress_bar=False):
+    """
+    Fit the ramps of an exposure with a known detector.
+
+    Parameters
+    ----------
+    reducer : `~miricigale.reduction.Reducer`
+        Settings.
+    ramp : `~miricigale.detector.Ramp` or `~miricigale.detector.Charge`
+        Counts in DN; or what was collected, whose slopes are drawn.
+    maps : `~miricigale.reduction.DetectorMaps`
+        What the detector is taken for.
+    progress_bar : bool, optional
+        Whether a progress bar is shown.
+
+    Returns
+    -------
+    fit : `~miricigale.reduction.RampFit`
+
+    Raises
+    ------
+    ValueError
+        If fewer than two groups are left.
+    """
+    exposure, detector = ramp.exposure, reducer.detector
+    dq = ramp.pixel_dq.astype(np.int64) | maps.pixel_dq
+    reference = (dq & DQ.REFERENCE_PIXEL) != 0
+    usable = (dq & _UNUSABLE) == 0
+    n_group = exposure.n_groups
+    skip_first, skip_last = _skipped(reducer, ramp)
+    if skip_first + skip_last > n_group - 2:
+        msg = f"at most {n_group - 2} groups together for {n_group} groups"
+        raise argument_error("skip_first, skip_last", msg, f"{skip_first}, {skip_last}")
+    factor = float(np.sum(detector.ipc_kernel**2)) if shares_charge(reducer, ramp) else 1.0
+    drift = _anomaly(reducer, ramp, maps)
+    options = {
+        "group_time": ramp.group_time,
+        "gain": maps.gain,
+        "read_noise": maps.read_noise,
+        "linearity": maps.linearity,
+        "saturation": maps.saturation,
+        "usable": usable,
+        "first_group": skip_first,
+        "last_group": n_group - skip_last,
+        "jump_threshold": reducer.jump_threshold,
+        "neighbor_threshold": reducer.neighbor_threshold,
+        "poisson_factor": factor,
+    }
+    if isinstance(ramp, Charge):
+        fit = draw_groups(ramp, bias=maps.bias + drift, **options)
+    else:
+        if "jump" in ramp.steps:
+            # the pipeline found them, and flags of groups tell them
+            options |= {"jump_threshold": None, "neighbor_threshold": None}
+        options |= {
+            "bias": maps.bias,
+            "drift": _drift(reducer, ramp, reference, drift),
+            "reset": maps.reset,
+            "dark": maps.dark,
+            "group_dq": None if ramp.simulated else ramp.group_dq,
+            "n_threads": reducer.n_threads,
+            "progress_bar": progress_bar,
+        }
+        fit = fit_groups(ramp.data, **options)
+    fit.flags[...] |= dq
+    fit.flags[~usable] |= int(DQ.DO_NOT_USE)
+    return fit
+
+
+def shares_charge(reducer, ramp):
+    """
+    Whether the charge of a ramp was coupled between neighbors.
+
+    Parameters
+    ----------
+    reducer : `~miricigale.reduction.Reducer`
+        Its ``ipc`` decides, or without it what the ramp says.
+    ramp : `~miricigale.detector.Ramp` or `~miricigale.detector.Charge`
+        What was exposed.
+
+    Returns
+    -------
+    shares : bool
+    """
+    if reducer.ipc is not None:
+        return bool(reducer.ipc)
+    told = ramp.shows(InterpixelCapacitance)
+    return is_own(reducer, ramp) if told is None else told
+
+
+def _skipped(reducer, ramp):
+    """Groups left out at the start and the end of the integrations of a ramp."""
+    n_group = ramp.exposure.n_groups
+    first, last = reducer.skip_first, reducer.skip_last
+    if first is None:
+        told = {"firstframe", "rscd"} & _steps(ramp)
+        first = int(ramp.shows(FirstFrame) is not False and n_group > 3 and not told)
+    if last is None:
+        told = "lastframe" in _steps(ramp)
+        last = int(ramp.shows(LastFrame) is not False and n_group > 2 and not told)
+    return first, last
+
+
+def _steps(ramp):
+    return frozenset() if isinstance(ramp, Charge) else ramp.steps
+
+
+def _drift(reducer, ramp, reference, drift):
+    """Add the drift of the reference pixels to an offset of each group."""
+    how = reducer.reference_correction
+    if how is None:
+        how = ramp.simulated or (ramp.exposure.subarray == "FULL" and "channels")
+    if not how or "refpix" in ramp.steps:
+        return drift
+    if how != "channels":
+        return drift + reference_drift(ramp.data, reference)
+    origin = ramp.exposure.aperture.origin
+    found = reference_channels(ramp.data, reference, origin=origin, window=reducer.reference_window)
+    return np.broadcast_to(drift, ramp.shape[:2])[:, :, None, None] + found
+
+
+def _anomaly(reducer, ramp, maps):
+    """Offset of each group after a reset, DN, beside that of the references."""
+    if reducer.reset_anomaly is not None:
+        exposure = ramp.exposure
+        return reducer.reset_anomaly.offsets(exposure.n_integrations, exposure.n_groups)
+    if reducer.skip_first is None and maps.reset is None and ramp.shows(ResetAnomaly):
+        msg = (
+            "the ramp shows a reset anomaly that this Reducer leaves in: give it "
+            "'reset_anomaly', or 'skip_first' groups to be left out"
+        )
+        warnings.warn(msg, MiricigaleWarning, stacklevel=4)
+    return 0.0

@@ -1,0 +1,66 @@
+"""Numbers that stand for no value, and columns as plain numbers."""
+
+import numpy as np
+
+from miricigale.utils.exceptions import argument_error
+
+__all__ = ["plain_floats", "without_codes"]
+
+#: Numbers that stand for no value, of either sign in magnitudes, negative in all other columns.
+_CODES = np.array([99.0, 99.9, 99.99, 99.999, 999.0, 999.9, 999.99, 9999.0, 9999.9, 99999.0])
+
+
+def without_codes(values, errors=None, *, magnitudes=False, further=()):
+    """
+    Where numbers stand for no value.
+
+    Parameters
+    ----------
+    values : `~numpy.ndarray`, shape (n,)
+        Fluxes or magnitudes as in the file.
+    errors : `~numpy.ndarray`, shape (n,), optional
+        Their errors.
+    magnitudes : bool, optional
+        Whether they are magnitudes.
+    further : iterable of float, optional
+        More such numbers.
+
+    Returns
+    -------
+    missing, no_error : `~numpy.ndarray` of bool, shape (n,)
+        Values that are missing: -99, -999 and the like; in magnitudes 99 and the like too, and 0 with an
+        error that is not positive or without errors; in fluxes 99 and the like with the same number for the
+        error, and 0 with an error of 0. Errors that are missing though the value may be there.
+    """
+    code, further = _is_code(values), np.asarray(list(further), float)
+    named = np.isin(values, further)
+    none = np.zeros(np.shape(values), bool)
+    if errors is None:
+        zero = (values == 0) if magnitudes else none
+        return (code & (magnitudes | (values < 0))) | zero | named, none
+    same = errors == values
+    no_error = (_is_code(errors) & ((errors < 0) | magnitudes | same)) | np.isin(errors, further)
+    zero = (values == 0) & (~(errors > 0) if magnitudes else errors == 0)
+    missing = (code & ((values < 0) | magnitudes | same)) | zero | named
+    return missing, no_error
+
+
+def _is_code(values):
+    # single precision has seven digits
+    size = np.abs(values)[..., None]
+    return (np.abs(size - _CODES) <= 1e-6 * _CODES).any(axis=-1)
+
+
+def plain_floats(column, name, argument):
+    """A column as plain floats, NaN where masked or blank."""
+    mask = np.broadcast_to(np.asarray(getattr(column, "mask", False)), np.shape(column))
+    column = getattr(column, "value", column)
+    values = np.ma.getdata(getattr(column, "unmasked", column))
+    if values.dtype.kind in "OUS":
+        # a column without a single number is text to the reader
+        values = np.where(mask, "nan", values.astype(str))
+    try:
+        return np.where(mask, np.nan, values.astype(float))
+    except (TypeError, ValueError):
+        wanted = f"a table with numbers in {name!r}"
+        raise argument_error(argument, wanted, repr(values[0])) from None

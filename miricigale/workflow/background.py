@@ -1,0 +1,116 @@
+"""The background of sky and telescope as options have it: by level, position or day."""
+
+import functools
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.depth import sky_background
+from miricigale.utils.units import SURFACE_BRIGHTNESS
+from miricigale.workflow.options import require
+
+__all__ = ["LEVELS_DOC", "background_text", "band_background", "check_levels"]
+
+#: What the options say of levels.
+LEVELS_DOC = (
+    "Zodiacal light (low, medium, high) or surface brightness ('12.5 MJy/sr'); one for all filters, or "
+    "one for each."
+)
+#: Names of levels, and the percentiles that they are.
+_PERCENTILES = {"low": 10, "medium": 50, "high": 90}
+
+
+def check_levels(section, key, levels, n, date=""):
+    """
+    Refuse levels that are none, of another number than 1 or ``n``, or that a day makes useless.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.ConfigError`
+        Naming ``section`` and ``key``, what was wanted and what came.
+    """
+    wanted = f"must have one level, or one for each band ({n})"
+    require(len(levels) in (1, n), section, key, wanted, len(levels))
+    wanted = f"must be one of {list(_PERCENTILES)} or a surface brightness such as '12.5 MJy/sr'"
+    for level in levels:
+        try:
+            good = level in _PERCENTILES or 0 <= _read(level).value < np.inf
+        except (TypeError, ValueError):
+            good = False
+        require(good, section, key, wanted, repr(level))
+    wanted = "must be left out with a date, which says how bright the zodiacal light is"
+    require(not date or tuple(levels) == ("low",), section, key, wanted, list(levels))
+
+
+def _read(level):
+    """The surface brightness that a text says."""
+    return u.Quantity(level).to(SURFACE_BRIGHTNESS)
+
+
+def _level_of(filter, filters, levels):
+    return levels[0] if len(levels) == 1 else levels[list(filters).index(filter)]
+
+
+def band_background(filter, filters, levels, *, position=None, date=""):
+    """
+    Background of one of several filters.
+
+    Parameters
+    ----------
+    filter : str
+        Which of ``filters``.
+    filters : iterable of str
+        All filters, in the order of the levels.
+    levels : tuple of str
+        Such as `check_levels` passes.
+    position : `~astropy.coordinates.SkyCoord`, optional
+        Where names and ``date`` are of; names are of the whole sky without it.
+    date : str, optional
+        The day, instead of a level.
+
+    Returns
+    -------
+    background : `~astropy.units.Quantity`
+        In MJy/sr.
+    """
+    level = _level_of(filter, filters, levels)
+    if level not in _PERCENTILES:
+        return sky_background(filter, _read(level))
+    if position is None:
+        return sky_background(filter, level)
+    return _at(filter, level, float(position.icrs.ra.deg), float(position.icrs.dec.deg), date)
+
+
+@functools.lru_cache(maxsize=64)
+def _at(filter, level, ra, dec, date):
+    """Background at a position: asked for by every exposure, and some time to evaluate for a day."""
+    from astropy.coordinates import SkyCoord
+
+    return sky_background(filter, level, position=SkyCoord(ra, dec, unit="deg"), date=date or None)
+
+
+def background_text(filters, levels, *, position=None, date=""):
+    """What the background of filters is and where it is from, in words; arguments as of `band_background`."""
+    found = {}
+    for name in filters:
+        text = _source(_level_of(name, filters, levels), position, date)
+        found.setdefault(text, []).append(name.removeprefix("miri.").upper())
+    if len(found) == 1:
+        return next(iter(found))
+    return "; ".join(f"{', '.join(names)}: {text}" for text, names in found.items())
+
+
+def _source(level, position, date):
+    if level not in _PERCENTILES:
+        return f"{_read(level):g}, as given"
+    if level == "low" and position is None:
+        return "telescope and low zodiacal light (Rigby et al. 2023, jwst_backgrounds)"
+    where = "the sky"
+    if position is not None:
+        where = f"RA {position.icrs.ra.deg:.4f}, Dec {position.icrs.dec.deg:.4f}"
+    if date:
+        light = f"zodiacal light of {date} at {where}"
+    else:
+        days = where if position is None else f"the days on which {where} can be seen"
+        light = f"{level} zodiacal light, the {_PERCENTILES[level]}th percentile over {days}"
+    return f"telescope and {light} (Kelsall et al. 1998 by ZodiPy)"

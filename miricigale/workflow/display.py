@@ -1,0 +1,45 @@
+"""What a run says of its progress."""
+
+import logging
+
+from miricigale.utils.progress import on_terminal, print_line, progress
+
+__all__ = ["Display"]
+
+# shown by the command line at any verbosity
+_compilation_log = logging.getLogger("miricigale.utils.compilation")
+
+
+class Display:
+    """A bar on a terminal, otherwise a line for each stage, or nothing."""
+
+    def __init__(self, show, total):
+        self.is_bar = show and on_terminal()
+        self._lines = show and not self.is_bar
+        self._bar = progress(total=total, show=self.is_bar, desc="study", unit="step")
+        self._spent = {}
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        self._bar.close()
+
+    def compilation(self, text):
+        """Say what is compiled, also where no progress is shown."""
+        if self._lines or self.is_bar:
+            print_line(text)
+        else:
+            _compilation_log.info(text)
+
+    def begin(self, titles):
+        self._bar.set_description(", ".join(titles))
+
+    def finish(self, stage, config, seconds):
+        """A unit of a stage is done."""
+        self._bar.update()
+        spent = self._spent.setdefault(stage.name, [])
+        spent.append(seconds)
+        if self._lines and len(spent) == len(stage.unit_names(config)) and any(spent):
+            units = f" ({len(spent)})" if len(spent) > 1 else ""
+            print_line(f"{stage.title}{units}: {sum(spent):.1f} s")

@@ -1,0 +1,375 @@
+"""Light of galaxies that is no Sersic profile: clumps, and stamps of an image of real galaxies."""
+
+import dataclasses
+import functools
+import logging
+
+import astropy.units as u
+import numpy as np
+from astropy.nddata import CCDData
+from astropy.table import QTable, Table, vstack
+from scipy.ndimage import find_objects
+
+from miricigale import photometry
+from miricigale.photometry.arrays import pixel_scale
+from miricigale.photometry.grids import grid_angle
+from miricigale.profiles import sersic_radius
+from miricigale.psf import psf_image, rotate_psf
+from miricigale.scene import CatalogFlags, Cutout, check_catalog, deconvolve
+from miricigale.utils.exceptions import DataError
+from miricigale.utils.random import stream
+from miricigale.utils.store import open_parts, write_parts
+from miricigale.utils.units import ANGLE
+from miricigale.workflow.kernel_files import image_psf
+
+__all__ = ["RealGalaxies", "add_clumps", "read_stamps", "stamps_of_sources", "write_stamps"]
+
+log = logging.getLogger(__name__)
+
+#: Clumps in a galaxy, least and largest number; slope of the number by light, dN/dL ~ L^-slope, and largest
+#: over least light (Dessauges-Zavadsky & Adamo 2018, MNRAS 479, L118, masses of clumps).
+CLUMPS, SLOPE, LIGHT_RANGE = (3, 12), 1.7, 30.0
+#: Share of a profile's light within which they lie, and largest index of galaxies that have some.
+CLUMPS_WITHIN, CLUMPY_INDEX = 0.9, 2.5
+
+#: Stamps: least signal-to-noise; least half-light radius (arcsec) where galaxies are drawn, above the pixel of
+#: MIRI; range of factors on their size.
+MIN_SNR, MIN_RADIUS, SIZE_FACTORS = 50.0, 0.15, (0.5, 2.0)
+#: Width of a PSF's array, and of the rim of a deconvolved image in which no galaxy is used (arcsec).
+_PSF_WIDTH, _RIM = 10.0, 1.0
+#: Detection: in sigma, above the noise that would join galaxies; and the least share of the light of a part that
+#: is taken for another galaxy, so that clumps stay.
+THRESHOLD, CONTRAST = 2.0, 0.1
+#: Galaxies of the most similar axis ratio out of which one is drawn.
+N_LIKE = 5
+_LAYOUT = "miricigale stamps 1"
+
+
+def _sersic(catalog):
+    """Which sources of a checked catalog are painted as Sersic profiles."""
+    spoilt = np.asarray(catalog["flags"]) & int(CatalogFlags.unusable_profile())
+    return (np.asarray(catalog["profile"]) == "sersic") & (spoilt == 0)
+
+
+def add_clumps(catalog, filter, *, share, seed, point=None):
+    """
+    Put a share of the light of disks into clumps: points at places drawn from their profiles.
+
+    These are made up, by the constants of this module: 3 to 12 clumps in each Sersic profile of an
+    index up to 2.5, their light drawn from a power law, their radii evenly in the light that the profile
+    encloses (up to 90 % of it), so that they follow the profile. Each galaxy has its own random stream: its clumps
+    are alike in all bands.
+
+    Parameters
+    ----------
+    catalog : `~astropy.table.QTable`
+        As for `~miricigale.scene.Scene`; it is not changed.
+    filter : str
+        The flux column.
+    share : float
+        Share of the light of a galaxy that is in its clumps.
+    seed : int
+        Seed of the draws.
+    point : str, optional
+        Column with the share of the flux that is in a point at the center: clumps take nothing of it.
+
+    Returns
+    -------
+    catalog : `~astropy.table.QTable`
+        The clumps are further rows, after those of the catalog, with ids of their own.
+
+    References
+    ----------
+    Wuyts et al. 2012, ApJ 753, 114 (up to 20 % of the star formation in clumps off the centers).
+    """
+    if share == 0:
+        return catalog
+    checked = check_catalog(catalog, filters=[filter])
+    clumpy = _sersic(checked) & (checked["sersic_index"] <= CLUMPY_INDEX)
+    rows = np.flatnonzero(clumpy)
+    drawn = [_clumps(checked[row], seed) for row in rows]
+    if not drawn:
+        return catalog
+    inner = np.nan_to_num(np.asarray(catalog[point], float)) if point else np.zeros(len(catalog))
+    flux = catalog[filter]
+    given = np.where(clumpy, share * (1 - inner), 0.0)
+    smooth = catalog.copy()
+    smooth[filter] = flux * (1 - given)
+    if point:
+        # the same light in the point
+        smooth[point] = inner / (1 - given)
+    owner = np.repeat(rows, [len(one[0]) for one in drawn])
+    light, east, north = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+    clumps = catalog[owner]
+    clumps["id"] = _new_ids(np.asarray(catalog["id"]), owner)
+    clumps["profile"] = np.full(len(owner), "point")
+    clumps["sky"] = catalog["sky"][owner].spherical_offsets_by(east * ANGLE, north * ANGLE)
+    clumps[filter] = flux[owner] * given[owner] * light
+    if point:
+        clumps[point] = np.zeros(len(owner))
+    return vstack([smooth, clumps], metadata_conflicts="silent")
+
+
+def _new_ids(ids, owner):
+    """Ids that no source has: numbers above all, or the owner's text with a number."""
+    number = np.arange(len(owner))
+    if ids.dtype.kind in "iu":
+        return ids.max() + 1 + number
+    return np.array([f"{ids[row]} clump {k}" for row, k in zip(owner, number, strict=True)])
+
+
+def _clumps(row, seed):
+    """Shares of the light, which add up to 1, and offsets to the east and north (arcsec)."""
+    rng = stream(seed, "perturb", "clumps", str(row["id"]))
+    n = int(rng.integers(CLUMPS[0], CLUMPS[1] + 1))
+    # the inverse of the enclosed number of a power law from 1 to LIGHT_RANGE
+    power = 1 - SLOPE
+    light = (1 + rng.uniform(size=n) * (LIGHT_RANGE**power - 1)) ** (1 / power)
+    radius = sersic_radius(rng.uniform(0, CLUMPS_WITHIN, n), row["sersic_index"])
+    radius = radius * row["half_light_radius"].to_value(ANGLE)
+    angle = rng.uniform(0, 2 * np.pi, n)
+    major, minor = radius * np.cos(angle), radius * np.sin(angle) * row["axis_ratio"]
+    turn = np.nan_to_num(row["position_angle"].to_value(u.rad))
+    east = major * np.sin(turn) + minor * np.cos(turn)
+    north = major * np.cos(turn) - minor * np.sin(turn)
+    return light / light.sum(), east, north
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RealGalaxies:
+    """
+    Galaxies that are found on an image, with the light that is theirs.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        MJy/sr with WCS, background subtracted, on which they are found.
+    psf : `~miricigale.psf.InstrumentPSF`, optional
+        Its PSF in the frame of the image, which is taken out of the stamps (`~miricigale.scene.deconvolve`).
+        They are left as they are without it.
+    """
+
+    image: CCDData
+    psf: object = None
+
+    @classmethod
+    def read(cls, path, *, psf=None):
+        """
+        Read an image of any origin.
+
+        Parameters
+        ----------
+        path : path-like
+            As for `~miricigale.photometry.read_mosaic`.
+        psf : path-like, optional
+            Image of its PSF, ``file.fits[EXTENSION,PLANE]`` of a cube. By default the model of its filter, if the
+            header names one of which there is a model.
+
+        Returns
+        -------
+        galaxies : `RealGalaxies`
+        """
+        file = photometry.MosaicFile(path)
+        header = file.header
+        model = image_psf(header, psf, argument="cutouts_psf")
+        if model is None:
+            log.warning("%s: no PSF is known, and none is taken out of its galaxies", path)
+        else:
+            model = rotate_psf(model, grid_angle=grid_angle(header.wcs, header.shape))
+        return cls(file.read(), model)
+
+    @functools.cached_property
+    def _found(self):
+        """Light before the PSF, labels, detections and the pixels that may be used."""
+        segments, table = photometry.detect_sources(
+            self.image,
+            preset="default",
+            threshold=THRESHOLD,
+            contrast=CONTRAST,
+            stated_on=0.06 * u.arcsec,
+            dilation="area",
+        )
+        usable = np.isfinite(self.image.data)
+        if self.image.mask is not None:
+            usable &= ~np.asarray(self.image.mask, bool)
+        data, rim = np.where(usable, self.image.data, 0.0), 1
+        if self.psf is not None:
+            scale = pixel_scale(self.image.wcs)
+            half = int(np.ceil(0.5 * _PSF_WIDTH / scale))
+            array = psf_image(self.psf, pixel_scale=scale * ANGLE, shape=2 * half + 1)
+            data, rim = deconvolve(data, array), int(np.ceil(_RIM / scale))
+        # what lies beyond the edges is not known
+        usable[:rim], usable[-rim:], usable[:, :rim], usable[:, -rim:] = False, False, False, False
+        return data, np.asarray(segments.data), table, usable
+
+    @functools.cached_property
+    def _slices(self):
+        return find_objects(self._found[1])
+
+    def cutout(self, label, position=None):
+        """
+        The stamp of a detection: its own segment, all else is 0.
+
+        Parameters
+        ----------
+        label : int
+            Label of its segment.
+        position : `~astropy.coordinates.SkyCoord`, optional
+            What of it stands at the catalog's position; the center of its light by default.
+
+        Returns
+        -------
+        cutout : `~miricigale.scene.Cutout` or None
+            None where its signal-to-noise is below 50, or a pixel of it is masked or near the edge.
+        """
+        data, labels, table, usable = self._found
+        box = self._slices[label - 1]
+        own = labels[box] == label
+        if not (table["snr"][label - 1] >= MIN_SNR and np.all(usable[box][own])):
+            return None
+        light = np.where(own, data[box], 0.0)
+        if not light.sum() > 0:
+            return None
+        wcs = self.image.wcs[box]
+        if position is None:
+            y, x = (float(np.sum(light * at) / light.sum()) for at in np.indices(light.shape))
+            position = wcs.pixel_to_world(x, y)
+        return Cutout.from_image(CCDData(light, unit=self.image.unit, wcs=wcs), position)
+
+    def labels_at(self, sky):
+        """Labels of the segments at positions; 0 where there is none."""
+        labels = self._found[1]
+        x, y = (np.asarray(v) for v in self.image.wcs.world_to_pixel(sky))
+        near = np.isfinite(x) & np.isfinite(y)
+        x, y = (np.rint(np.where(near, v, -1)).astype(int) for v in (x, y))
+        inside = (x >= 0) & (x < labels.shape[1]) & (y >= 0) & (y < labels.shape[0])
+        found = np.zeros(len(sky), int)
+        found[inside] = labels[y[inside], x[inside]]
+        return found
+
+    @functools.cached_property
+    def resolved(self):
+        """
+        All galaxies that are wider than points.
+
+        A table with ``stamp``, ``radius`` (arcsec, with half of the light), ``axis_ratio`` and
+        ``major_axis``, the angle (deg) of the major axis from +y of the stamp, counter-clockwise.
+        """
+        rows = []
+        for label in range(1, len(self._found[2]) + 1):
+            stamp = self.cutout(label)
+            if stamp is not None and stamp.half_light_radius.value >= MIN_RADIUS:
+                rows.append((stamp, stamp.half_light_radius.value, *_shape(stamp)))
+        names = ["stamp", "radius", "axis_ratio", "major_axis"]
+        return Table(rows=rows, names=names) if rows else Table(names=names)
+
+
+def _shape(stamp):
+    """Axis ratio and angle of the major axis, by the second moments within two half-light radii."""
+    y, x = np.indices(stamp.data.shape)
+    x, y = x - stamp.center[0], y - stamp.center[1]
+    inner = np.hypot(x, y) <= 2 * (stamp.half_light_radius / stamp.pixel_scale).value
+    light = np.where(inner, stamp.data, 0.0)
+    xx, yy, xy = (float(np.sum(light * a * b)) for a, b in ((x, x), (y, y), (x, y)))
+    values, axes = np.linalg.eigh([[xx, xy], [xy, yy]])
+    # noise can make the smaller one negative
+    ratio = np.sqrt(max(values[0], 0.01 * values[1]) / values[1])
+    return float(ratio), float(np.degrees(np.arctan2(-axes[0, 1], axes[1, 1])))
+
+
+def stamps_of_sources(catalog, galaxies, *, of, seed):
+    """
+    Stamps of the sources of a catalog that are Sersic profiles.
+
+    Parameters
+    ----------
+    catalog : `~astropy.table.QTable`
+        As for `~miricigale.scene.Scene`.
+    galaxies : `RealGalaxies`
+        Those of the image.
+    of : {"own", "any"}
+        ``"own"``: the galaxy of the image at the place of the source, if no other source is in its segment.
+        ``"any"``: one drawn for each source, by its id, out of the five most like it in axis ratio of those whose
+        half-light radius becomes that of the source by a factor of 0.5 to 2 on its size; its major axis is put on
+        that of the source, and its noise and what is left of the PSF are scaled with it.
+    seed : int
+        Seed of the draws.
+
+    Returns
+    -------
+    stamps : dict of int or str to `~miricigale.scene.Cutout`
+        By id. Sources without one keep their profile.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If no source has one.
+    """
+    checked = check_catalog(catalog)
+    rows = np.flatnonzero(_sersic(checked))
+    if of == "own":
+        labels = galaxies.labels_at(checked["sky"])
+        # of all sources, points too
+        counts = np.bincount(labels)
+        pairs = ((row, labels[row]) for row in rows if labels[row] and counts[labels[row]] == 1)
+        stamps = {row: galaxies.cutout(label, checked["sky"][row]) for row, label in pairs}
+    else:
+        stamps = {row: _drawn(checked[row], galaxies, seed) for row in rows}
+    ids = np.asarray(checked["id"]).tolist()
+    stamps = {ids[row]: one for row, one in stamps.items() if one is not None}
+    if not stamps:
+        how = "lies on a galaxy of" if of == "own" else "is like one of the galaxies of"
+        msg = (
+            f"none of the {len(rows)} Sersic profiles of the catalog {how} the image of [perturb] cutouts "
+            f"(signal-to-noise of {MIN_SNR:g}, away from edges and masked pixels)"
+        )
+        raise DataError(msg)
+    log.info("%d of %d Sersic profiles have the light of real galaxies", len(stamps), len(rows))
+    return stamps
+
+
+def _drawn(row, galaxies, seed):
+    """The stamp of a galaxy drawn for a source, scaled and turned; None if none is like it."""
+    choice = galaxies.resolved
+    radius = row["half_light_radius"].to_value(ANGLE) * np.sqrt(row["axis_ratio"])
+    factors = radius / np.asarray(choice["radius"], float)
+    like = np.flatnonzero((factors >= SIZE_FACTORS[0]) & (factors <= SIZE_FACTORS[1]))
+    if like.size == 0:
+        return None
+    rng = stream(seed, "perturb", "cutouts", str(row["id"]))
+    other = np.abs(np.asarray(choice["axis_ratio"][like], float) - row["axis_ratio"])
+    chosen = rng.choice(like[np.argsort(other, kind="stable")[:N_LIKE]])
+    stamp, turn = choice["stamp"][chosen], float(rng.choice([0.0, 180.0]))
+    angle = np.nan_to_num(row["position_angle"].to_value(u.deg)) - choice["major_axis"][chosen]
+    scale = stamp.pixel_scale * factors[chosen]
+    return dataclasses.replace(stamp, pixel_scale=scale, angle=(angle + turn) * u.deg)
+
+
+def write_stamps(stamps, path):
+    """Write stamps by id to a FITS file, in single precision."""
+    table = QTable({"id": list(stamps)})
+    table["ny"], table["nx"] = np.transpose([stamp.data.shape for stamp in stamps.values()])
+    table["x"], table["y"] = np.transpose([stamp.center for stamp in stamps.values()])
+    for name in ("pixel_scale", "angle"):
+        table[name] = u.Quantity([getattr(stamp, name) for stamp in stamps.values()])
+    light = np.concatenate([stamp.data.ravel() for stamp in stamps.values()])
+    parts = {"arrays": {"light": light.astype(np.float32)}, "tables": {"stamps": table}}
+    write_parts(path, _LAYOUT, **parts, overwrite=True)
+
+
+def read_stamps(path):
+    """Stamps by id of a file of `write_stamps`."""
+    with open_parts(path, (_LAYOUT,), wanted="stamps of galaxies") as parts:
+        table, light = parts.table("stamps", QTable), parts.array("light")
+        ends = np.cumsum(table["ny"] * table["nx"])
+        return {
+            key: Cutout(
+                one.reshape(row["ny"], row["nx"]),
+                pixel_scale=row["pixel_scale"],
+                angle=row["angle"],
+                center=(float(row["x"]), float(row["y"])),
+            )
+            for key, row, one in zip(
+                table["id"].tolist(), table, np.split(light, ends[:-1]), strict=True
+            )
+        }

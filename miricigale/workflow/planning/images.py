@@ -1,0 +1,347 @@
+"""Images of the planned exposures: the plan as a run of the study, and what that measures beside the noise."""
+
+import dataclasses
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+
+from miricigale.evaluation import OUTLIER, bootstrap
+from miricigale.evaluation.estimates import median, scatter
+from miricigale.photometry import ErrorModel
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.random import stream
+from miricigale.utils.store import replacing
+from miricigale.utils.tables import error_column
+from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.planning.sample import agn_mix
+from miricigale.workflow.sections import FitSection, PointSourceSection, RunSection
+from miricigale.workflow.stages.inputs import study_catalog
+from miricigale.workflow.stages.sample import SampleFlags
+from miricigale.workflow.study import run_study
+from miricigale.workflow.truths import CATALOG, FIELD, truth_names
+
+__all__ = [
+    "ImagedSample",
+    "image_sample",
+    "images_catalog",
+    "images_study",
+    "paired_bands",
+    "paired_numbers",
+]
+
+#: Sources that images say nothing of.
+_UNUSABLE = (
+    SampleFlags.OUTSIDE_FIELD | SampleFlags.STAR | SampleFlags.NO_MODEL | SampleFlags.NOT_MATCHED
+)
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class ImagedSample:
+    """
+    What the images of a plan say of its sample.
+
+    Parameters
+    ----------
+    measured : `~astropy.table.QTable`
+        A row for each source of the sample: ``id``, measured fluxes and errors in the MIRI bands, NaN where
+        the source is not usable.
+    in_field : `~numpy.ndarray` of bool, shape (n,)
+        Which sources all bands image.
+    usable : `~numpy.ndarray` of bool, shape (n,)
+        Which of them are also found on the prior image and matched.
+    errors : `~miricigale.photometry.ErrorModel`
+        The error functions that the images gave.
+    """
+
+    measured: QTable
+    in_field: np.ndarray
+    usable: np.ndarray
+    errors: ErrorModel
+
+
+def images_catalog(planner):
+    """
+    The catalog of the run: the plan's, each source with its fracAGN.
+
+    Sources that the sample does not have, which are neighbors in the images, get one of the same mix.
+    """
+    config = planner.config
+    catalog = study_catalog(config.catalog)
+    if config.agn.field or "frac_agn" in catalog.colnames:
+        return catalog
+    rng = stream(config.plan.seed, "plan", "neighbors")
+    fractions = agn_mix(config.agn, len(catalog), rng)
+    place = {key: row for row, key in enumerate(np.asarray(catalog["id"]).tolist())}
+    rows = [place[key] for key in np.asarray(planner.sources["id"]).tolist()]
+    fractions[rows] = np.asarray(planner.sources["frac_agn"], float)
+    catalog["frac_agn"] = fractions
+    return catalog
+
+
+def _levels(config, plans):
+    """Levels of the background of a run, those of the plan."""
+    if config.background.level == ("low",) and config.background.ra < 0:
+        return config.background.level
+    return tuple(f"{plan.background.to_value(u.MJy / u.sr)} MJy/sr" for plan in plans.values())
+
+
+def images_study(planner, source):
+    """
+    The configuration of the run that images a plan.
+
+    Parameters
+    ----------
+    planner : `~miricigale.workflow.planning.Planner`
+        The plan.
+    source : path-like
+        File of `images_catalog`.
+
+    Returns
+    -------
+    config : `~miricigale.workflow.StudyConfig`
+        Its first truth has no AGN and gives prior and error functions, as in a study; the last is that of
+        the sample.
+    """
+    config, plans = planner.config, planner.band_plans()
+    catalog = dataclasses.replace(
+        config.catalog, source=str(source), columns=(), units=(), survey="", missing=(), factor=""
+    )
+    sky = study_catalog(config.catalog)["sky"]
+    center = SkyCoord(sky.cartesian.mean(), representation_type="cartesian")
+    center.representation_type = "spherical"
+    options, ra, dec = config.images, center.ra.deg, center.dec.deg
+    if options.ra >= 0:
+        ra, dec = options.ra, options.dec
+    base, fit = StudyConfig(), config.fit
+    own = "frac_agn" in study_catalog(config.catalog).colnames
+    if config.agn.field and not own:
+        fractions = (0.0, FIELD)
+    elif own or np.any(np.asarray(planner.sources["frac_agn"], float) > 0):
+        fractions = (0.0, CATALOG)
+    else:
+        fractions = (0.0,)
+    return StudyConfig(
+        run=RunSection(
+            name=f"{config.plan.name} images", seed=config.plan.seed, threads=config.plan.threads
+        ),
+        catalog=catalog,
+        pointing=dataclasses.replace(
+            base.pointing, ra=float(ra), dec=float(dec), roll=options.roll
+        ),
+        sed=dataclasses.replace(config.sed, frac_agn=fractions),
+        scene=dataclasses.replace(base.scene, background=_levels(config, plans)),
+        exposures=dataclasses.replace(
+            base.exposures,
+            filters=tuple(plans),
+            kind=options.kind,
+            n_groups=tuple(plan.exposure.n_groups for plan in plans.values()),
+            n_integrations=tuple(plan.exposure.n_integrations for plan in plans.values()),
+            n_dithers=tuple(plan.n_dithers for plan in plans.values()),
+        ),
+        detector=dataclasses.replace(base.detector, residual=config.noise.residual),
+        fit=FitSection(
+            bands=fit.bands,
+            depths=fit.depths,
+            axes=fit.axes,
+            model_error=fit.model_error,
+            min_detected=min(fit.min_detected, len(plans)),
+        ),
+        point_sources=PointSourceSection(enabled=False),
+    )
+
+
+def image_sample(planner, folder, *, executor=None, progress_bar=False):
+    """
+    Image the exposures of a plan, and measure its sample.
+
+    Parameters
+    ----------
+    planner : `~miricigale.workflow.planning.Planner`
+        The plan, with a sample of its catalog.
+    folder : path-like
+        Folder of the run, which `~miricigale.workflow.run_study` goes on with; what belongs to another plan
+        is done again. The catalog is beside it, ``<folder>.ecsv``.
+    executor : `concurrent.futures.Executor`, optional
+        As for `~miricigale.workflow.run_study`.
+    progress_bar : bool, optional
+        Whether to show one.
+
+    Returns
+    -------
+    imaged : `ImagedSample`
+
+    Raises
+    ------
+    ValueError
+        If the plan has sources of the caller, which have no positions.
+    """
+    if planner.given is not None:
+        raise argument_error("planner", "one with the sample of its catalog", "given sources")
+    folder = Path(folder).resolve()
+    source = folder.with_name(f"{folder.name}.ecsv")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(source, overwrite=True) as partial:
+        images_catalog(planner).write(partial, format="ascii.ecsv")
+    study = images_study(planner, source)
+    run_study(
+        study, folder, executor=executor, redo=True, until="matches", progress_bar=progress_bar
+    )
+    truth = truth_names(study)[-1]
+    matched = QTable.read(folder / truth / "matched.ecsv")
+    place = {key: row for row, key in enumerate(np.asarray(matched["id"]).tolist())}
+    rows = np.array([place[key] for key in np.asarray(planner.sources["id"]).tolist()], int)
+    selection = np.asarray(matched["selection"])[rows]
+    usable = (selection & int(_UNUSABLE)) == 0
+    measured = QTable({"id": planner.sources["id"]})
+    for name in study.exposures.filters:
+        for column in (name, error_column(name)):
+            values = matched[column].to_value(u.uJy)[rows]
+            measured[column] = np.where(usable, values, np.nan) * u.uJy
+    in_field = (selection & int(SampleFlags.OUTSIDE_FIELD)) == 0
+    return ImagedSample(measured, in_field, usable, ErrorModel.read(folder / "errors.ecsv"))
+
+
+def paired_bands(planner, imaged):
+    """
+    Noise of the plan and of its images, band by band, of the same sources.
+
+    Parameters
+    ----------
+    planner : `~miricigale.workflow.planning.Planner`
+        The plan.
+    imaged : `ImagedSample`
+        Of `image_sample`.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        ``filter``; ``limit`` and ``limit_images``, 5-sigma limits of points by the plan and by the error
+        functions of the images; ``scatter`` and its ``_err``, sigma_MAD of (measured - true) over the error that
+        the plan gives each source, 1 if both agree; ``offset``, the median relative difference of the
+        sources above 10 sigma; ``n`` sources in the field, ``n_detected`` of them in the plan's mock fluxes and
+        ``n_detected_images`` in the images.
+    """
+    plans, seed = planner.band_plans(), planner.config.plan.seed
+    mock = planner.photometry(plans.values())
+    rows = []
+    for name, plan in plans.items():
+        true = planner.sources[name].to_value(u.uJy)
+        flux, error = (imaged.measured[c].value for c in (name, error_column(name)))
+        own_flux, own_error = (mock[c].to_value(u.uJy) for c in (name, error_column(name)))
+        pulls = bootstrap(scatter, ((flux - true) / own_error)[imaged.usable], seed=seed)
+        bright = imaged.usable & (true > 10 * own_error)
+        offset = bootstrap(median, (flux / true - 1)[bright], seed=seed)
+        with np.errstate(invalid="ignore"):
+            detected = [own_flux > 5 * own_error, flux > 5 * error]
+        counts = [int(np.count_nonzero(found & imaged.in_field)) for found in detected]
+        rows.append(
+            {
+                "filter": name,
+                "limit": plan.errors().limiting_magnitude(name),
+                "limit_images": imaged.errors.limiting_magnitude(name),
+                "scatter": pulls.value,
+                "scatter_err": pulls.error,
+                "offset": offset.value,
+                "offset_err": offset.error,
+                "n": int(np.count_nonzero(imaged.in_field)),
+                "n_detected": counts[0],
+                "n_detected_images": counts[1],
+            }
+        )
+    return QTable(rows)
+
+
+def paired_numbers(planner, plans, imaged_plans, imaged):
+    """
+    Accuracies with the noise of the plan and with its images, of the same sources.
+
+    Parameters
+    ----------
+    planner : `~miricigale.workflow.planning.Planner`
+        The plan.
+    plans, imaged_plans : list of `~miricigale.workflow.planning.Plan`
+        Of `Planner.compare`, without and with what the images measured.
+    imaged : `ImagedSample`
+        Of `image_sample`.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        For each set with MIRI and each number of `~miricigale.workflow.planning.planner.accuracy`: ``plan``,
+        ``number``, ``n`` sources (in the field, found on the prior, and detected in one of the plans by either),
+        ``noise`` and ``images`` with their errors, ``difference`` (images less noise) with the error that
+        sources drawn together give it, and ``sigma``, their ratio.
+    """
+    chosen = imaged.usable & (planner.common(plans) | planner.common(imaged_plans))
+    seed, limit = planner.config.plan.seed, planner.config.agn.limit
+    rows = []
+    for plan, other in zip(plans, imaged_plans, strict=True):
+        if not plan.bands:
+            continue
+        both = [planner.accuracy(one, chosen) for one in (plan, other)]
+        columns = [_columns(one.sources[chosen], limit) for one in (plan, other)]
+        for name, (statistic, *wanted) in _PAIRED.items():
+            values = [columns[k][key] for k in (0, 1) for key in wanted]
+            change = bootstrap(_difference(statistic, len(wanted)), *values, seed=seed)
+            rows.append(
+                {
+                    "plan": plan.name,
+                    "number": name,
+                    "n": int(np.count_nonzero(chosen)),
+                    "noise": both[0][name].value,
+                    "noise_err": both[0][name].error,
+                    "images": both[1][name].value,
+                    "images_err": both[1][name].error,
+                    "difference": change.value,
+                    "difference_err": change.error,
+                    "sigma": change.value / change.error if change.error > 0 else np.nan,
+                }
+            )
+    return QTable(rows)
+
+
+def _columns(sources, limit):
+    """What the numbers of a plan are made of, by source."""
+    z, f = (np.asarray(sources[name], float) for name in ("redshift", "frac_agn"))
+    dz = (np.asarray(sources["redshift_mean"], float) - z) / (1 + z)
+    return {
+        "dz": dz,
+        "outlier": np.where(np.isfinite(dz), np.abs(dz) > OUTLIER, np.nan),
+        "z_std": np.asarray(sources["redshift_std"], float) / (1 + z),
+        "df": np.asarray(sources["frac_agn_mean"], float) - f,
+        "f_std": np.asarray(sources["frac_agn_std"], float),
+        "agn": np.asarray(f >= limit, float),
+        "selected": np.asarray(sources["selected"], float),
+    }
+
+
+def _difference(statistic, n):
+    """The statistic of the last n columns less that of the first n."""
+    return lambda *values: statistic(*values[n:]) - statistic(*values[:n])
+
+
+def _mean(values):
+    return np.mean(values, axis=-1)
+
+
+def _completeness(agn, selected):
+    return np.sum(agn * selected, axis=-1) / np.sum(agn, axis=-1)
+
+
+def _purity(agn, selected):
+    return np.sum(agn * selected, axis=-1) / np.sum(selected, axis=-1)
+
+
+_PAIRED = {
+    "z_scatter": (scatter, "dz"),
+    "z_outliers": (_mean, "outlier"),
+    "z_width": (median, "z_std"),
+    "frac_bias": (median, "df"),
+    "frac_scatter": (scatter, "df"),
+    "frac_width": (median, "f_std"),
+    "completeness": (_completeness, "agn", "selected"),
+    "purity": (_purity, "agn", "selected"),
+}

@@ -1,0 +1,266 @@
+"""Files of exposures at any stage to mosaics of each filter, with a page of pictures."""
+
+import dataclasses
+import json
+import logging
+import os
+from pathlib import Path
+
+import numpy as np
+from astropy.table import Table
+
+from miricigale.detector import Ramp
+from miricigale.evaluation import Report
+from miricigale.instrument import ImageFacts
+from miricigale.plotting.axes import WIDTH, new_figure
+from miricigale.plotting.images import plot_image
+from miricigale.reduction import (
+    Reducer,
+    ReferenceFiles,
+    open_exposure,
+    read_images,
+    write_image,
+)
+from miricigale.utils.content import content_sha256, file_sha256
+from miricigale.utils.exceptions import DataError, argument_error
+from miricigale.utils.progress import progress
+from miricigale.utils.units import ANGLE, SURFACE_BRIGHTNESS, to_array
+
+__all__ = ["reduce_files"]
+
+log = logging.getLogger(__name__)
+
+#: Changes with what the products hold.
+_VERSION = 1
+
+#: What a bad file may raise; the others go on.
+_ERRORS = (ArithmeticError, ImportError, KeyError, MemoryError, OSError, ValueError)
+
+
+def reduce_files(
+    paths,
+    folder,
+    *,
+    reducer=None,
+    pixel_scale=0.11 * ANGLE,
+    resume=True,
+    progress_bar=False,
+):
+    """
+    Reduce files of exposures to a mosaic of each filter.
+
+    Parameters
+    ----------
+    paths : iterable of path-like
+        Files of the MIRI imager at any stage: ``_uncal``, ``_ramp``, ``_rate``, ``_rateints``, ``_cal``,
+        ``_i2d``.
+    folder : path-like
+        Gets ``<name>_rate.fits`` and ``<name>_cal.fits`` of each exposure (background subtracted, it is
+        in the extension BKG), ``mosaic_<filter>.fits`` (SCI, ERR, DQ, WHT, CON, BKG), ``files.ecsv`` and
+        ``index.html``.
+    reducer : `~miricigale.reduction.Reducer`, optional
+        Settings, references among them.
+    pixel_scale : `~astropy.units.Quantity`, optional
+        Of the mosaics.
+    resume : bool, optional
+        Whether products of the same files and settings that are there are kept.
+    progress_bar : bool, optional
+        Whether a progress bar is shown.
+
+    Returns
+    -------
+    files : `~astropy.table.Table`
+        A row for each file: ``file``, ``filter``, ``status`` (reduced, rate, kept or failed) and
+        ``reason``, why a file failed or has no brightness. A file that fails never loses the
+        others, and a filter whose mosaic fails is a row too.
+
+    Raises
+    ------
+    ValueError
+        If there are no paths, or two files have one name.
+    """
+    paths = [Path(path) for path in paths]
+    reducer = Reducer() if reducer is None else reducer
+    to_array(pixel_scale, ANGLE, "pixel_scale", ndim=0, finite=True)
+    if not paths:
+        raise argument_error("paths", "at least one file", "none")
+    stems = [_stem(path) for path in paths]
+    twice = sorted({stem for stem in stems if stems.count(stem) > 1})
+    if twice:
+        raise argument_error("paths", "files of different names", f"two of {', '.join(twice)}")
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    settings = _settings(reducer)
+    rows, done = [], {}
+    for path, stem in zip(progress(paths, show=progress_bar, desc="reduce"), stems, strict=True):
+        row = {"file": str(path), "filter": "", "status": "failed", "reason": ""}
+        rows.append(row)
+        try:
+            key = content_sha256([_VERSION, file_sha256(path), settings])
+            cal, status, reason = _exposure(reducer, path, folder / stem, key, resume)
+            row |= {"status": status, "reason": reason}
+            if cal is not None:
+                row["filter"] = ImageFacts.of(read_images(cal)[0].image).filter or ""
+                done.setdefault(row["filter"], []).append((cal, key))
+        except _ERRORS as err:
+            row["reason"] = _reason(err)
+            log.warning("%s is left out: %s", path, row["reason"])
+    page = Report("Reduction", subtitle=f"{len(paths)} files")
+    for name, members in sorted(done.items()):
+        row = {"file": f"mosaic_{name.rpartition('.')[2]}.fits", "filter": name}
+        rows.append(row | {"status": "failed", "reason": ""})
+        try:
+            scale = pixel_scale.to_value(ANGLE)
+            status, notes = _mosaic(reducer, members, folder / row["file"], scale, settings, resume)
+            rows[-1] |= {"status": status, "reason": "; ".join(notes)}
+            _show(page, folder / row["file"], members, notes)
+        except _ERRORS as err:
+            rows[-1]["reason"] = _reason(err)
+            log.warning("no mosaic of %s: %s", name, rows[-1]["reason"])
+    table = Table(rows=[list(row.values()) for row in rows], names=list(rows[0]))
+    table.write(folder / "files.ecsv", overwrite=True)
+    _list(page, table)
+    page.write(folder / "index.html")
+    return table
+
+
+def _stem(path):
+    """Name of a file without what tells its stage."""
+    stem = path.name.removesuffix(".gz").removesuffix(".fits")
+    head, _, stage = stem.rpartition("_")
+    known = ("uncal", "ramp", "rate", "rateints", "cal", "calints", "i2d", "crf")
+    return head if head and stage in known else stem
+
+
+def _reason(err):
+    text = str(err.args[0]) if isinstance(err, KeyError) and err.args else str(err)
+    return " ".join(text.split()) or type(err).__name__
+
+
+def _settings(reducer):
+    """What the products depend on: settings, and which state the reference files have."""
+    values = {
+        field.name: repr(getattr(reducer, field.name))
+        for field in dataclasses.fields(reducer)
+        if field.name != "n_threads"
+    }
+    if isinstance(reducer.references, ReferenceFiles):
+        for name in reducer.references.names():
+            if isinstance(path := getattr(reducer.references, name), Path):
+                state = os.stat(path)
+                values[f"reference {name}"] = [state.st_size, state.st_mtime_ns]
+    return values
+
+
+def _kept(path, key, resume):
+    """Whether a product of this key is there."""
+    if not (resume and path.is_file()):
+        return False
+    try:
+        return read_images(path)[0].image.meta.get("key") == key
+    except DataError:
+        return False
+
+
+def _exposure(reducer, path, stem, key, resume):
+    """Reduce one file: its calibrated product (None without), what was done, and why not more."""
+    cal, rate = (stem.with_name(f"{stem.name}_{kind}.fits") for kind in ("cal", "rate"))
+    if cal.resolve() == path.resolve() or rate.resolve() == path.resolve():
+        raise argument_error("folder", "another one than that of the files", stem.parent)
+    if _kept(cal, key, resume):
+        return cal, "kept", ""
+    slopes_only = "no photometry without references"
+    if reducer.references == "none" and _kept(rate, key, resume):
+        return None, "kept", slopes_only
+    exposure = open_exposure(path)
+    if reducer.references == "none" and not exposure.unit.is_equivalent(SURFACE_BRIGHTNESS):
+        slopes = reducer.fit_ramp(exposure) if isinstance(exposure, Ramp) else exposure
+        _write(slopes, rate, key)
+        return None, "rate", slopes_only
+    slopes, image, background = reducer.reduce(exposure)
+    if slopes is not None:
+        _write(slopes, rate, key)
+    _write(image, cal, key, BKG=background.level)
+    return cal, "reduced", ""
+
+
+def _write(image, path, key, **planes):
+    image.meta["key"] = key
+    write_image(image, path, planes=planes, overwrite=True)
+
+
+def _mosaic(reducer, members, path, scale, settings, resume):
+    """Make the mosaic of a filter: what was done, and what could not be."""
+    key = content_sha256([_VERSION, [key for _, key in members], scale, settings])
+    if _kept(path, key, resume):
+        return "kept", json.loads(read_images(path)[0].header["META"]).get("notes", [])
+    images = [read_images(cal)[0].image for cal, _ in members]
+    result = reducer.combine(images, [], pixel_scale=scale * ANGLE)
+    mosaic = result.mosaic
+    mosaic.meta["notes"] = list(result.notes)
+    level = result.mosaic_background.level
+    _write(mosaic, path, key, WHT=result.weight, CON=result.n_images, BKG=level)
+    return "reduced", list(result.notes)
+
+
+def _show(page, path, members, notes):
+    """Put the mosaic and its exposures on the page."""
+    file = read_images(path)[0]
+    image, meta = file.image, file.image.meta
+    name = meta["filter"].rpartition(".")[2].upper()
+    page.section(name, " ".join(f"{note}." for note in notes))
+    good = ~image.mask
+    sigma = float(np.median(image.uncertainty.array[good])) if good.any() else np.nan
+    page.items(
+        [
+            ("exposures", len(members)),
+            ("exposure time", f"{meta.get('exposure_time', np.nan):.6g} s"),
+            ("error of the median pixel", f"{sigma:.4g} MJy/sr"),
+            ("background of the exposures", _levels(members)),
+        ]
+    )
+    page.text(f"References that all have: {_references(meta)}.")
+    ny, nx = image.shape
+    _, axes = new_figure(1, 2, size=(WIDTH / 2, max(2.5, min(6.0, WIDTH / 2 * ny / nx))))
+    scale = meta["pixel_scale"]
+    data = np.where(image.mask, np.nan, image.data)
+    plot_image(data, ax=axes[0, 0], pixel_scale=scale, colorbar="MJy/sr", title=path.name)
+    count = np.squeeze(file.planes["CON"]).astype(float)
+    plot_image(
+        count,
+        ax=axes[0, 1],
+        pixel_scale=scale,
+        stretch="linear",
+        limits=(0, len(members)),
+        colorbar="exposures",
+        title="exposures of each pixel",
+    )
+    page.figure(axes[0, 0].figure, f"Mosaic {path.name}, background subtracted, and its exposures.")
+
+
+def _levels(members):
+    levels = [read_images(cal)[0].image.meta.get("background") for cal, _ in members]
+    known = [f"{level:.4g}" for level in levels if level is not None]
+    return ", ".join(known) + " MJy/sr" if known else "not known"
+
+
+def _references(meta):
+    """The references that all exposures share."""
+    found = {
+        key.removeprefix("reference_"): text
+        for key, text in meta.items()
+        if key.startswith("reference_")
+    }
+    return "; ".join(f"{name}: {text}" for name, text in found.items()) or "differ, or not known"
+
+
+def _list(page, table):
+    """Put the table of the files on the page."""
+    page.section("Files")
+    failed = int(np.count_nonzero(table["status"] == "failed"))
+    page.table(
+        [tuple(str(row[name]) for name in table.colnames) for row in table],
+        header=table.colnames,
+        text=4,
+        caption=f"{failed} failed." if failed else "",
+    )

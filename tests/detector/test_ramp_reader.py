@@ -1,0 +1,181 @@
+"""Ramps of the pipeline at any stage, and of ground tests."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.time import Time
+
+from helpers.real import real_file
+from miricigale.detector import Detector, Ramp, ramp_reader
+from miricigale.instrument import DQ, STEPS, steps_done
+from miricigale.utils.exceptions import DataError
+
+GROUND = "real/ramps/MIRI_5582_89_S_20180308-010230_SCE1_pipe.fits.gz"
+
+
+def stage(path, *, steps=("S_DQINIT", "S_SATURA", "S_LINEAR"), shape=(2, 4, 64, 72), primary=None):
+    """A file as a step of the pipeline would save it: floats, with flags."""
+    rng = np.random.default_rng(1)
+    data = rng.normal(12000, 5, shape).astype(np.float32)
+    pixel_dq = np.zeros(shape[2:], np.uint32)
+    pixel_dq[5, 6] = DQ.HOT | DQ.DO_NOT_USE
+    pixel_dq[7, 8] = DQ.OTHER_BAD_PIXEL
+    group_dq = np.zeros(shape, np.uint8)
+    group_dq[:, -1] = DQ.DO_NOT_USE
+    hdus = fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(data, name="SCI")])
+    hdus += [fits.ImageHDU(pixel_dq, name="PIXELDQ"), fits.ImageHDU(group_dq, name="GROUPDQ")]
+    hdus[0].header.update(
+        {
+            "INSTRUME": "MIRI",
+            "DETECTOR": "MIRIMAGE",
+            "EXP_TYPE": "MIR_IMAGE",
+            "FILTER": "F560W",
+            "READPATT": "FASTR1",
+            "SUBARRAY": "SUB64",
+            "NINTS": 10,
+            "INTSTART": 5,
+            "INTEND": 6,
+            "NGROUPS": shape[1],
+            "TGROUP": 0.0851,
+            "DATE-OBS": "2022-07-01",
+            **dict.fromkeys(steps, "COMPLETE"),
+            "S_DARK": "SKIPPED",
+            **(primary or {}),
+        }
+    )
+    hdus[1].header.update({"RA_REF": 214.9, "DEC_REF": 52.9, "ROLL_REF": 120.0})
+    hdus.writeto(path)
+    return data, pixel_dq, group_dq
+
+
+def test_reads_what_a_step_of_the_pipeline_saved(tmp_path):
+    path = tmp_path / "jw_linearity.fits"
+    data, pixel_dq, group_dq = stage(path)
+    ramp = Ramp.read(path)
+    np.testing.assert_array_equal(ramp.data, data)
+    np.testing.assert_array_equal(ramp.group_dq, group_dq)
+    np.testing.assert_array_equal(ramp.pixel_dq[:, 4:], pixel_dq[:, 4:])
+    assert np.all(ramp.pixel_dq[:, :4] & DQ.REFERENCE_PIXEL)
+    assert ramp.steps == {"dq_init", "saturation", "linearity"}
+    assert not ramp.simulated
+    # the frame's own time, not the rounded one of the table
+    assert ramp.group_time == 0.0851
+    assert ramp.header["DATE-OBS"] == "2022-07-01"
+    second = ramp.integration(1)
+    np.testing.assert_array_equal(second.data[0], data[1])
+    assert second.exposure.n_integrations == 1
+    assert second.steps == ramp.steps
+    with pytest.raises(ValueError, match="'number' must be from 0 to 1, got 2"):
+        ramp.integration(2)
+
+
+def test_ramps_larger_than_the_memory_are_refused_before_they_are_read(tmp_path, monkeypatch):
+    path = tmp_path / "jw_ramp.fits"
+    stage(path)
+
+    def never(*args):
+        raise AssertionError("read")
+
+    monkeypatch.setattr(ramp_reader, "_counts", never)
+    monkeypatch.setattr("miricigale.utils.parallel.available_memory", lambda: 150_000)
+    with pytest.raises(MemoryError, match=r"the ramp of .*jw_ramp\.fits, shape \(2, 4, 64, 72\)"):
+        Ramp.read(path)
+
+
+def test_exposures_larger_than_the_memory_are_refused_before_they_begin(
+    make_exposure, make_sky, monkeypatch
+):
+    monkeypatch.setattr("miricigale.utils.parallel.available_memory", lambda: 2_000_000)
+    exposure = make_exposure(n_groups=200)
+    with pytest.raises(MemoryError, match=r"expose fewer groups, or write it by 'expose_to'"):
+        Detector.miri_imager().expose(make_sky(exposure, 1.0), exposure, seed=1)
+
+
+def test_steps_are_those_that_are_complete():
+    header = fits.Header({"S_LINEAR": "COMPLETE", "S_DARK": "SKIPPED", "S_JUMP": " complete "})
+    assert steps_done(header) == {"linearity", "jump"}
+    assert steps_done(header) <= set(STEPS.values())
+
+
+def test_a_ramp_of_a_ground_test():
+    # 5 integrations of 50 groups, without filter, pointing, instrument and kind of exposure
+    path = real_file(GROUND)
+    ramp = Ramp.read(path)
+    with fits.open(path) as hdus:
+        np.testing.assert_array_equal(ramp.data, hdus["SCI"].data)
+        np.testing.assert_array_equal(ramp.reference_output, hdus["REFOUT"].data)
+    exposure = ramp.exposure
+    assert (exposure.filter, exposure.pointing, exposure.wcs) == (None, None, None)
+    assert (exposure.readout, exposure.subarray) == ("FASTR1", "SUB64")
+    assert ramp.group_time == 0.085
+    assert not ramp.simulated
+    with pytest.raises(ValueError, match="'exposure' must be one with a filter, got None"):
+        exposure.pointing_keywords()
+
+
+def test_an_exposure_of_nothing_is_not_simulated(make_exposure, make_sky):
+    exposure = make_exposure(n_groups=2)
+    sky = make_sky(exposure, 1.0)
+    for name, options in {
+        "filter": {"filter": None},
+        "pointing": {"pointing": None, "roll": None},
+    }.items():
+        with pytest.raises(ValueError, match=f"'exposure' must be one with a {name}"):
+            Detector.miri_imager().expose(sky, exposure.replace(**options), seed=1)
+    with pytest.raises(ValueError, match="'pointing, roll' must be both given or both None"):
+        exposure.replace(roll=None)
+
+
+def test_keywords_of_a_ramp_that_was_not_read_are_those_of_its_file(
+    make_exposure, make_sky, tmp_path
+):
+    exposure = make_exposure(n_groups=2)
+    ramp = Detector.miri_imager().expose(make_sky(exposure, 1.0), exposure, seed=1)
+    back = Ramp.read(ramp.write(tmp_path / "a_uncal.fits"))
+    for key in ("FILTER", "READPATT", "DATE-OBS", "RA_REF", "SUBSTRT2", "TGROUP"):
+        assert ramp.header[key] == back.header[key]
+    assert back.simulated
+    assert back.group_time == exposure.group_time / u.s
+
+
+def test_flags_of_another_shape_are_refused(tmp_path):
+    path = tmp_path / "jw_ramp.fits"
+    stage(path)
+    with fits.open(path, mode="update") as hdus:
+        hdus["GROUPDQ"].data = hdus["GROUPDQ"].data[:, :3]
+    with pytest.raises(DataError, match=r"flags of shape \(2, 4, 64, 72\) in GROUPDQ"):
+        Ramp.read(path)
+
+
+def test_a_real_ramp_keeps_its_keywords_and_its_fifth_output(tmp_path):
+    ramp = Ramp.read(real_file(GROUND))
+    path = ramp.write(tmp_path / "jpl_uncal.fits")
+    with fits.open(path) as hdus:
+        header = hdus[0].header
+        assert header["ORIGIN"] == "JPL"
+        assert header["FILENAME"] == "jpl_uncal.fits"
+        assert "FILTER" not in header
+        np.testing.assert_array_equal(hdus["REFOUT"].data, ramp.reference_output)
+        assert hdus[-1].name == "ASDF"
+    back = Ramp.read(path)
+    assert not back.simulated
+    np.testing.assert_array_equal(back.data, ramp.data)
+    np.testing.assert_array_equal(back.reference_output, ramp.reference_output)
+
+
+def test_times_of_the_integrations(make_exposure, make_sky, tmp_path):
+    exposure = make_exposure(n_groups=5, n_integrations=3)
+    start = Time("2023-01-02T03:04:05", scale="utc")
+    ramp = Detector.miri_imager().expose(make_sky(exposure, 1.0), exposure, seed=1)
+    path = ramp.write(tmp_path / "a_uncal.fits", start=start)
+    with fits.open(path) as hdus:
+        table, header = hdus["INT_TIMES"].data, hdus[0].header
+        np.testing.assert_array_equal(table["integration_number"], [1, 2, 3])
+        begin, end = table["int_start_MJD_UTC"], table["int_end_MJD_UTC"]
+        # five frames, and one for the reset between integrations
+        frame = exposure.frame_time.to_value("day")
+        np.testing.assert_allclose(end - begin, 5 * frame, rtol=1e-5)
+        np.testing.assert_allclose(np.diff(begin), 6 * frame, rtol=1e-5)
+        assert begin[0] == pytest.approx(start.mjd, abs=1e-9)
+        assert end[-1] == pytest.approx(header["EXPEND"], abs=1e-9)

@@ -1,0 +1,299 @@
+"""Catalogs of other people: magnitudes, ids, missing values, and the names of surveys."""
+
+import warnings
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable, Table
+
+from miricigale.filters import SURVEYS, CatalogMap, read_catalog_photometry
+from miricigale.filters.catalog_files import MappedRows
+from miricigale.utils.exceptions import DataError, MiricigaleWarning
+from miricigale.utils.missing import without_codes
+from miricigale.utils.row_files import open_rows
+
+BAND = "wfc3.f160w"
+FORMATS = {
+    "csv": "ascii.csv",
+    "ecsv": "ascii.ecsv",
+    "fits": "fits",
+    "xml": "votable",
+    "txt": "ascii",
+}
+
+
+def write(table, path):
+    table.write(path, format=FORMATS[path.suffix[1:]])
+    return path
+
+
+def convert(columns, **options):
+    return CatalogMap(**options).convert(Table(columns))
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_magnitudes_of_any_format_are_fluxes(tmp_path, suffix):
+    magnitude = np.array([23.9, 21.4, 26.4])
+    table = Table({"name": ["a1", "b2", "c3"], "H": magnitude, "dH": [0.01, 0.02, 0.3]})
+    path = write(table, tmp_path / f"mine.{suffix}")
+    columns = {"id": "name", BAND: "H", f"{BAND}_err": "dH"}
+    out = read_catalog_photometry(path, columns=columns, units={"flux": "ABmag"})
+    assert out["id"].tolist() == ["a1", "b2", "c3"]
+    np.testing.assert_allclose(out[BAND].to_value(u.uJy), [1, 10, 0.1])
+    np.testing.assert_allclose(out[BAND].to(u.ABmag).value, magnitude)
+    # d ln f = ln(10) / 2.5 dm
+    relative = np.log(10) / 2.5 * np.array([0.01, 0.02, 0.3])
+    np.testing.assert_allclose((out[f"{BAND}_err"] / out[BAND]).value, relative)
+
+
+def test_units_differ_by_column():
+    columns = {
+        "id": [1],
+        BAND: [23.9],
+        f"{BAND}_err": [0.1],
+        "irac.ch1": [2.0],
+        "irac.ch1_err": [0.5],
+    }
+    out, _ = convert(columns, units={"flux": "mJy", BAND: "mag(AB)"})
+    assert out[BAND][0].to_value(u.uJy) == pytest.approx(1)
+    assert out[f"{BAND}_err"][0].to_value(u.uJy) == pytest.approx(0.1 * np.log(10) / 2.5)
+    assert out["irac.ch1"][0].to_value(u.uJy) == pytest.approx(2000)
+    assert out["irac.ch1_err"][0].to_value(u.uJy) == pytest.approx(500)
+    # errors of magnitudes may be fluxes
+    out, _ = convert(columns, units={"flux": "mJy", BAND: "ABmag", f"{BAND}_err": "nJy"})
+    assert out[f"{BAND}_err"][0].to_value(u.uJy) == pytest.approx(1e-4)
+
+
+def test_units_of_the_file_are_taken(tmp_path):
+    table = QTable({"id": [1], BAND: [23.9] * u.ABmag, f"{BAND}_err": [0.1] * u.mag})
+    out = read_catalog_photometry(write(table, tmp_path / "c.ecsv"))
+    assert out[BAND][0].to_value(u.uJy) == pytest.approx(1)
+    table[BAND] = [23.9] * u.mag
+    with pytest.raises(u.UnitsError, match="got mag: AB magnitudes are units="):
+        read_catalog_photometry(write(table, tmp_path / "d.ecsv"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        out = read_catalog_photometry(tmp_path / "d.ecsv", units={"flux": "ABmag"})
+    assert out[BAND][0].to_value(u.uJy) == pytest.approx(1)
+    with pytest.raises(u.UnitsError, match="got None: say it, such as units="):
+        convert({"id": [1], BAND: [1.0]})
+
+
+def test_numbers_that_stand_for_nothing_in_magnitudes():
+    values = np.array([24.0, 99.0, -99.0, 0.0, 0.0, 24.0, 999.0, np.nan, 24.0])
+    errors = np.array([0.1, 28.1, -99.0, 0.0, 0.1, 99.0, 0.1, 0.1, -1.0])
+    missing, no_error = without_codes(values, errors, magnitudes=True)
+    assert missing.tolist() == [False, True, True, True, False, False, True, False, False]
+    assert no_error.tolist()[5] is True
+    table, coded = convert(
+        {"id": np.arange(9), BAND: values, f"{BAND}_err": errors}, units={"flux": "ABmag"}
+    )
+    flux, error = (table[name].value for name in (BAND, f"{BAND}_err"))
+    assert np.isnan(flux).tolist() == [False, True, True, True, False, False, True, True, False]
+    # an error that is none leaves the flux; one that is not positive is for the fit to flag
+    assert np.isnan(error[5])
+    assert error[8] < 0
+    assert coded[BAND][[1, 2, 3, 5, 6]].tolist() == [99, -99, 0, 99, 999]
+    assert np.isnan(coded[BAND][[0, 4, 7, 8]]).all()
+
+
+def test_numbers_that_stand_for_nothing_in_fluxes():
+    values = np.array([1.0, -99.0, 99.0, 99.0, 0.0, 0.0, -98.7, 1.0, -1.0])
+    errors = np.array([0.1, 5.0, 5.0, 99.0, 0.0, 0.3, 50.0, -99.9, 1.0])
+    missing, no_error = without_codes(values, errors)
+    # 99 is a flux unless the error is the same number; 0 is one unless its error is 0
+    assert missing.tolist() == [False, True, False, True, True, False, False, False, False]
+    assert no_error.tolist()[7] is True
+    assert without_codes(values, errors, further=[-1.0])[0].tolist()[8] is True
+    # single precision
+    assert without_codes(np.float32([-99.9, -999.9]).astype(float))[0].all()
+
+
+def test_what_is_missing_is_counted(tmp_path):
+    table = Table({"id": [1, 2, 3], BAND: [1.0, -99.0, -99.9], f"{BAND}_err": [0.1, -99.0, 0.1]})
+    path = write(table, tmp_path / "c.csv")
+    with pytest.warns(MiricigaleWarning, match=rf"{BAND} 2 of 3 \(-99.9, -99\)$"):
+        read_catalog_photometry(path, units={"flux": "uJy"})
+
+
+@pytest.mark.parametrize(
+    ("ids", "wanted"),
+    [
+        ([3.0, 7.0], [3, 7]),
+        ([1.5, 2.25], ["1.5", "2.25"]),
+        (["x", "10"], ["x", "10"]),
+        (np.array(["x", "y"], object), ["x", "y"]),
+    ],
+)
+def test_ids(ids, wanted):
+    out, _ = convert({"id": ids, BAND: [1.0, 2.0]}, units={"flux": "uJy"})
+    assert out["id"].tolist() == wanted
+
+
+def test_factors():
+    columns = {"id": [1, 2], BAND: [1.0, 2.0], f"{BAND}_err": [0.1, 0.1], "total": [2.0, 3.0]}
+    out, _ = convert(columns, units={"flux": "uJy"}, factor="total")
+    assert out[BAND].value.tolist() == [2, 6]
+    np.testing.assert_allclose(out[f"{BAND}_err"].value, [0.2, 0.3])
+    table = Table(columns)
+    table["total"] = [-2.5, 0.0] * u.mag
+    out, _ = CatalogMap(units={"flux": "uJy"}, factor="total").convert(table)
+    np.testing.assert_allclose(out[BAND].value, [10, 2])
+    with pytest.raises(KeyError, match="no column of catalog 'totl'"):
+        convert(columns, units={"flux": "uJy"}, factor="totl")
+
+
+#: Columns of each survey, our names of them, and uJy in one of their units.
+NAMES = {
+    "candels": (
+        ("ID", "RA", "DEC", "CFHT_u_FLUX", "ACS_F606W_FLUX", "WFC3_F160W_FLUX", "WIRCAM_K_FLUX",
+         "NEWFIRM_J1_FLUX", "ISAAC_KS_FLUX", "IRAC_CH1_FLUX"),
+        "{}ERR",
+        ("megacam.u", "acs.f606w", "wfc3.f160w", "sedpy.cfht_wircam_Ks_8302", "newfirm.j1",
+         "sedpy.vlt_isaac_Ks", "irac.ch1"),
+        1.0,
+    ),
+    "3dhst": (
+        ("id", "ra", "dec", "f_F606W", "f_F125W", "f_F160W", "f_IRAC4"),
+        "e_{}",
+        ("acs.f606w", "wfc3.f125w", "wfc3.f160w", "irac.ch4"),
+        0.363078,
+    ),
+    "jades": (
+        ("ID", "RA", "DEC", "F090W_KRON_CONV", "F410M_KRON_CONV", "F814W_KRON_CONV"),
+        "{}_e",
+        ("nircam.f090w", "nircam.f410m", "acs.f814w"),
+        1e-3,
+    ),
+    "dja": (
+        ("id", "ra", "dec", "f606w_tot_1", "f115w_tot_1", "f444w-clear_tot_1", "f770w_tot_1"),
+        "dja",
+        ("acs.f606w", "nircam.f115w", "nircam.f444w", "miri.f770w"),
+        1.0,
+    ),
+    "cosmos2020": (
+        ("ID", "ALPHA_J2000", "DELTA_J2000", "CFHT_ustar_FLUX_APER2", "HSC_g_FLUX_APER2",
+         "UVISTA_Ks_FLUX_APER2", "SC_IB427_FLUX_APER2", "IRAC_CH1_FLUX"),
+        "cosmos",
+        ("megacam.u", "sedpy.hsc_g", "sedpy.vista_vircam_Ks", "sedpy.subaru_suprimecam_ia427",
+         "irac.ch1"),
+        1.0,
+    ),
+    "ceers": (
+        ("id", "redshift", "hst.wfc.F606W", "jwst.nircam.F444W", "jwst.miri.F770W"),
+        "{}_err",
+        ("acs.f606w", "nircam.f444w", "miri.f770w"),
+        1e3,
+    ),
+}  # fmt: skip
+
+
+def _error(survey, name, pattern):
+    if survey == "3dhst":
+        return name.replace("f_", "e_", 1)
+    if survey == "dja":
+        return name.replace("_tot_", "_etot_")
+    return name.replace("FLUX", "FLUXERR") if survey == "cosmos2020" else pattern.format(name)
+
+
+@pytest.mark.parametrize("survey", NAMES)
+def test_columns_of_surveys(survey):
+    names, pattern, bands, in_ujy = NAMES[survey]
+    first = len(names) - len(bands)
+    table = Table({name: [k + 1.0] for k, name in enumerate(names)})
+    for name in names[first:]:
+        table[_error(survey, name, pattern)] = [0.5]
+    out, _ = CatalogMap(survey=survey).convert(table)
+    assert {"id", *bands} <= set(out.colnames)
+    for k, band in enumerate(bands):
+        assert out[band][0].to_value(u.uJy) == pytest.approx((first + k + 1) * in_ujy, rel=1e-5)
+        assert out[f"{band}_err"][0].to_value(u.uJy) == pytest.approx(0.5 * in_ujy, rel=1e-5)
+    if survey != "ceers":
+        assert out["ra"].unit == u.deg
+
+
+def test_bands_without_a_filter_are_told_and_ones_own_columns_come_first(tmp_path):
+    names = ["ID", "ACS_F606W_FLUX", "ACS_F606W_FLUXERR", "HAWKI_KS_FLUX", "HAWKI_KS_FLUXERR"]
+    path = write(Table({name: [1.0] for name in names}), tmp_path / "c.fits")
+    with pytest.warns(MiricigaleWarning, match="left out, no filter here: HAWKI_KS_FLUX$"):
+        out = read_catalog_photometry(path, "candels")
+    assert "acs.f606w" in out.colnames
+    columns = {"sedpy.vlt_isaac_Ks": "HAWKI_KS_FLUX", "sedpy.vlt_isaac_Ks_err": "HAWKI_KS_FLUXERR"}
+    out = read_catalog_photometry(path, survey="candels", columns=columns)
+    assert out["sedpy.vlt_isaac_Ks"].unit == u.uJy
+    with pytest.raises(ValueError, match="a table with columns of 'dja'"):
+        read_catalog_photometry(path, "dja")
+    with pytest.raises(KeyError, match=r"no survey 'cosmos2015'"):
+        read_catalog_photometry(path, "cosmos2015")
+    names = ["id", "f_F606W", "e_F606W", "f_ACS_F606W", "e_ACS_F606W"]
+    with pytest.raises(DataError, match=r"f_F606W and f_ACS_F606W are both the filter acs\.f606w"):
+        CatalogMap(survey="3dhst").convert(Table({name: [1.0] for name in names}))
+
+
+def test_a_map_in_a_file(tmp_path):
+    path = tmp_path / "map.toml"
+    path.write_text(f'missing = [-1]\n[columns]\n"{BAND}" = "H"\n[units]\nflux = "ABmag"\n')
+    mine = CatalogMap.read(path)
+    assert mine.columns == {BAND: "H"}
+    assert mine.settings()["missing"] == (-1.0,)
+    out, _ = mine.convert(Table({"id": [1, 2], "H": [23.9, -1.0]}))
+    np.testing.assert_allclose(out[BAND].value, [1, np.nan])
+    path.write_text("column = 1\n")
+    with pytest.raises(DataError, match=r"it has \['column'\]; known: \['columns', 'units'"):
+        CatalogMap.read(path)
+    with pytest.raises(DataError, match="cannot be read as a map of columns"):
+        CatalogMap.read(tmp_path / "none.toml")
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_pieces_are_the_whole(tmp_path, suffix):
+    table = Table({"name": [f"s{k}" for k in range(7)], "H": [20.0, 99, 22, 23, 24, 99, 26]})
+    path = write(table, tmp_path / f"c.{suffix}")
+    mine = CatalogMap(columns={"id": "name", BAND: "H"}, units={"flux": "ABmag"})
+    with pytest.warns(MiricigaleWarning, match="2 of 7"):
+        whole = read_catalog_photometry(path, mine)
+    rows = MappedRows(open_rows(path, 3), mine)
+    assert rows.colnames == ("id", BAND)
+    assert [text.endswith(f"{BAND} 2 of 7 (99)") for text in rows.told()] == [True]
+    parts = [rows.chunk(i) for i in range(rows.n_chunks)]
+    assert [len(part) for part in parts] == [3, 3, 1]
+    for name in ("id", BAND):
+        np.testing.assert_array_equal(
+            np.concatenate([np.asarray(p[name]) for p in parts]), np.asarray(whole[name])
+        )
+
+
+def test_the_real_part_of_ceers(data_file):
+    path = data_file("ceers/ceers_photometry_part.fits")
+    with pytest.warns(MiricigaleWarning, match="taken as missing"):
+        mine = read_catalog_photometry(path, "ceers")
+    theirs = Table.read(path)
+    assert len(mine) == 5229
+    assert mine["id"].dtype.kind == "i"
+    flux = np.asarray(theirs["jwst.miri.F770W"])
+    # -99.99, and in one row -99.9
+    there = flux > -99
+    np.testing.assert_array_equal(np.isfinite(mine["miri.f770w"].value), there)
+    np.testing.assert_allclose(mine["miri.f770w"].to_value(u.mJy)[there], flux[there])
+    snr = mine["miri.f770w"] / mine["miri.f770w_err"]
+    # of its README: 1053 of the whole table, of which this is a part
+    assert np.count_nonzero(snr > 5) <= 1053
+
+
+def test_real_magnitudes_of_goodss(data_file):
+    path = data_file("catalogs/goodss_3dhst.v4.1.jwst_galfit.cat.gz")
+    columns = {"wfc3.f160w": "mag_wfc3_f160w", "nircam.f444w": "mag_nircam-f444w"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MiricigaleWarning)
+        table = read_catalog_photometry(path, columns=columns, units={"flux": "ABmag"})
+    theirs = Table.read(path, format="ascii.commented_header")
+    flux = 0.363078 * np.asarray(theirs["f_F160W"])
+    same = np.isfinite(table["wfc3.f160w"].value) & (flux > 0.1)
+    # the magnitude is the measured flux, with zero point 25
+    ratio = table["wfc3.f160w"].value[same] / flux[same]
+    assert np.median(ratio) == pytest.approx(1, abs=0.02)
+
+
+def test_surveys_are_named():
+    assert set(SURVEYS) == {*NAMES, "cigale"}

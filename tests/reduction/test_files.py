@@ -1,0 +1,228 @@
+"""Images of the pipeline's later stages, real and written as it writes them."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.nddata import CCDData, StdDevUncertainty
+from astropy.wcs import WCS
+
+from helpers.real import real_file
+from helpers.references import write_photom, write_reference
+from miricigale.detector import Detector, Ramp
+from miricigale.instrument import DQ, Exposure, ImageFacts
+from miricigale.reduction import Reducer, ReferenceFiles, open_exposure, read_images, write_image
+from miricigale.utils.exceptions import DataError
+
+I2D = "real/i2d/jw01288015001_04101_00001_mirimage_i2d.fits"
+RATEINTS = "real/ramps/MIRI_5582_89_S_20180308-010230_SCE1_pipe_rateints.fits.gz"
+
+
+@pytest.fixture
+def exposure():
+    return Exposure(
+        "miri.f1000w",
+        n_groups=12,
+        subarray="SUB64",
+        pointing=SkyCoord(53.1344, -27.8344, unit="deg"),
+        roll=30 * u.deg,
+        dither=1,
+    )
+
+
+def rate_file(path, exposure, *, unit="DN/s", steps=("S_LINEAR", "S_DARK", "S_RAMP"), **planes):
+    """A ``_rate`` file with the keywords of JWST alone."""
+    rng = np.random.default_rng(2)
+    data = rng.normal(20, 0.5, exposure.shape).astype(np.float32)
+    dq = np.zeros(exposure.shape, np.uint32)
+    dq[10, 20], dq[11, 21] = DQ.DO_NOT_USE | DQ.OTHER_BAD_PIXEL, DQ.JUMP_DET
+    primary = fits.PrimaryHDU()
+    primary.header.update(
+        {
+            "INSTRUME": "MIRI", "DETECTOR": "MIRIMAGE", "FILTER": "F1000W", "READPATT": "FASTR1",
+            "SUBARRAY": "SUB64", "NGROUPS": 12, "NINTS": 1, "TGROUP": 0.085, "EFFEXPTM": 1.02,
+            "EXPMID": 60000.5, "PATT_NUM": 2, "R_FLAT": "crds://jwst_miri_flat_0786.fits",
+            **dict.fromkeys(steps, "COMPLETE"),
+        }
+    )  # fmt: skip
+    science = fits.Header({"BUNIT": unit})
+    for key, value in zip(
+        ("RA_REF", "DEC_REF", "ROLL_REF"), (53.1344, -27.8344, 30.0), strict=True
+    ):
+        science[key] = value
+    hdus = [primary, fits.ImageHDU(data, science, name="SCI")]
+    planes = {"ERR": np.full(exposure.shape, 0.5), "DQ": dq, **planes}
+    for name, plane in planes.items():
+        if plane is not None:
+            kind = np.uint32 if name == "DQ" else np.float32
+            hdus.append(fits.ImageHDU(np.asarray(plane, kind), name=name))
+    fits.HDUList(hdus).writeto(path)
+    return data
+
+
+@pytest.mark.parametrize("unit", ["DN/s", "adu/s", "DN / s"])
+def test_a_rate_of_the_pipeline(tmp_path, exposure, unit):
+    path = tmp_path / "jw_rate.fits"
+    data = rate_file(path, exposure, unit=unit)
+    (file,) = read_images(path)
+    image = file.image
+    assert image.unit == u.adu / u.s
+    np.testing.assert_array_equal(image.data, data)
+    assert image.flags[10, 20] == DQ.DO_NOT_USE | DQ.OTHER_BAD_PIXEL
+    assert image.flags[11, 21] == DQ.JUMP_DET
+    np.testing.assert_array_equal(np.argwhere(image.mask), [[10, 20]])
+    facts = ImageFacts.of(image)
+    assert (facts.filter, facts.subarray, facts.day) == ("miri.f1000w", "SUB64", 60000.5)
+    assert set(facts.steps) == {"linearity", "dark", "ramp_fit"}
+    assert not facts.simulated
+    assert image.meta["reference_flat"] == "jwst_miri_flat_0786.fits"
+    assert image.meta["dither"] == 1
+    # a rate has the linear part of the coordinates; the distortion is the imager's
+    for x, y in ((0, 0), (70, 60)):
+        expected = exposure.wcs.pixel_to_world(x, y)
+        assert image.wcs.pixel_to_world(x, y).separation(expected) < 1e-4 * u.arcsec
+
+
+def test_errors_come_from_variances_where_there_are_no_others(tmp_path, exposure):
+    variances = {
+        "VAR_POISSON": np.full(exposure.shape, 0.09),
+        "VAR_RNOISE": np.full(exposure.shape, 0.16),
+    }
+    rate_file(tmp_path / "a_rate.fits", exposure, ERR=None, **variances)
+    (file,) = read_images(tmp_path / "a_rate.fits")
+    np.testing.assert_allclose(file.image.uncertainty.array, 0.5, rtol=1e-6)
+    assert set(file.planes) == {"VAR_POISSON", "VAR_RNOISE"}
+    rate_file(tmp_path / "b_rate.fits", exposure, VAR_FLAT=np.ones((3, 4)))
+    with pytest.raises(DataError, match=r"must have \(64, 72\) pixels in VAR_FLAT"):
+        read_images(tmp_path / "b_rate.fits")
+    rate_file(tmp_path / "c_rate.fits", exposure, unit="Jy")
+    with pytest.raises(DataError, match="must state in BUNIT that it is a rate"):
+        read_images(tmp_path / "c_rate.fits")
+
+
+def test_what_was_done_to_a_rate_is_not_done_again(tmp_path, exposure):
+    flat = np.full(exposure.shape, 2.0)
+    references = ReferenceFiles(
+        flat=write_reference(tmp_path / "flat.fits", "flat", exposure, flat, FILTER="F1000W"),
+        photom=write_photom(tmp_path / "photom.fits", [("F1000W", "SUB64", 0.5)]),
+    )
+    reducer = Reducer(references=references, cosmic_rays=False, field_only=False)
+    level = {}
+    for name, steps in {"dark": ("S_DARK",), "flat": ("S_DARK", "S_FLAT")}.items():
+        path = tmp_path / f"{name}_rate.fits"
+        data = rate_file(path, exposure, steps=steps)
+        cal = reducer.calibrate(open_exposure(path))
+        level[name] = np.median(cal.data / data)
+        assert {"flat", "photom"} <= set(cal.meta["steps"])
+    assert level["dark"] == pytest.approx(0.25)
+    assert level["flat"] == pytest.approx(0.5)
+    with pytest.raises(ValueError, match="needed: flat, photom"):
+        Reducer().calibrate(open_exposure(tmp_path / "dark_rate.fits"))
+
+
+@pytest.mark.filterwarnings("ignore::astropy.wcs.FITSFixedWarning")
+def test_a_real_image_of_the_pipeline():
+    path = real_file(I2D)
+    (file,) = read_images(path)
+    with fits.open(path) as hdus:
+        np.testing.assert_array_equal(file.image.data, hdus["SCI"].data)
+        np.testing.assert_array_equal(file.image.uncertainty.array, hdus["ERR"].data)
+        np.testing.assert_array_equal(file.planes["WHT"], hdus["WHT"].data)
+        wcs = WCS(hdus["SCI"].header)
+    assert file.image.unit == "MJy / sr"
+    np.testing.assert_array_equal(
+        file.image.mask, ~(file.planes["WHT"] > 0) | np.isnan(file.image.data)
+    )
+    total = sum(file.planes[name] for name in ("VAR_POISSON", "VAR_RNOISE", "VAR_FLAT"))
+    good = ~file.image.mask
+    known = good & np.isfinite(total)
+    assert known.sum() > 0.99 * good.sum()
+    np.testing.assert_allclose(file.image.uncertainty.array[known] ** 2, total[known], rtol=1e-4)
+    assert file.image.wcs.pixel_to_world(3, 4).separation(wcs.pixel_to_world(3, 4)) < 1 * u.mas
+    assert ImageFacts.of(file.image).filter == "miri.f1130w"
+    assert file.image.meta["photmjsr"] == pytest.approx(1.188432)
+    # on its own pixels the mosaic is itself, less its background; a single one says what it lacks
+    result = Reducer(negative_threshold=None).run([path], wcs=file.image.wcs)
+    assert result.rates == ()
+    assert result.notes == (
+        "a single dither: outliers cannot be rejected, hits that ramps kept stay in",
+    )
+    both = good & ~result.mosaic.mask
+    # at the edge rounding of the coordinates shares pixels
+    both[:, [0, -1]] = both[[0, -1]] = False
+    back = result.mosaic.data + result.mosaic_background.level + result.backgrounds[0].level
+    np.testing.assert_allclose(back[both], file.image.data[both], rtol=1e-4)
+
+
+def test_real_rates_of_integrations_and_their_mean():
+    path = real_file(RATEINTS)
+    files = read_images(path)
+    with fits.open(path) as hdus:
+        data, dq = hdus["SCI"].data, hdus["DQ"].data.astype(np.int64)
+        for number, file in enumerate(files):
+            np.testing.assert_array_equal(file.image.data, data[number])
+            np.testing.assert_array_equal(file.image.flags, dq[number])
+            assert file.image.meta["integration"] == number
+    assert files[0].image.wcs is None
+    mean = open_exposure(path)
+    good = ~mean.mask
+    np.testing.assert_allclose(mean.data[good], data.mean(axis=0)[good], rtol=1e-4, atol=1e-5)
+    assert mean.mask.mean() < 0.02
+
+
+def test_files_that_are_written_are_read_by_others(tmp_path, exposure):
+    sky = CCDData(np.full(exposure.shape, 30.0), unit="MJy/sr")
+    ramp = Detector.miri_imager().expose(sky, exposure, seed=1)
+    uncal = ramp.write(tmp_path / "a_uncal.fits")
+    assert isinstance(open_exposure(uncal), Ramp)
+    reducer = Reducer()
+    rate, image, background = reducer.reduce(uncal)
+    path = write_image(image, tmp_path / "a_cal.fits", planes={"BKG": background.level})
+    # photutils, reproject and the like read extensions by these names
+    with fits.open(path) as hdus:
+        assert [hdu.name for hdu in hdus][:4] == ["PRIMARY", "SCI", "ERR", "DQ"]
+        assert hdus[0].header["FILTER"] == "F1000W"
+        assert hdus[0].header["INSTRUME"] == "MIRI"
+        assert hdus["SCI"].header["BUNIT"] == "MJy/sr"
+        assert hdus["DQ"].data.dtype == np.uint32
+        wcs = WCS(hdus["SCI"].header)
+    plain = CCDData.read(path, hdu="SCI", hdu_uncertainty="ERR", hdu_mask=None)
+    assert plain.unit == "MJy / sr"
+    expected = exposure.wcs.pixel_to_world(60, 5)
+    assert wcs.pixel_to_world(60, 5).separation(expected) < 1e-3 * u.mas
+    # nothing is lost on the way back
+    (file,) = read_images(path)
+    np.testing.assert_array_equal(file.image.data, image.data)
+    np.testing.assert_array_equal(file.image.uncertainty.array, image.uncertainty.array)
+    np.testing.assert_array_equal(file.image.mask, image.mask)
+    np.testing.assert_array_equal(file.image.flags & ~1, image.flags & ~1)
+    np.testing.assert_array_equal(file.planes["BKG"], background.level)
+    assert file.image.meta["reference_gain"] == "4 e-/DN of the simulated detector"
+    assert ImageFacts.of(file.image) == ImageFacts.of(image)
+    # and a rate is calibrated as the one in memory
+    write_image(rate, tmp_path / "a_rate.fits")
+    with fits.open(tmp_path / "a_rate.fits") as hdus:
+        assert hdus["SCI"].header["BUNIT"] == "DN/s"
+    again = reducer.calibrate(open_exposure(tmp_path / "a_rate.fits"))
+    np.testing.assert_array_equal(again.data, reducer.calibrate(rate).data)
+    with pytest.raises(OSError, match="exists"):
+        write_image(image, path)
+    with pytest.raises(ValueError, match=r"'planes' must be of .* named VAR_POISSON"):
+        write_image(image, tmp_path / "b.fits", planes={"SKY": background.level})
+
+
+def test_what_is_no_image_is_refused(tmp_path):
+    fits.PrimaryHDU().writeto(tmp_path / "empty.fits")
+    with pytest.raises(DataError, match="it has no image in SCI"):
+        read_images(tmp_path / "empty.fits")
+    hdus = fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(np.ones((3, 3)), name="SCI")])
+    hdus[0].header["INSTRUME"] = "NIRCAM"
+    hdus.writeto(tmp_path / "nircam.fits")
+    with pytest.raises(DataError, match="must be of the MIRI imager, got NIRCAM None"):
+        read_images(tmp_path / "nircam.fits")
+    with pytest.raises(ValueError, match="'exposure' must be a Ramp, a Charge, CCDData or a path"):
+        Reducer().reduce(3)
+    image = CCDData(np.ones((4, 4)), unit="Jy", uncertainty=StdDevUncertainty(np.ones((4, 4))))
+    with pytest.raises(ValueError, match="'exposure' must be in adu / s or MJy / sr, got Jy"):
+        Reducer().reduce(image)

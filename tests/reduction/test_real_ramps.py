@@ -1,0 +1,111 @@
+"""
+Ramps of a ground test beside what the official pipeline (jwst 0.17.0) made of them.
+
+Its steps were firstframe, lastframe, linearity, ipc, rscd, jump and ramp_fit, without reset, dark and
+refpix. Its linearity reference (0024) cannot be had; what that polynomial of raw DN did here is its
+derivative, which is measured on the second integration, by the ratio of slopes at 11000 to 12700 DN,
+and predicts the others. Its ipc step couples neighbors by 0.032 (rows) and 0.027 (columns).
+"""
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from scipy.ndimage import convolve
+
+from helpers.real import real_file
+from helpers.references import write_reference
+from miricigale.detector import Ramp
+from miricigale.reduction import Reducer, ReferenceFiles
+from miricigale.utils.exceptions import MiricigaleWarning
+
+STEM = "real/ramps/MIRI_5582_89_S_20180308-010230_SCE1_pipe"
+COUPLING = np.array([[0, 0.0272, 0], [0.0319, 1 - 2 * 0.0272 - 2 * 0.0319, 0.0319], [0, 0.0272, 0]])
+
+
+def slopes(ramp, number, first, last, power):
+    """Weighted least squares as jwst 0.17 has it: weights |g - middle|^power."""
+    groups = np.arange(first, last)
+    time = ramp.group_time * groups
+    weight = np.abs(groups - groups.mean()) ** power
+    lever = weight * (time - np.sum(weight * time) / weight.sum())
+    lever /= np.sum(lever * time)
+    values = np.tensordot(lever, ramp.data[number, first:last].astype(float), axes=(0, 0))
+    return convolve(values, COUPLING)
+
+
+@pytest.fixture(scope="module")
+def ramp():
+    return Ramp.read(real_file(f"{STEM}.fits.gz"))
+
+
+@pytest.fixture(scope="module")
+def pipeline():
+    """Rates of the pipeline, and which are good: no flag, not at the edge where light is coupled in."""
+    with fits.open(real_file(f"{STEM}_rateints.fits.gz")) as hdus:
+        rates = hdus["SCI"].data.astype(float)
+        good = hdus["DQ"].data == 0
+    good[:, :, :5] = good[:, :, -1] = False
+    good[:, 0] = good[:, -1] = False
+    return rates, good
+
+
+@pytest.fixture(scope="module")
+def derivative(ramp, pipeline):
+    """Of the pipeline's linearity at the level of each pixel: a + b raw DN, from integration 2."""
+    rates, good = pipeline
+    slope = slopes(ramp, 1, 3, 49, 0)[good[1]]
+    level = ramp.data[1, 3:49].mean(axis=0)[good[1]]
+    solution = np.linalg.lstsq(np.array([slope, slope * level]).T, rates[1][good[1]], rcond=None)
+    return solution[0]
+
+
+def test_later_integrations_have_the_slopes_of_the_pipeline(ramp, pipeline, derivative, tmp_path):
+    rates, good = pipeline
+    coefficients = np.zeros((3, 64, 72))
+    coefficients[1], coefficients[2] = derivative[0], derivative[1] / 2
+    linearity = write_reference(
+        tmp_path / "linearity.fits", "linearity", ramp.exposure, coefficients
+    )
+    references = ReferenceFiles(
+        linearity=linearity, gain=5.5, read_noise="measured", incomplete=True
+    )
+    # groups 4 to 49, as firstframe, rscd and lastframe left them
+    reducer = Reducer(references=references, skip_first=3)
+    with pytest.warns(MiricigaleWarning, match="mask, saturation, dark: these steps are left out"):
+        found = reducer.fit_integrations(ramp)
+    for number in (1, 2, 3, 4):
+        use = good[number] & ~found[number].mask
+        assert np.median(found[number].data[use]) == pytest.approx(
+            np.median(rates[number][use]), rel=0.03
+        )
+        coupled = convolve(np.nan_to_num(found[number].data), COUPLING)[use]
+        assert np.corrcoef(coupled, rates[number][use])[0, 1] > 0.97
+        # both are estimates of the same slopes from the same counts
+        error = np.median(found[number].uncertainty.array[use])
+        assert np.std(coupled - rates[number][use]) < 0.5 * error
+    # without any reference they are larger by what the linearity does
+    with pytest.warns(MiricigaleWarning, match="mask, saturation, linearity, dark"):
+        plain = Reducer(references="none", skip_first=3).fit_integrations(ramp)
+    ratio = [
+        np.median(p.data[g]) / np.median(f.data[g])
+        for p, f, g in zip(plain, found, good, strict=True)
+    ]
+    assert np.mean(ratio[1:]) == pytest.approx(
+        1 / (derivative[0] + derivative[1] * 11800), abs=0.06
+    )
+
+
+def test_the_first_integration_is_that_of_its_weights(ramp, pipeline, derivative):
+    # the settling after the reset bends its ramps, so that a slope is one of weights: those of the
+    # pipeline at a signal to noise of 10 to 20 (power 1), groups 2 to 49
+    rates, good = pipeline
+    use = good[0]
+    slope = slopes(ramp, 0, 1, 49, 1)
+    slope *= derivative[0] + derivative[1] * ramp.data[0, 1:49].mean(axis=0)
+    assert np.median(slope[use]) == pytest.approx(np.median(rates[0][use]), rel=0.01)
+    assert np.corrcoef(slope[use], rates[0][use])[0, 1] > 0.998
+    # of others it is another one: 13 DN/s from group 7 on, 19 with the first group
+    late = slopes(ramp, 0, 6, 49, 0)[use]
+    early = slopes(ramp, 0, 0, 49, 0)[use]
+    assert np.median(late) < 0.8 * np.median(rates[0][use])
+    assert np.median(early) > 1.05 * np.median(rates[0][use])

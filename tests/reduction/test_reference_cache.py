@@ -1,0 +1,132 @@
+"""Rules of CRDS; what they choose was compared with ``crds`` 14.0.3."""
+
+import pytest
+
+from helpers.references import write_cache
+from miricigale.reduction import ReferenceCache
+from miricigale.utils.exceptions import DataError
+
+HEADER = {
+    "DETECTOR": "MIRIMAGE",
+    "FILTER": "F770W",
+    "BAND": "N/A",
+    "READPATT": "FASTR1",
+    "SUBARRAY": "SUB64",
+    "EXP_TYPE": "MIR_IMAGE",
+    "DATE-OBS": "2022-07-03",
+    "TIME-OBS": "12:30:00.500",
+}
+
+DETECTOR = "('META.INSTRUMENT.DETECTOR',)"
+DATES = "('META.OBSERVATION.DATE', 'META.OBSERVATION.TIME')"
+
+RULES = {
+    # by dates
+    "gain": (
+        f"({DETECTOR}, {DATES})",
+        """Match({
+            'MIRIFULONG' : UseAfter({'2000-01-01 00:00:00' : 'long.fits',}),
+            'MIRIMAGE' : UseAfter({
+                '2000-01-01 00:00:00' : 'ground.fits',
+                '2022-07-03 12:00:00' : 'flight.fits',
+                '2022-07-03 13:00:00' : 'later.fits',
+            }),
+        })""",
+    ),
+    # the best match wins; GENERIC stands for N/A
+    "flat": (
+        ("(('META.INSTRUMENT.DETECTOR', 'META.INSTRUMENT.FILTER', 'META.INSTRUMENT.BAND', "
+        "'META.EXPOSURE.READPATT', 'META.SUBARRAY.NAME'),)"),
+        """Match({
+            ('MIRIMAGE', 'F1000W', 'N/A', '*', 'GENERIC') : 'other.fits',
+            ('MIRIMAGE', 'F770W', 'N/A', '*', 'GENERIC') : 'generic.fits',
+            ('MIRIMAGE', 'F770W', 'N/A', 'FAST|FASTR1', 'BRIGHTSKY') : 'brightsky.fits',
+            ('MIRIMAGE', 'F770W', 'N/A', 'FAST|FASTR1', 'SUB64|SUB128') : 'sub64.fits',
+            ('MIRIMAGE', 'F770W', 'N/A', 'SLOW', 'SUB64') : 'slow.fits',
+        })""",
+        {"substitutions": "{'META.SUBARRAY.NAME' : {'GENERIC' : 'N/A'}}"},
+    ),
+    "superbias": (f"({DETECTOR},)", "Match({'MIRIMAGE' : 'N/A'})"),
+    # equally good matches are put together by their dates
+    "dark": (
+        "(('META.INSTRUMENT.DETECTOR', 'META.EXPOSURE.READPATT', 'META.SUBARRAY.NAME'), " + DATES + ")",
+        """Match({
+            ('MIRIMAGE', 'FASTR1', 'N/A') : UseAfter({'2021-01-01 00:00:00' : 'one.fits',}),
+            ('MIRIMAGE', 'N/A', 'SUB64') : UseAfter({'2022-01-01 00:00:00' : 'two.fits',}),
+            ('NOT MIRIMAGE', 'N/A', 'SUB64') : UseAfter({'2022-02-01 00:00:00' : 'three.fits',}),
+        })""",
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_cache(tmp_path, RULES)
+    for name in ("ground", "flight", "later", "generic", "sub64", "two", "one"):
+        (tmp_path / "references/jwst/miri" / f"{name}.fits").touch()
+    return tmp_path
+
+
+def chosen(folder, **header):
+    files = ReferenceCache(folder).find({**HEADER, **header}, incomplete=True)
+    return {name: path.name for name in files.names() if (path := getattr(files, name)) is not None}
+
+
+def test_rules_choose_by_the_header(folder):
+    assert chosen(folder) == {"gain": "flight.fits", "flat": "sub64.fits", "dark": "two.fits"}
+    assert chosen(folder, **{"DATE-OBS": "2018-03-08"}) == {
+        "gain": "ground.fits",
+        "flat": "sub64.fits",
+    }
+    # without a filter there is no flat field
+    assert chosen(folder, **{"DATE-OBS": "2021-03-08", "FILTER": "F560W"}) == {
+        "gain": "ground.fits", "dark": "one.fits"
+    }  # fmt: skip
+    # the generic file has one match less
+    assert chosen(folder, SUBARRAY="FULL")["flat"] == "generic.fits"
+    files = ReferenceCache(folder).find(HEADER)
+    assert files.origin == "jwst_0001.pmap"
+    assert files.gain == folder / "references/jwst/miri/flight.fits"
+
+
+def test_the_context_is_that_of_the_variable_or_the_last(folder, monkeypatch):
+    write_cache(folder, {}, context="jwst_0002.pmap")
+    assert ReferenceCache(folder).context == "jwst_0002.pmap"
+    monkeypatch.setenv("CRDS_CONTEXT", "jwst_0001.pmap")
+    monkeypatch.setenv("CRDS_PATH", str(folder))
+    assert ReferenceCache().context == "jwst_0001.pmap"
+    assert ReferenceCache(context="jwst_0002.pmap").find(HEADER).missing() != ()
+
+
+def test_what_is_not_there_is_named(folder, tmp_path, monkeypatch):
+    monkeypatch.delenv("CRDS_PATH", raising=False)
+    with pytest.raises(ValueError, match="'folder' must be given, or the variable CRDS_PATH set"):
+        ReferenceCache()
+    with pytest.raises(DataError, match="is no CRDS cache of JWST"):
+        ReferenceCache(tmp_path / "nothing")
+    with pytest.raises(DataError, match=r"is no CRDS cache with jwst_0009\.pmap"):
+        ReferenceCache(folder, "jwst_0009.pmap")
+    (folder / "references/jwst/miri/flight.fits").unlink()
+    with pytest.raises(DataError, match=r"lacks the reference file flight\.fits, which jwst_0001"):
+        chosen(folder)
+
+
+@pytest.mark.parametrize(
+    ("selector", "match"),
+    [
+        ("SelectVersion({'<5' : 'a.fits'})", "selector SelectVersion is not understood"),
+        ("Match({'MIRIMAGE' : ", "cannot be read as a CRDS mapping"),
+        ("Match({'>5' : 'a.fits'})", "relation '>5' is not understood"),
+        ("Match({'MIRIMAGE' : UseAfter({'2000-01-01 00:00:00' : 'a.fits'})})", "more selectors"),
+    ],
+)
+def test_rules_of_other_kinds_are_refused(tmp_path, selector, match):
+    write_cache(tmp_path, {"gain": (f"({DETECTOR},)", selector)})
+    with pytest.raises(DataError, match=match):
+        chosen(tmp_path)
+
+
+def test_nothing_of_a_mapping_is_executed(tmp_path):
+    write_cache(tmp_path, {"gain": (f"({DETECTOR},)", "__import__('os').getcwd()")})
+    with pytest.raises(DataError, match="cannot be read as a CRDS mapping"):
+        chosen(tmp_path)

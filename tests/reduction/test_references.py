@@ -1,0 +1,301 @@
+"""Ramps of another detector, with its reference files in the form of CRDS."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from astropy.nddata import CCDData
+from numpy.polynomial import Polynomial
+
+from helpers.real import real_file
+from helpers.references import write_photom, write_reference
+from miricigale.detector import CosmicRays, Detector, InterpixelCapacitance, Ramp, ResetAnomaly
+from miricigale.instrument import DQ, Exposure, field_mask, flat_field, miri_detector, photmjsr
+from miricigale.reduction import Reducer, ReferenceFiles
+from miricigale.reduction.reference_maps import read_photom
+from miricigale.utils.exceptions import DataError, MiricigaleWarning
+
+SKY = 12.0
+OTHER = miri_detector().replace(
+    gain=5.5,
+    read_noise=8.0,
+    bias=9000.0,
+    dark_current=0.9,
+    full_well=250e3,
+    nonlinearity=(0.0, 1.0, 3e-6, 4e-11),
+)
+
+
+@pytest.fixture(scope="module")
+def exposure():
+    return Exposure(
+        "miri.f1000w",
+        n_groups=30,
+        n_integrations=2,
+        subarray="SUB256",
+        pointing=SkyCoord(53.1344, -27.8344, unit="deg"),
+        roll=30 * u.deg,
+    )
+
+
+@pytest.fixture(scope="module")
+def ramp(exposure):
+    """A ramp with stars that fill a fifth of the well, by the other detector."""
+    light = np.full(exposure.shape, SKY)
+    light[40:210:17, 60:230:17] = 660.0
+    anomaly = ResetAnomaly((-60.0, -40.0))
+    detector = Detector.miri_imager(anomaly, properties=OTHER)
+    return detector.without(CosmicRays, InterpixelCapacitance).expose(
+        CCDData(light, unit="MJy/sr"), exposure, seed=4, n_threads=1
+    )
+
+
+@pytest.fixture(scope="module")
+def references(exposure, ramp, tmp_path_factory):
+    """The other detector's reference files."""
+    folder, shape = tmp_path_factory.mktemp("references"), exposure.shape
+
+    def file(kind, *args, **options):
+        return write_reference(folder / f"{kind}.fits", kind, exposure, *args, **options)
+
+    def full(value):
+        return np.full(shape, value)
+
+    # as CRDS has it for MIRI, a polynomial of raw DN
+    raw = Polynomial(OTHER.nonlinearity)(Polynomial([-OTHER.bias, 1.0])) + OTHER.bias
+    step = exposure.group_time.value * OTHER.dark_current / OTHER.gain
+    dark = step * np.arange(1, 41)[:, None, None] * np.ones((2, 40, *shape))
+    offsets = ResetAnomaly((-60.0, -40.0)).offsets(2, 30)
+    sees = (ramp.pixel_dq & DQ.REFERENCE_PIXEL) == 0
+    # CRDS keeps the noise of a difference of two reads
+    noise = np.sqrt(2 * OTHER.read_noise**2)
+    bad = np.where(ramp.pixel_dq != 0, 1, 0)
+    rows = [("F1000W", "FULL", 9.0), ("F1000W", "SUB256", photmjsr("miri.f1000w", gain=OTHER.gain))]
+    return ReferenceFiles(
+        mask=file("mask", dq=bad, legend=["DO_NOT_USE"]),
+        saturation=file("saturation", full(OTHER.bias + 0.95 * OTHER.saturation_dn)),
+        reset=file("reset", offsets[:, :, None, None] * sees, READPATT="FAST"),
+        linearity=file("linearity", raw.coef[:, None, None] * np.ones(shape)),
+        dark=file("dark", dark * sees, READPATT="FASTR1"),
+        gain=file("gain", full(OTHER.gain)),
+        read_noise=file("readnoise", full(noise)),
+        flat=file("flat", flat_field(exposure.filter, subarray="SUB256"), FILTER="F1000W"),
+        photom=write_photom(folder / "photom.fits", rows),
+    )
+
+
+@pytest.fixture(scope="module")
+def real(ramp, tmp_path_factory):
+    """The same ramp in a file that does not tell who made it."""
+    path = tmp_path_factory.mktemp("ramps") / "jw_uncal.fits"
+    ramp.write(path)
+    with fits.open(path) as hdus:
+        kept = fits.HDUList([h for h in hdus if not h.name.startswith("SIM_")])
+        kept.writeto(path.with_name("other_uncal.fits"))
+    return Ramp.read(path.with_name("other_uncal.fits"))
+
+
+def test_another_detector_comes_out_right_with_its_references(exposure, real, ramp, references):
+    reducer = Reducer(references=references, skip_first=0, skip_last=0, cosmic_rays=False)
+    rate = reducer.fit_ramp(real)
+    truth = SKY / photmjsr(exposure.filter, gain=OTHER.gain)
+    truth = truth * flat_field(exposure.filter, subarray="SUB256")
+    good = ~rate.mask & (rate.data < 3 * np.median(rate.data[~rate.mask]))
+    pull = ((rate.data - truth) / rate.uncertainty.array)[good]
+    assert pull.std() == pytest.approx(1, abs=0.02)
+    assert abs(pull.mean()) < 4 / np.sqrt(good.sum()) + 0.02
+    # up to a fifth of the well, where the response falls by several per cent
+    stars = ~rate.mask & (rate.data > 30 * truth)
+    assert stars.sum() > 80
+    bright = 660.0 / photmjsr(exposure.filter, gain=OTHER.gain)
+    bright = bright * flat_field(exposure.filter, subarray="SUB256")[stars]
+    assert np.mean(rate.data[stars] / bright) == pytest.approx(1, abs=1e-3)
+    cal = reducer.calibrate(rate)
+    sky = ~cal.mask & good & field_mask(subarray="SUB256")
+    error = cal.uncertainty.array[sky].mean() / np.sqrt(sky.sum())
+    assert cal.data[sky].mean() == pytest.approx(SKY, abs=4 * error + 0.01)
+    # headers say which file was used
+    for name in ("mask", "linearity", "dark", "gain", "reset"):
+        assert cal.meta[f"reference_{name}"] == f"{name}.fits"
+    assert cal.meta["reference_read_noise"] == "readnoise.fits"
+    assert cal.meta["reference_bias"] == "none"
+    assert cal.meta["reference_flat"] == "flat.fits"
+    assert cal.meta["reference_photom"] == "photom.fits"
+    assert {"linearity", "dark", "flat", "photom"} <= set(cal.meta["steps"])
+    # who made the ramp does not matter then
+    same = reducer.replace(ipc=False).fit_ramp(ramp)
+    np.testing.assert_array_equal(same.data, rate.data)
+
+
+def test_a_bias_of_its_own_stands_before_the_polynomial(exposure, real, references, tmp_path):
+    above = np.array(OTHER.nonlinearity)[:, None, None] * np.ones(exposure.shape)
+    other = references.replace(
+        bias=write_reference(
+            tmp_path / "bias.fits", "superbias", exposure, np.full(exposure.shape, OTHER.bias)
+        ),
+        linearity=write_reference(tmp_path / "linearity.fits", "linearity", exposure, above),
+    )
+    one, two = (Reducer(references=r).fit_ramp(real) for r in (references, other))
+    np.testing.assert_allclose(two.data, one.data, rtol=2e-3, atol=2e-3)
+    assert two.meta["reference_bias"] == "bias.fits"
+    number = Reducer(references=other.replace(bias=OTHER.bias)).fit_ramp(real)
+    np.testing.assert_array_equal(number.data, two.data)
+
+
+def test_without_references_it_is_refused(ramp, real, references):
+    with pytest.raises(ValueError, match=r"did not simulate \(needed: mask, saturation, linear"):
+        Reducer().fit_ramp(real)
+    # our own ramps of another detector are not ours to reduce in silence either
+    with pytest.raises(ValueError, match="was made by another detector than miri_detector"):
+        Reducer().fit_ramp(ramp)
+    rate = Reducer(references="simulated", skip_first=9).fit_ramp(ramp)
+    assert rate.meta["reference_gain"] == "4 e-/DN of the simulated detector"
+    rate = Reducer(properties=OTHER, skip_first=9).fit_ramp(ramp)
+    assert rate.meta["reference_gain"] == "5.5 e-/DN of the simulated detector"
+    with pytest.raises(
+        ValueError, match=r"'references' must be complete for slopes .* none for dark"
+    ):
+        Reducer(references=references.replace(dark=None)).fit_ramp(real)
+    partial = references.replace(dark=None, incomplete=True)
+    with pytest.warns(MiricigaleWarning, match="slopes without references for dark"):
+        rate = Reducer(references=partial).fit_ramp(real)
+    assert rate.meta["reference_dark"] == "none"
+    with pytest.warns(MiricigaleWarning, match="the dark current is in the slopes still"):
+        Reducer(references=partial, cosmic_rays=False).calibrate(rate)
+    with pytest.raises(ValueError, match="must be given for surface brightness"):
+        Reducer().calibrate(rate)
+
+
+def test_slopes_without_any_reference_have_measured_noise(real):
+    reducer = Reducer(references="none", skip_first=8)
+    with pytest.warns(MiricigaleWarning, match="mask, saturation, linearity, dark: these steps"):
+        rate = reducer.fit_ramp(real)
+    assert rate.unit == "adu / s"
+    assert rate.meta["reference_read_noise"].endswith("DN (measured on the ramp)")
+    assert float(rate.meta["reference_read_noise"].split()[0]) == pytest.approx(8.0, rel=0.02)
+    assert rate.meta["reference_gain"].endswith("(measured on the ramp)")
+    assert rate.meta["reference_saturation"] == "the highest number of the converter"
+    # errors are those of the scatter, where the sky is flat, but for the gain, which stars bias
+    column = rate.data[:, 20:40][~rate.mask[:, 20:40]]
+    flat = flat_field("miri.f1000w", subarray="SUB256")[:, 20:40][~rate.mask[:, 20:40]]
+    expected = np.median(rate.uncertainty.array[:, 20:40][~rate.mask[:, 20:40]])
+    assert 1.4826 * np.median(np.abs(column / flat - np.median(column / flat))) == pytest.approx(
+        expected, rel=0.15
+    )
+    with (
+        pytest.warns(MiricigaleWarning, match="surface brightness without references for flat"),
+        pytest.raises(ValueError, match="given with 'photom' for surface brightness"),
+    ):
+        reducer.calibrate(rate)
+
+
+def test_what_a_file_had_done_to_it_is_not_done_twice(exposure, real, references):
+    # linear, dark and anomaly off: as the pipeline leaves it before the ramp fit
+    offsets = ResetAnomaly((-60.0, -40.0)).offsets(2, 30)
+    linear = OTHER.linearize(real.data - offsets[:, :, None, None] - OTHER.bias) + OTHER.bias
+    step = exposure.group_time.value * OTHER.dark_current / OTHER.gain
+    linear -= step * np.arange(1, 31)[:, None, None]
+    header = real.header
+    steps = ["dq_init", "saturation", "reset", "linearity", "dark", "lastframe"]
+    group_dq = np.zeros(real.shape, np.uint8)
+    group_dq[:, -1] = DQ.DO_NOT_USE
+    done = Ramp(
+        linear.astype(np.float32),
+        exposure,
+        pixel_dq=real.pixel_dq | np.where(references.maps(real).pixel_dq, 1, 0).astype(np.uint32),
+        group_dq=group_dq,
+        steps=steps,
+        header=header,
+    )
+    whole = Reducer(references=references, skip_first=0, skip_last=1).fit_ramp(real)
+    few = ReferenceFiles(gain=references.gain, read_noise=references.read_noise)
+    rest = Reducer(references=few, skip_first=0).fit_ramp(done)
+    both = ~whole.mask & ~rest.mask & (whole.data > 0)
+    assert both.mean() > 0.95
+    assert np.abs(rest.data - whole.data)[both].max() < 0.02 * whole.data[both].max()
+    np.testing.assert_allclose(rest.data[both], whole.data[both], rtol=0.01, atol=0.05)
+    assert rest.meta["reference_linearity"] == "done before"
+    assert set(steps) <= set(rest.meta["steps"])
+
+
+def test_files_for_something_else_are_refused(exposure, real, references, tmp_path):
+    def refused(name, kind, array, match, **keywords):
+        path = write_reference(tmp_path / f"{kind}.fits", kind, exposure, array, **keywords)
+        with pytest.raises(DataError, match=match):
+            Reducer(references=references.replace(**{name: path})).fit_ramp(real)
+
+    flat = np.ones(exposure.shape)
+    refused("gain", "gain", flat, "its DETECTOR is MIRIFULONG, not MIRIMAGE", DETECTOR="MIRIFULONG")
+    refused("gain", "gain", flat, "its REFTYPE is FLAT, not GAIN", REFTYPE="FLAT")
+    refused("gain", "gain", flat, "its INSTRUME is NIRCAM, not MIRI", INSTRUME="NIRCAM")
+    refused("gain", "gain", flat, "it covers .* and not SUB256", SUBSTRT2=700)
+    refused("read_noise", "readnoise", flat, "READPATT is SLOWR1, not FASTR1", READPATT="SLOW")
+    few = np.ones((1, 12, *exposure.shape))
+    refused("dark", "dark", few, "it has 12 groups, and the ramp 30")
+    refused("linearity", "linearity", flat, "must hold coefficients")
+    # a real one, of another part of the detector
+    path = real_file("miri_facts/jwst_miri_readnoise_SLITLESSPRISM.fits")
+    with pytest.raises(DataError, match="and not SUB256"):
+        Reducer(references=references.replace(read_noise=path)).fit_ramp(real)
+    with pytest.raises(ValueError, match="'gain' must be the path of a file, got nowhere"):
+        ReferenceFiles(gain="nowhere.fits")
+    with pytest.raises(ValueError, match="'gain' must be a path or a number above 0 in e-/DN"):
+        ReferenceFiles(gain=-1.0)
+    with pytest.raises(ValueError, match=r"'flat' must be a path, got 1\.0"):
+        ReferenceFiles(flat=1.0)
+
+
+def test_flags_of_references_are_read_by_their_names(exposure, real, references, tmp_path):
+    dq = np.zeros(exposure.shape, int)
+    dq[100, 100], dq[101, 101], dq[102, 102] = 1, 2, 4
+    legend = ["HOT", "DO_NOT_USE", "SOMETHING_ELSE"]
+    mask = write_reference(tmp_path / "mask.fits", "mask", exposure, dq=dq, legend=legend)
+    gain = np.full(exposure.shape, 5.5)
+    gain[110, 110] = np.nan
+    gain = write_reference(tmp_path / "gain.fits", "gain", exposure, gain)
+    rate = Reducer(references=references.replace(mask=mask, gain=gain)).fit_ramp(real)
+    assert rate.flags[100, 100] & DQ.HOT
+    assert not rate.mask[100, 100]
+    assert rate.mask[101, 101]
+    assert not rate.mask[102, 102]
+    assert rate.flags[110, 110] & DQ.NO_GAIN_VALUE
+    assert rate.mask[110, 110]
+
+
+def test_the_conversion_follows_time_as_the_pipeline_has_it(exposure, tmp_path):
+    rows = [("F770W", "GENERIC", 0.4), ("F1000W", "GENERIC", 0.5)]
+    day = 60000.0
+    plain = write_photom(tmp_path / "a.fits", rows)
+    assert read_photom(plain, exposure, None) == pytest.approx(0.5)
+    tables = {
+        "TIMECOEFF_LINEAR": {"t0": 59000.0, "lossperyear": 0.01},
+        "TIMECOEFF_EXPONENTIAL": {"t0": 59500.0, "amplitude": 0.1, "tau": 250.0, "const": 0.9},
+        "TIMECOEFF_POWERLAW": {"t0": 59635.0, "year1value": 0.98, "tsoft": 1.0, "alpha": -0.02},
+    }
+    factor = 1 - 0.01 * 1000 / 365
+    factor *= 0.1 * np.exp(-2) + 0.9
+    factor *= 0.98
+    timed = write_photom(tmp_path / "b.fits", rows, times=tables)
+    assert read_photom(timed, exposure, day) == pytest.approx(0.5 / factor, rel=1e-6)
+    old = {"TIMECOEFF": {"amplitude": 0.2, "tau": 250.0, "t0": 59500.0}}
+    old = write_photom(tmp_path / "c.fits", rows, times=old)
+    assert read_photom(old, exposure, day) == pytest.approx(0.5 + 0.2 * np.exp(-2), rel=1e-6)
+    with pytest.raises(DataError, match="depends on time, and the exposure does not tell when"):
+        read_photom(old, exposure, None)
+    with pytest.raises(DataError, match="has no row for F560W and SUB256"):
+        read_photom(plain, exposure.replace(filter="miri.f560w"), None)
+
+
+def test_integrations_apart(real, references):
+    reducer = Reducer(references=references, jump_threshold=None)
+    rates = reducer.fit_integrations(real)
+    assert [rate.meta["integration"] for rate in rates] == [0, 1]
+    whole = reducer.fit_ramp(real)
+    good = ~whole.mask & ~rates[0].mask & ~rates[1].mask
+    # independent halves of the same light, each with its own anomaly taken off
+    difference = (rates[1].data - rates[0].data)[good]
+    error = np.hypot(rates[0].uncertainty.array, rates[1].uncertainty.array)[good]
+    assert np.std(difference / error) == pytest.approx(1, abs=0.03)
+    mean = 0.5 * (rates[0].data + rates[1].data)[good]
+    np.testing.assert_allclose(mean, whole.data[good], rtol=0.01, atol=0.02)

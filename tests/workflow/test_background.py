@@ -1,0 +1,169 @@
+"""The background by name, level, position and day: one idea of studies and plans."""
+
+import sys
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+
+from miricigale.depth import zodiacal_factor
+from miricigale.instrument import background_level
+from miricigale.utils.exceptions import ConfigError
+from miricigale.workflow.background import background_text
+from miricigale.workflow.config import StudyConfig, load_config
+from miricigale.workflow.planning import load_plan
+from miricigale.workflow.planning.exposures import band_plans
+from miricigale.workflow.stages.exposures import (
+    background_options,
+    study_background,
+    study_exposures,
+)
+from miricigale.workflow.stages.images import expose_and_reduce
+from miricigale.workflow.stages.provenance import _background_sentence
+from miricigale.workflow.study import check_study
+
+BANDS = ["miri.f770w", "miri.f2100w"]
+COSMOS = {"ra": 150.1, "dec": 2.2}
+
+
+def study(**scene):
+    return StudyConfig.from_dict(
+        {"exposures": {"filters": BANDS}, "pointing": COSMOS, "scene": scene}
+    )
+
+
+def plan(**background):
+    exposures = {"bands": BANDS, "time": 900.0, "dithers": 4}
+    config = load_plan(overrides={"exposures": exposures, "background": background})
+    return {name: one.background for name, one in band_plans(config).items()}
+
+
+@pytest.mark.parametrize(
+    ("scene", "background"),
+    [
+        ({}, {}),
+        ({"background": "high"}, {"level": "high"}),
+        ({"background": ["low", "medium"]}, {"level": ["low", "medium"]}),
+        ({"background": "low", "background_of": "pointing"}, {"level": "low", **COSMOS}),
+        ({"background": "medium", "background_of": "pointing"}, {"level": "medium", **COSMOS}),
+        ({"background": ["6 MJy/sr", "high"]}, {"level": ["6 MJy/sr", "high"]}),
+    ],
+)
+def test_a_study_has_the_background_of_a_plan(scene, background):
+    config = study(**scene)
+    for name, level in plan(**background).items():
+        assert study_background(config, name) == level
+        assert study_background(study(**scene, background_scale=2.0), name) == 2 * level
+
+
+def test_only_the_zodiacal_part_grows_with_the_name():
+    cosmos = SkyCoord(**COSMOS, unit="deg")
+    for name in BANDS:
+        telescope = background_level(name, zodi="none")
+        low = study_background(study(), name) - telescope
+        for level in ("medium", "high"):
+            for of, position in (("sky", None), ("pointing", cosmos)):
+                own = study_background(study(background=level, background_of=of), name) - telescope
+                factor = zodiacal_factor(name, level, position=position)
+                assert (own / low).value == pytest.approx(factor)
+                assert factor > 1.2
+
+
+def test_a_level_is_what_it_says_in_any_unit():
+    config = study(background=["12.5 MJy/sr", "0.3 GJy / sr"])
+    assert study_background(config, BANDS[0]).value == pytest.approx(12.5)
+    assert study_background(config, BANDS[1]).value == pytest.approx(300.0)
+    assert background_text(**background_options(config)) == (
+        "F770W: 12.5 MJy / sr, as given; F2100W: 300 MJy / sr, as given"
+    )
+
+
+@pytest.mark.parametrize(
+    ("scene", "message"),
+    [
+        ({"background": "dark"}, r"or a surface brightness such as '12\.5 MJy/sr', got 'dark'"),
+        ({"background": "12.5"}, "got '12.5'"),
+        ({"background": "-1 MJy/sr"}, "got '-1 MJy/sr'"),
+        ({"background": "inf MJy/sr"}, "got 'inf MJy/sr'"),
+        ({"background": "3 uJy"}, "got '3 uJy'"),
+        ({"background": []}, r"must have one level, or one for each band \(2\), got 0"),
+        ({"background": ["low"] * 3}, r"one for each band \(2\), got 3"),
+        ({"background": "high", "background_date": "2027-05-01"}, "must be left out with a date"),
+        ({"background_of": "moon"}, r"background_of must be one of \['sky', 'pointing'\]"),
+    ],
+)  # fmt: skip
+def test_what_is_no_background_is_refused(scene, message):
+    with pytest.raises(ConfigError, match=rf"\[scene\] .*{message}"):
+        study(**scene)
+
+
+def test_a_plan_refuses_the_same():
+    with pytest.raises(ConfigError, match=r"\[background\] level must have one level"):
+        plan(level=["low", "low", "low"])
+    with pytest.raises(ConfigError, match="must be left out with a date"):
+        plan(level="high", date="2027-05-01", **COSMOS)
+
+
+def test_a_day_that_cannot_be_is_refused_before_anything_is_made(monkeypatch):
+    # the Sun is near to the field then
+    overrides = {"pointing": COSMOS, "scene": {"background_date": "2027-08-20"}}
+    with pytest.raises(ConfigError, match=r"\[scene\] background: 'date' must be a day on which"):
+        check_study(load_config("goodss", quick=True, overrides=overrides))
+    monkeypatch.setitem(sys.modules, "zodipy", None)
+    overrides["scene"]["background_date"] = "2027-05-01"
+    with pytest.raises(ConfigError, match=r"\[scene\] background: .*miricigale\[background\]"):
+        check_study(load_config("goodss", quick=True, overrides=overrides))
+
+
+def test_the_report_says_which_and_from_where():
+    low = _background_sentence(study())
+    assert "telescope and low zodiacal light (Rigby et al. 2023, jwst_backgrounds)" in low
+    assert low.endswith("grows by 5 % of that for each arcmin towards position angle 45 deg")
+    medium = study(
+        background="medium", background_of="pointing", background_scale=1.5, background_gradient=0.0
+    )
+    assert _background_sentence(medium) == (
+        "Background at the center of the field: telescope and medium zodiacal light, the 50th percentile "
+        "over the days on which RA 150.1000, Dec 2.2000 can be seen (Kelsall et al. 1998 by ZodiPy), times "
+        "1.5; it is the same everywhere"
+    )
+    assert "of the sky" not in _background_sentence(study(background="high"))
+    assert "90th percentile over the sky" in _background_sentence(study(background="high"))
+    day = background_text(**background_options(study(background_date="2027-05-01")))
+    assert day == (
+        "telescope and zodiacal light of 2027-05-01 at RA 150.1000, Dec 2.2000 (Kelsall et al. 1998 by ZodiPy)"
+    )
+
+
+def test_images_have_the_background_that_was_asked_for():
+    config = StudyConfig.from_dict(
+        {
+            "exposures": {
+                "filters": BANDS[:1], "kind": "rates", "n_groups": [40], "n_integrations": [1],
+                "n_dithers": [1],
+            },
+            "fit": {"min_detected": 1},
+            "scene": {"background": "20 MJy/sr", "background_gradient": 0.0},
+        }
+    )  # fmt: skip
+    (exposure,) = study_exposures(config).values()
+    catalog = QTable(
+        {
+            "id": [1],
+            "sky": SkyCoord([exposure.pointing.ra], [exposure.pointing.dec]),
+            "redshift": [1.0],
+            "profile": ["point"],
+            "half_light_radius": [0.0] * u.arcsec,
+            "sersic_index": [1.0],
+            "axis_ratio": [1.0],
+            "position_angle": [0.0] * u.deg,
+            BANDS[0]: [1.0] * u.uJy,
+        }
+    )
+    forecasts = []
+    _, cal = expose_and_reduce(config, exposure, catalog, seed=1, tell=forecasts.append)
+    # through gain, non-linearity, flat field and conversion back to a surface brightness
+    assert cal.meta["background"] == pytest.approx(20.0, rel=3e-3)
+    assert np.isfinite(forecasts[0].sky_fraction)

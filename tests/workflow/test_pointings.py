@@ -1,0 +1,126 @@
+"""Fields of several pointings: exposures, exposure times, and errors that follow them."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+from numpy.testing import assert_allclose
+
+from helpers.runs import do_stage, make_run, sky_image, small_config, thicker_half
+from miricigale.detector.effects.base import stream_key
+from miricigale.instrument import imager_columns
+from miricigale.photometry import ErrorModel
+from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.stages.exposures import (
+    exposure_plan,
+    grid_of,
+    mosaic_memory,
+    pointing_of,
+    pointing_time,
+    study_exposures,
+    study_pointings,
+)
+from miricigale.workflow.stages.sample import mean_coverage
+
+BAND = "miri.f770w"
+
+
+def field(**pointing):
+    return StudyConfig.from_dict(
+        {"pointing": pointing, "exposures": {"filters": [BAND, "miri.f2100w"]}}
+    )
+
+
+def test_one_pointing_is_what_it_was():
+    config = field()
+    (center,) = study_pointings(config)
+    assert (center.ra.deg, center.dec.deg) == (config.pointing.ra, config.pointing.dec)
+    exposures = study_exposures(config)
+    # the dithers of CEERS
+    assert list(exposures) == [f"{BAND}-{k}" for k in range(3)] + [
+        f"miri.f2100w-{k}" for k in range(6)
+    ]
+
+
+@pytest.mark.parametrize("pointing", [{"tiles": [2, 3]}, {"centers": [f"{k} 5" for k in range(6)]}])
+def test_every_exposure_of_a_field_is_its_own(pointing):
+    config, single = field(**pointing), study_exposures(field())
+    centers, exposures = study_pointings(config), study_exposures(config)
+    assert len(centers) == 6
+    assert len(exposures) == 6 * len(single)
+    assert all(name == f"{e.filter}-{e.dither}" for name, e in exposures.items())
+    # so that neither names nor random numbers are shared
+    keys = {stream_key(1, e, "read noise").tobytes() for e in exposures.values()}
+    assert len(keys) == len(exposures)
+    assert len({str(one) for one in exposure_plan(config).values()}) == len(exposures)
+    for name in config.exposures.filters:
+        own = [e for e in exposures.values() if e.filter == name]
+        assert [pointing_of(config, e) for e in own] == [
+            center for center in centers for _ in range(len(own) // 6)
+        ]
+        # the time of one pointing, not of the field
+        one = sum(e.exposure_time for e in single.values() if e.filter == name)
+        assert_allclose(pointing_time(config, name).to_value(u.s), one.to_value(u.s))
+
+
+def test_tiles_make_one_field_about_the_center():
+    config = field(tiles=[3, 2], overlap=0.15, ra=0.001)
+    sides = np.array(grid_of(config, 0.11).pixel_shape)
+    single = np.array(grid_of(field(ra=0.001), 0.11).pixel_shape)
+    first, last = imager_columns()
+    steps = sides - single
+    # north-up boxes about fields that are turned: the sum of both sides' projections
+    angle = np.radians(next(iter(study_exposures(config).values())).pa_aper.value)
+    wide, high = 2 * 0.85 * (last - first), 0.85 * 1024
+    expected = [
+        abs(wide * np.cos(angle)) + abs(high * np.sin(angle)),
+        abs(wide * np.sin(angle)) + abs(high * np.cos(angle)),
+    ]
+    assert_allclose(steps, expected, rtol=0.02)
+    middle = grid_of(config, 0.11).pixel_to_world(*(0.5 * (sides - 1)))
+    alone = grid_of(field(ra=0.001), 0.11).pixel_to_world(*(0.5 * (single - 1)))
+    assert middle.separation(alone) < 0.5 * u.arcsec
+
+
+def test_memory_follows_the_field():
+    """Fields of which some would not fit beside each other: by the area, not the number of bands."""
+    one, nine = (mosaic_memory(field(tiles=tiles), f"agn00/{BAND}") for tiles in ([1, 1], [3, 3]))
+    # of one pointing what the runner takes for a stage that says nothing
+    assert one == pytest.approx(1.2e9, rel=0.05)
+    pixels = [np.prod(grid_of(field(tiles=tiles), 0.06).pixel_shape) for tiles in ([1, 1], [3, 3])]
+    assert nine - one == 120 * (pixels[1] - pixels[0]) + 24 * 60_000_000
+
+
+def test_coverage_is_the_mean_about_a_source():
+    n_images = np.full((101, 101), 2, np.uint8)
+    n_images[:, 51:] = 4
+    # a pixel that a cosmic ray took, and a source off the image
+    n_images[20, 20] = 1
+    image = sky_image(0.1, n_images.shape, np.zeros(n_images.shape))
+    sky = image.wcs.pixel_to_world([20, 80, 20, 500], [50, 50, 20, 50])
+    found = mean_coverage(SkyCoord(sky), image, n_images)
+    assert_allclose(found[[0, 1, 3]], [2.0, 4.0, 0.0])
+    assert 1.98 < found[2] < 2.0
+
+
+@pytest.mark.parametrize("coverage", [True, False])
+def test_errors_of_a_run_follow_the_exposure_time(tmp_path, coverage):
+    """Half of the field exposed four times: the same fluxes have half of the errors there."""
+    make_run(tmp_path, [BAND], report=False)
+    n_images = thicker_half(tmp_path, BAND, 4)
+    values = {"errors": {"bin_size": 8, "coverage": coverage}}
+    config = StudyConfig.from_dict(values, base=small_config([BAND]))
+    do_stage(config, tmp_path, "errors")
+    do_stage(config, tmp_path, "matches", "agn00")
+    matched = QTable.read(tmp_path / "agn00" / "matched.ecsv")
+    matched = matched[np.isfinite(matched[BAND])]
+    shares = (matched[f"{BAND}_time"] / pointing_time(config, BAND)).to_value(u.one)
+    deep, shallow = shares == 4, shares == 1
+    assert n_images.max() == 4
+    assert np.count_nonzero(deep) > 5
+    assert np.count_nonzero(shallow) > 5
+    errors = ErrorModel.read(tmp_path / "errors.ecsv")
+    ratio = (matched[f"{BAND}_err"] / errors.sigma(matched[BAND], BAND)).to_value(u.one)
+    assert_allclose(ratio[deep], 0.5 if coverage else 1.0)
+    assert_allclose(ratio[shallow], 1.0)

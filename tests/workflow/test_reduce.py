@@ -1,0 +1,121 @@
+"""Files at several stages and of two filters to mosaics, from the command line."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData
+from astropy.table import Table
+
+from miricigale.cli import main
+from miricigale.detector import Detector
+from miricigale.instrument import Exposure, background_level
+from miricigale.reduction import Reducer, read_images, write_image
+from miricigale.utils.exceptions import MiricigaleWarning
+from miricigale.workflow import reduce_files
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Three dithers of F770W, one a rate; one of F1000W; and a file that is none."""
+    folder = tmp_path_factory.mktemp("exposures")
+    paths = []
+    for name, n_dithers in (("miri.f770w", 3), ("miri.f1000w", 1)):
+        for dither in range(n_dithers):
+            exposure = Exposure(
+                name,
+                n_groups=10,
+                subarray="SUB64",
+                pointing=SkyCoord(53.1344 + 1e-4 * dither, -27.8344, unit="deg"),
+                roll=30 * u.deg,
+                dither=dither,
+            )
+            light = np.full(exposure.shape, background_level(name).value)
+            light[30:33, 40:43] += 500
+            ramp = Detector.miri_imager().expose(CCDData(light, unit="MJy/sr"), exposure, seed=1)
+            stem = f"{name[5:]}_{dither}"
+            if dither == 1:
+                rate = Reducer().fit_ramp(ramp)
+                paths.append(write_image(rate, folder / f"{stem}_rate.fits"))
+            else:
+                paths.append(ramp.write(folder / f"{stem}_uncal.fits"))
+    broken = folder / "broken_uncal.fits"
+    broken.write_bytes(paths[0].read_bytes()[:30000])
+    return [*paths, broken]
+
+
+def test_all_stages_and_filters_in_one_go(files, tmp_path, capsys):
+    out = tmp_path / "out"
+    arguments = ["reduce", *map(str, files), "-o", str(out), "--no-progress"]
+    # the broken file is told, and the others are there
+    assert main(arguments) == 1
+    assert "broken_uncal.fits" in capsys.readouterr().out
+    table = Table.read(out / "files.ecsv")
+    assert list(table["status"]) == ["reduced"] * 4 + ["failed"] + ["reduced"] * 2
+    assert "truncated" in table["reason"][4]
+    assert table["reason"][5].startswith("a single dither: outliers cannot be rejected")
+    assert table["reason"][6] in ("", None, np.ma.masked)
+    page = (out / "index.html").read_text()
+    assert "broken_uncal.fits" in page
+    assert page.count("<img") == 2
+
+    # the mosaic is that of the classes
+    (file,) = read_images(out / "mosaic_f770w.fits")
+    result = Reducer().run(files[:3])
+    np.testing.assert_allclose(file.image.data, result.mosaic.data, rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(file.planes["CON"][0], result.n_images)
+    np.testing.assert_allclose(file.planes["WHT"], result.weight, rtol=1e-6)
+    np.testing.assert_allclose(file.planes["BKG"], result.mosaic_background.level, rtol=1e-5)
+    (cal,) = read_images(out / "f770w_0_cal.fits")
+    level = background_level("miri.f770w").value
+    assert np.median(cal.planes["BKG"]) == pytest.approx(level, rel=0.1)
+
+    # again, nothing is done; with another file, only what it changes
+    times = {path.name: path.stat().st_mtime_ns for path in out.glob("*.fits")}
+    assert main(arguments) == 1
+    assert times == {path.name: path.stat().st_mtime_ns for path in out.glob("*.fits")}
+    assert set(Table.read(out / "files.ecsv")["status"]) == {"kept", "failed"}
+    table = reduce_files([*files[:2], files[3]], out)
+    assert list(table["status"]) == ["kept"] * 3 + ["kept", "reduced"]
+    # and with other settings all
+    table = reduce_files(files[3:4], out, reducer=Reducer(box=16))
+    assert list(table["status"]) == ["reduced", "reduced"]
+
+
+def test_wrong_arguments_are_named(files, tmp_path, capsys):
+    with pytest.raises(ValueError, match="'paths' must be at least one file, got none"):
+        reduce_files([], tmp_path)
+    with pytest.raises(ValueError, match="files of different names, got two of f770w_0"):
+        reduce_files([files[0], tmp_path / "f770w_0_cal.fits"], tmp_path)
+    arguments = [
+        "reduce",
+        str(files[0]),
+        "-o",
+        str(tmp_path),
+        "--gain",
+        "4",
+        "--references",
+        "none",
+    ]
+    assert main(arguments) != 0
+    assert "only one of these" in capsys.readouterr().err
+
+
+def test_products_never_replace_what_they_are_made_of(files, tmp_path):
+    path = tmp_path / "a_rate.fits"
+    path.write_bytes(files[1].read_bytes())
+    table = reduce_files([path], tmp_path)
+    assert table["status"][0] == "failed"
+    assert "'folder' must be another one than that of the files" in table["reason"][0]
+    assert path.read_bytes() == files[1].read_bytes()
+
+
+def test_without_references_there_are_slopes_alone(files, tmp_path):
+    with pytest.warns(MiricigaleWarning, match="slopes without references for"):
+        table = reduce_files(files[:1], tmp_path, reducer=Reducer(references="none"))
+    assert list(table["status"]) == ["rate"]
+    assert table["reason"][0] == "no photometry without references"
+    (file,) = read_images(tmp_path / "f770w_0_rate.fits")
+    assert file.image.unit == u.adu / u.s
+    table = reduce_files(files[:1], tmp_path, reducer=Reducer(references="none"))
+    assert list(table["status"]) == ["kept"]

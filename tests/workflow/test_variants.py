@@ -1,0 +1,241 @@
+"""Variant images: what they have otherwise, and numbers that are changes of the same sources."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+
+from miricigale.evaluation import Report
+from miricigale.photometry import detect_sources
+from miricigale.psf import hst_psf
+from miricigale.scene import highres_image
+from miricigale.utils.exceptions import ConfigError
+from miricigale.workflow import Context
+from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.stages import study_stages, variants
+from miricigale.workflow.stages.exposures import grid_of, study_exposures
+from miricigale.workflow.stages.images import (
+    background_of,
+    expose_and_reduce,
+    imager_of,
+    mosaics_of,
+)
+from miricigale.workflow.stages.measure import measure_band
+from miricigale.workflow.truths import variant_changes
+
+STAGES = {stage.name: stage for stage in study_stages()}
+BAND, PRIOR = "miri.f2100w", "wfc3.f160w"
+
+
+def config_of(images="all", **sections):
+    exposures = {
+        "filters": [BAND], "kind": "rates", "n_groups": [10], "n_integrations": [4], "n_dithers": [1]
+    }  # fmt: skip
+    exposures |= sections.pop("exposures", {})
+    return StudyConfig.from_dict(
+        {
+            "exposures": exposures,
+            "fit": {"min_detected": 1},
+            "variants": {"images": images},
+            **sections,
+        }
+    )
+
+
+def test_each_variant_switches_one_thing_over():
+    assert variant_changes(config_of()) == {
+        "residual": {"detector": {"residual": "etc"}},
+        "gradient": {"scene": {"background_gradient": 0.0}},
+        "plane": {"reduction": {"background_plane": False}},
+    }
+    other = config_of(
+        ["plane", "residual"],
+        detector={"residual": 1e-3},
+        scene={"background_gradient": 0.0},
+        reduction={"background_plane": False},
+    )
+    assert variant_changes(other) == {
+        "residual": {"detector": {"residual": 0.0}},
+        "plane": {"reduction": {"background_plane": True}},
+    }
+    ramps = config_of("gradient", exposures={"kind": "ramps"}, scene={"background_gradient": 0.0})
+    assert variant_changes(ramps) == {
+        "rates": {},
+        "gradient": {"scene": {"background_gradient": 0.05}},
+    }
+    assert variant_changes(config_of([])) == {}
+    with pytest.raises(ConfigError, match=r"\[variants\] images must be one of"):
+        config_of("cosmic_rays")
+    with pytest.raises(ConfigError, match=r"\[variants\] images must not repeat"):
+        config_of(["plane", "plane"])
+
+
+def test_a_changed_configuration_differs_in_what_it_says():
+    config = config_of()
+    for changes in variant_changes(config).values():
+        own = variants.changed_config(config, changes)
+        for name in ("scene", "detector", "reduction", "pointing", "highres"):
+            known = dataclasses.asdict(getattr(config, name))
+            assert dataclasses.asdict(getattr(own, name)) == known | changes.get(name, {})
+    own = variants.changed_config(config, {"scene": {"background_gradient": 0.0}})
+    (exposure,) = study_exposures(config).values()
+    level = background_of(own, exposure).image(exposure.wcs, exposure.shape)
+    assert np.ptp(level) == 0
+    tilted = background_of(config, exposure).image(exposure.wcs, exposure.shape)
+    # 5 % for each of the 1.9 arcmin of the detector's sides, along a diagonal
+    assert 0.12 < np.ptp(tilted) / level[0, 0] < 0.14
+    names = [[type(e).__name__ for e in imager_of(c).effects] for c in (config, own)]
+    assert names[0] == names[1]
+    noisy = variants.changed_config(config, {"detector": {"residual": "etc"}})
+    assert [type(e).__name__ for e in imager_of(noisy).effects] == ["Residual", *names[0]]
+
+
+def test_nothing_else_of_a_study_depends_on_the_variants():
+    plain, config = config_of([]), config_of()
+    for name, stage in STAGES.items():
+        assert ("variants" in stage.sections) == (name == "report")
+        if name in ("variants", "report"):
+            continue
+        assert stage.unit_names(plain) == stage.unit_names(config)
+        for unit in stage.unit_names(plain):
+            assert stage.plan is None or stage.plan(config, unit) == stage.plan(plain, unit)
+    assert STAGES["variants"].unit_names(plain) == ()
+    assert STAGES["variants"].unit_names(config) == (BAND,)
+
+
+def made_truth(center):
+    rng = np.random.default_rng(3)
+    grid = np.meshgrid(np.linspace(-25, 25, 6), np.linspace(-25, 25, 6))
+    dx, dy = (a.ravel() + rng.uniform(-0.1, 0.1, a.size) for a in grid)
+    n = dx.size
+    truth = QTable({"id": np.arange(1, n + 1)})
+    truth["sky"] = center.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
+    truth["redshift"] = np.ones(n)
+    truth["profile"] = np.full(n, "point")
+    truth["half_light_radius"] = np.zeros(n) * u.arcsec
+    truth["sersic_index"] = truth["axis_ratio"] = np.ones(n)
+    truth["position_angle"] = np.zeros(n) * u.deg
+    truth[BAND] = rng.permutation(np.geomspace(3, 300, n)) * u.uJy
+    truth[PRIOR] = np.full(n, 30.0) * u.uJy
+    return truth
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Products up to the variants, of points 10 arcsec apart."""
+    folder, config = tmp_path_factory.mktemp("variants"), config_of(["residual", "gradient"])
+    truth = made_truth(SkyCoord(config.pointing.ra, config.pointing.dec, unit="deg"))
+    made = Context(config, folder)
+    made.save_table("agn00/truth.ecsv", truth)
+    psf = hst_psf(PRIOR, pixel_scale=0.06 * u.arcsec)
+    wcs = grid_of(config, config.highres.pixel_scale)
+    prior = highres_image(truth, filter=PRIOR, wcs=wcs, psf=psf, seed=1)
+    segmentation, detected = detect_sources(prior)
+    made.save_image("f160w.fits", prior)
+    made.save_image("segm.fits", prior, segmentation=np.asarray(segmentation.data, np.int32))
+    made.save_table("detections.ecsv", detected)
+    for name, unit in (("kernels", BAND), ("templates", ""), ("variants", BAND)):
+        STAGES[name].function(Context(config, folder, stage=STAGES[name], unit=unit), unit)
+    return folder
+
+
+def test_images_without_a_change_are_those_of_the_study(folder):
+    """A variant is the path of the study: exposed, reduced and measured, with the same seeds."""
+    config = config_of(["residual", "gradient"])
+    context = Context(config, folder, stage=STAGES["variants"], unit=BAND)
+    truth = QTable.read(folder / "agn00" / "truth.ecsv")
+    (exposure,) = study_exposures(config).values()
+    own = variants.changed_config(config, {"scene": {"background_gradient": 0.0}})
+    _, cal = expose_and_reduce(own, exposure, truth, seed=context.seed)
+    _, mosaic, _ = next(mosaics_of(own, [cal]))
+    study = measure_band(context, mosaic, BAND, "package").to_table()
+    table = QTable.read(folder / "variants" / "gradient" / f"{BAND}.ecsv")
+    found = np.isfinite(table[BAND])
+    assert found.sum() > 30
+    # detections that are no source are in the one table only
+    assert np.isin(table[BAND][found].value, study["flux"].value).all()
+
+
+def test_fluxes_of_all_images_are_the_true_ones(folder):
+    for name in ("residual", "gradient"):
+        table = QTable.read(folder / "variants" / name / f"{BAND}.ecsv")
+        found = np.isfinite(table[BAND]) & (table[f"{BAND}_true"] > 30 * u.uJy)
+        assert found.sum() > 10
+        off = (table[BAND] - table[f"{BAND}_true"])[found] / table[f"{BAND}_err"][found]
+        assert np.median(np.abs(off)) < 1.5
+
+
+def mock(n=400, seed=1):
+    """Study and variants with Gaussian errors: one as the study, one 1.5 times as noisy."""
+    rng = np.random.default_rng(seed)
+    true, noise = 10 ** rng.uniform(-1, 2, n), rng.normal(size=n)
+    matched = QTable({"id": np.arange(n), "selection": np.zeros(n, int)})
+    matched["selection"][:20] = 1
+    matched[f"{BAND}_true"] = true * u.uJy
+    matched[BAND] = (true + noise) * u.uJy
+    tables = {
+        "residual": QTable({BAND: (true + 1.5 * noise) * u.uJy}),
+        "gradient": QTable({BAND: (true + noise) * u.uJy}),
+    }
+    return matched, {name: {BAND: table} for name, table in tables.items()}
+
+
+def test_changes_are_of_the_same_sources():
+    matched, tables = mock()
+    # 5 sigma of unit errors
+    limit = float((5 * u.uJy).to_value(u.ABmag))
+    rows = variants.variant_numbers(matched, tables, {BAND: limit}, seed=3)
+    study, residual, gradient = rows
+    assert [row["images"] for row in rows] == ["study", "residual", "gradient"]
+    assert study["n"] == 380
+    assert study["limit"] == pytest.approx(limit, abs=4 * study["limit_err"])
+    assert study["scatter"] == pytest.approx(1, abs=4 * study["scatter_err"])
+    assert np.isnan(study["limit_change"])
+    # noise 1.5 times as large: 0.44 mag, better known than the limits
+    assert residual["limit_change"] == pytest.approx(-2.5 * np.log10(1.5), abs=0.02)
+    assert residual["limit_change_err"] < 0.5 * residual["limit_err"]
+    assert residual["scatter_change"] == pytest.approx(0.5, rel=1e-6)
+    assert (
+        gradient["limit_change"] == gradient["limit_change_err"] == gradient["scatter_change"] == 0
+    )
+    field = matched[20:]
+    found = np.count_nonzero(field[BAND].value > 5)
+    assert study["detected"] == pytest.approx(found, abs=12)
+    assert gradient["detected"] == study["detected"] > residual["detected"]
+    # of Gaussian errors half of the sources at the limit are lost, and few far above
+    assert residual["completeness"] < study["completeness"] < 1
+
+
+def test_variants_of_ramps_are_compared_with_rates():
+    matched, tables = mock()
+    tables = {"rates": tables["residual"], "residual": tables["residual"]}
+    rows = variants.variant_numbers(matched, tables, {BAND: 22.15}, seed=3)
+    assert rows["limit_change"][1] == pytest.approx(-2.5 * np.log10(1.5), abs=0.02)
+    assert rows["limit_change"][2] == 0
+
+
+def test_the_report_says_what_each_costs(tmp_path):
+    config = config_of(["residual", "gradient"])
+    matched, tables = mock()
+    context = Context(config, tmp_path)
+    for name, bands in tables.items():
+        context.save_table(f"variants/{name}/{BAND}.ecsv", bands[BAND])
+    report = Report("made up")
+    nothing = Context(config_of([]), tmp_path)
+    assert variants.write_variants(nothing, report, matched, {BAND: 22.15}) is None
+    numbers = variants.write_variants(context, report, matched, {BAND: 22.15})
+    page = report.to_html()
+    assert "residual noise</td>" in page
+    assert "without the gradient the limit changes by +0.00 ± 0.00 mag" in page
+    np.testing.assert_array_equal(
+        QTable.read(tmp_path / "report" / "variants.ecsv")["limit"], numbers["limit"]
+    )
+    reasons = {"limit.f2100w": "another field", "limit.f770w": "other"}
+    variants.add_reasons(reasons, numbers, config)
+    assert reasons["limit.f770w"] == "other"
+    told = reasons["limit.f2100w"]
+    assert told.startswith("another field; with the calculator's residual noise -0.4")
+    assert told.endswith("without the gradient +0.00 mag")
