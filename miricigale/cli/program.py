@@ -3,6 +3,7 @@
 import argparse
 import logging
 import os
+import signal
 import sys
 import threading
 
@@ -12,6 +13,9 @@ from miricigale.cli.exposures import add_reduce
 from miricigale.cli.study import add_compile, add_plan, add_run
 
 __all__ = ["command", "main"]
+
+# shells add the number of the signal to this
+_STOPPED = 128
 
 
 def _parser():
@@ -49,7 +53,7 @@ def main(argv=None):
     Returns
     -------
     status : int
-        0 if all went well, 2 for input that cannot be used, 130 if interrupted.
+        0 if all went well, 2 for input that cannot be used, 130 if interrupted, 143 if terminated.
     """
     parser = _parser()
     args = parser.parse_args(argv)
@@ -73,9 +77,9 @@ def main(argv=None):
         return 2
     try:
         return args.call(args)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         print(args.stopped(args), file=sys.stderr)
-        return 130
+        return _STOPPED + (stop.args[0] if stop.args else signal.SIGINT)
     except Exception as err:
         from astropy.units import UnitsError
 
@@ -94,11 +98,17 @@ def main(argv=None):
 
 def command():
     """Run `main` as the whole of a process; see there."""
+    # batch systems end a job by SIGTERM: it is left as by an interrupt, its lock taken off
+    signal.signal(signal.SIGTERM, _terminate)
     status = main()
     sys.stdout.flush()
     sys.stderr.flush()
     others = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
-    if status == 130 and not all(thread.daemon for thread in others):
+    if status > _STOPPED and not all(thread.daemon for thread in others):
         # threads in compiled code ignore interrupts, and the interpreter would wait for them
         os._exit(status)
     sys.exit(status)
+
+
+def _terminate(signum, frame):
+    raise KeyboardInterrupt(signum)

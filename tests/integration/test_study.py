@@ -84,11 +84,15 @@ def study(tmp_path_factory):
     before = product.stat().st_mtime_ns
     later = "agn00/exposures/miri.f1500w-0_cal.fits"
     interrupted = stopped(command, folder, later, signal.SIGINT)
+    terminated = stopped(command, folder, "agn00/photometry/miri.f770w.ecsv", signal.SIGTERM)
+    locked = (folder / "small" / "run.lock").exists()
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     return {
         "folder": folder / "small",
         "killed": killed,
         "interrupted": interrupted,
+        "terminated": terminated,
+        "locked": locked,
         "before": before,
         "after": product.stat().st_mtime_ns,
         "done": done,
@@ -97,9 +101,11 @@ def study(tmp_path_factory):
 
 def test_a_killed_and_a_stopped_run_go_on(study):
     assert study["killed"][0] == -signal.SIGKILL
-    status, message = study["interrupted"]
-    assert status == 130
-    assert "goes on from here" in message
+    for stop, number in (("interrupted", signal.SIGINT), ("terminated", signal.SIGTERM)):
+        status, message = study[stop]
+        assert status == 128 + number
+        assert "goes on from here" in message
+    assert not study["locked"]
     assert study["done"].returncode == 0, study["done"].stderr
     assert study["done"].stdout.strip().endswith("report/index.html")
     assert study["before"] == study["after"]
