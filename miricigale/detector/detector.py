@@ -400,7 +400,6 @@ class Detector:
     def _task(self, image, exposure, seed, previous):
         """Check what is exposed and gather what all its blocks share."""
         light = checked_light(image, exposure)
-        exposure.check_sky()
         seed = check_seed(seed)
         effects, included = self._acting(image)
         previous = self._previous(previous, exposure)

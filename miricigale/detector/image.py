@@ -27,11 +27,12 @@ def checked_light(image, exposure):
     `~astropy.units.UnitsError`
         If that is none of surface brightness.
     ValueError
-        If the image has another shape, filter or place on the sky than the exposure, masked
-        pixels, or values that are not finite or that are negative.
+        If the exposure has no filter or pointing, or the image another shape, filter or place on the
+        sky than the exposure, masked pixels, or values that are not finite or that are negative.
     """
     if not isinstance(exposure, Exposure):
         raise argument_error("exposure", "an Exposure", type(exposure).__name__)
+    exposure.check_sky()
     if isinstance(image, u.Quantity):
         image = NDData(image)
     if not isinstance(image, NDData) or image.unit is None:
