@@ -7,19 +7,22 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable, Table
 
-from miricigale.filters.band_names import band_filters, filter_of_band, is_line
+from miricigale.filters.band_names import band_filters, filter_of_band, given_filters, is_line
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 from miricigale.utils.files import read_table
+from miricigale.utils.missing import plain_floats, without_codes
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
 
 __all__ = ["cigale_columns", "read_cigale_catalog"]
 
-#: Values that stand for nothing, besides NaN and all below `THRESHOLD`.
-SENTINELS = (-99.0, -999.0)
+#: All below stands for nothing, besides NaN and the codes of `without_codes`.
 THRESHOLD = -9990.0
 #: Relative error of fluxes without a column of errors.
 DEFAULT_ERROR = 0.1
+
+#: What a warning says of bands without a filter.
+GIVE_FILTER = "names={'band': a Filter, the name of one, or the path of its file} gives it one"
 
 _OWN = ("id", "redshift", "distance")
 
@@ -40,9 +43,10 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
         band that has no column of errors.
     limits : bool, optional
         Whether negative errors mark upper limits; if not, such a band is missing.
-    names : dict of str to str, optional
-        Filters of bands that are not known, or otherwise known: CIGALE's name to ours (see
-        `~miricigale.filters.Filter.from_name`).
+    names : dict, optional
+        Filters of bands that are not known, or otherwise known: by CIGALE's name a
+        `~miricigale.filters.Filter`, the name of one, or the path of its file (wavelengths in Angstrom, as
+        CIGALE's files; see `~miricigale.filters.Filter.read`), which is called as the band.
     strict : bool, optional
         Whether a band without a filter is an error, not a warning.
 
@@ -64,11 +68,12 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     Warns
     -----
     `~miricigale.utils.exceptions.MiricigaleWarning`
-        Of bands and columns that are left out, all in one message.
+        Of bands and columns that are left out, and limits that are not positive, all in one message.
 
     Notes
     -----
-    Missing is a flux or error that is NaN, masked, -99, -999 or below -9990, and an error of 0.
+    Missing is a flux or error that is NaN, masked, below -9990, or -99, -99.9, -99.99, -999 and the like in the
+    file's unit, an error of 0, and an upper limit that is not positive.
     """
     path = Path(path)
     bands = None if bands is None else list(bands)
@@ -80,8 +85,9 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     chosen = _choose(path, table, bands)
     with_error = {error_column(name) for name in chosen}.intersection(bands or table.colnames)
     lines = [name for name in chosen if _is_flux_of_line(table[name])]
+    names = given_filters(names)
     try:
-        filters, lost = band_filters([name for name in chosen if name not in lines], names or {})
+        filters, lost = band_filters([name for name in chosen if name not in lines], names)
     except ValueError as err:
         msg = f"{path}: {err}"
         raise DataError(msg) from None
@@ -96,17 +102,17 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
     redshift = _numbers(path, table, "redshift")
     out["redshift"] = np.where(redshift >= 0, redshift, np.nan)
     if "distance" in table.colnames:
-        out["distance"] = _with_unit(path, table, "distance", u.Mpc)
-    no_error = []
+        distance = _numbers(path, table, "distance")
+        out["distance"] = _in_unit(path, table, "distance", distance, u.Mpc)
+    no_error, no_limit = [], []
     for name, band in filters.items():
-        flux = _missing(_with_unit(path, table, band, u.mJy).to_value(FNU), 1e3)
-        column = error_column(band)
-        if column in with_error:
-            error = _missing(_with_unit(path, table, column, u.mJy).to_value(FNU), 1e3)
-        else:
-            error = DEFAULT_ERROR * np.abs(flux)
+        column = error_column(band) if error_column(band) in with_error else None
+        flux, error = _fluxes(path, table, band, column)
+        if column is None:
             no_error.append(band)
-        _add_band(out, name, flux, error, limits)
+        n_lost = _add_band(out, name, flux, error, limits)
+        if n_lost:
+            no_limit.append(f"{band} {n_lost}")
         out[name].info.description = band
     out.meta["cigale"] = {
         "file": path.name,
@@ -115,9 +121,10 @@ def read_cigale_catalog(path, *, bands=None, limits=True, names=None, strict=Fal
         "left_out": left_out + other,
     }
     told = {
-        "left out, no filter here": left_out,
+        f"left out, no filter here ({GIVE_FILTER})": left_out,
         "left out, no bands": other,
         "10 % of the flux taken for the error": no_error,
+        "taken as missing, upper limits that are not positive": no_limit,
     }
     text = "; ".join(f"{what}: {', '.join(which)}" for what, which in told.items() if which)
     if strict and left_out:
@@ -179,44 +186,52 @@ def _is_flux_of_line(column):
     return is_line(column.name) or (unit is not None and unit.is_equivalent(u.W / u.m**2))
 
 
-def _missing(values, factor):
-    """Set values that stand for nothing to NaN; ``factor`` has brought them from mJy to uJy."""
-    bad = values < THRESHOLD * factor
-    for sentinel in SENTINELS:
-        # the file's own number times a unit: equal but for rounding
-        bad |= np.abs(values - sentinel * factor) <= 1e-9 * factor
-    return np.where(bad, np.nan, values)
+def _fluxes(path, table, band, column):
+    """Flux and error of a band in uJy, NaN where they are missing; 10 % of the flux without a column."""
+    values = _numbers(path, table, band)
+    errors = None if column is None else _numbers(path, table, column)
+    missing, no_error = without_codes(values, errors)
+    flux = np.where(missing | (values < THRESHOLD), np.nan, values)
+    flux = _in_unit(path, table, band, flux, u.mJy).to_value(FNU)
+    if errors is None:
+        return flux, DEFAULT_ERROR * np.abs(flux)
+    errors = np.where(no_error | (errors < THRESHOLD), np.nan, errors)
+    return flux, _in_unit(path, table, column, errors, u.mJy).to_value(FNU)
 
 
 def _add_band(out, name, flux, error, limits):
+    """Add the columns of a band; how many upper limits are not positive."""
     limit = error < 0
     gone = ~np.isfinite(flux) | ~np.isfinite(error) | (error == 0)
     if not limits:
         gone |= limit
+    limit &= ~gone
+    # no object is fainter than nothing
+    nothing = limit & (flux <= 0)
+    gone |= nothing
     limit &= ~gone
     out[name] = np.where(gone, np.nan, flux) * FNU
     out[error_column(name)] = np.where(gone, np.nan, np.abs(error)) * FNU
     if np.any(limit):
         out[f"{name}_limit"] = limit
         out[f"{name}_limit"].info.description = "whether the flux is an upper limit"
+    return np.count_nonzero(nothing)
 
 
 def _numbers(path, table, name):
     """Column as floats, NaN where masked."""
-    column = table[name]
     try:
-        values = np.array(np.ma.getdata(column), dtype=float)
-    except (TypeError, ValueError):
+        return plain_floats(table[name], name, path)
+    except ValueError:
         msg = f"{path}: the column {name!r} holds something else than numbers"
         raise DataError(msg) from None
-    values[np.broadcast_to(np.ma.getmaskarray(column), values.shape)] = np.nan
-    return values
 
 
-def _with_unit(path, table, name, default):
+def _in_unit(path, table, name, values, default):
+    """Numbers of a column in its unit, or the default one where it has none, converted to that."""
     unit = table[name].unit or default
     try:
-        return (_numbers(path, table, name) * u.Unit(unit)).to(default)
+        return (values * u.Unit(unit)).to(default)
     except (u.UnitConversionError, TypeError, ValueError):
         msg = f"{path}: the column {name!r} must be convertible to {default}, got {unit}"
         raise DataError(msg) from None

@@ -26,6 +26,9 @@ _WITHOUT_EFFECT = {
     "redshifting": ("redshift",),
 }
 
+#: Names of parameters in files of older versions, and those of today.
+_OLD_NAMES = {"sfhdelayed": {"age": "age_main"}}
+
 
 @dataclass
 class Chain:
@@ -46,8 +49,10 @@ class Module:
 
     def __init__(self, name, values, chain, *, folder, libraries):
         self.name, self.chain, self.folder, self.libraries = name, chain, folder, libraries
-        self._values = dict(values)
+        old = {k: new for k, new in _OLD_NAMES.get(name, {}).items() if new not in values}
+        self._values = {old.get(key, key): value for key, value in values.items()}
         self._taken = set(_WITHOUT_EFFECT.get(name, ()))
+        self._lacking, self._factors = [], {}
 
     def label(self, key):
         return f"{self.name}.{key}"
@@ -90,9 +95,20 @@ class Module:
         self._taken.update(keys)
 
     def rest(self):
-        """Report the parameters of the module that nothing here takes."""
+        """
+        Report the parameters of the module that nothing here takes, and the defaults that are taken.
+
+        Both at once may be one parameter under another name: that is a `ConfigError`.
+        """
         lost = [self.label(key) for key in self._values if key not in self._taken]
+        if lost and self._lacking:
+            keys = ", ".join(key for key, _ in self._lacking)
+            msg = f"{', '.join(lost)}: not known here, while defaults would be taken for {keys}"
+            raise ConfigError(msg)
         self.chain.left_out.extend(lost)
+        if self._lacking and self._values:
+            text = ", ".join(f"{key} = {value:g}" for key, value in self._lacking)
+            self.chain.differs.append(f"{self.name}: not in the file, the defaults here: {text}")
 
     def add(self, kind, values, *, why=None, **options):
         """
@@ -104,6 +120,7 @@ class Module:
         defaults = {}
         for name, (key, numbers) in values.items():
             if numbers is None:
+                self._lacking.append((key, declared[name].default * self._factors.get(name, 1.0)))
                 continue
             numbers = self._inside(declared[name], key, numbers)
             if numbers.size > 1:
@@ -135,6 +152,7 @@ class Module:
         # in the order of the names there, which is that of the axes of a grid
         for name in sorted(declared, key=[*names, *declared].index):
             theirs, _, factor = names.get(name, (name, None, 1.0))
+            self._factors[name] = factor
             key = _KEYS.get(name, theirs.rpartition(".")[2])
             numbers = self.numbers(key)
             out[name] = (key, None if numbers is None else numbers / factor)

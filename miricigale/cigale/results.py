@@ -8,6 +8,7 @@ from astropy.table import QTable, Table
 
 from miricigale.cigale.names import cigale_names, unit_of
 from miricigale.filters.band_names import cigale_band, filter_of_band
+from miricigale.fitting import FitFlags
 from miricigale.utils.exceptions import DataError, argument_error, unknown_name
 from miricigale.utils.files import read_table
 from miricigale.utils.store import replacing
@@ -51,11 +52,14 @@ def write_cigale_results(
 
     Notes
     -----
-    The columns are ``id``; ``bayes.X`` and ``bayes.X_err``, posterior means and standard
-    deviations; those of the bands' fluxes; ``best.chi_square`` and ``best.reduced_chi_square``
-    (by the number of bands less one); ``best.X``, quantities of the best model, also of
-    parameters that have one value; ``best.<band>``. Units are CIGALE's: Myr, Msun, Msun/yr, W,
-    mag, nm, deg, mJy.
+    ``left out``, ``replaced`` and ``differs`` of ``results.meta["cigale"]`` (`CigaleSetup.describe`) and the
+    meaning of the flags stand as comments in the header, or in lines with ``#`` above a text table.
+
+    The columns are ``id``; ``flags`` (`~miricigale.fitting.FitFlags`); ``bayes.X`` and ``bayes.X_err``,
+    posterior means and standard deviations; those of the bands' fluxes; ``best.chi_square`` and
+    ``best.reduced_chi_square`` (by the number of bands less one); ``best.X``, quantities of the best model, also
+    of parameters that have one value; ``best.<band>``. Units are CIGALE's: Myr, Msun, Msun/yr, W, mag, nm, deg,
+    mJy.
     """
     note = results.meta.get("cigale", {})
     modules = note.get("modules", {}) if modules is None else modules
@@ -63,6 +67,7 @@ def write_cigale_results(
     columns = _columns(results, cigale_names(modules), variables)
     table = Table()
     table["id"] = np.array(results.ids)
+    table["flags"] = np.array(results.flags)
     for name, (mean, std, _, unit) in columns.items():
         if mean is not None:
             table[f"bayes.{name}"] = u.Quantity(mean, unit)
@@ -80,10 +85,18 @@ def write_cigale_results(
         table[f"best.{name}"] = u.Quantity(best, unit)
     for name, band in written.items():
         table[f"best.{band}"] = fluxes[f"{name}_best"].to(u.mJy)
+    table.meta["comments"] = [*described(note), f"flags: {FitFlags.describe()}"]
     text = Path(path).suffix.lower() == ".txt"
     form = {"format": "ascii.fixed_width", "delimiter": None} if text else {"format": "fits"}
     with replacing(path, overwrite=overwrite) as partial:
         table.write(partial, **form)
+
+
+def described(note):
+    """Lines that say what of a run of CIGALE is left out, replaced or different, by lists under these names."""
+    for name in ("left_out", "replaced", "differs"):
+        if note.get(name):
+            yield f"{name.replace('_', ' ')}: {'; '.join(note[name])}"
 
 
 def _columns(results, names, variables):

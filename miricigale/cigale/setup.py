@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from miricigale.cigale.catalog import read_cigale_catalog
+from miricigale.cigale.catalog import GIVE_FILTER, read_cigale_catalog
 from miricigale.cigale.ini import LIMIT_FLAGS, parse_ini
 from miricigale.cigale.modules import read_modules
 from miricigale.cigale.names import cigale_names
-from miricigale.cigale.results import write_cigale_results
-from miricigale.filters.band_names import band_filters
+from miricigale.cigale.results import described, write_cigale_results
+from miricigale.filters.band_names import band_filters, given_filters
+from miricigale.filters.filter_set import FilterSet
 from miricigale.fitting import BayesFitter, FitResults
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError, MiricigaleWarning, argument_error
@@ -63,7 +64,7 @@ class CigaleSetup:
     left_out, replaced, differs : tuple of str
         What there is no counterpart of, what something else stands in for, and conventions
         that differ.
-    names : dict of str to str
+    names : dict of str to `~miricigale.filters.Filter`
         Filters that the user gave for bands, by CIGALE's names.
     """
 
@@ -94,8 +95,7 @@ class CigaleSetup:
 
     def describe(self):
         """Say what is left out, replaced and different, a line each; "" if nothing is."""
-        lists = {"left out": self.left_out, "replaced": self.replaced, "differs": self.differs}
-        return "\n".join(f"{name}: {'; '.join(items)}" for name, items in lists.items() if items)
+        return "\n".join(described(vars(self)))
 
     def model(self):
         """Make the `~miricigale.sed.SEDModel`."""
@@ -170,6 +170,19 @@ class CigaleSetup:
             path, bands=self.columns, limits=self.limits, names=self.names, strict=strict
         )
 
+    def filters(self, names=None):
+        """
+        Filters of bands: a `~miricigale.filters.FilterSet`.
+
+        Parameters
+        ----------
+        names : iterable of str, optional
+            Our names; those of ``bands`` and ``predicted`` by default.
+        """
+        given = {one.name: one for one in self.names.values()}
+        names = [*self.bands, *self.predicted] if names is None else names
+        return FilterSet([given.get(name, name) for name in names])
+
     def fitter(self, photometry, *, compat="cigale", **options):
         """
         Make the fitter, and the grid with the redshifts of the objects.
@@ -193,7 +206,7 @@ class CigaleSetup:
             wanted = f"a table with at least one of the columns {list(self.bands)}"
             raise argument_error("photometry", wanted, f"columns {photometry.colnames}")
         redshifts = photometry["redshift"] if "redshift" in photometry.colnames else None
-        grid = self.model().grid(self.axes(redshifts), [*have, *self.predicted])
+        grid = self.model().grid(self.axes(redshifts), self.filters([*have, *self.predicted]))
         options = {"model_error": self.additional_error} | options
         if compat is not None:
             options["compat"] = compat
@@ -280,8 +293,9 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     libraries : {"best", "bundled"}, optional
         Whether libraries that are registered (`miricigale.sed`) are used, or the bundled tables
         alone.
-    names : dict of str to str, optional
-        Filters of bands that are not known, or otherwise known: CIGALE's name to ours.
+    names : dict, optional
+        Filters of bands that are not known, or otherwise known: by CIGALE's name a
+        `~miricigale.filters.Filter`, the name of one, or the path of its file, as for `read_cigale_catalog`.
     strict : bool, optional
         Whether anything that is left out or replaced is an error, not a warning.
 
@@ -292,10 +306,12 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
-        If the file cannot be read.
+        If the file, or that of a filter, cannot be read.
+    KeyError
+        If there is no filter of a name in ``names``.
     `~miricigale.utils.exceptions.ConfigError`
-        If a value cannot be read, nothing can be fitted, or with ``strict``, something would be
-        left out or replaced.
+        If a value cannot be read, a parameter is not known while one that is would get its default, nothing
+        can be fitted, or with ``strict``, something would be left out or replaced.
 
     Warns
     -----
@@ -307,6 +323,7 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         raise argument_error("libraries", "'best' or 'bundled'", repr(libraries))
     config = parse_ini(path)
     analysis = config["analysis_params"]
+    names = given_filters(names)
     if config["parameters_file"]:
         msg = f"{path}: lists of models (parameters_file) are not read, grids are"
         raise ConfigError(msg)
@@ -317,11 +334,10 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
             folder=path.parent,
             libraries=libraries,
         )
-        names = dict(names or {})
         columns = config["bands"]
         bands, lost = band_filters(dict.fromkeys(c.removesuffix("_err") for c in columns), names)
         wanted = [band for band in analysis["bands"] if band not in bands.values()]
-        predicted, _ = band_filters(dict.fromkeys(wanted), names)
+        predicted, more = band_filters(dict.fromkeys(wanted), names)
     except (ConfigError, ValueError) as err:
         msg = f"{path}: {err}"
         raise ConfigError(msg) from err
@@ -336,10 +352,13 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     variables = analysis["variables"]
     chain.left_out[:] = [
         *(f"module {x}" if "." not in x and " " not in x else x for x in chain.left_out),
-        *(f"band {x}" for x in lost),
+        *_bands_without_filter(dict.fromkeys([*lost, *more])),
         *(f"variable {x}" for x in variables if x not in known),
         *(f"property {x}" for x in config["properties"] if not x.endswith("_err")),
     ]
+    extended = [x for x in {**bands, **predicted}.values() if x.endswith("_ext") and x not in names]
+    if extended:
+        chain.differs.append(f"bands {', '.join(extended)}: curves of point sources")
     flag = analysis["lim_flag"]
     if flag == "noscaling":
         chain.differs.append("lim_flag noscaling: upper limits act on the scale too, as with full")
@@ -365,6 +384,12 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
     if text:
         warnings.warn(f"{path}:\n{text}", MiricigaleWarning, stacklevel=2)
     return setup
+
+
+def _bands_without_filter(bands):
+    """Items of what is left out; the last one says what to do."""
+    items = [f"band {band}" for band in bands]
+    return [*items[:-1], f"{items[-1]} (no filter here: {GIVE_FILTER})"] if items else []
 
 
 def fit_cigale(ini, *, output=None, libraries="best", names=None, strict=False, **options):

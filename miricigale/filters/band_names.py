@@ -1,12 +1,15 @@
 """Names of bands: of CIGALE, old and new, and of surveys, for ours."""
 
+import os
 import re
 from functools import cache
+from pathlib import Path
 
 from miricigale.filters.filter import Filter
 from miricigale.filters.library import SEDPY, curve_folder
+from miricigale.utils.exceptions import argument_error
 
-__all__ = ["band_filters", "cigale_band", "filter_of_band", "is_line"]
+__all__ = ["band_filters", "cigale_band", "filter_of_band", "given_filters", "is_line"]
 
 #: Names without a rule: CIGALE's to ours.
 _NAMES = {
@@ -21,6 +24,13 @@ _NAMES = {
     "herschel.spire.PSW": "sedpy.herschel_spire_250",
     "herschel.spire.PMW": "sedpy.herschel_spire_350",
     "herschel.spire.PLW": "sedpy.herschel_spire_500",
+    # the curves of extended sources, which differ by the beam's area along the band
+    "PSW_ext": "sedpy.herschel_spire_250",
+    "PMW_ext": "sedpy.herschel_spire_350",
+    "PLW_ext": "sedpy.herschel_spire_500",
+    "herschel.spire.PSW_ext": "sedpy.herschel_spire_250",
+    "herschel.spire.PMW_ext": "sedpy.herschel_spire_350",
+    "herschel.spire.PLW_ext": "sedpy.herschel_spire_500",
     "MIPS1": "mips.24",
     "MIPS2": "mips.70",
     "MIPS3": "mips.160",
@@ -30,8 +40,6 @@ _NAMES = {
     "cfht.wircam.H": "sedpy.cfht_wircam_H_8201",
     "cfht.wircam.Ks": "sedpy.cfht_wircam_Ks_8302",
     "WIRCAM_K": "sedpy.cfht_wircam_Ks_8302",
-    "WIRCAM_J": "sedpy.cfht_wircam_J_8101",
-    "WIRCAM_H": "sedpy.cfht_wircam_H_8201",
     "MOSAIC_U": "sedpy.mayall_mosaic_U_k1001",
 }
 
@@ -56,7 +64,6 @@ _RULES = (
     (r"(?:sdss|SDSS)\.([ugriz])p?", "sedpy.sdss_{0}0", "sdss.{}p"),
     (r"2mass\.(J|H|Ks)", "sedpy.twomass_{0}", "2mass.{}"),
     (r"WISE([1-4])", "sedpy.wise_w{0}", "WISE{}"),
-    (r"wise\.[wW]([1-4])", "sedpy.wise_w{0}", "WISE{}"),
     (r"ukirt\.(?:wfcam\.)?(J|H|K)", "sedpy.ukirt_wfcam_{0}", "ukirt.{}"),
     (r"vista\.vircam\.(Z|Y|J|H|Ks)", "sedpy.vista_vircam_{0}", "vista.vircam.{}"),
     (r"subaru\.hsc\.([grizy])", "sedpy.hsc_{0}", "subaru.hsc.{}"),
@@ -66,33 +73,53 @@ _RULES = (
     # the older, short names
     (rf"(F(?:{_MIRI}))", "miri.{1}", None),
     (rf"(F(?:{_NIRCAM}))", "nircam.{1}", None),
-    (r"(?:ACS|acs)_([Ff]\d+(?:[Ww]|LP|lp))", "acs.{1}", None),
     (r"(?:WFC3|wfc3|HST-WFC3_IR\.)_?([Ff](?:098[Mm]|1\d\d[Ww]))", "wfc3.{1}", None),
     (r"(F\d+W)_UVIS_CHIP[12]", "sedpy.wfc3_uvis_{1}", None),
-    (r"IRAC([1-4])", "irac.ch{0}", None),
-    (r"irac_i([1-4])", "irac.ch{0}", None),
-    (r"(?:mips|MIPS)_?(24|70|160)", "mips.{0}", None),
-    (r"(?:megacam|MEGACAM)_([ugriz])", "megacam.{0}", None),
     (r"([ugriz])_prime", "sedpy.sdss_{0}0", None),
-    (r"SDSS_([ugriz])", "sedpy.sdss_{0}0", None),
     (r"(J|H|Ks)_2mass", "sedpy.twomass_{0}", None),
-    (r"(?:WFCAM|ukidss)_(J|H|K)", "sedpy.ukirt_wfcam_{0}", None),
-    (r"(?:DES|decam|DECam|DECAM)_([ugrizY])", "sedpy.decam_{0}", None),
-    (r"(?:PAN-STARRS|gpc1)_([grizy])", "sedpy.panstarrs_{0}", None),
-    (r"HSC_([grizy])", "sedpy.hsc_{0}", None),
     (r"LSST_([ugrizy])", "sedpy.lsst_baseline_{0}", None),
     (r"([UBVRI])_B90", "sedpy.bessell_{0}", None),
     # those of CANDELS and COSMOS
-    (r"IRAC_CH([1-4])", "irac.ch{0}", None),
     (r"CFHT_([ugriz])", "megacam.{0}", None),
-    (r"NEWFIRM_(J[123]|H[12]|K)", "newfirm.{1}", None),
     (r"ISAAC_(J|H)", "sedpy.vlt_isaac_{0}", None),
-    (r"UVISTA_(Y|J|H|Ks)", "sedpy.vista_vircam_{0}", None),
     (r"SC_I[AB](\d{3})", "sedpy.subaru_suprimecam_ia{0}", None),
     (r"SC_(B|V|rp|ip|zp)", "sedpy.subaru_suprimecam_{0}", None),
-    (r"GALEX_(FUV|NUV)", "sedpy.galex_{0}", None),
 )
 _COMPILED = tuple((re.compile(rule), ours, back) for rule, ours, back in _RULES)
+
+#: Instruments whose names are written in many ways, in any case and with any of . _ between the parts;
+#: the last part is the band, {} in our name, written as the curve is.
+_FREE = tuple(
+    (re.compile(rule, re.IGNORECASE), ours)
+    for rule, ours in (
+        (r"(?:jwst[._-])?nircam[._-]?(F\d+[WMN]2?)", "nircam.{}"),
+        (r"(?:jwst[._-])?miri[._-]?(F\d+W)", "miri.{}"),
+        (r"(?:hst[._-])?(?:wfc3|wfc3[._-]ir)[._-](F\d+[WM])", "wfc3.{}"),
+        (r"(?:hst[._-])?(?:wfc3[._-])?uvis[._-](F\d+W)", "sedpy.wfc3_uvis_{}"),
+        (r"(?:hst[._-])?(?:acs|acs[._-]wfc|wfc)[._-](F\d+(?:W|LP))", "acs.{}"),
+        (r"(?:spitzer[._-])?irac[._-]?(?:ch|i)?([1-4])", "irac.ch{}"),
+        (r"(?:spitzer[._-])?mips[._-]?(24|70|160)", "mips.{}"),
+        (r"(?:herschel[._-])?pacs[._-]?(70|100|160)", "sedpy.herschel_pacs_{}"),
+        (r"(?:herschel[._-])?spire[._-]?(250|350|500)", "sedpy.herschel_spire_{}"),
+        (r"(?:cfht[._-])?megacam[._-]([ugriz])", "megacam.{}"),
+        (r"(?:cfht[._-])?wircam[._-](J)", "sedpy.cfht_wircam_{}_8101"),
+        (r"(?:cfht[._-])?wircam[._-](H)", "sedpy.cfht_wircam_{}_8201"),
+        (r"(?:cfht[._-])?wircam[._-](K)s?", "sedpy.cfht_wircam_{}s_8302"),
+        (r"(?:ctio[._-]|blanco[._-])?(?:des|decam)[._-]([ugrizY])", "sedpy.decam_{}"),
+        (r"(?:pan-?starrs1?|ps1|gpc1)[._-](?:ps1[._-]|gpc1[._-])?([grizy])", "sedpy.panstarrs_{}"),
+        (r"(?:subaru[._-])?hsc[._-]([grizy])", "sedpy.hsc_{}"),
+        (r"(?:mayall[._-]|kpno[._-])?newfirm[._-](J[123]|H[12]|K)", "newfirm.{}"),
+        (
+            r"(?:vista[._-]vircam|uvista|ultravista|vista|vircam|video|viking|vhs)[._-](Z|Y|J|H|Ks)",
+            "sedpy.vista_vircam_{}",
+        ),
+        (r"(?:ukidss|ukirt|(?:ukirt[._-])?wfcam)[._-](J|H|K)", "sedpy.ukirt_wfcam_{}"),
+        (r"(?:2mass|twomass)[._-](J|H|Ks)", "sedpy.twomass_{}"),
+        (r"wise[._-]?w?([1-4])", "sedpy.wise_w{}"),
+        (r"galex[._-](FUV|NUV)", "sedpy.galex_{}"),
+        (r"sdss[._-]([ugriz])", "sedpy.sdss_{}0"),
+    )
+)
 
 
 @cache
@@ -114,7 +141,8 @@ def filter_of_band(band):
     Parameters
     ----------
     band : str
-        A name of CIGALE's, such as ``IRAC1``, ``spitzer.irac.ch1`` or ``F770W``, or one of ours.
+        A name of CIGALE's, such as ``IRAC1``, ``spitzer.irac.ch1`` or ``F770W``, one of ours, or the
+        instrument and the band in any usual form (``VISTA_Ks``, ``decam.g``, ``newfirm_J1``).
 
     Returns
     -------
@@ -125,12 +153,24 @@ def filter_of_band(band):
         return band
     if band in _NAMES:
         return _NAMES[band]
+    name = _by_rule(band)
+    if name is not None:
+        return name
+    for rule, ours in _FREE:
+        match = rule.fullmatch(band)
+        written = (match[1].lower(), match[1].upper(), match[1].capitalize()) if match else ()
+        for name in map(ours.format, written):
+            if _is_here(name):
+                return name
+    return None
+
+
+def _by_rule(band):
+    """Filter of a band by CIGALE's own names, as they are written there; None if there is none."""
     for rule, ours, _ in _COMPILED:
         match = rule.fullmatch(band)
-        if match is None:
-            continue
-        name = ours.format(match[1], match[1].lower())
-        if _is_here(name):
+        name = None if match is None else ours.format(match[1], match[1].lower())
+        if name is not None and _is_here(name):
             return name
     return None
 
@@ -161,7 +201,7 @@ def cigale_band(name):
             part = name[len(start) : len(name) - len(end)]
             for written in dict.fromkeys((part, part.upper())):
                 band = back.format(written)
-                if filter_of_band(band) == name:
+                if _by_rule(band) == name:
                     return band
     return name
 
@@ -175,12 +215,14 @@ def band_filters(bands, known):
     """
     Filters of bands: a dict of our name to CIGALE's, and the bands without a filter here.
 
-    ``known`` are filters that the user gave by CIGALE's names. Emission lines have no filter; two bands
-    of the same filter are a ValueError.
+    ``known`` are filters that the user gave by CIGALE's names, as `given_filters` has them. Emission lines
+    have no filter; two bands of the same filter are a ValueError.
     """
     filters, lost = {}, []
     for band in bands:
-        name = None if is_line(band) else known.get(band, filter_of_band(band))
+        given = known.get(band)
+        name = filter_of_band(band) if given is None else given.name
+        name = None if is_line(band) else name
         if name is None:
             lost.append(band)
         elif name in filters:
@@ -189,3 +231,46 @@ def band_filters(bands, known):
         else:
             filters[name] = band
     return filters, lost
+
+
+def given_filters(names):
+    """
+    Filters that a user gave for bands.
+
+    Parameters
+    ----------
+    names : dict of str to `~miricigale.filters.Filter`, str or path-like, or None
+        By the band's name a filter, the name of one here, or the path of its file (see `Filter.read`); the
+        filter of a file has the name of the band.
+
+    Returns
+    -------
+    filters : dict of str to `~miricigale.filters.Filter`
+
+    Raises
+    ------
+    KeyError
+        If there is no filter of a name.
+    `~miricigale.utils.exceptions.DataError`
+        If a file cannot be read as a filter.
+    ValueError
+        If a value is something else.
+    """
+    out = {}
+    for band, given in (names or {}).items():
+        if isinstance(given, Filter):
+            out[band] = given
+        elif isinstance(given, os.PathLike) or (isinstance(given, str) and _is_path(given)):
+            out[band] = Filter.read(Path(given).expanduser(), name=band)
+        elif isinstance(given, str):
+            out[band] = Filter.from_name(filter_of_band(given) or given)
+        else:
+            wanted = f"a dict whose value for {band!r} is a Filter, the name of one or the path of its file"
+            raise argument_error("names", wanted, type(given).__name__)
+    return out
+
+
+def _is_path(text):
+    if filter_of_band(text) is not None:
+        return False
+    return os.sep in text or Path(text).suffix in (".dat", ".txt", ".par") or Path(text).is_file()

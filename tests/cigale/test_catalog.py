@@ -196,6 +196,22 @@ def test_refused(tmp_path, content, wanted):
         ("subaru.suprime.IB427", "sedpy.subaru_suprimecam_ia427", 0.426),
         ("subaru.hsc.y", "sedpy.hsc_y", 0.98),
         ("V_B90", "sedpy.bessell_V", 0.55),
+        # as their users write them
+        ("cfht.wircam.Ks", "sedpy.cfht_wircam_Ks_8302", 2.15),
+        ("CFHT_wircam_J", "sedpy.cfht_wircam_J_8101", 1.25),
+        ("decam.g", "sedpy.decam_g", 0.48),
+        ("DECam_Y", "sedpy.decam_Y", 0.99),
+        ("panstarrs.i", "sedpy.panstarrs_i", 0.75),
+        ("PS1_y", "sedpy.panstarrs_y", 0.96),
+        ("newfirm.J1", "newfirm.j1", 1.05),
+        ("mayall.newfirm.K", "newfirm.k", 2.17),
+        ("VISTA_Ks", "sedpy.vista_vircam_Ks", 2.15),
+        ("VIRCAM_Y", "sedpy.vista_vircam_Y", 1.02),
+        ("PSW_ext", "sedpy.herschel_spire_250", 250.0),
+        ("SPIRE_350", "sedpy.herschel_spire_350", 350.0),
+        ("HSC-g", "sedpy.hsc_g", 0.48),
+        ("HST_ACS_F606W", "acs.f606w", 0.592),
+        ("MIRI_F770W", "miri.f770w", 7.64),
     ],
 )
 def test_bands(band, name, pivot):
@@ -204,7 +220,7 @@ def test_bands(band, name, pivot):
 
 
 def test_bands_without_a_curve():
-    for band in ("xray_boxcar_2to12keV", "VLA_L", "scuba.850", "jwst.miri.F999W", "F814W"):
+    for band in ("xray_boxcar_2to12keV", "VLA_L", "IRAS1", "N60", "jwst.miri.F999W", "F814W"):
         assert filter_of_band(band) is None
 
 
@@ -233,3 +249,58 @@ def test_a_catalog_of_sources_in_cigales_names(tmp_path):
     path.write_text("id redshift IRAC1 irac_i1\n1 0.5 1 1\n")
     with pytest.raises(DataError, match=r"are both the filter irac\.ch1"):
         cigale_columns(path)
+
+
+def box(path, low, high):
+    """A filter file of CIGALE, from ``low`` to ``high`` um."""
+    rows = [(low, 0), (low * 1.001, 1), (high * 0.999, 1), (high, 0)]
+    lines = [f"{wave * 1e4:.8g} {value}" for wave, value in rows]
+    path.write_text("\n".join(["# IRAS 12", "# energy", "# a box", *lines]) + "\n")
+    return path
+
+
+def test_a_band_takes_the_filter_that_is_given(tmp_path):
+    path = tmp_path / "galaxies.txt"
+    path.write_text("# id redshift IRAS1 IRAS1_err IRAC1 IRAC1_err\na 0.5 3 0.1 2 0.1\n")
+    with pytest.warns(MiricigaleWarning, match=r"IRAS1.*names=|names=.*IRAS1"):
+        table = read_cigale_catalog(path)
+    assert table.colnames == ["id", "redshift", "irac.ch1", "irac.ch1_err"]
+    curve = box(tmp_path / "iras12.dat", 8.0, 15.0)
+    mine = Filter.read(curve, name="iras.12")
+    for given, name in ((str(curve), "IRAS1"), (curve, "IRAS1"), (mine, "iras.12")):
+        table = read_cigale_catalog(path, names={"IRAS1": given})
+        assert table[name].value.tolist() == [3000.0]
+    table = read_cigale_catalog(path, names={"IRAS1": "sedpy.wise_w3"})
+    assert "sedpy.wise_w3" in table.colnames
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "wanted"),
+    [
+        ("none.dat", DataError, "none.dat cannot be read"),
+        ("miri.f707w", KeyError, "miri.f770w"),
+        (12.0, ValueError, r"'names' must be .* 'IRAS1' is a Filter, .* got float"),
+    ],
+)
+def test_a_wrong_filter_is_told_when_it_is_read(tmp_path, given, error, wanted):
+    path = tmp_path / "galaxies.txt"
+    path.write_text("# id redshift IRAS1 IRAS1_err\na 0.5 3 0.1\n")
+    with pytest.raises(error, match=wanted):
+        read_cigale_catalog(path, names={"IRAS1": given})
+
+
+def test_codes_and_limits_that_are_not_positive_are_missing(tmp_path):
+    """-99.99 with -99.99, as real catalogs have it, is no upper limit of -99.99 mJy."""
+    path = tmp_path / "galaxies.txt"
+    path.write_text(
+        "# id redshift IRAC1 IRAC1_err IRAC2 IRAC2_err\n"
+        "a 0.5 -99.99 -99.99 2 0.1\n"
+        "b 0.5 -1e-3 -1e-4 2 -0.1\n"
+        "c 0.5 0 -1e-4 2 -99.9\n"
+    )
+    with pytest.warns(MiricigaleWarning, match="limits that are not positive: IRAC1 2"):
+        table = read_cigale_catalog(path)
+    assert np.all(np.isnan(table["irac.ch1"]))
+    assert "irac.ch1_limit" not in table.colnames
+    assert table["irac.ch2_limit"].tolist() == [False, True, False]
+    np.testing.assert_array_equal(np.isnan(table["irac.ch2_err"]), [False, False, True])

@@ -3,6 +3,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.io import fits
 from astropy.table import QTable
 
 from miricigale.cigale import CigaleSetup, fit_cigale, read_cigale_results
@@ -372,6 +373,56 @@ def test_history_from_a_file(tmp_path):
     np.testing.assert_allclose(rate[50:], 0.0)
 
 
+def test_an_age_of_older_versions_is_that_of_the_main_population(tmp_path):
+    path = write(tmp_path, ("age_main = 5000, 1000", "age = 5000, 1000"))
+    np.testing.assert_allclose(quiet(path).parameters["age"], [1.0, 5.0])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "wanted"),
+    [
+        ("tau_main = 500, 5e3", "tau = 500, 5e3", r"sfhdelayed.tau: .* tau_main"),
+        ("uv_bump_width = 35.0", "width = 35", r"starburst.width: .* uv_bump_width"),
+    ],
+)
+def test_a_parameter_by_another_name_does_not_become_the_default(tmp_path, old, new, wanted):
+    with pytest.raises(ConfigError, match=wanted):
+        quiet(write(tmp_path, (old, new)))
+
+
+def test_defaults_and_parameters_without_a_part_are_told(tmp_path):
+    more = write(tmp_path, ("normalise = True", "normalise = True\n    colour = 3"))
+    assert "sfhdelayed.colour" in quiet(more).left_out
+    without = write(tmp_path, ("    delta = -0.36\n", ""))
+    assert "skirtor2016: not in the file, the defaults here: delta = 0" in quiet(without).differs
+
+
+def test_a_run_with_a_filter_of_the_user(tmp_path):
+    curve = tmp_path / "mine.dat"
+    curve.write_text("70000 0\n71000 1\n82000 1\n83000 0\n")
+    path = write(tmp_path, ("F770W, F770W_err", "AKARI_S7, AKARI_S7_err"))
+    with pytest.warns(MiricigaleWarning, match=r"band AKARI_S7 \(no filter here: names="):
+        read(path, libraries="bundled")
+    setup = quiet(path, names={"AKARI_S7": str(curve)})
+    assert setup.bands["AKARI_S7"] == "AKARI_S7"
+    with pytest.raises(DataError, match=r"none\.dat"):
+        quiet(path, names={"AKARI_S7": "none.dat"})
+    table = QTable(ROWS)
+    fluxes = setup.model().fluxes(table, setup.filters())
+    write_catalog(
+        tmp_path / "galaxies.txt",
+        ROWS["redshift"],
+        {band: fluxes[name].to_value(u.mJy) for name, band in setup.bands.items()},
+        setup.bands.values(),
+    )
+    results = fit_cigale(setup, output=tmp_path / "results.fits")
+    np.testing.assert_allclose(results.chi2, 0.0, atol=1e-6)
+    written = read_cigale_results(tmp_path / "results.fits")
+    np.testing.assert_allclose(
+        written["best.AKARI_S7"].to_value(u.uJy), fluxes["AKARI_S7"].to_value(u.uJy), rtol=1e-5
+    )
+
+
 def test_one_message_names_all_that_is_left_out(tmp_path):
     path = write(
         tmp_path,
@@ -552,6 +603,13 @@ def test_text_and_fits_say_the_same(run, tmp_path):
             np.testing.assert_allclose(
                 u.Quantity(one[name]).value, u.Quantity(two[name]).value, rtol=1e-12
             )
+    # what was replaced stands in both
+    header = " ".join(fits.getheader(tmp_path / "results.fits", 1)["COMMENT"])
+    head = (tmp_path / "results.txt").read_text().partition(" id ")[0]
+    for told in (header, head):
+        assert "skirtor2016 by parametric_torus" in told
+        assert "1 no band" in told
+    assert one["flags"].tolist() == results.flags.tolist()
     (tmp_path / "x.txt").write_text("id b\n1 2\n")
     with pytest.raises(DataError, match=r"no column best.chi_square"):
         read_cigale_results(tmp_path / "x.txt")
