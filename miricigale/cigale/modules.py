@@ -57,6 +57,10 @@ class Module:
     def label(self, key):
         return f"{self.name}.{key}"
 
+    def has(self, key):
+        """Whether the file has a parameter."""
+        return key in self._values
+
     def numbers(self, key, default=None):
         """Values of a parameter, ascending; ``default`` where it is not in the file."""
         self._taken.add(key)
@@ -258,8 +262,15 @@ def _dl2007(m):
 
 def _skirtor2016(m):
     values = m.values(c.Skirtor2016)
+    # since the version that has a choice of disks, grains take the place of the laws below 0.1 um
+    laws = {0: "smc_wd01" if m.has("disk_type") else "smc", 1: "calzetti", 2: "gaskell"}
+    law = m.option("law", 0, laws)
+    if m.has("disk_type") and law in ("calzetti", "gaskell"):
+        m.chain.differs.append(
+            f"skirtor2016.law {law}: continued below 0.1 um, where CIGALE has grains"
+        )
     options = {
-        "polar_law": m.option("law", 0, {0: "smc", 1: "calzetti", 2: "gaskell"}),
+        "polar_law": law,
         # files of older versions have no choice
         "disk": m.option("disk_type", 0, {0: "skirtor", 1: "schartmann2005"}),
     }

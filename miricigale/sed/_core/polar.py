@@ -49,16 +49,16 @@ def polar_curve(wave, law):
     raise ValueError(msg)
 
 
-def polar_grid(wave, law):
+def polar_grid(wave, curve):
     """
-    What `add_polar` needs of a grid of wavelengths and a law: shape (5, n_wave).
+    What `add_polar` needs of a grid of wavelengths and the extinction k there: shape (5, n_wave).
 
     Rows: -0.4 ln(10) k; lambda^-5; h c / (lambda k); ln(200 um / lambda); weights of the
     trapezoidal rule.
     """
     wave = np.asarray(wave, dtype=float)
     weight = trapezoid_weights(wave)
-    absorption = -0.4 * math.log(10.0) * polar_curve(wave, law)
+    absorption = -0.4 * math.log(10.0) * curve
     return np.stack([absorption, wave**-5.0, PLANCK_K / wave, np.log(_WAVE_THICK / wave), weight])
 
 

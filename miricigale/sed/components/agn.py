@@ -16,6 +16,14 @@ from miricigale.utils.units import frozen_array
 
 __all__ = ["AGN", "AGNTemplates", "Skirtor2016", "TorusSpectra"]
 
+#: Law ``smc`` with the extinction of grains in its place below 0.1 um.
+_GRAINS = "smc_wd01"
+_GRAINS_BELOW = 0.1  # um
+
+# beyond 25 um the library has a wavelength for each 0.06 dex, too few for straight lines
+_SPARSE = 25.0
+_FINE_STEP = 0.025  # in ln(lambda)
+
 
 @dataclass(frozen=True, eq=False)
 class TorusSpectra:
@@ -65,8 +73,8 @@ class AGN(Component):
     """
     Base of nuclei with a torus and polar dust; a subclass gives `torus_spectra`.
 
-    Polar dust (option ``polar_law``: ``smc``, ``calzetti`` or ``gaskell``) dims the disk where the
-    line of sight misses the torus (i <= 90 deg - opening angle). What it takes from the disk
+    Polar dust (option ``polar_law``: ``smc``, ``calzetti``, ``gaskell`` or ``smc_wd01``) dims the disk where
+    the line of sight misses the torus (i <= 90 deg - opening angle). What it takes from the disk
     over its cone, (7/18 - sin^2 oa / 6 - 2 sin^3 oa / 9) int disk (1 - 10^(-0.4 k E)), it sends
     out evenly as a modified blackbody, (1 - exp(-(200 um / lambda)^beta)) B_lambda(T); torus
     and polar emission together are then scaled to 1 W (Yang et al. 2020, MNRAS 491, 740).
@@ -76,7 +84,8 @@ class AGN(Component):
     """
 
     role = "agn"
-    options = {"polar_law": _core.POLAR_LAWS, "disk": tuple(_core.DISKS)}
+    options = {"polar_law": (*_core.POLAR_LAWS, _GRAINS), "disk": tuple(_core.DISKS)}
+    packages = ("dust_extinction",)
     frac_agn = Parameter(
         default=0.0, bounds=(0.0, 0.999999), doc="AGN fraction, in the model's definition."
     )
@@ -158,7 +167,24 @@ class AGN(Component):
 
 @functools.lru_cache(maxsize=16)
 def _polar_grid(wave_bytes, law):
-    return _core.polar_grid(np.frombuffer(wave_bytes), law)
+    wave = np.frombuffer(wave_bytes)
+    if law != _GRAINS:
+        return _core.polar_grid(wave, _core.polar_curve(wave, law))
+    curve = _core.polar_curve(wave, "smc")
+    short = wave < _GRAINS_BELOW
+    grains = _smc_grains(np.append(wave[short], _GRAINS_BELOW))
+    edge = _core.polar_curve(np.array([_GRAINS_BELOW]), "smc")[0]
+    curve[short] = grains[:-1] * (edge / grains[-1])
+    return _core.polar_grid(wave, curve)
+
+
+def _smc_grains(wave):
+    """Extinction of the SMC's grains in Weingartner & Draine 2001, any scale; constant below 0.01 um."""
+    import astropy.units as u
+    from dust_extinction.grain_models import WD01
+
+    model = WD01("SMCBar")
+    return np.asarray(model(np.minimum(1.0 / wave, model.x_range[1]) / u.um), dtype=float)
 
 
 @register
@@ -166,7 +192,8 @@ class Skirtor2016(AGN):
     """
     Clumpy two-phase tori, SKIRTOR, as the user registered them (``torus.skirtor2016``).
 
-    The dust spectrum is the library's, straight between its 132 wavelengths, zero outside.
+    The dust spectrum is the library's, straight between its 132 wavelengths up to 25 um, a power law
+    between them beyond (as in CIGALE), zero outside.
     Disk light at the inclination is the chosen disk times direct plus scattered light over
     that at inclination 0, both the library's: the disk changes and what the torus does to it
     stays (as in CIGALE 2020). The chosen disk has the power that the library's has at
@@ -176,6 +203,7 @@ class Skirtor2016(AGN):
     """
 
     name = "skirtor2016"
+    version = 2
     reference = "Stalevski et al. 2012, MNRAS 420, 2756; 2016, MNRAS 458, 2288"
     resource = "torus.skirtor2016"
     tau97 = Parameter(
@@ -210,11 +238,33 @@ class Skirtor2016(AGN):
         return _refusal(self.path, tuple([float(values[name]) for name in SKIRTOR_AXES]))
 
     def nodes(self):
-        return _core.merge_nodes([self.table.wave, _core.disk_nodes(self.disk, number=161)])
+        return _core.merge_nodes([_fine(self.table.wave), _core.disk_nodes(self.disk, number=161)])
 
     def torus_spectra(self, wave, values):
         axes = tuple([float(values[name]) for name in SKIRTOR_AXES])
         return _torus(self.path, wave.tobytes(), self.disk, float(values["disk_slope"]), axes)
+
+
+def _fine(wave):
+    """Wavelengths of the library and more of them where they are sparse."""
+    sparse = wave[np.searchsorted(wave, _SPARSE * (1.0 - 1e-6)) :]
+    if sparse.size < 2:
+        return wave
+    number = np.ceil(np.diff(np.log(sparse)) / _FINE_STEP).astype(int)
+    more = [
+        np.geomspace(a, b, n + 1)[1:-1] for a, b, n in zip(sparse, sparse[1:], number, strict=False)
+    ]
+    return _core.merge_nodes([wave, *more])
+
+
+def _refined(wave, dust, fine):
+    """A spectrum at `_fine` wavelengths: power laws between those of the library."""
+    tiny = np.finfo(float).tiny
+    return np.where(
+        fine < _SPARSE,
+        np.interp(fine, wave, dust),
+        np.exp(np.interp(np.log(fine), np.log(wave), np.log(np.maximum(dust, tiny)))),
+    )
 
 
 @cached_by_file(maxsize=4096)
@@ -239,13 +289,15 @@ def _torus(path, wave_bytes, disk, slope, axes):
     seen, top, dust = (
         table.spectrum(name, k) for name, k in (("disk", row), ("disk", above), ("dust", row))
     )
-    scale = 1.0 / np.trapezoid(dust, table.wave)
+    fine = _fine(table.wave)
+    dust = _refined(table.wave, np.asarray(dust, dtype=float), fine)
+    scale = 1.0 / np.trapezoid(dust, fine)
     through = np.divide(seen, top, out=np.zeros_like(top), where=top > 0.0)
     face_on = _core.disk_spectrum(wave, slope, disk)
     face_on *= scale * np.trapezoid(top, table.wave) / np.trapezoid(face_on, wave)
     parts = (
         face_on,
         face_on * np.interp(wave, table.wave, through),
-        np.interp(wave, table.wave, dust * scale, left=0.0, right=0.0),
+        np.interp(wave, fine, dust * scale, left=0.0, right=0.0),
     )
     return TorusSpectra(*map(frozen_array, parts))
