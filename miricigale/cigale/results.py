@@ -111,6 +111,10 @@ def _columns(results, names, variables):
         if ours in results.parameters:
             mean, std = (x.value * factor for x in (results.mean(ours), results.std(ours)))
             columns[theirs] = (mean, std, np.asarray(results.best[ours]) * factor, unit)
+        elif ours in results.best:
+            # at one node of a grid, and yet of each object
+            value = np.asarray(results.best[ours]) * factor
+            columns[theirs] = (value, np.where(results.fitted, 0.0, np.nan), value, unit)
         elif ours in constants:
             value = np.where(results.fitted, constants[ours] * factor, np.nan)
             columns[theirs] = (value, np.where(results.fitted, 0.0, np.nan), value, unit)

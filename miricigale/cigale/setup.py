@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from miricigale.cigale.catalog import GIVE_FILTER, read_cigale_catalog
+from miricigale.cigale.distances import at_their_distances
 from miricigale.cigale.ini import LIMIT_FLAGS, parse_ini
 from miricigale.cigale.modules import read_modules
 from miricigale.cigale.names import cigale_names
@@ -217,7 +218,9 @@ class CigaleSetup:
         Fit photometry.
 
         Objects with a redshift are fitted at the node next to it, after rounding where the nodes
-        are the objects' own; others over all redshifts that the configuration lists.
+        are the objects' own, and get masses and luminosities of their own distance: that of a column
+        ``distance`` if it is there, else of the redshift. Others are fitted over all redshifts that the
+        configuration lists.
 
         Parameters
         ----------
@@ -253,7 +256,15 @@ class CigaleSetup:
             "differs": list(self.differs),
         }
         meta = dict(results.meta) | {"cigale": note}
-        return dataclasses.replace(results, meta=meta, model=self.model())
+        model = self.model()
+        results = dataclasses.replace(results, meta=meta, model=model)
+        known = photometry["redshift"] if "redshift" in photometry.colnames else z
+        far = photometry["distance"] if "distance" in photometry.colnames else None
+        # objects over all redshifts of the file are where the model is
+        known = np.where(
+            np.isfinite(z), np.ma.filled(np.ma.asarray(known, dtype=float), np.nan), np.nan
+        )
+        return at_their_distances(results, known, far, model.cosmology)
 
     def write_results(self, results, path, *, overwrite=False):
         """Write results as `write_cigale_results` does, with the names of this configuration."""
@@ -421,9 +432,6 @@ def fit_cigale(ini, *, output=None, libraries="best", names=None, strict=False, 
     if not isinstance(ini, CigaleSetup):
         setup = read_pcigale_ini(ini, libraries=libraries, names=names, strict=strict)
     photometry = setup.catalog(strict=strict)
-    if "distance" in photometry.colnames and np.any(np.isfinite(photometry["distance"])):
-        msg = f"{setup.data_file}: distances are not used, those of the redshifts are"
-        warnings.warn(msg, MiricigaleWarning, stacklevel=2)
     results = setup.fit(photometry, **options)
     if output is not None:
         setup.write_results(results, output, overwrite=True)

@@ -58,7 +58,8 @@ def best_sed(results, model=None, **changes):
         raise argument_error("model", "an SEDModel (these results know none)", "None")
     best = results._fitted_one().best
     known = dict(results.constants)
-    known |= {name: best[name] for name in results.axes if np.isfinite(best[name].value)}
+    names = {**dict.fromkeys(results.axes), "redshift": None}
+    known |= {name: best[name] for name in names if name in best and np.isfinite(best[name].value)}
     values = {
         name: u.Quantity(getattr(value, "value", value), model.parameters[name].unit)
         for name, value in known.items()

@@ -202,6 +202,9 @@ class FitResults(ObjectRows):
         """Unit of a parameter or derived quantity."""
         if name in self.axes:
             return u.Unit(self.axes[name].unit)
+        if name == "redshift":
+            # a fixed one has no axis
+            return u.dimensionless_unscaled
         return self.units[self._quantity(name)]
 
     def extensive(self, name):

@@ -10,6 +10,7 @@ from miricigale.cigale import CigaleSetup, fit_cigale, read_cigale_results
 from miricigale.cigale import read_pcigale_ini as read
 from miricigale.cigale.ini import parse_ini, parse_values
 from miricigale.fitting import FitFlags
+from miricigale.sed.spectrum import COSMOLOGY
 from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarning
 
 INI = """\
@@ -522,6 +523,12 @@ ROWS = {
 }
 
 
+def nearer(redshift, node):
+    """Luminosity at a redshift over that at a node, for the same flux: (d / d_node)^2 (1 + z_node) / (1 + z)."""
+    d = [COSMOLOGY.luminosity_distance(z).value for z in (redshift, node)]
+    return (d[0] / d[1]) ** 2 * (1 + np.array(node)) / (1 + np.array(redshift))
+
+
 @pytest.fixture
 def run(tmp_path):
     """Three models, written as CIGALE's files."""
@@ -543,15 +550,17 @@ def test_a_run_gives_the_models_back(run, tmp_path):
     np.testing.assert_allclose(results.chi2, 0.0, atol=1e-6)
     table = read_cigale_results(out)
     assert table["id"].tolist() == ["g0", "g1", "g2"]
+    factor = nearer([0.52, 1.26, 0.5], [0.5, 1.3, 0.5])
     best = {
         "sfh.tau_main": ([500, 5000, 500], "Myr"),
         "sfh.age_main": ([5000, 1000, 1000], "Myr"),
-        "sfh.integrated": ([1e10, 3e10, 1e11], "Msun"),
+        "sfh.integrated": (factor * [1e10, 3e10, 1e11], "Msun"),
         "sfh.age_burst": ([20] * 3, "Myr"),
         "stellar.old_young_separation_age": ([10] * 3, "Myr"),
         "attenuation.E_BV_lines": ([0.5, 1.0, 0.5], "mag"),
         "attenuation.uv_bump_wavelength": ([217.5] * 3, "nm"),
-        "universe.redshift": ([0.5, 1.3, 0.5], ""),
+        # the models are at 0.5, 1.3 and 0.5
+        "universe.redshift": ([0.52, 1.26, 0.5], ""),
         "agn.fracAGN": ([0.5, 0.0, 0.9], ""),
         "agn.t": ([7, np.nan, 7], ""),
         "agn.i": ([30, np.nan, 70], "deg"),
@@ -569,7 +578,7 @@ def test_a_run_gives_the_models_back(run, tmp_path):
             "sfr_10myr": "sfh.sfr10Myrs",
             "accretion_power": "agn.accretion_power",
         }[name]
-        best[theirs] = (truth[name].to_value(unit), unit)
+        best[theirs] = (factor * truth[name].to_value(unit), unit)
     for name, (values, unit) in best.items():
         got = u.Quantity(table[f"best.{name}"])
         assert got.unit == u.Unit(unit), name
@@ -586,6 +595,33 @@ def test_a_run_gives_the_models_back(run, tmp_path):
     np.testing.assert_allclose(
         table["best.reduced_chi_square"], table["best.chi_square"] / 3, atol=1e-12
     )
+
+
+def test_one_redshift_and_a_distance_of_its_own(run, tmp_path):
+    """An object at 20 Mpc has (20 Mpc / d(z))^2 of the luminosity; its spectrum is drawn as it was fitted."""
+    path, fluxes, _ = run
+    setup = quiet(path)
+    catalog = tmp_path / "galaxies.txt"
+    names = [x for band in setup.bands.values() for x in (band, f"{band}_err")]
+    values = [x for b in setup.bands.values() for x in (fluxes[b][0], 0.01 * fluxes[b][0])]
+    rows = [
+        f"{i} 0.52 {d} " + " ".join(f"{x:.15g}" for x in values) for i, d in enumerate((20, "nan"))
+    ]
+    catalog.write_text(" ".join(["# id redshift distance", *names]) + "\n" + "\n".join(rows) + "\n")
+    results = fit_cigale(setup, output=tmp_path / "results.fits")
+    far = COSMOLOGY.luminosity_distance(0.52).value
+    mass = results.best["mass"].to_value(u.Msun)
+    np.testing.assert_allclose(
+        mass, 1e10 * nearer(0.52, 0.5) * np.array([(20 / far) ** 2, 1]), rtol=1e-5
+    )
+    np.testing.assert_allclose(results.std("stellar_mass") / results.mean("stellar_mass"),
+                               results[::-1].std("stellar_mass") / results[::-1].mean("stellar_mass"))  # fmt: skip
+    table = read_cigale_results(tmp_path / "results.fits")
+    np.testing.assert_allclose(table["best.universe.redshift"], 0.52)
+    np.testing.assert_allclose(table["best.IRAC1"].value, fluxes["IRAC1"][0], rtol=1e-5)
+    # the shape is that of z = 0.5: bands are the same to what 1.3 % in wavelength makes
+    drawn = setup.filters().synthetic_fluxes(results[1].best_sed())
+    np.testing.assert_allclose(drawn.value, results[1].best_flux, rtol=0.06)
 
 
 def test_text_and_fits_say_the_same(run, tmp_path):
@@ -627,7 +663,11 @@ def test_known_and_unknown_redshifts(run, tmp_path):
     catalog = tmp_path / "galaxies.txt"
     write_catalog(catalog, [0.61, -1, 2.0], fluxes, setup.bands.values())
     results = fit_cigale(setup)
-    np.testing.assert_allclose(results.best["redshift"], [0.5, 1.3, 1.3])
+    # masses are those of the objects' own redshifts
+    np.testing.assert_allclose(results.best["redshift"], [0.61, 1.3, 2.0])
+    np.testing.assert_allclose(
+        results.best["mass"][:2].value, [1e10 * nearer(0.61, 0.5), 3e10], rtol=1e-5
+    )
     np.testing.assert_allclose(results.chi2[:2], 0.0, atol=1e-6)
     assert results.chi2[2] > 1e-3
     np.testing.assert_allclose(results.pdf["redshift"][0], [1, 0, 0])

@@ -1,0 +1,62 @@
+"""Results at the distances of the objects, where the models are at the next redshift of a grid."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.sed.spectrum import distance
+
+__all__ = ["at_their_distances"]
+
+
+def at_their_distances(results, redshift, distances, cosmology):
+    """
+    Scale masses and luminosities from the distance of the models to that of the objects.
+
+    Fluxes were compared with models at a node of the grid near the object's redshift. What was found of
+    the shape of the spectrum stays; all that scales with mass is multiplied by (d / d_node)^2 (1 + z_node) /
+    (1 + z), as CIGALE does: 0.23 dex for z = 0.0153 at the node 0.02.
+
+    Parameters
+    ----------
+    results : `~miricigale.fitting.FitResults`
+        Results at nodes.
+    redshift : `~numpy.ndarray`, shape (n,)
+        Redshifts of the objects; NaN or 0 where the node is the redshift.
+    distances : `~astropy.units.Quantity`, shape (n,), or None
+        Distances that are used in place of those of the redshifts; NaN where there is none.
+    cosmology : `~astropy.cosmology.Cosmology`
+        For the distances of redshifts.
+
+    Returns
+    -------
+    results : `~miricigale.fitting.FitResults`
+        Their ``best["redshift"]`` is that of the object where it is known.
+    """
+    node = np.full(len(results), results.constants.get("redshift", np.nan))
+    node = np.asarray(results.best.get("redshift", node), dtype=float)
+    node = np.where(results.fitted, node, np.nan)
+    known = np.isfinite(redshift) & (redshift > 0) & np.isfinite(node)
+    z = np.where(known, redshift, node)
+    here, there = (distance(np.where(np.isfinite(x), x, 0.0), cosmology) for x in (z, node))
+    if distances is not None:
+        given = np.ma.filled(np.ma.asarray(distances.to_value(u.m)), np.nan)
+        here = np.where(np.isfinite(given) & (given > 0), given, here)
+    factor = np.where(np.isfinite(node), (here / there) ** 2 * (1.0 + node) / (1.0 + z), 1.0)
+    rows = [results.extensive(name) for name in results.quantities]
+    moments, quantiles = np.array(results.moments), np.array(results.quantiles)
+    moments[:, rows, :2] *= factor[:, None, None]
+    moments[:, rows, 2] += np.log10(factor)[:, None]
+    quantiles[:, rows] *= factor[:, None, None]
+    best = {
+        name: value * factor if results.extensive(name) else value
+        for name, value in results.best.items()
+    }
+    return dataclasses.replace(
+        results,
+        moments=moments,
+        quantiles=quantiles,
+        best=best | {"redshift": np.where(np.isfinite(node), z, np.nan)},
+        best_scale=results.best_scale * factor,
+    )
