@@ -11,6 +11,12 @@ from miricigale.utils.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
+        "calibration": (
+            "TemplateError",
+            "apply_zero_points",
+            "calibrate_zero_points",
+            "measure_template_error",
+        ),
         "checks": ("LeaveOutResult", "MockResult", "leave_out", "mock_analysis"),
         "fitter": ("BayesFitter",),
         "io": ("FitResultsFiles", "open_results"),

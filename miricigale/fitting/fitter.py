@@ -28,7 +28,7 @@ __all__ = ["BayesFitter"]
 logger = logging.getLogger(__name__)
 
 #: Options that only one kind of engine has.
-_OF_GRID = ("axes", "prior_f", "redshift_tolerance", "compat", "rtol")
+_OF_GRID = ("axes", "prior_f", "redshift_tolerance", "compat", "rtol", "template_error")
 _OF_SAMPLER = ("predict", "n_live", "n_effective", "max_calls", "n_draws", "n_cells")
 _OF_SAMPLER += ("sampler_options",)
 
@@ -78,6 +78,9 @@ class BayesFitter:
     model_error, error_floor : float or dict of str to float, optional
         Part of the flux that is added to its error in quadrature, and least relative error of a flux,
         for all or by filter.
+    template_error : `~miricigale.fitting.TemplateError`, optional
+        Of a grid: error of the models by rest wavelength, added in quadrature too; what it does to the
+        normalization of the likelihood counts. ``sigma`` of the results has that of the best model.
     n_bands_min : int, optional
         Objects with fewer usable bands, upper limits among them, are flagged and not fitted. One
         band at least must be no limit.
@@ -164,6 +167,7 @@ class BayesFitter:
         redshift_tolerance=None,
         compat=None,
         rtol=1e-6,
+        template_error=None,
         predict=(),
         n_live=500,
         n_effective=2000,
@@ -201,6 +205,7 @@ class BayesFitter:
                 scale_error=scale_error,
                 redshift_tolerance=redshift_tolerance,
                 compat=compat,
+                template_error=template_error,
             )
             for name in names or ():
                 if name not in self.bands:

@@ -74,6 +74,9 @@ class GridEngine:
     share_galaxy, share_agn : `~numpy.ndarray`, shapes (nG,) and (nA,), optional
         The AGN fraction in another definition is y / (1 + y), y the product of f / (1 - f) and
         both.
+    template_error : `~numpy.ndarray`, shape (nz, nb), optional
+        Part of a flux that is added to its error in quadrature at each redshift; what this does to the
+        normalization of the likelihood is part of the weights.
     rtol : float
         Relative error that pruning may cause. The weight of what is left out is bounded to a
         tenth of it, and what it could add to the variance of any derived quantity to
@@ -100,6 +103,7 @@ class GridEngine:
     levels: np.ndarray
     share_galaxy: np.ndarray | None = None
     share_agn: np.ndarray | None = None
+    template_error: np.ndarray | None = None
     rtol: float = 1e-6
     scale_error: bool = True
 
@@ -248,8 +252,7 @@ class GridEngine:
         size = self.size
         n_z, n_galaxy, n_agn, n_frac = size.values()
         n, n_bands = flux.shape
-        weight = 1.0 / np.square(sigma)
-        data = np.where(weight > 0, flux, 0.0)
+        data = np.where(np.isfinite(sigma), flux, 0.0)
         inverse = np.zeros((n, n_bands)) if limit_sigma is None else 1.0 / limit_sigma
         limit = np.where(inverse > 0, 0.0 if limit is None else limit, 0.0)
         negative = np.flatnonzero((inverse > 0).any(axis=0) & self._negative)
@@ -283,15 +286,38 @@ class GridEngine:
         sums = workspace[0]
         single = self.rtol >= _SINGLE
         for i in np.flatnonzero(log_prior.max(axis=1, initial=-1e300) > -1e200):
-            target = _target(data[i], weight[i], log_prior[i])
+            target = self._target(data[i], sigma[i], log_prior[i])
             limits = _limits(limit[i], inverse[i])
             sums.draws.state[0] = seeds[i]
             _core.clear(sums)
-            if target.norm > 0.0 and _core.sum_up(
+            if target.norm[0] > 0.0 and _core.sum_up(
                 self._tables, self._scales, self._request, target, limits, *workspace, single=single
             ):
                 self._summarize(target, limits, sums, out, i)
         return out
+
+    def _target(self, flux, sigma, log_prior):
+        """Bundle the data of one object."""
+        n_z, bands = len(log_prior), np.flatnonzero(np.isfinite(sigma))
+        level = np.zeros(n_z)
+        if self.template_error is None:
+            weight = 1.0 / np.square(sigma)
+            norm = np.full(n_z, np.sum(weight * flux * flux))
+            weight = np.tile(weight, (n_z, 1))
+        else:
+            more = np.square(self.template_error * flux)
+            weight = 1.0 / (np.square(sigma) + more)
+            norm = np.sum(weight * flux * flux, axis=1)
+            level = -norm - np.log1p(more / np.square(sigma)).sum(axis=1)
+        used = weight[:, bands]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            root32 = np.sqrt(used / used.max(axis=1, keepdims=True, initial=0.0)).astype(np.float32)
+            data32 = (flux[bands] * np.sqrt(used / norm[:, None])).astype(np.float32)
+        # at most 0: errors that are the same at all redshifts change nothing
+        top = -level.max() if np.any(level) else float(norm[0])
+        level -= level.max()
+        log_prior = np.where(log_prior > -1e200, log_prior + level, -1e300)
+        return _core.Target(flux, weight, log_prior, bands, root32, data32, norm, level, float(top))
 
     def _summarize(self, target, limits, sums, out, i):
         """Fill row i of the output."""
@@ -303,8 +329,8 @@ class GridEngine:
             power = scale * self.dust[g] * self.frac[f] / (1.0 - self.frac[f])
             model = model + power * self.agn[z, k]
         # from the residuals: |F|^2_w - R would lose digits
-        chi2 = np.sum(target.weight * (target.flux - model) ** 2)
-        norm = target.norm
+        chi2 = np.sum(target.weight[z] * (target.flux - model) ** 2)
+        norm = target.top
         if limits is not None:
             faint = limits.level - model[limits.bands] * limits.inverse
             chi2 -= 2.0 * log_ndtr(faint).sum()
@@ -399,16 +425,6 @@ def _ratio(frac):
 def _two_log(prior):
     """Return 2 ln(prior), -1e300 where it is zero."""
     return 2.0 * np.log(prior, where=prior > 0, out=np.full(prior.shape, -5e299))
-
-
-def _target(flux, weight, log_prior):
-    """Bundle the data of one object."""
-    bands = np.flatnonzero(weight > 0)
-    used, norm = weight[bands], float(np.sum(weight * flux * flux))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        root32 = np.sqrt(used / used.max(initial=0.0)).astype(np.float32)
-        data32 = (flux[bands] * np.sqrt(used / norm)).astype(np.float32)
-    return _core.Target(flux, weight, log_prior, bands, root32, data32, norm)
 
 
 def _limits(limit, inverse):

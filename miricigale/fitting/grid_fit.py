@@ -6,6 +6,7 @@ from functools import partial
 import astropy.units as u
 import numpy as np
 
+from miricigale.fitting.calibration import TemplateError, grid_errors
 from miricigale.fitting.grid import GridEngine
 from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import check_pairs, joint_names, joint_tables
@@ -54,6 +55,7 @@ class GridFit:
     redshift_tolerance: float | None
     compat: str | None
     prior_f: str
+    template_error: TemplateError | None = None
 
     #: Objects in a piece of the catalog.
     chunk_size = 64
@@ -62,7 +64,18 @@ class GridFit:
 
     @classmethod
     def of_model(
-        cls, model, filters, axes, priors, *, prior_f, rtol, scale_error, redshift_tolerance, compat
+        cls,
+        model,
+        filters,
+        axes,
+        priors,
+        *,
+        prior_f,
+        rtol,
+        scale_error,
+        redshift_tolerance,
+        compat,
+        template_error,
     ):
         """Make a grid if it is none, work out its priors and derived quantities, set the engine up."""
         if not (is_number(rtol) and 0 <= rtol < 0.1):
@@ -100,10 +113,23 @@ class GridFit:
             levels=DERIVED_LEVELS,
             share_galaxy=None if fraction is None else fraction.galaxy,
             share_agn=None if fraction is None else fraction.agn,
+            template_error=grid_errors(
+                template_error, grid.filters if model is grid else filters, grid.redshift
+            ),
             rtol=float(rtol),
             scale_error=scale_error,
         )
-        return cls(grid, priors, quantities, fraction, engine, redshift_tolerance, compat, prior_f)
+        return cls(
+            grid,
+            priors,
+            quantities,
+            fraction,
+            engine,
+            redshift_tolerance,
+            compat,
+            prior_f,
+            template_error,
+        )
 
     @property
     def filters(self):
@@ -139,6 +165,15 @@ class GridFit:
             "compat": self.compat,
             "n_models": int(self.engine.n_models),
             "constants": self.constants,
+        } | self._error_settings
+
+    @property
+    def _error_settings(self):
+        error = self.template_error
+        if error is None:
+            return {}
+        return {
+            "template_error": {"wave": error.wave.value.tolist(), "error": error.error.tolist()}
         }
 
     def provenance(self):
@@ -232,6 +267,11 @@ class GridFit:
         # limits are probabilities, which have no unit
         log_sigma = np.log(np.where(data.measured, data.sigma, 1.0)).sum(axis=1)
         log_sigma += 0.5 * data.measured.sum(axis=1) * np.log(2.0 * np.pi)
+        if self.template_error is not None:
+            # that of the best model
+            more = self.engine.template_error[np.maximum(out.index[:, 0], 0)] * data.flux
+            more[~data.measured | np.isnan(out.chi2)[:, None]] = 0.0
+            data = data._changed(sigma=np.hypot(data.sigma, more))
         return FitResults(
             **data.columns,
             flags=flags,

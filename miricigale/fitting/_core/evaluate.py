@@ -70,7 +70,7 @@ def _evaluate_alone(tables, target, limits, pairs, lanes, sums, delta, scale_err
             if log_prior < -1e200:
                 continue
             # what no galaxy of this redshift exceeds, priors being at most 1
-            if pairs.promise[z] + 1e-5 * target.norm < floor:
+            if pairs.promise[z] + 1e-5 * target.norm[z] < floor:
                 continue
             some = False
             for block in range(tables.tiles.shape[1]):
@@ -78,7 +78,7 @@ def _evaluate_alone(tables, target, limits, pairs, lanes, sums, delta, scale_err
                 for g in range(block * BLOCK, min((block + 1) * BLOCK, tables.galaxy.shape[1])):
                     p32 = max(pairs.p32[z, g], np.float32(0)) + 3e-6
                     prior = log_prior + tables.log_usable[z, g]
-                    if p32 * p32 * target.norm + prior < floor:
+                    if p32 * p32 * target.norm[z] + prior < floor:
                         continue
                     if not known:
                         known = True
@@ -95,7 +95,7 @@ def _evaluate_alone(tables, target, limits, pairs, lanes, sums, delta, scale_err
                         about += math.exp(max(0.5 * (value - best[2]), -700.0))
                         continue
                     some = True
-                    keep_best(sums, r, s, z, g, np.int64(0), np.int64(0))
+                    keep_best(sums, r + target.level[z], s, z, g, np.int64(0), np.int64(0))
                     t = math.exp(max(0.5 * (value - best[2]), -700.0))
                     lanes.galaxy_z[0, g] += t
                     lanes.galaxy_z[1, g] += t * s
@@ -169,7 +169,7 @@ def _evaluate_runs(
         z = pairs.run_key[r] >> (2 * KEY_BITS)
         if z != z_now:
             z_now = z
-            agn_products(tables.agn[z], target, pairs.agn_pq, pairs.agn_weighted)
+            agn_products(tables.agn[z], target, z, pairs.agn_pq, pairs.agn_weighted)
         filled = np.int64(0)
         while filled < BLOCK and r < n and pairs.run_key[r] >> (2 * KEY_BITS) == z:
             if pairs.top[r] >= floor:
@@ -181,11 +181,12 @@ def _evaluate_runs(
                 r += 1
         if filled > 0:
             fill_up(lanes, filled)
+            record = best[0] - target.level[z]
             if limits is not None:
                 over = 1e300
                 while over >= 200.0:
                     reached, over = limited_likelihoods(
-                        of_frac, lanes, limits, best[2], request.scale_error, best[0],
+                        of_frac, lanes, limits, best[2], request.scale_error, record,
                         request.delta, single,
                     )  # fmt: skip
                     if over >= 200.0:
@@ -193,11 +194,11 @@ def _evaluate_runs(
                         best[2] += 2.0 * over
                         _rescale(sums, lanes, math.exp(-min(over, 700.0)))
             elif light:
-                reached = single_likelihoods(of_frac, lanes, best[2], request.scale_error, best[0])
+                reached = single_likelihoods(of_frac, lanes, best[2], request.scale_error, record)
             else:
-                reached = likelihoods(of_frac, lanes, best[2], request.scale_error, best[0])
+                reached = likelihoods(of_frac, lanes, best[2], request.scale_error, record)
             if reached > 0.0:
-                find_best(tables, limits, lanes, sums, z)
+                find_best(tables, limits, lanes, sums, z, target.level[z])
             before = total[0]
             added = add_pairs(tables, lanes, sums, z, request.thin / n_listed)
             if sums.joint.gk.size + sums.joint.fg.size + sums.joint.fk.size > 0:
@@ -223,7 +224,7 @@ def _begin(tables, target, limits, pairs, origin):
     for i, z in enumerate(pairs.order):
         if pairs.promise[z] < -1e29 or (i >= 3 and reference > -1e299):
             break
-        weighted = tables.agn[z] * target.weight
+        weighted = tables.agn[z] * target.weight[z]
         pairs.agn_pq[:, 0] = weighted @ target.flux
         pairs.agn_pq[:, 1] = np.sum(weighted * tables.agn[z], axis=1)
         g = pairs.galaxy_of[z]
@@ -231,7 +232,7 @@ def _begin(tables, target, limits, pairs, origin):
         if value > reference:
             reference = value
             # where the best has no light others have about what one sigma allows
-            q = np.sum(np.square(tables.galaxy[z, g]) * target.weight)
+            q = np.sum(np.square(tables.galaxy[z, g]) * target.weight[z])
             scale = s if s > 0.0 else (1.0 / math.sqrt(q) if q > 1e-290 else 1.0)
     if reference < -1e299:
         return None
@@ -283,14 +284,14 @@ def sum_up(tables, scales, request, target, limits, sums, pairs, lanes, *, singl
         share *= 0.5
         if limits is not None:
             # a probability many sigma out is not one for single precision
-            single = single and max(target.norm + limits.dark - reference, highest) < _MODEST
+            single = single and max(target.top + limits.dark - reference, highest) < _MODEST
         floor, few = first_floor(pairs, n, reference)
         _evaluate_runs(
             tables, target, limits, pairs, lanes, sums, request, n, reference, floor,
             single and not few,
         )  # fmt: skip
         room = share * request.rtol * total[0]
-        tail = (target.norm + 1.0) / request.tail
+        tail = (target.norm.max() + 1.0) / request.tail
         unit = (
             math.exp(min(0.5 * (reference - best[2]), 600.0)) * prior_sum / max(prior_top, 1e-300)
         )

@@ -79,16 +79,17 @@ def _raise_bounds(tables, target, pairs, n, room, tail_galaxy, tail_agn, referen
     `widest`, ``room`` is |F|^2_w over how much more second moments may miss than weights. A bound is
     raised by 2 ln of how much more than its weight a pair can add to second moments.
     """
-    weight = target.weight
     top = 0.0
-    for b in range(weight.size):
-        top = max(top, weight[b])
     z_now = np.int64(-1)
     for r in range(n):
         key, row = pairs.run_key[r], pairs.bound[r]
         z = key >> (2 * KEY_BITS)
         if z != z_now:
             z_now = z
+            weight = target.weight[z]
+            top = 0.0
+            for b in range(weight.size):
+                top = max(top, weight[b])
             for g in range(tail_galaxy.size):
                 unit = tables.galaxy_unit[z, g]
                 inverse = np.float64(pairs.inverse_norm[z, g])

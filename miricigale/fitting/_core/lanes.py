@@ -31,7 +31,7 @@ def galaxy_products(tables, target, z, block, pq):
         p[i] = 0.0
         q[i] = 0.0
     for b in target.bands:
-        w = target.weight[b]
+        w = target.weight[z, b]
         wf = w * target.flux[b]
         tile = tables.tiles[z, block, b]
         for i in range(BLOCK):

@@ -68,7 +68,7 @@ def project(tables, target, pairs):
             norm[i] = zero
         for j in range(target.bands.size):
             row = tables.galaxy32[z, target.bands[j]]
-            s, d = target.root32[j], target.data32[j]
+            s, d = target.root32[z, j], target.data32[z, j]
             for i in range(p.size):
                 t = row[i] * s
                 norm[i] += t * t
@@ -92,13 +92,13 @@ def project(tables, target, pairs):
         pairs.galaxy_of[z] = best
         if best >= 0:
             value = np.float64(max(top, zero))
-            pairs.promise[z] = value * value * target.norm + target.log_prior[z]
+            pairs.promise[z] = value * value * target.norm[z] + target.log_prior[z]
 
 
 @njit(**PART)
-def agn_products(agn, target, agn_pq, agn_weighted):
+def agn_products(agn, target, z, agn_pq, agn_weighted):
     """Fill agn_pq[k] = <A, wF>, <A, wA> and agn_weighted[k] = w A for all AGN models of one redshift."""
-    weight, flux = target.weight, target.flux
+    weight, flux = target.weight[z], target.flux
     for k in range(agn_pq.shape[0]):
         for b in range(agn.shape[1]):
             agn_weighted[k, b] = agn[k, b] * weight[b]
@@ -122,7 +122,7 @@ def best_of_galaxy(tables, target, limits, pairs, z, g):
     of the model that has it.
     """
     galaxy, agn, of_frac = tables.galaxy[z, g], tables.agn[z], tables.of_frac
-    weight, bands, agn_pq = target.weight, target.bands, pairs.agn_pq
+    weight, bands, agn_pq = target.weight[z], target.bands, pairs.agn_pq
     log_prior = target.log_prior[z] + tables.log_usable[z, g]
     p = 0.0
     q = 0.0
@@ -167,7 +167,7 @@ def best_of_galaxy(tables, target, limits, pairs, z, g):
 
 
 @njit(**PART)
-def _project_tori(agn, target, unit, of_torus):
+def _project_tori(agn, target, z, unit, of_torus):
     """
     Fill unit vectors t of the AGN models of one redshift, <t, d>, and the square of its positive part.
 
@@ -177,13 +177,13 @@ def _project_tori(agn, target, unit, of_torus):
     n_used = target.bands.size
     for k in range(agn.shape[0]):
         for j in range(n_used):
-            unit[k, j] = agn[k, target.bands[j]] * target.root32[j]
+            unit[k, j] = agn[k, target.bands[j]] * target.root32[z, j]
         # sums apart from stores: see `agn_products`
         norm = zero
         s = zero
         for j in range(n_used):
             norm += unit[k, j] * unit[k, j]
-            s += unit[k, j] * target.data32[j]
+            s += unit[k, j] * target.data32[z, j]
         faint = norm < _TINY
         r = zero if faint else np.float32(1) / np.sqrt(norm)
         a = s * r
@@ -290,7 +290,7 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
     """
     n_z, n_blocks = tables.tiles.shape[0], tables.tiles.shape[1]
     n_agn = tables.agn.shape[1]
-    rows, bands, norm = pairs.rows, target.bands, target.norm
+    rows, bands = pairs.rows, target.bands
     # the largest prior a pair can have from AGN model and fraction
     log_pair = tables.log_top_agn + tables.log_top_frac
     # `_products` takes three bands at a time
@@ -311,8 +311,8 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
         if z != z_now:
             z_now = z
             agn_known = False
-            _project_tori(tables.agn32[z], target, pairs.unit_agn, pairs.agn32)
-        start = block * BLOCK
+            _project_tori(tables.agn32[z], target, z, pairs.unit_agn, pairs.agn32)
+        start, norm = block * BLOCK, target.norm[z]
         lowest = reference - delta - target.log_prior[z] - log_pair
         log_usable = tables.log_usable[z, start : start + BLOCK]
         p32 = pairs.p32[z, start : start + BLOCK]
@@ -331,7 +331,7 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
             rows[_BASE + i] = max(log_usable[i] + (target.log_prior[z] + log_pair), -1e30)
         for j in range(bands.size):
             row = tables.galaxy32[z, bands[j], start : start + BLOCK]
-            s32 = target.root32[j]
+            s32 = target.root32[z, j]
             for i in range(BLOCK):
                 pairs.unit_galaxy[j, i] = row[i] * s32 * inverse[i]
         key = ((z << KEY_BITS) + block) << KEY_BITS
@@ -342,7 +342,7 @@ def list_runs(tables, target, limits, pairs, delta, reference, position):
             if rows[_TOP + i] > reference + margin:
                 if not agn_known:
                     agn_known = True
-                    agn_products(tables.agn[z], target, pairs.agn_pq, pairs.agn_weighted)
+                    agn_products(tables.agn[z], target, z, pairs.agn_pq, pairs.agn_weighted)
                 value, _ = best_of_galaxy(tables, target, limits, pairs, z, start + i)
                 if value > reference:
                     reference = value

@@ -126,12 +126,16 @@ class Target(NamedTuple):
     """The data of one object."""
 
     flux: np.ndarray  # float64 (nb,), uJy; 0 in bands not measured
-    weight: np.ndarray  # float64 (nb,): 1 / sigma^2; 0 there
-    log_prior: np.ndarray  # float64 (nz,): 2 ln(prior) of the redshifts, -1e300 where it is 0
+    weight: np.ndarray  # float64 (nz, nb): 1 / sigma^2; 0 there
+    log_prior: (
+        np.ndarray
+    )  # float64 (nz,): 2 ln(prior) of the redshifts plus ``level``, -1e300 where it is 0
     bands: np.ndarray  # int64 (n_used,): the measured bands
-    root32: np.ndarray  # float32 (n_used,): roots of their weights, the largest being 1
-    data32: np.ndarray  # float32 (n_used,): flux over sigma, of norm 1
-    norm: float  # |F|^2_w
+    root32: np.ndarray  # float32 (nz, n_used): roots of their weights, the largest being 1
+    data32: np.ndarray  # float32 (nz, n_used): flux over sigma, of norm 1
+    norm: np.ndarray  # float64 (nz,): |F|^2_w
+    level: np.ndarray  # float64 (nz,): at most 0: R + level is top less chi2 and sum ln sigma^2,
+    top: float  # and that, the least of the norm and sum ln sigma^2
 
 
 class Limits(NamedTuple):

@@ -52,8 +52,8 @@ def keep_best(sums, r, s, z, g, k, f):
 
 
 @njit(**PART)
-def find_best(tables, limits, lanes, sums, z):
-    """Look for the best model among the lanes."""
+def find_best(tables, limits, lanes, sums, z, level):
+    """Look for the best model among the lanes; ``level`` is what R lacks to those of other redshifts."""
     buffer, of_frac, best = lanes.buffer, tables.of_frac, sums.best
     for i in range(BLOCK):
         if buffer[at.PRIOR + i] < -1e200:
@@ -62,13 +62,15 @@ def find_best(tables, limits, lanes, sums, z):
             buffer[at.P + i], buffer[at.Q + i], 0.5 * buffer[at.X2 + i], buffer[at.A + i], buffer[at.B + i],
             of_frac[at.RATIO, 0], of_frac[at.RATIO, -1],
         )  # fmt: skip
-        if r * (1.0 + 1e-12) < best[0]:
+        if r * (1.0 + 1e-12) + level < best[0]:
             continue
         for j in range(of_frac.shape[1]):
             if not of_frac[at.PRIOR_FRAC, j] > 0.0:
                 continue
-            s, r, _ = _model(tables, limits, lanes, z, i, j, best[0])
-            keep_best(sums, r, s, z, lanes.index[0, i], lanes.index[1, i], j + tables.zero_frac)
+            s, r, _ = _model(tables, limits, lanes, z, i, j, best[0] - level)
+            keep_best(
+                sums, r + level, s, z, lanes.index[0, i], lanes.index[1, i], j + tables.zero_frac
+            )
 
 
 @njit(**PART)

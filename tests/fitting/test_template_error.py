@@ -1,0 +1,132 @@
+"""Errors of models by rest wavelength, and what residuals at known redshifts say of them and of zero points."""
+
+from dataclasses import replace
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from miricigale.filters import FilterSet
+from miricigale.fitting import (
+    BayesFitter,
+    TemplateError,
+    apply_zero_points,
+    calibrate_zero_points,
+    measure_template_error,
+)
+
+BANDS = ("acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "miri.f770w", "miri.f1500w")
+PIVOTS = np.array([one.pivot.to_value(u.um) for one in FilterSet.from_names(BANDS)])
+
+
+@pytest.fixture(scope="module")
+def grid(make_grid):
+    return replace(make_grid(7, n_z=5, n_tau=3, n_age=3), filters=BANDS)
+
+
+def photometry(flux, err):
+    table = QTable({"id": np.arange(len(flux))})
+    for i, name in enumerate(BANDS):
+        table[name], table[f"{name}_err"] = flux[:, i] * u.uJy, err[:, i] * u.uJy
+    return table
+
+
+def test_one_that_is_everywhere_the_same_is_a_model_error(grid, draw_photometry):
+    table, _ = draw_photometry(grid, 8, noise=0.1)
+    plain = BayesFitter(grid, model_error=0.2).fit(table)
+    same = TemplateError([0.1, 10.0] * u.um, [0.2, 0.2])
+    ours = BayesFitter(grid, model_error=0.0, template_error=same).fit(table)
+    np.testing.assert_allclose(ours.pdf_2d, plain.pdf_2d, atol=1e-9)
+    for name in ("chi2", "log_evidence", "sigma", "best_flux"):
+        np.testing.assert_allclose(getattr(ours, name), getattr(plain, name), rtol=1e-9)
+    np.testing.assert_array_equal(ours.best_index, plain.best_index)
+
+
+def test_posterior_is_the_sum_over_models_with_the_errors_of_their_redshifts(grid, draw_photometry):
+    """With 1 / sigma of every band in the likelihood, which is that of normal deviates."""
+    error = TemplateError([0.1, 0.3, 1.0, 3.0, 10.0] * u.um, [0.5, 0.1, 0.02, 0.3, 1.0])
+    table, _ = draw_photometry(grid, 6, seed=3, noise=0.3)
+    fitter = BayesFitter(grid, model_error=0.0, template_error=error, rtol=0.0)
+    results = fitter.fit(table)
+    index = np.meshgrid(*(np.arange(n) for n in (5, 9, grid.n_agn, 4)), indexing="ij")
+    model = grid.flux(*index)
+    part = np.interp(
+        np.log(PIVOTS / (1 + grid.redshift[:, None])), np.log(error.wave.value), error.error
+    )
+    count = np.where(grid.allowed[:, :, None, None], grid.agn_multiplicity[:, None], 0)
+    for i in range(6):
+        flux, own = results.flux[i], results.flux_err[i]
+        sigma = np.hypot(own, part * flux)[:, None, None, None]
+        scale = np.maximum(np.sum(model * flux / sigma**2, -1), 0) / np.sum(
+            (model / sigma) ** 2, -1
+        )
+        chi2 = np.sum(((flux - scale[..., None] * model) / sigma) ** 2, -1)
+        log_like = -0.5 * chi2 - np.log(sigma).sum(-1)
+        weight = count * np.exp(log_like - log_like.max())
+        np.testing.assert_allclose(
+            results.pdf_2d[i], weight.sum((1, 2)) / weight.sum(), rtol=1e-5, atol=1e-12
+        )
+        best = np.unravel_index(np.argmax(np.where(count > 0, log_like, -np.inf)), chi2.shape)
+        assert results.chi2[i] == pytest.approx(chi2[best], rel=1e-9)
+        assert results.best_index[i][0] == best[0]
+        np.testing.assert_allclose(results.sigma[i], sigma[best[0], 0, 0, 0])
+        # the prior counts the models that the age of the universe excludes
+        every = 5 * 9 * 4 * grid.agn_multiplicity.sum()
+        total = np.log(weight.sum() / every) + log_like.max() - 3 * np.log(2 * np.pi)
+        assert results.log_evidence[i] == pytest.approx(total, abs=1e-3)
+
+
+@pytest.fixture(scope="module")
+def residuals(make_grid):
+    """One galaxy at three redshifts, whose fluxes scatter by 30 % beyond 2 um at rest and 5 % below."""
+    grid = replace(make_grid(5, n_z=3, n_tau=1, n_age=1, frac=[0.0]), filters=BANDS)
+    rng = np.random.default_rng(2)
+    z = rng.integers(3, size=900)
+    rest = PIVOTS / (1 + grid.redshift[z][:, None])
+    part = np.where(rest > 2.0, 0.3, 0.05)
+    model = 1e10 * grid.galaxy[z, 0]
+    flux = model * (1 + part * rng.normal(size=model.shape))
+    err = 0.02 * model
+    flux += err * rng.normal(size=model.shape)
+    return grid, photometry(flux, err), grid.redshift[z]
+
+
+def test_the_scatter_of_models_is_measured(residuals):
+    grid, table, z = residuals
+    error = TemplateError([1.99, 2.01] * u.um, [0.05, 0.3])
+    fitted = BayesFitter(grid, model_error=0.0, template_error=error).fit(table, redshift=z)
+    found = measure_template_error(fitted, edges=[0.1, 2.0, 20.0] * u.um)
+    # one parameter of six bands, four of them good: the residuals of these are sqrt(3/4) of the errors
+    np.testing.assert_allclose(found.error, [0.05 * np.sqrt(3 / 4), 0.3], rtol=0.12)
+
+
+def test_zero_points_are_found_and_applied(residuals):
+    grid, table, z = residuals
+    factors = dict(zip(BANDS, (1.0, 1.0, 1.0, 0.9, 1.0, 1.0), strict=True))
+    wrong = apply_zero_points(table, QTable({"band": BANDS, "factor": [*factors.values()]}))
+    error = TemplateError([1.99, 2.01] * u.um, [0.05, 0.3])
+    fitter = BayesFitter(grid, model_error=0.0, template_error=error)
+    for _ in range(4):
+        points = calibrate_zero_points(fitter.fit(wrong, redshift=z), reference="acs.f606w")
+        wrong = apply_zero_points(wrong, points)
+    assert points["factor"][0] == 1
+    np.testing.assert_allclose(points["factor"], 1, atol=0.01)
+    colors = [(t["wfc3.f160w"] / t["acs.f606w"]).value for t in (wrong, table)]
+    ratio = np.median(colors[0] / colors[1])
+    assert ratio == pytest.approx(1, abs=0.01)
+    assert wrong.meta["zero_points"].keys() == factors.keys()
+
+
+def test_free_redshifts_and_bad_errors_are_refused(grid, draw_photometry):
+    results = BayesFitter(grid).fit(draw_photometry(grid, 2)[0])
+    with pytest.raises(ValueError, match="known redshifts"):
+        calibrate_zero_points(results)
+    with pytest.raises(ValueError, match="known redshifts"):
+        measure_template_error(results)
+    with pytest.raises(ValueError, match="'wave' must be ascending"):
+        TemplateError([2.0, 1.0] * u.um, [0.1, 0.1])
+    with pytest.raises(ValueError, match="'error' must be 2 finite"):
+        TemplateError([1.0, 2.0] * u.um, [0.1, -0.1])
+    with pytest.raises(ValueError, match="a TemplateError"):
+        BayesFitter(grid, template_error=0.1)
