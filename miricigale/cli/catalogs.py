@@ -22,13 +22,18 @@ def add_fit(commands):
     fit.add_argument(
         "-o", "--output", type=Path, default=Path("fits"), help="folder of the results"
     )
-    fit.add_argument("--axes", choices=("fit", "quick"), default="fit", help="model grid")
+    fit.add_argument(
+        "--axes",
+        choices=("fit", "quick", "survey"),
+        default="fit",
+        help="model grid: that of Yang et al. 2021, a thinner one, or that for real galaxies of a survey",
+    )
     fit.add_argument("--redshift", metavar="COLUMN", help="column of known redshifts")
     fit.add_argument(
         "--model-error",
         type=float,
-        default=0.1,
-        help="model error as a part of the flux (0.1 is 10 %%)",
+        help="model error as a part of the flux, 0.1 (10 %%) by default; with --axes survey in place of its "
+        "template error",
     )
     fit.add_argument(
         "--pairs",

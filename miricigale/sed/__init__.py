@@ -18,7 +18,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "model": ("SEDModel",),
         "parameter": ("Parameter",),
         # with all components, which make themselves known
-        "presets": ("COMPONENTS", "yang2021_axes"),
+        "presets": ("COMPONENTS", "survey_axes", "yang2021_axes"),
         "spectrum": ("COSMOLOGY", "SED", "ModelSpectra"),
         "tables": ("ModelFlags",),
         "xray": ("XRay", "band_luminosity", "stern2015", "stern2015_6um", "xray_flux"),

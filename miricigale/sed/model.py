@@ -173,6 +173,37 @@ class SEDModel:
         model._notes = tuple(notes)
         return model
 
+    @classmethod
+    def survey(
+        cls,
+        *,
+        agn=True,
+        igm="meiksin2006",
+        libraries="best",
+        frac_agn_definition="dust",
+        cosmology=COSMOLOGY,
+    ):
+        """
+        A chain for real galaxies of a survey, to be fitted with `survey_axes`.
+
+        The chain of `yang2021` with lines and continuum of the gas (log U -2.5), a burst of 30 Myr ago,
+        and old stars with 0.44 of the color excess of young ones and of the gas (Calzetti et al. 2000).
+
+        Parameters
+        ----------
+        agn, igm, libraries, frac_agn_definition, cosmology : optional
+            As for `yang2021`.
+        """
+        parts, notes = presets.survey_components(agn=agn, igm=igm, libraries=libraries)
+        model = cls(parts, frac_agn_definition=frac_agn_definition, cosmology=cosmology)
+        model._notes = tuple(notes)
+        return model
+
+    @staticmethod
+    def survey_axes():
+        """Axes for real galaxies; see `miricigale.sed.survey_axes`."""
+        return presets.survey_axes()
+
     @staticmethod
     def yang2021_axes(kind="fit"):
         """Axes of the grids of Yang et al. 2021; see `miricigale.sed.yang2021_axes`."""

@@ -162,14 +162,14 @@ def fit_catalog(
     output,
     *,
     axes="fit",
-    model_error=0.1,
+    model_error=None,
     catalog_map=None,
     hdu=None,
     chunk_rows=10000,
     **options,
 ):
     """
-    Fit a catalog of photometry of any length with the chain of Yang et al. 2021.
+    Fit a catalog of photometry of any length with the chain of Yang et al. 2021, or that of surveys.
 
     Parameters
     ----------
@@ -178,10 +178,11 @@ def fit_catalog(
         ``<filter>_err``, or with columns that ``catalog_map`` gives these names.
     output : path-like
         Folder of the results.
-    axes : {"fit", "quick"}, optional
-        Model grid; see `miricigale.sed.yang2021_axes`.
+    axes : {"fit", "quick", "survey"}, optional
+        Model grid; see `miricigale.sed.yang2021_axes` and `miricigale.sed.survey_axes`.
     model_error : float, optional
-        Relative model error.
+        Relative model error: 0.1 by default; with ``axes="survey"`` it takes the place of
+        `miricigale.fitting.TemplateError.survey`, which is then the default.
     catalog_map : `~miricigale.filters.CatalogMap`, str or path-like, optional
         Names and units of the catalog; the name of a survey, or a TOML file.
     hdu, chunk_rows, **options
@@ -222,7 +223,7 @@ def fit_catalog(
             f"columns {list(names)}",
         )
     # heavy imports only after the file was checked
-    from miricigale.fitting import BayesFitter, fit_file
+    from miricigale.fitting import BayesFitter, TemplateError, fit_file
     from miricigale.fitting.likelihood import unused_bands
     from miricigale.sed import SEDModel
 
@@ -233,8 +234,13 @@ def fit_catalog(
             f"errors are missing: {', '.join(unused)}"
         )
         warnings.warn(msg, MiricigaleWarning, stacklevel=2)
-    fitter = BayesFitter(
-        SEDModel.yang2021(), bands, axes=SEDModel.yang2021_axes(axes), model_error=model_error
-    )
+    if axes == "survey":
+        model, nodes = SEDModel.survey(), SEDModel.survey_axes()
+        error = TemplateError.survey() if model_error is None else None
+        errors = {"model_error": model_error or 0.0, "template_error": error}
+    else:
+        model, nodes = SEDModel.yang2021(), SEDModel.yang2021_axes(axes)
+        errors = {"model_error": 0.1 if model_error is None else model_error}
+    fitter = BayesFitter(model, bands, axes=nodes, **errors)
     options |= {"catalog_map": catalog_map, "hdu": hdu, "chunk_rows": chunk_rows}
     return fit_file(fitter, path, output, **options)

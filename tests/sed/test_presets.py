@@ -87,3 +87,17 @@ def test_xrays_of_the_paper():
     got = model.derived(frac_agn=0.5, age=1.0, redshift=2.0, mass=1e10)
     scale = 10**42.5 / got["l_2_10kev"].to_value("erg/s")
     assert 0.7e-16 < scale * got["xray_flux"].to_value("erg / (s cm2)") < 1.4e-16
+
+
+def test_survey_axes_are_those_of_the_chain(folder):
+    model, axes = SEDModel.survey(), SEDModel.survey_axes()
+    assert names(model)["nebular"] == "nebular"
+    assert axes["ebv"][0] == 0
+    assert axes["frac_agn"][0] == 0
+    assert np.all(np.diff(np.log1p(axes["redshift"])) <= 0.02 + 1e-9)
+    grid = model.grid(
+        axes | {"tau": [0.5], "alpha": [2.0], "redshift": [1.4]}, ["wfc3.f160w", "miri.f770w"]
+    )
+    # seven ages, three bursts, two metallicities and slopes, eight color excesses; two tori of three depths
+    assert (grid.n_galaxies, grid.n_agn) == (672, 6)
+    assert np.all(grid.galaxy > 0)
