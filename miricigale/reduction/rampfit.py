@@ -40,7 +40,7 @@ class RampFit:
     rate : `~numpy.ndarray` of float32, shape (ny, nx)
         Slope in DN/s; NaN where there is none.
     var_poisson, var_read : `~numpy.ndarray` of float32, shape (ny, nx)
-        The two parts of its variance, (DN/s)^2.
+        The two parts of its variance, (DN/s)^2: of photons, and of the read-out.
     n_used : `~numpy.ndarray` of int16, shape (ny, nx)
         Differences of groups that the slope stands on, all integrations.
     n_jump : `~numpy.ndarray` of int16, shape (ny, nx)
@@ -102,6 +102,7 @@ def fit_groups(
     group_time,
     gain,
     read_noise,
+    slow_noise=0.0,
     bias=0.0,
     drift=0.0,
     reset=None,
@@ -132,6 +133,9 @@ def fit_groups(
     read_noise : float or `~numpy.ndarray`, shape (ny, nx)
         Standard deviation of one read, DN. The variance of rounding, 1/12, is added for
         integer data.
+    slow_noise : float or `~numpy.ndarray`, shape (ny, nx), optional
+        Standard deviation that the read-out adds from one group to the next, DN: a random walk,
+        as the noise of photons is.
     bias : float or `~numpy.ndarray`, shape (ny, nx), optional
         Level of an empty pixel, DN.
     drift : array_like, shape (n_int, n_group) or (n_int, n_group, 1 or ny, 4), optional
@@ -209,6 +213,7 @@ def fit_groups(
 
     gain = _map(gain, "gain", usable, above=0.0, infinite=True)
     read_noise = _map(read_noise, "read_noise", usable, least=0.0)
+    slow_noise = _map(slow_noise, "slow_noise", usable, least=0.0)
     bias = _map(bias, "bias", usable)
     saturation = _map(saturation, "saturation", usable, infinite=True)
     coef = _coefficients(linearity, usable)
@@ -234,7 +239,7 @@ def fit_groups(
     ramp = (data, (drift, bias, reset), (coef, saturation, dark))
     groups = (first_group, last_group)
     # a trace of read noise keeps the closed forms finite
-    noise = (np.maximum(variance, 1e-6), poisson_factor / gain)
+    noise = (np.maximum(variance, 1e-6), poisson_factor / gain, np.square(slow_noise))
     last = (noise, 1 / group_time, jump)
     # pixels whose groups have flags are fitted one by one
     plain = usable if flagged is None else usable & ~flagged

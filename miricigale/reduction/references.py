@@ -47,6 +47,8 @@ class DetectorMaps:
     ----------
     gain, read_noise, bias, saturation : float or `~numpy.ndarray`, shape (ny, nx)
         Electrons per DN; DN of one read; DN of an empty pixel; raw DN.
+    slow_noise : float or `~numpy.ndarray`, shape (ny, nx)
+        DN that the read-out adds from one group to the next, a random walk.
     linearity : tuple of float or `~numpy.ndarray`, shape (n, ny, nx)
         Polynomial, lowest power first, from DN above the bias to linear DN.
     reset, dark : `~numpy.ndarray` or None
@@ -59,6 +61,7 @@ class DetectorMaps:
 
     gain: object
     read_noise: object
+    slow_noise: object = 0.0
     bias: object = 0.0
     saturation: object = np.inf
     linearity: object = (0.0, 1.0)
@@ -358,6 +361,8 @@ class ReferenceFiles:
             for name in unknown:
                 values[name] = getattr(measured, name)
                 used[name] = measured.describe(name)
+            if "gain" in unknown:
+                values["slow_noise"] = measured.slow_noise
         if self.origin is not None:
             used["context"] = self.origin
         return DetectorMaps(**values, used=used)

@@ -79,6 +79,7 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False):
             # the pipeline found them, and flags of groups tell them
             options |= {"jump_threshold": None, "neighbor_threshold": None}
         options |= {
+            "slow_noise": maps.slow_noise,
             "bias": maps.bias,
             "drift": _drift(reducer, ramp, reference, drift),
             "reset": maps.reset,

@@ -138,7 +138,7 @@ def _segments(cut, valid, n_diff, first, last):
 
 
 @njit(cache=True, error_model="numpy")
-def fit_pixel(d, cut, valid, n_diff, s, inv_gain, threshold, f, tmp, first, last, found):
+def fit_pixel(d, cut, valid, n_diff, s, inv_gain, slow, threshold, f, tmp, first, last, found):
     """
     Fit one pixel, cutting the most significant jump until none is left.
 
@@ -156,9 +156,9 @@ def fit_pixel(d, cut, valid, n_diff, s, inv_gain, threshold, f, tmp, first, last
             for i in range(first[k], last[k]):
                 mean += d[i]
         slope = mean / n_used
-        v = _poisson(slope, inv_gain, s)
+        v = _poisson(slope, inv_gain, s) + slow
         slope, total, total2 = _solve(d, first, last, n_seg, v, s, f)
-        v = _poisson(slope, inv_gain, s)
+        v = _poisson(slope, inv_gain, s) + slow
         slope, total, total2 = _solve(d, first, last, n_seg, v, s, f)
         if n_used == 1:
             break
@@ -169,7 +169,7 @@ def fit_pixel(d, cut, valid, n_diff, s, inv_gain, threshold, f, tmp, first, last
         found[j] = sign * np.sqrt(t2)
         n_new += 1
     var = 1.0 / total
-    var_poisson = v * total2 * var * var
+    var_poisson = (v - slow) * total2 * var * var
     return slope, var_poisson, max(var - var_poisson, 0.0), n_used, n_new
 
 
@@ -312,7 +312,7 @@ def refit(
     parameters are those of `fit_rows`. Jumps that were found before belong to the cuts; new ones are
     added to their number.
     """
-    variance, inv_gain = noise
+    variance, inv_gain, slow = noise
     n_int = data.shape[0]
     n_diff = g1 - g0 - 1
     n_all = n_int * n_diff
@@ -333,8 +333,8 @@ def refit(
         for j in range(start[i], start[i + 1]):
             cut[cuts[j]] = True
         result = fit_pixel(
-            d, cut, valid, n_diff, at(variance, y, x), at(inv_gain, y, x), threshold, f, tmp,
-            first, last, found,
+            d, cut, valid, n_diff, at(variance, y, x), at(inv_gain, y, x), at(slow, y, x),
+            threshold, f, tmp, first, last, found,
         )  # fmt: skip
         # its own jumps are among the cuts
         jumps = n_jump[y, x] + result[4]

@@ -45,8 +45,8 @@ def fit_rows(
     saturation (map): a group from it (raw DN) and all after it are dropped; dark signal
     (integrations, groups, ny, nx), subtracted last. Anomaly and dark of no groups are none.
 
-    ``noise``: variance of one read in DN^2, and what times the slope is the Poisson variance of a
-    difference (maps).
+    ``noise``: variance of one read in DN^2, what times the slope is the Poisson variance of a
+    difference, and what slow noise of the read-out adds to it (maps).
 
     Pixels that are not ``usable`` get NaN. ``scale`` is the inverse group time, and jumps are cut
     above ``threshold`` sigma. The images ``rate`` to ``dq`` are filled in place.
@@ -56,7 +56,7 @@ def fit_rows(
     """
     drift, bias, reset = levels
     coefficients, limits, dark = response
-    variances, poisson = noise
+    variances, poisson, wander = noise
     n_int, _, _, nx = data.shape
     n_coef = coefficients.shape[0]
     n_channel = drift.shape[3]
@@ -77,6 +77,7 @@ def fit_rows(
     saturation = np.empty(BLOCK)
     s = np.empty(BLOCK)
     inv_gain = np.empty(BLOCK)
+    slow = np.empty(BLOCK)
     top = np.empty(BLOCK)
     slope = np.empty(BLOCK)
     v = np.empty(BLOCK)
@@ -114,6 +115,7 @@ def fit_rows(
                 saturation[b] = at(limits, y, x)
                 s[b] = at(variances, y, x)
                 inv_gain[b] = at(poisson, y, x)
+                slow[b] = at(wander, y, x)
                 for j in range(n_coef):
                     coef[j, b] = at(coefficients[j], y, x)
             for k in range(n_int):
@@ -164,7 +166,7 @@ def fit_rows(
                 for b in range(BLOCK):
                     vv = slope[b] * inv_gain[b]
                     low = X_MIN * s[b]
-                    vv = vv if vv > low else low
+                    vv = (vv if vv > low else low) + slow[b]
                     v[b] = vv
                     xx = vv / s[b]
                     q = 0.5 * xx + np.sqrt(xx + 0.25 * xx * xx)
@@ -225,7 +227,7 @@ def fit_rows(
                     continue
                 if top[b] < saturation[b] and crit[b] <= 0.0:
                     var = 1.0 / (sw[b] * norm[b] * n_int)
-                    vp = v[b] * sw2[b] * norm[b] * norm[b] * n_int * var * var
+                    vp = (v[b] - slow[b]) * sw2[b] * norm[b] * norm[b] * n_int * var * var
                     rate[y, x] = slope[b] * scale
                     var_poisson[y, x] = vp * scale * scale
                     var_read[y, x] = max(var - vp, 0.0) * scale * scale
@@ -240,7 +242,8 @@ def fit_rows(
                     saturated = gather(data, levels, response, y, x, g0, g1, d1, valid)
                 cut[:] = False
                 result = fit_pixel(
-                    d1, cut, valid, n_diff, s[b], inv_gain[b], threshold, f1, tmp1, first, last, found,
+                    d1, cut, valid, n_diff, s[b], inv_gain[b], slow[b], threshold, f1, tmp1, first, last,
+                    found,
                 )  # fmt: skip
                 store(
                     y, x, scale, result, saturated, False,
