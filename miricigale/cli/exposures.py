@@ -38,6 +38,7 @@ def add_reduce(commands):
         metavar="ARCSEC",
         help="of the mosaics (0.11)",
     )
+    add("--rateints", action="store_true", help="slopes of each integration too")
     add("--no-resume", dest="resume", action="store_false", help="make everything again")
     add("--threads", type=int, help="threads (default: all cores)")
     add("--no-progress", action="store_true", help="no progress bar")
@@ -59,6 +60,7 @@ def _reduce(args):
         args.output,
         reducer=reducer,
         pixel_scale=args.pixel_scale,
+        integrations=args.rateints,
         resume=args.resume,
         progress_bar=not args.no_progress,
     )

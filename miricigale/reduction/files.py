@@ -17,6 +17,7 @@ from astropy.wcs import WCS, FITSFixedWarning
 from miricigale.detector import Ramp
 from miricigale.instrument import DQ, STEPS, dq_legend, imager_wcs, read_dq, steps_done, subarrays
 from miricigale.reduction.assumed import middle_of
+from miricigale.reduction.images import plain_flags, plain_mask, sigma
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.files import open_fits, write_fits
 from miricigale.utils.meta import undated
@@ -322,14 +323,15 @@ def write_image(image, path, *, planes=None, header=None, overwrite=False):
 
     Parameters
     ----------
-    image : `~astropy.nddata.CCDData`
-        Rate, calibrated image or mosaic. Its WCS, with distortion, goes to the header of SCI; its
+    image : `~astropy.nddata.CCDData`, `ImageFile` or list of one of them
+        Rate, calibrated image or mosaic; of a list, the integrations of an exposure, all planes
+        are cubes (``_rateints``). Its WCS, with distortion, goes to the header of SCI; its
         meta dictionary, as JSON, to the keyword META, by which `read_images` restores it.
     path : path-like
         The file.
     planes : dict of str to `~numpy.ndarray`, optional
         Further planes by name (`ImageFile`), such as ``WHT``, ``CON`` (numbers of images)
-        and ``BKG`` (what was subtracted).
+        and ``BKG`` (what was subtracted), beside those of an `ImageFile`.
     header : `~astropy.io.fits.Header`, optional
         Keywords of the observation.
     overwrite : bool, optional
@@ -344,16 +346,17 @@ def write_image(image, path, *, planes=None, header=None, overwrite=False):
     OSError
         If the file exists and ``overwrite`` is False.
     ValueError
-        If a plane has another name or shape.
+        If a plane has another name or shape, or integrations do not belong together.
     """
     path = Path(path)
+    image, planes, wcs = _joined(image, planes or {})
     primary = fits.PrimaryHDU()
     meta = undated(image.meta)
     keywords = {
         "TELESCOP": "JWST", "INSTRUME": "MIRI", "DETECTOR": "MIRIMAGE", "EXP_TYPE": "MIR_IMAGE",
         "FILTER": str(meta.get("filter", "")).rpartition(".")[2].upper() or None,
         "SUBARRAY": meta.get("subarray"), "READPATT": meta.get("readout"),
-        "DATAMODL": "ImageModel", "FILENAME": path.name,
+        "DATAMODL": "ImageModel" if image.data.ndim == 2 else "CubeModel", "FILENAME": path.name,
     }  # fmt: skip
     if header is not None:
         primary.header.extend(header.copy(strip=True), unique=True, strip=True)
@@ -362,8 +365,8 @@ def write_image(image, path, *, planes=None, header=None, overwrite=False):
         if STEPS[step] in meta["steps"]:
             primary.header[step] = "COMPLETE"
     science = fits.Header()
-    if image.wcs is not None:
-        science = image.wcs.to_header(relax=True)
+    if wcs is not None:
+        science = wcs.to_header(relax=True)
         # what is no WCS keyword of this image, and confuses
         for name in ("DATE-OBS", "MJD-OBS", "TIMESYS"):
             science.remove(name, ignore_missing=True)
@@ -392,9 +395,9 @@ def write_image(image, path, *, planes=None, header=None, overwrite=False):
     if np.any(flags >> 32):
         own = fits.Header([("DQSHIFT", 32, "bit n of this plane is bit n + 32 of the legend")])
         hdus.append(fits.ImageHDU((flags >> 32).astype(np.uint8), own, name="DQ_OWN"))
-    for name, plane in (planes or {}).items():
+    for name, plane in planes.items():
         plane = np.asarray(plane)
-        if name not in PLANES or plane.shape[-2:] != image.shape:
+        if name not in PLANES or plane.shape[-2:] != image.shape[-2:]:
             wanted = f"of {image.shape} pixels, named {', '.join(PLANES)}"
             raise argument_error("planes", wanted, f"{name} of {plane.shape}")
         plane = plane.astype(np.int32 if name == "CON" else np.float32)
@@ -405,6 +408,42 @@ def write_image(image, path, *, planes=None, header=None, overwrite=False):
             hdus[-1].header["BUNIT"] = unit
     write_fits(hdus, path, overwrite=overwrite)
     return path
+
+
+def _joined(image, planes):
+    """Image, planes and WCS that are written of an image, of one with planes, or of integrations."""
+    several = isinstance(image, (list, tuple))
+    files = [
+        part if isinstance(part, ImageFile) else ImageFile(part, {}, fits.Header())
+        for part in (image if several else [image])
+    ]
+    first = files[0].image if files else None
+    alike = all(
+        file.image.shape == first.shape
+        and file.image.unit == first.unit
+        and file.image.uncertainty is not None
+        and set(file.planes) == set(files[0].planes)
+        for file in files
+    )
+    if not files or (several and not alike):
+        wanted = "integrations of one shape and unit, with errors and the same planes"
+        raise argument_error("image", wanted, f"{len(files)} others")
+    if not several:
+        return first, {**files[0].planes, **planes}, first.wcs
+
+    def cube(values):
+        return np.array([values(file) for file in files])
+
+    joined = CCDData(
+        cube(lambda file: file.image.data),
+        unit=first.unit,
+        uncertainty=StdDevUncertainty(cube(lambda file: sigma(file.image))),
+        mask=cube(lambda file: plain_mask(file.image)),
+        flags=cube(lambda file: plain_flags(file.image)),
+        meta={key: value for key, value in first.meta.items() if key != "integration"},
+    )
+    own = {name: cube(lambda file, n=name: file.planes[n]) for name in files[0].planes}
+    return joined, {**own, **planes}, first.wcs
 
 
 def _plain(value):

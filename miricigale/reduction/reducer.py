@@ -4,6 +4,7 @@ import dataclasses
 import os
 
 import numpy as np
+from astropy.io.fits import Header
 from astropy.nddata import CCDData
 
 from miricigale.detector import Charge, Ramp, ResetAnomaly
@@ -11,7 +12,7 @@ from miricigale.instrument import DetectorProperties, ImageFacts, miri_detector,
 from miricigale.reduction.assumed import brightness_of, history_of, maps_of
 from miricigale.reduction.background import estimate_background, subtract_background
 from miricigale.reduction.calibration import calibrate
-from miricigale.reduction.files import open_exposure
+from miricigale.reduction.files import ImageFile, open_exposure
 from miricigale.reduction.images import (
     check_images,
     check_overlap,
@@ -213,27 +214,36 @@ class Reducer:
             raise argument_error("ramp", "a Ramp or a Charge", type(ramp).__name__)
         return fit_slopes(self, ramp, maps_of(self, ramp), progress_bar)
 
-    def fit_ramp(self, ramp, *, progress_bar=False):
+    def fit_ramp(self, ramp, *, planes=False, progress_bar=False):
         """
         Fit the ramps of an exposure.
 
-        Parameters are those of `fit_groups`.
+        Parameters
+        ----------
+        ramp : `~miricigale.detector.Ramp` or `~miricigale.detector.Charge`
+            Counts in DN; or what was collected, whose slopes are drawn.
+        planes : bool, optional
+            Whether the two parts of the variance are given too.
+        progress_bar : bool, optional
+            Whether a progress bar is shown.
 
         Returns
         -------
-        rate : `~astropy.nddata.CCDData`
+        rate : `~astropy.nddata.CCDData` or `ImageFile`
             Slope in DN/s with standard deviation, mask, ``flags`` (`DQ`) and WCS;
             masked pixels without a slope are NaN. The meta dictionary has the exposure in
             plain values, and ``noise_correction``: by how much the sum over many pixels is
-            noisier than their errors in quadrature, because neighbors share charge.
+            noisier than their errors in quadrature, because neighbors share charge. With
+            ``planes`` it is the ``image`` of an `ImageFile`, whose ``planes`` are ``VAR_POISSON``
+            and ``VAR_RNOISE``, (DN/s)^2: what `write_image` writes as a ``_rate``.
         """
         if not isinstance(ramp, (Ramp, Charge)):
             raise argument_error("ramp", "a Ramp or a Charge", type(ramp).__name__)
         maps = maps_of(self, ramp)
-        fit = fit_slopes(self, ramp, maps, progress_bar)
-        return self._image(ramp, maps, fit)
+        rate = self._image(ramp, maps, fit_slopes(self, ramp, maps, progress_bar))
+        return rate if planes else rate.image
 
-    def fit_integrations(self, ramp, *, progress_bar=False):
+    def fit_integrations(self, ramp, *, planes=False, progress_bar=False):
         """
         Fit the ramps of each integration alone.
 
@@ -241,14 +251,16 @@ class Reducer:
         ----------
         ramp : `~miricigale.detector.Ramp`
             Counts in DN.
+        planes : bool, optional
+            As for `fit_ramp`.
         progress_bar : bool, optional
             Whether a progress bar is shown.
 
         Returns
         -------
-        rates : list of `~astropy.nddata.CCDData`
+        rates : list of `~astropy.nddata.CCDData` or of `ImageFile`
             As `fit_ramp` returns them, one for each integration; the references are those of
-            the exposure.
+            the exposure. `write_image` makes a ``_rateints`` of the list.
         """
         if not isinstance(ramp, Ramp):
             raise argument_error("ramp", "a Ramp", type(ramp).__name__)
@@ -257,11 +269,11 @@ class Reducer:
         for number in progress(range(ramp.shape[0]), show=progress_bar, desc="integrations"):
             part, own = ramp.integration(number), maps.integration(number)
             rates.append(self._image(part, own, fit_slopes(self, part, own)))
-            rates[-1].meta["integration"] = number
-        return rates
+            rates[-1].image.meta["integration"] = number
+        return rates if planes else [rate.image for rate in rates]
 
     def _image(self, ramp, maps, fit):
-        """What `fit_ramp` returns."""
+        """What `fit_ramp` returns, with its planes."""
         ipc = shares_charge(self, ramp)
         meta = provenance(
             **exposure_values(ramp.exposure),
@@ -271,9 +283,11 @@ class Reducer:
             gain=float(np.median(maps.gain)),
             **history_of(self, ramp, maps),
         )
-        return image(
+        rate = image(
             fit.rate, RATE, error=fit.error, flags=fit.flags, wcs=ramp.exposure.wcs, meta=meta
         )
+        planes = {"VAR_POISSON": fit.var_poisson, "VAR_RNOISE": fit.var_read}
+        return ImageFile(rate, planes, Header())
 
     def calibrate(self, rate):
         """

@@ -31,7 +31,7 @@ __all__ = ["reduce_files"]
 log = logging.getLogger(__name__)
 
 #: Changes with what the products hold.
-_VERSION = 1
+_VERSION = 2
 
 #: What a bad file may raise; the others go on.
 _ERRORS = (ArithmeticError, ImportError, KeyError, MemoryError, OSError, ValueError)
@@ -43,6 +43,7 @@ def reduce_files(
     *,
     reducer=None,
     pixel_scale=0.11 * ANGLE,
+    integrations=False,
     resume=True,
     progress_bar=False,
 ):
@@ -55,13 +56,16 @@ def reduce_files(
         Files of the MIRI imager at any stage: ``_uncal``, ``_ramp``, ``_rate``, ``_rateints``, ``_cal``,
         ``_i2d``.
     folder : path-like
-        Gets ``<name>_rate.fits`` and ``<name>_cal.fits`` of each exposure (background subtracted, it is
-        in the extension BKG), ``mosaic_<filter>.fits`` (SCI, ERR, DQ, WHT, CON, BKG), ``files.ecsv`` and
-        ``index.html``.
+        Gets ``<name>_rate.fits`` (with VAR_POISSON and VAR_RNOISE) and ``<name>_cal.fits`` of each
+        exposure (background subtracted, it is in the extension BKG), ``mosaic_<filter>.fits`` (SCI,
+        ERR, DQ, WHT, CON, BKG), ``files.ecsv`` and ``index.html``.
     reducer : `~miricigale.reduction.Reducer`, optional
         Settings, references among them.
     pixel_scale : `~astropy.units.Quantity`, optional
         Of the mosaics.
+    integrations : bool, optional
+        Whether ramps of several integrations give a ``<name>_rateints.fits`` too, with the
+        slopes of each.
     resume : bool, optional
         Whether products of the same files and settings that are there are kept.
     progress_bar : bool, optional
@@ -96,8 +100,8 @@ def reduce_files(
         row = {"file": str(path), "filter": "", "status": "failed", "reason": ""}
         rows.append(row)
         try:
-            key = content_sha256([_VERSION, file_sha256(path), settings])
-            cal, status, reason = _exposure(reducer, path, folder / stem, key, resume)
+            key = content_sha256([_VERSION, file_sha256(path), settings, integrations])
+            cal, status, reason = _exposure(reducer, path, folder / stem, key, resume, integrations)
             row |= {"status": status, "reason": reason}
             if cal is not None:
                 row["filter"] = ImageFacts.of(read_images(cal)[0].image).filter or ""
@@ -162,7 +166,7 @@ def _kept(path, key, resume):
         return False
 
 
-def _exposure(reducer, path, stem, key, resume):
+def _exposure(reducer, path, stem, key, resume, integrations):
     """Reduce one file: its calibrated product (None without), what was done, and why not more."""
     cal, rate = (stem.with_name(f"{stem.name}_{kind}.fits") for kind in ("cal", "rate"))
     if cal.resolve() == path.resolve() or rate.resolve() == path.resolve():
@@ -172,14 +176,19 @@ def _exposure(reducer, path, stem, key, resume):
     slopes_only = "no photometry without references"
     if reducer.references == "none" and _kept(rate, key, resume):
         return None, "kept", slopes_only
-    exposure = open_exposure(path)
+    exposure, planes = open_exposure(path), {}
+    if isinstance(exposure, Ramp):
+        if integrations and exposure.shape[0] > 1:
+            parts = reducer.fit_integrations(exposure, planes=True)
+            write_image(parts, stem.with_name(f"{stem.name}_rateints.fits"), overwrite=True)
+        slopes = reducer.fit_ramp(exposure, planes=True)
+        exposure, planes = slopes.image, slopes.planes
     if reducer.references == "none" and not exposure.unit.is_equivalent(SURFACE_BRIGHTNESS):
-        slopes = reducer.fit_ramp(exposure) if isinstance(exposure, Ramp) else exposure
-        _write(slopes, rate, key)
+        _write(exposure, rate, key, **planes)
         return None, "rate", slopes_only
     slopes, image, background = reducer.reduce(exposure)
     if slopes is not None:
-        _write(slopes, rate, key)
+        _write(slopes, rate, key, **planes)
     _write(image, cal, key, BKG=background.level)
     return cal, "reduced", ""
 

@@ -10,7 +10,7 @@ from astropy.wcs import WCS
 
 from helpers.real import real_file
 from helpers.references import write_photom, write_reference
-from miricigale.detector import Detector, Ramp
+from miricigale.detector import CosmicRays, Detector, Ramp
 from miricigale.instrument import DQ, Exposure, ImageFacts
 from miricigale.reduction import Reducer, ReferenceFiles, open_exposure, read_images, write_image
 from miricigale.utils.exceptions import DataError
@@ -226,3 +226,39 @@ def test_what_is_no_image_is_refused(tmp_path):
     image = CCDData(np.ones((4, 4)), unit="Jy", uncertainty=StdDevUncertainty(np.ones((4, 4))))
     with pytest.raises(ValueError, match="'exposure' must be in adu / s or MJy / sr, got Jy"):
         Reducer().reduce(image)
+
+
+def test_slopes_have_their_two_variances_and_those_of_each_integration(exposure, tmp_path):
+    exposure = exposure.replace(n_integrations=3)
+    sky = CCDData(np.full(exposure.shape, 12.0), unit="MJy/sr")
+    ramp = Detector.miri_imager().without(CosmicRays).expose(sky, exposure, seed=2)
+    reducer = Reducer(jump_threshold=None)
+    rate = reducer.fit_ramp(ramp, planes=True)
+    np.testing.assert_array_equal(rate.image.data, reducer.fit_ramp(ramp).data)
+    back = read_images(write_image(rate, tmp_path / "a_rate.fits"))[0]
+    good = ~back.image.mask
+    total = back.planes["VAR_POISSON"] + back.planes["VAR_RNOISE"]
+    np.testing.assert_allclose(total[good], back.image.uncertainty.array[good] ** 2, rtol=1e-5)
+    # without photons, the variance of a straight line through reads (a closed form)
+    n, sigma = exposure.n_groups, np.hypot(ramp.properties.read_noise, np.sqrt(1 / 12))
+    step = exposure.group_time.to_value("s")
+    line = 12 * sigma**2 / (step**2 * n * (n**2 - 1)) / 3
+    assert np.all(back.planes["VAR_RNOISE"][good] >= 0.999 * line)
+    assert np.median(back.planes["VAR_RNOISE"][good]) == pytest.approx(line, rel=0.05)
+    parts = reducer.fit_integrations(ramp, planes=True)
+    path = write_image(parts, tmp_path / "a_rateints.fits")
+    with fits.open(path) as hdus:
+        for name in ("SCI", "ERR", "DQ", "VAR_POISSON", "VAR_RNOISE"):
+            assert hdus[name].shape == (3, *exposure.shape)
+        assert hdus[0].header["DATAMODL"] == "CubeModel"
+    for number, (file, part) in enumerate(zip(read_images(path), parts, strict=True)):
+        assert file.image.meta["integration"] == number
+        np.testing.assert_array_equal(file.image.data, part.image.data)
+        np.testing.assert_array_equal(file.planes["VAR_POISSON"], part.planes["VAR_POISSON"])
+        seen = file.image.wcs.pixel_to_world(10, 20)
+        assert seen.separation(exposure.wcs.pixel_to_world(10, 20)) < 1e-6 * u.arcsec
+    # their mean is the slope of all, where nothing is cut
+    mean = open_exposure(path)
+    np.testing.assert_allclose(mean.data[good], rate.image.data[good], rtol=0.02, atol=0.2)
+    with pytest.raises(ValueError, match="'image' must be integrations of one shape and unit"):
+        write_image([parts[0], parts[1].image], tmp_path / "b.fits")

@@ -119,3 +119,30 @@ def test_without_references_there_are_slopes_alone(files, tmp_path):
     assert file.image.unit == u.adu / u.s
     table = reduce_files(files[:1], tmp_path, reducer=Reducer(references="none"))
     assert list(table["status"]) == ["kept"]
+
+
+def test_slopes_of_each_integration_on_demand(tmp_path):
+    exposure = Exposure(
+        "miri.f770w",
+        n_groups=10,
+        n_integrations=2,
+        subarray="SUB64",
+        pointing=SkyCoord(53.1344, -27.8344, unit="deg"),
+        roll=30 * u.deg,
+    )
+    sky = CCDData(np.full(exposure.shape, 5.0), unit="MJy/sr")
+    path = Detector.miri_imager().expose(sky, exposure, seed=1).write(tmp_path / "a_uncal.fits")
+    arguments = ["reduce", str(path), "-o", str(tmp_path / "out"), "--no-progress"]
+    assert main([*arguments, "--rateints"]) == 0
+    rate, *parts = read_images(tmp_path / "out/a_rate.fits") + read_images(
+        tmp_path / "out/a_rateints.fits"
+    )
+    assert len(parts) == 2
+    for file in (rate, *parts):
+        assert {"VAR_POISSON", "VAR_RNOISE"} <= set(file.planes)
+    # half the exposure, twice the variance
+    good = ~rate.image.mask & ~parts[0].image.mask
+    ratio = parts[0].image.uncertainty.array[good] / rate.image.uncertainty.array[good]
+    assert np.median(ratio) == pytest.approx(np.sqrt(2), rel=0.02)
+    assert main(arguments) == 0
+    assert Table.read(tmp_path / "out/files.ecsv")["status"][0] == "reduced"
