@@ -25,6 +25,7 @@ __getattr__, __dir__, __all__ = lazy_names(
             "ReadNoise",
             "ReferencePixels",
             "ResetAnomaly",
+            "ResetDecay",
             "Residual",
             "Saturation",
         ),

@@ -19,6 +19,7 @@ from miricigale.detector.effects import (
     Persistence,
     ReadNoise,
     ResetAnomaly,
+    ResetDecay,
     Residual,
 )
 from miricigale.detector.effects.order import check_order, keyed, place_of
@@ -41,7 +42,7 @@ logger = logging.getLogger(__name__)
 _STANDARD = [
     kind
     for kind in ORDER
-    if kind not in (Residual, Persistence, ResetAnomaly, FirstFrame, LastFrame)
+    if kind not in (Residual, Persistence, ResetAnomaly, ResetDecay, FirstFrame, LastFrame)
 ]
 
 _EXPOSE_TO = "expose fewer groups, or write it by 'expose_to'"
@@ -324,8 +325,8 @@ class Detector:
         `~astropy.units.UnitsError`
             As `expose`.
         ValueError
-            As `expose`; or if the detector has 1/f noise or effects of other kinds than the
-            package's.
+            As `expose`; or if the detector has 1/f noise, a decay after resets, or effects of
+            other kinds than the package's.
 
         Warns
         -----
@@ -339,8 +340,11 @@ class Detector:
         """
         for effect in self._effects:
             pink = isinstance(effect, ReadNoise) and effect.pink > 0
-            if pink or place_of(effect) is None:
-                wanted = "the package's own, without 1/f noise, to be collected without groups"
+            if pink or isinstance(effect, ResetDecay) or place_of(effect) is None:
+                wanted = (
+                    "the package's own, without 1/f noise and decay after resets, to be collected "
+                    "without groups"
+                )
                 raise argument_error("effects", wanted, repr(effect))
         seed = check_seed(seed)
         task = self._task(image, exposure, seed, previous)

@@ -10,6 +10,7 @@ from miricigale.detector import (
     InterpixelCapacitance,
     LastFrame,
     ResetAnomaly,
+    ResetDecay,
 )
 from miricigale.instrument import DQ
 from miricigale.reduction.assumed import is_own
@@ -148,6 +149,12 @@ def _drift(reducer, ramp, reference, drift):
 
 def _anomaly(reducer, ramp, maps):
     """Offset of each group after a reset, DN, beside that of the references."""
+    if reducer.skip_first is None and ramp.shows(ResetDecay) and ramp.exposure.n_integrations > 1:
+        msg = (
+            "the ramp shows a decay after the resets between integrations that this Reducer leaves in: "
+            "give it 'skip_first' groups to be left out"
+        )
+        warnings.warn(msg, MiricigaleWarning, stacklevel=4)
     if reducer.reset_anomaly is not None:
         exposure = ramp.exposure
         return reducer.reset_anomaly.offsets(exposure.n_integrations, exposure.n_groups)

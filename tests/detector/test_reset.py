@@ -15,6 +15,7 @@ from miricigale.detector import (
     Persistence,
     Photons,
     ResetAnomaly,
+    ResetDecay,
 )
 from miricigale.instrument import background_level, miri_detector, reference_pixel_mask
 from miricigale.reduction import Reducer
@@ -75,9 +76,39 @@ def test_the_last_frame_feels_the_row_pair_before(make_block):
     assert not change[:, ~sees].any()
 
 
+def test_the_decay_goes_with_the_signal_of_the_integration_before(make_block):
+    block = make_block(n_groups=6, n_integrations=3, seed=0)
+    rng = np.random.default_rng(3)
+    signal = rng.uniform(0, 5e4, block.ramp_shape).astype(np.float32)
+    change = ResetDecay(share=-0.02, groups=1.5).apply(signal.copy(), block) - signal
+    sees = ~reference_pixel_mask(subarray="SUB64")
+    decay = -0.02 * np.exp(-np.arange(6) / 1.5)
+    expected = decay[:, None] * signal[:-1, -1][:, None, sees].astype(float)
+    np.testing.assert_allclose(change[1:][:, :, sees], expected, atol=0.01)
+    assert not change[0].any()
+    assert not change[:, :, ~sees].any()
+
+
+def test_the_decay_is_told_and_gone_with_the_first_groups(make_exposure, make_sky):
+    exposure = make_exposure(n_groups=20, n_integrations=3)
+    detector = Detector.miri_imager().without(CosmicRays, BadPixels)
+    sky = make_sky(exposure, 4e3)
+    plain = detector.expose(sky, exposure, seed=1)
+    spoilt = detector.replaced(ResetDecay(groups=1.0)).expose(sky, exposure, seed=1)
+    with pytest.warns(MiricigaleWarning, match="shows a decay after the resets"):
+        left = Reducer(jump_threshold=None).fit_groups(spoilt)
+    reducer = Reducer(skip_first=8, jump_threshold=None)
+    clean, fit = reducer.fit_groups(plain), reducer.fit_groups(spoilt)
+    good = np.isfinite(clean.rate)
+    assert np.nanmean(fit.rate) == pytest.approx(np.mean(clean.rate[good]), rel=1e-4)
+    assert np.nanmean(left.rate) > 1.001 * np.mean(clean.rate[good])
+    with pytest.raises(ValueError, match="without 1/f noise and decay after resets"):
+        detector.replaced(ResetDecay()).collect(sky, exposure, seed=1)
+
+
 def test_every_reset_effect_is_the_same_in_any_blocks(make_exposure, make_sky, set_block_size):
     exposure = make_exposure(n_groups=5, n_integrations=2, subarray="SUB128")
-    detector = Detector.miri_imager(ResetAnomaly(), FirstFrame(), LastFrame())
+    detector = Detector.miri_imager(ResetAnomaly(), ResetDecay(), FirstFrame(), LastFrame())
     sky = make_sky(exposure, 300.0, includes=())
     one = detector.expose(sky, exposure, seed=5, n_threads=1)
     # an odd number of rows: pairs are cut in two
@@ -136,18 +167,19 @@ def test_they_stand_between_response_and_bias(make_exposure, make_sky):
     names = [
         type(e).__name__
         for e in Detector.miri_imager(
-            ResetAnomaly(), FirstFrame(), LastFrame(), Persistence()
+            ResetAnomaly(), ResetDecay(), FirstFrame(), LastFrame(), Persistence()
         ).effects
     ]
     assert names[names.index("Nonlinearity") : names.index("ReadNoise")] == [
         "Nonlinearity",
         "ResetAnomaly",
+        "ResetDecay",
         "FirstFrame",
         "LastFrame",
         "Bias",
     ]
     # and none of them is there unless it is asked for
-    assert len(Detector.miri_imager().effects) == len(names) - 4
+    assert len(Detector.miri_imager().effects) == len(names) - 5
 
 
 @pytest.mark.parametrize(
@@ -156,6 +188,8 @@ def test_they_stand_between_response_and_bias(make_exposure, make_sky):
         (lambda: ResetAnomaly(amplitudes=()), "amplitudes"),
         (lambda: ResetAnomaly(amplitudes=(np.nan,)), "amplitudes"),
         (lambda: ResetAnomaly(groups=0), "groups"),
+        (lambda: ResetDecay(share=1.0), "share"),
+        (lambda: ResetDecay(groups=np.nan), "groups"),
         (lambda: FirstFrame(offset=np.inf), "offset"),
         (lambda: LastFrame(coupling=1.5), "coupling"),
         (lambda: LastFrame(offset=np.nan), "offset"),

@@ -26,7 +26,7 @@ from miricigale.detector.effects.charge import (
 from miricigale.detector.effects.light import Photons, Residual
 from miricigale.detector.effects.order import ORDER, effect_from_record
 from miricigale.detector.effects.readout import ADConversion, Bias, Nonlinearity, ReadNoise
-from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly
+from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly, ResetDecay
 
 __all__ = [
     "ORDER",
@@ -47,6 +47,7 @@ __all__ = [
     "ReadNoise",
     "ReferencePixels",
     "ResetAnomaly",
+    "ResetDecay",
     "Residual",
     "Saturation",
     "WholeBlock",

@@ -15,7 +15,7 @@ from miricigale.detector.effects.charge import (
 )
 from miricigale.detector.effects.light import Photons, Residual
 from miricigale.detector.effects.readout import ADConversion, Bias, Nonlinearity, ReadNoise
-from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly
+from miricigale.detector.effects.reset import FirstFrame, LastFrame, ResetAnomaly, ResetDecay
 from miricigale.utils.exceptions import argument_error
 
 __all__ = ["ORDER", "check_order", "effect_from_record", "keyed", "place_of"]
@@ -33,6 +33,7 @@ ORDER = (
     Saturation,
     Nonlinearity,
     ResetAnomaly,
+    ResetDecay,
     FirstFrame,
     LastFrame,
     Bias,

@@ -1,5 +1,5 @@
 """
-What resets do to the ramps of MIRI: the anomaly after one, the first and the last frame.
+What resets do to the ramps of MIRI: the anomaly and the decay after one, the first and last frame.
 
 The effects act on DN above the bias, after `Nonlinearity` and before `Bias`: in the same
 place as the steps of the official pipeline that undo them (reset, rscd, lastframe; all but
@@ -25,7 +25,7 @@ from miricigale.detector.effects.base import Effect, check_finite, check_ramp
 from miricigale.instrument import reference_pixel_mask
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["FirstFrame", "LastFrame", "ResetAnomaly"]
+__all__ = ["FirstFrame", "LastFrame", "ResetAnomaly", "ResetDecay"]
 
 
 def _light_sensitive(block):
@@ -91,6 +91,46 @@ class ResetAnomaly(Effect):
         sees = _light_sensitive(block).astype(np.float32)
         for i, g in np.ndindex(*offsets.shape):
             ramp[i, g] += offsets[i, g] * sees
+        return ramp
+
+
+@dataclasses.dataclass(frozen=True)
+class ResetDecay(Effect):
+    """
+    The decay after the reset between integrations, which goes with the signal before it (RSCD).
+
+    Group g (from 0) of every integration but the first is offset by ``share exp(-g / groups)`` times
+    the last signal of its pixel in the integration before: bright ramps begin too low, and faint
+    ones do not. Exposures begin with more resets, so that their first integration shows none.
+
+    Parameters
+    ----------
+    share : float, optional
+        Of the signal at the end of the integration before; of our own. Published is that first groups
+        of later integrations are low by what decays and goes with that signal.
+    groups : float, optional
+        Number of groups in which the offset falls by a factor e; of our own.
+    """
+
+    share: float = -0.005
+    groups: float = 2.0
+
+    def __post_init__(self):
+        if not -1 < self.share < 1:
+            raise argument_error("share", "between -1 and 1", self.share)
+        if not (np.isfinite(self.groups) and self.groups > 0):
+            raise argument_error("groups", "positive", self.groups)
+
+    def apply(self, array, block):
+        """Offset the groups of all integrations but the first."""
+        ramp = check_ramp(array, block, self)
+        sees = _light_sensitive(block)
+        decay = (self.share * np.exp(-np.arange(ramp.shape[1]) / self.groups)).astype(np.float32)
+        # the last first: what an integration is offset by is of the one before as it was
+        for i in range(ramp.shape[0] - 1, 0, -1):
+            signal = np.where(sees, ramp[i - 1, -1], np.float32(0))
+            for g, share in enumerate(decay):
+                ramp[i, g] += share * signal
         return ramp
 
 
