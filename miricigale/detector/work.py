@@ -33,9 +33,6 @@ _COLLECTING = (
     ReferencePixels,
 )
 
-#: Those of them whose electrons are one Poisson number, before neighbors are coupled.
-_LIGHT = (Residual, Photons, Dark)
-
 # rows whose charge is collected at once
 _ROWS = 128
 
@@ -123,14 +120,37 @@ class Work:
         shape = (*self.shape[:2], wide.stop - wide.start, self.shape[3])
         pixel_dq = np.zeros(shape[2:], np.uint32)
         group_dq = np.zeros(shape, np.uint8)
-        array = self.light[wide]
-        for effect, key in self.keyed:
-            block = Block(
-                self.exposure, self.properties, wide, pixel_dq, group_dq, key, self.previous
-            )
-            array = effect.apply(array, block)
+        where = (self.exposure, self.properties, wide, pixel_dq, group_dq)
+        _, array, rest = self._lit(Block, where, self.keyed)
+        for effect, key in rest:
+            array = effect.apply(array, Block(*where, key, self.previous))
         inner = slice(rows.start - wide.start, rows.stop - wide.start)
         return array[:, :, inner], pixel_dq[inner], group_dq[:, :, inner]
+
+    def _lit(self, kind, where, chain):
+        """
+        Draw the electrons of light and dark current together: a sum of Poisson numbers is one.
+
+        Returns the mean rate, the ramp, and the effects of the chain that are left.
+        """
+        light = self.light[where[2]]
+        n = next(i for i, (effect, _) in enumerate(chain) if isinstance(effect, Photons))
+        for effect, key in chain[:n]:
+            light = effect.apply(light, kind(*where, key))
+        block = kind(*where, chain[n][1])
+        mean = chain[n][0].expected(light, block)
+        if type(chain[n][0]).apply is not Photons.apply:
+            # a kind of its own, that may draw otherwise
+            return mean, chain[n][0].apply(light, block), chain[n + 1 :]
+        for effect, key in chain[n + 1 :]:
+            if type(effect).apply is not Dark.apply:
+                break
+            mean = effect.expected(mean, kind(*where, key))
+            n += 1
+        ramp = np.zeros(block.ramp_shape, np.float32)
+        electrons = np.ascontiguousarray(mean * block.group_time, float)
+        _core.add_poisson(ramp, electrons, block.key, block.rows.start)
+        return mean, ramp, chain[n + 1 :]
 
     def _collected(self, rows):
         """Collect the charge of some rows: mean rate, electrons, flags of pixels, hits."""
@@ -139,16 +159,9 @@ class Work:
         wide = slice(max(rows.start - halo, 0), min(rows.stop + halo, self.light.shape[0]))
         shape = (wide.stop - wide.start, self.shape[3])
         pixel_dq = np.zeros(shape, np.uint32)
-        ramp = np.zeros((1, 1, *shape), np.float32)
-        where = (self.exposure, self.properties, wide, pixel_dq, np.zeros(ramp.shape, np.uint8))
-        mean = self.light[wide]
-        n_light = sum(isinstance(effect, _LIGHT) for effect, _ in chain)
-        for effect, key in chain[:n_light]:
-            block = WholeBlock(*where, key)
-            mean = effect.expected(mean, block)
-        # photons and dark current together, as their sum is one Poisson number
-        _core.add_poisson(ramp, mean * block.total_time, key, wide.start)
-        for effect, key in chain[n_light:]:
+        where = (self.exposure, self.properties, wide, pixel_dq, np.zeros((1, 1, *shape), np.uint8))
+        mean, ramp, rest = self._lit(WholeBlock, where, chain)
+        for effect, key in rest:
             block = WholeBlock(*where, key, self.previous)
             mean, ramp = effect.expected(mean, block), effect.apply(ramp, block)
         hits = (np.empty((3, 0), np.int32), np.empty(0))

@@ -1,6 +1,7 @@
 """A noiseless image of a catalog of sources, and the truth that belongs to it."""
 
 import functools
+import warnings
 
 import astropy.units as u
 import numpy as np
@@ -18,7 +19,7 @@ from miricigale.scene.catalog_files import read_catalog
 from miricigale.scene.cutouts import Cutout
 from miricigale.scene.render import FieldPainter, Painter
 from miricigale.scene.sky import local_jacobian, pixel_positions
-from miricigale.utils.exceptions import argument_error
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.meta import provenance
 from miricigale.utils.tables import Flags
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
@@ -83,6 +84,12 @@ class Scene:
         If the WCS has no shape, the PSF belongs to other pixels or another filter, a cutout
         is missing or has no source, or a value of ``agn`` is out of its range.
 
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        If fluxes are NaN, infinite or negative, with the number of each: such sources are not
+        painted, and flagged in the truth.
+
     Notes
     -----
     Positions, sizes and angles go through the local Jacobian of the WCS. All sources are
@@ -124,6 +131,7 @@ class Scene:
         )
         self._cutouts = self._check_cutouts(cutouts)
         self._galaxy_flux, self._agn_flux = self._split_flux(agn)
+        self._warn_of_fluxes()
 
     def __repr__(self):
         ny, nx = self._shape
@@ -193,6 +201,26 @@ class Scene:
             wanted = "fluxes that are finite and not negative"
             raise argument_error("agn", wanted, f"{column[row]} in row {row}")
         return flux, light
+
+    def _warn_of_fluxes(self):
+        """Tell of sources that are not painted, as they have no flux that could be."""
+        flux = self._galaxy_flux + self._agn_flux
+        kinds = {
+            "NaN": np.isnan(flux),
+            "infinite": np.isinf(flux),
+            "negative": np.isfinite(flux) & (flux < 0),
+        }
+        counts = [f"{np.count_nonzero(bad)} {name}" for name, bad in kinds.items() if bad.any()]
+        if not counts:
+            return
+        bad = np.any(list(kinds.values()), axis=0)
+        ids = self._catalog["id"][bad]
+        first = ", ".join(map(str, ids[:5].tolist())) + (", ..." if len(ids) > 5 else "")
+        msg = (
+            f"{len(ids)} of {len(self._catalog)} sources are not painted: fluxes in {self._filter!r} "
+            f"are {', '.join(counts)} (flag no_flux of the truth): ids {first}"
+        )
+        warnings.warn(msg, MiricigaleWarning, stacklevel=3)
 
     @staticmethod
     def _check_background(background):

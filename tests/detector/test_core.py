@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage, stats
 
 from miricigale.detector import _core
-from miricigale.detector._core.random import inversion_table, log_factorial
+from miricigale.detector._core.random import GUIDE, fill_table, log_factorial
 
 KEY = np.array([11, 22, 33, 44], np.uint64)
 
@@ -64,22 +64,61 @@ def test_poisson_numbers_are_poisson(mean):
     assert stats.chi2.sf(chi2, keep.sum() - 1) > 1e-3
 
 
-@pytest.mark.parametrize("mean", [1e-3, 0.555, 3.0, 9.99])
+@pytest.mark.parametrize("mean", [1e-3, 0.555, 3.0, 9.99, 161.0, 5448.0, 16384.0])
 def test_table_of_one_mean_is_the_distribution(mean):
-    steps, guide = inversion_table(mean)
-    assert steps[-1] == 2**53
-    assert np.all(np.diff(steps) >= 0)
-    cdf = stats.poisson.cdf(np.arange(steps.size), mean)
-    np.testing.assert_allclose(steps[:-1] / 2.0**53, cdf[:-1], rtol=0, atol=2e-15)
+    steps, guide = np.empty(32 + int(21 * np.sqrt(mean)), np.int64), np.empty(GUIDE, np.int16)
+    least, n = fill_table(mean, steps, guide)
+    assert steps[n - 1] == 2**53
+    assert np.all(np.diff(steps[:n]) >= 0)
+    cdf = stats.poisson.cdf(least + np.arange(n), mean)
+    # of large means scipy's own function is good to 1e-12
+    atol = 2e-15 if mean < 10 else 2e-12
+    np.testing.assert_allclose(steps[: n - 1] / 2.0**53, cdf[:-1], rtol=0, atol=atol)
+    assert stats.poisson.cdf(least - 1, mean) < 1e-18
     entries = np.arange(guide.size) * (2**53 // guide.size)
-    np.testing.assert_array_equal(guide, np.searchsorted(steps, entries, side="right"))
-    # a pixel of another mean beside it: every number is then searched for, from the same draws
-    ramps = np.zeros((2, 1, 300, 4, 101), np.float32)
-    means = np.full((2, 4, 101), mean)
-    means[1, :, -1] *= 1.001
-    for ramp, one in zip(ramps, means, strict=True):
-        _core.add_poisson(ramp, one, KEY, 7)
-    np.testing.assert_array_equal(ramps[0][..., :-1], ramps[1][..., :-1])
+    np.testing.assert_array_equal(guide, np.searchsorted(steps[:n], entries, side="right"))
+
+
+def test_groups_of_any_means_are_poisson_and_independent():
+    # every pixel another mean, across tables, their rests, and the means without a table
+    rng = np.random.default_rng(3)
+    mean = 10 ** rng.uniform(-2, 4.6, (20, 500))
+    ramp = np.zeros((1, 200, 20, 500), np.float32)
+    _core.add_poisson(ramp, mean, KEY, 0)
+    counts = np.diff(ramp[0].astype(float), axis=0, prepend=0)
+    # beyond 2^24 the sum is no whole number in float32
+    counts = counts[:, mean < 5e4]
+    mean = mean[mean < 5e4]
+    n = mean.size
+    z = (counts - mean) / np.sqrt(mean)
+    for part in np.array_split(np.argsort(mean), 8):
+        # moments of Poisson numbers: 0, 1, 1 / sqrt(mean), 3 + 1 / mean
+        m, size = mean[part], 200 * part.size
+        assert abs(z[:, part].mean()) < 4 / np.sqrt(size)
+        spread = np.sqrt((2 + np.mean(1 / m)) / size)
+        assert abs(np.mean(z[:, part] ** 2) - 1) < 4 * spread
+    large = mean > 1
+    skew = np.mean(z[:, large] ** 3) - np.mean(mean[large] ** -0.5)
+    assert abs(skew) < 4 * np.sqrt(60 / (200 * large.sum()))
+    # groups next to each other, and first and last
+    for lag in (1, 7, 199):
+        both = z[lag:] * z[:-lag]
+        assert abs(both.mean()) < 4 / np.sqrt(both.size)
+    # pixels next to each other have tables in common
+    both = z[:, 1:] * z[:, :-1]
+    assert abs(both.mean()) < 4 / np.sqrt(both.size)
+    # all groups together
+    total = (counts.sum(axis=0) - 200 * mean) / np.sqrt(200 * mean)
+    assert abs(total.var() - 1) < 4 * np.sqrt((2 + np.mean(1 / (200 * mean))) / n)
+
+
+def test_a_pixel_draws_the_same_beside_other_rows():
+    rng = np.random.default_rng(4)
+    mean = 10 ** rng.uniform(0, 3, (6, 90))
+    whole, part = np.zeros((2, 50, 6, 90), np.float32), np.zeros((2, 50, 2, 90), np.float32)
+    _core.add_poisson(whole, mean, KEY, 100)
+    _core.add_poisson(part, np.ascontiguousarray(mean[3:5]), KEY, 103)
+    np.testing.assert_array_equal(whole[:, :, 3:5], part)
 
 
 def test_dark_columns_leave_the_draws_of_others_alone():

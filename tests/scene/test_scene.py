@@ -10,6 +10,7 @@ from photutils.psf import ImagePSF
 from helpers import scenes
 from miricigale.instrument import pixel_area_map
 from miricigale.scene import Background, Scene, SceneFlags
+from miricigale.utils.exceptions import MiricigaleWarning
 
 FILTER = "miri.f770w"
 
@@ -166,7 +167,10 @@ def test_flags_say_what_happened(wcs, psf):
         index=[8.0, 1.0, 20.0, 1.0],
         radius=1.0,
     )
-    truth = Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, max_radius=4 * u.arcsec).truth
+    told = f"2 of 4 sources are not painted: fluxes in '{FILTER}' are 1 NaN, 1 negative .*no_flux"
+    with pytest.warns(MiricigaleWarning, match=told):
+        scene = Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, max_radius=4 * u.arcsec)
+    truth = scene.truth
     f = SceneFlags
     assert truth["flags"].tolist() == [
         f.NEAR_EDGE | f.CUT_PROFILE,

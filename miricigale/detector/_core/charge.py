@@ -5,16 +5,17 @@ import math
 import numpy as np
 
 from miricigale.detector._core.random import (
+    GUIDE,
     PTRS_FROM,
     advance,
     fill_normals,
-    inversion_table,
+    fill_table,
     poisson,
     poisson_inversion,
-    poisson_lookup,
     ptrs_constants,
     ptrs_rest,
     seed_stream,
+    table_lookup,
     uniform,
     unit,
 )
@@ -32,76 +33,150 @@ __all__ = [
 _MEAN_MAX = 1e9
 
 
+#: Draws of a pixel's mean from which a table of it is worth its making.
+_TABLE_DRAWS = 64
+
+#: Greatest mean with a table.
+_TABLE_MEAN = 2.0**14
+
+# tables at hand: of means in steps of 1 / 1024 of an octave or more, and of the small means between them
+_COARSE = 512
+_FINE = 32
+
+#: What is left of a mean, in electrons, that is drawn as single events.
+_REST = 0.25
+
+# pixels of a row whose groups are drawn before they are added
+_PIXELS = 16
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _node(mean):
+    """Split a mean into that of a coarse table, the number of this table, and the rest."""
+    _, octave = math.frexp(mean)
+    step = max(2.0 ** (octave - 11), 1.0 / 16.0)
+    number = int(mean / step)
+    return number * step, number & (_COARSE - 1), mean - number * step
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add_tabulated(s0, s1, s2, s3, mean, slot, tables, out):
+    """Add a draw of a mean to each of ``out``; the table in ``slot`` is made if it has another mean."""
+    means, first, steps, guide = tables
+    if means[slot] != mean:
+        first[slot], _ = fill_table(mean, steps[slot], guide[slot])
+        means[slot] = mean
+    step, entry, least = steps[slot], guide[slot], first[slot]
+    for g in range(out.size):
+        s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
+        out[g] += least + table_lookup(bits, step, entry)
+    return s0, s1, s2, s3
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add_single(s0, s1, s2, s3, mean, out):
+    """Add a draw of a mean to each of ``out``, without a table."""
+    if mean < PTRS_FROM:
+        p0 = math.exp(-mean)
+        for g in range(out.size):
+            s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
+            out[g] += poisson_inversion(unit(bits), mean, p0)
+        return s0, s1, s2, s3
+    a, b, v_r, inverse_alpha, log_mean = ptrs_constants(mean)
+    for g in range(out.size):
+        k = -1.0
+        while k < 0.0:
+            s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
+            u = unit(bits) - 0.5
+            s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
+            v = unit(bits)
+            us = 0.5 - abs(u)
+            k = math.floor((2.0 * a / us + b) * u + mean + 0.43)
+            if us < 0.07 or v > v_r:
+                k = ptrs_rest(mean, a, b, inverse_alpha, log_mean, v, k, us)
+        out[g] += k
+    return s0, s1, s2, s3
+
+
+@njit(cache=True, nogil=True)
+def _draw_groups(state, mean, tables, out):
+    """
+    Fill ``out`` (n_group,) with Poisson numbers of a mean.
+
+    The mean is the sum of those of one or two tables and of a rest, whose events are as many as
+    all groups have together, each in a group of its own choice: a sum of Poisson numbers is one.
+    """
+    s0, s1, s2, s3 = state[0], state[1], state[2], state[3]
+    n_group = out.size
+    out[:] = 0.0
+    if tables[0].size == 0 or mean > _TABLE_MEAN:
+        s0, s1, s2, s3 = _add_single(s0, s1, s2, s3, mean, out)
+        state[0], state[1], state[2], state[3] = s0, s1, s2, s3
+        return
+    node, slot, rest = _node(mean)
+    if node > 0.0:
+        s0, s1, s2, s3 = _add_tabulated(s0, s1, s2, s3, node, slot, tables, out)
+    number = int(rest / _REST)
+    if number > 0:
+        slot = _COARSE + number
+        s0, s1, s2, s3 = _add_tabulated(s0, s1, s2, s3, number * _REST, slot, tables, out)
+        rest -= number * _REST
+    state[0], state[1], state[2], state[3] = s0, s1, s2, s3
+    for _ in range(int(poisson(state, rest * n_group))):
+        out[min(int(uniform(state) * n_group), n_group - 1)] += 1.0
+
+
 @njit(cache=True, nogil=True)
 def add_poisson(ramp, mean, key, first_row):
     """Add charge that arrives at random: ``mean`` electrons per group, (n_row, n_col)."""
     n_int, n_group, n_row, n_col = ramp.shape
     state = np.empty(4, np.uint64)
     columns = np.empty(n_col, np.int64)
-    mu = np.empty(n_col)
-    a = np.empty(n_col)
-    b = np.empty(n_col)
-    c = np.empty(n_col)
-    inverse_alpha = np.empty(n_col)
-    log_mu = np.empty(n_col)
-    total = np.empty(n_col)
-    steps, guide = np.empty(0, np.int64), np.empty(0, np.int64)
-    tabulated = -1.0
+    drawn = np.empty((_PIXELS, n_group))
+    total = np.empty(_PIXELS)
+    n_table = _COARSE + _FINE if n_int * n_group >= _TABLE_DRAWS else 0
+    # room for the distribution of the greatest mean, out to a part in 10^20
+    width = 32
+    if n_table > 0:
+        for r in range(n_row):
+            for x in range(n_col):
+                if mean[r, x] > 0.0:
+                    width = max(width, 32 + int(21.0 * math.sqrt(min(mean[r, x], _TABLE_MEAN))))
+    tables = (
+        np.full(n_table, -1.0),
+        np.empty(n_table, np.int64),
+        np.empty((n_table, width), np.int64),
+        np.empty((n_table, GUIDE), np.int16),
+    )
     for r in range(n_row):
         # pixels without light draw nothing
         n = 0
-        alike = True
         for x in range(n_col):
             if mean[r, x] > 0.0:
                 columns[n] = x
-                mu[n] = min(mean[r, x], _MEAN_MAX)
-                alike = alike and mu[n] == mu[0]
                 n += 1
         if n == 0:
             continue
-        # one mean for all, such as the dark current's
-        alike = alike and mu[0] < PTRS_FROM
-        if alike:
-            if mu[0] != tabulated:
-                tabulated = mu[0]
-                steps, guide = inversion_table(tabulated)
-        else:
-            for m in range(n):
-                if mu[m] < PTRS_FROM:
-                    c[m] = math.exp(-mu[m])
-                else:
-                    a[m], b[m], c[m], inverse_alpha[m], log_mu[m] = ptrs_constants(mu[m])
+        gaps = columns[n - 1] - columns[0] > n - 1
         for i in range(n_int):
             seed_stream(state, key, i, first_row + r)
-            s0, s1, s2, s3 = state[0], state[1], state[2], state[3]
-            total[:] = 0.0
-            for g in range(n_group):
-                if alike:
-                    for m in range(n):
-                        s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
-                        total[m] += poisson_lookup(bits, steps, guide)
-                else:
-                    for m in range(n):
-                        if mu[m] < PTRS_FROM:
-                            s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
-                            total[m] += poisson_inversion(unit(bits), mu[m], c[m])
-                            continue
-                        k = -1.0
-                        while k < 0.0:
-                            s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
-                            u = unit(bits) - 0.5
-                            s0, s1, s2, s3, bits = advance(s0, s1, s2, s3)
-                            v = unit(bits)
-                            us = 0.5 - abs(u)
-                            k = math.floor((2.0 * a[m] / us + b[m]) * u + mu[m] + 0.43)
-                            if us < 0.07 or v > c[m]:
-                                k = ptrs_rest(
-                                    mu[m], a[m], b[m], inverse_alpha[m], log_mu[m], v, k, us
-                                )
-                        total[m] += k
-                row = ramp[i, g, r]
-                for m in range(n):
-                    row[columns[m]] += np.float32(total[m])
+            for m in range(0, n, _PIXELS):
+                part = min(_PIXELS, n - m)
+                for j in range(part):
+                    one = min(mean[r, columns[m + j]], _MEAN_MAX)
+                    _draw_groups(state, one, tables, drawn[j])
+                total[:] = 0.0
+                for g in range(n_group):
+                    row = ramp[i, g, r]
+                    for j in range(part):
+                        total[j] += drawn[j, g]
+                    if gaps:
+                        for j in range(part):
+                            row[columns[m + j]] += np.float32(total[j])
+                    else:
+                        x = columns[m]
+                        for j in range(part):
+                            row[x + j] += np.float32(total[j])
 
 
 @njit(cache=True, nogil=True)

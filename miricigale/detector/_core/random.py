@@ -3,8 +3,9 @@ Random numbers of the detector: one stream for each row, and exact draws from it
 
 xoshiro256++: Blackman & Vigna 2021, ACM Trans. Math. Softw. 47, 36; seeding by
 splitmix64 as they advise. Ziggurat: Marsaglia & Tsang 2000, J. Stat. Softw. 5, 8, with
-256 layers and 53 bits. Poisson: inversion below, transformed rejection PTRS above
-(Hoermann 1993, Insur. Math. Econ. 12, 39); both exact.
+256 layers and 53 bits. Poisson: inversion, from a table (Chen & Asau 1974, AIIE Trans. 6, 163) where one
+mean is drawn often, by search below, and transformed rejection PTRS above (Hoermann 1993, Insur. Math.
+Econ. 12, 39); all exact.
 """
 
 import math
@@ -15,19 +16,20 @@ from numba import uint64
 from miricigale.utils.compilation import njit
 
 __all__ = [
+    "GUIDE",
     "PTRS_FROM",
     "advance",
     "fill_normals",
-    "inversion_table",
+    "fill_table",
     "log_factorial",
     "mix",
     "poisson",
     "poisson_inversion",
-    "poisson_lookup",
     "ptrs_constants",
     "ptrs_rest",
     "seed_stream",
     "standard_normals",
+    "table_lookup",
     "uniform",
     "unit",
 ]
@@ -195,40 +197,48 @@ def poisson_inversion(u, mean, p0):
 
 
 @njit(cache=True, nogil=True)
-def inversion_table(mean):
+def fill_table(mean, steps, guide):
     """
-    Where `poisson_inversion` goes from one number to the next, for many draws of one mean.
+    Tabulate the inversion of a Poisson distribution, for many draws of one mean.
 
-    Returns the first of the 2^53 draws that gives more than 0, more than 1, ... (the last is 2^53),
-    and the number that the first draw of each of ``GUIDE`` equal parts gives.
+    ``steps`` gets, from some number of events on, the first of the 2^53 draws that gives more
+    than that, more than one more, ... (the last is 2^53); ``guide`` the place in it of the number that
+    the first draw of each of ``GUIDE`` equal parts gives. Returns the number and how many steps there are.
     """
-    p0 = math.exp(-mean)
-    steps = np.empty(201, np.int64)
-    low, end = np.int64(0), np.int64(1) << 53
+    mode = int(mean)
+    # relative to the mode; what is left out is below a part in 10^18
+    least, p = mode, 1.0
+    while least > 0 and p > 1e-20:
+        p *= least / mean
+        least -= 1
     n = 0
-    while low < end:
-        # the number never falls as the draw grows: bisection
-        high = end
-        while low < high:
-            middle = (low + high) // 2
-            if poisson_inversion((float(middle) + 0.5) * _TO_UNIT, mean, p0) > n:
-                high = middle
-            else:
-                low = middle + 1
-        steps[n] = low
+    total = 0.0
+    while n < steps.size and (p > 1e-20 or least + n <= mode):
+        total += p
         n += 1
-    guide = np.empty(GUIDE, np.int64)
-    k = 0
+        p *= mean / (least + n)
+    # back to the lowest, as the sum is needed first
+    p = 1.0
+    for k in range(mode, least, -1):
+        p *= k / mean
+    end = np.int64(1) << 53
+    below = 0.0
+    for j in range(n):
+        below += p / total
+        steps[j] = min(np.int64(below * 2.0**53 + 0.5), end)
+        p *= mean / (least + j + 1)
+    steps[n - 1] = end
+    j = 0
     for part in range(GUIDE):
-        while part * (end // GUIDE) >= steps[k]:
-            k += 1
-        guide[part] = k
-    return steps[:n], guide
+        while part * (end // GUIDE) >= steps[j]:
+            j += 1
+        guide[part] = j
+    return least, n
 
 
 @njit(cache=True, nogil=True, inline="always")
-def poisson_lookup(bits, steps, guide):
-    """The number that `poisson_inversion` gives for a draw, bit for bit, from its mean's tables."""
+def table_lookup(bits, steps, guide):
+    """Place in a table of `fill_table` of the number that a draw gives."""
     draw = np.int64(bits >> _U11)
     k = guide[draw >> _TO_GUIDE]
     while draw >= steps[k]:

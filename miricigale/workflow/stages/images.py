@@ -159,7 +159,7 @@ def _sky_plan(config, unit):
 @stage(
     "exposures",
     "exposure",
-    version=7,
+    version=8,
     needs={"truth": of_truth},
     sections=(*IMAGES, "run.keep_level1b"),
     resources=EXPOSURE_RESOURCES,
