@@ -9,8 +9,17 @@ import numpy as np
 from miricigale.filters.catalog_map import CatalogMap
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
 from miricigale.utils.files import read_table
+from miricigale.utils.missing import plain_floats, without_codes
+from miricigale.utils.tables import error_column
 
-__all__ = ["MappedRows", "as_catalog_map", "read_catalog_photometry", "told_of"]
+__all__ = [
+    "MappedRows",
+    "as_catalog_map",
+    "codes_of",
+    "read_catalog_photometry",
+    "told_of",
+    "warn_of_codes",
+]
 
 #: Bands whose missing values are counted one by one in a message.
 _FEW = 8
@@ -86,7 +95,7 @@ def as_catalog_map(catalog_map, options=None):
     return CatalogMap.read(catalog_map)
 
 
-def told_of(lost, coded):
+def told_of(lost, coded, what="taken as missing, by the number that stands there"):
     """What is to be told of bands without a filter, and of numbers that stand for no value."""
     if lost:
         yield f"left out, no filter here: {', '.join(lost)}"
@@ -99,7 +108,52 @@ def told_of(lost, coded):
     if len(parts) > _FEW:
         parts = [*parts[:_FEW], f"and {len(parts) - _FEW} more bands"]
     if parts:
-        yield f"taken as missing, by the number that stands there: {'; '.join(parts)}"
+        yield f"{what}: {'; '.join(parts)}"
+
+
+def codes_of(table, bands):
+    """
+    Numbers of a table that look like codes for a missing value (`miricigale.utils.missing`).
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        Fluxes by band and their errors, whatever the unit.
+    bands : iterable of str
+        The bands; those whose columns hold no plain numbers are skipped.
+
+    Returns
+    -------
+    coded : dict of str to `~numpy.ndarray` of float, shape (n,)
+        By band the number, NaN in rows that have none; as `told_of` takes it.
+    """
+    coded = {}
+    for name in bands:
+        error = error_column(name)
+        if any(n not in table.colnames or table[n].dtype.kind == "c" for n in (name, error)):
+            continue
+        try:
+            values = plain_floats(table[name], name, "photometry")
+            errors = plain_floats(table[error], error, "photometry")
+        except ValueError:
+            # told by who reads them
+            continue
+        missing, no_error = without_codes(values, errors)
+        # zeros with zero errors are flagged object by object
+        missing &= values != 0
+        code = np.where(missing, values, np.nan)
+        coded[name] = np.where(no_error & ~missing, errors, code)
+    return coded
+
+
+def warn_of_codes(coded, where, stacklevel):
+    """Warn of what `codes_of` found, by band and count, for fits that take the numbers as they are."""
+    found = {name: values for name, values in coded.items() if np.any(~np.isnan(values))}
+    for text in told_of(
+        (), found, "look like numbers that stand for no value, and are fitted as they are"
+    ):
+        how = "NaN is a missing band; read_catalog_photometry, or --map, makes them so"
+        warnings.warn(f"{where}: {text} ({how})", MiricigaleWarning, stacklevel=stacklevel + 1)
 
 
 class MappedRows:

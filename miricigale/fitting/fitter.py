@@ -4,6 +4,7 @@ import logging
 
 import numpy as np
 
+from miricigale.filters.catalog_files import codes_of, warn_of_codes
 from miricigale.fitting.grid_fit import GridFit
 from miricigale.fitting.likelihood import (
     FitFlags,
@@ -315,7 +316,8 @@ class BayesFitter:
         `~miricigale.utils.exceptions.MiricigaleWarning`
             If ``filters`` was not given and the photometry has bands (names of filters, or columns
             in a unit of flux density with an error beside them) that the grid lacks. Bands that
-            are not fitted are also in ``meta["fit"]["unused_bands"]`` of the results.
+            are not fitted are also in ``meta["fit"]["unused_bands"]`` of the results. And of numbers that
+            look like codes for a missing value, such as -99 or 99 with an error of 99, by band and count.
 
         Raises
         ------
@@ -331,6 +333,7 @@ class BayesFitter:
         """
         options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
         options["stacklevel"] = 4
+        warn_of_codes(codes_of(photometry, self._reader.fitted(photometry)), "photometry", 2)
         parallel = {"executor": executor, "progress_bar": progress_bar}
         return self._fit_rows(photometry, options, seed=seed, chunk_size=chunk_size, **parallel)
 
@@ -424,6 +427,7 @@ class BayesFitter:
             msg = "draws of a sampler are in its results: fitter.fit(photometry).samples(id)"
             raise ValueError(msg)
         n_draws, seed = check_count(n_draws, "n_draws"), check_seed(seed)
+        warn_of_codes(codes_of(photometry, self._reader.fitted(photometry)), "photometry", 2)
         data, known, settings = self._prepare(
             photometry, redshift=redshift, redshift_prior=redshift_prior, stacklevel=3
         )

@@ -10,7 +10,12 @@ import warnings
 import astropy.units as u
 import numpy as np
 
-from miricigale.filters.catalog_files import MappedRows, as_catalog_map
+from miricigale.filters.catalog_files import (
+    MappedRows,
+    as_catalog_map,
+    codes_of,
+    warn_of_codes,
+)
 from miricigale.fitting.fitter import BayesFitter
 from miricigale.fitting.io import FORMAT, FitFolder, open_results, part_ids, part_name
 from miricigale.utils.content import content_sha256
@@ -96,8 +101,8 @@ def fit_file(
     Warns
     -----
     `~miricigale.utils.exceptions.MiricigaleWarning`
-        What `BayesFitter.fit` warns of, once. With ``catalog_map`` what it takes as missing is counted and told
-        before anything is fitted.
+        What `BayesFitter.fit` warns of, once. Numbers that look like codes for a missing value are counted and
+        told before anything is fitted, and with ``catalog_map`` what it takes as missing.
 
     Raises
     ------
@@ -129,6 +134,8 @@ def fit_file(
     if catalog_map is not None:
         rows = MappedRows(rows, as_catalog_map(catalog_map))
     options = {"redshift": redshift, "redshift_prior": redshift_prior, "pairs": pairs}
+    if catalog_map is None:
+        warn_of_codes(_codes(rows, fitter.bands), rows.path.name, 2)
     for text in rows.told() if catalog_map is not None else ():
         warnings.warn(f"{rows.path.name}: {text}", MiricigaleWarning, stacklevel=2)
     fluxes = {c for name in fitter.bands for c in (name, error_column(name))}
@@ -160,6 +167,15 @@ def _check_ids(rows):
     for i in rows.foreign_chunks("id") if "id" in rows.colnames else ():
         with _noted(rows, i):
             ascii_ids(read_ids(rows.chunk(i)), "photometry")
+
+
+def _codes(rows, bands):
+    """What `codes_of` finds in the whole file."""
+    parts = {}
+    for i in range(rows.n_chunks):
+        for name, codes in codes_of(rows.chunk(i), bands).items():
+            parts.setdefault(name, []).append(codes)
+    return {name: np.concatenate(codes) for name, codes in parts.items()}
 
 
 def _fit_parts(fitter, inputs, folder, seed, executor, progress_bar):

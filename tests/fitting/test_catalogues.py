@@ -309,3 +309,37 @@ def test_fluxes_without_noise_give_their_model_back(make_grid, draw_photometry, 
     assert_allclose(results.chi2, 0.0, atol=1e-9)
     assert np.isfinite(results.log_evidence).all()
     assert np.isfinite(results.model_flux_std).all()
+
+
+# ----------------------------------------------------------- codes for a missing value
+
+
+def coded(catalogue):
+    """-99 with errors alike in a row, an error of -999, 99 with 99; real fluxes of -98.9 are none."""
+    table = catalogue.copy()
+    table["band1"][0] = table["band1_err"][0] = -99 * u.uJy
+    table["band1_err"][2] = -999 * u.uJy
+    table["band2"][3] = table["band2_err"][3] = 99 * u.uJy
+    table["band0"][1] = -98.9 * u.uJy
+    table["band0"][2] = np.nan
+    return table
+
+
+def test_numbers_that_look_like_codes_are_told_before_the_fit(grid, catalogue):
+    wanted = (
+        r"photometry: look like .* as they are: band1 2 of 6 \(-999, -99\); band2 1 of 6 \(99\)"
+    )
+    with pytest.warns(MiricigaleWarning, match=wanted) as told:
+        BayesFitter(grid).fit(coded(catalogue))
+    assert len(told) == 1
+    assert told[0].filename == __file__
+
+
+def test_codes_of_a_whole_file_are_counted(grid, catalogue, tmp_path):
+    path = tmp_path / "catalogue.fits"
+    coded(catalogue).write(path)
+    with pytest.warns(
+        MiricigaleWarning, match=r"catalogue\.fits: look like .*band1 2 of 6"
+    ) as told:
+        fit_file(BayesFitter(grid), path, tmp_path / "out", chunk_rows=2)
+    assert len(told) == 1
