@@ -15,6 +15,7 @@ __all__ = [
     "cruciform_fraction",
     "cruciform_shift",
     "detector_response",
+    "halo_share",
 ]
 
 #: Effects that a PSF may include, in the order in which they act.
@@ -28,8 +29,15 @@ _FOLDING = 25.0
 _SHIFT_X = ((0.0, 357.0, 1031.0), (1.5, 0.5, -0.9))
 _SHIFT_Y = ((0.0, 511.0, 1031.0), (1.6, 0.0, -1.6))
 
-#: Factors on the amplitudes that in-flight images ask for.
+#: Factors on the amplitudes that in-flight images ask for: all scattered light over stpsf's cross.
 _IN_FLIGHT = {"miri.f560w": 2.0}
+
+#: Share of the scattered light that is diffuse in flight: a deep image's cross is 1.0-1.3 times
+#: stpsf's, the rest a halo around the source.
+_HALO = {"miri.f560w": 0.35}
+
+#: Integral of 1 / r over the unit square around r = 0.
+_CENTRAL_CELL = 4 * math.log(1 + math.sqrt(2))
 
 
 def _amplitude(filter_name, calibration):
@@ -50,7 +58,7 @@ def _profile(distance, filter_name, calibration):
 
 def cruciform_fraction(filter_name, *, calibration="flight"):
     """
-    Light that the cruciform takes out of the image's core.
+    Light that the detector scatters out of the image's core, into the cross and its halo.
 
     Parameters
     ----------
@@ -69,6 +77,23 @@ def cruciform_fraction(filter_name, *, calibration="flight"):
     integral = 2 * _FOLDING * (0.5 * (1 - outside) + outside)
     both = 2 * _amplitude(filter_name, calibration) * integral
     return both / (1 + both)
+
+
+def halo_share(filter_name, *, calibration="flight"):
+    """
+    Share of the scattered light that is in a diffuse halo instead of the cross.
+
+    Parameters
+    ----------
+    filter_name, calibration
+        See `cruciform`.
+
+    Returns
+    -------
+    share : float
+        Zero for stpsf's calibration, and for filters of which no deep image has been compared.
+    """
+    return _HALO.get(filter_name, 0.0) if calibration == "flight" else 0.0
 
 
 def cruciform_shift(x, y):
@@ -101,7 +126,25 @@ def _shifted(image, shift, axis):
     return result
 
 
-def cruciform(image, filter_name, *, oversampling, calibration="flight", shift=(0.0, 0.0)):
+def _diffuse(image, profile):
+    """Scatter light evenly in all directions: as far as in the four arms of a ``profile`` by cells."""
+    n = image.shape[0]
+    size = next_fast_len(2 * n, real=True)
+    axis = np.minimum(np.arange(size), size - np.arange(size))
+    radius = np.hypot(axis[:, None], axis)
+    kernel = np.interp(radius, np.arange(profile.size), profile)
+    radius[0, 0] = 1 / _CENTRAL_CELL
+    kernel *= 4 / (2 * np.pi * radius)
+    # no arm is longer than the image is wide, so that nothing comes around
+    kernel[:, axis >= n] = 0.0
+    kernel[axis >= n] = 0.0
+    spectrum = rfft2(image, (size, size)) * rfft2(kernel)
+    return irfft2(spectrum, (size, size))[:n, :n]
+
+
+def cruciform(
+    image, filter_name, *, oversampling, calibration="flight", shift=(0.0, 0.0), halo=0.0
+):
     """
     Scatter light along rows and columns, as the detector does at short wavelengths.
 
@@ -118,6 +161,9 @@ def cruciform(image, filter_name, *, oversampling, calibration="flight", shift=(
         stpsf's amplitudes, or those with the factor 2 that in-flight F560W images want.
     shift : tuple of float, optional
         Offset of the cross in x, y in pixels (see `cruciform_shift`).
+    halo : float, optional
+        Share of the scattered light that goes evenly in all directions, as far as in the arms,
+        so that the encircled energies stay (see `halo_share`).
 
     References
     ----------
@@ -126,13 +172,15 @@ def cruciform(image, filter_name, *, oversampling, calibration="flight", shift=(
     fraction = cruciform_fraction(filter_name, calibration=calibration)
     if fraction == 0:
         return image
-    distance = np.arange(max(image.shape)) / oversampling
+    distance = np.arange(math.ceil(math.sqrt(2) * max(image.shape)) + 1) / oversampling
     kernel = _profile(distance, filter_name, calibration) / oversampling
     columns, rows = (_core.line_scatter(image, kernel, axis) for axis in (0, 1))
     if any(shift):
         columns = _shifted(columns, shift[0] * oversampling, 1)
         rows = _shifted(rows, shift[1] * oversampling, 0)
     scattered = columns + rows
+    if halo > 0:
+        scattered = (1 - halo) * scattered + halo * _diffuse(image, kernel)
     return (image + scattered) * (1 - fraction)
 
 

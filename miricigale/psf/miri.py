@@ -14,6 +14,7 @@ from miricigale.psf.effects import (
     cruciform_fraction,
     cruciform_shift,
     detector_response,
+    halo_share,
 )
 from miricigale.psf.model import make_psf
 from miricigale.psf.optics import jwst_constants
@@ -99,7 +100,12 @@ def _miri_data(telescope, oversampling, fov, includes, calibration, position=Non
         jitter = math.hypot(constants["jitter"], extra) / scale
     if "cruciform" in includes:
         data = cruciform(
-            data, name, oversampling=oversampling, calibration=calibration, shift=shift
+            data,
+            name,
+            oversampling=oversampling,
+            calibration=calibration,
+            shift=shift,
+            halo=halo_share(name, calibration=calibration),
         )
     data = detector_response(
         data,
@@ -151,8 +157,9 @@ def miri_psf(
         What is applied, out of ``"jitter"``, ``"cruciform"``, ``"pixel"`` and ``"ipc"``.
         A simulation with the PSF must not apply these again.
     calibration : {"flight", "stpsf"}, optional
-        With ``"flight"``, F560W gets twice the cruciform of stpsf and, as part of the
-        jitter, a blur of 0.03 arcsec (rms of the radius; 0.021 per axis).
+        With ``"flight"``, F560W scatters twice the light of stpsf's cruciform, 35 % of it into a
+        diffuse halo, and gets, as part of the jitter, a blur of 0.03 arcsec (rms of the
+        radius; 0.021 per axis).
     n_wavelengths : int, optional
         Wavelengths per band, of equal weight.
     spectral_index : float, optional
@@ -175,7 +182,8 @@ def miri_psf(
         0.1105 x 0.1113, or that of the pixel at ``position``. The sum of the data is
         ``oversampling**2`` times the fraction of light on the grid. The core's centroid is
         the middle cell. The meta has ``wavefront_error`` (nm), ``seed``, ``calibration``,
-        ``cruciform_fraction`` and ``citations``.
+        ``cruciform_fraction`` (all light that the detector scatters), ``halo_fraction`` (of it,
+        the diffuse part) and ``citations``.
 
     Raises
     ------
@@ -209,7 +217,12 @@ def miri_psf(
     place = None if position is None else (*(float(v) for v in position), subarray)
     data, scale = _miri_data(telescope, oversampling, width, effects, calibration, place)
     scattered = cruciform_fraction(name, calibration=calibration) if "cruciform" in effects else 0.0
-    meta = {"instrument": "MIRI", "calibration": calibration, "cruciform_fraction": scattered}
+    meta = {
+        "instrument": "MIRI",
+        "calibration": calibration,
+        "cruciform_fraction": scattered,
+        "halo_fraction": scattered * halo_share(name, calibration=calibration),
+    }
     return make_psf(
         data,
         pixel_scale=scale * ANGLE,

@@ -1,8 +1,10 @@
+import astropy.units as u
 import numpy as np
 import pytest
 
 from helpers.light import gaussian_image
-from miricigale.psf import cruciform_fraction, effects
+from miricigale.psf import cruciform_fraction, effects, miri_psf
+from miricigale.psf.miri import _miri_data
 
 
 def moments(image):
@@ -67,6 +69,54 @@ def test_cruciform_does_not_depend_on_the_oversampling():
         arm = effects.cruciform(image, "miri.f560w", oversampling=k)[c, c + 20 * k : c + 60 * k]
         arms.append(arm.sum())
     assert arms[0] == pytest.approx(arms[1], rel=0.02)
+
+
+def test_halo_takes_its_share_of_the_scattered_light_as_far_as_the_arms_go():
+    n, name, halo = 1201, "miri.f560w", 0.35
+    image = np.zeros((n, n))
+    image[600, 600] = 1.0
+    cross = effects.cruciform(image, name, oversampling=2)
+    both = effects.cruciform(image, name, oversampling=2, halo=halo)
+    # what is left of the arms, far from where the halo peaks
+    arm = both[600, 700:1000].sum() - both[580:590, 700:1000].mean(axis=0).sum()
+    assert arm == pytest.approx((1 - halo) * cross[600, 700:1000].sum(), rel=0.01)
+    y, x = np.mgrid[:n, :n] - 600
+    radius = np.hypot(x, y)
+    for r in (10, 30, 60, 120, 400):
+        here, there = both[radius < r].sum(), cross[radius < r].sum()
+        assert here == pytest.approx(there, abs=1e-3)
+    # and it is the same in all directions
+    ring = (radius > 150) & (radius < 152) & (abs(x) > 5) & (abs(y) > 5)
+    flat = (both * radius * np.exp(radius / 50))[ring]
+    assert np.ptp(flat) < 0.005 * flat.mean()
+
+
+def test_arms_and_halo_of_f560w_are_those_of_a_deep_image(monkeypatch):
+    """Light of one arm per arcsec over that within 1 arcsec, off an empirical PSF of a deep field."""
+    kind = {"fov": 17 * u.arcsec, "oversampling": 2, "n_wavelengths": 5}
+    psf = miri_psf("miri.f560w", **kind)
+    monkeypatch.setattr(effects, "_HALO", {})
+    _miri_data.cache_clear()
+    without = miri_psf("miri.f560w", **kind)
+    _miri_data.cache_clear()
+    step = psf.pixel_scale.to_value(u.arcsec) / 2
+    axis = (np.arange(psf.data.shape[0]) - psf.data.shape[0] // 2) * step
+    x, y = np.meshgrid(axis, axis)
+    radius, angle = np.hypot(x, y), np.degrees(np.arctan2(y, x)) % 90
+    between = np.minimum(angle, 90 - angle) > 15
+    found = {2: 0.0051, 3: 0.0038, 4: 0.0028, 5.5: 0.0012}
+    for (low, value), high in zip(found.items(), (3, 4, 5.5, 7.5), strict=True):
+        ring = (radius >= low) & (radius < high)
+        halo = [np.median(p.data[ring & between]) for p in (psf, without)]
+        beside = psf.data[ring & between].mean()
+        arms = ring & (np.minimum(abs(x), abs(y)) < 0.5)
+        light = np.sum(psf.data[arms] - beside) / 4 / (high - low)
+        assert light / psf.data[radius < 1].sum() == pytest.approx(value, rel=0.17)
+        # the halo was seen at 1.5 to 4 times that of a model with the cross alone
+        assert 1.5 < halo[0] / halo[1] < 4
+        for r in (0.5, 1, 2, high):
+            inside = radius < r
+            assert psf.data[inside].sum() == pytest.approx(without.data[inside].sum(), rel=1e-3)
 
 
 def test_in_flight_f560w_scatters_about_twice_as_much():

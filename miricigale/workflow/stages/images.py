@@ -301,7 +301,7 @@ def kernel_of(config, name):
 @stage(
     "kernels",
     "matching kernel",
-    version=2,
+    version=3,
     sections=KERNEL,
     resources=IMAGE_RESOURCES,
     units=band_names,
