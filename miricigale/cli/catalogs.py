@@ -30,6 +30,11 @@ def add_fit(commands):
     )
     fit.add_argument("--redshift", metavar="COLUMN", help="column of known redshifts")
     fit.add_argument(
+        "--z-spec",
+        metavar="COLUMN",
+        help="column of redshifts to compare with on the page (else z_spec, zspec or redshift)",
+    )
+    fit.add_argument(
         "--model-error",
         type=float,
         help="model error as a part of the flux, 0.1 (10 %%) by default; with --axes survey in place of its "
@@ -68,7 +73,9 @@ def _fit(args):
     from miricigale.utils.exceptions import OtherResultsError
     from miricigale.utils.parallel import thread_count, thread_pool
     from miricigale.workflow.commands import fit_catalog
+    from miricigale.workflow.fit_page import fit_page
 
+    hdu = int(args.hdu) if (args.hdu or "").isdigit() else args.hdu
     n_threads = thread_count(args.threads or None)
     try:
         with thread_pool(n_threads) as executor:
@@ -77,16 +84,18 @@ def _fit(args):
                 args.output,
                 **chosen(args, "axes redshift model_error pairs flux_unit catalog_map"),
                 **chosen(args, "chunk_rows resume"),
-                hdu=int(args.hdu) if (args.hdu or "").isdigit() else args.hdu,
+                hdu=hdu,
                 executor=executor if n_threads > 1 else None,
                 progress_bar=not args.no_progress,
             )
         table = args.output / "table.fits"
         results.write_table(table, overwrite=True)
+        page = fit_page(results, args.photometry, **chosen(args, "catalog_map z_spec"), hdu=hdu)
+        page = page.write(args.output / "page.html")
     except OtherResultsError as err:
         # name the option of this command instead of the argument
         raise OtherResultsError(err.reason, "--no-resume to replace them") from err
-    print(f"{results!r}; all in {table}")
+    print(f"{results!r}; all in {table}; page: {page}")
     return 0
 
 

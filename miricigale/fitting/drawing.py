@@ -102,7 +102,8 @@ def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):
     return plot_sed_fit(
         u.Quantity(filters.pivots)[order],
         results.flux * FNU,
-        np.where(used, results.sigma, results.flux_err) * FNU,
+        # a band that was left out may have an error that is none
+        np.where(used, results.sigma, np.maximum(results.flux_err, 0.0)) * FNU,
         results.best_flux * FNU,
         used=used,
         limit=results.limit,

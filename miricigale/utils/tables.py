@@ -51,7 +51,7 @@ class Flags(enum.IntFlag):
         source, found = inspect.getsource(cls), {}
         for member in cls:
             before = re.search(rf"((?: *#: .*\n)+) *{member.name} = ", source)
-            after = re.search(rf'\b{member.name} = .*\n *"""(.*?)"""', source, flags=re.DOTALL)
+            after = re.search(rf'\b{member.name} = [^\n]*\n *"""(.*?)"""', source, flags=re.DOTALL)
             text = (before or after)[1] if before or after else ""
             plain = text.replace("#:", "").replace("``", "")
             found[member.value] = member.name.lower().replace("_", " "), " ".join(plain.split())

@@ -10,6 +10,8 @@ from miricigale.fitting import open_results
 from miricigale.fitting.grid import GridEngine
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import MiricigaleWarning
+from miricigale.workflow.commands import fit_catalog
+from miricigale.workflow.fit_page import fit_page
 
 BANDS = ("wfc3.f125w", "wfc3.f160w", "irac.ch1", "irac.ch2", "miri.f770w", "miri.f1500w")
 
@@ -45,6 +47,16 @@ def test_a_catalog_becomes_a_folder_of_results(catalog, tmp_path, capsys):
         np.testing.assert_allclose(joint.sum(axis=0), galaxy.pdf["age"], atol=1e-9)
         assert list(galaxy.pairs) == [("age", "tau"), ("ebv", "age")]
     table = QTable.read(out / "table.fits")
+    page = (out / "page.html").read_text()
+    for text in (
+        "5 objects, 6 bands",
+        "Redshifts were given",
+        "miri.f770w",
+        "What was left out",
+        "Examples",
+    ):
+        assert text in page
+    assert page.count("<img") == 3
     # the mass formed that went in
     np.testing.assert_allclose(table["mass_best"].to_value(u.Msun), 1e10, rtol=0.02)
     assert main([*command, "--chunk-rows", "3"]) == 2
@@ -168,3 +180,26 @@ def test_magnitudes_are_no_fluxes(tmp_path, capsys):
     err = capsys.readouterr().err
     assert "column 'irac.ch1' must be convertible to uJy, got mag(AB)" in err
     assert "Traceback" not in err
+
+
+def test_the_page_of_a_catalog_says_how_redshifts_compare_and_what_was_left_out(catalog, tmp_path):
+    """Redshifts of the models themselves come back; a band of no error is counted, flags have their meanings."""
+    table = catalog.copy()
+    table["irac.ch2_err"][1] = -1.0 * u.uJy
+    table["miri.f999w"], table["miri.f999w_err"] = table["irac.ch1"], table["irac.ch1_err"]
+    table.write(tmp_path / "cat.fits")
+    with pytest.warns(MiricigaleWarning, match=r"not fitted.*miri\.f999w"):
+        results = fit_catalog(tmp_path / "cat.fits", tmp_path / "out", axes="quick")
+    page = fit_page(results, tmp_path / "cat.fits").to_html()
+    for text in (
+        "objects with z_spec",
+        "fluxes with an error that is no error (0, negative or infinite): irac.ch2 1;",
+        "for want of a filter or of errors: miri.f999w",
+        "4 bad error",
+        "A flux whose error is zero, negative",
+        "axis redshift",
+    ):
+        assert text in page, text
+    assert "outliers, above 0.15" in page
+    with pytest.raises(ValueError, match="z_phot"):
+        fit_page(results, tmp_path / "cat.fits", z_spec="z_phot")

@@ -1,0 +1,439 @@
+"""The page of a fitted catalog: redshifts, how well models fit, fractions, examples, what was left out."""
+
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+
+from miricigale.evaluation import Report, number, photoz_metrics
+from miricigale.filters import Filter, FilterSet
+from miricigale.filters.catalog_files import MappedRows, as_catalog_map
+from miricigale.fitting import FitFlags
+from miricigale.fitting.likelihood import unused_bands
+from miricigale.plotting.axes import WIDTH, new_figure
+from miricigale.plotting.comparison import plot_redshifts
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing import plain_floats
+from miricigale.utils.row_files import open_rows
+
+__all__ = ["fit_page"]
+
+#: Columns that hold known redshifts, the first that is there.
+KNOWN_REDSHIFTS = ("z_spec", "zspec", "z_true", "redshift_spec", "redshift")
+#: Examples on the page, and points in a drawing.
+_EXAMPLES, _POINTS = 6, 5000
+_COLOR, _SECOND = "#1d4ed8", "#c2410c"
+#: Fluxes in a band for which a median is drawn.
+_FEW = 5
+#: Letters of a setting that are shown.
+_LONG = 200
+#: AGN fraction above which an object counts as one with an AGN.
+_SOME_AGN = 0.2
+
+
+def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
+    """
+    Make the page of a fitted catalog.
+
+    Parameters
+    ----------
+    results : `~miricigale.fitting.FitResultsFiles`
+        What `~miricigale.workflow.commands.fit_catalog` returned.
+    path : path-like
+        The catalog that was fitted.
+    catalog_map, hdu : optional
+        As for the fit.
+    z_spec : str, optional
+        Column of known redshifts to compare with; by default the first of `KNOWN_REDSHIFTS` that is there.
+
+    Returns
+    -------
+    page : `~miricigale.evaluation.Report`
+        ``page.write(path)`` writes it, one HTML file.
+
+    Raises
+    ------
+    ValueError
+        If the catalog has no column ``z_spec``.
+    """
+    rows = open_rows(path, results.job["chunk_rows"], hdu=hdu)
+    if catalog_map is not None:
+        rows = MappedRows(rows, as_catalog_map(catalog_map))
+    found = _Found(results)
+    known = _known_redshifts(rows, z_spec)
+    page = Report(
+        f"Fits of {Path(path).name}",
+        subtitle=f"{len(results)} objects, {len(found.filters)} bands",
+        notices=_notices(found),
+    )
+    _summary(page, found, known)
+    _redshifts(page, found, known)
+    _goodness(page, found)
+    _physics(page, found)
+    _examples(page, results, found)
+    _left_out(page, results, rows, found)
+    _settings(page, results)
+    return page
+
+
+class _Found:
+    """Numbers of all objects: redshift, fraction, mass, fit and residuals of each."""
+
+    def __init__(self, results):
+        parts = [_numbers(part) for part in results.parts()]
+        for name in parts[0]:
+            setattr(self, name, np.concatenate([part[name] for part in parts]))
+        first = next(iter(results.parts()))
+        self.filters, self.fixed = first.fitted_filters, first.redshift_fixed
+        self.meta = dict(first.meta)
+
+    @property
+    def good(self):
+        """Objects that were fitted."""
+        return np.isfinite(self.chi2)
+
+
+def _numbers(part):
+    n = len(part)
+    bands = [part.filters.index(name) for name in part.fitted_filters]
+    used = np.isfinite(part.sigma[:, bands]) & ~part.limit[:, bands]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        model, flux = part.best_flux[:, bands], part.flux[:, bands]
+        ratio = np.where(used & (model > 0), flux / model, np.nan)
+        pull = np.where(used, (flux - model) / part.sigma[:, bands], np.nan)
+    out = {
+        "ids": np.array(part.ids).astype(str),
+        "flags": np.array(part.flags),
+        "n_bands": np.array(part.n_bands),
+        "chi2": np.array(part.reduced_chi2, float),
+        "ratio": ratio.astype(np.float32),
+        "pull": pull.astype(np.float32),
+        "unusable": np.isfinite(part.flux[:, bands]) & ~np.isfinite(part.sigma[:, bands]),
+    }
+    for name, of in (("z", "redshift"), ("frac", "frac_agn"), ("mass", "stellar_mass")):
+        values = np.full((n, 3), np.nan)
+        if of in part.parameters:
+            values = np.asarray(part.percentile(of, [0.16, 0.5, 0.84]).value)
+        elif of in part.constants:
+            values[:] = np.where(part.fitted, part.constants[of], np.nan)[:, None]
+        out[name] = values
+    return out
+
+
+def _known_redshifts(rows, name):
+    """Name of the column of known redshifts and its values; (None, NaN) without one."""
+    names = rows.colnames
+    if name is None:
+        name = next((one for one in KNOWN_REDSHIFTS if one in names), None)
+    if name is None:
+        return None, None
+    if name not in names:
+        raise argument_error("z_spec", f"one of the columns {list(names)}", repr(name))
+    values = []
+    for i in range(rows.n_chunks):
+        values.append(plain_floats(rows.chunk(i)[name], name, "photometry"))
+    z = np.concatenate(values)
+    return name, np.where(z > 0, z, np.nan)
+
+
+def _notices(found):
+    good = found.good
+    lines = []
+    poor = good & (found.flags & int(FitFlags.HIGH_CHI2) != 0)
+    if good.any() and np.mean(poor[good]) > 0.1:
+        lines.append(
+            f"{np.mean(poor[good]):.0%} of the objects have no model that fits (reduced chi2 above the limit): "
+            "errors that are too small, zero points, wrong columns or units, or models that are not theirs."
+        )
+    for name, column in zip(found.filters, found.ratio.T, strict=True):
+        some = column[np.isfinite(column)]
+        if some.size >= 30 and not 0.8 < np.median(some) < 1.25:
+            lines.append(
+                f"{name}: fluxes are {np.median(some):.2f} times those of the best models in the median of "
+                f"{some.size} objects: look at its zero point and unit."
+            )
+    edge = good & (found.flags & int(FitFlags.REDSHIFT_EDGE) != 0)
+    if good.any() and np.mean(edge[good]) > 0.1:
+        lines.append(
+            f"{np.mean(edge[good]):.0%} of the objects reach the first or last redshift of the grid."
+        )
+    if not good.any():
+        lines.append("No object was fitted; the flags below say why.")
+    return lines
+
+
+def _summary(page, found, known):
+    page.section("Summary")
+    good = found.good
+    none = "no object was fitted"
+    items = [
+        ("objects", len(good)),
+        ("fitted", int(good.sum())),
+        ("without any flag", int(np.count_nonzero(good & (found.flags == 0)))),
+        ("bands of an object, median", number(_median(found.n_bands[good]), ".0f", none)),
+        ("reduced chi2, median", number(_median(found.chi2), ".2f", none)),
+    ]
+    if not found.fixed:
+        items.append(("redshift, median", number(_median(found.z[good, 1]), ".2f", none)))
+        width = (found.z[:, 2] - found.z[:, 0]) / 2 / (1 + found.z[:, 1])
+        items.append(("half width of z over 1 + z, median", number(_median(width), ".3f", none)))
+    if np.isfinite(found.frac).any():
+        share = np.mean(found.frac[good, 0] > _SOME_AGN)
+        label = f"with fracAGN above {_SOME_AGN:g} at 84 %"
+        items.append((label, number(share, "{:.0f} %", none, scale=100)))
+    page.items(items)
+
+
+def _median(values):
+    values = values[np.isfinite(values)]
+    return np.median(values) if values.size else np.nan
+
+
+def _redshifts(page, found, known):
+    name, z = known
+    good = found.good
+    if found.fixed:
+        page.section("Redshifts", "Redshifts were given; they were not fitted.")
+        return
+    page.section("Redshifts")
+    some = good & np.isfinite(z) if z is not None else np.zeros(good.size, bool)
+    figure, axes = new_figure(1, 2 if some.any() else 1, size=(WIDTH / 2, 4.2))
+    if some.any():
+        metrics = photoz_metrics(z[some], found.z[some, 1])
+        inside = (found.z[some, 0] <= z[some]) & (z[some] <= found.z[some, 2])
+        page.items(
+            [
+                (f"objects with {name}", int(some.sum())),
+                ("bias, median of dz / (1 + z)", f"{metrics.bias:+.3f}"),
+                ("sigma_MAD of dz / (1 + z)", f"{metrics.sigma_mad:.3f}"),
+                ("outliers, above 0.15", f"{100 * metrics.outlier_fraction:.1f} %"),
+                ("in their 16-84 % interval (68 % wanted)", f"{100 * np.mean(inside):.0f} %"),
+            ]
+        )
+        rows = np.flatnonzero(some)[:: max(1, int(some.sum()) // _POINTS)]
+        plot_redshifts(z[rows], found.z[rows, 1], ax=axes[0, 0])
+        axes[0, 0].set(xlabel=name, ylabel="fitted redshift (median)")
+    ax = axes[0, -1]
+    if good.any():
+        ax.hist(found.z[good, 1], 40, color="0.75", label="fitted")
+        if some.any():
+            ax.hist(z[some], 40, histtype="step", color=_COLOR, label=name)
+            ax.legend(frameon=False)
+    ax.set(xlabel="redshift", ylabel="objects")
+    text = "Fitted redshifts (posterior medians)"
+    if some.any():
+        text += f" against {name}; dashed lines are |dz| = 0.15 (1 + z)"
+    page.figure(figure, f"{text}.")
+
+
+def _goodness(page, found):
+    page.section(
+        "How well models fit",
+        "Reduced chi2 is that of the best model over bands less one, with the model error in the errors. "
+        "A median ratio far from 1 in one band tells of its zero point, unit or curve.",
+    )
+    good = np.isfinite(found.chi2)
+    order = np.argsort([_pivot(name) for name in found.filters])
+    figure, axes = new_figure(1, 2, size=(WIDTH / 2, 3.6))
+    ax = axes[0, 0]
+    if good.any():
+        values = np.clip(found.chi2[good], 1e-2, 1e3)
+        ax.hist(values, np.geomspace(1e-2, 1e3, 51), color="0.75")
+        ax.axvline(np.median(found.chi2[good]), color=_COLOR, lw=1, label="median")
+        ax.legend(frameon=False)
+    ax.set(
+        xscale="log", xlabel="reduced chi2 (those beyond in the outermost bins)", ylabel="objects"
+    )
+    ax = axes[0, 1]
+    rows = []
+    for k, i in enumerate(order):
+        ratio, pull = (
+            values[np.isfinite(values)] for values in (found.ratio[:, i], found.pull[:, i])
+        )
+        name = found.filters[i]
+        none = "no flux was fitted"
+        low = mid = high = np.nan
+        if ratio.size:
+            low, mid, high = np.percentile(ratio.astype(float), [16, 50, 84])
+        if ratio.size >= _FEW:
+            ax.errorbar(k, mid, [[mid - low], [high - mid]], fmt="o", color=_COLOR, ms=4, lw=1)
+        rows.append(
+            (
+                name,
+                f"{_pivot(name):.3g}",
+                ratio.size,
+                number(mid, ".3f", none),
+                number(low, ".2f", none),
+                number(high, ".2f", none),
+                number(np.median(pull) if pull.size else np.nan, "+.2f", none),
+                number(
+                    np.mean(np.abs(pull) > 3) if pull.size else np.nan, "{:.1f} %", none, scale=100
+                ),
+            )
+        )
+    ax.axhline(1.0, color="0.6", lw=0.8)
+    ax.set_xticks(range(len(order)), [found.filters[i] for i in order], rotation=90, fontsize=7)
+    ax.set(ylabel="flux over that of the best model", ylim=(0.4, 1.8))
+    page.figure(
+        figure,
+        f"Reduced chi2, and measured over model flux in bands of {_FEW} or more fluxes: median, 16-84 %.",
+    )
+    header = (
+        "band",
+        "um",
+        "fluxes",
+        "flux / model",
+        "16 %",
+        "84 %",
+        "median pull",
+        "beyond 3 sigma",
+    )
+    page.table(rows, header=header)
+
+
+def _pivot(name):
+    """Pivot wavelength of a filter of the library in um."""
+    return float(Filter.from_name(name).pivot.value)
+
+
+def _physics(page, found):
+    good = found.good & np.isfinite(found.mass[:, 1]) & (found.mass[:, 1] > 0)
+    with_agn = np.isfinite(found.frac).any()
+    if not good.any():
+        return
+    page.section("Masses and AGN" if with_agn else "Masses")
+    figure, axes = new_figure(1, 2 if with_agn else 1, size=(WIDTH / 2, 3.6))
+    rows = np.flatnonzero(good)[:: max(1, int(good.sum()) // _POINTS)]
+    ax = axes[0, 0]
+    mass = np.log10(found.mass[rows, 1])
+    if with_agn:
+        strong = found.frac[rows, 0] > _SOME_AGN
+        ax.plot(found.z[rows[~strong], 1], mass[~strong], ".", ms=3, color="0.6", label="others")
+        label = f"fracAGN above {_SOME_AGN:g} at 84 %"
+        ax.plot(found.z[rows[strong], 1], mass[strong], ".", ms=4, color=_SECOND, label=label)
+        ax.legend(frameon=False, fontsize=8)
+        ax = axes[0, 1]
+        bins = np.linspace(0, 1, 26)
+        ax.hist(found.frac[good, 1], bins, color="0.75", label="posterior median")
+        ax.hist(found.frac[good, 0], bins, histtype="step", color=_COLOR, label="16th percentile")
+        ax.set(xlabel="fracAGN", ylabel="objects", yscale="log")
+        ax.legend(frameon=False, fontsize=8)
+        ax = axes[0, 0]
+    else:
+        ax.plot(found.z[rows, 1], mass, ".", ms=3, color=_COLOR)
+    low, high = np.percentile(mass, [0.5, 99.5])
+    ax.set(xlabel="redshift", ylabel="log stellar mass (Msun)", ylim=(low - 0.5, high + 0.5))
+    page.figure(
+        figure, "Stellar masses (posterior medians)" + (" and AGN fractions." if with_agn else ".")
+    )
+    if with_agn:
+        page.text(
+            "A fraction above 0 is no detection of an AGN: see the guide, Is my AGN real? Without data beyond 3 um at "
+            "rest the fraction is what the prior makes it."
+        )
+
+
+def _examples(page, results, found):
+    chosen = _choose(found)
+    if not chosen:
+        return
+    page.section("Examples")
+    filters = FilterSet(_model_filters(results))
+    figure, axes = new_figure(-(-len(chosen) // 2), 2, size=(WIDTH / 2, 3.3))
+    picked = results[np.array([row for row, _ in chosen])]
+    for ax, (_, what), one in zip(axes.ravel(), chosen, picked, strict=False):
+        one.plot_sed(ax, filters=filters)
+        z = "" if found.fixed else f"z = {one.best['redshift'].value:.2f}, "
+        title = f"{np.asarray(one.ids).item()}: {z}reduced chi2 {one.reduced_chi2:.2f} ({what})"
+        ax.set_title(title, fontsize="small")
+    for ax in axes.ravel()[len(chosen) :]:
+        ax.remove()
+    page.figure(
+        figure,
+        "Measured fluxes (points; open where they were not fitted), best model (line) and its fluxes (squares).",
+    )
+
+
+def _model_filters(results):
+    """Names of the bands of the models."""
+    return next(iter(results.parts())).filters
+
+
+def _choose(found):
+    """Rows to be shown, and why: spread over chi2, and the strongest AGN."""
+    rows = np.flatnonzero(np.isfinite(found.chi2))
+    if not rows.size:
+        return []
+    order = rows[np.argsort(found.chi2[rows], kind="stable")]
+    places = {0.1: "a good fit", 0.5: "median chi2", 0.9: "worst tenth", 1.0: "the worst fit"}
+    chosen = {}
+    for place, what in places.items():
+        chosen.setdefault(int(order[int(place * (order.size - 1))]), what)
+    fraction = np.where(np.isfinite(found.frac[rows, 0]), found.frac[rows, 0], -1.0)
+    if fraction.max() > _SOME_AGN:
+        chosen.setdefault(int(rows[np.argmax(fraction)]), "surest AGN")
+    if not found.fixed:
+        high = np.where(found.flags[rows] == 0, found.z[rows, 0], -1.0)
+        if high.max() > 0:
+            chosen.setdefault(int(rows[np.argmax(high)]), "highest redshift without a flag")
+    return list(chosen.items())[:_EXAMPLES]
+
+
+def _left_out(page, results, rows, found):
+    page.section(
+        "What was left out", "Nothing is dropped in silence: a row of the catalog is a row here."
+    )
+    lines = list(rows.told()) if isinstance(rows, MappedRows) else []
+    unused = unused_bands(rows.chunk(0), list(found.filters))
+    if unused:
+        lines.append(
+            f"bands that were not fitted, for want of a filter or of errors: {', '.join(unused)}"
+        )
+    empty = [name for name, column in zip(found.filters, found.ratio.T, strict=True)
+             if not np.isfinite(column).any()]  # fmt: skip
+    if empty:
+        lines.append(f"bands without a flux in any object: {', '.join(empty)}")
+    bad = found.unusable.sum(axis=0)
+    if bad.any():
+        counts = ", ".join(f"{name} {n}" for name, n in zip(found.filters, bad, strict=True) if n)
+        lines.append(
+            f"fluxes with an error that is no error (0, negative or infinite): {counts}; negative errors that "
+            "mark upper limits are read by miricigale.cigale.read_cigale_catalog, or given as <band>_limit"
+        )
+    page.bullets(lines or ["No column and no number of the catalog."])
+    counts = [("none", "", int(np.count_nonzero(found.flags == 0)))]
+    for value, (name, meaning) in FitFlags.meanings().items():
+        n = int(np.count_nonzero(found.flags & value))
+        if n:
+            fitted = "" if not value & int(FitFlags.UNFITTED) else " Not fitted."
+            counts.append((f"{value} {name}", f"{meaning}{fitted}", n))
+    page.table(counts, header=("flag", "meaning", "objects"), text=2)
+
+
+def _settings(page, results):
+    page.section("What was fitted")
+    first = next(iter(results.parts()))
+    meta = dict(first.meta)
+    rows = [
+        (name, _plain(value)) for name, value in meta.get("fit", {}).items() if name != "filters"
+    ]
+    model = results.model
+    if model is not None:
+        rows += [(name, _plain(value)) for name, value in model.recipe.items()]
+    for name, axis in first.axes.items():
+        values = np.asarray(axis.values)
+        text = f"{values.size} from {values[0]:g} to {values[-1]:g} {u.Unit(axis.unit)}"
+        rows.append((f"axis {name}", text.strip()))
+    rows = [(name, text if len(text) < _LONG else f"{text[:_LONG]} ...") for name, text in rows]
+    page.table(rows, header=("", ""), text=2)
+
+
+def _plain(value):
+    if isinstance(value, dict):
+        different = set(map(str, value.values()))
+        if len(different) == 1:
+            return f"{different.pop()} in all bands"
+        return ", ".join(f"{name} {v}" for name, v in value.items())
+    if isinstance(value, (list, tuple)):
+        return "; ".join(map(str, value)) or "none"
+    return str(value)
