@@ -328,8 +328,8 @@ def _physics(page, found):
     )
     if with_agn:
         page.text(
-            "A fraction above 0 is no detection of an AGN: see the guide, Is my AGN real? Without data beyond 3 um at "
-            "rest the fraction is what the prior makes it."
+            "A fraction above 0 is no detection of an AGN: see the guide, Is my AGN real? Without data beyond "
+            "3 um at rest the fraction is what the prior makes it."
         )
 
 
