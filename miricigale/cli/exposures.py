@@ -29,6 +29,7 @@ def add_reduce(commands):
         kind = "file, number or 'measured'" if name in ("gain", "read_noise") else kind
         add(f"--{name.replace('_', '-')}", metavar="REF", help=f"{name.replace('_', ' ')} ({kind})")
     add("--incomplete", action="store_true", help="do without references that are missing")
+    add("--backend", choices=("native", "jwst"), default="native", help="who fits the ramps")
     add("--skip-first", type=int, metavar="N", help="groups left out at the start of integrations")
     add("--skip-last", type=int, metavar="N", help="groups left out at their end")
     add(
@@ -50,6 +51,7 @@ def _reduce(args):
     from miricigale.workflow.reduce import reduce_files
 
     reducer = Reducer(
+        backend=args.backend,
         references=_references(args),
         skip_first=args.skip_first,
         skip_last=args.skip_last,

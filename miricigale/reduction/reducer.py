@@ -39,7 +39,7 @@ from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
 __all__ = ["BACKENDS", "Reducer"]
 
 #: Known backends.
-BACKENDS = ("native",)
+BACKENDS = ("native", "jwst")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -49,8 +49,10 @@ class Reducer:
 
     Parameters
     ----------
-    backend : {"native"}, optional
-        Who does the work.
+    backend : {"native", "jwst"}, optional
+        Who fits the ramps: this package, or the steps of the official pipeline (``jwst``, an extra of the
+        installation) with the same references. The other settings, calibration, background
+        and mosaic are the same.
     jump_threshold : float or None, optional
         Sigma above which a jump is cut out of a ramp; None for no jump detection.
     neighbor_threshold : float or None, optional
@@ -279,7 +281,12 @@ class Reducer:
             **exposure_values(ramp.exposure),
             n_jumps=len(fit.jumps),
             ipc=ipc,
-            noise_correction=fit.noise_correction(self.detector.ipc_kernel) if ipc else 1.0,
+            # errors of the pipeline are those of pixels that share nothing
+            noise_correction=(
+                fit.noise_correction(self.detector.ipc_kernel)
+                if ipc and self.backend == "native"
+                else 1.0
+            ),
             gain=float(np.median(maps.gain)),
             **history_of(self, ramp, maps),
         )

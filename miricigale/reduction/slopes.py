@@ -13,6 +13,7 @@ from miricigale.detector import (
     ResetDecay,
 )
 from miricigale.instrument import DQ
+from miricigale.reduction._jwst import fit_steps
 from miricigale.reduction.assumed import is_own
 from miricigale.reduction.drawn import draw_groups
 from miricigale.reduction.rampfit import fit_groups
@@ -58,8 +59,13 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False):
     if skip_first + skip_last > n_group - 2:
         msg = f"at most {n_group - 2} groups together for {n_group} groups"
         raise argument_error("skip_first, skip_last", msg, f"{skip_first}, {skip_last}")
-    factor = float(np.sum(detector.ipc_kernel**2)) if shares_charge(reducer, ramp) else 1.0
     drift = _anomaly(reducer, ramp, maps)
+    if reducer.backend == "jwst":
+        offsets = np.broadcast_to(drift, (exposure.n_integrations, n_group))
+        fit = fit_steps(reducer, ramp, maps, reset=offsets, skipped=(skip_first, skip_last))
+        fit.flags[...] |= dq
+        return fit
+    factor = float(np.sum(detector.ipc_kernel**2)) if shares_charge(reducer, ramp) else 1.0
     options = {
         "group_time": ramp.group_time,
         "gain": maps.gain,

@@ -143,6 +143,9 @@ class StudyConfig(Configuration):
         ramps = exposures.kind == "ramps"
         wanted = "must be false with [exposures] kind = 'rates', which have no ramps"
         require(ramps or not self.run.keep_level1b, "run", "keep_level1b", wanted, "true")
+        backend = self.reduction.backend
+        wanted = "must be 'native' with [exposures] kind = 'rates', which have no ramps"
+        require(ramps or backend == "native", "reduction", "backend", wanted, repr(backend))
         good = len(alpha) == 2 and 0 < alpha[0] <= alpha[1] <= 4
         require(good, "sed", "alpha", "must be two numbers in order, above 0 to 4", list(alpha))
         wanted = f"must be at most the number of MIRI filters ({n})"

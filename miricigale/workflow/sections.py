@@ -221,6 +221,11 @@ class DetectorSection:
 class ReductionSection:
     """How ramps become mosaics."""
 
+    backend: str = option(
+        "native",
+        "Who fits the ramps: own, or the steps of the official pipeline (jwst, to be installed).",
+        choices=("native", "jwst"),
+    )
     jump_threshold: float = option(5.0, "Jump detection threshold in sigma.", low=2.0, high=50.0)
     background_box: int = option(32, "Box of the background mesh in pixels.", low=8, high=512)
     background_filter: int = option(3, "Median filter of the mesh in cells.", low=1, high=15)

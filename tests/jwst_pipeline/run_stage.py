@@ -1,7 +1,7 @@
 """
 One stage of the official pipeline in a process of its own, which cannot open a connection.
 
-``python run_stage.py STAGE OUTPUT FILE [FILE ...]``
+``python run_stage.py STAGE OUTPUT FILE [FILE ...]``; ``detector1+ramp`` keeps the ramp that is fitted.
 """
 
 import json
@@ -19,11 +19,11 @@ def refuse(self, address):
     raise OSError(msg)
 
 
-def detector1(files, output):
+def detector1(files, output, **options):
     from jwst.pipeline import Detector1Pipeline
 
     for path in files:
-        Detector1Pipeline.call(path, save_results=True, output_dir=output)
+        Detector1Pipeline.call(path, save_results=True, output_dir=output, **options)
 
 
 def image2(files, output):
@@ -55,7 +55,9 @@ def image3(files, output):
 
 if __name__ == "__main__":
     stage, folder, *paths = sys.argv[1:]
+    stage, _, kept = stage.partition("+")
+    options = {"save_calibrated_ramp": True} if kept else {}
     socket.socket.connect = socket.socket.connect_ex = refuse
-    {"detector1": detector1, "image2": image2, "image3": image3}[stage](paths, folder)
+    {"detector1": detector1, "image2": image2, "image3": image3}[stage](paths, folder, **options)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     Path(folder, f"{stage}.json").write_text(json.dumps({"attempts": attempts, "peak_mb": peak}))

@@ -1,3 +1,5 @@
+import sys
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -236,7 +238,7 @@ def test_groups_can_be_left_out():
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"backend": "magic"}, "'backend' must be 'native', got 'magic'"),
+        ({"backend": "magic"}, "'backend' must be 'native' or 'jwst', got 'magic'"),
         ({"jump_threshold": 0}, "'jump_threshold' must be positive or None"),
         ({"saturation": 1.5}, "'saturation' must be above 0 and at most 1"),
         ({"box": 1}, "'box' must be at least 4"),
@@ -281,3 +283,10 @@ def test_what_is_no_ramp_or_grid_is_named():
     far.wcs.crval = [150.1, 2.2]
     with pytest.raises(ValueError, match="'wcs' must be a grid that overlaps the images"):
         Reducer().mosaic([cal], far)
+
+
+def test_the_official_pipeline_is_asked_for_by_name(monkeypatch):
+    monkeypatch.setitem(sys.modules, "jwst", None)
+    ramp = expose(SKY, exposure(n_groups=4, subarray="SUB64"))
+    with pytest.raises(ImportError, match=r"pip install 'miricigale\[jwst\]'"):
+        Reducer(backend="jwst").fit_ramp(ramp)

@@ -54,6 +54,7 @@ def reducer_of(config, n_threads=None):
     """The reducer that a configuration describes."""
     options = config.reduction
     return reduction.Reducer(
+        backend=options.backend,
         jump_threshold=options.jump_threshold,
         box=options.background_box,
         filter_size=options.background_filter,
