@@ -5,8 +5,15 @@ from miricigale.utils.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        "background": ("Background", "estimate_background", "subtract_background"),
+        "background": (
+            "Background",
+            "BackgroundFlags",
+            "estimate_background",
+            "remove_background",
+            "subtract_background",
+        ),
         "calibration": ("calibrate", "find_cosmic_rays"),
+        "dither_background": ("dither_backgrounds",),
         "files": ("ImageFile", "open_exposure", "read_images", "write_image"),
         "mosaic": (
             "Mosaic",

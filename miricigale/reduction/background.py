@@ -1,22 +1,50 @@
-"""Smooth background of an image, with the sources masked."""
+"""Smooth background of an image, with the sources masked, and how far it can be trusted."""
 
 import dataclasses
+import warnings
 
 import numpy as np
-from scipy.ndimage import binary_dilation, gaussian_filter, label
+from scipy.ndimage import binary_dilation
 
-from miricigale.instrument import DQ
+from miricigale.instrument import DQ, ImageFacts
 from miricigale.reduction.images import flag_pixels, plain_mask, sigma, with_data
+from miricigale.reduction.sky_mask import cells_of, contamination, darkest, detect, grown, pixels_of
+from miricigale.reduction.sky_mesh import fit_surface, sky_boxes, spread_over, surface
 from miricigale.utils import sep_tools
-from miricigale.utils.exceptions import argument_error
-from miricigale.utils.parallel import chunks
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.tables import Flags
 
-__all__ = ["Background", "estimate_background", "subtract_background"]
+__all__ = [
+    "Background",
+    "BackgroundFlags",
+    "estimate_background",
+    "remove_background",
+    "subtract_background",
+]
 
-# detection of what is masked: standard deviations of the smoothing in pixels (cores, and
-# the wings of bright sources), and the least number of connected pixels
-_WIDTHS = (0.85, 2.5)
-_MIN_AREA = 5
+# least share of the pixels that is taken for sky
+_LEAST_SKY = 0.05
+# sky near sources may be brighter than far from them by this much, in the noise of a pixel
+_CONTAMINATION = 0.1
+# noise of the sky over the errors of the image that cannot be that of the sky alone
+_EXCESS = 3.0
+# what remains of their light in the farther half, over that difference, as measured (benchmarks/background.py)
+_REMAINDER = 2.0
+
+
+class BackgroundFlags(Flags):
+    """Why a background cannot be trusted."""
+
+    GOOD = 0
+    FEW_SKY = 1
+    """Sources leave less than a twentieth of the pixels: the darkest twentieth was taken for sky, and its
+    error is the difference to the median of the image."""
+    EXCESS_NOISE = 2
+    """What is left as sky scatters by more than three times the errors of the image: by sources that cannot
+    be told apart, if the errors are right. The darkest twentieth was taken for sky, with the error of
+    ``FEW_SKY``."""
+    CONTAMINATED = 4
+    """What is left as sky is brighter near sources than far from them: it has their light in it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -28,27 +56,49 @@ class Background:
     ----------
     level, rms : `~numpy.ndarray` of float32, shape (ny, nx)
         Background, and the noise of a pixel about it, in the unit of the image.
+    error : `~numpy.ndarray` of float32, shape (ny, nx)
+        Standard error of the level: what the noise of the sky's pixels leaves open, and the light of
+        sources that may be in it, in quadrature.
     source_mask : `~numpy.ndarray` of bool, shape (ny, nx)
         Pixels that were taken for sources.
     box, filter_size : int
         Size of the boxes in pixels, and of the median filter in boxes.
+    flags : `BackgroundFlags`
+        Why it cannot be trusted; 0 where nothing speaks against it.
     """
 
     level: np.ndarray
     rms: np.ndarray
+    error: np.ndarray
     source_mask: np.ndarray
     box: int
     filter_size: int
+    flags: BackgroundFlags = BackgroundFlags.GOOD
+
+    @property
+    def trusted(self):
+        """Whether nothing speaks against it."""
+        return not self.flags
 
     def __repr__(self):
+        doubt = "" if self.trusted else f", {', '.join(BackgroundFlags.names(self.flags))}"
         return (
-            f"<Background median {np.median(self.level):.4g}, rms {np.median(self.rms):.4g}, "
-            f"{100 * self.source_mask.mean():.1f} % masked as sources>"
+            f"<Background median {np.median(self.level):.4g} +- {np.median(self.error):.2g}, "
+            f"rms {np.median(self.rms):.4g}, "
+            f"{100 * self.source_mask.mean():.1f} % masked as sources{doubt}>"
         )
 
 
 def estimate_background(
-    image, *, box=32, filter_size=3, plane=True, threshold=3.0, grow=3, iterations=3
+    image,
+    *,
+    method="masked",
+    box=64,
+    filter_size=3,
+    plane=True,
+    threshold=3.0,
+    grow=3,
+    iterations=5,
 ):
     """
     Estimate the background of an image, masking what stands above it.
@@ -57,18 +107,22 @@ def estimate_background(
     ----------
     image : `~astropy.nddata.CCDData`
         Any unit.
+    method : {"masked", "sep"}, optional
+        ``"sep"`` is the plain mesh of sep, as in Yang et al. 2021 with boxes of 32 pixels and a filter of 3:
+        sources are only clipped, and the other options have no meaning.
     box, filter_size : int, optional
         Size of the boxes in pixels, and of the median filter in boxes.
     plane : bool, optional
-        Whether a plane is taken off before the mesh of boxes.
+        Whether a plane, or a parabola with twenty boxes or more, is taken off before the mesh of boxes.
     threshold : float, optional
         Sources are at least five connected pixels that rise by this many sigma above the
-        background after a Gaussian smoothing, once of 0.85 pixels and once, for the wings
-        of bright sources, of 2.5; sigma is that of the smoothed image, as measured.
+        background after a Gaussian smoothing of 0.85 pixels, twenty after one of 2.5, for the wings of
+        bright sources, or twelve cells of 4 x 4 pixels that rise by twice as many after one of 8, for
+        what is faint and wide. Sigma is that of the smoothed image, as measured.
     grow : int, optional
-        The mask is dilated by this many pixels.
+        The mask is dilated by this many pixels, and by half of the local half width of what it covers.
     iterations : int, optional
-        How often sources are detected and masked.
+        How often sources are detected and masked at most; it ends when the mask stays.
 
     Returns
     -------
@@ -79,17 +133,107 @@ def estimate_background(
     ValueError
         If an option is out of range or every pixel is masked.
 
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        If it cannot be trusted; ``background.flags`` says why.
+
     Notes
     -----
-    A plane, fitted to the medians of the boxes, is taken off first and given back. A box of which
-    a mask or the edge leaves a part stands for its center all the same, and is off by what a
-    gradient changes from there to the part; with ``plane=False`` (the mesh alone, as in Yang et al.
-    2021) that stays.
+    A plane or parabola, fitted to the boxes, each at the mean place of its sky, is taken off first and given
+    back: distortion bends a gradient of the sky. A box of which a mask or the edge leaves a part stands for its
+    center all the same, and is off by what a gradient changes from there to the part; with ``plane=False`` that
+    stays.
+
+    Where sky near sources is brighter than sky far from them, by more than a tenth of the noise of a pixel,
+    the nearer half of the sky is masked too, as often as that helps. If less than a twentieth of the pixels is
+    left, the darkest twentieth of each box is taken.
 
     Boxes that sources fill are filled from their neighbors. What is fainter than the
-    threshold stays in the background: its mean is the mean of the unmasked pixels,
-    clipped as Source Extractor does it (mode estimate).
+    threshold stays in the background, the clipped median of the unmasked pixels; before any source is
+    masked it is the mode as Source Extractor has it.
+
+    References
+    ----------
+    Detection in tiers of smoothing, from wide to narrow, follows Bagley et al. 2023, ApJL 946, L12, sec. 3.
     """
+    background = estimated(
+        image,
+        method=method,
+        box=box,
+        filter_size=filter_size,
+        plane=plane,
+        threshold=threshold,
+        grow=grow,
+        iterations=iterations,
+    )
+    tell(background, plain_mask(image))
+    return background
+
+
+def estimated(
+    image,
+    *,
+    method="masked",
+    box=64,
+    filter_size=3,
+    plane=True,
+    threshold=3.0,
+    grow=3,
+    iterations=5,
+):
+    """As `estimate_background`, without a warning."""
+    _check(method, box, filter_size, threshold, grow, iterations)
+    mask = plain_mask(image)
+    if mask.all():
+        raise argument_error("image", "one with pixels that are not masked", "every pixel masked")
+    data = sep_tools.native(image.data)
+    data = np.where(mask, 0, data if data.dtype.kind == "f" else data.astype(float))
+    if method == "sep":
+        return _plain(data, mask, int(box), int(filter_size), _correlation(image))
+    mesh = _Mesh(data, mask, int(box), int(filter_size), plane)
+    sources, flags, doubt = np.zeros(data.shape, bool), BackgroundFlags.GOOD, 0.0
+    avoided = np.zeros(cells_of(mask).shape, bool)
+    for _ in range(iterations):
+        found = detect(mesh.residual, mesh.rms, mask, sources, threshold)
+        if grow:
+            found = grown(binary_dilation(found, iterations=grow), mask)
+        found |= pixels_of(avoided, data.shape)
+        if np.count_nonzero(~found & ~mask) < _LEAST_SKY * np.count_nonzero(~mask):
+            flags = BackgroundFlags.FEW_SKY
+            break
+        # what one pixel in a thousand changes is less than the noise
+        same = np.count_nonzero(found ^ sources) <= 1e-3 * found.size
+        if not same:
+            mesh, sources = mesh.measured(found), found
+        # a gradient would be taken for light of sources, were it still there
+        flat = mesh.tilted if plane else mesh.residual
+        doubt, near = contamination(flat, ~(mask | sources), sources)
+        high = doubt > _CONTAMINATION * float(np.median(mesh.rms))
+        if high:
+            avoided |= near
+        elif same:
+            break
+    else:
+        if iterations and high:
+            flags = BackgroundFlags.CONTAMINATED
+    doubt *= _REMAINDER
+    if not flags & BackgroundFlags.FEW_SKY and _exceeds(image, mesh.rms, mask | sources):
+        flags |= BackgroundFlags.EXCESS_NOISE
+    if flags & (BackgroundFlags.FEW_SKY | BackgroundFlags.EXCESS_NOISE):
+        sources = ~darkest(mesh.tilted, mask, mesh.box, _LEAST_SKY)
+        mesh = mesh.measured(sources)
+        sources &= ~mask
+        doubt = max(0.0, float(np.median(mesh.residual[~mask])))
+    error = np.hypot(mesh.error * np.float32(_correlation(image)), np.float32(doubt))
+    background = Background(mesh.level, mesh.rms, error, sources, mesh.box, mesh.filter_size, flags)
+    tell(background, mask)
+    return background
+
+
+def _check(method, box, filter_size, threshold, grow, iterations):
+    if method not in ("masked", "sep"):
+        raise argument_error("method", "'masked' or 'sep'", repr(method))
     for name, value, least in (
         ("box", box, 4),
         ("filter_size", filter_size, 1),
@@ -100,116 +244,101 @@ def estimate_background(
             raise argument_error(name, f"at least {least}", value)
     if not threshold > 0:
         raise argument_error("threshold", "positive", threshold)
-    mask = plain_mask(image)
-    data = sep_tools.native(image.data)
-    data = np.where(mask, 0, data if data.dtype.kind == "f" else data.astype(float))
-    sources = np.zeros(data.shape, bool)
-    for step in range(iterations + 1):
-        tilted = _plane(data, mask | sources, box) if plane else np.zeros_like(data)
-        level, rms = sep_tools.background(data - tilted, mask | sources, box, filter_size)
-        level += tilted
-        if step == iterations:
-            break
-        found = _detect(data - level, rms, mask, sources, threshold)
-        if grow:
-            found = binary_dilation(found, iterations=grow)
-        if np.array_equal(found, sources):
-            break
-        # never mask everything: where nothing would be left the last mask stays
-        if (found | mask).all():
-            break
-        sources = found
-    return Background(
-        level.astype(np.float32, copy=False),
-        rms.astype(np.float32, copy=False),
-        sources,
-        int(box),
-        int(filter_size),
+
+
+def _exceeds(image, rms, mask):
+    """Whether the noise of the sky is far above what the image states; False where it states none."""
+    if image.uncertainty is None or mask.all():
+        return False
+    stated = sigma(image)[~mask]
+    return bool(np.median(rms[~mask]) > _EXCESS * np.median(stated[np.isfinite(stated)]))
+
+
+def _correlation(image):
+    """By how much the mean of many pixels is noisier than theirs in quadrature."""
+    return ImageFacts.of(image).noise_correction
+
+
+def tell(background, mask):
+    """Warn of a background that cannot be trusted."""
+    if background.trusted:
+        return
+    good = ~mask
+    reasons = " ".join(BackgroundFlags.meanings()[flag.value][1] for flag in background.flags)
+    text = (
+        f"the background of {np.median(background.level[good]):.4g} cannot be trusted to better than "
+        f"{np.median(background.error[good]):.2g} ({100 * background.source_mask[good].mean():.0f} % of the "
+        f"pixels are sources): {reasons}"
     )
+    warnings.warn(text, MiricigaleWarning, stacklevel=3)
 
 
-def _plane(data, mask, box):
-    """Plane through the medians of boxes, clipped."""
-    ny, nx = data.shape
-    points = []
-    columns = np.arange(0, nx, box)
-    x = 0.5 * (columns + np.minimum(columns + box, nx) - 1)
-    for rows in chunks(ny, box):
-        median, share = _box_medians(data[rows], mask[rows], box)
-        # boxes that are mostly masked say little
-        used = share >= 0.3
-        y = np.full(x.size, 0.5 * (rows.start + rows.stop - 1))
-        points.append(np.stack([np.ones(x.size), x / nx, y / ny, median], axis=1)[used])
-    points = np.concatenate(points)
-    if len(points) < 6:
-        return np.zeros_like(data)
-    keep = np.ones(len(points), bool)
-    for _ in range(5):
-        coef, *_ = np.linalg.lstsq(points[keep, :3], points[keep, 3], rcond=None)
-        residual = points[:, 3] - points[:, :3] @ coef
-        spread = float(_spread(residual[keep]))
-        new = np.abs(residual) <= 3 * spread
-        if new.sum() < 6 or np.array_equal(new, keep):
-            break
-        keep = new
-    y, x = np.ogrid[:ny, :nx]
-    return (coef[0] + coef[1] * (x / nx) + coef[2] * (y / ny)).astype(data.dtype)
+def _plain(data, mask, box, filter_size, correlation):
+    """The mesh of sep as it is."""
+    level, rms = sep_tools.background(data, mask, box, filter_size)
+    # sep takes boxes of which half is left, and gives 0 and 1 where there is none
+    flags = BackgroundFlags.GOOD if (sky_boxes(data, mask, box).share >= 0.5).any() else (
+        BackgroundFlags.FEW_SKY
+    )  # fmt: skip
+    error = rms * (2.14 * correlation * min(1.0, 1.2533 / filter_size) / box)
+    level, rms, error = (a.astype(np.float32, copy=False) for a in (level, rms, error))
+    return Background(level, rms, error, np.zeros(mask.shape, bool), box, filter_size, flags)
 
 
-def _box_medians(data, mask, box):
-    """Median of the unmasked pixels of the boxes side by side in some rows, and their share."""
-    height, nx = data.shape
-    n = -(-nx // box)
-    # infinity sorts behind the pixels that count
-    values = np.full((height, n * box), np.inf, data.dtype)
-    values[:, :nx] = np.where(mask, np.inf, data)
-    values = np.sort(values.reshape(height, n, box).swapaxes(0, 1).reshape(n, -1), axis=1)
-    count = np.isfinite(values).sum(axis=1)
-    middle = np.stack([np.maximum(count - 1, 0) // 2, count // 2], axis=1)
-    median = np.take_along_axis(values, np.minimum(middle, values.shape[1] - 1), axis=1)
-    size = np.full(n, height * box)
-    size[-1] = height * (nx - (n - 1) * box)
-    return median.mean(axis=1), count / size
+class _Mesh:
+    """A smooth surface and a mesh of boxes through the sky of an image, and what they leave."""
+
+    def __init__(self, data, mask, box, filter_size, plane):
+        self._data, self._mask, self._plane = data, mask, plane
+        self.box, self.filter_size = box, filter_size
+        self._smooth = np.zeros((1, 1), data.dtype)
+        # sources are not masked yet; boxes are measured once more without the surface, which
+        # widens their distribution
+        if plane:
+            boxes = sky_boxes(data, mask, box, mode=True)
+            self._smooth = self._surface(boxes, boxes.level)[0]
+        self._measure(np.zeros_like(mask), mode=True)
+
+    def measured(self, sources):
+        """The same of an image with other sources masked."""
+        out = object.__new__(_Mesh)
+        out.__dict__.update(self.__dict__)
+        out._measure(sources)
+        return out
+
+    def _surface(self, boxes, values):
+        """Surface through boxes, each at the mean place of its sky, in each pixel and there."""
+        coefficients = fit_surface(boxes, values)
+        rows, columns = np.ogrid[tuple(slice(n) for n in self._data.shape)]
+        pixels = surface(coefficients, rows, columns, boxes).astype(self._data.dtype)
+        return pixels, surface(coefficients, *boxes.center, boxes)
+
+    def _measure(self, sources, mode=False):
+        boxes = sky_boxes(self._data - self._smooth, self._mask | sources, self.box, mode=mode)
+        values = boxes.level
+        if self._plane:
+            more, there = self._surface(boxes, values)
+            self._smooth, values = self._smooth + more, values - there
+        mesh = self._over(values, boxes)
+        self.tilted = self._data - self._smooth
+        self.residual = self.tilted - mesh
+        self.level = (self._smooth + mesh).astype(np.float32)
+        self.rms = np.maximum(self._over(boxes.spread, boxes), 0)
+        self._boxes = boxes
+
+    def _over(self, values, boxes):
+        return spread_over(values, boxes.used, boxes.edges, self._data.shape, self.filter_size)
+
+    @property
+    def error(self):
+        """What noise leaves open of the level."""
+        error = self._over(self._boxes.error, self._boxes)
+        # that of a median of so many boxes
+        number = np.clip(np.count_nonzero(self._boxes.used), 1, self.filter_size**2)
+        return np.maximum(error, 0) * np.float32(min(1.0, 1.2533 / np.sqrt(number)))
 
 
-def _median(values):
-    """Median of finite values; they are put in another order."""
-    half = values.size // 2
-    values.partition(half)
-    if values.size % 2:
-        return values[half]
-    return np.mean([values[:half].max(), values[half]], dtype=values.dtype)
-
-
-def _spread(values):
-    """As `astropy.stats.mad_std`, in place: a fifth of the time of a background less."""
-    values -= _median(values)
-    return 1.4826 * _median(np.abs(values, out=values))
-
-
-def _detect(residual, rms, mask, sources, threshold):
-    """Pixels that rise above the noise of the image, smoothed little and much."""
-    good = ~mask & (rms > 0)
-    sky = good & ~sources
-    if not sky.any():
-        return np.zeros(mask.shape, bool)
-    scaled = np.zeros(mask.shape, np.float32)
-    np.divide(residual, rms, out=scaled, where=good, casting="same_kind")
-    found = np.zeros(mask.shape, bool)
-    for width in _WIDTHS:
-        smooth = gaussian_filter(scaled, width, mode="nearest")
-        # correlated noise is smoothed less: its width is measured
-        noise = _spread(smooth[sky])
-        high = good & (smooth > threshold * noise)
-        labels, n = label(high, np.ones((3, 3), bool))
-        # the sky, label 0, is most of the image: only what is high is looked at
-        labels = labels[high]
-        large = np.bincount(labels, minlength=n + 1) >= _MIN_AREA
-        found[high] |= large[labels]
-    return found
-
-
-def subtract_background(image, *, negative_threshold=10.0, **options):
+def subtract_background(image, *, negative_threshold=10.0, negative_noise="larger", **options):
     """
     Subtract the background and mask what lies far below it.
 
@@ -217,19 +346,54 @@ def subtract_background(image, *, negative_threshold=10.0, **options):
     ----------
     image : `~astropy.nddata.CCDData`
         Any unit.
-    negative_threshold : float or None, optional
-        Pixels below the background by more than this many sigma are masked with
-        `DQ.NEGATIVE`; None for none.
+    negative_threshold, negative_noise : optional
+        As of `remove_background`.
     **options
         Passed to `estimate_background`.
 
     Returns
     -------
     image : `~astropy.nddata.CCDData`
-        Without background; ``meta["background"]`` is the median that was taken off.
+        Without background, as `remove_background` returns it.
     background : `Background`
     """
     background = estimate_background(image, **options)
+    removed = remove_background(
+        image, background, negative_threshold=negative_threshold, negative_noise=negative_noise
+    )
+    return removed, background
+
+
+def remove_background(image, background, *, negative_threshold=10.0, negative_noise="larger"):
+    """
+    Take a background off an image and mask what lies far below it.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        Any unit.
+    background : `Background`
+        Of the image.
+    negative_threshold : float or None, optional
+        Pixels below the background by more than this many sigma are masked with
+        `DQ.NEGATIVE`; None for none.
+    negative_noise : {"larger", "background"}, optional
+        Whose sigma that is: the larger of the pixel's error and the noise about the background, so
+        that pixels that are known to be noisy stay; or the latter alone, as in Yang et al. 2021.
+
+    Returns
+    -------
+    image : `~astropy.nddata.CCDData`
+        Without background; ``meta["background"]`` is the median that was taken off, and ``meta["n_negative"]``
+        how many pixels were masked, if they were searched for.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range, or the errors are asked for and the image has none.
+    """
+    if negative_noise not in ("larger", "background"):
+        raise argument_error("negative_noise", "'larger' or 'background'", repr(negative_noise))
     out = with_data(
         image,
         np.asarray(image.data, np.float32) - background.level,
@@ -238,7 +402,10 @@ def subtract_background(image, *, negative_threshold=10.0, **options):
     if negative_threshold is not None:
         if not negative_threshold > 0:
             raise argument_error("negative_threshold", "positive or None", negative_threshold)
-        noise = np.fmax(background.rms, sigma(image))
+        noise = background.rms
+        if negative_noise == "larger":
+            noise = np.fmax(noise, sigma(image))
         low = ~plain_mask(out) & (out.data < -negative_threshold * noise)
         out = flag_pixels(out, low, DQ.NEGATIVE | DQ.DO_NOT_USE)
-    return out, background
+        out.meta["n_negative"] = int(np.count_nonzero(low))
+    return out

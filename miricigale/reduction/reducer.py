@@ -10,8 +10,13 @@ from astropy.nddata import CCDData
 from miricigale.detector import Charge, Ramp, ResetAnomaly
 from miricigale.instrument import DetectorProperties, ImageFacts, miri_detector, mosaic_wcs
 from miricigale.reduction.assumed import brightness_of, history_of, maps_of
-from miricigale.reduction.background import estimate_background, subtract_background
+from miricigale.reduction.background import (
+    BackgroundFlags,
+    estimate_background,
+    subtract_background,
+)
 from miricigale.reduction.calibration import calibrate
+from miricigale.reduction.dither_background import from_dithers
 from miricigale.reduction.files import ImageFile, open_exposure
 from miricigale.reduction.images import (
     check_images,
@@ -81,15 +86,23 @@ class Reducer:
     field_only : bool, optional
         Whether pixels behind the coronagraph masks are masked.
     cosmic_rays : bool, optional
-        Whether residual cosmic rays are searched on the slope image.
+        Whether residual cosmic rays are searched on the slope image (`find_cosmic_rays`). Off: ramps of 30
+        groups keep at most one hit in a full frame, and what the search flags lies in the wings of stars
+        (``benchmarks/cosmic_rays.py``). Of use in ramps of a few groups.
     cosmic_ray_sigma, cosmic_ray_contrast : float, optional
         ``sigma_clip`` and ``object_limit`` of `find_cosmic_rays`.
+    background : {"masked", "sep", "dithers"}, optional
+        How the background of an exposure is estimated: from its own sky, with the sources masked
+        (`estimate_background`); by the plain mesh of sep, as in Yang et al. 2021 (with ``box=32``); or, in
+        `run` and `combine`, from the other dithers (`dither_backgrounds`).
     box, filter_size : int, optional
         Of the background: boxes in pixels, median filter in boxes.
     plane : bool, optional
-        Whether a plane is taken off before the boxes are measured.
+        Whether a plane or parabola is taken off before the boxes are measured.
     negative_threshold : float or None, optional
         Pixels so many sigma below the background are masked.
+    negative_noise : {"larger", "background"}, optional
+        Whose sigma that is (`remove_background`).
     outlier_threshold : float or None, optional
         Sigma for the comparison of three or more dithers; None for none.
     pixfrac : float, optional
@@ -130,13 +143,15 @@ class Reducer:
     reference_window: int | None = None
     ipc: bool | None = None
     field_only: bool = True
-    cosmic_rays: bool = True
+    cosmic_rays: bool = False
     cosmic_ray_sigma: float = 5.0
     cosmic_ray_contrast: float = 3.0
-    box: int = 32
+    background: str = "masked"
+    box: int = 64
     filter_size: int = 3
     plane: bool = True
     negative_threshold: float | None = 10.0
+    negative_noise: str = "larger"
     outlier_threshold: float | None = 5.0
     pixfrac: float = 1.0
     references: object = None
@@ -162,6 +177,12 @@ class Reducer:
                 raise argument_error(name, "an integer of at least 0", value)
         if self.reset_anomaly is not None and not isinstance(self.reset_anomaly, ResetAnomaly):
             raise argument_error("reset_anomaly", "a ResetAnomaly", repr(self.reset_anomaly))
+        for name, known in (
+            ("background", ("masked", "sep", "dithers")), ("negative_noise", ("larger", "background"))
+        ):  # fmt: skip
+            if getattr(self, name) not in known:
+                wanted = " or ".join(repr(value) for value in known)
+                raise argument_error(name, wanted, repr(getattr(self, name)))
         if self.box < 4:
             raise argument_error("box", "at least 4", self.box)
         for name in ("saturation", "pixfrac"):
@@ -331,10 +352,23 @@ class Reducer:
         return cal
 
     def estimate_background(self, image):
-        """Estimate the background of an image: a `Background`."""
-        return estimate_background(
-            image, box=self.box, filter_size=self.filter_size, plane=self.plane
-        )
+        """Estimate the background of an image by itself: a `Background`."""
+        return estimate_background(image, **self._mesh)
+
+    @property
+    def _mesh(self):
+        """Options of `estimate_background`."""
+        method = "sep" if self.background == "sep" else "masked"
+        return {
+            "method": method, "box": self.box, "filter_size": self.filter_size, "plane": self.plane
+        }  # fmt: skip
+
+    @property
+    def _negative(self):
+        """Options of `remove_background`."""
+        return {
+            "negative_threshold": self.negative_threshold, "negative_noise": self.negative_noise
+        }  # fmt: skip
 
     def subtract_background(self, image):
         """
@@ -350,13 +384,7 @@ class Reducer:
         image : `~astropy.nddata.CCDData`
         background : `Background`
         """
-        return subtract_background(
-            image,
-            box=self.box,
-            filter_size=self.filter_size,
-            plane=self.plane,
-            negative_threshold=self.negative_threshold,
-        )
+        return subtract_background(image, **self._negative, **self._mesh)
 
     def mosaic(self, images, wcs, *, pixfrac=None):
         """
@@ -516,8 +544,22 @@ class Reducer:
         if self.outlier_threshold is not None and len(images) < 3:
             number = "a single dither" if len(images) == 1 else "two dithers"
             notes.append(f"{number}: outliers cannot be rejected, hits that ramps kept stay in")
+        if self.background == "dithers":
+            if len(images) >= 3 and len(backgrounds) == len(images):
+                images, backgrounds = from_dithers(images, backgrounds, wcs, **self._negative)
+            else:
+                notes.append("backgrounds are those of single exposures: it takes three and theirs")
+        doubts = [BackgroundFlags.names(b.flags) for b in backgrounds if not b.trusted]
+        if doubts:
+            reasons = ", ".join(
+                sorted({name.replace("_", " ") for names in doubts for name in names})
+            )
+            notes.append(f"{len(doubts)} backgrounds cannot be trusted ({reasons})")
         drizzled, images = self.drizzle(images, wcs)
         mosaic, mosaic_background = self.subtract_background(drizzled.image)
+        if not mosaic_background.trusted:
+            reasons = ", ".join(BackgroundFlags.names(mosaic_background.flags)).replace("_", " ")
+            notes.append(f"the background of the mosaic cannot be trusted ({reasons})")
         # the mosaic's own level would hide those of the dithers
         mosaic.meta["mosaic_background"] = mosaic.meta.pop("background")
         if "background" in drizzled.image.meta:

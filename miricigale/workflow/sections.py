@@ -227,9 +227,25 @@ class ReductionSection:
         choices=("native", "jwst"),
     )
     jump_threshold: float = option(5.0, "Jump detection threshold in sigma.", low=2.0, high=50.0)
-    background_box: int = option(32, "Box of the background mesh in pixels.", low=8, high=512)
+    residual_cosmic_rays: bool = option(
+        False, "Whether hits that ramps kept are searched on single images (L.A.Cosmic)."
+    )
+    background: str = option(
+        "masked",
+        "Background: about masked sources, or the plain mesh of sep.",
+        choices=("masked", "sep"),
+    )
+    background_box: int = option(64, "Box of the background mesh in pixels.", low=8, high=512)
     background_filter: int = option(3, "Median filter of the mesh in cells.", low=1, high=15)
     background_plane: bool = option(True, "Whether a plane is taken off before the mesh.")
+    negative_threshold: float = option(
+        10.0, "Pixels so many sigma below the background are masked.", low=3.0, high=1e6
+    )
+    negative_noise: str = option(
+        "larger",
+        "That sigma: the larger of a pixel's error and the noise of the background, or the latter.",
+        choices=("larger", "background"),
+    )
     pixel_scale: float = option(0.11, "Pixel scale of the mosaics in arcsec.", low=0.02, high=0.5)
     pixfrac: float = option(1.0, "Drop size of the drizzling.", low=0.1, high=1.0)
 

@@ -3,7 +3,9 @@ import pytest
 from astropy.nddata import CCDData, StdDevUncertainty
 
 from miricigale.instrument import DQ
-from miricigale.reduction import estimate_background, subtract_background
+from miricigale.reduction import BackgroundFlags, estimate_background, subtract_background
+from miricigale.utils import sep_tools
+from miricigale.utils.exceptions import MiricigaleWarning
 
 SHAPE = (400, 420)
 
@@ -43,7 +45,7 @@ def test_the_mesh_alone_is_off_where_a_box_is_seen_in_part():
     gradient, mask = 3 * x / 32, x < 16
     image = make(gradient + np.random.default_rng(1).normal(size=x.shape), mask=mask)
     for plane, wanted in ((True, 0.0), (False, 0.75)):
-        off = (estimate_background(image, plane=plane).level - gradient).mean(axis=0)
+        off = (estimate_background(image, plane=plane, box=32).level - gradient).mean(axis=0)
         # the middle of what is seen is 8 of 32 pixels from the center of the box
         assert off[15:17].mean() == pytest.approx(wanted, abs=0.1)
         assert np.abs(off[48:320]).max() < 0.1
@@ -95,6 +97,8 @@ def test_masked_pixels_do_not_count(noise):
 @pytest.mark.parametrize(
     ("options", "match"),
     [
+        ({"method": "median"}, "'method' must be 'masked' or 'sep', got 'median'"),
+        ({"negative_noise": "mine"}, "'negative_noise' must be 'larger' or 'background'"),
         ({"box": 2}, "'box' must be at least 4"),
         ({"threshold": 0}, "'threshold' must be positive"),
         ({"iterations": -1}, "'iterations' must be at least 0"),
@@ -104,3 +108,92 @@ def test_masked_pixels_do_not_count(noise):
 def test_bad_options_are_named(noise, options, match):
     with pytest.raises(ValueError, match=match):
         subtract_background(make(noise), **options)
+
+
+def blobs(shape, number, peak, width, seed=0):
+    """Gaussians on random places."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    scene = np.zeros(shape)
+    for _ in range(number):
+        x0, y0 = rng.uniform(0, shape[1]), rng.uniform(0, shape[0])
+        scene += peak * np.exp(-0.5 * ((x - x0) ** 2 + (y - y0) ** 2) / width**2)
+    return scene
+
+
+def test_a_crowded_field_is_told_and_its_error_holds():
+    shape = (256, 256)
+    noise = np.random.default_rng(1).normal(size=shape)
+    image = make(50 + noise + blobs(shape, 1500, 100, 3))
+    with pytest.warns(
+        MiricigaleWarning, match=r"the background of .* cannot be trusted .* scatters"
+    ):
+        background = estimate_background(image)
+    assert background.flags & BackgroundFlags.EXCESS_NOISE
+    assert not background.trusted
+    off = background.level - 50
+    assert np.all(np.abs(off) < 2 * background.error)
+    # no place is dark, but far from the mean of the light, 50 above
+    assert np.median(off) < 0.4 * np.median(image.data - 50)
+
+
+def test_a_galaxy_that_fills_the_frame_is_told():
+    y, x = np.mgrid[:64, :72]
+    light = 60 * np.exp(-np.hypot(x - 36, y - 32) / 16)
+    image = make(5 + light + np.random.default_rng(2).normal(size=light.shape) * 0.05, error=0.05)
+    with pytest.warns(MiricigaleWarning, match="cannot be trusted"):
+        background = estimate_background(image)
+    # the darkest corner has 3.9 of its light
+    assert np.abs(np.median(background.level) - 5 - 3.9) < 2
+    assert np.all(np.abs(background.level - 5) < 2 * background.error)
+
+
+def test_the_error_is_that_of_many_draws():
+    rng = np.random.default_rng(3)
+    levels, errors = [], []
+    scene = blobs((192, 192), 6, 300, 2)
+    for _ in range(60):
+        background = estimate_background(make(scene + rng.normal(size=scene.shape)))
+        assert background.trusted
+        levels.append(background.level[96, 96])
+        errors.append(background.error[96, 96])
+    assert np.std(levels) == pytest.approx(np.mean(errors), rel=0.35)
+    assert abs(np.mean(levels)) < 0.01
+
+
+@pytest.mark.parametrize(("width", "most"), [(1.2, 0.003), (5.0, 0.01)])
+def test_the_background_takes_no_light_of_sources(width, most):
+    """With the same noise with and without the sources: the share within ten widths."""
+    noise = np.random.default_rng(5).normal(size=SHAPE)
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    places = [(80, 90), (90, 320), (210, 200), (320, 100), (330, 330)]
+    distance = [np.hypot(x - x0, y - y0) for y0, x0 in places]
+    # exponential light, as of galaxies
+    flux = 4e4
+    scene = sum(flux * np.exp(-r / width) / (2 * np.pi * width**2) for r in distance)
+    level = estimate_background(make(7 + noise + scene)).level
+    without = estimate_background(make(7 + noise)).level
+    taken = [(level - without)[r < 10 * width].sum() / flux for r in distance]
+    assert abs(np.mean(taken)) < most
+
+
+def test_the_plain_mesh_is_that_of_sep(noise):
+    data = noise + blobs(SHAPE, 100, 30, 2) + 20
+    background = estimate_background(make(data), method="sep", box=32, filter_size=3)
+    level, rms = sep_tools.background(data, None, 32, 3)
+    np.testing.assert_array_equal(background.level, level.astype(np.float32))
+    np.testing.assert_array_equal(background.rms, rms.astype(np.float32))
+    assert not background.source_mask.any()
+
+
+def test_the_plain_mask_of_negative_pixels_is_by_key_and_counted(noise):
+    error = np.ones(SHAPE)
+    noise[50, 60], noise[51, 90], error[51, 90] = -25.0, -25.0, 10.0
+    image, _ = subtract_background(make(noise + 7, error=error))
+    assert image.meta["n_negative"] == 1
+    assert not image.mask[51, 90]
+    plain, background = subtract_background(
+        make(noise + 7, error=error), negative_noise="background"
+    )
+    assert plain.meta["n_negative"] == 2
+    np.testing.assert_array_equal(plain.mask, plain.data < -10 * background.rms)

@@ -56,9 +56,13 @@ def reducer_of(config, n_threads=None):
     return reduction.Reducer(
         backend=options.backend,
         jump_threshold=options.jump_threshold,
+        cosmic_rays=options.residual_cosmic_rays,
+        background=options.background,
         box=options.background_box,
         filter_size=options.background_filter,
         plane=options.background_plane,
+        negative_threshold=options.negative_threshold,
+        negative_noise=options.negative_noise,
         pixfrac=options.pixfrac,
         # what the analysis knows of the detector, also where a truth has another one
         references="simulated",
@@ -160,7 +164,7 @@ def _sky_plan(config, unit):
 @stage(
     "exposures",
     "exposure",
-    version=8,
+    version=9,
     needs={"truth": of_truth},
     sections=(*IMAGES, "run.keep_level1b"),
     resources=EXPOSURE_RESOURCES,
@@ -205,7 +209,7 @@ def make_exposure(context, unit):
 @stage(
     "mosaics",
     "mosaic",
-    version=4,
+    version=5,
     needs={"exposures": dithers_of_band},
     sections=(*GRID, "reduction", "highres.pixel_scale"),
     units=truth_bands,

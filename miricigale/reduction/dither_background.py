@@ -1,0 +1,171 @@
+"""Background of dithers from each other: what stays on the detector while the sky moves over it."""
+
+import dataclasses
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from miricigale.instrument import DQ, mosaic_wcs
+from miricigale.reduction.background import estimated, remove_background, tell
+from miricigale.reduction.images import check_images, plain_mask, seen_wcs, with_data
+from miricigale.reduction.mosaic import drizzle_images, pixel_map
+from miricigale.reduction.sky_mesh import sky_boxes, spread_over
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.parallel import chunks
+from miricigale.utils.units import ANGLE
+
+__all__ = ["dither_backgrounds", "from_dithers"]
+
+# rows of which the median of many images is taken together
+_ROWS = 128
+# the mask of the mosaic is widened by this many pixels: images are sharper or wider than it
+_WIDER = 2
+
+
+def dither_backgrounds(images, backgrounds=None, *, wcs=None, box=16, filter_size=1):
+    """
+    Backgrounds of dithered images from the other dithers, with the sources masked ("super background").
+
+    Parameters
+    ----------
+    images : list of `~astropy.nddata.CCDData`
+        At least three of one filter and shape, calibrated and with their background; best a dozen, dithered by
+        more than the sources are wide.
+    backgrounds : list of `Background`, optional
+        Of each alone; `estimate_background` if not given.
+    wcs : `~astropy.wcs.WCS`, optional
+        Grid of a mosaic, with its ``pixel_shape``, on which the sources are searched for that are masked; by
+        default that of `~miricigale.instrument.mosaic_wcs` with pixels of 0.11 arcsec. What stays on the
+        detector does not add up there, as sources do.
+    box, filter_size : int, optional
+        Boxes of pixels, and the median filter of boxes, over which the median of the dithers is
+        smoothed. ``box=1`` takes it pixel by pixel: patterns of single pixels are taken off too, and each
+        image gets the noise of n - 1 others, 1.25 / sqrt(n - 1) of its own.
+
+    Returns
+    -------
+    backgrounds : list of `Background`
+        Of each image: the median of the other images in pixels of the detector, each less its own
+        level, without masked pixels, smoothed, and on the level of the image's own sky. Noise and flags
+        are those of what is left.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than three images, they differ in shape or an option is out of range.
+
+    Notes
+    -----
+    What lies still on the detector (glow, residuals of the flat field) goes, however fine it is; what is on
+    the sky and wider than the dithers (zodiacal gradients apart, which all images share) stays in the
+    background only as far as it stays in place. Light of galaxies that the mesh of a single image takes is left to
+    them, if the dithers are wider than they are. Dithers of less than about 1.5 FWHM leave rests of
+    the sources.
+
+    References
+    ----------
+    Dicken et al. 2024, A&A 689, A5, sec. 10.2 (other dithers in place of all, and their limits); Yang et al. 2023,
+    ApJL 956, L12 (CEERS); Ostlin et al. 2025, A&A 696, A57 (MIDIS).
+    """
+    images = list(images)
+    if len(images) < 3:
+        raise argument_error("images", "at least three dithers", len(images))
+    for name, value, least in (("box", box, 1), ("filter_size", filter_size, 1)):
+        if value < least:
+            raise argument_error(name, f"at least {least}", value)
+    shape = images[0].shape
+    for im in images:
+        if im.shape != shape:
+            raise argument_error("images", f"of one shape {shape}", im.shape)
+    alone = [estimated(im) for im in images] if backgrounds is None else list(backgrounds)
+    if len(alone) != len(images):
+        raise argument_error("backgrounds", f"one for each of {len(images)} images", len(alone))
+    masks = [plain_mask(im) for im in images]
+    if wcs is None:
+        wcs = mosaic_wcs([seen_wcs(im) for im in images], 0.11 * ANGLE)
+    sources = _deep_masks(images, alone, wcs)
+    levels = [float(np.median(b.level[~m])) for b, m in zip(alone, masks, strict=True)]
+    templates = _other_medians(images, masks, sources, levels)
+    out = []
+    for im, own, mask, source, level, template in zip(
+        images, alone, masks, sources, levels, templates, strict=True
+    ):
+        known = np.isfinite(template)
+        boxes = sky_boxes(np.where(known, template, 0), ~known, max(box, 4))
+        smooth = spread_over(boxes.level, boxes.used, boxes.edges, shape, filter_size)
+        error = spread_over(boxes.error, boxes.used, boxes.edges, shape, filter_size)
+        error *= np.float32(1.2533 / filter_size if filter_size > 1 else 1.0)
+        if box == 1:
+            error = np.where(known, own.rms * np.float32(1.2533 / np.sqrt(len(images) - 1)), error)
+            smooth = np.where(known, template, smooth)
+        sky = ~(mask | source)
+        rest = with_data(im, im.data - smooth)
+        constant = float(np.median(rest.data[sky])) if sky.any() else level
+        # what is left is judged as an image is, its mesh is not taken off
+        left = estimated(rest, box=own.box, filter_size=own.filter_size)
+        new = dataclasses.replace(
+            left,
+            level=(smooth + constant).astype(np.float32),
+            error=np.hypot(error, left.error).astype(np.float32),
+            source_mask=source,
+        )
+        tell(new, mask)
+        out.append(new)
+    return out
+
+
+def from_dithers(images, backgrounds, wcs, **negative):
+    """Images less the backgrounds of their dithers in place of their own, which are off; and those."""
+    whole = []
+    for im, background in zip(images, backgrounds, strict=True):
+        whole.append(with_data(im, im.data + background.level))
+        # what was far below the background is judged again
+        low = (whole[-1].flags & int(DQ.NEGATIVE)) != 0
+        whole[-1].flags[low] &= ~int(DQ.NEGATIVE | DQ.DO_NOT_USE)
+        whole[-1].mask[low] = False
+    new = dither_backgrounds(whole, backgrounds, wcs=wcs)
+    return [remove_background(*pair, **negative) for pair in zip(whole, new, strict=True)], new
+
+
+def _deep_masks(images, backgrounds, wcs):
+    """Sources of the mosaic of the images, on the pixels of each."""
+    check_images(images, wcs)
+    flat = []
+    for im, background in zip(images, backgrounds, strict=True):
+        flat.append(im.copy())
+        flat[-1].data = im.data - background.level
+    maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
+    mosaic = drizzle_images(flat, wcs, pixel_maps=maps).image
+    found = binary_dilation(estimated(mosaic).source_mask, iterations=_WIDER)
+    out = []
+    for x, y in maps:
+        # beside the grid nothing is known
+        inside = (x > -0.5) & (x < found.shape[1] - 0.5) & (y > -0.5) & (y < found.shape[0] - 0.5)
+        at = (np.rint(np.where(inside, v, 0)).astype(int) for v in (y, x))
+        out.append(found[tuple(at)] & inside)
+    return out
+
+
+def _other_medians(images, masks, sources, levels):
+    """For each image the median of the others in each pixel, each less its level; NaN without any."""
+    shape = images[0].shape
+    out = [np.full(shape, np.nan, np.float32) for _ in images]
+    for rows in chunks(shape[0], _ROWS):
+        stack = np.stack(
+            [
+                np.where(mask[rows] | source[rows], np.nan, im.data[rows] - level)
+                for im, mask, source, level in zip(images, masks, sources, levels, strict=True)
+            ]
+        ).astype(np.float32)
+        ordered = np.sort(stack, axis=0)
+        seen = np.isfinite(stack)
+        count = seen.sum(axis=0)
+        for template, plane, own in zip(out, stack, seen, strict=True):
+            # what is above the image's own value moves down by one where that is taken out
+            rank = (stack < plane).sum(axis=0)
+            left = count - own
+            middle = [np.maximum(left - 1, 0) // 2, np.maximum(left, 1) // 2]
+            middle = [np.minimum(m + (own & (m >= rank)), len(stack) - 1) for m in middle]
+            values = [np.take_along_axis(ordered, m[None], axis=0)[0] for m in middle]
+            template[rows] = np.where(left > 0, 0.5 * (values[0] + values[1]), np.nan)
+    return out
