@@ -5,6 +5,7 @@ from miricigale.utils.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
+        "align": ("Alignment", "align_images", "align_to_catalog"),
         "background": (
             "Background",
             "BackgroundFlags",
@@ -30,5 +31,6 @@ __getattr__, __dir__, __all__ = lazy_names(
         "reducer": ("BACKENDS", "Reducer"),
         "references": ("DetectorMaps", "ReferenceFiles"),
         "results": ("ReductionResult",),
+        "sky_match": ("match_levels", "sky_offsets"),
     },
 )

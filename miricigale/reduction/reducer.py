@@ -9,6 +9,7 @@ from astropy.nddata import CCDData
 
 from miricigale.detector import Charge, Ramp, ResetAnomaly
 from miricigale.instrument import DetectorProperties, ImageFacts, miri_detector, mosaic_wcs
+from miricigale.reduction.align import align_images
 from miricigale.reduction.assumed import brightness_of, history_of, maps_of
 from miricigale.reduction.background import (
     BackgroundFlags,
@@ -34,6 +35,7 @@ from miricigale.reduction.mosaic import (
 from miricigale.reduction.reference_cache import ReferenceCache
 from miricigale.reduction.references import ReferenceFiles
 from miricigale.reduction.results import ReductionResult
+from miricigale.reduction.sky_match import match_levels
 from miricigale.reduction.slopes import fit_slopes, shares_charge
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.meta import provenance
@@ -103,6 +105,9 @@ class Reducer:
         Pixels so many sigma below the background are masked.
     negative_noise : {"larger", "background"}, optional
         Whose sigma that is (`remove_background`).
+    match_sky : bool, optional
+        Whether constants by which the levels of dithers differ where they overlap are taken off before
+        they are compared and combined (`match_levels`).
     outlier_threshold : float or None, optional
         Sigma for the comparison of three or more dithers; None for none.
     pixfrac : float, optional
@@ -152,6 +157,7 @@ class Reducer:
     plane: bool = True
     negative_threshold: float | None = 10.0
     negative_noise: str = "larger"
+    match_sky: bool = True
     outlier_threshold: float | None = 5.0
     pixfrac: float = 1.0
     references: object = None
@@ -434,6 +440,8 @@ class Reducer:
         weights = [weight_map(im) for im in images]
         maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
         check_overlap(maps, wcs.pixel_shape[::-1])
+        if self.match_sky and len(images) > 1:
+            images = match_levels(images, wcs, pixel_maps=maps)
         judged = all(ImageFacts.of(im).n_outliers is not None for im in images)
         if self.outlier_threshold is not None and len(images) >= 3 and not judged:
             images = reject_outliers(
@@ -473,7 +481,7 @@ class Reducer:
             raise argument_error("exposure", wanted, exposure.unit)
         return None, *self.subtract_background(exposure)
 
-    def run(self, ramps, *, wcs=None, pixel_scale=0.11 * ANGLE, progress_bar=False):
+    def run(self, ramps, *, wcs=None, pixel_scale=0.11 * ANGLE, align=None, progress_bar=False):
         """
         Reduce the dithers of one filter.
 
@@ -488,6 +496,9 @@ class Reducer:
             every unmasked pixel of the dithers.
         pixel_scale : `~astropy.units.Quantity`, optional
             Of that grid, if ``wcs`` is not given.
+        align : `~astropy.coordinates.SkyCoord` or "dithers", optional
+            Positions of a catalog to which the images are aligned (`align_images`), or to each other; not at
+            all by default.
         progress_bar : bool, optional
             Whether a progress bar is shown.
 
@@ -515,9 +526,12 @@ class Reducer:
                 rates.append(rate)
             images.append(subtracted)
             backgrounds.append(background)
-        return self.combine(images, backgrounds, rates=rates, wcs=wcs, pixel_scale=pixel_scale)
+        options = {"rates": rates, "wcs": wcs, "pixel_scale": pixel_scale, "align": align}
+        return self.combine(images, backgrounds, **options)
 
-    def combine(self, images, backgrounds, *, rates=(), wcs=None, pixel_scale=0.11 * ANGLE):
+    def combine(
+        self, images, backgrounds, *, rates=(), wcs=None, pixel_scale=0.11 * ANGLE, align=None
+    ):
         """
         Put the images of one filter together.
 
@@ -529,7 +543,7 @@ class Reducer:
             What was subtracted.
         rates : list of `~astropy.nddata.CCDData`, optional
             What they come from, for the result.
-        wcs, pixel_scale : optional
+        wcs, pixel_scale, align : optional
             As for `run`.
 
         Returns
@@ -538,6 +552,10 @@ class Reducer:
         """
         if not images:
             raise argument_error("ramps", "at least one ramp", "none")
+        if align is not None:
+            if isinstance(align, str) and align != "dithers":
+                raise argument_error("align", "a SkyCoord, 'dithers' or None", repr(align))
+            images, _ = align_images(images, None if isinstance(align, str) else align)
         if wcs is None:
             wcs = mosaic_wcs([seen_wcs(im) for im in images], pixel_scale)
         notes = []

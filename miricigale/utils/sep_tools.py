@@ -12,7 +12,7 @@ import sep
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["background", "extract", "native"]
+__all__ = ["background", "extract", "native", "window_positions"]
 
 
 def native(array, dtype=None):
@@ -188,3 +188,30 @@ def extract(
         segmentation_map=True,
         **options,
     )
+
+
+def window_positions(data, x, y, width, *, mask=None):
+    """
+    Windowed centroids of sources, as Source Extractor's ``XWIN_IMAGE``.
+
+    Parameters
+    ----------
+    data : array_like, shape (ny, nx)
+        Background-subtracted image; NaN counts as masked.
+    x, y : array_like, shape (n,)
+        First positions in pixels.
+    width : float
+        Standard deviation of the Gaussian window in pixels.
+    mask : array_like of bool, shape (ny, nx), optional
+        True where there is no data.
+
+    Returns
+    -------
+    x, y : `~numpy.ndarray`, shape (n,)
+        Positions.
+    fine : `~numpy.ndarray` of bool, shape (n,)
+        Whether all of the window has data.
+    """
+    data, mask = _image(data, mask)
+    x, y, flags = sep.winpos(data, x, y, float(width), mask=mask)
+    return np.asarray(x), np.asarray(y), np.asarray(flags) == 0

@@ -1,0 +1,242 @@
+"""Positions of images: to each other, and to a catalog."""
+
+import dataclasses
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord, search_around_sky
+from astropy.wcs import WCS
+from astropy.wcs.utils import proj_plane_pixel_scales
+from scipy.spatial import KDTree
+
+from miricigale.instrument import ImageFacts, psf_fwhm
+from miricigale.reduction.background import estimated
+from miricigale.reduction.images import plain_mask, with_data
+from miricigale.utils import sep_tools
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import ANGLE, positive
+
+__all__ = ["Alignment", "align_images", "align_to_catalog"]
+
+# pairs vote for the shift within this radius, and are matched within it after the shift, arcsec
+_VOTE = 0.1
+# sources to solve for a shift, and for a rotation too
+_LEAST, _LEAST_ROTATION = 3, 10
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Alignment:
+    """
+    How the coordinates of an image were changed.
+
+    Parameters
+    ----------
+    east, north : `~astropy.units.Quantity`
+        Shift of the reference position.
+    rotation : `~astropy.units.Quantity`
+        Turn about it, from north to east.
+    n_matched : int
+        Sources that were used.
+    scatter : `~astropy.units.Quantity`
+        Of one source about the solution, in one coordinate.
+    """
+
+    east: u.Quantity
+    north: u.Quantity
+    rotation: u.Quantity
+    n_matched: int
+    scatter: u.Quantity
+
+    @property
+    def error(self):
+        """Standard error of the shift, in one coordinate."""
+        return self.scatter / np.sqrt(self.n_matched)
+
+
+def align_to_catalog(
+    image, catalog, *, radius=1 * u.arcsec, threshold=10.0, fwhm=None, rotation=True
+):
+    """
+    Correct the coordinates of an image by the positions of a catalog.
+
+    Parameters
+    ----------
+    image : `~astropy.nddata.CCDData`
+        With uncertainty and WCS, background subtracted or not.
+    catalog : `~astropy.coordinates.SkyCoord`
+        Positions, at the epoch of the image.
+    radius : `~astropy.units.Quantity`, optional
+        Largest shift.
+    threshold : float, optional
+        Sigma of a pixel above which sources are detected.
+    fwhm : `~astropy.units.Quantity`, optional
+        Of the point-spread function; that of the image's filter if not given.
+    rotation : bool, optional
+        Whether a rotation is solved for, with ten sources or more.
+
+    Returns
+    -------
+    image : `~astropy.nddata.CCDData`
+        With the corrected WCS; data and distortion are as they were.
+    alignment : `Alignment`
+
+    Raises
+    ------
+    ValueError
+        If fewer than three sources of the catalog are found in the image, or an option is out of range.
+
+    Notes
+    -----
+    Positions are windowed centroids. All pairs of a source and a position within ``radius`` vote for a
+    shift; what agrees with the most frequent to 0.1 arcsec is fitted by least squares, clipped at three
+    standard deviations. A wrong scale would be one of the distortion, and is not looked for.
+    """
+    x, y = _sources(image, threshold, fwhm)
+    return _aligned(image, x, y, _positions(catalog), positive(radius, ANGLE, "radius"), rotation)
+
+
+def align_images(
+    images, catalog=None, *, radius=1 * u.arcsec, threshold=10.0, fwhm=None, rotation=True
+):
+    """
+    Align images to each other, or to a catalog.
+
+    Parameters
+    ----------
+    images : list of `~astropy.nddata.CCDData`
+        As for `align_to_catalog`.
+    catalog : `~astropy.coordinates.SkyCoord`, optional
+        Without one, the first image stands where it is, and each of the others is aligned to the sources of
+        those before it.
+    radius, threshold, fwhm, rotation : optional
+        As for `align_to_catalog`.
+
+    Returns
+    -------
+    images : list of `~astropy.nddata.CCDData`
+    alignments : list of `Alignment`
+    """
+    images = list(images)
+    if not images:
+        raise argument_error("images", "at least one image", "none")
+    reach = positive(radius, ANGLE, "radius")
+    known = None if catalog is None else _positions(catalog)
+    out, alignments = [], []
+    for im in images:
+        x, y = _sources(im, threshold, fwhm)
+        if known is None:
+            zero = 0 * ANGLE
+            kept = Alignment(
+                east=zero, north=zero, rotation=0 * u.deg, n_matched=x.size, scatter=zero
+            )
+            aligned, alignment = im, kept
+        else:
+            aligned, alignment = _aligned(im, x, y, known, reach, rotation)
+        if catalog is None:
+            sky = aligned.wcs.pixel_to_world(x, y)
+            if known is not None:
+                # what is there already stays as it is
+                _, apart, _ = sky.match_to_catalog_sky(known)
+                sky = sky[apart.to_value(ANGLE) > 0.5]
+                sky = SkyCoord(np.append(known.ra, sky.ra), np.append(known.dec, sky.dec))
+            known = sky.icrs
+        out.append(aligned)
+        alignments.append(alignment)
+    return out, alignments
+
+
+def _positions(catalog):
+    if not isinstance(catalog, SkyCoord) or catalog.isscalar:
+        raise argument_error("catalog", "a SkyCoord of several positions", repr(catalog)[:60])
+    return SkyCoord(catalog.icrs.ra, catalog.icrs.dec)
+
+
+def _sources(image, threshold, fwhm):
+    """Windowed positions of the sources of an image, in pixels."""
+    if image.wcs is None or image.uncertainty is None:
+        raise argument_error("image", "one with uncertainty and WCS", "one without")
+    if not threshold > 0:
+        raise argument_error("threshold", "positive", threshold)
+    scale = float(np.mean(proj_plane_pixel_scales(image.wcs))) * 3600
+    if fwhm is None:
+        name = ImageFacts.of(image).filter
+        if name is None:
+            raise argument_error("fwhm", "given for an image that does not tell its filter", "none")
+        fwhm = psf_fwhm(name)
+    width = positive(fwhm, ANGLE, "fwhm") / scale / 2.3548
+    mask, background = plain_mask(image), estimated(image)
+    data = np.where(mask, 0, image.data - background.level)
+    found, _ = sep_tools.extract(data, threshold, err=background.rms, mask=mask)
+    # the edge, and what is masked, cuts sources
+    x, y, fine = sep_tools.window_positions(data, found["x"], found["y"], width, mask=mask)
+    moved = np.hypot(x - found["x"], y - found["y"])
+    good = fine & (moved < width) & (found["flag"] == 0)
+    return x[good], y[good]
+
+
+def _aligned(image, x, y, catalog, radius, rotation):
+    """Image with its WCS moved to a catalog, and by how much."""
+    # plane about the reference position, deg, east and north
+    plane = WCS(naxis=2)
+    plane.wcs.ctype = "RA---TAN", "DEC--TAN"
+    plane.wcs.crval, plane.wcs.crpix = image.wcs.wcs.crval, (1.0, 1.0)
+    plane.wcs.cdelt = 1.0, 1.0
+    sky = image.wcs.pixel_to_world(x, y).icrs if len(x) else SkyCoord([], [], unit="deg")
+    i, j, *_ = search_around_sky(sky, catalog, radius * ANGLE) if len(x) else ([], [])
+    one, other = (
+        np.stack(plane.world_to_pixel(s[k]), axis=1) * 3600 if len(k) else np.empty((0, 2))
+        for s, k in ((sky, i), (catalog, j))
+    )
+    shift = other - one
+    used = np.zeros(len(shift), bool)
+    if len(shift):
+        tree = KDTree(shift)
+        votes = tree.query_ball_point(shift, _VOTE, return_length=True)
+        used = np.hypot(*(shift - np.median(shift[votes == votes.max()], axis=0)).T) < _VOTE
+    turn, move, residual = 0.0, np.zeros(2), shift
+    for _ in range(5):
+        if np.count_nonzero(used) < _LEAST:
+            wanted = f"one with at least {_LEAST} sources of the catalog within {radius:g} arcsec"
+            raise argument_error("image", wanted, f"{np.count_nonzero(used)} of {len(x)} sources")
+        turn, move = _solved(one[used], other[used], rotation)
+        residual = other - _turned(one, turn) - move
+        spread = np.sqrt(np.mean(np.square(residual[used])))
+        new = np.hypot(*residual.T) < max(3 * spread, 1e-6)
+        if np.array_equal(new, used):
+            break
+        used = new
+    wcs = image.wcs.deepcopy()
+    cos, sin = np.cos(turn), np.sin(turn)
+    matrix = np.array([[cos, sin], [-sin, cos]])
+    if wcs.wcs.has_cd():
+        wcs.wcs.cd = matrix @ wcs.wcs.cd
+    else:
+        scale = np.diag(wcs.wcs.cdelt)
+        wcs.wcs.pc = np.linalg.inv(scale) @ matrix @ scale @ wcs.wcs.get_pc()
+    center = plane.pixel_to_world(*(move / 3600)).icrs
+    wcs.wcs.crval = [center.ra.deg, center.dec.deg]
+    wcs.wcs.set()
+    alignment = Alignment(
+        east=move[0] * ANGLE,
+        north=move[1] * ANGLE,
+        rotation=np.degrees(turn) * u.deg,
+        n_matched=int(np.count_nonzero(used)),
+        scatter=float(np.sqrt(np.mean(np.square(residual[used])))) * ANGLE,
+    )
+    out = with_data(image, image.data, n_aligned=alignment.n_matched)
+    out.wcs = wcs
+    return out, alignment
+
+
+def _turned(places, turn):
+    cos, sin = np.cos(turn), np.sin(turn)
+    return places @ np.array([[cos, sin], [-sin, cos]]).T
+
+
+def _solved(one, other, rotation):
+    """Turn from north to east, and shift, that bring places to others."""
+    turn = 0.0
+    if rotation and len(one) >= _LEAST_ROTATION:
+        a, b = one - one.mean(axis=0), other - other.mean(axis=0)
+        turn = np.arctan2(np.sum(a[:, 1] * b[:, 0] - a[:, 0] * b[:, 1]), np.sum(a * b))
+    return turn, (other - _turned(one, turn)).mean(axis=0)

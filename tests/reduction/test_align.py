@@ -1,0 +1,110 @@
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData, StdDevUncertainty
+
+from miricigale.instrument import imager_wcs
+from miricigale.reduction import Reducer, align_images, align_to_catalog
+
+CENTER = SkyCoord(53.1344, -27.8344, unit="deg")
+SHAPE = (400, 420)
+
+
+def cut(pointing, angle=30.0):
+    """A part of the distorted imager."""
+    wcs = imager_wcs(pointing, angle * u.deg)
+    wcs.wcs.crpix = wcs.wcs.crpix - [480, 320]
+    wcs.sip = type(wcs.sip)(wcs.sip.a, wcs.sip.b, wcs.sip.ap, wcs.sip.bp, wcs.wcs.crpix)
+    wcs.pixel_shape = SHAPE[::-1]
+    wcs.wcs.set()
+    return wcs
+
+
+def observed(true, told, sky, peaks, rng):
+    """Image of Gaussian stars by one WCS that tells another."""
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    data = rng.normal(size=SHAPE) + 20
+    for x0, y0, peak in zip(*true.world_to_pixel(sky), peaks, strict=True):
+        data += peak * np.exp(-0.5 * ((x - x0) ** 2 + (y - y0) ** 2) / 1.1**2)
+    error = StdDevUncertainty(np.ones(SHAPE))
+    meta = {"filter": "miri.f770w"}
+    return CCDData(
+        data, unit="MJy/sr", uncertainty=error, mask=np.zeros(SHAPE, bool), wcs=told, meta=meta
+    )
+
+
+def off(wcs, true):
+    """Largest distance of two WCS over the image, arcsec."""
+    x, y = np.meshgrid(np.linspace(0, SHAPE[1], 5), np.linspace(0, SHAPE[0], 5))
+    return wcs.pixel_to_world(x, y).separation(true.pixel_to_world(x, y)).arcsec.max()
+
+
+@pytest.fixture
+def stars():
+    rng = np.random.default_rng(1)
+    reference = cut(CENTER)
+    sky = reference.pixel_to_world(rng.uniform(-60, 480, 60), rng.uniform(-60, 460, 60))
+    return sky, 10 ** rng.uniform(1.3, 2.5, 60)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.05])
+def test_offsets_are_taken_off_to_ten_mas(stars, turn):
+    sky, peaks = stars
+    rng = np.random.default_rng(2)
+    true = cut(CENTER)
+    for east, north in ((0.3, 0.0), (-0.2, 0.25)):
+        there = CENTER.spherical_offsets_by(east * u.arcsec, north * u.arcsec)
+        image = observed(true, cut(there, 30.0 + turn), sky, peaks, rng)
+        # a catalog with other sources, and errors of 5 mas
+        extra = true.pixel_to_world(rng.uniform(0, 420, 100), rng.uniform(0, 400, 100))
+        catalog = SkyCoord(np.append(sky.ra, extra.ra), np.append(sky.dec, extra.dec))
+        errors = rng.normal(size=(2, 160)) * 5 * u.mas
+        aligned, alignment = align_to_catalog(image, catalog.spherical_offsets_by(*errors))
+        assert off(image.wcs, true) > 0.29
+        assert off(aligned.wcs, true) < 0.01
+        assert alignment.n_matched > 20
+        assert alignment.rotation.value == pytest.approx(-turn, abs=0.006)
+        assert 3 < alignment.scatter.to_value("mas") < 20
+        if not turn:
+            assert alignment.east.value == pytest.approx(-east, abs=0.01)
+            assert alignment.north.value == pytest.approx(-north, abs=0.01)
+        np.testing.assert_array_equal(aligned.data, image.data)
+
+
+def test_dithers_are_aligned_to_the_first(stars):
+    sky, peaks = stars
+    rng = np.random.default_rng(3)
+    images, truths = [], []
+    for k, (dx, dy) in enumerate(((0, 0), (6, 2), (-4, 7))):
+        pointing = CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
+        error = 0.3 * u.arcsec if k else 0 * u.arcsec
+        told = pointing.spherical_offsets_by((-1) ** k * error, error / 2)
+        truths.append(cut(pointing))
+        images.append(observed(truths[-1], cut(told), sky, peaks, rng))
+    aligned, alignments = align_images(images)
+    assert alignments[0].east == 0
+    for im, true in zip(aligned, truths, strict=True):
+        assert off(im.wcs, true) < 0.01
+    reducer = Reducer(background="sep")
+    result = reducer.combine(images, [], align="dithers")
+    # stars of images that lie 0.3 arcsec beside each other are outliers
+    count = [
+        sum(im.meta["n_outliers"] for im in r.images) for r in (result, reducer.combine(images, []))
+    ]
+    assert count[0] < 0.1 * count[1]
+    with pytest.raises(ValueError, match="'align' must be a SkyCoord, 'dithers' or None"):
+        reducer.combine(images, [], align="gaia")
+
+
+def test_what_cannot_be_aligned_is_named(stars):
+    sky, peaks = stars
+    image = observed(cut(CENTER), cut(CENTER), sky, peaks, np.random.default_rng(4))
+    far = sky.spherical_offsets_by(60 * u.arcsec, 0 * u.arcsec)[:10]
+    with pytest.raises(ValueError, match="'image' must be one with at least 3 sources"):
+        align_to_catalog(image, far, radius=0.05 * u.arcsec)
+    with pytest.raises(ValueError, match="'catalog' must be a SkyCoord of several"):
+        align_to_catalog(image, sky[0])
+    image.meta = {}
+    with pytest.raises(ValueError, match="'fwhm' must be given"):
+        align_to_catalog(image, sky)
