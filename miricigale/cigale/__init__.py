@@ -5,6 +5,7 @@ from miricigale.utils.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
+        "best_models": ("best_model_table", "write_best_models"),
         "catalog": ("cigale_columns", "read_cigale_catalog"),
         "results": ("read_cigale_results", "write_cigale_results"),
         "setup": ("CigaleSetup", "fit_cigale", "read_pcigale_ini"),

@@ -16,6 +16,7 @@ _SPEC = """\
 data_file = string(default="")
 parameters_file = string(default="")
 sed_modules = force_list
+analysis_method = option(pdf_analysis, savefluxes, default=pdf_analysis)
 bands = force_list(default=list())
 properties = force_list(default=list())
 additionalerror = float(min=0, default=0.1)

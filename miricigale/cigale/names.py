@@ -2,8 +2,15 @@
 
 import astropy.units as u
 
-__all__ = ["cigale_names", "unit_of"]
+__all__ = ["AGN_PARTS", "cigale_names", "unit_of"]
 
+#: Parts of an AGN's light, by their names in `~miricigale.sed.components.AGNTemplates`: our name of the
+#: luminosity, which models do not have by themselves, and CIGALE's.
+AGN_PARTS = {
+    "disk": ("disk_luminosity", "agn.disk_luminosity"),
+    "torus": ("torus_luminosity", "agn.torus_dust_luminosity"),
+    "polar": ("polar_luminosity", "agn.polar_dust_luminosity"),
+}
 # our name, CIGALE's, CIGALE's unit
 _PARAMETERS = (
     ("redshift", "universe.redshift", ""),
@@ -57,6 +64,9 @@ _PARAMETERS = (
     ("agn_power", "agn.total_dust_luminosity", "W"),
     ("agn_luminosity", "agn.luminosity", "W"),
     ("accretion_power", "agn.accretion_power", "W"),
+    ("l_6um", "agn.L_6um", "W"),
+    ("beta", "param.beta_calz94", ""),
+    *((ours, theirs, "W") for ours, theirs in AGN_PARTS.values()),
 )
 #: Our units where they are not CIGALE's.
 _OURS = {

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from miricigale.cigale.best_models import write_best_models
 from miricigale.cigale.catalog import GIVE_FILTER, read_cigale_catalog
 from miricigale.cigale.distances import at_their_distances
 from miricigale.cigale.ini import LIMIT_FLAGS, parse_ini
+from miricigale.cigale.models import save_models, with_agn_parts
 from miricigale.cigale.modules import read_modules
-from miricigale.cigale.names import cigale_names
+from miricigale.cigale.names import AGN_PARTS, cigale_names
 from miricigale.cigale.results import described, write_cigale_results
 from miricigale.filters.band_names import band_filters, given_filters
 from miricigale.filters.filter_set import FilterSet
@@ -62,6 +64,8 @@ class CigaleSetup:
         Whether an analysis of mock objects was asked for.
     cores : int
         Number of cores asked for.
+    method : str
+        ``pdf_analysis``, or ``savefluxes``, which `save_models` does.
     left_out, replaced, differs : tuple of str
         What there is no counterpart of, what something else stands in for, and conventions
         that differ.
@@ -85,6 +89,7 @@ class CigaleSetup:
     redshift_decimals: int = 2
     mock: bool = False
     cores: int = 1
+    method: str = "pdf_analysis"
     left_out: tuple = ()
     replaced: tuple = ()
     differs: tuple = ()
@@ -208,6 +213,9 @@ class CigaleSetup:
             raise argument_error("photometry", wanted, f"columns {photometry.colnames}")
         redshifts = photometry["redshift"] if "redshift" in photometry.colnames else None
         grid = self.model().grid(self.axes(redshifts), self.filters([*have, *self.predicted]))
+        wanted = set(self.variables) & {theirs for _, theirs in AGN_PARTS.values()}
+        if wanted or not self.variables:
+            grid = with_agn_parts(grid, self.model())
         options = {"model_error": self.additional_error} | options
         if compat is not None:
             options["compat"] = compat
@@ -265,6 +273,33 @@ class CigaleSetup:
             np.isfinite(z), np.ma.filled(np.ma.asarray(known, dtype=float), np.nan), np.nan
         )
         return at_their_distances(results, known, far, model.cosmology)
+
+    def save_models(self, path, redshifts=None, *, overwrite=False):
+        """
+        Write all models of the grid, as the analysis ``savefluxes`` does in ``models-block-0.fits``.
+
+        Parameters
+        ----------
+        path : path-like
+            The FITS file.
+        redshifts : array_like, optional
+            As for `axes`.
+        overwrite : bool, optional
+            Whether a file that is there is replaced.
+
+        Returns
+        -------
+        table : `~astropy.table.QTable`
+            What was written, a row for each model of one solar mass formed: ``id``, fluxes in mJy by
+            CIGALE's bands, parameters and quantities by its names and in its units. Models older than the
+            universe have NaN.
+
+        Raises
+        ------
+        `~miricigale.utils.exceptions.ConfigError`
+            If there are more models than 2 million.
+        """
+        return save_models(self, path, redshifts, overwrite=overwrite)
 
     def write_results(self, results, path, *, overwrite=False):
         """Write results as `write_cigale_results` does, with the names of this configuration."""
@@ -385,6 +420,7 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
         redshift_decimals=analysis["redshift_decimals"],
         mock=analysis["mock_flag"],
         cores=config["cores"],
+        method=config["analysis_method"],
         names=names,
         **{k: tuple(v) if isinstance(v, list) else v for k, v in vars(chain).items()},
     )
@@ -403,7 +439,9 @@ def _bands_without_filter(bands):
     return [*items[:-1], f"{items[-1]} (no filter here: {GIVE_FILTER})"] if items else []
 
 
-def fit_cigale(ini, *, output=None, libraries="best", names=None, strict=False, **options):
+def fit_cigale(
+    ini, *, output=None, best_models=None, libraries="best", names=None, strict=False, **options
+):
     """
     Do what a run of CIGALE does: read configuration and catalog, fit, write.
 
@@ -414,6 +452,8 @@ def fit_cigale(ini, *, output=None, libraries="best", names=None, strict=False, 
     output : path-like, optional
         File of results in CIGALE's columns (``results.fits`` or ``.txt``), replaced if it is
         there.
+    best_models : path-like, optional
+        Folder of files of the best models (`write_best_models`), replaced if they are there.
     libraries, names, strict : optional
         As for `read_pcigale_ini`; no use for a `CigaleSetup`.
     **options
@@ -423,6 +463,12 @@ def fit_cigale(ini, *, output=None, libraries="best", names=None, strict=False, 
     -------
     results : `~miricigale.fitting.FitResults`
 
+    Raises
+    ------
+    `~miricigale.utils.exceptions.ConfigError`
+        If the configuration is one of ``savefluxes``, which `CigaleSetup.save_models` does; as
+        `read_pcigale_ini`.
+
     Examples
     --------
     >>> from miricigale.cigale import fit_cigale
@@ -431,8 +477,13 @@ def fit_cigale(ini, *, output=None, libraries="best", names=None, strict=False, 
     setup = ini
     if not isinstance(ini, CigaleSetup):
         setup = read_pcigale_ini(ini, libraries=libraries, names=names, strict=strict)
+    if setup.method == "savefluxes":
+        msg = f"{setup.path} asks for the models (savefluxes): CigaleSetup.save_models writes them"
+        raise ConfigError(msg)
     photometry = setup.catalog(strict=strict)
     results = setup.fit(photometry, **options)
     if output is not None:
         setup.write_results(results, output, overwrite=True)
+    if best_models is not None:
+        write_best_models(results, best_models, overwrite=True)
     return results

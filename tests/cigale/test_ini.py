@@ -10,7 +10,7 @@ from miricigale.cigale import CigaleSetup, fit_cigale, read_cigale_results
 from miricigale.cigale import read_pcigale_ini as read
 from miricigale.cigale.ini import parse_ini, parse_values
 from miricigale.fitting import FitFlags
-from miricigale.sed.spectrum import COSMOLOGY
+from miricigale.sed.spectrum import COSMOLOGY, SED
 from miricigale.utils.exceptions import ConfigError, DataError, MiricigaleWarning
 
 INI = """\
@@ -622,6 +622,81 @@ def test_one_redshift_and_a_distance_of_its_own(run, tmp_path):
     # the shape is that of z = 0.5: bands are the same to what 1.3 % in wavelength makes
     drawn = setup.filters().synthetic_fluxes(results[1].best_sed())
     np.testing.assert_allclose(drawn.value, results[1].best_flux, rtol=0.06)
+
+
+def test_parts_of_the_agn_have_posteriors(run, tmp_path):
+    """Disk, torus and polar dust of one watt of dust emission: the disk is what the AGN has beyond it."""
+    path, _, _ = run
+    names = (
+        "agn.disk_luminosity, agn.torus_dust_luminosity, agn.polar_dust_luminosity, agn.luminosity"
+    )
+    path = write(tmp_path, ("agn.fracAGN, stellar.m_star", f"{names}, agn.total_dust_luminosity"))
+    setup = quiet(path)
+    assert not any("agn." in text for text in setup.left_out)
+    fit_cigale(setup, output=tmp_path / "r.fits", best_models=tmp_path / "best")
+    table = read_cigale_results(tmp_path / "r.fits")
+    for kind in ("bayes", "best"):
+        value = {n: table[f"{kind}.agn.{n}"].to_value(u.W) for n in (
+            "disk_luminosity", "torus_dust_luminosity", "polar_dust_luminosity", "luminosity",
+            "total_dust_luminosity")}  # fmt: skip
+        dust = value["torus_dust_luminosity"] + value["polar_dust_luminosity"]
+        np.testing.assert_allclose(dust, value["total_dust_luminosity"], rtol=1e-6)
+        np.testing.assert_allclose(dust + value["disk_luminosity"], value["luminosity"], rtol=1e-6)
+    assert np.all(np.isfinite(table["bayes.agn.disk_luminosity_err"].value))
+    # the files of the best models say the same, and their parts sum up
+    assert sorted(p.name for p in (tmp_path / "best").iterdir()) == [
+        f"g{i}_best_model.fits" for i in range(3)
+    ]
+    with fits.open(tmp_path / "best" / "g0_best_model.fits") as hdus:
+        header, rows = dict(hdus[1].header), hdus[1].data
+    assert header["agn.disk_luminosity"] == pytest.approx(value["disk_luminosity"][0], rel=1e-3)
+    assert header["universe.redshift"] == pytest.approx(0.52)
+    total = rows["L_lambda_total"]
+    np.testing.assert_allclose(sum(rows[name] for name in rows.names[3:]), total, rtol=1e-9)
+    # what the galaxy's dust sends out is what was taken from stars and gas
+    taken = sum(
+        np.trapezoid(rows[n], rows["wavelength"]) for n in rows.names if n.startswith("att")
+    )
+    assert np.trapezoid(rows["dust"], rows["wavelength"]) == pytest.approx(-taken, rel=1e-3)
+    f160w = setup.filters()["wfc3.f160w"]
+    sed = SED(rows["wavelength"] * u.nm, rows["Fnu"] * u.mJy)
+    drawn = f160w.synthetic_flux(sed).to_value(u.mJy)
+    assert drawn == pytest.approx(table["best.hst.wfc3.F160W"][0].value, rel=0.05)
+
+
+def test_all_models_are_saved(tmp_path):
+    path = write(
+        tmp_path, ("pdf_analysis", "savefluxes"), ("fracAGN = 0.0, 0.5, 0.9", "fracAGN = 0.0, 0.5")
+    )
+    setup = quiet(path)
+    with pytest.raises(ConfigError, match=r"savefluxes\): CigaleSetup.save_models"):
+        fit_cigale(setup)
+    table = setup.save_models(tmp_path / "models-block-0.fits", [0.5])
+    # 2 tau x 2 ages x 2 E(B-V) x 2 tau97 x 2 inclinations x 2 fractions
+    assert len(table) == 64
+    again = QTable.read(tmp_path / "models-block-0.fits")
+    values = {
+        "tau": 5.0,
+        "age": 1.0,
+        "ebv_lines": 1.0,
+        "tau97": 3.0,
+        "inclination": 70.0,
+        "frac_agn": 0.5,
+    }
+    row = np.flatnonzero(
+        (again["sfh.tau_main"].value == 5000) & (again["sfh.age_main"].value == 1000)
+        & (again["attenuation.E_BV_lines"].value == 1.0) & (again["agn.t"].value == 3)
+        & (again["agn.i"].value == 70) & (again["agn.fracAGN"].value == 0.5)
+    )  # fmt: skip
+    assert row.size == 1
+    sed = setup.model().evaluate(**values, redshift=0.5, mass=1.0)
+    np.testing.assert_allclose(
+        again["IRAC1"][row[0]].to_value(u.uJy),
+        setup.filters()["irac.ch1"].synthetic_flux(sed).value,
+        rtol=1e-5,
+    )
+    with pytest.raises(OSError, match="overwrite"):
+        setup.save_models(tmp_path / "models-block-0.fits", [0.5])
 
 
 def test_text_and_fits_say_the_same(run, tmp_path):

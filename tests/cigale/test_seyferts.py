@@ -4,10 +4,14 @@ import warnings
 
 import numpy as np
 import pytest
+from astropy.io import fits
 
-from miricigale.cigale import read_cigale_results, read_pcigale_ini
+from miricigale.cigale import best_model_table, read_cigale_results, read_pcigale_ini
+from miricigale.cigale.names import cigale_names
 from miricigale.refdata import conf
 from miricigale.refdata.libraries import add_library
+from miricigale.sed import SEDModel
+from miricigale.sed import components as parts
 from miricigale.utils.exceptions import MiricigaleWarning
 
 RUN = "cigale_seyferts/group1_0a90"
@@ -65,3 +69,106 @@ def test_masses_are_at_the_distances_of_the_objects(tables):
         numbers(ours, "best.universe.redshift")[np.isfinite(dex)],
         numbers(theirs, "best.universe.redshift")[np.isfinite(dex)],
     )
+
+
+# ------------------------------------------------------- best models, part by part
+
+NAMES = ("ESO_428-14", "Mrk_493", "Mrk_509", "NGC_3516", "NGC_4748")
+
+
+@pytest.fixture(scope="module")
+def model(data_file, tmp_path_factory):
+    """The run's chain with its libraries of dust and torus (q 0), and the bundled stars and gas."""
+    folder = tmp_path_factory.mktemp("libraries")
+    with conf.set_temp("data_folder", str(folder)):
+        add_library("dust.dale2014", data_file("dale2014"))
+        add_library("torus.skirtor2016", data_file("skirtor2016/SKIRTOR.fits.gz"))
+        torus = parts.Skirtor2016(
+            q=0.0, polar_law="smc_wd01", disk="schartmann2005", disk_slope=-0.36
+        )
+        law = parts.ModifiedStarburst(gas_law="mw", ebv_scaling="cigale")
+        chain = [parts.DelayedSFH(), parts.BC03(), parts.Nebular(), law, parts.Dale2014(), torus]
+        yield SEDModel([*chain, parts.Meiksin2006()])
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def pair(request, model, data_file):
+    """Our table of a best model, CIGALE's columns, and its header as numbers."""
+    path = data_file(f"cigale_seyferts/best_models/{request.param}_best_model.fits.gz")
+    with fits.open(path) as hdus:
+        columns = {name: np.array(hdus[1].data[name]) for name in hdus[1].data.names}
+        header = {k: float(v) for k, v in hdus[1].header.items() if "." in k}
+    values = {
+        ours: header[theirs] / factor
+        for ours, (theirs, _, factor) in cigale_names({"sfh": "sfhdelayed"}).items()
+        if ours in model.parameters and theirs in header
+    }
+    # the libraries that are freely distributed have one torus
+    values |= {"q": 0.0, "opening_angle": 40.0, "mass": header["sfh.integrated"]}
+    return best_model_table(model, values), columns, header
+
+
+def ratio(ours, theirs, name, low, high):
+    """Ours over CIGALE's between two wavelengths in um, each for one watt of the part."""
+    a, b = np.array(ours[name]), theirs[name]
+    wave, at = np.array(ours["wavelength"]), theirs["wavelength"]
+    inside = (at > low * 1e3) & (at < high * 1e3)
+    power = np.trapezoid(a, wave) / np.trapezoid(b, at)
+    return np.interp(at, wave, a)[inside] / b[inside] / power
+
+
+def test_dust_polar_dust_and_disk_of_best_models(pair):
+    ours, theirs, header = pair
+    # below, where starlight was taken from the templates, up to 1.5 %
+    np.testing.assert_allclose(ratio(ours, theirs, "dust", 3.1, 100), 1.0, atol=0.01)
+    np.testing.assert_allclose(ratio(ours, theirs, "dust", 100, 900), 1.0, atol=0.01)
+    name = "agn.SKIRTOR2016_polar_dust"
+    # dust of 100 K is dark at shorter wavelengths
+    np.testing.assert_allclose(ratio(ours, theirs, name, 25, 100), 1.0, atol=0.01)
+    np.testing.assert_allclose(ratio(ours, theirs, name, 100, 900), 1.0, atol=0.02)
+    if header["agn.i"] < 90 - header["agn.oa"] and header["agn.oa"] == 40:
+        disk = ratio(ours, theirs, "agn.SKIRTOR2016_disk", 0.13, 5)
+        np.testing.assert_allclose(disk, 1.0, atol=0.01)
+
+
+def test_attenuation_of_best_models(pair):
+    """What passes the dust, of light that is there on both sides."""
+    ours, theirs, _ = pair
+    wave, at = np.array(ours["wavelength"]), theirs["wavelength"]
+    inside = (at > 130) & (at < 2000)
+    for age in ("old", "young"):
+        through = []
+        for table in (ours, theirs):
+            light = np.array(table[f"stellar.{age}"]) + np.array(table[f"nebular.absorption_{age}"])
+            taken = np.array(table[f"attenuation.stellar.{age}"])
+            through.append(1 + np.divide(taken, light, out=np.zeros(light.size), where=light > 0))
+        there = np.interp(at, wave, through[0])[inside]
+        np.testing.assert_allclose(there, through[1][inside], rtol=0.01)
+
+
+def test_columns_and_quantities_of_best_models(pair):
+    """Layout, distance and units; powers of the AGN hang together as CIGALE's do."""
+    ours, theirs, header = pair
+    assert ours.colnames == list(theirs)
+    one, two = (
+        np.array(t["Fnu"])[some]
+        / np.array(t["L_lambda_total"])[some]
+        / np.array(t["wavelength"])[some] ** 2
+        for t in (ours, theirs)
+        for some in [np.array(t["L_lambda_total"]) > 0]
+    )
+    one, two = np.median(one), np.median(two)
+    assert one == pytest.approx(two, rel=1e-4)
+    for name in ("sfh.sfr", "sfh.sfr10Myrs", "sfh.sfr100Myrs", "sfh.integrated"):
+        assert ours.meta[name] == pytest.approx(header[name], rel=1e-4), name
+    assert ours.meta["universe.luminosity_distance"] == pytest.approx(
+        header["universe.luminosity_distance"], rel=1e-4
+    )
+    # seen at 30 deg for one watt of accretion, polar dust for one watt
+    for name, wide in (("agn.intrin_Lnu_2500A_30deg", 5e-3), ("agn.polar_dust_luminosity", 3e-3)):
+        there = [m[name] / m["agn.accretion_power"] for m in (ours.meta, header)]
+        if header["agn.oa"] == 40:
+            assert there[0] == pytest.approx(there[1], rel=wide), name
+    # stars of other libraries: mass and light to a few percent
+    assert ours.meta["stellar.m_star"] == pytest.approx(header["stellar.m_star"], rel=0.06)
+    assert ours.meta["stellar.lum"] == pytest.approx(header["stellar.lum"], rel=0.1)

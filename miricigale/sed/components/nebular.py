@@ -260,6 +260,17 @@ class Nebular(Component):
         """
         return self._drawn[1] @ self._emission(age, weights, ionizing, values)
 
+    def parts(self, age, weights, ionizing, values):
+        """
+        Continuum and lines of `spectra`, which are their sum: two arrays of its shape.
+
+        Parameters are those of `spectra`.
+        """
+        emission, n = self._emission(age, weights, ionizing, values), self.table.wave.size
+        continuum, lines = np.zeros((2, emission.size))
+        continuum[:n], lines[n:] = emission[:n], emission[n:]
+        return self._drawn[1] @ continuum, self._drawn[1] @ lines
+
     def lines(self, age, weights, ionizing, values):
         """
         Luminosities of the lines before any dust: dict of W by `line_names`.

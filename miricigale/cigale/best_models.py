@@ -1,0 +1,209 @@
+"""Best models in the layout of CIGALE's ``<id>_best_model.fits``: spectra part by part, and quantities."""
+
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.io import fits
+from astropy.table import Table
+
+from miricigale.cigale.names import AGN_PARTS, cigale_names
+from miricigale.filters import Filter
+from miricigale.filters.band_names import filter_of_band
+from miricigale.sed.spectrum import distance
+from miricigale.utils.store import replacing
+
+__all__ = ["best_model_table", "write_best_models"]
+
+_LYMAN = 0.0912  # um
+_LIGHT = 299792458.0  # m/s
+_BLUE = 0.25  # um
+_AGN_COLUMNS = {"torus": "torus", "polar": "polar_dust", "disk": "disk"}
+
+
+def best_model_table(model, parameters, *, modules=None, bands=("B_B90", "V_B90", "FUV")):
+    """
+    One model in the layout of CIGALE's best models.
+
+    Parameters
+    ----------
+    model : `~miricigale.sed.SEDModel`
+        The model.
+    parameters : dict
+        Values of its parameters, as for `~miricigale.sed.SEDModel.evaluate`.
+    modules : dict of str to str, optional
+        Role of a component to CIGALE's module, on which some names depend.
+    bands : iterable of str, optional
+        Bands, by CIGALE's names, of whose attenuation there is a quantity.
+
+    Returns
+    -------
+    table : `~astropy.table.Table`
+        ``wavelength`` (nm, observed), ``Fnu`` (mJy), ``L_lambda_total`` and its parts (W/nm of observed
+        wavelength; what is absorbed is negative), which sum to it: ``stellar.old`` and ``young``,
+        ``nebular.absorption_*``, ``lines_*`` and ``continuum_*``, ``attenuation.*`` of each, ``dust``,
+        ``agn.SKIRTOR2016_torus``, ``polar_dust`` and ``disk``, ``igm``. The meta hold quantities by CIGALE's
+        names, in its units.
+
+    Raises
+    ------
+    KeyError, ValueError
+        As `~miricigale.sed.SEDModel.values`.
+    """
+    values = model.values(parameters)
+    spectra = model.decompose(**parameters)
+    chain, mass = model.chain, values["mass"]
+    derived = {name: quantity.value for name, quantity in spectra.derived.items()}
+    stars, quantities = _stars(model, values)
+    parts = {}
+    for age in ("old", "young"):
+        parts[f"stellar.{age}"] = stars[age]
+    gas = model.component("nebular") is not None
+    escaping = np.where(chain.wave < _LYMAN, values.get("f_esc", 1.0), 1.0)
+    for kind in ("absorption", "lines", "continuum") if gas else ():
+        for age in ("old", "young"):
+            light = stars[age] * (escaping - 1.0) if kind == "absorption" else stars[kind, age]
+            parts[f"nebular.{kind}_{age}"] = light
+    young, old, of_gas = chain.factors(chain.key(values, "attenuation"))
+    factor = {"young": young, "old": old}
+    for age in ("old", "young"):
+        parts[f"attenuation.stellar.{age}"] = stars[age] * escaping * (factor[age] - 1.0)
+    for kind in ("lines", "continuum") if gas else ():
+        for age in ("old", "young"):
+            through = factor[age] if of_gas is None else of_gas
+            parts[f"attenuation.nebular.{kind}_{age}"] = stars[kind, age] * (through - 1.0)
+    parts = {name: mass * light for name, light in parts.items()}
+    parts["dust"] = derived["dust_luminosity"] * chain.dust(chain.key(values, "dust"))
+    if model.has_agn:
+        nucleus, power = chain.agn(values), derived["agn_power"]
+        for name, told in _AGN_COLUMNS.items():
+            light = power * getattr(nucleus, name)
+            parts[f"agn.SKIRTOR2016_{told}"] = light
+            quantities[AGN_PARTS[name][1]] = float(chain.weights @ light)
+        slope = derived["accretion_power"] * _intrinsic(chain, model.component("agn"), values)
+        quantities["agn.intrin_Lnu_2500A_30deg"] = slope
+    total = sum(parts.values())
+    parts["igm"] = total * (chain.sky(values) - 1.0)
+    z = values["redshift"]
+    far = float(distance(z, model.cosmology))
+    table = Table()
+    table["wavelength"] = chain.wave * (1.0 + z) * 1e3 * u.nm
+    luminosity = sum(parts.values()) / (1.0 + z) * 1e-3  # W/nm of observed wavelength
+    fnu = luminosity * 1e9 * (table["wavelength"] * 1e-9) ** 2 / (_LIGHT * 4.0 * np.pi * far**2)
+    table["Fnu"] = np.asarray(fnu) * 1e29 * u.mJy
+    table["L_lambda_total"] = luminosity * u.W / u.nm
+    for name, light in parts.items():
+        table[name] = light / (1.0 + z) * 1e-3 * u.W / u.nm
+    for ours, (theirs, _, scale) in cigale_names(modules).items():
+        if ours in derived or ours in values:
+            quantities[theirs] = scale * (derived[ours] if ours in derived else values[ours])
+    quantities |= _attenuation(chain, parts, bands)
+    quantities["universe.age"] = model.cosmology.age(z).to_value(u.Myr)
+    quantities["universe.luminosity_distance"] = far
+    table.meta.update({name: float(value) for name, value in sorted(quantities.items())})
+    return table
+
+
+def _stars(model, values):
+    """Light of stars and gas for one solar mass formed, old and young, W/um; quantities of the stars."""
+    chain, mass = model.chain, values["mass"]
+    stellar, nebular = model.component("stellar"), model.component("nebular")
+    history = model.component("sfh").history(values)
+    age, spectra, surviving = stellar.table(values["metallicity"])
+    rate = stellar.ionizing(values["metallicity"])
+    nodes, out, found = np.asarray(stellar.nodes()), {}, {}
+    hard = chain.wave < _LYMAN
+    for name, weights in zip(("young", "old"), stellar.age_weights(history, values), strict=True):
+        light = np.interp(chain.wave, nodes, weights @ spectra, left=0.0, right=0.0)
+        out[name] = light
+        found[f"stellar.m_star_{name}"] = mass * float(weights @ surviving)
+        found[f"stellar.n_ly_{name}"] = mass * float(weights @ rate)
+        found[f"stellar.lum_{name}"] = mass * float(chain.weights @ light)
+        found[f"stellar.lum_ly_{name}"] = mass * float((chain.weights * hard) @ light)
+        if nebular is not None:
+            pair = nebular.parts(age, weights, rate, values)
+            for kind, part in zip(("continuum", "lines"), pair, strict=True):
+                grid = np.asarray(nebular.nodes())
+                out[kind, name] = np.interp(chain.wave, grid, part, left=0.0, right=0.0)
+    for name in ("n_ly", "lum", "lum_ly"):
+        found[f"stellar.{name}"] = found[f"stellar.{name}_young"] + found[f"stellar.{name}_old"]
+    return out, found
+
+
+def _intrinsic(chain, agn, values):
+    """L_nu at 0.25 um seen at 30 deg, without dust, in W/Hz for each watt of accretion power."""
+    face_on = agn.torus_spectra(chain.wave, values | {"inclination": 0.0}).face_on
+    mu = np.cos(np.radians(30.0))
+    # the disk shines as cos i (1 + 2 cos i) / 3; accretion power is 7/18 of the face-on integral
+    light = np.interp(_BLUE, chain.wave, face_on) / (7.0 / 18.0 * (chain.weights @ face_on))
+    return light * mu * (1.0 + 2.0 * mu) / 3.0 * _BLUE**2 * 1e-6 / _LIGHT
+
+
+def _attenuation(chain, parts, bands):
+    """Attenuation of a galaxy's light in rest-frame bands, in mag."""
+    before = sum(
+        light for name, light in parts.items() if name.startswith(("stellar.", "nebular."))
+    )
+    after = before + sum(light for name, light in parts.items() if name.startswith("attenuation."))
+    out = {}
+    for band in bands:
+        name = filter_of_band(band)
+        if name is None:
+            continue
+        weights = Filter.from_name(name).weights(chain.wave) * chain.to_lnu
+        out[f"attenuation.{band}"] = -2.5 * np.log10((weights @ after) / (weights @ before))
+    return out
+
+
+def write_best_models(results, folder, *, modules=None, overwrite=False):
+    """
+    Write the best model of every object as CIGALE does.
+
+    Parameters
+    ----------
+    results : `~miricigale.fitting.FitResults`
+        Results that know their model.
+    folder : path-like
+        Gets ``<id>_best_model.fits`` for each object that was fitted; made if it is not there.
+    modules : dict of str to str, optional
+        As for `best_model_table`; by default those of ``results.meta["cigale"]``.
+    overwrite : bool, optional
+        Whether files that are there are replaced.
+
+    Returns
+    -------
+    paths : list of `~pathlib.Path`
+
+    Raises
+    ------
+    OSError
+        If a file is there and ``overwrite`` is not given.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    modules = results.meta.get("cigale", {}).get("modules", {}) if modules is None else modules
+    paths = []
+    for one in results[results.fitted]:
+        known = dict(one.constants)
+        known |= {
+            name: one.best[name] for name in (*one.axes, "redshift", "mass") if name in one.best
+        }
+        names = one.model.parameters
+        known = {
+            name: float(getattr(value, "value", value))
+            for name, value in known.items()
+            if name in names
+        }
+        # what makes no difference to the best model has no value
+        known = {name: value for name, value in known.items() if np.isfinite(value)}
+        table = best_model_table(one.model, known, modules=modules)
+        table.meta["best.chi_square"] = float(one.chi2)
+        path = folder / f"{np.asarray(one.ids).item()}_best_model.fits"
+        meta, table.meta = table.meta, {}
+        hdu = fits.table_to_hdu(table)
+        for name, value in meta.items():
+            hdu.header[f"HIERARCH {name}"] = value
+        with replacing(path, overwrite=overwrite) as partial:
+            hdu.writeto(partial)
+        paths.append(path)
+    return paths
