@@ -18,6 +18,7 @@ import numpy as np
 
 from miricigale.instrument import DQ
 from miricigale.reduction import _core
+from miricigale.reduction.showers import find_showers
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks, parallel_map, threads
 
@@ -115,6 +116,7 @@ def fit_groups(
     last_group=None,
     jump_threshold=5.0,
     neighbor_threshold=10.0,
+    shower_threshold=None,
     poisson_factor=1.0,
     n_threads=None,
     progress_bar=False,
@@ -164,6 +166,9 @@ def fit_groups(
     neighbor_threshold : float or None, optional
         Where a jump is more significant than this, the four neighbors are cut at the same
         difference too.
+    shower_threshold : float or None, optional
+        Around tracks of jumps of 300 sigma together, differences are cut where the excess over the groups beside,
+        smoothed over 4 pixels, is above so many sigma: showers. None for none.
     poisson_factor : float, optional
         Variance of the photon noise of a pixel over that of independent electrons: below 1
         where neighbors share charge (interpixel capacitance), by the sum of the squared
@@ -207,6 +212,7 @@ def fit_groups(
             raise argument_error(name, "positive", value)
     jump = threshold(jump_threshold, "jump_threshold")
     neighbor = threshold(neighbor_threshold, "neighbor_threshold")
+    shower = threshold(shower_threshold, "shower_threshold")
     usable = np.ones((ny, nx), bool) if usable is None else np.ascontiguousarray(usable, bool)
     if usable.shape != (ny, nx):
         raise argument_error("usable", f"of shape {(ny, nx)}", usable.shape)
@@ -261,7 +267,12 @@ def fit_groups(
         )
         events = np.concatenate(events)
         n_diff = last_group - first_group - 1
-        parts = list(_neighbors(events, neighbor, usable, n_diff))
+        showers = None
+        if np.isfinite(shower):
+            showers = find_showers(
+                data, events, usable, shower, first_group=first_group, last_group=last_group
+            )
+        parts = list(_neighbors(events, neighbor, usable, n_diff, showers))
         if flagged is not None:
             parts += list(_uncut(flagged & usable, parts))
         parallel_map(refit_block, parts, executor=executor)
@@ -362,19 +373,22 @@ def threshold(value, name):
     return float(value)
 
 
-def _neighbors(events, threshold, usable, n_diff):
+def _neighbors(events, threshold, usable, n_diff, showers=None):
     """
-    Yield the pixels beside large jumps and where they are to be cut.
+    Yield the pixels beside large jumps, and those of showers, and where they are to be cut.
 
     Each part is the argument of one call of the kernel: rows, columns, start of each
     pixel's cuts, and the cuts. Pixels keep the cuts that they found themselves.
     """
     ny, nx = usable.shape
     large = events[np.abs(events[:, 4]) >= threshold].astype(np.int64)
-    if len(large) == 0:
+    if showers is None:
+        showers = np.zeros((4, 0), np.int64)
+    if len(large) == 0 and showers[0].size == 0:
         return
     cut = large[:, 2] * n_diff + large[:, 3]
-    pixels, cuts = [], []
+    pixels = [showers[0] * nx + showers[1]]
+    cuts = [showers[2] * n_diff + showers[3]]
     for dy, dx in ((-1, 0), (1, 0), (0, -1), (0, 1)):
         y, x = large[:, 0] + dy, large[:, 1] + dx
         inside = (y >= 0) & (y < ny) & (x >= 0) & (x < nx)

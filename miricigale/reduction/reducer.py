@@ -64,6 +64,9 @@ class Reducer:
         Sigma above which a jump is cut out of a ramp; None for no jump detection.
     neighbor_threshold : float or None, optional
         Sigma above which a jump is cut in the four neighbors too.
+    shower_threshold : float or None, optional
+        Sigma above which the smoothed light around very large jumps is cut, the showers of cosmic
+        rays (`fit_groups`); None for none.
     skip_first, skip_last : int or None, optional
         Groups left out at the start and end of each integration. None: one each (if more than
         three or two groups are there, as in the official pipeline) in ramps of the observatory, but
@@ -140,6 +143,7 @@ class Reducer:
     backend: str = "native"
     jump_threshold: float | None = 5.0
     neighbor_threshold: float | None = 10.0
+    shower_threshold: float | None = None
     skip_first: int | None = None
     skip_last: int | None = None
     reset_anomaly: ResetAnomaly | None = None
@@ -169,7 +173,8 @@ class Reducer:
             known = " or ".join(repr(name) for name in BACKENDS)
             raise argument_error("backend", known, repr(self.backend))
         for name in (
-            "jump_threshold", "neighbor_threshold", "negative_threshold", "outlier_threshold"
+            "jump_threshold", "neighbor_threshold", "shower_threshold", "negative_threshold",
+            "outlier_threshold",
         ):  # fmt: skip
             value = getattr(self, name)
             if value is not None and not value > 0:

@@ -87,6 +87,7 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False):
             options |= {"jump_threshold": None, "neighbor_threshold": None}
         options |= {
             "slow_noise": maps.slow_noise,
+            "shower_threshold": reducer.shower_threshold,
             "bias": maps.bias,
             "drift": _drift(reducer, ramp, reference, drift),
             "reset": maps.reset,

@@ -239,14 +239,16 @@ def _deposits(
     shower_fraction,
     shower_charge,
     shower_sigma,
+    shower_above,
 ):
     """
     Draw cosmic-ray hits, of which ``hits_per_row`` are expected in all ``n_slot`` groups.
 
     ``thickness`` of the layer and ``track_max`` are in pixels; ``yield_median`` is in electrons per
     pixel of path and ``yield_sigma`` the scatter of its natural logarithm. ``leakage`` is the share
-    of a deposit that goes to each of the four neighbors. A ``shower_fraction`` of the hits make a
-    shower of ``shower_charge`` electrons and a Gaussian width of ``shower_sigma`` pixels.
+    of a deposit that goes to each of the four neighbors. A ``shower_fraction`` of the hits that leave
+    ``shower_above`` electrons or more make a shower of ``shower_charge`` electrons and a Gaussian
+    width of ``shower_sigma`` pixels.
 
     Returns the deposits (next of the same group, row, column, electrons), their number, and the
     first of each group; -1 ends a list.
@@ -277,6 +279,7 @@ def _deposits(
             dx = length * math.cos(azimuth)
             dy = length * math.sin(azimuth)
             charge = yield_median * strength * math.sqrt(thickness**2 + length**2)
+            shower &= charge >= shower_above
             # walk through the pixels that the track crosses (Amanatides & Woo 1987)
             px, py = math.floor(x), math.floor(y)
             step_x = 1 if dx > 0.0 else -1
@@ -317,7 +320,7 @@ def _deposits(
 
 @njit(cache=True, nogil=True)
 def add_cosmic_rays(ramp, key, first_row, n_detector_rows, settings):
-    """Add the charge of cosmic-ray hits; ``settings`` are the last eight parameters of `_deposits`."""
+    """Add the charge of cosmic-ray hits; ``settings`` are the last ten parameters of `_deposits`."""
     n_int, n_group, n_row, n_col = ramp.shape
     deposits, _, head = _deposits(
         key, first_row, n_detector_rows, n_row, n_col, n_int * n_group, *settings

@@ -106,6 +106,9 @@ class CosmicRays(Effect):
         Share of the charge that goes to each of the four neighbors.
     shower_fraction : float, optional
         Share of hits that come with a shower, a faint Gaussian cloud; 0 for none.
+    shower_above : float, optional
+        Electrons that a hit leaves at least, if it is to come with a shower: those of MIRI follow
+        large hits.
     shower_charge : float, optional
         Median charge of a shower in electrons.
     shower_sigma : float, optional
@@ -121,6 +124,7 @@ class CosmicRays(Effect):
     shower_fraction: float = 0.0
     shower_charge: float = 3e5
     shower_sigma: float = 15.0
+    shower_above: float = 0.0
 
     def __post_init__(self):
         check_amounts(
@@ -128,6 +132,7 @@ class CosmicRays(Effect):
             yield_median=self.yield_median,
             yield_dex=self.yield_dex,
             shower_charge=self.shower_charge,
+            shower_above=self.shower_above,
         )
         check_amounts(above_zero=True, thickness=self.thickness, shower_sigma=self.shower_sigma)
         if not 0 <= self.leakage <= 0.2:
@@ -181,6 +186,7 @@ class CosmicRays(Effect):
             float(self.shower_fraction),
             float(self.shower_charge),
             float(self.shower_sigma),
+            float(self.shower_above),
         )
         return block.key, block.rows.start, block.exposure.shape[0], settings
 

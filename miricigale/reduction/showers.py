@@ -1,0 +1,97 @@
+"""Showers: faint, wide clouds of charge that come with large hits of cosmic rays."""
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, label, maximum_position, sum_labels
+
+__all__ = ["find_showers"]
+
+#: Tracks whose jumps add up to so many sigma are looked around.
+_LARGE = 300.0
+
+#: Pixels around a hit that are looked at, and the Gaussian width by which they are smoothed.
+_REACH, _WIDTH = 48, 4.0
+
+#: Groups before and after that tell what a pixel collects in one.
+_BESIDE = 3
+
+
+def find_showers(data, jumps, usable, threshold, *, first_group, last_group):
+    """
+    Find the differences of groups that showers spoil, around large jumps.
+
+    What a pixel gains in the group of the jump is held against the median of what it gains in
+    the groups beside, smoothed over 4 pixels, with the jumps of the group left out. The noise is that
+    of the same pixels, from the scatter of their neighborhood.
+
+    Parameters
+    ----------
+    data : `~numpy.ndarray`, shape (n_int, n_group, ny, nx)
+        Groups in DN.
+    jumps : `~numpy.ndarray`, shape (n_jumps, 5)
+        Row, column, integration, difference (from ``first_group``) and significance, sigma.
+    usable : `~numpy.ndarray` of bool, shape (ny, nx)
+        Pixels that are fitted.
+    threshold : float
+        Sigma of the smoothed excess from which a difference is cut.
+    first_group, last_group : int
+        Range of groups that take part.
+
+    Returns
+    -------
+    y, x, integration, difference : `~numpy.ndarray` of int
+        What is to be cut.
+    """
+    n_diff = last_group - first_group - 1
+    where = jumps[:, :4].astype(np.int64)
+    found = []
+    for k, i in np.unique(where[:, 2:], axis=0):
+        beside = [j for j in range(i - _BESIDE, i + _BESIDE + 1) if 0 <= j < n_diff and j != i]
+        if len(beside) < 2:
+            continue
+        same = (where[:, 2] == k) & (where[:, 3] == i)
+        hit = np.zeros(usable.shape, np.float32)
+        hit[where[same, 0], where[same, 1]] = np.abs(jumps[same, 4])
+        for y, x in _tracks(hit):
+            part = tuple(slice(max(c - _REACH, 0), c + _REACH + 1) for c in (y, x))
+            differences = [
+                data[k, first_group + j + 1][part].astype(np.float32)
+                - data[k, first_group + j][part]
+                for j in (i, *beside)
+            ]
+            excess = differences[0] - np.median(differences[1:], axis=0)
+            cut = _significant(excess, usable[part] & (hit[part] == 0), threshold)
+            ys, xs = np.nonzero(cut & usable[part])
+            place = np.full((len(ys), 4), (part[0].start, part[1].start, k, i))
+            place[:, :2] += np.stack([ys, xs], axis=1)
+            found.append(place)
+    if not found:
+        return tuple(np.zeros((4, 0), np.int64))
+    return tuple(np.unique(np.concatenate(found), axis=0).T)
+
+
+def _tracks(hit):
+    """Brightest pixel of each track of jumps whose significances add up to a large one."""
+    labels, number = label(hit > 0, structure=np.ones((3, 3)))
+    every = np.arange(1, number + 1)
+    large = every[sum_labels(hit, labels, every) >= _LARGE]
+    return maximum_position(hit, labels, large) if large.size else []
+
+
+def _significant(excess, good, threshold):
+    """Where the smoothed excess is above so many sigma."""
+    if np.count_nonzero(good) < 100:
+        return np.zeros(good.shape, bool)
+    middle = np.median(excess[good])
+    spread = 1.4826 * np.median(np.abs(excess[good] - middle))
+    if spread == 0:
+        return np.zeros(good.shape, bool)
+    # no single pixel, such as one of a star, must make a cloud
+    excess = np.clip(excess, middle - 5 * spread, middle + 5 * spread)
+    weight = gaussian_filter(good.astype(np.float32), _WIDTH, mode="constant")
+    smooth = gaussian_filter(np.where(good, excess, 0), _WIDTH, mode="constant")
+    mean = smooth / np.maximum(weight, 1e-3)
+    # the lower half of the smoothed map is that of noise: level and scatter without the shower
+    level = np.percentile(mean[good], 25)
+    # white noise of this spread, smoothed; the level is a quartile of it
+    sigma = spread / (2 * np.sqrt(np.pi) * _WIDTH)
+    return (mean - level - 0.6745 * sigma > threshold * sigma) & (weight > 0.3)

@@ -1,0 +1,80 @@
+"""Showers after large hits: what they leave in the slopes, and what cutting them costs."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData
+from scipy.ndimage import gaussian_filter
+
+from miricigale.detector import CosmicRays, Detector
+from miricigale.instrument import DQ, Exposure, flat_field, miri_detector, photmjsr
+from miricigale.reduction import Reducer
+
+BAND, SKY, WIDTH = "miri.f770w", 5.1, 4.0
+
+
+def expose(*, fraction, seed=2):
+    exposure = Exposure(
+        BAND,
+        n_groups=30,
+        subarray="BRIGHTSKY",
+        pointing=SkyCoord(53.1344, -27.8344, unit="deg"),
+        roll=30 * u.deg,
+    )
+    # charge is not shared: neighbors are independent
+    light = np.full(exposure.shape, SKY)
+    light[100:400:50, 100:400:50] = 4000.0
+    sky = CCDData(light, unit="MJy/sr", meta={"psf_includes": ["ipc"]})
+    rays = CosmicRays(shower_fraction=fraction, shower_above=5e4, shower_charge=1e5)
+    ramp = Detector.miri_imager(rays).expose(sky, exposure, seed=seed, n_threads=1)
+    detector = miri_detector()
+    truth = light * flat_field(BAND, subarray="BRIGHTSKY") / photmjsr(BAND)
+    return ramp, truth + detector.dark_current / detector.gain
+
+
+def smoothed_pull(fit, truth):
+    """Pulls, and their mean over some pixels in its own standard deviation."""
+    pull = (fit.rate - truth) / fit.error
+    good = np.isfinite(pull)
+    weight = np.maximum(gaussian_filter(good.astype(float), WIDTH), 0.1)
+    mean = gaussian_filter(np.where(good, pull, 0), WIDTH) / weight
+    return pull[good], (mean * 2 * np.sqrt(np.pi) * WIDTH)[good]
+
+
+def test_showers_of_large_hits_are_cut():
+    ramp, truth = expose(fraction=1.0)
+    left = smoothed_pull(Reducer().fit_groups(ramp), truth)
+    cut = smoothed_pull(Reducer(shower_threshold=5).fit_groups(ramp), truth)
+    # a tenth of the pixels lie in clouds that single pixels do not show
+    assert np.mean(left[1] > 5) > 0.1
+    assert np.mean(cut[1] > 5) < 0.005
+    assert np.std(left[0]) > 1.08
+    assert np.std(cut[0]) == pytest.approx(1, abs=0.01)
+    assert abs(np.mean(cut[0])) < 0.02
+
+
+def test_without_showers_nothing_else_is_cut():
+    ramp, truth = expose(fraction=0.0)
+    plain = Reducer().fit_groups(ramp)
+    fit = Reducer(shower_threshold=5).fit_groups(ramp)
+    changed = fit.flags != plain.flags
+    assert np.mean(changed) < 1e-3
+    assert not np.any((fit.flags ^ plain.flags) & int(DQ.DO_NOT_USE))
+    same = ~changed & np.isfinite(plain.rate) & (fit.n_used == plain.n_used)
+    np.testing.assert_array_equal(fit.rate[same], plain.rate[same])
+    assert np.std(smoothed_pull(fit, truth)[0]) == pytest.approx(1, abs=0.01)
+
+
+def test_only_large_hits_make_showers():
+    few, _ = expose(fraction=1.0)
+    none, _ = expose(fraction=0.0)
+    # the same hits: what differs is clouds, and not everywhere
+    difference = few.data[0, -1].astype(int) - none.data[0, -1].astype(int)
+    assert difference.min() >= -1
+    assert 0.05 < np.mean(difference > 20) < 0.9
+
+
+def test_a_wrong_threshold_is_named():
+    with pytest.raises(ValueError, match="'shower_threshold' must be positive or None"):
+        Reducer(shower_threshold=0)
