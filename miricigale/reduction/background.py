@@ -195,7 +195,8 @@ def estimated(
     sources, flags, doubt = np.zeros(data.shape, bool), BackgroundFlags.GOOD, 0.0
     avoided = np.zeros(cells_of(mask).shape, bool)
     for _ in range(iterations):
-        found = detect(mesh.residual, mesh.rms, mask, sources, threshold)
+        noise = _noise(image, mesh.rms, mask | sources)
+        found = detect(mesh.residual, noise, mask, sources, threshold)
         if grow:
             found = grown(binary_dilation(found, iterations=grow), mask)
         found |= pixels_of(avoided, data.shape)
@@ -244,6 +245,18 @@ def _check(method, box, filter_size, threshold, grow, iterations):
             raise argument_error(name, f"at least {least}", value)
     if not threshold > 0:
         raise argument_error("threshold", "positive", threshold)
+
+
+def _noise(image, rms, mask):
+    """Noise about the mesh, larger where the errors are: no mesh follows the seams of mosaics."""
+    if image.uncertainty is None or mask.all():
+        return rms
+    error = sigma(image)
+    ratio = rms[~mask] / error[~mask]
+    ratio = ratio[np.isfinite(ratio)]
+    if not ratio.size:
+        return rms
+    return np.fmax(rms, error * np.float32(np.median(ratio)))
 
 
 def _exceeds(image, rms, mask):
