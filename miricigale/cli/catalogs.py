@@ -56,6 +56,13 @@ def add_fit(commands):
         help="names and units of the columns: a survey (candels, 3dhst, jades, dja, cosmos2020, ceers, "
         "cigale), or a file with [columns], [units], survey, missing",
     )
+    fit.add_argument(
+        "--ebv",
+        type=float,
+        default=0.0,
+        metavar="MAG",
+        help="color excess E(B-V) of the Milky Way, if the fluxes are not corrected for it",
+    )
     fit.add_argument("--hdu", help="extension of a FITS file, if it has several tables")
     fit.add_argument("--chunk-rows", type=int, default=10000, help="rows in memory at a time")
     fit.add_argument(
@@ -82,7 +89,7 @@ def _fit(args):
             results = fit_catalog(
                 args.photometry,
                 args.output,
-                **chosen(args, "axes redshift model_error pairs flux_unit catalog_map"),
+                **chosen(args, "axes redshift model_error pairs flux_unit catalog_map ebv"),
                 **chosen(args, "chunk_rows resume"),
                 hdu=hdu,
                 executor=executor if n_threads > 1 else None,

@@ -14,7 +14,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.utils.units import FNU
 
-__all__ = ["Foreground", "GalacticExtinction", "band_extinction", "deredden"]
+__all__ = ["Foreground", "GalacticExtinction", "band_extinction", "color_excess", "deredden"]
 
 #: Laws of extinction with R_V, as `dust_extinction` names them, and whom to cite.
 LAWS = {
@@ -254,6 +254,42 @@ def _band_grid(band, low, high, sed):
         raise argument_error("sed", f"of positive flux in {band.name}", weights.sum())
     used = (weights != 0) & (wave >= low) & (wave <= high)
     return wave[used], weights[used], weights.sum()
+
+
+def color_excess(sky, dust_map, *, scale=1.0):
+    """
+    Color excess E(B-V) at positions, by a map.
+
+    Parameters
+    ----------
+    sky : `~astropy.coordinates.SkyCoord`, shape (n,)
+        The positions.
+    dust_map : object
+        With a method ``query(sky)`` that gives numbers of shape (n,), such as the maps of the package dustmaps
+        (``SFDQuery()``, ``PlanckQuery()``), which the user installs and whose data it downloads.
+    scale : float, optional
+        From the map's numbers to E(B-V): 0.86 for that of Schlegel, Finkbeiner & Davis (1998), as Schlafly
+        & Finkbeiner (2011) found.
+
+    Returns
+    -------
+    ebv : `~astropy.units.Quantity`, shape (n,)
+        In mag, for `deredden` and `band_extinction`.
+
+    Raises
+    ------
+    ValueError
+        If the map has no number, or a negative one, at a position; the message says how many.
+    """
+    if not hasattr(dust_map, "query"):
+        raise argument_error("dust_map", "a map with a method query(sky)", type(dust_map).__name__)
+    ebv = np.asarray(dust_map.query(sky), dtype=float) * scale
+    if ebv.shape != sky.shape:
+        raise argument_error("dust_map", f"numbers of shape {sky.shape}", f"{ebv.shape}")
+    bad = np.count_nonzero(~(np.isfinite(ebv) & (ebv >= 0)))
+    if bad:
+        raise argument_error("sky", "positions with a color excess", f"{bad} of {ebv.size} without")
+    return ebv * u.mag
 
 
 def band_extinction(filters, ebv, *, law="G23", r_v=3.1, sed=None, beyond="refuse"):

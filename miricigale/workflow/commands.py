@@ -164,6 +164,7 @@ def fit_catalog(
     axes="fit",
     model_error=None,
     catalog_map=None,
+    ebv=0.0,
     hdu=None,
     chunk_rows=10000,
     **options,
@@ -185,6 +186,10 @@ def fit_catalog(
         `miricigale.fitting.TemplateError.survey`, which is then the default.
     catalog_map : `~miricigale.filters.CatalogMap`, str or path-like, optional
         Names and units of the catalog; the name of a survey, or a TOML file.
+    ebv : float, optional
+        Color excess E(B-V) of the Milky Way, in mag, behind which all models are put
+        (`~miricigale.sed.components.GalacticExtinction`, law of Gordon et al. 2023, none beyond 32 um). For one
+        that differs from source to source see `~miricigale.sed.foreground.deredden`.
     hdu, chunk_rows, **options
         As for `miricigale.fitting.fit_file`, such as ``redshift``, a column of known redshifts, and
         ``resume``.
@@ -226,6 +231,7 @@ def fit_catalog(
     from miricigale.fitting import BayesFitter, TemplateError, fit_file
     from miricigale.fitting.likelihood import unused_bands
     from miricigale.sed import SEDModel
+    from miricigale.sed.components import GalacticExtinction
 
     unused = unused_bands(rows.chunk(0), bands)
     if unused:
@@ -241,6 +247,9 @@ def fit_catalog(
     else:
         model, nodes = SEDModel.yang2021(), SEDModel.yang2021_axes(axes)
         errors = {"model_error": 0.1 if model_error is None else model_error}
+    if ebv:
+        dust = GalacticExtinction(ebv_galactic=ebv, beyond="transparent")
+        model = SEDModel([*model.components, dust])
     fitter = BayesFitter(model, bands, axes=nodes, **errors)
     options |= {"catalog_map": catalog_map, "hdu": hdu, "chunk_rows": chunk_rows}
     return fit_file(fitter, path, output, **options)

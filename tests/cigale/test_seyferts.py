@@ -172,3 +172,25 @@ def test_columns_and_quantities_of_best_models(pair):
     # stars of other libraries: mass and light to a few percent
     assert ours.meta["stellar.m_star"] == pytest.approx(header["stellar.m_star"], rel=0.06)
     assert ours.meta["stellar.lum"] == pytest.approx(header["stellar.lum"], rel=0.1)
+
+
+def test_gas_of_a_best_model_for_each_ionizing_photon(model, data_file):
+    """H-beta is case B on both sides; log U is on two scales, by what the guide says (log U -2, solar, steady)."""
+    with fits.open(data_file("cigale_seyferts/best_models/Mrk_493_best_model.fits.gz")) as hdus:
+        theirs, header = hdus[1].data, {k: v for k, v in hdus[1].header.items() if "." in k}
+    z = float(header["universe.redshift"])
+    ours = best_model_table(model, {"age": 6.0, "tau": 5.0, "log_u": -2.0, "redshift": z})
+    photons = ours.meta["stellar.n_ly_young"], float(header["stellar.n_ly_young"])
+
+    def line(low, high):
+        light = []
+        for table, rate in zip((ours, theirs), photons, strict=True):
+            wave = np.array(table["wavelength"]) / (1 + z)
+            inside = (wave > low) & (wave < high)
+            power = np.trapezoid(np.array(table["nebular.lines_young"])[inside], wave[inside])
+            light.append(power / rate)
+        return light[0] / light[1]
+
+    assert line(484, 488.5) == pytest.approx(1.0, abs=0.05)
+    assert line(370.5, 375.5) == pytest.approx(4.3, abs=0.3)
+    assert line(493.5, 503.5) == pytest.approx(1.4, abs=0.1)

@@ -1,6 +1,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.table import MaskedColumn, QTable, Table
 from astropy.tests.helper import assert_quantity_allclose
 from astropy.utils.masked import Masked
@@ -12,6 +13,7 @@ from miricigale.sed.foreground import (
     LAWS,
     GalacticExtinction,
     band_extinction,
+    color_excess,
     coverage,
     deredden,
     extinction_curve,
@@ -324,3 +326,20 @@ def test_dereddening_refuses_magnitudes():
             deredden(table, 0.1, ["wfc3.f160w"])
     with pytest.raises(ValueError, match="'photometry' must be a table, got dict"):
         deredden({}, 0.1, ["wfc3.f160w"])
+
+
+class Slope:
+    """A map that is 0.1 mag at the north pole and 0 at the equator, and knows no south."""
+
+    def query(self, sky):
+        return np.where(sky.dec.deg >= 0, 0.1 * sky.dec.deg / 90, np.nan)
+
+
+def test_a_map_gives_the_color_excess_of_positions():
+    sky = SkyCoord([10.0, 20.0, 30.0], [0.0, 45.0, 90.0], unit="deg")
+    ebv = color_excess(sky, Slope(), scale=0.86)
+    np.testing.assert_allclose(ebv.to_value(u.mag), [0.0, 0.043, 0.086])
+    with pytest.raises(ValueError, match=r"'sky' must be positions with .* got 1 of 2 without"):
+        color_excess(SkyCoord([1.0, 1.0], [5.0, -5.0], unit="deg"), Slope())
+    with pytest.raises(ValueError, match=r"'dust_map' must be a map with a method query"):
+        color_excess(sky, 0.01)

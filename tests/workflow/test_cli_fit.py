@@ -9,6 +9,7 @@ from miricigale.cli import main
 from miricigale.fitting import open_results
 from miricigale.fitting.grid import GridEngine
 from miricigale.sed import SEDModel
+from miricigale.sed.foreground import band_extinction
 from miricigale.utils.exceptions import MiricigaleWarning
 from miricigale.workflow.commands import fit_catalog
 from miricigale.workflow.fit_page import fit_page
@@ -203,3 +204,19 @@ def test_the_page_of_a_catalog_says_how_redshifts_compare_and_what_was_left_out(
     assert "outliers, above 0.15" in page
     with pytest.raises(ValueError, match="z_phot"):
         fit_page(results, tmp_path / "cat.fits", z_spec="z_phot")
+
+
+def test_fluxes_behind_the_milky_way_give_the_galaxies_in_front_of_it(catalog, tmp_path):
+    """E(B-V) of 0.3, 0.2 mag in F125W, put on the fluxes and told to the fit; without it masses are low."""
+    table = catalog.copy()
+    lost = band_extinction(list(BANDS), 0.3)
+    for name in BANDS:
+        for column in (name, f"{name}_err"):
+            table[column] = table[column] * 10 ** (-0.4 * lost[name][0].value)
+    table.write(tmp_path / "cat.fits")
+    results = fit_catalog(
+        tmp_path / "cat.fits", tmp_path / "out", axes="quick", redshift="z_spec", ebv=0.3
+    )
+    found = results.to_table(["mass_best", "chi2_best"])
+    np.testing.assert_allclose(found["mass_best"].to_value(u.Msun), 1e10, rtol=0.03)
+    assert np.all(found["chi2_best"] < 0.1)
