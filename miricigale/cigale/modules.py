@@ -299,8 +299,8 @@ def _definition(m):
         raise ConfigError(msg) from None
     if (low, high) == (0.0, 0.0):
         return "dust"
-    if (low, high) == (3.0, 1000.0):
-        return "3-1000um"
+    if 0.1 <= low < high <= 1000.0:
+        return f"{low:g}-{high:g}um"
     m.chain.replaced.append(f"skirtor2016.lambda_fracAGN = {text} by 0/0")
     return "dust"
 

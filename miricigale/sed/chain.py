@@ -131,6 +131,8 @@ class Chain:
     ----------
     components : dict of str to `~miricigale.sed.Component`
         By role.
+    span : tuple of float, optional
+        Range of wavelengths in um whose light AGN fractions refer to.
 
     Attributes
     ----------
@@ -140,23 +142,30 @@ class Chain:
         Weights of the trapezoid rule on them.
     functionals : `~numpy.ndarray`, shape (n_functional, n_wave)
         Sums over a galaxy's light: of 3-1000 um, L_lambda at 0.55 um, means of the windows of
-        `UV_WINDOWS`, means of `COLOR_BANDS`.
+        `UV_WINDOWS`, means of `COLOR_BANDS`; of the light in ``span``, if that is another than 3-1000 um.
+    reference_row : int
+        Which of them is that of the light in ``span``.
     """
 
-    def __init__(self, components):
+    def __init__(self, components, *, span=INFRARED):
         self.by_role = {role: components.get(role) for role in ROLES}
         parts = [c.nodes() for c in components.values() if len(c.nodes())]
         limit = _core.LYMAN_LIMIT * np.array([1 - 1e-5, 1 + 1e-5])
         windows = np.ravel(UV_WINDOWS)
-        wave = _core.merge_nodes([*parts, [SIX, VISUAL, *INFRARED], limit, windows])
+        wave = _core.merge_nodes([*parts, [SIX, VISUAL, *INFRARED, *span], limit, windows])
         wave.flags.writeable = False
         self.wave = wave
         self.log_wave = np.log(wave)
         self.weights = _core.trapezoid_weights(wave)
         self.to_lnu = wave**2 / _core.LIGHT
         self._ionizing = wave < _core.LYMAN_LIMIT
-        self._at = {x: int(np.searchsorted(wave, x * (1 - 1e-9))) for x in (SIX, VISUAL, *INFRARED)}
-        self.functionals = self._functionals()
+        self._at = {
+            x: int(np.searchsorted(wave, x * (1 - 1e-9))) for x in (SIX, VISUAL, *INFRARED, *span)
+        }
+        self.functionals, self.reference_row = self._functionals(), 0
+        if tuple(span) != INFRARED:
+            self.functionals = np.concatenate([self.functionals, [self._light_in(span)]])
+            self.reference_row = -1
         self._names = {
             role: tuple(part.parameters) if part else () for role, part in self.by_role.items()
         }
@@ -164,9 +173,7 @@ class Chain:
 
     def _functionals(self):
         wave, n = self.wave, self.wave.size
-        infrared, visual = np.zeros((2, n))
-        part = slice(self._at[INFRARED[0]], self._at[INFRARED[1]] + 1)
-        infrared[part] = _core.trapezoid_weights(wave[part])
+        infrared, visual = self._light_in(INFRARED), np.zeros(n)
         visual[self._at[VISUAL]] = 1.0
         windows = np.zeros((len(UV_WINDOWS), n))
         for row, (low, high) in zip(windows, UV_WINDOWS, strict=True):
@@ -174,6 +181,12 @@ class Chain:
             row[first:last] = _core.trapezoid_weights(wave[first:last]) / (high - low)
         bands = FilterSet.from_names(list(COLOR_BANDS.values())).weights(wave) * self.to_lnu
         return np.concatenate([[infrared, visual], windows, bands])
+
+    def _light_in(self, span):
+        """Weights of the integral of L_lambda over a range of wavelengths."""
+        weights, part = np.zeros(self.wave.size), slice(self._at[span[0]], self._at[span[1]] + 1)
+        weights[part] = _core.trapezoid_weights(self.wave[part])
+        return weights
 
     def names(self, *roles):
         """Names of the parameters of these roles."""
@@ -376,6 +389,10 @@ class Chain:
     def infrared(self, spectrum):
         """Integral over 3-1000 um of L_lambda, along the last axis."""
         return spectrum @ self.functionals[0]
+
+    def reference(self, spectrum):
+        """Integral of L_lambda over the range that AGN fractions refer to, along the last axis."""
+        return spectrum @ self.functionals[self.reference_row]
 
     def six_micron(self, spectrum):
         """Power nu L_nu at 6 um."""

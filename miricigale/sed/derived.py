@@ -81,12 +81,13 @@ def columns(model):
     return out
 
 
-def galaxy_quantities(stars, absorbed, sums):
+def galaxy_quantities(stars, absorbed, sums, reference_row=0):
     """
     Derived quantities of n galaxies for one solar mass formed, in the units of `DERIVED`.
 
     ``stars`` are their `~miricigale.sed.chain.Stars`, ``absorbed``, shape (n,), the power in W that dust took,
-    ``sums``, shape (n, n_functional), their light times ``Chain.functionals``.
+    ``sums``, shape (n, n_functional), their light times ``Chain.functionals``; ``reference`` is the light
+    that AGN fractions refer to, and not in `DERIVED`.
     """
     n = len(_LOG_UV)
     visual, windows, bands = sums[:, 1], sums[:, 2 : 2 + n], sums[:, 2 + n :]
@@ -103,6 +104,7 @@ def galaxy_quantities(stars, absorbed, sums):
         "stellar_mass_formed": np.ones(len(stars)),
         "dust_luminosity": absorbed,
         "ir_luminosity": sums[:, 0],
+        "reference": sums[:, reference_row],
         "a_v": a_v,
         "beta": logs @ step / (step @ step),
     }
@@ -117,10 +119,10 @@ def agn_quantities(definition, ratio, galaxy, seen):
 
     ``definition`` says what the fraction f refers to, ``ratio`` is f / (1 - f), ``galaxy`` comes from
     `galaxy_quantities`; ``seen`` holds, for one watt of torus and polar emission, ``infrared``,
-    ``luminosity``, ``six`` and ``accretion``.
+    ``reference``, ``luminosity``, ``six`` and ``accretion``.
     """
     dust, infrared = galaxy["dust_luminosity"], galaxy["ir_luminosity"]
-    power = ratio * (dust if definition == "dust" else infrared / seen["infrared"])
+    power = ratio * (dust if definition == "dust" else galaxy["reference"] / seen["reference"])
     agn_infrared = power * seen["infrared"]
     total = infrared + agn_infrared
     return {

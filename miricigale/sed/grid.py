@@ -1,6 +1,7 @@
 """Factorised flux tables of a grid of models, as the grid fitter takes them."""
 
 import functools
+import re
 from dataclasses import dataclass, field
 
 import astropy.units as u
@@ -12,10 +13,11 @@ from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.unified import register, unified_read, unified_write
 from miricigale.utils.units import Frozen, frozen_array
 
-__all__ = ["DEFINITIONS", "ModelGrid"]
+__all__ = ["DEFINITIONS", "ModelGrid", "fraction_span"]
 
 #: What the AGN fraction is a fraction of.
 DEFINITIONS = ("dust", "3-1000um")
+_SPAN = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)um")
 
 #: Layouts of files; in the second the facts that decide stood in the meta.
 _LAYOUTS = ("miricigale-modelgrid-3", "miricigale-modelgrid-2")
@@ -38,6 +40,21 @@ _ARRAYS = {
 #: What a model and the grids that it made have in common.
 RECIPE = ("components", "options", "imf", "frac_agn_definition", "cosmology")
 _FACTS = ("axes", "inert", "bounds", "frac_agn_definition", "recipe")
+
+
+def fraction_span(definition):
+    """
+    Range of wavelengths in um of whose light an AGN fraction is a share; None for ``"dust"``.
+
+    ``definition`` is ``"dust"`` or a range such as ``"3-1000um"`` or ``"5-20um"`` in 0.1-1000 um; a ValueError
+    tells anything else.
+    """
+    match = _SPAN.fullmatch(definition) if isinstance(definition, str) else None
+    low, high = map(float, match.groups()) if match else (0.0, 0.0)
+    if definition != "dust" and not 0.1 <= low < high <= 1000.0:
+        wanted = "one of 'dust' and ranges in 0.1-1000 um such as '3-1000um'"
+        raise argument_error("frac_agn_definition", wanted, repr(definition))
+    return None if definition == "dust" else (low, high)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -65,7 +82,7 @@ class ModelGrid(Frozen):
     dust_luminosity : `~numpy.ndarray`, shape (nG,)
         Luminosity that the AGN fraction refers to, in W for each solar mass formed: the
         dust luminosity of the galaxy in the definition ``"dust"``, its 3-1000 um light in
-        the definition ``"3-1000um"``; AGN power is the same quantity of the AGN.
+        the definition ``"3-1000um"``, or that of another range; AGN power is the same quantity of the AGN.
     frac_agn : `~numpy.ndarray`, shape (nf,)
         AGN fractions in [0, 1), ascending.
     allowed : `~numpy.ndarray` of bool, shape (nz, nG)
@@ -93,8 +110,8 @@ class ModelGrid(Frozen):
         the mean of the values that were merged.
     bounds : dict of str to tuple of float, optional
         Smallest and largest value that the model allows for its parameters, in their units.
-    frac_agn_definition : {"dust", "3-1000um"}, optional
-        What the AGN fraction is a fraction of; see ``dust_luminosity``.
+    frac_agn_definition : {"dust", "3-1000um"} or str, optional
+        What the AGN fraction is a fraction of; see ``dust_luminosity`` and `fraction_span`.
     recipe : dict, optional
         `SEDModel.recipe` of the model that made the grid; empty if that is unknown.
 
@@ -144,9 +161,7 @@ class ModelGrid(Frozen):
         object.__setattr__(self, "inert", inert)
         if len(inert) != n_a:
             raise argument_error("inert", f"names for each of {n_a} AGN models", len(inert))
-        if self.frac_agn_definition not in DEFINITIONS:
-            wanted = f"one of {DEFINITIONS}"
-            raise argument_error("frac_agn_definition", wanted, repr(self.frac_agn_definition))
+        fraction_span(self.frac_agn_definition)
         shapes = {
             "redshift": (n_z,),
             "galaxy": (n_z, n_g, n_b),

@@ -122,7 +122,7 @@ def _factors(model, grid, index):
         parts = [chain.agn(_row(model, grid.agn_parameters, k)) for k in models.tolist()]
         nuclei = np.array([part.total for part in parts])
         if model.frac_agn_definition != "dust":
-            nuclei = nuclei / chain.infrared(nuclei)[:, None]
+            nuclei = nuclei / chain.reference(nuclei)[:, None]
     else:
         agn = np.zeros_like(agn)
     return chain.lnu(light), galaxy.ravel(), chain.lnu(nuclei), agn.ravel()

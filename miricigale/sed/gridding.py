@@ -104,14 +104,15 @@ class _Galaxies:
 
     def quantities(self):
         """Derived quantities: dict of arrays, one value for each galaxy."""
-        return galaxy_quantities(self._stars, self.absorbed, self.sums(self.chain.functionals.T))
+        sums = self.sums(self.chain.functionals.T)
+        return galaxy_quantities(self._stars, self.absorbed, sums, self.chain.reference_row)
 
 
 def _galaxy_tables(quantities):
     """What scales with mass, and what does not."""
     scaling, shape = QTable(), QTable()
     for name, values in quantities.items():
-        if name == "stellar_mass_formed":
+        if name in ("stellar_mass_formed", "reference"):
             continue
         entry = DERIVED[name]
         if entry.extensive:
@@ -130,7 +131,7 @@ def _agn_table(model, parts):
     seen = seen_agn(model.chain, parts)
     scale = np.ones(len(parts))
     if model.frac_agn_definition != "dust":
-        scale = 1.0 / seen["infrared"]
+        scale = 1.0 / seen["reference"]
     values = {
         "agn_power": np.ones(len(parts)),
         "agn_luminosity": seen["luminosity"],
@@ -160,7 +161,8 @@ def model_grid(model, axes, filters):
     defaults = model.defaults
     _refuse_invalid(model, [defaults | row for row in rows], GALAXY_ROLES)
     galaxies = _Galaxies(model, rows)
-    properties, shape = _galaxy_tables(galaxies.quantities())
+    quantities = galaxies.quantities()
+    properties, shape = _galaxy_tables(quantities)
 
     agn_rows, count, inert = [], np.zeros(0, int), []
     agn_spectra, agn_properties = np.zeros((0, chain.wave.size)), QTable()
@@ -174,7 +176,7 @@ def model_grid(model, axes, filters):
         agn_spectra = chain.lnu(np.array([t.total for t in parts])) * scale[:, None]
     reference = galaxies.absorbed
     if model.frac_agn_definition != "dust":
-        reference = properties["ir_luminosity"].value
+        reference = quantities["reference"]
 
     galaxy = np.empty((redshift.size, len(rows), len(filters)))
     agn = np.empty((redshift.size, len(agn_rows), len(filters)))

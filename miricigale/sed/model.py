@@ -17,7 +17,7 @@ from miricigale.sed.derived import (
     galaxy_quantities,
     scaled_quantities,
 )
-from miricigale.sed.grid import DEFINITIONS
+from miricigale.sed.grid import fraction_span
 from miricigale.sed.grid_cache import cached_grid
 from miricigale.sed.parameter import Parameter
 from miricigale.sed.spectrum import COSMOLOGY, SED, ModelSpectra, distance
@@ -54,9 +54,10 @@ class SEDModel:
         of their roles, whatever the order here.
     cosmology : `~astropy.cosmology.Cosmology`, optional
         For distances and the age of the universe.
-    frac_agn_definition : {"dust", "3-1000um"}, optional
+    frac_agn_definition : {"dust", "3-1000um"} or str, optional
         What ``frac_agn`` f means: AGN dust emission over the sum with the galaxy's dust
-        luminosity (CIGALE's default), or the AGN's share of all 3-1000 um light.
+        luminosity (CIGALE's default), or the AGN's share of all 3-1000 um light, or of another range
+        of rest wavelengths such as ``"5-20um"``, within 0.1-1000 um.
 
     Raises
     ------
@@ -74,9 +75,7 @@ class SEDModel:
 
     def __init__(self, components, *, cosmology=COSMOLOGY, frac_agn_definition="dust"):
         self.components = tuple(sorted(components, key=_role_order))
-        if frac_agn_definition not in DEFINITIONS:
-            wanted = f"one of {DEFINITIONS}"
-            raise argument_error("frac_agn_definition", wanted, repr(frac_agn_definition))
+        fraction_span(frac_agn_definition)
         self.cosmology = cosmology
         self.frac_agn_definition = frac_agn_definition
         roles = [c.role for c in self.components]
@@ -258,7 +257,8 @@ class SEDModel:
     @functools.cached_property
     def chain(self):
         """The components on their common grid of wavelengths (made on first use)."""
-        return Chain({c.role: c for c in self.components})
+        span = fraction_span(self.frac_agn_definition)
+        return Chain({c.role: c for c in self.components}, **({"span": span} if span else {}))
 
     @property
     def wave(self):
@@ -360,7 +360,8 @@ class SEDModel:
         chain, z = self.chain, values["redshift"]
         galaxy, agn = chain.galaxy(values), None
         spectrum, absorbed = galaxy.light, np.array([galaxy.dust_luminosity])
-        got = galaxy_quantities([galaxy.stars], absorbed, spectrum[None] @ chain.functionals.T)
+        sums = spectrum[None] @ chain.functionals.T
+        got = galaxy_quantities([galaxy.stars], absorbed, sums, chain.reference_row)
         if self.has_agn:
             agn, fraction = chain.agn(values), values["frac_agn"]
             ratio = np.array([fraction / (1.0 - fraction)])

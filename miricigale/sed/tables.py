@@ -51,6 +51,7 @@ def seen_agn(chain, parts):
     total = np.array([t.total for t in parts])
     return {
         "infrared": chain.infrared(total),
+        "reference": chain.reference(total),
         "luminosity": total @ chain.weights,
         "six": chain.six_micron(total),
         "accretion": np.array([t.accretion_power for t in parts]),
@@ -144,7 +145,8 @@ class _Blocks:
             for i in np.flatnonzero(excess != 1.0):
                 light[i] += (excess[i] - 1.0) * absorbed[i] * chain.dust(dusts[i])
             absorbed *= excess
-        return light, galaxy_quantities(stars, absorbed, light @ chain.functionals.T)
+        sums = light @ chain.functionals.T
+        return light, galaxy_quantities(stars, absorbed, sums, chain.reference_row)
 
     def agn(self, rows):
         """Spectra of AGN for one watt, which of them each row has, and their sums."""
@@ -152,7 +154,9 @@ class _Blocks:
         which = np.zeros(n, dtype=np.int64)
         active = np.flatnonzero(self.values["frac_agn"][rows] > 0)
         if active.size == 0:
-            blank = dict.fromkeys(("infrared", "luminosity", "six", "accretion"), np.ones(n))
+            blank = dict.fromkeys(
+                ("infrared", "reference", "luminosity", "six", "accretion"), np.ones(n)
+            )
             return np.zeros((1, chain.wave.size)), which, blank
         names = chain.names("agn")
         different, index = distinct(self._keys(rows[active], "agn"))

@@ -568,3 +568,34 @@ def test_from_dict_says_what_is_wrong():
     ):
         with pytest.raises(ConfigError, match=match):
             SEDModel.from_dict(config)
+
+
+@pytest.mark.parametrize("span", [(5.0, 20.0), (0.5, 2.0)])
+def test_a_fraction_of_the_light_in_any_range(span):
+    """Integrals of the parts over the range; models, tables of models and grids agree."""
+    model = SEDModel.yang2021(frac_agn_definition=f"{span[0]:g}-{span[1]:g}um")
+    values = {"redshift": 0.5, "age": 3.0, "frac_agn": 0.3, "mass": 1e10}
+    spectra = model.decompose(**values)
+    light = {}
+    for name in ("total", "agn_disk", "agn_torus", "agn_polar"):
+        sed = spectra.total if name == "total" else spectra.components[name]
+        wave = sed.wave.value / 1.5
+        inside = (wave >= span[0] * (1 - 1e-9)) & (wave <= span[1] * (1 + 1e-9))
+        light[name] = np.trapezoid(sed.fnu.value[inside] / wave[inside] ** 2, wave[inside])
+    agn = light["agn_disk"] + light["agn_torus"] + light["agn_polar"]
+    assert agn / light["total"] == pytest.approx(0.3, rel=1e-6)
+    bands = ["wfc3.f160w", "miri.f1500w"]
+    table = model.fluxes(QTable({name: [value] for name, value in values.items()}), bands)
+    grid = model.grid(
+        {"redshift": [0.5], "age": [1.0, 3.0], "frac_agn": [0.0, 0.3]}, bands, cache=False
+    )
+    one = grid.flux(0, 1, 0, 1) * 1e10
+    np.testing.assert_allclose([table[b][0].value for b in bands], one, rtol=1e-5)
+    assert spectra.derived["agn_power"].value == pytest.approx(
+        table["agn_power"][0].value, rel=1e-6
+    )
+    for wrong in ("20-5um", "0.01-20um", "ir"):
+        with pytest.raises(
+            ValueError, match="'frac_agn_definition' must be one of 'dust' and ranges"
+        ):
+            SEDModel.yang2021(frac_agn_definition=wrong)
