@@ -96,7 +96,7 @@ def test_flux_of_point_sources_is_conserved_through_the_distortion(scale):
         half = round(2.2 / scale)
         x0, y0 = round(float(x)), round(float(y))
         part = np.s_[y0 - half : y0 + half + 1, x0 - half : x0 + half + 1]
-        assert light[part].sum() == pytest.approx(flux, rel=1e-3)
+        assert light[part].sum() == pytest.approx(flux, rel=1e-5)
         center = np.average(xx[part], weights=light[part])
         assert center == pytest.approx(float(x), abs=0.02)
 
