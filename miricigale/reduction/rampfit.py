@@ -251,7 +251,8 @@ def fit_groups(
     plain = usable if flagged is None else usable & ~flagged
 
     def fit_block(rows):
-        return _core.fit_rows(*ramp, plain, rows.start, rows.stop, *groups, *last, *out)
+        events = _core.fit_rows(*ramp, plain, rows.start, rows.stop, *groups, *last, *out)
+        return events[np.lexsort(events.T[3::-1])]
 
     def refit_block(part):
         ys, xs, start, cuts = part

@@ -412,3 +412,75 @@ def test_bad_options_are_named(options, match):
 def test_refuses_another_number_of_dimensions():
     with pytest.raises(ValueError, match="'data' must be of four dimensions"):
         fit_groups(np.zeros((5, 3, 4), np.uint16), **OPTIONS)
+
+
+def plain_fit(integrations, s, threshold):
+    """Slope, variance and cuts of a pixel by dense linear algebra, jump by jump."""
+    cut = [np.zeros(len(d), bool) for d in integrations]
+    while True:
+        # blocks of the covariance between cuts, one after the other
+        parts = [
+            (k, part[~c[part]])
+            for k, c in enumerate(cut)
+            for part in np.split(np.arange(c.size), np.flatnonzero(c))
+            if not c[part].all()
+        ]
+        used = [integrations[k][part] for k, part in parts]
+        n_used = sum(len(d) for d in used)
+        if n_used == 0:
+            return np.nan, np.nan, cut
+        slope = np.mean(np.concatenate(used))
+        for _ in range(2):
+            v = max(slope / GAIN, 1e-8 * s)
+            slope, variance = gls(used, v, s)
+        if n_used == 1:
+            return slope, variance, cut
+        found = []
+        for (k, part), d in zip(parts, used, strict=True):
+            inverse = np.linalg.inv(covariance(len(d), v, s))
+            z, weight = inverse @ (d - slope), inverse.sum(axis=1)
+            share = np.diag(inverse) - weight**2 * variance
+            for j, z_j, p_j, c_j, d_j in zip(part, z, share, np.diag(inverse), d, strict=True):
+                if p_j > 1e-9 * c_j:
+                    found.append((round(z_j**2 / p_j, 6), d_j, k, j))
+        # of two differences that cannot be told apart the higher one
+        best = max(found)
+        if best[0] <= threshold**2:
+            return slope, variance, cut
+        cut[best[2]][best[3]] = True
+
+
+@pytest.mark.parametrize(("n_int", "n_group"), [(1, 40), (3, 12), (2, 3)])
+def test_jumps_and_slopes_are_those_of_the_plain_form(n_int, n_group):
+    rng = np.random.default_rng(n_group)
+    shape = (4, 131)
+    data = simulate(rng.uniform(0, 60, shape), n_int, n_group, dtype=np.float32, seed=n_int)
+    # many lanes at once, with up to five jumps each, up and down
+    for _ in range(5):
+        hit = np.argwhere(rng.uniform(size=shape) < 0.4)
+        k, g = rng.integers(0, n_int, len(hit)), rng.integers(1, n_group, len(hit))
+        size = 10 ** rng.uniform(1.3, 3.5, len(hit)) * rng.choice([1, 1, -1], len(hit))
+        for (y, x), one, start, dn in zip(hit, k, g, size, strict=True):
+            data[one, start:, y, x] += dn
+    limit = np.where(rng.uniform(size=shape) < 0.1, BIAS + 2000.0, np.inf)
+    fit = fit_groups(data, **OPTIONS, saturation=limit, neighbor_threshold=None)
+    jumps = set(zip(*(fit.jumps[name].tolist() for name in fit.jumps.dtype.names[:4]), strict=True))
+    assert sorted(jumps) == [
+        tuple(j) for j in fit.jumps[["y", "x", "integration", "group"]].tolist()
+    ]
+    n_found = 0
+    for y, x in np.ndindex(*shape):
+        ramps = data[:, :, y, x].astype(float)
+        lengths = [np.argmax(np.append(r >= limit[y, x], True)) for r in ramps]
+        differences = [np.diff(r[:n]) for r, n in zip(ramps, lengths, strict=True)]
+        slope, variance, cut = plain_fit(differences, READ**2, 5.0)
+        found = {(y, x, k, int(g) + 1) for k, c in enumerate(cut) for g in np.flatnonzero(c)}
+        assert {j for j in jumps if j[:2] == (y, x)} == found
+        n_found += len(found)
+        np.testing.assert_allclose(fit.rate[y, x] * DT, slope, rtol=2e-6, atol=1e-5)
+        np.testing.assert_allclose(fit.error[y, x] ** 2 * DT**2, variance, rtol=2e-6)
+        flags = int(fit.flags[y, x])
+        assert bool(flags & DQ.JUMP_DET) == bool(found)
+        assert bool(flags & DQ.SATURATED) == (min(lengths) < n_group)
+        assert fit.n_jump[y, x] == len(found)
+    assert n_found > 100

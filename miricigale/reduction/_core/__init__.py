@@ -20,12 +20,12 @@ All integrations of a pixel share one slope and one Poisson variance.
 """
 
 from miricigale.reduction._core.drawing import draw_slopes, hit_slopes, tabulate, variances
+from miricigale.reduction._core.lanes import refit
 from miricigale.reduction._core.pixel import (
     DO_NOT_USE,
     JUMP,
     JUMP_NEIGHBOR,
     SATURATED,
-    refit,
 )
 from miricigale.reduction._core.rows import BLOCK, fit_rows
 

@@ -1,8 +1,9 @@
-"""Whole rows of pixels without saturation or jumps, many at once; the others one by one."""
+"""Whole rows of pixels, many at once; those with saturation or jumps go to the lanes."""
 
 import numpy as np
 
-from miricigale.reduction._core.pixel import X_MIN, at, fit_pixel, gather, store
+from miricigale.reduction._core.lanes import LANES, fill_lane, fit_lanes, fitting_lanes, settle
+from miricigale.reduction._core.pixel import SATURATED, X_MIN, at, gather
 from miricigale.utils.compilation import njit
 
 __all__ = ["BLOCK", "fit_rows"]
@@ -51,8 +52,8 @@ def fit_rows(
     Pixels that are not ``usable`` get NaN. ``scale`` is the inverse group time, and jumps are cut
     above ``threshold`` sigma. The images ``rate`` to ``dq`` are filled in place.
 
-    Returns an array (n_event, 5): y, x, integration, difference (counted from ``g0``) and signed
-    significance of each jump.
+    Returns an array (n_event, 5) in no order: y, x, integration, difference (counted from ``g0``) and
+    signed significance of each jump.
     """
     drift, bias, reset = levels
     coefficients, limits, dark = response
@@ -91,15 +92,14 @@ def fit_rows(
     wf = np.empty(BLOCK)
     acc = np.empty(BLOCK)
     crit = np.empty(BLOCK)
-    # scratch of the general path
+    # pixels with jumps or saturation
+    out = (rate, var_poisson, var_read, n_used, n_jump, dq)
     d1 = np.empty(n_all)
-    cut = np.empty(n_all, np.bool_)
-    found = np.empty(n_all)
+    cut = np.zeros(n_all, np.bool_)
     valid = np.empty(n_int, np.int64)
-    f1 = np.empty(n_diff + 2)
-    tmp1 = np.empty(n_diff + 1)
-    first = np.empty(n_all + 1, np.int64)
-    last = np.empty(n_all + 1, np.int64)
+    lanes = fitting_lanes(n_int, n_diff)
+    free = np.arange(LANES)
+    n_free = LANES
     events = np.empty((256, 5))
     n_event = 0
 
@@ -233,36 +233,24 @@ def fit_rows(
                     var_read[y, x] = max(var - vp, 0.0) * scale * scale
                     n_used[y, x] = n_all
                     continue
-                if top[b] < saturation[b]:
-                    saturated = False
-                    valid[:] = n_diff
+                valid[:] = n_diff
+                saturated = top[b] >= saturation[b]
+                if saturated:
+                    saturated = gather(data, levels, response, y, x, g0, g1, d1, valid)
+                else:
                     for i in range(n_all):
                         d1[i] = d[i, b]
-                else:
-                    saturated = gather(data, levels, response, y, x, g0, g1, d1, valid)
-                cut[:] = False
-                result = fit_pixel(
-                    d1, cut, valid, n_diff, s[b], inv_gain[b], slow[b], threshold, f1, tmp1, first, last,
-                    found,
+                while n_free == 0:
+                    fit_lanes(lanes, n_int)
+                    n_free, events, n_event = settle(
+                        lanes, n_int, scale, threshold, events, n_event, free, out
+                    )
+                n_free -= 1
+                fill_lane(
+                    lanes, free[n_free], d1, cut, valid, s[b], inv_gain[b], slow[b], y, x, 0,
+                    SATURATED if saturated else 0,
                 )  # fmt: skip
-                store(
-                    y, x, scale, result, saturated, False,
-                    rate, var_poisson, var_read, n_used, n_jump, dq,
-                )  # fmt: skip
-                if result[4] > 0:
-                    for i in range(n_all):
-                        if cut[i]:
-                            if n_event == events.shape[0]:
-                                # by hand: an assignment of slices takes seconds to compile
-                                grown = np.empty((2 * n_event, 5))
-                                for k in range(n_event):
-                                    for j in range(5):
-                                        grown[k, j] = events[k, j]
-                                events = grown
-                            events[n_event, 0] = y
-                            events[n_event, 1] = x
-                            events[n_event, 2] = i // n_diff
-                            events[n_event, 3] = i % n_diff
-                            events[n_event, 4] = found[i]
-                            n_event += 1
+    while n_free < LANES:
+        fit_lanes(lanes, n_int)
+        n_free, events, n_event = settle(lanes, n_int, scale, threshold, events, n_event, free, out)
     return events[:n_event].copy()
