@@ -20,6 +20,7 @@ __all__ = [
     "integrals",
     "integrals_to",
     "known_redshifts",
+    "magnitude_prior",
     "read_density",
 ]
 
@@ -210,6 +211,58 @@ def known_redshifts(photometry, redshift):
     return np.where(good, values, np.nan)
 
 
+def magnitude_prior(
+    magnitude, redshift=None, *, power=0.90, peak=0.62, slope=0.066, pivot=24.0 * u.ABmag
+):
+    """
+    Density of redshift of galaxies of a magnitude, for ``redshift_prior`` of `BayesFitter.fit`.
+
+    z^a exp(-(z / z_m)^a) with its peak at z_m = ``peak`` + ``slope`` (m - ``pivot``), the form of Benitez 2000
+    (ApJ 536, 571, eq. 24), without types. The defaults are the fit of greatest likelihood to the 2302 sources of
+    CEERS of S/N above 3 in F160W, magnitude 20 to 28, whose redshifts Lisiecki et al. 2025 published; it is broad,
+    with 16 and 84 % at redshift 0.5 and 2.6 at magnitude 24.5.
+
+    Parameters
+    ----------
+    magnitude : `~astropy.units.Quantity`, shape (n,)
+        AB magnitudes in F160W, or fluxes; where it is not finite the prior is that of the pivot.
+    redshift : array_like, shape (n_z,), optional
+        Redshifts at which the density is given: 0 to 15 by default.
+    power, peak, slope : float, optional
+        a, and z_m at the pivot and its change with each magnitude.
+    pivot : `~astropy.units.Quantity`, optional
+        AB magnitude.
+
+    Returns
+    -------
+    redshift : `~numpy.ndarray`, shape (n_z,)
+        The redshifts.
+    density : `~numpy.ndarray`, shape (n, n_z)
+        Densities that integrate to 1.
+
+    Raises
+    ------
+    `~astropy.units.UnitsError`
+        If magnitudes have no unit.
+    ValueError
+        If ``power`` or ``peak`` is not above 0.
+    """
+    for name, value in (("power", power), ("peak", peak)):
+        if not value > 0:
+            raise argument_error(name, "above 0", repr(value))
+    to_magnitude = u.ABmag
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = np.atleast_1d(u.Quantity(magnitude, subok=True).to(to_magnitude).value).astype(
+            float
+        )
+    apart = values - u.Quantity(pivot, subok=True).to(to_magnitude).value
+    z = np.linspace(0.0, 15.0, 751) if redshift is None else np.asarray(redshift, dtype=float)
+    # bright galaxies are not all at 0
+    top = np.maximum(peak + slope * np.where(np.isfinite(apart), apart, 0.0), 0.1 * peak)[:, None]
+    density = z**power * np.exp(-((z / top) ** power))
+    return z, density / np.trapezoid(density, z, axis=1)[:, None]
+
+
 def read_density(redshift_prior, n):
     """
     Check densities of redshift for n objects: (redshifts, shape (n_z,), densities).
@@ -296,8 +349,10 @@ def fixed_log_prior(values, grid_redshift, allowed, tolerance, flags):
     if tolerance is not None:
         limit = np.full(n, tolerance)
     else:
-        edges = np.log1p(cell_edges(z, (0.0, np.inf)))
-        limit = 1.001 * (edges[node + 1] - edges[node]) / 2.0 + 1e-6
+        # in ln(1 + z), in which the nearest is: between two nodes nothing is too far from both
+        apart = np.abs(np.log1p(safe) - np.log1p(z[node]))
+        step = np.concatenate([[0.0], np.diff(np.log1p(z)), [0.0]])
+        limit = 1.001 * np.maximum(step[node], step[node + 1]) / 2.0 + 1e-6
         limit = np.maximum(limit, 1e-3 if z.size == 1 else 0.0)
     outside = ~missing & (apart > limit)
     flags[missing] |= int(FitFlags.NO_REDSHIFT)

@@ -13,6 +13,8 @@ from miricigale.fitting import (
     TemplateError,
     apply_zero_points,
     calibrate_zero_points,
+    magnitude_prior,
+    measure_band_errors,
     measure_template_error,
 )
 
@@ -130,3 +132,38 @@ def test_free_redshifts_and_bad_errors_are_refused(grid, draw_photometry):
         TemplateError([1.0, 2.0] * u.um, [0.1, -0.1])
     with pytest.raises(ValueError, match="a TemplateError"):
         BayesFitter(grid, template_error=0.1)
+
+
+def test_errors_of_bands_are_told_from_those_of_models(residuals):
+    """A band scattered by 20 % more than its models, where other bands are at the same rest wavelengths."""
+    grid, table, z = residuals
+    rng = np.random.default_rng(4)
+    scattered = QTable(table, copy=True)
+    for name in ("wfc3.f160w", "wfc3.f160w_err"):
+        scattered[name] = table[name] * (
+            1.0 if name.endswith("err") else 1 + 0.2 * rng.normal(size=len(table))
+        )
+    error = TemplateError([1.99, 2.01] * u.um, [0.05, 0.3])
+    fitter = BayesFitter(grid, model_error={"wfc3.f160w": 0.2}, template_error=error)
+    fitted = fitter.fit(scattered, redshift=z)
+    bands = ["wfc3.f125w", "wfc3.f160w"]
+    found = measure_band_errors(fitted, error, bands)
+    assert found["wfc3.f125w"] < 0.03
+    assert found["wfc3.f160w"] == pytest.approx(0.2, rel=0.12)
+    with pytest.raises(KeyError, match="no band that was fitted"):
+        measure_band_errors(fitted, error, ["miri.f2100w"])
+
+
+def test_prior_of_redshift_given_magnitude():
+    """z^a exp(-(z / z_m)^a) has its peak at z_m, and fluxes their magnitudes."""
+    z, density = magnitude_prior([22.0, 24.0, 26.0] * u.ABmag)
+    np.testing.assert_allclose(
+        z[np.argmax(density, axis=1)], 0.62 + 0.066 * np.array([-2, 0, 2]), atol=0.02
+    )
+    np.testing.assert_allclose(np.trapezoid(density, z, axis=1), 1)
+    flux = [22.0, 24.0, 26.0] * u.ABmag
+    np.testing.assert_allclose(magnitude_prior(flux.to(u.uJy))[1], density)
+    # no flux says nothing
+    np.testing.assert_allclose(magnitude_prior([0.0, -1.0] * u.uJy)[1], density[[1, 1]])
+    with pytest.raises(ValueError, match="'power' must be above 0"):
+        magnitude_prior(flux, power=0.0)
