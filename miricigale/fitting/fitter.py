@@ -14,6 +14,7 @@ from miricigale.fitting.likelihood import (
     per_band,
     unused_bands,
 )
+from miricigale.fitting.priors import known_redshifts
 from miricigale.fitting.results import FitResults
 from miricigale.fitting.samplers import Request, get_sampler
 from miricigale.fitting.samplers.fit import SamplerFit
@@ -29,7 +30,15 @@ __all__ = ["BayesFitter"]
 logger = logging.getLogger(__name__)
 
 #: Options that only one kind of engine has.
-_OF_GRID = ("axes", "prior_f", "redshift_tolerance", "compat", "rtol", "template_error")
+_OF_GRID = (
+    "axes",
+    "prior_f",
+    "redshift_tolerance",
+    "compat",
+    "rtol",
+    "template_error",
+    "interpolate",
+)
 _OF_SAMPLER = ("predict", "n_live", "n_effective", "max_calls", "n_draws", "n_cells")
 _OF_SAMPLER += ("sampler_options",)
 
@@ -106,6 +115,11 @@ class BayesFitter:
     rtol : float, optional
         Largest relative error of posterior weights, means and standard deviations that leaving
         out models of a grid may cause; 0 evaluates every model.
+    interpolate : int, optional
+        Of a grid: draw so many models of each object between the nodes, in cells that the posterior of
+        wider errors reaches, with fluxes interpolated from the nodes around, and take posteriors, means
+        and percentiles from them, weighed by their likelihoods (importance sampling). Known redshifts are
+        then those of the catalog. 1000 do for 68 % intervals. 0: the nodes alone.
     predict : list of str or `~miricigale.filters.FilterSet`, optional
         For a sampler: more bands, in which the fluxes of the models are predicted. A grid predicts
         all of its bands.
@@ -169,6 +183,7 @@ class BayesFitter:
         compat=None,
         rtol=1e-6,
         template_error=None,
+        interpolate=0,
         predict=(),
         n_live=500,
         n_effective=2000,
@@ -207,6 +222,7 @@ class BayesFitter:
                 redshift_tolerance=redshift_tolerance,
                 compat=compat,
                 template_error=template_error,
+                interpolate=check_count(interpolate, "interpolate", least=0),
             )
             for name in names or ():
                 if name not in self.bands:
@@ -388,6 +404,8 @@ class BayesFitter:
         few = (data.measured.sum(axis=1) < n_free) & ((flags & int(FitFlags.UNFITTED)) == 0)
         flags[few] |= int(FitFlags.FEW_FOR_PARAMETERS)
         settings = self.settings(filters) | {"redshift": kind, "unused_bands": unused}
+        if kind == "fixed":
+            data = data._changed(redshift=known_redshifts(photometry, redshift))
         return data._changed(flags=flags), known, settings
 
     def sample(

@@ -6,6 +6,7 @@ from functools import partial
 import astropy.units as u
 import numpy as np
 
+from miricigale.fitting.between import Between
 from miricigale.fitting.calibration import TemplateError, grid_errors
 from miricigale.fitting.grid import GridEngine
 from miricigale.fitting.likelihood import FitFlags
@@ -32,6 +33,8 @@ __all__ = ["GridFit"]
 VANISHING_CHI2 = 1417.0
 #: Numbers of joint sums that a piece may have at once (32 MB).
 _JOINT_SIZE = 1 << 22
+#: Weight of one galaxy model, and of one redshift, above which an object is flagged.
+_ALONE = 0.95
 #: Fluxes that are all 0 become negative by this part of their error; see `_engine_input`.
 _DARK = 1e-8
 #: Sum of squared S/N that counts as 0: smaller numbers have fewer digits, or none.
@@ -56,6 +59,7 @@ class GridFit:
     compat: str | None
     prior_f: str
     template_error: TemplateError | None = None
+    between: Between | None = None
 
     #: Objects in a piece of the catalog.
     chunk_size = 64
@@ -76,6 +80,7 @@ class GridFit:
         redshift_tolerance,
         compat,
         template_error,
+        interpolate,
     ):
         """Make a grid if it is none, work out its priors and derived quantities, set the engine up."""
         if not (is_number(rtol) and 0 <= rtol < 0.1):
@@ -129,6 +134,9 @@ class GridFit:
             compat,
             prior_f,
             template_error,
+            Between(grid, priors, quantities, fraction, engine, interpolate)
+            if interpolate
+            else None,
         )
 
     @property
@@ -164,6 +172,7 @@ class GridFit:
             "scale_error": self.engine.scale_error,
             "compat": self.compat,
             "n_models": int(self.engine.n_models),
+            "interpolate": 0 if self.between is None else self.between.n_draws,
             "constants": self.constants,
         } | self._error_settings
 
@@ -239,8 +248,19 @@ class GridFit:
         for rows in list(chunks(len(data), step)) or [slice(0, 0)]:
             some = data[rows]
             out = self.engine.fit(**_engine_input(some, log_prior[rows]), **options)
-            parts.append(self._results(some, out, pairs))
+            results = self._results(some, out, pairs)
+            if self.between is not None:
+                results = self._refined(some, log_prior[rows], results)
+            parts.append(results)
         return FitResults.concatenate(parts)
+
+    def _refined(self, data, log_prior, results):
+        """Results between the nodes."""
+        wide, seeds = self.between.widened(data)
+        index, _ = self.engine.draw(
+            n_draws=self.between.n_draws, seeds=seeds, **_engine_input(wide, log_prior)
+        )
+        return self.between.refine(data, wide, log_prior, index, seeds, results)
 
     def _results(self, data, out, pairs):
         """From models to parameters and derived quantities."""
@@ -251,6 +271,9 @@ class GridFit:
             _forget(out, vanished)
         axes = self.priors.axes
         pdf = {"redshift": out.zf.sum(axis=2)}
+        if self.between is None:
+            alone = np.minimum(out.galaxy.max(axis=1), pdf["redshift"].max(axis=1)) > _ALONE
+            flags[alone & (out.galaxy.shape[1] > 1)] |= int(FitFlags.ONE_NODE)
         for name, axis in axes.items():
             if axis.kind == "frac_agn":
                 pdf[name] = out.zf.sum(axis=1)

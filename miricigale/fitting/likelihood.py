@@ -74,6 +74,10 @@ class FitFlags(Flags):
     LOW_SIGNAL = 16384
     """The best model has S/N below 3 over all bands: take masses and luminosities from samples."""
 
+    ONE_NODE = 32768
+    """More than 95 % of the posterior lies on one galaxy model at one redshift of the grid: it is coarse
+    for these data."""
+
     UNFITTED = 1 | 2 | 8 | 16 | 32 | 512 | 4096 | 8192
     """Bits with which a row has no result."""
 
@@ -96,6 +100,8 @@ class FitData(ObjectRows):
         Which of the bands used are upper limits.
     flags : `~numpy.ndarray` of int, shape (n,)
         `FitFlags`.
+    redshift : `~numpy.ndarray`, shape (n,), optional
+        Known redshifts; NaN where one is missing.
     """
 
     ids: PerObject
@@ -104,6 +110,7 @@ class FitData(ObjectRows):
     sigma: PerObject
     limit: PerObject
     flags: PerObject
+    redshift: PerObject = None
 
     @property
     def used(self):
