@@ -252,11 +252,11 @@ def _noise(image, rms, mask):
     if image.uncertainty is None or mask.all():
         return rms
     error = sigma(image)
-    ratio = rms[~mask] / error[~mask]
-    ratio = ratio[np.isfinite(ratio)]
-    if not ratio.size:
+    # files have errors of 0 where they have none
+    known = ~mask & (error > 0) & np.isfinite(error)
+    if not known.any():
         return rms
-    return np.fmax(rms, error * np.float32(np.median(ratio)))
+    return np.fmax(rms, error * np.float32(np.median(rms[known] / error[known])))
 
 
 def _exceeds(image, rms, mask):

@@ -577,7 +577,9 @@ class Reducer:
             reasons = ", ".join(
                 sorted({name.replace("_", " ") for names in doubts for name in names})
             )
-            notes.append(f"{len(doubts)} backgrounds cannot be trusted ({reasons})")
+            notes.append(
+                f"{len(doubts)} of {len(backgrounds)} backgrounds cannot be trusted ({reasons})"
+            )
         drizzled, images = self.drizzle(images, wcs)
         mosaic, mosaic_background = self.subtract_background(drizzled.image)
         if not mosaic_background.trusted:
