@@ -1,5 +1,6 @@
 """What the smaller commands of the command line do, for use in code too."""
 
+import logging
 import warnings
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from miricigale.utils.row_files import open_rows
 from miricigale.utils.tables import error_column
 
 __all__ = ["filter_table", "fit_catalog", "plan_table", "write_plan"]
+
+log = logging.getLogger(__name__)
 
 
 def filter_table(pattern=""):
@@ -244,6 +247,12 @@ def fit_catalog(
         model, nodes = SEDModel.survey(), SEDModel.survey_axes()
         error = TemplateError.survey() if model_error is None else None
         errors = {"model_error": model_error or 0.0, "template_error": error}
+        if error is not None:
+            log.warning(
+                "errors of the models: %.0f to %.0f %% of the flux by rest wavelength, measured on sources "
+                "of CEERS (TemplateError.survey)",
+                *(100 * np.array([error.error.min(), error.error.max()])),
+            )
     else:
         model, nodes = SEDModel.yang2021(), SEDModel.yang2021_axes(axes)
         errors = {"model_error": 0.1 if model_error is None else model_error}

@@ -69,6 +69,39 @@ def test_a_catalog_becomes_a_folder_of_results(catalog, tmp_path, capsys):
     assert open_results(out).n_parts == 2
 
 
+def test_real_galaxies_have_their_own_grid_whose_errors_are_told(tmp_path, caplog):
+    """Of models of the survey grid without noise the best fit has all that went in."""
+    model, axes = SEDModel.survey(), SEDModel.survey_axes()
+    nodes = {name: np.full(2, values[len(values) // 2]) for name, values in axes.items()}
+    nodes["redshift"] = axes["redshift"][[len(axes["redshift"]) // 5, len(axes["redshift"]) // 2]]
+    truth = QTable({"id": [1, 2], "mass": np.full(2, 1e10) * u.Msun} | nodes)
+    bands = [*BANDS, "acs.f606w", "acs.f814w"]
+    fluxes = model.fluxes(truth, bands)
+    table = QTable({"id": truth["id"]})
+    for name in bands:
+        table[name], table[f"{name}_err"] = fluxes[name], 0.03 * fluxes[name]
+    table.write(tmp_path / "cat.fits")
+    out = tmp_path / "out"
+    command = [
+        "fit",
+        str(tmp_path / "cat.fits"),
+        "-o",
+        str(out),
+        "--axes",
+        "survey",
+        "--no-progress",
+    ]
+    assert main(command) == 0
+    assert "measured on sources of CEERS (TemplateError.survey)" in caplog.text
+    found = QTable.read(out / "table.fits")
+    for name in ("redshift", "frac_agn", "ebv"):
+        np.testing.assert_allclose(found[f"{name}_best"].value, nodes[name], rtol=1e-6)
+    np.testing.assert_allclose(found["mass_best"].to_value(u.Msun), 1e10, rtol=0.02)
+    caplog.clear()
+    assert main([*command[:3], str(tmp_path / "other"), *command[4:], "--model-error", "0.1"]) == 0
+    assert "TemplateError" not in caplog.text
+
+
 def test_a_votable_in_magnitudes_by_a_map(catalog, tmp_path, capsys):
     """Names of a survey, AB magnitudes and text ids give the fits of the same fluxes."""
     table = Table({"ID": [f"obj-{k}" for k in catalog["id"]], "zspec": catalog["z_spec"]})
