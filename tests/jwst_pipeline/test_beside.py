@@ -56,6 +56,8 @@ def cut_groups(fit, shape):
     return cut
 
 
+# the thresholds are those at which both hold: at 5, the default, recall in F2100W is 0.985 (pipeline
+# 0.9955), at 4 precision in F770W is 0.845 (0.874)
 @pytest.mark.parametrize(
     ("band", "n_groups", "n_integrations", "flux", "threshold"),
     [("miri.f770w", 40, 2, 200.0, 5.0), ("miri.f2100w", 12, 6, 2000.0, 4.0)],
