@@ -21,7 +21,7 @@ _BLUE = 0.25  # um
 _AGN_COLUMNS = {"torus": "torus", "polar": "polar_dust", "disk": "disk"}
 
 
-def best_model_table(model, parameters, *, modules=None, bands=("B_B90", "V_B90", "FUV")):
+def best_model_table(model, parameters, *, modules=None, bands=("B_B90", "V_B90", "FUV"), far=None):
     """
     One model in the layout of CIGALE's best models.
 
@@ -35,6 +35,8 @@ def best_model_table(model, parameters, *, modules=None, bands=("B_B90", "V_B90"
         Role of a component to CIGALE's module, on which some names depend.
     bands : iterable of str, optional
         Bands, by CIGALE's names, of whose attenuation there is a quantity.
+    far : `~astropy.units.Quantity`, optional
+        Distance at which ``Fnu`` is; that of the redshift by default.
 
     Returns
     -------
@@ -85,7 +87,7 @@ def best_model_table(model, parameters, *, modules=None, bands=("B_B90", "V_B90"
     total = sum(parts.values())
     parts["igm"] = total * (chain.sky(values) - 1.0)
     z = values["redshift"]
-    far = float(distance(z, model.cosmology))
+    far = float(distance(z, model.cosmology) if far is None else far.to_value(u.m))
     table = Table()
     table["wavelength"] = chain.wave * (1.0 + z) * 1e3 * u.nm
     luminosity = sum(parts.values()) / (1.0 + z) * 1e-3  # W/nm of observed wavelength
@@ -196,7 +198,9 @@ def write_best_models(results, folder, *, modules=None, overwrite=False):
         }
         # what makes no difference to the best model has no value
         known = {name: value for name, value in known.items() if np.isfinite(value)}
-        table = best_model_table(one.model, known, modules=modules)
+        own = one.distance is not None and np.isfinite(one.distance)
+        far = float(one.distance) * u.Mpc if own else None
+        table = best_model_table(one.model, known, modules=modules, far=far)
         table.meta["best.chi_square"] = float(one.chi2)
         path = folder / f"{np.asarray(one.ids).item()}_best_model.fits"
         meta, table.meta = table.meta, {}

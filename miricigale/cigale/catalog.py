@@ -10,7 +10,7 @@ from astropy.table import QTable, Table
 from miricigale.filters.band_names import band_filters, filter_of_band, given_filters, is_line
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 from miricigale.utils.files import read_table
-from miricigale.utils.missing import plain_floats, without_codes
+from miricigale.utils.missing import negative_errors, plain_floats, without_codes
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
 
@@ -201,21 +201,16 @@ def _fluxes(path, table, band, column):
 
 def _add_band(out, name, flux, error, limits):
     """Add the columns of a band; how many upper limits are not positive."""
-    limit = error < 0
-    gone = ~np.isfinite(flux) | ~np.isfinite(error) | (error == 0)
-    if not limits:
-        gone |= limit
-    limit &= ~gone
-    # no object is fainter than nothing
-    nothing = limit & (flux <= 0)
-    gone |= nothing
+    limit, nothing = negative_errors(flux, error)
+    gone = ~np.isfinite(flux) | ~np.isfinite(error) | (error == 0) | nothing
+    gone |= limit & (not limits)
     limit &= ~gone
     out[name] = np.where(gone, np.nan, flux) * FNU
     out[error_column(name)] = np.where(gone, np.nan, np.abs(error)) * FNU
     if np.any(limit):
         out[f"{name}_limit"] = limit
         out[f"{name}_limit"].info.description = "whether the flux is an upper limit"
-    return np.count_nonzero(nothing)
+    return np.count_nonzero(nothing) if limits else 0
 
 
 def _numbers(path, table, name):

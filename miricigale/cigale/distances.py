@@ -32,7 +32,7 @@ def at_their_distances(results, redshift, distances, cosmology):
     Returns
     -------
     results : `~miricigale.fitting.FitResults`
-        Their ``best["redshift"]`` is that of the object where it is known.
+        Their ``best["redshift"]`` is that of the object where it is known, and ``distance`` the given one.
     """
     node = np.full(len(results), results.constants.get("redshift", np.nan))
     node = np.asarray(results.best.get("redshift", node), dtype=float)
@@ -40,9 +40,11 @@ def at_their_distances(results, redshift, distances, cosmology):
     known = np.isfinite(redshift) & (redshift > 0) & np.isfinite(node)
     z = np.where(known, redshift, node)
     here, there = (distance(np.where(np.isfinite(x), x, 0.0), cosmology) for x in (z, node))
+    given = None
     if distances is not None:
-        given = np.ma.filled(np.ma.asarray(distances.to_value(u.m)), np.nan)
-        here = np.where(np.isfinite(given) & (given > 0), given, here)
+        given = np.ma.filled(np.ma.asarray(distances.to_value(u.Mpc)), np.nan)
+        given = np.where(np.isfinite(given) & (given > 0), given, np.nan)
+        here = np.where(np.isfinite(given), given * u.Mpc.to(u.m), here)
     factor = np.where(np.isfinite(node), (here / there) ** 2 * (1.0 + node) / (1.0 + z), 1.0)
     rows = [results.extensive(name) for name in results.quantities]
     moments, quantiles = np.array(results.moments), np.array(results.quantiles)
@@ -59,4 +61,5 @@ def at_their_distances(results, redshift, distances, cosmology):
         quantiles=quantiles,
         best=best | {"redshift": np.where(np.isfinite(node), z, np.nan)},
         best_scale=results.best_scale * factor,
+        distance=given,
     )

@@ -54,7 +54,7 @@ def add_fit(commands):
         dest="catalog_map",
         metavar="NAME|TOML",
         help="names and units of the columns: a survey (candels, 3dhst, jades, dja, cosmos2020, ceers, "
-        "cigale), or a file with [columns], [units], survey, missing",
+        "cigale), or a file with [columns], [units], survey, missing, factor, limits",
     )
     fit.add_argument(
         "--ebv",

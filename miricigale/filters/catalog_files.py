@@ -38,7 +38,8 @@ def read_catalog_photometry(path, catalog_map=None, *, hdu=None, **options):
     hdu : int or str, optional
         Extension of a FITS file with several tables.
     **options
-        As for `CatalogMap`, in place of it: ``columns``, ``units``, ``survey``, ``missing``, ``factor``.
+        As for `CatalogMap`, in place of it: ``columns``, ``units``, ``survey``, ``missing``, ``factor``,
+        ``limits``.
 
     Returns
     -------

@@ -15,7 +15,7 @@ from astropy.table import QTable
 from miricigale.filters.filter import Filter
 from miricigale.filters.surveys import SURVEYS, is_band
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error, unknown_name
-from miricigale.utils.missing import plain_floats, without_codes
+from miricigale.utils.missing import negative_errors, plain_floats, without_codes
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU
 
@@ -53,13 +53,16 @@ class CatalogMap:
     factor : str, optional
         The file's name of a column of factors on all fluxes and errors of a source, as from an aperture to
         the total; if it is in mag it is added to the magnitudes.
+    limits : bool, optional
+        Whether a negative error marks an upper limit, as in CIGALE: the flux is the limit and minus the error its
+        1 sigma, and a column ``<filter>_limit`` tells. Limits that are not positive are missing.
 
     Raises
     ------
     KeyError
         If ``columns`` or ``units`` name a filter that there is not, or ``survey`` is unknown.
     ValueError
-        If two columns are one of the file, or something is no dict.
+        If two columns are one of the file, or something is no dict or no truth value.
     """
 
     columns: Mapping = dataclasses.field(default_factory=dict)
@@ -67,6 +70,7 @@ class CatalogMap:
     survey: str | None = None
     missing: tuple = ()
     factor: str | None = None
+    limits: bool = False
 
     def __post_init__(self):
         for argument in ("columns", "units"):
@@ -84,12 +88,14 @@ class CatalogMap:
             raise argument_error("columns", "a dict whose values differ", dict(self.columns))
         if self.survey is not None and self.survey not in SURVEYS:
             raise unknown_name("survey", self.survey, SURVEYS)
+        if self.limits not in (True, False):
+            raise argument_error("limits", "True or False", repr(self.limits))
         object.__setattr__(self, "missing", tuple(float(value) for value in self.missing))
 
     @classmethod
     def read(cls, path):
         """
-        Read a map in TOML: tables ``columns`` and ``units``, keys ``survey``, ``missing`` and ``factor``.
+        Read a map in TOML: tables ``columns`` and ``units``, keys ``survey``, ``missing``, ``factor``, ``limits``.
 
         Raises
         ------
@@ -112,6 +118,9 @@ class CatalogMap:
     def settings(self):
         """What the map says, in plain values."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        if not self.limits:
+            # as before there were any: results of such maps can be gone on with
+            del values["limits"]
         values["columns"] = dict(self.columns)
         values["units"] = {name: str(unit) for name, unit in self.units.items()}
         return values
@@ -167,8 +176,8 @@ class CatalogMap:
         Returns
         -------
         table : `~astropy.table.QTable`
-            Fluxes and errors in uJy, NaN where they are missing; ids that are whole numbers as integers, and
-            other numbers as text.
+            Fluxes and errors in uJy, NaN where they are missing; with ``limits`` whether each flux is an upper
+            limit; ids that are whole numbers as integers, and other numbers as text.
         coded : dict of str to `~numpy.ndarray` of float, shape (n,)
             By band the number that stands for no value, NaN in rows that have none.
 
@@ -177,7 +186,8 @@ class CatalogMap:
         KeyError
             If a column is not there.
         ValueError, `~astropy.units.UnitsError`
-            If a column holds no numbers, or has no unit or a wrong one.
+            If a column holds no numbers, or has no unit or a wrong one; with ``limits``, if an error in
+            magnitudes is negative, which is no 1 sigma of a flux, or the file has ``<filter>_limit`` already.
 
         Warns
         -----
@@ -267,8 +277,23 @@ class CatalogMap:
             return code
         code = np.where(no_error & ~missing, errors, code)
         errors = np.where(missing | no_error, np.nan, errors)
+        if self.limits:
+            limit, nothing = negative_errors(flux, errors)
+            self._check_limits(table, name, ab, limit | nothing, argument)
+            code = np.where(nothing, values, code)
+            table[name] = np.where(nothing, np.nan, flux * factor) * FNU
+            table[f"{name}_limit"] = limit
+            errors = np.where(nothing, np.nan, np.abs(errors))
         table[error] = self._errors(table[error], error, errors, flux, ab, argument) * factor * FNU
         return code
+
+    def _check_limits(self, table, name, ab, negative, argument):
+        if f"{name}_limit" in table.colnames:
+            wanted = f"a table without the column '{name}_limit' where negative errors mark limits"
+            raise argument_error(argument, wanted, "both")
+        if ab and negative.any():
+            wanted = f"fluxes in {name!r} where negative errors mark limits"
+            raise argument_error(argument, wanted, "AB magnitudes")
 
     def _errors(self, column, name, errors, flux, ab, argument):
         """Errors of fluxes in uJy, from those in the file's unit."""

@@ -3,6 +3,7 @@
 import astropy.units as u
 import numpy as np
 
+from miricigale.sed.spectrum import distance
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import described_table
 from miricigale.utils.units import FNU
@@ -47,6 +48,8 @@ def best_sed(results, model=None, **changes):
     Returns
     -------
     sed : `~miricigale.sed.SED`
+        At the distance of the object, where the results have one (``distance``), unless ``changes`` has
+        another redshift.
 
     Raises
     ------
@@ -65,7 +68,11 @@ def best_sed(results, model=None, **changes):
         for name, value in known.items()
         if name in model.parameters
     }
-    return model.evaluate(**{**values, "mass": best["mass"], **changes})
+    sed = model.evaluate(**{**values, "mass": best["mass"], **changes})
+    if results.distance is None or not np.isfinite(results.distance) or "redshift" in changes:
+        return sed
+    nearer = distance(sed.redshift, model.cosmology) / (float(results.distance) * u.Mpc.to(u.m))
+    return sed.replace(fnu=sed.fnu * float(nearer**2))
 
 
 def plot_sed(results, ax=None, *, model=None, filters=None, **kwargs):

@@ -103,6 +103,9 @@ class FitResults(ObjectRows):
         Whether the fit was at given redshifts.
     constants : dict of str to float, optional
         Parameters with one value, which have no posterior.
+    distance : `~numpy.ndarray`, shape (n,), optional
+        Distances in Mpc that masses and luminosities are for, where they are not those of the redshifts; NaN
+        where they are.
     least_std : float, optional
         Part of the mean below which no standard deviation is given (CIGALE: 0.05).
     model : `~miricigale.sed.SEDModel`, optional
@@ -146,6 +149,7 @@ class FitResults(ObjectRows):
     intensive: tuple = ()
     fitted_filters: tuple | None = None
     redshift_fixed: bool = False
+    distance: PerObject = None
     constants: dict = field(default_factory=dict)
     least_std: float = 0.0
     model: object = None

@@ -4,7 +4,7 @@ import numpy as np
 
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["plain_floats", "without_codes"]
+__all__ = ["negative_errors", "plain_floats", "without_codes"]
 
 #: Numbers that stand for no value, of either sign in magnitudes, negative in all other columns.
 _CODES = np.array([99.0, 99.9, 99.99, 99.999, 999.0, 999.9, 999.99, 9999.0, 9999.9, 99999.0])
@@ -43,6 +43,25 @@ def without_codes(values, errors=None, *, magnitudes=False, further=()):
     zero = (values == 0) & (~(errors > 0) if magnitudes else errors == 0)
     missing = (code & ((values < 0) | magnitudes | same)) | zero | named
     return missing, no_error
+
+
+def negative_errors(values, errors):
+    """
+    Upper limits by CIGALE's convention: the value is the limit, and minus the error its 1 sigma.
+
+    Parameters
+    ----------
+    values, errors : `~numpy.ndarray`, shape (n,)
+        Fluxes and errors, NaN where they are missing.
+
+    Returns
+    -------
+    limit, nothing : `~numpy.ndarray` of bool, shape (n,)
+        Upper limits, and those that are none because they are not positive: no source is fainter than nothing.
+    """
+    known = np.isfinite(values) & np.isfinite(errors) & (errors < 0)
+    nothing = known & (values <= 0)
+    return known & ~nothing, nothing
 
 
 def _is_code(values):

@@ -397,8 +397,8 @@ def _left_out(page, results, rows, found):
     if bad.any():
         counts = ", ".join(f"{name} {n}" for name, n in zip(found.filters, bad, strict=True) if n)
         lines.append(
-            f"fluxes with an error that is no error (0, negative or infinite): {counts}; negative errors that "
-            "mark upper limits are read by miricigale.cigale.read_cigale_catalog, or given as <band>_limit"
+            f"fluxes with an error that is no error (0, negative or infinite): {counts}; where negative errors "
+            "mark upper limits, 'limits = true' in the map of --map says so"
         )
     page.bullets(lines or ["No column and no number of the catalog."])
     counts = [("none", "", int(np.count_nonzero(found.flags == 0)))]

@@ -4,9 +4,9 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.table import QTable
+from astropy.table import QTable, Table
 
-from miricigale.cigale import CigaleSetup, fit_cigale, read_cigale_results
+from miricigale.cigale import CigaleSetup, fit_cigale, read_cigale_results, write_best_models
 from miricigale.cigale import read_pcigale_ini as read
 from miricigale.cigale.ini import parse_ini, parse_values
 from miricigale.fitting import FitFlags
@@ -623,6 +623,21 @@ def test_one_redshift_and_a_distance_of_its_own(run, tmp_path):
     # the shape is that of z = 0.5: bands are the same to what 1.3 % in wavelength makes
     drawn = setup.filters().synthetic_fluxes(results[1].best_sed())
     np.testing.assert_allclose(drawn.value, results[1].best_flux, rtol=0.06)
+    # one photometry, one spectrum: the nearer object has the smaller mass, and the results as a file know it
+    results.write(tmp_path / "fit.fits")
+    near = type(results).read(tmp_path / "fit.fits")[0]
+    np.testing.assert_allclose(
+        near.best_sed(results.model).fnu, results[1].best_sed().fnu, rtol=1e-6
+    )
+    near_file, far_file = (
+        Table.read(p)["Fnu"] for p in write_best_models(results, tmp_path / "best")
+    )
+    np.testing.assert_allclose(near_file, far_file, rtol=1e-6)
+    # at another redshift the object is at the distance of that
+    np.testing.assert_allclose(
+        near.best_sed(results.model, redshift=0.4).fnu,
+        results[1].best_sed(redshift=0.4, mass=mass[0]).fnu,
+    )
 
 
 def test_parts_of_the_agn_have_posteriors(run, tmp_path):

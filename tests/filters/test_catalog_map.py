@@ -246,6 +246,34 @@ def test_a_map_in_a_file(tmp_path):
         CatalogMap.read(tmp_path / "none.toml")
 
 
+def test_negative_errors_are_upper_limits_where_the_map_says_so(tmp_path):
+    """CIGALE's convention: minus the error is 1 sigma of the limit; none is below nothing, codes are none."""
+    values, errors = [5.0, 2.0, -1.0, 3.0, -99.99, 4.0], [0.5, -0.2, -0.3, 0.0, -99.99, -99.9]
+    table = Table({"id": range(6), BAND: values, f"{BAND}_err": errors})
+    path = write(table, tmp_path / "c.csv")
+    with pytest.warns(MiricigaleWarning, match=rf"{BAND} 3 of 6 \(-99.99, -99.9, -1\)"):
+        out = read_catalog_photometry(path, limits=True, units={"flux": "mJy"})
+    np.testing.assert_allclose(out[BAND].value, [5e3, 2e3, np.nan, 3e3, np.nan, 4e3])
+    np.testing.assert_allclose(
+        out[f"{BAND}_err"].value, [500, 200, np.nan, 0, np.nan, np.nan], rtol=1e-12
+    )
+    assert out[f"{BAND}_limit"].tolist() == [False, True, False, False, False, False]
+    plain, _ = CatalogMap(units={"flux": "mJy"}).convert(table)
+    assert f"{BAND}_limit" not in plain.colnames
+    assert plain[f"{BAND}_err"][1].value == -200
+    # a factor to the total is one of the limit too
+    table["ap"] = np.full(6, 1.5)
+    out, _ = CatalogMap(units={"flux": "mJy"}, limits=True, factor="ap").convert(table)
+    np.testing.assert_allclose([out[BAND][1].value, out[f"{BAND}_err"][1].value], [3e3, 300])
+    with pytest.raises(ValueError, match=r"must be fluxes in .* where negative errors mark limits"):
+        CatalogMap(units={"flux": "ABmag"}, limits=True).convert(table)
+    table[f"{BAND}_limit"] = np.zeros(6, bool)
+    with pytest.raises(ValueError, match="where negative errors mark limits, got both"):
+        CatalogMap(units={"flux": "mJy"}, limits=True).convert(table)
+    with pytest.raises(ValueError, match="'limits' must be True or False"):
+        CatalogMap(limits="yes")
+
+
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_pieces_are_the_whole(tmp_path, suffix):
     table = Table({"name": [f"s{k}" for k in range(7)], "H": [20.0, 99, 22, 23, 24, 99, 26]})
