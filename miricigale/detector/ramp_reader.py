@@ -13,6 +13,8 @@ from miricigale.instrument import (
     DQ,
     DetectorProperties,
     Exposure,
+    exposure_keywords,
+    joined_header,
     reference_pixel_mask,
     steps_done,
 )
@@ -31,12 +33,6 @@ _REFERENCE = np.uint32(DQ.REFERENCE_PIXEL | DQ.NON_SCIENCE)
 
 #: Kinds of exposures that are imager ramps; ground tests state none.
 _KINDS = ("MIR_IMAGE", "MIR_DARKIMG", "MIR_FLATIMAGE", "ANY", "N/A", "")
-
-#: Names of the read-out patterns before the launch, for those of today.
-_PATTERNS = {"FAST": "FASTR1", "SLOW": "SLOWR1"}
-
-#: Where the light is blocked there is no filter.
-_NO_FILTER = ("", "OPAQUE", "N/A", "ANY")
 
 
 def read(path):
@@ -77,7 +73,7 @@ def _read(path, hdus):
     if "SCI" not in hdus:
         msg = f"{path} is no ramp: it has no SCI extension"
         raise DataError(msg)
-    header = _observation(hdus)
+    header = joined_header(hdus)
     _check_kind(path, header)
     shape = _ramp_shape(path, hdus["SCI"].header)
     exposure = _exposure(path, header, shape)
@@ -110,23 +106,6 @@ def _read(path, hdus):
     return values
 
 
-def _observation(hdus):
-    """Keywords of the observation: those of the primary header, and of SCI what it lacks."""
-    header = hdus[0].header.copy(strip=True)
-    science = hdus["SCI"].header.copy(strip=True)
-    for name in ("BSCALE", "BZERO", "EXTNAME", "EXTVER", "EXTEND", "NEXTEND"):
-        header.remove(name, ignore_missing=True)
-        science.remove(name, ignore_missing=True)
-    for card in science.cards:
-        if (
-            card.keyword
-            and card.keyword not in header
-            and card.keyword not in ("COMMENT", "HISTORY")
-        ):
-            header.append(card)
-    return header
-
-
 def _check_kind(path, header):
     """Refuse files of other instruments, detectors and kinds of exposures."""
     instrument = header.get("INSTRUME", "MIRI" if "DETECTOR" in header else None)
@@ -155,15 +134,11 @@ def _ramp_shape(path, head):
 def _exposure(path, header, shape):
     """The exposure that the keywords and the shape tell."""
     n_int, n_group, *size = shape
-
-    def keyword(name):
-        if name not in header:
-            msg = f"{path} has no keyword {name}"
+    name, readout, part, dither = exposure_keywords(header)
+    for key, value in (("READPATT", readout), ("SUBARRAY", part)):
+        if value is None:
+            msg = f"{path} has no keyword {key}"
             raise DataError(msg)
-        return header[name]
-
-    name = str(header.get("FILTER", "")).strip()
-    pattern = str(keyword("READPATT")).strip()
     pointed = [header.get(key) for key in ("RA_REF", "DEC_REF", "ROLL_REF")]
     stated = [value is not None for value in pointed]
     if any(stated) and not all(stated):
@@ -176,12 +151,12 @@ def _exposure(path, header, shape):
             "roll": pointed[2] * u.deg,
         }
     exposure = Exposure(
-        None if name in _NO_FILTER else f"miri.{name.lower()}",
-        readout=_PATTERNS.get(pattern, pattern),
+        name,
+        readout=readout,
         n_groups=n_group,
         n_integrations=n_int,
-        subarray=str(keyword("SUBARRAY")).strip(),
-        dither=max(int(header.get("PATT_NUM", 1)), 1) - 1,
+        subarray=part,
+        dither=dither,
         **sky,
     )
     if tuple(size) != exposure.shape:

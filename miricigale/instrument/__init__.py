@@ -23,6 +23,13 @@ __getattr__, __dir__, __all__ = lazy_names(
             "readout_patterns",
         ),
         "figures": ("imager_filters",),
+        "keywords": (
+            "READOUT_NAMES",
+            "STEPS",
+            "exposure_keywords",
+            "joined_header",
+            "steps_done",
+        ),
         "photometric": (
             "background_level",
             "background_spectrum",
@@ -41,7 +48,6 @@ __getattr__, __dir__, __all__ = lazy_names(
             "subarrays",
             "v2v3_to_sky",
         ),
-        "steps": ("STEPS", "steps_done"),
         "wcs": (
             "imager_wcs",
             "mosaic_wcs",

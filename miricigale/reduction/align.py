@@ -14,6 +14,7 @@ from miricigale.reduction.background import estimated
 from miricigale.reduction.images import plain_mask, with_data
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_positive
 from miricigale.utils.units import ANGLE, positive
 
 __all__ = ["Alignment", "align_images", "align_to_catalog"]
@@ -155,8 +156,7 @@ def _sources(image, threshold, fwhm):
     """Windowed positions of the sources of an image, in pixels."""
     if image.wcs is None or image.uncertainty is None:
         raise argument_error("image", "one with uncertainty and WCS", "one without")
-    if not threshold > 0:
-        raise argument_error("threshold", "positive", threshold)
+    check_positive(threshold, "threshold")
     scale = float(np.mean(proj_plane_pixel_scales(image.wcs))) * 3600
     if fwhm is None:
         name = ImageFacts.of(image).filter

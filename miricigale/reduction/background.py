@@ -12,6 +12,7 @@ from miricigale.reduction.sky_mask import cells_of, contamination, darkest, dete
 from miricigale.reduction.sky_mesh import fit_surface, sky_boxes, spread_over, surface
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.options import check_choice, check_least, check_positive
 from miricigale.utils.tables import Flags
 
 __all__ = [
@@ -21,6 +22,9 @@ __all__ = [
     "remove_background",
     "subtract_background",
 ]
+
+#: Whose sigma tells what lies far below the background.
+NEGATIVE_NOISES = ("larger", "background")
 
 # least share of the pixels that is taken for sky
 _LEAST_SKY = 0.05
@@ -183,7 +187,11 @@ def estimated(
     iterations=5,
 ):
     """As `estimate_background`, without a warning."""
-    _check(method, box, filter_size, threshold, grow, iterations)
+    check_choice(method, "method", ("masked", "sep"))
+    check_mesh(box, filter_size)
+    check_positive(threshold, "threshold")
+    check_least(grow, "grow", 0)
+    check_least(iterations, "iterations", 0)
     mask = plain_mask(image)
     if mask.all():
         raise argument_error("image", "one with pixels that are not masked", "every pixel masked")
@@ -232,19 +240,10 @@ def estimated(
     return background
 
 
-def _check(method, box, filter_size, threshold, grow, iterations):
-    if method not in ("masked", "sep"):
-        raise argument_error("method", "'masked' or 'sep'", repr(method))
-    for name, value, least in (
-        ("box", box, 4),
-        ("filter_size", filter_size, 1),
-        ("grow", grow, 0),
-        ("iterations", iterations, 0),
-    ):
-        if value < least:
-            raise argument_error(name, f"at least {least}", value)
-    if not threshold > 0:
-        raise argument_error("threshold", "positive", threshold)
+def check_mesh(box, filter_size, *, least=4):
+    """Refuse boxes, or a filter of boxes, that are too small."""
+    check_least(box, "box", least)
+    check_least(filter_size, "filter_size", 1)
 
 
 def _noise(image, rms, mask):
@@ -405,16 +404,14 @@ def remove_background(image, background, *, negative_threshold=10.0, negative_no
     ValueError
         If an option is out of range, or the errors are asked for and the image has none.
     """
-    if negative_noise not in ("larger", "background"):
-        raise argument_error("negative_noise", "'larger' or 'background'", repr(negative_noise))
+    check_choice(negative_noise, "negative_noise", NEGATIVE_NOISES)
+    check_positive(negative_threshold, "negative_threshold", optional=True)
     out = with_data(
         image,
         np.asarray(image.data, np.float32) - background.level,
         background=float(np.median(background.level[~plain_mask(image)])),
     )
     if negative_threshold is not None:
-        if not negative_threshold > 0:
-            raise argument_error("negative_threshold", "positive or None", negative_threshold)
         noise = background.rms
         if negative_noise == "larger":
             noise = np.fmax(noise, sigma(image))

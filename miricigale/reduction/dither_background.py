@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from miricigale.instrument import DQ, mosaic_wcs
-from miricigale.reduction.background import estimated, remove_background, tell
+from miricigale.reduction.background import check_mesh, estimated, remove_background, tell
 from miricigale.reduction.images import check_images, plain_mask, seen_wcs, with_data
 from miricigale.reduction.mosaic import drizzle_images, pixel_map
 from miricigale.reduction.sky_mesh import sky_boxes, spread_over
@@ -70,9 +70,7 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None, box=16, filter_siz
     images = list(images)
     if len(images) < 3:
         raise argument_error("images", "at least three dithers", len(images))
-    for name, value, least in (("box", box, 1), ("filter_size", filter_size, 1)):
-        if value < least:
-            raise argument_error(name, f"at least {least}", value)
+    check_mesh(box, filter_size, least=1)
     shape = images[0].shape
     for im in images:
         if im.shape != shape:

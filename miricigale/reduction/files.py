@@ -15,7 +15,17 @@ from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.wcs import WCS, FITSFixedWarning
 
 from miricigale.detector import Ramp
-from miricigale.instrument import DQ, STEPS, dq_legend, imager_wcs, read_dq, steps_done, subarrays
+from miricigale.instrument import (
+    DQ,
+    STEPS,
+    dq_legend,
+    exposure_keywords,
+    imager_wcs,
+    joined_header,
+    read_dq,
+    steps_done,
+    subarrays,
+)
 from miricigale.reduction.assumed import middle_of
 from miricigale.reduction.images import plain_flags, plain_mask, sigma
 from miricigale.utils.exceptions import DataError, argument_error
@@ -111,9 +121,7 @@ def read_images(path):
         if "SCI" not in hdus or hdus["SCI"].header.get("NAXIS") not in (2, 3):
             msg = f"{path} cannot be read as {_WANTED}: it has no image in SCI"
             raise DataError(msg)
-        header = hdus[0].header.copy(strip=True)
-        science = hdus["SCI"].header
-        header.extend(science.copy(strip=True), unique=True)
+        header = joined_header(hdus)
         if (
             header.get("INSTRUME", "MIRI") != "MIRI"
             or header.get("DETECTOR", "MIRIMAGE") != "MIRIMAGE"
@@ -123,7 +131,7 @@ def read_images(path):
             raise DataError(msg)
         shape = hdus["SCI"].shape
         check_memory(24 * np.prod(shape, dtype=float), f"the image {path}", advice="cut it")
-        unit = _unit(science, path)
+        unit = _unit(hdus["SCI"].header, path)
         meta = _meta(header, path)
         wcs = _wcs(hdus, header, meta)
         data = _plane(hdus, "SCI", shape, path)
@@ -269,16 +277,10 @@ def _meta(header, path):
     if own is not None:
         return json.loads(own)
     meta = {name: header[key] for key, name in _META.items() if header.get(key) is not None}
-    name = str(header.get("FILTER", "")).strip().lower()
-    if name:
-        meta["filter"] = f"miri.{name}"
-    part = str(header.get("SUBARRAY", "")).strip()
-    if part in subarrays():
-        meta["subarray"] = part
-    if "READPATT" in header:
-        pattern = str(header["READPATT"]).strip()
-        meta["readout"] = {"FAST": "FASTR1", "SLOW": "SLOWR1"}.get(pattern, pattern)
-    meta["dither"] = max(int(header.get("PATT_NUM", 1)), 1) - 1
+    name, readout, part, meta["dither"] = exposure_keywords(header)
+    part = part if part in subarrays() else None
+    stated = {"filter": name, "subarray": part, "readout": readout}
+    meta |= {key: value for key, value in stated.items() if value is not None}
     meta["steps"] = sorted(steps_done(header))
     if (day := middle_of(header)) is not None:
         meta["day"] = day

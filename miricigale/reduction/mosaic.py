@@ -22,6 +22,7 @@ from miricigale.reduction.images import (
 )
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_least, check_positive
 from miricigale.utils.parallel import chunks
 
 __all__ = [
@@ -321,10 +322,8 @@ def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None,
     """
     images = list(images)
     check_images(images, wcs)
-    if not threshold > 0:
-        raise argument_error("threshold", "positive", threshold)
-    if not derivative >= 0:
-        raise argument_error("derivative", "at least 0", derivative)
+    check_positive(threshold, "threshold")
+    check_least(derivative, "derivative", 0)
     if len(images) < 3:
         return images
     weights = [weight_map(im) for im in images] if weights is None else weights

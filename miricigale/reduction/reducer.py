@@ -3,50 +3,23 @@
 import dataclasses
 import os
 
-import numpy as np
-from astropy.io.fits import Header
 from astropy.nddata import CCDData
 
 from miricigale.detector import Charge, Ramp, ResetAnomaly
-from miricigale.instrument import DetectorProperties, ImageFacts, miri_detector, mosaic_wcs
-from miricigale.reduction.align import align_images
-from miricigale.reduction.assumed import brightness_of, history_of, maps_of
-from miricigale.reduction.background import (
-    BackgroundFlags,
-    estimate_background,
-    subtract_background,
-)
+from miricigale.instrument import DetectorProperties, ImageFacts, miri_detector
+from miricigale.reduction.assumed import brightness_of, maps_of
+from miricigale.reduction.background import estimate_background, subtract_background
 from miricigale.reduction.calibration import calibrate
-from miricigale.reduction.dither_background import from_dithers
-from miricigale.reduction.files import ImageFile, open_exposure
-from miricigale.reduction.images import (
-    check_images,
-    check_overlap,
-    exposure_values,
-    image,
-    seen_wcs,
-)
-from miricigale.reduction.mosaic import (
-    drizzle_images,
-    pixel_map,
-    reject_outliers,
-    weight_map,
-)
-from miricigale.reduction.reference_cache import ReferenceCache
-from miricigale.reduction.references import ReferenceFiles
-from miricigale.reduction.results import ReductionResult
-from miricigale.reduction.sky_match import match_levels
-from miricigale.reduction.slopes import fit_slopes, shares_charge
+from miricigale.reduction.combine import combine, drizzle
+from miricigale.reduction.files import open_exposure
+from miricigale.reduction.results import rate_image
+from miricigale.reduction.settings import BACKENDS, check_settings
+from miricigale.reduction.slopes import fit_slopes
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.meta import provenance
-from miricigale.utils.parallel import thread_count
 from miricigale.utils.progress import progress
 from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
 
 __all__ = ["BACKENDS", "Reducer"]
-
-#: Known backends.
-BACKENDS = ("native", "jwst")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -169,52 +142,7 @@ class Reducer:
     n_threads: int | None = None
 
     def __post_init__(self):
-        if self.backend not in BACKENDS:
-            known = " or ".join(repr(name) for name in BACKENDS)
-            raise argument_error("backend", known, repr(self.backend))
-        for name in (
-            "jump_threshold", "neighbor_threshold", "shower_threshold", "negative_threshold",
-            "outlier_threshold",
-        ):  # fmt: skip
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise argument_error(name, "positive or None", value)
-        for name in ("cosmic_ray_sigma", "cosmic_ray_contrast", "filter_size"):
-            if not getattr(self, name) > 0:
-                raise argument_error(name, "positive", getattr(self, name))
-        for name in ("skip_first", "skip_last"):
-            value = getattr(self, name)
-            if value is not None and (value < 0 or int(value) != value):
-                raise argument_error(name, "an integer of at least 0", value)
-        if self.reset_anomaly is not None and not isinstance(self.reset_anomaly, ResetAnomaly):
-            raise argument_error("reset_anomaly", "a ResetAnomaly", repr(self.reset_anomaly))
-        for name, known in (
-            ("background", ("masked", "sep", "dithers")), ("negative_noise", ("larger", "background"))
-        ):  # fmt: skip
-            if getattr(self, name) not in known:
-                wanted = " or ".join(repr(value) for value in known)
-                raise argument_error(name, wanted, repr(getattr(self, name)))
-        if self.box < 4:
-            raise argument_error("box", "at least 4", self.box)
-        for name in ("saturation", "pixfrac"):
-            if not 0 < getattr(self, name) <= 1:
-                raise argument_error(name, "above 0 and at most 1", getattr(self, name))
-        if self.reference_correction not in (True, False, "channels", None):
-            wanted = "True, False, 'channels' or None"
-            raise argument_error("reference_correction", wanted, repr(self.reference_correction))
-        if self.reference_window is not None and self.reference_correction != "channels":
-            wanted = "None without reference_correction='channels'"
-            raise argument_error("reference_window", wanted, self.reference_window)
-        thread_count(self.n_threads)
-        if self.properties is not None and not isinstance(self.properties, DetectorProperties):
-            raise argument_error("properties", "a DetectorProperties", repr(self.properties))
-
-        known = (None, "none", "simulated")
-        if not isinstance(self.references, (ReferenceFiles, ReferenceCache)) and (
-            self.references not in known
-        ):
-            wanted = "ReferenceFiles, a ReferenceCache, 'none', 'simulated' or None"
-            raise argument_error("references", wanted, repr(self.references))
+        check_settings(self)
 
     replace = dataclasses.replace
 
@@ -227,12 +155,7 @@ class Reducer:
         """
         Fit the ramps of an exposure, with every plane of the result.
 
-        Parameters
-        ----------
-        ramp : `~miricigale.detector.Ramp` or `~miricigale.detector.Charge`
-            Counts in DN; or what was collected, whose slopes are drawn.
-        progress_bar : bool, optional
-            Whether a progress bar is shown.
+        Parameters are those of `fit_ramp`.
 
         Returns
         -------
@@ -274,7 +197,7 @@ class Reducer:
         if not isinstance(ramp, (Ramp, Charge)):
             raise argument_error("ramp", "a Ramp or a Charge", type(ramp).__name__)
         maps = maps_of(self, ramp)
-        rate = self._image(ramp, maps, fit_slopes(self, ramp, maps, progress_bar))
+        rate = rate_image(self, ramp, maps, fit_slopes(self, ramp, maps, progress_bar))
         return rate if planes else rate.image
 
     def fit_integrations(self, ramp, *, planes=False, progress_bar=False):
@@ -302,31 +225,9 @@ class Reducer:
         rates = []
         for number in progress(range(ramp.shape[0]), show=progress_bar, desc="integrations"):
             part, own = ramp.integration(number), maps.integration(number)
-            rates.append(self._image(part, own, fit_slopes(self, part, own)))
+            rates.append(rate_image(self, part, own, fit_slopes(self, part, own)))
             rates[-1].image.meta["integration"] = number
         return rates if planes else [rate.image for rate in rates]
-
-    def _image(self, ramp, maps, fit):
-        """What `fit_ramp` returns, with its planes."""
-        ipc = shares_charge(self, ramp)
-        meta = provenance(
-            **exposure_values(ramp.exposure),
-            n_jumps=len(fit.jumps),
-            ipc=ipc,
-            # errors of the pipeline are those of pixels that share nothing
-            noise_correction=(
-                fit.noise_correction(self.detector.ipc_kernel)
-                if ipc and self.backend == "native"
-                else 1.0
-            ),
-            gain=float(np.median(maps.gain)),
-            **history_of(self, ramp, maps),
-        )
-        rate = image(
-            fit.rate, RATE, error=fit.error, flags=fit.flags, wcs=ramp.exposure.wcs, meta=meta
-        )
-        planes = {"VAR_POISSON": fit.var_poisson, "VAR_RNOISE": fit.var_read}
-        return ImageFile(rate, planes, Header())
 
     def calibrate(self, rate):
         """
@@ -374,13 +275,6 @@ class Reducer:
             "method": method, "box": self.box, "filter_size": self.filter_size, "plane": self.plane
         }  # fmt: skip
 
-    @property
-    def _negative(self):
-        """Options of `remove_background`."""
-        return {
-            "negative_threshold": self.negative_threshold, "negative_noise": self.negative_noise
-        }  # fmt: skip
-
     def subtract_background(self, image):
         """
         Subtract the background and mask pixels far below it.
@@ -395,7 +289,10 @@ class Reducer:
         image : `~astropy.nddata.CCDData`
         background : `Background`
         """
-        return subtract_background(image, **self._negative, **self._mesh)
+        negative = {
+            "negative_threshold": self.negative_threshold, "negative_noise": self.negative_noise
+        }  # fmt: skip
+        return subtract_background(image, **negative, **self._mesh)
 
     def mosaic(self, images, wcs, *, pixfrac=None):
         """
@@ -439,21 +336,7 @@ class Reducer:
         images : list of `~astropy.nddata.CCDData`
             The inputs with outliers masked.
         """
-        images = list(images)
-        check_images(images, wcs)
-        pixfrac = self.pixfrac if pixfrac is None else pixfrac
-        weights = [weight_map(im) for im in images]
-        maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
-        check_overlap(maps, wcs.pixel_shape[::-1])
-        if self.match_sky and len(images) > 1:
-            images = match_levels(images, wcs, pixel_maps=maps)
-        judged = all(ImageFacts.of(im).n_outliers is not None for im in images)
-        if self.outlier_threshold is not None and len(images) >= 3 and not judged:
-            images = reject_outliers(
-                images, wcs, threshold=self.outlier_threshold, weights=weights, pixel_maps=maps
-            )
-        result = drizzle_images(images, wcs, pixfrac=pixfrac, weights=weights, pixel_maps=maps)
-        return result, images
+        return drizzle(self, images, wcs, pixfrac)
 
     def reduce(self, exposure):
         """
@@ -555,47 +438,4 @@ class Reducer:
         -------
         result : `ReductionResult`
         """
-        if not images:
-            raise argument_error("ramps", "at least one ramp", "none")
-        if align is not None:
-            if isinstance(align, str) and align != "dithers":
-                raise argument_error("align", "a SkyCoord, 'dithers' or None", repr(align))
-            images, _ = align_images(images, None if isinstance(align, str) else align)
-        if wcs is None:
-            wcs = mosaic_wcs([seen_wcs(im) for im in images], pixel_scale)
-        notes = []
-        if self.outlier_threshold is not None and len(images) < 3:
-            number = "a single dither" if len(images) == 1 else "two dithers"
-            notes.append(f"{number}: outliers cannot be rejected, hits that ramps kept stay in")
-        if self.background == "dithers":
-            if len(images) >= 3 and len(backgrounds) == len(images):
-                images, backgrounds = from_dithers(images, backgrounds, wcs, **self._negative)
-            else:
-                notes.append("backgrounds are those of single exposures: it takes three and theirs")
-        doubts = [BackgroundFlags.names(b.flags) for b in backgrounds if not b.trusted]
-        if doubts:
-            reasons = ", ".join(
-                sorted({name.replace("_", " ") for names in doubts for name in names})
-            )
-            notes.append(
-                f"{len(doubts)} of {len(backgrounds)} backgrounds cannot be trusted ({reasons})"
-            )
-        drizzled, images = self.drizzle(images, wcs)
-        mosaic, mosaic_background = self.subtract_background(drizzled.image)
-        if not mosaic_background.trusted:
-            reasons = ", ".join(BackgroundFlags.names(mosaic_background.flags)).replace("_", " ")
-            notes.append(f"the background of the mosaic cannot be trusted ({reasons})")
-        # the mosaic's own level would hide those of the dithers
-        mosaic.meta["mosaic_background"] = mosaic.meta.pop("background")
-        if "background" in drizzled.image.meta:
-            mosaic.meta["background"] = drizzled.image.meta["background"]
-        return ReductionResult(
-            tuple(rates),
-            tuple(images),
-            tuple(backgrounds),
-            mosaic,
-            drizzled.weight,
-            drizzled.n_images,
-            mosaic_background,
-            tuple(notes),
-        )
+        return combine(self, images, backgrounds, rates, wcs, pixel_scale, align)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from miricigale.instrument import DQ, aperture
+from miricigale.instrument import DQ, READOUT_NAMES, aperture, joined_header
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.files import open_fits
 from miricigale.utils.parallel import check_memory
@@ -23,14 +23,7 @@ __all__ = [
 #: Values of keywords that fit any exposure.
 _ANY = ("", "N/A", "ANY", "GENERIC", "*")
 
-#: Names of the read-out patterns before the launch, for those of today.
-_PATTERNS = {"FAST": "FASTR1", "SLOW": "SLOWR1"}
-
 _SPOILT = int(DQ.DO_NOT_USE)
-
-
-def _pattern(name):
-    return _PATTERNS.get(name, name)
 
 
 def _refuse(path, kind, what, got, wanted):
@@ -56,22 +49,13 @@ def _check(path, kind, header, exposure, *, reftype, filtered=False, timed=False
         wanted = exposure.filter.rpartition(".")[2].upper()
         if stated("FILTER") != wanted:
             _refuse(path, kind, "FILTER", stated("FILTER"), wanted)
-    if stated("READPATT") is not None and _pattern(stated("READPATT")) != exposure.readout:
-        _refuse(path, kind, "READPATT", _pattern(stated("READPATT")), exposure.readout)
+    readout = READOUT_NAMES.get(stated("READPATT"), stated("READPATT"))
+    if readout not in (None, exposure.readout):
+        _refuse(path, kind, "READPATT", readout, exposure.readout)
     if timed:
         for name, wanted in (("NFRAMES", 1), ("GROUPGAP", 0)):
             if header.get(name, wanted) != wanted:
                 _refuse(path, kind, name, header[name], wanted)
-
-
-def _header(hdus, name):
-    """Keywords of a file: those of the primary header, and of an extension what it lacks."""
-    header = hdus[0].header.copy(strip=True)
-    if name in hdus:
-        for card in hdus[name].header.cards:
-            if card.keyword and card.keyword not in header:
-                header.append(card)
-    return header
 
 
 def _cut(path, kind, array, header, exposure):
@@ -136,7 +120,7 @@ def _read(path, exposure, kind, reftype, extension="SCI", **options):
         if extension not in hdus:
             msg = f"{path} cannot be read as {wanted}: it has {[hdu.name for hdu in hdus]}"
             raise DataError(msg)
-        header = _header(hdus, extension)
+        header = joined_header(hdus, extension)
         _check(path, kind, header, exposure, reftype=reftype, **options)
         shape = hdus[extension].shape
         if len(shape) < 2:
@@ -156,7 +140,7 @@ def read_mask(path, exposure):
         if "DQ" not in hdus:
             msg = f"{path} cannot be read as {wanted}: it has {[hdu.name for hdu in hdus]}"
             raise DataError(msg)
-        header = _header(hdus, "DQ")
+        header = joined_header(hdus, "DQ")
         _check(path, "mask", header, exposure, reftype="MASK")
         return None, _flags(path, "mask", hdus, header, exposure)
 
@@ -265,7 +249,7 @@ def read_photom(path, exposure, day):
         if "PHOTOM" not in hdus:
             msg = f"{path} cannot be read as {wanted}: it has {[hdu.name for hdu in hdus]}"
             raise DataError(msg)
-        header = _header(hdus, "PHOTOM")
+        header = joined_header(hdus, "PHOTOM")
         for name, value in (("REFTYPE", "PHOTOM"), ("INSTRUME", "MIRI"), ("DETECTOR", "MIRIMAGE")):
             if str(header.get(name, value)).strip().upper() not in (value, *_ANY):
                 _refuse(path, "photom", name, header[name], value)

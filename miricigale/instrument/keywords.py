@@ -1,0 +1,114 @@
+"""What the header of a file of the pipeline says: what was exposed, and what was done to it."""
+
+from astropy.io import fits
+
+__all__ = ["READOUT_NAMES", "STEPS", "exposure_keywords", "joined_header", "steps_done"]
+
+#: Read-out patterns by the names that they had before the launch.
+READOUT_NAMES = {"FAST": "FASTR1", "SLOW": "SLOWR1"}
+
+#: Where the light is blocked there is no filter.
+_NO_FILTER = ("", "OPAQUE", "N/A", "ANY")
+
+#: Steps of the JWST pipeline by the keywords that tell of them.
+STEPS = {
+    "S_DQINIT": "dq_init",
+    "S_SATURA": "saturation",
+    "S_IPC": "ipc",
+    "S_FRSTFR": "firstframe",
+    "S_LASTFR": "lastframe",
+    "S_SUPERB": "superbias",
+    "S_RESET": "reset",
+    "S_LINEAR": "linearity",
+    "S_RSCD": "rscd",
+    "S_DARK": "dark",
+    "S_REFPIX": "refpix",
+    "S_JUMP": "jump",
+    "S_GANSCL": "gain_scale",
+    "S_RAMP": "ramp_fit",
+    "S_FLAT": "flat",
+    "S_BKDSUB": "background",
+    "S_PHOTOM": "photom",
+    "S_SKYMAT": "skymatch",
+    "S_OUTLIR": "outlier",
+    "S_RESAMP": "resample",
+}
+
+
+def steps_done(header):
+    """
+    Steps that a file has behind it.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header`
+        Of the primary extension.
+
+    Returns
+    -------
+    steps : frozenset of str
+        Names of `STEPS` whose keyword says COMPLETE.
+    """
+    return frozenset(
+        step
+        for keyword, step in STEPS.items()
+        if str(header.get(keyword, "")).strip().upper() == "COMPLETE"
+    )
+
+
+def joined_header(hdus, name="SCI"):
+    """
+    Keywords of a file.
+
+    Parameters
+    ----------
+    hdus : `~astropy.io.fits.HDUList`
+        The file.
+    name : str, optional
+        Of an extension, which need not be there.
+
+    Returns
+    -------
+    header : `~astropy.io.fits.Header`
+        Those of the primary header, and of the extension what it lacks, but for the layout of the file.
+    """
+    header = hdus[0].header.copy(strip=True)
+    science = hdus[name].header.copy(strip=True) if name in hdus else fits.Header()
+    for name in ("BSCALE", "BZERO", "EXTNAME", "EXTVER", "EXTEND", "NEXTEND"):
+        header.remove(name, ignore_missing=True)
+        science.remove(name, ignore_missing=True)
+    for card in science.cards:
+        if (
+            card.keyword
+            and card.keyword not in header
+            and card.keyword not in ("COMMENT", "HISTORY")
+        ):
+            header.append(card)
+    return header
+
+
+def exposure_keywords(header):
+    """
+    What was exposed, in the names of this package.
+
+    Parameters
+    ----------
+    header : `~astropy.io.fits.Header`
+        As `joined_header` makes it.
+
+    Returns
+    -------
+    filter, readout, subarray : str or None
+        None where the header says nothing; without a filter also where the light was blocked.
+    dither : int
+        Position in the pattern of dithers, from 0.
+    """
+    name, pattern, part = (
+        str(header.get(key, "")).strip() for key in ("FILTER", "READPATT", "SUBARRAY")
+    )
+    return (
+        None if name in _NO_FILTER else f"miri.{name.lower()}",
+        READOUT_NAMES.get(pattern, pattern) or None,
+        part or None,
+        max(int(header.get("PATT_NUM", 1)), 1) - 1,
+    )

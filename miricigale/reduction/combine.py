@@ -1,0 +1,116 @@
+"""The images of one filter put together: aligned, on one level, without outliers, drizzled."""
+
+from miricigale.instrument import ImageFacts, mosaic_wcs
+from miricigale.reduction.align import align_images
+from miricigale.reduction.background import BackgroundFlags
+from miricigale.reduction.dither_background import from_dithers
+from miricigale.reduction.images import check_images, check_overlap, seen_wcs
+from miricigale.reduction.mosaic import drizzle_images, pixel_map, reject_outliers, weight_map
+from miricigale.reduction.results import ReductionResult
+from miricigale.reduction.sky_match import match_levels
+from miricigale.utils.exceptions import argument_error
+
+__all__ = ["combine", "drizzle"]
+
+
+def drizzle(reducer, images, wcs, pixfrac=None):
+    """
+    As `~miricigale.reduction.Reducer.drizzle`.
+
+    Parameters
+    ----------
+    reducer : `~miricigale.reduction.Reducer`
+        Settings.
+    images, wcs, pixfrac
+        As of that method.
+
+    Returns
+    -------
+    mosaic : `~miricigale.reduction.Mosaic`
+    images : list of `~astropy.nddata.CCDData`
+        The inputs on one level, with outliers masked.
+    """
+    images = list(images)
+    check_images(images, wcs)
+    pixfrac = reducer.pixfrac if pixfrac is None else pixfrac
+    weights = [weight_map(im) for im in images]
+    maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
+    check_overlap(maps, wcs.pixel_shape[::-1])
+    if reducer.match_sky and len(images) > 1:
+        images = match_levels(images, wcs, pixel_maps=maps)
+    judged = all(ImageFacts.of(im).n_outliers is not None for im in images)
+    if reducer.outlier_threshold is not None and len(images) >= 3 and not judged:
+        images = reject_outliers(
+            images, wcs, threshold=reducer.outlier_threshold, weights=weights, pixel_maps=maps
+        )
+    result = drizzle_images(images, wcs, pixfrac=pixfrac, weights=weights, pixel_maps=maps)
+    return result, images
+
+
+def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align):
+    """
+    As `~miricigale.reduction.Reducer.combine`.
+
+    Parameters
+    ----------
+    reducer : `~miricigale.reduction.Reducer`
+        Settings.
+    images, backgrounds, rates, wcs, pixel_scale, align
+        As of that method.
+
+    Returns
+    -------
+    result : `~miricigale.reduction.ReductionResult`
+    """
+    if not images:
+        raise argument_error("ramps", "at least one ramp", "none")
+    if align is not None:
+        if isinstance(align, str) and align != "dithers":
+            raise argument_error("align", "a SkyCoord, 'dithers' or None", repr(align))
+        images, _ = align_images(images, None if isinstance(align, str) else align)
+    if wcs is None:
+        wcs = mosaic_wcs([seen_wcs(im) for im in images], pixel_scale)
+    notes = []
+    if reducer.outlier_threshold is not None and len(images) < 3:
+        number = "a single dither" if len(images) == 1 else "two dithers"
+        notes.append(f"{number}: outliers cannot be rejected, hits that ramps kept stay in")
+    if reducer.background == "dithers":
+        if len(images) >= 3 and len(backgrounds) == len(images):
+            images, backgrounds = from_dithers(
+                images,
+                backgrounds,
+                wcs,
+                negative_threshold=reducer.negative_threshold,
+                negative_noise=reducer.negative_noise,
+            )
+        else:
+            notes.append("backgrounds are those of single exposures: it takes three and theirs")
+    doubts = [b for b in backgrounds if not b.trusted]
+    if doubts:
+        told = f"{len(doubts)} of {len(backgrounds)} backgrounds cannot be trusted"
+        notes.append(f"{told} ({_reasons(doubts)})")
+    drizzled, images = drizzle(reducer, images, wcs)
+    mosaic, mosaic_background = reducer.subtract_background(drizzled.image)
+    if not mosaic_background.trusted:
+        reasons = _reasons([mosaic_background])
+        notes.append(f"the background of the mosaic cannot be trusted ({reasons})")
+    # the mosaic's own level would hide those of the dithers
+    mosaic.meta["mosaic_background"] = mosaic.meta.pop("background")
+    if "background" in drizzled.image.meta:
+        mosaic.meta["background"] = drizzled.image.meta["background"]
+    return ReductionResult(
+        tuple(rates),
+        tuple(images),
+        tuple(backgrounds),
+        mosaic,
+        drizzled.weight,
+        drizzled.n_images,
+        mosaic_background,
+        tuple(notes),
+    )
+
+
+def _reasons(backgrounds):
+    """Why backgrounds cannot be trusted."""
+    names = {name for one in backgrounds for name in BackgroundFlags.names(one.flags)}
+    return ", ".join(sorted(names)).replace("_", " ")

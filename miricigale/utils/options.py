@@ -1,0 +1,33 @@
+"""Plain options, checked before anything is done with them."""
+
+import numbers
+
+from miricigale.utils.exceptions import argument_error
+
+__all__ = ["check_choice", "check_kind", "check_least", "check_positive"]
+
+
+def check_choice(value, name, known):
+    """Refuse a value that is none of those known (a `ValueError`)."""
+    if value not in known:
+        raise argument_error(name, " or ".join(repr(one) for one in known), repr(value))
+
+
+def check_kind(value, name, kind):
+    """Refuse what is neither None nor of a class (a `ValueError`)."""
+    if value is not None and not isinstance(value, kind):
+        raise argument_error(name, f"a {kind.__name__}", repr(value))
+
+
+def check_least(value, name, least):
+    """Refuse what is no number, or below ``least`` (a `ValueError`)."""
+    if not (isinstance(value, numbers.Real) and value >= least):
+        raise argument_error(name, f"at least {least}", value)
+
+
+def check_positive(value, name, *, optional=False):
+    """Refuse what is no number above 0 (a `ValueError`); with ``optional``, None passes."""
+    if optional and value is None:
+        return
+    if not (isinstance(value, numbers.Real) and value > 0):
+        raise argument_error(name, "positive or None" if optional else "positive", value)
