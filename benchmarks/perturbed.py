@@ -5,7 +5,8 @@ What it costs that the analysis does not know the sky: the table of docs/guide/w
 
 runs the preset ``goodss`` with all effects on a sky of fracAGN 0.4, all bands and the full grid, as rates of one
 dither, until the fits, and prints accuracies and their changes with the number of sources in common. A run
-that was stopped goes on; ``--only-table`` takes the skies that stand in the folder.
+that was stopped goes on; ``--only-table`` takes the skies that stand in the folder, ``--only NAME`` (repeated)
+makes these and the one without effects.
 """
 
 import argparse
@@ -60,6 +61,7 @@ def main():
     parser.add_argument("folder", type=Path)
     parser.add_argument("--set", action="append", default=[], metavar="section.key=value")
     parser.add_argument("--only-table", action="store_true")
+    parser.add_argument("--only", action="append", default=[], metavar="NAME")
     arguments = parser.parse_args()
     values = {name: dict(section) for name, section in STUDY.items()}
     for text in arguments.set:
@@ -68,7 +70,11 @@ def main():
     config = load_config("goodss", overrides=values)
     if not arguments.only_table:
         with process_pool(config.run.threads) as executor:
-            run_study(config, arguments.folder, executor=executor, until="fits", progress_bar=True)
+            skies = ["agn40", *(f"agn40+{name}" for name in arguments.only)]
+            for until in [f"fits:{sky}/*" for sky in skies] if arguments.only else ["fits"]:
+                run_study(
+                    config, arguments.folder, executor=executor, until=until, progress_bar=True
+                )
     show(config, arguments.folder)
 
 

@@ -154,7 +154,7 @@ class Perturbation:
 
     def with_flat(self, image, exposure):
         """
-        Light that makes of the known flat field another one, of another detector of the kind.
+        Light that makes of the known flat field one that is in part that of another detector of the kind.
 
         Parameters
         ----------
@@ -167,10 +167,10 @@ class Perturbation:
         -------
         image : `~astropy.nddata.CCDData`
         """
-        if "flat" in self.effects:
+        if self.effects.get("flat"):
             seed = int(self._random("flat").integers(2**31))
             flat = functools.partial(flat_field, exposure.filter, subarray=exposure.subarray)
-            image.data *= flat(seed=seed) / flat()
+            image.data *= 1.0 + self.effects["flat"] * (flat(seed=seed) / flat() - 1.0)
         return image
 
 

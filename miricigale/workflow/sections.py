@@ -331,6 +331,12 @@ class PerturbSection:
         single=True,
     )
     psf_width: float = option(0.02, "Relative width of the PSF, + or - by band.", low=0.0, high=0.2)
+    flat: float = option(
+        1.0,
+        "Share of the flat field that is another detector's, pixel by pixel.",
+        low=0.0,
+        high=1.0,
+    )
     gain: float = option(0.01, "Relative gain.", low=-0.2, high=0.2)
     linearity: float = option(0.01, "Relative signal near a full well.", low=-0.1, high=0.1)
     zero_point: float = option(

@@ -240,7 +240,7 @@ def test_flat_is_that_of_another_detector():
     exposure = Exposure(BAND, pointing=sources()["sky"][0], roll=0 * u.deg, n_groups=10)
     image = CCDData(np.full(exposure.shape, 5.0), unit="MJy/sr")
     known = flat_field(BAND)
-    seen = Perturbation({"flat": None}, SEED).with_flat(image, exposure).data * known / 5
+    seen = Perturbation({"flat": 1.0}, SEED).with_flat(image, exposure).data * known / 5
     # pixels by 1 %, independent of those that the reduction divides by
     inner = np.s_[:, 4:-4]
     pixels = [np.diff(flat[inner]).ravel() for flat in (seen, known)]
@@ -248,6 +248,11 @@ def test_flat_is_that_of_another_detector():
     assert abs(np.corrcoef(*pixels)[0, 1]) < 0.01
     assert seen[inner].mean() == pytest.approx(1, abs=1e-5)
     assert flat_field(BAND) is known or np.array_equal(flat_field(BAND), known)
+    # a tenth of the difference: that of two independent draws
+    image = CCDData(np.full(exposure.shape, 5.0), unit="MJy/sr")
+    tenth = Perturbation({"flat": 0.1}, SEED).with_flat(image, exposure).data * known / 5
+    off = np.diff((tenth / known)[inner]).ravel()
+    assert np.std(off) == pytest.approx(0.1 * np.sqrt(2) * np.std(pixels[1]), rel=0.03)
 
 
 def parameters():
@@ -441,7 +446,7 @@ def test_another_flat_takes_the_place_of_the_known_one(chain):
     # pixels share some of their charge with their neighbors
     assert imprint(chain({})[0]) == pytest.approx(0.9, abs=0.12)
     # 57,000 pixels of 1 %, whose slopes have errors of 6 %
-    assert imprint(chain({"flat": None})[0]) == pytest.approx(0, abs=0.12)
+    assert imprint(chain({"flat": 1.0})[0]) == pytest.approx(0, abs=0.12)
 
 
 def test_another_linearity_shows_where_wells_are_full(chain):

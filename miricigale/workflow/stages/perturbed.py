@@ -154,12 +154,13 @@ def write_perturbed(context, report, truths, every):
         "What the analysis does not know",
         "Skies that differ from what reduction, photometry and fits take them for, one effect at a time "
         f"and together: a PSF of another wavefront, or {100 * options.psf_width:g} % wider or narrower; "
-        f"another flat field; a gain other by {100 * options.gain:g} % (which the conversion to fluxes "
-        f"does not know either); a signal other by {100 * options.linearity:g} % at the full well; fluxes "
-        f"{100 * options.zero_point:g} % (MIRI) and {100 * options.zero_point_existing:g} % (existing bands) "
-        f"higher or lower, and positions {1000 * options.astrometry:g} mas off, by band; sources of other "
-        f"models, and of other shapes than the prior shows{_shapes(config, truths)}. Kernels, error "
-        "functions, templates and grids stay as they are.",
+        f"a flat field that is another detector's by {100 * options.flat:g} %; a gain other by "
+        f"{100 * options.gain:g} % (which the conversion to fluxes does not know either); a signal other by "
+        f"{100 * options.linearity:g} % at the full well; fluxes {100 * options.zero_point:g} % (MIRI) and "
+        f"{100 * options.zero_point_existing:g} % (existing bands) higher or lower, and positions "
+        f"{1000 * options.astrometry:g} mas off, by band; sources of other models, and of other shapes than "
+        f"the prior shows{_shapes(config, truths)}. Kernels, error functions, templates and grids stay as they "
+        "are.",
     )
     quantities = list(dict.fromkeys(table["quantity"]))
     cells = {(row["truth"], row["perturbation"], row["quantity"]): row for row in table}
