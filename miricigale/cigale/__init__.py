@@ -8,7 +8,8 @@ __getattr__, __dir__, __all__ = lazy_names(
         "best_models": ("best_model_table", "write_best_models"),
         "catalog": ("cigale_columns", "read_cigale_catalog"),
         "results": ("read_cigale_results", "write_cigale_results"),
-        "setup": ("CigaleSetup", "fit_cigale", "read_pcigale_ini"),
+        "run": ("fit_cigale", "read_pcigale_ini"),
+        "setup": ("CigaleSetup",),
     },
     moved={"miricigale.filters": ("cigale_band", "filter_of_band")},
 )

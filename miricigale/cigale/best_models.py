@@ -11,13 +11,13 @@ from miricigale.cigale.names import AGN_PARTS, cigale_names
 from miricigale.filters import Filter
 from miricigale.filters.band_names import filter_of_band
 from miricigale.sed.spectrum import distance
+from miricigale.sed.xray_bands import disk_2500
 from miricigale.utils.store import replacing
 
 __all__ = ["best_model_table", "write_best_models"]
 
 _LYMAN = 0.0912  # um
 _LIGHT = 299792458.0  # m/s
-_BLUE = 0.25  # um
 _AGN_COLUMNS = {"torus": "torus", "polar": "polar_dust", "disk": "disk"}
 
 
@@ -82,7 +82,7 @@ def best_model_table(model, parameters, *, modules=None, bands=("B_B90", "V_B90"
             light = power * getattr(nucleus, name)
             parts[f"agn.SKIRTOR2016_{told}"] = light
             quantities[AGN_PARTS[name][1]] = float(chain.weights @ light)
-        slope = derived["accretion_power"] * _intrinsic(chain, model.component("agn"), values)
+        slope = derived["accretion_power"] * disk_2500(chain, model.component("agn"), values)
         quantities["agn.intrin_Lnu_2500A_30deg"] = slope
     total = sum(parts.values())
     parts["igm"] = total * (chain.sky(values) - 1.0)
@@ -130,15 +130,6 @@ def _stars(model, values):
     for name in ("n_ly", "lum", "lum_ly"):
         found[f"stellar.{name}"] = found[f"stellar.{name}_young"] + found[f"stellar.{name}_old"]
     return out, found
-
-
-def _intrinsic(chain, agn, values):
-    """L_nu at 0.25 um seen at 30 deg, without dust, in W/Hz for each watt of accretion power."""
-    face_on = agn.torus_spectra(chain.wave, values | {"inclination": 0.0}).face_on
-    mu = np.cos(np.radians(30.0))
-    # the disk shines as cos i (1 + 2 cos i) / 3; accretion power is 7/18 of the face-on integral
-    light = np.interp(_BLUE, chain.wave, face_on) / (7.0 / 18.0 * (chain.weights @ face_on))
-    return light * mu * (1.0 + 2.0 * mu) / 3.0 * _BLUE**2 * 1e-6 / _LIGHT
 
 
 def _attenuation(chain, parts, bands):

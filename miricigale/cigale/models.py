@@ -17,6 +17,11 @@ _MOST = 2_000_000
 
 def save_models(setup, path, redshifts, *, overwrite):
     """See `CigaleSetup.save_models`."""
+    if setup.xray_bands():
+        msg = (
+            f"{setup.path}: models in X-ray bands ({', '.join(setup.xray_bands())}) are not written"
+        )
+        raise ConfigError(msg)
     axes = setup.axes(redshifts)
     count = int(np.prod([len(values) for values in axes.values()], dtype=float))
     if count > _MOST:

@@ -10,6 +10,7 @@ from miricigale.cigale.ini import parse_values
 from miricigale.cigale.names import cigale_names
 from miricigale.refdata import find_resource
 from miricigale.sed import components as c
+from miricigale.sed.xray_bands import ALPHA_OX
 from miricigale.utils.exceptions import ConfigError
 from miricigale.utils.files import read_table
 
@@ -39,6 +40,7 @@ class Chain:
     redshift: object = None
     modules: dict = field(default_factory=dict)
     frac_agn_definition: str = "dust"
+    xray: dict = field(default_factory=dict)
     left_out: list = field(default_factory=list)
     replaced: list = field(default_factory=list)
     differs: list = field(default_factory=list)
@@ -306,14 +308,29 @@ def _definition(m):
 
 
 def _xray(m):
-    values = {"photon_index": ("gam", np.array([m.one("gam", 1.8)]))}
-    m.ignore("E_cut", "alpha_ox", "max_dev_alpha_ox", "angle_coef")
-    m.ignore("gam_lmxb", "gam_hmxb", "det_lmxb", "det_hmxb")
-    m.chain.differs.append("xray: of the AGN alone, from L(6 um), without a part in the fit")
-    if m.chain.modules.get("agn") is None:
-        m.chain.left_out.append("xray (without skirtor2016)")
-        return
-    m.add(c.XRay, values)
+    """Options of `~miricigale.sed.with_xray_bands`; angles count since there is a parameter of them."""
+    text = m.text("angle_coef", "0 & 0").replace("/", "&")
+    try:
+        first, second = (float(part) for part in text.split("&"))
+    except ValueError:
+        msg = f"xray.angle_coef must be one pair of numbers as 0.5 & 0, got {text!r}"
+        raise ConfigError(msg) from None
+    m.chain.xray = {
+        "alpha_ox": m.numbers("alpha_ox", ALPHA_OX),
+        "photon_index": m.one("gam", 1.8),
+        "cutoff": m.one("E_cut", 300.0) * u.keV,
+        "angle_coefficients": (first, second),
+        "lmxb": m.one("det_lmxb", 0.0),
+        "hmxb": m.one("det_hmxb", 0.0),
+        "lmxb_index": m.one("gam_lmxb", 1.56),
+        "hmxb_index": m.one("gam_hmxb", 2.0),
+    }
+    if not m.has("alpha_ox"):
+        m.chain.differs.append("xray: not in the file, the default here: alpha_ox = -1.9 to -1.1")
+    most = m.one("max_dev_alpha_ox", 0.2)
+    if most > 0:
+        text = "no model is refused for its distance from the relation of Just et al. 2007"
+        m.chain.left_out.append(f"xray.max_dev_alpha_ox = {most:g} ({text})")
 
 
 def _redshifting(m):

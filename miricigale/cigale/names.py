@@ -65,6 +65,9 @@ _PARAMETERS = (
     ("agn_luminosity", "agn.luminosity", "W"),
     ("accretion_power", "agn.accretion_power", "W"),
     ("l_6um", "agn.L_6um", "W"),
+    ("alpha_ox", "xray.alpha_ox", ""),
+    ("l_2500", "agn.intrin_Lnu_2500A_30deg", "W / Hz"),
+    ("l_2_10kev", "xray.agn_Lx_2to10keV", "W"),
     ("beta", "param.beta_calz94", ""),
     *((ours, theirs, "W") for ours, theirs in AGN_PARTS.values()),
 )

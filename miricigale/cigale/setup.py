@@ -1,28 +1,26 @@
-"""A run of CIGALE: read from ``pcigale.ini``, as a model, a grid and a fit here."""
+"""A run of CIGALE as a model, a grid and a fit here."""
 
 import dataclasses
-import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import astropy.units as u
 import numpy as np
 
-from miricigale.cigale.best_models import write_best_models
-from miricigale.cigale.catalog import GIVE_FILTER, read_cigale_catalog
+from miricigale.cigale.catalog import read_cigale_catalog
 from miricigale.cigale.distances import at_their_distances
-from miricigale.cigale.ini import LIMIT_FLAGS, parse_ini
 from miricigale.cigale.models import save_models, with_agn_parts
-from miricigale.cigale.modules import read_modules
-from miricigale.cigale.names import AGN_PARTS, cigale_names
+from miricigale.cigale.names import AGN_PARTS
 from miricigale.cigale.results import described, write_cigale_results
-from miricigale.filters.band_names import band_filters, given_filters
+from miricigale.filters.band_names import xray_energies
 from miricigale.filters.filter_set import FilterSet
 from miricigale.fitting import BayesFitter, FitResults
 from miricigale.sed import SEDModel
-from miricigale.utils.exceptions import ConfigError, MiricigaleWarning, argument_error
-from miricigale.utils.tables import error_column, require_columns
+from miricigale.sed.xray_bands import with_xray_bands, xray_filter
+from miricigale.utils.exceptions import ConfigError, argument_error
+from miricigale.utils.tables import require_columns
 
-__all__ = ["CigaleSetup", "fit_cigale", "read_pcigale_ini"]
+__all__ = ["CigaleSetup"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -71,6 +69,8 @@ class CigaleSetup:
         that differ.
     names : dict of str to `~miricigale.filters.Filter`
         Filters that the user gave for bands, by CIGALE's names.
+    xray : dict
+        Options of `~miricigale.sed.with_xray_bands`; empty without X-rays.
     """
 
     path: Path
@@ -94,6 +94,7 @@ class CigaleSetup:
     replaced: tuple = ()
     differs: tuple = ()
     names: dict = field(default_factory=dict)
+    xray: dict = field(default_factory=dict)
 
     def __repr__(self):
         parts = " -> ".join(component.name for component in self.components)
@@ -186,8 +187,14 @@ class CigaleSetup:
             Our names; those of ``bands`` and ``predicted`` by default.
         """
         given = {one.name: one for one in self.names.values()}
+        given |= {name: xray_filter(name, band) for name, band in self.xray_bands().items()}
         names = [*self.bands, *self.predicted] if names is None else names
         return FilterSet([given.get(name, name) for name in names])
+
+    def xray_bands(self):
+        """X-ray bands among ``bands`` and ``predicted``: name to lowest and highest energy."""
+        names = [name for name in (*self.bands, *self.predicted) if xray_energies(name)]
+        return {name: xray_energies(name) * u.keV for name in names if name not in self.names}
 
     def fitter(self, photometry, *, compat="cigale", **options):
         """
@@ -212,10 +219,15 @@ class CigaleSetup:
             wanted = f"a table with at least one of the columns {list(self.bands)}"
             raise argument_error("photometry", wanted, f"columns {photometry.colnames}")
         redshifts = photometry["redshift"] if "redshift" in photometry.colnames else None
-        grid = self.model().grid(self.axes(redshifts), self.filters([*have, *self.predicted]))
-        wanted = set(self.variables) & {theirs for _, theirs in AGN_PARTS.values()}
-        if wanted or not self.variables:
+        xray, wanted = self.xray_bands(), [*have, *self.predicted]
+        bands = self.filters([name for name in wanted if name not in xray])
+        grid = self.model().grid(self.axes(redshifts), bands)
+        parts = {theirs for _, theirs in AGN_PARTS.values()}
+        if parts.intersection(self.variables) or not self.variables:
             grid = with_agn_parts(grid, self.model())
+        xray = {name: band for name, band in xray.items() if name in wanted}
+        if xray:
+            grid = with_xray_bands(grid, self.model(), xray, **self.xray)
         options = {"model_error": self.additional_error} | options
         if compat is not None:
             options["compat"] = compat
@@ -325,165 +337,3 @@ def _by_redshift(fitter, photometry, z, known):
     at = fitter.fit(photometry, redshift=np.where(fixed, z, fitter.grid.redshift[0]), **known)
     rows = np.concatenate([np.flatnonzero(~fixed), np.flatnonzero(fixed)])
     return FitResults.concatenate([free[~fixed], at[fixed]])[np.argsort(rows)]
-
-
-def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
-    """
-    Read the configuration of a run of CIGALE.
-
-    Parameters
-    ----------
-    path : path-like
-        ``pcigale.ini`` of CIGALE 2018 to 2022, with a grid of parameters for the analysis
-        ``pdf_analysis``.
-    libraries : {"best", "bundled"}, optional
-        Whether libraries that are registered (`miricigale.sed`) are used, or the bundled tables
-        alone.
-    names : dict, optional
-        Filters of bands that are not known, or otherwise known: by CIGALE's name a
-        `~miricigale.filters.Filter`, the name of one, or the path of its file, as for `read_cigale_catalog`.
-    strict : bool, optional
-        Whether anything that is left out or replaced is an error, not a warning.
-
-    Returns
-    -------
-    setup : `CigaleSetup`
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.DataError`
-        If the file, or that of a filter, cannot be read.
-    KeyError
-        If there is no filter of a name in ``names``.
-    `~miricigale.utils.exceptions.ConfigError`
-        If a value cannot be read, a parameter is not known while one that is would get its default, nothing
-        can be fitted, or with ``strict``, something would be left out or replaced.
-
-    Warns
-    -----
-    `~miricigale.utils.exceptions.MiricigaleWarning`
-        Of all that is left out, replaced or different, in one message.
-    """
-    path = Path(path)
-    if libraries not in ("best", "bundled"):
-        raise argument_error("libraries", "'best' or 'bundled'", repr(libraries))
-    config = parse_ini(path)
-    analysis = config["analysis_params"]
-    names = given_filters(names)
-    if config["parameters_file"]:
-        msg = f"{path}: lists of models (parameters_file) are not read, grids are"
-        raise ConfigError(msg)
-    try:
-        chain = read_modules(
-            config["sed_modules"],
-            config["sed_modules_params"],
-            folder=path.parent,
-            libraries=libraries,
-        )
-        columns = config["bands"]
-        bands, lost = band_filters(dict.fromkeys(c.removesuffix("_err") for c in columns), names)
-        wanted = [band for band in analysis["bands"] if band not in bands.values()]
-        predicted, more = band_filters(dict.fromkeys(wanted), names)
-    except (ConfigError, ValueError) as err:
-        msg = f"{path}: {err}"
-        raise ConfigError(msg) from err
-    if not bands:
-        msg = f"{path}: no band is known here, of {', '.join(lost) or 'none'}"
-        raise ConfigError(msg)
-    for band in bands.values():
-        if band not in columns:
-            msg = f"{path}: {error_column(band)} is among the bands, and {band} is not"
-            raise ConfigError(msg)
-    known = {theirs for theirs, *_ in cigale_names(chain.modules).values()}
-    variables = analysis["variables"]
-    chain.left_out[:] = [
-        *(f"module {x}" if "." not in x and " " not in x else x for x in chain.left_out),
-        *_bands_without_filter(dict.fromkeys([*lost, *more])),
-        *(f"variable {x}" for x in variables if x not in known),
-        *(f"property {x}" for x in config["properties"] if not x.endswith("_err")),
-    ]
-    extended = [x for x in {**bands, **predicted}.values() if x.endswith("_ext") and x not in names]
-    if extended:
-        chain.differs.append(f"bands {', '.join(extended)}: curves of point sources")
-    flag = analysis["lim_flag"]
-    if flag == "noscaling":
-        chain.differs.append("lim_flag noscaling: upper limits act on the scale too, as with full")
-    setup = CigaleSetup(
-        path=path,
-        data_file=path.parent / config["data_file"] if config["data_file"] else None,
-        bands=bands,
-        predicted={name: band for name, band in predicted.items() if name not in bands},
-        columns=tuple(c for c in columns if c.removesuffix("_err") in bands.values()),
-        variables=tuple(name for name in variables if name in known),
-        additional_error=config["additionalerror"],
-        limits=LIMIT_FLAGS[flag] != "none",
-        redshift_decimals=analysis["redshift_decimals"],
-        mock=analysis["mock_flag"],
-        cores=config["cores"],
-        method=config["analysis_method"],
-        names=names,
-        **{k: tuple(v) if isinstance(v, list) else v for k, v in vars(chain).items()},
-    )
-    text = setup.describe()
-    if strict and (setup.left_out or setup.replaced):
-        msg = f"{path}:\n{text}"
-        raise ConfigError(msg)
-    if text:
-        warnings.warn(f"{path}:\n{text}", MiricigaleWarning, stacklevel=2)
-    return setup
-
-
-def _bands_without_filter(bands):
-    """Items of what is left out; the last one says what to do."""
-    items = [f"band {band}" for band in bands]
-    return [*items[:-1], f"{items[-1]} (no filter here: {GIVE_FILTER})"] if items else []
-
-
-def fit_cigale(
-    ini, *, output=None, best_models=None, libraries="best", names=None, strict=False, **options
-):
-    """
-    Do what a run of CIGALE does: read configuration and catalog, fit, write.
-
-    Parameters
-    ----------
-    ini : path-like or `CigaleSetup`
-        ``pcigale.ini``, or what `read_pcigale_ini` made of it.
-    output : path-like, optional
-        File of results in CIGALE's columns (``results.fits`` or ``.txt``), replaced if it is
-        there.
-    best_models : path-like, optional
-        Folder of files of the best models (`write_best_models`), replaced if they are there.
-    libraries, names, strict : optional
-        As for `read_pcigale_ini`; no use for a `CigaleSetup`.
-    **options
-        Passed to `CigaleSetup.fit`.
-
-    Returns
-    -------
-    results : `~miricigale.fitting.FitResults`
-
-    Raises
-    ------
-    `~miricigale.utils.exceptions.ConfigError`
-        If the configuration is one of ``savefluxes``, which `CigaleSetup.save_models` does; as
-        `read_pcigale_ini`.
-
-    Examples
-    --------
-    >>> from miricigale.cigale import fit_cigale
-    >>> results = fit_cigale("pcigale.ini", output="results.fits")  # doctest: +SKIP
-    """
-    setup = ini
-    if not isinstance(ini, CigaleSetup):
-        setup = read_pcigale_ini(ini, libraries=libraries, names=names, strict=strict)
-    if setup.method == "savefluxes":
-        msg = f"{setup.path} asks for the models (savefluxes): CigaleSetup.save_models writes them"
-        raise ConfigError(msg)
-    photometry = setup.catalog(strict=strict)
-    results = setup.fit(photometry, **options)
-    if output is not None:
-        setup.write_results(results, output, overwrite=True)
-    if best_models is not None:
-        write_best_models(results, best_models, overwrite=True)
-    return results

@@ -9,7 +9,14 @@ from miricigale.filters.filter import Filter
 from miricigale.filters.library import SEDPY, curve_folder
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["band_filters", "cigale_band", "filter_of_band", "given_filters", "is_line"]
+__all__ = [
+    "band_filters",
+    "cigale_band",
+    "filter_of_band",
+    "given_filters",
+    "is_line",
+    "xray_energies",
+]
 
 #: Names without a rule: CIGALE's to ours.
 _NAMES = {
@@ -85,6 +92,7 @@ _RULES = (
     (r"SC_I[AB](\d{3})", "sedpy.subaru_suprimecam_ia{0}", None),
     (r"SC_(B|V|rp|ip|zp)", "sedpy.subaru_suprimecam_{0}", None),
 )
+_XRAY = re.compile(r"xray_boxcar_(\d+(?:p\d+)?)to(\d+(?:p\d+)?)keV")
 _COMPILED = tuple((re.compile(rule), ours, back) for rule, ours, back in _RULES)
 
 #: Instruments whose names are written in many ways, in any case and with any of . _ between the parts;
@@ -211,17 +219,24 @@ def is_line(band):
     return band.startswith(("line.", "linefilter."))
 
 
+def xray_energies(band):
+    """Lowest and highest energy in keV of a band of CIGALE such as ``xray_boxcar_0p5to2keV``; None of others."""
+    match = _XRAY.fullmatch(band)
+    ends = match and tuple(float(text.replace("p", ".")) for text in match.groups())
+    return ends if ends and 0 < ends[0] < ends[1] else None
+
+
 def band_filters(bands, known):
     """
     Filters of bands: a dict of our name to CIGALE's, and the bands without a filter here.
 
     ``known`` are filters that the user gave by CIGALE's names, as `given_filters` has them. Emission lines
-    have no filter; two bands of the same filter are a ValueError.
+    have no filter; two bands of the same filter are a ValueError. X-ray bands (`xray_energies`) keep their names.
     """
     filters, lost = {}, []
     for band in bands:
         given = known.get(band)
-        name = filter_of_band(band) if given is None else given.name
+        name = (filter_of_band(band) or _xray(band)) if given is None else given.name
         name = None if is_line(band) else name
         if name is None:
             lost.append(band)
@@ -231,6 +246,10 @@ def band_filters(bands, known):
         else:
             filters[name] = band
     return filters, lost
+
+
+def _xray(band):
+    return band if xray_energies(band) else None
 
 
 def given_filters(names):

@@ -27,6 +27,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "presets": ("COMPONENTS", "survey_axes", "yang2021_axes"),
         "spectrum": ("COSMOLOGY", "SED", "ModelSpectra"),
         "tables": ("ModelFlags",),
+        "xray_bands": ("with_xray_bands",),
         "xray": ("XRay", "band_luminosity", "stern2015", "stern2015_6um", "xray_flux"),
     },
 )

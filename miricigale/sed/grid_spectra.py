@@ -131,7 +131,10 @@ def _factors(model, grid, index):
 def _row(model, table, row):
     """Parameters of one row as plain numbers in the model's units, with defaults for the others."""
     return model.defaults | {
-        name: float(model.parameters[name].convert(table[name][row])) for name in table.colnames
+        name: float(model.parameters[name].convert(table[name][row]))
+        for name in table.colnames
+        # the slope of X-rays is none of the model
+        if name in model.parameters
     }
 
 

@@ -15,6 +15,7 @@ __all__ = [
     "XRAY_FLUX",
     "XRay",
     "band_luminosity",
+    "check_band",
     "stern2015",
     "stern2015_6um",
     "xray_flux",
@@ -142,8 +143,10 @@ def band_luminosity(l_x, *, from_band, to_band, photon_index=1.8):
     0.6099 W
     """
     index = to_array(photon_index, u.dimensionless_unscaled, "photon_index", finite=True)
-    top = _core.power_law_energy(*_band(to_band, "to_band"), index)
-    return u.Quantity(l_x) * (top / _core.power_law_energy(*_band(from_band, "from_band"), index))
+    top = _core.power_law_energy(*check_band(to_band, "to_band"), index)
+    return u.Quantity(l_x) * (
+        top / _core.power_law_energy(*check_band(from_band, "from_band"), index)
+    )
 
 
 def xray_flux(
@@ -205,12 +208,12 @@ def xray_flux(
     share = to_array(transmission, u.dimensionless_unscaled, "transmission", finite=True)
     _check("transmission", "from 0 to 1", share, (share < 0) | (share > 1))
     far = distance(z, cosmology)
-    flux = _core.xray_flux(power, z, far, _band(band, "band"), index, share)
+    flux = _core.xray_flux(power, z, far, check_band(band, "band"), index, share)
     return (flux * u.W / u.m**2).to(XRAY_FLUX)
 
 
-def _band(band, name):
-    """Ends of a band in keV."""
+def check_band(band, name):
+    """Ends of a band in keV; a ValueError tells what is not two ascending positive energies."""
     ends = to_array(band, u.keV, name, ndim=1, finite=True)
     if ends.shape != (2,) or not 0 < ends[0] < ends[1]:
         raise argument_error(name, "two ascending positive energies", band)

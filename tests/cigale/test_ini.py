@@ -794,8 +794,9 @@ def test_the_example_of_cigale(data_file):
         setup = read(path, libraries="bundled")
     assert len(record) == 1
     text = str(record[0].message)
-    for name in ("band xray_boxcar_2to12keV", "xray.alpha_ox", "dale2014 by", "skirtor2016 by"):
+    for name in ("xray.max_dev_alpha_ox = 0.2", "dale2014 by", "skirtor2016 by", "-1.9 to -1.1"):
         assert name in text
+    assert "boxcar" not in text
     np.testing.assert_allclose(setup.parameters["age"], [0.1, 3.0, 5.0])
     np.testing.assert_allclose(setup.parameters["ebv_polar"], [0, 0.05, 0.1, 0.15, 0.2, 0.3])
     catalog = setup.catalog()
@@ -809,3 +810,68 @@ def test_the_example_of_cigale(data_file):
     color = np.log10(catalog["sedpy.sdss_i0"] / catalog["sedpy.sdss_g0"])[:300].value
     dust = results.mean("ebv_polar").value
     assert np.corrcoef(color, dust)[0, 1] > 0.7
+    # the relation of Just et al. 2007 (scatter 0.14), above which quasars with X-ray detections lie
+    disk = np.log10(results.mean("l_2500").to_value(u.erg / u.s / u.Hz))
+    apart = results.mean("alpha_ox").value - (-0.137 * disk + 2.638)
+    assert 0.0 < np.median(apart) < 0.15
+    assert np.std(apart) < 0.2
+
+
+XRAY = """
+  [[xray]]
+    gam = 1.7
+    E_cut = 200
+    alpha_ox = -1.7, -1.4
+    max_dev_alpha_ox = 0
+    angle_coef = 0.5 & 0
+    det_lmxb = 0.2
+    det_hmxb = 0.0
+  [[redshifting]]"""
+
+
+def test_x_ray_bands_are_fitted_where_there_is_a_module(tmp_path):
+    module = (
+        ("skirtor2016, redshifting", "skirtor2016, xray, redshifting"),
+        ("\n  [[redshifting]]", XRAY),
+    )
+    band = ("bands = ", "bands = xray_boxcar_0p5to2keV, xray_boxcar_0p5to2keV_err, ")
+    text = INI.replace(*band, 1)
+    for change in module:
+        assert change[0] in text
+        text = text.replace(*change, 1)
+    path = tmp_path / "x.ini"
+    path.write_text(text)
+    setup = quiet(path)
+    assert "xray" not in setup.describe()
+    assert setup.xray["alpha_ox"].tolist() == [-1.7, -1.4]
+    assert setup.xray["angle_coefficients"] == (0.5, 0.0)
+    assert setup.bands["xray_boxcar_0p5to2keV"] == "xray_boxcar_0p5to2keV"
+    assert setup.filters().names[0] == "xray_boxcar_0p5to2keV"
+    fluxes, _ = models(quiet(write(tmp_path)), ROWS)
+    # X-rays of the first model: the mean of the two slopes, -0.15 / 0.3838 dex from either
+    catalog = QTable({"id": ["a"], "redshift": [0.5]})
+    for name, theirs in setup.bands.items():
+        value = fluxes[theirs][0] if theirs in fluxes else 1.0
+        catalog[name], catalog[f"{name}_err"] = [value] * u.mJy, [0.01 * value] * u.mJy
+    grid = setup.fitter(catalog).grid
+    assert grid.filters[-1] == "xray_boxcar_0p5to2keV"
+    assert grid.n_agn % 2 == 0
+    bright, faint = (grid.agn[:, i::2, -1] for i in (1, 0))
+    np.testing.assert_allclose(bright / faint, 10 ** (0.3 / 0.3838), rtol=1e-12)
+    with pytest.raises(ConfigError, match="models in X-ray bands"):
+        setup.save_models(tmp_path / "m.fits", [0.5])
+    for old, new, what in (
+        ("0.5 & 0", "0.5", "one pair of numbers"),
+        ("= 200", "= 200, 300", None),
+    ):
+        path.write_text(text.replace(old, new))
+        if what:
+            with pytest.raises(ConfigError, match=what):
+                quiet(path)
+        else:
+            assert "xray.E_cut = 300 (one value at a time)" in quiet(path).describe()
+    # without the module the band is left out, and told
+    path.write_text(INI.replace(*band, 1))
+    setup = quiet(path)
+    assert "band xray_boxcar_0p5to2keV (no module xray)" in setup.describe()
+    assert "xray_boxcar_0p5to2keV" not in setup.bands

@@ -1,0 +1,186 @@
+"""Runs of CIGALE from their files: configuration to setup, catalog to results."""
+
+import warnings
+from pathlib import Path
+
+from miricigale.cigale.best_models import write_best_models
+from miricigale.cigale.catalog import GIVE_FILTER
+from miricigale.cigale.ini import LIMIT_FLAGS, parse_ini
+from miricigale.cigale.modules import read_modules
+from miricigale.cigale.names import cigale_names
+from miricigale.cigale.setup import CigaleSetup
+from miricigale.filters.band_names import band_filters, given_filters, xray_energies
+from miricigale.utils.exceptions import ConfigError, MiricigaleWarning, argument_error
+from miricigale.utils.tables import error_column
+
+__all__ = ["fit_cigale", "read_pcigale_ini"]
+
+
+def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
+    """
+    Read the configuration of a run of CIGALE.
+
+    Parameters
+    ----------
+    path : path-like
+        ``pcigale.ini`` of CIGALE 2018 to 2022, with a grid of parameters for the analysis
+        ``pdf_analysis``.
+    libraries : {"best", "bundled"}, optional
+        Whether libraries that are registered (`miricigale.sed`) are used, or the bundled tables
+        alone.
+    names : dict, optional
+        Filters of bands that are not known, or otherwise known: by CIGALE's name a
+        `~miricigale.filters.Filter`, the name of one, or the path of its file, as for `read_cigale_catalog`.
+    strict : bool, optional
+        Whether anything that is left out or replaced is an error, not a warning.
+
+    Returns
+    -------
+    setup : `CigaleSetup`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If the file, or that of a filter, cannot be read.
+    KeyError
+        If there is no filter of a name in ``names``.
+    `~miricigale.utils.exceptions.ConfigError`
+        If a value cannot be read, a parameter is not known while one that is would get its default, nothing
+        can be fitted, or with ``strict``, something would be left out or replaced.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        Of all that is left out, replaced or different, in one message.
+    """
+    path = Path(path)
+    if libraries not in ("best", "bundled"):
+        raise argument_error("libraries", "'best' or 'bundled'", repr(libraries))
+    config = parse_ini(path)
+    analysis = config["analysis_params"]
+    names = given_filters(names)
+    if config["parameters_file"]:
+        msg = f"{path}: lists of models (parameters_file) are not read, grids are"
+        raise ConfigError(msg)
+    try:
+        chain = read_modules(
+            config["sed_modules"],
+            config["sed_modules_params"],
+            folder=path.parent,
+            libraries=libraries,
+        )
+        columns = config["bands"]
+        bands, lost = band_filters(dict.fromkeys(c.removesuffix("_err") for c in columns), names)
+        wanted = [band for band in analysis["bands"] if band not in bands.values()]
+        predicted, more = band_filters(dict.fromkeys(wanted), names)
+    except (ConfigError, ValueError) as err:
+        msg = f"{path}: {err}"
+        raise ConfigError(msg) from err
+    hard = {x for x in (*bands, *predicted) if xray_energies(x) and x not in names}
+    dark = set() if chain.xray else hard
+    bands, predicted = ({k: v for k, v in x.items() if k not in dark} for x in (bands, predicted))
+    if not bands:
+        msg = f"{path}: no band is known here, of {', '.join(lost) or 'none'}"
+        raise ConfigError(msg)
+    for band in bands.values():
+        if band not in columns:
+            msg = f"{path}: {error_column(band)} is among the bands, and {band} is not"
+            raise ConfigError(msg)
+    known = {theirs for theirs, *_ in cigale_names(chain.modules).values()}
+    if chain.xray and not hard:
+        chain.left_out.append("xray (no band of it)")
+    if dark or not hard:
+        known -= {"xray.alpha_ox", "xray.agn_Lx_2to10keV", "agn.intrin_Lnu_2500A_30deg"}
+    variables = analysis["variables"]
+    chain.left_out[:] = [
+        *(f"module {x}" if "." not in x and " " not in x else x for x in chain.left_out),
+        *(f"band {name} (no module xray)" for name in sorted(dark)),
+        *_bands_without_filter(dict.fromkeys([*lost, *more])),
+        *(f"variable {x}" for x in variables if x not in known),
+        *(f"property {x}" for x in config["properties"] if not x.endswith("_err")),
+    ]
+    extended = [x for x in {**bands, **predicted}.values() if x.endswith("_ext") and x not in names]
+    if extended:
+        chain.differs.append(f"bands {', '.join(extended)}: curves of point sources")
+    flag = analysis["lim_flag"]
+    if flag == "noscaling":
+        chain.differs.append("lim_flag noscaling: upper limits act on the scale too, as with full")
+    setup = CigaleSetup(
+        path=path,
+        data_file=path.parent / config["data_file"] if config["data_file"] else None,
+        bands=bands,
+        predicted={name: band for name, band in predicted.items() if name not in bands},
+        columns=tuple(c for c in columns if c.removesuffix("_err") in bands.values()),
+        variables=tuple(name for name in variables if name in known),
+        additional_error=config["additionalerror"],
+        limits=LIMIT_FLAGS[flag] != "none",
+        redshift_decimals=analysis["redshift_decimals"],
+        mock=analysis["mock_flag"],
+        cores=config["cores"],
+        method=config["analysis_method"],
+        names=names,
+        **{k: tuple(v) if isinstance(v, list) else v for k, v in vars(chain).items()},
+    )
+    text = setup.describe()
+    if strict and (setup.left_out or setup.replaced):
+        msg = f"{path}:\n{text}"
+        raise ConfigError(msg)
+    if text:
+        warnings.warn(f"{path}:\n{text}", MiricigaleWarning, stacklevel=2)
+    return setup
+
+
+def _bands_without_filter(bands):
+    """Items of what is left out; the last one says what to do."""
+    items = [f"band {band}" for band in bands]
+    return [*items[:-1], f"{items[-1]} (no filter here: {GIVE_FILTER})"] if items else []
+
+
+def fit_cigale(
+    ini, *, output=None, best_models=None, libraries="best", names=None, strict=False, **options
+):
+    """
+    Do what a run of CIGALE does: read configuration and catalog, fit, write.
+
+    Parameters
+    ----------
+    ini : path-like or `CigaleSetup`
+        ``pcigale.ini``, or what `read_pcigale_ini` made of it.
+    output : path-like, optional
+        File of results in CIGALE's columns (``results.fits`` or ``.txt``), replaced if it is
+        there.
+    best_models : path-like, optional
+        Folder of files of the best models (`write_best_models`), replaced if they are there.
+    libraries, names, strict : optional
+        As for `read_pcigale_ini`; no use for a `CigaleSetup`.
+    **options
+        Passed to `CigaleSetup.fit`.
+
+    Returns
+    -------
+    results : `~miricigale.fitting.FitResults`
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.ConfigError`
+        If the configuration is one of ``savefluxes``, which `CigaleSetup.save_models` does; as
+        `read_pcigale_ini`.
+
+    Examples
+    --------
+    >>> from miricigale.cigale import fit_cigale
+    >>> results = fit_cigale("pcigale.ini", output="results.fits")  # doctest: +SKIP
+    """
+    setup = ini
+    if not isinstance(ini, CigaleSetup):
+        setup = read_pcigale_ini(ini, libraries=libraries, names=names, strict=strict)
+    if setup.method == "savefluxes":
+        msg = f"{setup.path} asks for the models (savefluxes): CigaleSetup.save_models writes them"
+        raise ConfigError(msg)
+    photometry = setup.catalog(strict=strict)
+    results = setup.fit(photometry, **options)
+    if output is not None:
+        setup.write_results(results, output, overwrite=True)
+    if best_models is not None:
+        write_best_models(results, best_models, overwrite=True)
+    return results

@@ -1,0 +1,208 @@
+"""X-ray bands of a grid: corona of the AGN by alpha_ox, binaries and hot gas of the galaxy."""
+
+import dataclasses
+
+import astropy.constants as const
+import astropy.units as u
+import numpy as np
+
+from miricigale.filters import Filter
+from miricigale.sed.spectrum import distance
+from miricigale.sed.xray import check_band
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import to_array
+
+__all__ = ["ALPHA_OX", "disk_2500", "with_xray_bands", "xray_filter"]
+
+#: Slopes between 2500 A and 2 keV, the values of X-CIGALE.
+ALPHA_OX = tuple(np.round(np.arange(-1.9, -1.05, 0.1), 1))
+_PER_DEX = 0.3838  # alpha_ox over log(L_nu(2 keV) / L_nu(2500 A))
+_TWO = 2.0  # keV
+_ANGLE = 30.0  # deg, at which alpha_ox is defined
+_BLUE = 0.25  # um
+_LIGHT = const.c.to_value(u.m / u.s)
+_PER_KEV = (u.keV / const.h).to_value(u.Hz)
+_MICROJANSKY = 1e-32  # W / m2 / Hz
+#: Exponential cutoff of binaries and, as low as its temperature, of hot gas, and the gas's photon index; keV.
+_CUT_BINARIES, _CUT_GAS, _INDEX_GAS = 100.0, 1.0, 1.0
+_HARD, _SOFT = (2.0, 10.0), (0.5, 2.0)
+#: Mineo et al. 2012: hot gas in 0.5-2 keV for each Msun/yr, W.
+_GAS = 8.3e31
+#: Fragos et al. 2013, as fitted by Mezcua et al. 2018: log L(2-10 keV) in W, of low-mass binaries for 1e10 Msun in
+#: powers of the log of the age in Gyr, of high-mass binaries for 1 Msun/yr in powers of Z.
+_LOW_MASS = (33.276, -1.503, -0.423, 0.425, 0.136)
+_HIGH_MASS = (33.28, -62.12, 569.44, -1833.80, 1968.33)
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
+
+
+def with_xray_bands(
+    grid,
+    model,
+    bands,
+    *,
+    alpha_ox=ALPHA_OX,
+    photon_index=1.8,
+    cutoff=300 * u.keV,
+    angle_coefficients=(0.5, 0.0),
+    lmxb=0.0,
+    hmxb=0.0,
+    lmxb_index=1.56,
+    hmxb_index=2.0,
+):
+    r"""
+    Add X-ray bands to a grid, so that a fit takes X-ray fluxes like all others.
+
+    The corona shines as :math:`E^{1-\Gamma} e^{-E/E_c}` with :math:`L_\nu(2\,\mathrm{keV}) =
+    10^{\alpha_\mathrm{ox} / 0.3838} L_\nu(2500\,\mathrm{A})`, the disk being that without dust, seen at 30 deg;
+    ``alpha_ox`` becomes a parameter of the AGN. Low-mass binaries go with mass and age, high-mass binaries with
+    star-formation rate and metallicity, hot gas with the star-formation rate. Nothing absorbs: fluxes must be
+    corrected for absorption.
+
+    Parameters
+    ----------
+    grid : `ModelGrid`
+        The grid, of any bands.
+    model : `SEDModel`
+        The model that made it.
+    bands : dict of str to `~astropy.units.Quantity`, shape (2,)
+        Lowest and highest observed energy by the name of the band, whose flux is the energy flux over the width in
+        frequency.
+    alpha_ox : array_like, optional
+        Ascending slopes.
+    photon_index, lmxb_index, hmxb_index : float, optional
+        Gamma of the corona and of low-mass and high-mass binaries.
+    cutoff : `~astropy.units.Quantity`, optional
+        Energy of the corona's cutoff; the binaries' is 100 keV.
+    angle_coefficients : tuple of float, optional
+        a1 and a2 of the corona seen at an inclination i, a1 cos i + a2 cos^2 i + 1 - a1 - a2 of that at 0.
+    lmxb, hmxb : float, optional
+        Dex by which the binaries are brighter than usual.
+
+    Returns
+    -------
+    grid : `ModelGrid`
+        With the bands at the end, a row of AGN for each ``alpha_ox``, and the properties ``l_2500`` (disk at 2500
+        A and 30 deg, W/Hz) and ``l_2_10kev`` (corona as seen, W) of the AGN, each for a watt of its power.
+
+    Raises
+    ------
+    ValueError
+        If a band is not two ascending positive energies, or its name is taken, or ``alpha_ox`` does not ascend.
+    `~astropy.units.UnitsError`
+        If a unit is missing.
+
+    References
+    ----------
+    Yang et al. 2020, MNRAS 491, 740; Yang et al. 2022, ApJ 927, 192 (X-CIGALE); Mezcua et al. 2018, MNRAS 478,
+    2576; Mineo et al. 2012, MNRAS 426, 1870; Just et al. 2007, ApJ 665, 1004.
+    """
+    energies = {name: check_band(band, f"bands[{name!r}]") for name, band in bands.items()}
+    taken = set(energies) & set(grid.filters)
+    if taken or not energies:
+        raise argument_error("bands", f"new ones beside {list(grid.filters)}", f"{list(bands)}")
+    slopes = to_array(alpha_ox, u.dimensionless_unscaled, "alpha_ox", ndim=1, finite=True)
+    if slopes.size == 0 or np.any(np.diff(slopes) <= 0):
+        raise argument_error("alpha_ox", "ascending values", f"{slopes}")
+    z, far = grid.redshift, distance(grid.redshift, model.cosmology)
+
+    def observed(index, cut, power, norm):
+        """Fluxes in uJy, (nz, n, n_bands), of power (n,) in W within energies ``norm`` at rest."""
+        out = np.empty((z.size, len(power), len(energies)))
+        for k, (low, high) in enumerate(energies.values()):
+            share = np.array([_energy(low * (1 + x), high * (1 + x), index, cut) for x in z])
+            share /= _energy(*norm, index, cut)
+            dim = 4.0 * np.pi * far**2 * (high - low) * _PER_KEV * _MICROJANSKY
+            out[:, :, k] = (share / dim)[:, None] * power
+        return out
+
+    low, high, gas = _galaxy_powers(grid, lmxb, hmxb)
+    galaxy = observed(lmxb_index, _CUT_BINARIES, low, _HARD)
+    galaxy += observed(hmxb_index, _CUT_BINARIES, high, _HARD)
+    galaxy += observed(_INDEX_GAS, _CUT_GAS, gas, _SOFT)
+    new = {"galaxy": np.concatenate([grid.galaxy, galaxy], axis=2)}
+    if grid.n_agn:
+        cut = float(to_array(cutoff, u.keV, "cutoff", ndim=0, finite=True))
+        disk, angle = _disks(grid, model, angle_coefficients)
+        # L_E at 2 keV, whose integral over the spectrum's shape is the power
+        at_two = 10.0 ** (slopes / _PER_DEX) * disk[:, None] * angle[:, None] * _PER_KEV
+        hard = at_two * _energy(*_HARD, photon_index, cut) / _shape(_TWO, photon_index, cut)
+        corona = observed(photon_index, cut, hard.ravel(), _HARD)
+        agn = np.repeat(grid.agn, slopes.size, axis=1)
+        new["agn"] = np.concatenate([agn, corona], axis=2)
+        new |= _agn_rows(grid, slopes, disk, hard.ravel())
+    else:
+        new["agn"] = np.zeros((z.size, 0, len(grid.filters) + len(energies)))
+    return dataclasses.replace(grid, filters=(*grid.filters, *energies), **new)
+
+
+def _agn_rows(grid, slopes, disk, hard):
+    """What a grid says of its AGN, each of them repeated for every slope."""
+    rows = np.repeat(np.arange(grid.n_agn), slopes.size)
+    parameters, properties = grid.agn_parameters[rows], grid.agn_properties[rows]
+    parameters["alpha_ox"] = np.tile(slopes, grid.n_agn) * u.one
+    parameters["alpha_ox"].info.description = "slope from 2500 A to 2 keV"
+    properties["l_2500"] = disk[rows] / u.Hz
+    text = "L_nu of the disk at 2500 A, without dust at 30 deg, W/Hz for each W of AGN power"
+    properties["l_2500"].info.description = text
+    properties["l_2_10kev"] = hard * u.one
+    text = "2-10 keV luminosity of the AGN, unabsorbed, W for each W of AGN power"
+    properties["l_2_10kev"].info.description = text
+    return {
+        "agn_parameters": parameters,
+        "agn_properties": properties,
+        "agn_multiplicity": grid.agn_multiplicity[rows],
+        "inert": tuple(grid.inert[row] for row in rows),
+        "axes": grid.axes | {"alpha_ox": slopes},
+    }
+
+
+def _galaxy_powers(grid, lmxb, hmxb):
+    """Low-mass and high-mass binaries (2-10 keV), hot gas (0.5-2 keV) of each galaxy, W for each Msun formed."""
+    rate = grid.galaxy_properties["sfr_100myr"].to_value(1 / u.yr)
+    mass = grid.galaxy_properties["stellar_mass"].to_value(u.one)
+    age = np.log10(grid.galaxy_shape["age_mass"].to_value(u.Gyr))
+    metals = u.Quantity(grid.galaxy_parameters["metallicity"]).value
+    low = 1e-10 * mass * 10.0 ** (np.polyval(_LOW_MASS[::-1], age) + lmxb)
+    return low, rate * 10.0 ** (np.polyval(_HIGH_MASS[::-1], metals) + hmxb), _GAS * rate
+
+
+def _disks(grid, model, coefficients):
+    """L_nu at 2500 A and 30 deg, W/Hz for each W of AGN power, and the corona seen over that at 30 deg."""
+    a1, a2 = coefficients
+    rows = [
+        model.defaults
+        | {name: float(model.parameters[name].convert(row[name])) for name in row.colnames}
+        for row in grid.agn_parameters
+    ]
+    agn = model.component("agn")
+    light = np.array([disk_2500(model.chain, agn, row) for row in rows])
+    mu = np.cos(np.radians([[row["inclination"] for row in rows], [_ANGLE] * len(rows)]))
+    seen, at_30 = a1 * mu + a2 * mu**2 + 1.0 - a1 - a2
+    return light * grid.agn_properties["accretion_power"].value, seen / at_30
+
+
+def disk_2500(chain, agn, values):
+    """L_nu of a disk at 2500 A seen at 30 deg, without dust, in W/Hz for each watt of accretion power."""
+    face_on = agn.torus_spectra(chain.wave, values | {"inclination": 0.0}).face_on
+    mu = np.cos(np.radians(_ANGLE))
+    # the disk shines as cos i (1 + 2 cos i) / 3; accretion power is 7/18 of the face-on integral
+    light = np.interp(_BLUE, chain.wave, face_on) / (7.0 / 18.0 * (chain.weights @ face_on))
+    return light * mu * (1.0 + 2.0 * mu) / 3.0 * _BLUE**2 * 1e-6 / _LIGHT
+
+
+def xray_filter(name, band):
+    """A `~miricigale.filters.Filter` of an X-ray band, for drawings: flat between two energies."""
+    low, high = check_band(band, "band")
+    wave = (const.h * const.c / ([high, low] * u.keV)).to(u.um)
+    return Filter(wave, np.ones(2), name=name)
+
+
+def _shape(energy, index, cut):
+    return energy ** (1.0 - index) * np.exp(-energy / cut)
+
+
+def _energy(low, high, index, cut):
+    """Integral of E^(1 - Gamma) exp(-E / cut) over energies."""
+    middle, half = 0.5 * np.log(high * low), 0.5 * np.log(high / low)
+    energy = np.exp(middle + half * _NODES)
+    return half * np.sum(_WEIGHTS * energy * _shape(energy, index, cut))
