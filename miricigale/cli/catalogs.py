@@ -63,6 +63,17 @@ def add_fit(commands):
         metavar="MAG",
         help="color excess E(B-V) of the Milky Way, if the fluxes are not corrected for it",
     )
+    fit.add_argument(
+        "--quasars",
+        action="store_true",
+        help="fit type-1 AGN too, and tell by the evidence which objects are",
+    )
+    fit.add_argument(
+        "--stars",
+        type=Path,
+        metavar="SPECTRA",
+        help="fit stars too, with a file or folder of their spectra, such as the atlas of Pickles",
+    )
     fit.add_argument("--hdu", help="extension of a FITS file, if it has several tables")
     fit.add_argument("--chunk-rows", type=int, default=10000, help="rows in memory at a time")
     fit.add_argument(
@@ -79,16 +90,17 @@ def add_fit(commands):
 def _fit(args):
     from miricigale.utils.exceptions import OtherResultsError
     from miricigale.utils.parallel import thread_count, thread_pool
-    from miricigale.workflow.commands import fit_catalog
+    from miricigale.workflow.classes import fit_classes, write_table
     from miricigale.workflow.fit_page import fit_page
 
     hdu = int(args.hdu) if (args.hdu or "").isdigit() else args.hdu
     n_threads = thread_count(args.threads or None)
     try:
         with thread_pool(n_threads) as executor:
-            results = fit_catalog(
+            found = fit_classes(
                 args.photometry,
                 args.output,
+                **chosen(args, "quasars stars"),
                 **chosen(args, "axes redshift model_error pairs flux_unit catalog_map ebv"),
                 **chosen(args, "chunk_rows resume"),
                 hdu=hdu,
@@ -96,13 +108,13 @@ def _fit(args):
                 progress_bar=not args.no_progress,
             )
         table = args.output / "table.fits"
-        results.write_table(table, overwrite=True)
-        page = fit_page(results, args.photometry, **chosen(args, "catalog_map z_spec"), hdu=hdu)
+        write_table(found, table, overwrite=True)
+        page = fit_page(found, args.photometry, **chosen(args, "catalog_map z_spec"), hdu=hdu)
         page = page.write(args.output / "page.html")
     except OtherResultsError as err:
         # name the option of this command instead of the argument
         raise OtherResultsError(err.reason, "--no-resume to replace them") from err
-    print(f"{results!r}; all in {table}; page: {page}")
+    print(f"{found['galaxy']!r}; all in {table}; page: {page}")
     return 0
 
 

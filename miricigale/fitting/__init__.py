@@ -19,6 +19,7 @@ __getattr__, __dir__, __all__ = lazy_names(
             "measure_template_error",
         ),
         "checks": ("LeaveOutResult", "MockResult", "leave_out", "mock_analysis"),
+        "classification": ("compare_classes",),
         "fitter": ("BayesFitter",),
         "io": ("FitResultsFiles", "open_results"),
         "likelihood": ("FitFlags",),

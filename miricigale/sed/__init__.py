@@ -24,9 +24,10 @@ __getattr__, __dir__, __all__ = lazy_names(
         "model": ("SEDModel",),
         "parameter": ("Parameter",),
         # with all components, which make themselves known
-        "presets": ("COMPONENTS", "survey_axes", "yang2021_axes"),
+        "presets": ("COMPONENTS", "quasar_axes", "survey_axes", "yang2021_axes"),
         "spectrum": ("COSMOLOGY", "SED", "ModelSpectra"),
         "tables": ("ModelFlags",),
+        "templates": ("read_spectra", "template_grid"),
         "xray_bands": ("with_xray_bands",),
         "xray": ("XRay", "band_luminosity", "stern2015", "stern2015_6um", "xray_flux"),
     },

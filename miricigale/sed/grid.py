@@ -89,7 +89,7 @@ class ModelGrid(Frozen):
         Whether the galaxy is younger than the universe at that redshift.
     galaxy_parameters, agn_parameters : `~astropy.table.QTable`, nG and nA rows
         Parameter values of every galaxy and AGN model.
-    galaxy_properties : `~astropy.table.QTable`, nG rows
+    galaxy_properties : `~astropy.table.QTable`, nG rows, or without columns
         Derived quantities for each solar mass formed (``stellar_mass``, ``sfr``,
         ``sfr_10myr``, ``sfr_100myr``, ``dust_luminosity``, ...).
     agn_properties : `~astropy.table.QTable`, nA rows
@@ -177,7 +177,7 @@ class ModelGrid(Frozen):
         for name in _TABLES:
             rows = n_g if name.startswith("galaxy") else n_a
             table = getattr(self, name)
-            if len(table) != rows and not (name == "galaxy_shape" and not table.colnames):
+            if len(table) != rows and table.colnames:
                 raise argument_error(name, f"a table of {rows} rows", f"{len(table)} rows")
         if len(set(self.filters)) != n_b or n_b == 0:
             raise argument_error("filters", "one or more different names", f"{self.filters}")

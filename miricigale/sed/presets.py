@@ -7,7 +7,14 @@ from miricigale.sed import components as c
 from miricigale.sed.component import COMPONENTS
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["LIBRARIES", "survey_axes", "survey_components", "yang2021_axes", "yang2021_components"]
+__all__ = [
+    "LIBRARIES",
+    "quasar_axes",
+    "survey_axes",
+    "survey_components",
+    "yang2021_axes",
+    "yang2021_components",
+]
 
 #: Where a preset takes its libraries from.
 LIBRARIES = ("best", "bundled")
@@ -178,6 +185,34 @@ def survey_axes():
         "temperature_polar": np.array([200.0]),
         "frac_agn": np.array([0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 0.95]),
         "redshift": _redshifts(0.02, 0.01, 7.0),
+    }
+
+
+def quasar_axes():
+    """
+    Axes of type-1 AGN that outshine their galaxies, for the chain of `SEDModel.survey`.
+
+    Disks seen at 30 deg, three slopes of them (L_lambda ~ wave^-1.8 to wave^-1.2), behind polar dust of E(B-V) 0
+    to 0.4, and tori of three depths; AGN fractions from 0.7, of two young hosts with E(B-V) 0.2; the redshifts of
+    `survey_axes`. The disk has no broad lines, which add up to some 10 % to a broad band.
+
+    Returns
+    -------
+    axes : dict of str to `~numpy.ndarray`
+        In the units of the parameters (Gyr, mag, deg, K); to be changed at will.
+    """
+    return {
+        "tau": np.array([0.5]),
+        "age": np.array([0.3, 2.0]),
+        "ebv": np.array([0.2]),
+        "alpha": np.array([2.0]),
+        "inclination": np.array([30.0]),
+        "disk_slope": np.array([-0.3, 0.0, 0.3]),
+        "tau97": np.array([3.0, 7.0, 11.0]),
+        "ebv_polar": np.array([0.0, 0.05, 0.1, 0.2, 0.4]),
+        "temperature_polar": np.array([200.0]),
+        "frac_agn": np.array([0.7, 0.85, 0.93, 0.97, 0.99, 0.997]),
+        "redshift": survey_axes()["redshift"],
     }
 
 

@@ -165,6 +165,7 @@ def fit_catalog(
     output,
     *,
     axes="fit",
+    models=None,
     model_error=None,
     catalog_map=None,
     ebv=0.0,
@@ -184,13 +185,16 @@ def fit_catalog(
         Folder of the results.
     axes : {"fit", "quick", "survey"}, optional
         Model grid; see `miricigale.sed.yang2021_axes` and `miricigale.sed.survey_axes`.
+    models : callable, optional
+        Function of the bands (a list of str) that returns the `~miricigale.sed.SEDModel` and its axes in place of
+        those of ``axes``, or a `~miricigale.sed.ModelGrid` and None; ``axes`` says whose errors are taken then.
     model_error : float, optional
         Relative model error: 0.1 by default; with ``axes="survey"`` it takes the place of
         `miricigale.fitting.TemplateError.survey`, which is then the default.
     catalog_map : `~miricigale.filters.CatalogMap`, str or path-like, optional
         Names and units of the catalog; the name of a survey, or a TOML file.
     ebv : float, optional
-        Color excess E(B-V) of the Milky Way, in mag, behind which all models are put
+        Color excess E(B-V) of the Milky Way, in mag, behind which all models but given grids are put
         (`~miricigale.sed.components.GalacticExtinction`, law of Gordon et al. 2023, none beyond 32 um). For one
         that differs from source to source see `~miricigale.sed.foreground.deredden`.
     hdu, chunk_rows, **options
@@ -256,7 +260,9 @@ def fit_catalog(
     else:
         model, nodes = SEDModel.yang2021(), SEDModel.yang2021_axes(axes)
         errors = {"model_error": 0.1 if model_error is None else model_error}
-    if ebv:
+    if models is not None:
+        model, nodes = models(bands)
+    if ebv and isinstance(model, SEDModel):
         dust = GalacticExtinction(ebv_galactic=ebv, beyond="transparent")
         model = SEDModel([*model.components, dust])
     fitter = BayesFitter(model, bands, axes=nodes, **errors)

@@ -15,6 +15,7 @@ from miricigale.plotting.comparison import plot_redshifts
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.missing import plain_floats
 from miricigale.utils.row_files import open_rows
+from miricigale.workflow.classes import classes_section
 
 __all__ = ["fit_page"]
 
@@ -37,8 +38,9 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
 
     Parameters
     ----------
-    results : `~miricigale.fitting.FitResultsFiles`
-        What `~miricigale.workflow.commands.fit_catalog` returned.
+    results : `~miricigale.fitting.FitResultsFiles` or dict of it
+        What `~miricigale.workflow.commands.fit_catalog` returned, or
+        `~miricigale.workflow.classes.fit_classes`: then the page has a section on the classes.
     path : path-like
         The catalog that was fitted.
     catalog_map, hdu : optional
@@ -56,6 +58,8 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     ValueError
         If the catalog has no column ``z_spec``.
     """
+    classes = results if isinstance(results, dict) else {"galaxy": results}
+    results = classes["galaxy"]
     rows = open_rows(path, results.job["chunk_rows"], hdu=hdu)
     if catalog_map is not None:
         rows = MappedRows(rows, as_catalog_map(catalog_map))
@@ -70,6 +74,8 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     _redshifts(page, found, known)
     _goodness(page, found)
     _physics(page, found)
+    if len(classes) > 1:
+        classes_section(page, classes, found.ids, found.chi2)
     _examples(page, results, found)
     _left_out(page, results, rows, found)
     _settings(page, results)

@@ -3,12 +3,13 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.table import QTable, Table
+from astropy.modeling.models import BlackBody
+from astropy.table import QTable, Table, vstack
 
 from miricigale.cli import main
 from miricigale.fitting import open_results
 from miricigale.fitting.grid import GridEngine
-from miricigale.sed import SEDModel
+from miricigale.sed import SEDModel, read_spectra, template_grid
 from miricigale.sed.foreground import band_extinction
 from miricigale.utils.exceptions import MiricigaleWarning
 from miricigale.workflow.commands import fit_catalog
@@ -253,3 +254,50 @@ def test_fluxes_behind_the_milky_way_give_the_galaxies_in_front_of_it(catalog, t
     found = results.to_table(["mass_best", "chi2_best"])
     np.testing.assert_allclose(found["mass_best"].to_value(u.Msun), 1e10, rtol=0.03)
     assert np.all(found["chi2_best"] < 0.1)
+
+
+def test_a_catalog_is_sorted_into_galaxies_quasars_and_stars(catalog, tmp_path, capsys):
+    """Two stars of the library's own temperatures between the galaxies, which are of the galaxies' models."""
+    wave = np.geomspace(0.2, 60, 2000) * u.um
+    folder = tmp_path / "stars"
+    folder.mkdir()
+    for temperature in (3000, 5000, 9000):
+        fnu = BlackBody(temperature * u.K)(wave) * u.sr
+        flam = fnu.to(u.erg / u.s / u.cm**2 / u.AA, u.spectral_density(wave))
+        np.savetxt(
+            folder / f"t{temperature}.dat", np.column_stack([wave.to_value(u.AA), flam.value])
+        )
+    grid = template_grid(read_spectra(folder), list(BANDS))
+    rows = QTable({"id": [6, 7], "z_spec": [np.nan, np.nan]})
+    for i, name in enumerate(BANDS):
+        rows[name] = 10 * grid.galaxy[0, 1:, i] * u.uJy
+        rows[f"{name}_err"] = 0.05 * rows[name]
+    table = vstack([catalog, rows])
+    table.write(tmp_path / "cat.fits")
+    out = tmp_path / "out"
+    command = [
+        "fit",
+        str(tmp_path / "cat.fits"),
+        "-o",
+        str(out),
+        "--axes",
+        "quick",
+        "--no-progress",
+    ]
+    command += ["--quasars", "--stars", str(folder), "--chunk-rows", "4"]
+    assert main(command) == 0
+    table = QTable.read(out / "table.fits")
+    assert table["class"].tolist()[:5] == ["galaxy"] * 5
+    assert table["class"].tolist()[5:] == ["star"] * 2
+    assert np.all(table["reduced_chi2_star"][5:] < 0.1)
+    total = table["probability_galaxy"] + table["probability_quasar"] + table["probability_star"]
+    np.testing.assert_allclose(total, 1.0, rtol=1e-12)
+    assert np.all(table["log_ratio_star"][:5] < -5)
+    page = (out / "page.html").read_text()
+    assert "Galaxy, quasar or star" in page
+    assert "that of the galaxy" in page
+    # the fits of the classes are whole: the same command goes on from them, and finds nothing to do
+    assert main(command) == 0
+    capsys.readouterr()
+    assert main([*command[:-3], str(tmp_path / "none")]) == 2
+    assert "no such file" in capsys.readouterr().err

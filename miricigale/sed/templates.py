@@ -1,0 +1,184 @@
+"""Grids of given spectra at redshift 0, such as those of stars: each has a scale and nothing else."""
+
+import warnings
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable, Table
+
+from miricigale.filters import FilterSet
+from miricigale.sed.grid import ModelGrid
+from miricigale.sed.spectrum import SED
+from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
+from miricigale.utils.files import read_table
+from miricigale.utils.meta import provenance
+from miricigale.utils.units import FNU, WAVE
+
+__all__ = ["read_spectra", "template_grid"]
+
+_SUFFIXES = (".fits", ".fit", ".dat", ".txt", ".csv", ".ecsv", ".ascii")
+_FLAM = u.erg / u.s / u.cm**2 / u.AA
+#: How libraries write units that astropy does not know.
+_UNITS = {
+    "angstroms": u.AA,
+    "angstrom": u.AA,
+    "microns": u.um,
+    "flam": _FLAM,
+    "fnu": _FLAM * u.AA / u.Hz,
+}
+#: Where spectra that end before are continued to.
+_FAR = 100.0  # um
+#: Part of the wavelengths at the end of a spectrum whose mean its continuation starts from.
+_END = 0.95
+
+
+def read_spectra(path):
+    """
+    Read spectra, such as those of a library of stars.
+
+    Parameters
+    ----------
+    path : path-like
+        A file, or a folder of files with one of the usual suffixes: FITS tables or text. The first column is the
+        wavelength in vacuum (Angstrom where it has no unit), the second the flux density (F_lambda where it has
+        no unit), or several of them in a column of vectors; all others are left alone. That is how STScI
+        distributes the atlas of Pickles (1998), and others their model atmospheres.
+
+    Returns
+    -------
+    spectra : dict of str to `SED`
+        By the name of the file, with the number in the vector.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If there is no file, or one is no spectrum.
+    """
+    path = Path(path).expanduser()
+    files = [path]
+    if path.is_dir():
+        names = sorted(p for p in path.iterdir() if p.is_file())
+        files = [p for p in names if p.name.lower().removesuffix(".gz").endswith(_SUFFIXES)]
+        if not files:
+            msg = f"{path} has no files of spectra ({', '.join(_SUFFIXES)})"
+            raise DataError(msg)
+    out = {}
+    for file in files:
+        out |= _read_file(file)
+    return out
+
+
+def _read_file(file):
+    table = read_table(file, wanted="a spectrum", cls=Table)
+    if len(table.colnames) < 2:
+        msg = f"{file} cannot be read as a spectrum: it has the columns {table.colnames}"
+        raise DataError(msg)
+    wave, flux = (table[name] for name in table.colnames[:2])
+    try:
+        wave = np.asarray(wave, float) * _unit(wave, u.AA)
+        values = np.asarray(flux, float).reshape(wave.size, -1).T * _unit(flux, _FLAM)
+        stem = file.name.partition(".")[0]
+        names = [stem] if len(values) == 1 else [f"{stem}[{i}]" for i in range(len(values))]
+        return {name: SED(wave, one) for name, one in zip(names, values, strict=True)}
+    except (TypeError, ValueError, u.UnitsError) as err:
+        msg = f"{file} cannot be read as a spectrum: {err}"
+        raise DataError(msg) from err
+
+
+def _unit(column, default):
+    if column.unit is None:
+        return default
+    text = str(column.unit)
+    return _UNITS.get(text.lower()) or u.Unit(text)
+
+
+def template_grid(spectra, filters, *, beyond="error"):
+    """
+    A grid of given spectra at redshift 0, for `~miricigale.fitting.BayesFitter`.
+
+    Parameters
+    ----------
+    spectra : dict of str to `SED` or `synphot.SourceSpectrum`
+        The templates by name, such as stars that `read_spectra` read.
+    filters : `~miricigale.filters.FilterSet` or list of str
+        The bands.
+    beyond : {"error", "rayleigh-jeans"}, optional
+        What is done with spectra that end before the bands do: they are refused, or continued with
+        F_nu ~ wave^-2 to 100 um, and a warning tells. That holds within some percent for stars of 3500 K and
+        above; for brown dwarfs and stars in dust it does not.
+
+    Returns
+    -------
+    grid : `ModelGrid`
+        One redshift, 0; as galaxies the templates, numbered by the parameter ``template``, each with a mean flux
+        of 1 uJy in the bands; no AGN. The scale of a fit (``mass`` of its results) is the mean flux in uJy.
+        ``meta["templates"]`` has the names.
+
+    Raises
+    ------
+    ValueError
+        If there is no template, one does not cover a band, or has no light in them.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        Of spectra that are continued.
+    """
+    if beyond not in ("error", "rayleigh-jeans"):
+        raise argument_error("beyond", "'error' or 'rayleigh-jeans'", repr(beyond))
+    if not spectra:
+        raise argument_error("spectra", "a dict of at least one spectrum", repr(spectra))
+    filters = filters if isinstance(filters, FilterSet) else FilterSet(filters)
+    seds = {
+        name: one if isinstance(one, SED) else SED.from_synphot(one)
+        for name, one in spectra.items()
+    }
+    if beyond != "error":
+        last = max(band.wave[-1] for band in filters)
+        short = [name for name, sed in seds.items() if sed.wave[-1] < last]
+        seds |= {name: _continued(seds[name]) for name in short}
+        if short:
+            msg = f"{len(short)} of {len(seds)} spectra continued to {last:.3g} with F_nu ~ wave^-2"
+            warnings.warn(msg, MiricigaleWarning, stacklevel=2)
+    flux = np.array([_fluxes(name, sed, filters) for name, sed in seds.items()])
+    n = len(seds)
+    number = np.arange(n, dtype=float)
+    templates = QTable({"template": number * u.one})
+    templates["template"].info.description = "number of the template"
+    return ModelGrid(
+        filters=filters.names,
+        redshift=np.zeros(1),
+        galaxy=flux[None] / flux.mean(axis=1)[:, None],
+        agn=np.zeros((1, 0, len(filters))),
+        dust_luminosity=np.zeros(n),
+        frac_agn=np.zeros(1),
+        allowed=np.ones((1, n), bool),
+        galaxy_parameters=templates,
+        agn_parameters=QTable(),
+        galaxy_properties=QTable(),
+        agn_properties=QTable(),
+        agn_multiplicity=np.zeros(0, int),
+        meta=provenance(templates=list(seds)),
+        axes={"redshift": np.zeros(1), "template": number},
+    )
+
+
+def _continued(sed):
+    """A spectrum with F_nu ~ wave^-2 from its end on."""
+    wave, fnu = sed.wave.to_value(WAVE), sed.fnu.to_value(FNU)
+    end = wave > _END * wave[-1]
+    level = np.mean((fnu * wave**2)[end])
+    more = np.geomspace(wave[-1], max(_FAR, 2.0 * wave[-1]), 400)[1:]
+    return SED(np.append(wave, more) * WAVE, np.append(fnu, level / more**2) * FNU)
+
+
+def _fluxes(name, sed, filters):
+    try:
+        flux = filters.synthetic_fluxes(sed).to_value(FNU)
+    except ValueError as err:
+        msg = f"template {name!r}: {err}"
+        raise ValueError(msg) from err
+    if not flux.mean() > 0:
+        raise argument_error("spectra", f"with light in the bands, also {name!r}", f"{flux}")
+    return flux

@@ -1,0 +1,167 @@
+"""Catalogs sorted into galaxies, quasars and stars: fits of each class, their table and their part of a page."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from miricigale.evaluation import number
+from miricigale.fitting.classification import class_columns
+from miricigale.plotting.axes import WIDTH, new_figure
+from miricigale.utils.exceptions import MiricigaleWarning
+from miricigale.utils.row_files import write_rows
+from miricigale.workflow.commands import fit_catalog
+
+__all__ = ["classes_of", "classes_section", "fit_classes", "write_table"]
+
+#: Objects of other classes than the first that a page lists, those of the highest ratio.
+_LISTED = 20
+#: ln ratio beyond which a class is called sure (odds of 150 to 1).
+_SURE = 5.0
+#: ln ratios that a drawing spans.
+_SPAN = 60.0
+
+
+def fit_classes(path, output, *, quasars=False, stars=None, **options):
+    """
+    Fit a catalog with galaxies and, where asked for, with quasars and stars.
+
+    Parameters
+    ----------
+    path, output, **options
+        As for `~miricigale.workflow.commands.fit_catalog`, which fits the galaxies. All classes have the same
+        bands, errors of models, limits and known redshifts, but stars are at redshift 0, and in front of the Milky
+        Way's dust.
+    quasars : bool, optional
+        Whether type-1 AGN are fitted: `~miricigale.sed.SEDModel.survey` with `~miricigale.sed.quasar_axes`, into
+        the folder ``quasar`` of ``output``.
+    stars : path-like, optional
+        Spectra of stars (`~miricigale.sed.read_spectra`), into the folder ``star``; those that end before the
+        bands do are continued as `~miricigale.sed.template_grid` does with a warning.
+
+    Returns
+    -------
+    found : dict of str to `~miricigale.fitting.FitResultsFiles`
+        ``galaxy``, ``quasar``, ``star``.
+    """
+    from miricigale.sed import SEDModel, quasar_axes, read_spectra, template_grid
+
+    # a file that cannot be read is told before hours of fitting
+    spectra = None if stars is None else read_spectra(stars)
+    found = {"galaxy": fit_catalog(path, output, **options)}
+    models = {}
+    if quasars:
+        models["quasar"] = lambda _: (SEDModel.survey(), quasar_axes())
+    if spectra is not None:
+        models["star"] = lambda bands: (
+            template_grid(spectra, bands, beyond="rayleigh-jeans"),
+            None,
+        )
+    for name, make in models.items():
+        left = ("pairs", "redshift") if name == "star" else ("pairs",)
+        own = {key: value for key, value in options.items() if key not in left}
+        with warnings.catch_warnings():
+            # what was told of the catalog with the galaxies
+            for text in ("bands of the photometry", ".*numbers? that", ".*left out"):
+                warnings.filterwarnings("ignore", text, MiricigaleWarning)
+            found[name] = fit_catalog(path, Path(output) / name, models=make, **own)
+    return found
+
+
+def write_table(found, path, *, overwrite=False):
+    """
+    Write the table of all results, with the columns of the classes where there are several.
+
+    Parameters
+    ----------
+    found : dict of str to `~miricigale.fitting.FitResultsFiles`
+        As `fit_classes` returned it.
+    path, overwrite
+        As for `~miricigale.fitting.FitResultsFiles.write_table`.
+    """
+    first = found["galaxy"]
+    if len(found) == 1:
+        first.write_table(path, overwrite=overwrite)
+        return
+    width = max(part.ids.dtype.itemsize for part in first.parts())
+    write_rows(path, _tables(found), len(first), id_width=width, overwrite=overwrite)
+
+
+def _tables(found):
+    for parts in zip(*(results.parts() for results in found.values()), strict=True):
+        some = dict(zip(found, parts, strict=True))
+        table = some["galaxy"].to_table()
+        for name, (values, text) in class_columns(some).items():
+            table[name] = values
+            table[name].info.description = text
+        yield table
+
+
+def classes_of(found):
+    """Columns of `~miricigale.fitting.compare_classes` for all objects: dict of name to array."""
+    parts = [
+        class_columns(dict(zip(found, part, strict=True)))
+        for part in zip(*(results.parts() for results in found.values()), strict=True)
+    ]
+    return {name: np.concatenate([part[name][0] for part in parts]) for name in parts[0]}
+
+
+def classes_section(page, found, ids, chi2):
+    """
+    The part of a page on classes.
+
+    Parameters
+    ----------
+    page : `~miricigale.evaluation.Report`
+        Gets the section.
+    found : dict of str to `~miricigale.fitting.FitResultsFiles`
+        The classes.
+    ids, chi2 : `~numpy.ndarray`, shape (n,)
+        Ids and reduced chi2 of the galaxies.
+    """
+    columns, others = classes_of(found), list(found)[1:]
+    label = columns["class"]
+    page.section(
+        f"Galaxy, {' or '.join(others)}",
+        "The class is that of the highest evidence, all classes being taken as equally frequent: priors of your "
+        "own go into compare_classes. Log ratios are ln of the evidence over that of galaxies; 5 is 150 to 1.",
+    )
+    rows = []
+    for name in found:
+        mine = label == name
+        sure = columns[f"probability_{name}"][mine] > 1.0 / (1.0 + np.exp(-_SURE))
+        own = (chi2 if name == "galaxy" else columns[f"reduced_chi2_{name}"])[mine]
+        middle = number(np.median(own) if own.size else np.nan, ".2f", "no object")
+        rows.append((name, int(mine.sum()), int(sure.sum()), middle))
+    rows.append(("not fitted with all classes", int(np.sum(label == "")), "", ""))
+    page.table(
+        rows, header=("class", "objects", "of them beyond 150 to 1", "reduced chi2, median"), text=1
+    )
+    figure, axes = new_figure(1, len(others), size=(WIDTH / 2, 3.2))
+    for ax, name in zip(axes[0], others, strict=True):
+        ratio = columns[f"log_ratio_{name}"]
+        ratio = ratio[np.isfinite(ratio)]
+        ax.hist(np.clip(ratio, -_SPAN, _SPAN), np.linspace(-_SPAN, _SPAN, 61), color="0.75")
+        ax.axvline(0.0, color="0.3", lw=0.8)
+        ax.set(xlabel=f"ln evidence, {name} over galaxy", ylabel="objects", yscale="log")
+    page.figure(
+        figure, "Evidence over that of galaxies; what is beyond stands in the outermost bins."
+    )
+    best = np.max([columns[f"log_ratio_{name}"] for name in others], axis=0)
+    order = [i for i in np.argsort(-best, kind="stable") if label[i] in others][:_LISTED]
+    if order:
+        page.table(
+            [
+                (
+                    str(ids[i]),
+                    label[i],
+                    f"{columns[f'log_ratio_{label[i]}'][i]:+.1f}",
+                    f"{columns[f'reduced_chi2_{label[i]}'][i]:.2f}",
+                    f"{chi2[i]:.2f}",
+                )
+                for i in order
+            ],
+            header=("id", "class", "ln ratio to galaxy", "its reduced chi2", "that of the galaxy"),
+            caption=f"Up to {_LISTED} objects that are no galaxies, the surest first.",
+            text=2,
+        )

@@ -1,0 +1,208 @@
+"""Evidences of classes: a scale and a template in closed form, and sources of known class."""
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.modeling.models import BlackBody
+from astropy.table import QTable, Table
+from scipy.special import logsumexp
+
+from miricigale.filters import FilterSet
+from miricigale.fitting import BayesFitter, FitFlags, TemplateError, compare_classes
+from miricigale.sed import SED, ModelGrid, SEDModel, quasar_axes, read_spectra, template_grid
+from miricigale.utils.exceptions import DataError, MiricigaleWarning
+
+BANDS = ["acs.f606w", "wfc3.f125w", "wfc3.f160w", "irac.ch1", "miri.f770w", "miri.f1500w"]
+
+
+def planck(temperature, last=60.0):
+    """Planck's law, the stand-in for a star: what is tested is what is done with spectra, not the library."""
+    wave = np.geomspace(0.2, last, 3000) * u.um
+    return SED(wave, (1e10 * BlackBody(temperature * u.K)(wave) * u.sr).to(u.uJy))
+
+
+def noisy(flux, signal_to_noise, seed, names, bands=BANDS):
+    """Photometry of fluxes, shape (n, nb), in uJy."""
+    error = flux / signal_to_noise
+    flux = flux + error * np.random.default_rng(seed).normal(size=flux.shape)
+    table = QTable({"id": names})
+    for i, band in enumerate(bands):
+        table[band], table[f"{band}_err"] = flux[:, i] * u.uJy, error[:, i] * u.uJy
+    return table
+
+
+@pytest.fixture(scope="module")
+def stars():
+    return {f"T{t:.0f}": planck(t) for t in np.geomspace(2500, 15000, 13)}
+
+
+@pytest.mark.parametrize(
+    "template_error", [None, TemplateError([0.3, 3, 30] * u.um, [0.02, 0.1, 0.2])]
+)
+def test_the_evidence_of_templates_with_a_scale_is_the_closed_form(stars, template_error):
+    """ln of the mean over templates of exp(-chi2 / 2) at the best scale, over the norm of the Gaussians."""
+    grid = template_grid(stars, BANDS)
+    error = 0.05 if template_error is None else 0.0
+    fitter = BayesFitter(grid, model_error=error, template_error=template_error)
+    table = noisy(7.0 * grid.galaxy[0, [2, 9]], 10, 3, ["a", "b"])
+    table[BANDS[1]][1] = np.nan
+    results = fitter.fit(table)
+    for row in (0, 1):
+        flux = np.array([table[b][row].value for b in BANDS])
+        sigma = np.array([table[f"{b}_err"][row].value for b in BANDS])
+        part = error
+        if template_error is not None:
+            pivots = FilterSet.from_names(BANDS).pivots.to_value("um")
+            part = np.interp(np.log(pivots), np.log([0.3, 3, 30]), [0.02, 0.1, 0.2])
+        sigma = np.hypot(sigma, part * flux)
+        use = np.isfinite(flux)
+        f, s, model = flux[use], sigma[use], grid.galaxy[0][:, use]
+        chi2 = np.sum((f / s) ** 2) - ((f * model / s**2).sum(1) ** 2 / ((model / s) ** 2).sum(1))
+        norm = np.log(s).sum() + 0.5 * use.sum() * np.log(2 * np.pi)
+        wanted = logsumexp(-0.5 * chi2) - np.log(len(model)) - norm
+        assert results.log_evidence[row] == pytest.approx(wanted, rel=1e-9)
+    assert results.best["redshift"].value.tolist() == [0, 0]
+    # the scale is the mean flux of the six bands in uJy
+    assert results.best["mass"][0].value == pytest.approx(7.0, rel=0.1)
+    assert np.all(np.abs(results.best["template"].value - [2, 9]) <= 1)
+
+
+def test_upper_limits_and_files_of_template_grids(stars, tmp_path):
+    """The limit of a band excludes the hotter stars; the grid is the same after a file."""
+    grid = template_grid(stars, BANDS)
+    grid.write(tmp_path / "stars.fits")
+    again = ModelGrid.read(tmp_path / "stars.fits")
+    assert again.galaxy_properties.colnames == []
+    assert again.meta["templates"] == list(stars)
+    table = noisy(grid.galaxy[0, [0]], 20, 1, ["cool"])
+    table["acs.f606w"] = 10 * table["acs.f606w"]
+    table["acs.f606w_limit"] = [True]
+    free, limited = (BayesFitter(g, model_error=0.05).fit(table) for g in (grid, again))
+    assert limited.n_limits.tolist() == [1]
+    np.testing.assert_allclose(limited.log_evidence, free.log_evidence, rtol=1e-12)
+    assert limited.best["template"].value.tolist() == [0]
+
+
+@pytest.fixture(scope="module")
+def fitters(stars):
+    """Thin grids of the three classes, in steps of 0.05 in ln(1 + z)."""
+    model, z = SEDModel.survey(), np.expm1(np.arange(0.1, 1.8, 0.05))
+    galaxies = {
+        "tau": [0.1, 1.0], "age": [0.1, 0.3, 1.0, 3.0], "ebv": [0.0, 0.2, 0.5, 0.8], "alpha": [2.0],
+        "tau97": [5.0], "frac_agn": [0.0, 0.3, 0.7], "redshift": z,
+    }  # fmt: skip
+    quasars = quasar_axes() | {"redshift": z, "tau97": [5.0]}
+    return {
+        "galaxy": BayesFitter(model, BANDS, axes=galaxies, model_error=0.1),
+        "quasar": BayesFitter(model, BANDS, axes=quasars, model_error=0.1),
+        "star": BayesFitter(template_grid(stars, BANDS), model_error=0.1),
+    }
+
+
+def sources(n, seed):
+    """Galaxies, quasars and stars between the nodes of the grids, S/N 20, as bright in F160W."""
+    rng, model = np.random.default_rng(seed), SEDModel.survey()
+    z = np.expm1(rng.uniform(0.2, 1.6, (2, n)))
+    both = {
+        "alpha": rng.uniform(1.5, 3.0, n),
+        "tau97": rng.uniform(3, 11, n),
+        "mass": np.full(n, 1e10),
+    }
+    galaxies = both | {
+        "redshift": z[0], "tau": 10 ** rng.uniform(-1, 0.3, n), "ebv": rng.uniform(0, 0.7, n),
+        "age": np.minimum(10 ** rng.uniform(-1, 0.5, n), 0.8 * model.cosmology.age(z[0]).value),
+        "frac_agn": np.where(rng.random(n) < 0.5, 0.0, rng.uniform(0, 0.7, n)),
+    }  # fmt: skip
+    quasars = both | {
+        "redshift": z[1], "tau": np.full(n, 0.5), "age": np.full(n, 0.5), "ebv": rng.uniform(0.1, 0.4, n),
+        "frac_agn": rng.uniform(0.8, 0.99, n), "inclination": rng.uniform(10, 40, n),
+        "disk_slope": rng.uniform(-0.3, 0.3, n), "ebv_polar": rng.uniform(0.0, 0.2, n),
+    }  # fmt: skip
+    flux = [
+        np.column_stack([out[b].value for b in BANDS])
+        for out in (model.fluxes(QTable(table), BANDS) for table in (galaxies, quasars))
+    ]
+    temperatures = np.exp(rng.uniform(np.log(2700), np.log(12000), n))
+    flux.append(
+        template_grid({str(i): planck(t) for i, t in enumerate(temperatures)}, BANDS).galaxy[0]
+    )
+    flux = np.concatenate(flux)
+    names = [f"{kind}{i}" for kind in ("galaxy", "quasar", "star") for i in range(n)]
+    return noisy(10 * flux / flux[:, [2]], 20, seed, names)
+
+
+def test_sources_of_known_class_are_sorted(fitters):
+    """At S/N 20 in six bands nine of ten of each class are found, stars always (Planck's law is narrow)."""
+    n = 20
+    table = compare_classes({name: f.fit(sources(n, 11)) for name, f in fitters.items()})
+    right = np.char.startswith(table["id"].astype(str), table["class"].astype(str))
+    galaxy, quasar, star = right.reshape(3, n).sum(axis=1)
+    assert galaxy >= 0.9 * n
+    assert quasar >= 0.9 * n
+    assert star == n
+    # the probabilities are what the ratios say
+    ratio = np.array([table["log_ratio_quasar"], table["log_ratio_star"]])
+    wanted = 1.0 / (1.0 + np.exp(ratio).sum(axis=0))
+    np.testing.assert_allclose(table["probability_galaxy"], wanted, rtol=1e-9, atol=1e-300)
+
+
+def test_priors_of_classes_and_what_is_refused(fitters):
+    data = sources(2, 5)
+    data["wfc3.f160w"][0] = np.nan
+    for band in BANDS:
+        data[band][1] = np.nan
+    fits = {name: fitters[name].fit(data) for name in ("quasar", "star")}
+    plain = compare_classes(fits)
+    prior = {"quasar": 1.0, "star": np.full(6, 7.0)}
+    table = compare_classes(fits, prior=prior)
+    odds, before = (t["probability_star"] / t["probability_quasar"] for t in (table, plain))
+    some = (before > 1e-200) & np.isfinite(before)
+    np.testing.assert_allclose(odds[some], 7.0 * before[some], rtol=1e-9)
+    # what has no band has no class
+    assert fits["star"].flags[1] & FitFlags.NO_BAND
+    assert table["class"][1] == ""
+    assert np.isnan(table["probability_star"][1])
+    with pytest.raises(ValueError, match="two classes"):
+        compare_classes({"star": fits["star"]})
+    with pytest.raises(ValueError, match="'star' of the same data as 'quasar', got other objects"):
+        compare_classes(fits | {"star": fits["star"][:3]})
+    brighter = data.copy()
+    brighter["wfc3.f125w"] = 1.01 * brighter["wfc3.f125w"]
+    with pytest.raises(ValueError, match="got other values of 'flux'"):
+        compare_classes(fits | {"star": fitters["star"].fit(brighter)})
+    fewer = BayesFitter(fitters["star"].grid, BANDS[1:]).fit(data)
+    with pytest.raises(ValueError, match="got the bands"):
+        compare_classes(fits | {"star": fewer})
+    for prior, text in (({"star": 1}, "of the classes"), ({"star": 0, "quasar": 0}, "not all 0")):
+        with pytest.raises(ValueError, match=text):
+            compare_classes(fits, prior=prior)
+
+
+def test_spectra_of_files(tmp_path):
+    """Angstrom and F_lambda where a file says nothing; a vector is several; the Rayleigh-Jeans side goes on."""
+    wave = np.geomspace(2000, 25000, 400)
+    folder = tmp_path / "atlas"
+    folder.mkdir()
+    flam = 1e-17 * (wave / 5000) ** -2.0
+    np.savetxt(folder / "flat.dat", np.column_stack([wave, flam]), header="wave flux")
+    table = Table({"WAVELENGTH": wave, "FLUX": np.column_stack([flam, 2 * flam])})
+    table["WAVELENGTH"].unit, table["FLUX"].unit = "Angstrom", "erg / (s cm2 Angstrom)"
+    table.write(folder / "two.fits")
+    spectra = read_spectra(folder)
+    assert list(spectra) == ["flat", "two[0]", "two[1]"]
+    # F_lambda ~ wave^-2 is a flat F_nu: 1e-17 at 5000 Angstrom is 8.339 uJy
+    for name, level in zip(spectra, (8.339, 8.339, 16.678), strict=True):
+        np.testing.assert_allclose(spectra[name].fnu.value, level, rtol=1e-3)
+    with pytest.raises(ValueError, match=r"template 'flat'.*irac\.ch1"):
+        template_grid(spectra, BANDS)
+    with pytest.warns(MiricigaleWarning, match="3 of 3 spectra continued to"):
+        grid = template_grid(
+            spectra, ["wfc3.f125w", "miri.f770w", "miri.f1500w"], beyond="rayleigh-jeans"
+        )
+    ratio = grid.galaxy[0, 0, 1] / grid.galaxy[0, 0, 2]
+    assert ratio == pytest.approx((15.065 / 7.639) ** 2, rel=0.02)
+    (folder / "none.txt").write_text("wave flux\n1 nan\n2 1\n")
+    with pytest.raises(DataError, match=r"none\.txt cannot be read as a spectrum"):
+        read_spectra(folder)
+    with pytest.raises(DataError, match="no files of spectra"):
+        read_spectra(tmp_path)
