@@ -2,15 +2,15 @@
 
 from miricigale.instrument import ImageFacts, mosaic_wcs
 from miricigale.reduction.align import align_images
-from miricigale.reduction.background import BackgroundFlags
-from miricigale.reduction.dither_background import from_dithers
+from miricigale.reduction.background import BackgroundFlags, remove_background
+from miricigale.reduction.dither_background import dither_backgrounds, restored
 from miricigale.reduction.images import check_images, check_overlap, seen_wcs
 from miricigale.reduction.mosaic import drizzle_images, pixel_map, reject_outliers, weight_map
 from miricigale.reduction.results import ReductionResult
 from miricigale.reduction.sky_match import match_levels
 from miricigale.utils.exceptions import argument_error
 
-__all__ = ["combine", "drizzle"]
+__all__ = ["combine", "drizzle", "subtract_dithers"]
 
 
 def drizzle(reducer, images, wcs, pixfrac=None):
@@ -47,6 +47,17 @@ def drizzle(reducer, images, wcs, pixfrac=None):
     return result, images
 
 
+def subtract_dithers(reducer, images, alone, wcs=None):
+    """As `~miricigale.reduction.Reducer.subtract_dithers`, with the background of each image alone."""
+    backgrounds = dither_backgrounds(images, alone, wcs=wcs)
+    options = {
+        "negative_threshold": reducer.negative_threshold,
+        "negative_noise": reducer.negative_noise,
+    }
+    pairs = zip(images, backgrounds, strict=True)
+    return [remove_background(*pair, **options) for pair in pairs], backgrounds
+
+
 def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align):
     """
     As `~miricigale.reduction.Reducer.combine`.
@@ -76,13 +87,8 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align):
         notes.append(f"{number}: outliers cannot be rejected, hits that ramps kept stay in")
     if reducer.background == "dithers":
         if len(images) >= 3 and len(backgrounds) == len(images):
-            images, backgrounds = from_dithers(
-                images,
-                backgrounds,
-                wcs,
-                negative_threshold=reducer.negative_threshold,
-                negative_noise=reducer.negative_noise,
-            )
+            whole = [restored(im, b.level) for im, b in zip(images, backgrounds, strict=True)]
+            images, backgrounds = subtract_dithers(reducer, whole, backgrounds, wcs)
         else:
             notes.append("backgrounds are those of single exposures: it takes three and theirs")
     doubts = [b for b in backgrounds if not b.trusted]

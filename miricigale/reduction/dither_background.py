@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from miricigale.instrument import DQ, mosaic_wcs
-from miricigale.reduction.background import check_mesh, estimated, remove_background, tell
+from miricigale.reduction.background import check_mesh, estimated, tell
 from miricigale.reduction.images import check_images, plain_mask, seen_wcs, with_data
 from miricigale.reduction.mosaic import drizzle_images, pixel_map
 from miricigale.reduction.sky_mesh import sky_boxes, spread_over
@@ -14,7 +14,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks
 from miricigale.utils.units import ANGLE
 
-__all__ = ["dither_backgrounds", "from_dithers"]
+__all__ = ["dither_backgrounds", "restored"]
 
 # rows of which the median of many images is taken together
 _ROWS = 128
@@ -112,17 +112,14 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None, box=16, filter_siz
     return out
 
 
-def from_dithers(images, backgrounds, wcs, **negative):
-    """Images less the backgrounds of their dithers in place of their own, which are off; and those."""
-    whole = []
-    for im, background in zip(images, backgrounds, strict=True):
-        whole.append(with_data(im, im.data + background.level))
-        # what was far below the background is judged again
-        low = (whole[-1].flags & int(DQ.NEGATIVE)) != 0
-        whole[-1].flags[low] &= ~int(DQ.NEGATIVE | DQ.DO_NOT_USE)
-        whole[-1].mask[low] = False
-    new = dither_backgrounds(whole, backgrounds, wcs=wcs)
-    return [remove_background(*pair, **negative) for pair in zip(whole, new, strict=True)], new
+def restored(image, level):
+    """An image of which a background was subtracted, with that background."""
+    whole = with_data(image, image.data + level)
+    # what was far below the background is to be judged again
+    low = (whole.flags & int(DQ.NEGATIVE)) != 0
+    whole.flags[low] &= ~int(DQ.NEGATIVE | DQ.DO_NOT_USE)
+    whole.mask[low] = False
+    return whole
 
 
 def _deep_masks(images, backgrounds, wcs):

@@ -8,9 +8,9 @@ from astropy.nddata import CCDData
 from miricigale.detector import Charge, Ramp, ResetAnomaly
 from miricigale.instrument import DetectorProperties, ImageFacts, miri_detector
 from miricigale.reduction.assumed import brightness_of, maps_of
-from miricigale.reduction.background import estimate_background, subtract_background
+from miricigale.reduction.background import estimate_background, estimated, subtract_background
 from miricigale.reduction.calibration import calibrate
-from miricigale.reduction.combine import combine, drizzle
+from miricigale.reduction.combine import combine, drizzle, subtract_dithers
 from miricigale.reduction.files import open_exposure
 from miricigale.reduction.results import rate_image
 from miricigale.reduction.settings import BACKENDS, check_settings
@@ -72,7 +72,7 @@ class Reducer:
     background : {"masked", "sep", "dithers"}, optional
         How the background of an exposure is estimated: from its own sky, with the sources masked
         (`estimate_background`); by the plain mesh of sep, as in Yang et al. 2021 (with ``box=32``); or, in
-        `run` and `combine`, from the other dithers (`dither_backgrounds`).
+        `run`, `combine` and `subtract_dithers`, from the other dithers (`dither_backgrounds`).
     box, filter_size : int, optional
         Of the background: boxes in pixels, median filter in boxes.
     plane : bool, optional
@@ -293,6 +293,25 @@ class Reducer:
             "negative_threshold": self.negative_threshold, "negative_noise": self.negative_noise
         }  # fmt: skip
         return subtract_background(image, **negative, **self._mesh)
+
+    def subtract_dithers(self, images, *, wcs=None):
+        """
+        Subtract from each image the background of its dithers.
+
+        Parameters
+        ----------
+        images : list of `~astropy.nddata.CCDData`
+            Calibrated and with their background, three or more of one filter (`dither_backgrounds`).
+        wcs : `~astropy.wcs.WCS`, optional
+            Grid on which sources to be masked are searched for; that of `run` if not given.
+
+        Returns
+        -------
+        images : list of `~astropy.nddata.CCDData`
+        backgrounds : list of `Background`
+        """
+        images = list(images)
+        return subtract_dithers(self, images, [estimated(im, **self._mesh) for im in images], wcs)
 
     def mosaic(self, images, wcs, *, pixfrac=None):
         """

@@ -21,6 +21,7 @@ from miricigale.reduction import (
     read_images,
     write_image,
 )
+from miricigale.reduction.dither_background import restored
 from miricigale.utils.content import content_sha256, file_sha256
 from miricigale.utils.exceptions import DataError, argument_error
 from miricigale.utils.progress import progress
@@ -31,7 +32,7 @@ __all__ = ["reduce_files"]
 log = logging.getLogger(__name__)
 
 #: Changes with what the products hold.
-_VERSION = 3
+_VERSION = 4
 
 #: What a bad file may raise; the others go on.
 _ERRORS = (ArithmeticError, ImportError, KeyError, MemoryError, OSError, ValueError)
@@ -203,8 +204,14 @@ def _mosaic(reducer, members, path, scale, settings, resume):
     key = content_sha256([_VERSION, [key for _, key in members], scale, settings])
     if _kept(path, key, resume):
         return "kept", json.loads(read_images(path)[0].header["META"]).get("notes", [])
-    images = [read_images(cal)[0].image for cal, _ in members]
-    result = reducer.combine(images, [], pixel_scale=scale * ANGLE)
+    files = [read_images(cal)[0] for cal, _ in members]
+    images, backgrounds = [file.image for file in files], []
+    if reducer.background == "dithers" and len(files) >= 3:
+        images, backgrounds = reducer.subtract_dithers(
+            [restored(file.image, file.planes["BKG"]) for file in files]
+        )
+        reducer = reducer.replace(background="masked")
+    result = reducer.combine(images, backgrounds, pixel_scale=scale * ANGLE)
     mosaic = result.mosaic
     mosaic.meta["notes"] = list(result.notes)
     level = result.mosaic_background.level

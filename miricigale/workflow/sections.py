@@ -232,8 +232,8 @@ class ReductionSection:
     )
     background: str = option(
         "masked",
-        "Background: about masked sources, or the plain mesh of sep.",
-        choices=("masked", "sep"),
+        "Background: about masked sources, the plain mesh of sep, or that of the other dithers (three or more).",
+        choices=("masked", "sep", "dithers"),
     )
     background_box: int = option(64, "Box of the background mesh in pixels.", low=8, high=512)
     background_filter: int = option(3, "Median filter of the mesh in cells.", low=1, high=15)

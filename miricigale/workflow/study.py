@@ -1,5 +1,6 @@
 """The study as one call."""
 
+import collections
 from pathlib import Path
 
 import astropy.units as u
@@ -60,6 +61,12 @@ def check_study(config):
     except (KeyError, ValueError) as err:
         msg = f"[exposures] {err.args[0]}"
         raise ConfigError(msg) from err
+    number = collections.Counter(exposure.filter for exposure in exposures.values())
+    if config.reduction.background == "dithers" and (few := [n for n in number if number[n] < 3]):
+        msg = (
+            f"[reduction] background = 'dithers' takes three exposures of each filter, not so {few}"
+        )
+        raise ConfigError(msg)
     for exposure in exposures.values():
         try:
             level = study_background(config, exposure.filter)

@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
+from astropy.nddata import CCDData
 from astropy.table import QTable
 
 from miricigale.depth import zodiacal_factor
@@ -20,7 +21,13 @@ from miricigale.workflow.stages.exposures import (
     study_background,
     study_exposures,
 )
-from miricigale.workflow.stages.images import expose_and_reduce
+from miricigale.workflow.stages.images import (
+    expose_and_reduce,
+    expose_image,
+    imager_of,
+    mosaics_of,
+    reducer_of,
+)
 from miricigale.workflow.stages.provenance import _background_sentence
 from miricigale.workflow.study import check_study
 
@@ -167,3 +174,53 @@ def test_images_have_the_background_that_was_asked_for():
     # through gain, non-linearity, flat field and conversion back to a surface brightness
     assert cal.meta["background"] == pytest.approx(20.0, rel=3e-3)
     assert np.isfinite(forecasts[0].sky_fraction)
+
+
+@pytest.mark.slow
+def test_backgrounds_of_dithers_are_those_of_the_detector():
+    """Glow that lies still on the detector leaves mosaics; a mesh that is wider than it leaves it in them."""
+    exposures = {
+        "filters": BANDS[:1], "kind": "rates", "n_groups": [40], "n_integrations": [1],
+        "n_dithers": [3], "dithers": "ceers",
+    }  # fmt: skip
+    images, left = [], {}
+    for method in ("dithers", "masked"):
+        config = StudyConfig.from_dict(
+            {
+                "exposures": exposures,
+                "fit": {"min_detected": 1},
+                "reduction": {"background": method},
+            }
+        )
+        if not images:
+            for e in study_exposures(config).values():
+                y, x = np.indices(e.shape)
+                light = 20 + 0.4 * np.sin(2 * np.pi * x / 60) * np.sin(2 * np.pi * y / 60)
+                sky = CCDData(light, unit="MJy/sr", wcs=e.wcs)
+                images.append(expose_image(config, imager_of(config), sky, e, seed=2)[1])
+            # the sky stays in them until all dithers are there
+            assert np.median(images[0].data[~images[0].mask]) == pytest.approx(20.0, rel=3e-3)
+            own = images
+        else:
+            reducer = reducer_of(config)
+            own = [reducer.subtract_background(im)[0] for im in images]
+        _, mosaic, planes = next(mosaics_of(config, own))
+        ny, nx = (n // 12 * 12 for n in mosaic.shape)
+        cells = np.ma.masked_array(mosaic.data, mosaic.mask | (planes["n_images"] < 3))[:ny, :nx]
+        left[method] = cells.reshape(ny // 12, 12, nx // 12, 12).mean(axis=(1, 3)).std()
+    # 0.2 rms, less what dithers of a few arcsec average out; and noise
+    assert left["masked"] > 0.08
+    assert left["dithers"] < 0.3 * left["masked"]
+
+
+def test_backgrounds_of_dithers_take_three_of_them():
+    config = StudyConfig.from_dict(
+        {
+            "exposures": {"filters": BANDS, "n_dithers": [3, 2]},
+            "reduction": {"background": "dithers"},
+        }
+    )
+    with pytest.raises(
+        ConfigError, match=r"^\[reduction\] background = 'dithers' .* \['miri.f2100w'\]"
+    ):
+        check_study(config)

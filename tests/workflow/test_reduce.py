@@ -82,6 +82,18 @@ def test_all_stages_and_filters_in_one_go(files, tmp_path, capsys):
     assert list(table["status"]) == ["reduced", "reduced"]
 
 
+def test_backgrounds_of_dithers_are_those_of_the_classes(files, tmp_path):
+    reducer = Reducer(background="dithers")
+    table = reduce_files(files[:3], tmp_path, reducer=reducer)
+    assert table["reason"][-1] in ("", None, np.ma.masked)
+    (file,) = read_images(tmp_path / "mosaic_f770w.fits")
+    result = reducer.run(files[:3])
+    # but for the rounding of files and the mosaic's own level
+    noise = np.nanmedian(result.mosaic.uncertainty.array)
+    off = np.abs(file.image.data - result.mosaic.data)[~result.mosaic.mask]
+    assert np.percentile(off, 99) < 0.02 * noise
+
+
 def test_wrong_arguments_are_named(files, tmp_path, capsys):
     with pytest.raises(ValueError, match="'paths' must be at least one file, got none"):
         reduce_files([], tmp_path)

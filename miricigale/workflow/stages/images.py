@@ -120,7 +120,7 @@ def expose_and_reduce(
     Returns
     -------
     rate, cal : `~astropy.nddata.CCDData`
-        In DN/s and, background subtracted, in MJy/sr.
+        In DN/s and in MJy/sr, background subtracted unless that of dithers will be (`mosaics_of`).
     """
     differ = perturbation or Perturbation({}, seed)
     sky = scene.Scene(
@@ -149,7 +149,9 @@ def expose_image(config, imager, image, exposure, *, seed, n_threads=None, keep=
     reducer = reducer_of(config, n_threads)
     rate = reducer.fit_ramp(ramp)
     del ramp
-    cal, _ = reducer.subtract_background(reducer.calibrate(rate))
+    cal = reducer.calibrate(rate)
+    if reducer.background != "dithers":
+        cal, _ = reducer.subtract_background(cal)
     return rate, cal
 
 
@@ -230,6 +232,8 @@ def make_mosaic(context, unit):
 def mosaics_of(config, images):
     """Mosaics of a band, on its own grid (``""``) and on the prior's (``"_fine"``), with further planes."""
     reducer = reducer_of(config)
+    if reducer.background == "dithers":
+        images, _ = reducer.subtract_dithers(images)
     for label, scale in (("", config.reduction.pixel_scale), ("_fine", config.highres.pixel_scale)):
         # outliers are found in the first pass, which returns the images with them masked
         drizzled, images = reducer.drizzle(images, grid_of(config, scale))
