@@ -9,7 +9,7 @@ from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.stats import mad_std
 from astropy.wcs.utils import pixel_to_pixel, proj_plane_pixel_scales
 
-from miricigale.instrument import north_up_wcs, pixel_area_map
+from miricigale.instrument import ImageFacts, north_up_wcs, pixel_area_map
 from miricigale.photometry.sky_noise import mask_filled
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks
@@ -55,6 +55,7 @@ class FitArrays:
     wcs: object
     measured_noise: bool
     scratch: object = None  # Folder of files that images are kept in; in memory if None.
+    noise_correction: float = 1.0  # As the image states it (`ImageFacts`).
 
     def new(self, dtype=np.float32):
         """A new image of zeros."""
@@ -147,6 +148,7 @@ def fit_arrays(image, name, scratch=None):
         wcs=image.wcs,
         measured_noise=image.uncertainty is None,
         scratch=scratch,
+        noise_correction=ImageFacts.of(image).noise_correction,
     )
 
 

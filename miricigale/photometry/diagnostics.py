@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from miricigale.photometry import _core
-from miricigale.photometry.errors import noise_correlation
+from miricigale.photometry.errors import noise_correlation, stated_correlation
 from miricigale.photometry.flags import POOR_CHI2, POOR_STRAIN, ForcedFlags
 from miricigale.photometry.residual_sources import ResidualPeaks, residual_peaks
 from miricigale.utils.parallel import chunks
@@ -62,7 +62,7 @@ def diagnose(fit, xy):
 
 
 def _correlation(fit, residual, model):
-    """Measured correlation of the noise, or None where there is too little sky."""
+    """Measured correlation of the noise, or as the image states it where there is too little sky; or None."""
     usable = fit.arrays.usable
     free = fit.arrays.new(bool)
     for part in chunks(len(free), 256):
@@ -71,7 +71,8 @@ def _correlation(fit, residual, model):
     if np.count_nonzero(free) < max(400, 0.02 * np.count_nonzero(usable)):
         free = usable
     if np.count_nonzero(free) < 400:
-        return None
+        stated = fit.arrays.noise_correction
+        return stated_correlation(stated) if stated > 1 else None
     correlation = noise_correlation(
         residual, free, weight=fit.inverse_sigma, executor=fit.bank.executor
     )

@@ -12,7 +12,14 @@ from miricigale.photometry import _core
 from miricigale.photometry.templates import batches
 from miricigale.utils.parallel import chunks, parallel_map
 
-__all__ = ["LinearFit", "cross_matrix", "noise_correlation", "normal_matrix", "sandwich_matrix"]
+__all__ = [
+    "LinearFit",
+    "cross_matrix",
+    "noise_correlation",
+    "normal_matrix",
+    "sandwich_matrix",
+    "stated_correlation",
+]
 
 
 def noise_correlation(
@@ -96,6 +103,34 @@ def noise_correlation(
         lag = outer - 1
     keep = slice(len(index) // 2 - lag, len(index) // 2 + lag + 1)
     return covariance[keep, keep].copy()
+
+
+def stated_correlation(factor):
+    """
+    Covariance of pixels' noise of a mosaic that is too small for it to be measured.
+
+    Parameters
+    ----------
+    factor : float
+        How much noisier sums over many pixels are than their errors in quadrature; above 1.
+
+    Returns
+    -------
+    correlation : `~numpy.ndarray`, shape (2 m + 1, 2 m + 1)
+        As `noise_correlation` gives it: along each axis a triangle whose values have the sum ``factor``.
+
+    Notes
+    -----
+    Of drizzled images, whose drops are as wide as the output's pixels, it is what many dithers make (lag 1: 1/4).
+
+    References
+    ----------
+    Fruchter & Hook 2002, PASP 114, 144, sec. 7; Casertano et al. 2000, AJ 120, 2747, appendix A.
+    """
+    lag = max(1, int(np.ceil(factor - 1)))
+    width = lag * (lag + 1) / (2 * lag + 1 - factor)
+    triangle = 1 - np.abs(np.arange(-lag, lag + 1)) / width
+    return np.outer(triangle, triangle)
 
 
 #: Pairs of stamps that a thread works on at a time.

@@ -70,7 +70,8 @@ class ForcedPhotometer:
         of them the order is lowered, or one shift fitted, and a warning says so.
     correlated_noise : bool, optional
         Whether the noise's autocorrelation is measured on source-free pixels and goes into
-        the errors; otherwise the image's uncertainty is taken as white noise.
+        the errors; otherwise the image's uncertainty is taken as white noise. With fewer than 400 pixels
+        it is what the mosaic states (``meta["noise_correction"]``), if it does.
     integrate : bool, optional
         Whether templates are averaged over the image's pixels, for a kernel whose target
         does not include the response of the pixel.

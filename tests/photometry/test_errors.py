@@ -1,3 +1,5 @@
+import dataclasses
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -13,7 +15,9 @@ from miricigale.photometry.errors import (
     noise_correlation,
     normal_matrix,
     sandwich_matrix,
+    stated_correlation,
 )
+from miricigale.reduction import drizzle_images
 
 
 def noise_images(kind, shape, rng):
@@ -61,6 +65,59 @@ def test_pulls_are_unity(tools, kind):
         assert np.std(plain) > 2.0
     else:
         assert 0.9 < np.std(plain) < 1.1
+
+
+def drizzled(tools, rng, scale, side):
+    """A mosaic of ``side`` arcsec without sources, of four turned dithers of white noise."""
+    shape = (int(side / 0.11) + 20,) * 2
+    level = 0.5 * 1e-12 / tools.SR
+    images = []
+    for _ in range(4):
+        wcs = north_up_wcs(tools.CENTER, 0.11 * u.arcsec, shape)
+        wcs.wcs.crpix = wcs.wcs.crpix + rng.uniform(-3, 3, 2)
+        angle = np.radians(10.0)
+        wcs.wcs.pc = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        images.append(tools.as_ccd(level * rng.normal(size=shape), wcs, level))
+    n = int(side / scale)
+    return drizzle_images(images, north_up_wcs(tools.CENTER, scale * u.arcsec, (n, n))).image
+
+
+@pytest.mark.parametrize(("scale", "white"), [(0.11, 1.4), (0.06, 2.1)])
+def test_errors_on_mosaics_are_the_scatter_of_fits_of_nothing(tools, scale, white):
+    """Drizzled dithers, whose neighboring pixels share what they see (Fruchter & Hook 2002, sec. 7)."""
+    rng = np.random.default_rng(8)
+    at = (np.arange(9) - 4) * 2.7
+    dx, dy = (a.ravel() + rng.uniform(-0.3, 0.3, 81) for a in np.meshgrid(at, at))
+    catalog = QTable({"sky": tools.CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)})
+    photometer = ForcedPhotometer(tools.kernel, template="psf", psf_error=0.0)
+    pulls, plain = [], []
+    for k in range(10):
+        mosaic = drizzled(tools, rng, scale, 26.0)
+        result = photometer.measure(mosaic, catalog=catalog)
+        pulls.append(result.flux / result.flux_err)
+        if k < 3:
+            naive = dataclasses.replace(photometer, correlated_noise=False)
+            result = naive.measure(mosaic, catalog=catalog)
+            plain.append(result.flux / result.flux_err)
+    # 810 fits: 2.5 %
+    assert np.std(pulls) == pytest.approx(1, abs=0.07)
+    assert np.std(plain) > white
+
+
+@pytest.mark.parametrize("scale", [0.11, 0.06])
+def test_a_mosaic_without_room_for_sky_states_its_correlation(tools, scale):
+    rng = np.random.default_rng(9)
+    catalog = QTable({"sky": tools.CENTER.spherical_offsets_by([0] * u.arcsec, [0] * u.arcsec)})
+    photometer = ForcedPhotometer(tools.kernel, template="psf", psf_error=0.0)
+    pulls = []
+    for _ in range(100):
+        mosaic = drizzled(tools, rng, scale, 19 * scale)
+        result = photometer.measure(mosaic, catalog=catalog)
+        pulls.append((result.flux / result.flux_err)[0])
+    # 7 % by the number of draws
+    assert np.std(pulls) == pytest.approx(1, abs=0.2)
+    total = stated_correlation(mosaic.meta["noise_correction"]).sum()
+    assert total == pytest.approx(mosaic.meta["noise_correction"] ** 2)
 
 
 def test_wrong_sigmas_do_not_matter(tools):
