@@ -50,8 +50,8 @@ class Alignment:
 
     @property
     def error(self):
-        """Standard error of the shift, in one coordinate."""
-        return self.scatter / np.sqrt(self.n_matched)
+        """Standard error of the shift, in one coordinate; 0 of an image that stands where it is."""
+        return self.scatter / np.sqrt(max(self.n_matched, 1))
 
 
 def align_to_catalog(
@@ -116,6 +116,12 @@ def align_images(
     -------
     images : list of `~astropy.nddata.CCDData`
     alignments : list of `Alignment`
+        Of the first image without a catalog that of none, with the number of its sources.
+
+    Raises
+    ------
+    ValueError
+        As of `align_to_catalog`, naming the image by its place in the list; or if there are no images.
     """
     images = list(images)
     if not images:
@@ -123,8 +129,9 @@ def align_images(
     reach = positive(radius, ANGLE, "radius")
     known = None if catalog is None else _positions(catalog)
     out, alignments = [], []
-    for im in images:
-        x, y = _sources(im, threshold, fwhm)
+    for k, im in enumerate(images):
+        name = f"images[{k}]"
+        x, y = _sources(im, threshold, fwhm, name)
         if known is None:
             zero = 0 * ANGLE
             kept = Alignment(
@@ -132,7 +139,7 @@ def align_images(
             )
             aligned, alignment = im, kept
         else:
-            aligned, alignment = _aligned(im, x, y, known, reach, rotation)
+            aligned, alignment = _aligned(im, x, y, known, reach, rotation, name)
         if catalog is None:
             sky = aligned.wcs.pixel_to_world(x, y)
             if known is not None:
@@ -149,13 +156,23 @@ def align_images(
 def _positions(catalog):
     if not isinstance(catalog, SkyCoord) or catalog.isscalar:
         raise argument_error("catalog", "a SkyCoord of several positions", repr(catalog)[:60])
+    unknown = int(np.count_nonzero(~np.isfinite(catalog.cartesian.norm())))
+    if unknown:
+        raise argument_error(
+            "catalog", "of finite positions", f"{unknown} of {len(catalog)} that are not"
+        )
     return SkyCoord(catalog.icrs.ra, catalog.icrs.dec)
 
 
-def _sources(image, threshold, fwhm):
+def _sources(image, threshold, fwhm, argument="image"):
     """Windowed positions of the sources of an image, in pixels."""
     if image.wcs is None or image.uncertainty is None:
-        raise argument_error("image", "one with uncertainty and WCS", "one without")
+        raise argument_error(argument, "one with uncertainty and WCS", "one without")
+    if not str(image.wcs.wcs.ctype[0]).startswith("RA"):
+        axes = " and ".join(image.wcs.wcs.ctype)
+        raise argument_error(
+            argument, "one with right ascension along its first axis of the sky", axes
+        )
     check_positive(threshold, "threshold")
     scale = float(np.mean(proj_plane_pixel_scales(image.wcs))) * 3600
     if fwhm is None:
@@ -174,7 +191,7 @@ def _sources(image, threshold, fwhm):
     return x[good], y[good]
 
 
-def _aligned(image, x, y, catalog, radius, rotation):
+def _aligned(image, x, y, catalog, radius, rotation, argument="image"):
     """Image with its WCS moved to a catalog, and by how much."""
     # plane about the reference position, deg, east and north
     plane = WCS(naxis=2)
@@ -192,12 +209,14 @@ def _aligned(image, x, y, catalog, radius, rotation):
     if len(shift):
         tree = KDTree(shift)
         votes = tree.query_ball_point(shift, _VOTE, return_length=True)
-        used = np.hypot(*(shift - np.median(shift[votes == votes.max()], axis=0)).T) < _VOTE
+        # of several shifts that are as frequent one: between them there are none
+        near = tree.query_ball_point(shift[np.argmax(votes)], _VOTE)
+        used = np.hypot(*(shift - np.median(shift[near], axis=0)).T) < _VOTE
     turn, move, residual = 0.0, np.zeros(2), shift
     for _ in range(5):
         if np.count_nonzero(used) < _LEAST:
             wanted = f"one with at least {_LEAST} sources of the catalog within {radius:g} arcsec"
-            raise argument_error("image", wanted, f"{np.count_nonzero(used)} of {len(x)} sources")
+            raise argument_error(argument, wanted, f"{np.count_nonzero(used)} of {len(x)} sources")
         turn, move = _solved(one[used], other[used], rotation)
         residual = other - _turned(one, turn) - move
         spread = np.sqrt(np.mean(np.square(residual[used])))

@@ -57,18 +57,21 @@ def sky_offsets(images, wcs, *, pixel_maps=None):
         for im, where in zip(images, pixel_maps, strict=True)
     ]
     n = len(images)
-    matrix, right = np.zeros((n, n)), np.zeros(n)
-    for i in range(n):
-        for j in range(i):
-            difference, weight = _difference(means[i], means[j])
-            # the normal equations of offset i - offset j = difference
-            for k, m, sign in ((i, j, 1.0), (j, i, -1.0)):
-                matrix[k, k] += weight
-                matrix[k, m] -= weight
-                right[k] += sign * weight * difference
-    scale = matrix.max()
-    if not scale > 0:
+    pairs = {(i, j): _difference(means[i], means[j]) for i in range(n) for j in range(i)}
+    pairs = {pair: found for pair, found in pairs.items() if found is not None}
+    if not pairs:
         return np.zeros(n)
+    # images that are one and the same have no scatter: others would count for nothing beside them
+    least = 1e-3 * max(spread for _, spread, _ in pairs.values()) or 1.0
+    matrix, right = np.zeros((n, n)), np.zeros(n)
+    for (i, j), (difference, spread, number) in pairs.items():
+        weight = number / max(spread, least) ** 2
+        # the normal equations of offset i - offset j = difference
+        for k, m, sign in ((i, j, 1.0), (j, i, -1.0)):
+            matrix[k, k] += weight
+            matrix[k, m] -= weight
+            right[k] += sign * weight * difference
+    scale = matrix.max()
     # of the solutions the smallest: its mean is zero in each group
     return np.linalg.pinv(matrix / scale, rcond=1e-10, hermitian=True) @ (right / scale)
 
@@ -83,23 +86,20 @@ def _means(im, where, shape):
     cell = (row * nx + column)[inside]
     if not cell.size:
         return cell, np.empty(0)
-    numbers, cell, count = np.unique(cell, return_inverse=True, return_counts=True)
+    count = np.bincount(cell)
     total = np.bincount(cell, np.asarray(im.data, float)[good][inside])
-    full = count >= 0.5 * np.percentile(count, 90)
-    return numbers[full], total[full] / count[full]
+    numbers = np.flatnonzero(count >= max(1, 0.5 * np.percentile(count[count > 0], 90)))
+    return numbers, total[numbers] / count[numbers]
 
 
 def _difference(one, other):
-    """Median difference of two images in the cells that both fill, and its weight; zeros without enough."""
+    """Median difference of two images in the cells that both fill, its scatter and their number; None with few."""
     _, i, j = np.intersect1d(one[0], other[0], assume_unique=True, return_indices=True)
     if i.size < _LEAST:
-        return 0.0, 0.0
+        return None
     difference = one[1][i] - other[1][j]
     middle = float(np.median(difference))
-    spread = 1.4826 * float(np.median(np.abs(difference - middle)))
-    # images that are one and the same have no scatter
-    spread = max(spread, 1e-12 * max(1.0, abs(middle)))
-    return middle, i.size / spread**2
+    return middle, 1.4826 * float(np.median(np.abs(difference - middle))), i.size
 
 
 def match_levels(images, wcs, *, pixel_maps=None):

@@ -97,14 +97,40 @@ def test_dithers_are_aligned_to_the_first(stars):
         reducer.combine(images, [], align="gaia")
 
 
+def test_of_two_shifts_that_are_as_frequent_one_is_taken(stars):
+    """A catalog that holds each star twice, with and without an error of 0.5 arcsec."""
+    sky, peaks = stars
+    true = cut(CENTER)
+    image = observed(true, true, sky, peaks, np.random.default_rng(6))
+    twice = SkyCoord([sky, sky.spherical_offsets_by(0.5 * u.arcsec, 0 * u.arcsec)]).ravel()
+    _, alignment = align_to_catalog(image, twice)
+    assert min(abs(alignment.east.value - e) for e in (0, 0.5)) < 0.01
+    assert alignment.scatter.to_value("mas") < 20
+
+
 def test_what_cannot_be_aligned_is_named(stars):
     sky, peaks = stars
     image = observed(cut(CENTER), cut(CENTER), sky, peaks, np.random.default_rng(4))
     far = sky.spherical_offsets_by(60 * u.arcsec, 0 * u.arcsec)[:10]
     with pytest.raises(ValueError, match="'image' must be one with at least 3 sources"):
         align_to_catalog(image, far, radius=0.05 * u.arcsec)
+    with pytest.raises(
+        ValueError, match=r"'images\[1\]' must be one with at least 3 .* got 0 of \d+"
+    ):
+        align_images([image, observed(cut(far[0]), cut(CENTER), far, peaks[:10], np.random.default_rng(5))],
+                     radius=0.01 * u.arcsec)  # fmt: skip
     with pytest.raises(ValueError, match="'catalog' must be a SkyCoord of several"):
         align_to_catalog(image, sky[0])
+    lost = SkyCoord(np.append(sky.ra, np.nan * u.deg), np.append(sky.dec, 0 * u.deg))
+    with pytest.raises(ValueError, match="'catalog' must be of finite positions, got 1 of 61"):
+        align_to_catalog(image, lost)
+    galactic = image.copy()
+    galactic.wcs = image.wcs.deepcopy()
+    galactic.wcs.wcs.ctype = "GLON-TAN", "GLAT-TAN"
+    with pytest.raises(
+        ValueError, match=r"'image' must be one with right ascension .* got GLON-TAN"
+    ):
+        align_to_catalog(galactic, sky)
     image.meta = {}
     with pytest.raises(ValueError, match="'fwhm' must be given"):
         align_to_catalog(image, sky)

@@ -57,6 +57,15 @@ def test_images_that_touch_by_way_of_others_are_matched_and_others_are_left():
     assert offsets[3] == pytest.approx(0, abs=1e-9)
 
 
+def test_images_that_are_one_and_the_same_do_not_hide_the_others():
+    rng = np.random.default_rng(4)
+    one, other = (dither(dx, 0, level, rng=rng) for dx, level in ((0, 0.0), (20, 3.0)))
+    grid = mosaic_wcs([one.wcs, other.wcs], 0.11 * u.arcsec)
+    offsets = sky_offsets([one, one, other], grid)
+    np.testing.assert_allclose(offsets, [-1, -1, 2], atol=0.05)
+    np.testing.assert_array_equal(sky_offsets([one, one], grid), 0)
+
+
 def test_levels_are_matched_before_outliers_are_searched():
     rng = np.random.default_rng(3)
     shifts = [(0, 0), (13, 5), (-20, 9), (6, -30)]
