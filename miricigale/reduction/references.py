@@ -222,7 +222,9 @@ class ReferenceFiles:
     Notes
     -----
     ``"measured"`` takes gain and read noise from the scatter of the ramp's own groups
-    (`measure_noise`). References of the full frame are cut to the sub-array of the exposure; one of
+    (`measure_noise`); in sub-arrays without reference pixels (``SUB256``, ``BRIGHTSKY``) under an even sky
+    the gain has slow noise of the read-out in it, of which a warning tells. References of the full frame are
+    cut to the sub-array of the exposure; one of
     another detector, filter, read-out pattern or part of the detector is refused.
 
     Examples
@@ -363,6 +365,13 @@ class ReferenceFiles:
                 used[name] = measured.describe(name)
             if "gain" in unknown:
                 values["slow_noise"] = measured.slow_noise
+            if "gain" in unknown and measured.effective:
+                msg = (
+                    f"the gain of {measured.gain:.3g} e-/DN is that of all noise that grows with time: the "
+                    "light is even and there are no reference pixels, which would tell slow noise of the "
+                    "read-out from photons (measure_noise). Give 'gain' if it is known"
+                )
+                warnings.warn(msg, MiricigaleWarning, stacklevel=4)
         if self.origin is not None:
             used["context"] = self.origin
         return DetectorMaps(**values, used=used)

@@ -169,7 +169,10 @@ def test_without_references_it_is_refused(ramp, real, references):
 
 def test_slopes_without_any_reference_have_measured_noise(real):
     reducer = Reducer(references="none", skip_first=8)
-    with pytest.warns(MiricigaleWarning, match="mask, saturation, linearity, dark: these steps"):
+    with (
+        pytest.warns(MiricigaleWarning, match="mask, saturation, linearity, dark: these steps"),
+        pytest.warns(MiricigaleWarning, match="is that of all noise that grows with time"),
+    ):
         rate = reducer.fit_ramp(real)
     assert rate.unit == "adu / s"
     assert rate.meta["reference_read_noise"].endswith("DN (measured on the ramp)")
