@@ -9,7 +9,7 @@ from scipy.ndimage import binary_dilation
 from miricigale.instrument import DQ, ImageFacts
 from miricigale.reduction.images import flag_pixels, plain_mask, sigma, with_data
 from miricigale.reduction.sky_mask import cells_of, contamination, darkest, detect, grown, pixels_of
-from miricigale.reduction.sky_mesh import fit_surface, sky_boxes, spread_over, surface
+from miricigale.reduction.sky_mesh import fit_surface, sky_boxes, spread_over, surface, surface_over
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.options import check_choice, check_least, check_positive
@@ -30,6 +30,8 @@ NEGATIVE_NOISES = ("larger", "background")
 _LEAST_SKY = 0.05
 # sky near sources may be brighter than far from them by this much, in the noise of a pixel
 _CONTAMINATION = 0.1
+# pixels that tell a median of a smooth image
+_SOME = 100_000
 # noise of the sky over the errors of the image that cannot be that of the sky alone
 _EXCESS = 3.0
 # what remains of their light in the farther half, over that difference, as measured (benchmarks/background.py)
@@ -199,11 +201,11 @@ def estimated(
     data = np.where(mask, 0, data if data.dtype.kind == "f" else data.astype(float))
     if method == "sep":
         return _plain(data, mask, int(box), int(filter_size), _correlation(image))
-    mesh = _Mesh(data, mask, int(box), int(filter_size), plane)
+    mesh, stated = _Mesh(data, mask, int(box), int(filter_size), plane), _stated(image, mask)
     sources, flags, doubt = np.zeros(data.shape, bool), BackgroundFlags.GOOD, 0.0
     avoided = np.zeros(cells_of(mask).shape, bool)
     for _ in range(iterations):
-        noise = _noise(image, mesh.rms, mask | sources)
+        noise = _noise(stated, mesh.rms, mask | sources)
         found = detect(mesh.residual, noise, mask, sources, threshold)
         if grow:
             found = grown(binary_dilation(found, iterations=grow), mask)
@@ -218,7 +220,7 @@ def estimated(
         # a gradient would be taken for light of sources, were it still there
         flat = mesh.tilted if plane else mesh.residual
         doubt, near = contamination(flat, ~(mask | sources), sources)
-        high = doubt > _CONTAMINATION * float(np.median(mesh.rms))
+        high = doubt > _CONTAMINATION * float(np.median(_some(mesh.rms)))
         if high:
             avoided |= near
         elif same:
@@ -227,7 +229,7 @@ def estimated(
         if iterations and high:
             flags = BackgroundFlags.CONTAMINATED
     doubt *= _REMAINDER
-    if not flags & BackgroundFlags.FEW_SKY and _exceeds(image, mesh.rms, mask | sources):
+    if not flags & BackgroundFlags.FEW_SKY and _excess(stated, mesh.rms, mask | sources) > _EXCESS:
         flags |= BackgroundFlags.EXCESS_NOISE
     if flags & (BackgroundFlags.FEW_SKY | BackgroundFlags.EXCESS_NOISE):
         sources = ~darkest(mesh.tilted, mask, mesh.box, _LEAST_SKY)
@@ -246,24 +248,34 @@ def check_mesh(box, filter_size, *, least=4):
     check_least(filter_size, "filter_size", 1)
 
 
-def _noise(image, rms, mask):
-    """Noise about the mesh, larger where the errors are: no mesh follows the seams of mosaics."""
-    if image.uncertainty is None or mask.all():
-        return rms
+def _stated(image, mask):
+    """Errors of an image, and where it has them; None without any."""
+    if image.uncertainty is None:
+        return None
     error = sigma(image)
     # files have errors of 0 where they have none
-    known = ~mask & (error > 0) & np.isfinite(error)
-    if not known.any():
-        return rms
-    return np.fmax(rms, error * np.float32(np.median(rms[known] / error[known])))
+    return error, ~mask & (error > 0) & np.isfinite(error)
 
 
-def _exceeds(image, rms, mask):
-    """Whether the noise of the sky is far above what the image states; False where it states none."""
-    if image.uncertainty is None or mask.all():
-        return False
-    stated = sigma(image)[~mask]
-    return bool(np.median(rms[~mask]) > _EXCESS * np.median(stated[np.isfinite(stated)]))
+def _excess(stated, rms, mask):
+    """Median noise of the sky over the errors of an image; NaN without any."""
+    if stated is None:
+        return np.nan
+    error, known, rms, mask = (_some(values) for values in (*stated, rms, mask))
+    known = known & ~mask
+    return float(np.median(rms[known] / error[known])) if known.any() else np.nan
+
+
+def _some(values):
+    """Every so many rows and columns of a large image."""
+    step = max(1, int(np.sqrt(values.size / _SOME)))
+    return values[::step, ::step]
+
+
+def _noise(stated, rms, mask):
+    """Noise about the mesh, larger where the errors are: no mesh follows the seams of mosaics."""
+    scale = _excess(stated, rms, mask)
+    return np.fmax(rms, stated[0] * np.float32(scale)) if np.isfinite(scale) else rms
 
 
 def _correlation(image):
@@ -321,9 +333,7 @@ class _Mesh:
     def _surface(self, boxes, values):
         """Surface through boxes, each at the mean place of its sky, in each pixel and there."""
         coefficients = fit_surface(boxes, values)
-        rows, columns = np.ogrid[tuple(slice(n) for n in self._data.shape)]
-        pixels = surface(coefficients, rows, columns, boxes).astype(self._data.dtype)
-        return pixels, surface(coefficients, *boxes.center, boxes)
+        return surface_over(coefficients, boxes, self._data.shape), surface(coefficients, boxes)
 
     def _measure(self, sources, mode=False):
         boxes = sky_boxes(self._data - self._smooth, self._mask | sources, self.box, mode=mode)

@@ -240,18 +240,9 @@ def _drizzle(images, wcs, shape, pixfrac, weights, pixel_maps):
         weight = np.where(mask, 0.0, np.asarray(weight) / unit_weight).astype(np.float32)
         if not weight.any():
             continue
-        good = weight > 0
         variance = np.square(np.asarray(sigma(im), float))
-        sink.add_image(
-            np.where(good, im.data, 0.0).astype(np.float32),
-            exptime=1.0,
-            pixmap=np.dstack([x, y]),
-            data2=np.where(good, variance, 0.0).astype(np.float32),
-            weight_map=weight,
-            pixfrac=float(pixfrac),
-            pixel_scale_ratio=_scale(wcs) / _scale(im.wcs),
-            in_units="cps",
-        )
+        variance = np.where(weight > 0, variance, 0.0).astype(np.float32)
+        _add(sink, im, weight, (x, y), wcs, pixfrac, data2=variance)
         # an image of many may reach a small part of the grid
         part = _extent((x, y), shape)
         n_images[part] += sink.out_wht[part] > before[part]
@@ -284,6 +275,20 @@ def _drizzle(images, wcs, shape, pixfrac, weights, pixel_maps):
         meta=meta,
     )
     return Mosaic(out, (weight * np.float32(unit_weight)).astype(np.float32), n_images)
+
+
+def _add(sink, im, weight, pixel_map, wcs, pixfrac=1.0, **planes):
+    """Drizzle an image onto a grid."""
+    sink.add_image(
+        np.where(weight > 0, im.data, 0.0).astype(np.float32),
+        exptime=1.0,
+        pixmap=np.dstack(pixel_map),
+        weight_map=weight,
+        pixfrac=float(pixfrac),
+        pixel_scale_ratio=_scale(wcs) / _scale(im.wcs),
+        in_units="cps",
+        **planes,
+    )
 
 
 def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None, pixel_maps=None):
@@ -341,16 +346,21 @@ def reject_outliers(images, wcs, *, threshold=5.0, derivative=1.2, weights=None,
         steep[tuple(low)] = np.fmax(steep[tuple(low)], step)
         steep[tuple(high)] = np.fmax(steep[tuple(high)], step)
     median = np.where(judged, median, 0.0)
-    judged = judged.astype(np.float32)
+    ny, nx = median.shape
+    # between four pixels of the grid that all can be compared with
+    between = judged[:-1, :-1] & judged[:-1, 1:] & judged[1:, :-1] & judged[1:, 1:]
     out = []
     for im, (x, y) in zip(images, pixel_maps, strict=True):
+        column, row = (np.floor(np.nan_to_num(v, nan=-1)).astype(int) for v in (x, y))
+        inside = (column >= 0) & (column < nx - 1) & (row >= 0) & (row < ny - 1)
+        column[~inside] = row[~inside] = 0
         coords = np.array([y, x])
         options = {"order": 1, "mode": "constant", "cval": 0.0}
         expected = map_coordinates(median, coords, **options)
         slope = map_coordinates(np.nan_to_num(steep), coords, **options)
-        known = map_coordinates(judged, coords, **options) > 0.999
+        known = inside & between[row, column]
         # that of the median too, of as many images as there are at this place
-        noise = sigma(im) * np.sqrt(1 + map_coordinates(share, coords, **options))
+        noise = sigma(im) * np.sqrt(1 + share[row, column])
         with np.errstate(invalid="ignore"):
             far = np.abs(im.data - expected) > threshold * noise + derivative * slope
         outlier = far & known & ~plain_mask(im)
@@ -386,9 +396,11 @@ def _median_of(images, wcs, weights, pixel_maps):
         if extent is not None:
             rows, columns = extent
             size = rows.stop - rows.start, columns.stop - columns.start
-            moved = [(x - columns.start, y - rows.start)]
-            alone = _drizzle([im], wcs, size, 1.0, [weight], moved).image.data
-            parts.append((rows, columns, alone))
+            sink = Drizzle(kernel="square", fillval="NAN", out_shape=size, disable_ctx=True)
+            weight = np.where(plain_mask(im), 0.0, weight / (np.max(weight) or 1.0))
+            moved = x - columns.start, y - rows.start
+            _add(sink, im, weight.astype(np.float32), moved, wcs)
+            parts.append((rows, columns, sink.out_img))
     median, count = np.full(shape, np.nan, np.float32), np.zeros(shape, np.int16)
     for strip in chunks(shape[0], _ROWS):
         here = [part for part in parts if part[0].start < strip.stop and part[0].stop > strip.start]

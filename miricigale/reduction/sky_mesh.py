@@ -1,12 +1,21 @@
 """Brightness of the sky in boxes of an image, and the smooth surface through them."""
 
 import dataclasses
+import math
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import distance_transform_edt
 
-__all__ = ["SkyBoxes", "box_edges", "fit_surface", "sky_boxes", "spread_over", "surface"]
+__all__ = [
+    "SkyBoxes",
+    "box_edges",
+    "fit_surface",
+    "sky_boxes",
+    "spread_over",
+    "surface",
+    "surface_over",
+]
 
 #: Clipping of a box, in standard deviations, and what it leaves of that of a Gaussian.
 _CLIP, _CLIPPED = 3.0, 0.98655
@@ -107,9 +116,10 @@ def sky_boxes(data, mask, box, *, mode=False):
         values = np.where(good, data[strip], np.inf)[:, at]
         values[:, ~inside] = np.inf
         values = np.sort(values.swapaxes(0, 1).reshape(n, -1), axis=1)
-        level, spread, count = _clipped(values, mode)
-        found["level"][i], found["spread"][i], found["count"][i] = level, spread, count
         number = np.add.reduceat(good.sum(axis=0), columns[:-1])
+        for j, many in enumerate(number):
+            level, spread, count = _clipped(values[j, :many], mode)
+            found["level"][i, j], found["spread"][i, j], found["count"][i, j] = level, spread, count
         share[i] = number / (np.diff(columns) * good.shape[0])
         y = np.add.reduceat(good.T @ np.arange(rows[i], rows[i + 1]), columns[:-1])
         x = np.add.reduceat(good.sum(axis=0) * np.arange(nx), columns[:-1])
@@ -125,39 +135,28 @@ def sky_boxes(data, mask, box, *, mode=False):
 
 
 def _clipped(values, mode):
-    """Median or mode, standard deviation and number of sorted values of several boxes (inf: none), clipped."""
-    count = np.isfinite(values).sum(axis=1)
-    row = np.arange(len(values))
-    last = values.shape[1] - 1
-    first = values[row, np.clip(count // 2, 0, last)]
-    shift = np.where(count > 0, first, 0.0)[:, None]
-    finite = np.where(np.isfinite(values), values - shift, 0.0)
-    sums = [np.zeros((len(values), last + 2)) for _ in range(2)]
-    for total, power in zip(sums, (finite, finite * finite), strict=True):
-        np.cumsum(power, axis=1, dtype=float, out=total[:, 1:])
-    low, high = np.zeros_like(count), count
+    """Median or mode, standard deviation and number of the sorted values of a box, clipped; NaN of none."""
+    if not values.size:
+        return np.nan, np.nan, 0
+    # sums of squares of what is near zero are exact enough
+    shift = float(values[values.size // 2])
+    values = values.astype(float) - shift
+    low, high = 0, values.size
     for _ in range(20):
-        number = np.maximum(high - low, 1)
-        mean, square = ((total[row, high] - total[row, low]) / number for total in sums)
-        middle = low + np.stack([np.maximum(number - 1, 0) // 2, number // 2])
-        median = values[row, np.clip(middle, 0, last)].mean(axis=0) - shift[:, 0]
-        spread = np.sqrt(np.maximum(square - mean * mean, 0.0))
-        bounds = (median + sign * _CLIP * spread + shift[:, 0] for sign in (-1, 1))
-        bottom, top = (np.asarray(b)[:, None] for b in bounds)
-        new = (values < bottom).sum(axis=1), np.minimum((values <= top).sum(axis=1), count)
-        if np.array_equal(new[0], low) and np.array_equal(new[1], high):
+        part = values[low:high]
+        mean = np.add.reduce(part) / part.size
+        spread = math.sqrt(max(part @ part / part.size - mean * mean, 0.0))
+        median = 0.5 * (part[(part.size - 1) // 2] + part[part.size // 2])
+        new = (
+            values.searchsorted(median - _CLIP * spread),
+            values.searchsorted(median + _CLIP * spread, side="right"),
+        )
+        if new == (low, high):
             break
         low, high = new
-    if mode:
-        skewed = np.abs(mean - median) > 0.3 * spread
-        median = np.where(skewed, median, 2.5 * median - 1.5 * mean)
-    level = median + shift[:, 0]
-    empty = count == 0
-    return (
-        np.where(empty, np.nan, level),
-        np.where(empty, np.nan, spread / _CLIPPED),
-        np.where(empty, 0, high - low),
-    )
+    if mode and abs(mean - median) <= 0.3 * spread:
+        median = 2.5 * median - 1.5 * mean
+    return median + shift, spread / _CLIPPED, high - low
 
 
 def fit_surface(boxes, values):
@@ -172,7 +171,7 @@ def fit_surface(boxes, values):
     """
     used = boxes.used
     y, x, level = (v[used] for v in (*boxes.center, values))
-    terms = np.stack(_terms(y, x, boxes), axis=1)
+    terms = _terms(y, x, boxes)
     number = 6 if x.size >= 20 else 3 if x.size >= 6 else 0
     coefficients, keep = np.zeros(6), np.ones(x.size, bool)
     for _ in range(10 if number else 0):
@@ -188,15 +187,25 @@ def fit_surface(boxes, values):
     return coefficients
 
 
-def surface(coefficients, y, x, boxes):
-    """Polynomial of `fit_surface` at pixels."""
-    return sum(c * term for c, term in zip(coefficients, _terms(y, x, boxes), strict=True))
+def surface(coefficients, boxes):
+    """Polynomial of `fit_surface` at the places of boxes."""
+    return _terms(*boxes.center, boxes) @ coefficients
+
+
+def surface_over(coefficients, boxes, shape):
+    """Polynomial of `fit_surface` at the pixels of an image, float32."""
+    y, x = (np.arange(n) / edge[-1] - 0.5 for n, edge in zip(shape, boxes.edges, strict=True))
+    constant, along_y, along_x, y2, yx, x2 = coefficients
+    # one product of matrices in place of six images
+    left = np.stack([constant + (along_y + y2 * y) * y, np.ones_like(y), yx * y], axis=1)
+    right = np.stack([np.ones_like(x), (along_x + x2 * x) * x, x])
+    return left.astype(np.float32) @ right.astype(np.float32)
 
 
 def _terms(y, x, boxes):
     # in units of the image, about its middle
     y, x = (v / edge[-1] - 0.5 for v, edge in zip((y, x), boxes.edges, strict=True))
-    return np.ones_like(y + x), y, x, y * y, y * x, x * x
+    return np.stack([np.ones_like(y), y, x, y * y, y * x, x * x], axis=-1)
 
 
 def spread_over(values, used, edges, shape, filter_size):
