@@ -37,8 +37,9 @@ def aperture_photometry(image, sky, diameter, *, local_background=None):
     Returns
     -------
     table : `~astropy.table.QTable`
-        ``flux`` and ``flux_err`` (uJy; for noise that is not correlated) and ``coverage``, the
-        fraction of the aperture on usable pixels. NaN where that is zero.
+        ``flux`` and ``flux_err`` (uJy; for noise that is not correlated: on a mosaic of the package's own to be
+        multiplied by its ``meta["noise_correction"]``) and ``coverage``, the fraction of the aperture on usable
+        pixels. NaN where that is zero.
 
     Raises
     ------
