@@ -28,6 +28,8 @@ _TABLES = (
     "galaxy_shape",
     "agn_properties",
 )
+#: Those that may have no columns.
+_MAY_LACK = ("galaxy_properties", "galaxy_shape")
 _ARRAYS = {
     "redshift": (u.one, float),
     "galaxy": (u.uJy / u.Msun, float),
@@ -177,7 +179,7 @@ class ModelGrid(Frozen):
         for name in _TABLES:
             rows = n_g if name.startswith("galaxy") else n_a
             table = getattr(self, name)
-            if len(table) != rows and table.colnames:
+            if len(table) != rows and (table.colnames or name not in _MAY_LACK):
                 raise argument_error(name, f"a table of {rows} rows", f"{len(table)} rows")
         if len(set(self.filters)) != n_b or n_b == 0:
             raise argument_error("filters", "one or more different names", f"{self.filters}")

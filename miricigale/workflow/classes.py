@@ -14,8 +14,8 @@ from miricigale.workflow.commands import fit_catalog
 
 __all__ = ["classes_of", "classes_section", "fit_classes", "write_table"]
 
-#: Objects of other classes than the first that a page lists, those of the highest ratio.
-_LISTED = 20
+#: Objects of each class but the first that a page lists, those of the highest ratio.
+_LISTED = 10
 #: ln ratio beyond which a class is called sure (odds of 150 to 1).
 _SURE = 5.0
 #: ln ratios that a drawing spans.
@@ -106,7 +106,7 @@ def classes_of(found):
     return {name: np.concatenate([part[name][0] for part in parts]) for name in parts[0]}
 
 
-def classes_section(page, found, ids, chi2):
+def classes_section(page, columns, names, ids, chi2):
     """
     The part of a page on classes.
 
@@ -114,20 +114,21 @@ def classes_section(page, found, ids, chi2):
     ----------
     page : `~miricigale.evaluation.Report`
         Gets the section.
-    found : dict of str to `~miricigale.fitting.FitResultsFiles`
-        The classes.
+    columns : dict of str to `~numpy.ndarray`, shape (n,)
+        As `classes_of` returned them.
+    names : list of str
+        The classes, galaxies first.
     ids, chi2 : `~numpy.ndarray`, shape (n,)
         Ids and reduced chi2 of the galaxies.
     """
-    columns, others = classes_of(found), list(found)[1:]
-    label = columns["class"]
+    label, others = columns["class"], names[1:]
     page.section(
         f"Galaxy, {' or '.join(others)}",
         "The class is that of the highest evidence, all classes being taken as equally frequent: priors of your "
         "own go into compare_classes. Log ratios are ln of the evidence over that of galaxies; 5 is 150 to 1.",
     )
     rows = []
-    for name in found:
+    for name in names:
         mine = label == name
         sure = columns[f"probability_{name}"][mine] > 1.0 / (1.0 + np.exp(-_SURE))
         own = (chi2 if name == "galaxy" else columns[f"reduced_chi2_{name}"])[mine]
@@ -143,12 +144,15 @@ def classes_section(page, found, ids, chi2):
         ratio = ratio[np.isfinite(ratio)]
         ax.hist(np.clip(ratio, -_SPAN, _SPAN), np.linspace(-_SPAN, _SPAN, 61), color="0.75")
         ax.axvline(0.0, color="0.3", lw=0.8)
-        ax.set(xlabel=f"ln evidence, {name} over galaxy", ylabel="objects", yscale="log")
+        ax.set(xlabel=f"ln evidence, {name} over galaxy", ylabel="objects")
     page.figure(
         figure, "Evidence over that of galaxies; what is beyond stands in the outermost bins."
     )
-    best = np.max([columns[f"log_ratio_{name}"] for name in others], axis=0)
-    order = [i for i in np.argsort(-best, kind="stable") if label[i] in others][:_LISTED]
+    order = []
+    for name in others:
+        mine = np.flatnonzero(label == name)
+        best = np.argsort(-columns[f"log_ratio_{name}"][mine], kind="stable")
+        order.extend(mine[best][:_LISTED])
     if order:
         page.table(
             [
@@ -162,6 +166,6 @@ def classes_section(page, found, ids, chi2):
                 for i in order
             ],
             header=("id", "class", "ln ratio to galaxy", "its reduced chi2", "that of the galaxy"),
-            caption=f"Up to {_LISTED} objects that are no galaxies, the surest first.",
+            caption=f"Up to {_LISTED} objects of each class, the surest first.",
             text=2,
         )

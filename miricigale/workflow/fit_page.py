@@ -12,15 +12,12 @@ from miricigale.fitting import FitFlags
 from miricigale.fitting.likelihood import unused_bands
 from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.plotting.comparison import plot_redshifts
-from miricigale.utils.exceptions import argument_error
-from miricigale.utils.missing import plain_floats
 from miricigale.utils.row_files import open_rows
-from miricigale.workflow.classes import classes_section
+from miricigale.workflow.classes import classes_of, classes_section
+from miricigale.workflow.fit_numbers import FitNumbers, known_redshifts
 
 __all__ = ["fit_page"]
 
-#: Columns that hold known redshifts, the first that is there.
-KNOWN_REDSHIFTS = ("z_spec", "zspec", "z_true", "redshift_spec", "redshift")
 #: Examples on the page, and points in a drawing.
 _EXAMPLES, _POINTS = 6, 5000
 _COLOR, _SECOND = "#1d4ed8", "#c2410c"
@@ -63,83 +60,35 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     rows = open_rows(path, results.job["chunk_rows"], hdu=hdu)
     if catalog_map is not None:
         rows = MappedRows(rows, as_catalog_map(catalog_map))
-    found = _Found(results)
-    known = _known_redshifts(rows, z_spec)
+    found = every = FitNumbers(results)
+    known = known_redshifts(rows, z_spec)
+    columns = classes_of(classes) if len(classes) > 1 else None
+    if columns is not None:
+        # what stars and quasars are as galaxies tells nothing of the fit
+        ours = np.isin(columns["class"], ["galaxy", ""])
+        found, known = found.only(ours), (known[0], None if known[1] is None else known[1][ours])
     page = Report(
         f"Fits of {Path(path).name}",
         subtitle=f"{len(results)} objects, {len(found.filters)} bands",
         notices=_notices(found),
     )
-    _summary(page, found, known)
+    page.section("Summary")
+    if columns is not None:
+        others = " or ".join(list(classes)[1:])
+        page.text(
+            f"{found.chi2.size} of {len(results)} objects are no {others} by their evidence. All but the "
+            "examples and what was left out is of these."
+        )
+    _summary(page, found)
+    if columns is not None:
+        classes_section(page, columns, list(classes), every.ids, every.chi2)
     _redshifts(page, found, known)
     _goodness(page, found)
     _physics(page, found)
-    if len(classes) > 1:
-        classes_section(page, classes, found.ids, found.chi2)
-    _examples(page, results, found)
-    _left_out(page, results, rows, found)
+    _examples(page, results, every)
+    _left_out(page, rows, every)
     _settings(page, results)
     return page
-
-
-class _Found:
-    """Numbers of all objects: redshift, fraction, mass, fit and residuals of each."""
-
-    def __init__(self, results):
-        parts = [_numbers(part) for part in results.parts()]
-        for name in parts[0]:
-            setattr(self, name, np.concatenate([part[name] for part in parts]))
-        first = next(iter(results.parts()))
-        self.filters, self.fixed = first.fitted_filters, first.redshift_fixed
-        self.meta = dict(first.meta)
-
-    @property
-    def good(self):
-        """Objects that were fitted."""
-        return np.isfinite(self.chi2)
-
-
-def _numbers(part):
-    n = len(part)
-    bands = [part.filters.index(name) for name in part.fitted_filters]
-    used = np.isfinite(part.sigma[:, bands]) & ~part.limit[:, bands]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        model, flux = part.best_flux[:, bands], part.flux[:, bands]
-        ratio = np.where(used & (model > 0), flux / model, np.nan)
-        pull = np.where(used, (flux - model) / part.sigma[:, bands], np.nan)
-    out = {
-        "ids": np.array(part.ids).astype(str),
-        "flags": np.array(part.flags),
-        "n_bands": np.array(part.n_bands),
-        "chi2": np.array(part.reduced_chi2, float),
-        "ratio": ratio.astype(np.float32),
-        "pull": pull.astype(np.float32),
-        "unusable": np.isfinite(part.flux[:, bands]) & ~np.isfinite(part.sigma[:, bands]),
-    }
-    for name, of in (("z", "redshift"), ("frac", "frac_agn"), ("mass", "stellar_mass")):
-        values = np.full((n, 3), np.nan)
-        if of in part.parameters:
-            values = np.asarray(part.percentile(of, [0.16, 0.5, 0.84]).value)
-        elif of in part.constants:
-            values[:] = np.where(part.fitted, part.constants[of], np.nan)[:, None]
-        out[name] = values
-    return out
-
-
-def _known_redshifts(rows, name):
-    """Name of the column of known redshifts and its values; (None, NaN) without one."""
-    names = rows.colnames
-    if name is None:
-        name = next((one for one in KNOWN_REDSHIFTS if one in names), None)
-    if name is None:
-        return None, None
-    if name not in names:
-        raise argument_error("z_spec", f"one of the columns {list(names)}", repr(name))
-    values = []
-    for i in range(rows.n_chunks):
-        values.append(plain_floats(rows.chunk(i)[name], name, "photometry"))
-    z = np.concatenate(values)
-    return name, np.where(z > 0, z, np.nan)
 
 
 def _notices(found):
@@ -148,8 +97,8 @@ def _notices(found):
     poor = good & (found.flags & int(FitFlags.HIGH_CHI2) != 0)
     if good.any() and np.mean(poor[good]) > 0.1:
         lines.append(
-            f"{np.mean(poor[good]):.0%} of the objects have no model that fits (reduced chi2 above the limit): "
-            "errors that are too small, zero points, wrong columns or units, or models that are not theirs."
+            f"{100 * np.mean(poor[good]):.0f} % of the objects have no model that fits (reduced chi2 above "
+            "the limit): errors that are too small, zero points, wrong columns or units, or models not theirs."
         )
     for name, column in zip(found.filters, found.ratio.T, strict=True):
         some = column[np.isfinite(column)]
@@ -161,15 +110,14 @@ def _notices(found):
     edge = good & (found.flags & int(FitFlags.REDSHIFT_EDGE) != 0)
     if good.any() and np.mean(edge[good]) > 0.1:
         lines.append(
-            f"{np.mean(edge[good]):.0%} of the objects reach the first or last redshift of the grid."
+            f"{100 * np.mean(edge[good]):.0f} % of the objects reach the first or last redshift of the grid."
         )
-    if not good.any():
+    if good.size and not good.any():
         lines.append("No object was fitted; the flags below say why.")
     return lines
 
 
-def _summary(page, found, known):
-    page.section("Summary")
+def _summary(page, found):
     good = found.good
     none = "no object was fitted"
     items = [
@@ -185,7 +133,7 @@ def _summary(page, found, known):
         items.append(("half width of z over 1 + z, median", number(_median(width), ".3f", none)))
     if np.isfinite(found.frac).any():
         share = np.mean(found.frac[good, 0] > _SOME_AGN)
-        label = f"with fracAGN above {_SOME_AGN:g} at 84 %"
+        label = f"with 84 % of the posterior above fracAGN {_SOME_AGN:g}"
         items.append((label, number(share, "{:.0f} %", none, scale=100)))
     page.items(items)
 
@@ -221,9 +169,11 @@ def _redshifts(page, found, known):
         axes[0, 0].set(xlabel=name, ylabel="fitted redshift (median)")
     ax = axes[0, -1]
     if good.any():
-        ax.hist(found.z[good, 1], 40, color="0.75", label="fitted")
+        both = np.append(found.z[good, 1], z[some] if some.any() else [])
+        bins = np.histogram_bin_edges(both, 40)
+        ax.hist(found.z[good, 1], bins, color="0.75", label="fitted")
         if some.any():
-            ax.hist(z[some], 40, histtype="step", color=_COLOR, label=name)
+            ax.hist(z[some], bins, histtype="step", color=_COLOR, label=name)
             ax.legend(frameon=False)
     ax.set(xlabel="redshift", ylabel="objects")
     text = "Fitted redshifts (posterior medians)"
@@ -282,7 +232,8 @@ def _goodness(page, found):
     ax.set(ylabel="flux over that of the best model", ylim=(0.4, 1.8))
     page.figure(
         figure,
-        f"Reduced chi2, and measured over model flux in bands of {_FEW} or more fluxes: median, 16-84 %.",
+        f"Reduced chi2, and measured over model flux in bands of {_FEW} or more fluxes: median, 16-84 % (in full "
+        "in the table).",
     )
     header = (
         "band",
@@ -315,7 +266,7 @@ def _physics(page, found):
     if with_agn:
         strong = found.frac[rows, 0] > _SOME_AGN
         ax.plot(found.z[rows[~strong], 1], mass[~strong], ".", ms=3, color="0.6", label="others")
-        label = f"fracAGN above {_SOME_AGN:g} at 84 %"
+        label = f"84 % above fracAGN {_SOME_AGN:g}"
         ax.plot(found.z[rows[strong], 1], mass[strong], ".", ms=4, color=_SECOND, label=label)
         ax.legend(frameon=False, fontsize=8)
         ax = axes[0, 1]
@@ -385,7 +336,7 @@ def _choose(found):
     return list(chosen.items())[:_EXAMPLES]
 
 
-def _left_out(page, results, rows, found):
+def _left_out(page, rows, found):
     page.section(
         "What was left out", "Nothing is dropped in silence: a row of the catalog is a row here."
     )

@@ -1,0 +1,104 @@
+"""Numbers of the objects of a fitted catalog that a page shows, and their known redshifts."""
+
+import copy
+
+import numpy as np
+
+from miricigale.utils.exceptions import argument_error
+from miricigale.utils.missing import plain_floats
+
+__all__ = ["KNOWN_REDSHIFTS", "FitNumbers", "known_redshifts"]
+
+#: Columns that hold known redshifts, the first that is there.
+KNOWN_REDSHIFTS = ("z_spec", "zspec", "z_true", "redshift_spec", "redshift")
+
+
+class FitNumbers:
+    """Numbers of all objects: redshift, fraction, mass, fit and residuals of each."""
+
+    def __init__(self, results):
+        parts = [_numbers(part) for part in results.parts()]
+        self._names = list(parts[0])
+        for name in self._names:
+            setattr(self, name, np.concatenate([part[name] for part in parts]))
+        first = next(iter(results.parts()))
+        self.filters, self.fixed = first.fitted_filters, first.redshift_fixed
+        self.meta = dict(first.meta)
+
+    def only(self, rows):
+        """A copy of some objects."""
+        new = copy.copy(self)
+        for name in self._names:
+            setattr(new, name, getattr(self, name)[rows])
+        return new
+
+    @property
+    def good(self):
+        """Objects that were fitted."""
+        return np.isfinite(self.chi2)
+
+
+def _numbers(part):
+    n = len(part)
+    bands = [part.filters.index(name) for name in part.fitted_filters]
+    used = np.isfinite(part.sigma[:, bands]) & ~part.limit[:, bands]
+    error = part.flux_err[:, bands]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        model, flux = part.best_flux[:, bands], part.flux[:, bands]
+        ratio = np.where(used & (model > 0), flux / model, np.nan)
+        pull = np.where(used, (flux - model) / part.sigma[:, bands], np.nan)
+    out = {
+        "ids": np.array(part.ids).astype(str),
+        "flags": np.array(part.flags),
+        "n_bands": np.array(part.n_bands),
+        "chi2": np.array(part.reduced_chi2, float),
+        "ratio": ratio.astype(np.float32),
+        "pull": pull.astype(np.float32),
+        # a flux whose error is NaN is a missing band, and no mistake
+        "unusable": np.isfinite(flux) & ~np.isfinite(part.sigma[:, bands]) & ~np.isnan(error),
+    }
+    for name, of in (("z", "redshift"), ("frac", "frac_agn"), ("mass", "stellar_mass")):
+        values = np.full((n, 3), np.nan)
+        if of in part.parameters:
+            values = np.asarray(part.percentile(of, [0.16, 0.5, 0.84]).value)
+        elif of in part.constants:
+            values[:] = np.where(part.fitted, part.constants[of], np.nan)[:, None]
+        out[name] = values
+    return out
+
+
+def known_redshifts(rows, name):
+    """
+    Known redshifts of a catalog.
+
+    Parameters
+    ----------
+    rows : `~miricigale.utils.row_files.RowFile` or `~miricigale.filters.catalog_files.MappedRows`
+        The catalog.
+    name : str or None
+        The column; None for the first of `KNOWN_REDSHIFTS` that is there.
+
+    Returns
+    -------
+    name : str or None
+        The column, None without one.
+    redshift : `~numpy.ndarray`, shape (n,), or None
+        NaN where it is missing or not positive.
+
+    Raises
+    ------
+    ValueError
+        If there is no column ``name``.
+    """
+    names = rows.colnames
+    if name is None:
+        name = next((one for one in KNOWN_REDSHIFTS if one in names), None)
+    if name is None:
+        return None, None
+    if name not in names:
+        raise argument_error("z_spec", f"one of the columns {list(names)}", repr(name))
+    values = []
+    for i in range(rows.n_chunks):
+        values.append(plain_floats(rows.chunk(i)[name], name, "photometry"))
+    z = np.concatenate(values)
+    return name, np.where(z > 0, z, np.nan)
