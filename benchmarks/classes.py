@@ -3,9 +3,9 @@ Galaxy, quasar or star by their evidence: simulated sources, real quasars of SDS
 
     MIRICIGALE_DATA=../shared/data python benchmarks/classes.py [--n 40] [--seed 1]
 
-Simulated sources lie between the nodes of the grids, S/N 20 in ten bands; their stars are Planck's law, as there is
-no library of stars in the package. The real ones are fitted with a thinner grid of galaxies than that of surveys,
-with its template error and with errors of 10 %.
+Simulated sources lie between the nodes of the grids, S/N 20 in ten bands; their stars are Planck's law, as there
+is no library of stars in the package. The real ones are fitted with a thinner grid of galaxies than that of
+surveys, with its template error and with errors of 10 %.
 """
 
 import argparse

@@ -251,7 +251,7 @@ def fit_catalog(
         model, nodes = SEDModel.survey(), SEDModel.survey_axes()
         error = TemplateError.survey() if model_error is None else None
         errors = {"model_error": model_error or 0.0, "template_error": error}
-        if error is not None:
+        if error is not None and models is None:
             log.warning(
                 "errors of the models: %.0f to %.0f %% of the flux by rest wavelength, measured on sources "
                 "of CEERS (TemplateError.survey)",
