@@ -8,6 +8,7 @@ from astropy.table import QTable, Table
 
 from miricigale.cigale.ini import parse_values
 from miricigale.cigale.names import cigale_names
+from miricigale.cigale.relation import N_DRAWS
 from miricigale.refdata import find_resource
 from miricigale.sed import components as c
 from miricigale.sed.xray_bands import ALPHA_OX
@@ -41,6 +42,7 @@ class Chain:
     modules: dict = field(default_factory=dict)
     frac_agn_definition: str = "dust"
     xray: dict = field(default_factory=dict)
+    max_dev_alpha_ox: float = 0.0
     left_out: list = field(default_factory=list)
     replaced: list = field(default_factory=list)
     differs: list = field(default_factory=list)
@@ -327,10 +329,9 @@ def _xray(m):
     }
     if not m.has("alpha_ox"):
         m.chain.differs.append("xray: not in the file, the default here: alpha_ox = -1.9 to -1.1")
-    most = m.one("max_dev_alpha_ox", 0.2)
-    if most > 0:
-        text = "no model is refused for its distance from the relation of Just et al. 2007"
-        m.chain.left_out.append(f"xray.max_dev_alpha_ox = {most:g} ({text})")
+    m.chain.max_dev_alpha_ox = max(m.one("max_dev_alpha_ox", 0.2), 0.0)
+    if m.chain.max_dev_alpha_ox:
+        m.chain.differs.append(f"xray.max_dev_alpha_ox: by {N_DRAWS} draws of each posterior")
 
 
 def _redshifting(m):

@@ -11,6 +11,7 @@ from miricigale.cigale.catalog import read_cigale_catalog
 from miricigale.cigale.distances import at_their_distances
 from miricigale.cigale.models import save_models, with_agn_parts
 from miricigale.cigale.names import AGN_PARTS
+from miricigale.cigale.relation import near_relation
 from miricigale.cigale.results import described, write_cigale_results
 from miricigale.filters.band_names import xray_energies
 from miricigale.filters.filter_set import FilterSet
@@ -71,6 +72,8 @@ class CigaleSetup:
         Filters that the user gave for bands, by CIGALE's names.
     xray : dict
         Options of `~miricigale.sed.with_xray_bands`; empty without X-rays.
+    max_dev_alpha_ox : float
+        Largest distance from the relation of Just et al. 2007; 0 for any.
     """
 
     path: Path
@@ -95,6 +98,7 @@ class CigaleSetup:
     differs: tuple = ()
     names: dict = field(default_factory=dict)
     xray: dict = field(default_factory=dict)
+    max_dev_alpha_ox: float = 0.0
 
     def __repr__(self):
         parts = " -> ".join(component.name for component in self.components)
@@ -263,10 +267,15 @@ class CigaleSetup:
             z = self.rounded(photometry["redshift"])
         else:
             z = np.full(len(photometry), np.nan)
-        if self.redshift is None:
-            results = fitter.fit(photometry, redshift=z, **known)
-        else:
-            results = _by_redshift(fitter, photometry, z, known)
+
+        def fit(redshift=None):
+            found = fitter.fit(photometry, redshift=redshift, **known)
+            most = self.max_dev_alpha_ox if "l_2500" in found.quantities else 0.0
+            if not most:
+                return found
+            return near_relation(fitter, photometry, found, most, redshift=redshift)
+
+        results = fit(z) if self.redshift is None else _by_redshift(fit, z, fitter.grid.redshift[0])
         note = {
             "configuration": self.path.name,
             "bands": self.bands | self.predicted,
@@ -325,15 +334,15 @@ class CigaleSetup:
         )
 
 
-def _by_redshift(fitter, photometry, z, known):
+def _by_redshift(fit, z, any_redshift):
     """Fit objects of known redshift there and the others everywhere; join in order."""
     fixed = np.isfinite(z)
     if np.all(fixed):
-        return fitter.fit(photometry, redshift=z, **known)
-    free = fitter.fit(photometry, **known)
+        return fit(z)
+    free = fit()
     if not np.any(fixed):
         return free
     # both fits get all objects, so that duplicate ids are flagged
-    at = fitter.fit(photometry, redshift=np.where(fixed, z, fitter.grid.redshift[0]), **known)
+    at = fit(np.where(fixed, z, any_redshift))
     rows = np.concatenate([np.flatnonzero(~fixed), np.flatnonzero(fixed)])
     return FitResults.concatenate([free[~fixed], at[fixed]])[np.argsort(rows)]

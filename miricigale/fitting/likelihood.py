@@ -78,6 +78,10 @@ class FitFlags(Flags):
     """More than 95 % of the posterior lies on one galaxy model at one redshift of the grid: it is coarse
     for these data."""
 
+    OFF_RELATION = 65536
+    """Less than 1 % of the posterior keeps ``max_dev_alpha_ox`` of CIGALE's module xray: the result is without
+    it."""
+
     UNFITTED = 1 | 2 | 8 | 16 | 32 | 512 | 4096 | 8192
     """Bits with which a row has no result."""
 

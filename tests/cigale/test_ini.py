@@ -1,3 +1,4 @@
+import dataclasses
 import warnings
 
 import astropy.units as u
@@ -794,7 +795,12 @@ def test_the_example_of_cigale(data_file):
         setup = read(path, libraries="bundled")
     assert len(record) == 1
     text = str(record[0].message)
-    for name in ("xray.max_dev_alpha_ox = 0.2", "dale2014 by", "skirtor2016 by", "-1.9 to -1.1"):
+    for name in (
+        "max_dev_alpha_ox: by 5000 draws",
+        "dale2014 by",
+        "skirtor2016 by",
+        "-1.9 to -1.1",
+    ):
         assert name in text
     assert "boxcar" not in text
     np.testing.assert_allclose(setup.parameters["age"], [0.1, 3.0, 5.0])
@@ -811,10 +817,58 @@ def test_the_example_of_cigale(data_file):
     dust = results.mean("ebv_polar").value
     assert np.corrcoef(color, dust)[0, 1] > 0.7
     # the relation of Just et al. 2007 (scatter 0.14), above which quasars with X-ray detections lie
-    disk = np.log10(results.mean("l_2500").to_value(u.erg / u.s / u.Hz))
-    apart = results.mean("alpha_ox").value - (-0.137 * disk + 2.638)
+    bounded = [apart_from_just(one) for one in (results.mean, results.best.__getitem__)]
+    free = dataclasses.replace(setup, max_dev_alpha_ox=0.0).fit(catalog[:300])
+    apart = apart_from_just(free.mean)
     assert 0.0 < np.median(apart) < 0.15
     assert np.std(apart) < 0.2
+    # the bound of 0.2 holds for every model, and takes evidence from those beyond it
+    known = results.flags & FitFlags.OFF_RELATION == 0
+    assert np.mean(known) > 0.9
+    assert np.all(np.abs(bounded[1][known]) <= 0.2)
+    assert np.all(np.abs(bounded[0][known]) < 0.25)
+    assert np.all(results.log_evidence[known] <= free.log_evidence[known])
+    # others are as they were, and far from it
+    np.testing.assert_array_equal(bounded[0][~known], apart[~known])
+    assert np.all(np.abs(apart[~known]) > 0.2)
+
+
+def posterior_near_just(grid, catalog, most):
+    """Means and standard deviations over all models of a grid, one by one, that keep the bound."""
+    shape = (grid.n_galaxies, grid.n_agn, grid.frac_agn.size)
+    g, k, f = (x.ravel() for x in np.indices(shape))
+    flux = grid.flux(0, g, k, f)
+    data = np.array(
+        [catalog[b][0].to_value(u.uJy) if b in catalog.colnames else np.nan for b in grid.filters]
+    )
+    error = np.array([
+        np.hypot(catalog[f"{b}_err"][0].to_value(u.uJy), 0.05 * d) if np.isfinite(d) else np.inf
+        for b, d in zip(grid.filters, data, strict=True)
+    ])  # fmt: skip
+    data = np.nan_to_num(data)
+    scale = (flux * data / error**2).sum(1) / ((flux / error) ** 2).sum(1)
+    chi2 = (((data - scale[:, None] * flux) / error) ** 2).sum(1)
+    fraction = grid.frac_agn[f]
+    power = scale * fraction / (1 - fraction) * grid.dust_luminosity[g]
+    light = power * grid.agn_properties["l_2500"].value[k]
+    slope = grid.agn_parameters["alpha_ox"].value[k]
+    with np.errstate(divide="ignore"):
+        apart = np.abs(slope - (-0.137 * np.log10(light * 1e7) + 2.638))
+    weight = np.exp(-0.5 * (chi2 - chi2.min())) * ((fraction == 0) | (apart <= most))
+    # the fraction of CIGALE's file counts models, of which the AGN's rows may stand for several
+    weight *= grid.agn_multiplicity[k] / weight.sum()
+    weight /= weight.sum()
+    out = {}
+    for name, values in (("mass", scale), ("frac_agn", fraction), ("l_2500", light)):
+        mean = (weight * values).sum()
+        out[name] = mean, np.sqrt((weight * (values - mean) ** 2).sum())
+    return out
+
+
+def apart_from_just(values):
+    """How far alpha_ox is from -0.137 log L_nu(2500 A) + 2.638."""
+    disk = np.log10(values("l_2500").to_value(u.erg / u.s / u.Hz))
+    return values("alpha_ox").value - (-0.137 * disk + 2.638)
 
 
 XRAY = """
@@ -870,6 +924,20 @@ def test_x_ray_bands_are_fitted_where_there_is_a_module(tmp_path):
                 quiet(path)
         else:
             assert "xray.E_cut = 300 (one value at a time)" in quiet(path).describe()
+    # the bound of the relation, against every model by itself
+    path.write_text(text.replace("max_dev_alpha_ox = 0", "max_dev_alpha_ox = 0.15"))
+    setup = dataclasses.replace(quiet(path), limits=True)
+    assert "max_dev_alpha_ox: by 5000 draws" in setup.describe()
+    for name, theirs in setup.bands.items():
+        value = fluxes[theirs][0] if theirs in fluxes else 1e-6
+        catalog[name], catalog[f"{name}_err"] = [value] * u.mJy, [0.4 * value] * u.mJy
+    setup = dataclasses.replace(setup, redshift=np.array([0.5]))
+    fitter, results = setup.fitter(catalog), setup.fit(catalog)
+    wanted = posterior_near_just(fitter.grid, catalog, 0.15)
+    for name, (mean, std) in wanted.items():
+        got = results.mean(name)[0]
+        assert got.value == pytest.approx(mean, abs=5 * std / np.sqrt(500)), name
+    assert results.log_evidence[0] < fitter.fit(catalog, redshift=[0.5]).log_evidence[0]
     # without the module the band is left out, and told
     path.write_text(INI.replace(*band, 1))
     setup = quiet(path)

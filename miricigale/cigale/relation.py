@@ -1,0 +1,142 @@
+"""Posteriors within a distance of the relation of alpha_ox and L_nu(2500 A), from draws."""
+
+import dataclasses
+import warnings
+
+import astropy.units as u
+import numpy as np
+from scipy.special import log_ndtr
+
+from miricigale.fitting import FitFlags
+from miricigale.fitting.quantities import DERIVED_LEVELS
+from miricigale.utils.exceptions import MiricigaleWarning
+from miricigale.utils.parallel import chunks
+
+__all__ = ["N_DRAWS", "near_relation"]
+
+#: Just et al. 2007, ApJ 665, 1004, equation 3: slope and offset, for erg/s/Hz.
+_JUST = (-0.137, 2.638)
+#: Draws of each object, and objects whose draws are in memory at once.
+N_DRAWS, _OBJECTS = 5000, 64
+#: Part of the draws below which nothing can be said of those that are left.
+_LEAST = 0.01
+
+
+def near_relation(fitter, photometry, results, most, *, redshift=None, n_draws=N_DRAWS):
+    """
+    Leave out models whose corona is too far from what their disk should have, as X-CIGALE does.
+
+    The disk of a model has the luminosity that its scale gives it, so that the bound is none on the models of a
+    grid: models are drawn from the posterior, and those that keep it are the posterior under the bound.
+
+    Parameters
+    ----------
+    fitter : `~miricigale.fitting.BayesFitter`
+        The fitter, with a grid that `~miricigale.sed.with_xray_bands` made.
+    photometry : `~astropy.table.QTable`
+        What was fitted.
+    results : `~miricigale.fitting.FitResults`
+        What ``fitter.fit(photometry, redshift=redshift)`` returned.
+    most : float
+        Largest distance of alpha_ox from -0.137 log L_nu(2500 A) + 2.638 (Just et al. 2007).
+    redshift : array_like, optional
+        Known redshifts.
+    n_draws : int, optional
+        Draws of each object.
+
+    Returns
+    -------
+    results : `~miricigale.fitting.FitResults`
+        With posteriors, moments, quantiles, fluxes and evidence of the models that are left; the best model is the
+        best of them that was drawn, where the best of all is none of them. Objects of which less than 1 % of the
+        posterior keeps the bound are flagged ``OFF_RELATION``, and left as they are.
+    """
+    new = {
+        name: np.array(getattr(results, name))
+        for name in ("flags", "chi2", "log_evidence", "moments", "quantiles", "pdf_2d")
+        + ("model_flux", "model_flux_std", "best_flux", "best_index", "best_scale")
+    }
+    new["pdf"] = {name: np.array(pdf) for name, pdf in results.pdf.items()}
+    new["best"] = {name: np.array(values.value) for name, values in results.best.items()}
+    for rows in chunks(len(results), _OBJECTS):
+        z = None if redshift is None else np.asarray(redshift)[rows]
+        with warnings.catch_warnings():
+            # told by the fit
+            warnings.simplefilter("ignore", MiricigaleWarning)
+            samples = fitter.sample(photometry[rows], n_draws, seed=0, redshift=z)
+        kept = _near(samples, most)
+        values = {name: samples.values(name).value for name in results.parameters}
+        for j in np.flatnonzero(samples.fitted & results.fitted[rows]):
+            i, some = range(len(results))[rows][j], kept[j]
+            if np.mean(some) < _LEAST:
+                new["flags"][i] |= int(FitFlags.OFF_RELATION)
+                continue
+            index, scale = samples.index[j][some], samples.scale[j][some]
+            mine = {name: array[j][some] for name, array in values.items()}
+            _summarize(results, new, i, index, mine)
+            new["log_evidence"][i] += np.log(np.mean(some))
+            flux = scale[:, None] * fitter.grid.flux(*np.maximum(index, 0).T)
+            new["model_flux"][i], new["model_flux_std"][i] = flux.mean(axis=0), flux.std(axis=0)
+            if not _best_is_near(results, i, most):
+                _take_best(results, new, i, index, scale, flux, mine)
+    best = {name: u.Quantity(v, results.best[name].unit) for name, v in new.pop("best").items()}
+    return dataclasses.replace(results, **new, best=best)
+
+
+def _near(samples, most):
+    """Which draws are near the relation, or have no AGN: shape (n, n_draws)."""
+    slope = samples.grid.agn_parameters["alpha_ox"].value[np.maximum(samples.index[..., 2], 0)]
+    return ~(_distance(slope, samples.values("l_2500")) > most)
+
+
+def _distance(slope, light):
+    """How far a slope is from the relation; NaN without a disk."""
+    light = light.to_value(u.erg / u.s / u.Hz)
+    line = (
+        _JUST[0] * np.log10(light, where=light > 0, out=np.full(np.shape(light), np.nan)) + _JUST[1]
+    )
+    return np.abs(slope - line)
+
+
+def _best_is_near(results, i, most):
+    slope = results.best["alpha_ox"].value[i] if "alpha_ox" in results.best else None
+    slope = results.constants.get("alpha_ox") if slope is None else slope
+    return not _distance(slope, results.best["l_2500"][i]) > most
+
+
+def _summarize(results, new, i, index, values):
+    """Posteriors of parameters, moments and quantiles of derived quantities of one object."""
+    n_z, n_f = new["pdf_2d"].shape[1:]
+    count = np.bincount(index[:, 0] * n_f + index[:, 3], minlength=n_z * n_f)
+    new["pdf_2d"][i] = count.reshape(n_z, n_f) / len(index)
+    for name, axis in results.axes.items():
+        found = values[name][np.isfinite(values[name])]
+        node = np.argmin(np.abs(found[:, None] - axis.values), axis=1)
+        # of parameters of an AGN that is not there the posterior is the prior
+        rest = (len(index) - found.size) * axis.weights
+        new["pdf"][name][i] = (np.bincount(node, minlength=axis.values.size) + rest) / len(index)
+    for j, name in enumerate(results.quantities):
+        found = values[name][np.isfinite(values[name])]
+        if not found.size:
+            new["moments"][i, j], new["quantiles"][i, j] = np.nan, np.nan
+            continue
+        new["moments"][i, j, :2] = found.mean(), found.std()
+        lit = found[found > 0]
+        if np.isfinite(results.moments[i, j, 2]):
+            new["moments"][i, j, 2] = np.log10(lit).mean() if lit.size else np.nan
+        new["quantiles"][i, j] = np.quantile(found, DERIVED_LEVELS)
+
+
+def _take_best(results, new, i, index, scale, flux, values):
+    """The draw of the least chi2 as the best model."""
+    sigma, limit = results.sigma[i], results.limit[i]
+    used = np.isfinite(sigma)
+    pull = (results.flux[i] - flux)[:, used] / sigma[used]
+    terms = np.where(limit[used], -2.0 * log_ndtr(pull), np.square(pull))
+    chi2 = terms.sum(axis=1)
+    k = int(np.argmin(chi2))
+    new["chi2"][i], new["best_flux"][i] = chi2[k], flux[k]
+    new["best_index"][i], new["best_scale"][i] = index[k], scale[k]
+    for name, array in new["best"].items():
+        if name in values:
+            array[i] = values[name][k]
