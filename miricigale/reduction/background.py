@@ -9,7 +9,7 @@ from scipy.ndimage import binary_dilation
 from miricigale.instrument import DQ, ImageFacts
 from miricigale.reduction.images import flag_pixels, plain_mask, sigma, with_data
 from miricigale.reduction.sky_mask import cells_of, contamination, darkest, detect, grown, pixels_of
-from miricigale.reduction.sky_mesh import fit_surface, sky_boxes, spread_over, surface, surface_over
+from miricigale.reduction.sky_mesh import SkyMesh, sky_boxes
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.options import check_choice, check_least, check_positive
@@ -159,6 +159,10 @@ def estimate_background(
     threshold stays in the background, the clipped median of the unmasked pixels; before any source is
     masked it is the mode as Source Extractor has it.
 
+    In mosaics of pixels so small that several share their noise (``meta["noise_correction"]`` of 2 and more)
+    sources are searched for in means of as many by as many of them, which are the pixels of these options
+    then, but for the boxes.
+
     References
     ----------
     Detection in tiers of smoothing, from wide to narrow, follows Bagley et al. 2023, ApJL 946, L12, sec. 3.
@@ -201,15 +205,40 @@ def estimated(
     data = np.where(mask, 0, data if data.dtype.kind == "f" else data.astype(float))
     if method == "sep":
         return _plain(data, mask, int(box), int(filter_size), _correlation(image))
-    mesh, stated = _Mesh(data, mask, int(box), int(filter_size), plane), _stated(image, mask)
-    sources, flags, doubt = np.zeros(data.shape, bool), BackgroundFlags.GOOD, 0.0
+    correlation, stated = _correlation(image), _stated(image, mask)
+    step = _step(correlation, box)
+    options = {"threshold": threshold, "grow": grow, "iterations": iterations}
+    if step == 1:
+        mesh = SkyMesh(data, mask, int(box), int(filter_size), plane)
+        mesh, sources, flags, doubt = _search(mesh, stated, **options)
+    else:
+        mean, small, known = _averaged(data, mask, stated, step, correlation)
+        mesh = SkyMesh(mean, small, int(box) // step, int(filter_size), plane)
+        _, sources, flags, doubt = _search(mesh, known, **options)
+        sources = pixels_of(sources, data.shape, step) & ~mask
+        mesh = SkyMesh(data, mask, int(box), int(filter_size), plane, sources)
+    if not flags & BackgroundFlags.FEW_SKY and _excess(stated, mesh.rms, mask | sources) > _EXCESS:
+        flags |= BackgroundFlags.EXCESS_NOISE
+    if flags & (BackgroundFlags.FEW_SKY | BackgroundFlags.EXCESS_NOISE):
+        sources = ~darkest(mesh.tilted, mask, mesh.box, _LEAST_SKY)
+        mesh = mesh.measured(sources)
+        sources &= ~mask
+        doubt = max(0.0, float(np.median(mesh.residual[~mask])))
+    error = np.hypot(mesh.error * np.float32(correlation), np.float32(doubt))
+    return Background(mesh.level, mesh.rms, error, sources, mesh.box, mesh.filter_size, flags)
+
+
+def _search(mesh, stated, *, threshold, grow, iterations):
+    """Mesh, mask of the sources, flags, and the light of sources that may be in the sky."""
+    mask = mesh.mask
+    sources, flags, doubt = np.zeros(mask.shape, bool), BackgroundFlags.GOOD, 0.0
     avoided = np.zeros(cells_of(mask).shape, bool)
     for _ in range(iterations):
         noise = _noise(stated, mesh.rms, mask | sources)
         found = detect(mesh.residual, noise, mask, sources, threshold)
         if grow:
             found = grown(binary_dilation(found, iterations=grow), mask)
-        found |= pixels_of(avoided, data.shape)
+        found |= pixels_of(avoided, mask.shape)
         if np.count_nonzero(~found & ~mask) < _LEAST_SKY * np.count_nonzero(~mask):
             flags = BackgroundFlags.FEW_SKY
             break
@@ -218,7 +247,7 @@ def estimated(
         if not same:
             mesh, sources = mesh.measured(found), found
         # a gradient would be taken for light of sources, were it still there
-        flat = mesh.tilted if plane else mesh.residual
+        flat = mesh.tilted if mesh.plane else mesh.residual
         doubt, near = contamination(flat, ~(mask | sources), sources)
         high = doubt > _CONTAMINATION * float(np.median(_some(mesh.rms)))
         if high:
@@ -228,18 +257,22 @@ def estimated(
     else:
         if iterations and high:
             flags = BackgroundFlags.CONTAMINATED
-    doubt *= _REMAINDER
-    if not flags & BackgroundFlags.FEW_SKY and _excess(stated, mesh.rms, mask | sources) > _EXCESS:
-        flags |= BackgroundFlags.EXCESS_NOISE
-    if flags & (BackgroundFlags.FEW_SKY | BackgroundFlags.EXCESS_NOISE):
-        sources = ~darkest(mesh.tilted, mask, mesh.box, _LEAST_SKY)
-        mesh = mesh.measured(sources)
-        sources &= ~mask
-        doubt = max(0.0, float(np.median(mesh.residual[~mask])))
-    error = np.hypot(mesh.error * np.float32(_correlation(image)), np.float32(doubt))
-    background = Background(mesh.level, mesh.rms, error, sources, mesh.box, mesh.filter_size, flags)
-    tell(background, mask)
-    return background
+    return mesh, sources, flags, _REMAINDER * doubt
+
+
+def _step(correlation, box):
+    """Pixels along each axis that share their noise, as far as boxes have four such groups of them."""
+    return max(1, min(int(correlation), int(box) // 4))
+
+
+def _averaged(data, mask, stated, step, correlation):
+    """Means over pixels that share their noise, their mask, and what `_stated` says of them."""
+    mean, share = cells_of(data, ~mask, step)
+    small = share < 0.5
+    if stated is not None:
+        error, part = cells_of(*stated, step)
+        stated = error * np.float32(correlation / step), ~small & (part > 0)
+    return np.where(small, 0, mean), small, stated
 
 
 def check_mesh(box, filter_size, *, least=4):
@@ -307,57 +340,6 @@ def _plain(data, mask, box, filter_size, correlation):
     error = rms * (2.14 * correlation * min(1.0, 1.2533 / filter_size) / box)
     level, rms, error = (a.astype(np.float32, copy=False) for a in (level, rms, error))
     return Background(level, rms, error, np.zeros(mask.shape, bool), box, filter_size, flags)
-
-
-class _Mesh:
-    """A smooth surface and a mesh of boxes through the sky of an image, and what they leave."""
-
-    def __init__(self, data, mask, box, filter_size, plane):
-        self._data, self._mask, self._plane = data, mask, plane
-        self.box, self.filter_size = box, filter_size
-        self._smooth = np.zeros((1, 1), data.dtype)
-        # sources are not masked yet; boxes are measured once more without the surface, which
-        # widens their distribution
-        if plane:
-            boxes = sky_boxes(data, mask, box, mode=True)
-            self._smooth = self._surface(boxes, boxes.level)[0]
-        self._measure(np.zeros_like(mask), mode=True)
-
-    def measured(self, sources):
-        """The same of an image with other sources masked."""
-        out = object.__new__(_Mesh)
-        out.__dict__.update(self.__dict__)
-        out._measure(sources)
-        return out
-
-    def _surface(self, boxes, values):
-        """Surface through boxes, each at the mean place of its sky, in each pixel and there."""
-        coefficients = fit_surface(boxes, values)
-        return surface_over(coefficients, boxes, self._data.shape), surface(coefficients, boxes)
-
-    def _measure(self, sources, mode=False):
-        boxes = sky_boxes(self._data - self._smooth, self._mask | sources, self.box, mode=mode)
-        values = boxes.level
-        if self._plane:
-            more, there = self._surface(boxes, values)
-            self._smooth, values = self._smooth + more, values - there
-        mesh = self._over(values, boxes)
-        self.tilted = self._data - self._smooth
-        self.residual = self.tilted - mesh
-        self.level = (self._smooth + mesh).astype(np.float32)
-        self.rms = np.maximum(self._over(boxes.spread, boxes), 0)
-        self._boxes = boxes
-
-    def _over(self, values, boxes):
-        return spread_over(values, boxes.used, boxes.edges, self._data.shape, self.filter_size)
-
-    @property
-    def error(self):
-        """What noise leaves open of the level."""
-        error = self._over(self._boxes.error, self._boxes)
-        # that of a median of so many boxes
-        number = np.clip(np.count_nonzero(self._boxes.used), 1, self.filter_size**2)
-        return np.maximum(error, 0) * np.float32(min(1.0, 1.2533 / np.sqrt(number)))
 
 
 def subtract_background(image, *, negative_threshold=10.0, negative_noise="larger", **options):

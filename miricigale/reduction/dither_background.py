@@ -52,7 +52,8 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None, box=16, filter_siz
     Raises
     ------
     ValueError
-        If there are fewer than three images, they differ in shape or an option is out of range.
+        If there are fewer than three images, they differ in shape, none of the others of an image sees sky in
+        any of its pixels, or an option is out of range.
 
     Notes
     -----
@@ -89,6 +90,10 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None, box=16, filter_siz
         images, alone, masks, sources, levels, templates, strict=True
     ):
         known = np.isfinite(template)
+        if not known.any():
+            raise argument_error(
+                "images", "ones that leave some sky to each other", "none in common"
+            )
         boxes = sky_boxes(np.where(known, template, 0), ~known, max(box, 4))
         smooth = spread_over(boxes.level, boxes.used, boxes.edges, shape, filter_size)
         error = spread_over(boxes.error, boxes.used, boxes.edges, shape, filter_size)

@@ -122,12 +122,9 @@ def read_images(path):
             msg = f"{path} cannot be read as {_WANTED}: it has no image in SCI"
             raise DataError(msg)
         header = joined_header(hdus)
-        if (
-            header.get("INSTRUME", "MIRI") != "MIRI"
-            or header.get("DETECTOR", "MIRIMAGE") != "MIRIMAGE"
-        ):
-            got = f"{header.get('INSTRUME')} {header.get('DETECTOR')}"
-            msg = f"{path} must be of the MIRI imager, got {got}"
+        made = header.get("INSTRUME", "MIRI"), header.get("DETECTOR", "MIRIMAGE")
+        if made != ("MIRI", "MIRIMAGE"):
+            msg = f"{path} must be of the MIRI imager, got {made[0]} {made[1]}"
             raise DataError(msg)
         shape = hdus["SCI"].shape
         check_memory(24 * np.prod(shape, dtype=float), f"the image {path}", advice="cut it")

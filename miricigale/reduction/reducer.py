@@ -208,10 +208,8 @@ class Reducer:
         ----------
         ramp : `~miricigale.detector.Ramp`
             Counts in DN.
-        planes : bool, optional
+        planes, progress_bar : bool, optional
             As for `fit_ramp`.
-        progress_bar : bool, optional
-            Whether a progress bar is shown.
 
         Returns
         -------

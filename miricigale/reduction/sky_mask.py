@@ -15,32 +15,31 @@ _CELL, _CELL_WIDTH, _CELL_AREA, _CELL_THRESHOLD = 4, 2.0, 12, 2.0
 _GROWTH = (2.0, 1.0, 0.5)
 
 
-def cells_of(values, weight=None):
+def cells_of(values, weight=None, size=_CELL):
     """Mean of an image in cells, and the share of a cell that counts; without a weight, the share alone."""
     if weight is None:
-        return _added(values.astype(np.uint8)) / np.float32(_CELL**2)
-    total = _added(np.where(weight, values, np.float32(0)))
-    count = _added(weight.astype(np.uint8))
-    return total / np.maximum(count, 1), count / np.float32(_CELL**2)
+        return _added(values.astype(np.uint8), size) / np.float32(size**2)
+    total = _added(np.where(weight, values, np.float32(0)), size)
+    count = _added(weight.astype(np.uint8), size)
+    return total / np.maximum(count, 1), count / np.float32(size**2)
 
 
-def _added(values):
+def _added(values, size):
     """Sums over cells; what is beyond the edge is zero."""
-    left = [(0, -n % _CELL) for n in values.shape]
+    left = [(0, -n % size) for n in values.shape]
     if any(more for _, more in left):
         values = np.pad(values, left)
-    rows = values[::_CELL] + values[1::_CELL]
-    for k in range(2, _CELL):
-        rows += values[k::_CELL]
+    rows = values[::size] + values[1::size]
+    for k in range(2, size):
+        rows += values[k::size]
     # sums of neighbors as a product of matrices
-    return (
-        rows.astype(np.float32, copy=False).reshape(-1, _CELL) @ np.ones(_CELL, np.float32)
-    ).reshape(len(rows), -1)
+    pairs = rows.astype(np.float32, copy=False).reshape(-1, size)
+    return (pairs @ np.ones(size, np.float32)).reshape(len(rows), -1)
 
 
-def pixels_of(cells, shape):
+def pixels_of(cells, shape, size=_CELL):
     """Pixels of cells."""
-    wide = np.repeat(np.repeat(cells, _CELL, axis=0), _CELL, axis=1)
+    wide = np.repeat(np.repeat(cells, size, axis=0), size, axis=1)
     return wide[: shape[0], : shape[1]]
 
 
@@ -109,10 +108,18 @@ def contamination(data, sky, sources):
     """
     Light of sources in what is left as sky.
 
+    Parameters
+    ----------
+    data : `~numpy.ndarray`, shape (ny, nx)
+        Image without gradient.
+    sky, sources : `~numpy.ndarray` of bool, shape (ny, nx)
+        What is left as sky, and what is taken for sources.
+
     Returns
     -------
     difference : float
-        By how much the nearer half of the sky is brighter than the farther, if that is significant; else 0.
+        By how much the nearer half of the sky, by the distance of its cells from sources, is brighter than the
+        farther, if that is more than three times its error; else 0.
     near : `~numpy.ndarray` of bool
         The nearer half, in cells.
     """

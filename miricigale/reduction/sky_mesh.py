@@ -7,15 +7,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import distance_transform_edt
 
-__all__ = [
-    "SkyBoxes",
-    "box_edges",
-    "fit_surface",
-    "sky_boxes",
-    "spread_over",
-    "surface",
-    "surface_over",
-]
+__all__ = ["SkyBoxes", "SkyMesh", "sky_boxes", "spread_over"]
 
 #: Clipping of a box, in standard deviations, and what it leaves of that of a Gaussian.
 _CLIP, _CLIPPED = 3.0, 0.98655
@@ -273,3 +265,70 @@ def _filled(values):
         return values
     nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
     return values[tuple(nearest)]
+
+
+class SkyMesh:
+    """
+    A smooth surface and a mesh of boxes through the sky of an image, and what they leave.
+
+    Parameters
+    ----------
+    data : `~numpy.ndarray`, shape (ny, nx)
+        Image; finite where it is not masked.
+    mask : `~numpy.ndarray` of bool, shape (ny, nx)
+        What is no data.
+    box, filter_size : int
+        Size of the boxes in pixels, and of the median filter in boxes.
+    plane : bool
+        Whether a plane or parabola is taken off before the boxes are measured.
+    sources : `~numpy.ndarray` of bool, shape (ny, nx), optional
+        What is no sky; if not given, levels are modes.
+    """
+
+    def __init__(self, data, mask, box, filter_size, plane, sources=None):
+        self._data, self.mask, self.plane = data, mask, plane
+        self.box, self.filter_size = box, filter_size
+        self._smooth = np.zeros((1, 1), data.dtype)
+        mode = sources is None
+        sources = np.zeros_like(mask) if mode else sources
+        # boxes are measured once more without the surface, which widens their distribution
+        if plane:
+            boxes = sky_boxes(data, mask | sources, box, mode=mode)
+            self._smooth = self._surface(boxes, boxes.level)[0]
+        self._measure(sources, mode=mode)
+
+    def measured(self, sources):
+        """The same of an image with other sources masked."""
+        out = object.__new__(SkyMesh)
+        out.__dict__.update(self.__dict__)
+        out._measure(sources)
+        return out
+
+    def _surface(self, boxes, values):
+        """Surface through boxes, each at the mean place of its sky, in each pixel and there."""
+        coefficients = fit_surface(boxes, values)
+        return surface_over(coefficients, boxes, self._data.shape), surface(coefficients, boxes)
+
+    def _measure(self, sources, mode=False):
+        boxes = sky_boxes(self._data - self._smooth, self.mask | sources, self.box, mode=mode)
+        values = boxes.level
+        if self.plane:
+            more, there = self._surface(boxes, values)
+            self._smooth, values = self._smooth + more, values - there
+        mesh = self._over(values, boxes)
+        self.tilted = self._data - self._smooth
+        self.residual = self.tilted - mesh
+        self.level = (self._smooth + mesh).astype(np.float32)
+        self.rms = np.maximum(self._over(boxes.spread, boxes), 0)
+        self._boxes = boxes
+
+    def _over(self, values, boxes):
+        return spread_over(values, boxes.used, boxes.edges, self._data.shape, self.filter_size)
+
+    @property
+    def error(self):
+        """What noise leaves open of the level."""
+        error = self._over(self._boxes.error, self._boxes)
+        # that of a median of so many boxes
+        number = np.clip(np.count_nonzero(self._boxes.used), 1, self.filter_size**2)
+        return np.maximum(error, 0) * np.float32(min(1.0, 1.2533 / np.sqrt(number)))

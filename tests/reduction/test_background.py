@@ -1,9 +1,17 @@
+import astropy.units as u
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
 
-from miricigale.instrument import DQ
-from miricigale.reduction import BackgroundFlags, estimate_background, subtract_background
+from miricigale.instrument import DQ, north_up_wcs
+from miricigale.reduction import (
+    BackgroundFlags,
+    drizzle_images,
+    estimate_background,
+    subtract_background,
+)
+from miricigale.reduction.images import plain_mask
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import MiricigaleWarning
 
@@ -49,6 +57,39 @@ def test_the_mesh_alone_is_off_where_a_box_is_seen_in_part():
         # the middle of what is seen is 8 of 32 pixels from the center of the box
         assert off[15:17].mean() == pytest.approx(wanted, abs=0.1)
         assert np.abs(off[48:320]).max() < 0.1
+
+
+def test_fine_pixels_of_a_mosaic_are_masked_as_coarse_ones_are():
+    """Of two drizzles of the same dithers both have the sky that was put in, of the sources the same part."""
+    rng = np.random.default_rng(7)
+    center, shape = SkyCoord(53.1, -27.8, unit="deg"), (320, 320)
+    # their wings are what lifts a background
+    stars = rng.uniform(-16, 16, (2, 120)), 10 ** rng.uniform(0, 2.5, 120)
+    images = []
+    for _ in range(4):
+        wcs = north_up_wcs(center, 0.11 * u.arcsec, shape)
+        wcs.wcs.crpix = wcs.wcs.crpix + rng.uniform(-5, 5, 2)
+        y, x = np.mgrid[: shape[0], : shape[1]]
+        data = 20 + rng.normal(size=shape)
+        for dx, dy, peak in zip(*stars[0], stars[1], strict=True):
+            x0, y0 = wcs.wcs.crpix - 1 + np.array([dx, dy]) / 0.11
+            data += peak / (1 + ((x - x0) ** 2 + (y - y0) ** 2) / 4) ** 2
+        error = StdDevUncertainty(np.ones(shape))
+        images.append(CCDData(data, unit="MJy/sr", uncertainty=error, wcs=wcs))
+    found = {}
+    for scale in (0.11, 0.055):
+        n = int(33 / scale)
+        grid = north_up_wcs(center, scale * u.arcsec, (n, n))
+        mosaic = drizzle_images(images, grid).image
+        background = estimate_background(mosaic, box=int(7 / scale))
+        seen = ~plain_mask(mosaic)
+        noise = np.median(mosaic.uncertainty.array[seen])
+        assert np.median(background.rms[seen]) == pytest.approx(noise, rel=0.15)
+        off = np.median(background.level[seen]) - 20
+        assert abs(off) < 0.05 * noise
+        found[scale] = off, background.source_mask.mean()
+    assert found[0.055][0] == pytest.approx(found[0.11][0], abs=0.01)
+    assert found[0.055][1] == pytest.approx(found[0.11][1], rel=0.1)
 
 
 def test_sources_do_not_lift_it(noise, gradient):

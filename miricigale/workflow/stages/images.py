@@ -211,7 +211,7 @@ def make_exposure(context, unit):
 @stage(
     "mosaics",
     "mosaic",
-    version=6,
+    version=7,
     needs={"exposures": dithers_of_band},
     sections=(*GRID, "reduction", "highres.pixel_scale"),
     units=truth_bands,

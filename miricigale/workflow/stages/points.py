@@ -70,7 +70,7 @@ def point_catalog(exposure, band_flux, prior, *, spacing, seed):
 @stage(
     "points",
     "point sources",
-    version=5,
+    version=6,
     needs=("kernels",),
     sections=(
         *IMAGES,
