@@ -37,6 +37,7 @@ _OF_GRID = (
     "compat",
     "rtol",
     "template_error",
+    "sfr_prior",
     "interpolate",
 )
 _OF_SAMPLER = ("predict", "n_live", "n_effective", "max_calls", "n_draws", "n_cells")
@@ -91,6 +92,11 @@ class BayesFitter:
     template_error : `~miricigale.fitting.TemplateError`, optional
         Of a grid: error of the models by rest wavelength, added in quadrature too; what it does to the
         normalization of the likelihood counts. ``sigma`` of the results has that of the best model.
+    sfr_prior : tuple, optional
+        Of a grid: a function of stellar mass and redshift (a `~astropy.units.Quantity`, and an array that
+        broadcasts with it) to a star-formation rate, and a scatter in dex. The prior of the galaxies of each
+        redshift is multiplied by that log-normal distribution of their rate over the last 100 Myr, at the mass
+        that fits best without AGN, and keeps its sum. Not with ``interpolate``.
     n_bands_min : int, optional
         Objects with fewer usable bands, upper limits among them, are flagged and not fitted. One
         band at least must be no limit.
@@ -183,6 +189,7 @@ class BayesFitter:
         compat=None,
         rtol=1e-6,
         template_error=None,
+        sfr_prior=None,
         interpolate=0,
         predict=(),
         n_live=500,
@@ -222,6 +229,7 @@ class BayesFitter:
                 redshift_tolerance=redshift_tolerance,
                 compat=compat,
                 template_error=template_error,
+                sfr_prior=sfr_prior,
                 interpolate=check_count(interpolate, "interpolate", least=0),
             )
             for name in names or ():

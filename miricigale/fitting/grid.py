@@ -5,7 +5,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import log_ndtr, ndtr, ndtri
+from scipy.special import log_ndtr, logsumexp, ndtr, ndtri
 
 from miricigale.fitting import _core
 from miricigale.fitting.posterior import cell_edges
@@ -77,6 +77,9 @@ class GridEngine:
     template_error : `~numpy.ndarray`, shape (nz, nb), optional
         Part of a flux that is added to its error in quadrature at each redshift; what this does to the
         normalization of the likelihood is part of the weights.
+    mass_prior : callable, optional
+        Of solar masses formed, shape (n, nG), and the n redshifts they are at, as indices: ln of a factor of
+        the priors of galaxies. Taken at the mass that each galaxy has without AGN, for each object.
     rtol : float
         Relative error that pruning may cause. The weight of what is left out is bounded to a
         tenth of it, and what it could add to the variance of any derived quantity to
@@ -104,6 +107,7 @@ class GridEngine:
     share_galaxy: np.ndarray | None = None
     share_agn: np.ndarray | None = None
     template_error: np.ndarray | None = None
+    mass_prior: object = None
     rtol: float = 1e-6
     scale_error: bool = True
 
@@ -152,8 +156,8 @@ class GridEngine:
         if share_galaxy is None or share_agn is None:
             share_galaxy, share_agn = np.zeros(n_galaxy), np.zeros(self.agn.shape[1])
         log_dust = np.log10(self.dust, where=self.dust > 0, out=np.full(n_galaxy, -400.0))
-        of_galaxy = np.zeros((5, n_padded))
-        of_galaxy[:, :n_galaxy] = (self.dust, log_dust, log_galaxy, share_galaxy, self.mixed_galaxy)
+        of_galaxy = np.zeros((4, n_padded))
+        of_galaxy[:, :n_galaxy] = (self.dust, log_dust, share_galaxy, self.mixed_galaxy)
         n_agn = self.agn.shape[1]
         of_agn = np.zeros((3, max(n_agn, 1)))
         of_agn[:, :n_agn] = (_two_log(self._agn_prior), share_agn, self.mixed_agn)
@@ -288,13 +292,32 @@ class GridEngine:
         for i in np.flatnonzero(log_prior.max(axis=1, initial=-1e300) > -1e200):
             target = self._target(data[i], sigma[i], log_prior[i])
             limits = _limits(limit[i], inverse[i])
+            tables = self._tables_of(target)
             sums.draws.state[0] = seeds[i]
             _core.clear(sums)
             if target.norm[0] > 0.0 and _core.sum_up(
-                self._tables, self._scales, self._request, target, limits, *workspace, single=single
+                tables, self._scales, self._request, target, limits, *workspace, single=single
             ):
                 self._summarize(target, limits, sums, out, i)
         return out
+
+    def _tables_of(self, target):
+        """Tables with the priors that galaxies have at the masses they would have in an object."""
+        tables = self._tables
+        if self.mass_prior is None:
+            return tables
+        log, n_galaxy = tables.log_usable.copy(), self.size["g"]
+        rows = np.flatnonzero(target.log_prior > -1e200)
+        galaxy, weight = self.galaxy[rows], target.weight[rows]
+        data = np.einsum("zgb,zb->zg", galaxy, weight * target.flux)
+        norm = np.einsum("zgb,zgb,zb->zg", galaxy, galaxy, weight)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            plain = np.where(self.usable[rows], 0.5 * log[rows, :n_galaxy], -np.inf)
+            found = plain + self.mass_prior(np.maximum(data / norm, 1.0), rows)
+            # how much of the prior a redshift has is not for this factor to say
+            found += (logsumexp(plain, axis=1) - logsumexp(found, axis=1))[:, None]
+        log[rows, :n_galaxy] = np.where(found > -1e200, 2.0 * found, -1e300)
+        return tables._replace(log_usable=log)
 
     def _target(self, flux, sigma, log_prior):
         """Bundle the data of one object."""

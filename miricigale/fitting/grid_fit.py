@@ -17,6 +17,7 @@ from miricigale.fitting.priors import (
     fixed_log_prior,
     grid_priors,
     known_redshifts,
+    sfr_log_prior,
 )
 from miricigale.fitting.quantities import DERIVED_LEVELS, OtherFraction, Quantities, plain
 from miricigale.fitting.results import CIGALE_LEAST_STD, FitResults
@@ -25,7 +26,7 @@ from miricigale.sed import ModelGrid, SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.parallel import chunks, parallel_map
 from miricigale.utils.random import stream
-from miricigale.utils.units import is_number
+from miricigale.utils.units import MASS, is_number
 
 __all__ = ["GridFit"]
 
@@ -80,6 +81,7 @@ class GridFit:
         redshift_tolerance,
         compat,
         template_error,
+        sfr_prior,
         interpolate,
     ):
         """Make a grid if it is none, work out its priors and derived quantities, set the engine up."""
@@ -88,6 +90,8 @@ class GridFit:
         near = redshift_tolerance
         if near is not None and not (is_number(near) and near >= 0):
             raise argument_error("redshift_tolerance", ">= 0", repr(near))
+        if sfr_prior is not None and interpolate:
+            raise argument_error("sfr_prior", "None with 'interpolate'", repr(sfr_prior))
         if compat not in (None, "cigale"):
             raise argument_error("compat", "None or 'cigale'", repr(compat))
         grid = model
@@ -121,6 +125,7 @@ class GridFit:
             template_error=grid_errors(
                 template_error, grid.filters if model is grid else filters, grid.redshift
             ),
+            mass_prior=None if sfr_prior is None else sfr_log_prior(sfr_prior, grid),
             rtol=float(rtol),
             scale_error=scale_error,
         )
@@ -174,16 +179,20 @@ class GridFit:
             "n_models": int(self.engine.n_models),
             "interpolate": 0 if self.between is None else self.between.n_draws,
             "constants": self.constants,
-        } | self._error_settings
+        } | self._more_settings
 
     @property
-    def _error_settings(self):
-        error = self.template_error
-        if error is None:
-            return {}
-        return {
-            "template_error": {"wave": error.wave.value.tolist(), "error": error.error.tolist()}
-        }
+    def _more_settings(self):
+        error, prior, more = self.template_error, self.engine.mass_prior, {}
+        if error is not None:
+            wave = error.wave.value.tolist()
+            more["template_error"] = {"wave": wave, "error": error.error.tolist()}
+        if prior is not None:
+            relation, scatter, z = prior.args[:3]
+            # a function has no value to tell it by: its own at some masses
+            rates = [relation([1e8, 1e10, 1e12] * MASS, one).value.tolist() for one in z[[0, -1]]]
+            more["sfr_prior"] = {"scatter": scatter, "sfr": rates}
+        return more
 
     def provenance(self):
         """Return what results say of the grid."""

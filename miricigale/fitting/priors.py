@@ -1,6 +1,7 @@
 """Priors of the parameters of a grid, in weights of the nodes, and what is known of redshifts."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import astropy.units as u
 import numpy as np
@@ -9,7 +10,7 @@ from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import cell_edges
 from miricigale.fitting.quantities import plain
 from miricigale.utils.exceptions import argument_error, unknown_name
-from miricigale.utils.units import to_array
+from miricigale.utils.units import MASS, is_number, to_array
 
 __all__ = [
     "GridAxis",
@@ -22,6 +23,7 @@ __all__ = [
     "known_redshifts",
     "magnitude_prior",
     "read_density",
+    "sfr_log_prior",
 ]
 
 
@@ -261,6 +263,30 @@ def magnitude_prior(
     top = np.maximum(peak + slope * np.where(np.isfinite(apart), apart, 0.0), 0.1 * peak)[:, None]
     density = z**power * np.exp(-((z / top) ** power))
     return z, density / np.trapezoid(density, z, axis=1)[:, None]
+
+
+def sfr_log_prior(sfr_prior, grid):
+    """
+    Prior of star-formation rates given mass and redshift, for `~miricigale.fitting.grid.GridEngine`.
+
+    ``sfr_prior`` is that of `~miricigale.fitting.BayesFitter`: a relation and its scatter. A `ValueError` tells
+    what is none.
+    """
+    wanted = "a function of stellar mass and redshift, and a scatter in dex above 0"
+    pair = sfr_prior if isinstance(sfr_prior, tuple) and len(sfr_prior) == 2 else (None, None)
+    relation, scatter = pair
+    if not (callable(relation) and is_number(scatter) and scatter > 0):
+        raise argument_error("sfr_prior", wanted, repr(sfr_prior))
+    rate = grid.galaxy_properties["sfr_100myr"].to_value(u.Msun / u.yr / MASS)
+    stars = plain(grid.galaxy_properties["stellar_mass"])
+    return partial(_log_normal_sfr, relation, float(scatter), grid.redshift[:, None], stars, rate)
+
+
+def _log_normal_sfr(relation, scatter, redshift, stars, rate, formed, rows):
+    expected = relation(formed * stars * MASS, redshift[rows])
+    with np.errstate(divide="ignore"):
+        apart = np.log10(formed * rate / to_array(expected, u.Msun / u.yr, "sfr_prior"))
+    return -0.5 * np.square(apart / scatter)
 
 
 def read_density(redshift_prior, n):

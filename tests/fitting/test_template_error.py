@@ -167,3 +167,38 @@ def test_prior_of_redshift_given_magnitude():
     np.testing.assert_allclose(magnitude_prior([0.0, -1.0] * u.uJy)[1], density[[1, 1]])
     with pytest.raises(ValueError, match="'power' must be above 0"):
         magnitude_prior(flux, power=0.0)
+
+
+def test_prior_of_star_formation_given_mass_and_redshift(make_grid):
+    """Two galaxies of the same light: the odds are those of the prior at the mass that the flux gives."""
+    grid = make_grid(3, n_z=2, n_tau=2, n_age=1, frac=[0.0, 0.3])
+    galaxy, rate = np.repeat(grid.galaxy[:, :1], 2, axis=1), np.array([1e-9, 4e-10])
+    properties = QTable({"stellar_mass": [0.5, 0.8], "sfr_100myr": rate / u.yr})
+    grid = replace(
+        grid, galaxy=galaxy, galaxy_properties=properties, dust_luminosity=np.full(2, 1e29)
+    )
+    flux = 1e10 * galaxy[1, 0]
+    table = QTable({"id": [1]})
+    for name, one in zip(grid.filters, flux, strict=True):
+        table[name], table[f"{name}_err"] = [one] * u.uJy, [0.5 * one] * u.uJy
+
+    def relation(mass, redshift):
+        return 10 ** (0.8 * np.log10(mass / u.Msun) - 7.0 + redshift) * u.Msun / u.yr
+
+    fitter = BayesFitter(grid, model_error=0.0, sfr_prior=(relation, 0.3), rtol=0.0)
+    fits = fitter.fit(table), BayesFitter(grid, model_error=0.0, rtol=0.0).fit(table)
+    # which redshift it is stays with the fluxes
+    np.testing.assert_allclose(fits[0].pdf["redshift"], fits[1].pdf["redshift"], rtol=1e-6)
+    known = fitter.fit(table, redshift=grid.redshift[1])
+    expected = 0.8 * np.log10(1e10 * np.array([0.5, 0.8])) - 7.0 + grid.redshift[1]
+    prior = np.exp(-0.5 * ((np.log10(1e10 * rate) - expected) / 0.3) ** 2)
+    np.testing.assert_allclose(known.pdf["tau"][0], prior / prior.sum(), rtol=1e-9)
+    draws = fitter.sample(table, 4000, seed=1, redshift=grid.redshift[1])
+    part = np.mean(draws.to_table()["tau"] == grid.galaxy_parameters["tau"][0])
+    assert part == pytest.approx(prior[0] / prior.sum(), abs=5 * np.sqrt(0.25 / 4000))
+    with pytest.raises(ValueError, match="'sfr_prior' must be a function"):
+        BayesFitter(grid, sfr_prior=relation)
+    with pytest.raises(ValueError, match="'sfr_prior' must be None with 'interpolate'"):
+        BayesFitter(grid, sfr_prior=(relation, 0.3), interpolate=100)
+    with pytest.raises(ValueError, match="'sfr_prior' must be left out with a sampler"):
+        BayesFitter(None, ["acs.f606w"], engine="nautilus", sfr_prior=(relation, 0.3))

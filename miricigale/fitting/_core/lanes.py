@@ -107,7 +107,7 @@ def gather(tables, target, limits, pairs, lanes, r, start, floor, filled):
             buffer[at.X2 + filled] = 2.0 * x * d
             buffer[at.A + filled] = a * d
             buffer[at.B + filled] = b * d * d
-            buffer[at.PRIOR + filled] = log_prior + of_galaxy[at.LOG_GALAXY, g]
+            buffer[at.PRIOR + filled] = log_prior + tables.log_usable[z, g]
             buffer[at.SHARE + filled] = of_galaxy[at.SHARE_GALAXY, g] * share
             buffer[at.POWER + filled] = d
             lanes.index[0, filled] = g

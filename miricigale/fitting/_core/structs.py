@@ -45,8 +45,8 @@ DONE = np.float32(-3e38)
 NO_LIGHT = 1e-290
 
 #: Rows of ``Tables.of_galaxy``: dust luminosity in W for each solar mass formed and its log10 (-400
-#: where it is 0), 2 ln(prior), the galaxy's parts of the other fraction and of the quantity of both.
-DUST, LOG_DUST, LOG_GALAXY, SHARE_GALAXY, MIXED_GALAXY = range(5)
+#: where it is 0), the galaxy's parts of the other fraction and of the quantity of both.
+DUST, LOG_DUST, SHARE_GALAXY, MIXED_GALAXY = range(4)
 #: Rows of ``Tables.of_agn``: 2 ln(prior), the AGN model's parts of these.
 LOG_AGN, SHARE_AGN, MIXED_AGN = range(3)
 #: Rows of ``Tables.of_frac``, fractions above 0: c = f / (1 - f), its log10 in bins, prior,
@@ -89,7 +89,7 @@ class Tables(NamedTuple):
     agn32: np.ndarray  # float32 (nz, nA, nb), each AGN model in its own unit
     galaxy_unit: np.ndarray  # float64 (nz, nG): these units, uJy / Msun
     log_usable: np.ndarray  # float64 (nz, n_padded): 2 ln(prior) where usable, else -1e300
-    of_galaxy: np.ndarray  # float64 (5, n_padded)
+    of_galaxy: np.ndarray  # float64 (4, n_padded)
     of_agn: np.ndarray  # float64 (3, nA)
     of_frac: np.ndarray  # float64 (6, nf > 0)
     zero_frac: int  # 1 if f = 0 is in the grid
