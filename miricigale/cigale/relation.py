@@ -17,7 +17,7 @@ __all__ = ["N_DRAWS", "near_relation"]
 #: Just et al. 2007, ApJ 665, 1004, equation 3: slope and offset, for erg/s/Hz.
 _JUST = (-0.137, 2.638)
 #: Draws of each object, and objects whose draws are in memory at once.
-N_DRAWS, _OBJECTS = 5000, 64
+N_DRAWS, _OBJECTS = 2000, 64
 #: Part of the draws below which nothing can be said of those that are left.
 _LEAST = 0.01
 

@@ -796,7 +796,7 @@ def test_the_example_of_cigale(data_file):
     assert len(record) == 1
     text = str(record[0].message)
     for name in (
-        "max_dev_alpha_ox: by 5000 draws",
+        "max_dev_alpha_ox: by 2000 draws",
         "dale2014 by",
         "skirtor2016 by",
         "-1.9 to -1.1",
@@ -927,7 +927,7 @@ def test_x_ray_bands_are_fitted_where_there_is_a_module(tmp_path):
     # the bound of the relation, against every model by itself
     path.write_text(text.replace("max_dev_alpha_ox = 0", "max_dev_alpha_ox = 0.15"))
     setup = dataclasses.replace(quiet(path), limits=True)
-    assert "max_dev_alpha_ox: by 5000 draws" in setup.describe()
+    assert "max_dev_alpha_ox: by 2000 draws" in setup.describe()
     for name, theirs in setup.bands.items():
         value = fluxes[theirs][0] if theirs in fluxes else 1e-6
         catalog[name], catalog[f"{name}_err"] = [value] * u.mJy, [0.4 * value] * u.mJy
