@@ -41,7 +41,7 @@ def make_photometry(grid, n, *, seed=1, miri=True):
     names = [name for name in grid.filters if miri or not name.startswith("miri")]
     sigma = np.array([(DEPTHS[name] * u.ABmag).to_value(u.uJy) / 5.0 for name in grid.filters])
     h = grid.filters.index("wfc3.f160w")
-    rows = []
+    rows, redshift = [], []
     while len(rows) < n:
         z = rng.integers(grid.redshift.size // 12, grid.redshift.size * 5 // 6)
         g = rng.choice(np.flatnonzero(grid.allowed[z]))
@@ -49,8 +49,9 @@ def make_photometry(grid, n, *, seed=1, miri=True):
         model = 10.0 ** rng.uniform(8.0, 11.5) * grid.flux(z, g, k, f)
         if model[h] > 5.0 * sigma[h]:
             rows.append(model + sigma * rng.normal(size=sigma.size))
+            redshift.append(grid.redshift[z])
     flux = np.array(rows)
-    table = QTable({"id": np.arange(n)})
+    table = QTable({"id": np.arange(n), "redshift": redshift})
     for name in names:
         i = grid.filters.index(name)
         table[name] = flux[:, i] * u.uJy
@@ -158,12 +159,10 @@ def main():
             f"{ms.max():7.2f}"
         )
     table = make_photometry(grid, options.n)
-    z = grid.redshift[np.random.default_rng(0).integers(5, 50, options.n)]
-    start = time.time()
-    fitter.fit(table, redshift=z)
-    print(
-        f"{'21 bands, fixed redshift':32s} {'':7s} {1e3 * (time.time() - start) / options.n:7.2f}"
-    )
+    start = time.process_time()
+    fitter.fit(table, redshift="redshift")
+    spent = 1e3 * (time.process_time() - start) / options.n
+    print(f"{'21 bands, known redshift':32s} {'':7s} {spent:7.2f}")
     few = with_limits(grid, table[: max(options.n // 8, 2)])
     # limits have kernels of their own, which the first call compiles
     fitter.fit(few[:1])
