@@ -1,14 +1,17 @@
 """
 Redshifts of real galaxies with `SEDModel.survey`: CEERS sources in HST, NIRCam and MIRI bands.
 
-    MIRICIGALE_DATA=../shared/data python benchmarks/ceers.py [--n 386] [--grid grid.fits] [--zero-points]
+    MIRICIGALE_DATA=../shared/data python benchmarks/ceers.py [--n 386] [--grid grid.fits] [--flat] [--mocks]
+        [--times] [--sampler 200 interpolate|nautilus]
 
 The catalog is the part of that of Lisiecki et al. 2025 in $MIRICIGALE_DATA/ceers; of it sources with S/N above
-5 in two MIRI bands and five others. Most of the published redshifts are photometric, many in steps of 0.025: those
-that are not (spectra and grisms among them) are shown apart. Template error, errors of the MIRI bands (which the
-catalog measured apart) and zero points are measured on one half and used on the other, and the other way round;
-``--preset`` takes `TemplateError.survey` instead, which was measured on all of them. Zero points are printed, and
-applied with ``--zero-points`` only.
+5 in two MIRI bands and five others. Published redshifts in steps of 0.025 are photometric, from the same HST and
+NIRCam bands; the others, nearly all of F160W < 24, where 3D-HST has grism redshifts, are shown apart.
+Template error, zero points, priors of all parameters and the errors of the MIRI bands (which the catalog measured
+apart) are measured on one half and used on the other, and the other way round; ``--flat`` leaves the priors flat.
+``--mocks`` fits the best models with noise of these errors again: what chi2 is if errors are right. ``--sampler``
+fits some sources with continuous parameters too, and does nothing else. The last lines are what
+`TemplateError.survey` and `SEDModel.survey_priors` hold: means of both halves.
 """
 
 import argparse
@@ -20,16 +23,19 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 from astropy.stats import mad_std
+from fit import loop_time, time_each
 
 from miricigale.filters import FilterSet, read_catalog_photometry
 from miricigale.fitting import (
     BayesFitter,
     FitResults,
-    TemplateError,
     apply_zero_points,
     calibrate_zero_points,
+    leave_out,
     measure_band_errors,
+    measure_priors,
     measure_template_error,
+    mock_analysis,
 )
 from miricigale.sed import ModelGrid, SEDModel
 
@@ -51,19 +57,35 @@ def sample(path):
     return table[good], bands
 
 
-def calibrated(grid, bands, table):
+def calibrated(grid, bands, table, flat):
     """
-    Template error, errors of MIRI bands and zero points of sources at their published redshifts.
+    Template error, errors of MIRI bands, zero points and priors, of sources at their published redshifts.
 
-    Of one fit with errors of 10 % (30 % in MIRI): where the errors found are those of the next fit they shrink
+    Of fits with errors of 10 % (30 % in MIRI): where the errors found are those of the next fit they shrink
     from fit to fit, as those of the bands that a fit follows best are taken for small.
     """
     miri = [b for b in bands if b.startswith("miri")]
-    start = {b: 0.3 if b in miri else 0.1 for b in bands}
-    fit = BayesFitter(grid, bands, model_error=start).fit(table, redshift="redshift")
-    points = calibrate_zero_points(fit, reference="wfc3.f160w")
-    own = measure_band_errors(fit, measure_template_error(fit), miri)
-    return measure_template_error(fit, model_error=own), own, points
+    errors = {b: 0.3 if b in miri else 0.1 for b in bands}
+    priors = None
+    for _ in range(1 if flat else 6):
+        fit = BayesFitter(grid, bands, model_error=errors, priors=priors).fit(
+            table, redshift="redshift"
+        )
+        priors, before = None if flat else measure_priors(fit), priors
+    error, points = measure_template_error(fit), calibrate_zero_points(fit, reference="wfc3.f160w")
+    fitter = BayesFitter(grid, bands, model_error=0.0, template_error=error, priors=before)
+    measured = [b for b in miri if np.any(table[f"{b}_err"] > 0)]
+    left = leave_out(fitter, table, measured, redshift="redshift")
+    return error, measure_band_errors(left, error), points, before
+
+
+def with_errors(table, factor):
+    """The catalog with the errors of its MIRI bands multiplied."""
+    table = table.copy()
+    for name in table.colnames:
+        if name.startswith("miri") and name.endswith("_err"):
+            table[name] *= factor
+    return table
 
 
 def row(label, results, true, rows):
@@ -117,14 +139,59 @@ def worst_tenth(results, table, bands, true):
             print(f"  {name:24s} {np.nanmedian(values[worst]):8.2f} {np.nanmedian(values):8.2f}")
 
 
+def _continuous():
+    """Priors of a sampler over the ranges of the grid's axes."""
+    axes = SEDModel.survey_axes()
+    flat = ("slope", "ebv", "q_pah", "frac_agn", "redshift")
+    priors = {name: (axes[name][0], axes[name][-1]) for name in flat}
+    priors |= {name: (axes[name][0], axes[name][-1], "log") for name in ("tau", "age")}
+    return priors | {name: axes[name].tolist() for name in ("f_burst", "metallicity")}
+
+
+def compare(table, grid, n, engine):
+    """Redshifts and masses with continuous parameters beside those of the grid, with errors of 6 and 30 %."""
+    table = table[np.sort(np.random.default_rng(3).permutation(len(table))[:n])]
+    bands = list(grid.filters)
+    errors = {b: 0.3 if b.startswith("miri") else 0.06 for b in bands}
+    ours = BayesFitter(grid, bands, model_error=errors).fit(table)
+    if engine == "interpolate":
+        fitter = BayesFitter(grid, bands, model_error=errors, interpolate=1000)
+    else:
+        fitter = BayesFitter(
+            SEDModel.survey(), bands, model_error=errors, priors=_continuous(), engine=engine
+        )
+    start = time.process_time()
+    theirs = fitter.fit(table, seed=1)
+    print(f"\n{n} with {engine}: {(time.process_time() - start) / n:.2f} s of CPU an object")
+    z = [one.percentile("redshift", (0.16, 0.5, 0.84)).value for one in (ours, theirs)]
+    mass = [np.log10(one.percentile("mass", 0.5).value).ravel() for one in (ours, theirs)]
+    off = (z[1][:, 1] - z[0][:, 1]) / (1 + z[0][:, 1])
+    near = np.abs(off) < OUTLIER
+    print(
+        f"redshift: median {np.median(off):+.4f}, sigma_MAD {mad_std(off):.4f}, beyond 0.15 {np.sum(~near)}"
+    )
+    wide = [np.median((q[:, 2] - q[:, 0]) / (1 + q[:, 1])) for q in z]
+    print(f"median width of 68 % intervals over 1 + z: grid {wide[0]:.3f}, sampler {wide[1]:.3f}")
+    apart = (mass[1] - mass[0])[near]
+    print(
+        f"log mass of the same redshift: median {np.median(apart):+.3f}, sigma_MAD {mad_std(apart):.3f}"
+    )
+    true = np.asarray(table["redshift"], float)
+    for label, one in (("grid", ours), ("sampler", theirs)):
+        row(f"  {label}", one, true, np.ones(n, bool))
+
+
 def main():
     """Print the tables."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--n", type=int, help="sources, drawn at random (all)")
     parser.add_argument("--grid", type=Path, help="keep the grid in this file")
-    parser.add_argument("--preset", action="store_true", help="TemplateError.survey for all")
-    parser.add_argument("--zero-points", action="store_true", help="apply those of the other half")
-    parser.add_argument("--miri-error", type=float, help="of all MIRI bands (those measured)")
+    parser.add_argument("--flat", action="store_true", help="priors that are flat in the nodes")
+    parser.add_argument(
+        "--times", action="store_true", help="of each object, and of the plain loop"
+    )
+    parser.add_argument("--mocks", action="store_true", help="what chi2 is if errors are right")
+    parser.add_argument("--sampler", nargs=2, metavar=("N", "ENGINE"), help="fit N with a sampler")
     args = parser.parse_args()
     table, bands = sample(Path(os.environ["MIRICIGALE_DATA"]) / "ceers/ceers_photometry_part.fits")
     if args.n:
@@ -137,17 +204,16 @@ def main():
         if args.grid:
             grid.write(args.grid)
     print(f"{grid}, {time.process_time() - start:.0f} s")
+    if args.sampler:
+        compare(table, grid, int(args.sampler[0]), args.sampler[1])
+        return
     halves = [table[h::2] for h in (0, 1)]
-    found = [calibrated(grid, bands, half) for half in halves]
+    found = [calibrated(grid, bands, half, args.flat) for half in halves]
     print("band, factor of each half")
     for a, b in zip(found[0][2], found[1][2], strict=True):
         print(f"  {a['band']:14s} {a['factor']:.3f} {b['factor']:.3f} +- {a['factor_err']:.3f}")
-    print("errors of bands that are not the models', of each half")
-    for name in found[0][1]:
-        print(f"  {name:14s} " + " ".join(f"{one[1][name]:.3f}" for one in found))
-    print("rest wavelength in um, template error of each half")
-    for wave in sorted({*found[0][0].wave.value, *found[1][0].wave.value}):
-        print(f"  {wave:6.2f} " + " ".join(f"{one[0](wave * u.um):.3f}" for one in found))
+    for factor, part in (one[1] for one in found):
+        print(f"errors of MIRI: {factor:.2f} times those of the catalog and {100 * part:.0f} %")
     optical = [b for b in bands if not b.startswith("miri")]
     true = np.concatenate([np.asarray(half["redshift"], float) for half in halves])
     steps = true / 0.025
@@ -156,28 +222,49 @@ def main():
     joined = {name: np.concatenate([half[name] for half in halves]) for name in table.colnames}
     print("\n                                      n     bias sigma_MAD  out.,%  in 68 %")
     for label, used in (("HST, NIRCam", optical), ("HST, NIRCam, MIRI", bands)):
-        parts, times = [], []
+        parts, mocks, times, spent = [], [], [], 0.0
         for h, half in enumerate(halves):
-            error, own, points = found[1 - h]
-            error = TemplateError.survey() if args.preset else error
-            half = apply_zero_points(half, points) if args.zero_points else half
-            if args.miri_error is not None:
-                own = dict.fromkeys(own, args.miri_error)
-            own = {name: own.get(name, 0.0) for name in used}
-            fitter = BayesFitter(grid, used, model_error=own, template_error=error)
+            error, (factor, part), points, priors = found[1 - h]
+            half = with_errors(apply_zero_points(half, points), factor)
+            own = {name: part if name.startswith("miri") else 0.0 for name in used}
+            fitter = BayesFitter(grid, used, model_error=own, template_error=error, priors=priors)
             start = time.process_time()
             parts.append(fitter.fit(half))
-            times.append(time.process_time() - start)
+            spent += time.process_time() - start
+            if args.times:
+                times.extend(time_each(fitter, half))
+            if args.mocks:
+                mock = mock_analysis(fitter, parts[-1], half, seed=1, model_error=True)
+                mocks.append(mock.recovered)
         results = FitResults.concatenate(parts)
         row(label, results, true, whole)
         row("  redshifts not in steps of 0.025", results, true, apart)
-        below, above = chi2_parts(results, bands, whole)
+        row("  in steps", results, true, ~apart)
+        mean = 1e3 * spent / len(true)
         print(
-            f"  {1e3 * sum(times) / len(true):.0f} ms of CPU an object; median of mean squared pulls "
-            f"{below:.2f} below 3 um, {above:.2f} above; reduced chi2 {np.median(results.reduced_chi2):.2f}"
+            f"  {mean:.0f} ms of CPU an object; reduced chi2 {np.median(results.reduced_chi2):.2f}"
         )
+        if args.times:
+            print(
+                f"  one by one: median {np.median(times):.0f} ms, 95 % {np.quantile(times, 0.95):.0f} ms"
+            )
+        for what, one in (("", results), (" of mocks", mocks and FitResults.concatenate(mocks))):
+            if one:
+                below, above = chi2_parts(one, bands, whole)
+                text = f"{below:.2f} below 3 um, {above:.2f} above"
+                print(f"  median of mean squared pulls{what}: {text}")
     print("\nworst tenth, with MIRI: medians                  all")
     worst_tenth(results, joined, bands, true)
+    if args.times:
+        model = SEDModel.yang2021(libraries="bundled")
+        n_models = model.grid(SEDModel.yang2021_axes(), ["wfc3.f160w"]).n_allowed
+        seconds = loop_time(None, n_models, 21)
+        print(f"plain loop over the grid of Yang et al. 2021: {seconds:.2f} s an object")
+    error = np.mean([one[0](found[0][0].wave) for one in found], axis=0)
+    print("TemplateError.survey", found[0][0].wave.value.round(2).tolist(), error.round(3).tolist())
+    if not args.flat:
+        for name in found[0][3]:
+            print(name, np.mean([one[3][name] for one in found], axis=0).round(3).tolist())
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ GALAXIES = {
     "f_burst": [0.0, 0.3],
     "metallicity": [0.004, 0.02],
     "ebv": [0.0, 0.15, 0.35, 0.75],
-    "alpha": [2.0],
+    "q_pah": [2.5],
     "tau97": [5.0],
     "ebv_polar": [0.2],
     "frac_agn": [0.0, 0.3, 0.6, 0.9],
@@ -51,7 +51,7 @@ def simulated(model, n, seed):
     rng = np.random.default_rng(seed)
     z = np.expm1(rng.uniform(np.log1p(0.2), np.log1p(4), (2, n)))
     both = {
-        "mass": np.full(n, 1e10), "alpha": rng.uniform(1.2, 3, n), "tau97": rng.uniform(3, 11, n),
+        "mass": np.full(n, 1e10), "q_pah": rng.uniform(0.5, 4.5, n), "tau97": rng.uniform(3, 11, n),
         "ebv_polar": rng.uniform(0, 0.3, n), "temperature_polar": rng.uniform(100, 300, n),
     }  # fmt: skip
     galaxy = both | {

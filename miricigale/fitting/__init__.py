@@ -16,6 +16,7 @@ __getattr__, __dir__, __all__ = lazy_names(
             "apply_zero_points",
             "calibrate_zero_points",
             "measure_band_errors",
+            "measure_priors",
             "measure_template_error",
         ),
         "checks": ("LeaveOutResult", "MockResult", "leave_out", "mock_analysis"),

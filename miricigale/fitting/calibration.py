@@ -1,4 +1,4 @@
-"""What fits of sources of known redshift say of models and catalogs: template error and zero points."""
+"""What fits of sources of known redshift say of models and catalogs: errors, zero points and priors."""
 
 import itertools
 from dataclasses import dataclass
@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
-from scipy.optimize import brentq
+from scipy.optimize import brentq, minimize
 
 from miricigale.filters import FilterSet
-from miricigale.fitting.likelihood import per_band
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.tables import described_table, error_column, require_columns
 from miricigale.utils.units import FNU, WAVE, check_count, frozen_array, to_array
@@ -19,6 +18,7 @@ __all__ = [
     "apply_zero_points",
     "calibrate_zero_points",
     "measure_band_errors",
+    "measure_priors",
     "measure_template_error",
 ]
 
@@ -26,6 +26,8 @@ __all__ = [
 _LEAST_SIGNAL = 5.0
 #: Median of the absolute value of a normal deviate.
 _MEDIAN = 0.6744897501960817
+#: Shares of fluxes, and how many times their errors they scatter by.
+_MIXTURE = ((0.95, 1.0), (0.05, 5.0))
 #: Largest template error that is looked for.
 _MOST = 10.0
 #: Edges in um of the bins of rest wavelength; wider where few bands fall.
@@ -51,8 +53,8 @@ _EDGES = (
     12.0,
 )
 #: What `measure_template_error` found with `_EDGES`; see `TemplateError.survey`.
-_SURVEY = (0.036, 0.053, 0.055, 0.073, 0.050, 0.063, 0.051, 0.054, 0.066, 0.056, 0.046)
-_SURVEY += (0.097, 0.135, 0.156, 0.168, 0.208, 0.256, 0.279)
+_SURVEY = (0.036, 0.054, 0.059, 0.070, 0.049, 0.056, 0.051, 0.054, 0.068, 0.065, 0.060)
+_SURVEY += (0.115, 0.123, 0.167, 0.218, 0.216, 0.283, 0.339)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +106,8 @@ class TemplateError:
         Measured by `measure_template_error` (``benchmarks/ceers.py``) on 386 sources of CEERS (Finkelstein et
         al. 2023, ApJL 946, L13) in HST, NIRCam and MIRI bands as published by Lisiecki et al. 2025, with S/N
         above 5 in two MIRI bands and five others, at the published redshifts, most of which are photometric:
-        the mean of two halves of the sample. Errors of the MIRI bands of that catalog, which are not those of
-        models (`measure_band_errors`), are not in it.
+        the mean of two halves of the sample. Beyond 2.6 um the scatter of that catalog's MIRI fluxes
+        (`measure_band_errors`) is in it.
         """
         edges = np.array(_EDGES)
         return cls(np.sqrt(edges[1:] * edges[:-1]) * WAVE, _SURVEY)
@@ -126,11 +128,15 @@ def grid_errors(template_error, filters, redshift):
     return template_error(_pivots(filters) / (1.0 + np.asarray(redshift)[:, None]))
 
 
+def _check_known(results):
+    if not results.redshift_fixed:
+        wanted = "of fits at known redshifts (redshift=...)"
+        raise argument_error("results", wanted, "redshifts that were free")
+
+
 def _residuals(results):
     """Fluxes, errors, best models and pivots of fits at known redshifts, and which fluxes count."""
-    if not results.redshift_fixed:
-        wanted = "of fits at known redshifts (fitter.fit(photometry, redshift=...))"
-        raise argument_error("results", wanted, "redshifts that were free")
+    _check_known(results)
     flux, error, model = results.flux, results.flux_err, results.best_flux
     with np.errstate(invalid="ignore"):
         good = results.fitted[:, None] & np.isfinite(results.sigma) & ~results.limit & (model > 0)
@@ -145,63 +151,74 @@ def _excess(flux, error, model, some):
     def excess(part):
         return np.median(apart / np.hypot(e, part * f)) - _MEDIAN
 
-    return brentq(excess, 0.0, _MOST, xtol=1e-4) if excess(0.0) > 0 > excess(_MOST) else 0.0
+    if excess(_MOST) > 0:
+        raise argument_error("results", "with models near most fluxes", "models that are far off")
+    return brentq(excess, 0.0, _MOST, xtol=1e-4) if excess(0.0) > 0 else 0.0
 
 
-def _rest(results):
-    """Rest wavelengths of all bands in um, shape (n, nb)."""
-    return _pivots(results.filters).value / (1.0 + results.best["redshift"].value[:, None])
-
-
-def measure_band_errors(results, template_error, bands, *, longest=2.5 * u.um, n_min=10):
+def measure_band_errors(left, template_error, *, longest=2.5 * u.um, n_min=30):
     """
-    Measure errors of bands that are not those of models: other apertures, PSFs and blends than the rest.
+    Measure errors of bands that are not those of models: noise, and other apertures, PSFs and blends.
 
-    What is left, in each band, of the scatter about the best models once the template error is taken off,
-    at rest wavelengths where starlight makes the flux and other bands have measured it.
+    By the greatest likelihood of what was measured in bands that were left out of a fit, given what the other
+    bands predict, where starlight makes the flux: errors are those of the catalog times a factor, and a part of
+    the flux, beside the template error and that of the prediction. (Residuals of a fit that has the bands would
+    be too small, as models follow them.) One in twenty fluxes may be an outlier, with errors five times as large.
+    Errors of drizzled images may be too small by such a factor, for their noise is correlated; but where sources
+    were selected in these bands, the factor is also that of the fluxes that noise or neighbors brought into the
+    sample, and holds for sources that are selected like that.
 
     Parameters
     ----------
-    results : `FitResults`
-        Of a fit at known redshifts.
+    left : `LeaveOutResult`
+        Of `leave_out` at known redshifts, of bands that are alike, such as those of MIRI.
     template_error : `TemplateError`
         That of the fit.
-    bands : list of str
-        The bands, such as those of MIRI in a catalog made for NIRCam.
     longest : `~astropy.units.Quantity`, optional
         Longest rest wavelength that is looked at.
     n_min : int, optional
-        Fluxes of S/N above 5 without which a band gets the median of the others.
+        Fluxes of S/N above 5, in all bands together, that are needed.
 
     Returns
     -------
-    errors : dict of str to float
-        Parts of the flux, for ``model_error`` of `BayesFitter`.
+    factor : float
+        What the errors in the catalog are to be multiplied by.
+    part : float
+        Part of the flux, for ``model_error`` of `BayesFitter`.
 
     Raises
     ------
-    KeyError
-        If a band was not fitted.
     ValueError
-        If redshifts were free, or no band has as many fluxes.
+        If redshifts were free, or there are fewer fluxes.
     """
-    flux, error, model, good = _residuals(results)
-    rest, n_min = _rest(results), check_count(n_min, "n_min")
-    good &= rest < to_array(longest, WAVE, "longest", ndim=0)
-    error = np.hypot(error, template_error(rest * WAVE) * flux)
-    out = {}
-    for name in bands:
-        if name not in results.fitted_filters:
-            raise unknown_name("band that was fitted", name, results.fitted_filters)
-        i = results.filters.index(name)
-        if np.count_nonzero(good[:, i]) >= n_min:
-            out[name] = _excess(*(array[:, i] for array in (flux, error, model, good)))
-    if not out:
-        raise argument_error("results", f"with {n_min} fluxes of S/N above 5 in a band", "fewer")
-    return {name: float(out.get(name, np.median([*out.values()]))) for name in bands}
+    longest, n_min = to_array(longest, WAVE, "longest", ndim=0), check_count(n_min, "n_min")
+    for results in left.results.values():
+        _check_known(results)
+    z = np.array([left.results[name].best["redshift"].value for name in left.bands])
+    rest = _pivots(left.bands).value / (1.0 + z.T)
+    with np.errstate(invalid="ignore"):
+        good = (left.predicted > 0) & (left.flux > _LEAST_SIGNAL * left.flux_err) & (rest < longest)
+    if np.count_nonzero(good) < n_min:
+        raise argument_error("left", f"with {n_min} fluxes of S/N above 5", "fewer")
+    model, err = left.predicted[good], left.flux_err[good]
+    fixed = np.square(left.predicted_std[good])
+    fixed += np.square(template_error(rest[good] * WAVE) * model)
+    square = np.square(left.flux[good] - model)
+
+    def unlikely(logs):
+        variance = fixed + np.square(np.exp(logs[0]) * err) + np.square(np.exp(logs[1]) * model)
+        terms = [
+            np.log(share / wide) - 0.5 * (np.log(variance) + square / (wide * wide * variance))
+            for share, wide in _MIXTURE
+        ]
+        return -np.logaddexp(*terms).sum()
+
+    starts = np.log([[1.0, 0.2], [4.0, 0.1], [3.0, 0.02]])
+    found = [minimize(unlikely, start, method="Nelder-Mead") for start in starts]
+    return tuple(np.exp(min(found, key=lambda one: one.fun).x).tolist())
 
 
-def measure_template_error(results, *, edges=None, n_min=10, model_error=None):
+def measure_template_error(results, *, edges=None, n_min=10):
     """
     Measure the template error from fits of real sources at known redshifts.
 
@@ -219,8 +236,6 @@ def measure_template_error(results, *, edges=None, n_min=10, model_error=None):
         Edges of the bins.
     n_min : int, optional
         Fluxes of S/N above 5 without which a bin is left out.
-    model_error : dict of str to float, optional
-        Errors of bands that are not the models', as parts of the flux (`measure_band_errors`).
 
     Returns
     -------
@@ -234,9 +249,7 @@ def measure_template_error(results, *, edges=None, n_min=10, model_error=None):
     edges = to_array(_EDGES * WAVE if edges is None else edges, WAVE, "edges", ndim=1)
     n_min = check_count(n_min, "n_min")
     flux, error, model, good = _residuals(results)
-    rest = _rest(results)
-    of_band = per_band(model_error or {}, results.filters, "model_error")
-    error = np.hypot(error, np.array([*of_band.values()]) * flux)
+    rest = _pivots(results.filters).value / (1.0 + results.best["redshift"].value[:, None])
     wave, found = [], []
     for low, high in itertools.pairwise(edges):
         some = good & (rest >= low) & (rest < high)
@@ -247,6 +260,41 @@ def measure_template_error(results, *, edges=None, n_min=10, model_error=None):
     if not wave:
         raise argument_error("results", f"with {n_min} fluxes of S/N above 5 in a bin", "fewer")
     return TemplateError(wave * WAVE, found)
+
+
+def measure_priors(results):
+    """
+    Measure how often the values of each parameter occur among sources of known redshift.
+
+    The means of their posteriors: one step of expectation maximization, which never lowers the likelihood of
+    the sample. Fit again with these as ``priors`` and repeat: after some five steps little changes but that
+    rare values become rarer still, down to 0 in the end, which is why to stop there. Priors that are flat in
+    the nodes give young, dusty, bursting galaxies and bright AGN more weight than they have in any survey.
+
+    Parameters
+    ----------
+    results : `FitResults`
+        Of a fit at known redshifts.
+
+    Returns
+    -------
+    priors : dict of str to `~numpy.ndarray`
+        Weights of the values of ``results.axes``, without those of redshift, for ``priors`` of `BayesFitter`.
+
+    Raises
+    ------
+    ValueError
+        If redshifts were free, or nothing was fitted.
+
+    References
+    ----------
+    Dempster, Laird & Rubin 1977, JRSS B 39, 1.
+    """
+    _check_known(results)
+    if not results.fitted.any():
+        raise argument_error("results", "with fitted objects", "none")
+    names = [name for name in results.axes if name != "redshift"]
+    return {name: results.pdf[name][results.fitted].mean(axis=0) for name in names}
 
 
 def calibrate_zero_points(results, *, reference=None, n_min=30):
@@ -324,7 +372,7 @@ def apply_zero_points(photometry, zero_points):
     Returns
     -------
     photometry : `~astropy.table.QTable`
-        A copy; ``meta["zero_points"]`` has the factors.
+        A copy; ``meta["zero_points"]`` has the factors, with those that were applied before.
 
     Raises
     ------
@@ -341,5 +389,6 @@ def apply_zero_points(photometry, zero_points):
     for name, factor in factors.items():
         for column in (name, error_column(name)):
             out[column] = out[column] * factor
-    out.meta["zero_points"] = factors
+    before = out.meta.get("zero_points", {})
+    out.meta["zero_points"] = before | {b: f * before.get(b, 1.0) for b, f in factors.items()}
     return out

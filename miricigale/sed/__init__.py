@@ -24,7 +24,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "model": ("SEDModel",),
         "parameter": ("Parameter",),
         # with all components, which make themselves known
-        "presets": ("COMPONENTS", "quasar_axes", "survey_axes", "yang2021_axes"),
+        "presets": ("COMPONENTS", "quasar_axes", "survey_axes", "survey_priors", "yang2021_axes"),
         "spectrum": ("COSMOLOGY", "SED", "ModelSpectra"),
         "tables": ("ModelFlags",),
         "templates": ("read_spectra", "template_grid"),

@@ -186,7 +186,8 @@ class SEDModel:
         A chain for real galaxies of a survey, to be fitted with `survey_axes`.
 
         The chain of `yang2021` with lines and continuum of the gas (log U -2.5), a burst of 30 Myr ago,
-        and old stars with 0.44 of the color excess of young ones and of the gas (Calzetti et al. 2000).
+        old stars with 0.44 of the color excess of young ones and of the gas (Calzetti et al. 2000), and the
+        dust of Draine & Li 2007 for its mass fraction in PAHs.
 
         Parameters
         ----------
@@ -202,6 +203,11 @@ class SEDModel:
     def survey_axes():
         """Axes for real galaxies; see `miricigale.sed.survey_axes`."""
         return presets.survey_axes()
+
+    @staticmethod
+    def survey_priors():
+        """Priors of these axes, measured on CEERS; see `miricigale.sed.survey_priors`."""
+        return presets.survey_priors()
 
     @staticmethod
     def yang2021_axes(kind="fit"):

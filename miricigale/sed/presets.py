@@ -12,6 +12,7 @@ __all__ = [
     "quasar_axes",
     "survey_axes",
     "survey_components",
+    "survey_priors",
     "yang2021_axes",
     "yang2021_components",
 ]
@@ -39,7 +40,8 @@ def yang2021_components(*, agn=True, xray=False, igm="meiksin2006", libraries="b
         c.DelayedSFH(),
         choose("stars", c.BC03Library(), c.BC03(), solar),
         c.CalzettiLeitherer(),
-        *_dust_and_igm(choose, igm),
+        choose("dust", c.Dale2014(), c.DraineLi2007Alpha(), lambda _: None),
+        COMPONENTS.get(igm)(),
     ]
     if agn:
         parts.append(_torus(choose, yang2021_axes("fit")))
@@ -53,7 +55,9 @@ def survey_components(*, agn=True, igm="meiksin2006", libraries="best"):
     Components of the chain for galaxies of a survey, and which library each part comes from.
 
     Parameters are those of `SEDModel.survey`. Against `yang2021_components` there are the gas's lines and
-    continuum, a burst, two metallicities, and old stars with 0.44 of the color excess of young ones.
+    continuum, a burst, two metallicities, old stars with 0.44 of the color excess of young ones, and dust
+    whose mass fraction in PAHs varies: real galaxies have less light at 3-12 um than dust rich in PAHs that
+    absorbs as much.
     """
     choose, notes = _chooser(libraries)
 
@@ -66,7 +70,8 @@ def survey_components(*, agn=True, igm="meiksin2006", libraries="best"):
         choose("stars", c.BC03Library(), c.BC03(), metals),
         c.Nebular(log_u=-2.5),
         c.CalzettiLeitherer(ebv_factor=0.44),
-        *_dust_and_igm(choose, igm),
+        c.DraineLi2007(),
+        COMPONENTS.get(igm)(),
     ]
     if agn:
         parts.append(_torus(choose, survey_axes()))
@@ -94,11 +99,6 @@ def _chooser(libraries):
         return better
 
     return choose, notes
-
-
-def _dust_and_igm(choose, igm):
-    dust = choose("dust", c.Dale2014(), c.DraineLi2007Alpha(), lambda _: None)
-    return dust, COMPONENTS.get(igm)()
 
 
 def _torus(choose, axes):
@@ -164,8 +164,8 @@ def survey_axes():
 
     Histories of three time scales and seven ages from 50 Myr, without a burst or with one of 30 Myr ago that
     made 3 or 30 % of the stars; 0.2 solar and solar metallicity of stars and gas; two slopes of attenuation;
-    color excesses from 0. Redshifts to 7 in steps of 0.02 in ln(1 + z), half of the scatter of photometric
-    redshifts. 4032 galaxies, six AGN, seven fractions.
+    color excesses from 0; dust poor and rich in PAHs. Redshifts to 7 in steps of 0.02 in ln(1 + z), half of the
+    scatter of photometric redshifts. 4032 galaxies, six AGN, seven fractions.
 
     Returns
     -------
@@ -179,12 +179,39 @@ def survey_axes():
         "metallicity": np.array([0.004, 0.02]),
         "slope": np.array([-0.4, 0.0]),
         "ebv": np.array([0.0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.4]),
-        "alpha": np.array([1.5, 2.5]),
+        "q_pah": np.array([0.47, 4.58]),
         "tau97": np.array([3.0, 7.0, 11.0]),
         "ebv_polar": np.array([0.0, 0.2]),
         "temperature_polar": np.array([200.0]),
         "frac_agn": np.array([0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 0.95]),
         "redshift": _redshifts(0.02, 0.01, 7.0),
+    }
+
+
+def survey_priors():
+    """
+    Priors of the values of `survey_axes`, for ``priors`` of `~miricigale.fitting.BayesFitter`.
+
+    How often they occur among 386 sources of CEERS with S/N above 5 in two MIRI bands and five others, at
+    published redshifts most of which are photometric (the sample of `~miricigale.fitting.TemplateError.survey`):
+    the mean of two halves, each by five steps of `~miricigale.fitting.measure_priors` (``benchmarks/ceers.py``).
+    Redshifts and tori stay flat. Eight in ten have no AGN light that could be seen: leave ``frac_agn`` out, or put
+    in your own, where AGN are what is looked for. Another depth or selection has other galaxies.
+
+    Returns
+    -------
+    priors : dict of str to `~numpy.ndarray`
+        Weights of the values of each axis.
+    """
+    return {
+        "tau": np.array([0.2595, 0.4233, 0.3172]),
+        "age": np.array([0.0372, 0.0322, 0.2058, 0.2, 0.3446, 0.1591, 0.0211]),
+        "f_burst": np.array([0.7721, 0.2036, 0.0243]),
+        "metallicity": np.array([0.3722, 0.6278]),
+        "slope": np.array([0.4545, 0.5455]),
+        "ebv": np.array([0.109, 0.2712, 0.3281, 0.1, 0.0416, 0.0636, 0.0381, 0.0485]),
+        "q_pah": np.array([0.8905, 0.1095]),
+        "frac_agn": np.array([0.8018, 0.1079, 0.0565, 0.0226, 0.0081, 0.0028, 0.0003]),
     }
 
 
@@ -205,7 +232,6 @@ def quasar_axes():
         "tau": np.array([0.5]),
         "age": np.array([0.3, 2.0]),
         "ebv": np.array([0.2]),
-        "alpha": np.array([2.0]),
         "inclination": np.array([30.0]),
         "disk_slope": np.array([-0.3, 0.0, 0.3]),
         "tau97": np.array([3.0, 7.0, 11.0]),

@@ -88,7 +88,7 @@ def fitters(stars):
     """Thin grids of the three classes, in steps of 0.05 in ln(1 + z)."""
     model, z = SEDModel.survey(), np.expm1(np.arange(0.1, 1.8, 0.05))
     galaxies = {
-        "tau": [0.1, 1.0], "age": [0.1, 0.3, 1.0, 3.0], "ebv": [0.0, 0.2, 0.5, 0.8], "alpha": [2.0],
+        "tau": [0.1, 1.0], "age": [0.1, 0.3, 1.0, 3.0], "ebv": [0.0, 0.2, 0.5, 0.8], "q_pah": [2.5],
         "tau97": [5.0], "frac_agn": [0.0, 0.3, 0.7], "redshift": z,
     }  # fmt: skip
     quasars = quasar_axes() | {"redshift": z, "tau97": [5.0]}
@@ -104,7 +104,7 @@ def sources(n, seed):
     rng, model = np.random.default_rng(seed), SEDModel.survey()
     z = np.expm1(rng.uniform(0.2, 1.6, (2, n)))
     both = {
-        "alpha": rng.uniform(1.5, 3.0, n),
+        "q_pah": rng.uniform(0.5, 4.5, n),
         "tau97": rng.uniform(3, 11, n),
         "mass": np.full(n, 1e10),
     }

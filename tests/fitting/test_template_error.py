@@ -13,8 +13,10 @@ from miricigale.fitting import (
     TemplateError,
     apply_zero_points,
     calibrate_zero_points,
+    leave_out,
     magnitude_prior,
     measure_band_errors,
+    measure_priors,
     measure_template_error,
 )
 
@@ -118,6 +120,9 @@ def test_zero_points_are_found_and_applied(residuals):
     ratio = np.median(colors[0] / colors[1])
     assert ratio == pytest.approx(1, abs=0.01)
     assert wrong.meta["zero_points"].keys() == factors.keys()
+    # what was applied is the product of all steps
+    for name, factor in wrong.meta["zero_points"].items():
+        np.testing.assert_allclose(wrong[name], table[name] * factor, rtol=1e-12)
 
 
 def test_free_redshifts_and_bad_errors_are_refused(grid, draw_photometry):
@@ -135,23 +140,51 @@ def test_free_redshifts_and_bad_errors_are_refused(grid, draw_photometry):
 
 
 def test_errors_of_bands_are_told_from_those_of_models(residuals):
-    """A band scattered by 20 % more than its models, where other bands are at the same rest wavelengths."""
+    """Two bands with errors three times too small, and 10 % more scatter than the models."""
     grid, table, z = residuals
     rng = np.random.default_rng(4)
-    scattered = QTable(table, copy=True)
-    for name in ("wfc3.f160w", "wfc3.f160w_err"):
-        scattered[name] = table[name] * (
-            1.0 if name.endswith("err") else 1 + 0.2 * rng.normal(size=len(table))
-        )
-    error = TemplateError([1.99, 2.01] * u.um, [0.05, 0.3])
-    fitter = BayesFitter(grid, model_error={"wfc3.f160w": 0.2}, template_error=error)
-    fitted = fitter.fit(scattered, redshift=z)
     bands = ["wfc3.f125w", "wfc3.f160w"]
-    found = measure_band_errors(fitted, error, bands)
-    assert found["wfc3.f125w"] < 0.03
-    assert found["wfc3.f160w"] == pytest.approx(0.2, rel=0.12)
-    with pytest.raises(KeyError, match="no band that was fitted"):
-        measure_band_errors(fitted, error, ["miri.f2100w"])
+    scattered = QTable(table, copy=True)
+    for name in bands:
+        noise, part = rng.normal(size=(2, len(table)))
+        err = rng.uniform(0.005, 0.06, len(table)) * table[name]
+        scattered[name] = table[name] + 3 * err * noise + 0.1 * table[name] * part
+        scattered[f"{name}_err"] = err
+        # one flux in thirty is something else's
+        scattered[name][::30] *= 1.7
+    error = TemplateError([1.99, 2.01] * u.um, [0.05, 0.3])
+    fitter = BayesFitter(grid, model_error=0.0, template_error=error)
+    left = leave_out(fitter, scattered, bands, redshift=z)
+    np.testing.assert_allclose(measure_band_errors(left, error), [3, 0.1], rtol=0.12)
+    with pytest.raises(ValueError, match="known redshifts"):
+        measure_band_errors(leave_out(fitter, scattered[:50], bands), error)
+    # no starlight there
+    left = leave_out(fitter, scattered, ["miri.f1500w"], redshift=z)
+    with pytest.raises(ValueError, match="with 30 fluxes of S/N above 5"):
+        measure_band_errors(left, error)
+
+
+def test_how_often_values_occur_is_measured(make_grid, draw_photometry):
+    """Three in four galaxies are of the first kind: steps of the measured priors come to their share."""
+    grid = make_grid(6, n_z=2, n_tau=2, n_age=1, frac=[0.0])
+    rng = np.random.default_rng(3)
+    kind, z = (rng.random(1000) < 0.25).astype(int), rng.integers(2, size=1000)
+    model = grid.galaxy[z, kind] / np.linalg.norm(grid.galaxy[z, kind], axis=1)[:, None]
+    # of a total S/N of 3, with which galaxies are told apart, but not well
+    err = np.full(model.shape, 1.0)
+    flux = 3.0 * model + err * rng.normal(size=model.shape)
+    table = QTable({"id": np.arange(1000)})
+    for i, name in enumerate(grid.filters):
+        table[name], table[f"{name}_err"] = flux[:, i] * u.uJy, err[:, i] * u.uJy
+    priors, shares = None, []
+    for _ in range(30):
+        fitter = BayesFitter(grid, model_error=0.0, priors=priors)
+        priors = measure_priors(fitter.fit(table, redshift=grid.redshift[z]))
+        shares.append(priors["tau"][0])
+    assert abs(shares[0] - np.mean(kind == 0)) > 0.05
+    assert shares[-1] == pytest.approx(np.mean(kind == 0), abs=0.04)
+    with pytest.raises(ValueError, match="known redshifts"):
+        measure_priors(fitter.fit(table[:3]))
 
 
 def test_prior_of_redshift_given_magnitude():

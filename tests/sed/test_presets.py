@@ -96,8 +96,11 @@ def test_survey_axes_are_those_of_the_chain(folder):
     assert axes["frac_agn"][0] == 0
     assert np.all(np.diff(np.log1p(axes["redshift"])) <= 0.02 + 1e-9)
     grid = model.grid(
-        axes | {"tau": [0.5], "alpha": [2.0], "redshift": [1.4]}, ["wfc3.f160w", "miri.f770w"]
+        axes | {"tau": [0.5], "q_pah": [2.0], "redshift": [1.4]}, ["wfc3.f160w", "miri.f770w"]
     )
     # seven ages, three bursts, two metallicities and slopes, eight color excesses; two tori of three depths
     assert (grid.n_galaxies, grid.n_agn) == (672, 6)
+    for name, weights in SEDModel.survey_priors().items():
+        assert weights.shape == axes[name].shape
+        assert weights.sum() == pytest.approx(1, abs=1e-3)
     assert np.all(grid.galaxy > 0)
