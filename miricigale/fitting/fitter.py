@@ -122,10 +122,10 @@ class BayesFitter:
         Largest relative error of posterior weights, means and standard deviations that leaving
         out models of a grid may cause; 0 evaluates every model.
     interpolate : int, optional
-        Of a grid: draw so many models of each object between the nodes, in cells that the posterior of
-        wider errors reaches, with fluxes interpolated from the nodes around, and take posteriors, means
-        and percentiles from them, weighed by their likelihoods (importance sampling). Known redshifts are
-        then those of the catalog. 1000 do for 68 % intervals. 0: the nodes alone.
+        Of a grid: draw so many models of each object between the nodes, with fluxes interpolated from the
+        nodes around, by sequential Monte Carlo (Del Moral et al. 2006), and take posteriors, means and
+        percentiles from them. Known redshifts are then those of the catalog, in chi2, the evidence and the
+        best model too. 1000 do for 68 % intervals. 0: the nodes alone.
     predict : list of str or `~miricigale.filters.FilterSet`, optional
         For a sampler: more bands, in which the fluxes of the models are predicted. A grid predicts
         all of its bands.
@@ -310,7 +310,7 @@ class BayesFitter:
             Objects with limits only are flagged, not fitted.
         redshift : str or array_like, optional
             Column of ``photometry``, or values, of known redshifts; on a grid each is taken to the
-            nearest redshift. Without it the redshift is free.
+            nearest redshift, unless the fitter is to ``interpolate``. Without it the redshift is free.
         redshift_prior : tuple, optional
             Redshifts, shape (n_z,), and densities in redshift, shape (n_z,) or (n, n_z), joined by
             straight lines: a p(z) for all or each object, which takes the place of the prior of

@@ -32,6 +32,7 @@ class GridOutput(NamedTuple):
     log_sum: np.ndarray  # (n,): ln of the sum of prior exp(-chi2 / 2)
     n_models: np.ndarray  # (n,): how many models were evaluated
     best_scale: np.ndarray  # (n,): solar masses formed of the best model
+    best_flux: np.ndarray  # (n, nb): fluxes of that
     index: np.ndarray  # int (n, 4): its redshift, galaxy, AGN model and AGN fraction
     zf: np.ndarray  # (n, nz, nf): joint posterior of redshift and AGN fraction
     galaxy: np.ndarray  # (n, nG) and
@@ -273,6 +274,7 @@ class GridEngine:
             log_sum=np.full(n, np.nan),
             n_models=np.zeros(n),
             best_scale=np.full(n, np.nan),
+            best_flux=np.full((n, n_bands), np.nan),
             index=np.full((n, 4), -1),
             zf=np.full((n, n_z, n_frac), np.nan),
             galaxy=np.full((n, n_galaxy), np.nan),
@@ -351,6 +353,7 @@ class GridEngine:
         if self.frac[f] > 0:
             power = scale * self.dust[g] * self.frac[f] / (1.0 - self.frac[f])
             model = model + power * self.agn[z, k]
+        out.best_flux[i] = model
         # from the residuals: |F|^2_w - R would lose digits
         chi2 = np.sum(target.weight[z] * (target.flux - model) ** 2)
         norm = target.top

@@ -8,6 +8,7 @@ import numpy as np
 
 from miricigale.fitting.between import Between
 from miricigale.fitting.calibration import TemplateError, grid_errors
+from miricigale.fitting.continuation import Continuation
 from miricigale.fitting.grid import GridEngine
 from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import check_pairs, joint_names, joint_tables
@@ -129,20 +130,12 @@ class GridFit:
             rtol=float(rtol),
             scale_error=scale_error,
         )
-        return cls(
-            grid,
-            priors,
-            quantities,
-            fraction,
-            engine,
-            redshift_tolerance,
-            compat,
-            prior_f,
-            template_error,
-            Between(grid, priors, quantities, fraction, engine, interpolate)
-            if interpolate
-            else None,
-        )
+        between = None
+        # a single model has nothing between
+        if interpolate and any(axis.values.size > 1 for axis in priors.axes.values()):
+            between = Between(Continuation(priors, quantities, fraction, engine), interpolate)
+        of_grid = grid, priors, quantities, fraction, engine
+        return cls(*of_grid, near, compat, prior_f, template_error, between)
 
     @property
     def filters(self):
@@ -248,7 +241,11 @@ class GridFit:
         data, log_prior = piece
         joint = joint_names(pairs, self.priors.axes)
         options, step = {}, max(len(data), 1)
-        if joint:
+        own = self.between is not None and data.redshift is not None and self.grid.redshift.size > 1
+        if own:
+            # each has an engine of its own
+            step = 1
+        elif joint:
             # joint sums are large: those of a few objects are reduced before the next are made
             size = self.engine.size
             step = max(1, _JOINT_SIZE // sum(size[name[0]] * size[name[1]] for name in joint))
@@ -256,20 +253,47 @@ class GridFit:
         parts = []
         for rows in list(chunks(len(data), step)) or [slice(0, 0)]:
             some = data[rows]
+            if own and len(some):
+                parts.append(self._at_redshift(some, log_prior[rows], joint, pairs))
+                continue
             out = self.engine.fit(**_engine_input(some, log_prior[rows]), **options)
             results = self._results(some, out, pairs)
             if self.between is not None:
-                results = self._refined(some, log_prior[rows], results)
+                results = self._refined(self.engine, some, log_prior[rows], results)
             parts.append(results)
         return FitResults.concatenate(parts)
 
-    def _refined(self, data, log_prior, results):
+    def _at_redshift(self, data, log_prior, joint, pairs):
+        """Results of one object at its own redshift, between nodes; they stand at the nearest node."""
+        z, n_z = float(data.redshift[0]), log_prior.shape[1]
+        fitted = np.isfinite(log_prior).any()
+        node = int(np.argmax(log_prior[0]))
+        engine = self.between.models.at_redshift(z if fitted else self.grid.redshift[0], node)
+        log_prior = log_prior[:, node : node + 1]
+        out = engine.fit(**_engine_input(data, log_prior), joint=joint)
+        if fitted:
+            out.index[:, 0] = node
+        here = np.arange(n_z) == node
+        whole = {
+            name: np.where(here.reshape(-1, 1), table, table * 0.0)
+            for name, table in out.joint.items()
+            if name[0] == "z"
+        }
+        out = out._replace(
+            zf=np.where(here[:, None], out.zf, out.zf * 0.0), joint=out.joint | whole
+        )
+        results = self._results(data, out, pairs)
+        best = results.best | {"redshift": np.where(np.isfinite(out.chi2), z, np.nan)}
+        results = results._changed(best=best)
+        return self._refined(engine, data, log_prior, results)
+
+    def _refined(self, engine, data, log_prior, results):
         """Results between the nodes."""
         wide, seeds = self.between.widened(data)
-        index, _ = self.engine.draw(
+        index, _ = engine.draw(
             n_draws=self.between.n_draws, seeds=seeds, **_engine_input(wide, log_prior)
         )
-        return self.between.refine(data, wide, log_prior, index, seeds, results)
+        return self.between.refine(engine, data, wide, log_prior, index, seeds, results)
 
     def _results(self, data, out, pairs):
         """From models to parameters and derived quantities."""
@@ -325,7 +349,7 @@ class GridFit:
             quantiles=quantiles,
             model_flux=out.band[:, 0],
             model_flux_std=out.band[:, 1],
-            best_flux=self._best_flux(out),
+            best_flux=out.best_flux,
             constants=self.constants,
             least_std=CIGALE_LEAST_STD if self.compat == "cigale" else 0.0,
         )
@@ -339,15 +363,6 @@ class GridFit:
             return names, units, texts, known.shape.names
         units, texts = (*units, u.dimensionless_unscaled), (*texts, other.description)
         return (*names, other.name), units, texts, (*known.shape.names, other.name)
-
-    def _best_flux(self, out):
-        """Fluxes of the best models in uJy, shape (n, nb)."""
-        ok = np.isfinite(out.chi2)
-        flux = np.full((ok.size, len(self.filters)), np.nan)
-        if np.any(ok):
-            z, g, k, f = out.index[ok].T
-            flux[ok] = out.best_scale[ok, None] * self.grid.flux(z, g, np.maximum(k, 0), f)
-        return flux
 
     def _best(self, out):
         """Parameters and derived quantities of the best models: name to array."""
@@ -417,8 +432,8 @@ def _engine_input(data, log_prior):
 
 def _forget(out, rows):
     """Leave nothing of these objects, in place."""
-    sums = (out.chi2, out.log_sum, out.best_scale, out.zf, out.galaxy, out.agn, out.band)
-    derived = (out.moments, out.quantiles, out.share, out.share_quantiles)
+    sums = (out.chi2, out.log_sum, out.best_scale, out.best_flux, out.zf, out.galaxy, out.agn)
+    derived = (out.band, out.moments, out.quantiles, out.share, out.share_quantiles)
     for array in (*sums, *derived, *out.joint.values()):
         array[rows] = np.nan
     out.index[rows] = -1

@@ -5,11 +5,13 @@ Kernels of the grid fit: arrays in, arrays out.
 pairs of galaxy and AGN model that can matter are listed by their bounds (`pairs`, down to those of
 `floors`), evaluated side by side (`lanes`, `single` in single precision, `limits` with upper
 limits) and summed up (`sums`, `histogram`); `summarize` turns the sums into moments and quantiles.
+`sum_nodes` (`between`) interpolates models.
 `structs` says what the kernels take, `rows` where it stands there, `workspace` makes it. numba's
 cache of a function holds the compiled code of those it calls, and does not see when they change:
 who edits one empties ``__pycache__``.
 """
 
+from miricigale.fitting._core.between import sum_nodes
 from miricigale.fitting._core.evaluate import sum_up
 from miricigale.fitting._core.histogram import PER_DEX, make_scales, summarize
 from miricigale.fitting._core.structs import (
@@ -34,6 +36,7 @@ __all__ = [
     "make_scales",
     "make_sums",
     "make_workspace",
+    "sum_nodes",
     "sum_up",
     "summarize",
 ]

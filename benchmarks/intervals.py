@@ -1,0 +1,121 @@
+"""
+How often intervals hold the truth where it lies between the nodes of a grid, as a fitter's prior has it.
+
+    python benchmarks/intervals.py [--n 300] [--draws 0 1000] [--grid small|large] [--seed 7] [--model-error 0.1]
+
+Objects are models drawn from the prior: of any node, anywhere in its cell between the outermost nodes, computed by
+the chain itself, with S/N 10 in 21 bands, u* to MIPS 24. They are not scattered by the model error of the fit,
+which stands for what the models of a grid are off by. ``--draws`` is ``interpolate`` of the fitter. Grids have 0.8
+and 69 million models. Printed are the parts of the truths in 68 and 95 % intervals, and their binomial errors.
+"""
+
+import argparse
+import time
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.fitting import BayesFitter, FitFlags
+from miricigale.fitting.posterior import cell_edges
+from miricigale.sed import SEDModel
+
+BANDS = [
+    "megacam.u", "megacam.g", "megacam.r", "megacam.i", "megacam.z", "acs.f606w", "acs.f814w",
+    "wfc3.f125w", "wfc3.f140w", "wfc3.f160w", "irac.ch1", "irac.ch2", "irac.ch3", "irac.ch4", "mips.24",
+    "miri.f770w", "miri.f1000w", "miri.f1280w", "miri.f1500w", "miri.f1800w", "miri.f2100w",
+]  # fmt: skip
+SMALL = {
+    "tau": [0.1, 0.5, 1.0, 5.0],
+    "age": [0.5, 1.0, 3.0, 5.0],
+    "ebv": [0.1, 0.2, 0.4, 0.6, 0.9],
+    "alpha": [1.0, 2.0, 2.5],
+    "tau97": [3.0, 7.0, 11.0],
+    "ebv_polar": [0.0, 0.15, 0.3],
+    "temperature_polar": [100.0, 300.0],
+    "frac_agn": [0.0, 0.2, 0.4, 0.6, 0.8, 0.99],
+    "redshift": np.expm1(np.linspace(np.log(1.14), np.log(6.9), 31)),
+}
+LARGE = SEDModel.yang2021_axes("fit") | {
+    "tau": [0.1, 0.3, 0.5, 1.0, 2.0, 5.0],
+    "age": [0.5, 1.0, 2.0, 3.0, 5.0],
+    "ebv_polar": [0.0, 0.03, 0.1, 0.2, 0.3],
+    "redshift": np.expm1(np.linspace(np.log(1.14), np.log(6.9), 115)),
+}
+NAMES = ("redshift", "frac_agn", "stellar_mass", "sfr", "dust_luminosity")
+
+
+def drawn(fitter, n, rng):
+    """Values of parameters by name, from the prior of a fitter."""
+    priors, usable = fitter.priors, fitter.backend.engine.usable
+    shape, out = usable.shape, {}
+    weight = (usable * priors.galaxy * priors.redshift[:, None]).ravel()
+    z, galaxy = np.unravel_index(rng.choice(weight.size, n, p=weight / weight.sum()), shape)
+    for name, axis in priors.axes.items():
+        edges, node = cell_edges(axis.values), z
+        edges[[0, -1]] = axis.values[[0, -1]]
+        if axis.kind == "galaxy":
+            node = np.argmax(axis.share[:, galaxy], axis=0)
+        elif name != "redshift":
+            node = rng.choice(axis.values.size, n, p=axis.weights)
+        out[name] = edges[node] + np.diff(edges)[node] * rng.random(n)
+    return out
+
+
+def objects(fitter, model, n, rng):
+    """Photometry with noise, and true values by name."""
+    values = drawn(fitter, 2 * n, rng)
+    true = QTable({k: v * (model.parameters[k].unit or u.one) for k, v in values.items()})
+    fluxes = model.fluxes(true, BANDS)
+    # some are older than the universe, though their node is not
+    good = np.flatnonzero(np.isfinite(fluxes["sfr"].value))[:n]
+    true, fluxes = true[good], fluxes[good]
+    for name in NAMES[2:]:
+        true[name] = fluxes[name]
+    table = QTable({"id": np.arange(n)})
+    for name in BANDS:
+        table[name] = fluxes[name] * (1.0 + 0.1 * rng.normal(size=n))
+        table[f"{name}_err"] = 0.1 * fluxes[name]
+    return table, true
+
+
+def held(results, true, name, part):
+    """Part of the truths within an interval."""
+    low, high = results.percentile(name, [0.5 - part / 2, 0.5 + part / 2]).T
+    return np.mean((true[name] >= low) & (true[name] <= high))
+
+
+def main():
+    """Print the table."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--n", type=int, default=300)
+    parser.add_argument("--draws", type=int, nargs="+", default=[0, 1000])
+    parser.add_argument("--grid", choices=("small", "large"), default="small")
+    parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--model-error", type=float, default=0.1)
+    args = parser.parse_args()
+    model = SEDModel.yang2021(libraries="bundled")
+    grid = model.grid(SMALL if args.grid == "small" else LARGE, BANDS)
+    print(grid)
+    options = {"model_error": args.model_error}
+    rng = np.random.default_rng(args.seed)
+    table, true = objects(BayesFitter(grid, BANDS, **options), model, args.n, rng)
+    for part in (0.68, 0.95):
+        error = 100 * np.sqrt(part * (1 - part) / args.n)
+        print(f"parts of {args.n} truths in {100 * part:.0f} % intervals, +- {error:.1f} %")
+    print(f"draws    ms {' '.join(f'{name:>16s}' for name in NAMES)}  on one node")
+    for n_draws in args.draws:
+        start = time.process_time()
+        results = BayesFitter(grid, BANDS, interpolate=n_draws, **options).fit(table)
+        spent = 1e3 * (time.process_time() - start) / args.n
+        parts = [[100 * held(results, true, name, p) for p in (0.68, 0.95)] for name in NAMES]
+        alone = np.mean((results.flags & int(FitFlags.ONE_NODE)) != 0)
+        print(
+            f"{n_draws:5d} {spent:5.0f} {' '.join(f'{a:9.1f} {b:6.1f}' for a, b in parts)} "
+            f"{100 * alone:11.0f}%",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
