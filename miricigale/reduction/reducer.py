@@ -36,7 +36,7 @@ class Reducer:
     jump_threshold : float or None, optional
         Sigma above which a jump is cut out of a ramp; None for no jump detection.
     neighbor_threshold : float or None, optional
-        Sigma above which a jump is cut in the four neighbors too.
+        Sigma above which a jump is cut in the four neighbors too, without what leaked into it (`fit_groups`).
     shower_threshold : float or None, optional
         Sigma above which the smoothed light around very large jumps is cut, the showers of cosmic
         rays (`fit_groups`); None for none.

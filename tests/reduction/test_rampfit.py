@@ -198,6 +198,22 @@ def test_neighbors_of_a_large_jump_are_cut_at_the_same_group():
     np.testing.assert_array_equal(alone.flags == DQ.JUMP_DET, expected == DQ.JUMP_DET)
 
 
+def test_what_leaked_into_a_pixel_does_not_cut_its_neighbors():
+    data = simulate(np.full((9, 11), 10.0), 1, 30, seed=1)
+    # a hit of some 300 sigma whose leak of 3 % stands above 10 sigma, and beside it a hit of its own
+    data[0, 20:, 4, 5] += 6000
+    for y, x in ((3, 5), (5, 5), (4, 4), (4, 6)):
+        data[0, 20:, y, x] += 180
+    fit = fit_groups(data, **OPTIONS)
+    assert np.all(np.abs(fit.jumps["significance"]) > 10)
+    assert len(fit.jumps) == 5
+    assert np.count_nonzero(fit.flags) == 5
+    data[0, 20:, 4, 6] += 600
+    fit = fit_groups(data, **OPTIONS)
+    beside = {(int(y), int(x)) for y, x in np.argwhere(fit.flags & DQ.JUMP_NEIGHBOR)}
+    assert beside == {(3, 5), (5, 5), (4, 4), (4, 6), (4, 5), (3, 6), (5, 6), (4, 7)}
+
+
 def test_groups_from_the_first_saturated_one_on_are_left_out():
     rate = np.full((60, 64), 2000.0)
     limit = BIAS + 30000.0

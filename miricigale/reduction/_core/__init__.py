@@ -26,6 +26,7 @@ from miricigale.reduction._core.pixel import (
     JUMP,
     JUMP_NEIGHBOR,
     SATURATED,
+    own_charge,
 )
 from miricigale.reduction._core.rows import BLOCK, fit_rows
 
@@ -38,6 +39,7 @@ __all__ = [
     "draw_slopes",
     "fit_rows",
     "hit_slopes",
+    "own_charge",
     "refit",
     "tabulate",
     "variances",

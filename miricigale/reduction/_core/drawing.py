@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from miricigale.depth._core import difference_weight, weight_sums
-from miricigale.reduction._core.pixel import JUMP, JUMP_NEIGHBOR, SATURATED
+from miricigale.reduction._core.pixel import JUMP, JUMP_NEIGHBOR, SATURATED, own_charge
 from miricigale.utils.compilation import njit
 
 __all__ = ["draw_slopes", "hit_slopes", "tabulate", "variances"]
@@ -194,11 +194,11 @@ def _find(rate, variance, mean, head, link, slot, charge, n, n_group, g0, g1, st
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cut_neighbors(rate, head, link, slot, charge, cut, n, jumps, n_group, g0, neighbor):
-    """Cut the entries beside large jumps, or new ones without charge; returns what may grow."""
+def _cut_neighbors(rate, head, link, slot, charge, cut, n, jumps, own, n_group, g0, neighbor):
+    """Cut the entries beside large jumps (``own``), or new ones without charge; returns what may grow."""
     ny, nx = rate.shape
     for m in range(jumps.shape[0]):
-        if abs(jumps[m, 4]) < neighbor:
+        if own[m] < neighbor:
             continue
         when = int(jumps[m, 2]) * n_group + g0 + 1 + int(jumps[m, 3])
         for side in range(4):
@@ -276,7 +276,18 @@ def hit_slopes(
         limit, s, inv_gain, dn, jump, rng,
     )  # fmt: skip
     link, slot, charge, cut = _cut_neighbors(
-        rate, head, link, slot, charge, cut, n, jumps, n_group, g0, neighbor
+        rate,
+        head,
+        link,
+        slot,
+        charge,
+        cut,
+        n,
+        jumps,
+        own_charge(jumps, nx, n_diff),
+        n_group,
+        g0,
+        neighbor,
     )
     # segments that are not whole integrations; hits that stay: segment, difference, charge
     lengths = np.empty(n_int * (n_diff + 1) + 1, np.int64)

@@ -12,10 +12,13 @@ from miricigale.reduction._core.pixel import (
     JUMP,
     JUMP_NEIGHBOR,
     SATURATED,
-    X_MIN,
     at,
     cut_by_flags,
     gather,
+    no_slope,
+    polynomial,
+    store,
+    weights,
 )
 from miricigale.utils.compilation import njit
 
@@ -25,7 +28,7 @@ __all__ = ["LANES", "fill_lane", "fit_lanes", "fitting_lanes", "refit", "settle"
 LANES = 32
 
 # rows of what is known of the pixels in the lanes
-_S, _INV_GAIN, _SLOPE, _TOTAL, _SQUARES, _V, _USED, _WORST, _T2, _SIGN, _D, _SLOW = range(12)
+_S, _INV_GAIN, _SLOW, _SUM, _SLOPE, _TOTAL, _SQUARES, _V, _USED, _WORST, _T2, _SIGN, _D = range(13)
 _N_VALUES = 20
 
 # columns of what becomes of them
@@ -53,13 +56,18 @@ def fill_lane(lanes, b, d, cut, valid, s, inv_gain, slow, y, x, jumps, flags):
     values, pixels = lanes[5], lanes[6]
     n_int = valid.size
     n_diff = d.size // n_int
-    i = 0
+    i, used, total = 0, 0.0, 0.0
     for k in range(n_int):
         for j in range(n_diff):
-            lanes[0][i, b] = d[k * n_diff + j]
-            lanes[1][i, b] = 1.0 if j < valid[k] and not cut[k * n_diff + j] else 0.0
+            one, kept = d[k * n_diff + j], 1.0 if j < valid[k] and not cut[k * n_diff + j] else 0.0
+            lanes[0][i, b] = one
+            lanes[1][i, b] = kept
+            used += kept
+            total += kept * one
             i += 1
         i += 1
+    values[_USED, b] = used
+    values[_SUM, b] = total
     values[_S, b] = s
     values[_INV_GAIN, b] = inv_gain
     values[_SLOW, b] = slow
@@ -70,95 +78,76 @@ def fill_lane(lanes, b, d, cut, valid, s, inv_gain, slow, y, x, jumps, flags):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def fit_lanes(lanes, n_int):
+def fit_lanes(lanes):
     """Fit all lanes: slopes, sums of weights, and the difference with the largest statistic."""
     d, keep, left, right, forward, values, _ = lanes
     n = d.shape[0]
-    each = n // n_int
-    s, inv_gain, slope = values[_S], values[_INV_GAIN], values[_SLOPE]
+    s, inv_gain, slow, slope = values[_S], values[_INV_GAIN], values[_SLOW], values[_SLOPE]
     total, squares, v, used = values[_TOTAL], values[_SQUARES], values[_V], values[_USED]
     worst, worst_t2, sign, worst_d = values[_WORST], values[_T2], values[_SIGN], values[_D]
-    slow, acc, eps, inv_v, swd = values[_SLOW], values[12], values[13], values[14], values[18]
-    lam, inv_d, inv_total = values[15], values[16], values[17]
-    used[:] = 0.0
-    swd[:] = 0.0
-    for i in range(n):
-        for b in range(LANES):
-            used[b] += keep[i, b]
-            swd[b] += keep[i, b] * d[i, b]
-    for b in range(LANES):
-        slope[b] = swd[b] / used[b]
+    lam, eps, inv_d, inv_v = values[13], values[14], values[15], values[16]
+    swd, f, acc = values[17], values[18], values[19]
     # start with the plain mean, then twice the weights of the last slope
-    for _ in range(2):
+    for b in range(LANES):
+        slope[b] = values[_SUM, b] / used[b]
+    for last in range(2):
         for b in range(LANES):
-            vv = slope[b] * inv_gain[b]
-            low = X_MIN * s[b]
-            vv = (vv if vv > low else low) + slow[b]
-            v[b] = vv
-            x = vv / s[b]
-            q = 0.5 * x + np.sqrt(x + 0.25 * x * x)
-            eps[b] = q / (1.0 + q)
-            lam[b] = 1.0 / (1.0 + q)
-            inv_v[b] = 1.0 / vv
-            inv_d[b] = (1.0 + q) / (s[b] * q * (2.0 + q))
-            acc[b] = 0.0
-            total[b] = 0.0
-            squares[b] = 0.0
-            swd[b] = 0.0
+            v[b], lam[b], eps[b], inv_d[b] = weights(slope[b], s[b], inv_gain[b], slow[b])
+            inv_v[b] = 1.0 / v[b]
+        total[:] = squares[:] = swd[:] = f[:] = acc[:] = 0.0
         for i in range(n):
             for b in range(LANES):
-                acc[b] = (acc[b] + (1.0 - acc[b]) * eps[b]) * keep[i, b]
-                left[i, b] = acc[b]
-        acc[:] = 0.0
+                f[b] = (f[b] + (1.0 - f[b]) * eps[b]) * keep[i, b]
+                left[i, b] = f[b]
+            if last:
+                for b in range(LANES):
+                    h = f[b] * (2.0 - f[b])
+                    acc[b] = (lam[b] * acc[b] + h * (d[i, b] - slope[b])) * keep[i, b]
+                    forward[i, b] = acc[b]
+        f[:] = acc[:] = 0.0
         for i in range(n - 1, -1, -1):
             for b in range(LANES):
-                acc[b] = (acc[b] + (1.0 - acc[b]) * eps[b]) * keep[i, b]
-                right[i, b] = acc[b]
-                both = left[i, b] * acc[b]
-                # f of the whole segment, from the two sides
-                full = left[i, b] + acc[b] - both
-                w = both * inv_v[b] / (2.0 - full)
+                f[b] = (f[b] + (1.0 - f[b]) * eps[b]) * keep[i, b]
+                g, residual = left[i, b], d[i, b] - slope[b]
+                both = f[b] * g
+                # f of the whole segment, from the two sides; 1 where there is none
+                full = f[b] + g - both + (1.0 - keep[i, b])
+                unit = 1.0 / (full * (2.0 - full))
+                w = both * full * unit * inv_v[b]
                 total[b] += w
-                squares[b] += w * w
-                swd[b] += w * d[i, b]
+                swd[b] += w * residual
+                if last:
+                    squares[b] += w * w
+                    h, m = g * (2.0 - g), f[b] * (2.0 - f[b])
+                    # C^-1 times residuals, its diagonal and its sum
+                    forward[i, b] = (m * forward[i, b] + h * acc[b]) * (unit * inv_d[b])
+                    right[i, b] = h * m * (unit * inv_d[b])
+                    left[i, b] = w
+                    acc[b] = lam[b] * (acc[b] + m * residual) * keep[i, b]
         for b in range(LANES):
-            slope[b] = swd[b] / total[b]
-    # jump statistic of every difference
+            swd[b] /= total[b]
+            slope[b] += swd[b]
+    # jump statistic of every difference, with the residuals of the last slope
+    inv_total = acc
     for b in range(LANES):
         inv_total[b] = 1.0 / total[b]
-        acc[b] = 0.0
-        worst[b] = -1.0
-        worst_t2[b] = -1.0
+        worst[b] = worst_t2[b] = -1.0
         worst_d[b] = 0.0
         sign[b] = 1.0
     for i in range(n):
         for b in range(LANES):
-            h = left[i, b] * (2.0 - left[i, b])
-            acc[b] = (lam[b] * acc[b] + h * (d[i, b] - slope[b])) * keep[i, b]
-            forward[i, b] = acc[b]
-    for k in range(n_int):
-        acc[:] = 0.0
-        for i in range((k + 1) * each - 1, k * each - 1, -1):
-            for b in range(LANES):
-                f, g = left[i, b], right[i, b]
-                both = f * g
-                full = f + g - both
-                unit = 1.0 / (full * (2.0 - full))
-                h, m = f * (2.0 - f), g * (2.0 - g)
-                z = (m * forward[i, b] + h * acc[b]) * (unit * inv_d[b])
-                c = h * m * (unit * inv_d[b])
-                w = both * full * unit * inv_v[b]
-                p = c - w * w * inv_total[b]
-                t2 = z * z / p
-                best, one = worst_t2[b], d[i, b]
-                # two differences cannot tell which of them jumped: cosmic rays go up
-                higher = (t2 >= best * (1.0 - 1e-6)) & (one > worst_d[b])
-                take = (p > 1e-9 * c) & ((t2 > best * (1.0 + 1e-6)) | (higher & (best >= 0.0)))
-                worst_t2[b] = t2 if take else best
-                worst_d[b] = one if take else worst_d[b]
-                worst[b] = float(i) if take else worst[b]
-                sign[b] = z if take else sign[b]
-                acc[b] = lam[b] * (acc[b] + m * (one - slope[b])) * keep[i, b]
+            w, c = left[i, b], right[i, b]
+            z = forward[i, b] - swd[b] * w
+            p = c - w * w * inv_total[b]
+            t2 = z * z / p
+            best, one = worst_t2[b], d[i, b]
+            # two differences cannot tell which of them jumped: cosmic rays go up
+            higher = (t2 >= best * (1.0 - 1e-6)) & (one > worst_d[b])
+            take = (p > 1e-9 * c) & ((t2 > best * (1.0 + 1e-6)) | (higher & (best >= 0.0)))
+            worst_t2[b] = t2 if take else best
+            worst_d[b] = one if take else worst_d[b]
+            worst[b] = float(i) if take else worst[b]
+            sign[b] = z if take else sign[b]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -169,7 +158,6 @@ def settle(lanes, n_int, scale, threshold, events, n_event, free, out):
     ``free`` gets the lanes that hold no pixel; returns their number, the list of jumps (see
     `fit_rows`; grown where it is full), and the number of those.
     """
-    rate, var_poisson, var_read, n_used, n_jump, dq = out
     keep, values, pixels = lanes[1], lanes[5], lanes[6]
     each = keep.shape[0] // n_int
     n_free = 0
@@ -180,6 +168,8 @@ def settle(lanes, n_int, scale, threshold, events, n_event, free, out):
         if y >= 0 and used > 1 and t2 > threshold * threshold:
             i = int(values[_WORST, b])
             keep[i, b] = 0.0
+            values[_USED, b] -= 1.0
+            values[_SUM, b] -= lanes[0][i, b]
             pixels[b, _JUMPS] += 1
             if n_event == events.shape[0]:
                 # by hand: an assignment of slices takes seconds to compile
@@ -198,16 +188,14 @@ def settle(lanes, n_int, scale, threshold, events, n_event, free, out):
         if y >= 0:
             jumps, flags = pixels[b, _JUMPS], pixels[b, _FLAGS]
             if used == 0:
-                rate[y, x] = var_poisson[y, x] = var_read[y, x] = np.nan
+                no_slope(out, y, x)
             else:
-                var = 1.0 / values[_TOTAL, b]
-                photon = (values[_V, b] - values[_SLOW, b]) * values[_SQUARES, b] * var * var
-                rate[y, x] = values[_SLOPE, b] * scale
-                var_poisson[y, x] = photon * scale * scale
-                var_read[y, x] = max(var - photon, 0.0) * scale * scale
-            n_used[y, x] = used
-            n_jump[y, x] = jumps
-            dq[y, x] = flags | (JUMP if jumps > 0 else 0)
+                total, squares = values[_TOTAL, b], values[_SQUARES, b]
+                slope, v, slow = values[_SLOPE, b], values[_V, b], values[_SLOW, b]
+                store(out, y, x, slope, v, slow, total, squares, scale)
+            out[3][y, x] = used
+            out[4][y, x] = jumps
+            out[5][y, x] = flags | (JUMP if jumps > 0 else 0)
             pixels[b, _Y] = -1
         free[n_free] = b
         n_free += 1
@@ -222,6 +210,8 @@ def _gather_lanes(data, levels, response, ys, xs, g0, g1, scratch, d, top):
     coef, start, level, value, before = scratch
     n_coef = coefficients.shape[0]
     n = ys.size
+    rows = ys if drift.shape[2] > 1 else np.zeros_like(ys)
+    channels = xs % drift.shape[3]
     for b in range(n):
         start[b] = at(bias, ys[b], xs[b])
         top[b] = 0.0
@@ -235,8 +225,7 @@ def _gather_lanes(data, levels, response, ys, xs, g0, g1, scratch, d, top):
             for b in range(n):
                 raw = float(plane[ys[b], xs[b]])
                 top[b] = raw if raw > top[b] else top[b]
-                row = ys[b] if drift.shape[2] > 1 else 0
-                level[b] = raw - (shift[row, xs[b] % drift.shape[3]] + start[b])
+                level[b] = raw - (shift[rows[b], channels[b]] + start[b])
             # groups before the first count for the saturation alone
             if g < g0:
                 continue
@@ -244,11 +233,7 @@ def _gather_lanes(data, levels, response, ys, xs, g0, g1, scratch, d, top):
                 plane = reset[min(k, reset.shape[0] - 1), g]
                 for b in range(n):
                     level[b] -= plane[ys[b], xs[b]]
-            for b in range(LANES):
-                value[b] = coef[n_coef - 1, b]
-            for j in range(n_coef - 2, -1, -1):
-                for b in range(LANES):
-                    value[b] = value[b] * level[b] + coef[j, b]
+            polynomial(coef, level, value)
             if dark.shape[1] > 0:
                 plane = dark[min(k, dark.shape[0] - 1), g]
                 for b in range(n):
@@ -276,12 +261,7 @@ def refit(
     noise,
     scale,
     threshold,
-    rate,
-    var_poisson,
-    var_read,
-    n_used,
-    n_jump,
-    dq,
+    out,
 ):
     """
     Fit the pixels ``ys``, ``xs`` again with differences that are cut from outside.
@@ -292,7 +272,6 @@ def refit(
     added to their number.
     """
     variance, inv_gain, slow = noise
-    out = (rate, var_poisson, var_read, n_used, n_jump, dq)
     n_int = data.shape[0]
     n_diff = g1 - g0 - 1
     coefficients, limits, _ = response
@@ -315,7 +294,7 @@ def refit(
     i = 0
     while i < ys.size or n_free < LANES:
         if i == ys.size or n_free == 0:
-            fit_lanes(lanes, n_int)
+            fit_lanes(lanes)
             n_free, events, _ = settle(lanes, n_int, scale, threshold, events, 0, free, out)
             continue
         y = ys[i]
@@ -345,6 +324,6 @@ def refit(
         # its own jumps are among the cuts
         fill_lane(
             lanes, free[n_free], d, cut, valid, at(variance, y, x), at(inv_gain, y, x), at(slow, y, x),
-            y, x, n_jump[y, x], flags,
+            y, x, out[4][y, x], flags,
         )  # fmt: skip
         i += 1

@@ -1,4 +1,6 @@
-"""One pixel at a time: its linear differences, its saturation and the flags of its groups."""
+"""One pixel at a time: its linear differences, its weights, its saturation and the flags of its groups."""
+
+import numpy as np
 
 from miricigale.utils.compilation import njit
 
@@ -6,6 +8,7 @@ __all__ = [
     "DO_NOT_USE",
     "JUMP",
     "JUMP_NEIGHBOR",
+    "LEAK",
     "SATURATED",
     "X_MIN",
     "at",
@@ -13,6 +16,11 @@ __all__ = [
     "gather",
     "level_of",
     "linear",
+    "no_slope",
+    "own_charge",
+    "polynomial",
+    "store",
+    "weights",
 ]
 
 # bits that the kernels set or read; instrument.DQ gives them names
@@ -23,6 +31,9 @@ JUMP_NEIGHBOR = 2**32
 
 #: Least ratio of Poisson to read variance, to keep the closed forms finite.
 X_MIN = 1e-8
+
+#: Share of the charge of a hit that each of the four neighbors holds at most (about 0.03 in flight).
+LEAK = 0.05
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -52,6 +63,72 @@ def linear(value, coef, y, x):
     for k in range(coef.shape[0] - 2, -1, -1):
         out = out * value + coef[k, row, column]
     return out
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def polynomial(coef, level, value):
+    """Linearity polynomial of many pixels at once, coefficients ascending (n, n_pixel), into ``value``."""
+    n = value.size
+    for b in range(n):
+        value[b] = coef[coef.shape[0] - 1, b]
+    for j in range(coef.shape[0] - 2, -1, -1):
+        for b in range(n):
+            value[b] = value[b] * level[b] + coef[j, b]
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def weights(slope, s, inv_gain, slow):
+    """Variance v of a difference, l and 1 - l of the weights, and 1 / (s (1/l - l))."""
+    v = slope * inv_gain
+    low = X_MIN * s
+    v = (v if v > low else low) + slow
+    x = v / s
+    q = 0.5 * x + np.sqrt(x + 0.25 * x * x)
+    lam = 1.0 / (1.0 + q)
+    return v, lam, q * lam, (1.0 + q) / (s * q * (2.0 + q))
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def store(out, y, x, slope, v, slow, total, squares, scale):
+    """Slope of a pixel and the two parts of its variance, from the sums of weights and their squares."""
+    var = 1.0 / total
+    photon = (v - slow) * squares * var * var
+    out[0][y, x] = slope * scale
+    out[1][y, x] = photon * scale * scale
+    out[2][y, x] = max(var - photon, 0.0) * scale * scale
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def no_slope(out, y, x):
+    """Pixel without a slope."""
+    out[0][y, x] = out[1][y, x] = out[2][y, x] = np.nan
+
+
+@njit(cache=True, error_model="numpy")
+def own_charge(jumps, nx, n_diff):
+    """
+    Significance of jumps without what leaked from the jumps of the four neighbors at the same difference.
+
+    ``jumps`` (n, 5) are those of `fit_rows`, in the order of rows, columns, integrations and differences.
+    """
+    own = np.abs(jumps[:, 4])
+    if own.size == 0:
+        return own
+    n_all = (int(jumps[:, 2].max()) + 1) * n_diff
+    width = nx + 1
+    key = ((jumps[:, 0] * width + jumps[:, 1]) * n_all + jumps[:, 2] * n_diff + jumps[:, 3]).astype(
+        np.int64
+    )
+    leaked = np.zeros(own.size)
+    # the two before, which leak and are leaked to
+    for away in (1, width):
+        before = np.searchsorted(key, key - away * n_all)
+        for i in range(own.size):
+            j = before[i]
+            if key[j] == key[i] - away * n_all:
+                leaked[i] += own[j]
+                leaked[j] += own[i]
+    return own - LEAK * leaked
 
 
 @njit(cache=True, error_model="numpy")

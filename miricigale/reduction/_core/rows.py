@@ -3,7 +3,15 @@
 import numpy as np
 
 from miricigale.reduction._core.lanes import LANES, fill_lane, fit_lanes, fitting_lanes, settle
-from miricigale.reduction._core.pixel import SATURATED, X_MIN, at, gather
+from miricigale.reduction._core.pixel import (
+    SATURATED,
+    at,
+    gather,
+    no_slope,
+    polynomial,
+    store,
+    weights,
+)
 from miricigale.utils.compilation import njit
 
 __all__ = ["BLOCK", "fit_rows"]
@@ -25,12 +33,7 @@ def fit_rows(
     noise,
     scale,
     threshold,
-    rate,
-    var_poisson,
-    var_read,
-    n_used,
-    n_jump,
-    dq,
+    out,
 ):
     """
     Fit the ramps of rows ``y0`` to ``y1``, groups ``g0`` to ``g1``, and find their jumps.
@@ -50,7 +53,8 @@ def fit_rows(
     difference, and what slow noise of the read-out adds to it (maps).
 
     Pixels that are not ``usable`` get NaN. ``scale`` is the inverse group time, and jumps are cut
-    above ``threshold`` sigma. The images ``rate`` to ``dq`` are filled in place.
+    above ``threshold`` sigma. The images ``out``, those of `RampFit` from ``rate`` to ``flags``, are filled in
+    place.
 
     Returns an array (n_event, 5) in no order: y, x, integration, difference (counted from ``g0``) and
     signed significance of each jump.
@@ -66,9 +70,9 @@ def fit_rows(
     thr2 = threshold * threshold
 
     d = np.empty((n_all, BLOCK))
-    mean = np.empty((n_diff, BLOCK))
+    # sums over the integrations
+    mean = d if n_int == 1 else np.empty((n_diff, BLOCK))
     f = np.empty((n_diff + 2, BLOCK))
-    h = np.empty((n_diff + 2, BLOCK))
     tmp = np.empty((n_diff + 1, BLOCK))
     coef = np.empty((n_coef, BLOCK))
     start = np.empty(BLOCK)
@@ -93,7 +97,6 @@ def fit_rows(
     acc = np.empty(BLOCK)
     crit = np.empty(BLOCK)
     # pixels with jumps or saturation
-    out = (rate, var_poisson, var_read, n_used, n_jump, dq)
     d1 = np.empty(n_all)
     cut = np.zeros(n_all, np.bool_)
     valid = np.empty(n_int, np.int64)
@@ -107,7 +110,8 @@ def fit_rows(
         for x0 in range(0, nx, BLOCK):
             nb = min(BLOCK, nx - x0)
             top[:] = 0.0
-            mean[:, :] = 0.0
+            if n_int > 1:
+                mean[:, :] = 0.0
             # of these pixels, and of the last one again behind the edge
             for b in range(BLOCK):
                 x = min(x0 + b, nx - 1)
@@ -137,11 +141,7 @@ def fit_rows(
                         raw = float(row[x0 + b])
                         top[b] = raw if raw > top[b] else top[b]
                         level[b] = raw - level[b]
-                    for b in range(BLOCK):
-                        value[b] = coef[n_coef - 1, b]
-                    for j in range(n_coef - 2, -1, -1):
-                        for b in range(BLOCK):
-                            value[b] = value[b] * level[b] + coef[j, b]
+                    polynomial(coef, level, value)
                     if dark.shape[1] > 0:
                         row = dark[min(k, dark.shape[0] - 1), g, y]
                         for b in range(nb):
@@ -150,7 +150,9 @@ def fit_rows(
                         i = k * n_diff + g - g0 - 1
                         for b in range(nb):
                             d[i, b] = value[b] - before[b]
-                            mean[i - k * n_diff, b] += value[b] - before[b]
+                        if n_int > 1:
+                            for b in range(nb):
+                                mean[i - k * n_diff, b] += d[i, b]
                     for b in range(nb):
                         before[b] = value[b]
             for b in range(nb, BLOCK):
@@ -164,15 +166,7 @@ def fit_rows(
                 slope[b] = sw[b] / n_all
             for _ in range(2):
                 for b in range(BLOCK):
-                    vv = slope[b] * inv_gain[b]
-                    low = X_MIN * s[b]
-                    vv = (vv if vv > low else low) + slow[b]
-                    v[b] = vv
-                    xx = vv / s[b]
-                    q = 0.5 * xx + np.sqrt(xx + 0.25 * xx * xx)
-                    lam[b] = 1.0 / (1.0 + q)
-                    eps[b] = q / (1.0 + q)
-                    inv_d[b] = (1.0 + q) / (s[b] * q * (2.0 + q))
+                    v[b], lam[b], eps[b], inv_d[b] = weights(slope[b], s[b], inv_gain[b], slow[b])
                     f[0, b] = 0.0
                     sw[b] = 0.0
                     sw2[b] = 0.0
@@ -192,11 +186,8 @@ def fit_rows(
             # jump statistic of every difference
             crit[:] = -1.0
             if n_all > 1 and np.isfinite(threshold):
-                for i in range(n_diff + 2):
-                    for b in range(BLOCK):
-                        h[i, b] = f[i, b] * (2.0 - f[i, b])
                 for b in range(BLOCK):
-                    inv_d[b] = inv_d[b] / h[n_diff + 1, b]
+                    inv_d[b] = inv_d[b] / (f[n_diff + 1, b] * (2.0 - f[n_diff + 1, b]))
                     # w_j^2 / W with w_j = f f norm and W = n_int sw norm
                     wf[b] = norm[b] / (sw[b] * n_int)
                 for k in range(n_int):
@@ -204,34 +195,32 @@ def fit_rows(
                     acc[:] = 0.0
                     for j in range(1, n_diff + 1):
                         for b in range(BLOCK):
-                            acc[b] = lam[b] * acc[b] + h[j, b] * (d[base + j, b] - slope[b])
+                            h = f[j, b] * (2.0 - f[j, b])
+                            acc[b] = lam[b] * acc[b] + h * (d[base + j, b] - slope[b])
                             tmp[j, b] = acc[b]
                     acc[:] = 0.0
                     for j in range(n_diff, 0, -1):
                         m = n_diff + 1 - j
                         for b in range(BLOCK):
-                            z = (h[m, b] * tmp[j, b] + h[j, b] * acc[b]) * inv_d[b]
-                            c = h[j, b] * h[m, b] * inv_d[b]
-                            w = f[j, b] * f[m, b]
+                            left, right = f[j, b], f[m, b]
+                            h, g = left * (2.0 - left), right * (2.0 - right)
+                            z = (g * tmp[j, b] + h * acc[b]) * inv_d[b]
+                            c = h * g * inv_d[b]
+                            w = left * right
                             p = c - w * w * wf[b]
                             p = p if p > 1e-9 * c else 1e-9 * c
                             q = z * z - thr2 * p
                             crit[b] = q if q > crit[b] else crit[b]
-                            acc[b] = lam[b] * (acc[b] + h[m, b] * (d[base + j, b] - slope[b]))
+                            acc[b] = lam[b] * (acc[b] + g * (d[base + j, b] - slope[b]))
             for b in range(nb):
                 x = x0 + b
                 if not usable[y, x]:
-                    rate[y, x] = np.nan
-                    var_poisson[y, x] = np.nan
-                    var_read[y, x] = np.nan
+                    no_slope(out, y, x)
                     continue
                 if top[b] < saturation[b] and crit[b] <= 0.0:
-                    var = 1.0 / (sw[b] * norm[b] * n_int)
-                    vp = (v[b] - slow[b]) * sw2[b] * norm[b] * norm[b] * n_int * var * var
-                    rate[y, x] = slope[b] * scale
-                    var_poisson[y, x] = vp * scale * scale
-                    var_read[y, x] = max(var - vp, 0.0) * scale * scale
-                    n_used[y, x] = n_all
+                    total, squares = sw[b] * norm[b] * n_int, sw2[b] * norm[b] * norm[b] * n_int
+                    store(out, y, x, slope[b], v[b], slow[b], total, squares, scale)
+                    out[3][y, x] = n_all
                     continue
                 valid[:] = n_diff
                 saturated = top[b] >= saturation[b]
@@ -241,7 +230,7 @@ def fit_rows(
                     for i in range(n_all):
                         d1[i] = d[i, b]
                 while n_free == 0:
-                    fit_lanes(lanes, n_int)
+                    fit_lanes(lanes)
                     n_free, events, n_event = settle(
                         lanes, n_int, scale, threshold, events, n_event, free, out
                     )
@@ -251,6 +240,6 @@ def fit_rows(
                     SATURATED if saturated else 0,
                 )  # fmt: skip
     while n_free < LANES:
-        fit_lanes(lanes, n_int)
+        fit_lanes(lanes)
         n_free, events, n_event = settle(lanes, n_int, scale, threshold, events, n_event, free, out)
     return events[:n_event].copy()
