@@ -122,8 +122,8 @@ def read_images(path):
             msg = f"{path} cannot be read as {_WANTED}: it has no image in SCI"
             raise DataError(msg)
         header = joined_header(hdus)
-        made = header.get("INSTRUME", "MIRI"), header.get("DETECTOR", "MIRIMAGE")
-        if made != ("MIRI", "MIRIMAGE"):
+        made = header.get("INSTRUME"), header.get("DETECTOR")
+        if made[0] not in (None, "MIRI") or made[1] not in (None, "MIRIMAGE"):
             msg = f"{path} must be of the MIRI imager, got {made[0]} {made[1]}"
             raise DataError(msg)
         shape = hdus["SCI"].shape
