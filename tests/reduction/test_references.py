@@ -96,6 +96,18 @@ def real(ramp, tmp_path_factory):
     return Ramp.read(path.with_name("other_uncal.fits"))
 
 
+def test_the_last_group_is_left_out_where_nothing_says_that_it_is_good(real, ramp, references):
+    n_int, n_group = ramp.shape[:2]
+    for reducer, one, left_out in (
+        (Reducer(references=references), real, 2),
+        (Reducer(references=references, skip_last=0), real, 1),
+        (Reducer(references=references, skip_first=0, skip_last=0), real, 0),
+        (Reducer(references="simulated", reset_anomaly=ResetAnomaly()), ramp, 0),
+    ):
+        used = reducer.fit_groups(one).n_used
+        assert used.max() == n_int * (n_group - 1 - left_out)
+
+
 def test_another_detector_comes_out_right_with_its_references(exposure, real, ramp, references):
     reducer = Reducer(references=references, skip_first=0, skip_last=0, cosmic_rays=False)
     rate = reducer.fit_ramp(real)
