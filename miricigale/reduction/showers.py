@@ -1,7 +1,7 @@
 """Showers: faint, wide clouds of charge that come with large hits of cosmic rays."""
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, label, maximum_position, sum_labels
+from scipy.ndimage import gaussian_filter, label
 
 __all__ = ["find_showers"]
 
@@ -50,8 +50,9 @@ def find_showers(data, jumps, usable, threshold, *, first_group, last_group):
             continue
         same = (where[:, 2] == k) & (where[:, 3] == i)
         hit = np.zeros(usable.shape, np.float32)
-        hit[where[same, 0], where[same, 1]] = np.abs(jumps[same, 4])
-        for y, x in _tracks(hit):
+        ys, xs = where[same, :2].T
+        hit[ys, xs] = np.abs(jumps[same, 4])
+        for y, x in _tracks(hit, ys, xs):
             part = tuple(slice(max(c - _REACH, 0), c + _REACH + 1) for c in (y, x))
             differences = [
                 data[k, first_group + j + 1][part].astype(np.float32)
@@ -69,12 +70,16 @@ def find_showers(data, jumps, usable, threshold, *, first_group, last_group):
     return tuple(np.unique(np.concatenate(found), axis=0).T)
 
 
-def _tracks(hit):
+def _tracks(hit, ys, xs):
     """Brightest pixel of each track of jumps whose significances add up to a large one."""
     labels, number = label(hit > 0, structure=np.ones((3, 3)))
-    every = np.arange(1, number + 1)
-    large = every[sum_labels(hit, labels, every) >= _LARGE]
-    return maximum_position(hit, labels, large) if large.size else []
+    track, size = labels[ys, xs], hit[ys, xs]
+    large = np.bincount(track, size, number + 1) >= _LARGE
+    # the brightest of each comes last
+    order = np.lexsort((size, track))
+    brightest = order[np.append(np.diff(track[order]) != 0, True)]
+    brightest = brightest[large[track[brightest]]]
+    return zip(ys[brightest], xs[brightest], strict=True)
 
 
 def _significant(excess, good, threshold):
