@@ -30,8 +30,8 @@ _STEEP = 5.0
 #: Error of interpolated ln flux, as a part of how far the middle of three nodes is off a straight line: of 68 % of
 #: models of the chain of Yang et al. 2021 between the nodes of a coarse grid (0.02 to 0.09), but for 24 um.
 _INTERPOLATED = 0.25
-#: The latter of two nodes, which show no curvature, as a part of their difference.
-_TWO = 0.1
+#: The latter of two nodes, which show no curvature, as a part of their difference: of polar dust at 100, 300 K.
+_TWO = 0.25
 #: Part of the steps of AGN light that widens errors: some AGN have little light beside the galaxy's.
 _OF_AGN = 0.25
 
