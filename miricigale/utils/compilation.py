@@ -2,11 +2,17 @@
 How kernels are compiled: with a word to the user, and without a cache where none can be kept.
 
 numba compiles a kernel when it is first called and keeps the code on disk, in the folder
-``NUMBA_CACHE_DIR`` or else beside the source, so that this happens once for each installation.
+``NUMBA_CACHE_DIR`` or else beside the source, so that this happens once for each installation. The code of a
+kernel holds that of the kernels it calls, and numba looks at the file of the first only: what is kept is
+forgotten when any file of kernels changes.
 """
 
+import functools
 import gc
+import hashlib
 import logging
+import sys
+from pathlib import Path
 
 import numba
 from numba.core import event
@@ -59,7 +65,7 @@ event.register("numba:compile", _Listener())
 
 def njit(**options):
     """
-    Compile a function as `numba.njit` does, without a cache where there is no place for it.
+    Compile a function as `numba.njit` does, without a cache where there is no place for it or it is out of date.
 
     Parameters
     ----------
@@ -73,7 +79,10 @@ def njit(**options):
 
     def decorate(function):
         try:
-            return numba.njit(**options)(function)
+            kernel = numba.njit(**options)(function)
+            if kernel.stats.cache_path is not None:
+                _forget_stale(kernel.stats.cache_path, function.__module__.partition(".")[0])
+            return kernel
         except RuntimeError as err:
             if "no locator available" not in str(err):
                 raise
@@ -90,3 +99,23 @@ def njit(**options):
 
 
 _warned = set()
+
+
+@functools.cache
+def _forget_stale(folder, package):
+    """Remove the index of what is kept in a folder, if it was compiled from other sources than today's."""
+    current, marker = _digest(package), Path(folder) / "kernels.sha256"
+    if marker.is_file() and marker.read_text() == current:
+        return
+    for index in Path(folder).glob("*.nbi"):
+        index.unlink(missing_ok=True)
+    marker.write_text(current)
+
+
+@functools.cache
+def _digest(package):
+    """Checksum of all files of kernels of a package, ``_core.py`` and ``_core/*.py``."""
+    root, found = Path(sys.modules[package].__file__).parent, hashlib.sha256()
+    for path in sorted([*root.glob("*/_core.py"), *root.glob("*/_core/*.py")]):
+        found.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
+    return found.hexdigest()

@@ -6,9 +6,7 @@ pairs of galaxy and AGN model that can matter are listed by their bounds (`pairs
 `floors`), evaluated side by side (`lanes`, `single` in single precision, `limits` with upper
 limits) and summed up (`sums`, `histogram`); `summarize` turns the sums into moments and quantiles.
 `sum_nodes` (`between`) interpolates models.
-`structs` says what the kernels take, `rows` where it stands there, `workspace` makes it. numba's
-cache of a function holds the compiled code of those it calls, and does not see when they change:
-who edits one empties ``__pycache__``.
+`structs` says what the kernels take, `rows` where it stands there, `workspace` makes it.
 """
 
 from miricigale.fitting._core.between import sum_nodes
