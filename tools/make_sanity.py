@@ -19,11 +19,12 @@ from miricigale.evaluation import number
 from miricigale.sed import SEDModel
 from miricigale.workflow import Context, load_config
 from miricigale.workflow.products import read_image
-from miricigale.workflow.stages import figures, pictures, provenance
+from miricigale.workflow.stages import figures, pictures, provenance, truth_figures
+from miricigale.workflow.stages.comparison import study_results
 from miricigale.workflow.stages.metrics import StudyTables
 from miricigale.workflow.stages.sample import SampleFlags, typical_source
 from miricigale.workflow.stages.variants import HEADER, variant_rows
-from miricigale.workflow.truths import reference, variant_changes
+from miricigale.workflow.truths import reference, study_truths, variant_changes
 
 
 def rst_table(header, rows):
@@ -52,8 +53,8 @@ def main():
     config = load_config(run / "config.toml")
     bands = config.exposures.filters
     metrics = json.loads((run / "report" / "metrics.json").read_text())
-    shown = reference(config)
-    tables = StudyTables.read(Context(config, run), shown)
+    sky = reference(config)
+    tables = StudyTables.read(Context(config, run), sky)
     truth, matched, errors = tables.truth, tables.matched, tables.errors
     galaxies = tables.galaxies(field=True)
     area = metrics["area"] * u.arcmin**2
@@ -65,23 +66,25 @@ def main():
     chosen = figures.three_bands(bands)
     sample = truth[selection == 0]
     typical = typical_source(sample, results["all"].fitted, bands[-1])
+    row = truth[np.asarray(truth["id"]) == typical][0]
+    study = study_results(config, study_truths(config), {sky: tables}, metrics)
+    model = SEDModel.yang2021()
     drawn = {
         "inputs": figures.input_figure(tables.galaxies())[0],
         "counts": figures.counts_figure(galaxies, bands, area),
         "offsets": figures.offset_figure(inside, bands, magnitudes),
         "errors": figures.error_figure(errors, bands, limits),
         "redshifts": figures.redshift_figure(sample, fits),
-        "fractions": figures.fraction_figure(fits, config.sed.frac_agn[0]),
-        "example": figures.example_figure(results, truth, typical, SEDModel.yang2021()),
+        "fractions": truth_figures.fraction_figure(study),
+        "example": truth_figures.example_figure(results, row, typical, model),
         "color": pictures.field_figure(
-            [read_image(run / shown / f"mosaic_{name}.fits") for name in chosen],
+            [read_image(run / sky / f"mosaic_{name}.fits") for name in chosen],
             read_image(run / "f160w.fits"),
             [*chosen, config.highres.filter],
         ),
     }
     for name, figure in drawn.items():
         figure.savefig(args.images / f"{name}.png", dpi=80, metadata={"Software": None})
-    model = SEDModel.yang2021()
     print(*(f"* {text}" for text in provenance.stand_ins(config, model)), sep="\n", end="\n\n")
     rows = provenance.library_rows(model)
     print(rst_table(("part", "component", "library", "reference"), rows), "\n")

@@ -208,15 +208,18 @@ def estimated(
     correlation, stated = _correlation(image), _stated(image, mask)
     step = _step(correlation, box)
     options = {"threshold": threshold, "grow": grow, "iterations": iterations}
+    # without a plane what a gradient leaves at edges would be taken for sources, the more with each iteration
     if step == 1:
-        mesh = SkyMesh(data, mask, int(box), int(filter_size), plane)
+        mesh = SkyMesh(data, mask, int(box), int(filter_size), True)
         mesh, sources, flags, doubt = _search(mesh, stated, **options)
     else:
         mean, small, known = _averaged(data, mask, stated, step, correlation)
-        mesh = SkyMesh(mean, small, int(box) // step, int(filter_size), plane)
+        mesh = SkyMesh(mean, small, int(box) // step, int(filter_size), True)
         _, sources, flags, doubt = _search(mesh, known, **options)
         sources = pixels_of(sources, data.shape, step) & ~mask
-        mesh = SkyMesh(data, mask, int(box), int(filter_size), plane, sources)
+    if step > 1 or not plane:
+        masked = sources if iterations else None
+        mesh = SkyMesh(data, mask, int(box), int(filter_size), plane, masked)
     if not flags & BackgroundFlags.FEW_SKY and _excess(stated, mesh.rms, mask | sources) > _EXCESS:
         flags |= BackgroundFlags.EXCESS_NOISE
     if flags & (BackgroundFlags.FEW_SKY | BackgroundFlags.EXCESS_NOISE):
@@ -247,8 +250,7 @@ def _search(mesh, stated, *, threshold, grow, iterations):
         if not same:
             mesh, sources = mesh.measured(found), found
         # a gradient would be taken for light of sources, were it still there
-        flat = mesh.tilted if mesh.plane else mesh.residual
-        doubt, near = contamination(flat, ~(mask | sources), sources)
+        doubt, near = contamination(mesh.tilted, ~(mask | sources), sources)
         high = doubt > _CONTAMINATION * float(np.median(_some(mesh.rms)))
         if high:
             avoided |= near

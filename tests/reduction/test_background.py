@@ -59,6 +59,19 @@ def test_the_mesh_alone_is_off_where_a_box_is_seen_in_part():
         assert np.abs(off[48:320]).max() < 0.1
 
 
+def test_the_mesh_alone_does_not_take_a_gradient_for_sources():
+    y, x = np.mgrid[:512, :512]
+    # 2 sigma from box to box; the corner is hidden as that of the coronagraphs is
+    gradient, mask = (x + y) / 32, (x < 140) & (y > 300)
+    image = make(gradient + np.random.default_rng(2).normal(size=x.shape), mask=mask)
+    for plane in (True, False):
+        background = estimate_background(image, plane=plane)
+        assert background.source_mask.mean() < 0.01
+        off = (background.level - gradient)[~mask]
+        assert abs(np.median(off)) < 0.02
+        assert np.quantile(np.abs(off), 0.9) < 0.4
+
+
 def test_fine_pixels_of_a_mosaic_are_masked_as_coarse_ones_are():
     """Of two drizzles of the same dithers both have the sky that was put in, of the sources the same part."""
     rng = np.random.default_rng(7)

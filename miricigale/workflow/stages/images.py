@@ -166,7 +166,7 @@ def _sky_plan(config, unit):
 @stage(
     "exposures",
     "exposure",
-    version=10,
+    version=11,
     needs={"truth": of_truth},
     sections=(*IMAGES, "run.keep_level1b"),
     resources=EXPOSURE_RESOURCES,
@@ -211,7 +211,7 @@ def make_exposure(context, unit):
 @stage(
     "mosaics",
     "mosaic",
-    version=7,
+    version=8,
     needs={"exposures": dithers_of_band},
     sections=(*GRID, "reduction", "highres.pixel_scale"),
     units=truth_bands,

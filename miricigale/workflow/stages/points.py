@@ -70,7 +70,7 @@ def point_catalog(exposure, band_flux, prior, *, spacing, seed):
 @stage(
     "points",
     "point sources",
-    version=6,
+    version=7,
     needs=("kernels",),
     sections=(
         *IMAGES,

@@ -62,7 +62,7 @@ _OUT = SampleFlags.OUTSIDE_FIELD | SampleFlags.STAR | SampleFlags.NO_MODEL
 @stage(
     "variants",
     "variant images",
-    version=2,
+    version=3,
     needs={
         "truth": lambda config, _: (reference(config),),
         "highres": None,
