@@ -32,7 +32,7 @@ __all__ = ["reduce_files"]
 log = logging.getLogger(__name__)
 
 #: Changes with what the products hold.
-_VERSION = 4
+_VERSION = 5
 
 #: What a bad file may raise; the others go on.
 _ERRORS = (ArithmeticError, ImportError, KeyError, MemoryError, OSError, ValueError)
