@@ -1,5 +1,6 @@
 """Grids of given spectra at redshift 0, such as those of stars: each has a scale and nothing else."""
 
+import re
 import warnings
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from miricigale.sed.spectrum import SED
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
 from miricigale.utils.files import read_table
 from miricigale.utils.meta import provenance
+from miricigale.utils.missing import plain_floats
 from miricigale.utils.units import FNU, WAVE
 
 __all__ = ["read_spectra", "template_grid"]
@@ -48,12 +50,12 @@ def read_spectra(path):
     Returns
     -------
     spectra : dict of str to `SED`
-        By the name of the file, with the number in the vector.
+        By the name of the file without its suffix, with the number in the vector.
 
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
-        If there is no file, or one is no spectrum.
+        If there is no file, one is no spectrum or lacks values, or two have the same name but for their suffix.
     """
     path = Path(path).expanduser()
     files = [path]
@@ -65,7 +67,11 @@ def read_spectra(path):
             raise DataError(msg)
     out = {}
     for file in files:
-        out |= _read_file(file)
+        found = _read_file(file)
+        if found.keys() & out.keys():
+            msg = f"{file} has the name of another file of spectra but for its suffix"
+            raise DataError(msg)
+        out |= found
     return out
 
 
@@ -76,9 +82,13 @@ def _read_file(file):
         raise DataError(msg)
     wave, flux = (table[name] for name in table.colnames[:2])
     try:
-        wave = np.asarray(wave, float) * _unit(wave, u.AA)
-        values = np.asarray(flux, float).reshape(wave.size, -1).T * _unit(flux, _FLAM)
-        stem = file.name.partition(".")[0]
+        # NaN where a value is lacking, which is none of a spectrum
+        wave = plain_floats(wave, wave.name, "spectrum") * _unit(wave, u.AA)
+        values = plain_floats(flux, flux.name, "spectrum").reshape(wave.size, -1).T
+        values = values * _unit(flux, _FLAM)
+        stem = re.sub(
+            rf"({'|'.join(map(re.escape, _SUFFIXES))})?(\.gz)?$", "", file.name, flags=re.I
+        )
         names = [stem] if len(values) == 1 else [f"{stem}[{i}]" for i in range(len(values))]
         return {name: SED(wave, one) for name, one in zip(names, values, strict=True)}
     except (TypeError, ValueError, u.UnitsError) as err:

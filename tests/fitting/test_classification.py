@@ -206,3 +206,18 @@ def test_spectra_of_files(tmp_path):
         read_spectra(folder)
     with pytest.raises(DataError, match="no files of spectra"):
         read_spectra(tmp_path)
+
+
+def test_no_spectrum_of_a_library_is_lost_or_filled(tmp_path):
+    """Names of model atmospheres have points in them; a value that is lacking is no flux of 0."""
+    wave = np.linspace(1000, 3000, 5)
+    for name in ("lte030-4.5-0.0.dat", "lte030-4.5-0.5.dat"):
+        np.savetxt(tmp_path / name, np.column_stack([wave, wave]))
+    assert list(read_spectra(tmp_path)) == ["lte030-4.5-0.0", "lte030-4.5-0.5"]
+    np.savetxt(tmp_path / "lte030-4.5-0.0.txt", np.column_stack([wave, wave]))
+    with pytest.raises(DataError, match=r"0\.0\.txt has the name of another file"):
+        read_spectra(tmp_path)
+    gaps = tmp_path / "gaps.csv"
+    gaps.write_text("wave,flux\n1000,1\n2000,\n3000,1\n")
+    with pytest.raises(DataError, match=r"gaps\.csv cannot be read as a spectrum.*finite"):
+        read_spectra(gaps)
