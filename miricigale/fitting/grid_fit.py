@@ -15,6 +15,7 @@ from miricigale.fitting.posterior import check_pairs, joint_names, joint_tables
 from miricigale.fitting.priors import (
     GridPriors,
     density_log_prior,
+    expected_sfr,
     fixed_log_prior,
     grid_priors,
     known_redshifts,
@@ -183,7 +184,8 @@ class GridFit:
         if prior is not None:
             relation, scatter, z = prior.args[:3]
             # a function has no value to tell it by: its own at some masses
-            rates = [relation([1e8, 1e10, 1e12] * MASS, one).value.tolist() for one in z[[0, -1]]]
+            mass = [1e8, 1e10, 1e12] * MASS
+            rates = [expected_sfr(relation, mass, one).tolist() for one in z[[0, -1]]]
             more["sfr_prior"] = {"scatter": scatter, "sfr": rates}
         return more
 

@@ -16,6 +16,7 @@ __all__ = [
     "GridAxis",
     "GridPriors",
     "density_log_prior",
+    "expected_sfr",
     "fixed_log_prior",
     "grid_priors",
     "integrals",
@@ -282,10 +283,18 @@ def sfr_log_prior(sfr_prior, grid):
     return partial(_log_normal_sfr, relation, float(scatter), grid.redshift[:, None], stars, rate)
 
 
+def expected_sfr(relation, mass, redshift):
+    """Star-formation rates of a relation in Msun/yr; a `ValueError` tells those that are none."""
+    rate = to_array(relation(mass, redshift), u.Msun / u.yr, "sfr_prior")
+    if not np.all(rate >= 0):
+        raise argument_error("sfr_prior", "a relation to rates >= 0", "NaN or negative ones")
+    return rate
+
+
 def _log_normal_sfr(relation, scatter, redshift, stars, rate, formed, rows):
-    expected = relation(formed * stars * MASS, redshift[rows])
+    expected = expected_sfr(relation, formed * stars * MASS, redshift[rows])
     with np.errstate(divide="ignore"):
-        apart = np.log10(formed * rate / to_array(expected, u.Msun / u.yr, "sfr_prior"))
+        apart = np.log10(formed * rate / expected)
     return -0.5 * np.square(apart / scatter)
 
 

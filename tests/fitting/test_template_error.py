@@ -231,6 +231,12 @@ def test_prior_of_star_formation_given_mass_and_redshift(make_grid):
     assert part == pytest.approx(prior[0] / prior.sum(), abs=5 * np.sqrt(0.25 / 4000))
     with pytest.raises(ValueError, match="'sfr_prior' must be a function"):
         BayesFitter(grid, sfr_prior=relation)
+    bare = BayesFitter(grid, sfr_prior=(lambda mass, z: relation(mass, z).value, 0.3))
+    with pytest.raises(u.UnitsError, match="'sfr_prior' must be a quantity"):
+        bare.fit(table)
+    nothing = BayesFitter(grid, sfr_prior=(lambda mass, z: np.nan * relation(mass, z), 0.3))
+    with pytest.raises(ValueError, match="'sfr_prior' must be a relation to rates >= 0"):
+        nothing.fit(table)
     with pytest.raises(ValueError, match="'sfr_prior' must be None with 'interpolate'"):
         BayesFitter(grid, sfr_prior=(relation, 0.3), interpolate=100)
     with pytest.raises(ValueError, match="'sfr_prior' must be left out with a sampler"):
