@@ -10,7 +10,7 @@ from miricigale.filters import Filter
 from miricigale.sed.spectrum import distance
 from miricigale.sed.xray import check_band
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.units import to_array
+from miricigale.utils.units import positive, to_array
 
 __all__ = ["ALPHA_OX", "disk_2500", "with_xray_bands", "xray_filter"]
 
@@ -87,7 +87,8 @@ def with_xray_bands(
     Raises
     ------
     ValueError
-        If a band is not two ascending positive energies, or its name is taken, or ``alpha_ox`` does not ascend.
+        If a band is not two ascending positive energies, or its name is taken, ``alpha_ox`` does not ascend, the
+        cutoff is not positive, or the grid has X-ray bands already or no galaxies of a model.
     `~astropy.units.UnitsError`
         If a unit is missing.
 
@@ -100,6 +101,9 @@ def with_xray_bands(
     taken = set(energies) & set(grid.filters)
     if taken or not energies:
         raise argument_error("bands", f"new ones beside {list(grid.filters)}", f"{list(bands)}")
+    if "age_mass" not in grid.galaxy_shape.colnames or "alpha_ox" in grid.agn_parameters.colnames:
+        got = f"{grid.galaxy_shape.colnames} and {grid.agn_parameters.colnames}"
+        raise argument_error("grid", "one of a model with ages, and without X-rays yet", got)
     slopes = to_array(alpha_ox, u.dimensionless_unscaled, "alpha_ox", ndim=1, finite=True)
     if slopes.size == 0 or np.any(np.diff(slopes) <= 0):
         raise argument_error("alpha_ox", "ascending values", f"{slopes}")
@@ -121,7 +125,7 @@ def with_xray_bands(
     galaxy += observed(_INDEX_GAS, _CUT_GAS, gas, _SOFT)
     new = {"galaxy": np.concatenate([grid.galaxy, galaxy], axis=2)}
     if grid.n_agn:
-        cut = float(to_array(cutoff, u.keV, "cutoff", ndim=0, finite=True))
+        cut = positive(cutoff, u.keV, "cutoff")
         disk, angle = _disks(grid, model, angle_coefficients)
         # L_E at 2 keV, whose integral over the spectrum's shape is the power
         at_two = 10.0 ** (slopes / _PER_DEX) * disk[:, None] * angle[:, None] * _PER_KEV

@@ -131,6 +131,12 @@ def test_what_is_refused_and_how_bands_are_drawn(model, grid):
             with_xray_bands(grid, model, bands)
     with pytest.raises(ValueError, match="'alpha_ox' must be ascending"):
         with_xray_bands(grid, model, BANDS, alpha_ox=[-1.4, -1.4])
+    with pytest.raises(ValueError, match="'cutoff' must be positive, got -3"):
+        with_xray_bands(grid, model, BANDS, cutoff=-3 * u.keV)
+    # all bands at once: the slopes of one call are not those of another
+    once = with_xray_bands(grid, model, {"soft": BANDS["soft"]})
+    with pytest.raises(ValueError, match="'grid' must be one of a model with ages, and without X"):
+        with_xray_bands(once, model, {"hard": BANDS["hard"]})
     # 12.398 Angstrom keV
     band = xray_filter("x", [2, 12] * u.keV)
     np.testing.assert_allclose(
