@@ -45,12 +45,13 @@ def read_spectra(path):
         A file, or a folder of files with one of the usual suffixes: FITS tables or text. The first column is the
         wavelength in vacuum (Angstrom where it has no unit), the second the flux density (F_lambda where it has
         no unit), or several of them in a column of vectors; all others are left alone. That is how STScI
-        distributes the atlas of Pickles (1998), and others their model atmospheres.
+        distributes the atlas of Pickles (1998). In its model atmospheres (Castelli & Kurucz, PHOENIX) each column
+        ``g00`` to ``g55`` is one of another surface gravity: all that have light are read.
 
     Returns
     -------
     spectra : dict of str to `SED`
-        By the name of the file without its suffix, with the number in the vector.
+        By the name of the file without its suffix, with the number in the vector or the name of the gravity.
 
     Raises
     ------
@@ -80,17 +81,24 @@ def _read_file(file):
     if len(table.colnames) < 2:
         msg = f"{file} cannot be read as a spectrum: it has the columns {table.colnames}"
         raise DataError(msg)
-    wave, flux = (table[name] for name in table.colnames[:2])
+    first, *others = table.colnames
+    gravities = [name for name in others if re.fullmatch(r"g\d\d", name)]
     try:
         # NaN where a value is lacking, which is none of a spectrum
-        wave = plain_floats(wave, wave.name, "spectrum") * _unit(wave, u.AA)
-        values = plain_floats(flux, flux.name, "spectrum").reshape(wave.size, -1).T
-        values = values * _unit(flux, _FLAM)
+        wave = plain_floats(table[first], first, "spectrum") * _unit(table[first], u.AA)
         stem = re.sub(
             rf"({'|'.join(map(re.escape, _SUFFIXES))})?(\.gz)?$", "", file.name, flags=re.I
         )
-        names = [stem] if len(values) == 1 else [f"{stem}[{i}]" for i in range(len(values))]
-        return {name: SED(wave, one) for name, one in zip(names, values, strict=True)}
+        out = {}
+        for column in gravities or others[:1]:
+            values = plain_floats(table[column], column, "spectrum").reshape(wave.size, -1).T
+            parts = [column] if gravities else range(len(values)) if len(values) > 1 else [None]
+            for part, one in zip(parts, values, strict=True):
+                # atmospheres that were not computed are 0 in such files
+                if not gravities or one.any():
+                    name = stem if part is None else f"{stem}[{part}]"
+                    out[name] = SED(wave, one * _unit(table[column], _FLAM))
+        return out
     except (TypeError, ValueError, u.UnitsError) as err:
         msg = f"{file} cannot be read as a spectrum: {err}"
         raise DataError(msg) from err

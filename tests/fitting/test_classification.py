@@ -221,3 +221,17 @@ def test_no_spectrum_of_a_library_is_lost_or_filled(tmp_path):
     gaps.write_text("wave,flux\n1000,1\n2000,\n3000,1\n")
     with pytest.raises(DataError, match=r"gaps\.csv cannot be read as a spectrum.*finite"):
         read_spectra(gaps)
+
+
+def test_atmospheres_of_all_gravities_are_read(tmp_path):
+    """STScI's tables of model atmospheres: a column for each gravity, 0 where there is no model."""
+    wave = np.linspace(1000, 30000, 50)
+    table = Table({"WAVELENGTH": wave, "g00": 0 * wave, "g40": wave**-2.0, "g45": 2 * wave**-2.0})
+    for name in table.colnames:
+        table[name].unit = "Angstrom" if name == "WAVELENGTH" else "erg / (s cm2 Angstrom)"
+    table.write(tmp_path / "ckp00_10000.fits")
+    spectra = read_spectra(tmp_path)
+    assert list(spectra) == ["ckp00_10000[g40]", "ckp00_10000[g45]"]
+    low, high = (one.fnu.value for one in spectra.values())
+    np.testing.assert_allclose(high, 2 * low)
+    np.testing.assert_allclose(low, low[0])
