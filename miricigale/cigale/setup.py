@@ -237,7 +237,9 @@ class CigaleSetup:
             options["compat"] = compat
         return BayesFitter(grid, have, **options)
 
-    def fit(self, photometry, *, compat="cigale", executor=None, progress_bar=False, **options):
+    def fit(
+        self, photometry, *, compat="cigale", executor=None, progress_bar=False, seed=0, **options
+    ):
         """
         Fit photometry.
 
@@ -252,6 +254,8 @@ class CigaleSetup:
             See `fitter`.
         executor, progress_bar : optional
             See `~miricigale.fitting.BayesFitter.fit`.
+        seed : int, optional
+            Of the draws that keep ``max_dev_alpha_ox``.
 
         Returns
         -------
@@ -273,7 +277,7 @@ class CigaleSetup:
             most = self.max_dev_alpha_ox if "l_2500" in found.quantities else 0.0
             if not most:
                 return found
-            return near_relation(fitter, photometry, found, most, redshift=redshift)
+            return near_relation(fitter, photometry, found, most, redshift=redshift, seed=seed)
 
         results = fit(z) if self.redshift is None else _by_redshift(fit, z, fitter.grid.redshift[0])
         note = {

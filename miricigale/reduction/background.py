@@ -196,8 +196,8 @@ def estimated(
     check_choice(method, "method", ("masked", "sep"))
     check_mesh(box, filter_size)
     check_positive(threshold, "threshold")
-    check_least(grow, "grow", 0)
-    check_least(iterations, "iterations", 0)
+    check_least(grow, "grow", 0, whole=True)
+    check_least(iterations, "iterations", 0, whole=True)
     mask = plain_mask(image)
     if mask.all():
         raise argument_error("image", "one with pixels that are not masked", "every pixel masked")
@@ -279,8 +279,8 @@ def _averaged(data, mask, stated, step, correlation):
 
 def check_mesh(box, filter_size, *, least=4):
     """Refuse boxes, or a filter of boxes, that are too small."""
-    check_least(box, "box", least)
-    check_least(filter_size, "filter_size", 1)
+    check_least(box, "box", least, whole=True)
+    check_least(filter_size, "filter_size", 1, whole=True)
 
 
 def _stated(image, mask):

@@ -19,10 +19,10 @@ def check_kind(value, name, kind):
         raise argument_error(name, f"a {kind.__name__}", repr(value))
 
 
-def check_least(value, name, least):
-    """Refuse what is no number, or below ``least`` (a `ValueError`)."""
-    if not (isinstance(value, numbers.Real) and value >= least):
-        raise argument_error(name, f"at least {least}", value)
+def check_least(value, name, least, *, whole=False):
+    """Refuse what is no number, below ``least`` or, with ``whole``, no integer (a `ValueError`)."""
+    if not (isinstance(value, numbers.Integral if whole else numbers.Real) and value >= least):
+        raise argument_error(name, f"at least {least}{', an integer' * whole}", value)
 
 
 def check_positive(value, name, *, optional=False):

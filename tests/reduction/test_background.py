@@ -156,6 +156,8 @@ def test_masked_pixels_do_not_count(noise):
         ({"box": 2}, "'box' must be at least 4"),
         ({"threshold": 0}, "'threshold' must be positive"),
         ({"iterations": -1}, "'iterations' must be at least 0"),
+        ({"iterations": 2.5}, "'iterations' must be at least 0, an integer"),
+        ({"box": 7.5}, "'box' must be at least 4, an integer"),
         ({"negative_threshold": 0}, "'negative_threshold' must be positive or None"),
     ],
 )
