@@ -44,11 +44,16 @@ def fit_classes(path, output, *, quasars=False, stars=None, **options):
     found : dict of str to `~miricigale.fitting.FitResultsFiles`
         ``galaxy``, ``quasar``, ``star``.
     """
-    from miricigale.sed import SEDModel, quasar_axes, read_spectra, template_grid
+    spectra = None
+    if stars is not None:
+        from miricigale.sed import read_spectra
 
-    # a file that cannot be read is told before hours of fitting
-    spectra = None if stars is None else read_spectra(stars)
+        # a file that cannot be read is told before hours of fitting
+        spectra = read_spectra(stars)
     found = {"galaxy": fit_catalog(path, output, **options)}
+    # after the fit, which refuses what it cannot read before it loads the models
+    from miricigale.sed import SEDModel, quasar_axes, template_grid
+
     models = {}
     if quasars:
         models["quasar"] = lambda _: (SEDModel.survey(), quasar_axes())
