@@ -315,7 +315,8 @@ class GridEngine:
         norm = np.einsum("zgb,zgb,zb->zg", galaxy, galaxy, weight)
         with np.errstate(divide="ignore", invalid="ignore"):
             plain = np.where(self.usable[rows], 0.5 * log[rows, :n_galaxy], -np.inf)
-            found = plain + self.mass_prior(np.maximum(data / norm, 1.0), rows)
+            # a scale that is not positive, or of a model without light here, is taken for 1 Msun
+            found = plain + self.mass_prior(np.fmax(data / norm, 1.0), rows)
             # how much of the prior a redshift has is not for this factor to say
             found += (logsumexp(plain, axis=1) - logsumexp(found, axis=1))[:, None]
         log[rows, :n_galaxy] = np.where(found > -1e200, 2.0 * found, -1e300)

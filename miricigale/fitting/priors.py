@@ -253,12 +253,9 @@ def magnitude_prior(
     for name, value in (("power", power), ("peak", peak)):
         if not value > 0:
             raise argument_error(name, "above 0", repr(value))
-    to_magnitude = u.ABmag
     with np.errstate(divide="ignore", invalid="ignore"):
-        values = np.atleast_1d(u.Quantity(magnitude, subok=True).to(to_magnitude).value).astype(
-            float
-        )
-    apart = values - u.Quantity(pivot, subok=True).to(to_magnitude).value
+        values = u.Quantity(magnitude, subok=True).to(u.ABmag).value
+    apart = np.atleast_1d(values).astype(float) - u.Quantity(pivot, subok=True).to(u.ABmag).value
     z = np.linspace(0.0, 15.0, 751) if redshift is None else np.asarray(redshift, dtype=float)
     # bright galaxies are not all at 0
     top = np.maximum(peak + slope * np.where(np.isfinite(apart), apart, 0.0), 0.1 * peak)[:, None]

@@ -74,9 +74,9 @@ def joined_header(hdus, name="SCI"):
     """
     header = hdus[0].header.copy(strip=True)
     science = hdus[name].header.copy(strip=True) if name in hdus else fits.Header()
-    for name in ("BSCALE", "BZERO", "EXTNAME", "EXTVER", "EXTEND", "NEXTEND"):
-        header.remove(name, ignore_missing=True)
-        science.remove(name, ignore_missing=True)
+    for layout in ("BSCALE", "BZERO", "EXTNAME", "EXTVER", "EXTEND", "NEXTEND"):
+        header.remove(layout, ignore_missing=True)
+        science.remove(layout, ignore_missing=True)
     for card in science.cards:
         if (
             card.keyword
