@@ -23,9 +23,9 @@ __all__ = ["Between"]
 #: Least variance of a scale, and least prior density.
 _TINY = 1e-290
 #: Part of the population that the weights of a step may leave effective, and moves in each.
-_EFFECTIVE, _MOVES = 0.5, 6
+_EFFECTIVE, _MOVES = 0.5, 15
 #: Moves under the true errors, and those of them after which the population is kept.
-_LAST, _KEPT = 21, (7, 14, 21)
+_LAST, _KEPT = 45, (15, 30, 45)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class Between:
 
     def widened(self, data):
         """Photometry with the errors by which nodes are drawn, and seeds of the draws."""
-        more = np.where(data.measured, self.models.errors[0] * np.nan_to_num(data.flux), 0.0)
+        more = np.where(data.measured, self.models.errors * np.nan_to_num(data.flux), 0.0)
         seeds = [stream(0, "between", str(key)).integers(2**63) for key in data.ids]
         return data._changed(sigma=np.hypot(data.sigma, more)), np.array(seeds, np.int64)
 
@@ -93,8 +93,7 @@ class _Object:
         self.models, self.engine, self.rng, self.log_prior = models, engine, rng, log_prior
         used = data.used[0]
         self.used, self.limit, self.flux = used, data.limit[0][used], data.flux[0][used]
-        more = models.errors[1][used] * np.where(self.limit, 0.0, self.flux)
-        self.sigma, self.wide = np.hypot(data.sigma[0][used], more), wide[used]
+        self.sigma, self.wide = data.sigma[0][used], wide[used]
         self.free, self.known = list(models.cells), {}
         if data.redshift is not None and "redshift" in self.free:
             self.known["redshift"] = data.redshift[0]
@@ -104,7 +103,7 @@ class _Object:
     def population(self, index):
         """Values, nodes and derived quantities of the population under the true errors: dicts."""
         x, step = self._begin(index), 0.0
-        now = self._evaluate(self._place(x))
+        now = self._evaluate(self._models(x))
         while step < 1.0:
             weight, step = _next_step(now["true"] - now["node"], step)
             chosen = _resampled(weight, self.rng)
@@ -116,15 +115,15 @@ class _Object:
             x, now = self._move(x, now, 1.0)
             if i + 1 in _KEPT:
                 kept.append(x)
-        place = self._place(np.concatenate(kept))
-        flux, power = self.models.fluxes(place)
-        scale, variance, _ = self._likelihood(flux, place.node["redshift"], self.sigma)
+        models = self._models(np.concatenate(kept))
+        flux, power = self.models.fluxes(models)
+        scale, variance, _ = self._likelihood(flux, models.node["redshift"], self.sigma)
         if self.models.engine.scale_error:
             error = np.sqrt(np.maximum(variance, _TINY))
             low = ndtr(-scale / error)
             scale = scale + error * ndtri(low + (1.0 - low) * (1.0 - self.rng.random(len(scale))))
-        values, derived = self.models.describe(place, power, scale)
-        return values, place.node, derived
+        values, derived = self.models.describe(models, power, scale)
+        return values, models.node, derived
 
     def _begin(self, index):
         """Values in the cells of nodes."""
@@ -143,10 +142,10 @@ class _Object:
             x[:, j] = cells.edges[i] + np.diff(cells.edges)[i] * rng.random(len(z))
         return x
 
-    def _place(self, x):
+    def _models(self, x):
         values = dict(zip(self.free, x.T, strict=True))
         values |= {name: np.full(len(x), value) for name, value in self.known.items()}
-        return self.models.place(values, self.log_prior, self.free)
+        return self.models.models(values, self.log_prior, self.free)
 
     def _likelihood(self, flux, z, sigma):
         """Best scales, their variances, and ln(likelihood) but for a constant."""
@@ -162,12 +161,13 @@ class _Object:
             out[:, rows] = scale, variance, -0.5 * chi2 - np.log(s[~limit]).sum()
         return out
 
-    def _evaluate(self, place):
+    def _evaluate(self, models, step=0.0):
         """Ln of the prior density and of the likelihoods between the nodes and at the nearest."""
-        z = place.node["redshift"]
-        true = self._likelihood(self.models.fluxes(place)[0], z, self.sigma)[2]
-        node = self._likelihood(self.models.at_nodes(place, self.engine), z, self.wide)[2]
-        return {"true": true, "node": node, "prior": place.prior}
+        z, node = models.node["redshift"], np.zeros(len(models.prior))
+        true = self._likelihood(self.models.fluxes(models)[0], z, self.sigma)[2]
+        if step < 1.0:
+            node = self._likelihood(self.models.at_nodes(models, self.engine), z, self.wide)[2]
+        return {"true": true, "node": node, "prior": models.prior}
 
     def _move(self, x, now, step):
         """Move every member along the difference of two others, where the posterior agrees."""
@@ -179,11 +179,11 @@ class _Object:
         far = 2.38 / np.sqrt(2.0 * free) * self.rng.random(n) ** 0.5
         far = np.where(self.rng.random(n) < 0.1, 1.0, far)
         new = x + some * (far[:, None] * (x[a] - x[b]) + 1e-4 * x * self.rng.normal(size=x.shape))
-        place = self._place(new)
-        some = np.flatnonzero(np.isfinite(place.prior))
+        models = self._models(new)
+        some = np.flatnonzero(np.isfinite(models.prior))
         if not some.size:
             return x, now
-        then = self._evaluate(place.rows(some))
+        then = self._evaluate(models.rows(some), step)
         old = {key: value[some] for key, value in now.items()}
         rise = sum(
             part * (then[key] - old[key])

@@ -6,10 +6,12 @@ from functools import partial
 import astropy.units as u
 import numpy as np
 
+from miricigale.filters import FilterSet
 from miricigale.fitting.between import Between
 from miricigale.fitting.calibration import TemplateError, grid_errors
 from miricigale.fitting.continuation import Continuation
 from miricigale.fitting.grid import GridEngine
+from miricigale.fitting.interpolation import Nodes, finer_grid
 from miricigale.fitting.likelihood import FitFlags
 from miricigale.fitting.posterior import check_pairs, joint_names, joint_tables
 from miricigale.fitting.priors import (
@@ -85,6 +87,7 @@ class GridFit:
         template_error,
         sfr_prior,
         interpolate,
+        finer,
     ):
         """Make a grid if it is none, work out its priors and derived quantities, set the engine up."""
         if not (is_number(rtol) and 0 <= rtol < 0.1):
@@ -96,12 +99,15 @@ class GridFit:
             raise argument_error("sfr_prior", "None with 'interpolate'", repr(sfr_prior))
         if compat not in (None, "cigale"):
             raise argument_error("compat", "None or 'cigale'", repr(compat))
+        if finer is not None and not (interpolate and isinstance(finer, SEDModel)):
+            wanted = "an SEDModel" if interpolate else "None without 'interpolate'"
+            raise argument_error("finer", wanted, repr(finer))
         grid = model
         if isinstance(model, SEDModel):
             if axes is None or filters is None:
                 msg = "'axes' and 'filters' must be given when 'model' is an SEDModel"
                 raise ValueError(msg)
-            grid = model.grid(axes, filters)
+            grid, finer = model.grid(axes, filters), model if interpolate else None
         elif axes is not None:
             raise argument_error("axes", "None when 'model' is a ModelGrid", "a value")
         elif not isinstance(model, ModelGrid):
@@ -131,12 +137,17 @@ class GridFit:
             rtol=float(rtol),
             scale_error=scale_error,
         )
-        between = None
+        out = cls(grid, priors, quantities, fraction, engine, near, compat, prior_f, template_error)
         # a single model has nothing between
-        if interpolate and any(axis.values.size > 1 for axis in priors.axes.values()):
-            between = Between(Continuation(priors, quantities, fraction, engine), interpolate)
-        of_grid = grid, priors, quantities, fraction, engine
-        return cls(*of_grid, near, compat, prior_f, template_error, between)
+        if not interpolate or all(axis.values.size == 1 for axis in priors.axes.values()):
+            return out
+        nodes = finest = Nodes.of_grid(grid, priors.axes)
+        if finer is not None:
+            bands = filters if isinstance(filters, FilterSet) else grid.filters
+            finest = finer_grid(finer, grid, bands, out.constants, nodes)
+        return replace(
+            out, between=Between(Continuation(priors, engine, nodes, finest), interpolate)
+        )
 
     @property
     def filters(self):
