@@ -4,8 +4,10 @@ Posteriors between the nodes of a grid.
 A population of models begins as draws from the posterior of wider errors on the nodes, each put anywhere in its
 node's cell: exact draws from a likelihood that is that of the node all over its cell. From there it is led to the
 likelihood between the nodes in steps, at each of which it is weighed, resampled and moved (sequential Monte Carlo:
-Del Moral et al. 2006, JRSS B 68, 411; moves along differences of members: ter Braak 2006, Stat. Comput. 16, 239).
-`Continuation` has the models.
+Del Moral et al. 2006, JRSS B 68, 411), in coordinates in which the prior is normal. Moves are in turn along
+differences of members (ter Braak 2006, Stat. Comput. 16, 239; in some parameters at a time: Vrugt et al. 2009,
+Int. J. Nonlin. Sci. Num. Sim. 10, 273) and about the mean of all with their covariance (preconditioned
+Crank-Nicolson moves for a t distribution: Grumitt et al. 2024, arXiv:2407.07781). `Continuation` has the models.
 """
 
 from dataclasses import dataclass
@@ -23,9 +25,11 @@ __all__ = ["Between"]
 #: Least variance of a scale, and least prior density.
 _TINY = 1e-290
 #: Part of the population that the weights of a step may leave effective, and moves in each.
-_EFFECTIVE, _MOVES = 0.5, 15
-#: Moves under the true errors, and those of them after which the population is kept.
-_LAST, _KEPT = 45, (15, 30, 45)
+_EFFECTIVE, _MOVES = 0.5, 12
+#: Moves under the true errors: before the population is kept for the first time, all, and from one to the next.
+_FIRST, _LAST, _NEXT = 18, 54, 6
+#: Degrees of freedom of the t distribution, and part of the moves that shall be taken.
+_DEGREES, _TAKEN = 5.0, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,31 +94,32 @@ class _Object:
     """The models of one object: a population, its likelihoods and how it moves."""
 
     def __init__(self, models, engine, data, wide, log_prior, rng):
-        self.models, self.engine, self.rng, self.log_prior = models, engine, rng, log_prior
+        self.models, self.engine, self.rng = models, engine, rng
         used = data.used[0]
         self.used, self.limit, self.flux = used, data.limit[0][used], data.flux[0][used]
         self.sigma, self.wide = data.sigma[0][used], wide[used]
-        self.free, self.known = list(models.cells), {}
+        self.free, self.known = dict(models.cells), {}
         if data.redshift is not None and "redshift" in self.free:
             self.known["redshift"] = data.redshift[0]
-            self.free.remove("redshift")
-            self.log_prior = np.zeros(len(models.engine.galaxy))
+            del self.free["redshift"]
+        elif "redshift" in self.free:
+            self.free["redshift"] = self.free["redshift"].with_weights(
+                np.exp(log_prior - log_prior.max())
+            )
+        self.size = 0.5
 
     def population(self, index):
         """Values, nodes and derived quantities of the population under the true errors: dicts."""
-        x, step = self._begin(index), 0.0
-        now = self._evaluate(self._models(x))
+        x, step, kept = self._begin(index), 0.0, []
+        now = self._evaluate(x, step)
         while step < 1.0:
             weight, step = _next_step(now["true"] - now["node"], step)
             chosen = _resampled(weight, self.rng)
             x, now = x[chosen], {key: value[chosen] for key, value in now.items()}
-            for _ in range(_MOVES):
-                x, now = self._move(x, now, step)
-        kept = []
-        for i in range(_LAST):
-            x, now = self._move(x, now, 1.0)
-            if i + 1 in _KEPT:
-                kept.append(x)
+            for i in range(_MOVES if step < 1.0 else _LAST):
+                x, now = self._move(x, now, step, whole=i % 2)
+                if step == 1.0 and i >= _FIRST and i % _NEXT == 0:
+                    kept.append(x)
         models = self._models(np.concatenate(kept))
         flux, power = self.models.fluxes(models)
         scale, variance, _ = self._likelihood(flux, models.node["redshift"], self.sigma)
@@ -126,7 +131,7 @@ class _Object:
         return values, models.node, derived
 
     def _begin(self, index):
-        """Values in the cells of nodes."""
+        """Coordinates in the cells of nodes: the prior is normal in each."""
         z, g, k, f = index.T
         rng, node = self.rng, {"redshift": z, "frac_agn": f}
         for name, axis in self.models.priors.axes.items():
@@ -137,15 +142,17 @@ class _Object:
                 )
                 node[name] = np.sum(rng.random(len(g)) * share[-1] >= share, axis=0)
         x = np.empty((len(z), len(self.free)))
-        for j, name in enumerate(self.free):
-            cells, i = self.models.cells[name], node[name]
-            x[:, j] = cells.edges[i] + np.diff(cells.edges)[i] * rng.random(len(z))
+        for j, (name, cells) in enumerate(self.free.items()):
+            x[:, j] = ndtri(cells.cumulative(node[name], rng.random(len(z))))
         return x
 
     def _models(self, x):
-        values = dict(zip(self.free, x.T, strict=True))
+        unit = ndtr(x)
+        values = {
+            name: cells.value(unit[:, j]) for j, (name, cells) in enumerate(self.free.items())
+        }
         values |= {name: np.full(len(x), value) for name, value in self.known.items()}
-        return self.models.models(values, self.log_prior, self.free)
+        return self.models.models(values)
 
     def _likelihood(self, flux, z, sigma):
         """Best scales, their variances, and ln(likelihood) but for a constant."""
@@ -161,40 +168,62 @@ class _Object:
             out[:, rows] = scale, variance, -0.5 * chi2 - np.log(s[~limit]).sum()
         return out
 
-    def _evaluate(self, models, step=0.0):
-        """Ln of the prior density and of the likelihoods between the nodes and at the nearest."""
-        z, node = models.node["redshift"], np.zeros(len(models.prior))
-        true = self._likelihood(self.models.fluxes(models)[0], z, self.sigma)[2]
-        if step < 1.0:
-            node = self._likelihood(self.models.at_nodes(models, self.engine), z, self.wide)[2]
-        return {"true": true, "node": node, "prior": models.prior}
+    def _evaluate(self, x, step):
+        """Ln of the prior density and of the likelihoods between the nodes and, below step 1, at the nearest."""
+        models = self._models(x)
+        out = {"prior": -0.5 * np.sum(np.square(x), axis=1)}
+        out |= {"true": np.full(len(x), -np.inf), "node": np.zeros(len(x))}
+        some = np.flatnonzero(models.possible)
+        if some.size:
+            models = models.rows(some)
+            z = models.node["redshift"]
+            out["true"][some] = self._likelihood(self.models.fluxes(models)[0], z, self.sigma)[2]
+            if step < 1.0:
+                flux = self.models.at_nodes(models, self.engine)
+                out["node"][some] = self._likelihood(flux, z, self.wide)[2]
+        return out
 
-    def _move(self, x, now, step):
-        """Move every member along the difference of two others, where the posterior agrees."""
+    def _move(self, x, now, step, *, whole):
+        """Move every member, where the posterior agrees."""
+        if not x.shape[1]:
+            return x, now
+        new, more = self._about_mean(x) if whole else (self._along_differences(x), 0.0)
+        then = self._evaluate(new, step)
+        rise = more + sum(
+            part * (then[key] - now[key])
+            for key, part in (("prior", 1.0), ("node", 1.0 - step), ("true", step))
+        )
+        take = np.log(1.0 - self.rng.random(len(x))) < rise
+        if whole:
+            self.size = np.clip(self.size * np.exp(0.3 * (take.mean() - _TAKEN)), 0.05, 0.99)
+        now = {key: np.where(take, then[key], value) for key, value in now.items()}
+        return np.where(take[:, None], new, x), now
+
+    def _along_differences(self, x):
         n, d = x.shape
         a, b = (self.rng.permutation(n) for _ in range(2))
-        # in some of the parameters at a time (Vrugt et al. 2009, Int. J. Nonlin. Sci. Num. Sim. 10, 273)
         some = self.rng.random((n, d)) < self.rng.integers(1, 4, size=(n, 1)) / 3.0
         free = np.maximum(some.sum(axis=1), 1)
         far = 2.38 / np.sqrt(2.0 * free) * self.rng.random(n) ** 0.5
+        # from one peak to another
         far = np.where(self.rng.random(n) < 0.1, 1.0, far)
-        new = x + some * (far[:, None] * (x[a] - x[b]) + 1e-4 * x * self.rng.normal(size=x.shape))
-        models = self._models(new)
-        some = np.flatnonzero(np.isfinite(models.prior))
-        if not some.size:
-            return x, now
-        then = self._evaluate(models.rows(some), step)
-        old = {key: value[some] for key, value in now.items()}
-        rise = sum(
-            part * (then[key] - old[key])
-            for key, part in (("prior", 1.0), ("node", 1.0 - step), ("true", step))
-        )
-        take = np.log(1.0 - self.rng.random(some.size)) < rise
-        some, x, now = some[take], x.copy(), {key: value.copy() for key, value in now.items()}
-        x[some] = new[some]
-        for key, value in then.items():
-            now[key][some] = value[take]
-        return x, now
+        return x + some * (far[:, None] * (x[a] - x[b]) + 1e-3 * self.rng.normal(size=x.shape))
+
+    def _about_mean(self, x):
+        """Where members go, and ln of the ratio of the t densities from which and to which."""
+        (n, d), rng = x.shape, self.rng
+        mean = x.mean(axis=0)
+        root = np.linalg.cholesky(np.atleast_2d(np.cov(x.T)) + 1e-6 * np.eye(d))
+
+        def distance(x):
+            return np.sum(np.linalg.solve(root, (x - mean).T) ** 2, axis=0)
+
+        before = distance(x)
+        wide = np.sqrt(0.5 * (_DEGREES + before) / rng.gamma(0.5 * (d + _DEGREES), size=n))
+        drawn = wide[:, None] * (rng.normal(size=x.shape) @ root.T)
+        new = mean + np.sqrt(1.0 - self.size**2) * (x - mean) + self.size * drawn
+        ratio = np.log1p(distance(new) / _DEGREES) - np.log1p(before / _DEGREES)
+        return new, 0.5 * (d + _DEGREES) * ratio
 
 
 def _next_step(rise, step):

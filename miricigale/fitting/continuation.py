@@ -10,23 +10,44 @@ from miricigale.fitting.posterior import cell_edges
 
 __all__ = ["Continuation"]
 
-#: Least of a prior density, and of a flux.
-_TINY = 1e-290
+#: Least flux, and least part of a prior.
+_TINY, _LEAST = 1e-290, 1e-9
 #: Part of the steps of AGN light that widens errors: some AGN have little light beside the galaxy's.
 _OF_AGN = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Edges of the cells around the nodes of an axis, none beyond the outermost, and prior density in each."""
+    """Cells around the nodes of an axis, none beyond the outermost: n + 1 edges, and the prior below each."""
 
     edges: np.ndarray
-    density: np.ndarray
+    below: np.ndarray
+
+    @classmethod
+    def of_nodes(cls, values, weights):
+        """Around nodes with prior weights."""
+        edges = cell_edges(values)
+        edges[[0, -1]] = values[[0, -1]]
+        return cls(edges, None).with_weights(weights)
+
+    def with_weights(self, weights):
+        """Copy with other prior weights of the nodes."""
+        total = np.concatenate([[0.0], np.cumsum(weights)])
+        return Cells(self.edges, total / total[-1])
 
     def of(self, value):
         """Nodes in whose cells values lie."""
         place = np.searchsorted(self.edges, value, side="right") - 1
-        return np.clip(place, 0, self.density.size - 1)
+        return np.clip(place, 0, self.edges.size - 2)
+
+    def cumulative(self, node, part):
+        """Cumulative prior part of the way through cells of nodes, inside (0, 1)."""
+        prior = self.below[node] + part * (self.below[node + 1] - self.below[node])
+        return np.clip(prior, _LEAST, 1.0 - _LEAST)
+
+    def value(self, prior):
+        """Values at which the cumulative prior is the one given."""
+        return np.interp(prior, self.below, self.edges)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +57,7 @@ class Models:
     values: dict
     node: dict
     place: Place
-    prior: np.ndarray  # ln of the density
+    possible: np.ndarray  # (n,) of bool
 
     def rows(self, some):
         """Part of the models."""
@@ -44,7 +65,7 @@ class Models:
             {name: value[some] for name, value in self.values.items()},
             {name: value[some] for name, value in self.node.items()},
             self.place.rows(some),
-            self.prior[some],
+            self.possible[some],
         )
 
 
@@ -75,17 +96,8 @@ class Continuation:
     @cached_property
     def cells(self):
         """`Cells` of each axis with several values, by name."""
-        out = {}
-        for name, axis in self.priors.axes.items():
-            values = axis.values
-            if values.size == 1:
-                continue
-            edges = cell_edges(values)
-            edges[[0, -1]] = values[[0, -1]]
-            # redshifts have the priors of the object
-            weights = np.ones(values.size) if name == "redshift" else axis.weights
-            out[name] = Cells(edges, weights / np.diff(edges))
-        return out
+        axes = self.priors.axes.items()
+        return {n: Cells.of_nodes(a.values, a.weights) for n, a in axes if a.values.size > 1}
 
     @cached_property
     def errors(self):
@@ -114,33 +126,16 @@ class Continuation:
             # where the AGN outshines the galaxy few steps do
             yield np.sqrt(np.mean(np.square(steps), axis=(0, 1)))[None]
 
-    def models(self, values, log_prior, free):
-        """
-        `Models` of values by name, shape (n,); those that have none are at the only node of their axis.
-
-        ``log_prior``, shape (nz,), is that of the redshifts; ``free`` are the names of what has a prior.
-        """
-        n, node, axes = len(next(iter(values.values()))), {}, self.priors.axes
-        prior = np.zeros(n)
-        for name in axes:
-            node[name] = np.zeros(n, np.int64)
-            if name in values:
-                cells = self.cells[name]
-                node[name] = cells.of(values[name])
-            if name in free:
-                prior += np.log(np.maximum(cells.density[node[name]], _TINY))
-                outside = (values[name] < cells.edges[0]) | (values[name] > cells.edges[-1])
-                prior[outside] = -np.inf
+    def models(self, values):
+        """`Models` of values by name, shape (n,), some of which may be missing: these have the only node."""
+        n, axes = len(next(iter(values.values()))), self.priors.axes
+        node = {name: np.zeros(n, np.int64) for name in axes}
+        node |= {name: self.cells[name].of(value) for name, value in values.items()}
         z = axes["redshift"].values
-        redshift = np.asarray(values.get("redshift", np.full(n, z[0])))
-        if "redshift" in free:
-            redshift = np.clip(redshift, z[0], z[-1])
-        place = self.finer.place(values, redshift)
-        prior += log_prior[node["redshift"]]
+        place = self.finer.place(values, values.get("redshift", np.full(n, z[0])))
         galaxy = self.nodes.kinds["galaxy"].models(node)
         usable = (galaxy >= 0) & self.engine.usable[node["redshift"], galaxy]
-        prior[~(usable & self.finer.possible(place))] = -np.inf
-        return Models(values, node, place, prior)
+        return Models(values, node, place, usable & self.finer.possible(place))
 
     def at_redshift(self, redshift, node):
         """`GridEngine` of all models of the grid at one redshift; what else depends on it is that of a node."""
@@ -160,7 +155,7 @@ class Continuation:
     def fluxes(self, models):
         """Fluxes of one solar mass formed, shape (n, nb), and the AGN's power."""
         frac = models.values.get("frac_agn", self.engine.frac[models.node.get("frac_agn", 0)])
-        return self.finer.fluxes(models.place, np.broadcast_to(frac, models.prior.shape))
+        return self.finer.fluxes(models.place, np.broadcast_to(frac, models.possible.shape))
 
     def at_nodes(self, models, engine):
         """Fluxes at the nodes in whose cells models lie, by an engine of all redshifts or of one."""

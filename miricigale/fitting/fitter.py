@@ -129,8 +129,8 @@ class BayesFitter:
         best model too. 400 do for 68 % intervals. 0: the nodes alone.
     finer : `~miricigale.sed.SEDModel`, optional
         With ``interpolate``: the model that made the grid, of which a finer grid is made, between whose nodes
-        fluxes are good to some 2 %. Not needed where ``model`` is the model; fluxes are interpolated from the
-        grid's own nodes without it, and intervals are too narrow where its cells are wide.
+        fluxes are good to 0.5 % along each axis. Not needed where ``model`` is the model. Without it fluxes are
+        interpolated from the grid's own nodes, and intervals are too narrow where its cells are wide.
     predict : list of str or `~miricigale.filters.FilterSet`, optional
         For a sampler: more bands, in which the fluxes of the models are predicted. A grid predicts
         all of its bands.

@@ -11,11 +11,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from astropy.table import QTable
 
 from miricigale.fitting import _core
 from miricigale.fitting.priors import grid_priors
 from miricigale.fitting.quantities import OtherFraction, Quantities
+from miricigale.sed import ModelFlags
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.units import MASS
 
 __all__ = ["Nodes", "Place", "finer_grid", "less_factor"]
 
@@ -23,23 +26,22 @@ __all__ = ["Nodes", "Place", "finer_grid", "less_factor"]
 _POWERS = (1.0, 0.5, 0.1, -0.5)
 #: Fluxes below this part of a model's brightest band are interpolated as if they were it.
 _DARK = 1e-12
+#: Those below this part of it are not held to the chain.
+_FAINT = 1e-6
 #: Least of what is interpolated in the logarithm.
 _TINY = 1e-290
 #: Largest ln of a number.
 _LARGE = 690.0
 #: Largest change of ln flux from the nearest node that is followed.
 _STEEP = 5.0
-#: Error of interpolated ln flux, as a part of how far the middle of three nodes is off a straight line: that of
-#: straight lines at most; of 68 % of models of the chain of Yang et al. 2021 on a coarse grid, but for 24 um.
-_INTERPOLATED = 0.25
 #: The latter of two nodes, which show no curvature, as a part of their difference: of polar dust at 100, 300 K.
 _TWO = 0.25
 #: Errors count up to this: fluxes that change by more between nodes are faint.
 _MOST = 0.1
 #: Rms error of interpolated ln flux along an axis of a finer grid, and the bytes that its table may fill.
-_TOLERANCE, _LARGEST = 0.02, 1 << 28
+_TOLERANCE, _LARGEST = 0.005, 1 << 28
 #: Most times that the cells of an axis are halved.
-_HALVINGS = 3
+_HALVINGS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +129,7 @@ class Kind:
         """Interpolated fluxes, shape (n, nb)."""
         z, other, part = place.between
         ln = self._sum(self.flux, place, z, other, part)
-        here = self.flux[z, np.maximum(self.models(place.near), 0)]
+        here = self.flux[place.near["redshift"], np.maximum(self.models(place.near), 0)]
         ln = here + np.clip(ln - here, -_STEEP, _STEEP)
         return np.exp(ln - _two_ln(place.redshift)[:, None])
 
@@ -257,26 +259,6 @@ class Nodes:
         bends = self.kinds[axis.kind].bends(axis.name, _scaled(axis.values, power))
         return sum(np.abs(bend).mean() for bend in bends if bend.size)
 
-    @cached_property
-    def rms_errors(self):
-        """Rms error of interpolation along each axis by name, of ln flux or of what else there is."""
-        # some of many galaxies tell
-        flux = self.kinds["galaxy"].flux[:, :: max(len(self.allowed[0]) // 100, 1)]
-        x, bends = np.log1p(self.redshift), {}
-        if x.size > 2:
-            t = ((x[1:-1] - x[:-2]) / (x[2:] - x[:-2]))[:, None, None]
-            bends["redshift"] = [less_factor(flux[1:-1] - (1.0 - t) * flux[:-2] - t * flux[2:])]
-        for name, scale in self.scales.items():
-            bends[name] = self.kinds[self.axes[name].kind].bends(name, scale.scaled)
-        return {
-            name: max(
-                np.sqrt(np.mean(np.minimum(_INTERPOLATED * np.abs(bend), _MOST) ** 2))
-                for bend in both
-                if bend.size
-            )
-            for name, both in bends.items()
-        }
-
     def place(self, values, redshift):
         """`Place` of values by name, shape (n,), at redshifts; what has none is at the only node of its axis."""
         near, weights = {}, {}
@@ -348,7 +330,7 @@ class Nodes:
 
 def finer_grid(model, grid, filters, constants, nodes):
     """
-    Nodes of a grid of the same model, with cells halved until interpolation is good to 2 % (thrice at most).
+    Nodes of a grid of the same model, with cells halved until interpolation is good to 0.5 % along each axis.
 
     Parameters
     ----------
@@ -373,38 +355,72 @@ def finer_grid(model, grid, filters, constants, nodes):
     """
     axes = {name: [value] for name, value in constants.items()}
     axes |= {name: np.asarray(grid.axes.get(name, a.values)) for name, a in nodes.axes.items()}
+    test = _Test(model, filters, constants, grid.frac_agn)
+    if not test.rms(nodes) < 1e-3:
+        wanted = "the model that made the grid"
+        raise argument_error("finer", wanted, "one with other fluxes at its nodes")
     finer = nodes
     for _ in range(_HALVINGS):
-        rms, known = finer.rms_errors, dict(axes)
+        before = axes
+        rms = {name: test.rms(finer, name) for name in ("redshift", *finer.scales)}
         # the worst first, as far as there is memory
-        for name in sorted(rms, key=rms.get, reverse=True):
-            halved = axes | {name: _halved(model, name, axes[name])}
+        for name in sorted((n for n in rms if rms[n] > _TOLERANCE), key=rms.get, reverse=True):
+            halved = axes | {name: np.sort([*axes[name], *_middles(finer, name)])}
             size = [
                 len(halved[n]) for n, a in nodes.axes.items() if a.kind in ("redshift", "galaxy")
             ]
-            if rms[name] > _TOLERANCE and 8 * len(filters) * np.prod(size) <= _LARGEST:
+            if 8 * len(filters) * np.prod(size) <= _LARGEST:
                 axes = halved
-        if all(len(axes[name]) == len(values) for name, values in known.items()):
+        if axes is before:
             break
         finer = Nodes.of_grid(model.grid(axes, filters))
-    for kind, own in nodes.kinds.items():
-        z = np.searchsorted(finer.redshift, nodes.redshift[0])
-        same = finer.kinds[kind].flux[z][finer.those_of(nodes, kind)]
-        if not np.allclose(same, own.flux[0], rtol=0, atol=1e-3):
-            wanted = "the model that made the grid"
-            raise argument_error("finer", wanted, "one with other fluxes at its nodes")
     return finer
 
 
-def _halved(model, name, values):
-    """Values with the middles between them, if the model has such."""
-    x = np.log1p(values) if name == "redshift" else values
-    middle = 0.5 * (x[1:] + x[:-1])
-    middle = np.expm1(middle) if name == "redshift" else middle
-    parts = [c for c in model.components if name in c.parameters]
-    if any(c.invalid(model.defaults | {name: float(v)}) for c in parts for v in middle):
-        return values
-    return np.sort(np.concatenate([values, middle]))
+@dataclass(frozen=True, eq=False)
+class _Test:
+    """Models of a chain, to which interpolated ones are held."""
+
+    model: object
+    filters: object
+    constants: dict
+    frac: np.ndarray
+
+    def rms(self, nodes, name=None, n=300):
+        """
+        Rms of interpolated ln flux, but for a factor, at random nodes, or anywhere between those of an axis.
+
+        It is 0 where the model has nothing between them.
+        """
+        rng, known = np.random.default_rng(1), self.model.parameters
+        values = {other: rng.choice(axis.values, n) for other, axis in nodes.axes.items()}
+        if name is not None:
+            axis = nodes.axes[name].values
+            first = rng.integers(max(axis.size - 1, 1), size=n)
+            values[name] = axis[first] + rng.random(n) * (np.roll(axis, -1) - axis)[first]
+        values |= {other: np.full(n, value) for other, value in self.constants.items()}
+        table = QTable({other: value * known[other].unit for other, value in values.items()})
+        table["mass"] = 1.0 * MASS
+        true = self.model.fluxes(table, self.filters)
+        flags = true["flags"]
+        if np.any(flags & int(ModelFlags.NOT_IN_LIBRARY)) and name is not None:
+            return 0.0
+        frac = values.get("frac_agn", np.full(n, self.frac[0]))
+        place = nodes.place(values, values["redshift"])
+        flux = nodes.fluxes(place, frac)[0]
+        true = np.column_stack([true[band].value for band in true.colnames[: flux.shape[1]]])
+        good = np.isfinite(true).all(axis=1)
+        top = _FAINT * true[good].max(axis=1, keepdims=True)
+        ratio = np.maximum(flux[good], top) / np.maximum(true[good], top)
+        return np.sqrt(np.mean(np.minimum(np.abs(less_factor(np.log(ratio))), _MOST) ** 2))
+
+
+def _middles(nodes, name):
+    """Half way between the nodes of an axis."""
+    values = nodes.axes[name].values
+    if name == "redshift":
+        return np.expm1(0.5 * (np.log1p(values[1:]) + np.log1p(values[:-1])))
+    return 0.5 * (values[1:] + values[:-1])
 
 
 def less_factor(change):

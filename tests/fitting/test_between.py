@@ -8,7 +8,8 @@ import pytest
 from astropy.table import QTable
 
 from miricigale.fitting import BayesFitter, FitFlags
-from miricigale.sed import ModelGrid
+from miricigale.fitting.continuation import Continuation
+from miricigale.sed import ModelGrid, SEDModel
 
 BANDS = tuple(f"band{i}" for i in range(8))
 PLACE = np.linspace(-1.0, 1.0, len(BANDS))
@@ -79,7 +80,7 @@ def coverage(results, true, name):
 
 def test_intervals_hold_the_truth_between_nodes(grid, drawn):
     table, true = drawn
-    results = BayesFitter(grid, model_error=0.0, interpolate=300).fit(table)
+    results = BayesFitter(grid, model_error=0.0, interpolate=150).fit(table)
     nodes = BayesFitter(grid, model_error=0.0).fit(table)
     for name in ("redshift", "tau", "ebv", "mass", "sfr", "beta"):
         # three times the binomial error of 300 objects
@@ -104,7 +105,7 @@ def test_what_rests_on_one_node_is_flagged(grid, drawn):
 def test_known_redshifts_are_those_of_the_catalog(grid, drawn):
     """Also where they lie between nodes; the rest is then that of these redshifts."""
     table, true = drawn
-    results = BayesFitter(grid, model_error=0.0, interpolate=300).fit(table, redshift="z")
+    results = BayesFitter(grid, model_error=0.0, interpolate=150).fit(table, redshift="z")
     np.testing.assert_allclose(results.percentile("redshift", 0.5).value[:, 0], true["redshift"])
     for name in ("tau", "ebv", "mass", "sfr"):
         assert abs(coverage(results, true, name) - 0.68) < 0.08, name
@@ -173,3 +174,115 @@ def test_the_same_objects_have_the_same_draws(grid, drawn):
     )
     with pytest.raises(ValueError, match="'interpolate' must be an integer >= 0"):
         BayesFitter(grid, interpolate=-1)
+
+
+OPTICAL = ["megacam.u", "acs.f606w", "acs.f814w", "wfc3.f125w", "wfc3.f160w", "irac.ch1"]
+INFRARED = ["miri.f770w", "miri.f1000w", "miri.f1280w", "miri.f1500w", "miri.f1800w", "miri.f2100w"]
+CHAIN_BANDS = [*OPTICAL, *INFRARED]
+CHAIN = {
+    "redshift": np.expm1(np.linspace(np.log(1.2), np.log(4.0), 16)),
+    "tau": [0.1, 1.0, 5.0],
+    "age": [0.5, 1.0, 2.0],
+    "ebv": [0.1, 0.4, 0.8],
+    "alpha": [1.0, 2.5],
+    "ebv_polar": [0.0, 0.3],
+    "temperature_polar": [100.0, 300.0],
+    "frac_agn": [0.0, 0.3, 0.6, 0.9],
+}
+
+
+@pytest.fixture(scope="module")
+def chain():
+    """A coarse grid of a chain of galaxy and AGN."""
+    model = SEDModel.yang2021(libraries="bundled")
+    return model, model.grid(CHAIN, CHAIN_BANDS)
+
+
+@pytest.fixture(scope="module")
+def off_nodes(chain):
+    """80 models of the chain, of any node, anywhere in its cell, with S/N 10."""
+    model, rng, n, true = chain[0], np.random.default_rng(4), 80, QTable()
+    for name, values in CHAIN.items():
+        values = np.asarray(values)
+        edges = np.concatenate([values[:1], 0.5 * (values[1:] + values[:-1]), values[-1:]])
+        node = rng.integers(values.size, size=n)
+        value = edges[node] + np.diff(edges)[node] * rng.random(n)
+        true[name] = value * model.parameters[name].unit
+    fluxes = model.fluxes(true, CHAIN_BANDS)
+    table = QTable({"id": np.arange(n), "z": true["redshift"]})
+    for name in CHAIN_BANDS:
+        table[name] = fluxes[name] * (1.0 + 0.1 * rng.normal(size=n))
+        table[f"{name}_err"] = 0.1 * fluxes[name]
+    for name in ("stellar_mass", "sfr", "dust_luminosity"):
+        true[name] = fluxes[name]
+    return table, true, fluxes
+
+
+def test_interpolated_models_are_those_of_the_chain(chain, off_nodes):
+    """Between the nodes of a finer grid; between those of the grid itself they are far off."""
+    (model, grid), (_, true, fluxes) = chain, off_nodes
+    values = {name: true[name].value for name in CHAIN}
+    want = np.column_stack([fluxes[name].value for name in CHAIN_BANDS])
+    off = []
+    for finer in (None, model):
+        fitter = BayesFitter(grid, interpolate=1, finer=finer)
+        models: Continuation = fitter.backend.between.models
+        flux, power = models.fluxes(models.models(values))
+        ratio = np.log(flux * 1e10 / want)
+        off.append(np.sqrt(np.mean(np.minimum(np.abs(ratio), 0.3) ** 2)))
+        derived = models.describe(models.models(values), power, np.full(len(want), 1e10))[1]
+    assert off[0] > 0.1
+    assert off[1] < 0.02
+    for name, within in (("stellar_mass", 0.005), ("sfr", 0.1), ("dust_luminosity", 0.05)):
+        np.testing.assert_allclose(derived[name], true[name].value, rtol=within)
+
+
+def test_intervals_of_galaxies_and_agn(chain, off_nodes):
+    """Of models of the chain, two-sided; ``benchmarks/intervals.py`` measures more of them."""
+    (model, grid), (table, true, _) = chain, off_nodes
+    fitter = BayesFitter(grid, model_error=0.0, interpolate=300, finer=model)
+    results = fitter.fit(table)
+    nodes = BayesFitter(grid, model_error=0.0).fit(table)
+    names = ("redshift", "frac_agn", "stellar_mass", "sfr", "dust_luminosity")
+    held = {}
+    for name in names:
+        low, high = results.percentile(name, [0.16, 0.84]).T
+        held[name] = np.mean((true[name] >= low) & (true[name] <= high))
+        # three times the binomial error of 80 objects
+        assert abs(held[name] - 0.68) < 0.157, name
+        low, high = nodes.percentile(name, [0.16, 0.84]).T
+        assert np.mean((true[name] >= low) & (true[name] <= high)) < held[name], name
+    assert abs(np.mean(list(held.values())) - 0.68) < 0.1
+
+
+def test_known_redshifts_between_nodes_are_those_of_the_chain(chain):
+    """Galaxies of the nodes at redshifts between: chi2 is that of no noise, whatever the cells' width."""
+    model, grid = chain
+    true = QTable({"redshift": [0.51, 0.87, 1.63, 2.71], "age": [1.0, 0.5, 2.0, 1.0] * u.Gyr})
+    true["tau"], true["ebv"] = [0.1, 1.0, 5.0, 1.0] * u.Gyr, [0.4, 0.1, 0.8, 0.4] * u.mag
+    true["alpha"], true["frac_agn"] = [1.0, 2.5, 2.5, 1.0], np.zeros(4)
+    fluxes = model.fluxes(true, CHAIN_BANDS)
+    table = QTable({"id": np.arange(4)})
+    for name in CHAIN_BANDS:
+        table[name], table[f"{name}_err"] = fluxes[name], 0.02 * fluxes[name]
+    known = np.array(true["redshift"])
+    results = BayesFitter(grid, model_error=0.0, interpolate=20, finer=model).fit(
+        table, redshift=known
+    )
+    # fluxes are good to half a percent, a quarter of their errors
+    assert np.all(results.chi2 < len(CHAIN_BANDS) / 10)
+    nodes = BayesFitter(grid, model_error=0.0).fit(table, redshift=known)
+    assert np.all(nodes.chi2 > 10 * results.chi2)
+    for name in ("age", "tau", "ebv"):
+        np.testing.assert_allclose(u.Quantity(results.best[name]).value, true[name].value)
+
+
+def test_a_finer_grid_is_of_the_model_that_made_the_grid(chain):
+    model, grid = chain
+    other = SEDModel.yang2021(libraries="bundled", frac_agn_definition="3-1000um")
+    with pytest.raises(ValueError, match="'finer' must be the model that made the grid"):
+        BayesFitter(grid, interpolate=10, finer=other)
+    with pytest.raises(ValueError, match="'finer' must be None without 'interpolate'"):
+        BayesFitter(grid, finer=model)
+    with pytest.raises(ValueError, match="'finer' must be an SEDModel"):
+        BayesFitter(grid, interpolate=10, finer=grid)
