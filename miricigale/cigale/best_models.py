@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import astropy.constants as const
 import astropy.units as u
 import numpy as np
 from astropy.io import fits
@@ -11,17 +12,21 @@ from miricigale.cigale.names import AGN_PARTS, cigale_names
 from miricigale.filters import Filter
 from miricigale.filters.band_names import filter_of_band
 from miricigale.sed.spectrum import distance
-from miricigale.sed.xray_bands import disk_2500
+from miricigale.sed.xray_bands import SPAN, XRays, disk_2500
 from miricigale.utils.store import replacing
 
 __all__ = ["best_model_table", "write_best_models"]
 
 _LYMAN = 0.0912  # um
 _LIGHT = 299792458.0  # m/s
+_KEV_UM = (const.h * const.c).to_value(u.keV * u.um)
+_XRAY_WAVE = _KEV_UM / np.geomspace(*SPAN[::-1], 1000)  # um
 _AGN_COLUMNS = {"torus": "torus", "polar": "polar_dust", "disk": "disk"}
 
 
-def best_model_table(model, parameters, *, modules=None, bands=("B_B90", "V_B90", "FUV"), far=None):
+def best_model_table(
+    model, parameters, *, modules=None, bands=("B_B90", "V_B90", "FUV"), far=None, xray=None
+):
     """
     One model in the layout of CIGALE's best models.
 
@@ -37,6 +42,9 @@ def best_model_table(model, parameters, *, modules=None, bands=("B_B90", "V_B90"
         Bands, by CIGALE's names, of whose attenuation there is a quantity.
     far : `~astropy.units.Quantity`, optional
         Distance at which ``Fnu`` is; that of the redshift by default.
+    xray : dict, optional
+        Options of `~miricigale.sed.with_xray_bands`, for X-rays; ``alpha_ox`` is that of the model, NaN
+        where its corona is not known.
 
     Returns
     -------
@@ -44,8 +52,9 @@ def best_model_table(model, parameters, *, modules=None, bands=("B_B90", "V_B90"
         ``wavelength`` (nm, observed), ``Fnu`` (mJy), ``L_lambda_total`` and its parts (W/nm of observed
         wavelength; what is absorbed is negative), which sum to it: ``stellar.old`` and ``young``,
         ``nebular.absorption_*``, ``lines_*`` and ``continuum_*``, ``attenuation.*`` of each, ``dust``,
-        ``agn.SKIRTOR2016_torus``, ``polar_dust`` and ``disk``, ``igm``. The meta hold quantities by CIGALE's
-        names, in its units.
+        ``agn.SKIRTOR2016_torus``, ``polar_dust`` and ``disk``, ``igm``; with ``xray`` also ``xray.galaxy``
+        and, where ``alpha_ox`` is known, ``xray.agn``, in 0.25-1200 keV, without absorption. The meta hold
+        quantities by CIGALE's names, in its units.
 
     Raises
     ------
@@ -82,14 +91,23 @@ def best_model_table(model, parameters, *, modules=None, bands=("B_B90", "V_B90"
             light = power * getattr(nucleus, name)
             parts[f"agn.SKIRTOR2016_{told}"] = light
             quantities[AGN_PARTS[name][1]] = float(chain.weights @ light)
-        slope = derived["accretion_power"] * disk_2500(chain, model.component("agn"), values)
-        quantities["agn.intrin_Lnu_2500A_30deg"] = slope
+        disk = derived["accretion_power"] * disk_2500(chain, model.component("agn"), values)
+        quantities["agn.intrin_Lnu_2500A_30deg"] = disk
     total = sum(parts.values())
     parts["igm"] = total * (chain.sky(values) - 1.0)
+    quantities |= _attenuation(chain, parts, bands)
+    wave = chain.wave
+    if xray:
+        wave = np.concatenate([_XRAY_WAVE, wave])
+        parts = {name: np.pad(light, (_XRAY_WAVE.size, 0)) for name, light in parts.items()}
+        disk = quantities.get("agn.intrin_Lnu_2500A_30deg", np.nan)
+        bright, found = _xrays(xray, derived, values, disk)
+        parts |= {name: np.pad(light, (0, chain.wave.size)) for name, light in bright.items()}
+        quantities |= found
     z = values["redshift"]
     far = float(distance(z, model.cosmology) if far is None else far.to_value(u.m))
     table = Table()
-    table["wavelength"] = chain.wave * (1.0 + z) * 1e3 * u.nm
+    table["wavelength"] = wave * (1.0 + z) * 1e3 * u.nm
     luminosity = sum(parts.values()) / (1.0 + z) * 1e-3  # W/nm of observed wavelength
     fnu = luminosity * 1e9 * (table["wavelength"] * 1e-9) ** 2 / (_LIGHT * 4.0 * np.pi * far**2)
     table["Fnu"] = np.asarray(fnu) * 1e29 * u.mJy
@@ -99,11 +117,35 @@ def best_model_table(model, parameters, *, modules=None, bands=("B_B90", "V_B90"
     for ours, (theirs, _, scale) in cigale_names(modules).items():
         if ours in derived or ours in values:
             quantities[theirs] = scale * (derived[ours] if ours in derived else values[ours])
-    quantities |= _attenuation(chain, parts, bands)
     quantities["universe.age"] = model.cosmology.age(z).to_value(u.Myr)
     quantities["universe.luminosity_distance"] = far
     table.meta.update({name: float(value) for name, value in sorted(quantities.items())})
     return table
+
+
+def _xrays(options, derived, values, disk):
+    """L_lambda of X-rays in W/um at rest, `_XRAY_WAVE`, of the galaxy and the corona; their quantities."""
+    options = dict(options)
+    slope = float(options.pop("alpha_ox", np.nan))
+    xrays, energy = XRays(**options), _KEV_UM / _XRAY_WAVE
+    names = ("sfr_100myr", "stellar_mass", "age_mass")
+    sources = xrays.galaxy(*(derived[name] for name in names), values["metallicity"])
+    per_um = energy / _XRAY_WAVE  # keV for each um
+    light = {"xray.galaxy": sum(one.spectrum(energy) for one in sources.values()) * per_um}
+    found = {
+        "xray.gam": xrays.photon_index,
+        "xray.E_cut": xrays.cutoff.to_value(u.keV),
+        "xray.det_lmxb": xrays.lmxb,
+        "xray.det_hmxb": xrays.hmxb,
+    }
+    if np.isfinite(slope * disk):
+        sources["agn"] = corona = xrays.corona(disk, slope, values["inclination"])
+        light["xray.agn"] = corona.spectrum(energy) * per_um
+        found["xray.alpha_ox"] = slope
+    for name, one in sources.items():
+        low, high = (f"{energy:g}".replace(".", "p") for energy in one.band)
+        found[f"xray.{name}_Lx_{low}to{high}keV"] = one.power
+    return light, found
 
 
 def _stars(model, values):
@@ -148,7 +190,7 @@ def _attenuation(chain, parts, bands):
     return out
 
 
-def write_best_models(results, folder, *, modules=None, overwrite=False):
+def write_best_models(results, folder, *, modules=None, xray=None, overwrite=False):
     """
     Write the best model of every object as CIGALE does.
 
@@ -160,6 +202,8 @@ def write_best_models(results, folder, *, modules=None, overwrite=False):
         Gets ``<id>_best_model.fits`` for each object that was fitted; made if it is not there.
     modules : dict of str to str, optional
         As for `best_model_table`; by default those of ``results.meta["cigale"]``.
+    xray : dict, optional
+        Options of `~miricigale.sed.with_xray_bands` with which the grid was made, for X-rays.
     overwrite : bool, optional
         Whether files that are there are replaced.
 
@@ -191,7 +235,9 @@ def write_best_models(results, folder, *, modules=None, overwrite=False):
         known = {name: value for name, value in known.items() if np.isfinite(value)}
         own = one.distance is not None and np.isfinite(one.distance)
         far = float(one.distance) * u.Mpc if own else None
-        table = best_model_table(one.model, known, modules=modules, far=far)
+        if xray:
+            xray = xray | {"alpha_ox": float(one.best.get("alpha_ox", np.nan))}
+        table = best_model_table(one.model, known, modules=modules, far=far, xray=xray)
         table.meta["best.chi_square"] = float(one.chi2)
         path = folder / f"{np.asarray(one.ids).item()}_best_model.fits"
         meta, table.meta = table.meta, {}

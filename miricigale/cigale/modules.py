@@ -315,8 +315,9 @@ def _xray(m):
     try:
         first, second = (float(part) for part in text.split("&"))
     except ValueError:
-        msg = f"xray.angle_coef must be one pair of numbers as 0.5 & 0, got {text!r}"
+        msg = f"{m.label('angle_coef')} must be one pair of numbers as 0.5 & 0, got {text!r}"
         raise ConfigError(msg) from None
+    m.chain.modules["xray"] = m.name
     m.chain.xray = {
         "alpha_ox": m.numbers("alpha_ox", ALPHA_OX),
         "photon_index": m.one("gam", 1.8),
@@ -328,10 +329,14 @@ def _xray(m):
         "hmxb_index": m.one("gam_hmxb", 2.0),
     }
     if not m.has("alpha_ox"):
-        m.chain.differs.append("xray: not in the file, the default here: alpha_ox = -1.9 to -1.1")
+        m.chain.differs.append(
+            f"{m.name}: not in the file, the default here: alpha_ox = -1.9 to -1.1"
+        )
     m.chain.max_dev_alpha_ox = max(m.one("max_dev_alpha_ox", 0.2), 0.0)
     if m.chain.max_dev_alpha_ox:
-        m.chain.differs.append(f"xray.max_dev_alpha_ox: by {N_DRAWS} draws of each posterior")
+        m.chain.differs.append(
+            f"{m.label('max_dev_alpha_ox')}: by {N_DRAWS} draws of each posterior"
+        )
 
 
 def _redshifting(m):
@@ -353,6 +358,7 @@ _MODULES = {
     "dl2007": _dl2007,
     "skirtor2016": _skirtor2016,
     "xray": _xray,
+    "yang20": _xray,  # its name since there is a second module of X-rays
     "redshifting": _redshifting,
 }
 

@@ -88,7 +88,7 @@ def read_pcigale_ini(path, *, libraries="best", names=None, strict=False):
             raise ConfigError(msg)
     known = {theirs for theirs, *_ in cigale_names(chain.modules).values()}
     if chain.xray and not hard:
-        chain.left_out.append("xray (no band of it)")
+        chain.left_out.append(f"{chain.modules['xray']} (no band of it)")
     if dark or not hard:
         known -= {"xray.alpha_ox", "xray.agn_Lx_2to10keV", "agn.intrin_Lnu_2500A_30deg"}
     variables = analysis["variables"]
@@ -182,5 +182,6 @@ def fit_cigale(
     if output is not None:
         setup.write_results(results, output, overwrite=True)
     if best_models is not None:
-        write_best_models(results, best_models, overwrite=True)
+        xray = setup.xray if setup.xray_bands() else None
+        write_best_models(results, best_models, xray=xray, overwrite=True)
     return results

@@ -16,6 +16,7 @@ __all__ = [
     "model_fluxes",
     "observed_spectra",
     "rest_spectra",
+    "row_values",
 ]
 
 
@@ -114,12 +115,12 @@ def _factors(model, grid, index):
     chain = model.chain
     galaxies, galaxy = np.unique(index[:, 1], return_inverse=True)
     models, agn = np.unique(index[:, 2], return_inverse=True)
-    rows = [_row(model, grid.galaxy_parameters, g) for g in galaxies.tolist()]
+    rows = [row_values(model, grid.galaxy_parameters, g) for g in galaxies.tolist()]
     keys = [[chain.key(row, *roles) for row in rows] for roles in GALAXY]
     light, _ = chain.attenuated(chain.stars(keys[0]), *keys[1:])
     nuclei = np.zeros((1, chain.wave.size))
     if grid.n_agn and np.any(grid.frac_agn[index[:, 3]] > 0):
-        parts = [chain.agn(_row(model, grid.agn_parameters, k)) for k in models.tolist()]
+        parts = [chain.agn(row_values(model, grid.agn_parameters, k)) for k in models.tolist()]
         nuclei = np.array([part.total for part in parts])
         if model.frac_agn_definition != "dust":
             nuclei = nuclei / chain.reference(nuclei)[:, None]
@@ -128,7 +129,7 @@ def _factors(model, grid, index):
     return chain.lnu(light), galaxy.ravel(), chain.lnu(nuclei), agn.ravel()
 
 
-def _row(model, table, row):
+def row_values(model, table, row):
     """Parameters of one row as plain numbers in the model's units, with defaults for the others."""
     return model.defaults | {
         name: float(model.parameters[name].convert(table[name][row]))

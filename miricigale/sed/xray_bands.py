@@ -1,18 +1,21 @@
 """X-ray bands of a grid: corona of the AGN by alpha_ox, binaries and hot gas of the galaxy."""
 
 import dataclasses
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import astropy.constants as const
 import astropy.units as u
 import numpy as np
 
 from miricigale.filters import Filter
+from miricigale.sed.grid_spectra import row_values
 from miricigale.sed.spectrum import distance
 from miricigale.sed.xray import check_band
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import positive, to_array
 
-__all__ = ["ALPHA_OX", "disk_2500", "with_xray_bands", "xray_filter"]
+__all__ = ["ALPHA_OX", "SPAN", "XRays", "disk_2500", "with_xray_bands", "xray_filter"]
 
 #: Slopes between 2500 A and 2 keV, the values of X-CIGALE.
 ALPHA_OX = tuple(np.round(np.arange(-1.9, -1.05, 0.1), 1))
@@ -33,22 +36,66 @@ _GAS = 8.3e31
 _LOW_MASS = (33.276, -1.503, -0.423, 0.425, 0.136)
 _HIGH_MASS = (33.28, -62.12, 569.44, -1833.80, 1968.33)
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
+#: Energies in keV between which `Source.spectrum` is drawn, those of X-CIGALE.
+SPAN = (0.25, 1200.0)
 
 
-def with_xray_bands(
-    grid,
-    model,
-    bands,
-    *,
-    alpha_ox=ALPHA_OX,
-    photon_index=1.8,
-    cutoff=300 * u.keV,
-    angle_coefficients=(0.5, 0.0),
-    lmxb=0.0,
-    hmxb=0.0,
-    lmxb_index=1.56,
-    hmxb_index=2.0,
-):
+class Source(NamedTuple):
+    """What shines as E^(1 - index) exp(-E / cutoff): powers in W between two energies in keV."""
+
+    power: np.ndarray
+    index: float
+    cutoff: float
+    band: tuple
+
+    def spectrum(self, energy):
+        """L_E in W/keV."""
+        shape = _shape(energy, self.index, self.cutoff)
+        return self.power * shape / _energy(*self.band, self.index, self.cutoff)
+
+    def dimming(self, band, redshift, far):
+        """F_nu in uJy, the mean of an observed band (keV), over the power; distances in m."""
+        low, high = band
+        share = [_energy(low * (1 + z), high * (1 + z), self.index, self.cutoff) for z in redshift]
+        share = np.array(share) / _energy(*self.band, self.index, self.cutoff)
+        return share / (4.0 * np.pi * far**2 * (high - low) * _PER_KEV * _MICROJANSKY)
+
+
+@dataclass(frozen=True, eq=False)
+class XRays:
+    """Options of `with_xray_bands`, and the sources that they make."""
+
+    photon_index: float = 1.8
+    cutoff: u.Quantity = 300 * u.keV
+    angle_coefficients: tuple = (0.5, 0.0)
+    lmxb: float = 0.0
+    hmxb: float = 0.0
+    lmxb_index: float = 1.56
+    hmxb_index: float = 2.0
+
+    def galaxy(self, rate, mass, age, metallicity):
+        """Sources of galaxies by name, of SFR in Msun/yr, surviving mass in Msun, age in Gyr and Z."""
+        low = 1e-10 * mass * 10.0 ** (np.polyval(_LOW_MASS[::-1], np.log10(age)) + self.lmxb)
+        high = rate * 10.0 ** (np.polyval(_HIGH_MASS[::-1], metallicity) + self.hmxb)
+        return {
+            "lmxb": Source(low, self.lmxb_index, _CUT_BINARIES, _HARD),
+            "hmxb": Source(high, self.hmxb_index, _CUT_BINARIES, _HARD),
+            "hotgas": Source(_GAS * rate, _INDEX_GAS, _CUT_GAS, _SOFT),
+        }
+
+    def corona(self, disk, alpha_ox, inclination):
+        """The corona of disks of L_nu in W/Hz at 2500 A and 30 deg, as seen at inclinations in deg."""
+        cut = positive(self.cutoff, u.keV, "cutoff")
+        a1, a2 = self.angle_coefficients
+        mu = np.cos(np.radians([np.broadcast_to(_ANGLE, np.shape(inclination)), inclination]))
+        at_30, seen = a1 * mu + a2 * mu**2 + 1.0 - a1 - a2
+        # L_E at 2 keV, whose integral over the spectrum's shape is the power
+        at_two = 10.0 ** (alpha_ox / _PER_DEX) * disk * seen / at_30 * _PER_KEV
+        shape = _energy(*_HARD, self.photon_index, cut) / _shape(_TWO, self.photon_index, cut)
+        return Source(at_two * shape, self.photon_index, cut, _HARD)
+
+
+def with_xray_bands(grid, model, bands, *, alpha_ox=ALPHA_OX, **options):
     r"""
     Add X-ray bands to a grid, so that a fit takes X-ray fluxes like all others.
 
@@ -70,11 +117,12 @@ def with_xray_bands(
     alpha_ox : array_like, optional
         Ascending slopes.
     photon_index, lmxb_index, hmxb_index : float, optional
-        Gamma of the corona and of low-mass and high-mass binaries.
+        Gamma of the corona (1.8) and of low-mass (1.56) and high-mass binaries (2).
     cutoff : `~astropy.units.Quantity`, optional
-        Energy of the corona's cutoff; the binaries' is 100 keV.
+        Energy of the corona's cutoff, 300 keV; the binaries' is 100 keV.
     angle_coefficients : tuple of float, optional
-        a1 and a2 of the corona seen at an inclination i, a1 cos i + a2 cos^2 i + 1 - a1 - a2 of that at 0.
+        a1 and a2 (0.5 and 0) of the corona seen at an inclination i, a1 cos i + a2 cos^2 i + 1 - a1 - a2 of that
+        at 0.
     lmxb, hmxb : float, optional
         Dex by which the binaries are brighter than usual.
 
@@ -107,33 +155,30 @@ def with_xray_bands(
     slopes = to_array(alpha_ox, u.dimensionless_unscaled, "alpha_ox", ndim=1, finite=True)
     if slopes.size == 0 or np.any(np.diff(slopes) <= 0):
         raise argument_error("alpha_ox", "ascending values", f"{slopes}")
-    z, far = grid.redshift, distance(grid.redshift, model.cosmology)
+    xrays, z, far = XRays(**options), grid.redshift, distance(grid.redshift, model.cosmology)
 
-    def observed(index, cut, power, norm):
-        """Fluxes in uJy, (nz, n, n_bands), of power (n,) in W within energies ``norm`` at rest."""
-        out = np.empty((z.size, len(power), len(energies)))
-        for k, (low, high) in enumerate(energies.values()):
-            share = np.array([_energy(low * (1 + x), high * (1 + x), index, cut) for x in z])
-            share /= _energy(*norm, index, cut)
-            dim = 4.0 * np.pi * far**2 * (high - low) * _PER_KEV * _MICROJANSKY
-            out[:, :, k] = (share / dim)[:, None] * power
-        return out
+    def observed(*sources):
+        """Fluxes in uJy, (nz, n, n_bands)."""
+        seen = [
+            [s.dimming(band, z, far)[:, None] * s.power for s in sources]
+            for band in energies.values()
+        ]
+        return np.moveaxis(np.sum(seen, axis=1), 0, -1)
 
-    low, high, gas = _galaxy_powers(grid, lmxb, hmxb)
-    galaxy = observed(lmxb_index, _CUT_BINARIES, low, _HARD)
-    galaxy += observed(hmxb_index, _CUT_BINARIES, high, _HARD)
-    galaxy += observed(_INDEX_GAS, _CUT_GAS, gas, _SOFT)
-    new = {"galaxy": np.concatenate([grid.galaxy, galaxy], axis=2)}
+    galaxies = xrays.galaxy(
+        grid.galaxy_properties["sfr_100myr"].to_value(1 / u.yr),
+        grid.galaxy_properties["stellar_mass"].to_value(u.one),
+        grid.galaxy_shape["age_mass"].to_value(u.Gyr),
+        u.Quantity(grid.galaxy_parameters["metallicity"]).value,
+    )
+    new = {"galaxy": np.concatenate([grid.galaxy, observed(*galaxies.values())], axis=2)}
     if grid.n_agn:
-        cut = positive(cutoff, u.keV, "cutoff")
-        disk, angle = _disks(grid, model, angle_coefficients)
-        # L_E at 2 keV, whose integral over the spectrum's shape is the power
-        at_two = 10.0 ** (slopes / _PER_DEX) * disk[:, None] * angle[:, None] * _PER_KEV
-        hard = at_two * _energy(*_HARD, photon_index, cut) / _shape(_TWO, photon_index, cut)
-        corona = observed(photon_index, cut, hard.ravel(), _HARD)
+        disk, inclination = _disks(grid, model)
+        corona = xrays.corona(disk[:, None], slopes, inclination[:, None])
+        corona = corona._replace(power=corona.power.ravel())
         agn = np.repeat(grid.agn, slopes.size, axis=1)
-        new["agn"] = np.concatenate([agn, corona], axis=2)
-        new |= _agn_rows(grid, slopes, disk, hard.ravel())
+        new["agn"] = np.concatenate([agn, observed(corona)], axis=2)
+        new |= _agn_rows(grid, slopes, disk, corona.power)
     else:
         new["agn"] = np.zeros((z.size, 0, len(grid.filters) + len(energies)))
     return dataclasses.replace(grid, filters=(*grid.filters, *energies), **new)
@@ -160,29 +205,13 @@ def _agn_rows(grid, slopes, disk, hard):
     }
 
 
-def _galaxy_powers(grid, lmxb, hmxb):
-    """Low-mass and high-mass binaries (2-10 keV), hot gas (0.5-2 keV) of each galaxy, W for each Msun formed."""
-    rate = grid.galaxy_properties["sfr_100myr"].to_value(1 / u.yr)
-    mass = grid.galaxy_properties["stellar_mass"].to_value(u.one)
-    age = np.log10(grid.galaxy_shape["age_mass"].to_value(u.Gyr))
-    metals = u.Quantity(grid.galaxy_parameters["metallicity"]).value
-    low = 1e-10 * mass * 10.0 ** (np.polyval(_LOW_MASS[::-1], age) + lmxb)
-    return low, rate * 10.0 ** (np.polyval(_HIGH_MASS[::-1], metals) + hmxb), _GAS * rate
-
-
-def _disks(grid, model, coefficients):
-    """L_nu at 2500 A and 30 deg, W/Hz for each W of AGN power, and the corona seen over that at 30 deg."""
-    a1, a2 = coefficients
-    rows = [
-        model.defaults
-        | {name: float(model.parameters[name].convert(row[name])) for name in row.colnames}
-        for row in grid.agn_parameters
-    ]
+def _disks(grid, model):
+    """L_nu at 2500 A and 30 deg, W/Hz for each W of AGN power, and inclinations in deg."""
+    rows = [row_values(model, grid.agn_parameters, k) for k in range(grid.n_agn)]
     agn = model.component("agn")
     light = np.array([disk_2500(model.chain, agn, row) for row in rows])
-    mu = np.cos(np.radians([[row["inclination"] for row in rows], [_ANGLE] * len(rows)]))
-    seen, at_30 = a1 * mu + a2 * mu**2 + 1.0 - a1 - a2
-    return light * grid.agn_properties["accretion_power"].value, seen / at_30
+    inclination = np.array([row["inclination"] for row in rows])
+    return light * grid.agn_properties["accretion_power"].value, inclination
 
 
 def disk_2500(chain, agn, values):
