@@ -21,14 +21,10 @@ __all__ = ["read_spectra", "template_grid"]
 
 _SUFFIXES = (".fits", ".fit", ".dat", ".txt", ".csv", ".ecsv", ".ascii")
 _FLAM = u.erg / u.s / u.cm**2 / u.AA
-#: How libraries write units that astropy does not know.
-_UNITS = {
-    "angstroms": u.AA,
-    "angstrom": u.AA,
-    "microns": u.um,
-    "flam": _FLAM,
-    "fnu": _FLAM * u.AA / u.Hz,
-}
+#: How libraries write units that astropy does not know, in any case.
+_UNITS = {"angstroms": u.AA, "microns": u.um, "flam": _FLAM, "fnu": _FLAM * u.AA / u.Hz}
+_UNITS = {spelt: unit for x, unit in _UNITS.items() for spelt in (x, x.capitalize(), x.upper())}
+_UNITS["ANGSTROM"] = u.AA
 #: Where spectra that end before are continued to.
 _FAR = 100.0  # um
 #: Part of the wavelengths at the end of a spectrum whose mean its continuation starts from.
@@ -77,7 +73,8 @@ def read_spectra(path):
 
 
 def _read_file(file):
-    table = read_table(file, wanted="a spectrum", cls=Table)
+    with u.add_enabled_aliases(_UNITS):
+        table = read_table(file, wanted="a spectrum", cls=Table)
     if len(table.colnames) < 2:
         msg = f"{file} cannot be read as a spectrum: it has the columns {table.colnames}"
         raise DataError(msg)
@@ -85,7 +82,7 @@ def _read_file(file):
     gravities = [name for name in others if re.fullmatch(r"g\d\d", name)]
     try:
         # NaN where a value is lacking, which is none of a spectrum
-        wave = plain_floats(table[first], first, "spectrum") * _unit(table[first], u.AA)
+        wave = plain_floats(table[first], first, "spectrum") * (table[first].unit or u.AA)
         stem = re.sub(
             rf"({'|'.join(map(re.escape, _SUFFIXES))})?(\.gz)?$", "", file.name, flags=re.I
         )
@@ -97,18 +94,11 @@ def _read_file(file):
                 # atmospheres that were not computed are 0 in such files
                 if not gravities or one.any():
                     name = stem if part is None else f"{stem}[{part}]"
-                    out[name] = SED(wave, one * _unit(table[column], _FLAM))
+                    out[name] = SED(wave, one * (table[column].unit or _FLAM))
         return out
     except (TypeError, ValueError, u.UnitsError) as err:
         msg = f"{file} cannot be read as a spectrum: {err}"
         raise DataError(msg) from err
-
-
-def _unit(column, default):
-    if column.unit is None:
-        return default
-    text = str(column.unit)
-    return _UNITS.get(text.lower()) or u.Unit(text)
 
 
 def template_grid(spectra, filters, *, beyond="error"):

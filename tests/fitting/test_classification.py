@@ -3,6 +3,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from astropy.io.fits import BinTableHDU, Column
 from astropy.modeling.models import BlackBody
 from astropy.table import QTable, Table
 from scipy.special import logsumexp
@@ -235,3 +236,24 @@ def test_atmospheres_of_all_gravities_are_read(tmp_path):
     low, high = (one.fnu.value for one in spectra.values())
     np.testing.assert_allclose(high, 2 * low)
     np.testing.assert_allclose(low, low[0])
+
+
+@pytest.mark.parametrize(
+    ("units", "scale"),
+    # F_lambda of 1e-17 at 5000 Angstrom is 8.339 uJy; F_nu of 1e-29 erg/s/cm2/Hz is 1 uJy
+    [(("ANGSTROMS", "FLAM"), 1e-17), (("angstroms", "flam"), 1e-17), (("MICRONS", "FNU"), 1e-29)],
+)
+def test_units_as_stsci_writes_them(tmp_path, units, scale):
+    """The Pickles atlas says ANGSTROMS and FLAM, which FITS does not know: no warning, and no flux lost."""
+    wave = np.linspace(4000, 6000, 201) * (1e-4 if units[0] == "MICRONS" else 1.0)
+    columns = [
+        Column(name, "D", unit=unit, array=array)
+        for name, unit, array in zip(
+            ("WAVELENGTH", "FLUX"), units, (wave, np.full(201, scale)), strict=True
+        )
+    ]
+    BinTableHDU.from_columns(columns).writeto(tmp_path / "pickles_1.fits")
+    (sed,) = read_spectra(tmp_path).values()
+    assert sed.wave[100].to_value("Angstrom") == pytest.approx(5000)
+    level = 1.0 if units[1] == "FNU" else 8.339
+    assert sed.fnu[100].to_value("uJy") == pytest.approx(level, rel=1e-4)
