@@ -281,10 +281,16 @@ def sfr_log_prior(sfr_prior, grid):
 
 
 def expected_sfr(relation, mass, redshift):
-    """Star-formation rates of a relation in Msun/yr; a `ValueError` tells those that are none."""
+    """Star-formation rates of a relation in Msun/yr; a `ValueError` tells where they are none."""
     rate = to_array(relation(mass, redshift), u.Msun / u.yr, "sfr_prior")
-    if not np.all(rate >= 0):
-        raise argument_error("sfr_prior", "a relation to rates >= 0", "NaN or negative ones")
+    bad = ~((rate > 0) & np.isfinite(rate))
+    if np.any(bad):
+        # a rate of 0 would leave no galaxy any prior
+        values, mass, z = (
+            x[bad][0] for x in np.broadcast_arrays(rate, mass.to_value(MASS), redshift)
+        )
+        got = f"{values:g} Msun/yr at {mass:.3g} Msun and redshift {z:g}"
+        raise argument_error("sfr_prior", "a relation to rates above 0 and finite", got)
     return rate
 
 

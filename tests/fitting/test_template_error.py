@@ -234,9 +234,12 @@ def test_prior_of_star_formation_given_mass_and_redshift(make_grid):
     bare = BayesFitter(grid, sfr_prior=(lambda mass, z: relation(mass, z).value, 0.3))
     with pytest.raises(u.UnitsError, match="'sfr_prior' must be a quantity"):
         bare.fit(table)
-    nothing = BayesFitter(grid, sfr_prior=(lambda mass, z: np.nan * relation(mass, z), 0.3))
-    with pytest.raises(ValueError, match="'sfr_prior' must be a relation to rates >= 0"):
-        nothing.fit(table)
+    for factor, got in ((np.nan, "nan"), (0.0, "0"), (-1.0, "-"), (np.inf, "inf")):
+        nothing = BayesFitter(grid, sfr_prior=(lambda m, z, x=factor: x * relation(m, z), 0.3))
+        with pytest.raises(
+            ValueError, match=f"'sfr_prior' must be .* above 0 and finite, got {got}"
+        ):
+            nothing.fit(table)
     with pytest.raises(ValueError, match="'sfr_prior' must be None with 'interpolate'"):
         BayesFitter(grid, sfr_prior=(relation, 0.3), interpolate=100)
     with pytest.raises(ValueError, match="'sfr_prior' must be left out with a sampler"):
