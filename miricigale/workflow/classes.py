@@ -1,6 +1,7 @@
 """Catalogs sorted into galaxies, quasars and stars: fits of each class, their table and their part of a page."""
 
 import warnings
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,6 @@ import numpy as np
 from miricigale.evaluation import number
 from miricigale.fitting.classification import class_columns
 from miricigale.plotting.axes import WIDTH, new_figure
-from miricigale.utils.exceptions import MiricigaleWarning
 from miricigale.utils.row_files import write_rows
 from miricigale.workflow.commands import fit_catalog
 
@@ -43,6 +43,11 @@ def fit_classes(path, output, *, quasars=False, stars=None, **options):
     -------
     found : dict of str to `~miricigale.fitting.FitResultsFiles`
         ``galaxy``, ``quasar``, ``star``.
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        What `~miricigale.workflow.commands.fit_catalog` warns of, once for all classes.
     """
     spectra = None
     if stars is not None:
@@ -50,7 +55,9 @@ def fit_classes(path, output, *, quasars=False, stars=None, **options):
 
         # a file that cannot be read is told before hours of fitting
         spectra = read_spectra(stars)
-    found = {"galaxy": fit_catalog(path, output, **options)}
+    told = set()
+    with _each_once(told):
+        found = {"galaxy": fit_catalog(path, output, **options)}
     # after the fit, which refuses what it cannot read before it loads the models
     from miricigale.sed import SEDModel, quasar_axes, template_grid
 
@@ -65,12 +72,26 @@ def fit_classes(path, output, *, quasars=False, stars=None, **options):
     for name, make in models.items():
         left = ("pairs", "redshift") if name == "star" else ("pairs",)
         own = {key: value for key, value in options.items() if key not in left}
-        with warnings.catch_warnings():
-            # what was told of the catalog with the galaxies
-            for text in ("bands of the photometry", ".*numbers? that", ".*left out"):
-                warnings.filterwarnings("ignore", text, MiricigaleWarning)
+        with _each_once(told):
             found[name] = fit_catalog(path, Path(output) / name, models=make, **own)
     return found
+
+
+@contextmanager
+def _each_once(told):
+    """Show warnings but those of a text that was ``told``: what holds for the catalog holds for all classes."""
+    show = warnings.showwarning
+
+    def once(message, *args, **kwargs):
+        if str(message) not in told:
+            told.add(str(message))
+            show(message, *args, **kwargs)
+
+    warnings.showwarning = once
+    try:
+        yield
+    finally:
+        warnings.showwarning = show
 
 
 def write_table(found, path, *, overwrite=False):

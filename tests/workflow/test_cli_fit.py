@@ -1,5 +1,7 @@
 """``miricigale fit``: the folder it fills, and how it goes on."""
 
+import warnings
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -256,7 +258,9 @@ def test_fluxes_behind_the_milky_way_give_the_galaxies_in_front_of_it(catalog, t
     assert np.all(found["chi2_best"] < 0.1)
 
 
-def test_a_catalog_is_sorted_into_galaxies_quasars_and_stars(catalog, tmp_path, capsys):
+def test_a_catalog_is_sorted_into_galaxies_quasars_and_stars(
+    catalog, tmp_path, capsys, monkeypatch
+):
     """Two stars of the library's own temperatures between the galaxies, which are of the galaxies' models."""
     wave = np.geomspace(0.2, 60, 2000) * u.um
     folder = tmp_path / "stars"
@@ -273,8 +277,15 @@ def test_a_catalog_is_sorted_into_galaxies_quasars_and_stars(catalog, tmp_path, 
         rows[name] = 10 * grid.galaxy[0, 1:, i] * u.uJy
         rows[f"{name}_err"] = 0.05 * rows[name]
     table = vstack([catalog, rows])
+    table["miri.f999w"] = table["miri.f999w_err"] = 1.0 * u.uJy
     table.write(tmp_path / "cat.fits")
     out = tmp_path / "out"
+
+    def warned(*args, **options):
+        warnings.warn("a star is left out", MiricigaleWarning, stacklevel=2)
+        return template_grid(*args, **options)
+
+    monkeypatch.setattr("miricigale.sed.template_grid", warned)
     command = [
         "fit",
         str(tmp_path / "cat.fits"),
@@ -285,7 +296,12 @@ def test_a_catalog_is_sorted_into_galaxies_quasars_and_stars(catalog, tmp_path, 
         "--no-progress",
     ]
     command += ["--quasars", "--stars", str(folder), "--chunk-rows", "4"]
-    assert main(command) == 0
+    with pytest.warns(MiricigaleWarning) as record:
+        assert main(command) == 0
+    # what holds for the catalog is told once for all classes, what holds for one class is told
+    texts = [str(one.message) for one in record]
+    assert sum("not fitted" in text and "miri.f999w" in text for text in texts) == 1
+    assert texts.count("a star is left out") == 1
     table = QTable.read(out / "table.fits")
     assert table["class"].tolist()[:5] == ["galaxy"] * 5
     assert table["class"].tolist()[5:] == ["star"] * 2
@@ -296,8 +312,10 @@ def test_a_catalog_is_sorted_into_galaxies_quasars_and_stars(catalog, tmp_path, 
     page = (out / "page.html").read_text()
     assert "Galaxy, quasar or star" in page
     assert "that of the galaxy" in page
+    monkeypatch.undo()
     # the fits of the classes are whole: the same command goes on from them, and finds nothing to do
-    assert main(command) == 0
+    with pytest.warns(MiricigaleWarning, match="not fitted"):
+        assert main(command) == 0
     capsys.readouterr()
     assert main([*command[:-3], str(tmp_path / "none")]) == 2
     assert "no such file" in capsys.readouterr().err
