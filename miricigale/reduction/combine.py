@@ -74,7 +74,7 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align):
     result : `~miricigale.reduction.ReductionResult`
     """
     if not images:
-        raise argument_error("ramps", "at least one ramp", "none")
+        raise argument_error("images", "at least one image", "none")
     if align is not None:
         if isinstance(align, str) and align != "dithers":
             raise argument_error("align", "a SkyCoord, 'dithers' or None", repr(align))

@@ -431,6 +431,8 @@ class Reducer:
                 rates.append(rate)
             images.append(subtracted)
             backgrounds.append(background)
+        if not images:
+            raise argument_error("ramps", "at least one ramp", "none")
         options = {"rates": rates, "wcs": wcs, "pixel_scale": pixel_scale, "align": align}
         return self.combine(images, backgrounds, **options)
 
@@ -454,5 +456,10 @@ class Reducer:
         Returns
         -------
         result : `ReductionResult`
+
+        Raises
+        ------
+        ValueError
+            If there are no images.
         """
         return combine(self, images, backgrounds, rates, wcs, pixel_scale, align)

@@ -255,6 +255,8 @@ def test_bad_settings_are_named(options, match):
 
 def test_refuses_what_does_not_belong_together():
     reducer = Reducer(properties=DetectorProperties())
+    with pytest.raises(ValueError, match="'images' must be at least one image, got none"):
+        Reducer().combine([], [])
     with pytest.raises(ValueError, match="'ramps' must be at least one ramp"):
         reducer.run([])
     ramps = [
