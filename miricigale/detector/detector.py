@@ -24,7 +24,7 @@ from miricigale.detector.effects import (
 )
 from miricigale.detector.effects.order import check_order, keyed, place_of
 from miricigale.detector.image import checked_light
-from miricigale.detector.latent import Latent
+from miricigale.detector.latent import checked_previous
 from miricigale.detector.ramp import Ramp
 from miricigale.detector.work import Work
 from miricigale.instrument import DetectorProperties, ImageFacts, miri_detector
@@ -406,7 +406,10 @@ class Detector:
         light = checked_light(image, exposure)
         seed = check_seed(seed)
         effects, included = self._acting(image)
-        previous = self._previous(previous, exposure)
+        previous = checked_previous(previous, exposure)
+        if previous and not any(isinstance(e, Persistence) for e in self._effects):
+            wanted = "given to a detector whose effects hold Persistence"
+            raise argument_error("previous", wanted, "one without it")
         fraction = self._check_sky(light, exposure)
         meta = provenance(
             seed=seed,
@@ -417,24 +420,6 @@ class Detector:
         return Work(
             light, exposure, self._properties, keyed(effects, seed, exposure), previous, meta
         )
-
-    def _previous(self, previous, exposure):
-        """Previous exposures as a tuple, checked."""
-        if previous is None:
-            return ()
-        if isinstance(previous, Latent) or not np.iterable(previous):
-            previous = (previous,)
-        previous = tuple(previous)
-        for latent in previous:
-            if not isinstance(latent, Latent):
-                raise argument_error("previous", "a Latent or several", repr(latent))
-            if latent.subarray != exposure.subarray or latent.rate.shape != exposure.shape:
-                wanted = f"of {exposure.subarray}, {exposure.shape} pixels"
-                raise argument_error("previous", wanted, repr(latent))
-        if previous and not any(isinstance(e, Persistence) for e in self._effects):
-            wanted = "given to a detector whose effects hold Persistence"
-            raise argument_error("previous", wanted, "one without it")
-        return previous
 
     def _check_sky(self, light, exposure):
         """Share of the full well that the median pixel fills in one integration."""

@@ -10,7 +10,7 @@ from miricigale.instrument import DQ, aperture, miri_detector
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.units import TIME, Frozen, frozen_array, to_array
 
-__all__ = ["Latent"]
+__all__ = ["Latent", "checked_previous"]
 
 # pixels of a ramp that tell nothing of the light
 _NO_LIGHT = DQ.DO_NOT_USE | DQ.NON_SCIENCE | DQ.REFERENCE_PIXEL | DQ.DEAD
@@ -113,3 +113,17 @@ class Latent(Frozen):
         ny, nx = self.rate.shape
         n = np.count_nonzero(self.rate.value)
         return f"<Latent {self.subarray}: {n} of {ny} x {nx} pixels, {self.gap.value:g} s ago>"
+
+
+def checked_previous(previous, exposure):
+    """Exposures before one, a `Latent` or several, as a tuple; a `ValueError` tells what is none of its pixels."""
+    if previous is None:
+        return ()
+    previous = tuple(previous) if np.iterable(previous) else (previous,)
+    for latent in previous:
+        if not isinstance(latent, Latent):
+            raise argument_error("previous", "a Latent or several", repr(latent))
+        if latent.subarray != exposure.subarray or latent.rate.shape != exposure.shape:
+            wanted = f"of {exposure.subarray}, {exposure.shape} pixels"
+            raise argument_error("previous", wanted, repr(latent))
+    return previous

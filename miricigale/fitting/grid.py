@@ -292,8 +292,8 @@ class GridEngine:
         sums = workspace[0]
         single = self.rtol >= _SINGLE
         for i in np.flatnonzero(log_prior.max(axis=1, initial=-1e300) > -1e200):
-            target = self._target(data[i], sigma[i], log_prior[i])
-            limits = _limits(limit[i], inverse[i])
+            target = _core.make_target(data[i], sigma[i], log_prior[i], self.template_error)
+            limits = _core.make_limits(limit[i], inverse[i])
             tables = self._tables_of(target)
             sums.draws.state[0] = seeds[i]
             _core.clear(sums)
@@ -321,29 +321,6 @@ class GridEngine:
             found += (logsumexp(plain, axis=1) - logsumexp(found, axis=1))[:, None]
         log[rows, :n_galaxy] = np.where(found > -1e200, 2.0 * found, -1e300)
         return tables._replace(log_usable=log)
-
-    def _target(self, flux, sigma, log_prior):
-        """Bundle the data of one object."""
-        n_z, bands = len(log_prior), np.flatnonzero(np.isfinite(sigma))
-        level = np.zeros(n_z)
-        if self.template_error is None:
-            weight = 1.0 / np.square(sigma)
-            norm = np.full(n_z, np.sum(weight * flux * flux))
-            weight = np.tile(weight, (n_z, 1))
-        else:
-            more = np.square(self.template_error * flux)
-            weight = 1.0 / (np.square(sigma) + more)
-            norm = np.sum(weight * flux * flux, axis=1)
-            level = -norm - np.log1p(more / np.square(sigma)).sum(axis=1)
-        used = weight[:, bands]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            root32 = np.sqrt(used / used.max(axis=1, keepdims=True, initial=0.0)).astype(np.float32)
-            data32 = (flux[bands] * np.sqrt(used / norm[:, None])).astype(np.float32)
-        # at most 0: errors that are the same at all redshifts change nothing
-        top = -level.max() if np.any(level) else float(norm[0])
-        level -= level.max()
-        log_prior = np.where(log_prior > -1e200, log_prior + level, -1e300)
-        return _core.Target(flux, weight, log_prior, bands, root32, data32, norm, level, float(top))
 
     def _summarize(self, target, limits, sums, out, i):
         """Fill row i of the output."""
@@ -452,13 +429,3 @@ def _ratio(frac):
 def _two_log(prior):
     """Return 2 ln(prior), -1e300 where it is zero."""
     return 2.0 * np.log(prior, where=prior > 0, out=np.full(prior.shape, -5e299))
-
-
-def _limits(limit, inverse):
-    """Bundle the upper limits of one object; None if it has none."""
-    bands = np.flatnonzero(inverse > 0)
-    if bands.size == 0:
-        return None
-    level = limit[bands] * inverse[bands]
-    dark = float(-2.0 * log_ndtr(level).sum())
-    return _core.Limits(bands, level, inverse[bands], np.empty(bands.size), dark)

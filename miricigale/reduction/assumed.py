@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 from astropy.time import Time
 
-from miricigale.detector import Charge
+from miricigale.detector import Charge, Ramp
 from miricigale.instrument import Exposure, ImageFacts
 from miricigale.reduction.reference_maps import read_flat, read_photom
 from miricigale.reduction.references import BRIGHTNESS, SLOPES, STEP_OF, needed, own_maps
@@ -49,8 +49,10 @@ def maps_of(reducer, ramp):
     Raises
     ------
     ValueError
-        If there are no references for it, or another detector made it.
+        If it is no ramp, there are no references for it, or another detector made it.
     """
+    if not isinstance(ramp, (Ramp, Charge)):
+        raise argument_error("ramp", "a Ramp or a Charge", type(ramp).__name__)
     if is_own(reducer, ramp):
         told = reducer.references is not None or reducer.properties is not None
         if not told and ramp.properties not in (None, reducer.detector):

@@ -2,11 +2,12 @@
 
 from miricigale.instrument import ImageFacts, mosaic_wcs
 from miricigale.reduction.align import align_images
-from miricigale.reduction.background import BackgroundFlags, remove_background
+from miricigale.reduction.background import BackgroundFlags, estimated, remove_background
 from miricigale.reduction.dither_background import dither_backgrounds, restored
 from miricigale.reduction.images import check_images, check_overlap, seen_wcs
 from miricigale.reduction.mosaic import drizzle_images, pixel_map, reject_outliers, weight_map
 from miricigale.reduction.results import ReductionResult
+from miricigale.reduction.settings import mesh_options, negative_options
 from miricigale.reduction.sky_match import match_levels
 from miricigale.utils.exceptions import argument_error
 
@@ -47,13 +48,12 @@ def drizzle(reducer, images, wcs, pixfrac=None):
     return result, images
 
 
-def subtract_dithers(reducer, images, alone, wcs=None):
-    """As `~miricigale.reduction.Reducer.subtract_dithers`, with the background of each image alone."""
+def subtract_dithers(reducer, images, alone=None, wcs=None):
+    """As `~miricigale.reduction.Reducer.subtract_dithers`; ``alone`` is the background of each image by itself."""
+    if alone is None:
+        alone = [estimated(im, **mesh_options(reducer)) for im in images]
     backgrounds = dither_backgrounds(images, alone, wcs=wcs)
-    options = {
-        "negative_threshold": reducer.negative_threshold,
-        "negative_noise": reducer.negative_noise,
-    }
+    options = negative_options(reducer)
     pairs = zip(images, backgrounds, strict=True)
     return [remove_background(*pair, **options) for pair in pairs], backgrounds
 

@@ -8,18 +8,18 @@ from astropy.nddata import CCDData
 from miricigale.detector import Charge, Ramp, ResetAnomaly
 from miricigale.instrument import DetectorProperties, ImageFacts, miri_detector
 from miricigale.reduction.assumed import brightness_of, maps_of
-from miricigale.reduction.background import estimate_background, estimated, subtract_background
+from miricigale.reduction.background import estimate_background, subtract_background
 from miricigale.reduction.calibration import calibrate
 from miricigale.reduction.combine import combine, drizzle, subtract_dithers
 from miricigale.reduction.files import open_exposure
 from miricigale.reduction.results import rate_image
-from miricigale.reduction.settings import BACKENDS, check_settings
+from miricigale.reduction.settings import check_settings, mesh_options, negative_options
 from miricigale.reduction.slopes import fit_slopes
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.progress import progress
 from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
 
-__all__ = ["BACKENDS", "Reducer"]
+__all__ = ["Reducer"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -167,8 +167,6 @@ class Reducer:
         ValueError
             If it is no ramp, or fewer than two groups are left.
         """
-        if not isinstance(ramp, (Ramp, Charge)):
-            raise argument_error("ramp", "a Ramp or a Charge", type(ramp).__name__)
         return fit_slopes(self, ramp, maps_of(self, ramp), progress_bar)
 
     def fit_ramp(self, ramp, *, planes=False, progress_bar=False):
@@ -194,8 +192,6 @@ class Reducer:
             ``planes`` it is the ``image`` of an `ImageFile`, whose ``planes`` are ``VAR_POISSON``
             and ``VAR_RNOISE``, (DN/s)^2: what `write_image` writes as a ``_rate``.
         """
-        if not isinstance(ramp, (Ramp, Charge)):
-            raise argument_error("ramp", "a Ramp or a Charge", type(ramp).__name__)
         maps = maps_of(self, ramp)
         rate = rate_image(self, ramp, maps, fit_slopes(self, ramp, maps, progress_bar))
         return rate if planes else rate.image
@@ -263,15 +259,7 @@ class Reducer:
 
     def estimate_background(self, image):
         """Estimate the background of an image by itself: a `Background`."""
-        return estimate_background(image, **self._mesh)
-
-    @property
-    def _mesh(self):
-        """Options of `estimate_background`."""
-        method = "sep" if self.background == "sep" else "masked"
-        return {
-            "method": method, "box": self.box, "filter_size": self.filter_size, "plane": self.plane
-        }  # fmt: skip
+        return estimate_background(image, **mesh_options(self))
 
     def subtract_background(self, image):
         """
@@ -287,10 +275,7 @@ class Reducer:
         image : `~astropy.nddata.CCDData`
         background : `Background`
         """
-        negative = {
-            "negative_threshold": self.negative_threshold, "negative_noise": self.negative_noise
-        }  # fmt: skip
-        return subtract_background(image, **negative, **self._mesh)
+        return subtract_background(image, **negative_options(self), **mesh_options(self))
 
     def subtract_dithers(self, images, *, wcs=None):
         """
@@ -308,8 +293,7 @@ class Reducer:
         images : list of `~astropy.nddata.CCDData`
         backgrounds : list of `Background`
         """
-        images = list(images)
-        return subtract_dithers(self, images, [estimated(im, **self._mesh) for im in images], wcs)
+        return subtract_dithers(self, list(images), wcs=wcs)
 
     def mosaic(self, images, wcs, *, pixfrac=None):
         """

@@ -1,4 +1,4 @@
-"""Settings of a `Reducer`, checked."""
+"""Settings of a `Reducer`, checked, and as options of the steps."""
 
 from miricigale.detector import ResetAnomaly
 from miricigale.instrument import DetectorProperties
@@ -9,7 +9,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.options import check_choice, check_kind, check_positive
 from miricigale.utils.parallel import thread_count
 
-__all__ = ["BACKENDS", "check_settings"]
+__all__ = ["BACKENDS", "check_settings", "mesh_options", "negative_options"]
 
 #: Known backends.
 BACKENDS = ("native", "jwst")
@@ -57,3 +57,14 @@ def check_settings(reducer):
     ):
         wanted = "ReferenceFiles, a ReferenceCache, 'none', 'simulated' or None"
         raise argument_error("references", wanted, repr(reducer.references))
+
+
+def mesh_options(reducer):
+    """Options of `~miricigale.reduction.estimate_background`."""
+    options = {name: getattr(reducer, name) for name in ("box", "filter_size", "plane")}
+    return options | {"method": "sep" if reducer.background == "sep" else "masked"}
+
+
+def negative_options(reducer):
+    """Options of `~miricigale.reduction.background.remove_background`."""
+    return {name: getattr(reducer, name) for name in ("negative_threshold", "negative_noise")}

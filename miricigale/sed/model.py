@@ -1,29 +1,22 @@
 """Models: components in a chain, from parameters to spectra and band fluxes."""
 
 import functools
-import warnings
 
 import astropy.units as u
-import numpy as np
 
 from miricigale.filters import FilterSet
 from miricigale.refdata import citations
 from miricigale.sed import gridding, presets, tables
 from miricigale.sed.chain import Chain
 from miricigale.sed.component import ROLES, Component, read_config
-from miricigale.sed.derived import (
-    agn_quantities,
-    columns,
-    galaxy_quantities,
-    scaled_quantities,
-)
+from miricigale.sed.derived import columns
 from miricigale.sed.grid import fraction_span
 from miricigale.sed.grid_cache import cached_grid
 from miricigale.sed.parameter import Parameter
-from miricigale.sed.spectrum import COSMOLOGY, SED, ModelSpectra, distance
-from miricigale.utils.exceptions import ConfigError, MiricigaleWarning, argument_error, unknown_name
+from miricigale.sed.spectrum import COSMOLOGY
+from miricigale.utils.exceptions import ConfigError, argument_error, unknown_name
 from miricigale.utils.meta import provenance
-from miricigale.utils.units import FNU, WAVE
+from miricigale.utils.units import WAVE
 
 __all__ = ["SEDModel"]
 
@@ -131,16 +124,7 @@ class SEDModel:
             raise ConfigError(msg) from err
 
     @classmethod
-    def yang2021(
-        cls,
-        *,
-        agn=True,
-        xray=False,
-        igm="meiksin2006",
-        libraries="best",
-        frac_agn_definition="dust",
-        cosmology=COSMOLOGY,
-    ):
+    def yang2021(cls, *, agn=True, xray=False, igm="meiksin2006", libraries="best", **options):
         """
         The chain of Yang et al. 2021, from the best libraries at hand; ``meta`` names them.
 
@@ -164,24 +148,15 @@ class SEDModel:
         libraries : {"best", "bundled"}, optional
             Whether registered libraries are used, or the bundled tables alone;
             ``meta["libraries"]`` says which and why.
-        frac_agn_definition, cosmology : optional
-            As for the class.
+        **options
+            ``frac_agn_definition`` and ``cosmology``, as for the class.
         """
-        parts, notes = presets.yang2021_components(agn=agn, xray=xray, igm=igm, libraries=libraries)
-        model = cls(parts, frac_agn_definition=frac_agn_definition, cosmology=cosmology)
-        model._notes = tuple(notes)
-        return model
+        return cls._preset(
+            presets.yang2021_components(agn=agn, xray=xray, igm=igm, libraries=libraries), options
+        )
 
     @classmethod
-    def survey(
-        cls,
-        *,
-        agn=True,
-        igm="meiksin2006",
-        libraries="best",
-        frac_agn_definition="dust",
-        cosmology=COSMOLOGY,
-    ):
+    def survey(cls, *, agn=True, igm="meiksin2006", libraries="best", **options):
         """
         A chain for real galaxies of a survey, to be fitted with `survey_axes`.
 
@@ -191,11 +166,17 @@ class SEDModel:
 
         Parameters
         ----------
-        agn, igm, libraries, frac_agn_definition, cosmology : optional
+        agn, igm, libraries, **options
             As for `yang2021`.
         """
-        parts, notes = presets.survey_components(agn=agn, igm=igm, libraries=libraries)
-        model = cls(parts, frac_agn_definition=frac_agn_definition, cosmology=cosmology)
+        return cls._preset(
+            presets.survey_components(agn=agn, igm=igm, libraries=libraries), options
+        )
+
+    @classmethod
+    def _preset(cls, made, options):
+        parts, notes = made
+        model = cls(parts, **options)
         model._notes = tuple(notes)
         return model
 
@@ -362,46 +343,7 @@ class SEDModel:
         -------
         spectra : `ModelSpectra`
         """
-        values = self.values(parameters)
-        chain, z = self.chain, values["redshift"]
-        galaxy, agn = chain.galaxy(values), None
-        spectrum, absorbed = galaxy.light, np.array([galaxy.dust_luminosity])
-        sums = spectrum[None] @ chain.functionals.T
-        got = galaxy_quantities([galaxy.stars], absorbed, sums, chain.reference_row)
-        if self.has_agn:
-            agn, fraction = chain.agn(values), values["frac_agn"]
-            ratio = np.array([fraction / (1.0 - fraction)])
-            seen = tables.seen_agn(chain, [agn])
-            got |= agn_quantities(self.frac_agn_definition, ratio, got, seen)
-            spectrum = spectrum + got["agn_power"] * agn.total
-        if values.get("frac_agn", 0.0) > 0.0 and got["agn_power"][0] == 0.0:
-            msg = "frac_agn has no effect: the galaxy has no dust luminosity that it could refer to"
-            warnings.warn(msg, MiricigaleWarning, stacklevel=3)
-        far = distance(z, self.cosmology)
-        scaled = scaled_quantities(self, got, np.array([values["mass"]]), z, far, values)
-        factor = chain.sky(values) * (values["mass"] * float(tables.dilution(z, far)))
-        wave = chain.wave * (1.0 + z) * WAVE
-        quantities = {
-            name: u.Quantity(values[name], par.unit) for name, par in self._parameters.items()
-        }
-        derived = {
-            name: u.Quantity(scaled[name][0], entry.unit)
-            for name, entry in self.derived_columns().items()
-        }
-
-        def sed(spectrum, **meta):
-            return SED(wave, chain.lnu(spectrum) * factor * FNU, redshift=z, meta=meta)
-
-        parts = {"stellar_intrinsic": sed(galaxy.intrinsic), "stellar": sed(galaxy.starlight)}
-        if galaxy.nebular is not None:
-            parts["stellar"] = sed(galaxy.starlight - galaxy.nebular)
-            parts["nebular"] = sed(galaxy.nebular)
-        parts["dust"] = sed(galaxy.dust)
-        if agn is not None:
-            for name in ("disk", "torus", "polar"):
-                parts[f"agn_{name}"] = sed(got["agn_power"] * getattr(agn, name))
-        total = sed(spectrum, **self.meta, parameters=quantities, derived=derived)
-        return ModelSpectra(total, parts, derived, quantities)
+        return tables.spectra(self, self.values(parameters))
 
     def derived(self, **parameters):
         """Derived quantities of one model: dict of name to `~astropy.units.Quantity`."""

@@ -1,4 +1,4 @@
-"""Tables of models: rows of parameters to band fluxes and derived quantities."""
+"""Models evaluated: one as spectra, rows of parameters as band fluxes, both with derived quantities."""
 
 import difflib
 import functools
@@ -18,12 +18,12 @@ from miricigale.sed.derived import (
     galaxy_quantities,
     scaled_quantities,
 )
-from miricigale.sed.spectrum import distance
+from miricigale.sed.spectrum import SED, ModelSpectra, distance
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.tables import Flags
 from miricigale.utils.units import FNU, WAVE
 
-__all__ = ["ModelFlags", "dilution", "flux_table", "seen_agn"]
+__all__ = ["ModelFlags", "dilution", "flux_table", "seen_agn", "spectra"]
 
 BLOCK = 128  # rows worked out together: their spectra fit into the processor's cache
 
@@ -120,6 +120,49 @@ def _stack(filters):
     start = np.cumsum([0, *(w.size for w in waves)])
     band_wave = np.concatenate(waves)
     return start, band_wave, *_core.band_tables(start, band_wave, np.concatenate(curves))
+
+
+def spectra(model, values):
+    """Spectra of one model part by part, with derived quantities; see `SEDModel.decompose`."""
+    chain, z = model.chain, values["redshift"]
+    galaxy, agn = chain.galaxy(values), None
+    spectrum, absorbed = galaxy.light, np.array([galaxy.dust_luminosity])
+    sums = spectrum[None] @ chain.functionals.T
+    got = galaxy_quantities([galaxy.stars], absorbed, sums, chain.reference_row)
+    if model.has_agn:
+        agn, fraction = chain.agn(values), values["frac_agn"]
+        ratio = np.array([fraction / (1.0 - fraction)])
+        seen = seen_agn(chain, [agn])
+        got |= agn_quantities(model.frac_agn_definition, ratio, got, seen)
+        spectrum = spectrum + got["agn_power"] * agn.total
+    if values.get("frac_agn", 0.0) > 0.0 and got["agn_power"][0] == 0.0:
+        msg = "frac_agn has no effect: the galaxy has no dust luminosity that it could refer to"
+        warnings.warn(msg, MiricigaleWarning, stacklevel=4)
+    far = distance(z, model.cosmology)
+    scaled = scaled_quantities(model, got, np.array([values["mass"]]), z, far, values)
+    factor = chain.sky(values) * (values["mass"] * float(dilution(z, far)))
+    wave = chain.wave * (1.0 + z) * WAVE
+    quantities = {
+        name: u.Quantity(values[name], par.unit) for name, par in model.parameters.items()
+    }
+    derived = {
+        name: u.Quantity(scaled[name][0], entry.unit)
+        for name, entry in model.derived_columns().items()
+    }
+
+    def sed(spectrum, **meta):
+        return SED(wave, chain.lnu(spectrum) * factor * FNU, redshift=z, meta=meta)
+
+    parts = {"stellar_intrinsic": sed(galaxy.intrinsic), "stellar": sed(galaxy.starlight)}
+    if galaxy.nebular is not None:
+        parts["stellar"] = sed(galaxy.starlight - galaxy.nebular)
+        parts["nebular"] = sed(galaxy.nebular)
+    parts["dust"] = sed(galaxy.dust)
+    if agn is not None:
+        for name in ("disk", "torus", "polar"):
+            parts[f"agn_{name}"] = sed(got["agn_power"] * getattr(agn, name))
+    total = sed(spectrum, **model.meta, parameters=quantities, derived=derived)
+    return ModelSpectra(total, parts, derived, quantities)
 
 
 class _Blocks:

@@ -12,27 +12,29 @@ limits) and summed up (`sums`, `histogram`); `summarize` turns the sums into mom
 from miricigale.fitting._core.between import sum_nodes
 from miricigale.fitting._core.evaluate import sum_up
 from miricigale.fitting._core.histogram import PER_DEX, make_scales, summarize
-from miricigale.fitting._core.structs import (
-    BLOCK,
-    Limits,
-    Request,
-    Tables,
-    Target,
+from miricigale.fitting._core.structs import BLOCK, Request, Tables
+from miricigale.fitting._core.workspace import (
+    JOINT,
+    aligned,
+    clear,
+    make_limits,
+    make_sums,
+    make_target,
+    make_workspace,
 )
-from miricigale.fitting._core.workspace import JOINT, aligned, clear, make_sums, make_workspace
 
 __all__ = [
     "BLOCK",
     "JOINT",
     "PER_DEX",
-    "Limits",
     "Request",
     "Tables",
-    "Target",
     "aligned",
     "clear",
+    "make_limits",
     "make_scales",
     "make_sums",
+    "make_target",
     "make_workspace",
     "sum_nodes",
     "sum_up",

@@ -1,17 +1,36 @@
-"""Accumulators and work space of one worker."""
+"""What the kernels take: accumulators and work space of one worker, data of one object."""
 
 import math
 
 import numpy as np
+from scipy.special import log_ndtr
 
 from miricigale.fitting._core import structs as at
 from miricigale.fitting._core.histogram import N_BINS, N_SHARE, clear_rows
 from miricigale.fitting._core.limits import LIMITED_SIZE
 from miricigale.fitting._core.pairs import GROUP, ROWS
 from miricigale.fitting._core.single import single_size
-from miricigale.fitting._core.structs import BLOCK, Draws, Histograms, Joint, Lanes, Pairs, Sums
+from miricigale.fitting._core.structs import (
+    BLOCK,
+    Draws,
+    Histograms,
+    Joint,
+    Lanes,
+    Limits,
+    Pairs,
+    Sums,
+    Target,
+)
 
-__all__ = ["JOINT", "aligned", "clear", "make_sums", "make_workspace"]
+__all__ = [
+    "JOINT",
+    "aligned",
+    "clear",
+    "make_limits",
+    "make_sums",
+    "make_target",
+    "make_workspace",
+]
 
 #: Joint sums that can be asked for: of redshift, galaxy, AGN model and fraction.
 JOINT = Joint._fields
@@ -123,3 +142,37 @@ def clear(sums):
     sums.index.fill(-1)
     draws.index[:, 0] = -1
     clear_rows(hist.table, hist.used)
+
+
+def make_target(flux, sigma, log_prior, template_error=None):
+    """Bundle the data of one object; ``template_error`` is a part of the flux, shape (nz, nb)."""
+    n_z, bands = len(log_prior), np.flatnonzero(np.isfinite(sigma))
+    level = np.zeros(n_z)
+    if template_error is None:
+        weight = 1.0 / np.square(sigma)
+        norm = np.full(n_z, np.sum(weight * flux * flux))
+        weight = np.tile(weight, (n_z, 1))
+    else:
+        more = np.square(template_error * flux)
+        weight = 1.0 / (np.square(sigma) + more)
+        norm = np.sum(weight * flux * flux, axis=1)
+        level = -norm - np.log1p(more / np.square(sigma)).sum(axis=1)
+    used = weight[:, bands]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root32 = np.sqrt(used / used.max(axis=1, keepdims=True, initial=0.0)).astype(np.float32)
+        data32 = (flux[bands] * np.sqrt(used / norm[:, None])).astype(np.float32)
+    # at most 0: errors that are the same at all redshifts change nothing
+    top = -level.max() if np.any(level) else float(norm[0])
+    level -= level.max()
+    log_prior = np.where(log_prior > -1e200, log_prior + level, -1e300)
+    return Target(flux, weight, log_prior, bands, root32, data32, norm, level, float(top))
+
+
+def make_limits(limit, inverse):
+    """Bundle the upper limits of one object; None if it has none."""
+    bands = np.flatnonzero(inverse > 0)
+    if bands.size == 0:
+        return None
+    level = limit[bands] * inverse[bands]
+    dark = float(-2.0 * log_ndtr(level).sum())
+    return Limits(bands, level, inverse[bands], np.empty(bands.size), dark)
