@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from miricigale.evaluation.metrics import fraction_interval, sigma_mad
+from miricigale.evaluation.metrics import OUTLIER, fraction_interval, sigma_mad
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import check_seed, stream
 
@@ -61,6 +61,11 @@ def median(values):
 def scatter(values):
     """`sigma_mad` along the last axis without NaN: a statistic for `bootstrap`."""
     return sigma_mad(values, axis=-1, ignore_nan=True)
+
+
+def outlier_share(values):
+    """Share beyond `OUTLIER` along the last axis: a statistic for `bootstrap`."""
+    return np.mean(np.abs(values) > OUTLIER, axis=-1)
 
 
 def bootstrap(statistic, *columns, seed, n_draws=1000, n_all=None):

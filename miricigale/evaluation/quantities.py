@@ -6,7 +6,7 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.evaluation.classes import classify
-from miricigale.evaluation.estimates import Estimate, bootstrap
+from miricigale.evaluation.estimates import Estimate, bootstrap, outlier_share
 from miricigale.evaluation.estimates import median as _median
 from miricigale.evaluation.estimates import scatter as _scatter
 from miricigale.evaluation.infrared import feature_magnitude
@@ -24,14 +24,6 @@ __all__ = ["OF_FITS", "QUANTITIES", "REDSHIFT_BINS", "SHARES", "measure", "xray_
 REDSHIFT_BINS = ((0.0, 1.0), (1.0, 2.0), (2.0, 3.0), (3.0, np.inf))
 #: Fewest draws of statistics that are fits themselves.
 _FEW_DRAWS = 100
-
-
-def _size(values):
-    return np.abs(_median(values))
-
-
-def _outliers(delta):
-    return np.mean(np.abs(delta) > OUTLIER, axis=-1)
 
 
 def _ratio(statistic):
@@ -245,7 +237,7 @@ _MEASURES = {
     "z_scatter": ("sigma_MAD of dz/(1+z)", _of_sample(TruthResults.redshift_error, _scatter)),
     "z_outlier_ratio": (
         "photo-z outliers without over with MIRI",
-        _of_sample(_against_none(TruthResults.redshift_error), _ratio(_outliers)),
+        _of_sample(_against_none(TruthResults.redshift_error), _ratio(outlier_share)),
     ),
     "z_scatter_ratio": (
         "sigma_MAD of dz/(1+z) without over with MIRI",
@@ -261,7 +253,10 @@ _MEASURES = {
     ),
     "frac_offset_ratio": (
         "median fracAGN - true without over with MIRI",
-        _of_sample(_against_none(TruthResults.fraction_error), _ratio(_size)),
+        _of_sample(
+            _against_none(TruthResults.fraction_error),
+            _ratio(lambda values: np.abs(_median(values))),
+        ),
     ),
     "frac_scatter_ratio": (
         "sigma_MAD of fracAGN without over with MIRI",

@@ -236,7 +236,8 @@ def band_filters(bands, known):
     filters, lost = {}, []
     for band in bands:
         given = known.get(band)
-        name = (filter_of_band(band) or _xray(band)) if given is None else given.name
+        own = filter_of_band(band) or (band if xray_energies(band) else None)
+        name = own if given is None else given.name
         name = None if is_line(band) else name
         if name is None:
             lost.append(band)
@@ -246,10 +247,6 @@ def band_filters(bands, known):
         else:
             filters[name] = band
     return filters, lost
-
-
-def _xray(band):
-    return band if xray_energies(band) else None
 
 
 def given_filters(names):

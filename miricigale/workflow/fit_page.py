@@ -295,7 +295,7 @@ def _examples(page, results, found):
     if not chosen:
         return
     page.section("Examples")
-    filters = FilterSet(_model_filters(results))
+    filters = FilterSet(next(iter(results.parts())).filters)
     figure, axes = new_figure(-(-len(chosen) // 2), 2, size=(WIDTH / 2, 3.3))
     picked = results[np.array([row for row, _ in chosen])]
     for ax, (_, what), one in zip(axes.ravel(), chosen, picked, strict=False):
@@ -309,11 +309,6 @@ def _examples(page, results, found):
         figure,
         "Measured fluxes (points; open where they were not fitted), best model (line) and its fluxes (squares).",
     )
-
-
-def _model_filters(results):
-    """Names of the bands of the models."""
-    return next(iter(results.parts())).filters
 
 
 def _choose(found):

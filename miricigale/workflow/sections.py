@@ -14,6 +14,7 @@ __all__ = [
     "DetectorSection",
     "ErrorSection",
     "ExposureSection",
+    "FitBasics",
     "FitSection",
     "HighresSection",
     "PerturbSection",
@@ -287,14 +288,22 @@ class ErrorSection:
 
 
 @dataclasses.dataclass(frozen=True)
-class FitSection:
-    """The final fits, with and without MIRI."""
+class FitBasics:
+    """The fits."""
 
     bands: tuple[str, ...] = option(tuple(YANG2021_DEPTHS), "Existing bands.")
     depths: tuple[float, ...] = option(tuple(YANG2021_DEPTHS.values()), "Their 5-sigma AB depths.")
     axes: str = option("fit", "Grid of the fit.", choices=("fit", "quick"))
     model_error: float = option(0.1, "Relative model error.", low=0.0, high=1.0)
-    min_detected: int = option(2, "MIRI bands a source must be detected in.", low=0, high=9)
+    min_detected: int = option(
+        2, "MIRI bands in which a source must be detected to count.", low=0, high=9
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class FitSection(FitBasics):
+    """The final fits, with and without MIRI."""
+
     sets: tuple[str, ...] = option(
         ("all", "none"),
         "Sets of the MIRI bands that are fitted with the existing ones.",

@@ -15,12 +15,12 @@ from miricigale.workflow.stages.images import mosaic_psf
 PRIOR = "wfc3.f160w"
 
 
-def point_catalog(x, y, rng, fluxes):
-    """Points within 0.1 arcsec of places about the center (arcsec), with fluxes (uJy) by band."""
+def point_catalog(x, y, rng, fluxes, center=CENTER):
+    """Points within 0.1 arcsec of places about a center (arcsec), with fluxes (uJy) by band."""
     n = np.size(x)
     dx, dy = (np.ravel(place) + rng.uniform(-0.1, 0.1, n) for place in (x, y))
     catalog = QTable({"id": np.arange(1, n + 1)})
-    catalog["sky"] = CENTER.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
+    catalog["sky"] = center.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
     catalog["redshift"] = np.ones(n)
     catalog["profile"] = np.full(n, "point")
     catalog["half_light_radius"] = np.zeros(n) * u.arcsec

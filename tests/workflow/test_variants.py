@@ -8,6 +8,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
+from helpers.points import point_catalog
 from miricigale.evaluation import Report
 from miricigale.photometry import detect_sources
 from miricigale.psf import hst_psf
@@ -107,19 +108,9 @@ def test_nothing_else_of_a_study_depends_on_the_variants():
 
 
 def made_truth(center):
-    rng = np.random.default_rng(3)
-    grid = np.meshgrid(np.linspace(-25, 25, 6), np.linspace(-25, 25, 6))
-    dx, dy = (a.ravel() + rng.uniform(-0.1, 0.1, a.size) for a in grid)
-    n = dx.size
-    truth = QTable({"id": np.arange(1, n + 1)})
-    truth["sky"] = center.spherical_offsets_by(dx * u.arcsec, dy * u.arcsec)
-    truth["redshift"] = np.ones(n)
-    truth["profile"] = np.full(n, "point")
-    truth["half_light_radius"] = np.zeros(n) * u.arcsec
-    truth["sersic_index"] = truth["axis_ratio"] = np.ones(n)
-    truth["position_angle"] = np.zeros(n) * u.deg
-    truth[BAND] = rng.permutation(np.geomspace(3, 300, n)) * u.uJy
-    truth[PRIOR] = np.full(n, 30.0) * u.uJy
+    rng, places = np.random.default_rng(3), np.linspace(-25, 25, 6)
+    truth = point_catalog(*np.meshgrid(places, places), rng, {PRIOR: 30.0}, center)
+    truth[BAND] = rng.permutation(np.geomspace(3, 300, len(truth))) * u.uJy
     return truth
 
 

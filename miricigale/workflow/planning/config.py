@@ -4,11 +4,10 @@ import dataclasses
 from typing import ClassVar
 
 from miricigale.instrument import CEERS_FILTERS, imager_filters, readout_patterns
-from miricigale.photometry import YANG2021_DEPTHS
 from miricigale.utils.exceptions import unknown_name
 from miricigale.workflow.background import LEVELS_DOC, check_levels
 from miricigale.workflow.options import Configuration, option, read_text, require
-from miricigale.workflow.sections import CatalogSection, SedSection
+from miricigale.workflow.sections import CatalogSection, FitBasics, SedSection
 
 __all__ = ["PlanConfig", "load_plan"]
 
@@ -143,19 +142,6 @@ class ImageSection:
 
 
 @dataclasses.dataclass(frozen=True)
-class FitSection:
-    """The fits."""
-
-    bands: tuple[str, ...] = option(tuple(YANG2021_DEPTHS), "Existing bands.")
-    depths: tuple[float, ...] = option(tuple(YANG2021_DEPTHS.values()), "Their 5-sigma AB depths.")
-    axes: str = option("fit", "Grid of the fit.", choices=("fit", "quick"))
-    model_error: float = option(0.1, "Relative model error.", low=0.0, high=1.0)
-    min_detected: int = option(
-        2, "MIRI bands in which a source must be detected to count.", low=0, high=9
-    )
-
-
-@dataclasses.dataclass(frozen=True)
 class SurveySection:
     """Depth against area."""
 
@@ -238,7 +224,7 @@ class PlanConfig(Configuration):
     background: BackgroundSection = dataclasses.field(default_factory=BackgroundSection)
     noise: NoiseSection = dataclasses.field(default_factory=NoiseSection)
     images: ImageSection = dataclasses.field(default_factory=ImageSection)
-    fit: FitSection = dataclasses.field(default_factory=FitSection)
+    fit: FitBasics = dataclasses.field(default_factory=FitBasics)
     survey: SurveySection = dataclasses.field(default_factory=SurveySection)
     overheads: OverheadSection = dataclasses.field(default_factory=OverheadSection)
 

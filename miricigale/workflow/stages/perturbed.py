@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 from astropy.table import Table
 
-from miricigale.evaluation import Missing, bootstrap, sigma_mad
+from miricigale.evaluation import Missing, bootstrap
+from miricigale.evaluation.estimates import median, outlier_share, scatter
 from miricigale.filters import Filter
 from miricigale.workflow.stages.figures import band_label
 from miricigale.workflow.stages.metrics import bright_isolated
@@ -13,8 +14,6 @@ from miricigale.workflow.truths import CUTOUTS
 
 __all__ = ["perturbation_costs", "write_perturbed"]
 
-#: Redshifts beyond it, in (1 + z), are outliers.
-OUTLIER = 0.15
 #: Samples drawn for an error.
 N_DRAWS = 1000
 
@@ -40,18 +39,6 @@ _LABELS = {
 }
 
 
-def _median(values):
-    return np.median(values, axis=-1)
-
-
-def _scatter(values):
-    return sigma_mad(values, axis=-1)
-
-
-def _outliers(values):
-    return np.mean(np.abs(values) > OUTLIER, axis=-1)
-
-
 def _quantities(bands):
     """Columns of the table: name to the kind of the values, the band, and their statistic."""
     by_wave = sorted(bands, key=lambda name: Filter.from_name(name).pivot)
@@ -60,12 +47,12 @@ def _quantities(bands):
         **{
             f"{band} {name}": ("flux", band, statistic)
             for band in ends
-            for name, statistic in (("offset", _median), ("scatter", _scatter))
+            for name, statistic in (("offset", median), ("scatter", scatter))
         },
-        "photo-z sigma_MAD": ("redshift", None, _scatter),
-        "photo-z outliers": ("redshift", None, _outliers),
-        "fracAGN offset": ("frac_agn", None, _median),
-        "fracAGN scatter": ("frac_agn", None, _scatter),
+        "photo-z sigma_MAD": ("redshift", None, scatter),
+        "photo-z outliers": ("redshift", None, outlier_share),
+        "fracAGN offset": ("frac_agn", None, median),
+        "fracAGN scatter": ("frac_agn", None, scatter),
     }
 
 
@@ -124,13 +111,10 @@ def perturbation_costs(truths, every, bands, *, seed):
                     own_ids, own = _errors(every[truth.name], kind, band)
                     _, first, second = np.intersect1d(ids, own_ids, return_indices=True)
                     pairs = known[first], own[second]
-                    rows.append((*_named(truth), name, *_cost(statistic, pairs, seed)))
+                    which = truth.name.removeprefix(f"{truth.base}+")
+                    rows.append((truth.base, which, name, *_cost(statistic, pairs, seed)))
     names = ["truth", "perturbation", "quantity", "n", "value", "value_err", "change", "change_err"]
     return Table(rows=rows, names=names) if rows else Table(names=names)
-
-
-def _named(truth):
-    return truth.base, truth.name.removeprefix(f"{truth.base}+")
 
 
 def _cost(statistic, pairs, seed):
