@@ -22,7 +22,7 @@ N_DRAWS, _OBJECTS = 2000, 64
 _LEAST = 0.01
 
 
-def near_relation(fitter, photometry, results, most, *, redshift=None, n_draws=N_DRAWS, seed=0):
+def near_relation(fitter, photometry, results, most, *, redshift=None, seed=0):
     """
     Leave out models whose corona is too far from what their disk should have, as X-CIGALE does.
 
@@ -41,8 +41,8 @@ def near_relation(fitter, photometry, results, most, *, redshift=None, n_draws=N
         Largest distance of alpha_ox from -0.137 log L_nu(2500 A) + 2.638 (Just et al. 2007).
     redshift : array_like, optional
         Known redshifts.
-    n_draws, seed : int, optional
-        Draws of each object, and their seed.
+    seed : int, optional
+        Seed of the draws, `N_DRAWS` of each object.
 
     Returns
     -------
@@ -63,7 +63,7 @@ def near_relation(fitter, photometry, results, most, *, redshift=None, n_draws=N
         with warnings.catch_warnings():
             # told by the fit
             warnings.simplefilter("ignore", MiricigaleWarning)
-            samples = fitter.sample(photometry[rows], n_draws, seed=seed, redshift=z)
+            samples = fitter.sample(photometry[rows], N_DRAWS, seed=seed, redshift=z)
         kept = _near(samples, most)
         values = {name: samples.values(name).value for name in results.parameters}
         for j in np.flatnonzero(samples.fitted & results.fitted[rows]):

@@ -61,18 +61,11 @@ def polygon_coverage(vertices, n, step, rows):
     return np.minimum(coverage, 1.0)
 
 
-def remove_plane(values, weights, *, degree=1):
-    """
-    Subtract the weighted mean (degree 0) or the best plane (degree 1) of an image, (n, n).
-
-    Weights are not negative; zero where the weight is zero.
-    """
+def remove_plane(values, weights):
+    """Subtract the best plane of an image, (n, n), by weights >= 0; zero where the weight is zero."""
     inside = weights > 0
     y, x = np.nonzero(inside)
-    terms = [np.ones(x.size)]
-    if degree:
-        terms += [x - x.mean(), y - y.mean()]
-    design = np.stack(terms, axis=1)
+    design = np.stack([np.ones(x.size), x - x.mean(), y - y.mean()], axis=1)
     root = np.sqrt(weights[inside])
     solution = np.linalg.lstsq(design * root[:, None], values[inside] * root, rcond=None)[0]
     result = np.zeros_like(values)

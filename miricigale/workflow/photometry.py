@@ -389,11 +389,11 @@ def _pulls(result, kernel, n, seed, n_threads):
         return blank.measure(result.residual_image, catalog=empty).snr
 
 
-def empty_positions(result, n, *, seed, distance=0.3):
+def empty_positions(result, n, *, seed):
     """
     Up to ``n`` random positions at which a measurement left no light: ``id`` and ``sky``.
 
-    They are at least ``distance`` (arcsec) from pixels with light of a model (above a third of the
+    They are at least 0.3 arcsec from pixels with light of a model (above a third of the
     noise) or without data.
     """
     import scipy.ndimage
@@ -406,7 +406,7 @@ def empty_positions(result, n, *, seed, distance=0.3):
     level = 0.0 if result.background is None else result.background.to_value(residual.unit)
     free = ~np.asarray(residual.mask, bool)
     free &= np.abs(result.model_image.data - level) < 0.3 * np.where(free, sigma, 1.0)
-    steps = max(1, round(distance / pixel_scale(residual.wcs)))
+    steps = max(1, round(0.3 / pixel_scale(residual.wcs)))
     # pixels beyond the image count as without data
     free = scipy.ndimage.binary_erosion(free, iterations=steps)
     y, x = np.nonzero(free)

@@ -40,14 +40,14 @@ def disk_spectrum(wave, delta=0.0, disk="skirtor"):
     return out / total
 
 
-def disk_nodes(disk="skirtor", last=30.0, number=241):
+def disk_nodes(disk="skirtor", number=241):
     """
-    Wavelengths in um that follow a disk: evenly in the logarithm to ``last``, with its breaks.
+    Wavelengths in um that follow a disk: evenly in the logarithm to 30 um, with its breaks.
 
     The first lies just below the disk's beginning, where it is zero, so that nothing leaks to
     shorter wavelengths when grids are merged.
     """
     breaks = DISKS[disk][0]
     first = breaks[0]
-    even = first * (last / first) ** (np.arange(number) / (number - 1))
+    even = first * (30.0 / first) ** (np.arange(number) / (number - 1))
     return np.unique(np.concatenate([[first * (1.0 - 1e-5)], even, breaks[:-1]]))

@@ -222,9 +222,9 @@ def rival_counts(table):
     }
 
 
-def _se_offset(table, seed, method="yang2021"):
+def _se_offset(table, seed):
     """Source Extractor minus template fit (mag) of sources above 5 sigma: an `Estimate`."""
-    blind, forced = table["source_extractor"].value, table[method].value
+    blind, forced = table["source_extractor"].value, table["yang2021"].value
     with np.errstate(invalid="ignore"):
         good = np.asarray(table["field"]) & (np.asarray(table["snr"], float) > 5)
         good &= (blind > 0) & (forced > 0)

@@ -146,17 +146,17 @@ def fraction_bins_figure(study):
     return fractions_figure(values)
 
 
-def disk_figure(study, band_set="all"):
+def disk_figure(study):
     """Fitted against true accretion power of each truth with AGN; None if there is no such."""
     values, notes = {}, {}
     unit = u.erg / u.s
     for one in study.truths:
-        if band_set not in one.fits or "accretion_power" not in one.truth.colnames:
+        if "all" not in one.fits or "accretion_power" not in one.truth.colnames:
             continue
-        error = one.power_error(band_set)
+        error = one.power_error("all")
         error = error[np.isfinite(error)]
         if error.size:
-            fitted = one.fits[band_set]["accretion_power_mean"]
+            fitted = one.fits["all"]["accretion_power_mean"]
             true = one.truth["accretion_power"][one.sample]
             label = truth_label(one)
             values[label] = (true.to_value(unit), fitted.to_value(unit))
