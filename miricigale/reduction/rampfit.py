@@ -244,20 +244,19 @@ def fit_groups(
         np.zeros((ny, nx), np.int64),
     )
     ramp = (data, (drift, bias, reset), (coef, saturation, dark))
-    groups = (first_group, last_group)
     # a trace of read noise keeps the closed forms finite
     noise = (np.maximum(variance, 1e-6), poisson_factor / gain, np.square(slow_noise))
-    last = (noise, 1 / group_time, jump)
+    fit = (first_group, last_group, noise, 1 / group_time, jump)
     # pixels whose groups have flags are fitted one by one
     plain = usable if flagged is None else usable & ~flagged
 
     def fit_block(rows):
-        events = _core.fit_rows(*ramp, plain, rows.start, rows.stop, *groups, *last, out)
+        events = _core.fit_rows(ramp, plain, rows.start, rows.stop, fit, out)
         return events[np.lexsort(events.T[3::-1])]
 
     def refit_block(part):
         ys, xs, start, cuts = part
-        _core.refit(*ramp, group_dq, ys, xs, start, cuts, *groups, *last, out)
+        _core.refit(ramp, group_dq, ys, xs, start, cuts, fit, out)
 
     with threads(n_threads) as executor:
         events = parallel_map(

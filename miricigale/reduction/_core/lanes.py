@@ -247,22 +247,7 @@ def _gather_lanes(data, levels, response, ys, xs, g0, g1, scratch, d, top):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def refit(
-    data,
-    levels,
-    response,
-    group_dq,
-    ys,
-    xs,
-    start,
-    cuts,
-    g0,
-    g1,
-    noise,
-    scale,
-    threshold,
-    out,
-):
+def refit(ramp, group_dq, ys, xs, start, cuts, fit, out):
     """
     Fit the pixels ``ys``, ``xs`` again with differences that are cut from outside.
 
@@ -271,6 +256,8 @@ def refit(
     parameters are those of `fit_rows`. Jumps that were found before belong to the cuts; new ones are
     added to their number.
     """
+    data, levels, response = ramp
+    g0, g1, noise, scale, threshold = fit
     variance, inv_gain, slow = noise
     n_int = data.shape[0]
     n_diff = g1 - g0 - 1

@@ -21,24 +21,12 @@ BLOCK = 64
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def fit_rows(
-    data,
-    levels,
-    response,
-    usable,
-    y0,
-    y1,
-    g0,
-    g1,
-    noise,
-    scale,
-    threshold,
-    out,
-):
+def fit_rows(ramp, usable, y0, y1, fit, out):
     """
-    Fit the ramps of rows ``y0`` to ``y1``, groups ``g0`` to ``g1``, and find their jumps.
+    Fit the ramps of rows ``y0`` to ``y1``, and find their jumps.
 
-    ``data`` are DN as read, (n_int, n_group, ny, nx). Maps of pixels are (ny, nx) or, where all
+    ``ramp`` is data, levels and response; ``fit`` the first group and the one behind the last, noise, scale and
+    threshold. The data are DN as read, (n_int, n_group, ny, nx). Maps of pixels are (ny, nx) or, where all
     are alike, (1, 1), also within larger arrays:
 
     ``levels``: drift (n_int, n_group, 1 or ny, 1 or 4: the channels that columns belong to in
@@ -56,9 +44,11 @@ def fit_rows(
     above ``threshold`` sigma. The images ``out``, those of `RampFit` from ``rate`` to ``flags``, are filled in
     place.
 
-    Returns an array (n_event, 5) in no order: y, x, integration, difference (counted from ``g0``) and
+    Returns an array (n_event, 5) in no order: y, x, integration, difference (from the first group) and
     signed significance of each jump.
     """
+    data, levels, response = ramp
+    g0, g1, noise, scale, threshold = fit
     drift, bias, reset = levels
     coefficients, limits, dark = response
     variances, poisson, wander = noise
