@@ -101,8 +101,42 @@ def test_the_scatter_of_models_is_measured(residuals):
     error = TemplateError([1.99, 2.01] * u.um, [0.05, 0.3])
     fitted = BayesFitter(grid, model_error=0.0, template_error=error).fit(table, redshift=z)
     found = measure_template_error(fitted, edges=[0.1, 2.0, 20.0] * u.um)
-    # one parameter of six bands, four of them good: the residuals of these are sqrt(3/4) of the errors
-    np.testing.assert_allclose(found.error, [0.05 * np.sqrt(3 / 4), 0.3], rtol=0.12)
+    np.testing.assert_allclose(found.error, [0.05, 0.3], rtol=0.08)
+
+
+def test_errors_of_models_and_of_bands_are_each_counted_once(make_grid):
+    """One band has errors of its own, and is alone to see rest wavelengths of 1.1 to 1.4 um."""
+    grid = replace(make_grid(5, n_z=2, n_tau=1, n_age=1, frac=[0.0]), filters=BANDS)
+    rng, n = np.random.default_rng(8), 1500
+    z = rng.integers(2, size=n)
+    rest = PIVOTS / (1 + grid.redshift[z][:, None])
+    band = np.array(BANDS) == "wfc3.f160w"
+    models, own = np.where(rest < 0.75, 0.04, 0.12), np.where(band, 0.08, 0.0)
+    model = 1e10 * grid.galaxy[z, 0]
+    err = np.where(band, rng.choice([0.001, 0.06], (n, 1)), 0.01) * model
+    # errors are parts of the flux as measured: (flux - model)^2 = x^2 variance(flux) of a normal deviate x
+    x = rng.normal(size=model.shape)
+    a = 1 - x**2 * (models**2 + own**2)
+    b = model**2 - np.square(x * np.where(band, 3.0, 1.0) * err)
+    table = photometry((model + np.sign(x) * np.sqrt(model**2 - a * b)) / a, err)
+    known = {"redshift": grid.redshift[z]}
+    error = TemplateError([1.0] * u.um, [0.1])
+    for _ in range(6):
+        fitter = BayesFitter(grid, model_error=0.0, template_error=error)
+        left = leave_out(fitter, table, ["wfc3.f160w"], **known)
+        factor, part = measure_band_errors(left, error, longest=0.75 * u.um)
+        right, parts = QTable(table, copy=True), {"wfc3.f160w": part}
+        right["wfc3.f160w_err"] *= factor
+        fit = BayesFitter(grid, model_error=parts, template_error=error).fit(right, **known)
+        edges = [0.15, 0.3, 0.6, 0.75, 1.1, 1.4, 20.0] * u.um
+        error = measure_template_error(fit, model_error=parts, edges=edges)
+    # some 5 and 4 % of the values are their own errors
+    np.testing.assert_allclose([factor, part], [3.0, 0.08], rtol=0.15)
+    np.testing.assert_allclose(error.error, [0.04, 0.04, 0.04, 0.12, 0.12, 0.12], rtol=0.12)
+    # five degrees of freedom an object, each with a variance of 2
+    assert fit.chi2.sum() / (5 * n) == pytest.approx(1.0, abs=5 * np.sqrt(2 / (5 * n)))
+    with pytest.raises(ValueError, match="'model_error' must be a dict with keys among"):
+        measure_template_error(fit, model_error={"nircam.f444w": 0.1})
 
 
 def test_zero_points_are_found_and_applied(residuals):
