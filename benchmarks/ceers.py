@@ -9,8 +9,6 @@ The catalog is the part of that of Lisiecki et al. 2025 in $MIRICIGALE_DATA/ceer
 NIRCam bands; the others, nearly all of F160W < 24, where 3D-HST has grism redshifts, are shown apart.
 Template error, zero points, priors of all parameters and the errors of the MIRI bands (which the catalog measured
 apart) are measured on one half and used on the other, and the other way round; ``--flat`` leaves the priors flat.
-Some sources have fluxes that are something else's, or spectra that no model has: each is fitted with errors five
-times as large too, and has the fit of the higher evidence times share of such sources, as found in the other half.
 ``--mocks`` fits the best models with noise of these errors again: what chi2 is if errors are right. ``--sampler``
 fits some sources with continuous parameters too, and does nothing else. The last lines are what
 `TemplateError.survey` and `SEDModel.survey_priors` hold: means of both halves.
@@ -34,7 +32,6 @@ from miricigale.fitting import (
     TemplateError,
     apply_zero_points,
     calibrate_zero_points,
-    compare_classes,
     leave_out,
     measure_band_errors,
     measure_priors,
@@ -44,8 +41,6 @@ from miricigale.fitting import (
 from miricigale.sed import ModelGrid, SEDModel
 
 OUTLIER = 0.15
-#: How many times as large some sources' errors of models and bands are; as for outliers in `measure_band_errors`.
-WIDE = 5.0
 
 
 def sample(path):
@@ -67,10 +62,9 @@ def calibrated(grid, bands, table, flat):
     """
     Template error, errors of MIRI bands, zero points and priors, of sources at their published redshifts.
 
-    Priors and zero points are those of fits with errors of 10 % (30 % in MIRI). With the zero points applied, so
-    that these are in no error, the errors of MIRI are those of what HST and NIRCam predict, and the template error
-    is what residuals have beside them; a few turns, for each needs the other. Last comes the share of sources
-    whose errors are larger, by their evidences.
+    Priors and zero points are those of fits with errors of 10 % (30 % in MIRI). The errors of MIRI are those of
+    what HST and NIRCam predict, and the template error is what residuals have beside them; a few turns, for each
+    needs the other. Zero points stay in the template error, which is for catalogs of which they are not known.
     """
     miri = [b for b in bands if b.startswith("miri")]
     errors = {b: 0.3 if b in miri else 0.1 for b in bands}
@@ -81,7 +75,6 @@ def calibrated(grid, bands, table, flat):
         )
         priors, before = None if flat else measure_priors(fit), priors
     error, points = measure_template_error(fit), calibrate_zero_points(fit, reference="wfc3.f160w")
-    table = apply_zero_points(table, points)
     measured = [b for b in miri if np.any(table[f"{b}_err"] > 0)]
     for _ in range(5):
         fitter = BayesFitter(grid, bands, model_error=0.0, template_error=error, priors=before)
@@ -91,24 +84,7 @@ def calibrated(grid, bands, table, flat):
         fitter = BayesFitter(grid, bands, model_error=own, template_error=error, priors=before)
         fit = fitter.fit(with_errors(table, factor), redshift="redshift")
         error = measure_template_error(fit, model_error=own)
-    found = error, (factor, part), points, before
-    some, share = with_errors(table, factor), 0.05
-    fits = {
-        name: fitter_of(grid, bands, found, wide).fit(some, redshift="redshift")
-        for name, wide in (("plain", 1.0), ("wide", WIDE))
-    }
-    for _ in range(20):
-        odds = compare_classes(fits, prior={"plain": 1.0 - share, "wide": share})
-        share = np.nanmean(odds["probability_wide"])
-    return *found, share
-
-
-def fitter_of(grid, used, found, wide=1.0):
-    """Fitter with what was found in the other half, with errors of models and of bands some times as large."""
-    error, (_, part), _, priors = found[:4]
-    own = {name: wide * part if name.startswith("miri") else 0.0 for name in used}
-    error = TemplateError(error.wave, wide * error.error)
-    return BayesFitter(grid, used, model_error=own, template_error=error, priors=priors)
+    return error, (factor, part), points, before
 
 
 def with_errors(table, factor):
@@ -265,9 +241,8 @@ def main():
     print("band, factor of each half")
     for a, b in zip(found[0][2], found[1][2], strict=True):
         print(f"  {a['band']:14s} {a['factor']:.3f} {b['factor']:.3f} +- {a['factor_err']:.3f}")
-    for (factor, part), share in ((one[1], one[4]) for one in found):
+    for factor, part in (one[1] for one in found):
         print(f"errors of MIRI: {factor:.2f} times those of the catalog and {100 * part:.0f} %")
-        print(f"sources with errors {WIDE:.0f} times as large: {100 * share:.1f} %")
     optical = [b for b in bands if not b.startswith("miri")]
     true = np.concatenate([np.asarray(half["redshift"], float) for half in halves])
     steps = true / 0.025
@@ -276,43 +251,43 @@ def main():
     joined = {name: np.concatenate([half[name] for half in halves]) for name in table.colnames}
     print("\n                                      n     bias sigma_MAD  out.,%  in 68 %")
     for label, used in (("HST, NIRCam", optical), ("HST, NIRCam, MIRI", bands)):
-        parts, ones, mocks, plain, times, spent = [], [], [], [], [], 0.0
+        parts, mocks, known, times, spent = [], [], [], [], 0.0
         for h, half in enumerate(halves):
-            _, (factor, _), points, _, share = found[1 - h]
+            error, (factor, part), points, priors = found[1 - h]
             half = with_errors(apply_zero_points(half, points), factor)
-            fitter, wide = (fitter_of(grid, used, found[1 - h], k) for k in (1.0, WIDE))
+            own = {name: part if name.startswith("miri") else 0.0 for name in used}
+            fitter = BayesFitter(grid, used, model_error=own, template_error=error, priors=priors)
             start = time.process_time()
-            fits = {"plain": fitter.fit(half), "wide": wide.fit(half)}
+            parts.append(fitter.fit(half))
             spent += time.process_time() - start
-            best = compare_classes(fits, prior={"plain": 1.0 - share, "wide": share})["class"]
-            plain.append(best != "wide")
-            own = [fits["wide" if one == "wide" else "plain"] for one in best]
-            parts.append(FitResults.concatenate([one[i : i + 1] for i, one in enumerate(own)]))
-            ones.append(fits["plain"])
             if args.times:
                 times.extend(time_each(fitter, half))
             if args.mocks:
-                mock = mock_analysis(fitter, fits["plain"], half, seed=1, model_error=True)
+                mock = mock_analysis(fitter, parts[-1], half, seed=1, model_error=True)
                 mocks.append(mock.recovered)
-        plain = np.concatenate(plain)
+                at = {"redshift": "redshift"}
+                fit = fitter.fit(half, **at)
+                known.append(mock_analysis(fitter, fit, half, seed=1, model_error=True, **at))
         results = FitResults.concatenate(parts)
         row(label, results, true, whole)
         row("  redshifts not in steps of 0.025", results, true, apart)
         row("  in steps", results, true, ~apart)
-        row("  all with errors of one size", FitResults.concatenate(ones), true, whole)
-        row("  not in steps", FitResults.concatenate(ones), true, apart)
         mean = 1e3 * spent / len(true)
         print(
-            f"  {mean:.0f} ms of CPU an object for both fits; {np.sum(~plain)} with the larger errors"
+            f"  {mean:.0f} ms of CPU an object; reduced chi2 {np.median(results.reduced_chi2):.2f}"
         )
         if args.times:
             print(
                 f"  one by one: median {np.median(times):.0f} ms, 95 % {np.quantile(times, 0.95):.0f} ms"
             )
             time_known(grid, used, table)
-        for what, one in (("", results), (" of mocks", mocks and FitResults.concatenate(mocks))):
-            if one:
-                below, above = chi2_parts(one, bands, plain)
+        groups = {"": parts, " of mocks": mocks}
+        groups |= {" at known redshifts": [one.truth for one in known]}
+        groups |= {" of mocks at known redshifts": [one.recovered for one in known]}
+        for what, some in groups.items():
+            if some:
+                one = FitResults.concatenate(some)
+                below, above = chi2_parts(one, bands, whole)
                 text = f"{below:.2f} below 3 um, {above:.2f} above"
                 print(f"  median of mean squared pulls{what}: {text}")
     print("\nworst tenth, with MIRI: medians                  all")
