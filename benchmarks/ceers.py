@@ -184,10 +184,13 @@ def compare(table, grid, n, engine):
     errors = {b: 0.3 if b.startswith("miri") else 0.06 for b in bands}
     ours = BayesFitter(grid, bands, model_error=errors).fit(table)
     if engine == "interpolate":
-        fitter = BayesFitter(grid, bands, model_error=errors, interpolate=1000)
-    else:
         fitter = BayesFitter(
-            SEDModel.survey(), bands, model_error=errors, priors=_continuous(), engine=engine
+            grid, bands, model_error=errors, interpolate=400, finer=SEDModel.survey()
+        )
+    else:
+        few = {"n_live": 300, "n_effective": 500}
+        fitter = BayesFitter(
+            SEDModel.survey(), bands, model_error=errors, priors=_continuous(), engine=engine, **few
         )
     start = time.process_time()
     theirs = fitter.fit(table, seed=1)

@@ -39,7 +39,7 @@ _TWO = 0.25
 #: Errors count up to this: fluxes that change by more between nodes are faint.
 _MOST = 0.1
 #: Rms error of interpolated ln flux along an axis of a finer grid, and the bytes that its table may fill.
-_TOLERANCE, _LARGEST = 0.005, 1 << 28
+_TOLERANCE, _LARGEST = 0.005, 1 << 27
 #: Most times that the cells of an axis are halved.
 _HALVINGS = 4
 
