@@ -21,10 +21,9 @@ __all__ = ["read_spectra", "template_grid"]
 
 _SUFFIXES = (".fits", ".fit", ".dat", ".txt", ".csv", ".ecsv", ".ascii")
 _FLAM = u.erg / u.s / u.cm**2 / u.AA
-#: How libraries write units that astropy does not know, in any case.
-_UNITS = {"angstroms": u.AA, "microns": u.um, "flam": _FLAM, "fnu": _FLAM * u.AA / u.Hz}
-_UNITS = {spelt: unit for x, unit in _UNITS.items() for spelt in (x, x.capitalize(), x.upper())}
-_UNITS["ANGSTROM"] = u.AA
+#: How libraries write units that astropy does not know, in small letters.
+_UNITS = {"angstrom": u.AA, "angstroms": u.AA, "microns": u.um}
+_UNITS |= {"flam": _FLAM, "fnu": _FLAM * u.AA / u.Hz}
 #: Where spectra that end before are continued to.
 _FAR = 100.0  # um
 #: Part of the wavelengths at the end of a spectrum whose mean its continuation starts from.
@@ -73,7 +72,9 @@ def read_spectra(path):
 
 
 def _read_file(file):
-    with u.add_enabled_aliases(_UNITS):
+    # not aliases of astropy's, which hold for all threads: what is not known here either is refused below
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", u.UnitsWarning)
         table = read_table(file, wanted="a spectrum", cls=Table)
     if len(table.colnames) < 2:
         msg = f"{file} cannot be read as a spectrum: it has the columns {table.colnames}"
@@ -82,7 +83,7 @@ def _read_file(file):
     gravities = [name for name in others if re.fullmatch(r"g\d\d", name)]
     try:
         # NaN where a value is lacking, which is none of a spectrum
-        wave = plain_floats(table[first], first, "spectrum") * (table[first].unit or u.AA)
+        wave = plain_floats(table[first], first, "spectrum") * _unit(table[first], u.AA)
         stem = re.sub(
             rf"({'|'.join(map(re.escape, _SUFFIXES))})?(\.gz)?$", "", file.name, flags=re.I
         )
@@ -94,11 +95,15 @@ def _read_file(file):
                 # atmospheres that were not computed are 0 in such files
                 if not gravities or one.any():
                     name = stem if part is None else f"{stem}[{part}]"
-                    out[name] = SED(wave, one * (table[column].unit or _FLAM))
+                    out[name] = SED(wave, one * _unit(table[column], _FLAM))
         return out
     except (TypeError, ValueError, u.UnitsError) as err:
         msg = f"{file} cannot be read as a spectrum: {err}"
         raise DataError(msg) from err
+
+
+def _unit(column, default):
+    return default if column.unit is None else _UNITS.get(str(column.unit).lower(), column.unit)
 
 
 def template_grid(spectra, filters, *, beyond="error"):
