@@ -143,7 +143,8 @@ class GridFit:
             return out
         nodes = finest = Nodes.of_grid(grid, priors.axes)
         if finer is not None:
-            bands = filters if isinstance(filters, FilterSet) else grid.filters
+            same = isinstance(filters, FilterSet) and tuple(filters.names) == grid.filters
+            bands = filters if same else grid.filters
             finest = finer_grid(finer, grid, bands, out.constants, nodes)
         return replace(
             out, between=Between(Continuation(priors, engine, nodes, finest), interpolate)

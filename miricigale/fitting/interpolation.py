@@ -324,7 +324,8 @@ class Nodes:
         ]
         out = np.zeros(other.flux.shape[1], np.int64)
         if places:
-            out[other.model.ravel()] = own.model[np.ix_(*places)].ravel()
+            some = other.model >= 0
+            out[other.model[some]] = own.model[np.ix_(*places)][some]
         return out
 
 

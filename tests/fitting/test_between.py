@@ -8,7 +8,6 @@ import pytest
 from astropy.table import QTable
 
 from miricigale.fitting import BayesFitter, FitFlags
-from miricigale.fitting.continuation import Continuation
 from miricigale.sed import ModelGrid, SEDModel
 
 BANDS = tuple(f"band{i}" for i in range(8))
@@ -226,7 +225,7 @@ def test_interpolated_models_are_those_of_the_chain(chain, off_nodes):
     off = []
     for finer in (None, model):
         fitter = BayesFitter(grid, interpolate=1, finer=finer)
-        models: Continuation = fitter.backend.between.models
+        models = fitter.backend.between.models
         flux, power = models.fluxes(models.models(values))
         ratio = np.log(flux * 1e10 / want)
         off.append(np.sqrt(np.mean(np.minimum(np.abs(ratio), 0.3) ** 2)))
