@@ -34,8 +34,6 @@ _TINY = 1e-290
 _LARGE = 690.0
 #: Largest change of ln flux from the nearest node that is followed.
 _STEEP = 5.0
-#: The latter of two nodes, which show no curvature, as a part of their difference: of polar dust at 100, 300 K.
-_TWO = 0.25
 #: Errors count up to this: fluxes that change by more between nodes are faint.
 _MOST = 0.1
 #: Rms error of interpolated ln flux along an axis of a finer grid, and the bytes that its table may fill.
@@ -172,16 +170,11 @@ class Kind:
         """
         How far middle nodes of an axis are off the straight lines between their neighbors on a scale ``x``.
 
-        Of ln flux but for a factor, shape (m, nb), and of what else is interpolated, (m, n_rows). With two nodes
-        it is a part of their difference.
+        Of ln flux but for a factor, shape (m, nb), and of what else is interpolated, (m, n_rows).
         """
         table = np.moveaxis(self.model, self.names.index(name), 0).reshape(x.size, -1)
         out = []
         for numbers in (self.flux[len(self.flux) // 2], self.rows[0][:, self.lit]):
-            if x.size == 2:
-                both = table[:, (table >= 0).all(axis=0)]
-                out.append(_TWO * (numbers[both[1]] - numbers[both[0]]))
-                continue
             parts = []
             for i, t in enumerate((x[1:-1] - x[:-2]) / (x[2:] - x[:-2])):
                 low, here, high = table[i : i + 3, (table[i : i + 3] >= 0).all(axis=0)]
