@@ -22,7 +22,7 @@ from miricigale.utils.random import stream
 
 __all__ = ["Between"]
 
-#: Least variance of a scale, and least prior density.
+#: Least variance of a scale.
 _TINY = 1e-290
 #: Part of the population that the weights of a step may leave effective, and moves in each.
 _EFFECTIVE, _MOVES = 0.5, 12

@@ -106,6 +106,11 @@ class Continuation:
         steps = (np.square(step) for step in self._steps(flux) if len(step))
         return np.sqrt(sum((np.median(one, axis=0) for one in steps), np.zeros(flux.shape[2])))
 
+    @cached_property
+    def _same(self):
+        """Which of the finer models are those of the grid, by kind."""
+        return {kind: self.finer.those_of(self.nodes, kind) for kind in self.finer.kinds}
+
     def _steps(self, some):
         """Half the changes of ln flux, but for a factor, between nodes: (m, nb) along each axis."""
         engine, z = self.engine, len(some) // 2
@@ -142,7 +147,7 @@ class Continuation:
         engine, between = self.engine, self.finer.between(redshift)
         template = engine.template_error
         fluxes = {
-            kind: own.at_redshift(redshift, between, self.finer.those_of(self.nodes, kind))
+            kind: own.at_redshift(redshift, between, self._same[kind])
             for kind, own in self.finer.kinds.items()
         }
         return replace(

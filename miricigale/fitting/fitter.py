@@ -29,21 +29,6 @@ __all__ = ["BayesFitter"]
 
 logger = logging.getLogger(__name__)
 
-#: Options that only one kind of engine has.
-_OF_GRID = (
-    "axes",
-    "prior_f",
-    "redshift_tolerance",
-    "compat",
-    "rtol",
-    "template_error",
-    "sfr_prior",
-    "interpolate",
-    "finer",
-)
-_OF_SAMPLER = ("predict", "n_live", "n_effective", "max_calls", "n_draws", "n_cells")
-_OF_SAMPLER += ("sampler_options",)
-
 
 class BayesFitter:
     """
@@ -485,7 +470,7 @@ class BayesFitter:
 def _check_options(given):
     """Refuse options of another engine than the one that was chosen."""
     of_grid = given["engine"] == "grid"
-    for name in _OF_SAMPLER if of_grid else _OF_GRID:
+    for name in (SamplerFit if of_grid else GridFit).options:
         value, default = given[name], BayesFitter.__init__.__kwdefaults__[name]
         if value is not default and not (np.ndim(value) == 0 and value == default):
             wanted = "left out with engine='grid'" if of_grid else "left out with a sampler"

@@ -40,10 +40,6 @@ VANISHING_CHI2 = 1417.0
 _JOINT_SIZE = 1 << 22
 #: Weight of one galaxy model, and of one redshift, above which an object is flagged.
 _ALONE = 0.95
-#: Fluxes that are all 0 become negative by this part of their error; see `_engine_input`.
-_DARK = 1e-8
-#: Sum of squared S/N that counts as 0: smaller numbers have fewer digits, or none.
-_NO_SIGNAL = 1e-280
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +62,9 @@ class GridFit:
     template_error: TemplateError | None = None
     between: Between | None = None
 
+    #: Options of the fitter that no other backend has.
+    options = ("axes", "prior_f", "redshift_tolerance", "compat", "rtol", "template_error")
+    options += ("sfr_prior", "interpolate", "finer")
     #: Objects in a piece of the catalog.
     chunk_size = 64
     #: Weight of the first or last redshift above which an object is flagged.
@@ -107,6 +106,8 @@ class GridFit:
             if axes is None or filters is None:
                 msg = "'axes' and 'filters' must be given when 'model' is an SEDModel"
                 raise ValueError(msg)
+            if finer not in (None, model):
+                raise argument_error("finer", "left out when 'model' is an SEDModel", "another one")
             grid, finer = model.grid(axes, filters), model if interpolate else None
         elif axes is not None:
             raise argument_error("axes", "None when 'model' is a ModelGrid", "a value")
@@ -199,6 +200,9 @@ class GridFit:
             mass = [1e8, 1e10, 1e12] * MASS
             rates = [expected_sfr(relation, mass, one).tolist() for one in z[[0, -1]]]
             more["sfr_prior"] = {"scatter": scatter, "sfr": rates}
+        if self.between is not None and self.between.models.finer is not self.between.models.nodes:
+            finer = self.between.models.finer.axes.items()
+            more["finer"] = {name: int(axis.values.size) for name, axis in finer}
         return more
 
     def provenance(self):
@@ -270,7 +274,7 @@ class GridFit:
             if own and len(some):
                 parts.append(self._at_redshift(some, log_prior[rows], joint, pairs))
                 continue
-            out = self.engine.fit(**_engine_input(some, log_prior[rows]), **options)
+            out = self.engine.fit(**some.of_engine(log_prior[rows]), **options)
             results = self._results(some, out, pairs)
             if self.between is not None:
                 results = self._refined(self.engine, some, log_prior[rows], results)
@@ -284,7 +288,7 @@ class GridFit:
         node = int(np.argmax(log_prior[0]))
         engine = self.between.models.at_redshift(z if fitted else self.grid.redshift[0], node)
         log_prior = log_prior[:, node : node + 1]
-        out = engine.fit(**_engine_input(data, log_prior), joint=joint)
+        out = engine.fit(**data.of_engine(log_prior), joint=joint)
         if fitted:
             out.index[:, 0] = node
         here = np.arange(n_z) == node
@@ -305,7 +309,7 @@ class GridFit:
         """Results between the nodes."""
         wide, seeds = self.between.widened(data)
         index, _ = engine.draw(
-            n_draws=self.between.n_draws, seeds=seeds, **_engine_input(wide, log_prior)
+            n_draws=self.between.n_draws, seeds=seeds, **wide.of_engine(log_prior)
         )
         return self.between.refine(engine, data, wide, log_prior, index, seeds, results)
 
@@ -427,21 +431,7 @@ class GridFit:
 
 def _draw_piece(engine, n_draws, piece):
     data, log_prior, seeds = piece
-    return engine.draw(n_draws=n_draws, seeds=seeds, **_engine_input(data, log_prior))
-
-
-def _engine_input(data, log_prior):
-    """Keywords of `GridEngine.fit` for photometry and priors of redshift."""
-    flux, measured, limit = np.nan_to_num(data.flux), data.measured, data.limit
-    signal = np.divide(flux, data.sigma, out=np.zeros(flux.shape), where=measured)
-    # the engine compares directions, of which zeros have none. Just below zero the best scale
-    # of every model is 0 as well, and chi2 is larger by 1e-16 a band
-    dark = measured & (np.sum(signal * signal, axis=1) < _NO_SIGNAL)[:, None]
-    flux = np.where(dark, -_DARK * data.sigma, flux)
-    out = {"flux": flux, "sigma": np.where(limit, np.inf, data.sigma), "log_prior": log_prior}
-    if np.any(limit):
-        out |= {"limit": flux, "limit_sigma": np.where(limit, data.sigma, np.inf)}
-    return out
+    return engine.draw(n_draws=n_draws, seeds=seeds, **data.of_engine(log_prior))
 
 
 def _forget(out, rows):

@@ -30,6 +30,10 @@ LOW_SIGNAL = 3.0
 _LEAST_ERROR = 1e-6
 #: Least and largest error, and largest flux, in uJy; beyond, their squares are no numbers.
 _SMALL, _LARGE = 1e-60, 1e60
+#: Fluxes that are all 0 become negative by this part of their error; see `FitData.of_engine`.
+_DARK = 1e-8
+#: Sum of squared S/N that counts as 0: smaller numbers have fewer digits, or none.
+_NO_SIGNAL = 1e-280
 _TRUE = ("true", "t", "1")
 _FALSE = ("false", "f", "0", "")
 _KINDS = {"U": "text", "S": "text", "b": "true and false", "c": "complex numbers"}
@@ -131,6 +135,19 @@ class FitData(ObjectRows):
         """What results take over: keywords of `~miricigale.fitting.FitResults`."""
         taken = ("ids", "flux", "flux_err", "sigma", "limit")
         return {name: getattr(self, name) for name in taken} | {"n_bands": self.used.sum(axis=1)}
+
+    def of_engine(self, log_prior):
+        """Keywords of `~miricigale.fitting.grid.GridEngine.fit`; priors of redshift have the shape (n, nz)."""
+        flux, measured, limit = np.nan_to_num(self.flux), self.measured, self.limit
+        signal = np.divide(flux, self.sigma, out=np.zeros(flux.shape), where=measured)
+        # the engine compares directions, of which zeros have none. Just below zero the best scale
+        # of every model is 0 as well, and chi2 is larger by 1e-16 a band
+        dark = measured & (np.sum(signal * signal, axis=1) < _NO_SIGNAL)[:, None]
+        flux = np.where(dark, -_DARK * self.sigma, flux)
+        out = {"flux": flux, "sigma": np.where(limit, np.inf, self.sigma), "log_prior": log_prior}
+        if np.any(limit):
+            out |= {"limit": flux, "limit_sigma": np.where(limit, self.sigma, np.inf)}
+        return out
 
 
 @dataclass(frozen=True, eq=False)

@@ -283,5 +283,7 @@ def test_a_finer_grid_is_of_the_model_that_made_the_grid(chain):
         BayesFitter(grid, interpolate=10, finer=other)
     with pytest.raises(ValueError, match="'finer' must be None without 'interpolate'"):
         BayesFitter(grid, finer=model)
+    with pytest.raises(ValueError, match="'finer' must be left out when 'model' is an SEDModel"):
+        BayesFitter(model, CHAIN_BANDS, axes=CHAIN, interpolate=10, finer=other)
     with pytest.raises(ValueError, match="'finer' must be an SEDModel"):
         BayesFitter(grid, interpolate=10, finer=grid)

@@ -41,6 +41,9 @@ class SamplerFit:
     n_draws: int
     n_cells: int
 
+    #: Options of the fitter that no other backend has.
+    options = ("predict", "n_live", "n_effective", "max_calls", "n_draws", "n_cells")
+    options += ("sampler_options",)
     #: Objects in a piece of the catalog.
     chunk_size = 1
 
