@@ -12,8 +12,8 @@ import time
 import numpy as np
 
 from miricigale.evaluation import Estimate
+from miricigale.planning import Planner, load_plan
 from miricigale.utils.parallel import thread_count, thread_pool
-from miricigale.workflow.planning import Planner, load_plan
 
 #: docs/sanity.rst: 342 sources. The run's errors are the plan's, scaled to as many sources, and of shares
 #: those of its own counts.

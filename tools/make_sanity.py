@@ -15,10 +15,10 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.evaluation import number
+from miricigale.instrument.image_files import read_image
+from miricigale.pages import number
 from miricigale.sed import SEDModel
 from miricigale.workflow import Context, load_config
-from miricigale.workflow.products import read_image
 from miricigale.workflow.stages import figures, pictures, provenance, truth_figures
 from miricigale.workflow.stages.comparison import study_results
 from miricigale.workflow.stages.metrics import StudyTables

@@ -88,10 +88,10 @@ def add_fit(commands):
 
 
 def _fit(args):
+    from miricigale.fitting.classes import fit_classes, write_table
+    from miricigale.fitting.page import fit_page
     from miricigale.utils.exceptions import OtherResultsError
     from miricigale.utils.parallel import thread_count, thread_pool
-    from miricigale.workflow.classes import fit_classes, write_table
-    from miricigale.workflow.fit_page import fit_page
 
     hdu = int(args.hdu) if (args.hdu or "").isdigit() else args.hdu
     n_threads = thread_count(args.threads or None)
@@ -196,7 +196,7 @@ def add_photometry(commands):
 
 def _photometry(args):
     from miricigale.photometry import MosaicFile
-    from miricigale.workflow.photometry import measure_files
+    from miricigale.photometry.from_files import measure_files
 
     paths = [path for path in (args.image, args.highres) if path is not None] + args.positional
     if len(paths) != 2 or (args.positional and len(args.positional) != 2):

@@ -16,7 +16,7 @@ def add_filters(commands):
 
 
 def _filters(args):
-    from miricigale.workflow.commands import filter_table
+    from miricigale.filters import filter_table
 
     table = filter_table(args.pattern)
     if len(table) == 0:

@@ -48,7 +48,7 @@ def add_reduce(commands):
 
 def _reduce(args):
     from miricigale.reduction import Reducer
-    from miricigale.workflow.reduce import reduce_files
+    from miricigale.reduction.from_files import reduce_files
 
     reducer = Reducer(
         backend=args.backend,

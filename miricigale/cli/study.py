@@ -163,7 +163,7 @@ def _plan(args):
     options = ("config", "bands", "position", "output")
     given |= {name for name in options if getattr(args, name) is not None}
     if not given and not args.print_config:
-        from miricigale.workflow.commands import plan_table
+        from miricigale.planning import plan_table
 
         plan_table(quick=args.quick).pprint_all()
         return 0
@@ -173,9 +173,8 @@ def _plan(args):
     if args.time is not None and args.depth is not None:
         msg = "wanted are --time or --depth, not both"
         raise ValueError(msg)
+    from miricigale.planning import load_plan, write_plan
     from miricigale.utils.parallel import thread_count, thread_pool
-    from miricigale.workflow.commands import write_plan
-    from miricigale.workflow.planning import load_plan
 
     config = load_plan(args.config, overrides=_plan_overrides(args))
     if args.print_config:

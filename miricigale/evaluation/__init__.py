@@ -63,7 +63,6 @@ __getattr__, __dir__, __all__ = lazy_names(
         "numbers": ("selection_table", "study_confusion", "study_numbers"),
         "paper": ("PUBLISHED", "PublishedNumber", "compare_with_paper", "comparison_rows"),
         "quantities": ("QUANTITIES", "REDSHIFT_BINS", "measure", "xray_fluxes"),
-        "report": ("Missing", "Report", "number"),
         "study": ("StudyResults", "TruthResults"),
         "xray": (
             "XRAY_LIMITS",

@@ -6,7 +6,7 @@ import numpy as np
 
 from miricigale.evaluation.estimates import Estimate
 from miricigale.evaluation.quantities import QUANTITIES, SHARES, measure
-from miricigale.evaluation.report import Missing
+from miricigale.pages.page import Missing
 from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_rows
@@ -412,7 +412,7 @@ def comparison_rows(table):
     -------
     rows : list of tuple
         Section, description, paper (with ``[?]`` if second hand), ours with its error, completeness and
-        verdict: text, or `~miricigale.evaluation.Missing`.
+        verdict: text, or `~miricigale.pages.Missing`.
     """
     rows = []
     for row in table:

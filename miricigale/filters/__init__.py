@@ -10,6 +10,6 @@ __getattr__, __dir__, __all__ = lazy_names(
         "catalog_map": ("CatalogMap",),
         "surveys": ("SURVEYS",),
         "filter": ("Filter",),
-        "filter_set": ("FilterSet",),
+        "filter_set": ("FilterSet", "filter_table"),
     },
 )

@@ -4,13 +4,14 @@ import dataclasses
 
 import astropy.units as u
 import numpy as np
+from astropy.table import QTable
 
 from miricigale.filters.filter import UNCOVERED, Filter, check_wave, spectrum_arrays
 from miricigale.filters.library import full_name
 from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.units import FNU, WAVE
 
-__all__ = ["FilterSet"]
+__all__ = ["FilterSet", "filter_table"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -159,3 +160,28 @@ class FilterSet:
         ax = plot_filters(curves, ax=ax, **kwargs)
         ax.set_ylabel("throughput over its peak")
         return ax
+
+
+def filter_table(pattern=""):
+    """
+    The filters whose name holds a text.
+
+    Parameters
+    ----------
+    pattern : str, optional
+        Part of the name; all if empty.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        ``name``, ``pivot`` and ``width`` (um).
+    """
+    names = [name for name in Filter.names() if pattern.lower() in name]
+    filters = [Filter.from_name(name) for name in names]
+    return QTable(
+        {
+            "name": np.array(names, dtype=str),
+            "pivot": u.Quantity([f.pivot for f in filters], u.um) if names else [] * u.um,
+            "width": u.Quantity([f.width for f in filters], u.um) if names else [] * u.um,
+        }
+    )

@@ -22,6 +22,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "checks": ("LeaveOutResult", "MockResult", "leave_out", "mock_analysis"),
         "classification": ("compare_classes",),
         "fitter": ("BayesFitter",),
+        "from_files": ("fit_catalog",),
         "io": ("FitResultsFiles", "open_results"),
         "likelihood": ("FitFlags",),
         "priors": ("magnitude_prior",),

@@ -22,6 +22,7 @@ __getattr__, __dir__, __all__ = lazy_names(
             "frame_time",
             "readout_patterns",
         ),
+        "image_files": ("read_image", "write_image"),
         "figures": ("imager_filters",),
         "keywords": (
             "READOUT_NAMES",

@@ -20,6 +20,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "fields": ("SmoothField",),
         "flags": ("ForcedFlags",),
         "forced": ("ForcedPhotometer",),
+        "from_files": ("measure_files",),
         "injection": ("calibrate_errors",),
         "offsets": ("OffsetMap",),
         "mosaics": ("MosaicFile", "read_mosaic"),

@@ -16,6 +16,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "calibration": ("calibrate", "find_cosmic_rays"),
         "dither_background": ("dither_backgrounds",),
         "files": ("ImageFile", "open_exposure", "read_images", "write_image"),
+        "from_files": ("reduce_files",),
         "mosaic": (
             "Mosaic",
             "drizzle_images",

@@ -379,7 +379,7 @@ class Reducer:
         ramps : iterable of Ramp, Charge, `~astropy.nddata.CCDData` or path-like
             Exposures at any stage, as `reduce` takes them. One at a time is held if this is
             a generator, or paths. For files of several filters see
-            `miricigale.workflow.reduce_files`.
+            `miricigale.reduction.reduce_files`.
         wcs : `~astropy.wcs.WCS`, optional
             Of the mosaic; by default the smallest north-up grid that holds
             every unmasked pixel of the dithers.

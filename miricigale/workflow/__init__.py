@@ -6,8 +6,6 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "config": ("StudyConfig", "load_config", "preset_names"),
-        "products": ("write_image",),
-        "reduce": ("reduce_files",),
         "runner": ("StudyRunner",),
         "stage": ("Context", "Stage"),
         "stages": ("study_stages",),

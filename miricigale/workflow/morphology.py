@@ -13,6 +13,7 @@ from scipy.ndimage import find_objects
 from miricigale import photometry
 from miricigale.photometry.arrays import pixel_scale
 from miricigale.photometry.grids import grid_angle
+from miricigale.photometry.kernel_files import image_psf
 from miricigale.profiles import sersic_radius
 from miricigale.psf import psf_image, rotate_psf
 from miricigale.scene import CatalogFlags, Cutout, check_catalog, deconvolve
@@ -20,7 +21,6 @@ from miricigale.utils.exceptions import DataError
 from miricigale.utils.random import stream
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import ANGLE
-from miricigale.workflow.kernel_files import image_psf
 
 __all__ = ["RealGalaxies", "add_clumps", "read_stamps", "stamps_of_sources", "write_stamps"]
 

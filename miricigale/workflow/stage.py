@@ -6,11 +6,11 @@ import time
 import types
 from collections.abc import Callable
 
+from miricigale.instrument.image_files import read_image, write_image
 from miricigale.utils.exceptions import DataError
 from miricigale.utils.folder import FileFolder
 from miricigale.utils.meta import undated
 from miricigale.utils.parallel import single_threaded
-from miricigale.workflow.products import read_image, write_image
 
 __all__ = ["Context", "Stage", "run_unit", "stage"]
 

@@ -9,9 +9,9 @@ import numpy as np
 from miricigale.depth import saturation_forecast
 from miricigale.filters import Filter
 from miricigale.instrument import imager_filters
+from miricigale.photometry.kernel_files import file_place
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.disk import disk_use
-from miricigale.workflow.kernel_files import file_place
 from miricigale.workflow.runner import StudyRunner
 from miricigale.workflow.sections import HighresSection
 from miricigale.workflow.stages import study_stages

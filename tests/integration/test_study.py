@@ -15,8 +15,8 @@ from astropy.table import QTable
 
 from miricigale.depth import saturation_forecast
 from miricigale.instrument import DQ
+from miricigale.instrument.image_files import read_image
 from miricigale.workflow import disk_use, load_config, study_stages
-from miricigale.workflow.products import read_image
 from miricigale.workflow.stages.exposures import study_exposures
 
 SMALL = """

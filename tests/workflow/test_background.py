@@ -11,11 +11,11 @@ from astropy.table import QTable
 
 from miricigale.depth import zodiacal_factor
 from miricigale.instrument import background_level
+from miricigale.planning import load_plan
+from miricigale.planning.exposures import band_plans
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.background import background_text
 from miricigale.workflow.config import StudyConfig, load_config
-from miricigale.workflow.planning import load_plan
-from miricigale.workflow.planning.exposures import band_plans
 from miricigale.workflow.stages.exposures import (
     background_options,
     study_background,

@@ -122,7 +122,7 @@ def test_the_plan_states_the_exposures(capsys):
 
 def test_the_plans_own_limits_lie_between_the_calculators_and_those_without_a_residual():
     from miricigale.depth import sensitivity
-    from miricigale.workflow.commands import plan_table
+    from miricigale.planning import plan_table
 
     row = plan_table()[3]
     assert row["filter"] == "miri.f1500w"

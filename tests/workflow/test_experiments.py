@@ -6,8 +6,8 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 
-from miricigale.evaluation import Report
 from miricigale.fitting import FitResults
+from miricigale.pages import Page
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
@@ -184,7 +184,7 @@ def test_numbers_of_perfect_fits(truth):
 
 
 def test_the_section_of_the_page(folder):
-    context, report = Context(config_of(*FAST), folder), Report("made up")
+    context, report = Context(config_of(*FAST), folder), Page("made up")
     experiments.write_experiments(context, report, tables_of(folder))
     report.write(folder / "page.html")
     page = (folder / "page.html").read_text()
@@ -193,7 +193,7 @@ def test_the_section_of_the_page(folder):
     numbers = QTable.read(folder / "report" / "experiments.ecsv")
     assert list(numbers["experiment"]) == ["study", *FAST]
     assert np.all(numbers["n"] == N - 1)
-    report = Report("made up")
+    report = Page("made up")
     experiments.write_experiments(Context(config_of(), folder), report, tables_of(folder))
     report.write(folder / "none.html")
     assert "Further fits" not in (folder / "none.html").read_text()
@@ -204,7 +204,7 @@ def test_without_a_sampler_there_is_a_sentence(folder, monkeypatch):
     config = config_of("samplers")
     do(config, folder, "experiments", "agn40/samplers")
     assert len(read(folder, "samplers")) == 0
-    report = Report("made up")
+    report = Page("made up")
     experiments.write_experiments(Context(config, folder), report, tables_of(folder))
     report.write(folder / "left.html")
     assert "Neither nautilus nor dynesty is installed" in (folder / "left.html").read_text()
@@ -220,7 +220,7 @@ def test_a_subset_is_spread_over_the_sample(folder, monkeypatch):
     assert list(few["id"][[0, -1]]) == [1, N]
     same = kept[np.isin(kept["id"], few["id"])]
     assert_allclose(few["frac_agn_mean"], same["frac_agn_mean"], rtol=1e-6)
-    report = Report("made up")
+    report = Page("made up")
     experiments.write_experiments(Context(config, folder), report, tables_of(folder))
     numbers = QTable.read(folder / "report" / "experiments.ecsv")
     assert list(numbers["n_sources"]) == [N - 1, 3, 3]

@@ -9,8 +9,8 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 from astropy.table import QTable
 
-from miricigale.evaluation import Report
 from miricigale.instrument import Exposure, flat_field, miri_detector
+from miricigale.pages import Page
 from miricigale.psf import miri_psf
 from miricigale.scene import Scene
 from miricigale.sed import SEDModel
@@ -498,7 +498,7 @@ def test_costs_are_changes_of_the_same_sources(tmp_path):
     assert cost["all", "fracAGN offset"]["change"] == pytest.approx(0.2)
     assert cost["all", "fracAGN scatter"]["change"] == pytest.approx(0)
     assert len(perturbation_costs(study_truths(config_of([])), every, BANDS, seed=SEED)) == 0
-    report = Report("made up")
+    report = Page("made up")
     context = Context(config, tmp_path)
     write_perturbed(context, report, study_truths(config_of([])), every)
     assert "does not know" not in report.to_html()

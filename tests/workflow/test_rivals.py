@@ -6,7 +6,8 @@ import pytest
 from astropy.table import QTable
 
 from helpers.points import PRIOR, point_catalog, save_points
-from miricigale.evaluation import PUBLISHED, Report
+from miricigale.evaluation import PUBLISHED
+from miricigale.pages import Page
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig, load_config
@@ -127,13 +128,13 @@ def test_galaxies_are_told_apart_by_size(tables):
 
 
 def test_the_section_of_the_page(folder, tables):
-    report = Report("made up")
+    report = Page("made up")
     rivals.write_rivals(Context(config_of("package"), folder), report, tables)
     report.write(folder / "page.html")
     page = (folder / "page.html").read_text()
     assert "Rival photometry" in page
     assert "F1500W" in page
-    report = Report("made up")
+    report = Page("made up")
     rivals.write_rivals(Context(config_of("package"), folder), report, {})
     report.write(folder / "none.html")
     assert "Rival photometry" not in (folder / "none.html").read_text()

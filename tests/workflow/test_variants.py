@@ -9,7 +9,7 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
 from helpers.points import point_catalog
-from miricigale.evaluation import Report
+from miricigale.pages import Page
 from miricigale.photometry import detect_sources
 from miricigale.psf import hst_psf
 from miricigale.scene import highres_image
@@ -214,7 +214,7 @@ def test_the_report_says_what_each_costs(tmp_path):
     context = Context(config, tmp_path)
     for name, bands in tables.items():
         context.save_table(f"variants/{name}/{BAND}.ecsv", bands[BAND])
-    report = Report("made up")
+    report = Page("made up")
     nothing = Context(config_of([]), tmp_path)
     assert variants.write_variants(nothing, report, matched, {BAND: 22.15}) is None
     numbers = variants.write_variants(context, report, matched, {BAND: 22.15})

@@ -3,12 +3,8 @@
 import numpy as np
 
 from miricigale import photometry
-from miricigale.evaluation import (
-    AssociationFlags,
-    number,
-    photoz_metrics,
-    recovery_metrics,
-)
+from miricigale.evaluation import AssociationFlags, photoz_metrics, recovery_metrics
+from miricigale.pages import number
 from miricigale.utils.tables import Flags, error_column
 from miricigale.workflow.stages.figures import SET_LABELS, band_label
 from miricigale.workflow.stages.sample import SampleFlags

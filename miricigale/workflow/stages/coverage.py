@@ -2,7 +2,8 @@
 
 import astropy.units as u
 
-from miricigale.evaluation import Missing, coverage_table, number, posterior_ranks
+from miricigale.evaluation import coverage_table, posterior_ranks
+from miricigale.pages import Missing, number
 from miricigale.workflow.stages import truth_figures
 from miricigale.workflow.stages.figures import SET_LABELS
 from miricigale.workflow.stages.truth_figures import parameter_label, truth_label

@@ -11,11 +11,11 @@ from scipy import stats
 from miricigale import fitting, photometry, sed
 from miricigale.evaluation import (
     fraction_interval,
-    number,
     photoz_metrics,
     posterior_ranks,
     recovery_metrics,
 )
+from miricigale.pages import number
 from miricigale.photometry.surveys import HERSCHEL_DEPTHS
 from miricigale.utils.tables import described_rows
 from miricigale.workflow.stage import stage

@@ -3,7 +3,7 @@
 import astropy.units as u
 import numpy as np
 
-from miricigale.evaluation import Missing, number
+from miricigale.pages import Missing, number
 from miricigale.psf import MatchingKernel
 from miricigale.workflow.stages import conditions, figures, pictures, truth_figures
 from miricigale.workflow.stages.exposures import study_exposures, study_pointings

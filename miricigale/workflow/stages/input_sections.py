@@ -1,6 +1,6 @@
 """The section of the report on the inputs, beside published relations."""
 
-from miricigale.evaluation import Missing
+from miricigale.pages import Missing
 from miricigale.workflow.stages import figures
 from miricigale.workflow.stages.figures import band_label
 

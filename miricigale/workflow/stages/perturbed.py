@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 from astropy.table import Table
 
-from miricigale.evaluation import Missing, bootstrap
+from miricigale.evaluation import bootstrap
 from miricigale.evaluation.estimates import median, outlier_share, scatter
 from miricigale.filters import Filter
+from miricigale.pages import Missing
 from miricigale.workflow.stages.figures import band_label
 from miricigale.workflow.stages.metrics import bright_isolated
 from miricigale.workflow.truths import CUTOUTS

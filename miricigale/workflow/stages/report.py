@@ -7,10 +7,8 @@ import logging
 import numpy as np
 
 from miricigale import sed
-from miricigale.evaluation import (
-    Report,
-    study_numbers,
-)
+from miricigale.evaluation import study_numbers
+from miricigale.pages import Page
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages import (
     comparison,
@@ -30,7 +28,7 @@ from miricigale.workflow.stages.input_sections import write_inputs
 from miricigale.workflow.stages.inputs import sed_resources
 from miricigale.workflow.stages.metrics import StudyTables, study_metrics, truth_metrics
 from miricigale.workflow.stages.sample import footprint_area
-from miricigale.workflow.stages.truth_sections import Page, write_results
+from miricigale.workflow.stages.truth_sections import ResultsPage, write_results
 from miricigale.workflow.truths import reference, study_truths
 
 __all__ = ["make_report"]
@@ -111,7 +109,7 @@ def make_report(context, _):
         log.warning("no source is left to fit: %s", metrics["n_left_out"])
     text = json.dumps(_without_nan(metrics), indent=1, allow_nan=False)
     context.save("report/metrics.json", lambda path: path.write_text(text, encoding="utf-8"))
-    report = Report(
+    report = Page(
         f"miricigale: {config.run.name}",
         subtitle=(
             f"{metrics['n_field']} galaxies in {field_text(config)}, injected fracAGN "
@@ -132,7 +130,7 @@ def make_report(context, _):
     calculator = {name: entry["etc_limit"] for name, entry in metrics["bands"].items()}
     switched = variants.write_variants(context, report, tables.matched, calculator)
     write_results(
-        Page(
+        ResultsPage(
             report,
             study,
             known_tables,

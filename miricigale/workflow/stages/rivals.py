@@ -5,8 +5,9 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale import photometry
-from miricigale.evaluation import Estimate, bootstrap, match_truth, number, recovery_metrics
+from miricigale.evaluation import Estimate, bootstrap, match_truth, recovery_metrics
 from miricigale.evaluation.estimates import median
+from miricigale.pages import number
 from miricigale.utils.tables import described_rows, error_column
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.conditions import ConditionFlags

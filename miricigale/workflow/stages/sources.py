@@ -365,7 +365,7 @@ def _json(values):
 
 def _page(config, name, facts):
     """The page as text: the facts and the script are part of it."""
-    files = resources.files("miricigale.evaluation") / "templates"
+    files = resources.files("miricigale.pages") / "templates"
     return string.Template((files / "sources.html").read_text("utf-8")).substitute(
         title=html.escape(f"{config.run.name}: sources of {name}"),
         facts=_json(facts),

@@ -7,12 +7,12 @@ from astropy.table import QTable, hstack
 
 from miricigale import fitting, sed
 from miricigale.evaluation import AGNPopulation, agn_fraction, main_sequence_dust
+from miricigale.photometry.kernel_files import file_place
 from miricigale.refdata.locate import fingerprint
 from miricigale.utils.content import file_sha256
 from miricigale.utils.exceptions import ConfigError, DataError
 from miricigale.utils.meta import provenance
 from miricigale.utils.random import stream
-from miricigale.workflow.kernel_files import file_place
 from miricigale.workflow.morphology import RealGalaxies, stamps_of_sources, write_stamps
 from miricigale.workflow.perturbation import perturbed_model, perturbed_parameters, point_columns
 from miricigale.workflow.stage import stage

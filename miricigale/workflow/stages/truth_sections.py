@@ -7,15 +7,13 @@ from astropy.table import QTable
 
 from miricigale.evaluation import (
     CLASS_NAMES,
-    Missing,
-    Report,
     StudyResults,
     feature_residuals,
-    number,
     selection_table,
     study_confusion,
 )
 from miricigale.filters import Filter
+from miricigale.pages import Missing, Page, number
 from miricigale.sed import SEDModel
 from miricigale.workflow.stages import conditions, figures, truth_figures
 from miricigale.workflow.stages.coverage import share_cell, write_coverage
@@ -23,14 +21,14 @@ from miricigale.workflow.stages.figures import SET_LABELS, band_label
 from miricigale.workflow.stages.sample import typical_source
 from miricigale.workflow.stages.truth_figures import FEATURES, truth_label
 
-__all__ = ["Page", "percent", "write_results"]
+__all__ = ["ResultsPage", "percent", "write_results"]
 
 #: fracAGN of the truths of which a source is shown in detail.
 EXAMPLES = (0.0, 0.4)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class Page:
+class ResultsPage:
     """
     What the sections of a page read, and the report that they fill.
 
@@ -40,7 +38,7 @@ class Page:
     ``model_error`` their relative error.
     """
 
-    report: Report
+    report: Page
     study: StudyResults
     every: dict
     metrics: dict

@@ -9,8 +9,9 @@ from astropy.stats import biweight_scale
 from astropy.table import QTable
 
 from miricigale import photometry, psf, scene
-from miricigale.evaluation import fraction_interval, match_truth, number
+from miricigale.evaluation import fraction_interval, match_truth
 from miricigale.filters import Filter
+from miricigale.pages import number
 from miricigale.photometry.error_curves import limiting_flux, measured_curve
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_rows, error_column

@@ -7,8 +7,8 @@ from astropy.io import fits
 from astropy.nddata import CCDData, StdDevUncertainty
 from astropy.wcs import WCS
 
+from miricigale.instrument.image_files import read_image, write_image
 from miricigale.utils.exceptions import DataError
-from miricigale.workflow.products import read_image, write_image
 
 
 def test_images_survive_the_file(tmp_path):

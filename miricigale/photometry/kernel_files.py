@@ -281,7 +281,7 @@ def matching_kernel(image, highres, *, kernel=None, psf=None, highres_psf=None, 
     image, highres : `~miricigale.photometry.MosaicHeader`
         Of the two images, with filters and position angles.
     kernel, psf, highres_psf : path-like, optional
-        As for `~miricigale.workflow.photometry.measure_files`.
+        As for `~miricigale.photometry.from_files.measure_files`.
     **options
         ``psf_scale``, ``psf_angle``, ``highres_psf_scale`` and ``highres_psf_angle``, likewise.
 

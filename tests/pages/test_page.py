@@ -3,11 +3,11 @@ import re
 import pytest
 from matplotlib.figure import Figure
 
-from miricigale.evaluation import Missing, Report, number
+from miricigale.pages import Missing, Page, number
 
 
 def test_report_is_one_file_that_holds_everything(tmp_path):
-    report = Report("A <title>", subtitle="made by a test")
+    report = Page("A <title>", subtitle="made by a test")
     report.section("First & only", "5 < 6")
     report.items([("outliers", "1.5 %")])
     report.table([["miri.f770w", 1.0]], header=["band", "flux"], caption="fluxes")
@@ -27,7 +27,7 @@ def test_report_is_one_file_that_holds_everything(tmp_path):
 
 
 def test_what_is_missing_is_a_dash_with_its_reason(tmp_path):
-    report = Report("title", notices=["this & that stand in"])
+    report = Page("title", notices=["this & that stand in"])
     rows = [
         ("a", number(float("nan"), ".2f", "no source"), number(0.5, "{:.0f} %", "x", scale=100))
     ]
@@ -48,7 +48,7 @@ def test_what_is_missing_is_a_dash_with_its_reason(tmp_path):
 
 
 def test_columns_of_text_are_named_by_number_or_place(tmp_path):
-    report = Report("made up")
+    report = Page("made up")
     rows = [("band", 3, "a long verdict")]
     report.table(rows, header=("a", "b", "c"), text=2)
     report.table(rows, header=("a", "b", "c"), text=(0, 2))
@@ -58,7 +58,7 @@ def test_columns_of_text_are_named_by_number_or_place(tmp_path):
 
 
 def test_tables_without_rows_are_sentences():
-    report = Report("title")
+    report = Page("title")
     report.table([], header=("band",), empty="There is no band.")
     page = report.to_html()
     assert "<p>There is no band.</p>" in page
@@ -72,7 +72,7 @@ def test_tables_without_rows_are_sentences():
 def test_pages_are_the_same_bytes():
     pages = []
     for _ in range(2):
-        report = Report("title")
+        report = Page("title")
         figure = Figure(figsize=(2, 2))
         figure.add_subplot().plot([0, 1])
         report.figure(figure, "a line")

@@ -35,7 +35,7 @@ def make_sample(config, bands, *, executor=None):
 
     Parameters
     ----------
-    config : `~miricigale.workflow.planning.PlanConfig`
+    config : `~miricigale.planning.PlanConfig`
         Sections ``catalog``, ``sample``, ``sed`` and ``agn`` are used. The catalog may have a column
         ``frac_agn``, which takes the place of the mix of ``agn``.
     bands : iterable of str

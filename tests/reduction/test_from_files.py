@@ -10,9 +10,8 @@ from astropy.table import Table
 from miricigale.cli import main
 from miricigale.detector import Detector
 from miricigale.instrument import Exposure, background_level
-from miricigale.reduction import Reducer, read_images, write_image
+from miricigale.reduction import Reducer, read_images, reduce_files, write_image
 from miricigale.utils.exceptions import MiricigaleWarning
-from miricigale.workflow import reduce_files
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,12 @@ from astropy.modeling.models import BlackBody
 from astropy.table import QTable, Table, vstack
 
 from miricigale.cli import main
-from miricigale.fitting import open_results
+from miricigale.fitting import fit_catalog, open_results
 from miricigale.fitting.grid import GridEngine
+from miricigale.fitting.page import fit_page
 from miricigale.sed import SEDModel, read_spectra, template_grid
 from miricigale.sed.foreground import band_extinction
 from miricigale.utils.exceptions import MiricigaleWarning
-from miricigale.workflow.commands import fit_catalog
-from miricigale.workflow.fit_page import fit_page
 
 BANDS = ("wfc3.f125w", "wfc3.f160w", "irac.ch1", "irac.ch2", "miri.f770w", "miri.f1500w")
 

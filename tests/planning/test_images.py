@@ -9,12 +9,12 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
 from miricigale.photometry import ErrorModel
+from miricigale.planning import Planner, load_plan, paired_bands, paired_numbers
+from miricigale.planning.exposures import band_plans
+from miricigale.planning.images import ImagedSample, images_catalog, images_study
 from miricigale.scene import read_catalog
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context, StudyConfig
-from miricigale.workflow.planning import Planner, load_plan, paired_bands, paired_numbers
-from miricigale.workflow.planning.exposures import band_plans
-from miricigale.workflow.planning.images import ImagedSample, images_catalog, images_study
 from miricigale.workflow.stages import study_stages
 from miricigale.workflow.stages.exposures import band_exposures, study_background
 from miricigale.workflow.study import check_study

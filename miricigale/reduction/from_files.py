@@ -10,8 +10,8 @@ import numpy as np
 from astropy.table import Table
 
 from miricigale.detector import Ramp
-from miricigale.evaluation import Report
 from miricigale.instrument import ImageFacts
+from miricigale.pages import Page
 from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.plotting.images import plot_image
 from miricigale.reduction import (
@@ -110,7 +110,7 @@ def reduce_files(
         except _ERRORS as err:
             row["reason"] = _reason(err)
             log.warning("%s is left out: %s", path, row["reason"])
-    page = Report("Reduction", subtitle=f"{len(paths)} files")
+    page = Page("Reduction", subtitle=f"{len(paths)} files")
     for name, members in sorted(done.items()):
         row = {"file": f"mosaic_{name.rpartition('.')[2]}.fits", "filter": name}
         rows.append(row | {"status": "failed", "reason": ""})

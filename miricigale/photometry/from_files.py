@@ -12,7 +12,9 @@ import numpy as np
 from astropy.io.fits.verify import VerifyWarning
 
 from miricigale.filters import Filter
+from miricigale.instrument.image_files import write_image
 from miricigale.photometry.grids import grid_angle
+from miricigale.photometry.kernel_files import can_be_modeled, file_place, matching_kernel
 from miricigale.photometry.mosaics import MosaicFile
 from miricigale.utils.exceptions import DataError, MiricigaleWarning, argument_error
 from miricigale.utils.files import split_extension
@@ -20,8 +22,6 @@ from miricigale.utils.progress import progress
 from miricigale.utils.store import replacing
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import to_array
-from miricigale.workflow.kernel_files import can_be_modeled, file_place, matching_kernel
-from miricigale.workflow.products import write_image
 
 __all__ = ["empty_positions", "measure_files"]
 
@@ -75,7 +75,7 @@ def measure_files(
         on the prior.
     kernel : path-like, optional
         From the prior's resolution to that of the image, on the prior's pixels; see
-        ``miricigale.workflow.kernel_files.read_kernel``. Without a PSF of the prior sources are
+        ``miricigale.photometry.kernel_files.read_kernel``. Without a PSF of the prior sources are
         the segments as they are, and those without one are not measured.
     psf, highres_psf : path-like, optional
         PSFs of image and prior with the pixel and the drizzling in them: ``file.fits``,
@@ -192,7 +192,7 @@ def measure_files(
                 with replacing(path) as partial:
                     write_image(picture, partial)
         if page is not None:
-            from miricigale.workflow.photometry_page import photometry_page
+            from miricigale.photometry.page import photometry_page
 
             pulls = _pulls(result, matching, n_empty, seed, n_threads)
             photometry_page(result, filter_, mosaic, prior, matching, pulls, segments).write(page)

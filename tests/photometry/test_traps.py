@@ -13,6 +13,7 @@ from astropy.table import Table
 
 from miricigale.instrument import north_up_wcs, pixel_area_map
 from miricigale.photometry import read_mosaic
+from miricigale.photometry.from_files import measure_files
 from miricigale.psf import (
     MatchingKernel,
     encircled_energy,
@@ -23,7 +24,6 @@ from miricigale.psf import (
     psf_mosaic,
 )
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
-from miricigale.workflow.photometry import measure_files
 
 CENTER, ARCSEC = SkyCoord(34.3, -5.1, unit="deg"), u.arcsec
 COARSE, FINE, PA = 0.11, 0.06, 75.0

@@ -7,10 +7,10 @@ import pytest
 from miricigale.depth import etc_limit, saturation_forecast, sensitivity
 from miricigale.instrument import background_level
 from miricigale.photometry import ErrorModel
+from miricigale.planning import load_plan, wall_clock
+from miricigale.planning.config import OverheadSection
+from miricigale.planning.exposures import RunErrors, band_plans
 from miricigale.utils.exceptions import ConfigError, DataError
-from miricigale.workflow.planning import load_plan, wall_clock
-from miricigale.workflow.planning.config import OverheadSection
-from miricigale.workflow.planning.exposures import RunErrors, band_plans
 
 BAND = "miri.f1000w"
 

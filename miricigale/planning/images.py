@@ -11,12 +11,12 @@ from astropy.table import QTable
 from miricigale.evaluation import OUTLIER, bootstrap
 from miricigale.evaluation.estimates import median, scatter
 from miricigale.photometry import ErrorModel
+from miricigale.planning.sample import agn_mix
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import stream
 from miricigale.utils.store import replacing
 from miricigale.utils.tables import error_column
 from miricigale.workflow.config import StudyConfig
-from miricigale.workflow.planning.sample import agn_mix
 from miricigale.workflow.sections import FitSection, PointSourceSection, RunSection
 from miricigale.workflow.stages.inputs import study_catalog
 from miricigale.workflow.stages.sample import SampleFlags
@@ -94,7 +94,7 @@ def images_study(planner, source):
 
     Parameters
     ----------
-    planner : `~miricigale.workflow.planning.Planner`
+    planner : `~miricigale.planning.Planner`
         The plan.
     source : path-like
         File of `images_catalog`.
@@ -159,7 +159,7 @@ def image_sample(planner, folder, *, executor=None, progress_bar=False):
 
     Parameters
     ----------
-    planner : `~miricigale.workflow.planning.Planner`
+    planner : `~miricigale.planning.Planner`
         The plan, with a sample of its catalog.
     folder : path-like
         Folder of the run, which `~miricigale.workflow.run_study` goes on with; what belongs to another plan
@@ -210,7 +210,7 @@ def paired_bands(planner, imaged):
 
     Parameters
     ----------
-    planner : `~miricigale.workflow.planning.Planner`
+    planner : `~miricigale.planning.Planner`
         The plan.
     imaged : `ImagedSample`
         Of `image_sample`.
@@ -260,9 +260,9 @@ def paired_numbers(planner, plans, imaged_plans, imaged):
 
     Parameters
     ----------
-    planner : `~miricigale.workflow.planning.Planner`
+    planner : `~miricigale.planning.Planner`
         The plan.
-    plans, imaged_plans : list of `~miricigale.workflow.planning.Plan`
+    plans, imaged_plans : list of `~miricigale.planning.Plan`
         Of `Planner.compare`, without and with what the images measured.
     imaged : `ImagedSample`
         Of `image_sample`.
@@ -270,7 +270,7 @@ def paired_numbers(planner, plans, imaged_plans, imaged):
     Returns
     -------
     table : `~astropy.table.QTable`
-        For each set with MIRI and each number of `~miricigale.workflow.planning.planner.accuracy`: ``plan``,
+        For each set with MIRI and each number of `~miricigale.planning.planner.accuracy`: ``plan``,
         ``number``, ``n`` sources (in the field, found on the prior, and detected in one of the plans by either),
         ``noise`` and ``images`` with their errors, ``difference`` (images less noise) with the error that
         sources drawn together give it, and ``sigma``, their ratio.

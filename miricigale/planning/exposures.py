@@ -39,7 +39,7 @@ class BandPlan:
         Their number.
     background : `~astropy.units.Quantity`
         Of sky and telescope, MJy/sr.
-    noise : `~miricigale.workflow.planning.config.NoiseSection`
+    noise : `~miricigale.planning.config.NoiseSection`
         Kind of the errors.
     run : `RunErrors`, optional
         With ``noise.kind = "run"``.
@@ -231,7 +231,7 @@ def band_plans(config, *, share=1.0, run=None):
 
     Parameters
     ----------
-    config : `~miricigale.workflow.planning.PlanConfig`
+    config : `~miricigale.planning.PlanConfig`
         The configuration.
     share : float, optional
         Factor on all times.
@@ -264,7 +264,7 @@ def wall_clock(plans, options, *, pointings=1):
     ----------
     plans : iterable of `BandPlan`
         The bands of a pointing.
-    options : `~miricigale.workflow.planning.config.OverheadSection`
+    options : `~miricigale.planning.config.OverheadSection`
         Times of the overheads.
     pointings : int, optional
         Pointings, each a visit.

@@ -2,8 +2,8 @@
 
 import pytest
 
+from miricigale.planning import PlanConfig, load_plan
 from miricigale.utils.exceptions import ConfigError
-from miricigale.workflow.planning import PlanConfig, load_plan
 
 
 def test_the_text_gives_the_configuration_back(tmp_path):

@@ -5,16 +5,17 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 
-from miricigale.evaluation import Report, number, photoz_metrics
+from miricigale.evaluation import photoz_metrics
 from miricigale.filters import Filter, FilterSet
 from miricigale.filters.catalog_files import MappedRows, as_catalog_map
 from miricigale.fitting import FitFlags
+from miricigale.fitting.classes import classes_of, classes_section
 from miricigale.fitting.likelihood import unused_bands
+from miricigale.fitting.page_numbers import FitNumbers, known_redshifts
+from miricigale.pages import Page, number
 from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.plotting.comparison import plot_redshifts
 from miricigale.utils.row_files import open_rows
-from miricigale.workflow.classes import classes_of, classes_section
-from miricigale.workflow.fit_numbers import FitNumbers, known_redshifts
 
 __all__ = ["fit_page"]
 
@@ -36,8 +37,8 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
     Parameters
     ----------
     results : `~miricigale.fitting.FitResultsFiles` or dict of it
-        What `~miricigale.workflow.commands.fit_catalog` returned, or
-        `~miricigale.workflow.classes.fit_classes`: then the page has a section on the classes.
+        What `~miricigale.fitting.fit_catalog` returned, or
+        `~miricigale.fitting.classes.fit_classes`: then the page has a section on the classes.
     path : path-like
         The catalog that was fitted.
     catalog_map, hdu : optional
@@ -47,7 +48,7 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
 
     Returns
     -------
-    page : `~miricigale.evaluation.Report`
+    page : `~miricigale.pages.Page`
         ``page.write(path)`` writes it, one HTML file.
 
     Raises
@@ -67,7 +68,7 @@ def fit_page(results, path, *, catalog_map=None, hdu=None, z_spec=None):
         # what stars and quasars are as galaxies tells nothing of the fit
         ours = np.isin(columns["class"], ["galaxy", ""])
         found, known = found.only(ours), (known[0], None if known[1] is None else known[1][ours])
-    page = Report(
+    page = Page(
         f"Fits of {Path(path).name}",
         subtitle=f"{len(results)} objects, {len(found.filters)} bands",
         notices=_notices(found),

@@ -35,16 +35,16 @@ def comparison_table(planner, plans):
 
     Parameters
     ----------
-    planner : `~miricigale.workflow.planning.Planner`
+    planner : `~miricigale.planning.Planner`
         That made them.
-    plans : list of `~miricigale.workflow.planning.Plan`
+    plans : list of `~miricigale.planning.Plan`
         Of `Planner.compare`.
 
     Returns
     -------
     table : `~astropy.table.QTable`
         ``plan``, ``time`` (h), ``area``, ``n`` (sources compared), the numbers of
-        `~miricigale.workflow.planning.planner.accuracy` with their errors, ``n_detected`` and ``n_agn`` (expected
+        `~miricigale.planning.planner.accuracy` with their errors, ``n_detected`` and ``n_agn`` (expected
         in the area: sources detected, AGN detected and selected), and ``merit``, by which the rows are
         ranked. Of ``[survey] rank = "agn"`` that is ``n_agn`` times the purity for each hour; of ``"frac_agn"``
         and ``"redshift"`` the inverse variance of the means that is gained over the existing bands,
@@ -78,9 +78,9 @@ def area_table(planner, plans):
 
     Parameters
     ----------
-    planner : `~miricigale.workflow.planning.Planner`
+    planner : `~miricigale.planning.Planner`
         That made them.
-    plans : list of `~miricigale.workflow.planning.Plan`
+    plans : list of `~miricigale.planning.Plan`
         Of `Planner.divide`.
 
     Returns

@@ -13,7 +13,7 @@ import numpy as np
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.store import replacing
 
-__all__ = ["Missing", "Report", "number"]
+__all__ = ["Missing", "Page", "number"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +54,7 @@ def number(value, spec, reason, *, scale=1):
 
     Examples
     --------
-    >>> from miricigale.evaluation import number
+    >>> from miricigale.pages import number
     >>> number(0.0123, "{:+.1f} %", "no source", scale=100)
     '+1.2 %'
     >>> number(float("nan"), ".2f", "no source")
@@ -65,7 +65,7 @@ def number(value, spec, reason, *, scale=1):
     return (spec if "{" in spec else f"{{:{spec}}}").format(scale * value)
 
 
-class Report:
+class Page:
     """
     A report that is filled section by section and written once.
 
@@ -218,7 +218,7 @@ class Report:
     def to_html(self):
         """The page as text."""
         template = string.Template(
-            (resources.files("miricigale.evaluation") / "templates" / "report.html").read_text()
+            (resources.files("miricigale.pages") / "templates" / "report.html").read_text()
         )
         anchors = [f"s{k}" for k in range(len(self._sections))]
         contents = "".join(

@@ -3,11 +3,11 @@
 import astropy.units as u
 import numpy as np
 
-from miricigale.evaluation import Report, number
+from miricigale.pages import Page, number
+from miricigale.planning.exposures import background_options
 from miricigale.plotting.axes import new_figure
 from miricigale.plotting.comparison import MEASURED, SECOND, plot_redshifts
 from miricigale.workflow.background import background_text
-from miricigale.workflow.planning.exposures import background_options
 
 __all__ = ["write_page"]
 
@@ -33,9 +33,9 @@ def write_page(path, planner, plans, comparison, areas=None, images=None):
     ----------
     path : path-like
         HTML file.
-    planner : `~miricigale.workflow.planning.Planner`
+    planner : `~miricigale.planning.Planner`
         That made the plans.
-    plans : list of `~miricigale.workflow.planning.Plan`
+    plans : list of `~miricigale.planning.Plan`
         Of `Planner.compare`.
     comparison, areas : `~astropy.table.QTable`
         Of `comparison_table` and, if there is one, `area_table`.
@@ -48,7 +48,7 @@ def write_page(path, planner, plans, comparison, areas=None, images=None):
     """
     config, miri = planner.config, [plan for plan in plans if plan.bands]
     best = next(plan for plan in miri if plan.name == comparison["plan"][1])
-    page = Report(
+    page = Page(
         f"Plan {config.plan.name}",
         subtitle=f"{len(planner.sources)} sources, seed {config.plan.seed}",
         notices=_notices(planner),

@@ -16,10 +16,10 @@ from helpers.light import gaussian_image
 from helpers.mosaics import render
 from miricigale.cli import main
 from miricigale.instrument import north_up_wcs, pixel_area_map
+from miricigale.instrument.image_files import write_image
 from miricigale.photometry import ForcedFlags, read_mosaic
+from miricigale.photometry.kernel_files import read_kernel
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
-from miricigale.workflow.kernel_files import read_kernel
-from miricigale.workflow.products import write_image
 
 CENTER = SkyCoord(34.3, -5.1, unit="deg")
 #: Pixels and rms of the PSFs of image and prior, arcsec.

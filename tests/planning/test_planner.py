@@ -9,11 +9,11 @@ from astropy.table import QTable
 
 from miricigale.cli import main
 from miricigale.filters import Filter
+from miricigale.planning import Planner, area_table, comparison_table, load_plan
+from miricigale.planning.planner import EXISTING, accuracy
 from miricigale.utils.exceptions import ConfigError
 from miricigale.utils.parallel import thread_pool
 from miricigale.utils.tables import error_column
-from miricigale.workflow.planning import Planner, area_table, comparison_table, load_plan
-from miricigale.workflow.planning.planner import EXISTING, accuracy
 
 BANDS = ["miri.f770w", "miri.f1500w"]
 SETTINGS = {

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from miricigale.evaluation import number
 from miricigale.fitting.classification import class_columns
+from miricigale.fitting.from_files import fit_catalog
+from miricigale.pages import number
 from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.utils.row_files import write_rows
-from miricigale.workflow.commands import fit_catalog
 
 __all__ = ["classes_of", "classes_section", "fit_classes", "write_table"]
 
@@ -29,7 +29,7 @@ def fit_classes(path, output, *, quasars=False, stars=None, **options):
     Parameters
     ----------
     path, output, **options
-        As for `~miricigale.workflow.commands.fit_catalog`, which fits the galaxies. All classes have the same
+        As for `~miricigale.fitting.fit_catalog`, which fits the galaxies. All classes have the same
         bands, errors of models, limits and known redshifts, but stars are at redshift 0, and in front of the Milky
         Way's dust.
     quasars : bool, optional
@@ -47,7 +47,7 @@ def fit_classes(path, output, *, quasars=False, stars=None, **options):
     Warns
     -----
     `~miricigale.utils.exceptions.MiricigaleWarning`
-        What `~miricigale.workflow.commands.fit_catalog` warns of, once for all classes.
+        What `~miricigale.fitting.fit_catalog` warns of, once for all classes.
     """
     spectra = None
     if stars is not None:
@@ -138,7 +138,7 @@ def classes_section(page, columns, names, ids, chi2):
 
     Parameters
     ----------
-    page : `~miricigale.evaluation.Report`
+    page : `~miricigale.pages.Page`
         Gets the section.
     columns : dict of str to `~numpy.ndarray`, shape (n,)
         As `classes_of` returned them.

@@ -12,12 +12,12 @@ from miricigale.evaluation.estimates import median, scatter
 from miricigale.fitting import BayesFitter
 from miricigale.photometry import ErrorModel
 from miricigale.photometry.surveys import fractional_error
+from miricigale.planning.config import PlanConfig
+from miricigale.planning.exposures import RunErrors, band_plans, wall_clock
+from miricigale.planning.sample import make_sample
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column, require_columns
-from miricigale.workflow.planning.config import PlanConfig
-from miricigale.workflow.planning.exposures import RunErrors, band_plans, wall_clock
-from miricigale.workflow.planning.sample import make_sample
 from miricigale.workflow.stages.sample import detected_bands
 
 __all__ = ["EXISTING", "Plan", "Planner", "accuracy"]
@@ -39,7 +39,7 @@ class Plan:
     ----------
     name : str
         Name of the set of bands.
-    bands : dict of str to `~miricigale.workflow.planning.BandPlan`
+    bands : dict of str to `~miricigale.planning.BandPlan`
         The MIRI bands; empty for the existing ones alone.
     sources : `~astropy.table.QTable`
         A row for each source: ``id``, true ``redshift`` and ``frac_agn``, ``n_detected`` bands above 5
@@ -99,7 +99,7 @@ class Planner:
 
     Parameters
     ----------
-    config : `~miricigale.workflow.planning.PlanConfig`, optional
+    config : `~miricigale.planning.PlanConfig`, optional
         The plan; the exposures of CEERS by default.
     sources : `~astropy.table.QTable`, optional
         In place of the section ``sample``: a row for each source with ``id``, ``redshift``, ``frac_agn``
@@ -115,7 +115,7 @@ class Planner:
 
     Examples
     --------
-    >>> from miricigale.workflow.planning import Planner, load_plan
+    >>> from miricigale.planning import Planner, load_plan
     >>> config = load_plan(overrides={"sample": {"n_sources": 100}})
     >>> planner = Planner(config)  # doctest: +SKIP
     >>> for plan in planner.compare():  # doctest: +SKIP

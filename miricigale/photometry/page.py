@@ -6,7 +6,7 @@ import astropy.units as u
 import numpy as np
 from astropy.stats import mad_std
 
-from miricigale.evaluation import Report, number
+from miricigale.pages import Page, number
 from miricigale.photometry import ForcedFlags
 from miricigale.photometry.arrays import pixel_scale
 from miricigale.plotting.axes import new_figure
@@ -23,7 +23,7 @@ _BRIGHT = 20.0
 
 def photometry_page(result, filter_, image, highres, kernel, pulls=None, segments=None):
     """
-    Make the page (`~miricigale.evaluation.Report`) of one measurement in a filter.
+    Make the page (`~miricigale.pages.Page`) of one measurement in a filter.
 
     ``image`` and ``highres`` are what was measured and the prior, of
     `~miricigale.photometry.read_mosaic`, ``kernel`` is between them; ``pulls`` are flux over error at
@@ -31,7 +31,7 @@ def photometry_page(result, filter_, image, highres, kernel, pulls=None, segment
     """
     good = np.isfinite(result.flux.value)
     snr = result.snr
-    page = Report(
+    page = Page(
         f"Forced photometry: {filter_}",
         subtitle=" on the prior ".join(Path(one.meta["source"]).name for one in (image, highres)),
         notices=_notices(result, image, highres, kernel, pulls),

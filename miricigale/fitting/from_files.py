@@ -1,0 +1,126 @@
+"""Fits of a catalog of photometry in a file, with the models of Yang et al. 2021 or of surveys."""
+
+import logging
+import warnings
+
+import numpy as np
+
+from miricigale.filters import Filter
+from miricigale.filters.catalog_files import MappedRows, as_catalog_map
+from miricigale.utils.exceptions import MiricigaleWarning, argument_error
+from miricigale.utils.row_files import open_rows
+from miricigale.utils.tables import error_column
+
+__all__ = ["fit_catalog"]
+
+log = logging.getLogger(__name__)
+
+
+def fit_catalog(
+    path,
+    output,
+    *,
+    axes="fit",
+    models=None,
+    model_error=None,
+    catalog_map=None,
+    ebv=0.0,
+    hdu=None,
+    chunk_rows=10000,
+    **options,
+):
+    """
+    Fit a catalog of photometry of any length with the chain of Yang et al. 2021, or that of surveys.
+
+    Parameters
+    ----------
+    path : path-like
+        FITS, ECSV, CSV, VOTable or plain text with ``id`` and, for each band, ``<filter>`` and
+        ``<filter>_err``, or with columns that ``catalog_map`` gives these names.
+    output : path-like
+        Folder of the results.
+    axes : {"fit", "quick", "survey"}, optional
+        Model grid; see `miricigale.sed.yang2021_axes` and `miricigale.sed.survey_axes`.
+    models : callable, optional
+        Function of the bands (a list of str) that returns the `~miricigale.sed.SEDModel` and its axes in place of
+        those of ``axes``, or a `~miricigale.sed.ModelGrid` and None; ``axes`` says whose errors are taken then.
+    model_error : float, optional
+        Relative model error: 0.1 by default; with ``axes="survey"`` it takes the place of
+        `miricigale.fitting.TemplateError.survey`, which is then the default.
+    catalog_map : `~miricigale.filters.CatalogMap`, str or path-like, optional
+        Names and units of the catalog; the name of a survey, or a TOML file.
+    ebv : float, optional
+        Color excess E(B-V) of the Milky Way, in mag, behind which all models but given grids are put
+        (`~miricigale.sed.components.GalacticExtinction`, law of Gordon et al. 2023, none beyond 32 um). For one
+        that differs from source to source see `~miricigale.sed.foreground.deredden`.
+    hdu, chunk_rows, **options
+        As for `miricigale.fitting.fit_file`, such as ``redshift``, a column of known redshifts, and
+        ``resume``.
+
+    Returns
+    -------
+    results : `~miricigale.fitting.FitResultsFiles`
+
+    Warns
+    -----
+    `~miricigale.utils.exceptions.MiricigaleWarning`
+        If the catalog has bands under names that no filter has, or without errors.
+
+    Raises
+    ------
+    `~miricigale.utils.exceptions.DataError`
+        If there is no such file, or it cannot be read by rows.
+    ValueError
+        If no column is a flux in a known filter with an error beside it.
+    """
+    rows = open_rows(path, chunk_rows, hdu=hdu)
+    if catalog_map is not None:
+        catalog_map = as_catalog_map(catalog_map)
+        rows = MappedRows(rows, catalog_map)
+    names = rows.colnames
+    known = set(Filter.names())
+    bands = [
+        name
+        for name in names
+        if (name in known or name.startswith("sedpy.")) and error_column(name) in names
+    ]
+    if not bands:
+        raise argument_error(
+            "photometry",
+            "a table with columns <filter> and <filter>_err ('miricigale filters' lists the names)",
+            f"columns {list(names)}",
+        )
+    # heavy imports only after the file was checked
+    from miricigale.fitting import BayesFitter, TemplateError, fit_file
+    from miricigale.fitting.likelihood import unused_bands
+    from miricigale.sed import SEDModel
+    from miricigale.sed.components import GalacticExtinction
+
+    unused = unused_bands(rows.chunk(0), bands)
+    if unused:
+        msg = (
+            f"bands of the photometry are not fitted, as their names ('miricigale filters') or "
+            f"errors are missing: {', '.join(unused)}"
+        )
+        warnings.warn(msg, MiricigaleWarning, stacklevel=2)
+    if axes == "survey":
+        model, nodes = SEDModel.survey(), SEDModel.survey_axes()
+        error = TemplateError.survey() if model_error is None else None
+        errors = {"model_error": model_error or 0.0, "template_error": error}
+        if error is not None and models is None:
+            log.warning(
+                "errors of the models: %.0f to %.0f %% of the flux by rest wavelength, measured on sources "
+                "of CEERS (TemplateError.survey)",
+                *(100 * np.array([error.error.min(), error.error.max()])),
+            )
+    else:
+        model, nodes = SEDModel.yang2021(), SEDModel.yang2021_axes(axes)
+        errors = {"model_error": 0.1 if model_error is None else model_error}
+    if models is not None:
+        model, nodes = models(bands)
+    if ebv and isinstance(model, SEDModel):
+        dust = GalacticExtinction(ebv_galactic=ebv, beyond="transparent")
+        model = SEDModel([*model.components, dust])
+    fitter = BayesFitter(model, bands, axes=nodes, **errors)
+    options |= {"catalog_map": catalog_map, "hdu": hdu, "chunk_rows": chunk_rows}
+    return fit_file(fitter, path, output, **options)

@@ -1,0 +1,127 @@
+"""What `miricigale plan` does: the table of the CEERS exposures, and a plan with its files."""
+
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.utils.exceptions import argument_error
+
+__all__ = ["plan_table", "write_plan"]
+
+
+def plan_table(*, quick=False):
+    """
+    The CEERS exposures: time, filling of the well by the sky, limits (5 sigma, AB).
+
+    Parameters
+    ----------
+    quick : bool, optional
+        Whether of the quick exposures.
+
+    Returns
+    -------
+    table : `~astropy.table.QTable`
+        A row for each band. Three limits of point sources: ``limit_etc``, the exposure time
+        calculator's scaled by the root of the time; ``limit``, of these exposures by
+        `~miricigale.photometry.sensitivity` with the residual pattern
+        (``residual="etc"``); ``limit_proposal``, of the survey's proposal.
+    """
+    from astropy.coordinates import SkyCoord
+
+    from miricigale.depth import proposal_limit, saturation_forecast, scaled_limit, sensitivity
+    from miricigale.instrument import ceers_exposures, psf_fwhm
+
+    exposures = ceers_exposures(SkyCoord(0 * u.deg, 0 * u.deg), 0 * u.deg, quick=quick)
+    rows = []
+    for name in dict.fromkeys(e.filter for e in exposures):
+        mine = [e for e in exposures if e.filter == name]
+        first, time = mine[0], u.Quantity([e.exposure_time for e in mine]).sum()
+        limit = sensitivity(
+            name,
+            time,
+            n_sigma=5,
+            residual="etc",
+            n_groups=first.n_groups,
+            n_dithers=len(mine),
+            readout=first.readout,
+            subarray=first.subarray,
+        )
+        rows.append(
+            {
+                "filter": name,
+                "groups": first.n_groups,
+                "integrations": first.n_integrations,
+                "dithers": len(mine),
+                "time": np.round(time.to(u.s), 1),
+                "sky_in_well": round(float(saturation_forecast(first)), 3),
+                "limit_etc": np.round(scaled_limit(name, time).to(u.ABmag), 2),
+                "limit": np.round(limit.to(u.ABmag), 2),
+                "limit_proposal": np.round(proposal_limit(name), 2),
+                "fwhm": psf_fwhm(name),
+            }
+        )
+    return QTable(rows)
+
+
+def write_plan(config, folder, *, executor=None, progress_bar=False):
+    """
+    Work out a plan and write it.
+
+    Parameters
+    ----------
+    config : `~miricigale.planning.PlanConfig`
+        The plan.
+    folder : path-like
+        Gets ``plan.html``, ``plan.toml``, ``comparison.ecsv``, ``areas.ecsv`` (with ``[survey] areas``),
+        and ``bands-<n>.ecsv`` and ``sources-<n>.ecsv`` of each set of bands, in the order of the
+        configuration (0: the existing ones); with ``[images] enabled`` the run in ``images``, its catalog
+        ``images.ecsv``, ``images-numbers.ecsv`` and ``images-bands.ecsv``. Files of these names are replaced.
+    executor : `concurrent.futures.Executor`, optional
+        Threads to fit with; the answer is the same.
+    progress_bar : bool, optional
+        Whether the progress of the images is shown.
+
+    Returns
+    -------
+    comparison : `~astropy.table.QTable`
+        See `~miricigale.planning.comparison_table`.
+    """
+    from miricigale.planning import Planner, area_table, comparison_table, write_page
+
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise argument_error("folder", "a folder, or nothing yet", f"the file {folder}")
+    planner = Planner(config, executor=executor)
+    plans = planner.compare()
+    comparison = comparison_table(planner, plans)
+    areas = area_table(planner, planner.divide()) if config.survey.areas else None
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "plan.toml").write_text(config.to_toml(), encoding="utf-8")
+    tables = {"comparison": comparison}
+    tables |= {} if areas is None else {"areas": areas}
+    tables |= {f"sources-{k}": plan.sources for k, plan in enumerate(plans)}
+    tables |= {f"bands-{k}": plan.band_table() for k, plan in enumerate(plans) if plan.bands}
+    for name, table in tables.items():
+        table.write(folder / f"{name}.ecsv", overwrite=True)
+    pair = _write_images(planner, plans, folder, progress_bar) if config.images.enabled else None
+    write_page(folder / "plan.html", planner, plans, comparison, areas, pair)
+    return comparison
+
+
+def _write_images(planner, plans, folder, progress_bar):
+    """Image a plan, and write its numbers beside those of the noise: tables by band and of all."""
+    from miricigale.planning import image_sample, paired_bands, paired_numbers
+    from miricigale.utils.parallel import process_pool, thread_count
+
+    n_processes = thread_count(planner.config.plan.threads or None)
+    with process_pool(n_processes) as pool:
+        imaged = image_sample(planner, folder / "images", executor=pool, progress_bar=progress_bar)
+    pair = (
+        paired_bands(planner, imaged),
+        paired_numbers(planner, plans, planner.compare(measured=imaged.measured), imaged),
+    )
+    for name, table in zip(("bands", "numbers"), pair, strict=True):
+        table.write(folder / f"images-{name}.ecsv", overwrite=True)
+    return pair
