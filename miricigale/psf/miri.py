@@ -129,7 +129,6 @@ def miri_psf(
     includes=EFFECTS,
     calibration="flight",
     n_wavelengths=9,
-    spectral_index=0.0,
     n_pupil=384,
     position=None,
     subarray="FULL",
@@ -162,8 +161,6 @@ def miri_psf(
         radius; 0.021 per axis).
     n_wavelengths : int, optional
         Wavelengths per band, of equal weight.
-    spectral_index : float, optional
-        The source's spectrum is ``F_nu ~ nu**spectral_index``.
     n_pupil : int, optional
         Cells across the pupil.
     position : tuple of float, optional
@@ -210,8 +207,7 @@ def miri_psf(
     unknown = set(includes) - set(EFFECTS)
     if unknown:
         raise argument_error("includes", f"out of {EFFECTS}", sorted(unknown))
-    options = (wavefront_error, seed, n_wavelengths, spectral_index, n_pupil)
-    telescope = Telescope.of(name, _V3_ANGLE, *options)
+    telescope = Telescope(name, _V3_ANGLE, wavefront_error, seed, n_wavelengths, n_pupil)
     # written order, whatever the caller's
     effects = tuple(effect for effect in EFFECTS if effect in includes)
     place = None if position is None else (*(float(v) for v in position), subarray)

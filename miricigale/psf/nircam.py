@@ -24,7 +24,6 @@ def nircam_psf(
     wavefront_error=75 * u.nm,
     seed=1,
     n_wavelengths=9,
-    spectral_index=0.0,
     n_pupil=384,
 ):
     """
@@ -43,7 +42,7 @@ def nircam_psf(
         Cells per pixel of 0.031 arcsec (to F200W) or 0.063 arcsec.
     fov : `~astropy.units.Quantity`, optional
         Width of the grid; 6 arcsec to F200W, 10 arcsec beyond by default.
-    wavefront_error, seed, n_wavelengths, spectral_index, n_pupil
+    wavefront_error, seed, n_wavelengths, n_pupil
         As for `miri_psf`: the same seed is the same telescope.
 
     Returns
@@ -68,9 +67,8 @@ def nircam_psf(
     name = filter_name(filter, _PIXELS)
     scale = _PIXELS[name]
     oversampling, width = checked_grid(oversampling, fov, 6.0 if scale < 0.05 else 10.0)
-    options = (wavefront_error, seed, n_wavelengths, spectral_index, n_pupil)
     # the detectors' axes stand within 0.6 deg of the telescope's
-    telescope = Telescope.of(name, 0.0, *options)
+    telescope = Telescope(name, 0.0, wavefront_error, seed, n_wavelengths, n_pupil)
     cell = scale / oversampling
     data = telescope.image(cell, odd_cells(width, cell))
     jitter = jwst_constants()["jitter"] / scale

@@ -17,6 +17,7 @@ from miricigale.psf.effects import EFFECTS
 from miricigale.psf.model import make_psf
 from miricigale.psf.resample import psf_image
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_least
 from miricigale.utils.units import ANGLE, positive, to_array
 
 __all__ = ["psf_from_stars"]
@@ -103,8 +104,6 @@ def psf_from_stars(
     angle=0.0 * u.deg,
     includes=EFFECTS,
     enclosed=1.0,
-    max_iterations=10,
-    smoothing="quartic",
     progress_bar=False,
 ):
     """
@@ -137,10 +136,6 @@ def psf_from_stars(
     enclosed : float or `~photutils.psf.ImagePSF`, optional
         Fraction of a star's light within the stamp, or a PSF to take it from; stars do not
         tell. With 1 the encircled energies are those relative to the stamp.
-    max_iterations : int, optional
-        Most rounds of stacking and fitting.
-    smoothing : {"quartic", "quadratic"} or None, optional
-        Kernel that smooths each stack, see `~photutils.psf.EPSFBuilder`.
     progress_bar : bool, optional
         Whether to show one.
 
@@ -168,8 +163,7 @@ def psf_from_stars(
     """
     images = _checked_images(images)
     scale = _pixel_scale(images, pixel_scale)
-    if isinstance(oversampling, float) or oversampling < 1:
-        raise argument_error("oversampling", "a positive integer", oversampling)
+    check_least(oversampling, "oversampling", 1, whole=True)
     width = float(to_array(fov, ANGLE, "fov", ndim=0))
     size = 2 * round(0.5 * width / scale - 0.5) + 1
     if not size >= 7:
@@ -180,8 +174,8 @@ def psf_from_stars(
         raise argument_error("stars", f"at least {least} with stamps on the images", len(stamps))
     builder = EPSFBuilder(
         oversampling=int(oversampling),
-        maxiters=int(max_iterations),
-        smoothing_kernel=smoothing,
+        maxiters=10,
+        smoothing_kernel="quartic",
         progress_bar=progress_bar,
     )
     with warnings.catch_warnings(record=True) as caught:

@@ -9,7 +9,8 @@ import numpy as np
 from miricigale.filters import Filter
 from miricigale.psf.optics import jwst_pupil, polychromatic_psf
 from miricigale.refdata import citations
-from miricigale.utils.exceptions import argument_error, unknown_name
+from miricigale.utils.exceptions import unknown_name
+from miricigale.utils.options import check_least
 from miricigale.utils.units import ANGLE, WAVE, positive, to_array
 
 __all__ = ["Telescope", "band_quantiles", "checked_grid", "filter_name", "odd_cells"]
@@ -24,16 +25,16 @@ def filter_name(filter_, known):
 
 
 @functools.lru_cache(maxsize=64)
-def band_quantiles(name, n, spectral_index=0.0):
+def band_quantiles(name, n):
     """
     Wavelengths (um, ascending) of equal weight that stand for a band.
 
-    The photon rate of a source with ``F_nu ~ nu**spectral_index`` is cut into ``n`` equal parts; each is
+    The photon rate of a source of flat ``F_nu`` is cut into ``n`` equal parts; each is
     represented by its median.
     """
     band = Filter.from_name(name)
     wave = to_array(band.wave, WAVE, "wave")
-    rate = np.asarray(band.throughput, dtype=float) * wave ** (-1.0 - spectral_index)
+    rate = np.asarray(band.throughput, dtype=float) * wave**-1.0
     total = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(wave))])
     inside = np.concatenate([[True], np.diff(total) > 0])
     result = np.interp((np.arange(n) + 0.5) / n, total[inside] / total[-1], wave[inside])
@@ -48,8 +49,7 @@ def odd_cells(width, cell):
 
 def checked_grid(oversampling, fov, default):
     """Cells per pixel and width in arcsec of a PSF's grid."""
-    if isinstance(oversampling, float) or oversampling < 1:
-        raise argument_error("oversampling", "a positive integer", oversampling)
+    check_least(oversampling, "oversampling", 1, whole=True)
     return int(oversampling), default if fov is None else positive(fov, ANGLE, "fov")
 
 
@@ -64,30 +64,30 @@ class Telescope:
         Name of the band.
     angle : float
         V3IdlYAngle of the detector in deg (see `jwst_pupil`).
-    wavefront_error : float
-        Root mean square in nm.
+    wavefront_error : `~astropy.units.Quantity`
+        Root mean square; kept in nm.
     seed : int
         The same telescope in all filters.
-    n_wavelengths, spectral_index, n_pupil
+    n_wavelengths, n_pupil : int
         As for `~miricigale.psf.miri_psf`.
+
+    Raises
+    ------
+    ValueError
+        If the number of wavelengths is not positive.
     """
 
     filter: str
     angle: float
-    wavefront_error: float
+    wavefront_error: u.Quantity
     seed: int
     n_wavelengths: int
-    spectral_index: float
     n_pupil: int
 
-    @classmethod
-    def of(cls, filter, angle, wavefront_error, seed, n_wavelengths, spectral_index, n_pupil):
-        """The telescope of the options of `~miricigale.psf.miri_psf`, checked."""
-        if isinstance(n_wavelengths, float) or n_wavelengths < 1:
-            raise argument_error("n_wavelengths", "a positive integer", n_wavelengths)
-        rms = float(to_array(wavefront_error, u.nm, "wavefront_error"))
-        options = int(n_wavelengths), float(spectral_index), int(n_pupil)
-        return cls(filter, angle, rms, int(seed), *options)
+    def __post_init__(self):
+        check_least(self.n_wavelengths, "n_wavelengths", 1, whole=True)
+        rms = float(to_array(self.wavefront_error, u.nm, "wavefront_error"))
+        object.__setattr__(self, "wavefront_error", rms)
 
     @property
     def meta(self):
@@ -103,7 +103,7 @@ class Telescope:
         """Fraction of the light in each of n x n cells of ``cell`` arcsec, read-only."""
         pupil = jwst_pupil(self.n_pupil, angle=self.angle)
         opd = pupil.wavefront_error(self.wavefront_error, seed=self.seed)
-        waves = band_quantiles(self.filter, self.n_wavelengths, self.spectral_index)
+        waves = band_quantiles(self.filter, self.n_wavelengths)
         data = polychromatic_psf(pupil, opd, waves, step=cell, n=n)
         data.flags.writeable = False
         return data

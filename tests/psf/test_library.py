@@ -163,12 +163,11 @@ def test_table_of_a_mosaic_and_of_a_grid_that_holds_little():
     assert np.all(np.isnan(table["fwhm_flight"]))
 
 
-@pytest.mark.parametrize("index", [0.0, 2.0])
-def test_band_quantiles_have_the_mean_wavelength_of_the_photons(index):
+def test_band_quantiles_have_the_mean_wavelength_of_the_photons():
     band = Filter.from_name("miri.f1500w")
-    wave, rate = band.wave.value, band.throughput * band.wave.value ** (-1.0 - index)
+    wave, rate = band.wave.value, band.throughput / band.wave.value
     mean = np.trapezoid(rate * wave, wave) / np.trapezoid(rate, wave)
-    quantiles = band_quantiles("miri.f1500w", 51, index)
+    quantiles = band_quantiles("miri.f1500w", 51)
     assert np.all(np.diff(quantiles) > 0)
     assert quantiles.mean() == pytest.approx(mean, rel=1e-3)
 
@@ -244,7 +243,7 @@ def test_wrong_arguments_are_named():
         miri_psf("miri.f770w", fov=10)
     with pytest.raises(u.UnitsError, match="'wavefront_error' must be convertible"):
         miri_psf("miri.f770w", wavefront_error=1 * u.s)
-    with pytest.raises(ValueError, match="'oversampling' must be a positive integer"):
+    with pytest.raises(ValueError, match="'oversampling' must be at least 1, an integer"):
         miri_psf("miri.f770w", oversampling=0)
     with pytest.raises(ValueError, match="'fwhm' must be at least"):
         hst_psf(fwhm=0.1 * u.arcsec)
