@@ -89,12 +89,12 @@ def observe(exp, light, *, seed):
 
 def estimate(image, **options):
     """Background, processor time and whether there was a warning."""
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", MiricigaleWarning)
         start = time.process_time()
         background = estimate_background(image, **options)
         seconds = time.process_time() - start
-    return background, seconds, any(issubclass(w.category, MiricigaleWarning) for w in told)
+    return background, seconds, any(issubclass(w.category, MiricigaleWarning) for w in caught)
 
 
 def crowded(name, options):

@@ -81,8 +81,8 @@ def main():
         print(f"{window.z_low:g} < z < {window.z_high:g}: {', '.join(CLASS_NAMES)}; with noise")
         for score, x, y, shares in rows[:10]:
             names = "  ".join("/".join(band[5:].upper() for band in color) for color in (x, y))
-            told = " ".join(f"{100 * share:3.0f}" for share in shares)
-            print(f"    {names:30s} {told}   mean {100 * score:.0f} %", flush=True)
+            text = " ".join(f"{100 * share:3.0f}" for share in shares)
+            print(f"    {names:30s} {text}   mean {100 * score:.0f} %", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
 """
-Memory and time of a fit from file to file: a long catalogue and a small grid, or the paper's at known redshifts.
+Memory and time of a fit from file to file: a long catalog and a small grid, or the paper's at known redshifts.
 
     python benchmarks/large.py [--n 200000] [--chunk-rows 10000] [--threads 1] [--known]
 
 With ``--known`` the grid is that of Yang et al. 2021 (24 million models, 21 bands), objects are fitted at their
 known redshifts in one process, and CPU seconds are printed beside those of the loop of ``benchmarks/fit.py``.
-Otherwise the catalogue is written a piece at a time. Peak memory is that of a process of its own, for this
-catalogue and for one a tenth as long: the difference is what a longer catalogue costs.
+Otherwise the catalog is written a piece at a time. Peak memory is that of a process of its own, for this
+catalog and for one a tenth as long: the difference is what a longer catalog costs.
 """
 
 import argparse
@@ -39,7 +39,7 @@ def make_grid():
     return SEDModel.yang2021(agn=False).grid(axes, BANDS)
 
 
-def catalogue(grid, n, step=20000):
+def catalog(grid, n, step=20000):
     """Models of the grid with errors of 10 %, ``step`` rows at a time."""
     rng = np.random.default_rng(1)
     for start in range(0, n, step):
@@ -55,12 +55,12 @@ def catalogue(grid, n, step=20000):
         yield table
 
 
-def write_catalogue(path, grid, n):
-    write_rows(path, catalogue(grid, n), n)
+def write_catalog(path, grid, n):
+    write_rows(path, catalog(grid, n), n)
 
 
 def one(folder, n, chunk_rows, threads):
-    """Fit a catalogue and print seconds and peak memory."""
+    """Fit a catalog and print seconds and peak memory."""
     grid = make_grid()
     fitter = BayesFitter(grid)
     warm = QTable({"id": [0], **{c: [1.0] * u.uJy for b in BANDS for c in (b, f"{b}_err")}})
@@ -87,16 +87,16 @@ def one(folder, n, chunk_rows, threads):
 
 
 def known(n, chunk_rows):
-    """Fit a catalogue at known redshifts with the paper's grid; print CPU seconds."""
+    """Fit a catalog at known redshifts with the paper's grid; print CPU seconds."""
     grid = SEDModel.yang2021().grid(SEDModel.yang2021_axes("fit"), list(fit.DEPTHS))
     fitter, table = BayesFitter(grid), fit.make_photometry(grid, n)
     fitter.fit(table[:2], redshift="redshift")
     with tempfile.TemporaryDirectory() as folder:
-        table.write(Path(folder) / "catalogue.fits")
+        table.write(Path(folder) / "catalog.fits")
         start = time.process_time()
         fit_file(
             fitter,
-            Path(folder) / "catalogue.fits",
+            Path(folder) / "catalog.fits",
             Path(folder) / "out",
             redshift="redshift",
             chunk_rows=chunk_rows,
@@ -133,7 +133,7 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         folder = Path(folder)
         for n in (options.n // 10, options.n):
-            write_catalogue(folder / f"{n}.fits", grid, n)
+            write_catalog(folder / f"{n}.fits", grid, n)
             run = [sys.executable, __file__, "--one", str(folder), "--n", str(n)]
             run += ["--chunk-rows", str(options.chunk_rows), "--threads", str(options.threads)]
             env = {**os.environ, "OMP_NUM_THREADS": "1"}

@@ -5,7 +5,7 @@ Run a study of a large field of several pointings, and say what each stage took.
 
 Sources are draws of the bundled catalog, up to 2 mag fainter, at random places over the field: 620 for
 each square arcmin with the defaults, about what F160W counts have to 28 mag. One band of the quick
-exposures, as rates. Run again it goes on where it was stopped.
+exposures, as rates. Run again it resumes where it was stopped.
 """
 
 import argparse

@@ -38,7 +38,7 @@ def measured(field, low, **options):
     return ForcedPhotometer(kernel, **options).measure(low, high, segmentation, detected), index
 
 
-def told(name, ratio):
+def report(name, ratio):
     middle = np.nanmedian(ratio)
     scatter = 1.4826 * np.nanmedian(np.abs(ratio - middle))
     print(f"  {name:44s} {100 * (middle - 1):+6.1f} +- {100 * scatter:4.1f} %  ({len(ratio)})")
@@ -74,9 +74,9 @@ def hidden(fields, rng):
         near = (distance >= low) & (distance < high)
         print(f"  {low}-{high} arcsec: {found[near].sum()} of {near.sum()} found")
     print(f"  {others} others beside {sum(len(f[0]['flux']) for f in fields)} sources")
-    told("neighbours of those found, one pass", once[found & known])
-    told("the same, two passes", twice[found & known])
-    told("the points", light[found])
+    report("neighbors of those found, one pass", once[found & known])
+    report("the same, two passes", twice[found & known])
+    report("the points", light[found])
 
 
 def nuclei(fields, rng):
@@ -105,20 +105,20 @@ def nuclei(fields, rng):
             (twice.flux_point.value[galaxy] - point) / twice.flux_point_err.value[galaxy],
             once.flags[galaxy] & int(ForcedFlags.POOR_FIT) != 0, catalog["radius"][host[known]],
         ))  # fmt: skip
-    told("these, one template", np.concatenate([one[0] for one in others]))
-    told("these, two components", np.concatenate([one[1] for one in others]))
+    report("these, one template", np.concatenate([one[0] for one in others]))
+    report("these, two components", np.concatenate([one[1] for one in others]))
     once, twice, point, snr, pull, point_pull, poor, radius = map(
         np.concatenate, zip(*rows, strict=True)
     )
     for low, high in ((5, 20), (20, 999)):
         use = (snr >= low) & (snr < high)
         print(f"  template S/N {low}-{high}: {poor[use].sum()} of {use.sum()} are poor fits")
-        told("total, one template", once[use])
-        told("total, two components", twice[use])
+        report("total, one template", once[use])
+        report("total, two components", twice[use])
         split = use & np.isfinite(point)
         print(f"  {split.sum()} of {use.sum()} are split")
-        told("point", point[split])
-        told("point, galaxies above 0.2 arcsec", point[split & (radius > 0.2)])
+        report("point", point[split])
+        report("point, galaxies above 0.2 arcsec", point[split & (radius > 0.2)])
         for name, one in (("totals", pull[use]), ("points", point_pull[split])):
             spread = 1.4826 * np.nanmedian(np.abs(one))
             print(f"  scatter of the pulls of {name}: {spread:.2f}")
@@ -146,7 +146,7 @@ def distortion(fields):
             ("with a map", {"max_shift": 0.2 * u.arcsec, "offset_order": 1}),
         ):
             result = ForcedPhotometer(kernel, **options).measure(low, prior, segmentation, moved)
-            told(name, result.flux.value[index[good]] / truth)
+            report(name, result.flux.value[index[good]] / truth)
         found = result.offset_map.evaluate(moved["sky"])
         # +x is west
         left = (found * [-1, 1] + there).to_value(u.mas)

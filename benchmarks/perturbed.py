@@ -5,7 +5,7 @@ What it costs that the analysis does not know the sky: the table of docs/guide/w
 
 runs the preset ``goodss`` with all effects on a sky of fracAGN 0.4, all bands and the full grid, as rates of one
 dither, until the fits, and prints accuracies and their changes with the number of sources in common. A run
-that was stopped goes on; ``--only-table`` takes the skies that stand in the folder, ``--only NAME`` (repeated)
+that was stopped resumes; ``--only-table`` takes the skies that stand in the folder, ``--only NAME`` (repeated)
 makes these and the one without effects.
 """
 

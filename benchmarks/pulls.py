@@ -116,7 +116,7 @@ def measured(field, photometer, grids):
     segments, found = detect_sources(prior)
     index, distance, _ = field.catalog["sky"].match_to_catalog_sky(found["sky"])
     back, _, _ = found["sky"].match_to_catalog_sky(field.catalog["sky"])
-    # a detection belongs to one source; of a pair that was not told apart there is no truth
+    # a detection belongs to one source; of a pair that was not separated there is no truth
     ok = (distance < 0.25 * u.arcsec) & (back[index] == np.arange(len(index)))
     taken = np.bincount(index[distance < 1.2 * u.arcsec], minlength=len(found)) == 1
     ok &= ~field.catalog["pair"] | taken[index]

@@ -39,7 +39,7 @@ def mosaic(data, wcs, sigma):
 
 
 def fine_psf(array):
-    """Transform of a PSF of FINE pixels, sampled at STEP, its centre on the first pixel."""
+    """Transform of a PSF of FINE pixels, sampled at STEP, its center on the first pixel."""
     half = SIZE // 2
     at = (np.arange(SIZE) - half) * STEP / FINE + array.shape[0] // 2
     yy, xx = np.meshgrid(at, at, indexing="ij")
@@ -119,7 +119,7 @@ def make(seed, band="miri.f770w", n_side=12, spacing=6.5, share=0.25):
 
 
 def measure(fields, **options):
-    """Ratio to the truth and what it is told by, for the sources of all fields."""
+    """Ratio to the truth and what it is recognized by, for the sources of all fields."""
     rows, seconds = [], 0.0
     for catalog, kernel, high, low, segmentation, detected in fields:
         index, _ = match_sky(detected["sky"], catalog["sky"], radius=0.3 * u.arcsec)

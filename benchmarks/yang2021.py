@@ -6,7 +6,7 @@ Holds the photometry of Yang et al. 2021 against the package's own, on one simul
     python benchmarks/yang2021.py --seeds 3               with three times as many noise realisations
     python benchmarks/yang2021.py --dilation              bare segments as found and grown by rule
 
-The sources of the bundled catalogue (their positions and Sersic shapes), exposed as by CEERS: each dither
+The sources of the bundled catalog (their positions and Sersic shapes), exposed as by CEERS: each dither
 is rendered on the distorted detector and given white noise of the sky, then drizzled onto 0.11 and onto
 0.06 arcsec. The prior is F160W of 27.6 AB (5 sigma), on which sources are detected. Fluxes are those of
 F160W times a random color. Detector effects and the subtraction of a background are left out: what is off
@@ -41,7 +41,7 @@ FINE, COARSE = 0.06 * u.arcsec, 0.11 * u.arcsec
 
 
 def sources(band, rng):
-    """The catalogue with a flux in the band, within 1.5 arcmin of the pointing."""
+    """The catalog with a flux in the band, within 1.5 arcmin of the pointing."""
     catalog = read_catalog("catalog.goodss")
     catalog = catalog[catalog["sky"].separation(CENTER) < 1.5 * u.arcmin]
     catalog = catalog[np.isfinite(catalog[PRIOR].value) & (catalog[PRIOR].value > 0)]

@@ -1,13 +1,13 @@
 """
 Make ``catalog.goodss``: real galaxies around the MIRI field of the GOODS-S study.
 
-The 3D-HST v4.1 GOODS-S catalogue, with van der Wel et al. (2012) GALFIT fits and model
+The 3D-HST v4.1 GOODS-S catalog, with van der Wel et al. (2012) GALFIT fits and model
 magnitudes in JWST's bands, comes inside the mirage wheel::
 
     pip download --no-deps mirage==2.5.0
     python tools/make_catalog.py mirage-2.5.0-py3-none-any.whl
 
-Everything that the source catalogue marks as missing or that cannot be right is taken out
+Everything that the source catalog marks as missing or that cannot be right is taken out
 by the rules below, each a named function that is counted and printed; what a rule touched
 is written in the column ``quality``.
 """
@@ -35,7 +35,7 @@ CENTER = SkyCoord(53.13440 * u.deg, -27.83444 * u.deg)
 RADIUS = 95 * u.arcsec
 FAINT_LIMIT = 26.6  # F160W, AB
 
-#: Bands of the catalogue between 0.7 and 4.8 um that have a filter curve (no narrow bands).
+#: Bands of the catalog between 0.7 and 4.8 um that have a filter curve (no narrow bands).
 BANDS = (
     *("f070w", "f090w", "f115w", "f140m", "f150w", "f150w2", "f162m", "f182m", "f200w", "f210m"),
     *("f250m", "f277w", "f300m", "f322w2", "f335m", "f356w", "f360m", "f410m", "f430m", "f444w"),
@@ -43,7 +43,7 @@ BANDS = (
 )
 #: Model magnitudes outside are fill values or failed models.
 MAGNITUDE_LIMITS = (10.0, 40.0)
-#: Model colours (band - F160W) outside are failed models or sources blended in IRAC.
+#: Model colors (band - F160W) outside are failed models or sources blended in IRAC.
 COLOUR_LIMITS = (-2.5, 5.0)
 
 #: A Sersic profile is used only within these.
@@ -65,14 +65,14 @@ QUALITY = {
 
 
 def read_source(wheel):
-    """The catalogue inside the wheel, as it is."""
+    """The catalog inside the wheel, as it is."""
     with zipfile.ZipFile(wheel) as archive:
         text = archive.read(MEMBER).decode()
     return Table.read(text, format="ascii.commented_header")
 
 
 def f160w_magnitude(source):
-    """AB magnitude by the catalogue's flux, whose zero point is 25 ('mag' is GALFIT's own)."""
+    """AB magnitude by the catalog's flux, whose zero point is 25 ('mag' is GALFIT's own)."""
     return 25.0 - 2.5 * np.log10(np.asarray(source["f_F160W"], dtype=float))
 
 
@@ -92,7 +92,7 @@ def redshifts(source, star):
 
 
 def main():
-    """Write the catalogue and print what each rule did."""
+    """Write the catalog and print what each rule did."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[1])
     parser.add_argument("wheel", type=Path)
     parser.add_argument("--output", type=Path, default=TARGET)
@@ -158,7 +158,7 @@ def main():
         flux = np.where(wild | tail, np.nan, 10 ** (-0.4 * (value - 23.9)))
         table[f"nircam.{band}"] = np.array([float(f"{v:.4g}") for v in flux]) * u.uJy
         if np.any(wild | tail):
-            print(f"  nircam.{band}: {wild.sum()} magnitudes absurd, {tail.sum()} colours absurd")
+            print(f"  nircam.{band}: {wild.sum()} magnitudes absurd, {tail.sum()} colors absurd")
     rule("magnitude_absurd", absurd)
     rule("colour_absurd", colour)
     table["quality"] = quality

@@ -52,7 +52,7 @@ ARCSEC2 = u.arcsec.to(u.rad) ** 2
 #: Bits of JWST data quality that the references use.
 DQ_BITS = {"DO_NOT_USE": 0, "NON_SCIENCE": 9, "REFERENCE_PIXEL": 31}
 
-#: Encircled energies of the source catalogue's three apertures (its defaults).
+#: Encircled energies of the source catalog's three apertures (its defaults).
 FRACTIONS = (0.3, 0.5, 0.7)
 
 #: Order of the polynomials: that of the SIAF's distortion, and of its inverse.
@@ -383,7 +383,7 @@ def add_image_references(cache, detector, filters):
 
 
 def add_catalog_references(cache, filters):
-    """Add what the source catalogue of calwebb_image3 asks for."""
+    """Add what the source catalog of calwebb_image3 asks for."""
     from astropy.table import Table
     from stdatamodels.jwst import datamodels
 
@@ -406,7 +406,7 @@ def add_catalog_references(cache, filters):
     model = datamodels.MirImgApcorrModel(apcorr_table=np.array(rows, dtype=columns))
     model.meta.exposure.type = "MIR_IMAGE"
     cache.add(model, "apcorr")
-    # none of ours: the catalogue's Vega magnitudes are AB magnitudes
+    # none of ours: the catalog's Vega magnitudes are AB magnitudes
     names = [_short(name) for name in filters]
     model = datamodels.ABVegaOffsetModel()
     model.abvega_offset = Table({"filter": names, "abvega_offset": np.zeros(len(names), "f4")})

@@ -114,7 +114,7 @@ def make(single, power, output):
         one.append(thinned / total[:, None])
         unit = total[np.argmin(np.abs(U - 1.0))]
         power_one.append(total / unit)
-        # the wheel's power law is normalised to dust mass: (1 - Umin/Umax)^-1 Umin int U^-2
+        # the wheel's power law is normalized to dust mass: (1 - Umin/Umax)^-1 Umin int U^-2
         lump = thin(lam, nodes, t[q].T / lam)
         total = np.trapezoid(lump, nodes, axis=1)
         two.append(lump / total[:, None])

@@ -53,7 +53,7 @@ H_BETA = 4.78e-20  # J for each ionising photon, case B, 10^4 K: Inoue 2011, MNR
 SOUND = 4.6e-20
 NEEDED = 6.4e6  # yr: models must be sound to here
 FAINTEST = 0.002
-FLOOR = 1e-7  # of H-beta: lines fainter than this are stored as this, so that they have a logarithm
+FAINTEST = 1e-7  # of H-beta: lines fainter than this are stored as this, so that they have a logarithm
 BEND = 0.02
 LONGEST = 1e8  # angstrom
 BITS = 12
@@ -202,10 +202,10 @@ def make(paths, output):
     lines = np.array([hold(m[3], m[4])[:n_age] for m in models])
     beta = lines[..., names.index("H-beta")]
     cont = np.concatenate([hold(m[2], m[4])[:n_age] for m in models])
-    floor = np.array([np.interp(line_wave * 1e4, wave, row) for row in cont])
-    width = lines / (floor.reshape(lines.shape) * line_wave * 1e4)
+    continuum = np.array([np.interp(line_wave * 1e4, wave, row) for row in cont])
+    width = lines / (continuum.reshape(lines.shape) * line_wave * 1e4)
     bright = np.max(width, axis=(0, 1)) > FAINTEST
-    lines = np.maximum(lines, FLOOR * beta[..., None])[..., bright]
+    lines = np.maximum(lines, FAINTEST * beta[..., None])[..., bright]
 
     inside = (wave >= 911.0) & (wave <= LONGEST * 1.5)
     x, y = densify(wave[inside], cont[:, inside], np.array([912.5, LONGEST]))

@@ -3,7 +3,7 @@ Score, and fit again, the constants of the parametric torus (``torus.parametric`
 
 The constants stand in miricigale/refdata/files/sed/torus_parametric.toml. They come from
 least-squares fits to the 50 SKIRTOR SEDs with p = 1, q = 0, oa = 40 deg, R = 20 that lightningpy
-distributes (SKIRTOR.fits.gz, MIT licence; Stalevski et al. 2012, 2016), which are not part of
+distributes (SKIRTOR.fits.gz, MIT license; Stalevski et al. 2012, 2016), which are not part of
 this package.
 
     python tools/make_torus.py SKIRTOR.fits.gz [--fit]
