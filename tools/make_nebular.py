@@ -53,7 +53,9 @@ H_BETA = 4.78e-20  # J for each ionising photon, case B, 10^4 K: Inoue 2011, MNR
 SOUND = 4.6e-20
 NEEDED = 6.4e6  # yr: models must be sound to here
 FAINTEST = 0.002
-FAINTEST = 1e-7  # of H-beta: lines fainter than this are stored as this, so that they have a logarithm
+FAINTEST = (
+    1e-7  # of H-beta: lines fainter than this are stored as this, so that they have a logarithm
+)
 BEND = 0.02
 LONGEST = 1e8  # angstrom
 BITS = 12
