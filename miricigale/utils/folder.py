@@ -1,4 +1,4 @@
-"""A folder of files that belong together: written whole or not at all, and what stands in it noted."""
+"""A folder of files that belong together: written whole or not at all, and recorded."""
 
 import hashlib
 import json
@@ -17,8 +17,10 @@ __all__ = ["FileFolder", "RecordFolder"]
 log = logging.getLogger(__name__)
 
 MANIFEST = "manifest.json"
-#: The same text once more: what is noted outlives the loss of either file.
+#: The same text once more: the records outlive the loss of either file.
 SECOND_MANIFEST = ".manifest.copy.json"
+#: Records since the manifests were written, a line each: checksum, key and record as JSON.
+JOURNAL = ".manifest.journal"
 
 
 class FileFolder:
@@ -106,8 +108,9 @@ class RecordFolder(FileFolder):
     """
     A folder of files and the manifest of what stands in it.
 
-    The manifest is kept twice, each with a checksum. Used in a ``with`` statement the folder is
-    locked for other processes. Subclasses say by class attributes what the folder is for.
+    The manifest is kept twice, each with a checksum. Records that are made while the folder is in use are
+    appended to a journal, which goes into the manifests at the end. Used in a ``with`` statement the
+    folder is locked for other processes. Subclasses say by class attributes what the folder is for.
 
     Parameters
     ----------
@@ -122,7 +125,7 @@ class RecordFolder(FileFolder):
         By key (a stage, a piece): ``hash`` of all that its files depend on, ``products`` (name of
         each file to its ``sha256`` and ``bytes``), and what else was noted.
     is_sound : bool
-        Whether both manifests stand and say the same.
+        Whether both manifests stand and say the same, and no journal does.
 
     Raises
     ------
@@ -148,12 +151,16 @@ class RecordFolder(FileFolder):
         self.facts, self.records = {}, {}
         paths = [self.path(name) for name in (MANIFEST, SECOND_MANIFEST)]
         texts = [path.read_bytes() if path.is_file() else None for path in paths]
-        self.is_sound = texts[0] is not None and texts[0] == texts[1]
+        journal = self.path(JOURNAL)
+        self.is_sound = texts[0] is not None and texts[0] == texts[1] and not journal.is_file()
         for path, text in zip(paths, texts, strict=True):
             if text is not None and self._read_manifest(path, text):
                 break
         else:
             self._refuse_foreign(damaged=texts != [None, None])
+            return
+        if journal.is_file():
+            self._read_journal(journal)
 
     def _read_manifest(self, path, text):
         """Take over a manifest; False if it is damaged."""
@@ -165,6 +172,16 @@ class RecordFolder(FileFolder):
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as err:
             log.warning("%s is damaged (%s: %s)", path, type(err).__name__, err)
             return False
+        self._check_names(path, records)
+        # earlier versions wrote none
+        if values.get("sha256", _checksum(values)) != _checksum(values):
+            log.warning("%s is damaged (its checksum is wrong)", path)
+            return False
+        self.facts, self.records = facts, records
+        return True
+
+    def _check_names(self, path, records):
+        """Refuse records of files outside of the folder."""
         for record in records.values():
             for name in record["products"]:
                 try:
@@ -172,12 +189,19 @@ class RecordFolder(FileFolder):
                 except DataError as err:
                     msg = f"{path} cannot be used: {err}"
                     raise DataError(msg) from None
-        # earlier versions wrote none
-        if values.get("sha256", _checksum(values)) != _checksum(values):
-            log.warning("%s is damaged (its checksum is wrong)", path)
-            return False
-        self.facts, self.records = facts, records
-        return True
+
+    def _read_journal(self, path):
+        """Add the records of a journal; a line that is not whole, as after a kill, is left out."""
+        for line in path.read_bytes().splitlines():
+            try:
+                checksum, key, record = json.loads(line)
+                if checksum != _checksum({key: record}):
+                    continue
+                self.check_record(record)
+            except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+                continue
+            self._check_names(path, {key: record})
+            self.records[key] = record
 
     def parse(self, values):
         """
@@ -236,7 +260,11 @@ class RecordFolder(FileFolder):
         return self
 
     def __exit__(self, *exc):
-        self._lock.__exit__(*exc)
+        try:
+            if self.path(JOURNAL).is_file():
+                self.write_manifest()
+        finally:
+            self._lock.__exit__(*exc)
 
     def is_whole(self, key):
         """Whether all files of a record stand with the right checksums."""
@@ -292,8 +320,12 @@ class RecordFolder(FileFolder):
         **notes
             Plain values that are kept with it.
         """
-        self.records[key] = {"hash": digest, **notes, "products": products}
-        self.write_manifest()
+        record = {"hash": digest, **notes, "products": products}
+        self.records[key] = record
+        path = self.path(JOURNAL)
+        with writing(path), path.open("ab") as file:
+            # the first line end closes a line that could not be written wholly
+            file.write(f"\n{json.dumps([_checksum({key: record}), key, record])}\n".encode())
 
     def drop(self, key):
         """Forget a record and remove the files that it names."""
@@ -306,11 +338,12 @@ class RecordFolder(FileFolder):
         return sum(path.stat().st_size for path in paths if path.is_file())
 
     def write_manifest(self):
-        """Write both manifests."""
+        """Write both manifests, with what stands in the journal."""
         values = {**self.facts, self.records_name: dict(sorted(self.records.items()))}
         text = json.dumps({"sha256": _checksum(values), **values}, indent=1)
         for name in (MANIFEST, SECOND_MANIFEST):
             self.save(name, lambda path: path.write_text(text, encoding="utf-8"))
+        self.path(JOURNAL).unlink(missing_ok=True)
 
 
 def _checksum(values):

@@ -50,8 +50,8 @@ axes = "quick"
 
 def recorded(folder, name):
     """Whether a product is in the manifest: it is whole, and so is all that was made with it."""
-    manifest = folder / "small" / "manifest.json"
-    return manifest.is_file() and f'"{name}"' in manifest.read_text()
+    paths = [folder / "small" / file for file in ("manifest.json", ".manifest.journal")]
+    return any(path.is_file() and f'"{name}"' in path.read_text() for path in paths)
 
 
 def stopped(command, folder, name, how):

@@ -44,6 +44,36 @@ def test_what_was_noted_is_there_again(tmp_path):
     assert Parts(tmp_path / "fit").records == {}
 
 
+def test_records_outlive_a_kill_at_any_byte_of_the_journal(tmp_path):
+    """A record counts from the moment at which its line is whole; the manifests get it at the end."""
+    folder = tmp_path / "fit"
+    with Parts(folder) as store:
+        write(store, "part-0.txt", "abc")
+    with Parts(folder) as store:
+        for k in (1, 2):
+            write(store, f"part-{k}.txt", "abc")
+        assert "part-1" not in (folder / "manifest.json").read_text()
+        journal = (folder / ".manifest.journal").read_bytes()
+    assert set(json.loads((folder / "manifest.json").read_text())["parts"]) == set(store.records)
+    assert not (folder / ".manifest.journal").exists()
+    with Parts(folder) as store:
+        store.records = {"part-0.txt": store.records["part-0.txt"]}
+        store.write_manifest()
+    first_end = journal.index(b"\n", 1)
+    for n in range(len(journal) + 1):
+        (folder / ".manifest.journal").write_bytes(journal[:n])
+        n_whole = 1 + (n >= first_end) + (n >= len(journal) - 1)
+        assert len(Parts(folder).records) == n_whole
+    # a line that could not be written wholly costs itself only
+    (folder / ".manifest.journal").write_bytes(journal[: first_end - 5] + journal[first_end + 1 :])
+    again = Parts(folder)
+    assert set(again.records) == {"part-0.txt", "part-2.txt"}
+    assert not again.is_sound
+    with again:
+        assert not (folder / ".manifest.journal").exists()
+    assert set(Parts(folder).records) == {"part-0.txt", "part-2.txt"}
+
+
 def test_an_earlier_layout_stays_readable(tmp_path):
     with Parts(tmp_path) as store:
         write(store, "part-0.txt", "abc")

@@ -112,7 +112,7 @@ def test_a_second_run_in_the_folder_is_refused_and_the_first_one_goes_on(tmp_pat
 def test_a_configuration_that_changes_before_a_killed_run_goes_on(tmp_path, undisturbed):
     folder = tmp_path / "run"
     process = start(folder)
-    wait_for(folder / "manifest.json", process, '"first:c"')
+    wait_for(folder / ".manifest.journal", process, '"first:c"')
     process.kill()
     process.communicate(timeout=60)
     before = contents(folder)
