@@ -6,7 +6,7 @@ import numpy as np
 
 from miricigale.evaluation.estimates import Estimate
 from miricigale.evaluation.quantities import QUANTITIES, SHARES, measure
-from miricigale.pages.page import Missing
+from miricigale.pages import Missing
 from miricigale.utils.exceptions import unknown_name
 from miricigale.utils.random import check_seed, stream
 from miricigale.utils.tables import described_rows

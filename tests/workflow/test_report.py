@@ -84,7 +84,7 @@ def test_bands_stand_in_every_table_of_bands(reports):
         ("four", ["F1800W", "F560W", "F1000W", "F2550W"]),
     ):
         page = page_of(reports[kind])
-        tables = re.findall(r"<table>.*?</table>", page)
+        tables = re.findall(r"<table>.*?</table>", page, re.DOTALL)
         of_bands = [
             table for table in tables if "<th>band</th>" in table and "published" not in table
         ]

@@ -1,19 +1,19 @@
 """Pages on which the sources of a truth are looked at one by one, beside the report."""
 
 import dataclasses
-import html
 import json
-import string
 from importlib import resources
 
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
+from markupsafe import Markup
 from matplotlib.colors import to_hex
 
 from miricigale import fitting, photometry, sed
 from miricigale.evaluation import OUTLIER, AssociationFlags
 from miricigale.filters import Filter
+from miricigale.pages import render
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, WAVE, ab_magnitude
 from miricigale.workflow.stage import stage
@@ -365,9 +365,10 @@ def _json(values):
 
 def _page(config, name, facts):
     """The page as text: the facts and the script are part of it."""
-    files = resources.files("miricigale.pages") / "templates"
-    return string.Template((files / "sources.html").read_text("utf-8")).substitute(
-        title=html.escape(f"{config.run.name}: sources of {name}"),
-        facts=_json(facts),
-        script=(files / "sources.js").read_text("utf-8"),
+    script = resources.files("miricigale.pages") / "templates" / "sources.js"
+    return render(
+        "sources.html",
+        title=f"{config.run.name}: sources of {name}",
+        facts=Markup(_json(facts)),
+        script=Markup(script.read_text("utf-8")),
     )
