@@ -16,6 +16,7 @@ from miricigale.planning.exposures import band_plans
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.background import background_text
 from miricigale.workflow.config import StudyConfig, load_config
+from miricigale.workflow.page.provenance import _background_sentence
 from miricigale.workflow.stages.exposures import (
     background_options,
     study_background,
@@ -28,7 +29,6 @@ from miricigale.workflow.stages.images import (
     mosaics_of,
     reducer_of,
 )
-from miricigale.workflow.stages.provenance import _background_sentence
 from miricigale.workflow.study import check_study
 
 BANDS = ["miri.f770w", "miri.f2100w"]

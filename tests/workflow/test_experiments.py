@@ -12,8 +12,8 @@ from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.page.numbers import StudyTables
 from miricigale.workflow.stages import experiments, study_stages
-from miricigale.workflow.stages.metrics import StudyTables
 from miricigale.workflow.truths import EXPERIMENTS
 
 STAGES = {stage.name: stage for stage in study_stages()}

@@ -1,26 +1,20 @@
-"""What tells sources and detections apart without leaving them out: edges, neighbors, doubtful matches."""
+"""Conditions of sources and detections that stay in the tables: edges, neighbors, doubtful matches."""
 
 import numpy as np
 
 from miricigale import photometry
 from miricigale.evaluation import AssociationFlags, photoz_metrics, recovery_metrics
-from miricigale.pages import number
 from miricigale.utils.tables import Flags, error_column
-from miricigale.workflow.stages.figures import SET_LABELS, band_label
 from miricigale.workflow.stages.sample import SampleFlags
 
 __all__ = [
     "CONDITIONS",
-    "MARKS",
     "ConditionFlags",
     "add_conditions",
     "any_condition",
     "band_conditions",
     "detection_counts",
     "fit_conditions",
-    "write_conditions",
-    "write_fits",
-    "write_left_out",
 ]
 
 
@@ -46,11 +40,6 @@ CONDITIONS = {
     "edge": int(ConditionFlags.EDGE),
     "ambiguous": int(ConditionFlags.AMBIGUOUS),
 }
-#: How sources are marked in figures: bit, marker and label.
-MARKS = (
-    (int(ConditionFlags.CROWDED), "o", "crowded"),
-    (int(ConditionFlags.EDGE), "s", "at the edge"),
-)
 _ANY = sum(CONDITIONS.values())
 _DOUBTFUL = int(
     AssociationFlags.SEVERAL_FIRST | AssociationFlags.SEVERAL_SECOND | AssociationFlags.NOT_MUTUAL
@@ -96,7 +85,7 @@ def _groups(condition):
 
 def band_conditions(matched, name):
     """
-    Count the sources of the field by condition, and tell how well each kind is measured in a band.
+    Count the sources of the field by condition, with how well each kind is measured in a band.
 
     Of ``matched`` (stage 12): ``n_field`` (galaxies and stars with a model), ``n_not_measured`` of
     them, and for each of `CONDITIONS` ``n`` of the measured ones, and ``n_bright``, ``median`` and
@@ -168,80 +157,3 @@ def fit_conditions(sample, redshift, table, bands):
             "photoz_n_outliers": found.n_outliers,
         }
     return groups
-
-
-def write_left_out(report, metrics):
-    """Why sources of the catalog are not in the fit."""
-    report.table(
-        [(name.replace("_", " "), n) for name, n in metrics["n_left_out"].items()],
-        header=("reason", "sources"),
-        caption=f"Why sources of the catalog ({metrics['n_catalog']}) are not in the fit "
-        f"({metrics['n_sample']}), each for one reason or more",
-    )
-
-
-def write_conditions(report, metrics):
-    """Tables of the sources of the field and of the detections by condition."""
-    rows = []
-    for name, entry in metrics["bands"].items():
-        counts = entry["conditions"]
-        cells = [_told(counts[group]) for group in CONDITIONS]
-        rows.append((band_label(name), counts["n_field"], counts["n_not_measured"], *cells))
-    report.table(
-        rows,
-        header=("band", "in the field", "no flux", *CONDITIONS),
-        caption="Sources of the field by condition: their number, and median and scatter of measured "
-        "over true flux minus one of those above 5 sigma. Crowded: a neighbor within 2 arcsec is "
-        "brighter than the magnitude plus one; edge: more than a tenth of the light falls off the "
-        "image; ambiguous: the match to the detections is not the only one possible; isolated: "
-        f"none of these. A source may be in several of the three; fewer than {_FEWEST} above 5 sigma are "
-        "counted only",
-    )
-    found = metrics["detections"]
-    bright = found["n_spurious_bright"]
-    report.table(
-        [
-            ("detections in the field", found["n_field"]),
-            ("of them spurious: no source of the catalog is near", found["n_spurious"]),
-            ("of them ambiguous", found["n_ambiguous"]),
-            *(
-                (f"spurious above 5 sigma in {band_label(name)}", count)
-                for name, count in bright.items()
-            ),
-        ],
-        header=("high-resolution image", "number"),
-        caption=f"Detections of the high-resolution image ({found['n']} in all)",
-    )
-
-
-#: Fewest sources whose offset and scatter are told.
-_FEWEST = 5
-
-
-def _told(found):
-    """Number of a group, and offset and scatter of its bright ones, in one cell."""
-    # a scatter of fewer says nothing
-    if not np.isfinite(found["median"]) or found["n_bright"] < _FEWEST:
-        return f"{found['n']}"
-    return f"{found['n']}: {100 * found['median']:+.1f} ± {100 * found['scatter']:.1f} %"
-
-
-def write_fits(report, metrics):
-    """Photometric redshifts by condition."""
-    none = "no such source in the fit"
-    report.table(
-        [
-            (
-                SET_LABELS[unit],
-                group,
-                found["n"],
-                number(found["photoz_sigma_mad"], ".4f", none),
-                found["photoz_n_outliers"],
-            )
-            for unit, entry in metrics["fits"].items()
-            for group, found in entry["conditions"].items()
-        ],
-        header=("fit", "condition in any band", "sources", "sigma_MAD", "outliers"),
-        caption="Photometric redshifts by condition",
-        text=2,
-    )

@@ -1,4 +1,4 @@
-"""All truths of a run beside Yang et al. 2021: tables, numbers of other products, reasons."""
+"""All truths of a run compared with Yang et al. 2021: tables, numbers of other products, reasons."""
 
 import numpy as np
 
@@ -14,8 +14,8 @@ from miricigale.evaluation import (
     mid_infrared_fractions,
 )
 from miricigale.evaluation.paper import ONE_FIELD
+from miricigale.workflow.page.texts import sentence, texts_of
 from miricigale.workflow.stages.conditions import ConditionFlags
-from miricigale.workflow.stages.provenance import STAND_INS
 from miricigale.workflow.stages.sample import SampleFlags, matched_errors
 
 __all__ = ["agn_shares", "extra_numbers", "reasons_of", "study_results", "write_comparison"]
@@ -28,7 +28,6 @@ _MAG = 2.5 / np.log(10)
 def _truth_results(truth, tables, bands):
     """One truth as `~miricigale.evaluation.TruthResults`."""
     matched = tables.matched
-    near = int(ConditionFlags.CROWDED)
     return TruthResults(
         truth.name,
         None if isinstance(truth.frac_agn, str) else truth.frac_agn,
@@ -36,7 +35,10 @@ def _truth_results(truth, tables, bands):
         matched,
         tables.fits,
         (np.asarray(matched["selection"]) & _OUT) == 0,
-        {name: (np.asarray(matched[f"{name}_condition"]) & near) > 0 for name in bands},
+        {
+            name: (np.asarray(matched[f"{name}_condition"]) & ConditionFlags.CROWDED) > 0
+            for name in bands
+        },
     )
 
 
@@ -124,82 +126,54 @@ def extra_numbers(study, metrics, shares, seed):
 _PAPER_ALPHA = 1.0
 
 
-def _facts(config, metrics, model):
-    """What the run does otherwise than Yang et al. 2021: by topic, in a few words and in a sentence."""
-    n = metrics["n_field"]
-    facts = {
-        "field": ("another field", f"the field is another one: {n} galaxies; theirs has 463."),
-    }
-    if not metrics["as_paper"]:
-        facts["exposures"] = ("other exposures", "exposures or bands are not theirs.")
-    if config.errors.statistic == "mad":
-        sentence = (
-            "errors are 1.48 times the median absolute difference; theirs are the median itself, so that "
-            "their 5 sigma are 3.4 of Gaussian errors."
-        )
-        facts["statistic"] = ("errors 1.48 times theirs, which lowers it", sentence)
-    if config.detector.residual == 0.0:
-        facts["residual"] = (
-            "no residual of the flat field",
-            "images have no residual of flat field and sky beyond photon and read noise.",
-        )
-    if config.photometry.method != "yang2021":
-        facts["method"] = (
-            "other templates",
-            "templates of the photometry have wings, where theirs end at the segments.",
-        )
-    if config.fit.axes != "fit":
-        facts["grid"] = ("a coarse grid", "the grid of the fit is coarser than theirs.")
+def _differences(config, metrics, model):
+    """What a run does otherwise than Yang et al. 2021: topics, in their order, with facts for their sentences."""
     deeper = [m["limit"] - m["proposal"] for m in metrics["bands"].values()]
     shares = {row["limit"]: row["to_proposal"] for row in metrics["detected"]}
-    if np.isfinite([*deeper, *shares.values()]).all() and shares:
-        told = " and ".join(f"{100 * share:.0f} % of H < {h:g}" for h, share in shares.items())
-        sentence = (
-            f"5-sigma limits are {min(deeper):+.1f} to {max(deeper):+.1f} mag fainter than those of the CEERS "
-            f"proposal; to those {told} would be detected."
-        )
-        facts["limits"] = ("other limits", sentence)
-    low, high = config.sed.alpha
-    if not low == high == _PAPER_ALPHA:
-        sentence = (
-            f"the dust of the galaxies has alpha from {low:g} to {high:g}, which the bands of their fit do not "
-            "show; several numbers of the paper come out with alpha = 1 alone, dust with few PAHs, with which "
-            "fewer galaxies are detected, and from which an AGN is told more easily."
-        )
-        facts["dust"] = ("dust of other alpha", sentence)
-    names = [name for name in model.resources if name in STAND_INS]
-    if names:
-        facts["libraries"] = (
-            "stand-in libraries",
-            f"{', '.join(names)} stand in for their libraries.",
-        )
-    return facts
+    stand_ins = [name for name in model.resources if name in texts_of("stand_ins")]
+    differs = {
+        "field": True,
+        "exposures": not metrics["as_paper"],
+        "statistic": config.errors.statistic == "mad",
+        "residual": config.detector.residual == 0.0,
+        "method": config.photometry.method != "yang2021",
+        "grid": config.fit.axes != "fit",
+        "limits": bool(shares) and np.isfinite([*deeper, *shares.values()]).all(),
+        "dust": set(config.sed.alpha) != {_PAPER_ALPHA},
+        "libraries": bool(stand_ins),
+    }
+    facts = {
+        "n_field": metrics["n_field"],
+        "least_deeper": min(deeper),
+        "most_deeper": max(deeper),
+        "to_proposal": " and ".join(f"{100 * x:.0f} % of H < {h:g}" for h, x in shares.items()),
+        "alpha": config.sed.alpha,
+        "stand_ins": ", ".join(stand_ins),
+    }
+    return [topic for topic, differ in differs.items() if differ], facts
 
 
-#: Topics of `_facts` that bear on a quantity; on numbers of other products by the beginning of the key.
+_FIT_TOPICS = "exposures", "dust", "residual", "grid", "libraries", "field"
+_POWER_TOPICS = "exposures", "grid", "libraries"
+#: Topics of `_differences` that bear on a quantity; on numbers of other products by the beginning of the key.
 _TOPICS = {
     "detected_share": ("field", "exposures", "limits", "dust", "statistic", "residual"),
-    "frac_offset": ("exposures", "dust", "residual", "grid", "libraries", "field"),
-    "frac_scatter": ("exposures", "dust", "residual", "grid", "libraries", "field"),
-    "frac_offset_ratio": ("exposures", "dust", "residual", "grid", "libraries", "field"),
-    "class_share": ("exposures", "dust", "residual", "grid", "libraries", "field"),
-    "mips_share": ("field",),
-    "detected_catalog": ("field",),
-    "matched_catalog": ("field",),
+    **dict.fromkeys(
+        ("frac_offset", "frac_scatter", "frac_offset_ratio", "class_share"), _FIT_TOPICS
+    ),
+    **dict.fromkeys(("mips_share", "detected_catalog", "matched_catalog"), ("field",)),
+    **dict.fromkeys(("shape_share", "crowded_share"), ("field",)),
     "etc_limit": ("exposures",),
     "limit_offset": ("residual", "exposures", "method"),
     "shape_offset": ("method", "field"),
     "magnitude_scatter": ("method", "residual", "field"),
-    "shape_share": ("field",),
-    "crowded_share": ("field",),
     "signal_to_noise": ("statistic", "exposures", "residual", "field"),
     "points": ("exposures", "residual"),
     "colors": ("exposures", "libraries"),
-    "power_offset": ("exposures", "grid", "libraries"),
-    "power_scatter": ("exposures", "grid", "libraries"),
+    **dict.fromkeys(("power_offset", "power_scatter"), _POWER_TOPICS),
     "xray_half": ("exposures", "residual", "field", "libraries"),
 }
-_OF_FITS = ("exposures", "residual", "grid", "libraries", "field")
+_OTHER_TOPICS = ("exposures", "residual", "grid", "libraries", "field")
 
 
 def reasons_of(config, metrics, model):
@@ -213,34 +187,28 @@ def reasons_of(config, metrics, model):
     sentences : list of str
         What each of the run's own means.
     """
-    facts, reasons = _facts(config, metrics, model), {}
+    topics, facts = _differences(config, metrics, model)
+    words, reasons = {topic: texts_of("differences")[topic] for topic in topics}, {}
     for one in PUBLISHED:
         topic = one.quantity if one.quantity != "extra" else one.key.partition(".")[0]
         if topic == "f_aper":
             reasons[one.key] = "a PSF with other wings; the factor is not applied"
         if topic in ("feature", "f_scaling", "f_aper", "source_extractor"):
             continue
-        # that the field is another one is among the facts
+        # that the field is another one is among the run's own
         general = [part for part in one.why.split("; ") if part and part != ONE_FIELD]
-        told = [facts[name][0] for name in _TOPICS.get(topic, _OF_FITS) if name in facts]
-        reasons[one.key] = "; ".join([*general, *told])
-    return reasons, [f"{short}: {sentence}" for short, sentence in facts.values()]
+        own = [words[name][0] for name in _TOPICS.get(topic, _OTHER_TOPICS) if name in words]
+        reasons[one.key] = "; ".join([*general, *own])
+    return reasons, [sentence(f"{short}: {text}", facts) for short, text in words.values()]
 
 
-def write_comparison(context, report, study, reasons, sentences):
-    """The section that holds all numbers of Yang et al. 2021 against those of the run."""
-    table = compare_with_paper(study, seed=context.seed, reasons=reasons)
+def write_comparison(page, reasons, sentences):
+    """The section with all numbers of Yang et al. 2021 and those of the run."""
+    context = page.context
+    table = compare_with_paper(page.study, seed=context.seed, reasons=reasons)
     context.save_table("report/paper.ecsv", table)
-    report.section(
-        "Beside Yang et al. 2021",
-        "Every number of the paper's results, and this run's with its bootstrap error: conclusions are to be "
-        "compared, not digits. [?] marks numbers that were not read in the paper itself; completeness is the "
-        "share of the field's galaxies that a number is of. What this run does otherwise:",
-    )
-    report.bullets(sentences)
-    report.table(
-        comparison_rows(table),
-        header=("part", "number", "paper", "here", "completeness", "verdict"),
-        caption="Numbers of Yang et al. 2021 and of this run",
-        text=(0, 1, 5),
-    )
+    page.section("paper")
+    page.report.bullets(sentences)
+    header = ("part", "number", "paper", "here", "completeness", "verdict")
+    caption = page.sentence("table")
+    page.report.table(comparison_rows(table), header=header, caption=caption, text=(0, 1, 5))

@@ -9,7 +9,7 @@ from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.plotting.images import mark_sky, plot_color, plot_image, plot_model_residual
 from miricigale.plotting.measurements import background_figure, encircled_energy_figure
 from miricigale.psf.wiener import energy_error
-from miricigale.workflow.stages.figures import band_label
+from miricigale.workflow.page.labels import band_label
 
 __all__ = [
     "binned",

@@ -1,4 +1,4 @@
-"""The numbers of the report, from the products of a run."""
+"""The plain numbers of a study (``report/metrics.json``), from the tables of a run."""
 
 import dataclasses
 import functools
@@ -31,6 +31,8 @@ from miricigale.workflow.stages.exposures import pointing_exposures, pointing_ti
 from miricigale.workflow.stages.sample import SampleFlags
 
 __all__ = [
+    "FEWEST",
+    "MIPS_LIMIT",
     "StudyTables",
     "above_proposal",
     "as_ceers",
@@ -38,7 +40,13 @@ __all__ = [
     "bright_isolated",
     "study_metrics",
     "truth_metrics",
+    "whole_sample",
 ]
+
+#: Fewest sources of which a median with its error or scatter is shown.
+FEWEST = 5
+#: AB magnitude of the limit of the mock photometry at 24 um.
+MIPS_LIMIT = 19.3
 
 #: Shares of sources detected in two or more bands, by F160W limit: Yang et al. 2021.
 PAPER_DETECTED = ((26.0, 0.53), (25.0, 0.75))
@@ -104,24 +112,27 @@ def as_ceers(config, name):
     if name not in CEERS_FILTERS:
         return False
 
-    def seen(exposures):
-        return [(e.readout, e.subarray, e.n_groups * e.n_integrations) for e in exposures]
-
     own = pointing_exposures(config, name)
     # the split of the frames into groups and integrations is not the survey's
-    return seen(own) == seen(ceers_exposures(own[0].pointing, own[0].roll, filters=[name]))
+    frames = [
+        [(e.readout, e.subarray, e.n_groups * e.n_integrations) for e in exposures]
+        for exposures in (own, _of_ceers(own[0], name))
+    ]
+    return frames[0] == frames[1]
+
+
+def _of_ceers(exposure, name):
+    """The exposures of CEERS in a band, at the pointing of another exposure."""
+    return ceers_exposures(exposure.pointing, exposure.roll, filters=[name])
 
 
 def _proposal(name, exposure):
     """The limit that the CEERS proposal quotes for a band, and the time that it is for."""
-    if name not in CEERS_FILTERS:
-        return {"proposal": np.nan, "proposal_time": np.nan}
-    exposures = ceers_exposures(exposure.pointing, exposure.roll, filters=[name])
-    time = sum(e.exposure_time for e in exposures)
-    return {
-        "proposal": float(depth.proposal_limit(name).value),
-        "proposal_time": time.to_value(u.s),
-    }
+    limit = time = np.nan
+    if name in CEERS_FILTERS:
+        limit = float(depth.proposal_limit(name).value)
+        time = sum(e.exposure_time for e in _of_ceers(exposure, name)).to_value(u.s)
+    return {"proposal": limit, "proposal_time": time}
 
 
 def above_proposal(truth, bands):
@@ -138,13 +149,6 @@ def as_paper(config):
         set(config.exposures.filters) == set(CEERS_FILTERS)
         and all(as_ceers(config, name) for name in config.exposures.filters)
         and config.highres.filter == "wfc3.f160w"
-    )
-
-
-def _point_metrics(table):
-    good = np.asarray(table["in_field"], bool)
-    return recovery_metrics(
-        table["flux_true"][good].value, table["flux"][good].value, relative=True
     )
 
 
@@ -165,28 +169,7 @@ def bright_isolated(matched, name):
         return usable & whole & (matched[f"{name}_true"].value > 20 * formal) & ~near
 
 
-def _band_metrics(matched, name):
-    """Recovery of the isolated sources above 20 sigma, and pulls, in one band."""
-    usable, whole = _usable(matched, name)
-    flux, true = matched[name].value, matched[f"{name}_true"].value
-    formal = matched[f"{name}_formal_err"].value
-    bright = bright_isolated(matched, name)
-    with np.errstate(invalid="ignore"):
-        faint = usable & whole & (true < 20 * formal) & np.isfinite(flux)
-    pulls = (flux[faint] - true[faint]) / formal[faint]
-    return {
-        "bright_isolated": recovery_metrics(true[bright], flux[bright], relative=True),
-        "n_measured": int(np.count_nonzero(usable & np.isfinite(flux))),
-        "formal_limit": float(ab_magnitude(5 * np.nanmedian(formal[usable]) * u.uJy))
-        if usable.any()
-        else np.nan,
-        "pull_n": int(pulls.size),
-        "pull_median": float(np.median(pulls)) if pulls.size else np.nan,
-        "pull_scatter": sigma_mad(pulls),
-    }
-
-
-#: Exposure times, in units of that of one pointing, at which depths are told apart.
+#: Exposure times, in units of that of one pointing, that limit the rows of depths.
 _TIMES = (0.0, 0.8, 1.5, np.inf)
 
 
@@ -204,14 +187,6 @@ def _depth_by_time(tables, field, name, time):
     return rows
 
 
-def _coverage(truth, table, name):
-    """Share of the sources whose true value lies between the 16th and 84th percentile."""
-    low, high = table[f"{name}_p16"], table[f"{name}_p84"]
-    good = np.isfinite(low) & np.isfinite(high)
-    inside = good & (truth >= low) & (truth <= high)
-    return fraction_interval(int(np.count_nonzero(inside)), int(np.count_nonzero(good)))[0]
-
-
 def _light(galaxies, bands, area):
     """Light of all galaxies together, where it is published."""
     rows = []
@@ -219,12 +194,80 @@ def _light(galaxies, bands, area):
         if name in bands:
             flux = galaxies[name][galaxies[name] >= least * u.uJy]
             light, error = integrated_light(flux, area, wave * u.um)
-            published = {"published": value, "down": down, "up": up, "reference": reference}
-            here = {"n": len(flux), "light": light.value, "light_err": error.value}
             # without sources the error is undefined too
-            here |= {} if len(flux) else {"light": np.nan, "light_err": np.nan}
-            rows.append({"band": name, "wavelength": wave, "least": least, **here, **published})
+            values = (light.value, error.value) if len(flux) else (np.nan, np.nan)
+            row = {"band": name, "wavelength": wave, "least": least, "n": len(flux)}
+            row |= dict(zip(("light", "light_err"), values, strict=True))
+            row |= {"published": value, "down": down, "up": up, "reference": reference}
+            rows.append(row)
     return rows
+
+
+def _detected(config, tables, field, least):
+    """Shares of the galaxies of the field detected in enough bands, by limit of the prior's magnitude."""
+    prior = ab_magnitude(tables.truth[config.highres.filter])
+    proposal = above_proposal(tables.truth, config.exposures.filters)
+    rows = []
+    for limit, paper in PAPER_DETECTED:
+        if limit > config.catalog.mag_limit:
+            continue
+        chosen = field & (prior < limit)
+        n = int(np.count_nonzero(chosen & (tables.matched["n_detected"] >= least)))
+        fraction, low, high = fraction_interval(n, int(chosen.sum()))
+        row = {
+            "limit": limit,
+            "n": int(chosen.sum()),
+            "fraction": fraction,
+            "low": low,
+            "high": high,
+        }
+        known = proposal is not None and chosen.any()
+        row["to_proposal"] = float(np.mean(proposal[chosen] >= least)) if known else np.nan
+        rows.append(row | {"paper": paper})
+    return rows
+
+
+def _band_numbers(config, tables, field, name):
+    """Recovery, limits and conditions of one band."""
+    matched, errors = tables.matched, tables.errors
+    usable, whole = _usable(matched, name)
+    flux, true = matched[name].value, matched[f"{name}_true"].value
+    formal = matched[f"{name}_formal_err"].value
+    isolated = bright_isolated(matched, name)
+    bright = recovery_metrics(true[isolated], flux[isolated], relative=True)
+    with np.errstate(invalid="ignore"):
+        faint = usable & whole & (true < 20 * formal) & np.isfinite(flux)
+    pulls = (flux[faint] - true[faint]) / formal[faint]
+    time = pointing_time(config, name)
+    median = np.nanmedian(formal[usable]) if usable.any() else np.nan
+    entry = {
+        "n_measured": int(np.count_nonzero(usable & np.isfinite(flux))),
+        "formal_limit": float(ab_magnitude(5 * median * u.uJy)),
+        "pull_n": int(pulls.size),
+        "pull_median": float(np.median(pulls)) if pulls.size else np.nan,
+        "pull_scatter": sigma_mad(pulls),
+        "limit": float(errors.limiting_magnitude(name).value),
+        "etc_limit": float(depth.scaled_limit(name, time).to_value(u.ABmag)),
+        "coverage": _depth_by_time(tables, field, name, time) if config.errors.coverage else [],
+        **_proposal(name, pointing_exposures(config, name)[0]),
+        "ceers": as_ceers(config, name),
+        "bright_n": bright.n,
+        "bright_median": bright.median,
+        "bright_median_err": bright.median_err,
+        "conditions": band_conditions(matched, name),
+    }
+    if name in tables.points:
+        points = tables.points[name]
+        good = points[np.asarray(points["in_field"], bool)]
+        found = recovery_metrics(good["flux_true"].value, good["flux"].value, relative=True)
+        entry |= {
+            "points_n": found.n,
+            "points_median": found.median,
+            "points_scatter": found.sigma_mad,
+        }
+        for key in ("f_scaling", "f_scaling_err", "f_aper"):
+            entry[key] = float(points.meta.get(key, np.nan))
+    return entry
 
 
 def study_metrics(config, tables, area):
@@ -235,10 +278,12 @@ def study_metrics(config, tables, area):
     field; NaN where there is nothing to count.
     """
     bands = config.exposures.filters
-    truth, matched, errors = tables.truth, tables.matched, tables.errors
+    truth, matched = tables.truth, tables.matched
     selection = np.asarray(matched["selection"])
     field = (selection & (SampleFlags.OUTSIDE_FIELD | SampleFlags.STAR | SampleFlags.NO_MODEL)) == 0
-    metrics = {
+    # with a single band, detections in that band are counted
+    least = min(2, len(bands))
+    return {
         "n_catalog": len(truth),
         "n_field": int(field.sum()),
         "n_matched": int((field & (np.asarray(matched["matched"]))).sum()),
@@ -249,61 +294,11 @@ def study_metrics(config, tables, area):
         "area": float(area.to_value(u.arcmin**2)),
         "as_paper": as_paper(config),
         "detections": detection_counts(tables.detections, bands),
-        # with a single band, detections in that band are counted
-        "n_bands_detected": min(2, len(bands)),
-        "bands": {},
-        "detected": [],
+        "n_bands_detected": least,
+        "bands": {name: _band_numbers(config, tables, field, name) for name in bands},
+        "detected": _detected(config, tables, field, least),
         "light": _light(tables.galaxies(field=True), bands, area),
     }
-    prior = ab_magnitude(truth[config.highres.filter])
-    proposal = above_proposal(truth, bands)
-    for limit, paper in PAPER_DETECTED:
-        if limit > config.catalog.mag_limit:
-            continue
-        chosen = field & (prior < limit)
-        n = int(np.count_nonzero(chosen & (matched["n_detected"] >= metrics["n_bands_detected"])))
-        fraction, low, high = fraction_interval(n, int(chosen.sum()))
-        to_proposal = np.nan
-        if proposal is not None and chosen.any():
-            to_proposal = float(np.mean(proposal[chosen] >= metrics["n_bands_detected"]))
-        metrics["detected"].append(
-            {
-                "limit": limit,
-                "n": int(chosen.sum()),
-                "fraction": fraction,
-                "low": low,
-                "high": high,
-                "to_proposal": to_proposal,
-                "paper": paper,
-            }
-        )
-    for name in bands:
-        time = pointing_time(config, name)
-        entry = _band_metrics(matched, name)
-        bright = entry.pop("bright_isolated")
-        entry |= {
-            "limit": float(errors.limiting_magnitude(name).value),
-            "etc_limit": float(depth.scaled_limit(name, time).to_value(u.ABmag)),
-            "coverage": _depth_by_time(tables, field, name, time) if config.errors.coverage else [],
-            **_proposal(name, pointing_exposures(config, name)[0]),
-            "ceers": as_ceers(config, name),
-            "bright_n": bright.n,
-            "bright_median": bright.median,
-            "bright_median_err": bright.median_err,
-            "conditions": band_conditions(matched, name),
-        }
-        if name in tables.points:
-            points = _point_metrics(tables.points[name])
-            entry |= {
-                "points_n": points.n,
-                "points_median": points.median,
-                "points_scatter": points.sigma_mad,
-                "f_scaling": float(tables.points[name].meta.get("f_scaling", np.nan)),
-                "f_scaling_err": float(tables.points[name].meta.get("f_scaling_err", np.nan)),
-                "f_aper": float(tables.points[name].meta.get("f_aper", np.nan)),
-            }
-        metrics["bands"][name] = entry
-    return metrics
 
 
 #: Numbers of a fit by the quantities of `~miricigale.evaluation.study_numbers` that they are.
@@ -317,28 +312,41 @@ _OF_FIT = {
 }
 
 
+def whole_sample(numbers):
+    """
+    Return the rows that are of all redshifts, by truth, set of bands and quantity.
+
+    ``numbers`` is the table of `~miricigale.evaluation.study_numbers`.
+    """
+    rows = numbers[(numbers["z_low"] == 0) & np.isinf(numbers["z_high"])]
+    return {(row["truth"], row["band_set"], row["quantity"]): row for row in rows}
+
+
 def truth_metrics(truth, tables, numbers, bands):
     """
     Numbers of one truth as plain values: how well redshift and fracAGN are recovered, by set of bands.
 
-    ``truth`` is a `~miricigale.workflow.truths.Truth`, ``tables`` are its `StudyTables`, and ``numbers`` is
-    the table of `~miricigale.evaluation.study_numbers`.
+    ``truth`` is a `~miricigale.workflow.truths.Truth`, ``tables`` are its `StudyTables`, and ``numbers``
+    those of `whole_sample`.
     """
-    whole = (numbers["z_low"] == 0) & np.isinf(numbers["z_high"])
-    own = numbers[whole & (numbers["truth"] == truth.name)]
     sample, fits = tables.sample, {}
     matched = tables.matched[np.asarray(tables.matched["selection"]) == 0]
     for unit, table in tables.fits.items():
-        rows = {row["quantity"]: row for row in own[own["band_set"] == unit]}
-        values = {key: float(rows[name]["value"]) for key, name in _OF_FIT.items()}
-        outliers, n = rows["z_outliers"], int(rows["z_outliers"]["n"])
+        rows = {key: numbers[truth.name, unit, quantity] for key, quantity in _OF_FIT.items()}
+        values = {key: float(row["value"]) for key, row in rows.items()}
+        outliers = rows["photoz_outliers"]
+        n = int(outliers["n"])
+        low, high = table["redshift_p16"], table["redshift_p84"]
+        known = np.isfinite(low) & np.isfinite(high)
+        inside = known & (sample["redshift"] >= low) & (sample["redshift"] <= high)
         fits[unit] = {
             "n": n,
             **values,
             "photoz_n_outliers": round(n * values["photoz_outliers"]) if n else 0,
             "photoz_outliers_low": float(outliers["low"]),
             "photoz_outliers_high": float(outliers["high"]),
-            "redshift_coverage": _coverage(sample["redshift"], table, "redshift"),
+            # share of the true values between the 16th and 84th percentiles
+            "redshift_coverage": fraction_interval(int(inside.sum()), int(known.sum()))[0],
             "conditions": fit_conditions(matched, sample["redshift"], table, bands),
         }
     return {**truth.values(), "n_sample": len(sample), "fits": fits}

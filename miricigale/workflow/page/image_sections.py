@@ -1,0 +1,116 @@
+"""Sections on the images of the reference truth: headline, field, detections."""
+
+import numpy as np
+
+from miricigale.pages import Missing, number, percent
+from miricigale.workflow.page import pictures, study_figures
+from miricigale.workflow.page.labels import SET_LABELS, band_label, browse, three_bands
+from miricigale.workflow.stages.exposures import study_exposures, study_pointings
+from miricigale.workflow.stages.images import measured_mosaic, reducer_of
+
+__all__ = ["field_text", "write_detections", "write_images", "write_summary"]
+
+
+def write_summary(page, truths):
+    """Headline numbers, and links to the sources of each truth."""
+    m, none, sky = page.metrics, "no source in the fit", page.first.name
+    fits = {SET_LABELS[unit]: fit for unit, fit in m["fits"].items() if unit in ("all", "none")}
+    sample = f"in the fit: {page.config.fit.min_detected}+ MIRI bands"
+    page.section("summary")
+    page.report.items(
+        [
+            ("galaxies in the field", browse(sky, m["n_field"])),
+            ("imaged in all bands", f"{m['area']:.2f} arcmin\N{SUPERSCRIPT TWO}"),
+            ("found on the high-resolution image", m["n_matched"]),
+            (sample, browse(sky, m["n_sample"], show="sample")),
+            *(
+                (f"photo-z outliers {label}", percent(fit["photoz_outliers"], none))
+                for label, fit in fits.items()
+            ),
+            *(
+                (
+                    f"fracAGN offset ± scatter {label}",
+                    number(fit["frac_agn_bias"], "+.3f", none, error=fit["frac_agn_sigma_mad"]),
+                )
+                for label, fit in fits.items()
+            ),
+        ]
+    )
+    links = [browse(name, name) for name in truths]
+    page.report.links("The sources one by one:", [(link.text, link.address) for link in links])
+
+
+def write_images(page, mosaics):
+    """The field in color or gray; an exposure before and after; mosaic, model and residual."""
+    config, image, sky = page.config, page.context.image, page.first.name
+    chosen = three_bands(page.bands)
+    page.section("images")
+    page.figure(
+        "color" if len(chosen) == 3 else "gray",
+        pictures.field_figure(
+            [mosaics[name] for name in chosen],
+            image("f160w.fits"),
+            [*chosen, config.highres.filter],
+        ),
+    )
+    unit = next(n for n, e in study_exposures(config).items() if e.filter == chosen[-1])
+    rate, cal = (image(f"{sky}/exposures/{unit}_{kind}.fits") for kind in ("rate", "cal"))
+    page.figure("subtraction", pictures.subtraction_figure(rate, cal, reducer_of(config)))
+    suffix, _ = measured_mosaic(config)
+    pairs = [
+        (image(f"{sky}/mosaic_{n}{suffix}.fits"), image(f"{sky}/photometry/{n}_model.fits"))
+        for n in chosen
+    ]
+    page.figure("residual", pictures.residual_figure(pairs, chosen))
+
+
+def write_detections(page):
+    """Which galaxies are detected, and why the others are not in the fit."""
+    m, none, prior = page.metrics, "no galaxy", band_label(page.config.highres.filter)
+    least = m["n_bands_detected"]
+    columns = {
+        "sample": lambda row: f"{prior} < {row['limit']:g}",
+        "galaxies": lambda row: row["n"],
+        f"detected in {least}+ bands": lambda row: percent(row["fraction"], none),
+        "68 % interval": lambda row: (
+            f"{percent(row['low'], none)} to {percent(row['high'], none)}"
+            if row["n"]
+            else Missing(none)
+        ),
+        "Yang et al. 2021" + ("" if m["as_paper"] else ", six bands, other exposures"): (
+            lambda row: percent(row["paper"], "")
+        ),
+    }
+    if any(np.isfinite(row["to_proposal"]) for row in m["detected"]):
+        header = "by true flux, to the limits of the CEERS proposal"
+        columns[header] = lambda row: percent(row["to_proposal"], none)
+    page.section("detections")
+    page.table(
+        "shares",
+        m["detected"],
+        columns,
+        empty="too_bright",
+        detected_bands="two or more bands" if least == 2 else "the one band",
+        paper_sigma=page.sentence("paper_sigma") if page.config.errors.statistic == "mad" else "",
+    )
+    page.table(
+        "left_out",
+        m["n_left_out"].items(),
+        {
+            "reason": lambda entry: entry[0].replace("_", " "),
+            "sources": lambda entry: browse(
+                page.first.name, entry[1], show="all", flag=entry[0].replace("_", " ")
+            ),
+        },
+    )
+    if page.first.field.any():
+        page.figure("luminosity", study_figures.detection_figure(page.study))
+
+
+def field_text(config):
+    """Where the telescope looks, in words."""
+    centers, options = study_pointings(config), config.pointing
+    field = "a MIRI field" if len(centers) == 1 else f"{len(centers)} MIRI pointings"
+    if options.centers:
+        return f"{field}, the first at RA {centers[0].ra.deg:.5f}, Dec {centers[0].dec.deg:.5f}"
+    return f"{field} at RA {options.ra:.5f}, Dec {options.dec:.5f}"

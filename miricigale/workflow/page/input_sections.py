@@ -1,0 +1,35 @@
+"""The section on the inputs and published relations."""
+
+from miricigale.pages import number
+from miricigale.workflow.page import band_figures
+from miricigale.workflow.page.labels import band_label
+
+__all__ = ["write_inputs"]
+
+_NONE = "no source above the limit in the imaged area"
+_LIGHT = {
+    "band": lambda row: f"{band_label(row['band'])}, {row['wavelength']:g} µm",
+    "faint limit": lambda row: f"{row['least']:g} µJy" if row["least"] else "none",
+    "sources": lambda row: row["n"],
+    "here": lambda row: number(row["light"], ".2f", _NONE, error=row["light_err"]),
+    "published": lambda row: f"{row['published']:.2f} -{row['down']:.2f} +{row['up']:.2f}",
+    "reference": lambda row: row["reference"],
+}
+
+
+def write_inputs(page):
+    """Luminosities, star formation, counts and light of the galaxies of the reference truth."""
+    galaxies, imaged = page.tables.galaxies(), page.tables.galaxies(field=True)
+    page.section("inputs")
+    if len(galaxies) == 0:
+        page.text("no_model")
+        return
+    figure, left_out = band_figures.input_figure(galaxies)
+    page.figure("sequence", figure, n_not_shown=left_out, n_galaxies=len(galaxies))
+    if len(imaged) == 0:
+        page.text("none_imaged")
+        return
+    figure = band_figures.counts_figure(imaged, page.bands, page.area)
+    page.figure("counts", figure, n_imaged=len(imaged))
+    last = len(_LIGHT) - 1
+    page.table("light", page.metrics["light"], _LIGHT, text=(0, last), empty="no_light")
