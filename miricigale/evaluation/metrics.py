@@ -102,7 +102,7 @@ class PhotozMetrics:
     sigma_mad : float
         1.48 x median abs(dz - median dz).
     outlier_fraction, outlier_low, outlier_high : float
-        Share with abs(dz) above the limit and its 68 % interval.
+        Share with abs(dz) above `OUTLIER` and its 68 % interval.
     n_outliers : int
         Their number.
     """
@@ -117,7 +117,7 @@ class PhotozMetrics:
     n_outliers: int
 
 
-def photoz_metrics(z_true, z_fit, *, outlier=OUTLIER):
+def photoz_metrics(z_true, z_fit):
     """
     Compare photometric with true redshifts.
 
@@ -125,8 +125,6 @@ def photoz_metrics(z_true, z_fit, *, outlier=OUTLIER):
     ----------
     z_true, z_fit : array-like, shape (n,)
         Redshifts; pairs with a NaN are counted apart.
-    outlier : float, optional
-        A source with abs(dz) above this is an outlier.
 
     Returns
     -------
@@ -140,7 +138,7 @@ def photoz_metrics(z_true, z_fit, *, outlier=OUTLIER):
     z_true, z_fit = one_by_one(z_true, z_fit, ("z_true", "z_fit"))
     good = np.isfinite(z_true) & np.isfinite(z_fit)
     delta = (z_fit[good] - z_true[good]) / (1 + z_true[good])
-    n_out = int(np.count_nonzero(np.abs(delta) > outlier))
+    n_out = int(np.count_nonzero(np.abs(delta) > OUTLIER))
     fraction, low, high = fraction_interval(n_out, delta.size)
     return PhotozMetrics(
         n=int(delta.size),
