@@ -10,7 +10,6 @@ __getattr__, __dir__, __all__ = lazy_names(
             "CLASS_NAMES",
             "KIRKPATRICK_LIMITS",
             "SelectionQuality",
-            "class_fractions",
             "classify",
             "confusion",
             "selection_quality",

@@ -63,7 +63,7 @@ def test_nothing_selected_has_no_purity():
 
 
 def test_other_lengths_are_refused():
-    with pytest.raises(ValueError, match="'found' must be as long as 'true'"):
+    with pytest.raises(ValueError, match="'found' must be a 1-D array as long as 'true'"):
         confusion(["agn"], [])
-    with pytest.raises(ValueError, match="'selected' must be as long as 'wanted'"):
+    with pytest.raises(ValueError, match="'selected' must be a 1-D array as long as 'wanted'"):
         selection_quality([True], [True, False])

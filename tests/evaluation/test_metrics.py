@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from miricigale.evaluation import (
-    class_fractions,
     classify,
     fraction_interval,
     photoz_metrics,
@@ -77,8 +76,5 @@ def test_classes_have_the_papers_limits():
         "agn",
         "unknown",
     ]
-    assert class_fractions([0.0, 0.2, 0.9, np.nan]) == pytest.approx(
-        {"galaxy": 1 / 3, "composite": 1 / 3, "agn": 1 / 3}
-    )
     with pytest.raises(ValueError, match="'frac_agn' must be between 0 and 1"):
         classify([1.2])

@@ -67,7 +67,7 @@ def test_there_is_no_limit_where_all_or_none_are_found():
 
 
 def test_refuses():
-    with pytest.raises(ValueError, match="'found' must be as long as 'values'"):
+    with pytest.raises(ValueError, match="'found' must be a 1-D array as long as 'values'"):
         half_complete([1.0], [True, False])
     with pytest.raises(ValueError, match="'edges' must be ascending"):
         completeness([1.0], [True], [1.0, 0.0])

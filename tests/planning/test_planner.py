@@ -10,7 +10,8 @@ from astropy.table import QTable
 from miricigale.cli import main
 from miricigale.filters import Filter
 from miricigale.planning import Planner, area_table, comparison_table, load_plan
-from miricigale.planning.planner import EXISTING, accuracy
+from miricigale.planning.accuracy import accuracy
+from miricigale.planning.planner import EXISTING
 from miricigale.utils.exceptions import ConfigError
 from miricigale.utils.parallel import thread_pool
 from miricigale.utils.tables import error_column

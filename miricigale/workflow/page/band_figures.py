@@ -246,7 +246,6 @@ def input_figure(galaxies):
             lines=[(line.value, sequence.value, f"main sequence, z = {middle:g}")],
             ax=ax,
             labels=(r"stellar mass / M$_\odot$", r"SFR (100 Myr) / (M$_\odot$/yr)"),
-            log=(True, True),
         )
         ax.set_title(f"{title} ({np.count_nonzero(rows)})", fontsize="medium")
     outer_labels(list(axes.values()))
