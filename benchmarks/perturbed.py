@@ -38,7 +38,7 @@ def show(config, folder):
         if (folder / name / "fits_all.fits").is_file()
     }
     for name in truths:
-        every[name] = StudyTables.read(context, name)
+        every[name] = StudyTables(context, name)
     table = perturbation_costs(truths, every, config.exposures.filters, seed=config.run.seed)
     quantities = list(dict.fromkeys(table["quantity"]))
     print(" | ".join(["perturbation", *quantities]))

@@ -54,7 +54,7 @@ def main():
     bands = config.exposures.filters
     metrics = json.loads((run / "report" / "metrics.json").read_text())
     sky = reference(config)
-    tables = StudyTables.read(Context(config, run), sky)
+    tables = StudyTables(Context(config, run), sky)
     truth, matched, errors = tables.truth, tables.matched, tables.errors
     galaxies = tables.galaxies(field=True)
     area = metrics["area"] * u.arcmin**2

@@ -7,6 +7,6 @@ __getattr__, __dir__, __all__ = lazy_names(
     {
         "page": ("Page",),
         "rendering": ("render",),
-        "values": ("Link", "Missing", "number", "percent"),
+        "values": ("Link", "Missing", "cell_of", "number"),
     },
 )

@@ -5,7 +5,7 @@ from pathlib import Path
 from markupsafe import Markup
 
 from miricigale.pages.rendering import image_of, macros, render
-from miricigale.pages.values import Missing
+from miricigale.pages.values import Missing, cell_of
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.store import replacing
 
@@ -115,20 +115,24 @@ class Page:
         words = range(text) if isinstance(text, int) else text
         return self._add("table", shown, header, set(words), caption, marks)
 
-    def entries(self, entries, columns, **options):
+    def entries(self, entries, columns=None, **options):
         """
         Add a table with a row for each entry and declared columns.
 
         Parameters
         ----------
-        entries : iterable
+        entries : iterable of mapping
             What the rows are of.
-        columns : dict of str to callable
-            Header of each column, and the function that takes an entry and returns its cell.
+        columns : dict of str to object, optional
+            Header of each column, and how its cells are taken from the entries (see
+            `~miricigale.pages.cell_of`); by default all keys of the entries, in their order.
         **options
             Passed to `table`.
         """
-        rows = [[cell(entry) for cell in columns.values()] for entry in entries]
+        entries = list(entries)
+        if columns is None:
+            columns = {key: key for key in entries[0]} if entries else {}
+        rows = [[cell_of(entry, column) for column in columns.values()] for entry in entries]
         self.table(rows, header=tuple(columns), **options)
 
     def figure(self, figure, caption=""):

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from markupsafe import Markup
 
-__all__ = ["Link", "Missing", "number", "percent"]
+__all__ = ["Link", "Missing", "cell_of", "number"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,11 +57,12 @@ def number(value, spec, reason, *, error=None, scale=1):
     value : float or None
         The number; None or not finite is missing.
     spec : str
-        Format, such as ``"+.2f"``, or one with braces and text around them (``"{:.1f} %"``).
+        Format, such as ``"+.2f"``; one that ends in ``" %"`` writes a share in percent; or one with
+        braces and text around them (``"{:.1f} mag"``).
     reason : str
         Why it is missing.
     error : float, optional
-        Error of a number with a plain format, written after ``±`` where it is finite.
+        Error of a number with a format without braces, written after ``±`` where it is finite.
     scale : float, optional
         Factor applied before writing.
 
@@ -72,7 +73,7 @@ def number(value, spec, reason, *, error=None, scale=1):
     Examples
     --------
     >>> from miricigale.pages import number
-    >>> number(0.0123, "{:+.1f} %", "no source", scale=100)
+    >>> number(0.0123, "+.1f %", "no source")
     '+1.2 %'
     >>> number(0.0123, "+.3f", "no source", error=0.002)
     '+0.012 ± 0.002'
@@ -81,12 +82,36 @@ def number(value, spec, reason, *, error=None, scale=1):
     """
     if value is None or not np.isfinite(value):
         return Missing(reason)
-    text = (spec if "{" in spec else f"{{:{spec}}}").format(scale * value)
+    if "{" in spec:
+        return spec.format(scale * value)
+    spec, share, unit = spec.partition(" %")
+    scale = 100 * scale if share else scale
+    text = f"{scale * value:{spec}}"
     if error is not None and np.isfinite(error):
         text += f" ± {scale * error:{spec.lstrip('+')}}"
-    return text
+    return text + share + unit
 
 
-def percent(value, reason, spec=".1f"):
-    """Return a share as text in percent, or why it is missing."""
-    return number(value, f"{{:{spec}}} %", reason, scale=100)
+def cell_of(entry, column):
+    """
+    Return the cell of an entry in a declared column.
+
+    Parameters
+    ----------
+    entry : mapping
+        What the row is of.
+    column : str, tuple or callable
+        Key of the entry; or key, format and reason of a number (see `number`), and after these the
+        key of its error where it has one; or a function of the entry.
+
+    Returns
+    -------
+    cell : object
+        Text, a number, `Link` or `Missing`.
+    """
+    if callable(column):
+        return column(entry)
+    if isinstance(column, str):
+        return entry[column]
+    key, spec, reason, *error = column
+    return number(entry[key], spec, reason, error=entry[error[0]] if error else None)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_figure
-from miricigale.plotting.posteriors import plot_pdf_2d, plot_sed_fit
+from miricigale.plotting.posteriors import plot_pdf_2d
 from miricigale.plotting.spectra import plot_spectrum
 
 __all__ = ["fit_figure", "sequence_figure"]
@@ -12,23 +12,21 @@ _COLORS = (MEASURED, SECOND)
 _LABELS = ("redshift", "fracAGN")
 
 
-def fit_figure(photometry, posteriors, joint, *, truth, title):
+def fit_figure(draw_fit, posteriors, joint, *, truth):
     """
     Photometry with the best model and residuals, and 1-D and 2-D posteriors of two fits.
 
     Parameters
     ----------
-    photometry : dict
-        Arguments of `miricigale.plotting.posteriors.plot_sed_fit` by name: ``wave``, ``flux``,
-        ``flux_err``, ``model_flux``, and what else there is.
+    draw_fit : callable
+        Draws photometry, best model and residuals on ``ax``, a pair of axes: such as
+        `miricigale.fitting.FitResults.plot_sed` of an object.
     posteriors : dict of str to tuple
         By fit (with and without MIRI): for redshift and fracAGN, edges of cells and weights.
     joint : dict of str to array-like, shape (nx, ny)
         Joint weights of the cells of both, by fit.
     truth : tuple of float
         True values of the two.
-    title : str
-        Title.
 
     Returns
     -------
@@ -40,7 +38,7 @@ def fit_figure(photometry, posteriors, joint, *, truth, title):
     grid = figure.add_gridspec(3, 4, height_ratios=(2.6, 0.9, 2.6))
     upper = figure.add_subplot(grid[0, :])
     lower = figure.add_subplot(grid[1, :], sharex=upper)
-    plot_sed_fit(**photometry, ax=(upper, lower), title=title)
+    draw_fit(ax=(upper, lower))
     upper.set_xlabel("")
     upper.tick_params(labelbottom=False)
     if upper.get_legend():

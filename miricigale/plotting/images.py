@@ -146,7 +146,14 @@ def plot_image(
 
 
 def plot_model_residual(
-    image, model, *, ax=None, limits=None, titles=("image", "model", "residual"), unit=None, **options
+    image,
+    model,
+    *,
+    ax=None,
+    limits=None,
+    titles=("image", "model", "residual"),
+    unit=None,
+    **options,
 ):
     """
     Draw image, model and residual side by side with the same stretch.

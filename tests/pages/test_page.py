@@ -91,13 +91,19 @@ def test_columns_of_text_are_named_by_number_or_place():
     rows = [("band", 3, "a long verdict")]
     report.table(rows, header=("a", "b", "c"), text=2)
     report.table(rows, header=("a", "b", "c"), text=(0, 2))
-    columns = {"a": lambda row: row[0].upper(), "b": lambda row: row[1] + 1}
-    report.entries(rows, columns)
+    entries = [{"name": "band", "n": 3, "z": 0.123, "z_err": 0.01}]
+    columns = {
+        "a": lambda entry: entry["name"].upper(),
+        "b": "n",
+        "c": ("z", "+.1f %", "-", "z_err"),
+    }
+    report.entries(entries, columns)
+    report.entries(entries)
     page = report.to_html()
     assert "<td>band</td><td>3</td><td class=n>a long verdict</td>" in page
     assert "<td>band</td><td class=n>3</td><td>a long verdict</td>" in page
-    assert "<th>a</th><th class=n>b</th>" in page
-    assert "<td>BAND</td><td class=n>4</td>" in page
+    assert "<td>BAND</td><td class=n>3</td><td class=n>+12.3 ± 1.0 %</td>" in page
+    assert "<th>name</th><th class=n>n</th><th class=n>z</th>" in page
 
 
 def test_tables_without_rows_are_sentences():

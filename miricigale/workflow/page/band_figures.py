@@ -6,10 +6,16 @@ import numpy as np
 from miricigale import sed
 from miricigale.evaluation import main_sequence_sfr, number_counts, running_median
 from miricigale.filters import Filter
-from miricigale.plotting.axes import WIDTH, new_figure, panel_columns, panels
-from miricigale.plotting.comparison import (
+from miricigale.plotting.axes import (
     MEASURED,
     SECOND,
+    WIDTH,
+    label_outer,
+    legend,
+    new_figure,
+    panels,
+)
+from miricigale.plotting.comparison import (
     plot_counts,
     plot_error_function,
     plot_magnitudes,
@@ -26,44 +32,29 @@ __all__ = [
     "limit_figure",
     "magnitude_figure",
     "offset_figure",
-    "outer_labels",
     "point_figure",
     "variant_figure",
 ]
 
 
-def outer_labels(axes):
-    """Keep the labels of the outer axes of a figure's panels only."""
-    columns = panel_columns(len(axes))
-    for k, ax in enumerate(axes):
-        if k + columns < len(axes):
-            ax.set_xlabel("")
-        else:
-            ax.tick_params(labelbottom=True)
-        if k % columns:
-            ax.set_ylabel("")
-
-
-def _panels(bands, height):
-    """A panel for each band, with axes of one range."""
-    figure, axes = panels(bands, height=height, sharex=True, sharey=True)
-    return figure, list(axes.values())
+#: Panels of one range.
+_SHARED = {"sharex": True, "sharey": True}
 
 
 def magnitude_figure(table, bands):
     """Measured against true magnitude; ticks are sources without positive flux or off the axis."""
-    figure, axes = _panels(bands, 3.3)
+    figure, axes = panels(bands, height=3.3, **_SHARED)
     true = {name: ab_magnitude(table[f"{name}_true"]) for name in bands}
     measured = {name: ab_magnitude(table[name]) for name in bands}
     known = np.concatenate([values[np.isfinite(values)] for values in true.values()])
     high = known.max(initial=20) + 1.5
-    for ax, name in zip(axes, bands, strict=True):
+    for name, ax in axes.items():
         lost = true[name][np.isfinite(true[name]) & ~(measured[name] < high)]
         plot_magnitudes(true[name], measured[name], ax=ax, lost=lost, title=band_label(name))
     low = known.min(initial=high)
     bright = np.nanmin(np.concatenate([*measured.values(), [low]]))
-    axes[0].set(xlim=(low - 0.4, high - 1.1), ylim=(high, min(low, bright) - 0.4))
-    outer_labels(axes)
+    ax.set(xlim=(low - 0.4, high - 1.1), ylim=(high, min(low, bright) - 0.4))
+    label_outer(axes)
     return figure
 
 
@@ -74,8 +65,8 @@ def offset_figure(table, bands, limits=None, marks=()):
     ``limits`` are 5-sigma limits (AB), drawn as lines; ``marks`` are bit of the condition, marker and
     label of the sources that are marked.
     """
-    figure, axes = _panels(bands, 2.9)
-    for ax, name in zip(axes, bands, strict=True):
+    figure, axes = panels(bands, height=2.9, **_SHARED)
+    for name, ax in axes.items():
         true, measured = ab_magnitude(table[f"{name}_true"]), ab_magnitude(table[name])
         offset = measured - true
         good = np.isfinite(offset)
@@ -88,11 +79,9 @@ def offset_figure(table, bands, limits=None, marks=()):
             ax.plot(true[rows], offset[rows], marker, label=label, **style)
         if limits and np.isfinite(limits[name]):
             ax.axvline(limits[name], color="0.35", ls=":", lw=1.2, label="5-sigma limit")
-        if ax is axes[0] and ax.get_legend_handles_labels()[0]:
-            ax.legend(loc="lower left", fontsize=8, frameon=False)
-        elif ax.get_legend():
-            ax.get_legend().remove()
-    outer_labels(axes)
+        if ax.get_legend_handles_labels()[0]:
+            legend(ax, loc="lower left")
+    label_outer(axes)
     return figure
 
 
@@ -115,7 +104,7 @@ def error_figure(errors, bands, limits):
     )
     handles, names = ax.get_legend_handles_labels()
     labels = [band_label(name) for name in names]
-    ax.legend(handles, labels, fontsize=8, frameon=False, ncols=2)
+    legend(ax, handles=handles, labels=labels, ncols=2)
     return figure
 
 
@@ -160,7 +149,7 @@ def limit_figure(entries):
         xlabel="wavelength (µm)",
         ylabel="5-sigma limit (AB)",
     )
-    ax.legend(fontsize=8, frameon=False, loc="lower left")
+    legend(ax, loc="lower left")
     return figure
 
 
@@ -185,7 +174,7 @@ def variant_figure(numbers, labels):
     # space for the legend
     low, high = ax.get_ylim()
     ax.set_ylim(low - 0.35 * (high - low), high)
-    ax.legend(fontsize=8, frameon=False, loc="lower left", ncols=2)
+    legend(ax, loc="lower left", ncols=2)
     return figure
 
 
@@ -229,7 +218,7 @@ def input_figure(galaxies):
     galaxies that it does not show: beyond its redshifts, or below the axes.
     """
     titles = [f"{low:g} < z < {high:g}" for low, high in INPUT_REDSHIFTS]
-    figure, axes = panels(titles, height=3.4, sharex=True, sharey=True)
+    figure, axes = panels(titles, height=3.4, **_SHARED)
     redshift = np.asarray(galaxies["redshift"])
     mass, rate = galaxies["stellar_mass"], galaxies["sfr_100myr"]
     seen = (rate >= LEAST_RATE) & (mass >= LEAST_MASS)
@@ -248,17 +237,17 @@ def input_figure(galaxies):
             labels=(r"stellar mass / M$_\odot$", r"SFR (100 Myr) / (M$_\odot$/yr)"),
         )
         ax.set_title(f"{title} ({np.count_nonzero(rows)})", fontsize="medium")
-    outer_labels(list(axes.values()))
+    label_outer(axes)
     ax.set(xlim=(LEAST_MASS.value, None), ylim=(LEAST_RATE.value, None))
     return figure, len(galaxies) - shown
 
 
 def counts_figure(galaxies, bands, area):
     """Number counts of the injected fluxes in every band."""
-    figure, axes = _panels(bands, 2.7)
+    figure, axes = panels(bands, height=2.7, **_SHARED)
     edges = np.arange(15, 30.1, 0.5)
-    for ax, name in zip(axes, bands, strict=True):
+    for name, ax in axes.items():
         counts, error = (v.to_value(u.deg**-2) for v in number_counts(galaxies[name], area, edges))
         plot_counts(edges, counts, error, ax=ax, title=band_label(name))
-    outer_labels(axes)
+    label_outer(axes)
     return figure

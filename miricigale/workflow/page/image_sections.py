@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from miricigale.pages import Missing, number, percent
+from miricigale.pages import Missing, number
 from miricigale.workflow.page import pictures, study_figures
 from miricigale.workflow.page.labels import SET_LABELS, band_label, browse, three_bands
 from miricigale.workflow.stages.exposures import study_exposures, study_pointings
@@ -24,7 +24,7 @@ def write_summary(page, truths):
             ("found on the high-resolution image", m["n_matched"]),
             (sample, browse(sky, m["n_sample"], show="sample")),
             *(
-                (f"photo-z outliers {label}", percent(fit["photoz_outliers"], none))
+                (f"photo-z outliers {label}", number(fit["photoz_outliers"], ".1f %", none))
                 for label, fit in fits.items()
             ),
             *(
@@ -70,20 +70,20 @@ def write_detections(page):
     least = m["n_bands_detected"]
     columns = {
         "sample": lambda row: f"{prior} < {row['limit']:g}",
-        "galaxies": lambda row: row["n"],
-        f"detected in {least}+ bands": lambda row: percent(row["fraction"], none),
+        "galaxies": "n",
+        f"detected in {least}+ bands": ("fraction", ".1f %", none),
         "68 % interval": lambda row: (
-            f"{percent(row['low'], none)} to {percent(row['high'], none)}"
-            if row["n"]
-            else Missing(none)
+            f"{100 * row['low']:.1f} % to {100 * row['high']:.1f} %" if row["n"] else Missing(none)
         ),
         "Yang et al. 2021" + ("" if m["as_paper"] else ", six bands, other exposures"): (
-            lambda row: percent(row["paper"], "")
+            "paper",
+            ".1f %",
+            "",
         ),
     }
     if any(np.isfinite(row["to_proposal"]) for row in m["detected"]):
         header = "by true flux, to the limits of the CEERS proposal"
-        columns[header] = lambda row: percent(row["to_proposal"], none)
+        columns[header] = ("to_proposal", ".1f %", none)
     page.section("detections")
     page.table(
         "shares",
@@ -93,15 +93,13 @@ def write_detections(page):
         detected_bands="two or more bands" if least == 2 else "the one band",
         paper_sigma=page.sentence("paper_sigma") if page.config.errors.statistic == "mad" else "",
     )
+    reasons = {name.replace("_", " "): n for name, n in m["n_left_out"].items()}
     page.table(
         "left_out",
-        m["n_left_out"].items(),
-        {
-            "reason": lambda entry: entry[0].replace("_", " "),
-            "sources": lambda entry: browse(
-                page.first.name, entry[1], show="all", flag=entry[0].replace("_", " ")
-            ),
-        },
+        [
+            {"reason": name, "sources": browse(page.first.name, n, show="all", flag=name)}
+            for name, n in reasons.items()
+        ],
     )
     if page.first.field.any():
         page.figure("luminosity", study_figures.detection_figure(page.study))

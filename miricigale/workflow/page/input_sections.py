@@ -1,6 +1,5 @@
 """The section on the inputs and published relations."""
 
-from miricigale.pages import number
 from miricigale.workflow.page import band_figures
 from miricigale.workflow.page.labels import band_label
 
@@ -10,10 +9,10 @@ _NONE = "no source above the limit in the imaged area"
 _LIGHT = {
     "band": lambda row: f"{band_label(row['band'])}, {row['wavelength']:g} µm",
     "faint limit": lambda row: f"{row['least']:g} µJy" if row["least"] else "none",
-    "sources": lambda row: row["n"],
-    "here": lambda row: number(row["light"], ".2f", _NONE, error=row["light_err"]),
+    "sources": "n",
+    "here": ("light", ".2f", _NONE, "light_err"),
     "published": lambda row: f"{row['published']:.2f} -{row['down']:.2f} +{row['up']:.2f}",
-    "reference": lambda row: row["reference"],
+    "reference": "reference",
 }
 
 

@@ -78,5 +78,5 @@ def browse(truth, text, source="", **filters):
     """
     if text == 0:
         return text
-    query = f"?{urlencode(filters)}" if filters else ""
-    return Link(text, f"sources-{quote(truth)}.html#{quote(str(source), safe='')}{query}")
+    place = quote(str(source), safe="") + (f"?{urlencode(filters)}" if filters else "")
+    return Link(text, f"sources-{quote(truth)}.html{f'#{place}' if place else ''}")

@@ -1,6 +1,5 @@
 """The plain numbers of a study (``report/metrics.json``), from the tables of a run."""
 
-import dataclasses
 import functools
 import itertools
 
@@ -26,6 +25,7 @@ from miricigale.workflow.stages.conditions import (
     band_conditions,
     detection_counts,
     fit_conditions,
+    has_flag,
 )
 from miricigale.workflow.stages.exposures import pointing_exposures, pointing_time
 from miricigale.workflow.stages.sample import SampleFlags
@@ -52,46 +52,74 @@ MIPS_LIMIT = 19.3
 PAPER_DETECTED = ((26.0, 0.53), (25.0, 0.75))
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class StudyTables:
     """
-    The tables of one truth of a run, each read once.
+    The tables of one truth of a run, each read when it is first asked for.
 
-    ``truth`` and ``matched`` (stages 3 and 12) have the same sources row by row; ``detections`` is the
-    photometry of stage 12, ``errors`` the `~miricigale.photometry.ErrorModel`, ``results`` a
-    `~miricigale.fitting.FitResults` for each set of bands with a row for each source of the sample, and
-    ``points`` a table of bright point sources by band, empty where the check was not made.
+    Parameters
+    ----------
+    context : `~miricigale.workflow.Context`
+        Of a stage, or of none.
+    name : str
+        Name of the truth.
     """
 
-    truth: QTable
-    matched: QTable
-    detections: QTable
-    errors: object
-    results: dict
-    points: dict
+    def __init__(self, context, name):
+        self._context, self._name = context, name
 
-    @classmethod
-    def read(cls, context, name):
-        """Read those of a truth; ``context`` is that of a stage, or of none."""
-        config = context.config
-        bands = config.exposures.filters if config.point_sources.enabled else ()
-        results = {
-            unit: fitting.FitResults.read(context.path(f"{name}/fits_{unit}.fits"))
-            for unit in config.fit.sets
+    def _read(self, path, reader=QTable.read):
+        return reader(self._context.path(path))
+
+    @functools.cached_property
+    def truth(self):
+        """The sources of the catalog with their true fluxes (stage 3)."""
+        return self._read(f"{self._name}/truth.ecsv")
+
+    @functools.cached_property
+    def matched(self):
+        """The same sources row by row with measured fluxes (stage 12)."""
+        return self._read(f"{self._name}/matched.ecsv")
+
+    @functools.cached_property
+    def detections(self):
+        """The photometry of all detections."""
+        return self._read(f"{self._name}/photometry.ecsv")
+
+    @functools.cached_property
+    def errors(self):
+        """The error functions (`~miricigale.photometry.ErrorModel`), of the reference truth."""
+        return self._read("errors.ecsv", photometry.ErrorModel.read)
+
+    @functools.cached_property
+    def results(self):
+        """`~miricigale.fitting.FitResults` of the sample by set of bands."""
+        return {
+            unit: self._read(f"{self._name}/fits_{unit}.fits", fitting.FitResults.read)
+            for unit in self._context.config.fit.sets
         }
-        return cls(
-            QTable.read(context.path(f"{name}/truth.ecsv")),
-            QTable.read(context.path(f"{name}/matched.ecsv")),
-            QTable.read(context.path(f"{name}/photometry.ecsv")),
-            photometry.ErrorModel.read(context.path("errors.ecsv")),
-            results,
-            {band: QTable.read(context.path(f"points/{band}.ecsv")) for band in bands},
-        )
+
+    @functools.cached_property
+    def points(self):
+        """Bright point sources by band; empty where that check was not made."""
+        config = self._context.config
+        bands = config.exposures.filters if config.point_sources.enabled else ()
+        return {band: self._read(f"points/{band}.ecsv") for band in bands}
 
     @property
     def sample(self):
         """Rows of the truth that were fitted."""
         return self.truth[np.asarray(self.matched["selection"]) == 0]
+
+    @property
+    def inside(self):
+        """Which sources are in the imaged field."""
+        return ~has_flag(self.matched, "selection", SampleFlags.OUTSIDE_FIELD)
+
+    @property
+    def field(self):
+        """Which of these are galaxies with a model."""
+        no_galaxy = SampleFlags.STAR | SampleFlags.NO_MODEL
+        return self.inside & ~has_flag(self.matched, "selection", no_galaxy)
 
     @functools.cached_property
     def fits(self):
@@ -102,9 +130,7 @@ class StudyTables:
         """Rows of the truth that are galaxies with a model, of the imaged field or all."""
         known = np.isfinite(self.truth["stellar_mass"].value)
         known &= ~np.asarray(self.truth["star"], bool)
-        if field:
-            known &= (np.asarray(self.matched["selection"]) & SampleFlags.OUTSIDE_FIELD) == 0
-        return self.truth[known]
+        return self.truth[known & self.inside if field else known]
 
 
 def as_ceers(config, name):
@@ -154,31 +180,30 @@ def as_paper(config):
 
 def _usable(matched, name):
     """Sources that are measured in one band: in the field at all, and whole in the band."""
-    selection = np.asarray(matched["selection"])
-    usable = (selection & (SampleFlags.OUTSIDE_FIELD | SampleFlags.NOT_MATCHED)) == 0
+    lost = SampleFlags.OUTSIDE_FIELD | SampleFlags.NOT_MATCHED
     off = photometry.ForcedFlags.EDGE | photometry.ForcedFlags.MASKED
-    return usable, (np.asarray(matched[f"{name}_flags"]) & off) == 0
+    return ~has_flag(matched, "selection", lost), ~has_flag(matched, f"{name}_flags", off)
 
 
 def bright_isolated(matched, name):
     """Which sources are isolated and above 20 sigma in one band, whole and in the field."""
     usable, whole = _usable(matched, name)
-    near = (np.asarray(matched[f"{name}_condition"]) & ConditionFlags.CROWDED) > 0
-    formal = matched[f"{name}_formal_err"].value
+    crowded = has_flag(matched, f"{name}_condition", ConditionFlags.CROWDED)
+    true, formal = (matched[f"{name}_{end}"].value for end in ("true", "formal_err"))
     with np.errstate(invalid="ignore"):
-        return usable & whole & (matched[f"{name}_true"].value > 20 * formal) & ~near
+        return usable & whole & (true > 20 * formal) & ~crowded
 
 
 #: Exposure times, in units of that of one pointing, that limit the rows of depths.
 _TIMES = (0.0, 0.8, 1.5, np.inf)
 
 
-def _depth_by_time(tables, field, name, time):
-    """Galaxies of the field (``field``) by exposure time in a band, with its median and the limit there."""
+def _depth_by_time(tables, name, time):
+    """Galaxies of the field by exposure time in a band, with its median and the limit there."""
     seen = (tables.matched[f"{name}_time"] / time).to_value(u.one)
     rows = []
     for low, high in itertools.pairwise(_TIMES):
-        chosen = field & (seen >= low) & (seen < high)
+        chosen = tables.field & (seen >= low) & (seen < high)
         if np.any(chosen):
             share = float(np.median(seen[chosen]))
             # the error at a flux is that of one pointing, over the root of the share
@@ -203,7 +228,7 @@ def _light(galaxies, bands, area):
     return rows
 
 
-def _detected(config, tables, field, least):
+def _detected(config, tables, least):
     """Shares of the galaxies of the field detected in enough bands, by limit of the prior's magnitude."""
     prior = ab_magnitude(tables.truth[config.highres.filter])
     proposal = above_proposal(tables.truth, config.exposures.filters)
@@ -211,7 +236,7 @@ def _detected(config, tables, field, least):
     for limit, paper in PAPER_DETECTED:
         if limit > config.catalog.mag_limit:
             continue
-        chosen = field & (prior < limit)
+        chosen = tables.field & (prior < limit)
         n = int(np.count_nonzero(chosen & (tables.matched["n_detected"] >= least)))
         fraction, low, high = fraction_interval(n, int(chosen.sum()))
         row = {
@@ -227,7 +252,7 @@ def _detected(config, tables, field, least):
     return rows
 
 
-def _band_numbers(config, tables, field, name):
+def _band_numbers(config, tables, name):
     """Recovery, limits and conditions of one band."""
     matched, errors = tables.matched, tables.errors
     usable, whole = _usable(matched, name)
@@ -248,7 +273,7 @@ def _band_numbers(config, tables, field, name):
         "pull_scatter": sigma_mad(pulls),
         "limit": float(errors.limiting_magnitude(name).value),
         "etc_limit": float(depth.scaled_limit(name, time).to_value(u.ABmag)),
-        "coverage": _depth_by_time(tables, field, name, time) if config.errors.coverage else [],
+        "coverage": _depth_by_time(tables, name, time) if config.errors.coverage else [],
         **_proposal(name, pointing_exposures(config, name)[0]),
         "ceers": as_ceers(config, name),
         "bright_n": bright.n,
@@ -278,15 +303,13 @@ def study_metrics(config, tables, area):
     field; NaN where there is nothing to count.
     """
     bands = config.exposures.filters
-    truth, matched = tables.truth, tables.matched
-    selection = np.asarray(matched["selection"])
-    field = (selection & (SampleFlags.OUTSIDE_FIELD | SampleFlags.STAR | SampleFlags.NO_MODEL)) == 0
+    field, selection = tables.field, np.asarray(tables.matched["selection"])
     # with a single band, detections in that band are counted
     least = min(2, len(bands))
     return {
-        "n_catalog": len(truth),
+        "n_catalog": len(tables.truth),
         "n_field": int(field.sum()),
-        "n_matched": int((field & (np.asarray(matched["matched"]))).sum()),
+        "n_matched": int((field & np.asarray(tables.matched["matched"])).sum()),
         "n_sample": int((selection == 0).sum()),
         "n_left_out": {
             flag.name.lower(): int(np.count_nonzero(selection & flag)) for flag in SampleFlags
@@ -295,8 +318,8 @@ def study_metrics(config, tables, area):
         "as_paper": as_paper(config),
         "detections": detection_counts(tables.detections, bands),
         "n_bands_detected": least,
-        "bands": {name: _band_numbers(config, tables, field, name) for name in bands},
-        "detected": _detected(config, tables, field, least),
+        "bands": {name: _band_numbers(config, tables, name) for name in bands},
+        "detected": _detected(config, tables, least),
         "light": _light(tables.galaxies(field=True), bands, area),
     }
 

@@ -15,31 +15,13 @@ from miricigale.evaluation import (
 )
 from miricigale.evaluation.paper import ONE_FIELD
 from miricigale.workflow.page.texts import sentence, texts_of
-from miricigale.workflow.stages.conditions import ConditionFlags
-from miricigale.workflow.stages.sample import SampleFlags, matched_errors
+from miricigale.workflow.stages.conditions import ConditionFlags, has_flag
+from miricigale.workflow.stages.sample import matched_errors
 
 __all__ = ["agn_shares", "extra_numbers", "reasons_of", "study_results", "write_comparison"]
 
-_OUT = SampleFlags.OUTSIDE_FIELD | SampleFlags.STAR | SampleFlags.NO_MODEL
 #: Magnitudes of a small relative change of the flux.
 _MAG = 2.5 / np.log(10)
-
-
-def _truth_results(truth, tables, bands):
-    """One truth as `~miricigale.evaluation.TruthResults`."""
-    matched = tables.matched
-    return TruthResults(
-        truth.name,
-        None if isinstance(truth.frac_agn, str) else truth.frac_agn,
-        tables.truth,
-        matched,
-        tables.fits,
-        (np.asarray(matched["selection"]) & _OUT) == 0,
-        {
-            name: (np.asarray(matched[f"{name}_condition"]) & ConditionFlags.CROWDED) > 0
-            for name in bands
-        },
-    )
 
 
 def study_results(config, truths, every, metrics):
@@ -52,15 +34,24 @@ def study_results(config, truths, every, metrics):
     bands = config.exposures.filters
     reference = next(iter(every.values()))
     # the paper's limits are where the median absolute difference is a fifth of the flux
-    errors = matched_errors(
-        reference.matched,
-        (np.asarray(reference.matched["selection"]) & SampleFlags.OUTSIDE_FIELD) == 0,
-        bands,
-        statistic="median_abs",
-        bin_size=config.errors.bin_size,
-    )
+    options = {"statistic": "median_abs", "bin_size": config.errors.bin_size}
+    errors = matched_errors(reference.matched, reference.inside, bands, **options)
     return StudyResults(
-        tuple(_truth_results(truths[name], tables, bands) for name, tables in every.items()),
+        tuple(
+            TruthResults(
+                name,
+                None if isinstance(truths[name].frac_agn, str) else truths[name].frac_agn,
+                tables.truth,
+                tables.matched,
+                tables.fits,
+                tables.field,
+                {
+                    band: has_flag(tables.matched, f"{band}_condition", ConditionFlags.CROWDED)
+                    for band in bands
+                },
+            )
+            for name, tables in every.items()
+        ),
         bands,
         config.highres.filter,
         {name: float(errors.limiting_magnitude(name).value) for name in bands},
@@ -101,21 +92,17 @@ def extra_numbers(study, metrics, shares, seed):
         "detected_catalog": Estimate(n, n - np.sqrt(n), n + np.sqrt(n), n),
         "matched_catalog": Estimate.of_fraction(np.count_nonzero(found), found.size),
     }
-    offsets, scatters = [], []
-    for band, entry in metrics["bands"].items():
-        if "points_n" not in entry:
-            continue
-        label = band.rpartition(".")[2]
-        scaling, error = entry["f_scaling"], entry["f_scaling_err"]
-        count = entry["points_n"]
-        extra[f"f_scaling.{label}"] = Estimate(scaling, scaling - error, scaling + error, count)
-        extra[f"f_aper.{label}"] = Estimate(entry["f_aper"])
-        offsets.append((abs(_MAG * entry["points_median"]), count))
-        scatters.append((_MAG * entry["points_scatter"], count))
-    for key, values in (("points.offset", offsets), ("points.scatter", scatters)):
-        values = [(value, count) for value, count in values if np.isfinite(value)]
-        if values:
-            value, count = max(values)
+    points = {band: one for band, one in metrics["bands"].items() if "points_n" in one}
+    for band, one in points.items():
+        label, scaling, error = band.rpartition(".")[2], one["f_scaling"], one["f_scaling_err"]
+        ends = (scaling - error, scaling + error)
+        extra[f"f_scaling.{label}"] = Estimate(scaling, *ends, one["points_n"])
+        extra[f"f_aper.{label}"] = Estimate(one["f_aper"])
+    for key, name in (("points.offset", "points_median"), ("points.scatter", "points_scatter")):
+        sizes = [(abs(_MAG * one[name]), one["points_n"]) for one in points.values()]
+        sizes = [(size, n) for size, n in sizes if np.isfinite(size)]
+        if sizes:
+            value, count = max(sizes)
             extra[key] = Estimate(value, n=count)
     if shares:
         extra |= color_estimates(study, shares, seed=seed)
@@ -153,29 +140,6 @@ def _differences(config, metrics, model):
     return [topic for topic, differ in differs.items() if differ], facts
 
 
-_FIT_TOPICS = "exposures", "dust", "residual", "grid", "libraries", "field"
-_POWER_TOPICS = "exposures", "grid", "libraries"
-#: Topics of `_differences` that bear on a quantity; on numbers of other products by the beginning of the key.
-_TOPICS = {
-    "detected_share": ("field", "exposures", "limits", "dust", "statistic", "residual"),
-    **dict.fromkeys(
-        ("frac_offset", "frac_scatter", "frac_offset_ratio", "class_share"), _FIT_TOPICS
-    ),
-    **dict.fromkeys(("mips_share", "detected_catalog", "matched_catalog"), ("field",)),
-    **dict.fromkeys(("shape_share", "crowded_share"), ("field",)),
-    "etc_limit": ("exposures",),
-    "limit_offset": ("residual", "exposures", "method"),
-    "shape_offset": ("method", "field"),
-    "magnitude_scatter": ("method", "residual", "field"),
-    "signal_to_noise": ("statistic", "exposures", "residual", "field"),
-    "points": ("exposures", "residual"),
-    "colors": ("exposures", "libraries"),
-    **dict.fromkeys(("power_offset", "power_scatter"), _POWER_TOPICS),
-    "xray_half": ("exposures", "residual", "field", "libraries"),
-}
-_OTHER_TOPICS = ("exposures", "residual", "grid", "libraries", "field")
-
-
 def reasons_of(config, metrics, model):
     """
     Why numbers of a run may differ from the paper's: reasons by key, and what they mean.
@@ -189,6 +153,7 @@ def reasons_of(config, metrics, model):
     """
     topics, facts = _differences(config, metrics, model)
     words, reasons = {topic: texts_of("differences")[topic] for topic in topics}, {}
+    bearing = texts_of("bearing")
     for one in PUBLISHED:
         topic = one.quantity if one.quantity != "extra" else one.key.partition(".")[0]
         if topic == "f_aper":
@@ -197,7 +162,7 @@ def reasons_of(config, metrics, model):
             continue
         # that the field is another one is among the run's own
         general = [part for part in one.why.split("; ") if part and part != ONE_FIELD]
-        own = [words[name][0] for name in _TOPICS.get(topic, _OTHER_TOPICS) if name in words]
+        own = [words[name][0] for name in bearing.get(topic, bearing["other"]) if name in words]
         reasons[one.key] = "; ".join([*general, *own])
     return reasons, [sentence(f"{short}: {text}", facts) for short, text in words.values()]
 

@@ -3,13 +3,12 @@
 import astropy.units as u
 import numpy as np
 
-from miricigale.pages import number, percent
+from miricigale.pages import number
 from miricigale.psf import MatchingKernel
 from miricigale.workflow.page import band_figures, pictures, study_figures
 from miricigale.workflow.page.labels import band_label
 from miricigale.workflow.page.numbers import FEWEST
 from miricigale.workflow.stages.conditions import CONDITIONS, ConditionFlags
-from miricigale.workflow.stages.sample import SampleFlags
 
 __all__ = ["write_errors", "write_photometry"]
 
@@ -27,8 +26,7 @@ def write_photometry(page):
     page.section("photometry", text="yang2021" if own_steps else "text")
     kernels = {n: MatchingKernel.read(page.context.path(f"kernel_{n}.fits")) for n in page.bands}
     page.figure("convolution", pictures.convolution_figure(kernels))
-    inside = (np.asarray(matched["selection"]) & SampleFlags.OUTSIDE_FIELD) == 0
-    table = matched[inside & np.asarray(matched["matched"])]
+    table = matched[page.tables.inside & np.asarray(matched["matched"])]
     if len(table) == 0:
         page.text("no_match")
     else:
@@ -38,38 +36,39 @@ def write_photometry(page):
         page.figure("shapes", study_figures.shape_figure(page.study))
     reason, lost = "no isolated source above 20 sigma", "no point source measured"
     columns = {
-        "band": lambda x: band_label(x[0]),
-        "isolated > 20 sigma": lambda x: x[1]["bright_n"],
-        "median offset": lambda x: percent(x[1]["bright_median"], reason, "+.2f"),
-        "its error": lambda x: percent(x[1]["bright_median_err"], reason),
+        "band": "band",
+        "isolated > 20 sigma": "bright_n",
+        "median offset": ("bright_median", "+.2f %", reason),
+        "its error": ("bright_median_err", ".1f %", reason),
     }
     if points:
-        whole = "no whole point source in the field"
         columns |= {
-            "point sources": lambda x: x[1]["points_n"],
-            "their median offset": lambda x: percent(x[1]["points_median"], lost, "+.2f"),
-            "scatter": lambda x: percent(x[1]["points_scatter"], lost),
-            "f_scaling": lambda x: number(x[1]["f_scaling"], ".4f", whole),
+            "point sources": "points_n",
+            "their median offset": ("points_median", "+.2f %", lost),
+            "scatter": ("points_scatter", ".1f %", lost),
+            "f_scaling": ("f_scaling", ".4f", "no whole point source in the field"),
         }
-    page.table("scaling" if points else "recovery", bands.items(), columns)
+    page.table("scaling" if points else "recovery", page.band_rows, columns)
     if points:
         shown = {name: table[np.asarray(table["in_field"])] for name, table in points.items()}
         page.figure("points", band_figures.point_figure(shown, page.bands))
     else:
         page.text("no_points")
-    _write_conditions(page, bands, page.metrics["detections"])
+    _write_conditions(page, page.metrics["detections"])
 
 
-def _write_conditions(page, bands, found):
+def _write_conditions(page, found):
     """Tables of the sources of the field and of the detections by condition."""
-    columns = {
-        "band": lambda x: band_label(x[0]),
-        "in the field": lambda x: x[1]["conditions"]["n_field"],
-        "no flux": lambda x: x[1]["conditions"]["n_not_measured"],
-    }
-    for group in CONDITIONS:
-        columns[group] = lambda x, group=group: _offset_cell(x[1]["conditions"][group])
-    page.table("conditions", bands.items(), columns)
+    rows = [
+        {
+            "band": row["band"],
+            "in the field": row["conditions"]["n_field"],
+            "no flux": row["conditions"]["n_not_measured"],
+            **{group: _offset_cell(row["conditions"][group]) for group in CONDITIONS},
+        }
+        for row in page.band_rows
+    ]
+    page.table("conditions", rows)
     counts = {
         "detections in the field": found["n_field"],
         "of them spurious: no source of the catalog is near": found["n_spurious"],
@@ -77,8 +76,8 @@ def _write_conditions(page, bands, found):
     }
     for name, count in found["n_spurious_bright"].items():
         counts[f"spurious above 5 sigma in {band_label(name)}"] = count
-    columns = {"high-resolution image": lambda x: x[0], "number": lambda x: x[1]}
-    page.table("counts", counts.items(), columns, n_detections=found["n"])
+    rows = [{"high-resolution image": what, "number": n} for what, n in counts.items()]
+    page.table("counts", rows, n_detections=found["n"])
 
 
 def _offset_cell(found):
@@ -100,32 +99,26 @@ def write_errors(page):
     none, few = "the error function reaches 5 sigma nowhere", "no source below 20 sigma"
     own = all(entry["ceers"] for entry in bands.values())
     columns = {
-        "band": lambda x: band_label(x[0]),
-        "5 sigma, error function": lambda x: number(x[1]["limit"], ".2f", none),
-        "formal": lambda x: number(x[1]["formal_limit"], ".2f", "no source measured"),
-        "calculator, scaled": lambda x: f"{x[1]['etc_limit']:.2f}",
-        "fainter than calculator": lambda x: number(
-            x[1]["limit"] - x[1]["etc_limit"], "+.2f", none
-        ),
-        f"CEERS proposal{'' if own else ', for other exposures'}": lambda x: _proposal(x[1]),
-        "pull median": lambda x: number(x[1]["pull_median"], "+.2f", few),
-        "pull scatter": lambda x: number(x[1]["pull_scatter"], ".2f", few),
+        "band": "band",
+        "5 sigma, error function": ("limit", ".2f", none),
+        "formal": ("formal_limit", ".2f", "no source measured"),
+        "calculator, scaled": ("etc_limit", ".2f", ""),
+        "fainter than calculator": lambda x: number(x["limit"] - x["etc_limit"], "+.2f", none),
+        f"CEERS proposal{'' if own else ', for other exposures'}": _proposal,
+        "pull median": ("pull_median", "+.2f", few),
+        "pull scatter": ("pull_scatter", ".2f", few),
     }
-    page.table("table", bands.items(), columns)
-    # where not all sources have the same exposure time
-    depths = [
-        (name, one)
-        for name, entry in bands.items()
-        for one in entry["coverage"]
-        if len(entry["coverage"]) > 1
-    ]
+    page.table("table", page.band_rows, columns)
     columns = {
-        "band": lambda x: band_label(x[0]),
-        "exposure time": lambda x: f"{x[1]['share']:.2f}",
-        "galaxies": lambda x: x[1]["n"],
-        "5 sigma": lambda x: number(x[1]["limit"], ".2f", none),
+        "band": "band",
+        "exposure time": ("share", ".2f", ""),
+        "galaxies": "n",
+        "5 sigma": ("limit", ".2f", none),
     }
-    if depths:
+    # where not all sources have the same exposure time
+    several = [row for row in page.band_rows if len(row["coverage"]) > 1]
+    if several:
+        depths = [{"band": row["band"], **one} for row in several for one in row["coverage"]]
         page.table("coverage", depths, columns)
 
 

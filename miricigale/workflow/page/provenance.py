@@ -7,7 +7,6 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from miricigale.pages import percent
 from miricigale.refdata import citations, resource, resources
 from miricigale.utils.meta import provenance
 from miricigale.workflow.background import background_text
@@ -162,13 +161,13 @@ def write_exposures(page):
     bands = page.metrics["bands"]
     columns = {
         "band": lambda kind: band_label(kind["band"]),
-        "readout": lambda kind: kind["readout"],
-        "groups x integrations": lambda kind: kind["frames"],
-        "pointings x dithers": lambda kind: kind["exposures"],
-        "time (s)": lambda kind: f"{kind['time']:.0f}",
-        "background (MJy/sr)": lambda kind: f"{kind['background']:.4g}",
-        "sky fills of the well": lambda kind: percent(kind["fill"], "no usable pixel", ".0f"),
-        "saturated pixels": lambda kind: kind["saturated"],
+        "readout": "readout",
+        "groups x integrations": "frames",
+        "pointings x dithers": "exposures",
+        "time (s)": ("time", ".0f", ""),
+        "background (MJy/sr)": ("background", ".4g", ""),
+        "sky fills of the well": ("fill", ".0f %", "no usable pixel"),
+        "saturated pixels": "saturated",
         "as CEERS": lambda kind: "yes" if bands[kind["band"]]["ceers"] else "no",
     }
     page.table("exposures", exposure_kinds(config, forecasts), columns, text=2)

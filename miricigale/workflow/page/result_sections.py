@@ -12,7 +12,7 @@ from miricigale.evaluation import (
     study_confusion,
 )
 from miricigale.filters import Filter
-from miricigale.pages import Missing, number, percent
+from miricigale.pages import Missing, number
 from miricigale.workflow.page import study_figures
 from miricigale.workflow.page.labels import (
     CLASS_LABELS,
@@ -35,7 +35,6 @@ EXAMPLES = (0.0, 0.4)
 COVERED = ("redshift", "frac_agn", "stellar_mass", "sfr_100myr", "dust_luminosity")
 #: Those whose ranks are drawn.
 RANKED = ("redshift", "frac_agn", "stellar_mass")
-_NONE = "no source fitted"
 
 
 def write_results(page, numbers):
@@ -51,8 +50,9 @@ def write_results(page, numbers):
         page.section("no_fits", left_out=reasons)
         return
     _write_examples(page)
-    _write_redshifts(page, numbers)
-    _write_fractions(page, numbers)
+    rows = _fit_rows(page, numbers)
+    _write_redshifts(page, rows)
+    _write_fractions(page, rows)
     _write_figure(page, "disk", study_figures.disk_figure(page.study))
     several = ", of all truths together" if len(page.study.with_agn) > 1 else ""
     xrays = study_figures.xray_figure(page.study, page.context.seed)
@@ -102,86 +102,73 @@ def _write_examples(page):
 # ---------------------------------------------------------------------- redshift, AGN fraction
 
 
-def _table_of_fits(page, numbers, columns):
-    """
-    A table with a row for each truth and set of bands.
-
-    ``columns`` are by header: quantity, format and scale of a number with its error, or a function of
-    name of the truth, set and plain numbers of the fit.
-    """
+def _fit_rows(page, numbers):
+    """The fits of all truths: plain numbers of the sample, and by quantity those with errors."""
     labels = {one.name: truth_label(one) for one in page.study.truths}
-
-    def cell(column, name, unit, fit):
-        if callable(column):
-            return column(name, unit, fit)
-        quantity, spec, scale = column
-        row = numbers[name, unit, quantity]
-        error = 0.5 * (row["high"] - row["low"])
-        return number(row["value"], spec, _NONE, error=error, scale=scale)
-
-    page.table(
-        "table",
-        [
-            (name, unit, fit)
-            for name, truth in page.metrics["truths"].items()
-            for unit, fit in truth["fits"].items()
-        ],
-        {
-            "injected": lambda x: labels[x[0]],
-            "fit": lambda x: SET_LABELS[x[1]],
-            **{
-                header: (lambda x, column=column: cell(column, *x))
-                for header, column in columns.items()
-            },
-        },
-        text=2,
-    )
+    rows = []
+    for name, truth in page.metrics["truths"].items():
+        for unit, fit in truth["fits"].items():
+            row = {"injected": labels[name], "fit": SET_LABELS[unit], **fit}
+            n = fit["photoz_n_outliers"]
+            # the source browser lists the outliers of these
+            listed = unit in ("all", "none")
+            row["outliers"] = browse(name, n, show=f"outliers_{unit}") if listed else n
+            for quantity in _QUANTITIES:
+                found = numbers[name, unit, quantity]
+                row[quantity] = found["value"]
+                row[f"{quantity}_err"] = 0.5 * (found["high"] - found["low"])
+            rows.append(row)
+    return rows
 
 
-def _outliers(name, unit, fit):
-    """Number of outliers, with a link to their list for the sets that the source browser compares."""
-    n = fit["photoz_n_outliers"]
-    return browse(name, n, show=f"outliers_{unit}") if unit in ("all", "none") else n
+_NONE = "no source fitted"
+#: Columns of the tables of the fits, and the quantities in them that have errors.
+_REDSHIFTS = {
+    "injected": "injected",
+    "fit": "fit",
+    "sources": "n",
+    "dz/(1+z) median": ("z_bias", "+.4f", _NONE, "z_bias_err"),
+    "sigma_MAD": ("z_scatter", ".4f", _NONE, "z_scatter_err"),
+    "outliers": "outliers",
+    "share": ("z_outliers", ".1f %", _NONE, "z_outliers_err"),
+    "z in 16-84 %": ("redshift_coverage", ".0f %", _NONE),
+}
+_FRACTIONS = {
+    "injected": "injected",
+    "fit": "fit",
+    "fracAGN offset": ("frac_offset", "+.3f", _NONE, "frac_offset_err"),
+    "scatter": ("frac_scatter", ".3f", _NONE, "frac_scatter_err"),
+    "width": ("width", ".3f", _NONE, "width_err"),
+}
+_QUANTITIES = ("z_bias", "z_scatter", "z_outliers", "frac_offset", "frac_scatter", "width")
+_CONDITIONS = {
+    "fit": "fit",
+    "condition in any band": "group",
+    "sources": "n",
+    "sigma_MAD": ("photoz_sigma_mad", ".4f", "no such source in the fit"),
+    "outliers": "photoz_n_outliers",
+}
 
 
-def _write_redshifts(page, numbers):
+def _write_redshifts(page, rows):
     """Photometric redshifts."""
     page.section("redshifts")
     if len(page.tables.sample):
         figure = study_figures.redshift_figure(page.tables.sample, page.tables.fits)
         page.figure("scatter", figure)
     page.figure("errors", study_figures.histogram_figure(page.study, "redshift"))
-    columns = {
-        "sources": lambda name, unit, fit: fit["n"],
-        "dz/(1+z) median": ("z_bias", "+.4f", 1),
-        "sigma_MAD": ("z_scatter", ".4f", 1),
-        "outliers": _outliers,
-        "share (%)": ("z_outliers", ".1f", 100),
-        "z in 16-84 %": lambda name, unit, fit: percent(fit["redshift_coverage"], _NONE, ".0f"),
-    }
-    _table_of_fits(page, numbers, columns)
+    page.table("table", rows, _REDSHIFTS, text=2)
     if page.study.with_agn:
         page.text("outliers")
-    none = "no such source in the fit"
-    page.table(
-        "conditions",
-        [
-            (unit, group, fit["conditions"][group])
-            for unit, fit in page.metrics["fits"].items()
-            for group in CONDITIONS
-        ],
-        {
-            "fit": lambda x: SET_LABELS[x[0]],
-            "condition in any band": lambda x: x[1],
-            "sources": lambda x: x[2]["n"],
-            "sigma_MAD": lambda x: number(x[2]["photoz_sigma_mad"], ".4f", none),
-            "outliers": lambda x: x[2]["photoz_n_outliers"],
-        },
-        text=2,
-    )
+    groups = [
+        {"fit": SET_LABELS[unit], "group": group, **fit["conditions"][group]}
+        for unit, fit in page.metrics["fits"].items()
+        for group in CONDITIONS
+    ]
+    page.table("conditions", groups, _CONDITIONS, text=2)
 
 
-def _write_fractions(page, numbers):
+def _write_fractions(page, rows):
     """AGN fractions."""
     study = page.study
     page.section("fractions", text="truths" if len(study.truths) > 1 else "text")
@@ -189,12 +176,7 @@ def _write_fractions(page, numbers):
         page.figure("bins", study_figures.fraction_bins_figure(study))
     page.figure("means", study_figures.histogram_figure(study, "fraction"))
     page.figure("widths", study_figures.histogram_figure(study, "width"))
-    columns = {
-        "fracAGN offset": ("frac_offset", "+.3f", 1),
-        "scatter": ("frac_scatter", ".3f", 1),
-        "width": ("width", ".3f", 1),
-    }
-    _table_of_fits(page, numbers, columns)
+    page.table("table", rows, _FRACTIONS, text=2)
 
 
 # ---------------------------------------------------------------------- classes
@@ -213,45 +195,42 @@ def _share(name):
 
 
 _QUALITY = {name: _share(name) for name in ("completeness", "purity")}
+_SELECTIONS = {
+    "fit": lambda row: SET_LABELS[row["band_set"]],
+    "fracAGN at least": ("limit", "g", ""),
+    "AGN": "n_wanted",
+    "selected": "n_selected",
+    **_QUALITY,
+}
 
 
 def _write_classes(page):
     """Classes by fracAGN and by colors, and selections in a realistic field."""
     study = page.study
     page.section("classes")
-    sets = [name for name in ("all", "none") if name in page.first.fits]
-    if sets and any(one.frac_agn is not None for one in study.truths):
-        tables = {unit: study_confusion(study, unit) for unit in sets}
-        for unit, table in tables.items():
-            page.figure("figure", study_figures.class_figure(table), set=SET_LABELS[unit])
-        names = [n for n in (*CLASS_NAMES, "unknown") if n in tables[sets[0]].colnames]
-        page.table(
-            "table",
-            [{"fit": SET_LABELS[unit], **row} for unit, table in tables.items() for row in table],
-            {
-                "fit": lambda row: row["fit"],
-                "true class": lambda row: CLASS_LABELS.get(row["class"], row["class"]),
-                "sources": lambda row: row["n"],
-                **{
-                    f"found {CLASS_LABELS.get(name, name)}": lambda row, name=name: row[name]
-                    for name in names
-                },
-                **_QUALITY,
-            },
-            text=2,
-        )
+    tables = {
+        SET_LABELS[unit]: study_confusion(study, unit)
+        for unit in ("all", "none")
+        if unit in page.first.fits and any(one.frac_agn is not None for one in study.truths)
+    }
+    for label, table in tables.items():
+        page.figure("figure", study_figures.class_figure(table), set=label)
+    rows = [{"fit": label, **row} for label, table in tables.items() for row in table]
+    if rows:
+        names = [name for name in (*CLASS_NAMES, "unknown") if name in rows[0]]
+        columns = {
+            "fit": "fit",
+            "true class": lambda row: CLASS_LABELS.get(row["class"], row["class"]),
+            "sources": "n",
+            **{f"found {CLASS_LABELS.get(name, name)}": name for name in names},
+            **_QUALITY,
+        }
+        page.table("table", rows, columns, text=2)
     if page.shares:
         page.figure("colors", study_figures.color_figure(study, page.shares))
     for one in study.truths:
         if one.frac_agn is None and one.fits:
-            columns = {
-                "fit": lambda row: SET_LABELS[row["band_set"]],
-                "fracAGN at least": lambda row: f"{row['limit']:g}",
-                "AGN": lambda row: row["n_wanted"],
-                "selected": lambda row: row["n_selected"],
-                **_QUALITY,
-            }
-            page.table("selection", selection_table(one), columns, truth=truth_label(one))
+            page.table("selection", selection_table(one), _SELECTIONS, truth=truth_label(one))
 
 
 # ---------------------------------------------------------------------- features, coverage
@@ -272,21 +251,23 @@ def _write_features(page):
         options = {"pivot": own.pivot, "filter_width": own.width, "seed": page.context.seed}
         for rest in FEATURES:
             inside, outside = feature_residuals(values, redshift, feature=rest, **options)
-            rows.append((f"{band_label(band)}, {rest.value:g} µm", inside, outside))
-    columns = {
-        "band and feature": lambda x: x[0],
-        "sources with it": lambda x: x[1].n,
-        "median residual": lambda x: _residual(x[1]),
-        "of the others": lambda x: _residual(x[2]),
-    }
-    page.table("table", rows, columns)
+            rows.append(
+                {
+                    "band and feature": f"{band_label(band)}, {rest.value:g} µm",
+                    "sources with it": inside.n,
+                    "median residual": _residual(inside),
+                    "of the others": _residual(outside),
+                }
+            )
+    page.table("table", rows)
 
 
 def _residual(estimate):
     # a median of fewer, and its error, say nothing
-    if estimate.n < FEWEST or not np.isfinite(estimate.error):
-        return Missing(f"fewer than {FEWEST} sources above 5 sigma")
-    return number(estimate.value, "+.3f", "", error=estimate.error)
+    known = estimate.n >= FEWEST and np.isfinite(estimate.error)
+    value = estimate.value if known else None
+    reason = f"fewer than {FEWEST} sources above 5 sigma"
+    return number(value, "+.3f", reason, error=estimate.error)
 
 
 def _posterior_ranks(tables, seed):
@@ -314,13 +295,16 @@ def _write_coverage(page):
     page.section("coverage")
     drawn = {key: values for key, values in ranks.items() if key[1] in RANKED}
     page.figure("figure", study_figures.rank_figure(drawn))
-    columns = {
-        "fit": lambda x: SET_LABELS[x[0][0]],
-        "parameter": lambda x: parameter_label(x[0][1]),
-        "sources": lambda x: x[1]["n"],
-        "in 68 %": lambda x: share(x[1]),
-        "in 95 %": lambda x: share(x[2]),
-        "mean rank": lambda x: f"{x[1]['mean_rank']:.2f}",
-    }
     # the table has a row for each of the two intervals
-    page.table("table", zip(ranks, table[::2], table[1::2], strict=True), columns, text=2)
+    rows = [
+        {
+            "fit": SET_LABELS[unit],
+            "parameter": parameter_label(name),
+            "sources": first["n"],
+            "in 68 %": share(first),
+            "in 95 %": share(second),
+            "mean rank": f"{first['mean_rank']:.2f}",
+        }
+        for (unit, name), first, second in zip(ranks, table[::2], table[1::2], strict=True)
+    ]
+    page.table("table", rows, text=2)

@@ -1,5 +1,7 @@
 """Figures of the fits of all truths and of what is known of their sources."""
 
+import functools
+
 import astropy.units as u
 import numpy as np
 
@@ -19,8 +21,8 @@ from miricigale.evaluation import (
     sigma_mad,
     xray_fluxes,
 )
-from miricigale.filters import Filter, FilterSet
-from miricigale.plotting.axes import panels
+from miricigale.filters import Filter
+from miricigale.plotting.axes import label_outer, panels
 from miricigale.plotting.comparison import plot_redshifts
 from miricigale.plotting.examples import fit_figure, sequence_figure
 from miricigale.plotting.measurements import features_figure, offsets_figure
@@ -35,7 +37,6 @@ from miricigale.plotting.truths import (
     recovery_figure,
 )
 from miricigale.utils.units import FNU, ab_magnitude
-from miricigale.workflow.page.band_figures import outer_labels
 from miricigale.workflow.page.labels import (
     CLASS_LABELS,
     SET_LABELS,
@@ -118,7 +119,7 @@ def redshift_figure(truth, fits):
     for (title, ax), table in zip(axes.items(), fits.values(), strict=True):
         error, z = table["redshift_std"], table["redshift_mean"]
         plot_redshifts(truth["redshift"], z, z_err=error, ax=ax, title=title)
-    outer_labels(list(axes.values()))
+    label_outer(axes)
     return figure
 
 
@@ -259,7 +260,6 @@ def example_figure(results, row, key, model):
     the fits.
     """
     best = results["all"][key]
-    total = best.best_sed(model)
     parts, posteriors, joint = {}, {}, {}
     for name in ("all", "none"):
         one = results[name][key] if name in results else None
@@ -271,34 +271,22 @@ def example_figure(results, row, key, model):
         if name == "none":
             other = one.best_sed(model)
             parts["best model without MIRI"] = (other.wave, other.fnu)
-    fraction = best.best["frac_agn"].value
+    redshift, fraction = (best.best[axis].value for axis in ("redshift", "frac_agn"))
     if fraction > 0:
-        galaxy = best.best_sed(model, frac_agn=0.0)
+        total, galaxy = best.best_sed(model), best.best_sed(model, frac_agn=0.0)
         parts["galaxy of the best model"] = (galaxy.wave, galaxy.fnu)
         parts["AGN of the best model"] = (total.wave, total.fnu - galaxy.fnu)
-    filters = FilterSet.from_names(best.filters)
-    order = [filters.names.index(name) for name in best.filters]
-    used = np.isfinite(best.sigma)
-    photometry = {
-        "wave": u.Quantity(filters.pivots)[order],
-        "flux": best.flux * FNU,
-        "flux_err": np.where(used, best.sigma, best.flux_err) * FNU,
-        "model_flux": best.best_flux * FNU,
-        "used": used,
-        "limit": best.limit,
-        "spectrum": (total.wave, total.fnu),
-        "parts": parts,
-        "groups": ["MIRI" if n.startswith("miri.") else "existing bands" for n in best.filters],
-    }
-    return fit_figure(
-        photometry,
-        posteriors,
-        joint,
-        truth=(float(row["redshift"]), float(row["frac_agn"])),
+    draw_fit = functools.partial(
+        best.plot_sed,
+        model=model,
+        parts=parts,
+        groups=["MIRI" if n.startswith("miri.") else "existing bands" for n in best.filters],
         title=f"source {key}: injected z = {row['redshift']:.3f}, fracAGN = {row['frac_agn']:.2g}; "
-        f"best model with MIRI: z = {best.best['redshift'].value:.3f}, fracAGN = {fraction:g}, "
+        f"best model with MIRI: z = {redshift:.3f}, fracAGN = {fraction:g}, "
         f"chi2 = {best.chi2:.1f} in {best.n_bands} bands",
     )
+    truth = (float(row["redshift"]), float(row["frac_agn"]))
+    return fit_figure(draw_fit, posteriors, joint, truth=truth)
 
 
 def class_figure(table):
@@ -318,22 +306,20 @@ def color_figure(study, shares):
     range has an AGN.
     """
     planes, labels = {}, {}
+    share = np.concatenate([shares[one.name] for one in study.truths])
+    redshift = np.concatenate([np.asarray(one.truth["redshift"], float) for one in study.truths])
+    sample = np.concatenate([one.sample for one in study.truths]) & np.isfinite(share)
     for window in COLOR_WINDOWS:
-        colors, classes = [np.empty((0, 2))], []
-        for one in study.truths:
-            rows = one.sample & np.isfinite(shares[one.name])
-            z = np.asarray(one.truth["redshift"], float)
-            rows &= (z >= window.z_low) & (z < window.z_high)
-            colors.append(window.colors(one.matched[rows]))
-            classes.append(classify(shares[one.name][rows], limits=KIRKPATRICK_LIMITS))
-        colors, classes = np.concatenate(colors), np.concatenate([np.zeros(0, "<U9"), *classes])
-        good = np.isfinite(colors).all(axis=1)
-        if not np.any(classes[good] == CLASS_NAMES[2]):
+        colors = np.concatenate([window.colors(one.matched) for one in study.truths])
+        rows = sample & (redshift >= window.z_low) & (redshift < window.z_high)
+        rows &= np.isfinite(colors).all(axis=1)
+        classes = classify(share[rows], limits=KIRKPATRICK_LIMITS)
+        if CLASS_NAMES[2] not in classes:
             continue
-        circles = ColorCircles.fit(colors, classes)
+        circles = ColorCircles.fit(colors[rows], classes)
         title = f"{window.z_low:g} < z < {window.z_high:g}"
-        shown = [CLASS_LABELS.get(name, name) for name in classes[good].tolist()]
-        planes[title] = (colors[good], shown, circles.center, (circles.inner, circles.outer))
+        shown = [CLASS_LABELS.get(name, name) for name in classes.tolist()]
+        planes[title] = (colors[rows], shown, circles.center, (circles.inner, circles.outer))
         labels[title] = tuple(
             f"log {band_label(a)} / {band_label(b)}" for a, b in (window.x, window.y)
         )

@@ -79,17 +79,21 @@ class StudyPage:
         if figure is not None:
             self.report.figure(figure, self.sentence(name, **facts))
 
-    def table(self, name, entries, columns, *, text=1, empty=None, **facts):
+    def table(self, name, entries, columns=None, *, text=1, empty=None, **facts):
         """
         Add a table with its caption: a row for each entry, and the cells by declared columns.
 
-        ``columns`` are functions of an entry by header; ``empty`` names the sentence in place of a
-        table without rows.
+        ``columns`` are those of `~miricigale.pages.Page.entries`; ``empty`` names the sentence in place
+        of a table without rows.
         """
-        self.report.entries(
-            entries,
-            columns,
-            caption=self.sentence(name, **facts),
-            empty=self.sentence(empty) if empty else "",
-            text=text,
-        )
+        caption = self.sentence(name, **facts)
+        empty = self.sentence(empty) if empty else ""
+        self.report.entries(entries, columns, caption=caption, empty=empty, text=text)
+
+    @property
+    def band_rows(self):
+        """The numbers of each band, with its name and what it is called."""
+        return [
+            {"name": name, "band": band_label(name), **entry}
+            for name, entry in self.metrics["bands"].items()
+        ]

@@ -15,6 +15,7 @@ __all__ = [
     "band_conditions",
     "detection_counts",
     "fit_conditions",
+    "has_flag",
 ]
 
 
@@ -46,6 +47,11 @@ _DOUBTFUL = int(
 )
 
 
+def has_flag(table, column, flag):
+    """Which rows have at least one of some flags in a column: array of bool."""
+    return (np.asarray(table[column]) & flag) > 0
+
+
 def add_conditions(table, bands, *, suffix="", detections=False):
     """
     Add ``<band>_condition`` (`ConditionFlags`) to sources, or to detections (``detections``).
@@ -54,19 +60,16 @@ def add_conditions(table, bands, *, suffix="", detections=False):
     the flux and ``<band>_flags``; neighbors are compared by the fluxes ``<band><suffix>``, ``"_true"``
     for the truth. Detections without a source are spurious.
     """
-    association = np.asarray(table["association"])
+    alone = has_flag(table, "association", AssociationFlags.NONE_NEAR)
     for name in bands:
-        condition = np.zeros(len(table), int)
-        at_edge = (np.asarray(table[f"{name}_flags"]) & photometry.ForcedFlags.EDGE) > 0
-        condition[at_edge] |= int(ConditionFlags.EDGE)
-        near = photometry.crowded(table["sky"], table[f"{name}{suffix}"])
-        condition[near] |= int(ConditionFlags.CROWDED)
-        condition[(association & _DOUBTFUL) > 0] |= int(ConditionFlags.AMBIGUOUS)
-        if detections:
-            alone = (association & AssociationFlags.NONE_NEAR) > 0
-            condition[alone] |= int(ConditionFlags.SPURIOUS)
-        condition[~np.isfinite(table[name].value)] |= int(ConditionFlags.NOT_MEASURED)
-        table[f"{name}_condition"] = condition
+        found = {
+            ConditionFlags.EDGE: has_flag(table, f"{name}_flags", photometry.ForcedFlags.EDGE),
+            ConditionFlags.CROWDED: photometry.crowded(table["sky"], table[f"{name}{suffix}"]),
+            ConditionFlags.AMBIGUOUS: has_flag(table, "association", _DOUBTFUL),
+            ConditionFlags.SPURIOUS: alone & detections,
+            ConditionFlags.NOT_MEASURED: ~np.isfinite(table[name].value),
+        }
+        table[f"{name}_condition"] = sum(int(flag) * rows for flag, rows in found.items())
         table[f"{name}_condition"].info.description = ConditionFlags.describe()
 
 
@@ -91,10 +94,9 @@ def band_conditions(matched, name):
     them, and for each of `CONDITIONS` ``n`` of the measured ones, and ``n_bright``, ``median`` and
     ``scatter`` of measured over true flux minus one of those above five formal errors.
     """
-    selection = np.asarray(matched["selection"])
-    field = (selection & (SampleFlags.OUTSIDE_FIELD | SampleFlags.NO_MODEL)) == 0
-    condition = np.asarray(matched[f"{name}_condition"])
-    lost = (condition & ConditionFlags.NOT_MEASURED) > 0
+    column = f"{name}_condition"
+    field = ~has_flag(matched, "selection", SampleFlags.OUTSIDE_FIELD | SampleFlags.NO_MODEL)
+    lost = has_flag(matched, column, ConditionFlags.NOT_MEASURED)
     flux, true = matched[name].value, matched[f"{name}_true"].value
     with np.errstate(invalid="ignore"):
         bright = true > 5 * matched[f"{name}_formal_err"].value
@@ -102,7 +104,7 @@ def band_conditions(matched, name):
         "n_field": int(np.count_nonzero(field)),
         "n_not_measured": int(np.count_nonzero(field & lost)),
     }
-    for group, rows in _groups(condition).items():
+    for group, rows in _groups(np.asarray(matched[column])).items():
         rows = rows & field & ~lost
         found = recovery_metrics(true[rows & bright], flux[rows & bright], relative=True)
         counts[group] = {
@@ -121,21 +123,19 @@ def detection_counts(detections, bands):
     ``n``, ``n_field`` and of these ``n_spurious``, ``n_ambiguous``, and by band the spurious ones above
     five formal errors (``n_spurious_bright``).
     """
-    bands = list(bands)
     field = np.asarray(detections["in_field"], bool)
-    condition = np.asarray(detections[f"{bands[0]}_condition"])
-    spurious = field & ((condition & ConditionFlags.SPURIOUS) > 0)
-    bright = {}
-    for name in bands:
-        with np.errstate(invalid="ignore"):
-            seen = detections[name] > 5 * detections[error_column(name)]
-        bright[name] = int(np.count_nonzero(spurious & seen))
+    spurious, ambiguous = (
+        field & has_flag(detections, f"{bands[0]}_condition", flag)
+        for flag in (ConditionFlags.SPURIOUS, ConditionFlags.AMBIGUOUS)
+    )
+    with np.errstate(invalid="ignore"):
+        bright = {n: detections[n] > 5 * detections[error_column(n)] for n in bands}
     return {
         "n": len(detections),
         "n_field": int(field.sum()),
         "n_spurious": int(spurious.sum()),
-        "n_ambiguous": int(np.count_nonzero(field & ((condition & ConditionFlags.AMBIGUOUS) > 0))),
-        "n_spurious_bright": bright,
+        "n_ambiguous": int(ambiguous.sum()),
+        "n_spurious_bright": {n: int(np.sum(spurious & seen)) for n, seen in bright.items()},
     }
 
 
@@ -147,9 +147,8 @@ def fit_conditions(sample, redshift, table, bands):
     ``table`` the fits of the same sources, row by row; a source has a condition if it has it in one of
     the bands.
     """
-    condition = any_condition(sample, bands)
     groups = {}
-    for name, rows in _groups(condition).items():
+    for name, rows in _groups(any_condition(sample, bands)).items():
         found = photoz_metrics(np.asarray(redshift)[rows], table["redshift_mean"][rows])
         groups[name] = {
             "n": found.n,

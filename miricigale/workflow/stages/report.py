@@ -85,7 +85,7 @@ log = logging.getLogger(__name__)
 def make_report(context, _):
     """Stage 14: the page with its figures, and the numbers as JSON."""
     config, truths, model = context.config, study_truths(context.config), sed.SEDModel.yang2021()
-    every = {name: StudyTables.read(context, name) for name in truths}
+    every = {name: StudyTables(context, name) for name in truths}
     shown, bands = reference(config), config.exposures.filters
     mosaics = {name: context.image(f"{shown}/mosaic_{name}.fits") for name in bands}
     area = footprint_area(mosaics.values())
