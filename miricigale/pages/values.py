@@ -101,8 +101,8 @@ def cell_of(entry, column):
     entry : mapping
         What the row is of.
     column : str, tuple or callable
-        Key of the entry; or key, format and reason of a number (see `number`), and after these the
-        key of its error where it has one; or a function of the entry.
+        Key of the entry, for numbers followed by format and reason (see `number`), and after these
+        the key of the error where it has one; or a function of the entry.
 
     Returns
     -------
@@ -111,7 +111,8 @@ def cell_of(entry, column):
     """
     if callable(column):
         return column(entry)
-    if isinstance(column, str):
-        return entry[column]
-    key, spec, reason, *error = column
+    key, *form = (column,) if isinstance(column, str) else column
+    if not form:
+        return entry[key]
+    spec, reason, *error = form
     return number(entry[key], spec, reason, error=entry[error[0]] if error else None)

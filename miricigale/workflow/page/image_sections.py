@@ -4,7 +4,7 @@ import numpy as np
 
 from miricigale.pages import Missing, number
 from miricigale.workflow.page import pictures, study_figures
-from miricigale.workflow.page.labels import SET_LABELS, band_label, browse, three_bands
+from miricigale.workflow.page.labels import SET_LABELS, browse, three_bands
 from miricigale.workflow.stages.exposures import study_exposures, study_pointings
 from miricigale.workflow.stages.images import measured_mosaic, reducer_of
 
@@ -66,31 +66,20 @@ def write_images(page, mosaics):
 
 def write_detections(page):
     """Which galaxies are detected, and why the others are not in the fit."""
-    m, none, prior = page.metrics, "no galaxy", band_label(page.config.highres.filter)
-    least = m["n_bands_detected"]
-    columns = {
-        "sample": lambda row: f"{prior} < {row['limit']:g}",
-        "galaxies": "n",
-        f"detected in {least}+ bands": ("fraction", ".1f %", none),
-        "68 % interval": lambda row: (
-            f"{100 * row['low']:.1f} % to {100 * row['high']:.1f} %" if row["n"] else Missing(none)
-        ),
-        "Yang et al. 2021" + ("" if m["as_paper"] else ", six bands, other exposures"): (
-            "paper",
-            ".1f %",
-            "",
-        ),
-    }
-    if any(np.isfinite(row["to_proposal"]) for row in m["detected"]):
-        header = "by true flux, to the limits of the CEERS proposal"
-        columns[header] = ("to_proposal", ".1f %", none)
+    m, prior = page.metrics, page.facts["prior"]
+    rows = []
+    for row in m["detected"]:
+        interval = Missing("no galaxy")
+        if row["n"]:
+            interval = f"{100 * row['low']:.1f} % to {100 * row['high']:.1f} %"
+        rows.append({"sample": f"{prior} < {row['limit']:g}", "interval": interval, **row})
+        if all(np.isnan(one["to_proposal"]) for one in m["detected"]):
+            del rows[-1]["to_proposal"]
     page.section("detections")
     page.table(
         "shares",
-        m["detected"],
-        columns,
-        empty="too_bright",
-        detected_bands="two or more bands" if least == 2 else "the one band",
+        rows,
+        other_exposures="" if m["as_paper"] else ", six bands, other exposures",
         paper_sigma=page.sentence("paper_sigma") if page.config.errors.statistic == "mad" else "",
     )
     reasons = {name.replace("_", " "): n for name, n in m["n_left_out"].items()}

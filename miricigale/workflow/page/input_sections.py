@@ -5,16 +5,6 @@ from miricigale.workflow.page.labels import band_label
 
 __all__ = ["write_inputs"]
 
-_NONE = "no source above the limit in the imaged area"
-_LIGHT = {
-    "band": lambda row: f"{band_label(row['band'])}, {row['wavelength']:g} µm",
-    "faint limit": lambda row: f"{row['least']:g} µJy" if row["least"] else "none",
-    "sources": "n",
-    "here": ("light", ".2f", _NONE, "light_err"),
-    "published": lambda row: f"{row['published']:.2f} -{row['down']:.2f} +{row['up']:.2f}",
-    "reference": "reference",
-}
-
 
 def write_inputs(page):
     """Luminosities, star formation, counts and light of the galaxies of the reference truth."""
@@ -30,5 +20,13 @@ def write_inputs(page):
         return
     figure = band_figures.counts_figure(imaged, page.bands, page.area)
     page.figure("counts", figure, n_imaged=len(imaged))
-    last = len(_LIGHT) - 1
-    page.table("light", page.metrics["light"], _LIGHT, text=(0, last), empty="no_light")
+    rows = [
+        row
+        | {
+            "band": f"{band_label(row['band'])}, {row['wavelength']:g} µm",
+            "faint_limit": f"{row['least']:g} µJy" if row["least"] else "none",
+            "published": f"{row['published']:.2f} -{row['down']:.2f} +{row['up']:.2f}",
+        }
+        for row in page.metrics["light"]
+    ]
+    page.table("light", rows)

@@ -8,12 +8,12 @@ from miricigale.plotting.comparison import MEASURED, SECOND
 from miricigale.workflow.truths import CATALOG
 
 __all__ = [
-    "CLASS_LABELS",
     "SET_COLORS",
     "SET_LABELS",
     "band_label",
     "browse",
     "by_wavelength",
+    "class_label",
     "parameter_label",
     "three_bands",
     "truth_label",
@@ -27,14 +27,18 @@ SET_LABELS = {
     "red": "with the longer half of MIRI",
 }
 SET_COLORS = {"all": MEASURED, "none": SECOND, "blue": "tab:blue", "red": "tab:red"}
-#: What classes are called, where that is not their name.
-CLASS_LABELS = {"agn": "AGN", "unknown": "not in the fit"}
+_CLASS_LABELS = {"agn": "AGN", "unknown": "not in the fit"}
 _PARAMETER_LABELS = {"frac_agn": "fracAGN", "sfr_100myr": "SFR (100 Myr)"}
 
 
 def band_label(name):
     """Return what a band is called on the page: ``F770W`` for ``miri.f770w``."""
     return name.rpartition(".")[2].upper()
+
+
+def class_label(name):
+    """Return what a class of `~miricigale.evaluation.classify` is called."""
+    return _CLASS_LABELS.get(name, str(name))
 
 
 def parameter_label(name):

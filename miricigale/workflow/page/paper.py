@@ -14,7 +14,7 @@ from miricigale.evaluation import (
     mid_infrared_fractions,
 )
 from miricigale.evaluation.paper import ONE_FIELD
-from miricigale.workflow.page.texts import sentence, texts_of
+from miricigale.workflow.page.declared import sentence, texts_of
 from miricigale.workflow.stages.conditions import ConditionFlags, has_flag
 from miricigale.workflow.stages.sample import matched_errors
 

@@ -34,21 +34,7 @@ def write_photometry(page):
         page.figure("magnitudes", band_figures.magnitude_figure(table, page.bands))
         page.figure("offsets", band_figures.offset_figure(table, page.bands, limits, _MARKS))
         page.figure("shapes", study_figures.shape_figure(page.study))
-    reason, lost = "no isolated source above 20 sigma", "no point source measured"
-    columns = {
-        "band": "band",
-        "isolated > 20 sigma": "bright_n",
-        "median offset": ("bright_median", "+.2f %", reason),
-        "its error": ("bright_median_err", ".1f %", reason),
-    }
-    if points:
-        columns |= {
-            "point sources": "points_n",
-            "their median offset": ("points_median", "+.2f %", lost),
-            "scatter": ("points_scatter", ".1f %", lost),
-            "f_scaling": ("f_scaling", ".4f", "no whole point source in the field"),
-        }
-    page.table("scaling" if points else "recovery", page.band_rows, columns)
+    page.table("recovery", page.band_rows, scaling=page.sentence("scaling") if points else "")
     if points:
         shown = {name: table[np.asarray(table["in_field"])] for name, table in points.items()}
         page.figure("points", band_figures.point_figure(shown, page.bands))
@@ -96,30 +82,17 @@ def write_errors(page):
     page.figure("function", band_figures.error_figure(errors, page.bands, limits))
     if len(bands) > 1:
         page.figure("limits", band_figures.limit_figure(bands))
-    none, few = "the error function reaches 5 sigma nowhere", "no source below 20 sigma"
-    own = all(entry["ceers"] for entry in bands.values())
-    columns = {
-        "band": "band",
-        "5 sigma, error function": ("limit", ".2f", none),
-        "formal": ("formal_limit", ".2f", "no source measured"),
-        "calculator, scaled": ("etc_limit", ".2f", ""),
-        "fainter than calculator": lambda x: number(x["limit"] - x["etc_limit"], "+.2f", none),
-        f"CEERS proposal{'' if own else ', for other exposures'}": _proposal,
-        "pull median": ("pull_median", "+.2f", few),
-        "pull scatter": ("pull_scatter", ".2f", few),
-    }
-    page.table("table", page.band_rows, columns)
-    columns = {
-        "band": "band",
-        "exposure time": ("share", ".2f", ""),
-        "galaxies": "n",
-        "5 sigma": ("limit", ".2f", none),
-    }
+    rows = [
+        row | {"fainter": row["limit"] - row["etc_limit"], "proposal": _proposal(row)}
+        for row in page.band_rows
+    ]
+    own = all(row["ceers"] for row in rows)
+    page.table("table", rows, other_exposures="" if own else ", for other exposures")
     # where not all sources have the same exposure time
-    several = [row for row in page.band_rows if len(row["coverage"]) > 1]
+    several = [row for row in rows if len(row["coverage"]) > 1]
     if several:
         depths = [{"band": row["band"], **one} for row in several for one in row["coverage"]]
-        page.table("coverage", depths, columns)
+        page.table("coverage", depths)
 
 
 def _proposal(entry):

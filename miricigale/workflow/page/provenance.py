@@ -10,8 +10,8 @@ from astropy.table import QTable
 from miricigale.refdata import citations, resource, resources
 from miricigale.utils.meta import provenance
 from miricigale.workflow.background import background_text
+from miricigale.workflow.page.declared import sentence, texts_of
 from miricigale.workflow.page.labels import band_label
-from miricigale.workflow.page.texts import sentence, texts_of
 from miricigale.workflow.stages.exposures import (
     IMAGE_RESOURCES,
     background_options,
@@ -34,11 +34,12 @@ __all__ = [
 ]
 
 
-def exposure_kinds(config, forecasts):
+def exposure_kinds(config, forecasts, bands):
     """
     Kinds of exposures of each band as dictionaries, with what the dithers of a pointing have together.
 
-    ``forecasts`` are tables by unit; filling and saturation are the highest of the dithers.
+    ``forecasts`` are tables by unit, ``bands`` the plain numbers of the bands; filling and saturation
+    are the highest of the dithers.
     """
     kinds, n_pointings = {}, len(study_pointings(config))
     for unit, e in study_exposures(config).items():
@@ -46,7 +47,8 @@ def exposure_kinds(config, forecasts):
         kinds.setdefault(key, []).append((e, forecasts[unit]))
     return [
         {
-            "band": name,
+            "band": band_label(name),
+            "as_ceers": "yes" if bands[name]["ceers"] else "no",
             "readout": readout,
             "frames": f"{n_groups} x {n_integrations}",
             "exposures": f"{n_pointings} x {len(group) // n_pointings}",
@@ -158,19 +160,7 @@ def write_exposures(page):
         unit: QTable.read(context.path(f"{page.first.name}/exposures/{unit}_forecast.ecsv"))
         for unit in study_exposures(config)
     }
-    bands = page.metrics["bands"]
-    columns = {
-        "band": lambda kind: band_label(kind["band"]),
-        "readout": "readout",
-        "groups x integrations": "frames",
-        "pointings x dithers": "exposures",
-        "time (s)": ("time", ".0f", ""),
-        "background (MJy/sr)": ("background", ".4g", ""),
-        "sky fills of the well": ("fill", ".0f %", "no usable pixel"),
-        "saturated pixels": "saturated",
-        "as CEERS": lambda kind: "yes" if bands[kind["band"]]["ceers"] else "no",
-    }
-    page.table("exposures", exposure_kinds(config, forecasts), columns, text=2)
+    page.table("exposures", exposure_kinds(config, forecasts, page.metrics["bands"]))
     page.report.text(f"Dithers: {dithers_text(config)}. {_background_sentence(config)}.")
     catalog = QTable.read(context.path("catalog.ecsv"))
     page.report.table(catalog_facts(config, catalog), header=("catalog", ""), text=2)

@@ -4,7 +4,6 @@ import astropy.units as u
 import numpy as np
 
 from miricigale.evaluation import (
-    CLASS_NAMES,
     coverage_table,
     feature_residuals,
     posterior_ranks,
@@ -15,15 +14,15 @@ from miricigale.filters import Filter
 from miricigale.pages import Missing, number
 from miricigale.workflow.page import study_figures
 from miricigale.workflow.page.labels import (
-    CLASS_LABELS,
     SET_LABELS,
     band_label,
     browse,
+    class_label,
     parameter_label,
     truth_label,
 )
 from miricigale.workflow.page.numbers import FEWEST
-from miricigale.workflow.page.study_figures import FEATURES
+from miricigale.workflow.page.study_figures import CLASS_COLUMNS, FEATURES
 from miricigale.workflow.stages.conditions import CONDITIONS
 from miricigale.workflow.stages.sample import typical_source
 
@@ -121,33 +120,8 @@ def _fit_rows(page, numbers):
     return rows
 
 
-_NONE = "no source fitted"
-#: Columns of the tables of the fits, and the quantities in them that have errors.
-_REDSHIFTS = {
-    "injected": "injected",
-    "fit": "fit",
-    "sources": "n",
-    "dz/(1+z) median": ("z_bias", "+.4f", _NONE, "z_bias_err"),
-    "sigma_MAD": ("z_scatter", ".4f", _NONE, "z_scatter_err"),
-    "outliers": "outliers",
-    "share": ("z_outliers", ".1f %", _NONE, "z_outliers_err"),
-    "z in 16-84 %": ("redshift_coverage", ".0f %", _NONE),
-}
-_FRACTIONS = {
-    "injected": "injected",
-    "fit": "fit",
-    "fracAGN offset": ("frac_offset", "+.3f", _NONE, "frac_offset_err"),
-    "scatter": ("frac_scatter", ".3f", _NONE, "frac_scatter_err"),
-    "width": ("width", ".3f", _NONE, "width_err"),
-}
+#: Quantities of the fits that are shown with their errors.
 _QUANTITIES = ("z_bias", "z_scatter", "z_outliers", "frac_offset", "frac_scatter", "width")
-_CONDITIONS = {
-    "fit": "fit",
-    "condition in any band": "group",
-    "sources": "n",
-    "sigma_MAD": ("photoz_sigma_mad", ".4f", "no such source in the fit"),
-    "outliers": "photoz_n_outliers",
-}
 
 
 def _write_redshifts(page, rows):
@@ -157,7 +131,7 @@ def _write_redshifts(page, rows):
         figure = study_figures.redshift_figure(page.tables.sample, page.tables.fits)
         page.figure("scatter", figure)
     page.figure("errors", study_figures.histogram_figure(page.study, "redshift"))
-    page.table("table", rows, _REDSHIFTS, text=2)
+    page.table("table", rows)
     if page.study.with_agn:
         page.text("outliers")
     groups = [
@@ -165,7 +139,7 @@ def _write_redshifts(page, rows):
         for unit, fit in page.metrics["fits"].items()
         for group in CONDITIONS
     ]
-    page.table("conditions", groups, _CONDITIONS, text=2)
+    page.table("conditions", groups)
 
 
 def _write_fractions(page, rows):
@@ -176,61 +150,50 @@ def _write_fractions(page, rows):
         page.figure("bins", study_figures.fraction_bins_figure(study))
     page.figure("means", study_figures.histogram_figure(study, "fraction"))
     page.figure("widths", study_figures.histogram_figure(study, "width"))
-    page.table("table", rows, _FRACTIONS, text=2)
+    page.table("table", rows)
 
 
 # ---------------------------------------------------------------------- classes
 
 
-def _share(name):
-    """Cell of a share of a row with its interval, or why there is none."""
-
-    def cell(row):
-        if not np.isfinite(row[name]):
-            return Missing("no such source")
-        low, high = (100 * row[f"{name}_{end}"] for end in ("low", "high"))
-        return f"{100 * row[name]:.0f} % ({low:.0f} to {high:.0f})"
-
-    return cell
+def _share(row, name):
+    """A share of a row with its interval, or why there is none."""
+    if not np.isfinite(row[name]):
+        return Missing("no such source")
+    low, high = (100 * row[f"{name}_{end}"] for end in ("low", "high"))
+    return f"{100 * row[name]:.0f} % ({low:.0f} to {high:.0f})"
 
 
-_QUALITY = {name: _share(name) for name in ("completeness", "purity")}
-_SELECTIONS = {
-    "fit": lambda row: SET_LABELS[row["band_set"]],
-    "fracAGN at least": ("limit", "g", ""),
-    "AGN": "n_wanted",
-    "selected": "n_selected",
-    **_QUALITY,
-}
+def _quality(row):
+    return {name: _share(row, name) for name in ("completeness", "purity")}
 
 
 def _write_classes(page):
     """Classes by fracAGN and by colors, and selections in a realistic field."""
-    study = page.study
+    study, rows = page.study, []
     page.section("classes")
-    tables = {
-        SET_LABELS[unit]: study_confusion(study, unit)
-        for unit in ("all", "none")
-        if unit in page.first.fits and any(one.frac_agn is not None for one in study.truths)
-    }
-    for label, table in tables.items():
-        page.figure("figure", study_figures.class_figure(table), set=label)
-    rows = [{"fit": label, **row} for label, table in tables.items() for row in table]
+    for unit in ("all", "none"):
+        if unit in page.first.fits and any(one.frac_agn is not None for one in study.truths):
+            table, label = study_confusion(study, unit), SET_LABELS[unit]
+            page.figure("figure", study_figures.class_figure(table), set=label)
+            found = {f"found {class_label(n)}": n for n in CLASS_COLUMNS if n in table.colnames}
+            rows += [
+                {"fit": label, "true class": class_label(row["class"]), "sources": row["n"]}
+                | {header: row[name] for header, name in found.items()}
+                | _quality(row)
+                for row in table
+            ]
     if rows:
-        names = [name for name in (*CLASS_NAMES, "unknown") if name in rows[0]]
-        columns = {
-            "fit": "fit",
-            "true class": lambda row: CLASS_LABELS.get(row["class"], row["class"]),
-            "sources": "n",
-            **{f"found {CLASS_LABELS.get(name, name)}": name for name in names},
-            **_QUALITY,
-        }
-        page.table("table", rows, columns, text=2)
+        page.table("table", rows)
     if page.shares:
         page.figure("colors", study_figures.color_figure(study, page.shares))
     for one in study.truths:
         if one.frac_agn is None and one.fits:
-            page.table("selection", selection_table(one), _SELECTIONS, truth=truth_label(one))
+            rows = [
+                {"fit": SET_LABELS[row["band_set"]], **row, **_quality(row)}
+                for row in selection_table(one)
+            ]
+            page.table("selection", rows, truth=truth_label(one))
 
 
 # ---------------------------------------------------------------------- features, coverage
@@ -288,7 +251,7 @@ def _posterior_ranks(tables, seed):
 
 def _write_coverage(page):
     """Ranks of the truth in the posteriors, and how many are within central intervals."""
-    ranks, share = _posterior_ranks(page.tables, page.context.seed), _share("share")
+    ranks = _posterior_ranks(page.tables, page.context.seed)
     if not ranks:
         return
     table = coverage_table({" ".join(key): values for key, values in ranks.items()})
@@ -301,10 +264,10 @@ def _write_coverage(page):
             "fit": SET_LABELS[unit],
             "parameter": parameter_label(name),
             "sources": first["n"],
-            "in 68 %": share(first),
-            "in 95 %": share(second),
+            "in 68 %": _share(first, "share"),
+            "in 95 %": _share(second, "share"),
             "mean rank": f"{first['mean_rank']:.2f}",
         }
         for (unit, name), first, second in zip(ranks, table[::2], table[1::2], strict=True)
     ]
-    page.table("table", rows, text=2)
+    page.table("table", rows)

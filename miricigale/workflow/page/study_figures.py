@@ -38,10 +38,10 @@ from miricigale.plotting.truths import (
 )
 from miricigale.utils.units import FNU, ab_magnitude
 from miricigale.workflow.page.labels import (
-    CLASS_LABELS,
     SET_LABELS,
     band_label,
     by_wavelength,
+    class_label,
     parameter_label,
     truth_label,
 )
@@ -66,6 +66,8 @@ __all__ = [
 
 #: fracAGN of the spectra that are drawn over each other.
 SEQUENCE = (0.0, 0.2, 0.4, 0.6, 0.8, 0.99)
+#: Classes that sources are found in, as columns of tables.
+CLASS_COLUMNS = (*CLASS_NAMES, "unknown")
 #: PAH features that are looked for in the residuals.
 FEATURES = PAH_FEATURES[1:3]
 
@@ -291,11 +293,11 @@ def example_figure(results, row, key, model):
 
 def class_figure(table):
     """Shares found of each class, of a table of `~miricigale.evaluation.study_confusion`."""
-    names = [str(row["class"]) for row in table if row["n"]]
-    found = [name for name in (*CLASS_NAMES, "unknown") if name in table.colnames]
-    counts = np.array([[row[name] for name in found] for row in table if row["n"]], float)
-    labels = [[CLASS_LABELS.get(name, name) for name in some] for some in (names, found)]
-    return classes_figure(counts, labels[0], found=labels[1])
+    found = [name for name in CLASS_COLUMNS if name in table.colnames]
+    rows = [row for row in table if row["n"]]
+    counts = np.array([[row[name] for name in found] for row in rows], float)
+    names = [class_label(row["class"]) for row in rows]
+    return classes_figure(counts, names, found=[class_label(name) for name in found])
 
 
 def color_figure(study, shares):
@@ -318,7 +320,7 @@ def color_figure(study, shares):
             continue
         circles = ColorCircles.fit(colors[rows], classes)
         title = f"{window.z_low:g} < z < {window.z_high:g}"
-        shown = [CLASS_LABELS.get(name, name) for name in classes.tolist()]
+        shown = [class_label(name) for name in classes.tolist()]
         planes[title] = (colors[rows], shown, circles.center, (circles.inner, circles.outer))
         labels[title] = tuple(
             f"log {band_label(a)} / {band_label(b)}" for a, b in (window.x, window.y)

@@ -2,9 +2,9 @@
 
 import functools
 
+from miricigale.workflow.page.declared import sentence, texts_of
 from miricigale.workflow.page.labels import band_label, three_bands, truth_label
 from miricigale.workflow.page.numbers import FEWEST, MIPS_LIMIT
-from miricigale.workflow.page.texts import sentence, texts_of
 
 __all__ = ["StudyPage"]
 
@@ -13,7 +13,7 @@ class StudyPage:
     """
     What the sections of a study's page read, and the page that they fill.
 
-    Titles, paragraphs and captions are named: they stand in ``texts.toml``, by section.
+    Titles, paragraphs, captions and tables are named: ``sections.toml`` declares them, by section.
 
     Parameters
     ----------
@@ -51,6 +51,9 @@ class StudyPage:
             "truth": truth_label(self.first),
             "three_bands": ", ".join(chosen),
             "longest": chosen[-1],
+            "detected_bands": ("the one band", "two or more bands")[
+                self.metrics["n_bands_detected"] - 1
+            ],
             "prior": band_label(self.config.highres.filter),
             "mag_column": options.mag_column,
             "mag_limit": options.mag_limit,
@@ -79,16 +82,21 @@ class StudyPage:
         if figure is not None:
             self.report.figure(figure, self.sentence(name, **facts))
 
-    def table(self, name, entries, columns=None, *, text=1, empty=None, **facts):
-        """
-        Add a table with its caption: a row for each entry, and the cells by declared columns.
-
-        ``columns`` are those of `~miricigale.pages.Page.entries`; ``empty`` names the sentence in place
-        of a table without rows.
-        """
-        caption = self.sentence(name, **facts)
-        empty = self.sentence(empty) if empty else ""
-        self.report.entries(entries, columns, caption=caption, empty=empty, text=text)
+    def table(self, name, rows, **facts):
+        """Add a table as it is declared, from dictionaries; without columns it has all of their keys."""
+        table, rows, facts = texts_of(self._section)[name], list(rows), self.facts | facts
+        columns = {
+            sentence(header, facts): tuple(column)
+            for header, *column in table.get("columns", ())
+            if rows and column[0] in rows[0]
+        }
+        self.report.entries(
+            rows,
+            columns or None,
+            caption=sentence(table["caption"], facts),
+            empty=sentence(table.get("empty", ""), facts),
+            text=table.get("text", 1),
+        )
 
     @property
     def band_rows(self):

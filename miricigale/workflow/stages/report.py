@@ -39,45 +39,27 @@ __all__ = ["make_report"]
 log = logging.getLogger(__name__)
 
 
+#: Stages whose products are read: of the images, and of the measurements.
+_IMAGES = ("exposures", "mosaics", "highres", "kernels", "points", "variants")
+_TABLES = ("catalog", "truth", "photometry", "errors", "matches", "rivals", "fits", "experiments")
+#: Sections of the configuration on the sky and the images, and on the measurements.
+_SKY = (*GRID, "run.name", "catalog", "sed", "scene", "detector", "highres.filter", "perturb")
+_MEASURED = (
+    "photometry.method",
+    "photometry.rivals",
+    "reduction",
+    "fit",
+    "errors",
+    "point_sources",
+)
+
+
 @stage(
     "report",
     "report",
     version=7,
-    needs=(
-        "catalog",
-        "truth",
-        "exposures",
-        "mosaics",
-        "highres",
-        "kernels",
-        "photometry",
-        "points",
-        "errors",
-        "matches",
-        "rivals",
-        "variants",
-        "fits",
-        "experiments",
-    ),
-    sections=(
-        *GRID,
-        "run.name",
-        "catalog",
-        "sed",
-        "scene",
-        "detector",
-        "highres.filter",
-        "highres.pixel_scale",
-        "photometry.method",
-        "photometry.rivals",
-        "reduction",
-        "fit",
-        "errors",
-        "point_sources",
-        "perturb",
-        "variants",
-        "report",
-    ),
+    needs=(*_IMAGES, *_TABLES),
+    sections=(*_SKY, *_MEASURED, "highres.pixel_scale", "variants", "report"),
     resources=lambda: (*sed_resources(), *EXPOSURE_RESOURCES),
     plan=exposure_plan,
     kernels=("fit",),

@@ -1,4 +1,4 @@
-"""The sentences of the study's page: `texts.toml`, filled with facts of a run."""
+"""What is declared of the study's page in `sections.toml`, filled with facts of a run."""
 
 import functools
 import tomllib
@@ -11,12 +11,12 @@ __all__ = ["sentence", "texts_of"]
 
 @functools.cache
 def _texts():
-    text = (resources.files("miricigale.workflow.page") / "texts.toml").read_text("utf-8")
+    text = (resources.files("miricigale.workflow.page") / "sections.toml").read_text("utf-8")
     return tomllib.loads(text)
 
 
 def texts_of(section):
-    """Return the sentences of a section by name, as they stand in the file."""
+    """Return the sentences and tables of a section by name, as they stand in the file."""
     return _texts()[section]
 
 
