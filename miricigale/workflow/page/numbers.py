@@ -52,6 +52,13 @@ MIPS_LIMIT = 19.3
 PAPER_DETECTED = ((26.0, 0.53), (25.0, 0.75))
 
 
+def _product(path, reader=QTable.read):
+    """A product of a truth, by its path within the run, that is read when it is first asked for."""
+    return functools.cached_property(
+        lambda self: reader(self._context.path(path.format(self._name)))
+    )
+
+
 class StudyTables:
     """
     The tables of one truth of a run, each read when it is first asked for.
@@ -67,34 +74,20 @@ class StudyTables:
     def __init__(self, context, name):
         self._context, self._name = context, name
 
-    def _read(self, path, reader=QTable.read):
-        return reader(self._context.path(path))
-
-    @functools.cached_property
-    def truth(self):
-        """The sources of the catalog with their true fluxes (stage 3)."""
-        return self._read(f"{self._name}/truth.ecsv")
-
-    @functools.cached_property
-    def matched(self):
-        """The same sources row by row with measured fluxes (stage 12)."""
-        return self._read(f"{self._name}/matched.ecsv")
-
-    @functools.cached_property
-    def detections(self):
-        """The photometry of all detections."""
-        return self._read(f"{self._name}/photometry.ecsv")
-
-    @functools.cached_property
-    def errors(self):
-        """The error functions (`~miricigale.photometry.ErrorModel`), of the reference truth."""
-        return self._read("errors.ecsv", photometry.ErrorModel.read)
+    #: The sources of the catalog with their true fluxes (stage 3).
+    truth = _product("{}/truth.ecsv")
+    #: The same sources row by row with measured fluxes (stage 12).
+    matched = _product("{}/matched.ecsv")
+    #: The photometry of all detections.
+    detections = _product("{}/photometry.ecsv")
+    #: The error functions (`~miricigale.photometry.ErrorModel`), of the reference truth.
+    errors = _product("errors.ecsv", photometry.ErrorModel.read)
 
     @functools.cached_property
     def results(self):
         """`~miricigale.fitting.FitResults` of the sample by set of bands."""
         return {
-            unit: self._read(f"{self._name}/fits_{unit}.fits", fitting.FitResults.read)
+            unit: fitting.FitResults.read(self._context.path(f"{self._name}/fits_{unit}.fits"))
             for unit in self._context.config.fit.sets
         }
 
@@ -103,7 +96,7 @@ class StudyTables:
         """Bright point sources by band; empty where that check was not made."""
         config = self._context.config
         bands = config.exposures.filters if config.point_sources.enabled else ()
-        return {band: self._read(f"points/{band}.ecsv") for band in bands}
+        return {band: QTable.read(self._context.path(f"points/{band}.ecsv")) for band in bands}
 
     @property
     def sample(self):

@@ -78,7 +78,8 @@ def _write_examples(page):
     for one in study.truths:
         tables = page.every[one.name]
         fits = tables.results.get("all")
-        keys[one.name] = fits and typical_source(tables.sample, fits.fitted, study.bands[-1])
+        if fits is not None:
+            keys[one.name] = typical_source(tables.sample, fits.fitted, study.bands[-1])
     page.section("examples")
     key = next((key for key in keys.values() if key is not None), None)
     if key is None:
@@ -89,7 +90,7 @@ def _write_examples(page):
         page.figure("spectra", study_figures.spectra_figure(study, key, page.model), source=link)
     chosen = [one for fraction in EXAMPLES if (one := study.at(fraction)) is not None]
     for one in chosen or [page.first]:
-        key = keys[one.name]
+        key = keys.get(one.name)
         if key is not None:
             row = one.truth[np.asarray(one.truth["id"]) == key][0]
             results = page.every[one.name].results
