@@ -125,9 +125,7 @@ class _Sources(StudyTables):
         self.bands = (*(band for band in config.fit.bands if band not in self.miri), *self.miri)
         self.pivots = np.array([Filter.from_name(band).pivot.value for band in self.bands])
         self.edges = np.geomspace(0.7 * self.pivots.min(), 1.4 * self.pivots.max(), N_WAVE + 1)
-        # row of each source in the fits, -1 without
-        sample = np.asarray(self.matched["selection"]) == 0
-        self.fitted_row = np.where(sample, np.cumsum(sample) - 1, -1)
+        self.sampled = np.asarray(self.matched["selection"]) == 0
         # with and without MIRI: the sets in the table and the figure of the spectrum
         both = [unit for unit in ("all", "none") if unit in self.results]
         self.compared = both or list(self.results)[:2]
@@ -146,15 +144,6 @@ class _Sources(StudyTables):
         self.flux, self.error = (
             np.transpose(values) for values in zip(*map(self._measured, self.bands), strict=True)
         )
-        self.moments = {
-            unit: np.array(
-                [
-                    [getattr(found, kind)(key).to_value(own) for kind in ("mean", "std")]
-                    for key, own in self.units.items()
-                ]
-            )
-            for unit, found in self.results.items()
-        }
 
     def _measured(self, band):
         """Fluxes of all sources in a band and their errors; mock fluxes are of the sample, and of all sets."""
@@ -166,15 +155,14 @@ class _Sources(StudyTables):
 
     def of_sources(self, values):
         """Values of the rows of the fits as values of the sources, NaN without a fit."""
-        values, out = np.asarray(values, float), np.full(len(self.truth), np.nan)
-        sample = self.fitted_row >= 0
-        out[sample] = values[self.fitted_row[sample]]
+        out = np.full(len(self.truth), np.nan)
+        out[self.sampled] = values
         return out
 
     def first_of(self, rows, n):
         """Which of some rows (bool) are shown if at most ``n`` can be: fitted ones, then the brightest."""
         bright = np.nan_to_num(self.truth[self.prior].value, nan=-np.inf)
-        order = np.lexsort((-bright, self.fitted_row < 0, ~rows))
+        order = np.lexsort((-bright, ~self.sampled, ~rows))
         first = np.zeros(len(rows), bool)
         first[order[:n]] = True
         return first & rows
@@ -194,19 +182,16 @@ class _Sources(StudyTables):
         for unit in self.compared:
             fits = self.fits[unit]
             for parameter in DRAWN:
-                if f"{parameter}_mean" in fits.colnames:
-                    mean = self.of_sources(fits[f"{parameter}_mean"])
-                    columns[f"{parameter}_{unit}"] = mean
+                if (mean := f"{parameter}_mean") in fits.colnames:
+                    columns[f"{parameter}_{unit}"] = self.of_sources(fits[mean])
             columns[f"chi2_{unit}"] = self.of_sources(self.results[unit].reduced_chi2)
         for band in self.miri:
             flux, error = self._measured(band)
             none = np.full(len(flux), np.nan)
             columns[f"sn_{band}"] = np.divide(flux, error, out=none, where=error > 0)
             digits[f"sn_{band}"] = 3
-        columns["n_detected"] = matched["n_detected"]
-        columns["selection"] = matched["selection"]
+        columns |= {key: matched[key] for key in ("n_detected", "selection", "association")}
         columns["condition"] = any_condition(matched, self.miri)
-        columns["association"] = matched["association"]
         for unit, results in self.results.items():
             columns[f"fit_{unit}"] = np.nan_to_num(self.of_sources(results.flags)).astype(int)
         return {
@@ -223,13 +208,8 @@ class _Sources(StudyTables):
             ],
             "compared": self.compared,
             "bands": [
-                {
-                    "name": band,
-                    "label": band_label(band),
-                    "wave": _rounded(wave),
-                    "miri": band in self.miri,
-                }
-                for band, wave in zip(self.bands, self.pivots, strict=True)
+                {"name": name, "label": band_label(name), "wave": wave, "miri": name in self.miri}
+                for name, wave in zip(self.bands, _rounded(self.pivots), strict=True)
             ],
             "wave": _rounded(np.sqrt(self.edges[1:] * self.edges[:-1])),
             "pdf_edges": {
@@ -241,7 +221,6 @@ class _Sources(StudyTables):
 
     def entry(self, row):
         """What belongs to the source in a row of the truth."""
-        at = int(self.fitted_row[row])
         entry = {
             "id": self.truth["id"][row].item(),
             "true": _rounded(self.true[row]),
@@ -251,21 +230,23 @@ class _Sources(StudyTables):
             "conditions": [int(self.matched[f"{band}_condition"][row]) for band in self.miri],
             "parameters": _rounded(self.parameters[row]),
         }
-        if at >= 0:
-            entry["fits"] = {unit: self._fit(unit, at) for unit in self.results}
+        if self.sampled[row]:
+            entry["fits"] = {unit: self._fit(unit, entry["id"]) for unit in self.results}
         return entry
 
-    def _fit(self, unit, at):
-        """Chi2, posteriors and moments of a row of the fits, and the spectrum of its best model."""
-        results = self.results[unit]
-        one = results[results.ids[at]]
+    def _fit(self, unit, key):
+        """Chi2, posteriors and moments of a source, and the spectrum of its best model."""
+        one = self.results[unit][key]
         if not one.fitted:
             return None
         fit = {
             "chi2": _rounded(one.chi2),
             "n_bands": int(one.n_bands),
-            "moments": _rounded(self.moments[unit][:, :, at]),
-            "pdf": {key: _weights(one.pdf[key]) for key in _drawn(results)},
+            "moments": [
+                [_rounded(moment(name).to_value(own)) for moment in (one.mean, one.std)]
+                for name, own in self.units.items()
+            ],
+            "pdf": {name: _weights(one.pdf[name]) for name in _drawn(one)},
         }
         if unit in self.compared:
             best = one.best_sed(self.model)
