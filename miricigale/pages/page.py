@@ -65,7 +65,7 @@ class Page:
         self._add(
             "items",
             [
-                (f"{label} ({value.reason})" if isinstance(value, Missing) else label, value)
+                (label + f" ({value.reason})" if isinstance(value, Missing) else label, value)
                 for label, value in pairs
             ],
         )

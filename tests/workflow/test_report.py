@@ -149,25 +149,13 @@ def test_sections_stand_in_the_order_of_the_paper(reports):
     titles = {
         kind: re.findall(r"<h2>(.*?)</h2>", page_of(report)) for kind, report in reports.items()
     }
-    assert titles["truths"] == [
-        "At a glance",
-        "Exposures and catalog",
-        "Images",
-        "Detections",
-        "Forced photometry",
-        "Error function and limits",
-        "Example sources",
-        "Redshifts",
-        "AGN fraction",
-        "Luminosity of the accretion disk",
-        "X-rays",
-        "Classes",
-        "PAH features against residuals",
-        "Coverage of the posteriors",
-        "Comparison with Yang et al. 2021",
-        "Inputs and published relations",
-        "How it was made",
-    ]
+    assert " | ".join(titles["truths"]) == (
+        "At a glance | Exposures and catalog | Images | Detections | Forced photometry | "
+        "Error function and limits | Example sources | Redshifts | AGN fraction | "
+        "Luminosity of the accretion disk | X-rays | Classes | PAH features against residuals | "
+        "Coverage of the posteriors | Comparison with Yang et al. 2021 | "
+        "Inputs and published relations | How it was made"
+    )
     # without an AGN there are no disks, X-rays and classes
     lacking = {"Luminosity of the accretion disk", "X-rays", "Classes"}
     assert titles["four"] == [title for title in titles["truths"] if title not in lacking]
@@ -176,57 +164,29 @@ def test_sections_stand_in_the_order_of_the_paper(reports):
 
 #: What must stand on the page of a kind of run, and what must not.
 SAID = {
-    "one": (
-        "too few bands for colors",
-        "No source is left to fit.",
-        "few bands 24",
-        "fracAGN offset ± scatter with MIRI (no source in the fit)",
-        "The check with bright point sources was not made",
-        "no band of this run",
-    ),
-    "two": (
-        "too few bands for colors",
-        "point sources</th>",
-        "no band of CEERS",
-        "7 x 1",
-        "31 %",
-        "IMF Kroupa (inferred)",
-        "torus: torus.parametric; torus.skirtor2016 is not registered",
-        "(products: 1.2)",
-        "photutils",
-        "numba",
-        "Somebody 2001, with page",
-        "Bruzual & Charlot 2003",
-        "Momcheva et al. 2016",
-        "seed 20210211",
-        "22.8 in 4662 s",
-        "CEERS proposal, for other exposures",
-        f"in the {AREA:.2f} square arcmin that all bands have imaged",
-    ),
+    "one": "too few bands for colors | No source is left to fit. | few bands 24 | "
+    "fracAGN offset ± scatter with MIRI (no source in the fit) | no band of this run | "
+    "The check with bright point sources was not made",
+    "two": "too few bands for colors | point sources</th> | no band of CEERS | 7 x 1 | 31 % | "
+    "IMF Kroupa (inferred) | torus: torus.parametric; torus.skirtor2016 is not registered | "
+    "(products: 1.2) | photutils | numba | Somebody 2001, with page | Bruzual & Charlot 2003 | "
+    "Momcheva et al. 2016 | seed 20210211 | 22.8 in 4662 s | CEERS proposal, for other exposures | "
+    f"in the {AREA:.2f} square arcmin that all bands have imaged",
     # in order of wavelength, whatever the order of the configuration
-    "four": ("F560W, F1800W, F2550W (the shortest, the middle and the longest",),
-    "truths": (
-        "Injected fracAGN 0, source",
-        "Injected fracAGN 0.4, source",
-        "Spectra of source",
-        "Redshift errors by injected fracAGN",
-        "by bin of true redshift",
-        "luminosity of the accretion disk",
-        "X-ray fluxes of the AGN of the field",
-        "of each true class",
-        "background was subtracted",
-        "matching kernel",
-        "another field: the field is another one: 24 galaxies; theirs has 463.",
-        "3.4 of Gaussian errors",
-    ),
+    "four": "F560W, F1800W, F2550W (the shortest, the middle and the longest",
+    "truths": "Injected fracAGN 0, source | Injected fracAGN 0.4, source | Spectra of source | "
+    "Redshift errors by injected fracAGN | by bin of true redshift | of each true class | "
+    "luminosity of the accretion disk | X-ray fluxes of the AGN of the field | matching kernel | "
+    "background was subtracted | 3.4 of Gaussian errors | "
+    "another field: the field is another one: 24 galaxies; theirs has 463.",
 }
-NOT_SAID = {"one": ("point sources</th>",), "two": ("No source is left", "<li>Somebody 2001</li>")}
+NOT_SAID = {"one": ["point sources</th>"], "two": ["No source is left", "<li>Somebody 2001</li>"]}
 
 
 @pytest.mark.parametrize("kind", SAID)
 def test_the_page_says_what_was_done_and_what_is_missing(reports, kind):
     page = page_of(reports[kind])
-    assert [text for text in SAID[kind] if text not in page] == []
+    assert [text for text in SAID[kind].split(" | ") if text not in page] == []
     assert [text for text in NOT_SAID.get(kind, ()) if text in page] == []
     # what stands in comes first; when it was made is not on it
     assert page.index("stands in for SKIRTOR") < page.index("At a glance")

@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from miricigale.pages import Missing, number
+from miricigale.pages import Missing, cell_of
 from miricigale.workflow.page import pictures, study_figures
+from miricigale.workflow.page.declared import sentence, texts_of
 from miricigale.workflow.page.labels import SET_LABELS, browse, three_bands
 from miricigale.workflow.stages.exposures import study_exposures, study_pointings
 from miricigale.workflow.stages.images import measured_mosaic, reducer_of
@@ -13,28 +14,22 @@ __all__ = ["field_text", "write_detections", "write_images", "write_summary"]
 
 def write_summary(page, truths):
     """Headline numbers, and links to the sources of each truth."""
-    m, none, sky = page.metrics, "no source in the fit", page.first.name
-    fits = {SET_LABELS[unit]: fit for unit, fit in m["fits"].items() if unit in ("all", "none")}
-    sample = f"in the fit: {page.config.fit.min_detected}+ MIRI bands"
+    m, sky, texts = page.metrics, page.first.name, texts_of("summary")
+    linked = {
+        "n_field": browse(sky, m["n_field"]),
+        "n_sample": browse(sky, m["n_sample"], show="sample"),
+    }
+    facts = {"min_detected": page.config.fit.min_detected}
+    cells = [(header, facts, m | linked, column) for header, *column in texts["items"]]
+    cells += [
+        (header, {"set": SET_LABELS[unit]}, m["fits"][unit], column)
+        for header, *column in texts["fits"]
+        for unit in ("all", "none")
+        if unit in m["fits"]
+    ]
     page.section("summary")
     page.report.items(
-        [
-            ("galaxies in the field", browse(sky, m["n_field"])),
-            ("imaged in all bands", f"{m['area']:.2f} arcmin\N{SUPERSCRIPT TWO}"),
-            ("found on the high-resolution image", m["n_matched"]),
-            (sample, browse(sky, m["n_sample"], show="sample")),
-            *(
-                (f"photo-z outliers {label}", number(fit["photoz_outliers"], ".1f %", none))
-                for label, fit in fits.items()
-            ),
-            *(
-                (
-                    f"fracAGN offset ± scatter {label}",
-                    number(fit["frac_agn_bias"], "+.3f", none, error=fit["frac_agn_sigma_mad"]),
-                )
-                for label, fit in fits.items()
-            ),
-        ]
+        (sentence(header, facts), cell_of(entry, column)) for header, facts, entry, column in cells
     )
     links = [browse(name, name) for name in truths]
     page.report.links("The sources one by one:", [(link.text, link.address) for link in links])
