@@ -127,7 +127,7 @@ def test_a_day_that_cannot_be_is_refused_before_anything_is_made(monkeypatch):
 def test_the_report_says_which_and_from_where():
     low = _background_sentence(study())
     assert "telescope and low zodiacal light (Rigby et al. 2023, jwst_backgrounds)" in low
-    assert low.endswith("grows by 5 % of that for each arcmin towards position angle 45 deg")
+    assert low.endswith("grows by 5 % of that for each arcmin toward position angle 45 deg")
     medium = study(
         background="medium", background_of="pointing", background_scale=1.5, background_gradient=0.0
     )

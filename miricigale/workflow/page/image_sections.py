@@ -15,12 +15,9 @@ __all__ = ["field_text", "write_detections", "write_images", "write_summary"]
 def write_summary(page, truths):
     """Headline numbers, and links to the sources of each truth."""
     m, sky, texts = page.metrics, page.first.name, texts_of("summary")
-    linked = {
-        "n_field": browse(sky, m["n_field"]),
-        "n_sample": browse(sky, m["n_sample"], show="sample"),
-    }
+    linked = m | {"n_sample": browse(sky, m["n_sample"], show="sample")}
     facts = {"min_detected": page.config.fit.min_detected}
-    cells = [(header, facts, m | linked, column) for header, *column in texts["items"]]
+    cells = [(header, facts, linked, column) for header, *column in texts["items"]]
     cells += [
         (header, {"set": SET_LABELS[unit]}, m["fits"][unit], column)
         for header, *column in texts["fits"]

@@ -54,7 +54,7 @@ def _directions(image):
 
 def field_figure(images, prior, names):
     """
-    The field: the high-resolution image beside a color image of three bands, or each band in gray.
+    The field: the high-resolution image and a color image of three bands, or each band in gray.
 
     ``images`` are mosaics on one grid, the shortest wavelength first (other numbers than three are drawn
     in gray); ``names`` are their bands and that of the prior.

@@ -175,7 +175,7 @@ def _background_sentence(config):
     if options.background_gradient == 0:
         return f"{text}; it is the same everywhere"
     return (
-        f"{text}; it grows by {100 * options.background_gradient:g} % of that for each arcmin towards position "
+        f"{text}; it grows by {100 * options.background_gradient:g} % of that for each arcmin toward position "
         f"angle {options.gradient_angle:g} deg"
     )
 
