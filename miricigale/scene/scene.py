@@ -26,7 +26,7 @@ from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_
 
 __all__ = ["Scene", "SceneFlags"]
 
-#: PSFs that tell what they are.
+#: PSFs with known pixel, frame and filter.
 _TYPED = (InstrumentPSF, PSFGrid)
 
 #: uJy per sr in MJy per sr.

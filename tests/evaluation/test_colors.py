@@ -111,7 +111,7 @@ def test_rows_of_one_source_stay_together():
 
 def test_colors_of_a_study():
     study = mock_study((0.0, 0.6), n=900)
-    # the second color of each window tells the truths apart, the second truth is AGN or composite
+    # the second color of each window separates the truths, the second truth is AGN or composite
     rng = np.random.default_rng(1)
     shares = {}
     for one in study.truths:

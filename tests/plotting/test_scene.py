@@ -18,7 +18,7 @@ def test_an_image_is_drawn_about_its_median_with_marks(ax):
     np.testing.assert_allclose((drawn.norm.vmin, drawn.norm.vmax), (low, high))
     np.testing.assert_array_equal(line_data(ax, "o")[0], [[1.0, 2.0], [7.0, 3.0]])
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [pixel]", "y [pixel]")
-    # what was taken off is told
+    # the label states what was subtracted
     assert drawn.colorbar.ax.get_ylabel() == f"MJy/sr - {np.median(IMAGE):.4g}"
 
 

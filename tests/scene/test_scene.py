@@ -143,8 +143,8 @@ def test_flags_say_what_happened(wcs, psf):
         index=[8.0, 1.0, 20.0, 1.0],
         radius=1.0,
     )
-    told = f"2 of 4 sources are not painted: fluxes in '{FILTER}' are 1 NaN, 1 negative .*no_flux"
-    with pytest.warns(MiricigaleWarning, match=told):
+    text = f"2 of 4 sources are not painted: fluxes in '{FILTER}' are 1 NaN, 1 negative .*no_flux"
+    with pytest.warns(MiricigaleWarning, match=text):
         scene = make_scene(catalog, wcs, psf, max_radius=4 * u.arcsec)
     truth = scene.truth
     f = SceneFlags
@@ -170,8 +170,8 @@ def test_sources_on_the_other_side_of_the_sky_do_no_harm(wcs, psf):
     assert np.all(np.isfinite(scene.render().data))
 
 
-def test_points_alone_are_those_beside_a_galaxy(wcs, psf):
-    # alone they are added one by one, beside a galaxy convolved with it
+def test_points_alone_are_those_with_a_galaxy(wcs, psf):
+    # alone they are added one by one, with a galaxy convolved with it
     x, y = [20.3, 47.9, -1.2, 60.0, 61.5], [31.2, 12.6, 40.4, 60.0, 60.5]
     points = scenes.make_catalog(wcs, x, y)
     galaxy = scenes.make_catalog(wcs, [35.0], [38.0], profile="sersic", radius=0.3, index=1.0)
@@ -201,7 +201,7 @@ def test_the_same_on_any_number_of_threads(wcs, psf):
 
     alone = light(1)
     np.testing.assert_array_equal(light(3), alone)
-    # and with other scenes beside it
+    # and with other scenes at the same time
     with ThreadPoolExecutor(2) as pool:
         for image in pool.map(light, (1, 2, 1, 2)):
             np.testing.assert_array_equal(image, alone)
