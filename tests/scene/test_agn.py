@@ -50,30 +50,3 @@ def test_what_is_cut_is_of_all_light(wcs, psf):
     kind = {"max_radius": 4 * u.arcsec}
     assert light(galaxy, wcs, psf, **kind)[1]["flags"][0] & cut
     assert not light(galaxy, wcs, psf, agn="frac_agn", **kind)[1]["flags"][0] & cut
-
-
-@pytest.mark.parametrize(
-    ("agn", "message"),
-    [
-        ([0.2, 1.3], r"'agn' must be shares between 0 and 1, got 1\.3 in row 1"),
-        ([1.0, -2.0] * u.uJy, "'agn' must be fluxes that are finite and not negative"),
-        ([1.0, np.inf] * u.uJy, "'agn' must be fluxes that are finite and not negative"),
-        ([1.0, 2.0] * u.s, "'agn' must be convertible to uJy"),
-        (None, "'agn' must be a column of .* got 'agn'"),
-    ],
-)
-def test_refuses(wcs, psf, agn, message):
-    galaxy = scenes.make_catalog(wcs, [50.0, 30.0], 45.0, **GALAXY)
-    if agn is not None:
-        galaxy["agn"] = agn
-    with pytest.raises((ValueError, u.UnitsError), match=message):
-        light(galaxy, wcs, psf, agn="agn")
-
-
-def test_nothing_near_is_an_empty_image(wcs, psf):
-    galaxy = scenes.make_catalog(wcs, 50.0, 45.0, **GALAXY)
-    galaxy["sky"] = galaxy["sky"].directional_offset_by(0 * u.deg, 5 * u.arcmin)
-    galaxy["share"] = [0.5]
-    image, truth = light(galaxy, wcs, psf, agn="share")
-    assert not np.any(image)
-    assert truth["flags"].tolist() == [SceneFlags.OUTSIDE_IMAGE]

@@ -163,19 +163,6 @@ def test_light_beyond_the_edge_is_in_no_pixel(wcs, psf):
         assert 0.1 < total < 9
 
 
-def test_beside_other_sources(wcs, psf):
-    table = scenes.make_catalog(
-        wcs, [30.0, 60.0, 70.0], [40.0, 50.0, 20.0], profile=["sersic", "cutout", "point"]
-    )
-    stamp = gaussian_stamp(0.2, 0.2, 0.06)
-    scene = scenes.make_scene(table, wcs, psf, cutouts={2: stamp})
-    parts = [light(scenes.make_scene(table[k : k + 1], wcs, psf)) for k in (0, 2)]
-    parts.append(light(scenes.make_scene(table[1:2], wcs, psf, cutouts={2: stamp})))
-    np.testing.assert_allclose(light(scene), sum(parts), atol=1e-6)
-    assert scene.truth["profile"].tolist() == ["sersic", "cutout", "point"]
-    assert scene.truth["flags"].tolist() == [0, 0, 0]
-
-
 @pytest.mark.parametrize(
     ("cutouts", "message"),
     [

@@ -126,11 +126,8 @@ def test_in_image_flux_is_the_sum_of_each_source_alone(wcs, psf):
         alone = scenes.make_catalog(wcs, x[k], y[k], **kwargs)
         total = light(make_scene(alone, wcs, psf)).sum()
         assert truth["flux_in_image"].value[k] == pytest.approx(total, rel=1e-4)
-    assert truth["flags"].tolist() == [
-        SceneFlags.NEAR_EDGE,
-        SceneFlags.NEAR_EDGE,
-        SceneFlags.OUTSIDE_IMAGE,
-    ]
+    edge = SceneFlags.NEAR_EDGE
+    assert truth["flags"].tolist() == [edge, edge, SceneFlags.OUTSIDE_IMAGE]
 
 
 def test_flags_say_what_happened(wcs, psf):
@@ -148,12 +145,8 @@ def test_flags_say_what_happened(wcs, psf):
         scene = make_scene(catalog, wcs, psf, max_radius=4 * u.arcsec)
     truth = scene.truth
     f = SceneFlags
-    assert truth["flags"].tolist() == [
-        f.NEAR_EDGE | f.CUT_PROFILE,
-        f.NO_FLUX,
-        f.DRAWN_AS_POINT,
-        f.NO_FLUX,
-    ] or (truth["flags"].tolist() == [f.CUT_PROFILE, f.NO_FLUX, f.DRAWN_AS_POINT, f.NO_FLUX])
+    assert truth["flags"][0] & f.CUT_PROFILE
+    assert truth["flags"][1:].tolist() == [f.NO_FLUX, f.DRAWN_AS_POINT, f.NO_FLUX]
     assert truth["profile"].tolist() == ["sersic", "sersic", "point", "sersic"]
     assert truth["flux_in_image"][1] == 0
     assert truth["flux_in_image"][0] < 0.95 * truth["flux_total"][0]
@@ -168,6 +161,8 @@ def test_sources_on_the_other_side_of_the_sky_do_no_harm(wcs, psf):
     scene = make_scene(catalog, wcs, psf)
     assert scene.truth["flags"].tolist() == [0, SceneFlags.OUTSIDE_IMAGE]
     assert np.all(np.isfinite(scene.render().data))
+    alone = make_scene(catalog[1:], wcs, psf)
+    assert not np.any(alone.render().data)
 
 
 def test_points_alone_are_those_with_a_galaxy(wcs, psf):
