@@ -22,14 +22,6 @@ def test_an_image_is_drawn_about_its_median_with_marks(ax):
     assert drawn.colorbar.ax.get_ylabel() == f"MJy/sr - {np.median(IMAGE):.4g}"
 
 
-def test_ticks_of_the_bar_do_not_run_into_each_other(ax):
-    plot_scene(IMAGE, ax=ax)
-    (drawn,) = ax.images
-    places = np.sort([drawn.norm(tick) for tick in drawn.colorbar.get_ticks()])
-    assert len(places) > 1
-    assert np.diff(places).min() > 0.05
-
-
 def test_limits_of_the_colors_are_those_asked_for(ax):
     plot_scene(IMAGE, ax=ax, vmin=4.0, vmax=6.0, cmap="viridis", label="MJy/sr")
     (drawn,) = ax.images
