@@ -1,4 +1,4 @@
-"""Truth against result, from tables: matching, metrics, classes, a study beside its paper, the report."""
+"""Comparison of results with the truth, from tables: matches, metrics, classes, and a study with its paper."""
 
 from miricigale.utils.lazy import lazy_names
 

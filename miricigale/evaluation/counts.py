@@ -1,4 +1,4 @@
-"""Published relations that simulated samples are held against."""
+"""Published relations to compare simulated samples with."""
 
 import astropy.units as u
 import numpy as np

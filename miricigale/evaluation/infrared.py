@@ -179,7 +179,7 @@ def feature_residuals(residual, redshift, *, feature, pivot, filter_width, seed)
     """
     Median residuals in a band of sources with a feature in it, and of the others.
 
-    Their difference is what the templates lack or have too much of the feature, to be held against
+    Their difference is what the templates lack or have too much of the feature, to be compared with
     `feature_magnitude`.
 
     Parameters

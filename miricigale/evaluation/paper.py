@@ -1,4 +1,4 @@
-"""The numbers of Yang et al. 2021, and a study's beside them."""
+"""The numbers of Yang et al. 2021, compared with those of a study."""
 
 import dataclasses
 import tomllib
@@ -94,7 +94,7 @@ PUBLISHED = tuple(
 
 def compare_with_paper(study, *, seed, n_draws=1000, reasons=None):
     """
-    Every published number beside that of a study.
+    Compare every published number with that of a study.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Plans side by side: ranked for each hour, and depth against area."""
+"""Comparison of plans: ranked for each hour, and depth against area."""
 
 import astropy.units as u
 import numpy as np

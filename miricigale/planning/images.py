@@ -1,4 +1,4 @@
-"""Images of the planned exposures: the plan as a run of the study, and what that measures beside the noise."""
+"""Images of the planned exposures: the plan as a run of the study, compared with the noise."""
 
 import dataclasses
 from pathlib import Path
@@ -165,8 +165,8 @@ def image_sample(planner, folder, *, executor=None, progress_bar=False):
     planner : `~miricigale.planning.Planner`
         The plan, with a sample of its catalog.
     folder : path-like
-        Folder of the run, which `~miricigale.workflow.run_study` goes on with; what belongs to another plan
-        is done again. The catalog is beside it, ``<folder>.ecsv``.
+        Folder of the run, which `~miricigale.workflow.run_study` resumes; what belongs to another plan
+        is done again. The catalog is written to ``<folder>.ecsv``.
     executor : `concurrent.futures.Executor`, optional
         As for `~miricigale.workflow.run_study`.
     progress_bar : bool, optional

@@ -37,7 +37,7 @@ _EXPOSURES = {
     "saturates": "{saturates:.1f}",
     "sources": "{n_saturated}",
 }
-#: Columns of the images; those with an error beside them: name, format, factor.
+#: Columns of the images; those with an error: name, format, factor.
 _IMAGES = {
     "band": "{filter}",
     "limit, plan": "{limit:.2f}",

@@ -1,4 +1,4 @@
-"""From exposures to accuracy: mock photometry of a sample, fitted, beside its truth."""
+"""From exposures to accuracy: mock photometry of a sample, fitted and compared with its truth."""
 
 import dataclasses
 import functools

@@ -1,4 +1,4 @@
-"""Images: stretched, in color, with segments, and image beside model and residual."""
+"""Images: stretched, in color, with segments, and with model and residual."""
 
 import numpy as np
 
@@ -56,7 +56,7 @@ def _draw(image, ax, pixel_scale, title, center, **colors):
 
 def add_colorbar(drawn, label):
     """
-    Draw a color bar beside an image, whose ticks do not run into each other.
+    Draw a color bar next to an image, whose ticks do not overlap.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def add_colorbar(drawn, label):
 
     bar = drawn.axes.figure.colorbar(drawn, ax=drawn.axes, label=label, shrink=0.85)
     if isinstance(drawn.norm, AsinhNorm):
-        # from the bright end, as many as there is room for on the bar
+        # from the bright end, as many as the bar has space for
         ticks = []
         for tick in drawn.norm.vmax * np.array([1.0, 0.2, 0.03, 0.0]):
             if not ticks or drawn.norm(ticks[-1]) - drawn.norm(tick) > 0.08:
@@ -339,7 +339,7 @@ def mark_sky(ax, length, *, north=(0, 1), east=(-1, 0), color="black"):
     text = {"ha": "center", "va": "center", "fontsize": 8, **style}
     ax.text(x + length / 2, y + 0.03 * height, f'{length:g}"', **text)
     size = 0.09 * min(width, height)
-    # room for both arrows, wherever they point
+    # space for both arrows, wherever they point
     origin = np.array([right - 0.05 * width - 1.2 * size, bottom + 0.045 * height + 0.3 * size])
     for direction, letter in ((north, "N"), (east, "E")):
         step = size * np.asarray(direction, float) / np.hypot(*direction)

@@ -253,7 +253,7 @@ def classes_figure(counts, names, *, found):
 
 def colors_figure(planes, *, labels):
     """
-    Planes of two colors with sources of each class and the circles that tell them apart.
+    Planes of two colors with sources of each class and the circles that separate them.
 
     Parameters
     ----------

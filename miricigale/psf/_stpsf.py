@@ -48,7 +48,6 @@ def stpsf_grid(
     oversampling=4,
     fov=10.0 * ANGLE,
     opd=None,
-    n_wavelengths=9,
 ):
     """
     PSFs of the MIRI imager over the field, from stpsf.
@@ -66,8 +65,6 @@ def stpsf_grid(
     opd : str, path-like or `~astropy.io.fits.HDUList`, optional
         Wavefront error as stpsf takes it; ``"perfect"`` for none, and stpsf's default if
         not given.
-    n_wavelengths : int, optional
-        Wavelengths per band.
 
     Returns
     -------
@@ -95,7 +92,7 @@ def stpsf_grid(
         all_detectors=False,
         oversample=int(oversampling),
         fov_pixels=2 * int(np.ceil(pixels / 2)) + 1,
-        nlambda=int(n_wavelengths),
+        nlambda=9,
         verbose=False,
     )
     psfs = [

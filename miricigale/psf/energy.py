@@ -58,7 +58,7 @@ def encircled_energy(psf, radius, *, pixel_scale=None):
     return float(sums[0]) if radii.ndim == 0 else sums.reshape(radii.shape)
 
 
-def radius_of_encircled_energy(psf, fraction, *, relative_to="total"):
+def radius_of_encircled_energy(psf, fraction):
     """
     Radius of the circle that holds a fraction of the light.
 
@@ -67,9 +67,7 @@ def radius_of_encircled_energy(psf, fraction, *, relative_to="total"):
     psf : `~photutils.psf.ImagePSF`
         A PSF with the meta of `~miricigale.psf.make_psf`.
     fraction : float
-        Between 0 and 1.
-    relative_to : {"total", "grid"}, optional
-        Whether of all light or of that in the largest circle on the grid.
+        Of all light, between 0 and 1.
 
     Returns
     -------
@@ -82,18 +80,15 @@ def radius_of_encircled_energy(psf, fraction, *, relative_to="total"):
         If the grid does not hold the fraction.
     """
     psf = instrument_psf(psf)
-    if relative_to not in ("total", "grid"):
-        raise argument_error("relative_to", "'total' or 'grid'", repr(relative_to))
     cells = np.arange(0.0, psf.half_width / psf.cell, 0.25)
     sums = _core.radial_sums(psf.data, *psf.origin, cells) / psf.n_cells**2
-    level = fraction * (sums[-1] if relative_to == "grid" else 1.0)
-    if not 0 < fraction <= 1 or level > sums[-1]:
+    if not 0 < fraction <= min(1, sums[-1]):
         wanted = f"positive and at most the {sums[-1]:.4f} that the PSF's grid holds"
         raise argument_error("fraction", wanted, fraction)
-    k = int(np.argmax(sums >= level))
+    k = int(np.argmax(sums >= fraction))
     if k == 0:
         return 0.0 * ANGLE
-    part = (level - sums[k - 1]) / (sums[k] - sums[k - 1])
+    part = (fraction - sums[k - 1]) / (sums[k] - sums[k - 1])
     return (cells[k - 1] + part * 0.25) * psf.cell * ANGLE
 
 

@@ -24,10 +24,10 @@ _WFC3_PIXEL, _WFC3_PIXFRAC = 0.128, 0.8
 
 
 @functools.lru_cache(maxsize=8)
-def _hst_optics(name, cell, n, n_wavelengths, angle):
+def _hst_optics(name, cell, n, angle):
     pupil = hst_pupil(angle=angle)
-    waves = band_quantiles(name, n_wavelengths)
-    data = polychromatic_psf(pupil, np.zeros((pupil.n, pupil.n)), waves, step=cell, n=n)
+    flat = np.zeros((pupil.n, pupil.n))
+    data = polychromatic_psf(pupil, flat, band_quantiles(name), step=cell, n=n)
     data.flags.writeable = False
     return data
 
@@ -38,12 +38,12 @@ def _hst_blurred(data, oversampling, scale, sigma):
 
 
 @functools.lru_cache(maxsize=16)
-def _hst_blur(name, fwhm, scale, n_wavelengths):
+def _hst_blur(name, fwhm, scale):
     """Gaussian sigma in arcsec with which the mosaic's PSF has the width asked for."""
     oversampling = max(1, math.ceil(scale / 0.015))
     cell = scale / oversampling
     middle = odd_cells(2.4, cell) // 2
-    data = _hst_optics(name, cell, 2 * middle + 1, n_wavelengths, 45.0)
+    data = _hst_optics(name, cell, 2 * middle + 1, 45.0)
 
     def excess(sigma):
         image = _hst_blurred(data, oversampling, scale, sigma)
@@ -63,7 +63,6 @@ def hst_psf(
     fwhm=None,
     oversampling=4,
     fov=None,
-    n_wavelengths=9,
     angle=0.0 * u.deg,
 ):
     """
@@ -86,8 +85,6 @@ def hst_psf(
         Cells per mosaic pixel.
     fov : `~astropy.units.Quantity`, optional
         Width of the grid; 10 arcsec by default.
-    n_wavelengths : int, optional
-        Wavelengths per band, of equal weight.
     angle : `~astropy.units.Quantity`, optional
         Position angle of the telescope's +y; the vanes are at 45 deg to it.
 
@@ -112,14 +109,13 @@ def hst_psf(
     oversampling, width = checked_grid(oversampling, fov, 10.0)
     scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
     if fwhm is None:
-        sigma = _hst_blur("wfc3.f160w", 0.20, scale, n_wavelengths)
+        sigma = _hst_blur("wfc3.f160w", 0.20, scale)
     else:
-        target = float(to_array(fwhm, ANGLE, "fwhm"))
-        sigma = _hst_blur(name, target, scale, n_wavelengths)
+        sigma = _hst_blur(name, float(to_array(fwhm, ANGLE, "fwhm")), scale)
     cell = scale / oversampling
     # vanes at 45 deg to +y; on the sky an angle east of north is counter-clockwise
     turn = float(to_array(angle, u.deg, "angle"))
-    data = _hst_optics(name, cell, odd_cells(width, cell), n_wavelengths, (45.0 + turn) % 360.0)
+    data = _hst_optics(name, cell, odd_cells(width, cell), (45.0 + turn) % 360.0)
     data = _hst_blurred(data, oversampling, scale, sigma) * oversampling**2
     return make_psf(
         data,

@@ -105,7 +105,6 @@ class MatchingKernel:
         *,
         pixel_scale,
         regularization="auto",
-        penalty="laplacian",
         hi_angle=None,
         lo_angle=None,
         grid_angle=0.0 * u.deg,
@@ -115,7 +114,7 @@ class MatchingKernel:
         tolerance=1e-3,
     ):
         """
-        Make the kernel by a Wiener filter that penalizes roughness.
+        Make the kernel by a Wiener filter that penalizes roughness (the Laplacian).
 
         Parameters
         ----------
@@ -135,8 +134,6 @@ class MatchingKernel:
             whose noise gain exceeds 1.25 times that of the Gaussian between Gaussians as wide
             as the two cores, or whose negative pixels sum to less than -1.5, are left out: PSFs with
             noise or artifacts of resampling make those striped.
-        penalty : {"laplacian", "biharmonic"}, `~numpy.ndarray` or None, optional
-            What is rough, as for `photutils.psf_matching.make_wiener_kernel`.
         hi_angle, lo_angle : `~astropy.units.Quantity`, optional
             Position angle of the +y axis of a PSF in the detector frame; needed for those,
             refused for PSFs on the sky. An array of angles (rolls, dithers) gives the average.
@@ -199,7 +196,7 @@ class MatchingKernel:
             hi, lo, scale, angles=(hi_angle, lo_angle), grid_angle=grid_angle,
             resampling=resampling, extent=extent, normalize=normalize,
         )  # fmt: skip
-        make = wiener(source, target, penalty)
+        make = wiener(source, target)
         mu, array, figures = choose(regularization, make, source, target, tolerance)
         return cls(
             array,
@@ -208,7 +205,7 @@ class MatchingKernel:
             target=target,
             regularization=mu,
             meta={
-                "penalty": penalty,
+                "penalty": "laplacian",
                 "lost": 0.0,
                 "grid_angle": float(grid_angle.to_value(u.deg)),
                 "resampling": resampling or "none",

@@ -19,6 +19,9 @@ __all__ = ["Pupil", "hst_pupil", "jwst_constants", "jwst_pupil", "polychromatic_
 #: One arcsecond in rad.
 ARCSEC = math.pi / 180 / 3600
 
+#: Share of the variance of a wavefront error that is in terms of single segments.
+_SEGMENT_FRACTION = 0.6
+
 #: Lines per pupil cell along y at which outlines are sampled.
 _ROWS = 8
 
@@ -64,7 +67,7 @@ class Pupil:
         """Collecting area in m^2."""
         return float(self.amplitude.sum()) * self.step**2
 
-    def wavefront_error(self, rms, *, seed=1, segment_fraction=0.6):
+    def wavefront_error(self, rms, *, seed=1):
         """
         Draw a wavefront error for the pupil.
 
@@ -79,8 +82,6 @@ class Pupil:
             In nm, over the pupil.
         seed : int, optional
             The same seed gives the same telescope at every wavelength.
-        segment_fraction : float, optional
-            Share of the variance in the segment terms.
 
         Returns
         -------
@@ -90,12 +91,10 @@ class Pupil:
         Raises
         ------
         ValueError
-            If ``rms`` is negative or ``segment_fraction`` is outside 0 to 1.
+            If ``rms`` is negative.
         """
         if not rms >= 0:
             raise argument_error("rms", "zero or positive", rms)
-        if not 0 <= segment_fraction <= 1:
-            raise argument_error("segment_fraction", "between 0 and 1", segment_fraction)
         if rms == 0:
             return np.zeros_like(self.amplitude)
         axis = (np.arange(self.n) - 0.5 * (self.n - 1)) * 2 / self.n
@@ -104,7 +103,7 @@ class Pupil:
         a = math.radians(self.angle)
         x, y = -u * math.cos(a) + v * math.sin(a), u * math.sin(a) + v * math.cos(a)
         rng = stream(seed, "psf", "wavefront")
-        return _core.wavefront(self.amplitude, self.segments, x, y, rms, segment_fraction, rng)
+        return _core.wavefront(self.amplitude, self.segments, x, y, rms, _SEGMENT_FRACTION, rng)
 
 
 @functools.cache

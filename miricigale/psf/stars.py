@@ -104,7 +104,6 @@ def psf_from_stars(
     includes=EFFECTS,
     enclosed=1.0,
     max_iterations=10,
-    smoothing="quartic",
     progress_bar=False,
 ):
     """
@@ -139,8 +138,6 @@ def psf_from_stars(
         tell. With 1 the encircled energies are those relative to the stamp.
     max_iterations : int, optional
         Most rounds of stacking and fitting.
-    smoothing : {"quartic", "quadratic"} or None, optional
-        Kernel that smooths each stack, see `~photutils.psf.EPSFBuilder`.
     progress_bar : bool, optional
         Whether to show one.
 
@@ -181,7 +178,7 @@ def psf_from_stars(
     builder = EPSFBuilder(
         oversampling=int(oversampling),
         maxiters=int(max_iterations),
-        smoothing_kernel=smoothing,
+        smoothing_kernel="quartic",
         progress_bar=progress_bar,
     )
     with warnings.catch_warnings(record=True) as caught:

@@ -24,16 +24,16 @@ def filter_name(filter_, known):
 
 
 @functools.lru_cache(maxsize=64)
-def band_quantiles(name, n, spectral_index=0.0):
+def band_quantiles(name, n=9):
     """
     Wavelengths (um, ascending) of equal weight that stand for a band.
 
-    The photon rate of a source with ``F_nu ~ nu**spectral_index`` is cut into ``n`` equal parts; each is
-    represented by its median.
+    The photon rate of a source of constant ``F_nu`` is cut into ``n`` equal parts; each is represented by
+    its median.
     """
     band = Filter.from_name(name)
     wave = to_array(band.wave, WAVE, "wave")
-    rate = np.asarray(band.throughput, dtype=float) * wave ** (-1.0 - spectral_index)
+    rate = np.asarray(band.throughput, dtype=float) * wave**-1.0
     total = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(wave))])
     inside = np.concatenate([[True], np.diff(total) > 0])
     result = np.interp((np.arange(n) + 0.5) / n, total[inside] / total[-1], wave[inside])
@@ -68,26 +68,25 @@ class Telescope:
         Root mean square in nm.
     seed : int
         The same telescope in all filters.
-    n_wavelengths, spectral_index, n_pupil
-        As for `~miricigale.psf.miri_psf`.
+    n_wavelengths : int
+        Wavelengths of the band, of equal weight.
+    n_pupil : int
+        Cells across the pupil.
     """
 
     filter: str
     angle: float
     wavefront_error: float
     seed: int
-    n_wavelengths: int
-    spectral_index: float
-    n_pupil: int
+    n_wavelengths: int = 9
+    n_pupil: int = 384
 
     @classmethod
-    def of(cls, filter, angle, wavefront_error, seed, n_wavelengths, spectral_index, n_pupil):
+    def of(cls, filter, angle, wavefront_error, seed):
         """The telescope of the options of `~miricigale.psf.miri_psf`, checked."""
-        if isinstance(n_wavelengths, float) or n_wavelengths < 1:
-            raise argument_error("n_wavelengths", "a positive integer", n_wavelengths)
-        rms = float(to_array(wavefront_error, u.nm, "wavefront_error"))
-        options = int(n_wavelengths), float(spectral_index), int(n_pupil)
-        return cls(filter, angle, rms, int(seed), *options)
+        return cls(
+            filter, angle, float(to_array(wavefront_error, u.nm, "wavefront_error")), int(seed)
+        )
 
     @property
     def meta(self):
@@ -103,7 +102,7 @@ class Telescope:
         """Fraction of the light in each of n x n cells of ``cell`` arcsec, read-only."""
         pupil = jwst_pupil(self.n_pupil, angle=self.angle)
         opd = pupil.wavefront_error(self.wavefront_error, seed=self.seed)
-        waves = band_quantiles(self.filter, self.n_wavelengths, self.spectral_index)
+        waves = band_quantiles(self.filter, self.n_wavelengths)
         data = polychromatic_psf(pupil, opd, waves, step=cell, n=n)
         data.flags.writeable = False
         return data

@@ -6,7 +6,6 @@ import warnings
 
 import numpy as np
 from scipy.fft import fftshift, ifftshift, irfft2, next_fast_len, rfft2
-from scipy.signal import convolve2d
 
 from miricigale.psf import _core
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
@@ -26,9 +25,8 @@ _log = logging.getLogger(__name__)
 #: Regularization parameters that have a name; they belong to pixels of 0.06 arcsec.
 REGULARIZATIONS = {"yang2021": 0.03}
 
-# the second and fourth derivatives
-_PENALTIES = {"laplacian": np.array([[0, -1, 0], [-1, 4, -1], [0, -1, 0]])}
-_PENALTIES["biharmonic"] = convolve2d(_PENALTIES["laplacian"], _PENALTIES["laplacian"])
+# what is rough: the second derivative
+_LAPLACIAN = np.array([[0, -1, 0], [-1, 4, -1], [0, -1, 0]])
 
 # from smooth to sharp: two steps per decade
 _SEQUENCE = tuple(10.0 ** (-0.5 * k) for k in range(2, 17))
@@ -51,35 +49,17 @@ def odd_square(value, name):
     return value
 
 
-def _penalty_power(penalty, shape):
-    """Squared transfer function of a penalty."""
-    if isinstance(penalty, str):
-        if penalty not in _PENALTIES:
-            raise argument_error("penalty", f"None or one of {sorted(_PENALTIES)}", repr(penalty))
-        penalty = _PENALTIES[penalty]
-    penalty = odd_square(penalty, "penalty")
-    if penalty.shape[0] > shape[0]:
-        wanted = f"at most as large as the PSFs, {shape[0]} pixels"
-        raise argument_error("penalty", wanted, f"{penalty.shape[0]}")
-    return np.abs(rfft2(penalty, shape)) ** 2
-
-
-def wiener(source, target, penalty):
+def wiener(source, target):
     """
     The matching kernel, (n, n), of the sum of the wide PSF, as a function of the Wiener parameter.
 
     That of `photutils.psf_matching.make_wiener_kernel`; but what does not depend on the parameter
-    is worked out once for all that are tried. ``penalty`` is that of `MatchingKernel.from_psfs`.
-
-    Raises
-    ------
-    ValueError
-        If the penalty is unknown, not square and odd, or larger than the PSFs.
+    is computed once for all that are tried.
     """
     shape = source.shape
     own = rfft2(ifftshift(source))
     power, product = np.abs(own) ** 2, rfft2(ifftshift(target)) * own.conj()
-    rough = power.max() if penalty is None else _penalty_power(penalty, shape)
+    rough = np.abs(rfft2(_LAPLACIAN, shape)) ** 2
 
     def make(mu):
         kernel = fftshift(irfft2(product / (power + mu * rough), shape))

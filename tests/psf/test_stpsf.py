@@ -94,7 +94,7 @@ def test_ours_is_like_stpsf(name):
 def test_corners_of_the_array_are_like_stpsf():
     """Distortion and the lean of the cruciform: far nearer to stpsf than one PSF for all."""
     pytest.importorskip("stpsf")
-    kind = {"fov": 8 * u.arcsec, "n_wavelengths": 5}
+    kind = {"fov": 8 * u.arcsec}
     grid = stpsf_grid("miri.f560w", n_psfs=4, opd="perfect", **kind)
     assert grid.frame == "detector"
     assert list(grid.includes) == ["jitter", "cruciform", "pixel", "ipc"]
