@@ -1,5 +1,5 @@
 """
-Errors of point sources on simulated and reduced exposures beside those of `ErrorModel.from_exposure`.
+Errors of point sources on simulated and reduced exposures, compared with those of `ErrorModel.from_exposure`.
 
     python benchmarks/exposure_errors.py                         nine filters at three depths
     python benchmarks/exposure_errors.py --filters miri.f770w --residual off

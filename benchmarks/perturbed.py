@@ -15,7 +15,7 @@ from pathlib import Path
 from miricigale.utils.parallel import process_pool
 from miricigale.workflow import Context, load_config, run_study
 from miricigale.workflow.options import read_setting
-from miricigale.workflow.stages.metrics import StudyTables
+from miricigale.workflow.page.numbers import StudyTables
 from miricigale.workflow.stages.perturbed import perturbation_costs
 from miricigale.workflow.truths import study_truths
 
@@ -38,7 +38,7 @@ def show(config, folder):
         if (folder / name / "fits_all.fits").is_file()
     }
     for name in truths:
-        every[name] = StudyTables.read(context, name)
+        every[name] = StudyTables(context, name)
     table = perturbation_costs(truths, every, config.exposures.filters, seed=config.run.seed)
     quantities = list(dict.fromkeys(table["quantity"]))
     print(" | ".join(["perturbation", *quantities]))

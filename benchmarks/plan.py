@@ -1,5 +1,5 @@
 """
-The plan of the CEERS exposures beside what the imaging run of the same exposures measured.
+The plan of the CEERS exposures, compared with what the imaging run of the same exposures measured.
 
     python benchmarks/plan.py [--sources 500]
 

@@ -1,5 +1,5 @@
 """
-Point-source limits, 10 sigma in 10 ks, from simulated exposures beside the calculator's.
+Point-source limits, 10 sigma in 10 ks, from simulated exposures, compared with the calculator's.
 
     python benchmarks/sensitivity.py [--filters miri.f770w ...] [--seed 1] [--full]
 

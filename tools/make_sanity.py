@@ -19,9 +19,9 @@ from miricigale.instrument.image_files import read_image
 from miricigale.pages import number
 from miricigale.sed import SEDModel
 from miricigale.workflow import Context, load_config
-from miricigale.workflow.stages import figures, pictures, provenance, truth_figures
-from miricigale.workflow.stages.comparison import study_results
-from miricigale.workflow.stages.metrics import StudyTables
+from miricigale.workflow.page import band_figures, labels, pictures, provenance, study_figures
+from miricigale.workflow.page.numbers import StudyTables
+from miricigale.workflow.page.paper import study_results
 from miricigale.workflow.stages.sample import SampleFlags, typical_source
 from miricigale.workflow.stages.variants import HEADER, variant_rows
 from miricigale.workflow.truths import reference, study_truths, variant_changes
@@ -54,7 +54,7 @@ def main():
     bands = config.exposures.filters
     metrics = json.loads((run / "report" / "metrics.json").read_text())
     sky = reference(config)
-    tables = StudyTables.read(Context(config, run), sky)
+    tables = StudyTables(Context(config, run), sky)
     truth, matched, errors = tables.truth, tables.matched, tables.errors
     galaxies = tables.galaxies(field=True)
     area = metrics["area"] * u.arcmin**2
@@ -63,20 +63,20 @@ def main():
     fits, results = tables.fits, tables.results
     limits = {name: errors.limiting_flux(name).to_value(u.uJy) for name in bands}
     magnitudes = {name: errors.limiting_magnitude(name).value for name in bands}
-    chosen = figures.three_bands(bands)
+    chosen = labels.three_bands(bands)
     sample = truth[selection == 0]
     typical = typical_source(sample, results["all"].fitted, bands[-1])
     row = truth[np.asarray(truth["id"]) == typical][0]
     study = study_results(config, study_truths(config), {sky: tables}, metrics)
     model = SEDModel.yang2021()
     drawn = {
-        "inputs": figures.input_figure(tables.galaxies())[0],
-        "counts": figures.counts_figure(galaxies, bands, area),
-        "offsets": figures.offset_figure(inside, bands, magnitudes),
-        "errors": figures.error_figure(errors, bands, limits),
-        "redshifts": figures.redshift_figure(sample, fits),
-        "fractions": truth_figures.fraction_figure(study),
-        "example": truth_figures.example_figure(results, row, typical, model),
+        "inputs": band_figures.input_figure(tables.galaxies())[0],
+        "counts": band_figures.counts_figure(galaxies, bands, area),
+        "offsets": band_figures.offset_figure(inside, bands, magnitudes),
+        "errors": band_figures.error_figure(errors, bands, limits),
+        "redshifts": study_figures.redshift_figure(sample, fits),
+        "fractions": study_figures.histogram_figure(study, "fraction"),
+        "example": study_figures.example_figure(results, row, typical, model),
         "color": pictures.field_figure(
             [read_image(run / sky / f"mosaic_{name}.fits") for name in chosen],
             read_image(run / "f160w.fits"),
@@ -85,7 +85,8 @@ def main():
     }
     for name, figure in drawn.items():
         figure.savefig(args.images / f"{name}.png", dpi=80, metadata={"Software": None})
-    print(*(f"* {text}" for text in provenance.stand_ins(config, model)), sep="\n", end="\n\n")
+    lines = [text.unescape() for text in provenance.stand_ins(config, model)]
+    print(*(f"* {text}" for text in lines), sep="\n", end="\n\n")
     rows = provenance.library_rows(model)
     print(rst_table(("part", "component", "library", "reference"), rows), "\n")
     print(f"{metrics['area']:.2f} square arcmin, {len(galaxies)} galaxies\n")
@@ -140,7 +141,7 @@ def main():
     print(rst_table(header, rows), "\n")
     rows = [
         (
-            figures.SET_LABELS[unit],
+            labels.SET_LABELS[unit],
             m["n"],
             shown(m["photoz_bias"], "+.4f"),
             shown(m["photoz_sigma_mad"], ".4f"),

@@ -39,5 +39,5 @@ def saturation_flux(exposure, *, background=None, psf=None, detector=None):
     )
     psf = miri_psf(exposure.filter) if psf is None else psf
     peak = float(psf_image(psf, pixel_scale=MIRI_PIXEL_SCALE, shape=(3, 3))[1, 1])
-    room = noise.detector.full_well / exposure.integration_time.to_value(u.s) - noise.rate
-    return max(room, 0.0) / (noise.electrons * peak) * u.uJy
+    left = noise.detector.full_well / exposure.integration_time.to_value(u.s) - noise.rate
+    return max(left, 0.0) / (noise.electrons * peak) * u.uJy

@@ -255,7 +255,7 @@ def sensitivity(filter, time=1e4 * u.s, *, n_sigma=10.0, residual=None, **option
 
 def sensitivity_table(filters=None, time=1e4 * u.s, *, residual="etc", n_sigma=10.0, **options):
     """
-    Limits of several filters beside those of the exposure time calculator.
+    Limits of several filters, compared with those of the exposure time calculator.
 
     Parameters
     ----------

@@ -146,7 +146,7 @@ def saturation_forecast(exposure, *, background=None, detector=None):
     Returns
     -------
     fraction : float or `~numpy.ndarray`
-        Of the full well; above 0.6 little room is left for sources.
+        Of the full well; above 0.6 little of the well is left for sources.
     """
     detector = miri_detector() if detector is None else detector
     rate = electron_rate(exposure.filter, background, detector=detector)
@@ -241,9 +241,9 @@ def forecast_table(forecasts):
     forecasts = list(forecasts)
     if not forecasts:
         raise argument_error("forecasts", "at least one forecast", "none")
-    for told in forecasts:
-        if not isinstance(told, SaturationForecast):
-            raise argument_error("forecasts", "made of SaturationForecast", repr(told))
+    for one in forecasts:
+        if not isinstance(one, SaturationForecast):
+            raise argument_error("forecasts", "made of SaturationForecast", repr(one))
     columns = {}
     for name in ("filter", "dither", "readout", "subarray", "n_groups", "n_integrations"):
         columns[name] = [getattr(f.exposure, name) for f in forecasts]

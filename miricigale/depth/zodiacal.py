@@ -58,7 +58,7 @@ def zodiacal_factor(filter, level="medium", *, position=None, date=None):
     ImportError
         If a date is given and zodipy is not installed.
     KeyError
-        If there is no such filter or level.
+        If the filter or level is not known.
     ValueError
         If a date comes without a position, or the position is too near to the Sun, or too far from
         it, to be seen on that day.

@@ -1,4 +1,4 @@
-"""Truth against result, from tables: matching, metrics, classes, a study beside its paper, the report."""
+"""Comparison of results with the truth, from tables: matches, metrics, classes, and a study with its paper."""
 
 from miricigale.utils.lazy import lazy_names
 
@@ -10,7 +10,6 @@ __getattr__, __dir__, __all__ = lazy_names(
             "CLASS_NAMES",
             "KIRKPATRICK_LIMITS",
             "SelectionQuality",
-            "class_fractions",
             "classify",
             "confusion",
             "selection_quality",

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 
 from miricigale.evaluation.estimates import Estimate
+from miricigale.evaluation.metrics import one_by_one
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import described_table
 
@@ -13,7 +14,6 @@ __all__ = [
     "CLASS_NAMES",
     "KIRKPATRICK_LIMITS",
     "SelectionQuality",
-    "class_fractions",
     "classify",
     "confusion",
     "selection_quality",
@@ -56,20 +56,6 @@ def classify(frac_agn, *, limits=CLASS_LIMITS):
     return names[index]
 
 
-def class_fractions(frac_agn, **kwargs):
-    """
-    Share of the sources in each class.
-
-    Returns
-    -------
-    fractions : dict of str to float
-        For each name of `CLASS_NAMES`; sources without a value are left out.
-    """
-    classes = classify(frac_agn, **kwargs)
-    known = classes[classes != "unknown"]
-    return {name: float(np.mean(known == name)) if known.size else np.nan for name in CLASS_NAMES}
-
-
 def confusion(true, found):
     """
     How many sources of each true class were found in each class.
@@ -87,9 +73,7 @@ def confusion(true, found):
         were found in it, unknown ones among them) and ``purity`` (share of those found in the class that are of
         it), each with its 68 % (Wilson) interval ``_low`` and ``_high``.
     """
-    true, found = np.asarray(true, str), np.asarray(found, str)
-    if true.shape != found.shape or true.ndim != 1:
-        raise argument_error("found", "as long as 'true'", f"{found.shape} and {true.shape}")
+    true, found = one_by_one(true, found, ("true", "found"), dtypes=(str, str))
     counts = {
         name: np.array([np.sum((true == own) & (found == name)) for own in CLASS_NAMES])
         for name in (*CLASS_NAMES, "unknown")
@@ -99,15 +83,11 @@ def confusion(true, found):
         "n": (np.array([np.sum(true == own) for own in CLASS_NAMES]), "Sources of the class"),
     }
     columns |= {name: (values, f"Of them found as {name}") for name, values in counts.items()}
-    quality = [selection_quality(true == name, found == name) for name in CLASS_NAMES]
-    for kind, text in (
-        ("completeness", "Share of the class that was found in it"),
-        ("purity", "Share of those found in the class that are of it"),
-    ):
-        shares = [getattr(one, kind) for one in quality]
-        columns[kind] = (np.array([one.value for one in shares]), text)
-        columns[f"{kind}_low"] = (np.array([one.low for one in shares]), "Lower end of 68 %")
-        columns[f"{kind}_high"] = (np.array([one.high for one in shares]), "Upper end of 68 %")
+    columns |= quality_columns(
+        [selection_quality(true == name, found == name) for name in CLASS_NAMES],
+        "Share of the class that was found in it",
+        "Share of those found in the class that are of it",
+    )
     return described_table(columns)
 
 
@@ -149,11 +129,20 @@ def selection_quality(wanted, selected):
     >>> quality.completeness.value, quality.purity.value
     (0.5, 1.0)
     """
-    wanted, selected = np.asarray(wanted, bool), np.asarray(selected, bool)
-    if wanted.shape != selected.shape:
-        raise argument_error("selected", "as long as 'wanted'", selected.shape)
+    wanted, selected = one_by_one(wanted, selected, ("wanted", "selected"), dtypes=(bool, bool))
     both = np.count_nonzero(wanted & selected)
     return SelectionQuality(
         Estimate.of_fraction(both, np.count_nonzero(wanted)),
         Estimate.of_fraction(both, np.count_nonzero(selected)),
     )
+
+
+def quality_columns(qualities, completeness, purity):
+    """Columns for `described_table` of `SelectionQuality`, with the descriptions of the two numbers."""
+    columns = {}
+    for kind, text in (("completeness", completeness), ("purity", purity)):
+        shares = [getattr(one, kind) for one in qualities]
+        columns[kind] = (np.array([one.value for one in shares]), text)
+        columns[f"{kind}_low"] = (np.array([one.low for one in shares]), "Lower end of 68 %")
+        columns[f"{kind}_high"] = (np.array([one.high for one in shares]), "Upper end of 68 %")
+    return columns

@@ -1,4 +1,4 @@
-"""Classes from colors of MIRI bands, as a rival of the fits."""
+"""Classes from colors of MIRI bands, to be compared with those of the fits."""
 
 import dataclasses
 import itertools
@@ -21,7 +21,7 @@ _N_RADII, _N_CENTERS = 40, 17
 @dataclasses.dataclass(frozen=True)
 class ColorWindow:
     """
-    Two colors that tell AGN from galaxies in a range of redshifts.
+    Two colors that separate AGN from galaxies in a range of redshifts.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class ColorWindow:
 
 
 #: After Kirkpatrick et al. 2017, ApJ 849, 111: the slope from starlight to hot dust, and a band with a PAH
-#: feature over one beside it. Redshifts and bands of the first are theirs
+#: feature over a neighboring one. Redshifts and bands of the first are theirs
 #: (https://kirkpatrick.ku.edu/JWST, which has the colors as pictures); of the three ways to pair them
 #: this one, chosen for it, comes nearest to the shares that theirs find. Both of the others are ours in
 #: the same spirit.
@@ -153,11 +153,9 @@ def _best_radii(distance, classes):
     return score[i, j], (float(steps[i]), float(steps[j]))
 
 
-def color_classes(
-    fluxes, redshift, classes, *, windows=COLOR_WINDOWS, n_folds=2, groups=None, seed
-):
+def color_classes(fluxes, redshift, classes, *, windows=COLOR_WINDOWS, groups=None, seed):
     """
-    Classes of sources by their colors, with circles that were fitted to other sources.
+    Classes of sources by their colors: each half of them by circles fitted to the other half.
 
     Parameters
     ----------
@@ -169,10 +167,8 @@ def color_classes(
         True classes, to which the circles are fitted.
     windows : iterable of `ColorWindow`, optional
         Colors by redshift.
-    n_folds : int, optional
-        Parts of the sample: the sources of each are classified by circles fitted to the others.
     groups : array-like, shape (n,), optional
-        Rows of one value stay in one part, such as one galaxy with several AGN; ids of the sources.
+        Rows of one value stay in one half, such as one galaxy with several AGN; ids of the sources.
     seed : int
         Seed of the division.
 
@@ -185,33 +181,31 @@ def color_classes(
     found = np.full(redshift.size, "unknown", dtype="<U9")
     groups = np.arange(redshift.size) if groups is None else np.asarray(groups)
     names, index = np.unique(groups, return_inverse=True)
-    fold = (stream(check_seed(seed), "colors").permutation(names.size) % n_folds)[index]
+    half = (stream(check_seed(seed), "colors").permutation(names.size) % 2)[index]
     for window in windows:
         rows = (redshift >= window.z_low) & (redshift < window.z_high)
         colors = window.colors(fluxes)
         known = rows & np.isfinite(colors).all(axis=1)
-        for k in range(n_folds):
-            others, own = known & (fold != k), rows & (fold == k)
+        for k in range(2):
+            others, own = known & (half != k), rows & (half == k)
             if np.any(classes[others] == CLASS_NAMES[2]) and own.any():
                 found[own] = ColorCircles.fit(colors[others], classes[others]).classify(colors[own])
     return found
 
 
-def color_estimates(study, mid_infrared, *, band_set="all", seed):
+def color_estimates(study, mid_infrared, *, seed):
     """
     Shares of galaxies, composites and AGN that are found by colors, of all truths of a study together.
 
     Parameters
     ----------
     study : `~miricigale.evaluation.StudyResults`
-        The tables, with the bands of `COLOR_WINDOWS`.
+        The tables, with the bands of `COLOR_WINDOWS`; redshifts of the fit ``"all"`` choose the colors.
     mid_infrared : dict of str to array-like, shape (n,)
         True AGN shares of the 5-15 um light of all sources (`mid_infrared_fractions`) by name of the truth;
         others are left out.
-    band_set : str, optional
-        The fit whose redshifts choose the colors.
     seed : int
-        Of the division into parts.
+        Of the division into halves.
 
     Returns
     -------
@@ -222,9 +216,9 @@ def color_estimates(study, mid_infrared, *, band_set="all", seed):
     bands = tuple(dict.fromkeys(band for window in COLOR_WINDOWS for band in window.bands))
     tables, redshift, share = [], [], []
     for one in study.truths:
-        if one.name in mid_infrared and band_set in one.fits:
+        if one.name in mid_infrared and "all" in one.fits:
             tables.append(one.matched["id", *bands][one.sample])
-            redshift.append(one.fitted(band_set, "redshift_mean"))
+            redshift.append(one.fitted("all", "redshift_mean"))
             share.append(np.asarray(mid_infrared[one.name], float)[one.sample])
     if not tables:
         return {}

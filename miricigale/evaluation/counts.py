@@ -1,4 +1,4 @@
-"""Published relations that simulated samples are held against."""
+"""Published relations to compare simulated samples with."""
 
 import astropy.units as u
 import numpy as np
@@ -124,13 +124,14 @@ def uvj_quiescent(u_v, v_j, redshift):
     return red & old & (u_v > 0.88 * v_j + np.where(z < 0.5, 0.69, 0.59))
 
 
-def main_sequence_dust(table, *, seed, scatter=0.2, least=1.0, cosmology=COSMOLOGY):
+def main_sequence_dust(table, *, seed, scatter=0.2):
     """
     Dust luminosities of star-forming galaxies that lie on the main sequence.
 
     The star-formation rate of Speagle et al. 2014 for the galaxy's mass and redshift, its share that
     dust hides (`dust_obscured_fraction`) and the luminosity of that (Kennicutt & Evans 2012, log L
-    [erg/s] = log SFR + 43.41). Quiescent galaxies (`uvj_quiescent`) keep their dust luminosity.
+    [erg/s] = log SFR + 43.41), but at least that of ``table``: dust emits what the fitted attenuation
+    took. Quiescent galaxies (`uvj_quiescent`) keep their dust luminosity.
 
     Parameters
     ----------
@@ -142,11 +143,6 @@ def main_sequence_dust(table, *, seed, scatter=0.2, least=1.0, cosmology=COSMOLO
         Each source has its own stream by its id.
     scatter : float, optional
         Standard deviation in dex about the sequence; 0.2 is that of Speagle et al. 2014.
-    least : float, optional
-        Least ratio to the dust luminosity of ``table``: with 1 dust emits at least what the fitted
-        attenuation took; 0 puts every star-forming galaxy on the sequence.
-    cosmology : `~astropy.cosmology.Cosmology`, optional
-        For the age of the universe.
 
     Returns
     -------
@@ -158,14 +154,12 @@ def main_sequence_dust(table, *, seed, scatter=0.2, least=1.0, cosmology=COSMOLO
     Raises
     ------
     ValueError, `~astropy.units.UnitsError`
-        If a column is missing or has a wrong unit, an id is there twice, or ``scatter`` or
-        ``least`` is negative.
+        If a column is missing or has a wrong unit, an id is there twice, or ``scatter`` is negative.
     """
     units = {"stellar_mass": MASS, "dust_luminosity": LUMINOSITY, "u_v": u.mag, "v_j": u.mag}
     require_columns(table, ("id", "redshift", *units), "table", units=units)
-    for name, value in (("scatter", scatter), ("least", least)):
-        if not (np.isfinite(value) and value >= 0):
-            raise argument_error(name, "finite and >= 0", value)
+    if not (np.isfinite(scatter) and scatter >= 0):
+        raise argument_error("scatter", "finite and >= 0", scatter)
     ids, seed = unique_ids(table["id"], "table"), check_seed(seed)
     mass = to_array(u.Quantity(table["stellar_mass"]), MASS, "stellar_mass")
     dust = to_array(u.Quantity(table["dust_luminosity"]), LUMINOSITY, "dust_luminosity")
@@ -174,13 +168,11 @@ def main_sequence_dust(table, *, seed, scatter=0.2, least=1.0, cosmology=COSMOLO
     quiescent = galaxy & uvj_quiescent(u.Quantity(table["u_v"]), u.Quantity(table["v_j"]), z)
     rows = np.flatnonzero(galaxy & ~quiescent)
     hidden = mass[rows] * u.Msun
-    sfr = main_sequence_sfr(hidden, cosmology.age(z[rows])).value * dust_obscured_fraction(hidden)
+    sfr = main_sequence_sfr(hidden, COSMOLOGY.age(z[rows])).value * dust_obscured_fraction(hidden)
     offset = [stream(seed, "main sequence", str(ids[row])).normal() for row in rows]
-    infrared = (
-        10.0 ** (np.log10(sfr) + 43.41 + scatter * np.array(offset)) * u.erg / u.s
-    ).to_value(LUMINOSITY)
+    infrared = 10.0 ** (np.log10(sfr) + 43.41 + scatter * np.array(offset)) * u.erg / u.s
     excess = np.ones(len(ids))
-    excess[rows] = np.maximum(infrared / dust[rows], least)
+    excess[rows] = np.maximum(infrared.to_value(LUMINOSITY) / dust[rows], 1.0)
     return described_table(
         {
             "id": (ids, None),

@@ -98,19 +98,16 @@ def mid_infrared_fractions(model, parameters):
     return out
 
 
-def equivalent_width(wave, light, continuum=None):
+def equivalent_width(wave, light):
     """
-    Equivalent width of features over a continuum.
+    Equivalent width of features over the power law through the two ends of a range.
 
     Parameters
     ----------
     wave : `~astropy.units.Quantity`, shape (n,)
-        Rest wavelengths of the feature's range, ascending.
+        Rest wavelengths of the range, ascending, such as 5.95 to 6.55 um for the feature at 6.2 um.
     light : array-like, shape (n,)
         F_nu or L_nu.
-    continuum : array-like, shape (n,), optional
-        The same without the feature; by default the power law through the two ends of the range, such as
-        5.95 and 6.55 um for the feature at 6.2 um.
 
     Returns
     -------
@@ -118,11 +115,9 @@ def equivalent_width(wave, light, continuum=None):
         In um, positive in emission.
     """
     x = to_array(wave, WAVE, "wave", ndim=1)
-    light = u.Quantity(light)
-    if continuum is None:
-        ends = np.log(light.value[[0, -1]])
-        continuum = np.exp(np.interp(np.log(x), np.log(x[[0, -1]]), ends)) * light.unit
-    excess = (light / u.Quantity(continuum)).to_value(u.one) - 1.0
+    light = u.Quantity(light).value
+    continuum = np.exp(np.interp(np.log(x), np.log(x[[0, -1]]), np.log(light[[0, -1]])))
+    excess = light / continuum - 1.0
     return np.trapezoid(excess, x) * WAVE
 
 
@@ -184,7 +179,7 @@ def feature_residuals(residual, redshift, *, feature, pivot, filter_width, seed)
     """
     Median residuals in a band of sources with a feature in it, and of the others.
 
-    Their difference is what the templates lack or have too much of the feature, to be held against
+    Their difference is what the templates lack or have too much of the feature, to be compared with
     `feature_magnitude`.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Truth and measurement side by side."""
+"""Matches of measured and true sources, and associations of two catalogs."""
 
 import astropy.units as u
 import numpy as np
@@ -79,29 +79,25 @@ def associate(first, second, *, radius):
     pair = near.partner[0]
     alone = np.flatnonzero(near.partner[1] < 0)
     rows = (
-        np.concatenate([np.arange(len(sky[0])), np.full(len(alone), -1)]),
-        np.concatenate([pair, alone]),
+        np.append(np.arange(len(pair)), np.full(len(alone), -1)),
+        np.append(pair, alone),
     )
     reasons = np.zeros(len(rows[0]), int)
-    columns = {
-        "first": (rows[0], "Row of the first catalog, -1 for none"),
-        "second": (rows[1], "Row of the second catalog, -1 for none"),
-    }
-    for name, catalog, row in (("first_id", first, rows[0]), ("second_id", second, rows[1])):
+    columns, ids, counts = {}, {}, {}
+    for k, (name, other) in enumerate((("first", "second"), ("second", "first"))):
+        catalog, here = (first, second)[k], rows[k] >= 0
+        columns[name] = (rows[k], f"Row of the {name} catalog, -1 for none")
         if isinstance(catalog, Table) and "id" in catalog.colnames:
-            ids = np.asarray(catalog["id"])
-            values = np.concatenate([ids, np.zeros(1, ids.dtype)])[row]
-            columns[name] = (np.ma.MaskedArray(values, mask=row < 0), None)
-    separation = np.full(len(rows[0]), np.nan)
-    separation[: len(pair)] = near.separation
-    columns["separation"] = (separation * ANGLE, "Of the partners")
-    for k, names in enumerate((("n_second", "second", "first"), ("n_first", "first", "second"))):
-        here = rows[k] >= 0
-        count = np.full(len(here), -1)
-        count[here] = near.count[k][rows[k][here]]
-        text = f"Rows of the {names[1]} catalog within the radius of the row of the {names[2]}"
-        columns[names[0]] = (count, text)
+            values = np.asarray(catalog["id"])
+            values = np.append(values, np.zeros(1, values.dtype))[rows[k]]
+            ids[f"{name}_id"] = (np.ma.MaskedArray(values, mask=~here), None)
+        near_by = np.full(len(here), -1)
+        near_by[here] = near.count[k][rows[k][here]]
+        text = f"Rows of the {other} catalog within the radius of the row of the {name}"
+        counts[f"n_{other}"] = (near_by, text)
         reasons[here] |= near.reasons(k)[rows[k][here]]
+    separation = np.append(near.separation, np.full(len(alone), np.nan))
+    columns |= ids | {"separation": (separation * ANGLE, "Of the partners")} | counts
     # of rows with a partner neither of the two reasons is set
     status = np.where(reasons == 0, 0, np.where(reasons & (_NONE | _LOST), 2, 1))
     columns["status"] = (np.array(_STATUS)[status], "matched, ambiguous or unmatched")

@@ -23,8 +23,9 @@ __all__ = [
 OUTLIER = 0.15
 
 
-def _pair(first, second, names):
-    first, second = np.asarray(first, float), np.asarray(second, float)
+def one_by_one(first, second, names, *, dtypes=(float, float)):
+    """Two 1-D arrays of one length; an error by their ``names`` if they are not."""
+    first, second = np.asarray(first, dtypes[0]), np.asarray(second, dtypes[1])
     if first.shape != second.shape or first.ndim != 1:
         raise argument_error(
             names[1],
@@ -101,7 +102,7 @@ class PhotozMetrics:
     sigma_mad : float
         1.48 x median abs(dz - median dz).
     outlier_fraction, outlier_low, outlier_high : float
-        Share with abs(dz) above the limit and its 68 % interval.
+        Share with abs(dz) above `OUTLIER` and its 68 % interval.
     n_outliers : int
         Their number.
     """
@@ -116,7 +117,7 @@ class PhotozMetrics:
     n_outliers: int
 
 
-def photoz_metrics(z_true, z_fit, *, outlier=OUTLIER):
+def photoz_metrics(z_true, z_fit):
     """
     Compare photometric with true redshifts.
 
@@ -124,8 +125,6 @@ def photoz_metrics(z_true, z_fit, *, outlier=OUTLIER):
     ----------
     z_true, z_fit : array-like, shape (n,)
         Redshifts; pairs with a NaN are counted apart.
-    outlier : float, optional
-        A source with abs(dz) above this is an outlier.
 
     Returns
     -------
@@ -136,10 +135,10 @@ def photoz_metrics(z_true, z_fit, *, outlier=OUTLIER):
     ValueError
         If the shapes differ.
     """
-    z_true, z_fit = _pair(z_true, z_fit, ("z_true", "z_fit"))
+    z_true, z_fit = one_by_one(z_true, z_fit, ("z_true", "z_fit"))
     good = np.isfinite(z_true) & np.isfinite(z_fit)
     delta = (z_fit[good] - z_true[good]) / (1 + z_true[good])
-    n_out = int(np.count_nonzero(np.abs(delta) > outlier))
+    n_out = int(np.count_nonzero(np.abs(delta) > OUTLIER))
     fraction, low, high = fraction_interval(n_out, delta.size)
     return PhotozMetrics(
         n=int(delta.size),
@@ -190,7 +189,7 @@ def recovery_metrics(true, measured, *, relative=False):
     -------
     metrics : `RecoveryMetrics`
     """
-    true, measured = _pair(true, measured, ("true", "measured"))
+    true, measured = one_by_one(true, measured, ("true", "measured"))
     with np.errstate(divide="ignore", invalid="ignore"):
         delta = (measured - true) / true if relative else measured - true
     good = np.isfinite(delta)
@@ -221,7 +220,7 @@ def running_median(x, y, *, size=20):
     x_mid, y_mid, y_sigma : `~numpy.ndarray`, shape (n_bins,)
         Medians and `sigma_mad` in each bin.
     """
-    x, y = _pair(x, y, ("x", "y"))
+    x, y = one_by_one(x, y, ("x", "y"))
     if size < 1:
         raise argument_error("size", "at least 1", size)
     good = np.isfinite(x) & np.isfinite(y)

@@ -2,10 +2,16 @@
 
 import numpy as np
 
-from miricigale.evaluation.classes import CLASS_LIMITS, classify, confusion, selection_quality
+from miricigale.evaluation.classes import (
+    CLASS_LIMITS,
+    classify,
+    confusion,
+    quality_columns,
+    selection_quality,
+)
 from miricigale.evaluation.quantities import OF_FITS, REDSHIFT_BINS, measure
 from miricigale.utils.random import check_seed, stream
-from miricigale.utils.tables import described_rows
+from miricigale.utils.tables import described_rows, described_table
 
 __all__ = ["found_classes", "selection_table", "study_confusion", "study_numbers"]
 
@@ -108,29 +114,23 @@ def selection_table(one, *, limits=CLASS_LIMITS):
         A row for each band set and limit: ``band_set``, ``limit``, ``n_wanted``, ``n_selected``,
         ``completeness``, ``purity`` and their 68 % (Wilson) intervals ``_low`` and ``_high``.
     """
-    rows = []
     true = np.asarray(one.truth["frac_agn"], float)[one.field]
-    for band_set in one.fits:
+    pairs = [(band_set, limit) for band_set in one.fits for limit in limits]
+    found = []
+    for band_set, limit in pairs:
         mean = one.of_catalog(one.fitted(band_set, "frac_agn_mean"))[one.field]
-        for limit in limits:
-            # NaN is below every limit
-            quality = selection_quality(true >= limit, mean >= limit)
-            pair = (quality.completeness, quality.purity)
-            values = [value for got in pair for value in (got.value, got.low, got.high)]
-            rows.append((band_set, limit, pair[0].n, pair[1].n, *values))
-    texts = {
-        "band_set": "Bands of the fit",
-        "limit": "Least AGN fraction",
-        "n_wanted": "Sources of the field whose true fraction is as high",
-        "n_selected": "Sources whose posterior mean is as high",
+        # NaN is below every limit
+        found.append(selection_quality(true >= limit, mean >= limit))
+    wanted, selected = ([getattr(f, k).n for f in found] for k in ("completeness", "purity"))
+    columns = {
+        "band_set": ([name for name, _ in pairs], "Bands of the fit"),
+        "limit": ([limit for _, limit in pairs], "Least AGN fraction"),
+        "n_wanted": (wanted, "Sources of the field whose true fraction is as high"),
+        "n_selected": (selected, "Sources whose posterior mean is as high"),
     }
-    for name, text in (
-        ("completeness", "Share of the wanted sources that are selected"),
-        ("purity", "Share of the selected sources that are wanted"),
-    ):
-        texts |= {
-            name: text,
-            f"{name}_low": "Lower end of 68 %",
-            f"{name}_high": "Upper end of 68 %",
-        }
-    return described_rows(rows, texts)
+    columns |= quality_columns(
+        found,
+        "Share of the wanted sources that are selected",
+        "Share of the selected sources that are wanted",
+    )
+    return described_table(columns)

@@ -1,4 +1,4 @@
-"""AGN that the galaxies of a field have, after published luminosity and mass functions."""
+"""Which galaxies of a field have an AGN, by published luminosity and mass functions."""
 
 from dataclasses import dataclass
 
@@ -60,7 +60,7 @@ _EDDINGTON = np.log10(1.3e38 * 0.002 / 25.0)
 _LOG_MASS = np.arange(9.0, 12.6, 0.05)
 _LOG_L_MAX = 46.5
 _STEP = 0.05
-_ROWS = 4096  # worked out together
+_ROWS = 4096  # computed together
 
 
 def xray_luminosity_function(l_x, redshift):
@@ -186,7 +186,7 @@ class AGNPopulation:
     Parameters
     ----------
     min_luminosity : `~astropy.units.Quantity`, optional
-        Least 2-10 keV luminosity of what is called an AGN.
+        Least 2-10 keV luminosity of an AGN.
     compton_thick : float, optional
         Compton-thick AGN for each obscured Compton-thin one; 1 in Ueda et al. 2014, 0 leaves them
         out.

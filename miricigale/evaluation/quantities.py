@@ -1,6 +1,6 @@
 """Numbers of a study, each with its bootstrap error."""
 
-import dataclasses
+import functools
 
 import astropy.units as u
 import numpy as np
@@ -20,30 +20,20 @@ from miricigale.utils.units import ab_magnitude
 
 __all__ = ["OF_FITS", "QUANTITIES", "REDSHIFT_BINS", "SHARES", "measure", "xray_fluxes"]
 
-#: Redshifts between which the AGN fraction is told apart.
+#: Bins of redshift.
 REDSHIFT_BINS = ((0.0, 1.0), (1.0, 2.0), (2.0, 3.0), (3.0, np.inf))
 #: Fewest draws of statistics that are fits themselves.
 _FEW_DRAWS = 100
 
 
-def _ratio(statistic):
-    """Of a statistic without MIRI to that with it."""
-    return lambda without, within: statistic(without) / statistic(within)
+def _share(found, n_all=None):
+    """Share of sources that were found, of an array of bool; ``n_all`` is their number by default."""
+    n_all = found.size if n_all is None else n_all
+    return Estimate.of_fraction(np.count_nonzero(found), found.size, n_all=n_all)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Draws:
-    """Bootstrap with the seed and number of draws of one number."""
-
-    seed: object
-    n_draws: int
-
-    def __call__(self, statistic, *columns, n_all=None, few=False):
-        n = max(_FEW_DRAWS, self.n_draws // 10) if few else self.n_draws
-        return bootstrap(statistic, *columns, seed=self.seed, n_draws=n, n_all=n_all)
-
-
-# Each takes the study, one truth (or None for those of all), the band set, an option and `_Draws`.
+# Each takes the study, one truth (or None for those of all), the band set, an option and `bootstrap` with
+# the seed and the number of draws of one number.
 
 
 def _in_bin(one, option):
@@ -66,21 +56,30 @@ def _of_sample(values, statistic):
     return measure
 
 
-def _against_none(values):
-    """The same values without MIRI and with a band set."""
-    return lambda one, band_set: (values(one, "none"), values(one, band_set))
+def _ratio(values, statistic):
+    """Ratio of a statistic of values of the sample without MIRI to that with a band set."""
+
+    def both(one, band_set):
+        return values(one, "none"), values(one, band_set)
+
+    return _of_sample(both, lambda without, within: statistic(without) / statistic(within))
 
 
 def _width(one, band_set):
     return one.fitted(band_set, "frac_agn_std")
 
 
+def _size(values):
+    return np.abs(_median(values))
+
+
+_DZ, _DF = TruthResults.redshift_error, TruthResults.fraction_error
+
+
 def _detected_share(study, one, _, limit, draws):
     """Share of the field brighter than a magnitude that is detected in two or more bands."""
-    rows = one.field & (study.prior_magnitude(one) < limit)
-    found = rows & (np.asarray(one.matched["n_detected"]) >= min(2, len(study.bands)))
-    n = int(np.count_nonzero(rows))
-    return Estimate.of_fraction(int(np.count_nonzero(found)), n, n_all=n)
+    found = np.asarray(one.matched["n_detected"]) >= min(2, len(study.bands))
+    return _share(found[one.field & (study.prior_magnitude(one) < limit)])
 
 
 def _mips_share(study, one, _, option, draws):
@@ -88,10 +87,8 @@ def _mips_share(study, one, _, option, draws):
     limit, band, depth = option
     if band not in one.truth.colnames:
         return Estimate(np.nan)
-    rows = one.field & (study.prior_magnitude(one) < limit)
-    found = rows & (ab_magnitude(one.truth[band]) < depth)
-    n = int(np.count_nonzero(rows))
-    return Estimate.of_fraction(int(np.count_nonzero(found)), n, n_all=n)
+    found = ab_magnitude(one.truth[band]) < depth
+    return _share(found[one.field & (study.prior_magnitude(one) < limit)])
 
 
 def _etc_limit(study, one, band_set, band, draws):
@@ -107,9 +104,7 @@ def _limit_offset(study, one, band_set, band, draws):
 
 def _shape_share(study, one, _, option, draws):
     """Share of the sources of the field by shape."""
-    rows = one.shapes[option]
-    n = int(np.count_nonzero(one.field))
-    return Estimate.of_fraction(int(np.count_nonzero(rows & one.field)), n, n_all=n)
+    return _share(one.shapes[option][one.field])
 
 
 def _errors_of(study, one, rows):
@@ -136,8 +131,7 @@ def _crowded_share(study, one, band_set, option, draws):
     """Share of the sources of the field that are crowded in any band."""
     if not one.crowded:
         return Estimate(np.nan)
-    found = np.any([_crowded(one, band)[one.field] for band in study.bands], axis=0)
-    return Estimate.of_fraction(int(np.count_nonzero(found)), found.size, n_all=found.size)
+    return _share(np.any([_crowded(one, band)[one.field] for band in study.bands], axis=0))
 
 
 def _magnitude_scatter(study, one, _, option, draws):
@@ -158,9 +152,7 @@ def _outlier_share(study, one, band_set, option, draws):
     """Share of outliers in redshift, with its Wilson interval."""
     rows, n_all = _in_bin(one, option)
     delta = one.redshift_error(band_set)[rows]
-    delta = delta[np.isfinite(delta)]
-    n = int(np.count_nonzero(np.abs(delta) > OUTLIER))
-    return Estimate.of_fraction(n, delta.size, n_all=n_all)
+    return _share(np.abs(delta[np.isfinite(delta)]) > OUTLIER, n_all)
 
 
 def _class_share(study, one, band_set, option, draws):
@@ -169,15 +161,20 @@ def _class_share(study, one, band_set, option, draws):
     mean = one.fitted(band_set, "frac_agn_mean")[rows]
     good = np.isfinite(mean)
     found = classify(np.clip(mean[good], 0, 1)) == classify(one.true("frac_agn")[rows][good])
-    return Estimate.of_fraction(int(np.count_nonzero(found)), int(good.sum()), n_all=n_all)
+    return _share(found, n_all)
+
+
+def _truths(study, one, column):
+    """One truth, or all with an AGN if none is given, that have a column."""
+    truths = study.with_agn if one is None else (one,)
+    return [t for t in truths if column in t.truth.colnames]
 
 
 def _power(statistic):
     """Of the accretion power of one truth, or of all with an AGN together."""
 
     def measure(study, one, band_set, option, draws):
-        truths = study.with_agn if one is None else (one,)
-        truths = [t for t in truths if "accretion_power" in t.truth.colnames]
+        truths = _truths(study, one, "accretion_power")
         if not truths:
             return Estimate(np.nan)
         # the truths of a source are drawn together
@@ -199,8 +196,7 @@ def xray_fluxes(one):
 
 def _xray_half(study, one, band_set, option, draws):
     """Log of the X-ray flux above which more than half of the AGN of the field are in the sample."""
-    truths = study.with_agn if one is None else (one,)
-    truths = [t for t in truths if "l_6um" in t.truth.colnames]
+    truths = _truths(study, one, "l_6um")
     if not truths:
         return Estimate(np.nan)
     columns = [np.where(t.field, xray_fluxes(t), np.nan) for t in truths]
@@ -211,7 +207,8 @@ def _xray_half(study, one, band_set, option, draws):
         out = np.array([half_complete(x, np.nan_to_num(y) > 0) for x, y in rows])
         return out[0] if np.ndim(flux) == 1 else out
 
-    return draws(statistic, np.stack(columns, axis=1), np.stack(found, axis=1), few=True)
+    n_draws = max(_FEW_DRAWS, draws.keywords["n_draws"] // 10)
+    return draws(statistic, np.stack(columns, axis=1), np.stack(found, axis=1), n_draws=n_draws)
 
 
 def _feature(study, one, band_set, option, draws):
@@ -233,40 +230,16 @@ _MEASURES = {
     "magnitude_scatter": ("sigma_MAD of measured - true magnitude", _magnitude_scatter),
     "signal_to_noise": ("median S/N", _signal_to_noise),
     "z_outliers": ("photo-z outliers", _outlier_share),
-    "z_bias": ("median dz/(1+z)", _of_sample(TruthResults.redshift_error, _median)),
-    "z_scatter": ("sigma_MAD of dz/(1+z)", _of_sample(TruthResults.redshift_error, _scatter)),
-    "z_outlier_ratio": (
-        "photo-z outliers without over with MIRI",
-        _of_sample(_against_none(TruthResults.redshift_error), _ratio(outlier_share)),
-    ),
-    "z_scatter_ratio": (
-        "sigma_MAD of dz/(1+z) without over with MIRI",
-        _of_sample(_against_none(TruthResults.redshift_error), _ratio(_scatter)),
-    ),
-    "frac_offset": (
-        "median fracAGN - true",
-        _of_sample(TruthResults.fraction_error, _median),
-    ),
-    "frac_scatter": (
-        "sigma_MAD of fracAGN",
-        _of_sample(TruthResults.fraction_error, _scatter),
-    ),
-    "frac_offset_ratio": (
-        "median fracAGN - true without over with MIRI",
-        _of_sample(
-            _against_none(TruthResults.fraction_error),
-            _ratio(lambda values: np.abs(_median(values))),
-        ),
-    ),
-    "frac_scatter_ratio": (
-        "sigma_MAD of fracAGN without over with MIRI",
-        _of_sample(_against_none(TruthResults.fraction_error), _ratio(_scatter)),
-    ),
+    "z_bias": ("median dz/(1+z)", _of_sample(_DZ, _median)),
+    "z_scatter": ("sigma_MAD of dz/(1+z)", _of_sample(_DZ, _scatter)),
+    "z_outlier_ratio": ("photo-z outliers without over with MIRI", _ratio(_DZ, outlier_share)),
+    "z_scatter_ratio": ("sigma_MAD of dz/(1+z) without over with MIRI", _ratio(_DZ, _scatter)),
+    "frac_offset": ("median fracAGN - true", _of_sample(_DF, _median)),
+    "frac_scatter": ("sigma_MAD of fracAGN", _of_sample(_DF, _scatter)),
+    "frac_offset_ratio": ("median fracAGN - true without over with MIRI", _ratio(_DF, _size)),
+    "frac_scatter_ratio": ("sigma_MAD of fracAGN without over with MIRI", _ratio(_DF, _scatter)),
     "width": ("median posterior width of fracAGN", _of_sample(_width, _median)),
-    "width_ratio": (
-        "posterior width of fracAGN without over with MIRI",
-        _of_sample(_against_none(_width), _ratio(_median)),
-    ),
+    "width_ratio": ("posterior width of fracAGN without over with MIRI", _ratio(_width, _median)),
     "power_offset": ("median log accretion power - true (dex)", _power(_median)),
     "power_scatter": ("sigma_MAD of log accretion power (dex)", _power(_scatter)),
     "class_share": ("share found in its true class", _class_share),
@@ -276,22 +249,15 @@ _MEASURES = {
 #: Names of the quantities that are taken from the tables, and what they are.
 QUANTITIES = {name: text for name, (text, _) in _MEASURES.items()}
 #: Those that are shares of sources.
-SHARES = (
-    "detected_share",
-    "mips_share",
-    "shape_share",
-    "crowded_share",
-    "z_outliers",
-    "class_share",
-)
+SHARES = tuple(name for name in QUANTITIES if name.endswith("_share")) + ("z_outliers",)
 #: Those that are of several truths together if none is named.
 _OF_ALL = ("power_offset", "power_scatter", "xray_half")
 #: Those of a fit, and those of a band.
 OF_FITS = (
-    "z_outliers", "z_bias", "z_scatter", "z_outlier_ratio", "z_scatter_ratio", "frac_offset",
-    "frac_offset_ratio", "frac_scatter", "frac_scatter_ratio", "width", "width_ratio", "power_offset",
-    "power_scatter", "class_share",
-)  # fmt: skip
+    *("z_outliers", "z_bias", "z_scatter", "z_outlier_ratio", "z_scatter_ratio"),
+    *("frac_offset", "frac_offset_ratio", "frac_scatter", "frac_scatter_ratio"),
+    *("width", "width_ratio", "power_offset", "power_scatter", "class_share"),
+)
 _OF_BANDS = ("etc_limit", "limit_offset", "signal_to_noise")
 
 
@@ -334,4 +300,5 @@ def measure(study, quantity, *, truth=0.0, band_set="all", option=None, seed, n_
     lacks_fit = one is not None and quantity in OF_FITS and band_set not in one.fits
     if lacks_fit or (quantity in _OF_BANDS and option not in study.bands):
         return Estimate(np.nan)
-    return _MEASURES[quantity][1](study, one, band_set, option, _Draws(seed, n_draws))
+    draws = functools.partial(bootstrap, seed=seed, n_draws=n_draws)
+    return _MEASURES[quantity][1](study, one, band_set, option, draws)

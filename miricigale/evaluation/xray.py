@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit, ndtr, ndtri
 
-from miricigale.evaluation.metrics import fraction_interval
+from miricigale.evaluation.metrics import fraction_interval, one_by_one
 from miricigale.sed.xray import stern2015, xray_flux
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import described_table
@@ -203,7 +203,4 @@ def half_complete(values, found):
 
 
 def _checked(values, found):
-    values, found = np.asarray(values, float), np.asarray(found, bool)
-    if values.shape != found.shape or values.ndim != 1:
-        raise argument_error("found", "as long as 'values'", f"{found.shape} and {values.shape}")
-    return values, found
+    return one_by_one(values, found, ("values", "found"), dtypes=(float, bool))

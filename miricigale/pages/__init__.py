@@ -2,4 +2,11 @@
 
 from miricigale.utils.lazy import lazy_names
 
-__getattr__, __dir__, __all__ = lazy_names(__name__, {"page": ("Missing", "Page", "number")})
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "page": ("Page",),
+        "rendering": ("render",),
+        "values": ("Link", "Missing", "cell_of", "number"),
+    },
+)

@@ -1,4 +1,4 @@
-"""Plans side by side: ranked for each hour, and depth against area."""
+"""Comparison of plans: ranked for each hour, and depth against area."""
 
 import astropy.units as u
 import numpy as np
@@ -44,7 +44,7 @@ def comparison_table(planner, plans):
     -------
     table : `~astropy.table.QTable`
         ``plan``, ``time`` (h), ``area``, ``n`` (sources compared), the numbers of
-        `~miricigale.planning.planner.accuracy` with their errors, ``n_detected`` and ``n_agn`` (expected
+        `~miricigale.planning.accuracy.accuracy` with their errors, ``n_detected`` and ``n_agn`` (expected
         in the area: sources detected, AGN detected and selected), and ``merit``, by which the rows are
         ranked. Of ``[survey] rank = "agn"`` that is ``n_agn`` times the purity for each hour; of ``"frac_agn"``
         and ``"redshift"`` the inverse variance of the means that is gained over the existing bands,

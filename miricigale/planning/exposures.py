@@ -69,18 +69,8 @@ class BandPlan:
     @functools.cached_property
     def limit(self):
         """5-sigma AB limit of point sources in the calculator's aperture, by `~miricigale.depth.sensitivity`."""
-        e, residual = self.exposure, self.noise.residual
-        flux = sensitivity(
-            self.filter,
-            self.time,
-            n_sigma=5,
-            background=self.background,
-            residual=residual or None,
-            n_dithers=self.n_dithers,
-            n_groups=e.n_groups,
-            readout=e.readout,
-        )
-        return flux.to(u.ABmag)
+        residual = self.noise.residual
+        return _limit(self.exposure, self.n_dithers, self.background, residual).to(u.ABmag)
 
     @property
     def calculator(self):
@@ -108,9 +98,8 @@ class BandPlan:
         if self.noise.kind == "run":
             return self.run.scaled(self)
         if self.noise.kind == "aperture":
-            return ErrorModel.from_depths(
-                {self.filter: self.limit}, fractional=self.noise.fractional
-            )
+            depths = {self.filter: self.limit}
+            return ErrorModel.from_depths(depths, fractional=self.noise.fractional)
         return ErrorModel.from_exposure(
             self.filter,
             self.time,
@@ -159,25 +148,29 @@ class RunErrors:
             known = list(self.config.exposures.filters)
             msg = f"the run of [noise] has no band {plan.filter}; it has {known}"
             raise ConfigError(msg)
-        first, n = exposures[0], len(exposures)
-        own = sensitivity(
-            plan.filter,
-            n * first.exposure_time,
-            n_sigma=5,
-            background=study_background(self.config, plan.filter),
-            residual=self.config.detector.residual or None,
-            n_dithers=n,
-            n_groups=first.n_groups,
-            readout=first.readout,
-            subarray=first.subarray,
-        )
+        background = study_background(self.config, plan.filter)
+        own = _limit(exposures[0], len(exposures), background, self.config.detector.residual)
         ratio = float((plan.limit.to(u.uJy) / own).decompose())
         table = self.errors.to_table()
         table = table[table["filter"] == plan.filter]
         sigma = table["sigma"]
-        faint = np.min(sigma)
-        table["sigma"] = np.sqrt(sigma**2 + (ratio**2 - 1) * faint**2)
+        table["sigma"] = np.sqrt(sigma**2 + (ratio**2 - 1) * np.min(sigma) ** 2)
         return ErrorModel.from_table(table)
+
+
+def _limit(exposure, n_dithers, background, residual):
+    """5-sigma flux of point sources in the calculator's aperture, of several dithers."""
+    return sensitivity(
+        exposure.filter,
+        n_dithers * exposure.exposure_time,
+        n_sigma=5,
+        background=background,
+        residual=residual or None,
+        n_dithers=n_dithers,
+        n_groups=exposure.n_groups,
+        readout=exposure.readout,
+        subarray=exposure.subarray,
+    )
 
 
 def background_options(config):

@@ -1,4 +1,4 @@
-"""Images of the planned exposures: the plan as a run of the study, and what that measures beside the noise."""
+"""Images of the planned exposures: the plan as a run of the study, compared with the noise."""
 
 import dataclasses
 from pathlib import Path
@@ -8,16 +8,25 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
-from miricigale.evaluation import OUTLIER, bootstrap
+from miricigale.evaluation import bootstrap
 from miricigale.evaluation.estimates import median, scatter
 from miricigale.photometry import ErrorModel
+from miricigale.planning.accuracy import accuracy, difference
 from miricigale.planning.sample import agn_mix
 from miricigale.utils.exceptions import argument_error
 from miricigale.utils.random import stream
 from miricigale.utils.store import replacing
 from miricigale.utils.tables import error_column
 from miricigale.workflow.config import StudyConfig
-from miricigale.workflow.sections import FitSection, PointSourceSection, RunSection
+from miricigale.workflow.sections import (
+    DetectorSection,
+    ExposureSection,
+    FitSection,
+    PointingSection,
+    PointSourceSection,
+    RunSection,
+    SceneSection,
+)
 from miricigale.workflow.stages.inputs import study_catalog
 from miricigale.workflow.stages.sample import SampleFlags
 from miricigale.workflow.study import run_study
@@ -81,6 +90,10 @@ def images_catalog(planner):
     return catalog
 
 
+#: Options of a catalog that is written here.
+_PLAIN = {"columns": (), "units": (), "survey": "", "missing": (), "factor": ""}
+
+
 def _levels(config, plans):
     """Levels of the background of a run, those of the plan."""
     if config.background.level == ("low",) and config.background.ra < 0:
@@ -106,42 +119,32 @@ def images_study(planner, source):
         the sample.
     """
     config, plans = planner.config, planner.band_plans()
-    catalog = dataclasses.replace(
-        config.catalog, source=str(source), columns=(), units=(), survey="", missing=(), factor=""
-    )
-    sky = study_catalog(config.catalog)["sky"]
-    center = SkyCoord(sky.cartesian.mean(), representation_type="cartesian")
+    own, fit, options = study_catalog(config.catalog), config.fit, config.images
+    center = SkyCoord(own["sky"].cartesian.mean(), representation_type="cartesian")
     center.representation_type = "spherical"
-    options, ra, dec = config.images, center.ra.deg, center.dec.deg
+    ra, dec = float(center.ra.deg), float(center.dec.deg)
     if options.ra >= 0:
         ra, dec = options.ra, options.dec
-    base, fit = StudyConfig(), config.fit
-    own = "frac_agn" in study_catalog(config.catalog).colnames
-    if config.agn.field and not own:
-        fractions = (0.0, FIELD)
-    elif own or np.any(np.asarray(planner.sources["frac_agn"], float) > 0):
+    fractions = (0.0,)
+    if "frac_agn" in own.colnames or np.any(np.asarray(planner.sources["frac_agn"], float) > 0):
         fractions = (0.0, CATALOG)
-    else:
-        fractions = (0.0,)
+    if config.agn.field and "frac_agn" not in own.colnames:
+        fractions = (0.0, FIELD)
+    run, exposures = config.plan, [plan.exposure for plan in plans.values()]
     return StudyConfig(
-        run=RunSection(
-            name=f"{config.plan.name} images", seed=config.plan.seed, threads=config.plan.threads
-        ),
-        catalog=catalog,
-        pointing=dataclasses.replace(
-            base.pointing, ra=float(ra), dec=float(dec), roll=options.roll
-        ),
+        run=RunSection(name=f"{run.name} images", seed=run.seed, threads=run.threads),
+        catalog=dataclasses.replace(config.catalog, source=str(source), **_PLAIN),
+        pointing=PointingSection(ra=ra, dec=dec, roll=options.roll),
         sed=dataclasses.replace(config.sed, frac_agn=fractions),
-        scene=dataclasses.replace(base.scene, background=_levels(config, plans)),
-        exposures=dataclasses.replace(
-            base.exposures,
+        scene=SceneSection(background=_levels(config, plans)),
+        exposures=ExposureSection(
             filters=tuple(plans),
             kind=options.kind,
-            n_groups=tuple(plan.exposure.n_groups for plan in plans.values()),
-            n_integrations=tuple(plan.exposure.n_integrations for plan in plans.values()),
+            n_groups=tuple(one.n_groups for one in exposures),
+            n_integrations=tuple(one.n_integrations for one in exposures),
             n_dithers=tuple(plan.n_dithers for plan in plans.values()),
         ),
-        detector=dataclasses.replace(base.detector, residual=config.noise.residual),
+        detector=DetectorSection(residual=config.noise.residual),
         fit=FitSection(
             bands=fit.bands,
             depths=fit.depths,
@@ -162,8 +165,8 @@ def image_sample(planner, folder, *, executor=None, progress_bar=False):
     planner : `~miricigale.planning.Planner`
         The plan, with a sample of its catalog.
     folder : path-like
-        Folder of the run, which `~miricigale.workflow.run_study` goes on with; what belongs to another plan
-        is done again. The catalog is beside it, ``<folder>.ecsv``.
+        Folder of the run, which `~miricigale.workflow.run_study` resumes; what belongs to another plan
+        is done again. The catalog is written to ``<folder>.ecsv``.
     executor : `concurrent.futures.Executor`, optional
         As for `~miricigale.workflow.run_study`.
     progress_bar : bool, optional
@@ -270,78 +273,27 @@ def paired_numbers(planner, plans, imaged_plans, imaged):
     Returns
     -------
     table : `~astropy.table.QTable`
-        For each set with MIRI and each number of `~miricigale.planning.planner.accuracy`: ``plan``,
+        For each set with MIRI and each number of `~miricigale.planning.accuracy.accuracy`: ``plan``,
         ``number``, ``n`` sources (in the field, found on the prior, and detected in one of the plans by either),
         ``noise`` and ``images`` with their errors, ``difference`` (images less noise) with the error that
         sources drawn together give it, and ``sigma``, their ratio.
     """
     chosen = imaged.usable & (planner.common(plans) | planner.common(imaged_plans))
-    seed, limit = planner.config.plan.seed, planner.config.agn.limit
+    options = {"agn_limit": planner.config.agn.limit, "seed": planner.config.plan.seed}
     rows = []
     for plan, other in zip(plans, imaged_plans, strict=True):
         if not plan.bands:
             continue
-        both = [planner.accuracy(one, chosen) for one in (plan, other)]
-        columns = [_columns(one.sources[chosen], limit) for one in (plan, other)]
-        for name, (statistic, *wanted) in _PAIRED.items():
-            values = [columns[k][key] for k in (0, 1) for key in wanted]
-            change = bootstrap(_difference(statistic, len(wanted)), *values, seed=seed)
-            rows.append(
-                {
-                    "plan": plan.name,
-                    "number": name,
-                    "n": int(np.count_nonzero(chosen)),
-                    "noise": both[0][name].value,
-                    "noise_err": both[0][name].error,
-                    "images": both[1][name].value,
-                    "images_err": both[1][name].error,
-                    "difference": change.value,
-                    "difference_err": change.error,
-                    "sigma": change.value / change.error if change.error > 0 else np.nan,
-                }
-            )
+        pair = [one.sources[chosen] for one in (plan, other)]
+        noise, images = (accuracy(one, **options) for one in pair)
+        for name, change in difference(*pair, **options).items():
+            row = {"plan": plan.name, "number": name, "n": int(np.count_nonzero(chosen))}
+            for key, one in (
+                ("noise", noise[name]),
+                ("images", images[name]),
+                ("difference", change),
+            ):
+                row |= {key: one.value, f"{key}_err": one.error}
+            row["sigma"] = change.value / change.error if change.error > 0 else np.nan
+            rows.append(row)
     return QTable(rows)
-
-
-def _columns(sources, limit):
-    """What the numbers of a plan are made of, by source."""
-    z, f = (np.asarray(sources[name], float) for name in ("redshift", "frac_agn"))
-    dz = (np.asarray(sources["redshift_mean"], float) - z) / (1 + z)
-    return {
-        "dz": dz,
-        "outlier": np.where(np.isfinite(dz), np.abs(dz) > OUTLIER, np.nan),
-        "z_std": np.asarray(sources["redshift_std"], float) / (1 + z),
-        "df": np.asarray(sources["frac_agn_mean"], float) - f,
-        "f_std": np.asarray(sources["frac_agn_std"], float),
-        "agn": np.asarray(f >= limit, float),
-        "selected": np.asarray(sources["selected"], float),
-    }
-
-
-def _difference(statistic, n):
-    """The statistic of the last n columns less that of the first n."""
-    return lambda *values: statistic(*values[n:]) - statistic(*values[:n])
-
-
-def _mean(values):
-    return np.mean(values, axis=-1)
-
-
-def _completeness(agn, selected):
-    return np.sum(agn * selected, axis=-1) / np.sum(agn, axis=-1)
-
-
-def _purity(agn, selected):
-    return np.sum(agn * selected, axis=-1) / np.sum(selected, axis=-1)
-
-
-_PAIRED = {
-    "z_scatter": (scatter, "dz"),
-    "z_outliers": (_mean, "outlier"),
-    "z_width": (median, "z_std"),
-    "frac_bias": (median, "df"),
-    "frac_scatter": (scatter, "df"),
-    "frac_width": (median, "f_std"),
-    "completeness": (_completeness, "agn", "selected"),
-    "purity": (_purity, "agn", "selected"),
-}

@@ -1,4 +1,4 @@
-"""From exposures to accuracy: mock photometry of a sample, fitted, beside its truth."""
+"""From exposures to accuracy: mock photometry of a sample, fitted and compared with its truth."""
 
 import dataclasses
 import functools
@@ -7,11 +7,10 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable, vstack
 
-from miricigale.evaluation import OUTLIER, Estimate, bootstrap, selection_quality
-from miricigale.evaluation.estimates import median, scatter
 from miricigale.fitting import BayesFitter
 from miricigale.photometry import ErrorModel
 from miricigale.photometry.surveys import fractional_error
+from miricigale.planning.accuracy import accuracy
 from miricigale.planning.config import PlanConfig
 from miricigale.planning.exposures import RunErrors, band_plans, wall_clock
 from miricigale.planning.sample import make_sample
@@ -20,7 +19,7 @@ from miricigale.utils.exceptions import argument_error
 from miricigale.utils.tables import error_column, require_columns
 from miricigale.workflow.stages.sample import detected_bands
 
-__all__ = ["EXISTING", "Plan", "Planner", "accuracy"]
+__all__ = ["EXISTING", "Plan", "Planner"]
 
 #: Name of the fit without MIRI.
 EXISTING = "existing bands"
@@ -245,12 +244,11 @@ class Planner:
         results = fitter.fit(photometry, executor=self.executor)
         table = self._results(results, photometry, plans)
         pointings = config.exposures.pointings if pointings is None else pointings
-        time = (
-            wall_clock(plans.values(), config.overheads, pointings=pointings) if plans else 0 * u.h
-        )
-        area = pointings * _FIELD
+        time, area = 0 * u.h, (pointings * _FIELD).to(u.arcmin**2)
+        if plans:
+            time = wall_clock(plans.values(), config.overheads, pointings=pointings)
         name = name or ", ".join(b.removeprefix("miri.") for b in bands) or EXISTING
-        return Plan(name, plans, table, time, area.to(u.arcmin**2))
+        return Plan(name, plans, table, time, area)
 
     def _results(self, results, photometry, plans):
         """The table of sources of a `Plan`."""
@@ -269,8 +267,7 @@ class Planner:
             selected = table["frac_agn_mean"] >= agn.limit
         table["selected"] = selected
         for name, plan in plans.items():
-            limit = plan.saturation.to(u.uJy)
-            table[f"{name}_saturated"] = self.sources[name] >= limit
+            table[f"{name}_saturated"] = self.sources[name] >= plan.saturation.to(u.uJy)
         return table
 
     def compare(self, sets=None, *, measured=None):
@@ -326,7 +323,7 @@ class Planner:
 
     def accuracy(self, plan, chosen=None):
         """
-        Numbers of one plan; see `accuracy`.
+        Numbers of one plan; see `~miricigale.planning.accuracy.accuracy`.
 
         Parameters
         ----------
@@ -336,44 +333,5 @@ class Planner:
             Sources that count; those of `common` by default.
         """
         chosen = self.common([plan]) if chosen is None else np.asarray(chosen, bool)
-        return accuracy(
-            plan.sources[chosen], agn_limit=self.config.agn.limit, seed=self.config.plan.seed
-        )
-
-
-def accuracy(sources, *, agn_limit=0.4, seed=0):
-    """
-    How well redshift, fracAGN and AGN are recovered.
-
-    Parameters
-    ----------
-    sources : `~astropy.table.QTable`
-        Of a `Plan`.
-    agn_limit : float, optional
-        True fracAGN from which a source is an AGN.
-    seed : int, optional
-        Of the bootstrap.
-
-    Returns
-    -------
-    numbers : dict of str to `~miricigale.evaluation.Estimate`
-        Of the posterior means ``z_scatter`` (sigma_MAD of dz/(1+z)), ``z_outliers`` (share with abs(dz)/(1+z)
-        above 0.15), ``frac_bias`` and ``frac_scatter`` (median and sigma_MAD of the difference);
-        ``z_width`` and ``frac_width``, median posterior standard deviations (of z over 1+z);
-        ``completeness`` and ``purity`` of the selected AGN.
-    """
-    z, f = (np.asarray(sources[name], float) for name in ("redshift", "frac_agn"))
-    dz = (np.asarray(sources["redshift_mean"], float) - z) / (1 + z)
-    df = np.asarray(sources["frac_agn_mean"], float) - f
-    known = np.isfinite(dz)
-    quality = selection_quality(f >= agn_limit, sources["selected"])
-    return {
-        "z_scatter": bootstrap(scatter, dz, seed=seed),
-        "z_outliers": Estimate.of_fraction(np.sum(np.abs(dz[known]) > OUTLIER), np.sum(known)),
-        "z_width": bootstrap(median, np.asarray(sources["redshift_std"]) / (1 + z), seed=seed),
-        "frac_bias": bootstrap(median, df, seed=seed),
-        "frac_scatter": bootstrap(scatter, df, seed=seed),
-        "frac_width": bootstrap(median, sources["frac_agn_std"], seed=seed),
-        "completeness": quality.completeness,
-        "purity": quality.purity,
-    }
+        agn_limit, seed = self.config.agn.limit, self.config.plan.seed
+        return accuracy(plan.sources[chosen], agn_limit=agn_limit, seed=seed)

@@ -20,7 +20,7 @@ _AGE_SHARE = 0.95
 
 
 def catalog_area(config, catalog):
-    """Area of the catalog in square arcmin; None where neither it nor the configuration tells."""
+    """Area of the catalog in square arcmin; None where neither it nor the configuration states it."""
     if config.sample.area:
         return config.sample.area * u.arcmin**2
     if config.catalog.source in resources() and "radius_arcsec" in catalog.meta:

@@ -1,9 +1,28 @@
-"""The axes that every plot function draws on."""
+"""Figures, axes, colors and legends that all plots share."""
 
-__all__ = ["WIDTH", "new_figure", "panel_columns", "panels", "resolve_axes"]
+import numpy as np
+
+__all__ = [
+    "MEASURED",
+    "SECOND",
+    "STYLES",
+    "TRUE",
+    "WIDTH",
+    "add_borders",
+    "label_outer",
+    "legend",
+    "new_figure",
+    "panel_columns",
+    "panels",
+    "resolve_axes",
+]
 
 #: Inches across the figures of a page, which are shown at one width, so that letters have one size.
 WIDTH = 10.5
+#: Colors of truth, of what is measured and of a second measurement.
+TRUE, MEASURED, SECOND = "0.35", "#9a3412", "#1d4ed8"
+#: Colors and markers of samples drawn over each other, such as those of band sets, in their order.
+STYLES = ((MEASURED, "o"), (SECOND, "s"), ("0.4", "^"), ("#15803d", "D"))
 
 
 def panel_columns(n):
@@ -66,6 +85,60 @@ def panels(labels, *, height=2.7, **share):
     for label, ax in out.items():
         ax.set_title(label, fontsize="medium")
     return figure, out
+
+
+def label_outer(axes, xlabel=None, ylabel=None):
+    """
+    Label the outer axes of `panels` only, and keep the legend of the first.
+
+    Parameters
+    ----------
+    axes : dict of str to `~matplotlib.axes.Axes`
+        Of `panels`.
+    xlabel, ylabel : str, optional
+        Labels; those that the axes have by default.
+    """
+    axes = list(axes.values())
+    columns = panel_columns(len(axes))
+    for k, ax in enumerate(axes):
+        last = k + columns >= len(axes)
+        ax.set_xlabel((ax.get_xlabel() if xlabel is None else xlabel) if last else "")
+        ax.set_ylabel("" if k % columns else ax.get_ylabel() if ylabel is None else ylabel)
+        ax.tick_params(labelbottom=True)
+        if k and ax.get_legend():
+            ax.get_legend().remove()
+
+
+def legend(ax, **options):
+    """Add a legend in small letters without a frame; ``options`` as of `matplotlib.axes.Axes.legend`."""
+    return ax.legend(**{"fontsize": 8, "frameon": False} | options)
+
+
+def add_borders(ax, labels, x, y, **kwargs):
+    """
+    Draw the borders between cells of different labels; around those at the edge too, unless their label is 0.
+
+    Parameters
+    ----------
+    ax : `~matplotlib.axes.Axes`
+        Axes to draw on.
+    labels : array-like, shape (ny, nx)
+        Label of each cell.
+    x, y : array-like, shapes (nx + 1,) and (ny + 1,)
+        Edges of the cells.
+    **kwargs
+        Passed to `~matplotlib.collections.LineCollection`.
+    """
+    from matplotlib.collections import LineCollection
+
+    padded, x, y = np.pad(labels, 1), np.asarray(x), np.asarray(y)
+    j, i = np.nonzero(padded[1:-1, 1:] != padded[1:-1, :-1])
+    lines = [np.stack([x[[i, i]], y[[j, j + 1]]], axis=-1)]
+    j, i = np.nonzero(padded[1:, 1:-1] != padded[:-1, 1:-1])
+    lines += [np.stack([x[[i, i + 1]], y[[j, j]]], axis=-1)]
+    # to shape (n, 2 ends, 2 coordinates)
+    lines = np.concatenate(lines, axis=1).swapaxes(0, 1)
+    ax.add_collection(LineCollection(lines, **kwargs))
 
 
 def resolve_axes(ax):

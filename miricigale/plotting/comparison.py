@@ -2,19 +2,19 @@
 
 import numpy as np
 
-from miricigale.plotting.axes import resolve_axes
+from miricigale.plotting.axes import MEASURED, SECOND, TRUE, legend, resolve_axes
 
 __all__ = [
     "plot_counts",
     "plot_error_function",
-    "plot_histogram",
     "plot_magnitudes",
     "plot_offsets",
     "plot_redshifts",
     "plot_relation",
 ]
 
-TRUE, MEASURED, SECOND = "0.35", "#9a3412", "#1d4ed8"
+#: dz / (1 + z) beyond which a redshift is an outlier.
+_OUTLIER = 0.15
 
 
 def plot_magnitudes(true, measured, *, ax=None, lost=None, title=None):
@@ -45,19 +45,13 @@ def plot_magnitudes(true, measured, *, ax=None, lost=None, title=None):
         ax.plot([low - 0.3, high + 0.3], [low - 0.3, high + 0.3], color=TRUE, lw=1)
         ax.set(xlim=(low - 0.3, high + 0.3), ylim=(high + 0.3, low - 0.3))
     if lost is not None and len(lost):
-        ax.plot(
-            lost,
-            np.full(len(lost), 0.02),
-            "|",
-            color=TRUE,
-            ms=6,
-            transform=ax.get_xaxis_transform(),
-        )
+        at_bottom = {"transform": ax.get_xaxis_transform()}
+        ax.plot(lost, np.full(len(lost), 0.02), "|", color=TRUE, ms=6, **at_bottom)
     ax.set(xlabel="true magnitude (AB)", ylabel="measured magnitude (AB)", title=title)
     return ax
 
 
-def plot_offsets(true, offset, *, running=None, ax=None, title=None, limit=1.0, labels=None):
+def plot_offsets(true, offset, *, running=None, ax=None, title=None, limit=1.0):
     """
     Difference against true magnitude with its running median.
 
@@ -73,8 +67,6 @@ def plot_offsets(true, offset, *, running=None, ax=None, title=None, limit=1.0, 
         Title.
     limit : float, optional
         Half height of the axis; points beyond stand as triangles on the edge.
-    labels : tuple of str, optional
-        Labels of the axes instead of those for magnitudes.
 
     Returns
     -------
@@ -82,28 +74,20 @@ def plot_offsets(true, offset, *, running=None, ax=None, title=None, limit=1.0, 
     """
     ax = resolve_axes(ax)
     true, offset = np.asarray(true), np.asarray(offset)
-    inside = np.abs(offset) <= limit
     ax.axhline(0, color=TRUE, lw=1)
-    ax.plot(true[inside], offset[inside], ".", ms=3.5, color=MEASURED, alpha=0.55)
-    for sign, marker in ((1, "^"), (-1, "v")):
-        far = sign * offset > limit
-        ax.plot(
-            true[far],
-            np.full(far.sum(), sign * 0.97 * limit),
-            marker,
-            ms=3.5,
-            color=MEASURED,
-            alpha=0.55,
-        )
+    inside = np.abs(offset) <= limit
+    shown = np.where(inside, offset, 0.97 * limit * np.sign(offset))
+    for marker, rows in ((".", inside), ("^", offset > limit), ("v", offset < -limit)):
+        ax.plot(true[rows], shown[rows], marker, ms=3.5, color=MEASURED, alpha=0.55)
     if running is not None and len(running[0]):
         mid, median, sigma = running
         ax.fill_between(mid, median - sigma, median + sigma, color=SECOND, alpha=0.18, lw=0)
         # a single bin makes no line
         mark = "o" if len(mid) == 1 else None
         ax.plot(mid, median, color=SECOND, lw=1.8, marker=mark, label="running median, scatter")
-        ax.legend(loc="lower left", fontsize=8, frameon=False)
-    x_label, y_label = labels or ("true magnitude (AB)", "measured - true (mag)")
-    ax.set(ylim=(-limit, limit), xlabel=x_label, ylabel=y_label, title=title)
+        legend(ax, loc="lower left")
+    ax.set(ylim=(-limit, limit), title=title)
+    ax.set(xlabel="true magnitude (AB)", ylabel="measured - true (mag)")
     return ax
 
 
@@ -135,11 +119,11 @@ def plot_error_function(flux, sigma, *, limits=None, ax=None, colors=None):
         if np.isfinite(limit):
             ax.plot(limit, limit / 5, "o", color=line.get_color(), ms=5)
     ax.set(xlabel="flux (µJy)", ylabel=r"1$\sigma$ error (µJy)")
-    ax.legend(fontsize=8, frameon=False)
+    legend(ax)
     return ax
 
 
-def plot_redshifts(z_true, z_fit, *, z_err=None, ax=None, outlier=0.15, title=None):
+def plot_redshifts(z_true, z_fit, *, z_err=None, ax=None, title=None):
     """
     Fitted against true redshift on a scale of log(1 + z), with the outlier limits.
 
@@ -151,8 +135,6 @@ def plot_redshifts(z_true, z_fit, *, z_err=None, ax=None, outlier=0.15, title=No
         Errors of ``z_fit``.
     ax : `~matplotlib.axes.Axes`, optional
         Axes to draw on.
-    outlier : float, optional
-        Limit in dz / (1 + z).
     title : str, optional
         Title.
 
@@ -166,8 +148,8 @@ def plot_redshifts(z_true, z_fit, *, z_err=None, ax=None, outlier=0.15, title=No
     z = np.linspace(0, top, 200)
     ax.plot(z, z, color=TRUE, lw=1)
     for sign in (1, -1):
-        ax.plot(z, z + sign * outlier * (1 + z), color=TRUE, lw=0.8, ls="--")
-    bad = np.abs(z_fit - z_true) > outlier * (1 + z_true)
+        ax.plot(z, z + sign * _OUTLIER * (1 + z), color=TRUE, lw=0.8, ls="--")
+    bad = np.abs(z_fit - z_true) > _OUTLIER * (1 + z_true)
     if z_err is not None:
         ax.errorbar(z_true, z_fit, yerr=z_err, fmt="none", ecolor="0.8", elinewidth=0.6, zorder=0)
     ax.plot(z_true[~bad], z_fit[~bad], ".", ms=4, color=SECOND, alpha=0.7)
@@ -175,55 +157,17 @@ def plot_redshifts(z_true, z_fit, *, z_err=None, ax=None, outlier=0.15, title=No
     functions = (lambda v: np.log1p(np.maximum(v, -0.9)), np.expm1)
     ax.set_xscale("function", functions=functions)
     ax.set_yscale("function", functions=functions)
-    ticks = [0, 0.5, 1, 2, 3, 4, 6]
-    ax.set_xticks([t for t in ticks if t < top])
-    ax.set_yticks([t for t in ticks if t < top])
-    ax.set(
-        xlim=(0, top), ylim=(0, top), xlabel="true redshift", ylabel="fitted redshift", title=title
-    )
+    ticks = [tick for tick in (0, 0.5, 1, 2, 3, 4, 6) if tick < top]
+    ax.set(xlim=(0, top), xticks=ticks, xlabel="true redshift", title=title)
+    ax.set(ylim=(0, top), yticks=ticks, ylabel="fitted redshift")
     if np.any(bad):
-        ax.legend(fontsize=8, frameon=False, loc="upper left")
+        legend(ax, loc="upper left")
     return ax
 
 
-def plot_histogram(samples, bins, *, ax=None, xlabel=None, title=None, truth=None):
+def plot_relation(x, y, *, lines=(), ax=None, labels=("", "")):
     """
-    Histograms of several samples as steps.
-
-    Parameters
-    ----------
-    samples : dict of str to array-like
-        Values by label; NaN is not counted.
-    bins : array-like
-        Edges.
-    ax : `~matplotlib.axes.Axes`, optional
-        Axes to draw on.
-    xlabel, title : str, optional
-        Texts.
-    truth : float, optional
-        True value, as a vertical line.
-
-    Returns
-    -------
-    ax : `~matplotlib.axes.Axes`
-    """
-    ax = resolve_axes(ax)
-    colors = (MEASURED, SECOND, "0.4", "#15803d")
-    for k, (label, values) in enumerate(samples.items()):
-        values = np.asarray(values, float)
-        # the fifth has the first color, dashed
-        style = {"color": colors[k % 4], "ls": ("-", "--", ":")[k // 4 % 3], "lw": 1.6}
-        ax.hist(values[np.isfinite(values)], bins, histtype="step", label=label, **style)
-    if truth is not None:
-        ax.axvline(truth, color=TRUE, lw=1, ls="--", label="truth")
-    ax.set(xlabel=xlabel, ylabel="sources", title=title)
-    ax.legend(fontsize=8, frameon=False)
-    return ax
-
-
-def plot_relation(x, y, *, lines=(), ax=None, labels=("", ""), color=None, log=(False, True)):
-    """
-    A cloud of points with published relations over it.
+    A cloud of points with published relations over it, on logarithmic axes.
 
     Parameters
     ----------
@@ -235,30 +179,18 @@ def plot_relation(x, y, *, lines=(), ax=None, labels=("", ""), color=None, log=(
         Axes to draw on.
     labels : tuple of str, optional
         Labels of the axes.
-    color : array-like, optional
-        Redshifts, by which the points are colored.
-    log : tuple of bool, optional
-        Whether each axis is logarithmic.
 
     Returns
     -------
     ax : `~matplotlib.axes.Axes`
     """
     ax = resolve_axes(ax)
-    if color is None:
-        ax.plot(x, y, ".", ms=4, color=MEASURED, alpha=0.6)
-    else:
-        points = ax.scatter(x, y, c=color, s=9, cmap="viridis", alpha=0.8)
-        ax.figure.colorbar(points, ax=ax, label="redshift")
+    ax.loglog(x, y, ".", ms=4, color=MEASURED, alpha=0.6)
     for k, (line_x, line_y, label) in enumerate(lines):
         ax.plot(line_x, line_y, color=TRUE, lw=1.4, ls=("-", "--", ":", "-.")[k % 4], label=label)
-    if log[0]:
-        ax.set_xscale("log")
-    if log[1]:
-        ax.set_yscale("log")
     ax.set(xlabel=labels[0], ylabel=labels[1])
     if lines:
-        ax.legend(fontsize=8, frameon=False)
+        legend(ax)
     return ax
 
 
@@ -285,9 +217,7 @@ def plot_counts(edges, counts, counts_err, *, ax=None, title=None):
     edges, counts = np.asarray(edges), np.asarray(counts)
     good = counts > 0
     mid = 0.5 * (edges[1:] + edges[:-1])
-    ax.errorbar(
-        mid[good], counts[good], np.asarray(counts_err)[good], fmt="o", ms=4, color=MEASURED, lw=1
-    )
-    ax.set_yscale("log")
-    ax.set(xlabel="magnitude (AB)", ylabel=r"N (deg$^{-2}$ mag$^{-1}$)", title=title)
+    errors = np.asarray(counts_err)[good]
+    ax.errorbar(mid[good], counts[good], errors, fmt="o", ms=4, color=MEASURED, lw=1)
+    ax.set(xlabel="magnitude (AB)", ylabel=r"N (deg$^{-2}$ mag$^{-1}$)", yscale="log", title=title)
     return ax

@@ -2,37 +2,31 @@
 
 import numpy as np
 
-from miricigale.plotting.axes import WIDTH, new_figure
-from miricigale.plotting.comparison import MEASURED, SECOND, TRUE
-from miricigale.plotting.posteriors import plot_pdf_2d, plot_sed_fit
+from miricigale.plotting.axes import MEASURED, SECOND, TRUE, WIDTH, legend, new_figure
+from miricigale.plotting.posteriors import plot_pdf_2d
 from miricigale.plotting.spectra import plot_spectrum
 
 __all__ = ["fit_figure", "sequence_figure"]
 
 _COLORS = (MEASURED, SECOND)
+_LABELS = ("redshift", "fracAGN")
 
 
-def fit_figure(
-    photometry, posteriors, joint, *, truth=None, labels=("redshift", "fracAGN"), title=None
-):
+def fit_figure(draw_fit, posteriors, joint, *, truth):
     """
     Photometry with the best model and residuals, and 1-D and 2-D posteriors of two fits.
 
     Parameters
     ----------
-    photometry : dict
-        Arguments of `miricigale.plotting.posteriors.plot_sed_fit` by name: ``wave``, ``flux``,
-        ``flux_err``, ``model_flux``, and what else there is.
+    draw_fit : callable
+        Draws photometry, best model and residuals on ``ax``, a pair of axes: such as
+        `miricigale.fitting.FitResults.plot_sed` of an object.
     posteriors : dict of str to tuple
-        By fit (with and without MIRI): for each of the two parameters, edges of cells and weights.
+        By fit (with and without MIRI): for redshift and fracAGN, edges of cells and weights.
     joint : dict of str to array-like, shape (nx, ny)
         Joint weights of the cells of both, by fit.
-    truth : tuple of float, optional
+    truth : tuple of float
         True values of the two.
-    labels : tuple of str, optional
-        Names of the two.
-    title : str, optional
-        Title.
 
     Returns
     -------
@@ -44,36 +38,36 @@ def fit_figure(
     grid = figure.add_gridspec(3, 4, height_ratios=(2.6, 0.9, 2.6))
     upper = figure.add_subplot(grid[0, :])
     lower = figure.add_subplot(grid[1, :], sharex=upper)
-    plot_sed_fit(**photometry, ax=(upper, lower), title=title)
+    draw_fit(ax=(upper, lower))
     upper.set_xlabel("")
     upper.tick_params(labelbottom=False)
     if upper.get_legend():
         low, high = upper.get_ylim()
         upper.set_ylim(low, high * (high / low) ** 0.3)
-        upper.legend(fontsize=8, frameon=False, loc="upper left", ncols=3)
+        legend(upper, loc="upper left", ncols=3)
     for k in range(2):
         ax = figure.add_subplot(grid[2, k])
         _overlaid(ax, {name: pair[k] for name, pair in posteriors.items()})
-        if truth is not None:
-            ax.axvline(truth[k], ymax=0.6, color="0.2", ls=":", lw=1.4, label="truth")
-        ax.set_xlabel(labels[k])
+        ax.axvline(truth[k], ymax=0.6, color="0.2", ls=":", lw=1.4, label="truth")
+        ax.set_xlabel(_LABELS[k])
         if k == 0:
             ax.set_ylabel("posterior density (peak 1)")
-            ax.legend(fontsize=8, frameon=False, loc="upper left")
+            legend(ax, loc="upper left")
     planes = []
     for k, (name, weights) in enumerate(joint.items()):
         ax = figure.add_subplot(grid[2, 2 + k])
         edges = [_value(pair[0]) for pair in posteriors[name]]
-        plot_pdf_2d(
-            *edges, weights, ax=ax, labels=labels, truth=truth, cmap=("Oranges", "Blues")[k]
-        )
+        style = {"labels": _LABELS, "truth": truth, "cmap": ("Oranges", "Blues")[k]}
+        plot_pdf_2d(*edges, weights, ax=ax, **style)
         ax.set_title(name, fontsize="medium")
         planes.append(ax)
     # both planes alike, so that the areas can be compared
-    for limits, name in ((lambda ax: ax.get_xlim(), "xlim"), (lambda ax: ax.get_ylim(), "ylim")):
-        ends = np.array([limits(ax) for ax in planes])
-        for ax in planes:
-            ax.set(**{name: (ends[:, 0].min(), ends[:, 1].max())})
+    (left, right), (bottom, top) = (
+        (np.min(ends), np.max(ends))
+        for ends in ([ax.get_xlim() for ax in planes], [ax.get_ylim() for ax in planes])
+    )
+    for ax in planes:
+        ax.set(xlim=(left, right), ylim=(bottom, top))
     for ax in planes[1:]:
         ax.set_ylabel("")
     return figure
@@ -130,40 +124,28 @@ def sequence_figure(wave, spectra, *, bands=None, features=(), redshift=None):
     ax = axes[0, 0]
     wave = np.asarray(wave, float)
     steps = np.linspace(0.0, 0.85, max(len(spectra), 2))
-    top, bottom = 0.0, np.inf
     for k, (fraction, flux) in enumerate(sorted(spectra.items())):
-        flux = np.asarray(flux, float)
         color = colormaps["plasma"](steps[k])
         plot_spectrum(wave, flux, ax=ax, color=color, lw=1.6, label=f"fracAGN {fraction:g}")
-        positive = flux[flux > 0]
-        if positive.size:
-            top, bottom = max(top, positive.max()), min(bottom, positive.min())
-    bottom = max(bottom, 1e-5 * top)
-    span = np.log10(top / bottom) if top > 0 else 1.0
-    ax.set(
-        xlim=(wave.min(), wave.max()),
-        ylim=(bottom * 10 ** (-0.12 * span), top * 10 ** (0.1 * span)),
-    )
+    light = np.concatenate(list(spectra.values()))
+    light = light[light > 0]
+    top = light.max()
+    bottom = max(light.min(), 1e-5 * top)
+    span = np.log10(top / bottom)
+    ax.set_xlim(wave.min(), wave.max())
+    ax.set_ylim(bottom * 10 ** (-0.12 * span), top * 10 ** (0.1 * span))
     for k, (name, (first, last)) in enumerate((bands or {}).items()):
         y = bottom * 10 ** ((-0.08 + 0.05 * (k % 2)) * span)
         ax.plot([first, last], [y, y], color="0.55", lw=5, solid_capstyle="butt", zorder=0)
-        ax.annotate(
-            name,
-            (np.sqrt(first * last), y),
-            (0, 5),
-            textcoords="offset points",
-            ha="center",
-            fontsize=7,
-        )
+        above = {"xytext": (0, 5), "textcoords": "offset points"}
+        ax.annotate(name, (np.sqrt(first * last), y), ha="center", fontsize=7, **above)
     for rest in features:
         place = rest * (1 + redshift)
         if wave.min() < place < wave.max():
             ax.axvline(place, color=TRUE, lw=0.7, ls=":")
-            ax.text(
-                place, 0.98, f"{rest:g}", transform=ax.get_xaxis_transform(), rotation=90,
-                ha="right", va="top", fontsize=7, color=TRUE,
-            )  # fmt: skip
+            at_top = {"transform": ax.get_xaxis_transform(), "ha": "right", "va": "top"}
+            ax.text(place, 0.98, f"{rest:g}", rotation=90, fontsize=7, color=TRUE, **at_top)
     title = "" if redshift is None else f"z = {redshift:g}"
     ax.set_title(title, fontsize="medium")
-    ax.legend(fontsize=8, frameon=False, loc="upper left")
+    legend(ax, loc="upper left")
     return figure

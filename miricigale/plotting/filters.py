@@ -1,6 +1,6 @@
 """Filter curves."""
 
-from miricigale.plotting.axes import resolve_axes
+from miricigale.plotting.axes import legend, resolve_axes
 
 __all__ = ["plot_filters"]
 
@@ -25,8 +25,7 @@ def plot_filters(curves, ax=None, **kwargs):
     ax, curves = resolve_axes(ax), list(curves)
     for wave, throughput, name in curves:
         ax.plot(wave, throughput, **{"label": name, **kwargs})
-    ax.set_xlabel("wavelength (µm)")
-    ax.set_ylabel("throughput")
+    ax.set(xlabel="wavelength (µm)", ylabel="throughput")
     if len(curves) > 1:
-        ax.legend(fontsize=8, frameon=False)
+        legend(ax)
     return ax

@@ -1,8 +1,8 @@
-"""Images: stretched, in color, with segments, and image beside model and residual."""
+"""Images: stretched, in color, with segments, and with model and residual."""
 
 import numpy as np
 
-from miricigale.plotting.axes import new_figure, resolve_axes
+from miricigale.plotting.axes import add_borders, new_figure, resolve_axes
 
 __all__ = [
     "add_colorbar",
@@ -14,6 +14,10 @@ __all__ = [
     "plot_offsets",
     "plot_segmentation",
 ]
+
+
+#: Color of lines over an image.
+_LINES = "#c2410c"
 
 
 def _robust(image):
@@ -28,23 +32,31 @@ def _robust(image):
     return middle, sigma if sigma > 0 else float(values.std()) or 1.0
 
 
+def _limits(image):
+    """Values of the ends of the colors: from two sigma below the median to what is bright."""
+    middle, sigma = _robust(image)
+    finite = image[np.isfinite(image)]
+    high = np.percentile(finite, 99.7) if finite.size else 1.0
+    return middle - 2 * sigma, max(high, middle + 8 * sigma)
+
+
 def _extent(shape, pixel_scale, center):
     """Edges in arcsec, zero in the middle of the image or at a pixel."""
     ny, nx = shape
     x, y = ((nx - 1) / 2, (ny - 1) / 2) if center is None else center
-    left, right = -0.5 - x, nx - 0.5 - x
-    bottom, top = -0.5 - y, ny - 0.5 - y
-    return [edge * pixel_scale for edge in (left, right, bottom, top)]
+    return [edge * pixel_scale for edge in (-0.5 - x, nx - 0.5 - x, -0.5 - y, ny - 0.5 - y)]
 
 
-def _label(ax, title):
+def _draw(image, ax, pixel_scale, title, center, **colors):
+    """Draw pixels on axes in arcsec."""
+    extent = _extent(image.shape[:2], pixel_scale, center)
     ax.set(xlabel="x (arcsec)", ylabel="y (arcsec)", title=title)
-    return ax
+    return ax.imshow(image, origin="lower", interpolation="nearest", extent=extent, **colors)
 
 
 def add_colorbar(drawn, label):
     """
-    Draw a color bar beside an image, whose ticks do not run into each other.
+    Draw a color bar next to an image, whose ticks do not overlap.
 
     Parameters
     ----------
@@ -61,7 +73,7 @@ def add_colorbar(drawn, label):
 
     bar = drawn.axes.figure.colorbar(drawn, ax=drawn.axes, label=label, shrink=0.85)
     if isinstance(drawn.norm, AsinhNorm):
-        # from the bright end, as many as there is room for on the bar
+        # from the bright end, as many as the bar has space for
         ticks = []
         for tick in drawn.norm.vmax * np.array([1.0, 0.2, 0.03, 0.0]):
             if not ticks or drawn.norm(ticks[-1]) - drawn.norm(tick) > 0.08:
@@ -122,26 +134,15 @@ def plot_image(
         raise ValueError(msg)
     ax = resolve_axes(ax)
     image = np.asarray(image, float)
-    middle, sigma = _robust(image)
-    if limits is None:
-        finite = image[np.isfinite(image)]
-        high = np.percentile(finite, 99.7) if finite.size else 1.0
-        limits = middle - 2 * sigma, max(high, middle + 8 * sigma)
+    low, high = _limits(image) if limits is None else limits
     if stretch == "asinh":
-        norm = AsinhNorm(softening or 2 * sigma, vmin=limits[0], vmax=limits[1])
+        norm = AsinhNorm(softening or 2 * _robust(image)[1], vmin=low, vmax=high)
     else:
-        norm = Normalize(*limits)
-    drawn = ax.imshow(
-        image,
-        origin="lower",
-        interpolation="nearest",
-        norm=norm,
-        cmap=cmap,
-        extent=_extent(image.shape, pixel_scale, center),
-    )
+        norm = Normalize(low, high)
+    drawn = _draw(image, ax, pixel_scale, title, center, norm=norm, cmap=cmap)
     if colorbar is not None:
         add_colorbar(drawn, colorbar)
-    return _label(ax, title)
+    return ax
 
 
 def plot_model_residual(
@@ -149,11 +150,10 @@ def plot_model_residual(
     model,
     *,
     ax=None,
-    pixel_scale=1.0,
     limits=None,
     titles=("image", "model", "residual"),
     unit=None,
-    center=None,
+    **options,
 ):
     """
     Draw image, model and residual side by side with the same stretch.
@@ -164,8 +164,6 @@ def plot_model_residual(
         The residual is their difference.
     ax : sequence of three `~matplotlib.axes.Axes`, optional
         Axes to draw on; a new figure (``ax[0].figure``) by default.
-    pixel_scale : float, optional
-        Arcsec per pixel.
     limits : (float, float), optional
         As in `plot_image`, those of the image by default. The residual is drawn from -5 to
         5 sigma of its own noise.
@@ -173,8 +171,8 @@ def plot_model_residual(
         Titles.
     unit : str, optional
         Label of the color bars; none are drawn without it.
-    center : (float, float), optional
-        As in `plot_image`.
+    **options
+        ``pixel_scale`` and ``center``, as in `plot_image`.
 
     Returns
     -------
@@ -187,33 +185,21 @@ def plot_model_residual(
         msg = f"'ax' must be three axes, got {len(ax)}"
         raise ValueError(msg)
     image, model = np.asarray(image, float), np.asarray(model, float)
-    middle, sigma = _robust(image)
-    if limits is None:
-        finite = image[np.isfinite(image)]
-        high = np.percentile(finite, 99.7) if finite.size else 1.0
-        limits = middle - 2 * sigma, max(high, middle + 8 * sigma)
-    options = {"pixel_scale": pixel_scale, "colorbar": unit, "center": center}
     residual = image - model
+    noise = _robust(residual)[1]
     # one turnover for both, or a noiseless model would be stretched beyond comparison
-    for axes, data, title in zip(ax[:2], (image, model), titles[:2], strict=True):
-        plot_image(data, ax=axes, title=title, limits=limits, softening=2 * sigma, **options)
-    _, noise = _robust(residual)
-    span = (-5 * noise, 5 * noise)
-    plot_image(
-        residual,
-        ax=ax[2],
-        stretch="linear",
-        limits=span,
-        cmap="RdBu_r",
-        title=titles[2],
-        **options,
-    )
-    for axes in ax[1:]:
-        axes.set_ylabel("")
+    light = {"limits": _limits(image) if limits is None else limits}
+    light["softening"] = 2 * _robust(image)[1]
+    dark = {"limits": (-5 * noise, 5 * noise), "stretch": "linear", "cmap": "RdBu_r"}
+    planes = zip((image, model, residual), (light, light, dark), strict=True)
+    for axes, title, (data, colors) in zip(ax, titles, planes, strict=True):
+        plot_image(data, ax=axes, title=title, colorbar=unit, **colors, **options)
+        if axes is not ax[0]:
+            axes.set_ylabel("")
     return ax
 
 
-def plot_offsets(xy, offset, field, *, used=None, ax=None, title=None, colors=("#c2410c", "0.7")):
+def plot_offsets(xy, offset, field, *, used=None, ax=None, title=None):
     """
     Draw offsets of sources over those of a smooth map, as arrows on a grid of pixels.
 
@@ -231,8 +217,6 @@ def plot_offsets(xy, offset, field, *, used=None, ax=None, title=None, colors=("
         Axes to draw on.
     title : str, optional
         Title.
-    colors : (str, str), optional
-        Of the sources and of the map.
 
     Returns
     -------
@@ -249,9 +233,9 @@ def plot_offsets(xy, offset, field, *, used=None, ax=None, title=None, colors=("
     unit = np.median(sizes) or 1.0
     # arrows of the typical offset are as long as the map's grid is wide
     options = {"angles": "xy", "scale_units": "xy", "scale": unit / step, "width": 0.004}
-    ax.quiver(x, y, *np.moveaxis(smooth, -1, 0), color=colors[1], **options)
-    arrows = ax.quiver(*xy[used].T, *offset[used].T, color=colors[0], **options)
-    ax.plot(*xy[~used].T, "x", color=colors[0], ms=4)
+    ax.quiver(x, y, *np.moveaxis(smooth, -1, 0), color="0.7", **options)
+    arrows = ax.quiver(*xy[used].T, *offset[used].T, color=_LINES, **options)
+    ax.plot(*xy[~used].T, "x", color=_LINES, ms=4)
     ax.quiverkey(arrows, 0.9, 1.03, unit, f"{1e3 * unit:.0f} mas", labelpos="W")
     ax.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), aspect="equal")
     ax.set(xlabel="x (pixels)", ylabel="y (pixels)", title=title)
@@ -320,14 +304,8 @@ def plot_color(red, green, blue, *, ax=None, pixel_scale=1.0, title=None, center
     ax : `~matplotlib.axes.Axes`
     """
     ax = resolve_axes(ax)
-    image = color_image(red, green, blue, **kwargs)
-    ax.imshow(
-        image,
-        origin="lower",
-        interpolation="nearest",
-        extent=_extent(image.shape[:2], pixel_scale, center),
-    )
-    return _label(ax, title)
+    _draw(color_image(red, green, blue, **kwargs), ax, pixel_scale, title, center)
+    return ax
 
 
 def mark_sky(ax, length, *, north=(0, 1), east=(-1, 0), color="black"):
@@ -361,7 +339,7 @@ def mark_sky(ax, length, *, north=(0, 1), east=(-1, 0), color="black"):
     text = {"ha": "center", "va": "center", "fontsize": 8, **style}
     ax.text(x + length / 2, y + 0.03 * height, f'{length:g}"', **text)
     size = 0.09 * min(width, height)
-    # room for both arrows, wherever they point
+    # space for both arrows, wherever they point
     origin = np.array([right - 0.05 * width - 1.2 * size, bottom + 0.045 * height + 0.3 * size])
     for direction, letter in ((north, "N"), (east, "E")):
         step = size * np.asarray(direction, float) / np.hypot(*direction)
@@ -373,9 +351,7 @@ def mark_sky(ax, length, *, north=(0, 1), east=(-1, 0), color="black"):
     return ax
 
 
-def plot_segmentation(
-    image, labels, *, ax=None, pixel_scale=1.0, color="#c2410c", title=None, center=None, **kwargs
-):
+def plot_segmentation(image, labels, *, ax=None, pixel_scale=1.0, center=None, **kwargs):
     """
     Draw the outlines of segments over an image.
 
@@ -385,10 +361,8 @@ def plot_segmentation(
         The image.
     labels : int array_like, shape (ny, nx)
         Label of each pixel, 0 for none.
-    ax, pixel_scale, title, center : optional
+    ax, pixel_scale, center : optional
         As in `plot_image`.
-    color : str, optional
-        Of the outlines.
     **kwargs
         Passed to `plot_image`.
 
@@ -396,22 +370,12 @@ def plot_segmentation(
     -------
     ax : `~matplotlib.axes.Axes`
     """
-    from matplotlib.collections import LineCollection
-
     image, labels = np.asarray(image), np.asarray(labels)
     if image.shape != labels.shape:
         msg = f"'labels' must be of the image's shape {image.shape}, got {labels.shape}"
         raise ValueError(msg)
-    ax = plot_image(image, ax=ax, pixel_scale=pixel_scale, title=title, center=center, **kwargs)
+    ax = plot_image(image, ax=ax, pixel_scale=pixel_scale, center=center, **kwargs)
     left, _, bottom, _ = _extent(image.shape, pixel_scale, center)
-    lines = np.concatenate([_edges(labels), _edges(labels.T)[:, :, ::-1]])
-    lines = lines * pixel_scale + np.array([left, bottom])
-    ax.add_collection(LineCollection(lines, colors=color, linewidths=0.7))
+    y, x = (np.arange(n + 1) * pixel_scale for n in image.shape)
+    add_borders(ax, labels, left + x, bottom + y, colors=_LINES, linewidths=0.7)
     return ax
-
-
-def _edges(labels):
-    """Vertical edges between pixels of different labels, shape (n, 2, 2), in pixel corners."""
-    padded = np.pad(labels, ((0, 0), (1, 1)))
-    y, x = np.nonzero(padded[:, 1:] != padded[:, :-1])
-    return np.stack([np.stack([x, y], -1), np.stack([x, y + 1], -1)], axis=1).astype(float)

@@ -2,8 +2,16 @@
 
 import numpy as np
 
-from miricigale.plotting.axes import new_figure, panel_columns, panels
-from miricigale.plotting.comparison import MEASURED, SECOND, TRUE, plot_offsets
+from miricigale.plotting.axes import (
+    MEASURED,
+    SECOND,
+    TRUE,
+    label_outer,
+    legend,
+    new_figure,
+    panels,
+)
+from miricigale.plotting.comparison import plot_offsets
 from miricigale.plotting.images import plot_image
 
 __all__ = [
@@ -12,6 +20,10 @@ __all__ = [
     "features_figure",
     "offsets_figure",
 ]
+
+
+#: Most strips of a profile along an axis of an image.
+_N_STRIPS = 24
 
 
 def background_figure(before, after, *, pixel_scale=1.0, unit="MJy/sr", mask=None):
@@ -35,24 +47,18 @@ def background_figure(before, after, *, pixel_scale=1.0, unit="MJy/sr", mask=Non
     """
     figure, axes = new_figure(1, 3, size=(3.5, 3.5), width_ratios=(1, 1, 0.85))
     last = axes[0, 2]
-    for ax, image, title, color in zip(
-        axes[0],
-        (before, after),
-        ("before", "after"),
-        (SECOND, MEASURED),
-        strict=False,
-    ):
+    options = {"pixel_scale": pixel_scale, "colorbar": unit, "stretch": "linear"}
+    styles = {"before": (before, SECOND), "after": (after, MEASURED)}
+    for ax, (title, (image, color)) in zip(axes[0], styles.items(), strict=False):
         image = np.asarray(image, float)
-        plot_image(
-            image, ax=ax, pixel_scale=pixel_scale, title=title, colorbar=unit, stretch="linear"
-        )
+        plot_image(image, ax=ax, title=title, **options)
         sky = image if mask is None else np.where(np.asarray(mask, bool), np.nan, image)
         level = np.nanmedian(sky)
-        told = f"{level:.0f}" if abs(level) >= 10 else f"{level:.2g}"
+        number = f"{level:.0f}" if abs(level) >= 10 else f"{level:.2g}"
         for axis, style in ((0, "-"), (1, "--")):
             x, y = _profile(sky, axis)
             place = (x - 0.5 * image.shape[1 - axis]) * pixel_scale
-            label = f"{title} ({told}), along {'xy'[axis]}"
+            label = f"{title} ({number}), along {'xy'[axis]}"
             last.plot(place, y - level, style, color=color, lw=1.3, label=label)
     axes[0, 1].set_ylabel("")
     last.axhline(0, color=TRUE, lw=0.8)
@@ -60,14 +66,14 @@ def background_figure(before, after, *, pixel_scale=1.0, unit="MJy/sr", mask=Non
     low, high = last.get_ylim()
     # space for the legend
     last.set_ylim(low, high + 0.45 * (high - low))
-    last.legend(fontsize=7, frameon=False, loc="upper left")
+    legend(last, fontsize=7, loc="upper left")
     return figure
 
 
-def _profile(image, axis, n_bins=24):
+def _profile(image, axis):
     """Medians of strips of an image across an axis (0: along x), and their middles in pixels."""
     size = image.shape[1 - axis]
-    edges = np.unique(np.linspace(0, size, min(n_bins, size) + 1).astype(int))
+    edges = np.unique(np.linspace(0, size, min(_N_STRIPS, size) + 1).astype(int))
     strips = np.split(image, edges[1:-1], axis=1 - axis)
     values = [np.nanmedian(s) if np.isfinite(s).any() else np.nan for s in strips]
     return 0.5 * (edges[1:] + edges[:-1]), np.array(values)
@@ -95,24 +101,22 @@ def encircled_energy_figure(radius, before, after, *, limit=0.04):
 
     figure, axes = new_figure(1, 2, size=(5.25, 3.4), sharex=True)
     steps = np.linspace(0.0, 0.82, max(len(before), 2))
-    for ax, curves, title in zip(
-        axes[0], (before, after), ("before convolution", "after convolution"), strict=True
-    ):
+    for ax, curves, when in zip(axes[0], (before, after), ("before", "after"), strict=True):
         for k, (name, values) in enumerate(curves.items()):
             style = {"color": colormaps["viridis"](steps[k]), "ls": ("-", "--")[k % 2]}
             ax.plot(radius, 100 * np.asarray(values, float), lw=1.6, label=name, **style)
         ax.axhline(0, color=TRUE, lw=0.8)
-        ax.set_title(title, fontsize="medium")
+        ax.set_title(f"{when} convolution", fontsize="medium")
         ax.set_xlabel("radius (arcsec)")
     axes[0, 1].axhspan(-100 * limit, 100 * limit, color="0.92", zorder=0)
     axes[0, 0].set_ylabel("difference of encircled energy (%)")
-    axes[0, 0].legend(fontsize=8, frameon=False, ncols=2)
+    legend(axes[0, 0], ncols=2)
     reach = max([100 * limit, *(100 * np.nanmax(np.abs(v)) for v in after.values())])
     axes[0, 1].set_ylim(-1.15 * reach, 1.15 * reach)
     return figure
 
 
-def offsets_figure(groups, *, limit=1.0, labels=None, running=None, marked=None):
+def offsets_figure(groups, *, limit=1.0, marked=None):
     """
     Magnitude differences by kind of source, such as those of two photometries by Sersic index.
 
@@ -122,10 +126,6 @@ def offsets_figure(groups, *, limit=1.0, labels=None, running=None, marked=None)
         Magnitudes and differences by kind.
     limit : float, optional
         Half height of the axes.
-    labels : tuple of str, optional
-        Labels of the axes.
-    running : dict of str to tuple, optional
-        Middle, median and scatter of bins (`~miricigale.evaluation.running_median`) by kind.
     marked : dict of str to array-like of bool, shape (n,), optional
         Sources that get a circle, such as crowded ones, by kind.
 
@@ -134,16 +134,11 @@ def offsets_figure(groups, *, limit=1.0, labels=None, running=None, marked=None)
     figure : `~matplotlib.figure.Figure`
     """
     figure, axes = panels(groups, height=3.1, sharex=True, sharey=True)
-    columns = panel_columns(len(axes))
-    for k, (label, ax) in enumerate(axes.items()):
+    for label, ax in axes.items():
         mag, offset = (np.asarray(v, float) for v in groups[label])
         good = np.isfinite(mag) & np.isfinite(offset)
-        bins = (running or {}).get(label)
-        title = f"{label} ({np.count_nonzero(good)})"
-        plot_offsets(
-            mag[good], offset[good], running=bins, ax=ax, limit=limit, labels=labels, title=title
-        )
-        ax.set_title(title, fontsize="medium")
+        plot_offsets(mag[good], offset[good], ax=ax, limit=limit)
+        ax.set_title(f"{label} ({np.count_nonzero(good)})", fontsize="medium")
         if marked is not None:
             rows = good & np.asarray(marked[label], bool)
             place = np.clip(offset[rows], -0.97 * limit, 0.97 * limit)
@@ -151,12 +146,7 @@ def offsets_figure(groups, *, limit=1.0, labels=None, running=None, marked=None)
         if good.any():
             text = f"median {np.median(offset[good]):+.3f}"
             ax.text(0.96, 0.95, text, transform=ax.transAxes, ha="right", va="top", fontsize=8)
-        if k % columns:
-            ax.set_ylabel("")
-        if k + columns < len(axes):
-            ax.set_xlabel("")
-        if k and ax.get_legend():
-            ax.get_legend().remove()
+    label_outer(axes)
     return figure
 
 
@@ -178,12 +168,10 @@ def features_figure(values, ranges, *, limit=0.6):
     figure : `~matplotlib.figure.Figure`
     """
     figure, axes = panels(values, height=2.9, sharex=True, sharey=True)
-    columns = panel_columns(len(axes))
-    labels = ("redshift", "measured - model (mag)")
     for k, (label, ax) in enumerate(axes.items()):
         z, residual = (np.asarray(v, float) for v in values[label])
         good = np.isfinite(z) & np.isfinite(residual)
-        plot_offsets(z[good], residual[good], ax=ax, limit=limit, labels=labels, title=label)
+        plot_offsets(z[good], residual[good], ax=ax, limit=limit)
         ax.set_title(label, fontsize="medium")
         for i, (name, (low, high)) in enumerate(ranges[label].items()):
             if high > low:
@@ -193,9 +181,6 @@ def features_figure(values, ranges, *, limit=0.6):
                 if np.count_nonzero(inside) > 2:
                     ax.plot([low, high], [np.median(residual[inside])] * 2, color=color, lw=2)
         if k == 0:
-            ax.legend(fontsize=8, frameon=False, loc="upper right", ncols=2)
-        if k % columns:
-            ax.set_ylabel("")
-        if k + columns < len(axes):
-            ax.set_xlabel("")
+            legend(ax, loc="upper right", ncols=2)
+    label_outer(axes, "redshift", "measured - model (mag)")
     return figure

@@ -5,7 +5,7 @@ import itertools
 import astropy.units as u
 import numpy as np
 
-from miricigale.plotting.axes import resolve_axes
+from miricigale.plotting.axes import add_borders, legend, resolve_axes
 
 __all__ = [
     "plot_pdf",
@@ -21,6 +21,8 @@ _ARROW = {"fmt": "_", "uplims": True, "color": "tab:blue", "markersize": 10, "zo
 
 #: Colors and markers of groups of bands, which differ in shade too.
 _GROUPS = (("tab:blue", "o"), ("#9a3412", "D"), ("0.35", "^"))
+#: Colors and styles of spectra.
+_SPECTRA = (("0.45", "-"), ("#1d4ed8", ":"), ("C1", "--"), ("C2", "-."))
 
 
 def _value(quantity, unit=None):
@@ -55,15 +57,10 @@ def plot_pdf(edges, weights, *, ax=None, label=None, truth=None, log=False, **kw
     """
     ax = resolve_axes(ax)
     unit = getattr(edges, "unit", u.dimensionless_unscaled)
-    edges = np.asarray(_value(edges), dtype=float)
-    weights = np.asarray(weights, dtype=float)
-    place = np.log10(np.maximum(edges, 1e-300)) if log else edges
-    width = np.diff(place)
-    keep = width > 0
-    density = np.divide(weights, width, out=np.zeros(weights.size), where=keep)
-    kwargs.setdefault("fill", True)
-    kwargs.setdefault("alpha", 0.5)
-    ax.stairs(density, edges, **kwargs)
+    edges, weights = np.asarray(_value(edges), dtype=float), np.asarray(weights, dtype=float)
+    width = np.diff(np.log10(np.maximum(edges, 1e-300)) if log else edges)
+    density = np.divide(weights, width, out=np.zeros(weights.size), where=width > 0)
+    ax.stairs(density, edges, **{"fill": True, "alpha": 0.5, **kwargs})
     if log:
         ax.set_xscale("log")
     if truth is not None:
@@ -71,8 +68,7 @@ def plot_pdf(edges, weights, *, ax=None, label=None, truth=None, log=False, **kw
     if label is not None:
         text = "" if unit == u.dimensionless_unscaled else f" ({unit.to_string()})"
         ax.set_xlabel(f"{label}{text}")
-    ax.set_ylabel("probability density" + (" per dex" if log else ""))
-    ax.set_ylim(bottom=0)
+    ax.set(ylabel="probability density" + (" per dex" if log else ""), ylim=(0, None))
     return ax
 
 
@@ -110,8 +106,7 @@ def plot_pdf_2d(
     weights = np.asarray(weights, dtype=float)
     area = np.diff(x)[:, None] * np.diff(y)
     density = np.divide(weights, area, out=np.zeros(weights.shape), where=area > 0)
-    kwargs.setdefault("cmap", "Blues")
-    ax.pcolormesh(x, y, density.T, **kwargs)
+    ax.pcolormesh(x, y, density.T, **{"cmap": "Blues", **kwargs})
     order = np.argsort(density, axis=None)[::-1]
     inside = np.empty(weights.size)
     total = np.cumsum(weights.ravel()[order])
@@ -119,7 +114,8 @@ def plot_pdf_2d(
     inside[order] = np.concatenate([[0.0], total[:-1]]) / max(total[-1], 1e-300)
     inside = inside.reshape(weights.shape)
     for i, level in enumerate(levels):
-        _outline(ax, x, y, inside < level, linewidth=max(1.5 - 0.7 * i, 0.5))
+        border = {"colors": "black", "linewidth": max(1.5 - 0.7 * i, 0.5)}
+        add_borders(ax, (inside < level).T, x, y, **border)
     for edges, sums, limits in ((x, weights.sum(axis=1), "xlim"), (y, weights.sum(axis=0), "ylim")):
         seen = np.flatnonzero(sums > 1e-4 * sums.sum())
         if seen.size:
@@ -128,22 +124,8 @@ def plot_pdf_2d(
     if truth is not None:
         ax.plot(*truth, marker="x", color="tab:red", markersize=9, markeredgewidth=2)
     if labels is not None:
-        ax.set_xlabel(labels[0])
-        ax.set_ylabel(labels[1])
+        ax.set(xlabel=labels[0], ylabel=labels[1])
     return ax
-
-
-def _outline(ax, x, y, mask, **kwargs):
-    """Draw the border between cells inside and outside of a mask."""
-    from matplotlib.collections import LineCollection
-
-    padded = np.pad(mask, 1)
-    lines = []
-    for i, j in zip(*np.nonzero(padded[1:, 1:-1] != padded[:-1, 1:-1]), strict=True):
-        lines.append([(x[i], y[j]), (x[i], y[j + 1])])
-    for i, j in zip(*np.nonzero(padded[1:-1, 1:] != padded[1:-1, :-1]), strict=True):
-        lines.append([(x[i], y[j]), (x[i + 1], y[j])])
-    ax.add_collection(LineCollection(lines, colors="black", **kwargs))
 
 
 def plot_sed_fit(
@@ -192,13 +174,12 @@ def plot_sed_fit(
     -------
     axes : pair of `~matplotlib.axes.Axes`, or one if one was given
     """
-    import matplotlib.pyplot as plt
-
     residual_ax = None
     if ax is None:
-        _, (ax, residual_ax) = plt.subplots(
-            2, 1, sharex=True, figsize=(7, 5), height_ratios=(3, 1), layout="constrained"
-        )
+        import matplotlib.pyplot as plt
+
+        panels = {"sharex": True, "height_ratios": (3, 1), "layout": "constrained"}
+        _, (ax, residual_ax) = plt.subplots(2, 1, figsize=(7, 5), **panels)
     elif isinstance(ax, (tuple, list, np.ndarray)):
         ax, residual_ax = ax
     wave, flux = _value(wave, u.um), _value(flux, u.uJy)
@@ -206,56 +187,33 @@ def plot_sed_fit(
     used = np.ones(wave.size, bool) if used is None else np.asarray(used, bool)
     limit = np.zeros(wave.size, bool) if limit is None else np.asarray(limit, bool)
     have = np.isfinite(flux) & np.isfinite(err)
-    limits = np.concatenate([flux[have & (flux > 0)], model[np.isfinite(model) & (model > 0)]])
-    low, high = (limits.min() / 4, limits.max() * 4) if limits.size else (0.1, 10.0)
+    shown = np.concatenate([flux[have & (flux > 0)], model[np.isfinite(model) & (model > 0)]])
+    low, high = (shown.min() / 4, shown.max() * 4) if shown.size else (0.1, 10.0)
     if spectrum is not None:
         parts = {"best model": spectrum, **(parts or {})}
-    styles = [
-        ("0.45", "-", 1.1),
-        *((color, ls, 1.0) for color, ls in (("#1d4ed8", ":"), ("C1", "--"), ("C2", "-."))),
-    ]
     for k, (label, (x, y)) in enumerate((parts or {}).items()):
         x, y = _value(x, u.um), _value(y, u.uJy)
-        shown = (x > 0.5 * wave.min()) & (x < 2.0 * wave.max())
-        color, line, width = styles[k % len(styles)]
-        ax.plot(x[shown], y[shown], color=color, ls=line, linewidth=width, zorder=1, label=label)
-    ax.plot(
-        wave, model, "s", color="tab:orange", markersize=7, fillstyle="none", zorder=3,
-        label="best model in the bands",
-    )  # fmt: skip
-    legend = bool(parts) or groups is not None
-    groups = np.full(wave.size, "") if groups is None else np.asarray(groups, str)
-    kinds = dict(zip(dict.fromkeys(groups.tolist()), itertools.cycle(_GROUPS)))
-    above = have & (flux > 0) & ~limit
+        near = (x > 0.5 * wave.min()) & (x < 2.0 * wave.max())
+        color, line = _SPECTRA[k % len(_SPECTRA)]
+        ax.plot(x[near], y[near], color=color, ls=line, lw=1.0, zorder=1, label=label)
+    boxes = {"color": "tab:orange", "markersize": 7, "fillstyle": "none"}
+    ax.plot(wave, model, "s", zorder=3, label="best model in the bands", **boxes)
+    points = _points(groups, used, limit)
+    for rows, label, style in points:
+        rows = rows & have & (flux > 0)
+        ax.errorbar(wave[rows], flux[rows], err[rows], zorder=4, label=label, **style)
     below = have & ~(flux > 0) & ~limit
-    for group, (color, marker) in kinds.items():
-        for keep, fill in ((used, "full"), (~used, "none")):
-            keep = keep & above & (groups == group)
-            ax.errorbar(
-                wave[keep],
-                flux[keep],
-                yerr=err[keep],
-                fmt=marker,
-                color=color,
-                fillstyle=fill,
-                markersize=5,
-                zorder=4,
-                label=group if group and fill == "full" else None,
-            )
-    top = np.maximum(flux, 0.0) + 2.0 * err
     if np.any(below):
-        ax.plot(wave[below], np.maximum(top[below], low), "v", color="tab:blue", zorder=4)
+        top = np.maximum(np.maximum(flux, 0.0) + 2.0 * err, low)[below]
+        ax.plot(wave[below], top, "v", color="tab:blue", zorder=4)
     bound = have & limit
     if np.any(bound):
         top = np.maximum(flux[bound], 3.0 * low)
         ax.errorbar(wave[bound], top, yerr=0.5 * top, **_ARROW)
-    ax.set_xscale("log")
-    ax.set_yscale("log")
-    ax.set_xlim(0.7 * wave.min(), 1.4 * wave.max())
-    ax.set_ylim(low, high)
-    ax.set_ylabel("flux density (µJy)")
-    if legend:
-        ax.legend(fontsize=8, frameon=False)
+    ax.set(xscale="log", xlim=(0.7 * wave.min(), 1.4 * wave.max()))
+    ax.set(yscale="log", ylim=(low, high), ylabel="flux density (µJy)")
+    if parts or groups is not None:
+        legend(ax)
     if title is not None:
         ax.set_title(title, fontsize="medium")
     if residual_ax is None:
@@ -263,21 +221,28 @@ def plot_sed_fit(
         return ax
     pull = np.where(have, (flux - model) / np.where(have, err, 1.0), np.nan)
     residual_ax.axhline(0.0, color="0.6", linewidth=0.8)
-    for group, (color, marker) in kinds.items():
-        for keep, fill in ((used, "full"), (~used, "none")):
-            keep = keep & ~limit & (groups == group)
-            residual_ax.plot(
-                wave[keep], pull[keep], marker, color=color, fillstyle=fill, markersize=5
-            )
+    for rows, _, style in points:
+        residual_ax.plot(wave[rows], pull[rows], **style)
     # of limits only those that the model passes have to be seen
     seen = have & ~(limit & (pull > 0))
     size = np.nanmax(np.abs(pull[seen]), initial=2.5) * 1.15
     if np.any(bound):
         residual_ax.errorbar(wave[bound], pull[bound], yerr=0.25 * size, **_ARROW)
-    residual_ax.set_ylim(-size, size)
-    residual_ax.set_ylabel("residual (sigma)")
+    residual_ax.set(ylim=(-size, size), ylabel="residual (sigma)")
     residual_ax.set_xlabel("observed wavelength (µm)")
     return ax, residual_ax
+
+
+def _points(groups, used, limit):
+    """Rows, label and style of the measured bands of each group, fitted (full) and not (open)."""
+    names = np.full(used.size, "") if groups is None else np.asarray(groups, str)
+    points = []
+    for name, (color, marker) in zip(dict.fromkeys(names.tolist()), itertools.cycle(_GROUPS)):
+        for rows, fill in ((used, "full"), (~used, "none")):
+            style = {"color": color, "marker": marker, "fillstyle": fill, "markersize": 5, "ls": ""}
+            label = name if name and fill == "full" else None
+            points.append((rows & ~limit & (names == name), label, style))
+    return points
 
 
 def plot_sed_band(wave, bands, *, ax=None, rest=True, color="tab:blue", label=None, **kwargs):
@@ -312,20 +277,18 @@ def plot_sed_band(wave, bands, *, ax=None, rest=True, color="tab:blue", label=No
         rows = [(nu * band).to_value(u.W) for band in bands]
     else:
         rows = [_value(band, u.uJy) for band in bands]
-    kwargs.setdefault("alpha", 0.3)
+    style = {"color": color, "linewidth": 0, "alpha": 0.3, **kwargs}
     n = len(rows)
     for i in range(n // 2):
         text = label if i == 0 and n % 2 == 0 else None
-        ax.fill_between(x, rows[i], rows[n - 1 - i], color=color, linewidth=0, label=text, **kwargs)
+        ax.fill_between(x, rows[i], rows[n - 1 - i], label=text, **style)
     if n % 2:
         ax.plot(x, rows[n // 2], color=color, linewidth=1, label=label)
     top = max(float(np.max(row)) for row in rows)
-    ax.set_xscale("log")
-    ax.set_yscale("log")
+    ax.set(xscale="log", xlabel=f"{'rest' if rest else 'observed'} wavelength (µm)")
+    ax.set(yscale="log", ylabel=r"$\nu L_\nu$ (W)" if rest else "flux density (µJy)")
     if top > 0:
         ax.set_ylim(1e-5 * top, 3.0 * top)
-    ax.set_xlabel(f"{'rest' if rest else 'observed'} wavelength (µm)")
-    ax.set_ylabel(r"$\nu L_\nu$ (W)" if rest else "flux density (µJy)")
     return ax
 
 
@@ -361,11 +324,9 @@ def plot_recovery(true, mean, std, *, ax=None, name=None, unit="", log=False, **
         ends = np.array([true[good].min(), true[good].max()])
         ax.plot(ends, ends, color="0.4", linewidth=1)
     if log:
-        ax.set_xscale("log")
-        ax.set_yscale("log")
-    text = f" ({unit})" if unit else ""
-    ax.set_xlabel(f"true {name or ''}{text}")
-    ax.set_ylabel(f"recovered {name or ''}{text}")
+        ax.set(xscale="log", yscale="log")
+    text = f"{name or ''}{f' ({unit})' if unit else ''}"
+    ax.set(xlabel=f"true {text}", ylabel=f"recovered {text}")
     return ax
 
 
@@ -399,7 +360,6 @@ def plot_pulls(pull, *, ax=None, label=None, limit=5.0, **kwargs):
         edges = np.linspace(-limit, limit, 21)
         options = {"histtype": "step", "density": True} | kwargs
         ax.hist(pull, bins=edges, label=label, **options)
-    ax.set_xlim(-limit, limit)
-    ax.set_xlabel("(measured - predicted) / error")
+    ax.set(xlim=(-limit, limit), xlabel="(measured - predicted) / error")
     ax.set_ylabel("probability density")
     return ax

@@ -2,8 +2,16 @@
 
 import numpy as np
 
-from miricigale.plotting.axes import new_figure, panel_columns, panels
-from miricigale.plotting.comparison import MEASURED, SECOND, TRUE, plot_histogram
+from miricigale.plotting.axes import (
+    MEASURED,
+    SECOND,
+    STYLES,
+    TRUE,
+    label_outer,
+    legend,
+    new_figure,
+    panels,
+)
 
 __all__ = [
     "classes_figure",
@@ -16,21 +24,7 @@ __all__ = [
     "recovery_figure",
 ]
 
-#: Colors and markers of band sets, in their order.
-_SETS = ((MEASURED, "o"), (SECOND, "s"), ("0.4", "^"), ("#15803d", "D"))
-
-
-def _outer_labels(axes, xlabel, ylabel):
-    """Label the outer axes of `panels`, and keep one legend."""
-    axes = list(axes.values())
-    columns = panel_columns(len(axes))
-    for k, ax in enumerate(axes):
-        last = k + columns >= len(axes)
-        ax.set_xlabel(xlabel if last else "")
-        ax.set_ylabel("" if k % columns else ylabel)
-        ax.tick_params(labelbottom=True)
-        if k and ax.get_legend():
-            ax.get_legend().remove()
+_RANK_BINS = 10
 
 
 def histograms_figure(samples, bins, *, xlabel, truth=None):
@@ -57,11 +51,16 @@ def histograms_figure(samples, bins, *, xlabel, truth=None):
     figure, axes = panels(samples, sharex=True)
     middle = 0.5 * (bins[[0, -2]] + bins[[1, -1]])
     for label, ax in axes.items():
-        inside = {name: np.clip(v, *middle) for name, v in samples[label].items()}
-        plot_histogram(inside, bins, ax=ax, title=label, truth=(truth or {}).get(label))
-        ax.set_title(label, fontsize="medium")
+        for k, (name, values) in enumerate(samples[label].items()):
+            inside = np.clip(np.asarray(values, float), *middle)
+            # the fifth has the first color, dashed
+            style = {"color": STYLES[k % 4][0], "ls": ("-", "--", ":")[k // 4 % 3], "lw": 1.6}
+            ax.hist(inside[np.isfinite(inside)], bins, histtype="step", label=name, **style)
+        if (truth or {}).get(label) is not None:
+            ax.axvline(truth[label], color=TRUE, lw=1, ls="--", label="truth")
         ax.set_xlim(bins[0], bins[-1])
-    _outer_labels(axes, xlabel, "sources")
+        legend(ax)
+    label_outer(axes, xlabel, "sources")
     return figure
 
 
@@ -83,13 +82,13 @@ def fractions_figure(values):
         ax.plot([0, 1], [0, 1], color=TRUE, lw=1)
         count = len(values[label])
         for k, (name, (true, median, scatter)) in enumerate(values[label].items()):
-            color, marker = _SETS[k % len(_SETS)]
-            # beside each other, so that the bars can be told apart
+            color, marker = STYLES[k % len(STYLES)]
+            # side by side, so that the bars do not cover each other
             place = np.asarray(true, float) + 0.015 * (k - 0.5 * (count - 1))
             ax.errorbar(place, median, scatter, fmt=marker, ms=4.5, color=color, lw=1.2, label=name)
         ax.set(xlim=(-0.07, 1.07), ylim=(-0.12, 1.12))
-        ax.legend(fontsize=8, frameon=False, loc="upper left")
-    _outer_labels(axes, "injected fracAGN", "fitted fracAGN")
+        legend(ax, loc="upper left")
+    label_outer(axes, "injected fracAGN", "fitted fracAGN")
     return figure
 
 
@@ -127,7 +126,7 @@ def recovery_figure(values, *, label, notes=None):
             ax.plot(ends, ends, color=TRUE, lw=1)
             ax.fill_between(ends, ends / 2, ends * 2, color=TRUE, alpha=0.12, lw=0)
             ax.set(xlim=ends, ylim=ends)
-    _outer_labels(axes, f"true {label}", f"fitted {label}")
+    label_outer(axes, f"true {label}", f"fitted {label}")
     return figure
 
 
@@ -163,25 +162,22 @@ def completeness_figure(table, *, xlabel, limits=(), half=None):
     lower.vlines(place, some["share_low"], some["share_high"], color=MEASURED, lw=1.2)
     lower.plot(place, some["share"], "o", ms=4, color=MEASURED)
     lower.axhline(0.5, color=TRUE, lw=0.8, ls="--")
-    if half is not None and np.isfinite(half[0]):
-        for ax in (upper, lower):
-            ax.axvspan(half[1], half[2], color=MEASURED, alpha=0.15, lw=0)
-            label = "50 % of these" if ax is upper else None
-            ax.axvline(half[0], color=MEASURED, lw=1.2, label=label)
     shades = (SECOND, "0.2", "#15803d", "#7c3aed")
-    for k, (value, name, known) in enumerate(limits):
-        for ax in (upper, lower):
-            label = name if ax is upper else None
+    for ax in (upper, lower):
+        if half is not None and np.isfinite(half[0]):
+            ax.axvspan(half[1], half[2], color=MEASURED, alpha=0.15, lw=0)
+            ax.axvline(half[0], color=MEASURED, lw=1.2, label="50 % of these")
+        for k, (value, name, known) in enumerate(limits):
             style = {"color": shades[k % len(shades)], "ls": "-" if known else ":"}
-            ax.axvline(value, lw=1.6, label=label, **style)
+            ax.axvline(value, lw=1.6, label=name, **style)
     # above the axes, which are full of lines
-    upper.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=3)
+    legend(upper, loc="lower left", bbox_to_anchor=(0, 1), ncols=3)
     upper.set(ylabel="sources", xlim=(bins[0], bins[-1]))
     lower.set(ylabel="share found", xlabel=xlabel, ylim=(-0.05, 1.08))
     return figure
 
 
-def luminosity_figure(redshift, luminosity, groups, *, sfr=None, curves=None):
+def luminosity_figure(redshift, luminosity, groups, *, sfr=None):
     """
     Infrared luminosity against redshift with an axis of star-formation rates, and detections.
 
@@ -193,8 +189,6 @@ def luminosity_figure(redshift, luminosity, groups, *, sfr=None, curves=None):
         Detected sources by label, drawn over each other in this order; all others are gray.
     sfr : tuple, optional
         Star-formation rate (Msun / yr) of one Lsun, and the label of the axis on the right.
-    curves : dict of str to tuple of array-like, optional
-        Redshifts and luminosities of limits, by label.
 
     Returns
     -------
@@ -204,21 +198,13 @@ def luminosity_figure(redshift, luminosity, groups, *, sfr=None, curves=None):
     ax = axes[0, 0]
     z, power = np.asarray(redshift, float), np.asarray(luminosity, float)
     good = (power > 0) & np.isfinite(z)
-    seen = np.zeros(z.size, bool)
-    for rows in groups.values():
-        seen |= np.asarray(rows, bool)
-    rest = good & ~seen
+    rest = good & ~np.any([np.zeros(z.size, bool), *groups.values()], axis=0)
     ax.semilogy(z[rest], power[rest], ".", ms=4, color="0.75", label="not detected", zorder=1)
     for k, (name, rows) in enumerate(groups.items()):
-        color, marker = _SETS[k % len(_SETS)]
+        color, marker = STYLES[k % len(STYLES)]
         rows = good & np.asarray(rows, bool)
-        size = 3 + 2.5 * k
-        face = color if k == 0 else "none"
-        ax.plot(
-            z[rows], power[rows], marker, ms=size, color=color, mfc=face, alpha=0.75, label=name
-        )
-    for k, (name, (x, y)) in enumerate((curves or {}).items()):
-        ax.plot(x, y, color=TRUE, lw=1.4, ls=("--", ":", "-.")[k % 3], label=name)
+        style = {"ms": 3 + 2.5 * k, "color": color, "mfc": "none" if k else color, "alpha": 0.75}
+        ax.plot(z[rows], power[rows], marker, label=name, **style)
     if good.any():
         low, high = np.percentile(power[good], [1, 100])
         ax.set(xlim=(0, 1.03 * z[good].max()), ylim=(0.5 * low, 2 * high))
@@ -228,11 +214,11 @@ def luminosity_figure(redshift, luminosity, groups, *, sfr=None, curves=None):
         right = ax.secondary_yaxis("right", functions=(lambda v: v * factor, lambda v: v / factor))
         right.set_ylabel(label)
     # above the axes, which are full of points
-    ax.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=4)
+    legend(ax, loc="lower left", bbox_to_anchor=(0, 1), ncols=4)
     return figure
 
 
-def classes_figure(counts, names, *, found=None):
+def classes_figure(counts, names, *, found):
     """
     Shares of the sources of each true class that are found in each class.
 
@@ -242,15 +228,14 @@ def classes_figure(counts, names, *, found=None):
         Sources by true class and class found.
     names : sequence of str
         Names of the n true classes.
-    found : sequence of str, optional
-        Names of the m classes found; the same by default.
+    found : sequence of str
+        Names of the m classes found.
 
     Returns
     -------
     figure : `~matplotlib.figure.Figure`
     """
     counts = np.asarray(counts, float)
-    found = list(names if found is None else found)
     total = counts.sum(axis=1, keepdims=True)
     share = np.divide(counts, total, out=np.zeros(counts.shape), where=total > 0)
     figure, axes = new_figure(size=(1.3 + 1.1 * len(found), 1.0 + 0.8 * len(names)))
@@ -259,23 +244,16 @@ def classes_figure(counts, names, *, found=None):
     for (i, j), value in np.ndenumerate(share):
         text = f"{100 * value:.0f} %\n{counts[i, j]:.0f}"
         ax.text(j, i, text, ha="center", va="center", fontsize=9)
-    ax.set(
-        xticks=range(len(found)),
-        xticklabels=found,
-        yticks=range(len(names)),
-        yticklabels=list(names),
-        xlabel="found as",
-        ylabel="true class",
-    )
+    ax.set(xticks=range(len(found)), xticklabels=found, xlabel="found as")
+    ax.set(yticks=range(len(names)), yticklabels=names, ylabel="true class")
     ax.tick_params(length=0)
-    for side in ax.spines.values():
-        side.set_visible(False)
+    ax.spines[:].set_visible(False)
     return figure
 
 
 def colors_figure(planes, *, labels):
     """
-    Planes of two colors with sources of each class and the circles that tell them apart.
+    Planes of two colors with sources of each class and the circles that separate them.
 
     Parameters
     ----------
@@ -295,21 +273,20 @@ def colors_figure(planes, *, labels):
         colors, classes, center, radii = planes[title]
         colors, classes = np.asarray(colors, float), np.asarray(classes, str)
         for i, name in enumerate(dict.fromkeys(sorted(classes.tolist()))):
-            shade, marker = _SETS[i % len(_SETS)]
+            shade, marker = STYLES[i % len(STYLES)]
             rows = classes == name
             ax.plot(*colors[rows].T, marker, ms=3.5, color=shade, alpha=0.55, label=name)
         for radius, style in zip(radii, ("-", "--"), strict=False):
             circle = {"fill": False, "color": "black", "lw": 1.3, "ls": style, "zorder": 5}
             ax.add_patch(Circle(center, radius, **circle))
-        ax.set(
-            xlabel=labels[title][0], ylabel=labels[title][1], aspect="equal", adjustable="datalim"
-        )
+        ax.set(xlabel=labels[title][0], ylabel=labels[title][1])
+        ax.set_aspect("equal", adjustable="datalim")
         if k == 0:
-            ax.legend(fontsize=8, frameon=False, loc="upper left")
+            legend(ax, loc="upper left")
     return figure
 
 
-def ranks_figure(ranks, *, bins=10):
+def ranks_figure(ranks):
     """
     Histograms of the ranks of true values in their posteriors, with what chance allows.
 
@@ -318,33 +295,26 @@ def ranks_figure(ranks, *, bins=10):
     ranks : dict of str to dict of str to array-like
         Ranks between 0 and 1 (`~miricigale.evaluation.posterior_ranks`) by parameter and fit; NaN is
         left out.
-    bins : int, optional
-        Bins.
 
     Returns
     -------
     figure : `~matplotlib.figure.Figure`
     """
     figure, axes = panels(ranks, height=2.6, sharex=True)
-    edges = np.linspace(0, 1, bins + 1)
     for label, ax in axes.items():
-        least = 0
+        most = 0
         for k, (name, values) in enumerate(ranks[label].items()):
             values = np.asarray(values, float)
-            values = values[np.isfinite(values)]
-            n, _ = np.histogram(values, edges)
-            least = max(least, values.size)
-            density = n * bins / max(values.size, 1)
-            color = _SETS[k % len(_SETS)][0]
-            ax.stairs(
-                density, edges, color=color, lw=1.6, ls=("-", "--", ":", "-.")[k % 4], label=name
-            )
-        if least:
+            n, edges = np.histogram(values[np.isfinite(values)], _RANK_BINS, (0, 1))
+            most = max(most, n.sum())
+            style = {"color": STYLES[k % 4][0], "lw": 1.6, "ls": ("-", "--", ":", "-.")[k % 4]}
+            ax.stairs(n * _RANK_BINS / max(n.sum(), 1), edges, label=name, **style)
+        if most:
             # binomial, of a uniform distribution
-            error = np.sqrt((bins - 1) / least)
+            error = np.sqrt((_RANK_BINS - 1) / most)
             ax.axhspan(1 - error, 1 + error, color="0.88", zorder=0)
         ax.axhline(1, color=TRUE, lw=0.8)
         ax.set(xlim=(0, 1), ylim=(0, max(2.0, 1.05 * ax.get_ylim()[1])))
-        ax.legend(fontsize=8, frameon=False, loc="upper center")
-    _outer_labels(axes, "rank of the truth", "density")
+        legend(ax, loc="upper center")
+    label_outer(axes, "rank of the truth", "density")
     return figure

@@ -1,4 +1,4 @@
-"""PSFs of stpsf, STScI's own PSF simulator (optional)."""
+"""The door to stpsf, STScI's own PSF simulator (optional)."""
 
 import os
 

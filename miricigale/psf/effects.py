@@ -7,7 +7,7 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 
 from miricigale.psf import _core
 from miricigale.psf.optics import jwst_constants
-from miricigale.utils.options import check_choice
+from miricigale.utils.exceptions import argument_error
 
 __all__ = [
     "EFFECTS",
@@ -42,7 +42,8 @@ _CENTRAL_CELL = 4 * math.log(1 + math.sqrt(2))
 
 def _amplitude(filter_name, calibration):
     """Light scattered along each axis per pixel of distance, beyond the inner radius."""
-    check_choice(calibration, "calibration", ("flight", "stpsf"))
+    if calibration not in ("flight", "stpsf"):
+        raise argument_error("calibration", "'flight' or 'stpsf'", repr(calibration))
     # the tabulated kernel holds at an oversampling of 4: one pixel is 4 cells of A / 4^2
     amplitude = jwst_constants()["cruciform"].get(filter_name, 0.0) / 4
     return amplitude * (_IN_FLIGHT.get(filter_name, 1.0) if calibration == "flight" else 1.0)

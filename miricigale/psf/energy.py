@@ -67,7 +67,7 @@ def radius_of_encircled_energy(psf, fraction):
     psf : `~photutils.psf.ImagePSF`
         A PSF with the meta of `~miricigale.psf.make_psf`.
     fraction : float
-        Between 0 and 1, of all light.
+        Of all light, between 0 and 1.
 
     Returns
     -------
@@ -82,7 +82,7 @@ def radius_of_encircled_energy(psf, fraction):
     psf = instrument_psf(psf)
     cells = np.arange(0.0, psf.half_width / psf.cell, 0.25)
     sums = _core.radial_sums(psf.data, *psf.origin, cells) / psf.n_cells**2
-    if not 0 < fraction <= min(1.0, sums[-1]):
+    if not 0 < fraction <= min(1, sums[-1]):
         wanted = f"positive and at most the {sums[-1]:.4f} that the PSF's grid holds"
         raise argument_error("fraction", wanted, fraction)
     k = int(np.argmax(sums >= fraction))

@@ -26,8 +26,8 @@ _WFC3_PIXEL, _WFC3_PIXFRAC = 0.128, 0.8
 @functools.lru_cache(maxsize=8)
 def _hst_optics(name, cell, n, angle):
     pupil = hst_pupil(angle=angle)
-    waves = band_quantiles(name, 9)
-    data = polychromatic_psf(pupil, np.zeros((pupil.n, pupil.n)), waves, step=cell, n=n)
+    flat = np.zeros((pupil.n, pupil.n))
+    data = polychromatic_psf(pupil, flat, band_quantiles(name), step=cell, n=n)
     data.flags.writeable = False
     return data
 
@@ -111,8 +111,7 @@ def hst_psf(
     if fwhm is None:
         sigma = _hst_blur("wfc3.f160w", 0.20, scale)
     else:
-        target = float(to_array(fwhm, ANGLE, "fwhm"))
-        sigma = _hst_blur(name, target, scale)
+        sigma = _hst_blur(name, float(to_array(fwhm, ANGLE, "fwhm")), scale)
     cell = scale / oversampling
     # vanes at 45 deg to +y; on the sky an angle east of north is counter-clockwise
     turn = float(to_array(angle, u.deg, "angle"))

@@ -18,7 +18,6 @@ from miricigale.psf.wiener import (
     wiener,
 )
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_choice
 from miricigale.utils.unified import read_write, unified_read
 from miricigale.utils.units import ANGLE, frozen_array, positive, to_array
 
@@ -191,7 +190,8 @@ class MatchingKernel:
         1.0
         """
         scale = float(to_array(pixel_scale, ANGLE, "pixel_scale"))
-        check_choice(resampling, "resampling", ("drizzle", None))
+        if resampling not in ("drizzle", None):
+            raise argument_error("resampling", "'drizzle' or None", repr(resampling))
         source, target, mended = psf_pair(
             hi, lo, scale, angles=(hi_angle, lo_angle), grid_angle=grid_angle,
             resampling=resampling, extent=extent, normalize=normalize,

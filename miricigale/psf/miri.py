@@ -128,8 +128,6 @@ def miri_psf(
     seed=1,
     includes=EFFECTS,
     calibration="flight",
-    n_wavelengths=9,
-    n_pupil=384,
     position=None,
     subarray="FULL",
 ):
@@ -137,7 +135,8 @@ def miri_psf(
     PSF of the MIRI imager, from the telescope's pupil.
 
     Matrix Fourier transforms of the segmented pupil with a random wavefront error, summed
-    over the filter's band, then what the detector does to it.
+    over the filter's band (nine wavelengths of equal photon rate of a source of constant F_nu), then
+    what the detector does to it.
 
     Parameters
     ----------
@@ -159,10 +158,6 @@ def miri_psf(
         With ``"flight"``, F560W scatters twice the light of stpsf's cruciform, 35 % of it into a
         diffuse halo, and gets, as part of the jitter, a blur of 0.03 arcsec (rms of the
         radius; 0.021 per axis).
-    n_wavelengths : int, optional
-        Wavelengths per band, of equal weight.
-    n_pupil : int, optional
-        Cells across the pupil.
     position : tuple of float, optional
         Where on the array, 0-based pixels x, y: the image is then sampled by the pixel
         that the distortion makes there (its sides, turn and shear) and the cruciform's
@@ -207,7 +202,7 @@ def miri_psf(
     unknown = set(includes) - set(EFFECTS)
     if unknown:
         raise argument_error("includes", f"out of {EFFECTS}", sorted(unknown))
-    telescope = Telescope(name, _V3_ANGLE, wavefront_error, seed, n_wavelengths, n_pupil)
+    telescope = Telescope.of(name, _V3_ANGLE, wavefront_error, seed)
     # written order, whatever the caller's
     effects = tuple(effect for effect in EFFECTS if effect in includes)
     place = None if position is None else (*(float(v) for v in position), subarray)

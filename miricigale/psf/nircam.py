@@ -16,16 +16,7 @@ _PIXELS |= dict.fromkeys((f"nircam.f{n}w" for n in (277, 356, 444)), 0.063)
 NIRCAM_FILTERS = tuple(_PIXELS)
 
 
-def nircam_psf(
-    filter,
-    *,
-    oversampling=4,
-    fov=None,
-    wavefront_error=75 * u.nm,
-    seed=1,
-    n_wavelengths=9,
-    n_pupil=384,
-):
+def nircam_psf(filter, *, oversampling=4, fov=None, wavefront_error=75 * u.nm, seed=1):
     """
     PSF of a wide filter of NIRCam, by the optics of `miri_psf`.
 
@@ -42,7 +33,7 @@ def nircam_psf(
         Cells per pixel of 0.031 arcsec (to F200W) or 0.063 arcsec.
     fov : `~astropy.units.Quantity`, optional
         Width of the grid; 6 arcsec to F200W, 10 arcsec beyond by default.
-    wavefront_error, seed, n_wavelengths, n_pupil
+    wavefront_error, seed
         As for `miri_psf`: the same seed is the same telescope.
 
     Returns
@@ -68,7 +59,7 @@ def nircam_psf(
     scale = _PIXELS[name]
     oversampling, width = checked_grid(oversampling, fov, 6.0 if scale < 0.05 else 10.0)
     # the detectors' axes stand within 0.6 deg of the telescope's
-    telescope = Telescope(name, 0.0, wavefront_error, seed, n_wavelengths, n_pupil)
+    telescope = Telescope.of(name, 0.0, wavefront_error, seed)
     cell = scale / oversampling
     data = telescope.image(cell, odd_cells(width, cell))
     jitter = jwst_constants()["jitter"] / scale

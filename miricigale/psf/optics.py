@@ -19,8 +19,8 @@ __all__ = ["Pupil", "hst_pupil", "jwst_constants", "jwst_pupil", "polychromatic_
 #: One arcsecond in rad.
 ARCSEC = math.pi / 180 / 3600
 
-#: Share of the variance of the wavefront error in the segment terms.
-_OF_SEGMENTS = 0.6
+#: Share of the variance of a wavefront error that is in terms of single segments.
+_SEGMENT_FRACTION = 0.6
 
 #: Lines per pupil cell along y at which outlines are sampled.
 _ROWS = 8
@@ -103,7 +103,7 @@ class Pupil:
         a = math.radians(self.angle)
         x, y = -u * math.cos(a) + v * math.sin(a), u * math.sin(a) + v * math.cos(a)
         rng = stream(seed, "psf", "wavefront")
-        return _core.wavefront(self.amplitude, self.segments, x, y, rms, _OF_SEGMENTS, rng)
+        return _core.wavefront(self.amplitude, self.segments, x, y, rms, _SEGMENT_FRACTION, rng)
 
 
 @functools.cache

@@ -11,7 +11,6 @@ from miricigale.psf import _core
 from miricigale.psf.effects import detector_response
 from miricigale.psf.model import instrument_psf
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_choice, check_least
 from miricigale.utils.units import ANGLE, positive, to_array
 
 __all__ = ["average_psf", "psf_image", "psf_mosaic", "rotate_psf"]
@@ -236,7 +235,8 @@ def psf_mosaic(
     Fruchter & Hook 2002, PASP 114, 144.
     """
     psf = instrument_psf(psf)
-    check_choice(resampling, "resampling", ("drizzle", None))
+    if resampling not in ("drizzle", None):
+        raise argument_error("resampling", "'drizzle' or None", repr(resampling))
     if not 0 < pixfrac <= 1:
         raise argument_error("pixfrac", "above 0 and at most 1", pixfrac)
     scale = positive(pixel_scale, ANGLE, "pixel_scale")
@@ -245,7 +245,8 @@ def psf_mosaic(
     turns = [_turn_by(psf, angle, grid, "pa") for angle in angles]
     if oversampling is None:
         oversampling = max(1, math.ceil(scale / psf.cell - 1e-6))
-    check_least(oversampling, "oversampling", 1, whole=True)
+    if int(oversampling) != oversampling or oversampling < 1:
+        raise argument_error("oversampling", "a positive integer", oversampling)
     cell = scale / oversampling
     width = 2 * psf.half_width if fov is None else positive(fov, ANGLE, "fov")
     n = 2 * round(0.5 * width / cell - 0.5) + 1

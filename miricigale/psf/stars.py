@@ -17,7 +17,6 @@ from miricigale.psf.effects import EFFECTS
 from miricigale.psf.model import make_psf
 from miricigale.psf.resample import psf_image
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_least
 from miricigale.utils.units import ANGLE, positive, to_array
 
 __all__ = ["psf_from_stars"]
@@ -104,6 +103,7 @@ def psf_from_stars(
     angle=0.0 * u.deg,
     includes=EFFECTS,
     enclosed=1.0,
+    max_iterations=10,
     progress_bar=False,
 ):
     """
@@ -136,6 +136,8 @@ def psf_from_stars(
     enclosed : float or `~photutils.psf.ImagePSF`, optional
         Fraction of a star's light within the stamp, or a PSF to take it from; stars do not
         tell. With 1 the encircled energies are those relative to the stamp.
+    max_iterations : int, optional
+        Most rounds of stacking and fitting.
     progress_bar : bool, optional
         Whether to show one.
 
@@ -163,7 +165,8 @@ def psf_from_stars(
     """
     images = _checked_images(images)
     scale = _pixel_scale(images, pixel_scale)
-    check_least(oversampling, "oversampling", 1, whole=True)
+    if isinstance(oversampling, float) or oversampling < 1:
+        raise argument_error("oversampling", "a positive integer", oversampling)
     width = float(to_array(fov, ANGLE, "fov", ndim=0))
     size = 2 * round(0.5 * width / scale - 0.5) + 1
     if not size >= 7:
@@ -174,7 +177,7 @@ def psf_from_stars(
         raise argument_error("stars", f"at least {least} with stamps on the images", len(stamps))
     builder = EPSFBuilder(
         oversampling=int(oversampling),
-        maxiters=10,
+        maxiters=int(max_iterations),
         smoothing_kernel="quartic",
         progress_bar=progress_bar,
     )

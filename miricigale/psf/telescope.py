@@ -9,8 +9,7 @@ import numpy as np
 from miricigale.filters import Filter
 from miricigale.psf.optics import jwst_pupil, polychromatic_psf
 from miricigale.refdata import citations
-from miricigale.utils.exceptions import unknown_name
-from miricigale.utils.options import check_least
+from miricigale.utils.exceptions import argument_error, unknown_name
 from miricigale.utils.units import ANGLE, WAVE, positive, to_array
 
 __all__ = ["Telescope", "band_quantiles", "checked_grid", "filter_name", "odd_cells"]
@@ -25,12 +24,12 @@ def filter_name(filter_, known):
 
 
 @functools.lru_cache(maxsize=64)
-def band_quantiles(name, n):
+def band_quantiles(name, n=9):
     """
     Wavelengths (um, ascending) of equal weight that stand for a band.
 
-    The photon rate of a source of flat ``F_nu`` is cut into ``n`` equal parts; each is
-    represented by its median.
+    The photon rate of a source of constant ``F_nu`` is cut into ``n`` equal parts; each is represented by
+    its median.
     """
     band = Filter.from_name(name)
     wave = to_array(band.wave, WAVE, "wave")
@@ -49,7 +48,8 @@ def odd_cells(width, cell):
 
 def checked_grid(oversampling, fov, default):
     """Cells per pixel and width in arcsec of a PSF's grid."""
-    check_least(oversampling, "oversampling", 1, whole=True)
+    if isinstance(oversampling, float) or oversampling < 1:
+        raise argument_error("oversampling", "a positive integer", oversampling)
     return int(oversampling), default if fov is None else positive(fov, ANGLE, "fov")
 
 
@@ -64,30 +64,29 @@ class Telescope:
         Name of the band.
     angle : float
         V3IdlYAngle of the detector in deg (see `jwst_pupil`).
-    wavefront_error : `~astropy.units.Quantity`
-        Root mean square; kept in nm.
+    wavefront_error : float
+        Root mean square in nm.
     seed : int
         The same telescope in all filters.
-    n_wavelengths, n_pupil : int
-        As for `~miricigale.psf.miri_psf`.
-
-    Raises
-    ------
-    ValueError
-        If the number of wavelengths is not positive.
+    n_wavelengths : int
+        Wavelengths of the band, of equal weight.
+    n_pupil : int
+        Cells across the pupil.
     """
 
     filter: str
     angle: float
-    wavefront_error: u.Quantity
+    wavefront_error: float
     seed: int
-    n_wavelengths: int
-    n_pupil: int
+    n_wavelengths: int = 9
+    n_pupil: int = 384
 
-    def __post_init__(self):
-        check_least(self.n_wavelengths, "n_wavelengths", 1, whole=True)
-        rms = float(to_array(self.wavefront_error, u.nm, "wavefront_error"))
-        object.__setattr__(self, "wavefront_error", rms)
+    @classmethod
+    def of(cls, filter, angle, wavefront_error, seed):
+        """The telescope of the options of `~miricigale.psf.miri_psf`, checked."""
+        return cls(
+            filter, angle, float(to_array(wavefront_error, u.nm, "wavefront_error")), int(seed)
+        )
 
     @property
     def meta(self):

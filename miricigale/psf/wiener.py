@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 #: Regularization parameters that have a name; they belong to pixels of 0.06 arcsec.
 REGULARIZATIONS = {"yang2021": 0.03}
 
-# what is rough: the second derivatives, as in Boucaud et al. 2016
+# what is rough: the second derivative
 _LAPLACIAN = np.array([[0, -1, 0], [-1, 4, -1], [0, -1, 0]])
 
 # from smooth to sharp: two steps per decade
@@ -53,8 +53,8 @@ def wiener(source, target):
     """
     The matching kernel, (n, n), of the sum of the wide PSF, as a function of the Wiener parameter.
 
-    That of `photutils.psf_matching.make_wiener_kernel` with the Laplacian as penalty; but what does not depend on
-    the parameter is worked out once for all that are tried.
+    That of `photutils.psf_matching.make_wiener_kernel`; but what does not depend on the parameter
+    is computed once for all that are tried.
     """
     shape = source.shape
     own = rfft2(ifftshift(source))

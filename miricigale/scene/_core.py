@@ -8,7 +8,7 @@ exact sub-pixel placement at the price of one convolution for all sources. Exten
 is deposited cell by cell: near the cusp in small cells at their centroids, farther out one
 cell per node, followed by the filter (1, 6, 1) / 8, which gives with the cell's own width
 (variance 1/12) the variance 1/3 of B3. Where the profile is smooth over many nodes, the deposit
-of a node is the brightness there and a sixth of its Laplacian, worked out on every fourth node
+of a node is the brightness there and a sixth of its Laplacian, computed on every fourth node
 of a row and interpolated between.
 """
 
@@ -23,7 +23,7 @@ from miricigale.utils.compilation import njit
 #: Small cells per node and axis near the cusp.
 SUB = 4
 
-#: In the smooth part one node in so many is worked out, the others by polynomials through six.
+#: Sampling step of the smooth part; nodes between are interpolated (polynomials through six).
 STEP = 4
 LAGRANGE = np.array(
     [
@@ -152,7 +152,7 @@ def deposit_nodes(grid, i, j, light):
 
 @njit(cache=True, nogil=True)
 def _deposit(part, y, x, light, wy, wx):
-    """Put one point's light on the nodes of a part of the grid; beside it, it is lost."""
+    """Put one point's light on the nodes of a part of the grid; light outside it is dropped."""
     ny, nx = part.shape
     iy, ix = math.floor(y), math.floor(x)
     if iy < -2 or ix < -2 or iy > ny or ix > nx:
@@ -166,7 +166,7 @@ def _deposit(part, y, x, light, wy, wx):
 
 @njit(cache=True, nogil=True)
 def deposit_pieces(part, x, y, light):
-    """Put pieces at ``x``, ``y`` (nodes) on a grid of their own; what falls beside it is lost."""
+    """Put pieces at ``x``, ``y`` (nodes) on a separate grid; parts outside it are dropped."""
     wy, wx = np.empty(4), np.empty(4)
     for k in range(x.size):
         _deposit(part, y[k], x[k], light[k], wy, wx)

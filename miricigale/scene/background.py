@@ -53,16 +53,16 @@ class Background:
         object.__setattr__(self, "position_angle", float(angle) * u.deg)
 
     @classmethod
-    def low_zodi(cls, filter, *, gradient=0.05 / u.arcmin, position_angle=45 * u.deg, center=None):
+    def low_zodi(cls, filter, *, center=None):
         """
-        The background of a MIRI filter at low zodiacal light.
+        The background of a MIRI filter at low zodiacal light, with a gradient of 5 % per arcmin.
 
         Parameters
         ----------
         filter : str
             One of `~miricigale.instrument.imager_filters`.
-        gradient, position_angle, center
-            As of the class; by default 5 % per arcmin at 45 deg.
+        center : `~astropy.coordinates.SkyCoord`, optional
+            As of the class.
 
         Examples
         --------
@@ -70,8 +70,7 @@ class Background:
         >>> Background.low_zodi("miri.f770w").gradient
         <Quantity 0.05 1 / arcmin>
         """
-        level = background_level(filter)
-        return cls(level, gradient=gradient, position_angle=position_angle, center=center)
+        return cls(background_level(filter), gradient=0.05 / u.arcmin, center=center)
 
     def image(self, wcs, shape):
         """
@@ -111,9 +110,8 @@ class Background:
         north = (np.cos(dec0) * np.sin(dec) - np.sin(dec0) * np.cos(dec) * np.cos(ra - ra0)) / cos
         angle = self.position_angle.to_value(u.rad)
         along = np.degrees(east * np.sin(angle) + north * np.cos(angle)) * 60.0
-        image = level * (
-            1 + gradient * RectBivariateSpline(*nodes, along)(np.arange(ny), np.arange(nx))
-        )
+        smooth = RectBivariateSpline(*nodes, along)(np.arange(ny), np.arange(nx))
+        image = level * (1 + gradient * smooth)
         if image.min() < 0:
             msg = f"the background's gradient of {self.gradient} makes it negative within the image"
             raise ValueError(msg)

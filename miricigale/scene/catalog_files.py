@@ -1,4 +1,4 @@
-"""Catalogs of people: read from common formats, with their own names and units."""
+"""Catalogs of users, read from common formats with their own names and units."""
 
 import warnings
 from pathlib import Path
@@ -31,7 +31,7 @@ _FAR_OFF = 10.0  # times the counts; overdense fields have a few times as many
 _FAINTEST = 29.5  # AB magnitude that half of the sources of a catalog may be brighter than
 _SPARSE = 27.5, 0.02  # a sample that is fainter, and has fewer times the counts
 _FEW = 20  # sources that counts and colors are not judged by
-#: Median color in dex between bands below and beyond 10 um that tells of another unit.
+#: Median color in dex between bands below and beyond 10 um that indicates another unit.
 _COLOR = 2.2, 2.9
 
 
@@ -61,9 +61,9 @@ def read_catalog(path, catalog_map=None, **options):
     Raises
     ------
     `~miricigale.utils.exceptions.DataError`
-        If there is no such file, or it is no table.
+        If the file does not exist, or is no table.
     KeyError
-        If the map names a column or filter that there is not.
+        If the map names an unknown column or filter.
     ValueError, `~astropy.units.UnitsError`
         If the table is refused by `check_catalog`.
 
@@ -99,14 +99,14 @@ def read_catalog(path, catalog_map=None, **options):
     _, lost = catalog_map.names(table.colnames, path.name)
     table, coded = catalog_map.convert(table, path.name)
     _flags_of_stars(table)
-    told = [*told_of(lost, coded), *_fill_profiles(table, path.name)]
+    texts = [*told_of(lost, coded), *_fill_profiles(table, path.name)]
     catalog = check_catalog(table, argument=path.name)
     for codes in coded.values():
         catalog["flags"][~np.isnan(codes)] |= int(CatalogFlags.MISSING_CODE)
-    told += _missing_fluxes(catalog)
+    texts += _missing_fluxes(catalog)
     # counts need an area that is right
-    told += list(_hours(table, catalog)) or _odd_units(catalog)
-    for text in told:
+    texts += list(_hours(table, catalog)) or _odd_units(catalog)
+    for text in texts:
         warnings.warn(f"{path.name}: {text}", MiricigaleWarning, stacklevel=2)
     return catalog
 
@@ -123,7 +123,7 @@ def _flags_of_stars(table):
 
 
 def _fill_profiles(table, argument):
-    """Make the columns of profiles that are not there; what is to be told."""
+    """Add missing columns of profiles; yield warnings."""
     if "profile" in table.colnames:
         return
     missing = [name for name in _SHAPE if name not in table.colnames]
@@ -142,7 +142,7 @@ def _fill_profiles(table, argument):
 
 
 def _missing_fluxes(catalog):
-    """What is to be told of sources without a flux."""
+    """Warnings about sources without a flux."""
     lost = (catalog["flags"] & int(CatalogFlags.NO_FLUX)) > 0
     if np.any(lost):
         first = ", ".join(map(str, catalog["id"][lost][:5].tolist()))
@@ -154,7 +154,7 @@ def _missing_fluxes(catalog):
 
 
 def _hours(table, catalog):
-    """What is to be told of right ascensions in degrees that look like hours."""
+    """Warnings about right ascensions in degrees that look like hours."""
     if "ra" not in table.colnames or table["ra"].unit != u.deg or len(catalog) < 3:
         return
     ra, dec = catalog["sky"].ra.deg, catalog["sky"].dec.deg
@@ -167,7 +167,7 @@ def _hours(table, catalog):
 
 
 def _odd_units(catalog):
-    """What is to be told of fluxes by their number on the sky and their colors."""
+    """Warnings about units of fluxes, by their number on the sky and their colors."""
     pivots = {
         name: Filter.from_name(name).pivot.value
         for name in catalog.colnames
@@ -197,7 +197,7 @@ def _odd_units(catalog):
 
 
 def _odd_counts(catalog, log_flux, name):
-    """What is to be told of a band by the density of its sources."""
+    """Warnings about the unit of a band, by the density of its sources."""
     median = 23.9 - 2.5 * float(np.nanmedian(log_flux))
     sky = catalog["sky"][np.isfinite(log_flux)]
     ra = sky.ra.wrap_at(sky.ra[0] + 180 * u.deg).deg

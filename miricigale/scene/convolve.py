@@ -97,7 +97,7 @@ def phases(data, origin, oversampling):
     pixels less ``a`` and ``b`` nodes in y and x.
     """
     os_, (cx, cy) = oversampling, origin
-    # room for the splines to die out
+    # space in which the splines decay
     reach = max(cx, cy, data.shape[1] - 1 - cx, data.shape[0] - 1 - cy) + 8
     half = math.ceil((reach + os_) / os_)
     size = half * os_ + os_ - 1

@@ -6,7 +6,7 @@ import warnings
 import astropy.units as u
 import numpy as np
 from astropy.nddata import CCDData
-from astropy.table import QTable, Table
+from astropy.table import Table
 from astropy.wcs import WCS
 from photutils.psf import GriddedPSFModel
 
@@ -21,12 +21,12 @@ from miricigale.scene.render import FieldPainter, Painter
 from miricigale.scene.sky import local_jacobian, pixel_positions
 from miricigale.utils.exceptions import MiricigaleWarning, argument_error
 from miricigale.utils.meta import provenance
-from miricigale.utils.tables import Flags
+from miricigale.utils.tables import Flags, described_table
 from miricigale.utils.units import ANGLE, FNU, SURFACE_BRIGHTNESS, positive, to_array
 
 __all__ = ["Scene", "SceneFlags"]
 
-#: PSFs that tell what they are.
+#: PSFs with known pixel, frame and filter.
 _TYPED = (InstrumentPSF, PSFGrid)
 
 #: uJy per sr in MJy per sr.
@@ -170,12 +170,9 @@ class Scene:
                 raise argument_error("cutouts", f"a Cutout for {key!r}", type(value).__name__)
         rows = np.flatnonzero(self._catalog["profile"] == "cutout")
         ids = {self._catalog["id"][row].item(): int(row) for row in rows}
-        lacking, foreign = (
-            sorted(one, key=str) for one in (set(ids) - set(cutouts), set(cutouts) - set(ids))
-        )
-        if lacking:
+        if lacking := sorted(set(ids) - set(cutouts), key=str):
             raise argument_error("cutouts", "one for each profile 'cutout'", f"none for {lacking}")
-        if foreign:
+        if foreign := sorted(set(cutouts) - set(ids), key=str):
             wanted = "for ids whose profile is 'cutout'"
             raise argument_error("cutouts", wanted, f"some for {foreign}")
         return {ids[key]: value for key, value in cutouts.items()}
@@ -189,31 +186,29 @@ class Scene:
             raise argument_error("agn", f"a column of {self._catalog.colnames}", repr(agn))
         column = unmasked(self._catalog[agn])
         unit = getattr(column, "unit", None)
-        if unit is None or unit == u.one:
-            share = np.nan_to_num(np.asarray(column, dtype=float), nan=0.0, posinf=2.0)
-            if np.any((share < 0) | (share > 1)):
-                row = int(np.argmax((share < 0) | (share > 1)))
-                raise argument_error("agn", "shares between 0 and 1", f"{column[row]} in row {row}")
-            return flux * (1 - share), flux * share
-        light = np.nan_to_num(to_array(column, FNU, "agn"), nan=0.0)
-        if np.any((light < 0) | ~np.isfinite(light)):
-            row = int(np.argmax((light < 0) | ~np.isfinite(light)))
+        is_share = unit is None or unit == u.one
+        if is_share:
+            values, high = np.asarray(column, dtype=float), 1.0
+            wanted = "shares between 0 and 1"
+        else:
+            values, high = to_array(column, FNU, "agn"), np.finfo(float).max
             wanted = "fluxes that are finite and not negative"
+        bad = (values < 0) | (values > high)
+        if np.any(bad):
+            row = int(np.argmax(bad))
             raise argument_error("agn", wanted, f"{column[row]} in row {row}")
-        return flux, light
+        values = np.nan_to_num(values, nan=0.0)
+        return (flux * (1 - values), flux * values) if is_share else (flux, values)
 
     def _warn_of_fluxes(self):
-        """Tell of sources that are not painted, as they have no flux that could be."""
+        """Warn of sources that are not painted: without a finite, positive flux."""
         flux = self._galaxy_flux + self._agn_flux
-        kinds = {
-            "NaN": np.isnan(flux),
-            "infinite": np.isinf(flux),
-            "negative": np.isfinite(flux) & (flux < 0),
-        }
+        finite = np.isfinite(flux)
+        kinds = {"NaN": np.isnan(flux), "infinite": np.isinf(flux), "negative": finite & (flux < 0)}
         counts = [f"{np.count_nonzero(bad)} {name}" for name, bad in kinds.items() if bad.any()]
         if not counts:
             return
-        bad = np.any(list(kinds.values()), axis=0)
+        bad = ~(flux >= 0) | ~finite
         ids = self._catalog["id"][bad]
         first = ", ".join(map(str, ids[:5].tolist())) + (", ..." if len(ids) > 5 else "")
         msg = (
@@ -328,33 +323,24 @@ class Scene:
         )
         painted_as = np.where(sersic, "sersic", "point").astype("U6")
         painted_as[list(self._cutouts)] = "cutout"
-        truth = QTable(
+        held = "light that the image holds, through PSF and edges"
+        truth = described_table(
             {
-                "id": catalog["id"],
-                "sky": catalog["sky"],
-                "x": x,
-                "y": y,
-                "profile": painted_as,
-                "flux_total": flux * FNU,
-                "flux_agn": agn * FNU,
-                "flux_in_image": in_image * FNU,
-                "flags": flags,
+                "id": (catalog["id"], None),
+                "sky": (catalog["sky"], None),
+                "x": (x, None),
+                "y": (y, None),
+                "profile": (painted_as, None),
+                "flux_total": (flux * FNU, "light to infinity, the AGN's included"),
+                "flux_agn": (agn * FNU, "light of the point at the center"),
+                "flux_in_image": (in_image * FNU, held),
+                "flags": (flags, SceneFlags.describe()),
             },
-            meta=provenance(filter=self._filter),
+            provenance(filter=self._filter),
         )
-        filled = {
-            catalog["id"][row].item(): stamp.n_filled
-            for row, stamp in self._cutouts.items()
-            if stamp.n_filled
-        }
-        if filled:
-            truth.meta["cutout_pixels_filled"] = filled
-        truth["flux_total"].info.description = "light to infinity, the AGN's included"
-        truth["flux_agn"].info.description = "light of the point at the center"
-        truth[
-            "flux_in_image"
-        ].info.description = "light that the image holds, through PSF and edges"
-        truth["flags"].info.description = SceneFlags.describe()
+        filled = {catalog["id"][row].item(): one.n_filled for row, one in self._cutouts.items()}
+        if any(filled.values()):
+            truth.meta["cutout_pixels_filled"] = {key: n for key, n in filled.items() if n}
         return image, truth
 
     @property

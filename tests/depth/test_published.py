@@ -81,9 +81,6 @@ def test_scaled_limits_of_the_survey():
 
 
 def test_versions_of_the_calculator():
-    for name in imager_filters():
-        assert_quantity_allclose(etc_limit(name, "2.0"), etc_limit(name), rtol=0.25)
-    assert_quantity_allclose(etc_limit("miri.f2100w", "2.0"), 3.99 * u.uJy)
     with pytest.raises(KeyError, match=r"version of the exposure time calculator '3.0'"):
         etc_limit("miri.f770w", "3.0")
     with pytest.raises(KeyError, match=r"no band of the survey 'miri.f560w'"):

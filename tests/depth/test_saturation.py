@@ -41,7 +41,7 @@ def test_a_point_source_of_the_saturation_flux_fills_the_well_by_the_last_group(
     assert saturation_forecast(exposure, background=sky + brightness) == pytest.approx(
         1.0, rel=1e-6
     )
-    # where the sky alone fills the well there is no room
+    # where the sky alone fills the well nothing is left
     assert saturation_flux(exposure, background=1e4 * u.MJy / u.sr) == 0 * u.uJy
     # half the integration: more than twice the flux, as the sky takes its part of the well
     shorter = exposure.replace(n_groups=exposure.n_groups // 2)

@@ -10,39 +10,28 @@ from miricigale.evaluation import (
 )
 
 TRUE = ["galaxy"] * 4 + ["composite"] * 2 + ["agn"] * 4
-FOUND = [
-    "galaxy",
-    "galaxy",
-    "galaxy",
-    "agn",
-    "composite",
-    "unknown",
-    "agn",
-    "agn",
-    "agn",
-    "composite",
-]
+FOUND = ["galaxy"] * 3 + ["agn", "composite", "unknown"] + ["agn"] * 3 + ["composite"]
 
 
 def test_confusion_of_a_table_by_hand():
     table = confusion(TRUE, FOUND)
     assert table["class"].tolist() == list(CLASS_NAMES)
     assert table["n"].tolist() == [4, 2, 4]
-    assert [table[name].tolist() for name in (*CLASS_NAMES, "unknown")] == [
-        [3, 0, 0],
-        [0, 1, 1],
-        [1, 0, 3],
-        [0, 1, 0],
-    ]
+    counts = [table[name].tolist() for name in (*CLASS_NAMES, "unknown")]
+    assert counts == [[3, 0, 0], [0, 1, 1], [1, 0, 3], [0, 1, 0]]
     np.testing.assert_allclose(table["completeness"], [3 / 4, 1 / 2, 3 / 4])
     np.testing.assert_allclose(table["purity"], [1, 1 / 2, 3 / 4])
     assert np.all(table["completeness_low"] <= table["completeness"])
     assert np.all(table["completeness_high"] >= table["completeness"])
 
 
-def test_classes_by_the_mid_infrared_share():
+def test_classes_have_the_published_limits():
+    got = classify([0.0, 0.0999, 0.1, 0.39, 0.4, 1.0, np.nan]).tolist()
+    assert got == ["galaxy"] * 2 + ["composite"] * 2 + ["agn"] * 2 + ["unknown"]
     got = classify([0.2, 0.5, 0.8], limits=KIRKPATRICK_LIMITS)
     assert got.tolist() == ["galaxy", "composite", "agn"]
+    with pytest.raises(ValueError, match="'frac_agn' must be between 0 and 1"):
+        classify([1.2])
 
 
 def test_purity_falls_with_the_share_of_wanted_sources_and_completeness_does_not():
@@ -63,7 +52,7 @@ def test_nothing_selected_has_no_purity():
 
 
 def test_other_lengths_are_refused():
-    with pytest.raises(ValueError, match="'found' must be as long as 'true'"):
+    with pytest.raises(ValueError, match="'found' must be a 1-D array as long as 'true'"):
         confusion(["agn"], [])
-    with pytest.raises(ValueError, match="'selected' must be as long as 'wanted'"):
+    with pytest.raises(ValueError, match="'selected' must be a 1-D array as long as 'wanted'"):
         selection_quality([True], [True, False])

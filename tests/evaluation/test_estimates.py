@@ -89,7 +89,8 @@ def test_columns_of_other_lengths_are_refused():
         bootstrap(mean, [1.0, 2.0], [1.0], seed=1)
 
 
-def test_sigma_mad_along_an_axis():
+def test_sigma_mad_by_hand_and_along_an_axis():
+    assert np.isnan(sigma_mad([]))
     table = np.array([[1, 2, 3, 4, 100], [0, 0, 0, 0, 0]], float)
     np.testing.assert_allclose(sigma_mad(table, axis=-1), [1.48, 0.0])
     table[0, 4] = np.nan

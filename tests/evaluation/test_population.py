@@ -204,12 +204,6 @@ def test_what_is_no_galaxy_has_no_agn():
     assert len(AGNPopulation().draw(table[:0], seed=1)) == 0
 
 
-def test_massive_galaxies_have_a_probability():
-    chance = AGNPopulation().probability(10 ** np.arange(9.0, 13) * u.Msun, [3.0])
-    assert np.all(np.diff(chance[:3]) > 0)
-    assert np.all((chance > 0) & (chance <= 1))
-
-
 def test_refuses():
     with pytest.raises(ValueError, match="'min_luminosity' must be from 1e41 to 1e46 erg/s"):
         AGNPopulation(min_luminosity=1 * u.W)

@@ -40,11 +40,8 @@ def test_redshifts_come_out_as_drawn(study, band_set):
     one = study.at(0.0)
     own = photoz_metrics(one.true("redshift"), one.fitted(band_set, "redshift_mean"))
     share = got(study, "z_outliers", band_set=band_set)
-    assert (share.value, share.low, share.high) == (
-        own.outlier_fraction,
-        own.outlier_low,
-        own.outlier_high,
-    )
+    got_share = (share.value, share.low, share.high)
+    assert got_share == (own.outlier_fraction, own.outlier_low, own.outlier_high)
     # a shift by 1 is an outlier below z = 5.7
     assert share.value == pytest.approx(outliers, abs=4 * share.error)
     width = got(study, "z_scatter", band_set=band_set)
@@ -128,10 +125,10 @@ def test_magnitudes_by_shape_and_crowding():
     for name in ("n < 2", "point"):
         kept = got(study, "shape_offset", option=name)
         assert kept.value == pytest.approx(0, abs=4 * kept.error)
-    crowded, isolated = (
-        got(study, "magnitude_scatter", option=name).value for name in ("crowded", "isolated")
-    )
-    assert crowded > 1.5 * isolated
+    scatter = {
+        name: got(study, "magnitude_scatter", option=name) for name in ("crowded", "isolated")
+    }
+    assert scatter["crowded"].value > 1.5 * scatter["isolated"].value
     shares = [got(study, "shape_share", option=name).value for name in ("point", "n < 2", "n >= 2")]
     assert sum(shares) == pytest.approx(1)
     assert got(study, "crowded_share").value == pytest.approx(1 - 0.85**6, abs=0.03)
@@ -224,12 +221,8 @@ def test_published_numbers_are_named_once_and_can_be_measured():
 
 def test_a_study_beside_the_paper(study):
     extra = {"points.scatter": Estimate(0.01), "f_scaling.f770w": Estimate(1.0, 0.99, 1.01, 40)}
-    table = compare_with_paper(
-        dataclasses.replace(study, extra=extra),
-        seed=1,
-        n_draws=100,
-        reasons={"f_scaling.f770w": "no mismatch"},
-    )
+    study, reasons = dataclasses.replace(study, extra=extra), {"f_scaling.f770w": "no mismatch"}
+    table = compare_with_paper(study, seed=1, n_draws=100, reasons=reasons)
     assert len(table) == len(PUBLISHED)
     row = {r["key"]: r for r in table}
     assert row["points.scatter"]["verdict"] == "within the bound"
@@ -237,13 +230,10 @@ def test_a_study_beside_the_paper(study):
     assert scaling["sigma"] == pytest.approx(-0.08 / np.hypot(0.01, 0.01))
     assert scaling["verdict"] == "differs by -5.7 sigma: no mismatch"
     assert row["frac_scatter.0.4.all"]["verdict"] == "not measured"
-    power = row["power_offset"]
-    assert power["verdict"].startswith("agrees (")
-    right = row["class.0"]
+    assert row["power_offset"]["verdict"].startswith("agrees (")
+    right, one = row["class.0"], study.at(0.0)
     assert right["of_all"] == pytest.approx(right["ours"] * right["completeness"])
-    assert right["completeness"] == pytest.approx(
-        np.count_nonzero(study.at(0.0).sample) / np.count_nonzero(study.at(0.0).field)
-    )
+    assert right["completeness"] == pytest.approx(one.sample.sum() / one.field.sum())
     rows = comparison_rows(table)
     assert len(rows) == len(table)
     texts = dict(zip(table["key"], rows, strict=True))

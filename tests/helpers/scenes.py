@@ -4,12 +4,15 @@ import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
-from astropy.wcs import WCS
+from astropy.wcs import WCS, Sip
 from photutils.psf import ImagePSF
 
 from helpers.light import pixel_gaussian
+from miricigale.instrument import pixel_area_map
 from miricigale.psf import InstrumentPSF
+from miricigale.scene import Scene
 
+FILTER = "miri.f770w"
 CENTER = SkyCoord(53.13440 * u.deg, -27.83444 * u.deg)
 
 
@@ -50,5 +53,36 @@ def make_catalog(wcs, x, y, *, flux=10.0, profile="point", **columns):
     table["sersic_index"] = np.broadcast_to(columns.get("index", 1.0), n)
     table["axis_ratio"] = np.broadcast_to(columns.get("ratio", 1.0), n)
     table["position_angle"] = np.broadcast_to(columns.get("angle", 0.0), n) * u.deg
-    table["miri.f770w"] = np.broadcast_to(np.asarray(flux, float), n) * u.uJy
+    table[FILTER] = np.broadcast_to(np.asarray(flux, float), n) * u.uJy
     return table
+
+
+def make_scene(catalog, wcs, psf, **options):
+    """The scene of a catalog of `make_catalog`."""
+    return Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, **options)
+
+
+def light(scene):
+    """Light in each pixel (uJy), background included."""
+    image = scene.render()
+    return image.data * pixel_area_map(scene.wcs, image.shape) * 1e12
+
+
+def moments(image):
+    """Center x, y and the matrix of second moments."""
+    y, x = np.indices(image.shape)
+    total = image.sum()
+    x0, y0 = np.sum(image * x) / total, np.sum(image * y) / total
+    x, y = x - x0, y - y0
+    return x0, y0, np.array([[np.sum(image * p * q) / total for p in (x, y)] for q in (x, y)])
+
+
+def distorted_wcs():
+    """0.15 pixel per pixel at 50 pixels from the center."""
+    wcs = tan_wcs(pa=20.0)
+    a, b = np.zeros((3, 3)), np.zeros((3, 3))
+    a[2, 0], b[1, 1] = 1.5e-3, -8e-4
+    wcs.wcs.ctype = ["RA---TAN-SIP", "DEC--TAN-SIP"]
+    wcs.sip = Sip(a, b, None, None, wcs.wcs.crpix)
+    wcs.wcs.set()
+    return wcs

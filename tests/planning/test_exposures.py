@@ -1,4 +1,4 @@
-"""Exposures of a plan: times, depths, noise, the clock, against closed forms and other rooms."""
+"""Exposures of a plan: times, depths, noise, the clock, against closed forms and other subpackages."""
 
 import astropy.units as u
 import numpy as np
@@ -75,17 +75,7 @@ def test_the_clock_counts_every_overhead_once():
     light = 4 * plan.exposure.duration
     assert wall_clock([plan], free).to_value(u.s) == pytest.approx(light.value)
     # two bands, four dithers each, three pointings
-    counts = {
-        "slew": 1,
-        "next_slew": 2,
-        "guide_star": 3,
-        "visit": 3,
-        "filter": 6,
-        "script": 6,
-        "exposure": 24,
-        "dither": 18,
-    }
-    for name, count in counts.items():
+    for name, count in zip(names, (1, 2, 3, 3, 6, 6, 24, 18), strict=True):
         options = OverheadSection(**{**dict.fromkeys(names, 0.0), name: 10.0}, observatory=0.0)
         time = wall_clock([plan, plan], options, pointings=3).to_value(u.s)
         assert time - 6 * light.value == pytest.approx(10 * count), name

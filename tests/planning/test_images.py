@@ -1,5 +1,6 @@
 """Plans with images: the run that they become, and the comparison with their noise."""
 
+import tomllib
 from types import SimpleNamespace
 
 import astropy.units as u
@@ -58,21 +59,13 @@ def test_the_run_exposes_what_the_plan_does(planner, study):
             assert (one.n_groups, one.readout) == (plan.exposure.n_groups, plan.exposure.readout)
     assert config.exposures.kind == "rates"
     assert config.run.seed == planner.config.plan.seed
-    assert (config.fit.bands, config.fit.depths) == (
-        planner.config.fit.bands,
-        planner.config.fit.depths,
-    )
+    fit = planner.config.fit
+    assert (config.fit.bands, config.fit.depths) == (fit.bands, fit.depths)
     # it is a configuration like any other
-    assert StudyConfig.from_dict(_plain(config)) == config
+    assert StudyConfig.from_dict(tomllib.loads(config.to_toml())) == config
     middle = SkyCoord(config.pointing.ra * u.deg, config.pointing.dec * u.deg)
     # the bundled catalog is a circle about the default pointing
     assert middle.separation(SkyCoord(53.13440 * u.deg, -27.83444 * u.deg)) < 5 * u.arcsec
-
-
-def _plain(config):
-    import tomllib
-
-    return tomllib.loads(config.to_toml())
 
 
 def test_the_sky_has_the_fluxes_of_the_sample(planner, study):
@@ -117,20 +110,12 @@ def test_images_have_the_background_of_the_plan(tmp_path):
 
 
 def test_what_images_cannot_do_is_refused():
-    for section, values, text in (
-        (
-            "exposures",
-            {"readout": "SLOWR1"},
-            r"\[exposures\] readout must be FASTR1 with \[images\]",
-        ),
-        (
-            "sample",
-            {"luminosity_function": "lf.ecsv"},
-            r"\[sample\] luminosity_function must be left out",
-        ),
+    for section, key, value, text in (
+        ("exposures", "readout", "SLOWR1", r"readout must be FASTR1 with \[images\]"),
+        ("sample", "luminosity_function", "lf.ecsv", "luminosity_function must be left out"),
     ):
-        with pytest.raises(ConfigError, match=text):
-            load_plan(overrides={"images": {"enabled": True}, section: values})
+        with pytest.raises(ConfigError, match=rf"\[{section}\] {text}"):
+            load_plan(overrides={"images": {"enabled": True}, section: {key: value}})
 
 
 @pytest.fixture(scope="module")

@@ -8,12 +8,11 @@ import pytest
 from astropy.table import QTable
 
 from miricigale.cli import main
-from miricigale.filters import Filter
 from miricigale.planning import Planner, area_table, comparison_table, load_plan
-from miricigale.planning.planner import EXISTING, accuracy
+from miricigale.planning.accuracy import accuracy
+from miricigale.planning.planner import EXISTING
 from miricigale.utils.exceptions import ConfigError
 from miricigale.utils.parallel import thread_pool
-from miricigale.utils.tables import error_column
 
 BANDS = ["miri.f770w", "miri.f1500w"]
 SETTINGS = {
@@ -38,9 +37,8 @@ def test_the_sample_has_the_mix_of_the_configuration(planner):
     sources = planner.sources
     assert len(sources) == 60
     values, counts = np.unique(sources["frac_agn"], return_counts=True)
-    assert dict(zip(values, counts, strict=True)) == {
-        0.0: 30, 0.2: 6, 0.4: 6, 0.6: 6, 0.8: 6, 0.99: 6
-    }  # fmt: skip
+    assert values.tolist() == [0.0, 0.2, 0.4, 0.6, 0.8, 0.99]
+    assert counts.tolist() == [30, 6, 6, 6, 6, 6]
     # 1308 sources in a circle of 95 arcsec, some of which are stars
     assert 150 < planner.density < 1308 / (np.pi * (95 / 60) ** 2)
 
@@ -49,10 +47,7 @@ def test_noise_is_that_of_the_errors(planner):
     """Pulls of the mock fluxes are those of a normal distribution, in each band and of each size."""
     table = planner.photometry(planner.band_plans().values())
     pulls = np.array(
-        [
-            ((table[name] - planner.sources[name]) / table[error_column(name)]).value
-            for name in planner.bands
-        ]
+        [((table[n] - planner.sources[n]) / table[f"{n}_err"]).value for n in planner.bands]
     )
     assert np.mean(pulls) == pytest.approx(0, abs=5 / np.sqrt(pulls.size))
     assert np.std(pulls) == pytest.approx(1, abs=5 / np.sqrt(2 * pulls.size))
@@ -62,9 +57,8 @@ def test_noise_is_that_of_the_errors(planner):
     point = errors.sigma(planner.sources["miri.f770w"], "miri.f770w")
     extended = planner.sources["size"] > 0.3 * u.arcsec
     assert np.all(own[extended] > point[extended])
-    np.testing.assert_allclose(
-        own[planner.sources["size"] == 0], point[planner.sources["size"] == 0]
-    )
+    round_ = planner.sources["size"] == 0
+    np.testing.assert_allclose(own[round_], point[round_])
 
 
 def test_draws_belong_to_source_and_band_and_no_thread_changes_them(planner, plans):
@@ -146,13 +140,8 @@ def test_a_luminosity_function_gives_the_sample(tmp_path):
     """One cell holds nearly all galaxies: they are drawn there, as many as the volume holds."""
     from astropy.cosmology import FlatLambdaCDM
 
-    table = QTable(
-        {
-            "log_luminosity": np.tile([11.0, 11.2], 2),
-            "redshift": np.repeat([1.0, 1.1], 2),
-            "phi": np.full(4, 1e-3),
-        }
-    )
+    table = QTable({"log_luminosity": np.tile([11.0, 11.2], 2), "phi": np.full(4, 1e-3)})
+    table["redshift"] = np.repeat([1.0, 1.1], 2)
     path = tmp_path / "lf.ecsv"
     table.write(path)
     sample = {"n_sources": 40, "luminosity_function": str(path)}
@@ -194,7 +183,6 @@ def test_the_command_writes_a_page(tmp_path, capsys):
     assert set(table["plan"]) == {EXISTING, "all", "f770w"}
     assert len(QTable.read(folder / "sources-1.ecsv")) == 30
     assert load_plan(folder / "plan.toml").sample.n_sources == 30
-    assert Filter.from_name("miri.f770w").pivot > 7 * u.um
 
 
 @pytest.mark.parametrize(

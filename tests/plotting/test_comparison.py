@@ -5,7 +5,6 @@ from helpers.figures import error_bars, legend_texts, line_data
 from miricigale.plotting.comparison import (
     plot_counts,
     plot_error_function,
-    plot_histogram,
     plot_magnitudes,
     plot_offsets,
     plot_redshifts,
@@ -44,9 +43,7 @@ def test_offsets_beyond_the_limit_are_triangles_at_its_edge(ax):
 
 def test_the_running_median_has_a_band_of_its_scatter(ax):
     middle, median, scatter = [20.0, 21.0, 22.0], np.array([0.1, 0.0, -0.1]), np.full(3, 0.2)
-    plot_offsets(
-        [20.0], [0.0], running=(middle, median, scatter), ax=ax, limit=0.5, labels=("a", "b")
-    )
+    plot_offsets([20.0], [0.0], running=(middle, median, scatter), ax=ax, limit=0.5)
     (line,) = (one for one in ax.lines if one.get_label() == "running median, scatter")
     np.testing.assert_allclose(line.get_xydata(), np.transpose([middle, median]))
     corners = ax.collections[0].get_paths()[0].vertices
@@ -54,7 +51,6 @@ def test_the_running_median_has_a_band_of_its_scatter(ax):
         y = corners[corners[:, 0] == x, 1]
         assert (y.min(), y.max()) == pytest.approx((m - 0.2, m + 0.2))
     assert ax.get_ylim() == (-0.5, 0.5)
-    assert labels(ax) == ("a", "b")
 
 
 def test_error_functions_meet_their_limits_at_five_sigma(ax):
@@ -88,22 +84,6 @@ def test_outliers_of_redshifts_are_marked(ax):
     assert labels(ax) == ("true redshift", "fitted redshift")
 
 
-def test_histograms_count_what_is_finite(ax):
-    samples = {"one": [0.1, 0.2, np.nan], "two": [0.7]}
-    assert plot_histogram(samples, [0, 0.5, 1], ax=ax, xlabel="dex", truth=0.4) is ax
-    heights = sorted(patch.get_xy()[:, 1].max() for patch in ax.patches)
-    assert heights == [1.0, 2.0]
-    assert line_data(ax, "--")[0][:, 0].tolist() == [0.4, 0.4]
-    assert set(legend_texts(ax)) == {"one", "two", "truth"}
-    assert labels(ax) == ("dex", "sources")
-
-
-def test_every_one_of_many_samples_is_drawn_and_differs(ax):
-    plot_histogram({f"s{i}": [0.1] * (i + 1) for i in range(6)}, [0, 1], ax=ax)
-    assert [patch.get_xy()[:, 1].max() for patch in ax.patches] == [1, 2, 3, 4, 5, 6]
-    assert len({(patch.get_edgecolor(), patch.get_linestyle()) for patch in ax.patches}) == 6
-
-
 def test_points_and_the_relations_over_them(ax):
     lines = [([1, 2], [5, 6], "law"), ([1, 2], [7, 8], "rule")]
     assert plot_relation([1, 2], [10, 20], lines=lines, ax=ax, labels=("M", "SFR")) is ax
@@ -112,18 +92,8 @@ def test_points_and_the_relations_over_them(ax):
         np.testing.assert_allclose(line.get_xydata(), np.transpose([x, y]))
         assert line.get_label() == label
     assert legend_texts(ax) == ["law", "rule"]
-    assert (ax.get_xscale(), ax.get_yscale()) == ("linear", "log")
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
     assert labels(ax) == ("M", "SFR")
-
-
-def test_points_may_have_the_color_of_their_redshift(ax):
-    plot_relation([1, 2], [10, 20], color=[0.5, 1.5], ax=ax, log=(True, False))
-    (points,) = ax.collections
-    np.testing.assert_allclose(points.get_offsets(), [[1, 10], [2, 20]])
-    np.testing.assert_allclose(points.get_array(), [0.5, 1.5])
-    assert points.colorbar.ax.get_ylabel() == "redshift"
-    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "linear")
-    assert ax.get_legend() is None
 
 
 def test_counts_stand_in_the_middle_of_their_bins(ax):

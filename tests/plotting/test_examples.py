@@ -1,9 +1,12 @@
+import functools
+
 import astropy.units as u
 import numpy as np
 import pytest
 
 from helpers.figures import legend_texts
 from miricigale.plotting.examples import fit_figure, sequence_figure
+from miricigale.plotting.posteriors import plot_sed_fit
 
 Z, F = np.linspace(0, 4, 41), np.linspace(0, 1, 11)
 
@@ -22,7 +25,8 @@ def test_a_fit_has_residuals_and_posteriors_with_one_range():
     posteriors = {
         name: ((Z * u.one, w.sum(axis=1)), (F, w.sum(axis=0))) for name, w in planes.items()
     }
-    figure = fit_figure(photometry, posteriors, planes, truth=(1.5, 0.4), title="source 7")
+    draw = functools.partial(plot_sed_fit, **photometry, title="source 7")
+    figure = fit_figure(draw, posteriors, planes, truth=(1.5, 0.4))
     upper, lower, redshift, fraction, first, second = figure.axes
     assert upper.get_title() == "source 7"
     assert lower.get_ylabel().startswith("residual")

@@ -41,14 +41,13 @@ def test_encircled_energy_is_in_percent_and_the_limit_is_shown():
 
 def test_offsets_have_a_panel_for_each_kind():
     groups = {"n < 2": ([20.0, 21.0], [0.1, 0.3]), "n >= 2": ([20.0, 22.0], [np.nan, 5.0])}
-    running = {"n < 2": (np.array([20.5]), np.array([0.2]), np.array([0.1]))}
-    figure = offsets_figure(groups, limit=0.5, labels=("mag", "SE - TPHOT"), running=running)
+    figure = offsets_figure(groups, limit=0.5)
     first, second = figure.axes
     np.testing.assert_allclose(line_data(first, ".")[0], [[20, 0.1], [21, 0.3]])
     np.testing.assert_allclose(line_data(second, "^")[0], [[22, 0.485]])
     assert (first.get_title(), second.get_title()) == ("n < 2 (2)", "n >= 2 (1)")
     assert first.texts[0].get_text() == "median +0.200"
-    assert (first.get_ylabel(), second.get_ylabel()) == ("SE - TPHOT", "")
+    assert (first.get_ylabel(), second.get_ylabel()) == ("measured - true (mag)", "")
 
 
 def test_features_are_shaded_with_the_median_inside():

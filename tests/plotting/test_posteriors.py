@@ -140,16 +140,8 @@ def test_limits_are_arrows_in_both_panels(pair):
 def test_parts_and_groups_stand_in_the_legend(ax):
     flux = np.array([1.0, 2.0, 3.0]) * u.uJy
     spectrum = (WAVE, flux)
-    plot_sed_fit(
-        WAVE,
-        flux,
-        0.1 * flux,
-        flux,
-        spectrum=spectrum,
-        parts={"AGN": (WAVE, 0.1 * flux)},
-        groups=["old", "old", "MIRI"],
-        ax=ax,
-    )
+    kind = {"parts": {"AGN": (WAVE, 0.1 * flux)}, "groups": ["old", "old", "MIRI"]}
+    plot_sed_fit(WAVE, flux, 0.1 * flux, flux, spectrum=spectrum, ax=ax, **kind)
     labels = legend_texts(ax)
     assert labels[:2] == ["best model", "AGN"]
     assert {"old", "MIRI"} < set(labels)
@@ -160,12 +152,6 @@ def test_parts_and_groups_stand_in_the_legend(ax):
     assert points["old"].get_xdata().tolist() == [1.0, 4.0]
     assert points["MIRI"].get_xdata().tolist() == [15.0]
     assert points["old"].get_color() != points["MIRI"].get_color()
-
-
-def test_one_group_has_a_legend_too(ax):
-    flux = np.array([1.0, 2.0, 3.0]) * u.uJy
-    plot_sed_fit(WAVE, flux, 0.1 * flux, flux, groups=["MIRI"] * 3, ax=ax)
-    assert "MIRI" in legend_texts(ax)
 
 
 @pytest.mark.parametrize("rest", [True, False])

@@ -32,6 +32,15 @@ def test_every_truth_has_a_panel_with_every_band_set():
     assert [ax.get_xlabel() for ax in figure.axes] == ["", "", "fracAGN", "fracAGN"]
 
 
+def test_every_one_of_many_samples_is_drawn_and_differs():
+    figure = histograms_figure(
+        {"f": {f"s{i}": [0.1] * (i + 1) for i in range(6)}}, [0, 1], xlabel=""
+    )
+    (ax,) = figure.axes
+    assert heights(ax) == [1, 2, 3, 4, 5, 6]
+    assert len({(patch.get_edgecolor(), patch.get_linestyle()) for patch in ax.patches}) == 6
+
+
 def test_values_beyond_the_bins_are_counted_at_their_ends():
     figure = histograms_figure({"f": {"all": [-9, 0.2, 9.0, 9.0]}}, [0, 1, 2], xlabel="z")
     assert heights(figure.axes[0]) == [2]
@@ -84,9 +93,7 @@ def test_completeness_has_counts_above_and_shares_beneath():
 def test_luminosities_with_an_axis_of_star_formation():
     z, power = [0.5, 1.0, 2.0, 3.0], [1e10, 1e11, 1e12, -1.0]
     groups = {"MIRI": [False, True, True, True], "MIPS": [False, False, True, False]}
-    figure = luminosity_figure(
-        z, power, groups, sfr=(1e-10, "SFR"), curves={"limit": ([0, 3], [1e9, 1e11])}
-    )
+    figure = luminosity_figure(z, power, groups, sfr=(1e-10, "SFR"))
     ax = figure.axes[0]
     np.testing.assert_allclose(line_data(ax, ".")[0], [[0.5, 1e10]])
     np.testing.assert_allclose(line_data(ax, "o")[0], [[1, 1e11], [2, 1e12]])
@@ -94,7 +101,7 @@ def test_luminosities_with_an_axis_of_star_formation():
     (right,) = ax.child_axes
     figure.draw_without_rendering()
     np.testing.assert_allclose(right.get_ylim(), np.array(ax.get_ylim()) * 1e-10)
-    assert legend_texts(ax) == ["not detected", "MIRI", "MIPS", "limit"]
+    assert legend_texts(ax) == ["not detected", "MIRI", "MIPS"]
 
 
 def test_classes_say_shares_and_numbers():

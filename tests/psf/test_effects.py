@@ -93,7 +93,7 @@ def test_halo_takes_its_share_of_the_scattered_light_as_far_as_the_arms_go():
 
 def test_arms_and_halo_of_f560w_are_those_of_a_deep_image(monkeypatch):
     """Light of one arm per arcsec over that within 1 arcsec, off an empirical PSF of a deep field."""
-    kind = {"fov": 17 * u.arcsec, "oversampling": 2, "n_wavelengths": 5}
+    kind = {"fov": 17 * u.arcsec, "oversampling": 2}
     psf = miri_psf("miri.f560w", **kind)
     monkeypatch.setattr(effects, "_HALO", {})
     _miri_data.cache_clear()

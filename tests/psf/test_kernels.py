@@ -43,9 +43,8 @@ def test_kernel_is_photutils_wiener_kernel():
     kind = {"pixel_scale": 0.06 * u.arcsec, "fov": 4 * u.arcsec}
     hi, lo = (gaussian_psf(w * u.arcsec, **kind) for w in (0.2, 0.5))
     kernel = MatchingKernel.from_psfs(hi, lo, pixel_scale=0.06 * u.arcsec, regularization=0.01)
-    expected = make_wiener_kernel(
-        kernel.source, kernel.target, regularization=0.01, penalty="laplacian"
-    )
+    form = {"regularization": 0.01, "penalty": "laplacian"}
+    expected = make_wiener_kernel(kernel.source, kernel.target, **form)
     expected *= kernel.target.sum() / expected.sum()
     np.testing.assert_allclose(kernel.array, expected, rtol=0, atol=1e-13)
     # and the error that goes into the choice is that of the linear convolution

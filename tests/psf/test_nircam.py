@@ -54,7 +54,5 @@ def test_is_centred_normalised_and_says_what_it_is():
 def test_unknown_filters_and_options_are_named():
     with pytest.raises(KeyError, match=r"no PSF for the filter 'nircam.f182m'; known: nircam"):
         nircam_psf("nircam.f182m")
-    with pytest.raises(ValueError, match="'n_wavelengths' must be at least 1, an integer"):
-        nircam_psf("nircam.f444w", n_wavelengths=0)
-    with pytest.raises(ValueError, match="'oversampling' must be at least 1, an integer"):
+    with pytest.raises(ValueError, match="'oversampling' must be a positive integer"):
         nircam_psf("nircam.f444w", oversampling=0)

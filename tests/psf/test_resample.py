@@ -293,7 +293,7 @@ def test_sizes_that_make_no_grid_are_named():
     kind = {"pa": 3 * u.deg} if psf.frame == "detector" else {}
     with pytest.raises(ValueError, match="'pixel_scale' must be positive"):
         psf_mosaic(psf, 0 * u.arcsec, **kind)
-    with pytest.raises(ValueError, match="'oversampling' must be at least 1, an integer, got 0"):
+    with pytest.raises(ValueError, match="'oversampling' must be a positive integer, got 0"):
         psf_mosaic(psf, 0.06 * u.arcsec, oversampling=0, **kind)
     with pytest.raises(ValueError, match="'fov' must be positive"):
         psf_mosaic(psf, 0.06 * u.arcsec, fov=-2 * u.arcsec, **kind)

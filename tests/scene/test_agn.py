@@ -5,16 +5,14 @@ import numpy as np
 import pytest
 
 from helpers import scenes
-from miricigale.instrument import pixel_area_map
-from miricigale.scene import Scene, SceneFlags
+from miricigale.scene import SceneFlags
 
-FILTER = "miri.f770w"
 GALAXY = {"profile": "sersic", "radius": 0.5, "index": 2.0, "ratio": 0.4, "angle": 40.0}
 
 
 def light(catalog, wcs, psf, **options):
-    scene = Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, **options)
-    return scene.render().data * pixel_area_map(wcs, (90, 100)) * 1e12, scene.truth
+    scene = scenes.make_scene(catalog, wcs, psf, **options)
+    return scenes.light(scene), scene.truth
 
 
 def test_a_share_of_the_light_is_in_the_point(wcs, psf):
@@ -52,29 +50,3 @@ def test_what_is_cut_is_of_all_light(wcs, psf):
     kind = {"max_radius": 4 * u.arcsec}
     assert light(galaxy, wcs, psf, **kind)[1]["flags"][0] & cut
     assert not light(galaxy, wcs, psf, agn="frac_agn", **kind)[1]["flags"][0] & cut
-
-
-def test_refuses(wcs, psf):
-    galaxy = scenes.make_catalog(wcs, [50.0, 30.0], 45.0, **GALAXY)
-    with pytest.raises(ValueError, match=r"'agn' must be a column of .* got 'nucleus'"):
-        light(galaxy, wcs, psf, agn="nucleus")
-    galaxy["share"] = [0.2, 1.3]
-    with pytest.raises(
-        ValueError, match=r"'agn' must be shares between 0 and 1, got 1\.3 in row 1"
-    ):
-        light(galaxy, wcs, psf, agn="share")
-    galaxy["extra"] = [1.0, -2.0] * u.uJy
-    with pytest.raises(ValueError, match="'agn' must be fluxes that are finite and not negative"):
-        light(galaxy, wcs, psf, agn="extra")
-    galaxy["other"] = [1.0, 2.0] * u.s
-    with pytest.raises(u.UnitsError, match="'agn' must be convertible to uJy"):
-        light(galaxy, wcs, psf, agn="other")
-
-
-def test_nothing_near_is_an_empty_image(wcs, psf):
-    galaxy = scenes.make_catalog(wcs, 50.0, 45.0, **GALAXY)
-    galaxy["sky"] = galaxy["sky"].directional_offset_by(0 * u.deg, 5 * u.arcmin)
-    galaxy["share"] = [0.5]
-    image, truth = light(galaxy, wcs, psf, agn="share")
-    assert not np.any(image)
-    assert truth["flags"].tolist() == [SceneFlags.OUTSIDE_IMAGE]

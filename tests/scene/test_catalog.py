@@ -73,49 +73,40 @@ def test_unusable_rows_are_flagged(table):
     assert flags.tolist() == wanted
 
 
-def test_refuses(table):
-    def broken(**columns):
-        copy = table.copy()
-        for name, value in columns.items():
-            copy[name] = value
-        return copy
+NOWHERE = SkyCoord([53, np.nan], [-27, -27], unit="deg")
 
-    with pytest.raises(ValueError, match=r"columns \['redshift'\], got columns"):
-        check_catalog(
-            table[
-                "id",
-                "sky",
-                "profile",
-                "half_light_radius",
-                "sersic_index",
-                "axis_ratio",
-                "position_angle",
-            ]
-        )
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"half_light_radius": [0.1, 0.2]}, "'half_light_radius' must be .* to arcsec, got None"),
+        ({"miri.f770w": [1, 2] * u.s}, r"'miri\.f770w' must be convertible to uJy, got s"),
+        ({"id": [3, 3]}, r"ids are unique, got duplicates such as \[3\]"),
+        ({"id": [1.5, 2.5]}, "integers or text in 'id'"),
+        ({"id": ["a", "\xe4"]}, "ASCII"),
+        ({"sky": NOWHERE}, "finite positions, got 1 that are not, first in row 1"),
+        ({"profile": ["disk", "point"]}, r"'profile' among .*, got \['disk'\]"),
+        ({"axis_ratio": ["x", "y"]}, "numbers in 'axis_ratio'"),
+        ({"star": [0, 1]}, "True or False in 'star', got int64"),
+    ],
+)
+def test_refuses_columns(table, columns, message):
+    for name, value in columns.items():
+        table[name] = value
+    with pytest.raises((ValueError, u.UnitsError), match=message):
+        check_catalog(table, filters=["miri.f770w"])
+
+
+def test_refuses(table):
     with pytest.raises(ValueError, match=r"columns \['miri.f560w'\]"):
         check_catalog(table, filters=["miri.f560w"])
-    with pytest.raises(
-        u.UnitsError, match="'half_light_radius' must be convertible to arcsec, got None"
-    ):
-        check_catalog(broken(half_light_radius=[0.1, 0.2]))
-    with pytest.raises(u.UnitsError, match=r"'miri\.f770w' must be convertible to uJy, got s"):
-        check_catalog(broken(**{"miri.f770w": [1, 2] * u.s}), filters=["miri.f770w"])
-    with pytest.raises(ValueError, match=r"ids are unique, got duplicates such as \[3\]"):
-        check_catalog(broken(id=[3, 3]))
-    with pytest.raises(ValueError, match="integers or text in 'id'"):
-        check_catalog(broken(id=[1.5, 2.5]))
-    with pytest.raises(ValueError, match="ASCII"):
-        check_catalog(broken(id=["a", "\xe4"]))
-    with pytest.raises(ValueError, match="finite positions, got 1 that are not, first in row 1"):
-        check_catalog(broken(sky=SkyCoord([53, np.nan], [-27, -27], unit="deg")))
-    with pytest.raises(ValueError, match=r"'profile' among .*, got \['disk'\]"):
-        check_catalog(broken(profile=["disk", "point"]))
-    with pytest.raises(ValueError, match="numbers in 'axis_ratio'"):
-        check_catalog(broken(axis_ratio=["x", "y"]))
     with pytest.raises(ValueError, match="a table with rows, got none"):
         check_catalog(table[:0])
     with pytest.raises(ValueError, match="'catalog' must be a table, got dict"):
         check_catalog({})
+    table.remove_column("redshift")
+    with pytest.raises(ValueError, match=r"columns \['redshift'\], got columns"):
+        check_catalog(table)
 
 
 def test_unreadable_files(tmp_path):
@@ -177,13 +168,10 @@ def test_columns_called_by_a_filter_must_be_fluxes(table, tmp_path, name):
     assert {"other.mag", "class.prob"} <= set(check_catalog(table).colnames)
 
 
-def test_stars_are_told_or_there_are_none(table):
+def test_stars_are_stated_or_none(table):
     assert check_catalog(table)["star"].tolist() == [False, False]
     table["star"] = [False, True]
     assert check_catalog(table)["star"].tolist() == [False, True]
-    table["star"] = [0, 1]
-    with pytest.raises(ValueError, match="True or False in 'star', got int64"):
-        check_catalog(table)
 
 
 @pytest.mark.parametrize("kind", [Table, QTable])

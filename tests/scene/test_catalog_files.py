@@ -1,4 +1,4 @@
-"""Catalogs as people have them: formats, names, units, and what is told of them."""
+"""Catalogs of users: formats, names, units, and warnings about them."""
 
 import warnings
 
@@ -78,9 +78,9 @@ def test_a_catalog_of_cigale(tmp_path):
         "2 1.5 53.2 -27.8 -9999. -9999. -9999. 1\n"
     )
     columns = {"irac.ch1": "IRAC1", "irac.ch1_err": "IRAC1_err", "mips.24": "MIPS1"}
-    with pytest.warns(MiricigaleWarning) as told:
+    with pytest.warns(MiricigaleWarning) as caught:
         catalog = read_catalog(path, columns=columns, units={"flux": "mJy"})
-    texts = sorted(str(one.message) for one in told)
+    texts = sorted(str(one.message) for one in caught)
     assert texts == [
         "cigale.txt: 1 of 2 sources have no usable flux in any band (flag no_flux): ids 2",
         "cigale.txt: 2 of 2 sources are points (no column 'half_light_radius')",
@@ -110,7 +110,7 @@ def test_columns_may_change_places(plain, tmp_path):
     assert catalog["sky"].ra.deg.tolist() == [53.1, 53.2]
 
 
-def test_wrong_names_are_told_with_the_right_ones(plain, tmp_path):
+def test_wrong_names_are_refused_with_the_right_ones(plain, tmp_path):
     path = write(plain, tmp_path / "c.csv")
     with pytest.raises(KeyError, match=r"no column of c\.csv .*'FLUX_h'.*did you mean 'FLUX_H'"):
         read_catalog(path, columns={"wfc3.f160w": "FLUX_h"})
@@ -138,9 +138,9 @@ def test_units_must_be_said_where_the_file_has_none(plain, tmp_path):
         read_catalog(path, columns=COLUMNS | SHAPE, units={"flux": "mJy"})
     plain["FLUX_H"].unit = "uJy"
     path = write(plain, tmp_path / "c.fits")
-    with pytest.warns(MiricigaleWarning) as told:
+    with pytest.warns(MiricigaleWarning) as caught:
         catalog = read_catalog(path, columns=COLUMNS | SHAPE, units=UNITS)
-    assert "'wfc3.f160w' taken in mJy, the file says uJy" in str(told[0].message)
+    assert "'wfc3.f160w' taken in mJy, the file says uJy" in str(caught[0].message)
     assert catalog["wfc3.f160w"][0].to_value(u.uJy) == pytest.approx(1)
 
 
@@ -161,9 +161,9 @@ def test_blanks_are_missing(tmp_path):
         "2,53.1,-27.8,,,,,,,,,True\n"
         "3,53.2,-27.8,1.0,,2.5,,0.2,2,0.4,,False\n"
     )
-    with pytest.warns(MiricigaleWarning) as told:
+    with pytest.warns(MiricigaleWarning) as caught:
         catalog = read_catalog(path, units={"flux": "uJy", "half_light_radius": "arcsec"})
-    assert len(told) == 2
+    assert len(caught) == 2
     assert np.isnan(catalog["wfc3.f160w"].value).tolist() == [False, True, True]
     assert np.all(np.isnan(catalog["irac.ch2"].value))
     assert catalog["profile"].tolist() == ["sersic", "point", "point"]
@@ -206,7 +206,7 @@ def test_empty_and_repeated(plain, tmp_path):
         read_catalog(path)
 
 
-# -------------------------------------------------------------- what looks wrong is told
+# ------------------------------------------------------------------------- warnings
 
 
 @pytest.fixture(scope="module")
@@ -217,7 +217,7 @@ def bundled():
     return catalog
 
 
-def test_a_sound_catalog_is_read_without_a_word(bundled, tmp_path):
+def test_a_sound_catalog_is_read_without_a_warning(bundled, tmp_path):
     bundled.write(tmp_path / "c.ecsv")
     read_silently(tmp_path / "c.ecsv")
     read_silently("catalog.goodss")
@@ -230,7 +230,7 @@ def test_a_sound_catalog_is_read_without_a_word(bundled, tmp_path):
 
 @pytest.mark.parametrize("limit", [22.0, 24.0, 26.6])
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
-def test_fluxes_of_another_unit_are_told_by_counts(bundled, tmp_path, factor, limit):
+def test_counts_reveal_fluxes_of_another_unit(bundled, tmp_path, factor, limit):
     table = bundled[bundled["mag_f160w"].value < limit]
     for name in [n for n in table.colnames if "." in n]:
         table[name] = factor * table[name]
@@ -242,18 +242,18 @@ def test_fluxes_of_another_unit_are_told_by_counts(bundled, tmp_path, factor, li
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
-def test_one_band_of_another_unit_is_told_by_color(bundled, tmp_path, factor):
+def test_colors_reveal_one_band_of_another_unit(bundled, tmp_path, factor):
     table = bundled.copy()
     table["nircam.f444w"] = factor * table["nircam.f444w"]
     table.write(tmp_path / "c.ecsv")
     with pytest.warns(
         MiricigaleWarning, match=r"median of nircam\.f444w over .* in one unit"
-    ) as told:
+    ) as caught:
         read_catalog(tmp_path / "c.ecsv")
-    assert len(told) == 1
+    assert len(caught) == 1
 
 
-def test_hours_without_a_word_are_told(bundled, tmp_path):
+def test_hours_without_a_unit_are_noticed(bundled, tmp_path):
     table = bundled.copy()
     table["ra"] = table["ra"].to_value(u.hourangle) * u.deg
     table.write(tmp_path / "c.ecsv")

@@ -7,27 +7,12 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.nddata import CCDData
-from astropy.wcs import Sip
 from photutils.psf import ImagePSF
 
 from helpers import scenes
-from miricigale.instrument import pixel_area_map
+from helpers.scenes import light, moments
 from miricigale.profiles import sersic_image
-from miricigale.scene import Cutout, Scene
-
-FILTER = "miri.f770w"
-
-
-def light(scene):
-    return scene.render().data * pixel_area_map(scene.wcs, (90, 100)) * 1e12
-
-
-def moments(image):
-    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
-    total = image.sum()
-    x0, y0 = np.sum(image * x) / total, np.sum(image * y) / total
-    x, y = x - x0, y - y0
-    return x0, y0, np.array([[np.sum(image * p * q) / total for p in (x, y)] for q in (x, y)])
+from miricigale.scene import Cutout
 
 
 def one(wcs, x, y, **columns):
@@ -43,6 +28,9 @@ def gaussian_stamp(sigma_x, sigma_y, scale, n=81, **options):
     return Cutout(data, pixel_scale=scale * u.arcsec, **options)
 
 
+STAMP = gaussian_stamp(0.2, 0.2, 0.06)
+
+
 @pytest.mark.parametrize("scale", [0.03, 0.06, 0.2])
 @pytest.mark.parametrize(("x", "y"), [(50.0, 45.0), (50.37, 44.81), (49.5, 45.24)])
 def test_light_is_kept_to_1e6_and_the_place_to_a_hundredth_of_a_pixel(psf, scale, x, y):
@@ -50,7 +38,7 @@ def test_light_is_kept_to_1e6_and_the_place_to_a_hundredth_of_a_pixel(psf, scale
     stamp = gaussian_stamp(0.35, 0.35, scale, n=4 * round(1.5 / scale) + 1)
     # the catalog's flux, whatever the stamp's own unit
     stamp = Cutout(17.0 * stamp.data, pixel_scale=stamp.pixel_scale)
-    scene = Scene(one(wcs, x, y), filter=FILTER, wcs=wcs, psf=psf, cutouts={1: stamp})
+    scene = scenes.make_scene(one(wcs, x, y), wcs, psf, cutouts={1: stamp})
     image = light(scene)
     assert image.sum() == pytest.approx(10.0, rel=1e-6)
     assert scene.truth["flux_in_image"].value[0] == pytest.approx(image.sum(), rel=1e-6)
@@ -65,7 +53,7 @@ def test_second_moments_through_angle_and_parity(psf, pa, angle, parity):
     wcs = scenes.tan_wcs(pa=pa, parity=parity)
     scale = 0.05
     stamp = gaussian_stamp(0.2, 0.5, scale, angle=angle * u.deg)
-    scene = Scene(one(wcs, 50, 45), filter=FILTER, wcs=wcs, psf=psf, cutouts={1: stamp})
+    scene = scenes.make_scene(one(wcs, 50, 45), wcs, psf, cutouts={1: stamp})
     x0, y0, got = moments(light(scene))
     assert (x0, y0) == (pytest.approx(50, abs=1e-3), pytest.approx(45, abs=1e-3))
     # the stamp's +y at the position angle, +x west of it; east is to the left for parity -1
@@ -80,7 +68,7 @@ def test_second_moments_through_angle_and_parity(psf, pa, angle, parity):
 
 def test_a_very_small_stamp_is_a_point(wcs, psf):
     stamp = Cutout(np.ones((1, 1)), pixel_scale=1e-4 * u.arcsec)
-    scene = Scene(one(wcs, 40.37, 30.81), filter=FILTER, wcs=wcs, psf=psf, cutouts={1: stamp})
+    scene = scenes.make_scene(one(wcs, 40.37, 30.81), wcs, psf, cutouts={1: stamp})
     y, x = np.mgrid[:90, :100]
     expected = ImagePSF(psf.data, oversampling=4, x_0=40.37, y_0=30.81, flux=10)(x, y)
     np.testing.assert_allclose(light(scene), expected, atol=2e-6 * expected.max())
@@ -95,9 +83,8 @@ def test_a_drawn_galaxy_is_the_galaxy(wcs, psf):
         (601, 601), x=300, y=300, r_eff=40, n=1.5, axis_ratio=0.5, theta=np.radians(120)
     )
     stamp = Cutout(data, pixel_scale=0.01 * u.arcsec)
-    kind = {"filter": FILTER, "wcs": wcs, "psf": psf}
-    image = light(Scene(one(wcs, 50.3, 44.8), cutouts={1: stamp}, **kind))
-    truth = light(Scene(galaxy, max_radius=2.9 * u.arcsec, **kind))
+    image = light(scenes.make_scene(one(wcs, 50.3, 44.8), wcs, psf, cutouts={1: stamp}))
+    truth = light(scenes.make_scene(galaxy, wcs, psf, max_radius=2.9 * u.arcsec))
     np.testing.assert_allclose(
         image / image.sum(), truth / truth.sum(), atol=4e-3 * truth.max() / truth.sum()
     )
@@ -119,7 +106,7 @@ def test_stamp_of_an_image_stands_as_the_image_does(psf, parity):
     wcs = scenes.tan_wcs(pa=20.0)
     catalog = one(wcs, 50, 45)
     catalog["sky"] = sky.reshape((1,))
-    scene = Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, cutouts={1: stamp})
+    scene = scenes.make_scene(catalog, wcs, psf, cutouts={1: stamp})
     cx, cy = (float(v) for v in wcs.world_to_pixel(own.pixel_to_world(60, 45)))
     drawn = light(scene)
     part = np.s_[round(cy) - 4 : round(cy) + 5, round(cx) - 4 : round(cx) + 5]
@@ -145,22 +132,17 @@ def test_pixels_without_a_measurement_are_an_error_or_counted(wcs, psf):
     stamp = Cutout.from_image(image, fill=2000 * u.kJy / u.sr)
     assert stamp.data.sum() == pytest.approx(60 + 3 * 2)
     assert "3 pixels filled" in repr(stamp)
-    scene = Scene(one(wcs, 50, 45), filter=FILTER, wcs=wcs, psf=psf, cutouts={1: stamp})
+    scene = scenes.make_scene(one(wcs, 50, 45), wcs, psf, cutouts={1: stamp})
     assert scene.truth.meta["cutout_pixels_filled"] == {1: 3}
     whole = CCDData(np.ones((7, 9)), unit="adu", wcs=own)
     assert Cutout.from_image(whole, fill=0).n_filled == 0
 
 
 def test_distortion_stretches_the_stamp(psf):
-    wcs = scenes.tan_wcs(pa=20.0)
-    a, b = np.zeros((3, 3)), np.zeros((3, 3))
-    a[2, 0], b[1, 1] = 1.5e-3, -8e-4
-    wcs.wcs.ctype = ["RA---TAN-SIP", "DEC--TAN-SIP"]
-    wcs.sip = Sip(a, b, None, None, wcs.wcs.crpix)
-    wcs.wcs.set()
+    wcs = scenes.distorted_wcs()
     catalog = one(wcs, 20.0, 25.0)
     stamp = gaussian_stamp(0.25, 0.25, 0.05)
-    scene = Scene(catalog, filter=FILTER, wcs=wcs, psf=psf, cutouts={1: stamp})
+    scene = scenes.make_scene(catalog, wcs, psf, cutouts={1: stamp})
     x0, y0, got = moments(light(scene))
     assert (x0, y0) == (pytest.approx(20, abs=0.01), pytest.approx(25, abs=0.01))
     t = np.linspace(0, 2 * np.pi, 16, endpoint=False)
@@ -175,41 +157,39 @@ def test_distortion_stretches_the_stamp(psf):
 def test_light_beyond_the_edge_is_in_no_pixel(wcs, psf):
     stamp = gaussian_stamp(0.6, 0.6, 0.06)
     for x in (-3.0, 1.0, 98.6):
-        scene = Scene(one(wcs, x, 45.0), filter=FILTER, wcs=wcs, psf=psf, cutouts={1: stamp})
+        scene = scenes.make_scene(one(wcs, x, 45.0), wcs, psf, cutouts={1: stamp})
         total = light(scene).sum()
         assert scene.truth["flux_in_image"].value[0] == pytest.approx(total, rel=1e-5)
         assert 0.1 < total < 9
 
 
-def test_beside_other_sources(wcs, psf):
-    table = scenes.make_catalog(
-        wcs, [30.0, 60.0, 70.0], [40.0, 50.0, 20.0], profile=["sersic", "cutout", "point"]
-    )
-    stamp = gaussian_stamp(0.2, 0.2, 0.06)
-    kind = {"filter": FILTER, "wcs": wcs, "psf": psf}
-    scene = Scene(table, cutouts={2: stamp}, **kind)
-    parts = [light(Scene(table[k : k + 1], **kind)) for k in (0, 2)]
-    parts.append(light(Scene(table[1:2], cutouts={2: stamp}, **kind)))
-    np.testing.assert_allclose(light(scene), sum(parts), atol=1e-6)
-    assert scene.truth["profile"].tolist() == ["sersic", "cutout", "point"]
-    assert scene.truth["flags"].tolist() == [0, 0, 0]
+@pytest.mark.parametrize(
+    ("cutouts", "message"),
+    [
+        ({}, r"'cutouts' must be one for each .* got none for \[1\]"),
+        ({1: STAMP, 7: STAMP}, r"'cutouts' must be for ids .* got some for \[7\]"),
+        ({1: np.ones((5, 5))}, "'cutouts' must be a Cutout for 1, got ndarray"),
+    ],
+)
+def test_a_stamp_for_each_cutout(wcs, psf, cutouts, message):
+    with pytest.raises(ValueError, match=message):
+        scenes.make_scene(one(wcs, 50, 45), wcs, psf, cutouts=cutouts)
 
 
-def test_refuses(wcs, psf):
-    stamp = gaussian_stamp(0.2, 0.2, 0.06)
-    kind = {"filter": FILTER, "wcs": wcs, "psf": psf}
-    with pytest.raises(ValueError, match=r"'cutouts' must be one for each .* got none for \[1\]"):
-        Scene(one(wcs, 50, 45), **kind)
-    with pytest.raises(ValueError, match=r"'cutouts' must be for ids .* got some for \[7\]"):
-        Scene(one(wcs, 50, 45), cutouts={1: stamp, 7: stamp}, **kind)
-    with pytest.raises(ValueError, match="'cutouts' must be a Cutout for 1, got ndarray"):
-        Scene(one(wcs, 50, 45), cutouts={1: np.ones((5, 5))}, **kind)
-    with pytest.raises(ValueError, match="'data' must be a finite 2D array with a positive sum"):
-        Cutout(np.zeros((5, 5)), pixel_scale=0.1 * u.arcsec)
-    with pytest.raises(ValueError, match="'pixel_scale' must be positive"):
-        Cutout(np.ones((5, 5)), pixel_scale=0 * u.arcsec)
-    with pytest.raises(u.UnitsError, match="'pixel_scale' must be a quantity"):
-        Cutout(np.ones((5, 5)), pixel_scale=0.1)
+@pytest.mark.parametrize(
+    ("data", "scale", "message"),
+    [
+        (np.zeros((5, 5)), 0.1 * u.arcsec, "'data' must be a finite 2D array with a positive sum"),
+        (np.ones((5, 5)), 0 * u.arcsec, "'pixel_scale' must be positive"),
+        (np.ones((5, 5)), 0.1, "'pixel_scale' must be a quantity"),
+    ],
+)
+def test_refuses(data, scale, message):
+    with pytest.raises((ValueError, u.UnitsError), match=message):
+        Cutout(data, pixel_scale=scale)
+
+
+def test_images_without_a_usable_wcs_are_refused():
     with pytest.raises(ValueError, match="'image' must be NDData with a WCS"):
         Cutout.from_image(CCDData(np.ones((5, 5)), unit="adu"))
     long = scenes.tan_wcs((5, 5))
@@ -217,8 +197,8 @@ def test_refuses(wcs, psf):
     with pytest.raises(ValueError, match="'image' must be with square pixels"):
         Cutout.from_image(CCDData(np.ones((5, 5)), unit="adu", wcs=long))
     with pytest.raises(ValueError, match="read-only"):
-        stamp.data[0, 0] = 1
-    assert repr(stamp) == "<Cutout 81 x 81 pixels of 0.06 arcsec, angle 0 deg>"
+        STAMP.data[0, 0] = 1
+    assert repr(STAMP) == "<Cutout 81 x 81 pixels of 0.06 arcsec, angle 0 deg>"
 
 
 def test_copies_cannot_be_changed_either():

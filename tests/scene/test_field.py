@@ -8,11 +8,11 @@ from astropy.nddata import NDData
 from photutils.psf import GriddedPSFModel
 
 from helpers import scenes
-from miricigale.instrument import aperture, imager_wcs, pixel_area_map
+from helpers.scenes import FILTER, light, make_scene
+from miricigale.instrument import aperture, imager_wcs
 from miricigale.psf import miri_psf_grid
 from miricigale.scene import Cutout, Scene
 
-FILTER = "miri.f770w"
 CORNERS = [(0, 0), (99, 0), (0, 89), (99, 89)]
 
 
@@ -22,14 +22,10 @@ def grid():
     return GriddedPSFModel(NDData(data, meta={"grid_xypos": CORNERS, "oversampling": 4}))
 
 
-def light(scene):
-    return scene.render().data * pixel_area_map(scene.wcs, scene.render().shape) * 1e12
-
-
 def test_points_are_what_photutils_evaluates(wcs, grid):
     x, y = [20.3, 49.5, 80.7, -2.0], [15.2, 44.5, 70.9, 50.0]
     catalog = scenes.make_catalog(wcs, x, y, flux=[10.0, 20.0, 30.0, 40.0])
-    scene = Scene(catalog, filter=FILTER, wcs=wcs, psf=grid)
+    scene = make_scene(catalog, wcs, grid)
     yy, xx = np.mgrid[:90, :100]
     expected = sum(
         grid.evaluate(xx, yy, f, a, b)
@@ -45,7 +41,7 @@ def test_galaxies_widen_by_the_local_psf(wcs, grid):
     catalog = scenes.make_catalog(
         wcs, 60.0, 30.0, profile="sersic", radius=0.4, index=0.5, ratio=1.0
     )
-    scene = Scene(catalog, filter=FILTER, wcs=wcs, psf=grid, enclosed=0.99999)
+    scene = make_scene(catalog, wcs, grid, enclosed=0.99999)
     image = light(scene)
     y, x = np.mgrid[:90, :100]
     total = image.sum()
@@ -124,7 +120,7 @@ def test_the_imagers_psfs_belong_to_their_subarray():
     grid = miri_psf_grid(FILTER, subarray="SUB64", **kind)
     wcs = imager_wcs(field, 30 * u.deg, subarray="SUB64")
     catalog = scenes.make_catalog(wcs, 30.2, 20.7)
-    scene = Scene(catalog, filter=FILTER, wcs=wcs, psf=grid)
+    scene = make_scene(catalog, wcs, grid)
     image = light(scene)
     ny, nx = aperture("SUB64").shape
     yy, xx = np.mgrid[:ny, :nx]
@@ -135,4 +131,4 @@ def test_the_imagers_psfs_belong_to_their_subarray():
     assert scene.render().meta["psf_includes"] == ["jitter", "cruciform", "pixel", "ipc"]
     wcs = imager_wcs(field, 30 * u.deg, subarray="SUB128")
     with pytest.raises(ValueError, match="'psf' must be a grid of places on this image, got those"):
-        Scene(scenes.make_catalog(wcs, 30.2, 20.7), filter=FILTER, wcs=wcs, psf=grid)
+        make_scene(scenes.make_catalog(wcs, 30.2, 20.7), wcs, grid)

@@ -24,7 +24,7 @@ SHARP = galsim.GSParams(
 
 
 def galaxy(n, radius, ratio, angle):
-    """Half-light radius along the major axis; ``angle`` in deg from +x towards +y."""
+    """Half-light radius along the major axis; ``angle`` in deg from +x toward +y."""
     round_one = galsim.Sersic(n=n, half_light_radius=radius * ratio**0.5, gsparams=SHARP)
     return round_one.shear(q=ratio, beta=angle * galsim.degrees)
 

@@ -85,7 +85,7 @@ def test_any_place_within_the_pixel(x, y):
     ("n", "ratio"), [(0.8, 0.9), (1.0, 0.5), (2.5, 0.3), (4.0, 0.8), (8.0, 0.2)]
 )
 def test_wide_outskirts(n, ratio, theta):
-    """Far from the center, where only one node in four is worked out: every pixel to 1e-4."""
+    """Far from the center, where only one node in four is computed: every pixel to 1e-4."""
     galaxy = (n, 40.0, ratio, 20.3, 25.8, theta)
     got = painted(*galaxy, size=150, sigma=1.0)
     want = by_small_cells(*galaxy, size=150, sigma=1.0, fine=4)

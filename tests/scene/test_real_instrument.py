@@ -4,15 +4,9 @@ import pytest
 from astropy.coordinates import SkyCoord
 from photutils.psf import ImagePSF
 
-from miricigale.instrument import (
-    Exposure,
-    imager_wcs,
-    north_up_wcs,
-    pixel_area_map,
-    pixel_to_sky,
-)
-from miricigale.psf import hst_psf, miri_psf
-from miricigale.scene import Background, Scene, highres_image, read_catalog
+from miricigale.instrument import Exposure, imager_wcs, pixel_area_map, pixel_to_sky
+from miricigale.psf import miri_psf
+from miricigale.scene import Background, Scene, read_catalog
 
 POINTING = SkyCoord(53.13440 * u.deg, -27.83444 * u.deg)
 ROLL = 107 * u.deg
@@ -71,20 +65,3 @@ def test_stars_through_subarrays_dithers_and_angles(subarray, pattern):
         yy, xx = np.mgrid[round(y0) - 6 : round(y0) + 7, round(x0) - 6 : round(x0) + 7]
         star = ImagePSF(psf.data, oversampling=psf.oversampling, x_0=x0, y_0=y0, flux=flux)(xx, yy)
         np.testing.assert_allclose(light[yy, xx], star, atol=2e-3 * star.max())
-
-
-def test_f160w_of_goodss():
-    catalog = read_catalog("catalog.goodss")
-    wcs = north_up_wcs(POINTING, 0.06 * u.arcsec, (300, 300))
-    psf = hst_psf("wfc3.f160w")
-    image = highres_image(catalog, wcs=wcs, psf=psf, seed=1)
-    truth = Scene(catalog, filter="wfc3.f160w", wcs=wcs, psf=psf).truth
-    signal = (image.data * pixel_area_map(wcs, (300, 300))).sum() * 1e12
-    noise = (
-        np.sqrt(300 * 300)
-        * (image.uncertainty.array * pixel_area_map(wcs, (300, 300))).mean()
-        * 1e12
-    )
-    assert abs(signal - truth["flux_in_image"].value.sum()) < 4 * noise
-    with pytest.raises(ValueError, match="'psf' must be on the pixels of the WCS"):
-        highres_image(catalog, wcs=imager_wcs(POINTING, ROLL), psf=psf, seed=1)

@@ -16,6 +16,7 @@ from miricigale.planning.exposures import band_plans
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow.background import background_text
 from miricigale.workflow.config import StudyConfig, load_config
+from miricigale.workflow.page.provenance import _background_sentence
 from miricigale.workflow.stages.exposures import (
     background_options,
     study_background,
@@ -28,7 +29,6 @@ from miricigale.workflow.stages.images import (
     mosaics_of,
     reducer_of,
 )
-from miricigale.workflow.stages.provenance import _background_sentence
 from miricigale.workflow.study import check_study
 
 BANDS = ["miri.f770w", "miri.f2100w"]
@@ -127,7 +127,7 @@ def test_a_day_that_cannot_be_is_refused_before_anything_is_made(monkeypatch):
 def test_the_report_says_which_and_from_where():
     low = _background_sentence(study())
     assert "telescope and low zodiacal light (Rigby et al. 2023, jwst_backgrounds)" in low
-    assert low.endswith("grows by 5 % of that for each arcmin towards position angle 45 deg")
+    assert low.endswith("grows by 5 % of that for each arcmin toward position angle 45 deg")
     medium = study(
         background="medium", background_of="pointing", background_scale=1.5, background_gradient=0.0
     )

@@ -41,9 +41,9 @@ def test_each_condition_has_its_own_code():
         flags.CROWDED, 0, flags.EDGE, flags.AMBIGUOUS, flags.NOT_MEASURED, flags.NOT_MEASURED,
     ]  # fmt: skip
     table = associate(truth, found, radius=0.5 * u.arcsec)
+    table = table[table["second"] >= 0]
     found["association"] = np.zeros(7, int)
-    here = table["second"] >= 0
-    found["association"][table["second"][here]] = table["reasons"][here]
+    found["association"][table["second"]] = table["reasons"]
     add_conditions(found, [BAND], detections=True)
     assert list(found[f"{BAND}_condition"]) == [
         flags.CROWDED, 0, flags.EDGE, flags.AMBIGUOUS | flags.CROWDED,

@@ -6,14 +6,13 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 
-from miricigale.fitting import FitResults
 from miricigale.pages import Page
 from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.page.numbers import StudyTables
 from miricigale.workflow.stages import experiments, study_stages
-from miricigale.workflow.stages.metrics import StudyTables
 from miricigale.workflow.truths import EXPERIMENTS
 
 STAGES = {stage.name: stage for stage in study_stages()}
@@ -39,6 +38,7 @@ def config_of(*names, frac_agn=(0.4,)):
                 ],
                 "depths": [27.2, 28.2, 27.6, 23.9, 24.2, 19.3],
                 "axes": "quick",
+                "sets": ["all"],
                 "experiments": list(names),
             },
         }
@@ -96,11 +96,7 @@ def read(folder, name):
 
 
 def tables_of(folder):
-    results = FitResults.read(folder / "agn40" / "fits_all.fits")
-    truth, matched = (
-        QTable.read(folder / "agn40" / f"{name}.ecsv") for name in ("truth", "matched")
-    )
-    return {"agn40": StudyTables(truth, matched, None, None, {"all": results}, {})}
+    return {"agn40": StudyTables(Context(config_of(), folder), "agn40")}
 
 
 def test_all_fit_the_sample_of_the_study(found):

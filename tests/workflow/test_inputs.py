@@ -12,8 +12,8 @@ from miricigale.sed import SEDModel
 from miricigale.utils.exceptions import ConfigError, MiricigaleWarning
 from miricigale.workflow import Context, StudyRunner
 from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.page.provenance import catalog_facts
 from miricigale.workflow.stages import study_stages
-from miricigale.workflow.stages.provenance import catalog_facts
 
 STAGES = {stage.name: stage for stage in study_stages()}
 SHORT, LONG = ["nircam.f090w", "nircam.f150w", "nircam.f200w"], ["mips.24"]

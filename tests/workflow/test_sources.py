@@ -45,6 +45,10 @@ def run(tmp_path_factory):
     return folder, *read_page(folder)
 
 
+def product(folder, name):
+    return QTable.read(folder / "agn00" / f"{name}.ecsv")
+
+
 def close(values, wanted, rtol=6e-4):
     """Whether plain values, None for NaN, are those wanted."""
     values = np.array([np.nan if v is None else v for v in values], float)
@@ -54,8 +58,7 @@ def close(values, wanted, rtol=6e-4):
 def test_the_table_holds_what_the_tables_hold(run):
     folder, facts, entries = run
     table = facts["table"]
-    truth = QTable.read(folder / "agn00/truth.ecsv")
-    matched = QTable.read(folder / "agn00/matched.ecsv")
+    truth, matched = product(folder, "truth"), product(folder, "matched")
     assert {len(column) for column in table.values()} == {len(truth)}
     assert sorted(table["id"]) == sorted(truth["id"])
     assert [entry["id"] for entry in entries] == table["id"]
@@ -70,17 +73,15 @@ def test_the_table_holds_what_the_tables_hold(run):
         ratio = (matched[name] / matched[f"{name}_err"]).value[rows]
         assert close(table[f"sn_{name}"], ratio, rtol=6e-3)
     for chosen in ("all", "none"):
-        fits = QTable.read(folder / f"agn00/fits_{chosen}.ecsv")
+        fits = product(folder, f"fits_{chosen}")
         at = {key: k for k, key in enumerate(fits["id"])}
         for k, key in enumerate(table["id"]):
             if key not in at:
                 assert table[f"redshift_{chosen}"][k] is None
                 continue
-            row = fits[at[key]]
-            assert close([table[f"redshift_{chosen}"][k]], [row["redshift_mean"]])
-            assert close([table[f"frac_agn_{chosen}"][k]], [row["frac_agn_mean"]])
-            assert close([table[f"chi2_{chosen}"][k]], [row["reduced_chi2"]])
-            assert table[f"fit_{chosen}"][k] == row["flags"]
+            row, names = fits[at[key]], ("redshift_mean", "frac_agn_mean", "reduced_chi2", "flags")
+            columns = [f"{name}_{chosen}" for name in ("redshift", "frac_agn", "chi2", "fit")]
+            assert close([table[column][k] for column in columns], [row[name] for name in names])
 
 
 def test_ids_that_are_text_and_fractions_of_the_catalog(tmp_path):
@@ -91,11 +92,8 @@ def test_ids_that_are_text_and_fractions_of_the_catalog(tmp_path):
     do_stage(small_config(BANDS, frac_agn=(0.0, "catalog")), tmp_path, "sources", "catalog")
     facts, entries = read_page(tmp_path, "catalog")
     truth = QTable.read(tmp_path / "catalog/truth.ecsv")
-    assert (
-        sorted(facts["table"]["id"])
-        == sorted(truth["id"])
-        == sorted(f"src-{k}" for k in range(1, 25))
-    )
+    assert sorted(truth["id"]) == sorted(f"src-{k}" for k in range(1, 25))
+    assert sorted(facts["table"]["id"]) == sorted(truth["id"])
     assert [entry["id"] for entry in entries] == facts["table"]["id"]
     own = dict(zip(truth["id"].tolist(), truth["frac_agn"], strict=True))
     assert close(facts["table"]["frac_agn"], [own[key] for key in facts["table"]["id"]])
@@ -103,8 +101,7 @@ def test_ids_that_are_text_and_fractions_of_the_catalog(tmp_path):
 
 def test_details_are_those_of_the_fits(run):
     folder, facts, entries = run
-    truth = QTable.read(folder / "agn00/truth.ecsv")
-    matched = QTable.read(folder / "agn00/matched.ecsv")
+    truth, matched = product(folder, "truth"), product(folder, "matched")
     model, bands = SEDModel.yang2021(), [band["name"] for band in facts["bands"]]
     assert bands == ["megacam.r", "wfc3.f160w", "irac.ch1", *BANDS]
     results = {n: FitResults.read(folder / f"agn00/fits_{n}.fits") for n in ("all", "none")}
@@ -125,10 +122,8 @@ def test_details_are_those_of_the_fits(run):
         for name, found in results.items():
             one, fit = found[entry["id"]], entry["fits"][name]
             assert (fit["n_bands"], True) == (one.n_bands, close([fit["chi2"]], [one.chi2]))
-            mean, std = fit["moments"][names.index("stellar_mass")]
-            assert close(
-                [mean, std], [v.value for v in (one.mean("stellar_mass"), one.std("stellar_mass"))]
-            )
+            mass = [kind("stellar_mass").value for kind in (one.mean, one.std)]
+            assert close(fit["moments"][names.index("stellar_mass")], mass)
             for parameter, (first, weights) in fit["pdf"].items():
                 whole = np.zeros(len(one.pdf[parameter]))
                 whole[first : first + len(weights)] = weights
@@ -165,11 +160,11 @@ def test_pictures_are_of_so_many_sources_the_fitted_and_the_brightest_first(run,
     shown = [entry["id"] for entry in entries if entry["top"] is not None]
     assert len(shown) == facts["pictured"] == 5
     # nothing else is left out
-    assert {entry["id"]: entry["imaged"] for entry in entries} == {
-        entry["id"]: entry["imaged"] for entry in every
-    }
-    assert sorted(facts["table"]["id"]) == sorted(entry["id"] for entry in every)
-    assert sum("fits" in entry for entry in entries) == sum("fits" in entry for entry in every)
+    kept, wanted = (
+        sorted((one["id"], one["imaged"], "fits" in one) for one in some)
+        for some in (entries, every)
+    )
+    assert kept == wanted
     magnitude = dict(zip(facts["table"]["id"], facts["table"]["mag"], strict=True))
     fitted = [entry["id"] for entry in every if "fits" in entry and entry["imaged"]]
     assert len(fitted) > 5
@@ -181,7 +176,7 @@ def test_pictures_are_of_so_many_sources_the_fitted_and_the_brightest_first(run,
 def test_pictures_of_many_sources_are_looked_at_in_parts(run, monkeypatch):
     folder, _, every = run
     cut = Cutouts.read(Context(small_config(BANDS), folder), "agn00")
-    sky = QTable.read(folder / "agn00/truth.ecsv")["sky"]
+    sky = product(folder, "truth")["sky"]
     whole = cut.on_image(sky)
     monkeypatch.setattr(cutouts, "_AT_ONCE", 5)
     np.testing.assert_array_equal(cut.on_image(sky), whole)
@@ -209,14 +204,11 @@ def test_the_page_needs_nothing_from_outside(run):
 
 
 def test_the_same_products_give_the_same_bytes(run):
-    folder = run[0]
-    paths = [
-        *(folder / "report").glob("sources-*.html"),
-        *(folder / "report/sources/agn00").iterdir(),
-    ]
-    before = {path: path.read_bytes() for path in paths}
-    do_stage(small_config(BANDS), folder, "sources", "agn00")
-    assert before == {path: path.read_bytes() for path in paths}
+    report = run[0] / "report"
+    paths = [*report.glob("sources-*.html"), *(report / "sources/agn00").iterdir()]
+    before = [path.read_bytes() for path in paths]
+    do_stage(small_config(BANDS), run[0], "sources", "agn00")
+    assert before == [path.read_bytes() for path in paths]
     assert len(before) == 3
 
 

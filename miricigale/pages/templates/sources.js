@@ -60,9 +60,9 @@
       row.outlier[set] = z !== null && z !== undefined && row.redshift !== null
         && Math.abs(z - row.redshift) / (1 + row.redshift) > facts.outlier;
     }
-    const told = new Set([...words("selection", row.selection), ...words("condition", row.condition)]);
-    for (const set of facts.compared) words("fit", row["fit_" + set]).forEach((word) => told.add(word));
-    row.words = [...told];
+    const noted = new Set([...words("selection", row.selection), ...words("condition", row.condition)]);
+    for (const set of facts.compared) words("fit", row["fit_" + set]).forEach((word) => noted.add(word));
+    row.words = [...noted];
     row.flags = row.words.join(", ");
     return row;
   });
@@ -243,9 +243,9 @@
     state.id = String(row.id);
     const at = listed.indexOf(row), box = $("scroll");
     if (intoView && at >= 0) {
-      const room = box.clientHeight - $("list").tHead.offsetHeight;
+      const height = box.clientHeight - $("list").tHead.offsetHeight;
       if (at * ROW < box.scrollTop) box.scrollTop = at * ROW;
-      else if ((at + 1) * ROW > box.scrollTop + room) box.scrollTop = (at + 1) * ROW - room;
+      else if ((at + 1) * ROW > box.scrollTop + height) box.scrollTop = (at + 1) * ROW - height;
     }
     writeAddress();
     render();
@@ -423,8 +423,8 @@
     const truth = { fill: "none", stroke: "#6b7280" };
     bands.forEach((band, k) => {
       const cx = x(log(band.wave)), flux = entry.flux[k], error = entry.error[k], color = band.miri ? "#9a3412" : "#1c2330";
-      const told = draw("title", {}, band.label + ": " + number(flux) + " ± " + number(error) + " µJy, true " + number(entry.true[k]));
-      const group = draw("g", {}, told);
+      const title = draw("title", {}, band.label + ": " + number(flux) + " ± " + number(error) + " µJy, true " + number(entry.true[k]));
+      const group = draw("g", {}, title);
       if (entry.true[k] > 0) group.append(draw("rect", { x: cx - 5, y: y(log(entry.true[k])) - 5, width: 10, height: 10, ...truth }));
       if (flux !== null && error > 0) {
         if (flux > error) {
@@ -504,14 +504,14 @@
   function fluxes(entry) {
     let k = -1;
     const body = bands.map((band, i) => {
-      const told = [];
+      const noted = [];
       if (band.miri) {
         k += 1;
-        told.push(...words("condition", entry.conditions[k]), ...words("photometry", entry.flags[k] < 0 ? 0 : entry.flags[k]));
+        noted.push(...words("condition", entry.conditions[k]), ...words("photometry", entry.flags[k] < 0 ? 0 : entry.flags[k]));
       }
       const ratio = entry.error[i] > 0 && entry.flux[i] !== null ? entry.flux[i] / entry.error[i] : null;
       return make("tr", {}, make("td", { class: "t" }, band.miri ? band.label : band.name), make("td", {}, number(band.wave)), make("td", {}, number(entry.true[i])),
-        make("td", {}, number(entry.flux[i])), make("td", {}, number(entry.error[i])), make("td", {}, number(ratio, 1)), make("td", { class: "t" }, [...new Set(told)].join(", ")));
+        make("td", {}, number(entry.flux[i])), make("td", {}, number(entry.error[i])), make("td", {}, number(ratio, 1)), make("td", { class: "t" }, [...new Set(noted)].join(", ")));
     });
     return make("div", { class: "scrolls" }, make("table", { class: "values" },
       make("thead", {}, make("tr", {}, ["band", "µm", "true", "measured", "error", "S/N", "flags"].map((text, j) => make("th", { class: j === 0 || j === 6 ? "t" : null }, text)))),

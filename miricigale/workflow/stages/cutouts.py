@@ -8,8 +8,8 @@ from PIL import Image
 
 from miricigale.evaluation import sigma_mad
 from miricigale.utils.parallel import chunks
+from miricigale.workflow.page.pictures import binned, filled
 from miricigale.workflow.stages.images import measured_mosaic
-from miricigale.workflow.stages.pictures import binned, filled
 
 __all__ = ["Cutouts"]
 

@@ -9,8 +9,8 @@ from miricigale.evaluation import bootstrap
 from miricigale.evaluation.estimates import median, outlier_share, scatter
 from miricigale.filters import Filter
 from miricigale.pages import Missing
-from miricigale.workflow.stages.figures import band_label
-from miricigale.workflow.stages.metrics import bright_isolated
+from miricigale.workflow.page.labels import band_label
+from miricigale.workflow.page.numbers import bright_isolated
 from miricigale.workflow.truths import CUTOUTS
 
 __all__ = ["perturbation_costs", "write_perturbed"]
@@ -85,7 +85,7 @@ def perturbation_costs(truths, every, bands, *, seed):
     ----------
     truths : dict of str to `~miricigale.workflow.truths.Truth`
         All truths.
-    every : dict of str to `~miricigale.workflow.stages.metrics.StudyTables`
+    every : dict of str to `~miricigale.workflow.page.numbers.StudyTables`
         Their tables.
     bands : iterable of str
         MIRI bands; fluxes are those of the shortest and the longest.

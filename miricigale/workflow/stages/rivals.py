@@ -9,6 +9,7 @@ from miricigale.evaluation import Estimate, bootstrap, match_truth, recovery_met
 from miricigale.evaluation.estimates import median
 from miricigale.pages import number
 from miricigale.utils.tables import described_rows, error_column
+from miricigale.workflow.page.labels import band_label
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.conditions import ConditionFlags
 from miricigale.workflow.stages.exposures import (
@@ -17,7 +18,6 @@ from miricigale.workflow.stages.exposures import (
     band_names,
     exposure_plan,
 )
-from miricigale.workflow.stages.figures import band_label
 from miricigale.workflow.stages.measure import measure_band
 from miricigale.workflow.stages.sample import SampleFlags, in_field
 from miricigale.workflow.truths import reference

@@ -1,26 +1,25 @@
-"""Pages on which the sources of a truth are looked at one by one, beside the report."""
+"""The source browser: pages that show the sources of a truth one by one, linked from the report."""
 
-import dataclasses
-import html
 import json
-import string
 from importlib import resources
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
+from markupsafe import Markup
 from matplotlib.colors import to_hex
 
 from miricigale import fitting, photometry, sed
 from miricigale.evaluation import OUTLIER, AssociationFlags
 from miricigale.filters import Filter
+from miricigale.pages import render
 from miricigale.utils.tables import error_column
 from miricigale.utils.units import FNU, WAVE, ab_magnitude
+from miricigale.workflow.page.labels import SET_COLORS, SET_LABELS, band_label
+from miricigale.workflow.page.numbers import StudyTables
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.conditions import ConditionFlags, any_condition
 from miricigale.workflow.stages.cutouts import Cutouts
 from miricigale.workflow.stages.exposures import bands_of_truth
-from miricigale.workflow.stages.figures import SET_COLORS, SET_LABELS, band_label
 from miricigale.workflow.stages.inputs import sed_resources
 from miricigale.workflow.stages.sample import SampleFlags
 from miricigale.workflow.truths import of_truth, truth_names
@@ -71,249 +70,189 @@ FLAGS = {
     kernels=("fit",),
 )
 def make_sources(context, name):
-    """Beside stage 14: the page of a truth, and what it shows of its sources, `CHUNK` in a file."""
-    tables = _Tables.read(context, name)
-    cutouts = Cutouts.read(context, name)
-    imaged = cutouts.on_image(tables.truth["sky"])
+    """Stage 14, in addition: the page of a truth, and what it shows of its sources, `CHUNK` in a file."""
+    tables, cutouts = _Sources(context, name), Cutouts.read(context, name)
+    sky = tables.truth["sky"]
+    imaged = cutouts.on_image(sky)
     shown = tables.first_of(imaged, context.config.report.pictures)
     # those of a file are near to each other in the page, and those without pictures come last
     order = np.argsort(~shown, kind="stable")
-    folder = f"report/sources/{name}"
-    details = _Details(tables)
     for k, first in enumerate(range(0, len(order), CHUNK)):
-        rows = order[first : first + CHUNK]
+        rows, stem, tops = order[first : first + CHUNK], f"report/sources/{name}/{k:03d}", {}
         pictured = rows[shown[rows]]
-        tops = {}
         if pictured.size:
-            sheet, limits = cutouts.sheet(tables.truth["sky"][pictured])
-            tops = dict(zip(pictured, limits, strict=True))
-            context.save(f"{folder}/{k:03d}.png", lambda path, sheet=sheet: sheet.save(path))
+            sheet, limits = cutouts.sheet(sky[pictured])
+            tops = dict(zip(pictured, _rounded(limits), strict=True))
+            context.save(f"{stem}.png", sheet.save)
         entries = [
-            details.entry(row)
-            | {"top": _rounded(tops[row]) if row in tops else None, "imaged": bool(imaged[row])}
-            for row in rows
+            tables.entry(row) | {"top": tops.get(row), "imaged": bool(imaged[row])} for row in rows
         ]
-        text = f"loaded({k}, {_json(entries)});\n"
-        context.save(f"{folder}/{k:03d}.js", lambda path, text=text: path.write_text(text, "utf-8"))
+        _save_text(context, f"{stem}.js", f"loaded({k}, {_json(entries)});\n")
     facts = {
         "truth": name,
         "truths": context.plan,
         "chunk": CHUNK,
         "outlier": OUTLIER,
         "pictured": int(shown.sum()),
-        "prior": band_label(context.config.highres.filter),
+        "prior": band_label(tables.prior),
         "cutouts": cutouts.describe(),
         "flags": {kind: flags.meanings() for kind, flags in FLAGS.items()},
-        **details.describe(),
-        "table": _table(tables, order),
+        **tables.describe(),
+        "table": tables.columns(order),
     }
-    page = _page(context.config, name, facts)
-    context.save(f"report/sources-{name}.html", lambda path: path.write_text(page, "utf-8"))
+    script = resources.files("miricigale.pages") / "templates" / "sources.js"
+    page = render(
+        "sources.html",
+        title=f"{context.config.run.name}: sources of {name}",
+        facts=Markup(_json(facts)),
+        script=Markup(script.read_text("utf-8")),
+    )
+    _save_text(context, f"report/sources-{name}.html", page)
 
 
-@dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class _Tables:
-    """
-    What the page shows of a truth.
+def _save_text(context, name, text):
+    context.save(name, lambda path: path.write_text(text, "utf-8"))
 
-    ``truth`` and ``matched`` have the same sources row by row; ``results`` are those of each set of
-    bands, and ``fits`` their tables; ``fitted_row`` is the row of each source in these, -1 without.
-    """
 
-    truth: QTable
-    matched: QTable
-    results: dict
-    fits: dict
-    fitted_row: np.ndarray
-    bands: tuple
-    miri: tuple
-    prior: str
+class _Sources(StudyTables):
+    """What the page shows of a truth: photometry, spectra, posteriors, parameters and flags of its sources."""
 
-    @classmethod
-    def read(cls, context, name):
-        """Read the products of a truth."""
-        config = context.config
-        matched = QTable.read(context.path(f"{name}/matched.ecsv"))
-        results = {
-            chosen: fitting.FitResults.read(context.path(f"{name}/fits_{chosen}.fits"))
-            for chosen in config.fit.sets
+    def __init__(self, context, name):
+        super().__init__(context, name)
+        config, truth = context.config, self.truth
+        self.model, self.prior = sed.SEDModel.yang2021(), config.highres.filter
+        self.miri = tuple(config.exposures.filters)
+        self.bands = (*(band for band in config.fit.bands if band not in self.miri), *self.miri)
+        self.pivots = np.array([Filter.from_name(band).pivot.value for band in self.bands])
+        self.edges = np.geomspace(0.7 * self.pivots.min(), 1.4 * self.pivots.max(), N_WAVE + 1)
+        self.sampled = np.asarray(self.matched["selection"]) == 0
+        # with and without MIRI: the sets in the table and the figure of the spectrum
+        both = [unit for unit in ("all", "none") if unit in self.results]
+        self.compared = both or list(self.results)[:2]
+        every = list(self.results.values())
+        self.units = {
+            parameter: every[0].unit(parameter)
+            for parameter in every[0].parameters
+            if parameter in truth.colnames
+            and all(parameter in results.parameters for results in every)
         }
-        sample = np.asarray(matched["selection"]) == 0
-        miri = tuple(config.exposures.filters)
-        bands = (*(band for band in config.fit.bands if band not in miri), *miri)
-        return cls(
-            QTable.read(context.path(f"{name}/truth.ecsv")),
-            matched,
-            results,
-            {chosen: found.to_table() for chosen, found in results.items()},
-            np.where(sample, np.cumsum(sample) - 1, -1),
-            bands,
-            miri,
-            config.highres.filter,
+        # columns without a unit are in that of the parameter
+        self.parameters = np.transpose(
+            [u.Quantity(truth[key], unit, dtype=float).value for key, unit in self.units.items()]
+        )
+        self.true = np.transpose([truth[band].to_value(FNU) for band in self.bands])
+        self.flux, self.error = (
+            np.transpose(values) for values in zip(*map(self._measured, self.bands), strict=True)
         )
 
-    @property
-    def compared(self):
-        """The sets in the table and the figure of the spectrum: with and without MIRI."""
-        pair = [name for name in ("all", "none") if name in self.results]
-        return pair or list(self.results)[:2]
+    def _measured(self, band):
+        """Fluxes of all sources in a band and their errors; mock fluxes are of the sample, and of all sets."""
+        if band in self.miri:
+            return [self.matched[key].to_value(FNU) for key in (band, error_column(band))]
+        results = next(iter(self.results.values()))
+        at = results.filters.index(band)
+        return [self.of_sources(values[:, at]) for values in (results.flux, results.flux_err)]
+
+    def of_sources(self, values):
+        """Values of the rows of the fits as values of the sources, NaN without a fit."""
+        out = np.full(len(self.truth), np.nan)
+        out[self.sampled] = values
+        return out
 
     def first_of(self, rows, n):
         """Which of some rows (bool) are shown if at most ``n`` can be: fitted ones, then the brightest."""
         bright = np.nan_to_num(self.truth[self.prior].value, nan=-np.inf)
-        order = np.lexsort((-bright, self.fitted_row < 0, ~rows))
+        order = np.lexsort((-bright, ~self.sampled, ~rows))
         first = np.zeros(len(rows), bool)
         first[order[:n]] = True
         return first & rows
 
-    def of_sources(self, values):
-        """Values of the rows of the fits as values of the sources, NaN without a fit."""
-        values, out = np.asarray(values, float), np.full(len(self.truth), np.nan)
-        sample = self.fitted_row >= 0
-        out[sample] = values[self.fitted_row[sample]]
-        return out
-
-
-def _table(tables, order):
-    """Columns of the table of all sources, in the order of the files."""
-    truth, matched = tables.truth, tables.matched
-    columns = {
-        "id": truth["id"],
-        "mag": ab_magnitude(truth[tables.prior]),
-        "ra": truth["sky"].ra.deg,
-        "dec": truth["sky"].dec.deg,
-        "redshift": truth["redshift"],
-        "frac_agn": truth["frac_agn"],
-    }
-    digits = {"mag": 5, "ra": 9, "dec": 9}
-    for name in tables.compared:
-        fits, results = tables.fits[name], tables.results[name]
-        for parameter in DRAWN:
-            if f"{parameter}_mean" in fits.colnames:
-                mean = tables.of_sources(fits[f"{parameter}_mean"])
-                columns[f"{parameter}_{name}"] = mean
-        columns[f"chi2_{name}"] = tables.of_sources(results.reduced_chi2)
-    for name in tables.miri:
-        flux, error = matched[name].value, matched[error_column(name)].value
-        columns[f"sn_{name}"] = np.divide(
-            flux, error, out=np.full(len(flux), np.nan), where=error > 0
-        )
-        digits[f"sn_{name}"] = 3
-    columns["n_detected"] = matched["n_detected"]
-    columns["selection"] = matched["selection"]
-    columns["condition"] = any_condition(matched, tables.miri)
-    columns["association"] = matched["association"]
-    for name, results in tables.results.items():
-        columns[f"fit_{name}"] = np.nan_to_num(tables.of_sources(results.flags)).astype(int)
-    return {
-        name: _rounded(np.asarray(values)[order], digits.get(name, 4))
-        for name, values in columns.items()
-    }
-
-
-class _Details:
-    """What the page shows of single sources: photometry, spectra, posteriors, parameters, flags."""
-
-    def __init__(self, tables):
-        self.tables, self.model = tables, sed.SEDModel.yang2021()
-        truth, matched, every = tables.truth, tables.matched, list(tables.results.values())
-        self.pivots = np.array([Filter.from_name(name).pivot.value for name in tables.bands])
-        self.edges = np.geomspace(0.7 * self.pivots.min(), 1.4 * self.pivots.max(), N_WAVE + 1)
-        self.units = {
-            name: every[0].unit(name)
-            for name in every[0].parameters
-            if name in truth.colnames and all(name in results.parameters for results in every)
+    def columns(self, order):
+        """Columns of the table of all sources, in the order of the files."""
+        truth, matched = self.truth, self.matched
+        columns = {
+            "id": truth["id"],
+            "mag": ab_magnitude(truth[self.prior]),
+            "ra": truth["sky"].ra.deg,
+            "dec": truth["sky"].dec.deg,
+            "redshift": truth["redshift"],
+            "frac_agn": truth["frac_agn"],
         }
-        self.true = np.transpose([truth[name].to_value(FNU) for name in tables.bands])
-        # columns without a unit are in that of the parameter
-        self.parameters = np.transpose(
-            [u.Quantity(truth[name], unit, dtype=float).value for name, unit in self.units.items()]
-        )
-        self.flux, self.error = np.full((2, *self.true.shape), np.nan)
-        for k, name in enumerate(tables.bands):
-            if name in tables.miri:
-                self.flux[:, k] = matched[name].to_value(FNU)
-                self.error[:, k] = matched[error_column(name)].to_value(FNU)
-                continue
-            # the mock fluxes of the sample, which all sets share
-            at = every[0].filters.index(name)
-            self.flux[:, k] = tables.of_sources(every[0].flux[:, at])
-            self.error[:, k] = tables.of_sources(every[0].flux_err[:, at])
-        self.moments = {
-            name: np.array(
-                [
-                    [results.mean(p).to_value(unit), results.std(p).to_value(unit)]
-                    for p, unit in self.units.items()
-                ]
-            )
-            for name, results in tables.results.items()
+        digits = {"mag": 5, "ra": 9, "dec": 9}
+        for unit in self.compared:
+            fits = self.fits[unit]
+            for parameter in DRAWN:
+                if (mean := f"{parameter}_mean") in fits.colnames:
+                    columns[f"{parameter}_{unit}"] = self.of_sources(fits[mean])
+            columns[f"chi2_{unit}"] = self.of_sources(self.results[unit].reduced_chi2)
+        for band in self.miri:
+            flux, error = self._measured(band)
+            none = np.full(len(flux), np.nan)
+            columns[f"sn_{band}"] = np.divide(flux, error, out=none, where=error > 0)
+            digits[f"sn_{band}"] = 3
+        columns |= {key: matched[key] for key in ("n_detected", "selection", "association")}
+        columns["condition"] = any_condition(matched, self.miri)
+        for unit, results in self.results.items():
+            columns[f"fit_{unit}"] = np.nan_to_num(self.of_sources(results.flags)).astype(int)
+        return {
+            key: _rounded(np.asarray(values)[order], digits.get(key, 4))
+            for key, values in columns.items()
         }
 
     def describe(self):
         """What all sources have in common."""
-        tables = self.tables
         return {
             "sets": [
-                {"name": name, "label": SET_LABELS[name], "color": to_hex(SET_COLORS[name])}
-                for name in tables.results
+                {"name": unit, "label": SET_LABELS[unit], "color": to_hex(SET_COLORS[unit])}
+                for unit in self.results
             ],
-            "compared": tables.compared,
+            "compared": self.compared,
             "bands": [
-                {
-                    "name": name,
-                    "label": band_label(name),
-                    "wave": _rounded(wave),
-                    "miri": name in tables.miri,
-                }
-                for name, wave in zip(tables.bands, self.pivots, strict=True)
+                {"name": name, "label": band_label(name), "wave": wave, "miri": name in self.miri}
+                for name, wave in zip(self.bands, _rounded(self.pivots), strict=True)
             ],
             "wave": _rounded(np.sqrt(self.edges[1:] * self.edges[:-1])),
             "pdf_edges": {
-                name: {
-                    parameter: _rounded(results.distribution(parameter)[0].value)
-                    for parameter in _drawn(results)
-                }
-                for name, results in tables.results.items()
+                unit: {key: _rounded(found.distribution(key)[0].value) for key in _drawn(found)}
+                for unit, found in self.results.items()
             },
-            "parameters": [
-                {"name": name, "unit": unit.to_string()} for name, unit in self.units.items()
-            ],
+            "parameters": [{"name": key, "unit": str(unit)} for key, unit in self.units.items()],
         }
 
     def entry(self, row):
         """What belongs to the source in a row of the truth."""
-        tables, at = self.tables, int(self.tables.fitted_row[row])
         entry = {
-            "id": tables.truth["id"][row].item(),
+            "id": self.truth["id"][row].item(),
             "true": _rounded(self.true[row]),
             "flux": _rounded(self.flux[row]),
             "error": _rounded(self.error[row], 3),
-            "flags": [int(tables.matched[f"{name}_flags"][row]) for name in tables.miri],
-            "conditions": [int(tables.matched[f"{name}_condition"][row]) for name in tables.miri],
+            "flags": [int(self.matched[f"{band}_flags"][row]) for band in self.miri],
+            "conditions": [int(self.matched[f"{band}_condition"][row]) for band in self.miri],
             "parameters": _rounded(self.parameters[row]),
         }
-        if at >= 0:
-            entry["fits"] = {name: self._fit(name, at) for name in tables.results}
+        if self.sampled[row]:
+            entry["fits"] = {unit: self._fit(unit, entry["id"]) for unit in self.results}
         return entry
 
-    def _fit(self, name, at):
-        """Chi2, posteriors and moments of a row of the fits, and the spectrum of its best model."""
-        results = self.tables.results[name]
-        one = results[results.ids[at]]
+    def _fit(self, unit, key):
+        """Chi2, posteriors and moments of a source, and the spectrum of its best model."""
+        one = self.results[unit][key]
         if not one.fitted:
             return None
         fit = {
             "chi2": _rounded(one.chi2),
             "n_bands": int(one.n_bands),
-            "moments": _rounded(self.moments[name][:, :, at]),
-            "pdf": {parameter: _weights(one.pdf[parameter]) for parameter in _drawn(results)},
+            "moments": [
+                [_rounded(moment(name).to_value(own)) for moment in (one.mean, one.std)]
+                for name, own in self.units.items()
+            ],
+            "pdf": {name: _weights(one.pdf[name]) for name in _drawn(one)},
         }
-        if name in self.tables.compared:
-            spectrum = one.best_sed(self.model)
-            means = _cell_means(
-                spectrum.wave.to_value(WAVE), spectrum.fnu.to_value(FNU), self.edges
-            )
-            fit["spectrum"] = _milli_dex(means)
+        if unit in self.compared:
+            best = one.best_sed(self.model)
+            means = _cell_means(best.wave.to_value(WAVE), best.fnu.to_value(FNU), self.edges)
+            # thousandths of log10
+            fit["spectrum"] = [round(1000 * np.log10(x)) if x > 0 else None for x in means]
         return fit
 
 
@@ -338,11 +277,6 @@ def _cell_means(x, y, edges):
     return np.diff(np.interp(edges, x, total)) / np.diff(edges)
 
 
-def _milli_dex(values):
-    """Thousandths of log10 of values; None where they are not positive."""
-    return [round(1000 * np.log10(value)) if value > 0 else None for value in values]
-
-
 def _rounded(values, digits=4):
     """Plain numbers of so many significant digits, None for NaN; text, integers and flags as they are."""
     values = np.asarray(values)
@@ -361,13 +295,3 @@ def _json(values):
     text = json.dumps(values, separators=(",", ":"), allow_nan=False)
     # no tag and no comment of HTML can begin in it
     return text.replace("<", "\\u003c")
-
-
-def _page(config, name, facts):
-    """The page as text: the facts and the script are part of it."""
-    files = resources.files("miricigale.pages") / "templates"
-    return string.Template((files / "sources.html").read_text("utf-8")).substitute(
-        title=html.escape(f"{config.run.name}: sources of {name}"),
-        facts=_json(facts),
-        script=(files / "sources.js").read_text("utf-8"),
-    )

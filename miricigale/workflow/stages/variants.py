@@ -15,6 +15,8 @@ from miricigale.pages import number
 from miricigale.photometry.error_curves import limiting_flux, measured_curve
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_rows, error_column
+from miricigale.workflow.page.band_figures import variant_figure
+from miricigale.workflow.page.labels import band_label
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.exposures import (
     EXPOSURE_RESOURCES,
@@ -23,7 +25,6 @@ from miricigale.workflow.stages.exposures import (
     band_names,
     exposure_plan,
 )
-from miricigale.workflow.stages.figures import band_label, variant_figure
 from miricigale.workflow.stages.images import (
     background_of,
     expose_image,
@@ -352,7 +353,7 @@ def _row(table, band, name):
 
 
 def add_reasons(reasons, table, config):
-    """Add to the reasons of `~miricigale.workflow.stages.comparison.reasons_of` what the variants cost."""
+    """Add to the reasons of `~miricigale.workflow.page.paper.reasons_of` what the variants cost."""
     changes = variant_changes(config)
     for row in () if table is None else table:
         key = f"limit.{row['band'].removeprefix('miri.')}"

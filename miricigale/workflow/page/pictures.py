@@ -9,7 +9,7 @@ from miricigale.plotting.axes import WIDTH, new_figure
 from miricigale.plotting.images import mark_sky, plot_color, plot_image, plot_model_residual
 from miricigale.plotting.measurements import background_figure, encircled_energy_figure
 from miricigale.psf.wiener import energy_error
-from miricigale.workflow.stages.figures import band_label
+from miricigale.workflow.page.labels import band_label
 
 __all__ = [
     "binned",
@@ -54,7 +54,7 @@ def _directions(image):
 
 def field_figure(images, prior, names):
     """
-    The field: the high-resolution image beside a color image of three bands, or each band in gray.
+    The field: the high-resolution image and a color image of three bands, or each band in gray.
 
     ``images`` are mosaics on one grid, the shortest wavelength first (other numbers than three are drawn
     in gray); ``names`` are their bands and that of the prior.

@@ -1,4 +1,6 @@
-"""Figures of the report on what was found of the truths, from their tables."""
+"""Figures of the fits of all truths and of what is known of their sources."""
+
+import functools
 
 import astropy.units as u
 import numpy as np
@@ -19,7 +21,9 @@ from miricigale.evaluation import (
     sigma_mad,
     xray_fluxes,
 )
-from miricigale.filters import Filter, FilterSet
+from miricigale.filters import Filter
+from miricigale.plotting.axes import label_outer, panels
+from miricigale.plotting.comparison import plot_redshifts
 from miricigale.plotting.examples import fit_figure, sequence_figure
 from miricigale.plotting.measurements import features_figure, offsets_figure
 from miricigale.plotting.truths import (
@@ -33,8 +37,15 @@ from miricigale.plotting.truths import (
     recovery_figure,
 )
 from miricigale.utils.units import FNU, ab_magnitude
-from miricigale.workflow.stages.figures import SET_LABELS, band_label
-from miricigale.workflow.truths import CATALOG, SETS
+from miricigale.workflow.page.labels import (
+    SET_LABELS,
+    band_label,
+    by_wavelength,
+    class_label,
+    parameter_label,
+    truth_label,
+)
+from miricigale.workflow.page.numbers import MIPS_LIMIT
 
 __all__ = [
     "band_residuals",
@@ -44,84 +55,74 @@ __all__ = [
     "disk_figure",
     "example_figure",
     "fraction_bins_figure",
-    "fraction_figure",
-    "parameter_label",
+    "histogram_figure",
     "rank_figure",
     "redshift_figure",
     "residual_figure",
     "shape_figure",
     "spectra_figure",
-    "truth_label",
-    "width_figure",
     "xray_figure",
 ]
 
 #: fracAGN of the spectra that are drawn over each other.
 SEQUENCE = (0.0, 0.2, 0.4, 0.6, 0.8, 0.99)
-#: AB magnitude of the limit of the mock photometry at 24 um.
-MIPS_LIMIT = 19.3
-#: What classes are called on the page, where that is not their name.
-CLASS_LABELS = {"agn": "AGN", "unknown": "not in the fit"}
+#: Classes that sources are found in, as columns of tables.
+CLASS_COLUMNS = (*CLASS_NAMES, "unknown")
 #: PAH features that are looked for in the residuals.
 FEATURES = PAH_FEATURES[1:3]
 
 
-def truth_label(one):
-    """What a truth (`~miricigale.evaluation.TruthResults`) is called on the page."""
-    if one.frac_agn is None:
-        return "AGN of the catalog" if one.name.startswith(CATALOG) else "realistic field"
-    return f"fracAGN {one.frac_agn:g}"
+def _both(one):
+    """The fits with and without MIRI that a truth has: name and label."""
+    return {name: SET_LABELS[name] for name in ("all", "none") if name in one.fits}
 
 
-def parameter_label(name):
-    """What a parameter of the fits is called on the page."""
-    told = {"frac_agn": "fracAGN", "sfr_100myr": "SFR (100 Myr)"}
-    return told.get(name, name.replace("_", " "))
-
-
-def _sets(one, sets=SETS):
-    """The sets of bands that a truth was fitted with, of those given: name and label."""
-    return {name: SET_LABELS[name] for name in sets if name in one.fits}
-
-
-def _by_truth(study, values):
-    """Values of each truth and set, with and without MIRI: function of truth and set to arrays."""
-    return {
-        truth_label(one): {
-            label: values(one, name) for name, label in _sets(one, ("all", "none")).items()
-        }
-        for one in study.truths
-        if one.sample.any()
-    }
-
-
-def redshift_figure(study):
-    """Histograms of the redshift errors of each truth."""
-    return histograms_figure(
-        _by_truth(study, lambda one, name: one.redshift_error(name)),
+#: Histograms: values of a truth and a set of bands, edges of bins, label, and the true value of a truth.
+_HISTOGRAMS = {
+    "redshift": (
+        lambda one, name: one.redshift_error(name),
         np.linspace(-0.3, 0.3, 31),
-        xlabel=r"(z$_{\rm fit}$ - z) / (1 + z)",
-        truth={truth_label(one): 0.0 for one in study.truths},
-    )
-
-
-def fraction_figure(study):
-    """Histograms of the posterior means of fracAGN of each truth."""
-    return histograms_figure(
-        _by_truth(study, lambda one, name: one.fitted(name, "frac_agn_mean")),
+        r"(z$_{\rm fit}$ - z) / (1 + z)",
+        lambda one: 0.0,
+    ),
+    "fraction": (
+        lambda one, name: one.fitted(name, "frac_agn_mean"),
         np.linspace(0, 1, 26),
-        xlabel="fracAGN (posterior mean)",
-        truth={truth_label(one): one.frac_agn for one in study.truths},
-    )
-
-
-def width_figure(study):
-    """Histograms of the posterior widths of fracAGN of each truth."""
-    return histograms_figure(
-        _by_truth(study, lambda one, name: one.fitted(name, "frac_agn_std")),
+        "fracAGN (posterior mean)",
+        lambda one: one.frac_agn,
+    ),
+    "width": (
+        lambda one, name: one.fitted(name, "frac_agn_std"),
         np.linspace(0, 0.4, 26),
-        xlabel="posterior width of fracAGN (std)",
+        "posterior width of fracAGN (std)",
+        lambda one: None,
+    ),
+}
+
+
+def histogram_figure(study, quantity):
+    """Histograms of ``"redshift"`` errors, or the ``"fraction"`` of the AGN or its ``"width"``, by truth."""
+    values, bins, xlabel, true = _HISTOGRAMS[quantity]
+    truths = {truth_label(one): one for one in study.truths if one.sample.any()}
+    return histograms_figure(
+        {
+            title: {label: values(one, name) for name, label in _both(one).items()}
+            for title, one in truths.items()
+        },
+        bins,
+        xlabel=xlabel,
+        truth={title: true(one) for title, one in truths.items()},
     )
+
+
+def redshift_figure(truth, fits):
+    """Fitted against true redshifts, by set of bands."""
+    figure, axes = panels([SET_LABELS[unit] for unit in fits], height=4.7)
+    for (title, ax), table in zip(axes.items(), fits.values(), strict=True):
+        error, z = table["redshift_std"], table["redshift_mean"]
+        plot_redshifts(truth["redshift"], z, z_err=error, ax=ax, title=title)
+    label_outer(axes)
+    return figure
 
 
 def fraction_bins_figure(study):
@@ -130,7 +131,7 @@ def fraction_bins_figure(study):
     values = {}
     for low, high in REDSHIFT_BINS:
         own = {}
-        for name, label in (_sets(truths[0], ("all", "none")) if truths else {}).items():
+        for name, label in _both(truths[0]).items():
             rows = []
             for one in truths:
                 z = one.true("redshift")
@@ -188,8 +189,8 @@ def xray_figure(study, seed):
         completeness(values, found, edges),
         xlabel=r"log X-ray flux, 0.5-7 keV (erg s$^{-1}$ cm$^{-2}$)",
         limits=[
-            (np.log10(limit.flux.value), f"{limit.survey}, {limit.kind}", limit.checked)
-            for limit in XRAY_LIMITS
+            (np.log10(one.flux.value), f"{one.survey}, {one.kind}", one.checked)
+            for one in XRAY_LIMITS
         ],
         half=half,
     )
@@ -201,14 +202,12 @@ def detection_figure(study):
     table = one.truth
     least = min(2, len(study.bands))
     named = "two or more MIRI bands" if least == 2 else "the MIRI band"
-    groups = {
-        f"detected in {named}": one.field & (np.asarray(one.matched["n_detected"]) >= least),
-    }
+    seen = one.field & (np.asarray(one.matched["n_detected"]) >= least)
+    groups = {f"detected in {named}": seen}
     if "mips.24" in table.colnames:
         with np.errstate(invalid="ignore"):
-            groups["MIPS 24 µm above its limit"] = one.field & (
-                ab_magnitude(table["mips.24"]) < MIPS_LIMIT
-            )
+            bright = ab_magnitude(table["mips.24"]) < MIPS_LIMIT
+        groups["MIPS 24 µm above its limit"] = one.field & bright
     power = np.where(one.field, table["ir_luminosity"].to_value(u.Lsun), np.nan)
     rate = 1 / sfr_to_infrared_luminosity(1 * u.Msun / u.yr).to_value(u.Lsun)
     # of light of AGN it is no star-formation rate
@@ -246,17 +245,12 @@ def spectra_figure(study, key, model):
         shown = (wave > 0.3) & (wave < 40)
         spectra[fraction] = sed.fnu.to_value(FNU)[shown]
     bands = {}
-    for name in study.bands:
+    for name in by_wavelength(study.bands):
         band = Filter.from_name(name)
         middle, half = band.pivot.to_value(u.um), 0.5 * band.width.to_value(u.um)
         bands[band_label(name)] = (middle - half, middle + half)
-    return sequence_figure(
-        wave[shown],
-        spectra,
-        bands=dict(sorted(bands.items(), key=lambda item: item[1])),
-        features=PAH_FEATURES.value,
-        redshift=redshift,
-    )
+    options = {"bands": bands, "features": PAH_FEATURES.value, "redshift": redshift}
+    return sequence_figure(wave[shown], spectra, **options)
 
 
 def example_figure(results, row, key, model):
@@ -268,7 +262,6 @@ def example_figure(results, row, key, model):
     the fits.
     """
     best = results["all"][key]
-    total = best.best_sed(model)
     parts, posteriors, joint = {}, {}, {}
     for name in ("all", "none"):
         one = results[name][key] if name in results else None
@@ -280,43 +273,31 @@ def example_figure(results, row, key, model):
         if name == "none":
             other = one.best_sed(model)
             parts["best model without MIRI"] = (other.wave, other.fnu)
-    fraction = best.best["frac_agn"].value
+    redshift, fraction = (best.best[axis].value for axis in ("redshift", "frac_agn"))
     if fraction > 0:
-        galaxy = best.best_sed(model, frac_agn=0.0)
+        total, galaxy = best.best_sed(model), best.best_sed(model, frac_agn=0.0)
         parts["galaxy of the best model"] = (galaxy.wave, galaxy.fnu)
         parts["AGN of the best model"] = (total.wave, total.fnu - galaxy.fnu)
-    filters = FilterSet.from_names(best.filters)
-    order = [filters.names.index(name) for name in best.filters]
-    used = np.isfinite(best.sigma)
-    photometry = {
-        "wave": u.Quantity(filters.pivots)[order],
-        "flux": best.flux * FNU,
-        "flux_err": np.where(used, best.sigma, best.flux_err) * FNU,
-        "model_flux": best.best_flux * FNU,
-        "used": used,
-        "limit": best.limit,
-        "spectrum": (total.wave, total.fnu),
-        "parts": parts,
-        "groups": ["MIRI" if n.startswith("miri.") else "existing bands" for n in best.filters],
-    }
-    return fit_figure(
-        photometry,
-        posteriors,
-        joint,
-        truth=(float(row["redshift"]), float(row["frac_agn"])),
+    draw_fit = functools.partial(
+        best.plot_sed,
+        model=model,
+        parts=parts,
+        groups=["MIRI" if n.startswith("miri.") else "existing bands" for n in best.filters],
         title=f"source {key}: injected z = {row['redshift']:.3f}, fracAGN = {row['frac_agn']:.2g}; "
-        f"best model with MIRI: z = {best.best['redshift'].value:.3f}, fracAGN = {fraction:g}, "
+        f"best model with MIRI: z = {redshift:.3f}, fracAGN = {fraction:g}, "
         f"chi2 = {best.chi2:.1f} in {best.n_bands} bands",
     )
+    truth = (float(row["redshift"]), float(row["frac_agn"]))
+    return fit_figure(draw_fit, posteriors, joint, truth=truth)
 
 
 def class_figure(table):
     """Shares found of each class, of a table of `~miricigale.evaluation.study_confusion`."""
-    names = [str(row["class"]) for row in table if row["n"]]
-    found = [name for name in (*CLASS_NAMES, "unknown") if name in table.colnames]
-    counts = np.array([[row[name] for name in found] for row in table if row["n"]], float)
-    labels = [[CLASS_LABELS.get(name, name) for name in some] for some in (names, found)]
-    return classes_figure(counts, labels[0], found=labels[1])
+    found = [name for name in CLASS_COLUMNS if name in table.colnames]
+    rows = [row for row in table if row["n"]]
+    counts = np.array([[row[name] for name in found] for row in rows], float)
+    names = [class_label(row["class"]) for row in rows]
+    return classes_figure(counts, names, found=[class_label(name) for name in found])
 
 
 def color_figure(study, shares):
@@ -327,22 +308,20 @@ def color_figure(study, shares):
     range has an AGN.
     """
     planes, labels = {}, {}
+    share = np.concatenate([shares[one.name] for one in study.truths])
+    redshift = np.concatenate([np.asarray(one.truth["redshift"], float) for one in study.truths])
+    sample = np.concatenate([one.sample for one in study.truths]) & np.isfinite(share)
     for window in COLOR_WINDOWS:
-        colors, classes = [np.empty((0, 2))], []
-        for one in study.truths:
-            rows = one.sample & np.isfinite(shares[one.name])
-            z = np.asarray(one.truth["redshift"], float)
-            rows &= (z >= window.z_low) & (z < window.z_high)
-            colors.append(window.colors(one.matched[rows]))
-            classes.append(classify(shares[one.name][rows], limits=KIRKPATRICK_LIMITS))
-        colors, classes = np.concatenate(colors), np.concatenate([np.zeros(0, "<U9"), *classes])
-        good = np.isfinite(colors).all(axis=1)
-        if not np.any(classes[good] == CLASS_NAMES[2]):
+        colors = np.concatenate([window.colors(one.matched) for one in study.truths])
+        rows = sample & (redshift >= window.z_low) & (redshift < window.z_high)
+        rows &= np.isfinite(colors).all(axis=1)
+        classes = classify(share[rows], limits=KIRKPATRICK_LIMITS)
+        if CLASS_NAMES[2] not in classes:
             continue
-        circles = ColorCircles.fit(colors, classes)
+        circles = ColorCircles.fit(colors[rows], classes)
         title = f"{window.z_low:g} < z < {window.z_high:g}"
-        shown = [CLASS_LABELS.get(name, name) for name in classes[good].tolist()]
-        planes[title] = (colors[good], shown, circles.center, (circles.inner, circles.outer))
+        shown = [class_label(name) for name in classes.tolist()]
+        planes[title] = (colors[rows], shown, circles.center, (circles.inner, circles.outer))
         labels[title] = tuple(
             f"log {band_label(a)} / {band_label(b)}" for a, b in (window.x, window.y)
         )

@@ -1,0 +1,106 @@
+"""How well a plan recovers redshift, fracAGN and AGN: numbers of one plan, and of two with the same sources."""
+
+import numpy as np
+
+from miricigale.evaluation import OUTLIER, Estimate, bootstrap
+from miricigale.evaluation.estimates import median, scatter
+
+__all__ = ["accuracy", "difference"]
+
+
+def _share(found, among):
+    """Share of sources found, by row: a statistic for `~miricigale.evaluation.bootstrap`."""
+    return np.sum(found, axis=-1) / np.sum(among, axis=-1)
+
+
+#: Statistic of each number, and the columns (`_columns`) that it is of.
+_NUMBERS = {
+    "z_scatter": (scatter, "dz"),
+    "z_outliers": (_share, "outlier", "known"),
+    "z_width": (median, "z_std"),
+    "frac_bias": (median, "df"),
+    "frac_scatter": (scatter, "df"),
+    "frac_width": (median, "f_std"),
+    "completeness": (_share, "found", "agn"),
+    "purity": (_share, "found", "selected"),
+}
+
+
+def _columns(sources, agn_limit):
+    """What the numbers are made of, by source."""
+    z, f = (np.asarray(sources[name], float) for name in ("redshift", "frac_agn"))
+    dz = (np.asarray(sources["redshift_mean"], float) - z) / (1 + z)
+    agn, selected = f >= agn_limit, np.asarray(sources["selected"], bool)
+    known = np.isfinite(dz)
+    columns = {
+        "dz": dz,
+        "known": known,
+        "outlier": np.where(known, np.abs(dz) > OUTLIER, np.nan),
+        "z_std": np.asarray(sources["redshift_std"], float) / (1 + z),
+        "df": np.asarray(sources["frac_agn_mean"], float) - f,
+        "f_std": sources["frac_agn_std"],
+        "agn": agn,
+        "selected": selected,
+        "found": agn & selected,
+    }
+    return {name: np.asarray(values, float) for name, values in columns.items()}
+
+
+def accuracy(sources, *, agn_limit=0.4, seed=0):
+    """
+    How well redshift, fracAGN and AGN are recovered.
+
+    Parameters
+    ----------
+    sources : `~astropy.table.QTable`
+        Of a `~miricigale.planning.Plan`.
+    agn_limit : float, optional
+        True fracAGN from which a source is an AGN.
+    seed : int, optional
+        Of the bootstrap.
+
+    Returns
+    -------
+    numbers : dict of str to `~miricigale.evaluation.Estimate`
+        Of the posterior means ``z_scatter`` (sigma_MAD of dz/(1+z)), ``z_outliers`` (share with abs(dz)/(1+z)
+        above 0.15), ``frac_bias`` and ``frac_scatter`` (median and sigma_MAD of the difference);
+        ``z_width`` and ``frac_width``, median posterior standard deviations (of z over 1+z);
+        ``completeness`` and ``purity`` of the selected AGN.
+    """
+    columns, numbers = _columns(sources, agn_limit), {}
+    for name, (statistic, *wanted) in _NUMBERS.items():
+        values = [columns[key] for key in wanted]
+        if statistic is _share:
+            numbers[name] = Estimate.of_fraction(*(np.nansum(one) for one in values))
+        else:
+            numbers[name] = bootstrap(statistic, *values, seed=seed)
+    return numbers
+
+
+def difference(first, second, *, agn_limit, seed):
+    """
+    Numbers of `accuracy` of the second plan less those of the first.
+
+    Parameters
+    ----------
+    first, second : `~astropy.table.QTable`
+        Tables of the same sources, row by row.
+    agn_limit, seed
+        As for `accuracy`.
+
+    Returns
+    -------
+    numbers : dict of str to `~miricigale.evaluation.Estimate`
+        With the errors of sources that are drawn together.
+    """
+    columns = [_columns(one, agn_limit) for one in (first, second)]
+    numbers = {}
+    for name, (statistic, *wanted) in _NUMBERS.items():
+        n = len(wanted)
+
+        def change(*values, statistic=statistic, n=n):
+            return statistic(*values[n:]) - statistic(*values[:n])
+
+        values = [one[key] for one in columns for key in wanted]
+        numbers[name] = bootstrap(change, *values, seed=seed)
+    return numbers

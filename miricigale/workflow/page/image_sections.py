@@ -1,0 +1,95 @@
+"""Sections on the images of the reference truth: headline, field, detections."""
+
+import numpy as np
+
+from miricigale.pages import Missing, cell_of
+from miricigale.workflow.page import pictures, study_figures
+from miricigale.workflow.page.declared import sentence, texts_of
+from miricigale.workflow.page.labels import SET_LABELS, browse, three_bands
+from miricigale.workflow.stages.exposures import study_exposures, study_pointings
+from miricigale.workflow.stages.images import measured_mosaic, reducer_of
+
+__all__ = ["field_text", "write_detections", "write_images", "write_summary"]
+
+
+def write_summary(page, truths):
+    """Headline numbers, and links to the sources of each truth."""
+    m, sky, texts = page.metrics, page.first.name, texts_of("summary")
+    linked = m | {"n_sample": browse(sky, m["n_sample"], show="sample")}
+    facts = {"min_detected": page.config.fit.min_detected}
+    cells = [(header, facts, linked, column) for header, *column in texts["items"]]
+    cells += [
+        (header, {"set": SET_LABELS[unit]}, m["fits"][unit], column)
+        for header, *column in texts["fits"]
+        for unit in ("all", "none")
+        if unit in m["fits"]
+    ]
+    page.section("summary")
+    page.report.items(
+        (sentence(header, facts), cell_of(entry, column)) for header, facts, entry, column in cells
+    )
+    links = [browse(name, name) for name in truths]
+    page.report.links("The sources one by one:", [(link.text, link.address) for link in links])
+
+
+def write_images(page, mosaics):
+    """The field in color or gray; an exposure before and after; mosaic, model and residual."""
+    config, image, sky = page.config, page.context.image, page.first.name
+    chosen = three_bands(page.bands)
+    page.section("images")
+    page.figure(
+        "color" if len(chosen) == 3 else "gray",
+        pictures.field_figure(
+            [mosaics[name] for name in chosen],
+            image("f160w.fits"),
+            [*chosen, config.highres.filter],
+        ),
+    )
+    unit = next(n for n, e in study_exposures(config).items() if e.filter == chosen[-1])
+    rate, cal = (image(f"{sky}/exposures/{unit}_{kind}.fits") for kind in ("rate", "cal"))
+    page.figure("subtraction", pictures.subtraction_figure(rate, cal, reducer_of(config)))
+    suffix, _ = measured_mosaic(config)
+    pairs = [
+        (image(f"{sky}/mosaic_{n}{suffix}.fits"), image(f"{sky}/photometry/{n}_model.fits"))
+        for n in chosen
+    ]
+    page.figure("residual", pictures.residual_figure(pairs, chosen))
+
+
+def write_detections(page):
+    """Which galaxies are detected, and why the others are not in the fit."""
+    m, prior = page.metrics, page.facts["prior"]
+    rows = []
+    for row in m["detected"]:
+        interval = Missing("no galaxy")
+        if row["n"]:
+            interval = f"{100 * row['low']:.1f} % to {100 * row['high']:.1f} %"
+        rows.append({"sample": f"{prior} < {row['limit']:g}", "interval": interval, **row})
+        if all(np.isnan(one["to_proposal"]) for one in m["detected"]):
+            del rows[-1]["to_proposal"]
+    page.section("detections")
+    page.table(
+        "shares",
+        rows,
+        other_exposures="" if m["as_paper"] else ", six bands, other exposures",
+        paper_sigma=page.sentence("paper_sigma") if page.config.errors.statistic == "mad" else "",
+    )
+    reasons = {name.replace("_", " "): n for name, n in m["n_left_out"].items()}
+    page.table(
+        "left_out",
+        [
+            {"reason": name, "sources": browse(page.first.name, n, show="all", flag=name)}
+            for name, n in reasons.items()
+        ],
+    )
+    if page.first.field.any():
+        page.figure("luminosity", study_figures.detection_figure(page.study))
+
+
+def field_text(config):
+    """Where the telescope looks, in words."""
+    centers, options = study_pointings(config), config.pointing
+    field = "a MIRI field" if len(centers) == 1 else f"{len(centers)} MIRI pointings"
+    if options.centers:
+        return f"{field}, the first at RA {centers[0].ra.deg:.5f}, Dec {centers[0].dec.deg:.5f}"
+    return f"{field} at RA {options.ra:.5f}, Dec {options.dec:.5f}"

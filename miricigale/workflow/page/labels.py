@@ -1,0 +1,86 @@
+"""What bands, sets of bands, truths and parameters are called on the page, and links to its sources."""
+
+from urllib.parse import quote, urlencode
+
+from miricigale.filters import Filter
+from miricigale.pages import Link
+from miricigale.plotting.comparison import MEASURED, SECOND
+from miricigale.workflow.truths import CATALOG
+
+__all__ = [
+    "SET_COLORS",
+    "SET_LABELS",
+    "band_label",
+    "browse",
+    "by_wavelength",
+    "class_label",
+    "parameter_label",
+    "three_bands",
+    "truth_label",
+]
+
+#: Sets of bands: what they are called, and their colors.
+SET_LABELS = {
+    "all": "with MIRI",
+    "none": "without MIRI",
+    "blue": "with the shorter half of MIRI",
+    "red": "with the longer half of MIRI",
+}
+SET_COLORS = {"all": MEASURED, "none": SECOND, "blue": "tab:blue", "red": "tab:red"}
+_CLASS_LABELS = {"agn": "AGN", "unknown": "not in the fit"}
+_PARAMETER_LABELS = {"frac_agn": "fracAGN", "sfr_100myr": "SFR (100 Myr)"}
+
+
+def band_label(name):
+    """Return what a band is called on the page: ``F770W`` for ``miri.f770w``."""
+    return name.rpartition(".")[2].upper()
+
+
+def class_label(name):
+    """Return what a class of `~miricigale.evaluation.classify` is called."""
+    return _CLASS_LABELS.get(name, str(name))
+
+
+def parameter_label(name):
+    """Return what a parameter of the fits is called."""
+    return _PARAMETER_LABELS.get(name, name.replace("_", " "))
+
+
+def truth_label(one):
+    """Return what a truth (`~miricigale.evaluation.TruthResults`) is called."""
+    if one.frac_agn is None:
+        return "AGN of the catalog" if one.name.startswith(CATALOG) else "realistic field"
+    return f"fracAGN {one.frac_agn:g}"
+
+
+def by_wavelength(names):
+    """Return names of bands in the order of their pivot wavelengths."""
+    return sorted(names, key=lambda name: Filter.from_name(name).pivot)
+
+
+def three_bands(names):
+    """Return the shortest, the middle and the longest of some bands, or all of fewer than three."""
+    bands = by_wavelength(names)
+    return bands if len(bands) < 3 else [bands[0], bands[len(bands) // 2], bands[-1]]
+
+
+def browse(truth, text, source="", **filters):
+    """
+    Return a cell or words that link into the source browser of a truth.
+
+    Parameters
+    ----------
+    truth : str
+        Name of the truth.
+    text : str or int
+        What the reader sees; a number of 0 sources is no link.
+    source : str or int, optional
+        Id of the source that is opened.
+    **filters
+        What the browser lists: ``show``, ``flag`` and ``text`` of its controls, or a range by the
+        name of a column.
+    """
+    if text == 0:
+        return text
+    place = quote(str(source), safe="") + (f"?{urlencode(filters)}" if filters else "")
+    return Link(text, f"sources-{quote(truth)}.html{f'#{place}' if place else ''}")

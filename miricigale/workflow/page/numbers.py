@@ -1,0 +1,368 @@
+"""The plain numbers of a study (``report/metrics.json``), from the tables of a run."""
+
+import functools
+import itertools
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale import depth, fitting, photometry
+from miricigale.evaluation import (
+    PUBLISHED_LIGHT,
+    fraction_interval,
+    integrated_light,
+    recovery_metrics,
+    sigma_mad,
+)
+from miricigale.instrument import (
+    CEERS_FILTERS,
+    ceers_exposures,
+)
+from miricigale.utils.units import ab_magnitude
+from miricigale.workflow.stages.conditions import (
+    ConditionFlags,
+    band_conditions,
+    detection_counts,
+    fit_conditions,
+    has_flag,
+)
+from miricigale.workflow.stages.exposures import pointing_exposures, pointing_time
+from miricigale.workflow.stages.sample import SampleFlags
+
+__all__ = [
+    "FEWEST",
+    "MIPS_LIMIT",
+    "StudyTables",
+    "above_proposal",
+    "as_ceers",
+    "as_paper",
+    "bright_isolated",
+    "study_metrics",
+    "truth_metrics",
+    "whole_sample",
+]
+
+#: Fewest sources of which a median with its error or scatter is shown.
+FEWEST = 5
+#: AB magnitude of the limit of the mock photometry at 24 um.
+MIPS_LIMIT = 19.3
+
+#: Shares of sources detected in two or more bands, by F160W limit: Yang et al. 2021.
+PAPER_DETECTED = ((26.0, 0.53), (25.0, 0.75))
+
+
+def _product(path, reader=QTable.read):
+    """A product of a truth, by its path within the run, that is read when it is first asked for."""
+    return functools.cached_property(
+        lambda self: reader(self._context.path(path.format(self._name)))
+    )
+
+
+class StudyTables:
+    """
+    The tables of one truth of a run, each read when it is first asked for.
+
+    Parameters
+    ----------
+    context : `~miricigale.workflow.Context`
+        Of a stage, or of none.
+    name : str
+        Name of the truth.
+    """
+
+    def __init__(self, context, name):
+        self._context, self._name = context, name
+
+    #: The sources of the catalog with their true fluxes (stage 3).
+    truth = _product("{}/truth.ecsv")
+    #: The same sources row by row with measured fluxes (stage 12).
+    matched = _product("{}/matched.ecsv")
+    #: The photometry of all detections.
+    detections = _product("{}/photometry.ecsv")
+    #: The error functions (`~miricigale.photometry.ErrorModel`), of the reference truth.
+    errors = _product("errors.ecsv", photometry.ErrorModel.read)
+
+    @functools.cached_property
+    def results(self):
+        """`~miricigale.fitting.FitResults` of the sample by set of bands."""
+        return {
+            unit: fitting.FitResults.read(self._context.path(f"{self._name}/fits_{unit}.fits"))
+            for unit in self._context.config.fit.sets
+        }
+
+    @functools.cached_property
+    def points(self):
+        """Bright point sources by band; empty where that check was not made."""
+        config = self._context.config
+        bands = config.exposures.filters if config.point_sources.enabled else ()
+        return {band: QTable.read(self._context.path(f"points/{band}.ecsv")) for band in bands}
+
+    @property
+    def sample(self):
+        """Rows of the truth that were fitted."""
+        return self.truth[np.asarray(self.matched["selection"]) == 0]
+
+    @property
+    def inside(self):
+        """Which sources are in the imaged field."""
+        return ~has_flag(self.matched, "selection", SampleFlags.OUTSIDE_FIELD)
+
+    @property
+    def field(self):
+        """Which of these are galaxies with a model."""
+        no_galaxy = SampleFlags.STAR | SampleFlags.NO_MODEL
+        return self.inside & ~has_flag(self.matched, "selection", no_galaxy)
+
+    @functools.cached_property
+    def fits(self):
+        """The results as tables: dict of str to `~astropy.table.QTable`."""
+        return {unit: results.to_table() for unit, results in self.results.items()}
+
+    def galaxies(self, *, field=False):
+        """Rows of the truth that are galaxies with a model, of the imaged field or all."""
+        known = np.isfinite(self.truth["stellar_mass"].value)
+        known &= ~np.asarray(self.truth["star"], bool)
+        return self.truth[known & self.inside if field else known]
+
+
+def as_ceers(config, name):
+    """Whether a band is exposed as CEERS did: readout, frames in each dither, number of dithers."""
+    if name not in CEERS_FILTERS:
+        return False
+
+    own = pointing_exposures(config, name)
+    # the split of the frames into groups and integrations is not the survey's
+    frames = [
+        [(e.readout, e.subarray, e.n_groups * e.n_integrations) for e in exposures]
+        for exposures in (own, _of_ceers(own[0], name))
+    ]
+    return frames[0] == frames[1]
+
+
+def _of_ceers(exposure, name):
+    """The exposures of CEERS in a band, at the pointing of another exposure."""
+    return ceers_exposures(exposure.pointing, exposure.roll, filters=[name])
+
+
+def _proposal(name, exposure):
+    """The limit that the CEERS proposal quotes for a band, and the time that it is for."""
+    limit = time = np.nan
+    if name in CEERS_FILTERS:
+        limit = float(depth.proposal_limit(name).value)
+        time = sum(e.exposure_time for e in _of_ceers(exposure, name)).to_value(u.s)
+    return {"proposal": limit, "proposal_time": time}
+
+
+def above_proposal(truth, bands):
+    """Bands in which each true flux is above the limit of the CEERS proposal; None if a band has none."""
+    if not set(bands) <= set(CEERS_FILTERS):
+        return None
+    limits = {name: depth.proposal_limit(name).value for name in bands}
+    return sum((ab_magnitude(truth[name]) < limit).astype(int) for name, limit in limits.items())
+
+
+def as_paper(config):
+    """Whether exposures, bands and selection are those of Yang et al. 2021."""
+    return (
+        set(config.exposures.filters) == set(CEERS_FILTERS)
+        and all(as_ceers(config, name) for name in config.exposures.filters)
+        and config.highres.filter == "wfc3.f160w"
+    )
+
+
+def _usable(matched, name):
+    """Sources that are measured in one band: in the field at all, and whole in the band."""
+    lost = SampleFlags.OUTSIDE_FIELD | SampleFlags.NOT_MATCHED
+    off = photometry.ForcedFlags.EDGE | photometry.ForcedFlags.MASKED
+    return ~has_flag(matched, "selection", lost), ~has_flag(matched, f"{name}_flags", off)
+
+
+def bright_isolated(matched, name):
+    """Which sources are isolated and above 20 sigma in one band, whole and in the field."""
+    usable, whole = _usable(matched, name)
+    crowded = has_flag(matched, f"{name}_condition", ConditionFlags.CROWDED)
+    true, formal = (matched[f"{name}_{end}"].value for end in ("true", "formal_err"))
+    with np.errstate(invalid="ignore"):
+        return usable & whole & (true > 20 * formal) & ~crowded
+
+
+#: Exposure times, in units of that of one pointing, that limit the rows of depths.
+_TIMES = (0.0, 0.8, 1.5, np.inf)
+
+
+def _depth_by_time(tables, name, time):
+    """Galaxies of the field by exposure time in a band, with its median and the limit there."""
+    seen = (tables.matched[f"{name}_time"] / time).to_value(u.one)
+    rows = []
+    for low, high in itertools.pairwise(_TIMES):
+        chosen = tables.field & (seen >= low) & (seen < high)
+        if np.any(chosen):
+            share = float(np.median(seen[chosen]))
+            # the error at a flux is that of one pointing, over the root of the share
+            limit = tables.errors.limiting_magnitude(name, 5.0 / np.sqrt(share))
+            rows.append({"n": int(chosen.sum()), "share": share, "limit": float(limit.value)})
+    return rows
+
+
+def _light(galaxies, bands, area):
+    """Light of all galaxies together, where it is published."""
+    rows = []
+    for name, wave, least, value, down, up, reference in PUBLISHED_LIGHT:
+        if name in bands:
+            flux = galaxies[name][galaxies[name] >= least * u.uJy]
+            light, error = integrated_light(flux, area, wave * u.um)
+            # without sources the error is undefined too
+            values = (light.value, error.value) if len(flux) else (np.nan, np.nan)
+            row = {"band": name, "wavelength": wave, "least": least, "n": len(flux)}
+            row |= dict(zip(("light", "light_err"), values, strict=True))
+            row |= {"published": value, "down": down, "up": up, "reference": reference}
+            rows.append(row)
+    return rows
+
+
+def _detected(config, tables, least):
+    """Shares of the galaxies of the field detected in enough bands, by limit of the prior's magnitude."""
+    prior = ab_magnitude(tables.truth[config.highres.filter])
+    proposal = above_proposal(tables.truth, config.exposures.filters)
+    rows = []
+    for limit, paper in PAPER_DETECTED:
+        if limit > config.catalog.mag_limit:
+            continue
+        chosen = tables.field & (prior < limit)
+        n = int(np.count_nonzero(chosen & (tables.matched["n_detected"] >= least)))
+        fraction, low, high = fraction_interval(n, int(chosen.sum()))
+        row = {
+            "limit": limit,
+            "n": int(chosen.sum()),
+            "fraction": fraction,
+            "low": low,
+            "high": high,
+        }
+        known = proposal is not None and chosen.any()
+        row["to_proposal"] = float(np.mean(proposal[chosen] >= least)) if known else np.nan
+        rows.append(row | {"paper": paper})
+    return rows
+
+
+def _band_numbers(config, tables, name):
+    """Recovery, limits and conditions of one band."""
+    matched, errors = tables.matched, tables.errors
+    usable, whole = _usable(matched, name)
+    flux, true = matched[name].value, matched[f"{name}_true"].value
+    formal = matched[f"{name}_formal_err"].value
+    isolated = bright_isolated(matched, name)
+    bright = recovery_metrics(true[isolated], flux[isolated], relative=True)
+    with np.errstate(invalid="ignore"):
+        faint = usable & whole & (true < 20 * formal) & np.isfinite(flux)
+    pulls = (flux[faint] - true[faint]) / formal[faint]
+    time = pointing_time(config, name)
+    median = np.nanmedian(formal[usable]) if usable.any() else np.nan
+    entry = {
+        "n_measured": int(np.count_nonzero(usable & np.isfinite(flux))),
+        "formal_limit": float(ab_magnitude(5 * median * u.uJy)),
+        "pull_n": int(pulls.size),
+        "pull_median": float(np.median(pulls)) if pulls.size else np.nan,
+        "pull_scatter": sigma_mad(pulls),
+        "limit": float(errors.limiting_magnitude(name).value),
+        "etc_limit": float(depth.scaled_limit(name, time).to_value(u.ABmag)),
+        "coverage": _depth_by_time(tables, name, time) if config.errors.coverage else [],
+        **_proposal(name, pointing_exposures(config, name)[0]),
+        "ceers": as_ceers(config, name),
+        "bright_n": bright.n,
+        "bright_median": bright.median,
+        "bright_median_err": bright.median_err,
+        "conditions": band_conditions(matched, name),
+    }
+    if name in tables.points:
+        points = tables.points[name]
+        good = points[np.asarray(points["in_field"], bool)]
+        found = recovery_metrics(good["flux_true"].value, good["flux"].value, relative=True)
+        entry |= {
+            "points_n": found.n,
+            "points_median": found.median,
+            "points_scatter": found.sigma_mad,
+        }
+        for key in ("f_scaling", "f_scaling_err", "f_aper"):
+            entry[key] = float(points.meta.get(key, np.nan))
+    return entry
+
+
+def study_metrics(config, tables, area):
+    """
+    Numbers of the field and of its bands, as plain values for ``report/metrics.json``.
+
+    ``tables`` are those of the reference truth, ``area`` is the solid angle of the imaged
+    field; NaN where there is nothing to count.
+    """
+    bands = config.exposures.filters
+    field, selection = tables.field, np.asarray(tables.matched["selection"])
+    # with a single band, detections in that band are counted
+    least = min(2, len(bands))
+    return {
+        "n_catalog": len(tables.truth),
+        "n_field": int(field.sum()),
+        "n_matched": int((field & np.asarray(tables.matched["matched"])).sum()),
+        "n_sample": int((selection == 0).sum()),
+        "n_left_out": {
+            flag.name.lower(): int(np.count_nonzero(selection & flag)) for flag in SampleFlags
+        },
+        "area": float(area.to_value(u.arcmin**2)),
+        "as_paper": as_paper(config),
+        "detections": detection_counts(tables.detections, bands),
+        "n_bands_detected": least,
+        "bands": {name: _band_numbers(config, tables, name) for name in bands},
+        "detected": _detected(config, tables, least),
+        "light": _light(tables.galaxies(field=True), bands, area),
+    }
+
+
+#: Numbers of a fit by the quantities of `~miricigale.evaluation.study_numbers` that they are.
+_OF_FIT = {
+    "photoz_bias": "z_bias",
+    "photoz_sigma_mad": "z_scatter",
+    "photoz_outliers": "z_outliers",
+    "frac_agn_bias": "frac_offset",
+    "frac_agn_sigma_mad": "frac_scatter",
+    "frac_agn_width": "width",
+}
+
+
+def whole_sample(numbers):
+    """
+    Return the rows that are of all redshifts, by truth, set of bands and quantity.
+
+    ``numbers`` is the table of `~miricigale.evaluation.study_numbers`.
+    """
+    rows = numbers[(numbers["z_low"] == 0) & np.isinf(numbers["z_high"])]
+    return {(row["truth"], row["band_set"], row["quantity"]): row for row in rows}
+
+
+def truth_metrics(truth, tables, numbers, bands):
+    """
+    Numbers of one truth as plain values: how well redshift and fracAGN are recovered, by set of bands.
+
+    ``truth`` is a `~miricigale.workflow.truths.Truth`, ``tables`` are its `StudyTables`, and ``numbers``
+    those of `whole_sample`.
+    """
+    sample, fits = tables.sample, {}
+    matched = tables.matched[np.asarray(tables.matched["selection"]) == 0]
+    for unit, table in tables.fits.items():
+        rows = {key: numbers[truth.name, unit, quantity] for key, quantity in _OF_FIT.items()}
+        values = {key: float(row["value"]) for key, row in rows.items()}
+        outliers = rows["photoz_outliers"]
+        n = int(outliers["n"])
+        low, high = table["redshift_p16"], table["redshift_p84"]
+        known = np.isfinite(low) & np.isfinite(high)
+        inside = known & (sample["redshift"] >= low) & (sample["redshift"] <= high)
+        fits[unit] = {
+            "n": n,
+            **values,
+            "photoz_n_outliers": round(n * values["photoz_outliers"]) if n else 0,
+            "photoz_outliers_low": float(outliers["low"]),
+            "photoz_outliers_high": float(outliers["high"]),
+            # share of the true values between the 16th and 84th percentiles
+            "redshift_coverage": fraction_interval(int(inside.sum()), int(known.sum()))[0],
+            "conditions": fit_conditions(matched, sample["redshift"], table, bands),
+        }
+    return {**truth.values(), "n_sample": len(sample), "fits": fits}

@@ -1,0 +1,194 @@
+"""What the report says of where its numbers come from: exposures, libraries, software, citations."""
+
+import importlib.metadata
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.refdata import citations, resource, resources
+from miricigale.utils.meta import provenance
+from miricigale.workflow.background import background_text
+from miricigale.workflow.page.declared import sentence, texts_of
+from miricigale.workflow.page.labels import band_label
+from miricigale.workflow.stages.exposures import (
+    IMAGE_RESOURCES,
+    background_options,
+    dithers_text,
+    study_background,
+    study_exposures,
+    study_pointings,
+)
+from miricigale.workflow.stages.inputs import catalog_bands, input_bands
+
+__all__ = [
+    "catalog_facts",
+    "exposure_kinds",
+    "library_rows",
+    "sources_to_cite",
+    "stand_ins",
+    "versions",
+    "write_exposures",
+    "write_origin",
+]
+
+
+def exposure_kinds(config, forecasts, bands):
+    """
+    Kinds of exposures of each band as dictionaries, with what the dithers of a pointing have together.
+
+    ``forecasts`` are tables by unit, ``bands`` the plain numbers of the bands; filling and saturation
+    are the highest of the dithers.
+    """
+    kinds, n_pointings = {}, len(study_pointings(config))
+    for unit, e in study_exposures(config).items():
+        key = (e.filter, f"{e.readout} {e.subarray}", e.n_groups, e.n_integrations)
+        kinds.setdefault(key, []).append((e, forecasts[unit]))
+    return [
+        {
+            "band": band_label(name),
+            "as_ceers": "yes" if bands[name]["ceers"] else "no",
+            "readout": readout,
+            "frames": f"{n_groups} x {n_integrations}",
+            "exposures": f"{n_pointings} x {len(group) // n_pointings}",
+            "time": sum(e.exposure_time for e, _ in group).to_value(u.s) / n_pointings,
+            "background": study_background(config, name).value,
+            "fill": max(float(table["sky_fraction"][0]) for _, table in group),
+            "saturated": max(int(table["n_pixels"][0]) for _, table in group),
+        }
+        for (name, readout, n_groups, n_integrations), group in kinds.items()
+    ]
+
+
+def stand_ins(config, model):
+    """Sentences on everything that is not what Yang et al. 2021, or the observatory, have."""
+    texts, residual = texts_of("stand_ins"), config.detector.residual
+    chosen = [name for name in model.resources if name in texts]
+    chosen += ["instrument", "no_residual" if residual == 0.0 else "residual"]
+    chosen += ["rates"] if config.exposures.kind == "rates" else []
+    rays = ", read-out and cosmic rays" if config.detector.cosmic_rays else " and read-out"
+    facts = {"rays": rays, "residual": residual}
+    return [sentence(texts[name], facts) for name in (*chosen, "existing")]
+
+
+def library_rows(model):
+    """Role, component, and reference data of each component of a model."""
+    rows = []
+    for part in model.components:
+        record = resources().get(part.resource) if part.resource else None
+        what = f"{record.title} ({part.resource})" if record else "closed form"
+        if part.role == "stellar":
+            what += f"; IMF {part.imf}"
+        rows.append(
+            (part.role, part.name, what, part.reference or (record.citation if record else ""))
+        )
+    return rows
+
+
+def catalog_facts(config, catalog):
+    """What the sources that were taken are, and how their SEDs are fitted: pairs of text."""
+    options, limit = config.catalog, config.sed.max_wavelength
+    # the folder of a user's file is not part of the result
+    source = f"{Path(options.source).name}, the user's file"
+    if options.source in resources():
+        source = f"{options.source}: {resource(options.source).title}"
+    bands = catalog_bands(catalog)
+    fitted, longest = input_bands(catalog, limit)
+    described = dict.fromkeys(
+        text for name in bands if (text := catalog[name].info.description) is not None
+    )
+    fluxes = f"{len(bands)} bands, as the file gives them, without a description"
+    if described:
+        fluxes = f"{len(bands)} bands; the description in the file: {'; '.join(described)}"
+    prior = config.highres.filter
+    own = [name for name, errors in fitted.items() if errors]
+    guess = f"{100 * config.sed.catalog_error:g} % error each"
+    if not own:
+        how = f" (pivot up to {limit:g} µm), {guess}, for the catalog gives none"
+    elif len(own) == len(fitted):
+        how = ", with the catalog's errors"
+    else:
+        how = f", with the catalog's errors in {', '.join(own)}; {guess} in the others"
+    if longest > limit:
+        how += "; the dust's alpha is fitted too"
+    if prior in bands:
+        how += f"; each SED is scaled to the flux in {prior}"
+    facts = [
+        ("source", source),
+        ("cut", f"{options.mag_column} <= {options.mag_limit:g}, {len(catalog)} sources"),
+        ("fluxes", fluxes),
+        ("input SEDs fitted to", f"{', '.join(fitted)}{how}"),
+    ]
+    if "redshift_source" in catalog.colnames:
+        kinds, counts = np.unique(np.asarray(catalog["redshift_source"], str), return_counts=True)
+        text = ", ".join(f"{n} {kind}" for kind, n in zip(kinds, counts, strict=True))
+        facts.append(("redshifts", text))
+    facts.append(("stars", f"{np.count_nonzero(catalog['star'])}"))
+    return facts
+
+
+def versions(*metas):
+    """
+    Software: pairs of package and version.
+
+    ``metas`` are those of products, whose version of this package may be another than today's.
+    """
+    here = provenance()["version"]
+    made = sorted({meta["version"] for meta in metas if "version" in meta})
+    own = here if made in ([], [here]) else f"{here} (products: {', '.join(made)})"
+    packages = ("numpy", "astropy", "photutils", "numba", "scipy", "drizzle", "astro-sedpy")
+    return [("miricigale", own), *((name, importlib.metadata.version(name)) for name in packages)]
+
+
+def sources_to_cite(names, metas):
+    """
+    What to cite for resources (``names``) and for products (their ``metas``), each once.
+
+    Entries are sorted, and one that another contains is left out.
+    """
+    entries = {entry for meta in metas for entry in meta.get("citations", ())}
+    entries |= set(citations(*names))
+    return sorted(one for one in entries if not any(one != two and one in two for two in entries))
+
+
+def write_exposures(page):
+    """The section on what was exposed, of the reference truth, and of which sources."""
+    config, context = page.config, page.context
+    page.section("exposures")
+    forecasts = {
+        unit: QTable.read(context.path(f"{page.first.name}/exposures/{unit}_forecast.ecsv"))
+        for unit in study_exposures(config)
+    }
+    page.table("exposures", exposure_kinds(config, forecasts, page.metrics["bands"]))
+    page.report.text(f"Dithers: {dithers_text(config)}. {_background_sentence(config)}.")
+    catalog = QTable.read(context.path("catalog.ecsv"))
+    page.report.table(catalog_facts(config, catalog), header=("catalog", ""), text=2)
+
+
+def _background_sentence(config):
+    """Which background the images have, where it is from and how it varies."""
+    options = config.scene
+    text = f"Background at the center of the field: {background_text(**background_options(config))}"
+    if options.background_scale != 1:
+        text += f", times {options.background_scale:g}"
+    if options.background_gradient == 0:
+        return f"{text}; it is the same everywhere"
+    return (
+        f"{text}; it grows by {100 * options.background_gradient:g} % of that for each arcmin toward position "
+        f"angle {options.gradient_angle:g} deg"
+    )
+
+
+def write_origin(page, metas):
+    """The section on libraries, software and citations; ``metas`` are those of products."""
+    report, model = page.report, page.model
+    page.section("origin")
+    header = ("part", "component", "library", "reference")
+    report.table(library_rows(model), header=header, caption=page.sentence("library"), text=4)
+    report.bullets(model.meta["libraries"])
+    report.table(versions(*metas), header=("software", "version"), text=2)
+    page.text("cite")
+    catalog = {page.config.catalog.source} & set(resources())
+    names = {*IMAGE_RESOURCES, "instrument.etc", *model.resources, *catalog}
+    report.bullets(sources_to_cite(names, metas))

@@ -1,0 +1,107 @@
+"""The page of a study while it is filled, and the products that its sections show."""
+
+import functools
+
+from miricigale.workflow.page.declared import sentence, texts_of
+from miricigale.workflow.page.labels import band_label, three_bands, truth_label
+from miricigale.workflow.page.numbers import FEWEST, MIPS_LIMIT
+
+__all__ = ["StudyPage"]
+
+
+class StudyPage:
+    """
+    What the sections of a study's page read, and the page that they fill.
+
+    Titles, paragraphs, captions and tables are named: ``sections.toml`` declares them, by section.
+
+    Parameters
+    ----------
+    report : `~miricigale.pages.Page`
+        The page.
+    context : `~miricigale.workflow.Context`
+        The run.
+    every : dict of str to `~miricigale.workflow.page.numbers.StudyTables`
+        The tables of the truths of whose sky the analysis knows all, the reference first.
+    study : `~miricigale.evaluation.StudyResults`
+        The same.
+    metrics : dict
+        Plain numbers of the field, the bands and the fits (``report/metrics.json``).
+    shares : dict of str to `~numpy.ndarray`
+        True AGN shares of the 5-15 um light of all sources by truth, empty without AGN.
+    model : `~miricigale.sed.SEDModel`
+        That of the fits.
+    area : `~astropy.units.Quantity`
+        Solid angle of the imaged field.
+    """
+
+    def __init__(self, report, context, every, study, metrics, shares, model, area):
+        self.report, self.context, self.config = report, context, context.config
+        self.every, self.study, self.first = every, study, study.truths[0]
+        self.tables = every[self.first.name]
+        self.bands = self.config.exposures.filters
+        self.metrics, self.shares, self.model, self.area = metrics, shares, model, area
+        self._section = None
+
+    @functools.cached_property
+    def facts(self):
+        """What the sentences say of the run: dict of str to values."""
+        options, chosen = self.config.catalog, [band_label(n) for n in three_bands(self.bands)]
+        return self.metrics | {
+            "truth": truth_label(self.first),
+            "three_bands": ", ".join(chosen),
+            "longest": chosen[-1],
+            "detected_bands": ("the one band", "two or more bands")[
+                self.metrics["n_bands_detected"] - 1
+            ],
+            "prior": band_label(self.config.highres.filter),
+            "mag_column": options.mag_column,
+            "mag_limit": options.mag_limit,
+            "mips_limit": MIPS_LIMIT,
+            "fewest": FEWEST,
+            "model_error": 100 * self.config.fit.model_error,
+            **{name: self.model.meta[name] for name in ("cosmology", "frac_agn_definition")},
+        }
+
+    def sentence(self, name, **facts):
+        """Return a sentence of the current section, filled with facts of the run and further ones."""
+        return sentence(texts_of(self._section)[name], self.facts | facts)
+
+    def section(self, name, text="text", **facts):
+        """Begin a section, with the paragraph ``text`` where it has that."""
+        self._section = name
+        paragraph = self.sentence(text, **facts) if text in texts_of(name) else ""
+        self.report.section(texts_of(name)["title"], paragraph)
+
+    def text(self, name, **facts):
+        """Add a paragraph."""
+        self.report.text(self.sentence(name, **facts))
+
+    def figure(self, name, figure, **facts):
+        """Add a figure with its caption, unless there is none."""
+        if figure is not None:
+            self.report.figure(figure, self.sentence(name, **facts))
+
+    def table(self, name, rows, **facts):
+        """Add a table as it is declared, from dictionaries; without columns it has all of their keys."""
+        table, rows, facts = texts_of(self._section)[name], list(rows), self.facts | facts
+        columns = {
+            sentence(header, facts): tuple(column)
+            for header, *column in table.get("columns", ())
+            if rows and column[0] in rows[0]
+        }
+        self.report.entries(
+            rows,
+            columns or None,
+            caption=sentence(table["caption"], facts),
+            empty=sentence(table.get("empty", ""), facts),
+            text=table.get("text", 1),
+        )
+
+    @property
+    def band_rows(self):
+        """The numbers of each band, with its name and what it is called."""
+        return [
+            {"name": name, "band": band_label(name), **entry}
+            for name, entry in self.metrics["bands"].items()
+        ]
