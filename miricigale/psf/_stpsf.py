@@ -1,4 +1,4 @@
-"""The door to stpsf, STScI's own PSF simulator (optional)."""
+"""PSFs from stpsf, STScI's own PSF simulator (optional)."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""The PSF that a filter should have: models by name, and what others' PSFs say beside them."""
+"""The PSF that a filter should have: models by name, and checks of other PSFs against them."""
 
 import logging
 import math
@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 MODEL_FILTERS = (*MIRI_FILTERS, *NIRCAM_FILTERS, *WFC3_FILTERS)
 
 #: Factor in FWHM beyond which a PSF is not that of the filter; parts from which on a narrower and a
-#: wider one is told (real mosaics are some percent wider than the models).
+#: wider one gets a warning (real mosaics are some percent wider than the models).
 _OTHER_WIDTH, _NARROWER, _WIDER = 1.5, 0.05, 0.15
 #: How far a sum may be from the fraction of light that the model's grid holds to be taken for it, and
 #: the sum from which on a PSF counts as normalized on its own grid.
@@ -113,7 +113,7 @@ def checked_psf(
         If there is no model for the filter.
     ValueError
         If the PSF is more than 1.5 times wider or narrower than the model (its pixel is another),
-        or its spikes stand as in the detector's axes although it is said to stand on the sky.
+        or its spikes stand as in the detector's axes although its frame is the sky.
 
     Warns
     -----

@@ -24,7 +24,7 @@ EFFECTS = ("jitter", "cruciform", "pixel", "ipc")
 #: Length over which the cruciform falls by e, in pixels.
 _FOLDING = 25.0
 
-#: Where the cross stands beside the source, pixels, against the column or row in the full
+#: Offset of the cross from the source, pixels, against the column or row in the full
 #: frame: broken lines through stpsf's nodes, which were read off stars in flight.
 _SHIFT_X = ((0.0, 357.0, 1031.0), (1.5, 0.5, -0.9))
 _SHIFT_Y = ((0.0, 511.0, 1031.0), (1.6, 0.0, -1.6))

@@ -102,7 +102,7 @@ def miri_psf_grid(filter, *, n_psfs=9, subarray="FULL", positions=None, **option
         ny, nx = part.shape
         first, last = (int(np.clip(c - part.origin[0], 0, nx)) for c in imager_columns())
         if last - first < 2:
-            first, last = 0, nx  # SUB64 and SUB128 stand beside the imager's own field
+            first, last = 0, nx  # SUB64 and SUB128 lie outside the imager's own field
         columns = np.linspace(first, last - 1, side)
         rows = np.linspace(0, ny - 1, side)
         positions = [(x, y) for y in rows for x in columns]

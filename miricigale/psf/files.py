@@ -51,7 +51,7 @@ def fits_image(path, ext, plane, pixel_scale, *, wanted, oversampling=1):
     """
     An image of any FITS file, its header, its pixel (a quantity) and its position angle (deg or None).
 
-    Parameters and errors are those of `read_psf`; ``wanted`` says what the file is to hold.
+    Parameters and errors are those of `read_psf`; ``wanted`` describes the expected content for messages.
     """
     with open_fits(path, wanted=wanted, output_verify="silentfix") as hdus:
         data = hdus[ext].data

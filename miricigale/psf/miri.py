@@ -146,7 +146,7 @@ def miri_psf(
         Cells per pixel.
     fov : `~astropy.units.Quantity`, optional
         Width of the grid; 21 arcsec by default. Light beyond it is missing from the data,
-        and the sum says so.
+        and from their sum.
     wavefront_error : `~astropy.units.Quantity`, optional
         Root mean square of the wavefront error.
     seed : int, optional

@@ -18,7 +18,7 @@ __all__ = ["FRAMES", "InstrumentPSF", "PSFGrid", "from_photutils", "instrument_p
 #: Where a PSF's axes may stand: on the detector (angle on the sky not yet known) or the sky.
 FRAMES = ("detector", "sky")
 
-#: What an `InstrumentPSF` is made with beside its data.
+#: Parameters of an `InstrumentPSF` besides its data.
 _FACTS = ("pixel_scale", "frame", "oversampling", "origin", "angle", "includes", "filter")
 _FACTS += ("total_known", "position", "subarray", "pa_aper")
 

@@ -23,7 +23,7 @@ def nircam_psf(filter, *, oversampling=4, fov=None, wavefront_error=75 * u.nm, s
     Telescope, jitter and the pixel's response: no interpixel capacitance, no charge
     diffusion, no aberrations of NIRCam itself beyond the wavefront error of the whole, no
     dependence on the field. It is for simulated and approximate priors; for photometry on a
-    real image, whose stars tell (`psf_from_stars`) or whose mosaic comes with PSFs, take those.
+    real image take PSFs of its stars (`psf_from_stars`) or those that come with the mosaic.
 
     Parameters
     ----------

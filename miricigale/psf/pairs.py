@@ -136,12 +136,12 @@ def ready_arrays(array, scale, **psfs):
     if not 0.9 <= total <= 1.1:
         raise argument_error("array", "a kernel whose sum is 1", f"a sum of {total:.6g}")
     array = array / total
-    said = [f"summed to {total:.4f} and was brought to 1"] if abs(total - 1) > 1e-3 else []
+    texts = [f"summed to {total:.4f} and was brought to 1"] if abs(total - 1) > 1e-3 else []
     c = array.shape[0] // 2
     x, y, _ = _core.core_moments(array)
     if not np.hypot(x - c, y - c) < 0.1:
-        said.append(f"stands ({x - c:.2f}, {y - c:.2f}) pixels off the center")
-    for text in said:
+        texts.append(f"stands ({x - c:.2f}, {y - c:.2f}) pixels off the center")
+    for text in texts:
         warnings.warn(f"the matching kernel {text}", MiricigaleWarning, stacklevel=3)
     images = {}
     for name, psf in psfs.items():

@@ -134,8 +134,8 @@ def psf_from_stars(
         As for `~miricigale.psf.make_psf`. Stars hold all that the detector does to light; those
         of a mosaic also ``"drizzle"``, and stand in the frame ``"sky"``.
     enclosed : float or `~photutils.psf.ImagePSF`, optional
-        Fraction of a star's light within the stamp, or a PSF to take it from; stars do not
-        tell. With 1 the encircled energies are those relative to the stamp.
+        Fraction of a star's light within the stamp, or a PSF to take it from; it cannot be
+        measured from stars. With 1 the encircled energies are those relative to the stamp.
     max_iterations : int, optional
         Most rounds of stacking and fitting.
     progress_bar : bool, optional

@@ -1,4 +1,4 @@
-"""PSFs of others beside the model of their filter."""
+"""PSFs of other origin compared with the model of their filter."""
 
 import astropy.units as u
 import numpy as np
@@ -96,7 +96,7 @@ def test_exposures_are_sharper_than_mosaics(mosaic):
 
 
 def test_noise_and_coarse_pixels_refuse_nothing(mosaic):
-    """The turn is told from noisy PSFs too, and never of those that stand right."""
+    """A wrong turn is found in noisy PSFs too, and never where there is none."""
     rng = np.random.default_rng(1)
     for turn in (0, 75):
         data = stamp(filter_psf("miri.f770w", pixel_scale=PIXEL, pa=turn * u.deg), 55)

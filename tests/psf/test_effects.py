@@ -25,7 +25,7 @@ def test_pixel_response_is_a_box(oversampling):
     assert vy == pytest.approx(25 + oversampling**2 / 12, rel=1e-6)
 
 
-def test_interpixel_capacitance_moves_charge_to_the_neighbours():
+def test_interpixel_capacitance_moves_charge_to_the_neighbors():
     image = np.zeros((41, 41))
     image[20, 20] = 1.0
     out = effects.detector_response(image, oversampling=4, pixel=False, ipc=(0.03, 0.02, 0.01))
@@ -53,7 +53,7 @@ def test_cruciform_takes_the_stated_fraction_and_keeps_the_rest(name):
     # 300 px = 12 folding lengths
     assert out.sum() == pytest.approx(1.0, abs=2e-4)
     assert out[1200].sum() + out[:, 1200].sum() - out[1200, 1200] == pytest.approx(out.sum())
-    # the sampled kernel also hits the centre itself
+    # the sampled kernel also hits the center itself
     assert out[1200, 1200] == pytest.approx(1 - fraction, abs=0.003)
     # e-folding of 25 pixels
     assert out[1200, 1200 + 400] / out[1200, 1200 + 300] == pytest.approx(np.exp(-1), rel=1e-6)
@@ -108,9 +108,9 @@ def test_arms_and_halo_of_f560w_are_those_of_a_deep_image(monkeypatch):
     for (low, value), high in zip(found.items(), (3, 4, 5.5, 7.5), strict=True):
         ring = (radius >= low) & (radius < high)
         halo = [np.median(p.data[ring & between]) for p in (psf, without)]
-        beside = psf.data[ring & between].mean()
+        around = psf.data[ring & between].mean()
         arms = ring & (np.minimum(abs(x), abs(y)) < 0.5)
-        light = np.sum(psf.data[arms] - beside) / 4 / (high - low)
+        light = np.sum(psf.data[arms] - around) / 4 / (high - low)
         assert light / psf.data[radius < 1].sum() == pytest.approx(value, rel=0.17)
         # the halo was seen at 1.5 to 4 times that of a model with the cross alone
         assert 1.5 < halo[0] / halo[1] < 4

@@ -102,9 +102,9 @@ def test_convolved_template_of_unit_flux_is_the_wide_psf(hi, lo):
     np.testing.assert_allclose(image, expected, atol=0.01 * expected.max())
     assert kernel.array.sum() == pytest.approx(expected.sum(), rel=1e-9)
     assert kernel.array.sum() == pytest.approx(psf.enclosed, abs=5e-3)
-    normalised = MatchingKernel.from_psfs(hi, psf, pixel_scale=SCALE, normalize=True)
-    assert normalised.array.sum() == pytest.approx(1, rel=1e-9)
-    assert normalised.target.sum() == pytest.approx(1, rel=1e-9)
+    normalized = MatchingKernel.from_psfs(hi, psf, pixel_scale=SCALE, normalize=True)
+    assert normalized.array.sum() == pytest.approx(1, rel=1e-9)
+    assert normalized.target.sum() == pytest.approx(1, rel=1e-9)
 
 
 def test_angle_turns_the_target(hi, lo):

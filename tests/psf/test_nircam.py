@@ -28,7 +28,7 @@ def test_energy_is_that_of_drizzled_psfs(data_file):
     path = data_file("uds/psf/uds-test-f444w_psf.fits.gz")
     radii = [0.15, 0.2, 0.3, 0.5, 0.8, 1.2, 1.6] * u.arcsec
     scale = 0.04 * u.arcsec
-    # planes whose cores stand within 0.2 pixel of the centre
+    # planes whose cores stand within 0.2 pixel of the center
     real = [
         encircled_energy(read_psf(path, plane=k, pixel_scale=scale, frame="sky"), radii)
         for k in (9, 15, 19)
@@ -37,7 +37,7 @@ def test_energy_is_that_of_drizzled_psfs(data_file):
     np.testing.assert_allclose(ours, np.mean(real, axis=0), atol=0.03)
 
 
-def test_is_centred_normalised_and_says_what_it_is():
+def test_is_centered_normalized_and_says_what_it_is():
     psf = nircam_psf("nircam.f200w", oversampling=3, seed=4)
     info = psf
     assert np.unravel_index(info.data.argmax(), info.data.shape) == tuple(

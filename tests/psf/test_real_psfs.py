@@ -1,4 +1,4 @@
-"""PSFs as people bring them: truncated, off-centre, even-sized, oversampled, unnormalised."""
+"""PSFs of users: truncated, off-center, even-sized, oversampled, unnormalized."""
 
 import astropy.units as u
 import numpy as np
@@ -36,7 +36,7 @@ def moffat(n, core, beta, x=0.0, y=0.0):
 
 
 def expected_kernel(n):
-    """Gaussians: the kernel is that of the difference of the variances, and centred."""
+    """Gaussians: the kernel is that of the difference of the variances, and centered."""
     return gaussian_image(n, np.sqrt(LO**2 - HI**2))
 
 
@@ -57,7 +57,7 @@ def assert_is_the_gaussian_kernel(kernel):
 
 @pytest.mark.parametrize("n", [51, 52])
 @pytest.mark.parametrize("off", [(0.0, 0.0), (1.3, -0.8), (-0.46, 1.77)])
-def test_off_centre_and_even_arrays_give_the_centred_kernel(n, off):
+def test_off_center_and_even_arrays_give_the_centered_kernel(n, off):
     kernel = MatchingKernel.from_psfs(
         gaussian_image(n, HI, -off[1], off[0]), gaussian_image(n, LO, *off), pixel_scale=SCALE
     )
@@ -73,7 +73,7 @@ def test_off_centre_and_even_arrays_give_the_centred_kernel(n, off):
     np.testing.assert_allclose(found, off, atol=2e-3)
 
 
-def test_off_centre_psfs_keep_their_angles():
+def test_off_center_psfs_keep_their_angles():
     """The core is put on the axis before the PSF is turned about it."""
     psfs = [
         make_psf(gaussian_image(61, s, 1.2, -0.9), pixel_scale=SCALE, frame="detector")
@@ -84,7 +84,7 @@ def test_off_centre_psfs_keep_their_angles():
     assert_is_the_gaussian_kernel(kernel)
 
 
-def test_core_that_is_nowhere_near_the_centre_is_refused():
+def test_core_that_is_nowhere_near_the_center_is_refused():
     with pytest.raises(ValueError, match="'lo' must be a PSF whose core stands near its center"):
         MatchingKernel.from_psfs(
             gaussian_image(51, HI), gaussian_image(51, LO, 15.0, 0.0), pixel_scale=SCALE
@@ -126,22 +126,22 @@ def test_sums_that_are_no_fraction_are_refused_unless_scaled(factor):
 def test_truncated_wings_are_said_and_the_kernel_has_unit_sum():
     """Wings as r**-3, of which a circle of R leaves (1 + R^2 / c^2)^-1/2 outside."""
     hi, lo = moffat(101, 2.0, 1.5), moffat(101, 4.0, 1.5)
-    with pytest.warns(MiricigaleWarning, match="light beyond the PSFs' grids") as said:
+    with pytest.warns(MiricigaleWarning, match="light beyond the PSFs' grids") as caught:
         kernel = MatchingKernel.from_psfs(hi, lo, pixel_scale=SCALE)
-    assert f"{1 - lo.sum():.3f} of 'lo'" in str(said[0].message)
+    assert f"{1 - lo.sum():.3f} of 'lo'" in str(caught[0].message)
     assert kernel.array.sum() == pytest.approx(1, abs=1e-9)
     assert kernel.meta["held"] == pytest.approx([hi.sum(), lo.sum()])
     absolute = MatchingKernel.from_psfs(hi, lo, pixel_scale=SCALE, normalize=False)
     assert absolute.array.sum() == pytest.approx(lo.sum(), abs=1e-9)
-    # known fractions stay as they are, without a word
+    # known fractions stay as they are, without a warning
     known = [
         make_psf(d, pixel_scale=SCALE, frame="sky", enclosed=e) for d, e in ((hi, 0.96), (lo, 0.93))
     ]
     assert MatchingKernel.from_psfs(*known, pixel_scale=SCALE).array.sum() == pytest.approx(0.93)
-    # scaled to 1 on their own grids, the wings alone can tell: the light beyond the circle
-    with pytest.warns(MiricigaleWarning, match="light beyond the PSFs' grids") as said:
+    # scaled to 1 on their own grids, the wings alone show it: the light beyond the circle
+    with pytest.warns(MiricigaleWarning, match="light beyond the PSFs' grids") as caught:
         MatchingKernel.from_psfs(hi / hi.sum(), lo / lo.sum(), pixel_scale=SCALE)
-    words = str(said[0].message).split("wings: ")[1].split()
+    words = str(caught[0].message).split("wings: ")[1].split()
     truth = [1 / np.sqrt(1 + (50.5 / core) ** 2) for core in (2.0, 4.0)]
     np.testing.assert_allclose([float(words[0]), float(words[3])], truth, rtol=0.15)
 
@@ -318,7 +318,7 @@ def test_real_drizzled_psfs(data_file, region):
     error = kernel.encircled_energy_error(np.arange(0.15, 1.9, 0.02) * u.arcsec)
     assert np.abs(error).max() < 0.005
     assert kernel.array.sum() == pytest.approx(1, abs=1e-6)
-    # what was measured off the centre is gone: moments of the cores, no window
+    # what was measured off the center is gone: moments of the cores, no window
     for image in (kernel.source, kernel.target):
         c = image.shape[0] // 2
         core = image[c - 4 : c + 5, c - 4 : c + 5]

@@ -11,7 +11,7 @@ from astropy.wcs import WCS
 from miricigale.psf import encircled_energy, fwhm, miri_psf, psf_from_stars
 
 SIZE, SCALE = 260, 0.1109
-# far enough apart for the wings of the neighbours to matter little
+# far enough apart for the wings of the neighbors to matter little
 SPACING = 78
 DITHERS = [(0, 0), (6.5, 3.25), (-5.75, 4.5), (5.25, -6.75), (-3, -6.5), (1.5, 7.25), (-7, 0.75)]
 RADII = [0.2, 0.3, 0.5, 1.0, 1.5] * u.arcsec
@@ -118,7 +118,7 @@ def test_stars_near_edges_are_counted(truth, field):
     table.add_row((np.nan, 100.0))
     psf = psf_from_stars(images[0], table, pixel_scale=SCALE * u.arcsec, max_iterations=2)
     assert (psf.meta["n_stamps"], psf.meta["n_left_out"]) == (9, 2)
-    # relative to the stamp if nothing else is said
+    # relative to the stamp if nothing else is given
     assert psf.enclosed == pytest.approx(1, abs=1e-6)
 
 
