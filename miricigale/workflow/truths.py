@@ -1,6 +1,7 @@
 """What a study simulates more than once, and what it fits of each: truths and sets of bands."""
 
 import dataclasses
+import typing
 
 from miricigale.filters import Filter
 
@@ -16,6 +17,8 @@ __all__ = [
     "VARIANTS",
     "Truth",
     "band_sets",
+    "itself",
+    "of_reference",
     "of_truth",
     "perturbed_values",
     "reference",
@@ -39,11 +42,34 @@ EFFECTS = (
 )  # fmt: skip
 #: Those that there are with AGN only.
 NEEDS_AGN = ("torus", "point_agn")
-#: What further images of the first sky have otherwise: section, key, and its two values.
+
+
+class Variant(typing.NamedTuple):
+    """What further images of the first sky have otherwise: a key, its two values, and how each is called."""
+
+    section: str
+    key: str
+    values: tuple
+    labels: tuple
+
+
+#: Variant images by name, on and off.
 VARIANTS = {
-    "residual": ("detector", "residual", ("etc", 0.0)),
-    "gradient": ("scene", "background_gradient", (0.05, 0.0)),
-    "plane": ("reduction", "background_plane", (True, False)),
+    "residual": Variant(
+        "detector",
+        "residual",
+        ("etc", 0.0),
+        ("with the calculator's residual noise", "without residual noise"),
+    ),
+    "gradient": Variant(
+        "scene", "background_gradient", (0.05, 0.0), ("with a gradient", "without the gradient")
+    ),
+    "plane": Variant(
+        "reduction",
+        "background_plane",
+        (True, False),
+        ("plane taken off before the mesh", "background by the mesh alone"),
+    ),
 }
 #: That which there is with an image only.
 CUTOUTS = "cutouts"
@@ -146,6 +172,16 @@ def reference(config):
     return truth_names(config)[0]
 
 
+def of_reference(config, _):
+    """The reference truth, as ``needs`` of a stage takes it."""
+    return (reference(config),)
+
+
+def itself(_, unit):
+    """The unit of the same name, as ``needs`` of a stage takes it."""
+    return (unit,)
+
+
 def of_truth(config, unit):
     """The truth of a unit that begins with its name, as ``needs`` of a stage takes it."""
     return (unit.partition("/")[0],)
@@ -192,8 +228,8 @@ def variant_changes(config):
     chosen, changes = config.variants.images, {}
     if chosen and config.exposures.kind == "ramps":
         changes["rates"] = {}
-    for name, (section, key, (on, off)) in VARIANTS.items():
+    for name, one in VARIANTS.items():
         if name in chosen or ALL in chosen:
-            value = getattr(getattr(config, section), key)
-            changes[name] = {section: {key: off if value else on}}
+            on = getattr(getattr(config, one.section), one.key)
+            changes[name] = {one.section: {one.key: one.values[1 if on else 0]}}
     return changes

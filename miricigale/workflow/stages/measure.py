@@ -5,6 +5,7 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale import photometry, psf
+from miricigale.utils.tables import error_column
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.exposures import (
     IMAGE_RESOURCES,
@@ -82,6 +83,12 @@ def measure_band(context, mosaic, name, method):
         mosaic,
         templates=photometry.SourceTemplates.read(context.path("templates.fits")),
     )
+
+
+def joined_photometry(tables):
+    """Join tables of results by band into one, with a row for each detection."""
+    columns = ["id", "sky", "flux", error_column("flux"), "flags"]
+    return photometry.join_bands({name: table[columns] for name, table in tables.items()})
 
 
 def yang2021_photometer(config, name, n_threads):

@@ -7,8 +7,9 @@ from astropy.table import QTable
 from miricigale import photometry
 from miricigale.evaluation import Estimate, bootstrap, match_truth, recovery_metrics
 from miricigale.evaluation.estimates import median
-from miricigale.pages import number
+from miricigale.pages import Missing, number
 from miricigale.utils.tables import described_rows, error_column
+from miricigale.workflow.derived import NO_SOURCE, Cell, read_tables
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.conditions import ConditionFlags
 from miricigale.workflow.stages.exposures import (
@@ -20,7 +21,7 @@ from miricigale.workflow.stages.exposures import (
 from miricigale.workflow.stages.figures import band_label
 from miricigale.workflow.stages.measure import measure_band
 from miricigale.workflow.stages.sample import SampleFlags, in_field
-from miricigale.workflow.truths import reference
+from miricigale.workflow.truths import itself, of_reference, reference
 
 __all__ = [
     "RIVALS",
@@ -44,11 +45,7 @@ SE_BAND = "miri.f1500w"
 SNR_RANGES = ((3.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20.0, 50.0), (50.0, np.inf))
 #: Ranges of the half-light radius (arcsec) of sources that are no points.
 SIZE_RANGES = ((0.0, 0.2), (0.2, 0.4), (0.4, 0.8), (0.8, np.inf))
-
-
-def _one_band(select):
-    """Units of a stage that a rival of a band reads, of the reference truth."""
-    return lambda config, unit: (select.format(truth=reference(config), band=unit),)
+_MEDIAN = Cell("", "median", "+.1f", scale=100, unit=" %", error="scatter")
 
 
 @stage(
@@ -56,12 +53,12 @@ def _one_band(select):
     "rival photometry",
     version=2,
     needs={
-        "truth": _one_band("{truth}"),
-        "mosaics": _one_band("{truth}/{band}"),
+        "truth": of_reference,
+        "mosaics": lambda config, band: (f"{reference(config)}/{band}",),
         "highres": None,
-        "kernels": _one_band("{band}"),
+        "kernels": itself,
         "templates": None,
-        "matches": _one_band("{truth}"),
+        "matches": of_reference,
     },
     sections=(*KERNEL, "photometry.method", "photometry.match_radius"),
     resources=IMAGE_RESOURCES,
@@ -84,9 +81,8 @@ def measure_rivals(context, name):
     measured = mosaic if other == "yang2021" else context.image(f"{of_truth}/mosaic_{name}.fits")
     forced = measure_band(context, measured, name, other).to_table()
     blind = photometry.source_extractor_photometry(mosaic)
-    inside = in_field(truth["sky"], [mosaic])
-    blind["inside"] = in_field(blind["sky"], [mosaic]) if len(blind) else np.zeros(0, bool)
-    table = rival_table(truth, matched, name, own=own, inside=inside)
+    n_blind = np.count_nonzero(in_field(blind["sky"], [mosaic])) if len(blind) else 0
+    table = rival_table(truth, matched, name, own=own, inside=in_field(truth["sky"], [mosaic]))
     for method, measured, column in (
         (other, forced, "flux"),
         ("source_extractor", blind, "flux_best"),
@@ -96,7 +92,7 @@ def measure_rivals(context, name):
         rows["flags"] = np.zeros(len(rows), int)
         found = match_truth(truth, rows, [name], radius=radius)
         table[method], table[error_column(method)] = found[name], found[error_column(name)]
-    table.meta.update(method=own, n_source_extractor=int(np.count_nonzero(blind["inside"])))
+    table.meta.update(method=own, n_source_extractor=int(n_blind))
     context.save_table(f"rivals/{name}.ecsv", table)
 
 
@@ -116,9 +112,8 @@ def rival_table(truth, matched, name, *, own, inside):
     shapes = np.where(index < 2, "n < 2", "n >= 2")
     table["shape"] = np.where(np.asarray(truth["profile"]) == "point", "point", shapes)
     table["half_light_radius"] = truth["half_light_radius"].to(u.arcsec)
-    near = (np.asarray(matched[f"{name}_condition"]) & ConditionFlags.CROWDED) > 0
-    edge = (np.asarray(matched[f"{name}_condition"]) & ConditionFlags.EDGE) > 0
-    table["crowded"], table["edge"] = near, edge
+    for column, flag in (("crowded", ConditionFlags.CROWDED), ("edge", ConditionFlags.EDGE)):
+        table[column] = (np.asarray(matched[f"{name}_condition"]) & flag) > 0
     modeled = (np.asarray(matched["selection"]) & SampleFlags.NO_MODEL) == 0
     table["field"] = inside & modeled
     table[own], table[error_column(own)] = matched[name], formal
@@ -128,8 +123,7 @@ def rival_table(truth, matched, name, *, own, inside):
 def read_rivals(context):
     """Tables of the stage by band; none where it was not asked for."""
     config = context.config
-    names = band_names(config) if config.photometry.rivals else ()
-    return {name: QTable.read(context.path(f"rivals/{name}.ecsv")) for name in names}
+    return read_tables(context, "rivals", band_names(config) if config.photometry.rivals else ())
 
 
 def _groups(table):
@@ -207,19 +201,19 @@ def rival_numbers(tables):
 
 def rival_counts(table):
     """
-    What Source Extractor finds of a band.
+    What Source Extractor finds of a band, as `~miricigale.evaluation.Estimate` objects.
 
-    ``detected`` sources in the field, ``matched`` ones of the catalog, and ``missed`` of the
-    ``template`` sources of the field that the template fit has measured.
+    ``detected`` sources in the field, ``matched`` ones of the catalog, and the share ``missed`` of the sources
+    of the field that the template fit has measured. Intervals of the counts are Poisson's.
     """
     field = np.asarray(table["field"])
     forced = field & np.isfinite(table[table.meta["method"]].value)
     blind = np.isfinite(table["source_extractor"].value)
+    matched, missed = (int(np.count_nonzero(of)) for of in (field & blind, forced & ~blind))
+    counts = {"detected": int(table.meta["n_source_extractor"]), "matched": matched}
     return {
-        "detected": int(table.meta["n_source_extractor"]),
-        "matched": int(np.count_nonzero(field & blind)),
-        "template": int(np.count_nonzero(forced)),
-        "missed": int(np.count_nonzero(forced & ~blind)),
+        **{n: Estimate(float(k), k - np.sqrt(k), k + np.sqrt(k), k) for n, k in counts.items()},
+        "missed": Estimate.of_fraction(missed, np.count_nonzero(forced)),
     }
 
 
@@ -248,23 +242,13 @@ def source_extractor_numbers(tables, seed):
     -------
     numbers : dict of str to `~miricigale.evaluation.Estimate`
         By key of `~miricigale.evaluation.PUBLISHED`, for ``StudyResults.extra``; empty without
-        the band. Intervals of the counts are Poisson's.
+        the band.
     """
     if SE_BAND not in tables:
         return {}
     table = tables[SE_BAND]
-    counts = rival_counts(table)
-
-    def count(name):
-        n = counts[name]
-        return Estimate(float(n), n - np.sqrt(n), n + np.sqrt(n), n)
-
-    return {
-        "source_extractor.detected": count("detected"),
-        "source_extractor.matched": count("matched"),
-        "source_extractor.missed": Estimate.of_fraction(counts["missed"], counts["template"]),
-        "source_extractor.offset": _se_offset(table, seed),
-    }
+    numbers = rival_counts(table) | {"offset": _se_offset(table, seed)}
+    return {f"source_extractor.{name}": number for name, number in numbers.items()}
 
 
 def write_rivals(context, report, tables):
@@ -281,23 +265,19 @@ def write_rivals(context, report, tables):
         "settings of the paper (the brighter of AUTO/0.94 and the 1.86 arcsec aperture/0.8). Errors are "
         "the formal ones of each.",
     )
-    none = "no such source"
-    cells = {}
+    # by group of each band: what is shown for each method
+    shown = {}
     for row in numbers:
-        group = (row["band"], row["kind"], row["group"])
-        cells.setdefault(group, [row["n_group"]])
-        told = number(row["median"], "+.1f", none, scale=100)
-        if np.isfinite(row["median"]):
-            scatter = number(row["scatter"], ".1f", none, scale=100)
-            told = f"{told} ± {scatter} % ({row['n']})"
-        cells[group].append(told)
+        cells = shown.setdefault((row["band"], row["kind"], row["group"]), [row["n_group"]])
+        text = _MEDIAN.text(row)
+        cells.append(text if isinstance(text, Missing) else f"{text} ({row['n']})")
         if row["kind"] == "all":
-            cells[group].append(number(row["pull_scatter"], ".1f", none))
+            cells.append(number(row["pull_scatter"], ".1f", NO_SOURCE))
     header = [RIVALS[method] for method in RIVALS]
     report.table(
         [
-            (kind, group, *found)
-            for (band, kind, group), found in cells.items()
+            (kind, group, *cells)
+            for (band, kind, group), cells in shown.items()
             if band == "all" and kind != "all"
         ],
         header=("by", "sources", "in the group", *header),
@@ -308,8 +288,8 @@ def write_rivals(context, report, tables):
     )
     report.table(
         [
-            (band_label(band), *found)
-            for (band, kind, _), found in cells.items()
+            (band_label(band), *cells)
+            for (band, kind, _), cells in shown.items()
             if kind == "all" and band != "all"
         ],
         header=("band", "above 5 sigma", *(x for h in header for x in (h, "scatter of pulls"))),
@@ -318,16 +298,13 @@ def write_rivals(context, report, tables):
     rows = []
     for name, table in tables.items():
         counts, offset = rival_counts(table), _se_offset(table, context.seed)
-        share = counts["missed"] / counts["template"] if counts["template"] else np.nan
         rows.append(
             (
                 band_label(name),
-                counts["detected"],
-                counts["matched"],
-                counts["template"],
-                number(share, ".0f", none, scale=100),
-                number(offset.value, "+.3f", none),
-                number(offset.error, ".3f", none),
+                *(counts[key].n for key in ("detected", "matched", "missed")),
+                number(counts["missed"].value, ".0f", NO_SOURCE, scale=100),
+                number(offset.value, "+.3f", NO_SOURCE),
+                number(offset.error, ".3f", NO_SOURCE),
             )
         )
     report.table(

@@ -68,22 +68,18 @@ def mean_coverage(sky, image, n_images):
     return found
 
 
-def matched_errors(matched, inside, bands, *, statistic, bin_size, noise=None):
+def matched_errors(matched, inside, bands, *, noise=None, **options):
     """
     Error functions (`~miricigale.photometry.ErrorModel`) of bands, of matched sources.
 
     ``matched`` is of `~miricigale.evaluation.match_truth`; ``inside`` says which rows are in the field,
-    and ``noise`` is that of `~miricigale.photometry.ErrorModel.from_tables` for all rows.
+    and ``noise`` is that of `~miricigale.photometry.ErrorModel.from_tables` for all rows, which has the
+    ``options`` ``statistic`` and ``bin_size`` too.
     """
     truth = QTable({"id": matched["id"], **{name: matched[f"{name}_true"] for name in bands}})
     own = None if noise is None else {name: values[inside] for name, values in noise.items()}
     return ErrorModel.from_tables(
-        truth[inside],
-        matched[inside],
-        filters=bands,
-        statistic=statistic,
-        bin_size=bin_size,
-        noise=own,
+        truth[inside], matched[inside], filters=bands, noise=own, **options
     )
 
 
@@ -109,7 +105,7 @@ def add_selection(matched, truth, bands, *, inside, min_detected, redshifts):
 
     ``matched`` is of `~miricigale.evaluation.match_truth` with errors from the error function,
     ``truth`` has the same sources row by row, with ``star``; ``inside`` is that of `in_field`, and
-    ``redshifts`` the range of the grid of the fit.
+    ``redshifts`` the nodes of the grid of the fit.
     """
     flags = np.zeros(len(matched), int)
     matched["n_detected"] = detected_bands(matched, bands)
@@ -120,7 +116,7 @@ def add_selection(matched, truth, bands, *, inside, min_detected, redshifts):
     flags[~matched["matched"]] |= SampleFlags.NOT_MATCHED
     flags[matched["n_detected"] < min_detected] |= SampleFlags.FEW_BANDS
     redshift = np.asarray(truth["redshift"], float)
-    flags[~((redshift >= redshifts[0]) & (redshift <= redshifts[1]))] |= SampleFlags.OUTSIDE_GRID
+    flags[~((redshift >= redshifts[0]) & (redshift <= redshifts[-1]))] |= SampleFlags.OUTSIDE_GRID
     matched["selection"] = flags
     matched["selection"].info.description = SampleFlags.describe()
 
