@@ -13,7 +13,7 @@ from astropy.table import QTable
 
 from miricigale.pages import Missing, number
 
-__all__ = ["Cell", "changed_config", "read_tables", "rows_of"]
+__all__ = ["Cell", "cells_of", "changed_config", "read_tables", "rows_of"]
 
 #: Why a number of a comparison is missing.
 NO_SOURCE = "no such source"
@@ -73,8 +73,8 @@ class Cell:
         Factor before it is written.
     unit : str, optional
         Text after the number.
-    error : str, optional
-        Name of its error in a row, which follows the value; none by default.
+    error : bool, optional
+        Whether its error, ``<key>_err`` in a row, follows the value.
     why : str, optional
         Why there is no number where the value is not finite.
     """
@@ -84,7 +84,7 @@ class Cell:
     spec: str
     scale: float = 1
     unit: str = ""
-    error: str = ""
+    error: bool = False
     why: str = NO_SOURCE
 
     def text(self, row):
@@ -93,5 +93,10 @@ class Cell:
         if isinstance(text, Missing):
             return text
         if self.error:
-            text += f" ± {self.scale * row[self.error]:{self.spec.lstrip('+')}}"
+            text += f" ± {self.scale * row[f'{self.key}_err']:{self.spec.lstrip('+')}}"
         return text + self.unit
+
+
+def cells_of(row, cells):
+    """Texts of several `Cell` objects in a row of a table."""
+    return [cell.text(row) for cell in cells]

@@ -1,7 +1,6 @@
 """What a study simulates more than once, and what it fits of each: truths and sets of bands."""
 
 import dataclasses
-import typing
 
 from miricigale.filters import Filter
 
@@ -35,41 +34,31 @@ EXPERIMENTS = ("free_agn", "far_infrared", "no_model_error", "known_redshift", "
 FIELD = "field"
 #: In place of a fracAGN: that of each source, in the column ``frac_agn`` of the catalog.
 CATALOG = "catalog"
-#: In what the sky may differ from what the analysis takes it for: see the section [perturb].
-EFFECTS = (
-    "psf", "psf_width", "flat", "gain", "linearity", "zero_point", "zero_point_existing", "astrometry",
-    "stars", "dust", "torus", "point_agn", "clumps", "cutouts",
-)  # fmt: skip
+#: Where the sky may differ from what the analysis assumes (section [perturb]), and what the page calls it.
+EFFECTS = {
+    "psf": "PSF, another wavefront",
+    "psf_width": "PSF, width",
+    "flat": "flat field",
+    "gain": "gain",
+    "linearity": "linearity",
+    "zero_point": "zero point, MIRI",
+    "zero_point_existing": "zero point, existing bands",
+    "astrometry": "astrometry",
+    "stars": "stars: bursts and gas",
+    "dust": "dust: Draine & Li",
+    "torus": "another torus",
+    "point_agn": "AGN as a point",
+    "clumps": "made-up clumps",
+    "cutouts": "light of real galaxies",
+}
 #: Those that there are with AGN only.
 NEEDS_AGN = ("torus", "point_agn")
 
-
-class Variant(typing.NamedTuple):
-    """What further images of the first sky have otherwise: a key, its two values, and how each is called."""
-
-    section: str
-    key: str
-    values: tuple
-    labels: tuple
-
-
-#: Variant images by name, on and off.
+#: What further images of the first sky have otherwise: section, key, and its two values.
 VARIANTS = {
-    "residual": Variant(
-        "detector",
-        "residual",
-        ("etc", 0.0),
-        ("with the calculator's residual noise", "without residual noise"),
-    ),
-    "gradient": Variant(
-        "scene", "background_gradient", (0.05, 0.0), ("with a gradient", "without the gradient")
-    ),
-    "plane": Variant(
-        "reduction",
-        "background_plane",
-        (True, False),
-        ("plane taken off before the mesh", "background by the mesh alone"),
-    ),
+    "residual": ("detector", "residual", ("etc", 0.0)),
+    "gradient": ("scene", "background_gradient", (0.05, 0.0)),
+    "plane": ("reduction", "background_plane", (True, False)),
 }
 #: That which there is with an image only.
 CUTOUTS = "cutouts"
@@ -127,10 +116,11 @@ def study_truths(config):
     """
     truths = [Truth(_name(value), value) for value in config.sed.frac_agn]
     for value in perturbed_values(config):
-        effects = _effects(config.perturb, value)
-        truths += [_perturbed(value, effect[0], (effect,)) for effect in effects]
+        effects, base = _effects(config.perturb, value), _name(value)
+        skies = {effect[0]: (effect,) for effect in effects}
         if config.perturb.together and len(effects) > 1:
-            truths.append(_perturbed(value, ALL, effects))
+            skies[ALL] = effects
+        truths += [Truth(f"{base}+{label}", value, own, base) for label, own in skies.items()]
     return {truth.name: truth for truth in truths}
 
 
@@ -155,11 +145,6 @@ def _effects(options, frac_agn):
     if not options.cutouts:
         chosen = [name for name in chosen if name != CUTOUTS]
     return tuple((n, sizes.get(n)) for n in chosen if frac_agn != 0 or n not in NEEDS_AGN)
-
-
-def _perturbed(frac_agn, label, effects):
-    base = _name(frac_agn)
-    return Truth(f"{base}+{label}", frac_agn, effects, base)
 
 
 def truth_names(config):
@@ -228,8 +213,8 @@ def variant_changes(config):
     chosen, changes = config.variants.images, {}
     if chosen and config.exposures.kind == "ramps":
         changes["rates"] = {}
-    for name, one in VARIANTS.items():
+    for name, (section, key, (on, off)) in VARIANTS.items():
         if name in chosen or ALL in chosen:
-            on = getattr(getattr(config, one.section), one.key)
-            changes[name] = {one.section: {one.key: one.values[1 if on else 0]}}
+            value = getattr(getattr(config, section), key)
+            changes[name] = {section: {key: off if value else on}}
     return changes

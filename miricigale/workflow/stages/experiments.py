@@ -16,7 +16,7 @@ from miricigale.evaluation import (
 )
 from miricigale.photometry.surveys import HERSCHEL_DEPTHS
 from miricigale.utils.tables import described_rows
-from miricigale.workflow.derived import Cell, read_tables, rows_of
+from miricigale.workflow.derived import Cell, cells_of, read_tables, rows_of
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.fits import FIT_SECTIONS, fit_mock, fit_sample
 from miricigale.workflow.stages.inputs import sed_resources
@@ -64,14 +64,14 @@ _FIXED, _NO_AGN = "no such source, or redshifts were given", "no source with an 
 _CELLS = (
     Cell("sources", "n_sources", "d"),
     Cell("z sigma_MAD", "photoz_sigma_mad", ".4f", why=_FIXED),
-    Cell("outliers", "photoz_outliers", ".1f", scale=100, unit=" %", why=_FIXED),
+    Cell("outliers", "photoz_outliers", ".1f", 100, " %", why=_FIXED),
     Cell("fracAGN offset", "frac_agn_bias", "+.3f"),
     Cell("scatter", "frac_agn_sigma_mad", ".3f"),
     Cell("width", "frac_agn_width", ".3f"),
     Cell("accretion power offset (dex)", "power_bias", "+.2f", why=_NO_AGN),
     Cell("scatter", "power_sigma_mad", ".2f", why=_NO_AGN),
-    Cell("z in 68 %", "redshift_coverage", ".0f", scale=100, unit=" %", why=_FIXED),
-    Cell("fracAGN in 68 %", "frac_agn_coverage", ".0f", scale=100, unit=" %"),
+    Cell("z in 68 %", "redshift_coverage", ".0f", 100, " %", why=_FIXED),
+    Cell("fracAGN in 68 %", "frac_agn_coverage", ".0f", 100, " %"),
 )
 #: What Yang et al. 2021 fix, freed; the fixed values (70 deg, 1, 1) are nodes or within. To stay below
 #: a hundred million models the other axes of the AGN are thinner than in the study.
@@ -303,10 +303,7 @@ def write_experiments(context, report, every):
         + " ".join(_SENTENCES[name] for name in names),
     )
     report.table(
-        [
-            (row["truth"], LABELS[row["experiment"]], *(cell.text(row) for cell in _CELLS))
-            for row in numbers
-        ],
+        [(row["truth"], LABELS[row["experiment"]], *cells_of(row, _CELLS)) for row in numbers],
         header=("sky", "fit", *(cell.header for cell in _CELLS)),
         caption="Redshift, AGN fraction and accretion power against truth, and shares of the true values in the "
         "central 68 % of their posteriors; where an experiment has a part of the sample, the fit of the "

@@ -17,7 +17,7 @@ from miricigale.instrument import (
     tile_offsets,
 )
 from miricigale.utils.exceptions import ConfigError
-from miricigale.workflow.background import band_background
+from miricigale.workflow.background import band_background, of_filter, text_by_filter
 from miricigale.workflow.truths import truth_names
 
 __all__ = [
@@ -35,6 +35,7 @@ __all__ = [
     "exposure_memory",
     "exposure_plan",
     "exposure_units",
+    "exposures_of",
     "grid_of",
     "mosaic_memory",
     "pointing_exposures",
@@ -78,7 +79,7 @@ def _pattern(options, k):
     """Dithers of a filter: the name of a pattern, or offsets in arcsec as pairs."""
     if not options.dithers:
         return "ceers"
-    name = options.dithers[k if len(options.dithers) > 1 else 0]
+    name = of_filter(options.dithers, k)
     if name in dither_patterns():
         return name
     path = Path(name).expanduser()
@@ -135,11 +136,8 @@ def _exposures(field, options, patterns):
     """Names and exposures of two sections of a configuration, and of the dithers of each filter."""
     units = {}
     for k, name in enumerate(options.filters):
-        own = {
-            key: getattr(options, key)[k]
-            for key in ("n_groups", "n_integrations")
-            if getattr(options, key)
-        }
+        keys = ("n_groups", "n_integrations")
+        own = {key: getattr(options, key)[k] for key in keys if getattr(options, key)}
         pattern, named = patterns[k], isinstance(patterns[k], str)
         n_dithers = options.n_dithers[k] if options.n_dithers else None
         if not named:
@@ -167,12 +165,9 @@ def _planned(name, own, n_dithers, pointing, roll, options):
 
 def dithers_text(config):
     """Where the dithers of the study are from, in words."""
-    options = config.exposures
-    names = options.dithers or ("ceers",)
-    if len(names) == 1:
-        names = names * len(options.filters)
-    texts = {}
-    for k, (filter, name) in enumerate(zip(options.filters, names, strict=True)):
+    options, texts = config.exposures, {}
+    for k, filter in enumerate(options.filters):
+        name = of_filter(options.dithers or ("ceers",), k)
         if name in dither_patterns():
             text = f"the package's pattern {name!r}, of the form of the observatory's but not its digits"
         else:
@@ -181,10 +176,8 @@ def dithers_text(config):
                 text += f", observation {options.dither_observation}"
             if options.dither_exposures and name.lower().endswith(".pointing"):
                 text += f", exposure {options.dither_exposures[k]}"
-        texts.setdefault(text, []).append(filter.removeprefix("miri.").upper())
-    if len(texts) == 1:
-        return next(iter(texts))
-    return "; ".join(f"{', '.join(filters)}: {text}" for text, filters in texts.items())
+        texts[filter] = text
+    return text_by_filter(texts)
 
 
 def background_options(config):
@@ -225,34 +218,34 @@ def bands_of_truth(config, unit):
     return tuple(f"{truth}/{name}" for name in band_names(config))
 
 
+def exposures_of(config, unit=""):
+    """Exposures by name of a unit that ends with the name of an exposure or of a band; all without one."""
+    name = unit.rpartition("/")[2]
+    every = study_exposures(config)
+    return {own: e for own, e in every.items() if not name or name in (own, e.filter)}
+
+
 def dithers_of_band(config, unit):
     """Units of `exposure_units` of a unit of `truth_bands`."""
-    truth, _, band = unit.partition("/")
-    return tuple(
-        f"{truth}/{name}" for name, e in study_exposures(config).items() if e.filter == band
-    )
+    return tuple(f"{unit.partition('/')[0]}/{name}" for name in exposures_of(config, unit))
 
 
-def exposure_plan(config, unit=None):
+def exposure_plan(config, unit=""):
     """Plain values of the exposures of a unit, a filter, or the whole study, for hashing."""
+    counts = ("readout", "n_groups", "n_integrations", "subarray")
     return {
-        name: [
-            e.readout,
-            e.n_groups,
-            e.n_integrations,
-            e.subarray,
-            e.pointing.ra.deg,
-            e.pointing.dec.deg,
-            e.roll.value,
-        ]
-        for name, e in study_exposures(config).items()
-        if not unit or unit.rpartition("/")[2] in (name, e.filter)
+        name: [*(getattr(e, key) for key in counts), *_degrees(e.pointing), e.roll.value]
+        for name, e in exposures_of(config, unit).items()
     }
+
+
+def _degrees(position):
+    return position.ra.deg, position.dec.deg
 
 
 def band_exposures(config, name):
     """The exposures of one band, in order."""
-    return [e for e in study_exposures(config).values() if e.filter == name]
+    return list(exposures_of(config, name).values())
 
 
 def pointing_exposures(config, name):
@@ -279,8 +272,7 @@ def exposure_memory(config, unit):
     """
     if config.exposures.kind == "rates":
         return 600_000_000
-    name = unit.rpartition("/")[2]
-    chosen = [e for own, e in study_exposures(config).items() if name in (own, e.filter)]
+    chosen = exposures_of(config, unit).values()
     groups = max(math.prod(e.shape) * e.n_groups * e.n_integrations for e in chosen)
     return 500_000_000 + int(3.3 * groups)
 
@@ -292,6 +284,6 @@ def mosaic_memory(config, unit):
     Measured, of one to four pointings: 0.5 GB, 60 MB for each exposure, and 120 bytes for each pixel of the
     prior's grid.
     """
-    name = unit.rpartition("/")[2]
     pixels = math.prod(grid_of(config, config.highres.pixel_scale).pixel_shape)
-    return 500_000_000 + 60_000_000 * len(band_exposures(config, name)) + 120 * pixels
+    n_images = len(exposures_of(config, unit)) if unit else 0
+    return 500_000_000 + 60_000_000 * n_images + 120 * pixels

@@ -7,9 +7,9 @@ from astropy.table import QTable
 from miricigale import photometry
 from miricigale.evaluation import Estimate, bootstrap, match_truth, recovery_metrics
 from miricigale.evaluation.estimates import median
-from miricigale.pages import Missing, number
+from miricigale.pages import number
 from miricigale.utils.tables import described_rows, error_column
-from miricigale.workflow.derived import NO_SOURCE, Cell, read_tables
+from miricigale.workflow.derived import NO_SOURCE, read_tables
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.conditions import ConditionFlags
 from miricigale.workflow.stages.exposures import (
@@ -45,7 +45,6 @@ SE_BAND = "miri.f1500w"
 SNR_RANGES = ((3.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20.0, 50.0), (50.0, np.inf))
 #: Ranges of the half-light radius (arcsec) of sources that are no points.
 SIZE_RANGES = ((0.0, 0.2), (0.2, 0.4), (0.4, 0.8), (0.8, np.inf))
-_MEDIAN = Cell("", "median", "+.1f", scale=100, unit=" %", error="scatter")
 
 
 @stage(
@@ -63,9 +62,9 @@ _MEDIAN = Cell("", "median", "+.1f", scale=100, unit=" %", error="scatter")
     sections=(*KERNEL, "photometry.method", "photometry.match_radius"),
     resources=IMAGE_RESOURCES,
     units=lambda config: band_names(config) if config.photometry.rivals else (),
-    plan=lambda config, unit: {
+    plan=lambda config, band: {
         "truth": reference(config),
-        "exposures": exposure_plan(config, unit),
+        "exposures": exposure_plan(config, band),
     },
     kernels=("photometry",),
 )
@@ -269,8 +268,10 @@ def write_rivals(context, report, tables):
     shown = {}
     for row in numbers:
         cells = shown.setdefault((row["band"], row["kind"], row["group"]), [row["n_group"]])
-        text = _MEDIAN.text(row)
-        cells.append(text if isinstance(text, Missing) else f"{text} ({row['n']})")
+        text = number(row["median"], "+.1f", NO_SOURCE, scale=100)
+        if row["n"]:
+            text += f" ± {100 * row['scatter']:.1f} % ({row['n']})"
+        cells.append(text)
         if row["kind"] == "all":
             cells.append(number(row["pull_scatter"], ".1f", NO_SOURCE))
     header = [RIVALS[method] for method in RIVALS]

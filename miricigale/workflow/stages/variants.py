@@ -11,7 +11,7 @@ from miricigale.filters import Filter
 from miricigale.photometry.error_curves import limiting_flux, measured_curve
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_rows, error_column
-from miricigale.workflow.derived import Cell, changed_config, read_tables
+from miricigale.workflow.derived import Cell, cells_of, changed_config, read_tables
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.exposures import (
     EXPOSURE_RESOURCES,
@@ -30,7 +30,7 @@ from miricigale.workflow.stages.images import (
 )
 from miricigale.workflow.stages.measure import joined_photometry, measure_band
 from miricigale.workflow.stages.sample import SampleFlags
-from miricigale.workflow.truths import VARIANTS, itself, of_reference, reference, variant_changes
+from miricigale.workflow.truths import itself, of_reference, reference, variant_changes
 
 __all__ = [
     "HEADER",
@@ -43,6 +43,12 @@ __all__ = [
 
 #: Draws of the sources for the errors of limits.
 N_DRAWS = 100
+#: What images are called: where the key is on, and where it is off.
+_LABELS = {
+    "residual": ("with the calculator's residual noise", "without residual noise"),
+    "gradient": ("with a gradient", "without the gradient"),
+    "plane": ("plane taken off before the mesh", "background by the mesh alone"),
+}
 STUDY, RATES = "study", "rates"
 _OUT = SampleFlags.OUTSIDE_FIELD | SampleFlags.STAR | SampleFlags.NO_MODEL
 _NO_LIMIT = "the error function reaches 5 sigma nowhere"
@@ -51,19 +57,11 @@ _SAME = "compared with itself, or no limit"
 CELLS = (
     Cell("5 sigma", "limit", ".2f", why=_NO_LIMIT),
     Cell("minus calculator", "offset", "+.2f", why=_NO_LIMIT),
-    Cell("change (mag)", "limit_change", "+.2f", error="limit_change_err", why=_SAME),
+    Cell("change (mag)", "limit_change", "+.2f", error=True, why=_SAME),
     Cell("faint scatter (µJy)", "scatter", ".3g"),
-    Cell(
-        "change",
-        "scatter_change",
-        "+.1f",
-        scale=100,
-        unit=" %",
-        error="scatter_change_err",
-        why=_SAME,
-    ),
+    Cell("change", "scatter_change", "+.1f", 100, " %", error=True, why=_SAME),
     Cell("detected", "detected", "d"),
-    Cell("complete", "completeness", ".0f", scale=100, unit=" %", why="no such galaxy"),
+    Cell("complete", "completeness", ".0f", 100, " %", why="no such galaxy"),
 )
 HEADER = ("band", "images", *(cell.header for cell in CELLS))
 
@@ -72,12 +70,7 @@ HEADER = ("band", "images", *(cell.header for cell in CELLS))
     "variants",
     "variant images",
     version=3,
-    needs={
-        "truth": of_reference,
-        "highres": None,
-        "kernels": itself,
-        "templates": None,
-    },
+    needs={"truth": of_reference, "highres": None, "kernels": itself, "templates": None},
     sections=(*IMAGES, "highres", "photometry.method", "photometry.match_radius"),
     resources=EXPOSURE_RESOURCES,
     units=lambda config: band_names(config) if config.variants.images else (),
@@ -94,12 +87,8 @@ def measure_variants(context, band):
     truth = QTable.read(context.path(f"{plan['truth']}/truth.ecsv"))
     exposures = band_exposures(config, band)
     # the sources on the sky are the same in all of them
-    lights = [
-        scene.Scene(
-            truth, filter=band, wcs=e.wcs, psf=psf.miri_psf(band), n_threads=context.n_threads
-        ).render()
-        for e in exposures
-    ]
+    options = {"filter": band, "psf": psf.miri_psf(band), "n_threads": context.n_threads}
+    lights = [scene.Scene(truth, wcs=e.wcs, **options).render() for e in exposures]
     suffix, _ = measured_mosaic(config)
     for name, changes in plan["changes"].items():
         # all of them by rates, whatever the study's are
@@ -115,12 +104,8 @@ def measure_variants(context, band):
             images.append(cal)
         mosaic = next(one for label, one, _ in mosaics_of(own, images) if label == suffix)
         result = measure_band(context, mosaic, band, config.photometry.method).to_table()
-        matched = match_truth(
-            truth,
-            joined_photometry({band: result}),
-            [band],
-            radius=config.photometry.match_radius * u.arcsec,
-        )
+        radius = config.photometry.match_radius * u.arcsec
+        matched = match_truth(truth, joined_photometry({band: result}), [band], radius=radius)
         kept = ["id", f"{band}_true", band, error_column(band), f"{band}_flags"]
         context.save_table(f"variants/{name}/{band}.ecsv", matched[kept])
 
@@ -170,12 +155,8 @@ def variant_numbers(matched, tables, calculator, *, seed, statistic="mad", bin_s
         found = {}
         for name, flux in fluxes.items():
             curves = [measured_curve(band, true[k], flux[k], bin_size, statistic) for k in samples]
-            found[name] = np.array(
-                [
-                    _limit_and_scatter(curve, (flux - true)[k][faint[k]])
-                    for curve, k in zip(curves, samples, strict=True)
-                ]
-            )
+            off = ((flux - true)[k][faint[k]] for k in samples)
+            found[name] = np.array([_measures(*pair) for pair in zip(curves, off, strict=True)])
             # the images of the study, by rates too
             other = RATES if RATES in tables and name not in (STUDY, RATES) else STUDY
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -188,11 +169,9 @@ def variant_numbers(matched, tables, calculator, *, seed, statistic="mad", bin_s
             for k in range(2):
                 numbers += [found[name][0, k], _half_width(found[name][1:, k])]
                 numbers += [change[0, k], _half_width(change[1:, k])]
-            n, n_bright = int(np.count_nonzero(seen & bright)), int(bright.sum())
-            complete = Estimate.of_fraction(n, n_bright)
-            count = int(np.count_nonzero(seen & field))
-            sizes = len(samples[0]), limit, *numbers, count
-            rows.append((band, name, *sizes, complete.value, complete.error))
+            complete = Estimate.of_fraction(np.count_nonzero(seen & bright), bright.sum())
+            numbers += [int(np.count_nonzero(seen & field)), complete.value, complete.error]
+            rows.append((band, name, len(samples[0]), limit, *numbers))
     texts = {
         "band": "Band",
         "images": "Images: of the study, or with one thing otherwise",
@@ -213,7 +192,7 @@ def variant_numbers(matched, tables, calculator, *, seed, statistic="mad", bin_s
     return described_rows(rows, texts)
 
 
-def _limit_and_scatter(curve, faint):
+def _measures(curve, faint):
     """The 5-sigma limit of a curve of errors in AB magnitudes, and the scatter of faint sources."""
     limit = float((limiting_flux(curve, 5.0) * u.uJy).to_value(u.ABmag))
     return limit, biweight_scale(faint) if faint.size else np.nan
@@ -233,7 +212,7 @@ def variant_label(name, changes):
         return "the same, by rates"
     (values,) = changes[name].values()
     (value,) = values.values()
-    return VARIANTS[name].labels[0 if value else 1]
+    return _LABELS[name][0 if value else 1]
 
 
 def variant_rows(table, changes):
@@ -244,14 +223,8 @@ def variant_rows(table, changes):
     """
     table = table.copy()
     table["offset"] = table["limit"] - table["calculator"]
-    return [
-        (
-            band_label(row["band"]),
-            variant_label(row["images"], changes),
-            *(cell.text(row) for cell in CELLS),
-        )
-        for row in table
-    ]
+    names = ((band_label(row["band"]), variant_label(row["images"], changes)) for row in table)
+    return [(*name, *cells_of(row, CELLS)) for name, row in zip(names, table, strict=True)]
 
 
 def write_variants(context, report, matched, limits):
@@ -263,9 +236,8 @@ def write_variants(context, report, matched, limits):
     config, changes = context.config, variant_changes(context.config)
     if not changes:
         return None
-    tables = {
-        name: read_tables(context, f"variants/{name}", band_names(config)) for name in changes
-    }
+    bands = band_names(config)
+    tables = {name: read_tables(context, f"variants/{name}", bands) for name in changes}
     options = {"statistic": config.errors.statistic, "bin_size": config.errors.bin_size}
     table = variant_numbers(matched, tables, limits, seed=context.seed, **options)
     context.save_table("report/variants.ecsv", table)
@@ -317,6 +289,6 @@ def add_reasons(reasons, table, config):
     changes = variant_changes(config)
     for row in () if table is None else table:
         key = f"limit.{row['band'].removeprefix('miri.')}"
-        if key in reasons and row["images"] in VARIANTS and np.isfinite(row["limit_change"]):
+        if key in reasons and row["images"] in _LABELS and np.isfinite(row["limit_change"]):
             cost = f"{variant_label(row['images'], changes)} {row['limit_change']:+.2f} mag"
             reasons[key] = "; ".join(part for part in (reasons[key], cost) if part)
