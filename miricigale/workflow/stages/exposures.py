@@ -71,36 +71,46 @@ def study_exposures(config):
     Dithers are counted through all pointings, so that each exposure has random numbers of its own.
     """
     options = config.exposures
-    patterns = tuple(_pattern(options, k) for k in range(len(options.filters)))
+    patterns = tuple(_dithers(options, k)[0] for k in range(len(options.filters)))
     return dict(_exposures(config.pointing, options, patterns))
 
 
-def _pattern(options, k):
-    """Dithers of a filter: the name of a pattern, or offsets in arcsec as pairs."""
-    if not options.dithers:
-        return "ceers"
-    name = of_filter(options.dithers, k)
+def dithers_text(config):
+    """Where the dithers of the study are from, in words."""
+    options = config.exposures
+    return text_by_filter({f: _dithers(options, k)[1] for k, f in enumerate(options.filters)})
+
+
+def _dithers(options, k):
+    """Dithers of a filter, the name of a pattern or offsets in arcsec as pairs, and where they are from."""
+    name = of_filter(options.dithers or ("ceers",), k)
     if name in dither_patterns():
-        return name
-    path = Path(name).expanduser()
+        text = (
+            f"the package's pattern {name!r}, of the form of the observatory's but not its digits"
+        )
+        return name, text
+    path, part = Path(name).expanduser(), {}
     if not path.is_file():
         msg = (
             f"[exposures] dithers must be a file or one of {list(dither_patterns())}, got {name!r}"
         )
         raise ConfigError(msg)
-    observation = exposure = None
     if path.suffix.lower() == ".pointing":
-        observation = options.dither_observation or None
-        exposure = options.dither_exposures[k] if options.dither_exposures else None
+        if options.dither_observation:
+            part["observation"] = options.dither_observation
+        if options.dither_exposures:
+            part["exposure"] = options.dither_exposures[k]
+    text = "".join(f", {key} {value}" for key, value in part.items())
     stat = path.stat()
-    return _file_pattern(path, observation, exposure, stat.st_mtime_ns, stat.st_size)
+    offsets = _file_pattern(path, stat.st_mtime_ns, stat.st_size, **part)
+    return offsets, f"offsets in the file {path.name}{text}"
 
 
 @functools.lru_cache(maxsize=64)
-def _file_pattern(path, observation, exposure, *_):
+def _file_pattern(path, *_, **part):
     """Offsets in a file, which is read again when it has changed."""
     try:
-        offsets = read_dithers(path, observation=observation, exposure=exposure)
+        offsets = read_dithers(path, **part)
     except (ValueError, u.UnitsError) as err:
         msg = f"[exposures] dithers: {path.name}: {err}"
         raise ConfigError(msg) from err
@@ -163,23 +173,6 @@ def _planned(name, own, n_dithers, pointing, roll, options):
     return planned[0].replace(pointing=pointing, **own), n_dithers or len(planned)
 
 
-def dithers_text(config):
-    """Where the dithers of the study are from, in words."""
-    options, texts = config.exposures, {}
-    for k, filter in enumerate(options.filters):
-        name = of_filter(options.dithers or ("ceers",), k)
-        if name in dither_patterns():
-            text = f"the package's pattern {name!r}, of the form of the observatory's but not its digits"
-        else:
-            text = f"offsets in the file {Path(name).name}"
-            if options.dither_observation and name.lower().endswith(".pointing"):
-                text += f", observation {options.dither_observation}"
-            if options.dither_exposures and name.lower().endswith(".pointing"):
-                text += f", exposure {options.dither_exposures[k]}"
-        texts[filter] = text
-    return text_by_filter(texts)
-
-
 def background_options(config):
     """Arguments of `~miricigale.workflow.background.band_background`, but for the filter."""
     options = config.scene
@@ -234,13 +227,14 @@ def exposure_plan(config, unit=""):
     """Plain values of the exposures of a unit, a filter, or the whole study, for hashing."""
     counts = ("readout", "n_groups", "n_integrations", "subarray")
     return {
-        name: [*(getattr(e, key) for key in counts), *_degrees(e.pointing), e.roll.value]
+        name: [
+            *(getattr(e, k) for k in counts),
+            e.pointing.ra.deg,
+            e.pointing.dec.deg,
+            e.roll.value,
+        ]
         for name, e in exposures_of(config, unit).items()
     }
-
-
-def _degrees(position):
-    return position.ra.deg, position.dec.deg
 
 
 def band_exposures(config, name):

@@ -2,7 +2,7 @@
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, vstack
 
 from miricigale import photometry
 from miricigale.evaluation import Estimate, bootstrap, match_truth, recovery_metrics
@@ -161,27 +161,20 @@ def rival_numbers(tables):
         which ``n`` have a flux; ``median`` and ``scatter`` of measured over true flux minus one, and of
         the differences in units of the error (``pull_median``, ``pull_scatter``).
     """
-    values = {}
-    for name, table in tables.items():
-        true = table["flux_true"].value
-        for kind, group, rows in _groups(table):
-            for method in RIVALS:
-                flux = table[method].value[rows]
-                error = table[error_column(method)].value[rows]
-                for key in (name, "all"):
-                    parts = values.setdefault((key, kind, group, method), [])
-                    parts.append((true[rows], flux, error))
+    every = vstack(list(tables.values()), metadata_conflicts="silent")
     found = []
-    for key, parts in values.items():
-        true, flux, error = (np.concatenate(part) for part in zip(*parts, strict=True))
-        ratio = recovery_metrics(true, flux, relative=True)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            pulls = recovery_metrics(np.zeros(true.size), (flux - true) / error)
-        found.append(
-            (*key, true.size, ratio.n, ratio.median, ratio.median_err, ratio.sigma_mad,
-             pulls.median, pulls.sigma_mad)
-        )  # fmt: skip
-    found.sort(key=lambda row: row[0] == "all")
+    for band, table in (*tables.items(), ("all", every)):
+        for kind, group, rows in _groups(table):
+            true = table["flux_true"].value[rows]
+            for method in RIVALS:
+                flux, error = (table[name].value[rows] for name in (method, error_column(method)))
+                ratio = recovery_metrics(true, flux, relative=True)
+                with np.errstate(invalid="ignore", divide="ignore"):
+                    pulls = recovery_metrics(np.zeros(true.size), (flux - true) / error)
+                sizes = true.size, ratio.n
+                ratios = ratio.median, ratio.median_err, ratio.sigma_mad
+                pair = pulls.median, pulls.sigma_mad
+                found.append((band, kind, group, method, *sizes, *ratios, *pair))
     texts = {
         "band": "Band, or all together",
         "kind": "By what sources are grouped",
@@ -269,7 +262,7 @@ def write_rivals(context, report, tables):
     for row in numbers:
         cells = shown.setdefault((row["band"], row["kind"], row["group"]), [row["n_group"]])
         text = number(row["median"], "+.1f", NO_SOURCE, scale=100)
-        if row["n"]:
+        if np.isfinite(row["median"]):
             text += f" ± {100 * row['scatter']:.1f} % ({row['n']})"
         cells.append(text)
         if row["kind"] == "all":
