@@ -9,7 +9,14 @@ from miricigale.depth import sky_background
 from miricigale.utils.units import SURFACE_BRIGHTNESS
 from miricigale.workflow.options import require
 
-__all__ = ["LEVELS_DOC", "background_text", "band_background", "check_levels"]
+__all__ = [
+    "LEVELS_DOC",
+    "background_text",
+    "band_background",
+    "check_levels",
+    "of_filter",
+    "text_by_filter",
+]
 
 #: What the options say of levels.
 LEVELS_DOC = (
@@ -47,8 +54,19 @@ def _read(level):
     return u.Quantity(level).to(SURFACE_BRIGHTNESS)
 
 
-def _level_of(filter, filters, levels):
-    return levels[0] if len(levels) == 1 else levels[list(filters).index(filter)]
+def of_filter(values, k):
+    """The value of a filter, the k-th one, of values of all filters or a single one for all."""
+    return values[k if len(values) > 1 else 0]
+
+
+def text_by_filter(texts):
+    """One sentence of the texts of filters: the text alone where it is the same for all."""
+    names = {}
+    for filter, text in texts.items():
+        names.setdefault(text, []).append(filter.removeprefix("miri.").upper())
+    if len(names) == 1:
+        return next(iter(names))
+    return "; ".join(f"{', '.join(filters)}: {text}" for text, filters in names.items())
 
 
 def band_background(filter, filters, levels, *, position=None, date=""):
@@ -73,7 +91,7 @@ def band_background(filter, filters, levels, *, position=None, date=""):
     background : `~astropy.units.Quantity`
         In MJy/sr.
     """
-    level = _level_of(filter, filters, levels)
+    level = of_filter(levels, list(filters).index(filter))
     if level not in _PERCENTILES:
         return sky_background(filter, _read(level))
     if position is None:
@@ -91,13 +109,8 @@ def _at(filter, level, ra, dec, date):
 
 def background_text(filters, levels, *, position=None, date=""):
     """What the background of filters is and where it is from, in words; arguments as of `band_background`."""
-    found = {}
-    for name in filters:
-        text = _source(_level_of(name, filters, levels), position, date)
-        found.setdefault(text, []).append(name.removeprefix("miri.").upper())
-    if len(found) == 1:
-        return next(iter(found))
-    return "; ".join(f"{', '.join(names)}: {text}" for text, names in found.items())
+    sources = (_source(of_filter(levels, k), position, date) for k in range(len(filters)))
+    return text_by_filter(dict(zip(filters, sources, strict=True)))
 
 
 def _source(level, position, date):

@@ -21,6 +21,7 @@ from miricigale.utils.exceptions import DataError
 from miricigale.utils.random import stream
 from miricigale.utils.store import open_parts, write_parts
 from miricigale.utils.units import ANGLE
+from miricigale.workflow.stages.sample import values_at
 
 __all__ = ["RealGalaxies", "add_clumps", "read_stamps", "stamps_of_sources", "write_stamps"]
 
@@ -39,7 +40,13 @@ MIN_SNR, MIN_RADIUS, SIZE_FACTORS = 50.0, 0.15, (0.5, 2.0)
 _PSF_WIDTH, _RIM = 10.0, 1.0
 #: Detection: in sigma, above the noise that would join galaxies; and the least share of the light of a part that
 #: is taken for another galaxy, so that clumps stay.
-THRESHOLD, CONTRAST = 2.0, 0.1
+DETECTION = {
+    "preset": "default",
+    "threshold": 2.0,
+    "contrast": 0.1,
+    "stated_on": 0.06 * u.arcsec,
+    "dilation": "area",
+}
 #: Galaxies of the most similar axis ratio out of which one is drawn.
 N_LIKE = 5
 _LAYOUT = "miricigale stamps 1"
@@ -87,9 +94,9 @@ def add_clumps(catalog, filter, *, share, seed, point=None):
     checked = check_catalog(catalog, filters=[filter])
     clumpy = _sersic(checked) & (checked["sersic_index"] <= CLUMPY_INDEX)
     rows = np.flatnonzero(clumpy)
-    drawn = [_clumps(checked[row], seed) for row in rows]
-    if not drawn:
+    if rows.size == 0:
         return catalog
+    drawn = [_clumps(checked[row], seed) for row in rows]
     inner = np.nan_to_num(np.asarray(catalog[point], float)) if point else np.zeros(len(catalog))
     flux = catalog[filter]
     given = np.where(clumpy, share * (1 - inner), 0.0)
@@ -170,25 +177,18 @@ class RealGalaxies:
         galaxies : `RealGalaxies`
         """
         file = photometry.MosaicFile(path)
-        header = file.header
-        model = image_psf(header, psf, argument="cutouts_psf")
+        model = image_psf(file.header, psf, argument="cutouts_psf")
         if model is None:
             log.warning("%s: no PSF is known, and none is taken out of its galaxies", path)
         else:
-            model = rotate_psf(model, grid_angle=grid_angle(header.wcs, header.shape))
+            angle = grid_angle(file.header.wcs, file.header.shape)
+            model = rotate_psf(model, grid_angle=angle)
         return cls(file.read(), model)
 
     @functools.cached_property
     def _found(self):
         """Light before the PSF, labels, detections and the pixels that may be used."""
-        segments, table = photometry.detect_sources(
-            self.image,
-            preset="default",
-            threshold=THRESHOLD,
-            contrast=CONTRAST,
-            stated_on=0.06 * u.arcsec,
-            dilation="area",
-        )
+        segments, table = photometry.detect_sources(self.image, **DETECTION)
         usable = np.isfinite(self.image.data)
         if self.image.mask is not None:
             usable &= ~np.asarray(self.image.mask, bool)
@@ -238,14 +238,7 @@ class RealGalaxies:
 
     def labels_at(self, sky):
         """Labels of the segments at positions; 0 where there is none."""
-        labels = self._found[1]
-        x, y = (np.asarray(v) for v in self.image.wcs.world_to_pixel(sky))
-        near = np.isfinite(x) & np.isfinite(y)
-        x, y = (np.rint(np.where(near, v, -1)).astype(int) for v in (x, y))
-        inside = (x >= 0) & (x < labels.shape[1]) & (y >= 0) & (y < labels.shape[0])
-        found = np.zeros(len(sky), int)
-        found[inside] = labels[y[inside], x[inside]]
-        return found
+        return values_at(sky, self.image.wcs, self._found[1])
 
     @functools.cached_property
     def resolved(self):

@@ -62,10 +62,9 @@ class Perturbation:
         -------
         psf : `~miricigale.psf.InstrumentPSF`
         """
-        options = {}
-        if "psf" in self.effects:
-            # the same telescope in all bands
-            options["seed"] = int(self._random("psf").integers(2, 2**31))
+        # the same telescope in all bands
+        other = "psf" in self.effects
+        options = {"seed": int(self._random("psf").integers(2, 2**31))} if other else {}
         own = psf.miri_psf(filter, **options)
         factor = 1.0 + self._signed("psf_width", filter)
         if factor == 1.0:
@@ -121,13 +120,8 @@ class Perturbation:
             real = np.isin(catalog["id"], list(self.stamps))
             catalog["profile"] = np.where(real, "cutout", np.asarray(catalog["profile"]))
         if self.effects.get("clumps"):
-            catalog = add_clumps(
-                catalog,
-                filter,
-                share=self.effects["clumps"],
-                seed=self.seed,
-                point=self.point_column(filter),
-            )
+            options = {"share": self.effects["clumps"], "point": self.point_column(filter)}
+            catalog = add_clumps(catalog, filter, seed=self.seed, **options)
         if self.effects.get("astrometry"):
             catalog = catalog.copy()
             shift = self.effects["astrometry"] * u.arcsec
@@ -240,14 +234,10 @@ def perturbed_parameters(effects, table, models, prior, *, seed):
     changed = table.copy()
     for effect, ranges in (("stars", BURST), ("dust", DUST)):
         if effect in effects:
-            drawn = [
-                {
-                    name: np.exp(rng.uniform(*np.log(ends))) for name, ends in ranges.items()
-                }
-                for rng in (stream(seed, "perturb", effect, str(key)) for key in table["id"])
-            ]  # fmt: skip
-            for name in ranges:
-                changed[name] = np.array([row[name] for row in drawn])
+            streams = [stream(seed, "perturb", effect, str(key)) for key in table["id"]]
+            # each stream gives the first parameter, then the second
+            for name, ends in ranges.items():
+                changed[name] = np.array([np.exp(rng.uniform(*np.log(ends))) for rng in streams])
     known, own = (
         galaxy_light(model, parameters, [prior])[prior].value
         for model, parameters in zip(models, (table, changed), strict=True)

@@ -16,6 +16,8 @@ __all__ = [
     "VARIANTS",
     "Truth",
     "band_sets",
+    "itself",
+    "of_reference",
     "of_truth",
     "perturbed_values",
     "reference",
@@ -32,13 +34,26 @@ EXPERIMENTS = ("free_agn", "far_infrared", "no_model_error", "known_redshift", "
 FIELD = "field"
 #: In place of a fracAGN: that of each source, in the column ``frac_agn`` of the catalog.
 CATALOG = "catalog"
-#: In what the sky may differ from what the analysis takes it for: see the section [perturb].
-EFFECTS = (
-    "psf", "psf_width", "flat", "gain", "linearity", "zero_point", "zero_point_existing", "astrometry",
-    "stars", "dust", "torus", "point_agn", "clumps", "cutouts",
-)  # fmt: skip
+#: Where the sky may differ from what the analysis assumes (section [perturb]), and what the page calls it.
+EFFECTS = {
+    "psf": "PSF, another wavefront",
+    "psf_width": "PSF, width",
+    "flat": "flat field",
+    "gain": "gain",
+    "linearity": "linearity",
+    "zero_point": "zero point, MIRI",
+    "zero_point_existing": "zero point, existing bands",
+    "astrometry": "astrometry",
+    "stars": "stars: bursts and gas",
+    "dust": "dust: Draine & Li",
+    "torus": "another torus",
+    "point_agn": "AGN as a point",
+    "clumps": "made-up clumps",
+    "cutouts": "light of real galaxies",
+}
 #: Those that there are with AGN only.
 NEEDS_AGN = ("torus", "point_agn")
+
 #: What further images of the first sky have otherwise: section, key, and its two values.
 VARIANTS = {
     "residual": ("detector", "residual", ("etc", 0.0)),
@@ -101,10 +116,11 @@ def study_truths(config):
     """
     truths = [Truth(_name(value), value) for value in config.sed.frac_agn]
     for value in perturbed_values(config):
-        effects = _effects(config.perturb, value)
-        truths += [_perturbed(value, effect[0], (effect,)) for effect in effects]
+        effects, base = _effects(config.perturb, value), _name(value)
+        skies = {effect[0]: (effect,) for effect in effects}
         if config.perturb.together and len(effects) > 1:
-            truths.append(_perturbed(value, ALL, effects))
+            skies[ALL] = effects
+        truths += [Truth(f"{base}+{label}", value, own, base) for label, own in skies.items()]
     return {truth.name: truth for truth in truths}
 
 
@@ -131,11 +147,6 @@ def _effects(options, frac_agn):
     return tuple((n, sizes.get(n)) for n in chosen if frac_agn != 0 or n not in NEEDS_AGN)
 
 
-def _perturbed(frac_agn, label, effects):
-    base = _name(frac_agn)
-    return Truth(f"{base}+{label}", frac_agn, effects, base)
-
-
 def truth_names(config):
     """Names of the truths."""
     return tuple(study_truths(config))
@@ -144,6 +155,16 @@ def truth_names(config):
 def reference(config):
     """Name of the truth that gives the prior image and the error functions."""
     return truth_names(config)[0]
+
+
+def of_reference(config, _):
+    """The reference truth, as ``needs`` of a stage takes it."""
+    return (reference(config),)
+
+
+def itself(_, unit):
+    """The unit of the same name, as ``needs`` of a stage takes it."""
+    return (unit,)
 
 
 def of_truth(config, unit):

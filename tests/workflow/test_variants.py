@@ -16,8 +16,9 @@ from miricigale.scene import highres_image
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
 from miricigale.workflow.config import StudyConfig
+from miricigale.workflow.derived import changed_config
 from miricigale.workflow.stages import study_stages, variants
-from miricigale.workflow.stages.exposures import grid_of, study_exposures
+from miricigale.workflow.stages.exposures import IMAGES, grid_of, study_exposures
 from miricigale.workflow.stages.images import (
     background_of,
     expose_and_reduce,
@@ -44,6 +45,10 @@ def config_of(images="all", **sections):
             **sections,
         }
     )
+
+
+def changed(config, changes):
+    return changed_config(config, (*IMAGES, "highres"), changes)
 
 
 def test_each_variant_switches_one_thing_over():
@@ -77,11 +82,11 @@ def test_each_variant_switches_one_thing_over():
 def test_a_changed_configuration_differs_in_what_it_says():
     config = config_of()
     for changes in variant_changes(config).values():
-        own = variants.changed_config(config, changes)
+        own = changed(config, changes)
         for name in ("scene", "detector", "reduction", "pointing", "highres"):
             known = dataclasses.asdict(getattr(config, name))
             assert dataclasses.asdict(getattr(own, name)) == known | changes.get(name, {})
-    own = variants.changed_config(config, {"scene": {"background_gradient": 0.0}})
+    own = changed(config, {"scene": {"background_gradient": 0.0}})
     (exposure,) = study_exposures(config).values()
     level = background_of(own, exposure).image(exposure.wcs, exposure.shape)
     assert np.ptp(level) == 0
@@ -90,7 +95,7 @@ def test_a_changed_configuration_differs_in_what_it_says():
     assert 0.12 < np.ptp(tilted) / level[0, 0] < 0.14
     names = [[type(e).__name__ for e in imager_of(c).effects] for c in (config, own)]
     assert names[0] == names[1]
-    noisy = variants.changed_config(config, {"detector": {"residual": "etc"}})
+    noisy = changed(config, {"detector": {"residual": "etc"}})
     assert [type(e).__name__ for e in imager_of(noisy).effects] == ["Residual", *names[0]]
 
 
@@ -139,7 +144,7 @@ def test_images_without_a_change_are_those_of_the_study(folder):
     context = Context(config, folder, stage=STAGES["variants"], unit=BAND)
     truth = QTable.read(folder / "agn00" / "truth.ecsv")
     (exposure,) = study_exposures(config).values()
-    own = variants.changed_config(config, {"scene": {"background_gradient": 0.0}})
+    own = changed(config, {"scene": {"background_gradient": 0.0}})
     _, cal = expose_and_reduce(own, exposure, truth, seed=context.seed)
     _, mosaic, _ = next(mosaics_of(own, [cal]))
     study = measure_band(context, mosaic, BAND, "package").to_table()

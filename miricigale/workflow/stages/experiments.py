@@ -1,25 +1,24 @@
 """Further fits of the samples of a study: freed AGN, far infrared, samplers, without model error."""
 
 import importlib.util
-from concurrent.futures import ThreadPoolExecutor
 
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 from scipy import stats
 
-from miricigale import fitting, photometry, sed
+from miricigale import photometry, sed
 from miricigale.evaluation import (
     fraction_interval,
     photoz_metrics,
     posterior_ranks,
     recovery_metrics,
 )
-from miricigale.pages import number
 from miricigale.photometry.surveys import HERSCHEL_DEPTHS
 from miricigale.utils.tables import described_rows
+from miricigale.workflow.derived import Cell, cells_of, read_tables, rows_of
 from miricigale.workflow.stage import stage
-from miricigale.workflow.stages.fits import FIT_SECTIONS, mock_photometry
+from miricigale.workflow.stages.fits import FIT_SECTIONS, fit_mock, fit_sample
 from miricigale.workflow.stages.inputs import sed_resources
 from miricigale.workflow.truths import of_truth, study_truths
 
@@ -29,7 +28,6 @@ __all__ = [
     "experiment_units",
     "far_infrared_photometry",
     "fit_experiment",
-    "read_experiments",
     "write_experiments",
 ]
 
@@ -51,6 +49,30 @@ SAMPLER_OPTIONS = {"n_live": 200, "n_effective": 1000, "max_calls": 60_000}
 SAMPLERS = ("nautilus", "dynesty")
 #: Parameters whose posteriors are ranked, and compared between a sampler and the grid.
 RANKED = ("redshift", "frac_agn")
+#: What the page says of each.
+_SENTENCES = {
+    "free_agn": "Torus freed: inclination, p and q, which Yang et al. fix, have axes of their own (the other axes "
+    f"of the AGN are thinner), for up to {N_FREE} sources of each sky.",
+    "far_infrared": "With far infrared: mock fluxes at 100, 160, 250, 350 and 500 µm, to the depths of deep "
+    "Herschel surveys.",
+    "no_model_error": "Without model error: no relative error is added to the fluxes.",
+    "known_redshift": "Redshifts known: those of the truth are given to the fit.",
+    "samplers": "Nested sampler: parameters are continuous, in place of the nodes of the grid.",
+}
+_NO_SAMPLER = "Neither nautilus nor dynesty is installed (pip install nautilus-sampler)."
+_FIXED, _NO_AGN = "no such source, or redshifts were given", "no source with an AGN"
+_CELLS = (
+    Cell("sources", "n_sources", "d"),
+    Cell("z sigma_MAD", "photoz_sigma_mad", ".4f", why=_FIXED),
+    Cell("outliers", "photoz_outliers", ".1f", 100, " %", why=_FIXED),
+    Cell("fracAGN offset", "frac_agn_bias", "+.3f"),
+    Cell("scatter", "frac_agn_sigma_mad", ".3f"),
+    Cell("width", "frac_agn_width", ".3f"),
+    Cell("accretion power offset (dex)", "power_bias", "+.2f", why=_NO_AGN),
+    Cell("scatter", "power_sigma_mad", ".2f", why=_NO_AGN),
+    Cell("z in 68 %", "redshift_coverage", ".0f", 100, " %", why=_FIXED),
+    Cell("fracAGN in 68 %", "frac_agn_coverage", ".0f", 100, " %"),
+)
 #: What Yang et al. 2021 fix, freed; the fixed values (70 deg, 1, 1) are nodes or within. To stay below
 #: a hundred million models the other axes of the AGN are thinner than in the study.
 _FREED = {"inclination": (60.0, 70.0, 90.0), "p": (0.0, 1.0), "q": (0.0, 1.0)}
@@ -129,13 +151,10 @@ def fit_experiment(context, unit):
     """Fit the sample of a truth, with all MIRI bands, in another way than the study does."""
     config, plan = context.config, context.plan
     of, name = unit.split("/")
-    truth = QTable.read(context.path(f"{of}/truth.ecsv"))
-    matched = QTable.read(context.path(f"{of}/matched.ecsv"))
+    truth, matched, mock = fit_sample(context, of)
     sample = truth[np.asarray(matched["selection"]) == 0]
-    mock = mock_photometry(config, truth, matched, seed=context.seed)
-    bands = [*config.fit.bands, *config.exposures.filters]
+    bands, given = list(config.exposures.filters), {}
     options = {"axes": {key: np.array(values) for key, values in plan["axes"].items()}}
-    given = {}
     if "n" in plan and len(mock) > plan["n"]:
         rows = np.linspace(0, len(mock) - 1, plan["n"]).round().astype(int)
         mock, sample = mock[rows], sample[rows]
@@ -146,29 +165,20 @@ def fit_experiment(context, unit):
             mock[column] = light[column]
     elif name == "known_redshift":
         given["redshift"] = np.asarray(sample["redshift"], float)
+    elif name == "no_model_error":
+        options["model_error"] = 0.0
     elif name == "samplers":
         if plan["sampler"] is None:
             left = QTable({"id": sample["id"][:0]}, meta={"left_out": _NO_SAMPLER})
             context.save_table(f"{of}/experiments/{name}.ecsv", left)
             return
-        options = {
-            "engine": plan["sampler"],
-            "priors": sampler_priors(options["axes"]),
-            **plan["options"],
-        }
-        given["seed"] = context.seed
-    model_error = 0.0 if name == "no_model_error" else config.fit.model_error
-    fitter = fitting.BayesFitter(sed.SEDModel.yang2021(), bands, model_error=model_error, **options)
-    with ThreadPoolExecutor(context.n_threads) as executor:
+        priors = sampler_priors(options["axes"])
+        options = {"engine": plan["sampler"], "priors": priors, **plan["options"]}
         # samplers are Python: threads gain nothing
-        given["executor"] = None if name == "samplers" else executor
-        results = fitter.fit(mock, progress_bar=context.progress_bar, **given)
+        given = {"seed": context.seed, "executor": None}
+    results = fit_mock(context, mock, bands, given=given, **options)
     context.save_result(f"{of}/experiments/{name}.fits", results)
-    table = _ranked(results, sample, context.seed)
-    context.save_table(f"{of}/experiments/{name}.ecsv", table)
-
-
-_NO_SAMPLER = "Neither nautilus nor dynesty is installed (pip install nautilus-sampler)."
+    context.save_table(f"{of}/experiments/{name}.ecsv", _ranked(results, sample, context.seed))
 
 
 def sampler_priors(axes):
@@ -198,15 +208,6 @@ def _ranked(results, sample, seed):
     return table
 
 
-def read_experiments(context, truths):
-    """Tables of the stage, by truth and name."""
-    return {
-        (of, name): QTable.read(context.path(f"{of}/experiments/{name}.ecsv"))
-        for of in truths
-        for name in context.config.fit.experiments
-    }
-
-
 def experiment_numbers(sample, table):
     """
     How well the sources of a table of fits are recovered.
@@ -226,20 +227,17 @@ def experiment_numbers(sample, table):
         ``power_bias`` and ``power_sigma_mad`` in dex of sources with an AGN; ``redshift_coverage`` and
         ``frac_agn_coverage``, shares of true values in the central 68 %.
     """
-    place = {key: row for row, key in enumerate(np.asarray(sample["id"]))}
-    true = sample[[place[key] for key in np.asarray(table["id"])]]
+    true = rows_of(sample, table["id"])
     photoz = photoz_metrics(true["redshift"], table["redshift_mean"])
     known = not np.isfinite(table["redshift_rank"]).any()
     fraction = recovery_metrics(true["frac_agn"], table["frac_agn_mean"])
     width = np.asarray(table["frac_agn_std"], float)
     power = np.full(len(true), np.nan)
     if "accretion_power" in true.colnames and "accretion_power_mean" in table.colnames:
-        unit = table["accretion_power_mean"].unit
-        truth = true["accretion_power"].to_value(unit)
+        measured = table["accretion_power_mean"]
+        truth = true["accretion_power"].to_value(measured.unit)
         with np.errstate(divide="ignore", invalid="ignore"):
-            power = np.log10(
-                table["accretion_power_mean"].value / np.where(truth > 0, truth, np.nan)
-            )
+            power = np.log10(measured.value / np.where(truth > 0, truth, np.nan))
     power = recovery_metrics(np.zeros(power.size), np.where(np.isfinite(power), power, np.nan))
     found = {
         "n": photoz.n,
@@ -279,57 +277,39 @@ def write_experiments(context, report, every):
     names = context.config.fit.experiments
     if not names:
         return
-    tables, rows, pairs, left = read_experiments(context, every), [], [], {}
+    rows, pairs, left = [], [], {}
     for of, study in every.items():
         own = _ranked(study.results["all"], study.sample, context.seed)
-        place = {key: row for row, key in enumerate(np.asarray(own["id"]))}
-        rows.append((of, "study", len(own), experiment_numbers(study.sample, own)))
-        for name in names:
-            table = tables[of, name]
+        fits = [("study", own)]
+        for name, table in read_tables(context, f"{of}/experiments", names).items():
             if "left_out" in table.meta:
                 left[name] = table.meta["left_out"]
                 continue
+            same = rows_of(own, table["id"])
             if 0 < len(table) < len(own):
-                same = own[[place[key] for key in np.asarray(table["id"])]]
-                found = experiment_numbers(study.sample, same)
-                rows.append((of, "study", len(table), found))
-            found = experiment_numbers(study.sample, table)
-            rows.append((of, name, len(table), found))
+                fits.append(("study", same))
+            fits.append((name, table))
             if name == "samplers" and len(table):
-                same = own[[place[key] for key in np.asarray(table["id"])]]
                 pairs.append((of, len(table), *_sampler_numbers(same, table)))
-    _save_numbers(context, rows)
+        for name, table in fits:
+            rows.append((of, name, len(table), experiment_numbers(study.sample, table)))
+    texts = {"truth": "Sky", "experiment": "Fit", "n_sources": "Sources"}
+    texts |= {key: key.replace("_", " ") for key in rows[0][3]}
+    numbers = described_rows([(*row, *values.values()) for *row, values in rows], texts)
+    context.save_table("report/experiments.ecsv", numbers)
     report.section(
         "Further fits",
         "The same photometry with all MIRI bands fitted in other ways, beside the fit of the study. "
-        f"{_told(names)}",
+        + " ".join(_SENTENCES[name] for name in names),
     )
-    none, fixed = "no such source", "redshifts were given"
     report.table(
-        [
-            (
-                of,
-                LABELS[name],
-                n,
-                number(x["photoz_sigma_mad"], ".4f", fixed if n else none),
-                number(x["photoz_outliers"], "{:.1f} %", fixed if n else none, scale=100),
-                number(x["frac_agn_bias"], "+.3f", none),
-                number(x["frac_agn_sigma_mad"], ".3f", none),
-                number(x["frac_agn_width"], ".3f", none),
-                number(x["power_bias"], "+.2f", "no source with an AGN"),
-                number(x["power_sigma_mad"], ".2f", "no source with an AGN"),
-                number(x["redshift_coverage"], "{:.0f} %", fixed if n else none, scale=100),
-                number(x["frac_agn_coverage"], "{:.0f} %", none, scale=100),
-            )
-            for of, name, n, x in rows
-        ],
-        header=("sky", "fit", "sources", "z sigma_MAD", "outliers", "fracAGN offset", "scatter",
-                "width", "accretion power offset (dex)", "scatter", "z in 68 %", "fracAGN in 68 %"),
+        [(row["truth"], LABELS[row["experiment"]], *cells_of(row, _CELLS)) for row in numbers],
+        header=("sky", "fit", *(cell.header for cell in _CELLS)),
         caption="Redshift, AGN fraction and accretion power against truth, and shares of the true values in the "
         "central 68 % of their posteriors; where an experiment has a part of the sample, the fit of the "
         "study of the same sources stands above it",
         text=2,
-    )  # fmt: skip
+    )
     if pairs:
         report.table(
             [(of, n, *(f"{value:.2f}" for value in values)) for of, n, *values in pairs],
@@ -340,29 +320,3 @@ def write_experiments(context, report, every):
         )  # fmt: skip
     for name, why in left.items():
         report.text(f"Left out: {LABELS[name]}. {why}")
-
-
-def _told(names):
-    """What the experiments are, in sentences."""
-    sentences = {
-        "free_agn": (
-            "Torus freed: inclination, p and q, which Yang et al. fix, have axes of their own (the other axes "
-            f"of the AGN are thinner), for up to {N_FREE} sources of each sky."
-        ),
-        "far_infrared": (
-            "With far infrared: mock fluxes at 100, 160, 250, 350 and 500 µm, to the depths of deep "
-            "Herschel surveys."
-        ),
-        "no_model_error": "Without model error: no relative error is added to the fluxes.",
-        "known_redshift": "Redshifts known: those of the truth are given to the fit.",
-        "samplers": "Nested sampler: parameters are continuous, in place of the nodes of the grid.",
-    }
-    return " ".join(sentences[name] for name in names)
-
-
-def _save_numbers(context, rows):
-    """All numbers as a table of the report."""
-    texts = {"truth": "Sky", "experiment": "Fit", "n_sources": "Sources"}
-    texts |= {key: key.replace("_", " ") for key in rows[0][3]}
-    table = described_rows([(*row[:3], *row[3].values()) for row in rows], texts)
-    context.save_table("report/experiments.ecsv", table)

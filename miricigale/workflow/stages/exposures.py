@@ -17,7 +17,7 @@ from miricigale.instrument import (
     tile_offsets,
 )
 from miricigale.utils.exceptions import ConfigError
-from miricigale.workflow.background import band_background
+from miricigale.workflow.background import band_background, of_filter, text_by_filter
 from miricigale.workflow.truths import truth_names
 
 __all__ = [
@@ -35,6 +35,7 @@ __all__ = [
     "exposure_memory",
     "exposure_plan",
     "exposure_units",
+    "exposures_of",
     "grid_of",
     "mosaic_memory",
     "pointing_exposures",
@@ -70,36 +71,46 @@ def study_exposures(config):
     Dithers are counted through all pointings, so that each exposure has random numbers of its own.
     """
     options = config.exposures
-    patterns = tuple(_pattern(options, k) for k in range(len(options.filters)))
+    patterns = tuple(_dithers(options, k)[0] for k in range(len(options.filters)))
     return dict(_exposures(config.pointing, options, patterns))
 
 
-def _pattern(options, k):
-    """Dithers of a filter: the name of a pattern, or offsets in arcsec as pairs."""
-    if not options.dithers:
-        return "ceers"
-    name = options.dithers[k if len(options.dithers) > 1 else 0]
+def dithers_text(config):
+    """Where the dithers of the study are from, in words."""
+    options = config.exposures
+    return text_by_filter({f: _dithers(options, k)[1] for k, f in enumerate(options.filters)})
+
+
+def _dithers(options, k):
+    """Dithers of a filter, the name of a pattern or offsets in arcsec as pairs, and where they are from."""
+    name = of_filter(options.dithers or ("ceers",), k)
     if name in dither_patterns():
-        return name
-    path = Path(name).expanduser()
+        text = (
+            f"the package's pattern {name!r}, of the form of the observatory's but not its digits"
+        )
+        return name, text
+    path, part = Path(name).expanduser(), {}
     if not path.is_file():
         msg = (
             f"[exposures] dithers must be a file or one of {list(dither_patterns())}, got {name!r}"
         )
         raise ConfigError(msg)
-    observation = exposure = None
     if path.suffix.lower() == ".pointing":
-        observation = options.dither_observation or None
-        exposure = options.dither_exposures[k] if options.dither_exposures else None
+        if options.dither_observation:
+            part["observation"] = options.dither_observation
+        if options.dither_exposures:
+            part["exposure"] = options.dither_exposures[k]
+    text = "".join(f", {key} {value}" for key, value in part.items())
     stat = path.stat()
-    return _file_pattern(path, observation, exposure, stat.st_mtime_ns, stat.st_size)
+    offsets = _file_pattern(path, stat.st_mtime_ns, stat.st_size, **part)
+    return offsets, f"offsets in the file {path.name}{text}"
 
 
 @functools.lru_cache(maxsize=64)
-def _file_pattern(path, observation, exposure, *_):
+def _file_pattern(path, *_, **part):
     """Offsets in a file, which is read again when it has changed."""
     try:
-        offsets = read_dithers(path, observation=observation, exposure=exposure)
+        offsets = read_dithers(path, **part)
     except (ValueError, u.UnitsError) as err:
         msg = f"[exposures] dithers: {path.name}: {err}"
         raise ConfigError(msg) from err
@@ -135,11 +146,8 @@ def _exposures(field, options, patterns):
     """Names and exposures of two sections of a configuration, and of the dithers of each filter."""
     units = {}
     for k, name in enumerate(options.filters):
-        own = {
-            key: getattr(options, key)[k]
-            for key in ("n_groups", "n_integrations")
-            if getattr(options, key)
-        }
+        keys = ("n_groups", "n_integrations")
+        own = {key: getattr(options, key)[k] for key in keys if getattr(options, key)}
         pattern, named = patterns[k], isinstance(patterns[k], str)
         n_dithers = options.n_dithers[k] if options.n_dithers else None
         if not named:
@@ -163,28 +171,6 @@ def _planned(name, own, n_dithers, pointing, roll, options):
         return Exposure(name, pointing=pointing, roll=roll, **own), n_dithers
     planned = ceers_exposures(pointing, roll, filters=[name], quick=options.plan == "quick")
     return planned[0].replace(pointing=pointing, **own), n_dithers or len(planned)
-
-
-def dithers_text(config):
-    """Where the dithers of the study are from, in words."""
-    options = config.exposures
-    names = options.dithers or ("ceers",)
-    if len(names) == 1:
-        names = names * len(options.filters)
-    texts = {}
-    for k, (filter, name) in enumerate(zip(options.filters, names, strict=True)):
-        if name in dither_patterns():
-            text = f"the package's pattern {name!r}, of the form of the observatory's but not its digits"
-        else:
-            text = f"offsets in the file {Path(name).name}"
-            if options.dither_observation and name.lower().endswith(".pointing"):
-                text += f", observation {options.dither_observation}"
-            if options.dither_exposures and name.lower().endswith(".pointing"):
-                text += f", exposure {options.dither_exposures[k]}"
-        texts.setdefault(text, []).append(filter.removeprefix("miri.").upper())
-    if len(texts) == 1:
-        return next(iter(texts))
-    return "; ".join(f"{', '.join(filters)}: {text}" for text, filters in texts.items())
 
 
 def background_options(config):
@@ -225,34 +211,35 @@ def bands_of_truth(config, unit):
     return tuple(f"{truth}/{name}" for name in band_names(config))
 
 
+def exposures_of(config, unit=""):
+    """Exposures by name of a unit that ends with the name of an exposure or of a band; all without one."""
+    name = unit.rpartition("/")[2]
+    every = study_exposures(config)
+    return {own: e for own, e in every.items() if not name or name in (own, e.filter)}
+
+
 def dithers_of_band(config, unit):
     """Units of `exposure_units` of a unit of `truth_bands`."""
-    truth, _, band = unit.partition("/")
-    return tuple(
-        f"{truth}/{name}" for name, e in study_exposures(config).items() if e.filter == band
-    )
+    return tuple(f"{unit.partition('/')[0]}/{name}" for name in exposures_of(config, unit))
 
 
-def exposure_plan(config, unit=None):
+def exposure_plan(config, unit=""):
     """Plain values of the exposures of a unit, a filter, or the whole study, for hashing."""
+    counts = ("readout", "n_groups", "n_integrations", "subarray")
     return {
         name: [
-            e.readout,
-            e.n_groups,
-            e.n_integrations,
-            e.subarray,
+            *(getattr(e, k) for k in counts),
             e.pointing.ra.deg,
             e.pointing.dec.deg,
             e.roll.value,
         ]
-        for name, e in study_exposures(config).items()
-        if not unit or unit.rpartition("/")[2] in (name, e.filter)
+        for name, e in exposures_of(config, unit).items()
     }
 
 
 def band_exposures(config, name):
     """The exposures of one band, in order."""
-    return [e for e in study_exposures(config).values() if e.filter == name]
+    return list(exposures_of(config, name).values())
 
 
 def pointing_exposures(config, name):
@@ -279,8 +266,7 @@ def exposure_memory(config, unit):
     """
     if config.exposures.kind == "rates":
         return 600_000_000
-    name = unit.rpartition("/")[2]
-    chosen = [e for own, e in study_exposures(config).items() if name in (own, e.filter)]
+    chosen = exposures_of(config, unit).values()
     groups = max(math.prod(e.shape) * e.n_groups * e.n_integrations for e in chosen)
     return 500_000_000 + int(3.3 * groups)
 
@@ -292,6 +278,6 @@ def mosaic_memory(config, unit):
     Measured, of one to four pointings: 0.5 GB, 60 MB for each exposure, and 120 bytes for each pixel of the
     prior's grid.
     """
-    name = unit.rpartition("/")[2]
     pixels = math.prod(grid_of(config, config.highres.pixel_scale).pixel_shape)
-    return 500_000_000 + 60_000_000 * len(band_exposures(config, name)) + 120 * pixels
+    n_images = len(exposures_of(config, unit)) if unit else 0
+    return 500_000_000 + 60_000_000 * n_images + 120 * pixels

@@ -7,7 +7,9 @@ import numpy as np
 from astropy.table import QTable
 
 from miricigale import evaluation, fitting, photometry, sed
+from miricigale.photometry.surveys import fractional_error
 from miricigale.utils.tables import error_column
+from miricigale.workflow.derived import read_tables
 from miricigale.workflow.perturbation import Perturbation
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.conditions import ConditionFlags, add_conditions, any_condition
@@ -18,6 +20,7 @@ from miricigale.workflow.stages.exposures import (
     pointing_time,
 )
 from miricigale.workflow.stages.inputs import fit_plan, sed_resources
+from miricigale.workflow.stages.measure import joined_photometry
 from miricigale.workflow.stages.sample import (
     add_selection,
     in_field,
@@ -34,20 +37,11 @@ from miricigale.workflow.truths import (
 
 __all__ = [
     "FIT_SECTIONS",
-    "band_photometry",
     "fit_photometry",
-    "fit_units",
     "make_errors",
     "match_sources",
     "mock_photometry",
 ]
-
-
-def band_photometry(context, truth, bands):
-    """The photometry of all bands of a truth in one table, a row for each detection."""
-    columns = ["id", "sky", "flux", error_column("flux"), "flags"]
-    tables = {n: QTable.read(context.path(f"{truth}/photometry/{n}.ecsv")) for n in bands}
-    return photometry.join_bands({name: table[columns] for name, table in tables.items()})
 
 
 class _Field:
@@ -58,7 +52,8 @@ class _Field:
         bands = config.exposures.filters
         radius = config.photometry.match_radius * u.arcsec
         self.truth = QTable.read(context.path(f"{name}/truth.ecsv"))
-        self.detections = band_photometry(context, name, bands)
+        tables = read_tables(context, f"{name}/photometry", bands)
+        self.detections = joined_photometry(tables)
         self.matched = evaluation.match_truth(self.truth, self.detections, bands, radius=radius)
         self.association = evaluation.associate(self.truth, self.detections, radius=radius)
         mosaics = {}
@@ -88,6 +83,7 @@ class _Field:
         return noise
 
 
+#: What is matched: a truth, and the mosaics and photometry of its bands.
 _MATCHED = {"truth": of_truth, "mosaics": bands_of_truth, "photometry": bands_of_truth}
 
 
@@ -104,12 +100,11 @@ _MATCHED = {"truth": of_truth, "mosaics": bands_of_truth, "photometry": bands_of
 )
 def make_errors(context, _):
     """Stage 12: error function of every band, of the matched sources of the reference truth."""
-    config, bands = context.config, context.config.exposures.filters
-    field = _Field(context, context.plan)
+    config, field = context.config, _Field(context, context.plan)
     errors = matched_errors(
         field.matched,
         field.inside,
-        bands,
+        config.exposures.filters,
         statistic=config.errors.statistic,
         bin_size=config.errors.bin_size,
         noise=field.noise(config),
@@ -122,13 +117,7 @@ def make_errors(context, _):
     "match to the truth",
     version=2,
     needs={**_MATCHED, "errors": None},
-    sections=(
-        *GRID,
-        "errors.coverage",
-        "photometry.match_radius",
-        "fit.min_detected",
-        "fit.axes",
-    ),
+    sections=(*GRID, "errors.coverage", "photometry.match_radius", "fit.min_detected", "fit.axes"),
     units=truth_names,
     plan=fit_plan,
 )
@@ -136,23 +125,21 @@ def match_sources(context, unit):
     """Stage 12: each truth matched, with the errors of the error function; sample of the fit."""
     config, bands = context.config, context.config.exposures.filters
     field = _Field(context, unit)
-    matched, detections = field.matched, field.detections
+    matched, detections, association = field.matched, field.detections, field.association
     errors = photometry.ErrorModel.read(context.path("errors.ecsv"))
     for name in bands:
         matched[f"{name}_formal_err"] = matched[error_column(name)]
         matched[f"{name}_extrapolated"] = errors.extrapolated(matched[name], name)
     matched = errors.assign(matched, filters=bands, noise=field.noise(config))
-    nodes = sed.SEDModel.yang2021_axes(config.fit.axes)["redshift"]
     add_selection(
         matched,
         field.truth,
         bands,
         inside=field.inside,
         min_detected=config.fit.min_detected,
-        redshifts=(nodes[0], nodes[-1]),
+        redshifts=sed.SEDModel.yang2021_axes(config.fit.axes)["redshift"],
     )
     add_conditions(matched, bands, suffix="_true")
-    association = field.association
     detections["association"] = np.zeros(len(detections), int)
     here = np.asarray(association["second"]) >= 0
     detections["association"][association["second"][here]] = association["reasons"][here]
@@ -170,8 +157,6 @@ def mock_photometry(config, truth, matched, *, seed, zero_point=0.0):
     on ``seed``, its id and the band only. The light of existing bands is higher or lower by the share
     ``zero_point``, of which the fits do not know.
     """
-    from miricigale.photometry.surveys import fractional_error
-
     bands = config.fit.bands
     errors = photometry.ErrorModel.from_depths(
         dict(zip(bands, config.fit.depths, strict=True)),
@@ -185,11 +170,6 @@ def mock_photometry(config, truth, matched, *, seed, zero_point=0.0):
         for column in (name, error_column(name)):
             table[column] = matched[column][sample]
     return table
-
-
-def fit_units(config):
-    """Names of the fits, ``<truth>/<set>``."""
-    return tuple(f"{truth}/{name}" for truth in truth_names(config) for name in config.fit.sets)
 
 
 #: What fits of mock photometry read of the configuration.
@@ -212,29 +192,69 @@ def _fit_plan(config, unit):
     sections=FIT_SECTIONS,
     resources=sed_resources,
     plan=_fit_plan,
-    units=fit_units,
+    units=lambda config: tuple(
+        f"{of}/{name}" for of in truth_names(config) for name in config.fit.sets
+    ),
     kernels=("fit",),
 )
 def fit_photometry(context, unit):
     """Stage 13: fit the detected sources of a truth with a set of the MIRI bands."""
-    config = context.config
+    config, plan = context.config, context.plan
     name, chosen = unit.split("/")
-    truth = QTable.read(context.path(f"{name}/truth.ecsv"))
-    matched = QTable.read(context.path(f"{name}/matched.ecsv"))
-    zero_point = context.plan.get("zero_point", 0.0)
-    mock = mock_photometry(config, truth, matched, seed=context.seed, zero_point=zero_point)
-    fitter = fitting.BayesFitter(
-        sed.SEDModel.yang2021(),
-        [*config.fit.bands, *context.plan["bands"]],
-        axes=sed.SEDModel.yang2021_axes(config.fit.axes),
-        model_error=config.fit.model_error,
+    _, matched, mock = fit_sample(context, name, zero_point=plan.get("zero_point", 0.0))
+    results = fit_mock(
+        context, mock, plan["bands"], axes=sed.SEDModel.yang2021_axes(config.fit.axes)
     )
-    with ThreadPoolExecutor(context.n_threads) as executor:
-        results = fitter.fit(mock, executor=executor, progress_bar=context.progress_bar)
     context.save_result(f"{name}/fits_{chosen}.fits", results)
     table = results.to_table()
-    table["condition"] = any_condition(matched, config.exposures.filters)[
-        np.asarray(matched["selection"]) == 0
-    ]
+    conditions = any_condition(matched, config.exposures.filters)
+    table["condition"] = conditions[np.asarray(matched["selection"]) == 0]
     table["condition"].info.description = ConditionFlags.describe()
     context.save_table(f"{name}/fits_{chosen}.ecsv", table)
+
+
+def fit_sample(context, name, **options):
+    """Truth, matched sources and `mock_photometry` of a truth."""
+    truth, matched = (
+        QTable.read(context.path(f"{name}/{table}.ecsv")) for table in ("truth", "matched")
+    )
+    return (
+        truth,
+        matched,
+        mock_photometry(context.config, truth, matched, seed=context.seed, **options),
+    )
+
+
+def fit_mock(context, mock, bands, *, model_error=None, given=None, **options):
+    """
+    Fit mock photometry in the existing and in further bands as the study does.
+
+    Parameters
+    ----------
+    context : `~miricigale.workflow.Context`
+        Of a stage with `FIT_SECTIONS`.
+    mock : `~astropy.table.QTable`
+        As of `mock_photometry`.
+    bands : iterable of str
+        Bands that join the existing ones.
+    model_error : float, optional
+        In place of the study's.
+    given : dict, optional
+        Further arguments of ``BayesFitter.fit``.
+    **options
+        Further arguments of `~miricigale.fitting.BayesFitter`.
+
+    Returns
+    -------
+    results : `~miricigale.fitting.FitResults`
+    """
+    fit = context.config.fit
+    fitter = fitting.BayesFitter(
+        sed.SEDModel.yang2021(),
+        [*fit.bands, *bands],
+        model_error=fit.model_error if model_error is None else model_error,
+        **options,
+    )
+    with ThreadPoolExecutor(context.n_threads) as executor:
+        given = {"executor": executor, "progress_bar": context.progress_bar} | (given or {})
+        return fitter.fit(mock, **given)

@@ -22,6 +22,7 @@ from miricigale.workflow.stages.exposures import (
     exposure_memory,
     exposure_plan,
     exposure_units,
+    exposures_of,
     grid_of,
     mosaic_memory,
     pointing_of,
@@ -29,14 +30,14 @@ from miricigale.workflow.stages.exposures import (
     study_exposures,
     truth_bands,
 )
-from miricigale.workflow.truths import CUTOUTS, of_truth, reference, study_truths
+from miricigale.workflow.truths import CUTOUTS, of_reference, of_truth, reference, study_truths
 
 __all__ = [
+    "DETECTION",
     "background_of",
     "expose_and_reduce",
     "expose_image",
     "imager_of",
-    "kernel_of",
     "make_exposure",
     "make_highres",
     "make_kernel",
@@ -44,6 +45,8 @@ __all__ = [
     "measured_mosaic",
     "mosaic_psf",
     "mosaics_of",
+    "prior_image",
+    "prior_psf",
     "reducer_of",
 ]
 
@@ -158,9 +161,9 @@ def expose_image(config, imager, image, exposure, *, seed, n_threads=None, keep=
 def _sky_plan(config, unit):
     """The plan of an exposure, the perturbations of its truth, and whether that is the reference."""
     name = unit.partition("/")[0]
-    values = study_truths(config)[name].values()
-    differ = {"perturbations": values["perturbations"]} if "perturbations" in values else {}
-    return exposure_plan(config, unit) | differ | {"is_reference": name == reference(config)}
+    plan = exposure_plan(config, unit) | {"is_reference": name == reference(config)}
+    effects = dict(study_truths(config)[name].perturbations)
+    return plan | ({"perturbations": effects} if effects else {})
 
 
 @stage(
@@ -223,7 +226,7 @@ def make_mosaic(context, unit):
     """Stage 8: drizzle the dithers of one band, on its own grid and on the prior's."""
     config = context.config
     truth, band = unit.split("/")
-    names = [name for name, e in study_exposures(config).items() if e.filter == band]
+    names = exposures_of(config, band)
     images = [context.image(f"{truth}/exposures/{name}_cal.fits") for name in names]
     for label, mosaic, planes in mosaics_of(config, images):
         context.save_image(f"{truth}/mosaic_{band}{label}.fits", mosaic, dq=mosaic.flags, **planes)
@@ -244,12 +247,16 @@ def mosaics_of(config, images):
         yield label, mosaic, planes
 
 
+#: What the detection of sources on the high-resolution image depends on.
+DETECTION = ("photometry.threshold", "photometry.n_pixels")
+
+
 @stage(
     "highres",
     "high-resolution image",
     version=3,
-    needs={"truth": lambda config, _: (reference(config),)},
-    sections=(*GRID, "highres", "photometry.threshold", "photometry.n_pixels"),
+    needs={"truth": of_reference},
+    sections=(*GRID, "highres", *DETECTION),
     resources=("filters.sedpy",),
     plan=lambda config, _: {"exposures": exposure_plan(config), "truth": reference(config)},
     memory=mosaic_memory,
@@ -259,23 +266,35 @@ def make_highres(context, _):
     """Stage 9: the high-resolution image, its segmentation and the detected sources."""
     config = context.config
     truth = QTable.read(context.path(f"{context.plan['truth']}/truth.ecsv"))
-    options = config.highres
-    image = scene.highres_image(
-        truth,
-        filter=options.filter,
-        wcs=grid_of(config, options.pixel_scale),
-        psf=psf.hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec),
-        depth=options.depth * u.ABmag,
-        seed=context.seed,
-    )
-    segmentation, detected = photometry.detect_sources(
-        image,
-        threshold=config.photometry.threshold,
-        n_pixels=config.photometry.n_pixels,
-    )
+    wcs = grid_of(config, config.highres.pixel_scale)
+    image, segmentation, detected = prior_image(config, truth, wcs, seed=context.seed)
     context.save_image("f160w.fits", image)
     context.save_image("segm.fits", image, segmentation=np.asarray(segmentation.data, np.int32))
     context.save_table("detections.ecsv", detected)
+
+
+def prior_psf(config):
+    """The PSF of the high-resolution image."""
+    options = config.highres
+    return psf.hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec)
+
+
+def prior_image(config, catalog, wcs, *, seed):
+    """High-resolution image of a catalog, its segmentation and the detected sources."""
+    options = config.highres
+    image = scene.highres_image(
+        catalog,
+        filter=options.filter,
+        wcs=wcs,
+        psf=prior_psf(config),
+        depth=options.depth * u.ABmag,
+        seed=seed,
+    )
+    detection = config.photometry
+    segmentation, detected = photometry.detect_sources(
+        image, threshold=detection.threshold, n_pixels=detection.n_pixels
+    )
+    return image, segmentation, detected
 
 
 def mosaic_psf(config, name, scale):
@@ -295,18 +314,6 @@ def measured_mosaic(config):
     return "", config.reduction.pixel_scale
 
 
-def kernel_of(config, name):
-    """Kernel from the high-resolution image to the mosaic of one band."""
-    options = config.highres
-    value = config.photometry.regularization
-    return psf.MatchingKernel.from_psfs(
-        psf.hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec),
-        mosaic_psf(config, name, config.reduction.pixel_scale),
-        pixel_scale=options.pixel_scale * u.arcsec,
-        regularization=value if value in ("auto", "yang2021") else float(value),
-    )
-
-
 @stage(
     "kernels",
     "matching kernel",
@@ -318,6 +325,12 @@ def kernel_of(config, name):
     kernels=("images", "photometry"),
 )
 def make_kernel(context, name):
-    """Stage 10: the kernel of one band."""
-    kernel = kernel_of(context.config, name)
+    """Stage 10: the kernel from the high-resolution image to the mosaic of one band."""
+    config, value = context.config, context.config.photometry.regularization
+    kernel = psf.MatchingKernel.from_psfs(
+        prior_psf(config),
+        mosaic_psf(config, name, config.reduction.pixel_scale),
+        pixel_scale=config.highres.pixel_scale * u.arcsec,
+        regularization=value if value in ("auto", "yang2021") else float(value),
+    )
     context.save_result(f"kernel_{name}.fits", kernel)

@@ -92,13 +92,10 @@ def study_catalog(options):
 @functools.lru_cache(maxsize=2)
 def _catalog(options, state):
     """The catalog, read and warned of once; ``state`` tells whether a file has changed."""
-    columns, units = (
-        dict(pair.split("=") for pair in pairs) for pairs in (options.columns, options.units)
-    )
     return read_catalog(
         options.source,
-        columns=columns,
-        units=units,
+        columns=dict(pair.split("=") for pair in options.columns),
+        units=dict(pair.split("=") for pair in options.units),
         survey=options.survey or None,
         missing=options.missing,
         factor=options.factor or None,

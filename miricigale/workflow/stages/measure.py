@@ -1,10 +1,10 @@
 """Stage 11: forced photometry."""
 
-import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
 from miricigale import photometry, psf
+from miricigale.utils.tables import error_column
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.exposures import (
     IMAGE_RESOURCES,
@@ -13,9 +13,10 @@ from miricigale.workflow.stages.exposures import (
     mosaic_memory,
     truth_bands,
 )
-from miricigale.workflow.stages.images import measured_mosaic, mosaic_psf
+from miricigale.workflow.stages.images import measured_mosaic, mosaic_psf, prior_psf
+from miricigale.workflow.truths import itself
 
-__all__ = ["make_templates", "measure_band", "measure_photometry", "yang2021_photometer"]
+__all__ = ["make_templates", "measure_band", "measure_photometry", "photometer_of"]
 
 
 @stage(
@@ -29,14 +30,8 @@ __all__ = ["make_templates", "measure_band", "measure_photometry", "yang2021_pho
 )
 def make_templates(context, _):
     """Stage 11, once for all bands: what the detected sources look like on the prior."""
-    options = context.config.highres
-    _, labels = context.image("segm.fits", "segmentation")
     templates = photometry.SourceTemplates.from_images(
-        context.image("f160w.fits"),
-        labels.astype(np.int32),
-        QTable.read(context.path("detections.ecsv")),
-        psf=psf.hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec),
-        n_threads=context.n_threads,
+        *_detections(context), psf=prior_psf(context.config), n_threads=context.n_threads
     )
     context.save_result("templates.fits", templates)
 
@@ -46,7 +41,7 @@ def make_templates(context, _):
     "forced photometry",
     version=5,
     needs={
-        "mosaics": lambda config, unit: (unit,),
+        "mosaics": itself,
         "highres": None,
         "kernels": lambda config, unit: (unit.partition("/")[2],),
         "templates": None,
@@ -70,36 +65,37 @@ def measure_photometry(context, unit):
     context.save_image(f"{truth}/photometry/{name}_residual.fits", result.residual_image)
 
 
-def measure_band(context, mosaic, name, method):
-    """Result of the forced photometry of a mosaic of one band, ``"package"`` or ``"yang2021"``."""
+def photometer_of(context, name, method):
+    """Photometer of one band: of the package, or by the steps of Yang et al. 2021 (images not scaled)."""
+    config = context.config
     if method == "yang2021":
-        return _as_yang2021(context, mosaic, name)
-    kernel = psf.MatchingKernel.read(context.path(f"kernel_{name}.fits"))
+        blur = mosaic_psf(config, name, config.highres.pixel_scale)
+        return photometry.Yang2021Photometer(prior_psf(config), blur, n_threads=context.n_threads)
     # the constant absorbs the light of faint sources and of wings in the background
     return photometry.ForcedPhotometer(
-        kernel, fit_background=True, n_threads=context.n_threads
-    ).measure(
-        mosaic,
-        templates=photometry.SourceTemplates.read(context.path("templates.fits")),
+        psf.MatchingKernel.read(context.path(f"kernel_{name}.fits")),
+        fit_background=True,
+        n_threads=context.n_threads,
     )
 
 
-def yang2021_photometer(config, name, n_threads):
-    """Photometer of one band by the steps of Yang et al. 2021, without a scaling of the image."""
-    options = config.highres
-    return photometry.Yang2021Photometer(
-        psf.hst_psf(options.filter, pixel_scale=options.pixel_scale * u.arcsec),
-        mosaic_psf(config, name, options.pixel_scale),
-        n_threads=n_threads,
-    )
+def measure_band(context, mosaic, name, method):
+    """Result of the forced photometry of a mosaic of one band, ``"package"`` or ``"yang2021"``."""
+    photometer = photometer_of(context, name, method)
+    if method == "yang2021":
+        # on the grid of the prior
+        return photometer.measure(mosaic, *_detections(context))
+    templates = photometry.SourceTemplates.read(context.path("templates.fits"))
+    return photometer.measure(mosaic, templates=templates)
 
 
-def _as_yang2021(context, mosaic, name):
-    """Forced photometry of one band by the steps of Yang et al. 2021, on the grid of the prior."""
-    _, labels = context.image("segm.fits", "segmentation")
-    return yang2021_photometer(context.config, name, context.n_threads).measure(
-        mosaic,
-        context.image("f160w.fits"),
-        labels.astype(np.int32),
-        QTable.read(context.path("detections.ecsv")),
-    )
+def _detections(context):
+    """The high-resolution image, the labels of its segments, and the detected sources."""
+    image, (_, labels) = context.image("f160w.fits"), context.image("segm.fits", "segmentation")
+    return image, labels.astype(np.int32), QTable.read(context.path("detections.ecsv"))
+
+
+def joined_photometry(tables):
+    """Join tables of results by band into one, with a row for each detection."""
+    columns = ["id", "sky", "flux", error_column("flux"), "flags"]
+    return photometry.join_bands({name: table[columns] for name, table in tables.items()})

@@ -11,7 +11,7 @@ from miricigale.filters import Filter
 from miricigale.pages import Missing
 from miricigale.workflow.page.labels import band_label
 from miricigale.workflow.page.numbers import bright_isolated
-from miricigale.workflow.truths import CUTOUTS
+from miricigale.workflow.truths import ALL, CUTOUTS, EFFECTS
 
 __all__ = ["perturbation_costs", "write_perturbed"]
 
@@ -20,36 +20,17 @@ N_DRAWS = 1000
 
 #: Name of what no effect has changed.
 NONE = "none"
-_LABELS = {
-    NONE: "none",
-    "psf": "PSF, another wavefront",
-    "psf_width": "PSF, width",
-    "flat": "flat field",
-    "gain": "gain",
-    "linearity": "linearity",
-    "zero_point": "zero point, MIRI",
-    "zero_point_existing": "zero point, existing bands",
-    "astrometry": "astrometry",
-    "stars": "stars: bursts and gas",
-    "dust": "dust: Draine & Li",
-    "torus": "another torus",
-    "point_agn": "AGN as a point",
-    "clumps": "made-up clumps",
-    "cutouts": "light of real galaxies",
-    "all": "all together",
-}
+_LABELS = {NONE: "none", **EFFECTS, ALL: "all together"}
 
 
 def _quantities(bands):
     """Columns of the table: name to the kind of the values, the band, and their statistic."""
     by_wave = sorted(bands, key=lambda name: Filter.from_name(name).pivot)
-    ends = dict.fromkeys((by_wave[0], by_wave[-1]))
-    return {
-        **{
-            f"{band} {name}": ("flux", band, statistic)
-            for band in ends
-            for name, statistic in (("offset", median), ("scatter", scatter))
-        },
+    found = {}
+    for band in (by_wave[0], by_wave[-1]):
+        found[f"{band} offset"] = ("flux", band, median)
+        found[f"{band} scatter"] = ("flux", band, scatter)
+    return found | {
         "photo-z sigma_MAD": ("redshift", None, scatter),
         "photo-z outliers": ("redshift", None, outlier_share),
         "fracAGN offset": ("frac_agn", None, median),
@@ -103,26 +84,29 @@ def perturbation_costs(truths, every, bands, *, seed):
     rows = []
     perturbed = [truth for truth in truths.values() if truth.perturbations]
     for base in dict.fromkeys(truth.base for truth in perturbed):
+        skies = {t.name.removeprefix(f"{base}+"): t.name for t in perturbed if t.base == base}
         for name, (kind, band, statistic) in _quantities(bands).items():
             ids, known = _errors(every[base], kind, band)
             plain = bootstrap(statistic, known, seed=seed, n_draws=N_DRAWS)
             rows.append((base, NONE, name, plain.n, plain.value, plain.error, np.nan, np.nan))
-            for truth in perturbed:
-                if truth.base == base:
-                    own_ids, own = _errors(every[truth.name], kind, band)
-                    _, first, second = np.intersect1d(ids, own_ids, return_indices=True)
-                    pairs = known[first], own[second]
-                    which = truth.name.removeprefix(f"{truth.base}+")
-                    rows.append((truth.base, which, name, *_cost(statistic, pairs, seed)))
+            for which, sky in skies.items():
+                own_ids, own = _errors(every[sky], kind, band)
+                _, first, second = np.intersect1d(ids, own_ids, return_indices=True)
+                cost = _cost(statistic, known[first], own[second], seed)
+                rows.append((base, which, name, *cost))
     names = ["truth", "perturbation", "quantity", "n", "value", "value_err", "change", "change_err"]
     return Table(rows=rows, names=names) if rows else Table(names=names)
 
 
-def _cost(statistic, pairs, seed):
+def _cost(statistic, known, own, seed):
     """Number of pairs, statistic of the second, its error, its change and the change's error."""
-    value = bootstrap(statistic, pairs[1], seed=seed, n_draws=N_DRAWS)
+    value = bootstrap(statistic, own, seed=seed, n_draws=N_DRAWS)
     change = bootstrap(
-        lambda known, own: statistic(own) - statistic(known), *pairs, seed=seed, n_draws=N_DRAWS
+        lambda first, second: statistic(second) - statistic(first),
+        known,
+        own,
+        seed=seed,
+        n_draws=N_DRAWS,
     )
     return value.n, value.value, value.error, change.value, change.error
 

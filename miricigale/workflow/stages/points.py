@@ -5,7 +5,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
-from miricigale import depth, photometry, psf, scene
+from miricigale import depth, photometry
 from miricigale.instrument import mosaic_wcs, tangent_offset
 from miricigale.utils.random import text_key
 from miricigale.utils.tables import error_column, match_sky
@@ -13,18 +13,20 @@ from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.exposures import (
     EXPOSURE_RESOURCES,
     IMAGES,
+    band_exposures,
     band_names,
     exposure_memory,
     exposure_plan,
-    study_exposures,
 )
 from miricigale.workflow.stages.images import (
+    DETECTION,
     expose_and_reduce,
     measured_mosaic,
     mosaic_psf,
+    prior_image,
     reducer_of,
 )
-from miricigale.workflow.stages.measure import yang2021_photometer
+from miricigale.workflow.stages.measure import photometer_of
 from miricigale.workflow.stages.sample import in_field
 
 __all__ = ["measure_point_sources", "point_catalog"]
@@ -49,21 +51,11 @@ def point_catalog(exposure, band_flux, prior, *, spacing, seed):
         tangent_offset(exposure.pointing, dx * u.arcsec, dy * u.arcsec, exposure.pa_aper)
         for dx, dy in zip(x, y, strict=True)
     ]
-    n = len(positions)
-    catalog = QTable(
-        {
-            "id": np.arange(1, n + 1),
-            "sky": SkyCoord(positions),
-            "redshift": np.full(n, np.nan),
-            "profile": np.full(n, "point"),
-            "half_light_radius": np.zeros(n) * u.arcsec,
-            "sersic_index": np.ones(n),
-            "axis_ratio": np.ones(n),
-            "position_angle": np.zeros(n) * u.deg,
-        }
-    )
-    catalog[exposure.filter] = np.full(n, band_flux.to_value(u.uJy)) * u.uJy
-    catalog[prior] = np.full(n, PRIOR_FLUX.value) * u.uJy
+    catalog = QTable({"id": np.arange(1, len(positions) + 1), "sky": SkyCoord(positions)})
+    catalog["redshift"], catalog["profile"] = np.nan, "point"
+    catalog["half_light_radius"], catalog["position_angle"] = 0.0 * u.arcsec, 0.0 * u.deg
+    catalog["sersic_index"] = catalog["axis_ratio"] = 1.0
+    catalog[exposure.filter], catalog[prior] = band_flux.to(u.uJy), PRIOR_FLUX
     return catalog
 
 
@@ -72,14 +64,7 @@ def point_catalog(exposure, band_flux, prior, *, spacing, seed):
     "point sources",
     version=7,
     needs=("kernels",),
-    sections=(
-        *IMAGES,
-        "highres",
-        "photometry.threshold",
-        "photometry.n_pixels",
-        "photometry.method",
-        "point_sources",
-    ),
+    sections=(*IMAGES, "highres", *DETECTION, "photometry.method", "point_sources"),
     resources=EXPOSURE_RESOURCES,
     units=lambda config: band_names(config) if config.point_sources.enabled else (),
     plan=exposure_plan,
@@ -90,7 +75,7 @@ def measure_point_sources(context, name):
     """Simulate, reduce and measure bright point sources in one band, as the study does."""
     config = context.config
     options, prior = config.point_sources, config.highres.filter
-    exposure = next(e for e in study_exposures(config).values() if e.filter == name)
+    exposure = band_exposures(config, name)[0]
     flux = options.signal_to_noise * depth.scaled_limit(name, exposure.exposure_time, n_sigma=1.0)
     # random streams other than those of the exposures of the study
     seed = (context.seed + text_key(f"points/{name}")) % 2**63
@@ -103,25 +88,9 @@ def measure_point_sources(context, name):
     _, scale = measured_mosaic(config)
     mosaic = reducer.mosaic([cal], mosaic_wcs([exposure], scale * u.arcsec))
     mosaic, _ = reducer.subtract_background(mosaic)
-    highres = scene.highres_image(
-        catalog,
-        filter=prior,
-        wcs=mosaic_wcs([exposure], config.highres.pixel_scale * u.arcsec),
-        psf=psf.hst_psf(prior, pixel_scale=config.highres.pixel_scale * u.arcsec),
-        depth=config.highres.depth * u.ABmag,
-        seed=seed,
-    )
-    segmentation, detected = photometry.detect_sources(
-        highres, threshold=config.photometry.threshold, n_pixels=config.photometry.n_pixels
-    )
-    if config.photometry.method == "yang2021":
-        photometer = yang2021_photometer(config, name, context.n_threads)
-    else:
-        photometer = photometry.ForcedPhotometer(
-            psf.MatchingKernel.read(context.path(f"kernel_{name}.fits")),
-            fit_background=True,
-            n_threads=context.n_threads,
-        )
+    wcs = mosaic_wcs([exposure], config.highres.pixel_scale * u.arcsec)
+    highres, segmentation, detected = prior_image(config, catalog, wcs, seed=seed)
+    photometer = photometer_of(context, name, config.photometry.method)
     result = photometer.measure(mosaic, highres, segmentation, detected)
     table = catalog["id", "sky"]
     table["flux_true"] = catalog[name]

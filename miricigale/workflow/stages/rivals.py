@@ -2,13 +2,14 @@
 
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, vstack
 
 from miricigale import photometry
 from miricigale.evaluation import Estimate, bootstrap, match_truth, recovery_metrics
 from miricigale.evaluation.estimates import median
 from miricigale.pages import number
 from miricigale.utils.tables import described_rows, error_column
+from miricigale.workflow.derived import NO_SOURCE, read_tables
 from miricigale.workflow.page.labels import band_label
 from miricigale.workflow.stage import stage
 from miricigale.workflow.stages.conditions import ConditionFlags
@@ -20,7 +21,7 @@ from miricigale.workflow.stages.exposures import (
 )
 from miricigale.workflow.stages.measure import measure_band
 from miricigale.workflow.stages.sample import SampleFlags, in_field
-from miricigale.workflow.truths import reference
+from miricigale.workflow.truths import itself, of_reference, reference
 
 __all__ = [
     "RIVALS",
@@ -46,29 +47,24 @@ SNR_RANGES = ((3.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20.0, 50.0), (50.0, np.inf
 SIZE_RANGES = ((0.0, 0.2), (0.2, 0.4), (0.4, 0.8), (0.8, np.inf))
 
 
-def _one_band(select):
-    """Units of a stage that a rival of a band reads, of the reference truth."""
-    return lambda config, unit: (select.format(truth=reference(config), band=unit),)
-
-
 @stage(
     "rivals",
     "rival photometry",
     version=2,
     needs={
-        "truth": _one_band("{truth}"),
-        "mosaics": _one_band("{truth}/{band}"),
+        "truth": of_reference,
+        "mosaics": lambda config, band: (f"{reference(config)}/{band}",),
         "highres": None,
-        "kernels": _one_band("{band}"),
+        "kernels": itself,
         "templates": None,
-        "matches": _one_band("{truth}"),
+        "matches": of_reference,
     },
     sections=(*KERNEL, "photometry.method", "photometry.match_radius"),
     resources=IMAGE_RESOURCES,
     units=lambda config: band_names(config) if config.photometry.rivals else (),
-    plan=lambda config, unit: {
+    plan=lambda config, band: {
         "truth": reference(config),
-        "exposures": exposure_plan(config, unit),
+        "exposures": exposure_plan(config, band),
     },
     kernels=("photometry",),
 )
@@ -84,9 +80,8 @@ def measure_rivals(context, name):
     measured = mosaic if other == "yang2021" else context.image(f"{of_truth}/mosaic_{name}.fits")
     forced = measure_band(context, measured, name, other).to_table()
     blind = photometry.source_extractor_photometry(mosaic)
-    inside = in_field(truth["sky"], [mosaic])
-    blind["inside"] = in_field(blind["sky"], [mosaic]) if len(blind) else np.zeros(0, bool)
-    table = rival_table(truth, matched, name, own=own, inside=inside)
+    n_blind = np.count_nonzero(in_field(blind["sky"], [mosaic])) if len(blind) else 0
+    table = rival_table(truth, matched, name, own=own, inside=in_field(truth["sky"], [mosaic]))
     for method, measured, column in (
         (other, forced, "flux"),
         ("source_extractor", blind, "flux_best"),
@@ -96,7 +91,7 @@ def measure_rivals(context, name):
         rows["flags"] = np.zeros(len(rows), int)
         found = match_truth(truth, rows, [name], radius=radius)
         table[method], table[error_column(method)] = found[name], found[error_column(name)]
-    table.meta.update(method=own, n_source_extractor=int(np.count_nonzero(blind["inside"])))
+    table.meta.update(method=own, n_source_extractor=int(n_blind))
     context.save_table(f"rivals/{name}.ecsv", table)
 
 
@@ -116,9 +111,8 @@ def rival_table(truth, matched, name, *, own, inside):
     shapes = np.where(index < 2, "n < 2", "n >= 2")
     table["shape"] = np.where(np.asarray(truth["profile"]) == "point", "point", shapes)
     table["half_light_radius"] = truth["half_light_radius"].to(u.arcsec)
-    near = (np.asarray(matched[f"{name}_condition"]) & ConditionFlags.CROWDED) > 0
-    edge = (np.asarray(matched[f"{name}_condition"]) & ConditionFlags.EDGE) > 0
-    table["crowded"], table["edge"] = near, edge
+    for column, flag in (("crowded", ConditionFlags.CROWDED), ("edge", ConditionFlags.EDGE)):
+        table[column] = (np.asarray(matched[f"{name}_condition"]) & flag) > 0
     modeled = (np.asarray(matched["selection"]) & SampleFlags.NO_MODEL) == 0
     table["field"] = inside & modeled
     table[own], table[error_column(own)] = matched[name], formal
@@ -128,8 +122,7 @@ def rival_table(truth, matched, name, *, own, inside):
 def read_rivals(context):
     """Tables of the stage by band; none where it was not asked for."""
     config = context.config
-    names = band_names(config) if config.photometry.rivals else ()
-    return {name: QTable.read(context.path(f"rivals/{name}.ecsv")) for name in names}
+    return read_tables(context, "rivals", band_names(config) if config.photometry.rivals else ())
 
 
 def _groups(table):
@@ -168,27 +161,20 @@ def rival_numbers(tables):
         which ``n`` have a flux; ``median`` and ``scatter`` of measured over true flux minus one, and of
         the differences in units of the error (``pull_median``, ``pull_scatter``).
     """
-    values = {}
-    for name, table in tables.items():
-        true = table["flux_true"].value
-        for kind, group, rows in _groups(table):
-            for method in RIVALS:
-                flux = table[method].value[rows]
-                error = table[error_column(method)].value[rows]
-                for key in (name, "all"):
-                    parts = values.setdefault((key, kind, group, method), [])
-                    parts.append((true[rows], flux, error))
+    every = vstack(list(tables.values()), metadata_conflicts="silent")
     found = []
-    for key, parts in values.items():
-        true, flux, error = (np.concatenate(part) for part in zip(*parts, strict=True))
-        ratio = recovery_metrics(true, flux, relative=True)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            pulls = recovery_metrics(np.zeros(true.size), (flux - true) / error)
-        found.append(
-            (*key, true.size, ratio.n, ratio.median, ratio.median_err, ratio.sigma_mad,
-             pulls.median, pulls.sigma_mad)
-        )  # fmt: skip
-    found.sort(key=lambda row: row[0] == "all")
+    for band, table in (*tables.items(), ("all", every)):
+        for kind, group, rows in _groups(table):
+            true = table["flux_true"].value[rows]
+            for method in RIVALS:
+                flux, error = (table[name].value[rows] for name in (method, error_column(method)))
+                ratio = recovery_metrics(true, flux, relative=True)
+                with np.errstate(invalid="ignore", divide="ignore"):
+                    pulls = recovery_metrics(np.zeros(true.size), (flux - true) / error)
+                sizes = true.size, ratio.n
+                ratios = ratio.median, ratio.median_err, ratio.sigma_mad
+                pair = pulls.median, pulls.sigma_mad
+                found.append((band, kind, group, method, *sizes, *ratios, *pair))
     texts = {
         "band": "Band, or all together",
         "kind": "By what sources are grouped",
@@ -207,19 +193,19 @@ def rival_numbers(tables):
 
 def rival_counts(table):
     """
-    What Source Extractor finds of a band.
+    What Source Extractor finds of a band, as `~miricigale.evaluation.Estimate` objects.
 
-    ``detected`` sources in the field, ``matched`` ones of the catalog, and ``missed`` of the
-    ``template`` sources of the field that the template fit has measured.
+    ``detected`` sources in the field, ``matched`` ones of the catalog, and the share ``missed`` of the sources
+    of the field that the template fit has measured. Intervals of the counts are Poisson's.
     """
     field = np.asarray(table["field"])
     forced = field & np.isfinite(table[table.meta["method"]].value)
     blind = np.isfinite(table["source_extractor"].value)
+    matched, missed = (int(np.count_nonzero(of)) for of in (field & blind, forced & ~blind))
+    counts = {"detected": int(table.meta["n_source_extractor"]), "matched": matched}
     return {
-        "detected": int(table.meta["n_source_extractor"]),
-        "matched": int(np.count_nonzero(field & blind)),
-        "template": int(np.count_nonzero(forced)),
-        "missed": int(np.count_nonzero(forced & ~blind)),
+        **{n: Estimate(float(k), k - np.sqrt(k), k + np.sqrt(k), k) for n, k in counts.items()},
+        "missed": Estimate.of_fraction(missed, np.count_nonzero(forced)),
     }
 
 
@@ -248,23 +234,13 @@ def source_extractor_numbers(tables, seed):
     -------
     numbers : dict of str to `~miricigale.evaluation.Estimate`
         By key of `~miricigale.evaluation.PUBLISHED`, for ``StudyResults.extra``; empty without
-        the band. Intervals of the counts are Poisson's.
+        the band.
     """
     if SE_BAND not in tables:
         return {}
     table = tables[SE_BAND]
-    counts = rival_counts(table)
-
-    def count(name):
-        n = counts[name]
-        return Estimate(float(n), n - np.sqrt(n), n + np.sqrt(n), n)
-
-    return {
-        "source_extractor.detected": count("detected"),
-        "source_extractor.matched": count("matched"),
-        "source_extractor.missed": Estimate.of_fraction(counts["missed"], counts["template"]),
-        "source_extractor.offset": _se_offset(table, seed),
-    }
+    numbers = rival_counts(table) | {"offset": _se_offset(table, seed)}
+    return {f"source_extractor.{name}": number for name, number in numbers.items()}
 
 
 def write_rivals(context, report, tables):
@@ -281,23 +257,21 @@ def write_rivals(context, report, tables):
         "settings of the paper (the brighter of AUTO/0.94 and the 1.86 arcsec aperture/0.8). Errors are "
         "the formal ones of each.",
     )
-    none = "no such source"
-    cells = {}
+    # by group of each band: what is shown for each method
+    shown = {}
     for row in numbers:
-        group = (row["band"], row["kind"], row["group"])
-        cells.setdefault(group, [row["n_group"]])
-        told = number(row["median"], "+.1f", none, scale=100)
+        cells = shown.setdefault((row["band"], row["kind"], row["group"]), [row["n_group"]])
+        text = number(row["median"], "+.1f", NO_SOURCE, scale=100)
         if np.isfinite(row["median"]):
-            scatter = number(row["scatter"], ".1f", none, scale=100)
-            told = f"{told} ± {scatter} % ({row['n']})"
-        cells[group].append(told)
+            text += f" ± {100 * row['scatter']:.1f} % ({row['n']})"
+        cells.append(text)
         if row["kind"] == "all":
-            cells[group].append(number(row["pull_scatter"], ".1f", none))
+            cells.append(number(row["pull_scatter"], ".1f", NO_SOURCE))
     header = [RIVALS[method] for method in RIVALS]
     report.table(
         [
-            (kind, group, *found)
-            for (band, kind, group), found in cells.items()
+            (kind, group, *cells)
+            for (band, kind, group), cells in shown.items()
             if band == "all" and kind != "all"
         ],
         header=("by", "sources", "in the group", *header),
@@ -308,8 +282,8 @@ def write_rivals(context, report, tables):
     )
     report.table(
         [
-            (band_label(band), *found)
-            for (band, kind, _), found in cells.items()
+            (band_label(band), *cells)
+            for (band, kind, _), cells in shown.items()
             if kind == "all" and band != "all"
         ],
         header=("band", "above 5 sigma", *(x for h in header for x in (h, "scatter of pulls"))),
@@ -318,16 +292,13 @@ def write_rivals(context, report, tables):
     rows = []
     for name, table in tables.items():
         counts, offset = rival_counts(table), _se_offset(table, context.seed)
-        share = counts["missed"] / counts["template"] if counts["template"] else np.nan
         rows.append(
             (
                 band_label(name),
-                counts["detected"],
-                counts["matched"],
-                counts["template"],
-                number(share, ".0f", none, scale=100),
-                number(offset.value, "+.3f", none),
-                number(offset.error, ".3f", none),
+                *(counts[key].n for key in ("detected", "matched", "missed")),
+                number(counts["missed"].value, ".0f", NO_SOURCE, scale=100),
+                number(offset.value, "+.3f", NO_SOURCE),
+                number(offset.error, ".3f", NO_SOURCE),
             )
         )
     report.table(

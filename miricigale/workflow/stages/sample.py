@@ -19,6 +19,7 @@ __all__ = [
     "matched_errors",
     "mean_coverage",
     "typical_source",
+    "values_at",
 ]
 
 
@@ -39,16 +40,22 @@ class SampleFlags(Flags):
     OUTSIDE_GRID = 32
 
 
+def values_at(sky, wcs, plane, *, off=0):
+    """Values of a plane with a WCS at the pixels of positions, shape (n,); ``off`` outside of it."""
+    x, y = (np.asarray(v) for v in wcs.world_to_pixel(sky))
+    near = np.isfinite(x) & np.isfinite(y)
+    x, y = (np.round(np.where(near, v, -1)).astype(int) for v in (x, y))
+    on = (x >= 0) & (x < plane.shape[1]) & (y >= 0) & (y < plane.shape[0])
+    found = np.full(len(sky), off, plane.dtype)
+    found[on] = plane[y[on], x[on]]
+    return found
+
+
 def in_field(sky, images):
     """Whether positions, shape (n,), fall on a usable pixel of every image (with WCS and mask)."""
     inside = np.ones(len(sky), bool)
     for image in images:
-        x, y = (np.round(v).astype(int) for v in image.wcs.world_to_pixel(sky))
-        ny, nx = image.shape
-        on = (x >= 0) & (x < nx) & (y >= 0) & (y < ny)
-        usable = ~np.asarray(image.mask, bool)
-        inside &= on
-        inside[on] &= usable[y[on], x[on]]
+        inside &= values_at(sky, image.wcs, ~np.asarray(image.mask, bool), off=False)
     return inside
 
 
@@ -61,29 +68,21 @@ def mean_coverage(sky, image, n_images):
     """
     pixel = float(proj_plane_pixel_scales(image.wcs)[0] * 3600)
     mean = uniform_filter(n_images.astype(np.float32), max(1, round(1.0 / pixel)), mode="constant")
-    x, y = (np.round(v).astype(int) for v in image.wcs.world_to_pixel(sky))
-    on = (x >= 0) & (x < mean.shape[1]) & (y >= 0) & (y < mean.shape[0])
-    found = np.zeros(len(sky))
-    found[on] = mean[y[on], x[on]]
-    return found
+    return values_at(sky, image.wcs, mean).astype(float)
 
 
-def matched_errors(matched, inside, bands, *, statistic, bin_size, noise=None):
+def matched_errors(matched, inside, bands, *, noise=None, **options):
     """
     Error functions (`~miricigale.photometry.ErrorModel`) of bands, of matched sources.
 
     ``matched`` is of `~miricigale.evaluation.match_truth`; ``inside`` says which rows are in the field,
-    and ``noise`` is that of `~miricigale.photometry.ErrorModel.from_tables` for all rows.
+    and ``noise`` is that of `~miricigale.photometry.ErrorModel.from_tables` for all rows, which has the
+    ``options`` ``statistic`` and ``bin_size`` too.
     """
     truth = QTable({"id": matched["id"], **{name: matched[f"{name}_true"] for name in bands}})
     own = None if noise is None else {name: values[inside] for name, values in noise.items()}
     return ErrorModel.from_tables(
-        truth[inside],
-        matched[inside],
-        filters=bands,
-        statistic=statistic,
-        bin_size=bin_size,
-        noise=own,
+        truth[inside], matched[inside], filters=bands, noise=own, **options
     )
 
 
@@ -109,7 +108,7 @@ def add_selection(matched, truth, bands, *, inside, min_detected, redshifts):
 
     ``matched`` is of `~miricigale.evaluation.match_truth` with errors from the error function,
     ``truth`` has the same sources row by row, with ``star``; ``inside`` is that of `in_field`, and
-    ``redshifts`` the range of the grid of the fit.
+    ``redshifts`` the nodes of the grid of the fit.
     """
     flags = np.zeros(len(matched), int)
     matched["n_detected"] = detected_bands(matched, bands)
@@ -120,7 +119,7 @@ def add_selection(matched, truth, bands, *, inside, min_detected, redshifts):
     flags[~matched["matched"]] |= SampleFlags.NOT_MATCHED
     flags[matched["n_detected"] < min_detected] |= SampleFlags.FEW_BANDS
     redshift = np.asarray(truth["redshift"], float)
-    flags[~((redshift >= redshifts[0]) & (redshift <= redshifts[1]))] |= SampleFlags.OUTSIDE_GRID
+    flags[~((redshift >= redshifts[0]) & (redshift <= redshifts[-1]))] |= SampleFlags.OUTSIDE_GRID
     matched["selection"] = flags
     matched["selection"].info.description = SampleFlags.describe()
 

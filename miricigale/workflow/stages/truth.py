@@ -22,6 +22,8 @@ from miricigale.workflow.truths import CATALOG, CUTOUTS, FIELD, study_truths, tr
 
 __all__ = ["add_agn", "add_field_agn", "catalog_fractions", "galaxy_parameters", "make_truth"]
 
+#: What the models of the galaxies depend on beside their fits.
+MODELS = ("sed.alpha", "sed.alpha_draw", "sed.infrared")
 GALAXY_PARAMETERS = ("tau", "age", "ebv", "alpha", "metallicity")
 #: Inclinations (deg) of AGN seen through the torus, after Yang et al. 2021, and of the others.
 EDGE_ON, FACE_ON = (60.0, 70.0, 80.0, 90.0), (0.0, 10.0, 20.0, 30.0, 40.0)
@@ -75,24 +77,23 @@ def add_agn(table, frac_agn, seed):
     source has its own random stream. See table 3
     of Yang et al. 2021, ApJ 908, 144.
     """
-    drawn = {
-        name: np.empty(len(table))
-        for name in (
-            "tau97", "p", "q", "inclination", "ebv_polar", "temperature_polar", "emissivity_polar"
-        )
-    }  # fmt: skip
-    for row, key in enumerate(table["id"]):
-        rng = stream(seed, "truth", str(key))
-        drawn["tau97"][row] = rng.choice([3.0, 5.0, 7.0, 9.0, 11.0])
-        drawn["p"][row] = rng.choice([0.0, 0.5, 1.0, 1.5])
-        drawn["q"][row] = rng.choice([0.0, 0.5, 1.0, 1.5])
-        drawn["inclination"][row] = rng.choice(EDGE_ON)
-        drawn["ebv_polar"][row] = rng.uniform(0, 0.3)
-        drawn["temperature_polar"][row] = rng.uniform(100, 300)
-        drawn["emissivity_polar"][row] = rng.uniform(1, 2)
+    drawn = [_torus(stream(seed, "truth", str(key))) for key in table["id"]]
     table["frac_agn"] = np.broadcast_to(np.asarray(frac_agn, float), len(table)).copy()
-    for name, values in drawn.items():
-        table[name] = values
+    for name in drawn[0]:
+        table[name] = np.array([torus[name] for torus in drawn])
+
+
+def _torus(rng):
+    """Parameters of a torus."""
+    return {
+        "tau97": rng.choice([3.0, 5.0, 7.0, 9.0, 11.0]),
+        "p": rng.choice([0.0, 0.5, 1.0, 1.5]),
+        "q": rng.choice([0.0, 0.5, 1.0, 1.5]),
+        "inclination": rng.choice(EDGE_ON),
+        "ebv_polar": rng.uniform(0, 0.3),
+        "temperature_polar": rng.uniform(100, 300),
+        "emissivity_polar": rng.uniform(1, 2),
+    }
 
 
 def catalog_fractions(catalog):
@@ -101,11 +102,11 @@ def catalog_fractions(catalog):
         msg = "[sed] frac_agn = 'catalog' needs a column frac_agn in the catalog"
         raise ConfigError(msg)
     values = np.asarray(catalog["frac_agn"], float)
-    bad = ~((values >= 0) & (values <= 0.99))
-    if np.any(bad):
+    bad = values[~((values >= 0) & (values <= 0.99))]
+    if len(bad):
         msg = (
-            f"the column frac_agn of the catalog must be between 0 and 0.99; {np.count_nonzero(bad)} of "
-            f"{len(values)} are not, such as {values[bad][0]:g}"
+            f"the column frac_agn of the catalog must be between 0 and 0.99; {len(bad)} of "
+            f"{len(values)} are not, such as {bad[0]:g}"
         )
         raise ConfigError(msg)
     return values
@@ -150,14 +151,7 @@ def _truth_plan(config, unit):
     "model fluxes",
     version=3,
     needs=("catalog", "seds"),
-    sections=(
-        "sed.alpha",
-        "sed.alpha_draw",
-        "sed.infrared",
-        "exposures.filters",
-        "fit.bands",
-        "highres.filter",
-    ),
+    sections=(*MODELS, "exposures.filters", "fit.bands", "highres.filter"),
     resources=sed_resources,
     units=truth_names,
     plan=_truth_plan,
@@ -170,9 +164,8 @@ def make_truth(context, name):
     catalog = QTable.read(context.path("catalog.ecsv"))
     best = fitting.FitResults.read(context.path("input_seds.fits")).to_table()
     parameters = galaxy_parameters(config, catalog, best, seed=context.seed)
-    bands = list(
-        dict.fromkeys([*config.fit.bands, *config.exposures.filters, config.highres.filter])
-    )
+    prior = config.highres.filter
+    bands = list(dict.fromkeys([*config.fit.bands, *config.exposures.filters, prior]))
     model = sed.SEDModel.yang2021(agn=frac_agn != 0)
     if frac_agn == FIELD:
         add_field_agn(parameters, model, bands[0], context.seed)
@@ -182,16 +175,14 @@ def make_truth(context, name):
         add_agn(parameters, frac_agn, context.seed)
     other = perturbed_model(effects, agn=model.has_agn)
     if other is not None:
-        prior = config.highres.filter
-        parameters = perturbed_parameters(
-            effects, parameters, (model, other), prior, seed=context.seed
-        )
+        models = model, other
+        parameters = perturbed_parameters(effects, parameters, models, prior, seed=context.seed)
         model = other
     light = model.fluxes(parameters, bands)
-    lacking = (light["flags"] & int(sed.ModelFlags.NOT_IN_LIBRARY)) > 0
-    if np.any(lacking):
+    lacking = np.count_nonzero(light["flags"] & int(sed.ModelFlags.NOT_IN_LIBRARY))
+    if lacking:
         msg = (
-            f"{np.count_nonzero(lacking)} of {len(light)} sources have parameters that the "
+            f"{lacking} of {len(light)} sources have parameters that the "
             f"registered libraries lack ({'; '.join(model.meta['libraries'])}): register whole "
             "libraries with 'miricigale data add', or remove these"
         )
@@ -204,14 +195,9 @@ def make_truth(context, name):
             light[band][star] = stars[band]
     # what a column frac_agn of the catalog says is of the truth of that name only
     own = {"frac_agn", *light.colnames, *parameters.colnames}
-    truth = hstack(
-        [
-            parameters,
-            catalog[[c for c in catalog.colnames if c not in own and "." not in c]],
-            light[[c for c in light.colnames if c not in parameters.colnames]],
-        ],
-        metadata_conflicts="silent",
-    )
+    known = catalog[[c for c in catalog.colnames if c not in own and "." not in c]]
+    light = light[[c for c in light.colnames if c not in parameters.colnames]]
+    truth = hstack([parameters, known, light], metadata_conflicts="silent")
     if "point_agn" in effects:
         for column, share in point_columns(model, parameters, config.exposures.filters).items():
             # the light of a star is not that of the model

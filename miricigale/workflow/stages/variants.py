@@ -1,20 +1,17 @@
 """Variant images of the first sky: what residual noise, gradient and background do to the limits."""
 
-import dataclasses
-import types
-
 import astropy.units as u
 import numpy as np
 from astropy.stats import biweight_scale
 from astropy.table import QTable
 
-from miricigale import photometry, psf, scene
-from miricigale.evaluation import fraction_interval, match_truth
+from miricigale import psf, scene
+from miricigale.evaluation import Estimate, match_truth
 from miricigale.filters import Filter
-from miricigale.pages import number
 from miricigale.photometry.error_curves import limiting_flux, measured_curve
 from miricigale.utils.random import stream
 from miricigale.utils.tables import described_rows, error_column
+from miricigale.workflow.derived import Cell, cells_of, changed_config, read_tables
 from miricigale.workflow.page.band_figures import variant_figure
 from miricigale.workflow.page.labels import band_label
 from miricigale.workflow.stage import stage
@@ -32,9 +29,9 @@ from miricigale.workflow.stages.images import (
     measured_mosaic,
     mosaics_of,
 )
-from miricigale.workflow.stages.measure import measure_band
+from miricigale.workflow.stages.measure import joined_photometry, measure_band
 from miricigale.workflow.stages.sample import SampleFlags
-from miricigale.workflow.truths import reference, variant_changes
+from miricigale.workflow.truths import itself, of_reference, reference, variant_changes
 
 __all__ = [
     "HEADER",
@@ -54,23 +51,27 @@ _LABELS = {
     "plane": ("plane taken off before the mesh", "background by the mesh alone"),
 }
 STUDY, RATES = "study", "rates"
-HEADER = (
-    "band", "images", "5 sigma", "minus calculator", "change (mag)", "faint scatter (µJy)", "change",
-    "detected", "complete",
-)  # fmt: skip
 _OUT = SampleFlags.OUTSIDE_FIELD | SampleFlags.STAR | SampleFlags.NO_MODEL
+_NO_LIMIT = "the error function reaches 5 sigma nowhere"
+_SAME = "compared with itself, or no limit"
+#: Numbers of the page.
+CELLS = (
+    Cell("5 sigma", "limit", ".2f", why=_NO_LIMIT),
+    Cell("minus calculator", "offset", "+.2f", why=_NO_LIMIT),
+    Cell("change (mag)", "limit_change", "+.2f", error=True, why=_SAME),
+    Cell("faint scatter (µJy)", "scatter", ".3g"),
+    Cell("change", "scatter_change", "+.1f", 100, " %", error=True, why=_SAME),
+    Cell("detected", "detected", "d"),
+    Cell("complete", "completeness", ".0f", 100, " %", why="no such galaxy"),
+)
+HEADER = ("band", "images", *(cell.header for cell in CELLS))
 
 
 @stage(
     "variants",
     "variant images",
     version=3,
-    needs={
-        "truth": lambda config, _: (reference(config),),
-        "highres": None,
-        "kernels": lambda config, unit: (unit,),
-        "templates": None,
-    },
+    needs={"truth": of_reference, "highres": None, "kernels": itself, "templates": None},
     sections=(*IMAGES, "highres", "photometry.method", "photometry.match_radius"),
     resources=EXPOSURE_RESOURCES,
     units=lambda config: band_names(config) if config.variants.images else (),
@@ -87,64 +88,27 @@ def measure_variants(context, band):
     truth = QTable.read(context.path(f"{plan['truth']}/truth.ecsv"))
     exposures = band_exposures(config, band)
     # the sources on the sky are the same in all of them
-    lights = [
-        scene.Scene(
-            truth, filter=band, wcs=e.wcs, psf=psf.miri_psf(band), n_threads=context.n_threads
-        ).render()
-        for e in exposures
-    ]
+    options = {"filter": band, "psf": psf.miri_psf(band), "n_threads": context.n_threads}
+    lights = [scene.Scene(truth, wcs=e.wcs, **options).render() for e in exposures]
+    suffix, _ = measured_mosaic(config)
     for name, changes in plan["changes"].items():
-        own = changed_config(config, changes)
+        # all of them by rates, whatever the study's are
+        changes = {**changes, "exposures": {"kind": "rates"}}
+        own = changed_config(config, (*IMAGES, "highres"), changes)
         imager, images = imager_of(own), []
         for exposure, light in zip(exposures, lights, strict=True):
             image = light.copy()
             image.data += background_of(own, exposure).image(exposure.wcs, exposure.shape)
-            images.append(
-                expose_image(
-                    own, imager, image, exposure, seed=context.seed, n_threads=context.n_threads
-                )[1]
+            _, cal = expose_image(
+                own, imager, image, exposure, seed=context.seed, n_threads=context.n_threads
             )
-        suffix, _ = measured_mosaic(config)
+            images.append(cal)
         mosaic = next(one for label, one, _ in mosaics_of(own, images) if label == suffix)
         result = measure_band(context, mosaic, band, config.photometry.method).to_table()
-        columns = ["id", "sky", "flux", error_column("flux"), "flags"]
-        measured = photometry.join_bands({band: result[columns]})
         radius = config.photometry.match_radius * u.arcsec
-        matched = match_truth(truth, measured, [band], radius=radius)
+        matched = match_truth(truth, joined_photometry({band: result}), [band], radius=radius)
         kept = ["id", f"{band}_true", band, error_column(band), f"{band}_flags"]
         context.save_table(f"variants/{name}/{band}.ecsv", matched[kept])
-
-
-def changed_config(config, changes):
-    """The sections of a configuration that images are made of, with other values, for rates."""
-    changes = {**changes, "exposures": {"kind": "rates"}}
-    sections = {name: getattr(config, name) for name in (*IMAGES, "highres")}
-    for name, values in changes.items():
-        sections[name] = dataclasses.replace(sections[name], **values)
-    return types.SimpleNamespace(**sections)
-
-
-def read_variants(context, changes):
-    """Tables of the stage by name and band."""
-    return {
-        name: {
-            band: QTable.read(context.path(f"variants/{name}/{band}.ecsv"))
-            for band in band_names(context.config)
-        }
-        for name in changes
-    }
-
-
-def _compared_with(name, tables):
-    """The images whose change a variant is: those of the study, by rates too."""
-    return RATES if RATES in tables and name not in (STUDY, RATES) else STUDY
-
-
-def _measures(band, true, seen, faint, bin_size, statistic):
-    """Curve of the errors; the limit in AB magnitudes, and the scatter of faint sources."""
-    curve = measured_curve(band, true, seen, bin_size, statistic)
-    limit = float((limiting_flux(curve, 5.0) * u.uJy).to_value(u.ABmag))
-    return curve, np.array([limit, biweight_scale((seen - true)[faint]) if faint.any() else np.nan])
 
 
 def variant_numbers(matched, tables, calculator, *, seed, statistic="mad", bin_size=30):
@@ -186,39 +150,29 @@ def variant_numbers(matched, tables, calculator, *, seed, statistic="mad", bin_s
         bright = field & (true > 10 ** (-0.4 * (limit - 23.9)))
         faint = good & ~bright
         rng = stream(seed, "variants", band)
-        draws = [rng.choice(np.flatnonzero(good), size=good.sum()) for _ in range(N_DRAWS)]
-        values, drawn = {}, {}
+        # the whole sample, then its draws
+        samples = [np.flatnonzero(good)]
+        samples += [rng.choice(samples[0], size=good.sum()) for _ in range(N_DRAWS)]
+        found = {}
         for name, flux in fluxes.items():
-            # the whole sample, then its draws
-            found = [
-                _measures(band, true[k], flux[k], faint[k], bin_size, statistic)
-                for k in (np.flatnonzero(good), *draws)
-            ]
-            (curve, values[name]), drawn[name] = found[0], np.array([one for _, one in found[1:]])
-            with np.errstate(invalid="ignore"):
-                seen = flux > 5 * curve.sigma(flux)
-            other = _compared_with(name, tables)
-            change, spread = values[name] - values[other], drawn[name] - drawn[other]
+            curves = [measured_curve(band, true[k], flux[k], bin_size, statistic) for k in samples]
+            off = ((flux - true)[k][faint[k]] for k in samples)
+            found[name] = np.array([_measures(*pair) for pair in zip(curves, off, strict=True)])
+            # the images of the study, by rates too
+            other = RATES if RATES in tables and name not in (STUDY, RATES) else STUDY
             with np.errstate(divide="ignore", invalid="ignore"):
-                change[1] /= values[other][1]
-                spread[:, 1] /= drawn[other][:, 1]
+                change = found[name] - found[other]
+                change[:, 1] /= found[other][:, 1]
+                seen = flux > 5 * curves[0].sigma(flux)
             if name == other:
-                change, spread = np.full(2, np.nan), np.full((1, 2), np.nan)
-            share, low, high = fraction_interval(
-                int(np.count_nonzero(seen & bright)), int(bright.sum())
-            )
-            numbers = [
-                (
-                    values[name][k],
-                    _half_width(drawn[name][:, k]),
-                    change[k],
-                    _half_width(spread[:, k]),
-                )
-                for k in range(2)
-            ]
-            count = int(np.count_nonzero(seen & field))
-            sizes = len(draws[0]), count, share, (high - low) / 2
-            rows.append((band, name, sizes[0], limit, *numbers[0], *numbers[1], *sizes[1:]))
+                change[:] = np.nan
+            numbers = []
+            for k in range(2):
+                numbers += [found[name][0, k], _half_width(found[name][1:, k])]
+                numbers += [change[0, k], _half_width(change[1:, k])]
+            complete = Estimate.of_fraction(np.count_nonzero(seen & bright), bright.sum())
+            numbers += [int(np.count_nonzero(seen & field)), complete.value, complete.error]
+            rows.append((band, name, len(samples[0]), limit, *numbers))
     texts = {
         "band": "Band",
         "images": "Images: of the study, or with one thing otherwise",
@@ -237,6 +191,12 @@ def variant_numbers(matched, tables, calculator, *, seed, statistic="mad", bin_s
         "completeness_err": "Half of its 68 % interval",
     }
     return described_rows(rows, texts)
+
+
+def _measures(curve, faint):
+    """The 5-sigma limit of a curve of errors in AB magnitudes, and the scatter of faint sources."""
+    limit = float((limiting_flux(curve, 5.0) * u.uJy).to_value(u.ABmag))
+    return limit, biweight_scale(faint) if faint.size else np.nan
 
 
 def _half_width(draws):
@@ -262,21 +222,10 @@ def variant_rows(table, changes):
 
     ``table`` is of `variant_numbers`, ``changes`` of `~miricigale.workflow.truths.variant_changes`.
     """
-    none, same = "the error function reaches 5 sigma nowhere", "compared with itself"
-    return [
-        (
-            band_label(row["band"]),
-            variant_label(row["images"], changes),
-            number(row["limit"], ".2f", none),
-            number(row["limit"] - row["calculator"], "+.2f", none),
-            _change(row, "limit_change", 1, ".2f", same if row["images"] == STUDY else none),
-            f"{row['scatter']:.3g}",
-            _change(row, "scatter_change", 100, ".1f", same, " %"),
-            row["detected"],
-            number(row["completeness"], "{:.0f} %", "no such galaxy", scale=100),
-        )
-        for row in table
-    ]
+    table = table.copy()
+    table["offset"] = table["limit"] - table["calculator"]
+    names = ((band_label(row["band"]), variant_label(row["images"], changes)) for row in table)
+    return [(*name, *cells_of(row, CELLS)) for name, row in zip(names, table, strict=True)]
 
 
 def write_variants(context, report, matched, limits):
@@ -288,7 +237,8 @@ def write_variants(context, report, matched, limits):
     config, changes = context.config, variant_changes(context.config)
     if not changes:
         return None
-    tables = read_variants(context, changes)
+    bands = band_names(config)
+    tables = {name: read_tables(context, f"variants/{name}", bands) for name in changes}
     options = {"statistic": config.errors.statistic, "bin_size": config.errors.bin_size}
     table = variant_numbers(matched, tables, limits, seed=context.seed, **options)
     context.save_table("report/variants.ecsv", table)
@@ -313,43 +263,26 @@ def write_variants(context, report, matched, limits):
         + (" by rates" if RATES in changes else ""),
         text=2,
     )
-    told = _gradient_told(table, changes)
-    if told:
-        report.text(told)
+    if "gradient" in changes:
+        _write_gradient(report, table, changes)
     return table
 
 
-def _change(row, name, scale, form, why, unit=""):
-    if not np.isfinite(row[name]):
-        return number(np.nan, form, why)
-    return f"{scale * row[name]:+{form}} ± {scale * row[f'{name}_err']:{form}}{unit}"
-
-
-def _gradient_told(table, changes):
-    """What the gradient does in the longest band, in words; empty if that was not tried."""
-    if "gradient" not in changes:
-        return ""
+def _write_gradient(report, table, changes):
+    """What the gradient does in the longest band, in words, if that is known."""
     band = max(set(table["band"]), key=lambda name: Filter.from_name(name).pivot)
-    told = []
-    for name in ("gradient", "plane"):
-        row = _row(table, band, name) if name in changes else None
-        if row is not None and np.isfinite(row["limit_change"]):
-            limit = _change(row, "limit_change", 1, ".2f", "no limit", " mag")
-            scatter = _change(row, "scatter_change", 100, ".1f", "no faint source", " %")
-            label = variant_label(name, changes)
-            told.append(
-                f"{label} the limit changes by {limit}, the scatter of faint fluxes by {scatter}"
-            )
-    if not told:
-        return ""
-    return (
-        f"In {band_label(band)}: {'; '.join(told)}. Yang et al. 2021 hold the gradient of 5 % per arcmin "
-        "responsible for a limit in F2100W that is 0.95 mag shallower than the calculator's."
-    )
-
-
-def _row(table, band, name):
-    return table[(table["band"] == band) & (table["images"] == name)][0]
+    limit, scatter = CELLS[2], CELLS[4]
+    effects = [
+        f"{variant_label(row['images'], changes)} the limit changes by {limit.text(row)} mag, the scatter "
+        f"of faint fluxes by {scatter.text(row)}"
+        for row in table[table["band"] == band]
+        if row["images"] in ("gradient", "plane") and np.isfinite(row["limit_change"])
+    ]
+    if effects:
+        report.text(
+            f"In {band_label(band)}: {'; '.join(effects)}. Yang et al. 2021 hold the gradient of 5 % per "
+            "arcmin responsible for a limit in F2100W that is 0.95 mag shallower than the calculator's."
+        )
 
 
 def add_reasons(reasons, table, config):
@@ -358,5 +291,5 @@ def add_reasons(reasons, table, config):
     for row in () if table is None else table:
         key = f"limit.{row['band'].removeprefix('miri.')}"
         if key in reasons and row["images"] in _LABELS and np.isfinite(row["limit_change"]):
-            told = f"{variant_label(row['images'], changes)} {row['limit_change']:+.2f} mag"
-            reasons[key] = "; ".join(part for part in (reasons[key], told) if part)
+            cost = f"{variant_label(row['images'], changes)} {row['limit_change']:+.2f} mag"
+            reasons[key] = "; ".join(part for part in (reasons[key], cost) if part)

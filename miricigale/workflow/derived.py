@@ -1,0 +1,102 @@
+"""
+Derived runs: the same study with one thing otherwise, and the comparison of the two.
+
+The stages ``variants``, ``rivals`` and ``experiments`` and the perturbed truths each declare what they change
+and which numbers are compared; what they share is here.
+"""
+
+import dataclasses
+import types
+
+import numpy as np
+from astropy.table import QTable
+
+from miricigale.pages import Missing, number
+
+__all__ = ["Cell", "cells_of", "changed_config", "read_tables", "rows_of"]
+
+#: Why a number of a comparison is missing.
+NO_SOURCE = "no such source"
+
+
+def changed_config(config, sections, changes):
+    """
+    Return sections of a configuration with other values.
+
+    Parameters
+    ----------
+    config : `~miricigale.workflow.StudyConfig`
+        The configuration, or the part of it that a stage declares.
+    sections : iterable of str
+        Names of the sections that are needed.
+    changes : dict of str to dict
+        Values by section and key.
+
+    Returns
+    -------
+    changed : `~types.SimpleNamespace`
+        With the sections as attributes.
+    """
+    return types.SimpleNamespace(
+        **{
+            name: dataclasses.replace(getattr(config, name), **changes.get(name, {}))
+            for name in sections
+        }
+    )
+
+
+def read_tables(context, folder, names):
+    """Read the tables ``<folder>/<name>.ecsv`` of a stage, by name."""
+    return {name: QTable.read(context.path(f"{folder}/{name}.ecsv")) for name in names}
+
+
+def rows_of(table, ids):
+    """Return the rows of a table with the given ids, in their order."""
+    place = {key: row for row, key in enumerate(np.asarray(table["id"]))}
+    return table[[place[key] for key in np.asarray(ids)]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """
+    A number of a comparison as the page shows it.
+
+    Parameters
+    ----------
+    header : str
+        Name of its column on the page.
+    key : str
+        Name of its value in a row.
+    spec : str
+        Format, such as ``"+.2f"``.
+    scale : float, optional
+        Factor before it is written.
+    unit : str, optional
+        Text after the number.
+    error : bool, optional
+        Whether its error, ``<key>_err`` in a row, follows the value.
+    why : str, optional
+        Why there is no number where the value is not finite.
+    """
+
+    header: str
+    key: str
+    spec: str
+    scale: float = 1
+    unit: str = ""
+    error: bool = False
+    why: str = NO_SOURCE
+
+    def text(self, row):
+        """Text of the number in a row of a table, or `~miricigale.pages.Missing`."""
+        text = number(row[self.key], self.spec, self.why, scale=self.scale)
+        if isinstance(text, Missing):
+            return text
+        if self.error:
+            text += f" ± {self.scale * row[f'{self.key}_err']:{self.spec.lstrip('+')}}"
+        return text + self.unit
+
+
+def cells_of(row, cells):
+    """Texts of several `Cell` objects in a row of a table."""
+    return [cell.text(row) for cell in cells]
