@@ -21,7 +21,7 @@ from miricigale.reduction import Reducer, find_cosmic_rays
 from miricigale.reduction.calibration import _PIXEL_SCALE
 
 
-def measure(name, number, seed, groups, options):
+def measure(name, number, seed, groups):
     """Flagged pixels, kept hits, and those that are both, of one frame."""
     rng = np.random.default_rng(seed)
     exp = exposure(name, "FULL").replace(n_groups=groups, n_integrations=1)
@@ -46,7 +46,7 @@ def measure(name, number, seed, groups, options):
     good = ~(with_hits.mask | without.mask)
     off = (with_hits.data - without.data) / with_hits.uncertainty.array
     kept = hit & good & (off > 5)
-    found = find_cosmic_rays(with_hits, fwhm=psf_fwhm(name).value / _PIXEL_SCALE, **options) & good
+    found = find_cosmic_rays(with_hits, fwhm=psf_fwhm(name).value / _PIXEL_SCALE) & good
     return found, kept, light
 
 
@@ -67,7 +67,7 @@ def main():
             start = time.process_time()
             sums = np.zeros(4, int)
             for seed in range(args.seeds):
-                found, kept, _ = measure(name, number, 100 + seed, args.groups, {})
+                found, kept, _ = measure(name, number, 100 + seed, args.groups)
                 near = binary_dilation(kept, np.ones((3, 3))) & ~kept
                 sums += [kept.sum(), found.sum(), (found & kept).sum(), (found & near).sum()]
             n, flagged, true, beside = sums

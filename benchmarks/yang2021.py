@@ -31,7 +31,7 @@ from miricigale.photometry import (
     flux_scaling,
 )
 from miricigale.psf import MatchingKernel, encircled_energy, hst_psf, miri_psf, psf_mosaic
-from miricigale.reduction import Reducer
+from miricigale.reduction import MosaicSettings, Reducer
 from miricigale.scene import Scene, highres_image, read_catalog
 from miricigale.utils.tables import match_sky
 
@@ -77,7 +77,7 @@ def expose(catalog, band, exposures, sigma, rng):
             data, unit="MJy/sr", wcs=exposure.wcs, uncertainty=StdDevUncertainty(noise),
             meta={"filter": band},
         ))  # fmt: skip
-    reducer = Reducer(outlier_threshold=None)
+    reducer = Reducer(mosaics=MosaicSettings(outlier_threshold=None))
     return [
         reducer.drizzle(images, mosaic_wcs(exposures, scale))[0].image for scale in (COARSE, FINE)
     ]

@@ -30,7 +30,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "reference_cache": ("ReferenceCache",),
         "reference_pixels": ("reference_channels", "reference_drift"),
         "reducer": ("Reducer",),
-        "settings": ("BACKENDS",),
+        "settings": ("BACKENDS", "BackgroundSettings", "MosaicSettings", "RampSettings"),
         "references": ("DetectorMaps", "ReferenceFiles"),
         "results": ("ReductionResult",),
         "sky_match": ("match_levels", "sky_offsets"),

@@ -74,7 +74,7 @@ def fit_steps(reducer, ramp, maps, *, reset, skipped):
         steps.append((LinearityStep, {}, {"linearity": models.linearity()}))
     if maps.dark is not None:
         steps.append((DarkCurrentStep, {}, {"dark": models.dark()}))
-    if reducer.reference_correction is not False:
+    if reducer.ramps.reference_correction is not False:
         steps.append((RefPixStep, {}, {"refpix": "N/A", "sirskernel": "N/A"}))
     noise = {"gain": models.gain(), "readnoise": models.read_noise()}
     if reducer.jump_threshold is not None:
@@ -83,10 +83,10 @@ def fit_steps(reducer, ramp, maps, *, reset, skipped):
             "rejection_threshold": limit,
             "three_group_rejection_threshold": limit,
             "four_group_rejection_threshold": limit,
-            "flag_4_neighbors": reducer.neighbor_threshold is not None,
+            "flag_4_neighbors": reducer.ramps.neighbor_threshold is not None,
         }
-        if reducer.neighbor_threshold is not None:
-            options["min_jump_to_flag_neighbors"] = reducer.neighbor_threshold
+        if reducer.ramps.neighbor_threshold is not None:
+            options["min_jump_to_flag_neighbors"] = reducer.ramps.neighbor_threshold
         steps.append((JumpStep, options, noise))
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         # the models speak of optional keywords that no step reads

@@ -10,7 +10,7 @@ from astropy.wcs.utils import proj_plane_pixel_scales
 from scipy.spatial import KDTree
 
 from miricigale.instrument import ImageFacts, psf_fwhm
-from miricigale.reduction.background import estimated
+from miricigale.reduction.background import estimate_background
 from miricigale.reduction.images import plain_mask, with_data
 from miricigale.utils import sep_tools
 from miricigale.utils.exceptions import argument_error
@@ -54,9 +54,7 @@ class Alignment:
         return self.scatter / np.sqrt(max(self.n_matched, 1))
 
 
-def align_to_catalog(
-    image, catalog, *, radius=1 * u.arcsec, threshold=10.0, fwhm=None, rotation=True
-):
+def align_to_catalog(image, catalog, *, radius=1 * u.arcsec, threshold=10.0):
     """
     Correct the coordinates of an image by the positions of a catalog.
 
@@ -70,10 +68,6 @@ def align_to_catalog(
         Largest shift.
     threshold : float, optional
         Sigma of a pixel above which sources are detected.
-    fwhm : `~astropy.units.Quantity`, optional
-        Of the point-spread function; that of the image's filter if not given.
-    rotation : bool, optional
-        Whether a rotation is solved for, with ten sources or more.
 
     Returns
     -------
@@ -90,15 +84,14 @@ def align_to_catalog(
     -----
     Positions are windowed centroids. All pairs of a source and a position within ``radius`` vote for a
     shift; what agrees with the most frequent to 0.1 arcsec is fitted by least squares, clipped at three
-    standard deviations. A wrong scale would be one of the distortion, and is not looked for.
+    standard deviations; a rotation is fitted too with ten sources or more. A wrong scale
+    would be one of the distortion, and is not looked for.
     """
-    x, y = _sources(image, threshold, fwhm)
-    return _aligned(image, x, y, _positions(catalog), positive(radius, ANGLE, "radius"), rotation)
+    x, y = _sources(image, threshold, "image")
+    return _aligned(image, x, y, _positions(catalog), positive(radius, ANGLE, "radius"), "image")
 
 
-def align_images(
-    images, catalog=None, *, radius=1 * u.arcsec, threshold=10.0, fwhm=None, rotation=True
-):
+def align_images(images, catalog=None, *, radius=1 * u.arcsec, threshold=10.0):
     """
     Align images to each other, or to a catalog.
 
@@ -109,7 +102,7 @@ def align_images(
     catalog : `~astropy.coordinates.SkyCoord`, optional
         Without one, the first image stands where it is, and each of the others is aligned to the sources of
         those before it.
-    radius, threshold, fwhm, rotation : optional
+    radius, threshold : optional
         As for `align_to_catalog`.
 
     Returns
@@ -131,15 +124,12 @@ def align_images(
     out, alignments = [], []
     for k, im in enumerate(images):
         name = f"images[{k}]"
-        x, y = _sources(im, threshold, fwhm, name)
+        x, y = _sources(im, threshold, name)
         if known is None:
-            zero = 0 * ANGLE
-            kept = Alignment(
-                east=zero, north=zero, rotation=0 * u.deg, n_matched=x.size, scatter=zero
-            )
-            aligned, alignment = im, kept
+            still = dict.fromkeys(("east", "north", "scatter"), 0 * ANGLE)
+            aligned, alignment = im, Alignment(**still, rotation=0 * u.deg, n_matched=x.size)
         else:
-            aligned, alignment = _aligned(im, x, y, known, reach, rotation, name)
+            aligned, alignment = _aligned(im, x, y, known, reach, name)
         if catalog is None:
             sky = aligned.wcs.pixel_to_world(x, y)
             if known is not None:
@@ -164,7 +154,7 @@ def _positions(catalog):
     return SkyCoord(catalog.icrs.ra, catalog.icrs.dec)
 
 
-def _sources(image, threshold, fwhm, argument="image"):
+def _sources(image, threshold, argument):
     """Windowed positions of the sources of an image, in pixels."""
     if image.wcs is None or image.uncertainty is None:
         raise argument_error(argument, "one with uncertainty and WCS", "one without")
@@ -175,13 +165,11 @@ def _sources(image, threshold, fwhm, argument="image"):
         )
     check_positive(threshold, "threshold")
     scale = float(np.mean(proj_plane_pixel_scales(image.wcs))) * 3600
-    if fwhm is None:
-        name = ImageFacts.of(image).filter
-        if name is None:
-            raise argument_error("fwhm", "given for an image that does not tell its filter", "none")
-        fwhm = psf_fwhm(name)
-    width = positive(fwhm, ANGLE, "fwhm") / scale / 2.3548
-    mask, background = plain_mask(image), estimated(image)
+    name = ImageFacts.of(image).filter
+    if name is None:
+        raise argument_error(argument, "one whose meta names its filter", "none")
+    width = psf_fwhm(name).to_value(ANGLE) / scale / 2.3548
+    mask, background = plain_mask(image), estimate_background(image, warn=False)
     data = np.where(mask, 0, image.data - background.level)
     found, _ = sep_tools.extract(data, threshold, err=background.rms, mask=mask)
     # the edge, and what is masked, cuts sources
@@ -191,7 +179,7 @@ def _sources(image, threshold, fwhm, argument="image"):
     return x[good], y[good]
 
 
-def _aligned(image, x, y, catalog, radius, rotation, argument="image"):
+def _aligned(image, x, y, catalog, radius, argument):
     """Image with its WCS moved to a catalog, and by how much."""
     # plane about the reference position, deg, east and north
     plane = WCS(naxis=2)
@@ -217,7 +205,7 @@ def _aligned(image, x, y, catalog, radius, rotation, argument="image"):
         if np.count_nonzero(used) < _LEAST:
             wanted = f"one with at least {_LEAST} sources of the catalog within {radius:g} arcsec"
             raise argument_error(argument, wanted, f"{np.count_nonzero(used)} of {len(x)} sources")
-        turn, move = _solved(one[used], other[used], rotation)
+        turn, move = _solved(one[used], other[used])
         residual = other - _turned(one, turn) - move
         spread = np.sqrt(np.mean(np.square(residual[used])))
         new = np.hypot(*residual.T) < max(3 * spread, 1e-6)
@@ -252,10 +240,10 @@ def _turned(places, turn):
     return places @ np.array([[cos, sin], [-sin, cos]]).T
 
 
-def _solved(one, other, rotation):
+def _solved(one, other):
     """Turn from north to east, and shift, that bring places to others."""
     turn = 0.0
-    if rotation and len(one) >= _LEAST_ROTATION:
+    if len(one) >= _LEAST_ROTATION:
         a, b = one - one.mean(axis=0), other - other.mean(axis=0)
         turn = np.arctan2(np.sum(a[:, 1] * b[:, 0] - a[:, 0] * b[:, 1]), np.sum(a * b))
     return turn, (other - _turned(one, turn)).mean(axis=0)

@@ -61,7 +61,7 @@ def maps_of(reducer, ramp):
                 "give 'references' or 'properties' (references='simulated' takes it for miri_detector())"
             )
             raise ValueError(msg)
-        return own_maps(reducer.detector, reducer.saturation)
+        return own_maps(reducer.detector)
     if isinstance(ramp, Charge):
         wanted = "None or 'simulated' for a Charge, which has no counts"
         raise argument_error("references", wanted, repr(reducer.references))

@@ -28,6 +28,8 @@ NEGATIVE_NOISES = ("larger", "background")
 
 # least share of the pixels that is taken for sky
 _LEAST_SKY = 0.05
+# the mask of the sources is dilated by this many pixels
+_GROW = 3
 # sky near sources may be brighter than far from them by this much, in the noise of a pixel
 _CONTAMINATION = 0.1
 # pixels that tell a median of a smooth image
@@ -103,8 +105,8 @@ def estimate_background(
     filter_size=3,
     plane=True,
     threshold=3.0,
-    grow=3,
     iterations=5,
+    warn=True,
 ):
     """
     Estimate the background of an image, masking what stands above it.
@@ -125,10 +127,10 @@ def estimate_background(
         background after a Gaussian smoothing of 0.85 pixels, twenty after one of 2.5, for the wings of
         bright sources, or twelve cells of 4 x 4 pixels that rise by twice as many after one of 8, for
         what is faint and wide. Sigma is that of the smoothed image, as measured.
-    grow : int, optional
-        The mask is dilated by this many pixels, and by half of the local half width of what it covers.
     iterations : int, optional
         How often sources are detected and masked at most; it ends when the mask stays.
+    warn : bool, optional
+        Whether there is a warning of a background that cannot be trusted.
 
     Returns
     -------
@@ -146,6 +148,8 @@ def estimate_background(
 
     Notes
     -----
+    The mask of the sources is dilated by three pixels, and by half of the local half width of what it covers.
+
     A plane or parabola, fitted to the boxes, each at the mean place of its sky, is taken off first and given
     back: distortion bends a gradient of the sky. A box of which a mask or the edge leaves a part stands for its
     center all the same, and is off by what a gradient changes from there to the part; with ``plane=False`` that
@@ -167,59 +171,42 @@ def estimate_background(
     ----------
     Detection in tiers of smoothing, from wide to narrow, follows Bagley et al. 2023, ApJL 946, L12, sec. 3.
     """
-    background = estimated(
-        image,
-        method=method,
-        box=box,
-        filter_size=filter_size,
-        plane=plane,
-        threshold=threshold,
-        grow=grow,
-        iterations=iterations,
-    )
-    tell(background, plain_mask(image))
-    return background
-
-
-def estimated(
-    image,
-    *,
-    method="masked",
-    box=64,
-    filter_size=3,
-    plane=True,
-    threshold=3.0,
-    grow=3,
-    iterations=5,
-):
-    """As `estimate_background`, without a warning."""
     check_choice(method, "method", ("masked", "sep"))
     check_mesh(box, filter_size)
     check_positive(threshold, "threshold")
-    check_least(grow, "grow", 0, whole=True)
     check_least(iterations, "iterations", 0, whole=True)
     mask = plain_mask(image)
     if mask.all():
         raise argument_error("image", "one with pixels that are not masked", "every pixel masked")
     data = sep_tools.native(image.data)
     data = np.where(mask, 0, data if data.dtype.kind == "f" else data.astype(float))
+    correlation = ImageFacts.of(image).noise_correction
     if method == "sep":
-        return _plain(data, mask, int(box), int(filter_size), _correlation(image))
-    correlation, stated = _correlation(image), _stated(image, mask)
+        background = _plain(data, mask, int(box), int(filter_size), correlation)
+    else:
+        stated, mesh = _stated(image, mask), (int(box), int(filter_size), plane)
+        background = _masked(data, mask, stated, mesh, correlation, threshold, iterations)
+    if warn:
+        warn_of(background, mask)
+    return background
+
+
+def _masked(data, mask, stated, mesh, correlation, threshold, iterations):
+    """Background with the sources masked; ``mesh`` has the size of the boxes, the filter and the plane."""
+    box, filter_size, plane = mesh
     step = _step(correlation, box)
-    options = {"threshold": threshold, "grow": grow, "iterations": iterations}
     # without a plane what a gradient leaves at edges would be taken for sources, the more with each iteration
     if step == 1:
-        mesh = SkyMesh(data, mask, int(box), int(filter_size), True)
-        mesh, sources, flags, doubt = _search(mesh, stated, **options)
+        mesh = SkyMesh(data, mask, box, filter_size, True)
+        mesh, sources, flags, doubt = _search(mesh, stated, threshold, iterations)
     else:
         mean, small, known = _averaged(data, mask, stated, step, correlation)
-        mesh = SkyMesh(mean, small, int(box) // step, int(filter_size), True)
-        _, sources, flags, doubt = _search(mesh, known, **options)
+        mesh = SkyMesh(mean, small, box // step, filter_size, True)
+        _, sources, flags, doubt = _search(mesh, known, threshold, iterations)
         sources = pixels_of(sources, data.shape, step) & ~mask
     if step > 1 or not plane:
         masked = sources if iterations else None
-        mesh = SkyMesh(data, mask, int(box), int(filter_size), plane, masked)
+        mesh = SkyMesh(data, mask, box, filter_size, plane, masked)
     if not flags & BackgroundFlags.FEW_SKY and _excess(stated, mesh.rms, mask | sources) > _EXCESS:
         flags |= BackgroundFlags.EXCESS_NOISE
     if flags & (BackgroundFlags.FEW_SKY | BackgroundFlags.EXCESS_NOISE):
@@ -231,7 +218,7 @@ def estimated(
     return Background(mesh.level, mesh.rms, error, sources, mesh.box, mesh.filter_size, flags)
 
 
-def _search(mesh, stated, *, threshold, grow, iterations):
+def _search(mesh, stated, threshold, iterations):
     """Mesh, mask of the sources, flags, and the light of sources that may be in the sky."""
     mask = mesh.mask
     sources, flags, doubt = np.zeros(mask.shape, bool), BackgroundFlags.GOOD, 0.0
@@ -239,8 +226,7 @@ def _search(mesh, stated, *, threshold, grow, iterations):
     for _ in range(iterations):
         noise = _noise(stated, mesh.rms, mask | sources)
         found = detect(mesh.residual, noise, mask, sources, threshold)
-        if grow:
-            found = grown(binary_dilation(found, iterations=grow), mask)
+        found = grown(binary_dilation(found, iterations=_GROW), mask)
         found |= pixels_of(avoided, mask.shape)
         if np.count_nonzero(~found & ~mask) < _LEAST_SKY * np.count_nonzero(~mask):
             flags = BackgroundFlags.FEW_SKY
@@ -264,7 +250,7 @@ def _search(mesh, stated, *, threshold, grow, iterations):
 
 def _step(correlation, box):
     """Pixels along each axis that share their noise, as far as boxes have four such groups of them."""
-    return max(1, min(int(correlation), int(box) // 4))
+    return max(1, min(int(correlation), box // 4))
 
 
 def _averaged(data, mask, stated, step, correlation):
@@ -313,12 +299,7 @@ def _noise(stated, rms, mask):
     return np.fmax(rms, stated[0] * np.float32(scale)) if np.isfinite(scale) else rms
 
 
-def _correlation(image):
-    """By how much the mean of many pixels is noisier than theirs in quadrature."""
-    return ImageFacts.of(image).noise_correction
-
-
-def tell(background, mask):
+def warn_of(background, mask):
     """Warn of a background that cannot be trusted."""
     if background.trusted:
         return

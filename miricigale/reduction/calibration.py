@@ -15,21 +15,21 @@ __all__ = ["calibrate", "find_cosmic_rays"]
 # needs no more accuracy
 _PIXEL_SCALE = 0.1109
 
+# L.A.Cosmic: Laplacian over noise from which a pixel counts, the fraction of it for the neighbors of a hit,
+# the least contrast between the Laplacian and the fine structure (higher values protect point sources
+# better), and passes
+_SIGMA, _FRACTION, _CONTRAST, _PASSES = 5.0, 0.3, 3.0, 3
+
+# how many times steeper than a Gaussian of the PSF's width, centered on a pixel, a hit must be: the peak less
+# the mean of its four neighbors, over the highest of the eight neighbors
+_SHARPNESS = 2.0
+
 # pixels that the filters of one pass of L.A.Cosmic reach (the widest, medians of 3 and 7 one after
 # the other and the growth of hits, reach 6, the cleaning 2 more), and some to spare
 _REACH = 12
 
 
-def find_cosmic_rays(
-    image,
-    *,
-    fwhm,
-    sigma_clip=5.0,
-    sigma_fraction=0.3,
-    object_limit=3.0,
-    iterations=3,
-    sharpness=2.0,
-):
+def find_cosmic_rays(image, *, fwhm):
     """
     Find what is sharper than a point source.
 
@@ -42,19 +42,6 @@ def find_cosmic_rays(
         With uncertainty.
     fwhm : float
         Of the point-spread function, in pixels.
-    sigma_clip : float, optional
-        Laplacian over noise from which a pixel counts.
-    sigma_fraction : float, optional
-        Fraction of that for the neighbors of a hit.
-    object_limit : float, optional
-        Least contrast between the Laplacian and the fine structure (differences of
-        median filters): higher values protect point sources better.
-    iterations : int, optional
-        Passes.
-    sharpness : float, optional
-        How many times steeper than a Gaussian of ``fwhm``, centered on a pixel, a hit must be:
-        the peak less the mean of its four neighbors, over the highest of the eight
-        neighbors.
 
     Returns
     -------
@@ -63,7 +50,7 @@ def find_cosmic_rays(
 
     Notes
     -----
-    Without the last condition L.A.Cosmic eats the cores and diffraction patterns of bright
+    Without the last condition L.A.Cosmic flags the cores and diffraction patterns of bright
     point sources, for any choice of its parameters. The price are hits spread evenly
     over several pixels, which only the other dithers show (`reject_outliers`).
 
@@ -83,31 +70,22 @@ def find_cosmic_rays(
     unit = np.median(error[good])
     data = np.where(good, (image.data - level) / unit, 0.0).astype(np.float32)
     variance = np.where(good, np.square(error / unit), 1.0).astype(np.float32)
-    hits = _lacosmic(
-        data,
-        variance,
-        ~good,
-        sigma_clip,
-        iterations,
-        sigfrac=float(sigma_fraction),
-        objlim=float(object_limit),
-    )
-    hits &= good
+    hits = _lacosmic(data, variance, ~good) & good
     if not hits.any():
         return hits
     # a Gaussian's pixel over its neighbor: exp(1 / (2 sigma^2))
     ratio = np.exp(0.5 * (2 * np.sqrt(2 * np.log(2)) / fwhm) ** 2)
-    steep = max(sharpness * (ratio - 1), 1.0)
+    steep = max(_SHARPNESS * (ratio - 1), 1.0)
     mean = convolve(data, np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], np.float32) / 4)
     ring = np.ones((3, 3), bool)
     highest = maximum_filter(data, footprint=ring & (np.arange(9).reshape(3, 3) != 4))
     noise = np.sqrt(variance)
     rise = data - mean
-    sharp = hits & (rise > steep * highest) & (rise > sigma_clip * noise)
+    sharp = hits & (rise > steep * highest) & (rise > _SIGMA * noise)
     return hits & binary_dilation(sharp, ring)
 
 
-def _lacosmic(data, variance, mask, sigma_clip, iterations, **options):
+def _lacosmic(data, variance, mask):
     """
     L.A.Cosmic, only where there may be a hit.
 
@@ -120,8 +98,8 @@ def _lacosmic(data, variance, mask, sigma_clip, iterations, **options):
     up, down, left, right = wide[:-2, 1:-1], wide[2:, 1:-1], wide[1:-1, :-2], wide[1:-1, 2:]
     laplacian = sum(np.maximum(2 * data - y - x, 0) for y in (up, down) for x in (left, right))
     # a per cent for rounding
-    seeds = ~mask & (laplacian > 0.99 * 8 * sigma_clip * np.sqrt(variance))
-    for passes in (1, iterations):
+    seeds = ~mask & (laplacian > 0.99 * 8 * _SIGMA * np.sqrt(variance))
+    for passes in (1, _PASSES):
         # new hits come from as far as the filters reach, and so do the errors at the rim of a part
         near = _grown(seeds, _REACH * (2 * passes - 1))
         found = np.zeros_like(mask)
@@ -133,12 +111,13 @@ def _lacosmic(data, variance, mask, sigma_clip, iterations, **options):
                 np.ascontiguousarray(data[part]),
                 inmask=np.ascontiguousarray(mask[part]),
                 invar=np.ascontiguousarray(variance[part]),
-                sigclip=float(sigma_clip),
+                sigclip=_SIGMA,
+                sigfrac=_FRACTION,
+                objlim=_CONTRAST,
                 gain=1.0,
                 readnoise=0.0,
                 satlevel=np.inf,
-                niter=int(passes),
-                **options,
+                niter=passes,
             )
             found[part] |= hits & _grown(seeds[part], _REACH * (passes - 1) + 2)
         seeds = found
@@ -162,7 +141,7 @@ def calibrate(
     conversion=None,
     flags=None,
     field_only=True,
-    cosmic_rays=None,
+    cosmic_rays=False,
 ):
     """
     Turn an image of slopes into surface brightness.
@@ -189,8 +168,8 @@ def calibrate(
     field_only : bool, optional
         Whether pixels behind the coronagraph masks are masked; sub-arrays that lie wholly
         outside the imager's field are left alone.
-    cosmic_rays : dict or None, optional
-        Options of `find_cosmic_rays`; None leaves that step out.
+    cosmic_rays : bool, optional
+        Whether residual cosmic rays are searched and masked (`find_cosmic_rays`).
 
     Returns
     -------
@@ -227,9 +206,9 @@ def calibrate(
         outside = ~inside if inside.any() else np.zeros_like(inside)
         outside &= (plain_flags(rate) & DQ.REFERENCE_PIXEL) == 0
         out = flag_pixels(out, outside, DQ.NON_SCIENCE | DQ.DO_NOT_USE)
-    if cosmic_rays is not None:
+    if cosmic_rays:
         fwhm = psf_fwhm(filter).value / _PIXEL_SCALE
-        hits = find_cosmic_rays(out, fwhm=fwhm, **cosmic_rays)
+        hits = find_cosmic_rays(out, fwhm=fwhm)
         out = flag_pixels(out, hits, DQ.COSMIC_RAY | DQ.DO_NOT_USE)
         out.meta["n_cosmic_rays"] = int(np.count_nonzero(hits))
     return out

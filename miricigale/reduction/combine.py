@@ -2,27 +2,26 @@
 
 from miricigale.instrument import ImageFacts, mosaic_wcs
 from miricigale.reduction.align import align_images
-from miricigale.reduction.background import BackgroundFlags, estimated, remove_background
+from miricigale.reduction.background import BackgroundFlags, estimate_background, remove_background
 from miricigale.reduction.dither_background import dither_backgrounds, restored
 from miricigale.reduction.images import check_images, check_overlap, seen_wcs
 from miricigale.reduction.mosaic import drizzle_images, pixel_map, reject_outliers, weight_map
 from miricigale.reduction.results import ReductionResult
-from miricigale.reduction.settings import mesh_options, negative_options
 from miricigale.reduction.sky_match import match_levels
 from miricigale.utils.exceptions import argument_error
 
 __all__ = ["combine", "drizzle", "subtract_dithers"]
 
 
-def drizzle(reducer, images, wcs, pixfrac=None):
+def drizzle(settings, images, wcs):
     """
     As `~miricigale.reduction.Reducer.drizzle`.
 
     Parameters
     ----------
-    reducer : `~miricigale.reduction.Reducer`
-        Settings.
-    images, wcs, pixfrac
+    settings : `~miricigale.reduction.MosaicSettings`
+        How images are combined.
+    images, wcs
         As of that method.
 
     Returns
@@ -33,29 +32,27 @@ def drizzle(reducer, images, wcs, pixfrac=None):
     """
     images = list(images)
     check_images(images, wcs)
-    pixfrac = reducer.pixfrac if pixfrac is None else pixfrac
     weights = [weight_map(im) for im in images]
     maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
     check_overlap(maps, wcs.pixel_shape[::-1])
-    if reducer.match_sky and len(images) > 1:
+    if settings.match_sky and len(images) > 1:
         images = match_levels(images, wcs, pixel_maps=maps)
     judged = all(ImageFacts.of(im).n_outliers is not None for im in images)
-    if reducer.outlier_threshold is not None and len(images) >= 3 and not judged:
+    if settings.outlier_threshold is not None and len(images) >= 3 and not judged:
         images = reject_outliers(
-            images, wcs, threshold=reducer.outlier_threshold, weights=weights, pixel_maps=maps
+            images, wcs, threshold=settings.outlier_threshold, weights=weights, pixel_maps=maps
         )
-    result = drizzle_images(images, wcs, pixfrac=pixfrac, weights=weights, pixel_maps=maps)
-    return result, images
+    mosaic = drizzle_images(images, wcs, pixfrac=settings.pixfrac, weights=weights, pixel_maps=maps)
+    return mosaic, images
 
 
 def subtract_dithers(reducer, images, alone=None, wcs=None):
     """As `~miricigale.reduction.Reducer.subtract_dithers`; ``alone`` is the background of each image by itself."""
     if alone is None:
-        alone = [estimated(im, **mesh_options(reducer)) for im in images]
+        alone = [estimate_background(im, warn=False, **reducer.background.mesh) for im in images]
     backgrounds = dither_backgrounds(images, alone, wcs=wcs)
-    options = negative_options(reducer)
     pairs = zip(images, backgrounds, strict=True)
-    return [remove_background(*pair, **options) for pair in pairs], backgrounds
+    return [remove_background(*pair, **reducer.background.negative) for pair in pairs], backgrounds
 
 
 def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align):
@@ -82,10 +79,10 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align):
     if wcs is None:
         wcs = mosaic_wcs([seen_wcs(im) for im in images], pixel_scale)
     notes = []
-    if reducer.outlier_threshold is not None and len(images) < 3:
+    if reducer.mosaics.outlier_threshold is not None and len(images) < 3:
         number = "a single dither" if len(images) == 1 else "two dithers"
         notes.append(f"{number}: outliers cannot be rejected, hits that ramps kept stay in")
-    if reducer.background == "dithers":
+    if reducer.background.method == "dithers":
         if len(images) >= 3 and len(backgrounds) == len(images):
             whole = [restored(im, b.level) for im, b in zip(images, backgrounds, strict=True)]
             images, backgrounds = subtract_dithers(reducer, whole, backgrounds, wcs)
@@ -93,9 +90,9 @@ def combine(reducer, images, backgrounds, rates, wcs, pixel_scale, align):
             notes.append("backgrounds are those of single exposures: it takes three and theirs")
     doubts = [b for b in backgrounds if not b.trusted]
     if doubts:
-        told = f"{len(doubts)} of {len(backgrounds)} backgrounds cannot be trusted"
-        notes.append(f"{told} ({_reasons(doubts)})")
-    drizzled, images = drizzle(reducer, images, wcs)
+        doubt = f"{len(doubts)} of {len(backgrounds)} backgrounds cannot be trusted"
+        notes.append(f"{doubt} ({_reasons(doubts)})")
+    drizzled, images = drizzle(reducer.mosaics, images, wcs)
     mosaic, mosaic_background = reducer.subtract_background(drizzled.image)
     if not mosaic_background.trusted:
         reasons = _reasons([mosaic_background])

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from miricigale.instrument import DQ, mosaic_wcs
-from miricigale.reduction.background import check_mesh, estimated, tell
+from miricigale.reduction.background import check_mesh, estimate_background, warn_of
 from miricigale.reduction.images import check_images, plain_mask, seen_wcs, with_data
 from miricigale.reduction.mosaic import drizzle_images, pixel_map
 from miricigale.reduction.sky_mesh import sky_boxes, spread_over
@@ -76,7 +76,11 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None, box=16, filter_siz
     for im in images:
         if im.shape != shape:
             raise argument_error("images", f"of one shape {shape}", im.shape)
-    alone = [estimated(im) for im in images] if backgrounds is None else list(backgrounds)
+    alone = (
+        [estimate_background(im, warn=False) for im in images]
+        if backgrounds is None
+        else list(backgrounds)
+    )
     if len(alone) != len(images):
         raise argument_error("backgrounds", f"one for each of {len(images)} images", len(alone))
     masks = [plain_mask(im) for im in images]
@@ -105,14 +109,14 @@ def dither_backgrounds(images, backgrounds=None, *, wcs=None, box=16, filter_siz
         rest = with_data(im, im.data - smooth)
         constant = float(np.median(rest.data[sky])) if sky.any() else level
         # what is left is judged as an image is, its mesh is not taken off
-        left = estimated(rest, box=own.box, filter_size=own.filter_size)
+        left = estimate_background(rest, warn=False, box=own.box, filter_size=own.filter_size)
         new = dataclasses.replace(
             left,
             level=(smooth + constant).astype(np.float32),
             error=np.hypot(error, left.error).astype(np.float32),
             source_mask=source,
         )
-        tell(new, mask)
+        warn_of(new, mask)
         out.append(new)
     return out
 
@@ -136,7 +140,7 @@ def _deep_masks(images, backgrounds, wcs):
         flat[-1].data = im.data - background.level
     maps = [pixel_map(im.wcs, wcs, im.shape) for im in images]
     mosaic = drizzle_images(flat, wcs, pixel_maps=maps).image
-    found = binary_dilation(estimated(mosaic).source_mask, iterations=_WIDER)
+    found = binary_dilation(estimate_background(mosaic, warn=False).source_mask, iterations=_WIDER)
     out = []
     for x, y in maps:
         # beside the grid nothing is known

@@ -23,22 +23,7 @@ _NODES = 1024
 _SLOPES = 4096
 
 
-def draw_groups(
-    charge,
-    *,
-    group_time,
-    gain,
-    read_noise,
-    bias,
-    linearity,
-    saturation,
-    usable,
-    first_group,
-    last_group,
-    jump_threshold,
-    neighbor_threshold,
-    poisson_factor,
-):
+def draw_groups(charge, maps, drift, usable, part, *, thresholds, poisson_factor):
     """
     Draw the slopes that `fit_groups` would fit to the ramps of an exposure.
 
@@ -46,11 +31,17 @@ def draw_groups(
     ----------
     charge : `~miricigale.detector.Charge`
         What is collected, and how it is read.
-    bias : float or array_like, shape (n_int, n_group)
+    maps : `DetectorMaps`
+        What the fit knows of the detector, one number for all pixels; it need not be the truth.
+    drift : float or array_like, shape (n_int, n_group)
         As for `fit_groups`; its mean over the integrations counts.
-    group_time, gain, read_noise, linearity, saturation, usable, first_group, last_group : optional
-        As for `fit_groups`: what the fit knows of the detector, which need not be the truth.
-    jump_threshold, neighbor_threshold, poisson_factor : optional
+    usable : `~numpy.ndarray` of bool, shape (ny, nx)
+        Pixels to fit; the others get NaN.
+    part : tuple of int
+        Range of groups that take part; the last is not included.
+    thresholds : tuple of float or None
+        For jumps and for their neighbors, as for `fit_groups`.
+    poisson_factor : float
         As for `fit_groups`.
 
     Returns
@@ -58,21 +49,22 @@ def draw_groups(
     fit : `RampFit`
     """
     exposure, truth = charge.exposure, charge.properties
-    n_int, n_group = exposure.n_integrations, exposure.n_groups
-    n_diff = last_group - first_group - 1
-    offset = np.broadcast_to(np.asarray(bias, float), (n_int, n_group)).mean(axis=0)
+    n_int, n_group, group_time = exposure.n_integrations, exposure.n_groups, charge.group_time
+    n_diff = part[1] - part[0] - 1
+    offset = np.asarray(maps.bias + drift, float)
+    offset = np.broadcast_to(offset, (n_int, n_group)).mean(axis=0)
     level = charge.level
-    limit = charge.limit(saturation - level.mean())
-    s, inv_gain = max(read_noise**2 + 1 / 12, 1e-6), poisson_factor / gain
+    limit = charge.limit(maps.saturation - level.mean())
+    s, inv_gain = max(maps.read_noise**2 + 1 / 12, 1e-6), poisson_factor / maps.gain
     rng = stream(charge.seed, "slopes", exposure.filter, exposure.dither)
 
     # rates that fill a pixel by the last group, and below
     scale = (_NODES - 1) / (limit / (n_group * group_time)) ** 0.25
     rates = (np.arange(_NODES) / scale) ** 4
-    groups = np.arange(first_group, last_group)
+    groups = np.arange(*part)
     read = charge.measured(rates[:, None] * group_time * (groups + 1)) + (level - offset)[groups]
-    linear = polynomial.polyval(read, linearity)
-    derivative = polynomial.polyval(read, polynomial.polyder(linearity))
+    linear = polynomial.polyval(read, maps.linearity)
+    derivative = polynomial.polyval(read, polynomial.polyder(maps.linearity))
     table = _core.tabulate(linear, derivative, n_int, s, charge.read_variance, inv_gain, group_time)
     zero = table[0, 0]
     table[0, 1:] = (table[0, 1:] - zero) / rates[1:]
@@ -93,10 +85,11 @@ def draw_groups(
         quoted_scale, images,
     )  # fmt: skip
     n_used = np.where(usable, np.int16(n_int * n_diff), np.int16(0))
-    n_jump, flags = np.zeros(shape, np.int16), np.zeros(shape, np.int64)
+    images += n_used, np.zeros(shape, np.int16), np.zeros(shape, np.int64)
+    names = ("jump_threshold", "neighbor_threshold")
     jumps = _core.hit_slopes(
-        mean, charge.hits, charge.hit_electrons, n_int, n_group, first_group, last_group,
-        group_time, limit, s, inv_gain, 1 / truth.gain, threshold(jump_threshold, "jump_threshold"),
-        threshold(neighbor_threshold, "neighbor_threshold"), rng, *images, n_used, n_jump, flags,
+        mean, charge.hits, charge.hit_electrons, (n_int, n_group, *part),
+        (group_time, s, inv_gain), (limit, 1 / truth.gain),
+        tuple(map(threshold, thresholds, names)), rng, images,
     )  # fmt: skip
-    return fit_result(*images, n_used, n_jump, flags, jumps, first_group)
+    return fit_result(*images, jumps, part[0])

@@ -206,11 +206,13 @@ def _mosaic(reducer, members, path, scale, settings, resume):
         return "kept", json.loads(read_images(path)[0].header["META"]).get("notes", [])
     files = [read_images(cal)[0] for cal, _ in members]
     images, backgrounds = [file.image for file in files], []
-    if reducer.background == "dithers" and len(files) >= 3:
+    if reducer.background.method == "dithers" and len(files) >= 3:
         images, backgrounds = reducer.subtract_dithers(
             [restored(file.image, file.planes["BKG"]) for file in files]
         )
-        reducer = reducer.replace(background="masked")
+        reducer = reducer.replace(
+            background=dataclasses.replace(reducer.background, method="masked")
+        )
     result = reducer.combine(images, backgrounds, pixel_scale=scale * ANGLE)
     mosaic = result.mosaic
     mosaic.meta["notes"] = list(result.notes)

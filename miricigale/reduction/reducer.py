@@ -2,24 +2,40 @@
 
 import dataclasses
 import os
+from dataclasses import field
 
 from astropy.nddata import CCDData
 
 from miricigale.detector import Charge, Ramp, ResetAnomaly
 from miricigale.instrument import DetectorProperties, ImageFacts, miri_detector
 from miricigale.reduction.assumed import brightness_of, maps_of
-from miricigale.reduction.background import estimate_background, subtract_background
+from miricigale.reduction.background import subtract_background
 from miricigale.reduction.calibration import calibrate
 from miricigale.reduction.combine import combine, drizzle, subtract_dithers
 from miricigale.reduction.files import open_exposure
+from miricigale.reduction.reference_cache import ReferenceCache
+from miricigale.reduction.references import ReferenceFiles
 from miricigale.reduction.results import rate_image
-from miricigale.reduction.settings import check_settings, mesh_options, negative_options
+from miricigale.reduction.settings import (
+    BACKENDS,
+    BackgroundSettings,
+    MosaicSettings,
+    RampSettings,
+)
 from miricigale.reduction.slopes import fit_slopes
 from miricigale.utils.exceptions import argument_error
+from miricigale.utils.options import check_choice, check_kind, check_least, check_positive
+from miricigale.utils.parallel import thread_count
 from miricigale.utils.progress import progress
 from miricigale.utils.units import ANGLE, RATE, SURFACE_BRIGHTNESS, to_array
 
 __all__ = ["Reducer"]
+
+#: Classes of the options that are objects.
+_KINDS = {
+    "reset_anomaly": ResetAnomaly, "ramps": RampSettings, "background": BackgroundSettings,
+    "mosaics": MosaicSettings, "properties": DetectorProperties,
+}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,76 +46,39 @@ class Reducer:
     Parameters
     ----------
     backend : {"native", "jwst"}, optional
-        Who fits the ramps: this package, or the steps of the official pipeline (``jwst``, an extra of the
+        Which code fits the ramps: this package, or the steps of the official pipeline (``jwst``, an extra of the
         installation) with the same references. The other settings, calibration, background
         and mosaic are the same.
     jump_threshold : float or None, optional
         Sigma above which a jump is cut out of a ramp; None for no jump detection.
-    neighbor_threshold : float or None, optional
-        Sigma above which a jump is cut in the four neighbors too, without what leaked into it (`fit_groups`).
-    shower_threshold : float or None, optional
-        Sigma above which the smoothed light around very large jumps is cut, the showers of cosmic
-        rays (`fit_groups`); None for none.
     skip_first, skip_last : int or None, optional
-        Groups left out at the start and end of each integration. None: one each (if more than
-        three or two groups are there, as in the official pipeline) in ramps of the observatory, but
-        for those of which flags of groups tell it, and in simulated ones that say that
+        Groups left out at the start and end of each integration. None: one each (if there are more than
+        three or two groups, as in the official pipeline) in ramps of the observatory, except
+        where flags of groups mark them, and in simulated ramps on which
         `~miricigale.detector.FirstFrame` or `~miricigale.detector.LastFrame` acted; else none.
     reset_anomaly : `~miricigale.detector.ResetAnomaly`, optional
-        The settling after a reset, which is taken off the groups; none if not given.
-    saturation : float, optional
-        Fraction of the detector's saturation from which groups are left out.
-    reference_correction : bool, "channels" or None, optional
-        Whether the mean of the reference columns is taken off, group by group; ``"channels"``
-        for means of the four channels and of odd and even rows, as the official pipeline has
-        them (`reference_channels`), which come out without a change in the first group. None: the
-        mean in simulated ramps, and in others what the pipeline does, ``"channels"`` in full frames
-        and nothing in sub-arrays.
-    reference_window : int or None, optional
-        Odd number of groups over which the drift of the channels is smoothed.
-    ipc : bool or None, optional
-        Whether neighbors share their charge, which lowers the photon noise of a pixel
-        (and correlates it) and blurs the flat field. None: as the ramp says, False where
-        it does not: a measured gain and flat field have it in them.
-    field_only : bool, optional
-        Whether pixels behind the coronagraph masks are masked.
+        The settling after a reset, which is subtracted from the groups; none if not given.
+    ramps : `RampSettings`, optional
+        How ramps are fitted.
     cosmic_rays : bool, optional
         Whether residual cosmic rays are searched on the slope image (`find_cosmic_rays`). Off: ramps of 30
         groups keep at most one hit in a full frame, and what the search flags lies in the wings of stars
         (``benchmarks/cosmic_rays.py``). Of use in ramps of a few groups.
-    cosmic_ray_sigma, cosmic_ray_contrast : float, optional
-        ``sigma_clip`` and ``object_limit`` of `find_cosmic_rays`.
-    background : {"masked", "sep", "dithers"}, optional
-        How the background of an exposure is estimated: from its own sky, with the sources masked
-        (`estimate_background`); by the plain mesh of sep, as in Yang et al. 2021 (with ``box=32``); or, in
-        `run`, `combine` and `subtract_dithers`, from the other dithers (`dither_backgrounds`).
-    box, filter_size : int, optional
-        Of the background: boxes in pixels, median filter in boxes.
-    plane : bool, optional
-        Whether a plane or parabola is taken off before the boxes are measured.
-    negative_threshold : float or None, optional
-        Pixels so many sigma below the background are masked.
-    negative_noise : {"larger", "background"}, optional
-        Whose sigma that is (`remove_background`).
-    match_sky : bool, optional
-        Whether constants by which the levels of dithers differ where they overlap are taken off before
-        they are compared and combined (`match_levels`).
-    outlier_threshold : float or None, optional
-        Sigma for the comparison of three or more dithers; None for none.
-    pixfrac : float, optional
-        Side of the drizzle's drops in input pixels.
+    background : `BackgroundSettings`, optional
+        How backgrounds are estimated.
+    mosaics : `MosaicSettings`, optional
+        How images are combined.
     references : ReferenceFiles, ReferenceCache, "none" or "simulated", optional
-        What the detector is taken for. `ReferenceFiles` names the files, `ReferenceCache` finds
+        Reference data of the detector. `ReferenceFiles` names the files, `ReferenceCache` finds
         them for each exposure by its header, ``"none"`` does without: slopes in DN/s with
-        measured noise. None, or ``"simulated"`` for whatever a ramp says of itself: the constants of
+        measured noise. None, or ``"simulated"`` whatever the ramp's metadata say: the constants of
         the package's own detector, which hold for ramps that its `~miricigale.detector.Detector`
         made. Other ramps are refused without references.
     properties : `~miricigale.instrument.DetectorProperties`, optional
         The simulated detector; `~miricigale.instrument.miri_detector` if not given, and
         ramps of any other are refused then.
     n_threads : int, optional
-        Threads of the ramp fit; as many as there are processors if not given. It changes
-        nothing in the result.
+        Threads of the ramp fit; as many as there are processors if not given. The result does not depend on it.
 
     Raises
     ------
@@ -115,34 +94,32 @@ class Reducer:
 
     backend: str = "native"
     jump_threshold: float | None = 5.0
-    neighbor_threshold: float | None = 10.0
-    shower_threshold: float | None = None
     skip_first: int | None = None
     skip_last: int | None = None
     reset_anomaly: ResetAnomaly | None = None
-    saturation: float = 0.98
-    reference_correction: bool | str | None = None
-    reference_window: int | None = None
-    ipc: bool | None = None
-    field_only: bool = True
+    ramps: RampSettings = field(default_factory=RampSettings)
     cosmic_rays: bool = False
-    cosmic_ray_sigma: float = 5.0
-    cosmic_ray_contrast: float = 3.0
-    background: str = "masked"
-    box: int = 64
-    filter_size: int = 3
-    plane: bool = True
-    negative_threshold: float | None = 10.0
-    negative_noise: str = "larger"
-    match_sky: bool = True
-    outlier_threshold: float | None = 5.0
-    pixfrac: float = 1.0
+    background: BackgroundSettings = field(default_factory=BackgroundSettings)
+    mosaics: MosaicSettings = field(default_factory=MosaicSettings)
     references: object = None
     properties: DetectorProperties | None = None
     n_threads: int | None = None
 
     def __post_init__(self):
-        check_settings(self)
+        check_choice(self.backend, "backend", BACKENDS)
+        check_positive(self.jump_threshold, "jump_threshold", optional=True)
+        for name in ("skip_first", "skip_last"):
+            if getattr(self, name) is not None:
+                check_least(getattr(self, name), name, 0, whole=True)
+        for name, kind in _KINDS.items():
+            check_kind(getattr(self, name), name, kind)
+        thread_count(self.n_threads)
+        known = (None, "none", "simulated")
+        if not isinstance(self.references, (ReferenceFiles, ReferenceCache)) and (
+            self.references not in known
+        ):
+            wanted = "ReferenceFiles, a ReferenceCache, 'none', 'simulated' or None"
+            raise argument_error("references", wanted, repr(self.references))
 
     replace = dataclasses.replace
 
@@ -244,22 +221,16 @@ class Reducer:
         for key in ("filter", "subarray"):
             if getattr(facts, key) is None:
                 raise argument_error("rate", f"an image whose meta has {key!r}", "none")
-        options = {"sigma_clip": self.cosmic_ray_sigma, "object_limit": self.cosmic_ray_contrast}
         brightness, used = brightness_of(self, rate)
         cal = calibrate(
             rate,
             filter=facts.filter,
             subarray=facts.subarray,
             **brightness,
-            field_only=self.field_only,
-            cosmic_rays=options if self.cosmic_rays else None,
+            cosmic_rays=self.cosmic_rays,
         )
         cal.meta.update(used)
         return cal
-
-    def estimate_background(self, image):
-        """Estimate the background of an image by itself: a `Background`."""
-        return estimate_background(image, **mesh_options(self))
 
     def subtract_background(self, image):
         """
@@ -275,7 +246,7 @@ class Reducer:
         image : `~astropy.nddata.CCDData`
         background : `Background`
         """
-        return subtract_background(image, **negative_options(self), **mesh_options(self))
+        return subtract_background(image, **self.background.negative, **self.background.mesh)
 
     def subtract_dithers(self, images, *, wcs=None):
         """
@@ -295,7 +266,7 @@ class Reducer:
         """
         return subtract_dithers(self, list(images), wcs=wcs)
 
-    def mosaic(self, images, wcs, *, pixfrac=None):
+    def mosaic(self, images, wcs):
         """
         Drizzle images onto one grid.
 
@@ -306,8 +277,6 @@ class Reducer:
             are three or more images and that was not done before.
         wcs : `~astropy.wcs.WCS`
             Of the output, with ``pixel_shape``.
-        pixfrac : float, optional
-            That of the settings if not given.
 
         Returns
         -------
@@ -323,9 +292,9 @@ class Reducer:
             If the images are not surface brightness of one filter, or the grid has no shape
             or lies elsewhere on the sky.
         """
-        return self.drizzle(images, wcs, pixfrac=pixfrac)[0].image
+        return self.drizzle(images, wcs)[0].image
 
-    def drizzle(self, images, wcs, *, pixfrac=None):
+    def drizzle(self, images, wcs):
         """
         Drizzle images onto one grid, with every plane of the result.
 
@@ -337,7 +306,7 @@ class Reducer:
         images : list of `~astropy.nddata.CCDData`
             The inputs with outliers masked.
         """
-        return drizzle(self, images, wcs, pixfrac)
+        return drizzle(self.mosaics, images, wcs)
 
     def reduce(self, exposure):
         """

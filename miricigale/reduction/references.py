@@ -32,6 +32,9 @@ STEP_OF = {
 #: References that may be numbers instead of files, with their units.
 _NUMBERS = {"gain": "e-/DN", "read_noise": "DN", "bias": "DN", "saturation": "DN"}
 
+#: Fraction of the simulated detector's saturation from which groups are left out.
+_SATURATION = 0.98
+
 #: References that may be measured on the ramp itself.
 _MEASURED = ("gain", "read_noise")
 
@@ -91,7 +94,7 @@ class DetectorMaps:
         return dataclasses.replace(self, **own)
 
 
-def own_maps(properties, saturation):
+def own_maps(properties):
     """
     The package's own detector, for ramps that it simulated.
 
@@ -99,15 +102,13 @@ def own_maps(properties, saturation):
     ----------
     properties : `~miricigale.instrument.DetectorProperties`
         Of the detector.
-    saturation : float
-        Fraction of its saturation from which groups are left out.
 
     Returns
     -------
     maps : `DetectorMaps`
     """
     own = "of the simulated detector"
-    limit = properties.bias + saturation * properties.saturation_dn
+    limit = properties.bias + _SATURATION * properties.saturation_dn
     used = {
         "mask": f"bad and reference pixels {own}",
         "saturation": f"{limit:.8g} DN {own}",

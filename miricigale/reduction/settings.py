@@ -1,70 +1,146 @@
-"""Settings of a `Reducer`, checked, and as options of the steps."""
+"""Settings of the steps of a `Reducer`: how ramps are fitted, backgrounds estimated and mosaics made."""
 
-from miricigale.detector import ResetAnomaly
-from miricigale.instrument import DetectorProperties
-from miricigale.reduction.background import NEGATIVE_NOISES, check_mesh
-from miricigale.reduction.reference_cache import ReferenceCache
-from miricigale.reduction.references import ReferenceFiles
+import dataclasses
+
 from miricigale.utils.exceptions import argument_error
-from miricigale.utils.options import check_choice, check_kind, check_positive
-from miricigale.utils.parallel import thread_count
+from miricigale.utils.options import check_choice, check_least, check_positive
 
-__all__ = ["BACKENDS", "check_settings", "mesh_options", "negative_options"]
+__all__ = ["BACKENDS", "BackgroundSettings", "MosaicSettings", "RampSettings"]
 
 #: Known backends.
 BACKENDS = ("native", "jwst")
 
 
-def check_settings(reducer):
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RampSettings:
     """
-    Refuse settings of a `~miricigale.reduction.Reducer` that are out of range.
+    How ramps are fitted, beyond the options of `Reducer` itself.
+
+    Parameters
+    ----------
+    neighbor_threshold : float or None, optional
+        Sigma above which a jump is cut in the four neighbors too, without what leaked into it (`fit_groups`).
+    shower_threshold : float or None, optional
+        Sigma above which the smoothed light around very large jumps is cut, the showers of cosmic
+        rays (`fit_groups`); None for none.
+    reference_correction : bool, "channels" or None, optional
+        Whether the mean of the reference columns is subtracted, group by group; ``"channels"``
+        for means of the four channels and of odd and even rows, as in the official pipeline
+        (`reference_channels`), which leave the first group unchanged. None: the
+        mean in simulated ramps, and in others what the pipeline does, ``"channels"`` in full frames
+        and nothing in sub-arrays.
+    reference_window : int or None, optional
+        Odd number of groups over which the drift of the channels is smoothed.
+    ipc : bool or None, optional
+        Whether neighbors share their charge, which lowers the photon noise of a pixel
+        (and correlates it) and blurs the flat field. None: as the ramp says, False where
+        it does not: a measured gain and flat field include it.
 
     Raises
     ------
     ValueError
-        Naming the setting, what was wanted and what came.
+        If an option is out of range.
     """
-    for name, known in (
-        ("backend", BACKENDS),
-        ("background", ("masked", "sep", "dithers")),
-        ("negative_noise", NEGATIVE_NOISES),
-        ("reference_correction", (True, False, "channels", None)),
-    ):
-        check_choice(getattr(reducer, name), name, known)
-    for name in (
-        "jump_threshold", "neighbor_threshold", "shower_threshold", "negative_threshold",
-        "outlier_threshold",
-    ):  # fmt: skip
-        check_positive(getattr(reducer, name), name, optional=True)
-    for name in ("cosmic_ray_sigma", "cosmic_ray_contrast"):
-        check_positive(getattr(reducer, name), name)
-    check_mesh(reducer.box, reducer.filter_size)
-    for name in ("skip_first", "skip_last"):
-        value = getattr(reducer, name)
-        if value is not None and (value < 0 or int(value) != value):
-            raise argument_error(name, "an integer of at least 0", value)
-    for name in ("saturation", "pixfrac"):
-        if not 0 < getattr(reducer, name) <= 1:
-            raise argument_error(name, "above 0 and at most 1", getattr(reducer, name))
-    if reducer.reference_window is not None and reducer.reference_correction != "channels":
-        wanted = "None without reference_correction='channels'"
-        raise argument_error("reference_window", wanted, reducer.reference_window)
-    thread_count(reducer.n_threads)
-    check_kind(reducer.reset_anomaly, "reset_anomaly", ResetAnomaly)
-    check_kind(reducer.properties, "properties", DetectorProperties)
-    if not isinstance(reducer.references, (ReferenceFiles, ReferenceCache)) and (
-        reducer.references not in (None, "none", "simulated")
-    ):
-        wanted = "ReferenceFiles, a ReferenceCache, 'none', 'simulated' or None"
-        raise argument_error("references", wanted, repr(reducer.references))
+
+    neighbor_threshold: float | None = 10.0
+    shower_threshold: float | None = None
+    reference_correction: bool | str | None = None
+    reference_window: int | None = None
+    ipc: bool | None = None
+
+    def __post_init__(self):
+        for name in ("neighbor_threshold", "shower_threshold"):
+            check_positive(getattr(self, name), name, optional=True)
+        known = (True, False, "channels", None)
+        check_choice(self.reference_correction, "reference_correction", known)
+        if self.reference_window is not None and self.reference_correction != "channels":
+            wanted = "None without reference_correction='channels'"
+            raise argument_error("reference_window", wanted, self.reference_window)
 
 
-def mesh_options(reducer):
-    """Options of `~miricigale.reduction.estimate_background`."""
-    options = {name: getattr(reducer, name) for name in ("box", "filter_size", "plane")}
-    return options | {"method": "sep" if reducer.background == "sep" else "masked"}
+@dataclasses.dataclass(frozen=True)
+class BackgroundSettings:
+    """
+    How the background of an image is estimated, and which pixels below it are masked.
+
+    Parameters
+    ----------
+    method : {"masked", "sep", "dithers"}, optional
+        From the image's own sky, with the sources masked (`estimate_background`); by the plain mesh of sep, as in
+        Yang et al. 2021 (with ``box=32``); or, in `Reducer.run`, `Reducer.combine` and `Reducer.subtract_dithers`,
+        from the other dithers (`dither_backgrounds`).
+    box, filter_size : int, optional
+        Boxes in pixels, median filter in boxes.
+    plane : bool, optional
+        Whether a plane or parabola is subtracted before the boxes are measured.
+    negative_threshold : float or None, optional
+        Pixels more than this many sigma below the background are masked; None for none.
+    negative_noise : {"larger", "background"}, optional
+        Which noise gives that sigma (`remove_background`).
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range.
+    """
+
+    method: str = "masked"
+    _: dataclasses.KW_ONLY
+    box: int = 64
+    filter_size: int = 3
+    plane: bool = True
+    negative_threshold: float | None = 10.0
+    negative_noise: str = "larger"
+
+    def __post_init__(self):
+        check_choice(self.method, "method", ("masked", "sep", "dithers"))
+        check_least(self.box, "box", 4, whole=True)
+        check_least(self.filter_size, "filter_size", 1, whole=True)
+        check_positive(self.negative_threshold, "negative_threshold", optional=True)
+        check_choice(self.negative_noise, "negative_noise", ("larger", "background"))
+
+    @property
+    def mesh(self):
+        """Options of `estimate_background`: those of single images, also where dithers follow."""
+        method = "sep" if self.method == "sep" else "masked"
+        names = ("box", "filter_size", "plane")
+        return {"method": method, **{name: getattr(self, name) for name in names}}
+
+    @property
+    def negative(self):
+        """Options of `remove_background`."""
+        return {
+            "negative_threshold": self.negative_threshold,
+            "negative_noise": self.negative_noise,
+        }
 
 
-def negative_options(reducer):
-    """Options of `~miricigale.reduction.background.remove_background`."""
-    return {name: getattr(reducer, name) for name in ("negative_threshold", "negative_noise")}
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MosaicSettings:
+    """
+    How the images of a filter are combined.
+
+    Parameters
+    ----------
+    match_sky : bool, optional
+        Whether constants by which the levels of dithers differ where they overlap are subtracted before
+        they are compared and combined (`match_levels`).
+    outlier_threshold : float or None, optional
+        Sigma for the comparison of three or more dithers; None for none.
+    pixfrac : float, optional
+        Side of the drizzle's drops in input pixels.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range.
+    """
+
+    match_sky: bool = True
+    outlier_threshold: float | None = 5.0
+    pixfrac: float = 1.0
+
+    def __post_init__(self):
+        check_positive(self.outlier_threshold, "outlier_threshold", optional=True)
+        if not 0 < self.pixfrac <= 1:
+            raise argument_error("pixfrac", "above 0 and at most 1", self.pixfrac)

@@ -66,37 +66,35 @@ def fit_slopes(reducer, ramp, maps, progress_bar=False):
         fit.flags[...] |= dq
         return fit
     factor = float(np.sum(detector.ipc_kernel**2)) if shares_charge(reducer, ramp) else 1.0
-    options = {
-        "group_time": ramp.group_time,
-        "gain": maps.gain,
-        "read_noise": maps.read_noise,
-        "linearity": maps.linearity,
-        "saturation": maps.saturation,
-        "usable": usable,
-        "first_group": skip_first,
-        "last_group": n_group - skip_last,
-        "jump_threshold": reducer.jump_threshold,
-        "neighbor_threshold": reducer.neighbor_threshold,
-        "poisson_factor": factor,
-    }
+    part = skip_first, n_group - skip_last
+    thresholds = reducer.jump_threshold, reducer.ramps.neighbor_threshold
     if isinstance(ramp, Charge):
-        fit = draw_groups(ramp, bias=maps.bias + drift, **options)
+        fit = draw_groups(
+            ramp, maps, drift, usable, part, thresholds=thresholds, poisson_factor=factor
+        )
     else:
         if "jump" in ramp.steps:
-            # the pipeline found them, and flags of groups tell them
-            options |= {"jump_threshold": None, "neighbor_threshold": None}
-        options |= {
-            "slow_noise": maps.slow_noise,
-            "shower_threshold": reducer.shower_threshold,
-            "bias": maps.bias,
-            "drift": _drift(reducer, ramp, reference, drift),
-            "reset": maps.reset,
-            "dark": maps.dark,
-            "group_dq": None if ramp.simulated else ramp.group_dq,
-            "n_threads": reducer.n_threads,
-            "progress_bar": progress_bar,
-        }
-        fit = fit_groups(ramp.data, **options)
+            # the pipeline found them, and flags of groups mark them
+            thresholds = None, None
+        names = (
+            "gain", "read_noise", "slow_noise", "bias", "reset", "linearity", "saturation", "dark"
+        )  # fmt: skip
+        fit = fit_groups(
+            ramp.data,
+            group_time=ramp.group_time,
+            **{name: getattr(maps, name) for name in names},
+            drift=_drift(reducer, ramp, reference, drift),
+            usable=usable,
+            group_dq=None if ramp.simulated else ramp.group_dq,
+            first_group=part[0],
+            last_group=part[1],
+            jump_threshold=thresholds[0],
+            neighbor_threshold=thresholds[1],
+            shower_threshold=reducer.ramps.shower_threshold,
+            poisson_factor=factor,
+            n_threads=reducer.n_threads,
+            progress_bar=progress_bar,
+        )
     fit.flags[...] |= dq
     fit.flags[~usable] |= int(DQ.DO_NOT_USE)
     return fit
@@ -109,7 +107,7 @@ def shares_charge(reducer, ramp):
     Parameters
     ----------
     reducer : `~miricigale.reduction.Reducer`
-        Its ``ipc`` decides, or without it what the ramp says.
+        Its ``ramps.ipc`` decides, or without it what the ramp says.
     ramp : `~miricigale.detector.Ramp` or `~miricigale.detector.Charge`
         What was exposed.
 
@@ -117,32 +115,28 @@ def shares_charge(reducer, ramp):
     -------
     shares : bool
     """
-    if reducer.ipc is not None:
-        return bool(reducer.ipc)
-    told = ramp.shows(InterpixelCapacitance)
-    return is_own(reducer, ramp) if told is None else told
+    if reducer.ramps.ipc is not None:
+        return bool(reducer.ramps.ipc)
+    acted = ramp.shows(InterpixelCapacitance)
+    return is_own(reducer, ramp) if acted is None else acted
 
 
 def _skipped(reducer, ramp):
     """Groups left out at the start and the end of the integrations of a ramp."""
-    n_group = ramp.exposure.n_groups
+    n_group, steps = ramp.exposure.n_groups, getattr(ramp, "steps", frozenset())
     first, last = reducer.skip_first, reducer.skip_last
     if first is None:
-        told = {"firstframe", "rscd"} & _steps(ramp)
-        first = int(ramp.shows(FirstFrame) is not False and n_group > 3 and not told)
+        done = {"firstframe", "rscd"} & steps
+        first = int(ramp.shows(FirstFrame) is not False and n_group > 3 and not done)
     if last is None:
-        told = "lastframe" in _steps(ramp)
-        last = int(ramp.shows(LastFrame) is not False and n_group > 2 and not told)
+        done = "lastframe" in steps
+        last = int(ramp.shows(LastFrame) is not False and n_group > 2 and not done)
     return first, last
-
-
-def _steps(ramp):
-    return frozenset() if isinstance(ramp, Charge) else ramp.steps
 
 
 def _drift(reducer, ramp, reference, drift):
     """Add the drift of the reference pixels to an offset of each group."""
-    how = reducer.reference_correction
+    how = reducer.ramps.reference_correction
     if how is None:
         how = ramp.simulated or (ramp.exposure.subarray == "FULL" and "channels")
     if not how or "refpix" in ramp.steps:
@@ -150,25 +144,28 @@ def _drift(reducer, ramp, reference, drift):
     if how != "channels":
         return drift + reference_drift(ramp.data, reference)
     origin = ramp.exposure.aperture.origin
-    found = reference_channels(ramp.data, reference, origin=origin, window=reducer.reference_window)
+    found = reference_channels(
+        ramp.data, reference, origin=origin, window=reducer.ramps.reference_window
+    )
     return np.broadcast_to(drift, ramp.shape[:2])[:, :, None, None] + found
 
 
 def _anomaly(reducer, ramp, maps):
-    """Offset of each group after a reset, DN, beside that of the references."""
-    if reducer.skip_first is None and ramp.shows(ResetDecay) and ramp.exposure.n_integrations > 1:
-        msg = (
-            "the ramp shows a decay after the resets between integrations that this Reducer leaves in: "
-            "give it 'skip_first' groups to be left out"
-        )
-        warnings.warn(msg, MiricigaleWarning, stacklevel=4)
+    """Offset of each group after a reset, DN, in addition to that of the references."""
+    exposure, skipping = ramp.exposure, reducer.skip_first is not None
+    if not skipping and ramp.shows(ResetDecay) and exposure.n_integrations > 1:
+        _warn_of("a decay after the resets between integrations", "")
     if reducer.reset_anomaly is not None:
-        exposure = ramp.exposure
         return reducer.reset_anomaly.offsets(exposure.n_integrations, exposure.n_groups)
-    if reducer.skip_first is None and maps.reset is None and ramp.shows(ResetAnomaly):
-        msg = (
-            "the ramp shows a reset anomaly that this Reducer leaves in: give it "
-            "'reset_anomaly', or 'skip_first' groups to be left out"
-        )
-        warnings.warn(msg, MiricigaleWarning, stacklevel=4)
+    if not skipping and maps.reset is None and ramp.shows(ResetAnomaly):
+        _warn_of("a reset anomaly", "'reset_anomaly', or ")
     return 0.0
+
+
+def _warn_of(what, remedy):
+    """Warn of an effect of resets that stays in the slopes."""
+    msg = (
+        f"the ramp shows {what} that this Reducer leaves in: "
+        f"give it {remedy}'skip_first' groups to be left out"
+    )
+    warnings.warn(msg, MiricigaleWarning, stacklevel=5)

@@ -51,7 +51,7 @@ def _images():
     from miricigale.instrument import Exposure, north_up_wcs
     from miricigale.photometry import detect_sources
     from miricigale.psf import hst_psf
-    from miricigale.reduction import Reducer
+    from miricigale.reduction import RampSettings, Reducer
     from miricigale.scene import highres_image
     from miricigale.workflow.config import load_config
     from miricigale.workflow.stages.images import expose_and_reduce, reducer_of
@@ -77,7 +77,7 @@ def _images():
             for exposure in exposures
         ]
     # low thresholds, so that few pixels contain large jumps
-    Reducer(jump_threshold=2.0, neighbor_threshold=2.0).fit_ramp(ramps[0])
+    Reducer(jump_threshold=2.0, ramps=RampSettings(neighbor_threshold=2.0)).fit_ramp(ramps[0])
     grid = north_up_wcs(center, 0.06 * u.arcsec, (128, 128))
     reducer_of(config).drizzle(images, grid)
     prior = highres_image(

@@ -8,7 +8,7 @@ from astropy.io import fits
 from miricigale.detector import CosmicRays, Detector, Ramp
 from miricigale.detector.effects import Block, stream_key
 from miricigale.instrument import DQ, Exposure, field_mask, flat_field, photmjsr
-from miricigale.reduction import Reducer
+from miricigale.reduction import RampSettings, Reducer
 
 pytest.importorskip("jwst", reason="needs the official pipeline: pip install miricigale[jwst]")
 pytestmark = pytest.mark.slow
@@ -50,7 +50,7 @@ def cut_groups(fit, reducer, shape):
     k, g, y, x = where
     sides = ((0, 1), (2, 1), (1, 0), (1, 2))
     leaked = sum(padded[k, g, y + dy, x + dx] for dy, dx in sides)
-    large = significance[where] - 0.05 * leaked >= reducer.neighbor_threshold
+    large = significance[where] - 0.05 * leaked >= reducer.ramps.neighbor_threshold
     cut = padded > 0
     for dy, dx in sides:
         cut[k[large], g[large], y[large] + dy, x[large] + dx] = True
@@ -80,7 +80,7 @@ def test_full_frame(tmp_path, tools, band, n_groups, n_integrations, flux):
     with fits.open(seen.product(tmp_path, "ramp")) as hdus:
         official = (hdus["GROUPDQ"].data & int(DQ.JUMP_DET)) != 0
     # the groups and the correction by reference pixels that the pipeline has, and the default thresholds
-    reducer = Reducer(skip_last=1, reference_correction="channels")
+    reducer = Reducer(skip_last=1, ramps=RampSettings(reference_correction="channels"))
     ramp = Ramp.read(seen.uncal)
     fit = reducer.fit_groups(ramp)
     detector = Detector.miri_imager()

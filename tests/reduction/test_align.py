@@ -5,7 +5,7 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
 
 from miricigale.instrument import imager_wcs
-from miricigale.reduction import Reducer, align_images, align_to_catalog
+from miricigale.reduction import BackgroundSettings, Reducer, align_images, align_to_catalog
 
 CENTER = SkyCoord(53.1344, -27.8344, unit="deg")
 SHAPE = (400, 420)
@@ -86,7 +86,7 @@ def test_dithers_are_aligned_to_the_first(stars):
     assert alignments[0].east == 0
     for im, true in zip(aligned, truths, strict=True):
         assert off(im.wcs, true) < 0.01
-    reducer = Reducer(background="sep")
+    reducer = Reducer(background=BackgroundSettings("sep"))
     result = reducer.combine(images, [], align="dithers")
     # stars of images that lie 0.3 arcsec beside each other are outliers
     count = [
@@ -132,5 +132,5 @@ def test_what_cannot_be_aligned_is_named(stars):
     ):
         align_to_catalog(galactic, sky)
     image.meta = {}
-    with pytest.raises(ValueError, match="'fwhm' must be given"):
+    with pytest.raises(ValueError, match="'image' must be one whose meta names its filter"):
         align_to_catalog(image, sky)

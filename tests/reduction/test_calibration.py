@@ -103,19 +103,11 @@ def test_hits_are_those_of_lacosmic_on_the_whole_frame(n_hits):
     variance = (1 + np.maximum(data, 0) / 300).astype(np.float32)
     mask = rng.random(x.shape) < 0.01
     mask[:, :20] = True
-    options = {"sigfrac": 0.3, "objlim": 3.0}
     expected, _ = astroscrappy.detect_cosmics(
-        data,
-        inmask=mask,
-        invar=variance,
-        sigclip=5.0,
-        gain=1.0,
-        readnoise=0.0,
-        satlevel=np.inf,
-        niter=3,
-        **options,
-    )
-    found = calibration._lacosmic(data, variance, mask, 5.0, 3, **options)
+        data, inmask=mask, invar=variance, sigclip=5.0, sigfrac=0.3, objlim=3.0, gain=1.0,
+        readnoise=0.0, satlevel=np.inf, niter=3,
+    )  # fmt: skip
+    found = calibration._lacosmic(data, variance, mask)
     np.testing.assert_array_equal(found & ~mask, expected & ~mask)
     assert np.count_nonzero(found & ~mask) >= n_hits
 

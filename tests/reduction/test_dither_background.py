@@ -4,7 +4,13 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
 
 from miricigale.instrument import north_up_wcs
-from miricigale.reduction import Reducer, dither_backgrounds, estimate_background
+from miricigale.reduction import (
+    BackgroundSettings,
+    MosaicSettings,
+    Reducer,
+    dither_backgrounds,
+    estimate_background,
+)
 from miricigale.utils.units import ANGLE
 
 SHAPE = (192, 200)
@@ -98,7 +104,9 @@ def test_sources_of_the_mosaic_are_masked_where_no_image_shows_them():
 
 def test_the_reducer_takes_backgrounds_of_dithers_in_its_second_pass():
     images, _, ripple = dithers()
-    reducer = Reducer(background="dithers", outlier_threshold=None)
+    reducer = Reducer(
+        background=BackgroundSettings("dithers"), mosaics=MosaicSettings(outlier_threshold=None)
+    )
     pairs = [reducer.subtract_background(im) for im in images]
     result = reducer.combine(
         [im for im, _ in pairs], [b for _, b in pairs], pixel_scale=0.11 * ANGLE
@@ -120,5 +128,5 @@ def test_bad_input_is_named():
         dither_backgrounds(images, box=0)
     with pytest.raises(ValueError, match="'backgrounds' must be one for each of 3 images"):
         dither_backgrounds(images, [])
-    with pytest.raises(ValueError, match="'background' must be 'masked' or 'sep' or 'dithers'"):
-        Reducer(background="none")
+    with pytest.raises(ValueError, match="'method' must be 'masked' or 'sep' or 'dithers'"):
+        BackgroundSettings("none")

@@ -24,7 +24,7 @@ from miricigale.instrument import (
     mosaic_wcs,
     pixel_area_map,
 )
-from miricigale.reduction import Reducer
+from miricigale.reduction import RampSettings, Reducer
 
 CENTER = SkyCoord(53.1344, -27.8344, unit="deg")
 STORM = CosmicRays(flux=8e-7)  # ten times as many as there are
@@ -143,7 +143,7 @@ def test_hits_that_are_not_cut_stay_where_they_are():
 
 
 def test_hits_below_the_threshold_make_the_same_tails():
-    reducer = Reducer(jump_threshold=20, neighbor_threshold=None)
+    reducer = Reducer(jump_threshold=20, ramps=RampSettings(neighbor_threshold=None))
     level = background_level("miri.f770w").value
     tails = []
     for seed in range(5):

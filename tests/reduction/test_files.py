@@ -12,7 +12,14 @@ from helpers.real import real_file
 from helpers.references import write_photom, write_reference
 from miricigale.detector import CosmicRays, Detector, Ramp
 from miricigale.instrument import DQ, Exposure, ImageFacts
-from miricigale.reduction import Reducer, ReferenceFiles, open_exposure, read_images, write_image
+from miricigale.reduction import (
+    BackgroundSettings,
+    Reducer,
+    ReferenceFiles,
+    open_exposure,
+    read_images,
+    write_image,
+)
 from miricigale.utils.exceptions import DataError, MiricigaleWarning
 
 I2D = "real/i2d/jw01288015001_04101_00001_mirimage_i2d.fits"
@@ -107,7 +114,7 @@ def test_what_was_done_to_a_rate_is_not_done_again(tmp_path, exposure):
         flat=write_reference(tmp_path / "flat.fits", "flat", exposure, flat, FILTER="F1000W"),
         photom=write_photom(tmp_path / "photom.fits", [("F1000W", "SUB64", 0.5)]),
     )
-    reducer = Reducer(references=references, cosmic_rays=False, field_only=False)
+    reducer = Reducer(references=references)
     level = {}
     for name, steps in {"dark": ("S_DARK",), "flat": ("S_DARK", "S_FLAT")}.items():
         path = tmp_path / f"{name}_rate.fits"
@@ -145,7 +152,9 @@ def test_a_real_image_of_the_pipeline():
     # on its own pixels the mosaic is itself, less its background; a single one says what it lacks, and
     # the light of the target fills the image
     with pytest.warns(MiricigaleWarning, match="cannot be trusted to better than"):
-        result = Reducer(negative_threshold=None).run([path], wcs=file.image.wcs)
+        result = Reducer(background=BackgroundSettings(negative_threshold=None)).run(
+            [path], wcs=file.image.wcs
+        )
     assert result.rates == ()
     single, *doubts = result.notes
     assert single == "a single dither: outliers cannot be rejected, hits that ramps kept stay in"

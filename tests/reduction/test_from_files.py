@@ -10,7 +10,7 @@ from astropy.table import Table
 from miricigale.cli import main
 from miricigale.detector import Detector
 from miricigale.instrument import Exposure, background_level
-from miricigale.reduction import Reducer, read_images, reduce_files, write_image
+from miricigale.reduction import BackgroundSettings, Reducer, read_images, reduce_files, write_image
 from miricigale.utils.exceptions import MiricigaleWarning
 
 
@@ -77,12 +77,12 @@ def test_all_stages_and_filters_in_one_go(files, tmp_path, capsys):
     table = reduce_files([*files[:2], files[3]], out)
     assert list(table["status"]) == ["kept"] * 3 + ["kept", "reduced"]
     # and with other settings all
-    table = reduce_files(files[3:4], out, reducer=Reducer(box=16))
+    table = reduce_files(files[3:4], out, reducer=Reducer(background=BackgroundSettings(box=16)))
     assert list(table["status"]) == ["reduced", "reduced"]
 
 
 def test_backgrounds_of_dithers_are_those_of_the_classes(files, tmp_path):
-    reducer = Reducer(background="dithers")
+    reducer = Reducer(background=BackgroundSettings("dithers"))
     table = reduce_files(files[:3], tmp_path, reducer=reducer)
     assert table["reason"][-1] in ("", None, np.ma.masked)
     (file,) = read_images(tmp_path / "mosaic_f770w.fits")

@@ -24,7 +24,13 @@ from miricigale.instrument import (
     photmjsr,
     pixel_area_map,
 )
-from miricigale.reduction import Reducer, ReductionResult
+from miricigale.reduction import (
+    BackgroundSettings,
+    MosaicSettings,
+    RampSettings,
+    Reducer,
+    ReductionResult,
+)
 
 FILTER = "miri.f1000w"
 SKY = background_level(FILTER).value
@@ -163,7 +169,7 @@ def test_the_whole_way_keeps_fluxes_and_errors(field):
 
 def test_the_fine_mosaic_has_the_same_light(field):
     exps, positions, _, ramps = field
-    reducer = Reducer(outlier_threshold=None)
+    reducer = Reducer(mosaics=MosaicSettings(outlier_threshold=None))
     result = reducer.run(ramps[:2], pixel_scale=0.11 * u.arcsec)
     fine = reducer.mosaic(result.images, mosaic_wcs(exps[:2], 0.06 * u.arcsec))
     sums = []
@@ -205,7 +211,7 @@ def test_charge_sharing_is_as_the_ramp_says():
     good = ~rate.mask
     pull = ((rate.data - expected_rate(exp, SKY, ipc=False)) / rate.uncertainty.array)[good]
     assert 0.97 < pull.std() < 1.03
-    assert Reducer(ipc=True).fit_ramp(ramp).meta["ipc"] is True
+    assert Reducer(ramps=RampSettings(ipc=True)).fit_ramp(ramp).meta["ipc"] is True
 
 
 def test_saturated_stars_are_used_or_masked_with_the_reason():
@@ -236,21 +242,22 @@ def test_groups_can_be_left_out():
 
 
 @pytest.mark.parametrize(
-    ("options", "match"),
+    ("kind", "options", "match"),
     [
-        ({"backend": "magic"}, "'backend' must be 'native' or 'jwst', got 'magic'"),
-        ({"jump_threshold": 0}, "'jump_threshold' must be positive or None"),
-        ({"saturation": 1.5}, "'saturation' must be above 0 and at most 1"),
-        ({"box": 1}, "'box' must be at least 4"),
-        ({"skip_first": -1}, "'skip_first' must be an integer of at least 0"),
-        ({"cosmic_ray_sigma": 0}, "'cosmic_ray_sigma' must be positive"),
-        ({"n_threads": 0}, "'n_threads' must be at least 1 and an integer"),
-        ({"properties": 3}, "'properties' must be a DetectorProperties"),
+        (Reducer, {"backend": "magic"}, "'backend' must be 'native' or 'jwst', got 'magic'"),
+        (Reducer, {"jump_threshold": 0}, "'jump_threshold' must be positive or None"),
+        (BackgroundSettings, {"box": 1}, "'box' must be at least 4"),
+        (MosaicSettings, {"pixfrac": 1.5}, "'pixfrac' must be above 0 and at most 1"),
+        (RampSettings, {"reference_window": 3}, "'reference_window' must be None without"),
+        (Reducer, {"skip_first": -1}, "'skip_first' must be at least 0, an integer, got -1"),
+        (Reducer, {"n_threads": 0}, "'n_threads' must be at least 1 and an integer"),
+        (Reducer, {"properties": 3}, "'properties' must be a DetectorProperties"),
+        (Reducer, {"background": "sep"}, "'background' must be a BackgroundSettings, got 'sep'"),
     ],
 )
-def test_bad_settings_are_named(options, match):
+def test_bad_settings_are_named(kind, options, match):
     with pytest.raises(ValueError, match=match):
-        Reducer(**options)
+        kind(**options)
 
 
 def test_refuses_what_does_not_belong_together():

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from miricigale.detector import CosmicRays, Detector
 from miricigale.instrument import DQ, Exposure, flat_field, miri_detector, photmjsr
-from miricigale.reduction import Reducer
+from miricigale.reduction import RampSettings, Reducer
 
 BAND, SKY, WIDTH = "miri.f770w", 5.1, 4.0
 
@@ -45,7 +45,7 @@ def smoothed_pull(fit, truth):
 def test_showers_of_large_hits_are_cut():
     ramp, truth = expose(fraction=1.0)
     left = smoothed_pull(Reducer().fit_groups(ramp), truth)
-    cut = smoothed_pull(Reducer(shower_threshold=5).fit_groups(ramp), truth)
+    cut = smoothed_pull(Reducer(ramps=RampSettings(shower_threshold=5)).fit_groups(ramp), truth)
     # a tenth of the pixels lie in clouds that single pixels do not show
     assert np.mean(left[1] > 5) > 0.1
     assert np.mean(cut[1] > 5) < 0.005
@@ -57,7 +57,7 @@ def test_showers_of_large_hits_are_cut():
 def test_without_showers_nothing_else_is_cut():
     ramp, truth = expose(fraction=0.0)
     plain = Reducer().fit_groups(ramp)
-    fit = Reducer(shower_threshold=5).fit_groups(ramp)
+    fit = Reducer(ramps=RampSettings(shower_threshold=5)).fit_groups(ramp)
     changed = fit.flags != plain.flags
     assert np.mean(changed) < 1e-3
     assert not np.any((fit.flags ^ plain.flags) & int(DQ.DO_NOT_USE))
@@ -77,4 +77,4 @@ def test_only_large_hits_make_showers():
 
 def test_a_wrong_threshold_is_named():
     with pytest.raises(ValueError, match="'shower_threshold' must be positive or None"):
-        Reducer(shower_threshold=0)
+        RampSettings(shower_threshold=0)

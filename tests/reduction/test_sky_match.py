@@ -5,7 +5,7 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData, StdDevUncertainty
 
 from miricigale.instrument import DQ, mosaic_wcs, north_up_wcs
-from miricigale.reduction import Reducer, match_levels, sky_offsets
+from miricigale.reduction import MosaicSettings, Reducer, match_levels, sky_offsets
 
 CENTER = SkyCoord(53.1344, -27.8344, unit="deg")
 SHAPE = (160, 170)
@@ -78,7 +78,7 @@ def test_levels_are_matched_before_outliers_are_searched():
     assert used[1].flags[80, 80] & DQ.OUTLIER
     # without, the fourth is an outlier everywhere
     assert max(im.meta["n_outliers"] for im in used) < 20
-    _, plain = Reducer(match_sky=False).drizzle(images, grid)
+    _, plain = Reducer(mosaics=MosaicSettings(match_sky=False)).drizzle(images, grid)
     assert plain[3].meta["n_outliers"] > 1000
     inner = mosaic.n_images == 4
     assert abs(np.median(mosaic.image.data[inner]) - 2) < 0.02

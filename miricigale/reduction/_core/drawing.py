@@ -152,8 +152,7 @@ def _list(rate, hits, electrons):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _find(rate, variance, mean, head, link, slot, charge, n, n_group, g0, g1, step, limit, s,
-          inv_gain, dn, jump, rng):  # fmt: skip
+def _find(rate, variance, mean, entries, n, groups, noise, truth, jump, rng):
     """
     Jumps that the fit finds, (n_jump, 5) as from `fit_rows`, and which entries are cut by it.
 
@@ -161,6 +160,10 @@ def _find(rate, variance, mean, head, link, slot, charge, n, n_group, g0, g1, st
     independent of the slope: the fit is the best linear one.
     """
     ny, nx = rate.shape
+    head, link, slot, charge = entries
+    _, n_group, g0, g1 = groups
+    step, s, inv_gain = noise
+    limit, dn = truth
     n_diff = g1 - g0 - 1
     cut = np.zeros(link.size, np.uint8)
     jumps = np.empty((n, 5))
@@ -194,9 +197,11 @@ def _find(rate, variance, mean, head, link, slot, charge, n, n_group, g0, g1, st
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cut_neighbors(rate, head, link, slot, charge, cut, n, jumps, own, n_group, g0, neighbor):
+def _cut_neighbors(rate, entries, cut, n, jumps, own, groups, neighbor):
     """Cut the entries beside large jumps (``own``), or new ones without charge; returns what may grow."""
     ny, nx = rate.shape
+    head, link, slot, charge = entries
+    _, n_group, g0, _ = groups
     for m in range(jumps.shape[0]):
         if own[m] < neighbor:
             continue
@@ -237,57 +242,34 @@ def _sums(lengths, n, v, s, whole, n_whole):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def hit_slopes(
-    mean,
-    hits,
-    electrons,
-    n_int,
-    n_group,
-    g0,
-    g1,
-    step,
-    limit,
-    s,
-    inv_gain,
-    dn,
-    jump,
-    neighbor,
-    rng,
-    rate,
-    var_poisson,
-    var_read,
-    n_used,
-    n_jump,
-    dq,
-):
+def hit_slopes(mean, hits, electrons, groups, noise, truth, thresholds, rng, out):
     """
     Change the slopes of pixels that lose groups to hits or saturation, or keep a hit.
 
     ``hits`` (3, n) are group, row and column of deposits of ``electrons``, those of a pixel in the
-    order of the groups; ``dn`` is the inverse of the true gain. The fit to fewer groups is that
-    to all of them plus independent noise of the difference of the variances. Returns the jumps that
-    are found, as `fit_rows`.
+    order of the groups. ``groups`` are the numbers of integrations and groups, the first group and the one
+    behind the last; ``noise`` the group time, the variance of a read and the Poisson variance of a difference
+    over the slope; ``truth`` the charge at which a pixel is full and the inverse of the true gain;
+    ``thresholds`` those of jumps and of their neighbors; ``out`` the images of `RampFit` from ``rate`` to
+    ``flags``.
+
+    The fit to fewer groups is that to all of them plus independent noise of the difference of the
+    variances. Returns the jumps that are found, as `fit_rows`.
     """
+    n_int, n_group, g0, g1 = groups
+    step, s, inv_gain = noise
+    limit, dn = truth
+    jump, neighbor = thresholds
+    rate, var_poisson, var_read, n_used, n_jump, dq = out
     ny, nx = rate.shape
     n_diff = g1 - g0 - 1
     head, link, slot, charge, n = _list(rate, hits, electrons)
-    jumps, cut = _find(
-        rate, var_poisson + var_read, mean, head, link, slot, charge, n, n_group, g0, g1, step,
-        limit, s, inv_gain, dn, jump, rng,
-    )  # fmt: skip
+    entries = head, link, slot, charge
+    variance = var_poisson + var_read
+    jumps, cut = _find(rate, variance, mean, entries, n, groups, noise, truth, jump, rng)
+    own_jumps = own_charge(jumps, nx, n_diff)
     link, slot, charge, cut = _cut_neighbors(
-        rate,
-        head,
-        link,
-        slot,
-        charge,
-        cut,
-        n,
-        jumps,
-        own_charge(jumps, nx, n_diff),
-        n_group,
-        g0,
-        neighbor,
+        rate, entries, cut, n, jumps, own_jumps, groups, neighbor
     )
     # segments that are not whole integrations; hits that stay: segment, difference, charge
     lengths = np.empty(n_int * (n_diff + 1) + 1, np.int64)

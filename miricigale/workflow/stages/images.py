@@ -60,13 +60,15 @@ def reducer_of(config, n_threads=None):
         backend=options.backend,
         jump_threshold=options.jump_threshold,
         cosmic_rays=options.residual_cosmic_rays,
-        background=options.background,
-        box=options.background_box,
-        filter_size=options.background_filter,
-        plane=options.background_plane,
-        negative_threshold=options.negative_threshold,
-        negative_noise=options.negative_noise,
-        pixfrac=options.pixfrac,
+        background=reduction.BackgroundSettings(
+            options.background,
+            box=options.background_box,
+            filter_size=options.background_filter,
+            plane=options.background_plane,
+            negative_threshold=options.negative_threshold,
+            negative_noise=options.negative_noise,
+        ),
+        mosaics=reduction.MosaicSettings(pixfrac=options.pixfrac),
         # what the analysis knows of the detector, also where a truth has another one
         references="simulated",
         n_threads=n_threads,
@@ -153,7 +155,7 @@ def expose_image(config, imager, image, exposure, *, seed, n_threads=None, keep=
     rate = reducer.fit_ramp(ramp)
     del ramp
     cal = reducer.calibrate(rate)
-    if reducer.background != "dithers":
+    if reducer.background.method != "dithers":
         cal, _ = reducer.subtract_background(cal)
     return rate, cal
 
@@ -235,7 +237,7 @@ def make_mosaic(context, unit):
 def mosaics_of(config, images):
     """Mosaics of a band, on its own grid (``""``) and on the prior's (``"_fine"``), with further planes."""
     reducer = reducer_of(config)
-    if reducer.background == "dithers":
+    if reducer.background.method == "dithers":
         images, _ = reducer.subtract_dithers(images)
     for label, scale in (("", config.reduction.pixel_scale), ("_fine", config.highres.pixel_scale)):
         # outliers are found in the first pass, which returns the images with them masked

@@ -82,7 +82,7 @@ def measure_point_sources(context, name):
     catalog = point_catalog(exposure, flux, prior, spacing=options.spacing, seed=seed)
     _, cal = expose_and_reduce(config, exposure, catalog, seed=seed, n_threads=context.n_threads)
     reducer = reducer_of(config)
-    if reducer.background == "dithers":
+    if reducer.background.method == "dithers":
         # there are none of this field
         cal, _ = reducer.subtract_background(cal)
     _, scale = measured_mosaic(config)
