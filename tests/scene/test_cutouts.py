@@ -7,7 +7,6 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.nddata import CCDData
-from photutils.psf import ImagePSF
 
 from helpers import scenes
 from helpers.scenes import light, moments
@@ -64,14 +63,6 @@ def test_second_moments_through_angle_and_parity(psf, pa, angle, parity):
     own = np.diag([0.2**2, 0.5**2]) + np.eye(2) * scale**2 / 6
     truth = (pixels @ sky) @ own @ (pixels @ sky).T + np.eye(2) * (0.85**2 + 1 / 12)
     np.testing.assert_allclose(got, truth, rtol=2e-3, atol=5e-3)
-
-
-def test_a_very_small_stamp_is_a_point(wcs, psf):
-    stamp = Cutout(np.ones((1, 1)), pixel_scale=1e-4 * u.arcsec)
-    scene = scenes.make_scene(one(wcs, 40.37, 30.81), wcs, psf, cutouts={1: stamp})
-    y, x = np.mgrid[:90, :100]
-    expected = ImagePSF(psf.data, oversampling=4, x_0=40.37, y_0=30.81, flux=10)(x, y)
-    np.testing.assert_allclose(light(scene), expected, atol=2e-6 * expected.max())
 
 
 def test_a_drawn_galaxy_is_the_galaxy(wcs, psf):
