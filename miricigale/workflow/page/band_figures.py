@@ -24,6 +24,7 @@ from miricigale.plotting.comparison import (
 )
 from miricigale.utils.units import ab_magnitude
 from miricigale.workflow.page.labels import band_label, by_wavelength
+from miricigale.workflow.stages.conditions import has_flag
 
 __all__ = [
     "counts_figure",
@@ -58,7 +59,7 @@ def magnitude_figure(table, bands):
     return figure
 
 
-def offset_figure(table, bands, limits=None, marks=()):
+def offset_figure(table, bands, limits, marks=()):
     """
     Magnitude differences of matched sources with running medians.
 
@@ -72,12 +73,11 @@ def offset_figure(table, bands, limits=None, marks=()):
         good = np.isfinite(offset)
         running = running_median(true[good], offset[good], size=20)
         plot_offsets(true[good], offset[good], running=running, ax=ax, title=band_label(name))
-        condition = np.asarray(table[f"{name}_condition"])
         style = {"ms": 5, "mfc": "none", "mec": "0.35", "mew": 0.7}
         for bit, marker, label in marks:
-            rows = good & ((condition & bit) > 0) & (np.abs(offset) <= 1)
+            rows = good & has_flag(table, f"{name}_condition", bit) & (np.abs(offset) <= 1)
             ax.plot(true[rows], offset[rows], marker, label=label, **style)
-        if limits and np.isfinite(limits[name]):
+        if np.isfinite(limits[name]):
             ax.axvline(limits[name], color="0.35", ls=":", lw=1.2, label="5-sigma limit")
         if ax.get_legend_handles_labels()[0]:
             legend(ax, loc="lower left")
@@ -94,17 +94,15 @@ def error_figure(errors, bands, limits):
     finite = [value for value in limits.values() if np.isfinite(value)]
     flux = np.geomspace(0.02, max(300, 30 * max(finite, default=1)), 120) * u.uJy
     # darker at shorter wavelengths, distinct to color-blind readers
-    colors = dict(zip(order, colormaps["viridis"](np.linspace(0, 0.82, len(order))), strict=True))
+    shades = colormaps["viridis"](np.linspace(0, 0.82, len(order)))
     plot_error_function(
-        dict.fromkeys(bands, flux.value),
-        {name: errors.sigma(flux, name).to_value(u.uJy) for name in bands},
-        limits=limits,
+        {band_label(name): flux.value for name in order},
+        {band_label(name): errors.sigma(flux, name).to_value(u.uJy) for name in order},
+        limits={band_label(name): limits[name] for name in order},
         ax=ax,
-        colors=colors,
+        colors={band_label(name): shade for name, shade in zip(order, shades, strict=True)},
     )
-    handles, names = ax.get_legend_handles_labels()
-    labels = [band_label(name) for name in names]
-    legend(ax, handles=handles, labels=labels, ncols=2)
+    legend(ax, ncols=2)
     return figure
 
 

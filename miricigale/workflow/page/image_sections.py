@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from miricigale.pages import Missing, cell_of
+from miricigale.pages import cell_of, number
 from miricigale.workflow.page import pictures, study_figures
 from miricigale.workflow.page.declared import sentence, texts_of
 from miricigale.workflow.page.labels import SET_LABELS, browse, three_bands
@@ -58,15 +58,15 @@ def write_images(page, mosaics):
 
 def write_detections(page):
     """Which galaxies are detected, and why the others are not in the fit."""
-    m, prior = page.metrics, page.facts["prior"]
+    m, none, prior = page.metrics, "no galaxy", page.facts["prior"]
+    # a column without any value is left out
+    unknown = {"to_proposal"} if all(np.isnan(row["to_proposal"]) for row in m["detected"]) else ()
     rows = []
     for row in m["detected"]:
-        interval = Missing("no galaxy")
-        if row["n"]:
-            interval = f"{100 * row['low']:.1f} % to {100 * row['high']:.1f} %"
-        rows.append({"sample": f"{prior} < {row['limit']:g}", "interval": interval, **row})
-        if all(np.isnan(one["to_proposal"]) for one in m["detected"]):
-            del rows[-1]["to_proposal"]
+        low, high = (number(row[end], ".1f %", none) for end in ("low", "high"))
+        interval = f"{low} to {high}" if row["n"] else low
+        known = {key: value for key, value in row.items() if key not in unknown}
+        rows.append({"sample": f"{prior} < {row['limit']:g}", "interval": interval, **known})
     page.section("detections")
     page.table(
         "shares",

@@ -51,9 +51,7 @@ class StudyPage:
             "truth": truth_label(self.first),
             "three_bands": ", ".join(chosen),
             "longest": chosen[-1],
-            "detected_bands": ("the one band", "two or more bands")[
-                self.metrics["n_bands_detected"] - 1
-            ],
+            "detected_bands": "the one band" if len(self.bands) == 1 else "two or more bands",
             "prior": band_label(self.config.highres.filter),
             "mag_column": options.mag_column,
             "mag_limit": options.mag_limit,
