@@ -8,6 +8,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 from astropy.nddata import CCDData
 
+from helpers.runs import one_band
 from helpers.scenes import catalog_at
 from miricigale.depth import zodiacal_factor
 from miricigale.instrument import background_level
@@ -145,16 +146,8 @@ def test_the_report_says_which_and_from_where():
 
 
 def test_images_have_the_background_that_was_asked_for():
-    config = StudyConfig.from_dict(
-        {
-            "exposures": {
-                "filters": BANDS[:1], "kind": "rates", "n_groups": [40], "n_integrations": [1],
-                "n_dithers": [1],
-            },
-            "fit": {"min_detected": 1},
-            "scene": {"background": "20 MJy/sr", "background_gradient": 0.0},
-        }
-    )  # fmt: skip
+    scene = {"background": "20 MJy/sr", "background_gradient": 0.0}
+    config = one_band(BANDS[0], kind="rates", n_groups=40, scene=scene)
     (exposure,) = study_exposures(config).values()
     sky = SkyCoord([exposure.pointing.ra], [exposure.pointing.dec])
     catalog = catalog_at(sky, **{BANDS[0]: 1.0 * u.uJy})

@@ -6,23 +6,14 @@ import pytest
 from astropy.table import QTable
 
 from helpers.points import PRIOR, point_catalog, save_points
-from helpers.runs import do_stage
+from helpers.runs import do_stage, one_band
 from miricigale.workflow import Context
-from miricigale.workflow.config import StudyConfig
 
 BAND = "miri.f1000w"
 
 
 def config_of(method):
-    return StudyConfig.from_dict(
-        {
-            "exposures": {
-                "filters": [BAND], "n_groups": [7], "n_integrations": [1], "n_dithers": [1],
-            },
-            "fit": {"min_detected": 1},
-            "photometry": {"method": method},
-        }
-    )  # fmt: skip
+    return one_band(BAND, photometry={"method": method})
 
 
 @pytest.fixture(scope="module")

@@ -6,12 +6,12 @@ import pytest
 from astropy.table import QTable
 
 from helpers.points import PRIOR, point_catalog, save_points
-from helpers.runs import STAGES, do_stage
+from helpers.runs import STAGES, do_stage, one_band
 from miricigale.evaluation import PUBLISHED
 from miricigale.pages import Page
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
-from miricigale.workflow.config import StudyConfig, load_config
+from miricigale.workflow.config import load_config
 from miricigale.workflow.stages import rivals
 
 BAND = "miri.f1500w"
@@ -20,15 +20,7 @@ N, N_FAINT = 14, 2
 
 
 def config_of(method, **photometry):
-    return StudyConfig.from_dict(
-        {
-            "exposures": {
-                "filters": [BAND], "n_groups": [7], "n_integrations": [1], "n_dithers": [1],
-            },
-            "fit": {"min_detected": 1},
-            "photometry": {"method": method, "rivals": True, **photometry},
-        }
-    )  # fmt: skip
+    return one_band(BAND, photometry={"method": method, "rivals": True, **photometry})
 
 
 def made_matched(truth):

@@ -9,11 +9,10 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
 from helpers.points import PRIOR, point_catalog, save_prior
-from helpers.runs import STAGES, do_stage
+from helpers.runs import STAGES, do_stage, one_band
 from miricigale.pages import Page
 from miricigale.utils.exceptions import ConfigError
 from miricigale.workflow import Context
-from miricigale.workflow.config import StudyConfig
 from miricigale.workflow.derived import changed_config
 from miricigale.workflow.stages import variants
 from miricigale.workflow.stages.exposures import IMAGES, grid_of, study_exposures
@@ -30,18 +29,8 @@ BAND = "miri.f2100w"
 
 
 def config_of(images="all", **sections):
-    exposures = {
-        "filters": [BAND], "kind": "rates", "n_groups": [10], "n_integrations": [4], "n_dithers": [1]
-    }  # fmt: skip
-    exposures |= sections.pop("exposures", {})
-    return StudyConfig.from_dict(
-        {
-            "exposures": exposures,
-            "fit": {"min_detected": 1},
-            "variants": {"images": images},
-            **sections,
-        }
-    )
+    options = {"kind": "rates", "n_groups": 10, "n_integrations": 4, **sections}
+    return one_band(BAND, variants={"images": images}, **options)
 
 
 def changed(config, changes):
@@ -64,7 +53,7 @@ def test_each_variant_switches_one_thing_over():
         "residual": {"detector": {"residual": 0.0}},
         "plane": {"reduction": {"background_plane": True}},
     }
-    ramps = config_of("gradient", exposures={"kind": "ramps"}, scene={"background_gradient": 0.0})
+    ramps = config_of("gradient", kind="ramps", scene={"background_gradient": 0.0})
     assert variant_changes(ramps) == {
         "rates": {},
         "gradient": {"scene": {"background_gradient": 0.05}},
